@@ -1,0 +1,5 @@
+"""What a DR-GS asset is, and its container file."""
+
+from .model import MATERIAL_CHANNELS, Asset, Binding, Environment, Mesh, PosedSurfels, Surfels
+
+__all__ = ["MATERIAL_CHANNELS", "Asset", "Binding", "Environment", "Mesh", "PosedSurfels", "Surfels"]

@@ -1,0 +1,188 @@
+"""What a DR-GS asset is, as plain arrays.
+
+Conventions of every array in this project: right-handed, Z up, metres; float32, C-contiguous, (n, 3); colour is
+linear Rec.709, scene-referred; quaternions are wxyz; roughness is perceptual (alpha = roughness squared).
+Asset arrays are in **object space**: the space in which the mesh object's vertices live in Blender.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..errors import AssetError
+
+Array = np.ndarray
+
+#: Material channels of a surfel or vertex: name -> width. Albedo is linear Rec.709 in [0, 1].
+MATERIAL_CHANNELS: dict[str, int] = {"albedo": 3, "roughness": 1, "metallic": 1}
+
+
+def as_float(values: Any, shape: tuple[int, ...], name: str) -> Array:
+    """Return `values` as a C-contiguous float32 array of `shape` (-1 is free) or raise AssetError naming it."""
+    try:
+        array = np.ascontiguousarray(values, dtype=np.float32)
+    except (TypeError, ValueError) as error:
+        raise AssetError(name, f"is not an array of numbers ({error})") from error
+    fits = array.ndim == len(shape) and all(w in (-1, g) for w, g in zip(shape, array.shape, strict=False))
+    if not fits:
+        raise AssetError(name, f"has shape {array.shape}, expected {shape}")
+    return array
+
+
+@dataclass(slots=True)
+class Surfels:
+    """2D Gaussian surfels, activated (never raw network values).
+
+    Attributes
+    ----------
+    centre : (n, 3) float32, metres, object space
+    scale : (n, 2) float32, metres: standard deviations along the two tangents (linear, not log)
+    rotation : (n, 4) float32 unit quaternion wxyz; the rotated X and Y axes are the tangents, Z is the normal
+    opacity : (n,) float32 in [0, 1]
+    albedo, roughness, metallic : (n, 3), (n,), (n,) float32 in [0, 1]
+    sh : (n, k, 3) float32 or None: spherical-harmonic outgoing colour as captured (3DGS basis and order)
+    extras : unknown per-surfel properties kept from the file, name -> (n,) or (n, c) float32
+    """
+
+    centre: Array
+    scale: Array
+    rotation: Array
+    opacity: Array
+    albedo: Array
+    roughness: Array
+    metallic: Array
+    sh: Array | None = None
+    extras: dict[str, Array] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.centre = as_float(self.centre, (-1, 3), "surfel centre")
+        n = len(self.centre)
+        self.scale = as_float(self.scale, (n, 2), "surfel scale")
+        self.rotation = as_float(self.rotation, (n, 4), "surfel rotation")
+        self.opacity = as_float(self.opacity, (n,), "surfel opacity")
+        self.albedo = as_float(self.albedo, (n, 3), "surfel albedo")
+        self.roughness = as_float(self.roughness, (n,), "surfel roughness")
+        self.metallic = as_float(self.metallic, (n,), "surfel metallic")
+        if self.sh is not None:
+            self.sh = as_float(self.sh, (n, -1, 3), "surfel sh")
+
+    def __len__(self) -> int:
+        return len(self.centre)
+
+
+@dataclass(slots=True)
+class Mesh:
+    """Triangle mesh that carries the materials rays meet.
+
+    Attributes
+    ----------
+    vertices : (n, 3) float32, metres, object space
+    faces : (m, 3) int32, counter-clockwise seen from outside
+    albedo, roughness, metallic : per vertex (n, 3), (n,), (n,) float32 in [0, 1]
+    groups : named vertex sets kept from the source (one a material or part), name -> (k,) int32 vertex indices
+    """
+
+    vertices: Array
+    faces: Array
+    albedo: Array
+    roughness: Array
+    metallic: Array
+    groups: dict[str, Array] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.vertices = as_float(self.vertices, (-1, 3), "mesh vertices")
+        n = len(self.vertices)
+        self.faces = np.ascontiguousarray(self.faces, dtype=np.int32)
+        if self.faces.ndim != 2 or self.faces.shape[1] != 3:
+            raise AssetError("mesh faces", f"have shape {self.faces.shape}, expected (-1, 3)")
+        if len(self.faces) and (self.faces.min() < 0 or self.faces.max() >= n):
+            raise AssetError("mesh faces", f"refer to vertex {int(self.faces.max())} but there are only {n} vertices")
+        self.albedo = as_float(self.albedo, (n, 3), "mesh albedo")
+        self.roughness = as_float(self.roughness, (n,), "mesh roughness")
+        self.metallic = as_float(self.metallic, (n,), "mesh metallic")
+
+
+@dataclass(slots=True)
+class Binding:
+    """How surfel i hangs on face ``face[i]``: p = sum_k barycentric_k v_k + offset * r_rest * n_face.
+
+    Attributes
+    ----------
+    face : (n,) int32
+    barycentric : (n, 3) float32, sums to 1
+    offset : (n,) float32, along the unit face normal in units of the rest face's mean edge length
+    normal : (n, 3) float32: shading normal in the orthonormal frame (t, b, s) of the face, where s is the
+        interpolated smooth vertex normal, t the first edge projected off s, b = s x t. Surfels made from the mesh
+        have exactly (0, 0, 1).
+    """
+
+    face: Array
+    barycentric: Array
+    offset: Array
+    normal: Array
+
+    def __post_init__(self) -> None:
+        self.face = np.ascontiguousarray(self.face, dtype=np.int32)
+        n = len(self.face)
+        self.barycentric = as_float(self.barycentric, (n, 3), "binding barycentric")
+        self.offset = as_float(self.offset, (n,), "binding offset")
+        self.normal = as_float(self.normal, (n, 3), "binding normal")
+
+
+@dataclass(slots=True)
+class Environment:
+    """Distant light: lat-long radiance in Blender's mapping.
+
+    ``radiance`` is (h, w, 3) float32, row 0 at +Z; u = 0.5 - atan2(y, x) / 2pi, v = acos(z) / pi; +X at the centre.
+    """
+
+    radiance: Array
+
+    def __post_init__(self) -> None:
+        self.radiance = as_float(self.radiance, (-1, -1, 3), "environment")
+
+
+@dataclass(slots=True)
+class Asset:
+    """Everything that does not change during an animation.
+
+    ``binding`` is None only until the surfels are bound. ``provenance`` is JSON-able: where each part came from,
+    conversions done, counts dropped.
+    """
+
+    surfels: Surfels
+    mesh: Mesh
+    binding: Binding | None = None
+    environment: Environment | None = None
+    provenance: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(slots=True)
+class PosedSurfels:
+    """Surfels of one frame, ready to rasterise: what every deformation yields.
+
+    Attributes
+    ----------
+    centre : (n, 3) float32, world space
+    tangent_u, tangent_v : (n, 3) float32, world space, **scaled** (F s_u t_u, F s_v t_v); need not be orthogonal:
+        the kernel at q solves q - centre = u tangent_u + v tangent_v and is exp(-(u^2 + v^2) / 2)
+    normal : (n, 3) float32 unit shading normal, world space
+    opacity, albedo, roughness, metallic : as in Surfels, after the frame's material edits
+    object_index : (n,) int32: index into Frame.objects
+    """
+
+    centre: Array
+    tangent_u: Array
+    tangent_v: Array
+    normal: Array
+    opacity: Array
+    albedo: Array
+    roughness: Array
+    metallic: Array
+    object_index: Array
+
+    def __len__(self) -> int:
+        return len(self.centre)

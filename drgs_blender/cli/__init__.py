@@ -1,0 +1,1 @@
+"""The `drgs` command; one module a command."""

@@ -1,0 +1,1 @@
+"""The engine process: protocol, server, session, client."""

@@ -1,0 +1,84 @@
+"""The few errors that reach a user. Each message names the file or object, what is wrong, and what to do.
+
+The ``exit_code`` of a class is what ``drgs`` returns to the shell or the farm when the error ends a command.
+"""
+
+from __future__ import annotations
+
+EXIT_OK = 0
+EXIT_USAGE = 64
+EXIT_BAD_ASSET = 65
+EXIT_NO_DEVICE = 69
+EXIT_INTERNAL = 70
+EXIT_CANNOT_WRITE = 73
+EXIT_RETRY = 75
+EXIT_VERSION = 78
+
+
+class DrgsError(Exception):
+    """Base of every error meant for a user.
+
+    Parameters
+    ----------
+    subject : str
+        The file, object or setting the error is about.
+    problem : str
+        What is wrong with it.
+    remedy : str
+        What the user can do.
+    """
+
+    exit_code = EXIT_INTERNAL
+
+    def __init__(self, subject: str, problem: str, remedy: str = "") -> None:
+        self.subject, self.problem, self.remedy = subject, problem, remedy
+        super().__init__(f"{subject}: {problem}." + (f" {remedy}." if remedy else ""))
+
+    def __reduce__(self) -> tuple[type, tuple[str, str, str]]:
+        return type(self), (self.subject, self.problem, self.remedy)
+
+
+class UsageError(DrgsError):
+    """A setting or argument that cannot be used."""
+
+    exit_code = EXIT_USAGE
+
+
+class AssetError(DrgsError):
+    """A file (asset, mesh, surfels, environment) that is damaged, incomplete or does not fit."""
+
+    exit_code = EXIT_BAD_ASSET
+
+
+class DeviceError(DrgsError):
+    """Something needed to compute (engine interpreter, Embree, a device) is absent."""
+
+    exit_code = EXIT_NO_DEVICE
+
+
+class WriteError(DrgsError):
+    """An output that cannot be written."""
+
+    exit_code = EXIT_CANNOT_WRITE
+
+
+class EngineError(DrgsError):
+    """The engine died or did not answer; the same request may succeed when repeated."""
+
+    exit_code = EXIT_RETRY
+
+
+class VersionError(DrgsError):
+    """Two parts of DR-GS of different versions met."""
+
+    exit_code = EXIT_VERSION
+
+
+class Cancelled(Exception):
+    """The user cancelled; not an error."""
+
+
+#: Name -> class, for errors that cross the process boundary.
+ERROR_CLASSES: dict[str, type[DrgsError]] = {
+    c.__name__: c for c in (DrgsError, UsageError, AssetError, DeviceError, WriteError, EngineError, VersionError)
+}

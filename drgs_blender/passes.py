@@ -1,0 +1,47 @@
+"""The one table of render passes: the engine fills it, the EXR writer and Blender's view layer read it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Pass:
+    """One render pass.
+
+    Attributes
+    ----------
+    name : name in Frame.passes and layer name in EXR files (Blender's own name where Blender has the pass)
+    channels : channel letters, as Blender's ``add_pass`` wants them
+    kind : Blender's pass type ('COLOR', 'VECTOR' or 'VALUE')
+    blender : property of ``ViewLayer`` that switches it on in Blender; "" where DR-GS has its own switch
+    about : tooltip
+    """
+
+    name: str
+    channels: str
+    kind: str
+    blender: str
+    about: str
+
+
+PASSES: tuple[Pass, ...] = (
+    Pass("Combined", "RGBA", "COLOR", "use_pass_combined", "Beauty, premultiplied alpha"),
+    Pass("Depth", "Z", "VALUE", "use_pass_z", "Distance along the view axis in metres, 1e10 where empty"),
+    Pass("Position", "XYZ", "VECTOR", "use_pass_position", "World-space position in metres"),
+    Pass("Normal", "XYZ", "VECTOR", "use_pass_normal", "World-space shading normal"),
+    Pass("Albedo", "RGB", "COLOR", "", "Base colour of the surface, linear"),
+    Pass("Roughness", "X", "VALUE", "", "Perceptual roughness"),
+    Pass("Metallic", "X", "VALUE", "", "Metallic"),
+    Pass("Coverage", "X", "VALUE", "", "Part of the pixel that DR-GS objects cover"),
+    Pass("IndexOB", "X", "VALUE", "use_pass_object_index", "Pass index of the nearest object"),
+    Pass("DiffDir", "RGB", "COLOR", "use_pass_diffuse_direct", "Direct diffuse light, colour included"),
+    Pass("DiffInd", "RGB", "COLOR", "use_pass_diffuse_indirect", "Indirect diffuse light, colour included"),
+    Pass("GlossDir", "RGB", "COLOR", "use_pass_glossy_direct", "Direct glossy light, colour included"),
+    Pass("GlossInd", "RGB", "COLOR", "use_pass_glossy_indirect", "Indirect glossy light, colour included"),
+    Pass("Env", "RGB", "COLOR", "use_pass_environment", "Light straight from the world"),
+    Pass("Noisy Image", "RGBA", "COLOR", "", "Beauty before denoising"),
+)
+
+#: name -> Pass
+BY_NAME: dict[str, Pass] = {p.name: p for p in PASSES}
