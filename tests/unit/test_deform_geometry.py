@@ -1,0 +1,38 @@
+"""Vertex normals shared by deformation and rendering."""
+
+from __future__ import annotations
+
+import numpy as np
+import trimesh
+
+from drgs_blender.geometry import VertexNormals, corner_table
+
+
+def test_cube_corners_point_along_the_diagonal_however_it_is_triangulated():
+    cube = trimesh.creation.box()
+    normals = VertexNormals(cube.faces, 8)(cube.vertices)
+    np.testing.assert_allclose(normals, np.sign(cube.vertices) / np.sqrt(3), atol=1e-6)
+
+
+def test_angle_weights_match_trimesh_on_an_irregular_mesh():
+    mesh = trimesh.creation.icosphere(3)
+    mesh.vertices *= [1.0, 0.6, 1.7]
+    mesh.vertices += np.random.default_rng(0).normal(0, 0.01, mesh.vertices.shape)
+    expected = np.zeros_like(mesh.vertices)
+    for k in range(3):
+        np.add.at(expected, mesh.faces[:, k], mesh.face_normals * mesh.face_angles[:, k, None])
+    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+    np.testing.assert_allclose(VertexNormals(mesh.faces, len(mesh.vertices))(mesh.vertices), expected, atol=2e-6)
+
+
+def test_degenerate_faces_weigh_nothing_and_lonely_vertices_stay_finite():
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [2, 0, 0], [9, 9, 9], [np.nan, 0, 0]], np.float32)
+    faces = np.array([[0, 1, 2], [0, 1, 3], [1, 1, 2], [2, 3, 5]])
+    normals = VertexNormals(faces, len(vertices))(vertices)
+    assert np.array_equal(normals, np.tile(np.float32([0, 0, 1]), (6, 1)))
+
+
+def test_corner_table_lists_every_corner_once():
+    faces = np.array([[0, 1, 2], [2, 1, 3]])
+    start, corner = corner_table(faces, 5)
+    assert [sorted(corner[start[v] : start[v + 1]]) for v in range(5)] == [[0], [1, 4], [2, 3], [5], []]
