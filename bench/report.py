@@ -1,0 +1,56 @@
+"""Where measured figures go: one section of docs/benchmarks.md a program, replaced each time it runs."""
+
+from __future__ import annotations
+
+import os
+import platform
+import re
+from collections.abc import Sequence
+from datetime import date
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+DOCUMENT = ROOT / "docs" / "benchmarks.md"
+OUT = ROOT / "out" / "bench"
+
+HEADER = """# Benchmarks
+
+Every figure here was measured by a program in `bench/`, which wrote its own section. `make bench` runs them all.
+"""
+
+
+def machine() -> str:
+    """One line that names processor, core count, system and Python."""
+    model = platform.processor() or platform.machine()
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        found = re.search(r"model name\s*:\s*(.+)", cpuinfo.read_text())
+        model = found.group(1) if found else model
+    return f"{model}, {os.cpu_count()} cores, {platform.system()}, Python {platform.python_version()}"
+
+
+def table(columns: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    """A Markdown table; floats are shown with three significant figures."""
+
+    def cell(value: object) -> str:
+        return f"{value:.3g}" if isinstance(value, float) and abs(value) < 1e3 else str(value)
+
+    lines = ["| " + " | ".join(columns) + " |", "|" + "---|" * len(columns)]
+    lines += ["| " + " | ".join(cell(v) for v in row) + " |" for row in rows]
+    return "\n".join(lines)
+
+
+def write_section(name: str, title: str, command: str, body: str) -> None:
+    """Replace section `name` of docs/benchmarks.md (or append it) and print it."""
+    text = DOCUMENT.read_text() if DOCUMENT.exists() else HEADER
+    begin, end = f"<!-- begin {name} -->", f"<!-- end {name} -->"
+    section = (
+        f"{begin}\n## {title}\n\n{body.strip()}\n\n`{command}` · {date.today().isoformat()} · {machine()}\n{end}"
+    )
+    pattern = re.compile(re.escape(begin) + ".*?" + re.escape(end), re.DOTALL)
+    if pattern.search(text):
+        text = pattern.sub(lambda _: section, text)
+    else:
+        text = text.rstrip() + "\n\n" + section + "\n"
+    DOCUMENT.write_text(text)
+    print(section)
