@@ -1,0 +1,332 @@
+"""Set up, test and show DR-GS from a clean checkout, on any system, with nothing but Python.
+
+    python3.11 tools/dev.py demo          # two commands after `git clone`: this one, then look at the picture
+    python3.11 tools/dev.py test
+
+Standard library only. Two environments are made beside the checkout, because Blender's Python pins an older numpy:
+``.venv`` (the engine) and ``.venv-blender`` (Blender as a module, for tests and batch rendering).
+"""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import json
+import os
+import re
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import tomllib
+import venv
+import xml.etree.ElementTree as xml
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+#: Exactly this torch, so that pip never goes looking for a larger build; DRGS_TORCH replaces it (pip arguments).
+TORCH = "torch==2.13.0"
+BLENDER = "5.0.1"
+BLENDER_FLOOR = "4.2.23"
+#: Shared library that Blender needs -> the Debian package that holds it.
+APT_PACKAGES = {
+    "libEGL.so.1": "libegl1",
+    "libGL.so.1": "libgl1",
+    "libGLX.so.0": "libglx0",
+    "libICE.so.6": "libice6",
+    "libSM.so.6": "libsm6",
+    "libX11.so.6": "libx11-6",
+    "libXext.so.6": "libxext6",
+    "libXfixes.so.3": "libxfixes3",
+    "libXi.so.6": "libxi6",
+    "libXrender.so.1": "libxrender1",
+    "libXxf86vm.so.1": "libxxf86vm1",
+    "libgomp.so.1": "libgomp1",
+    "libxkbcommon.so.0": "libxkbcommon0",
+}
+SUITES = ("lint", "engine", "blender", "floor")
+TEST_SECONDS = 600
+
+
+class Failure(Exception):
+    """A step that cannot go on; the message is for the user."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one subcommand; the return value is the exit code."""
+    args = parse(argv)
+    try:
+        return args.run(args)
+    except Failure as failure:
+        print(f"dev.py: {failure}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return 130
+
+
+def parse(argv: Sequence[str] | None) -> argparse.Namespace:
+    """The command line of this script."""
+    parser = argparse.ArgumentParser(
+        prog="dev.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    def command(name: str, run: object, about: str) -> argparse.ArgumentParser:
+        sub = commands.add_parser(name, help=about, description=about)
+        sub.set_defaults(run=run, rest=[])
+        return sub
+
+    env = command("env", run_env, "make or refresh the environments (instant when nothing changed)")
+    env.add_argument(
+        "--blender", metavar="VERSION", help=f"only Blender's environment of this version, e.g. {BLENDER_FLOOR}"
+    )
+    command("system", run_system, "print the system packages that Blender needs and that are missing (Linux)")
+    test = command("test", run_test, "format, types and every test suite; exit code 0 only when all pass")
+    test.add_argument("suites", nargs="*", metavar="SUITE", help=f"any of {', '.join(SUITES)}; default: all")
+    demo = command("demo", run_demo, "render the demo through Blender; further arguments go to examples/demo.py")
+    extension = command("extension", run_extension, "build the extension's zip; arguments go to tools/extension.py")
+    bench = command("bench", run_bench, "measure; further arguments go to bench/run.py")
+    for sub in (demo, extension, bench):
+        sub.add_argument("rest", nargs=argparse.REMAINDER, help="passed on")
+    clean = command("clean", run_clean, "remove build products and caches")
+    clean.add_argument("--all", action="store_true", help="also the environments")
+    return parser.parse_args(argv)
+
+
+# Environments
+
+
+def blender_folder(version: str) -> Path:
+    """``.venv-blender`` for the main version, ``.venv-blender-4.2`` and so on for the others."""
+    series = ".".join(version.split(".")[:2])
+    return ROOT / (".venv-blender" if version == BLENDER else f".venv-blender-{series}")
+
+
+def python_of(folder: Path) -> Path:
+    """The interpreter of an environment."""
+    return folder / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
+
+
+def ensure_engine() -> Path:
+    """Make ``.venv`` when needed and return its interpreter."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    torch = shlex.split(os.environ.get("DRGS_TORCH", TORCH))
+    wanted = {
+        "torch": torch,
+        "dependencies": project["dependencies"],
+        "optional": project["optional-dependencies"],
+        "scripts": project["scripts"],
+    }
+    return ensure(ROOT / ".venv", wanted, [torch, ["-e", f"{ROOT}[reconstruct,dev]"]], "import drgs_blender")
+
+
+def ensure_blender(version: str = BLENDER) -> Path:
+    """Make the environment with Blender `version` as a module when needed and return its interpreter."""
+    packages = [f"bpy=={version}", "pytest>=8"]
+    return ensure(blender_folder(version), {"packages": packages}, [packages], "import bpy", python311())
+
+
+def ensure(
+    folder: Path, wanted: dict[str, object], steps: Iterable[list[str]], probe: str, python: Path | None = None
+) -> Path:
+    """Make `folder` a virtual environment in which each of `steps` was pip-installed and `probe` runs.
+
+    A stamp in the folder remembers what was wanted, so a second call does nothing.
+    """
+    interpreter, stamp = python_of(folder), folder / "drgs-stamp.json"
+    text = json.dumps(wanted, indent=1, sort_keys=True)
+    if interpreter.exists() and stamp.exists() and stamp.read_text(encoding="utf-8") == text:
+        return interpreter
+    started = time.monotonic()
+    print(f"Preparing {folder.name} ...", flush=True)
+    if not interpreter.exists():
+        if python is None or python.resolve() == Path(sys.executable).resolve():
+            venv.create(folder, with_pip=True)
+        else:
+            subprocess.run([python, "-m", "venv", folder], check=True)
+    for step in steps:
+        command = [interpreter, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", *step]
+        if subprocess.run(command, cwd=ROOT).returncode:
+            raise Failure(f"pip install {' '.join(step)} failed in {folder.name}; its message is above")
+    trial = subprocess.run([interpreter, "-c", probe], capture_output=True, text=True, timeout=300, cwd=ROOT)
+    if trial.returncode:
+        raise Failure(import_trouble(folder, trial.stderr))
+    stamp.write_text(text, encoding="utf-8")
+    print(f"Preparing {folder.name} took {time.monotonic() - started:.0f} s", flush=True)
+    return interpreter
+
+
+def python311() -> Path:
+    """A Python 3.11, the only version for which Blender 4.2 to 5.0 exist as a module."""
+    if sys.version_info[:2] == (3, 11):
+        return Path(sys.executable)
+    candidates = [["py", "-3.11"]] if os.name == "nt" else [["python3.11"], ["/opt/homebrew/bin/python3.11"]]
+    for candidate in candidates:
+        if shutil.which(candidate[0]):
+            ask = [*candidate, "-c", "import sys; print(sys.executable)"]
+            found = subprocess.run(ask, capture_output=True, text=True)
+            if found.returncode == 0:
+                return Path(found.stdout.strip())
+    raise Failure("Blender as a module needs Python 3.11, which was not found. Install it and run this script again")
+
+
+def import_trouble(folder: Path, message: str) -> str:
+    """Say why an import failed; on Linux name every missing system library and how to get them."""
+    missing = set(re.findall(r"(\S+\.so[.\d]*): cannot open shared object file", message))
+    if shutil.which("ldd"):
+        for library in folder.glob("lib/python*/site-packages/bpy/__init__*.so"):
+            listing = subprocess.run(["ldd", library], capture_output=True, text=True).stdout
+            missing |= set(re.findall(r"(\S+) => not found", listing))
+    if not missing:
+        return f"{folder.name} does not work:\n{message.strip()}"
+    packages = sorted({APT_PACKAGES.get(name, name) for name in missing})
+    return (
+        f"Blender needs system libraries that are not installed: {', '.join(sorted(missing))}.\n"
+        f"On Debian or Ubuntu: sudo apt-get install -y --no-install-recommends {' '.join(packages)}"
+    )
+
+
+def run_env(args: argparse.Namespace) -> int:
+    """Make the environments that are missing or out of date."""
+    pythons = [ensure_blender(args.blender)] if args.blender else [ensure_engine(), ensure_blender()]
+    for python in pythons:
+        print(python)
+    return 0
+
+
+def run_system(args: argparse.Namespace) -> int:
+    """Print the Debian packages of the shared libraries in the table that cannot be loaded here."""
+    if sys.platform.startswith("linux"):
+        print(" ".join(package for library, package in APT_PACKAGES.items() if not loads(library)))
+    return 0
+
+
+def loads(library: str) -> bool:
+    """Whether the system's loader finds a shared library."""
+    try:
+        ctypes.CDLL(library)
+    except OSError:
+        return False
+    return True
+
+
+# Tests
+
+
+def run_test(args: argparse.Namespace) -> int:
+    """Run the chosen suites one after another and sum up what they report."""
+    suites = args.suites or SUITES
+    if unknown := sorted(set(suites) - set(SUITES)):
+        raise Failure(f"unknown suite {', '.join(unknown)}; there are {', '.join(SUITES)}")
+    engine = ensure_engine()
+    tally = Tally()
+    if "lint" in suites:
+        for tool in (["ruff", "check", "."], ["ruff", "format", "--check", "."], ["mypy"]):
+            tally.check(" ".join(tool), [engine, "-m", *tool])
+    if "engine" in suites:
+        tally.pytest("engine", engine, "tests/unit", "tests/engine")
+    if "blender" in suites:
+        tally.pytest(f"Blender {BLENDER}", ensure_blender(), "tests/blender")
+    if "floor" in suites:
+        tally.pytest(f"Blender {BLENDER_FLOOR}", ensure_blender(BLENDER_FLOOR), "tests/blender")
+    return tally.finish()
+
+
+class Tally:
+    """Counts over all suites; a suite that collects no test, dies or runs too long counts as a failure."""
+
+    def __init__(self) -> None:
+        self.passed = self.failed = self.skipped = 0
+        self.wrong: list[str] = []
+
+    def check(self, title: str, command: Sequence[str | Path]) -> None:
+        """Run a tool that only passes or fails."""
+        print(f"== {title}", flush=True)
+        if run(command, timeout=TEST_SECONDS):
+            self.wrong.append(title)
+
+    def pytest(self, title: str, python: Path, *folders: str) -> None:
+        """Run pytest on `folders` and add its counts."""
+        print(f"== tests: {title}", flush=True)
+        report = ROOT / "build" / f"tests-{re.sub(r'[^a-z0-9.]+', '-', title.lower())}.xml"
+        report.parent.mkdir(exist_ok=True)
+        report.unlink(missing_ok=True)
+        code = run([python, "-m", "pytest", "-q", f"--junitxml={report}", *folders], timeout=TEST_SECONDS)
+        counts = {"tests": 0, "failures": 0, "errors": 0, "skipped": 0}
+        if report.exists():
+            for suite in xml.parse(report).getroot().iter("testsuite"):
+                counts = {key: value + int(suite.get(key, 0)) for key, value in counts.items()}
+        failed = counts["failures"] + counts["errors"]
+        self.failed += failed
+        self.skipped += counts["skipped"]
+        self.passed += counts["tests"] - failed - counts["skipped"]
+        if code or not counts["tests"]:
+            self.wrong.append(title)
+
+    def finish(self) -> int:
+        """Print the summary line; 0 when everything passed."""
+        if self.wrong:
+            print(f"not passed: {', '.join(self.wrong)}")
+        print(f"{self.passed} passed, {self.failed} failed, {self.skipped} skipped", flush=True)
+        return 1 if self.wrong or self.failed else 0
+
+
+# Programs of the project
+
+
+def run_demo(args: argparse.Namespace) -> int:
+    """Render the demo with both environments."""
+    return with_both("examples/demo.py", args.rest)
+
+
+def run_bench(args: argparse.Namespace) -> int:
+    """Measure."""
+    return with_both("bench/run.py", args.rest)
+
+
+def run_extension(args: argparse.Namespace) -> int:
+    """Build the extension."""
+    return with_both("tools/extension.py", args.rest)
+
+
+def with_both(program: str, rest: Sequence[str]) -> int:
+    """Run a program of the project in the engine's environment, which is told where Blender's is."""
+    engine = ensure_engine()
+    os.environ.setdefault("DRGS_BLENDER", str(ensure_blender()))
+    return run([engine, ROOT / program, *rest])
+
+
+def run_clean(args: argparse.Namespace) -> int:
+    """Remove what can be made again."""
+    folders = [ROOT / name for name in ("build", "dist", "out", ".pytest_cache", ".ruff_cache", ".mypy_cache")]
+    if args.all:
+        folders += [*ROOT.glob(".venv*"), *ROOT.glob("*.egg-info")]
+    for folder in folders:
+        shutil.rmtree(folder, ignore_errors=True)
+    return 0
+
+
+def run(command: Sequence[str | Path], timeout: float | None = None) -> int:
+    """Run a command with DRGS_ENGINE set; on timeout or interrupt end it with all its children; its exit code."""
+    environment = os.environ | {"DRGS_ENGINE": str(python_of(ROOT / ".venv"))}
+    own_group = os.name != "nt"
+    process = subprocess.Popen([str(part) for part in command], cwd=ROOT, env=environment, start_new_session=own_group)
+    try:
+        return process.wait(timeout)
+    except subprocess.TimeoutExpired:
+        print(f"ended after {timeout:.0f} s: {command[0]}", file=sys.stderr)
+        return 124
+    finally:
+        if process.poll() is None:
+            if own_group:
+                os.killpg(process.pid, signal.SIGKILL)
+            else:
+                subprocess.run(["taskkill", "/F", "/T", "/PID", str(process.pid)], capture_output=True)
+            process.wait()
+
+
+if __name__ == "__main__":
+    sys.exit(main())
