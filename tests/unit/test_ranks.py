@@ -1,0 +1,138 @@
+"""Who imports whom: the rank table of docs/architecture.md, held against every import in the code."""
+
+from __future__ import annotations
+
+import ast
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGE = ROOT / "drgs_blender"
+#: What the extension may use of the engine's package.
+LIGHT_MODULES = ("engine.protocol", "engine.client")
+
+
+def rank_table() -> dict[str, int]:
+    """Package or module directly under drgs_blender -> its rank, read from the architecture page."""
+    rows = re.findall(r"^\| (\d) \| ([^|]+) \|", (ROOT / "docs/architecture.md").read_text(encoding="utf-8"), re.M)
+    return {name: int(rank) for rank, names in rows for name in re.findall(r"`(\w+)`", names)}
+
+
+RANKS = rank_table()
+
+
+def imports(path: Path, root: Path) -> Iterator[tuple[int, str, int]]:
+    """(line, absolute dotted module, level) of every import of a file, wherever in the file it stands."""
+    package = path.relative_to(root).with_suffix("").parts[:-1]
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                yield node.lineno, alias.name, 0
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else ()
+            stem = (*base, *((node.module or "").split(".") if node.module else ()))
+            for alias in node.names:
+                yield node.lineno, ".".join((*stem, alias.name)), node.level
+
+
+def sources(folder: Path) -> list[Path]:
+    return [path for path in sorted(folder.rglob("*.py")) if "__pycache__" not in path.parts]
+
+
+def top_level(path: Path) -> str:
+    return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+
+
+def test_every_module_has_a_rank():
+    assert {top_level(path) for path in sources(PACKAGE)} - {"__init__"} <= set(RANKS)
+
+
+def test_lower_ranks_never_import_higher_ones():
+    wrong = []
+    for path in sources(PACKAGE):
+        own = top_level(path)
+        rank = RANKS.get(own, 0)
+        for line, module, _ in imports(path, ROOT):
+            parts = module.split(".")
+            if parts[0] != "drgs_blender" or len(parts) < 2 or parts[1] not in RANKS:
+                continue
+            other = RANKS[parts[1]]
+            sideways = other == rank and rank >= 2 and parts[1] != own
+            if other > rank or sideways:
+                wrong.append(f"{path.relative_to(ROOT)}:{line} (rank {rank}) imports {module} (rank {other})")
+    assert not wrong, "\n".join(wrong)
+
+
+def test_the_engine_never_imports_blender():
+    wrong = [
+        f"{path.relative_to(ROOT)}:{line} imports {module}"
+        for path in sources(PACKAGE)
+        if path.name != "blender_job.py"  # the one script of the package that runs inside Blender
+        for line, module, _ in imports(path, ROOT)
+        if module.split(".")[0] in ("bpy", "mathutils", "bl_ext", "addon_utils")
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
+def light_sources() -> list[Path]:
+    """Files that run in Blender's Python: rank 0 and the two light modules of the engine."""
+    files = [path for path in sources(PACKAGE) if RANKS.get(top_level(path), 0) == 0]
+    files += [PACKAGE / (module.replace(".", "/") + ".py") for module in LIGHT_MODULES]
+    return [path for path in files if path.exists()]
+
+
+def test_rank_zero_needs_numpy_alone():
+    allowed = {"numpy", "drgs_blender", *sys.stdlib_module_names}
+    wrong = [
+        f"{path.relative_to(ROOT)}:{line} imports {module}"
+        for path in light_sources()
+        for line, module, _ in imports(path, ROOT)
+        if module.split(".")[0] not in allowed
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_rank_zero_imports_are_relative():
+    """Inside Blender the package is called bl_ext.<repository>.<id>.drgs_blender."""
+    wrong = [
+        f"{path.relative_to(ROOT)}:{line} imports {module}"
+        for path in light_sources()
+        for line, module, level in imports(path, ROOT)
+        if module.split(".")[0] == "drgs_blender" and level == 0
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.parametrize("folder", ["addon", "operators"])
+def test_extension_uses_only_the_light_part_by_relative_import(folder):
+    light = tuple(name for name, rank in RANKS.items() if rank == 0)
+    wrong = []
+    for path in sources(ROOT / folder):
+        for line, module, level in imports(path, ROOT):
+            where = f"{path.relative_to(ROOT)}:{line} imports {module}"
+            parts = module.split(".")
+            if parts[0] in ("drgs_blender", "addon", "operators"):
+                if level == 0:
+                    wrong.append(f"{where} absolutely")
+                inside = ".".join(parts[1:])
+                is_light = inside in ("", "__version__") or parts[1] in light or inside.startswith(LIGHT_MODULES)
+                if parts[0] == "drgs_blender" and not is_light:
+                    wrong.append(f"{where}, which needs more than numpy")
+            elif parts[0] in ("numba", "torch", "embreex", "OpenEXR", "scipy", "trimesh", "igl", "PIL", "tqdm"):
+                wrong.append(f"{where}, which Blender does not have")
+    assert not wrong, "\n".join(wrong)
+
+
+def test_addon_never_imports_operators_except_to_register_them():
+    wrong = [
+        f"{path.relative_to(ROOT)}:{line} imports {module}"
+        for path in sources(ROOT / "addon")
+        if path.name not in ("__init__.py", "registration.py", "register.py")
+        for line, module, _ in imports(path, ROOT)
+        if module.split(".")[0] == "operators"
+    ]
+    assert not wrong, "\n".join(wrong)
