@@ -44,9 +44,7 @@ def write_section(name: str, title: str, command: str, body: str) -> None:
     """Replace section `name` of docs/benchmarks.md (or append it) and print it."""
     text = DOCUMENT.read_text() if DOCUMENT.exists() else HEADER
     begin, end = f"<!-- begin {name} -->", f"<!-- end {name} -->"
-    section = (
-        f"{begin}\n## {title}\n\n{body.strip()}\n\n`{command}` · {date.today().isoformat()} · {machine()}\n{end}"
-    )
+    section = f"{begin}\n## {title}\n\n{body.strip()}\n\n`{command}` · {date.today().isoformat()} · {machine()}\n{end}"
     pattern = re.compile(re.escape(begin) + ".*?" + re.escape(end), re.DOTALL)
     if pattern.search(text):
         text = pattern.sub(lambda _: section, text)

@@ -1,0 +1,41 @@
+"""Render a picture with our engine, in process, through the same session the engine process uses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from drgs_blender.cli.camera_file import parse_camera
+from drgs_blender.engine.session import Session
+from drgs_blender.formats.registry import read_environment
+
+from drgs_blender.frame import Frame, ObjectState, RenderSettings, World, split_rays
+
+#: One session for a whole program, so that kernels and assets are loaded once.
+SESSION = Session()
+
+
+def relight(
+    asset: Path,
+    environment: Path,
+    camera: dict[str, Any],
+    *,
+    rays: int,
+    vertices: np.ndarray | None = None,
+    passes: tuple[str, ...] = ("Combined",),
+    **settings: Any,
+) -> dict[str, np.ndarray]:
+    """Passes of one object under one HDRI; `settings` are fields of RenderSettings."""
+    cosine, ggx, light = split_rays(rays)
+    key = SESSION.load_asset(asset)
+    frame = Frame(
+        number=1,
+        camera=parse_camera(camera),
+        objects=[ObjectState("subject", key, vertices=vertices)],
+        world=World(environment=read_environment(environment).radiance),
+        settings=RenderSettings(cosine=cosine, ggx=ggx, environment=light, film_transparent=True, **settings),
+        passes=passes,
+    )
+    result = SESSION.render(frame)
+    return result.passes if hasattr(result, "passes") else result

@@ -1,0 +1,56 @@
+"""The objects the benchmarks look at: real meshes of examples/, with materials from matte to polished."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from drgs_blender.build.make import make_asset
+from report import OUT, ROOT
+
+from drgs_blender.asset import Asset, Mesh
+from drgs_blender.asset.container import read_asset, write_asset
+
+SOURCES = {
+    "spot": "spot/spot_triangulated.obj",
+    "cat": "cat/egyptian_cat.glb",
+    "robot": "robot/RobotExpressive.glb",
+    "helmet": "helmet/FlightHelmet.gltf",
+}
+
+
+def asset_path(name: str) -> Path:
+    """`.drgs` of an example as `drgs make` builds it, made once."""
+    path = OUT / f"{name}.drgs"
+    if not path.exists():
+        OUT.mkdir(parents=True, exist_ok=True)
+        made = make_asset(ROOT / "examples" / SOURCES[name])
+        write_asset(path, made[0] if isinstance(made, tuple) else made)
+    return path
+
+
+def spread_materials(mesh: Mesh) -> dict[str, np.ndarray]:
+    """Arrays of `mesh` with roughness .1 to .9 from bottom to top and metallic 0 to 1 around the vertical axis."""
+    v = mesh.vertices
+    low, high = v.min(0), v.max(0)
+    height = (v[:, 2] - low[2]) / max(float(high[2] - low[2]), 1e-6)
+    angle = np.arctan2(v[:, 1] - (low[1] + high[1]) / 2, v[:, 0] - (low[0] + high[0]) / 2)
+    return {
+        "vertices": v,
+        "faces": mesh.faces,
+        "albedo": np.clip(mesh.albedo, 0.05, 0.95),
+        "roughness": (0.1 + 0.8 * height).astype(np.float32),
+        "metallic": (0.5 + 0.5 * np.sin(3 * angle)).astype(np.float32),
+    }
+
+
+def spread_asset(name: str) -> tuple[Path, Path]:
+    """(.drgs, .npz) of an example with spread materials, for our engine and for Cycles."""
+    drgs, npz = OUT / f"{name}-spread.drgs", OUT / f"{name}-spread.npz"
+    if not (drgs.exists() and npz.exists()):
+        asset = read_asset(asset_path(name))
+        data = spread_materials(asset.mesh)
+        mesh = Mesh(**data)
+        write_asset(drgs, Asset(asset.surfels, mesh, asset.binding, None, {"source": name}))
+        np.savez(npz, **data)
+    return drgs, npz
