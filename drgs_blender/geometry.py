@@ -100,3 +100,45 @@ def _gather_normals(
             normals[v, 0], normals[v, 1], normals[v, 2] = x / length, y / length, z / length
         else:
             normals[v, 0], normals[v, 1], normals[v, 2] = 0.0, 0.0, 1.0
+
+
+def unit(vectors: Array, fallback: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> Array:
+    """Normalise (..., 3) vectors, keeping their dtype; those without a direction become `fallback`."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    proper = np.isfinite(length) & (length > 1e-30)
+    return np.where(proper, vectors / np.where(proper, length, 1), np.asarray(fallback, vectors.dtype))
+
+
+def rotation_matrices(quaternions: Array) -> Array:
+    """(n, 4) unit quaternions wxyz -> (n, 3, 3) rotation matrices of the same dtype; columns are the rotated axes."""
+    w, x, y, z = np.moveaxis(quaternions, -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, -1) for row in rows], -2)
+
+
+def quaternions(matrices: Array) -> Array:
+    """(n, 3, 3) rotation matrices -> (n, 4) unit quaternions wxyz with w >= 0, of the same dtype.
+
+    Of the four rows of 4 q q^T the one with the largest diagonal is normalised, which never divides by a small number.
+    """
+    m = np.moveaxis(matrices, (-2, -1), (0, 1))
+    trace = m[0, 0] + m[1, 1] + m[2, 2]
+    diagonal = np.stack([1 + trace] + [1 - trace + 2 * m[k, k] for k in range(3)], -1)
+    wx, wy, wz = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
+    xy, xz, yz = m[0, 1] + m[1, 0], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1]
+    rows = np.stack(
+        [
+            np.stack([diagonal[..., 0], wx, wy, wz], -1),
+            np.stack([wx, diagonal[..., 1], xy, xz], -1),
+            np.stack([wy, xy, diagonal[..., 2], yz], -1),
+            np.stack([wz, xz, yz, diagonal[..., 3]], -1),
+        ],
+        -2,
+    )
+    best = np.take_along_axis(rows, np.argmax(diagonal, -1)[..., None, None], -2)[..., 0, :]
+    best = best / np.linalg.norm(best, axis=-1, keepdims=True)
+    return np.where(best[..., :1] < 0, -best, best)
