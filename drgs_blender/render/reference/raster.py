@@ -1,0 +1,177 @@
+"""Surfels to a G-buffer in torch: every surfel against every pixel, differentiable in all of a surfel's parameters.
+
+The ray of a pixel meets the plane of a surfel at centre + u tangent_u + v tangent_v, where the Gaussian is
+exp(-(u^2 + v^2) / 2) (Huang et al. 2024, "2D Gaussian Splatting", with the intersection solved for tangents of any
+length and angle). A screen-space Gaussian around the projected centre keeps surfels that are small or seen edge-on
+from vanishing between pixels. Contributions are blended front to back.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...asset.model import PosedSurfels
+from ...frame import Camera
+from .brdf import dot, normalise
+
+#: Variance of the screen-space filter, square pixels.
+FILTER_VARIANCE = 0.5
+#: Fainter contributions are skipped; none is stronger than the second.
+MIN_ALPHA, MAX_ALPHA = 1 / 255, 0.99
+#: Blending stops once no more than this part of the background is left.
+MIN_TRANSMITTANCE = 1e-4
+#: Sine of the angle between ray and plane below which the intersection is not used.
+MIN_SINE = 1e-6
+
+
+@dataclass
+class Splats:
+    """The tensors of PosedSurfels: world space, tangents scaled, see there."""
+
+    centre: Tensor
+    tangent_u: Tensor
+    tangent_v: Tensor
+    normal: Tensor
+    opacity: Tensor
+    albedo: Tensor
+    roughness: Tensor
+    metallic: Tensor
+
+    @classmethod
+    def from_posed(cls, posed: PosedSurfels, dtype: torch.dtype = torch.float64, device: str = "cpu") -> Splats:
+        """Copy of `posed` as tensors."""
+        values = {
+            f.name: torch.as_tensor(np.asarray(getattr(posed, f.name)), dtype=dtype, device=device) for f in fields(cls)
+        }
+        return cls(**values)
+
+
+@dataclass
+class ReferenceGBuffer:
+    """One row a pixel position. Empty pixels have coverage 0 and zeros elsewhere.
+
+    Attributes
+    ----------
+    coverage : (p,) 1 - prod(1 - alpha_i)
+    depth : (p,) metres along the view axis, mean of the contributions by weight
+    position : (p, 3) world: the point of the pixel's ray at that depth
+    normal : (p, 3) unit, world, facing the viewer
+    albedo, roughness, metallic : (p, 3), (p,), (p,): means by weight
+    """
+
+    coverage: Tensor
+    depth: Tensor
+    position: Tensor
+    normal: Tensor
+    albedo: Tensor
+    roughness: Tensor
+    metallic: Tensor
+
+
+def pixel_centres(camera: Camera, dtype: torch.dtype = torch.float64, device: str = "cpu") -> Tensor:
+    """(h * w, 2) positions of the centres of the pixels in the camera's window, row by row."""
+    x0, y0, x1, y1 = camera.window
+    x = torch.arange(x0, x1, dtype=dtype, device=device) + 0.5
+    y = torch.arange(y0, y1, dtype=dtype, device=device) + 0.5
+    return torch.stack(torch.meshgrid(x, y, indexing="xy"), -1).reshape(-1, 2)
+
+
+def camera_rays(camera: Camera, position: Tensor) -> tuple[Tensor, Tensor]:
+    """World-space rays of pixel positions (p, 2): origins and directions (p, 3); a direction has unit depth."""
+    matrix = torch.as_tensor(np.asarray(camera.matrix_world), dtype=position.dtype, device=position.device)
+    x = (position[:, 0] - camera.cx) / camera.fx
+    y = -(position[:, 1] - camera.cy) / camera.fy
+    zero, minus = torch.zeros_like(x), -torch.ones_like(x)
+    start = torch.stack([x, y, zero], -1) if camera.orthographic else torch.stack([zero, zero, zero], -1)
+    along = torch.stack([zero, zero, minus], -1) if camera.orthographic else torch.stack([x, y, minus], -1)
+    return start @ matrix[:3, :3].T + matrix[:3, 3], along @ matrix[:3, :3].T
+
+
+def project(camera: Camera, point: Tensor) -> tuple[Tensor, Tensor]:
+    """Pixel position (n, 2) and view depth (n,) of world points (n, 3)."""
+    matrix = torch.as_tensor(np.asarray(camera.matrix_world), dtype=point.dtype, device=point.device)
+    x, y, z = ((point - matrix[:3, 3]) @ matrix[:3, :3]).unbind(-1)
+    depth = -z
+    scale = torch.ones_like(depth) if camera.orthographic else torch.where(depth == 0, torch.ones_like(depth), depth)
+    return torch.stack([camera.cx + camera.fx * x / scale, camera.cy - camera.fy * y / scale], -1), depth
+
+
+def intersect(splats: Splats, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Squared Gaussian radius u^2 + v^2, ray parameter and validity (p, n) of each ray in each surfel's plane."""
+    across = torch.linalg.cross(splats.tangent_u, splats.tangent_v)
+    area = torch.linalg.vector_norm(across, dim=-1)
+    slope = direction @ across.T
+    length = torch.linalg.vector_norm(direction, dim=-1)
+    valid = slope.abs() > MIN_SINE * area * length[:, None]
+    towards = splats.centre[None] - origin[:, None]
+    t = (towards * across).sum(-1) / torch.where(valid, slope, torch.ones_like(slope))
+    offset = t.unsqueeze(-1) * direction[:, None] - towards
+    # Dual basis of the tangents in their plane: u = offset . dual_u, v = offset . dual_v.
+    dual_u = torch.linalg.cross(splats.tangent_v, across) / (area**2).unsqueeze(-1)
+    dual_v = torch.linalg.cross(across, splats.tangent_u) / (area**2).unsqueeze(-1)
+    return dot(offset, dual_u) ** 2 + dot(offset, dual_v) ** 2, t, valid
+
+
+def rasterise(splats: Splats, camera: Camera, position: Tensor | None = None, chunk: int = 1 << 21) -> ReferenceGBuffer:
+    """G-buffer of surfels at pixel positions.
+
+    Contribution i has the strength a_i = opacity_i max(G_3d, G_2d), at most `MAX_ALPHA`, skipped below `MIN_ALPHA`.
+    Its depth is that of the ray's intersection where G_3d is the larger, else that of the centre. Sorted by depth,
+    T_i = prod_{j<i} (1 - a_j) and the weights of the means are T_i a_i / sum. A contribution counts while T_i is at
+    least `MIN_TRANSMITTANCE`.
+
+    Parameters
+    ----------
+    position : (p, 2) pixel positions; the pixel centres of the camera's window by default
+    chunk : surfel-pixel pairs held at once
+    """
+    if position is None:
+        position = pixel_centres(camera, splats.centre.dtype, str(splats.centre.device))
+    step = max(1, chunk // max(1, len(splats.centre)))
+    parts = [_blend(splats, camera, p) for p in position.split(step)]
+    return ReferenceGBuffer(
+        **{f.name: torch.cat([getattr(p, f.name) for p in parts]) for f in fields(ReferenceGBuffer)}
+    )
+
+
+def _blend(splats: Splats, camera: Camera, position: Tensor) -> ReferenceGBuffer:
+    origin, direction = camera_rays(camera, position)
+    radius2, t, valid = intersect(splats, origin, direction)
+    in_range = (t >= camera.clip_start) & (t <= camera.clip_end)
+    inside = torch.exp(-0.5 * torch.where(valid & in_range, radius2, torch.inf))
+    centre, centre_depth = project(camera, splats.centre)
+    distance2 = ((position[:, None] - centre) ** 2).sum(-1)
+    seen = (centre_depth >= camera.clip_start) & (centre_depth <= camera.clip_end)
+    around = torch.exp(-0.5 / FILTER_VARIANCE * torch.where(seen, distance2, torch.inf))
+
+    depth = torch.where(inside >= around, t, centre_depth.expand_as(t))
+    alpha = (splats.opacity * torch.maximum(inside, around)).clamp(max=MAX_ALPHA)
+    alpha = torch.where(alpha >= MIN_ALPHA, alpha, torch.zeros_like(alpha))
+    order = torch.argsort(depth.detach(), dim=1, stable=True)
+    alpha, depth = alpha.gather(1, order), depth.gather(1, order)
+    left = torch.cumprod(1 - alpha, 1)
+    before = torch.cat([torch.ones_like(left[:, :1]), left[:, :-1]], 1)
+    alpha = torch.where(before.detach() >= MIN_TRANSMITTANCE, alpha, torch.zeros_like(alpha))
+    weight = before * alpha
+    coverage = weight.sum(1)
+    weight = weight / torch.where(coverage > 0, coverage, torch.ones_like(coverage)).unsqueeze(1)
+
+    side = torch.where(direction @ splats.normal.T > 0, -1.0, 1.0).to(direction.dtype)
+    normal = (weight.unsqueeze(-1) * side.gather(1, order).unsqueeze(-1) * splats.normal[order]).sum(1)
+    mean_depth = (weight * torch.where(weight > 0, depth, torch.zeros_like(depth))).sum(1)
+    covered = (coverage > 0).unsqueeze(-1)
+    upright = normalise(torch.where(covered, normal, torch.ones_like(normal)))
+    position_ = origin + mean_depth.unsqueeze(-1) * direction
+    return ReferenceGBuffer(
+        coverage=coverage,
+        depth=mean_depth,
+        position=torch.where(covered, position_, torch.zeros_like(position_)),
+        normal=torch.where(covered, upright, torch.zeros_like(upright)),
+        albedo=(weight.unsqueeze(-1) * splats.albedo[order]).sum(1),
+        roughness=(weight * splats.roughness[order]).sum(1),
+        metallic=(weight * splats.metallic[order]).sum(1),
+    )
