@@ -194,7 +194,7 @@ def check_asset(asset: Asset, subject: str, values: bool = True) -> None:
         if binding.face.shape != (len(surfels),):
             raise AssetError(
                 f"{subject}, binding",
-                f"has face numbers of shape {binding.face.shape}, not one for each of {len(surfels)} surfels",
+                f"has face shape {binding.face.shape} for {len(surfels)} surfels",
             )
         _check_indices(binding.face, len(mesh.faces), f"{subject}, binding face", "faces")
     if values:
