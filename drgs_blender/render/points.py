@@ -1,0 +1,81 @@
+"""What goes into the integrator and what comes out: compacted visible points and the light they send to the camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from ..asset.model import as_float
+
+Array = np.ndarray
+
+#: Order of ``Radiance.components`` along its second axis.
+DIFFUSE_DIRECT, DIFFUSE_INDIRECT, GLOSSY_DIRECT, GLOSSY_INDIRECT = range(4)
+
+_WIDTHS = {
+    "weight": (), "origin": (3,), "normal": (3,), "geometric_normal": (3,), "view": (3,),
+    "albedo": (3,), "roughness": (), "metallic": (),
+}  # fmt: skip
+
+
+@dataclass(slots=True)
+class ShadingPoints:
+    """The visible surface points of a strip of the picture, structure of arrays, world space.
+
+    Attributes
+    ----------
+    pixel : (n,) int32: y * camera.width + x in the full picture; seeds the random numbers
+    sample : (n,) int32: sub-pixel sample, 0 .. aa - 1; a pair (pixel, sample) may occur once
+    weight : (n,) float32: alpha / aa, what the point contributes to its pixel
+    origin : (n, 3) float32 metres: on the traced mesh, where secondary rays start
+    normal : (n, 3) float32 unit: shading normal, faces the viewer
+    geometric_normal : (n, 3) float32 unit: of the traced mesh at ``origin``, faces the viewer
+    view : (n, 3) float32 unit: towards the camera
+    albedo, roughness, metallic : (n, 3), (n,), (n,) float32 in [0, 1]; linear Rec.709
+    """
+
+    pixel: Array
+    sample: Array
+    weight: Array
+    origin: Array
+    normal: Array
+    geometric_normal: Array
+    view: Array
+    albedo: Array
+    roughness: Array
+    metallic: Array
+
+    def __post_init__(self) -> None:
+        self.pixel = np.ascontiguousarray(self.pixel, np.int32)
+        self.sample = np.ascontiguousarray(self.sample, np.int32)
+        n = len(self.pixel)
+        for name, width in _WIDTHS.items():
+            setattr(self, name, as_float(getattr(self, name), (n, *width), f"shading point {name}"))
+
+    def __len__(self) -> int:
+        return len(self.pixel)
+
+    def __getitem__(self, rows: slice | Array) -> ShadingPoints:
+        """Return the points that `rows` (slice, mask or indices) selects."""
+        return ShadingPoints(*(getattr(self, f.name)[rows] for f in fields(self)))
+
+
+@dataclass(slots=True)
+class Radiance:
+    """Light that leaves each shading point towards the camera.
+
+    Attributes
+    ----------
+    components : (n, 4, 3) float32 linear Rec.709: diffuse direct, diffuse indirect, glossy direct, glossy indirect;
+        surface colour included; their sum is the point's radiance. Not yet multiplied by ``ShadingPoints.weight``
+    variance : (n, 2) float32: estimated variance of the luminance of the diffuse and of the glossy sum
+    """
+
+    components: Array
+    variance: Array
+
+    @property
+    def total(self) -> Array:
+        """(n, 3) float32: the sum of the four components."""
+        return self.components.sum(axis=1)
