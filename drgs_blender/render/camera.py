@@ -1,0 +1,156 @@
+"""Camera rays and the sub-pixel positions they go through.
+
+Both primary stages (surfels and mesh) look through the same positions, so their pictures can be compared pixel by
+pixel. The positions of a pixel are a rank-1 lattice (k / n, k * golden ratio), shifted on the torus by a hash of
+(seed, frame, pixel): evenly spread for every n, uniform one by one, hence an unbiased box filter of one pixel.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from ..errors import UsageError
+from ..frame import Camera, RenderSettings
+from ..jit import njit
+
+Array = np.ndarray
+
+#: Offsets into the array of `camera_parameters`.
+POSITION, FX, FY, CX, CY, ORTHOGRAPHIC, CLIP_START, CLIP_END, WIDTH, SEED, AA, PARAMETERS = (
+    *(9, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21, 22),
+)
+_GOLDEN = 0.6180339887498949
+
+
+def check_camera(camera: Camera) -> None:
+    """Raise UsageError when no picture can be taken through `camera`."""
+
+    def refuse(problem: str, remedy: str) -> None:
+        raise UsageError("camera", problem, remedy)
+
+    matrix = np.asarray(camera.matrix_world, dtype=np.float64)
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        refuse("its matrix is not a finite 4 x 4 matrix", "Check the camera's transform and its drivers")
+    rotation = matrix[:3, :3]
+    if np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-3:
+        refuse("its matrix scales or shears", "Apply the scale of the camera and of its parents")
+    if camera.width < 1 or camera.height < 1:
+        refuse(f"the picture has {camera.width} x {camera.height} pixels", "Choose a resolution of at least one pixel")
+    if max(camera.width, camera.height) > 65536 or camera.width * camera.height > 2**31 - 1:
+        refuse(f"the picture has {camera.width} x {camera.height} pixels", "Render it in several parts")
+    intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
+    if not np.isfinite(intrinsics).all() or camera.fx <= 0 or camera.fy <= 0:
+        refuse(
+            f"its focal lengths are {camera.fx:g} and {camera.fy:g} pixels",
+            "Check focal length, sensor size, orthographic scale and pixel aspect",
+        )
+    if not (math.isfinite(camera.clip_start) and camera.clip_end > camera.clip_start):
+        refuse(f"it clips from {camera.clip_start:g} to {camera.clip_end:g}", "Let the clip end exceed the clip start")
+    if camera.clip_start <= 0 and not camera.orthographic:
+        refuse(f"its clip start is {camera.clip_start:g}", "Choose a clip start above zero")
+    x0, y0, x1, y1 = camera.window
+    if not (0 <= x0 < x1 <= camera.width and 0 <= y0 < y1 <= camera.height):
+        refuse(f"the region {camera.window} is empty or leaves the picture", "Clear or redraw the render region")
+
+
+def camera_parameters(camera: Camera, settings: RenderSettings, frame_number: int) -> Array:
+    """Flatten the camera, sub-pixel count and seed for kernels.
+
+    Returns
+    -------
+    (PARAMETERS,) float64: the camera-to-world rotation (row-major), then the fields named by this module's offsets.
+
+    Raises
+    ------
+    UsageError: the camera cannot take a picture, or ``settings.aa`` is below one.
+    """
+    check_camera(camera)
+    if settings.aa < 1:
+        raise UsageError("sub-pixel samples", f"are {settings.aa}", "Choose at least one")
+    matrix = np.asarray(camera.matrix_world, dtype=np.float64)
+    out = np.empty(PARAMETERS)
+    out[:9] = matrix[:3, :3].ravel()
+    out[POSITION : POSITION + 3] = matrix[:3, 3]
+    out[FX], out[FY], out[CX], out[CY] = camera.fx, camera.fy, camera.cx, camera.cy
+    out[ORTHOGRAPHIC] = camera.orthographic
+    out[CLIP_START], out[CLIP_END], out[WIDTH] = camera.clip_start, camera.clip_end, camera.width
+    out[SEED] = _mix_host((settings.seed & 0xFFFFFFFF) ^ _mix_host(frame_number & 0xFFFFFFFF))
+    out[AA] = settings.aa
+    return out
+
+
+def _mix_host(x: int) -> int:
+    """`_mix` on Python integers."""
+    x = ((x ^ (x >> 16)) * 0x7FEB352D) & 0xFFFFFFFF
+    x = ((x ^ (x >> 15)) * 0x846CA68B) & 0xFFFFFFFF
+    return x ^ (x >> 16)
+
+
+@njit(inline="always")
+def _mix(x: Any) -> Any:
+    """Wellons' `lowbias32`, a hash of 32 bits with low avalanche bias."""
+    x = np.uint32(x)
+    x = np.uint32((x ^ (x >> np.uint32(16))) * np.uint32(0x7FEB352D))
+    x = np.uint32((x ^ (x >> np.uint32(15))) * np.uint32(0x846CA68B))
+    return np.uint32(x ^ (x >> np.uint32(16)))
+
+
+@njit
+def pixel_shift(parameters: Any, pixel: Any) -> Any:
+    """Toroidal shift (x, y) in [0, 1) of the sub-pixel lattice of `pixel` (index y * width + x)."""
+    h = _mix(np.uint32(pixel) ^ np.uint32(np.int64(parameters[SEED])))
+    g = _mix(h ^ np.uint32(0x9E3779B9))
+    return np.float64(h) * 2.0**-32, np.float64(g) * 2.0**-32
+
+
+@njit(inline="always")
+def lattice(shift_x: Any, shift_y: Any, sample: Any, aa: Any) -> Any:
+    """Position of sub-pixel sample number `sample` of `aa` inside its pixel, both in [0, 1)."""
+    x = shift_x + sample / aa
+    y = shift_y + sample * _GOLDEN
+    # Just below one, so that adding the pixel's index in float32 stays inside the pixel for pictures of 65536 pixels.
+    return min(x - math.floor(x), 0.995), min(y - math.floor(y), 0.995)
+
+
+@njit
+def camera_ray(parameters: Any, px: Any, py: Any) -> Any:
+    """World-space ray through pixel position (px, py).
+
+    Returns
+    -------
+    (ox, oy, oz, dx, dy, dz): float64; the direction has length 1 along the view axis, so that the ray's parameter is
+    the depth.
+    """
+    p = parameters
+    x = (px - p[CX]) / p[FX]
+    y = -(py - p[CY]) / p[FY]
+    ox, oy, oz = p[POSITION], p[POSITION + 1], p[POSITION + 2]
+    if p[ORTHOGRAPHIC] != 0.0:
+        return (
+            ox + p[0] * x + p[1] * y,
+            oy + p[3] * x + p[4] * y,
+            oz + p[6] * x + p[7] * y,
+            -p[2],
+            -p[5],
+            -p[8],
+        )
+    return (
+        ox,
+        oy,
+        oz,
+        p[0] * x + p[1] * y - p[2],
+        p[3] * x + p[4] * y - p[5],
+        p[6] * x + p[7] * y - p[8],
+    )
+
+
+@njit
+def sample_ray(parameters: Any, pixel: Any, sample: Any) -> Any:
+    """`camera_ray` through sub-pixel sample `sample` of `pixel` (index y * width + x)."""
+    width = np.int64(parameters[WIDTH])
+    shift_x, shift_y = pixel_shift(parameters, pixel)
+    jx, jy = lattice(shift_x, shift_y, sample, parameters[AA])
+    return camera_ray(parameters, pixel % width + jx, pixel // width + jy)
