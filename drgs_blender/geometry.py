@@ -79,7 +79,7 @@ def _gather_normals(
         nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
         twice_area = math.sqrt(nx * nx + ny * ny + nz * nz)
         uu, vv, uv = ux * ux + uy * uy + uz * uz, vx * vx + vy * vy + vz * vz, ux * vx + uy * vy + uz * vz
-        proper = twice_area > 1e-10 * (uu + vv) and math.isfinite(twice_area)
+        proper = 1e-10 * (uu + vv) < twice_area < 1e30  # false for NaN
         inverse = 1.0 / twice_area if proper else 0.0
         for k in range(3):
             cosine = uv if k == 0 else (uu - uv if k == 1 else vv - uv)

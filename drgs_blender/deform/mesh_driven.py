@@ -1,0 +1,281 @@
+"""Mesh-driven deformation: surfels follow the faces they hang on, exactly.
+
+A face and its unit normal span space, so the deformation gradient of a face is F = [e1' e2' n'] [e1 e2 n]^-1 and the
+scaled tangents become T' = F T. With C = [e1 e2 n]^-1 T precomputed, a frame costs three vertices, one normal and a
+3x3 by 3x2 product a surfel. Rotations are never blended: F comes from the face, and the shading normal from smooth
+vertex normals.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from ..asset.model import MATERIAL_CHANNELS, Binding, Mesh, PosedSurfels, Surfels
+from ..errors import AssetError
+from ..geometry import VertexNormals, rotation_matrices
+from ..jit import njit, prange
+from .faces import Faces
+
+Array = np.ndarray
+log = logging.getLogger(__name__)
+
+
+class MeshDriven:
+    """Poses bound surfels from the vertices of each frame.
+
+    Parameters
+    ----------
+    mesh, surfels, binding : the asset at rest, object space
+
+    Attributes
+    ----------
+    degenerate_faces : int
+        Faces without area at rest. Their surfels keep their shape in the smooth shading frame and scale with the
+        face's edges, since such a face has no deformation gradient.
+    lost : int
+        Surfels of the last pose whose face had a vertex that was not finite; they are transparent.
+    """
+
+    def __init__(self, mesh: Mesh, surfels: Surfels, binding: Binding) -> None:
+        if len(binding.face) != len(surfels):
+            raise AssetError(
+                "binding", f"is of {len(binding.face)} surfels but there are {len(surfels)}", "Bind the surfels again"
+            )
+        if len(binding.face) and (binding.face.min() < 0 or binding.face.max() >= len(mesh.faces)):
+            raise AssetError(
+                "binding", f"refers to a face that the mesh of {len(mesh.faces)} faces lacks", "Bind the surfels again"
+            )
+        self.mesh, self.surfels, self.binding = mesh, surfels, binding
+        self.normals = VertexNormals(mesh.faces, len(mesh.vertices))
+        faces = Faces.of(mesh.vertices, mesh.faces)
+        self.degenerate_faces = int(faces.degenerate.sum())
+        self.lost = 0
+        face, corners = binding.face, faces.corners
+        self._offset = (binding.offset * faces.mean_edge[face]).astype(np.float32)
+        self._rest_edge = np.where(faces.degenerate, faces.mean_edge, 0).astype(np.float32)  # 0: a proper face
+
+        tangents = rotation_matrices(surfels.rotation.astype(np.float64))[..., :2] * surfels.scale[:, None, :]
+        basis = np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], faces.normal], -1)
+        if self.degenerate_faces:
+            log.warning("mesh: %d faces have no area at rest", self.degenerate_faces)
+            smooth = self.normals(mesh.vertices).astype(np.float64)[mesh.faces].mean(axis=1)
+            for f in np.flatnonzero(faces.degenerate):
+                frame = _tangent_frame(*basis[f, :, 0].tolist(), *basis[f, :, 1].tolist(), *smooth[f].tolist())
+                basis[f] = np.reshape(frame, (3, 3)).T
+        self._coordinates = np.ascontiguousarray(np.linalg.inv(basis)[face] @ tangents, dtype=np.float32)
+
+    def pose(
+        self,
+        vertices_world: Array,
+        corner_normals_world: Array | None = None,
+        materials: Mapping[str, Array | None] | None = None,
+        *,
+        matrix_world: Array | None = None,
+        object_index: int = 0,
+    ) -> PosedSurfels:
+        """Surfels of one frame.
+
+        Parameters
+        ----------
+        vertices_world : (n, 3) float32, world space: the posed mesh
+        corner_normals_world : (m, 3, 3) float32 unit normals of the face corners, pointing out of the object in the
+            world (as they appear, mirrored or not); None computes smooth angle-weighted ones
+        materials : "albedo" (n, 3), "roughness" (n,), "metallic" (n,) of the vertices in this frame; None or absent
+            keeps the asset's. A surfel keeps its own value as far as its face's vertices are unchanged and takes the
+            new value in proportion to the weights of the changed ones.
+        matrix_world : (4, 4) object-to-world that `vertices_world` contain. Needed where it mirrors or scales: it
+            says which side of a face is out, and scales what stands off the surface. None is rigid.
+        object_index : index into Frame.objects, copied to every surfel
+
+        Returns
+        -------
+        PosedSurfels
+            Always finite. A collapsed face yields flat or vanishing tangents and a finite normal.
+        """
+        vertices = np.ascontiguousarray(vertices_world, dtype=np.float32)
+        if vertices.shape != self.mesh.vertices.shape:
+            raise AssetError(
+                "mesh", f"has {len(vertices)} vertices but was bound with {len(self.mesh.vertices)}", "Bind it again"
+            )
+        linear = np.eye(3) if matrix_world is None else np.asarray(matrix_world, np.float64)[:3, :3]
+        side = -1.0 if np.linalg.det(linear) < 0 else 1.0
+        by_corner = corner_normals_world is not None
+        if corner_normals_world is None:
+            normals = self.normals(vertices)
+            if side < 0:
+                normals = -normals
+        else:
+            normals = np.ascontiguousarray(corner_normals_world, dtype=np.float32).reshape(-1, 3)
+            if len(normals) != 3 * len(self.mesh.faces):
+                raise AssetError("corner normals", f"are {len(normals)}, expected {3 * len(self.mesh.faces)}")
+
+        n = len(self.surfels)
+        centre, tangent_u, tangent_v, normal = (np.empty((n, 3), np.float32) for _ in range(4))
+        opacity = self.surfels.opacity.copy()
+        binding = self.binding
+        _pose(
+            vertices, self.mesh.faces, normals, by_corner, linear, side,
+            binding.face, binding.barycentric, self._offset, self._rest_edge, binding.normal, self._coordinates,
+            centre, tangent_u, tangent_v, normal, opacity,
+        )  # fmt: skip
+        self.lost = int(np.count_nonzero(opacity != self.surfels.opacity))
+        if self.lost:
+            log.warning("%d surfels hang on vertices that are not finite; they are hidden", self.lost)
+        channels = {name: self._channel(name, (materials or {}).get(name)) for name in MATERIAL_CHANNELS}
+        return PosedSurfels(
+            centre, tangent_u, tangent_v, normal, opacity, **channels, object_index=np.full(n, object_index, np.int32)
+        )
+
+    def _channel(self, name: str, edited: Array | None) -> Array:
+        """A material channel of the surfels after the vertices' values became `edited`."""
+        own, rest = getattr(self.surfels, name), getattr(self.mesh, name)
+        if edited is None:
+            return own
+        edited = np.ascontiguousarray(edited, dtype=np.float32)
+        if edited.shape != rest.shape:
+            raise AssetError(f"{name} of the vertices", f"has shape {edited.shape}, expected {rest.shape}")
+        changed = np.abs(edited - rest) > 1e-6
+        if changed.ndim == 2:
+            changed = changed.any(axis=1)
+        if not changed.any():
+            return own
+        result = own.reshape(len(own), -1).copy()
+        _repaint(
+            self.mesh.faces, self.binding.face, self.binding.barycentric, changed, edited.reshape(len(rest), -1), result
+        )
+        return result.reshape(own.shape)
+
+
+@njit
+def _tangent_frame(
+    ax: float, ay: float, az: float, bx: float, by: float, bz: float, sx: float, sy: float, sz: float
+) -> tuple[float, float, float, float, float, float, float, float, float]:
+    """Axes t, b, s of the shading frame: s = normalised (sx, sy, sz), t = a (else b, else an axis) projected off s."""
+    length = math.sqrt(sx * sx + sy * sy + sz * sz)
+    if not (length > 1e-12):
+        sx, sy, sz, length = 0.0, 0.0, 1.0, 1.0
+    sx, sy, sz = sx / length, sy / length, sz / length
+    tx, ty, tz, length = 0.0, 0.0, 0.0, 0.0
+    for k in range(3):
+        if k == 1:
+            ax, ay, az = bx, by, bz
+        elif k == 2:
+            along_x = abs(sx) <= abs(sy) and abs(sx) <= abs(sz)
+            along_y = not along_x and abs(sy) <= abs(sz)
+            ax, ay = 1.0 if along_x else 0.0, 1.0 if along_y else 0.0
+            az = 1.0 - ax - ay
+        d = ax * sx + ay * sy + az * sz
+        tx, ty, tz = ax - d * sx, ay - d * sy, az - d * sz
+        length = math.sqrt(tx * tx + ty * ty + tz * tz)
+        if length > 1e-6 * math.sqrt(ax * ax + ay * ay + az * az):
+            break
+    tx, ty, tz = tx / length, ty / length, tz / length
+    return tx, ty, tz, sy * tz - sz * ty, sz * tx - sx * tz, sx * ty - sy * tx, sx, sy, sz
+
+
+@njit(parallel=True)
+def _pose(
+    vertices: Array, faces: Array, normals: Array, by_corner: bool, linear: Array, side: float,
+    face: Array, weights: Array, offset: Array, rest_edge: Array, local_normal: Array, coordinates: Array,
+    centre: Array, tangent_u: Array, tangent_v: Array, normal: Array, opacity: Array,
+) -> None:  # fmt: skip
+    """One surfel an iteration; arithmetic in double so that a small object far from the origin stays exact."""
+    for i in prange(len(face)):
+        f = face[i]
+        ia, ib, ic = faces[f, 0], faces[f, 1], faces[f, 2]
+        wa, wb, wc = np.float64(weights[i, 0]), np.float64(weights[i, 1]), np.float64(weights[i, 2])
+        ax, ay, az = np.float64(vertices[ia, 0]), np.float64(vertices[ia, 1]), np.float64(vertices[ia, 2])
+        ux, uy, uz = vertices[ib, 0] - ax, vertices[ib, 1] - ay, vertices[ib, 2] - az
+        vx, vy, vz = vertices[ic, 0] - ax, vertices[ic, 1] - ay, vertices[ic, 2] - az
+        size = abs(ax) + abs(ay) + abs(az) + abs(ux) + abs(uy) + abs(uz) + abs(vx) + abs(vy) + abs(vz)
+        if not (size < 1e30):  # a comparison: math.isfinite(a + b) is folded to True when sums may be reordered
+            opacity[i] = 0.0
+            for k in range(3):
+                centre[i, k] = tangent_u[i, k] = tangent_v[i, k] = 0.0
+                normal[i, k] = 1.0 if k == 2 else 0.0
+            continue
+
+        # Smooth normal: of the vertices or of the corners.
+        ja, jb, jc = (3 * f, 3 * f + 1, 3 * f + 2) if by_corner else (ia, ib, ic)
+        pa, pb, pc = max(wa, 0.0), max(wb, 0.0), max(wc, 0.0)  # weights may leave the face, its normal does not
+        sx = pa * normals[ja, 0] + pb * normals[jb, 0] + pc * normals[jc, 0]
+        sy = pa * normals[ja, 1] + pb * normals[jb, 1] + pc * normals[jc, 1]
+        sz = pa * normals[ja, 2] + pb * normals[jb, 2] + pc * normals[jc, 2]
+
+        # Outward unit face normal; a collapsed face takes the smooth one.
+        nx, ny, nz = side * (uy * vz - uz * vy), side * (uz * vx - ux * vz), side * (ux * vy - uy * vx)
+        length = math.sqrt(nx * nx + ny * ny + nz * nz)
+        uu, vv = ux * ux + uy * uy + uz * uz, vx * vx + vy * vy + vz * vz
+        if not (length > 1e-10 * (uu + vv)):
+            nx, ny, nz = sx, sy, sz
+            length = math.sqrt(nx * nx + ny * ny + nz * nz)
+            if not (length > 1e-12):
+                nx, ny, nz, length = 0.0, 0.0, 1.0, 1.0
+        nx, ny, nz = nx / length, ny / length, nz / length
+        if not (sx * sx + sy * sy + sz * sz > 1e-12):
+            sx, sy, sz = nx, ny, nz
+        tx, ty, tz, bx, by, bz, sx, sy, sz = _tangent_frame(ux, uy, uz, vx, vy, vz, sx, sy, sz)
+
+        # What stands off the surface goes through matrix_world: A normalise(A^T n), A its linear part.
+        ox = linear[0, 0] * nx + linear[1, 0] * ny + linear[2, 0] * nz
+        oy = linear[0, 1] * nx + linear[1, 1] * ny + linear[2, 1] * nz
+        oz = linear[0, 2] * nx + linear[1, 2] * ny + linear[2, 2] * nz
+        length = math.sqrt(ox * ox + oy * oy + oz * oz)
+        length = 1.0 / length if length > 1e-300 else 0.0
+        ox, oy, oz = ox * length, oy * length, oz * length
+        hx = linear[0, 0] * ox + linear[0, 1] * oy + linear[0, 2] * oz
+        hy = linear[1, 0] * ox + linear[1, 1] * oy + linear[1, 2] * oz
+        hz = linear[2, 0] * ox + linear[2, 1] * oy + linear[2, 2] * oz
+
+        d = np.float64(offset[i])
+        centre[i, 0] = ax + wb * ux + wc * vx + d * hx
+        centre[i, 1] = ay + wb * uy + wc * vy + d * hy
+        centre[i, 2] = az + wb * uz + wc * vz + d * hz
+
+        if rest_edge[f] > 0.0:
+            wx, wy, wz = vx - ux, vy - uy, vz - uz
+            edges = math.sqrt(uu) + math.sqrt(vv) + math.sqrt(wx * wx + wy * wy + wz * wz)
+            grow = edges / (3.0 * rest_edge[f])
+            ux, uy, uz = grow * tx, grow * ty, grow * tz
+            vx, vy, vz = side * grow * bx, side * grow * by, side * grow * bz
+            hx, hy, hz = grow * sx, grow * sy, grow * sz
+        c = coordinates[i]
+        tangent_u[i, 0] = ux * c[0, 0] + vx * c[1, 0] + hx * c[2, 0]
+        tangent_u[i, 1] = uy * c[0, 0] + vy * c[1, 0] + hy * c[2, 0]
+        tangent_u[i, 2] = uz * c[0, 0] + vz * c[1, 0] + hz * c[2, 0]
+        tangent_v[i, 0] = ux * c[0, 1] + vx * c[1, 1] + hx * c[2, 1]
+        tangent_v[i, 1] = uy * c[0, 1] + vy * c[1, 1] + hy * c[2, 1]
+        tangent_v[i, 2] = uz * c[0, 1] + vz * c[1, 1] + hz * c[2, 1]
+
+        lx, ly, lz = np.float64(local_normal[i, 0]), side * local_normal[i, 1], np.float64(local_normal[i, 2])
+        nx = tx * lx + bx * ly + sx * lz
+        ny = ty * lx + by * ly + sy * lz
+        nz = tz * lx + bz * ly + sz * lz
+        length = math.sqrt(nx * nx + ny * ny + nz * nz)
+        if not (length > 1e-12):
+            nx, ny, nz, length = sx, sy, sz, 1.0
+        normal[i, 0], normal[i, 1], normal[i, 2] = nx / length, ny / length, nz / length
+
+
+@njit(parallel=True)
+def _repaint(faces: Array, face: Array, weights: Array, changed: Array, edited: Array, values: Array) -> None:
+    """Blend `values` (n, c) of the surfels towards the `edited` (k, c) values of their changed vertices."""
+    for i in prange(len(face)):
+        total, new = 0.0, 0.0
+        for k in range(3):
+            w = max(weights[i, k], np.float32(0.0))
+            total += w
+            if changed[faces[face[i], k]]:
+                new += w
+        if new > 0.0:
+            for c in range(values.shape[1]):
+                value = (total - new) * values[i, c]
+                for k in range(3):
+                    v = faces[face[i], k]
+                    if changed[v]:
+                        value += max(weights[i, k], np.float32(0.0)) * edited[v, c]
+                values[i, c] = value / total
