@@ -88,7 +88,7 @@ class Light:
         return ((1 - t) * upper + t * lower) * self.colour
 
     def sample(self, u: Tensor) -> Tensor:
-        """World directions (..., 3) of uniform numbers (..., 3): two for the place in a texel, the third for the texel."""
+        """World directions (..., 3) of uniform numbers (..., 3): two place them in a texel, the third picks it."""
         index = torch.searchsorted(self._cumulative, u[..., 2].contiguous() * self._cumulative[-1], right=True)
         index = index.clamp(max=len(self._cumulative) - 1)
         row, column = index // self.width, index % self.width
