@@ -1,0 +1,403 @@
+"""The engine seen from the extension: start it, load assets, render frames, survive its death.
+
+numpy and the standard library only. All waiting is done with a deadline, and while waiting the caller's `cancelled`
+is asked at least every 50 ms and its `on_progress` is called, both on the calling thread.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import logging
+import queue
+import threading
+import time
+import weakref
+from collections.abc import Callable, Iterator
+from typing import Any, TypeVar
+
+import numpy as np
+
+from ..errors import ERROR_CLASSES, Cancelled, DeviceError, DrgsError, EngineError, UsageError, VersionError
+from ..frame import Frame
+from ..version import __version__
+from . import protocol
+from .child import Child
+from .codec import CodecError, encode_frame
+from .locate import engine_command, locate_engine
+from .protocol import PROTOCOL, Passes, sendable
+from .slots import SentSlots
+
+logger = logging.getLogger(__name__)
+
+Array = np.ndarray
+OnProgress = Callable[[str, float], None]
+IsCancelled = Callable[[], bool]
+T = TypeVar("T")
+
+_POLL = 0.04
+_CANCEL_WAIT = 0.3
+_PREPARING = "preparing kernels"
+
+
+class _Lost(Exception):
+    """The engine died, fell silent or spoke nonsense; a new one may do better."""
+
+
+class _Watch:
+    """Counts how long the engine has been silent, and how long its main thread has stood still.
+
+    Time is counted in small steps, so that a pause of this process (a debugger, a suspended machine) is not taken
+    for one of the engine.
+    """
+
+    def __init__(self, child: Child, silence: float, stall: float) -> None:
+        self._child, self._silence, self._stall = child, silence, stall
+        self._last = time.monotonic()
+        self._seen = (child.heard, child.steps)
+        self._quiet = self._still = 0.0
+
+    def check(self) -> None:
+        now = time.monotonic()
+        passed, self._last = min(now - self._last, 0.5), now
+        heard, steps = self._seen
+        self._quiet = 0.0 if self._child.heard != heard else self._quiet + passed
+        self._still = 0.0 if self._child.steps != steps else self._still + passed
+        self._seen = (self._child.heard, self._child.steps)
+        if self._quiet > self._silence:
+            raise _Lost(f"did not answer for {self._silence:g} s")
+        if self._still > self._stall:
+            raise EngineError(
+                "engine", f"made no progress for {self._stall:g} s", "Try fewer samples or a smaller scene"
+            )
+
+
+class EngineClient:
+    """A DR-GS engine in a process of its own.
+
+    Requests may come from any thread; they are served one at a time. Nothing is started before the first request.
+
+    Parameters
+    ----------
+    command : command line of the engine, see `locate_engine`
+    silence : seconds without a sign of life after which the engine is taken for dead
+    stall : seconds its main thread may work on one step
+    restarts : how often one request is repeated on a new engine after the old one died
+    shared : exchange arrays through shared memory where the system has it
+    """
+
+    def __init__(
+        self,
+        command: list[str],
+        *,
+        silence: float = 20.0,
+        stall: float = 900.0,
+        restarts: int = 1,
+        shared: bool = True,
+    ) -> None:
+        self.command = list(command)
+        self.silence, self.stall, self.restarts, self.shared = silence, stall, restarts, shared
+        self._child: Child | None = None
+        self._sent = SentSlots()
+        self._assets: dict[str, str] = {}
+        self._number = 0
+        self._busy = threading.Lock()
+        self._closing = False
+        self._past_log = ""
+        _clients.add(self)
+
+    @property
+    def pid(self) -> int:
+        """Process id of the running engine, 0 when there is none."""
+        return self._child.pid if self._child is not None and self._child.running else 0
+
+    @property
+    def log(self) -> str:
+        """What the engine wrote to its standard error lately, for an error report."""
+        return self._child.log if self._child is not None else self._past_log
+
+    @property
+    def bulk_bytes(self) -> tuple[int, int]:
+        """Bytes of arrays sent to and received from the running engine so far."""
+        link = self._child.link if self._child is not None else None
+        return (link.bulk_sent, link.bulk_received) if link is not None else (0, 0)
+
+    def start(self, cancelled: IsCancelled | None = None) -> None:
+        """Start the engine if it does not run, and shake hands.
+
+        Raises
+        ------
+        DeviceError
+            When the command cannot be run or ends at once.
+        VersionError
+            When the engine is of another version.
+        EngineError
+            When it does not answer.
+        """
+        with self._exclusive(cancelled):
+            self._repeating(lambda: None, None, cancelled)
+
+    def load_asset(self, path: str, on_progress: OnProgress | None = None, cancelled: IsCancelled | None = None) -> str:
+        """Load the asset file at `path`, or look whether it changed; return its key for `ObjectState.asset`.
+
+        Raises
+        ------
+        AssetError, EngineError, DeviceError, VersionError, Cancelled
+        """
+        with self._exclusive(cancelled):
+            return self._repeating(lambda: self._load(str(path), on_progress, cancelled), on_progress, cancelled)
+
+    def render(
+        self, frame: Frame, on_progress: OnProgress | None = None, cancelled: IsCancelled | None = None
+    ) -> Passes:
+        """Render `frame`.
+
+        Parameters
+        ----------
+        on_progress : called with the phase and the part done in [0, 1]
+        cancelled : asked often; once it says True, `Cancelled` is raised within half a second
+
+        Returns
+        -------
+        Passes
+            Pass name -> (h, w, c) float32 of the camera's window, with ``.warnings`` and ``.statistics``.
+
+        Raises
+        ------
+        UsageError, AssetError
+            When the frame cannot be rendered.
+        EngineError
+            When the engine died or fell silent, and once more when the frame was repeated.
+        DeviceError, VersionError, Cancelled
+        """
+        try:
+            description, arrays = encode_frame(frame)
+            ready = {slot: sendable(array) for slot, array in arrays.items()}
+        except CodecError as error:
+            raise UsageError(f"frame {frame.number}", str(error), "Correct the setting or object it names") from error
+
+        def work() -> Passes:
+            for _ in range(2):
+                versions, changed = self._sent.changes(ready)
+                message = protocol.Render(self._next(), description, versions)
+                answer, pictures = self._request(message, changed, on_progress, cancelled)
+                if isinstance(answer, protocol.Result):
+                    return Passes(pictures, answer.warnings, answer.statistics)
+                self._sent.forget()
+            raise _Lost("keeps asking for arrays it was sent")
+
+        with self._exclusive(cancelled):
+            return self._repeating(work, on_progress, cancelled)
+
+    def close(self) -> None:
+        """End the engine; a request under way ends with `Cancelled`, a later one starts a new engine."""
+        self._closing = True
+        try:
+            if self._busy.locked() and self._child is not None:
+                self._child.kill()
+            with self._busy:
+                child, self._child = self._child, None
+                if child is not None:
+                    child.close()
+                    self._past_log = child.log
+                self._sent.forget()
+        finally:
+            self._closing = False
+
+    def __enter__(self) -> EngineClient:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __del__(self) -> None:
+        child = getattr(self, "_child", None)
+        if child is not None:
+            child.kill()
+
+    # --- one request -----------------------------------------------------------------------------------------------
+
+    def _next(self) -> int:
+        self._number += 1
+        return self._number
+
+    @contextlib.contextmanager
+    def _exclusive(self, cancelled: IsCancelled | None) -> Iterator[None]:
+        while not self._busy.acquire(timeout=_POLL):
+            if cancelled is not None and cancelled():
+                raise Cancelled
+        try:
+            yield
+        finally:
+            self._busy.release()
+
+    def _repeating(self, work: Callable[[], T], on_progress: OnProgress | None, cancelled: IsCancelled | None) -> T:
+        """Do `work` on a running engine, again on a new one when the engine is lost."""
+        for attempt in range(self.restarts + 1):
+            try:
+                self._ensure(on_progress, cancelled)
+                return work()
+            except _Lost as loss:
+                child = self._child
+                problem = str(loss)
+                if child is not None:
+                    problem = problem if child.running else child.epitaph()
+                    child.close(grace=0.0)
+                    self._past_log = child.log
+                self._child = None
+                if self._closing:
+                    raise Cancelled from loss
+                if attempt == self.restarts:
+                    remedy = "Try again; if it happens again, see the engine's log and look at the memory it has"
+                    raise EngineError("engine", problem, remedy) from loss
+                logger.warning("the engine %s; it is started again", problem)
+            except EngineError:
+                self._abandon()
+                raise
+        raise AssertionError("unreachable")
+
+    def _abandon(self) -> None:
+        if self._child is not None:
+            self._child.close(grace=0.0)
+            self._past_log = self._child.log
+            self._child = None
+
+    def _ensure(self, on_progress: OnProgress | None, cancelled: IsCancelled | None) -> None:
+        """Have a running engine that knows all assets."""
+        if self._child is not None and self._child.running:
+            return
+        self._abandon()
+        self._sent.forget()
+        self._child = Child(self.command, self.shared)
+        try:
+            self._handshake(self._child, cancelled)
+        except (DrgsError, Cancelled):
+            self._abandon()
+            raise
+        for path in list(self._assets):
+            try:
+                self._load(path, on_progress, cancelled)
+            except DrgsError as error:  # the frame may not use it any more; if it does, the engine says so
+                logger.warning("asset not loaded again: %s", error)
+                del self._assets[path]
+
+    def _handshake(self, child: Child, cancelled: IsCancelled | None) -> None:
+        watch = _Watch(child, self.silence, self.stall)
+        while True:
+            if cancelled is not None and cancelled():
+                raise Cancelled
+            try:
+                item = child.inbox.get(timeout=_POLL)
+            except queue.Empty:
+                watch.check()
+                continue
+            remedy = "Install the engine in the environment named in the preferences, or correct the path"
+            if isinstance(item, OSError) and child.pid == 0:
+                raise DeviceError(self.command[0], f"cannot be started ({item})", remedy) from item
+            if isinstance(item, Exception):
+                raise DeviceError(
+                    self.command[0], f"did not start as an engine: it {child.epitaph()}", remedy
+                ) from item
+            greeting = item[0]
+            if not isinstance(greeting, protocol.Hello):
+                raise DeviceError(self.command[0], "does not greet as an engine does", remedy)
+            if not protocol.same_version(greeting):
+                raise VersionError(
+                    "engine",
+                    f"is version {greeting.version} (protocol {greeting.protocol}), "
+                    f"the extension is version {__version__} (protocol {PROTOCOL})",
+                    "Install the same version of both",
+                )
+            child.welcome()
+            return
+
+    def _load(self, path: str, on_progress: OnProgress | None, cancelled: IsCancelled | None) -> str:
+        answer, _ = self._request(protocol.LoadAsset(self._next(), path), {}, on_progress, cancelled)
+        if not isinstance(answer, protocol.Loaded):
+            raise _Lost(f"answered {type(answer).__name__} when asked to load an asset")
+        self._assets[path] = answer.key
+        return answer.key
+
+    def _request(
+        self,
+        message: Any,
+        arrays: dict[str, Array],
+        on_progress: OnProgress | None,
+        cancelled: IsCancelled | None,
+    ) -> tuple[Any, dict[str, Array]]:
+        """Send `message` and wait for its answer, which is returned unless it is an error."""
+        child = self._child
+        assert child is not None
+        self._settle(child, on_progress, cancelled)
+        child.request(message, arrays)
+        watch = _Watch(child, self.silence, self.stall)
+        stop_at = None
+        try:
+            while True:
+                item = self._take(child, on_progress)
+                if item is not None and item[0].id == message.id:
+                    if isinstance(item[0], protocol.Stopped):
+                        raise Cancelled
+                    if isinstance(item[0], protocol.Failed):
+                        raise _as_error(item[0])
+                    return item
+                watch.check()
+                if stop_at is None and cancelled is not None and cancelled():
+                    stop_at = time.monotonic() + _CANCEL_WAIT
+                    child.cancel(message.id, OBEY_SECONDS)
+                if stop_at is not None and time.monotonic() > stop_at:
+                    raise Cancelled
+        finally:
+            if stop_at is None and not child.idle.is_set():  # on_progress or cancelled raised
+                child.cancel(message.id, OBEY_SECONDS)
+
+    def _settle(self, child: Child, on_progress: OnProgress | None, cancelled: IsCancelled | None) -> None:
+        """Wait until the engine has answered a request that was cancelled before."""
+        watch = _Watch(child, self.silence, self.stall)
+        while not child.idle.is_set():
+            self._take(child, on_progress)
+            watch.check()
+            if cancelled is not None and cancelled():
+                raise Cancelled
+
+    def _take(self, child: Child, on_progress: OnProgress | None) -> tuple[Any, dict[str, Array]] | None:
+        """The next answer, or None after a short wait; progress is passed on."""
+        try:
+            item = child.inbox.get(timeout=_POLL)
+        except queue.Empty:
+            if child.preparing and on_progress is not None:
+                on_progress(_PREPARING, 0.0)
+            return None
+        if isinstance(item, CodecError):
+            raise UsageError("frame", str(item), "Correct the setting or object it names") from item
+        if isinstance(item, Exception):
+            raise _Lost(str(item) or type(item).__name__) from item
+        if isinstance(item[0], protocol.Progress):
+            if on_progress is not None:
+                on_progress(item[0].phase, item[0].fraction)
+            return None
+        if isinstance(item[0], protocol.Failed) and item[0].id == 0:
+            raise _Lost(f"refused a message: {item[0].problem}")
+        return item
+
+
+#: Seconds of work after which an engine that was asked to stop is killed.
+OBEY_SECONDS = 2.0
+
+
+def _as_error(failure: protocol.Failed) -> DrgsError:
+    kind = ERROR_CLASSES.get(failure.error, DrgsError)
+    return kind(failure.subject, failure.problem, failure.remedy)
+
+
+_clients: weakref.WeakSet[EngineClient] = weakref.WeakSet()
+
+
+@atexit.register
+def close_all() -> None:
+    """End every engine of this process; registered to run when it exits."""
+    for client in list(_clients):
+        client.close()
+
+
+__all__ = ["EngineClient", "Passes", "close_all", "engine_command", "locate_engine"]

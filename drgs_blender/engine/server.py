@@ -1,0 +1,260 @@
+"""The engine's side of the link: one thread computes, one listens, one shows that the engine is alive.
+
+The engine lives exactly as long as its parent: the end of its standard input, SIGTERM and (on Linux) the parent's
+death end it at once. It holds nothing that would have to be cleaned up.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import faulthandler
+import logging
+import os
+import queue
+import signal
+import sys
+import threading
+import time
+from typing import Any
+
+import numpy as np
+
+from ..errors import EXIT_INTERNAL, EXIT_OK, EXIT_VERSION, Cancelled, DeviceError, DrgsError
+from ..version import __version__
+from . import protocol
+from .codec import CodecError, decode_frame
+from .protocol import PROTOCOL, Link, ProtocolError
+from .shared import Region
+from .slots import HeldSlots
+
+logger = logging.getLogger(__name__)
+
+Array = np.ndarray
+
+#: Seconds between two signs of life, and between two progress messages of one phase.
+ALIVE_SECONDS = 0.5
+PROGRESS_SECONDS = 0.1
+
+
+class Server:
+    """Serves the requests of one client.
+
+    Parameters
+    ----------
+    link : to the client
+    """
+
+    def __init__(self, link: Link) -> None:
+        self.link = link
+        self.held = HeldSlots()
+        self.session: Any = None
+        self._requests: queue.SimpleQueue[tuple[Any, dict[str, Array]]] = queue.SimpleQueue()
+        self._last_cancelled = 0
+        self._current = 0
+        self._steps = 0
+        self._compiling = 0
+        self._reported = ("", 0.0)
+
+    # --- threads beside the main one -------------------------------------------------------------------------------
+
+    def listen(self) -> None:
+        """Take messages until the pipe ends; ends the process then, whatever the main thread does."""
+        try:
+            while (received := self.link.receive()) is not None:
+                message, arrays = received
+                if isinstance(message, protocol.Cancel):
+                    self._last_cancelled = max(self._last_cancelled, message.id)
+                elif isinstance(message, protocol.Shutdown):
+                    break
+                elif isinstance(message, (protocol.LoadAsset, protocol.Render)):
+                    self._requests.put((message, arrays))
+                else:
+                    raise ProtocolError(f"{type(message).__name__} is not for the engine, or not now")
+        except ProtocolError as error:
+            _refuse(self.link, str(error))
+        except BaseException:
+            logger.exception("the listening thread failed")
+            _leave(EXIT_INTERNAL)
+        _leave(EXIT_OK)
+
+    def show_life(self) -> None:
+        """Say regularly that the engine is there and whether it advances."""
+        while True:
+            time.sleep(ALIVE_SECONDS)
+            self._answer(protocol.Alive(self._steps, self._compiling > 0))
+
+    # --- the main thread -------------------------------------------------------------------------------------------
+
+    def serve(self) -> None:
+        """Answer requests, one after the other, for ever."""
+        for target in (self.listen, self.show_life):
+            threading.Thread(target=target, name=f"drgs-{target.__name__}", daemon=True).start()
+        try:
+            self._open_session()
+        except Exception:
+            logger.exception("the engine is incomplete")  # the first request will meet it again and be told
+        while True:
+            message, arrays = self._requests.get()
+            self._current = message.id
+            self._steps += 1
+            try:
+                self._handle(message, arrays)
+            except Cancelled:
+                self._answer(protocol.Stopped(message.id))
+            except DrgsError as error:
+                logger.info("request %d: %s", message.id, error)
+                self._fail(message.id, type(error).__name__, error.subject, error.problem, error.remedy)
+            except MemoryError:
+                logger.exception("request %d", message.id)
+                remedy = "Close other programs, or choose a lower resolution or fewer sub-pixel samples"
+                self._fail(message.id, "DrgsError", "engine", "ran out of memory", remedy)
+            except Exception as error:
+                logger.exception("request %d", message.id)
+                problem = f"met an unexpected {type(error).__name__}: {str(error)[:500]}"
+                remedy = "Report it with the engine's log, which has the details"
+                self._fail(message.id, "DrgsError", "engine", problem, remedy)
+
+    def _handle(self, message: Any, arrays: dict[str, Array]) -> None:
+        if isinstance(message, protocol.LoadAsset):
+            session = self._open_session()
+            key = session.load_asset(message.path)
+            asset = session.asset(key)
+            self._answer(protocol.Loaded(message.id, key, len(asset.mesh.vertices), len(asset.surfels)))
+            return
+        held, missing = self.held.update(message.slots, arrays)
+        if missing:
+            self._answer(protocol.Need(message.id, missing))
+            return
+        try:
+            frame = decode_frame(message.frame, held)
+        except CodecError as error:
+            raise DrgsError("frame", f"cannot be read: {error}", "Report it with the engine's log") from error
+        passes = self._open_session().render(frame, self._progress, self._cancelled)
+        self._answer(protocol.Result(message.id, passes.warnings, passes.statistics), passes)
+
+    def _open_session(self) -> Any:
+        if self.session is None:
+            try:
+                from numba.core import event
+
+                from .session import Session
+            except ImportError as error:
+                remedy = "Install DR-GS again in this environment"
+                raise DeviceError(sys.executable, f"lacks a part of the engine ({error})", remedy) from error
+            event.register("numba:compile", _CompileListener(self))
+            self.session = Session()
+        return self.session
+
+    def _cancelled(self) -> bool:
+        self._steps += 1
+        return self._current <= self._last_cancelled
+
+    def _progress(self, phase: str, fraction: float) -> None:
+        """Tell the client where the request stands, not more often than it can use."""
+        self._steps += 1
+        now = time.monotonic()
+        last_phase, last_time = self._reported
+        if phase != last_phase or now - last_time >= PROGRESS_SECONDS:
+            self._reported = phase, now
+            self._answer(protocol.Progress(self._current, phase, min(1.0, max(0.0, float(fraction)))))
+
+    def note_compiling(self, change: int) -> None:
+        """Count kernels that are being compiled."""
+        self._steps += 1
+        self._compiling += change
+        if change > 0:
+            self._progress("preparing kernels", 0.0)
+        if self._compiling <= 1:
+            self._answer(protocol.Alive(self._steps, self._compiling > 0))
+
+    def _fail(self, request: int, error: str, subject: str, problem: str, remedy: str) -> None:
+        self._answer(protocol.Failed(request, error, subject, problem, remedy))
+
+    def _answer(self, message: Any, arrays: dict[str, Array] | None = None) -> None:
+        try:
+            self.link.send(message, arrays)
+        except OSError:  # the client is gone
+            _leave(EXIT_OK)
+
+
+class _CompileListener:
+    """Numba's event listener (its interface): tells the client why the first picture takes a minute."""
+
+    def __init__(self, server: Server) -> None:
+        self._server = server
+
+    def notify(self, event: Any) -> None:
+        self._server.note_compiling(1 if event.is_start else -1)
+
+
+def _refuse(link: Link, problem: str) -> None:
+    """Say why the link cannot go on, and end."""
+    logger.error("the client does not speak the engine's protocol: %s", problem)
+    with contextlib.suppress(OSError):  # nobody may be listening
+        link.send(protocol.Failed(0, "EngineError", "engine link", problem, "Install the same version of both"))
+    _leave(EXIT_INTERNAL)
+
+
+def _leave(code: int) -> None:
+    logging.shutdown()
+    os._exit(code)
+
+
+def take_pipes() -> Link:
+    """Keep the pipes for messages: whatever else writes to standard output goes to standard error from now on."""
+    reader = os.fdopen(os.dup(0), "rb", buffering=0)
+    writer = os.fdopen(os.dup(1), "wb", buffering=0)
+    nothing = os.open(os.devnull, os.O_RDONLY)
+    os.dup2(nothing, 0)
+    os.close(nothing)
+    os.dup2(2, 1)
+    return Link(reader, writer)
+
+
+def die_with_parent() -> None:
+    """Ask Linux to kill this process when its parent dies; elsewhere the end of standard input has to do."""
+    if not sys.platform.startswith("linux"):
+        return
+    import ctypes
+
+    pr_set_pdeathsig = 1
+    if ctypes.CDLL(None, use_errno=True).prctl(pr_set_pdeathsig, signal.SIGKILL, 0, 0, 0) != 0:
+        logger.warning("cannot tie the engine to its parent: errno %d", ctypes.get_errno())
+
+
+def shake_hands(link: Link) -> None:
+    """Greet the client and take over the shared regions; ends the process when the versions differ."""
+    link.send(protocol.Hello(PROTOCOL, __version__, os.getpid()))
+    try:
+        received = link.receive()
+    except ProtocolError as error:
+        _refuse(link, str(error))
+        raise AssertionError("unreachable") from error
+    if received is None:
+        _leave(EXIT_OK)
+        raise AssertionError("unreachable")
+    welcome = received[0]
+    if not isinstance(welcome, protocol.Welcome):
+        _refuse(link, f"expected Welcome, received {type(welcome).__name__}")
+    if not protocol.same_version(welcome):
+        logger.error("client %s, engine %s", welcome.version, __version__)
+        problem = f"is version {welcome.version}, the engine is version {__version__}"
+        with contextlib.suppress(OSError):  # the client may have left already
+            link.send(protocol.Failed(0, "VersionError", "extension", problem, "Install the same version of both"))
+        _leave(EXIT_VERSION)
+    try:
+        link.incoming = Region(welcome.to_engine) if welcome.to_engine > 2 else None
+        link.outgoing = Region(welcome.to_client) if welcome.to_client > 2 else None
+    except OSError as error:
+        _refuse(link, f"the shared regions cannot be used ({error})")
+
+
+def main() -> None:
+    """Run the engine on this process's standard input and output until the client leaves."""
+    link = take_pipes()
+    logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(levelname)s %(name)s: %(message)s")
+    faulthandler.enable(sys.stderr)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C in the terminal is for the client, which ends us
+    die_with_parent()
+    shake_hands(link)
+    Server(link).serve()

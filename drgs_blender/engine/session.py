@@ -1,0 +1,260 @@
+"""One frame after the other: composes the stages and keeps what did not change. The only state of the engine.
+
+Usable without the process: ``Session().render(frame)`` gives the same bits as a client's ``render``.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import logging
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+
+from ..asset.container import read_asset
+from ..asset.model import Asset, PosedSurfels
+from ..deform.mesh_driven import MeshDriven
+from ..errors import AssetError, Cancelled, UsageError
+from ..frame import Frame, ObjectState, World
+from ..jit import use_threads
+from ..passes import BY_NAME
+from ..render.light import EnvironmentLight
+from ..render.pipeline import render
+from ..render.scene import TraceObject, TraceScene
+from .objects import join, posed_surfels, traced_object
+from .protocol import Passes
+from .slots import keep, same_bits
+
+logger = logging.getLogger(__name__)
+
+Array = np.ndarray
+OnProgress = Callable[[str, float], None]
+IsCancelled = Callable[[], bool]
+
+S = TypeVar("S", ObjectState, World)
+
+
+@dataclass(slots=True)
+class _Loaded:
+    """An asset, the state of the file it is mapped from, and its deformation once it was needed."""
+
+    asset: Asset
+    stamp: tuple[int, int, int]
+    driven: MeshDriven | None = None
+
+    def surfels_of(self, state: ObjectState) -> MeshDriven:
+        """The deformation of the asset's surfels, made when an object first needs it."""
+        if self.driven is None:
+            asset = self.asset
+            if asset.binding is None:
+                problem = f"the surfels of {state.asset} are not bound to its mesh"
+                raise AssetError(f"object {state.name}", problem, "Bind them, or choose the mesh as primary surface")
+            self.driven = MeshDriven(asset.mesh, asset.surfels, asset.binding)
+        return self.driven
+
+
+@dataclass(slots=True)
+class _Object:
+    """An object as it was in the last frame, and what was made of it."""
+
+    state: ObjectState
+    index: int
+    loaded: _Loaded
+    traced: TraceObject
+    posed: PosedSurfels | None = None
+    lost: int = 0
+
+
+class Session:
+    """Renders frames; keeps loaded assets, the trace scene, posed surfels and the light between them."""
+
+    def __init__(self) -> None:
+        self._assets: dict[str, _Loaded] = {}
+        self._objects: list[_Object] = []
+        self._scene = TraceScene()
+        self._world: World | None = None
+        self._light: EnvironmentLight | None = None
+
+    def load_asset(self, path: str | os.PathLike[str]) -> str:
+        """Map the asset file at `path` unless it is mapped and unchanged; return its key.
+
+        The key is the resolved path: a file that was written again keeps its key and is used from the next call on.
+
+        Raises
+        ------
+        AssetError, VersionError
+            Naming the file.
+        """
+        key = os.path.realpath(path)
+        try:
+            status = os.stat(key)
+        except OSError as error:
+            reason = error.strerror or str(error)
+            raise AssetError(key, f"cannot be opened ({reason})", "Check that the file is where it was") from error
+        stamp = status.st_ino, status.st_mtime_ns, status.st_size
+        known = self._assets.get(key)
+        if known is None or known.stamp != stamp:
+            self._assets[key] = _Loaded(read_asset(key), stamp)
+        return key
+
+    def asset(self, key: str) -> Asset:
+        """The loaded asset of `key`."""
+        return self._assets[key].asset
+
+    def render(self, frame: Frame, progress: OnProgress | None = None, cancelled: IsCancelled | None = None) -> Passes:
+        """Render one frame.
+
+        Parameters
+        ----------
+        progress : called with (phase, part of the picture done in [0, 1])
+        cancelled : asked between steps; True raises `Cancelled`
+
+        Raises
+        ------
+        AssetError
+            An object's asset is not loaded, or its mesh does not fit; names the object.
+        UsageError
+            A setting cannot be used.
+        Cancelled
+        """
+        statistics: dict[str, float] = {}
+        clock = time.perf_counter()
+
+        def lap(stage: str) -> None:
+            nonlocal clock
+            now = time.perf_counter()
+            statistics[f"seconds.{stage}"], clock = now - clock, now
+            if cancelled is not None and cancelled():
+                raise Cancelled
+
+        _check(frame)
+        use_threads(frame.settings.threads)
+        if progress is not None:
+            progress("deforming", 0.0)
+        posed = self._pose(frame)
+        lap("deform")
+        light = self._light_of(frame.world)
+        lap("light")
+        pictures = render(self._scene, light, posed, frame, progress, cancelled)
+        lap("render")
+        x0, y0, x1, y1 = frame.camera.window
+        statistics |= {
+            "seconds.total": sum(statistics.values()),
+            "objects": float(len(frame.objects)),
+            "triangles": float(len(self._scene.faces)),
+            "surfels": float(len(posed)),
+            "samples": float((x1 - x0) * (y1 - y0) * frame.settings.rays),
+        }
+        return Passes(pictures, self._warnings(), statistics)
+
+    # --- objects ---------------------------------------------------------------------------------------------------
+
+    def _pose(self, frame: Frame) -> PosedSurfels:
+        """Bring the trace scene up to date; return the surfels of all objects."""
+        with_surfels = frame.settings.primary == "surfels"
+        before = {item.state.name: item for item in self._objects}
+        objects = []
+        for index, state in enumerate(frame.objects):
+            loaded = self._assets.get(state.asset)
+            if loaded is None:
+                raise AssetError(
+                    f"object {state.name}",
+                    f"its asset {state.asset} is not loaded",
+                    "Link the object to its file again",
+                )
+            known = before.get(state.name)
+            if known is not None and known.loaded is loaded and known.index == index and _same(known.state, state):
+                item = known
+            else:
+                kept = _snapshot(state)
+                item = _Object(kept, index, loaded, traced_object(kept, loaded.asset))
+            if with_surfels and item.posed is None:
+                item.posed, item.lost = posed_surfels(item.state, index, loaded.surfels_of(item.state), item.traced)
+            objects.append(item)
+        if len(objects) != len(self._objects) or any(a is not b for a, b in zip(objects, self._objects)):
+            self._objects = []  # an update that fails half way leaves nothing to be taken for current
+            self._scene.update([item.traced for item in objects])
+        self._objects = objects
+        return join([item.posed for item in objects if item.posed is not None] if with_surfels else [])
+
+    def _warnings(self) -> list[str]:
+        """What the user should know about the meshes of the last frame."""
+        found = []
+        for fault in self._scene.faults:
+            if fault.bad_vertices:
+                found.append(
+                    f"{fault.name}: {fault.bad_vertices} vertices are not finite; {fault.bad_faces} faces are left out"
+                )
+            if fault.empty_faces:
+                found.append(f"{fault.name}: {fault.empty_faces} faces have no area; light passes through them")
+        found += [
+            f"{item.state.name}: {item.lost} surfels hang on vertices that are not finite; they are hidden"
+            for item in self._objects
+            if item.lost
+        ]
+        if self._light is not None and self._light.bad_texels:
+            found.append(f"world: {self._light.bad_texels} texels are not finite or negative; they are black")
+        return found
+
+    # --- light -----------------------------------------------------------------------------------------------------
+
+    def _light_of(self, world: World) -> EnvironmentLight:
+        """The light of `world`, made again only when something about it changed; a rotation costs nothing."""
+        known = self._world
+        if self._light is not None and known is not None:
+            if _same(known, world):
+                return self._light
+            if _same(dataclasses.replace(known, rotation=world.rotation), world):
+                self._light.rotation = np.ascontiguousarray(world.rotation, np.float32)
+                self._world = _snapshot(world)
+                return self._light
+        self._light, self._world = EnvironmentLight(world), _snapshot(world)
+        return self._light
+
+
+def _check(frame: Frame) -> None:
+    """Refuse what no stage would notice by itself."""
+    for name in frame.passes:
+        if name not in BY_NAME:
+            raise UsageError(f"pass {name}", "is not known", f"Choose from {', '.join(BY_NAME)}")
+    settings = frame.settings
+    for name in ("cosine", "ggx", "environment", "bounces"):
+        if getattr(settings, name) < 0:
+            raise UsageError(f"setting {name}", f"is {getattr(settings, name)}", "Choose a number from 0 up")
+    if settings.rays < 1:
+        raise UsageError("samples", "are all 0", "Choose at least one sample of one strategy")
+    for name, rows in (("environment rotation", frame.world.rotation), ("camera matrix", frame.camera.matrix_world)):
+        if not np.isfinite(rows).all():
+            raise UsageError(name, "is not finite", "Check the transform and its drivers")
+    if frame.world.rotation.shape != (3, 3):
+        raise UsageError("environment rotation", f"has shape {frame.world.rotation.shape}", "Give a 3 x 3 matrix")
+    names = [state.name for state in frame.objects]
+    if len(set(names)) != len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise UsageError(f"object {twice}", "occurs twice in the frame", "Give every object a name of its own")
+
+
+def _same(a: ObjectState | World, b: ObjectState | World) -> bool:
+    """Whether two dataclasses of one kind have the same values, arrays bit by bit."""
+    for f in dataclasses.fields(a):
+        x, y = getattr(a, f.name), getattr(b, f.name)
+        if isinstance(x, np.ndarray) and isinstance(y, np.ndarray):
+            if not same_bits(x, y):
+                return False
+        elif (x is None) != (y is None) or x != y:
+            return False
+    return True
+
+
+def _snapshot(state: S) -> S:
+    """A copy whose arrays nobody can change."""
+    copied = copy.copy(state)
+    for f in dataclasses.fields(state):
+        if isinstance(value := getattr(state, f.name), np.ndarray):
+            setattr(copied, f.name, keep(value))
+    return copied
