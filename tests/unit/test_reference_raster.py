@@ -204,6 +204,22 @@ def test_normals_face_the_viewer_and_have_length_one():
     assert ((a.normal * camera_rays(camera, pixel_centres(camera))[1]).sum(1)[seen] < 0).all()
 
 
+def test_a_jump_of_the_depth_separates_surfaces():
+    """Two layers, 2 m apart: without a gap their mean lies in the empty space between, with it on the heavier."""
+    near, behind = facing((0, 0, 1.0), opacity=0.3), facing((0, 0, -1.0), 1.0, 1.0, opacity=0.9)
+    close = facing((0, 0, -1.2), 1.0, 1.0, opacity=0.5)
+    camera = look()
+    centre = project(camera, near.centre)[0]
+    mixed, split = (rasterise(join(near, behind, close), camera, centre, gap) for gap in (None, 3.0))
+    assert 4.5 < float(mixed.depth) < 5.9
+    assert 6.0 < float(split.depth) < 6.2
+    torch.testing.assert_close(mixed.coverage, split.coverage)
+    only = rasterise(join(behind, close), camera, centre)
+    torch.testing.assert_close(split.depth, only.depth)
+    near.opacity[:] = 0.8
+    assert float(rasterise(join(near, behind, close), camera, centre, 3.0).depth) == pytest.approx(4.0)
+
+
 def test_chunks_do_not_change_the_picture():
     cloud = splats(15, 7)
     same(rasterise(cloud, look()), rasterise(cloud, look(), chunk=100), 1e-12)

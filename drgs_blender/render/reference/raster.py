@@ -103,49 +103,75 @@ def project(camera: Camera, point: Tensor) -> tuple[Tensor, Tensor]:
 def intersect(splats: Splats, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Squared Gaussian radius u^2 + v^2, ray parameter and validity (p, n) of each ray in each surfel's plane."""
     across = torch.linalg.cross(splats.tangent_u, splats.tangent_v)
-    area = torch.linalg.vector_norm(across, dim=-1)
+    area2 = (across**2).sum(-1)
+    area2 = torch.where(area2 > 0, area2, torch.ones_like(area2))  # of no area: never valid
     slope = direction @ across.T
     length = torch.linalg.vector_norm(direction, dim=-1)
-    valid = slope.abs() > MIN_SINE * area * length[:, None]
+    valid = slope.abs() > MIN_SINE * torch.sqrt(area2) * length[:, None]
     towards = splats.centre[None] - origin[:, None]
     t = (towards * across).sum(-1) / torch.where(valid, slope, torch.ones_like(slope))
     offset = t.unsqueeze(-1) * direction[:, None] - towards
     # Dual basis of the tangents in their plane: u = offset . dual_u, v = offset . dual_v.
-    dual_u = torch.linalg.cross(splats.tangent_v, across) / (area**2).unsqueeze(-1)
-    dual_v = torch.linalg.cross(across, splats.tangent_u) / (area**2).unsqueeze(-1)
+    dual_u = torch.linalg.cross(splats.tangent_v, across) / area2.unsqueeze(-1)
+    dual_v = torch.linalg.cross(across, splats.tangent_u) / area2.unsqueeze(-1)
     return dot(offset, dual_u) ** 2 + dot(offset, dual_v) ** 2, t, valid
 
 
-def rasterise(splats: Splats, camera: Camera, position: Tensor | None = None, chunk: int = 1 << 21) -> ReferenceGBuffer:
+def rasterise(
+    splats: Splats,
+    camera: Camera,
+    position: Tensor | None = None,
+    gap: float | None = None,
+    chunk: int = 1 << 21,
+) -> ReferenceGBuffer:
     """G-buffer of surfels at pixel positions.
 
     Contribution i has the strength a_i = opacity_i max(G_3d, G_2d), at most `MAX_ALPHA`, skipped below `MIN_ALPHA`.
     Its depth is that of the ray's intersection where G_3d is the larger, else that of the centre. Sorted by depth,
     T_i = prod_{j<i} (1 - a_j) and the weights of the means are T_i a_i / sum. A contribution counts while T_i is at
-    least `MIN_TRANSMITTANCE`.
+    least `MIN_TRANSMITTANCE`. Normals are turned to agree with the nearest contribution's, their mean to the viewer.
 
     Parameters
     ----------
     position : (p, 2) pixel positions; the pixel centres of the camera's window by default
+    gap : split the contributions where the depth jumps by more than this many times the mean size of the surfels on
+        both sides (the larger standard deviation, at least a pixel), and describe the heaviest part alone; coverage
+        is that of all. None blends all contributions
     chunk : surfel-pixel pairs held at once
     """
     if position is None:
         position = pixel_centres(camera, splats.centre.dtype, str(splats.centre.device))
     step = max(1, chunk // max(1, len(splats.centre)))
-    parts = [_blend(splats, camera, p) for p in position.split(step)]
+    parts = [_blend(splats, camera, p, gap) for p in position.split(step)]
     return ReferenceGBuffer(
         **{f.name: torch.cat([getattr(p, f.name) for p in parts]) for f in fields(ReferenceGBuffer)}
     )
 
 
-def _blend(splats: Splats, camera: Camera, position: Tensor) -> ReferenceGBuffer:
+def _heaviest_part(depth: Tensor, weight: Tensor, size: Tensor, gap: float) -> Tensor:
+    """Mask (p, n) of the contributions, sorted by depth, in the heaviest run without a jump of the depth."""
+    counts, n = weight > 0, weight.shape[1]
+    place = torch.arange(n, device=weight.device).expand_as(weight)
+    last = torch.cummax(torch.where(counts, place, torch.zeros_like(place)), 1).values
+    previous = torch.cat([torch.zeros_like(last[:, :1]), last[:, :-1]], 1)
+    jump = depth - depth.gather(1, previous) > 0.5 * gap * (size + size.gather(1, previous))
+    follows = torch.cumsum(counts, 1) > 1  # the first contribution begins the first run
+    run = torch.cumsum(jump & counts & follows, 1)
+    total = torch.zeros_like(weight).scatter_add(1, run, weight)
+    return (run == total.argmax(1, keepdim=True)) & counts
+
+
+def _blend(splats: Splats, camera: Camera, position: Tensor, gap: float | None) -> ReferenceGBuffer:
+    if not len(splats.centre):
+        empty, rows = position.new_zeros(len(position)), position.new_zeros(len(position), 3)
+        return ReferenceGBuffer(empty, empty, rows, rows, rows, empty, empty)
     origin, direction = camera_rays(camera, position)
     radius2, t, valid = intersect(splats, origin, direction)
-    in_range = (t >= camera.clip_start) & (t <= camera.clip_end)
+    in_range = (t > camera.clip_start) & (t < camera.clip_end)
     inside = torch.exp(-0.5 * torch.where(valid & in_range, radius2, torch.inf))
     centre, centre_depth = project(camera, splats.centre)
     distance2 = ((position[:, None] - centre) ** 2).sum(-1)
-    seen = (centre_depth >= camera.clip_start) & (centre_depth <= camera.clip_end)
+    seen = (centre_depth > camera.clip_start) & (centre_depth < camera.clip_end)
     around = torch.exp(-0.5 / FILTER_VARIANCE * torch.where(seen, distance2, torch.inf))
 
     depth = torch.where(inside >= around, t, centre_depth.expand_as(t))
@@ -158,18 +184,31 @@ def _blend(splats: Splats, camera: Camera, position: Tensor) -> ReferenceGBuffer
     alpha = torch.where(before.detach() >= MIN_TRANSMITTANCE, alpha, torch.zeros_like(alpha))
     weight = before * alpha
     coverage = weight.sum(1)
-    weight = weight / torch.where(coverage > 0, coverage, torch.ones_like(coverage)).unsqueeze(1)
+    depth = torch.where(weight > 0, depth, torch.zeros_like(depth))
+    if gap is not None:
+        with torch.no_grad():
+            size = torch.linalg.vector_norm(torch.stack([splats.tangent_u, splats.tangent_v]), dim=-1).amax(0)
+            pixel = (1.0 if camera.orthographic else depth) / min(camera.fx, camera.fy)
+            part = _heaviest_part(depth, weight, torch.maximum(size[order], torch.as_tensor(pixel)), gap)
+        weight = torch.where(part, weight, torch.zeros_like(weight))
+    total = weight.sum(1, keepdim=True)
+    weight = weight / torch.where(total > 0, total, torch.ones_like(total))
 
-    side = torch.where(direction @ splats.normal.T > 0, -1.0, 1.0).to(direction.dtype)
-    normal = (weight.unsqueeze(-1) * side.gather(1, order).unsqueeze(-1) * splats.normal[order]).sum(1)
-    mean_depth = (weight * torch.where(weight > 0, depth, torch.zeros_like(depth))).sum(1)
+    normals = splats.normal[order]
+    with torch.no_grad():
+        nearest = (weight > 0).to(weight.dtype).argmax(1)
+        opposed = dot(normals, normals[torch.arange(len(normals)), nearest].unsqueeze(1)) < 0
+        sign = torch.where(opposed, -1.0, 1.0).to(weight.dtype)
+    normal = ((weight * sign).unsqueeze(-1) * normals).sum(1)
+    normal = torch.where((dot(normal, direction) > 0).unsqueeze(-1), -normal, normal)
+    mean_depth = (weight * depth).sum(1)
     covered = (coverage > 0).unsqueeze(-1)
     upright = normalise(torch.where(covered, normal, torch.ones_like(normal)))
-    position_ = origin + mean_depth.unsqueeze(-1) * direction
+    point = origin + mean_depth.unsqueeze(-1) * direction
     return ReferenceGBuffer(
         coverage=coverage,
         depth=mean_depth,
-        position=torch.where(covered, position_, torch.zeros_like(position_)),
+        position=torch.where(covered, point, torch.zeros_like(point)),
         normal=torch.where(covered, upright, torch.zeros_like(upright)),
         albedo=(weight.unsqueeze(-1) * splats.albedo[order]).sum(1),
         roughness=(weight * splats.roughness[order]).sum(1),
