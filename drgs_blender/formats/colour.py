@@ -1,0 +1,28 @@
+"""The sRGB transfer function (IEC 61966-2-1)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+Array = np.ndarray
+
+
+def srgb_to_linear(encoded: Array) -> Array:
+    """Decode sRGB values; float32, any shape. Values outside [0, 1] follow the curve's extension."""
+    x = np.asarray(encoded, np.float32)
+    power = ((np.maximum(x, 0.04045) + np.float32(0.055)) / np.float32(1.055)) ** np.float32(2.4)
+    return np.where(x <= 0.04045, x / np.float32(12.92), power).astype(np.float32)
+
+
+def linear_to_srgb(linear: Array) -> Array:
+    """Encode linear values as sRGB; float32, any shape."""
+    x = np.asarray(linear, np.float32)
+    power = np.float32(1.055) * np.maximum(x, 0.0031308) ** np.float32(1 / 2.4) - np.float32(0.055)
+    return np.where(x <= 0.0031308, x * np.float32(12.92), power).astype(np.float32)
+
+
+def to_unit(pixels: Array) -> Array:
+    """Integers as fractions of their type's maximum, floats as they are; float32."""
+    if pixels.dtype.kind == "u":
+        return pixels.astype(np.float32) / np.float32(np.iinfo(pixels.dtype).max)
+    return pixels.astype(np.float32)

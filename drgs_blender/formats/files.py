@@ -1,0 +1,142 @@
+"""What readers of foreign files return: plain arrays plus what a person should be told about them.
+
+Colours are linear Rec.709 already; positions are in the axes of the file unless a field says otherwise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from ..asset import Environment, Surfels
+
+Array = np.ndarray
+
+
+@dataclass(slots=True)
+class SurfelFile:
+    """Surfels of a file.
+
+    Attributes
+    ----------
+    surfels : activated values; axes as in the file (see formats.axes). Properties that no layout knows, and known
+        ones that a surfel cannot hold, are in ``surfels.extras``
+    layout : which program writes such files
+    unknown : properties of the file that the layout does not name
+    notes : what was converted, dropped or assumed
+    """
+
+    surfels: Surfels
+    layout: str
+    unknown: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+
+@dataclass(slots=True)
+class Image:
+    """A texture.
+
+    Attributes
+    ----------
+    pixels : (h, w, c) uint8, uint16 or float32, row 0 at the top; integers are fractions of their maximum
+    srgb : pixels are sRGB-encoded (else linear)
+    uv_transform : (2, 3) float64: texture coordinates = uv_transform @ (u, v, 1), v **up** (Blender's convention)
+    wrap : "repeat", "clamp" or "mirror" along u and v
+    """
+
+    pixels: Array
+    srgb: bool
+    uv_transform: Array = field(default_factory=lambda: np.eye(2, 3))
+    wrap: tuple[str, str] = ("repeat", "repeat")
+
+
+@dataclass(slots=True)
+class MaterialFile:
+    """A material: factors, times images where there are any.
+
+    Attributes
+    ----------
+    base_colour : linear Rec.709 factor
+    base_colour_image : RGB(A); multiplies base_colour
+    metallic_roughness_image : G is roughness, B is metallic (glTF); multiplies the factors; never sRGB
+    """
+
+    name: str
+    base_colour: tuple[float, float, float] = (0.8, 0.8, 0.8)
+    roughness: float = 0.5
+    metallic: float = 0.0
+    base_colour_image: Image | None = None
+    metallic_roughness_image: Image | None = None
+
+
+@dataclass(slots=True)
+class MeshFile:
+    """Triangles of a file with what is needed to look up their materials.
+
+    Attributes
+    ----------
+    vertices : (n, 3) float32
+    faces : (m, 3) int32
+    corner_normals : (m, 3, 3) float32 unit, or None
+    corner_uvs : (m, 3, 2) float32, v up (0 is the bottom row of an image), or None
+    face_material : (m,) int32 into `materials`, -1 without one
+    materials : list of MaterialFile
+    parts : (name, first face, one past the last face) of each named object or primitive
+    vertex_colours : (n, 3) linear factor on the base colour, or None
+    vertex_roughness, vertex_metallic : (n,) in [0, 1], used in place of the material's, or None
+    up_axis : "Z" where positions are known to be Z up (glTF is converted on reading), "unknown" else
+    notes : what was converted, dropped or assumed
+    """
+
+    vertices: Array
+    faces: Array
+    corner_normals: Array | None = None
+    corner_uvs: Array | None = None
+    face_material: Array | None = None
+    materials: list[MaterialFile] = field(default_factory=list)
+    parts: list[tuple[str, int, int]] = field(default_factory=list)
+    vertex_colours: Array | None = None
+    vertex_roughness: Array | None = None
+    vertex_metallic: Array | None = None
+    up_axis: Literal["Z", "unknown"] = "unknown"
+    notes: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.vertices = np.ascontiguousarray(self.vertices, dtype=np.float32).reshape(-1, 3)
+        self.faces = np.ascontiguousarray(self.faces, dtype=np.int32).reshape(-1, 3)
+        if self.face_material is None:
+            self.face_material = np.full(len(self.faces), 0 if self.materials else -1, np.int32)
+
+
+@dataclass(slots=True)
+class EnvironmentFile:
+    """Distant light of a file, converted to Blender's lat-long mapping.
+
+    Attributes
+    ----------
+    environment : linear radiance
+    layout : which program writes such files
+    notes : what was converted or assumed
+    """
+
+    environment: Environment
+    layout: str
+    notes: list[str] = field(default_factory=list)
+
+
+@dataclass(slots=True)
+class MaterialsFile:
+    """Materials one a vertex, without the mesh (NeRO).
+
+    Attributes
+    ----------
+    albedo, roughness, metallic : (n, 3), (n,), (n,) float32 in [0, 1], linear
+    """
+
+    albedo: Array
+    roughness: Array
+    metallic: Array
+    layout: str
+    notes: list[str] = field(default_factory=list)

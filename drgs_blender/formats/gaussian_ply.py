@@ -1,0 +1,336 @@
+"""Gaussian splats in PLY files, of every trainer in use, to activated surfels.
+
+One table says how to recognise each layout and how its raw values become physical ones. The table is in the order
+that never confuses two layouts. Sources: the public training code of each project.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..asset import Surfels
+from ..errors import AssetError
+from .axes import multiply_quaternions
+from .colour import srgb_to_linear
+from .files import SurfelFile
+from .ply import Header, Rows, read_ply
+
+Array = np.ndarray
+Columns = dict[str, Array]
+
+#: Zeroth spherical-harmonic basis function.
+SH_C0 = 0.28209479177387814
+#: A splat whose shortest axis is more than this part of the next one is not nearly a surfel.
+FLAT = 0.3
+#: Largest SH degree in use has 16 coefficients; more is damage.
+SH_LIMIT = 64
+
+
+def sigmoid(x: Array) -> Array:
+    """Logistic function, without overflow."""
+    return 0.5 * (1.0 + np.tanh(0.5 * x))
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """A material channel: properties it is read from and what turns raw values into [0, 1]."""
+
+    properties: tuple[str, ...]
+    activate: Callable[[Array], Array] = sigmoid
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """One row of the table.
+
+    Attributes
+    ----------
+    name : who writes it
+    has, lacks : properties that must and must not be there
+    albedo, roughness, metallic : channels, None where the file has none
+    srgb : the albedo is sRGB-encoded after activation
+    known : other properties whose meaning is known, as a regular expression (kept in the extras, not "unknown")
+    note : told to the user
+    """
+
+    name: str
+    has: tuple[str, ...] = ()
+    lacks: tuple[str, ...] = ()
+    albedo: Channel | None = None
+    roughness: Channel | None = None
+    metallic: Channel | None = None
+    srgb: bool = False
+    known: str = r"(?!)"
+    note: str = ""
+
+    def fits(self, names: set[str]) -> bool:
+        """Whether a file with these properties has this layout."""
+        return names.issuperset(self.has) and names.isdisjoint(self.lacks)
+
+
+def _three(prefix: str) -> tuple[str, ...]:
+    return tuple(f"{prefix}{i}" for i in range(3))
+
+
+_BASE_COLOUR = _three("base_color_")
+_PLAIN = Channel(_BASE_COLOUR)
+_NARROWED = Channel(_BASE_COLOUR, lambda x: 0.77 * sigmoid(x) + 0.03)
+_REF = {
+    "albedo": Channel(_three("ori_color_")),
+    "roughness": Channel(("roughness",)),
+    "metallic": Channel(("refl_strength",)),
+    "srgb": True,
+    "known": r"ind_(dc|rest|asg)_\d+|n[xyz]2|metalness|diffuse_color_\d",
+    "note": "albedo was trained in display space and is decoded from sRGB; refl_strength is the metallic",
+}
+
+#: Layouts in order of detection. GaussianMesh keeps its position relative to a face, see `_decode_face_positions`.
+LAYOUTS: tuple[Layout, ...] = (
+    Layout("Ref-Gaussian", has=("ind_asg_0", "refl_strength"), **_REF),  # type: ignore[arg-type]
+    Layout("Ref-Gaussian", has=("refl_strength",), **_REF),  # type: ignore[arg-type]
+    Layout(
+        "Ref-Gaussian in IRGS",
+        has=("ind_dc_0", "base_color_0"),
+        albedo=_PLAIN,
+        roughness=Channel(("roughness",)),
+        metallic=Channel(("metallic",)),
+        known=r"ind_(dc|rest)_\d+",
+    ),
+    Layout(
+        "Relightable 3D Gaussian",
+        has=("incidents_dc_0", "base_color_0"),
+        albedo=_NARROWED,
+        roughness=Channel(("roughness",), lambda x: 0.9 * sigmoid(x) + 0.09),
+        known=r"(incidents|visibility)_(dc|rest)_\d+",
+        note="has no metallic, 0 is used",
+    ),
+    Layout(
+        "GS-ROR2",
+        has=("albedo0",),
+        albedo=Channel(_three("albedo")),
+        roughness=Channel(("roughness",)),
+        metallic=Channel(("metallic",)),
+        known=r"(specular|diffuse)\d|n[xyz]2",
+    ),
+    Layout("GaussianMesh", has=("face_id", "ca", "cb", "cc"), known=r"c[abc]|v\d_?[xyz]|dis|v_index\d|radius|face_id"),
+    Layout(
+        "IRGS",
+        has=("base_color_0", "scale_1"),
+        lacks=("scale_2",),
+        albedo=_NARROWED,
+        roughness=Channel(("roughness",)),
+        known="metallic",
+        note="metallic is never trained there, 0 is used",
+    ),
+    Layout("2DGS", lacks=("scale_2",)),
+    Layout("3DGS"),
+)
+
+_GEOMETRY = ("x", "y", "z", "opacity", "scale_0", "scale_1", "rot_0", "rot_1", "rot_2", "rot_3")
+_REMEDY = "Export the point cloud again with the program that trained it"
+
+
+def is_gaussian(header: Header) -> bool:
+    """Whether a PLY header is that of Gaussian splats."""
+    vertex = header.element("vertex")
+    return vertex is not None and all(name in vertex for name in ("scale_0", "rot_0", "opacity"))
+
+
+def find_layout(names: set[str]) -> Layout:
+    """The layout of a file whose vertices have the properties `names`."""
+    return next(layout for layout in LAYOUTS if layout.fits(names))
+
+
+def read_gaussian_ply(path: Path) -> SurfelFile:
+    """Read Gaussian splats from the PLY file at `path`.
+
+    Raises
+    ------
+    AssetError
+        The file is damaged, lacks properties its layout needs, or is of a kind that cannot be decoded (Mani-GS).
+    """
+    header, elements = read_ply(path)
+    return decode_splats(header, elements.get("vertex"), str(path))
+
+
+def decode_splats(header: Header, rows: Rows | None, subject: str) -> SurfelFile:
+    """Turn the rows of the element ``vertex`` into activated surfels."""
+    if rows is None or rows.lists:
+        raise AssetError(subject, "has no element 'vertex' of plain numbers", _REMEDY)
+    columns = rows.columns
+    names = set(columns)
+    if missing := [n for n in _GEOMETRY if n not in names]:
+        raise AssetError(subject, f"is not a complete splat file: it lacks {', '.join(missing)}", _REMEDY)
+    layout = find_layout(names)
+    notes = [layout.note] if layout.note else []
+    used = {*_GEOMETRY}
+
+    def take(wanted: tuple[str, ...]) -> Array:
+        if missing := [n for n in wanted if n not in names]:
+            raise AssetError(subject, f"looks like {layout.name} but lacks {', '.join(missing)}", _REMEDY)
+        used.update(wanted)
+        return stack(columns, wanted)
+
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        centre = take(("x", "y", "z"))
+        opacity = sigmoid(columns["opacity"].astype(np.float32))
+        axes = np.exp(take(tuple(n for n in ("scale_0", "scale_1", "scale_2") if n in names)))
+        rotation = take(("rot_0", "rot_1", "rot_2", "rot_3"))
+        length = np.linalg.norm(rotation, axis=1, keepdims=True)
+        rotation = rotation / length
+        extras: dict[str, Array] = {}
+        if layout.name == "GaussianMesh":
+            centre, extras["barycentric"] = _decode_face_positions(columns, centre, notes)
+        sh = _harmonics(columns, names, used, subject)
+        material = {
+            "albedo": _albedo(layout, take, sh, notes),
+            "roughness": _scalar(layout.roughness, take, 0.5, len(centre)),
+            "metallic": _scalar(layout.metallic, take, 0.0, len(centre)),
+        }
+    if layout.roughness is None:
+        notes.append("has no materials: roughness 0.5 and metallic 0 are used")
+    if axes.shape[1] == 3:
+        rotation, axes = _flatten(rotation, axes, notes)
+    finite = np.ones(len(centre), bool)
+    for array in (centre, opacity, axes, rotation, *material.values(), *([] if sh is None else [sh])):
+        finite &= np.isfinite(array).reshape(len(array), -1).all(axis=1)
+    extras |= _extras(columns, names - used)
+    keep: Array | slice = slice(None)
+    if dropped := int(np.count_nonzero(~finite)):
+        keep = finite
+        notes.append(f"{dropped} of {len(finite)} splats dropped: NaN or infinite values")
+    unknown = sorted(n for n in names - used if not re.fullmatch(layout.known + r"|n[xyz]", n))
+    if unknown:
+        notes.append(f"{len(unknown)} unknown properties kept: {', '.join(unknown[:8])}{' ...' * (len(unknown) > 8)}")
+    surfels = Surfels(
+        centre[keep],
+        axes[keep],
+        rotation[keep],
+        opacity[keep],
+        **{name: array[keep] for name, array in material.items()},
+        sh=None if sh is None else sh[keep],
+        extras=_sanitised({name: array[keep] for name, array in extras.items()}, notes),
+    )
+    return SurfelFile(surfels, layout.name, unknown, notes)
+
+
+def stack(columns: Columns, names: tuple[str, ...]) -> Array:
+    """Columns side by side as (n, len(names)) float32."""
+    arrays = [columns[name] for name in names]
+    first = arrays[0]
+    result = np.empty((len(first), len(names)), np.float32)
+    if all(a.dtype == np.float32 and a.strides == first.strides for a in arrays) and all(
+        a.ctypes.data == first.ctypes.data + 4 * i for i, a in enumerate(arrays)
+    ):  # neighbours in the file: one pass over memory
+        result[:] = np.lib.stride_tricks.as_strided(first, result.shape, (*first.strides, 4), writeable=False)
+    else:
+        for i, array in enumerate(arrays):
+            result[:, i] = array
+    return result
+
+
+def _albedo(layout: Layout, take: Callable[[tuple[str, ...]], Array], sh: Array | None, notes: list[str]) -> Array:
+    """Linear albedo: the trained one, else the captured colour of the file (display-referred sRGB)."""
+    if layout.albedo is not None:
+        albedo = layout.albedo.activate(take(layout.albedo.properties))
+        return srgb_to_linear(albedo) if layout.srgb else albedo
+    if sh is None:
+        take(("f_dc_0", "f_dc_1", "f_dc_2"))  # names what is missing
+        raise AssertionError("unreachable: without f_dc the line above raises")
+    notes.append("albedo is the captured colour (SH DC, decoded from sRGB), with the light of the capture in it")
+    return srgb_to_linear(np.clip(0.5 + SH_C0 * sh[:, 0], 0.0, 1.0))
+
+
+def _scalar(channel: Channel | None, take: Callable[[tuple[str, ...]], Array], default: float, n: int) -> Array:
+    if channel is None:
+        return np.full(n, default, np.float32)
+    return channel.activate(take(channel.properties)[:, 0])
+
+
+def _harmonics(columns: Columns, names: set[str], used: set[str], subject: str) -> Array | None:
+    """(n, k, 3) spherical harmonics from f_dc and the channel-major f_rest, or None without f_dc."""
+    dc = ("f_dc_0", "f_dc_1", "f_dc_2")
+    if not names.issuperset(dc):
+        return None
+    rest = sorted((n for n in names if re.fullmatch(r"f_rest_\d+", n)), key=lambda n: int(n[7:]))
+    if len(rest) % 3 or rest != [f"f_rest_{i}" for i in range(len(rest))] or len(rest) > 3 * SH_LIMIT:
+        raise AssetError(subject, f"has {len(rest)} f_rest properties, which is no whole number of colours", _REMEDY)
+    used.update(dc, rest)
+    per_channel = len(rest) // 3
+    sh = np.empty((len(columns["x"]), 1 + per_channel, 3), np.float32)
+    sh[:, 0] = stack(columns, dc)
+    if rest:
+        sh[:, 1:] = stack(columns, tuple(rest)).reshape(-1, 3, per_channel).transpose(0, 2, 1)
+    return sh
+
+
+def _flatten(rotation: Array, axes: Array, notes: list[str]) -> tuple[Array, Array]:
+    """3D Gaussians to surfels: drop the shortest axis, which becomes the normal; the frame stays right-handed."""
+    shortest = np.argmin(axes, axis=1)
+    rows = np.arange(len(axes))
+    kept = np.stack([axes[rows, (shortest + 1) % 3], axes[rows, (shortest + 2) % 3]], axis=1)
+    # Rotations that carry X, Y, Z onto the axes (k + 1, k + 2, k) for the dropped axis k.
+    turn = np.array([[0.5, 0.5, 0.5, 0.5], [0.5, -0.5, -0.5, -0.5], [1, 0, 0, 0]], np.float32)[shortest]
+    with np.errstate(invalid="ignore"):
+        thick = int(np.count_nonzero(axes[rows, shortest] > FLAT * kept.min(axis=1)))
+    notes.append(
+        f"3D Gaussians: the shortest axis became the normal; {thick} of {len(axes)} were far from flat "
+        f"(shortest above {FLAT:g} of the next)"
+    )
+    if len(axes) and np.count_nonzero(shortest == 0) >= 0.999 * len(axes):
+        notes.append("the shortest axis is scale_0 throughout, as SuGaR writes it")
+    return multiply_quaternions(rotation, turn).astype(np.float32), kept
+
+
+def _decode_face_positions(columns: Columns, centre: Array, notes: list[str]) -> tuple[Array, Array]:
+    """GaussianMesh: softmax barycentric coordinates on a face, and an offset along its normal."""
+    logits = stack(columns, ("ca", "cb", "cc"))
+    weights = np.exp(logits - logits.max(axis=1, keepdims=True))
+    weights /= weights.sum(axis=1, keepdims=True)
+    corners = [next((c for c in _corner_names(k) if all(n in columns for n in c)), None) for k in (1, 2, 3)]
+    if any(c is None for c in corners) or "dis" not in columns or "radius" not in columns:
+        notes.append("lacks the corners of the faces: positions are taken as they are in the file")
+        return centre, weights
+    a, b, c = (stack(columns, names) for names in corners if names is not None)
+    normal = np.cross(b - a, c - a)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    offset = 4.0 * columns["radius"] * (sigmoid(columns["dis"]) - 0.5)
+    notes.append("positions decoded from the faces they hang on; face numbers and weights are in the extras")
+    return weights[:, :1] * a + weights[:, 1:2] * b + weights[:, 2:] * c + offset[:, None] * normal, weights
+
+
+def _corner_names(k: int) -> tuple[tuple[str, str, str], ...]:
+    return (f"v{k}x", f"v{k}y", f"v{k}z"), (f"v{k}_x", f"v{k}_y", f"v{k}_z"), (f"v{k}_0", f"v{k}_1", f"v{k}_2")
+
+
+def _extras(columns: Columns, names: set[str]) -> dict[str, Array]:
+    """Properties that a surfel cannot hold, numbered ones (a_0, a_1, ...) joined into one array."""
+    families: dict[str, list[tuple[int, str]]] = {}
+    for name in names:
+        match = re.fullmatch(r"(.*?)_?(\d{1,6})", name)
+        key, number = (match[1], int(match[2])) if match and match[1] else (name, 0)
+        families.setdefault(key, []).append((number, name))
+    extras: dict[str, Array] = {}
+    for key, members in sorted(families.items()):
+        ordered = tuple(name for _, name in sorted(members))
+        values = stack(columns, ordered)
+        if values.any():  # 3DGS and others write normals that are always zero
+            extras[key if len(ordered) > 1 else ordered[0]] = values if len(ordered) > 1 else values[:, 0]
+    if all(axis in extras for axis in ("nx", "ny", "nz")):
+        extras["normal"] = np.stack([extras.pop(axis) for axis in ("nx", "ny", "nz")], axis=1)
+    return extras
+
+
+def _sanitised(extras: dict[str, Array], notes: list[str]) -> dict[str, Array]:
+    """Extras with non-finite values set to 0, and said so."""
+    for name, values in extras.items():
+        bad = ~np.isfinite(values)
+        if bad.any():
+            notes.append(f"{int(bad.sum())} values of {name} that were NaN or infinite set to 0")
+            values[bad] = 0.0
+    return extras
