@@ -1,0 +1,165 @@
+"""Runs inside Blender for ``drgs render``: evaluates frames and sends their descriptions to the waiting parent.
+
+Started as a plain script, so nothing is imported from this package before the extension is enabled. What Blender
+prints goes to stderr; stdin and the original stdout become a link of engine.protocol, on which this side plays the
+client: LoadAsset for every asset, Render for every frame and view layer, Failed when something is wrong.
+"""
+
+from __future__ import annotations
+
+import importlib
+import io
+import json
+import os
+import sys
+import traceback
+from pathlib import Path
+from typing import Any
+
+READY = b"DRGS-BLENDER-READY\n"
+ENGINE = "DRGS_BATCH"
+
+
+def main() -> None:
+    """Do the job that the parent describes in one line of JSON."""
+    reader, writer = private_streams()
+    job = json.loads(read_line(reader))
+    package = enable_extension(job["repository"])
+    protocol = importlib.import_module(f"{package}.drgs_blender.engine.protocol")
+    errors = importlib.import_module(f"{package}.drgs_blender.errors")
+    version = importlib.import_module(f"{package}.drgs_blender.version").__version__
+    link = protocol.Link(reader, writer)
+    link.send(protocol.Hello(protocol.PROTOCOL, version, os.getpid()))
+    try:
+        render_frames(Exporter(link, package, protocol), job)
+        link.send(protocol.Shutdown())
+    except errors.DrgsError as error:
+        link.send(protocol.Failed(0, type(error).__name__, error.subject, error.problem, error.remedy))
+    except Exception as error:
+        # Reported to the parent, which ends the job; the traceback is in Blender's output (-v).
+        traceback.print_exc()
+        link.send(protocol.Failed(0, "DrgsError", "Blender", f"{type(error).__name__}: {error}", ""))
+
+
+def private_streams() -> tuple[io.FileIO, io.FileIO]:
+    """Take stdin and stdout for the link and point file descriptor 1, where Blender prints, at stderr."""
+    sys.stdout.flush()
+    writer = io.FileIO(os.dup(1), "w")
+    os.dup2(2, 1)
+    writer.write(b"\n" + READY)
+    return io.FileIO(os.dup(0), "r"), writer
+
+
+def read_line(reader: io.FileIO) -> bytes:
+    """One line, unbuffered: what follows it belongs to the link."""
+    line = bytearray()
+    while not line.endswith(b"\n"):
+        byte = reader.read(1)
+        if not byte:
+            raise EOFError("the parent is gone")
+        line += byte
+    return bytes(line)
+
+
+def enable_extension(repository: str | None) -> str:
+    """Enable DR-GS and return its package: from a local repository folder when given, else the installed one."""
+    import addon_utils
+    import bpy
+
+    installed = [m.__name__ for m in addon_utils.modules() if m.__name__.split(".")[-1] == "drgs"]
+    if repository:
+        for name in installed:
+            addon_utils.disable(name)
+        bpy.context.preferences.extensions.repos.new(name="drgs_job", module="drgs_job", custom_directory=repository)
+        addon_utils.extensions_refresh(ensure_wheels=False)
+        installed = ["bl_ext.drgs_job.drgs"]
+    if not installed:
+        raise RuntimeError("the extension DR-GS is not installed in this Blender")
+    if addon_utils.enable(installed[0]) is None:
+        raise RuntimeError(f"the extension {installed[0]} cannot be enabled; Blender's output says why")
+    return installed[0]
+
+
+class Exporter:
+    """Sends evaluated frames over the link and waits until the parent has dealt with each."""
+
+    def __init__(self, link: Any, package: str, protocol: Any) -> None:
+        self.link, self.protocol = link, protocol
+        self.export_frame = importlib.import_module(f"{package}.addon.export").export_frame
+        self.encode_frame = importlib.import_module(f"{package}.drgs_blender.engine.codec").encode_frame
+        self.sent = importlib.import_module(f"{package}.drgs_blender.engine.slots").SentSlots()
+        self.keys: dict[Path, str] = {}
+        self.requests = 0
+        self.error: Exception | None = None
+
+    def key_of(self, path: Path) -> str:
+        """The parent's key of the asset at `path`."""
+        if path not in self.keys:
+            self.requests += 1
+            self.keys[path] = self.ask(self.protocol.LoadAsset(self.requests, str(path))).key
+        return self.keys[path]
+
+    def ask(self, message: Any, arrays: dict[str, Any] | None = None) -> Any:
+        """Send a request and return the answer; end this process when the parent is gone."""
+        self.link.send(message, arrays)
+        answer = self.link.receive()
+        if answer is None:
+            os._exit(1)
+        return answer[0]
+
+    def send(self, depsgraph: Any) -> None:
+        """Describe the evaluated view layer."""
+        warnings: list[str] = []
+        frame, arrays = self.encode_frame(self.export_frame(depsgraph, self.key_of, warnings.append))
+        scene, layers = depsgraph.scene, [layer for layer in depsgraph.scene.view_layers if layer.use]
+        slots, changed = self.sent.changes(arrays)
+        self.requests += 1
+        description = {
+            "number": scene.frame_current,
+            "layer": depsgraph.view_layer.name if len(layers) > 1 else "",
+            "warnings": warnings,
+            "frame": frame,
+        }
+        self.ask(self.protocol.Render(self.requests, description, slots), changed)
+
+
+def render_frames(exporter: Exporter, job: dict[str, Any]) -> None:
+    """Evaluate every frame as a final render does: render visibility, render levels, handlers, each view layer."""
+    import bpy
+
+    class BatchEngine(bpy.types.RenderEngine):
+        """Hands the evaluated scene on; the picture is made and written elsewhere."""
+
+        bl_idname = ENGINE
+        bl_label = "DR-GS batch"
+        bl_use_postprocess = False
+
+        def render(self, depsgraph: Any) -> None:
+            try:
+                if exporter.error is None:
+                    exporter.send(depsgraph)
+            except Exception as error:
+                # Blender prints and forgets what is raised here; it is raised again below.
+                exporter.error = error
+
+    bpy.ops.wm.open_mainfile(filepath=job["scene"], load_ui=False, use_scripts=job["scripts"])
+    bpy.utils.register_class(BatchEngine)
+    try:
+        scene = bpy.context.scene
+        scene.render.engine = ENGINE
+        scene.render.use_compositing = scene.render.use_sequencer = False
+        scene.render.use_persistent_data = True
+        for number in job["frames"]:
+            scene.frame_current = number
+            bpy.ops.render.render()
+            if exporter.error:
+                raise exporter.error
+    finally:
+        bpy.utils.unregister_class(BatchEngine)
+
+
+if __name__ == "__main__":
+    main()
+    # Nothing is left to save, and the exit of some Blender versions hangs or crashes after a render.
+    sys.stderr.flush()
+    os._exit(0)

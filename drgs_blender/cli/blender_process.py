@@ -1,0 +1,163 @@
+"""Blender as a child process that evaluates frames for ``drgs render`` (the other side is blender_job)."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import shutil
+import subprocess
+import tempfile
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..engine import protocol
+from ..engine.codec import decode_frame
+from ..engine.protocol import Link, ProtocolError
+from ..engine.slots import HeldSlots
+from ..errors import ERROR_CLASSES, DeviceError, DrgsError, EngineError, VersionError
+from ..frame import Frame
+from ..version import __version__
+from .blender_job import READY
+from .find_blender import Blender, extension_source
+
+logger = logging.getLogger(__name__)
+
+#: One evaluated view layer: frame number, layer ("" when there is only one), description, warnings of the export.
+Evaluated = tuple[int, str, Frame, list[str]]
+
+
+class BlenderProcess:
+    """A running Blender; a context manager, at whose end it is gone with all it left.
+
+    Parameters
+    ----------
+    blender : which Blender
+    job : what it should do, JSON-able: ``scene``, ``frames``, ``scripts``
+    key_of : gives the engine's key of the asset at a path
+    """
+
+    def __init__(self, blender: Blender, job: dict[str, Any], key_of: Callable[[Path], str]) -> None:
+        self._blender, self._job, self._key_of = blender, job, key_of
+        self._words: deque[str] = deque(maxlen=50)
+        self._held = HeldSlots()
+
+    def __enter__(self) -> BlenderProcess:
+        self._folder = tempfile.mkdtemp(prefix="drgs-")
+        source = extension_source()
+        repository = self._repository(source) if source else None
+        command = self._blender.command(Path(__file__).with_name("blender_job.py"))
+        pipe = subprocess.PIPE
+        try:
+            self._process = subprocess.Popen(command, bufsize=0, stdin=pipe, stdout=pipe, stderr=pipe)
+        except OSError as error:
+            shutil.rmtree(self._folder, ignore_errors=True)
+            raise DeviceError(f"Blender at {self._blender.program}", f"does not start ({error})") from error
+        self._listener = threading.Thread(target=self._listen, daemon=True)
+        self._listener.start()
+        self._link = Link(self._process.stdout, self._process.stdin)  # type: ignore[arg-type]
+        try:
+            self._greet(self._job | {"repository": repository})
+        except BaseException:
+            self.__exit__()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.kill()
+        self._process.wait()
+        self._listener.join(5)
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+    def frames(self) -> Iterator[Evaluated]:
+        """Evaluated view layers in the order of the job; Blender goes on when the next one is asked for.
+
+        Raises
+        ------
+        DrgsError
+            What Blender's side reports; EngineError when it died.
+        """
+        while True:
+            message, arrays = self._receive()
+            if isinstance(message, protocol.Shutdown):
+                return
+            if isinstance(message, protocol.LoadAsset):
+                self._link.send(protocol.Loaded(message.id, self._key_of(Path(message.path)), 0, 0))
+            elif isinstance(message, protocol.Render):
+                yield self._evaluated(message, arrays)
+                self._link.send(protocol.Result(message.id, [], {}))
+            else:
+                raise EngineError("Blender", f"sent {type(message).__name__}, which makes no sense here", "Try again")
+
+    def _repository(self, source: Path) -> str:
+        """A local extension repository that holds this package's own extension, so that both are one version."""
+        target = Path(self._folder) / "drgs"
+        try:
+            target.symlink_to(source, target_is_directory=True)
+        except OSError as error:
+            logger.debug("no symbolic links (%s): the extension is copied", error)
+            target.mkdir()
+            for part in ("__init__.py", "blender_manifest.toml"):
+                shutil.copy2(source / part, target / part)
+            for part in ("addon", "operators", "drgs_blender"):
+                shutil.copytree(source / part, target / part, ignore=shutil.ignore_patterns("__pycache__"))
+        return self._folder
+
+    def _greet(self, job: dict[str, Any]) -> None:
+        stream = self._process.stdout
+        assert stream is not None and self._process.stdin is not None
+        with contextlib.suppress(BrokenPipeError):  # the end of stdout tells what happened
+            self._process.stdin.write(json.dumps(job).encode() + b"\n")
+        while (line := stream.readline()) != READY:
+            if not line:
+                raise DeviceError(f"Blender at {self._blender.program}", f"does not start: {self._epitaph()}")
+            self._note(line)
+        message, _ = self._receive()
+        if not isinstance(message, protocol.Hello) or not protocol.same_version(message):
+            version = getattr(message, "version", "unknown")
+            remedy = "Install the same version of both"
+            raise VersionError("DR-GS extension", f"is version {version}, drgs is {__version__}", remedy)
+
+    def _receive(self) -> tuple[Any, dict[str, np.ndarray]]:
+        try:
+            received = self._link.receive()
+        except (ProtocolError, OSError) as error:
+            raise EngineError("Blender", f"stopped in the middle of a message ({error})", self._epitaph()) from error
+        if received is None:
+            raise EngineError("Blender", f"ended before the job: {self._epitaph()}", "Try again; -v shows its output")
+        message = received[0]
+        if isinstance(message, protocol.Failed):
+            raise ERROR_CLASSES.get(message.error, DrgsError)(message.subject, message.problem, message.remedy)
+        return received
+
+    def _evaluated(self, message: protocol.Render, sent: dict[str, np.ndarray]) -> Evaluated:
+        arrays, missing = self._held.update(message.slots, sent)
+        if missing:
+            raise EngineError("Blender", f"did not send {missing[0]}", "Try again")
+        about = message.frame
+        return about["number"], about["layer"], decode_frame(about["frame"], arrays), about["warnings"]
+
+    def _listen(self) -> None:
+        """Gather what Blender prints: shown with -vv, and its last words when it dies."""
+        assert self._process.stderr is not None
+        for line in self._process.stderr:
+            self._note(line)
+
+    def _note(self, line: bytes) -> None:
+        text = line.decode("utf-8", "replace").rstrip()
+        if text:
+            self._words.append(text)
+            logger.debug("blender: %s", text)
+
+    def _epitaph(self) -> str:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(5)
+        self._listener.join(2)
+        code = self._process.poll()
+        end = "it closed its pipe" if code is None else f"exit code {code}"
+        return f"{end}, last words: {self._words[-1][:300] if self._words else 'none'}"

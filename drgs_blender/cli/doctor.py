@@ -1,0 +1,168 @@
+"""Check what DR-GS needs on this computer: versions, Embree, OpenEXR, the engine, Blender, folders, variables.
+
+Exit code 0 when rendering works, 69 when something essential is missing; each problem comes with its remedy.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.metadata
+import json
+import os
+import platform
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from ..errors import EXIT_NO_DEVICE, EXIT_OK, DeviceError, DrgsError
+from ..version import __version__
+
+EXAMPLES = """examples:
+  drgs doctor
+  drgs doctor --json
+  DRGS_BLENDER=/opt/blender/blender drgs doctor
+"""
+
+#: Earlier versions have known holes that a damaged file can use.
+OPENEXR_MINIMUM = (3, 4, 10)
+_REINSTALL = "Install it again: pip install --upgrade drgs-blender"
+
+
+@dataclass(slots=True)
+class Finding:
+    """The outcome of one check: ``state`` is "ok", "absent" (optional, not there) or "missing" (essential)."""
+
+    name: str
+    state: str
+    detail: str
+    remedy: str = ""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``drgs doctor``."""
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.add_argument("--blender", metavar="PATH", help="blender program, or a Python that has bpy")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Check everything, print what was found."""
+    findings = [check(name, essential, test, args) for name, essential, test in CHECKS]
+    healthy = all(finding.state != "missing" for finding in findings)
+    if args.json:
+        print(json.dumps({"healthy": healthy, "checks": [asdict(finding) for finding in findings]}, indent=2))
+    else:
+        for finding in findings:
+            print(f"{finding.state:8} {finding.name:12} {finding.detail}")
+            if finding.remedy:
+                print(f"{'':22}{finding.remedy}")
+        print("DR-GS can render here." if healthy else "DR-GS cannot render here until what is missing is there.")
+    return EXIT_OK if healthy else EXIT_NO_DEVICE
+
+
+def check(name: str, essential: bool, test: Callable[[argparse.Namespace], str], args: argparse.Namespace) -> Finding:
+    """Run one test; what it raises becomes the finding."""
+    state = "missing" if essential else "absent"
+    try:
+        return Finding(name, "ok", test(args))
+    except DrgsError as error:
+        return Finding(name, state, f"{error.subject}: {error.problem}", error.remedy)
+    except ImportError as error:
+        return Finding(name, state, str(error), _REINSTALL)
+    except OSError as error:
+        return Finding(name, state, str(error), "Check the path and its permissions")
+
+
+def python(args: argparse.Namespace) -> str:
+    """Interpreter and version of DR-GS."""
+    return f"{platform.python_version()} at {sys.executable}, drgs {__version__}, {platform.platform(terse=True)}"
+
+
+def numba(args: argparse.Namespace) -> str:
+    """Numba and its threads."""
+    from ..jit import numba
+
+    return f"{numba.__version__}, {numba.config.NUMBA_NUM_THREADS} threads, layer {numba.config.THREADING_LAYER}"
+
+
+def cache(args: argparse.Namespace) -> str:
+    """Whether compiled kernels can be kept."""
+    from ..jit import cache_folder
+
+    folder = cache_folder()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        remedy = "Set DRGS_CACHE_DIR to a folder that can be written; without one kernels compile at every start"
+        raise DeviceError(f"kernel cache {folder}", error.strerror or str(error), remedy) from error
+    return str(folder)
+
+
+def embree(args: argparse.Namespace) -> str:
+    """Embree, loaded as the renderer loads it."""
+    from ..render.embree import library
+
+    return f"embreex {importlib.metadata.version('embreex')}, {Path(library()._name).name}"
+
+
+def openexr(args: argparse.Namespace) -> str:
+    """OpenEXR of a safe version."""
+    import OpenEXR
+
+    version = importlib.metadata.version("OpenEXR")
+    if tuple(int(part) for part in version.split(".")[:3] if part.isdigit()) < OPENEXR_MINIMUM:
+        minimum = ".".join(map(str, OPENEXR_MINIMUM))
+        raise DeviceError("OpenEXR", f"is {version}, older than {minimum}", "Run: pip install --upgrade OpenEXR")
+    return f"{version} at {Path(OpenEXR.__file__).parent}"
+
+
+def engine(args: argparse.Namespace) -> str:
+    """Start an engine process as the extension does, and shake hands."""
+    from ..engine.client import EngineClient, engine_command, locate_engine
+
+    command = locate_engine() if os.environ.get("DRGS_ENGINE") else engine_command(sys.executable)
+    with EngineClient(command) as client:
+        client.start()
+        return f"answers, {command[0]}"
+
+
+def blender(args: argparse.Namespace) -> str:
+    """A Blender for `drgs render`."""
+    from .find_blender import find_blender
+
+    found = find_blender(args.blender)
+    return f"{found.version()}, {found.program} ({found.origin})"
+
+
+def torch(args: argparse.Namespace) -> str:
+    """PyTorch, which relighting does not need."""
+    try:
+        return importlib.metadata.version("torch")
+    except importlib.metadata.PackageNotFoundError:
+        raise DeviceError(
+            "torch", "is not installed", "Only reconstruction needs it: drgs-blender[reconstruct]"
+        ) from None
+
+
+def variables(args: argparse.Namespace) -> str:
+    """What the environment sets."""
+    return (
+        ", ".join(f"{name}={value}" for name, value in sorted(os.environ.items()) if name.startswith("DRGS_")) or "none"
+    )
+
+
+#: name, essential?, test
+CHECKS: tuple[tuple[str, bool, Callable[[argparse.Namespace], str]], ...] = (
+    ("Python", True, python),
+    ("Numba", True, numba),
+    ("kernel cache", False, cache),
+    ("Embree", True, embree),
+    ("OpenEXR", True, openexr),
+    ("engine", True, engine),
+    ("Blender", False, blender),
+    ("torch", False, torch),
+    ("variables", False, variables),
+)

@@ -1,0 +1,69 @@
+"""The lines a farm's worker reads from ``drgs render``: Fra:, Saved:, Time:, skipping; one at least every 30 s."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+HEARTBEAT_SECONDS = 30.0
+#: Between two progress lines of one frame.
+PROGRESS_SECONDS = 5.0
+
+
+class FrameLines:
+    """Prints to stdout; a context manager that keeps a heartbeat going.
+
+    The words "Error:", "Exception:" and "Warning" never occur in benign lines: strict workers fail a task on them.
+    """
+
+    def __init__(self, heartbeat: float = HEARTBEAT_SECONDS, interval: float = PROGRESS_SECONDS) -> None:
+        self._heartbeat, self._interval = heartbeat, interval
+        self._lock = threading.Lock()
+        self._ended = threading.Event()
+        self._last = self._started = time.monotonic()
+        self._doing = "Fra:- | Starting Blender"
+
+    def __enter__(self) -> FrameLines:
+        self._thread = threading.Thread(target=self._beat, daemon=True)
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        self._thread.join()
+
+    def begin(self, frame: int) -> None:
+        """A frame's description arrived."""
+        self._started = time.monotonic()
+        self._say(f"Fra:{frame} | Rendering | Sample 0/100", doing=True)
+
+    def progress(self, frame: int, phase: str, fraction: float) -> None:
+        """Where the picture stands; most calls print nothing."""
+        self._doing = f"Fra:{frame} | {phase.capitalize()} | Sample {int(100 * min(max(fraction, 0), 1))}/100"
+        if time.monotonic() - self._last >= self._interval:
+            self._say(self._doing)
+
+    def saved(self, path: object) -> None:
+        """A frame is on disk and verified."""
+        minutes, seconds = divmod(time.monotonic() - self._started, 60)
+        self._say(f"Saved: '{path}'\n Time: {int(minutes):02d}:{seconds:05.2f}")
+
+    def skipped(self, path: object) -> None:
+        """A frame is there already, complete and of the same settings."""
+        self._say(f"skipping existing frame '{path}'")
+
+    def note(self, text: str) -> None:
+        """Something the user should know that does not stop the job."""
+        self._say(f"Note: {text}")
+
+    def _say(self, line: str, doing: bool = False) -> None:
+        with self._lock:
+            if doing:
+                self._doing = line
+            self._last = time.monotonic()
+            print(line, flush=True)
+
+    def _beat(self) -> None:
+        while not self._ended.wait(min(1.0, self._heartbeat / 4)):
+            if time.monotonic() - self._last >= self._heartbeat:
+                self._say(self._doing)

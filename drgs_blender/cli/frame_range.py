@@ -1,0 +1,67 @@
+"""Which frames to render, and the file of each: ``1-24x2,30`` and ``out/####.exr``."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from ..errors import UsageError
+
+_TERM = re.compile(r"(?P<first>-?\d+)(?:-(?P<last>-?\d+)(?:[x:](?P<step>-?\d+))?)?")
+#: Far beyond any shot; a mistyped range must not fill the memory.
+MOST_FRAMES = 1_000_000
+
+
+def parse_frames(text: str) -> list[int]:
+    """Expand a frame range.
+
+    Parameters
+    ----------
+    text : str
+        Terms separated by commas: ``7``, ``1-24``, every second frame ``1-24x2`` or ``1-24:2``, downwards
+        ``24-1x-2``. Numbers may be negative: ``-5--1``.
+
+    Returns
+    -------
+    list of int
+        In the order written, each frame once.
+
+    Raises
+    ------
+    UsageError
+        Naming the term that cannot be used.
+    """
+    frames: dict[int, None] = {}
+    for term in text.replace(" ", "").split(","):
+        match = _TERM.fullmatch(term)
+        if not match:
+            raise UsageError(f"frame range {text!r}", f"{term!r} is not a frame or a range", "Write it as 1-24x2,30")
+        first = int(match["first"])
+        last = int(match["last"] or first)
+        step = int(match["step"] or 1)
+        if step == 0:
+            raise UsageError(f"frame range {text!r}", f"{term!r} has a step of 0", "Use a step of at least 1")
+        count = (last - first) // step + 1
+        if count < 1:
+            raise UsageError(f"frame range {text!r}", f"{term!r} is empty", "A range that runs down needs a step x-1")
+        if len(frames) + count > MOST_FRAMES:
+            raise UsageError(f"frame range {text!r}", f"has more than {MOST_FRAMES} frames", "Split it")
+        frames.update(dict.fromkeys(range(first, first + count * step, step)))
+    return list(frames)
+
+
+def frame_path(template: str, frame: int) -> Path:
+    """Path of a frame: the last run of ``#`` in the file's name becomes the number, padded with zeros."""
+    folder, name = Path(template).parent, Path(template).name
+    runs = list(re.finditer("#+", name))
+    if not runs:
+        return folder / name
+    start, end = runs[-1].span()
+    number = f"{'-' if frame < 0 else ''}{abs(frame):0{end - start}d}"
+    return folder / (name[:start] + number + name[end:])
+
+
+def check_template(template: str, frames: list[int]) -> None:
+    """Refuse a template that would write several frames to one file."""
+    if len(frames) > 1 and "#" not in Path(template).name:
+        raise UsageError(f"--out {template}", "has no # for the frame's number", "Write it as out/####.exr")

@@ -1,0 +1,64 @@
+"""Frames on disk: which are there already and may stay, and writing the others."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from ..asset.container import digest_asset
+from ..engine.codec import encode_frame
+from ..errors import AssetError
+from ..frame import Frame
+from ..passes import BY_NAME
+from ..render.frames import read_frame, write_frame
+from ..version import __version__
+
+logger = logging.getLogger(__name__)
+
+#: Name of the settings hash in a frame's metadata.
+SETTINGS = "settings"
+
+
+def settings_hash(frame: Frame, assets: Mapping[str, Path]) -> str:
+    """SHA-256 over all that decides what the picture is.
+
+    That is the description of the frame down to the last vertex, the content of its assets, and the version of DR-GS;
+    not the number of threads.
+
+    Parameters
+    ----------
+    assets : path of the asset behind each ``ObjectState.asset``
+    """
+    description, arrays = encode_frame(frame)
+    del description["settings"]["threads"]
+    for state in description["objects"]:
+        state["asset"] = digest_asset(assets[state["asset"]])
+    digest = hashlib.sha256(json.dumps([__version__, description], sort_keys=True).encode())
+    for slot, array in sorted(arrays.items()):
+        digest.update(f"{slot} {array.dtype.str} {array.shape}".encode())
+        digest.update(np.ascontiguousarray(array).reshape(-1).view(np.uint8))
+    return digest.hexdigest()
+
+
+def is_complete(path: Path, frame: Frame, settings: str) -> bool:
+    """Whether `path` is a frame that decodes, has the right size and passes, and was made with these settings."""
+    if not path.is_file():
+        return False
+    try:
+        pictures, metadata = read_frame(path)
+    except AssetError as error:
+        logger.info("rendered again: %s", error)
+        return False
+    x0, y0, x1, y1 = frame.camera.window
+    expected = {name: (y1 - y0, x1 - x0, len(BY_NAME[name].channels)) for name in frame.passes}
+    return metadata.get(SETTINGS) == settings and {name: p.shape for name, p in pictures.items()} == expected
+
+
+def save(path: Path, pictures: Mapping[str, np.ndarray], frame: Frame, number: int, settings: str) -> None:
+    """Write a frame; WriteError when it cannot be written and read back."""
+    write_frame(path, dict(pictures), {SETTINGS: settings, "frame": str(number), "seed": str(frame.settings.seed)})

@@ -1,0 +1,143 @@
+"""Say what a file holds: a .drgs asset, a mesh, surfels or splats, an environment, or a rendered EXR frame.
+
+The kind is found from the content, not from the name.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import AssetError
+
+EXAMPLES = """examples:
+  drgs inspect helmet.drgs
+  drgs inspect capture.ply --json
+  drgs inspect frames/0001.exr
+"""
+
+_ZIP = b"PK\x03\x04"
+_EXR = b"\x76\x2f\x31\x01"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``drgs inspect``."""
+    parser.add_argument("file", type=Path, metavar="FILE", help="any file that DR-GS reads or writes")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the description."""
+    report = {"file": str(args.file), **inspect_file(args.file)}
+    print(json.dumps(report, indent=2, allow_nan=False) if args.json else "\n".join(as_lines(report)))
+    return 0
+
+
+def inspect_file(path: Path) -> dict[str, Any]:
+    """Describe a file with JSON-able values; ``kind`` says what it is.
+
+    Raises
+    ------
+    AssetError
+        The file cannot be read or is of no known kind.
+    """
+    try:
+        with path.open("rb") as stream:
+            magic = stream.read(4)
+    except OSError as error:
+        raise AssetError(str(path), f"cannot be read ({error.strerror})", "Check the path") from error
+    if magic == _ZIP and path.suffix.lower() == ".drgs":
+        from ..asset.container import inspect_asset
+
+        return {"kind": "asset", **inspect_asset(path)}
+    if magic == _EXR and (frame := inspect_frame(path)):
+        return frame
+    from ..formats.registry import read
+
+    found = read(path)
+    return {"kind": type(found).__name__.removesuffix("File").lower(), **describe(found)}
+
+
+def inspect_frame(path: Path) -> dict[str, Any] | None:
+    """Describe a frame written by DR-GS; None when the EXR was written by another program."""
+    from ..render.frames import read_frame
+
+    try:
+        pictures, metadata = read_frame(path)
+    except AssetError:
+        return None
+    if "Combined" not in pictures:
+        return None
+    height, width = pictures["Combined"].shape[:2]
+    passes = {name: summary(picture) for name, picture in pictures.items()}
+    return {"kind": "frame", "width": width, "height": height, "passes": passes, "metadata": dict(metadata)}
+
+
+def summary(array: np.ndarray) -> dict[str, Any]:
+    """Shape, type and range of an array; ``not_finite`` counts NaN and infinities where there are any."""
+    result: dict[str, Any] = {"shape": list(array.shape), "dtype": array.dtype.name}
+    if array.size and array.dtype.kind in "fiu":
+        finite = np.isfinite(array)
+        bad = int(array.size - np.count_nonzero(finite))
+        if bad:
+            result["not_finite"] = bad
+        if bad < array.size:
+            values = array if not bad else array[finite]
+            result["range"] = [float(values.min()), float(values.max())]
+    return result
+
+
+def describe(value: Any) -> Any:
+    """JSON-able description of what a reader returned: dataclasses by field, arrays by `summary`."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: describe(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if isinstance(value, np.ndarray):
+        return summary(value)
+    if isinstance(value, dict):
+        return {str(key): describe(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [describe(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    return value if isinstance(value, bool | int | float | str | None) else str(value)
+
+
+def as_lines(value: Any, depth: int = 0) -> Iterator[str]:
+    """Indented lines for a person; short lists and array summaries stay on one line."""
+    pad = "  " * depth
+    items = value.items() if isinstance(value, dict) else enumerate(value)
+    for key, item in items:
+        if isinstance(item, dict) and "shape" in item and "dtype" in item:
+            low_high = " from {:.4g} to {:.4g}".format(*item["range"]) if item.get("range") else ""
+            bad = f", {item['not_finite']} not finite" if item.get("not_finite") else ""
+            yield f"{pad}{key}: {' x '.join(map(str, item['shape']))} {item['dtype']}{low_high}{bad}"
+        elif isinstance(item, dict | list) and item and not is_short(item):
+            yield f"{pad}{key}:"
+            yield from as_lines(item, depth + 1)
+        elif isinstance(item, list):
+            yield f"{pad}{key}: {', '.join(plain(part) for part in item) or 'none'}"
+        else:
+            yield f"{pad}{key}: {plain(item)}"
+
+
+def is_short(value: Any) -> bool:
+    """Whether a list fits a line."""
+    return isinstance(value, list) and len(value) <= 16 and not any(isinstance(item, dict | list) for item in value)
+
+
+def plain(value: Any) -> str:
+    """A value as a person writes it."""
+    if value is None or value == {}:
+        return "none"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,158 @@
+"""The `drgs` command: one table of commands, shared options, exit codes.
+
+Exit codes are those of `drgs_blender.errors` (0 done, 64 usage, 65 bad asset, 69 something missing, 70 internal,
+73 cannot write, 75 may work when repeated, 78 version mismatch), 130 and 143 when interrupted or terminated.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import logging
+import signal
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NoReturn
+
+from .. import errors
+from ..version import __version__
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """One command: its name, the module of this package that implements it, one line of help.
+
+    The module has ``EXAMPLES`` (text under --help), ``add_arguments(parser)`` and ``run(args) -> int``, and imports
+    what computes only inside ``run``.
+    """
+
+    name: str
+    module: str
+    about: str
+
+
+COMMANDS: tuple[Command, ...] = (
+    Command("make", "make", "make an asset from a textured mesh"),
+    Command("import", "import_surfels", "make an asset from captured surfels or splats"),
+    Command("inspect", "inspect_file", "say what a file holds: asset, mesh, surfels, environment or rendered frame"),
+    Command("relight", "relight", "render an asset under an environment, without Blender"),
+    Command("render", "render", "render frames of a .blend file through Blender"),
+    Command("doctor", "doctor", "check what DR-GS needs and say what is missing"),
+)
+
+#: Exit code -> word in the last line of ``drgs render``, which farms parse.
+EXIT_CLASSES = {
+    errors.EXIT_OK: "ok",
+    errors.EXIT_USAGE: "usage",
+    errors.EXIT_BAD_ASSET: "bad-asset",
+    errors.EXIT_NO_DEVICE: "no-device",
+    errors.EXIT_INTERNAL: "internal",
+    errors.EXIT_CANNOT_WRITE: "cannot-write",
+    errors.EXIT_RETRY: "retry",
+    errors.EXIT_VERSION: "version",
+    130: "interrupted",
+    143: "terminated",
+}
+
+
+class Parser(argparse.ArgumentParser):
+    """An argument parser whose errors end with exit code 64, as farms expect, and not 2."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print usage and the problem, and leave."""
+        self.print_usage(sys.stderr)
+        self.exit(errors.EXIT_USAGE, f"{self.prog}: {message}\n")
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The parser of the whole command line, from the table."""
+    shared = Parser(add_help=False)
+    group = shared.add_argument_group("messages")
+    group.add_argument("-v", "--verbose", action="count", default=argparse.SUPPRESS, help="more messages; -vv for all")
+    group.add_argument("-q", "--quiet", action="store_true", default=argparse.SUPPRESS, help="errors only")
+    group.add_argument(
+        "--progress",
+        action=argparse.BooleanOptionalAction,
+        default=argparse.SUPPRESS,
+        help="progress bars on stderr; default: only on a terminal",
+    )
+    parser = Parser(
+        prog="drgs",
+        description="Captured objects as 2D Gaussian surfels, deformed and relit.",
+        epilog="`drgs COMMAND --help` shows the options of a command, with examples.",
+        parents=[shared],
+    )
+    parser.add_argument("--version", action="version", version=f"drgs {__version__}")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    for command in COMMANDS:
+        module = importlib.import_module(f".{command.module}", __package__)
+        sub = commands.add_parser(
+            command.name,
+            help=command.about,
+            description=module.__doc__,
+            epilog=module.EXAMPLES,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+            parents=[shared],
+        )
+        module.add_arguments(sub)
+        sub.set_defaults(run=module.run)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit code."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    code = run_command(arguments)
+    command = next((word for word in arguments if not word.startswith("-")), None)
+    if command == "render" and not {"-h", "--help"} & set(arguments):
+        # Farms read this last line.
+        print(f"DRGS_EXIT class={EXIT_CLASSES.get(code, 'internal')}", flush=True)
+    return code
+
+
+def run_command(arguments: Sequence[str]) -> int:
+    """Parse and run; every way to end becomes an exit code here."""
+    verbose = 0
+    try:
+        args = build_parser().parse_args(arguments)
+        verbose = getattr(args, "verbose", 0)
+        args.verbose, args.quiet = verbose, getattr(args, "quiet", False)
+        args.progress = getattr(args, "progress", None)
+        set_up_logging(verbose, args.quiet)
+        previous = signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+        try:
+            return args.run(args)
+        finally:
+            signal.signal(signal.SIGTERM, previous)
+    except errors.DrgsError as error:
+        print(f"drgs: {error}", file=sys.stderr)
+        return error.exit_code
+    except (KeyboardInterrupt, errors.Cancelled):
+        print("drgs: interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        sys.stdout = None  # the reader left; nothing may be flushed at exit
+        return 141
+    except SystemExit as ending:
+        return ending.code if isinstance(ending.code, int) else errors.EXIT_OK
+    except Exception as error:
+        # The one place where any exception ends: a user gets a sentence, -v a traceback, a farm its exit code.
+        logger.info("internal error", exc_info=True)
+        hint = "" if verbose else " Run again with -v for details and report it."
+        print(f"drgs: internal: {type(error).__name__}: {error}.{hint}", file=sys.stderr)
+        return errors.EXIT_INTERNAL
+
+
+def set_up_logging(verbose: int, quiet: bool) -> None:
+    """Messages go to stderr: warnings by default, errors with -q, information with -v, all with -vv."""
+    level = logging.ERROR if quiet else [logging.WARNING, logging.INFO, logging.DEBUG][min(verbose, 2)]
+    logging.basicConfig(level=level, format="drgs: %(message)s", stream=sys.stderr, force=True)
+    for noisy in ("numba", "PIL", "trimesh"):
+        logging.getLogger(noisy).setLevel(max(level, logging.WARNING))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,84 @@
+"""Where a command writes: checked before work starts, written in one step."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import UsageError, WriteError
+
+
+def check_suffix(path: Path, suffixes: tuple[str, ...]) -> None:
+    """Refuse an output whose extension is not one of `suffixes`."""
+    if path.suffix.lower() not in suffixes:
+        raise UsageError(f"--out {path}", f"does not end in {' or '.join(suffixes)}", "Choose such a name")
+
+
+def check_writable(path: Path) -> None:
+    """Make the folder of `path` and prove that a file can be written there; a long job must not find out last.
+
+    Raises
+    ------
+    WriteError
+        Naming the path and the system's reason.
+    """
+    if path.is_dir():
+        raise WriteError(str(path), "is a folder", "Choose the name of a file")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=".drgs-"):
+            pass
+    except OSError as error:
+        raise _cannot_write(path, error) from error
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A temporary path beside `path` that takes its place when the block ends well and vanishes when not."""
+    check_writable(path)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=".drgs-", suffix=path.suffix)
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        yield temporary
+        temporary.chmod(0o666 & ~_umask())
+        temporary.replace(path)
+    except OSError as error:
+        raise _cannot_write(path, error) from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_preview(path: Path, combined: np.ndarray) -> None:
+    """Write a picture to look at.
+
+    Parameters
+    ----------
+    path : PNG file
+    combined : (h, w, 4) float32, linear Rec.709, premultiplied alpha; written as 8-bit sRGB, straight alpha, clipped
+        to [0, 1]. Nothing else is done to it: view transforms belong to Blender.
+    """
+    from PIL import Image
+
+    alpha = np.clip(np.nan_to_num(combined[..., 3:4]), 0, 1)
+    linear = np.clip(np.nan_to_num(combined[..., :3]) / np.maximum(alpha, 1e-6), 0, 1)
+    srgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    pixels = (np.concatenate([srgb, alpha], axis=-1) * 255 + 0.5).astype(np.uint8)
+    with replacing(path) as temporary:
+        Image.fromarray(pixels, "RGBA").save(temporary)
+
+
+def _cannot_write(path: Path, error: OSError) -> WriteError:
+    reason = error.strerror or str(error)
+    return WriteError(str(path), f"cannot be written ({reason})", "Check the folder, its permissions and free space")
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

@@ -1,0 +1,124 @@
+"""Render an asset under an environment, without Blender: one picture, from a camera in a JSON file.
+
+The camera file holds matrix_world (4 rows of 4 numbers, camera to world, Blender's convention: looks down -Z, Y up),
+width, height, and fov_x in degrees or fx, fy, cx, cy in pixels; optionally orthographic, clip_start, clip_end.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import math
+import time
+from pathlib import Path
+
+import numpy as np
+
+from ..asset import Asset
+from ..errors import UsageError
+from ..frame import Frame, ObjectState, RenderSettings, World
+from . import sampling
+from .camera_file import read_camera
+from .output import check_suffix, check_writable, write_preview
+from .progress import FractionBar
+
+logger = logging.getLogger(__name__)
+
+EXAMPLES = """examples:
+  drgs relight helmet.drgs --env studio.hdr --camera front.json --out helmet.exr
+  drgs relight helmet.drgs --env city.exr --env-rotation 90 --camera front.json --rays 128 --denoise svgf \\
+      --passes all --transparent --out helmet.exr
+  drgs relight robot.drgs --env city.exr --camera front.json --vertices pose.npy --out pose.png
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``drgs relight``."""
+    parser.add_argument("asset", type=Path, metavar="ASSET", help=".drgs file")
+    parser.add_argument("--camera", type=Path, required=True, metavar="CAMERA.json", help="camera")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="EXR frame, or PNG to look at")
+    light = parser.add_argument_group("light")
+    light.add_argument("--env", type=Path, help="lat-long environment (EXR, HDR); default: the asset's own")
+    light.add_argument(
+        "--env-rotation", type=_finite, default=0.0, metavar="DEG", help="Rotation Z of a World Mapping node, degrees"
+    )
+    light.add_argument("--env-strength", type=_finite, default=1.0, metavar="S", help="factor on the environment")
+    parser.add_argument(
+        "--vertices", type=Path, metavar="V.npy", help="pose: (n, 3) array, the mesh's vertices in object space, metres"
+    )
+    sampling.add_arguments(parser, defaults=True)
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"{text} is not a finite number")
+    return value
+
+
+def run(args: argparse.Namespace) -> int:
+    """Render one picture."""
+    check_suffix(args.out, (".exr", ".png"))
+    camera = read_camera(args.camera)
+    settings = sampling.override(RenderSettings(), args)
+    vertices = read_vertices(args.vertices) if args.vertices else None
+    check_writable(args.out)
+
+    from ..engine.session import Session
+    from ..render.frames import write_frame
+
+    session = Session()
+    key = session.load_asset(args.asset)
+    frame = Frame(
+        number=1,
+        camera=camera,
+        objects=[ObjectState(name=args.asset.stem, asset=key, vertices=vertices)],
+        world=World(
+            read_environment(args, session.asset(key)), rotation_z(args.env_rotation), strength=args.env_strength
+        ),
+        settings=settings,
+        passes=args.passes,
+    )
+    started = time.perf_counter()
+    with FractionBar(args, "rendering") as progress:
+        picture = session.render(frame, progress)
+    for warning in picture.warnings:
+        logger.warning("%s", warning)
+    logger.info("rendered in %.2f s", time.perf_counter() - started)
+    if args.out.suffix.lower() == ".png":
+        write_preview(args.out, picture["Combined"])
+    else:
+        write_frame(args.out, picture, {"asset": key})
+    return 0
+
+
+def read_vertices(path: Path) -> np.ndarray:
+    """Read a pose; only its form is checked here, its length against the asset by the engine."""
+    subject = f"--vertices {path}"
+    try:
+        array = np.load(path, allow_pickle=False)
+    except OSError as error:
+        raise UsageError(subject, f"cannot be read ({error.strerror or error})", "Check the path") from error
+    except ValueError as error:
+        raise UsageError(subject, f"is not a .npy file of plain numbers ({error})") from error
+    if not isinstance(array, np.ndarray) or array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in "fiu":
+        shape = getattr(array, "shape", "no shape")
+        raise UsageError(subject, f"has shape {shape}, expected (n, 3) numbers", "Save the vertices as one array")
+    return np.ascontiguousarray(array, dtype=np.float32)
+
+
+def read_environment(args: argparse.Namespace, asset: Asset) -> np.ndarray:
+    """Radiance of the light, (h, w, 3): from a file, or what the asset brought along."""
+    if args.env:
+        from ..formats.registry import read_environment
+
+        return read_environment(args.env).radiance
+    if asset.environment is None:
+        raise UsageError(str(args.asset), "holds no environment", "Give one with --env")
+    return asset.environment.radiance
+
+
+def rotation_z(degrees: float) -> np.ndarray:
+    """What Rotation Z of a Mapping node does to a direction: (3, 3)."""
+    cos, sin = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    return np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])

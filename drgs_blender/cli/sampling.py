@@ -1,0 +1,84 @@
+"""Options of the solution of a frame, shared by ``relight`` and ``render``."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from typing import Any, get_args, get_type_hints
+
+from ..errors import UsageError
+from ..frame import RenderSettings, split_rays
+from ..passes import BY_NAME, PASSES
+
+
+def add_arguments(parser: argparse.ArgumentParser, *, defaults: bool) -> None:
+    """Add the sampling options; without `defaults` an absent option stays None and the scene decides."""
+    settings, hints = RenderSettings(), get_type_hints(RenderSettings)
+    group = parser.add_argument_group("solution" if defaults else "solution (default: what the scene says)")
+
+    def add(flag: str, field: str, about: str, **options: Any) -> None:
+        default = settings.rays if field == "rays" else getattr(settings, field)
+        about += f"; default {default}" if defaults else ""
+        group.add_argument(flag, dest=field, default=default if defaults else None, help=about, **options)
+
+    def choices(field: str) -> tuple[str, ...]:
+        return get_args(hints[field])
+
+    add("--rays", "rays", "rays a pixel: half by cosine, a quarter GGX, a quarter environment", type=_whole(1, 65536))
+    add("--bounces", "bounces", "indirect bounces", type=_whole(0, 64))
+    add("--aa", "aa", "sub-pixel positions among which the rays are divided", type=_whole(1, 1024))
+    add("--primary", "primary", "what the camera sees: surfels or the mesh", choices=choices("primary"))
+    add("--denoise", "denoise", "denoiser", choices=choices("denoise"))
+    add("--look", "look", "material model", choices=choices("look"))
+    add("--seed", "seed", "seed of the noise", type=_whole(0, 2**31 - 1))
+    add("--threads", "threads", "threads, 0 for all cores", type=_whole(0, 1024))
+    group.add_argument(
+        "--transparent",
+        dest="film_transparent",
+        action=argparse.BooleanOptionalAction,
+        default=False if defaults else None,
+        help="leave the background transparent",
+    )
+    group.add_argument(
+        "--passes",
+        type=passes,
+        default=("Combined",) if defaults else None,
+        metavar="NAMES",
+        help=f"passes to write, separated by commas, or `all`: {', '.join(p.name for p in PASSES)}",
+    )
+
+
+def _whole(low: int, high: int) -> Any:
+    def parse(text: str) -> int:
+        value = int(text)
+        if not low <= value <= high:
+            raise argparse.ArgumentTypeError(f"{value} is not from {low} to {high}")
+        return value
+
+    parse.__name__ = "whole number"
+    return parse
+
+
+def passes(text: str) -> tuple[str, ...]:
+    """``Combined,Depth`` or ``all`` -> names of the pass table, in its order; Combined is always among them."""
+    if text == "all":
+        return tuple(BY_NAME)
+    known = {name.lower(): name for name in BY_NAME}
+    wanted = {"Combined"}
+    for word in text.split(","):
+        if word.strip().lower() not in known:
+            raise argparse.ArgumentTypeError(f"there is no pass {word.strip()!r}; there are {', '.join(BY_NAME)}")
+        wanted.add(known[word.strip().lower()])
+    return tuple(name for name in BY_NAME if name in wanted)
+
+
+def override(settings: RenderSettings, args: argparse.Namespace) -> RenderSettings:
+    """`settings` with every option that was given."""
+    names = ("bounces", "aa", "primary", "denoise", "look", "seed", "threads", "film_transparent")
+    given = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
+    if args.rays is not None:
+        given |= dict(zip(("cosine", "ggx", "environment"), split_rays(args.rays), strict=True))
+    result = replace(settings, **given)
+    if result.aa > result.rays:
+        raise UsageError("--aa", f"{result.aa} is more than the {result.rays} rays of a pixel", "Use more rays or less")
+    return result

@@ -1,0 +1,220 @@
+"""The command table, exit codes, output files, farm lines."""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from drgs_blender import errors
+from drgs_blender.cli import main as command_line
+from drgs_blender.cli import sampling
+from drgs_blender.cli.find_blender import find_blender
+from drgs_blender.cli.frame_lines import FrameLines
+from drgs_blender.cli.main import COMMANDS, EXIT_CLASSES, main
+from drgs_blender.cli.output import check_writable, replacing, write_preview
+from drgs_blender.frame import RenderSettings
+from drgs_blender.passes import BY_NAME
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=lambda c: c.name)
+def test_help_shows_examples(command, capsys):
+    assert main([command.name, "--help"]) == 0
+    text = capsys.readouterr().out
+    assert f"examples:\n  drgs {command.name}" in text
+    assert "DRGS_EXIT" not in text.splitlines()[-1]
+
+
+def test_every_exit_code_has_a_class():
+    codes = {value for name, value in vars(errors).items() if name.startswith("EXIT_")}
+    assert codes <= set(EXIT_CLASSES)
+    assert len(set(EXIT_CLASSES.values())) == len(EXIT_CLASSES)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [],
+        ["nonsense"],
+        ["relight"],
+        ["relight", "a.drgs", "--camera", "c.json", "--out", "o.exr", "--rays", "0"],
+        ["relight", "a.drgs", "--camera", "c.json", "--out", "o.exr", "--rays", "many"],
+        ["relight", "a.drgs", "--camera", "c.json", "--out", "o.exr", "--passes", "Combined,Beauty"],
+        ["relight", "a.drgs", "--camera", "c.json", "--out", "o.exr", "--env-strength", "nan"],
+        ["relight", "a.drgs", "--camera", "no.json", "--out", "o.exr"],
+        ["relight", "a.drgs", "--camera", "no.json", "--out", "o.jpeg"],
+        ["make", "a.glb", "--out", "a.zip"],
+    ],
+)
+def test_usage_errors_exit_64(arguments, capsys):
+    assert main(arguments) == errors.EXIT_USAGE
+    assert capsys.readouterr().err.strip()
+
+
+@pytest.mark.parametrize(
+    ("raised", "code"),
+    [
+        (errors.AssetError("a.drgs", "is damaged", "Restore it"), 65),
+        (errors.WriteError("o.exr", "cannot be written"), 73),
+        (errors.VersionError("engine", "is older"), 78),
+        (errors.EngineError("engine", "died"), 75),
+        (errors.Cancelled(), 130),
+        (KeyboardInterrupt(), 130),
+        (SystemExit(143), 143),
+        (RuntimeError("surprise"), 70),
+    ],
+)
+def test_every_end_of_a_command_has_its_exit_code(monkeypatch, capsys, raised, code):
+    from drgs_blender.cli import render
+
+    def fail(args):
+        raise raised
+
+    monkeypatch.setattr(render, "run", fail)
+    assert main(["render", "s.blend", "--frames", "1", "--out", "o.exr"]) == code
+    out, err = capsys.readouterr()
+    assert out.splitlines()[-1] == f"DRGS_EXIT class={EXIT_CLASSES[code]}"
+    assert "Traceback" not in err
+
+
+def test_traceback_of_an_unexpected_error_only_when_asked(monkeypatch, capsys):
+    from drgs_blender.cli import doctor
+
+    monkeypatch.setattr(doctor, "run", lambda args: 1 // 0)
+    assert main(["doctor"]) == errors.EXIT_INTERNAL
+    plain = capsys.readouterr().err
+    assert "ZeroDivisionError" in plain and "Traceback" not in plain
+    assert main(["-v", "doctor"]) == errors.EXIT_INTERNAL
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_render_refuses_before_it_starts_anything(tmp_path, capsys):
+    out = str(tmp_path / "####.exr")
+    scene = tmp_path / "s.blend"
+    assert main(["render", str(scene), "--frames", "1-2", "--out", out]) == errors.EXIT_BAD_ASSET
+    scene.touch()
+    assert main(["render", str(scene), "--frames", "1-x", "--out", out]) == errors.EXIT_USAGE
+    assert main(["render", str(scene), "--frames", "1-2", "--out", str(tmp_path / "a.exr")]) == errors.EXIT_USAGE
+    assert main(["render", str(scene), "--frames", "1", "--out", str(scene / "a.exr")]) == errors.EXIT_CANNOT_WRITE
+    absent = ["--blender", str(tmp_path / "blender")]
+    assert main(["render", str(scene), "--frames", "1", "--out", out, *absent]) == errors.EXIT_USAGE
+    assert [line.split("=")[1] for line in capsys.readouterr().out.splitlines()] == [
+        "bad-asset", "usage", "usage", "cannot-write", "usage"
+    ]  # fmt: skip
+
+
+def test_reader_that_leaves_is_not_an_error_message():
+    program = "import sys; from drgs_blender.cli.main import main; sys.exit(main(['doctor', '--help']))"
+    process = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    process.stdout.close()
+    err = process.stderr.read()
+    process.stderr.close()
+    process.wait(60)
+    assert b"Traceback" not in err
+
+
+def test_blender_variable_that_leads_nowhere_is_said(monkeypatch, tmp_path):
+    monkeypatch.setenv("DRGS_BLENDER", str(tmp_path / "gone"))
+    with pytest.raises(errors.DeviceError, match="DRGS_BLENDER"):
+        find_blender()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="uses a shell script as a program")
+def test_blender_that_does_not_start_is_said(tmp_path):
+    fake = tmp_path / "blender"
+    fake.write_text("#!/bin/sh\necho 'libX11.so.6: cannot open shared object file' >&2\nexit 127\n")
+    fake.chmod(0o755)
+    with pytest.raises(errors.DeviceError, match=r"libX11\.so\.6"):
+        find_blender(str(fake)).version()
+
+
+def options(arguments: list[str], defaults: bool):
+    parser = command_line.Parser()
+    sampling.add_arguments(parser, defaults=defaults)
+    return parser.parse_args(arguments)
+
+
+def test_defaults_are_those_of_the_settings():
+    assert sampling.override(RenderSettings(), options([], True)) == RenderSettings()
+
+
+def test_only_given_options_override_the_scene():
+    scene = RenderSettings(cosine=1, ggx=2, environment=3, bounces=4, aa=5, look="paper", film_transparent=True, seed=9)
+    assert sampling.override(scene, options([], False)) == scene
+    changed = sampling.override(scene, options(["--rays", "64", "--no-transparent"], False))
+    assert (changed.cosine, changed.ggx, changed.environment) == (32, 16, 16)
+    assert (changed.film_transparent, changed.look, changed.seed, changed.bounces) == (False, "paper", 9, 4)
+
+
+def test_more_positions_than_rays_is_refused():
+    with pytest.raises(errors.UsageError, match="--aa"):
+        sampling.override(RenderSettings(), options(["--rays", "4", "--aa", "8"], True))
+
+
+def test_pass_names():
+    assert sampling.passes("all") == tuple(BY_NAME)
+    assert sampling.passes("depth, NORMAL") == ("Combined", "Depth", "Normal")
+
+
+def test_preview_is_srgb_with_straight_alpha(tmp_path):
+    combined = np.zeros((1, 4, 4), np.float32)
+    combined[0, 0] = (0.5, 0.5, 0.5, 1)  # IEC 61966-2-1: 0.5 -> 187.5
+    combined[0, 1] = (0.25, 0, 0, 0.5)  # premultiplied red 0.5
+    combined[0, 2] = (9, 9, 9, 1)
+    combined[0, 3] = (np.nan, 0, 0, 0)
+    write_preview(tmp_path / "p.png", combined)
+    pixels = np.asarray(Image.open(tmp_path / "p.png"))
+    assert pixels[0].tolist() == [[188, 188, 188, 255], [188, 0, 0, 128], [255, 255, 255, 255], [0, 0, 0, 0]]
+
+
+def test_output_replaces_only_when_the_block_ends_well(tmp_path):
+    path = tmp_path / "sub" / "a.txt"
+    with replacing(path) as temporary:
+        temporary.write_text("first")
+        assert not path.exists()
+    with pytest.raises(ZeroDivisionError), replacing(path) as temporary:
+        temporary.write_text("second")
+        raise ZeroDivisionError
+    assert path.read_text() == "first"
+    assert [p.name for p in path.parent.iterdir()] == ["a.txt"]
+
+
+def test_unwritable_output_is_found_before_the_work(tmp_path):
+    (tmp_path / "file").touch()
+    for path in (tmp_path / "file" / "o.exr", tmp_path):
+        with pytest.raises(errors.WriteError):
+            check_writable(path)
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
+def test_farm_lines_parse_and_stay_benign(capsys):
+    with FrameLines(interval=0) as lines:
+        lines.begin(12)
+        lines.progress(12, "tracing", 0.4)
+        lines.saved("out/0012.exr")
+        lines.skipped("out/0013.exr")
+    text = capsys.readouterr().out
+    # What Deadline and Flamenco look for.
+    assert re.findall(r"^Fra:.*Sample\s(\d+)/(\d+)$", text, re.M) == [("0", "100"), ("40", "100")]
+    assert re.search(r"^Saved: '(.+)'$", text, re.M)[1] == "out/0012.exr"
+    assert re.search(r"Time: \d\d:\d\d\.\d\d$", text, re.M)
+    assert "skipping existing frame" in text
+    assert not re.search(r"Error:|Exception:|Warning", text)
+
+
+def test_heartbeat_while_nothing_is_said(monkeypatch):
+    stream = io.StringIO()
+    monkeypatch.setattr(sys, "stdout", stream)
+    with FrameLines(heartbeat=0.05) as lines:
+        lines.begin(3)
+        deadline = time.monotonic() + 10
+        while stream.getvalue().count("Fra:3") < 3 and time.monotonic() < deadline:
+            time.sleep(0.01)
+    assert stream.getvalue().count("Fra:3 | Rendering | Sample 0/100") >= 3
