@@ -1,0 +1,90 @@
+"""The .drgs file behind an object: where it lies and what its rest mesh is."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from pathlib import Path
+
+import bpy
+
+from ..drgs_blender.asset import Asset
+from ..drgs_blender.asset.container import read_asset
+from ..drgs_blender.errors import AssetError
+from .preferences import ROOT
+
+#: (path, mtime_ns, size) -> asset, arrays memory-mapped. A changed file gets a new key; `forget` empties it.
+_open: dict[tuple[str, int, int], Asset] = {}
+
+
+def is_drgs(obj: bpy.types.Object | None) -> bool:
+    """Whether `obj` is a mesh object with a DR-GS asset."""
+    return obj is not None and obj.type == "MESH" and obj.drgs.asset is not None
+
+
+def anchor(path: Path) -> bpy.types.Volume:
+    """The Volume datablock that holds `path`; one per file. The path is relative once the .blend is saved."""
+    for volume in bpy.data.volumes:
+        if not volume.library and volume.filepath and _same(bpy.path.abspath(volume.filepath), path):
+            return volume
+    volume = bpy.data.volumes.new(path.name)
+    volume.filepath = str(path)
+    if bpy.data.filepath:
+        try:
+            volume.filepath = bpy.path.relpath(str(path))
+        except ValueError:  # another drive on Windows: there is no relative path
+            volume.filepath = str(path)
+    return volume
+
+
+def file_of(obj: bpy.types.Object) -> Path:
+    """Path of the asset on disk; a packed one is written to the extension's folder first.
+
+    Raises
+    ------
+    AssetError
+        The file does not exist; names the object and the path.
+    """
+    volume = obj.original.drgs.asset
+    if volume.packed_file:
+        return _unpack(volume)
+    path = Path(bpy.path.abspath(volume.filepath, library=volume.library))
+    if not path.is_file():
+        raise AssetError(
+            f'Object "{obj.name}"',
+            f"the asset {path} does not exist",
+            "Choose File > External Data > Find Missing Files, or set the path in Object Data > DR-GS",
+        )
+    return path
+
+
+def load(path: Path) -> Asset:
+    """The asset at `path`, memory-mapped and cached until the file changes."""
+    stat = path.stat()
+    key = (str(path), stat.st_mtime_ns, stat.st_size)
+    if key not in _open:
+        for stale in [k for k in _open if k[0] == key[0]]:
+            del _open[stale]
+        _open[key] = read_asset(path, verify=False)
+    return _open[key]
+
+
+def forget() -> None:
+    """Close every asset."""
+    _open.clear()
+
+
+def _unpack(volume: bpy.types.Volume) -> Path:
+    """Write a packed asset to a file named by its content, once."""
+    data = volume.packed_file.data
+    folder = Path(bpy.utils.extension_path_user(ROOT, path="packed", create=True))
+    path = folder / f"{hashlib.sha256(data).hexdigest()}.drgs"
+    if not path.is_file():
+        partial = path.with_suffix(f".{os.getpid()}.part")
+        partial.write_bytes(data)
+        partial.replace(path)
+    return path
+
+
+def _same(first: str, second: Path) -> bool:
+    return os.path.normcase(os.path.realpath(first)) == os.path.normcase(os.path.realpath(second))

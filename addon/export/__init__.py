@@ -1,0 +1,5 @@
+"""An evaluated scene -> the Frame the engine renders."""
+
+from .frame import export_frame
+
+__all__ = ["export_frame"]

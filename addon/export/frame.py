@@ -1,0 +1,53 @@
+"""Compose a Frame from camera, objects, world and settings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import bpy
+
+from ...drgs_blender.errors import UsageError
+from ...drgs_blender.frame import Camera, Frame
+from .. import preferences
+from ..passes import enabled
+from .camera import export_camera
+from .objects import export_objects
+from .world import export_world
+
+
+def export_frame(
+    depsgraph: bpy.types.Depsgraph,
+    key_of: Callable[[Path], str],
+    warn: Callable[[str], None],
+    camera: Camera | None = None,
+) -> Frame:
+    """Describe the frame that `depsgraph` was evaluated for.
+
+    Parameters
+    ----------
+    key_of : gives the engine's key of the asset at a path
+    warn : told of everything that cannot be rendered as the scene has it
+    camera : replaces the scene's camera
+
+    Raises
+    ------
+    UsageError
+        There is no camera, or it cannot be rendered.
+    AssetError
+        From `export_objects`.
+    """
+    scene = depsgraph.scene_eval
+    if camera is None:
+        if scene.camera is None:
+            raise UsageError(f'Scene "{scene.name}"', "has no camera", "Add a camera, or make one active with Ctrl 0")
+        camera = export_camera(scene.camera.evaluated_get(depsgraph), scene.render)
+    settings = scene.drgs
+    return Frame(
+        number=scene.frame_current if settings.use_animated_seed else 0,
+        camera=camera,
+        objects=export_objects(depsgraph, key_of, warn),
+        world=export_world(scene.world, warn),
+        settings=settings.to_settings(scene.render.film_transparent, preferences.read("threads", 0)),
+        passes=tuple(p.name for p in enabled(depsgraph.view_layer)),
+    )

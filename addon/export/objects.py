@@ -1,0 +1,135 @@
+"""DR-GS objects of an evaluated scene -> frame.ObjectState, one for each visible instance."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+from ...drgs_blender.asset import MATERIAL_CHANNELS, Asset
+from ...drgs_blender.errors import AssetError
+from ...drgs_blender.frame import ObjectState
+from .. import assets, mesh_arrays
+
+Warn = Callable[[str], None]
+#: Gives the engine's key of the asset at a path.
+KeyOf = Callable[[Path], str]
+
+#: Object types with a surface that a picture without them would lack.
+SURFACES = {"MESH", "CURVE", "SURFACE", "META", "FONT", "CURVES", "POINTCLOUD", "VOLUME"}
+#: Modifiers that move vertices and never change their number.
+DEFORMING = {
+    *("ARMATURE", "CAST", "CURVE", "DISPLACE", "HOOK", "LAPLACIANDEFORM", "LATTICE", "MESH_DEFORM", "SHRINKWRAP"),
+    *("SIMPLE_DEFORM", "SMOOTH", "CORRECTIVE_SMOOTH", "LAPLACIANSMOOTH", "SURFACE_DEFORM", "WARP", "WAVE"),
+    *("VOLUME_DISPLACE", "CLOTH", "COLLISION", "SOFT_BODY", "SURFACE", "MESH_CACHE", "MESH_SEQUENCE_CACHE"),
+    *("DATA_TRANSFER", "NORMAL_EDIT", "WEIGHTED_NORMAL", "UV_PROJECT", "UV_WARP", "VERTEX_WEIGHT_EDIT"),
+    *("VERTEX_WEIGHT_MIX", "VERTEX_WEIGHT_PROXIMITY", "DYNAMIC_PAINT", "PARTICLE_SYSTEM"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Visible:
+    """One visible instance: an evaluated object and where it stands."""
+
+    object: bpy.types.Object
+    matrix_world: np.ndarray
+
+
+def visible(depsgraph: bpy.types.Depsgraph) -> Iterator[Visible]:
+    """Everything with a surface that the view layer shows, instances included. Valid during the iteration only."""
+    for instance in depsgraph.object_instances:
+        obj = instance.object
+        if obj.type in SURFACES and instance.show_self:
+            yield Visible(obj, np.array(instance.matrix_world, np.float64))
+
+
+def export_objects(depsgraph: bpy.types.Depsgraph, key_of: KeyOf, warn: Warn) -> list[ObjectState]:
+    """All visible DR-GS objects; other surfaces are counted in one warning.
+
+    Raises
+    ------
+    AssetError
+        An asset is missing, or the evaluated mesh does not have the asset's vertices; names object and modifiers.
+    """
+    states: list[ObjectState] = []
+    shapes: dict[tuple[int, int], ObjectState] = {}
+    others: set[str] = set()
+    for item in visible(depsgraph):
+        obj = item.object
+        if not assets.is_drgs(obj):
+            others.add(obj.name)
+            continue
+        shape_of = (obj.original.as_pointer(), obj.data.as_pointer())
+        if shape_of not in shapes:
+            shapes[shape_of] = _shape(obj, depsgraph, key_of, warn)
+        states.append(replace(shapes[shape_of], matrix_world=item.matrix_world, pass_index=obj.pass_index))
+    if others:
+        names = ", ".join(sorted(others)[:3]) + (", ..." if len(others) > 3 else "")
+        warn(f"{len(others)} other object(s) are not rendered by DR-GS: {names}")
+    return states
+
+
+def _shape(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, key_of: KeyOf, warn: Warn) -> ObjectState:
+    """What all instances of an object share."""
+    path = assets.file_of(obj)
+    asset = assets.load(path)
+    # While a mesh is edited, its evaluated data is a wrapper without arrays; a converted copy has them.
+    editing = obj.mode == "EDIT"
+    mesh = obj.to_mesh(preserve_all_data_layers=True, depsgraph=depsgraph) if editing else obj.data
+    try:
+        if len(mesh.vertices) != len(asset.mesh.vertices):
+            raise _wrong_count(obj, len(mesh.vertices), len(asset.mesh.vertices))
+        return ObjectState(
+            name=obj.name,
+            asset=key_of(path),
+            vertices=mesh_arrays.read_vertices(mesh),
+            corner_normals=_corner_normals(obj, mesh, asset, warn),
+            **{channel: _edited(obj, mesh, asset, channel, warn) for channel in MATERIAL_CHANNELS},
+        )
+    finally:
+        if editing:
+            obj.to_mesh_clear()
+
+
+def _corner_normals(obj: bpy.types.Object, mesh: bpy.types.Mesh, asset: Asset, warn: Warn) -> np.ndarray | None:
+    """Normals per corner where the mesh has flat, sharp or custom ones; smooth ones the engine makes itself."""
+    if mesh.normals_domain == "POINT":
+        return None
+    triangles = mesh_arrays.read_triangles(mesh)
+    if triangles is None or not np.array_equal(triangles, asset.mesh.faces):
+        warn(f'"{obj.name}": its faces are not those of the asset, so it is shaded smooth')
+        return None
+    return mesh_arrays.read_corner_normals(mesh)
+
+
+def _edited(obj: bpy.types.Object, mesh: bpy.types.Mesh, asset: Asset, channel: str, warn: Warn) -> np.ndarray | None:
+    """A material channel where it differs from the asset's, else None."""
+    try:
+        values = mesh_arrays.read_channel(mesh, channel)
+    except TypeError as error:
+        warn(f'"{obj.name}": attribute {channel} is {error}; the asset\'s values are used')
+        return None
+    if values is None or np.array_equal(values, getattr(asset.mesh, channel)):
+        return None
+    return values
+
+
+def _wrong_count(obj: bpy.types.Object, found: int, expected: int) -> AssetError:
+    subject = f'Object "{obj.name}"'
+    source = obj.original
+    if len(source.data.vertices) != expected:
+        return AssetError(
+            subject,
+            f"its mesh has {len(source.data.vertices)} vertices, the asset {expected}",
+            "Undo the edit that added or removed vertices, or import the asset again",
+        )
+    suspects = [m.name for m in source.modifiers if m.show_render and m.type not in DEFORMING]
+    named = "modifier " + " or ".join(f'"{name}"' for name in suspects) if suspects else "a modifier"
+    return AssetError(
+        subject,
+        f"{named} changes the number of vertices from {expected} to {found}",
+        "Remove it, or disable it for renders",
+    )

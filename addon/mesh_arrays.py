@@ -1,0 +1,102 @@
+"""Blender meshes to and from numpy arrays, all through bulk access."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+
+from ..drgs_blender.asset import MATERIAL_CHANNELS, Mesh
+
+Array = np.ndarray
+
+#: Material channel -> (attribute data type, its value property, values an element).
+ATTRIBUTES = {
+    name: ("FLOAT_COLOR", "color", 4) if width == 3 else ("FLOAT", "value", 1)
+    for name, width in MATERIAL_CHANNELS.items()
+}
+
+
+def new_mesh(name: str, source: Mesh) -> bpy.types.Mesh:
+    """A Blender mesh with exactly the triangles of `source` in their order, smooth, with material attributes."""
+    mesh = bpy.data.meshes.new(name)
+    faces = len(source.faces)
+    mesh.vertices.add(len(source.vertices))
+    mesh.attributes["position"].data.foreach_set("vector", source.vertices.ravel())
+    mesh.loops.add(3 * faces)
+    mesh.loops.foreach_set("vertex_index", source.faces.ravel())
+    mesh.polygons.add(faces)
+    mesh.polygons.foreach_set("loop_start", np.arange(0, 3 * faces, 3, dtype=np.int32))
+    for channel in MATERIAL_CHANNELS:
+        write_channel(mesh, channel, getattr(source, channel))
+    for group, members in source.groups.items():
+        mask = np.zeros(len(source.vertices), bool)
+        mask[members] = True
+        mesh.attributes.new(group, "BOOLEAN", "POINT").data.foreach_set("value", mask)
+    mesh.attributes.default_color_name = mesh.attributes.active_color_name = "albedo"
+    mesh.update(calc_edges=True)
+    mesh.shade_smooth()
+    return mesh
+
+
+def write_channel(mesh: bpy.types.Mesh, channel: str, values: Array) -> None:
+    """Set the point attribute of a material channel, (n, 3) or (n,) float32."""
+    kind, prop, width = ATTRIBUTES[channel]
+    attribute = mesh.attributes.get(channel)
+    if attribute is not None and (attribute.data_type, attribute.domain) != (kind, "POINT"):
+        mesh.attributes.remove(attribute)
+        attribute = None
+    if attribute is None:
+        attribute = mesh.attributes.new(channel, kind, "POINT")
+    if width == 4:
+        values = np.column_stack((values, np.ones(len(values), np.float32)))
+    attribute.data.foreach_set(prop, np.ascontiguousarray(values, np.float32).ravel())
+
+
+def read_channel(mesh: bpy.types.Mesh, channel: str) -> Array | None:
+    """The point attribute of a material channel, linear and clamped to [0, 1]; None where there is none.
+
+    Raises
+    ------
+    TypeError
+        The attribute exists with a domain or type that is no value per vertex.
+    """
+    attribute = mesh.attributes.get(channel)
+    if attribute is None:
+        return None
+    _, prop, width = ATTRIBUTES[channel]
+    kinds = ("FLOAT_COLOR", "BYTE_COLOR") if width == 4 else ("FLOAT",)
+    if attribute.domain != "POINT" or attribute.data_type not in kinds:
+        raise TypeError(f"{attribute.data_type} on {attribute.domain}, expected {kinds[0]} on POINT")
+    values = np.empty(len(mesh.vertices) * width, np.float32)
+    attribute.data.foreach_get(prop, values)
+    if width == 4:
+        values = np.ascontiguousarray(values.reshape(-1, 4)[:, :3])
+    return np.clip(np.nan_to_num(values, copy=False), 0, 1, out=values)
+
+
+def read_vertices(mesh: bpy.types.Mesh) -> Array:
+    """(n, 3) float32 positions in object space."""
+    vertices = np.empty((len(mesh.vertices), 3), np.float32)
+    if len(vertices):
+        mesh.attributes["position"].data.foreach_get("vector", vertices.ravel())
+    return vertices
+
+
+def read_triangles(mesh: bpy.types.Mesh) -> Array | None:
+    """(m, 3) int32 vertices of every polygon, or None where one is no triangle."""
+    if len(mesh.loops) != 3 * len(mesh.polygons):
+        return None
+    starts = np.empty(len(mesh.polygons), np.int32)
+    mesh.polygons.foreach_get("loop_start", starts)
+    if not np.array_equal(starts, np.arange(0, 3 * len(starts), 3, dtype=np.int32)):
+        return None
+    corners = np.empty(len(mesh.loops), np.int32)
+    mesh.loops.foreach_get("vertex_index", corners)
+    return corners.reshape(-1, 3)
+
+
+def read_corner_normals(mesh: bpy.types.Mesh) -> Array:
+    """(m, 3, 3) float32 unit normals, object space, of the corners of a mesh of triangles."""
+    normals = np.empty(3 * len(mesh.loops), np.float32)
+    mesh.corner_normals.foreach_get("vector", normals)
+    return normals.reshape(-1, 3, 3)

@@ -1,0 +1,47 @@
+"""What the user should know, kept for the panel: warnings and errors of exports, renders and the engine.
+
+Plain data, so that it may be written from the render thread and drawn from the interface.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections import deque
+from typing import NamedTuple
+
+log = logging.getLogger("drgs")
+
+KEPT = 50
+
+
+class Message(NamedTuple):
+    """One line of the log panel."""
+
+    time: float
+    level: str  # 'INFO', 'WARNING' or 'ERROR', as in Operator.report
+    text: str
+
+
+#: Newest last.
+history: deque[Message] = deque(maxlen=KEPT)
+
+
+def note(level: str, text: str) -> None:
+    """Remember a message; a repetition of the latest one only renews its time."""
+    log.log(getattr(logging, level), text)
+    if history and history[-1][1:] == (level, text):
+        history.pop()
+    history.append(Message(time.time(), level, text))
+
+
+class Warnings:
+    """Collects the warnings of one export; every text once."""
+
+    def __init__(self) -> None:
+        self.texts: list[str] = []
+
+    def __call__(self, text: str) -> None:
+        if text not in self.texts:
+            self.texts.append(text)
+            note("WARNING", text)

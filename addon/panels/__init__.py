@@ -1,0 +1,19 @@
+"""What the extension shows in Blender's interface."""
+
+from __future__ import annotations
+
+import bpy
+
+from . import object_data, render, sidebar, view_layer
+
+CLASSES = (*render.CLASSES, *view_layer.CLASSES, *object_data.CLASSES, *sidebar.CLASSES)
+
+
+def register() -> None:
+    for cls in CLASSES:
+        bpy.utils.register_class(cls)
+
+
+def unregister() -> None:
+    for cls in reversed(CLASSES):
+        bpy.utils.unregister_class(cls)

@@ -1,0 +1,33 @@
+"""View layer properties: the passes of the one table."""
+
+from __future__ import annotations
+
+import bpy
+
+from ...drgs_blender.passes import PASSES
+from ..passes import blender_name
+from ..properties import switch_of
+
+
+class DRGS_PT_passes(bpy.types.Panel):
+    bl_label = "Passes"
+    bl_space_type = "PROPERTIES"
+    bl_region_type = "WINDOW"
+    bl_context = "view_layer"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return context.engine == "DRGS"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout
+        layout.use_property_split = True
+        layout.use_property_decorate = False
+        view_layer = context.view_layer
+        column = layout.column(heading="Include")
+        for p in PASSES:
+            owner, name = (view_layer, p.blender) if p.blender else (view_layer.drgs, switch_of(p))
+            column.prop(owner, name, text=blender_name(p))
+
+
+CLASSES = (DRGS_PT_passes,)

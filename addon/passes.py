@@ -1,0 +1,35 @@
+"""The engine's table of passes, seen from a view layer."""
+
+from __future__ import annotations
+
+import bpy
+
+from ..drgs_blender.passes import PASSES, Pass
+from .properties import switch_of
+
+#: Names that Blender 5.0 spelled out; compositor nodes and its EXR files know only these.
+_FULL_NAMES = {
+    "IndexOB": "Object Index",
+    "DiffDir": "Diffuse Direct",
+    "DiffInd": "Diffuse Indirect",
+    "GlossDir": "Glossy Direct",
+    "GlossInd": "Glossy Indirect",
+    "Env": "Environment",
+}
+
+
+def blender_name(render_pass: Pass) -> str:
+    """What this Blender calls a pass."""
+    name = render_pass.name
+    return _FULL_NAMES.get(name, name) if bpy.app.version >= (5, 0, 0) else name
+
+
+def enabled(view_layer: bpy.types.ViewLayer) -> list[Pass]:
+    """The passes switched on in a view layer; Combined always, as Blender always has it."""
+    extra = view_layer.drgs
+    return [
+        p
+        for p in PASSES
+        if p.name == "Combined"
+        or (getattr(view_layer, p.blender, False) if p.blender else getattr(extra, switch_of(p)))
+    ]

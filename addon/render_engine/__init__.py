@@ -1,0 +1,18 @@
+"""DR-GS as a render engine of Blender."""
+
+from __future__ import annotations
+
+import bpy
+
+from .engine import DrgsRenderEngine
+from .panels import share_panels, withdraw_panels
+
+
+def register() -> None:
+    bpy.utils.register_class(DrgsRenderEngine)
+    share_panels()
+
+
+def unregister() -> None:
+    withdraw_panels()
+    bpy.utils.unregister_class(DrgsRenderEngine)

@@ -1,0 +1,234 @@
+"""Bind to Rig: the weights and shape keys of a rigged mesh, carried over to a DR-GS object at the same place."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import bpy
+import numpy as np
+from mathutils.bvhtree import BVHTree
+
+from ..addon import assets, mesh_arrays
+from ..drgs_blender.errors import UsageError
+from .base import DrgsOperator
+from .shape_keys import transfer_shape_keys
+from .vertex_weights import Weights, read_weights, write_weights
+
+Array = np.ndarray
+
+#: Mean distance between the surfaces, as a part of the source's diagonal, above which the user is warned / refused.
+DOUBTFUL, WRONG = 0.02, 0.2
+
+
+@dataclass(slots=True)
+class Source:
+    """One mesh that gives weights: its arrays at rest in world space."""
+
+    object: bpy.types.Object
+    vertices: Array  # (n, 3) float64 world
+    triangles: Array  # (m, 3) int
+    matrix: Array  # (4, 4) object to world
+
+
+@dataclass(slots=True)
+class Match:
+    """For each target vertex: the nearest place on the sources."""
+
+    source: Array  # (n,) index into the sources
+    corners: Array  # (n, 3) vertices of the nearest triangle, in its source
+    barycentric: Array  # (n, 3)
+    distance: Array  # (n,) metres
+
+
+class DRGS_OT_bind_to_rig(DrgsOperator, bpy.types.Operator):
+    """Let the active DR-GS object follow the rig of the other selected meshes: copy their weights and shape keys"""
+
+    bl_idname = "drgs.bind_to_rig"
+    bl_label = "Bind to Rig"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        if context.mode != "OBJECT" or not assets.is_drgs(context.active_object):
+            cls.poll_message_set("Select the rigged meshes, then a DR-GS object, in Object Mode")
+            return False
+        return True
+
+    def run(self, context: bpy.types.Context) -> set[str]:
+        target = context.active_object
+        sources = [o for o in context.selected_objects if o is not target and o.type == "MESH"]
+        distance = bind_to_rig(context, target, sources)
+        if distance > DOUBTFUL:
+            self.warn(f'"{target.name}" lies {distance:.1%} of its size away from the meshes it was bound to')
+        return {"FINISHED"}
+
+
+def bind_to_rig(context: bpy.types.Context, target: bpy.types.Object, sources: list[bpy.types.Object]) -> float:
+    """Make `target` follow the armature and shape keys of `sources`, which it must coincide with at rest.
+
+    Each vertex takes what the nearest point of the sources has: vertex weights interpolated over the triangle (exact
+    where a vertex coincides), all of one bone where the source is parented to a bone, and shape key offsets.
+
+    Returns
+    -------
+    float
+        Mean distance to the sources as a part of their diagonal.
+
+    Raises
+    ------
+    UsageError
+        No usable source, several armatures, or the objects do not coincide.
+    """
+    if not sources:
+        raise UsageError(
+            f'Object "{target.name}"',
+            "there is no other mesh selected to take the rig from",
+            "Select the rigged meshes first and the DR-GS object last",
+        )
+    armature = armature_of(target.name, sources)
+    with rest_pose(context, armature):
+        places = [_source(o) for o in sources]
+        matrix = np.array(target.matrix_world, np.float64)
+        armature_matrix = armature.matrix_world.copy() if armature else None
+    vertices = mesh_arrays.read_vertices(target.data).astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+    match = nearest(vertices, places)
+    everything = np.concatenate([s.vertices for s in places])
+    distance = float(match.distance.mean() / max(np.linalg.norm(np.ptp(everything, axis=0)), 1e-12))
+    if distance > WRONG:
+        raise UsageError(
+            f'Object "{target.name}"',
+            f"lies {distance:.0%} of their size away from the selected meshes",
+            "Move it onto them in their rest pose, then bind again",
+        )
+    if armature is not None:
+        write_weights(target, _weights(places, match, armature))
+        _attach(target, armature, armature_matrix, sources)
+    transfer_shape_keys(target, matrix, [(s.object, s.matrix) for s in places], match)
+    return distance
+
+
+def armature_of(name: str, sources: list[bpy.types.Object]) -> bpy.types.Object | None:
+    """The armature that moves the sources; None when shape keys alone do."""
+    found = {a for a in map(_armature, sources) if a is not None}
+    if len(found) > 1:
+        names = ", ".join(sorted(f'"{a.name}"' for a in found))
+        raise UsageError(f'Object "{name}"', f"the selected meshes follow several armatures: {names}", "Bind to one")
+    if not found and not any(s.data.shape_keys for s in sources):
+        raise UsageError(
+            f'Object "{name}"', "none of the selected meshes has an armature or shape keys", "Select the rigged meshes"
+        )
+    return found.pop() if found else None
+
+
+def _armature(obj: bpy.types.Object) -> bpy.types.Object | None:
+    """Armature by modifier or parenting, through parents."""
+    if (found := obj.find_armature()) is not None:
+        return found
+    parent = obj.parent
+    while parent is not None and parent.type != "ARMATURE":
+        parent = parent.parent
+    return parent
+
+
+@contextlib.contextmanager
+def rest_pose(context: bpy.types.Context, armature: bpy.types.Object | None) -> Iterator[None]:
+    """Show the armature in its rest pose for a while."""
+    if armature is None:
+        yield
+        return
+    before = armature.data.pose_position
+    armature.data.pose_position = "REST"
+    context.view_layer.update()
+    try:
+        yield
+    finally:
+        armature.data.pose_position = before
+        context.view_layer.update()
+
+
+def _source(obj: bpy.types.Object) -> Source:
+    mesh = obj.data
+    if mesh.shape_keys:
+        local = np.empty((len(mesh.vertices), 3), np.float32)
+        mesh.shape_keys.reference_key.points.foreach_get("co", local.ravel())
+    else:
+        local = mesh_arrays.read_vertices(mesh)
+    mesh.calc_loop_triangles()
+    triangles = np.empty(3 * len(mesh.loop_triangles), np.int32)
+    mesh.loop_triangles.foreach_get("vertices", triangles)
+    if not len(triangles):
+        raise UsageError(f'Object "{obj.name}"', "has no faces", "Deselect it")
+    matrix = np.array(obj.matrix_world, np.float64)
+    return Source(obj, local @ matrix[:3, :3].T + matrix[:3, 3], triangles.reshape(-1, 3), matrix)
+
+
+def nearest(points: Array, sources: list[Source]) -> Match:
+    """Nearest place on the sources for each point, (n, 3) world."""
+    starts = np.cumsum([0, *(len(s.vertices) for s in sources)])
+    vertices = np.concatenate([s.vertices for s in sources])
+    triangles = np.concatenate([s.triangles + start for s, start in zip(sources, starts)])
+    tree = BVHTree.FromPolygons(vertices.tolist(), triangles.tolist(), all_triangles=True)
+    hits = [tree.find_nearest(p) for p in points.tolist()]
+    found = np.array([h[0] for h in hits], np.float64)
+    corners = triangles[[h[2] for h in hits]]
+    source = np.searchsorted(starts, corners[:, 0], side="right") - 1
+    return Match(
+        source=source,
+        corners=corners - starts[source][:, None],
+        barycentric=barycentric(found, vertices[corners]),
+        distance=np.linalg.norm(found - points, axis=1),
+    )
+
+
+def barycentric(points: Array, triangles: Array) -> Array:
+    """Barycentric coordinates, clamped to the triangle, of (n, 3) points in (n, 3, 3) triangles."""
+    a, b, c = triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+    p = points - a
+    bb, bc, cc = (np.einsum("ij,ij->i", x, y) for x, y in ((b, b), (b, c), (c, c)))
+    pb, pc = np.einsum("ij,ij->i", p, b), np.einsum("ij,ij->i", p, c)
+    area = bb * cc - bc * bc
+    flat = area <= 1e-12 * np.maximum(bb * cc, 1e-300)
+    area = np.where(flat, 1, area)
+    v, w = (cc * pb - bc * pc) / area, (bb * pc - bc * pb) / area
+    weights = np.clip(np.stack((1 - v - w, v, w), axis=1), 0, 1)
+    weights[weights < 1e-5] = 0  # a vertex that coincides takes exactly its partner's values
+    near = np.linalg.norm(triangles - points[:, None], axis=2).argmin(axis=1)
+    weights[flat] = np.eye(3)[near[flat]]
+    return weights / weights.sum(axis=1, keepdims=True)
+
+
+def _weights(sources: list[Source], match: Match, armature: bpy.types.Object) -> Weights:
+    """Weights of each target vertex for the armature's bones."""
+    bones = [b.name for b in armature.data.bones]
+    index = {name: i for i, name in enumerate(bones)}
+    parts = []
+    for number, source in enumerate(sources):
+        rows = np.flatnonzero(match.source == number)
+        if not len(rows):
+            continue
+        own = read_weights(source.object, index)
+        parts.append(own.interpolated(match.corners[rows], match.barycentric[rows], rows))
+    return Weights.joined(bones, parts)
+
+
+def _attach(
+    target: bpy.types.Object, armature: bpy.types.Object, matrix: bpy.types.Matrix, sources: list[bpy.types.Object]
+) -> None:
+    """Parent to the armature without moving, and deform by it, before all other modifiers."""
+    world = target.matrix_world.copy()
+    target.parent, target.parent_type = armature, "OBJECT"
+    target.matrix_parent_inverse = matrix.inverted()
+    target.matrix_world = world
+    modifier = next((m for m in target.modifiers if m.type == "ARMATURE"), None)
+    if modifier is None:
+        modifier = target.modifiers.new("Armature", "ARMATURE")
+        target.modifiers.move(len(target.modifiers) - 1, 0)
+    modifier.object = armature
+    modifier.use_deform_preserve_volume = any(
+        m.type == "ARMATURE" and m.use_deform_preserve_volume for s in sources for m in s.modifiers
+    )
+
+
+CLASSES = (DRGS_OT_bind_to_rig,)

@@ -1,0 +1,56 @@
+"""Start, test and stop the engine; clear the message panel."""
+
+from __future__ import annotations
+
+import time
+
+import bpy
+
+from ..addon import engine_link, messages
+from .base import DrgsOperator
+
+
+class DRGS_OT_engine_test(DrgsOperator, bpy.types.Operator):
+    """Start the engine if it does not run, and talk to it"""
+
+    bl_idname = "drgs.engine_test"
+    bl_label = "Test Engine"
+
+    def run(self, context: bpy.types.Context) -> set[str]:
+        begin = time.perf_counter()
+        client = engine_link.client()
+        client.start()
+        text = f"The engine answers (process {client.pid}, {time.perf_counter() - begin:.1f} s): {client.command[0]}"
+        messages.note("INFO", text)
+        self.report({"INFO"}, text)
+        return {"FINISHED"}
+
+
+class DRGS_OT_engine_stop(DrgsOperator, bpy.types.Operator):
+    """End the engine process and free its memory; the next render starts it again"""
+
+    bl_idname = "drgs.engine_stop"
+    bl_label = "Stop Engine"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return engine_link.is_running()
+
+    def run(self, context: bpy.types.Context) -> set[str]:
+        engine_link.stop()
+        messages.note("INFO", "Engine stopped")
+        return {"FINISHED"}
+
+
+class DRGS_OT_clear_messages(DrgsOperator, bpy.types.Operator):
+    """Empty the list of messages"""
+
+    bl_idname = "drgs.clear_messages"
+    bl_label = "Clear"
+
+    def run(self, context: bpy.types.Context) -> set[str]:
+        messages.history.clear()
+        return {"FINISHED"}
+
+
+CLASSES = (DRGS_OT_engine_test, DRGS_OT_engine_stop, DRGS_OT_clear_messages)

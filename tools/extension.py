@@ -1,0 +1,129 @@
+"""Build the Blender extension's zip and check what Blender's own validator lets through.
+
+    python tools/extension.py [--out dist/drgs-0.1.0.zip]
+
+Pure standard library; the archive is the same bytes for the same sources.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+import tomllib
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parent.parent
+#: What the zip holds, relative to the root. Of folders, only the files with these endings.
+CONTENTS = ("__init__.py", "blender_manifest.toml", "LICENSE", "README.md", "addon", "operators", "drgs_blender")
+SUFFIXES = {".py", ".typed", ".md", ".toml", ".json"}
+REQUIRED = {
+    "schema_version": str,
+    "id": str,
+    "version": str,
+    "name": str,
+    "tagline": str,
+    "maintainer": str,
+    "type": str,
+    "license": list,
+    "blender_version_min": str,
+}
+#: Tags and platforms that extensions.blender.org knows; another one is refused only after the upload.
+TAGS = {
+    *("3D View", "Add Curve", "Add Mesh", "Animation", "Bake", "Camera", "Compositing", "Development", "Game Engine"),
+    *("Geometry Nodes", "Grease Pencil", "Import-Export", "Lighting", "Material", "Modeling", "Mesh", "Node", "Object"),
+    *("Paint", "Pipeline", "Physics", "Render", "Rigging", "Scene", "Sculpt", "Sequencer", "System", "Text Editor"),
+    *("Tracking", "User Interface", "UV"),
+}
+PLATFORMS = {"windows-x64", "windows-arm64", "macos-x64", "macos-arm64", "linux-x64"}
+PERMISSIONS = {"files", "network", "clipboard", "camera", "microphone"}
+
+
+def project_version(root: Path = ROOT) -> str:
+    """The version written in drgs_blender/version.py, read without importing it."""
+    text = (root / "drgs_blender" / "version.py").read_text(encoding="utf-8")
+    return re.search(r'__version__ = "([^"]+)"', text)[1]
+
+
+def faults(manifest: dict[str, Any], version: str) -> list[str]:
+    """Everything wrong with a manifest, one sentence each; empty when it is good."""
+    found = [
+        f"{key} is missing or not a {kind.__name__}"
+        for key, kind in REQUIRED.items()
+        if not isinstance(manifest.get(key), kind)
+    ]
+    if found:
+        return found
+    if manifest["version"] != version:
+        found.append(f"version is {manifest['version']} but drgs_blender/version.py says {version}")
+    if not manifest["id"].isidentifier():
+        found.append(f"id {manifest['id']!r} is not a Python identifier")
+    if len(manifest["tagline"]) > 64 or not manifest["tagline"][-1:].isalnum():
+        found.append("tagline must have at most 64 characters and no punctuation at its end")
+    if not all(re.fullmatch(r"SPDX:[\w.+-]+", licence) for licence in manifest["license"]):
+        found.append("license must list SPDX identifiers such as SPDX:GPL-3.0-or-later")
+    if not re.fullmatch(r"\d+\.\d+\.\d+", manifest["blender_version_min"]):
+        found.append("blender_version_min must look like 4.2.0")
+    found += [f"tag {tag!r} is not one of Blender's" for tag in sorted(set(manifest.get("tags", [])) - TAGS)]
+    found += [f"platform {name!r} is unknown" for name in sorted(set(manifest.get("platforms", [])) - PLATFORMS)]
+    for name, reason in manifest.get("permissions", {}).items():
+        if name not in PERMISSIONS:
+            found.append(f"permission {name!r} is unknown")
+        if not isinstance(reason, str) or not 0 < len(reason) <= 64 or not reason[-1].isalnum():
+            found.append(f"the reason of permission {name!r} must have 1 to 64 characters and no final punctuation")
+    if {"paths", "paths_exclude_pattern"} <= set(manifest.get("build", {})):
+        found.append("[build] may have paths or paths_exclude_pattern, not both")
+    if "wheels" in manifest:
+        found.append("wheels are not used: the engine is an environment of its own")
+    return found
+
+
+def members(root: Path = ROOT) -> Iterator[Path]:
+    """The files of the extension, sorted, relative to `root`."""
+    for name in CONTENTS:
+        path = root / name
+        if path.is_file():
+            yield Path(name)
+        elif path.is_dir():
+            for file in sorted(path.rglob("*")):
+                inside = file.relative_to(root)
+                hidden = any(part.startswith(".") or part == "__pycache__" for part in inside.parts)
+                if file.is_file() and file.suffix in SUFFIXES and not hidden:
+                    yield inside
+
+
+def build(out: Path | None = None, root: Path = ROOT) -> Path:
+    """Check the manifest and write the zip atomically; returns its path. Raises ValueError naming every fault."""
+    manifest = tomllib.loads((root / "blender_manifest.toml").read_text(encoding="utf-8"))
+    if wrong := faults(manifest, project_version(root)):
+        raise ValueError("blender_manifest.toml: " + "; ".join(wrong))
+    out = out or root / "dist" / f"{manifest['id']}-{manifest['version']}.zip"
+    out.parent.mkdir(parents=True, exist_ok=True)
+    partial = out.with_name(out.name + ".part")
+    with zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name in members(root):
+            entry = zipfile.ZipInfo(name.as_posix(), date_time=(2025, 1, 1, 0, 0, 0))
+            entry.external_attr = 0o644 << 16
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            archive.writestr(entry, (root / name).read_bytes())
+    partial.replace(out)
+    return out
+
+
+def main() -> int:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, help="the zip to write (default: dist/drgs-VERSION.zip)")
+    try:
+        print(build(parser.parse_args().out))
+    except (OSError, ValueError) as error:
+        print(f"extension.py: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
