@@ -1,0 +1,228 @@
+"""The environment light: radiance from a direction, and directions in proportion to radiance.
+
+A texel's directions are drawn uniformly over its solid angle (uniform in azimuth and in z), so its density is one
+constant, finite at the poles. Its probability is the luminance, averaged over the texel as the bilinear lookup sees it,
+times the solid angle: wherever a lookup can be positive, so is the density.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ..asset.model import as_float
+from ..errors import UsageError
+from ..frame import World
+from ..jit import njit
+from .sampling import fast_acos, fast_atan2_turns, sincos_turns
+
+Array = np.ndarray
+
+#: Rec.709 luminance.
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
+
+#: Cells of the sampling table at most; larger pictures are averaged down for sampling (never for the lookup).
+_MOST_CELLS = 1 << 22
+
+
+@njit
+def _alias_table(weights, threshold, alias):  # type: ignore[no-untyped-def]
+    """Vose's alias method; `threshold` is the chance, in units of 2^-32, to keep the cell itself."""
+    n = len(weights)
+    mean = weights.sum() / n
+    scaled = weights / mean
+    small, large = np.empty(n, np.int32), np.empty(n, np.int32)
+    s = l = 0
+    for i in range(n):
+        alias[i] = i
+        threshold[i] = np.uint32(0xFFFFFFFF)
+        if scaled[i] < 1.0:
+            small[s] = i
+            s += 1
+        else:
+            large[l] = i
+            l += 1
+    while s > 0 and l > 0:
+        s -= 1
+        i, j = small[s], large[l - 1]
+        threshold[i] = np.uint32(min(4294967295.0, scaled[i] * 4294967296.0))
+        alias[i] = j
+        scaled[j] -= 1.0 - scaled[i]
+        if scaled[j] < 1.0:
+            l -= 1
+            small[s] = j
+            s += 1
+
+
+def _texel_means(luminance: Array) -> Array:
+    """Mean over each texel of the bilinear interpolant (wraps in columns, clamps in rows)."""
+    rows = np.concatenate([luminance[:1], luminance, luminance[-1:]])
+    rows = 0.75 * luminance + 0.125 * (rows[:-2] + rows[2:])
+    return 0.75 * rows + 0.125 * (np.roll(rows, 1, axis=1) + np.roll(rows, -1, axis=1))
+
+
+class EnvironmentLight:
+    """A `World` made ready for lookups and sampling by compiled code.
+
+    Attributes
+    ----------
+    radiance : (h, w, 4) float32: lat-long radiance times colour and strength, linear Rec.709; the last is padding
+    density : (rows, columns) float32: probability per solid angle of each sampling cell; 0 everywhere when black
+    threshold, alias : (rows * columns,) uint32, int32: the alias table
+    row_z : (rows + 1,) float32: z at the upper edge of each row of cells, from 1 to -1
+    rotation : (3, 3) float32: world direction to environment direction
+    bad_texels : int: NaN, infinite or negative texels, taken as black
+    black : bool: no light at all
+    """
+
+    def __init__(self, world: World) -> None:
+        if world.environment is None:
+            image = np.ones((1, 1, 3), np.float32)
+        else:
+            image = as_float(world.environment, (-1, -1, 3), "environment")
+            if image.size == 0:
+                raise UsageError("environment", "has no pixels", "Choose another picture or a colour")
+        rotation = np.asarray(world.rotation, np.float64).reshape(3, 3)
+        tint = np.asarray(world.colour, np.float64) * float(world.strength)
+        if not (np.isfinite(rotation).all() and np.isfinite(tint).all()):
+            raise UsageError("world", "has a colour, strength or rotation that is not finite", "Check its settings")
+        with np.errstate(all="ignore"):
+            tinted = image * tint.astype(np.float32)
+            bad = ~((tinted >= 0) & (tinted < 1e30)).all(axis=2)
+        self.bad_texels = int(bad.sum())
+        h, w = image.shape[:2]
+        self.radiance = np.zeros((h, w, 4), np.float32)
+        self.radiance[..., :3] = np.where(bad[..., None], np.float32(0), tinted)
+        self.rotation = np.ascontiguousarray(rotation, np.float32)
+        self._make_table()
+
+    def _make_table(self) -> None:
+        means = _texel_means(self.radiance[..., :3].astype(np.float64) @ LUMINANCE.astype(np.float64))
+        h, w = means.shape
+        step = 1
+        while (h // step) * (w // step) > _MOST_CELLS or h % step or w % step:
+            step += 1
+            if step > min(h, w):
+                step = 1
+                break
+        if step > 1:
+            means = means.reshape(h // step, step, w // step, step).mean(axis=(1, 3))
+        rows, columns = means.shape
+        edges = np.cos(np.pi * np.arange(rows + 1) / rows)
+        edges[0], edges[-1] = 1.0, -1.0
+        solid = -np.diff(edges) * (2.0 * math.pi / columns)
+        weights = means * solid[:, None]
+        total = weights.sum()
+        self.black = not total > 0.0
+        self.row_z = edges.astype(np.float32)
+        self.density = (means / total if not self.black else np.zeros_like(means)).astype(np.float32)
+        self.threshold = np.full(rows * columns, 0xFFFFFFFF, np.uint32)
+        self.alias = np.arange(rows * columns, dtype=np.int32)
+        if not self.black:
+            _alias_table(weights.ravel(), self.threshold, self.alias)
+
+    def lookup(self, directions: Array) -> Array:
+        """(n, 3) radiance from (n, 3) unit world directions."""
+        return _lookup_many(np.ascontiguousarray(directions, np.float32), self.radiance, self.rotation)
+
+    def pdf(self, directions: Array) -> Array:
+        """(n,) density per solid angle with which ``sample`` draws (n, 3) unit world directions."""
+        return _pdf_many(np.ascontiguousarray(directions, np.float32), self.density, self.rotation)
+
+    def sample(self, numbers: Array) -> tuple[Array, Array]:
+        """World directions (n, 3) and densities (n,) from (n, 4) uint32 random numbers."""
+        numbers = np.ascontiguousarray(numbers, np.uint32)
+        return _sample_many(numbers, self.threshold, self.alias, self.density, self.row_z, self.rotation)
+
+
+@njit(inline="always")
+def to_map(dx, dy, dz, rotation):  # type: ignore[no-untyped-def]
+    """Lat-long coordinates (u, v) in [0, 1] of a world direction; row 0 at +Z, +X at u = 1/2."""
+    x = rotation[0, 0] * dx + rotation[0, 1] * dy + rotation[0, 2] * dz
+    y = rotation[1, 0] * dx + rotation[1, 1] * dy + rotation[1, 2] * dz
+    z = rotation[2, 0] * dx + rotation[2, 1] * dy + rotation[2, 2] * dz
+    return np.float32(0.5) - fast_atan2_turns(y, x), fast_acos(z) * np.float32(1.0 / math.pi)
+
+
+@njit(inline="always")
+def density_at(u, v, density):  # type: ignore[no-untyped-def]
+    """Density per solid angle of the sampling cell that holds (u, v)."""
+    rows, columns = density.shape
+    r = min(np.int32(rows - 1), np.int32(v * np.float32(rows)))
+    c = min(np.int32(columns - 1), np.int32(u * np.float32(columns)))
+    return density[r, c]
+
+
+@njit(inline="always")
+def radiance_at(u, v, radiance):  # type: ignore[no-untyped-def]
+    """Bilinear lookup, wrapped in u and clamped in v."""
+    h, w = radiance.shape[0], radiance.shape[1]
+    x, y = u * np.float32(w) - np.float32(0.5), v * np.float32(h) - np.float32(0.5)
+    y = min(max(y, np.float32(0.0)), np.float32(h - 1))
+    c0, r0 = np.int32(math.floor(x)), np.int32(y)
+    a, b = x - np.float32(c0), y - np.float32(r0)
+    c1 = c0 + 1 if c0 + 1 < w else 0
+    if c0 < 0:
+        c0 = w - 1
+    r1 = min(r0 + 1, h - 1)
+    one = np.float32(1.0)
+    p00, p01, p10, p11 = (one - a) * (one - b), a * (one - b), (one - a) * b, a * b
+    red = p00 * radiance[r0, c0, 0] + p01 * radiance[r0, c1, 0] + p10 * radiance[r1, c0, 0] + p11 * radiance[r1, c1, 0]
+    green = (
+        p00 * radiance[r0, c0, 1] + p01 * radiance[r0, c1, 1] + p10 * radiance[r1, c0, 1] + p11 * radiance[r1, c1, 1]
+    )
+    blue = p00 * radiance[r0, c0, 2] + p01 * radiance[r0, c1, 2] + p10 * radiance[r1, c0, 2] + p11 * radiance[r1, c1, 2]
+    return red, green, blue
+
+
+@njit(inline="always")
+def sample_map(n0, n1, n2, n3, threshold, alias, density, row_z, rotation):  # type: ignore[no-untyped-def]
+    """World direction, its (u, v) and its density from four uint32: cell, alias choice, place inside the cell."""
+    rows, columns = density.shape
+    cell = np.int64((np.uint64(n0) * np.uint64(rows * columns)) >> np.uint64(32))
+    if n1 > threshold[cell]:
+        cell = np.int64(alias[cell])
+    r, c = cell // columns, cell % columns
+    scale = np.float32(1.0 / 16777216.0)
+    u = (np.float32(c) + np.float32(n2 >> np.uint32(8)) * scale) / np.float32(columns)
+    t = np.float32(n3 >> np.uint32(8)) * scale
+    z = row_z[r] + t * (row_z[r + 1] - row_z[r])
+    s, k = sincos_turns(np.float32(0.5) - u)
+    ring = math.sqrt(max(np.float32(0.0), np.float32(1.0) - z * z))
+    x, y = ring * k, ring * s
+    dx = rotation[0, 0] * x + rotation[1, 0] * y + rotation[2, 0] * z
+    dy = rotation[0, 1] * x + rotation[1, 1] * y + rotation[2, 1] * z
+    dz = rotation[0, 2] * x + rotation[1, 2] * y + rotation[2, 2] * z
+    v = fast_acos(z) * np.float32(1.0 / math.pi)
+    return dx, dy, dz, u, v, density[r, c]
+
+
+@njit
+def _lookup_many(directions, radiance, rotation):  # type: ignore[no-untyped-def]
+    out = np.empty((len(directions), 3), np.float32)
+    for i in range(len(directions)):
+        u, v = to_map(directions[i, 0], directions[i, 1], directions[i, 2], rotation)
+        out[i, 0], out[i, 1], out[i, 2] = radiance_at(u, v, radiance)
+    return out
+
+
+@njit
+def _pdf_many(directions, density, rotation):  # type: ignore[no-untyped-def]
+    out = np.empty(len(directions), np.float32)
+    for i in range(len(directions)):
+        u, v = to_map(directions[i, 0], directions[i, 1], directions[i, 2], rotation)
+        out[i] = density_at(u, v, density)
+    return out
+
+
+@njit
+def _sample_many(numbers, threshold, alias, density, row_z, rotation):  # type: ignore[no-untyped-def]
+    n = len(numbers)
+    directions, pdf = np.empty((n, 3), np.float32), np.empty(n, np.float32)
+    for i in range(n):
+        x, y, z, _, _, p = sample_map(
+            numbers[i, 0], numbers[i, 1], numbers[i, 2], numbers[i, 3], threshold, alias, density, row_z, rotation
+        )
+        directions[i, 0], directions[i, 1], directions[i, 2], pdf[i] = x, y, z, p
+    return directions, pdf

@@ -1,0 +1,120 @@
+"""Numbers for Monte Carlo and the maps from the unit square, as small scalar functions for compiled code.
+
+Every number is a pure function of (seed, frame, pixel, strategy, sample index, dimension): pictures do not depend on
+strips, threads or order. The samples of one strategy in one pixel are a Sobol' point set, randomised by a digital shift
+hashed from the rest (Kollig and Keller 2002); deeper dimensions are hashed alone.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ..jit import njit
+
+Array = np.ndarray
+
+F = np.float32
+U = np.uint32
+ZERO, HALF, ONE, TWO, PI = F(0.0), F(0.5), F(1.0), F(2.0), F(math.pi)
+INVERSE_PI = F(1.0 / math.pi)
+GOLDEN = U(0x9E3779B9)
+_UNIT = F(1.0 / 16777216.0)
+
+
+@njit(inline="always")
+def mix(x):  # type: ignore[no-untyped-def]
+    """Hash of a uint32 (the "lowbias32" constants of C. Wellons' search)."""
+    x = U(x ^ (x >> U(16)))
+    x = U(x * U(0x7FEB352D))
+    x = U(x ^ (x >> U(15)))
+    x = U(x * U(0x846CA68B))
+    return U(x ^ (x >> U(16)))
+
+
+@njit(inline="always")
+def unit(x):  # type: ignore[no-untyped-def]
+    """float32 in [0, 1) from a uint32."""
+    return F(np.int32(x >> U(8))) * _UNIT
+
+
+def sobol(count: int) -> Array:
+    """(count, 3) uint32: the first points of the three-dimensional Sobol' sequence (Joe and Kuo's numbers)."""
+    bits = 32
+    directions = np.zeros((3, bits), np.uint64)
+    for i in range(bits):
+        directions[0, i] = 1 << (bits - 1 - i)
+    # Primitive polynomials x + 1 and x^2 + x + 1 with initial values 1 and 1, 3.
+    for row, (degree, inner, initial) in enumerate(((1, 0, (1,)), (2, 1, (1, 3))), start=1):
+        v = [m << (bits - 1 - i) for i, m in enumerate(initial)]
+        for i in range(degree, bits):
+            value = v[i - degree] ^ (v[i - degree] >> degree)
+            for k in range(1, degree):
+                if inner >> (degree - 1 - k) & 1:
+                    value ^= v[i - k]
+            v.append(value)
+        directions[row] = v
+    index = np.arange(count, dtype=np.uint64)
+    points = np.zeros((count, 3), np.uint64)
+    for i in range(max(1, count.bit_length())):
+        points ^= np.where((index >> np.uint64(i) & np.uint64(1)).astype(bool)[:, None], directions[:, i], np.uint64(0))
+    return points.astype(np.uint32)
+
+
+@njit(inline="always")
+def sincos_turns(q):  # type: ignore[no-untyped-def]
+    """sin and cos of 2 pi q to 4e-7, by minimax polynomials on an eighth of a turn."""
+    quarter = math.floor(q * F(4.0) + HALF)
+    x = q - quarter * F(0.25)
+    y = x * x
+    s = x * (F(6.28318783) + y * (F(-41.34295931) + y * (F(81.75866578) + y * F(-81.47826283))))
+    c = ONE + y * (F(-19.73922825) + y * (F(64.9363831) + y * (F(-84.37502959) + y * F(6.99699888))))
+    turn = np.int32(quarter) & 3
+    if turn & 1:
+        s, c = c, -s
+    if turn & 2:
+        s, c = -s, -c
+    return s, c
+
+
+@njit(inline="always")
+def fast_acos(x):  # type: ignore[no-untyped-def]
+    """acos to 1e-6 radians, by a minimax polynomial; arguments beyond [-1, 1] are clamped."""
+    a = min(abs(x), ONE)
+    p = F(0.08815665) + a * (F(-0.04588359) + a * (F(0.02056646) + a * F(-0.00488817)))
+    y = math.sqrt(ONE - a) * (F(1.57079571) + a * (F(-0.21454126) + a * p))
+    return y if x >= ZERO else PI - y
+
+
+@njit(inline="always")
+def fast_atan2_turns(y, x):  # type: ignore[no-untyped-def]
+    """atan2 / 2 pi in [-1/2, 1/2] to 3e-7 turns, by a minimax polynomial."""
+    ax, ay = abs(x), abs(y)
+    large = max(ax, ay)
+    t = min(ax, ay) / large if large > ZERO else ZERO
+    s = t * t
+    p = F(0.03083551) + s * (F(-0.01860468) + s * (F(0.00845371) + s * F(-0.00189218)))
+    r = t * (F(0.15915157) + s * (F(-0.05294417) + s * p))
+    if ay > ax:
+        r = F(0.25) - r
+    if x < ZERO:
+        r = HALF - r
+    return r if y >= ZERO else -r
+
+
+@njit(inline="always")
+def basis(nx, ny, nz):  # type: ignore[no-untyped-def]
+    """Two unit tangents of a unit normal (Duff et al. 2017)."""
+    sign = ONE if nz >= ZERO else -ONE
+    a = -ONE / (sign + nz)
+    b = nx * ny * a
+    return ONE + sign * nx * nx * a, sign * b, -sign * nx, b, sign + ny * ny * a, -ny
+
+
+@njit(inline="always")
+def cosine_hemisphere(u, v):  # type: ignore[no-untyped-def]
+    """Direction about +Z with density z / pi."""
+    s, c = sincos_turns(u)
+    r = math.sqrt(v)
+    return r * c, r * s, math.sqrt(max(ZERO, ONE - v))
