@@ -216,8 +216,10 @@ def _beyond(ox, oy, oz, dx, dy, dz, hit, tracer, geometry, light, table, look, b
 
 
 @njit
-def _point(pixel, sample, surface, frame, tracer, geometry, light, table, numbers, counts, aa, bounces, look, seed,
-           components, variance):  # type: ignore[no-untyped-def] # fmt: skip
+def _point(  # type: ignore[no-untyped-def]
+    pixel, sample, surface, frame, tracer, geometry, light, table, numbers, counts, aa, bounces, look, seed, components,
+    variance,
+):  # fmt: skip
     """All samples of one visible point."""
     ox, oy, oz, nx, ny, nz, gx, gy, gz, vx, vy, vz = frame
     ar, ag, ab, roughness, metallic = surface
@@ -303,8 +305,10 @@ def _point(pixel, sample, surface, frame, tracer, geometry, light, table, number
 
 
 @njit(parallel=True)
-def _kernel(keys, frames, surfaces, tracer, geometry, light, table, numbers, counts, aa, bounces, look, seed,
-            components, variance):  # type: ignore[no-untyped-def] # fmt: skip
+def _kernel(  # type: ignore[no-untyped-def]
+    keys, frames, surfaces, tracer, geometry, light, table, numbers, counts, aa, bounces, look, seed, components,
+    variance,
+):  # fmt: skip
     pixel, sample = keys
     origin, normal, flat, view = frames
     albedo, roughness, metallic = surfaces

@@ -89,11 +89,11 @@ class EnvironmentLight:
             raise UsageError("world", "has a colour, strength or rotation that is not finite", "Check its settings")
         with np.errstate(all="ignore"):
             tinted = image * tint.astype(np.float32)
-            bad = ~((tinted >= 0) & (tinted < 1e30)).all(axis=2)
+            bad = ~np.asarray((tinted >= 0) & (tinted < 1e30)).all(axis=2, keepdims=True)
         self.bad_texels = int(bad.sum())
         h, w = image.shape[:2]
         self.radiance = np.zeros((h, w, 4), np.float32)
-        self.radiance[..., :3] = np.where(bad[..., None], np.float32(0), tinted)
+        self.radiance[..., :3] = np.where(bad, np.float32(0), tinted)
         self.rotation = np.ascontiguousarray(rotation, np.float32)
         self._make_table()
 

@@ -269,10 +269,9 @@ class TraceScene:
             rows = np.arange(n, dtype=np.int32) if smooth else own.ravel()
             faces.append(own + np.int32(vertex))
             shading_faces.append((own if smooth else np.arange(3 * m, dtype=np.int32).reshape(m, 3)) + np.int32(row))
-            stops = vertex + n, face + m, row + len(rows)
-            spans = (slice(a, b) for a, b in zip((vertex, face, row), stops))
-            self._parts.append(_Part(own, *spans, rows, smooth))
-            vertex, face, row = stops
+            spans = slice(vertex, vertex + n), slice(face, face + m), slice(row, row + len(rows))
+            self._parts.append(_Part(own, spans[0], spans[1], spans[2], rows, smooth))
+            vertex, face, row = (span.stop for span in spans)
         self._vertex_count = vertex
         self._faces = np.concatenate(faces)
         self.shading_faces = np.concatenate(shading_faces)
