@@ -31,7 +31,7 @@ def main() -> None:
     link = protocol.Link(reader, writer)
     link.send(protocol.Hello(protocol.PROTOCOL, version, os.getpid()))
     try:
-        render_frames(Exporter(link, package, protocol), job)
+        render_frames(Exporter(link, package), job)
         link.send(protocol.Shutdown())
     except errors.DrgsError as error:
         link.send(protocol.Failed(0, type(error).__name__, error.subject, error.problem, error.remedy))
@@ -63,8 +63,9 @@ def read_line(reader: io.FileIO) -> bytes:
 
 def enable_extension(repository: str | None) -> str:
     """Enable DR-GS and return its package: from a local repository folder when given, else the installed one."""
-    import addon_utils
     import bpy
+
+    import addon_utils  # isort: skip  # the module bpy must be there first to find it
 
     installed = [m.__name__ for m in addon_utils.modules() if m.__name__.split(".")[-1] == "drgs"]
     if repository:
@@ -83,8 +84,10 @@ def enable_extension(repository: str | None) -> str:
 class Exporter:
     """Sends evaluated frames over the link and waits until the parent has dealt with each."""
 
-    def __init__(self, link: Any, package: str, protocol: Any) -> None:
-        self.link, self.protocol = link, protocol
+    def __init__(self, link: Any, package: str) -> None:
+        self.link = link
+        self.protocol = importlib.import_module(f"{package}.drgs_blender.engine.protocol")
+        self.errors = importlib.import_module(f"{package}.drgs_blender.errors")
         self.export_frame = importlib.import_module(f"{package}.addon.export").export_frame
         self.encode_frame = importlib.import_module(f"{package}.drgs_blender.engine.codec").encode_frame
         self.sent = importlib.import_module(f"{package}.drgs_blender.engine.slots").SentSlots()
@@ -142,7 +145,11 @@ def render_frames(exporter: Exporter, job: dict[str, Any]) -> None:
                 # Blender prints and forgets what is raised here; it is raised again below.
                 exporter.error = error
 
-    bpy.ops.wm.open_mainfile(filepath=job["scene"], load_ui=False, use_scripts=job["scripts"])
+    try:
+        bpy.ops.wm.open_mainfile(filepath=job["scene"], load_ui=False, use_scripts=job["scripts"])
+    except RuntimeError as error:
+        reason = str(error).strip().removeprefix("Error: ")
+        raise exporter.errors.AssetError(job["scene"], f"cannot be opened ({reason})", "Check the file") from error
     bpy.utils.register_class(BatchEngine)
     try:
         scene = bpy.context.scene

@@ -28,6 +28,8 @@ from .find_blender import Blender, extension_source
 
 logger = logging.getLogger(__name__)
 
+_CHECK = "Run `drgs doctor`; -vv shows what Blender prints"
+
 #: One evaluated view layer: frame number, layer ("" when there is only one), description, warnings of the export.
 Evaluated = tuple[int, str, Frame, list[str]]
 
@@ -113,11 +115,12 @@ class BlenderProcess:
         assert stream is not None and self._process.stdin is not None
         with contextlib.suppress(BrokenPipeError):  # the end of stdout tells what happened
             self._process.stdin.write(json.dumps(job).encode() + b"\n")
-        while (line := stream.readline()) != READY:
-            if not line:
-                raise DeviceError(f"Blender at {self._blender.program}", f"does not start: {self._epitaph()}")
+        while (line := stream.readline()) not in (READY, b""):
             self._note(line)
-        message, _ = self._receive()
+        received = self._link.receive() if line else None
+        if received is None:
+            raise DeviceError(f"Blender at {self._blender.program}", f"cannot do the job: {self._epitaph()}", _CHECK)
+        message = received[0]
         if not isinstance(message, protocol.Hello) or not protocol.same_version(message):
             version = getattr(message, "version", "unknown")
             remedy = "Install the same version of both"
