@@ -91,8 +91,8 @@ class SurfelSamples:
     ----------
     alpha : (rows, width, aa) float32 coverage, 1 - transmittance
     depth : (rows, width, aa) float32, metres along the view axis
-    surface : (rows, width, aa, 9) float32: world normal (unit, faces the viewer), albedo, roughness, metallic, and the
-        mean standard deviation of the surfels in metres
+    surface : (rows, width, aa, 9) float32: world normal (unit, on the surfels' own side, which may face away from the
+        viewer; 0 where they cancel), albedo, roughness, metallic, and the mean standard deviation in metres
     object_index : (rows, width, aa) int32
     """
 
@@ -428,15 +428,14 @@ def _absorb(i: Any, z: Any, alpha: Any, surface: Any, objects: Any, least: Any, 
     weight = t * alpha
     s = surface[i]
     size = max(s[_SIZE], least)
-    if acc[_WEIGHT] > np.float32(0.0):
-        if z - acc[12] > np.float32(0.5 * GAP) * (size + acc[13]):
-            if acc[_WEIGHT] > best[_WEIGHT]:
-                best[:] = acc
-            acc[_WEIGHT] = np.float32(0.0)
+    if acc[_WEIGHT] > np.float32(0.0) and z - acc[12] > np.float32(0.5 * GAP) * (size + acc[13]):
+        if acc[_WEIGHT] > best[_WEIGHT]:
+            best[:] = acc
+        acc[_WEIGHT] = np.float32(0.0)
     if acc[_WEIGHT] == np.float32(0.0):
         acc[:] = np.float32(0.0)
         acc[12] = z
-    # Normals agree with the nearest one; the sample is turned to the viewer as a whole, see `_finish`.
+    # Both sides of a thin sheet may lie in one cluster: normals agree with the nearest one.
     flip = acc[2] * s[0] + acc[3] * s[1] + acc[4] * s[2] < np.float32(0.0)
     signed = -weight if flip else weight
     acc[_WEIGHT] += weight
@@ -455,18 +454,12 @@ def _absorb(i: Any, z: Any, alpha: Any, surface: Any, objects: Any, least: Any, 
 
 
 @njit(inline="always")
-def _finish(best: Any, dx: Any, dy: Any, dz: Any, out: Any) -> Any:
-    """Write normalised attributes of a sample; the normal faces the viewer. Returns depth and object index."""
+def _finish(best: Any, out: Any) -> Any:
+    """Write the normalised attributes of a sample. Returns its depth and object index."""
     inverse = np.float32(1.0) / best[_WEIGHT]
     x, y, z = best[_ATTRIBUTES], best[_ATTRIBUTES + 1], best[_ATTRIBUTES + 2]
     length = np.sqrt(x * x + y * y + z * z)
-    facing = x * dx + y * dy + z * dz
-    if length <= np.float32(1e-12) * best[_WEIGHT]:
-        length = np.sqrt(dx * dx + dy * dy + dz * dz)
-        x, y, z = -dx, -dy, -dz
-    elif facing > np.float32(0.0):
-        x, y, z = -x, -y, -z
-    k = np.float32(1.0) / length
+    k = np.float32(1.0) / length if length > np.float32(1e-6) * best[_WEIGHT] else np.float32(0.0)
     out[0], out[1], out[2] = k * x, k * y, k * z
     for c in range(3, 9):
         out[c] = best[_ATTRIBUTES + c] * inverse
@@ -633,12 +626,7 @@ def _blend(
                             continue
                         if acc[at, _WEIGHT] > best[at, _WEIGHT]:
                             best[at] = acc[at]
-                        cx = 0.0 if ortho else (sx[at] - p[CX]) / p[FX]
-                        cy = 0.0 if ortho else -(sy[at] - p[CY]) / p[FY]
-                        dx = np.float32(p[0] * cx + p[1] * cy - p[2])
-                        dy = np.float32(p[3] * cx + p[4] * cy - p[5])
-                        dz = np.float32(p[6] * cx + p[7] * cy - p[8])
-                        depth, owner = _finish(best[at], dx, dy, dz, out_surface[y - y0, x - x0, k])
+                        depth, owner = _finish(best[at], out_surface[y - y0, x - x0, k])
                         out_alpha[y - y0, x - x0, k] = np.float32(1.0) - t
                         out_depth[y - y0, x - x0, k] = depth
                         out_object[y - y0, x - x0, k] = owner

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from drgs_blender.asset.model import PosedSurfels
-from drgs_blender.errors import UsageError
 from drgs_blender.frame import Camera, RenderSettings
 from drgs_blender.render import raster
-from drgs_blender.render.camera import camera_parameters, camera_ray, sample_ray
+from drgs_blender.render.camera import camera_parameters, sample_ray
 
 FIELDS = ("centre", "tangent_u", "tangent_v", "normal", "opacity", "albedo", "roughness", "metallic", "object_index")
 

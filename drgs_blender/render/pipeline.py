@@ -1,0 +1,153 @@
+"""One frame, from posed surfels and a traced scene to passes.
+
+The picture is made in strips of rows, the light of a strip in batches of points. Both sizes only bound memory and the
+time until a cancel is seen: no sample depends on them, so the passes are the same to the last bit whatever they are.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from ..asset.model import PosedSurfels
+from ..errors import Cancelled, UsageError
+from ..frame import Frame, RenderSettings
+from ..jit import use_threads
+from ..passes import BY_NAME
+from . import raster
+from .camera import camera_parameters
+from .denoise import denoise
+from .film import COMPONENTS, Film
+from .gbuffer import GBuffer
+from .integrate import integrate
+from .light import EnvironmentLight
+from .points import Radiance, ShadingPoints
+from .primary_mesh import primary_mesh
+from .primary_surfels import primary_surfels, snap_windows
+from .scene import TraceScene
+
+Array = np.ndarray
+Progress = Callable[[float, str], None]
+Check = Callable[[], None]
+
+#: Memory a strip may take, and what a sub-pixel sample takes of it at most (samples, points, light).
+STRIP_BYTES, SAMPLE_BYTES = 64 << 20, 250
+#: Seconds a batch of points should take, and how many points the first one has.
+BATCH_SECONDS, FIRST_BATCH = 0.1, 4096
+
+
+def render(
+    scene: TraceScene,
+    light: EnvironmentLight,
+    posed: PosedSurfels,
+    frame: Frame,
+    progress: Progress | None = None,
+    cancelled: Callable[[], bool] | None = None,
+) -> dict[str, Array]:
+    """Render the passes of a frame.
+
+    Parameters
+    ----------
+    scene : what rays meet, updated for this frame; its objects in the order of ``frame.objects``
+    light : the frame's world
+    posed : surfels of all objects, world space; not used when ``frame.settings.primary`` is "mesh"
+    progress : called with the part done in [0, 1] and the name of the phase
+    cancelled : asked several times a second
+
+    Returns
+    -------
+    pass name -> (h, w, channels) float32 of the camera's window, row 0 at the top; those of ``frame.passes``
+
+    Raises
+    ------
+    UsageError: a camera through which nothing can be seen, an unknown pass or setting.
+    Cancelled: `cancelled` said so.
+    """
+    settings, camera = frame.settings, frame.camera
+    _check(frame)
+    use_threads(settings.threads)
+    parameters = camera_parameters(camera, settings, frame.number)
+
+    def check() -> None:
+        if cancelled is not None and cancelled():
+            raise Cancelled
+
+    def tell(part: float, phase: str) -> None:
+        check()
+        if progress is not None:
+            progress(part, phase)
+
+    tell(0.0, "Projecting")
+    surfels = settings.primary == "surfels"
+    if surfels:
+        splats = raster.prepare(posed, camera, parameters)
+        windows = snap_windows(scene, len(frame.objects))
+    film = Film(camera, settings, parameters)
+    _, top, _, bottom = camera.window
+    end = 0.9 if settings.denoise == "svgf" else 1.0
+    batches = _Batches(settings)
+    height = strip_height(camera.window[2] - camera.window[0], settings.aa)
+    for y0 in range(top, bottom, height):
+        tell(end * (y0 - top) / (bottom - top), "Rendering")
+        y1 = min(y0 + height, bottom)
+        if surfels:
+            buffer = primary_surfels(splats, scene, windows, camera, y0, y1)
+        else:
+            buffer = primary_mesh(scene, camera, parameters, y0, y1)
+        check()
+        radiance = batches.light(scene, light, buffer, frame.number, check)
+        film.add(buffer, radiance, scene.pass_index, light)
+    components = None
+    if settings.denoise == "svgf":
+        tell(end, "Denoising")
+        split = any(name in frame.passes for name in COMPONENTS)
+        components = denoise(film.components, film.variance, film.guides(), split, check)
+    tell(1.0, "Done")
+    return film.passes(frame.passes, components)
+
+
+def strip_height(width: int, aa: int) -> int:
+    """Rows of a strip that fit in `STRIP_BYTES`."""
+    return max(1, STRIP_BYTES // (SAMPLE_BYTES * width * aa))
+
+
+class _Batches:
+    """Integrates points in batches as long as `BATCH_SECONDS`, learning how many points these are."""
+
+    def __init__(self, settings: RenderSettings) -> None:
+        self.settings = settings
+        self.size = FIRST_BATCH
+
+    def light(
+        self, scene: TraceScene, light: EnvironmentLight, buffer: GBuffer, frame_number: int, check: Check
+    ) -> Radiance:
+        """Light of all points of `buffer`."""
+        points: ShadingPoints = buffer.points
+        n = len(points)
+        out = Radiance(np.empty((n, 4, 3), np.float32), np.empty((n, 2), np.float32))
+        first = 0
+        while first < n:
+            last = min(first + self.size, n)
+            began = time.perf_counter()
+            part = integrate(scene, light, points[first:last], self.settings, frame_number)
+            out.components[first:last], out.variance[first:last] = part.components, part.variance
+            if last - first == self.size:
+                pace = BATCH_SECONDS / max(time.perf_counter() - began, 1e-6)
+                self.size = int(min(max(self.size * min(max(pace, 0.25), 4.0), 256), 1 << 20))
+            first = last
+            check()
+        return out
+
+
+def _check(frame: Frame) -> None:
+    """Raise UsageError on what the stages below would misunderstand."""
+    settings = frame.settings
+    for name in frame.passes:
+        if name not in BY_NAME:
+            raise UsageError(f"pass {name!r}", "does not exist", f"Choose from {', '.join(BY_NAME)}")
+    if settings.primary not in ("surfels", "mesh"):
+        raise UsageError("primary visibility", f"is {settings.primary!r}", "Choose surfels or mesh")
+    if settings.denoise not in ("none", "svgf"):
+        raise UsageError("denoiser", f"is {settings.denoise!r}", "Choose none or svgf")
