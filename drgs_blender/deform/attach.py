@@ -25,7 +25,7 @@ Array = np.ndarray
 log = logging.getLogger(__name__)
 
 #: Standard deviations of a fitted surfel over those of its triangle's area: opaque inside, little bleeding outside.
-SPREAD = 1.6
+SPREAD = 1.8
 #: Opacity of surfels made from a mesh alone.
 OPAQUE = 0.99
 #: Opacity where pretrained surfels were given but none is near (paper's initial value).
@@ -48,7 +48,7 @@ def attach(
     tau: float = 0.02,
     *,
     scale: Literal["fitted", "paper"] = "fitted",
-    density: float = 300.0,
+    density: float = 100.0,
     spread: float = SPREAD,
     opacity: float = OPAQUE,
 ) -> tuple[Surfels, Binding, dict[str, Any]]:
