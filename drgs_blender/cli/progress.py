@@ -19,7 +19,7 @@ class FractionBar:
     """A bar for work that reports the fraction done; used as a context manager and called as (phase, fraction)."""
 
     def __init__(self, args: argparse.Namespace, label: str) -> None:
-        layout = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}<{remaining}"
+        layout = "{desc}{percentage:3.0f}%|{bar}| {elapsed}<{remaining}"
         self._bar = bar(args, label, total=1.0, bar_format=layout)
 
     def __enter__(self) -> FractionBar:

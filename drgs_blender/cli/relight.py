@@ -65,7 +65,6 @@ def run(args: argparse.Namespace) -> int:
     check_writable(args.out)
 
     from ..engine.session import Session
-    from ..render.frames import write_frame
 
     session = Session()
     key = session.load_asset(args.asset)
@@ -88,6 +87,8 @@ def run(args: argparse.Namespace) -> int:
     if args.out.suffix.lower() == ".png":
         write_preview(args.out, picture["Combined"])
     else:
+        from ..render.frames import write_frame
+
         write_frame(args.out, picture, {"asset": key})
     return 0
 
