@@ -56,6 +56,21 @@ def sphere(rows: int) -> tuple[torch.Tensor, torch.Tensor]:
     return grid, ((edges[:-1] - edges[1:]) * math.pi / rows)[:, None]
 
 
+@pytest.mark.parametrize("roughness", [0.3, 0.6, 1.0])
+def test_the_bounded_cap_wastes_less_and_has_the_density_it_says(roughness: float):
+    """Its density is the unbounded one times a constant: the share of draws that end above the surface says so."""
+    u = torch.rand(200_000, 2, dtype=F64, generator=torch.Generator().manual_seed(8))
+    alpha = torch.tensor(roughness**2, dtype=F64)
+    whole = sampling.sample_ggx(NORMAL, VIEW, alpha, u)
+    above = [(d @ NORMAL > 0).double().mean() for d in (whole, sampling.sample_ggx(NORMAL, VIEW, alpha, u, True))]
+    light = whole[whole @ NORMAL > 0][:100]
+    ratio = sampling.pdf_ggx(NORMAL, VIEW, light, alpha, True) / sampling.pdf_ggx(NORMAL, VIEW, light, alpha)
+    torch.testing.assert_close(ratio, ratio[:1].expand(100))
+    error = (above[0] * (1 - above[0]) / len(u)).sqrt() / above[0]
+    assert ratio[0] >= 1
+    assert float(above[1] / above[0]) == pytest.approx(float(ratio[0]), abs=float(6 * error * ratio[0]))
+
+
 @pytest.mark.parametrize("name", STRATEGIES)
 def test_density_integrates_to_one(name: str):
     grid, solid = sphere(384)

@@ -148,28 +148,31 @@ def evaluate(
 
     Returns
     -------
-    diffuse, glossy : (..., 3); zero where view or light is below the surface
+    diffuse, glossy : (..., 3); zero where the light is below the surface, glossy also where the view is (an
+        interpolated normal may turn away from the viewer at a silhouette; diffuse light does not ask for the view)
     """
     if look not in LOOKS:
         raise ValueError(f"look {look!r} is not one of {LOOKS}")
     normal, view, light = torch.broadcast_tensors(normal, view, light)
-    above = (dot(normal, view) > 0) & (dot(normal, light) > 0)
+    lit = (dot(normal, light) > 0).unsqueeze(-1)
+    seen = lit & (dot(normal, view) > 0).unsqueeze(-1)
     # Directions below the surface are replaced by the normal, so that neither value nor gradient is ever NaN.
-    view = torch.where(above.unsqueeze(-1), view, normal)
-    light = torch.where(above.unsqueeze(-1), light, normal)
+    cos_light = dot(normal, torch.where(lit, light, normal))
+    base = ((1 - metallic) / math.pi * cos_light).unsqueeze(-1) * albedo
+    if look == "principled":
+        base = base * (1 - layer_albedo(dot(normal, view), roughness)).unsqueeze(-1)
+
+    view, light = torch.where(seen, view, normal), torch.where(seen, light, normal)
     cos_view, cos_light = dot(normal, view), dot(normal, light)
     half = normalise(view + light)
     cos_half = dot(view, half).clamp(0, 1)
     alpha = alpha_of(roughness)
     facets = ggx_distribution(normal, half, alpha) * smith_visibility(cos_view, cos_light, alpha) * cos_light
-    base = ((1 - metallic) / math.pi * cos_light).unsqueeze(-1) * albedo
     metal = metallic.unsqueeze(-1)
     if look == "paper":
         fresnel = fresnel_schlick(cos_half, 0.04 * (1 - metal) + albedo * metal)
     else:
         dielectric = fresnel_dielectric(cos_half).unsqueeze(-1)
         fresnel = metal * fresnel_schlick(cos_half, albedo) + (1 - metal) * dielectric
-        base = base * (1 - layer_albedo(cos_view, roughness)).unsqueeze(-1)
-    mask = above.unsqueeze(-1)
     zero = torch.zeros((), dtype=normal.dtype, device=normal.device)
-    return torch.where(mask, base, zero), torch.where(mask, facets.unsqueeze(-1) * fresnel, zero)
+    return torch.where(lit, base, zero), torch.where(seen, facets.unsqueeze(-1) * fresnel, zero)

@@ -66,7 +66,8 @@ class Light:
         The bilinear picture, integrated over a texel, weighs the neighbours (1/8, 3/4, 1/8) along either axis: light
         that leaks into a black texel is still found.
         """
-        value = self.image @ torch.tensor(LUMINANCE, dtype=self.image.dtype, device=self.image.device)
+        weights = torch.tensor(LUMINANCE, dtype=self.image.dtype, device=self.image.device)
+        value = (self.image * self.colour) @ weights
         value = (torch.roll(value, 1, 1) + torch.roll(value, -1, 1)) / 8 + 0.75 * value
         padded = torch.cat([value[:1], value, value[-1:]])
         value = (padded[:-2] + padded[2:]) / 8 + 0.75 * value

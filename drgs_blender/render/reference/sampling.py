@@ -48,31 +48,43 @@ def pdf_cosine(normal: Tensor, light: Tensor) -> Tensor:
     return dot(normal, light).clamp(min=0) / math.pi
 
 
-def sample_ggx(normal: Tensor, view: Tensor, alpha: Tensor, u: Tensor) -> Tensor:
+def _cap_bound(cos_view: Tensor, alpha: Tensor, bounded: bool) -> Tensor:
+    """Part of the stretched view's height below which no cap normal reflects above the surface; 1 keeps them all."""
+    if not bounded:
+        return torch.ones_like(cos_view * alpha)
+    s2 = (1 + torch.sqrt((1 - cos_view**2).clamp(min=0))) ** 2
+    return (1 - alpha**2) * s2 / (s2 + alpha**2 * cos_view**2)
+
+
+def sample_ggx(normal: Tensor, view: Tensor, alpha: Tensor, u: Tensor, bounded: bool = False) -> Tensor:
     """Reflections of `view` at visible GGX normals; some end below the surface.
 
     The visible normals are a spherical cap once the surface is stretched to a hemisphere (Heitz 2018, in the form of
-    Dupuy and Benyoub 2023).
+    Dupuy and Benyoub 2023). `bounded` leaves out a part of the cap that only reflects below the surface (Eto and
+    Tokuyoshi 2023).
     """
     local = to_local(view, normal)
     width = torch.stack(torch.broadcast_tensors(alpha, alpha, torch.ones_like(alpha)), -1)
     stretched = normalise(local * width)
+    lowest = _cap_bound(local[..., 2], alpha, bounded) * stretched[..., 2]
     phi = 2 * math.pi * u[..., 0]
-    z = (1 - u[..., 1]) * (1 + stretched[..., 2]) - stretched[..., 2]
+    z = (1 - u[..., 1]) * (1 + lowest) - lowest
     sine = torch.sqrt((1 - z * z).clamp(min=0))
     cap = torch.stack(torch.broadcast_tensors(sine * torch.cos(phi), sine * torch.sin(phi), z), -1)
     half = normalise((cap + stretched) * width)
     return to_world(2 * dot(local, half).unsqueeze(-1) * half - local, normal)
 
 
-def pdf_ggx(normal: Tensor, view: Tensor, light: Tensor, alpha: Tensor) -> Tensor:
-    """Density of `sample_ggx` at `light`: G1(view) D(half) / (4 cos_view).
+def pdf_ggx(normal: Tensor, view: Tensor, light: Tensor, alpha: Tensor, bounded: bool = False) -> Tensor:
+    """Density of `sample_ggx` at `light`: G1(view) D(half) / (4 cos_view), or more where the cap is `bounded`.
 
-    It integrates to one over the **sphere**: what is reflected below the surface counts.
+    Without the bound it integrates to one over the **sphere**: what is reflected below the surface counts. With it,
+    the density is exact for directions above the surface; below, where a part is left out, it is not meant.
     """
     cosine = dot(normal, view)
     half = normalise(view + light)
-    density = 0.5 * ggx_distribution(normal, half, alpha) / (cosine + smith_root(cosine, alpha))
+    kept = _cap_bound(cosine, alpha, bounded) * cosine + smith_root(cosine, alpha)
+    density = 0.5 * ggx_distribution(normal, half, alpha) / kept
     return torch.where((cosine > 0) & (dot(normal, half) > 0), density, torch.zeros_like(density))
 
 
