@@ -1,0 +1,157 @@
+"""Meshes of files made fit for materials at vertices: welding, and subdivision without cracks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+Array = np.ndarray
+
+
+@dataclass(slots=True)
+class Net:
+    """A triangle mesh whose vertices may share a place.
+
+    Vertices at one place are apart where shading or material must not blend (hard edges, seams between materials).
+    ``point`` numbers the places: what is done to an edge is done to all edges between the same two points, so that no
+    crack opens between them.
+
+    Attributes
+    ----------
+    vertices : (n, 3) float64
+    point : (n,) int64
+    values : (n, c) float64 attributes of the vertices, interpolated linearly
+    faces : (m, 3) int64
+    uvs : (m, 3, 2) float64
+    tags : (m, t) int64 labels of the faces, inherited
+    """
+
+    vertices: Array
+    point: Array
+    values: Array
+    faces: Array
+    uvs: Array
+    tags: Array
+
+
+def weld(
+    vertices: Array, faces: Array, keys: Array, normals: Array | None, agree: float = 0.99
+) -> tuple[Array, Array, Array]:
+    """Merge the corners of faces into vertices by place, key and normal.
+
+    Parameters
+    ----------
+    vertices : (n, 3) finite
+    faces : (m, 3)
+    keys : (m,) int: corners of faces with different keys (materials) are never merged
+    normals : (m, 3, 3) unit corner normals: corners whose normals differ (cosine below `agree`) stay apart; None
+        merges them all
+
+    Returns
+    -------
+    source : (k,) an original vertex for each new one
+    point : (k,) the place of each new vertex, numbered
+    faces : (m, 3) new faces
+    """
+    extent = np.ptp(vertices, axis=0).max(initial=0.0)
+    grid = np.round((vertices - vertices.min(axis=0)) / max(extent * 2e-7, 1e-30)).astype(np.int64)
+    place = np.unique(grid, axis=0, return_inverse=True)[1].reshape(-1)
+    corner_vertex = faces.reshape(-1)
+    corner_place, corner_key = place[corner_vertex], np.repeat(keys, 3)
+    group = np.unique(np.stack([corner_place, corner_key], -1), axis=0, return_inverse=True)[1].reshape(-1)
+    label = np.zeros(len(group), np.int64)
+    if normals is not None:
+        label = _clusters(group, normals.reshape(-1, 3), agree)
+    _, first, new = np.unique(np.stack([group, label], -1), axis=0, return_index=True, return_inverse=True)
+    point = np.unique(corner_place[first], return_inverse=True)[1].reshape(-1)
+    return corner_vertex[first], point, new.reshape(-1, 3)
+
+
+def _clusters(group: Array, normals: Array, agree: float) -> Array:
+    """Within each group, number corners by the first corner whose normal they agree with."""
+    label = np.full(len(group), -1, np.int64)
+    seeds = np.empty(group.max(initial=-1) + 1, np.int64)
+    left, number = np.arange(len(group)), 0
+    while len(left):
+        seeds[group[left][::-1]] = left[::-1]  # the first corner left in each group
+        seed = seeds[group[left]]
+        same = (np.einsum("nc,nc->n", normals[left], normals[seed]) >= agree) | (seed == left)
+        label[left[same]] = number
+        left, number = left[~same], number + 1
+    return label
+
+
+def edges(net: Net) -> tuple[Array, int]:
+    """Number of the edge between points from each corner to the next, (m, 3), and how many edges there are."""
+    place = net.point[net.faces]
+    ends = np.sort(np.stack([place, np.roll(place, -1, axis=1)], -1), axis=-1)
+    key = ends[..., 0] * (int(net.point.max(initial=0)) + 1) + ends[..., 1]
+    unique, number = np.unique(key.reshape(-1), return_inverse=True)
+    return number.reshape(-1, 3), len(unique)
+
+
+def edge_lengths(net: Net) -> Array:
+    """Length of the edge from each corner to the next, (m, 3)."""
+    corners = net.vertices[net.faces]
+    return np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=-1)
+
+
+def close_marks(edge: Array, lengths: Array, marked: Array) -> Array:
+    """Mark the longest edge of every face with a marked edge, until nothing changes (Rivara's refinement).
+
+    It keeps triangles from degenerating however often they are divided.
+    """
+    longest = np.take_along_axis(edge, lengths.argmax(axis=1)[:, None], 1)[:, 0]
+    marked = marked.copy()
+    while True:
+        before = marked.sum()
+        marked[longest[marked[edge].any(axis=1)]] = True
+        if marked.sum() == before:
+            return marked
+
+
+def subdivide(net: Net, edge: Array, marked: Array) -> Net:
+    """Divide marked edges at their middles; `marked` (edges,) must be closed (`close_marks`).
+
+    A face is bisected at its longest edge, and each half at its own marked edge if it has one.
+    """
+    lengths = edge_lengths(net)
+    turn = (lengths.argmax(axis=1)[:, None] + np.arange(3)) % 3  # start at the longest edge
+    faces = np.take_along_axis(net.faces, turn, 1)
+    uvs = np.take_along_axis(net.uvs, turn[..., None], 1)
+    edge = np.take_along_axis(edge, turn, 1)
+    split = marked[edge]
+
+    # Middles: one a pair of vertices; those of one edge between points share a place.
+    ends = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], -1), axis=-1)
+    n = len(net.vertices)
+    pairs, first, middle = np.unique(ends[split][:, 0] * n + ends[split][:, 1], return_index=True, return_inverse=True)
+    a, b = pairs // n, pairs % n
+    place = np.cumsum(marked) - 1 + int(net.point.max(initial=-1)) + 1
+    middles = np.full(faces.shape, -1, np.int64)
+    middles[split] = n + middle.reshape(-1)
+
+    corner = np.concatenate([faces, middles], 1)  # slots: corners 0-2, middles 3-5
+    slot_uvs = np.concatenate([uvs, 0.5 * (uvs + np.roll(uvs, -1, axis=1))], 1)
+    none, left, right = ~split[:, 0], split[:, 0] & ~split[:, 2], split[:, 0] & ~split[:, 1]
+    twice_left, twice_right = split[:, 0] & split[:, 2], split[:, 0] & split[:, 1]
+    recipes = (
+        (none, (0, 1, 2)),
+        (left, (0, 3, 2)),
+        (twice_left, (0, 3, 5)),
+        (twice_left, (3, 2, 5)),
+        (right, (3, 1, 2)),
+        (twice_right, (3, 1, 4)),
+        (twice_right, (3, 4, 2)),
+    )
+    # Children take the place of their parent in the list, so that neighbours stay close in memory.
+    order = np.argsort(np.concatenate([np.flatnonzero(rows) for rows, _ in recipes]), kind="stable")
+    return Net(
+        np.concatenate([net.vertices, 0.5 * (net.vertices[a] + net.vertices[b])]),
+        np.concatenate([net.point, place[edge[split][first]]]),
+        np.concatenate([net.values, 0.5 * (net.values[a] + net.values[b])]),
+        np.concatenate([corner[rows][:, slots] for rows, slots in recipes])[order],
+        np.concatenate([slot_uvs[rows][:, slots] for rows, slots in recipes])[order],
+        np.concatenate([net.tags[rows] for rows, _ in recipes])[order],
+    )
