@@ -37,7 +37,7 @@ T = TypeVar("T")
 
 _POLL = 0.04
 _CANCEL_WAIT = 0.3
-_PREPARING = "preparing kernels"
+_PREPARING = "Preparing kernels"
 
 
 class _Lost(Exception):
@@ -241,7 +241,7 @@ class EngineClient:
                 child = self._child
                 problem = str(loss)
                 if child is not None:
-                    problem = problem if child.running else child.epitaph()
+                    problem = child.epitaph() if isinstance(loss.__cause__, EOFError) else problem
                     child.close(grace=0.0)
                     self._past_log = child.log
                 self._child = None

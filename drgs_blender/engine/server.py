@@ -135,13 +135,12 @@ class Server:
     def _open_session(self) -> Any:
         if self.session is None:
             try:
-                from numba.core import event
-
+                from . import compiling
                 from .session import Session
             except ImportError as error:
                 remedy = "Install DR-GS again in this environment"
                 raise DeviceError(sys.executable, f"lacks a part of the engine ({error})", remedy) from error
-            event.register("numba:compile", _CompileListener(self))
+            compiling.watch(self._note_compiling)
             self.session = Session()
         return self.session
 
@@ -158,12 +157,12 @@ class Server:
             self._reported = phase, now
             self._answer(protocol.Progress(self._current, phase, min(1.0, max(0.0, float(fraction)))))
 
-    def note_compiling(self, change: int) -> None:
+    def _note_compiling(self, change: int) -> None:
         """Count kernels that are being compiled."""
         self._steps += 1
         self._compiling += change
         if change > 0:
-            self._progress("preparing kernels", 0.0)
+            self._progress("Preparing kernels", 0.0)
         if self._compiling <= 1:
             self._answer(protocol.Alive(self._steps, self._compiling > 0))
 
@@ -175,16 +174,6 @@ class Server:
             self.link.send(message, arrays)
         except OSError:  # the client is gone
             _leave(EXIT_OK)
-
-
-class _CompileListener:
-    """Numba's event listener (its interface): tells the client why the first picture takes a minute."""
-
-    def __init__(self, server: Server) -> None:
-        self._server = server
-
-    def notify(self, event: Any) -> None:
-        self._server.note_compiling(1 if event.is_start else -1)
 
 
 def _refuse(link: Link, problem: str) -> None:

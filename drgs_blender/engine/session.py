@@ -22,7 +22,6 @@ from ..deform.mesh_driven import MeshDriven
 from ..errors import AssetError, Cancelled, UsageError
 from ..frame import Frame, ObjectState, World
 from ..jit import use_threads
-from ..passes import BY_NAME
 from ..render.light import EnvironmentLight
 from ..render.pipeline import render
 from ..render.scene import TraceObject, TraceScene
@@ -63,7 +62,6 @@ class _Object:
     """An object as it was in the last frame, and what was made of it."""
 
     state: ObjectState
-    index: int
     loaded: _Loaded
     traced: TraceObject
     posed: PosedSurfels | None = None
@@ -135,12 +133,13 @@ class Session:
         _check(frame)
         use_threads(frame.settings.threads)
         if progress is not None:
-            progress("deforming", 0.0)
+            progress("Deforming", 0.0)
         posed = self._pose(frame)
         lap("deform")
         light = self._light_of(frame.world)
         lap("light")
-        pictures = render(self._scene, light, posed, frame, progress, cancelled)
+        tell = None if progress is None else lambda part, phase: progress(phase, part)
+        pictures = render(self._scene, light, posed, frame, tell, cancelled)
         lap("render")
         x0, y0, x1, y1 = frame.camera.window
         statistics |= {
@@ -157,7 +156,6 @@ class Session:
     def _pose(self, frame: Frame) -> PosedSurfels:
         """Bring the trace scene up to date; return the surfels of all objects."""
         with_surfels = frame.settings.primary == "surfels"
-        before = {item.state.name: item for item in self._objects}
         objects = []
         for index, state in enumerate(frame.objects):
             loaded = self._assets.get(state.asset)
@@ -167,12 +165,12 @@ class Session:
                     f"its asset {state.asset} is not loaded",
                     "Link the object to its file again",
                 )
-            known = before.get(state.name)
-            if known is not None and known.loaded is loaded and known.index == index and _same(known.state, state):
+            known = self._objects[index] if index < len(self._objects) else None
+            if known is not None and known.loaded is loaded and _same(known.state, state):
                 item = known
             else:
                 kept = _snapshot(state)
-                item = _Object(kept, index, loaded, traced_object(kept, loaded.asset))
+                item = _Object(kept, loaded, traced_object(kept, loaded.asset))
             if with_surfels and item.posed is None:
                 item.posed, item.lost = posed_surfels(item.state, index, loaded.surfels_of(item.state), item.traced)
             objects.append(item)
@@ -219,24 +217,11 @@ class Session:
 
 def _check(frame: Frame) -> None:
     """Refuse what no stage would notice by itself."""
-    for name in frame.passes:
-        if name not in BY_NAME:
-            raise UsageError(f"pass {name}", "is not known", f"Choose from {', '.join(BY_NAME)}")
-    settings = frame.settings
-    for name in ("cosine", "ggx", "environment", "bounces"):
-        if getattr(settings, name) < 0:
-            raise UsageError(f"setting {name}", f"is {getattr(settings, name)}", "Choose a number from 0 up")
-    if settings.rays < 1:
-        raise UsageError("samples", "are all 0", "Choose at least one sample of one strategy")
     for name, rows in (("environment rotation", frame.world.rotation), ("camera matrix", frame.camera.matrix_world)):
         if not np.isfinite(rows).all():
             raise UsageError(name, "is not finite", "Check the transform and its drivers")
     if frame.world.rotation.shape != (3, 3):
         raise UsageError("environment rotation", f"has shape {frame.world.rotation.shape}", "Give a 3 x 3 matrix")
-    names = [state.name for state in frame.objects]
-    if len(set(names)) != len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise UsageError(f"object {twice}", "occurs twice in the frame", "Give every object a name of its own")
 
 
 def _same(a: ObjectState | World, b: ObjectState | World) -> bool:

@@ -70,6 +70,7 @@ def make_frame(asset_path: Path, mesh: Mesh) -> Callable[..., Frame]:
         matrix = np.eye(4)
         matrix[:3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]  # looks along +Y
         matrix[1, 3] = -4.0
+        sampling = {"cosine": rays, "ggx": rays, "environment": rays, "aa": 2, "film_transparent": True}
         vertices = mesh.vertices.copy()
         vertices[:, 0] += np.float32(bend) * vertices[:, 2] ** 2
         return Frame(
@@ -77,7 +78,7 @@ def make_frame(asset_path: Path, mesh: Mesh) -> Callable[..., Frame]:
             camera=Camera(matrix, width, height, 1.3 * width, 1.3 * width, width / 2, height / 2),
             objects=[ObjectState("Ball", str(asset_path.resolve()), vertices=vertices)],
             world=World(environment.copy()),
-            settings=RenderSettings(cosine=rays, ggx=rays, environment=rays, aa=2, **settings),  # type: ignore[arg-type]
+            settings=RenderSettings(**sampling | settings),  # type: ignore[arg-type]
             passes=("Combined", "Depth", "Normal"),
         )
 
