@@ -34,8 +34,8 @@ Check = Callable[[], None]
 
 #: Memory a strip may take, and what a sub-pixel sample takes of it at most (samples, points, light).
 STRIP_BYTES, SAMPLE_BYTES = 64 << 20, 250
-#: Seconds a batch of points should take, and how many points the first one has.
-BATCH_SECONDS, FIRST_BATCH = 0.1, 4096
+#: Seconds a batch of points should take, how many samples (points times rays) the first one has, fewest points of any.
+BATCH_SECONDS, FIRST_SAMPLES, FEWEST_POINTS = 0.1, 1 << 17, 16
 
 
 def render(
@@ -118,7 +118,7 @@ class _Batches:
 
     def __init__(self, settings: RenderSettings) -> None:
         self.settings = settings
-        self.size = FIRST_BATCH
+        self.size = max(FEWEST_POINTS, FIRST_SAMPLES // max(1, settings.rays))
 
     def light(
         self, scene: TraceScene, light: EnvironmentLight, buffer: GBuffer, frame_number: int, check: Check
@@ -135,7 +135,7 @@ class _Batches:
             out.components[first:last], out.variance[first:last] = part.components, part.variance
             if last - first == self.size:
                 pace = BATCH_SECONDS / max(time.perf_counter() - began, 1e-6)
-                self.size = int(min(max(self.size * min(max(pace, 0.25), 4.0), 256), 1 << 20))
+                self.size = int(min(max(self.size * min(max(pace, 0.25), 4.0), FEWEST_POINTS), 1 << 20))
             first = last
             check()
         return out
