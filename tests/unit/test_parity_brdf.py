@@ -17,7 +17,7 @@ from drgs_blender.render.light import EnvironmentLight  # noqa: E402
 from drgs_blender.render.reference import brdf, sampling  # noqa: E402
 from drgs_blender.render.reference.light import Light  # noqa: E402
 
-torch.set_num_threads(2)
+torch.set_num_threads(1)
 F64 = torch.float64
 COUNT = 4000
 

@@ -15,7 +15,7 @@ from drgs_blender.render import raster as kernel  # noqa: E402
 from drgs_blender.render.camera import camera_parameters, lattice, pixel_shift  # noqa: E402
 from drgs_blender.render.reference import raster as reference  # noqa: E402
 
-torch.set_num_threads(2)
+torch.set_num_threads(1)
 AA = 2
 
 

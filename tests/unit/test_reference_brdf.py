@@ -10,7 +10,7 @@ torch = pytest.importorskip("torch")
 
 from drgs_blender.render.reference import brdf, sampling  # noqa: E402
 
-torch.set_num_threads(2)
+torch.set_num_threads(1)
 F64 = torch.float64
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=F64)
 

@@ -22,7 +22,7 @@ from drgs_blender.render.reference.integrate import (  # noqa: E402
 )
 from drgs_blender.render.reference.light import Light  # noqa: E402
 
-torch.set_num_threads(2)
+torch.set_num_threads(1)
 F64 = torch.float64
 WHITE = Light.from_world(World())
 

@@ -21,7 +21,7 @@ from drgs_blender.render.reference.raster import (  # noqa: E402
     rasterise,
 )
 
-torch.set_num_threads(2)
+torch.set_num_threads(1)
 F64 = torch.float64
 
 

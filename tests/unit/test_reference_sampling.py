@@ -14,7 +14,7 @@ from drgs_blender.frame import World  # noqa: E402
 from drgs_blender.render.reference import brdf, sampling  # noqa: E402
 from drgs_blender.render.reference.light import Light, directions_of  # noqa: E402
 
-torch.set_num_threads(2)
+torch.set_num_threads(1)
 F64 = torch.float64
 NORMAL = brdf.normalise(torch.tensor([0.3, -0.5, 0.7], dtype=F64))
 VIEW = brdf.normalise(torch.tensor([-0.6, 0.1, 0.6], dtype=F64))

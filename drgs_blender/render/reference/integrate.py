@@ -125,14 +125,15 @@ class TriangleTracer:
         weights = torch.cat([1 - vw.sum(-1, keepdim=True), vw], -1)
         corners = self.faces[face]
         facing = self.face_normal[face]
-        side = torch.where(dot(facing, direction) > 0, -1.0, 1.0).to(t.dtype).unsqueeze(-1)
+        facing = torch.where((dot(facing, direction) > 0).unsqueeze(-1), -facing, facing)
         normal = facing
         if self.corner_normals is not None:
             normal = normalise((weights.unsqueeze(-1) * self.corner_normals[face]).sum(1))
+            normal = torch.where((dot(normal, facing) < 0).unsqueeze(-1), -normal, normal)
         points = SurfacePoints(
-            origin=origin + t.unsqueeze(-1) * direction + self.offset * side * facing,
-            normal=side * normal,
-            geometric_normal=side * facing,
+            origin=origin + t.unsqueeze(-1) * direction + self.offset * facing,
+            normal=normal,
+            geometric_normal=facing,
             view=-direction,
             albedo=(weights.unsqueeze(-1) * self.albedo[corners]).sum(1),
             roughness=(weights * self.roughness[corners]).sum(1),
