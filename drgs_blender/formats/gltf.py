@@ -1,0 +1,369 @@
+"""glTF and GLB files as one triangle mesh, Z up, with materials."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import AssetError
+from .axes import vectors_to_z_up
+from .files import Image, MaterialFile, MeshFile
+from .gltf_document import Document
+from .gltf_nodes import NodeTree, Pose
+from .images import decode_image
+
+Array = np.ndarray
+
+_WRAP = {33071: "clamp", 33648: "mirror", 10497: "repeat"}
+#: Required extensions that change nothing of what is read here, or that are read.
+_UNDERSTOOD = {
+    "KHR_texture_transform",
+    "KHR_mesh_quantization",
+    "KHR_lights_punctual",
+    "KHR_animation_pointer",
+    "KHR_xmp_json_ld",
+    "EXT_texture_webp",
+}
+
+
+def read_gltf(path: Path, pose: Pose = "rest") -> MeshFile:
+    """Read the default scene of a glTF 2.0 file.
+
+    Vertices are in the scene's space turned to Z up as Blender's importer does. Skinned meshes are posed, see
+    `gltf_nodes`; morph targets are left at rest. Vertices that the file splits at seams stay split.
+
+    Raises
+    ------
+    AssetError
+        The file is damaged, or compressed (Draco, meshopt).
+    """
+    document = Document(path)
+    notes: list[str] = []
+    _check_extensions(document, notes)
+    tree = NodeTree(document, pose)
+    materials = _Materials(document, notes)
+    pieces = []
+    for node_index in tree.order:
+        node = document.items("nodes")[node_index]
+        mesh_index = document.index(node, "mesh")
+        if mesh_index is None:
+            continue
+        mesh = document.item("meshes", mesh_index)
+        name = str(node.get("name") or mesh.get("name") or f"mesh {mesh_index}")
+        for primitive in document.get(mesh, "primitives", list, []):
+            if not isinstance(primitive, dict):
+                raise AssetError(document.subject, "has a primitive of the wrong type")
+            piece = _primitive(document, primitive, tree, node, node_index, materials, notes)
+            if piece is not None:
+                pieces.append((name, piece))
+    if tree.skins:
+        notes.append(f"skinned: the mesh is in its {'rest' if pose == 'rest' else 'default'} pose")
+    if document.items("animations"):
+        notes.append("animations ignored")
+    return _join(pieces, materials.used, list(dict.fromkeys(notes)))
+
+
+def _check_extensions(document: Document, notes: list[str]) -> None:
+    for name in document.get(document.json, "extensionsRequired", list, []):
+        if not isinstance(name, str):
+            raise AssetError(document.subject, "has a required extension of the wrong type")
+        if "draco" in name or "meshopt" in name:
+            raise AssetError(document.subject, f"is compressed ({name})", "Export it without mesh compression")
+        if name not in _UNDERSTOOD and not name.startswith("KHR_materials_"):
+            notes.append(f"required extension {name} is not understood and ignored")
+
+
+class _Piece:
+    """Arrays of one primitive in one place: per vertex, with faces into them."""
+
+    __slots__ = ("colours", "faces", "material", "normals", "uvs", "vertices")
+
+    def __init__(self, vertices: Array, faces: Array, material: int) -> None:
+        self.vertices, self.faces, self.material = vertices, faces, material
+        self.normals: Array | None = None
+        self.uvs: Array | None = None
+        self.colours: Array | None = None
+
+
+def _primitive(
+    document: Document,
+    primitive: dict[str, Any],
+    tree: NodeTree,
+    node: dict[str, Any],
+    node_index: int,
+    materials: _Materials,
+    notes: list[str],
+) -> _Piece | None:
+    """One primitive of a mesh node, placed in the scene; None where it has no triangles."""
+    extensions = document.get(primitive, "extensions", dict, {})
+    if "KHR_draco_mesh_compression" in extensions:
+        raise AssetError(document.subject, "is compressed with Draco", "Export it without mesh compression")
+    attributes = document.get(primitive, "attributes", dict, {})
+    mode = document.index(primitive, "mode")
+    if "POSITION" not in attributes or mode in (0, 1, 2, 3):
+        notes.append("points, lines and primitives without positions ignored")
+        return None
+    vertices = _float(document, attributes, "POSITION", ("VEC3",))
+    assert vertices is not None
+    faces = _triangles(document, primitive, mode, len(vertices))
+    if "targets" in primitive:
+        notes.append("morph targets left at rest")
+    normals = _same_length(document, _float(document, attributes, "NORMAL", ("VEC3",)), vertices, "NORMAL")
+    matrix = tree.mesh_world(node_index)
+    skin = document.index(node, "skin")
+    if skin is not None and "JOINTS_0" in attributes and "WEIGHTS_0" in attributes:
+        blend = _blend_matrices(document, attributes, tree.skin_matrices(skin), len(vertices))
+        vertices = np.einsum("nij,nj->ni", blend[:, :, :3], vertices) + blend[:, :, 3]
+        if normals is not None:
+            normals = np.einsum("nij,nj->ni", blend[:, :, :3], normals)
+    else:
+        with np.errstate(all="ignore"):  # values that overflow are refused when all is joined
+            vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
+            linear = matrix[:3, :3]
+            if normals is not None:
+                cofactors = np.stack([np.cross(linear[(i + 1) % 3], linear[(i + 2) % 3]) for i in range(3)])
+                normals = normals @ cofactors.T
+            if np.linalg.det(linear) < 0:  # a mirror: keep the outside outside
+                faces = faces[:, ::-1]
+                normals = None if normals is None else -normals
+    material, uv_set = materials.use(document.index(primitive, "material"))
+    piece = _Piece(vertices_up(vertices), faces, material)
+    if normals is not None:
+        with np.errstate(invalid="ignore", divide="ignore"):
+            piece.normals = vertices_up(normals / np.linalg.norm(normals, axis=1, keepdims=True))
+    uvs = _same_length(document, _float(document, attributes, f"TEXCOORD_{uv_set}", ("VEC2",)), vertices, "TEXCOORD")
+    piece.uvs = None if uvs is None else np.stack([uvs[:, 0], 1.0 - uvs[:, 1]], axis=1)
+    colours = _same_length(document, _float(document, attributes, "COLOR_0", ("VEC3", "VEC4")), vertices, "COLOR_0")
+    piece.colours = None if colours is None else colours[:, :3]
+    return piece
+
+
+def vertices_up(vectors: Array) -> Array:
+    """Y up to Z up, float32."""
+    with np.errstate(over="ignore"):
+        return vectors_to_z_up(vectors).astype(np.float32)
+
+
+def _float(document: Document, attributes: dict[str, Any], name: str, kinds: tuple[str, ...]) -> Array | None:
+    if name not in attributes:
+        return None
+    return document.accessor(attributes[name], kinds).astype(np.float64)
+
+
+def _same_length(document: Document, values: Array | None, vertices: Array, name: str) -> Array | None:
+    if values is not None and len(values) != len(vertices):
+        raise AssetError(document.subject, f"has {len(values)} {name} for {len(vertices)} vertices")
+    return values
+
+
+def _triangles(document: Document, primitive: dict[str, Any], mode: int | None, count: int) -> Array:
+    """(m, 3) int32 faces of a primitive of triangles, a strip or a fan."""
+    if "indices" in primitive:
+        raw = document.accessor(primitive["indices"], ("SCALAR",))
+        if raw.dtype.kind != "u":
+            raise AssetError(document.subject, "has indices that are not unsigned integers")
+        indices = raw[:, 0].astype(np.int64)
+    else:
+        indices = np.arange(count)
+    if len(indices) and int(indices.max()) >= count:
+        raise AssetError(document.subject, f"has faces that refer to vertex {int(indices.max())} of {count}")
+    if mode == 5:
+        strip = np.stack([indices[:-2], indices[1:-1], indices[2:]], axis=1) if len(indices) > 2 else indices[:0]
+        strip = strip.reshape(-1, 3)
+        strip[1::2] = strip[1::2, ::-1]
+        return strip
+    if mode == 6:
+        fan = [np.full(max(len(indices) - 2, 0), indices[0] if len(indices) else 0), indices[1:-1], indices[2:]]
+        return np.stack([f[: len(fan[0])] for f in fan], axis=1)
+    if mode not in (None, 4) or len(indices) % 3:
+        raise AssetError(document.subject, f"has {len(indices)} indices in a primitive of mode {mode}, not triangles")
+    return indices.reshape(-1, 3)
+
+
+def _blend_matrices(document: Document, attributes: dict[str, Any], joints: Array, count: int) -> Array:
+    """(n, 3, 4) matrix of each vertex: joint matrices blended by weights that are made to sum to 1."""
+    blend = np.zeros((count, 3, 4))
+    total = np.zeros(count)
+    number = 0
+    while f"JOINTS_{number}" in attributes and f"WEIGHTS_{number}" in attributes:
+        which = document.accessor(attributes[f"JOINTS_{number}"], ("VEC4",))
+        weights = document.accessor(attributes[f"WEIGHTS_{number}"], ("VEC4",)).astype(np.float64)
+        if (
+            which.dtype.kind != "u"
+            or len(which) != count
+            or len(weights) != count
+            or which.max(initial=0) >= len(joints)
+        ):
+            raise AssetError(document.subject, "has joints or weights that do not fit its skin")
+        for k in range(4):
+            blend += weights[:, k, None, None] * joints[which[:, k], :3]
+        total += weights.sum(axis=1)
+        number += 1
+    loose = ~(total > 0)  # vertices without weights follow the first joint, as in Blender
+    blend[loose], total[loose] = joints[0, :3], 1.0
+    return blend / total[:, None, None]
+
+
+class _Materials:
+    """The materials of a document, converted when a primitive uses them; images are decoded once."""
+
+    def __init__(self, document: Document, notes: list[str]) -> None:
+        self.document, self.notes = document, notes
+        self.used: list[MaterialFile] = []
+        self._known: dict[int | None, tuple[int, int]] = {}
+        self._pixels: dict[int, Array | None] = {}
+
+    def use(self, index: int | None) -> tuple[int, int]:
+        """(number in `used`, UV set) of the glTF material `index`; None is glTF's default material."""
+        if index not in self._known:
+            self.used.append(MaterialFile("default", (1.0, 1.0, 1.0), 1.0, 1.0))
+            self._known[index] = len(self.used) - 1, 0
+            if index is not None:
+                self._known[index] = len(self.used) - 1, self._convert(index)
+        return self._known[index]
+
+    def _convert(self, index: int) -> int:
+        """Fill the newest material from the glTF material `index`; return the UV set of its textures."""
+        document, get = self.document, self.document.get
+        entry = document.item("materials", index)
+        material = self.used[-1]
+        material.name = str(entry.get("name") or f"material {index}")
+        extensions = get(entry, "extensions", dict, {})
+        if "KHR_materials_pbrSpecularGlossiness" in extensions and "pbrMetallicRoughness" not in entry:
+            return self._specular_glossiness(material, get(extensions, "KHR_materials_pbrSpecularGlossiness", dict))
+        pbr = get(entry, "pbrMetallicRoughness", dict, {})
+        colour = document.numbers(pbr, "baseColorFactor", (1.0, 1.0, 1.0, 1.0))
+        material.base_colour = _rgb(colour)
+        material.metallic = float(document.numbers(pbr, "metallicFactor", (1.0,))[0])
+        material.roughness = float(document.numbers(pbr, "roughnessFactor", (1.0,))[0])
+        material.base_colour_image, colour_set = self._texture(pbr, "baseColorTexture", srgb=True)
+        material.metallic_roughness_image, other_set = self._texture(pbr, "metallicRoughnessTexture", srgb=False)
+        if material.base_colour_image and material.metallic_roughness_image and colour_set != other_set:
+            self.notes.append(f"{material.name}: textures on two UV maps; the one of the base colour is used for both")
+        if get(entry, "emissiveTexture", dict) or document.numbers(entry, "emissiveFactor", (0.0, 0.0, 0.0)).any():
+            self.notes.append(f"{material.name}: emission ignored")
+        if get(entry, "alphaMode", str, "OPAQUE") != "OPAQUE":
+            self.notes.append(f"{material.name}: alpha ignored, the surface is opaque")
+        if get(entry, "normalTexture", dict):
+            self.notes.append(f"{material.name}: normal map ignored")
+        for name in extensions:
+            if name.startswith("KHR_materials_"):
+                self.notes.append(f"{material.name}: {name} ignored")
+        return colour_set if material.base_colour_image else other_set
+
+    def _specular_glossiness(self, material: MaterialFile, pbr: dict[str, Any]) -> int:
+        """Approximate a specular-glossiness material: what is specular beyond a dielectric's 4 % is metal."""
+        diffuse = self.document.numbers(pbr, "diffuseFactor", (1.0, 1.0, 1.0, 1.0))[:3]
+        specular = self.document.numbers(pbr, "specularFactor", (1.0, 1.0, 1.0))
+        material.roughness = 1.0 - float(self.document.numbers(pbr, "glossinessFactor", (1.0,))[0])
+        material.base_colour_image, uv_set = self._texture(pbr, "diffuseTexture", srgb=True)
+        textured = material.base_colour_image is not None or "specularGlossinessTexture" in pbr
+        brightest = float(specular.max())
+        excess = max(brightest - 0.04, 0.0)
+        metallic = 0.0 if textured else excess / max(excess + float(diffuse.max()), 1e-6)
+        material.metallic = metallic
+        material.base_colour = _rgb(np.clip((1 - metallic) * diffuse + metallic * specular, 0, 1))
+        self.notes.append(f"{material.name}: specular-glossiness converted approximately to metallic-roughness")
+        return uv_set
+
+    def _texture(self, entry: dict[str, Any], key: str, srgb: bool) -> tuple[Image | None, int]:
+        """(image, UV set) of a texture reference; (None, 0) without one."""
+        document = self.document
+        info = document.get(entry, key, dict)
+        if info is None:
+            return None, 0
+        texture = document.item("textures", document.index(info, "index"))
+        extensions = document.get(texture, "extensions", dict, {})
+        source = document.index(document.get(extensions, "EXT_texture_webp", dict, texture), "source")
+        uv_set = document.index(info, "texCoord") or 0
+        if source is None:
+            self.notes.append(f"texture of {key} in a format that is not read (KTX2?) ignored")
+            return None, uv_set
+        pixels = self._image(source)
+        if pixels is None:
+            return None, uv_set
+        sampler_index = document.index(texture, "sampler")
+        sampler = {} if sampler_index is None else document.item("samplers", sampler_index)
+        wrap = [_WRAP.get(document.index(sampler, k) or 10497, "repeat") for k in ("wrapS", "wrapT")]
+        moved = document.get(document.get(info, "extensions", dict, {}), "KHR_texture_transform", dict)
+        transform = np.eye(2, 3)
+        if moved is not None:
+            replaced = document.index(moved, "texCoord")
+            uv_set = uv_set if replaced is None else replaced
+            transform = uv_transform(
+                document.numbers(moved, "offset", (0.0, 0.0)),
+                float(document.numbers(moved, "rotation", (0.0,))[0]),
+                document.numbers(moved, "scale", (1.0, 1.0)),
+            )
+        return Image(pixels, srgb, transform, (wrap[0], wrap[1])), uv_set
+
+    def _image(self, index: int) -> Array | None:
+        """Pixels of an image; None, with a note, where it cannot be had: a mesh without it is still a mesh."""
+        if index not in self._pixels:
+            try:
+                self._pixels[index] = decode_image(*self.document.image(index))
+            except AssetError as error:
+                self._pixels[index] = None
+                self.notes.append(f"texture left out: {error}")
+        return self._pixels[index]
+
+
+def uv_transform(offset: Array, rotation: float, scale: Array) -> Array:
+    """KHR_texture_transform as (2, 3) matrix on coordinates whose v points **up** (glTF's own points down)."""
+    c, s = np.cos(rotation), np.sin(rotation)
+    return np.array(
+        [
+            [c * scale[0], -s * scale[1], offset[0] + s * scale[1]],
+            [s * scale[0], c * scale[1], 1.0 - offset[1] - c * scale[1]],
+        ]
+    )
+
+
+def _rgb(colour: Array) -> tuple[float, float, float]:
+    return float(colour[0]), float(colour[1]), float(colour[2])
+
+
+def _join(pieces: list[tuple[str, _Piece]], materials: list[MaterialFile], notes: list[str]) -> MeshFile:
+    """All pieces as one mesh; what only some pieces have is filled in for the others."""
+    if not pieces:
+        return MeshFile(np.zeros((0, 3)), np.zeros((0, 3)), up_axis="Z", notes=[*notes, "no triangles"])
+    starts = np.cumsum([0, *(len(p.vertices) for _, p in pieces)])
+    ends = np.cumsum([len(p.faces) for _, p in pieces])
+    parts: list[tuple[str, int, int]] = []
+    for (name, piece), end in zip(pieces, ends.tolist(), strict=True):
+        if parts and parts[-1][0] == name:
+            parts[-1] = (name, parts[-1][1], end)
+        else:
+            parts.append((name, end - len(piece.faces), end))
+    each = [p for _, p in pieces]
+    mesh = MeshFile(
+        vertices=np.concatenate([p.vertices for p in each]),
+        faces=np.concatenate([p.faces + start for p, start in zip(each, starts, strict=False)]),
+        face_material=np.concatenate([np.full(len(p.faces), p.material, np.int32) for p in each]),
+        materials=materials,
+        parts=parts,
+        up_axis="Z",
+        notes=notes,
+    )
+    if any(p.normals is not None for p in each):
+        mesh.corner_normals = np.concatenate(
+            [_flat_normals(p) if p.normals is None else p.normals[p.faces] for p in each]
+        ).astype(np.float32)
+    if any(p.uvs is not None for p in each):
+        uvs = [np.zeros((len(p.faces), 3, 2)) if p.uvs is None else p.uvs[p.faces] for p in each]
+        mesh.corner_uvs = np.concatenate(uvs).astype(np.float32)
+    if any(p.colours is not None for p in each):
+        colours = [np.ones_like(p.vertices) if p.colours is None else p.colours for p in each]
+        mesh.vertex_colours = np.concatenate(colours).astype(np.float32)
+    return mesh
+
+
+def _flat_normals(piece: _Piece) -> Array:
+    """Face normals at the corners, which is what glTF prescribes without NORMAL."""
+    a, b, c = (piece.vertices[piece.faces[:, k]] for k in range(3))
+    with np.errstate(all="ignore"):
+        normals = np.cross(b - a, c - a)
+        normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.repeat(np.nan_to_num(normals)[:, None], 3, axis=1)

@@ -1,0 +1,41 @@
+"""What every mesh reader's result goes through: nothing that is not finite reaches the rest of the program."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .files import MeshFile
+
+Array = np.ndarray
+
+
+def sanitise(mesh: MeshFile) -> MeshFile:
+    """Remove faces with vertices that are NaN or infinite, and these vertices; replace other values that are not
+    finite. What was changed is counted in ``notes``. Returns `mesh` itself, changed.
+    """
+    finite = np.isfinite(mesh.vertices).all(axis=1)
+    if not finite.all():
+        keep = finite[mesh.faces].all(axis=1)
+        number = np.cumsum(finite) - 1
+        mesh.notes.append(
+            f"{int((~finite).sum())} vertices that are NaN or infinite removed, with {int((~keep).sum())} faces"
+        )
+        faces_before = np.cumsum([0, *keep])
+        mesh.parts = [(n, int(faces_before[a]), int(faces_before[b])) for n, a, b in mesh.parts]
+        mesh.vertices = mesh.vertices[finite]
+        mesh.faces = number[mesh.faces[keep]].astype(np.int32)
+        for name in ("corner_normals", "corner_uvs", "face_material"):
+            if (values := getattr(mesh, name)) is not None:
+                setattr(mesh, name, values[keep])
+        for name in ("vertex_colours", "vertex_roughness", "vertex_metallic"):
+            if (values := getattr(mesh, name)) is not None:
+                setattr(mesh, name, values[finite])
+    if mesh.corner_normals is not None and not np.isfinite(mesh.corner_normals).all():
+        mesh.notes.append("normals ignored: some are NaN or infinite")
+        mesh.corner_normals = None
+    if mesh.corner_uvs is not None and not np.isfinite(mesh.corner_uvs).all():
+        mesh.notes.append("texture coordinates that are NaN or infinite set to 0")
+        mesh.corner_uvs = np.nan_to_num(mesh.corner_uvs, posinf=0.0, neginf=0.0)
+    if mesh.vertex_colours is not None:
+        mesh.vertex_colours = np.clip(np.nan_to_num(mesh.vertex_colours), 0.0, 1.0).astype(np.float32)
+    return mesh

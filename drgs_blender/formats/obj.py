@@ -1,0 +1,219 @@
+"""Wavefront OBJ with MTL: polygons, texture coordinates, normals, materials (also the PBR ones of MTL)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from ..errors import AssetError
+from .colour import srgb_to_linear
+from .files import Image, MaterialFile, MeshFile
+from .images import load_image
+
+Array = np.ndarray
+
+_DAMAGED = "Export the file again, or restore it from a copy"
+
+
+@dataclass(slots=True)
+class _Reading:
+    """What has been read so far."""
+
+    vertices: list[list[float]] = field(default_factory=list)
+    colours: list[list[float]] = field(default_factory=list)
+    uvs: list[list[float]] = field(default_factory=list)
+    normals: list[list[float]] = field(default_factory=list)
+    corners: list[tuple[int, int, int]] = field(default_factory=list)  # vertex, uv, normal; three a triangle
+    face_material: list[int] = field(default_factory=list)
+    materials: list[str] = field(default_factory=list)
+    libraries: list[str] = field(default_factory=list)
+    parts: list[tuple[str, int]] = field(default_factory=list)  # name, first face
+
+
+def read_obj(path: Path) -> MeshFile:
+    """Read the OBJ file at `path` and the MTL files and images it names. Polygons become triangle fans.
+
+    OBJ states no up axis: positions are as in the file. Vertex colours (an extension) are taken as sRGB, as Blender
+    does.
+
+    Raises
+    ------
+    AssetError
+        A line cannot be understood or refers to what is not there.
+    """
+    reading = _Reading()
+    current = -1
+    # latin-1 decodes anything; names in UTF-8 survive the round trip in `_text`
+    lines = path.read_text(encoding="latin-1").replace("\\\r\n", " ").replace("\\\n", " ").split("\n")
+    for number, line in enumerate(lines, 1):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        keyword, rest = words[0], line.strip()[len(words[0]) :].strip()
+        try:
+            if keyword == "v":
+                _vertex(reading, [float(w) for w in words[1:]])
+            elif keyword == "vt":
+                reading.uvs.append([float(words[1]), float(words[2]) if len(words) > 2 else 0.0])
+            elif keyword == "vn":
+                reading.normals.append([float(w) for w in words[1:4]])
+            elif keyword == "f":
+                _face(reading, words[1:], current)
+            elif keyword == "usemtl":
+                name = _text(rest)
+                if name not in reading.materials:
+                    reading.materials.append(name)
+                current = reading.materials.index(name)
+            elif keyword == "mtllib":
+                reading.libraries.append(_text(rest))
+            elif keyword in ("o", "g"):
+                reading.parts.append((_text(rest), len(reading.face_material)))
+        except (ValueError, IndexError) as error:
+            raise AssetError(
+                f"{path}, line {number}", f"cannot be understood ({line.strip()[:60]!r})", _DAMAGED
+            ) from error
+    return _finish(reading, path)
+
+
+def _vertex(reading: _Reading, numbers: list[float]) -> None:
+    if len(numbers) < 3:
+        raise ValueError("too few coordinates")
+    reading.vertices.append(numbers[:3])
+    if len(numbers) >= 6:
+        reading.colours.append(numbers[3:6])
+
+
+def _face(reading: _Reading, words: list[str], material: int) -> None:
+    """Add a polygon as a fan; missing texture coordinates and normals are -1."""
+    sizes = len(reading.vertices), len(reading.uvs), len(reading.normals)
+    corners = []
+    for word in words:
+        entry = [-1, -1, -1]
+        for k, text in enumerate(word.split("/")[:3]):
+            if text:
+                index = int(text)
+                entry[k] = index - 1 if index > 0 else sizes[k] + index
+                if index == 0 or not 0 <= entry[k] < sizes[k]:
+                    raise IndexError(f"refers to number {index} of {sizes[k]}")
+        if entry[0] < 0:
+            raise ValueError("a corner without a vertex")
+        corners.append((entry[0], entry[1], entry[2]))
+    for k in range(1, len(corners) - 1):
+        reading.corners += [corners[0], corners[k], corners[k + 1]]
+        reading.face_material.append(material)
+
+
+def _finish(reading: _Reading, path: Path) -> MeshFile:
+    notes: list[str] = []
+    corners = np.array(reading.corners, np.int64).reshape(-1, 3, 3)
+    known = _libraries(reading.libraries, path, notes)
+    for name in reading.materials:
+        if name not in known:
+            notes.append(f"material {name} is not described")
+    ends = [first for _, first in reading.parts[1:]] + [len(corners)]
+    with np.errstate(over="ignore"):
+        mesh = MeshFile(
+            np.array(reading.vertices).reshape(-1, 3),
+            corners[:, :, 0],
+            face_material=np.array(reading.face_material, np.int32),
+            materials=[known.get(name, MaterialFile(name)) for name in reading.materials],
+            parts=[(n, first, end) for (n, first), end in zip(reading.parts, ends, strict=False) if end > first],
+            notes=notes,
+        )
+        mesh.corner_uvs = _per_corner(reading.uvs, corners[:, :, 1])
+        normals = _per_corner(reading.normals, corners[:, :, 2])
+    if normals is not None and (corners[:, :, 2] >= 0).all():
+        length = np.linalg.norm(normals, axis=2, keepdims=True)
+        if np.isfinite(length).all() and (length > 0).all():
+            mesh.corner_normals = normals / length
+    if len(reading.colours) == len(reading.vertices) > 0:
+        mesh.vertex_colours = srgb_to_linear(np.clip(np.nan_to_num(np.array(reading.colours)), 0.0, 1.0))
+        notes.append("vertex colours decoded from sRGB")
+    return mesh
+
+
+def _per_corner(values: list[list[float]], which: Array) -> Array | None:
+    """Values at the corners as float32, zeros where a corner has none; None where no corner has any."""
+    if not values or not (which >= 0).any():
+        return None
+    table = np.array(values, np.float64).reshape(len(values), -1).astype(np.float32)
+    return np.where(which[..., None] >= 0, table[which], np.float32(0))
+
+
+def _libraries(names: list[str], path: Path, notes: list[str]) -> dict[str, MaterialFile]:
+    materials: dict[str, MaterialFile] = {}
+    for name in dict.fromkeys(names):
+        file = _beside(path, name)
+        if file is None or not file.is_file():
+            notes.append(f"material file {name} not found")
+        else:
+            materials |= _read_mtl(file, notes)
+    return materials
+
+
+def _read_mtl(path: Path, notes: list[str]) -> dict[str, MaterialFile]:
+    """Materials of an MTL file by name."""
+    materials: dict[str, MaterialFile] = {}
+    current = MaterialFile("")
+    for line in path.read_text(encoding="latin-1").split("\n"):
+        words = line.split()
+        if not words:
+            continue
+        keyword = words[0].lower()
+        try:
+            if keyword == "newmtl":
+                name = _text(line.strip()[6:].strip())
+                current = materials[name] = MaterialFile(name)
+            elif keyword == "kd":
+                r, g, b = (float(w) for w in words[1:4])
+                current.base_colour = r, g, b
+            elif keyword == "ns":  # Blender's own mapping between shininess and roughness
+                current.roughness = float(np.clip(1.0 - np.sqrt(max(float(words[1]), 0.0) / 1000.0), 0.0, 1.0))
+            elif keyword == "pr":
+                current.roughness = float(words[1])
+            elif keyword == "pm":
+                current.metallic = float(words[1])
+            elif keyword == "map_kd":
+                current.base_colour_image = _image(line, path, notes)
+                if current.base_colour_image is not None:
+                    current.base_colour = (1.0, 1.0, 1.0)
+            elif keyword in ("map_pr", "map_pm", "map_ns"):
+                notes.append(f"{current.name}: {keyword} ignored")
+        except ValueError:
+            notes.append(f"{path.name}: line {line.strip()[:60]!r} not understood")
+    return materials
+
+
+def _image(line: str, path: Path, notes: list[str]) -> Image | None:
+    """The image a map statement names (its options come first, the file last)."""
+    name = _text(line.split()[-1])
+    file = _beside(path, name)
+    if file is None or not file.is_file():
+        rest = _text(line.strip().split(None, 1)[1])  # a name with spaces and no options
+        file = _beside(path, rest)
+    if file is None or not file.is_file():
+        notes.append(f"texture {name} not found")
+        return None
+    try:
+        return Image(load_image(file), srgb=True)
+    except AssetError as error:
+        notes.append(f"texture left out: {error}")
+        return None
+
+
+def _beside(path: Path, name: str) -> Path | None:
+    """The file `name` relative to `path`; of an absolute name only the last part is tried."""
+    pure = PurePosixPath(name.replace("\\", "/"))
+    if not pure.name or "\0" in name:
+        return None
+    return path.parent / (pure.name if pure.is_absolute() or ":" in name else pure)
+
+
+def _text(raw: str) -> str:
+    """A name as UTF-8 where it is that."""
+    try:
+        return raw.encode("latin-1").decode()
+    except UnicodeDecodeError:
+        return raw

@@ -1,0 +1,261 @@
+"""Every foreign format in one table; files are recognised by their content.
+
+``docs/formats.md`` is made from this table.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from ..asset import Environment
+from ..errors import AssetError
+from .environment import read_exr_environment, read_hdr_environment, read_picture_environment
+from .files import EnvironmentFile, MaterialsFile, MeshFile, SurfelFile
+from .gaussian_ply import LAYOUTS, is_gaussian, read_gaussian_ply
+from .gltf import read_gltf
+from .learned_light import LEGACY, ZIP, read_learned_light
+from .materials import is_nero_folder, read_nero_materials
+from .mesh import sanitise
+from .obj import read_obj
+from .packed_splats import is_compressed, read_compressed_ply, read_splat, sniff_splat
+from .ply import HEADER_LIMIT, parse_header
+from .ply_mesh import read_ply_mesh
+
+Kind = Literal["surfels", "mesh", "environment", "materials"]
+AnyFile = SurfelFile | MeshFile | EnvironmentFile | MaterialsFile
+
+
+@dataclass(frozen=True, slots=True)
+class Format:
+    """A format that can be read.
+
+    Attributes
+    ----------
+    name : shown to users
+    extensions : usual file names, for file dialogs; never decides alone
+    kind : what comes out
+    sniff : (first bytes, path) -> whether the file is of this format
+    read : path -> what comes out
+    note : one line for the documentation
+    """
+
+    name: str
+    extensions: tuple[str, ...]
+    kind: Kind
+    sniff: Callable[[bytes, Path], bool]
+    read: Callable[[Path], AnyFile]
+    note: str
+
+
+def _ply(test: Callable[..., bool]) -> Callable[[bytes, Path], bool]:
+    """A sniffer that looks at the header of PLY files."""
+
+    def sniff(head: bytes, path: Path) -> bool:
+        return head.startswith((b"ply\n", b"ply\r")) and test(parse_header(head, str(path)))
+
+    return sniff
+
+
+def _magic(*starts: bytes) -> Callable[[bytes, Path], bool]:
+    return lambda head, path: head.startswith(starts)
+
+
+def _sniff_gltf(head: bytes, path: Path) -> bool:
+    text = head.removeprefix(b"\xef\xbb\xbf").lstrip()
+    return head.startswith(b"glTF") or (
+        text.startswith(b"{") and (b'"asset"' in head or path.suffix.lower() == ".gltf")
+    )
+
+
+def _sniff_obj(head: bytes, path: Path) -> bool:
+    """Plain text most of whose first lines start with a keyword of OBJ."""
+    if b"\0" in head[:4096]:
+        return False
+    lines = [line.split()[0] for line in head[:65536].split(b"\n")[:200] if line.split()]
+    known = {b"v", b"vt", b"vn", b"f", b"o", b"g", b"s", b"l", b"usemtl", b"mtllib", b"#"}
+    hits = sum(word in known or word.startswith(b"#") for word in lines)
+    return any(w in (b"v", b"f", b"o", b"mtllib") for w in lines) and hits >= 0.8 * len(lines)
+
+
+def _sniff_torch(head: bytes, path: Path) -> bool:
+    return head.startswith(LEGACY) or (head.startswith(ZIP) and b"data.pkl" in head[:4096])
+
+
+#: The table; the first format that recognises a file reads it.
+FORMATS: tuple[Format, ...] = (
+    Format(
+        "Gaussian PLY",
+        (".ply",),
+        "surfels",
+        _ply(is_gaussian),
+        read_gaussian_ply,
+        f"{', '.join(dict.fromkeys(layout.name for layout in LAYOUTS))}; gsplat and SuGaR write 3DGS's",
+    ),
+    Format(
+        "compressed PLY",
+        (".ply",),
+        "surfels",
+        _ply(is_compressed),
+        read_compressed_ply,
+        "PlayCanvas and SuperSplat; 3D splats, flattened",
+    ),
+    Format("splat", (".splat",), "surfels", sniff_splat, read_splat, "32 bytes a splat; 3D splats, flattened"),
+    Format(
+        "PLY mesh",
+        (".ply",),
+        "mesh",
+        _ply(lambda header: header.element("vertex") is not None),
+        lambda path: sanitise(read_ply_mesh(path)),
+        "any encoding; polygons, strips, points; sRGB vertex colours or DR-GS's own linear channels",
+    ),
+    Format(
+        "glTF 2.0",
+        (".glb", ".gltf"),
+        "mesh",
+        _sniff_gltf,
+        lambda path: sanitise(read_gltf(path)),
+        "metallic-roughness materials; skins in Blender's rest pose; turned to Z up; not Draco or meshopt",
+    ),
+    Format(
+        "Wavefront OBJ",
+        (".obj",),
+        "mesh",
+        _sniff_obj,
+        lambda path: sanitise(read_obj(path)),
+        "with MTL (Kd, map_Kd, Ns, Pr, Pm)",
+    ),
+    Format(
+        "Radiance HDR", (".hdr",), "environment", _magic(b"#?"), read_hdr_environment, "RGBE and XYZE, old and new runs"
+    ),
+    Format(
+        "OpenEXR",
+        (".exr",),
+        "environment",
+        _magic(b"\x76\x2f\x31\x01"),
+        read_exr_environment,
+        "lat-long or cube map; any part or layer with RGB, or luminance",
+    ),
+    Format(
+        "picture",
+        (".png", ".jpg", ".jpeg", ".webp"),
+        "environment",
+        lambda head, path: head.startswith((b"\x89PNG", b"\xff\xd8\xff")) or head[8:12] == b"WEBP",
+        read_picture_environment,
+        "display-referred, decoded from sRGB",
+    ),
+    Format(
+        "learned light",
+        (".map", ".pth"),
+        "environment",
+        _sniff_torch,
+        read_learned_light,
+        "IRGS and Ref-Gaussian; needs torch",
+    ),
+    Format(
+        "NeRO materials",
+        (".npy",),
+        "materials",
+        lambda head, path: is_nero_folder(path) or (head.startswith(b"\x93NUMPY") and is_nero_folder(path.parent)),
+        read_nero_materials,
+        "folder with albedo.npy, metallic.npy, roughness.npy, one row a vertex",
+    ),
+)
+
+
+def find_format(path: Path, kind: Kind | None = None) -> Format:
+    """The format of the file (or folder) at `path`, of the wanted `kind` where one is given.
+
+    Raises
+    ------
+    AssetError
+        The file cannot be read, or no format recognises it; lists what is understood.
+    """
+    head = b""
+    if not path.is_dir():
+        try:
+            with open(path, "rb") as file:
+                head = file.read(HEADER_LIMIT)
+        except OSError as error:
+            raise AssetError(str(path), f"cannot be read ({error.strerror or error})", "Check the path") from error
+    recognised = [f for f in FORMATS if f.sniff(head, path)]
+    fitting = [f for f in recognised if kind in (None, f.kind)]
+    if fitting:
+        return fitting[0]
+    wanted = [f for f in FORMATS if kind in (None, f.kind)]
+    understood = "; ".join(f"{f.name} ({' '.join(f.extensions)})" for f in wanted)
+    found = (
+        f"is {recognised[0].name}, not {kind}" if recognised else "is empty" if not head else "is of no known format"
+    )
+    raise AssetError(str(path), found, f"Understood: {understood}")
+
+
+def read(path: str | Path, *, kind: Kind | None = None) -> AnyFile:
+    """Read any file; `kind` narrows down what it may be.
+
+    Raises
+    ------
+    AssetError
+        The file is not understood, or damaged.
+    """
+    path = Path(path)
+    return find_format(path, kind).read(path)
+
+
+def read_surfels(path: str | Path) -> SurfelFile:
+    """Read splats or surfels; axes as in the file. Raises AssetError."""
+    result = read(path, kind="surfels")
+    assert isinstance(result, SurfelFile)
+    return result
+
+
+def read_mesh(path: str | Path) -> MeshFile:
+    """Read a mesh with its materials; ``up_axis`` says whether it is known to be Z up. Raises AssetError."""
+    result = read(path, kind="mesh")
+    assert isinstance(result, MeshFile)
+    return result
+
+
+def read_environment(path: str | Path) -> Environment:
+    """Read distant light as linear lat-long radiance in Blender's mapping. Raises AssetError."""
+    result = read(path, kind="environment")
+    assert isinstance(result, EnvironmentFile)
+    return result.environment
+
+
+def read_materials(path: str | Path) -> MaterialsFile:
+    """Read materials that come without a mesh. Raises AssetError."""
+    result = read(path, kind="materials")
+    assert isinstance(result, MaterialsFile)
+    return result
+
+
+def document() -> str:
+    """The text of docs/formats.md."""
+    lines = [
+        "# Files that can be read",
+        "",
+        "Made from the table in `drgs_blender/formats/registry.py`; a test holds them together. Files are recognised",
+        "by their content; the extensions are only what such files are usually called.",
+        "",
+        "| Format | Usual names | Becomes | Remarks |",
+        "|---|---|---|---|",
+        *(f"| {f.name} | {' '.join(f.extensions)} | {f.kind} | {f.note} |" for f in FORMATS),
+        "",
+        "## Gaussian PLY layouts",
+        "",
+        "In the order of detection. Opacity and scales are activated everywhere (sigmoid, exp); properties that a",
+        "surfel cannot hold are kept in its extras.",
+        "",
+        "| Layout | Recognised by | Albedo from | Roughness from | Metallic from | Remarks |",
+        "|---|---|---|---|---|---|",
+    ]
+    for layout in LAYOUTS:
+        signs = [*layout.has, *(f"no {name}" for name in layout.lacks)]
+        channels = [c.properties[0] if c else "-" for c in (layout.albedo, layout.roughness, layout.metallic)]
+        colour = channels[0] if layout.albedo else "f_dc_0 (captured colour)"
+        row = (layout.name, ", ".join(signs) or "anything else", colour, *channels[1:], layout.note)
+        lines.append(f"| {' | '.join(row)} |")
+    return "\n".join(lines) + "\n"
