@@ -87,9 +87,10 @@ def run(args: argparse.Namespace) -> int:
     if args.out.suffix.lower() == ".png":
         write_preview(args.out, picture["Combined"])
     else:
+        from ..asset.container import digest_asset
         from ..render.frames import write_frame
 
-        write_frame(args.out, picture, {"asset": key})
+        write_frame(args.out, picture, {"asset": digest_asset(key), "seed": str(settings.seed)})
     return 0
 
 

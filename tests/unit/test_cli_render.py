@@ -1,0 +1,218 @@
+"""``drgs render`` through a real Blender: frames, resuming, overriding, faults. Skipped where there is no Blender."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drgs_blender.asset.container import write_asset
+from drgs_blender.asset.model import Asset, Mesh
+from drgs_blender.cli.find_blender import CHECKOUT, find_blender
+from drgs_blender.cli.main import main
+from drgs_blender.deform.attach import attach
+from drgs_blender.errors import DeviceError
+from drgs_blender.render.frames import read_frame
+
+BUILD = """
+import importlib, os, runpy, sys, tempfile
+from pathlib import Path
+import bpy
+checkout, folder = {checkout!r}, Path({folder!r})
+job = runpy.run_path(checkout + "/drgs_blender/cli/blender_job.py")
+bpy.ops.wm.read_factory_settings(use_empty=True)
+with tempfile.TemporaryDirectory() as repository:
+    os.symlink(checkout, repository + "/drgs", target_is_directory=True)
+    package = job["enable_extension"](repository)
+    importlib.import_module(package + ".operators.import_asset").import_assets(bpy.context, [folder / "tile.drgs"])
+scene = bpy.context.scene
+tile = bpy.context.object
+tile.keyframe_insert("location", frame=1)
+tile.location.x = 1
+tile.keyframe_insert("location", frame=3)
+hidden = tile.copy()
+hidden.name, hidden.hide_render, hidden.location.z = "Hidden", True, 1
+hidden.animation_data_clear()
+scene.collection.objects.link(hidden)
+camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
+camera.location, camera.rotation_euler = (0, -6, 0), (1.5707963, 0, 0)
+scene.collection.objects.link(camera)
+scene.camera = camera
+scene.world = bpy.data.worlds.new("World")
+scene.world.use_nodes = True
+scene.render.engine = "BLENDER_WORKBENCH"
+scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = 64, 48, 50
+scene.drgs.rays = 4
+bpy.ops.wm.save_as_mainfile(filepath=str(folder / "shot.blend"))
+text = bpy.data.texts.new("stop.py")
+text.write("import os; os._exit(9)")
+text.use_module = True
+bpy.ops.wm.save_as_mainfile(filepath=str(folder / "script.blend"))
+bpy.data.texts.remove(text)
+scene.view_layers.new("Second layer")
+bpy.ops.wm.save_as_mainfile(filepath=str(folder / "layers.blend"))
+scene.view_layers.remove(scene.view_layers["Second layer"])
+scene.camera = None
+bpy.ops.wm.save_as_mainfile(filepath=str(folder / "blind.blend"))
+sys.stdout.flush()
+os._exit(0)
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An asset and Blender files that show it moving to the right from frame 1 to 3."""
+    try:
+        blender = find_blender()
+        blender.version()
+    except DeviceError as error:
+        pytest.skip(str(error))
+    folder = tmp_path_factory.mktemp("render")
+    x, z = np.meshgrid(np.linspace(-0.5, 0.5, 9), np.linspace(-0.5, 0.5, 9))
+    vertices = np.stack([x.ravel(), np.zeros(81), z.ravel()], axis=1)
+    quads = (np.arange(8)[:, None] * 9 + np.arange(8)).ravel()
+    faces = np.concatenate([quads[:, None] + (0, 1, 10), quads[:, None] + (0, 10, 9)])
+    mesh = Mesh(vertices, faces, np.full((81, 3), 0.8), np.full(81, 0.5), np.zeros(81))
+    surfels, binding, _ = attach(mesh, density=30)
+    write_asset(folder / "tile.drgs", Asset(surfels, mesh, binding))
+    script = folder / "build.py"
+    script.write_text(BUILD.format(checkout=str(CHECKOUT), folder=str(folder)))
+    result = subprocess.run(blender.command(script), capture_output=True, text=True, timeout=120)
+    assert (folder / "blind.blend").exists(), result.stdout + result.stderr
+    return folder
+
+
+@pytest.fixture
+def render(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture):
+    """Function that renders and returns (exit code, lines on stdout, lines on stderr)."""
+
+    def render(*options: str, scene: str = "shot.blend", frames: str = "1-3") -> tuple[int, list[str], list[str]]:
+        out = str(tmp_path / "####.exr")
+        code = main(["render", str(folder / scene), "--frames", frames, "--out", out, *options])
+        captured = capsys.readouterr()
+        return code, captured.out.splitlines(), captured.err.splitlines()
+
+    return render
+
+
+def column(path: Path) -> float:
+    """Where the object is in a frame: centre of its coverage in pixels."""
+    coverage = read_frame(path)[0]["Coverage"][..., 0]
+    return float(coverage.sum(axis=0) @ (np.arange(coverage.shape[1]) + 0.5) / coverage.sum())
+
+
+def test_renders_evaluated_frames_and_resumes(render, tmp_path):
+    options = ("--passes", "Coverage,Depth", "--primary", "mesh")
+    code, lines, _ = render(*options)
+    assert code == 0 and lines[-1] == "DRGS_EXIT class=ok"
+    paths = [tmp_path / f"000{n}.exr" for n in (1, 2, 3)]
+    assert [re.fullmatch("Saved: '(.*)'", line)[1] for line in lines if line.startswith("Saved")] == [*map(str, paths)]
+    assert sorted(tmp_path.iterdir()) == paths
+    first = read_frame(paths[0])[0]
+    assert {name: p.shape for name, p in first.items()} == {
+        "Combined": (24, 32, 4), "Depth": (24, 32, 1), "Coverage": (24, 32, 1)
+    }  # fmt: skip
+    # 1 m at 6 m distance through a 50 mm lens on a 36 mm sensor, 32 pixels wide.
+    assert column(paths[0]) == pytest.approx(16, abs=0.05)
+    assert column(paths[2]) - column(paths[0]) == pytest.approx(32 * 50 / 36 / 6, abs=0.1)
+    # One square of 1 m; the object that is hidden from renders is not there.
+    assert first["Coverage"].sum() == pytest.approx((32 * 50 / 36 / 6) ** 2, rel=0.05)
+
+    stamps = [p.stat().st_mtime_ns for p in paths]
+    code, lines, _ = render(*options, "--threads", "1")
+    assert code == 0 and sum("skipping existing frame" in line for line in lines) == 3
+    assert [p.stat().st_mtime_ns for p in paths] == stamps
+
+    paths[1].write_bytes(paths[1].read_bytes()[:-100])
+    paths[2].write_bytes(b"")
+    code, lines, _ = render(*options)
+    assert code == 0 and [int(p.stat().st_mtime_ns != s) for p, s in zip(paths, stamps)] == [0, 1, 1]
+    assert column(paths[2]) > column(paths[1]) > column(paths[0])
+
+
+def test_other_settings_are_rendered_again(render, tmp_path):
+    path = tmp_path / "0002.exr"
+    render(frames="2")
+    before = read_frame(path)[0]["Combined"]
+    assert any("Saved" in line for line in render("--seed", "3", frames="2")[1])
+    after = read_frame(path)[0]["Combined"]
+    assert before.shape == after.shape and not np.array_equal(before, after)
+    assert any("Saved" in line for line in render("--seed", "3", "--overwrite", frames="2")[1])
+    assert np.array_equal(read_frame(path)[0]["Combined"], after)
+
+
+def test_a_frame_does_not_depend_on_its_chunk(render, tmp_path):
+    render(frames="1-3")
+    together = read_frame(tmp_path / "0003.exr")[0]["Combined"]
+    render("--overwrite", frames="3")
+    assert np.array_equal(read_frame(tmp_path / "0003.exr")[0]["Combined"], together)
+
+
+def test_every_view_layer_gets_a_file(render, tmp_path):
+    assert render(scene="layers.blend", frames="1")[0] == 0
+    assert [p.name for p in sorted(tmp_path.iterdir())] == ["0001_Second_layer.exr", "0001_ViewLayer.exr"]
+
+
+def test_scripts_in_the_file_run_only_when_allowed(render):
+    assert render(scene="script.blend", frames="1")[0] == 0
+    code, lines, errors = render("--enable-scripts", scene="script.blend", frames="2")
+    assert code == 75 and lines[-1] == "DRGS_EXIT class=retry"
+    assert "exit code 9" in errors[-1]
+
+
+def test_scene_faults_have_their_exit_code(render, folder, tmp_path):
+    code, lines, errors = render(scene="blind.blend")
+    assert (code, lines[-1]) == (64, "DRGS_EXIT class=usage") and "has no camera" in errors[-1]
+    (folder / "torn.blend").write_bytes((folder / "shot.blend").read_bytes()[:200])
+    code, lines, errors = render(scene="torn.blend")
+    assert (code, lines[-1]) == (65, "DRGS_EXIT class=bad-asset") and "torn.blend" in errors[-1]
+    (folder / "tile.drgs").rename(folder / "away.drgs")
+    try:
+        code, lines, errors = render()
+    finally:
+        (folder / "away.drgs").rename(folder / "tile.drgs")
+    assert (code, lines[-1]) == (65, "DRGS_EXIT class=bad-asset") and "tile.drgs" in errors[-1]
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(os.name == "nt", reason="SIGTERM ends a process at once there")
+def test_termination_leaves_nothing_behind(folder, tmp_path):
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    command = [sys.executable, "-m", "drgs_blender.cli.main", "render", str(folder / "shot.blend"), "--frames", "1-9"]
+    command += ["--out", str(tmp_path / "####.exr"), "--rays", "65536"]
+    environment = os.environ | {"TMPDIR": str(scratch)}
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment, start_new_session=True)
+    try:
+        while not process.stdout.readline().startswith("Fra:1 "):
+            assert process.poll() is None
+        time.sleep(0.3)
+        process.send_signal(signal.SIGTERM)
+        started = time.monotonic()
+        rest, _ = process.communicate(timeout=20)
+    finally:
+        process.kill()
+    assert time.monotonic() - started < 5
+    assert process.returncode == 143
+    assert rest.splitlines()[-1] == "DRGS_EXIT class=terminated"
+    assert [p.name for p in tmp_path.iterdir()] == ["scratch"]
+    assert not list(scratch.glob("drgs-*"))
+    with pytest.raises(ProcessLookupError):  # neither Blender nor the engine outlives it
+        deadline = time.monotonic() + 2
+        while time.monotonic() < deadline:
+            os.killpg(process.pid, 0)
+            time.sleep(0.05)
+
+
+def test_nothing_is_left_in_the_temporary_folder(render):
+    before = set(Path(tempfile.gettempdir()).glob("drgs-*"))
+    assert render(frames="1")[0] == 0
+    assert set(Path(tempfile.gettempdir()).glob("drgs-*")) <= before

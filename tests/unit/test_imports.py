@@ -1,0 +1,53 @@
+"""What may be imported where: the light part with numpy alone, relighting without torch."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGE = ROOT / "drgs_blender"
+#: What runs inside Blender (a test of the ranks holds that the extension uses nothing else).
+LIGHT = ["__init__.py", "errors.py", "frame.py", "passes.py", "version.py", "engine/protocol.py", "engine/client.py"]
+
+BLOCK = """
+import sys
+class Block:
+    def find_spec(self, name, path=None, target=None):
+        if name.split('.')[0] in {blocked!r}:
+            raise ImportError(name + ' is blocked by this test')
+sys.meta_path.insert(0, Block())
+"""
+
+
+def run_blocked(blocked: set[str], program: str) -> subprocess.CompletedProcess:
+    code = BLOCK.format(blocked=blocked) + program
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, cwd=ROOT)
+
+
+def dotted(path: Path) -> str:
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+
+
+def test_light_part_imports_with_numpy_alone():
+    blocked = {"bpy", "torch", "numba", "embreex", "OpenEXR", "scipy", "trimesh", "igl", "PIL", "tqdm", "skimage"}
+    paths = [PACKAGE / name for name in LIGHT] + sorted((PACKAGE / "asset").glob("*.py"))
+    names = [dotted(path) for path in paths]
+    result = run_blocked(blocked, "import importlib\n" + "".join(f"importlib.import_module({n!r})\n" for n in names))
+    assert result.returncode == 0, result.stderr
+
+
+def test_command_line_starts_without_heavy_imports():
+    program = "from drgs_blender.cli.main import main\nsys.exit(main(['--version']))"
+    result = run_blocked({"bpy", "torch", "numba", "embreex", "OpenEXR", "scipy", "trimesh", "igl"}, program)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.startswith("drgs ")
+
+
+@pytest.mark.parametrize("module", ["drgs_blender.engine.session", "drgs_blender.render.pipeline"])
+def test_relighting_imports_without_torch(module):
+    result = run_blocked({"torch", "bpy", "skimage"}, f"import {module}")
+    assert result.returncode == 0, result.stderr
