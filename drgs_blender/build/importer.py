@@ -1,0 +1,142 @@
+"""Captured surfels, their mesh and their light made into one bound asset."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..asset.model import Asset, Mesh, Surfels
+from ..deform.binding import bind
+from ..errors import AssetError
+from ..formats.axes import surfels_to_z_up
+from ..formats.files import MeshFile, SurfelFile
+from ..formats.gaussian_ply import LAYOUTS
+from .make import TOLERANCE, mesh_with_materials, read_environment_of, read_mesh_file
+from .proxy import mesh_from_surfels
+from .transfer import surfels_to_vertices, vertices_to_surfels
+
+Array = np.ndarray
+log = logging.getLogger(__name__)
+
+#: Part of the surfels that must lie in the box of the mesh, widened by a tenth of its diagonal.
+OVERLAP = 0.5
+
+
+def import_asset(
+    surfels: str | Path | SurfelFile,
+    mesh: str | Path | MeshFile | None = None,
+    environment: str | Path | None = None,
+    up: str | None = None,
+    *,
+    resolution: int = 192,
+    max_triangles: int = 300_000,
+) -> Asset:
+    """Read captured surfels and what belongs to them, and bind them.
+
+    Parameters
+    ----------
+    surfels : path of surfels or splats, or a file already read
+    mesh : path of the mesh they were captured with; None builds a closed one around them
+    environment : path of the light of the capture
+    up : "y" or "z", the up axis of surfels and mesh; None is what the formats say, and Z where they say nothing
+    resolution : voxels along the longest side of a mesh that is built
+    max_triangles : budget for texture detail of a textured mesh
+
+    Returns
+    -------
+    Asset
+        What was converted, dropped and assumed is in ``provenance["report"]``. Materials that only the surfels have
+        are carried to the mesh and the other way round; ``provenance["materials"]`` says which.
+    """
+    surfel_name = "surfels" if isinstance(surfels, SurfelFile) else str(surfels)
+    file = surfels if isinstance(surfels, SurfelFile) else _read_surfels(surfels)
+    report: dict[str, Any] = {"layout": file.layout, "surfel_notes": list(file.notes)}
+    captured, report["not_finite"] = _finite(file.surfels, surfel_name)
+    if up == "y":
+        captured = surfels_to_z_up(captured)
+
+    if mesh is None:
+        mesh_name, surface_known = "mesh built from the surfels", False
+        surface, report["mesh"] = mesh_from_surfels(captured, resolution=resolution)
+    else:
+        mesh_name = "mesh" if isinstance(mesh, MeshFile) else str(mesh)
+        mesh_file = read_mesh_file(mesh)
+        surface_known = _has_materials(mesh_file)
+        surface, report["mesh"] = mesh_with_materials(
+            mesh_file, mesh_name, up=up, max_triangles=max_triangles, tolerance=TOLERANCE
+        )
+        _check_overlap(captured, surface, surfel_name, mesh_name)
+
+    binding, report["binding"] = bind(surface, captured)
+    surfels_known = any(layout.name == file.layout and layout.albedo is not None for layout in LAYOUTS)
+    if surface_known and not surfels_known:
+        vertices_to_surfels(surface, captured, binding)
+        materials = "of the mesh, carried to the surfels"
+    elif surface_known:
+        materials = "of the surfels and of the mesh, as they are"
+    else:
+        report["vertices_without_surfels"] = surfels_to_vertices(surface, captured, binding)
+        materials = "of the surfels" if surfels_known else "captured colour of the surfels, light included"
+        materials += ", carried to the mesh"
+    provenance = {
+        "surfels": Path(surfel_name).name,
+        "mesh": Path(mesh_name).name,
+        "materials": materials,
+        "report": report,
+    }
+    if environment is not None:
+        provenance["environment"] = Path(environment).name
+    log.info("imported %d surfels of %s: %s", len(captured), surfel_name, report)
+    return Asset(captured, surface, binding, read_environment_of(environment), provenance)
+
+
+def _read_surfels(path: str | Path) -> SurfelFile:
+    from ..formats.registry import read_surfels
+
+    return read_surfels(path)
+
+
+def _finite(surfels: Surfels, name: str) -> tuple[Surfels, int]:
+    """Surfels without those that have a number that is not finite, and how many those were."""
+    if not len(surfels):
+        raise AssetError(name, "has no surfels", "Export the capture again")
+    good = np.ones(len(surfels), bool)
+    for channel in ("centre", "scale", "rotation", "opacity", "albedo", "roughness", "metallic"):
+        good &= np.isfinite(getattr(surfels, channel).reshape(len(surfels), -1)).all(axis=1)
+    if not good.any():
+        raise AssetError(name, f"has {len(surfels)} surfels, none with finite values", "Export the capture again")
+    if good.all():
+        return replace(surfels), 0
+    kept = {
+        channel: getattr(surfels, channel)[good]
+        for channel in ("centre", "scale", "rotation", "opacity", "albedo", "roughness", "metallic")
+    }
+    sh = None if surfels.sh is None else surfels.sh[good]
+    extras = {key: values[good] for key, values in surfels.extras.items()}
+    return Surfels(**kept, sh=sh, extras=extras), int((~good).sum())
+
+
+def _has_materials(file: MeshFile) -> bool:
+    """Whether a mesh file says what its surface is made of; bare vertex colours are the capture's radiance."""
+    return bool(file.materials) or file.vertex_roughness is not None or file.vertex_metallic is not None
+
+
+def _check_overlap(surfels: Surfels, mesh: Mesh, surfel_name: str, mesh_name: str) -> None:
+    """Raise AssetError when most surfels lie away from the mesh."""
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    margin = 0.1 * np.linalg.norm(high - low)
+    inside = ((surfels.centre >= low - margin) & (surfels.centre <= high + margin)).all(axis=1).mean()
+    if inside < OVERLAP:
+        box = lambda points: " x ".join(f"{v:.4g}" for v in np.ptp(points, axis=0))  # noqa: E731
+        at = lambda points: ", ".join(f"{v:.4g}" for v in points.mean(axis=0))  # noqa: E731
+        raise AssetError(
+            f"{surfel_name} and {mesh_name}",
+            f"do not overlap: {100 * inside:.0f} % of the surfels are near the mesh; the surfels measure "
+            f"{box(surfels.centre)} around ({at(surfels.centre)}), the mesh {box(mesh.vertices)} around "
+            f"({at(mesh.vertices)})",
+            "Choose the mesh of this capture, in the same units and with the same up axis",
+        )
