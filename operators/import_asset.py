@@ -80,7 +80,8 @@ def viewport_material() -> bpy.types.Material:
     if material is not None and not material.library:
         return material
     material = bpy.data.materials.new(MATERIAL)
-    material.use_nodes = True
+    if material.node_tree is None:  # before Blender 5.0
+        material.use_nodes = True
     nodes, links = material.node_tree.nodes, material.node_tree.links
     surface = next(n for n in nodes if n.type == "BSDF_PRINCIPLED")
     surface.distribution = "GGX"
@@ -103,7 +104,8 @@ def new_world(name: str, environment: Environment) -> bpy.types.World:
     image.update()
     image.pack()
     world = bpy.data.worlds.new(name)
-    world.use_nodes = True
+    if world.node_tree is None:
+        world.use_nodes = True
     nodes = world.node_tree.nodes
     background = next(n for n in nodes if n.type == "BACKGROUND")
     texture = nodes.new("ShaderNodeTexEnvironment")

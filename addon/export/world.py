@@ -73,7 +73,8 @@ class _Tree:
 
     def light(self) -> Light:
         tree = self.world.node_tree
-        if tree is None or not self.world.use_nodes:
+        # From Blender 5.0 on every world has nodes, and the switch is deprecated.
+        if tree is None or (bpy.app.version < (5, 0, 0) and not self.world.use_nodes):
             return Light(np.array(self.world.color, np.float32))
         output = tree.get_output_node("CYCLES") or tree.get_output_node("ALL")
         if output is None or not output.inputs["Surface"].is_linked:

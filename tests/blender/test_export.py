@@ -1,0 +1,180 @@
+"""The scene as the engine gets it: visibility, instances, deformation, normals, materials, settings."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+import pytest
+from mathutils import Matrix
+from scenes import armature_object, mesh_object, part, sphere
+
+errors = part("drgs_blender.errors")
+
+
+def test_object_is_described_with_world_matrix_and_vertices(ball, export):
+    ball.matrix_world = Matrix.Translation((1, 2, 3)) @ Matrix.Diagonal((1, -2, 0.5, 1))
+    ball.pass_index = 7
+    frame, warnings = export()
+    (state,) = frame.objects
+    np.testing.assert_allclose(state.matrix_world, np.array(ball.matrix_world))
+    np.testing.assert_array_equal(state.vertices, sphere()[0])
+    assert (state.name, state.pass_index, state.corner_normals) == ("ball", 7, None)
+    assert state.albedo is None and state.roughness is None and state.metallic is None
+    assert not warnings
+
+
+def test_other_objects_are_counted_in_one_warning(ball, export):
+    for name in ("Cube", "Floor"):
+        mesh_object(name, *sphere(4, 4))
+    frame, warnings = export()
+    assert len(frame.objects) == 1
+    assert warnings == ["2 other object(s) are not rendered by DR-GS: Cube, Floor"]
+
+
+def test_instances_have_their_own_transforms_and_share_arrays(ball, scene, export):
+    group = bpy.data.collections.new("Group")
+    group.objects.link(ball)
+    for x in (3, 6):
+        empty = bpy.data.objects.new("Instance", None)
+        empty.instance_type, empty.instance_collection = "COLLECTION", group
+        empty.location.x = x
+        scene.collection.objects.link(empty)
+    frame, _ = export()
+    assert sorted(s.matrix_world[0, 3] for s in frame.objects) == [0, 3, 6]
+    assert len({id(s.vertices) for s in frame.objects}) == 1
+
+
+def test_hidden_objects_are_not_rendered(ball, scene, captured):
+    hidden = ball.copy()
+    scene.collection.objects.link(hidden)
+    hidden.hide_render = True
+    eye = ball.copy()
+    scene.collection.objects.link(eye)
+    eye.hide_viewport = True  # of no concern to a render
+    excluded = bpy.data.collections.new("Excluded")
+    scene.collection.children.link(excluded)
+    excluded.objects.link(ball.copy())
+    bpy.context.view_layer.layer_collection.children["Excluded"].exclude = True
+    bpy.ops.render.render()
+    assert sorted(s.name for s in captured[0].objects) == ["ball", eye.name]
+
+
+def test_armature_and_shape_key_move_the_vertices(ball, export):
+    rig = armature_object({"Bone": ((0, 0, -1), (0, 0, 1))})
+    rest = sphere()[0]
+    top = np.flatnonzero(rest[:, 2] > 0.5)
+    ball.vertex_groups.new(name="Bone").add(top.tolist(), 1.0, "REPLACE")
+    ball.modifiers.new("Armature", "ARMATURE").object = rig
+    ball.shape_key_add(name="Basis")
+    key = ball.shape_key_add(name="Wide", from_mix=False)
+    wide = rest * np.float32((2, 1, 1))
+    key.points.foreach_set("co", wide.ravel())
+    key.value = 0.5
+    rig.pose.bones["Bone"].location = (0, 0.25, 0)  # along the bone, which is +Z of the world
+    frame, _ = export()
+    expected = (rest + wide) / 2
+    expected[top, 2] += 0.25
+    np.testing.assert_allclose(frame.objects[0].vertices, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["SUBSURF", "DECIMATE"])
+def test_modifier_that_changes_the_count_is_named(ball, export, kind):
+    ball.modifiers.new("Innocent", "SMOOTH")
+    ball.modifiers.new("Culprit", kind)
+    if kind == "DECIMATE":
+        ball.modifiers["Culprit"].ratio = 0.5
+    with pytest.raises(errors.AssetError, match='"ball".*"Culprit" changes the number of vertices from 86') as caught:
+        export()
+    assert "Innocent" not in str(caught.value)
+    ball.modifiers["Culprit"].show_viewport = ball.modifiers["Culprit"].show_render = False
+    assert len(export()[0].objects[0].vertices) == 86
+
+
+def test_edited_mesh_is_named(ball, export):
+    ball.data.vertices.add(1)
+    ball.data.update()
+    with pytest.raises(errors.AssetError, match='"ball".*its mesh has 87 vertices, the asset 86'):
+        export()
+
+
+def test_edit_mode_exports_the_mesh(ball, export):
+    bpy.ops.object.mode_set(mode="EDIT")
+    try:
+        np.testing.assert_array_equal(export()[0].objects[0].vertices, sphere()[0])
+    finally:
+        bpy.ops.object.mode_set(mode="OBJECT")
+
+
+def test_corner_normals_are_sent_only_when_shading_is_not_smooth(ball, export):
+    assert export()[0].objects[0].corner_normals is None
+    ball.data.shade_flat()
+    vertices, faces = sphere()
+    corners = vertices[faces]
+    flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    flat /= np.linalg.norm(flat, axis=1, keepdims=True)
+    normals = export()[0].objects[0].corner_normals
+    np.testing.assert_allclose(normals, np.repeat(flat[:, None], 3, 1), atol=1e-5)
+    ball.data.shade_smooth()
+    custom = np.tile(np.float32((0, 0, 1)), (3 * len(faces), 1))
+    ball.data.normals_split_custom_set(custom.tolist())
+    np.testing.assert_allclose(export()[0].objects[0].corner_normals.reshape(-1, 3), custom, atol=1e-3)
+
+
+def test_edited_materials_are_sent_and_only_those(ball, export):
+    count = len(sphere()[0])
+    arrays = part("addon.mesh_arrays")
+    paint = np.random.default_rng(3).uniform(0, 1, (count, 3)).astype(np.float32)
+    arrays.write_channel(ball.data, "albedo", paint)
+    (state,) = export()[0].objects
+    np.testing.assert_array_equal(state.albedo, paint)
+    assert state.roughness is None and state.metallic is None
+    ball.data.attributes["roughness"].data.foreach_set("value", np.full(count, np.nan, np.float32))
+    assert (export()[0].objects[0].roughness == 0).all()
+
+
+def test_attribute_of_a_wrong_kind_is_named_and_ignored(ball, export):
+    ball.data.attributes.remove(ball.data.attributes["albedo"])
+    ball.data.attributes.new("albedo", "FLOAT_COLOR", "CORNER")
+    frame, warnings = export()
+    assert frame.objects[0].albedo is None
+    assert any('"ball"' in w and "albedo" in w for w in warnings)
+
+
+def test_missing_asset_is_named(ball, ball_file, export):
+    ball_file.unlink()
+    with pytest.raises(errors.AssetError, match=r'"ball".*ball\.drgs does not exist'):
+        export()
+
+
+def test_replaced_asset_file_is_read_again(ball, ball_file, export):
+    export()
+    container = part("drgs_blender.asset.container")
+    asset = container.read_asset(ball_file)
+    asset.mesh.roughness = np.zeros_like(asset.mesh.roughness)
+    container.write_asset(ball_file, asset)
+    assert export()[0].objects[0].roughness is not None
+
+
+def test_no_camera_is_an_error_with_a_remedy(scene, export):
+    scene.camera = None
+    with pytest.raises(errors.UsageError, match="has no camera.*Add a camera"):
+        export()
+
+
+def test_settings_and_passes_reach_the_frame(ball, scene, captured):
+    settings, layer = scene.drgs, scene.view_layers[0]
+    settings.use_custom_split, settings.rays = False, 64
+    settings.bounces, settings.aa, settings.look, settings.denoise, settings.seed = 3, 8, "paper", "svgf", 5
+    settings.primary, scene.render.film_transparent = "mesh", True
+    layer.use_pass_z = layer.use_pass_object_index = layer.drgs.use_pass_albedo = layer.drgs.use_pass_noisy_image = True
+    scene.frame_set(12)
+    bpy.ops.render.render()
+    frame = captured[0]
+    s = frame.settings
+    assert (s.cosine, s.ggx, s.environment, s.bounces, s.aa, s.seed) == (32, 16, 16, 3, 8, 5)
+    assert (s.look, s.denoise, s.primary, s.film_transparent) == ("paper", "svgf", "mesh", True)
+    assert frame.passes == ("Combined", "Depth", "Albedo", "IndexOB", "Noisy Image")
+    assert frame.number == 12
+    settings.use_animated_seed = False
+    bpy.ops.render.render()
+    assert captured[1].number == 0

@@ -1,0 +1,120 @@
+"""Assets become objects that Blender's own tools understand."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+from scenes import part, read_exr, sphere, write_ball
+
+
+def channel(mesh, name):
+    return part("addon.mesh_arrays").read_channel(mesh, name)
+
+
+def test_mesh_is_the_assets_in_order_with_its_materials(ball, ball_file):
+    asset = part("drgs_blender.asset.container").read_asset(ball_file)
+    arrays = part("addon.mesh_arrays")
+    np.testing.assert_array_equal(arrays.read_vertices(ball.data), asset.mesh.vertices)
+    np.testing.assert_array_equal(arrays.read_triangles(ball.data), asset.mesh.faces)
+    for name in ("albedo", "roughness", "metallic"):
+        np.testing.assert_array_equal(channel(ball.data, name), getattr(asset.mesh, name))
+    assert ball.data.normals_domain == "POINT"
+    assert ball.drgs.is_drgs and not ball.data.validate()
+
+
+def test_path_is_relative_and_known_to_blenders_path_tools(ball, ball_file, tmp_path):
+    assert ball.drgs.path == "//" + os.path.join("assets", "ball.drgs")
+    assert ball.drgs.path in bpy.utils.blend_paths() or str(ball_file) in bpy.utils.blend_paths(absolute=True)
+    bpy.ops.file.make_paths_absolute()
+    assert Path(ball.drgs.path) == ball_file
+    bpy.ops.file.make_paths_relative()
+    assert ball.drgs.path.startswith("//")
+    moved = tmp_path / "elsewhere"
+    moved.mkdir()
+    shutil.move(ball_file, moved / "ball.drgs")
+    with pytest.raises(part("drgs_blender.errors").AssetError, match='"ball".*Find Missing Files'):
+        part("addon.assets").file_of(ball)
+    bpy.ops.file.find_missing_files(directory=str(moved))
+    assert part("addon.assets").file_of(ball) == moved / "ball.drgs"
+
+
+def test_packed_asset_renders_without_its_file(ball, ball_file, export, tmp_path):
+    expected = ball_file.read_bytes()
+    bpy.ops.file.pack_all()
+    ball_file.unlink()
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "packed.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "packed.blend"))
+    path = part("addon.assets").file_of(bpy.data.objects["ball"])
+    assert path.read_bytes() == expected
+    frame, _ = export()
+    assert frame.objects[0].asset == str(path)
+
+
+def test_anchor_survives_saving_duplicating_and_appending(ball, tmp_path):
+    copy = ball.copy()
+    bpy.context.collection.objects.link(copy)
+    assert copy.drgs.asset == ball.drgs.asset
+    saved = str(tmp_path / "scene.blend")
+    bpy.ops.wm.save_mainfile()
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    with bpy.data.libraries.load(saved) as (_, target):
+        target.objects = ["ball"]
+    assert Path(bpy.path.abspath(target.objects[0].drgs.path)) == tmp_path / "assets" / "ball.drgs"
+
+
+def test_several_files_share_one_anchor_each(scene, tmp_path):
+    names = [write_ball(tmp_path / f"{n}.drgs").name for n in ("one", "two")]
+    files = [{"name": n} for n in names]
+    for _ in range(2):
+        bpy.ops.import_scene.drgs(directory=str(tmp_path), files=files)
+    assert len(bpy.data.volumes) == 2 and sum(o.type == "MESH" for o in scene.objects) == 4
+    assert len(bpy.data.materials) == 1
+
+
+def test_environment_becomes_a_world_that_gives_the_same_light(scene, tmp_path, export):
+    light = np.random.default_rng(1).uniform(0, 40, (8, 16, 3)).astype(np.float32)
+    path = write_ball(tmp_path / "lit.drgs", light)
+    bpy.ops.import_scene.drgs(filepath=str(path), use_environment=True)
+    frame, warnings = export()
+    np.testing.assert_allclose(frame.world.environment, light, rtol=1e-6)
+    assert not warnings
+    bpy.ops.wm.save_mainfile()
+    bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
+    frame, _ = export()
+    np.testing.assert_allclose(frame.world.environment, light, rtol=1e-3)  # packed as half floats
+
+
+def test_damaged_file_is_refused_with_its_name_and_adds_nothing(scene, ball_file):
+    data = bytearray(ball_file.read_bytes())
+    data[len(data) // 2] ^= 255
+    ball_file.write_bytes(data)
+    before = len(bpy.data.objects)
+    with pytest.raises(RuntimeError, match="ball.drgs"):
+        bpy.ops.import_scene.drgs(filepath=str(ball_file))
+    assert len(bpy.data.objects) == before
+    assert part("addon.messages").history[-1].level == "ERROR"
+
+
+def test_viewport_material_shows_the_albedo_attribute_in_cycles(ball, scene):
+    """A white furnace through Cycles: of a rough non-metal the picture's colour follows the attribute."""
+    count = len(sphere()[0])
+    arrays = part("addon.mesh_arrays")
+    arrays.write_channel(ball.data, "albedo", np.tile(np.float32((0.8, 0.1, 0.1)), (count, 1)))
+    arrays.write_channel(ball.data, "roughness", np.ones(count, np.float32))
+    arrays.write_channel(ball.data, "metallic", np.zeros(count, np.float32))
+    world = bpy.data.worlds.new("White")
+    world.color = (1, 1, 1)
+    if world.node_tree:
+        next(n for n in world.node_tree.nodes if n.type == "BACKGROUND").inputs["Color"].default_value = (1, 1, 1, 1)
+    scene.world = world
+    scene.render.engine = "CYCLES"
+    scene.cycles.samples, scene.cycles.use_denoising = 16, False
+    scene.render.resolution_x = scene.render.resolution_y = 16
+    bpy.ops.render.render(write_still=True)
+    centre = read_exr(scene.render.filepath, 16, 16)[7:9, 7:9].mean((0, 1))
+    assert 0.6 < centre[0] < 0.95 and centre[1] < 0.25 and abs(centre[1] - centre[2]) < 0.03

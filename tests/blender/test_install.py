@@ -1,0 +1,118 @@
+"""The zip installs, what is registered works, nothing is left behind."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tomllib
+import zipfile
+from pathlib import Path
+
+import bpy
+import extension
+import pytest
+from scenes import PACKAGE, ROOT, part
+
+
+def test_extension_is_enabled_from_the_zip():
+    assert PACKAGE in bpy.context.preferences.addons
+    assert Path(part("addon").__file__).is_relative_to(bpy.utils.user_resource("EXTENSIONS"))
+    assert bpy.types.RenderEngine.bl_rna_get_subclass_py("DRGS") is not None
+
+
+def test_manifest_has_no_fault_and_faults_are_found():
+    manifest = tomllib.loads((ROOT / "blender_manifest.toml").read_text(encoding="utf-8"))
+    version = extension.project_version()
+    assert extension.faults(manifest, version) == []
+    broken = {"tagline": "Too long " * 9, "version": "9.9.9", "tags": ["Surfels"], "platforms": ["amiga"], "id": "a-b"}
+    for key, value in broken.items():
+        assert any(key.rstrip("s") in fault for fault in extension.faults(manifest | {key: value}, version)), key
+    assert extension.faults({}, version)
+
+
+def test_zip_is_reproducible_and_equals_what_blenders_builder_takes(tmp_path):
+    first, second = extension.build(tmp_path / "1.zip"), extension.build(tmp_path / "2.zip")
+    assert first.read_bytes() == second.read_bytes()
+    with zipfile.ZipFile(first) as archive:
+        ours = set(archive.namelist())
+    assert {"__init__.py", "blender_manifest.toml", "LICENSE", "addon/__init__.py"} <= ours
+    assert not any(name.startswith(("tests/", "bench/", "docs/", ".")) for name in ours)
+    builders = list(Path(bpy.utils.resource_path("LOCAL")).glob("scripts/addons_core/bl_pkg/cli/blender_ext.py"))
+    builder = builders[0]
+    # A copy of what is tracked: Blender's builder would also walk through environments of a working folder.
+    source = tmp_path / "source"
+    for name in ours:
+        (source / name).parent.mkdir(parents=True, exist_ok=True)
+        (source / name).write_bytes((ROOT / name).read_bytes())
+    for stray in ("tests/test_x.py", "docs/a.md", ".git/config", "drgs_blender/__pycache__/a.pyc", "Makefile"):
+        (source / stray).parent.mkdir(parents=True, exist_ok=True)
+        (source / stray).write_text("")
+    command = [sys.executable, str(builder), "build", "--source-dir", str(source), "--output-dir", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stdout + done.stderr
+    (built,) = tmp_path.glob("drgs-*.zip")
+    with zipfile.ZipFile(built) as archive:
+        assert {n for n in archive.namelist() if not n.endswith("/")} == ours
+
+
+def test_no_absolute_import_of_the_engine_package():
+    assert not [name for name in sys.modules if name.split(".")[0] == "drgs_blender"]
+
+
+class Layout:
+    """Stands in for UILayout and takes every call."""
+
+    def __getattr__(self, name):
+        if name in ("row", "column", "box", "split"):
+            return lambda *a, **k: Layout()
+        if name in ("prop", "template_ID"):
+            return self.prop
+        return lambda *a, **k: None
+
+    def __setattr__(self, name, value):
+        pass
+
+    def prop(self, data, name, **_):
+        assert name in data.bl_rna.properties, f"{data} has no property {name}"
+
+
+@pytest.mark.parametrize("loaded", [False, True])
+def test_every_panel_draws_and_every_poll_answers(scene, ball_file, loaded):
+    if loaded:
+        bpy.ops.import_scene.drgs(filepath=str(ball_file))
+        part("addon.messages").note("WARNING", "a rather long message " * 6)
+    classes = part("addon.panels").CLASSES
+    assert len(classes) >= 8
+    drawn = 0
+    for cls in classes:
+        if getattr(cls, "poll", lambda _: True)(bpy.context):
+            stand_in = type("StandIn", (), {"layout": Layout()})()
+            cls.draw(stand_in, bpy.context)
+            drawn += 1
+    assert drawn >= (8 if loaded else 7)
+    for module in part("operators").MODULES:
+        for cls in module.CLASSES:
+            if hasattr(cls, "bl_idname") and "." in cls.bl_idname:
+                group, name = cls.bl_idname.split(".")
+                assert getattr(getattr(bpy.ops, group), name).poll() in (True, False)
+    stand_in = type("StandIn", (), {"layout": Layout(), "bl_rna": part("addon.preferences").DrgsPreferences.bl_rna})()
+    part("addon.preferences").DrgsPreferences.draw(stand_in, bpy.context)
+
+
+def test_blenders_own_panels_are_shared_and_given_back(scene):
+    shared = [p for p in bpy.types.Panel.__subclasses__() if "DRGS" in getattr(p, "COMPAT_ENGINES", ())]
+    assert {"RENDER_PT_format", "RENDER_PT_output"} <= {p.__name__ for p in shared}
+    panels = part("addon.render_engine.panels")
+    panels.withdraw_panels()
+    try:
+        assert not [p for p in bpy.types.Panel.__subclasses__() if "DRGS" in getattr(p, "COMPAT_ENGINES", ())]
+    finally:
+        panels.share_panels()
+
+
+def test_disable_and_enable_again(scene):
+    bpy.ops.preferences.addon_disable(module=PACKAGE)
+    assert not hasattr(bpy.types.Scene, "drgs")
+    assert not [h for h in bpy.app.handlers.load_post if h.__module__.startswith(PACKAGE)]
+    bpy.ops.preferences.addon_enable(module=PACKAGE)
+    assert scene.drgs.rays == 32
