@@ -12,12 +12,12 @@ import numpy as np
 
 from ..errors import UsageError
 from ..frame import RenderSettings
-from ..jit import njit, prange
+from ..jit import prange
 from . import brdf, sampling
 from .embree import closest_hit, occluded
 from .light import EnvironmentLight, density_at, radiance_at, sample_map, to_map
 from .points import Radiance, ShadingPoints
-from .sampling import GOLDEN, INVERSE_PI, ONE, TWO, ZERO, F, U, mix, unit
+from .sampling import GOLDEN, INVERSE_PI, ONE, TWO, ZERO, F, U, exact, mix, unit
 from .scene import TraceScene
 
 Array = np.ndarray
@@ -94,14 +94,14 @@ def mixed(seed: int, frame_number: int) -> int:
     return value >> 32
 
 
-@njit(inline="always")
+@exact
 def _offset(px, py, pz, gx, gy, gz, extent):  # type: ignore[no-untyped-def]
     """Lift a ray's start off the surface by more than rounding can push it below."""
     lift = _OFFSET_POINT * max(abs(px), max(abs(py), abs(pz))) + _OFFSET_SCENE * extent
     return px + lift * gx, py + lift * gy, pz + lift * gz
 
 
-@njit(inline="always")
+@exact
 def _half_vector(nx, ny, nz, vx, vy, vz, lx, ly, lz, nl, nv):  # type: ignore[no-untyped-def]
     """(v . l, cos^2, sin^2) of the angle between the normal and the half vector."""
     vl = vx * lx + vy * ly + vz * lz
@@ -111,7 +111,7 @@ def _half_vector(nx, ny, nz, vx, vy, vz, lx, ly, lz, nl, nv):  # type: ignore[no
     return vl, (nl + nv) * (nl + nv) * inverse, (cx * cx + cy * cy + cz * cz) * inverse
 
 
-@njit
+@exact
 def _beyond(ox, oy, oz, dx, dy, dz, hit, tracer, geometry, light, table, look, bounces, key):  # type: ignore[no-untyped-def]
     """Radiance that comes back along a ray that hit a surface: a path of up to `bounces` vertices from that hit on.
 
@@ -215,7 +215,7 @@ def _beyond(ox, oy, oz, dx, dy, dz, hit, tracer, geometry, light, table, look, b
     return red, green, blue
 
 
-@njit
+@exact
 def _point(  # type: ignore[no-untyped-def]
     pixel, sample, surface, frame, tracer, geometry, light, table, numbers, counts, aa, bounces, look, seed, components,
     variance,
@@ -244,8 +244,8 @@ def _point(  # type: ignore[no-untyped-def]
         # This sub-sample's part of the pixel's samples: n / aa on average, n over all sub-samples together.
         dither = unit(mix(U(key + U(4)))) if counts[strategy] % aa else ZERO
         step = F(counts[strategy]) * share
-        first = np.int32(math.floor(F(sample) * step + dither))
-        past = np.int32(math.floor(F(sample + 1) * step + dither)) if sample + 1 < aa else counts[strategy]
+        first = np.int32(F(sample) * step + dither)
+        past = np.int32(F(sample + 1) * step + dither) if sample + 1 < aa else counts[strategy]
         for j in range(first, past):
             total += 1
             n0, n1 = U(numbers[j, 0] ^ shift_0), U(numbers[j, 1] ^ shift_1)
@@ -304,7 +304,7 @@ def _point(  # type: ignore[no-untyped-def]
     variance[0], variance[1] = diffuse_2, glossy_2
 
 
-@njit(parallel=True)
+@exact(parallel=True)
 def _kernel(  # type: ignore[no-untyped-def]
     keys, frames, surfaces, tracer, geometry, light, table, numbers, counts, aa, bounces, look, seed, components,
     variance,

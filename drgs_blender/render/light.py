@@ -14,8 +14,7 @@ import numpy as np
 from ..asset.model import as_float
 from ..errors import UsageError
 from ..frame import World
-from ..jit import njit
-from .sampling import fast_acos, fast_atan2_turns, sincos_turns
+from .sampling import exact, fast_acos, fast_atan2_turns, sincos_turns
 
 Array = np.ndarray
 
@@ -26,7 +25,7 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 _MOST_CELLS = 1 << 22
 
 
-@njit
+@exact
 def _alias_table(weights, threshold, alias):  # type: ignore[no-untyped-def]
     """Vose's alias method; `threshold` is the chance, in units of 2^-32, to keep the cell itself."""
     n = len(weights)
@@ -136,7 +135,7 @@ class EnvironmentLight:
         return _sample_many(numbers, self.threshold, self.alias, self.density, self.row_z, self.rotation)
 
 
-@njit(inline="always")
+@exact
 def to_map(dx, dy, dz, rotation):  # type: ignore[no-untyped-def]
     """Lat-long coordinates (u, v) in [0, 1] of a world direction; row 0 at +Z, +X at u = 1/2."""
     x = rotation[0, 0] * dx + rotation[0, 1] * dy + rotation[0, 2] * dz
@@ -145,7 +144,7 @@ def to_map(dx, dy, dz, rotation):  # type: ignore[no-untyped-def]
     return np.float32(0.5) - fast_atan2_turns(y, x), fast_acos(z) * np.float32(1.0 / math.pi)
 
 
-@njit(inline="always")
+@exact
 def density_at(u, v, density):  # type: ignore[no-untyped-def]
     """Density per solid angle of the sampling cell that holds (u, v)."""
     rows, columns = density.shape
@@ -154,13 +153,13 @@ def density_at(u, v, density):  # type: ignore[no-untyped-def]
     return density[r, c]
 
 
-@njit(inline="always")
+@exact
 def radiance_at(u, v, radiance):  # type: ignore[no-untyped-def]
     """Bilinear lookup, wrapped in u and clamped in v."""
     h, w = radiance.shape[0], radiance.shape[1]
     x, y = u * np.float32(w) - np.float32(0.5), v * np.float32(h) - np.float32(0.5)
     y = min(max(y, np.float32(0.0)), np.float32(h - 1))
-    c0, r0 = np.int32(math.floor(x)), np.int32(y)
+    c0, r0 = np.int32(x + np.float32(1.0)) - np.int32(1), np.int32(y)
     a, b = x - np.float32(c0), y - np.float32(r0)
     c1 = c0 + 1 if c0 + 1 < w else 0
     if c0 < 0:
@@ -176,7 +175,7 @@ def radiance_at(u, v, radiance):  # type: ignore[no-untyped-def]
     return red, green, blue
 
 
-@njit(inline="always")
+@exact
 def sample_map(n0, n1, n2, n3, threshold, alias, density, row_z, rotation):  # type: ignore[no-untyped-def]
     """World direction, its (u, v) and its density from four uint32: cell, alias choice, place inside the cell."""
     rows, columns = density.shape
@@ -198,7 +197,7 @@ def sample_map(n0, n1, n2, n3, threshold, alias, density, row_z, rotation):  # t
     return dx, dy, dz, u, v, density[r, c]
 
 
-@njit
+@exact
 def _lookup_many(directions, radiance, rotation):  # type: ignore[no-untyped-def]
     out = np.empty((len(directions), 3), np.float32)
     for i in range(len(directions)):
@@ -207,7 +206,7 @@ def _lookup_many(directions, radiance, rotation):  # type: ignore[no-untyped-def
     return out
 
 
-@njit
+@exact
 def _pdf_many(directions, density, rotation):  # type: ignore[no-untyped-def]
     out = np.empty(len(directions), np.float32)
     for i in range(len(directions)):
@@ -216,7 +215,7 @@ def _pdf_many(directions, density, rotation):  # type: ignore[no-untyped-def]
     return out
 
 
-@njit
+@exact
 def _sample_many(numbers, threshold, alias, density, row_z, rotation):  # type: ignore[no-untyped-def]
     n = len(numbers)
     directions, pdf = np.empty((n, 3), np.float32), np.empty(n, np.float32)
