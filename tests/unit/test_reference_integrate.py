@@ -41,12 +41,12 @@ def random_light(seed: int = 0, height: int = 8) -> Light:
     return Light.from_world(World(environment=image))
 
 
-def quads(*corners: list[tuple[float, float, float]], albedo: float = 0.6) -> TriangleTracer:
+def quads(*corners: list[tuple[float, float, float]], albedo: float = 0.6, dtype: torch.dtype = F64) -> TriangleTracer:
     """Quadrilaterals, two triangles each, diffuse."""
     vertices = np.concatenate([np.asarray(c, dtype=float) for c in corners])
     faces = np.concatenate([np.array([[0, 1, 2], [0, 2, 3]]) + 4 * i for i in range(len(corners))])
     n = len(vertices)
-    return tracer_from_arrays(vertices, faces, np.full((n, 3), albedo), np.ones(n), np.zeros(n))
+    return tracer_from_arrays(vertices, faces, np.full((n, 3), albedo), np.ones(n), np.zeros(n), dtype=dtype)
 
 
 FLOOR = [(-50, 0, 0), (50, 0, 0), (50, 50, 0), (-50, 50, 0)]
@@ -185,3 +185,34 @@ def test_gradient_of_the_estimate_is_an_estimate_of_the_gradient():
     drawn = torch.cat(drawn)
     assert (drawn.mean() - expected).abs() < 4 * drawn.std() / math.sqrt(len(drawn))
     assert drawn.std() / math.sqrt(len(drawn)) < 0.1 * expected.abs()
+
+
+def test_gradients_reach_the_materials_that_rays_meet():
+    """Directions do not depend on colour, so with one seed the estimate is a polynomial of it."""
+    points = points_up((0.6,), (0.2,))
+    points.origin = torch.tensor([[0.1, 0.3, 1e-4]], dtype=F64)
+    wall = quads([(-2, 0, 0), (2, 0, 0), (2, 0, 3), (-2, 0, 3)])
+    light = random_light(6, 4)
+
+    def lit(vertex_albedo):
+        wall.albedo = vertex_albedo
+        generator = torch.Generator().manual_seed(4)
+        return integrate(wall, light, points, Counts(20, 10, 10), 2, generator=generator)
+
+    albedo = torch.rand(4, 3, dtype=F64, generator=torch.Generator().manual_seed(7), requires_grad=True)
+    assert lit(albedo)[0, 1].min() > 0
+    assert torch.autograd.gradcheck(lit, (albedo,))
+
+
+def test_single_precision_is_precise_enough():
+    wall, light, points = quads(WALL), random_light(1), points_up()
+    points.origin = torch.tensor([[0.1, 0.3, 1e-3]], dtype=F64).expand(3, 3)
+    truth = integrate_quadrature(wall, light, points, 64)
+
+    rows = SurfacePoints(**{name: values.float() for name, values in vars(points).items()})
+    sky = Light(light.image.float(), light.rotation.float(), light.colour.float())
+    small = quads(WALL, dtype=torch.float32)
+    found = integrate_quadrature(small, sky, rows, 64)
+    assert found.dtype == torch.float32
+    torch.testing.assert_close(found.double(), truth, rtol=1e-3, atol=1e-5)
+    assert integrate(small, sky, rows, Counts(2, 2, 2), 1).isfinite().all()
