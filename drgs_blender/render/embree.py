@@ -6,6 +6,9 @@ run-time integers, so compiled code can be cached on disk and still finds the li
 
 from __future__ import annotations
 
+from ..jit import njit, prange  # first of all: it sets Numba up before anything imports Numba
+
+# isort: split
 import ctypes
 import functools
 import math
@@ -19,7 +22,6 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from ..errors import DeviceError, UsageError
-from ..jit import njit, prange
 
 Array = np.ndarray
 

@@ -1,0 +1,152 @@
+"""The environment light: orientation, densities, odd pictures."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drgs_blender.errors import UsageError
+from drgs_blender.frame import World
+from drgs_blender.render.light import LUMINANCE, EnvironmentLight
+
+
+def picture(kind: str) -> np.ndarray | None:
+    rng = np.random.default_rng(5)
+    if kind == "constant":
+        return None
+    image = rng.random((16, 32, 3)) ** 4 if kind == "random" else np.zeros((16, 32, 3))
+    if kind == "sun":
+        image[5, 31] = 1000.0
+    if kind == "pole":
+        image[0, 3] = 10.0
+    return image.astype(np.float32)
+
+
+KINDS = ["constant", "random", "sun", "pole"]
+
+
+def sphere_grid(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
+    """Directions (n, 3) on a lat-long grid and the solid angle (n,) of each; multiples of 16 and 32 keep to cells."""
+    theta = np.pi * (np.arange(rows) + 0.5) / rows
+    phi = 2 * np.pi * (np.arange(columns) + 0.5) / columns
+    angle = -np.diff(np.cos(np.pi * np.arange(rows + 1) / rows)) * 2 * np.pi / columns
+    theta, phi = (a.ravel() for a in np.meshgrid(theta, phi, indexing="ij"))
+    directions = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=1)
+    return directions, np.repeat(angle, columns)
+
+
+def numbers(count: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 2**32, size=(count, 4), dtype=np.uint32)
+
+
+def test_blenders_orientation() -> None:
+    """+X in the middle, +Y a quarter turn to the left (u = 1/4), +Z on top."""
+    image = np.zeros((8, 16, 3), np.float32)
+    image[:, :, 0] = (np.arange(16) + 0.5) / 16
+    image[:, :, 1] = ((np.arange(8) + 0.5) / 8)[:, None]
+    light = EnvironmentLight(World(environment=image))
+    found = light.lookup(np.array([[1, 0, 0], [0, 1, 0], [0, -1, 0], [0.6, 0, 0.8], [0, 0, 1], [0, 0, -1]]))
+    np.testing.assert_allclose(found[:3, 0], [0.5, 0.25, 0.75], atol=1e-5)
+    np.testing.assert_allclose(found[:3, 1], 0.5, atol=1e-5)
+    assert found[3, 1] == pytest.approx(np.arccos(0.8) / np.pi, abs=1e-5)
+    np.testing.assert_allclose(found[4:, 1], [1 / 16, 15 / 16], atol=1e-5)
+
+
+def test_the_seam_is_interpolated() -> None:
+    image = np.zeros((4, 8, 3), np.float32)
+    image[:, 0], image[:, 7] = 1.0, 3.0
+    light = EnvironmentLight(World(environment=image))
+    np.testing.assert_allclose(light.lookup([[-1, 1e-7, 0], [-1, -1e-7, 0]]), 2.0, atol=1e-4)
+
+
+def test_rotation_colour_and_strength() -> None:
+    image = picture("random")
+    angle = 0.7
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    plain = EnvironmentLight(World(environment=image))
+    turned = EnvironmentLight(World(environment=image, rotation=turn, colour=(1.0, 0.5, 0.0), strength=3.0))
+    directions, _ = sphere_grid(20, 40)
+    expected = plain.lookup(directions @ turn.T) * [3.0, 1.5, 0.0]
+    np.testing.assert_allclose(turned.lookup(directions), expected, atol=2e-4)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_density_integrates_to_one(kind: str) -> None:
+    light = EnvironmentLight(World(environment=picture(kind)))
+    rows, columns = light.density.shape
+    # Rows of cells have unequal heights in z: integrate cell by cell.
+    solid = -np.diff(light.row_z.astype(float)) * 2 * np.pi / columns
+    assert (light.density * solid[:, None]).sum() == pytest.approx(1.0, abs=1e-5)
+    directions, angle = sphere_grid(160, 320)
+    assert light.pdf(directions).astype(float) @ angle == pytest.approx(1.0, abs=1e-4)
+    assert rows * columns == len(light.alias)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("turned", [False, True])
+def test_samples_follow_the_density(kind: str, turned: bool) -> None:
+    rotation = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0] if turned else np.eye(3)
+    light = EnvironmentLight(World(environment=picture(kind), rotation=rotation))
+    count = 200_000
+    directions, pdf = light.sample(numbers(count))
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-5)
+    # On a cell's very border the lookup may fall to the neighbour.
+    assert (np.abs(light.pdf(directions) - pdf) <= 1e-4 * pdf).mean() > 0.999
+    # Histogram over octants and over bands, against the density's integral.
+    grid, angle = sphere_grid(480, 960)
+    weights = light.pdf(grid @ rotation) * angle  # the grid keeps to the cells in the environment's own frame
+
+    def cells(d: np.ndarray) -> np.ndarray:
+        return (d > 0) @ [1, 2, 4] * 4 + np.minimum((np.abs(d[:, 2]) * 4).astype(int), 3)
+
+    expected = np.bincount(cells(grid), weights, minlength=32)
+    found = np.bincount(cells(directions @ rotation.T), minlength=32) / count
+    np.testing.assert_allclose(found, expected, atol=5 * np.sqrt(0.25 / count))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_sampling_integrates_the_radiance(kind: str) -> None:
+    light = EnvironmentLight(World(environment=picture(kind)))
+    directions, pdf = light.sample(numbers(100_000, seed=1))
+    value = light.lookup(directions) @ LUMINANCE / pdf
+    grid, angle = sphere_grid(960, 1920)
+    expected = (light.lookup(grid) @ LUMINANCE) @ angle
+    error = value.std() / np.sqrt(len(value))
+    assert abs(value.mean() - expected) < 5 * error + 3e-3 * expected
+    if kind == "constant":
+        np.testing.assert_allclose(pdf, 1 / (4 * np.pi), rtol=1e-5)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_where_light_is_there_is_density(kind: str) -> None:
+    light = EnvironmentLight(World(environment=picture(kind)))
+    directions, _ = sphere_grid(300, 600)
+    lit = light.lookup(directions).sum(axis=1) > 0
+    assert lit.any()
+    assert (light.pdf(directions)[lit] > 0).all()
+
+
+def test_bad_texels_are_black_and_counted() -> None:
+    image = np.ones((8, 16, 3), np.float32)
+    image[2, 3, 0], image[4, 4, 1], image[5, 5], image[6, 6, 2] = np.nan, np.inf, -1.0, -np.inf
+    light = EnvironmentLight(World(environment=image))
+    assert light.bad_texels == 4
+    directions, _ = sphere_grid(100, 200)
+    found = light.lookup(directions)
+    assert np.isfinite(found).all() and found.min() >= 0 and found.max() <= 1.00001
+    _, pdf = light.sample(numbers(1000))
+    assert np.isfinite(pdf).all() and (pdf > 0).all()
+
+
+def test_black_worlds_are_black() -> None:
+    for world in (World(strength=0.0), World(environment=np.zeros((4, 8, 3), np.float32))):
+        light = EnvironmentLight(world)
+        assert light.black
+        assert not light.lookup([[0, 0, 1]]).any() and not light.pdf([[0, 0, 1]]).any()
+
+
+def test_a_world_that_is_no_world_is_refused() -> None:
+    with pytest.raises(UsageError, match="not finite"):
+        EnvironmentLight(World(strength=float("nan")))
+    with pytest.raises(UsageError, match="no pixels"):
+        EnvironmentLight(World(environment=np.zeros((0, 8, 3), np.float32)))
