@@ -29,7 +29,7 @@ _EXR = b"\x76\x2f\x31\x01"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of ``drgs inspect``."""
-    parser.add_argument("file", type=Path, metavar="FILE", help="any file that DR-GS reads or writes")
+    parser.add_argument("file", type=Path, metavar="FILE", help="any file (or folder) that DR-GS reads or writes")
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
@@ -48,9 +48,11 @@ def inspect_file(path: Path) -> dict[str, Any]:
     AssetError
         The file cannot be read or is of no known kind.
     """
+    magic = b""
     try:
-        with path.open("rb") as stream:
-            magic = stream.read(4)
+        if not path.is_dir():
+            with path.open("rb") as stream:
+                magic = stream.read(4)
     except OSError as error:
         raise AssetError(str(path), f"cannot be read ({error.strerror})", "Check the path") from error
     if magic == _ZIP and path.suffix.lower() == ".drgs":
@@ -59,10 +61,10 @@ def inspect_file(path: Path) -> dict[str, Any]:
         return {"kind": "asset", **inspect_asset(path)}
     if magic == _EXR and (frame := inspect_frame(path)):
         return frame
-    from ..formats.registry import read
+    from ..formats.registry import find_format
 
-    found = read(path)
-    return {"kind": type(found).__name__.removesuffix("File").lower(), **describe(found)}
+    kind = find_format(path)
+    return {"kind": kind.kind, "format": kind.name, **describe(kind.read(path))}
 
 
 def inspect_frame(path: Path) -> dict[str, Any] | None:
@@ -114,8 +116,8 @@ def describe(value: Any) -> Any:
 def as_lines(value: Any, depth: int = 0) -> Iterator[str]:
     """Indented lines for a person; short lists and array summaries stay on one line."""
     pad = "  " * depth
-    items = value.items() if isinstance(value, dict) else enumerate(value)
-    for key, item in items:
+    named = isinstance(value, dict)
+    for key, item in value.items() if named else enumerate(value):
         if isinstance(item, dict) and "shape" in item and "dtype" in item:
             low_high = " from {:.4g} to {:.4g}".format(*item["range"]) if item.get("range") else ""
             bad = f", {item['not_finite']} not finite" if item.get("not_finite") else ""
@@ -126,12 +128,14 @@ def as_lines(value: Any, depth: int = 0) -> Iterator[str]:
         elif isinstance(item, list):
             yield f"{pad}{key}: {', '.join(plain(part) for part in item) or 'none'}"
         else:
-            yield f"{pad}{key}: {plain(item)}"
+            yield f"{pad}{key}: {plain(item)}" if named else f"{pad}- {plain(item)}"
 
 
 def is_short(value: Any) -> bool:
-    """Whether a list fits a line."""
-    return isinstance(value, list) and len(value) <= 16 and not any(isinstance(item, dict | list) for item in value)
+    """Whether a list fits a line: few items, none of them nested or a sentence."""
+    if not isinstance(value, list) or len(value) > 16:
+        return False
+    return not any(isinstance(item, dict | list) or len(str(item)) > 30 for item in value)
 
 
 def plain(value: Any) -> str:

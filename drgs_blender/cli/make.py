@@ -1,30 +1,36 @@
-"""Make an asset from a textured mesh: surfels grown on it, materials from its textures.
+"""Make an asset from a textured mesh: surfels grown on its faces, materials from its textures.
 
-Reads glTF, GLB, OBJ, PLY and what else the formats registry knows; textures may lie beside the mesh.
+Reads every mesh that `drgs inspect` knows. The mesh is divided where its textures need more vertices.
 """
 
 from __future__ import annotations
 
 import argparse
-import logging
 from pathlib import Path
 
-from .output import check_suffix, check_writable
-from .progress import FractionBar
-
-logger = logging.getLogger(__name__)
+from .output import check_suffix, check_writable, write_and_report
+from .progress import clock
+from .sampling import whole
 
 EXAMPLES = """examples:
   drgs make helmet.gltf --out helmet.drgs
-  drgs make statue.obj --up y --out statue.drgs
+  drgs make statue.obj --up y --env studio.hdr --out statue.drgs
+  drgs make scan.ply --max-triangles 400000 --density 200 --out scan.drgs
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of ``drgs make``."""
-    parser.add_argument("mesh", type=Path, metavar="MESH", help="textured mesh")
+    parser.add_argument("mesh", type=Path, metavar="MESH", help="mesh with materials (glTF, GLB, OBJ, PLY)")
     parser.add_argument("--out", type=Path, required=True, metavar="A.drgs", help="asset to write")
     parser.add_argument("--up", choices=("y", "z"), help="up axis of the file; default: what its format says")
+    parser.add_argument("--env", type=Path, help="environment kept in the asset")
+    parser.add_argument(
+        "--max-triangles", type=whole(1, 10**8), metavar="N", help="budget when the mesh is divided for texture detail"
+    )
+    parser.add_argument(
+        "--density", type=whole(1, 100_000), metavar="D", help="surfels along the mesh's diagonal, at least"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -32,11 +38,10 @@ def run(args: argparse.Namespace) -> int:
     check_suffix(args.out, (".drgs",))
     check_writable(args.out)
 
-    from ..asset.container import write_asset
     from ..build.make import make_asset
 
-    with FractionBar(args, "making"):
-        asset = make_asset(args.mesh)
-    write_asset(args.out, asset)
-    print(f"{args.out}: {len(asset.surfels)} surfels on {len(asset.mesh.faces)} triangles")
+    given = {name: value for name in ("max_triangles", "density") if (value := getattr(args, name)) is not None}
+    with clock(args, "making the asset"):
+        asset = make_asset(args.mesh, up=args.up, environment=args.env, **given)
+    write_and_report(args.out, asset)
     return 0

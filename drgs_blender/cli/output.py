@@ -5,11 +5,13 @@ from __future__ import annotations
 import contextlib
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from ..asset import Asset
 from ..errors import UsageError, WriteError
 
 
@@ -52,6 +54,27 @@ def replacing(path: Path) -> Iterator[Path]:
         raise _cannot_write(path, error) from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def write_and_report(path: Path, asset: Asset) -> None:
+    """Write an asset and say on stdout what it holds, and what its maker noted."""
+    from ..asset.container import write_asset
+
+    write_asset(path, asset)
+    print(f"{path}: {len(asset.surfels)} surfels on {len(asset.mesh.faces)} triangles")
+    if "materials" in asset.provenance:
+        print(f"  materials: {asset.provenance['materials']}")
+    for note in notes_of(asset.provenance):
+        print(f"  {note}")
+
+
+def notes_of(provenance: Mapping[str, Any]) -> Iterator[str]:
+    """Every text in lists called notes, at any depth: what a reader converted, assumed or left out."""
+    for key, value in provenance.items():
+        if isinstance(value, Mapping):
+            yield from notes_of(value)
+        elif key.endswith("notes"):
+            yield from value
 
 
 def write_preview(path: Path, combined: np.ndarray) -> None:

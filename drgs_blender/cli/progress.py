@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import threading
+from collections.abc import Iterator
 from typing import Any
 
 
@@ -13,6 +16,25 @@ def bar(args: argparse.Namespace, label: str, total: float | None = None, unit: 
     wanted = args.progress
     disable = True if args.quiet or wanted is False else (False if wanted else None)
     return tqdm(total=total, desc=label, unit=unit, disable=disable, leave=False, dynamic_ncols=True, **options)
+
+
+@contextlib.contextmanager
+def clock(args: argparse.Namespace, label: str) -> Iterator[None]:
+    """A running clock beside `label`, for work that cannot say how far it is."""
+    with bar(args, label, bar_format="{desc} {elapsed}") as line:
+        ended = threading.Event()
+
+        def tick() -> None:
+            while not ended.wait(0.5):
+                line.refresh()
+
+        thread = threading.Thread(target=tick, daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            thread.join()
 
 
 class FractionBar:

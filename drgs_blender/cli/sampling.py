@@ -24,14 +24,14 @@ def add_arguments(parser: argparse.ArgumentParser, *, defaults: bool) -> None:
     def choices(field: str) -> tuple[str, ...]:
         return get_args(hints[field])
 
-    add("--rays", "rays", "rays a pixel: half by cosine, a quarter GGX, a quarter environment", type=_whole(1, 65536))
-    add("--bounces", "bounces", "indirect bounces", type=_whole(0, 64))
-    add("--aa", "aa", "sub-pixel positions among which the rays are divided", type=_whole(1, 1024))
+    add("--rays", "rays", "rays a pixel: half by cosine, a quarter GGX, a quarter environment", type=whole(1, 65536))
+    add("--bounces", "bounces", "indirect bounces", type=whole(0, 64))
+    add("--aa", "aa", "sub-pixel positions among which the rays are divided", type=whole(1, 1024))
     add("--primary", "primary", "what the camera sees: surfels or the mesh", choices=choices("primary"))
     add("--denoise", "denoise", "denoiser", choices=choices("denoise"))
     add("--look", "look", "material model", choices=choices("look"))
-    add("--seed", "seed", "seed of the noise", type=_whole(0, 2**31 - 1))
-    add("--threads", "threads", "threads, 0 for all cores", type=_whole(0, 1024))
+    add("--seed", "seed", "seed of the noise", type=whole(0, 2**31 - 1))
+    add("--threads", "threads", "threads, 0 for all cores", type=whole(0, 1024))
     group.add_argument(
         "--transparent",
         dest="film_transparent",
@@ -48,7 +48,9 @@ def add_arguments(parser: argparse.ArgumentParser, *, defaults: bool) -> None:
     )
 
 
-def _whole(low: int, high: int) -> Any:
+def whole(low: int, high: int) -> Any:
+    """Parser of a whole number from `low` to `high`."""
+
     def parse(text: str) -> int:
         value = int(text)
         if not low <= value <= high:

@@ -1,0 +1,198 @@
+"""``drgs make``, ``import``, ``inspect`` and ``doctor`` on files made here."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from drgs_blender.asset.container import read_asset
+from drgs_blender.cli import doctor
+from drgs_blender.cli.main import main
+from drgs_blender.render.frames import write_frame
+
+#: Unit cube, each face on the whole texture.
+CUBE = """mtllib cube.mtl
+v -1 -1 -1
+v 1 -1 -1
+v 1 1 -1
+v -1 1 -1
+v -1 -1 1
+v 1 -1 1
+v 1 1 1
+v -1 1 1
+vt 0 0
+vt 1 0
+vt 1 1
+vt 0 1
+usemtl paint
+f 1/1 4/2 3/3 2/4
+f 5/1 6/2 7/3 8/4
+f 1/1 2/2 6/3 5/4
+f 3/1 4/2 8/3 7/4
+f 2/1 3/2 7/3 6/4
+f 4/1 1/2 5/3 8/4
+"""
+
+
+@pytest.fixture
+def cube(tmp_path: Path) -> Path:
+    """A textured cube: the lower half of each face dark red, the upper half light blue."""
+    pixels = np.zeros((8, 8, 3), np.uint8)
+    pixels[4:], pixels[:4] = (188, 0, 0), (0, 0, 255)
+    Image.fromarray(pixels).save(tmp_path / "paint.png")
+    (tmp_path / "cube.mtl").write_text("newmtl paint\nKd 1 1 1\nmap_Kd paint.png\n")
+    (tmp_path / "cube.obj").write_text(CUBE)
+    return tmp_path / "cube.obj"
+
+
+def splats(path: Path) -> Path:
+    """A PLY in the layout of 2D Gaussian splatting: 400 discs on a unit sphere, in the colour of albedo 0.5."""
+    turn = np.arange(400)
+    z = 1 - (2 * turn + 1) / 400
+    angle = turn * np.pi * (3 - np.sqrt(5))  # Fibonacci lattice: evenly spread
+    ring = np.sqrt(1 - z**2)
+    direction = np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=1)
+    # Quaternion that turns +Z to the direction: half way between the two.
+    rotation = np.stack([1 + direction[:, 2], -direction[:, 1], direction[:, 0], np.zeros(400)], axis=1)
+    rotation /= np.linalg.norm(rotation, axis=1, keepdims=True)
+    columns = {name: direction[:, k] for k, name in enumerate("xyz")}
+    columns |= {f"f_dc_{k}": np.zeros(400) for k in range(3)}
+    columns |= {"opacity": np.full(400, 4.0)}
+    columns |= {f"scale_{k}": np.full(400, np.log(0.08)) for k in range(2)}
+    columns |= {f"rot_{k}": rotation[:, k] for k in range(4)}
+    header = ["ply", "format binary_little_endian 1.0", "element vertex 400"]
+    header += [f"property float {name}" for name in columns] + ["end_header", ""]
+    path.write_bytes("\n".join(header).encode() + np.stack([*columns.values()], axis=1).astype("<f4").tobytes())
+    return path
+
+
+def described(path: Path, capsys: pytest.CaptureFixture) -> dict:
+    """What ``drgs inspect --json`` says."""
+    capsys.readouterr()
+    assert main(["inspect", str(path), "--json"]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def test_make_carries_the_texture_to_the_mesh(cube, tmp_path, capsys):
+    out = tmp_path / "cube.drgs"
+    assert main(["make", str(cube), "--up", "z", "--out", str(out)]) == 0
+    asset = read_asset(out)
+    said = capsys.readouterr().out
+    assert f"{len(asset.surfels)} surfels on {len(asset.mesh.faces)} triangles" in said
+    # sRGB 188 is 0.503 linear (IEC 61966-2-1).
+    for part in (asset.mesh, asset.surfels):
+        red, blue = part.albedo[:, 0], part.albedo[:, 2]
+        assert red.max() == pytest.approx(0.503, abs=0.01) and blue.max() == pytest.approx(1, abs=0.01)
+        assert part.albedo[:, 1].max() < 0.01
+    np.testing.assert_allclose(np.abs(asset.mesh.vertices).max(axis=0), 1, atol=1e-6)
+    report = described(out, capsys)
+    assert (report["kind"], report["bound"], report["verified"]) == ("asset", True, True)
+    assert report["counts"]["surfels"] == len(asset.surfels)
+
+
+def test_up_axis_turns_the_object(cube, tmp_path):
+    cube.write_text(CUBE.replace("v 1 1 1\n", "v 1 3 1\n"))
+    tops = []
+    for up in ("y", "z"):
+        assert main(["make", str(cube), "--up", up, "--out", str(tmp_path / "c.drgs")]) == 0
+        tops.append(read_asset(tmp_path / "c.drgs").mesh.vertices.max(axis=0))
+    assert tops[0][2] == pytest.approx(3) and tops[1][1] == pytest.approx(3)
+
+
+def test_import_builds_a_mesh_around_splats(tmp_path, capsys):
+    out = tmp_path / "ball.drgs"
+    assert main(["import", str(splats(tmp_path / "s.ply")), "--resolution", "24", "--out", str(out)]) == 0
+    asset = read_asset(out)
+    assert len(asset.surfels) == 400 and asset.binding is not None
+    radius = np.linalg.norm(asset.mesh.vertices, axis=1)
+    assert np.abs(radius - 1).max() < 0.15
+    report = described(out, capsys)
+    assert report["provenance"]["surfels"] == "s.ply" and report["counts"]["faces"] == len(asset.mesh.faces)
+
+
+def test_import_with_its_mesh_and_light(cube, tmp_path):
+    Image.fromarray(np.full((4, 8, 3), 255, np.uint8)).save(tmp_path / "white.png")
+    out = tmp_path / "a.drgs"
+    arguments = ["import", str(splats(tmp_path / "s.ply")), "--mesh", str(cube), "--env", str(tmp_path / "white.png")]
+    assert main([*arguments, "--out", str(out)]) == 0
+    asset = read_asset(out)
+    np.testing.assert_allclose(asset.environment.radiance, 1, atol=1e-6)
+    np.testing.assert_allclose(np.abs(asset.mesh.vertices).max(axis=0), 1, atol=1e-6)
+
+
+def test_inspect_knows_every_kind(cube, tmp_path, capsys):
+    passes = {"Combined": np.ones((3, 5, 4), np.float32), "Depth": np.full((3, 5, 1), 7, np.float32)}
+    write_frame(tmp_path / "f.exr", passes, {"settings": "abc"})
+    frame = described(tmp_path / "f.exr", capsys)
+    assert (frame["kind"], frame["width"], frame["height"]) == ("frame", 5, 3)
+    assert frame["passes"]["Depth"]["range"] == [7, 7] and frame["metadata"]["settings"] == "abc"
+    mesh = described(cube, capsys)
+    assert mesh["kind"] == "mesh" and mesh["faces"]["shape"] == [12, 3]
+    surfels = described(splats(tmp_path / "s.ply"), capsys)
+    assert surfels["kind"] == "surfels" and surfels["surfels"]["centre"]["shape"] == [400, 3]
+    assert described(tmp_path / "paint.png", capsys)["kind"] == "environment"
+    assert main(["inspect", str(cube)]) == 0
+    assert "faces: 12 x 3 int32" in capsys.readouterr().out
+
+
+def test_inspect_counts_what_is_not_finite(tmp_path, capsys):
+    picture = np.ones((2, 2, 4), np.float32)
+    picture[0, 0] = np.nan
+    write_frame(tmp_path / "f.exr", {"Combined": picture}, {})
+    combined = described(tmp_path / "f.exr", capsys)["passes"]["Combined"]
+    assert combined["not_finite"] == 4 and combined["range"] == [1, 1]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code"),
+    [
+        (["inspect", "absent.ply"], 65),
+        (["inspect", "noise.bin"], 65),
+        (["inspect", "torn.drgs"], 65),
+        (["inspect", "."], 65),
+        (["make", "absent.obj", "--out", "o.drgs"], 65),
+        (["make", "noise.bin", "--out", "o.drgs"], 65),
+        (["make", "cube.obj", "--out", "cube.obj/o.drgs"], 73),
+        (["make", "cube.obj", "--out", "o.drgs", "--env", "noise.bin"], 65),
+        (["import", "cube.obj", "--out", "o.drgs"], 65),
+        (["import", "absent.ply", "--out", "o.drgs"], 65),
+        (["import", "noise.bin", "--out", "o.drgs", "--resolution", "0"], 64),
+    ],
+)
+def test_bad_files_are_named(cube, monkeypatch, capsys, arguments, code):
+    monkeypatch.chdir(cube.parent)
+    Path("noise.bin").write_bytes(np.random.default_rng(0).bytes(4096))
+    Path("torn.drgs").write_bytes(b"PK\x03\x04 and no more")
+    assert main(arguments) == code
+    err = capsys.readouterr().err
+    assert "Traceback" not in err and "internal" not in err
+    assert not Path("o.drgs").exists()
+
+
+def test_doctor_finds_this_environment_healthy(capsys):
+    assert main(["doctor", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    states = {check["name"]: check["state"] for check in report["checks"]}
+    assert report["healthy"]
+    assert {states[name] for name in ("Python", "Numba", "Embree", "OpenEXR", "engine")} == {"ok"}
+
+
+def test_doctor_names_what_is_missing_and_the_remedy(monkeypatch, capsys, tmp_path):
+    monkeypatch.setenv("DRGS_ENGINE", str(tmp_path / "gone"))
+    monkeypatch.setattr(doctor.importlib.metadata, "version", lambda name: "3.3.0")
+    assert main(["doctor", "--json"]) == 69
+    checks = {check["name"]: check for check in json.loads(capsys.readouterr().out)["checks"]}
+    assert checks["engine"]["state"] == "missing" and "DRGS_ENGINE" in checks["engine"]["detail"]
+    assert checks["OpenEXR"]["state"] == "missing" and "pip install" in checks["OpenEXR"]["remedy"]
+
+
+def test_doctor_only_notes_the_absence_of_what_is_optional(monkeypatch, capsys, tmp_path):
+    monkeypatch.setenv("DRGS_BLENDER", str(tmp_path / "gone"))
+    monkeypatch.setattr(doctor, "CHECKS", [c for c in doctor.CHECKS if c[0] in ("Python", "Blender")])
+    assert main(["doctor"]) == 0
+    text = capsys.readouterr().out
+    assert "absent   Blender" in text and "DRGS_BLENDER" in text

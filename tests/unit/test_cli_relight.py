@@ -1,0 +1,183 @@
+"""``drgs relight`` on a small asset: what the options do, and every bad input."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from drgs_blender.asset.container import read_asset, write_asset
+from drgs_blender.asset.model import Asset, Environment, Mesh
+from drgs_blender.cli.main import main
+from drgs_blender.deform.attach import attach
+from drgs_blender.passes import BY_NAME
+from drgs_blender.render.frames import read_frame
+
+# Stands at -Y and looks along +Y; the picture's right is +X.
+FRONT = {"matrix_world": [[1, 0, 0, 0], [0, 0, -1, -6], [0, 1, 0, 0], [0, 0, 0, 1]], "width": 40, "height": 30}
+
+
+def octahedron(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
+    """Unit sphere from a subdivided octahedron."""
+    vertices = np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
+    faces = np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4], [1, 0, 5], [2, 1, 5], [3, 2, 5], [0, 3, 5]])
+    for _ in range(subdivisions):
+        a, b, c = (vertices[faces[:, k]] for k in range(3))
+        corners = np.stack([a, a + b, a + c, a + b, b, b + c, a + c, b + c, c, a + b, b + c, a + c], axis=1)
+        corners = corners.reshape(-1, 3) / np.linalg.norm(corners.reshape(-1, 3), axis=1, keepdims=True)
+        vertices, index = np.unique(corners.round(9), axis=0, return_inverse=True)
+        faces = index.reshape(-1, 3)
+    return vertices, faces
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Assets with and without an environment that is bright towards +X, and a camera."""
+    folder = tmp_path_factory.mktemp("relight")
+    vertices, faces = octahedron(3)
+    n = len(vertices)
+    mesh = Mesh(vertices, faces, np.full((n, 3), 0.5), np.full(n, 0.8), np.zeros(n))
+    surfels, binding, _ = attach(mesh, density=20)
+    radiance = np.full((8, 16, 3), 0.05, np.float32)
+    radiance[2:6, 6:10] = 4.0  # around +X, the centre of the picture
+    write_asset(folder / "ball.drgs", Asset(surfels, mesh, binding))
+    write_asset(folder / "lit.drgs", Asset(surfels, mesh, binding, Environment(radiance)))
+    (folder / "front.json").write_text(json.dumps(FRONT | {"fov_x": 30}))
+    return folder
+
+
+@pytest.fixture
+def relight(folder: Path, tmp_path: Path):
+    """Function that relights and returns (passes, metadata)."""
+
+    def relight(*options: str, asset: str = "lit.drgs") -> tuple[dict[str, np.ndarray], dict[str, str]]:
+        out = tmp_path / "o.exr"
+        arguments = ["relight", str(folder / asset), "--camera", str(folder / "front.json"), "--out", str(out)]
+        assert main([*arguments, "--rays", "16", *options]) == 0
+        return read_frame(out)
+
+    return relight
+
+
+def test_same_options_give_the_same_bits(relight):
+    first, second = (relight("--seed", "5")[0]["Combined"] for _ in range(2))
+    other = relight("--seed", "6")[0]["Combined"]
+    assert np.array_equal(first, second)
+    assert not np.array_equal(first, other)
+
+
+def test_strength_is_a_factor(relight):
+    once, twice = (relight("--env-strength", s)[0]["Combined"][..., :3] for s in ("1", "2"))
+    np.testing.assert_allclose(twice, 2 * once, rtol=1e-5)
+
+
+def test_rotation_is_that_of_a_mapping_node(relight):
+    """Mapping turns the looked-up vector: with Rotation Z of 90 degrees, -Y looks up +X, where the light is."""
+    front, back, right, left = (
+        relight("--env-rotation", d)[0]["Combined"][10:20, 15:25, :3].mean() for d in ("90", "-90", "0", "180")
+    )
+    assert front > 4 * back
+    assert back < min(left, right) < max(left, right) < front
+    lit = relight()[0]["Combined"][..., :3].sum(axis=-1)
+    assert lit[12:18, 25:28].mean() > 4 * lit[12:18, 12:15].mean()  # unrotated, the right side is lit
+
+
+def test_all_passes_are_written_with_their_channels(relight):
+    passes, _ = relight("--passes", "all")
+    assert {name: p.shape for name, p in passes.items()} == {
+        name: (30, 40, len(entry.channels)) for name, entry in BY_NAME.items()
+    }
+    assert np.isfinite(np.concatenate([p.ravel() for p in passes.values()])).all()
+    # The nearest point of the unit sphere is 5 m before the camera.
+    assert passes["Depth"].min() == pytest.approx(5, abs=0.05)
+
+
+def test_transparent_film_has_the_silhouette_as_alpha(relight):
+    alpha = relight("--transparent", "--primary", "mesh")[0]["Combined"][..., 3]
+    opaque = relight()[0]["Combined"][..., 3]
+    assert (opaque == 1).all()
+    assert alpha[0, 0] == 0 and alpha[15, 20] == pytest.approx(1, abs=1e-3)
+    # Outline of a unit sphere at 6 m: the cone of half angle asin(1 / 6).
+    radius = 20 / np.tan(np.radians(15)) * np.tan(np.arcsin(1 / 6))
+    assert alpha.sum() == pytest.approx(np.pi * radius**2, rel=0.05)
+
+
+def test_vertices_pose_the_asset(relight, folder, tmp_path):
+    moved = read_asset(folder / "lit.drgs").mesh.vertices + np.float32([0.5, 0, 0])
+    np.save(tmp_path / "moved.npy", moved)
+    columns = np.arange(40) + 0.5
+    centre = [
+        (coverage := relight("--passes", "Coverage", *pose)[0]["Coverage"][..., 0]).sum(axis=0)
+        @ columns
+        / coverage.sum()
+        for pose in ((), ("--vertices", str(tmp_path / "moved.npy")))
+    ]
+    # 0.5 m at 6 m distance, times fx pixels.
+    assert centre[1] - centre[0] == pytest.approx(0.5 / 6 * 20 / np.tan(np.radians(15)), rel=0.05)
+
+
+def test_mesh_and_surfels_show_the_same_object(relight):
+    surfels, mesh = (
+        relight("--primary", p, "--passes", "Depth")[0]["Depth"][12:18, 17:23] for p in ("surfels", "mesh")
+    )
+    np.testing.assert_allclose(surfels, mesh, atol=0.02)
+
+
+def test_png_preview(folder, tmp_path):
+    out = tmp_path / "o.png"
+    arguments = ["relight", str(folder / "lit.drgs"), "--camera", str(folder / "front.json"), "--out", str(out)]
+    assert main([*arguments, "--rays", "4", "--transparent"]) == 0
+    with Image.open(out) as picture:
+        assert (picture.size, picture.mode) == ((40, 30), "RGBA")
+        assert picture.getpixel((0, 0)) == (0, 0, 0, 0) and picture.getpixel((20, 15))[3] == 255
+
+
+@pytest.mark.parametrize(
+    ("changes", "code", "named"),
+    [
+        ({"asset": "no.drgs"}, 65, "no.drgs"),
+        ({"asset": "torn.drgs"}, 65, "torn.drgs"),
+        ({"asset": "ball.drgs"}, 64, "--env"),
+        ({"--env": "no.exr"}, 65, "no.exr"),
+        ({"--env": "front.json"}, 65, "front.json"),
+        ({"--camera": "no.json"}, 64, "no.json"),
+        ({"--camera": "flat.json"}, 64, "width is 0"),
+        ({"--vertices": "short.npy"}, 65, "7"),
+        ({"--vertices": "flat.npy"}, 64, "(9,)"),
+        ({"--vertices": "pickle.npy"}, 64, "pickle.npy"),
+        ({"--vertices": "no.npy"}, 64, "no.npy"),
+        ({"--out": "front.json/o.exr"}, 73, "o.exr"),
+        ({"--out": "o.tif"}, 64, "o.tif"),
+    ],
+)
+def test_bad_input_ends_with_its_code_and_name(folder, capsys, changes, code, named):
+    (folder / "torn.drgs").write_bytes((folder / "ball.drgs").read_bytes()[:5000])
+    (folder / "flat.json").write_text(json.dumps(FRONT | {"fov_x": 30, "width": 0}))
+    np.save(folder / "short.npy", np.zeros((7, 3), np.float32))
+    np.save(folder / "flat.npy", np.zeros(9, np.float32))
+    np.save(folder / "pickle.npy", np.array([print], dtype=object), allow_pickle=True)
+    options = {"asset": "lit.drgs", "--camera": "front.json", "--out": "o.exr"} | changes
+    arguments = ["relight", str(folder / options.pop("asset"))]
+    for name, value in options.items():
+        arguments += [name, str(folder / value)]
+    assert main(arguments) == code
+    assert named in capsys.readouterr().err
+    assert not (folder / "o.exr").exists()
+
+
+def test_relights_with_torch_blocked(folder, tmp_path):
+    program = (
+        "import sys; sys.modules['torch'] = None; sys.modules['bpy'] = None\n"
+        "from drgs_blender.cli.main import main; sys.exit(main(sys.argv[1:]))"
+    )
+    out = tmp_path / "o.exr"
+    arguments = ["relight", str(folder / "lit.drgs"), "--camera", str(folder / "front.json"), "--out", str(out)]
+    command = [sys.executable, "-c", program, *arguments, "--rays", "4", "--denoise", "svgf"]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert result.returncode == 0, result.stderr
+    assert np.isfinite(read_frame(out)[0]["Combined"]).all()
