@@ -13,7 +13,7 @@ from ..asset.model import Asset, Mesh, Surfels
 from ..deform.binding import bind
 from ..errors import AssetError
 from ..formats.axes import surfels_to_z_up
-from ..formats.files import MeshFile, SurfelFile
+from ..formats.files import MaterialsFile, MeshFile, SurfelFile
 from ..formats.gaussian_ply import LAYOUTS
 from .make import TOLERANCE, mesh_with_materials, read_environment_of, read_mesh_file
 from .proxy import mesh_from_surfels
@@ -32,6 +32,7 @@ def import_asset(
     environment: str | Path | None = None,
     up: str | None = None,
     *,
+    materials: str | Path | MaterialsFile | None = None,
     resolution: int = 192,
     max_triangles: int = 300_000,
 ) -> Asset:
@@ -43,6 +44,7 @@ def import_asset(
     mesh : path of the mesh they were captured with; None builds a closed one around them
     environment : path of the light of the capture
     up : "y" or "z", the up axis of surfels and mesh; None is what the formats say, and Z where they say nothing
+    materials : materials of the mesh's vertices kept apart from it (NeRO's folder), or such a file already read
     resolution : voxels along the longest side of a mesh that is built
     max_triangles : budget for texture detail of a textured mesh
 
@@ -64,7 +66,7 @@ def import_asset(
         surface, report["mesh"] = mesh_from_surfels(captured, resolution=resolution)
     else:
         mesh_name = "mesh" if isinstance(mesh, MeshFile) else str(mesh)
-        mesh_file = read_mesh_file(mesh)
+        mesh_file = _with_materials(read_mesh_file(mesh), materials, mesh_name)
         surface_known = _has_materials(mesh_file)
         surface, report["mesh"] = mesh_with_materials(
             mesh_file, mesh_name, up=up, max_triangles=max_triangles, tolerance=TOLERANCE
@@ -75,17 +77,17 @@ def import_asset(
     surfels_known = any(layout.name == file.layout and layout.albedo is not None for layout in LAYOUTS)
     if surface_known and not surfels_known:
         vertices_to_surfels(surface, captured, binding)
-        materials = "of the mesh, carried to the surfels"
+        origin = "of the mesh, carried to the surfels"
     elif surface_known:
-        materials = "of the surfels and of the mesh, as they are"
+        origin = "of the surfels and of the mesh, as they are"
     else:
         report["vertices_without_surfels"] = surfels_to_vertices(surface, captured, binding)
-        materials = "of the surfels" if surfels_known else "captured colour of the surfels, light included"
-        materials += ", carried to the mesh"
+        origin = "of the surfels" if surfels_known else "captured colour of the surfels, light included"
+        origin += ", carried to the mesh"
     provenance = {
         "surfels": Path(surfel_name).name,
         "mesh": Path(mesh_name).name,
-        "materials": materials,
+        "materials": origin,
         "report": report,
     }
     if environment is not None:
@@ -98,6 +100,30 @@ def _read_surfels(path: str | Path) -> SurfelFile:
     from ..formats.registry import read_surfels
 
     return read_surfels(path)
+
+
+def _with_materials(mesh: MeshFile, source: str | Path | MaterialsFile | None, name: str) -> MeshFile:
+    """The mesh with materials from a file of their own in place of its own."""
+    if source is None:
+        return mesh
+    if not isinstance(source, MaterialsFile):
+        from ..formats.materials import read_nero_materials
+
+        source = read_nero_materials(Path(source))
+    if len(source.albedo) != len(mesh.vertices):
+        raise AssetError(
+            name,
+            f"has {len(mesh.vertices)} vertices but its materials are of {len(source.albedo)}",
+            "Choose the mesh that the materials were made with",
+        )
+    return replace(
+        mesh,
+        materials=[],
+        face_material=None,
+        vertex_colours=source.albedo,
+        vertex_roughness=source.roughness,
+        vertex_metallic=source.metallic,
+    )
 
 
 def _finite(surfels: Surfels, name: str) -> tuple[Surfels, int]:

@@ -28,6 +28,8 @@ TOLERANCE = 0.05
 FINEST = 1 / 1500
 #: A vertex averages its texture over this part of its mean edge.
 FOOTPRINT = 0.7
+#: Texture compared with the interpolation is averaged over this part of an edge, so that finer detail is noticed.
+LOOK = 0.1
 #: Rounds of subdivision at most.
 ROUNDS = 16
 
@@ -108,7 +110,7 @@ def mesh_with_materials(
     report: dict[str, Any] = {"source_vertices": len(file.vertices), "source_faces": len(file.faces)}
     report["notes"] = list(file.notes)
     net = _net(file, name, report)
-    materials = Materials(file.materials)
+    materials = Materials(file.materials, coloured=file.vertex_colours is not None)
     net, report["rounds"], report["unresolved_edges"] = refine(net, materials, tolerance, max_triangles)
     values = bake(net, materials)
     report["vertices"], report["faces"] = len(net.vertices), len(net.faces)
@@ -249,11 +251,11 @@ def _edge_errors(net: Net, materials: Materials) -> Array:
         for t in (0.25, 0.5, 0.75):
             weights = np.zeros(3)
             weights[k], weights[(k + 1) % 3] = 1 - t, t
-            found = error(weights, some, 0.25 * extent[some, k])
+            found = error(weights, some, LOOK * extent[some, k])
             result[rows[some], k] = np.maximum(result[rows[some], k], found)
     some = np.flatnonzero(coarse.any(axis=1))
     longest = edge_lengths(net)[rows[some]].argmax(axis=1)
-    centre = error(np.full(3, 1 / 3), some, 0.25 * extent[some].mean(axis=1))
+    centre = error(np.full(3, 1 / 3), some, LOOK * extent[some].mean(axis=1))
     result[rows[some], longest] = np.maximum(result[rows[some], longest], centre)
     return result
 

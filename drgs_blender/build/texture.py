@@ -81,12 +81,14 @@ class Materials:
 
     Parameters
     ----------
-    materials : of the file; face material -1 stands for a default one
+    materials : of the file
+    coloured : the vertices have colours: the base colour of faces without a material (-1) is then white
     """
 
-    def __init__(self, materials: list[MaterialFile]) -> None:
+    def __init__(self, materials: list[MaterialFile], coloured: bool = False) -> None:
         self._pyramids: dict[int, Pyramid] = {}
-        self._materials = [*materials, MaterialFile("")]  # index -1 finds the default
+        plain = MaterialFile("", base_colour=(1.0, 1.0, 1.0)) if coloured else MaterialFile("")
+        self._materials = [*materials, plain]  # index -1 finds the last
         self.textured = np.array([bool(self._images(m)) for m in self._materials])
 
     def sample(self, material: Array, uvs: Array, scale: Array) -> Array:
