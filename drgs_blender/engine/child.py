@@ -27,6 +27,9 @@ logger = logging.getLogger(__name__)
 
 Array = np.ndarray
 
+#: Seconds of work after which an engine that was asked to stop is killed: later, and before its first picture.
+OBEY_SECONDS, OBEY_SECONDS_COLD = 2.0, 15.0
+
 _LOG_LINES = 500
 _LOG_LINE = 2000
 _ANSWERS = (protocol.Loaded, protocol.Result, protocol.Need, protocol.Stopped, protocol.Failed)
@@ -47,6 +50,8 @@ class Child:
     heard : grows with every byte that arrives
     steps, preparing : the last `protocol.Alive`
     idle : set while no request is unanswered
+    greeted : whether hands were shaken
+    warm : whether it has finished a picture: everything is imported, kernels are loaded
     """
 
     def __init__(self, command: list[str], shared: bool) -> None:
@@ -55,6 +60,8 @@ class Child:
         self.heard = 0
         self.steps = 0
         self.preparing = False
+        self.greeted = False
+        self.warm = False
         self.idle = threading.Event()
         self.idle.set()
         self.link: Link | None = None
@@ -90,6 +97,7 @@ class Child:
         self.send(protocol.Welcome(protocol.PROTOCOL, protocol.__version__, *files))
         if self.link is not None:
             self.link.outgoing, self.link.incoming = self._to_engine, self._to_client
+        self.greeted = True
 
     def send(self, message: Any, arrays: dict[str, Array] | None = None) -> None:
         """Hand a message to the writing thread; what goes wrong there arrives in `inbox`."""
@@ -100,13 +108,14 @@ class Child:
         self.idle.clear()
         self.send(message, arrays)
 
-    def cancel(self, request: int, patience: float) -> None:
-        """Ask the engine to stop; kill it when it has not within `patience` seconds of work.
+    def cancel(self, request: int) -> None:
+        """Ask the engine to stop; kill it when it has not within `OBEY_SECONDS` of work.
 
-        Compiling kernels does not count: it happens once, cannot be interrupted, and would otherwise never be done
-        by a viewport that cancels with every movement of the mouse.
+        Compiling kernels does not count, and the first picture may take longer: both happen once, cannot be
+        interrupted, and would otherwise never be done by a viewport that cancels with every movement of the mouse.
         """
         self.send(protocol.Cancel(request))
+        patience = OBEY_SECONDS if self.warm else OBEY_SECONDS_COLD
         threading.Thread(target=self._enforce, args=(patience,), name="drgs-cancel", daemon=True).start()
 
     def kill(self) -> None:
@@ -189,6 +198,7 @@ class Child:
             self.steps, self.preparing = message.steps, message.preparing
             return
         if isinstance(message, _ANSWERS):
+            self.warm |= isinstance(message, protocol.Result)
             self.idle.set()
         self.inbox.put((message, arrays))
 

@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from ..errors import ERROR_CLASSES, Cancelled, DeviceError, DrgsError, EngineError, UsageError, VersionError
+from ..errors import ERROR_CLASSES, AssetError, Cancelled, DeviceError, DrgsError, EngineError, UsageError, VersionError
 from ..frame import Frame
 from ..version import __version__
 from . import protocol
@@ -100,6 +100,7 @@ class EngineClient:
         self._child: Child | None = None
         self._sent = SentSlots()
         self._assets: dict[str, str] = {}
+        self._to_load: list[str] = []
         self._number = 0
         self._busy = threading.Lock()
         self._closing = False
@@ -193,14 +194,9 @@ class EngineClient:
         """End the engine; a request under way ends with `Cancelled`, a later one starts a new engine."""
         self._closing = True
         try:
-            if self._busy.locked() and self._child is not None:
-                self._child.kill()
             with self._busy:
-                child, self._child = self._child, None
-                if child is not None:
-                    child.close()
-                    self._past_log = child.log
-                self._sent.forget()
+                if self._child is not None:
+                    self._abandon(grace=1.0)
         finally:
             self._closing = False
 
@@ -221,10 +217,13 @@ class EngineClient:
         self._number += 1
         return self._number
 
+    def _stopped(self, cancelled: IsCancelled | None) -> bool:
+        return self._closing or (cancelled is not None and cancelled())
+
     @contextlib.contextmanager
     def _exclusive(self, cancelled: IsCancelled | None) -> Iterator[None]:
         while not self._busy.acquire(timeout=_POLL):
-            if cancelled is not None and cancelled():
+            if self._stopped(cancelled):
                 raise Cancelled
         try:
             yield
@@ -238,15 +237,10 @@ class EngineClient:
                 self._ensure(on_progress, cancelled)
                 return work()
             except _Lost as loss:
-                child = self._child
                 problem = str(loss)
-                if child is not None:
-                    problem = child.epitaph() if isinstance(loss.__cause__, EOFError) else problem
-                    child.close(grace=0.0)
-                    self._past_log = child.log
-                self._child = None
-                if self._closing:
-                    raise Cancelled from loss
+                if self._child is not None and isinstance(loss.__cause__, EOFError):
+                    problem = self._child.epitaph()
+                self._abandon()
                 if attempt == self.restarts:
                     remedy = "Try again; if it happens again, see the engine's log and look at the memory it has"
                     raise EngineError("engine", problem, remedy) from loss
@@ -256,48 +250,54 @@ class EngineClient:
                 raise
         raise AssertionError("unreachable")
 
-    def _abandon(self) -> None:
+    def _abandon(self, grace: float = 0.0) -> None:
+        """End the running engine, if any, and what is known of it."""
         if self._child is not None:
-            self._child.close(grace=0.0)
+            self._child.close(grace)
             self._past_log = self._child.log
             self._child = None
+        self._sent.forget()
 
     def _ensure(self, on_progress: OnProgress | None, cancelled: IsCancelled | None) -> None:
-        """Have a running engine that knows all assets."""
-        if self._child is not None and self._child.running:
-            return
-        self._abandon()
-        self._sent.forget()
-        self._child = Child(self.command, self.shared)
-        try:
-            self._handshake(self._child, cancelled)
-        except (DrgsError, Cancelled):
+        """Have a running engine that knows all assets. Cancelled half way, the next call goes on from there."""
+        if self._child is None or not self._child.running:
             self._abandon()
-            raise
-        for path in list(self._assets):
+            self._child = Child(self.command, self.shared)
+            self._to_load = list(self._assets)
+        if not self._child.greeted:
+            try:
+                self._handshake(self._child, cancelled)
+            except DrgsError:
+                self._abandon()
+                raise
+        while self._to_load:
+            path = self._to_load[0]
             try:
                 self._load(path, on_progress, cancelled)
-            except DrgsError as error:  # the frame may not use it any more; if it does, the engine says so
+            except (
+                AssetError,
+                VersionError,
+            ) as error:  # the frame may not use it any more; if it does, the engine says so
                 logger.warning("asset not loaded again: %s", error)
                 del self._assets[path]
+            del self._to_load[0]
 
     def _handshake(self, child: Child, cancelled: IsCancelled | None) -> None:
         watch = _Watch(child, self.silence, self.stall)
+        remedy = "Install the engine in the environment named in the preferences, or correct the path"
         while True:
-            if cancelled is not None and cancelled():
+            if self._stopped(cancelled):
                 raise Cancelled
             try:
                 item = child.inbox.get(timeout=_POLL)
             except queue.Empty:
                 watch.check()
                 continue
-            remedy = "Install the engine in the environment named in the preferences, or correct the path"
             if isinstance(item, OSError) and child.pid == 0:
                 raise DeviceError(self.command[0], f"cannot be started ({item})", remedy) from item
             if isinstance(item, Exception):
-                raise DeviceError(
-                    self.command[0], f"did not start as an engine: it {child.epitaph()}", remedy
-                ) from item
+                problem = f"did not start as an engine: it {child.epitaph()}"
+                raise DeviceError(self.command[0], problem, remedy) from item
             greeting = item[0]
             if not isinstance(greeting, protocol.Hello):
                 raise DeviceError(self.command[0], "does not greet as an engine does", remedy)
@@ -342,14 +342,14 @@ class EngineClient:
                         raise _as_error(item[0])
                     return item
                 watch.check()
-                if stop_at is None and cancelled is not None and cancelled():
-                    stop_at = time.monotonic() + _CANCEL_WAIT
-                    child.cancel(message.id, OBEY_SECONDS)
+                if stop_at is None and self._stopped(cancelled):
+                    stop_at = time.monotonic() + (0.0 if self._closing else _CANCEL_WAIT)
+                    child.cancel(message.id)
                 if stop_at is not None and time.monotonic() > stop_at:
                     raise Cancelled
         finally:
             if stop_at is None and not child.idle.is_set():  # on_progress or cancelled raised
-                child.cancel(message.id, OBEY_SECONDS)
+                child.cancel(message.id)
 
     def _settle(self, child: Child, on_progress: OnProgress | None, cancelled: IsCancelled | None) -> None:
         """Wait until the engine has answered a request that was cancelled before."""
@@ -357,7 +357,7 @@ class EngineClient:
         while not child.idle.is_set():
             self._take(child, on_progress)
             watch.check()
-            if cancelled is not None and cancelled():
+            if self._stopped(cancelled):
                 raise Cancelled
 
     def _take(self, child: Child, on_progress: OnProgress | None) -> tuple[Any, dict[str, Array]] | None:
@@ -379,10 +379,6 @@ class EngineClient:
         if isinstance(item[0], protocol.Failed) and item[0].id == 0:
             raise _Lost(f"refused a message: {item[0].problem}")
         return item
-
-
-#: Seconds of work after which an engine that was asked to stop is killed.
-OBEY_SECONDS = 2.0
 
 
 def _as_error(failure: protocol.Failed) -> DrgsError:

@@ -52,7 +52,7 @@ class Server:
         self._last_cancelled = 0
         self._current = 0
         self._steps = 0
-        self._compiling = 0
+        self._preparing = 0
         self._reported = ("", 0.0)
 
     # --- threads beside the main one -------------------------------------------------------------------------------
@@ -81,7 +81,7 @@ class Server:
         """Say regularly that the engine is there and whether it advances."""
         while True:
             time.sleep(ALIVE_SECONDS)
-            self._answer(protocol.Alive(self._steps, self._compiling > 0))
+            self._answer(protocol.Alive(self._steps, self._preparing > 0))
 
     # --- the main thread -------------------------------------------------------------------------------------------
 
@@ -89,10 +89,12 @@ class Server:
         """Answer requests, one after the other, for ever."""
         for target in (self.listen, self.show_life):
             threading.Thread(target=target, name=f"drgs-{target.__name__}", daemon=True).start()
+        self._note_preparing(1)
         try:
             self._open_session()
         except Exception:
             logger.exception("the engine is incomplete")  # the first request will meet it again and be told
+        self._note_preparing(-1)
         while True:
             message, arrays = self._requests.get()
             self._current = message.id
@@ -140,7 +142,7 @@ class Server:
             except ImportError as error:
                 remedy = "Install DR-GS again in this environment"
                 raise DeviceError(sys.executable, f"lacks a part of the engine ({error})", remedy) from error
-            compiling.watch(self._note_compiling)
+            compiling.watch(self._note_preparing)
             self.session = Session()
         return self.session
 
@@ -157,14 +159,14 @@ class Server:
             self._reported = phase, now
             self._answer(protocol.Progress(self._current, phase, min(1.0, max(0.0, float(fraction)))))
 
-    def _note_compiling(self, change: int) -> None:
-        """Count kernels that are being compiled."""
+    def _note_preparing(self, change: int) -> None:
+        """Count what cannot be interrupted: imports, kernels that are being compiled."""
         self._steps += 1
-        self._compiling += change
+        self._preparing += change
         if change > 0:
             self._progress("Preparing kernels", 0.0)
-        if self._compiling <= 1:
-            self._answer(protocol.Alive(self._steps, self._compiling > 0))
+        if self._preparing <= 1:
+            self._answer(protocol.Alive(self._steps, self._preparing > 0))
 
     def _fail(self, request: int, error: str, subject: str, problem: str, remedy: str) -> None:
         self._answer(protocol.Failed(request, error, subject, problem, remedy))

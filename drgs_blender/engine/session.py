@@ -178,6 +178,10 @@ class Session:
             self._objects = []  # an update that fails half way leaves nothing to be taken for current
             self._scene.update([item.traced for item in objects])
         self._objects = objects
+        used = {state.asset for state in frame.objects}
+        for key, loaded in self._assets.items():
+            if key not in used:
+                loaded.driven = None
         return join([item.posed for item in objects if item.posed is not None] if with_surfels else [])
 
     def _warnings(self) -> list[str]:

@@ -227,3 +227,56 @@ def test_unusable_frames_are_refused_by_name_and_the_engine_lives(client, make_f
     assert np.isfinite(passes["Combined"]).all()
     assert_same_bits(client.render(make_frame(0.2)), expected)
     assert client.pid == pid
+
+
+def test_engine_that_lost_an_array_asks_for_it(client, make_frame, expected):
+    client.render(make_frame(0.2))
+    sent = client.bulk_bytes[0]
+    client._sent._held = {slot: (version + 100, array) for slot, (version, array) in client._sent._held.items()}
+    assert_same_bits(client.render(make_frame(0.2)), expected)
+    assert client.bulk_bytes[0] >= 2 * sent - 64  # all of it, once more
+
+
+def test_impatient_viewport_gets_its_picture_from_a_cold_engine(make_client, make_frame, asset_path, expected):
+    """Cancelling again and again while the engine starts does not keep it from starting."""
+    client = make_client()
+    pids = set()
+    for _ in range(30):
+        deadline = time.monotonic() + 0.1
+        try:
+            client.load_asset(str(asset_path), cancelled=lambda: time.monotonic() > deadline)  # noqa: B023
+            client.render(make_frame(), cancelled=lambda: time.monotonic() > deadline)  # noqa: B023
+        except Cancelled:
+            pass
+        pids.add(client.pid)
+    client.load_asset(str(asset_path))
+    assert_same_bits(client.render(make_frame(0.2)), expected)
+    assert len({*pids, client.pid}) == 1
+
+
+def test_engine_outlives_the_thread_that_started_it(make_client, make_frame, asset_path, expected):
+    """Linux ties a child to the *thread* that made it; Blender renders in threads that come and go."""
+    client = make_client()
+    thread = threading.Thread(target=client.load_asset, args=(str(asset_path),))
+    thread.start()
+    thread.join()
+    pid = client.pid
+    time.sleep(0.2)
+    assert_same_bits(client.render(make_frame(0.2)), expected)
+    assert client.pid == pid
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
+def test_engines_that_come_and_go_leave_no_thread_and_no_file_behind(client, make_frame):
+    def held():
+        return threading.active_count(), len(os.listdir("/proc/self/fd"))
+
+    client.render(make_frame())
+    before = held()
+    for _ in range(3):
+        os.kill(client.pid, signal.SIGKILL)
+        client.render(make_frame())
+    assert held() == before
+    client.close()
+    assert held()[0] == before[0] - 3
+    assert held()[1] <= before[1] - 4
