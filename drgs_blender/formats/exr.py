@@ -40,7 +40,7 @@ def read_exr(path: Path) -> tuple[Array, bool, list[str]]:
                 _check_size(part.header, path)
             declared = [len(part.header["channels"]) for part in file.parts]
         with OpenEXR.File(subject, separate_channels=True) as file:
-            parts = [(p.header, {name: c.pixels for name, c in p.channels.items()}) for p in file.parts]
+            parts = [(dict(p.header), {name: c.pixels for name, c in p.channels.items()}) for p in file.parts]
             # The binding only prints a warning where pixels cannot be decoded, and leaves the channels out.
             whole = [len(part.channels) for part in file.parts] == declared
     except AssetError:

@@ -80,19 +80,19 @@ def _three(prefix: str) -> tuple[str, ...]:
 _BASE_COLOUR = _three("base_color_")
 _PLAIN = Channel(_BASE_COLOUR)
 _NARROWED = Channel(_BASE_COLOUR, lambda x: 0.77 * sigmoid(x) + 0.03)
-_REF = {
-    "albedo": Channel(_three("ori_color_")),
-    "roughness": Channel(("roughness",)),
-    "metallic": Channel(("refl_strength",)),
-    "srgb": True,
-    "known": r"ind_(dc|rest|asg)_\d+|n[xyz]2|metalness|diffuse_color_\d",
-    "note": "albedo was trained in display space and is decoded from sRGB; refl_strength is the metallic",
-}
 
 #: Layouts in order of detection. GaussianMesh keeps its position relative to a face, see `_decode_face_positions`.
 LAYOUTS: tuple[Layout, ...] = (
-    Layout("Ref-Gaussian", has=("ind_asg_0", "refl_strength"), **_REF),  # type: ignore[arg-type]
-    Layout("Ref-Gaussian", has=("refl_strength",), **_REF),  # type: ignore[arg-type]
+    Layout(
+        "Ref-Gaussian",
+        has=("refl_strength",),
+        albedo=Channel(_three("ori_color_")),
+        roughness=Channel(("roughness",)),
+        metallic=Channel(("refl_strength",)),
+        srgb=True,
+        known=r"ind_(dc|rest|asg)_\d+|n[xyz]2|metalness|diffuse_color_\d",
+        note="albedo was trained in display space and is decoded from sRGB; refl_strength is the metallic",
+    ),
     Layout(
         "Ref-Gaussian in IRGS",
         has=("ind_dc_0", "base_color_0"),
@@ -107,7 +107,8 @@ LAYOUTS: tuple[Layout, ...] = (
         albedo=_NARROWED,
         roughness=Channel(("roughness",), lambda x: 0.9 * sigmoid(x) + 0.09),
         known=r"(incidents|visibility)_(dc|rest)_\d+",
-        note="has no metallic, 0 is used",
+        note="has no metallic, 0 is used. A heap of splats at the origin is a file of Mani-GS: the same layout, but "
+        "relative to triangles that it does not name, which cannot be recovered",
     ),
     Layout(
         "GS-ROR2",
@@ -198,7 +199,7 @@ def decode_splats(header: Header, rows: Rows | None, subject: str) -> SurfelFile
         rotation, axes = _flatten(rotation, axes, notes)
     finite = np.ones(len(centre), bool)
     for array in (centre, opacity, axes, rotation, *material.values(), *([] if sh is None else [sh])):
-        finite &= np.isfinite(array).reshape(len(array), -1).all(axis=1)
+        finite &= np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
     extras |= _extras(columns, names - used)
     keep: Array | slice = slice(None)
     if dropped := int(np.count_nonzero(~finite)):
@@ -309,20 +310,24 @@ def _corner_names(k: int) -> tuple[tuple[str, str, str], ...]:
 
 
 def _extras(columns: Columns, names: set[str]) -> dict[str, Array]:
-    """Properties that a surfel cannot hold, numbered ones (a_0, a_1, ...) joined into one array."""
+    """Properties that a surfel cannot hold; normals and numbered ones (a_0, a_1, ...) joined into one array each."""
     families: dict[str, list[tuple[int, str]]] = {}
     for name in names:
-        match = re.fullmatch(r"(.*?)_?(\d{1,6})", name)
-        key, number = (match[1], int(match[2])) if match and match[1] else (name, 0)
-        families.setdefault(key, []).append((number, name))
+        match = re.fullmatch(r"(.+?)_?(\d{1,6})", name)
+        if match and match[1] not in names and not re.fullmatch("n[xyz]", match[1]):
+            families.setdefault(match[1], []).append((int(match[2]), name))
+    groups = {key: tuple(n for _, n in sorted(found)) for key, found in families.items() if len(found) > 1}
+    for suffix in ("", "2"):
+        axes = (f"nx{suffix}", f"ny{suffix}", f"nz{suffix}")
+        if names.issuperset(axes):
+            groups[f"normal{suffix}"] = axes
+    grouped = {name for members in groups.values() for name in members}
+    groups |= {name: (name,) for name in names - grouped}
     extras: dict[str, Array] = {}
-    for key, members in sorted(families.items()):
-        ordered = tuple(name for _, name in sorted(members))
-        values = stack(columns, ordered)
+    for key, members in sorted(groups.items()):
+        values = stack(columns, members)
         if values.any():  # 3DGS and others write normals that are always zero
-            extras[key if len(ordered) > 1 else ordered[0]] = values if len(ordered) > 1 else values[:, 0]
-    if all(axis in extras for axis in ("nx", "ny", "nz")):
-        extras["normal"] = np.stack([extras.pop(axis) for axis in ("nx", "ny", "nz")], axis=1)
+            extras[key] = values if len(members) > 1 else values[:, 0]
     return extras
 
 
