@@ -76,7 +76,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
 
     def command(name: str, run: object, about: str) -> argparse.ArgumentParser:
         sub = commands.add_parser(name, help=about, description=about)
-        sub.set_defaults(run=run, rest=[])
+        sub.set_defaults(run=run, passes_on=False)
         return sub
 
     env = command("env", run_env, "make or refresh the environments (instant when nothing changed)")
@@ -90,10 +90,13 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     extension = command("extension", run_extension, "build the extension's zip; arguments go to tools/extension.py")
     bench = command("bench", run_bench, "measure; further arguments go to bench/run.py")
     for sub in (demo, extension, bench):
-        sub.add_argument("rest", nargs=argparse.REMAINDER, help="passed on")
+        sub.set_defaults(passes_on=True)
     clean = command("clean", run_clean, "remove build products and caches")
     clean.add_argument("--all", action="store_true", help="also the environments")
-    return parser.parse_args(argv)
+    args, args.rest = parser.parse_known_args(argv)
+    if args.rest and not args.passes_on:
+        parser.error(f"unrecognized arguments: {' '.join(args.rest)}")
+    return args
 
 
 # Environments
