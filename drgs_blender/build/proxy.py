@@ -68,19 +68,23 @@ def mesh_from_surfels(surfels: Surfels, *, resolution: int = 192, views: int = 6
 
     seen = np.zeros((len(posed), 3))
     for camera, direction in zip(cameras, _directions(views)):
-        alpha, depth, _ = _look(posed, camera)
+        alpha, depth, _, _ = _look(posed, camera, direction)
         seen += _visible(posed.centre, surfels.scale.max(axis=1), camera, alpha, depth, voxel)[:, None] * direction
     outward = np.where((np.einsum("nc,nc->n", seen, posed.normal) < 0)[:, None], -posed.normal, posed.normal)
 
-    total = np.zeros(tuple(shape), np.float32)
+    total, weight = np.zeros(tuple(shape), np.float32), np.zeros(tuple(shape), np.float32)
     count = np.zeros(tuple(shape), np.int32)
     for camera, direction in zip(cameras, _directions(views)):
         front = (outward @ direction > 0).astype(np.float32)
-        alpha, depth, facing = _look(replace(posed, albedo=np.repeat(front[:, None], 3, axis=1)), camera)
-        depth[(alpha >= 0.5) & (facing < 0.5)] = -np.inf  # a back side: says nothing about what is before it
-        depth[alpha < 0.5] = np.inf
-        _fuse(total, count, low, voxel, camera.matrix_world, camera.fx, camera.cx, camera.cy, depth, BAND * voxel)
-    field = np.where(count >= WITNESSES, total / np.maximum(count, 1), -1.0)
+        flagged = replace(posed, normal=outward.astype(np.float32), albedo=np.repeat(front[:, None], 3, axis=1))
+        alpha, depth, cosine, facing = _look(flagged, camera, direction)
+        cosine[facing < 0.5] = 0  # a back side: says nothing about what is before it
+        depth[alpha < 0.5], cosine[alpha < 0.5] = np.inf, 1
+        _fuse(
+            total, weight, count, low, voxel, camera.matrix_world, camera.fx, camera.cx, camera.cy,
+            depth, cosine, BAND * voxel,
+        )  # fmt: skip
+    field = np.where(count >= WITNESSES, total / np.maximum(weight, 1e-6), -1.0)
     field = gaussian_filter(field, 0.7)
     field = np.pad(field, 1, constant_values=1.0)
     if not (field.min() < 0 < field.max()):
@@ -149,10 +153,13 @@ def _camera(direction: Array, low: Array, high: Array, voxel: float) -> Camera:
     )
 
 
-def _look(posed: PosedSurfels, camera: Camera) -> tuple[Array, Array, Array]:
-    """Coverage, depth and red albedo (size, size) of a view."""
+def _look(posed: PosedSurfels, camera: Camera, direction: Array) -> tuple[Array, Array, Array, Array]:
+    """Coverage, depth, cosine between surface and view, and red albedo (size, size) of a view."""
     samples = rasterise(prepare(posed, camera, camera_parameters(camera, RenderSettings(aa=1), 0)), 0, camera.height)
-    return samples.alpha[..., 0], samples.depth[..., 0].copy(), samples.surface[..., 0, 3]
+    alpha, surface = samples.alpha[..., 0], samples.surface[..., 0, :]
+    surface = np.where(alpha[..., None] > 0, surface, 0)
+    cosine = np.abs(surface[..., :3] @ direction.astype(np.float32))
+    return alpha, samples.depth[..., 0].copy(), cosine, surface[..., 3]
 
 
 def _visible(centre: Array, size: Array, camera: Camera, alpha: Array, depth: Array, voxel: float) -> Array:
@@ -168,12 +175,14 @@ def _visible(centre: Array, size: Array, camera: Camera, alpha: Array, depth: Ar
 
 @njit(parallel=True)
 def _fuse(
-    total: Array, count: Array, low: Array, voxel: float, matrix: Array, scale: float, cx: float, cy: float,
-    depth: Array, band: float,
+    total: Array, weight: Array, count: Array, low: Array, voxel: float, matrix: Array, scale: float,
+    cx: float, cy: float, depth: Array, cosine: Array, band: float,
 ) -> None:  # fmt: skip
     """Add a depth map to the field: +1 before the surface, falling to -1 behind it within the band.
 
-    `depth` is +inf where nothing was seen and -inf where what was seen says nothing.
+    `depth` is +inf where nothing was seen. A pixel counts with the `cosine` at which it sees the surface: the rim of
+    a silhouette, widened by the raster's filter, says little. The same cosine turns distance along the ray into
+    distance from the surface.
     """
     size = depth.shape[0]
     for i in prange(total.shape[0]):
@@ -184,12 +193,14 @@ def _fuse(
                 z = low[2] + k * voxel - matrix[2, 3]
                 px = int(np.floor((matrix[0, 0] * x + matrix[1, 0] * y + matrix[2, 0] * z) * scale + cx))
                 py = int(np.floor(cy - (matrix[0, 1] * x + matrix[1, 1] * y + matrix[2, 1] * z) * scale))
-                if px < 0 or py < 0 or px >= size or py >= size:
+                if px < 0 or py < 0 or px >= size or py >= size or cosine[py, px] < 0.1:
                     continue
                 away = -(matrix[0, 2] * x + matrix[1, 2] * y + matrix[2, 2] * z)
                 gap = (depth[py, px] - away) / band
                 if gap > -1.0:
-                    total[i, j, k] += min(gap, 1.0)
+                    w = cosine[py, px]
+                    total[i, j, k] += w * min(w * gap, 1.0)
+                    weight[i, j, k] += w
                     count[i, j, k] += 1
 
 
