@@ -212,7 +212,32 @@ def test_termination_leaves_nothing_behind(folder, tmp_path):
             time.sleep(0.05)
 
 
-def test_nothing_is_left_in_the_temporary_folder(render):
-    before = set(Path(tempfile.gettempdir()).glob("drgs-*"))
+@pytest.mark.skipif(sys.platform != "linux", reason="finds the engine in /proc")
+def test_engine_killed_in_the_middle_of_a_frame_costs_no_pixel(render, folder, tmp_path):
+    assert render("--rays", "2048", frames="1")[0] == 0
+    (tmp_path / "0001.exr").rename(tmp_path / "calm.exr")
+    command = [sys.executable, "-m", "drgs_blender.cli.main", "render", str(folder / "shot.blend"), "--frames", "1"]
+    command += ["--out", str(tmp_path / "####.exr"), "--rays", "2048"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
+        while not process.stdout.readline().startswith("Fra:1 "):
+            assert process.poll() is None
+        children = Path(f"/proc/{process.pid}/task").glob("*/children")
+        pids = [int(pid) for listing in children for pid in listing.read_text().split()]
+        engines = [pid for pid in pids if b"drgs_blender.engine" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+        assert len(engines) == 1
+        os.kill(engines[0], signal.SIGKILL)
+        rest, _ = process.communicate(timeout=120)
+    finally:
+        process.kill()
+    assert process.returncode == 0 and rest.splitlines()[-1] == "DRGS_EXIT class=ok"
+    calm, shaken = (read_frame(tmp_path / name)[0]["Combined"] for name in ("calm.exr", "0001.exr"))
+    assert np.array_equal(calm, shaken)
+
+
+def test_nothing_is_left_in_the_temporary_folder(render, tmp_path_factory, monkeypatch):
+    scratch = tmp_path_factory.mktemp("scratch")
+    monkeypatch.setattr(tempfile, "tempdir", str(scratch))
     assert render(frames="1")[0] == 0
-    assert set(Path(tempfile.gettempdir()).glob("drgs-*")) <= before
+    assert render(scene="blind.blend")[0] == 64
+    assert not list(scratch.iterdir())
