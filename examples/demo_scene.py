@@ -34,7 +34,7 @@ def add_robot(assets: Path) -> bpy.types.Object:
     """The robot: Blender's importer brings the rig, DR-GS the relightable object; binding joins them."""
     bpy.ops.import_scene.gltf(filepath=str(EXAMPLES / "robot" / "RobotExpressive.glb"))
     rig = next(o for o in bpy.context.selected_objects if o.type == "ARMATURE")
-    sources = [o for o in bpy.context.scene.objects if o.type == "MESH" and (o.parent == rig or o.find_armature())]
+    sources = [o for o in rig.children_recursive if o.type == "MESH"]
     robot = import_drgs(assets / "robot.drgs")
     bpy.ops.object.select_all(action="DESELECT")
     for source in sources:

@@ -81,7 +81,7 @@ def _parent_bone(obj: bpy.types.Object) -> str:
     """Bone that the object or one of its parents hangs on, "" when a modifier deforms it or there is none."""
     if obj.find_armature() is not None and any(m.type == "ARMATURE" for m in obj.modifiers):
         return ""
-    while obj is not None:
+    while obj is not None and obj.type != "ARMATURE":
         if obj.parent_type == "BONE":
             return obj.parent_bone
         obj = obj.parent
