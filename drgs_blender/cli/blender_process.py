@@ -132,7 +132,7 @@ class BlenderProcess:
         except (ProtocolError, OSError) as error:
             raise EngineError("Blender", f"stopped in the middle of a message ({error})", self._epitaph()) from error
         if received is None:
-            raise EngineError("Blender", f"ended before the job: {self._epitaph()}", "Try again; -v shows its output")
+            raise EngineError("Blender", f"ended before the job: {self._epitaph()}", "Try again; -vv shows its output")
         message = received[0]
         if isinstance(message, protocol.Failed):
             raise ERROR_CLASSES.get(message.error, DrgsError)(message.subject, message.problem, message.remedy)
