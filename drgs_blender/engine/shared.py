@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 import mmap
 import os
+import sys
 
 logger = logging.getLogger(__name__)
 
@@ -32,21 +33,21 @@ class Region:
     @classmethod
     def create(cls) -> Region | None:
         """A new, empty region, or None where the system cannot make one."""
-        if not hasattr(os, "memfd_create") or not hasattr(os, "posix_fallocate"):
+        if sys.platform != "linux":
             return None
         import fcntl
 
         try:
             fd = os.memfd_create("drgs", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
             fcntl.fcntl(fd, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK)
-        except OSError as error:
+        except (OSError, AttributeError) as error:  # a system or a Python built without it
             logger.info("no shared memory (%s): arrays travel in the pipe", error)
             return None
         return cls(fd)
 
     def writable(self, size: int) -> memoryview | None:
         """The first `size` bytes to write to, growing the file; None when it cannot grow so far."""
-        if size > self.max_bytes:
+        if sys.platform != "linux" or size > self.max_bytes:
             return None
         if self._map is None or len(self._map) < size:
             whole = -(-size // _STEP) * _STEP

@@ -13,7 +13,9 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "drgs_blender"
 #: What the extension may use of the engine's package.
-LIGHT_MODULES = ("engine.protocol", "engine.client")
+LIGHT_MODULES = tuple(
+    f"engine.{name}" for name in ("protocol", "client", "codec", "slots", "shared", "child", "locate")
+)
 
 
 def rank_table() -> dict[str, int]:
@@ -79,7 +81,7 @@ def test_the_engine_never_imports_blender():
 
 
 def light_sources() -> list[Path]:
-    """Files that run in Blender's Python: rank 0 and the two light modules of the engine."""
+    """Files that run in Blender's Python: rank 0 and the light modules of the engine."""
     files = [path for path in sources(PACKAGE) if RANKS.get(top_level(path), 0) == 0]
     files += [PACKAGE / (module.replace(".", "/") + ".py") for module in LIGHT_MODULES]
     return [path for path in files if path.exists()]
