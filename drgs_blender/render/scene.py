@@ -8,8 +8,9 @@ import numpy as np
 
 from ..asset.model import as_float
 from ..errors import UsageError
-from ..jit import njit, prange
+from ..jit import prange
 from .embree import TriangleBVH
+from .sampling import exact
 
 Array = np.ndarray
 
@@ -54,7 +55,7 @@ class ObjectFaults:
     empty_faces: int  # have no area
 
 
-@njit(parallel=True)
+@exact(parallel=True)
 def _copy_vertices(source, target):  # type: ignore[no-untyped-def]
     """Copy usable vertices, put the others at the origin; return how many there are of the latter."""
     bad = 0
@@ -67,7 +68,7 @@ def _copy_vertices(source, target):  # type: ignore[no-untyped-def]
     return bad
 
 
-@njit
+@exact
 def _corners_of_rows(shading_faces, rows):  # type: ignore[no-untyped-def]
     """CSR lists of the face corners (3 face + k) that share each shading row, in ascending order."""
     start = np.zeros(rows + 1, np.int32)
@@ -84,7 +85,7 @@ def _corners_of_rows(shading_faces, rows):  # type: ignore[no-untyped-def]
     return start, corners
 
 
-@njit(inline="always")
+@exact
 def _acos(x):  # type: ignore[no-untyped-def]
     """acos to 7e-5: Abramowitz and Stegun 4.4.45."""
     a = abs(x)
@@ -94,7 +95,7 @@ def _acos(x):  # type: ignore[no-untyped-def]
     return y if x >= 0 else np.float32(np.pi) - y
 
 
-@njit(parallel=True)
+@exact(parallel=True)
 def _face_terms(vertices, faces, first, last, weighted):  # type: ignore[no-untyped-def]
     """Fill weighted[f] = (unit face normal, corner angles) of faces first..last; return how many have no area."""
     empty = 0
@@ -118,7 +119,7 @@ def _face_terms(vertices, faces, first, last, weighted):  # type: ignore[no-unty
     return empty
 
 
-@njit(parallel=True)
+@exact(parallel=True)
 def _row_normals(weighted, start, corners, shading):  # type: ignore[no-untyped-def]
     """Sum angle-weighted face normals at each shading row, always in the same order."""
     for row in prange(len(shading)):
@@ -136,7 +137,7 @@ def _row_normals(weighted, start, corners, shading):  # type: ignore[no-untyped-
         shading[row, 0], shading[row, 1], shading[row, 2] = x, y, z
 
 
-@njit(parallel=True)
+@exact(parallel=True)
 def _given_normals(normals, first, shading):  # type: ignore[no-untyped-def]
     """Overwrite normals from row `first` on by those given, where these are usable."""
     for i in prange(len(normals)):
@@ -147,7 +148,7 @@ def _given_normals(normals, first, shading):  # type: ignore[no-untyped-def]
             shading[first + i, 0], shading[first + i, 1], shading[first + i, 2] = x * scale, y * scale, z * scale
 
 
-@njit(parallel=True)
+@exact(parallel=True)
 def _materials(rows, first, albedo, roughness, metallic, shading):  # type: ignore[no-untyped-def]
     """Copy the material of vertex rows[i] to shading row first + i, within [0, 1]; NaN becomes 0."""
     for i in prange(len(rows)):
