@@ -59,17 +59,19 @@ def sphere_over_plane() -> dict[str, np.ndarray]:
     }
 
 
-def visible_points() -> SurfacePoints:
-    """Three points on the plane (one below the sphere), three on the sphere's faces, seen from one side."""
+def visible_points(enclosed: bool = False) -> SurfacePoints:
+    """Three points on the plane and three on the sphere's faces; `enclosed`: in the gap, where they see each other."""
     scene = sphere_over_plane()
-    chosen = [3, 20, 61]
+    height = scene["vertices"][scene["faces"][:-2]].mean(1)[:, 2]
+    chosen = np.argsort(height)[[0, 2, 9]] if enclosed else [3, 20, 61]
+    places = [(0.1, 0.2, 0), (0.5, -0.2, 0), (-0.4, 0.1, 0)] if enclosed else [(0.9, 0.3, 0), (-0.2, 0.5, 0), (2, 2, 0)]
     corners = scene["vertices"][scene["faces"][chosen]].astype(float)
     flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     flat /= np.linalg.norm(flat, axis=1, keepdims=True)
     smooth = scene["corner_normals"][chosen].astype(float).mean(1)
     smooth /= np.linalg.norm(smooth, axis=1, keepdims=True)
     up = np.tile((0, 0, 1.0), (3, 1))
-    origin = np.concatenate([[(0.9, 0.3, 0), (-0.2, 0.5, 0), (2, 2, 0)], corners.mean(1)])
+    origin = np.concatenate([places, corners.mean(1)])
     normal, geometric = np.concatenate([up, smooth]), np.concatenate([up, flat])
     aside = np.array(
         [(0.8, 0.2, 0.5), (-0.3, 0.9, 0.2), (0.1, -0.7, 0.7), (0.4, 0.4, 0.1), (0.2, -0.5, 0.3), (0.3, 0, 0)]
@@ -137,10 +139,10 @@ def test_direct_light(name: str, look: str):
 @pytest.mark.parametrize("look", ["principled", "paper"])
 @pytest.mark.parametrize("bounces", [1, 3])
 def test_indirect_light(bounces: int, look: str):
-    points = visible_points()
+    points = visible_points(enclosed=True)
     tracer, light = tracer_from_arrays(**sphere_over_plane()), Light.from_world(world())
     generator = torch.Generator().manual_seed(21)
-    counts = Counts(*((3000, 1500, 1500) if bounces == 1 else (800, 400, 400)))
+    counts = Counts(*((5000, 2500, 2500) if bounces == 1 else (1600, 800, 800)))
     samples = integrate(tracer, light, _lifted(points), counts, bounces, look, generator, samples=True)
     reference, noise = samples.sum(1).numpy(), (samples.var(1) * samples.shape[1]).sqrt().numpy()
     found, error = kernel_means(points, RenderSettings(8, 4, 4, bounces, aa=1, look=look), 4000)

@@ -67,7 +67,10 @@ class EmptyTracer:
 
 
 class TriangleTracer:
-    """Every ray against every triangle (Moeller and Trumbore 1997), in chunks: for small scenes.
+    """Every ray against every triangle, in chunks: for small scenes.
+
+    The ray meets the plane of a triangle at corner + v edge1 + w edge2; v and w are linear in the point, so that the
+    whole is a few matrix products.
 
     Parameters
     ----------
@@ -86,28 +89,28 @@ class TriangleTracer:
         metallic: Tensor,
         corner_normals: Tensor | None = None,
         offset: float = 1e-5,
-        chunk: int = 1 << 22,
+        chunk: int = 1 << 18,
     ) -> None:
         self.faces = faces.long()
-        self.corner, self.edge1, self.edge2 = self._edges(vertices)
-        self.face_normal = normalise(torch.linalg.cross(self.edge1, self.edge2))
+        with torch.no_grad():
+            corner, b, c = vertices[self.faces].unbind(1)
+            edge1, edge2 = b - corner, c - corner
+            across = torch.linalg.cross(edge1, edge2)
+            area2 = (across**2).sum(-1, keepdim=True)
+            # Plane normal and dual basis of the edges, each with its value at the corner.
+            self.planes = [across, torch.linalg.cross(edge2, across) / area2, torch.linalg.cross(across, edge1) / area2]
+            self.levels = [dot(plane, corner) for plane in self.planes]
+            self.face_normal = across / torch.sqrt(area2)
         self.albedo, self.roughness, self.metallic = albedo, roughness, metallic
         self.corner_normals, self.offset, self.chunk = corner_normals, offset, chunk
-
-    def _edges(self, vertices: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        a, b, c = vertices[self.faces].unbind(1)
-        return a, b - a, c - a
 
     @torch.no_grad()
     def _search(self, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Distance (inf where nothing is hit), face and barycentric coordinates (v, w) of the nearest hits."""
-        across = torch.linalg.cross(direction[:, None], self.edge2[None])
-        inverse = 1 / dot(self.edge1, across)
-        from_corner = origin[:, None] - self.corner
-        v = dot(from_corner, across) * inverse
-        other = torch.linalg.cross(from_corner, self.edge1[None].expand_as(from_corner))
-        w = dot(direction[:, None], other) * inverse
-        t = dot(self.edge2, other) * inverse
+        start, v, w = (origin @ plane.T - level for plane, level in zip(self.planes, self.levels))
+        slope, v_slope, w_slope = (direction @ plane.T for plane in self.planes)
+        t = -start / slope
+        v, w = v + t * v_slope, w + t * w_slope
         inside = (v >= 0) & (w >= 0) & (v + w <= 1) & (t > 0)
         t, face = torch.where(inside, t, torch.inf).min(1)
         rows = torch.arange(len(t), device=t.device)
@@ -151,6 +154,8 @@ class Counts:
     environment: int = 8
 
 
+#: Products of points and grid cells that the quadrature holds at once.
+_CELLS_AT_ONCE = 1 << 17
 #: What is drawn at every point after the first.
 SECONDARY = Counts(1, 1, 1)
 
@@ -232,15 +237,15 @@ def integrate_quadrature(
     def follow(met: SurfacePoints) -> Tensor:
         return integrate_quadrature(tracer, light, met, max(rows // 8, 8), look, bounces - 1).sum(1)
 
-    parts = []
-    for i in range(len(points)):
-        point = points.select(torch.tensor([i], device=device))
-        above = (dot(point.normal, grid) > 0) & (dot(point.geometric_normal, grid) > 0)
-        gathered = _gather(
-            tracer, light, point, grid[above][None], solid_angle[above][None], look, follow if bounces > 0 else None
-        )
-        parts.append(gathered.sum(1))
-    return torch.cat(parts) if parts else torch.zeros(0, 4, 3, dtype=dtype, device=device)
+    parts = [torch.zeros(0, 4, 3, dtype=dtype, device=device)]
+    block = max(1, _CELLS_AT_ONCE // len(grid))
+    for first in range(0, len(points), block):
+        some = points.select(torch.arange(first, min(first + block, len(points)), device=device))
+        above = (some.normal @ grid.T > 0) & (some.geometric_normal @ grid.T > 0)
+        weight = torch.where(above, solid_angle, torch.zeros_like(solid_angle))
+        directions = grid.expand(len(some), -1, 3)
+        parts.append(_gather(tracer, light, some, directions, weight, look, follow if bounces > 0 else None).sum(1))
+    return torch.cat(parts)
 
 
 def _gather(

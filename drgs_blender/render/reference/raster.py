@@ -122,7 +122,7 @@ def rasterise(
     camera: Camera,
     position: Tensor | None = None,
     gap: float | None = None,
-    chunk: int = 1 << 21,
+    chunk: int = 1 << 18,
 ) -> ReferenceGBuffer:
     """G-buffer of surfels at pixel positions.
 
