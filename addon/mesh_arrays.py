@@ -50,6 +50,7 @@ def write_channel(mesh: bpy.types.Mesh, channel: str, values: Array) -> None:
     if width == 4:
         values = np.column_stack((values, np.ones(len(values), np.float32)))
     attribute.data.foreach_set(prop, np.ascontiguousarray(values, np.float32).ravel())
+    mesh.update_tag()
 
 
 def read_channel(mesh: bpy.types.Mesh, channel: str) -> Array | None:

@@ -1,8 +1,7 @@
-"""Make an asset from captured surfels, their mesh and their light, in the engine's process, then import it."""
+"""Make an asset from captured surfels, their mesh and their light, by the command ``drgs``, then import it."""
 
 from __future__ import annotations
 
-import os
 import subprocess
 import tempfile
 from pathlib import Path
@@ -19,7 +18,7 @@ from .import_asset import import_assets
 
 
 class DRGS_OT_import_parts(DrgsOperator, bpy.types.Operator):
-    """Make a .drgs asset from a file of surfels or splats, with its mesh and environment, and load it"""
+    """Make a .drgs asset from surfels or splats and their mesh, or from a textured mesh alone, and load it"""
 
     bl_idname = "drgs.import_parts"
     bl_label = "Import Surfels and Mesh"
@@ -28,14 +27,20 @@ class DRGS_OT_import_parts(DrgsOperator, bpy.types.Operator):
     surfels: StringProperty(
         name="Surfels", description="PLY, SPZ, SOG, ... with surfels or splats", subtype="FILE_PATH"
     )
-    mesh: StringProperty(name="Mesh", description="The mesh they were reconstructed with", subtype="FILE_PATH")
+    mesh: StringProperty(
+        name="Mesh",
+        description="The mesh they were reconstructed with; or, without surfels, any textured mesh",
+        subtype="FILE_PATH",
+    )
     environment: StringProperty(name="Environment", description="EXR or HDR image of the light", subtype="FILE_PATH")
-    out: StringProperty(name="Asset", description="The file to write; empty is beside the surfels", subtype="FILE_PATH")
+    out: StringProperty(
+        name="Asset", description="The file to write; empty is beside the first file", subtype="FILE_PATH"
+    )
     up: EnumProperty(
         name="Up",
         description="Axis that points up in the files",
-        items=(("z", "+Z", ""), ("y", "+Y", ""), ("-y", "-Y", "")),
-        default="z",
+        items=(("auto", "Automatic", "As the file formats say"), ("z", "Z", ""), ("y", "Y", "")),
+        default="auto",
     )
     use_environment: BoolProperty(name="Set World", description="Light the scene with the environment", default=False)
 
@@ -76,27 +81,34 @@ class DRGS_OT_import_parts(DrgsOperator, bpy.types.Operator):
         self._release(context)
 
     def _target(self) -> Path:
-        if self.out:
-            return Path(bpy.path.abspath(self.out)).with_suffix(".drgs")
-        return Path(bpy.path.abspath(self.surfels)).with_suffix(".drgs")
+        """The asset to write."""
+        return Path(bpy.path.abspath(self.out or self.surfels or self.mesh)).with_suffix(".drgs")
+
+    def _arguments(self) -> list[str]:
+        """Arguments of the command ``drgs``."""
+        surfels, mesh, light = (bpy.path.abspath(p) for p in (self.surfels, self.mesh, self.environment))
+        if not surfels and not mesh:
+            raise UsageError("Import", "neither surfels nor a mesh are given", "Choose at least one file")
+        arguments = ["import", surfels] if surfels else ["make", mesh]
+        if surfels and mesh:
+            arguments += ["--mesh", mesh]
+        if light:
+            arguments += ["--env", light]
+        if self.up != "auto":
+            arguments += ["--up", self.up]
+        return [*arguments, "--out", str(self._target())]
 
     def _start(self) -> None:
-        if not self.surfels:
-            raise UsageError("Import", "no file of surfels is given", "Choose one under Surfels")
+        arguments = self._arguments()
         command = locate_engine(preferences.read("engine_python", "") or None)
         python = command[: command.index("-m")]
-        arguments = ["import", bpy.path.abspath(self.surfels), "--out", str(self._target()), f"--up={self.up}"]
-        for option, value in (("--mesh", self.mesh), ("--environment", self.environment)):
-            if value:
-                arguments += [option, bpy.path.abspath(value)]
-        self._log = tempfile.TemporaryFile()
+        self._log = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the process
         try:
             self._process = subprocess.Popen(
-                [*python, "-m", "drgs_blender.cli.main", *arguments],
+                [*python, "-m", "drgs_blender.cli.main", "--no-progress", *arguments],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=self._log,
-                env={k: v for k, v in os.environ.items() if not k.startswith("PYTHON")},
             )
         except OSError as error:
             self._log.close()
@@ -109,7 +121,9 @@ class DRGS_OT_import_parts(DrgsOperator, bpy.types.Operator):
         self._log.close()
         if self._process.returncode:
             reason = lines[-1].removeprefix("drgs: ") if lines else f"exit code {self._process.returncode}"
-            raise AssetError(Path(self.surfels).name, f"could not be made into an asset: {reason.rstrip('.')}")
+            raise AssetError(
+                Path(self.surfels or self.mesh).name, f"could not be made into an asset: {reason.rstrip('.')}"
+            )
         for line in lines:
             messages.note("INFO", line)
         import_assets(context, [self._target()], self.use_environment)

@@ -38,7 +38,7 @@ def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
 
 @pytest.hookimpl(trylast=True)
 def pytest_unconfigure(config: pytest.Config) -> None:
-    """Disable the extension, then leave at once: the exit of Blender 4.2 as a module crashes with classes registered."""
+    """Disable the extension, then leave at once: Blender 4.2 as a module crashes when Python tidies up after it."""
     bpy.ops.preferences.addon_disable(module=PACKAGE)
     shutil.rmtree(USER_FOLDER, ignore_errors=True)
     sys.stdout.flush()

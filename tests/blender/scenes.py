@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import struct
 from pathlib import Path
 
 import bpy
@@ -84,6 +85,28 @@ def read_exr(path: str | Path, width: int, height: int) -> np.ndarray:
     image.pixels.foreach_get(pixels)
     bpy.data.images.remove(image)
     return pixels.reshape(height, width, 4)[::-1].copy()
+
+
+def write_exr(path: str | Path, pixels: np.ndarray) -> None:
+    """Write (h, w, 3) float32 as an uncompressed EXR; what Blender itself writes depends on its version's views."""
+    height, width, _ = pixels.shape
+
+    def attribute(name: str, kind: str, value: bytes) -> bytes:
+        return name.encode() + b"\0" + kind.encode() + b"\0" + struct.pack("<i", len(value)) + value
+
+    channels = b"".join(c + b"\0" + struct.pack("<iB3xii", 2, 0, 1, 1) for c in (b"B", b"G", b"R")) + b"\0"
+    box = struct.pack("<4i", 0, 0, width - 1, height - 1)
+    header = b"\x76\x2f\x31\x01" + struct.pack("<i", 2)
+    header += attribute("channels", "chlist", channels) + attribute("compression", "compression", b"\0")
+    header += attribute("dataWindow", "box2i", box) + attribute("displayWindow", "box2i", box)
+    header += attribute("lineOrder", "lineOrder", b"\0")
+    header += attribute("pixelAspectRatio", "float", struct.pack("<f", 1))
+    header += attribute("screenWindowCenter", "v2f", struct.pack("<2f", 0, 0))
+    header += attribute("screenWindowWidth", "float", struct.pack("<f", 1)) + b"\0"
+    line = 8 + 12 * width
+    offsets = len(header) + 8 * height + line * np.arange(height, dtype="<u8")
+    rows = (struct.pack("<ii", y, 12 * width) + pixels[y, :, ::-1].T.astype("<f4").tobytes() for y in range(height))
+    Path(path).write_bytes(header + offsets.tobytes() + b"".join(rows))
 
 
 def mesh_object(name: str, vertices, faces) -> bpy.types.Object:

@@ -116,7 +116,7 @@ def test_every_pixel_of_a_cycles_picture_of_positions_projects_to_itself(scene, 
 
 def test_panoramic_camera_is_refused_with_a_remedy(scene):
     scene.camera.data.type = "PANO"
-    with pytest.raises(part("drgs_blender.errors").UsageError, match='"Camera".*Perspective or Orthographic'):
+    with pytest.raises(part("drgs_blender.errors").UsageError, match=r'"Camera".*Perspective or Orthographic'):
         exported(scene)
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 import pytest
-from scenes import part, read_exr, sphere, write_ball
+from scenes import ROOT, part, read_exr, sphere, write_ball
 
 
 def channel(mesh, name):
@@ -37,7 +37,7 @@ def test_path_is_relative_and_known_to_blenders_path_tools(ball, ball_file, tmp_
     moved = tmp_path / "elsewhere"
     moved.mkdir()
     shutil.move(ball_file, moved / "ball.drgs")
-    with pytest.raises(part("drgs_blender.errors").AssetError, match='"ball".*Find Missing Files'):
+    with pytest.raises(part("drgs_blender.errors").AssetError, match=r'"ball".*Find Missing Files'):
         part("addon.assets").file_of(ball)
     bpy.ops.file.find_missing_files(directory=str(moved))
     assert part("addon.assets").file_of(ball) == moved / "ball.drgs"
@@ -94,7 +94,7 @@ def test_damaged_file_is_refused_with_its_name_and_adds_nothing(scene, ball_file
     data[len(data) // 2] ^= 255
     ball_file.write_bytes(data)
     before = len(bpy.data.objects)
-    with pytest.raises(RuntimeError, match="ball.drgs"):
+    with pytest.raises(RuntimeError, match=r"ball\.drgs"):
         bpy.ops.import_scene.drgs(filepath=str(ball_file))
     assert len(bpy.data.objects) == before
     assert part("addon.messages").history[-1].level == "ERROR"
@@ -118,3 +118,30 @@ def test_viewport_material_shows_the_albedo_attribute_in_cycles(ball, scene):
     bpy.ops.render.render(write_still=True)
     centre = read_exr(scene.render.filepath, 16, 16)[7:9, 7:9].mean((0, 1))
     assert 0.6 < centre[0] < 0.95 and centre[1] < 0.25 and abs(centre[1] - centre[2]) < 0.03
+
+
+def few_splats(path: Path, count: int = 400) -> Path:
+    """The first splats of a captured toy."""
+    header, body = (ROOT / "examples" / "playbot" / "playbot.ply").read_bytes().split(b"end_header\n", 1)
+    total = int(next(line for line in header.split(b"\n") if line.startswith(b"element vertex")).split()[-1])
+    row = len(body) // total
+    header = header.replace(b"element vertex %d" % total, b"element vertex %d" % count)
+    path.write_bytes(header + b"end_header\n" + body[: row * count])
+    return path
+
+
+def test_surfels_become_an_asset_and_an_object(scene, tmp_path):
+    splats = few_splats(tmp_path / "toy.ply")
+    assert bpy.ops.drgs.import_parts(surfels=str(splats), up="y") == {"FINISHED"}
+    obj = bpy.context.active_object
+    assert obj.name == "toy" and obj.drgs.path == "//toy.drgs"
+    assert len(part("addon.assets").load(tmp_path / "toy.drgs").surfels) == 400
+
+
+def test_a_failed_conversion_says_why(scene, tmp_path):
+    (tmp_path / "broken.ply").write_bytes(b"ply\nformat ascii 1.0\nelement vertex 3\n")
+    with pytest.raises(RuntimeError, match=r"broken\.ply.*could not be made into an asset"):
+        bpy.ops.drgs.import_parts(surfels=str(tmp_path / "broken.ply"))
+    with pytest.raises(RuntimeError, match="neither surfels nor a mesh"):
+        bpy.ops.drgs.import_parts()
+    assert not [o for o in scene.objects if o.type == "MESH"]
