@@ -15,6 +15,7 @@ import numpy as np
 from ..errors import UsageError
 from ..frame import Camera, RenderSettings
 from ..jit import njit
+from .sampling import GOLDEN, mix
 
 Array = np.ndarray
 
@@ -22,7 +23,7 @@ Array = np.ndarray
 POSITION, FX, FY, CX, CY, ORTHOGRAPHIC, CLIP_START, CLIP_END, WIDTH, SEED, AA, PARAMETERS = (
     *(9, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21, 22),
 )
-_GOLDEN = 0.6180339887498949
+_GOLDEN_RATIO = 0.6180339887498949
 
 
 def check_camera(camera: Camera) -> None:
@@ -77,32 +78,16 @@ def camera_parameters(camera: Camera, settings: RenderSettings, frame_number: in
     out[FX], out[FY], out[CX], out[CY] = camera.fx, camera.fy, camera.cx, camera.cy
     out[ORTHOGRAPHIC] = camera.orthographic
     out[CLIP_START], out[CLIP_END], out[WIDTH] = camera.clip_start, camera.clip_end, camera.width
-    out[SEED] = _mix_host((settings.seed & 0xFFFFFFFF) ^ _mix_host(frame_number & 0xFFFFFFFF))
+    out[SEED] = mix(np.uint32(settings.seed & 0xFFFFFFFF) ^ mix(np.uint32(frame_number & 0xFFFFFFFF)))
     out[AA] = settings.aa
     return out
-
-
-def _mix_host(x: int) -> int:
-    """`_mix` on Python integers."""
-    x = ((x ^ (x >> 16)) * 0x7FEB352D) & 0xFFFFFFFF
-    x = ((x ^ (x >> 15)) * 0x846CA68B) & 0xFFFFFFFF
-    return x ^ (x >> 16)
-
-
-@njit(inline="always")
-def _mix(x: Any) -> Any:
-    """Wellons' `lowbias32`, a hash of 32 bits with low avalanche bias."""
-    x = np.uint32(x)
-    x = np.uint32((x ^ (x >> np.uint32(16))) * np.uint32(0x7FEB352D))
-    x = np.uint32((x ^ (x >> np.uint32(15))) * np.uint32(0x846CA68B))
-    return np.uint32(x ^ (x >> np.uint32(16)))
 
 
 @njit
 def pixel_shift(parameters: Any, pixel: Any) -> Any:
     """Toroidal shift (x, y) in [0, 1) of the sub-pixel lattice of `pixel` (index y * width + x)."""
-    h = _mix(np.uint32(pixel) ^ np.uint32(np.int64(parameters[SEED])))
-    g = _mix(h ^ np.uint32(0x9E3779B9))
+    h = mix(np.uint32(pixel) ^ np.uint32(np.int64(parameters[SEED])))
+    g = mix(h ^ GOLDEN)
     return np.float64(h) * 2.0**-32, np.float64(g) * 2.0**-32
 
 
@@ -110,7 +95,7 @@ def pixel_shift(parameters: Any, pixel: Any) -> Any:
 def lattice(shift_x: Any, shift_y: Any, sample: Any, aa: Any) -> Any:
     """Position of sub-pixel sample number `sample` of `aa` inside its pixel, both in [0, 1)."""
     x = shift_x + sample / aa
-    y = shift_y + sample * _GOLDEN
+    y = shift_y + sample * _GOLDEN_RATIO
     # Just below one, so that adding the pixel's index in float32 stays inside the pixel for pictures of 65536 pixels.
     return min(x - math.floor(x), 0.995), min(y - math.floor(y), 0.995)
 

@@ -109,15 +109,15 @@ def denoise(
 
 
 @njit(inline="always")
-def _colour(lobe: Any, albedo: Any, metallic: Any) -> Any:
+def _colour(lobe: Any, albedo: Any, metallic: Any, y: Any, x: Any) -> Any:
     """Surface colour of a lobe's light, at least COLOUR_FLOOR: diffuse a (1 - m), glossy Fresnel's F0."""
     floor = np.float32(COLOUR_FLOOR)
-    m = metallic
+    m, r, g, b = metallic[y, x], albedo[y, x, 0], albedo[y, x, 1], albedo[y, x, 2]
+    k = np.float32(1.0) - m
     if lobe == 0:
-        k = np.float32(1.0) - m
-        return max(k * albedo[0], floor), max(k * albedo[1], floor), max(k * albedo[2], floor)
-    base = np.float32(DIELECTRIC_F0) * (np.float32(1.0) - m)
-    return max(base + m * albedo[0], floor), max(base + m * albedo[1], floor), max(base + m * albedo[2], floor)
+        return max(k * r, floor), max(k * g, floor), max(k * b, floor)
+    base = np.float32(DIELECTRIC_F0) * k
+    return max(base + m * r, floor), max(base + m * g, floor), max(base + m * b, floor)
 
 
 @njit(inline="always")
@@ -129,8 +129,7 @@ def _luminance(r: Any, g: Any, b: Any) -> Any:
 def _lobe_luminance(light: Any, y: Any, x: Any, lobe: Any) -> Any:
     total = np.float32(0.0)
     for part in range(light.shape[3]):
-        v = light[y, x, lobe, part]
-        total += _luminance(v[0], v[1], v[2])
+        total += _luminance(light[y, x, lobe, part, 0], light[y, x, lobe, part, 1], light[y, x, lobe, part, 2])
     return total
 
 
@@ -153,6 +152,7 @@ def _demodulate(
     """Divide light by surface colour and coverage; gather the guides of a pixel side by side."""
     h, w = coverage.shape
     parts = light.shape[3]
+    usable = np.float32(1e30)
     for y in prange(h):
         for x in range(w):
             cover = coverage[y, x]
@@ -166,19 +166,20 @@ def _demodulate(
             g[_ROUGHNESS], g[_INDEX], g[_FOOTPRINT] = r, index[y, x], footprint[y, x]
             valid = np.float32(1.0)
             for lobe in range(2):
-                c = _colour(lobe, albedo[y, x], metallic[y, x])
+                c = _colour(lobe, albedo, metallic, y, x)
                 shade = cover * _luminance(c[0], c[1], c[2])
                 for k in range(3):
                     scale = np.float32(1.0) / (cover * c[k])
                     direct, indirect = components[y, x, 2 * lobe, k], components[y, x, 2 * lobe + 1, k]
-                    if not np.isfinite(direct) or not np.isfinite(indirect):
+                    # Comparisons, since reassociation folds the x - x == 0 of isfinite.
+                    if not (abs(direct) < usable and abs(indirect) < usable):
                         valid = np.float32(0.0)
                     if parts == 2:
                         light[y, x, lobe, 0, k], light[y, x, lobe, 1, k] = direct * scale, indirect * scale
                     else:
                         light[y, x, lobe, 0, k] = (direct + indirect) * scale
                 v = variance[y, x, lobe] / (shade * shade)
-                if not np.isfinite(v):
+                if not v < usable:
                     valid = np.float32(0.0)
                 spread[y, x, lobe] = max(v, np.float32(0.0))
             if valid == np.float32(0.0):
@@ -195,21 +196,21 @@ def _clamp_fireflies(guide: Any, light: Any, spread: Any, out: Any, out_spread: 
     parts = light.shape[3]
     for y in prange(h):
         for x in range(w):
-            g = guide[y, x]
-            if g[_VALID] == np.float32(0.0):
+            if guide[y, x, _VALID] == np.float32(0.0):
                 continue
+            index = guide[y, x, _INDEX]
             for lobe in range(2):
-                total = square = around = np.float32(0.0)
+                total = square = np.float32(0.0)
                 n = 0
                 for yy in range(max(y - 2, 0), min(y + 3, h)):
                     for xx in range(max(x - 2, 0), min(x + 3, w)):
-                        q = guide[yy, xx]
-                        if (yy == y and xx == x) or not q[_VALID] > np.float32(0.0) or q[_INDEX] != g[_INDEX]:
+                        if yy == y and xx == x:
+                            continue
+                        if not guide[yy, xx, _VALID] > np.float32(0.0) or guide[yy, xx, _INDEX] != index:
                             continue
                         value = _lobe_luminance(light, yy, xx, lobe)
                         total += value
                         square += value * value
-                        around += spread[yy, xx, lobe]
                         n += 1
                 own = _lobe_luminance(light, y, x, lobe)
                 scale = np.float32(1.0)
@@ -250,9 +251,12 @@ def _a_trous(step: Any, guide: Any, light: Any, spread: Any, out: Any, out_sprea
     for y in prange(h):
         sums = np.empty((2, parts, 3), np.float32)
         for x in range(w):
-            g = guide[y, x]
-            if g[_VALID] == zero:
+            if guide[y, x, _VALID] == zero:
                 continue
+            # Scalars, not a view of the row: a view costs two atomic reference counts each time.
+            px, py, pz = guide[y, x, _POSITION], guide[y, x, _POSITION + 1], guide[y, x, _POSITION + 2]
+            nx, ny, nz = guide[y, x, _NORMAL], guide[y, x, _NORMAL + 1], guide[y, x, _NORMAL + 2]
+            power, roughness, index = guide[y, x, _POWER], guide[y, x, _ROUGHNESS], guide[y, x, _INDEX]
             own_d, own_g = _lobe_luminance(light, y, x, 0), _lobe_luminance(light, y, x, 1)
             # Variance of the neighbourhood: 3 x 3 Gaussian.
             var_d = var_g = norm = zero
@@ -261,16 +265,16 @@ def _a_trous(step: Any, guide: Any, light: Any, spread: Any, out: Any, out_sprea
                     yy, xx = y + dy, x + dx
                     if yy < 0 or xx < 0 or yy >= h or xx >= w or not guide[yy, xx, _VALID] > zero:
                         continue
-                    k = np.float32((2 - abs(dy)) * (2 - abs(dx)))
-                    norm += k
-                    var_d += k * spread[yy, xx, 0]
-                    var_g += k * spread[yy, xx, 1]
+                    tap = np.float32((2 - abs(dy)) * (2 - abs(dx)))
+                    norm += tap
+                    var_d += tap * spread[yy, xx, 0]
+                    var_g += tap * spread[yy, xx, 1]
             norm = np.float32(1.0) / max(norm, np.float32(1.0))
             inv_d = np.float32(1.0) / (np.float32(SIGMA_LUMINANCE) * np.sqrt(var_d * norm) + tiny)
             inv_g = np.float32(1.0) / (np.float32(SIGMA_LUMINANCE) * np.sqrt(var_g * norm) + tiny)
-            if g[_VALID] < zero:
+            if guide[y, x, _VALID] < zero:
                 inv_d = inv_g = zero  # nothing to compare with
-            inv_plane = np.float32(1.0) / (np.float32(SIGMA_PLANE) * g[_FOOTPRINT])
+            inv_plane = np.float32(1.0) / (np.float32(SIGMA_PLANE) * guide[y, x, _FOOTPRINT])
             sums[:] = zero
             sum_d = sum_g = spread_d = spread_g = zero
             for dy in range(-2, 3):
@@ -281,30 +285,30 @@ def _a_trous(step: Any, guide: Any, light: Any, spread: Any, out: Any, out_sprea
                     xx = x + dx * step
                     if xx < 0 or xx >= w:
                         continue
-                    q = guide[yy, xx]
-                    if not q[_VALID] > zero or q[_INDEX] != g[_INDEX]:
+                    if not guide[yy, xx, _VALID] > zero or guide[yy, xx, _INDEX] != index:
                         continue
                     kernel = taps[abs(dy)] * taps[abs(dx)]
                     if dy == 0 and dx == 0:
-                        weight_d = weight_g = kernel
+                        weight_d, weight_g = kernel, kernel
                     else:
                         plane = abs(
-                            g[_NORMAL] * (q[_POSITION] - g[_POSITION])
-                            + g[_NORMAL + 1] * (q[_POSITION + 1] - g[_POSITION + 1])
-                            + g[_NORMAL + 2] * (q[_POSITION + 2] - g[_POSITION + 2])
+                            nx * (guide[yy, xx, _POSITION] - px)
+                            + ny * (guide[yy, xx, _POSITION + 1] - py)
+                            + nz * (guide[yy, xx, _POSITION + 2] - pz)
                         )
-                        away = np.float32(step * max(abs(dy), abs(dx)))
                         turn = np.float32(1.0) - (
-                            g[_NORMAL] * q[_NORMAL] + g[_NORMAL + 1] * q[_NORMAL + 1] + g[_NORMAL + 2] * q[_NORMAL + 2]
+                            nx * guide[yy, xx, _NORMAL]
+                            + ny * guide[yy, xx, _NORMAL + 1]
+                            + nz * guide[yy, xx, _NORMAL + 2]
                         )
-                        common = plane * inv_plane / away
+                        common = plane * inv_plane / np.float32(step * max(abs(dy), abs(dx)))
                         if common > np.float32(12.0):
                             continue
-                        rough = abs(q[_ROUGHNESS] - g[_ROUGHNESS]) * np.float32(1.0 / SIGMA_ROUGHNESS)
+                        rough = abs(guide[yy, xx, _ROUGHNESS] - roughness) * np.float32(1.0 / SIGMA_ROUGHNESS)
                         far_d = abs(_lobe_luminance(light, yy, xx, 0) - own_d) * inv_d
                         far_g = abs(_lobe_luminance(light, yy, xx, 1) - own_g) * inv_g
                         weight_d = kernel * _exp(-common - diffuse_power * turn - far_d)
-                        weight_g = kernel * _exp(-common - g[_POWER] * turn - rough - far_g)
+                        weight_g = kernel * _exp(-common - power * turn - rough - far_g)
                     sum_d += weight_d
                     sum_g += weight_g
                     spread_d += weight_d * weight_d * spread[yy, xx, 0]
@@ -332,7 +336,7 @@ def _modulate(light: Any, guide: Any, coverage: Any, albedo: Any, metallic: Any,
             if guide[y, x, _VALID] == np.float32(0.0):
                 continue
             for lobe in range(2):
-                c = _colour(lobe, albedo[y, x], metallic[y, x])
+                c = _colour(lobe, albedo, metallic, y, x)
                 for part in range(light.shape[3]):
                     for k in range(3):
                         out[y, x, 2 * lobe + part, k] = light[y, x, lobe, part, k] * c[k] * coverage[y, x]

@@ -82,7 +82,7 @@ def read_frame(path: str | Path) -> tuple[dict[str, Array], dict[str, str]]:
 
     Returns
     -------
-    passes : pass name -> (h, w, channels) float32, row 0 at the top; layers that are not of `passes.PASSES` are left out
+    passes : pass name -> (h, w, channels) float32, row 0 at the top; unknown layers are left out
     metadata : as given to `write_frame`
 
     Raises

@@ -88,10 +88,11 @@ def _trace(
 
 
 @njit(inline="always")
-def _face_normal(a: Any, b: Any, c: Any) -> Any:
-    """(b - a) x (c - a) in float64."""
-    ux, uy, uz = np.float64(b[0]) - a[0], np.float64(b[1]) - a[1], np.float64(b[2]) - a[2]
-    wx, wy, wz = np.float64(c[0]) - a[0], np.float64(c[1]) - a[1], np.float64(c[2]) - a[2]
+def _face_normal(v: Any, a: Any, b: Any, c: Any) -> Any:
+    """(v[b] - v[a]) x (v[c] - v[a]) in float64."""
+    x, y, z = np.float64(v[a, 0]), np.float64(v[a, 1]), np.float64(v[a, 2])
+    ux, uy, uz = v[b, 0] - x, v[b, 1] - y, v[b, 2] - z
+    wx, wy, wz = v[c, 0] - x, v[c, 1] - y, v[c, 2] - z
     return uy * wz - uz * wy, uz * wx - ux * wz, ux * wy - uy * wx
 
 
@@ -139,7 +140,7 @@ def _shade(
                 _, _, _, dx, dy, dz = sample_ray(p, pixel[n], sample[n])
                 scale = -1.0 / np.sqrt(dx * dx + dy * dy + dz * dz)
                 vx, vy, vz = scale * dx, scale * dy, scale * dz
-                gx, gy, gz = _face_normal(vertices[a], vertices[b], vertices[c])
+                gx, gy, gz = _face_normal(vertices, a, b, c)
                 length = np.sqrt(gx * gx + gy * gy + gz * gz)
                 if gx * vx + gy * vy + gz * vz < 0.0:
                     length = -length

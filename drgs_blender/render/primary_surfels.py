@@ -5,8 +5,8 @@ the mesh is blocked by its own surface, one that starts above misses contact sha
 the mesh point that belongs to it:
 
 1. along the camera ray, within a window of depths around the surfel: the first face that is turned as the surfel is;
-2. else (the surfel overhangs the mesh's silhouette) along the surfel's normal, inwards, then outwards, within the window;
-3. else, the nearest face along the camera ray within the window, whichever way it is turned;
+2. else (the surfel overhangs the mesh's silhouette) within the window along the surfel's normal, inwards, then outwards;
+3. else the nearest face along the camera ray within the window, whichever way it is turned;
 4. else (no mesh near) the point stays where it is, lifted by the window along its normal.
 
 The window is `WINDOW_SCALES` standard deviations of the surfels or `WINDOW_EDGES` mean edge lengths of the object's
@@ -194,17 +194,20 @@ def _attach(
             for k in range(aa):
                 if alpha[row, column, k] == np.float32(0.0):
                     continue
-                values = surface[row, column, k]
                 s = np.float64(sample_depth[row, column, k])
                 who = sample_object[row, column, k]
                 ox, oy, oz, dx, dy, dz = sample_ray(p, pixel[n], sample[n])
                 x, y, z = ox + s * dx, oy + s * dy, oz + s * dz
                 slope = np.sqrt(dx * dx + dy * dy + dz * dz)
                 vx, vy, vz = -dx / slope, -dy / slope, -dz / slope
-                nx, ny, nz = np.float64(values[0]), np.float64(values[1]), np.float64(values[2])
+                nx, ny, nz = (
+                    np.float64(surface[row, column, k, 0]),
+                    np.float64(surface[row, column, k, 1]),
+                    np.float64(surface[row, column, k, 2]),
+                )
                 if nx * nx + ny * ny + nz * nz < 0.5:
                     nx, ny, nz = vx, vy, vz
-                window = np.float64(WINDOW_SCALES) * values[8]
+                window = np.float64(WINDOW_SCALES) * surface[row, column, k, 8]
                 if who < len(windows):
                     window = max(window, np.float64(windows[who]))
                 # The window starts in front of the surfel, yet not behind the camera.
@@ -216,7 +219,7 @@ def _attach(
                         address, bvh, x, y, z, nx, ny, nz, vx, vy, vz, ahead, window
                     )  # fmt: skip
                 # A face met by the camera ray shows which side is seen; else the surfel tells, save at its rim.
-                if how == ALONG_VIEW or how == ANY_SIDE:
+                if how in (ALONG_VIEW, ANY_SIDE):
                     behind = gx * vx + gy * vy + gz * vz < 0.0
                 else:
                     behind = nx * vx + ny * vy + nz * vz < -RIM
@@ -230,8 +233,12 @@ def _attach(
                 normal[n, 0], normal[n, 1], normal[n, 2] = nx, ny, nz
                 geometric[n, 0], geometric[n, 1], geometric[n, 2] = gx, gy, gz
                 view[n, 0], view[n, 1], view[n, 2] = vx, vy, vz
-                albedo[n, 0], albedo[n, 1], albedo[n, 2] = values[3], values[4], values[5]
-                roughness[n], metallic[n] = values[6], values[7]
+                albedo[n, 0], albedo[n, 1], albedo[n, 2] = (
+                    surface[row, column, k, 3],
+                    surface[row, column, k, 4],
+                    surface[row, column, k, 5],
+                )
+                roughness[n], metallic[n] = surface[row, column, k, 6], surface[row, column, k, 7]
                 position[n, 0], position[n, 1], position[n, 2] = x, y, z
                 depth[n], owner[n] = s, who
                 n += 1

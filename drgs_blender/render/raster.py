@@ -38,7 +38,8 @@ from .camera import AA, CLIP_END, CLIP_START, CX, CY, FX, FY, ORTHOGRAPHIC, POSI
 Array = np.ndarray
 
 TILE = 16
-WINDOW = 16
+WINDOW = 16  # a power of two
+_RING = WINDOW - 1
 #: Depth jump that separates two surfaces, in units of the mean of the two surfels' sizes.
 GAP = 3.0
 MIN_ALPHA = 1.0 / 255.0
@@ -47,10 +48,11 @@ MIN_TRANSMITTANCE = 1e-4
 
 # Columns of a splat's screen record. A_, B_, N_, D_: constant, x and y coefficients of u, v, denominator and depth.
 _RX, _RY, _A, _B, _N, _D, _ZC, _CUT, _LOW, _RECORD = 0, 1, 2, 5, 8, 11, 14, 15, 16, 20
-# Columns of a splat's surface record: normal, albedo, roughness, metallic, opacity, size.
-_NORMAL, _ALBEDO, _ROUGHNESS, _METALLIC, _OPACITY, _SIZE, _SURFACE = 0, 3, 6, 7, 8, 9, 10
-# Columns of a sample's accumulators, while blending.
-_WEIGHT, _DEPTH, _ATTRIBUTES, _HEAVIEST, _ACCUMULATORS = 0, 1, 2, 11, 12
+# Columns of a splat's surface record: normal, albedo, roughness, metallic, size, opacity.
+_NORMAL, _ALBEDO, _ROUGHNESS, _METALLIC, _SIZE, _OPACITY, _SURFACE = 0, 3, 6, 7, 8, 9, 10
+# Columns of a cluster of a sample: sums by weight of the first nine columns above, of one and of depth; the heaviest
+# contribution's weight and object; depth and size of the last contribution.
+_WEIGHT, _DEPTH, _HEAVIEST, _OWNER, _LAST, _LAST_SIZE, _CLUSTER = 9, 10, 11, 12, 13, 14, 16
 
 
 @dataclass(slots=True)
@@ -60,7 +62,7 @@ class Splats:
     Attributes
     ----------
     screen : (m, _RECORD) float32 coefficients in pixels of the full picture
-    surface : (m, _SURFACE) float32 world-space normal, material, opacity, size (metres, larger standard deviation)
+    surface : (m, _SURFACE) float32 world-space normal, material, size (metres, larger standard deviation), opacity
     box : (m, 4) int32 pixels (x0, y0, x1, y1), half-open, inside the window; conservative
     nearest : (m,) float32 least depth of any contribution
     object_index : (m,) int32
@@ -252,7 +254,8 @@ def _project(
         b = _to_camera(p, np.float64(tangent_v[i, 0]), np.float64(tangent_v[i, 1]), np.float64(tangent_v[i, 2]))
         alpha = np.float64(opacity[i])
         total = c[0] + c[1] + c[2] + a[0] + a[1] + a[2] + b[0] + b[1] + b[2] + alpha
-        if not np.isfinite(total) or not alpha > MIN_ALPHA:
+        # A comparison, since reassociation folds the x - x == 0 of isfinite.
+        if not abs(total) < 1e30 or not alpha > MIN_ALPHA:
             continue
         cut = 2.0 * np.log(alpha / MIN_ALPHA)
         reach = np.sqrt(cut * (a[2] * a[2] + b[2] * b[2]))
@@ -403,67 +406,114 @@ def _list_by_tile(box: Any, tile_x0: Any, tile_y0: Any, tiles_x: Any, tiles_y: A
 
 @njit(inline="always")
 def _gaussian(q: Any) -> Any:
-    """exp(-q / 2) for 0 <= q <= 12, relative error below 1e-6: 2^n by exponent bits times a polynomial for 2^f."""
-    t = q * np.float32(-0.7213475204444817)
-    n = np.floor(t)
-    f = (t - n) - np.float32(0.5)
-    # Taylor series of sqrt(2) exp(f ln 2) about 1/2, |f| <= 1/2.
-    y = np.float32(0.00021783882)
-    y = y * f + np.float32(0.0018856498)
-    y = y * f + np.float32(0.0136020886)
-    y = y * f + np.float32(0.0784946632)
-    y = y * f + np.float32(0.339731584)
-    y = y * f + np.float32(0.98025814)
-    y = y * f + np.float32(1.4142136)
-    return y / np.float32(1 << np.int64(-n))
+    """exp(-q / 2) for 0 <= q <= 12, relative error below 4e-6: Taylor's series of exp(-q / 32) to the 16th power.
+
+    Branch-free, so that a loop over samples becomes vector code.
+    """
+    t = q * np.float32(-1.0 / 32.0)
+    y = np.float32(1.0 / 720.0)
+    y = y * t + np.float32(1.0 / 120.0)
+    y = y * t + np.float32(1.0 / 24.0)
+    y = y * t + np.float32(1.0 / 6.0)
+    y = y * t + np.float32(0.5)
+    y = y * t + np.float32(1.0)
+    y = y * t + np.float32(1.0)
+    y = y * y
+    y = y * y
+    y = y * y
+    return y * y
 
 
 @njit(inline="always")
-def _absorb(i: Any, z: Any, alpha: Any, surface: Any, objects: Any, least: Any, t: Any, acc: Any, best: Any) -> Any:
+def _meet(
+    screen: Any,
+    i: Any,
+    opacity: Any,
+    near: Any,
+    far: Any,
+    sx: Any,
+    sy: Any,
+    first: Any,
+    count: Any,
+    alpha: Any,
+    depth: Any,
+) -> None:
+    """Strength (0 below MIN_ALPHA or when clipped) and depth of a splat at samples first .. first + count.
+
+    Without a branch: the loop becomes vector code.
+    """
+    big, zero = np.float32(1e30), np.float32(0.0)
+    rx, ry, zc, cut, low = screen[i, _RX], screen[i, _RY], screen[i, _ZC], screen[i, _CUT], screen[i, _LOW]
+    a0, a1, a2 = screen[i, _A], screen[i, _A + 1], screen[i, _A + 2]
+    b0, b1, b2 = screen[i, _B], screen[i, _B + 1], screen[i, _B + 2]
+    n0, n1, n2 = screen[i, _N], screen[i, _N + 1], screen[i, _N + 2]
+    d0, d1, d2 = screen[i, _D], screen[i, _D + 1], screen[i, _D + 2]
+    for j in range(count):
+        ex, ey = sx[first + j] - rx, sy[first + j] - ry
+        inverse = np.float32(1.0) / (n0 + n1 * ex + n2 * ey)
+        u = (a0 + a1 * ex + a2 * ey) * inverse
+        v = (b0 + b1 * ex + b2 * ey) * inverse
+        z = (d0 + d1 * ex + d2 * ey) * inverse
+        # NaN and points outside the clip range leave the low-pass alone.
+        exact = u * u + v * v if (z > near) & (z < far) else big
+        filtered = low * (ex * ex + ey * ey)
+        take = exact <= filtered
+        q = exact if take else filtered
+        z = z if take else zc
+        seen = (q < cut) & (z > near) & (z < far)
+        alpha[j] = min(opacity * _gaussian(q), np.float32(MAX_ALPHA)) if seen else zero
+        depth[j] = z
+
+
+@njit(inline="always")
+def _absorb(
+    surface: Any, i: Any, owner: Any, z: Any, alpha: Any, least: Any, t: Any, acc: Any, best: Any, at: Any
+) -> Any:
     """Blend one contribution into the accumulators of its sample; returns the transmittance behind it.
 
-    ``acc`` and ``best`` are [sample record, previous depth, previous size, object]: the cluster being gathered and the
-    heaviest cluster so far. ``least`` is the width of a pixel at this depth, metres.
+    ``acc`` is the cluster being gathered, ``best`` the heaviest one so far. ``least`` is the width of a pixel at this
+    depth, metres.
     """
     weight = t * alpha
-    s = surface[i]
-    size = max(s[_SIZE], least)
-    if acc[_WEIGHT] > np.float32(0.0) and z - acc[12] > np.float32(0.5 * GAP) * (size + acc[13]):
-        if acc[_WEIGHT] > best[_WEIGHT]:
-            best[:] = acc
-        acc[_WEIGHT] = np.float32(0.0)
-    if acc[_WEIGHT] == np.float32(0.0):
-        acc[:] = np.float32(0.0)
-        acc[12] = z
+    size = max(surface[i, _SIZE], least)
+    if acc[at, _WEIGHT] > np.float32(0.0) and z - acc[at, _LAST] > np.float32(0.5 * GAP) * (size + acc[at, _LAST_SIZE]):
+        if acc[at, _WEIGHT] > best[at, _WEIGHT]:
+            for c in range(_CLUSTER):
+                best[at, c] = acc[at, c]
+        acc[at, _WEIGHT] = np.float32(0.0)
+    if acc[at, _WEIGHT] == np.float32(0.0):
+        for c in range(_CLUSTER):
+            acc[at, c] = np.float32(0.0)
+        acc[at, _LAST] = z
     # Both sides of a thin sheet may lie in one cluster: normals agree with the nearest one.
-    flip = acc[2] * s[0] + acc[3] * s[1] + acc[4] * s[2] < np.float32(0.0)
-    signed = -weight if flip else weight
-    acc[_WEIGHT] += weight
-    acc[_DEPTH] += weight * z
+    signed = weight
+    if acc[at, 0] * surface[i, 0] + acc[at, 1] * surface[i, 1] + acc[at, 2] * surface[i, 2] < np.float32(0.0):
+        signed = -weight
     for c in range(3):
-        acc[_ATTRIBUTES + c] += signed * s[c]
-    for c in range(3, 8):
-        acc[_ATTRIBUTES + c] += weight * s[c]
-    acc[_ATTRIBUTES + 8] += weight * s[_SIZE]
-    if weight > acc[_HEAVIEST]:
-        acc[_HEAVIEST] = weight
-        acc[14] = np.float32(objects[i])
-    acc[12] = max(z, acc[12])
-    acc[13] = size
+        acc[at, c] += signed * surface[i, c]
+    for c in range(3, 9):
+        acc[at, c] += weight * surface[i, c]
+    acc[at, _WEIGHT] += weight
+    acc[at, _DEPTH] += weight * z
+    if weight > acc[at, _HEAVIEST]:
+        acc[at, _HEAVIEST] = weight
+        acc[at, _OWNER] = np.float32(owner)
+    acc[at, _LAST] = max(z, acc[at, _LAST])
+    acc[at, _LAST_SIZE] = size
     return t * (np.float32(1.0) - alpha)
 
 
 @njit(inline="always")
-def _finish(best: Any, out: Any) -> Any:
+def _finish(best: Any, at: Any, out: Any, y: Any, x: Any, k: Any) -> Any:
     """Write the normalised attributes of a sample. Returns its depth and object index."""
-    inverse = np.float32(1.0) / best[_WEIGHT]
-    x, y, z = best[_ATTRIBUTES], best[_ATTRIBUTES + 1], best[_ATTRIBUTES + 2]
-    length = np.sqrt(x * x + y * y + z * z)
-    k = np.float32(1.0) / length if length > np.float32(1e-6) * best[_WEIGHT] else np.float32(0.0)
-    out[0], out[1], out[2] = k * x, k * y, k * z
+    inverse = np.float32(1.0) / best[at, _WEIGHT]
+    nx, ny, nz = best[at, 0], best[at, 1], best[at, 2]
+    length = np.sqrt(nx * nx + ny * ny + nz * nz)
+    scale = np.float32(1.0) / length if length > np.float32(1e-6) * best[at, _WEIGHT] else np.float32(0.0)
+    out[y, x, k, 0], out[y, x, k, 1], out[y, x, k, 2] = scale * nx, scale * ny, scale * nz
     for c in range(3, 9):
-        out[c] = best[_ATTRIBUTES + c] * inverse
-    return best[_DEPTH] * inverse, np.int32(best[14])
+        out[y, x, k, c] = best[at, c] * inverse
+    return best[at, _DEPTH] * inverse, np.int32(best[at, _OWNER])
 
 
 @njit(parallel=True)
@@ -500,8 +550,7 @@ def _blend(
     pixel = np.float32(0.0 if ortho else 1.0 / min(p[FX], p[FY]))
     pixel_base = np.float32(1.0 / min(p[FX], p[FY]) if ortho else 0.0)
     stop = np.float32(MIN_TRANSMITTANCE)
-    clamp = np.float32(MAX_ALPHA)
-    big = np.float32(1e30)
+    zero, big = np.float32(0.0), np.float32(1e30)
     per_row = TILE * aa
     capacity = TILE * per_row
     for worker in prange(workers):
@@ -511,8 +560,8 @@ def _blend(
         farthest = np.empty(capacity, np.float32)
         win_z, win_a = np.empty((capacity, WINDOW), np.float32), np.empty((capacity, WINDOW), np.float32)
         win_i = np.empty((capacity, WINDOW), np.int32)
-        acc, best = np.empty((capacity, 16), np.float32), np.empty((capacity, 16), np.float32)
-        q_run, z_run = np.empty(per_row, np.float32), np.empty(per_row, np.float32)
+        acc, best = np.empty((capacity, _CLUSTER), np.float32), np.empty((capacity, _CLUSTER), np.float32)
+        alpha_run, z_run = np.empty(per_row, np.float32), np.empty(per_row, np.float32)
         for task in range(worker, n_tiles, workers):
             tx, ty = tile_x0 + task % tiles_x, first_row + task // tiles_x
             tile = (ty - tile_y0) * tiles_x + task % tiles_x
@@ -531,7 +580,7 @@ def _blend(
                         count[at + k] = head[at + k] = 0
                         running[at + k] = resolved[at + k] = np.float32(1.0)
                         farthest[at + k] = -big
-                        acc[at + k, 0] = best[at + k, 0] = np.float32(0.0)
+                        acc[at + k, _WEIGHT] = best[at + k, _WEIGHT] = zero
             open_samples = (bottom - top) * (right - left) * aa
             limit = big
             for entry in range(begin, end):
@@ -547,68 +596,49 @@ def _blend(
                         continue
                 bx0, bx1 = max(box[i, 0], left), min(box[i, 2], right)
                 by0, by1 = max(box[i, 1], top), min(box[i, 3], bottom)
-                s = screen[i]
-                rx, ry, zc, cut, low = s[_RX], s[_RY], s[_ZC], s[_CUT], s[_LOW]
-                a0, a1, a2 = s[_A], s[_A + 1], s[_A + 2]
-                b0, b1, b2 = s[_B], s[_B + 1], s[_B + 2]
-                n0, n1, n2 = s[_N], s[_N + 1], s[_N + 2]
-                d0, d1, d2 = s[_D], s[_D + 1], s[_D + 2]
-                opacity = surface[i, _OPACITY]
                 run = (bx1 - bx0) * aa
                 for y in range(by0, by1):
                     base = (y - top) * per_row + (bx0 - left) * aa
+                    _meet(screen, i, surface[i, _OPACITY], near, far, sx, sy, base, run, alpha_run, z_run)
                     for j in range(run):
-                        ex, ey = sx[base + j] - rx, sy[base + j] - ry
-                        inverse = np.float32(1.0) / (n0 + n1 * ex + n2 * ey)
-                        u = (a0 + a1 * ex + a2 * ey) * inverse
-                        v = (b0 + b1 * ex + b2 * ey) * inverse
-                        z = (d0 + d1 * ex + d2 * ey) * inverse
-                        exact = u * u + v * v
-                        # A comparison with NaN or a point outside the clip range leaves the low-pass alone.
-                        exact = exact if z > near and z < far else big
-                        filtered = low * (ex * ex + ey * ey)
-                        take = exact <= filtered
-                        q_run[j] = exact if take else filtered
-                        z_run[j] = z if take else zc
-                    for j in range(run):
-                        q = q_run[j]
-                        if not q < cut:
+                        alpha = alpha_run[j]
+                        if alpha == zero:
                             continue
                         at = base + j
                         z = z_run[j]
-                        if running[at] < stop and z >= farthest[at]:
+                        before = running[at]
+                        if before < stop and z >= farthest[at]:
                             continue
-                        if not (z > near and z < far):
-                            continue
-                        alpha = min(opacity * _gaussian(q), clamp)
-                        if count[at] == WINDOW:
-                            h = head[at]
-                            resolved[at] = _absorb(
-                                win_i[at, h], win_z[at, h], win_a[at, h], surface, objects,
-                                pixel_base + pixel * win_z[at, h], resolved[at], acc[at], best[at],
+                        n, h = count[at], head[at]
+                        if n == WINDOW:
+                            k = win_i[at, h]
+                            t = _absorb(
+                                surface, k, objects[k], win_z[at, h], win_a[at, h],
+                                pixel_base + pixel * win_z[at, h], resolved[at], acc, best, at,
                             )  # fmt: skip
-                            head[at] = (h + 1) % WINDOW
-                            count[at] -= 1
-                            if resolved[at] < stop:
+                            resolved[at] = t
+                            h = (h + 1) & _RING
+                            head[at] = h
+                            n -= 1
+                            if t < stop:
                                 count[at] = 0
-                                if running[at] >= stop:
-                                    open_samples -= 1
-                                running[at] = np.float32(0.0)
+                                open_samples -= before >= stop
+                                running[at] = zero
                                 farthest[at] = -big
                                 continue
-                        k = count[at]
-                        while k > 0 and win_z[at, (head[at] + k - 1) % WINDOW] > z:
-                            to, fro = (head[at] + k) % WINDOW, (head[at] + k - 1) % WINDOW
+                        to = (h + n) & _RING
+                        for _ in range(n):
+                            fro = (to - 1) & _RING
+                            if win_z[at, fro] <= z:
+                                break
                             win_z[at, to], win_a[at, to], win_i[at, to] = win_z[at, fro], win_a[at, fro], win_i[at, fro]
-                            k -= 1
-                        to = (head[at] + k) % WINDOW
+                            to = fro
                         win_z[at, to], win_a[at, to], win_i[at, to] = z, alpha, i
-                        count[at] += 1
+                        count[at] = n + 1
                         farthest[at] = max(farthest[at], z)
-                        before = running[at]
-                        running[at] = before * (np.float32(1.0) - alpha)
-                        if running[at] < stop and before >= stop:
-                            open_samples -= 1
+                        after = before * (np.float32(1.0) - alpha)
+                        running[at] = after
+                        open_samples -= after < stop and before >= stop
             for y in range(top, bottom):
                 for x in range(left, right):
                     for k in range(aa):
@@ -617,16 +647,18 @@ def _blend(
                         for w in range(count[at]):
                             if t < stop:
                                 break
-                            h = (head[at] + w) % WINDOW
+                            h = (head[at] + w) & _RING
+                            i = win_i[at, h]
                             t = _absorb(
-                                win_i[at, h], win_z[at, h], win_a[at, h], surface, objects,
-                                pixel_base + pixel * win_z[at, h], t, acc[at], best[at],
+                                surface, i, objects[i], win_z[at, h], win_a[at, h],
+                                pixel_base + pixel * win_z[at, h], t, acc, best, at,
                             )  # fmt: skip
                         if acc[at, _WEIGHT] == np.float32(0.0):
                             continue
                         if acc[at, _WEIGHT] > best[at, _WEIGHT]:
-                            best[at] = acc[at]
-                        depth, owner = _finish(best[at], out_surface[y - y0, x - x0, k])
+                            for c in range(_CLUSTER):
+                                best[at, c] = acc[at, c]
+                        depth, owner = _finish(best, at, out_surface, y - y0, x - x0, k)
                         out_alpha[y - y0, x - x0, k] = np.float32(1.0) - t
                         out_depth[y - y0, x - x0, k] = depth
                         out_object[y - y0, x - x0, k] = owner

@@ -1,14 +1,17 @@
-"""The CPU raster against the torch oracle, analytic cases, and its promises (order, gaps, independence of strips)."""
+"""The surfel raster: closed forms, order, depth gaps, clipping, independence of strips. Oracle: test_parity_raster."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from drgs_blender.asset.model import PosedSurfels
+from drgs_blender.errors import UsageError
 from drgs_blender.frame import Camera, RenderSettings
 from drgs_blender.render import raster
-from drgs_blender.render.camera import camera_parameters, sample_ray
+from drgs_blender.render.camera import camera_parameters, lattice, pixel_shift
 
 FIELDS = ("centre", "tangent_u", "tangent_v", "normal", "opacity", "albedo", "roughness", "metallic", "object_index")
 
@@ -32,12 +35,12 @@ def surfels(centre: object, u: object, v: object, **values: object) -> PosedSurf
     defaults = {"opacity": 0.9, "albedo": (0.5, 0.5, 0.5), "roughness": 0.5, "metallic": 0.0}
     data = {k: np.asarray(values.get(k, d), np.float32) for k, d in defaults.items()}
     shapes = {"opacity": (n,), "albedo": (n, 3), "roughness": (n,), "metallic": (n,)}
-    data = {k: np.ascontiguousarray(np.broadcast_to(a, shapes[k])) for k, a in data.items()}
+    data = {k: np.array(np.broadcast_to(a, shapes[k])) for k, a in data.items()}
     index = np.ascontiguousarray(np.broadcast_to(np.asarray(values.get("object_index", 0), np.int32), (n,)))
     return PosedSurfels(
         np.ascontiguousarray(centre),
-        np.ascontiguousarray(u),
-        np.ascontiguousarray(v),
+        np.array(u),
+        np.array(v),
         normal.astype(np.float32),
         object_index=index,
         **data,
@@ -72,59 +75,186 @@ def render(posed: PosedSurfels, camera: Camera, aa: int = 1, seed: int = 3) -> r
 
 
 def sample_positions(camera: Camera, aa: int, seed: int = 3) -> np.ndarray:
-    """(h, w, aa, 2) pixel positions of all samples, from the rays the renderer shoots."""
+    """(h, w, aa, 2) pixel positions of the samples of `render`."""
     p = camera_parameters(camera, RenderSettings(aa=aa, seed=seed), 7)
     x0, y0, x1, y1 = camera.window
-    matrix = np.asarray(camera.matrix_world)
     out = np.empty((y1 - y0, x1 - x0, aa, 2))
-    for y in range(y0, y1):
-        for x in range(x0, x1):
-            for k in range(aa):
-                ray = np.array(sample_ray(p, y * camera.width + x, k))
-                local = matrix[:3, :3].T @ ray[3:]
-                if camera.orthographic:
-                    local = matrix[:3, :3].T @ (ray[:3] - matrix[:3, 3])
-                out[y - y0, x - x0, k] = (
-                    camera.cx + camera.fx * local[0],
-                    camera.cy - camera.fy * local[1],
-                )
+    for y, x, k in np.ndindex(*out.shape[:3]):
+        shift = pixel_shift(p, (y0 + y) * camera.width + x0 + x)
+        out[y, x, k] = np.add((x0 + x, y0 + y), lattice(*shift, k, aa))
     return out
 
 
 @pytest.mark.parametrize("orthographic", [False, True])
-@pytest.mark.parametrize("size", [0.002, 0.05, 0.5])
-def test_agrees_with_the_torch_oracle(monkeypatch: pytest.MonkeyPatch, orthographic: bool, size: float) -> None:
-    reference = pytest.importorskip("drgs_blender.render.reference.raster")
-    camera = look_along_y(40, 32, focal=12.0 if orthographic else 44.0, orthographic=orthographic, clip_start=0.1)
-    # So few large ones that no contribution is more than a window out of order; see the test of the window itself.
-    posed = random_surfels(400 if size < 0.1 else 50, size=size)
-    posed.normal[:, 1] = -2.0  # shading normals that face the camera and agree with each other
-    posed.normal /= np.linalg.norm(posed.normal, axis=1, keepdims=True)
-    mine = render_without_gaps(posed, camera, aa=2)
-    positions = sample_positions(camera, 2)
-    import torch
+def test_one_surfel_is_the_gaussian_it_should_be(orthographic: bool) -> None:
+    camera = look_along_y(60, 50, distance=4, focal=20.0 if orthographic else 80.0, orthographic=orthographic)
+    # Sheared tangents in the plane y = 0, depth 4; 1 m is 20 pixels there.
+    u, v = np.array([0.3, 0, 0.1]), np.array([0.1, 0, 0.4])
+    got = render(surfels([[0.1, 0, -0.2]], u, v, opacity=0.8), camera, aa=2)
+    at = sample_positions(camera, 2)
+    offset = np.stack([(at[..., 0] - 30) / 20 - 0.1, -(at[..., 1] - 25) / 20 + 0.2], -1)
+    uv = offset @ np.linalg.inv(np.array([u[[0, 2]], v[[0, 2]]]))
+    expected = 0.8 * np.exp(-0.5 * (uv**2).sum(-1))
+    inside = expected >= 1 / 255
+    assert np.allclose(got.alpha[inside], expected[inside], atol=2e-5)
+    assert (got.alpha[expected < 0.999 / 255] == 0).all()
+    assert np.allclose(got.depth[got.alpha > 0], 4, atol=1e-5)
+    assert np.allclose(got.surface[got.alpha > 0][:, 8], np.hypot(0.1, 0.4), atol=1e-6)
 
-    oracle = reference.rasterise(reference.Splats.from_posed(posed), camera, torch.as_tensor(positions.reshape(-1, 2)))
-    coverage = oracle.coverage.numpy().reshape(mine.alpha.shape)
-    # A contribution at exactly 1/255 may fall on either side of the threshold.
-    assert np.abs(mine.alpha - coverage).max() < 1.2 / 255
-    assert np.quantile(np.abs(mine.alpha - coverage), 0.99) < 1e-4
-    seen = coverage > 0.1
-    assert seen.mean() > 0.02
-    for got, want in (
-        (mine.depth, oracle.depth),
-        (mine.surface[..., 3], oracle.albedo[:, 0]),
-        (mine.surface[..., 6], oracle.roughness),
-        (mine.surface[..., 7], oracle.metallic),
-        (mine.surface[..., 0], oracle.normal[:, 0]),
-    ):
-        error = np.abs(got - want.numpy().reshape(got.shape))[seen]
-        assert np.quantile(error, 0.98) < 2e-3, np.quantile(error, [0.5, 0.9, 0.98, 1.0])
+
+@pytest.mark.parametrize("aa", [1, 4, 16])
+def test_the_low_pass_is_one_pixel_however_many_sub_samples(aa: int) -> None:
+    camera = look_along_y(31, 31)
+    dot = surfels([[0, 0, 0]], [1e-5, 0, 0], [0, 0, 1e-5], opacity=1.0)
+    got = render(dot, camera, aa)
+    distance2 = ((sample_positions(camera, aa) - 15.5) ** 2).sum(-1)
+    expected = np.minimum(np.exp(-distance2), 0.99)
+    expected[np.exp(-distance2) < 1 / 255] = 0
+    assert np.allclose(got.alpha, expected, atol=2e-5)
+    if aa == 16:  # its image has the integral of the filter, pi square pixels
+        assert abs(got.alpha.mean(-1).sum() - np.pi) < 0.1
+
+
+def test_an_edge_on_surfel_stays_visible() -> None:
+    got = render(surfels([[0, 0, 0]], [0, 0.5, 0], [0, 0, 0.5], opacity=0.9), look_along_y(40, 40), aa=4)
+    column = got.alpha[:, 19:21].max(axis=(1, 2))
+    assert column[18:22].max() > 0.6
+    assert np.allclose(got.depth[got.alpha > 0], 4, atol=1e-4)
+
+
+def plane_of_surfels(y: float, half: float, spacing: float, sigma: float, **values: object) -> PosedSurfels:
+    """A grid of surfels that faces the camera of `look_along_y`, covering |x|, |z| <= half."""
+    line = np.arange(-half, half + 1e-9, spacing)
+    x, z = (a.ravel() for a in np.meshgrid(line, line))
+    return surfels(np.stack([x, np.full_like(x, y), z], -1), [sigma, 0, 0], [0, 0, sigma], **values)
+
+
+def test_a_front_edge_does_not_bleed_into_the_back_surface() -> None:
+    camera = look_along_y(64, 64, distance=4)
+    front = plane_of_surfels(-1.0, 0.5, 0.05, 0.04, albedo=(1, 0, 0), roughness=0.1, object_index=1)
+    back = plane_of_surfels(1.0, 3.0, 0.08, 0.06, albedo=(0, 0, 1), roughness=0.9, object_index=2)
+    both = join(front, back)
+    got = render(both, camera, aa=4)
+    depth, owner = got.depth, got.object_index
+    assert (got.alpha > 0.95).all()
+    # Every sample lies on one of the surfaces, none between, and everything about it is of that surface.
+    assert (np.minimum(np.abs(depth - 3), np.abs(depth - 5)) < 1e-3).all()
+    assert np.array_equal(owner == 1, depth < 4)
+    assert np.allclose(got.surface[..., 3], owner == 1, atol=1e-5)
+    assert np.allclose(got.surface[..., 6], np.where(owner == 1, 0.1, 0.9), atol=1e-4)
+    # The blend without clusters has what the clusters prevent.
+    blended = render_without_gaps(both, camera, aa=4)
+    assert ((blended.depth > 3.2) & (blended.depth < 4.8)).sum() > 100
+    assert np.array_equal(blended.alpha, got.alpha)
+    # The heavier surface wins: the edge lies where the front surface covers half.
+    alone = render(front, camera, aa=4).alpha
+    assert np.array_equal((owner == 1)[np.abs(alone - 0.5) > 0.01], (alone > 0.5)[np.abs(alone - 0.5) > 0.01])
 
 
 def render_without_gaps(posed: PosedSurfels, camera: Camera, aa: int) -> raster.SurfelSamples:
     """Blend as the paper does, one mean over all contributions: sizes so large that no gap is one."""
     p = camera_parameters(camera, RenderSettings(aa=aa, seed=3), 7)
     splats = raster.prepare(posed, camera, p)
-    splats.surface[:, 9] = 1e6
+    splats.surface[:, raster._SIZE] = 1e6
     return raster.rasterise(splats, camera.window[1], camera.window[3])
+
+
+def test_intersecting_surfels_are_ordered_where_the_ray_meets_them() -> None:
+    """Two planes cross like an X; sorted by centre alone one would lie before the other everywhere."""
+    camera = look_along_y(40, 40, distance=4, orthographic=True, focal=20)
+    rising = surfels([[0, 0.01, 0]], [0.7, 0.7, 0], [0, 0, 1], albedo=(1, 0, 0), opacity=0.99)
+    falling = surfels([[0, -0.01, 0]], [0.7, -0.7, 0], [0, 0, 1], albedo=(0, 1, 0), opacity=0.99)
+    red = render_without_gaps(join(rising, falling), camera, aa=1).surface[20, :, 0, 3]
+    assert red[12:18].min() > 0.5 > red[22:28].max()
+
+
+def test_the_order_of_the_input_does_not_matter() -> None:
+    posed = random_surfels(300, seed=5)
+    turned = PosedSurfels(*(np.ascontiguousarray(getattr(posed, f)[::-1]) for f in FIELDS))
+    camera = look_along_y(48, 40)
+    a, b = render(posed, camera, aa=2), render(turned, camera, aa=2)
+    assert np.array_equal(a.alpha, b.alpha)
+    seen = a.alpha > 0
+    assert np.array_equal(a.surface[seen], b.surface[seen])
+
+
+def test_rows_and_regions_are_crops_of_the_picture() -> None:
+    posed = random_surfels(500, seed=6)
+    camera = look_along_y(70, 61)
+    whole = render(posed, camera, aa=3)
+    p = camera_parameters(camera, RenderSettings(aa=3, seed=3), 7)
+    splats = raster.prepare(posed, camera, p)
+    for y0, y1 in ((0, 1), (5, 38), (31, 61), (60, 61)):
+        part = raster.rasterise(splats, y0, y1)
+        assert np.array_equal(part.alpha, whole.alpha[y0:y1])
+        seen = part.alpha > 0
+        assert np.array_equal(part.surface[seen], whole.surface[y0:y1][seen])
+    camera.region = (13, 7, 50, 41)
+    part = render(posed, camera, aa=3)
+    assert np.array_equal(part.alpha, whole.alpha[7:41, 13:50])
+    seen = part.alpha > 0
+    assert np.array_equal(part.depth[seen], whole.depth[7:41, 13:50][seen])
+
+
+def test_unusable_surfels_are_left_out() -> None:
+    good = random_surfels(50, seed=7)
+    bad = random_surfels(50, seed=8)
+    for i, field in enumerate(("centre", "tangent_u", "tangent_v")):
+        getattr(bad, field)[i * 10 : i * 10 + 10, i] = (np.nan, np.inf, -np.inf, np.nan, np.inf) * 2
+    bad.opacity[30:40] = np.nan
+    bad.opacity[40:45] = 0.0
+    bad.centre[45:50, 1] = -40.0  # behind the camera
+    camera = look_along_y(40, 40)
+    with_bad, alone = render(join(good, bad), camera), render(good, camera)
+    assert np.array_equal(with_bad.alpha, alone.alpha)
+    assert np.isfinite(with_bad.surface[with_bad.alpha > 0]).all()
+
+
+def test_no_surfels() -> None:
+    nothing = surfels(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3)))
+    assert (render(nothing, look_along_y(9, 7)).alpha == 0).all()
+
+
+def test_clipping() -> None:
+    near, far = plane_of_surfels(-2.0, 1, 0.1, 0.08), plane_of_surfels(1.0, 2, 0.1, 0.08)
+    camera = look_along_y(32, 32, distance=4, clip_start=3.0, clip_end=100.0)
+    got = render(join(near, far), camera)
+    assert np.allclose(got.depth[got.alpha > 0], 5, atol=1e-3)
+    camera.clip_start, camera.clip_end = 0.1, 4.5
+    got = render(join(near, far), camera)
+    assert np.allclose(got.depth[got.alpha > 0], 2, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"fx": 0.0},
+        {"fy": float("nan")},
+        {"width": 0},
+        {"width": 10**6},
+        {"clip_start": 0.0},
+        {"clip_end": 1e-4},
+        {"region": (5, 5, 5, 9)},
+        {"region": (0, 0, 33, 8)},
+        {"matrix_world": np.diag([2.0, 1, 1, 1])},
+        {"matrix_world": np.full((4, 4), np.nan)},
+    ],
+)
+def test_cameras_that_cannot_see_are_refused(change: dict[str, object]) -> None:
+    camera = replace(look_along_y(32, 32), **change)
+    with pytest.raises(UsageError, match="camera"):
+        camera_parameters(camera, RenderSettings(), 1)
+
+
+@pytest.mark.parametrize("aa", [1, 2, 3, 4, 7, 16])
+def test_sub_pixel_positions_are_stratified_and_uniform(aa: int) -> None:
+    camera = look_along_y(48, 48)
+    at = sample_positions(camera, aa) % 1.0
+    assert (at >= 0).all() and (at < 1).all()
+    assert np.abs(at.mean(axis=(0, 1)) - 0.5).max() < 0.05  # each sample number alone is uniform
+    assert np.abs(np.sort(at.reshape(-1, 2), axis=0).mean(0) - 0.5).max() < 0.02
+    gaps = np.diff(np.sort(at[..., 0], axis=2), axis=2)
+    if aa > 1:  # evenly spaced along x
+        assert np.abs(gaps - 1 / aa).max() < 0.01
+    other = sample_positions(camera, aa, seed=4) % 1.0
+    assert np.abs(other - at).mean() > 0.1

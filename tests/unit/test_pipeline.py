@@ -1,0 +1,209 @@
+"""The whole way from surfels to passes: independence of strips and batches, cancelling, odd scenes, refusals."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+
+from drgs_blender.asset.model import PosedSurfels
+from drgs_blender.errors import Cancelled, UsageError
+from drgs_blender.frame import Camera, Frame, ObjectState, RenderSettings, World
+from drgs_blender.passes import BY_NAME
+from drgs_blender.render import pipeline
+from drgs_blender.render.light import EnvironmentLight
+from drgs_blender.render.scene import TraceObject, TraceScene
+
+ALL = tuple(BY_NAME)
+
+
+def look_along_y(size: int = 48, distance: float = 4.0, focal: float = 70.0, **more: object) -> Camera:
+    matrix = np.eye(4)
+    matrix[:3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
+    matrix[1, 3] = -distance
+    return Camera(matrix, size, size, focal, focal, size / 2, size / 2, **more)  # type: ignore[arg-type]
+
+
+def sphere_mesh(levels: int = 4) -> tuple[np.ndarray, np.ndarray]:
+    import trimesh
+
+    mesh = trimesh.creation.icosphere(levels)
+    return np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.int32)
+
+
+def scene_of(*meshes: tuple[np.ndarray, np.ndarray], albedo: float = 0.5) -> TraceScene:
+    scene = TraceScene()
+    scene.update(
+        [
+            TraceObject(f"mesh {i}", v, f, np.full((len(v), 3), albedo), np.full(len(v), 0.6), np.zeros(len(v)))
+            for i, (v, f) in enumerate(meshes)
+        ]
+    )
+    return scene
+
+
+def sphere_surfels(radius: float, n: int = 6000, albedo: float = 0.5) -> PosedSurfels:
+    i = np.arange(n) + 0.5
+    z, turn = 1 - 2 * i / n, np.pi * (1 + 5**0.5) * i
+    normal = np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], -1)
+    u = np.cross(normal, np.where(np.abs(z)[:, None] < 0.9, [[0, 0, 1.0]], [[1.0, 0, 0]]))
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    sigma = 0.6 * np.sqrt(4 * np.pi / n)
+    arrays = (
+        radius * normal, sigma * u, sigma * np.cross(normal, u), normal, np.full(n, 0.9), np.full((n, 3), albedo),
+        np.full(n, 0.6), np.zeros(n),
+    )  # fmt: skip
+    return PosedSurfels(*(np.ascontiguousarray(a, np.float32) for a in arrays), np.zeros(n, np.int32))
+
+
+def frame(camera: Camera, passes: tuple[str, ...] = ALL, objects: int = 1, **settings: object) -> Frame:
+    defaults: dict[str, object] = {"aa": 2, "cosine": 4, "ggx": 2, "environment": 2}
+    states = [ObjectState(f"object {i}", "key") for i in range(objects)]
+    return Frame(3, camera, states, settings=RenderSettings(**(defaults | settings)), passes=passes)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def ball() -> tuple[TraceScene, PosedSurfels, EnvironmentLight]:
+    rng = np.random.default_rng(0)
+    world = World(environment=rng.random((8, 16, 3)).astype(np.float32))
+    return scene_of(sphere_mesh(3)), sphere_surfels(1.0, 3000), EnvironmentLight(world)
+
+
+@pytest.mark.parametrize("primary", ["surfels", "mesh"])
+def test_strips_and_batches_do_not_change_a_bit(
+    ball: tuple[TraceScene, PosedSurfels, EnvironmentLight], monkeypatch: pytest.MonkeyPatch, primary: str
+) -> None:
+    scene, posed, light = ball
+    this = frame(look_along_y(52), primary=primary, denoise="svgf", threads=1)
+    whole = pipeline.render(scene, light, posed, this)
+    for height, batch in ((1, 400), (7, 3333), (52, 10**7)):
+        monkeypatch.setattr(pipeline, "strip_height", lambda width, aa, h=height: h)
+        monkeypatch.setattr(pipeline, "FIRST_SAMPLES", batch)
+        monkeypatch.setattr(pipeline, "BATCH_SECONDS", 1e-9)  # batches shrink as fast as they can
+        again = pipeline.render(scene, light, posed, this)
+        for name in ALL:
+            assert np.array_equal(again[name], whole[name]), (height, name)
+
+
+def test_threads_do_not_change_a_bit(ball: tuple[TraceScene, PosedSurfels, EnvironmentLight]) -> None:
+    scene, posed, light = ball
+    one = pipeline.render(scene, light, posed, frame(look_along_y(40), denoise="svgf", threads=1))
+    all_of_them = pipeline.render(scene, light, posed, frame(look_along_y(40), denoise="svgf", threads=0))
+    assert all(np.array_equal(one[n], all_of_them[n]) for n in ALL)
+
+
+def test_a_region_is_a_crop(ball: tuple[TraceScene, PosedSurfels, EnvironmentLight]) -> None:
+    scene, posed, light = ball
+    whole = pipeline.render(scene, light, posed, frame(look_along_y(48)))
+    part = pipeline.render(scene, light, posed, frame(look_along_y(48, region=(11, 5, 40, 31))))
+    for name in ALL:
+        assert part[name].shape[:2] == (26, 29)
+        assert np.array_equal(part[name], whole[name][5:31, 11:40]), name
+
+
+def test_surfels_and_mesh_of_one_ball_look_alike(ball: tuple[TraceScene, PosedSurfels, EnvironmentLight]) -> None:
+    scene, _, light = ball
+    settings = {"cosine": 64, "ggx": 32, "environment": 32, "film_transparent": True}
+    camera = look_along_y(48)
+    a = pipeline.render(scene, light, sphere_surfels(1.0, 30000), frame(camera, primary="surfels", **settings))
+    b = pipeline.render(scene, light, sphere_surfels(1.0, 10), frame(camera, primary="mesh", **settings))
+    inside = b["Coverage"][..., 0] == 1
+    inside[1:-1, 1:-1] &= inside[2:, 1:-1] & inside[:-2, 1:-1] & inside[1:-1, 2:] & inside[1:-1, :-2]
+    difference = np.abs(a["Combined"] - b["Combined"])[inside]
+    assert difference.mean() < 0.01 and b["Combined"][inside].mean() > 0.2
+    # Surfels smaller than a pixel are seen through the low-pass, nearest first: up to a pixel (0.043 m) on a slope.
+    facing = inside & (b["Normal"][..., 1] < -0.8)
+    assert np.abs(a["Depth"] - b["Depth"])[facing].max() < 0.06
+
+
+@pytest.mark.parametrize("primary", ["surfels", "mesh"])
+@pytest.mark.parametrize("denoise", ["none", "svgf"])
+def test_an_empty_scene_is_the_world(primary: str, denoise: str) -> None:
+    nothing = PosedSurfels(
+        *(np.empty((0, 3), np.float32) for _ in range(4)), np.empty(0, np.float32), np.empty((0, 3), np.float32),
+        *(np.empty(0, np.float32) for _ in range(2)), np.empty(0, np.int32),
+    )  # fmt: skip
+    light = EnvironmentLight(World(colour=(0.25, 0.5, 1.0)))
+    this = frame(look_along_y(8), objects=0, primary=primary, denoise=denoise)
+    passes = pipeline.render(scene_of(), light, nothing, this)
+    assert np.allclose(passes["Combined"], (0.25, 0.5, 1.0, 1.0))
+    assert (passes["Depth"] == 1e10).all() and (passes["Coverage"] == 0).all()
+
+
+def test_a_black_world_is_black(ball: tuple[TraceScene, PosedSurfels, EnvironmentLight]) -> None:
+    scene, posed, _ = ball
+    light = EnvironmentLight(World(strength=0.0))
+    passes = pipeline.render(scene, light, posed, frame(look_along_y(16), denoise="svgf"))
+    assert (passes["Combined"][..., :3] == 0).all() and (passes["Combined"][..., 3] == 1).all()
+
+
+def test_only_the_passes_asked_for_come_back(ball: tuple[TraceScene, PosedSurfels, EnvironmentLight]) -> None:
+    scene, posed, light = ball
+    passes = pipeline.render(scene, light, posed, frame(look_along_y(16), ("Normal", "Combined")))
+    assert list(passes) == ["Normal", "Combined"]
+
+
+def test_the_sum_of_denoised_passes_is_combined(ball: tuple[TraceScene, PosedSurfels, EnvironmentLight]) -> None:
+    scene, posed, light = ball
+    p = pipeline.render(scene, light, posed, frame(look_along_y(40), denoise="svgf"))
+    total = p["DiffDir"] + p["DiffInd"] + p["GlossDir"] + p["GlossInd"] + p["Env"]
+    assert np.array_equal(p["Combined"][..., :3], total)
+    assert np.abs(p["Combined"] - p["Noisy Image"]).mean() > 1e-4
+    fast = pipeline.render(scene, light, posed, frame(look_along_y(40), ("Combined",), denoise="svgf"))
+    assert np.allclose(fast["Combined"], p["Combined"], atol=1e-5)
+
+
+def test_progress_rises_to_one(ball: tuple[TraceScene, PosedSurfels, EnvironmentLight]) -> None:
+    scene, posed, light = ball
+    told: list[tuple[float, str]] = []
+    pipeline.render(
+        scene, light, posed, frame(look_along_y(32), denoise="svgf"), lambda part, phase: told.append((part, phase))
+    )
+    parts = [part for part, _ in told]
+    assert parts == sorted(parts) and parts[0] == 0 and parts[-1] == 1
+    assert {phase for _, phase in told} == {"Projecting", "Rendering", "Denoising", "Done"}
+
+
+def test_cancel_is_seen_soon(ball: tuple[TraceScene, PosedSurfels, EnvironmentLight]) -> None:
+    """The time between two questions stays short even when a whole strip would take many seconds."""
+    scene, posed, light = ball
+    this = frame(look_along_y(200, focal=300.0), aa=4, cosine=256, ggx=128, environment=128)
+    pipeline.render(scene, light, posed, frame(look_along_y(16)))  # compile
+    asked: list[float] = [time.process_time()]
+
+    def cancelled() -> bool:
+        asked.append(time.process_time())
+        return asked[-1] - asked[0] > 1.0
+
+    with pytest.raises(Cancelled):
+        pipeline.render(scene, light, posed, this, cancelled=cancelled)
+    assert len(asked) > 4
+    # CPU time of both threads, so that a busy machine does not matter.
+    assert max(np.diff(asked)) < 0.8
+
+
+def test_cancel_at_once(ball: tuple[TraceScene, PosedSurfels, EnvironmentLight]) -> None:
+    scene, posed, light = ball
+    with pytest.raises(Cancelled):
+        pipeline.render(scene, light, posed, frame(look_along_y(16)), cancelled=lambda: True)
+
+
+@pytest.mark.parametrize(
+    ("settings", "passes", "message"),
+    [
+        ({"aa": 0}, ALL, "sub-pixel"),
+        ({"primary": "voxels"}, ALL, "voxels"),
+        ({"denoise": "oidn"}, ALL, "oidn"),
+        ({}, ("Combined", "Shadow"), "Shadow"),
+    ],
+)
+def test_refusals(
+    ball: tuple[TraceScene, PosedSurfels, EnvironmentLight],
+    settings: dict[str, object],
+    passes: tuple[str, ...],
+    message: str,
+) -> None:
+    scene, posed, light = ball
+    with pytest.raises(UsageError, match=message):
+        pipeline.render(scene, light, posed, frame(look_along_y(8), passes, **settings))

@@ -1,0 +1,213 @@
+"""What the camera sees: mesh against closed forms, surfels tied to their mesh without shadowing themselves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from drgs_blender.asset.model import PosedSurfels
+from drgs_blender.frame import Camera, RenderSettings, World
+from drgs_blender.render import raster
+from drgs_blender.render.camera import camera_parameters
+from drgs_blender.render.gbuffer import GBuffer
+from drgs_blender.render.integrate import integrate
+from drgs_blender.render.light import EnvironmentLight
+from drgs_blender.render.points import ShadingPoints
+from drgs_blender.render.primary_mesh import primary_mesh
+from drgs_blender.render.primary_surfels import primary_surfels, snap_windows
+from drgs_blender.render.scene import TraceObject, TraceScene
+
+SETTINGS = RenderSettings(aa=2, bounces=0, cosine=32, ggx=16, environment=16, look="paper")
+
+
+def look_along_y(size: int = 48, distance: float = 4.0, focal: float = 70.0, **more: object) -> Camera:
+    matrix = np.eye(4)
+    matrix[:3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
+    matrix[1, 3] = -distance
+    return Camera(matrix, size, size, focal, focal, size / 2, size / 2, **more)  # type: ignore[arg-type]
+
+
+def sphere_mesh(levels: int = 4) -> tuple[np.ndarray, np.ndarray]:
+    import trimesh
+
+    mesh = trimesh.creation.icosphere(levels)
+    return np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.int32)
+
+
+def scene_of(*meshes: tuple[np.ndarray, np.ndarray], albedo: float = 0.5) -> TraceScene:
+    scene = TraceScene()
+    scene.update(
+        [
+            TraceObject(f"mesh {i}", v, f, np.full((len(v), 3), albedo), np.full(len(v), 0.6), np.zeros(len(v)))
+            for i, (v, f) in enumerate(meshes)
+        ]
+    )
+    return scene
+
+
+def sphere_surfels(radius: float, n: int = 6000, albedo: float = 0.5) -> PosedSurfels:
+    i = np.arange(n) + 0.5
+    z, turn = 1 - 2 * i / n, np.pi * (1 + 5**0.5) * i
+    normal = np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], -1)
+    u = np.cross(normal, np.where(np.abs(z)[:, None] < 0.9, [[0, 0, 1.0]], [[1.0, 0, 0]]))
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    sigma = 0.6 * np.sqrt(4 * np.pi / n)
+    arrays = (
+        radius * normal, sigma * u, sigma * np.cross(normal, u), normal, np.full(n, 0.9), np.full((n, 3), albedo),
+        np.full(n, 0.6), np.zeros(n),
+    )  # fmt: skip
+    return PosedSurfels(*(np.ascontiguousarray(a, np.float32) for a in arrays), np.zeros(n, np.int32))
+
+
+def surfel_buffer(posed: PosedSurfels, scene: TraceScene, camera: Camera, settings: RenderSettings) -> GBuffer:
+    parameters = camera_parameters(camera, settings, 1)
+    windows = snap_windows(scene, 1)
+    return primary_surfels(raster.prepare(posed, camera, parameters), scene, windows, camera, 0, camera.height)
+
+
+def white_light(scene: TraceScene, points: ShadingPoints) -> np.ndarray:
+    """(n,) direct light of a uniform white world."""
+    return integrate(scene, EnvironmentLight(World()), points, SETTINGS, 1).total[:, 1]
+
+
+def check_contract(buffer: GBuffer, aa: int) -> None:
+    points = buffer.points
+    for name in ("normal", "geometric_normal", "view"):
+        assert np.allclose(np.linalg.norm(getattr(points, name), axis=1), 1, atol=1e-5), name
+    assert ((points.normal * points.view).sum(1) > 0).all()
+    assert ((points.geometric_normal * points.view).sum(1) > 0).all()
+    order = points.pixel.astype(np.int64) * aa + points.sample
+    assert (np.diff(order) > 0).all()
+    covered = buffer.alpha[buffer.alpha > 0]
+    assert np.allclose(points.weight, covered / aa)
+
+
+@pytest.mark.parametrize("offset", [-0.1, -0.02, -0.004, 0.0, 0.004, 0.02, 0.1])
+def test_surfels_off_their_mesh_do_not_shadow_themselves(offset: float) -> None:
+    """In a uniform white world a convex object is lit alike wherever it is looked at: no sample may be dark."""
+    scene = scene_of(sphere_mesh(3))
+    buffer = surfel_buffer(sphere_surfels(1 + offset), scene, look_along_y(), SETTINGS)
+    check_contract(buffer, 2)
+    points = buffer.points
+    lit = white_light(scene, points)
+    frontal = (points.normal * points.view).sum(1) > 0.3
+    reference = np.median(lit[frontal])
+    assert 0.4 < reference < 0.6
+    assert lit[frontal].min() > 0.85 * reference
+    assert lit.min() > 0.5 * reference  # the rim as well, where smooth and flat normals differ most
+    # Origins lie on the mesh, positions on the surfels (half a standard deviation, which is 0.027).
+    assert np.abs(np.linalg.norm(points.origin, axis=1) - 1).max() < 0.02
+    facing = (points.normal * points.view).sum(1) > 0.9
+    assert np.abs(np.linalg.norm(buffer.position, axis=1) - 1 - offset)[facing].max() < 0.0137
+    if offset == -0.1:
+        # What happens without: rays that start at the surfels are blocked by the mesh outside.
+        naive = replace(points, origin=buffer.position, geometric_normal=points.normal)
+        assert np.median(white_light(scene, naive)[frontal]) < 0.1 * reference
+
+
+def test_a_thin_front_surface_takes_the_light_of_its_own_side() -> None:
+    """Two sheets, closer than the window and turned apart: surfels snap to the sheet that is turned as they are."""
+    square = np.array([[-3, 0, -3], [3, 0, -3], [3, 0, 3], [-3, 0, 3]], np.float32)
+    front = (square + np.float32([0, -0.02, 0]), np.array([[0, 1, 2], [0, 2, 3]], np.int32))
+    back = (square + np.float32([0, 0.02, 0]), np.array([[0, 2, 1], [0, 3, 2]], np.int32))
+    scene = scene_of(front, back)
+    line = np.linspace(-1, 1, 41)
+    x, z = (a.ravel() for a in np.meshgrid(line, line))
+    n = len(x)
+    for normal_y, expected in ((-1.0, -0.02), (1.0, 0.02)):
+        posed = PosedSurfels(
+            np.stack([x, np.full(n, 0.01), z], -1).astype(np.float32),
+            np.tile(np.float32([0.04, 0, 0]), (n, 1)),
+            np.tile(np.float32([0, 0, 0.04]), (n, 1)),
+            np.tile(np.float32([0, normal_y, 0]), (n, 1)),
+            *(np.full((n, *s), 0.9, np.float32) for s in ((), (3,), (), ())),
+            np.zeros(n, np.int32),
+        )
+        buffer = surfel_buffer(posed, scene, look_along_y(24), SETTINGS)
+        assert np.allclose(buffer.points.origin[:, 1], expected, atol=1e-4)
+        # Whichever side they belong to, the normals face the camera.
+        assert np.allclose(buffer.points.normal, (0, -1, 0), atol=1e-4)
+        check_contract(buffer, 2)
+
+
+def test_without_a_mesh_points_stay_and_are_lit() -> None:
+    scene = scene_of()
+    buffer = surfel_buffer(sphere_surfels(1.0), scene, look_along_y(), SETTINGS)
+    check_contract(buffer, 2)
+    points = buffer.points
+    lifted = np.linalg.norm(points.origin - buffer.position, axis=1)
+    sigma = 0.6 * np.sqrt(4 * np.pi / 6000)
+    assert np.allclose(lifted, 4 * sigma, rtol=1e-3)
+    frontal = (points.normal * points.view).sum(1) > 0.3
+    assert white_light(scene, points)[frontal].min() > 0.4
+
+
+def test_surfels_that_overhang_the_silhouette_are_brought_back() -> None:
+    scene = scene_of(sphere_mesh(4))
+    buffer = surfel_buffer(sphere_surfels(1.02), scene, look_along_y(64), SETTINGS)
+    points = buffer.points
+    # Distance of the camera ray from the sphere's centre: beyond one it misses the mesh.
+    overhang = (np.linalg.norm(np.cross([0, -4, 0], points.view), axis=1) > 1.001) & (points.weight > 0.25)
+    assert overhang.sum() > 50
+    assert np.abs(np.linalg.norm(points.origin[overhang], axis=1) - 1).max() < 0.01
+    assert white_light(scene, points)[overhang].min() > 0.35
+
+
+@pytest.mark.parametrize("orthographic", [False, True])
+def test_mesh_samples_lie_on_the_sphere(orthographic: bool) -> None:
+    scene = scene_of(sphere_mesh(5))
+    camera = look_along_y(focal=16.0 if orthographic else 70.0, orthographic=orthographic)
+    parameters = camera_parameters(camera, SETTINGS, 1)
+    buffer = primary_mesh(scene, camera, parameters, 0, camera.height)
+    check_contract(buffer, 2)
+    points = buffer.points
+    assert np.abs(np.linalg.norm(points.origin, axis=1) - 1).max() < 1e-3
+    assert np.allclose(points.normal, points.origin, atol=0.03)
+    assert np.allclose(buffer.depth, points.origin[:, 1] + 4, atol=1e-4)
+    assert np.allclose(points.roughness, 0.6) and np.allclose(points.albedo, 0.5)
+    # Area of the disc in pixels: the sphere's outline.
+    radius = 16.0 if orthographic else 70 * np.tan(np.arcsin(1 / 4))
+    assert abs(points.weight.sum() - np.pi * radius**2) < 0.01 * np.pi * radius**2
+    if orthographic:
+        assert np.allclose(points.view, (0, -1, 0), atol=1e-6)
+    else:
+        towards = np.array([0, -4, 0]) - points.origin
+        assert np.allclose(points.view, towards / np.linalg.norm(towards, axis=1, keepdims=True), atol=1e-4)
+
+
+def test_mesh_and_surfels_look_through_the_same_positions() -> None:
+    square = np.array([[-3, 0, -3], [3, 0, -3], [3, 1, 3], [-3, 1, 3]], np.float32)
+    scene = scene_of((square, np.array([[0, 1, 2], [0, 2, 3]], np.int32)))
+    posed = PosedSurfels(
+        np.float32([[0, 0.5, 0]]), np.float32([[50, 0, 0]]), np.float32([[0, 50 / 6, 50]]),
+        np.float32([[0, -0.986, 0.164]]), *(np.full((1, *s), 0.9, np.float32) for s in ((), (3,), (), ())),
+        np.zeros(1, np.int32),
+    )  # fmt: skip
+    camera = look_along_y(20)
+    a = surfel_buffer(posed, scene, camera, SETTINGS)
+    b = primary_mesh(scene, camera, camera_parameters(camera, SETTINGS, 1), 0, 20)
+    assert np.array_equal(a.points.pixel, b.points.pixel) and np.array_equal(a.points.sample, b.points.sample)
+    assert np.allclose(a.position, b.position, atol=1e-4)
+    assert np.allclose(a.points.origin, b.points.origin, atol=1e-4)
+    assert np.allclose(a.points.view, b.points.view, atol=1e-6)
+
+
+def test_mesh_region_and_clipping() -> None:
+    scene = scene_of(sphere_mesh(3))
+    camera = look_along_y(40)
+    parameters = camera_parameters(camera, SETTINGS, 1)
+    whole = primary_mesh(scene, camera, parameters, 0, 40)
+    camera.region = (9, 4, 31, 37)
+    part = primary_mesh(scene, camera, parameters, 11, 29)
+    x, y = whole.points.pixel % 40, whole.points.pixel // 40
+    inside = (x >= 9) & (x < 31) & (y >= 11) & (y < 29)
+    assert np.array_equal(part.points.pixel, whole.points.pixel[inside])
+    assert np.array_equal(part.points.origin, whole.points.origin[inside])
+    camera = look_along_y(40, clip_start=3.5)  # cuts the front off: the inside of the back is seen
+    cut = primary_mesh(scene, camera, camera_parameters(camera, SETTINGS, 1), 0, 40)
+    assert cut.depth.min() >= 3.5 and cut.depth.max() > 4.5
+    check_contract(cut, 2)
+    camera = look_along_y(40, clip_end=2.5)
+    assert len(primary_mesh(scene, camera, camera_parameters(camera, SETTINGS, 1), 0, 40).points) == 0
