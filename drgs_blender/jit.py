@@ -33,6 +33,7 @@ import numba  # noqa: E402
 from numba import get_num_threads, prange, set_num_threads  # noqa: E402
 
 #: Floating-point freedoms that keep NaN and Inf: reassociation, contraction (FMA), reciprocals, no signed zeros.
+#: Caution: `isfinite` of a sum becomes True (it is x - x == 0, which reassociation cancels); compare `abs(x) < limit`.
 FAST = {"reassoc", "contract", "arcp", "nsz", "afn"}
 
 
