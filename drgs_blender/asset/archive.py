@@ -72,7 +72,7 @@ def write_archive(path: str | os.PathLike[str], members: Sequence[tuple[str, Seq
             yield from buffers
         yield tail
 
-    _replace(path, parts())
+    replace_file(path, parts())
 
 
 def read_archive(path: str | os.PathLike[str], check: Collection[str] = ()) -> dict[str, Array]:
@@ -198,7 +198,7 @@ def _check_names(members: Sequence[Member], subject: str) -> None:
         seen.add(name.casefold())
 
 
-def _replace(path: Path, parts: Iterable[bytes | memoryview]) -> None:
+def replace_file(path: Path, parts: Iterable[bytes | memoryview]) -> None:
     """Write `parts` beside `path`, make them durable, and give them its name."""
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     try:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
+import io
 import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..asset import Asset
+from ..asset.archive import replace_file
 from ..errors import UsageError, WriteError
 
 
@@ -36,24 +36,8 @@ def check_writable(path: Path) -> None:
         with tempfile.NamedTemporaryFile(dir=path.parent, prefix=".drgs-"):
             pass
     except OSError as error:
-        raise _cannot_write(path, error) from error
-
-
-@contextlib.contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """A temporary path beside `path` that takes its place when the block ends well and vanishes when not."""
-    check_writable(path)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=".drgs-", suffix=path.suffix)
-    os.close(handle)
-    temporary = Path(name)
-    try:
-        yield temporary
-        temporary.chmod(0o666 & ~_umask())
-        temporary.replace(path)
-    except OSError as error:
-        raise _cannot_write(path, error) from error
-    finally:
-        temporary.unlink(missing_ok=True)
+        reason = error.strerror or str(error)
+        raise WriteError(str(path), f"cannot be written ({reason})", "Check the folder and its permissions") from error
 
 
 def write_and_report(path: Path, asset: Asset) -> None:
@@ -92,16 +76,6 @@ def write_preview(path: Path, combined: np.ndarray) -> None:
     linear = np.clip(np.nan_to_num(combined[..., :3]) / np.maximum(alpha, 1e-6), 0, 1)
     srgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
     pixels = (np.concatenate([srgb, alpha], axis=-1) * 255 + 0.5).astype(np.uint8)
-    with replacing(path) as temporary:
-        Image.fromarray(pixels, "RGBA").save(temporary)
-
-
-def _cannot_write(path: Path, error: OSError) -> WriteError:
-    reason = error.strerror or str(error)
-    return WriteError(str(path), f"cannot be written ({reason})", "Check the folder, its permissions and free space")
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+    encoded = io.BytesIO()
+    Image.fromarray(pixels).save(encoded, "PNG")
+    replace_file(path, [encoded.getvalue()])

@@ -19,7 +19,7 @@ from drgs_blender.cli import sampling
 from drgs_blender.cli.find_blender import find_blender
 from drgs_blender.cli.frame_lines import FrameLines
 from drgs_blender.cli.main import COMMANDS, EXIT_CLASSES, main
-from drgs_blender.cli.output import check_writable, replacing, write_preview
+from drgs_blender.cli.output import check_writable, write_preview
 from drgs_blender.frame import RenderSettings
 from drgs_blender.passes import BY_NAME
 
@@ -172,18 +172,6 @@ def test_preview_is_srgb_with_straight_alpha(tmp_path):
     write_preview(tmp_path / "p.png", combined)
     pixels = np.asarray(Image.open(tmp_path / "p.png"))
     assert pixels[0].tolist() == [[188, 188, 188, 255], [188, 0, 0, 128], [255, 255, 255, 255], [0, 0, 0, 0]]
-
-
-def test_output_replaces_only_when_the_block_ends_well(tmp_path):
-    path = tmp_path / "sub" / "a.txt"
-    with replacing(path) as temporary:
-        temporary.write_text("first")
-        assert not path.exists()
-    with pytest.raises(ZeroDivisionError), replacing(path) as temporary:
-        temporary.write_text("second")
-        raise ZeroDivisionError
-    assert path.read_text() == "first"
-    assert [p.name for p in path.parent.iterdir()] == ["a.txt"]
 
 
 def test_unwritable_output_is_found_before_the_work(tmp_path):
