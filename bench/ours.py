@@ -6,14 +6,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from drgs_blender.cli.camera_file import parse_camera
 from drgs_blender.engine.session import Session
 from drgs_blender.formats.registry import read_environment
 
-from drgs_blender.frame import Frame, ObjectState, RenderSettings, World, split_rays
+from drgs_blender.frame import Camera, Frame, ObjectState, RenderSettings, World, split_rays
 
 #: One session for a whole program, so that kernels and assets are loaded once.
 SESSION = Session()
+
+
+def pinhole(camera: dict[str, Any]) -> Camera:
+    """Camera of a CAM.json dictionary with `fov_x`."""
+    width, height = camera["width"], camera["height"]
+    f = width / 2 / np.tan(np.radians(camera["fov_x"]) / 2)
+    return Camera(np.array(camera["matrix_world"], float), width, height, f, f, width / 2, height / 2)
 
 
 def relight(
@@ -31,11 +37,10 @@ def relight(
     key = SESSION.load_asset(asset)
     frame = Frame(
         number=1,
-        camera=parse_camera(camera),
+        camera=pinhole(camera),
         objects=[ObjectState("subject", key, vertices=vertices)],
         world=World(environment=read_environment(environment).radiance),
         settings=RenderSettings(cosine=cosine, ggx=ggx, environment=light, film_transparent=True, **settings),
         passes=passes,
     )
-    result = SESSION.render(frame)
-    return result.passes if hasattr(result, "passes") else result
+    return SESSION.render(frame)

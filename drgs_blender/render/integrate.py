@@ -72,10 +72,13 @@ def integrate(
         (points.albedo, points.roughness, points.metallic),
         (scene.bvh.intersect_address, scene.bvh.occluded_address, scene.bvh.scene),
         (scene.shading_faces, scene.shading, F(scene.extent)),
-        (light.radiance, light.density, light.threshold, light.alias, light.row_z, light.rotation),
+        (light.radiance, light.density, *light.cells, light.row_z, light.rotation),
         brdf.layer_table(),
-        sampling.sobol(max(counts)),
-        np.array(counts, np.int32),
+        (
+            sampling.sobol(max(counts)),
+            np.array(counts, np.int32),
+            np.array([(1 << (32 - max(0, (n - 1).bit_length()))) - 1 for n in counts], np.uint32),
+        ),
         settings.aa,
         settings.bounces,
         brdf.LOOKS[settings.look],
@@ -119,7 +122,8 @@ def _beyond(ox, oy, oz, dx, dy, dz, hit, tracer, geometry, light, table, look, b
     """
     intersect_address, occluded_address, tree = tracer
     shading_faces, shading, extent = geometry
-    radiance, density, threshold, alias, row_z, rotation = light
+    radiance, density, order, upper, guide, row_z, rotation = light
+    cells = order, upper, guide
     red = green = blue = ZERO
     tr = tg = tb = ONE
     t, face, hu, hv, gx, gy, gz = hit
@@ -164,8 +168,8 @@ def _beyond(ox, oy, oz, dx, dy, dz, hit, tracer, geometry, light, table, look, b
 
         key = U(key + GOLDEN)
         n0, n1 = mix(key), mix(U(key + U(0x68E31DA4)))
-        n2, n3 = mix(U(key + U(0xB5297A4D))), mix(U(key + U(0x1B56C4E9)))
-        lx, ly, lz, u, v, pe = sample_map(n0, n1, n2, n3, threshold, alias, density, row_z, rotation)
+        n2 = mix(U(key + U(0xB5297A4D)))
+        lx, ly, lz, u, v, pe = sample_map(n0, n1, n2, cells, density, row_z, rotation)
         nl = nx * lx + ny * ly + nz * lz
         if nl > ZERO and gx * lx + gy * ly + gz * lz > ZERO:
             vl, nh2, sin2 = _half_vector(nx, ny, nz, vx, vy, vz, lx, ly, lz, nl, nv)
@@ -217,14 +221,16 @@ def _beyond(ox, oy, oz, dx, dy, dz, hit, tracer, geometry, light, table, look, b
 
 @exact
 def _point(  # type: ignore[no-untyped-def]
-    pixel, sample, surface, frame, tracer, geometry, light, table, numbers, counts, aa, bounces, look, seed, components,
+    pixel, sample, surface, frame, tracer, geometry, light, table, numbers, aa, bounces, look, seed, components,
     variance,
 ):  # fmt: skip
     """All samples of one visible point."""
     ox, oy, oz, nx, ny, nz, gx, gy, gz, vx, vy, vz = frame
     ar, ag, ab, roughness, metallic = surface
     intersect_address, _, tree = tracer
-    radiance, density, threshold, alias, row_z, rotation = light
+    sequence, counts, strata = numbers
+    radiance, density, order, upper, guide, row_z, rotation = light
+    cells = order, upper, guide
     ox, oy, oz = _offset(ox, oy, oz, gx, gy, gz, geometry[2])
     nv = nx * vx + ny * vy + nz * vz
     a2 = brdf.alpha_squared(roughness)
@@ -240,7 +246,10 @@ def _point(  # type: ignore[no-untyped-def]
     total = 0
     for strategy in range(3):
         key = mix(U(pixel_key + U(U(strategy + 1) * GOLDEN)))
-        shift_0, shift_1, shift_2 = mix(U(key + U(1))), mix(U(key + U(2))), mix(U(key + U(3)))
+        # The point set fills strata of 2^32 / n; below them every point is moved by itself.
+        below = strata[strategy]
+        shift_0, shift_1 = U(mix(U(key + U(1))) & ~below), U(mix(U(key + U(2))) & ~below)
+        shift_2 = U(mix(U(key + U(3))) & ~below)
         # This sub-sample's part of the pixel's samples: n / aa on average, n over all sub-samples together.
         dither = unit(mix(U(key + U(4)))) if counts[strategy] % aa else ZERO
         step = F(counts[strategy]) * share
@@ -248,14 +257,13 @@ def _point(  # type: ignore[no-untyped-def]
         past = np.int32(F(sample + 1) * step + dither) if sample + 1 < aa else counts[strategy]
         for j in range(first, past):
             total += 1
-            n0, n1 = U(numbers[j, 0] ^ shift_0), U(numbers[j, 1] ^ shift_1)
             own = mix(U(key ^ U(U(j + 1) * U(0x85EBCA6B))))
+            n0 = U((sequence[j, 0] ^ shift_0) + (mix(U(own + U(5))) & below))
+            n1 = U((sequence[j, 1] ^ shift_1) + (mix(U(own + U(6))) & below))
             u = v = pe = ZERO
             if strategy == 2:
-                n2 = U(numbers[j, 2] ^ shift_2)
-                lx, ly, lz, u, v, pe = sample_map(
-                    n2, mix(U(own + U(5))), n0, n1, threshold, alias, density, row_z, rotation
-                )
+                n2 = U((sequence[j, 2] ^ shift_2) + (mix(U(own + U(7))) & below))
+                lx, ly, lz, u, v, pe = sample_map(n2, n0, n1, cells, density, row_z, rotation)
                 nl = nx * lx + ny * ly + nz * lz
             else:
                 if strategy == 0:
@@ -306,7 +314,7 @@ def _point(  # type: ignore[no-untyped-def]
 
 @exact(parallel=True)
 def _kernel(  # type: ignore[no-untyped-def]
-    keys, frames, surfaces, tracer, geometry, light, table, numbers, counts, aa, bounces, look, seed, components,
+    keys, frames, surfaces, tracer, geometry, light, table, numbers, aa, bounces, look, seed, components,
     variance,
 ):  # fmt: skip
     pixel, sample = keys
@@ -323,6 +331,6 @@ def _kernel(  # type: ignore[no-untyped-def]
             frame = (o[0], o[1], o[2], m[0], m[1], m[2], g[0], g[1], g[2], v[0], v[1], v[2])
             surface = (a[0], a[1], a[2], roughness[i], metallic[i])
             _point(
-                pixel[i], sample[i], surface, frame, tracer, geometry, light, table, numbers, counts, aa, bounces,
+                pixel[i], sample[i], surface, frame, tracer, geometry, light, table, numbers, aa, bounces,
                 look, seed, components[i], variance[i],
             )  # fmt: skip

@@ -25,33 +25,27 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 _MOST_CELLS = 1 << 22
 
 
+def _morton(rows: Array, columns: Array) -> Array:
+    """Interleave the bits of two indices below 2^16: neighbours in the map stay near in the order."""
+
+    def spread(x: Array) -> Array:
+        x = x.astype(np.uint32)
+        for shift, mask in ((8, 0x00FF00FF), (4, 0x0F0F0F0F), (2, 0x33333333), (1, 0x55555555)):
+            x = (x | (x << np.uint32(shift))) & np.uint32(mask)
+        return x
+
+    return (spread(rows) << np.uint32(1)) | spread(columns)
+
+
 @exact
-def _alias_table(weights, threshold, alias):  # type: ignore[no-untyped-def]
-    """Vose's alias method; `threshold` is the chance, in units of 2^-32, to keep the cell itself."""
-    n = len(weights)
-    mean = weights.sum() / n
-    scaled = weights / mean
-    small, large = np.empty(n, np.int32), np.empty(n, np.int32)
-    s = l = 0
-    for i in range(n):
-        alias[i] = i
-        threshold[i] = np.uint32(0xFFFFFFFF)
-        if scaled[i] < 1.0:
-            small[s] = i
-            s += 1
-        else:
-            large[l] = i
-            l += 1
-    while s > 0 and l > 0:
-        s -= 1
-        i, j = small[s], large[l - 1]
-        threshold[i] = np.uint32(min(4294967295.0, scaled[i] * 4294967296.0))
-        alias[i] = j
-        scaled[j] -= 1.0 - scaled[i]
-        if scaled[j] < 1.0:
-            l -= 1
-            small[s] = j
-            s += 1
+def _guide_table(upper, guide):  # type: ignore[no-untyped-def]
+    """First cell of each equal slice of the random numbers: the inversion starts there (Chen and Asau 1974)."""
+    width = np.uint64(1 << 32) // np.uint64(len(guide))
+    i = np.int64(0)
+    for g in range(len(guide)):
+        while np.uint64(upper[i]) < np.uint64(g) * width:
+            i += 1
+        guide[g] = i
 
 
 def _texel_means(luminance: Array) -> Array:
@@ -68,7 +62,10 @@ class EnvironmentLight:
     ----------
     radiance : (h, w, 4) float32: lat-long radiance times colour and strength, linear Rec.709; the last is padding
     density : (rows, columns) float32: probability per solid angle of each sampling cell; 0 everywhere when black
-    threshold, alias : (rows * columns,) uint32, int32: the alias table
+    order : (k,) int32: the lit cells in Morton order, so that equal strata of one random number are compact
+        regions of equal power
+    upper : (k,) uint32: last random number that falls on each cell of `order`
+    guide : (2^b,) int32: where to start looking in `upper`
     row_z : (rows + 1,) float32: z at the upper edge of each row of cells, from 1 to -1
     rotation : (3, 3) float32: world direction to environment direction
     bad_texels : int: NaN, infinite or negative texels, taken as black
@@ -111,15 +108,30 @@ class EnvironmentLight:
         edges = np.cos(np.pi * np.arange(rows + 1) / rows)
         edges[0], edges[-1] = 1.0, -1.0
         solid = -np.diff(edges) * (2.0 * math.pi / columns)
-        weights = means * solid[:, None]
+        weights = (means * solid[:, None]).ravel()
         total = weights.sum()
         self.black = not total > 0.0
         self.row_z = edges.astype(np.float32)
-        self.density = (means / total if not self.black else np.zeros_like(means)).astype(np.float32)
-        self.threshold = np.full(rows * columns, 0xFFFFFFFF, np.uint32)
-        self.alias = np.arange(rows * columns, dtype=np.int32)
+        cells = np.arange(rows * columns)
+        lit = cells if self.black else cells[weights > 0]
+        lit = lit[np.argsort(_morton(lit // columns, lit % columns), kind="stable")]
+        # Widths in whole random numbers, at least one where there is light; the density follows from them exactly.
+        share = np.full(len(lit), 1.0 / len(lit)) if self.black else weights[lit] / total
+        width = np.maximum(np.rint(share * 2.0**32), 1).astype(np.int64)
+        width[width.argmax()] += 2**32 - width.sum()
+        self.order = lit.astype(np.int32)
+        self.upper = (np.cumsum(width) - 1).astype(np.uint32)
+        self.guide = np.zeros(1 << max(0, (len(cells) - 1).bit_length()), np.int32)
+        _guide_table(self.upper, self.guide)
+        density = np.zeros(len(cells))
         if not self.black:
-            _alias_table(weights.ravel(), self.threshold, self.alias)
+            density[lit] = width * 2.0**-32
+        self.density = (density.reshape(rows, columns) / solid[:, None]).astype(np.float32)
+
+    @property
+    def cells(self) -> tuple[Array, Array, Array]:
+        """What `sample_map` inverts: order, upper, guide."""
+        return self.order, self.upper, self.guide
 
     def lookup(self, directions: Array) -> Array:
         """(n, 3) radiance from (n, 3) unit world directions."""
@@ -130,9 +142,9 @@ class EnvironmentLight:
         return _pdf_many(np.ascontiguousarray(directions, np.float32), self.density, self.rotation)
 
     def sample(self, numbers: Array) -> tuple[Array, Array]:
-        """World directions (n, 3) and densities (n,) from (n, 4) uint32 random numbers."""
+        """World directions (n, 3) and densities (n,) from (n, 3) uint32 random numbers."""
         numbers = np.ascontiguousarray(numbers, np.uint32)
-        return _sample_many(numbers, self.threshold, self.alias, self.density, self.row_z, self.rotation)
+        return _sample_many(numbers, self.cells, self.density, self.row_z, self.rotation)
 
 
 @exact
@@ -176,16 +188,18 @@ def radiance_at(u, v, radiance):  # type: ignore[no-untyped-def]
 
 
 @exact
-def sample_map(n0, n1, n2, n3, threshold, alias, density, row_z, rotation):  # type: ignore[no-untyped-def]
-    """World direction, its (u, v) and its density from four uint32: cell, alias choice, place inside the cell."""
-    rows, columns = density.shape
-    cell = np.int64((np.uint64(n0) * np.uint64(rows * columns)) >> np.uint64(32))
-    if n1 > threshold[cell]:
-        cell = np.int64(alias[cell])
+def sample_map(n0, n1, n2, cells, density, row_z, rotation):  # type: ignore[no-untyped-def]
+    """World direction, its (u, v) and its density from three uint32: the cell, and the place inside it."""
+    order, upper, guide = cells
+    columns = density.shape[1]
+    i = np.int64(guide[np.int64((np.uint64(n0) * np.uint64(len(guide))) >> np.uint64(32))])
+    while n0 > upper[i]:
+        i += 1
+    cell = np.int64(order[i])
     r, c = cell // columns, cell % columns
     scale = np.float32(1.0 / 16777216.0)
-    u = (np.float32(c) + np.float32(n2 >> np.uint32(8)) * scale) / np.float32(columns)
-    t = np.float32(n3 >> np.uint32(8)) * scale
+    u = (np.float32(c) + np.float32(n1 >> np.uint32(8)) * scale) / np.float32(columns)
+    t = np.float32(n2 >> np.uint32(8)) * scale
     z = row_z[r] + t * (row_z[r + 1] - row_z[r])
     s, k = sincos_turns(np.float32(0.5) - u)
     ring = math.sqrt(max(np.float32(0.0), np.float32(1.0) - z * z))
@@ -216,12 +230,10 @@ def _pdf_many(directions, density, rotation):  # type: ignore[no-untyped-def]
 
 
 @exact
-def _sample_many(numbers, threshold, alias, density, row_z, rotation):  # type: ignore[no-untyped-def]
+def _sample_many(numbers, cells, density, row_z, rotation):  # type: ignore[no-untyped-def]
     n = len(numbers)
     directions, pdf = np.empty((n, 3), np.float32), np.empty(n, np.float32)
     for i in range(n):
-        x, y, z, _, _, p = sample_map(
-            numbers[i, 0], numbers[i, 1], numbers[i, 2], numbers[i, 3], threshold, alias, density, row_z, rotation
-        )
+        x, y, z, _, _, p = sample_map(numbers[i, 0], numbers[i, 1], numbers[i, 2], cells, density, row_z, rotation)
         directions[i, 0], directions[i, 1], directions[i, 2], pdf[i] = x, y, z, p
     return directions, pdf
