@@ -15,6 +15,9 @@ from .camera import export_camera
 from .objects import export_objects
 from .world import export_world
 
+#: Colour space of everything the engine gets and gives.
+WORKING_SPACE = "Linear Rec.709"
+
 
 def export_frame(
     depsgraph: bpy.types.Depsgraph,
@@ -42,6 +45,7 @@ def export_frame(
         if scene.camera is None:
             raise UsageError(f'Scene "{scene.name}"', "has no camera", "Add a camera, or make one active with Ctrl 0")
         camera = export_camera(scene.camera.evaluated_get(depsgraph), scene.render)
+        _check_features(scene, warn)
     settings = scene.drgs
     return Frame(
         number=scene.frame_current if settings.use_animated_seed else 0,
@@ -51,3 +55,27 @@ def export_frame(
         settings=settings.to_settings(scene.render.film_transparent, preferences.read("threads", 0)),
         passes=tuple(p.name for p in enabled(depsgraph.view_layer)),
     )
+
+
+def _check_features(scene: bpy.types.Scene, warn: Callable[[str], None]) -> None:
+    """Say which features of the scene the picture will lack.
+
+    Raises
+    ------
+    UsageError
+        The scene wants several views; all but one would stay black.
+    """
+    if scene.render.use_multiview:
+        raise UsageError(
+            f'Scene "{scene.name}"',
+            "renders several views, of which DR-GS can render only one",
+            "Disable Output > Stereoscopy",
+        )
+    # From Blender 5.0 on a file may choose its working space.
+    space = getattr(getattr(bpy.data, "colorspace", None), "working_space", WORKING_SPACE)
+    if space != WORKING_SPACE:
+        warn(f"The file works in {space}; DR-GS renders {WORKING_SPACE}, so colours will differ")
+    if scene.render.use_motion_blur:
+        warn("Motion blur is not rendered by DR-GS")
+    if scene.camera.data.dof.use_dof:
+        warn(f'Depth of field of camera "{scene.camera.name}" is not rendered by DR-GS')

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Callable
 
@@ -64,5 +65,5 @@ def _key(image: bpy.types.Image) -> tuple[object, ...] | None:
         changed = os.stat(path).st_mtime_ns
     except OSError:  # packed, or missing (then there are no pixels)
         changed = 0
-    packed = image.packed_file.size if image.packed_file else 0
+    packed = hashlib.blake2b(image.packed_file.data).digest() if image.packed_file else b""
     return image.session_uid, path, changed, packed, image.colorspace_settings.name, tuple(image.size)

@@ -39,15 +39,15 @@ class Visible:
 
 
 def visible(depsgraph: bpy.types.Depsgraph) -> Iterator[Visible]:
-    """Everything with a surface that the view layer shows, instances included. Valid during the iteration only."""
+    """Surfaces and lights that the view layer shows, instances included. Valid during the iteration only."""
     for instance in depsgraph.object_instances:
         obj = instance.object
-        if obj.type in SURFACES and instance.show_self:
+        if (obj.type in SURFACES or obj.type == "LIGHT") and instance.show_self:
             yield Visible(obj, np.array(instance.matrix_world, np.float64))
 
 
 def export_objects(depsgraph: bpy.types.Depsgraph, key_of: KeyOf, warn: Warn) -> list[ObjectState]:
-    """All visible DR-GS objects; other surfaces are counted in one warning.
+    """All visible DR-GS objects; other surfaces and lights are counted in one warning each.
 
     Raises
     ------
@@ -56,19 +56,21 @@ def export_objects(depsgraph: bpy.types.Depsgraph, key_of: KeyOf, warn: Warn) ->
     """
     states: list[ObjectState] = []
     shapes: dict[tuple[int, int], ObjectState] = {}
-    others: set[str] = set()
+    others: dict[str, set[str]] = {"other object": set(), "light": set()}
     for item in visible(depsgraph):
         obj = item.object
         if not assets.is_drgs(obj):
-            others.add(obj.name)
+            others["light" if obj.type == "LIGHT" else "other object"].add(obj.name)
             continue
         shape_of = (obj.original.as_pointer(), obj.data.as_pointer())
         if shape_of not in shapes:
             shapes[shape_of] = _shape(obj, depsgraph, key_of, warn)
         states.append(replace(shapes[shape_of], matrix_world=item.matrix_world, pass_index=obj.pass_index))
-    if others:
-        names = ", ".join(sorted(others)[:3]) + (", ..." if len(others) > 3 else "")
-        warn(f"{len(others)} other object(s) are not rendered by DR-GS: {names}")
+    for kind, found in others.items():
+        if found:
+            names = ", ".join(sorted(found)[:3]) + (", ..." if len(found) > 3 else "")
+            plural = f"{kind}s are" if len(found) > 1 else f"{kind} is"
+            warn(f"{len(found)} {plural} not rendered by DR-GS: {names}")
     return states
 
 
@@ -82,10 +84,12 @@ def _shape(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, key_of: KeyOf,
     try:
         if len(mesh.vertices) != len(asset.mesh.vertices):
             raise _wrong_count(obj, len(mesh.vertices), len(asset.mesh.vertices))
+        vertices = mesh_arrays.read_vertices(mesh)
+        vertices.flags.writeable = False  # so that the engine's client need not copy it
         return ObjectState(
             name=obj.name,
             asset=key_of(path),
-            vertices=mesh_arrays.read_vertices(mesh),
+            vertices=vertices,
             corner_normals=_corner_normals(obj, mesh, asset, warn),
             **{channel: _edited(obj, mesh, asset, channel, warn) for channel in MATERIAL_CHANNELS},
         )

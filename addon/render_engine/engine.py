@@ -40,8 +40,8 @@ class DrgsRenderEngine(bpy.types.RenderEngine):
             )
 
     def _fail(self, text: str) -> None:
+        """Report an error. `error_set` would let Blender write a black picture and go on."""
         messages.note("ERROR", text)
-        self.error_set(text)
         self.report({"ERROR"}, text)
 
     def _render(self, depsgraph: bpy.types.Depsgraph) -> None:

@@ -28,7 +28,20 @@ def test_other_objects_are_counted_in_one_warning(ball, export):
         mesh_object(name, *sphere(4, 4))
     frame, warnings = export()
     assert len(frame.objects) == 1
-    assert warnings == ["2 other object(s) are not rendered by DR-GS: Cube, Floor"]
+    assert warnings == ["2 other objects are not rendered by DR-GS: Cube, Floor"]
+
+
+def test_what_the_picture_will_lack_is_said(ball, scene, export):
+    lamp = bpy.data.objects.new("Lamp", bpy.data.lights.new("Lamp", "SUN"))
+    scene.collection.objects.link(lamp)
+    scene.camera.data.dof.use_dof = scene.render.use_motion_blur = True
+    _, warnings = export()
+    assert len(warnings) == 3
+    assert "1 light is not rendered by DR-GS: Lamp" in warnings
+    assert any('camera "Camera"' in w for w in warnings)
+    scene.render.use_multiview = True
+    with pytest.raises(errors.UsageError, match="Disable Output > Stereoscopy"):
+        export()
 
 
 def test_instances_have_their_own_transforms_and_share_arrays(ball, scene, export):

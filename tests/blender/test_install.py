@@ -59,21 +59,30 @@ def test_no_absolute_import_of_the_engine_package():
     assert not [name for name in sys.modules if name.split(".")[0] == "drgs_blender"]
 
 
+ICONS = set(bpy.types.UILayout.bl_rna.functions["prop"].parameters["icon"].enum_items.keys())
+
+
 class Layout:
-    """Stands in for UILayout and takes every call."""
+    """Stands in for UILayout: takes the calls that panels make and checks what they name."""
 
-    def __getattr__(self, name):
-        if name in ("row", "column", "box", "split"):
-            return lambda *a, **k: Layout()
-        if name in ("prop", "template_ID"):
-            return self.prop
-        return lambda *a, **k: None
+    def row(self, **_):
+        return Layout()
 
-    def __setattr__(self, name, value):
-        pass
+    column = box = row
 
-    def prop(self, data, name, **_):
+    def prop(self, data, name, icon="NONE", **_):
         assert name in data.bl_rna.properties, f"{data} has no property {name}"
+        assert icon in ICONS
+
+    template_ID = prop
+
+    def operator(self, name, icon="NONE", **_):
+        group, verb = name.split(".")
+        assert getattr(getattr(bpy.ops, group), verb).get_rna_type().name
+        assert icon in ICONS
+
+    def label(self, text="", icon="NONE"):
+        assert isinstance(text, str) and icon in ICONS
 
 
 @pytest.mark.parametrize("loaded", [False, True])
