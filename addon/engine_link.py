@@ -11,6 +11,8 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
+import bpy
+
 from ..drgs_blender.engine.client import EngineClient, Passes, locate_engine
 from ..drgs_blender.frame import Frame
 from . import messages, preferences
@@ -20,6 +22,11 @@ IsCancelled = Callable[[], bool]
 
 _lock = threading.Lock()
 _client: EngineClient | None = None
+
+
+def command_line() -> list[str]:
+    """Command of the engine that DRGS_ENGINE or the preferences name; see locate_engine for the errors."""
+    return locate_engine(bpy.path.abspath(preferences.read("engine_python", "")) or None)
 
 
 def client() -> EngineClient:
@@ -32,7 +39,7 @@ def client() -> EngineClient:
     """
     global _client
     with _lock:
-        command = locate_engine(preferences.read("engine_python", "") or None)
+        command = command_line()
         if _client is not None and _client.command != command:
             _client.close()
             _client = None

@@ -10,8 +10,7 @@ from typing import IO
 import bpy
 from bpy.props import BoolProperty, EnumProperty, StringProperty
 
-from ..addon import messages, preferences
-from ..drgs_blender.engine.client import locate_engine
+from ..addon import engine_link, messages
 from ..drgs_blender.errors import AssetError, UsageError
 from .base import DrgsOperator
 from .import_asset import import_assets
@@ -100,7 +99,7 @@ class DRGS_OT_import_parts(DrgsOperator, bpy.types.Operator):
 
     def _start(self) -> None:
         arguments = self._arguments()
-        command = locate_engine(preferences.read("engine_python", "") or None)
+        command = engine_link.command_line()
         python = command[: command.index("-m")]
         self._log = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the process
         try:

@@ -110,10 +110,12 @@ def test_edited_mesh_is_named(ball, export):
         export()
 
 
-def test_edit_mode_exports_the_mesh(ball, export):
+def test_edit_mode_exports_and_renders_the_mesh(ball, export, captured):
     bpy.ops.object.mode_set(mode="EDIT")
     try:
         np.testing.assert_array_equal(export()[0].objects[0].vertices, sphere()[0])
+        bpy.ops.render.render()
+        np.testing.assert_array_equal(captured[0].objects[0].vertices, sphere()[0])
     finally:
         bpy.ops.object.mode_set(mode="OBJECT")
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 import pytest
-from scenes import ROOT, new_world, part, read_exr
+from scenes import PACKAGE, ROOT, new_world, part, read_exr
 
 link = part("addon.engine_link")
 errors = part("drgs_blender.errors")
@@ -186,6 +186,21 @@ def test_without_engine_nothing_is_written_and_the_message_helps(ball, scene, no
     assert part("addon.messages").history[-1].level == "ERROR"
     with pytest.raises(RuntimeError, match="nowhere"):
         bpy.ops.drgs.engine_test()
+
+
+def test_preference_names_the_engine_where_the_environment_does_not(scene, monkeypatch):
+    place = os.environ["DRGS_ENGINE"]
+    monkeypatch.delenv("DRGS_ENGINE")
+    settings = bpy.context.preferences.addons[PACKAGE].preferences
+    settings.engine_python = place
+    try:
+        assert link.command_line()[0] == place
+        assert bpy.ops.drgs.engine_test() == {"FINISHED"} and link.is_running()
+        settings.engine_python = str(Path(place).with_name("no-such-python"))
+        with pytest.raises(RuntimeError, match=r"preference.*no-such-python"):
+            bpy.ops.drgs.engine_test()
+    finally:
+        settings.engine_python = ""
 
 
 def test_failing_frame_stops_an_animation(ball, scene, ball_file, captured, tmp_path):
