@@ -78,7 +78,7 @@ def denoise(
     guide = np.zeros((h, w, _GUIDE), np.float32)
     parts = 2 if split else 1
     light = np.zeros((h, w, 2, parts, 3), np.float32)
-    spread = np.zeros((h, w, 2), np.float32)
+    spread = np.zeros((h, w, 4), np.float32)  # variance, then luminance, of diffuse and glossy
     _demodulate(
         components,
         variance,
@@ -186,6 +186,7 @@ def _demodulate(
                 light[y, x] = np.float32(0.0)
                 spread[y, x] = np.float32(0.0)
                 valid = np.float32(-1.0)
+            spread[y, x, 2], spread[y, x, 3] = _lobe_luminance(light, y, x, 0), _lobe_luminance(light, y, x, 1)
             g[_VALID] = valid
 
 
@@ -208,11 +209,11 @@ def _clamp_fireflies(guide: Any, light: Any, spread: Any, out: Any, out_spread: 
                             continue
                         if not guide[yy, xx, _VALID] > np.float32(0.0) or guide[yy, xx, _INDEX] != index:
                             continue
-                        value = _lobe_luminance(light, yy, xx, lobe)
+                        value = spread[yy, xx, 2 + lobe]
                         total += value
                         square += value * value
                         n += 1
-                own = _lobe_luminance(light, y, x, lobe)
+                own = spread[y, x, 2 + lobe]
                 scale = np.float32(1.0)
                 if n >= 4:
                     inverse = np.float32(1.0) / np.float32(n)
@@ -226,6 +227,7 @@ def _clamp_fireflies(guide: Any, light: Any, spread: Any, out: Any, out_spread: 
                     for k in range(3):
                         out[y, x, lobe, part, k] = light[y, x, lobe, part, k] * scale
                 out_spread[y, x, lobe] = spread[y, x, lobe] * scale * scale
+                out_spread[y, x, 2 + lobe] = own * scale
 
 
 @njit(inline="always")
@@ -257,7 +259,7 @@ def _a_trous(step: Any, guide: Any, light: Any, spread: Any, out: Any, out_sprea
             px, py, pz = guide[y, x, _POSITION], guide[y, x, _POSITION + 1], guide[y, x, _POSITION + 2]
             nx, ny, nz = guide[y, x, _NORMAL], guide[y, x, _NORMAL + 1], guide[y, x, _NORMAL + 2]
             power, roughness, index = guide[y, x, _POWER], guide[y, x, _ROUGHNESS], guide[y, x, _INDEX]
-            own_d, own_g = _lobe_luminance(light, y, x, 0), _lobe_luminance(light, y, x, 1)
+            own_d, own_g = spread[y, x, 2], spread[y, x, 3]
             # Variance of the neighbourhood: 3 x 3 Gaussian.
             var_d = var_g = norm = zero
             for dy in range(-1, 2):
@@ -305,8 +307,8 @@ def _a_trous(step: Any, guide: Any, light: Any, spread: Any, out: Any, out_sprea
                         if common > np.float32(12.0):
                             continue
                         rough = abs(guide[yy, xx, _ROUGHNESS] - roughness) * np.float32(1.0 / SIGMA_ROUGHNESS)
-                        far_d = abs(_lobe_luminance(light, yy, xx, 0) - own_d) * inv_d
-                        far_g = abs(_lobe_luminance(light, yy, xx, 1) - own_g) * inv_g
+                        far_d = abs(spread[yy, xx, 2] - own_d) * inv_d
+                        far_g = abs(spread[yy, xx, 3] - own_g) * inv_g
                         weight_d = kernel * _exp(-common - diffuse_power * turn - far_d)
                         weight_g = kernel * _exp(-common - power * turn - rough - far_g)
                     sum_d += weight_d
@@ -325,6 +327,7 @@ def _a_trous(step: Any, guide: Any, light: Any, spread: Any, out: Any, out_sprea
                     out[y, x, 1, part, k] = sums[1, part, k] * inverse_g
             out_spread[y, x, 0] = spread_d * inverse_d * inverse_d
             out_spread[y, x, 1] = spread_g * inverse_g * inverse_g
+            out_spread[y, x, 2], out_spread[y, x, 3] = _lobe_luminance(out, y, x, 0), _lobe_luminance(out, y, x, 1)
 
 
 @njit(parallel=True)

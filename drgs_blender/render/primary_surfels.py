@@ -5,7 +5,7 @@ the mesh is blocked by its own surface, one that starts above misses contact sha
 the mesh point that belongs to it:
 
 1. along the camera ray, within a window of depths around the surfel: the first face that is turned as the surfel is;
-2. else (the surfel overhangs the mesh's silhouette) within the window along the surfel's normal, inwards, then outwards;
+2. else (the surfel overhangs the mesh's silhouette) within the window along its normal, inwards, then outwards;
 3. else the nearest face along the camera ray within the window, whichever way it is turned;
 4. else (no mesh near) the point stays where it is, lifted by the window along its normal.
 
