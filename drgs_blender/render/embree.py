@@ -105,9 +105,10 @@ def _address(function: Any) -> int:
     return ctypes.cast(function, ctypes.c_void_p).value or 0
 
 
-# RTCRayHit as 20 words: org 0-2, tnear 3, dir 4-6, time 7, tfar 8, mask 9, id 10, flags 11,
-# Ng 12-14, u 15, v 16, primID 17, geomID 18, instID 19.
-_WORDS = 20
+# RTCRayHit as 24 words: org 0-2, tnear 3, dir 4-6, time 7, tfar 8, mask 9, id 10, flags 11,
+# Ng 12-14, u 15, v 16, primID 17, geomID 18, instID 19, instPrimID 20 (new in 4.4), padding to 16 bytes.
+# Embree writes instPrimID on every hit: in a shorter structure it overwrites whatever lies behind on the stack.
+_WORDS = 24
 _MASK, _PRIMITIVE, _GEOMETRY, _INSTANCE = 9, 17, 18, 19
 _TFAR = 8
 
