@@ -14,8 +14,7 @@ import numpy as np
 
 from ..errors import UsageError
 from ..frame import Camera, RenderSettings
-from ..jit import njit
-from .sampling import GOLDEN, mix
+from .sampling import GOLDEN, exact, mix
 
 Array = np.ndarray
 
@@ -83,7 +82,7 @@ def camera_parameters(camera: Camera, settings: RenderSettings, frame_number: in
     return out
 
 
-@njit
+@exact
 def pixel_shift(parameters: Any, pixel: Any) -> Any:
     """Toroidal shift (x, y) in [0, 1) of the sub-pixel lattice of `pixel` (index y * width + x)."""
     h = mix(np.uint32(pixel) ^ np.uint32(np.int64(parameters[SEED])))
@@ -91,7 +90,7 @@ def pixel_shift(parameters: Any, pixel: Any) -> Any:
     return np.float64(h) * 2.0**-32, np.float64(g) * 2.0**-32
 
 
-@njit(inline="always")
+@exact(inline="always")
 def lattice(shift_x: Any, shift_y: Any, sample: Any, aa: Any) -> Any:
     """Position of sub-pixel sample number `sample` of `aa` inside its pixel, both in [0, 1)."""
     x = shift_x + sample / aa
@@ -100,7 +99,7 @@ def lattice(shift_x: Any, shift_y: Any, sample: Any, aa: Any) -> Any:
     return min(x - math.floor(x), 0.995), min(y - math.floor(y), 0.995)
 
 
-@njit
+@exact
 def camera_ray(parameters: Any, px: Any, py: Any) -> Any:
     """World-space ray through pixel position (px, py).
 
@@ -132,7 +131,7 @@ def camera_ray(parameters: Any, px: Any, py: Any) -> Any:
     )
 
 
-@njit
+@exact
 def sample_ray(parameters: Any, pixel: Any, sample: Any) -> Any:
     """`camera_ray` through sub-pixel sample `sample` of `pixel` (index y * width + x)."""
     width = np.int64(parameters[WIDTH])
