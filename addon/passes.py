@@ -18,10 +18,14 @@ _FULL_NAMES = {
 }
 
 
+def label(render_pass: Pass) -> str:
+    """Full name, for the interface."""
+    return _FULL_NAMES.get(render_pass.name, render_pass.name)
+
+
 def blender_name(render_pass: Pass) -> str:
     """What this Blender calls a pass."""
-    name = render_pass.name
-    return _FULL_NAMES.get(name, name) if bpy.app.version >= (5, 0, 0) else name
+    return label(render_pass) if bpy.app.version >= (5, 0, 0) else render_pass.name
 
 
 def enabled(view_layer: bpy.types.ViewLayer) -> list[Pass]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ...drgs_blender.passes import PASSES
-from ..passes import blender_name
+from ..passes import label
 from ..properties import switch_of
 
 
@@ -27,7 +27,7 @@ class DRGS_PT_passes(bpy.types.Panel):
         column = layout.column(heading="Include")
         for p in PASSES:
             owner, name = (view_layer, p.blender) if p.blender else (view_layer.drgs, switch_of(p))
-            column.prop(owner, name, text=blender_name(p))
+            column.prop(owner, name, text=label(p))
 
 
 CLASSES = (DRGS_PT_passes,)
