@@ -43,8 +43,8 @@ def main() -> None:
              f"{psnr(pictures['surfels'], pictures['mesh'], mesh | surfels):.2f}")
         )  # fmt: skip
     body = (
-        f"{options.size}x{options.size}, {options.rays} rays, 16 sub-pixel samples, city.exr; silhouettes at alpha 0.5; PSNR "
-        "in sRGB over pixels wholly inside the mesh, and over the union of both silhouettes.\n\n"
+        f"{options.size}x{options.size}, {options.rays} rays, 16 sub-pixel samples, city.exr; silhouettes at alpha .5; "
+        "PSNR in sRGB over pixels wholly inside the mesh, and over the union of both silhouettes.\n\n"
         + table(("Asset", "Triangles", "Surfels", "Silhouette IoU", "PSNR inside dB", "PSNR union dB"), rows)
     )
     write_section("primary", "Surfels against mesh as primary surface", "python bench/bench_primary.py", body)

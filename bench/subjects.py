@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from drgs_blender.build.make import make_asset
 from report import OUT, ROOT
 
 from drgs_blender.asset import Asset, Mesh
 from drgs_blender.asset.container import read_asset, write_asset
+from drgs_blender.build.make import make_asset
 
 SOURCES = {
     "spot": "spot/spot_triangulated.obj",

@@ -15,8 +15,9 @@ import time
 from pathlib import Path
 
 import numpy as np
-from drgs_blender.render.frames import read_frame
 from PIL import Image
+
+from drgs_blender.render.frames import read_frame
 
 ROOT = Path(__file__).resolve().parent.parent
 BIN = "Scripts" if sys.platform == "win32" else "bin"

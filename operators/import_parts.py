@@ -38,7 +38,13 @@ class DRGS_OT_import_parts(DrgsOperator, bpy.types.Operator):
     up: EnumProperty(
         name="Up",
         description="Axis that points up in the files",
-        items=(("auto", "Automatic", "As the file formats say"), ("z", "Z", ""), ("y", "Y", "")),
+        items=(
+            ("auto", "Automatic", "As the file formats say"),
+            ("z", "Z", ""),
+            ("y", "Y", ""),
+            ("-y", "-Y", "Most photogrammetry"),
+            ("-z", "-Z", ""),
+        ),
         default="auto",
     )
     use_environment: BoolProperty(name="Set World", description="Light the scene with the environment", default=False)
@@ -94,7 +100,7 @@ class DRGS_OT_import_parts(DrgsOperator, bpy.types.Operator):
         if light:
             arguments += ["--env", light]
         if self.up != "auto":
-            arguments += ["--up", self.up]
+            arguments.append(f"--up={self.up}")
         return [*arguments, "--out", str(self._target())]
 
     def _start(self) -> None:

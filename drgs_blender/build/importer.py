@@ -43,7 +43,8 @@ def import_asset(
     surfels : path of surfels or splats, or a file already read
     mesh : path of the mesh they were captured with; None builds a closed one around them
     environment : path of the light of the capture
-    up : "y" or "z", the up axis of surfels and mesh; None is what the formats say, and Z where they say nothing
+    up : "z", "y", "-z" or "-y", the up axis of surfels and mesh; None is what the formats say,
+        and Z where they say nothing
     materials : materials of the mesh's vertices kept apart from it (NeRO's folder), or such a file already read
     resolution : voxels along the longest side of a mesh that is built
     max_triangles : budget for texture detail of a textured mesh
@@ -58,8 +59,8 @@ def import_asset(
     file = surfels if isinstance(surfels, SurfelFile) else _read_surfels(surfels)
     report: dict[str, Any] = {"layout": file.layout, "surfel_notes": list(file.notes)}
     captured, report["not_finite"] = _finite(file.surfels, surfel_name)
-    if up == "y":
-        captured = surfels_to_z_up(captured)
+    if up:
+        captured = surfels_to_z_up(captured, up)
 
     if mesh is None:
         mesh_name, surface_known = "mesh built from the surfels", False

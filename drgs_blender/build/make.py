@@ -49,7 +49,7 @@ def make_asset(
     Parameters
     ----------
     source : path, or a mesh file already read
-    up : "y" or "z", the up axis of the file; None is what its format says, and Z where it says nothing
+    up : "z", "y", "-z" or "-y", the up axis of the file; None is what its format says, and Z where it says nothing
     max_triangles : budget of the subdivision that gives texture detail its vertices; a finer mesh is left as it is
     tolerance : error of interpolated materials at which edges are split
     density : see `deform.attach.attach`
@@ -105,8 +105,8 @@ def mesh_with_materials(
         "source_vertices", "source_faces", "not_finite_faces", "degenerate_faces" (removed), "vertices", "faces",
         "rounds" of subdivision, "unresolved_edges" (detail left out by the budget or the finest edge), "notes".
     """
-    if up == "y" and file.up_axis == "unknown":
-        file = mesh_to_z_up(file)
+    if up and file.up_axis == "unknown":
+        file = mesh_to_z_up(file, up)
     report: dict[str, Any] = {"source_vertices": len(file.vertices), "source_faces": len(file.faces)}
     report["notes"] = list(file.notes)
     net = _net(file, name, report)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from ..formats.axes import UP_AXES
 from .output import check_suffix, check_writable, write_and_report
 from .progress import clock
 from .sampling import whole
@@ -15,7 +16,7 @@ from .sampling import whole
 EXAMPLES = """examples:
   drgs import point_cloud.ply --mesh fuse_post.ply --out capture.drgs
   drgs import point_cloud.ply --mesh fuse_post.ply --env room.exr --up y --out capture.drgs
-  drgs import splats.compressed.ply --up y --resolution 256 --out splats.drgs
+  drgs import splats.compressed.ply --up=-y --resolution 256 --out splats.drgs
 """
 
 
@@ -25,7 +26,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="A.drgs", help="asset to write")
     parser.add_argument("--mesh", type=Path, help="their mesh; default: one is built around them")
     parser.add_argument("--env", type=Path, help="environment of the capture, kept in the asset")
-    parser.add_argument("--up", choices=("y", "z"), help="up axis of surfels and mesh; default: what the formats say")
+    parser.add_argument(
+        "--up",
+        choices=tuple(UP_AXES),
+        help="up axis of surfels and mesh, --up=-y for most photogrammetry; default: what the formats say",
+    )
     parser.add_argument(
         "--resolution", type=whole(8, 1024), metavar="N", help="voxels along the longest side of a built mesh"
     )

@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from ..formats.axes import UP_AXES
 from .output import check_suffix, check_writable, write_and_report
 from .progress import clock
 from .sampling import whole
@@ -23,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of ``drgs make``."""
     parser.add_argument("mesh", type=Path, metavar="MESH", help="mesh with materials (glTF, GLB, OBJ, PLY)")
     parser.add_argument("--out", type=Path, required=True, metavar="A.drgs", help="asset to write")
-    parser.add_argument("--up", choices=("y", "z"), help="up axis of the file; default: what its format says")
+    parser.add_argument("--up", choices=tuple(UP_AXES), help="up axis of the file; default: what its format says")
     parser.add_argument("--env", type=Path, help="environment kept in the asset")
     parser.add_argument(
         "--max-triangles", type=whole(1, 10**8), metavar="N", help="budget when the mesh is divided for texture detail"

@@ -26,6 +26,8 @@ CANDIDATES = 16
 REACH = 4.0
 #: Normals of a capture are trusted when at least this part of the surfels agrees with the nearest face.
 TRUST = 0.7
+#: Cosine to its face below which a surfel's normal is noise: the axis a flattened splat lost was not its normal.
+CREDIBLE = 0.5
 
 
 def project(mesh: Mesh, faces: Faces, points: Array) -> tuple[Array, Array, Array]:
@@ -71,13 +73,15 @@ def bind(mesh: Mesh, surfels: Surfels) -> tuple[Binding, dict[str, Any]]:
 
     On thin walls the nearest face may be the one on the other side. Where the normals of the capture can be trusted
     (most agree with the nearest face) a surfel that faces away from its face moves to a nearby face of its own
-    direction. Any that still disagrees is shaded with its normal flipped outwards; surfels have no inside.
+    direction. Any that still disagrees is shaded with its normal flipped outwards; surfels have no inside. A normal
+    more than 60 degrees off its face is not believed: such a surfel is shaded with the smooth normal of the mesh.
 
     Returns
     -------
     binding : Binding
     report : dict
-        "surfels", "flipped" (normal turned outwards), "other_side" (moved to a farther face of the same direction),
+        "surfels", "flipped" (normal turned outwards), "unsure_normals" (the mesh's are used),
+        "other_side" (moved to a farther face of the same direction),
         "normals_agree" (part of the surfels, 0..1), "distance_median", "distance_max" (metres), "far" (farther than
         two mean edges from the mesh), "snapped" (moved because they lie far beside the mesh), "degenerate_faces".
     """
@@ -97,6 +101,7 @@ def bind(mesh: Mesh, surfels: Surfels) -> tuple[Binding, dict[str, Any]]:
         agreement = dot(normal, faces.normal[face])
     flipped = agreement < 0
     normal = np.where(flipped[:, None], -normal, normal)
+    unsure = np.abs(agreement) < CREDIBLE
 
     corners = faces.corners[face]
     height = dot(surfels.centre - corners[:, 0], faces.normal[face])
@@ -110,11 +115,12 @@ def bind(mesh: Mesh, surfels: Surfels) -> tuple[Binding, dict[str, Any]]:
         face=face,
         barycentric=weights,
         offset=height / faces.mean_edge[face],
-        normal=np.einsum("nij,ni->nj", frames, normal),
+        normal=np.where(unsure[:, None], (0.0, 0.0, 1.0), np.einsum("nij,ni->nj", frames, normal)),
     )
     report = {
         "surfels": len(surfels),
         "flipped": int(flipped.sum()),
+        "unsure_normals": int(unsure.sum()),
         "other_side": int(moved.sum()),
         "normals_agree": agree,
         "distance_median": float(np.median(distance)),

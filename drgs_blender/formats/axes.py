@@ -1,4 +1,7 @@
-"""Y-up files to Z up, exactly as Blender's importers turn them: (x, y, z) -> (x, -z, y)."""
+"""Other up axes to Z up, as Blender's importers turn them: a rotation about X, (x, y, z) -> (x, -z, y) for Y up.
+
+Photogrammetry often has -Y up (the cameras' own axes).
+"""
 
 from __future__ import annotations
 
@@ -11,37 +14,50 @@ from .files import MeshFile
 
 Array = np.ndarray
 
-#: Rotation by +90 degrees about X: Y up becomes Z up.
-Y_TO_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-#: The same as a quaternion, wxyz.
-Y_TO_Z_UP_QUATERNION = np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])
+#: Up axis of a file -> (3, 3) rotation that brings it to Z up; entries are exact.
+UP_AXES: dict[str, Array] = {
+    "z": np.eye(3),
+    "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
+    "-z": np.diag([1.0, -1.0, -1.0]),
+    "-y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
+}
+_HALF = np.sqrt(0.5)
+#: The same rotations as quaternions, wxyz.
+_QUATERNIONS = {
+    "z": np.array([1.0, 0.0, 0.0, 0.0]),
+    "y": np.array([_HALF, _HALF, 0.0, 0.0]),
+    "-z": np.array([0.0, 1.0, 0.0, 0.0]),
+    "-y": np.array([_HALF, -_HALF, 0.0, 0.0]),
+}
 
 
-def vectors_to_z_up(vectors: Array) -> Array:
-    """Turn (..., 3) positions or directions from Y up to Z up; same dtype."""
-    x, y, z = np.moveaxis(vectors, -1, 0)
-    return np.ascontiguousarray(np.stack([x, -z, y], axis=-1))
+def vectors_to_z_up(vectors: Array, up: str = "y") -> Array:
+    """Turn (..., 3) positions or directions from `up` (a key of `UP_AXES`) to Z up; same dtype."""
+    turn = UP_AXES[up]
+    source = np.abs(turn).argmax(axis=1)
+    sign = turn[np.arange(3), source].astype(vectors.dtype)
+    return np.ascontiguousarray(vectors[..., source] * sign)
 
 
-def surfels_to_z_up(surfels: Surfels) -> Surfels:
-    """Turn surfels from Y up to Z up: centres and rotations.
+def surfels_to_z_up(surfels: Surfels, up: str = "y") -> Surfels:
+    """Turn surfels from `up` to Z up: centres and rotations.
 
     Spherical harmonics stay in the old axes (they are kept as captured, not shaded with).
     """
     return replace(
         surfels,
-        centre=vectors_to_z_up(surfels.centre),
-        rotation=multiply_quaternions(Y_TO_Z_UP_QUATERNION, surfels.rotation).astype(np.float32),
+        centre=vectors_to_z_up(surfels.centre, up),
+        rotation=multiply_quaternions(_QUATERNIONS[up], surfels.rotation).astype(np.float32),
     )
 
 
-def mesh_to_z_up(mesh: MeshFile) -> MeshFile:
-    """Turn a mesh from Y up to Z up: vertices and normals."""
+def mesh_to_z_up(mesh: MeshFile, up: str = "y") -> MeshFile:
+    """Turn a mesh from `up` to Z up: vertices and normals."""
     normals = mesh.corner_normals
     return replace(
         mesh,
-        vertices=vectors_to_z_up(mesh.vertices),
-        corner_normals=None if normals is None else vectors_to_z_up(normals),
+        vertices=vectors_to_z_up(mesh.vertices, up),
+        corner_normals=None if normals is None else vectors_to_z_up(normals, up),
         up_axis="Z",
     )
 

@@ -249,3 +249,21 @@ def test_wrong_input_is_told():
     surfels.centre[3] = np.nan
     with pytest.raises(AssetError, match="1 centres"):
         bind(mesh, surfels)
+
+
+def test_normals_across_the_surface_are_not_believed():
+    mesh = blob()
+    surfels = shell_surfels(mesh, tilt=0)
+    frames = rotation_matrices(surfels.rotation.astype(float))
+    across = np.arange(len(surfels)) % 4 == 0
+    # Cyclic order of the axes: the normal becomes a tangent.
+    frames[across] = frames[across][..., [1, 2, 0]]
+    surfels.rotation = quaternions(frames).astype(np.float32)
+    binding, report = bind(mesh, surfels)
+    assert report["unsure_normals"] == across.sum()
+    assert (binding.normal[across] == [0, 0, 1]).all()
+    posed = MeshDriven(mesh, surfels, binding).pose(mesh.vertices)
+    outside = np.where(across[:, None], frames[..., 1], frames[..., 2])
+    # The analytic normal of the ellipsoid; the mesh's own is as coarse as its triangles.
+    agreement = np.einsum("nc,nc->n", posed.normal, outside)
+    assert (agreement[~across] > 0.9999).all() and (agreement > 0.8).all() and agreement[across].mean() > 0.99

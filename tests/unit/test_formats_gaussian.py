@@ -9,7 +9,7 @@ import pytest
 
 from drgs_blender.asset import Surfels
 from drgs_blender.errors import AssetError
-from drgs_blender.formats.axes import Y_TO_Z_UP, surfels_to_z_up
+from drgs_blender.formats.axes import UP_AXES, surfels_to_z_up
 from drgs_blender.formats.colour import linear_to_srgb, srgb_to_linear
 from drgs_blender.formats.gaussian_ply import SH_C0
 from drgs_blender.formats.gltf_nodes import rotation_matrix
@@ -218,11 +218,15 @@ def test_no_splats_is_a_valid_file(tmp_path: Path) -> None:
         assert len(read_surfels(write(tmp_path / "a.ply", random_columns(layout, 0))).surfels) == 0
 
 
-def test_turning_up_commutes_with_the_frame(tmp_path: Path) -> None:
+@pytest.mark.parametrize("up", UP_AXES)
+def test_turning_up_commutes_with_the_frame(tmp_path: Path, up: str) -> None:
     s = read_surfels(write(tmp_path / "a.ply", random_columns("2DGS"))).surfels
-    turned = surfels_to_z_up(s)
-    np.testing.assert_allclose(turned.centre, s.centre @ Y_TO_Z_UP.T, atol=1e-6)
-    np.testing.assert_allclose(frames(turned), Y_TO_Z_UP @ frames(s), atol=1e-5)
+    turned, turn = surfels_to_z_up(s, up), UP_AXES[up]
+    axis = np.eye(3)["xyz".index(up[-1])] * (-1 if up.startswith("-") else 1)
+    np.testing.assert_array_equal(turn @ axis, [0, 0, 1])
+    assert np.linalg.det(turn) == 1
+    np.testing.assert_allclose(turned.centre, s.centre @ turn.T, atol=1e-6)
+    np.testing.assert_allclose(frames(turned), turn @ frames(s), atol=1e-5)
 
 
 def test_a_real_capture_with_two_scales_is_the_flattened_one_with_three(shared_data: Path) -> None:
