@@ -61,7 +61,7 @@ def main() -> int:
     examples = ROOT / "examples"
     run(*drgs, "make", examples / "robot/RobotExpressive.glb", "--out", out / "robot.drgs")
     run(*drgs, "make", examples / "helmet/FlightHelmet.gltf", "--out", out / "helmet.drgs")
-    run(*drgs, "import", examples / "playbot/playbot.ply", "--up", "y", "--out", out / "playbot.drgs")
+    run(*drgs, "import", examples / "playbot/playbot.ply", "--up=-y", "--out", out / "playbot.drgs")
     run(sys.executable, ROOT / "tools/extension.py", "--out", out / "extension.zip")
     blender = os.environ.get("DRGS_BLENDER_PYTHON", ROOT / ".venv-blender" / BIN / f"python{EXE}")
     environment = os.environ | {"BLENDER_USER_RESOURCES": str(out / "blender"), "DRGS_ENGINE": sys.executable}

@@ -105,13 +105,13 @@ def main(zip_path: Path, assets: Path, blend: Path) -> None:
     bpy.ops.wm.save_as_mainfile(filepath=str(blend))
     add_robot(assets)
     helmet = import_drgs(assets / "helmet.drgs")
-    stand(helmet, 1.7, Vector((2.6, 0.6, 0.0)))
+    stand(helmet, 3.2, Vector((4.4, 0.5, 0.0)))
     for frame, degrees in ((1, -30), (FRAMES, 60)):
         helmet.rotation_euler = (0, 0, math.radians(degrees))
         helmet.keyframe_insert("rotation_euler", frame=frame)
-    stand(import_drgs(assets / "playbot.drgs"), 1.9, Vector((-2.5, 0.4, 0.0)), math.radians(20))
-    add_turning_world("studio.exr")
-    add_camera(Vector((0.0, 0.0, 1.9)), 12.5)
+    stand(import_drgs(assets / "playbot.drgs"), 2.4, Vector((-4.4, 0.8, 0.0)), math.radians(-15))
+    add_turning_world("courtyard.exr")
+    add_camera(Vector((0.0, 0.0, 1.9)), 15.0)
     scene.render.engine = "DRGS"
     scene.render.resolution_x = scene.render.resolution_y = SIZE
     bpy.ops.wm.save_as_mainfile(filepath=str(blend))
