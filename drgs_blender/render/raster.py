@@ -7,8 +7,10 @@ denominator. They are written relative to the projected centre, where u = v = 0:
 The same form holds for orthographic cameras. (Huang et al., "2D Gaussian Splatting", 2024, section 4, states it
 through two planes.)
 
-The kernel of a sample is G = max(exp(-(u^2 + v^2) / 2), exp(-d^2)), d the distance in **pixels** between the sample
-and the projected centre: the low-pass filter of that paper. A sample that the low-pass decides has the centre's depth.
+The kernel of a sample is G = max(exp(-(u^2 + v^2) / 2), exp(-n d^2)), d the distance in pixels between the sample and
+the projected centre, n the samples a pixel: the low-pass filter of that paper at the rate at which the picture is
+sampled, so that silhouettes do not grow by a pixel where there are sub-samples. A sample that the low-pass decides has
+the centre's depth.
 Contributions alpha G below 1/255 are skipped, others clamped to 0.99 and blended until the transmittance is below 1e-4.
 
 Order. Surfels are sorted once by centre depth, yet blended by the depth at which the ray meets them: every sample
@@ -276,7 +278,7 @@ def _project(
         s = screen[i]
         s[:] = 0.0
         s[_RX], s[_RY], s[_ZC], s[_CUT] = rx, ry, c[2], cut
-        s[_LOW] = 2.0 if in_front else 1e30
+        s[_LOW] = 2.0 * p[AA] if in_front else 1e30
         if length <= 0.0:
             s[_A], s[_N], s[_D] = 1e15, 1.0, c[2]  # a point: only the low-pass sees it
         elif ortho:
@@ -300,7 +302,7 @@ def _project(
                 s[_B] = k * (c[0] * a[1] - c[1] * a[0])
                 s[_N] = k * nz
         # Screen bounds.
-        low = np.sqrt(0.5 * cut)
+        low = np.sqrt(0.5 * cut / p[AA])
         if ortho:
             lo_x, hi_x = _span(fx, rx, 1.0, a[0], b[0], 0.0, 0.0, cut)
             lo_y, hi_y = _span(fy, ry, 1.0, a[1], b[1], 0.0, 0.0, cut)

@@ -70,7 +70,7 @@ def test_g_buffer(scene: str, orthographic: bool):
     splats = reference.Splats.from_posed(posed)
     place = torch.from_numpy(position.reshape(-1, 2))
     with torch.no_grad():
-        truth = reference.rasterise(splats, view, place, kernel.GAP)
+        truth = reference.rasterise(splats, view, place, kernel.GAP, samples=AA)
 
     coverage, depth = found.alpha.reshape(-1), found.depth.reshape(-1)
     surface = found.surface.reshape(-1, 9)

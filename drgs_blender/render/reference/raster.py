@@ -122,6 +122,7 @@ def rasterise(
     camera: Camera,
     position: Tensor | None = None,
     gap: float | None = None,
+    samples: int = 1,
     chunk: int = 1 << 18,
 ) -> ReferenceGBuffer:
     """G-buffer of surfels at pixel positions.
@@ -137,12 +138,13 @@ def rasterise(
     gap : split the contributions where the depth jumps by more than this many times the mean size of the surfels on
         both sides (the larger standard deviation, at least a pixel), and describe the heaviest part alone; coverage
         is that of all. None blends all contributions
+    samples : positions a pixel; the low-pass filter is that much narrower in variance
     chunk : surfel-pixel pairs held at once
     """
     if position is None:
         position = pixel_centres(camera, splats.centre.dtype, str(splats.centre.device))
     step = max(1, chunk // max(1, len(splats.centre)))
-    parts = [_blend(splats, camera, p, gap) for p in position.split(step)]
+    parts = [_blend(splats, camera, p, gap, samples) for p in position.split(step)]
     return ReferenceGBuffer(
         **{f.name: torch.cat([getattr(p, f.name) for p in parts]) for f in fields(ReferenceGBuffer)}
     )
@@ -161,7 +163,7 @@ def _heaviest_part(depth: Tensor, weight: Tensor, size: Tensor, gap: float) -> T
     return (run == total.argmax(1, keepdim=True)) & counts
 
 
-def _blend(splats: Splats, camera: Camera, position: Tensor, gap: float | None) -> ReferenceGBuffer:
+def _blend(splats: Splats, camera: Camera, position: Tensor, gap: float | None, samples: int) -> ReferenceGBuffer:
     if not len(splats.centre):
         empty, rows = position.new_zeros(len(position)), position.new_zeros(len(position), 3)
         return ReferenceGBuffer(empty, empty, rows, rows, rows, empty, empty)
@@ -172,7 +174,7 @@ def _blend(splats: Splats, camera: Camera, position: Tensor, gap: float | None) 
     centre, centre_depth = project(camera, splats.centre)
     distance2 = ((position[:, None] - centre) ** 2).sum(-1)
     seen = (centre_depth > camera.clip_start) & (centre_depth < camera.clip_end)
-    around = torch.exp(-0.5 / FILTER_VARIANCE * torch.where(seen, distance2, torch.inf))
+    around = torch.exp(-0.5 * samples / FILTER_VARIANCE * torch.where(seen, distance2, torch.inf))
 
     depth = torch.where(inside >= around, t, centre_depth.expand_as(t))
     alpha = (splats.opacity * torch.maximum(inside, around)).clamp(max=MAX_ALPHA)
