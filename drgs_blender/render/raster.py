@@ -561,7 +561,7 @@ def _blend(
         running, resolved = np.empty(capacity, np.float32), np.empty(capacity, np.float32)
         farthest = np.empty(capacity, np.float32)
         win_z, win_a = np.empty((capacity, WINDOW), np.float32), np.empty((capacity, WINDOW), np.float32)
-        win_i = np.empty((capacity, WINDOW), np.int32)
+        win_i = np.empty((capacity, WINDOW), np.uint32)
         acc, best = np.empty((capacity, _CLUSTER), np.float32), np.empty((capacity, _CLUSTER), np.float32)
         alpha_run, z_run = np.empty(per_row, np.float32), np.empty(per_row, np.float32)
         for task in range(worker, n_tiles, workers):
@@ -606,7 +606,7 @@ def _blend(
                         alpha = alpha_run[j]
                         if alpha == zero:
                             continue
-                        at = base + j
+                        at = np.uintp(base + j)  # unsigned: no check for negative indices
                         z = z_run[j]
                         before = running[at]
                         if before < stop and z >= farthest[at]:
