@@ -59,7 +59,8 @@ def psnr(a: Array, b: Array, mask: Array | None = None) -> float:
 
 def foreground(alpha: Array, erode: int = 2) -> Array:
     """Mask of fully covered pixels, eroded."""
-    return binary_erosion(alpha > 0.999, iterations=erode)
+    covered = alpha > 0.999
+    return binary_erosion(covered, iterations=erode) if erode else covered
 
 
 def look_at(eye: Array, target: Array) -> Array:

@@ -1,6 +1,6 @@
 """Run benchmark programs one after the other; each writes its section of docs/benchmarks.md.
 
-    python bench/run.py [NAME ...]      # parity primary frame engine deform embree; all by default
+python bench/run.py [NAME ...]      # parity primary frame engine deform embree; all by default
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Numba, set up once: cached compilation in a user folder, the `workqueue` layer, no fast-math on NaN.
+"""Numba, set up once: cached compilation in a user folder, the `workqueue` layer, strict arithmetic.
+
+Strict, because with fast-math the same source gave other last digits when a kernel came out of the cache than when it
+had just been compiled, and a frame is the same picture either way; it costs nothing that could be measured.
 
 Import ``njit``, ``prange`` and friends from here, never from numba, so that the settings below come first. One
 parallel kernel may run at a time in a process (workqueue is not re-entrant).
@@ -6,10 +9,17 @@ parallel kernel may run at a time in a process (workqueue is not re-entrant).
 
 from __future__ import annotations
 
+import hashlib
+import logging
 import os
+import shutil
 import sys
+import time
 from pathlib import Path
 from typing import Any
+
+log = logging.getLogger(__name__)
+_MONTH = 30 * 24 * 3600.0
 
 
 def cache_folder() -> Path:
@@ -25,24 +35,48 @@ def cache_folder() -> Path:
     return base / "drgs" / "numba"
 
 
-os.environ.setdefault("NUMBA_CACHE_DIR", str(cache_folder()))
+def source_digest() -> str:
+    """Digest of the package's sources.
+
+    Numba notices that a kernel's own file changed, but not the files of the functions that it calls: kernels of
+    different sources must not share a cache.
+    """
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.rglob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def current_cache() -> Path:
+    """The part of `cache_folder` for these sources, marked as used; parts unused for a month are removed."""
+    folder = cache_folder() / source_digest()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        os.utime(folder)
+        for other in folder.parent.iterdir():
+            if other.is_dir() and time.time() - other.stat().st_mtime > _MONTH:
+                shutil.rmtree(other, ignore_errors=True)
+    except OSError as error:
+        log.info("compiled kernels cannot be kept in %s (%s)", folder, error)
+    return folder
+
+
 os.environ.setdefault("NUMBA_THREADING_LAYER", "workqueue")
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import numba  # noqa: E402
 from numba import get_num_threads, prange, set_num_threads  # noqa: E402
 
-#: Floating-point freedoms that keep NaN and Inf: reassociation, contraction (FMA), reciprocals, no signed zeros.
-#: Caution: `isfinite` of a sum becomes True (it is x - x == 0, which reassociation cancels); compare `abs(x) < limit`.
-FAST = {"reassoc", "contract", "arcp", "nsz", "afn"}
+if "NUMBA_CACHE_DIR" not in os.environ:
+    numba.config.CACHE_DIR = str(current_cache())
 
 
 def njit(function: Any = None, **options: Any) -> Any:
-    """``numba.njit`` with caching, `FAST` arithmetic, no division errors, no interpreter lock.
+    """``numba.njit`` with caching, no division errors, no interpreter lock.
 
     Without the lock, the engine hears a cancel and shows that it is alive while a kernel runs.
     """
-    options = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": FAST} | options
+    options = {"cache": True, "nogil": True, "error_model": "numpy"} | options
     if function is None:
         return lambda f: numba.njit(f, **options)
     return numba.njit(function, **options)
@@ -54,4 +88,4 @@ def use_threads(count: int) -> None:
     set_num_threads(limit if count <= 0 else min(count, limit))
 
 
-__all__ = ["FAST", "cache_folder", "get_num_threads", "njit", "prange", "set_num_threads", "use_threads"]
+__all__ = ["cache_folder", "get_num_threads", "njit", "prange", "set_num_threads", "source_digest", "use_threads"]

@@ -40,7 +40,7 @@ def make_asset(
     up: str | None = None,
     max_triangles: int = MAX_TRIANGLES,
     tolerance: float = TOLERANCE,
-    density: float = 100.0,
+    density: float = 140.0,
     pretrained: Surfels | None = None,
     environment: Environment | str | Path | None = None,
 ) -> Asset:

@@ -26,6 +26,11 @@ log = logging.getLogger(__name__)
 
 #: Standard deviations of a fitted surfel over those of its triangle's area: opaque inside, little bleeding outside.
 SPREAD = 1.8
+#: The same across a sharp edge that the surfel's piece of face ends at: alpha is half on the edge itself, where a
+#: triangle's centroid is 2^(1/2) deviations away.
+RIM = 1.2
+#: Cosine between the normals of two faces below which their common edge is sharp (30 degrees).
+SHARP = 0.866
 #: Opacity of surfels made from a mesh alone.
 OPAQUE = 0.99
 #: Opacity where pretrained surfels were given but none is near (paper's initial value).
@@ -48,7 +53,7 @@ def attach(
     tau: float = 0.02,
     *,
     scale: Literal["fitted", "paper"] = "fitted",
-    density: float = 100.0,
+    density: float = 140.0,
     spread: float = SPREAD,
     opacity: float = OPAQUE,
 ) -> tuple[Surfels, Binding, dict[str, Any]]:
@@ -100,7 +105,9 @@ def attach(
     if scale == "paper":
         deviation = _nearest_centres(faces, patches.face)
     else:
-        frame, deviation = _fit(frame, centre, np.einsum("npk,nkc->npc", patches.weights, corners), spread)
+        rims = _rims(patches, corners, faces.normal[patches.face], sharp_edges(mesh, faces))
+        pieces = np.einsum("npk,nkc->npc", patches.weights, corners)
+        frame, deviation = _fit(frame, centre, pieces, spread, rims)
 
     at = mesh.faces[patches.face]
     mix = lambda values: np.clip(np.einsum("nk,nk...->n...", weights, values[at]), 0, 1)  # noqa: E731
@@ -158,17 +165,48 @@ def _face_frames(corners: Array, normal: Array) -> Array:
     return np.stack([tangent, np.cross(normal, tangent), normal], -1)
 
 
-def _fit(frame: Array, centre: Array, pieces: Array, spread: float) -> tuple[Array, Array]:
+def sharp_edges(mesh: Mesh, faces: Faces) -> Array:
+    """(m, 3) bool: whether the edge of a face opposite its corner k is an outline, a fold or a rim.
+
+    Vertices at one place count as one, so that hard edges whose vertices are split are judged by their angle.
+    """
+    _, place = np.unique(mesh.vertices, axis=0, return_inverse=True)
+    corner = place.reshape(-1)[mesh.faces]
+    ends = np.sort(np.stack([corner[:, [1, 2]], corner[:, [2, 0]], corner[:, [0, 1]]], axis=1).reshape(-1, 2), axis=1)
+    edge = np.unique(ends, axis=0, return_inverse=True)[1].reshape(-1)
+    proper = np.repeat(~faces.degenerate, 3)
+    count = np.bincount(edge[proper], minlength=edge.max() + 1)
+    normal = np.repeat(faces.normal, 3, axis=0)
+    # Two unit normals add up to a length of 2 cos(angle / 2).
+    total = np.stack([np.bincount(edge[proper], normal[proper, c], len(count)) for c in range(3)], -1)
+    smooth = (count == 2) & (np.einsum("ec,ec->e", total, total) >= 2 + 2 * SHARP)
+    return ~smooth[edge].reshape(-1, 3)
+
+
+def _rims(patches: _Patches, corners: Array, normal: Array, sharp: Array) -> Array:
+    """(n, 3, 3): unit directions across the sharp edges that a patch lies on, by the corner opposite; 0 elsewhere."""
+    along = np.roll(corners, 1, axis=1) - np.roll(corners, -1, axis=1)
+    across = unit(np.cross(normal[:, None], along).reshape(-1, 3)).reshape(-1, 3, 3)
+    on = (patches.weights == 0).sum(axis=1) == 2  # bisection keeps weights on an edge exactly zero
+    return across * (on & sharp[patches.face])[..., None]
+
+
+def _fit(frame: Array, centre: Array, pieces: Array, spread: float, rims: Array) -> tuple[Array, Array]:
     """Frame turned to the principal axes of each piece (n, 3, 3), and its deviations (n, 2) about `centre`.
 
     A triangle's covariance is the sum of its corners' outer products about the centroid over 12; a centre moved by d
-    adds d d^T, so that the surfel still covers its piece.
+    adds d d^T, so that the surfel still covers its piece. Across `rims` the spread is at most `RIM`.
     """
+    less = max(0.0, 1 - RIM / spread)
     plane = frame[:, :, :2]
     middle = pieces.mean(axis=1)
     rays = np.einsum("npc,nci->npi", pieces - middle[:, None], plane)
     moved = np.einsum("nc,nci->ni", middle - centre, plane)
     covariance = np.einsum("npi,npj->nij", rays, rays) / 12 + np.einsum("ni,nj->nij", moved, moved)
+    for k in range(3):
+        across = np.einsum("nc,nci->ni", rims[:, k], plane)
+        shrink = np.eye(2) - less * across[:, :, None] * across[:, None, :]
+        covariance = shrink @ covariance @ shrink
     values, axes = np.linalg.eigh(covariance)
     values, axes = values[:, ::-1], axes[:, :, ::-1]  # longest first
     axes = axes * np.where(np.linalg.det(axes) < 0, -1, 1)[:, None, None] ** np.array([0, 1])

@@ -14,7 +14,8 @@ import math
 
 import numpy as np
 
-from .sampling import HALF, INVERSE_PI, ONE, PI, TWO, ZERO, F, exact, sincos_turns
+from ..jit import njit
+from .sampling import HALF, INVERSE_PI, ONE, PI, TWO, ZERO, F, sincos_turns
 
 Array = np.ndarray
 
@@ -26,14 +27,14 @@ _F0 = F(0.04)
 _NODES = 16
 
 
-@exact
+@njit
 def alpha_squared(roughness):  # type: ignore[no-untyped-def]
     """Square of GGX's alpha = max(roughness^2, 1e-3)."""
     alpha = max(roughness * roughness, F(1e-3))
     return alpha * alpha
 
 
-@exact
+@njit
 def fresnel_dielectric(c):  # type: ignore[no-untyped-def]
     """Unpolarised Fresnel reflectance of IOR 1.5 at cosine c from outside."""
     eta2 = F(_IOR * _IOR)
@@ -43,7 +44,7 @@ def fresnel_dielectric(c):  # type: ignore[no-untyped-def]
     return HALF * a * a * (ONE + b * b)
 
 
-@exact
+@njit
 def layer_albedo(roughness, nv, table):  # type: ignore[no-untyped-def]
     """Cycles' estimate of the dielectric lobe's directional albedo: bilinear in (n . v, roughness)."""
     last = F(_NODES - 1)
@@ -55,7 +56,7 @@ def layer_albedo(roughness, nv, table):  # type: ignore[no-untyped-def]
     return low + b * (high - low)
 
 
-@exact
+@njit
 def diffuse_weight(roughness, metallic, nv, look, table):  # type: ignore[no-untyped-def]
     """What multiplies albedo / pi in the diffuse lobe."""
     if look == PAPER:
@@ -63,7 +64,7 @@ def diffuse_weight(roughness, metallic, nv, look, table):  # type: ignore[no-unt
     return (ONE - metallic) * (ONE - layer_albedo(roughness, nv, table))
 
 
-@exact
+@njit
 def fresnel(vh, r, g, b, metallic, look):  # type: ignore[no-untyped-def]
     """Reflectance (RGB) of the specular lobes at half-vector cosine vh."""
     x = max(ZERO, ONE - vh)
@@ -81,7 +82,7 @@ def fresnel(vh, r, g, b, metallic, look):  # type: ignore[no-untyped-def]
     )
 
 
-@exact
+@njit
 def ggx(nl, nv, nh2, sin2, a2):  # type: ignore[no-untyped-def]
     """D G / (4 nl nv) of GGX with height-correlated Smith, and D; nh2 = cos^2, sin2 = sin^2 of the half vector.
 
@@ -93,7 +94,7 @@ def ggx(nl, nv, nh2, sin2, a2):  # type: ignore[no-untyped-def]
     return d * HALF / smith, d
 
 
-@exact
+@njit
 def vndf_terms(nv, a2):  # type: ignore[no-untyped-def]
     """(bound, norm): the cap's lower bound factor k, and what turns D into the density of reflected directions."""
     s = ONE + math.sqrt(max(ZERO, ONE - nv * nv))
@@ -102,7 +103,7 @@ def vndf_terms(nv, a2):  # type: ignore[no-untyped-def]
     return bound, HALF / (bound * nv + math.sqrt(a2 + (ONE - a2) * nv * nv))
 
 
-@exact
+@njit
 def sample_vndf(u, v, ix, iy, iz, alpha, bound):  # type: ignore[no-untyped-def]
     """Reflected direction for view (ix, iy, iz), iz > 0, in the frame of the normal."""
     x, y = ix * alpha, iy * alpha
@@ -119,7 +120,7 @@ def sample_vndf(u, v, ix, iy, iz, alpha, bound):  # type: ignore[no-untyped-def]
     return twice * hx - ix, twice * hy - iy, twice * hz - iz
 
 
-@exact
+@njit
 def evaluate(nl, nv, vl, nh2, sin2, r, g, b, kd, metallic, a2, norm, look):  # type: ignore[no-untyped-def]
     """Diffuse and specular (RGB each) BRDF values and the density of ``sample_vndf``; all without the cosine.
 

@@ -14,7 +14,8 @@ import numpy as np
 
 from ..errors import UsageError
 from ..frame import Camera, RenderSettings
-from .sampling import GOLDEN, exact, mix
+from ..jit import njit
+from .sampling import GOLDEN, mix
 
 Array = np.ndarray
 
@@ -82,7 +83,7 @@ def camera_parameters(camera: Camera, settings: RenderSettings, frame_number: in
     return out
 
 
-@exact
+@njit
 def pixel_shift(parameters: Any, pixel: Any) -> Any:
     """Toroidal shift (x, y) in [0, 1) of the sub-pixel lattice of `pixel` (index y * width + x)."""
     h = mix(np.uint32(pixel) ^ np.uint32(np.int64(parameters[SEED])))
@@ -90,7 +91,7 @@ def pixel_shift(parameters: Any, pixel: Any) -> Any:
     return np.float64(h) * 2.0**-32, np.float64(g) * 2.0**-32
 
 
-@exact(inline="always")
+@njit(inline="always")
 def lattice(shift_x: Any, shift_y: Any, sample: Any, aa: Any) -> Any:
     """Position of sub-pixel sample number `sample` of `aa` inside its pixel, both in [0, 1)."""
     x = shift_x + sample / aa
@@ -99,7 +100,7 @@ def lattice(shift_x: Any, shift_y: Any, sample: Any, aa: Any) -> Any:
     return min(x - math.floor(x), 0.995), min(y - math.floor(y), 0.995)
 
 
-@exact
+@njit
 def camera_ray(parameters: Any, px: Any, py: Any) -> Any:
     """World-space ray through pixel position (px, py).
 
@@ -131,7 +132,7 @@ def camera_ray(parameters: Any, px: Any, py: Any) -> Any:
     )
 
 
-@exact
+@njit
 def sample_ray(parameters: Any, pixel: Any, sample: Any) -> Any:
     """`camera_ray` through sub-pixel sample `sample` of `pixel` (index y * width + x)."""
     width = np.int64(parameters[WIDTH])

@@ -21,8 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from ..jit import prange
-from .sampling import exact
+from ..jit import njit, prange
 
 Array = np.ndarray
 
@@ -109,7 +108,7 @@ def denoise(
     return out
 
 
-@exact(inline="always")
+@njit(inline="always")
 def _colour(lobe: Any, albedo: Any, metallic: Any, y: Any, x: Any) -> Any:
     """Surface colour of a lobe's light, at least COLOUR_FLOOR: diffuse a (1 - m), glossy Fresnel's F0."""
     floor = np.float32(COLOUR_FLOOR)
@@ -121,12 +120,12 @@ def _colour(lobe: Any, albedo: Any, metallic: Any, y: Any, x: Any) -> Any:
     return max(base + m * r, floor), max(base + m * g, floor), max(base + m * b, floor)
 
 
-@exact(inline="always")
+@njit(inline="always")
 def _luminance(r: Any, g: Any, b: Any) -> Any:
     return np.float32(0.2126) * r + np.float32(0.7152) * g + np.float32(0.0722) * b
 
 
-@exact(inline="always")
+@njit(inline="always")
 def _lobe_luminance(light: Any, y: Any, x: Any, lobe: Any) -> Any:
     total = np.float32(0.0)
     for part in range(light.shape[3]):
@@ -134,7 +133,7 @@ def _lobe_luminance(light: Any, y: Any, x: Any, lobe: Any) -> Any:
     return total
 
 
-@exact(parallel=True)
+@njit(parallel=True)
 def _demodulate(
     components: Any,
     variance: Any,
@@ -190,7 +189,7 @@ def _demodulate(
             g[_VALID] = valid
 
 
-@exact(parallel=True)
+@njit(parallel=True)
 def _clamp_fireflies(guide: Any, light: Any, spread: Any, out: Any, out_spread: Any) -> None:
     """Scale down outliers among 5 x 5 neighbours of the same object, and fill in pixels that hold no number."""
     h, w = guide.shape[:2]
@@ -230,7 +229,7 @@ def _clamp_fireflies(guide: Any, light: Any, spread: Any, out: Any, out_spread: 
                 out_spread[y, x, 2 + lobe] = own * scale
 
 
-@exact(inline="always")
+@njit(inline="always")
 def _exp(x: Any) -> Any:
     """exp(x) for x <= 0, relative error below 2e-4: (1 + r)^256 would lose bits, so 2^n times a cubic of 2^f."""
     t = max(x * np.float32(1.4426950408889634), np.float32(-30.0))
@@ -242,7 +241,7 @@ def _exp(x: Any) -> Any:
     return y / np.float32(1 << np.int64(-n))
 
 
-@exact(parallel=True)
+@njit(parallel=True)
 def _a_trous(step: Any, guide: Any, light: Any, spread: Any, out: Any, out_spread: Any) -> None:
     """One level: 5 x 5 B-spline taps `step` pixels apart."""
     h, w = guide.shape[:2]
@@ -330,7 +329,7 @@ def _a_trous(step: Any, guide: Any, light: Any, spread: Any, out: Any, out_sprea
             out_spread[y, x, 2], out_spread[y, x, 3] = _lobe_luminance(out, y, x, 0), _lobe_luminance(out, y, x, 1)
 
 
-@exact(parallel=True)
+@njit(parallel=True)
 def _modulate(light: Any, guide: Any, coverage: Any, albedo: Any, metallic: Any, out: Any) -> None:
     """Multiply by surface colour and coverage again."""
     h, w = coverage.shape

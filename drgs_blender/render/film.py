@@ -18,13 +18,12 @@ from typing import Any
 import numpy as np
 
 from ..frame import Camera, RenderSettings
-from ..jit import prange
+from ..jit import njit, prange
 from .camera import FX, FY, ORTHOGRAPHIC, WIDTH, sample_ray
 from .denoise import Guides
 from .gbuffer import GBuffer
 from .light import EnvironmentLight, radiance_at, to_map
 from .points import Radiance
-from .sampling import exact
 
 Array = np.ndarray
 
@@ -152,7 +151,7 @@ class Film:
         return out
 
 
-@exact(parallel=True)
+@njit(parallel=True)
 def _develop(
     start: Any,
     x0: Any,
@@ -235,7 +234,7 @@ def _develop(
             first = last
 
 
-@exact(parallel=True)
+@njit(parallel=True)
 def _background(p: Any, x0: Any, y0: Any, alpha: Any, radiance: Any, rotation: Any, out: Any) -> None:
     """Add the world's radiance along every sub-pixel ray, weighted by what the surfaces leave uncovered."""
     width = np.int64(p[WIDTH])

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from ..jit import njit
 from .camera import AA, WIDTH
 from .points import ShadingPoints
-from .sampling import exact
 
 Array = np.ndarray
 
@@ -63,7 +63,7 @@ def compact(alpha: Array, parameters: Array, x0: int, y0: int) -> tuple[GBuffer,
     return GBuffer((y0, y0 + len(alpha)), points, position, depth, owner, alpha), start
 
 
-@exact
+@njit
 def _number(alpha: Any, p: Any, x0: Any, y0: Any, pixel: Any, sample: Any, weight: Any) -> None:
     """List the covered samples in order."""
     width = np.int64(p[WIDTH])
@@ -80,7 +80,7 @@ def _number(alpha: Any, p: Any, x0: Any, y0: Any, pixel: Any, sample: Any, weigh
                     n += 1
 
 
-@exact(inline="always")
+@njit(inline="always")
 def face_viewer(nx: Any, ny: Any, nz: Any, gx: Any, gy: Any, gz: Any, vx: Any, vy: Any, vz: Any) -> Any:
     """Shading normal on the side of the geometric normal g, which faces the viewer at v, and visible from there.
 

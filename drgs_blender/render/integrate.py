@@ -12,12 +12,12 @@ import numpy as np
 
 from ..errors import UsageError
 from ..frame import RenderSettings
-from ..jit import prange
+from ..jit import njit, prange
 from . import brdf, sampling
 from .embree import closest_hit, occluded
 from .light import EnvironmentLight, density_at, radiance_at, sample_map, to_map
 from .points import Radiance, ShadingPoints
-from .sampling import GOLDEN, INVERSE_PI, ONE, TWO, ZERO, F, U, exact, mix, unit
+from .sampling import GOLDEN, INVERSE_PI, ONE, TWO, ZERO, F, U, mix, unit
 from .scene import TraceScene
 
 Array = np.ndarray
@@ -97,14 +97,14 @@ def mixed(seed: int, frame_number: int) -> int:
     return value >> 32
 
 
-@exact
+@njit
 def _offset(px, py, pz, gx, gy, gz, extent):  # type: ignore[no-untyped-def]
     """Lift a ray's start off the surface by more than rounding can push it below."""
     lift = _OFFSET_POINT * max(abs(px), max(abs(py), abs(pz))) + _OFFSET_SCENE * extent
     return px + lift * gx, py + lift * gy, pz + lift * gz
 
 
-@exact
+@njit
 def _half_vector(nx, ny, nz, vx, vy, vz, lx, ly, lz, nl, nv):  # type: ignore[no-untyped-def]
     """(v . l, cos^2, sin^2) of the angle between the normal and the half vector."""
     vl = vx * lx + vy * ly + vz * lz
@@ -114,7 +114,7 @@ def _half_vector(nx, ny, nz, vx, vy, vz, lx, ly, lz, nl, nv):  # type: ignore[no
     return vl, (nl + nv) * (nl + nv) * inverse, (cx * cx + cy * cy + cz * cz) * inverse
 
 
-@exact
+@njit
 def _beyond(ox, oy, oz, dx, dy, dz, hit, tracer, geometry, light, table, look, bounces, key):  # type: ignore[no-untyped-def]
     """Radiance that comes back along a ray that hit a surface: a path of up to `bounces` vertices from that hit on.
 
@@ -219,7 +219,7 @@ def _beyond(ox, oy, oz, dx, dy, dz, hit, tracer, geometry, light, table, look, b
     return red, green, blue
 
 
-@exact
+@njit
 def _point(  # type: ignore[no-untyped-def]
     pixel, sample, surface, frame, tracer, geometry, light, table, numbers, aa, bounces, look, seed, components,
     variance,
@@ -312,7 +312,7 @@ def _point(  # type: ignore[no-untyped-def]
     variance[0], variance[1] = diffuse_2, glossy_2
 
 
-@exact(parallel=True)
+@njit(parallel=True)
 def _kernel(  # type: ignore[no-untyped-def]
     keys, frames, surfaces, tracer, geometry, light, table, numbers, aa, bounces, look, seed, components,
     variance,

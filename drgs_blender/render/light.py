@@ -14,7 +14,8 @@ import numpy as np
 from ..asset.model import as_float
 from ..errors import UsageError
 from ..frame import World
-from .sampling import exact, fast_acos, fast_atan2_turns, sincos_turns
+from ..jit import njit
+from .sampling import fast_acos, fast_atan2_turns, sincos_turns
 
 Array = np.ndarray
 
@@ -37,7 +38,7 @@ def _morton(rows: Array, columns: Array) -> Array:
     return (spread(rows) << np.uint32(1)) | spread(columns)
 
 
-@exact
+@njit
 def _guide_table(upper, guide):  # type: ignore[no-untyped-def]
     """First cell of each equal slice of the random numbers: the inversion starts there (Chen and Asau 1974)."""
     width = np.uint64(1 << 32) // np.uint64(len(guide))
@@ -147,7 +148,7 @@ class EnvironmentLight:
         return _sample_many(numbers, self.cells, self.density, self.row_z, self.rotation)
 
 
-@exact
+@njit
 def to_map(dx, dy, dz, rotation):  # type: ignore[no-untyped-def]
     """Lat-long coordinates (u, v) in [0, 1] of a world direction; row 0 at +Z, +X at u = 1/2."""
     x = rotation[0, 0] * dx + rotation[0, 1] * dy + rotation[0, 2] * dz
@@ -156,7 +157,7 @@ def to_map(dx, dy, dz, rotation):  # type: ignore[no-untyped-def]
     return np.float32(0.5) - fast_atan2_turns(y, x), fast_acos(z) * np.float32(1.0 / math.pi)
 
 
-@exact
+@njit
 def density_at(u, v, density):  # type: ignore[no-untyped-def]
     """Density per solid angle of the sampling cell that holds (u, v)."""
     rows, columns = density.shape
@@ -165,7 +166,7 @@ def density_at(u, v, density):  # type: ignore[no-untyped-def]
     return density[r, c]
 
 
-@exact
+@njit
 def radiance_at(u, v, radiance):  # type: ignore[no-untyped-def]
     """Bilinear lookup, wrapped in u and clamped in v."""
     h, w = radiance.shape[0], radiance.shape[1]
@@ -187,7 +188,7 @@ def radiance_at(u, v, radiance):  # type: ignore[no-untyped-def]
     return red, green, blue
 
 
-@exact
+@njit
 def sample_map(n0, n1, n2, cells, density, row_z, rotation):  # type: ignore[no-untyped-def]
     """World direction, its (u, v) and its density from three uint32: the cell, and the place inside it."""
     order, upper, guide = cells
@@ -211,7 +212,7 @@ def sample_map(n0, n1, n2, cells, density, row_z, rotation):  # type: ignore[no-
     return dx, dy, dz, u, v, density[r, c]
 
 
-@exact
+@njit
 def _lookup_many(directions, radiance, rotation):  # type: ignore[no-untyped-def]
     out = np.empty((len(directions), 3), np.float32)
     for i in range(len(directions)):
@@ -220,7 +221,7 @@ def _lookup_many(directions, radiance, rotation):  # type: ignore[no-untyped-def
     return out
 
 
-@exact
+@njit
 def _pdf_many(directions, density, rotation):  # type: ignore[no-untyped-def]
     out = np.empty(len(directions), np.float32)
     for i in range(len(directions)):
@@ -229,7 +230,7 @@ def _pdf_many(directions, density, rotation):  # type: ignore[no-untyped-def]
     return out
 
 
-@exact
+@njit
 def _sample_many(numbers, cells, density, row_z, rotation):  # type: ignore[no-untyped-def]
     n = len(numbers)
     directions, pdf = np.empty((n, 3), np.float32), np.empty(n, np.float32)

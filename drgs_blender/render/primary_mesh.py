@@ -7,11 +7,10 @@ from typing import Any
 import numpy as np
 
 from ..frame import Camera
-from ..jit import prange
+from ..jit import njit, prange
 from .camera import AA, CLIP_END, CLIP_START, WIDTH, camera_ray, lattice, pixel_shift, sample_ray
 from .embree import closest_hit
 from .gbuffer import GBuffer, compact, face_viewer
-from .sampling import exact
 from .scene import TraceScene
 
 Array = np.ndarray
@@ -65,7 +64,7 @@ def primary_mesh(scene: TraceScene, camera: Camera, parameters: Array, y0: int, 
     return buffer
 
 
-@exact(parallel=True)
+@njit(parallel=True)
 def _trace(
     address: Any, bvh: Any, p: Any, x0: Any, y0: Any, alpha: Any, depth: Any, face: Any, barycentric: Any
 ) -> None:
@@ -88,7 +87,7 @@ def _trace(
                 barycentric[y, x, k, 0], barycentric[y, x, k, 1] = u, v
 
 
-@exact(inline="always")
+@njit(inline="always")
 def _face_normal(v: Any, a: Any, b: Any, c: Any) -> Any:
     """(v[b] - v[a]) x (v[c] - v[a]) in float64."""
     x, y, z = np.float64(v[a, 0]), np.float64(v[a, 1]), np.float64(v[a, 2])
@@ -97,7 +96,7 @@ def _face_normal(v: Any, a: Any, b: Any, c: Any) -> Any:
     return uy * wz - uz * wy, uz * wx - ux * wz, ux * wy - uy * wx
 
 
-@exact(parallel=True)
+@njit(parallel=True)
 def _shade(
     p: Any,
     start: Any,

@@ -20,12 +20,11 @@ from typing import Any
 import numpy as np
 
 from ..frame import Camera
-from ..jit import prange
+from ..jit import njit, prange
 from . import raster
 from .camera import sample_ray
 from .embree import closest_hit
 from .gbuffer import GBuffer, compact, face_viewer
-from .sampling import exact
 from .scene import TraceScene
 
 Array = np.ndarray
@@ -86,7 +85,7 @@ def primary_surfels(
     return buffer
 
 
-@exact
+@njit
 def _edge_lengths(vertices: Any, faces: Any, face_object: Any, total: Any, count: Any) -> None:
     """Sum and number of edge lengths an object, from at most about 100,000 evenly chosen faces."""
     step = max(1, len(faces) // 100_000)
@@ -102,7 +101,7 @@ def _edge_lengths(vertices: Any, faces: Any, face_object: Any, total: Any, count
                 count[owner] += 1
 
 
-@exact(inline="always")
+@njit(inline="always")
 def _shoot(address: Any, bvh: Any, x: Any, y: Any, z: Any, dx: Any, dy: Any, dz: Any, reach: Any) -> Any:
     """Closest hit on the segment from (x, y, z) along (dx, dy, dz): its parameter, unit face normal, and whether.
 
@@ -118,7 +117,7 @@ def _shoot(address: Any, bvh: Any, x: Any, y: Any, z: Any, dx: Any, dy: Any, dz:
     return np.float64(t), gx / length, gy / length, gz / length, True
 
 
-@exact(inline="always")
+@njit(inline="always")
 def _find(
     address: Any,
     bvh: Any,
@@ -162,7 +161,7 @@ def _find(
     return how, hx, hy, hz, gx, gy, gz
 
 
-@exact(parallel=True)
+@njit(parallel=True)
 def _attach(
     address: Any,
     bvh: Any,

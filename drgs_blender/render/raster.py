@@ -34,9 +34,8 @@ import numpy as np
 
 from ..asset.model import PosedSurfels
 from ..frame import Camera
-from ..jit import get_num_threads, prange
+from ..jit import get_num_threads, njit, prange
 from .camera import AA, CLIP_END, CLIP_START, CX, CY, FX, FY, ORTHOGRAPHIC, POSITION, WIDTH, lattice, pixel_shift
-from .sampling import exact
 
 Array = np.ndarray
 
@@ -182,7 +181,7 @@ def rasterise(splats: Splats, y0: int, y1: int) -> SurfelSamples:
     return samples
 
 
-@exact(inline="always")
+@njit(inline="always")
 def _to_camera(p: Any, x: Any, y: Any, z: Any) -> Any:
     """World direction to camera coordinates (right, down, forward)."""
     return (
@@ -192,7 +191,7 @@ def _to_camera(p: Any, x: Any, y: Any, z: Any) -> Any:
     )
 
 
-@exact(inline="always")
+@njit(inline="always")
 def _span(focal: Any, centre: Any, sc: Any, pa: Any, pb: Any, sa: Any, sb: Any, r2: Any) -> Any:
     """Least and greatest screen coordinate of the disc u^2 + v^2 <= r2, wholly in front of the camera.
 
@@ -205,7 +204,7 @@ def _span(focal: Any, centre: Any, sc: Any, pa: Any, pb: Any, sa: Any, sb: Any, 
     return centre + focal * (-qb - root) / qa, centre + focal * (-qb + root) / qa
 
 
-@exact(inline="always")
+@njit(inline="always")
 def _clipped_bounds(c: Any, a: Any, b: Any, r: Any, near: Any, p: Any) -> Any:
     """Screen bounds of the square c +- r a +- r b cut at depth `near` (camera coordinates): for discs that cross it."""
     x0 = y0 = np.inf
@@ -229,7 +228,7 @@ def _clipped_bounds(c: Any, a: Any, b: Any, r: Any, near: Any, p: Any) -> Any:
     return x0, x1, y0, y1
 
 
-@exact(parallel=True)
+@njit(parallel=True)
 def _project(
     centre: Any,
     tangent_u: Any,
@@ -324,7 +323,7 @@ def _project(
         nearest[i] = max(c[2] - reach, near)
 
 
-@exact
+@njit
 def _depth_order(screen: Any, box: Any) -> Any:
     """Indices of the surfels with a box, by centre depth; equal depths keep their order. Radix sort, 3 x 11 bits."""
     n = 0
@@ -360,7 +359,7 @@ def _depth_order(screen: Any, box: Any) -> Any:
     return order
 
 
-@exact(parallel=True)
+@njit(parallel=True)
 def _gather_surface(
     order: Any,
     tangent_u: Any,
@@ -385,7 +384,7 @@ def _gather_surface(
         out[k, _SIZE] = np.sqrt(max(uu, vv))
 
 
-@exact
+@njit
 def _list_by_tile(box: Any, tile_x0: Any, tile_y0: Any, tiles_x: Any, tiles_y: Any) -> Any:
     """Counting sort of (tile, splat) pairs: start of each tile's list, and the lists, in splat order."""
     start = np.zeros(tiles_x * tiles_y + 1, np.int64)
@@ -406,7 +405,7 @@ def _list_by_tile(box: Any, tile_x0: Any, tile_y0: Any, tiles_x: Any, tiles_y: A
     return start, listed
 
 
-@exact(inline="always")
+@njit(inline="always")
 def _gaussian(q: Any) -> Any:
     """exp(-q / 2) for 0 <= q <= 12, relative error below 4e-6: Taylor's series of exp(-q / 32) to the 16th power.
 
@@ -426,7 +425,7 @@ def _gaussian(q: Any) -> Any:
     return y * y
 
 
-@exact(inline="always")
+@njit(inline="always")
 def _meet(
     screen: Any,
     i: Any,
@@ -467,7 +466,7 @@ def _meet(
         depth[j] = z
 
 
-@exact(inline="always")
+@njit(inline="always")
 def _absorb(
     surface: Any, i: Any, owner: Any, z: Any, alpha: Any, least: Any, t: Any, acc: Any, best: Any, at: Any
 ) -> Any:
@@ -505,7 +504,7 @@ def _absorb(
     return t * (np.float32(1.0) - alpha)
 
 
-@exact(inline="always")
+@njit(inline="always")
 def _finish(best: Any, at: Any, out: Any, y: Any, x: Any, k: Any) -> Any:
     """Write the normalised attributes of a sample. Returns its depth and object index."""
     inverse = np.float32(1.0) / best[at, _WEIGHT]
@@ -518,7 +517,7 @@ def _finish(best: Any, at: Any, out: Any, y: Any, x: Any, k: Any) -> Any:
     return best[at, _DEPTH] * inverse, np.int32(best[at, _OWNER])
 
 
-@exact(parallel=True)
+@njit(parallel=True)
 def _blend(
     screen: Any,
     surface: Any,

@@ -7,7 +7,6 @@ hashed from the rest (Kollig and Keller 2002); deeper dimensions are hashed alon
 
 from __future__ import annotations
 
-import functools
 import math
 
 import numpy as np
@@ -15,10 +14,6 @@ import numpy as np
 from ..jit import njit
 
 Array = np.ndarray
-
-#: ``njit`` without any floating-point freedom. With it the same source gives other last digits when a kernel comes out
-#: of the cache than when it was just compiled, and a frame must be the same picture either way.
-exact = functools.partial(njit, fastmath=False)
 
 F = np.float32
 U = np.uint32
@@ -28,7 +23,7 @@ GOLDEN = U(0x9E3779B9)
 _UNIT = F(1.0 / 16777216.0)
 
 
-@exact
+@njit
 def mix(x):  # type: ignore[no-untyped-def]
     """Hash of a uint32 (the "lowbias32" constants of C. Wellons' search)."""
     x = U(x ^ (x >> U(16)))
@@ -38,7 +33,7 @@ def mix(x):  # type: ignore[no-untyped-def]
     return U(x ^ (x >> U(16)))
 
 
-@exact
+@njit
 def unit(x):  # type: ignore[no-untyped-def]
     """float32 in [0, 1) from a uint32."""
     return F(np.int32(x >> U(8))) * _UNIT
@@ -67,7 +62,7 @@ def sobol(count: int) -> Array:
     return points.astype(np.uint32)
 
 
-@exact
+@njit
 def sincos_turns(q):  # type: ignore[no-untyped-def]
     """sin and cos of 2 pi q, -2 < q < 2, to 4e-7, by minimax polynomials on an eighth of a turn."""
     turn = np.int32(q * F(4.0) + F(8.5)) - np.int32(8)
@@ -82,7 +77,7 @@ def sincos_turns(q):  # type: ignore[no-untyped-def]
     return s, c
 
 
-@exact
+@njit
 def fast_acos(x):  # type: ignore[no-untyped-def]
     """acos to 1e-6 radians, by a minimax polynomial; arguments beyond [-1, 1] are clamped."""
     a = min(abs(x), ONE)
@@ -91,7 +86,7 @@ def fast_acos(x):  # type: ignore[no-untyped-def]
     return y if x >= ZERO else PI - y
 
 
-@exact
+@njit
 def fast_atan2_turns(y, x):  # type: ignore[no-untyped-def]
     """atan2 / 2 pi in [-1/2, 1/2] to 3e-7 turns, by a minimax polynomial."""
     ax, ay = abs(x), abs(y)
@@ -107,7 +102,7 @@ def fast_atan2_turns(y, x):  # type: ignore[no-untyped-def]
     return r if y >= ZERO else -r
 
 
-@exact
+@njit
 def basis(nx, ny, nz):  # type: ignore[no-untyped-def]
     """Two unit tangents of a unit normal (Duff et al. 2017)."""
     sign = ONE if nz >= ZERO else -ONE
@@ -116,7 +111,7 @@ def basis(nx, ny, nz):  # type: ignore[no-untyped-def]
     return ONE + sign * nx * nx * a, sign * b, -sign * nx, b, sign + ny * ny * a, -ny
 
 
-@exact
+@njit
 def cosine_hemisphere(u, v):  # type: ignore[no-untyped-def]
     """Direction about +Z with density z / pi."""
     s, c = sincos_turns(u)

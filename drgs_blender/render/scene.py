@@ -8,9 +8,8 @@ import numpy as np
 
 from ..asset.model import as_float
 from ..errors import UsageError
-from ..jit import prange
+from ..jit import njit, prange
 from .embree import TriangleBVH
-from .sampling import exact
 
 Array = np.ndarray
 
@@ -55,7 +54,7 @@ class ObjectFaults:
     empty_faces: int  # have no area
 
 
-@exact(parallel=True)
+@njit(parallel=True)
 def _copy_vertices(source, target):  # type: ignore[no-untyped-def]
     """Copy usable vertices, put the others at the origin; return how many there are of the latter."""
     bad = 0
@@ -68,7 +67,7 @@ def _copy_vertices(source, target):  # type: ignore[no-untyped-def]
     return bad
 
 
-@exact
+@njit
 def _corners_of_rows(shading_faces, rows):  # type: ignore[no-untyped-def]
     """CSR lists of the face corners (3 face + k) that share each shading row, in ascending order."""
     start = np.zeros(rows + 1, np.int32)
@@ -85,7 +84,7 @@ def _corners_of_rows(shading_faces, rows):  # type: ignore[no-untyped-def]
     return start, corners
 
 
-@exact
+@njit
 def _acos(x):  # type: ignore[no-untyped-def]
     """acos to 7e-5: Abramowitz and Stegun 4.4.45."""
     a = abs(x)
@@ -95,7 +94,7 @@ def _acos(x):  # type: ignore[no-untyped-def]
     return y if x >= 0 else np.float32(np.pi) - y
 
 
-@exact(parallel=True)
+@njit(parallel=True)
 def _face_terms(vertices, faces, first, last, weighted):  # type: ignore[no-untyped-def]
     """Fill weighted[f] = (unit face normal, corner angles) of faces first..last; return how many have no area."""
     empty = 0
@@ -119,7 +118,7 @@ def _face_terms(vertices, faces, first, last, weighted):  # type: ignore[no-unty
     return empty
 
 
-@exact(parallel=True)
+@njit(parallel=True)
 def _row_normals(weighted, start, corners, shading):  # type: ignore[no-untyped-def]
     """Sum angle-weighted face normals at each shading row, always in the same order."""
     for row in prange(len(shading)):
@@ -137,7 +136,7 @@ def _row_normals(weighted, start, corners, shading):  # type: ignore[no-untyped-
         shading[row, 0], shading[row, 1], shading[row, 2] = x, y, z
 
 
-@exact(parallel=True)
+@njit(parallel=True)
 def _given_normals(normals, first, shading):  # type: ignore[no-untyped-def]
     """Overwrite normals from row `first` on by those given, where these are usable."""
     for i in prange(len(normals)):
@@ -148,7 +147,7 @@ def _given_normals(normals, first, shading):  # type: ignore[no-untyped-def]
             shading[first + i, 0], shading[first + i, 1], shading[first + i, 2] = x * scale, y * scale, z * scale
 
 
-@exact(parallel=True)
+@njit(parallel=True)
 def _materials(rows, first, albedo, roughness, metallic, shading):  # type: ignore[no-untyped-def]
     """Copy the material of vertex rows[i] to shading row first + i, within [0, 1]; NaN becomes 0."""
     for i in prange(len(rows)):

@@ -7,7 +7,8 @@ import pytest
 import trimesh
 
 from drgs_blender.asset.model import Mesh, Surfels
-from drgs_blender.deform.attach import UNSEEN, attach
+from drgs_blender.deform.attach import UNSEEN, attach, sharp_edges
+from drgs_blender.deform.faces import Faces
 from drgs_blender.deform.mesh_driven import MeshDriven
 from drgs_blender.frame import Camera, RenderSettings
 from drgs_blender.geometry import rotation_matrices
@@ -120,3 +121,29 @@ def test_degenerate_faces_get_no_surfel():
     mesh = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [2, 0, 0]], [[0, 1, 2], [0, 1, 3]], np.ones((4, 3)), [1] * 4, [0] * 4)
     surfels, binding, report = attach(mesh, density=0.5)
     assert len(surfels) == 1 and report["degenerate_faces"] == 1 and binding.face[0] == 0
+
+
+def test_sharp_edges_are_folds_and_rims_even_where_vertices_are_split():
+    box = trimesh.creation.box((1, 1, 1)).subdivide()
+    soup = box.vertices[box.faces].reshape(-1, 3)
+    for vertices, indices in ((box.vertices, box.faces), (soup, np.arange(len(soup)).reshape(-1, 3))):
+        n = len(vertices)
+        mesh = Mesh(vertices, indices, np.ones((n, 3)), np.ones(n), np.zeros(n))
+        sharp = sharp_edges(mesh, Faces.of(mesh.vertices, mesh.faces))
+        a, b = (vertices[np.roll(indices, -k, axis=1)] for k in (1, 2))
+        folded = ((np.abs(a) == 0.5) & (a == b)).sum(axis=2) == 2  # both ends on the same two sides of the box
+        assert np.array_equal(sharp, folded)
+
+
+def test_surfels_stay_inside_folds():
+    box = trimesh.creation.box((1, 1, 1)).subdivide().subdivide()
+    n = len(box.vertices)
+    mesh = Mesh(box.vertices, box.faces, np.ones((n, 3)), np.ones(n), np.zeros(n))
+    surfels, binding, _ = attach(mesh)
+    normal = box.face_normals[binding.face]
+    frame = rotation_matrices(surfels.rotation.astype(float))
+    # Where the kernel is one half: sqrt(2 ln 2) deviations from the centre, in any direction of the plane.
+    reach = np.sqrt(2 * np.log(2) * ((frame[:, :, :2] * surfels.scale[:, None]) ** 2).sum(axis=2))
+    beyond = np.where(np.abs(normal) > 0.5, 0, np.abs(surfels.centre) + reach - 0.5)
+    size = 1 / 4 * 2**0.5
+    assert beyond.max() < 0.03 * size
