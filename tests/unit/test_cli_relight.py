@@ -131,7 +131,7 @@ def test_mesh_and_surfels_show_the_same_object(relight):
 def test_png_preview(folder, tmp_path):
     out = tmp_path / "o.png"
     arguments = ["relight", str(folder / "lit.drgs"), "--camera", str(folder / "front.json"), "--out", str(out)]
-    assert main([*arguments, "--rays", "4", "--transparent"]) == 0
+    assert main([*arguments, "--rays", "4", "--transparent", "--primary", "mesh"]) == 0
     with Image.open(out) as picture:
         assert (picture.size, picture.mode) == ((40, 30), "RGBA")
         assert picture.getpixel((0, 0)) == (0, 0, 0, 0) and picture.getpixel((20, 15))[3] == 255
