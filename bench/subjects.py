@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from report import OUT, ROOT
@@ -19,13 +20,12 @@ SOURCES = {
 }
 
 
-def asset_path(name: str) -> Path:
-    """`.drgs` of an example as `drgs make` builds it, made once."""
-    path = OUT / f"{name}.drgs"
+def asset_path(name: str, **options: Any) -> Path:
+    """`.drgs` of an example as `drgs make` builds it with `options`, made once."""
+    path = OUT / ("-".join([name, *map(str, options.values())]) + ".drgs")
     if not path.exists():
         OUT.mkdir(parents=True, exist_ok=True)
-        made = make_asset(ROOT / "examples" / SOURCES[name])
-        write_asset(path, made[0] if isinstance(made, tuple) else made)
+        write_asset(path, make_asset(ROOT / "examples" / SOURCES[name], **options))
     return path
 
 
