@@ -101,7 +101,7 @@ class Film:
             self.index[rows],
         )
         if not self.transparent and not light.black:
-            _background(self.parameters, x0, y0, buffer.alpha, light.radiance, light.rotation, self.environment[rows])
+            _background(self.parameters, x0, y0, buffer.alpha, light.texels, light.rotation, self.environment[rows])
 
     def guides(self) -> Guides:
         """What the denoiser tells surfaces apart by."""

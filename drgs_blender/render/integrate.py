@@ -72,7 +72,7 @@ def integrate(
         (points.albedo, points.roughness, points.metallic),
         (scene.bvh.intersect_address, scene.bvh.occluded_address, scene.bvh.scene),
         (scene.shading_faces, scene.shading, F(scene.extent)),
-        (light.radiance, light.density, *light.cells, light.row_z, light.rotation),
+        (light.texels, light.cells, light.guide, light.row_z, light.rotation),
         brdf.layer_table(),
         (
             sampling.sobol(max(counts)),
@@ -122,8 +122,7 @@ def _beyond(ox, oy, oz, dx, dy, dz, hit, tracer, geometry, light, table, look, b
     """
     intersect_address, occluded_address, tree = tracer
     shading_faces, shading, extent = geometry
-    radiance, density, order, upper, guide, row_z, rotation = light
-    cells = order, upper, guide
+    texels, cells, guide, row_z, rotation = light
     red = green = blue = ZERO
     tr = tg = tb = ONE
     t, face, hu, hv, gx, gy, gz = hit
@@ -169,12 +168,12 @@ def _beyond(ox, oy, oz, dx, dy, dz, hit, tracer, geometry, light, table, look, b
         key = U(key + GOLDEN)
         n0, n1 = mix(key), mix(U(key + U(0x68E31DA4)))
         n2 = mix(U(key + U(0xB5297A4D)))
-        lx, ly, lz, u, v, pe = sample_map(n0, n1, n2, cells, density, row_z, rotation)
+        lx, ly, lz, u, v, pe = sample_map(n0, n1, n2, texels, cells, guide, row_z, rotation)
         nl = nx * lx + ny * ly + nz * lz
         if nl > ZERO and gx * lx + gy * ly + gz * lz > ZERO:
             vl, nh2, sin2 = _half_vector(nx, ny, nz, vx, vy, vz, lx, ly, lz, nl, nv)
             qr, qg, qb, sr, sg, sb, pg = brdf.evaluate(nl, nv, vl, nh2, sin2, ar, ag, ab, kd, metallic, a2, norm, look)
-            er, eg, eb = radiance_at(u, v, radiance)
+            er, eg, eb = radiance_at(u, v, texels)
             weight = nl / (pe + share * nl * INVERSE_PI + rest * pg)
             er, eg, eb = tr * er * (qr + sr) * weight, tg * eg * (qg + sg) * weight, tb * eb * (qb + sb) * weight
             if er + eg + eb > ZERO and not occluded(occluded_address, tree, ox, oy, oz, lx, ly, lz, ZERO, _FAR):
@@ -203,8 +202,8 @@ def _beyond(ox, oy, oz, dx, dy, dz, hit, tracer, geometry, light, table, look, b
             free = face < 0
         if free:
             u, v = to_map(lx, ly, lz, rotation)
-            er, eg, eb = radiance_at(u, v, radiance)
-            weight = ONE / (pb + density_at(u, v, density))
+            er, eg, eb = radiance_at(u, v, texels)
+            weight = ONE / (pb + density_at(u, v, texels))
             red, green, blue = red + fr * er * weight, green + fg * eg * weight, blue + fb * eb * weight
         if free or last:
             break
@@ -222,15 +221,14 @@ def _beyond(ox, oy, oz, dx, dy, dz, hit, tracer, geometry, light, table, look, b
 @njit
 def _point(  # type: ignore[no-untyped-def]
     pixel, sample, surface, frame, tracer, geometry, light, table, numbers, aa, bounces, look, seed, components,
-    variance,
+    variance, i,
 ):  # fmt: skip
     """All samples of one visible point."""
     ox, oy, oz, nx, ny, nz, gx, gy, gz, vx, vy, vz = frame
     ar, ag, ab, roughness, metallic = surface
     intersect_address, _, tree = tracer
     sequence, counts, strata = numbers
-    radiance, density, order, upper, guide, row_z, rotation = light
-    cells = order, upper, guide
+    texels, cells, guide, row_z, rotation = light
     ox, oy, oz = _offset(ox, oy, oz, gx, gy, gz, geometry[2])
     nv = nx * vx + ny * vy + nz * vz
     a2 = brdf.alpha_squared(roughness)
@@ -263,7 +261,7 @@ def _point(  # type: ignore[no-untyped-def]
             u = v = pe = ZERO
             if strategy == 2:
                 n2 = U((sequence[j, 2] ^ shift_2) + (mix(U(own + U(7))) & below))
-                lx, ly, lz, u, v, pe = sample_map(n2, n0, n1, cells, density, row_z, rotation)
+                lx, ly, lz, u, v, pe = sample_map(n2, n0, n1, texels, cells, guide, row_z, rotation)
                 nl = nx * lx + ny * ly + nz * lz
             else:
                 if strategy == 0:
@@ -283,9 +281,9 @@ def _point(  # type: ignore[no-untyped-def]
                 continue
             if strategy != 2:
                 u, v = to_map(lx, ly, lz, rotation)
-                pe = density_at(u, v, density)
+                pe = density_at(u, v, texels)
             if free:
-                er, eg, eb = radiance_at(u, v, radiance)
+                er, eg, eb = radiance_at(u, v, texels)
                 row = 0
             else:
                 er, eg, eb = _beyond(ox, oy, oz, lx, ly, lz, hit, tracer, geometry, light, table, look, bounces, own)
@@ -293,12 +291,12 @@ def _point(  # type: ignore[no-untyped-def]
             weight = nl / (n_cosine * nl * INVERSE_PI + n_ggx * pg + n_light * pe)
             er, eg, eb = er * weight, eg * weight, eb * weight
             qr, qg, qb, sr, sg, sb = qr * er, qg * eg, qb * eb, sr * er, sg * eg, sb * eb
-            components[row, 0] += qr
-            components[row, 1] += qg
-            components[row, 2] += qb
-            components[row + 2, 0] += sr
-            components[row + 2, 1] += sg
-            components[row + 2, 2] += sb
+            components[i, row, 0] += qr
+            components[i, row, 1] += qg
+            components[i, row, 2] += qb
+            components[i, row + 2, 0] += sr
+            components[i, row + 2, 1] += sg
+            components[i, row + 2, 2] += sb
             value = _RED * qr + _GREEN * qg + _BLUE * qb
             diffuse_1, diffuse_2 = diffuse_1 + value, diffuse_2 + value * value
             value = _RED * sr + _GREEN * sg + _BLUE * sb
@@ -309,7 +307,7 @@ def _point(  # type: ignore[no-untyped-def]
         scale = count / (count - ONE)
         diffuse_2 = max(ZERO, diffuse_2 - diffuse_1 * diffuse_1 / count) * scale
         glossy_2 = max(ZERO, glossy_2 - glossy_1 * glossy_1 / count) * scale
-    variance[0], variance[1] = diffuse_2, glossy_2
+    variance[i, 0], variance[i, 1] = diffuse_2, glossy_2
 
 
 @njit(parallel=True)
@@ -323,14 +321,18 @@ def _kernel(  # type: ignore[no-untyped-def]
     n = len(pixel)
     for block in prange((n + _BLOCK - 1) // _BLOCK):
         for i in range(block * _BLOCK, min(n, (block + 1) * _BLOCK)):
-            o, m, g, v, a = origin[i], normal[i], flat[i], view[i], albedo[i]
-            check = o[0] + o[1] + o[2] + m[0] + m[1] + m[2] + g[0] + g[1] + g[2] + v[0] + v[1] + v[2]
-            check += a[0] + a[1] + a[2] + roughness[i] + metallic[i]
+            # No views of rows: each would count references, and the threads would wait for each other's counts.
+            check = roughness[i] + metallic[i]
+            for k in range(3):
+                check += origin[i, k] + normal[i, k] + flat[i, k] + view[i, k] + albedo[i, k]
             if not abs(check) < F(1e18):
                 continue
-            frame = (o[0], o[1], o[2], m[0], m[1], m[2], g[0], g[1], g[2], v[0], v[1], v[2])
-            surface = (a[0], a[1], a[2], roughness[i], metallic[i])
+            frame = (
+                origin[i, 0], origin[i, 1], origin[i, 2], normal[i, 0], normal[i, 1], normal[i, 2],
+                flat[i, 0], flat[i, 1], flat[i, 2], view[i, 0], view[i, 1], view[i, 2],
+            )  # fmt: skip
+            surface = (albedo[i, 0], albedo[i, 1], albedo[i, 2], roughness[i], metallic[i])
             _point(
                 pixel[i], sample[i], surface, frame, tracer, geometry, light, table, numbers, aa, bounces,
-                look, seed, components[i], variance[i],
+                look, seed, components, variance, i,
             )  # fmt: skip

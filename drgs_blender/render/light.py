@@ -39,12 +39,12 @@ def _morton(rows: Array, columns: Array) -> Array:
 
 
 @njit
-def _guide_table(upper, guide):  # type: ignore[no-untyped-def]
+def _guide_table(cells, guide):  # type: ignore[no-untyped-def]
     """First cell of each equal slice of the random numbers: the inversion starts there (Chen and Asau 1974)."""
     width = np.uint64(1 << 32) // np.uint64(len(guide))
     i = np.int64(0)
     for g in range(len(guide)):
-        while np.uint64(upper[i]) < np.uint64(g) * width:
+        while np.uint64(cells[i, 0]) < np.uint64(g) * width:
             i += 1
         guide[g] = i
 
@@ -61,12 +61,12 @@ class EnvironmentLight:
 
     Attributes
     ----------
-    radiance : (h, w, 4) float32: lat-long radiance times colour and strength, linear Rec.709; the last is padding
+    texels : (h, w, 4) float32: lat-long radiance times colour and strength, linear Rec.709, and in the last place the
+        density of the sampling cell that the texel lies in: one cache line serves both
     density : (rows, columns) float32: probability per solid angle of each sampling cell; 0 everywhere when black
-    order : (k,) int32: the lit cells in Morton order, so that equal strata of one random number are compact
-        regions of equal power
-    upper : (k,) uint32: last random number that falls on each cell of `order`
-    guide : (2^b,) int32: where to start looking in `upper`
+    cells : (k, 2) uint32: last random number that falls on a cell, and the cell; the lit cells in Morton order, so that
+        equal strata of one random number are compact regions of equal power
+    guide : (2^b,) int32: where to start looking in `cells`
     row_z : (rows + 1,) float32: z at the upper edge of each row of cells, from 1 to -1
     rotation : (3, 3) float32: world direction to environment direction
     bad_texels : int: NaN, infinite or negative texels, taken as black
@@ -89,13 +89,13 @@ class EnvironmentLight:
             bad = ~np.asarray((tinted >= 0) & (tinted < 1e30)).all(axis=2, keepdims=True)
         self.bad_texels = int(bad.sum())
         h, w = image.shape[:2]
-        self.radiance = np.zeros((h, w, 4), np.float32)
-        self.radiance[..., :3] = np.where(bad, np.float32(0), tinted)
+        self.texels = np.zeros((h, w, 4), np.float32)
+        self.texels[..., :3] = np.where(bad, np.float32(0), tinted)
         self.rotation = np.ascontiguousarray(rotation, np.float32)
         self._make_table()
 
     def _make_table(self) -> None:
-        means = _texel_means(self.radiance[..., :3].astype(np.float64) @ LUMINANCE.astype(np.float64))
+        means = _texel_means(self.texels[..., :3].astype(np.float64) @ LUMINANCE.astype(np.float64))
         h, w = means.shape
         step = 1
         while (h // step) * (w // step) > _MOST_CELLS or h % step or w % step:
@@ -113,39 +113,34 @@ class EnvironmentLight:
         total = weights.sum()
         self.black = not total > 0.0
         self.row_z = edges.astype(np.float32)
-        cells = np.arange(rows * columns)
-        lit = cells if self.black else cells[weights > 0]
+        every = np.arange(rows * columns)
+        lit = every if self.black else every[weights > 0]
         lit = lit[np.argsort(_morton(lit // columns, lit % columns), kind="stable")]
         # Widths in whole random numbers, at least one where there is light; the density follows from them exactly.
         share = np.full(len(lit), 1.0 / len(lit)) if self.black else weights[lit] / total
         width = np.maximum(np.rint(share * 2.0**32), 1).astype(np.int64)
         width[width.argmax()] += 2**32 - width.sum()
-        self.order = lit.astype(np.int32)
-        self.upper = (np.cumsum(width) - 1).astype(np.uint32)
-        self.guide = np.zeros(1 << max(0, (len(cells) - 1).bit_length()), np.int32)
-        _guide_table(self.upper, self.guide)
-        density = np.zeros(len(cells))
+        self.cells = np.stack([np.cumsum(width) - 1, lit], axis=1).astype(np.uint32)
+        self.guide = np.zeros(1 << max(0, (len(every) - 1).bit_length()), np.int32)
+        _guide_table(self.cells, self.guide)
+        density = np.zeros(len(every))
         if not self.black:
             density[lit] = width * 2.0**-32
         self.density = (density.reshape(rows, columns) / solid[:, None]).astype(np.float32)
-
-    @property
-    def cells(self) -> tuple[Array, Array, Array]:
-        """What `sample_map` inverts: order, upper, guide."""
-        return self.order, self.upper, self.guide
+        self.texels[..., 3] = self.density.repeat(step, axis=0).repeat(step, axis=1)
 
     def lookup(self, directions: Array) -> Array:
         """(n, 3) radiance from (n, 3) unit world directions."""
-        return _lookup_many(np.ascontiguousarray(directions, np.float32), self.radiance, self.rotation)
+        return _lookup_many(np.ascontiguousarray(directions, np.float32), self.texels, self.rotation)
 
     def pdf(self, directions: Array) -> Array:
         """(n,) density per solid angle with which ``sample`` draws (n, 3) unit world directions."""
-        return _pdf_many(np.ascontiguousarray(directions, np.float32), self.density, self.rotation)
+        return _pdf_many(np.ascontiguousarray(directions, np.float32), self.texels, self.rotation)
 
     def sample(self, numbers: Array) -> tuple[Array, Array]:
         """World directions (n, 3) and densities (n,) from (n, 3) uint32 random numbers."""
         numbers = np.ascontiguousarray(numbers, np.uint32)
-        return _sample_many(numbers, self.cells, self.density, self.row_z, self.rotation)
+        return _sample_many(numbers, self.texels, self.cells, self.guide, self.row_z, self.rotation)
 
 
 @njit
@@ -158,18 +153,18 @@ def to_map(dx, dy, dz, rotation):  # type: ignore[no-untyped-def]
 
 
 @njit
-def density_at(u, v, density):  # type: ignore[no-untyped-def]
+def density_at(u, v, texels):  # type: ignore[no-untyped-def]
     """Density per solid angle of the sampling cell that holds (u, v)."""
-    rows, columns = density.shape
-    r = min(np.int32(rows - 1), np.int32(v * np.float32(rows)))
-    c = min(np.int32(columns - 1), np.int32(u * np.float32(columns)))
-    return density[r, c]
+    h, w = texels.shape[0], texels.shape[1]
+    return texels[
+        min(np.int32(h - 1), np.int32(v * np.float32(h))), min(np.int32(w - 1), np.int32(u * np.float32(w))), 3
+    ]
 
 
 @njit
-def radiance_at(u, v, radiance):  # type: ignore[no-untyped-def]
+def radiance_at(u, v, texels):  # type: ignore[no-untyped-def]
     """Bilinear lookup, wrapped in u and clamped in v."""
-    h, w = radiance.shape[0], radiance.shape[1]
+    h, w = texels.shape[0], texels.shape[1]
     x, y = u * np.float32(w) - np.float32(0.5), v * np.float32(h) - np.float32(0.5)
     y = min(max(y, np.float32(0.0)), np.float32(h - 1))
     c0, r0 = np.int32(x + np.float32(1.0)) - np.int32(1), np.int32(y)
@@ -180,23 +175,21 @@ def radiance_at(u, v, radiance):  # type: ignore[no-untyped-def]
     r1 = min(r0 + 1, h - 1)
     one = np.float32(1.0)
     p00, p01, p10, p11 = (one - a) * (one - b), a * (one - b), (one - a) * b, a * b
-    red = p00 * radiance[r0, c0, 0] + p01 * radiance[r0, c1, 0] + p10 * radiance[r1, c0, 0] + p11 * radiance[r1, c1, 0]
-    green = (
-        p00 * radiance[r0, c0, 1] + p01 * radiance[r0, c1, 1] + p10 * radiance[r1, c0, 1] + p11 * radiance[r1, c1, 1]
-    )
-    blue = p00 * radiance[r0, c0, 2] + p01 * radiance[r0, c1, 2] + p10 * radiance[r1, c0, 2] + p11 * radiance[r1, c1, 2]
+    red = p00 * texels[r0, c0, 0] + p01 * texels[r0, c1, 0] + p10 * texels[r1, c0, 0] + p11 * texels[r1, c1, 0]
+    green = p00 * texels[r0, c0, 1] + p01 * texels[r0, c1, 1] + p10 * texels[r1, c0, 1] + p11 * texels[r1, c1, 1]
+    blue = p00 * texels[r0, c0, 2] + p01 * texels[r0, c1, 2] + p10 * texels[r1, c0, 2] + p11 * texels[r1, c1, 2]
     return red, green, blue
 
 
 @njit
-def sample_map(n0, n1, n2, cells, density, row_z, rotation):  # type: ignore[no-untyped-def]
+def sample_map(n0, n1, n2, texels, cells, guide, row_z, rotation):  # type: ignore[no-untyped-def]
     """World direction, its (u, v) and its density from three uint32: the cell, and the place inside it."""
-    order, upper, guide = cells
-    columns = density.shape[1]
+    step = texels.shape[0] // (len(row_z) - 1)
+    columns = texels.shape[1] // step
     i = np.int64(guide[np.int64((np.uint64(n0) * np.uint64(len(guide))) >> np.uint64(32))])
-    while n0 > upper[i]:
+    while n0 > cells[i, 0]:
         i += 1
-    cell = np.int64(order[i])
+    cell = np.int64(cells[i, 1])
     r, c = cell // columns, cell % columns
     scale = np.float32(1.0 / 16777216.0)
     u = (np.float32(c) + np.float32(n1 >> np.uint32(8)) * scale) / np.float32(columns)
@@ -209,32 +202,34 @@ def sample_map(n0, n1, n2, cells, density, row_z, rotation):  # type: ignore[no-
     dy = rotation[0, 1] * x + rotation[1, 1] * y + rotation[2, 1] * z
     dz = rotation[0, 2] * x + rotation[1, 2] * y + rotation[2, 2] * z
     v = fast_acos(z) * np.float32(1.0 / math.pi)
-    return dx, dy, dz, u, v, density[r, c]
+    return dx, dy, dz, u, v, texels[r * step, c * step, 3]
 
 
 @njit
-def _lookup_many(directions, radiance, rotation):  # type: ignore[no-untyped-def]
+def _lookup_many(directions, texels, rotation):  # type: ignore[no-untyped-def]
     out = np.empty((len(directions), 3), np.float32)
     for i in range(len(directions)):
         u, v = to_map(directions[i, 0], directions[i, 1], directions[i, 2], rotation)
-        out[i, 0], out[i, 1], out[i, 2] = radiance_at(u, v, radiance)
+        out[i, 0], out[i, 1], out[i, 2] = radiance_at(u, v, texels)
     return out
 
 
 @njit
-def _pdf_many(directions, density, rotation):  # type: ignore[no-untyped-def]
+def _pdf_many(directions, texels, rotation):  # type: ignore[no-untyped-def]
     out = np.empty(len(directions), np.float32)
     for i in range(len(directions)):
         u, v = to_map(directions[i, 0], directions[i, 1], directions[i, 2], rotation)
-        out[i] = density_at(u, v, density)
+        out[i] = density_at(u, v, texels)
     return out
 
 
 @njit
-def _sample_many(numbers, cells, density, row_z, rotation):  # type: ignore[no-untyped-def]
+def _sample_many(numbers, texels, cells, guide, row_z, rotation):  # type: ignore[no-untyped-def]
     n = len(numbers)
     directions, pdf = np.empty((n, 3), np.float32), np.empty(n, np.float32)
     for i in range(n):
-        x, y, z, _, _, p = sample_map(numbers[i, 0], numbers[i, 1], numbers[i, 2], cells, density, row_z, rotation)
+        x, y, z, _, _, p = sample_map(
+            numbers[i, 0], numbers[i, 1], numbers[i, 2], texels, cells, guide, row_z, rotation
+        )
         directions[i, 0], directions[i, 1], directions[i, 2], pdf[i] = x, y, z, p
     return directions, pdf

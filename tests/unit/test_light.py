@@ -79,9 +79,9 @@ def test_the_density_integrates_to_one(kind: str) -> None:
     assert (light.density * solid[:, None]).sum() == pytest.approx(1.0, abs=1e-5)
     directions, angle = sphere_grid(160, 320)
     assert light.pdf(directions).astype(float) @ angle == pytest.approx(1.0, abs=1e-4)
-    assert (light.density > 0).sum() == len(light.order)
-    assert len(np.unique(light.order)) == len(light.order)
-    assert light.upper[-1] == 2**32 - 1
+    assert (light.density > 0).sum() == len(light.cells)
+    assert len(np.unique(light.cells[:, 1])) == len(light.cells)
+    assert light.cells[-1, 0] == 2**32 - 1
 
 
 @pytest.mark.parametrize("kind", KINDS)
