@@ -21,13 +21,13 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--runs", type=int, default=5)
     parser.add_argument("--size", type=int, default=800)
-    parser.add_argument("--asset", default="helmet")
+    parser.add_argument("--asset", default="cat")
+    parser.add_argument("--max-triangles", type=int, default=82000)
     options = parser.parse_args()
-    # No subdivision for texture detail: the triangles of the file.
-    path = asset_path(options.asset, max_triangles=1)
+    path = asset_path(options.asset, max_triangles=options.max_triangles)
     mesh = read_asset(path).mesh
     surfels = len(read_asset(path).surfels)
-    camera = frame_camera(mesh.vertices, options.size, azimuth=-60, fill=0.82)
+    camera = frame_camera(mesh.vertices, options.size, azimuth=-60, fill=0.78)
     npz = OUT / f"{options.asset}.npz"
     np.savez(npz, **{k: getattr(mesh, k) for k in ("vertices", "faces", "albedo", "roughness", "metallic")})
     environment = environments() / "city.exr"
