@@ -77,11 +77,13 @@ def strategies() -> list[list[object]]:
 
 def main() -> None:
     body = "White furnace: radiance of a white surface under light of one, seen at cosine 0.2 / 0.9. The loss of\n"
-    body += "metals is the single-scattering GGX lobe's; the paper's look adds its lobe to a full Lambert base, and gains.\n\n"
+    body += (
+        "metals is the single-scattering GGX lobe's; the paper's look adds its to a full Lambert base, and gains.\n\n"
+    )
     body += table(["look", "metallic", "roughness .05", ".3", ".6", "1"], furnace())
     body += "\n\nIntegral of the density of light sampling over the sphere (BRDF densities: tests/unit):\n\n"
     body += table(["density", "integral"], [[name, f"{value:.7f}"] for name, value in densities()])
-    body += "\n\nEach strategy alone against all together under forest.exr (no sun that a strategy would miss), direct light,\n"
+    body += "\n\nEach strategy alone against all together under forest.exr (no sun to be missed), direct light,\n"
     body += "mean of 20,000 pixels ± standard error:\n\n"
     body += table(["roughness", "metallic", "all", "cosine alone", "GGX alone", "environment alone"], strategies())
     write_section("estimator", "The estimator", "python bench/bench_estimator.py", body)

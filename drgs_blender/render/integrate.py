@@ -12,7 +12,7 @@ import numpy as np
 
 from ..errors import UsageError
 from ..frame import RenderSettings
-from ..jit import njit, prange
+from ..jit import get_num_threads, njit, prange
 from . import brdf, sampling
 from .embree import closest_hit, occluded
 from .light import EnvironmentLight, density_at, radiance_at, sample_map, to_map
@@ -23,7 +23,7 @@ from .scene import TraceScene
 Array = np.ndarray
 
 _FAR = F(np.inf)
-_BLOCK = 256
+_BLOCK = 64
 _RED, _GREEN, _BLUE = F(0.2126), F(0.7152), F(0.0722)
 _TINY = F(1e-30)
 #: Ray offset from the surface: relative to the point's own and to the scene's largest coordinate.
@@ -83,6 +83,7 @@ def integrate(
         settings.bounces,
         brdf.LOOKS[settings.look],
         U(mixed(settings.seed, frame_number)),
+        8 * get_num_threads(),
         components,
         variance,
     )
@@ -312,27 +313,30 @@ def _point(  # type: ignore[no-untyped-def]
 
 @njit(parallel=True)
 def _kernel(  # type: ignore[no-untyped-def]
-    keys, frames, surfaces, tracer, geometry, light, table, numbers, aa, bounces, look, seed, components,
-    variance,
+    keys, frames, surfaces, tracer, geometry, light, table, numbers, aa, bounces, look, seed, lanes,
+    components, variance,
 ):  # fmt: skip
     pixel, sample = keys
     origin, normal, flat, view = frames
     albedo, roughness, metallic = surfaces
     n = len(pixel)
-    for block in prange((n + _BLOCK - 1) // _BLOCK):
-        for i in range(block * _BLOCK, min(n, (block + 1) * _BLOCK)):
-            # No views of rows: each would count references, and the threads would wait for each other's counts.
-            check = roughness[i] + metallic[i]
-            for k in range(3):
-                check += origin[i, k] + normal[i, k] + flat[i, k] + view[i, k] + albedo[i, k]
-            if not abs(check) < F(1e18):
-                continue
-            frame = (
-                origin[i, 0], origin[i, 1], origin[i, 2], normal[i, 0], normal[i, 1], normal[i, 2],
-                flat[i, 0], flat[i, 1], flat[i, 2], view[i, 0], view[i, 1], view[i, 2],
-            )  # fmt: skip
-            surface = (albedo[i, 0], albedo[i, 1], albedo[i, 2], roughness[i], metallic[i])
-            _point(
-                pixel[i], sample[i], surface, frame, tracer, geometry, light, table, numbers, aa, bounces,
-                look, seed, components, variance, i,
-            )  # fmt: skip
+    blocks = (n + _BLOCK - 1) // _BLOCK
+    # Threads get neighbouring lanes, lanes get every so-manyth block: no thread is left with all the costly ones.
+    for lane in prange(lanes):
+        for block in range(lane, blocks, lanes):
+            for i in range(block * _BLOCK, min(n, (block + 1) * _BLOCK)):
+                # No views of rows: each would count references, and the threads would wait for each other's counts.
+                check = roughness[i] + metallic[i]
+                for k in range(3):
+                    check += origin[i, k] + normal[i, k] + flat[i, k] + view[i, k] + albedo[i, k]
+                if not abs(check) < F(1e18):
+                    continue
+                frame = (
+                    origin[i, 0], origin[i, 1], origin[i, 2], normal[i, 0], normal[i, 1], normal[i, 2],
+                    flat[i, 0], flat[i, 1], flat[i, 2], view[i, 0], view[i, 1], view[i, 2],
+                )  # fmt: skip
+                surface = (albedo[i, 0], albedo[i, 1], albedo[i, 2], roughness[i], metallic[i])
+                _point(
+                    pixel[i], sample[i], surface, frame, tracer, geometry, light, table, numbers, aa, bounces,
+                    look, seed, components, variance, i,
+                )  # fmt: skip
