@@ -16,7 +16,6 @@ from ..errors import Cancelled, UsageError
 from ..frame import Frame, RenderSettings
 from ..jit import use_threads
 from ..passes import BY_NAME
-from . import raster
 from .camera import camera_parameters
 from .denoise import denoise
 from .film import COMPONENTS, Film
@@ -27,6 +26,7 @@ from .points import Radiance, ShadingPoints
 from .primary_mesh import primary_mesh
 from .primary_surfels import primary_surfels, snap_windows
 from .scene import TraceScene
+from .splats import prepare
 
 Array = np.ndarray
 Progress = Callable[[float, str], None]
@@ -82,7 +82,7 @@ def render(
     tell(0.0, "Projecting")
     surfels = settings.primary == "surfels"
     if surfels:
-        splats = raster.prepare(posed, camera, parameters)
+        splats = prepare(posed, camera, parameters)
         windows = snap_windows(scene, len(frame.objects))
     film = Film(camera, settings, parameters)
     _, top, _, bottom = camera.window

@@ -21,11 +21,12 @@ import numpy as np
 
 from ..frame import Camera
 from ..jit import njit, prange
-from . import raster
 from .camera import sample_ray
 from .embree import closest_hit
 from .gbuffer import GBuffer, compact, face_viewer
+from .raster import rasterise
 from .scene import TraceScene
+from .splats import Splats
 
 Array = np.ndarray
 
@@ -45,17 +46,15 @@ def snap_windows(scene: TraceScene, object_count: int) -> Array:
     return (WINDOW_EDGES * total / np.maximum(count, 1)).astype(np.float32)
 
 
-def primary_surfels(
-    splats: raster.Splats, scene: TraceScene, windows: Array, camera: Camera, y0: int, y1: int
-) -> GBuffer:
+def primary_surfels(splats: Splats, scene: TraceScene, windows: Array, camera: Camera, y0: int, y1: int) -> GBuffer:
     """Blend the surfels of the rows ``y0 .. y1`` (full-picture pixels) and tie them to the mesh.
 
     Parameters
     ----------
-    splats : `raster.prepare` of this frame
+    splats : `prepare` of this frame
     windows : `snap_windows` of this frame
     """
-    samples = raster.rasterise(splats, y0, y1)
+    samples = rasterise(splats, y0, y1)
     buffer, start = compact(samples.alpha, splats.parameters, camera.window[0], y0)
     points = buffer.points
     _attach(

@@ -14,6 +14,7 @@ from drgs_blender.frame import Camera, RenderSettings  # noqa: E402
 from drgs_blender.render import raster as kernel  # noqa: E402
 from drgs_blender.render.camera import camera_parameters, lattice, pixel_shift  # noqa: E402
 from drgs_blender.render.reference import raster as reference  # noqa: E402
+from drgs_blender.render.splats import prepare  # noqa: E402
 
 torch.set_num_threads(1)
 AA = 2
@@ -60,7 +61,7 @@ SCENES = {
 def test_g_buffer(scene: str, orthographic: bool):
     posed, view = SCENES[scene](), camera(orthographic)
     parameters = camera_parameters(view, RenderSettings(aa=AA, seed=5), 7)
-    found = kernel.rasterise(kernel.prepare(posed, view, parameters), 0, view.height)
+    found = kernel.rasterise(prepare(posed, view, parameters), 0, view.height)
 
     position = np.empty((view.height, view.width, AA, 2))
     for y, x in np.ndindex(view.height, view.width):

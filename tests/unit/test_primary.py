@@ -9,7 +9,6 @@ import pytest
 
 from drgs_blender.asset.model import PosedSurfels
 from drgs_blender.frame import Camera, RenderSettings, World
-from drgs_blender.render import raster
 from drgs_blender.render.camera import camera_parameters
 from drgs_blender.render.gbuffer import GBuffer
 from drgs_blender.render.integrate import integrate
@@ -18,6 +17,7 @@ from drgs_blender.render.points import ShadingPoints
 from drgs_blender.render.primary_mesh import primary_mesh
 from drgs_blender.render.primary_surfels import primary_surfels, snap_windows
 from drgs_blender.render.scene import TraceObject, TraceScene
+from drgs_blender.render.splats import prepare
 
 SETTINGS = RenderSettings(aa=2, bounces=0, cosine=32, ggx=16, environment=16, look="paper")
 
@@ -64,7 +64,7 @@ def sphere_surfels(radius: float, n: int = 6000, albedo: float = 0.5) -> PosedSu
 def surfel_buffer(posed: PosedSurfels, scene: TraceScene, camera: Camera, settings: RenderSettings) -> GBuffer:
     parameters = camera_parameters(camera, settings, 1)
     windows = snap_windows(scene, 1)
-    return primary_surfels(raster.prepare(posed, camera, parameters), scene, windows, camera, 0, camera.height)
+    return primary_surfels(prepare(posed, camera, parameters), scene, windows, camera, 0, camera.height)
 
 
 def white_light(scene: TraceScene, points: ShadingPoints) -> np.ndarray:

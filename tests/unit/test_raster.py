@@ -11,6 +11,7 @@ from drgs_blender.asset.model import PosedSurfels
 from drgs_blender.errors import UsageError
 from drgs_blender.frame import Camera, RenderSettings
 from drgs_blender.render import raster
+from drgs_blender.render import splats as screen
 from drgs_blender.render.camera import camera_parameters, lattice, pixel_shift
 
 FIELDS = ("centre", "tangent_u", "tangent_v", "normal", "opacity", "albedo", "roughness", "metallic", "object_index")
@@ -71,7 +72,7 @@ def random_surfels(n: int, seed: int = 0, size: float = 0.05) -> PosedSurfels:
 
 def render(posed: PosedSurfels, camera: Camera, aa: int = 1, seed: int = 3) -> raster.SurfelSamples:
     p = camera_parameters(camera, RenderSettings(aa=aa, seed=seed), 7)
-    return raster.rasterise(raster.prepare(posed, camera, p), camera.window[1], camera.window[3])
+    return raster.rasterise(screen.prepare(posed, camera, p), camera.window[1], camera.window[3])
 
 
 def sample_positions(camera: Camera, aa: int, seed: int = 3) -> np.ndarray:
@@ -154,8 +155,8 @@ def test_a_front_edge_does_not_bleed_into_the_back_surface() -> None:
 def render_without_gaps(posed: PosedSurfels, camera: Camera, aa: int) -> raster.SurfelSamples:
     """Blend as the paper does, one mean over all contributions: sizes so large that no gap is one."""
     p = camera_parameters(camera, RenderSettings(aa=aa, seed=3), 7)
-    splats = raster.prepare(posed, camera, p)
-    splats.surface[:, raster._SIZE] = 1e6
+    splats = screen.prepare(posed, camera, p)
+    splats.surface[:, screen.SIZE] = 1e6
     return raster.rasterise(splats, camera.window[1], camera.window[3])
 
 
@@ -183,7 +184,7 @@ def test_rows_and_regions_are_crops_of_the_picture() -> None:
     camera = look_along_y(70, 61)
     whole = render(posed, camera, aa=3)
     p = camera_parameters(camera, RenderSettings(aa=3, seed=3), 7)
-    splats = raster.prepare(posed, camera, p)
+    splats = screen.prepare(posed, camera, p)
     for y0, y1 in ((0, 1), (5, 38), (31, 61), (60, 61)):
         part = raster.rasterise(splats, y0, y1)
         assert np.array_equal(part.alpha, whole.alpha[y0:y1])
