@@ -42,6 +42,7 @@ def add_robot(assets: Path) -> bpy.types.Object:
     robot.select_set(True)
     bpy.context.view_layer.objects.active = robot
     bpy.ops.drgs.bind_to_rig()
+    put_rigid_parts_back(robot, rig)
     for source in sources:
         bpy.data.objects.remove(source)
     # Materials are attributes like any other: this robot gets a coat of metallic paint.
@@ -58,6 +59,29 @@ def add_robot(assets: Path) -> bpy.types.Object:
             surprised.value = value
             surprised.keyframe_insert("value", frame=frame)
     return robot
+
+
+def put_rigid_parts_back(robot: bpy.types.Object, rig: bpy.types.Object) -> None:
+    """Move the robot's rigid parts to where their file has them.
+
+    The armature is scaled by 100, and Blender's glTF importer then sets objects that hang on bones one bone too low.
+    The parts are vertex groups by now: moving vertices is an edit like any other, the surfels follow.
+    """
+    scale = rig.matrix_world.to_scale().y
+    to_robot = robot.matrix_world.inverted().to_3x3() @ rig.matrix_world.to_3x3()
+    moves = {}
+    parts = [c for c in rig.children if any(o.type == "MESH" for o in (c, *c.children_recursive))]
+    for name in {part.parent_bone for part in parts if part.parent_type == "BONE"}:
+        bone, group = rig.data.bones[name], robot.vertex_groups.get(name)
+        if group:
+            moves[group.index] = to_robot @ bone.matrix_local.to_3x3() @ Vector((0, bone.length * (scale - 1), 0))
+    keys = robot.data.shape_keys
+    shapes = [robot.data.vertices, *([block.data for block in keys.key_blocks] if keys else [])]
+    for vertex in robot.data.vertices:
+        move = next((moves[g.group] for g in vertex.groups if g.group in moves and g.weight > 0.99), None)
+        if move:
+            for points in shapes:
+                points[vertex.index].co += move
 
 
 def stand(subject: bpy.types.Object, height: float, at: Vector, turn: float = 0.0) -> None:
