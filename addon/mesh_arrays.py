@@ -96,6 +96,15 @@ def read_triangles(mesh: bpy.types.Mesh) -> Array | None:
     return corners.reshape(-1, 3)
 
 
+def read_edges(mesh: bpy.types.Mesh) -> Array:
+    """(k, 2) int32 vertices of the edges that polygons use."""
+    used = np.empty(len(mesh.loops), np.int32)
+    mesh.loops.foreach_get("edge_index", used)
+    edges = np.empty(2 * len(mesh.edges), np.int32)
+    mesh.edges.foreach_get("vertices", edges)
+    return edges.reshape(-1, 2)[np.unique(used)]
+
+
 def read_corner_normals(mesh: bpy.types.Mesh) -> Array:
     """(m, 3, 3) float32 unit normals, object space, of the corners of a mesh of triangles."""
     normals = np.empty(3 * len(mesh.loops), np.float32)

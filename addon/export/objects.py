@@ -10,9 +10,9 @@ import bpy
 import numpy as np
 
 from ...drgs_blender.asset import MATERIAL_CHANNELS, Asset
-from ...drgs_blender.errors import AssetError
 from ...drgs_blender.frame import ObjectState
 from .. import assets, mesh_arrays
+from .fit import check_fit
 
 Warn = Callable[[str], None]
 #: Gives the engine's key of the asset at a path.
@@ -20,14 +20,6 @@ KeyOf = Callable[[Path], str]
 
 #: Object types with a surface that a picture without them would lack.
 SURFACES = {"MESH", "CURVE", "SURFACE", "META", "FONT", "CURVES", "POINTCLOUD", "VOLUME"}
-#: Modifiers that move vertices and never change their number.
-DEFORMING = {
-    *("ARMATURE", "CAST", "CURVE", "DISPLACE", "HOOK", "LAPLACIANDEFORM", "LATTICE", "MESH_DEFORM", "SHRINKWRAP"),
-    *("SIMPLE_DEFORM", "SMOOTH", "CORRECTIVE_SMOOTH", "LAPLACIANSMOOTH", "SURFACE_DEFORM", "WARP", "WAVE"),
-    *("VOLUME_DISPLACE", "CLOTH", "COLLISION", "SOFT_BODY", "SURFACE", "MESH_CACHE", "MESH_SEQUENCE_CACHE"),
-    *("DATA_TRANSFER", "NORMAL_EDIT", "WEIGHTED_NORMAL", "UV_PROJECT", "UV_WARP", "VERTEX_WEIGHT_EDIT"),
-    *("VERTEX_WEIGHT_MIX", "VERTEX_WEIGHT_PROXIMITY", "DYNAMIC_PAINT", "PARTICLE_SYSTEM"),
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +44,7 @@ def export_objects(depsgraph: bpy.types.Depsgraph, key_of: KeyOf, warn: Warn) ->
     Raises
     ------
     AssetError
-        An asset is missing, or the evaluated mesh does not have the asset's vertices; names object and modifiers.
+        An asset is missing, or the evaluated mesh is not the asset's, moved; names object and modifiers.
     """
     states: list[ObjectState] = []
     shapes: dict[tuple[int, int], ObjectState] = {}
@@ -82,15 +74,14 @@ def _shape(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, key_of: KeyOf,
     editing = obj.mode == "EDIT"
     mesh = obj.to_mesh(preserve_all_data_layers=True, depsgraph=depsgraph) if editing else obj.data
     try:
-        if len(mesh.vertices) != len(asset.mesh.vertices):
-            raise _wrong_count(obj, len(mesh.vertices), len(asset.mesh.vertices))
+        same_faces = check_fit(obj, mesh, asset.mesh, warn)
         vertices = mesh_arrays.read_vertices(mesh)
         vertices.flags.writeable = False  # so that the engine's client need not copy it
         return ObjectState(
             name=obj.name,
             asset=key_of(path),
             vertices=vertices,
-            corner_normals=_corner_normals(obj, mesh, asset, warn),
+            corner_normals=_corner_normals(obj, mesh, same_faces, warn),
             **{channel: _edited(obj, mesh, asset, channel, warn) for channel in MATERIAL_CHANNELS},
         )
     finally:
@@ -98,12 +89,11 @@ def _shape(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, key_of: KeyOf,
             obj.to_mesh_clear()
 
 
-def _corner_normals(obj: bpy.types.Object, mesh: bpy.types.Mesh, asset: Asset, warn: Warn) -> np.ndarray | None:
+def _corner_normals(obj: bpy.types.Object, mesh: bpy.types.Mesh, same_faces: bool, warn: Warn) -> np.ndarray | None:
     """Normals per corner where the mesh has flat, sharp or custom ones; smooth ones the engine makes itself."""
     if mesh.normals_domain == "POINT":
         return None
-    triangles = mesh_arrays.read_triangles(mesh)
-    if triangles is None or not np.array_equal(triangles, asset.mesh.faces):
+    if not same_faces:
         warn(f'"{obj.name}": its faces are not those of the asset, so it is shaded smooth')
         return None
     return mesh_arrays.read_corner_normals(mesh)
@@ -119,21 +109,3 @@ def _edited(obj: bpy.types.Object, mesh: bpy.types.Mesh, asset: Asset, channel: 
     if values is None or np.array_equal(values, getattr(asset.mesh, channel)):
         return None
     return values
-
-
-def _wrong_count(obj: bpy.types.Object, found: int, expected: int) -> AssetError:
-    subject = f'Object "{obj.name}"'
-    source = obj.original
-    if len(source.data.vertices) != expected:
-        return AssetError(
-            subject,
-            f"its mesh has {len(source.data.vertices)} vertices, the asset {expected}",
-            "Undo the edit that added or removed vertices, or import the asset again",
-        )
-    suspects = [m.name for m in source.modifiers if m.show_render and m.type not in DEFORMING]
-    named = "modifier " + " or ".join(f'"{name}"' for name in suspects) if suspects else "a modifier"
-    return AssetError(
-        subject,
-        f"{named} changes the number of vertices from {expected} to {found}",
-        "Remove it, or disable it for renders",
-    )

@@ -82,9 +82,12 @@ def read_environment_of(source: Environment | str | Path | None) -> Environment 
     """The environment of a path, or `source` itself."""
     if source is None or isinstance(source, Environment):
         return source
-    from ..formats.registry import read_environment
+    from ..formats.registry import read_environment_file
 
-    return read_environment(source)
+    file = read_environment_file(source)
+    for note in file.notes:
+        log.warning("%s: %s", source, note)
+    return file.environment
 
 
 def mesh_with_materials(

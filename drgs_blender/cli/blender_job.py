@@ -156,8 +156,13 @@ def render_frames(exporter: Exporter, job: dict[str, Any]) -> None:
         scene.render.engine = ENGINE
         scene.render.use_compositing = scene.render.use_sequencer = False
         scene.render.use_persistent_data = True
+        if min(job["frames"]) < 0:
+            bpy.context.preferences.edit.use_negative_frames = True  # else Blender stops at 0
         for number in job["frames"]:
             scene.frame_current = number
+            if scene.frame_current != number:
+                problem = f"cannot be reached, Blender goes to {scene.frame_current}"
+                raise exporter.errors.UsageError(f"frame {number}", problem, "Choose other frames")
             bpy.ops.render.render()
             if exporter.error:
                 raise exporter.error

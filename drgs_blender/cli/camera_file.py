@@ -14,6 +14,8 @@ from ..frame import Camera
 
 _KEYS = {"matrix_world", "width", "height", "fov_x", "fx", "fy", "cx", "cy", "orthographic", "clip_start", "clip_end"}
 LARGEST_SIDE = 65536
+#: Bytes; a camera is a few hundred.
+LARGEST_FILE = 1 << 20
 
 
 def read_camera(path: str | Path) -> Camera:
@@ -35,11 +37,16 @@ def read_camera(path: str | Path) -> Camera:
         Naming the file and the key.
     """
     subject = f"camera {path}"
+    path = Path(path)
     try:
-        data = json.loads(Path(path).read_text(encoding="utf-8"))
+        size = path.stat().st_size
+        if not path.is_file() or size > LARGEST_FILE:
+            problem = f"has {size} bytes" if path.is_file() else "is not a regular file"
+            raise UsageError(subject, problem, "Choose a JSON file of a camera")
+        data = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise UsageError(subject, f"cannot be read ({error.strerror})", "Check the path") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise UsageError(subject, f"is not JSON ({error})") from error
     if not isinstance(data, dict):
         raise UsageError(subject, "is not a JSON object")

@@ -7,9 +7,11 @@ from pathlib import Path
 
 from ..errors import UsageError
 
-_TERM = re.compile(r"(?P<first>-?\d+)(?:-(?P<last>-?\d+)(?:[x:](?P<step>-?\d+))?)?")
+_TERM = re.compile(r"(?P<first>-?\d{1,20})(?:-(?P<last>-?\d{1,20})(?:[x:](?P<step>-?\d{1,20}))?)?")
 #: Far beyond any shot; a mistyped range must not fill the memory.
 MOST_FRAMES = 1_000_000
+#: Blender's MAXFRAME; it silently stops there in both directions.
+LAST_FRAME = 1_048_574
 
 
 def parse_frames(text: str) -> list[int]:
@@ -46,6 +48,9 @@ def parse_frames(text: str) -> list[int]:
             raise UsageError(f"frame range {text!r}", f"{term!r} is empty", "A range that runs down needs a step x-1")
         if len(frames) + count > MOST_FRAMES:
             raise UsageError(f"frame range {text!r}", f"has more than {MOST_FRAMES} frames", "Split it")
+        if max(abs(first), abs(last)) > LAST_FRAME:
+            problem = f"{term!r} is beyond the frames of Blender"
+            raise UsageError(f"frame range {text!r}", problem, f"They are {-LAST_FRAME} to {LAST_FRAME}")
         frames.update(dict.fromkeys(range(first, first + count * step, step)))
     return list(frames)
 

@@ -138,6 +138,11 @@ def run_command(arguments: Sequence[str]) -> int:
         return 141
     except SystemExit as ending:
         return ending.code if isinstance(ending.code, int) else errors.EXIT_OK
+    except MemoryError as error:
+        logger.info("out of memory", exc_info=True)
+        reason = f" ({error})" if str(error) else ""
+        print(f"drgs: the memory is not enough for this{reason}. Use a smaller picture or file.", file=sys.stderr)
+        return errors.EXIT_RETRY
     except Exception as error:
         # The one place where any exception ends: a user gets a sentence, -v a traceback, a farm its exit code.
         logger.info("internal error", exc_info=True)

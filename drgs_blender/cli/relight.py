@@ -11,6 +11,7 @@ import logging
 import math
 import time
 from pathlib import Path
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -61,6 +62,7 @@ def run(args: argparse.Namespace) -> int:
     check_suffix(args.out, (".exr", ".png"))
     camera = read_camera(args.camera)
     settings = sampling.override(RenderSettings(), args)
+    sampling.check_size(camera, args.passes)
     vertices = read_vertices(args.vertices) if args.vertices else None
     check_writable(args.out)
 
@@ -97,24 +99,50 @@ def run(args: argparse.Namespace) -> int:
 def read_vertices(path: Path) -> np.ndarray:
     """Read a pose; only its form is checked here, its length against the asset by the engine."""
     subject = f"--vertices {path}"
+    remedy = "Save it with numpy.save(path, vertices), an (n, 3) array of numbers"
     try:
-        array = np.load(path, allow_pickle=False)
+        if path.exists() and not path.is_file():
+            raise UsageError(subject, "is not a regular file", remedy)
+        with open(path, "rb") as file:
+            shape, dtype = _npy_header(file)
+            available = path.stat().st_size - file.tell()
+            if dtype.kind not in "fiu":
+                raise UsageError(subject, f"holds values of type {dtype.name}, not real numbers", remedy)
+            if len(shape) != 2 or shape[1] != 3:
+                raise UsageError(subject, f"has shape {shape}, expected (n, 3) numbers", remedy)
+            needed = math.prod(shape) * dtype.itemsize
+            if needed > available:
+                problem = f"is truncated: {shape} {dtype.name} are {needed} bytes, {available} are there"
+                raise UsageError(subject, problem, remedy)
+            file.seek(0)
+            array = np.load(file, allow_pickle=False)
     except OSError as error:
         raise UsageError(subject, f"cannot be read ({error.strerror or error})", "Check the path") from error
-    except ValueError as error:
-        raise UsageError(subject, f"is not a .npy file of plain numbers ({error})") from error
-    if not isinstance(array, np.ndarray) or array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in "fiu":
-        shape = getattr(array, "shape", "no shape")
-        raise UsageError(subject, f"has shape {shape}, expected (n, 3) numbers", "Save the vertices as one array")
-    return np.ascontiguousarray(array, dtype=np.float32)
+    except (ValueError, EOFError, SyntaxError, RecursionError, MemoryError) as error:
+        raise UsageError(subject, "is not a .npy file of one array of numbers", remedy) from error
+    with np.errstate(over="ignore"):
+        return np.ascontiguousarray(array, dtype=np.float32)
+
+
+def _npy_header(file: BinaryIO) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """(shape, dtype) that a .npy file declares; ValueError where it is none."""
+    version = np.lib.format.read_magic(file)
+    read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}.get(version)
+    if read is None:
+        raise ValueError(f"unknown version {version}")
+    shape, _, dtype = read(file)
+    return shape, dtype
 
 
 def read_environment(args: argparse.Namespace, asset: Asset) -> np.ndarray:
     """Radiance of the light, (h, w, 3): from a file, or what the asset brought along."""
     if args.env:
-        from ..formats.registry import read_environment
+        from ..formats.registry import read_environment_file
 
-        return read_environment(args.env).radiance
+        file = read_environment_file(args.env)
+        for note in file.notes:
+            logger.warning("%s: %s", args.env, note)
+        return file.environment.radiance
     if asset.environment is None:
         raise UsageError(str(args.asset), "holds no environment", "Give one with --env")
     return asset.environment.radiance

@@ -97,6 +97,7 @@ def run(args: argparse.Namespace) -> int:
                     settings=sampling.override(scene_frame.settings, args),
                     passes=args.passes or scene_frame.passes,
                 )
+                sampling.check_size(frame.camera, frame.passes)
                 settings = frame_store.settings_hash(frame, assets)
                 if not args.overwrite and frame_store.is_complete(path, frame, settings):
                     lines.skipped(path)

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, get_args, get_type_hints
 
 from ..errors import UsageError
-from ..frame import RenderSettings, split_rays
+from ..frame import Camera, RenderSettings, split_rays
 from ..passes import BY_NAME, PASSES
+
+#: Pixels times passes of one picture; 16k x 16k with one pass.
+MOST_PIXEL_PASSES = 1 << 28
 
 
 def add_arguments(parser: argparse.ArgumentParser, *, defaults: bool) -> None:
@@ -72,6 +76,16 @@ def passes(text: str) -> tuple[str, ...]:
             raise argparse.ArgumentTypeError(f"there is no pass {word.strip()!r}; there are {', '.join(BY_NAME)}")
         wanted.add(known[word.strip().lower()])
     return tuple(name for name in BY_NAME if name in wanted)
+
+
+def check_size(camera: Camera, passes: Sequence[str]) -> None:
+    """Refuse a picture that no memory holds, before anything is taken for it."""
+    x0, y0, x1, y1 = camera.window
+    pixels = (x1 - x0) * (y1 - y0)
+    if pixels * len(passes) > MOST_PIXEL_PASSES:
+        size = 4 * pixels * sum(len(BY_NAME[name].channels) for name in passes) / 2**30
+        problem = f"of {x1 - x0} x {y1 - y0} pixels with {len(passes)} passes would need {size:.0f} GiB and more"
+        raise UsageError("a picture", problem, "Render fewer pixels or fewer passes at a time")
 
 
 def override(settings: RenderSettings, args: argparse.Namespace) -> RenderSettings:

@@ -61,6 +61,8 @@ def _finish(radiance: Array, layout: str, notes: list[str]) -> EnvironmentFile:
     if negative := int(np.count_nonzero(radiance < 0)):
         notes.append(f"{negative} negative values set to 0")
         radiance = np.maximum(radiance, 0.0)
+    if not radiance.any():
+        notes.append("completely black: it gives no light")
     height, width = radiance.shape[:2]
     if abs(width - 2 * height) > 0.02 * width:
         notes.append(f"{width} x {height} is not 2:1; it is taken as lat-long all the same")

@@ -50,6 +50,8 @@ def read_exr(path: Path) -> tuple[Array, bool, list[str]]:
     if not whole:
         raise AssetError(subject, "is damaged: its pixels cannot be decoded", _DAMAGED)
     header, pixels = _choose(parts, subject, notes)
+    if not np.isfinite(pixels).any():
+        raise AssetError(subject, "has only values that are NaN or infinite", _DAMAGED)
     if not np.isfinite(pixels).all():
         notes.append(f"{int(np.count_nonzero(~np.isfinite(pixels)))} values that are NaN or infinite set to 0")
         pixels = np.nan_to_num(pixels, nan=0.0, posinf=0.0, neginf=0.0)

@@ -220,9 +220,14 @@ def read_mesh(path: str | Path) -> MeshFile:
 
 def read_environment(path: str | Path) -> Environment:
     """Read distant light as linear lat-long radiance in Blender's mapping. Raises AssetError."""
+    return read_environment_file(path).environment
+
+
+def read_environment_file(path: str | Path) -> EnvironmentFile:
+    """As `read_environment`, with the notes of the reader. Raises AssetError."""
     result = read(path, kind="environment")
     assert isinstance(result, EnvironmentFile)
-    return result.environment
+    return result
 
 
 def read_materials(path: str | Path) -> MaterialsFile:

@@ -49,6 +49,19 @@ def _guide_table(cells, guide):  # type: ignore[no-untyped-def]
         guide[g] = i
 
 
+def _whole_widths(share: Array) -> Array:
+    """Divide the 2^32 random numbers among cells by their `share` (sums to 1), at least one each; int64."""
+    width = np.diff(np.rint(np.cumsum(share) / share.sum() * 2.0**32).astype(np.int64), prepend=0)
+    # What the darkest cells get on top of their share comes from all others, in proportion.
+    owed = int(np.maximum(1 - width, 0).sum())
+    width = np.maximum(width, 1)
+    spare = width - 1
+    taken = spare * owed // max(int(spare.sum()), 1)
+    width -= taken
+    width[np.argsort(-width, kind="stable")[: owed - int(taken.sum())]] -= 1
+    return width
+
+
 def _texel_means(luminance: Array) -> Array:
     """Mean over each texel of the bilinear interpolant (wraps in columns, clamps in rows)."""
     rows = np.concatenate([luminance[:1], luminance, luminance[-1:]])
@@ -118,8 +131,7 @@ class EnvironmentLight:
         lit = lit[np.argsort(_morton(lit // columns, lit % columns), kind="stable")]
         # Widths in whole random numbers, at least one where there is light; the density follows from them exactly.
         share = np.full(len(lit), 1.0 / len(lit)) if self.black else weights[lit] / total
-        width = np.maximum(np.rint(share * 2.0**32), 1).astype(np.int64)
-        width[width.argmax()] += 2**32 - width.sum()
+        width = _whole_widths(share)
         self.cells = np.stack([np.cumsum(width) - 1, lit], axis=1).astype(np.uint32)
         self.guide = np.zeros(1 << max(0, (len(every) - 1).bit_length()), np.int32)
         _guide_table(self.cells, self.guide)

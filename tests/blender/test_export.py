@@ -103,6 +103,65 @@ def test_modifier_that_changes_the_count_is_named(ball, export, kind):
     assert len(export()[0].objects[0].vertices) == 86
 
 
+def renumbered(ball, order):
+    """Give the object the same surface with vertex i called order[i]."""
+    vertices, faces = sphere()
+    moved = np.empty_like(vertices)
+    moved[order] = vertices
+    mesh = bpy.data.meshes.new("Renumbered")
+    mesh.from_pydata(moved.tolist(), [], order[faces].tolist())
+    mesh.shade_smooth()
+    ball.data = mesh
+
+
+def test_renumbered_vertices_are_refused(ball, export):
+    """As many vertices and faces as the asset, but the asset's faces would join the wrong ones."""
+    renumbered(ball, np.random.default_rng(5).permutation(len(sphere()[0])))
+    with pytest.raises(errors.AssetError, match=r'"ball".*ball\.drgs.*edges differ.*import the asset again'):
+        export()
+    renumbered(ball, np.arange(len(sphere()[0])))
+    assert export()[1] == []
+
+
+def modeled(obj, change):
+    """Change the mesh with bmesh."""
+    import bmesh
+
+    edited = bmesh.new()
+    edited.from_mesh(obj.data)
+    change(bmesh.ops, edited)
+    edited.to_mesh(obj.data)
+    edited.free()
+
+
+def test_triangles_merged_to_polygons_fit(ball, export):
+    def merge(ops, mesh):
+        ops.join_triangles(mesh, faces=mesh.faces[:], angle_face_threshold=1, angle_shape_threshold=1)
+
+    modeled(ball, merge)
+    ball.data.shade_smooth()
+    assert len(ball.data.polygons) < len(sphere()[1])
+    frame, warnings = export()
+    np.testing.assert_array_equal(frame.objects[0].vertices, sphere()[0])
+    assert warnings == []
+    ball.data.shade_flat()
+    assert [w for w in export()[1] if "shaded smooth" in w]
+
+
+def test_faces_in_another_order_fit_and_deleted_ones_are_counted(ball, export):
+    modeled(ball, lambda ops, mesh: ops.reverse_faces(mesh, faces=mesh.faces[:40]))
+    assert export()[1] == []
+    modeled(ball, lambda ops, mesh: ops.delete(mesh, geom=mesh.faces[:3], context="FACES_ONLY"))
+    frame, warnings = export()
+    assert len(frame.objects) == 1
+    assert warnings == ['"ball": 3 faces of its asset were deleted; they are rendered all the same']
+
+
+def test_loose_edges_are_no_faces(ball, export):
+    modeled(ball, lambda ops, mesh: (mesh.verts.ensure_lookup_table(), mesh.edges.new((mesh.verts[0], mesh.verts[50]))))
+    assert len(ball.data.edges) > 0 and export()[1] == []
+
+
 def test_edited_mesh_is_named(ball, export):
     ball.data.vertices.add(1)
     ball.data.update()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 
 import numpy as np
 import pytest
@@ -86,7 +87,7 @@ def test_mistake_is_named(write, changes, named):
     assert caught.value.exit_code == 64
 
 
-@pytest.mark.parametrize("text", ["", "{", "[1, 2]", "null", "\x00\xff"])
+@pytest.mark.parametrize("text", ["", "{", "[1, 2]", "null", "\x00\xff", "[" * 200_000, " " * (1 << 20) + "{}"])
 def test_not_a_camera_at_all(tmp_path, text):
     path = tmp_path / "camera.json"
     path.write_bytes(text.encode("latin1"))
@@ -97,3 +98,17 @@ def test_not_a_camera_at_all(tmp_path, text):
 def test_absent_file(tmp_path):
     with pytest.raises(UsageError, match="cannot be read"):
         read_camera(tmp_path / "no.json")
+
+
+@pytest.mark.skipif(os.name == "nt", reason="pipes are no files there")
+@pytest.mark.parametrize("kind", ["fifo", "folder", "device"])
+def test_only_a_regular_file_is_opened(tmp_path, kind):
+    path = tmp_path / "c.json"
+    if kind == "fifo":
+        os.mkfifo(path)
+    elif kind == "folder":
+        path.mkdir()
+    else:
+        path.symlink_to("/dev/zero")
+    with pytest.raises(UsageError, match="is not a regular file"):
+        read_camera(path)

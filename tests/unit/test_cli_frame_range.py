@@ -49,6 +49,9 @@ def test_range_expands(text, frames):
         ("2,1-4x", "'1-4x'"),
         (f"1-{MOST_FRAMES + 1}", "more than"),
         ("0-99999999999999999999", "more than"),
+        ("1048575", "beyond"),
+        ("-1048575", "beyond"),
+        ("9" * 5000, "not a frame"),
     ],
 )
 def test_bad_range_names_the_term(text, named):

@@ -69,6 +69,7 @@ def test_usage_errors_exit_64(arguments, capsys):
         (KeyboardInterrupt(), 130),
         (SystemExit(143), 143),
         (RuntimeError("surprise"), 70),
+        (MemoryError("12 GiB"), 75),
     ],
 )
 def test_every_end_of_a_command_has_its_exit_code(monkeypatch, capsys, raised, code):

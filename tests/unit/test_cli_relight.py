@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import pytest
 from PIL import Image
 
@@ -137,6 +138,49 @@ def test_png_preview(folder, tmp_path):
         assert picture.getpixel((0, 0)) == (0, 0, 0, 0) and picture.getpixel((20, 15))[3] == 255
 
 
+def write_exr(path: Path, pixels: np.ndarray) -> None:
+    """A picture with the channels R, G and B."""
+    header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
+    OpenEXR.File(header, {"RGB": pixels}).write(str(path))
+
+
+def damage_vertices(folder: Path) -> None:
+    """Files that are no poses, each in its own way."""
+    (folder / "empty.npy").write_bytes(b"")
+    np.save(folder / "torn.npy", np.zeros((7, 3)))
+    (folder / "torn.npy").write_bytes((folder / "torn.npy").read_bytes()[:60])
+    with open(folder / "huge.npy", "wb") as file:
+        header = {"descr": "<f4", "fortran_order": False, "shape": (10**12, 3)}
+        np.lib.format.write_array_header_1_0(file, header)
+        file.write(bytes(8))
+    np.savez(folder / "zip.npz", vertices=np.zeros((7, 3)))
+    (folder / "torn.npz").write_bytes(b"PK\x03\x04" + bytes(100))
+    np.save(folder / "complex.npy", np.zeros((7, 3), complex))
+    np.save(folder / "bool.npy", np.zeros((7, 3), bool))
+    np.save(folder / "text.npy", np.full((7, 3), "a"))
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: np.zeros((4, 8, 3)), "completely black"),
+        (lambda: np.ones((4, 4, 3)), "not 2:1"),
+        (lambda: np.where(np.arange(96).reshape(4, 8, 3) < 1, np.nan, 1.0), "1 values that are NaN"),
+    ],
+)
+def test_what_the_reader_of_the_light_noted_is_said(relight, tmp_path, capsys, make, said):
+    write_exr(tmp_path / "e.exr", make().astype(np.float32))
+    relight("--env", str(tmp_path / "e.exr"), "--primary", "mesh")
+    said_of_it = capsys.readouterr().err
+    assert "e.exr" in said_of_it and said in said_of_it
+
+
+def test_display_referred_light_is_said(relight, tmp_path, capsys):
+    Image.new("RGB", (8, 4), "white").save(tmp_path / "e.png")
+    relight("--env", str(tmp_path / "e.png"), "--primary", "mesh")
+    assert "display-referred" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("changes", "code", "named"),
     [
@@ -151,6 +195,18 @@ def test_png_preview(folder, tmp_path):
         ({"--vertices": "flat.npy"}, 64, "(9,)"),
         ({"--vertices": "pickle.npy"}, 64, "pickle.npy"),
         ({"--vertices": "no.npy"}, 64, "no.npy"),
+        ({"--vertices": "empty.npy"}, 64, "(n, 3) array"),
+        ({"--vertices": "torn.npy"}, 64, "(n, 3) array"),
+        ({"--vertices": "huge.npy"}, 64, "12000000000000 bytes, 8 are there"),
+        ({"--vertices": "zip.npz"}, 64, "(n, 3) array"),
+        ({"--vertices": "torn.npz"}, 64, "(n, 3) array"),
+        ({"--vertices": "complex.npy"}, 64, "type complex128"),
+        ({"--vertices": "bool.npy"}, 64, "type bool"),
+        ({"--vertices": "text.npy"}, 64, "type str"),
+        ({"--vertices": "pickle.npy"}, 64, "type object"),
+        ({"--vertices": "."}, 64, "not a regular file"),
+        ({"--camera": "wide.json"}, 64, "65536 x 65536 pixels"),
+        ({"--env": "nan.exr"}, 65, "nan.exr"),
         ({"--out": "front.json/o.exr"}, 73, "o.exr"),
         ({"--out": "o.tif"}, 64, "o.tif"),
     ],
@@ -160,13 +216,17 @@ def test_bad_input_ends_with_its_code_and_name(folder, capsys, changes, code, na
     (folder / "flat.json").write_text(json.dumps(FRONT | {"fov_x": 30, "width": 0}))
     np.save(folder / "short.npy", np.zeros((7, 3), np.float32))
     np.save(folder / "flat.npy", np.zeros(9, np.float32))
+    (folder / "wide.json").write_text(json.dumps(FRONT | {"fov_x": 30, "width": 65536, "height": 65536}))
     np.save(folder / "pickle.npy", np.array([print], dtype=object), allow_pickle=True)
+    damage_vertices(folder)
+    write_exr(folder / "nan.exr", np.full((4, 8, 3), np.nan, np.float32))
     options = {"asset": "lit.drgs", "--camera": "front.json", "--out": "o.exr"} | changes
     arguments = ["relight", str(folder / options.pop("asset"))]
     for name, value in options.items():
         arguments += [name, str(folder / value)]
     assert main(arguments) == code
-    assert named in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert named in said and "allow_pickle" not in said
     assert not (folder / "o.exr").exists()
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from drgs_blender.errors import UsageError
 from drgs_blender.frame import World
-from drgs_blender.render.light import LUMINANCE, EnvironmentLight
+from drgs_blender.render.light import LUMINANCE, EnvironmentLight, _texel_means
 
 
 def picture(kind: str) -> np.ndarray | None:
@@ -82,6 +82,26 @@ def test_the_density_integrates_to_one(kind: str) -> None:
     assert (light.density > 0).sum() == len(light.cells)
     assert len(np.unique(light.cells[:, 1])) == len(light.cells)
     assert light.cells[-1, 0] == 2**32 - 1
+
+
+@pytest.mark.parametrize("size", [(1000, 2000), (1024, 2048), (1448, 2896)])
+@pytest.mark.parametrize("sky", ["white", "gradient", "sun"])
+def test_every_lit_cell_of_a_large_map_has_its_density(size: tuple[int, int], sky: str) -> None:
+    image = np.ones((*size, 3), np.float32)
+    if sky == "gradient":
+        image *= np.linspace(1e-4, 1, size[0], dtype=np.float32)[:, None, None]
+    elif sky == "sun":
+        image *= 1e-5
+        image[size[0] // 3, 70:73] = 1e5
+    light = EnvironmentLight(World(environment=image))
+    solid = -np.diff(light.row_z.astype(float)) * 2 * np.pi / light.density.shape[1]
+    expected = _texel_means(image @ LUMINANCE)
+    probability = light.density * solid[:, None]
+    expected = expected * solid[:, None] / (expected * solid[:, None]).sum()
+    # Half a random number of rounding at either edge, and what the darkest cells were raised to one.
+    assert np.abs(probability - expected).max() < 2.0**-32 * 2 + 1e-3 * expected.max()
+    assert light.density.min() > 0
+    assert (np.diff(light.cells[:, 0].astype(np.int64)) >= 1).all() and light.cells[-1, 0] == 2**32 - 1
 
 
 @pytest.mark.parametrize("kind", KINDS)
