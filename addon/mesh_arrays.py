@@ -92,7 +92,8 @@ def read_triangles(mesh: bpy.types.Mesh) -> Array | None:
     if not np.array_equal(starts, np.arange(0, 3 * len(starts), 3, dtype=np.int32)):
         return None
     corners = np.empty(len(mesh.loops), np.int32)
-    mesh.loops.foreach_get("vertex_index", corners)
+    if len(corners):
+        mesh.attributes[".corner_vert"].data.foreach_get("value", corners)  # copies; `loops` asks for each element
     return corners.reshape(-1, 3)
 
 

@@ -46,13 +46,20 @@ def export_camera(
     Raises
     ------
     UsageError
-        The camera is of a type the engine has no rays for, or the render region is empty.
+        The object is no camera, or one of a type the engine has no rays for; its scale is zero or its transform not
+        finite; or the render region is empty. Names the object.
 
     Notes
     -----
     As in Blender, the sensor spans the larger side of the (aspect-corrected) picture when the fit is AUTO, shifts
     are in units of the fitted side, and of the camera's matrix only rotation and position count.
     """
+    if camera.type != "CAMERA":
+        raise UsageError(
+            f'Object "{camera.name}"',
+            f"is the scene's camera, but of type {camera.type.capitalize()}",
+            "Choose a camera in Scene > Camera",
+        )
     data = camera.data
     if data.type not in SUPPORTED:
         raise UsageError(
@@ -68,13 +75,19 @@ def export_camera(
         fit = "HORIZONTAL" if width >= aspect * height else "VERTICAL"
     # Pixels (of horizontal size) that the fitted side of the sensor spans.
     span = width if fit == "HORIZONTAL" else aspect * height
+    if orthographic and not data.ortho_scale > 0:
+        raise UsageError(
+            f'Camera "{camera.name}"',
+            f"has an Orthographic Scale of {data.ortho_scale:g}",
+            "Make it larger than 0",
+        )
     if orthographic:
         fx = span / data.ortho_scale
     else:
         fx = span * data.lens / (data.sensor_height if data.sensor_fit == "VERTICAL" else data.sensor_width)
     shift_x = data.shift_x if shift_x is None else shift_x
     return Camera(
-        matrix_world=np.array((matrix_world or camera.matrix_world).normalized(), np.float64),
+        matrix_world=_pose(camera.name, matrix_world or camera.matrix_world),
         width=width,
         height=height,
         fx=fx,
@@ -86,3 +99,15 @@ def export_camera(
         clip_end=data.clip_end,
         region=border(render, width, height),
     )
+
+
+def _pose(name: str, matrix_world: Matrix) -> np.ndarray:
+    """(4, 4) float64 without the scale; UsageError where nothing is left."""
+    pose = np.array(matrix_world.normalized(), np.float64)
+    if not np.isfinite(pose).all() or abs(np.linalg.det(pose[:3, :3])) < 1e-6:
+        raise UsageError(
+            f'Camera "{name}"',
+            "has a scale of 0 or a transform that is not finite",
+            "Set its scale to 1, and check its parents, constraints and drivers",
+        )
+    return pose

@@ -12,6 +12,7 @@ import bpy
 import numpy as np
 from mathutils import Euler, Matrix
 
+from ...drgs_blender.errors import UsageError
 from ...drgs_blender.frame import World
 from .image import forget, linear_pixels
 
@@ -48,7 +49,13 @@ BLACK = Light(np.zeros(3, np.float32))
 
 
 def export_world(world: bpy.types.World | None, warn: Warn) -> World:
-    """Describe an evaluated world; black without one, as in Blender."""
+    """Describe an evaluated world; black without one, as in Blender.
+
+    Raises
+    ------
+    UsageError
+        Colour, strength or rotation are not finite; names the world.
+    """
     light = BLACK
     if world is not None:
         light = _Tree(world, warn).light()
@@ -58,7 +65,23 @@ def export_world(world: bpy.types.World | None, warn: Warn) -> World:
         if pixels is None:
             warn(f'World: image "{light.image.name}" cannot be read; its colour is taken as grey')
             light = light.times(FALLBACK)
+    if world is not None:
+        light = _usable(light, world.name, warn)
     return World(environment=pixels, rotation=light.rotation, colour=tuple(map(float, light.colour)))
+
+
+def _usable(light: Light, name: str, warn: Warn) -> Light:
+    """`light` without negative parts; UsageError where it is no number."""
+    if not (np.isfinite(light.colour).all() and np.isfinite(light.rotation).all()):
+        raise UsageError(
+            f'World "{name}"',
+            "has a colour, strength or rotation that is not finite",
+            "Check the values of its nodes and their drivers",
+        )
+    if (light.colour < 0).any():
+        warn(f'World "{name}": its colour times strength is negative; negative light is taken as black')
+        return replace(light, colour=np.maximum(light.colour, 0))
+    return light
 
 
 class _Tree:

@@ -125,3 +125,29 @@ def test_empty_region_is_refused(scene):
     scene.render.border_min_x = scene.render.border_max_x = 0.5
     with pytest.raises(part("drgs_blender.errors").UsageError, match="Render Region"):
         exported(scene)
+
+
+@pytest.mark.parametrize("kind", ["EMPTY", "MESH"])
+def test_object_that_is_no_camera_is_named(scene, export, kind):
+    mesh = mesh_object("Plate", [(0, 0, 0), (1, 0, 0), (0, 1, 0)], [(0, 1, 2)])
+    empty = bpy.data.objects.new("Target", None)
+    scene.collection.objects.link(empty)
+    scene.camera = mesh if kind == "MESH" else empty
+    name = scene.camera.name
+    with pytest.raises(part("drgs_blender.errors").UsageError, match=rf'"{name}".*{kind.capitalize()}.*Scene > Camera'):
+        export()
+
+
+def test_orthographic_scale_of_zero_is_refused(scene, export):
+    scene.camera.data.type, scene.camera.data.ortho_scale = "ORTHO", 0
+    if scene.camera.data.ortho_scale > 0:
+        pytest.skip("this Blender does not allow it")
+    with pytest.raises(part("drgs_blender.errors").UsageError, match=r'"Camera".*Orthographic Scale of 0'):
+        export()
+
+
+@pytest.mark.parametrize("scale", [(0, 0, 0), (1, 0, 1), (float("nan"), 1, 1), (float("inf"), 1, 1)])
+def test_camera_without_a_direction_is_named(scene, export, scale):
+    scene.camera.scale = scale
+    with pytest.raises(part("drgs_blender.errors").UsageError, match=r'Camera "Camera".*scale of 0 or.*not finite'):
+        export()

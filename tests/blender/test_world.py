@@ -198,3 +198,21 @@ def test_loading_another_file_drops_remembered_pixels(scene, export, sky):
     assert image._known
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     assert not image._known and not part("addon.assets")._open
+
+
+@pytest.mark.parametrize("socket", ["Strength", "Color"])
+def test_light_that_is_no_number_is_refused_by_the_name_of_its_world(scene, export, socket):
+    _, background = new_world(scene)
+    bad = float("nan")
+    background.inputs[socket].default_value = bad if socket == "Strength" else (bad, 0, 0, 1)
+    with pytest.raises(part("drgs_blender.errors").UsageError, match=r'^World "World": .*not finite'):
+        export()
+
+
+def test_negative_light_is_black_and_said(scene, export):
+    _, background = new_world(scene)
+    background.inputs["Color"].default_value = (1, 0.5, 0.25, 1)
+    background.inputs["Strength"].default_value = -2
+    frame, warnings = export()
+    assert frame.world.colour == (0, 0, 0)
+    assert len(warnings) == 1 and '"World"' in warnings[0] and "negative" in warnings[0]
