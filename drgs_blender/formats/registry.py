@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+
 from ..asset import Environment
 from ..errors import AssetError
 from .environment import read_exr_environment, read_hdr_environment, read_picture_environment
@@ -173,22 +175,28 @@ def find_format(path: Path, kind: Kind | None = None) -> Format:
     AssetError
         The file cannot be read, or no format recognises it; lists what is understood.
     """
-    head = b""
-    if not path.is_dir():
-        try:
+    head, folder = b"", False
+    try:
+        folder = path.is_dir()
+        if not folder:
+            if path.exists() and not path.is_file():  # a pipe or a device may never end
+                raise AssetError(str(path), "is not a regular file", "Choose a file")
             with open(path, "rb") as file:
                 head = file.read(HEADER_LIMIT)
-        except OSError as error:
-            raise AssetError(str(path), f"cannot be read ({error.strerror or error})", "Check the path") from error
+    except OSError as error:
+        raise AssetError(str(path), f"cannot be read ({error.strerror or error})", "Check the path") from error
     recognised = [f for f in FORMATS if f.sniff(head, path)]
     fitting = [f for f in recognised if kind in (None, f.kind)]
     if fitting:
         return fitting[0]
     wanted = [f for f in FORMATS if kind in (None, f.kind)]
     understood = "; ".join(f"{f.name} ({' '.join(f.extensions)})" for f in wanted)
-    found = (
-        f"is {recognised[0].name}, not {kind}" if recognised else "is empty" if not head else "is of no known format"
-    )
+    if kind is None:
+        understood = f"DR-GS asset (.drgs); {understood}"
+    if recognised:
+        found = f"is {recognised[0].name}, not {kind}"
+    else:
+        found = "is a folder" if folder else "is of no known format" if head else "is empty"
     raise AssetError(str(path), found, f"Understood: {understood}")
 
 
@@ -201,7 +209,8 @@ def read(path: str | Path, *, kind: Kind | None = None) -> AnyFile:
         The file is not understood, or damaged.
     """
     path = Path(path)
-    return find_format(path, kind).read(path)
+    with np.errstate(all="ignore"):  # every reader deals with what is not finite; numpy need not say it, too
+        return find_format(path, kind).read(path)
 
 
 def read_surfels(path: str | Path) -> SurfelFile:
