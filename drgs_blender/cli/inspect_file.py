@@ -50,7 +50,7 @@ def inspect_file(path: Path) -> dict[str, Any]:
     """
     magic = b""
     try:
-        if not path.is_dir():
+        if path.is_file():
             with path.open("rb") as stream:
                 magic = stream.read(4)
     except OSError as error:
@@ -61,10 +61,10 @@ def inspect_file(path: Path) -> dict[str, Any]:
         return {"kind": "asset", **inspect_asset(path)}
     if magic == _EXR and (frame := inspect_frame(path)):
         return frame
-    from ..formats.registry import find_format
+    from ..formats.registry import find_format, read
 
     kind = find_format(path)
-    return {"kind": kind.kind, "format": kind.name, **describe(kind.read(path))}
+    return {"kind": kind.kind, "format": kind.name, **describe(read(path))}
 
 
 def inspect_frame(path: Path) -> dict[str, Any] | None:

@@ -29,11 +29,12 @@ def check_writable(path: Path) -> None:
     WriteError
         Naming the path and the system's reason.
     """
-    if path.is_dir():
-        raise WriteError(str(path), "is a folder", "Choose the name of a file")
     try:
+        if path.is_dir():
+            raise WriteError(str(path), "is a folder", "Choose the name of a file")
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=".drgs-"):
+        # As long as the temporary name under which the file will be written: a long name must not fail last either.
+        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp"):
             pass
     except OSError as error:
         reason = error.strerror or str(error)

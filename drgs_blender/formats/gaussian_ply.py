@@ -132,14 +132,20 @@ LAYOUTS: tuple[Layout, ...] = (
     Layout("3DGS"),
 )
 
+#: A centre beyond this is damage: squares of distances would leave the range of 32-bit floats soon.
+FARTHEST = 1e15
 _GEOMETRY = ("x", "y", "z", "opacity", "scale_0", "scale_1", "rot_0", "rot_1", "rot_2", "rot_3")
 _REMEDY = "Export the point cloud again with the program that trained it"
 
 
 def is_gaussian(header: Header) -> bool:
-    """Whether a PLY header is that of Gaussian splats."""
+    """Whether a PLY header is that of Gaussian splats, complete or not; the reader names what is missing."""
     vertex = header.element("vertex")
-    return vertex is not None and all(name in vertex for name in ("scale_0", "rot_0", "opacity"))
+    if vertex is None:
+        return False
+    if all(name in vertex for name in ("scale_0", "rot_0", "opacity")):
+        return True
+    return header.element("face") is None and any(n in vertex for n in ("scale_0", "rot_0", "opacity", "f_dc_0"))
 
 
 def find_layout(names: set[str]) -> Layout:
@@ -200,11 +206,13 @@ def decode_splats(header: Header, rows: Rows | None, subject: str) -> SurfelFile
     finite = np.ones(len(centre), bool)
     for array in (centre, opacity, axes, rotation, *material.values(), *([] if sh is None else [sh])):
         finite &= np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
+    finite &= (np.abs(centre) <= FARTHEST).all(axis=1)
     extras |= _extras(columns, names - used)
     keep: Array | slice = slice(None)
     if dropped := int(np.count_nonzero(~finite)):
         keep = finite
-        notes.append(f"{dropped} of {len(finite)} splats dropped: NaN or infinite values")
+        far = f", or centres beyond {FARTHEST:g}" if (np.abs(centre[np.isfinite(centre)]) > FARTHEST).any() else ""
+        notes.append(f"{dropped} of {len(finite)} splats dropped: NaN or infinite values{far}")
     unknown = sorted(n for n in names - used if not re.fullmatch(layout.known + r"|n[xyz]", n))
     if unknown:
         notes.append(f"{len(unknown)} unknown properties kept: {', '.join(unknown[:8])}{' ...' * (len(unknown) > 8)}")

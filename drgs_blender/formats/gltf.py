@@ -28,6 +28,7 @@ _UNDERSTOOD = {
 }
 
 
+@np.errstate(all="ignore")
 def read_gltf(path: Path, pose: Pose = "rest") -> MeshFile:
     """Read the default scene of a glTF 2.0 file.
 

@@ -179,9 +179,11 @@ class Document:
                 raise AssetError(self.subject, f"has damaged embedded data ({error})", _DAMAGED) from error
             return np.frombuffer(data, np.uint8)
         name = unquote(uri)
-        if not name or "\0" in name or ":" in name or name.startswith(("/", "\\")):
-            raise AssetError(self.subject, f"refers to {uri[:60]!r}, which is no file beside it", _DAMAGED)
+        if not name or "\0" in name or ":" in name or not below(name):
+            raise AssetError(self.subject, f"refers to {uri[:60]!r}, which is no file beside or below it", _DAMAGED)
         try:
+            if (self.path.parent / name).exists() and not (self.path.parent / name).is_file():
+                raise OSError("not a regular file")
             return np.fromfile(self.path.parent / name, np.uint8)
         except OSError as error:
             raise AssetError(self.subject, f"needs the file {name!r}, which cannot be read", "Put it beside") from error
@@ -212,6 +214,16 @@ class Document:
         values = values.copy()
         values[indices] = self._strided(self.index(what, "bufferView") or 0, offsets[1], count, dtype, shape)
         return values
+
+
+def below(name: str) -> bool:
+    """Whether a relative name stays in its folder all the way, whichever system's separators it uses."""
+    depth = 0
+    for part in name.replace("\\", "/").split("/"):
+        depth += {"": 0, ".": 0, "..": -1}.get(part, 1)
+        if depth < 0:
+            return False
+    return not name.startswith(("/", "\\"))
 
 
 def _split_glb(data: bytes, subject: str) -> tuple[bytes, bytes | None]:

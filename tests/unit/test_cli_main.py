@@ -207,3 +207,10 @@ def test_heartbeat_while_nothing_is_said(monkeypatch):
         while stream.getvalue().count("Fra:3") < 3 and time.monotonic() < deadline:
             time.sleep(0.01)
     assert stream.getvalue().count("Fra:3 | Rendering | Sample 0/100") >= 3
+
+
+@pytest.mark.parametrize("length", [250, 300])
+def test_a_name_too_long_is_said_before_the_work(tmp_path, length):
+    with pytest.raises(errors.WriteError, match="too long"):
+        check_writable(tmp_path / ("n" * (length - 4) + ".exr"))
+    assert not list(tmp_path.iterdir())

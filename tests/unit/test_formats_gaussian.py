@@ -202,6 +202,22 @@ def test_bad_splats_are_dropped_and_counted(tmp_path: Path) -> None:
     np.testing.assert_array_equal(file.surfels.centre[:, 1], columns["y"][4:])
 
 
+def test_splats_absurdly_far_are_dropped_and_counted(tmp_path: Path) -> None:
+    columns = random_columns("2DGS")
+    columns["z"][4], columns["y"][7] = 1e20, -3e15
+    file = read_surfels(write(tmp_path / "a.ply", columns))
+    assert len(file.surfels) == 48 and np.abs(file.surfels.centre).max() < 10
+    assert "2 of 50 splats dropped: NaN or infinite values, or centres beyond 1e+15" in file.notes
+
+
+@pytest.mark.parametrize("missing", ["opacity", "scale_0", "rot_0"])
+def test_splats_without_one_property_are_no_mesh(tmp_path: Path, missing: str) -> None:
+    columns = random_columns("2DGS")
+    del columns[missing]
+    with pytest.raises(AssetError, match=f"lacks {missing}"):
+        read_surfels(write(tmp_path / "a.ply", columns))
+
+
 @pytest.mark.parametrize("missing", ["x", "rot_3", "f_dc_1", "roughness", "base_color_1", "f_rest_4"])
 def test_what_is_missing_is_named(tmp_path: Path, missing: str) -> None:
     columns = random_columns("IRGS")

@@ -218,6 +218,34 @@ def test_damaged_gltf_is_refused_with_the_reason(tmp_path: Path, change: Any, wo
         read_mesh(b.write(tmp_path / "a.gltf"))
 
 
+@pytest.mark.parametrize(
+    "uri", ["../out.bin", "a/../../out.bin", "%2e%2e/out.bin", "..\\out.bin", "/etc/passwd", "file:///etc/passwd"]
+)
+def test_data_outside_the_folder_are_never_opened(tmp_path: Path, uri: str) -> None:
+    b = quad()
+    (tmp_path / "inside" / "a").mkdir(parents=True)
+    path = b.write(tmp_path / "inside" / "a.gltf")
+    (tmp_path / "out.bin").write_bytes(b.data)
+    b.json["buffers"] = [{"byteLength": len(b.data), "uri": uri}]
+    path.write_text(json.dumps(b.json))
+    with pytest.raises(AssetError, match="no file beside or below"):
+        read_mesh(path)
+    (tmp_path / "inside" / "in.bin").write_bytes(b.data)
+    path.write_text(json.dumps(b.json | {"buffers": [{"byteLength": len(b.data), "uri": "a/../in.bin"}]}))
+    assert len(read_mesh(path).faces) == 2
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("value", [np.nan, np.inf, 3e38])
+def test_values_that_overflow_are_no_warnings_of_numpy(tmp_path: Path, value: float) -> None:
+    b = quad({"scale": [1e10, 1e10, 1e10], "rotation": [0.5, 0.5, 0.5, 0.5]})
+    vertices = POSITIONS.copy()
+    vertices[3] = value
+    b.json["meshes"][0]["primitives"][0]["attributes"]["POSITION"] = b.accessor(vertices, "VEC3")
+    mesh = read_mesh(b.write(tmp_path / "a.gltf"))
+    assert np.isfinite(mesh.vertices).all() and len(mesh.faces) == 1
+
+
 def test_faces_beyond_the_vertices_are_refused(tmp_path: Path) -> None:
     b = quad()
     b.json["meshes"][0]["primitives"][0]["indices"] = b.accessor(np.array([0, 1, 9], np.uint32), "SCALAR")

@@ -50,8 +50,20 @@ def test_what_is_not_understood_lists_what_is(tmp_path: Path) -> None:
         read(path)
     with pytest.raises(AssetError, match="cannot be read"):
         read(tmp_path / "none.ply")
-    with pytest.raises(AssetError, match=r"of no known format|is empty"):
+    assert ".drgs" in caught.value.remedy
+    with pytest.raises(AssetError, match="is a folder"):
         read(tmp_path)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="pipes are no files there")
+def test_what_may_never_end_is_not_opened(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.ply")
+    (tmp_path / "zero.ply").symlink_to("/dev/zero")
+    for path in (tmp_path / "pipe.ply", tmp_path / "zero.ply"):
+        with pytest.raises(AssetError, match="is not a regular file"):
+            read(path)
+    with pytest.raises(AssetError, match="cannot be read"):
+        read(tmp_path / ("n" * 300))
 
 
 def test_the_wrong_kind_is_said(tmp_path: Path) -> None:
