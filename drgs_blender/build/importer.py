@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from ..asset.model import Asset, Mesh, Surfels
-from ..deform.binding import bind
+from ..deform.binding import bind, project
+from ..deform.faces import Faces
 from ..errors import AssetError
 from ..formats.axes import surfels_to_z_up
 from ..formats.files import MaterialsFile, MeshFile, SurfelFile
@@ -24,6 +25,11 @@ log = logging.getLogger(__name__)
 
 #: Part of the surfels that must lie in the box of the mesh, widened by a tenth of its diagonal.
 OVERLAP = 0.5
+#: Largest median distance between surfels and mesh, as part of the surfels' extent, and largest ratio of the extents.
+APART = 0.1
+RATIO = 8.0
+#: Surfels whose distance to the mesh is measured.
+SAMPLE = 2000
 
 
 def import_asset(
@@ -153,16 +159,25 @@ def _has_materials(file: MeshFile) -> bool:
 
 
 def _check_overlap(surfels: Surfels, mesh: Mesh, surfel_name: str, mesh_name: str) -> None:
-    """Raise AssetError when most surfels lie away from the mesh."""
+    """Raise AssetError when most surfels lie away from the mesh, or the two are of different units."""
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     margin = 0.1 * np.linalg.norm(high - low)
     inside = ((surfels.centre >= low - margin) & (surfels.centre <= high + margin)).all(axis=1).mean()
-    if inside < OVERLAP:
+    step = -(-len(surfels) // SAMPLE)
+    distance = float(np.median(project(mesh, Faces.of(mesh.vertices, mesh.faces), surfels.centre[::step])[2]))
+    # Without the outermost points: captures have floaters, meshes have splinters.
+    extents = [
+        float(np.linalg.norm(np.subtract(*np.quantile(points, (0.98, 0.02), axis=0))))
+        for points in (surfels.centre, mesh.vertices)
+    ]
+    foreign = max(extents) > RATIO * min(extents)
+    if inside < OVERLAP or distance > APART * extents[0] or foreign:
         box = lambda points: " x ".join(f"{v:.4g}" for v in np.ptp(points, axis=0))  # noqa: E731
         at = lambda points: ", ".join(f"{v:.4g}" for v in points.mean(axis=0))  # noqa: E731
         raise AssetError(
             f"{surfel_name} and {mesh_name}",
-            f"do not overlap: {100 * inside:.0f} % of the surfels are near the mesh; the surfels measure "
+            f"do not {'fit' if inside >= OVERLAP else 'overlap'}: {100 * inside:.0f} % of the surfels are in the box of "
+            f"the mesh, at a median distance of {distance:.4g}; the surfels measure "
             f"{box(surfels.centre)} around ({at(surfels.centre)}), the mesh {box(mesh.vertices)} around "
             f"({at(mesh.vertices)})",
             "Choose the mesh of this capture, in the same units and with the same up axis",

@@ -30,6 +30,8 @@ FINEST = 1 / 1500
 FOOTPRINT = 0.7
 #: Texture compared with the interpolation is averaged over this part of an edge, so that finer detail is noticed.
 LOOK = 0.1
+#: Sizes of a mesh in metres: the squared areas of its faces stay within the range of 32-bit floats.
+SMALLEST, LARGEST = 1e-6, 1e9
 #: Rounds of subdivision at most.
 ROUNDS = 16
 
@@ -126,7 +128,9 @@ def _net(file: MeshFile, name: str, report: dict[str, Any]) -> Net:
     """Proper faces of the file, welded; tags are (material, part)."""
     m = len(file.faces)
     if not m:
-        raise AssetError(name, "has no faces", "Choose a file with a surface")
+        lost = [note for note in file.notes if "NaN" in note]
+        problem = f"has no faces that are left ({'; '.join(lost)})" if lost else "has no faces"
+        raise AssetError(name, problem, "Choose a file with a surface")
     finite = np.isfinite(file.vertices).all(axis=1)[file.faces].all(axis=1)
     part = np.full(m, -1, np.int64)
     for index, (_, start, stop) in enumerate(file.parts):
@@ -135,6 +139,10 @@ def _net(file: MeshFile, name: str, report: dict[str, Any]) -> Net:
         proper = finite & ~Faces.of(file.vertices, file.faces).degenerate
     if not proper.any():
         raise AssetError(name, f"has {m} faces, none with an area", "Export the mesh again")
+    extent = float(np.ptp(file.vertices[file.faces[proper]].reshape(-1, 3).astype(np.float64), axis=0).max())
+    if not SMALLEST <= extent <= LARGEST:
+        problem = f"measures {extent:.3g} m, at which 32-bit numbers cannot hold the areas of its faces"
+        raise AssetError(name, problem, "Export it at its true size")
     faces = file.faces[proper].astype(np.int64)
     material = np.asarray(file.face_material, np.int64)[proper]
     used, faces = np.unique(faces, return_inverse=True)

@@ -133,6 +133,23 @@ def test_foreign_mesh_is_refused_with_both_sizes():
         import_asset(SurfelFile(sphere_capture(500), "3DGS"), mesh)
 
 
+@pytest.mark.parametrize("factor", [0.001, 0.01, 0.4, 2.5, 100, 1000])
+def test_other_units_are_refused_whichever_is_larger(factor):
+    """Both around the origin: a mesh in millimetres encloses all surfels of its capture in metres."""
+    mesh = sphere_mesh(3)
+    mesh.vertices = mesh.vertices * np.float32(factor)
+    with pytest.raises(AssetError, match=rf"surfels and mesh: do not .*1\.9\d.*the mesh {2 * factor:.4g} x"):
+        import_asset(SurfelFile(sphere_capture(500), "3DGS"), mesh)
+
+
+def test_other_units_of_what_is_flat_are_refused():
+    square = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32) * 100
+    capture = sphere_capture(500)
+    capture.centre[:, 2] = 0
+    with pytest.raises(AssetError, match="do not fit"):
+        import_asset(SurfelFile(capture, "3DGS"), MeshFile(square, [[0, 1, 2], [0, 2, 3]]))
+
+
 def test_surfels_that_are_not_finite_are_dropped_and_counted():
     capture = sphere_capture(500)
     capture.centre[3] = np.nan

@@ -179,6 +179,21 @@ def test_meshes_without_a_surface_are_refused_by_name():
         mesh_with_materials(MeshFile(np.zeros((3, 3)), [[0, 1, 2]]), "thing.obj")
 
 
+@pytest.mark.parametrize("scale", [1e-20, 1e-12, 1e15])
+def test_sizes_that_floats_cannot_hold_are_refused(scale):
+    with pytest.raises(AssetError, match=r"mesh: measures .* m, at which"):
+        file = plane()
+        file.vertices *= np.float32(scale)
+        make_asset(file)
+
+
+def test_faces_lost_to_vertices_without_a_place_are_said(tmp_path):
+    path = tmp_path / "a.obj"
+    path.write_text("v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    with pytest.raises(AssetError, match=r"a\.obj: has no faces that are left \(1 vertices that are NaN"):
+        make_asset(path)
+
+
 def test_y_up_files_are_turned_and_vertex_materials_win():
     file = plane(1)
     file.materials, file.face_material = [], np.full(2, -1)
