@@ -5,9 +5,14 @@ the mesh is blocked by its own surface, one that starts above misses contact sha
 the mesh point that belongs to it:
 
 1. along the camera ray, within a window of depths around the surfel: the first face that is turned as the surfel is;
-2. else (the surfel overhangs the mesh's silhouette) within the window along its normal, inwards, then outwards;
-3. else the nearest face along the camera ray within the window, whichever way it is turned;
-4. else (no mesh near) the point stays where it is, lifted by the window along its normal.
+2. else the first face along it that is turned to the viewer: the surfel overhangs a fold, and what is seen beyond the
+   fold is lit as the face there, with that face's normal;
+3. else (the surfel overhangs the mesh's silhouette) within the window along its normal, inwards, then outwards;
+4. else the nearest face along the camera ray within the window, whichever way it is turned;
+5. else (no mesh near) the point stays where it is, lifted by the window along its normal.
+
+A surfel's normal that is turned away from its face by more than 60 degrees would lose most of the light between both;
+the face's own is used then.
 
 The window is `WINDOW_SCALES` standard deviations of the surfels or `WINDOW_EDGES` mean edge lengths of the object's
 mesh, whichever is larger. The seen position and depth stay those of the surfels.
@@ -34,9 +39,11 @@ WINDOW_SCALES = 4.0
 WINDOW_EDGES = 2.0
 #: A surfel off the mesh's silhouette counts as seen from behind only when this cosine says so clearly.
 RIM = 0.3
+#: Cosine between a surfel's normal and a face's from which they are turned alike.
+ALIKE = 0.5
 
 # How a surfel's mesh point was found.
-NOWHERE, ALONG_VIEW, ALONG_NORMAL, ANY_SIDE = 0, 1, 2, 3
+NOWHERE, ALONG_VIEW, ALONG_NORMAL, ANY_SIDE, FACING = 0, 1, 2, 3, 4
 
 
 def snap_windows(scene: TraceScene, object_count: int) -> Array:
@@ -142,19 +149,20 @@ def _find(
         if not hit:
             break
         sx, sy, sz = sx - t * vx, sy - t * vy, sz - t * vz
-        agrees = fx * nx + fy * ny + fz * nz > 0.0
-        if agrees or how == NOWHERE:
-            how = ALONG_VIEW if agrees else ANY_SIDE
+        agrees = fx * nx + fy * ny + fz * nz > ALIKE
+        facing = fx * vx + fy * vy + fz * vz > 0.0
+        if agrees or how == NOWHERE or (facing and how == ANY_SIDE):
+            how = ALONG_VIEW if agrees else FACING if facing else ANY_SIDE
             hx, hy, hz, gx, gy, gz = sx, sy, sz, fx, fy, fz
         past = 1e-3 * window
         left -= t + past
         if agrees or left <= 0.0:
             break
         sx, sy, sz = sx - past * vx, sy - past * vy, sz - past * vz
-    if how != ALONG_VIEW:
+    if how != ALONG_VIEW and how != FACING:
         for side in (-1.0, 1.0):
             t, fx, fy, fz, hit = _shoot(address, bvh, x, y, z, side * nx, side * ny, side * nz, window)
-            if hit and fx * nx + fy * ny + fz * nz > 0.0:
+            if hit and fx * nx + fy * ny + fz * nz > ALIKE:
                 t *= side
                 return ALONG_NORMAL, x + t * nx, y + t * ny, z + t * nz, fx, fy, fz
     return how, hx, hy, hz, gx, gy, gz
@@ -218,7 +226,7 @@ def _attach(
                         address, bvh, x, y, z, nx, ny, nz, vx, vy, vz, ahead, window
                     )  # fmt: skip
                 # A face met by the camera ray shows which side is seen; else the surfel tells, save at its rim.
-                if how in (ALONG_VIEW, ANY_SIDE):
+                if how in (ALONG_VIEW, ANY_SIDE, FACING):
                     behind = gx * vx + gy * vy + gz * vz < 0.0
                 else:
                     behind = nx * vx + ny * vy + nz * vz < -RIM
@@ -226,6 +234,8 @@ def _attach(
                     gx, gy, gz = -gx, -gy, -gz
                 gx, gy, gz = face_viewer(gx, gy, gz, gx, gy, gz, vx, vy, vz)
                 nx, ny, nz = face_viewer(nx, ny, nz, gx, gy, gz, vx, vy, vz)
+                if nx * gx + ny * gy + nz * gz < ALIKE:
+                    nx, ny, nz = gx, gy, gz
                 if how == NOWHERE:
                     hx, hy, hz = x + window * gx, y + window * gy, z + window * gz
                 origin[n, 0], origin[n, 1], origin[n, 2] = hx, hy, hz

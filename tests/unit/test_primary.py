@@ -211,3 +211,33 @@ def test_mesh_region_and_clipping() -> None:
     check_contract(cut, 2)
     camera = look_along_y(40, clip_end=2.5)
     assert len(primary_mesh(scene, camera, camera_parameters(camera, SETTINGS, 1), 0, 40).points) == 0
+
+
+def test_overhang_of_a_fold_is_lit_as_the_face_beyond() -> None:
+    """A step seen from above at a slant: surfels of the upright side reach over the flat top, and must not darken it."""
+    vertices = np.float32([[-1, 0, 0], [1, 0, 0], [1, 0, 1], [-1, 0, 1], [1, 2, 1], [-1, 2, 1]])
+    faces = np.int32([[0, 1, 2], [0, 2, 3], [3, 2, 4], [3, 4, 5]])
+    eye, target = np.array([0.0, -2.0, 1.6]), np.array([0.0, 0.1, 1.0])
+    back = (eye - target) / np.linalg.norm(eye - target)
+    right = np.array([1.0, 0, 0])
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(back, right), back], axis=1)
+    pose[:3, 3] = eye
+    camera = Camera(pose, 40, 40, 120.0, 120.0, 20.0, 20.0)
+    settings = RenderSettings(aa=4)
+    parameters = camera_parameters(camera, settings, 0)
+    scene = TraceScene()
+    one = np.ones(len(vertices), np.float32)
+    scene.update([TraceObject("step", vertices, faces, np.ones((6, 3), np.float32), one, 0 * one)])
+    # One large surfel in the plane of the upright side, centred on the edge: half of it hangs in the air over the top.
+    posed = PosedSurfels(
+        np.float32([[0, 0, 1]]), np.float32([[0.3, 0, 0]]), np.float32([[0, 0, 0.1]]), np.float32([[0, -1, 0]]),
+        np.float32([0.99]), np.ones((1, 3), np.float32), np.float32([1]), np.float32([0]), np.int32([0]),
+    )  # fmt: skip
+    windows = snap_windows(scene, 1)
+    points = primary_surfels(prepare(posed, camera, parameters), scene, windows, camera, 0, 40).points
+    above, side = points.origin[:, 1] > 0.01, points.origin[:, 2] < 0.99  # beyond the edge, below it
+    assert above.sum() > 20 and side.sum() > 20
+    np.testing.assert_allclose(points.normal[above], np.tile([0, 0, 1], (above.sum(), 1)), atol=1e-5)
+    np.testing.assert_allclose(points.normal[side], np.tile([0, -1, 0], (side.sum(), 1)), atol=1e-5)
+    np.testing.assert_allclose(points.origin[above, 2], 1, atol=1e-4)
