@@ -124,7 +124,7 @@ class MeshDriven:
         )  # fmt: skip
         self.lost = int(np.count_nonzero(opacity != self.surfels.opacity))
         if self.lost:
-            log.warning("%d surfels hang on vertices that are not finite; they are hidden", self.lost)
+            log.debug("%d surfels hang on vertices that are not finite; they are hidden", self.lost)
         channels = {name: self._channel(name, (materials or {}).get(name)) for name in MATERIAL_CHANNELS}
         return PosedSurfels(
             centre, tangent_u, tangent_v, normal, opacity, **channels, object_index=np.full(n, object_index, np.int32)

@@ -165,6 +165,7 @@ class Session:
                     f"its asset {state.asset} is not loaded",
                     "Link the object to its file again",
                 )
+            _check_surface(state, loaded.asset, with_surfels)
             known = self._objects[index] if index < len(self._objects) else None
             if known is not None and known.loaded is loaded and _same(known.state, state):
                 item = known
@@ -187,18 +188,17 @@ class Session:
     def _warnings(self) -> list[str]:
         """What the user should know about the meshes of the last frame."""
         found = []
-        for fault in self._scene.faults:
+        if not self._objects:
+            found.append("the frame has no DR-GS object; the picture shows the world alone")
+        for item, fault in zip(self._objects, self._scene.faults, strict=True):
             if fault.bad_vertices:
+                hidden = f" and {item.lost} surfels" if item.lost else ""
                 found.append(
-                    f"{fault.name}: {fault.bad_vertices} vertices are not finite; {fault.bad_faces} faces are left out"
+                    f"{fault.name}: {fault.bad_vertices} vertices are not finite or too far away; "
+                    f"{fault.bad_faces} faces{hidden} are left out"
                 )
             if fault.empty_faces:
                 found.append(f"{fault.name}: {fault.empty_faces} faces have no area; light passes through them")
-        found += [
-            f"{item.state.name}: {item.lost} surfels hang on vertices that are not finite; they are hidden"
-            for item in self._objects
-            if item.lost
-        ]
         if self._light is not None and self._light.bad_texels:
             found.append(f"world: {self._light.bad_texels} texels are not finite or negative; they are black")
         return found
@@ -217,6 +217,15 @@ class Session:
                 return self._light
         self._light, self._world = EnvironmentLight(world), _snapshot(world)
         return self._light
+
+
+def _check_surface(state: ObjectState, asset: Asset, with_surfels: bool) -> None:
+    """Refuse an asset of which nothing would be seen."""
+    subject = f"object {state.name}"
+    if not len(asset.mesh.faces):
+        raise AssetError(subject, f"the mesh of {state.asset} has no faces", "Import a file whose mesh has faces")
+    if with_surfels and not len(asset.surfels):
+        raise AssetError(subject, f"{state.asset} has no surfels", "Choose the mesh as primary surface")
 
 
 def _check(frame: Frame) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from drgs_blender.asset.container import read_asset, write_asset
-from drgs_blender.asset.model import Asset
+from drgs_blender.asset.model import Asset, Mesh, Surfels
 from drgs_blender.engine.objects import traced_object
 from drgs_blender.engine.session import Session
 from drgs_blender.errors import AssetError, Cancelled, UsageError
@@ -156,11 +156,50 @@ def test_unusable_settings_are_refused(session, make_frame):
         session.render(frame)
 
 
+def test_vertices_of_a_huge_object_are_not_called_infinite_alone(session, make_frame, caplog):
+    frame = make_frame(primary="mesh")
+    frame.objects[0].matrix_world[:3, :3] *= 1e20
+    (text,) = session.render(frame).warnings
+    assert text.startswith("Ball: ") and "not finite or too far away" in text
+    frame = make_frame()
+    frame.objects[0].vertices[1] = np.nan
+    session.render(frame)
+    assert not [r for r in caplog.records if r.levelname == "WARNING"], "the user reads the frame's warnings"
+
+
+@pytest.mark.parametrize(("part", "problem"), [("surfels", "has no surfels"), ("faces", "has no faces")])
+def test_asset_of_which_nothing_would_be_seen_is_refused(tmp_path, session, make_frame, asset_path, part, problem):
+    asset = read_asset(asset_path)
+    flat, wide = np.empty(0, np.float32), np.empty((0, 3), np.float32)
+    mesh, none = asset.mesh, Surfels(wide, wide[:, :2], np.empty((0, 4), np.float32), flat, wide, flat, flat)
+    if part == "faces":
+        mesh = Mesh(mesh.vertices, mesh.faces[:0], mesh.albedo, mesh.roughness, mesh.metallic)
+    path = tmp_path / "empty.drgs"
+    write_asset(path, Asset(none, mesh))
+    frame = make_frame()
+    frame.objects[0].asset = session.load_asset(path)
+    with pytest.raises(AssetError, match=f"Ball.*{problem}"):
+        session.render(frame)
+    frame.settings.primary = "mesh"
+    if part == "surfels":
+        assert session.render(frame)["Combined"][..., 3].max() > 0.9
+    else:
+        with pytest.raises(AssetError, match=f"Ball.*{problem}"):
+            session.render(frame)
+
+
+def test_frame_without_an_object_says_so(session, make_frame):
+    frame = make_frame()
+    frame.objects = []
+    assert [text for text in session.render(frame).warnings if "no DR-GS object" in text]
+
+
 def test_bad_vertices_are_counted_and_leave_no_bad_pixel(session, make_frame):
     frame = make_frame()
     frame.objects[0].vertices[[1, 5]] = np.nan, np.inf, 0.0
     passes = session.render(frame)
-    assert any(text.startswith("Ball: 2 vertices are not finite") for text in passes.warnings)
+    (text,) = passes.warnings
+    assert text.startswith("Ball: 2 vertices are not finite or too far away; ") and "surfels are left out" in text
     assert all(np.isfinite(array).all() for array in passes.values())
     assert session.render(make_frame()).warnings == []
 
