@@ -87,6 +87,14 @@ class Child:
         return self._process is not None and self._process.poll() is None
 
     @property
+    def killed(self) -> bool:
+        """Whether a signal ended the process (Windows has none)."""
+        try:
+            return self._process is not None and self._process.wait(1.0) < 0
+        except subprocess.TimeoutExpired:
+            return False
+
+    @property
     def log(self) -> str:
         """The last lines the engine wrote to its standard error."""
         return "\n".join(self._log)

@@ -81,6 +81,7 @@ class EngineClient:
     ----------
     command : command line of the engine, see `locate_engine`
     silence : seconds without a sign of life after which the engine is taken for dead
+    greeting : seconds a new process has to say something; importing Python on a busy machine takes some
     stall : seconds its main thread may work on one step
     restarts : how often one request is repeated on a new engine after the old one died
     shared : exchange arrays through shared memory where the system has it
@@ -91,12 +92,14 @@ class EngineClient:
         command: list[str],
         *,
         silence: float = 20.0,
+        greeting: float = 15.0,
         stall: float = 900.0,
         restarts: int = 1,
         shared: bool = True,
     ) -> None:
         self.command = list(command)
-        self.silence, self.stall, self.restarts, self.shared = silence, stall, restarts, shared
+        self.silence, self.greeting, self.stall = silence, greeting, stall
+        self.restarts, self.shared = restarts, shared
         self._child: Child | None = None
         self._sent = SentSlots()
         self._assets: dict[str, str] = {}
@@ -129,11 +132,11 @@ class EngineClient:
         Raises
         ------
         DeviceError
-            When the command cannot be run or ends at once.
+            When the command cannot be run, ends at once, or does not speak as an engine does.
         VersionError
             When the engine is of another version.
         EngineError
-            When it does not answer.
+            When it was killed while it started, and the next one as well.
         """
         with self._exclusive(cancelled):
             self._repeating(lambda: None, None, cancelled)
@@ -283,7 +286,7 @@ class EngineClient:
             del self._to_load[0]
 
     def _handshake(self, child: Child, cancelled: IsCancelled | None) -> None:
-        watch = _Watch(child, self.silence, self.stall)
+        watch = _Watch(child, self.greeting, self.stall)
         remedy = "Install the engine in the environment named in the preferences, or correct the path"
         while True:
             if self._stopped(cancelled):
@@ -291,10 +294,18 @@ class EngineClient:
             try:
                 item = child.inbox.get(timeout=_POLL)
             except queue.Empty:
-                watch.check()
+                try:
+                    watch.check()
+                except _Lost as silence:
+                    problem = f"does not greet as an engine does: it said nothing for {self.greeting:g} s"
+                    raise DeviceError(self.command[0], problem, remedy) from silence
                 continue
             if isinstance(item, OSError) and child.pid == 0:
                 raise DeviceError(self.command[0], f"cannot be started ({item})", remedy) from item
+            if isinstance(item, EOFError) and child.killed:
+                raise _Lost("was killed while it started") from item
+            if isinstance(item, protocol.ProtocolError):
+                raise DeviceError(self.command[0], f"does not speak as an engine does ({item})", remedy) from item
             if isinstance(item, Exception):
                 problem = f"did not start as an engine: it {child.epitaph()}"
                 raise DeviceError(self.command[0], problem, remedy) from item

@@ -19,6 +19,7 @@ from drgs_blender.engine.codec import encode_frame
 from drgs_blender.engine.protocol import Link
 from drgs_blender.errors import (
     EXIT_INTERNAL,
+    EXIT_RETRY,
     EXIT_VERSION,
     AssetError,
     DeviceError,
@@ -102,7 +103,8 @@ def test_engine_refuses_a_client_of_another_version():
     [
         (["/nowhere/python"], "cannot be started"),
         ([sys.executable, "-c", "raise SystemExit('no such engine')"], "no such engine"),
-        ([sys.executable, "-c", "print('hello' * 100)"], "did not start as an engine"),
+        ([sys.executable, "-c", "print('hello' * 100)"], "does not speak as an engine does"),
+        ([sys.executable, "-c", "while True: print('hello')"], "does not speak as an engine does"),
     ],
 )
 def test_what_is_no_engine_is_an_error_that_says_why(command, problem):
@@ -113,13 +115,39 @@ def test_what_is_no_engine_is_an_error_that_says_why(command, problem):
     client.close()
 
 
-def test_command_that_says_nothing_meets_the_deadline():
-    client = EngineClient([sys.executable, "-c", "import time; time.sleep(60)"], silence=0.5, restarts=0)
+def test_command_that_says_nothing_meets_the_deadline_once(tmp_path):
+    """It is no engine, so that another start would only make the user wait longer."""
+    program = f"open({str(tmp_path / 'starts')!r}, 'a').write('x'); import time; time.sleep(60)"
+    client = EngineClient([sys.executable, "-c", program], greeting=1.5)
     start = time.monotonic()
-    with pytest.raises(EngineError, match="did not answer"):
+    with pytest.raises(DeviceError, match="does not greet as an engine does"):
         client.start()
-    assert time.monotonic() - start < 5.0
+    assert time.monotonic() - start < 8.0
+    assert (tmp_path / "starts").read_text() == "x"
+    assert client.pid == 0
     client.close()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals")
+@pytest.mark.parametrize("deaths", [1, 2])
+def test_engine_killed_while_it_starts_is_started_once_more(make_client, tmp_path, deaths):
+    """As the system does where memory is short: the engine is there, and may fit the next time."""
+    die = f"""
+import os, pathlib, signal
+starts = pathlib.Path({str(tmp_path / "starts")!r})
+count = len(starts.read_text()) if starts.exists() else 0
+starts.write_text("x" * (count + 1))
+if count < {deaths}: os.kill(os.getpid(), signal.SIGKILL)
+"""
+    client = make_client(die)
+    if deaths == 1:
+        client.start()
+        assert client.pid
+    else:
+        with pytest.raises(EngineError, match="killed by signal 9") as caught:
+            client.start()
+        assert caught.value.exit_code == EXIT_RETRY
+    assert (tmp_path / "starts").read_text() == "xx"
 
 
 @pytest.mark.parametrize("after_handshake", [False, True])
