@@ -22,7 +22,8 @@ _known: dict[tuple[object, ...], Array] = {}
 def linear_pixels(image: bpy.types.Image, warn: Callable[[str], None]) -> Array | None:
     """(h, w, 3) float32 linear Rec.709, row 0 at the top, read-only; None when the image has no pixels.
 
-    Blender keeps float images in scene-linear already; 8-bit ones are as in the file and decoded here.
+    Blender keeps float images in scene-linear already; 8-bit ones are as in the file and decoded here. Values that are
+    no light (NaN, infinite, negative) stay as they are: the engine takes such texels as black and warns with a count.
     """
     if image.source in ("MOVIE", "SEQUENCE"):
         warn(f'Image "{image.name}": of a {image.source.lower()} only the current picture lights the scene')
@@ -42,7 +43,7 @@ def linear_pixels(image: bpy.types.Image, warn: Callable[[str], None]) -> Array 
         if space != "sRGB":
             warn(f'Image "{image.name}": colour space {space} of an 8-bit image is read as sRGB')
         pixels = np.where(pixels <= 0.04045, pixels / 12.92, ((pixels + 0.055) / 1.055) ** 2.4)
-    pixels = np.array(np.maximum(np.nan_to_num(pixels, posinf=65504.0), 0), np.float32, order="C")
+    pixels = np.array(pixels, np.float32, order="C")
     pixels.flags.writeable = False
     if key is not None:
         while len(_known) >= KEPT:

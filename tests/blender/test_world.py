@@ -216,3 +216,20 @@ def test_negative_light_is_black_and_said(scene, export):
     frame, warnings = export()
     assert frame.world.colour == (0, 0, 0)
     assert len(warnings) == 1 and '"World"' in warnings[0] and "negative" in warnings[0]
+
+
+def test_texels_that_are_no_light_are_black_with_one_counted_warning(scene, sky, tmp_path):
+    """The same rule as for an environment that the command line reads."""
+    pixels = sky[1].copy()
+    pixels[3, 5], pixels[10, 20, 1], pixels[40, 7, 0] = np.nan, np.inf, -1
+    write_exr(tmp_path / "bad.exr", pixels)
+    link_sky(scene, str(tmp_path / "bad.exr"))
+    scene.render.image_settings.file_format = "OPEN_EXR"
+    messages = part("addon.messages")
+    for _ in range(2):  # the second frame has the picture from memory
+        messages.history.clear()
+        bpy.ops.render.render(write_still=True)
+        texts = [m.text for m in messages.history if m.level == "WARNING" and "texel" in m.text]
+        assert texts == ["world: 3 texels are not finite or negative; they are black"]
+    assert np.isfinite(read_exr(scene.render.filepath, 64, 48)).all()
+    assert [m for m in messages.history if "no DR-GS object" in m.text], "the empty scene is said as well"
