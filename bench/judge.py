@@ -17,8 +17,8 @@ Array = np.ndarray
 
 
 def blender_python() -> Path:
-    """Interpreter that has bpy: DRGS_BLENDER_PYTHON, else .venv-blender beside the checkout."""
-    if override := os.environ.get("DRGS_BLENDER_PYTHON"):
+    """Interpreter that has bpy: DRGS_BLENDER, else .venv-blender beside the checkout."""
+    if override := os.environ.get("DRGS_BLENDER"):
         return Path(override)
     folder = ROOT / ".venv-blender"
     return folder / ("Scripts/python.exe" if sys.platform == "win32" else "bin/python")

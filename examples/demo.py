@@ -63,7 +63,7 @@ def main() -> int:
     run(*drgs, "make", examples / "helmet/FlightHelmet.gltf", "--out", out / "helmet.drgs")
     run(*drgs, "import", examples / "playbot/playbot.ply", "--up=-y", "--out", out / "playbot.drgs")
     run(sys.executable, ROOT / "tools/extension.py", "--out", out / "extension.zip")
-    blender = os.environ.get("DRGS_BLENDER_PYTHON", ROOT / ".venv-blender" / BIN / f"python{EXE}")
+    blender = os.environ.get("DRGS_BLENDER", ROOT / ".venv-blender" / BIN / f"python{EXE}")
     environment = os.environ | {"BLENDER_USER_RESOURCES": str(out / "blender"), "DRGS_ENGINE": sys.executable}
     os.environ.update(environment)
     run(blender, "-P", examples / "demo_scene.py", out / "extension.zip", out, out / "demo.blend")

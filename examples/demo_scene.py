@@ -2,7 +2,7 @@
 
     .venv-blender/bin/python examples/demo_scene.py EXTENSION.zip ASSET_FOLDER SCENE.blend
 
-A robot with its skeleton, walk and facial shape keys; a flight helmet that turns; a photographed toy; an HDRI of
+A robot with its skeleton, dance and facial shape keys; a flight helmet that turns; a captured toy; an HDRI of
 Blender's own that turns once around them in 24 frames.
 """
 

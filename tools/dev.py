@@ -48,7 +48,7 @@ APT_PACKAGES = {
     "libxkbcommon.so.0": "libxkbcommon0",
 }
 SUITES = ("lint", "engine", "blender", "floor")
-TEST_SECONDS = 600
+TEST_SECONDS = 1200
 
 
 class Failure(Exception):
