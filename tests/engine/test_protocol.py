@@ -289,3 +289,13 @@ def test_zero_sign_is_a_change_and_receiver_names_what_it_lacks():
     versions, changed = sender.changes({"a": np.array([0.0, -0.0])})
     assert set(changed) == {"a"}
     assert receiver.update(versions, {}) == ({}, ["a"])
+
+
+def test_older_content_of_a_slot_is_not_taken_for_the_one_that_is_named():
+    receiver = HeldSlots()
+    old, new = np.zeros(3), np.ones(3)
+    assert receiver.update({"a": 1}, {"a": old})[1] == []
+    assert receiver.update({"a": 2}, {}) == ({}, ["a"])  # the sender changed it, but the content never came
+    held, missing = receiver.update({"a": 2}, {"a": new})
+    assert missing == [] and held["a"] is new
+    assert receiver.update({"a": 1}, {}) == ({}, ["a"])  # nor the other way round

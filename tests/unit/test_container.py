@@ -355,6 +355,36 @@ def test_a_failed_write_leaves_the_old_file_and_no_other(file: Path, monkeypatch
         write_asset(file.parent / "nowhere" / "a.drgs", make_asset())
 
 
+@pytest.mark.skipif(os.name == "nt", reason="an open file cannot be replaced there")
+def test_writing_replaces_the_file_and_never_changes_it(file: Path) -> None:
+    """Who has the old file open or mapped goes on with the old asset."""
+    before, number = file.read_bytes(), file.stat().st_ino
+    mapped = read_asset(file)
+    albedo = np.array(mapped.mesh.albedo)
+    with open(file, "rb") as old:
+        write_asset(file, make_asset(100))
+        assert old.read() == before
+    assert np.array_equal(mapped.mesh.albedo, albedo)
+    assert file.stat().st_ino != number
+    assert len(read_asset(file).surfels) == 100
+
+
+def test_a_failed_rename_leaves_the_old_file_and_no_other(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before, tried = file.read_bytes(), []
+
+    def refuse(source: Path, target: Path) -> None:
+        tried.append((Path(source).read_bytes()[:4], Path(source).parent, Path(target)))
+        raise PermissionError(13, "Permission denied")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", refuse)
+        with pytest.raises(WriteError, match="Permission denied"):
+            write_asset(file, make_asset(100))
+    assert tried == [(b"PK\3\4", file.parent, file)], "a whole file of the same folder is renamed"
+    assert file.read_bytes() == before
+    assert list(file.parent.iterdir()) == [file]
+
+
 def test_not_an_asset(tmp_path: Path) -> None:
     with pytest.raises(AssetError, match="does not exist"):
         read_asset(tmp_path / "none.drgs")

@@ -108,6 +108,37 @@ def test_a_failure_leaves_the_old_frame_and_nothing_else(tmp_path: Path, monkeyp
     assert np.array_equal(read_frame(path)[0]["Combined"], old["Combined"])
 
 
+@pytest.mark.skipif(os.name == "nt", reason="an open file cannot be replaced there")
+def test_writing_replaces_the_frame_and_never_changes_it(tmp_path: Path) -> None:
+    """A player that has the old frame open reads the old frame to its end."""
+    path = tmp_path / "f.exr"
+    write_frame(path, some_passes((4, 4), ("Combined",)), {"run": "1"})
+    before, number = path.read_bytes(), path.stat().st_ino
+    with open(path, "rb") as old:
+        write_frame(path, some_passes((5, 5), ("Combined",)), {"run": "2"})
+        assert old.read() == before
+    assert path.stat().st_ino != number
+    assert read_frame(path)[1] == {"run": "2"}
+
+
+def test_a_failed_rename_leaves_the_old_frame_and_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "f.exr"
+    write_frame(path, some_passes((4, 4), ("Combined",)), {"run": "1"})
+    before, tried = path.read_bytes(), []
+
+    def refuse(source: Path, target: Path) -> None:
+        tried.append((read_frame(source)[1], Path(source).parent, Path(target)))
+        raise PermissionError(13, "Permission denied")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", refuse)
+        with pytest.raises(WriteError, match="Permission denied"):
+            write_frame(path, some_passes((5, 5), ("Combined",)), {"run": "2"})
+    assert tried == [({"run": "2"}, tmp_path, path)], "a whole frame of the same folder is renamed"
+    assert path.read_bytes() == before
+    assert os.listdir(tmp_path) == ["f.exr"]
+
+
 def test_missing_folder(tmp_path: Path) -> None:
     with pytest.raises(WriteError):
         write_frame(tmp_path / "absent" / "f.exr", some_passes((2, 2)), {})
