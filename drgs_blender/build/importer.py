@@ -176,8 +176,8 @@ def _check_overlap(surfels: Surfels, mesh: Mesh, surfel_name: str, mesh_name: st
         at = lambda points: ", ".join(f"{v:.4g}" for v in points.mean(axis=0))  # noqa: E731
         raise AssetError(
             f"{surfel_name} and {mesh_name}",
-            f"do not {'fit' if inside >= OVERLAP else 'overlap'}: {100 * inside:.0f} % of the surfels are in the box of "
-            f"the mesh, at a median distance of {distance:.4g}; the surfels measure "
+            f"do not {'fit' if inside >= OVERLAP else 'overlap'}: {100 * inside:.0f} % of the surfels are in the box "
+            f"of the mesh, at a median distance of {distance:.4g}; the surfels measure "
             f"{box(surfels.centre)} around ({at(surfels.centre)}), the mesh {box(mesh.vertices)} around "
             f"({at(mesh.vertices)})",
             "Choose the mesh of this capture, in the same units and with the same up axis",

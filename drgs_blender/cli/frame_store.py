@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import io
 import json
 import logging
-from collections.abc import Mapping
+import os
+import sys
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -50,13 +54,35 @@ def is_complete(path: Path, frame: Frame, settings: str) -> bool:
     if not path.is_file():
         return False
     try:
-        pictures, metadata = read_frame(path)
+        with quiet_descriptors():
+            pictures, metadata = read_frame(path)
     except AssetError as error:
         logger.info("rendered again: %s", error)
         return False
     x0, y0, x1, y1 = frame.camera.window
     expected = {name: (y1 - y0, x1 - x0, len(BY_NAME[name].channels)) for name in frame.passes}
     return metadata.get(SETTINGS) == settings and {name: p.shape for name, p in pictures.items()} == expected
+
+
+@contextlib.contextmanager
+def quiet_descriptors() -> Iterator[None]:
+    """Nothing reaches stdout and stderr: OpenEXR prints "Warning:", on which strict farms fail a task.
+
+    Its C++ side writes to the descriptors, its Python side to the streams.
+    """
+    sys.stdout.flush()
+    sys.stderr.flush()
+    kept = [os.dup(1), os.dup(2)]
+    try:
+        with open(os.devnull, "wb") as nothing:
+            os.dup2(nothing.fileno(), 1)
+            os.dup2(nothing.fileno(), 2)
+        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+            yield
+    finally:
+        for target, copy in enumerate(kept, 1):
+            os.dup2(copy, target)
+            os.close(copy)
 
 
 def save(path: Path, pictures: Mapping[str, np.ndarray], frame: Frame, number: int, settings: str) -> None:

@@ -20,7 +20,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from ..errors import AssetError, EngineError
+from ..errors import AssetError, EngineError, UsageError
 from . import sampling
 from .find_blender import find_blender
 from .frame_lines import FrameLines
@@ -76,6 +76,7 @@ def run(args: argparse.Namespace) -> int:
     assets: dict[str, Path] = {}
     noted: set[str] = set()
     done: set[int] = set()
+    files: dict[str, str] = {}
     with FrameLines() as lines, EngineClient(engine_command(sys.executable)) as engine:
 
         def key_of(path: Path) -> str:
@@ -92,6 +93,7 @@ def run(args: argparse.Namespace) -> int:
             for number, layer, scene_frame, warnings in process.frames():
                 note(warnings)
                 path = layer_path(frame_path(template, number), layer)
+                claim(files, path, layer)
                 frame = replace(
                     scene_frame,
                     settings=sampling.override(scene_frame.settings, args),
@@ -118,3 +120,11 @@ def layer_path(path: Path, layer: str) -> Path:
     """File of a view layer: where a scene has several, the layer's name goes before the suffix."""
     safe = re.sub(r"[^\w.-]+", "_", layer)
     return path.with_name(f"{path.stem}_{safe}{path.suffix}") if layer else path
+
+
+def claim(files: dict[str, str], path: Path, layer: str) -> None:
+    """Note in `files` that `path` is of `layer`; UsageError when it is another's (or is where case is ignored)."""
+    other = files.setdefault(str(path).casefold(), layer)
+    if other != layer:
+        remedy = "Rename one of them"
+        raise UsageError(f"view layers {other!r} and {layer!r}", f"would both be written to {path.name}", remedy)
