@@ -23,6 +23,34 @@ DEFORMING = {
 }
 
 
+def check_modifiers(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> None:
+    """Refuse an object that is subdivided last of all, before its mesh is asked for.
+
+    Blender subdivides only when somebody looks at the result, which may take minutes.
+
+    Raises
+    ------
+    AssetError
+        Names object and modifier.
+    """
+    final = depsgraph.mode == "RENDER"
+    render = depsgraph.scene_eval.render
+    limit = render.simplify_subdivision_render if final else render.simplify_subdivision
+    for modifier in reversed(obj.original.modifiers):
+        shown = modifier.show_render if final else modifier.show_viewport
+        if not shown or modifier.type in DEFORMING:
+            continue
+        if modifier.type == "SUBSURF" and len(obj.original.data.polygons):
+            levels = modifier.render_levels if final else modifier.levels
+            if min(levels, limit if render.use_simplify else levels) > 0:
+                raise AssetError(
+                    f'Object "{obj.name}"',
+                    f'modifier "{modifier.name}" changes the number of vertices by subdividing the mesh',
+                    "Remove it, or disable it for renders",
+                )
+        return
+
+
 def check_fit(obj: bpy.types.Object, mesh: bpy.types.Mesh, rest: Mesh, warn: Callable[[str], None]) -> bool:
     """Compare the evaluated `mesh` of `obj` with the asset's mesh.
 

@@ -12,7 +12,7 @@ import numpy as np
 from ...drgs_blender.asset import MATERIAL_CHANNELS, Asset
 from ...drgs_blender.frame import ObjectState
 from .. import assets, mesh_arrays
-from .fit import check_fit
+from .fit import check_fit, check_modifiers
 
 Warn = Callable[[str], None]
 #: Gives the engine's key of the asset at a path.
@@ -54,6 +54,7 @@ def export_objects(depsgraph: bpy.types.Depsgraph, key_of: KeyOf, warn: Warn) ->
         if not assets.is_drgs(obj):
             others["light" if obj.type == "LIGHT" else "other object"].add(obj.name)
             continue
+        check_modifiers(obj, depsgraph)
         shape_of = (obj.original.as_pointer(), obj.data.as_pointer())
         if shape_of not in shapes:
             shapes[shape_of] = _shape(obj, depsgraph, key_of, warn)
