@@ -6,11 +6,12 @@ python bench/bench_frame.py [--runs 5]
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 
 import numpy as np
 from judge import environments, frame_camera, run_cycles
-from ours import SESSION, relight
+from ours import relight
 from report import OUT, table, write_section
 from subjects import asset_path
 
@@ -27,7 +28,7 @@ def main() -> None:
     path = asset_path(options.asset, max_triangles=options.max_triangles)
     mesh = read_asset(path).mesh
     surfels = len(read_asset(path).surfels)
-    camera = frame_camera(mesh.vertices, options.size, azimuth=-60, fill=0.78)
+    camera = frame_camera(mesh.vertices, options.size, azimuth=-60, fill=0.66)
     npz = OUT / f"{options.asset}.npz"
     np.savez(npz, **{k: getattr(mesh, k) for k in ("vertices", "faces", "albedo", "roughness", "metallic")})
     environment = environments() / "city.exr"
@@ -64,8 +65,7 @@ def main() -> None:
         "with persistent data, file writing included, same mesh, bounces and camera.\n\n"
         + table(("Frame", "Seconds", "Cycles / ours"), rows)
     )
-    write_section("frame", "Time of a frame", "python bench/bench_frame.py", body)
-    SESSION.close() if hasattr(SESSION, "close") else None
+    write_section("frame", "Time of a frame", " ".join(["python", *sys.argv]), body)
 
 
 if __name__ == "__main__":

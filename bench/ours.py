@@ -28,6 +28,7 @@ def relight(
     camera: dict[str, Any],
     *,
     rays: int,
+    strength: float = 1.0,
     vertices: np.ndarray | None = None,
     passes: tuple[str, ...] = ("Combined",),
     **settings: Any,
@@ -39,7 +40,7 @@ def relight(
         number=1,
         camera=pinhole(camera),
         objects=[ObjectState("subject", key, vertices=vertices)],
-        world=World(environment=read_environment(environment).radiance),
+        world=World(environment=read_environment(environment).radiance, strength=strength),
         settings=RenderSettings(cosine=cosine, ggx=ggx, environment=light, film_transparent=True, **settings),
         passes=passes,
     )

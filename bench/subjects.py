@@ -11,21 +11,23 @@ from report import OUT, ROOT
 from drgs_blender.asset import Asset, Mesh
 from drgs_blender.asset.container import read_asset, write_asset
 from drgs_blender.build.make import make_asset
+from drgs_blender.jit import source_digest
 
 SOURCES = {
-    "spot": "spot/spot_triangulated.obj",
-    "cat": "cat/egyptian_cat.glb",
-    "robot": "robot/RobotExpressive.glb",
-    "helmet": "helmet/FlightHelmet.gltf",
+    "spot": ("spot/spot_triangulated.obj", {"up": "y"}),
+    "cat": ("cat/egyptian_cat.glb", {}),
+    "robot": ("robot/RobotExpressive.glb", {}),
+    "helmet": ("helmet/FlightHelmet.gltf", {}),
 }
 
 
 def asset_path(name: str, **options: Any) -> Path:
-    """`.drgs` of an example as `drgs make` builds it with `options`, made once."""
-    path = OUT / ("-".join([name, *map(str, options.values())]) + ".drgs")
+    """`.drgs` of an example as `drgs make` builds it with `options`, made once for these sources."""
+    path = OUT / source_digest() / ("-".join([name, *map(str, options.values())]) + ".drgs")
     if not path.exists():
-        OUT.mkdir(parents=True, exist_ok=True)
-        write_asset(path, make_asset(ROOT / "examples" / SOURCES[name], **options))
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file, defaults = SOURCES[name]
+        write_asset(path, make_asset(ROOT / "examples" / file, **defaults, **options))
     return path
 
 
@@ -46,7 +48,8 @@ def spread_materials(mesh: Mesh) -> dict[str, np.ndarray]:
 
 def spread_asset(name: str) -> tuple[Path, Path]:
     """(.drgs, .npz) of an example with spread materials, for our engine and for Cycles."""
-    drgs, npz = OUT / f"{name}-spread.drgs", OUT / f"{name}-spread.npz"
+    folder = asset_path(name).parent
+    drgs, npz = folder / f"{name}-spread.drgs", folder / f"{name}-spread.npz"
     if not (drgs.exists() and npz.exists()):
         asset = read_asset(asset_path(name))
         data = spread_materials(asset.mesh)
