@@ -14,6 +14,7 @@ from ..deform.faces import Faces
 from ..errors import AssetError
 from ..formats.axes import mesh_to_z_up
 from ..formats.files import MeshFile
+from ..formats.gltf_nodes import Pose
 from .texture import CHANNELS, Materials
 from .topology import Net, close_marks, edge_lengths, edges, subdivide, weld
 
@@ -45,6 +46,7 @@ def make_asset(
     density: float = 140.0,
     pretrained: Surfels | None = None,
     environment: Environment | str | Path | None = None,
+    pose: Pose = "rest",
 ) -> Asset:
     """Make an asset from a mesh with textures: glTF, GLB, OBJ, PLY and whatever else `formats` reads.
 
@@ -57,6 +59,7 @@ def make_asset(
     density : see `deform.attach.attach`
     pretrained : surfels whose place and opacity the attached ones take over (Algorithm 1)
     environment : light kept in the asset
+    pose : of a skinned glTF file, "rest" as Blender's importer rests it or "default" as viewers show the file
 
     Returns
     -------
@@ -64,20 +67,20 @@ def make_asset(
         What was merged, removed, divided and attached is in ``provenance["report"]``.
     """
     name = "mesh" if isinstance(source, MeshFile) else str(source)
-    file = read_mesh_file(source)
+    file = read_mesh_file(source, pose)
     mesh, report = mesh_with_materials(file, name, up=up, max_triangles=max_triangles, tolerance=tolerance)
     surfels, binding, report["surfels"] = attach(mesh, pretrained, density=density)
     provenance = {"mesh": Path(name).name, "made": "surfels attached to the mesh", "report": report}
     return Asset(surfels, mesh, binding, read_environment_of(environment), provenance)
 
 
-def read_mesh_file(source: str | Path | MeshFile) -> MeshFile:
-    """The mesh of a path, or `source` itself when it is one."""
+def read_mesh_file(source: str | Path | MeshFile, pose: Pose = "rest") -> MeshFile:
+    """The mesh of a path, skinned glTF in that `pose`; or `source` itself when it is one."""
     if isinstance(source, MeshFile):
         return source
     from ..formats.registry import read_mesh
 
-    return read_mesh(source)
+    return read_mesh(source, pose)
 
 
 def read_environment_of(source: Environment | str | Path | None) -> Environment | None:

@@ -58,7 +58,7 @@ def mesh_from_surfels(surfels: Surfels, *, resolution: int = 192, views: int = 6
         from skimage.measure import marching_cubes
     except ImportError as error:
         raise DeviceError(
-            "a mesh from surfels", "needs scikit-image", "Install drgs-blender[reconstruct], or give a mesh"
+            "a mesh from surfels", "needs scikit-image", "Install it: pip install scikit-image; or give a mesh"
         ) from error
     posed = _as_posed(surfels)
     low, high = _bounds(surfels)

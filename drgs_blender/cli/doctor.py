@@ -27,7 +27,8 @@ EXAMPLES = """examples:
 
 #: Earlier versions have known holes that a damaged file can use.
 OPENEXR_MINIMUM = (3, 4, 10)
-_REINSTALL = "Install it again: pip install --upgrade drgs-blender"
+_PACKAGE = "." if (Path(__file__).parents[2] / "pyproject.toml").is_file() else "drgs-blender"
+_REINSTALL = f"Install it again: pip install --upgrade {_PACKAGE}"
 
 
 @dataclass(slots=True)
@@ -43,7 +44,9 @@ class Finding:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of ``drgs doctor``."""
     parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.add_argument("--blender", metavar="PATH", help="blender program, or a Python that has bpy")
+    parser.add_argument(
+        "--blender", metavar="PATH", help="blender program, or a Python (or its environment) that has bpy"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -67,7 +70,8 @@ def check(name: str, essential: bool, test: Callable[[argparse.Namespace], str],
     try:
         return Finding(name, "ok", test(args))
     except DrgsError as error:
-        return Finding(name, state, f"{error.subject}: {error.problem}", error.remedy)
+        subject = "" if error.subject.lower() == name.lower() else f"{error.subject}: "
+        return Finding(name, state, f"{subject}{error.problem}", error.remedy)
     except ImportError as error:
         return Finding(name, state, str(error), _REINSTALL)
     except OSError as error:
@@ -137,13 +141,20 @@ def blender(args: argparse.Namespace) -> str:
     return f"{found.version()}, {found.program} ({found.origin})"
 
 
+def scikit_image(args: argparse.Namespace) -> str:
+    """scikit-image, which builds the mesh of a capture that has none."""
+    from skimage.measure import marching_cubes
+
+    return f"{importlib.metadata.version('scikit-image')} at {Path(marching_cubes.__code__.co_filename).parents[1]}"
+
+
 def torch(args: argparse.Namespace) -> str:
     """PyTorch, which relighting does not need."""
     try:
         return importlib.metadata.version("torch")
     except importlib.metadata.PackageNotFoundError:
         raise DeviceError(
-            "torch", "is not installed", "Only reconstruction needs it: drgs-blender[reconstruct]"
+            "torch", "is not installed", f"Only reconstruction needs it: pip install '{_PACKAGE}[reconstruct]'"
         ) from None
 
 
@@ -163,6 +174,7 @@ CHECKS: tuple[tuple[str, bool, Callable[[argparse.Namespace], str]], ...] = (
     ("OpenEXR", True, openexr),
     ("engine", True, engine),
     ("Blender", False, blender),
+    ("scikit-image", False, scikit_image),
     ("torch", False, torch),
     ("variables", False, variables),
 )

@@ -69,15 +69,22 @@ def find_blender(explicit: str | None = None) -> Blender:
         (os.environ.get("DRGS_BLENDER"), "DRGS_BLENDER", DeviceError),
     ):
         if given:
-            if not (program := shutil.which(given)):
+            if not (program := shutil.which(given) or program_in(Path(given))):
                 raise kind(f"{origin} {given}", "is not a program that can be run", _REMEDY)
             return Blender(Path(program), origin)
     if program := shutil.which("blender"):
         return Blender(Path(program), "PATH")
-    for name in ("bin/python", "Scripts/python.exe"):
-        if (python := CHECKOUT / ".venv-blender" / name).is_file():
-            return Blender(python, "checkout")
+    if program := program_in(CHECKOUT / ".venv-blender"):
+        return Blender(Path(program), "checkout")
     raise DeviceError("Blender", "was not found", _REMEDY)
+
+
+def program_in(folder: Path) -> str | None:
+    """The program in the folder of a virtual environment that has bpy, or of an unpacked Blender."""
+    for name in ("blender", "blender.exe", "bin/python", "Scripts/python.exe"):
+        if program := shutil.which(folder / name):
+            return program
+    return None
 
 
 def extension_source() -> Path | None:

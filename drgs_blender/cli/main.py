@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import logging
+import re
 import signal
 import sys
 from collections.abc import Sequence
@@ -117,7 +118,7 @@ def run_command(arguments: Sequence[str]) -> int:
     """Parse and run; every way to end becomes an exit code here."""
     verbose = 0
     try:
-        args = build_parser().parse_args(arguments)
+        args = build_parser().parse_args(join_values(arguments))
         verbose = getattr(args, "verbose", 0)
         args.verbose, args.quiet = verbose, getattr(args, "quiet", False)
         args.progress = getattr(args, "progress", None)
@@ -149,6 +150,17 @@ def run_command(arguments: Sequence[str]) -> int:
         hint = "" if verbose else " Run again with -v for details and report it."
         print(f"drgs: internal: {type(error).__name__}: {error}.{hint}", file=sys.stderr)
         return errors.EXIT_INTERNAL
+
+
+def join_values(arguments: Sequence[str]) -> list[str]:
+    """``--up -y`` and ``--frames -5--1`` as ``--up=-y`` and ``--frames=-5--1``: argparse takes a dash for an option."""
+    joined: list[str] = []
+    for word in arguments:
+        if joined and joined[-1] in ("--up", "--frames") and re.match(r"-[yz\d]", word):
+            joined[-1] += f"={word}"
+        else:
+            joined.append(word)
+    return joined
 
 
 def set_up_logging(verbose: int, quiet: bool) -> None:

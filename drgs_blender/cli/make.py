@@ -25,6 +25,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("mesh", type=Path, metavar="MESH", help="mesh with materials (glTF, GLB, OBJ, PLY)")
     parser.add_argument("--out", type=Path, required=True, metavar="A.drgs", help="asset to write")
     parser.add_argument("--up", choices=tuple(UP_AXES), help="up axis of the file; default: what its format says")
+    parser.add_argument(
+        "--pose",
+        choices=("rest", "default"),
+        default="rest",
+        help="of a skinned glTF: as Blender's importer rests it, for Bind to Rig (default), or as viewers show it",
+    )
     parser.add_argument("--env", type=Path, help="environment kept in the asset")
     parser.add_argument(
         "--max-triangles", type=whole(1, 10**8), metavar="N", help="budget when the mesh is divided for texture detail"
@@ -43,6 +49,6 @@ def run(args: argparse.Namespace) -> int:
 
     given = {name: value for name in ("max_triangles", "density") if (value := getattr(args, name)) is not None}
     with clock(args, "making the asset"):
-        asset = make_asset(args.mesh, up=args.up, environment=args.env, **given)
+        asset = make_asset(args.mesh, up=args.up, environment=args.env, pose=args.pose, **given)
     write_and_report(args.out, asset)
     return 0

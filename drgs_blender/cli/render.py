@@ -47,7 +47,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="PATTERN",
         help="EXR files; #### becomes the frame's number, // the scene's folder",
     )
-    parser.add_argument("--blender", metavar="PATH", help="blender program, or a Python that has bpy")
+    parser.add_argument(
+        "--blender", metavar="PATH", help="blender program, or a Python (or its environment) that has bpy"
+    )
     parser.add_argument("--overwrite", action="store_true", help="render frames that are already there, too")
     parser.add_argument(
         "--enable-scripts", action="store_true", help="let the file run its own Python scripts and drivers"

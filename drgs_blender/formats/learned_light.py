@@ -57,9 +57,7 @@ def _load(path: Path) -> Any:
     try:
         import torch
     except ImportError as error:
-        raise DeviceError(
-            str(path), "needs torch to be read", 'Install it: pip install "drgs-blender[reconstruct]"'
-        ) from error
+        raise DeviceError(str(path), "needs torch to be read", "Install it: pip install torch") from error
     try:
         return torch.load(path, map_location="cpu", weights_only=True)
     except (RuntimeError, OSError, EOFError, ValueError, KeyError, pickle.UnpicklingError) as error:

@@ -18,6 +18,7 @@ from .environment import read_exr_environment, read_hdr_environment, read_pictur
 from .files import EnvironmentFile, MaterialsFile, MeshFile, SurfelFile
 from .gaussian_ply import LAYOUTS, is_gaussian, read_gaussian_ply
 from .gltf import read_gltf
+from .gltf_nodes import Pose
 from .learned_light import LEGACY, ZIP, read_learned_light
 from .materials import is_nero_folder, read_nero_materials
 from .mesh import sanitise
@@ -86,6 +87,10 @@ def _sniff_torch(head: bytes, path: Path) -> bool:
     return head.startswith(LEGACY) or (head.startswith(ZIP) and b"data.pkl" in head[:4096])
 
 
+def _read_gltf(path: Path, pose: Pose = "rest") -> MeshFile:
+    return sanitise(read_gltf(path, pose))
+
+
 #: The table; the first format that recognises a file reads it.
 FORMATS: tuple[Format, ...] = (
     Format(
@@ -118,7 +123,7 @@ FORMATS: tuple[Format, ...] = (
         (".glb", ".gltf"),
         "mesh",
         _sniff_gltf,
-        lambda path: sanitise(read_gltf(path)),
+        _read_gltf,
         "metallic-roughness materials; skins in Blender's rest pose; turned to Z up; not Draco or meshopt",
     ),
     Format(
@@ -220,8 +225,14 @@ def read_surfels(path: str | Path) -> SurfelFile:
     return result
 
 
-def read_mesh(path: str | Path) -> MeshFile:
-    """Read a mesh with its materials; ``up_axis`` says whether it is known to be Z up. Raises AssetError."""
+def read_mesh(path: str | Path, pose: Pose = "rest") -> MeshFile:
+    """Read a mesh with its materials; ``up_axis`` says whether it is known to be Z up. Raises AssetError.
+
+    `pose` is that of skinned glTF: "rest" as Blender's importer rests it, "default" as viewers show the file.
+    """
+    path = Path(path)
+    if find_format(path, "mesh").read is _read_gltf:
+        return _read_gltf(path, pose)
     result = read(path, kind="mesh")
     assert isinstance(result, MeshFile)
     return result

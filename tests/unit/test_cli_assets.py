@@ -12,6 +12,7 @@ from PIL import Image
 from drgs_blender.asset.container import read_asset
 from drgs_blender.cli import doctor
 from drgs_blender.cli.main import main
+from drgs_blender.formats.gltf import read_gltf
 from drgs_blender.render.frames import write_frame
 
 #: Unit cube, each face on the whole texture.
@@ -97,10 +98,12 @@ def test_make_carries_the_texture_to_the_mesh(cube, tmp_path, capsys):
 def test_up_axis_turns_the_object(cube, tmp_path):
     cube.write_text(CUBE.replace("v 1 1 1\n", "v 1 3 1\n"))
     tops = []
-    for up in ("y", "z"):
+    for up in ("y", "z", "-y"):
         assert main(["make", str(cube), "--up", up, "--out", str(tmp_path / "c.drgs")]) == 0
-        tops.append(read_asset(tmp_path / "c.drgs").mesh.vertices.max(axis=0))
-    assert tops[0][2] == pytest.approx(3) and tops[1][1] == pytest.approx(3)
+        vertices = read_asset(tmp_path / "c.drgs").mesh.vertices
+        tops.append([vertices.min(axis=0), vertices.max(axis=0)])
+    assert tops[0][1][2] == pytest.approx(3) and tops[1][1][1] == pytest.approx(3)
+    assert tops[2][0][2] == pytest.approx(-3)
 
 
 def test_import_builds_a_mesh_around_splats(tmp_path, capsys):
@@ -196,3 +199,33 @@ def test_doctor_only_notes_the_absence_of_what_is_optional(monkeypatch, capsys, 
     assert main(["doctor"]) == 0
     text = capsys.readouterr().out
     assert "absent   Blender" in text and "DRGS_BLENDER" in text
+
+
+def test_doctor_says_a_name_once(monkeypatch, capsys):
+    def absent(name):
+        raise doctor.importlib.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(doctor.importlib.metadata, "version", absent)
+    monkeypatch.setattr(doctor, "CHECKS", [c for c in doctor.CHECKS if c[0] == "torch"])
+    assert main(["doctor"]) == 0
+    assert "absent   torch        is not installed\n" in capsys.readouterr().out
+
+
+def test_doctor_looks_for_what_builds_meshes(capsys):
+    assert main(["doctor", "--json"]) == 0
+    checks = {check["name"]: check for check in json.loads(capsys.readouterr().out)["checks"]}
+    assert checks["scikit-image"]["state"] == "ok"
+
+
+@pytest.mark.parametrize("rig", ["RobotExpressive.glb"])
+def test_pose_of_a_rig(shared_data, tmp_path, rig):
+    path = next(shared_data.rglob(rig))
+    extents = []
+    for pose in ("rest", "default"):
+        out = tmp_path / f"{pose}.drgs"
+        assert main(["make", str(path), "--pose", pose, "--density", "20", "--out", str(out)]) == 0
+        mesh = read_asset(out).mesh
+        expected = read_gltf(path, pose=pose).vertices
+        extents.append(np.stack([mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)]))
+        np.testing.assert_allclose(extents[-1], [expected.min(axis=0), expected.max(axis=0)], atol=1e-4)
+    assert np.abs(extents[0] - extents[1]).max() > 0.01

@@ -136,6 +136,25 @@ def test_blender_that_does_not_start_is_said(tmp_path):
         find_blender(str(fake)).version()
 
 
+@pytest.mark.skipif(os.name == "nt", reason="uses a shell script as a program")
+@pytest.mark.parametrize("place", ["bin/python", "blender"])
+def test_blender_may_be_named_by_its_folder(tmp_path, place):
+    program = tmp_path / place
+    program.parent.mkdir(exist_ok=True)
+    program.write_text("#!/bin/sh\n")
+    program.chmod(0o755)
+    assert find_blender(str(tmp_path)).program == program
+    with pytest.raises(errors.UsageError, match="not a program"):
+        find_blender(str(tmp_path / "nowhere"))
+
+
+def test_values_that_begin_with_a_dash_need_no_equals_sign(tmp_path, capsys):
+    scene = tmp_path / "absent.blend"
+    out = str(tmp_path / "#.exr")
+    assert main(["render", str(scene), "--frames", "-5--1", "--out", out]) == errors.EXIT_BAD_ASSET
+    assert main(["make", "a.obj", "--up", "-q", "--out", "a.drgs"]) == errors.EXIT_USAGE
+
+
 def options(arguments: list[str], defaults: bool):
     parser = command_line.Parser()
     sampling.add_arguments(parser, defaults=defaults)
