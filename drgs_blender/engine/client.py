@@ -27,6 +27,7 @@ from .codec import CodecError, encode_frame
 from .locate import engine_command, locate_engine
 from .protocol import PROTOCOL, Passes, sendable
 from .slots import SentSlots
+from .watch import Lost, Watch
 
 logger = logging.getLogger(__name__)
 
@@ -38,38 +39,6 @@ T = TypeVar("T")
 _POLL = 0.04
 _CANCEL_WAIT = 0.3
 _PREPARING = "Preparing kernels"
-
-
-class _Lost(Exception):
-    """The engine died, fell silent or spoke nonsense; a new one may do better."""
-
-
-class _Watch:
-    """Counts how long the engine has been silent, and how long its main thread has stood still.
-
-    Time is counted in small steps, so that a pause of this process (a debugger, a suspended machine) is not taken
-    for one of the engine.
-    """
-
-    def __init__(self, child: Child, silence: float, stall: float) -> None:
-        self._child, self._silence, self._stall = child, silence, stall
-        self._last = time.monotonic()
-        self._seen = (child.heard, child.steps)
-        self._quiet = self._still = 0.0
-
-    def check(self) -> None:
-        now = time.monotonic()
-        passed, self._last = min(now - self._last, 0.5), now
-        heard, steps = self._seen
-        self._quiet = 0.0 if self._child.heard != heard else self._quiet + passed
-        self._still = 0.0 if self._child.steps != steps else self._still + passed
-        self._seen = (self._child.heard, self._child.steps)
-        if self._quiet > self._silence:
-            raise _Lost(f"did not answer for {self._silence:g} s")
-        if self._still > self._stall:
-            raise EngineError(
-                "engine", f"made no progress for {self._stall:g} s", "Try fewer samples or a smaller scene"
-            )
 
 
 class EngineClient:
@@ -188,7 +157,7 @@ class EngineClient:
                 if isinstance(answer, protocol.Result):
                     return Passes(pictures, answer.warnings, answer.statistics)
                 self._sent.forget()
-            raise _Lost("keeps asking for arrays it was sent")
+            raise Lost("keeps asking for arrays it was sent")
 
         with self._exclusive(cancelled):
             return self._repeating(work, on_progress, cancelled)
@@ -239,7 +208,7 @@ class EngineClient:
             try:
                 self._ensure(on_progress, cancelled)
                 return work()
-            except _Lost as loss:
+            except Lost as loss:
                 problem = str(loss)
                 if self._child is not None and isinstance(loss.__cause__, EOFError):
                     problem = self._child.epitaph()
@@ -286,7 +255,7 @@ class EngineClient:
             del self._to_load[0]
 
     def _handshake(self, child: Child, cancelled: IsCancelled | None) -> None:
-        watch = _Watch(child, self.greeting, self.stall)
+        watch = Watch(child, self.greeting, self.stall)
         remedy = "Install the engine in the environment named in the preferences, or correct the path"
         while True:
             if self._stopped(cancelled):
@@ -296,14 +265,14 @@ class EngineClient:
             except queue.Empty:
                 try:
                     watch.check()
-                except _Lost as silence:
+                except Lost as silence:
                     problem = f"does not greet as an engine does: it said nothing for {self.greeting:g} s"
                     raise DeviceError(self.command[0], problem, remedy) from silence
                 continue
             if isinstance(item, OSError) and child.pid == 0:
                 raise DeviceError(self.command[0], f"cannot be started ({item})", remedy) from item
             if isinstance(item, EOFError) and child.killed:
-                raise _Lost("was killed while it started") from item
+                raise Lost("was killed while it started") from item
             if isinstance(item, protocol.ProtocolError):
                 raise DeviceError(self.command[0], f"does not speak as an engine does ({item})", remedy) from item
             if isinstance(item, Exception):
@@ -325,7 +294,7 @@ class EngineClient:
     def _load(self, path: str, on_progress: OnProgress | None, cancelled: IsCancelled | None) -> str:
         answer, _ = self._request(protocol.LoadAsset(self._next(), path), {}, on_progress, cancelled)
         if not isinstance(answer, protocol.Loaded):
-            raise _Lost(f"answered {type(answer).__name__} when asked to load an asset")
+            raise Lost(f"answered {type(answer).__name__} when asked to load an asset")
         self._assets[path] = answer.key
         return answer.key
 
@@ -341,7 +310,7 @@ class EngineClient:
         assert child is not None
         self._settle(child, on_progress, cancelled)
         child.request(message, arrays)
-        watch = _Watch(child, self.silence, self.stall)
+        watch = Watch(child, self.silence, self.stall)
         stop_at = None
         try:
             while True:
@@ -364,7 +333,7 @@ class EngineClient:
 
     def _settle(self, child: Child, on_progress: OnProgress | None, cancelled: IsCancelled | None) -> None:
         """Wait until the engine has answered a request that was cancelled before."""
-        watch = _Watch(child, self.silence, self.stall)
+        watch = Watch(child, self.silence, self.stall)
         while not child.idle.is_set():
             self._take(child, on_progress)
             watch.check()
@@ -382,13 +351,13 @@ class EngineClient:
         if isinstance(item, CodecError):
             raise UsageError("frame", str(item), "Correct the setting or object it names") from item
         if isinstance(item, Exception):
-            raise _Lost(str(item) or type(item).__name__) from item
+            raise Lost(str(item) or type(item).__name__) from item
         if isinstance(item[0], protocol.Progress):
             if on_progress is not None:
                 on_progress(item[0].phase, item[0].fraction)
             return None
         if isinstance(item[0], protocol.Failed) and item[0].id == 0:
-            raise _Lost(f"refused a message: {item[0].problem}")
+            raise Lost(f"refused a message: {item[0].problem}")
         return item
 
 

@@ -1,4 +1,4 @@
-"""The messages between the extension and the engine, and the link that carries them (docs/protocol.md).
+"""How extension and engine send each other `messages`: their form, and the link that carries it (docs/protocol.md).
 
 A message is a fixed prefix, a JSON header of limited size, and arrays: in the pipe behind the header, or in a shared
 region. Everything is checked against limits before memory is taken for it; nothing received is ever executed.
@@ -19,7 +19,60 @@ import numpy as np
 
 from ..version import __version__
 from .codec import CodecError, decode, encode
+from .messages import (
+    MESSAGES,
+    Alive,
+    Cancel,
+    Failed,
+    Hello,
+    LoadAsset,
+    Loaded,
+    Need,
+    Passes,
+    Progress,
+    Render,
+    Result,
+    Shutdown,
+    Stopped,
+    Welcome,
+)
 from .shared import Region
+
+__all__ = [  # the messages are part of it
+    "ALIGNMENT",
+    "DTYPES",
+    "MAGIC",
+    "MAX_ARRAYS",
+    "MAX_BULK",
+    "MAX_DIMENSIONS",
+    "MAX_HEADER",
+    "MESSAGES",
+    "PREFIX",
+    "PROTOCOL",
+    "Alive",
+    "Cancel",
+    "Failed",
+    "Hello",
+    "Link",
+    "LoadAsset",
+    "Loaded",
+    "Need",
+    "Passes",
+    "Placed",
+    "Progress",
+    "ProtocolError",
+    "RawIO",
+    "Render",
+    "Result",
+    "Shutdown",
+    "Stopped",
+    "Welcome",
+    "__version__",
+    "pack",
+    "same_version",
+    "sendable",
+    "unpack",
+]
 
 Array = np.ndarray
 
@@ -46,142 +99,6 @@ class RawIO(Protocol):
 
     def readinto(self, buffer: memoryview, /) -> int | None: ...
     def write(self, data: memoryview | bytes, /) -> int | None: ...
-
-
-# --- messages: engine -> client -----------------------------------------------------------------------------------
-
-
-@dataclass(slots=True)
-class Hello:
-    """First words of the engine, before anything slow is imported. Its fields never change."""
-
-    protocol: int
-    version: str
-    pid: int
-
-
-@dataclass(slots=True)
-class Loaded:
-    """An asset is ready under `key`."""
-
-    id: int
-    key: str
-    vertices: int
-    surfels: int
-
-
-@dataclass(slots=True)
-class Progress:
-    """Where a request stands; ``fraction`` of the phase or picture in [0, 1]."""
-
-    id: int
-    phase: str
-    fraction: float
-
-
-@dataclass(slots=True)
-class Result:
-    """A finished picture; its passes are the message's arrays."""
-
-    id: int
-    warnings: list[str]
-    statistics: dict[str, float]
-
-
-@dataclass(slots=True)
-class Need:
-    """These slots are not held at the version named: send them again."""
-
-    id: int
-    slots: list[str]
-
-
-@dataclass(slots=True)
-class Stopped:
-    """A request ended because it was cancelled."""
-
-    id: int
-
-
-@dataclass(slots=True)
-class Failed:
-    """A request ended in an error (`error` is a name of errors.ERROR_CLASSES). Request 0 is the link itself."""
-
-    id: int
-    error: str
-    subject: str
-    problem: str
-    remedy: str
-
-
-@dataclass(slots=True)
-class Alive:
-    """The engine is there. ``steps`` grows while its main thread advances, ``preparing`` while kernels compile."""
-
-    steps: int
-    preparing: bool
-
-
-# --- messages: client -> engine -----------------------------------------------------------------------------------
-
-
-@dataclass(slots=True)
-class Welcome:
-    """The client's answer to Hello: its version, and the inherited files of the shared regions (-1: none)."""
-
-    protocol: int
-    version: str
-    to_engine: int
-    to_client: int
-
-
-@dataclass(slots=True)
-class LoadAsset:
-    """Map the asset at `path`."""
-
-    id: int
-    path: str
-
-
-@dataclass(slots=True)
-class Render:
-    """Render one frame: its description, the version of every slot it uses, and (as arrays) what changed."""
-
-    id: int
-    frame: dict[str, Any]
-    slots: dict[str, int]
-
-
-@dataclass(slots=True)
-class Cancel:
-    """Stop the request."""
-
-    id: int
-
-
-@dataclass(slots=True)
-class Shutdown:
-    """End the engine."""
-
-
-_FROM_ENGINE: tuple[type, ...] = (Hello, Loaded, Progress, Result, Need, Stopped, Failed, Alive)
-_FROM_CLIENT: tuple[type, ...] = (Welcome, LoadAsset, Render, Cancel, Shutdown)
-MESSAGES: dict[str, type] = {c.__name__: c for c in (*_FROM_ENGINE, *_FROM_CLIENT)}
-
-
-class Passes(dict[str, Array]):
-    """Passes of a finished picture, name -> (h, w, c) float32, with what the engine has to say about it.
-
-    Attributes
-    ----------
-    warnings : list of str, each naming the object it is about
-    statistics : seconds a stage (``seconds.deform`` ...), counts of triangles, surfels, rays
-    """
-
-    def __init__(self, passes: dict[str, Array], warnings: list[str], statistics: dict[str, float]) -> None:
-        super().__init__(passes)
-        self.warnings = warnings
-        self.statistics = statistics
 
 
 # --- headers ------------------------------------------------------------------------------------------------------
