@@ -7,38 +7,67 @@ client: LoadAsset for every asset, Render for every frame and view layer, Failed
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import io
 import json
 import os
+import shutil
 import sys
+import threading
+import time
 import traceback
 from pathlib import Path
 from typing import Any
 
 READY = b"DRGS-BLENDER-READY\n"
 ENGINE = "DRGS_BATCH"
+ALIVE_SECONDS = 5.0
 
 
 def main() -> None:
     """Do the job that the parent describes in one line of JSON."""
     reader, writer = private_streams()
     job = json.loads(read_line(reader))
+    try:
+        do(job, reader, writer)
+    finally:
+        if job["repository"]:  # the parent made it, and may have been killed
+            shutil.rmtree(job["repository"], ignore_errors=True)
+
+
+def do(job: dict[str, Any], reader: io.FileIO, writer: io.FileIO) -> None:
+    """Greet the parent and render the frames of `job`; what goes wrong is sent to the parent."""
     package = enable_extension(job["repository"])
     protocol = importlib.import_module(f"{package}.drgs_blender.engine.protocol")
     errors = importlib.import_module(f"{package}.drgs_blender.errors")
     version = importlib.import_module(f"{package}.drgs_blender.version").__version__
     link = protocol.Link(reader, writer)
     link.send(protocol.Hello(protocol.PROTOCOL, version, os.getpid()))
+    threading.Thread(target=say_alive, args=(link, protocol), daemon=True).start()
     try:
         render_frames(Exporter(link, package), job)
         link.send(protocol.Shutdown())
     except errors.DrgsError as error:
         link.send(protocol.Failed(0, type(error).__name__, error.subject, error.problem, error.remedy))
+    except ParentGone:
+        return
     except Exception as error:
         # Reported to the parent, which ends the job; the traceback is in Blender's output (-v).
         traceback.print_exc()
         link.send(protocol.Failed(0, "DrgsError", "Blender", f"{type(error).__name__}: {error}", ""))
+
+
+class ParentGone(Exception):
+    """Nobody reads what this side sends."""
+
+
+def say_alive(link: Any, protocol: Any) -> None:
+    """Send a word every few seconds, so that the parent can tell a long evaluation from a Blender that hangs."""
+    with contextlib.suppress(OSError):
+        while True:
+            time.sleep(ALIVE_SECONDS)
+            link.send(protocol.Progress(0, "evaluating", 0.0))
 
 
 def private_streams() -> tuple[io.FileIO, io.FileIO]:
@@ -103,11 +132,14 @@ class Exporter:
         return self.keys[path]
 
     def ask(self, message: Any, arrays: dict[str, Any] | None = None) -> Any:
-        """Send a request and return the answer; end this process when the parent is gone."""
-        self.link.send(message, arrays)
+        """Send a request and return the answer; ParentGone when nobody is there."""
+        try:
+            self.link.send(message, arrays)
+        except OSError as error:
+            raise ParentGone from error
         answer = self.link.receive()
         if answer is None:
-            os._exit(1)
+            raise ParentGone
         return answer[0]
 
     def send(self, depsgraph: Any) -> None:
@@ -171,7 +203,12 @@ def render_frames(exporter: Exporter, job: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except BaseException:
+        traceback.print_exc()
+        sys.stderr.flush()
+        os._exit(70)
     # Nothing is left to save, and the exit of some Blender versions hangs or crashes after a render.
     sys.stderr.flush()
     os._exit(0)

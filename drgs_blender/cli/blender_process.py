@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import tempfile
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -28,6 +29,8 @@ from .find_blender import Blender, extension_source
 
 logger = logging.getLogger(__name__)
 
+#: Blender says every ALIVE_SECONDS that it is alive; starting may take long on a cold network drive.
+SILENT_SECONDS, START_SECONDS = 120.0, 300.0
 _CHECK = "Run `drgs doctor`; -vv shows what Blender prints"
 
 #: One evaluated view layer: frame number, layer ("" when there is only one), description, warnings of the export.
@@ -48,6 +51,9 @@ class BlenderProcess:
         self._blender, self._job, self._key_of = blender, job, key_of
         self._words: deque[str] = deque(maxlen=50)
         self._held = HeldSlots()
+        self._ended = threading.Event()
+        self._deadline: float | None = None  # set while this side waits
+        self._silent = False
 
     def __enter__(self) -> BlenderProcess:
         self._folder = tempfile.mkdtemp(prefix="drgs-")
@@ -62,7 +68,8 @@ class BlenderProcess:
             raise DeviceError(f"Blender at {self._blender.program}", f"does not start ({error})") from error
         self._listener = threading.Thread(target=self._listen, daemon=True)
         self._listener.start()
-        self._link = Link(self._process.stdout, self._process.stdin)  # type: ignore[arg-type]
+        self._link = Link(self._process.stdout, self._process.stdin, self._hear)  # type: ignore[arg-type]
+        threading.Thread(target=self._watch, daemon=True).start()
         try:
             self._greet(self._job | {"repository": repository})
         except BaseException:
@@ -71,6 +78,7 @@ class BlenderProcess:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._ended.set()
         self._process.kill()
         self._process.wait()
         self._listener.join(5)
@@ -115,10 +123,13 @@ class BlenderProcess:
         assert stream is not None and self._process.stdin is not None
         with contextlib.suppress(BrokenPipeError):  # the end of stdout tells what happened
             self._process.stdin.write(json.dumps(job).encode() + b"\n")
+        self._deadline = time.monotonic() + START_SECONDS
         while (line := stream.readline()) not in (READY, b""):
             self._note(line)
         received = self._link.receive() if line else None
+        self._deadline = None
         if received is None:
+            self._complain_of_silence(START_SECONDS)
             raise DeviceError(f"Blender at {self._blender.program}", f"cannot do the job: {self._epitaph()}", _CHECK)
         message = received[0]
         if not isinstance(message, protocol.Hello) or not protocol.same_version(message):
@@ -128,10 +139,17 @@ class BlenderProcess:
 
     def _receive(self) -> tuple[Any, dict[str, np.ndarray]]:
         try:
+            self._hear()
             received = self._link.receive()
+            while received is not None and isinstance(received[0], protocol.Progress):
+                received = self._link.receive()
         except (ProtocolError, OSError) as error:
+            self._complain_of_silence(SILENT_SECONDS)
             raise EngineError("Blender", f"stopped in the middle of a message ({error})", self._epitaph()) from error
+        finally:
+            self._deadline = None
         if received is None:
+            self._complain_of_silence(SILENT_SECONDS)
             raise EngineError("Blender", f"ended before the job: {self._epitaph()}", "Try again; -vv shows its output")
         message = received[0]
         if isinstance(message, protocol.Failed):
@@ -144,6 +162,23 @@ class BlenderProcess:
             raise EngineError("Blender", f"did not send {missing[0]}", "Try again")
         about = message.frame
         return about["number"], about["layer"], decode_frame(about["frame"], arrays), about["warnings"]
+
+    def _hear(self) -> None:
+        """Something arrived, or waiting begins."""
+        self._deadline = max(self._deadline or 0.0, time.monotonic() + SILENT_SECONDS)
+
+    def _watch(self) -> None:
+        """End a Blender from which nothing is heard for too long while this side waits."""
+        while not self._ended.wait(0.5):
+            deadline = self._deadline
+            if deadline is not None and time.monotonic() > deadline:
+                self._silent = True
+                self._process.kill()
+                return
+
+    def _complain_of_silence(self, seconds: float) -> None:
+        if self._silent:
+            raise EngineError("Blender", f"did not answer for {seconds:g} s and was ended", "Try again")
 
     def _listen(self) -> None:
         """Gather what Blender prints: shown with -vv, and its last words when it dies."""

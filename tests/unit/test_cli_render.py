@@ -16,10 +16,11 @@ import pytest
 
 from drgs_blender.asset.container import write_asset
 from drgs_blender.asset.model import Asset, Mesh
+from drgs_blender.cli import blender_process
 from drgs_blender.cli.find_blender import CHECKOUT, find_blender
 from drgs_blender.cli.main import main
 from drgs_blender.deform.attach import attach
-from drgs_blender.errors import DeviceError
+from drgs_blender.errors import DeviceError, EngineError
 from drgs_blender.render.frames import read_frame
 
 BUILD = """
@@ -159,6 +160,47 @@ def test_a_frame_does_not_depend_on_its_chunk(render, tmp_path):
 def test_every_view_layer_gets_a_file(render, tmp_path):
     assert render(scene="layers.blend", frames="1")[0] == 0
     assert [p.name for p in sorted(tmp_path.iterdir())] == ["0001_Second_layer.exr", "0001_ViewLayer.exr"]
+
+
+def test_negative_frames_are_evaluated_where_they_are(render, tmp_path):
+    assert render("--passes", "Coverage", "--primary", "mesh", frames="-2,2,3")[0] == 0
+    assert [p.name for p in sorted(tmp_path.iterdir())] == ["-0002.exr", "0002.exr", "0003.exr"]
+    assert column(tmp_path / "-0002.exr") == pytest.approx(16, abs=0.05)
+    assert column(tmp_path / "0002.exr") > 16.5
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="finds Blender in /proc")
+def test_job_that_is_killed_leaves_no_folder(folder, tmp_path):
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "drgs_blender.cli.main", "render", str(folder / "shot.blend"), "--frames", "1-9",
+         "--out", str(tmp_path / "####.exr"), "--rays", "65536"],
+        stdout=subprocess.PIPE, text=True, env=os.environ | {"TMPDIR": str(scratch)},
+    )  # fmt: skip
+    try:
+        while not process.stdout.readline().startswith("Fra:1 "):
+            assert process.poll() is None
+        assert list(scratch.glob("drgs-*"))
+    finally:
+        process.kill()
+        process.wait()
+    deadline = time.monotonic() + 20
+    while list(scratch.glob("drgs-*")) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not list(scratch.glob("drgs-*"))
+
+
+@pytest.mark.skipif(os.name == "nt", reason="there are no such signals there")
+def test_blender_that_stops_answering_is_ended(folder, monkeypatch):
+    monkeypatch.setattr(blender_process, "SILENT_SECONDS", 7.0)
+    job = {"scene": str(folder / "shot.blend"), "frames": list(range(1, 9)), "scripts": False}
+    with blender_process.BlenderProcess(find_blender(), job, lambda path: "key") as process:
+        frames = process.frames()
+        next(frames)
+        os.kill(process._process.pid, signal.SIGSTOP)
+        with pytest.raises(EngineError, match="did not answer for 7 s"):
+            next(frames)
 
 
 def test_scripts_in_the_file_run_only_when_allowed(render):
