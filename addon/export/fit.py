@@ -26,7 +26,7 @@ DEFORMING = {
 def check_modifiers(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> None:
     """Refuse an object that is subdivided last of all, before its mesh is asked for.
 
-    Blender subdivides only when somebody looks at the result, which may take minutes.
+    From 5.0 on Blender subdivides only when somebody looks at the result, which may take minutes.
 
     Raises
     ------
