@@ -214,7 +214,7 @@ def test_mesh_region_and_clipping() -> None:
 
 
 def test_overhang_of_a_fold_is_lit_as_the_face_beyond() -> None:
-    """A step seen from above at a slant: surfels of the upright side reach over the flat top, and must not darken it."""
+    """A step seen at a slant from above: surfels of its upright side reach over the flat top and must not darken it."""
     vertices = np.float32([[-1, 0, 0], [1, 0, 0], [1, 0, 1], [-1, 0, 1], [1, 2, 1], [-1, 2, 1]])
     faces = np.int32([[0, 1, 2], [0, 2, 3], [3, 2, 4], [3, 4, 5]])
     eye, target = np.array([0.0, -2.0, 1.6]), np.array([0.0, 0.1, 1.0])
