@@ -66,6 +66,6 @@ def locate_engine(preference: str | os.PathLike[str] | None = None) -> list[str]
     raise DeviceError(
         "engine",
         f"not found: {'; '.join(looked)}",
-        f"Create an environment with `python -m venv` and `pip install .` in a checkout of DR-GS, then name its folder in "
-        f"the add-on preferences or in {VARIABLE}",
+        f"Create an environment with `python -m venv` and `pip install .` in a checkout of DR-GS, then name its "
+        f"folder in the add-on preferences or in {VARIABLE}",
     )
