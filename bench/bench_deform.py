@@ -111,7 +111,7 @@ def main() -> None:
     body += table(["step", "processor ms", "wall ms"], rows)
     body += "\n\nUpdate of a surfel under random gradients (identity plus normal noise of 0.4), medians:\n\n"
     body += table(["rule", "relative error of the covariance", "tilt of the normal, degrees"], rule_errors())
-    write_section("deform", "Deformation", "python bench/bench_deform.py", body)
+    write_section("deform", "Deformation", body)
 
 
 if __name__ == "__main__":

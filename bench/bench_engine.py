@@ -125,7 +125,7 @@ def main() -> None:
         "Kernels cached; a sheet of 20,000 triangles at 400 x 400, 4 rays; medians of 5 starts. Link: 12 MB "
         "of vertices one way, 24.9 MB of picture back, median of 15.\n\n" + table(["step", "wall ms"], rows)
     )
-    write_section("engine", "The engine process", "python bench/bench_engine.py", body)
+    write_section("engine", "The engine process", body)
 
 
 if __name__ == "__main__":

@@ -86,7 +86,7 @@ def main() -> None:
     body += "\n\nEach strategy alone against all together under forest.exr (no sun to be missed), direct light,\n"
     body += "mean of 20,000 pixels ± standard error:\n\n"
     body += table(["roughness", "metallic", "all", "cosine alone", "GGX alone", "environment alone"], strategies())
-    write_section("estimator", "The estimator", "python bench/bench_estimator.py", body)
+    write_section("estimator", "The estimator", body)
 
 
 if __name__ == "__main__":

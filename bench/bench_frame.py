@@ -6,7 +6,6 @@ python bench/bench_frame.py [--runs 5]
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 
 import numpy as np
@@ -65,7 +64,7 @@ def main() -> None:
         "with persistent data, file writing included, same mesh, bounces and camera.\n\n"
         + table(("Frame", "Seconds", "Cycles / ours"), rows)
     )
-    write_section("frame", "Time of a frame", " ".join(["python", *sys.argv]), body)
+    write_section("frame", "Time of a frame", body)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ python bench/bench_parity.py [--size 256] [--samples 1024] [--rays 4096]
 from __future__ import annotations
 
 import argparse
-import sys
 
 import numpy as np
 from judge import environments, foreground, frame_camera, psnr, run_cycles
@@ -69,7 +68,7 @@ def main() -> None:
         f"Bent: mean {np.mean(bent):.2f} dB, lowest {min(bent):.2f} dB; "
         f"worst change {min(b - r for b, r in zip(bent, rest)):+.2f} dB."
     )
-    write_section("parity", "Parity with Cycles", " ".join(["python", *sys.argv]), body)
+    write_section("parity", "Parity with Cycles", body)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ python bench/bench_primary.py [--size 400]
 from __future__ import annotations
 
 import argparse
-import sys
 
 import numpy as np
 from judge import environments, foreground, frame_camera, psnr
@@ -48,7 +47,7 @@ def main() -> None:
         "PSNR in sRGB over pixels wholly inside the mesh, and over the union of both silhouettes.\n\n"
         + table(("Asset", "Triangles", "Surfels", "Silhouette IoU", "PSNR inside dB", "PSNR union dB"), rows)
     )
-    write_section("primary", "Surfels against mesh as primary surface", " ".join(["python", *sys.argv]), body)
+    write_section("primary", "Surfels against mesh as primary surface", body)
 
 
 if __name__ == "__main__":

@@ -75,7 +75,7 @@ def main() -> None:
     body = "Update of the traced scene when every vertex moved: refit, smooth normals, materials; median of 10.\n\n"
     body += table(["scene", "wall ms", "ms a million triangles"], [update_of(6), update_of(8)])
     body += "\n\nA .drgs file of 1,000,000 surfels and 81,920 triangles:\n\n" + table(["step", "wall ms"], file_times())
-    write_section("scene", "Scene update and asset files", "python bench/bench_scene.py", body)
+    write_section("scene", "Scene update and asset files", body)
 
 
 if __name__ == "__main__":

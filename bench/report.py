@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import re
+import sys
 from collections.abc import Sequence
 from datetime import date
 from pathlib import Path
@@ -40,11 +41,18 @@ def table(columns: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
     return "\n".join(lines)
 
 
-def write_section(name: str, title: str, command: str, body: str) -> None:
+def command_line() -> str:
+    """How this program was called, from the checkout's folder."""
+    return " ".join(["python", f"bench/{Path(sys.argv[0]).name}", *sys.argv[1:]])
+
+
+def write_section(name: str, title: str, body: str) -> None:
     """Replace section `name` of docs/benchmarks.md (or append it) and print it."""
     text = DOCUMENT.read_text() if DOCUMENT.exists() else HEADER
     begin, end = f"<!-- begin {name} -->", f"<!-- end {name} -->"
-    section = f"{begin}\n## {title}\n\n{body.strip()}\n\n`{command}` · {date.today().isoformat()} · {machine()}\n{end}"
+    section = (
+        f"{begin}\n## {title}\n\n{body.strip()}\n\n`{command_line()}` · {date.today().isoformat()} · {machine()}\n{end}"
+    )
     pattern = re.compile(re.escape(begin) + ".*?" + re.escape(end), re.DOTALL)
     if pattern.search(text):
         text = pattern.sub(lambda _: section, text)
