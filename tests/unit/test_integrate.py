@@ -247,6 +247,24 @@ def test_a_furnace_of_mirrors_keeps_its_light(look: str) -> None:
     assert total.mean() == pytest.approx(1.0, abs=0.01)
 
 
+def test_roulette_takes_nothing_from_the_mean() -> None:
+    """Paths end by their strongest channel. At the bottom of a shaft, green light must not depend on what red does."""
+    box = trimesh.creation.box((1, 1, 3))
+    faces = box.faces[~(box.face_normals[:, 2] > 0.5)]  # open above
+    n = len(box.vertices)
+    green = []
+    for red in (0.8, 1.0):
+        scene, rough, dielectric = TraceScene(), np.ones(n), np.zeros(n)
+        albedo = np.tile([red, 0.8, 0.8], (n, 1))
+        scene.update([TraceObject("shaft", box.vertices, faces, albedo, rough, dielectric)])
+        seen = points(20_000, origin=(0.1, 0.2, -1.5), albedo=0.8, roughness=1.0)
+        lit = integrate(scene, WHITE, seen, settings(16, 0, 4, bounces=12), 0).components[:, :2, 1].sum(axis=1)
+        green.append((lit.mean(), lit.std() / np.sqrt(len(lit))))
+    (few, a), (all_, b) = green
+    assert abs(few - all_) < 4 * np.hypot(a, b)
+    assert 4 * np.hypot(a, b) < 0.02 * all_  # roulette starts late: a loss of a fifth a bounce shows as some percent
+
+
 def test_a_closed_room_is_dark() -> None:
     box = trimesh.creation.box((2, 2, 2))
     scene = scene_of((box.vertices, box.faces))
