@@ -225,6 +225,8 @@ def run_test(args: argparse.Namespace) -> int:
     if unknown := sorted(set(suites) - set(SUITES)):
         raise Failure(f"unknown suite {', '.join(unknown)}; there are {', '.join(SUITES)}")
     engine = ensure_engine()
+    if "blender" in suites:
+        ensure_blender()  # the engine's suite runs `drgs render` through it where it is there
     tally = Tally()
     if "lint" in suites:
         for tool in (["ruff", "check", "."], ["ruff", "format", "--check", "."], ["mypy"]):
