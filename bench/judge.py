@@ -13,6 +13,8 @@ import numpy as np
 from report import OUT, ROOT
 from scipy.ndimage import binary_erosion
 
+from drgs_blender.formats.colour import linear_to_srgb
+
 Array = np.ndarray
 
 
@@ -45,8 +47,7 @@ def run_cycles(jobs: list[dict[str, Any]], name: str, timeout: float = 3000) -> 
 
 def to_srgb(linear: Array) -> Array:
     """Linear Rec.709 -> sRGB, clipped to [0, 1]."""
-    x = np.clip(linear, 0, 1)
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(np.maximum(x, 1e-9), 1 / 2.4) - 0.055)
+    return linear_to_srgb(np.clip(linear, 0, 1))
 
 
 def psnr(a: Array, b: Array, mask: Array | None = None) -> float:

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from drgs_blender.formats.colour import linear_to_srgb
 from drgs_blender.render.frames import read_frame
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -31,9 +32,7 @@ def run(*command: object) -> None:
 
 def to_picture(linear: np.ndarray) -> Image.Image:
     """Linear Rec.709 -> 8-bit sRGB."""
-    x = np.clip(linear[..., :3], 0, 1)
-    srgb = np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
-    return Image.fromarray((srgb * 255 + 0.5).astype(np.uint8))
+    return Image.fromarray((linear_to_srgb(np.clip(linear[..., :3], 0, 1)) * 255 + 0.5).astype(np.uint8))
 
 
 def publish(frames: list[Path], out: Path) -> None:

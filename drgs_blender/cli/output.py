@@ -73,10 +73,11 @@ def write_preview(path: Path, combined: np.ndarray) -> None:
     """
     from PIL import Image
 
+    from ..formats.colour import linear_to_srgb
+
     alpha = np.clip(np.nan_to_num(combined[..., 3:4]), 0, 1)
     linear = np.clip(np.nan_to_num(combined[..., :3]) / np.maximum(alpha, 1e-6), 0, 1)
-    srgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-    pixels = (np.concatenate([srgb, alpha], axis=-1) * 255 + 0.5).astype(np.uint8)
+    pixels = (np.concatenate([linear_to_srgb(linear), alpha], axis=-1) * 255 + 0.5).astype(np.uint8)
     encoded = io.BytesIO()
     Image.fromarray(pixels).save(encoded, "PNG")
     replace_file(path, [encoded.getvalue()])

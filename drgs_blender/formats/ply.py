@@ -127,12 +127,6 @@ def parse_header(head: bytes, subject: str) -> Header:
     return Header(parsed, order, end.end(), tuple(comments))
 
 
-def read_header(path: Path) -> Header:
-    """Parse the header of the file at `path`."""
-    with open(path, "rb") as file:
-        return parse_header(file.read(HEADER_LIMIT), str(path))
-
-
 def read_ply(path: Path) -> tuple[Header, dict[str, Rows]]:
     """Read the file at `path`; return its header and element name -> Rows.
 
