@@ -50,6 +50,22 @@ class Camera:
 
 
 @dataclass(slots=True)
+class Visibility:
+    """Which rays meet an object, as in Blender's Object > Visibility panel.
+
+    ``diffuse`` and ``glossy`` are indirect rays from a diffuse or glossy scattering, ``shadow`` rays towards lights. A
+    ``holdout`` cuts a hole into the picture; of a ``shadow_catcher`` only the shadows on it are seen.
+    """
+
+    camera: bool = True
+    diffuse: bool = True
+    glossy: bool = True
+    shadow: bool = True
+    holdout: bool = False
+    shadow_catcher: bool = False
+
+
+@dataclass(slots=True)
 class ObjectState:
     """One DR-GS object in one frame.
 
@@ -63,6 +79,7 @@ class ObjectState:
         vertex normals computed by the engine
     albedo, roughness, metallic : per-vertex overrides (n, 3), (n,), (n,); None keeps the asset's
     pass_index : Blender's object index pass
+    visibility : which rays meet it
     """
 
     name: str
@@ -74,6 +91,134 @@ class ObjectState:
     roughness: Array | None = None
     metallic: Array | None = None
     pass_index: int = 0
+    visibility: Visibility = field(default_factory=Visibility)
+
+
+@dataclass(slots=True)
+class Image:
+    """Pixels that textures refer to by name.
+
+    Attributes
+    ----------
+    pixels : (h, w, 4) uint8 or float32, row 0 at the top; alpha is straight and last
+    encoding : "srgb" is decoded by the engine (colour channels only), "linear" is linear Rec.709 or no colour at all
+    """
+
+    name: str
+    pixels: Array
+    encoding: Literal["linear", "srgb"] = "linear"
+
+
+@dataclass(slots=True)
+class Texture:
+    """An image on a surface.
+
+    Attributes
+    ----------
+    image : name of one of ``Frame.images``
+    channel : what of it: "rgb" for colours, one channel or the luminance for numbers
+    transform : (2, 3) float64, maps (u, v, 1) to the image's own (u, v); v = 0 is the image's bottom edge
+    interpolation, extension : as Blender's Image Texture node
+    """
+
+    image: str
+    channel: Literal["rgb", "r", "g", "b", "a", "luminance"] = "rgb"
+    transform: Array = field(default_factory=lambda: np.eye(2, 3))
+    interpolation: Literal["linear", "closest"] = "linear"
+    extension: Literal["repeat", "extend", "clip", "mirror"] = "repeat"
+
+
+@dataclass(slots=True)
+class Material:
+    """What Blender's Principled BSDF says of an ordinary surface. Where there is a texture, the number multiplies it.
+
+    Attributes
+    ----------
+    base_colour : linear Rec.709, [0, 1]
+    roughness, metallic : [0, 1]
+    emission : linear Rec.709 radiance, colour times strength
+    """
+
+    name: str
+    base_colour: tuple[float, float, float] = (0.8, 0.8, 0.8)
+    roughness: float = 0.5
+    metallic: float = 0.0
+    emission: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    base_colour_texture: Texture | None = None
+    roughness_texture: Texture | None = None
+    metallic_texture: Texture | None = None
+    emission_texture: Texture | None = None
+
+
+@dataclass(slots=True)
+class MeshState:
+    """An ordinary mesh next to the DR-GS objects, in one frame: one shape, standing in one or more places.
+
+    Attributes
+    ----------
+    name : object name, used in messages
+    vertices : (n, 3) float32, object space
+    faces : (m, 3) int32
+    matrices : (k, 4, 4) float64 object-to-world, one an instance
+    pass_indices : (k,) int32, Blender's object index pass of each instance
+    corner_normals : (m, 3, 3) float32 unit, object space, or None for smooth angle-weighted vertex normals
+    uvs : (m, 3, 2) float32, one a face corner, or None without textures
+    material_index : (m,) int32 into ``materials``, or None: the first everywhere
+    materials : never empty
+    visibility : of all its instances
+    """
+
+    name: str
+    vertices: Array
+    faces: Array
+    matrices: Array
+    pass_indices: Array
+    corner_normals: Array | None = None
+    uvs: Array | None = None
+    material_index: Array | None = None
+    materials: list[Material] = field(default_factory=lambda: [Material("Default")])
+    visibility: Visibility = field(default_factory=Visibility)
+
+
+@dataclass(slots=True)
+class Light:
+    """One of Blender's lights. The quantities are those of Blender's panel; the engine turns them into radiance.
+
+    Attributes
+    ----------
+    kind : "point", "sun", "spot" or "area"
+    matrix_world : (4, 4) float64; the light shines along its -Z
+    colour : linear Rec.709
+    power : watts of radiant flux; of a sun watts a square metre at a surface that faces it. Exposure and
+        temperature are already in power and colour
+    radius : metres, of point and spot lights
+    angle : radians, apparent diameter of a sun
+    spot_size, spot_blend : radians, full cone angle; [0, 1]
+    shape, size_x, size_y : of area lights, metres before ``matrix_world`` scales them
+    spread : radians, of area lights; pi shines everywhere
+    normalize : power is independent of the light's size (Blender 5's switch, on by default)
+    camera, diffuse, glossy : whether such rays see the light
+    cast_shadow : whether objects between light and surface block it
+    """
+
+    name: str
+    kind: Literal["point", "sun", "spot", "area"]
+    matrix_world: Array
+    colour: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    power: float = 10.0
+    radius: float = 0.0
+    angle: float = 0.0
+    spot_size: float = 0.785398
+    spot_blend: float = 0.15
+    shape: Literal["square", "rectangle", "disk", "ellipse"] = "square"
+    size_x: float = 1.0
+    size_y: float = 1.0
+    spread: float = 3.1415927
+    normalize: bool = True
+    camera: bool = False
+    diffuse: bool = True
+    glossy: bool = True
+    cast_shadow: bool = True
 
 
 @dataclass(slots=True)
@@ -98,6 +243,9 @@ class RenderSettings:
     ``cosine``, ``ggx``, ``environment`` are samples a pixel of each strategy (their sum is "rays"); ``aa`` is the
     number of sub-pixel positions among which they are divided. ``bounces`` counts indirect bounces. ``look`` is
     "principled" (Blender's Principled BSDF, GGX) or "paper" (the paper's BRDF). ``threads`` 0 is all cores.
+    ``noise_threshold`` above 0 stops sampling a pixel once its estimated error (as Cycles defines it) is below it; the
+    samples above are then the most a pixel gets. ``clamp_indirect`` above 0 limits the brightness of a single indirect
+    sample, which loses energy. ``tracer`` says what rays meet of DR-GS objects: their mesh or their surfels.
     """
 
     cosine: int = 16
@@ -111,6 +259,9 @@ class RenderSettings:
     film_transparent: bool = False
     seed: int = 0
     threads: int = 0
+    noise_threshold: float = 0.0
+    clamp_indirect: float = 0.0
+    tracer: Literal["mesh", "surfels"] = "mesh"
 
     @property
     def rays(self) -> int:
@@ -128,6 +279,9 @@ class Frame:
     world: World = field(default_factory=World)
     settings: RenderSettings = field(default_factory=RenderSettings)
     passes: tuple[str, ...] = ("Combined",)
+    meshes: list[MeshState] = field(default_factory=list)
+    lights: list[Light] = field(default_factory=list)
+    images: list[Image] = field(default_factory=list)
 
 
 def split_rays(rays: int) -> tuple[int, int, int]:
