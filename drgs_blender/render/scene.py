@@ -9,7 +9,7 @@ import numpy as np
 from ..asset.model import as_float
 from ..errors import UsageError
 from ..jit import njit, prange
-from .embree import TriangleBVH
+from .tree import TriangleBVH
 
 Array = np.ndarray
 

@@ -14,7 +14,7 @@ import trimesh
 
 from drgs_blender.errors import DeviceError, UsageError
 from drgs_blender.render import embree
-from drgs_blender.render.embree import TriangleBVH
+from drgs_blender.render.tree import ALL, Group, TriangleBVH
 
 
 def rays(count: int, seed: int = 0, spread: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
@@ -134,11 +134,11 @@ def test_a_wheel_without_embree_is_a_device_error(tmp_path: Path, monkeypatch: p
 
 _PROGRAM = """
 import numpy as np
-from drgs_blender.render import embree
-bvh = embree.TriangleBVH()
+from drgs_blender.render import tree
+bvh = tree.TriangleBVH()
 bvh.build([[0, 0, 1], [1, 0, 1], [0, 1, 1]], [[0, 1, 2]])
 t, face, u, v = bvh.intersect([[0.25, 0.25, 0]], [[0, 0, 1]])
-print(t[0], face[0], u[0], v[0], sum(embree._intersect.stats.cache_hits.values()))
+print(t[0], face[0], u[0], v[0], sum(tree._intersect.stats.cache_hits.values()))
 """
 
 
@@ -153,3 +153,107 @@ def test_kernels_come_out_of_the_cache_in_another_process(tmp_path: Path) -> Non
     ]
     assert outputs[0].stdout.split() == ["1.0", "0", "0.25", "0.25", "0"]
     assert outputs[1].stdout.split() == ["1.0", "0", "0.25", "0.25", "1"]
+
+
+# --- groups and places ---
+
+
+def place(*, shift: tuple[float, float, float], scale: tuple[float, float, float], turn: int) -> np.ndarray:
+    """(3, 4) float32: scale, then a turn, then a shift."""
+    q, _ = np.linalg.qr(np.random.default_rng(turn).normal(size=(3, 3)))
+    return np.concatenate([q * scale, np.array(shift)[:, None]], axis=1).astype(np.float32)
+
+
+PLACES = np.stack(
+    [
+        place(shift=(0, 0, 0), scale=(1, 1, 1), turn=0),
+        place(shift=(3, 0, 1), scale=(0.3, 0.7, 0.5), turn=1),
+        place(shift=(0, -3, 0), scale=(-1, 1, 0.4), turn=2),
+        place(shift=(-2, 2, -2), scale=(0.01, 0.01, 0.01), turn=3),
+    ]
+)
+
+
+def copies(vertices: np.ndarray, faces: np.ndarray, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    moved = np.concatenate([vertices.astype(float) @ m[:, :3].T + m[:, 3] for m in places.astype(float)])
+    return moved.astype(np.float32), np.concatenate([faces + i * len(vertices) for i in range(len(places))])
+
+
+def assert_same_hits(instanced: TriangleBVH, plain: TriangleBVH, faces: int, seed: int = 0) -> None:
+    """Hits in places equal those of copies, save where a ray passes an edge."""
+    origins, directions = rays(4000, seed, spread=3.0)
+    t, face, instance, u, v = instanced.hits(origins, directions)
+    expected_t, expected, expected_u, expected_v = plain.intersect(origins, directions)
+    same = np.where(face >= 0, instance * faces + face, -1) == expected
+    assert same.mean() > 0.995
+    hit = same & (face >= 0)
+    assert hit.sum() > 100 and len(np.unique(instance[hit])) > 1
+    np.testing.assert_allclose(t[hit], expected_t[hit], rtol=2e-5, atol=2e-5)
+    np.testing.assert_allclose(np.stack([u, v])[:, hit], np.stack([expected_u, expected_v])[:, hit], atol=5e-3)
+    np.testing.assert_array_equal(instanced.occluded_many(origins, directions)[same], (face >= 0)[same])
+
+
+def test_places_hit_as_copies_and_follow_what_moves() -> None:
+    mesh = trimesh.creation.icosphere(subdivisions=3)
+    vertices, faces = mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32)
+    bvh, plain = TriangleBVH(), TriangleBVH()
+    bvh.build(vertices, faces, [Group(0, len(faces), places=PLACES)])
+    built = bvh.rebuilds
+    plain.build(*copies(vertices, faces, PLACES))
+    assert_same_hits(bvh, plain, len(faces))
+    other = PLACES[::-1] + np.float32(0.1)
+    bvh.refit(moved=(), places={0: other})
+    plain.build(*copies(vertices, faces, other))
+    assert_same_hits(bvh, plain, len(faces), 1)
+    vertices = vertices * np.float32([1.0, 0.7, 1.3])
+    bvh.refit(vertices)
+    plain.build(*copies(vertices, faces, other))
+    assert_same_hits(bvh, plain, len(faces), 2)
+    for count in (2, 7):  # the number of places may change
+        more = np.concatenate([PLACES, PLACES + np.float32([0, 0, 0, 2])])[:count]
+        bvh.refit(moved=(), places={0: more})
+        plain.build(*copies(vertices, faces, more))
+        assert_same_hits(bvh, plain, len(faces), 3)
+    assert bvh.rebuilds == built
+
+
+def test_rays_meet_the_groups_of_their_mask() -> None:
+    """Three squares behind each other, the last in places; each mask meets the nearest that has one of its bits."""
+    square = np.float32([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    vertices = np.concatenate([square + np.float32([0, 0, 1]), square + np.float32([0, 0, 2]), square])
+    faces = np.concatenate([np.int32([[0, 1, 2], [0, 2, 3]]) + 4 * i for i in range(3)])
+    places = np.stack([np.eye(4, dtype=np.float32)[:3] for _ in range(2)])
+    places[:, 2, 3] = 3, 4
+    bvh = TriangleBVH()
+    bvh.build(vertices, faces, [Group(0, 2, 1), Group(2, 4, 2 | 4), Group(4, 6, 4 | 8 | -(2**31), places)])
+    origins, directions = np.float32([[0.2, 0.1, 0]] * 2), np.float32([[0, 0, 1], [0, 0, -1]])
+    cases = ((1, 1, 0), (2, 2, 2), (4, 2, 2), (8, 3, 4), (1 | 8, 1, 0), (16, np.inf, -1), (ALL, 1, 0), (-(2**31), 3, 4))
+    for mask, distance, face in cases:
+        t, found, instance, _, _ = bvh.hits(origins, directions, mask=mask)
+        assert (t[0], found[0] // 2 * 2, instance[0]) == (distance, face if face >= 0 else -2, 0 if face == 4 else -1)
+        assert found[1] == -1
+        np.testing.assert_array_equal(bvh.occluded_many(origins, directions, mask=mask), [face >= 0, False])
+
+
+def test_groups_are_refitted_alone_and_rebuilt_alone() -> None:
+    mesh = trimesh.creation.icosphere(subdivisions=4)
+    n, m = len(mesh.vertices), len(mesh.faces)
+    vertices = np.concatenate([mesh.vertices, mesh.vertices + 4]).astype(np.float32)
+    faces = np.concatenate([mesh.faces, mesh.faces + n]).astype(np.int32)
+    groups = [Group(0, m, 1), Group(m, 2 * m, 2)]
+    bvh, fresh = TriangleBVH(), TriangleBVH()
+    bvh.build(vertices, faces, groups)
+    built = bvh.rebuilds
+    origins, directions = rays(3000, spread=3.0)
+    rng = np.random.default_rng(0)
+    vertices[n:] += np.float32([0.5, 0, 0])
+    torn = vertices.copy()
+    torn[:n] = rng.permutation(torn[:n])
+    for now, moved, rebuilds in ((vertices, {1}, built), (torn, {0}, built + 1)):
+        bvh.vertices[:] = now
+        bvh.refit(moved=moved)
+        fresh.build(now, faces, groups)
+        assert bvh.rebuilds == rebuilds
+        for mask in (1, 2, 3):
+            for a, b in zip(bvh.hits(origins, directions, mask=mask), fresh.hits(origins, directions, mask=mask)):
+                np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)
