@@ -9,7 +9,8 @@ Lookups are those of Cycles' Image Texture node, measured in Blender 5.0 (tests/
   the image: whoever describes the frame does the same;
 - a point whose coordinates are not finite is transparent black; an image that is missing is magenta.
 
-Texels stay where they are: compiled code reads them at their address, so even large images are not copied.
+Texels stay where they are: compiled code reads them at their address, so even large images are not copied. So it reads
+the tables too: arrays that are passed on from function to function are counted at each step, by all threads at once.
 """
 
 from __future__ import annotations
@@ -49,6 +50,10 @@ _INFINITE = F(np.inf)
 _BYTE_SCALE = F(1.0 / 255.0)
 
 
+def _address(array: Array) -> int:
+    return int(array.__array_interface__["data"][0])
+
+
 @dataclass(slots=True)
 class _Texels:
     """An image made ready: what was given, what compiled code reads instead, and what was wrong."""
@@ -66,7 +71,7 @@ class _Texels:
     def row(self) -> tuple[int, int, int, int]:
         """Address, width, height, kind."""
         height, width = self.texels.shape[:2]
-        return self.texels.__array_interface__["data"][0], width, height, self.kind
+        return _address(self.texels), width, height, self.kind
 
 
 class MaterialTable:
@@ -85,7 +90,8 @@ class MaterialTable:
 
     Attributes
     ----------
-    arrays : what ``material_at`` reads, valid as long as this table lives:
+    addresses : of the six arrays, for ``material_at``; valid as long as this table lives
+    arrays : what ``material_at`` reads:
         constants (k, 8) float32, the eight results without textures;
         slots (k, 4) int32, rows of textures for base colour, roughness, metallic and emission, or -1;
         textures (t, 4) int32, image, channel, interpolation, extension;
@@ -119,11 +125,14 @@ class MaterialTable:
             np.array([texels.row() for texels in self._images.values()], np.int64).reshape(-1, 4),
             srgb_to_linear(np.arange(256) / 255.0),
         )
+        self.addresses = tuple(_address(array) for array in self.arrays)
 
     def lookup(self, material: Array, uv: Array) -> Array:
         """(n, 8) float32, the results of ``material_at`` for (n,) integers and (n, 2) coordinates."""
         out = np.empty((len(material), 8), np.float32)
-        _material_many(np.ascontiguousarray(material, np.int32), np.ascontiguousarray(uv, np.float32), self.arrays, out)
+        _material_many(
+            np.ascontiguousarray(material, np.int32), np.ascontiguousarray(uv, np.float32), self.addresses, out
+        )
         return out
 
     def _constants(self, material: Material) -> Array:
@@ -223,8 +232,10 @@ def _load(scalar: Any, kind: Any) -> Any:
     return load
 
 
-_load_word = _load(types.uint32, ir.IntType(32))
-_load_float = _load(types.float32, ir.FloatType())
+_word = _load(types.uint32, ir.IntType(32))
+_int32 = _load(types.int32, ir.IntType(32))
+_int64 = _load(types.int64, ir.IntType(64))
+_float = _load(types.float32, ir.FloatType())
 
 
 @njit
@@ -233,12 +244,12 @@ def _texel(address, kind, index, weight, red, green, blue, alpha):  # type: igno
     if kind == _FLOAT:
         index *= 4
         return (
-            red + weight * _load_float(address, index),
-            green + weight * _load_float(address, index + 1),
-            blue + weight * _load_float(address, index + 2),
-            alpha + weight * _load_float(address, index + 3),
+            red + weight * _float(address, index),
+            green + weight * _float(address, index + 1),
+            blue + weight * _float(address, index + 2),
+            alpha + weight * _float(address, index + 3),
         )
-    word = np.int64(_load_word(address, index))
+    word = np.int64(_word(address, index))
     return (
         red + weight * F(word & 255),
         green + weight * F((word >> 8) & 255),
@@ -281,19 +292,28 @@ def _axis(u, n, interpolation, extension):  # type: ignore[no-untyped-def]
 def _decoded(x, decode):  # type: ignore[no-untyped-def]
     """Linear value of an sRGB value in [0, 255], to 6e-6."""
     i = min(np.int64(x), 254)
-    return decode[i] + (x - F(i)) * (decode[i + 1] - decode[i])
+    below = _float(decode, i)
+    return below + (x - F(i)) * (_float(decode, i + 1) - below)
 
 
 @njit
-def _lookup(row, u, v, arrays):  # type: ignore[no-untyped-def]
+def _lookup(row, u, v, addresses):  # type: ignore[no-untyped-def]
     """Red, green, blue, alpha of a texture."""
-    _, _, textures, transforms, images, decode = arrays
-    s = transforms[row, 0] * u + transforms[row, 1] * v + transforms[row, 2]
-    t = transforms[row, 3] * u + transforms[row, 4] * v + transforms[row, 5]
+    _, _, textures, transforms, images, decode = addresses
+    i = 6 * row
+    s = _float(transforms, i) * u + _float(transforms, i + 1) * v + _float(transforms, i + 2)
+    t = _float(transforms, i + 3) * u + _float(transforms, i + 4) * v + _float(transforms, i + 5)
     if not (abs(s) < _INFINITE and abs(t) < _INFINITE):
         return ZERO, ZERO, ZERO, ZERO
-    image, interpolation, extension = textures[row, 0], textures[row, 2], textures[row, 3]
-    address, width, height, kind = images[image, 0], images[image, 1], images[image, 2], images[image, 3]
+    i = 4 * row
+    interpolation, extension = _int32(textures, i + 2), _int32(textures, i + 3)
+    i = 4 * np.int64(_int32(textures, i))
+    address, width, height, kind = (
+        _int64(images, i),
+        _int64(images, i + 1),
+        _int64(images, i + 2),
+        _int64(images, i + 3),
+    )
     left, right, a, b = _axis(s, width, interpolation, extension)
     low, high, c, d = _axis(t, height, interpolation, extension)
     # Row 0 is at the top, v = 0 at the bottom.
@@ -311,10 +331,10 @@ def _lookup(row, u, v, arrays):  # type: ignore[no-untyped-def]
 
 
 @njit
-def _number(row, u, v, arrays):  # type: ignore[no-untyped-def]
+def _number(row, u, v, addresses):  # type: ignore[no-untyped-def]
     """One number of a texture; of a colour its luminance, as where Blender plugs a colour into a number."""
-    red, green, blue, alpha = _lookup(row, u, v, arrays)
-    channel = arrays[2][row, 1]
+    red, green, blue, alpha = _lookup(row, u, v, addresses)
+    channel = _int32(addresses[2], 4 * row + 1)
     if channel >= _LUMINANCE:
         return _RED * red + _GREEN * green + _BLUE * blue
     if channel == _A:
@@ -323,12 +343,12 @@ def _number(row, u, v, arrays):  # type: ignore[no-untyped-def]
 
 
 @njit
-def _colour(row, u, v, arrays):  # type: ignore[no-untyped-def]
+def _colour(row, u, v, addresses):  # type: ignore[no-untyped-def]
     """Colour of a texture; of one channel a grey."""
-    if arrays[2][row, 1] == _RGB:
-        red, green, blue, _ = _lookup(row, u, v, arrays)
+    if _int32(addresses[2], 4 * row + 1) == _RGB:
+        red, green, blue, _ = _lookup(row, u, v, addresses)
         return red, green, blue
-    grey = _number(row, u, v, arrays)
+    grey = _number(row, u, v, addresses)
     return grey, grey, grey
 
 
@@ -339,44 +359,47 @@ def _within(x, highest):  # type: ignore[no-untyped-def]
 
 
 @njit
-def material_at(material, u, v, arrays):  # type: ignore[no-untyped-def]
+def material_at(material, u, v, addresses):  # type: ignore[no-untyped-def]
     """What a material is at texture coordinates (u, v).
 
     Parameters
     ----------
     material : integer, index into the materials of the table; not checked
     u, v : float32, v upwards
-    arrays : ``MaterialTable.arrays``
+    addresses : ``MaterialTable.addresses``
 
     Returns
     -------
     r, g, b, roughness, metallic, er, eg, eb : float32
         Base colour, linear Rec.709, roughness and metallic in [0, 1]; emitted radiance, linear Rec.709, finite, >= 0.
     """
-    constants, slots = arrays[0], arrays[1]
-    r, g, b = constants[material, 0], constants[material, 1], constants[material, 2]
-    roughness, metallic = constants[material, 3], constants[material, 4]
-    er, eg, eb = constants[material, 5], constants[material, 6], constants[material, 7]
-    first, second, third, last = slots[material, 0], slots[material, 1], slots[material, 2], slots[material, 3]
+    constants, slots = addresses[0], addresses[1]
+    i = 8 * np.int64(material)
+    r, g, b = _float(constants, i), _float(constants, i + 1), _float(constants, i + 2)
+    roughness, metallic = _float(constants, i + 3), _float(constants, i + 4)
+    er, eg, eb = _float(constants, i + 5), _float(constants, i + 6), _float(constants, i + 7)
+    i = 4 * np.int64(material)
+    first, second = np.int64(_int32(slots, i)), np.int64(_int32(slots, i + 1))
+    third, last = np.int64(_int32(slots, i + 2)), np.int64(_int32(slots, i + 3))
     # Only if all are -1 are all bits set.
     if (first & second & third & last) == -1:
         return r, g, b, roughness, metallic, er, eg, eb
     if first >= 0:
-        x, y, z = _colour(first, u, v, arrays)
+        x, y, z = _colour(first, u, v, addresses)
         r, g, b = _within(r * x, ONE), _within(g * y, ONE), _within(b * z, ONE)
     if second >= 0:
-        roughness = _within(roughness * _number(second, u, v, arrays), ONE)
+        roughness = _within(roughness * _number(second, u, v, addresses), ONE)
     if third >= 0:
-        metallic = _within(metallic * _number(third, u, v, arrays), ONE)
+        metallic = _within(metallic * _number(third, u, v, addresses), ONE)
     if last >= 0:
-        x, y, z = _colour(last, u, v, arrays)
+        x, y, z = _colour(last, u, v, addresses)
         er, eg, eb = _within(er * x, _BRIGHTEST), _within(eg * y, _BRIGHTEST), _within(eb * z, _BRIGHTEST)
     return r, g, b, roughness, metallic, er, eg, eb
 
 
 @njit
-def _material_many(material, uv, arrays, out):  # type: ignore[no-untyped-def]
+def _material_many(material, uv, addresses, out):  # type: ignore[no-untyped-def]
     for i in range(len(material)):
-        r, g, b, roughness, metallic, er, eg, eb = material_at(material[i], uv[i, 0], uv[i, 1], arrays)
+        r, g, b, roughness, metallic, er, eg, eb = material_at(material[i], uv[i, 0], uv[i, 1], addresses)
         out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4] = r, g, b, roughness, metallic
         out[i, 5], out[i, 6], out[i, 7] = er, eg, eb
