@@ -192,6 +192,7 @@ class Light:
     power : watts of radiant flux; of a sun watts a square metre at a surface that faces it. Exposure and
         temperature are already in power and colour
     radius : metres, of point and spot lights
+    soft_falloff : point and spot lights are disks that face whoever looks (Blender's default), else spheres
     angle : radians, apparent diameter of a sun
     spot_size, spot_blend : radians, full cone angle; [0, 1]
     shape, size_x, size_y : of area lights, metres before ``matrix_world`` scales them
@@ -207,6 +208,7 @@ class Light:
     colour: tuple[float, float, float] = (1.0, 1.0, 1.0)
     power: float = 10.0
     radius: float = 0.0
+    soft_falloff: bool = True
     angle: float = 0.0
     spot_size: float = 0.785398
     spot_blend: float = 0.15
