@@ -104,6 +104,8 @@ class MaterialTable:
     def __init__(self, materials: list[Material], images: list[Image], previous: MaterialTable | None = None) -> None:
         self.warnings: list[str] = []
         self._given = {image.name: image for image in images}
+        if len(self._given) < len(images):
+            self.warnings.append("several images have the same name; the last of each is used")
         self._known = previous._images if previous else {}
         self._rows: dict[str, int] = {}
         self._images: dict[str, _Texels] = {}
@@ -126,6 +128,8 @@ class MaterialTable:
             srgb_to_linear(np.arange(256) / 255.0),
         )
         self.addresses = tuple(_address(array) for array in self.arrays)
+        # Only needed above; they would keep the pixels of the frame before alive.
+        self._given, self._known = {}, {}
 
     def lookup(self, material: Array, uv: Array) -> Array:
         """(n, 8) float32, the results of ``material_at`` for (n,) integers and (n, 2) coordinates."""

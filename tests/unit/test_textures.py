@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import weakref
 
 import numpy as np
 import pytest
@@ -248,6 +249,18 @@ def test_frozen_pixels_are_read_once():
     # Another encoding, other pixels, or pixels that may have changed are read anew.
     for image in (Image("i", wide, "srgb"), Image("i", wide.copy())):
         assert MaterialTable(materials, [image], second).arrays[4][0, 0] != first.arrays[4][0, 0]
+
+
+def test_old_pixels_are_let_go():
+    pixels = RNG.integers(0, 256, (4, 4, 4), dtype=np.uint8)
+    gone = weakref.ref(pixels)
+    materials = [Material("m", base_colour_texture=Texture("i"))]
+    table = MaterialTable(materials, [Image("i", pixels)])
+    del pixels
+    assert gone() is not None
+    table = MaterialTable(materials, [Image("i", BYTES), Image("unused", BYTES), Image("i", BYTES)], table)
+    assert gone() is None
+    assert "same name" in table.warnings[0]
 
 
 def test_unaligned_and_strided_pixels():
