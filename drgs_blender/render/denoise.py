@@ -1,8 +1,8 @@
 """Spatial SVGF: an edge-stopping a-trous filter on demodulated light, guided by the light's variance.
 
-Schied et al., "Spatiotemporal Variance-Guided Filtering" (2017), without its temporal half, so that a frame does not
-depend on other frames. Diffuse and glossy light are filtered apart, each divided by the colour of its surface first and
-multiplied again afterwards, so that texture is not blurred. Changes and their reasons:
+Schied et al., "Spatiotemporal Variance-Guided Filtering" (2017); its temporal half is in `temporal`. Diffuse and glossy
+light are filtered apart, each divided by the colour of its surface first and multiplied again afterwards, so that
+texture is not blurred. Changes and their reasons:
 
 - Light is divided by coverage too, and pixels without coverage take no part: silhouettes do not bleed.
 - Depth is compared as distance from the tangent plane, in pixel widths: exact on slanted planes, no depth gradient that
@@ -11,6 +11,10 @@ multiplied again afterwards, so that texture is not blurred. Changes and their r
   does not vouch for them.
 - Rough surfaces reflect smoothly: the power on the normals' cosine falls from 128 to 32 with roughness; 32 for diffuse.
 - Direct and indirect light share one set of weights, so their sum stays the sum to the last bit.
+- Edges are stopped by (1 - x / 8)^8 where the paper has exp(-x): much the same, but exactly zero from x = 8 on.
+
+Pictures are planar here, (rows, planes, columns), with `PAD` empty columns on either side: kernels work on runs of
+`TILE` pixels, plane by plane, with scratch arrays whose strides the compiler knows, so that all of it is SIMD.
 """
 
 from __future__ import annotations
@@ -22,6 +26,7 @@ from typing import Any
 import numpy as np
 
 from ..jit import njit, prange
+from .rows import over_rows
 
 Array = np.ndarray
 
@@ -37,8 +42,13 @@ FIREFLY = 3.0
 COLOUR_FLOOR = 0.02
 DIELECTRIC_F0 = 0.04
 
-# Columns of the guide of a pixel.
-_POSITION, _NORMAL, _POWER, _ROUGHNESS, _INDEX, _FOOTPRINT, _VALID, _GUIDE = 0, 3, 6, 7, 8, 9, 10, 12
+#: Pixels a kernel works on at once; empty columns left and right of a picture (twice the last level's step).
+TILE, PAD = 128, 2 << (LEVELS - 1)
+#: Planes of a guide. ``SURFACE`` is the object's index, NaN where nothing is covered; ``SOURCE`` the same, NaN also
+#: where the light is no number. ``WIDTH`` is the inverse width of a pixel.
+POSITION, NORMAL, ROUGHNESS, SOURCE, SURFACE, WIDTH, GUIDES = 0, 3, 6, 7, 8, 9, 10
+#: Planes of a signal, two lobes each: luminance, variance of it; then the light.
+LUMINANCE, VARIANCE, LIGHT = 0, 2, 4
 
 
 @dataclass(slots=True)
@@ -58,6 +68,23 @@ class Guides:
     footprint: Array
 
 
+@dataclass(slots=True)
+class Signal:
+    """Demodulated light of a picture and what guides its filters.
+
+    Attributes
+    ----------
+    guide : (h, GUIDES, w + 2 PAD) float32
+    light : (h, LIGHT + 6 parts, w + 2 PAD) float32; after ``LIGHT``: diffuse direct, (indirect,) glossy direct,
+        (indirect), three colours each, divided by surface colour and coverage
+    spans : (h, 2) int32: first and last + 1 column of each row that is covered, `PAD` not counted
+    """
+
+    guide: Array
+    light: Array
+    spans: Array
+
+
 def denoise(
     components: Array, variance: Array, guides: Guides, split: bool = True, check: Callable[[], None] = lambda: None
 ) -> Array:
@@ -74,37 +101,43 @@ def denoise(
     -------
     (h, w, 4, 3) float32
     """
-    h, w = guides.coverage.shape
-    guide = np.zeros((h, w, _GUIDE), np.float32)
-    parts = 2 if split else 1
-    light = np.zeros((h, w, 2, parts, 3), np.float32)
-    spread = np.zeros((h, w, 4), np.float32)  # variance, then luminance, of diffuse and glossy
-    _demodulate(
-        components,
-        variance,
-        guides.coverage,
-        guides.position,
-        guides.normal,
-        guides.albedo,
-        guides.roughness,
-        guides.metallic,
-        guides.index,
-        guides.footprint,
-        guide,
-        light,
-        spread,
-    )
+    signal = demodulate(components, variance, guides, split)
     check()
-    other = np.zeros_like(light)
-    other_spread = np.zeros_like(spread)
-    _clamp_fireflies(guide, light, spread, other, other_spread)
-    light, other, spread, other_spread = other, light, other_spread, spread
+    smooth(signal, check)
+    return modulate(signal, guides)
+
+
+def demodulate(components: Array, variance: Array, guides: Guides, split: bool = True) -> Signal:
+    """Divide light by surface colour and coverage, and clamp its fireflies; parameters as of `denoise`."""
+    h, w = guides.coverage.shape
+    planes = LIGHT + (12 if split else 6)
+    guide = np.zeros((h, GUIDES, w + 2 * PAD), np.float32)
+    light = np.zeros((h, planes, w + 2 * PAD), np.float32)
+    spans = np.zeros((h, 2), np.int32)
+    g = guides
+    _demodulate(
+        components, variance, g.coverage, g.position, g.normal, g.albedo, g.roughness, g.metallic, g.index,
+        g.footprint, guide, light, spans,
+    )  # fmt: skip
+    clamped = np.zeros_like(light)
+    over_rows(_clamp_fireflies, h, guide, spans, light, clamped)
+    return Signal(guide, clamped, spans)
+
+
+def smooth(signal: Signal, check: Callable[[], None] = lambda: None) -> None:
+    """Run all levels of the a-trous filter over ``signal.light``, in place."""
+    light, other = signal.light, np.zeros_like(signal.light)
     for level in range(LEVELS):
         check()
-        _a_trous(1 << level, guide, light, spread, other, other_spread)
-        light, other, spread, other_spread = other, light, other_spread, spread
-    out = np.zeros((h, w, 4, 3), np.float32)
-    _modulate(light, guide, guides.coverage, guides.albedo, guides.metallic, out)
+        over_rows(_a_trous, len(light), 1 << level, signal.guide, signal.spans, light, other)
+        light, other = other, light
+    signal.light = light
+
+
+def modulate(signal: Signal, guides: Guides) -> Array:
+    """(h, w, 4, 3) float32: light multiplied by surface colour and coverage again."""
+    out = np.zeros((*guides.coverage.shape, 4, 3), np.float32)
+    _modulate(signal.light, signal.spans, guides.coverage, guides.albedo, guides.metallic, out)
     return out
 
 
@@ -125,220 +158,258 @@ def _luminance(r: Any, g: Any, b: Any) -> Any:
     return np.float32(0.2126) * r + np.float32(0.7152) * g + np.float32(0.0722) * b
 
 
-@njit(inline="always")
-def _lobe_luminance(light: Any, y: Any, x: Any, lobe: Any) -> Any:
-    total = np.float32(0.0)
-    for part in range(light.shape[3]):
-        total += _luminance(light[y, x, lobe, part, 0], light[y, x, lobe, part, 1], light[y, x, lobe, part, 2])
-    return total
-
-
 @njit(parallel=True)
 def _demodulate(
-    components: Any,
-    variance: Any,
-    coverage: Any,
-    position: Any,
-    normal: Any,
-    albedo: Any,
-    roughness: Any,
-    metallic: Any,
-    index: Any,
-    footprint: Any,
-    guide: Any,
-    light: Any,
-    spread: Any,
-) -> None:
-    """Divide light by surface colour and coverage; gather the guides of a pixel side by side."""
+    components: Any, variance: Any, coverage: Any, position: Any, normal: Any, albedo: Any, roughness: Any,
+    metallic: Any, index: Any, footprint: Any, guide: Any, light: Any, spans: Any,
+) -> None:  # fmt: skip
+    """Fill the planes of all covered pixels."""
     h, w = coverage.shape
-    parts = light.shape[3]
+    parts = (light.shape[1] - LIGHT) // 6
     usable = np.float32(1e30)
+    nothing = np.float32(np.nan)
     for y in prange(h):
+        guide[y, SOURCE] = nothing
+        guide[y, SURFACE] = nothing
+        first, last = w, 0
         for x in range(w):
             cover = coverage[y, x]
             if not cover > np.float32(0.0):
                 continue
-            g = guide[y, x]
+            first, last = min(first, x), x + 1
+            c = x + PAD
             for k in range(3):
-                g[_POSITION + k], g[_NORMAL + k] = position[y, x, k], normal[y, x, k]
-            r = roughness[y, x]
-            g[_POWER] = np.float32(NORMAL_POWER) + r * np.float32(ROUGH_NORMAL_POWER - NORMAL_POWER)
-            g[_ROUGHNESS], g[_INDEX], g[_FOOTPRINT] = r, index[y, x], footprint[y, x]
-            valid = np.float32(1.0)
+                guide[y, POSITION + k, c], guide[y, NORMAL + k, c] = position[y, x, k], normal[y, x, k]
+            guide[y, ROUGHNESS, c] = roughness[y, x]
+            guide[y, WIDTH, c] = np.float32(1.0) / footprint[y, x]
+            guide[y, SURFACE, c] = index[y, x]
+            valid = True
             for lobe in range(2):
-                c = _colour(lobe, albedo, metallic, y, x)
-                shade = cover * _luminance(c[0], c[1], c[2])
+                colour = _colour(lobe, albedo, metallic, y, x)
+                shade = cover * _luminance(colour[0], colour[1], colour[2])
+                base = LIGHT + 3 * parts * lobe
                 for k in range(3):
-                    scale = np.float32(1.0) / (cover * c[k])
+                    scale = np.float32(1.0) / (cover * colour[k])
                     direct, indirect = components[y, x, 2 * lobe, k], components[y, x, 2 * lobe + 1, k]
                     if not (abs(direct) < usable and abs(indirect) < usable):
-                        valid = np.float32(0.0)
+                        valid = False
                     if parts == 2:
-                        light[y, x, lobe, 0, k], light[y, x, lobe, 1, k] = direct * scale, indirect * scale
+                        light[y, base + k, c], light[y, base + 3 + k, c] = direct * scale, indirect * scale
                     else:
-                        light[y, x, lobe, 0, k] = (direct + indirect) * scale
-                v = variance[y, x, lobe] / (shade * shade)
-                if not v < usable:
-                    valid = np.float32(0.0)
-                spread[y, x, lobe] = max(v, np.float32(0.0))
-            if valid == np.float32(0.0):
-                light[y, x] = np.float32(0.0)
-                spread[y, x] = np.float32(0.0)
-                valid = np.float32(-1.0)
-            spread[y, x, 2], spread[y, x, 3] = _lobe_luminance(light, y, x, 0), _lobe_luminance(light, y, x, 1)
-            g[_VALID] = valid
-
-
-@njit(parallel=True)
-def _clamp_fireflies(guide: Any, light: Any, spread: Any, out: Any, out_spread: Any) -> None:
-    """Scale down outliers among 5 x 5 neighbours of the same object, and fill in pixels that hold no number."""
-    h, w = guide.shape[:2]
-    parts = light.shape[3]
-    for y in prange(h):
-        for x in range(w):
-            if guide[y, x, _VALID] == np.float32(0.0):
-                continue
-            index = guide[y, x, _INDEX]
-            for lobe in range(2):
-                total = square = np.float32(0.0)
-                n = 0
-                for yy in range(max(y - 2, 0), min(y + 3, h)):
-                    for xx in range(max(x - 2, 0), min(x + 3, w)):
-                        if yy == y and xx == x:
-                            continue
-                        if not guide[yy, xx, _VALID] > np.float32(0.0) or guide[yy, xx, _INDEX] != index:
-                            continue
-                        value = spread[yy, xx, 2 + lobe]
-                        total += value
-                        square += value * value
-                        n += 1
-                own = spread[y, x, 2 + lobe]
-                scale = np.float32(1.0)
-                if n >= 4:
-                    inverse = np.float32(1.0) / np.float32(n)
-                    mean = total * inverse
-                    deviation = np.sqrt(max(square * inverse - mean * mean, np.float32(0.0)))
-                    limit = mean + np.float32(FIREFLY) * deviation
-                    doubtful = spread[y, x, lobe] > (own - mean) * (own - mean) * np.float32(0.0625)
-                    if own > limit and doubtful:
-                        scale = limit / own
-                for part in range(parts):
-                    for k in range(3):
-                        out[y, x, lobe, part, k] = light[y, x, lobe, part, k] * scale
-                out_spread[y, x, lobe] = spread[y, x, lobe] * scale * scale
-                out_spread[y, x, 2 + lobe] = own * scale
+                        light[y, base + k, c] = (direct + indirect) * scale
+                spread = variance[y, x, lobe] / (shade * shade)
+                if not spread < usable:
+                    valid = False
+                light[y, VARIANCE + lobe, c] = max(spread, np.float32(0.0))
+            if valid:
+                guide[y, SOURCE, c] = index[y, x]
+                for lobe in range(2):
+                    light[y, LUMINANCE + lobe, c] = _lobe_luminance(light, y, c, lobe, parts)
+            else:
+                for k in range(light.shape[1]):
+                    light[y, k, c] = np.float32(0.0)
+        spans[y, 0], spans[y, 1] = first, max(last, first)
 
 
 @njit(inline="always")
-def _exp(x: Any) -> Any:
-    """exp(x) for x <= 0, relative error below 2e-4: (1 + r)^256 would lose bits, so 2^n times a cubic of 2^f."""
-    t = max(x * np.float32(1.4426950408889634), np.float32(-30.0))
-    n = np.floor(t)
-    f = t - n
-    y = np.float32(0.07944154) * f + np.float32(0.22441137)
-    y = y * f + np.float32(0.69611657)
-    y = y * f + np.float32(1.0)
-    return y / np.float32(1 << np.int64(-n))
+def _lobe_luminance(light: Any, y: Any, c: Any, lobe: Any, parts: Any) -> Any:
+    total = np.float32(0.0)
+    for part in range(parts):
+        k = LIGHT + 3 * (parts * lobe + part)
+        total += _luminance(light[y, k, c], light[y, k + 1, c], light[y, k + 2, c])
+    return total
 
 
-@njit(parallel=True)
-def _a_trous(step: Any, guide: Any, light: Any, spread: Any, out: Any, out_spread: Any) -> None:
+@njit
+def _clamp_fireflies(y0: Any, y1: Any, guide: Any, spans: Any, light: Any, out: Any) -> None:
+    """Scale down outliers among 5 x 5 neighbours of the same object; pixels that hold no number stay as they are."""
+    h, planes = light.shape[:2]
+    zero, one = np.float32(0.0), np.float32(1.0)
+    near = np.empty((3, TILE + 4), np.float32)
+    own = np.empty((5, TILE), np.float32)
+    sums = np.empty((5, TILE), np.float32)
+    for y in range(y0, y1):
+        for x0 in range(spans[y, 0] + PAD, spans[y, 1] + PAD, TILE):
+            n = min(TILE, spans[y, 1] + PAD - x0)
+            for i in range(n):
+                own[0, i] = guide[y, SURFACE, x0 + i]
+                for k in range(5):
+                    sums[k, i] = zero
+            for k in range(4):
+                for i in range(n):
+                    own[1 + k, i] = light[y, k, x0 + i]
+            for yy in range(max(y - 2, 0), min(y + 3, h)):
+                for i in range(n + 4):
+                    near[0, i] = guide[yy, SOURCE, x0 - 2 + i]
+                for k in range(2):
+                    for i in range(n + 4):
+                        near[1 + k, i] = light[yy, k, x0 - 2 + i]
+                for dx in range(5):
+                    if yy == y and dx == 2:
+                        continue
+                    off = np.uint64(dx)
+                    for i in range(np.uint64(n)):
+                        j = i + off
+                        same = one if near[0, j] == own[0, i] else zero
+                        d, g = same * near[1, j], same * near[2, j]
+                        sums[0, i] += same
+                        sums[1, i] += d
+                        sums[2, i] += d * near[1, j]
+                        sums[3, i] += g
+                        sums[4, i] += g * near[2, j]
+            for lobe in range(2):
+                for i in range(n):
+                    inverse = one / max(sums[0, i], one)
+                    mean = sums[1 + 2 * lobe, i] * inverse
+                    deviation = np.sqrt(max(sums[2 + 2 * lobe, i] * inverse - mean * mean, zero))
+                    limit = mean + np.float32(FIREFLY) * deviation
+                    value, spread = own[1 + lobe, i], own[3 + lobe, i]
+                    doubtful = spread > (value - mean) * (value - mean) * np.float32(0.0625)
+                    scale = limit / value if sums[0, i] >= np.float32(4.0) and value > limit and doubtful else one
+                    sums[1 + 2 * lobe, i] = scale
+                for i in range(n):
+                    scale = sums[1 + 2 * lobe, i]
+                    out[y, LUMINANCE + lobe, x0 + i] = own[1 + lobe, i] * scale
+                    out[y, VARIANCE + lobe, x0 + i] = own[3 + lobe, i] * scale * scale
+                width = (planes - LIGHT) // 2
+                for k in range(LIGHT + lobe * width, LIGHT + (lobe + 1) * width):
+                    for i in range(n):
+                        out[y, k, x0 + i] = light[y, k, x0 + i] * sums[1 + 2 * lobe, i]
+
+
+@njit(inline="always")
+def _stop(x: Any) -> Any:
+    """(1 - x / 8)^8 for x in [0, 8], beyond it 0."""
+    u = max(np.float32(1.0) - np.float32(0.125) * x, np.float32(0.0))
+    u *= u
+    u *= u
+    return u * u
+
+
+@njit
+def _a_trous(y0: Any, y1: Any, step: Any, guide: Any, spans: Any, light: Any, out: Any) -> None:
     """One level: 5 x 5 B-spline taps `step` pixels apart."""
-    h, w = guide.shape[:2]
-    parts = light.shape[3]
-    taps = (np.float32(0.375), np.float32(0.25), np.float32(0.0625))
-    zero, tiny = np.float32(0.0), np.float32(1e-8)
+    h, planes = light.shape[:2]
+    taps = (np.float32(0.0625), np.float32(0.25), np.float32(0.375), np.float32(0.25), np.float32(0.0625))
+    zero, one, tiny = np.float32(0.0), np.float32(1.0), np.float32(1e-8)
     diffuse_power = np.float32(ROUGH_NORMAL_POWER)
-    for y in prange(h):
-        sums = np.empty((2, parts, 3), np.float32)
-        for x in range(w):
-            if guide[y, x, _VALID] == zero:
-                continue
-            # Scalars, not a view of the row: a view costs two atomic reference counts each time.
-            px, py, pz = guide[y, x, _POSITION], guide[y, x, _POSITION + 1], guide[y, x, _POSITION + 2]
-            nx, ny, nz = guide[y, x, _NORMAL], guide[y, x, _NORMAL + 1], guide[y, x, _NORMAL + 2]
-            power, roughness, index = guide[y, x, _POWER], guide[y, x, _ROUGHNESS], guide[y, x, _INDEX]
-            own_d, own_g = spread[y, x, 2], spread[y, x, 3]
-            # Variance of the neighbourhood: 3 x 3 Gaussian.
-            var_d = var_g = norm = zero
-            for dy in range(-1, 2):
-                for dx in range(-1, 2):
-                    yy, xx = y + dy, x + dx
-                    if yy < 0 or xx < 0 or yy >= h or xx >= w or not guide[yy, xx, _VALID] > zero:
-                        continue
-                    tap = np.float32((2 - abs(dy)) * (2 - abs(dx)))
-                    norm += tap
-                    var_d += tap * spread[yy, xx, 0]
-                    var_g += tap * spread[yy, xx, 1]
-            norm = np.float32(1.0) / max(norm, np.float32(1.0))
-            inv_d = np.float32(1.0) / (np.float32(SIGMA_LUMINANCE) * np.sqrt(var_d * norm) + tiny)
-            inv_g = np.float32(1.0) / (np.float32(SIGMA_LUMINANCE) * np.sqrt(var_g * norm) + tiny)
-            if guide[y, x, _VALID] < zero:
-                inv_d = inv_g = zero  # nothing to compare with
-            inv_plane = np.float32(1.0) / (np.float32(SIGMA_PLANE) * guide[y, x, _FOOTPRINT])
-            sums[:] = zero
-            sum_d = sum_g = spread_d = spread_g = zero
-            for dy in range(-2, 3):
-                yy = y + dy * step
-                if yy < 0 or yy >= h:
+    power_slope = np.float32(ROUGH_NORMAL_POWER - NORMAL_POWER)
+    lobe_planes = (planes - LIGHT) // 2
+    first_glossy = LIGHT + lobe_planes
+    # What is read at a tap (guide, then signal), at the pixel itself, and what is summed.
+    near = np.empty((SURFACE + LIGHT + 12, TILE + 2 * PAD), np.float32)
+    own = np.empty((SURFACE + 7, TILE), np.float32)
+    weight = np.empty((2, TILE), np.float32)
+    sums = np.empty((2 + LIGHT + 12, TILE), np.float32)
+    for y in range(y0, y1):
+        for x0 in range(spans[y, 0] + PAD, spans[y, 1] + PAD, TILE):
+            n = min(TILE, spans[y, 1] + PAD - x0)
+            # Variance of the neighbourhood, 3 x 3 Gaussian.
+            for i in range(n):
+                sums[0, i] = sums[1, i] = sums[2, i] = zero
+            for yy in range(max(y - 1, 0), min(y + 2, h)):
+                for i in range(n + 2):
+                    near[0, i] = guide[yy, SOURCE, x0 - 1 + i]
+                    near[1, i] = light[yy, VARIANCE, x0 - 1 + i]
+                    near[2, i] = light[yy, VARIANCE + 1, x0 - 1 + i]
+                for dx in range(3):
+                    tap = np.float32((2 - abs(yy - y)) * (2 - abs(dx - 1)))
+                    off = np.uint64(dx)
+                    for i in range(np.uint64(n)):
+                        share = tap if near[0, i + off] == near[0, i + off] else zero
+                        sums[0, i] += share
+                        sums[1, i] += share * near[1, i + off]
+                        sums[2, i] += share * near[2, i + off]
+            for k in range(SURFACE + 2):
+                for i in range(n):
+                    own[k, i] = guide[y, k, x0 + i]
+            for k in range(2):
+                for i in range(n):
+                    own[SURFACE + 2 + k, i] = light[y, LUMINANCE + k, x0 + i]
+            for k in range(2):
+                for i in range(n):
+                    inverse = one / max(sums[0, i], one)
+                    deviation = np.float32(SIGMA_LUMINANCE) * np.sqrt(sums[1 + k, i] * inverse) + tiny
+                    # A pixel that holds no number has nothing to compare with.
+                    own[SURFACE + 4 + k, i] = one / deviation if own[SOURCE, i] == own[SOURCE, i] else zero
+            for i in range(n):
+                own[SURFACE + 6, i] = np.float32(NORMAL_POWER) + power_slope * own[ROUGHNESS, i]
+            for k in range(2 + planes):
+                for i in range(n):
+                    sums[k, i] = zero
+            for dy in range(5):
+                yy = y + (dy - 2) * step
+                if yy < 0 or yy >= h or spans[yy, 0] >= spans[yy, 1]:
                     continue
-                for dx in range(-2, 3):
-                    xx = x + dx * step
-                    if xx < 0 or xx >= w:
-                        continue
-                    if not guide[yy, xx, _VALID] > zero or guide[yy, xx, _INDEX] != index:
-                        continue
-                    kernel = taps[abs(dy)] * taps[abs(dx)]
-                    if dy == 0 and dx == 0:
-                        weight_d, weight_g = kernel, kernel
-                    else:
+                start, reach = x0 - 2 * step, n + 4 * step
+                for k in range(SURFACE):
+                    for i in range(reach):
+                        near[k, i] = guide[yy, k, start + i]
+                for k in range(planes):
+                    for i in range(reach):
+                        near[SURFACE + k, i] = light[yy, k, start + i]
+                for dx in range(5):
+                    kernel = taps[dy] * taps[dx]
+                    off = np.uint64(dx * step)
+                    far = one / (np.float32(SIGMA_PLANE) * np.float32(max(1, step * max(abs(dy - 2), abs(dx - 2)))))
+                    for i in range(np.uint64(n)):
+                        j = i + off
+                        nx, ny, nz = own[NORMAL, i], own[NORMAL + 1, i], own[NORMAL + 2, i]
                         plane = abs(
-                            nx * (guide[yy, xx, _POSITION] - px)
-                            + ny * (guide[yy, xx, _POSITION + 1] - py)
-                            + nz * (guide[yy, xx, _POSITION + 2] - pz)
+                            nx * (near[POSITION, j] - own[POSITION, i])
+                            + ny * (near[POSITION + 1, j] - own[POSITION + 1, i])
+                            + nz * (near[POSITION + 2, j] - own[POSITION + 2, i])
                         )
-                        turn = np.float32(1.0) - (
-                            nx * guide[yy, xx, _NORMAL]
-                            + ny * guide[yy, xx, _NORMAL + 1]
-                            + nz * guide[yy, xx, _NORMAL + 2]
-                        )
-                        common = plane * inv_plane / np.float32(step * max(abs(dy), abs(dx)))
-                        if common > np.float32(12.0):
-                            continue
-                        rough = abs(guide[yy, xx, _ROUGHNESS] - roughness) * np.float32(1.0 / SIGMA_ROUGHNESS)
-                        far_d = abs(spread[yy, xx, 2] - own_d) * inv_d
-                        far_g = abs(spread[yy, xx, 3] - own_g) * inv_g
-                        weight_d = kernel * _exp(-common - diffuse_power * turn - far_d)
-                        weight_g = kernel * _exp(-common - power * turn - rough - far_g)
-                    sum_d += weight_d
-                    sum_g += weight_g
-                    spread_d += weight_d * weight_d * spread[yy, xx, 0]
-                    spread_g += weight_g * weight_g * spread[yy, xx, 1]
-                    for part in range(parts):
-                        for k in range(3):
-                            sums[0, part, k] += weight_d * light[yy, xx, 0, part, k]
-                            sums[1, part, k] += weight_g * light[yy, xx, 1, part, k]
-            inverse_d = np.float32(1.0) / max(sum_d, np.float32(1e-20))
-            inverse_g = np.float32(1.0) / max(sum_g, np.float32(1e-20))
-            for part in range(parts):
-                for k in range(3):
-                    out[y, x, 0, part, k] = sums[0, part, k] * inverse_d
-                    out[y, x, 1, part, k] = sums[1, part, k] * inverse_g
-            out_spread[y, x, 0] = spread_d * inverse_d * inverse_d
-            out_spread[y, x, 1] = spread_g * inverse_g * inverse_g
-            out_spread[y, x, 2], out_spread[y, x, 3] = _lobe_luminance(out, y, x, 0), _lobe_luminance(out, y, x, 1)
+                        turn = one - (nx * near[NORMAL, j] + ny * near[NORMAL + 1, j] + nz * near[NORMAL + 2, j])
+                        common = plane * own[WIDTH, i] * far
+                        rough = abs(near[ROUGHNESS, j] - own[ROUGHNESS, i]) * np.float32(1.0 / SIGMA_ROUGHNESS)
+                        far_d = abs(near[SURFACE + LUMINANCE, j] - own[SURFACE + 2, i]) * own[SURFACE + 4, i]
+                        far_g = abs(near[SURFACE + LUMINANCE + 1, j] - own[SURFACE + 3, i]) * own[SURFACE + 5, i]
+                        same = kernel if near[SOURCE, j] == own[SURFACE, i] else zero
+                        weight[0, i] = same * _stop(common + diffuse_power * turn + far_d)
+                        weight[1, i] = same * _stop(common + own[SURFACE + 6, i] * turn + rough + far_g)
+                    for lobe in range(2):
+                        for i in range(np.uint64(n)):
+                            w = weight[lobe, i]
+                            sums[lobe, i] += w
+                            sums[2 + VARIANCE + lobe, i] += w * w * near[SURFACE + VARIANCE + lobe, i + off]
+                        for k in range(LIGHT + lobe * lobe_planes, LIGHT + (lobe + 1) * lobe_planes):
+                            for i in range(np.uint64(n)):
+                                sums[2 + k, i] += weight[lobe, i] * near[SURFACE + k, i + off]
+            for lobe in range(2):
+                for i in range(n):
+                    sums[lobe, i] = one / max(sums[lobe, i], np.float32(1e-20))
+                    sums[2 + LUMINANCE + lobe, i] = zero
+                    out[y, VARIANCE + lobe, x0 + i] = sums[2 + VARIANCE + lobe, i] * sums[lobe, i] * sums[lobe, i]
+            for k in range(LIGHT, planes):
+                lobe = 1 if k >= first_glossy else 0
+                share = taps_luminance((k - LIGHT) % 3)
+                for i in range(n):
+                    value = sums[2 + k, i] * sums[lobe, i]
+                    sums[2 + LUMINANCE + lobe, i] += share * value
+                    out[y, k, x0 + i] = value
+            for lobe in range(2):
+                for i in range(n):
+                    out[y, LUMINANCE + lobe, x0 + i] = sums[2 + LUMINANCE + lobe, i]
+
+
+@njit(inline="always")
+def taps_luminance(k: Any) -> Any:
+    """Share of colour channel `k` in luminance."""
+    return np.float32(0.2126) if k == 0 else np.float32(0.7152) if k == 1 else np.float32(0.0722)
 
 
 @njit(parallel=True)
-def _modulate(light: Any, guide: Any, coverage: Any, albedo: Any, metallic: Any, out: Any) -> None:
+def _modulate(light: Any, spans: Any, coverage: Any, albedo: Any, metallic: Any, out: Any) -> None:
     """Multiply by surface colour and coverage again."""
-    h, w = coverage.shape
-    for y in prange(h):
-        for x in range(w):
-            if guide[y, x, _VALID] == np.float32(0.0):
+    parts = (light.shape[1] - LIGHT) // 6
+    for y in prange(len(spans)):
+        for x in range(spans[y, 0], spans[y, 1]):
+            if not coverage[y, x] > np.float32(0.0):
                 continue
             for lobe in range(2):
-                c = _colour(lobe, albedo, metallic, y, x)
-                for part in range(light.shape[3]):
+                colour = _colour(lobe, albedo, metallic, y, x)
+                for part in range(parts):
                     for k in range(3):
-                        out[y, x, 2 * lobe + part, k] = light[y, x, lobe, part, k] * c[k] * coverage[y, x]
+                        value = light[y, LIGHT + 3 * (parts * lobe + part) + k, x + PAD]
+                        out[y, x, 2 * lobe + part, k] = value * colour[k] * coverage[y, x]
