@@ -1,309 +1,319 @@
-"""Everything rays can meet in one frame: all objects as one world-space triangle soup with one tree."""
+"""Everything rays can meet in one frame: DR-GS objects and ordinary meshes, with one tree.
+
+DR-GS objects and meshes in one place are triangles in world space; a mesh in several places keeps its vertices in
+object space and a tree of its own, and stands in the scene as instances.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import groupby
 
 import numpy as np
 
 from ..asset.model import as_float
 from ..errors import UsageError
-from ..jit import njit, prange
-from .tree import TriangleBVH
+from ..frame import Image, MeshState
+from .instances import Places, normal_matrices, usable_places
+from .masks import object_flags
+from .parts import (
+    ALBEDO,
+    METALLIC,
+    NORMAL,
+    ROUGHNESS,
+    SHADING_WIDTH,
+    Part,
+    TraceObject,
+    mask_of,
+    own_faces,
+    take_mesh,
+    take_object,
+)
+from .sampling import F
+from .surface import Geometry, Tracer
+from .textures import MaterialTable
+from .tree import Group, TriangleBVH
 
 Array = np.ndarray
 
-#: Columns of ``TraceScene.shading``.
-NORMAL, ALBEDO, ROUGHNESS, METALLIC, SHADING_WIDTH = slice(0, 3), slice(3, 6), 6, 7, 8
-
-#: Coordinates beyond this (metres) are as unusable as NaN: their products overflow.
-_FARTHEST = 1e15
-
-
-@dataclass(slots=True)
-class TraceObject:
-    """One object as rays see it.
-
-    Attributes
-    ----------
-    name : used in messages
-    vertices : (n, 3) float32, metres, world space
-    faces : (m, 3) int32
-    albedo, roughness, metallic : per vertex (n, 3), (n,), (n,) in [0, 1]; linear Rec.709
-    corner_normals : (m, 3, 3) float32, world space, or None: smooth angle-weighted vertex normals
-    pass_index : Blender's object index pass
-    """
-
-    name: str
-    vertices: Array
-    faces: Array
-    albedo: Array
-    roughness: Array
-    metallic: Array
-    corner_normals: Array | None = None
-    pass_index: int = 0
+__all__ = ["ALBEDO", "METALLIC", "NORMAL", "ROUGHNESS", "ObjectFaults", "TraceObject", "TraceScene"]
 
 
 @dataclass(slots=True)
 class ObjectFaults:
-    """What was wrong with one object's mesh in the last update; such faces are invisible to rays."""
+    """What was wrong with one object in the last update; such faces and places are invisible to rays."""
 
     name: str
     bad_vertices: int  # NaN, infinite or absurdly far
     bad_faces: int  # touch a bad vertex
     empty_faces: int  # have no area
-
-
-@njit(parallel=True)
-def _copy_vertices(source, target):  # type: ignore[no-untyped-def]
-    """Copy usable vertices, put the others at the origin; return how many there are of the latter."""
-    bad = 0
-    for i in prange(len(source)):
-        x, y, z = source[i, 0], source[i, 1], source[i, 2]
-        if not (abs(x) < _FARTHEST and abs(y) < _FARTHEST and abs(z) < _FARTHEST):
-            x = y = z = np.float32(0.0)
-            bad += 1
-        target[i, 0], target[i, 1], target[i, 2] = x, y, z
-    return bad
-
-
-@njit
-def _corners_of_rows(shading_faces, rows):  # type: ignore[no-untyped-def]
-    """CSR lists of the face corners (3 face + k) that share each shading row, in ascending order."""
-    start = np.zeros(rows + 1, np.int32)
-    flat = shading_faces.ravel()
-    for row in flat:
-        start[row + 1] += 1
-    for row in range(rows):
-        start[row + 1] += start[row]
-    corners = np.empty(len(flat), np.int32)
-    place = start[:-1].copy()
-    for c in range(len(flat)):
-        corners[place[flat[c]]] = c
-        place[flat[c]] += 1
-    return start, corners
-
-
-@njit
-def _acos(x):  # type: ignore[no-untyped-def]
-    """acos to 7e-5: Abramowitz and Stegun 4.4.45."""
-    a = abs(x)
-    y = np.sqrt(max(np.float32(0.0), np.float32(1.0) - a)) * (
-        np.float32(1.5707288) + a * (np.float32(-0.2121144) + a * (np.float32(0.0742610) + a * np.float32(-0.0187293)))
-    )
-    return y if x >= 0 else np.float32(np.pi) - y
-
-
-@njit(parallel=True)
-def _face_terms(vertices, faces, first, last, weighted):  # type: ignore[no-untyped-def]
-    """Fill weighted[f] = (unit face normal, corner angles) of faces first..last; return how many have no area."""
-    empty = 0
-    for f in prange(first, last):
-        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-        ux, uy, uz = vertices[b, 0] - vertices[a, 0], vertices[b, 1] - vertices[a, 1], vertices[b, 2] - vertices[a, 2]
-        vx, vy, vz = vertices[c, 0] - vertices[b, 0], vertices[c, 1] - vertices[b, 1], vertices[c, 2] - vertices[b, 2]
-        wx, wy, wz = vertices[a, 0] - vertices[c, 0], vertices[a, 1] - vertices[c, 1], vertices[a, 2] - vertices[c, 2]
-        nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-        area = np.sqrt(nx * nx + ny * ny + nz * nz)
-        if not area > 0.0:
-            empty += 1
-            weighted[f, :] = np.float32(0.0)
-            continue
-        scale = np.float32(1.0) / area
-        weighted[f, 0], weighted[f, 1], weighted[f, 2] = nx * scale, ny * scale, nz * scale
-        u2, v2, w2 = ux * ux + uy * uy + uz * uz, vx * vx + vy * vy + vz * vz, wx * wx + wy * wy + wz * wz
-        weighted[f, 3] = _acos(-(ux * wx + uy * wy + uz * wz) / np.sqrt(u2 * w2))
-        weighted[f, 4] = _acos(-(ux * vx + uy * vy + uz * vz) / np.sqrt(u2 * v2))
-        weighted[f, 5] = _acos(-(vx * wx + vy * wy + vz * wz) / np.sqrt(v2 * w2))
-    return empty
-
-
-@njit(parallel=True)
-def _row_normals(weighted, start, corners, shading):  # type: ignore[no-untyped-def]
-    """Sum angle-weighted face normals at each shading row, always in the same order."""
-    for row in prange(len(shading)):
-        x = y = z = np.float32(0.0)
-        for k in range(start[row], start[row + 1]):
-            f, c = corners[k] // 3, corners[k] % 3
-            angle = weighted[f, 3 + c]
-            x, y, z = x + angle * weighted[f, 0], y + angle * weighted[f, 1], z + angle * weighted[f, 2]
-        length = np.sqrt(x * x + y * y + z * z)
-        if length > np.float32(1e-12):
-            scale = np.float32(1.0) / length
-            x, y, z = x * scale, y * scale, z * scale
-        else:
-            x, y, z = np.float32(0.0), np.float32(0.0), np.float32(1.0)
-        shading[row, 0], shading[row, 1], shading[row, 2] = x, y, z
-
-
-@njit(parallel=True)
-def _given_normals(normals, first, shading):  # type: ignore[no-untyped-def]
-    """Overwrite normals from row `first` on by those given, where these are usable."""
-    for i in prange(len(normals)):
-        x, y, z = normals[i, 0], normals[i, 1], normals[i, 2]
-        length = np.sqrt(x * x + y * y + z * z)
-        if length > 1e-12 and length < _FARTHEST:
-            scale = np.float32(1.0) / length
-            shading[first + i, 0], shading[first + i, 1], shading[first + i, 2] = x * scale, y * scale, z * scale
-
-
-@njit(parallel=True)
-def _materials(rows, first, albedo, roughness, metallic, shading):  # type: ignore[no-untyped-def]
-    """Copy the material of vertex rows[i] to shading row first + i, within [0, 1]; NaN becomes 0."""
-    for i in prange(len(rows)):
-        v = rows[i]
-        for k in range(3):
-            shading[first + i, 3 + k] = min(np.float32(1.0), max(np.float32(0.0), albedo[v, k]))
-            if not shading[first + i, 3 + k] >= 0.0:
-                shading[first + i, 3 + k] = 0.0
-        shading[first + i, 6] = min(np.float32(1.0), max(np.float32(0.0), roughness[v]))
-        shading[first + i, 7] = min(np.float32(1.0), max(np.float32(0.0), metallic[v]))
-        for k in (6, 7):
-            if not shading[first + i, k] >= 0.0:
-                shading[first + i, k] = 0.0
-
-
-@dataclass(slots=True)
-class _Part:
-    """Where an object lies in the scene's arrays, and the topology this was made for."""
-
-    faces: Array
-    vertex: slice
-    face: slice
-    row: slice
-    rows: Array  # vertex of the object behind each of its shading rows
-    smooth: bool
-
-    def fits(self, item: TraceObject) -> bool:
-        return (
-            self.vertex.stop - self.vertex.start == len(item.vertices)
-            and self.smooth == (item.corner_normals is None)
-            and np.array_equal(self.faces, item.faces)
-        )
+    bad_places: int = 0  # matrices that are not finite, or flatten one of several places
 
 
 class TraceScene:
-    """All objects of a frame in world space.
+    """All objects and meshes of a frame.
+
+    Objects are numbered: DR-GS objects as given, then meshes as given, then the places of meshes that stand in
+    several, in the order of the meshes.
 
     Attributes
     ----------
     bvh : TriangleBVH over everything
-    vertices : (n, 3) float32, faces : (m, 3) int32: as traced (``bvh``'s own arrays); a face with a bad vertex is
-        collapsed to one point
-    face_object : (m,) int32: index of each face's object in the list given to ``update``
-    shading_faces : (m, 3) int32: rows of ``shading`` at the corners of each face
+    vertices : (n, 3) float32, faces : (m, 3) int32: as traced (``bvh``'s own arrays), world space save for meshes in
+        several places; a face with a bad vertex is collapsed to one point
+    face_object : (m,) int32: object of each face (of a mesh in several places: the mesh)
+    shading_faces : (m, 3) int32: rows of ``shading`` (DR-GS objects) or of ``normals`` at the corners of each face
     shading : (k, 8) float32: unit shading normal (3), albedo (3), roughness, metallic
-    pass_index : (objects,) int32
+    normals : (r, 3) float32: of meshes; object space where these stand in several places
+    vertex_faces : how many faces are of DR-GS objects; those come first
+    places : (p, 3, 4) float32 object-to-world matrices of meshes in several places
+    pass_index, object_flags : (objects,) int32: Blender's object index pass; bits HOLDOUT and CATCHER
+    any_ordinary : whether the camera may see an ordinary mesh
+    materials : MaterialTable of the meshes
     extent : float, metres: the largest absolute coordinate, the scale of rounding errors
-    faults : what was wrong, one entry an object
+    faults : what was wrong, one entry an object, then one a mesh
     """
 
     def __init__(self) -> None:
         self.bvh = TriangleBVH()
         self.shading_faces: Array = np.empty((0, 3), np.int32)
         self.shading: Array = np.empty((0, SHADING_WIDTH), np.float32)
+        self.normals: Array = np.empty((0, 3), np.float32)
         self.face_object: Array = np.empty(0, np.int32)
+        self.vertex_faces = 0
+        self.places: Array = np.empty((0, 3, 4), np.float32)
         self.pass_index: Array = np.empty(0, np.int32)
+        self.object_flags: Array = np.empty(0, np.int32)
+        self.any_ordinary = False
+        self.materials = MaterialTable([], [])
         self.extent = 0.0
         self.faults: list[ObjectFaults] = []
-        self._parts: list[_Part] = []
+        self._parts: list[Part] = []
+        self._groups: list[list[int]] = []  # parts of each group
         self._vertex_count = 0
-        self._faces: Array = np.empty((0, 3), np.int32)  # all of them, bad or not
-        self._traced: Array = self._faces  # what the tree was built with
-        self._weighted: Array = np.empty((0, 6), np.float32)
-        self._start: Array = np.zeros(1, np.int32)
-        self._corners: Array = np.empty(0, np.int32)
+        self._place_normal: Array = np.empty((0, 3, 3), np.float32)
+        self._place_object: Array = np.empty(0, np.int32)
+        self._first_place: Array = np.zeros(1, np.int32)
+        self._material: Array = np.empty(0, np.int32)
+        self._uvs: Array = np.empty((0, 3, 2), np.float32)
 
     @property
     def vertices(self) -> Array:
-        """(n, 3) float32 world-space vertices of all objects, metres."""
+        """(n, 3) float32 vertices, metres."""
         return self.bvh.vertices
 
     @property
     def faces(self) -> Array:
-        """(m, 3) int32 faces of all objects, as traced."""
+        """(m, 3) int32 faces of everything, as traced."""
         return self.bvh.faces
 
-    def update(self, objects: list[TraceObject]) -> None:
-        """Take the objects of a new frame: refit when only vertices or materials changed, rebuild otherwise.
+    @property
+    def tracer(self) -> Tracer:
+        """How compiled code casts rays into the scene."""
+        bvh = self.bvh
+        return Tracer(bvh.intersect_address, bvh.occluded_address, bvh.scene, bvh.first_face, self._first_place)
+
+    @property
+    def geometry(self) -> Geometry:
+        """What compiled code finds behind a hit."""
+        return Geometry(
+            self.shading_faces, self.shading, self.normals, self.face_object, self.vertex_faces, self._material,
+            self._uvs, self._place_normal, self._place_object, self.materials.arrays,
+        )  # fmt: skip
+
+    def update(
+        self, objects: Sequence[TraceObject], meshes: Sequence[MeshState] = (), images: Sequence[Image] = ()
+    ) -> None:
+        """Take the objects of a new frame: refit what moved, rebuild when faces or visibility changed.
+
+        An object that is the same (``is``) as in the last update is unchanged; so is an array of one that is not.
 
         Raises
         ------
-        UsageError
-            When an object's arrays do not fit together.
+        UsageError, AssetError
+            When an object's arrays do not fit together; names the object.
         """
-        same = len(objects) == len(self._parts) and all(p.fits(o) for p, o in zip(self._parts, objects))
+        items: list[TraceObject | MeshState] = [*objects, *meshes]
+        places: list[Places | None] = [None] * len(objects)
+        places += [usable_places(mesh) for mesh in meshes]
+        # An update that fails half way leaves nothing to be taken for current.
+        parts, self._parts = self._parts, []
+        order = _order(items, places)
+        same = [part.source for part in parts] == order and all(
+            p.fits(items[p.source], places[p.source]) for p in parts
+        )
         if not same:
-            self._lay_out(objects)
-        self.pass_index = np.array([o.pass_index for o in objects], np.int32)
-        self.faults = [ObjectFaults(o.name, 0, 0, 0) for o in objects]
-        vertices = self.bvh.vertices if same else np.empty((self._vertex_count, 3), np.float32)
-        for part, item, fault in zip(self._parts, objects, self.faults):
-            given = as_float(item.vertices, (-1, 3), f"vertices of {item.name}")
-            fault.bad_vertices = int(_copy_vertices(given, vertices[part.vertex]))
-        faces = self._without_bad_vertices(objects) if any(f.bad_vertices for f in self.faults) else self._faces
-        if same and (faces is self._traced or np.array_equal(faces, self._traced)):
-            self.bvh.refit()
-        else:
-            self.bvh.build(vertices, faces)
-            self._traced = faces
-        self.extent = float(np.abs(vertices).max(initial=0.0))
-        self._shade(objects)
+            parts = self._lay_out(items, places, order)
+        before = [part.item for part in parts]
+        vertices = self.bvh.vertices if same else np.zeros((self._vertex_count, 3), np.float32)
+        moved, died = [], not same
+        for index, part in enumerate(parts):
+            item, where = items[part.source], places[part.source]
+            if part.item is item:
+                continue
+            if isinstance(item, TraceObject):
+                change = take_object(part, item, vertices, self.shading)
+            else:
+                assert where is not None
+                change = take_mesh(part, item, where, vertices, self.normals)
+            if change[0]:
+                moved.append(index)
+            died |= change[1]
+        self._number(objects, meshes, places)
+        self._take_materials(parts, before, meshes, images, len(objects))
+        self._commit(parts, vertices, places, set(moved), died)
+        self.faults = [
+            ObjectFaults(item.name, 0, 0, 0, where.bad if where else 0) for item, where in zip(items, places)
+        ]
+        for part in parts:
+            fault = self.faults[part.source]
+            fault.bad_vertices, fault.empty_faces = part.bad_vertices, part.empty_faces
+            fault.bad_faces = 0 if part.dead is None else int(part.dead.sum())
+        self._parts = parts
 
     def close(self) -> None:
         """Give the tree's memory back."""
         self.bvh.close()
 
-    def _lay_out(self, objects: list[TraceObject]) -> None:
-        """Give every object its place in the scene's arrays; all that depends on topology alone."""
-        self._parts = []
-        faces, shading_faces = [np.empty((0, 3), np.int32)], [np.empty((0, 3), np.int32)]
-        vertex = face = row = 0
-        for item in objects:
-            n, own = len(item.vertices), np.array(item.faces, np.int32).reshape(-1, 3)
-            m = len(own)
-            if m and (own.min() < 0 or own.max() >= n):
-                raise UsageError(item.name, f"faces refer to vertices outside 0..{n - 1}", "Check the mesh's indices")
-            smooth = item.corner_normals is None
-            # Corners with normals of their own get a shading row each.
-            rows = np.arange(n, dtype=np.int32) if smooth else own.ravel()
-            faces.append(own + np.int32(vertex))
-            shading_faces.append((own if smooth else np.arange(3 * m, dtype=np.int32).reshape(m, 3)) + np.int32(row))
-            spans = slice(vertex, vertex + n), slice(face, face + m), slice(row, row + len(rows))
-            self._parts.append(_Part(own, spans[0], spans[1], spans[2], rows, smooth))
-            vertex, face, row = (span.stop for span in spans)
+    def _lay_out(
+        self, items: Sequence[TraceObject | MeshState], places: Sequence[Places | None], order: list[int]
+    ) -> list[Part]:
+        """Give everything its place in the scene's arrays; all that depends on topology alone."""
+        parts = []
+        faces, owners = [np.empty((0, 3), np.int32)], [np.empty(0, np.int32)]
+        vertex = face = self.vertex_faces = 0
+        rows = {True: 0, False: 0}
+        for source in order:
+            item, where = items[source], places[source]
+            own, n = own_faces(item), len(item.vertices)
+            m, smooth, surfels = len(own), item.corner_normals is None, isinstance(item, TraceObject)
+            row = rows[surfels]
+            # Corners with normals of their own get a row each.
+            corner = own if smooth else np.arange(3 * m, dtype=np.int32).reshape(m, 3)
+            faces.append(corner + np.int32(row))
+            owners.append(np.full(m, source, np.int32))
+            rows[surfels] += n if smooth else 3 * m
+            spans = slice(vertex, vertex + n), slice(face, face + m), slice(row, rows[surfels])
+            instanced = where is not None and where.instanced
+            parts.append(Part(source, item.name, own, *spans, mask_of(item), smooth, instanced))
+            vertex, face = vertex + n, face + m
+            self.vertex_faces += m if surfels else 0
         self._vertex_count = vertex
-        self._faces = np.concatenate(faces)
-        self.shading_faces = np.concatenate(shading_faces)
-        self.shading = np.zeros((row, SHADING_WIDTH), np.float32)
-        counts = [len(p.faces) for p in self._parts]
-        self.face_object = np.repeat(np.arange(len(objects), dtype=np.int32), counts)
-        self._weighted = np.empty((face, 6), np.float32)
-        self._start, self._corners = _corners_of_rows(self.shading_faces, row)
+        self.shading_faces, self.face_object = np.concatenate(faces), np.concatenate(owners)
+        self.shading = np.zeros((rows[True], SHADING_WIDTH), np.float32)
+        self.normals = np.zeros((rows[False], 3), np.float32)
+        self._material = np.zeros(face - self.vertex_faces, np.int32)
+        self._uvs = np.empty((0, 3, 2), np.float32)
+        # A part in places is a group of its own; others of one mask share one.
+        alike = groupby(range(len(parts)), lambda i: (parts[i].mask, i if parts[i].instanced else -1))
+        self._groups = [list(members) for _, members in alike]
+        return parts
 
-    def _without_bad_vertices(self, objects: list[TraceObject]) -> Array:
-        """Faces with those that touch a bad vertex collapsed to one point."""
-        faces = self._faces.copy()
-        for part, item, fault in zip(self._parts, objects, self.faults):
-            with np.errstate(invalid="ignore"):
-                bad = ~(np.abs(np.asarray(item.vertices)) < _FARTHEST).all(axis=1)
-            dead = bad[part.faces].any(axis=1)
-            fault.bad_faces = int(dead.sum())
-            faces[part.face][dead] = part.vertex.start
-        return faces
+    def _number(
+        self, objects: Sequence[TraceObject], meshes: Sequence[MeshState], places: Sequence[Places | None]
+    ) -> None:
+        """Number objects and places; see the class."""
+        count = len(objects)
+        where = [p for p in places[count:] if p is not None]
+        index = [np.array([o.pass_index for o in objects], np.int32)]
+        index.append(np.array([p.pass_index[0] if len(p.pass_index) else 0 for p in where], np.int32))
+        index += [p.pass_index for p in where if p.instanced]
+        self.pass_index = np.concatenate(index)
+        seen = [o.visibility for o in objects] + [mesh.visibility for mesh in meshes]
+        flags = np.array([object_flags(visibility) for visibility in seen], np.int32)
+        repeat = [(count + i, len(p.matrices)) for i, p in enumerate(where) if p.instanced]
+        of_places = np.repeat([source for source, _ in repeat], [n for _, n in repeat]).astype(np.int64)
+        self.object_flags = np.concatenate([flags, flags[of_places]])
+        self.any_ordinary = any(mesh.visibility.camera and len(p.matrices) > 0 for mesh, p in zip(meshes, where))
+        matrices = np.concatenate([np.empty((0, 3, 4)), *(p.matrices for p in where if p.instanced)])
+        self.places = np.ascontiguousarray(matrices, np.float32)
+        self._place_normal = normal_matrices(matrices)
+        self._place_object = np.arange(len(flags), len(flags) + len(matrices), dtype=np.int32)
 
-    def _shade(self, objects: list[TraceObject]) -> None:
-        """Recompute shading normals and copy materials."""
-        for part, fault in zip(self._parts, self.faults):
-            empty = _face_terms(self.vertices, self.faces, part.face.start, part.face.stop, self._weighted)
-            fault.empty_faces = int(empty) - fault.bad_faces
-        _row_normals(self._weighted, self._start, self._corners, self.shading)
-        for part, item in zip(self._parts, objects):
-            if item.corner_normals is not None:
-                normals = as_float(item.corner_normals, (len(part.faces), 3, 3), f"corner normals of {item.name}")
-                _given_normals(normals.reshape(-1, 3), part.row.start, self.shading)
-            n = part.vertex.stop - part.vertex.start
-            albedo = as_float(item.albedo, (n, 3), f"albedo of {item.name}")
-            roughness = as_float(item.roughness, (n,), f"roughness of {item.name}")
-            metallic = as_float(item.metallic, (n,), f"metallic of {item.name}")
-            _materials(part.rows, part.row.start, albedo, roughness, metallic, self.shading)
+    def _take_materials(
+        self,
+        parts: Sequence[Part],
+        before: Sequence[TraceObject | MeshState | None],
+        meshes: Sequence[MeshState],
+        images: Sequence[Image],
+        count: int,
+    ) -> None:
+        """Bring materials and texture coordinates of meshes up to date."""
+        self.materials = MaterialTable([m for mesh in meshes for m in mesh.materials], list(images), self.materials)
+        first = np.cumsum([0, *(len(mesh.materials) for mesh in meshes)])
+        if any(mesh.uvs is not None for mesh in meshes) and not len(self._uvs):
+            self._uvs = np.zeros((len(self._material), 3, 2), np.float32)
+            before = [None] * len(before)
+        for part, old in zip(parts, before):
+            mesh = part.item
+            if not isinstance(mesh, MeshState):
+                continue
+            rows = slice(part.face.start - self.vertex_faces, part.face.stop - self.vertex_faces)
+            own = _material_index(mesh, len(part.faces))
+            self._material[rows] = first[part.source - count] + own
+            if mesh.uvs is not None and (not isinstance(old, MeshState) or old.uvs is not mesh.uvs):
+                self._uvs[rows] = as_float(mesh.uvs, (len(part.faces), 3, 2), f"texture coordinates of {mesh.name}")
+
+    def _commit(
+        self,
+        parts: Sequence[Part],
+        vertices: Array,
+        places: Sequence[Places | None],
+        moved: set[int],
+        other_faces: bool,
+    ) -> None:
+        """Bring the tree up to date."""
+        first_place, count = [], 0
+        matrices: dict[int, Array] = {}
+        for index, members in enumerate(self._groups):
+            where = places[parts[members[0]].source]
+            first_place.append(count)
+            if parts[members[0]].instanced and where is not None:
+                matrices[index] = self.places[count : count + len(where.matrices)]
+                count += len(where.matrices)
+        self._first_place = np.array(first_place or [0], np.int32)
+        if other_faces:
+            faces = [part.traced_faces + np.int32(part.vertex.start) for part in parts]
+            groups = [
+                Group(parts[m[0]].face.start, parts[m[-1]].face.stop, parts[m[0]].mask, matrices.get(i))
+                for i, m in enumerate(self._groups)
+            ]
+            self.bvh.build(vertices, np.concatenate([np.empty((0, 3), np.int32), *faces]), groups)
+        else:
+            self.bvh.refit(None, [i for i, members in enumerate(self._groups) if moved & set(members)], matrices)
+        reach = [part.reach for part in parts if not part.instanced]
+        for index, m in matrices.items():
+            part = parts[self._groups[index][0]]
+            reach.append(float((np.abs(m[:, :, :3]).sum(axis=2) * part.reach + np.abs(m[:, :, 3])).max(initial=0.0)))
+        self.extent = float(F(max(reach, default=0.0)))
+
+
+def _order(items: Sequence[TraceObject | MeshState], places: Sequence[Places | None]) -> list[int]:
+    """Indices of what is traced, in the order of the scene's arrays: objects, meshes in one place, in several.
+
+    Neighbours of one mask share a group, so each kind is sorted by mask; meshes stay in order of places.
+    """
+
+    def kind(source: int) -> tuple[int, int]:
+        where = places[source]
+        if where is None:
+            return 0, mask_of(items[source])
+        return (2, 0) if where.instanced else (1, mask_of(items[source]))
+
+    here = [i for i, where in enumerate(places) if where is None or len(where.matrices)]
+    return sorted(here, key=kind)
+
+
+def _material_index(mesh: MeshState, count: int) -> Array | int:
+    """Material of each face, within the mesh's materials."""
+    if not mesh.materials:
+        raise UsageError(f"object {mesh.name}", "has no material", "Give it at least one")
+    if mesh.material_index is None:
+        return 0
+    index = np.asarray(mesh.material_index)
+    if index.shape != (count,):
+        raise UsageError(
+            f"object {mesh.name}", f"{len(index)} material indices for {count} faces", "Give one index a face"
+        )
+    return np.clip(index, 0, len(mesh.materials) - 1)
