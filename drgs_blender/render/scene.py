@@ -119,7 +119,7 @@ class TraceScene:
         """What compiled code finds behind a hit."""
         return Geometry(
             self.shading_faces, self.shading, self.normals, self.face_object, self.vertex_faces, self._material,
-            self._uvs, self._place_normal, self._place_object, self.materials.arrays,
+            self._uvs, self._place_normal, self._place_object, self.materials.addresses,
         )  # fmt: skip
 
     def update(

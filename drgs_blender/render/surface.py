@@ -53,7 +53,7 @@ class Geometry(NamedTuple):
     uvs : (m - vertex_faces, 3, 2) float32, or (0, 3, 2) when no mesh has any
     place_normal : (p, 3, 3) float32, matrices of normals
     place_object : (p,) int32
-    materials : `textures.MaterialTable.arrays`
+    materials : `textures.MaterialTable.addresses`
     """
 
     shading_faces: Array
