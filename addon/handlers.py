@@ -5,14 +5,14 @@ from __future__ import annotations
 import bpy
 
 from . import assets, messages
-from .export import world
+from .export import images
 
 
 @bpy.app.handlers.persistent
 def forget_everything(*_: object) -> None:
     """Nothing of the last file may be seen in the next."""
     assets.forget()
-    world.forget()
+    images.forget()
     messages.history.clear()
 
 

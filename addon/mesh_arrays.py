@@ -91,10 +91,7 @@ def read_triangles(mesh: bpy.types.Mesh) -> Array | None:
     mesh.polygons.foreach_get("loop_start", starts)
     if not np.array_equal(starts, np.arange(0, 3 * len(starts), 3, dtype=np.int32)):
         return None
-    corners = np.empty(len(mesh.loops), np.int32)
-    if len(corners):
-        mesh.attributes[".corner_vert"].data.foreach_get("value", corners)  # copies; `loops` asks for each element
-    return corners.reshape(-1, 3)
+    return read_corner_vertices(mesh).reshape(-1, 3)
 
 
 def read_edges(mesh: bpy.types.Mesh) -> Array:
@@ -108,6 +105,59 @@ def read_edges(mesh: bpy.types.Mesh) -> Array:
 
 def read_corner_normals(mesh: bpy.types.Mesh) -> Array:
     """(m, 3, 3) float32 unit normals, object space, of the corners of a mesh of triangles."""
-    normals = np.empty(3 * len(mesh.loops), np.float32)
-    mesh.corner_normals.foreach_get("vector", normals)
-    return normals.reshape(-1, 3, 3)
+    normals = np.empty((len(mesh.polygons), 3, 3), np.float32)
+    mesh.corner_normals.foreach_get("vector", normals.ravel())
+    return normals
+
+
+def smooth_or_corner_normals(mesh: bpy.types.Mesh) -> Array | None:
+    """(l, 3) float32 unit normals, object space, of all corners; None where smooth vertex normals are the same."""
+    if mesh.normals_domain == "POINT" and not mesh.has_custom_normals:
+        return None
+    normals = np.empty((len(mesh.loops), 3), np.float32)
+    mesh.corner_normals.foreach_get("vector", normals.ravel())
+    return normals
+
+
+def read_loop_triangles(mesh: bpy.types.Mesh) -> tuple[Array, Array]:
+    """Triangles of all polygons: their corners (m, 3) int32 and the polygon of each (m,) int32."""
+    if read_triangles(mesh) is not None:
+        count = len(mesh.polygons)
+        return np.arange(3 * count, dtype=np.int32).reshape(-1, 3), np.arange(count, dtype=np.int32)
+    mesh.calc_loop_triangles()
+    count = len(mesh.loop_triangles)
+    corners, polygons = np.empty((count, 3), np.int32), np.empty(count, np.int32)
+    mesh.loop_triangles.foreach_get("loops", corners.ravel())
+    mesh.loop_triangle_polygons.foreach_get("value", polygons)
+    return corners, polygons
+
+
+def read_corner_vertices(mesh: bpy.types.Mesh) -> Array:
+    """(l,) int32 vertex of every corner."""
+    vertices = np.empty(len(mesh.loops), np.int32)
+    if len(vertices):
+        mesh.attributes[".corner_vert"].data.foreach_get("value", vertices)  # copies; `loops` asks for each element
+    return vertices
+
+
+def read_material_index(mesh: bpy.types.Mesh) -> Array | None:
+    """(p,) int32 material slot of every polygon; None where all have the first."""
+    attribute = mesh.attributes.get("material_index")
+    if attribute is None or attribute.domain != "FACE" or attribute.data_type != "INT":
+        return None
+    index = np.empty(len(mesh.polygons), np.int32)
+    attribute.data.foreach_get("value", index)
+    return index if index.any() else None
+
+
+def read_uvs(mesh: bpy.types.Mesh, name: str) -> Array | None:
+    """(l, 2) float32 of a UV map, of the one that renders when `name` is ""; None where there is no such map."""
+    if name == "":
+        layer = next((layer for layer in mesh.uv_layers if layer.active_render), None)
+    else:
+        layer = mesh.uv_layers.get(name)
+    if layer is None:
+        return None
+    uvs = np.empty((len(mesh.loops), 2), np.float32)
+    layer.uv.foreach_get("vector", uvs.ravel())
+    return uvs

@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+import typing
+
 import bpy
-from bpy.props import BoolProperty, EnumProperty, IntProperty, PointerProperty, StringProperty
+from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, PointerProperty, StringProperty
 
 from ..drgs_blender.frame import RenderSettings, split_rays
 from ..drgs_blender.passes import PASSES, Pass
+
+_DENOISERS = {
+    "none": ("None", "Keep the noise"),
+    "svgf": ("SVGF", "Variance-guided filter that keeps edges and material detail"),
+    "oidn": ("OpenImageDenoise", "Intel's learned filter; smoothest with few rays"),
+}
+#: The denoisers that the engine knows, for the menu.
+DENOISE_ITEMS = [(n, *_DENOISERS[n]) for n in typing.get_args(typing.get_type_hints(RenderSettings)["denoise"])]
 
 
 class DrgsSceneSettings(bpy.types.PropertyGroup):
@@ -34,6 +44,29 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
     bounces: IntProperty(
         name="Bounces", description="Times that light is passed on between surfaces", min=0, soft_max=8, default=1
     )
+    use_noise_threshold: BoolProperty(
+        name="Noise Threshold",
+        description="Stop sampling a pixel once its noise is below the threshold; Rays are then the most it gets",
+        default=False,
+    )
+    noise_threshold: FloatProperty(
+        name="Noise Threshold",
+        description="Estimated noise below which a pixel is done, as Cycles defines it. Lower is cleaner and slower",
+        min=0.0001,
+        soft_max=0.1,
+        max=1.0,
+        default=0.01,
+        precision=4,
+    )
+    clamp_indirect: FloatProperty(
+        name="Clamp Indirect",
+        description="Limit the brightness of a single sample of passed-on light. Takes away bright specks, and some "
+        "light with them; 0 is off",
+        min=0.0,
+        soft_max=100.0,
+        default=0.0,
+        precision=1,
+    )
     aa: IntProperty(
         name="Anti-aliasing",
         description="Positions inside a pixel among which its rays are divided",
@@ -50,12 +83,19 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
         ),
         default="surfels",
     )
+    tracer: EnumProperty(
+        name="Rays Meet",
+        description="What shadows, reflections and passed-on light see of DR-GS objects",
+        items=(
+            ("mesh", "Mesh", "The triangle mesh that carries the surfels: fast"),
+            ("surfels", "Surfels", "The captured Gaussians themselves: fine detail in reflections and shadows"),
+        ),
+        default="mesh",
+    )
     denoise: EnumProperty(
         name="Denoise",
-        items=(
-            ("none", "None", "Keep the noise"),
-            ("svgf", "SVGF", "Variance-guided filter that keeps edges and material detail"),
-        ),
+        description="Filter that takes the noise out of the picture",
+        items=DENOISE_ITEMS,
         default="none",
     )
     look: EnumProperty(
@@ -88,6 +128,9 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
             film_transparent=film_transparent,
             seed=self.seed,
             threads=threads,
+            noise_threshold=self.noise_threshold if self.use_noise_threshold else 0.0,
+            clamp_indirect=self.clamp_indirect,
+            tracer=self.tracer,
         )
 
 

@@ -9,10 +9,15 @@ import bpy
 
 from ...drgs_blender.errors import UsageError
 from ...drgs_blender.frame import Camera, Frame
-from .. import preferences
+from .. import assets, preferences
 from ..passes import enabled
 from .camera import export_camera
-from .objects import export_objects
+from .images import end_export
+from .instances import UNRENDERED, Unrendered, visible
+from .lights import export_light
+from .materials import Materials
+from .meshes import Meshes
+from .objects import DrgsObjects
 from .world import export_world
 
 #: Colour space of everything the engine gets and gives.
@@ -38,7 +43,7 @@ def export_frame(
     UsageError
         There is no camera, or it cannot be rendered.
     AssetError
-        From `export_objects`.
+        From `DrgsObjects.add`.
     """
     scene = depsgraph.scene_eval
     if camera is None:
@@ -46,15 +51,35 @@ def export_frame(
             raise UsageError(f'Scene "{scene.name}"', "has no camera", "Add a camera, or make one active with Ctrl 0")
         camera = export_camera(scene.camera.evaluated_get(depsgraph), scene.render)
         _check_features(scene, warn)
+    materials, unrendered, lights = Materials(warn), Unrendered(), []
+    objects, meshes = DrgsObjects(depsgraph, key_of, warn), Meshes(depsgraph, materials, warn)
+    for item in visible(depsgraph):
+        if item.object.type == "LIGHT":
+            light = export_light(item, warn)
+            if light is not None:
+                lights.append(light)
+        elif item.object.type in UNRENDERED:
+            unrendered.add(item.object)
+        elif assets.is_drgs(item.object):
+            objects.add(item)
+        else:
+            meshes.add(item)
+            unrendered.add(item.object)
+    unrendered.tell(warn)
     settings = scene.drgs
-    return Frame(
+    frame = Frame(
         number=scene.frame_current if settings.use_animated_seed else 0,
         camera=camera,
-        objects=export_objects(depsgraph, key_of, warn),
+        objects=objects.states,
         world=export_world(scene.world, warn),
         settings=settings.to_settings(scene.render.film_transparent, preferences.read("threads", 0)),
         passes=tuple(p.name for p in enabled(depsgraph.view_layer)),
+        meshes=meshes.states(),
+        lights=lights,
+        images=list(materials.images.values()),
     )
+    end_export()
+    return frame
 
 
 def _check_features(scene: bpy.types.Scene, warn: Callable[[str], None]) -> None:

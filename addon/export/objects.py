@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import bpy
@@ -13,58 +13,38 @@ from ...drgs_blender.asset import MATERIAL_CHANNELS, Asset
 from ...drgs_blender.frame import ObjectState
 from .. import assets, mesh_arrays
 from .fit import check_fit, check_modifiers
+from .instances import Visible
 
 Warn = Callable[[str], None]
 #: Gives the engine's key of the asset at a path.
 KeyOf = Callable[[Path], str]
 
-#: Object types with a surface that a picture without them would lack.
-SURFACES = {"MESH", "CURVE", "SURFACE", "META", "FONT", "CURVES", "POINTCLOUD", "VOLUME"}
 
+class DrgsObjects:
+    """Collects the DR-GS objects of one export."""
 
-@dataclass(frozen=True, slots=True)
-class Visible:
-    """One visible instance: an evaluated object and where it stands."""
+    def __init__(self, depsgraph: bpy.types.Depsgraph, key_of: KeyOf, warn: Warn) -> None:
+        self._depsgraph, self._key_of, self._warn = depsgraph, key_of, warn
+        self._shapes: dict[tuple[int, int], ObjectState] = {}
+        self.states: list[ObjectState] = []
 
-    object: bpy.types.Object
-    matrix_world: np.ndarray
+    def add(self, item: Visible) -> None:
+        """Take in a visible instance.
 
-
-def visible(depsgraph: bpy.types.Depsgraph) -> Iterator[Visible]:
-    """Surfaces and lights that the view layer shows, instances included. Valid during the iteration only."""
-    for instance in depsgraph.object_instances:
-        obj = instance.object
-        if (obj.type in SURFACES or obj.type == "LIGHT") and instance.show_self:
-            yield Visible(obj, np.array(instance.matrix_world, np.float64))
-
-
-def export_objects(depsgraph: bpy.types.Depsgraph, key_of: KeyOf, warn: Warn) -> list[ObjectState]:
-    """All visible DR-GS objects; other surfaces and lights are counted in one warning each.
-
-    Raises
-    ------
-    AssetError
-        An asset is missing, or the evaluated mesh is not the asset's, moved; names object and modifiers.
-    """
-    states: list[ObjectState] = []
-    shapes: dict[tuple[int, int], ObjectState] = {}
-    others: dict[str, set[str]] = {"other object": set(), "light": set()}
-    for item in visible(depsgraph):
+        Raises
+        ------
+        AssetError
+            Its asset is missing, or the evaluated mesh is not the asset's, moved; names object and modifiers.
+        """
         obj = item.object
-        if not assets.is_drgs(obj):
-            others["light" if obj.type == "LIGHT" else "other object"].add(obj.name)
-            continue
-        check_modifiers(obj, depsgraph)
+        check_modifiers(obj, self._depsgraph)
         shape_of = (obj.original.as_pointer(), obj.data.as_pointer())
-        if shape_of not in shapes:
-            shapes[shape_of] = _shape(obj, depsgraph, key_of, warn)
-        states.append(replace(shapes[shape_of], matrix_world=item.matrix_world, pass_index=obj.pass_index))
-    for kind, found in others.items():
-        if found:
-            names = ", ".join(sorted(found)[:3]) + (", ..." if len(found) > 3 else "")
-            plural = f"{kind}s are" if len(found) > 1 else f"{kind} is"
-            warn(f"{len(found)} {plural} not rendered by DR-GS: {names}")
-    return states
+        if shape_of not in self._shapes:
+            self._shapes[shape_of] = _shape(obj, self._depsgraph, self._key_of, self._warn)
+        shape = self._shapes[shape_of]
+        self.states.append(
+            replace(shape, matrix_world=item.matrix_world, pass_index=obj.pass_index, visibility=item.visibility)
+        )
 
 
 def _shape(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, key_of: KeyOf, warn: Warn) -> ObjectState:

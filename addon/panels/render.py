@@ -32,6 +32,11 @@ class DRGS_PT_sampling(_RenderPanel, bpy.types.Panel):
                 column.prop(settings, name)
         else:
             column.prop(settings, "rays")
+        row = layout.row(heading="Noise Threshold")
+        row.prop(settings, "use_noise_threshold", text="")
+        value = row.row()
+        value.active = settings.use_noise_threshold
+        value.prop(settings, "noise_threshold", text="")
         layout.prop(settings, "aa")
         layout.prop(settings, "denoise")
         row = layout.row(align=True)
@@ -47,9 +52,8 @@ class DRGS_PT_light(_RenderPanel, bpy.types.Panel):
         layout.use_property_split = True
         layout.use_property_decorate = False
         settings = context.scene.drgs
-        layout.prop(settings, "bounces")
-        layout.prop(settings, "look")
-        layout.prop(settings, "primary")
+        for name in ("bounces", "clamp_indirect", "look", "primary", "tracer"):
+            layout.prop(settings, name)
 
 
 class DRGS_PT_film(_RenderPanel, bpy.types.Panel):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import typing
 
 import bpy
 import numpy as np
@@ -25,25 +26,53 @@ def test_object_is_described_with_world_matrix_and_vertices(ball, export):
     assert not warnings
 
 
-def test_other_objects_are_counted_in_one_warning(ball, export):
+def test_other_objects_take_part_without_a_warning(ball, export):
     for name in ("Cube", "Floor"):
         mesh_object(name, *sphere(4, 4))
     frame, warnings = export()
-    assert len(frame.objects) == 1
-    assert warnings == ["2 other objects are not rendered by DR-GS: Cube, Floor"]
+    assert [s.name for s in frame.objects] == ["ball"]
+    assert sorted(m.name for m in frame.meshes) == ["Cube", "Floor"]
+    assert warnings == []
 
 
 def test_what_the_picture_will_lack_is_said(ball, scene, export):
-    lamp = bpy.data.objects.new("Lamp", bpy.data.lights.new("Lamp", "SUN"))
-    scene.collection.objects.link(lamp)
+    for name in ("Fur", "Moss"):
+        scene.collection.objects.link(bpy.data.objects.new(name, bpy.data.hair_curves.new(name)))
+    scene.collection.objects.link(bpy.data.objects.new("Fog", bpy.data.volumes.new("Fog")))
     scene.camera.data.dof.use_dof = scene.render.use_motion_blur = True
     _, warnings = export()
-    assert len(warnings) == 3
-    assert "1 light is not rendered by DR-GS: Lamp" in warnings
+    assert len(warnings) == 4
+    assert "2 hair objects are not rendered by DR-GS: Fur, Moss" in warnings
+    assert "1 volume object is not rendered by DR-GS: Fog" in warnings
     assert any('camera "Camera"' in w for w in warnings)
     scene.render.use_multiview = True
     with pytest.raises(errors.UsageError, match="Disable Output > Stereoscopy"):
         export()
+
+
+def test_visibility_of_objects_is_blenders(ball, scene, export):
+    assert export()[0].objects[0].visibility == part("drgs_blender.frame").Visibility()
+    ball.visible_camera = ball.visible_glossy = ball.visible_shadow = False
+    ball.is_holdout = ball.is_shadow_catcher = True
+    rays = export()[0].objects[0].visibility
+    assert (rays.camera, rays.diffuse, rays.glossy, rays.shadow) == (False, True, False, False)
+    assert rays.holdout and rays.shadow_catcher
+    ball.visible_diffuse = False
+    assert export()[0].objects == [], "what no ray meets is not sent"
+
+
+def test_collections_make_holdouts_and_indirect_objects(ball, scene, export):
+    group = bpy.data.collections.new("Group")
+    scene.collection.children.link(group)
+    scene.collection.objects.unlink(ball)
+    group.objects.link(ball)
+    layer = bpy.context.view_layer.layer_collection.children["Group"]
+    layer.indirect_only = True
+    rays = export()[0].objects[0].visibility
+    assert not rays.camera and rays.diffuse and not rays.holdout
+    layer.holdout = True
+    rays = export()[0].objects[0].visibility
+    assert rays.camera and rays.holdout
 
 
 def test_instances_have_their_own_transforms_and_share_arrays(ball, scene, export):
@@ -260,6 +289,7 @@ def test_settings_and_passes_reach_the_frame(ball, scene, captured):
     settings.use_custom_split, settings.rays = False, 64
     settings.bounces, settings.aa, settings.look, settings.denoise, settings.seed = 3, 8, "paper", "svgf", 5
     settings.primary, scene.render.film_transparent = "mesh", True
+    settings.noise_threshold, settings.clamp_indirect, settings.tracer = 0.02, 10, "surfels"
     layer.use_pass_z = layer.use_pass_object_index = layer.drgs.use_pass_albedo = layer.drgs.use_pass_noisy_image = True
     scene.frame_set(12)
     bpy.ops.render.render()
@@ -267,8 +297,19 @@ def test_settings_and_passes_reach_the_frame(ball, scene, captured):
     s = frame.settings
     assert (s.cosine, s.ggx, s.environment, s.bounces, s.aa, s.seed) == (32, 16, 16, 3, 8, 5)
     assert (s.look, s.denoise, s.primary, s.film_transparent) == ("paper", "svgf", "mesh", True)
+    assert (s.noise_threshold, s.clamp_indirect, s.tracer) == (0, 10, "surfels"), "the threshold is off"
     assert frame.passes == ("Combined", "Depth", "Albedo", "IndexOB", "Noisy Image")
     assert frame.number == 12
-    settings.use_animated_seed = False
+    settings.use_animated_seed, settings.use_noise_threshold = False, True
     bpy.ops.render.render()
-    assert captured[1].number == 0
+    assert captured[1].number == 0 and captured[1].settings.noise_threshold == pytest.approx(0.02)
+
+
+def test_settings_offer_what_the_engine_knows():
+    """The menus of the panel and the choices of the frame description are the same."""
+    hints = typing.get_type_hints(part("drgs_blender.frame").RenderSettings)
+    defaults = part("drgs_blender.frame").RenderSettings()
+    properties = part("addon.properties").DrgsSceneSettings.bl_rna.properties
+    for name in ("primary", "denoise", "look", "tracer"):
+        assert {i.identifier for i in properties[name].enum_items} == set(typing.get_args(hints[name])), name
+        assert properties[name].default == getattr(defaults, name)

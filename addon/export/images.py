@@ -1,0 +1,193 @@
+"""Image datablocks -> pixels, remembered while an image does not change."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable
+from typing import Any
+
+import bpy
+import numpy as np
+
+from ...drgs_blender.frame import Image
+
+Array = np.ndarray
+Warn = Callable[[str], None]
+
+#: Colour spaces of 8-bit images that store linear light (or no colour).
+LINEAR = {"Linear Rec.709", "Linear", "Non-Color", "Raw", "scene_linear"}
+#: Those that are no colour.
+DATA = {"Non-Color", "Raw"}
+#: What Cycles shows for an image it cannot read.
+MISSING = (1.0, 0.0, 1.0)
+#: Exports for which an image that none of them used is remembered: view layers and scenes take turns.
+KEPT = 4
+
+#: What was made of an image -> (the number of the export that used it last, result).
+_known: dict[tuple[object, ...], tuple[int, Any]] = {}
+_export = 0
+
+
+def linear_pixels(image: bpy.types.Image, warn: Warn) -> Array | None:
+    """(h, w, 3) float32 linear Rec.709, row 0 at the top, read-only; None when the image has no pixels.
+
+    Blender keeps float images in scene-linear already; 8-bit ones are as in the file and decoded here. Values that are
+    no light (NaN, infinite, negative) stay as they are: the engine takes such texels as black and warns with a count.
+    """
+    _check(image, warn)
+    return _remembered(image, "light", _linear)
+
+
+def export_image(image: bpy.types.Image, straight: bool, warn: Warn) -> Image | None:
+    """Pixels of a texture; None when the image has none.
+
+    Parameters
+    ----------
+    straight : keep the colours as they are where alpha is small. Cycles does so only for nodes whose Alpha is used;
+        else the colours are multiplied with alpha (not those of data and of channel-packed images)
+    """
+    _check(image, warn)
+    return _remembered(image, "straight" if straight else "associated", _straight if straight else _associated)
+
+
+def mean_colour(picture: Image) -> Array:
+    """(4,) linear mean of a picture, from at most some 65 thousand of its pixels."""
+    step = [max(1, n // 256) for n in picture.pixels.shape[:2]]
+    some = picture.pixels[:: step[0], :: step[1]].reshape(-1, 4).astype(np.float64)
+    if picture.pixels.dtype == np.uint8:
+        some /= 255
+    if picture.encoding == "srgb":
+        some[:, :3] = _decoded(some[:, :3])
+    some = some[np.isfinite(some).all(axis=1)]
+    return some.mean(axis=0) if len(some) else np.zeros(4)
+
+
+def end_export() -> None:
+    """Drop what the last exports did not use."""
+    global _export
+    _export += 1
+    for key in [k for k, (used, _) in _known.items() if used < _export - KEPT]:
+        del _known[key]
+
+
+def forget() -> None:
+    """Drop all remembered pixels."""
+    _known.clear()
+
+
+def _check(image: bpy.types.Image, warn: Warn) -> None:
+    """Say what is not as in Cycles."""
+    if image.source in ("MOVIE", "SEQUENCE"):
+        warn(f'Image "{image.name}": of a {image.source.lower()} only the current picture is used')
+    if image.source == "TILED" and len(image.tiles) > 1:
+        warn(f'Image "{image.name}": of its {len(image.tiles)} UDIM tiles only the first is used')
+    space = image.colorspace_settings.name
+    if not image.is_float and space not in LINEAR and space != "sRGB":
+        warn(f'Image "{image.name}": colour space {space} of an 8-bit image is read as sRGB')
+
+
+def _read(image: bpy.types.Image) -> Array | None:
+    """(h, w, c) float32 as Blender holds them, row 0 at the top; None when the image has no pixels."""
+    width, height = image.size
+    if width * height == 0:
+        return None
+    pixels = np.empty(width * height * image.channels, np.float32)
+    image.pixels.foreach_get(pixels)
+    return pixels.reshape(height, width, image.channels)[::-1]
+
+
+def _is_srgb(image: bpy.types.Image) -> bool:
+    return not image.is_float and image.colorspace_settings.name not in LINEAR
+
+
+def _decoded(values: Array) -> Array:
+    """sRGB -> linear."""
+    return np.where(values <= 0.04045, values / 12.92, ((np.maximum(values, 0) + 0.055) / 1.055) ** 2.4)
+
+
+def _linear(image: bpy.types.Image) -> Array | None:
+    pixels = _read(image)
+    if pixels is None:
+        return None
+    pixels = pixels[..., :3] if pixels.shape[2] >= 3 else np.repeat(pixels[..., :1], 3, axis=2)
+    if _is_srgb(image):
+        pixels = _decoded(pixels)
+    return _frozen(pixels, np.float32)
+
+
+def _straight(image: bpy.types.Image) -> Image | None:
+    pixels = _rgba(image)
+    if pixels is None:
+        return None
+    alpha = pixels[..., 3:]
+    if image.is_float and _has_alpha(image) and (alpha != 1).any():
+        np.divide(pixels[..., :3], alpha, out=pixels[..., :3], where=alpha > 0)
+    return _picture(image, f"{image.name_full} (straight)", pixels)
+
+
+def _associated(image: bpy.types.Image) -> Image | None:
+    pixels = _rgba(image)
+    if pixels is None:
+        return None
+    if not image.is_float and _has_alpha(image) and (pixels[..., 3] != 1).any():
+        pixels[..., :3] *= pixels[..., 3:]  # of the encoded values, as Cycles does
+    return _picture(image, image.name_full, pixels)
+
+
+def _has_alpha(image: bpy.types.Image) -> bool:
+    """Whether alpha belongs to the colours."""
+    return image.alpha_mode in ("STRAIGHT", "PREMUL") and image.colorspace_settings.name not in DATA
+
+
+def _rgba(image: bpy.types.Image) -> Array | None:
+    """(h, w, 4) float32."""
+    pixels = _read(image)
+    if pixels is None:
+        return None
+    rgba = np.ones((*pixels.shape[:2], 4), np.float32)
+    count = pixels.shape[2]
+    rgba[..., : max(count, 3)] = pixels if count >= 3 else pixels[..., :1]
+    if image.alpha_mode == "NONE":
+        rgba[..., 3] = 1
+    return rgba
+
+
+def _picture(image: bpy.types.Image, name: str, pixels: Array) -> Image:
+    if image.is_float:
+        return Image(name, _frozen(pixels, np.float32), "linear")
+    return Image(name, _frozen(np.rint(pixels * 255), np.uint8), "srgb" if _is_srgb(image) else "linear")
+
+
+def _frozen(pixels: Array, kind: type) -> Array:
+    """An array of its own that nobody can write to, so that its identity says whether it changed."""
+    pixels = np.array(pixels, kind, order="C")
+    pixels.flags.writeable = False
+    return pixels
+
+
+def _remembered(image: bpy.types.Image, kind: str, make: Callable[[bpy.types.Image], Any]) -> Any:
+    """What `make` makes of the image, from memory where the image did not change."""
+    key = _key(image)
+    if key is None:
+        return make(image)
+    key = (kind, *key)
+    if key not in _known:
+        _known[key] = _export, make(image)
+    result = _known[key][1]
+    _known[key] = _export, result
+    return result
+
+
+def _key(image: bpy.types.Image) -> tuple[object, ...] | None:
+    """What the pixels depend on, or None where that cannot be told: painted, generated and moving images."""
+    if image.source != "FILE" or image.is_dirty:
+        return None
+    path = bpy.path.abspath(image.filepath, library=image.library)
+    try:
+        changed = os.stat(path).st_mtime_ns
+    except OSError:  # packed, or missing (then there are no pixels)
+        changed = 0
+    packed = hashlib.blake2b(image.packed_file.data).digest() if image.packed_file else b""
+    settings = image.colorspace_settings.name, image.alpha_mode
+    return image.session_uid, image.name_full, path, changed, packed, *settings, tuple(image.size)

@@ -1,0 +1,84 @@
+"""What the view layer shows: every visible surface and light, instances included, and which rays meet it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import bpy
+import numpy as np
+
+from ...drgs_blender.frame import Visibility
+
+Warn = Callable[[str], None]
+
+#: What has a surface that a picture without it would lack, by the type of the object.
+UNRENDERED = {"CURVES": "hair", "POINTCLOUD": "point cloud", "VOLUME": "volume"}
+
+
+@dataclass(frozen=True, slots=True)
+class Visible:
+    """One visible instance: an evaluated object, where it stands and which rays meet it."""
+
+    object: bpy.types.Object
+    matrix_world: np.ndarray
+    visibility: Visibility
+
+
+def visible(depsgraph: bpy.types.Depsgraph) -> Iterator[Visible]:
+    """Meshes, lights and what cannot be rendered. Valid during the iteration only.
+
+    Curves, texts, surfaces and metaballs appear twice, as themselves and as the mesh they were made into; only the
+    mesh is given.
+    """
+    layer = depsgraph.view_layer
+    known: dict[tuple[int, int], Visibility | None] = {}
+    for instance in depsgraph.object_instances:
+        obj = instance.object
+        if not instance.show_self or not (obj.type in ("MESH", "LIGHT") or obj.type in UNRENDERED):
+            continue
+        parent = instance.parent if instance.is_instance else None
+        key = obj.original.as_pointer(), parent.original.as_pointer() if parent else 0
+        if key not in known:
+            known[key] = _visibility(obj, parent, layer)
+        visibility = known[key]
+        if visibility is not None:
+            yield Visible(obj, np.array(instance.matrix_world, np.float64), visibility)
+
+
+def _visibility(
+    obj: bpy.types.Object, parent: bpy.types.Object | None, layer: bpy.types.ViewLayer
+) -> Visibility | None:
+    """As Cycles reads it: of an instance and of what makes the instances. None where no ray meets it."""
+    both = [obj.original] + ([parent.original] if parent is not None else [])
+    rays = {
+        name: all(getattr(o, f"visible_{name}") for o in both) for name in ("camera", "diffuse", "glossy", "shadow")
+    }
+    holdout = any(o.holdout_get(view_layer=layer) for o in both)
+    if not holdout and both[-1].indirect_only_get(view_layer=layer):
+        rays["camera"] = False
+    if not any(rays.values()):
+        return None
+    return Visibility(**rays, holdout=holdout, shadow_catcher=obj.is_shadow_catcher)
+
+
+class Unrendered:
+    """Counts what is visible and cannot be rendered."""
+
+    def __init__(self) -> None:
+        self._names: dict[str, set[str]] = {}
+
+    def add(self, obj: bpy.types.Object) -> None:
+        """Remember an object of a type in `UNRENDERED`, or the hair on another."""
+        kind = UNRENDERED.get(obj.type)
+        if kind is not None:
+            self._names.setdefault(kind, set()).add(obj.name)
+        elif any(p.settings.type == "HAIR" and p.settings.render_type == "PATH" for p in obj.particle_systems):
+            self._names.setdefault("hair", set()).add(obj.name)
+
+    def tell(self, warn: Warn) -> None:
+        """One warning a kind."""
+        for kind, found in self._names.items():
+            names = ", ".join(sorted(found)[:3]) + (", ..." if len(found) > 3 else "")
+            objects = "object is" if len(found) == 1 else "objects are"
+            warn(f"{len(found)} {kind} {objects} not rendered by DR-GS: {names}")

@@ -1,0 +1,118 @@
+"""Blender's lights -> frame.Light."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import bpy
+import numpy as np
+
+from ...drgs_blender.frame import Light
+from .instances import Visible
+from .nodes import Paint, Place, Walker, plain, surface_of
+
+Warn = Callable[[str], None]
+
+
+def export_light(item: Visible, warn: Warn) -> Light | None:
+    """Describe a visible instance of a light; None for portals, which give no light of their own."""
+    obj, light = item.object, item.object.data
+    if light.type == "AREA" and light.cycles.is_portal:
+        return None
+    name = f'Light "{obj.name}"'
+    linking = obj.light_linking
+    if linking.receiver_collection or linking.blocker_collection:
+        warn(f"{name}: light linking is not rendered; it lights everything")
+    if light.use_custom_distance:
+        warn(f"{name}: a custom distance is not rendered; its light goes on")
+    colour = np.array(light.color, np.float64)
+    if getattr(light, "use_temperature", False):  # from Blender 4.5 on
+        colour *= np.array(light.temperature_color)
+    if light.use_nodes and light.node_tree is not None:
+        colour *= _Tree(light, warn).emission()
+    power = light.energy * 2.0 ** getattr(light, "exposure", 0.0)
+    if not (np.isfinite(colour).all() and np.isfinite(power)):
+        warn(f"{name}: its colour or power is not finite; it is off")
+        colour, power = np.zeros(3), 0.0
+    kind = light.type.lower()
+    rays = item.visibility
+    return Light(
+        name=obj.name,
+        kind=kind,
+        matrix_world=item.matrix_world,
+        colour=tuple(map(float, colour)),
+        power=power,
+        normalize=getattr(light, "normalize", True),
+        camera=rays.camera,
+        diffuse=rays.diffuse,
+        glossy=rays.glossy,
+        cast_shadow=light.use_shadow,
+        **_SHAPES[kind](light),
+    )
+
+
+def _point(light: bpy.types.Light) -> dict[str, object]:
+    return {"radius": light.shadow_soft_size, "soft_falloff": light.use_soft_falloff}
+
+
+def _spot(light: bpy.types.Light) -> dict[str, object]:
+    return {**_point(light), "spot_size": light.spot_size, "spot_blend": light.spot_blend}
+
+
+def _area(light: bpy.types.Light) -> dict[str, object]:
+    shape = light.shape.lower()
+    height = light.size_y if shape in ("rectangle", "ellipse") else light.size
+    return {"shape": shape, "size_x": light.size, "size_y": height, "spread": light.spread}
+
+
+_SHAPES: dict[str, Callable[[bpy.types.Light], dict[str, object]]] = {
+    "point": _point,
+    "sun": lambda light: {"angle": light.angle},
+    "spot": _spot,
+    "area": _area,
+}
+
+
+class _Tree(Walker):
+    """What a light's nodes multiply it with."""
+
+    unknown = 1.0
+
+    def __init__(self, light: bpy.types.Light, warn: Warn) -> None:
+        super().__init__(f'Light "{light.name}"', warn)
+        self.tree = light.node_tree
+
+    def emission(self) -> np.ndarray:
+        """(3,): colour times strength; black without an output, as in Blender."""
+        surface = surface_of(self.tree)
+        return np.zeros(3) if surface is None else self.shader(surface)
+
+    def shader(self, place: Place) -> np.ndarray:
+        """(3,) of a shader input."""
+        origin = place.origin()
+        if not origin.socket.is_output:
+            return np.zeros(3)
+        node = origin.node
+        if node.type == "EMISSION":
+            return self.fixed(origin.input("Color")) * self.value(origin.input("Strength"))
+        if node.type == "ADD_SHADER":
+            return self.shader(origin.input(0)) + self.shader(origin.input(1))
+        if node.type == "MIX_SHADER":
+            share = float(np.clip(self.value(origin.input(0)), 0, 1))
+            return (1 - share) * self.shader(origin.input(1)) + share * self.shader(origin.input(2))
+        self.warn(node, f"{node.bl_label} is not supported in a light; its own colour is used")
+        return np.ones(3)
+
+    def node_light_falloff(self, output: Place) -> Paint:
+        strength = self.number(output.input("Strength"))
+        if output.socket.name != "Quadratic" or self.value(output.input("Smooth")) != 0:
+            self.warn(output.node, "only the natural, quadratic falloff is rendered")
+        return strength
+
+    def node_tex_ies(self, output: Place) -> Paint:
+        self.warn(output.node, "IES profiles are not rendered; it shines evenly")
+        return self.number(output.input("Strength")) if "Strength" in output.node.inputs else plain(1)
+
+    def node_tex_image(self, output: Place) -> Paint:
+        self.warn(output.node, "images are not projected by lights; white is used")
+        return plain(1)

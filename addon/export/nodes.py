@@ -1,0 +1,494 @@
+"""Walking back through shader nodes: from a socket to the constant, or the scaled texture, that feeds it.
+
+What worlds, materials and lights share. Colours are linear Rec.709; numbers are colours of three equal parts. What
+cannot be expressed is replaced by the nearest that can, with a warning that names the node; never by black.
+"""
+
+from __future__ import annotations
+
+import colorsys
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import bpy
+import numpy as np
+from mathutils import Euler, Matrix
+
+Warn = Callable[[str], None]
+Array = np.ndarray
+
+#: Luminance weights of Rec.709.
+LUMINANCE = np.array((0.2126, 0.7152, 0.0722))
+#: Colours with which a function is probed for being a plain scaling of each channel.
+_PROBES = np.array(((0.9, 0.6, 0.3), (0.2, 0.5, 0.8), (0.04, 0.02, 0.07)))
+
+
+class Place(NamedTuple):
+    """A socket, and the group nodes that were entered to come to it, outermost first."""
+
+    socket: bpy.types.NodeSocket
+    groups: tuple[bpy.types.Node, ...] = ()
+
+    @property
+    def node(self) -> bpy.types.Node:
+        return self.socket.node
+
+    def input(self, key: int | str) -> Place:
+        """An input of the same node by index or name."""
+        return Place(self.node.inputs[key], self.groups)
+
+    def inputs(self) -> dict[str, Place]:
+        """The inputs of the same node by identifier, which is unique."""
+        return {s.identifier: Place(s, self.groups) for s in self.node.inputs}
+
+    def origin(self) -> Place:
+        """The output that feeds this input, through reroutes, muted nodes and groups; where nothing does, the input
+        whose own value counts."""
+        own = place = self
+        while place.socket.is_linked:
+            link = place.socket.links[0]
+            if link.is_muted:
+                return own
+            source = Place(link.from_socket, place.groups)
+            node = source.node
+            if node.mute:
+                passed = [i.from_socket for i in node.internal_links if i.to_socket == source.socket]
+                if not passed:
+                    return own
+                place = Place(passed[0], place.groups)
+            elif node.type == "REROUTE":
+                place = source.input(0)
+            elif node.type == "GROUP" and node.node_tree is not None:
+                exits = [n for n in node.node_tree.nodes if n.type == "GROUP_OUTPUT" and n.is_active_output]
+                if not exits:
+                    return source
+                own = place = Place(_same(exits[0].inputs, source.socket), (*place.groups, node))
+            elif node.type == "GROUP_INPUT" and place.groups:
+                own = place = Place(_same(place.groups[-1].inputs, source.socket), place.groups[:-1])
+            else:
+                return source
+        return own
+
+
+def _same(sockets: bpy.types.bpy_prop_collection, socket: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+    """The socket on the other side of a group's border."""
+    return next(s for s in sockets if s.identifier == socket.identifier)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Paint:
+    """A colour, times a texture where there is one."""
+
+    colour: Array
+    texture: Hashable | None = None
+
+    def times(self, factor: Array | float) -> Paint:
+        """Scaled."""
+        return replace(self, colour=self.colour * factor)
+
+    @property
+    def black(self) -> bool:
+        return not self.colour.any()
+
+
+def plain(value: Array | float) -> Paint:
+    """Without texture."""
+    return Paint(np.broadcast_to(np.asarray(value, np.float64), (3,)).copy())
+
+
+def constant(socket: bpy.types.NodeSocket) -> Array:
+    """(3,) float64: a socket's own value."""
+    value = socket.default_value
+    return np.array(value[:3] if hasattr(value, "__len__") else (value,) * 3, np.float64)
+
+
+class Walker:
+    """Evaluates the sockets of one node tree. A method ``node_<type>`` gives the paint of an output of such nodes."""
+
+    #: Grey for a colour that nothing is known of.
+    unknown = 0.5
+
+    def __init__(self, owner: str, warn: Warn) -> None:
+        self.owner = owner
+        self._warn = warn
+        self._said: set[str] = set()
+
+    def warn(self, node: bpy.types.Node, problem: str) -> None:
+        """Say `problem` once."""
+        text = f'{self.owner}, node "{node.label or node.name}": {problem}'
+        if text not in self._said:
+            self._said.add(text)
+            self._warn(text)
+
+    # What a subclass knows of its textures
+
+    def mean(self, texture: Hashable) -> Array:
+        """(3,) mean colour of a texture."""
+        raise TypeError(f"{self.owner} has no textures")
+
+    def channel(self, texture: Hashable, name: str) -> Hashable | None:
+        """The texture reduced to "r", "g", "b" or "luminance"; None where there is no such thing."""
+        return None
+
+    # Sockets
+
+    def colour(self, place: Place) -> Paint:
+        """Value of a colour or vector input."""
+        origin = place.origin()
+        if not origin.socket.is_output:
+            return Paint(constant(origin.socket))
+        evaluate = getattr(self, f"node_{origin.node.type.lower()}", None)
+        return evaluate(origin) if evaluate is not None else self.nearest(origin, place)
+
+    def number(self, place: Place) -> Paint:
+        """Value of a number input; of a colour its luminance, of a vector its mean."""
+        paint, source = self.colour(place), place.origin()
+        if not source.socket.is_output or source.socket.type == "VALUE":
+            return paint
+        if source.socket.type == "VECTOR":
+            return plain(self.flat(source.node, paint).mean())
+        return self.grey(source.node, paint)
+
+    def fixed(self, place: Place) -> Array:
+        """(3,): an input that must not vary over the surface."""
+        paint = self.colour(place)
+        return self.flat(place.origin().node, paint)
+
+    def value(self, place: Place) -> float:
+        """A number that must not vary over the surface."""
+        return float(self.flat(place.origin().node, self.number(place))[0])
+
+    def flat(self, node: bpy.types.Node, paint: Paint) -> Array:
+        """(3,): the mean of a paint."""
+        if paint.texture is None:
+            return paint.colour
+        self.warn(node, "a texture cannot vary this; its mean is used")
+        return paint.colour * self.mean(paint.texture)
+
+    def grey(self, node: bpy.types.Node, paint: Paint) -> Paint:
+        """Luminance."""
+        if paint.texture is None:
+            return plain(paint.colour @ LUMINANCE)
+        texture = self.channel(paint.texture, "luminance")
+        if texture is None:
+            return plain(self.flat(node, paint) @ LUMINANCE)
+        if texture == paint.texture or np.ptp(paint.colour) < 1e-6:
+            return Paint(plain(paint.colour @ LUMINANCE).colour, texture)
+        self.warn(node, "the luminance of a tinted image is that of the image, scaled")
+        mean = self.mean(paint.texture)
+        return Paint(plain((paint.colour * mean) @ LUMINANCE / max(mean @ LUMINANCE, 1e-9)).colour, texture)
+
+    def part(self, node: bpy.types.Node, paint: Paint, index: int) -> Paint:
+        """Red, green or blue."""
+        if paint.texture is None:
+            return plain(paint.colour[index])
+        texture = self.channel(paint.texture, "rgb"[index])
+        if texture is None:
+            return plain(self.flat(node, paint)[index])
+        return Paint(plain(paint.colour[index]).colour, texture)
+
+    def combine(self, node: bpy.types.Node, function: Callable[..., Array], *paints: Paint) -> Paint:
+        """`function` of (3,) arrays for paints.
+
+        Exact for constants, and where the result is a scaled texture. Else the texture with the most influence stays,
+        scaled so that the mean is right; where the result falls as the texture rises, the mean alone.
+        """
+        textures = dict.fromkeys(p.texture for p in paints if p.texture is not None and not p.black)
+
+        def at(levels: dict[Hashable, Array]) -> Array:
+            return np.asarray(function(*(p.colour * levels.get(p.texture, 0 if p.texture else 1) for p in paints)))
+
+        if not textures:
+            return plain(at({}))
+        if len(textures) == 1:
+            (texture,) = textures
+            zero, *probed = (at({texture: level}) for level in (np.zeros(3), *_PROBES))
+            scales = np.array(probed) / _PROBES
+            if not zero.any() and np.allclose(scales, scales[0], rtol=1e-5, atol=1e-7):
+                return Paint(scales[0], texture)
+        means = {t: self.mean(t) for t in textures}
+        whole = at(means)
+        influence = {t: np.abs(whole - at({**means, t: np.zeros(3)})).max() for t in textures}
+        texture = max(influence, key=lambda t: influence[t])
+        if influence[texture] < 1e-6:
+            return plain(whole)
+        if len(textures) > 1 and sorted(influence.values())[-2] < 1e-6:
+            return self.combine(node, function, *(_fixed_but(p, texture, means) for p in paints))
+        halved = at({**means, texture: means[texture] / 2})
+        if whole.sum() < halved.sum():
+            self.warn(node, "this cannot be done to an image; the mean colour is used. Bake it to an image")
+            return plain(whole)
+        self.warn(node, "this cannot be done to an image exactly; the image is scaled to the right mean")
+        mean = means[texture]
+        return Paint(np.where(mean > 1e-9, whole / np.maximum(mean, 1e-9), 1.0), texture)
+
+    def nearest(self, origin: Place, place: Place) -> Paint:
+        """An unknown node: its first linked colour, the mean of its own colours, or what the input is without it."""
+        node = origin.node
+        colours = [Place(s, origin.groups) for s in node.inputs if s.type == "RGBA" and s.enabled]
+        linked = [c for c in colours if c.socket.is_linked]
+        if linked:
+            self.warn(node, f"{node.bl_label} is not supported and left out")
+            return self.colour(linked[0])
+        if origin.socket.type == "RGBA" or node.type.startswith("TEX_"):
+            self.warn(node, f"{node.bl_label} is not supported; a plain colour is used. Bake it to an image")
+            if origin.socket.type == "RGBA" and colours:
+                return plain(np.mean([constant(c.socket) for c in colours], axis=0))
+            return plain(self.unknown)
+        own = constant(place.socket) if hasattr(place.socket, "default_value") else np.full(3, self.unknown)
+        said = f"{own[0]:g}" if place.socket.type == "VALUE" else "a plain colour"
+        self.warn(node, f"{node.bl_label} is not supported; {said} is used for {place.socket.name}")
+        return plain(own)
+
+    # Nodes
+
+    def node_rgb(self, output: Place) -> Paint:
+        return Paint(constant(output.socket))
+
+    node_value = node_rgb
+
+    def node_blackbody(self, output: Place) -> Paint:
+        return Paint(blackbody(self.value(output.input("Temperature"))))
+
+    def node_mix(self, output: Place) -> Paint:
+        node, inputs = output.node, output.inputs()
+        kind = {"FLOAT": "Float", "VECTOR": "Vector", "RGBA": "Color"}.get(node.data_type)
+        if kind is None:
+            return self.nearest(output, output)
+        apart = kind == "Vector" and node.factor_mode == "NON_UNIFORM"
+        factor = self.colour(inputs["Factor_Vector"]) if apart else self.number(inputs["Factor_Float"])
+        evaluate = self.number if kind == "Float" else self.colour
+        operands = evaluate(inputs[f"A_{kind}"]), evaluate(inputs[f"B_{kind}"])
+        blend = node.blend_type if kind == "Color" else "MIX"
+        return self.blended(node, blend, node.clamp_factor, node.clamp_result, factor, *operands)
+
+    def node_mix_rgb(self, output: Place) -> Paint:
+        node = output.node
+        operands = self.number(output.input(0)), self.colour(output.input(1)), self.colour(output.input(2))
+        return self.blended(node, node.blend_type, True, node.use_clamp, *operands)
+
+    def blended(
+        self, node: bpy.types.Node, kind: str, clamp_factor: bool, clamp: bool, factor: Paint, a: Paint, b: Paint
+    ) -> Paint:
+        """Mix Color: from `a` to what `kind` makes of both."""
+        if kind not in _BLEND:
+            self.warn(node, f"blending by {kind.title()} is not supported; its first colour is used")
+            return a
+
+        def mix(f: Array, x: Array, y: Array) -> Array:
+            f = np.clip(f, 0, 1) if clamp_factor else f
+            mixed = x + f * (_BLEND[kind](x, y) - x)
+            return np.clip(mixed, 0, 1) if clamp else mixed
+
+        return self.combine(node, mix, factor, a, b)
+
+    def node_math(self, output: Place) -> Paint:
+        node = output.node
+        if node.operation not in _MATH:
+            return self.first_input(output)
+        count, function = _MATH[node.operation]
+        operands = [self.number(output.input(i)) for i in range(count)]
+        return self.combine(node, (lambda *v: np.clip(function(*v), 0, 1)) if node.use_clamp else function, *operands)
+
+    def node_vect_math(self, output: Place) -> Paint:
+        node = output.node
+        if node.operation == "SCALE":
+            scale = self.number(output.input("Scale"))
+            return self.combine(node, np.multiply, self.colour(output.input(0)), scale)
+        if node.operation not in _MATH or _MATH[node.operation][0] > 2:
+            return self.first_input(output)
+        count, function = _MATH[node.operation]
+        return self.combine(node, function, *(self.colour(output.input(i)) for i in range(count)))
+
+    def first_input(self, output: Place) -> Paint:
+        """Pass on what goes into an operation that is not known."""
+        self.warn(output.node, f"{output.node.operation.title()} is not supported; its first input is used")
+        return self.colour(output.input(0))
+
+    def node_clamp(self, output: Place) -> Paint:
+        operands = [self.number(output.input(i)) for i in range(3)]
+        return self.combine(output.node, np.clip, *operands)
+
+    def node_map_range(self, output: Place) -> Paint:
+        node = output.node
+        if node.data_type != "FLOAT" or node.interpolation_type != "LINEAR":
+            return self.nearest(output, output)
+
+        def mapped(v: Array, from_min: Array, from_max: Array, to_min: Array, to_max: Array) -> Array:
+            span = from_max - from_min
+            part = np.divide(v - from_min, span, out=np.zeros(3), where=span != 0)
+            return to_min + (np.clip(part, 0, 1) if node.clamp else part) * (to_max - to_min)
+
+        names = ("Value", "From Min", "From Max", "To Min", "To Max")
+        inputs = output.inputs()
+        return self.combine(node, mapped, *(self.number(inputs[name]) for name in names))
+
+    def node_gamma(self, output: Place) -> Paint:
+        operands = self.colour(output.input("Color")), self.number(output.input("Gamma"))
+        return self.combine(output.node, lambda c, g: np.maximum(c, 0) ** g, *operands)
+
+    def node_invert(self, output: Place) -> Paint:
+        operands = self.number(output.input(0)), self.colour(output.input("Color"))
+        return self.combine(output.node, lambda f, c: c + f * (1 - 2 * c), *operands)
+
+    def node_brightcontrast(self, output: Place) -> Paint:
+        operands = (self.colour(output.input(0)), self.number(output.input(1)), self.number(output.input(2)))
+        return self.combine(output.node, lambda c, b, k: np.maximum((1 + k) * c + b - k / 2, 0), *operands)
+
+    def node_hue_sat(self, output: Place) -> Paint:
+        inputs = output.inputs()
+        operands = [self.number(inputs[name]) for name in ("Hue", "Saturation", "Value", "Fac")]
+        return self.combine(output.node, _hue_saturation, *operands, self.colour(inputs["Color"]))
+
+    def node_curve_rgb(self, output: Place) -> Paint:
+        mapping = output.node.mapping
+        mapping.initialize()
+
+        def curved(f: Array, colour: Array) -> Array:
+            once = [mapping.evaluate(mapping.curves[3], c) for c in colour]
+            twice = np.array([mapping.evaluate(mapping.curves[i], c) for i, c in enumerate(once)])
+            return colour + f * (twice - colour)
+
+        return self.combine(output.node, curved, self.number(output.input(0)), self.colour(output.input("Color")))
+
+    def node_valtorgb(self, output: Place) -> Paint:
+        ramp, alpha = output.node.color_ramp, output.socket.name == "Alpha"
+
+        def ramped(f: Array) -> Array:
+            return np.array([ramp.evaluate(v)[3 if alpha else i] for i, v in enumerate(f)])
+
+        return self.combine(output.node, ramped, self.number(output.input(0)))
+
+    def node_rgbtobw(self, output: Place) -> Paint:
+        return self.grey(output.node, self.colour(output.input(0)))
+
+    def node_separate_color(self, output: Place) -> Paint:
+        node, colour = output.node, self.colour(output.input(0))
+        index = list(node.outputs).index(output.socket)
+        mode = getattr(node, "mode", "RGB")
+        if mode == "RGB":
+            return self.part(node, colour, index)
+        convert = colorsys.rgb_to_hsv if mode == "HSV" else _rgb_to_hsl
+        return plain(convert(*self.flat(node, colour))[index])
+
+    node_seprgb = node_sepxyz = node_separate_color
+
+    def node_combine_color(self, output: Place) -> Paint:
+        mode = getattr(output.node, "mode", "RGB")
+
+        def joined(r: Array, g: Array, b: Array) -> Array:
+            rgb = r[0], g[1], b[2]
+            if mode == "HSV":
+                return np.array(colorsys.hsv_to_rgb(*rgb))
+            return np.array(colorsys.hls_to_rgb(rgb[0], rgb[2], rgb[1]) if mode == "HSL" else rgb)
+
+        return self.combine(output.node, joined, *(self.number(output.input(i)) for i in range(3)))
+
+    node_combrgb = node_combxyz = node_combine_color
+
+
+def _fixed_but(paint: Paint, texture: Hashable, means: dict[Hashable, Array]) -> Paint:
+    """`paint`, flattened to its mean unless it has this texture."""
+    if paint.texture is None or paint.texture == texture:
+        return paint
+    return Paint(paint.colour * means.get(paint.texture, 0))
+
+
+def _divide(a: Array, b: Array) -> Array:
+    return np.divide(a, b, out=np.zeros(3), where=b != 0)
+
+
+def _overlay(a: Array, b: Array) -> Array:
+    return np.where(a < 0.5, 2 * a * b, 1 - 2 * (1 - a) * (1 - b))
+
+
+def _rgb_to_hsl(r: float, g: float, b: float) -> tuple[float, float, float]:
+    hue, lightness, saturation = colorsys.rgb_to_hls(r, g, b)
+    return hue, saturation, lightness
+
+
+def _hue_saturation(hue: Array, saturation: Array, value: Array, factor: Array, colour: Array) -> Array:
+    h, s, v = colorsys.rgb_to_hsv(*colour)
+    turned = colorsys.hsv_to_rgb((h + hue[0] + 0.5) % 1, np.clip(s * saturation[0], 0, 1), v * value[0])
+    return colour + factor * (np.maximum(turned, 0) - colour)
+
+
+#: Blend type -> what the second colour does to the first at factor 1.
+_BLEND: dict[str, Callable[[Array, Array], Array]] = {
+    "MIX": lambda a, b: b,
+    "MULTIPLY": np.multiply,
+    "ADD": np.add,
+    "SUBTRACT": np.subtract,
+    "DIVIDE": _divide,
+    "SCREEN": lambda a, b: 1 - (1 - a) * (1 - b),
+    "OVERLAY": _overlay,
+    "DIFFERENCE": lambda a, b: np.abs(a - b),
+    "EXCLUSION": lambda a, b: a + b - 2 * a * b,
+    "DARKEN": np.minimum,
+    "LIGHTEN": np.maximum,
+}
+
+#: Operation -> number of operands, function.
+_MATH: dict[str, tuple[int, Callable[..., Array]]] = {
+    "ADD": (2, np.add),
+    "SUBTRACT": (2, np.subtract),
+    "MULTIPLY": (2, np.multiply),
+    "DIVIDE": (2, _divide),
+    "MULTIPLY_ADD": (3, lambda a, b, c: a * b + c),
+    "POWER": (2, lambda a, b: np.abs(a) ** b),
+    "SQRT": (1, lambda a: np.sqrt(np.maximum(a, 0))),
+    "ABSOLUTE": (1, np.abs),
+    "MINIMUM": (2, np.minimum),
+    "MAXIMUM": (2, np.maximum),
+    "LESS_THAN": (2, lambda a, b: np.where(a < b, 1.0, 0.0)),
+    "GREATER_THAN": (2, lambda a, b: np.where(a > b, 1.0, 0.0)),
+    "ROUND": (1, lambda a: np.floor(a + 0.5)),
+    "FLOOR": (1, np.floor),
+    "CEIL": (1, np.ceil),
+    "FRACT": (1, lambda a: a - np.floor(a)),
+    "SINE": (1, np.sin),
+    "COSINE": (1, np.cos),
+}
+
+
+def blackbody(kelvin: float) -> Array:
+    """(3,) linear Rec.709 colour of a glowing body, luminance 1, as Blender's Blackbody node.
+
+    Planck's law under the CIE 1931 observer, whose functions are the fits of Wyman, Sloan and Shirley, "Simple analytic
+    approximations to the CIE XYZ color matching functions", JCGT 2 (2013). Outside 800 to 12000 K as at these.
+    """
+    wave = np.arange(380.0, 781.0, 5.0)
+    light = wave**-5 / np.expm1(1.4387769e7 / (wave * np.clip(kelvin, 800, 12000)))
+
+    def lobe(peak: float, below: float, above: float) -> Array:
+        return np.exp(-0.5 * ((wave - peak) * np.where(wave < peak, below, above)) ** 2)
+
+    x = 1.056 * lobe(599.8, 0.0264, 0.0323) + 0.362 * lobe(442.0, 0.0624, 0.0374) - 0.065 * lobe(501.1, 0.0490, 0.0382)
+    y = 0.821 * lobe(568.8, 0.0213, 0.0247) + 0.286 * lobe(530.9, 0.0613, 0.0322)
+    z = 1.217 * lobe(437.0, 0.0845, 0.0278) + 0.681 * lobe(459.0, 0.0385, 0.0725)
+    to_rec709 = np.array(((3.2406, -1.5372, -0.4986), (-0.9689, 1.8758, 0.0415), (0.0557, -0.2040, 1.0570)))
+    return np.maximum(to_rec709 @ (light @ np.stack((x, y, z), 1)), 0) / (light @ y)
+
+
+def euler(angles: Array) -> Array:
+    """(3, 3) rotation of XYZ Euler angles."""
+    return np.array(Euler(tuple(angles), "XYZ").to_matrix())
+
+
+def vector_rotate(walker: Walker, output: Place) -> Array:
+    """(3, 3) rotation of a Vector Rotate node, about the origin."""
+    node = output.node
+    if node.rotation_type == "EULER_XYZ":
+        turn = euler(walker.fixed(output.input("Rotation")))
+    else:
+        axes = {"X_AXIS": (1, 0, 0), "Y_AXIS": (0, 1, 0), "Z_AXIS": (0, 0, 1)}
+        axis = axes.get(node.rotation_type) or walker.fixed(output.input("Axis"))
+        turn = np.array(Matrix.Rotation(walker.value(output.input("Angle")), 3, tuple(axis)))
+    return turn.T if node.invert else turn
+
+
+def surface_of(tree: bpy.types.NodeTree | None) -> Place | None:
+    """The surface socket of the output that Cycles would use; None without one."""
+    output = tree and (tree.get_output_node("CYCLES") or tree.get_output_node("ALL"))
+    return Place(output.inputs["Surface"]) if output else None
