@@ -4,7 +4,9 @@
 
 The job lists renders; each names an .npz with `vertices faces albedo roughness metallic`, an environment file,
 a camera, samples, bounces. With `deform`, an armature of two bones and a shape key bend the mesh first, and the
-evaluated vertices are written beside the picture. Pictures are written as .npy (h, w, 4), linear, row 0 on top.
+evaluated vertices are written beside the picture. `terminator_offset` replaces Blender's shadow terminator geometry
+offset of 0.1, which moves the start of shadow rays off the mesh at grazing light. Pictures are written as .npy
+(h, w, 4), linear, row 0 on top.
 """
 
 from __future__ import annotations
@@ -157,6 +159,8 @@ def main(path: str) -> None:
         scene = reset()
         with np.load(job["mesh"]) as data:
             subject = add_mesh({k: data[k] for k in data.files}, job.get("smooth", True))
+        if "terminator_offset" in job:
+            subject.shadow_terminator_geometry_offset = job["terminator_offset"]
         add_world(scene, job["environment"], job.get("rotation_z", 0.0), job.get("strength", 1.0))
         add_camera(scene, job["camera"])
         if job.get("deform"):

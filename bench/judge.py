@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import subprocess
@@ -16,6 +17,8 @@ from scipy.ndimage import binary_erosion
 from drgs_blender.formats.colour import linear_to_srgb
 
 Array = np.ndarray
+
+_PROGRAM = Path(__file__).with_name("cycles_job.py")
 
 
 def blender_python() -> Path:
@@ -40,9 +43,25 @@ def run_cycles(jobs: list[dict[str, Any]], name: str, timeout: float = 3000) -> 
     OUT.mkdir(parents=True, exist_ok=True)
     path = OUT / f"{name}.json"
     path.write_text(json.dumps(jobs))
-    program = Path(__file__).with_name("cycles_job.py")
-    subprocess.run([str(blender_python()), "-P", str(program), str(path)], check=True, timeout=timeout)
+    subprocess.run([str(blender_python()), "-P", str(_PROGRAM), str(path)], check=True, timeout=timeout)
     return json.loads(path.with_suffix(".result.json").read_text())
+
+
+def cycles_pictures(jobs: list[dict[str, Any]], name: str) -> None:
+    """Render those `jobs` whose pictures do not lie there yet; a picture's job is kept beside it, to tell."""
+    missing = []
+    for job in jobs:
+        note = Path(job["out"]).with_suffix(".job.json")
+        mesh = hashlib.sha256(Path(job["mesh"]).read_bytes()).hexdigest()
+        # What the mesh holds decides, not where it lies: the folder's name changes with every source of the engine.
+        text = json.dumps([job | {"mesh": mesh}, hashlib.sha256(_PROGRAM.read_bytes()).hexdigest()])
+        if not (Path(job["out"]).exists() and note.exists() and note.read_text() == text):
+            note.unlink(missing_ok=True)
+            missing.append((job, note, text))
+    if missing:
+        run_cycles([job for job, _, _ in missing], name, timeout=600.0 * len(missing))
+    for _, note, text in missing:
+        note.write_text(text)
 
 
 def to_srgb(linear: Array) -> Array:
@@ -50,12 +69,36 @@ def to_srgb(linear: Array) -> Array:
     return linear_to_srgb(np.clip(linear, 0, 1))
 
 
+def decibels(mse: float) -> float:
+    """PSNR of a mean squared error of values in [0, 1]."""
+    return float(-10 * np.log10(max(mse, 1e-12)))
+
+
 def psnr(a: Array, b: Array, mask: Array | None = None) -> float:
     """PSNR in dB of two linear pictures (h, w, >=3), in sRGB, over `mask`."""
     error = (to_srgb(a[..., :3]) - to_srgb(b[..., :3])) ** 2
     if mask is not None:
         error = error[mask]
-    return float(-10 * np.log10(max(error.mean(), 1e-12)))
+    return decibels(float(error.mean()))
+
+
+def systematic_error(ours: Array, theirs: Array, mask: Array) -> tuple[float, float]:
+    """Mean squared difference of two renderers without the noise of either, and its standard error, in sRGB.
+
+    With k independent pictures of each, d_i = ours_i - theirs_i are independent with the same mean, the systematic
+    difference; the mean of d_i d_j over all pairs i != j is an unbiased estimate of its square, because the noise of
+    two pictures has nothing in common. It can come out negative where there is nothing to be found.
+
+    Parameters
+    ----------
+    ours, theirs : (k, h, w, >=3) linear, k >= 2
+    mask : (h, w) bool
+    """
+    d = np.stack([to_srgb(a[mask][:, :3]) - to_srgb(b[mask][:, :3]) for a, b in zip(ours, theirs, strict=True)])
+    d = d.astype(np.float64)
+    pairs = (d.sum(0) ** 2 - (d**2).sum(0)) / (len(d) * (len(d) - 1))
+    pixels = pairs.mean(axis=1)
+    return float(pixels.mean()), float(pixels.std() / np.sqrt(len(pixels)))
 
 
 def foreground(alpha: Array, erode: int = 2) -> Array:

@@ -8,7 +8,9 @@ accounts for a deviation of 0.1 %.
 
 from __future__ import annotations
 
+import importlib
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -82,3 +84,22 @@ def test_kernel_agrees_with_cycles():
     error = found.std(0) / math.sqrt(pixels)
     assert (np.abs(found.mean(0) - EXPECTED) <= 4 * error + 2e-3 * EXPECTED + 1e-5).all()
     assert (error <= 0.01 * EXPECTED + 1e-5).all()
+
+
+@pytest.mark.parametrize("difference", [0.0, 0.004])
+def test_systematic_error_sees_through_noise(monkeypatch, difference):
+    """Rare bright dots ten times as bad as the difference do not move its estimate by more than its error says."""
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "bench"))
+    judge = importlib.import_module("judge")
+    rng = np.random.default_rng(11)
+    grey = np.full((4, 64, 64, 4), 0.3)
+    dots = np.where(rng.random((4, 64, 64, 1)) < 2e-3, 0.4, 0.0)
+    theirs = grey + dots - dots.mean() + rng.normal(0, 0.01, grey.shape)
+    ours = grey + rng.normal(0, 0.01, grey.shape)
+    # Given in sRGB, so that the expected error is the difference squared.
+    slope = (judge.to_srgb(0.301) - judge.to_srgb(0.299)) / 0.002
+    ours += difference / slope
+    mask = np.ones((64, 64), bool)
+    error, deviation = judge.systematic_error(ours, theirs, mask)
+    assert abs(error - difference**2) < 4 * deviation
+    assert deviation < 2e-6 < 1e-5 < 10 ** (-judge.psnr(ours[0], theirs[0], mask) / 10)
