@@ -17,6 +17,7 @@ from ..errors import UsageError
 from ..frame import Image, MeshState
 from .instances import Places, normal_matrices, usable_places
 from .masks import object_flags
+from .memory import address
 from .parts import (
     ALBEDO,
     METALLIC,
@@ -110,17 +111,26 @@ class TraceScene:
 
     @property
     def tracer(self) -> Tracer:
-        """How compiled code casts rays into the scene."""
+        """How compiled code casts rays into the scene; until the next update."""
         bvh = self.bvh
-        return Tracer(bvh.intersect_address, bvh.occluded_address, bvh.scene, bvh.first_face, self._first_place)
+        tables = address(bvh.first_face), address(self._first_place)
+        return Tracer(bvh.intersect_address, bvh.occluded_address, bvh.scene, *tables)
 
     @property
     def geometry(self) -> Geometry:
-        """What compiled code finds behind a hit."""
+        """What compiled code finds behind a hit; until the next update."""
         return Geometry(
-            self.shading_faces, self.shading, self.normals, self.face_object, self.vertex_faces, self._material,
-            self._uvs, self._place_normal, self._place_object, self.materials.addresses,
-        )  # fmt: skip
+            address(self.shading_faces),
+            address(self.shading),
+            address(self.normals),
+            address(self.face_object),
+            self.vertex_faces,
+            address(self._material),
+            address(self._uvs) if len(self._uvs) else 0,
+            address(self._place_normal),
+            address(self._place_object),
+            self.materials.addresses,
+        )
 
     def update(
         self, objects: Sequence[TraceObject], meshes: Sequence[MeshState] = (), images: Sequence[Image] = ()

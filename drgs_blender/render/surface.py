@@ -8,39 +8,38 @@ object space, and the hit says in which place it is.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from ..jit import njit
 from .embree import blocked, trace
+from .memory import load_float, load_int32
 from .sampling import ONE, ZERO, F
 from .textures import material_at
-
-Array = np.ndarray
 
 _TINY = F(1e-30)
 
 
 class Tracer(NamedTuple):
-    """How rays are cast; see `tree.TriangleBVH`.
+    """How rays are cast; valid until the next update of the scene. All are int64.
 
     Attributes
     ----------
-    intersect, occluded, scene : int64 addresses
-    first_face : (groups,) int32, the first face of each group
-    first_place : (groups,) int32, the first row of each group's places in ``Geometry.place_*``
+    intersect, occluded, scene : addresses, see `tree.TriangleBVH`
+    first_face : address of (groups,) int32, the first face of each group
+    first_place : address of (groups,) int32, the first row of each group's places in ``Geometry.place_*``
     """
 
     intersect: int
     occluded: int
     scene: int
-    first_face: Array
-    first_place: Array
+    first_face: int
+    first_place: int
 
 
 class Geometry(NamedTuple):
-    """What lies behind the faces. Compiled code reads scalars of it only: a view of a row counts references.
+    """What lies behind the faces; valid until the next update of the scene. Addresses of arrays, save for two numbers.
 
     Attributes
     ----------
@@ -50,22 +49,22 @@ class Geometry(NamedTuple):
     face_object : (m,) int32, object of each face; not used for faces of shapes in places
     vertex_faces : how many faces carry materials at their vertices
     material : (m - vertex_faces,) int32, rows of ``materials``
-    uvs : (m - vertex_faces, 3, 2) float32, or (0, 3, 2) when no mesh has any
+    uvs : (m - vertex_faces, 3, 2) float32, or 0 when no mesh has any
     place_normal : (p, 3, 3) float32, matrices of normals
     place_object : (p,) int32
     materials : `textures.MaterialTable.addresses`
     """
 
-    shading_faces: Array
-    shading: Array
-    normals: Array
-    face_object: Array
+    shading_faces: int
+    shading: int
+    normals: int
+    face_object: int
     vertex_faces: int
-    material: Array
-    uvs: Array
-    place_normal: Array
-    place_object: Array
-    materials: Any
+    material: int
+    uvs: int
+    place_normal: int
+    place_object: int
+    materials: tuple[int, ...]
 
 
 @njit
@@ -75,15 +74,13 @@ def nearest(tracer, ox, oy, oz, dx, dy, dz, tnear, tfar, mask):  # type: ignore[
     ``face`` is -1 when nothing is hit (t is then `tfar`), ``place`` -1 outside shapes in places. The hit is
     (1 - u - v) v0 + u v1 + v v2; g is for `surface_at`. `mask` (int32) tells what the ray meets, see `masks`.
     """
-    t, group, primitive, instance, u, v, gx, gy, gz = trace(
+    t, group, face, place, u, v, gx, gy, gz = trace(
         tracer.intersect, tracer.scene, ox, oy, oz, dx, dy, dz, tnear, tfar, mask
     )
-    if group < 0:
-        return t, np.int32(-1), np.int32(-1), u, v, gx, gy, gz
-    face = np.int32(tracer.first_face[group] + primitive)
-    place = np.int32(-1)
-    if instance >= 0:
-        place = np.int32(tracer.first_place[group] + instance)
+    if group >= 0:
+        face = np.int32(face + load_int32(tracer.first_face, group))
+        if place >= 0:
+            place = np.int32(place + load_int32(tracer.first_place, group))
     return t, face, place, u, v, gx, gy, gz
 
 
@@ -93,15 +90,37 @@ def shadowed(tracer, ox, oy, oz, dx, dy, dz, tnear, tfar, mask):  # type: ignore
     return blocked(tracer.occluded, tracer.scene, ox, oy, oz, dx, dy, dz, tnear, tfar, mask)
 
 
+@njit(inline="always")
+def _blend(rows, i, j, k, w, u, v):  # type: ignore[no-untyped-def]
+    """A float32 column blended over a face, from where its corners' values lie."""
+    return w * load_float(rows, i) + u * load_float(rows, j) + v * load_float(rows, k)
+
+
 @njit
-def _turned(place, x, y, z, matrices):  # type: ignore[no-untyped-def]
+def _turned(matrices, place, x, y, z):  # type: ignore[no-untyped-def]
     """A normal of a shape as a unit vector in world space; (0, 0, 0) when it has no direction."""
-    a = matrices[place, 0, 0] * x + matrices[place, 0, 1] * y + matrices[place, 0, 2] * z
-    b = matrices[place, 1, 0] * x + matrices[place, 1, 1] * y + matrices[place, 1, 2] * z
-    c = matrices[place, 2, 0] * x + matrices[place, 2, 1] * y + matrices[place, 2, 2] * z
+    m = 9 * np.int64(place)
+    a = load_float(matrices, m) * x + load_float(matrices, m + 1) * y + load_float(matrices, m + 2) * z
+    b = load_float(matrices, m + 3) * x + load_float(matrices, m + 4) * y + load_float(matrices, m + 5) * z
+    c = load_float(matrices, m + 6) * x + load_float(matrices, m + 7) * y + load_float(matrices, m + 8) * z
     length = a * a + b * b + c * c
     scale = ONE / math.sqrt(length) if length > _TINY else ZERO
     return a * scale, b * scale, c * scale
+
+
+@njit
+def _normal_of_place(normals, i, j, k, w, u, v, matrices, place):  # type: ignore[no-untyped-def]
+    """Each corner's normal is turned before they are blended, as it is for a mesh in a single place."""
+    ax, ay, az = _turned(
+        matrices, place, load_float(normals, i), load_float(normals, i + 1), load_float(normals, i + 2)
+    )
+    bx, by, bz = _turned(
+        matrices, place, load_float(normals, j), load_float(normals, j + 1), load_float(normals, j + 2)
+    )
+    cx, cy, cz = _turned(
+        matrices, place, load_float(normals, k), load_float(normals, k + 1), load_float(normals, k + 2)
+    )
+    return w * ax + u * bx + v * cx, w * ay + u * by + v * cy, w * az + u * bz + v * cz
 
 
 @njit
@@ -121,43 +140,44 @@ def surface_at(face, place, u, v, gx, gy, gz, dx, dy, dz, geometry):  # type: ig
     nx, ny, nz, gx, gy, gz, r, g, b, roughness, metallic, er, eg, eb : float32, object : int32
         Unit shading and geometric normal, albedo, emitted radiance; linear Rec.709.
     """
-    faces = geometry.shading_faces
-    i, j, k = faces[face, 0], faces[face, 1], faces[face, 2]
+    corner = 3 * np.int64(face)
+    i = np.int64(load_int32(geometry.shading_faces, corner))
+    j = np.int64(load_int32(geometry.shading_faces, corner + 1))
+    k = np.int64(load_int32(geometry.shading_faces, corner + 2))
     w = ONE - u - v
     er = eg = eb = ZERO
-    owner = geometry.face_object[face]
+    owner = load_int32(geometry.face_object, np.int64(face))
     if face < geometry.vertex_faces:
         rows = geometry.shading
-        nx = w * rows[i, 0] + u * rows[j, 0] + v * rows[k, 0]
-        ny = w * rows[i, 1] + u * rows[j, 1] + v * rows[k, 1]
-        nz = w * rows[i, 2] + u * rows[j, 2] + v * rows[k, 2]
-        r = w * rows[i, 3] + u * rows[j, 3] + v * rows[k, 3]
-        g = w * rows[i, 4] + u * rows[j, 4] + v * rows[k, 4]
-        b = w * rows[i, 5] + u * rows[j, 5] + v * rows[k, 5]
-        roughness = w * rows[i, 6] + u * rows[j, 6] + v * rows[k, 6]
-        metallic = w * rows[i, 7] + u * rows[j, 7] + v * rows[k, 7]
+        i, j, k = 8 * i, 8 * j, 8 * k
+        nx = _blend(rows, i, j, k, w, u, v)
+        ny = _blend(rows, i + 1, j + 1, k + 1, w, u, v)
+        nz = _blend(rows, i + 2, j + 2, k + 2, w, u, v)
+        r = _blend(rows, i + 3, j + 3, k + 3, w, u, v)
+        g = _blend(rows, i + 4, j + 4, k + 4, w, u, v)
+        b = _blend(rows, i + 5, j + 5, k + 5, w, u, v)
+        roughness = _blend(rows, i + 6, j + 6, k + 6, w, u, v)
+        metallic = _blend(rows, i + 7, j + 7, k + 7, w, u, v)
     else:
-        own = face - geometry.vertex_faces
+        own = np.int64(face) - geometry.vertex_faces
         s = t = ZERO
-        if len(geometry.uvs) > 0:
-            s = w * geometry.uvs[own, 0, 0] + u * geometry.uvs[own, 1, 0] + v * geometry.uvs[own, 2, 0]
-            t = w * geometry.uvs[own, 0, 1] + u * geometry.uvs[own, 1, 1] + v * geometry.uvs[own, 2, 1]
-        r, g, b, roughness, metallic, er, eg, eb = material_at(geometry.material[own], s, t, geometry.materials)
-        n = geometry.normals
+        if geometry.uvs != 0:
+            c = 6 * own
+            s = _blend(geometry.uvs, c, c + 2, c + 4, w, u, v)
+            t = _blend(geometry.uvs, c + 1, c + 3, c + 5, w, u, v)
+        material = load_int32(geometry.material, own)
+        r, g, b, roughness, metallic, er, eg, eb = material_at(material, s, t, geometry.materials)
+        rows = geometry.normals
+        i, j, k = 3 * i, 3 * j, 3 * k
         if place < 0:
-            nx = w * n[i, 0] + u * n[j, 0] + v * n[k, 0]
-            ny = w * n[i, 1] + u * n[j, 1] + v * n[k, 1]
-            nz = w * n[i, 2] + u * n[j, 2] + v * n[k, 2]
+            nx = _blend(rows, i, j, k, w, u, v)
+            ny = _blend(rows, i + 1, j + 1, k + 1, w, u, v)
+            nz = _blend(rows, i + 2, j + 2, k + 2, w, u, v)
         else:
-            # Each corner's normal is turned before they are blended, as it is for a mesh in a single place.
-            matrices = geometry.place_normal
-            ax, ay, az = _turned(place, n[i, 0], n[i, 1], n[i, 2], matrices)
-            bx, by, bz = _turned(place, n[j, 0], n[j, 1], n[j, 2], matrices)
-            cx, cy, cz = _turned(place, n[k, 0], n[k, 1], n[k, 2], matrices)
-            nx, ny, nz = w * ax + u * bx + v * cx, w * ay + u * by + v * cy, w * az + u * bz + v * cz
+            nx, ny, nz = _normal_of_place(rows, i, j, k, w, u, v, geometry.place_normal, place)
             scale = ONE / max(abs(gx), max(abs(gy), max(abs(gz), _TINY)))
-            gx, gy, gz = _turned(place, gx * scale, gy * scale, gz * scale, matrices)
-            owner = geometry.place_object[place]
+            gx, gy, gz = _turned(geometry.place_normal, place, gx * scale, gy * scale, gz * scale)
+            owner = load_int32(geometry.place_object, np.int64(place))
     scale = ONE / math.sqrt(max(gx * gx + gy * gy + gz * gz, _TINY))
     if gx * dx + gy * dy + gz * dz > ZERO:
         scale = -scale
