@@ -23,8 +23,8 @@ KIND, PLACE, RADIUS, RADIANCE, AXIS, U_AXIS, V_AXIS, HALF_U, HALF_V = 0, 1, 4, 5
 #: tan(spread / 2) and the factor that keeps the power, 0 without spread; cosine of a spot's cone and 1 / its soft part.
 SPREAD_TAN, SPREAD_SCALE, CONE_COS, CONE_SCALE = 19, 20, 21, 22
 #: Bits below; luminous intensity along the axis (of suns irradiance); radius around PLACE; cosine of the angle from
-#: AXIS beyond which nothing is sent.
-FLAGS, INTENSITY, BOUND, REACH_COS = 23, 24, 25, 26
+#: AXIS beyond which nothing is sent; luminous flux (of suns unused).
+FLAGS, INTENSITY, BOUND, REACH_COS, FLUX = 23, 24, 25, 26, 27
 WIDTH = 28
 
 #: Kinds. A soft point is a disk that faces whoever looks; the two bare ones are met by no ray.
@@ -78,6 +78,7 @@ def lamp_row(light: Light) -> Array | str:
         return "its size or scale is zero"
     row[RADIANCE : RADIANCE + 3] = radiance * colour
     row[INTENSITY] *= radiance * float(colour @ _LUMINANCE)
+    row[FLUX] *= radiance * float(colour @ _LUMINANCE)
     with np.errstate(over="ignore"):
         row32 = row.astype(np.float32)
     return row32 if np.isfinite(row32).all() else "it is too bright or too far away"
@@ -99,13 +100,13 @@ def _sun(row: Array, light: Light) -> float:
 def _point(row: Array, light: Light) -> float:
     """Intensity is power / 4 pi, spread over the disk of the radius. The object's scale does not count."""
     radius = abs(light.radius)
-    row[INTENSITY] = 1.0
+    row[INTENSITY], row[FLUX] = 1.0, 4.0 * math.pi
     if radius < _LEAST_RADIUS:
         row[KIND] = BARE_POINT
         return 1.0 / (4.0 * math.pi) if light.normalize else 1.0 / math.pi
     disk = math.pi * radius**2
     row[KIND], row[RADIUS] = SOFT_POINT if light.soft_falloff else SPHERE, radius
-    row[BOUND], row[INTENSITY] = radius, disk
+    row[BOUND], row[INTENSITY], row[FLUX] = radius, disk, 4.0 * math.pi * disk
     return 1.0 / (4.0 * math.pi * disk) if light.normalize else 1.0 / math.pi
 
 
@@ -117,6 +118,7 @@ def _cone(row: Array, light: Light, columns: Array, lengths: Array) -> None:
     stretch = lengths[:2] / lengths[2]
     for column, axis, factor in zip((U_AXIS, V_AXIS), columns[:2] / lengths[:2, None], stretch, strict=True):
         row[column : column + 3] = axis / factor
+    row[FLUX] *= 0.5 * (1.0 - math.cos(half)) * float(stretch.prod())
     row[REACH_COS] = math.cos(math.atan2(math.sin(half) * stretch.max(), math.cos(half)))
 
 
@@ -135,7 +137,7 @@ def _area(row: Array, light: Light, columns: Array, lengths: Array) -> float | N
     round_ = light.shape in ("disk", "ellipse")
     row[KIND], row[BOUND] = (ELLIPSE, max(half_u, half_v)) if round_ else (RECTANGLE, math.hypot(half_u, half_v))
     area = (math.pi if round_ else 4.0) * half_u * half_v
-    row[INTENSITY], row[REACH_COS] = area, 0.0
+    row[INTENSITY], row[FLUX], row[REACH_COS] = area, math.pi * area, 0.0
     if light.spread < math.pi - 1e-6:
         half = 0.5 * max(light.spread, _LEAST_SPREAD)
         row[SPREAD_TAN], row[REACH_COS] = math.tan(half), math.cos(half)

@@ -10,15 +10,15 @@ from __future__ import annotations
 import numpy as np
 
 from ..jit import njit
-from .lamp_shapes import AXIS, BARE_SUN, BOUND, INTENSITY, KIND, PLACE, REACH_COS, RECTANGLE, SUN
+from .lamp_shapes import AXIS, BARE_SUN, BOUND, FLUX, INTENSITY, KIND, PLACE, REACH_COS, RECTANGLE, SUN
 from .sampling import HALF, ONE, ZERO, F
 
 Array = np.ndarray
 
 #: Lamps in a leaf at most.
-_LEAF = 16
-#: Columns of a node: its box, the axis and cosine of the cone around all its lamps send into, the sum of their
-#: intensities, the rows of the table it holds, its second child (0: a leaf) and the node after all below it.
+_LEAF = 32
+#: Columns of a node: its box, the axis and cosine of a cone around all directions its lamps send into, their mean
+#: intensity over that cone, the rows of the table it holds, its second child (0: a leaf) and the node after all below.
 _LOW, _HIGH, _CONE, _REACH, _POWER, FIRST, PAST, SECOND, NEXT = 0, 3, 6, 9, 10, 11, 12, 13, 14
 _NODE_WIDTH = 16
 #: Row 0 of the nodes is no node: how many nodes, where suns begin and end in the table, their irradiance.
@@ -50,7 +50,9 @@ def build(table: Array) -> tuple[Array, Array]:
         pad = 1e-6 * np.maximum(np.abs(low), np.abs(high)).max() + 1e-12
         node[_LOW : _LOW + 3], node[_HIGH : _HIGH + 3] = low - pad, high + pad
         node[_CONE : _CONE + 3], node[_REACH] = _common_cone(table[own].astype(np.float64))
-        node[_POWER], node[FIRST], node[PAST] = table[own, INTENSITY].sum(dtype=np.float64), first, past
+        # Mean intensity over the cone: what a lamp of unknown direction sends to a point in it.
+        cone = 2.0 * np.pi * (1.0 - node[_REACH])
+        node[_POWER], node[FIRST], node[PAST] = table[own, FLUX].sum(dtype=np.float64) / cone, first, past
         if past - first > _LEAF:
             side = int(np.argmax(np.ptp(places[own], axis=0)))
             order[first:past] = own[np.argsort(places[own, side], kind="stable")]

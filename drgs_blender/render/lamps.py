@@ -164,10 +164,10 @@ def lamp_flags(index, table):  # type: ignore[no-untyped-def]
 def pdf_lamp(index, px, py, pz, lx, ly, lz, table, pick):  # type: ignore[no-untyped-def]
     """Density per solid angle, pick included, with which ``sample_lamp`` draws this unit direction by this lamp.
 
-    0 where the direction misses the lamp, and for lamps without size.
+    0 where the lamp sends nothing from there: the density of samples whose radiance is not 0. 0 for lamps without size.
     """
     t = lamp_hit(index, px, py, pz, lx, ly, lz, table)
-    if not t >= ZERO:
+    if not (t >= ZERO and lamp_emission(index, lx, ly, lz, table) > ZERO):
         return ZERO
     density = lamp_density(index, px, py, pz, lx, ly, lz, t, table)
     return density * pick_probability(index, px, py, pz, table, pick) if density > ZERO else ZERO
