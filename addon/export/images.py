@@ -113,7 +113,9 @@ def _linear(image: bpy.types.Image) -> Array | None:
     pixels = pixels[..., :3] if pixels.shape[2] >= 3 else np.repeat(pixels[..., :1], 3, axis=2)
     if _is_srgb(image):
         pixels = _decoded(pixels)
-    return _frozen(pixels, np.float32)
+    pixels = np.array(pixels, np.float32, order="C")
+    pixels.flags.writeable = False
+    return pixels
 
 
 def _straight(image: bpy.types.Image) -> Image | None:
@@ -121,7 +123,7 @@ def _straight(image: bpy.types.Image) -> Image | None:
     if pixels is None:
         return None
     alpha = pixels[..., 3:]
-    if image.is_float and _has_alpha(image) and (alpha != 1).any():
+    if image.is_float and _has_alpha(image):
         np.divide(pixels[..., :3], alpha, out=pixels[..., :3], where=alpha > 0)
     return _picture(image, f"{image.name_full} (straight)", pixels)
 
@@ -130,8 +132,9 @@ def _associated(image: bpy.types.Image) -> Image | None:
     pixels = _rgba(image)
     if pixels is None:
         return None
-    if not image.is_float and _has_alpha(image) and (pixels[..., 3] != 1).any():
-        pixels[..., :3] *= pixels[..., 3:]  # of the encoded values, as Cycles does
+    if not image.is_float and _has_alpha(image) and (pixels[..., 3] != 255).any():
+        # Of the encoded values and rounded down, as Cycles does.
+        pixels[..., :3] = pixels[..., :3].astype(np.uint16) * pixels[..., 3:] // 255
     return _picture(image, image.name_full, pixels)
 
 
@@ -141,29 +144,21 @@ def _has_alpha(image: bpy.types.Image) -> bool:
 
 
 def _rgba(image: bpy.types.Image) -> Array | None:
-    """(h, w, 4) float32."""
+    """(h, w, 4) uint8 or float32, as Blender has them."""
     pixels = _read(image)
     if pixels is None:
         return None
-    rgba = np.ones((*pixels.shape[:2], 4), np.float32)
     count = pixels.shape[2]
+    rgba = np.ones((*pixels.shape[:2], 4), np.float32)
     rgba[..., : max(count, 3)] = pixels if count >= 3 else pixels[..., :1]
     if image.alpha_mode == "NONE":
         rgba[..., 3] = 1
-    return rgba
+    return rgba if image.is_float else np.rint(rgba * 255).astype(np.uint8)
 
 
 def _picture(image: bpy.types.Image, name: str, pixels: Array) -> Image:
-    if image.is_float:
-        return Image(name, _frozen(pixels, np.float32), "linear")
-    return Image(name, _frozen(np.rint(pixels * 255), np.uint8), "srgb" if _is_srgb(image) else "linear")
-
-
-def _frozen(pixels: Array, kind: type) -> Array:
-    """An array of its own that nobody can write to, so that its identity says whether it changed."""
-    pixels = np.array(pixels, kind, order="C")
-    pixels.flags.writeable = False
-    return pixels
+    pixels.flags.writeable = False  # so that its identity says whether it changed
+    return Image(name, pixels, "srgb" if _is_srgb(image) else "linear")
 
 
 def _remembered(image: bpy.types.Image, kind: str, make: Callable[[bpy.types.Image], Any]) -> Any:

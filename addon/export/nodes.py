@@ -456,7 +456,8 @@ def blackbody(kelvin: float) -> Array:
     """(3,) linear Rec.709 colour of a glowing body, luminance 1, as Blender's Blackbody node.
 
     Planck's law under the CIE 1931 observer, whose functions are the fits of Wyman, Sloan and Shirley, "Simple analytic
-    approximations to the CIE XYZ color matching functions", JCGT 2 (2013). Outside 800 to 12000 K as at these.
+    approximations to the CIE XYZ color matching functions", JCGT 2 (2013); within 2 % from 1900 K on. Below 800 and
+    above 12000 K as at these.
     """
     wave = np.arange(380.0, 781.0, 5.0)
     light = wave**-5 / np.expm1(1.4387769e7 / (wave * np.clip(kelvin, 800, 12000)))

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import bpy
 
-from . import object_data, render, sidebar, view_layer
+from . import object_data, rays, render, sidebar, view_layer
 
-CLASSES = (*render.CLASSES, *view_layer.CLASSES, *object_data.CLASSES, *sidebar.CLASSES)
+CLASSES = (*render.CLASSES, *view_layer.CLASSES, *object_data.CLASSES, *rays.CLASSES, *sidebar.CLASSES)
 
 
 def register() -> None:

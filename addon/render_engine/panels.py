@@ -1,4 +1,4 @@
-"""Blender's own panels that also make sense for DR-GS: output, camera, world, material, passes we have."""
+"""Blender's own panels that also make sense for DR-GS: output, camera, world, material, light, passes we have."""
 
 from __future__ import annotations
 
@@ -18,13 +18,21 @@ EXCLUDED = {
     "RENDER_PT_motion_blur",
     "RENDER_PT_hydra_debug",
     "OBJECT_PT_relations_render",
+    "DATA_PT_light",  # the one below has more
+}
+#: Eevee's panels for what DR-GS renders as well: nodes of materials and worlds, the quantities of lights.
+INCLUDED = {
+    "EEVEE_MATERIAL_PT_context_material",
+    "EEVEE_MATERIAL_PT_surface",
+    "EEVEE_WORLD_PT_surface",
+    "DATA_PT_EEVEE_light",
 }
 
 
 def _shared() -> Iterator[type[bpy.types.Panel]]:
     for panel in bpy.types.Panel.__subclasses__():
         engines = getattr(panel, "COMPAT_ENGINES", ())
-        if "BLENDER_RENDER" in engines and panel.__name__ not in EXCLUDED:
+        if ("BLENDER_RENDER" in engines and panel.__name__ not in EXCLUDED) or panel.__name__ in INCLUDED:
             yield panel
 
 

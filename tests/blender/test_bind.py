@@ -50,7 +50,7 @@ def bind(target, *sources):
     assert bpy.ops.drgs.bind_to_rig() == {"FINISHED"}
 
 
-def test_coincident_vertices_follow_exactly(ball, rig):
+def test_coincident_vertices_follow_exactly(ball, rig, export):
     source = skinned("Source", rig, *sphere())
     bind(ball, source)
     np.testing.assert_allclose(world_vertices(ball), sphere()[0], atol=1e-6)
@@ -58,7 +58,7 @@ def test_coincident_vertices_follow_exactly(ball, rig):
     moved = world_vertices(source)
     assert np.abs(moved - sphere()[0]).max() > 0.3
     np.testing.assert_allclose(world_vertices(ball), moved, atol=2e-6)
-    exported = part("addon.export.objects").export_objects(bpy.context.evaluated_depsgraph_get(), str, lambda _: None)
+    exported = export()[0].objects
     state = exported[0]
     assert state.name == "ball"
     np.testing.assert_allclose(

@@ -108,10 +108,23 @@ def test_every_panel_draws_and_every_poll_answers(scene, ball_file, loaded):
     part("addon.preferences").DrgsPreferences.draw(stand_in, bpy.context)
 
 
+@pytest.mark.parametrize("kind", ["POINT", "AREA"])
+def test_panels_of_a_light_draw(scene, kind):
+    obj = bpy.data.objects.new("Lamp", bpy.data.lights.new("Lamp", kind))
+    context = type("Context", (), {"engine": "DRGS", "object": obj, "light": obj.data})
+    rays = part("addon.panels.rays")
+    for cls in rays.CLASSES:
+        assert cls.poll(context)
+        cls.draw(type("StandIn", (), {"layout": Layout()})(), context)
+    context.engine = "CYCLES"
+    assert not any(cls.poll(context) for cls in rays.CLASSES)
+
+
 def test_blenders_own_panels_are_shared_and_given_back(scene):
     shared = [p for p in bpy.types.Panel.__subclasses__() if "DRGS" in getattr(p, "COMPAT_ENGINES", ())]
     assert {"RENDER_PT_format", "RENDER_PT_output"} <= {p.__name__ for p in shared}
     panels = part("addon.render_engine.panels")
+    assert {p.__name__ for p in shared} >= panels.INCLUDED, "nodes of materials and worlds, quantities of lights"
     panels.withdraw_panels()
     try:
         assert not [p for p in bpy.types.Panel.__subclasses__() if "DRGS" in getattr(p, "COMPAT_ENGINES", ())]
