@@ -90,7 +90,7 @@ def _check(image: bpy.types.Image, warn: Warn) -> None:
 def _read(image: bpy.types.Image) -> Array | None:
     """(h, w, c) float32 as Blender holds them, row 0 at the top; None when the image has no pixels."""
     width, height = image.size
-    if width * height == 0:
+    if width * height == 0 or len(image.pixels) == 0:
         return None
     pixels = np.empty(width * height * image.channels, np.float32)
     image.pixels.foreach_get(pixels)

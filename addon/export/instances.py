@@ -59,7 +59,7 @@ def _visibility(
         rays["camera"] = False
     if not any(rays.values()):
         return None
-    return Visibility(**rays, holdout=holdout, shadow_catcher=obj.is_shadow_catcher)
+    return Visibility(**rays, holdout=holdout, shadow_catcher=any(o.is_shadow_catcher for o in both))
 
 
 class Unrendered:

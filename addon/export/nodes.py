@@ -48,7 +48,7 @@ class Place(NamedTuple):
         own = place = self
         while place.socket.is_linked:
             link = place.socket.links[0]
-            if link.is_muted:
+            if link.is_muted or not link.is_valid:  # a loop has a link that is not valid
                 return own
             source = Place(link.from_socket, place.groups)
             node = source.node

@@ -406,6 +406,20 @@ def test_procedural_textures_are_named_and_never_black(scene, export, kind, sock
     assert min(found.base_colour) > 0.1 and 0.1 < found.roughness < 1
 
 
+def test_loops_of_nodes_end(scene, export):
+    tree, principled = material()
+    first, second = (tree.nodes.new("NodeReroute") for _ in range(2))
+    gammas = [add(tree, "Gamma", A, 2.0).node for _ in range(2)]
+    for a, b in ((first, second), (second, first), gammas, gammas[::-1]):
+        tree.links.new(a.outputs[0], b.inputs[0])
+    tree.links.new(first.outputs[0], principled.inputs["Base Color"])
+    tree.links.new(gammas[0].outputs[0], principled.inputs["Emission Color"])
+    principled.inputs["Emission Strength"].default_value = 1
+    swatch(bpy.data.materials["Material"])
+    found = export()[0].meshes[0].materials[0]
+    assert min(found.base_colour) > 0 and min(found.emission) > 0
+
+
 def test_one_warning_names_all_that_a_material_lacks(scene, export):
     tree, principled = material()
     for name in ("Coat Weight", "Transmission Weight", "Sheen Weight", "Subsurface Weight"):

@@ -109,6 +109,9 @@ def test_collection_instances_share_the_shape_and_the_visibility_of_both(scene, 
     states = sorted(export()[0].meshes, key=lambda s: len(s.matrices))
     assert [len(s.matrices) for s in states] == [1, 2]
     assert [s.visibility.glossy for s in states] == [False, True]
+    empty.is_shadow_catcher = True
+    states = sorted(export()[0].meshes, key=lambda s: len(s.matrices))
+    assert [s.visibility.shadow_catcher for s in states] == [True, False]
 
 
 def scatter(obj: bpy.types.Object) -> None:
@@ -130,6 +133,21 @@ def test_instances_of_geometry_nodes_are_one_shape(scene, export):
     (state,) = export()[0].meshes
     assert state.matrices.shape == (9, 4, 4) and len(state.faces) == 12
     np.testing.assert_allclose(np.sort(np.unique(state.matrices[:, 0, 3].round(5))), (9.5, 10, 10.5))
+
+
+def test_materials_set_by_geometry_nodes(scene, export):
+    obj = mesh_object("Scatter", np.zeros((1, 3)), [])
+    scatter(obj)
+    group = obj.modifiers[0].node_group
+    shape = next(n for n in group.nodes if n.bl_idname == "GeometryNodeMeshCube")
+    target = shape.outputs["Mesh"].links[0].to_socket
+    node = group.nodes.new("GeometryNodeSetMaterial")
+    node.inputs["Material"].default_value = bpy.data.materials.new("Painted")
+    group.links.new(shape.outputs["Mesh"], node.inputs[0])
+    group.links.new(node.outputs[0], target)
+    (state,) = export()[0].meshes
+    index = 0 if state.material_index is None else state.material_index[0]
+    assert state.materials[index].name == "Painted" and len(state.matrices) == 9
 
 
 def test_curves_texts_surfaces_and_metaballs_come_as_their_mesh_once(scene, export):
