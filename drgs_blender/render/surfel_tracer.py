@@ -63,7 +63,7 @@ _NOTHING = (ZERO,) * 14
 def transmittance(  # type: ignore[no-untyped-def]
     address, scene, ox, oy, oz, dx, dy, dz, tnear, tfar, mask, own, gx, gy, gz, size
 ):
-    """Share of light that passes the surfels between `tnear` and `tfar`, 0 where that is below 1e-4.
+    """Share of light that passes the surfels between `tnear` and `tfar`, 0 where that is below MIN_TRANSMITTANCE.
 
     Parameters
     ----------
@@ -227,7 +227,8 @@ def trace(
     numbers, index = np.empty((n, 14), np.float32), np.empty(n, np.int32)
     _trace(
         (bvh.intersect_address, bvh.scene, bvh.surface, bvh.objects), origins, directions, F(tnear), F(tfar),
-        np.int32(mask), (starts.object_index, starts.normal, starts.size), F(gap), 8 * get_num_threads(), numbers, index,
+        np.int32(mask), (starts.object_index, starts.normal, starts.size), F(gap), 8 * get_num_threads(),
+        numbers, index,
     )  # fmt: skip
     return SurfelHits(
         numbers[:, 0], numbers[:, 1], numbers[:, 2:5], numbers[:, 5:8], numbers[:, 8:11], numbers[:, 11],
