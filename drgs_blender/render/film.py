@@ -8,7 +8,11 @@ that describe the surface are not premultiplied, so that the object has no dark 
 - Normal, Albedo, Roughness, Metallic: mean of all covered samples by weight;
 - IndexOB: of the nearest sample.
 
-Combined is DiffDir + DiffInd + GlossDir + GlossInd + Env, added in this order, to the last bit.
+Combined is DiffDir + DiffInd + GlossDir + GlossInd + Env + Emit, added in this order, to the last bit.
+
+A holdout leaves a hole: black, alpha 0. A shadow catcher is seen by its shadow alone, a black veil as dense as the part
+of its light that the rest of the scene takes from it: 1 - (light in the scene) / (light among catchers alone), both
+summed over the pixel first, so that the quotient is not one of noise.
 """
 
 from __future__ import annotations
@@ -23,13 +27,15 @@ from .camera import FX, FY, ORTHOGRAPHIC, WIDTH, sample_ray
 from .denoise import Guides
 from .gbuffer import GBuffer
 from .light import EnvironmentLight, radiance_at, to_map
-from .points import Radiance
+from .points import CATCHER, Radiance
 
 Array = np.ndarray
 
 EMPTY_DEPTH = 1e10
 #: Samples of one pixel within this many pixel widths of depth are of one surface (a slope of 83 degrees).
 SAME_SURFACE = 8.0
+
+_RED, _GREEN, _BLUE = np.float32(0.2126), np.float32(0.7152), np.float32(0.0722)
 
 COMPONENTS = ("DiffDir", "DiffInd", "GlossDir", "GlossInd")
 
@@ -41,8 +47,11 @@ class Film:
     ----------
     components : (h, w, 4, 3) float32, in the order of `points.Radiance.components`, premultiplied
     variance : (h, w, 2) float32 of the luminance of the premultiplied diffuse and glossy sums
-    environment : (h, w, 3) float32 light straight from the world
-    coverage : (h, w) float32
+    environment : (h, w, 3) float32 light straight from the world, as if catchers had no shadow
+    emission : (h, w, 3) float32 light that seen surfaces emit
+    coverage, hole : (h, w) float32, by surfaces and by holdouts
+    catcher : (h, w, 3) float32 sums by weight over the points of catchers: one, luminance, unshadowed luminance
+    veiled : (h, w, 3) float32 the part of ``environment`` that is seen through catchers
     depth, position, normal, albedo, roughness, metallic, index : (h, w) or (h, w, 3) float32
     """
 
@@ -55,6 +64,8 @@ class Film:
         self.components = np.zeros((*size, 4, 3), np.float32)
         self.variance = np.zeros((*size, 2), np.float32)
         self.environment = np.zeros((*size, 3), np.float32)
+        self.emission, self.catcher, self.veiled = (np.zeros((*size, 3), np.float32) for _ in range(3))
+        self.hole = np.zeros(size, np.float32)
         self.coverage, self.roughness, self.metallic, self.index = (np.zeros(size, np.float32) for _ in range(4))
         self.depth = np.full(size, EMPTY_DEPTH, np.float32)
         self.position, self.normal, self.albedo = (np.zeros((*size, 3), np.float32) for _ in range(3))
@@ -86,9 +97,12 @@ class Film:
             buffer.position,
             buffer.depth,
             buffer.object_index,
+            buffer.emission,
+            points.flags,
             pass_index,
             radiance.components,
             radiance.variance,
+            np.zeros(len(points), np.float32) if radiance.unshadowed is None else radiance.unshadowed,
             self.components[rows],
             self.variance[rows],
             self.coverage[rows],
@@ -99,9 +113,19 @@ class Film:
             self.roughness[rows],
             self.metallic[rows],
             self.index[rows],
+            self.emission[rows],
+            self.catcher[rows],
         )
+        if buffer.hole is not None:
+            self.hole[rows] = buffer.hole.mean(axis=2)
         if not self.transparent and not light.black:
             _background(self.parameters, x0, y0, buffer.alpha, light.texels, light.rotation, self.environment[rows])
+            caught = np.flatnonzero(points.flags & CATCHER)
+            if len(caught):
+                _behind(
+                    self.parameters, x0, y0, points.pixel[caught], points.sample[caught], points.weight[caught],
+                    light.texels, light.rotation, self.veiled[rows],
+                )  # fmt: skip
 
     def guides(self) -> Guides:
         """What the denoiser tells surfaces apart by."""
@@ -127,7 +151,9 @@ class Film:
         """
         light = self.components if components is None else components
         made = {name: np.ascontiguousarray(light[:, :, i]) for i, name in enumerate(COMPONENTS)}
-        made["Env"] = self.environment
+        shadow = self._shadow()
+        made["Env"] = self.environment - self.veiled * shadow[..., None] if shadow.any() else self.environment
+        made["Emit"] = self.emission
         made |= {"Position": self.position, "Normal": self.normal, "Albedo": self.albedo}
         scalars = {
             "Depth": self.depth,
@@ -138,16 +164,23 @@ class Film:
         }
         made |= {name: values[..., None] for name, values in scalars.items()}
         if "Combined" in names:
-            made["Combined"] = self._beauty(light)
+            made["Combined"] = self._beauty(light, made["Env"], shadow)
         if "Noisy Image" in names:
-            made["Noisy Image"] = self._beauty(self.components)
+            made["Noisy Image"] = self._beauty(self.components, made["Env"], shadow)
         return {name: made[name] for name in names}
 
-    def _beauty(self, light: Array) -> Array:
+    def _shadow(self) -> Array:
+        """(h, w) float32 in [0, 1]: how dense the shadows on catchers are."""
+        _, light, unshadowed = np.moveaxis(self.catcher, 2, 0)
+        return np.where(unshadowed > 0, np.clip(1 - light / np.where(unshadowed > 0, unshadowed, 1), 0, 1), 0)
+
+    def _beauty(self, light: Array, environment: Array, shadow: Array) -> Array:
         out = np.ones((*self.coverage.shape, 4), np.float32)
-        out[..., :3] = light[:, :, 0] + light[:, :, 1] + light[:, :, 2] + light[:, :, 3] + self.environment
+        out[..., :3] = light[:, :, 0] + light[:, :, 1] + light[:, :, 2] + light[:, :, 3] + environment + self.emission
         if self.transparent:
-            out[..., 3] = self.coverage
+            out[..., 3] = self.coverage + self.catcher[:, :, 0] * shadow
+        else:
+            out[..., 3] -= self.hole
         return out
 
 
@@ -165,9 +198,12 @@ def _develop(
     position: Any,
     depth: Any,
     owner: Any,
+    emission: Any,
+    flags: Any,
     pass_index: Any,
     light: Any,
     light_variance: Any,
+    unshadowed: Any,
     components: Any,
     variance: Any,
     coverage: Any,
@@ -178,6 +214,8 @@ def _develop(
     out_roughness: Any,
     out_metallic: Any,
     out_index: Any,
+    out_emission: Any,
+    out_catcher: Any,
 ) -> None:
     """Sum the points of each pixel; they are neighbours in the arrays."""
     width = np.int64(p[WIDTH])
@@ -191,16 +229,30 @@ def _develop(
             while last < start[y + 1] and pixel[last] == pixel[first]:
                 last += 1
             x = pixel[first] % width - x0
-            nearest = first
+            nearest = -1
             for i in range(first, last):
-                if depth[i] < depth[nearest]:
+                if flags[i] & CATCHER:
+                    shine = zero
+                    for c in range(4):
+                        shine += _RED * light[i, c, 0] + _GREEN * light[i, c, 1] + _BLUE * light[i, c, 2]
+                    out_catcher[y, x, 0] += weight[i]
+                    out_catcher[y, x, 1] += weight[i] * shine
+                    out_catcher[y, x, 2] += weight[i] * unshadowed[i]
+                elif nearest < 0 or depth[i] < depth[nearest]:
                     nearest = i
+            if nearest < 0:
+                first = last
+                continue
             limit = depth[nearest] * (np.float32(1.0) + per_depth) + fixed
             total = surface = mean_depth = rough = metal = zero
             px = py = pz = nx = ny = nz = r = g = b = zero
             for i in range(first, last):
+                if flags[i] & CATCHER:
+                    continue
                 w = weight[i]
                 total += w
+                for k in range(3):
+                    out_emission[y, x, k] += w * emission[i, k]
                 for c in range(4):
                     for k in range(3):
                         components[y, x, c, k] += w * light[i, c, k]
@@ -234,13 +286,23 @@ def _develop(
             first = last
 
 
+@njit
+def _world(p: Any, pixel: Any, sample: Any, radiance: Any, rotation: Any) -> Any:
+    """The world's radiance along the ray of a sub-pixel sample."""
+    if radiance.shape[0] * radiance.shape[1] == 1:
+        return radiance[0, 0, 0], radiance[0, 0, 1], radiance[0, 0, 2]
+    _, _, _, dx, dy, dz = sample_ray(p, pixel, sample)
+    scale = 1.0 / np.sqrt(dx * dx + dy * dy + dz * dz)
+    u, v = to_map(np.float32(dx * scale), np.float32(dy * scale), np.float32(dz * scale), rotation)
+    return radiance_at(u, v, radiance)
+
+
 @njit(parallel=True)
 def _background(p: Any, x0: Any, y0: Any, alpha: Any, radiance: Any, rotation: Any, out: Any) -> None:
     """Add the world's radiance along every sub-pixel ray, weighted by what the surfaces leave uncovered."""
     width = np.int64(p[WIDTH])
     rows, columns, aa = alpha.shape
     share = np.float32(1.0 / aa)
-    constant = radiance.shape[0] * radiance.shape[1] == 1
     for y in prange(rows):
         for x in range(columns):
             red = green = blue = np.float32(0.0)
@@ -248,12 +310,20 @@ def _background(p: Any, x0: Any, y0: Any, alpha: Any, radiance: Any, rotation: A
                 left = (np.float32(1.0) - alpha[y, x, k]) * share
                 if left <= np.float32(0.0):
                     continue
-                if constant:
-                    r, g, b = radiance[0, 0, 0], radiance[0, 0, 1], radiance[0, 0, 2]
-                else:
-                    _, _, _, dx, dy, dz = sample_ray(p, (y0 + y) * width + x0 + x, k)
-                    scale = 1.0 / np.sqrt(dx * dx + dy * dy + dz * dz)
-                    u, v = to_map(np.float32(dx * scale), np.float32(dy * scale), np.float32(dz * scale), rotation)
-                    r, g, b = radiance_at(u, v, radiance)
+                r, g, b = _world(p, (y0 + y) * width + x0 + x, k, radiance, rotation)
                 red, green, blue = red + left * r, green + left * g, blue + left * b
             out[y, x, 0], out[y, x, 1], out[y, x, 2] = red, green, blue
+
+
+@njit
+def _behind(
+    p: Any, x0: Any, y0: Any, pixel: Any, sample: Any, weight: Any, radiance: Any, rotation: Any, out: Any
+) -> None:
+    """Add the world's radiance behind some points, by weight."""
+    width = np.int64(p[WIDTH])
+    for i in range(len(pixel)):
+        y, x = pixel[i] // width - y0, pixel[i] % width - x0
+        r, g, b = _world(p, pixel[i], sample[i], radiance, rotation)
+        out[y, x, 0] += weight[i] * r
+        out[y, x, 1] += weight[i] * g
+        out[y, x, 2] += weight[i] * b

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 
@@ -12,6 +12,10 @@ Array = np.ndarray
 
 #: Order of ``Radiance.components`` along its second axis.
 DIFFUSE_DIRECT, DIFFUSE_INDIRECT, GLOSSY_DIRECT, GLOSSY_INDIRECT = range(4)
+
+#: Bits of ``ShadingPoints.flags``. SECOND: an ordinary mesh seen next to surfels; a first point may have the same pixel
+#: and sample, so random numbers must differ. CATCHER: of a shadow catcher, see ``Radiance.unshadowed``.
+SECOND, CATCHER = 1, 2
 
 _WIDTHS = {
     "weight": (), "origin": (3,), "normal": (3,), "geometric_normal": (3,), "view": (3,),
@@ -26,13 +30,14 @@ class ShadingPoints:
     Attributes
     ----------
     pixel : (n,) int32: y * camera.width + x in the full picture; seeds the random numbers
-    sample : (n,) int32: sub-pixel sample, 0 .. aa - 1; a pair (pixel, sample) may occur once
+    sample : (n,) int32: sub-pixel sample, 0 .. aa - 1; a pair (pixel, sample) may occur twice, once flagged SECOND
     weight : (n,) float32: alpha / aa, what the point contributes to its pixel
     origin : (n, 3) float32 metres: on the traced mesh, where secondary rays start
     normal : (n, 3) float32 unit: shading normal, faces the viewer
     geometric_normal : (n, 3) float32 unit: of the traced mesh at ``origin``, faces the viewer
     view : (n, 3) float32 unit: towards the camera
     albedo, roughness, metallic : (n, 3), (n,), (n,) float32 in [0, 1]; linear Rec.709
+    flags : (n,) uint8: SECOND, CATCHER; 0 when not given
     """
 
     pixel: Array
@@ -45,6 +50,7 @@ class ShadingPoints:
     albedo: Array
     roughness: Array
     metallic: Array
+    flags: Array = field(default_factory=lambda: np.zeros(0, np.uint8))
 
     def __post_init__(self) -> None:
         self.pixel = np.ascontiguousarray(self.pixel, np.int32)
@@ -52,6 +58,7 @@ class ShadingPoints:
         n = len(self.pixel)
         for name, width in _WIDTHS.items():
             setattr(self, name, as_float(getattr(self, name), (n, *width), f"shading point {name}"))
+        self.flags = np.ascontiguousarray(self.flags if len(self.flags) else np.zeros(n), np.uint8)
 
     def __len__(self) -> int:
         return len(self.pixel)
@@ -70,10 +77,13 @@ class Radiance:
     components : (n, 4, 3) float32 linear Rec.709: diffuse direct, diffuse indirect, glossy direct, glossy indirect;
         surface colour included; their sum is the point's radiance. Not yet multiplied by ``ShadingPoints.weight``
     variance : (n, 2) float32: estimated variance of the luminance of the diffuse and of the glossy sum
+    unshadowed : (n,) float32 or None: for points flagged CATCHER the luminance that would leave them if rays met
+        shadow catchers alone (masks shifted by `masks.WITHOUT`); not read elsewhere
     """
 
     components: Array
     variance: Array
+    unshadowed: Array | None = None
 
     @property
     def total(self) -> Array:

@@ -26,9 +26,13 @@ import numpy as np
 
 from ..frame import Camera
 from ..jit import njit, prange
-from .camera import sample_ray
-from .embree import closest_hit
+from .camera import WIDTH, sample_ray
+from .camera_hits import shade_mesh
+from .embree import trace
 from .gbuffer import GBuffer, compact, face_viewer
+from .layers import combine
+from .masks import SURFELS
+from .points import SECOND
 from .raster import rasterise
 from .scene import TraceScene
 from .splats import Splats
@@ -62,21 +66,24 @@ def primary_surfels(splats: Splats, scene: TraceScene, windows: Array, camera: C
     windows : `snap_windows` of this frame
     """
     samples = rasterise(splats, y0, y1)
-    buffer, start = compact(samples.alpha, splats.parameters, camera.window[0], y0)
+    layers = combine(samples, scene, splats.parameters, camera.window[0], y0)
+    buffer, start = compact(layers.first, splats.parameters, camera.window[0], y0, layers.second)
+    buffer.alpha, buffer.hole = layers.opaque, layers.hole
     points = buffer.points
     _attach(
         scene.bvh.intersect_address,
         scene.bvh.scene,
-        len(scene.faces) > 0,
+        scene.vertex_faces > 0,
         splats.parameters,
         windows,
+        camera.window[0],
         start,
-        samples.alpha,
         samples.depth,
         samples.surface,
         samples.object_index,
         points.pixel,
         points.sample,
+        points.flags,
         points.origin,
         points.normal,
         points.geometric_normal,
@@ -88,6 +95,9 @@ def primary_surfels(splats: Splats, scene: TraceScene, windows: Array, camera: C
         buffer.depth,
         buffer.object_index,
     )
+    if layers.hits is not None:
+        shade_mesh(scene, layers.hits, splats.parameters, camera.window[0], start, buffer, SECOND)
+    buffer.mark_catchers(scene.object_flags)
     return buffer
 
 
@@ -113,12 +123,12 @@ def _shoot(address: Any, bvh: Any, x: Any, y: Any, z: Any, dx: Any, dy: Any, dz:
 
     Short segments that start near the surface keep float32 exact where a ray from a distant camera would not.
     """
-    t, face, _, _, gx, gy, gz = closest_hit(
-        address, bvh, np.float32(x), np.float32(y), np.float32(z),
-        np.float32(dx), np.float32(dy), np.float32(dz), np.float32(0.0), np.float32(reach),
+    t, group, _, _, _, _, gx, gy, gz = trace(
+        address, bvh, np.float32(x), np.float32(y), np.float32(z), np.float32(dx), np.float32(dy), np.float32(dz),
+        np.float32(0.0), np.float32(reach), np.int32(SURFELS),
     )  # fmt: skip
     length = np.sqrt(np.float64(gx) * gx + np.float64(gy) * gy + np.float64(gz) * gz)
-    if face < 0 or length == 0.0:
+    if group < 0 or length == 0.0:
         return np.float64(0.0), 0.0, 0.0, 0.0, False
     return np.float64(t), gx / length, gy / length, gz / length, True
 
@@ -175,13 +185,14 @@ def _attach(
     any_mesh: Any,
     p: Any,
     windows: Any,
+    x0: Any,
     start: Any,
-    alpha: Any,
     sample_depth: Any,
     surface: Any,
     sample_object: Any,
     pixel: Any,
     sample: Any,
+    flags: Any,
     origin: Any,
     normal: Any,
     geometric: Any,
@@ -194,60 +205,58 @@ def _attach(
     owner: Any,
 ) -> None:
     """Fill the shading points row by row; see the module's head for the order of attempts."""
-    rows, columns, aa = alpha.shape
-    for row in prange(rows):
-        n = start[row]
-        for column in range(columns):
-            for k in range(aa):
-                if alpha[row, column, k] == np.float32(0.0):
-                    continue
-                s = np.float64(sample_depth[row, column, k])
-                who = sample_object[row, column, k]
-                ox, oy, oz, dx, dy, dz = sample_ray(p, pixel[n], sample[n])
-                x, y, z = ox + s * dx, oy + s * dy, oz + s * dz
-                slope = np.sqrt(dx * dx + dy * dy + dz * dz)
-                vx, vy, vz = -dx / slope, -dy / slope, -dz / slope
-                nx, ny, nz = (
-                    np.float64(surface[row, column, k, 0]),
-                    np.float64(surface[row, column, k, 1]),
-                    np.float64(surface[row, column, k, 2]),
-                )
-                if nx * nx + ny * ny + nz * nz < 0.5:
-                    nx, ny, nz = vx, vy, vz
-                window = np.float64(WINDOW_SCALES) * surface[row, column, k, 8]
-                if who < len(windows):
-                    window = max(window, np.float64(windows[who]))
-                # The window starts in front of the surfel, yet not behind the camera.
-                ahead = min(window, 0.999 * s * slope)
-                how = NOWHERE
-                hx, hy, hz, gx, gy, gz = x, y, z, nx, ny, nz
-                if any_mesh:
-                    how, hx, hy, hz, gx, gy, gz = _find(
-                        address, bvh, x, y, z, nx, ny, nz, vx, vy, vz, ahead, window
-                    )  # fmt: skip
-                # A face met by the camera ray shows which side is seen; else the surfel tells, save at its rim.
-                if how in (ALONG_VIEW, ANY_SIDE, FACING):
-                    behind = gx * vx + gy * vy + gz * vz < 0.0
-                else:
-                    behind = nx * vx + ny * vy + nz * vz < -RIM
-                if behind:
-                    gx, gy, gz = -gx, -gy, -gz
-                gx, gy, gz = face_viewer(gx, gy, gz, gx, gy, gz, vx, vy, vz)
-                nx, ny, nz = face_viewer(nx, ny, nz, gx, gy, gz, vx, vy, vz)
-                if nx * gx + ny * gy + nz * gz < ALIKE:
-                    nx, ny, nz = gx, gy, gz
-                if how == NOWHERE:
-                    hx, hy, hz = x + window * gx, y + window * gy, z + window * gz
-                origin[n, 0], origin[n, 1], origin[n, 2] = hx, hy, hz
-                normal[n, 0], normal[n, 1], normal[n, 2] = nx, ny, nz
-                geometric[n, 0], geometric[n, 1], geometric[n, 2] = gx, gy, gz
-                view[n, 0], view[n, 1], view[n, 2] = vx, vy, vz
-                albedo[n, 0], albedo[n, 1], albedo[n, 2] = (
-                    surface[row, column, k, 3],
-                    surface[row, column, k, 4],
-                    surface[row, column, k, 5],
-                )
-                roughness[n], metallic[n] = surface[row, column, k, 6], surface[row, column, k, 7]
-                position[n, 0], position[n, 1], position[n, 2] = x, y, z
-                depth[n], owner[n] = s, who
-                n += 1
+    width = np.int64(p[WIDTH])
+    for row in prange(len(start) - 1):
+        for n in range(start[row], start[row + 1]):
+            if flags[n] & SECOND:
+                continue
+            column, k = pixel[n] % width - x0, sample[n]
+            s = np.float64(sample_depth[row, column, k])
+            who = sample_object[row, column, k]
+            ox, oy, oz, dx, dy, dz = sample_ray(p, pixel[n], sample[n])
+            x, y, z = ox + s * dx, oy + s * dy, oz + s * dz
+            slope = np.sqrt(dx * dx + dy * dy + dz * dz)
+            vx, vy, vz = -dx / slope, -dy / slope, -dz / slope
+            nx, ny, nz = (
+                np.float64(surface[row, column, k, 0]),
+                np.float64(surface[row, column, k, 1]),
+                np.float64(surface[row, column, k, 2]),
+            )
+            if nx * nx + ny * ny + nz * nz < 0.5:
+                nx, ny, nz = vx, vy, vz
+            window = np.float64(WINDOW_SCALES) * surface[row, column, k, 8]
+            if who < len(windows):
+                window = max(window, np.float64(windows[who]))
+            # The window starts in front of the surfel, yet not behind the camera.
+            ahead = min(window, 0.999 * s * slope)
+            how = NOWHERE
+            hx, hy, hz, gx, gy, gz = x, y, z, nx, ny, nz
+            if any_mesh:
+                how, hx, hy, hz, gx, gy, gz = _find(
+                    address, bvh, x, y, z, nx, ny, nz, vx, vy, vz, ahead, window
+                )  # fmt: skip
+            # A face met by the camera ray shows which side is seen; else the surfel tells, save at its rim.
+            if how in (ALONG_VIEW, ANY_SIDE, FACING):
+                behind = gx * vx + gy * vy + gz * vz < 0.0
+            else:
+                behind = nx * vx + ny * vy + nz * vz < -RIM
+            if behind:
+                gx, gy, gz = -gx, -gy, -gz
+            gx, gy, gz = face_viewer(gx, gy, gz, gx, gy, gz, vx, vy, vz)
+            nx, ny, nz = face_viewer(nx, ny, nz, gx, gy, gz, vx, vy, vz)
+            if nx * gx + ny * gy + nz * gz < ALIKE:
+                nx, ny, nz = gx, gy, gz
+            if how == NOWHERE:
+                hx, hy, hz = x + window * gx, y + window * gy, z + window * gz
+            origin[n, 0], origin[n, 1], origin[n, 2] = hx, hy, hz
+            normal[n, 0], normal[n, 1], normal[n, 2] = nx, ny, nz
+            geometric[n, 0], geometric[n, 1], geometric[n, 2] = gx, gy, gz
+            view[n, 0], view[n, 1], view[n, 2] = vx, vy, vz
+            albedo[n, 0], albedo[n, 1], albedo[n, 2] = (
+                surface[row, column, k, 3],
+                surface[row, column, k, 4],
+                surface[row, column, k, 5],
+            )
+            roughness[n], metallic[n] = surface[row, column, k, 6], surface[row, column, k, 7]
+            position[n, 0], position[n, 1], position[n, 2] = x, y, z
+            depth[n], owner[n] = s, who

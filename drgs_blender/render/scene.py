@@ -69,6 +69,7 @@ class TraceScene:
     normals : (r, 3) float32: of meshes; object space where these stand in several places
     vertex_faces : how many faces are of DR-GS objects; those come first
     places : (p, 3, 4) float32 object-to-world matrices of meshes in several places
+    place_object : (p,) int32: object of each place
     pass_index, object_flags : (objects,) int32: Blender's object index pass; bits HOLDOUT and CATCHER
     any_ordinary : whether the camera may see an ordinary mesh
     materials : MaterialTable of the meshes
@@ -88,13 +89,14 @@ class TraceScene:
         self.object_flags: Array = np.empty(0, np.int32)
         self.any_ordinary = False
         self.materials = MaterialTable([], [])
+        self._material_tables: Array = np.array(self.materials.addresses, np.int64)
         self.extent = 0.0
         self.faults: list[ObjectFaults] = []
         self._parts: list[Part] = []
         self._groups: list[list[int]] = []  # parts of each group
         self._vertex_count = 0
         self._place_normal: Array = np.empty((0, 3, 3), np.float32)
-        self._place_object: Array = np.empty(0, np.int32)
+        self.place_object: Array = np.empty(0, np.int32)
         self._first_place: Array = np.zeros(1, np.int32)
         self._material: Array = np.empty(0, np.int32)
         self._uvs: Array = np.empty((0, 3, 2), np.float32)
@@ -128,8 +130,8 @@ class TraceScene:
             address(self._material),
             address(self._uvs) if len(self._uvs) else 0,
             address(self._place_normal),
-            address(self._place_object),
-            self.materials.addresses,
+            address(self.place_object),
+            address(self._material_tables),
         )
 
     def update(
@@ -239,7 +241,7 @@ class TraceScene:
         matrices = np.concatenate([np.empty((0, 3, 4)), *(p.matrices for p in where if p.instanced)])
         self.places = np.ascontiguousarray(matrices, np.float32)
         self._place_normal = normal_matrices(matrices)
-        self._place_object = np.arange(len(flags), len(flags) + len(matrices), dtype=np.int32)
+        self.place_object = np.arange(len(flags), len(flags) + len(matrices), dtype=np.int32)
 
     def _take_materials(
         self,
@@ -251,6 +253,7 @@ class TraceScene:
     ) -> None:
         """Bring materials and texture coordinates of meshes up to date."""
         self.materials = MaterialTable([m for mesh in meshes for m in mesh.materials], list(images), self.materials)
+        self._material_tables = np.array(self.materials.addresses, np.int64)
         first = np.cumsum([0, *(len(mesh.materials) for mesh in meshes)])
         if any(mesh.uvs is not None for mesh in meshes) and not len(self._uvs):
             self._uvs = np.zeros((len(self._material), 3, 2), np.float32)

@@ -14,7 +14,7 @@ import numpy as np
 
 from ..jit import njit
 from .embree import blocked, trace
-from .memory import load_float, load_int32
+from .memory import load_float, load_int32, load_int64
 from .sampling import ONE, ZERO, F
 from .textures import material_at
 
@@ -52,7 +52,7 @@ class Geometry(NamedTuple):
     uvs : (m - vertex_faces, 3, 2) float32, or 0 when no mesh has any
     place_normal : (p, 3, 3) float32, matrices of normals
     place_object : (p,) int32
-    materials : `textures.MaterialTable.addresses`
+    materials : (6,) int64, ``textures.MaterialTable.addresses``
     """
 
     shading_faces: int
@@ -64,7 +64,7 @@ class Geometry(NamedTuple):
     uvs: int
     place_normal: int
     place_object: int
-    materials: tuple[int, ...]
+    materials: int
 
 
 @njit
@@ -166,7 +166,11 @@ def surface_at(face, place, u, v, gx, gy, gz, dx, dy, dz, geometry):  # type: ig
             s = _blend(geometry.uvs, c, c + 2, c + 4, w, u, v)
             t = _blend(geometry.uvs, c + 1, c + 3, c + 5, w, u, v)
         material = load_int32(geometry.material, own)
-        r, g, b, roughness, metallic, er, eg, eb = material_at(material, s, t, geometry.materials)
+        m = geometry.materials
+        tables = (
+            load_int64(m, 0), load_int64(m, 1), load_int64(m, 2), load_int64(m, 3), load_int64(m, 4), load_int64(m, 5),
+        )  # fmt: skip
+        r, g, b, roughness, metallic, er, eg, eb = material_at(material, s, t, tables)
         rows = geometry.normals
         i, j, k = 3 * i, 3 * j, 3 * k
         if place < 0:

@@ -64,7 +64,7 @@ def test_combined_is_the_sum_of_its_parts_to_the_last_bit(transparent: bool) -> 
     p = film.passes(ALL)
     assert [p[n].shape for n in ALL] == [(10, 12, len(BY_NAME[n].channels)) for n in ALL]
     assert all(v.dtype == np.float32 for v in p.values())
-    total = p["DiffDir"] + p["DiffInd"] + p["GlossDir"] + p["GlossInd"] + p["Env"]
+    total = p["DiffDir"] + p["DiffInd"] + p["GlossDir"] + p["GlossInd"] + p["Env"] + p["Emit"]
     assert np.array_equal(p["Combined"][..., :3], total)
     assert np.array_equal(p["Combined"], p["Noisy Image"])
     if transparent:
@@ -145,5 +145,5 @@ def test_denoised_light_replaces_all_but_the_noisy_image() -> None:
     p = film.passes(ALL, 2 * film.components)
     assert np.allclose(p["Combined"][..., :3], 2 * p["Noisy Image"][..., :3], rtol=1e-6)
     assert np.array_equal(p["Combined"][..., 3], p["Noisy Image"][..., 3])
-    total = p["DiffDir"] + p["DiffInd"] + p["GlossDir"] + p["GlossInd"] + p["Env"]
+    total = p["DiffDir"] + p["DiffInd"] + p["GlossDir"] + p["GlossInd"] + p["Env"] + p["Emit"]
     assert np.array_equal(p["Combined"][..., :3], total)
