@@ -53,14 +53,59 @@ def export_image(image: bpy.types.Image, straight: bool, warn: Warn) -> Image | 
 
 def mean_colour(picture: Image) -> Array:
     """(4,) linear mean of a picture, from at most some 65 thousand of its pixels."""
-    step = [max(1, n // 256) for n in picture.pixels.shape[:2]]
-    some = picture.pixels[:: step[0], :: step[1]].reshape(-1, 4).astype(np.float64)
+    some = _some(picture).astype(np.float64)
     if picture.pixels.dtype == np.uint8:
         some /= 255
     if picture.encoding == "srgb":
-        some[:, :3] = _decoded(some[:, :3])
+        some[:, :3] = decoded(some[:, :3])
     some = some[np.isfinite(some).all(axis=1)]
     return some.mean(axis=0) if len(some) else np.zeros(4)
+
+
+def _some(picture: Image) -> Array:
+    """(n, 4) of its pixels, spread evenly."""
+    steps = [max(1, n // 256) for n in picture.pixels.shape[:2]]
+    return picture.pixels[:: steps[0], :: steps[1]].reshape(-1, 4)
+
+
+def export_curved(image: bpy.types.Image, straight: bool, source: str, curve: bytes, warn: Warn) -> Image:
+    """Pixels of an 8-bit texture whose bytes stand for other values.
+
+    Parameters
+    ----------
+    source : channel whose bytes are looked up for red, green and blue; "rgb" is each of its own
+    curve : (256, 3) float32 in [0, 1], linear, as bytes
+    """
+    plain = export_image(image, straight, warn)
+    values = np.frombuffer(curve, np.float32).reshape(256, 3)
+    number = bool((np.ptp(values, axis=1) < 1e-6).all()) and source != "rgb"
+    table = np.rint(255 * (values if number else encoded(values))).astype(np.uint8)
+
+    def make(_: bpy.types.Image) -> Image:
+        pixels = plain.pixels.copy()
+        for i in range(3):
+            pixels[..., i] = table[plain.pixels[..., i if source == "rgb" else "rgba".index(source)], i]
+        pixels.flags.writeable = False
+        mark = hashlib.blake2b(source.encode() + curve, digest_size=6).hexdigest()
+        return Image(f"{plain.name} ({mark})", pixels, "linear" if number else "srgb")
+
+    return _remembered(image, f"{straight} {source} {hashlib.blake2b(curve).hexdigest()}", make)
+
+
+def is_grey(picture: Image) -> bool:
+    """Whether red, green and blue are the same, in some 65 thousand of its pixels at most."""
+    some = _some(picture)
+    return bool((some[:, 0] == some[:, 1]).all() and (some[:, 0] == some[:, 2]).all())
+
+
+def decoded(values: Array) -> Array:
+    """sRGB -> linear."""
+    return np.where(values <= 0.04045, values / 12.92, ((np.maximum(values, 0) + 0.055) / 1.055) ** 2.4)
+
+
+def encoded(values: Array) -> Array:
+    """Linear -> sRGB."""
+    return np.where(values <= 0.0031308, values * 12.92, 1.055 * np.maximum(values, 0) ** (1 / 2.4) - 0.055)
 
 
 def end_export() -> None:
@@ -101,18 +146,13 @@ def _is_srgb(image: bpy.types.Image) -> bool:
     return not image.is_float and image.colorspace_settings.name not in LINEAR
 
 
-def _decoded(values: Array) -> Array:
-    """sRGB -> linear."""
-    return np.where(values <= 0.04045, values / 12.92, ((np.maximum(values, 0) + 0.055) / 1.055) ** 2.4)
-
-
 def _linear(image: bpy.types.Image) -> Array | None:
     pixels = _read(image)
     if pixels is None:
         return None
     pixels = pixels[..., :3] if pixels.shape[2] >= 3 else np.repeat(pixels[..., :1], 3, axis=2)
     if _is_srgb(image):
-        pixels = _decoded(pixels)
+        pixels = decoded(pixels)
     pixels = np.array(pixels, np.float32, order="C")
     pixels.flags.writeable = False
     return pixels

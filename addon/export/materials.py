@@ -10,7 +10,8 @@ import numpy as np
 
 from ...drgs_blender.frame import Image, Material, Texture
 from . import images
-from .nodes import LUMINANCE, Paint, Place, Walker, constant, euler, plain, surface_of, vector_rotate
+from .nodes import Paint, Place, Walker, constant, euler, plain, surface_of, vector_rotate
+from .pictures import Picture
 
 Warn = Callable[[str], None]
 Array = np.ndarray
@@ -25,20 +26,6 @@ _LOBES = {
     "Thin Film Thickness": "thin film",
     "Diffuse Roughness": "diffuse roughness",
 }
-_CHANNELS = {"r": 0, "g": 1, "b": 2, "a": 3}
-
-
-@dataclass(frozen=True, slots=True)
-class Picture:
-    """An image on a surface; all that frame.Texture says, and the datablock."""
-
-    image: bpy.types.Image
-    straight: bool
-    channel: str
-    uv_map: str
-    matrix: tuple[tuple[float, ...], ...]
-    interpolation: str
-    extension: str
 
 
 @dataclass(slots=True)
@@ -113,10 +100,9 @@ class Materials:
         return Look(Material(material.name, **values), maps[0] if maps else None)
 
     def _texture(self, picture: Picture) -> Texture:
-        exported = images.export_image(picture.image, picture.straight, self._warn)
+        exported = picture.export(self._warn)
         self.images[exported.name] = exported
-        matrix = np.array(picture.matrix)[:2, (0, 1, 3)]
-        return Texture(exported.name, picture.channel, matrix, picture.interpolation, picture.extension)
+        return picture.texture(exported.name)
 
 
 def _usable(tree: _Tree, name: str, paint: Paint, default: tuple[float, float, float] | float) -> object:
@@ -171,16 +157,14 @@ class _Tree(Walker):
     # Textures
 
     def mean(self, texture: Picture) -> Array:
-        picture = images.export_image(texture.image, texture.straight, self._warn)
-        mean = images.mean_colour(picture)
-        if texture.channel == "rgb":
-            return mean[:3]
-        if texture.channel == "luminance":
-            return np.full(3, mean[:3] @ LUMINANCE)
-        return np.full(3, mean[_CHANNELS[texture.channel]])
+        return texture.mean(self._warn)
 
     def channel(self, texture: Picture, name: str) -> Picture:
-        return replace(texture, channel=name) if texture.channel == "rgb" else texture
+        return texture.only(name)
+
+    def curved(self, texture: Picture, function: Callable[[Array], Array]) -> Paint | None:
+        found = texture.curved(function, self._warn)
+        return None if found is None else Paint(np.full(3, found[1]), found[0])
 
     def node_tex_image(self, output: Place) -> Paint:
         node, image = output.node, output.node.image

@@ -131,6 +131,10 @@ class Walker:
         """The texture reduced to "r", "g", "b" or "luminance"; None where there is no such thing."""
         return None
 
+    def curved(self, texture: Hashable, function: Callable[[Array], Array]) -> Paint | None:
+        """The texture with `function` of (n, 3) colours done to its values; None where that cannot be."""
+        return None
+
     # Sockets
 
     def colour(self, place: Place) -> Paint:
@@ -189,10 +193,11 @@ class Walker:
         return Paint(plain(paint.colour[index]).colour, texture)
 
     def combine(self, node: bpy.types.Node, function: Callable[..., Array], *paints: Paint) -> Paint:
-        """`function` of (3,) arrays for paints.
+        """`function` of (..., 3) arrays for paints.
 
-        Exact for constants, and where the result is a scaled texture. Else the texture with the most influence stays,
-        scaled so that the mean is right; where the result falls as the texture rises, the mean alone.
+        Exact for constants, where the result is a scaled texture, and where the texture takes curves. Else the texture
+        with the most influence stays, scaled so that the mean is right; where the result falls as the texture rises,
+        the mean alone.
         """
         textures = dict.fromkeys(p.texture for p in paints if p.texture is not None and not p.black)
 
@@ -215,6 +220,11 @@ class Walker:
             return plain(whole)
         if len(textures) > 1 and sorted(influence.values())[-2] < 1e-6:
             return self.combine(node, function, *(_fixed_but(p, texture, means) for p in paints))
+        curved = self.curved(texture, lambda value: at({**means, texture: value}))
+        if curved is not None:
+            if len(textures) > 1:
+                self.warn(node, "of several images the one with the most influence stays, the mean of the others")
+            return curved
         halved = at({**means, texture: means[texture] / 2})
         if whole.sum() < halved.sum():
             self.warn(node, "this cannot be done to an image; the mean colour is used. Bake it to an image")
@@ -317,7 +327,7 @@ class Walker:
 
         def mapped(v: Array, from_min: Array, from_max: Array, to_min: Array, to_max: Array) -> Array:
             span = from_max - from_min
-            part = np.divide(v - from_min, span, out=np.zeros(3), where=span != 0)
+            part = _divide(v - from_min, span)
             return to_min + (np.clip(part, 0, 1) if node.clamp else part) * (to_max - to_min)
 
         names = ("Value", "From Min", "From Max", "To Min", "To Max")
@@ -345,6 +355,7 @@ class Walker:
         mapping = output.node.mapping
         mapping.initialize()
 
+        @_by_row
         def curved(f: Array, colour: Array) -> Array:
             once = [mapping.evaluate(mapping.curves[3], c) for c in colour]
             twice = np.array([mapping.evaluate(mapping.curves[i], c) for i, c in enumerate(once)])
@@ -355,6 +366,7 @@ class Walker:
     def node_valtorgb(self, output: Place) -> Paint:
         ramp, alpha = output.node.color_ramp, output.socket.name == "Alpha"
 
+        @_by_row
         def ramped(f: Array) -> Array:
             return np.array([ramp.evaluate(v)[3 if alpha else i] for i, v in enumerate(f)])
 
@@ -377,6 +389,7 @@ class Walker:
     def node_combine_color(self, output: Place) -> Paint:
         mode = getattr(output.node, "mode", "RGB")
 
+        @_by_row
         def joined(r: Array, g: Array, b: Array) -> Array:
             rgb = r[0], g[1], b[2]
             if mode == "HSV":
@@ -395,8 +408,19 @@ def _fixed_but(paint: Paint, texture: Hashable, means: dict[Hashable, Array]) ->
     return Paint(paint.colour * means.get(paint.texture, 0))
 
 
+def _by_row(function: Callable[..., Array]) -> Callable[..., Array]:
+    """A function of (3,) arrays as one of (..., 3) arrays."""
+
+    def many(*values: Array) -> Array:
+        shape = np.broadcast_shapes(*(np.shape(v) for v in values))
+        rows = zip(*(np.broadcast_to(v, shape).reshape(-1, 3) for v in values))
+        return np.array([function(*row) for row in rows]).reshape(shape)
+
+    return many
+
+
 def _divide(a: Array, b: Array) -> Array:
-    return np.divide(a, b, out=np.zeros(3), where=b != 0)
+    return np.divide(a, b, out=np.zeros(np.broadcast_shapes(np.shape(a), np.shape(b))), where=b != 0)
 
 
 def _overlay(a: Array, b: Array) -> Array:
@@ -408,6 +432,7 @@ def _rgb_to_hsl(r: float, g: float, b: float) -> tuple[float, float, float]:
     return hue, saturation, lightness
 
 
+@_by_row
 def _hue_saturation(hue: Array, saturation: Array, value: Array, factor: Array, colour: Array) -> Array:
     h, s, v = colorsys.rgb_to_hsv(*colour)
     turned = colorsys.hsv_to_rgb((h + hue[0] + 0.5) % 1, np.clip(s * saturation[0], 0, 1), v * value[0])
