@@ -1,0 +1,46 @@
+"""How much a sequence of pictures flickers."""
+
+from __future__ import annotations
+
+import numpy as np
+from judge import to_srgb
+from scipy.ndimage import map_coordinates
+
+Array = np.ndarray
+LUMINANCE = np.float32([0.2126, 0.7152, 0.0722])
+
+
+def flicker(pictures: Array, mask: Array, vectors: Array | None = None) -> float:
+    """Mean absolute second difference in time of what a surface point shows.
+
+    A steady change (light that turns, a fade) has none; noise of deviation s, different in each frame, has about 2 s.
+
+    Parameters
+    ----------
+    pictures : (n, h, w, 3) linear, n >= 3
+    mask : (n, h, w) bool, pixels to look at
+    vectors : (n, h, w, 2) pixels, from each pixel to its surface's place in the frame before; NaN where there is none.
+        None when nothing moves
+
+    Returns
+    -------
+    float, in sRGB luminance; subtract that of a converged sequence to have what the noise alone does
+    """
+    shown = [to_srgb(p[..., :3]) @ LUMINANCE for p in pictures]
+    n, h, w = mask.shape
+    total, count = 0.0, 0
+    for t in range(2, n):
+        y, x = np.mgrid[:h, :w].astype(np.float64)
+        seen, usable = [shown[t]], mask[t].copy()
+        for k in (t, t - 1):
+            if vectors is not None:
+                step = [map_coordinates(vectors[k, ..., i], (y, x), order=0, cval=np.nan) for i in (0, 1)]
+                x, y = x + step[0], y + step[1]
+            usable &= np.isfinite(x) & np.isfinite(y)
+            place = np.where(usable, y, -1.0), np.where(usable, x, -1.0)
+            usable &= map_coordinates(mask[k - 1].astype(np.float32), place, order=1, cval=0.0) > 0.999
+            seen.append(map_coordinates(shown[k - 1], place, order=1))
+            x, y = np.where(usable, x, -1.0), np.where(usable, y, -1.0)
+        difference = np.abs(seen[0] - 2 * seen[1] + seen[2])[usable]
+        total, count = total + float(difference.sum()), count + difference.size
+    return total / max(count, 1)

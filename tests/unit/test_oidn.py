@@ -1,0 +1,55 @@
+"""Open Image Denoise as an option: what it gains where it is installed, what is said where it is not."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+
+from drgs_blender.errors import DeviceError
+from drgs_blender.render.denoise import Guides
+from drgs_blender.render.oidn import available, denoise_oidn
+
+SIZE = 64
+
+
+def noisy() -> tuple[np.ndarray, np.ndarray, Guides]:
+    """Truth, truth with noise, guides of a painted wall that covers the left three quarters."""
+    rng = np.random.default_rng(0)
+    x = np.broadcast_to(np.arange(SIZE), (SIZE, SIZE))
+    coverage = (x < 48).astype(np.float32)
+    albedo = np.repeat((0.2 + 0.6 * (x // 8 % 2))[..., None], 3, 2).astype(np.float32)
+    normal = np.broadcast_to(np.float32([0, -1, 0]), (SIZE, SIZE, 3))
+    flat = np.zeros((SIZE, SIZE), np.float32)
+    truth = np.zeros((SIZE, SIZE, 4, 3), np.float32)
+    truth[:, :, 0], truth[:, :, 1] = (albedo * coverage[..., None]), 0.5 * (albedo * coverage[..., None])
+    light = truth * (1 + 0.3 * rng.normal(size=(SIZE, SIZE, 4, 1))).astype(np.float32)
+    return truth, light, Guides(coverage, np.zeros_like(albedo), normal, albedo, flat, flat, flat, flat + 1)
+
+
+@pytest.mark.skipif(not available(), reason="the wheel pyoidn is not installed")
+def test_noise_goes_and_each_component_stays_itself() -> None:
+    truth, light, guides = noisy()
+    light[3, 4, 0, 1] = np.nan
+    split, whole = denoise_oidn(light, guides), denoise_oidn(light, guides, split=False)
+    light[3, 4, 0, 1] = 0
+    for k in (0, 1):
+        before, after = np.abs(light - truth)[:, :, k].mean(), np.abs(split - truth)[:, :, k].mean()
+        assert after < before / 3
+    assert np.abs(whole.sum(2) - truth.sum(2)).mean() < np.abs(light.sum(2) - truth.sum(2)).mean() / 3
+    assert (whole[:, :, 1:] == 0).all() and np.isfinite(split).all()
+
+
+@pytest.mark.skipif(not available(), reason="the wheel pyoidn is not installed")
+def test_it_gives_the_same_bits_again() -> None:
+    _, light, guides = noisy()
+    assert (denoise_oidn(light, guides, split=False) == denoise_oidn(light, guides, split=False)).all()
+
+
+def test_absence_is_an_error_with_a_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pyoidn", None)
+    _, light, guides = noisy()
+    assert not available()
+    with pytest.raises(DeviceError, match="pip install pyoidn"):
+        denoise_oidn(light, guides)

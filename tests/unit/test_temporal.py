@@ -1,0 +1,344 @@
+"""Motion of surfaces, light gathered over frames: what it must keep, what it must forget, how much it gains."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drgs_blender.frame import Camera, RenderSettings
+from drgs_blender.jit import get_num_threads, use_threads
+from drgs_blender.render.camera import camera_parameters, camera_ray
+from drgs_blender.render.denoise import LIGHT, PAD, Guides, Signal, demodulate
+from drgs_blender.render.motion import Motion, MotionFilm, previous_positions, project
+from drgs_blender.render.temporal import Shot, denoise_next, window
+
+H, W = 48, 64
+PITCH = 1e-3  # metres a pixel
+
+
+def camera(**changes: object) -> Camera:
+    """Looks along +Y at the wall Y = 0 from one metre away."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
+    matrix[:3, 3] = 0, -1, 0
+    values: dict = {"matrix_world": matrix, "width": W, "height": H, "fx": 1000.0, "fy": 1000.0, "cx": W / 2}
+    return Camera(**(values | {"cy": H / 2} | changes))
+
+
+def parameters(**changes: object) -> np.ndarray:
+    return camera_parameters(camera(**changes), RenderSettings(), 1)
+
+
+def wall(shift: float = 0.0, box: bool = False) -> Guides:
+    """The wall Y = 0, a millimetre a pixel, painted in stripes and moved by `shift` pixels to the right.
+
+    With `box`, a second object stands 50 mm before it, ten pixels wide, and only it moves.
+    """
+    x, y = np.meshgrid(np.arange(W) + 0.5, np.arange(H) + 0.5)
+    position = np.stack([(x - W / 2) * PITCH, np.zeros((H, W)), (H / 2 - y) * PITCH], -1)
+    on_box = (np.abs(x - (W / 2 + shift)) < 5) & box
+    paint = 0.2 + 0.6 * (np.floor((x - (0.0 if box else shift)) / 4) % 2)
+    position[on_box] *= 0.95
+    position[on_box, 1] = -0.05
+    return Guides(
+        *(
+            np.array(a, np.float32)
+            for a in (
+                np.ones((H, W)), position, np.broadcast_to([0, -1, 0], (H, W, 3)), np.repeat(paint[..., None], 3, 2),
+                np.full((H, W), 0.5), np.zeros((H, W)), on_box, np.where(on_box, 0.95, 1.0) * PITCH,
+            )
+        )
+    )  # fmt: skip
+
+
+def still(guides: Guides) -> Motion:
+    return Motion(np.zeros((H, W, 2), np.float32), guides.position.copy())
+
+
+def moved(guides: Guides, pixels: float, where: object = True) -> Motion:
+    """Everything (or `where`) has moved by `pixels` to the right since the frame before."""
+    motion = still(guides)
+    mask = np.broadcast_to(where, (H, W))  # type: ignore[arg-type]
+    motion.vector[mask, 0] = -pixels
+    motion.previous[mask, 0] -= (pixels * guides.footprint)[mask]
+    return motion
+
+
+def shot(guides: Guides, value: float | np.ndarray, noise: float, seed: int, motion: Motion | None = None) -> Shot:
+    """Irradiance `value` on the guides' surfaces with noise of the given deviation, and its variance."""
+    rng = np.random.default_rng(seed)
+    light = np.broadcast_to(value, (H, W)) + noise * rng.normal(size=(H, W))
+    components = np.zeros((H, W, 4, 3), np.float32)
+    components[:, :, 0] = light[..., None] * guides.albedo
+    components[:, :, 2] = 0.04 * light[..., None]
+    variance = np.zeros((H, W, 2), np.float32)
+    variance[..., 0] = (noise * guides.albedo[..., 0]) ** 2
+    variance[..., 1] = (noise * 0.04) ** 2
+    return Shot(components, variance, guides, motion)
+
+
+def gathered(shots: list[Shot]) -> Signal:
+    """What is known after all `shots`, before any filter over the picture."""
+    signal: Signal | None = None
+    for s in shots:
+        _, signal = denoise_next(s, signal, split=False)
+    assert signal is not None
+    return signal
+
+
+def diffuse(signal: Signal) -> np.ndarray:
+    """(h, w) demodulated diffuse light, first colour."""
+    return signal.light[:, LIGHT, PAD : PAD + W]
+
+
+# --- motion ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("orthographic", [False, True])
+def test_projection_inverts_the_camera_ray(orthographic: bool) -> None:
+    rng = np.random.default_rng(0)
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    matrix[:3, 3] = rng.normal(size=3)
+    p = parameters(matrix_world=matrix, fx=70.0, fy=55.0, cx=20.0, orthographic=orthographic)
+    for x, y, depth in rng.uniform(0.5, 60, (50, 3)):
+        o = np.array(camera_ray(p, x, y))
+        assert np.allclose(project(p, *(o[:3] + depth * o[3:])), (x, y, depth), atol=1e-9)
+
+
+def mesh(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    return rng.normal(size=(60, 3)).astype(np.float32), rng.permutation(60).reshape(20, 3).astype(np.int32)
+
+
+def test_points_move_with_their_faces() -> None:
+    rng = np.random.default_rng(1)
+    vertices, faces = mesh(rng)
+    face = rng.integers(0, 20, 200).astype(np.int32)
+    weights = rng.dirichlet([1, 1, 1], 200).astype(np.float32)
+    corners = vertices[faces[face]]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    on = (weights[:, :, None] * corners).sum(1)
+    tilt = 0.05 * (corners[:, 1] - corners[:, 0]) + 0.02 * normal
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    turn *= np.sign(np.linalg.det(turn))
+    before = (vertices @ turn.T + [1, 2, 3]).astype(np.float32)
+    for points in (on, on + tilt):  # on the mesh, and off it
+        found = previous_positions(faces, vertices, before, face, weights[:, 1:], points.astype(np.float32))
+        assert np.abs(found - (points @ turn.T + [1, 2, 3])).max() < 2e-5
+    # Any affine map: what lies in the face's plane follows exactly, what stands off keeps its distance.
+    matrix = rng.normal(size=(3, 3))
+    before = (vertices @ matrix.T).astype(np.float32)
+    shifted = on + 0.05 * (corners[:, 1] - corners[:, 0])
+    found = previous_positions(faces, vertices, before, face, weights[:, 1:], shifted.astype(np.float32))
+    assert np.abs(found - shifted @ matrix.T).max() < 2e-4
+
+
+def test_points_without_a_face_stand_still_and_flat_faces_do_no_harm() -> None:
+    vertices, faces = mesh(np.random.default_rng(2))
+    vertices[faces[3]] = vertices[faces[3, 0]]
+    points = np.random.default_rng(3).normal(size=(2, 3)).astype(np.float32)
+    third = np.full((2, 2), 1 / 3, np.float32)
+    found = previous_positions(faces, vertices, vertices + np.float32(1), np.array([-1, 3], np.int32), third, points)
+    assert (found[0] == points[0]).all()
+    assert np.allclose(found[1], points[1] + 1, atol=1e-5)
+
+
+def test_vectors_lead_to_the_place_in_the_picture_before() -> None:
+    guides = wall()
+    film = MotionFilm((H, W), (0, 0), parameters())
+    rest = film.motion(guides.position, guides.coverage, parameters())
+    assert (rest.vector == 0).all() and (rest.previous == guides.position).all()
+    matrix = camera().matrix_world.copy()
+    matrix[0, 3] = 3 * PITCH  # the camera was three pixels further right: the wall, further left in its picture
+    found = film.motion(guides.position, guides.coverage, parameters(matrix_world=matrix))
+    assert np.allclose(found.vector, [-3, 0], atol=1e-4)
+    film.displacement[..., 2] = 2 * PITCH  # the wall was higher
+    found = film.motion(guides.position, guides.coverage, parameters())
+    assert np.allclose(found.vector, [0, -2], atol=1e-4)
+    film.displacement[..., 1] = -5  # it was behind the camera
+    found = film.motion(guides.position, np.where(np.arange(W) < 5, 0, guides.coverage), parameters())
+    assert np.isnan(found.vector).all()
+
+
+# --- accumulation ---------------------------------------------------------------------------------------------------
+
+
+def test_a_constant_stays_one() -> None:
+    shots = [shot(wall(1.3 * k), 2.0, 0.0, k, moved(wall(1.3 * k), 1.3)) for k in range(4)]
+    history = None
+    for s in shots:
+        out, history = denoise_next(s, history)
+        assert np.allclose(out, s.components, rtol=2e-5, atol=1e-7)
+
+
+def test_noise_falls_as_the_root_of_the_frames() -> None:
+    guides = wall()
+    for n in (2, 4, 8):
+        left = diffuse(gathered([shot(guides, 2.0, 0.5, k, still(guides)) for k in range(n)])) - 2.0
+        assert abs(left.std() * np.sqrt(n) / 0.5 - 1) < 0.08, n
+        assert abs(left.mean()) < 4 * 0.5 / np.sqrt(n * H * W)
+
+
+def test_the_variance_it_reports_is_the_one_it_has() -> None:
+    guides = wall()
+    signal = gathered([shot(guides, 2.0, 0.5, k, still(guides)) for k in range(6)])
+    reported = signal.light[:, 2, PAD : PAD + W].mean()
+    assert abs(reported / diffuse(signal).var() - 1) < 0.15
+
+
+@pytest.mark.parametrize("pixels", [3.0, 2.4])
+def test_texture_moves_without_a_ghost(pixels: float) -> None:
+    """Stripes of contrast one to four move a few pixels a frame; their light does not."""
+    guides = [wall(pixels * k) for k in range(6)]
+    shots = [shot(g, 2.0, 0.3, k, moved(g, pixels)) for k, g in enumerate(guides)]
+    found = diffuse(gathered(shots)) - 2.0
+    seen = slice(int(pixels * 5) + 2, W)  # the rest came in from the left
+    assert found[:, seen].std() < 0.3 / np.sqrt(6) * 1.15
+    stripes = [found[:, seen][guides[-1].albedo[:, seen, 0] < 0.5], found[:, seen][guides[-1].albedo[:, seen, 0] > 0.5]]
+    assert abs(stripes[0].mean() - stripes[1].mean()) < 0.02
+
+
+def test_what_comes_into_view_starts_anew() -> None:
+    """A box moves before a wall of other light: what it uncovers is the present alone, the rest is gathered."""
+    step = 4.0
+    shots = []
+    for k in range(5):
+        g = wall(step * k - 8, box=True)
+        on_box = g.index == 1
+        shots.append(shot(g, np.where(on_box, 0.5, 3.0), 0.2, k, moved(g, step, on_box)))
+    last = shots[-1].guides
+    found = diffuse(gathered(shots))
+    x = np.arange(W) + 0.5
+    box = np.abs(x - (W / 2 + 8)) < 5
+    fresh = (np.abs(x - (W / 2 + 4)) < 5) & ~box
+    assert (last.index[0] == box).all() and fresh.sum() == 4
+    present = demodulate(shots[-1].components, shots[-1].variance, last, split=False)
+    assert (found[:, fresh] == diffuse(present)[:, fresh]).all()
+    old = np.abs(x - W / 2) > 20
+    assert found[:, old].std() < 0.2 / np.sqrt(5) * 1.15
+    assert found[:, box].std() < 0.2 / np.sqrt(5) * 1.15
+    assert abs(found[:, box].mean() - 0.5) < 0.01 and abs(found[:, ~box].mean() - 3.0) < 0.01
+
+
+def test_surfaces_that_turn_away_or_change_places_are_not_mixed() -> None:
+    before, now = wall(), wall()
+    now.normal[:, : W // 2] = [0.9, -np.sqrt(1 - 0.81), 0]
+    now.index[: H // 2] = 7
+    past = gathered([shot(before, 5.0, 0.0, 0)])
+    found = diffuse(gathered([shot(before, 5.0, 0.1, 0), shot(now, 1.0, 0.1, 1, still(now))]))
+    present = diffuse(gathered([shot(now, 1.0, 0.1, 1)]))
+    alone = np.ones((H, W), bool)
+    alone[H // 2 :, W // 2 :] = False
+    assert (found[alone] == present[alone]).all()
+    assert diffuse(past).mean() > 4.9
+
+
+def test_light_that_changes_is_followed() -> None:
+    """A steady light is gathered; one that jumps is taken up at once, not over ten frames."""
+    guides = wall()
+    shots = [shot(guides, 2.0, 0.2, k, still(guides)) for k in range(8)]
+    jump = gathered([*shots, shot(guides, 4.0, 0.2, 9, still(guides))])
+    assert abs(diffuse(jump).mean() - 4.0) < 0.05
+    slow = [shot(guides, 2.0 + 0.04 * k, 0.2, k, still(guides)) for k in range(20)]
+    found = diffuse(gathered(slow))
+    assert abs(found.mean() - (2 + 0.04 * 19)) < 0.1 and found.std() < 0.15
+
+
+def test_numbers_that_are_none_take_the_past() -> None:
+    guides = wall()
+    shots = [shot(guides, 2.0, 0.1, k, still(guides)) for k in range(3)]
+    shots[1].components[5, 6, 0, 1] = np.nan
+    shots[2].components[9, 30, 2] = np.inf
+    shots[2].variance[30, 9, 1] = np.nan
+    signal = gathered(shots)
+    assert np.isfinite(signal.light).all()
+    for y, x in ((5, 6), (9, 30), (30, 9)):
+        assert abs(diffuse(signal)[y, x] - 2.0) < 0.4
+    broken = still(guides)
+    broken.vector[3] = np.nan
+    broken.previous[4] = np.nan
+    again = gathered([shots[0], shot(guides, 2.0, 0.1, 8, broken)])
+    assert np.isfinite(again.light).all()
+    assert np.isfinite(window([None, shots[0], shots[1], shots[2], None])).all()
+
+
+def test_a_picture_of_another_size_is_no_history() -> None:
+    guides = wall()
+    _, history = denoise_next(shot(guides, 2.0, 0.1, 0), None, split=True)
+    fresh, _ = denoise_next(shot(guides, 2.0, 0.1, 1, still(guides)), None, split=False)
+    found, _ = denoise_next(shot(guides, 2.0, 0.1, 1, still(guides)), history, split=False)
+    assert (found == fresh).all()
+
+
+def test_results_do_not_depend_on_threads() -> None:
+    shots = [shot(wall(1.7 * k), 2.0, 0.3, k, moved(wall(1.7 * k), 1.7)) for k in range(5)]
+    results = []
+    before = get_num_threads()
+    try:
+        for threads in (1, 2):
+            use_threads(threads)
+            results.append((gathered(shots).light, window(shots)))
+    finally:
+        use_threads(before)
+    for one, two in zip(*results):
+        assert (one == two).all()
+
+
+# --- window ---------------------------------------------------------------------------------------------------------
+
+
+def test_window_gathers_five_frames_of_what_moves() -> None:
+    guides = [wall(2.4 * k) for k in range(5)]
+    shots = [shot(g, 2.0, 0.3, k, moved(g, 2.4)) for k, g in enumerate(guides)]
+    alone = [window([None, None, s, None, None])[:, 16:-16, 0, 0] for s in shots[2:3]]
+    both = window(shots)[:, 16:-16, 0, 0]
+    truth = 2.0 * guides[2].albedo[:, 16:-16, 0]
+    assert np.abs(both - truth).mean() < 0.62 * np.abs(alone[0] - truth).mean()
+    assert abs((both / truth).mean() - 1) < 0.01
+
+
+def test_window_does_not_lag() -> None:
+    """Light that grows steadily: the frames before and after cancel."""
+    guides = wall()
+    shots = [shot(guides, 2.0 + 0.02 * k, 0.2, k, still(guides)) for k in range(5)]
+    found = window(shots)[:, :, 0, 0] / guides.albedo[..., 0]
+    assert abs(found.mean() - 2.04) < 0.005
+
+
+def test_window_does_not_mix_what_is_hidden_in_other_frames() -> None:
+    shots = []
+    for k in range(5):
+        g = wall(5.0 * k - 10, box=True)
+        on_box = g.index == 1
+        shots.append(shot(g, np.where(on_box, 0.5, 3.0), 0.05, k, moved(g, 5.0, on_box)))
+    found = window(shots)[:, :, 0, 0]
+    on_box = shots[2].guides.index == 1
+    albedo = shots[2].guides.albedo[..., 0]
+    assert np.abs(found / albedo - np.where(on_box, 0.5, 3.0)).max() < 0.15
+
+
+def test_window_depends_on_its_frames_alone() -> None:
+    """Whoever renders a frame, and in which run, gets the same bits; the frames' order of creation is irrelevant."""
+    shots = [shot(wall(k), 2.0, 0.3, k, moved(wall(k), 1.0)) for k in range(7)]
+    padded: list[Shot | None] = [None, None, *shots, None, None]
+    whole = [window(padded[k : k + 5]) for k in range(7)]
+    for k in (6, 0, 3):
+        assert (window(padded[k : k + 5]) == whole[k]).all()
+    with pytest.raises(ValueError):
+        window([*padded[2:4], None, *padded[5:7]])
+
+
+def test_light_passes_stay_a_sum_and_gather_alike() -> None:
+    guides = wall()
+    shots = [shot(guides, 2.0, 0.3, k, still(guides)) for k in range(3)]
+    for s in shots:
+        s.components[:, :, 1] = 0.25 * s.components[:, :, 0]
+        s.components[:, :, 3] = 0.25 * s.components[:, :, 2]
+    history: dict[bool, Signal | None] = {True: None, False: None}
+    out: dict[bool, np.ndarray] = {}
+    for s in shots:
+        for split in (True, False):
+            out[split], history[split] = denoise_next(s, history[split], split)
+    assert np.allclose(out[True][:, :, 0] + out[True][:, :, 1], out[False][:, :, 0], rtol=1e-4)
+    assert np.allclose(out[True][:, :, 1], 0.25 * out[True][:, :, 0], rtol=1e-4)
