@@ -472,6 +472,6 @@ class SurfelBVH:
 
 
 def _corners(n: int) -> Array:
-    """(n, 3) int32 rows of `boxes`, as if each box were a triangle: what the measures of embree.py read."""
+    """(n, 3) int32 rows of `boxes`, as if each box were a triangle: what the measures of tree.py read."""
     first = 2 * np.arange(n, dtype=np.int32)
     return np.stack([first, first + 1, first], axis=1)

@@ -218,6 +218,26 @@ def test_surfels_that_moved_are_met_where_they_are() -> None:
     check(bvh, torn)
 
 
+def test_a_hit_depends_neither_on_the_tree_nor_on_other_rays() -> None:
+    """Lists are sorted and cut by content: a refitted tree gives the last bit of what a new one gives."""
+    first, then = cloud(2000, seed=12, size=0.15), cloud(2000, seed=13, size=0.15)
+    bvh = traced(first)
+    bvh.update(then)
+    origins, directions = rays(1000, 12)
+    hits, again = trace(bvh, origins, directions), trace(traced(then), origins[::-3], directions[::-3])
+    for name in SurfelHits.__slots__:
+        np.testing.assert_array_equal(getattr(hits, name)[::-3], getattr(again, name), err_msg=name)
+
+
+def test_rays_that_are_not_finite_meet_nothing() -> None:
+    bvh = traced(cloud(500, seed=14, size=0.4))
+    origins, directions = rays(4, 14, spread=0.1)
+    origins[0, 1], directions[1, 2], directions[2] = np.nan, np.nan, 0.0
+    hits = trace(bvh, origins, directions)
+    np.testing.assert_array_equal(hits.object_index >= 0, [False, False, False, True])
+    np.testing.assert_array_equal(transmittance_many(bvh, origins, directions) < 1.0, [False, False, False, True])
+
+
 def test_no_surfels_no_hits() -> None:
     bvh = SurfelBVH()
     origins, directions = rays(20)
