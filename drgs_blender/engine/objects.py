@@ -83,6 +83,7 @@ def traced_object(state: ObjectState, asset: Asset) -> TraceObject:
         metallic=mesh.metallic if metallic is None else metallic,
         corner_normals=normals,
         pass_index=state.pass_index,
+        visibility=state.visibility,
     )
 
 

@@ -5,14 +5,11 @@ Usable without the process: ``Session().render(frame)`` gives the same bits as a
 
 from __future__ import annotations
 
-import copy
-import dataclasses
 import logging
 import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 
@@ -20,22 +17,20 @@ from ..asset.container import read_asset
 from ..asset.model import Asset, PosedSurfels
 from ..deform.mesh_driven import MeshDriven
 from ..errors import AssetError, Cancelled, UsageError
-from ..frame import Frame, ObjectState, World
+from ..frame import Frame, Image, MeshState, ObjectState, World
 from ..jit import use_threads
 from ..render.light import EnvironmentLight
 from ..render.pipeline import render
 from ..render.scene import TraceObject, TraceScene
 from .objects import join, posed_surfels, traced_object
 from .protocol import Passes
-from .slots import keep, same_bits
+from .snapshots import renewed
 
 logger = logging.getLogger(__name__)
 
 Array = np.ndarray
 OnProgress = Callable[[str, float], None]
 IsCancelled = Callable[[], bool]
-
-S = TypeVar("S", ObjectState, World)
 
 
 @dataclass(slots=True)
@@ -74,7 +69,10 @@ class Session:
     def __init__(self) -> None:
         self._assets: dict[str, _Loaded] = {}
         self._objects: list[_Object] = []
+        self._meshes: list[MeshState] = []
+        self._images: list[Image] = []
         self._scene = TraceScene()
+        self._current = True
         self._world: World | None = None
         self._light: EnvironmentLight | None = None
 
@@ -167,38 +165,48 @@ class Session:
                 )
             _check_surface(state, loaded.asset, with_surfels)
             known = self._objects[index] if index < len(self._objects) else None
-            if known is not None and known.loaded is loaded and _same(known.state, state):
+            kept = renewed(state, None if known is None else known.state)
+            if known is not None and known.loaded is loaded and known.state is kept:
                 item = known
             else:
-                kept = _snapshot(state)
                 item = _Object(kept, loaded, traced_object(kept, loaded.asset))
             if with_surfels and item.posed is None:
                 item.posed, item.lost = posed_surfels(item.state, index, loaded.surfels_of(item.state), item.traced)
             objects.append(item)
-        if len(objects) != len(self._objects) or any(a is not b for a, b in zip(objects, self._objects)):
-            self._objects = []  # an update that fails half way leaves nothing to be taken for current
-            self._scene.update([item.traced for item in objects])
-        self._objects = objects
+        meshes, images = renewed(frame.meshes, self._meshes), renewed(frame.images, self._images)
+        same = len(objects) == len(self._objects) and all(a is b for a, b in zip(objects, self._objects))
+        if not (self._current and same and meshes is self._meshes and images is self._images):
+            self._current = False  # an update that fails half way leaves nothing to be taken for current
+            self._scene.update([item.traced for item in objects], meshes, images)
+            self._current = True
+        self._objects, self._meshes, self._images = objects, meshes, images
         used = {state.asset for state in frame.objects}
         for key, loaded in self._assets.items():
             if key not in used:
                 loaded.driven = None
-        return join([item.posed for item in objects if item.posed is not None] if with_surfels else [])
+        seen = [item for item in objects if item.state.visibility.camera] if with_surfels else []
+        return join([item.posed for item in seen if item.posed is not None])
 
     def _warnings(self) -> list[str]:
         """What the user should know about the meshes of the last frame."""
         found = []
-        if not self._objects:
+        if not self._objects and not self._meshes:
             found.append("the frame has no DR-GS object; the picture shows the world alone")
-        for item, fault in zip(self._objects, self._scene.faults, strict=True):
+        lost = [item.lost for item in self._objects] + [0] * len(self._meshes)
+        for hidden, fault in zip(lost, self._scene.faults, strict=True):
             if fault.bad_vertices:
-                hidden = f" and {item.lost} surfels" if item.lost else ""
+                surfels = f" and {hidden} surfels" if hidden else ""
                 found.append(
                     f"{fault.name}: {fault.bad_vertices} vertices are not finite or too far away; "
-                    f"{fault.bad_faces} faces{hidden} are left out"
+                    f"{fault.bad_faces} faces{surfels} are left out"
                 )
             if fault.empty_faces:
                 found.append(f"{fault.name}: {fault.empty_faces} faces have no area; light passes through them")
+            if fault.bad_places:
+                found.append(
+                    f"{fault.name}: {fault.bad_places} instances are flat, not finite or too far away; left out"
+                )
+        found += self._scene.materials.warnings
         if self._light is not None and self._light.bad_texels:
             found.append(f"world: {self._light.bad_texels} texels are not finite or negative; they are black")
         return found
@@ -207,15 +215,15 @@ class Session:
 
     def _light_of(self, world: World) -> EnvironmentLight:
         """The light of `world`, made again only when something about it changed; a rotation costs nothing."""
-        known = self._world
-        if self._light is not None and known is not None:
-            if _same(known, world):
-                return self._light
-            if _same(dataclasses.replace(known, rotation=world.rotation), world):
-                self._light.rotation = np.ascontiguousarray(world.rotation, np.float32)
-                self._world = _snapshot(world)
-                return self._light
-        self._light, self._world = EnvironmentLight(world), _snapshot(world)
+        known, kept = self._world, renewed(world, self._world)
+        if self._light is None or known is None:
+            self._light = EnvironmentLight(kept)
+        elif kept is not known:
+            if all(getattr(kept, name) is getattr(known, name) for name in ("environment", "colour", "strength")):
+                self._light.rotation = np.ascontiguousarray(kept.rotation, np.float32)
+            else:
+                self._light = EnvironmentLight(kept)
+        self._world = kept
         return self._light
 
 
@@ -235,24 +243,3 @@ def _check(frame: Frame) -> None:
             raise UsageError(name, "is not finite", "Check the transform and its drivers")
     if frame.world.rotation.shape != (3, 3):
         raise UsageError("environment rotation", f"has shape {frame.world.rotation.shape}", "Give a 3 x 3 matrix")
-
-
-def _same(a: ObjectState | World, b: ObjectState | World) -> bool:
-    """Whether two dataclasses of one kind have the same values, arrays bit by bit."""
-    for f in dataclasses.fields(a):
-        x, y = getattr(a, f.name), getattr(b, f.name)
-        if isinstance(x, np.ndarray) and isinstance(y, np.ndarray):
-            if not same_bits(x, y):
-                return False
-        elif (x is None) != (y is None) or x != y:
-            return False
-    return True
-
-
-def _snapshot(state: S) -> S:
-    """A copy whose arrays nobody can change."""
-    copied = copy.copy(state)
-    for f in dataclasses.fields(state):
-        if isinstance(value := getattr(state, f.name), np.ndarray):
-            setattr(copied, f.name, keep(value))
-    return copied

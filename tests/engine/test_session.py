@@ -11,8 +11,9 @@ from drgs_blender.asset.container import read_asset, write_asset
 from drgs_blender.asset.model import Asset, Mesh, Surfels
 from drgs_blender.engine.objects import traced_object
 from drgs_blender.engine.session import Session
+from drgs_blender.engine.snapshots import renewed
 from drgs_blender.errors import AssetError, Cancelled, UsageError
-from drgs_blender.frame import ObjectState, World
+from drgs_blender.frame import Image, Material, MeshState, ObjectState, Texture, Visibility, World
 
 
 @pytest.fixture
@@ -58,6 +59,109 @@ def test_history_does_not_show(session, make_frame, asset_path):
     twins.objects = [two.objects[0], ObjectState("Ball", second.asset, second.matrix_world)]
     for frame in (*frames, two, swapped, twins, mesh, constant, painted, frames[0]):
         assert_same_bits(session.render(frame), fresh(asset_path, frame))
+
+
+def with_meshes(frame, **changes):
+    """The frame with a floor and two small squares in front of it, the latter with an image."""
+    square = np.float32([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    faces = np.int32([[0, 1, 2], [0, 2, 3]])
+    floor = np.diag([5.0, 5.0, 1.0, 1.0])
+    floor[2, 3] = -1.2
+    places = np.stack([np.diag([0.2, 0.2, 0.2, 1.0])] * 2)
+    places[:, :3, 3] = (0.8, 0.5, -0.5), (-0.8, 0.5, 0.5)
+    picture = Image("Picture", np.full((2, 2, 4), 200, np.uint8), "srgb")
+    painted = Material("Painted", (1, 1, 1), base_colour_texture=Texture("Picture"), emission=(0.1, 0.2, 0.3))
+    uvs = square[faces][:, :, :2].copy()
+    frame.meshes = [
+        MeshState("Floor", square.copy(), faces, floor[None], np.int32([5])),
+        MeshState("Squares", square.copy(), faces, places, np.int32([6, 7]), uvs=uvs, materials=[painted]),
+    ]
+    frame.images = [picture]
+    for path, value in changes.items():
+        index, name = path.split("_", 1)
+        setattr(frame.meshes["ab".index(index)], name, value)
+    return frame
+
+
+def test_history_of_meshes_does_not_show(session, make_frame, asset_path):
+    """As above with ordinary meshes next to the object: every change gives the bits of a fresh session."""
+    frames = [with_meshes(make_frame(0.1)) for _ in range(2)]
+    frames.append(with_meshes(make_frame(0.3)))
+    base = frames[0].meshes
+    for changes in (
+        {"a_matrices": base[0].matrices + 0.1},
+        {"b_matrices": base[1].matrices[::-1].copy()},
+        {"b_matrices": base[1].matrices[:1], "b_pass_indices": np.int32([9])},
+        {"b_vertices": base[1].vertices * 2},
+        {"a_visibility": Visibility(camera=False)},
+        {"a_visibility": Visibility(holdout=True)},
+        {"b_materials": [Material("Plain", (0.1, 0.9, 0.1))]},
+        {"b_uvs": base[1].uvs[::-1].copy()},
+    ):
+        frames.append(with_meshes(make_frame(0.1), **changes))
+    repainted = with_meshes(make_frame(0.1))
+    repainted.images[0].pixels[:] = 20
+    hidden = with_meshes(make_frame(0.1))
+    hidden.objects[0].visibility.camera = False
+    for frame in (*frames, repainted, hidden, make_frame(0.1), frames[0]):
+        assert_same_bits(session.render(frame), fresh(asset_path, frame))
+
+
+def test_only_what_changed_is_given_on(session, make_frame):
+    session.render(with_meshes(make_frame(0.1)))
+    floor, squares = session._meshes
+    built = session._scene.bvh.rebuilds
+    frame = with_meshes(make_frame(0.1))
+    frame.meshes[1].matrices[0, 0, 3] += 0.1
+    session.render(frame)
+    assert session._meshes[0] is floor and session._meshes[1] is not squares
+    assert session._meshes[1].vertices is squares.vertices and session._meshes[1].materials is squares.materials
+    assert session._scene.bvh.rebuilds == built
+    before = list(session._meshes)
+    session.render(frame)
+    assert all(a is b for a, b in zip(before, session._meshes, strict=True))
+
+
+def test_a_camera_that_does_not_see_the_object_sees_the_mesh_behind_it(session, make_frame):
+    frame = with_meshes(make_frame(0.0))
+    seen = session.render(frame)
+    frame.objects[0].visibility.camera = False
+    unseen = session.render(frame)
+    assert unseen["Depth"].max() <= seen["Depth"].max() + 1e-3 or (unseen["Depth"] == 1e10).any()
+    frame.objects = []
+    gone = session.render(frame)
+    np.testing.assert_array_equal(unseen["Depth"], gone["Depth"])
+    assert not np.array_equal(unseen["Combined"], gone["Combined"])  # it still throws shadows
+
+
+def test_unusable_instances_are_named(session, make_frame):
+    frame = with_meshes(make_frame())
+    frame.meshes[1].matrices[1] = np.nan
+    frame.meshes[1].materials[0].base_colour_texture.image = "Nothing"
+    passes = session.render(frame)
+    assert any(text.startswith("Squares: 1 instances are flat") for text in passes.warnings)
+    assert any("'Nothing' is missing" in text for text in passes.warnings)
+    assert all(np.isfinite(array).all() for array in passes.values())
+    assert session.render(with_meshes(make_frame())).warnings == []
+
+
+def test_renewed_shares_what_is_equal():
+    frame = with_meshes_state()
+    known = renewed(frame, None)
+    assert known is not frame and not known.vertices.flags.writeable
+    assert renewed(frame, known) is known
+    frame.materials[0].roughness = 0.25
+    changed = renewed(frame, known)
+    assert changed is not known and changed.vertices is known.vertices and changed.visibility is known.visibility
+    assert known.materials[0].roughness == 0.5 and changed.materials[0].roughness == 0.25
+    frame.vertices[0, 0] = np.nan
+    again = renewed(frame, changed)
+    assert again.vertices is not changed.vertices and renewed(frame, again) is again
+
+
+def with_meshes_state():
+    square = np.float32([[-1, -1, 0], [1, -1, 0], [1, 1, 0]])
+    return MeshState("Square", square, np.int32([[0, 1, 2]]), np.eye(4)[None], np.int32([0]))
 
 
 def test_array_changed_in_place_is_noticed(session, make_frame, asset_path):
