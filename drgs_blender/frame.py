@@ -256,7 +256,7 @@ class RenderSettings:
     bounces: int = 1
     aa: int = 4
     primary: Literal["surfels", "mesh"] = "surfels"
-    denoise: Literal["none", "svgf"] = "none"
+    denoise: Literal["none", "svgf", "oidn"] = "none"
     look: Literal["principled", "paper"] = "principled"
     film_transparent: bool = False
     seed: int = 0

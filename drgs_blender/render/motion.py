@@ -16,6 +16,7 @@ from ..jit import njit, prange
 from .camera import CX, CY, FX, FY, ORTHOGRAPHIC, POSITION, WIDTH
 from .film import SAME_SURFACE
 from .gbuffer import GBuffer
+from .points import CATCHER
 
 Array = np.ndarray
 
@@ -78,8 +79,8 @@ class MotionFilm:
         points = buffer.points
         start = np.searchsorted(points.pixel, np.arange(y0, y1 + 1, dtype=np.int64) * int(self.parameters[WIDTH]))
         _displace(
-            start, x0, self.parameters, points.pixel, points.weight, buffer.depth, buffer.position, previous,
-            self.displacement[y0 - top : y1 - top],
+            start, x0, self.parameters, points.pixel, points.weight, points.flags, buffer.depth, buffer.position,
+            previous, self.displacement[y0 - top : y1 - top],
         )  # fmt: skip
 
     def motion(self, position: Array, coverage: Array, before: Array) -> Motion:
@@ -144,7 +145,7 @@ def _previous(
 
 @njit(parallel=True)
 def _displace(
-    start: Any, x0: Any, p: Any, pixel: Any, weight: Any, depth: Any, position: Any, previous: Any, out: Any
+    start: Any, x0: Any, p: Any, pixel: Any, weight: Any, flags: Any, depth: Any, position: Any, previous: Any, out: Any
 ) -> None:
     """Mean displacement of the samples on the surface nearest to the camera, the same that make up Position."""
     width = np.int64(p[WIDTH])
@@ -154,22 +155,24 @@ def _displace(
     for y in prange(len(start) - 1):
         first = start[y]
         while first < start[y + 1]:
-            last = first + 1
-            nearest = depth[first]
+            last = first
+            nearest = np.float32(np.inf)
             while last < start[y + 1] and pixel[last] == pixel[first]:
-                nearest = min(nearest, depth[last])
+                if not flags[last] & CATCHER:
+                    nearest = min(nearest, depth[last])
                 last += 1
             limit = nearest * (np.float32(1.0) + per_depth) + fixed
             total = dx = dy = dz = np.float32(0.0)
             for i in range(first, last):
-                if depth[i] <= limit:
+                if depth[i] <= limit and not flags[i] & CATCHER:
                     w = weight[i]
                     total += w
                     dx += w * (previous[i, 0] - position[i, 0])
                     dy += w * (previous[i, 1] - position[i, 1])
                     dz += w * (previous[i, 2] - position[i, 2])
-            x = pixel[first] % width - x0
-            out[y, x, 0], out[y, x, 1], out[y, x, 2] = dx / total, dy / total, dz / total
+            if total > np.float32(0.0):
+                x = pixel[first] % width - x0
+                out[y, x, 0], out[y, x, 1], out[y, x, 2] = dx / total, dy / total, dz / total
             first = last
 
 

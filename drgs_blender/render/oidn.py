@@ -19,10 +19,23 @@ Array = np.ndarray
 def available() -> bool:
     """Whether `denoise_oidn` can work here."""
     try:
-        import pyoidn  # noqa: F401
-    except (ImportError, OSError):  # no wheel, or its libraries do not load
+        require()
+    except DeviceError:
         return False
     return True
+
+
+def require() -> Callable[..., Array]:
+    """The wheel's function; DeviceError, with what to do, where it is not installed or its libraries do not load."""
+    try:
+        from pyoidn import denoise
+    except (ImportError, OSError) as error:
+        raise DeviceError(
+            "denoiser OIDN",
+            f"cannot be loaded in the engine's Python ({error})",
+            "Install it there with `pip install pyoidn`, or choose SVGF",
+        ) from error
+    return denoise
 
 
 def denoise_oidn(
@@ -45,14 +58,7 @@ def denoise_oidn(
     ------
     DeviceError: the wheel is not installed, or it cannot work on this machine.
     """
-    try:
-        from pyoidn import denoise
-    except (ImportError, OSError) as error:
-        raise DeviceError(
-            "denoiser OIDN",
-            f"cannot be loaded in the engine's Python ({error})",
-            "Install it there with `pip install pyoidn`, or choose SVGF",
-        ) from error
+    run = require()
     cover = guides.coverage[..., None]
     albedo = np.ascontiguousarray(guides.albedo * cover, np.float32)
     normal = np.ascontiguousarray(guides.normal * cover, np.float32)
@@ -62,7 +68,7 @@ def denoise_oidn(
     for k, colour in enumerate(noisy):
         check()
         try:
-            out[:, :, k] = denoise(np.ascontiguousarray(colour), albedo, normal, hdr=True, clean_aux=True)
+            out[:, :, k] = run(np.ascontiguousarray(colour), albedo, normal, hdr=True, clean_aux=True)
         except RuntimeError as error:
             raise DeviceError("denoiser OIDN", f"failed ({error})", "Choose SVGF") from error
     return out

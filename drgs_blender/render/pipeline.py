@@ -22,6 +22,7 @@ from .film import COMPONENTS, Film
 from .gbuffer import GBuffer
 from .integrate import integrate
 from .light import EnvironmentLight
+from .oidn import denoise_oidn, require
 from .points import Radiance, ShadingPoints
 from .primary_mesh import primary_mesh
 from .primary_surfels import primary_surfels, snap_windows
@@ -86,7 +87,7 @@ def render(
         windows = snap_windows(scene, len(frame.objects))
     film = Film(camera, settings, parameters)
     _, top, _, bottom = camera.window
-    end = 0.9 if settings.denoise == "svgf" else 1.0
+    end = 1.0 if settings.denoise == "none" else 0.9
     batches = _Batches(settings)
     height = strip_height(camera.window[2] - camera.window[0], settings.aa)
     for y0 in range(top, bottom, height):
@@ -100,10 +101,13 @@ def render(
         radiance = batches.light(scene, light, buffer, frame.number, check)
         film.add(buffer, radiance, scene.pass_index, light)
     components = None
-    if settings.denoise == "svgf":
+    if settings.denoise != "none":
         tell(end, "Denoising")
         split = any(name in frame.passes for name in COMPONENTS)
-        components = denoise(film.components, film.variance, film.guides(), split, check)
+        if settings.denoise == "oidn":
+            components = denoise_oidn(film.components, film.guides(), split, check)
+        else:
+            components = denoise(film.components, film.variance, film.guides(), split, check)
     tell(1.0, "Done")
     return film.passes(frame.passes, components)
 
@@ -149,5 +153,7 @@ def _check(frame: Frame) -> None:
             raise UsageError(f"pass {name!r}", "does not exist", f"Choose from {', '.join(BY_NAME)}")
     if settings.primary not in ("surfels", "mesh"):
         raise UsageError("primary visibility", f"is {settings.primary!r}", "Choose surfels or mesh")
-    if settings.denoise not in ("none", "svgf"):
-        raise UsageError("denoiser", f"is {settings.denoise!r}", "Choose none or svgf")
+    if settings.denoise not in ("none", "svgf", "oidn"):
+        raise UsageError("denoiser", f"is {settings.denoise!r}", "Choose none, svgf or oidn")
+    if settings.denoise == "oidn":
+        require()  # before the work, not after it

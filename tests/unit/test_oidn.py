@@ -53,3 +53,14 @@ def test_absence_is_an_error_with_a_remedy(monkeypatch: pytest.MonkeyPatch) -> N
     assert not available()
     with pytest.raises(DeviceError, match="pip install pyoidn"):
         denoise_oidn(light, guides)
+
+
+def test_the_pipeline_says_so_before_it_renders(monkeypatch: pytest.MonkeyPatch) -> None:
+    from drgs_blender.frame import Camera, Frame, RenderSettings
+    from drgs_blender.render.pipeline import render
+
+    monkeypatch.setitem(sys.modules, "pyoidn", None)
+    camera = Camera(np.eye(4), 8, 8, 8.0, 8.0, 4.0, 4.0)
+    frame = Frame(1, camera, [], settings=RenderSettings(denoise="oidn"))
+    with pytest.raises(DeviceError, match="OIDN"):
+        render(None, None, None, frame)  # type: ignore[arg-type]

@@ -161,6 +161,27 @@ def test_vectors_lead_to_the_place_in_the_picture_before() -> None:
     assert np.isnan(found.vector).all()
 
 
+def test_samples_make_up_a_pixels_motion_as_they_make_up_its_position() -> None:
+    """Two samples near, one far behind, one of a shadow catcher in front: the near ones count, by weight."""
+    from drgs_blender.render.gbuffer import compact
+    from drgs_blender.render.points import CATCHER
+
+    alpha = np.zeros((H, W, 4), np.float32)
+    alpha[7, 9] = 1.0
+    p = parameters()
+    buffer, _ = compact(alpha, p, 0, 0)
+    buffer.position[:] = 0
+    buffer.depth[:] = [1.0, 1.001, 2.0, 0.5]
+    buffer.points.weight[:] = [0.25, 0.75, 1.0, 1.0]
+    buffer.points.flags[3] = CATCHER
+    previous = np.float32([[4, 0, 0], [0, 4, 0], [9, 9, 9], [7, 7, 7]])
+    film = MotionFilm((H, W), (0, 0), p)
+    film.add(buffer, previous)
+    assert np.allclose(film.displacement[7, 9], [1, 3, 0])
+    film.displacement[7, 9] = 0
+    assert (film.displacement == 0).all()
+
+
 # --- accumulation ---------------------------------------------------------------------------------------------------
 
 
