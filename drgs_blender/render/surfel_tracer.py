@@ -9,8 +9,8 @@ Surfels are two-sided: each one's normals are turned towards the ray before they
 more than `gap` times the mean of the sizes on both sides, a new surface begins, and the hit is the heaviest surface
 alone, as in `raster`: no point lies in the air between two. An infinite gap blends the whole ray, as the paper does.
 
-Rays that start on surfels must not be stopped by those very surfels; see OWN_REACH in `surfel_bvh` for the rule, which
-needs the object, normal and size of what the ray starts on. Only surfels of that object are ever left out.
+Rays that start on surfels must not be stopped by those very surfels; see OWN_REACH in `surfel_query` for the rule,
+which needs the object, normal and size of what the ray starts on. Only surfels of that object are ever left out.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from ..errors import UsageError
 from ..jit import get_num_threads, njit, prange
 from .raster import GAP
 from .sampling import ONE, ZERO, F
-from .surfel_bvh import (
-    ALBEDO,
+from .surfel_bvh import ALBEDO, METALLIC, NORMAL, PLANE, ROUGHNESS, SIZE, SurfelBVH
+from .surfel_query import (
     ALPHAS,
     CAPACITY,
     COUNT,
@@ -34,14 +34,8 @@ from .surfel_bvh import (
     INDICES,
     LAST_INDEX,
     LAST_T,
-    METALLIC,
     MIN_TRANSMITTANCE,
-    NORMAL,
-    PLANE,
     PRODUCT,
-    ROUGHNESS,
-    SIZE,
-    SurfelBVH,
     begin_query,
     cast,
     load_double,

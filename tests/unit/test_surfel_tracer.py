@@ -14,7 +14,8 @@ from shapes import sphere_surfels
 
 from drgs_blender.asset.model import PosedSurfels
 from drgs_blender.errors import UsageError
-from drgs_blender.render.surfel_bvh import CAPACITY, SurfelBVH
+from drgs_blender.render.surfel_bvh import SurfelBVH
+from drgs_blender.render.surfel_query import CAPACITY
 from drgs_blender.render.surfel_tracer import Starts, SurfelHits, trace, transmittance_many
 
 Array = np.ndarray
