@@ -34,11 +34,12 @@ def update_of(levels: int) -> list[object]:
     n = len(ball.vertices)
     scene, step = TraceScene(), iter(range(1000))
     grey, rough = np.full((n, 3), 0.5, np.float32), np.full(n, 0.5, np.float32)
+    faces = ball.faces.astype(np.int32)
 
     def move() -> None:
         vertices = (ball.vertices * (1 + 0.001 * next(step))).astype(np.float32)
         began = time.perf_counter()
-        scene.update([TraceObject("ball", vertices, ball.faces.astype(np.int32), grey, rough, rough)])
+        scene.update([TraceObject("ball", vertices, faces, grey, rough, rough)])
         times.append(time.perf_counter() - began)
 
     times: list[float] = []

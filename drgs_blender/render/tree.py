@@ -22,7 +22,7 @@ ALL = -1
 #: Rebuild when the boxes of neighbouring triangles have grown this much against the whole scene's box.
 _DEGRADED = 2.0
 _RUN = 32  # neighbouring triangles in one box of that measure
-_RUNS = 2048  # boxes looked at
+_RUNS = 1024  # boxes looked at
 
 
 @dataclass(slots=True)
@@ -66,23 +66,27 @@ def _occluded(address, scene, origins, directions, tnear, tfar, mask, out):  # t
             )  # fmt: skip
 
 
-@njit
+@njit(parallel=True)
 def looseness(vertices, faces, runs):  # type: ignore[no-untyped-def]
     """Summed box surface of runs of once neighbouring triangles, relative to the box of them all."""
+    boxes = np.empty((len(runs), 6), np.float32)
+    for g in prange(len(runs)):
+        x0 = y0 = z0 = np.float32(np.inf)
+        x1 = y1 = z1 = np.float32(-np.inf)
+        for k in range(runs.shape[1]):
+            for c in range(3):
+                v = faces[runs[g, k], c]
+                x, y, z = vertices[v, 0], vertices[v, 1], vertices[v, 2]
+                x0, y0, z0 = min(x0, x), min(y0, y), min(z0, z)
+                x1, y1, z1 = max(x1, x), max(y1, y), max(z1, z)
+        boxes[g, 0], boxes[g, 1], boxes[g, 2], boxes[g, 3], boxes[g, 4], boxes[g, 5] = x0, y0, z0, x1, y1, z1
     total = 0.0
     lowest, highest = np.full(3, np.inf), np.full(3, -np.inf)
-    low, high = np.empty(3), np.empty(3)
     for g in range(len(runs)):
-        low[:], high[:] = np.inf, -np.inf
-        for f in runs[g]:
-            for c in range(3):
-                for a in range(3):
-                    x = vertices[faces[f, c], a]
-                    low[a], high[a] = min(low[a], x), max(high[a], x)
-        x, y, z = high[0] - low[0], high[1] - low[1], high[2] - low[2]
+        x, y, z = boxes[g, 3] - boxes[g, 0], boxes[g, 4] - boxes[g, 1], boxes[g, 5] - boxes[g, 2]
         total += x * y + y * z + z * x
         for a in range(3):
-            lowest[a], highest[a] = min(lowest[a], low[a]), max(highest[a], high[a])
+            lowest[a], highest[a] = min(lowest[a], boxes[g, a]), max(highest[a], boxes[g, 3 + a])
     x, y, z = highest[0] - lowest[0], highest[1] - lowest[1], highest[2] - lowest[2]
     whole = x * y + y * z + z * x
     return total / whole if whole > 0.0 else 0.0
