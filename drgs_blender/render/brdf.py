@@ -83,6 +83,30 @@ def fresnel(vh, r, g, b, metallic, look):  # type: ignore[no-untyped-def]
 
 
 @njit
+def glossy_normal(nx, ny, nz, gx, gy, gz, vx, vy, vz):  # type: ignore[no-untyped-def]
+    """Shading normal of the specular lobe: turned until the mirror direction is just above the face.
+
+    A smooth normal far from the geometric normal g would mirror the viewer v into the surface; Cycles turns it as far
+    as needed (``ensure_valid_specular_reflection``), in the plane of both normals. All of unit length, g.v >= 0.
+    """
+    nv = nx * vx + ny * vy + nz * vz
+    gv = gx * vx + gy * vy + gz * vz
+    ng = nx * gx + ny * gy + nz * gz
+    least = min(F(0.9) * gv, F(0.01))
+    if TWO * nv * ng - gv >= least or ng > F(0.999999):
+        return nx, ny, nz
+    tx, ty, tz = nx - ng * gx, ny - ng * gy, nz - ng * gz
+    scale = ONE / math.sqrt(max(tx * tx + ty * ty + tz * tz, F(1e-30)))
+    tx, ty, tz = tx * scale, ty * scale, tz * scale
+    tv = tx * vx + ty * vy + tz * vz
+    # With m = cos(a) g + sin(a) t, the mirror direction's height above the face is |(tv, gv)| cos(2 a - angle(tv, gv)).
+    length = max(math.sqrt(tv * tv + gv * gv), F(1e-30))
+    angle = HALF * (F(math.atan2(tv, gv)) + F(math.acos(min(ONE, least / length))))
+    s, c = F(math.sin(angle)), F(math.cos(angle))
+    return c * gx + s * tx, c * gy + s * ty, c * gz + s * tz
+
+
+@njit
 def ggx(nl, nv, nh2, sin2, a2):  # type: ignore[no-untyped-def]
     """D G / (4 nl nv) of GGX with height-correlated Smith, and D; nh2 = cos^2, sin2 = sin^2 of the half vector.
 
@@ -124,12 +148,11 @@ def sample_vndf(u, v, ix, iy, iz, alpha, bound):  # type: ignore[no-untyped-def]
 def evaluate(nl, nv, vl, nh2, sin2, r, g, b, kd, metallic, a2, norm, look):  # type: ignore[no-untyped-def]
     """Diffuse and specular (RGB each) BRDF values and the density of ``sample_vndf``; all without the cosine.
 
-    nl > 0; where nv <= 0 the specular lobe is black, as in Cycles.
+    nl > 0; where nv <= 0 the specular lobe is black, as in Cycles. Without branches, so that loops over it vectorise.
     """
     k = kd * INVERSE_PI
-    if nv <= ZERO:
-        return k * r, k * g, k * b, ZERO, ZERO, ZERO, ZERO
     value, d = ggx(nl, nv, nh2, sin2, a2)
+    value, d = value if nv > ZERO else ZERO, d if nv > ZERO else ZERO
     fr, fg, fb = fresnel(math.sqrt(max(ZERO, HALF + HALF * vl)), r, g, b, metallic, look)
     return k * r, k * g, k * b, value * fr, value * fg, value * fb, d * norm
 

@@ -1,49 +1,64 @@
-"""Light at the visible points: multi-strategy direct light with ray-traced visibility, then a path traced on.
+"""Light at the visible points: multi-strategy direct light with ray-traced visibility, then paths traced on.
 
-See docs/rendering.md for the estimator. Everything here runs per point, in blocks, in parallel; a point's result
-depends on nothing but the point, the scene, the light, the settings, the seed and the frame number.
+See docs/rendering.md for the estimator. Everything here runs in blocks of points, in parallel, each block in batches of
+rays (`wave`); a point's result depends on nothing but the point, the scene, the light, the settings, the seed and the
+frame number.
 """
 
 from __future__ import annotations
 
-import math
+from typing import Any
 
 import numpy as np
 
 from ..errors import UsageError
 from ..frame import RenderSettings
 from ..jit import get_num_threads, njit, prange
-from . import brdf, sampling
-from .embree import closest_hit, occluded
-from .light import EnvironmentLight, density_at, radiance_at, sample_map, to_map
-from .points import Radiance, ShadingPoints
-from .sampling import GOLDEN, INVERSE_PI, ONE, TWO, ZERO, F, U, mix, unit
+from . import brdf, masks, sampling
+from . import wave as w
+from .lamp_shapes import DIFFUSE, GLOSSY
+from .lamps import Lamps, lamps_along
+from .light import EnvironmentLight, sky_radiance
+from .paths import CARRIED, EMITTED, FOUND, INDIRECT, add_path, lifted, trace_paths
+from .points import CATCHER, SECOND, Radiance, ShadingPoints
+from .sampling import GOLDEN, ONE, ZERO, F, U, mix, unit
 from .scene import TraceScene
+from .surface import nearest
 
 Array = np.ndarray
 
 _FAR = F(np.inf)
-_BLOCK = 64
-_RED, _GREEN, _BLUE = F(0.2126), F(0.7152), F(0.0722)
-_TINY = F(1e-30)
-#: Ray offset from the surface: relative to the point's own and to the scene's largest coordinate.
-_OFFSET_POINT, _OFFSET_SCENE = F(1e-5), F(2e-6)
-#: Russian roulette starts after this many bounces.
-_SURE_BOUNCES = 3
+#: Points of a block, and rays of a batch: few enough for the second cache, enough to fill vectors.
+_BLOCK, _BATCH = 64, 512
+#: Strategies in the order of ``RenderSettings``' counts; the samples of the last are divided between sky and lamps.
+_COSINE, _GGX, _SKY, _LAMPS = range(4)
+#: Columns of a block's sums, once each for direct and indirect light and that of emitting surfaces: diffuse and glossy
+#: light, then sum and sum of squares of the luminance of each.
+_KIND, _MOMENTS = 10, 6
+#: Least share of the light samples that go to sky or lamps when both shine.
+_LEAST_SHARE = 0.1
 
 
 def integrate(
-    scene: TraceScene, light: EnvironmentLight, points: ShadingPoints, settings: RenderSettings, frame_number: int
+    scene: TraceScene,
+    light: EnvironmentLight,
+    points: ShadingPoints,
+    settings: RenderSettings,
+    frame_number: int,
+    lamps: Lamps | None = None,
+    part: tuple[int, int] = (0, 1),
 ) -> Radiance:
     """Light that leaves `points` towards the camera.
 
     Parameters
     ----------
-    scene, light : what rays meet, and what they see when they meet nothing
+    scene, light, lamps : what rays meet, what they see when they meet nothing, and what shines in between
     points : visible points, world space
     settings : ``cosine``, ``ggx`` and ``environment`` samples a pixel, divided among its ``aa`` sub-samples;
-        ``bounces``, ``look``, ``seed``
+        ``bounces``, ``look``, ``seed``, ``clamp_indirect``
     frame_number : int, part of the seed
+    part : (i, n): only the i-th of n equal parts of each sub-sample's samples, which must be divisible by n; the mean
+        over all parts is the whole
 
     Returns
     -------
@@ -64,30 +79,73 @@ def integrate(
         raise UsageError("render settings", f"look {settings.look!r} is unknown", "Use principled or paper")
     n = len(points)
     components, variance = np.zeros((n, 4, 3), np.float32), np.zeros((n, 2), np.float32)
-    if n == 0 or light.black or sum(counts) == 0:
+    lamps = lamps or _NO_LAMPS
+    only_objects = scene.vertex_faces == len(scene.faces)  # which emit nothing
+    if n == 0 or sum(counts) == 0 or (light.black and not lamps.count and only_objects):
         return Radiance(components, variance)
-    _kernel(
-        (points.pixel, points.sample),
-        (points.origin, points.normal, points.geometric_normal, points.view),
-        (points.albedo, points.roughness, points.metallic),
-        (scene.bvh.intersect_address, scene.bvh.occluded_address, scene.bvh.scene),
-        (scene.shading_faces, scene.shading, F(scene.extent)),
-        (light.texels, light.cells, light.guide, light.row_z, light.rotation),
+    share = sky_share(light, lamps)
+    tables = (
+        scene.tracer,
+        scene.geometry,
+        F(scene.extent),
+        light.sky,
+        (not light.black, U(min(share * 2.0**32, 2.0**32 - 1))),
+        (lamps.table, lamps.pick),
         brdf.layer_table(),
         (
             sampling.sobol(max(counts)),
             np.array(counts, np.int32),
             np.array([(1 << (32 - max(0, (n - 1).bit_length()))) - 1 for n in counts], np.uint32),
         ),
+    )
+    samples = [count / settings.aa / part[1] for count in counts]
+    shares = (F(samples[0]), F(samples[1]), F(samples[2] * share), F(samples[2] * (1.0 - share)))
+    rules = (
         settings.aa,
+        part,
+        shares,
         settings.bounces,
         brdf.LOOKS[settings.look],
         U(mixed(settings.seed, frame_number)),
-        8 * get_num_threads(),
-        components,
-        variance,
+        F(settings.clamp_indirect / max(1.0, sum(samples))),
+        lamps.rays_differ,
     )
-    return Radiance(components, variance)
+
+    def run(some: ShadingPoints, shift: int, components: Array, variance: Array) -> None:
+        _kernel(
+            (some.pixel, some.sample, some.flags),
+            (some.origin, some.normal, some.geometric_normal, some.view),
+            (some.albedo, some.roughness, some.metallic),
+            *tables,
+            *rules,
+            shift,
+            8 * get_num_threads(),
+            components,
+            variance,
+        )
+
+    run(points, 0, components, variance)
+    unshadowed = None
+    caught = np.flatnonzero(points.flags & CATCHER)
+    if len(caught):
+        alone = np.zeros((len(caught), 4, 3), np.float32)
+        run(points[caught], masks.WITHOUT, alone, np.zeros((len(caught), 2), np.float32))
+        unshadowed = np.zeros(n, np.float32)
+        unshadowed[caught] = alone.sum(axis=1) @ np.array([0.2126, 0.7152, 0.0722], np.float32)
+    return Radiance(components, variance, unshadowed)
+
+
+def sky_share(light: EnvironmentLight, lamps: Lamps) -> float:
+    """Part of the light samples that go to the environment; the others go to lamps."""
+    if not lamps.count:
+        return 1.0
+    if light.black:
+        return 0.0
+    share = light.power / (light.power + lamps.power) if lamps.power > 0.0 else 1.0
+    return float(min(max(share, _LEAST_SHARE), 1.0 - _LEAST_SHARE))
+
+
+_NO_LAMPS = Lamps([])
 
 
 def mixed(seed: int, frame_number: int) -> int:
@@ -99,244 +157,308 @@ def mixed(seed: int, frame_number: int) -> int:
 
 
 @njit
-def _offset(px, py, pz, gx, gy, gz, extent):  # type: ignore[no-untyped-def]
-    """Lift a ray's start off the surface by more than rounding can push it below."""
-    lift = _OFFSET_POINT * max(abs(px), max(abs(py), abs(pz))) + _OFFSET_SCENE * extent
-    return px + lift * gx, py + lift * gy, pz + lift * gz
+def _heads(first: Any, last: Any, frames: Any, surfaces: Any, extent: Any, look: Any, table: Any, head: Any) -> None:
+    """What all samples of a point share: start of its rays, alpha squared (-1: unusable), diffuse weight, normal m."""
+    origin, normal, flat, view = frames
+    albedo, roughness, metallic = surfaces
+    for i in range(first, last):
+        h = i - first
+        check = roughness[i] + metallic[i]
+        for k in range(3):
+            check += origin[i, k] + normal[i, k] + flat[i, k] + view[i, k] + albedo[i, k]
+        if not abs(check) < F(1e18):
+            head[h, 3] = -ONE
+            continue
+        gx, gy, gz, vx, vy, vz = flat[i, 0], flat[i, 1], flat[i, 2], view[i, 0], view[i, 1], view[i, 2]
+        head[h, 0], head[h, 1], head[h, 2] = lifted(origin[i, 0], origin[i, 1], origin[i, 2], gx, gy, gz, extent)
+        mx, my, mz = brdf.glossy_normal(normal[i, 0], normal[i, 1], normal[i, 2], gx, gy, gz, vx, vy, vz)
+        head[h, 3] = brdf.alpha_squared(roughness[i])
+        head[h, 4] = brdf.diffuse_weight(roughness[i], metallic[i], mx * vx + my * vy + mz * vz, look, table)
+        head[h, 5], head[h, 6], head[h, 7] = mx, my, mz
 
 
 @njit
-def _half_vector(nx, ny, nz, vx, vy, vz, lx, ly, lz, nl, nv):  # type: ignore[no-untyped-def]
-    """(v . l, cos^2, sin^2) of the angle between the normal and the half vector."""
-    vl = vx * lx + vy * ly + vz * lz
-    inverse = ONE / max(TWO + TWO * vl, _TINY)
-    hx, hy, hz = vx + lx, vy + ly, vz + lz
-    cx, cy, cz = ny * hz - nz * hy, nz * hx - nx * hz, nx * hy - ny * hx
-    return vl, (nl + nv) * (nl + nv) * inverse, (cx * cx + cy * cy + cz * cz) * inverse
+def _put(s: Any, ints: Any, slot: Any, i: Any, h: Any, frames: Any, surfaces: Any, head: Any) -> None:
+    """Copy point i, the h-th of its block, into a slot."""
+    _, normal, flat, view = frames
+    albedo, _, metallic = surfaces
+    a, c = w.at(slot)
+    s[a + w.OX], s[a + w.OY], s[a + w.OZ] = head[h, 0], head[h, 1], head[h, 2]
+    s[a + w.NX], s[a + w.NY], s[a + w.NZ] = normal[i, 0], normal[i, 1], normal[i, 2]
+    s[a + w.MX], s[a + w.MY], s[a + w.MZ] = head[h, 5], head[h, 6], head[h, 7]
+    s[a + w.GX], s[a + w.GY], s[a + w.GZ] = flat[i, 0], flat[i, 1], flat[i, 2]
+    s[a + w.VX], s[a + w.VY], s[a + w.VZ] = view[i, 0], view[i, 1], view[i, 2]
+    s[a + w.AR], s[a + w.AG], s[a + w.AB] = albedo[i, 0], albedo[i, 1], albedo[i, 2]
+    s[a + w.METALLIC], s[a + w.A2], s[a + w.KD] = metallic[i], head[h, 3], head[h, 4]
+    ints[c + w.OWNER] = U(h)
 
 
 @njit
-def _beyond(ox, oy, oz, dx, dy, dz, hit, tracer, geometry, light, table, look, bounces, key):  # type: ignore[no-untyped-def]
-    """Radiance that comes back along a ray that hit a surface: a path of up to `bounces` vertices from that hit on.
+def _add(sums: Any, h: Any, kind: Any, qr: Any, qg: Any, qb: Any, sr: Any, sg: Any, sb: Any) -> None:
+    """Add what one sample found, diffuse and glossy, to the sums of point h.
 
-    At each vertex one environment sample and one BRDF sample, combined by the balance heuristic.
+    The kinds of light are kept apart because they come in an order that depends on the neighbours.
     """
-    intersect_address, occluded_address, tree = tracer
-    shading_faces, shading, extent = geometry
-    texels, cells, guide, row_z, rotation = light
-    red = green = blue = ZERO
-    tr = tg = tb = ONE
-    t, face, hu, hv, gx, gy, gz = hit
-    for bounce in range(bounces):
-        px, py, pz = ox + t * dx, oy + t * dy, oz + t * dz
-        i, j, k = shading_faces[face, 0], shading_faces[face, 1], shading_faces[face, 2]
-        hw = ONE - hu - hv
-        nx = hw * shading[i, 0] + hu * shading[j, 0] + hv * shading[k, 0]
-        ny = hw * shading[i, 1] + hu * shading[j, 1] + hv * shading[k, 1]
-        nz = hw * shading[i, 2] + hu * shading[j, 2] + hv * shading[k, 2]
-        ar = hw * shading[i, 3] + hu * shading[j, 3] + hv * shading[k, 3]
-        ag = hw * shading[i, 4] + hu * shading[j, 4] + hv * shading[k, 4]
-        ab = hw * shading[i, 5] + hu * shading[j, 5] + hv * shading[k, 5]
-        roughness = hw * shading[i, 6] + hu * shading[j, 6] + hv * shading[k, 6]
-        metallic = hw * shading[i, 7] + hu * shading[j, 7] + hv * shading[k, 7]
-        # Both sides are the same: the geometric normal faces the ray, the shading normal follows it.
-        scale = ONE / math.sqrt(max(gx * gx + gy * gy + gz * gz, _TINY))
-        if gx * dx + gy * dy + gz * dz > ZERO:
-            scale = -scale
-        gx, gy, gz = gx * scale, gy * scale, gz * scale
-        length = nx * nx + ny * ny + nz * nz
-        if length > F(1e-12):
-            scale = ONE / math.sqrt(length)
-            if gx * nx + gy * ny + gz * nz < ZERO:
-                scale = -scale
-            nx, ny, nz = nx * scale, ny * scale, nz * scale
-        else:
-            nx, ny, nz = gx, gy, gz
-        ox, oy, oz = _offset(px, py, pz, gx, gy, gz, extent)
-        vx, vy, vz = -dx, -dy, -dz
-        nv = nx * vx + ny * vy + nz * vz
-        a2 = brdf.alpha_squared(roughness)
-        kd = brdf.diffuse_weight(roughness, metallic, nv, look, table)
-        bound, norm, share = ZERO, ZERO, ONE
-        if nv > ZERO:
-            bound, norm = brdf.vndf_terms(nv, a2)
-            fr, fg, fb = brdf.fresnel(nv, ar, ag, ab, metallic, look)
-            diffuse = kd * (_RED * ar + _GREEN * ag + _BLUE * ab)
-            glossy = _RED * fr + _GREEN * fg + _BLUE * fb
-            share = min(max(diffuse / max(diffuse + glossy, _TINY), F(0.1)), F(0.9))
-        rest = ONE - share
-
-        key = U(key + GOLDEN)
-        n0, n1 = mix(key), mix(U(key + U(0x68E31DA4)))
-        n2 = mix(U(key + U(0xB5297A4D)))
-        lx, ly, lz, u, v, pe = sample_map(n0, n1, n2, texels, cells, guide, row_z, rotation)
-        nl = nx * lx + ny * ly + nz * lz
-        if nl > ZERO and gx * lx + gy * ly + gz * lz > ZERO:
-            vl, nh2, sin2 = _half_vector(nx, ny, nz, vx, vy, vz, lx, ly, lz, nl, nv)
-            qr, qg, qb, sr, sg, sb, pg = brdf.evaluate(nl, nv, vl, nh2, sin2, ar, ag, ab, kd, metallic, a2, norm, look)
-            er, eg, eb = radiance_at(u, v, texels)
-            weight = nl / (pe + share * nl * INVERSE_PI + rest * pg)
-            er, eg, eb = tr * er * (qr + sr) * weight, tg * eg * (qg + sg) * weight, tb * eb * (qb + sb) * weight
-            if er + eg + eb > ZERO and not occluded(occluded_address, tree, ox, oy, oz, lx, ly, lz, ZERO, _FAR):
-                red, green, blue = red + er, green + eg, blue + eb
-
-        bx, by, bz, cx, cy, cz = sampling.basis(nx, ny, nz)
-        n0, n1, n2 = mix(U(key + U(0x7FEB352D))), mix(U(key + U(0x2C1B3C6D))), mix(U(key + U(0x297A2D39)))
-        if unit(n2) < share:
-            x, y, z = sampling.cosine_hemisphere(unit(n0), unit(n1))
-        else:
-            x, y = bx * vx + by * vy + bz * vz, cx * vx + cy * vy + cz * vz
-            x, y, z = brdf.sample_vndf(unit(n0), unit(n1), x, y, nv, math.sqrt(a2), bound)
-        lx, ly, lz = x * bx + y * cx + z * nx, x * by + y * cy + z * ny, x * bz + y * cz + z * nz
-        nl = z
-        if not (nl > ZERO and gx * lx + gy * ly + gz * lz > ZERO):
-            break
-        vl, nh2, sin2 = _half_vector(nx, ny, nz, vx, vy, vz, lx, ly, lz, nl, nv)
-        qr, qg, qb, sr, sg, sb, pg = brdf.evaluate(nl, nv, vl, nh2, sin2, ar, ag, ab, kd, metallic, a2, norm, look)
-        pb = share * nl * INVERSE_PI + rest * pg
-        fr, fg, fb = tr * (qr + sr) * nl, tg * (qg + sg) * nl, tb * (qb + sb) * nl
-        last = bounce + 1 == bounces
-        if last:
-            free = not occluded(occluded_address, tree, ox, oy, oz, lx, ly, lz, ZERO, _FAR)
-        else:
-            t, face, hu, hv, gx, gy, gz = closest_hit(intersect_address, tree, ox, oy, oz, lx, ly, lz, ZERO, _FAR)
-            free = face < 0
-        if free:
-            u, v = to_map(lx, ly, lz, rotation)
-            er, eg, eb = radiance_at(u, v, texels)
-            weight = ONE / (pb + density_at(u, v, texels))
-            red, green, blue = red + fr * er * weight, green + fg * eg * weight, blue + fb * eb * weight
-        if free or last:
-            break
-        weight = ONE / pb
-        tr, tg, tb = fr * weight, fg * weight, fb * weight
-        if bounce + 1 >= _SURE_BOUNCES:
-            survive = min(ONE, max(tr, max(tg, tb)))
-            if not unit(mix(U(key + U(0x165667B1)))) < survive:
-                break
-            tr, tg, tb = tr / survive, tg / survive, tb / survive
-        dx, dy, dz = lx, ly, lz
-    return red, green, blue
+    k = _KIND * kind
+    sums[h, k] += qr
+    sums[h, k + 1] += qg
+    sums[h, k + 2] += qb
+    sums[h, k + 3] += sr
+    sums[h, k + 4] += sg
+    sums[h, k + 5] += sb
+    value = w.luminance(qr, qg, qb)
+    sums[h, k + 6] += value
+    sums[h, k + 7] += value * value
+    value = w.luminance(sr, sg, sb)
+    sums[h, k + 8] += value
+    sums[h, k + 9] += value * value
 
 
 @njit
-def _point(  # type: ignore[no-untyped-def]
-    pixel, sample, surface, frame, tracer, geometry, light, table, numbers, aa, bounces, look, seed, components,
-    variance, i,
-):  # fmt: skip
-    """All samples of one visible point."""
-    ox, oy, oz, nx, ny, nz, gx, gy, gz, vx, vy, vz = frame
-    ar, ag, ab, roughness, metallic = surface
-    intersect_address, _, tree = tracer
-    sequence, counts, strata = numbers
-    texels, cells, guide, row_z, rotation = light
-    ox, oy, oz = _offset(ox, oy, oz, gx, gy, gz, geometry[2])
-    nv = nx * vx + ny * vy + nz * vz
-    a2 = brdf.alpha_squared(roughness)
-    alpha = math.sqrt(a2)
-    kd = brdf.diffuse_weight(roughness, metallic, nv, look, table)
-    bound, norm = brdf.vndf_terms(max(nv, ZERO), a2)
-    bx, by, bz, cx, cy, cz = sampling.basis(nx, ny, nz)
-    ix, iy = bx * vx + by * vy + bz * vz, cx * vx + cy * vy + cz * vz
-    share = ONE / F(aa)
-    n_cosine, n_ggx, n_light = F(counts[0]) * share, F(counts[1]) * share, F(counts[2]) * share
-    pixel_key = mix(U(seed ^ mix(U(pixel))))
-    diffuse_1 = diffuse_2 = glossy_1 = glossy_2 = ZERO
-    total = 0
-    for strategy in range(3):
-        key = mix(U(pixel_key + U(U(strategy + 1) * GOLDEN)))
-        # The point set fills strata of 2^32 / n; below them every point is moved by itself.
-        below = strata[strategy]
-        shift_0, shift_1 = U(mix(U(key + U(1))) & ~below), U(mix(U(key + U(2))) & ~below)
-        shift_2 = U(mix(U(key + U(3))) & ~below)
-        # This sub-sample's part of the pixel's samples: n / aa on average, n over all sub-samples together.
-        dither = unit(mix(U(key + U(4)))) if counts[strategy] % aa else ZERO
-        step = F(counts[strategy]) * share
-        first = np.int32(F(sample) * step + dither)
-        past = np.int32(F(sample + 1) * step + dither) if sample + 1 < aa else counts[strategy]
-        for j in range(first, past):
-            total += 1
-            own = mix(U(key ^ U(U(j + 1) * U(0x85EBCA6B))))
-            n0 = U((sequence[j, 0] ^ shift_0) + (mix(U(own + U(5))) & below))
-            n1 = U((sequence[j, 1] ^ shift_1) + (mix(U(own + U(6))) & below))
-            u = v = pe = ZERO
-            if strategy == 2:
-                n2 = U((sequence[j, 2] ^ shift_2) + (mix(U(own + U(7))) & below))
-                lx, ly, lz, u, v, pe = sample_map(n2, n0, n1, texels, cells, guide, row_z, rotation)
-                nl = nx * lx + ny * ly + nz * lz
-            else:
-                if strategy == 0:
-                    x, y, nl = sampling.cosine_hemisphere(unit(n0), unit(n1))
-                elif nv > ZERO:
-                    x, y, nl = brdf.sample_vndf(unit(n0), unit(n1), ix, iy, nv, alpha, bound)
-                else:
-                    continue
-                lx, ly, lz = x * bx + y * cx + nl * nx, x * by + y * cy + nl * ny, x * bz + y * cz + nl * nz
-            if not (nl > ZERO and gx * lx + gy * ly + gz * lz > ZERO):
-                continue
-            vl, nh2, sin2 = _half_vector(nx, ny, nz, vx, vy, vz, lx, ly, lz, nl, nv)
-            qr, qg, qb, sr, sg, sb, pg = brdf.evaluate(nl, nv, vl, nh2, sin2, ar, ag, ab, kd, metallic, a2, norm, look)
-            hit = closest_hit(intersect_address, tree, ox, oy, oz, lx, ly, lz, ZERO, _FAR)
-            free = hit[1] < 0
-            if not free and bounces == 0:
-                continue
-            if strategy != 2:
-                u, v = to_map(lx, ly, lz, rotation)
-                pe = density_at(u, v, texels)
-            if free:
-                er, eg, eb = radiance_at(u, v, texels)
-                row = 0
-            else:
-                er, eg, eb = _beyond(ox, oy, oz, lx, ly, lz, hit, tracer, geometry, light, table, look, bounces, own)
-                row = 1
-            weight = nl / (n_cosine * nl * INVERSE_PI + n_ggx * pg + n_light * pe)
-            er, eg, eb = er * weight, eg * weight, eb * weight
-            qr, qg, qb, sr, sg, sb = qr * er, qg * eg, qb * eb, sr * er, sg * eg, sb * eb
-            components[i, row, 0] += qr
-            components[i, row, 1] += qg
-            components[i, row, 2] += qb
-            components[i, row + 2, 0] += sr
-            components[i, row + 2, 1] += sg
-            components[i, row + 2, 2] += sb
-            value = _RED * qr + _GREEN * qg + _BLUE * qb
-            diffuse_1, diffuse_2 = diffuse_1 + value, diffuse_2 + value * value
-            value = _RED * sr + _GREEN * sg + _BLUE * sb
-            glossy_1, glossy_2 = glossy_1 + value, glossy_2 + value * value
-    # Variance of a sum of `total` samples, from their spread; from one sample alone, its square.
-    if total > 1:
-        count = F(total)
-        scale = count / (count - ONE)
-        diffuse_2 = max(ZERO, diffuse_2 - diffuse_1 * diffuse_1 / count) * scale
-        glossy_2 = max(ZERO, glossy_2 - glossy_1 * glossy_1 / count) * scale
-    variance[i, 0], variance[i, 1] = diffuse_2, glossy_2
+def _deliver(count: Any, found: Any, limit: Any, sums: Any) -> None:
+    """Add the light of finished paths to their points; `limit` bounds the mean of an indirect sample's channels."""
+    for path in range(count):
+        h = np.int64(found[path, CARRIED + 6])
+        fr, fg, fb = found[path, CARRIED], found[path, CARRIED + 1], found[path, CARRIED + 2]
+        hr, hg, hb = found[path, CARRIED + 3], found[path, CARRIED + 4], found[path, CARRIED + 5]
+        r, g, b = found[path, INDIRECT], found[path, INDIRECT + 1], found[path, INDIRECT + 2]
+        k = ONE
+        if limit > ZERO:
+            mean = (r * (fr + hr) + g * (fg + hg) + b * (fb + hb)) / F(3.0)
+            k = limit / mean if mean > limit else ONE
+        r, g, b = r * k, g * k, b * k
+        _add(sums, h, 1, fr * r, fg * g, fb * b, hr * r, hg * g, hb * b)
+        r, g, b = found[path, EMITTED], found[path, EMITTED + 1], found[path, EMITTED + 2]
+        if r + g + b > ZERO:
+            _add(sums, h, 2, fr * r, fg * g, fb * b, hr * r, hg * g, hb * b)
+
+
+@njit
+def _see_lamps(
+    strategy: Any, slot: Any, s: Any, ints: Any, distance: Any, shares: Any, lamps: Any, differ: Any, sums: Any
+) -> None:
+    """Lamps between a point and what its ray hit; the BRDF is not yet weighed."""
+    i, c = w.at(slot)
+    position, direction = (s[i + w.OX], s[i + w.OY], s[i + w.OZ]), (s[i + w.LX], s[i + w.LY], s[i + w.LZ])
+    others = shares[_COSINE] * s[i + w.PC] + shares[_GGX] * s[i + w.PG]
+    if not others > ZERO:
+        return
+    dr, dg, db = lamps_along(*position, *direction, distance, others, shares[_LAMPS], DIFFUSE, *lamps)
+    gr, gg, gb = dr, dg, db
+    if differ:
+        gr, gg, gb = lamps_along(*position, *direction, distance, others, shares[_LAMPS], GLOSSY, *lamps)
+    if dr + dg + db + gr + gg + gb > ZERO:
+        _add(
+            sums, np.int64(ints[c + w.OWNER]), 0, s[i + w.QR] * dr, s[i + w.QG] * dg, s[i + w.QB] * db,
+            s[i + w.SR] * gr, s[i + w.SG] * gg, s[i + w.SB] * gb,
+        )  # fmt: skip
+
+
+@njit
+def _trace_lamps(
+    count: Any, s: Any, ints: Any, scene: Any, lamps: Any, shares: Any, look: Any, shift: Any, sums: Any
+) -> None:
+    """Lamp samples: draw, trace, add."""
+    w.lamp_directions(s, ints, count, lamps)
+    w.evaluate(s, count, look)
+    mask = np.int32(masks.SHADOW << shift)
+    for slot in range(count):
+        i, c = w.at(slot)
+        others = shares[_COSINE] * s[i + w.PC] + shares[_GGX] * s[i + w.PG]
+        dr, dg, db, gr, gg, gb = w.lamp_light(s, ints, slot, others, shares[_LAMPS], lamps, scene[0], mask)
+        if dr + dg + db + gr + gg + gb > ZERO:
+            _add(
+                sums, np.int64(ints[c + w.OWNER]), 0, s[i + w.QR] * dr, s[i + w.QG] * dg, s[i + w.QB] * db,
+                s[i + w.SR] * gr, s[i + w.SG] * gg, s[i + w.SB] * gb,
+            )  # fmt: skip
+
+
+@njit
+def _trace(
+    strategy: Any, count: Any, rays: Any, paths: Any, begun: Any, found: Any, scene: Any, lights: Any, table: Any,
+    shares: Any, bounces: Any, look: Any, below: Any, limit: Any, differ: Any, shift: Any, sums: Any,
+) -> Any:  # fmt: skip
+    """Samples of one strategy: draw, weigh, trace, and add what they see; return the number of paths under way."""
+    s, ints = rays
+    p, path_ints = paths
+    tracer = scene[0]
+    sky, sky_shines, lamps, _ = lights
+    w.jitter(ints, count, below)
+    if strategy == _LAMPS:
+        _trace_lamps(count, s, ints, scene, lamps, shares, look, shift, sums)
+        return begun
+    if strategy == _COSINE:
+        w.cosine_directions(s, ints, count)
+        mask = np.int32(masks.DIFFUSE << shift)
+    elif strategy == _GGX:
+        w.ggx_directions(s, ints, count)
+        mask = np.int32(masks.GLOSSY << shift)
+    else:
+        w.light_directions(s, ints, count, sky)
+        mask = np.int32(masks.SHADOW << shift)
+    w.evaluate(s, count, look)
+    if strategy != _SKY:
+        w.look_up(s, count, sky)
+    see_lamps = strategy != _SKY and shares[_LAMPS] > ZERO
+    # Lamps are seen before the BRDF is weighed, for they have densities of their own: such rays are traced first.
+    if not see_lamps:
+        w.weigh(s, count, shares[_COSINE], shares[_GGX], shares[_SKY])
+    for slot in range(count):
+        i, c = w.at(slot)
+        if not s[i + w.LIVE] > ZERO:
+            continue
+        position, direction = (s[i + w.OX], s[i + w.OY], s[i + w.OZ]), (s[i + w.LX], s[i + w.LY], s[i + w.LZ])
+        hit = nearest(tracer, *position, *direction, ZERO, _FAR, mask)
+        if see_lamps:
+            _see_lamps(strategy, slot, s, ints, hit[0], shares, lamps, differ, sums)
+            w.weigh_one(s, i, shares[_COSINE], shares[_GGX], shares[_SKY])
+        if hit[1] < 0:
+            continue
+        s[i + w.LIVE] = ZERO
+        if bounces == 0:
+            continue
+        if begun == _BATCH:
+            trace_paths(p, path_ints, begun, scene, _path_lights(lights, shares), look, table, bounces, shift, found)
+            _deliver(begun, found, limit, sums)
+            begun = 0
+        add_path(p, path_ints, begun, position, direction, hit, ints[c + w.KEY], begun)
+        found[begun, CARRIED], found[begun, CARRIED + 1], found[begun, CARRIED + 2] = (
+            s[i + w.QR], s[i + w.QG], s[i + w.QB],
+        )  # fmt: skip
+        found[begun, CARRIED + 3], found[begun, CARRIED + 4], found[begun, CARRIED + 5] = (
+            s[i + w.SR], s[i + w.SG], s[i + w.SB],
+        )  # fmt: skip
+        found[begun, CARRIED + 6] = F(ints[c + w.OWNER])
+        begun += 1
+    if not sky_shines:
+        return begun
+    for slot in range(count):
+        i, c = w.at(slot)
+        if s[i + w.LIVE] > ZERO:
+            r, g, b = sky_radiance(s[i + w.MU], s[i + w.MV], sky)
+            _add(
+                sums, np.int64(ints[c + w.OWNER]), 0, r * s[i + w.QR], g * s[i + w.QG], b * s[i + w.QB],
+                r * s[i + w.SR], g * s[i + w.SG], b * s[i + w.SB],
+            )  # fmt: skip
+    return begun
+
+
+@njit
+def _path_lights(lights: Any, shares: Any) -> Any:
+    """Lights as `trace_paths` takes them: one sample of the lamps a vertex where there are any."""
+    return lights[0], lights[1], lights[2], ONE if shares[_LAMPS] > ZERO else ZERO
+
+
+@njit
+def _finish(sums: Any, h: Any, total: Any, components: Any, variance: Any, i: Any) -> None:
+    """Write out point i. Variance of a sum of `total` samples from their spread; from one sample alone, its square."""
+    for lobe in range(2):
+        for k in range(3):
+            c = 3 * lobe + k
+            components[i, 2 * lobe, k] = sums[h, c] + sums[h, 2 * _KIND + c]
+            components[i, 2 * lobe + 1, k] = sums[h, _KIND + c]
+        m = _MOMENTS + 2 * lobe
+        mean = sums[h, m] + sums[h, _KIND + m] + sums[h, 2 * _KIND + m]
+        square = sums[h, m + 1] + sums[h, _KIND + m + 1] + sums[h, 2 * _KIND + m + 1]
+        if total > 1:
+            n = F(total)
+            square = max(ZERO, square - mean * mean / n) * (n / (n - ONE))
+        variance[i, lobe] = square
+
+
+@njit
+def _divided(number: Any, threshold: Any) -> Any:
+    """Split a random number at a threshold: (whether it is below, a random number again)."""
+    whole, n = np.uint64(threshold), np.uint64(number)
+    if n < whole:
+        return True, U((n << np.uint64(32)) // whole)
+    return False, U(((n - whole) << np.uint64(32)) // (np.uint64(1 << 32) - whole))
 
 
 @njit(parallel=True)
-def _kernel(  # type: ignore[no-untyped-def]
-    keys, frames, surfaces, tracer, geometry, light, table, numbers, aa, bounces, look, seed, lanes,
-    components, variance,
-):  # fmt: skip
-    pixel, sample = keys
-    origin, normal, flat, view = frames
-    albedo, roughness, metallic = surfaces
+def _kernel(
+    keys: Any, frames: Any, surfaces: Any, tracer: Any, geometry: Any, extent: Any, sky: Any, sky_rules: Any,
+    lamps: Any, table: Any, numbers: Any, aa: Any, part: Any, shares: Any, bounces: Any, look: Any, seed: Any,
+    limit: Any, differ: Any, shift: Any, lanes: Any, components: Any, variance: Any,
+) -> None:  # fmt: skip
+    pixel, sample, flags = keys
+    sequence, counts, strata = numbers
     n = len(pixel)
     blocks = (n + _BLOCK - 1) // _BLOCK
     # Threads get neighbouring lanes, lanes get every so-manyth block: no thread is left with all the costly ones.
     for lane in prange(lanes):
+        scene, lights = (tracer, geometry, extent), (sky, sky_rules[0], lamps, sky_rules[1])
+        rays, paths = w.batch(_BATCH), w.batch(_BATCH)
+        s, ints = rays
+        found = np.zeros((_BATCH, FOUND), np.float32)
+        sums = np.empty((_BLOCK, 3 * _KIND), np.float32)
+        head = np.empty((_BLOCK, 8), np.float32)
+        total = np.empty(_BLOCK, np.int64)
         for block in range(lane, blocks, lanes):
-            for i in range(block * _BLOCK, min(n, (block + 1) * _BLOCK)):
-                # No views of rows: each would count references, and the threads would wait for each other's counts.
-                check = roughness[i] + metallic[i]
-                for k in range(3):
-                    check += origin[i, k] + normal[i, k] + flat[i, k] + view[i, k] + albedo[i, k]
-                if not abs(check) < F(1e18):
+            start = block * _BLOCK
+            end = min(n, start + _BLOCK)
+            sums[:] = ZERO
+            total[:] = 0
+            _heads(start, end, frames, surfaces, extent, look, table, head)
+            begun = 0
+            for strategy in range(4):
+                if strategy >= _SKY and shares[strategy] == ZERO:
                     continue
-                frame = (
-                    origin[i, 0], origin[i, 1], origin[i, 2], normal[i, 0], normal[i, 1], normal[i, 2],
-                    flat[i, 0], flat[i, 1], flat[i, 2], view[i, 0], view[i, 1], view[i, 2],
+                source = min(strategy, _SKY)
+                both = strategy >= _SKY and shares[_SKY] > ZERO and shares[_LAMPS] > ZERO
+                # The point set fills strata of 2^32 / n; below them every point is moved by itself.
+                below = strata[source]
+                step = F(counts[source]) / F(aa)
+                count = 0
+                for i in range(start, end):
+                    h = i - start
+                    if head[h, 3] < ZERO:
+                        continue
+                    own = U(seed ^ mix(U(pixel[i])))
+                    if flags[i] & SECOND:
+                        own = U(own ^ U(0x5BD1E995))
+                    key = mix(U(mix(own) + U(U(source + 1) * GOLDEN)))
+                    shift_0, shift_1 = U(mix(U(key + U(1))) & ~below), U(mix(U(key + U(2))) & ~below)
+                    shift_2 = U(mix(U(key + U(3))) & ~below)
+                    # This sub-sample's part of the pixel's samples: n / aa on average, n over all sub-samples together.
+                    dither = unit(mix(U(key + U(4)))) if counts[source] % aa else ZERO
+                    first = np.int64(F(sample[i]) * step + dither)
+                    past = np.int64(F(sample[i] + 1) * step + dither)
+                    if sample[i] + 1 == aa:
+                        past = np.int64(counts[source])
+                    if part[1] > 1:
+                        size = past - first
+                        first, past = first + size * part[0] // part[1], first + size * (part[0] + 1) // part[1]
+                    for j in range(first, past):
+                        key_j = mix(U(key ^ U(U(j + 1) * U(0x85EBCA6B))))
+                        number = U(0)
+                        if strategy >= _SKY:
+                            number = U((sequence[j, 2] ^ shift_2) + (mix(U(key_j + U(7))) & below))
+                            if both:
+                                towards_sky, number = _divided(number, lights[3])
+                                if towards_sky != (strategy == _SKY):
+                                    continue
+                        if count == _BATCH:
+                            begun = _trace(
+                                strategy, count, rays, paths, begun, found, scene, lights, table, shares, bounces,
+                                look, below, limit, differ, shift, sums,
+                            )  # fmt: skip
+                            count = 0
+                        total[h] += 1
+                        _put(s, ints, count, i, h, frames, surfaces, head)
+                        _, c = w.at(count)
+                        ints[c + w.KEY] = key_j
+                        ints[c + w.N0] = U(sequence[j, 0] ^ shift_0)
+                        ints[c + w.N1] = U(sequence[j, 1] ^ shift_1)
+                        ints[c + w.N2] = number
+                        count += 1
+                begun = _trace(
+                    strategy, count, rays, paths, begun, found, scene, lights, table, shares, bounces, look, below,
+                    limit, differ, shift, sums,
                 )  # fmt: skip
-                surface = (albedo[i, 0], albedo[i, 1], albedo[i, 2], roughness[i], metallic[i])
-                _point(
-                    pixel[i], sample[i], surface, frame, tracer, geometry, light, table, numbers, aa, bounces,
-                    look, seed, components, variance, i,
-                )  # fmt: skip
+            trace_paths(
+                paths[0], paths[1], begun, scene, _path_lights(lights, shares), look, table, bounces, shift, found
+            )
+            _deliver(begun, found, limit, sums)
+            for i in range(start, end):
+                _finish(sums, i - start, total[i - start], components, variance, i)

@@ -8,6 +8,7 @@ times the solid angle: wherever a lookup can be positive, so is the density.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from ..asset.model import as_float
 from ..errors import UsageError
 from ..frame import World
 from ..jit import njit
+from .memory import address, load_float, load_int32, load_uint32
 from .sampling import fast_acos, fast_atan2_turns, sincos_turns
 
 Array = np.ndarray
@@ -67,6 +69,29 @@ def _texel_means(luminance: Array) -> Array:
     rows = np.concatenate([luminance[:1], luminance, luminance[-1:]])
     rows = 0.75 * luminance + 0.125 * (rows[:-2] + rows[2:])
     return 0.75 * rows + 0.125 * (np.roll(rows, 1, axis=1) + np.roll(rows, -1, axis=1))
+
+
+class Sky(NamedTuple):
+    """An `EnvironmentLight` for compiled code: addresses of its arrays, their sizes, and its rotation row by row."""
+
+    texels: int
+    height: int
+    width: int
+    cells: int
+    guide: int
+    guide_size: int
+    row_z: int
+    step: int
+    columns: int
+    xx: np.float32
+    xy: np.float32
+    xz: np.float32
+    yx: np.float32
+    yy: np.float32
+    yz: np.float32
+    zx: np.float32
+    zy: np.float32
+    zz: np.float32
 
 
 class EnvironmentLight:
@@ -125,6 +150,7 @@ class EnvironmentLight:
         weights = (means * solid[:, None]).ravel()
         total = weights.sum()
         self.black = not total > 0.0
+        self._power = float(total)
         self.row_z = edges.astype(np.float32)
         every = np.arange(rows * columns)
         lit = every if self.black else every[weights > 0]
@@ -141,6 +167,29 @@ class EnvironmentLight:
         self.density = (density.reshape(rows, columns) / solid[:, None]).astype(np.float32)
         self.texels[..., 3] = self.density.repeat(step, axis=0).repeat(step, axis=1)
 
+    @property
+    def sky(self) -> Sky:
+        """What compiled code reads; valid while this light lives and its rotation is not replaced."""
+        height, width = self.texels.shape[:2]
+        step = height // (len(self.row_z) - 1)
+        return Sky(
+            address(self.texels),
+            height,
+            width,
+            address(self.cells),
+            address(self.guide),
+            len(self.guide),
+            address(self.row_z),
+            step,
+            width // step,
+            *self.rotation.ravel(),
+        )
+
+    @property
+    def power(self) -> float:
+        """Luminance integrated over all directions."""
+        return self._power
+
     def lookup(self, directions: Array) -> Array:
         """(n, 3) radiance from (n, 3) unit world directions."""
         return _lookup_many(np.ascontiguousarray(directions, np.float32), self.texels, self.rotation)
@@ -153,6 +202,67 @@ class EnvironmentLight:
         """World directions (n, 3) and densities (n,) from (n, 3) uint32 random numbers."""
         numbers = np.ascontiguousarray(numbers, np.uint32)
         return _sample_many(numbers, self.texels, self.cells, self.guide, self.row_z, self.rotation)
+
+
+@njit
+def map_at(dx, dy, dz, sky):  # type: ignore[no-untyped-def]
+    """Lat-long coordinates (u, v) in [0, 1] of a world direction; row 0 at +Z, +X at u = 1/2."""
+    x = sky.xx * dx + sky.xy * dy + sky.xz * dz
+    y = sky.yx * dx + sky.yy * dy + sky.yz * dz
+    z = sky.zx * dx + sky.zy * dy + sky.zz * dz
+    return np.float32(0.5) - fast_atan2_turns(y, x), fast_acos(z) * np.float32(1.0 / math.pi)
+
+
+@njit
+def sky_density(u, v, sky):  # type: ignore[no-untyped-def]
+    """Density per solid angle of the sampling cell that holds (u, v)."""
+    row = min(np.int64(sky.height - 1), np.int64(v * np.float32(sky.height)))
+    column = min(np.int64(sky.width - 1), np.int64(u * np.float32(sky.width)))
+    return load_float(sky.texels, 4 * (row * sky.width + column) + 3)
+
+
+@njit
+def sky_radiance(u, v, sky):  # type: ignore[no-untyped-def]
+    """Bilinear lookup, wrapped in u and clamped in v."""
+    h, w = sky.height, sky.width
+    x, y = u * np.float32(w) - np.float32(0.5), v * np.float32(h) - np.float32(0.5)
+    y = min(max(y, np.float32(0.0)), np.float32(h - 1))
+    c0, r0 = np.int64(x + np.float32(1.0)) - 1, np.int64(y)
+    a, b = x - np.float32(c0), y - np.float32(r0)
+    c1 = c0 + 1 if c0 + 1 < w else 0
+    c0 = w - 1 if c0 < 0 else c0
+    r1 = min(r0 + 1, h - 1)
+    one = np.float32(1.0)
+    p00, p01, p10, p11 = (one - a) * (one - b), a * (one - b), (one - a) * b, a * b
+    i00, i01, i10, i11 = 4 * (r0 * w + c0), 4 * (r0 * w + c1), 4 * (r1 * w + c0), 4 * (r1 * w + c1)
+    t = sky.texels
+    red = p00 * load_float(t, i00) + p01 * load_float(t, i01) + p10 * load_float(t, i10) + p11 * load_float(t, i11)
+    i00, i01, i10, i11 = i00 + 1, i01 + 1, i10 + 1, i11 + 1
+    green = p00 * load_float(t, i00) + p01 * load_float(t, i01) + p10 * load_float(t, i10) + p11 * load_float(t, i11)
+    i00, i01, i10, i11 = i00 + 1, i01 + 1, i10 + 1, i11 + 1
+    blue = p00 * load_float(t, i00) + p01 * load_float(t, i01) + p10 * load_float(t, i10) + p11 * load_float(t, i11)
+    return red, green, blue
+
+
+@njit
+def first_cell(n, sky):  # type: ignore[no-untyped-def]
+    """Place in the sampling cells where the search for the random number n (uint32) starts."""
+    return load_int32(sky.guide, np.int64((np.uint64(n) * np.uint64(sky.guide_size)) >> np.uint64(32)))
+
+
+@njit
+def cell_end(place, sky):  # type: ignore[no-untyped-def]
+    """Last random number (uint32) that falls on the cell at a place."""
+    return load_uint32(sky.cells, 2 * np.int64(place))
+
+
+@njit
+def cell_at(place, sky):  # type: ignore[no-untyped-def]
+    """(row, column) of the cell at a place, upper and lower z of its row, density per solid angle."""
+    cell = np.int64(load_uint32(sky.cells, 2 * np.int64(place) + 1))
+    row, column = cell // sky.columns, cell % sky.columns
+    density = load_float(sky.texels, 4 * (row * sky.step * sky.width + column * sky.step) + 3)
+    return row, column, load_float(sky.row_z, row), load_float(sky.row_z, row + 1), density
 
 
 @njit
