@@ -6,16 +6,18 @@ sampled, so that silhouettes do not grow by a pixel where there are sub-samples.
 the centre's depth.
 Contributions alpha G below 1/255 are skipped, others clamped to 0.99 and blended until the transmittance is below 1e-4.
 
-Order. Surfels are sorted once by centre depth, yet blended by the depth at which the ray meets them: every sample
-keeps a window of its WINDOW nearest unblended contributions, sorted; the nearest is blended when the window is full.
-The order is exact unless a contribution is more than WINDOW places off.
+Order. Contributions are blended by the depth at which the ray meets them, not by that of the surfels' centres: every
+sample lists its contributions and sorts them once all are there. A list that is full is sorted early and cut where the
+sample is opaque, and only when that does not make room it grows; as 1/255 is the least strength, it stays short.
 
 Depth gaps. Where a ray passes the edge of one surface and meets another, the mean of both would be a point between
 them. Contributions are therefore split into clusters where the depth jumps by more than `GAP` standard deviations of
 the surfels on both sides (or of the pixel, when that is larger). Position, normal and material are those of the
 heaviest cluster alone; coverage is that of all.
 
-Work is divided in tiles; a sample's result depends neither on the tiles nor on the rows rendered together.
+Work is divided in tiles and these in blocks of samples that are neighbours in a row; a sample's result depends neither
+on them nor on the rows rendered together. Kernels that take many arrays are functions of their own, never inlined in
+Numba's sense: in a loop that would count references of every array at every turn.
 """
 
 from __future__ import annotations
@@ -26,14 +28,16 @@ from typing import Any
 import numpy as np
 
 from ..jit import get_num_threads, njit, prange
+from .blending import GAP, LANES, MANY, MIN_TRANSMITTANCE, mean, merge_sort, prune, rank_sort, weigh, widen
 from .camera import AA, CLIP_END, CLIP_START, FX, FY, ORTHOGRAPHIC, WIDTH, lattice, pixel_shift
 from .splats import (
     CUT,
     LOW,
     OPACITY,
+    RECORD,
     RX,
     RY,
-    SIZE,
+    SURFACE,
     TILE,
     ZC,
     A,
@@ -45,16 +49,18 @@ from .splats import (
 
 Array = np.ndarray
 
-WINDOW = 16  # a power of two
-_RING = WINDOW - 1
-#: Depth jump that separates two surfaces, in units of the mean of the two surfels' sizes.
-GAP = 3.0
-MAX_ALPHA = 0.99
-MIN_TRANSMITTANCE = 1e-4
+__all__ = ["GAP", "SurfelSamples", "rasterise"]
 
-# Columns of a cluster of a sample: sums by weight of the first nine columns above, of one and of depth; the heaviest
-# contribution's weight and object; depth and size of the last contribution.
-_WEIGHT, _DEPTH, _HEAVIEST, _OWNER, _LAST, _LAST_SIZE, _CLUSTER = 9, 10, 11, 12, 13, 14, 16
+# Rows of the state of a block, `LANES` samples that vector code works on at a time: position; transmittance of all
+# contributions gathered and the depth of the farthest; strength and depth of the splat at hand.
+_X, _Y, _LEFT, _FARTHEST, _ALPHA, _DEPTH, _BLOCK = (np.uintp(LANES * k) for k in range(7))
+# Columns of a splat's record that are free on the screen: opacity and nearest depth.
+_STRENGTH, _NEAREST = RECORD - 2, RECORD - 1
+#: Contributions of a sample there is room for at first.
+ROOM = 64
+#: Splats between two looks at which blocks are opaque.
+_CHECK = 32
+MAX_ALPHA = 0.99
 
 
 @dataclass(slots=True)
@@ -132,33 +138,23 @@ def _gaussian(q: Any) -> Any:
     return y * y
 
 
-@njit(inline="always")
-def _meet(
-    screen: Any,
-    i: Any,
-    opacity: Any,
-    near: Any,
-    far: Any,
-    sx: Any,
-    sy: Any,
-    first: Any,
-    count: Any,
-    alpha: Any,
-    depth: Any,
-) -> None:
-    """Strength (0 below MIN_ALPHA or when clipped) and depth of a splat at samples first .. first + count.
+@njit
+def _meet(screen: Any, i: Any, opacity: Any, near: Any, far: Any, state: Any, first: Any, last: Any) -> Any:
+    """Splat i at the lanes first .. last of a block: strength (0 where it has no part) and depth; how many have one.
 
-    Without a branch: the loop becomes vector code.
+    One array, constant distances, no branch: the loop becomes vector code.
     """
-    big, zero = np.float32(1e30), np.float32(0.0)
+    big, zero, one, stop = np.float32(1e30), np.float32(0.0), np.float32(1.0), np.float32(MIN_TRANSMITTANCE)
     rx, ry, zc, cut, low = screen[i, RX], screen[i, RY], screen[i, ZC], screen[i, CUT], screen[i, LOW]
     a0, a1, a2 = screen[i, A], screen[i, A + 1], screen[i, A + 2]
     b0, b1, b2 = screen[i, B], screen[i, B + 1], screen[i, B + 2]
     n0, n1, n2 = screen[i, N], screen[i, N + 1], screen[i, N + 2]
     d0, d1, d2 = screen[i, D], screen[i, D + 1], screen[i, D + 2]
-    for j in range(count):
-        ex, ey = sx[first + j] - rx, sy[first + j] - ry
-        inverse = np.float32(1.0) / (n0 + n1 * ex + n2 * ey)
+    hits = np.int32(0)
+    for j in range(LANES):
+        at = np.uintp(j)
+        ex, ey = state[at + _X] - rx, state[at + _Y] - ry
+        inverse = one / (n0 + n1 * ex + n2 * ey)
         u = (a0 + a1 * ex + a2 * ey) * inverse
         v = (b0 + b1 * ex + b2 * ey) * inverse
         z = (d0 + d1 * ex + d2 * ey) * inverse
@@ -168,60 +164,147 @@ def _meet(
         take = exact <= filtered
         q = exact if take else filtered
         z = z if take else zc
-        seen = (q < cut) & (z > near) & (z < far)
-        alpha[j] = min(opacity * _gaussian(q), np.float32(MAX_ALPHA)) if seen else zero
-        depth[j] = z
+        before, farthest = state[at + _LEFT], state[at + _FARTHEST]
+        inside = (np.int32(j) >= first) & (np.int32(j) < last)
+        seen = inside & (q < cut) & (z > near) & (z < far) & ((before >= stop) | (z < farthest))
+        alpha = min(opacity * _gaussian(q), np.float32(MAX_ALPHA)) if seen else zero
+        state[at + _ALPHA] = alpha
+        state[at + _DEPTH] = z
+        state[at + _LEFT] = before * (one - alpha)
+        state[at + _FARTHEST] = z if seen & (z > farthest) else farthest
+        hits = np.int32(hits + np.int32(seen))
+    return hits
 
 
-@njit(inline="always")
-def _absorb(
-    surface: Any, i: Any, owner: Any, z: Any, alpha: Any, least: Any, t: Any, acc: Any, best: Any, at: Any
-) -> Any:
-    """Blend one contribution into the accumulators of its sample; returns the transmittance behind it.
+@njit
+def _collect(
+    tile_list: Any, begin: Any, end: Any, screen: Any, surface: Any, box: Any, nearest: Any,
+    left: Any, top: Any, right: Any, bottom: Any, tile_left: Any, tile_top: Any, aa: Any,
+    records: Any, surfaces: Any, spans: Any,
+) -> None:  # fmt: skip
+    """Bring together what blending reads of a tile's splats; spans are samples of the tile's rows, and rows."""
+    for entry in range(begin, end):
+        i, e = np.uintp(tile_list[entry]), np.uintp(entry - begin)
+        for c in range(RECORD):
+            records[e, c] = screen[i, c]
+        for c in range(SURFACE):
+            surfaces[e, c] = surface[i, c]
+        records[e, _STRENGTH], records[e, _NEAREST] = surface[i, OPACITY], nearest[i]
+        spans[e, 0], spans[e, 2] = (max(box[i, 0], left) - tile_left) * aa, (min(box[i, 2], right) - tile_left) * aa
+        spans[e, 1], spans[e, 3] = max(box[i, 1], top) - tile_top, min(box[i, 3], bottom) - tile_top
 
-    ``acc`` is the cluster being gathered, ``best`` the heaviest one so far. ``least`` is the width of a pixel at this
-    depth, metres.
+
+@njit
+def _count(spans: Any, n: Any, blocks_row: Any, start: Any) -> None:
+    """start[b + 1] .. start[b + 2]: how many of the tile's splats touch the blocks before, and b as well."""
+    start[:] = 0
+    for e in range(n):
+        first, last = spans[e, 0] // LANES, (spans[e, 2] - 1) // LANES
+        for y in range(spans[e, 1], spans[e, 3]):
+            for block in range(y * blocks_row + first, y * blocks_row + last + 1):
+                start[np.uintp(block + 2)] += 1
+    for b in range(2, len(start)):
+        start[b] += start[b - 1]
+
+
+@njit
+def _bin(spans: Any, n: Any, blocks_row: Any, start: Any, binned: Any) -> None:
+    """Counting sort of the tile's splats by block, in order; afterwards start[b] .. start[b + 1] are those of b."""
+    for e in range(n):
+        first, last = spans[e, 0] // LANES, (spans[e, 2] - 1) // LANES
+        for y in range(spans[e, 1], spans[e, 3]):
+            for block in range(y * blocks_row + first, y * blocks_row + last + 1):
+                to = start[np.uintp(block + 1)]
+                binned[np.uintp(to)] = e
+                start[np.uintp(block + 1)] = to + 1
+
+
+@njit
+def _limit(state: Any) -> Any:
+    """Depth from which on a block takes no contribution, as all its samples are opaque."""
+    limit = np.float32(-1e30)
+    for lane in range(LANES):
+        k = np.uintp(lane)
+        is_open = state[_LEFT + k] >= np.float32(MIN_TRANSMITTANCE)
+        limit = max(limit, np.float32(1e30) if is_open else state[_FARTHEST + k])
+    return limit
+
+
+@njit
+def _place(p: Any, width: Any, y: Any, tile_left: Any, left: Any, right: Any, first: Any, aa: Any, state: Any) -> None:
+    """Start a block: positions of its samples, nothing gathered. Those outside the window count as opaque."""
+    zero = np.float32(0.0)
+    for lane in range(LANES):
+        k = np.uintp(lane)
+        x = tile_left + (first + lane) // aa
+        state[_X + k] = state[_Y + k] = state[_LEFT + k] = zero
+        state[_FARTHEST + k] = np.float32(-1e30)
+        if left <= x < right:
+            shift_x, shift_y = pixel_shift(p, y * width + x)
+            jx, jy = lattice(shift_x, shift_y, (first + lane) % aa, p[AA])
+            state[_X + k], state[_Y + k], state[_LEFT + k] = x + jx, y + jy, np.float32(1.0)
+
+
+@njit
+def _gather(
+    records: Any, spans: Any, binned: Any, begin: Any, end: Any, first: Any, near: Any, far: Any, state: Any,
+    count: Any, lists_z: Any, lists_a: Any, lists_i: Any, room: Any,
+) -> Any:  # fmt: skip
+    """List the contributions of the splats begin .. end to a block's samples.
+
+    Returns the splat to go on with: it is less than `end` when a sample's list is full.
     """
-    weight = t * alpha
-    size = max(surface[i, SIZE], least)
-    if acc[at, _WEIGHT] > np.float32(0.0) and z - acc[at, _LAST] > np.float32(0.5 * GAP) * (size + acc[at, _LAST_SIZE]):
-        if acc[at, _WEIGHT] > best[at, _WEIGHT]:
-            for c in range(_CLUSTER):
-                best[at, c] = acc[at, c]
-        acc[at, _WEIGHT] = np.float32(0.0)
-    if acc[at, _WEIGHT] == np.float32(0.0):
-        for c in range(_CLUSTER):
-            acc[at, c] = np.float32(0.0)
-        acc[at, _LAST] = z
-    # Both sides of a thin sheet may lie in one cluster: normals agree with the nearest one.
-    signed = weight
-    if acc[at, 0] * surface[i, 0] + acc[at, 1] * surface[i, 1] + acc[at, 2] * surface[i, 2] < np.float32(0.0):
-        signed = -weight
-    for c in range(3):
-        acc[at, c] += signed * surface[i, c]
-    for c in range(3, 9):
-        acc[at, c] += weight * surface[i, c]
-    acc[at, _WEIGHT] += weight
-    acc[at, _DEPTH] += weight * z
-    if weight > acc[at, _HEAVIEST]:
-        acc[at, _HEAVIEST] = weight
-        acc[at, _OWNER] = np.float32(owner)
-    acc[at, _LAST] = max(z, acc[at, _LAST])
-    acc[at, _LAST_SIZE] = size
-    return t * (np.float32(1.0) - alpha)
+    limit = np.float32(1e30)
+    for entry in range(begin, end):
+        i = np.uintp(binned[np.uintp(entry)])
+        if (entry - begin) % _CHECK == _CHECK - 1:
+            limit = _limit(state)
+        if records[i, _NEAREST] >= limit:
+            continue
+        hits = _meet(
+            records, i, records[i, _STRENGTH], near, far, state,
+            np.int32(spans[i, 0] - first), np.int32(spans[i, 2] - first),
+        )  # fmt: skip
+        if hits == 0:
+            continue
+        most = np.int32(0)
+        for lane in range(LANES):
+            k = np.uintp(lane)
+            n = count[k]
+            to = k * np.uintp(room) + np.uintp(n)
+            lists_z[to], lists_a[to], lists_i[to] = state[_DEPTH + k], state[_ALPHA + k], i
+            n += np.int32(state[_ALPHA + k] > np.float32(0.0))
+            count[k] = n
+            most = max(most, n)
+        if most == room:
+            return entry + 1
+    return end
 
 
-@njit(inline="always")
-def _finish(best: Any, at: Any, out: Any, y: Any, x: Any, k: Any) -> Any:
-    """Write the normalised attributes of a sample. Returns its depth and object index."""
-    inverse = np.float32(1.0) / best[at, _WEIGHT]
-    nx, ny, nz = best[at, 0], best[at, 1], best[at, 2]
-    length = np.sqrt(nx * nx + ny * ny + nz * nz)
-    scale = np.float32(1.0) / length if length > np.float32(1e-6) * best[at, _WEIGHT] else np.float32(0.0)
-    out[y, x, k, 0], out[y, x, k, 1], out[y, x, k, 2] = scale * nx, scale * ny, scale * nz
-    for c in range(3, 9):
-        out[y, x, k, c] = best[at, c] * inverse
-    return best[at, _DEPTH] * inverse, np.int32(best[at, _OWNER])
+@njit
+def _finish(
+    surfaces: Any, lists_z: Any, lists_a: Any, lists_i: Any, room: Any, count: Any, rank: Any, order: Any,
+    weights: Any, pixel_base: Any, pixel: Any, aa: Any, y: Any, x: Any, first: Any,
+    owner: Any, out_alpha: Any, out_depth: Any, out_surface: Any,
+) -> None:  # fmt: skip
+    """Resolve the samples of a block and write them; ``owner`` gets each one's heaviest splat. x: of the tile."""
+    for lane in range(LANES):
+        n = np.int64(count[lane])
+        if n == 0:
+            continue
+        base = lane * room
+        if n > MANY:
+            merge_sort(lists_z, base, n, order)
+        else:
+            rank_sort(lists_z, base, n, rank, order)
+        column, k = x + (first + lane) // aa, (first + lane) % aa
+        t, total, depth, owner[lane], begin, end = weigh(
+            surfaces, lists_z, lists_a, lists_i, base, n, order, weights, pixel_base, pixel
+        )
+        values = mean(surfaces, lists_i, base, order, weights, total, begin, end)
+        for c in range(9):
+            out_surface[y, column, k, c] = values[c]
+        out_alpha[y, column, k], out_depth[y, column, k] = np.float32(1.0) - t, depth * (np.float32(1.0) / total)
 
 
 @njit(parallel=True)
@@ -257,116 +340,70 @@ def _blend(
     # A pixel at depth z is pixel_base + pixel * z metres wide.
     pixel = np.float32(0.0 if ortho else 1.0 / min(p[FX], p[FY]))
     pixel_base = np.float32(1.0 / min(p[FX], p[FY]) if ortho else 0.0)
-    stop = np.float32(MIN_TRANSMITTANCE)
-    zero, big = np.float32(0.0), np.float32(1e30)
-    per_row = TILE * aa
-    capacity = TILE * per_row
+    blocks_row = TILE * aa // LANES
     for worker in prange(workers):
-        sx, sy = np.empty(capacity, np.float32), np.empty(capacity, np.float32)
-        count, head = np.empty(capacity, np.int32), np.empty(capacity, np.int32)
-        running, resolved = np.empty(capacity, np.float32), np.empty(capacity, np.float32)
-        farthest = np.empty(capacity, np.float32)
-        win_z, win_a = np.empty((capacity, WINDOW), np.float32), np.empty((capacity, WINDOW), np.float32)
-        win_i = np.empty((capacity, WINDOW), np.uint32)
-        acc, best = np.empty((capacity, _CLUSTER), np.float32), np.empty((capacity, _CLUSTER), np.float32)
-        alpha_run, z_run = np.empty(per_row, np.float32), np.empty(per_row, np.float32)
+        state = np.empty(_BLOCK, np.float32)
+        count = np.empty(LANES, np.int32)
+        room = ROOM
+        lists_z, lists_a = np.empty(LANES * room, np.float32), np.empty(LANES * room, np.float32)
+        lists_i = np.empty(LANES * room, np.int32)
+        rank, order, weights = np.empty(LANES, np.int32), np.empty(room, np.int32), np.empty(room, np.float32)
+        start, binned = np.empty(TILE * blocks_row + 2, np.int64), np.empty(0, np.int32)
+        records, surfaces = np.empty((0, RECORD), np.float32), np.empty((0, SURFACE), np.float32)
+        spans, owner = np.empty((0, 4), np.int32), np.empty(LANES, np.int32)
         for task in range(worker, n_tiles, workers):
             tx, ty = tile_x0 + task % tiles_x, first_row + task // tiles_x
             tile = (ty - tile_y0) * tiles_x + task % tiles_x
-            begin, end = tile_start[tile], tile_start[tile + 1]
-            if begin == end:
+            listed, n = tile_start[tile], tile_start[tile + 1] - tile_start[tile]
+            if n == 0:
                 continue
             left, top = max(tx * TILE, x0), max(ty * TILE, y0)
             right, bottom = min(tx * TILE + TILE, x1), min(ty * TILE + TILE, y1)
-            for y in range(top, bottom):
-                for x in range(left, right):
-                    shift_x, shift_y = pixel_shift(p, y * width + x)
-                    at = (y - top) * per_row + (x - left) * aa
-                    for k in range(aa):
-                        jx, jy = lattice(shift_x, shift_y, k, p[AA])
-                        sx[at + k], sy[at + k] = x + jx, y + jy
-                        count[at + k] = head[at + k] = 0
-                        running[at + k] = resolved[at + k] = np.float32(1.0)
-                        farthest[at + k] = -big
-                        acc[at + k, _WEIGHT] = best[at + k, _WEIGHT] = zero
-            open_samples = (bottom - top) * (right - left) * aa
-            limit = big
-            for entry in range(begin, end):
-                i = tile_list[entry]
-                if open_samples == 0:
-                    # All samples are opaque: only what might lie in front of their windows' ends still matters.
-                    if limit == big:
-                        limit = -big
-                        for y in range(bottom - top):
-                            for j in range(y * per_row, y * per_row + (right - left) * aa):
-                                limit = max(limit, farthest[j])
-                    if nearest[i] >= limit:
-                        continue
-                bx0, bx1 = max(box[i, 0], left), min(box[i, 2], right)
-                by0, by1 = max(box[i, 1], top), min(box[i, 3], bottom)
-                run = (bx1 - bx0) * aa
-                for y in range(by0, by1):
-                    base = (y - top) * per_row + (bx0 - left) * aa
-                    _meet(screen, i, surface[i, OPACITY], near, far, sx, sy, base, run, alpha_run, z_run)
-                    for j in range(run):
-                        alpha = alpha_run[j]
-                        if alpha == zero:
-                            continue
-                        at = np.uintp(base + j)  # unsigned: no check for negative indices
-                        z = z_run[j]
-                        before = running[at]
-                        if before < stop and z >= farthest[at]:
-                            continue
-                        n, h = count[at], head[at]
-                        if n == WINDOW:
-                            k = win_i[at, h]
-                            t = _absorb(
-                                surface, k, objects[k], win_z[at, h], win_a[at, h],
-                                pixel_base + pixel * win_z[at, h], resolved[at], acc, best, at,
-                            )  # fmt: skip
-                            resolved[at] = t
-                            h = (h + 1) & _RING
-                            head[at] = h
-                            n -= 1
-                            if t < stop:
-                                count[at] = 0
-                                open_samples -= before >= stop
-                                running[at] = zero
-                                farthest[at] = -big
-                                continue
-                        to = (h + n) & _RING
-                        for _ in range(n):
-                            fro = (to - 1) & _RING
-                            if win_z[at, fro] <= z:
-                                break
-                            win_z[at, to], win_a[at, to], win_i[at, to] = win_z[at, fro], win_a[at, fro], win_i[at, fro]
-                            to = fro
-                        win_z[at, to], win_a[at, to], win_i[at, to] = z, alpha, i
-                        count[at] = n + 1
-                        farthest[at] = max(farthest[at], z)
-                        after = before * (np.float32(1.0) - alpha)
-                        running[at] = after
-                        open_samples -= after < stop and before >= stop
-            for y in range(top, bottom):
-                for x in range(left, right):
-                    for k in range(aa):
-                        at = (y - top) * per_row + (x - left) * aa + k
-                        t = resolved[at]
-                        for w in range(count[at]):
-                            if t < stop:
-                                break
-                            h = (head[at] + w) & _RING
-                            i = win_i[at, h]
-                            t = _absorb(
-                                surface, i, objects[i], win_z[at, h], win_a[at, h],
-                                pixel_base + pixel * win_z[at, h], t, acc, best, at,
-                            )  # fmt: skip
-                        if acc[at, _WEIGHT] == np.float32(0.0):
-                            continue
-                        if acc[at, _WEIGHT] > best[at, _WEIGHT]:
-                            for c in range(_CLUSTER):
-                                best[at, c] = acc[at, c]
-                        depth, owner = _finish(best, at, out_surface, y - y0, x - x0, k)
-                        out_alpha[y - y0, x - x0, k] = np.float32(1.0) - t
-                        out_depth[y - y0, x - x0, k] = depth
-                        out_object[y - y0, x - x0, k] = owner
+            if n > len(records):
+                records, surfaces = np.empty((2 * n, RECORD), np.float32), np.empty((2 * n, SURFACE), np.float32)
+                spans = np.empty((2 * n, 4), np.int32)
+            _collect(
+                tile_list, listed, listed + n, screen, surface, box, nearest, left, top, right, bottom,
+                tx * TILE, ty * TILE, aa, records, surfaces, spans,
+            )  # fmt: skip
+            _count(spans, n, blocks_row, start)
+            if start[-1] > len(binned):
+                binned = np.empty(2 * start[-1], np.int32)
+            _bin(spans, n, blocks_row, start, binned)
+            for block in range(TILE * blocks_row):
+                begin, end = start[block], start[block + 1]
+                if begin == end:
+                    continue
+                y = ty * TILE + block // blocks_row
+                first = block % blocks_row * LANES  # of the samples of the tile's row
+                _place(p, width, y, tx * TILE, left, right, first, aa, state)
+                count[:] = 0
+                while True:
+                    begin = _gather(
+                        records, spans, binned, begin, end, first, near, far, state, count,
+                        lists_z, lists_a, lists_i, room,
+                    )  # fmt: skip
+                    if begin == end:
+                        break
+                    most = 0
+                    for lane in range(LANES):
+                        if count[lane] == room:
+                            kept = prune(lists_z, lists_a, lists_i, lane * room, room, rank, order)
+                            if kept < room:
+                                state[_FARTHEST + np.uintp(lane)] = lists_z[lane * room + kept - 1]
+                            count[lane] = kept
+                        most = max(most, count[lane])
+                    if most > room // 2:
+                        lists_z, lists_a = widen(lists_z, room), widen(lists_a, room)
+                        lists_i = widen(lists_i, room)
+                        room *= 2
+                        order, weights = np.empty(room, np.int32), np.empty(room, np.float32)
+                _finish(
+                    surfaces, lists_z, lists_a, lists_i, room, count, rank, order, weights, pixel_base, pixel, aa,
+                    y - y0, tx * TILE - x0, first, owner, out_alpha, out_depth, out_surface,
+                )  # fmt: skip
+                for lane in range(LANES):
+                    if count[lane] > 0:
+                        out_object[y - y0, tx * TILE - x0 + (first + lane) // aa, (first + lane) % aa] = objects[
+                            tile_list[listed + owner[lane]]
+                        ]

@@ -50,8 +50,8 @@ def cloud(count: int, seed: int, size: float, spread: float) -> PosedSurfels:
 SCENES = {
     "large": lambda: cloud(150, 1, 0.25, 1.0),
     "small": lambda: cloud(800, 2, 0.02, 1.0),
-    # Few enough on a ray that the kernel's sorting window holds all that can come out of order.
     "dense": lambda: cloud(300, 3, 0.12, 0.7),
+    "fog": lambda: cloud(1500, 6, 0.3, 1.0),
     "around the camera": lambda: cloud(200, 4, 0.3, 5.0),
 }
 

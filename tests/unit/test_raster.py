@@ -169,6 +169,56 @@ def test_intersecting_surfels_are_ordered_where_the_ray_meets_them() -> None:
     assert red[12:18].min() > 0.5 > red[22:28].max()
 
 
+def test_fog_of_any_depth_is_blended_in_exact_order() -> None:
+    """A thousand faint tilted sheets on every ray, listed by centre in an order that differs on both sides of it."""
+    rng = np.random.default_rng(9)
+    n, opacity = 1000, 0.012
+    camera = look_along_y(8, 8, distance=4, orthographic=True, focal=4)
+    tilt, middle, red = rng.uniform(-0.6, 0.6, n), rng.uniform(-1, 1, n), rng.random(n)
+    u = np.stack([np.full(n, 1e4), 1e4 * tilt, np.zeros(n)], -1)
+    centre = np.stack([np.zeros(n), middle, np.zeros(n)], -1)
+    albedo = np.stack([red, red, red], -1)
+    sheets = surfels(centre, u, [0, 0, 1e4], opacity=opacity, albedo=albedo)
+    got = render_without_gaps(sheets, camera, aa=2)
+    at = sample_positions(camera, 2)
+    x = (at[..., 0] - 4) / 4
+    depth = 4 + middle + tilt * x[..., None]
+    order = np.argsort(depth, axis=-1, kind="stable")
+    left = (1 - opacity) ** np.arange(n + 1)
+    counted = left[:-1] >= 1e-4
+    weight = np.where(counted, opacity * left[:-1], 0.0)
+    assert 700 < counted.sum() < n  # more than a list has room for at first, and some behind opacity
+    assert np.allclose(got.alpha, weight.sum(), atol=1e-5)
+    assert np.allclose(got.surface[..., 3], (weight * red[order]).sum(-1) / weight.sum(), atol=1e-4)
+    sorted_depth = np.take_along_axis(depth, order, -1)
+    assert np.allclose(got.depth, (weight * sorted_depth).sum(-1) / weight.sum(), atol=1e-4)
+
+
+def test_what_full_lists_drop_is_hidden() -> None:
+    """Hundreds of strong sheets, of which a ray may meet the last one first: full lists are cut only behind opacity."""
+    n = 400
+    camera = look_along_y(8, 8, distance=4, orthographic=True, focal=4)
+    k = np.arange(n)
+    # Centres far to the left, ever deeper; on the right of the picture the sheets lie in reverse order.
+    tilt = -0.0028 * k
+    centre = np.stack([np.full(n, -4.0), -2 + 0.01 * k, np.zeros(n)], -1)
+    u = np.stack([np.full(n, 1e4), 1e4 * tilt, np.zeros(n)], -1)
+    red = k / n
+    sheets = surfels(centre, u, [0, 0, 1e4], opacity=0.1, albedo=np.stack([red, red, red], -1))
+    got = render_without_gaps(sheets, camera, aa=1)
+    x = (sample_positions(camera, 1)[..., 0] - 4) / 4
+    depth = 2 + 0.01 * k + tilt * (x[..., None] + 4)
+    order = np.argsort(depth, axis=-1, kind="stable")
+    left = 0.9 ** np.arange(n)
+    weight = np.where(left >= 1e-4, 0.1 * left, 0.0)
+    expected = (weight * red[order]).sum(-1) / weight.sum()
+    assert 60 < (weight > 0).sum() < 120
+    clipped = (depth <= camera.clip_start).any(-1)
+    assert not clipped.any()
+    assert np.allclose(got.surface[..., 3], expected, atol=1e-3)
+    assert np.allclose(got.alpha, weight.sum(), atol=1e-5)
+
+
 def test_the_order_of_the_input_does_not_matter() -> None:
     posed = random_surfels(300, seed=5)
     turned = PosedSurfels(*(np.ascontiguousarray(getattr(posed, f)[::-1]) for f in FIELDS))
