@@ -18,7 +18,7 @@ from drgs_blender.asset.container import read_asset
 from drgs_blender.formats.registry import read_environment
 from drgs_blender.frame import Frame, ObjectState, RenderSettings, World, split_rays
 from drgs_blender.render import pipeline
-from drgs_blender.render.denoise import Signal, denoise
+from drgs_blender.render.denoise import denoise
 from drgs_blender.render.film import Film
 from drgs_blender.render.motion import Motion
 from drgs_blender.render.oidn import available, denoise_oidn
