@@ -15,6 +15,7 @@ _FULL_NAMES = {
     "GlossDir": "Glossy Direct",
     "GlossInd": "Glossy Indirect",
     "Env": "Environment",
+    "Emit": "Emission",
 }
 
 
