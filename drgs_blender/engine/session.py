@@ -17,8 +17,9 @@ from ..asset.container import read_asset
 from ..asset.model import Asset, PosedSurfels
 from ..deform.mesh_driven import MeshDriven
 from ..errors import AssetError, Cancelled, UsageError
-from ..frame import Frame, Image, MeshState, ObjectState, World
+from ..frame import Frame, Image, Light, MeshState, ObjectState, World
 from ..jit import use_threads
+from ..render.lamps import Lamps
 from ..render.light import EnvironmentLight
 from ..render.pipeline import render
 from ..render.scene import TraceObject, TraceScene
@@ -75,6 +76,7 @@ class Session:
         self._current = True
         self._world: World | None = None
         self._light: EnvironmentLight | None = None
+        self._lamps = Lamps([])
 
     def load_asset(self, path: str | os.PathLike[str]) -> str:
         """Map the asset file at `path` unless it is mapped and unchanged; return its key.
@@ -137,7 +139,7 @@ class Session:
         light = self._light_of(frame.world)
         lap("light")
         tell = None if progress is None else lambda part, phase: progress(phase, part)
-        pictures = render(self._scene, light, posed, frame, tell, cancelled)
+        pictures = render(self._scene, light, posed, frame, tell, cancelled, self._lamps_of(frame.lights))
         lap("render")
         x0, y0, x1, y1 = frame.camera.window
         statistics |= {
@@ -207,6 +209,7 @@ class Session:
                     f"{fault.name}: {fault.bad_places} instances are flat, not finite or too far away; left out"
                 )
         found += self._scene.materials.warnings
+        found += self._lamps.warnings
         if self._light is not None and self._light.bad_texels:
             found.append(f"world: {self._light.bad_texels} texels are not finite or negative; they are black")
         return found
@@ -225,6 +228,14 @@ class Session:
                 self._light = EnvironmentLight(kept)
         self._world = kept
         return self._light
+
+    def _lamps_of(self, lights: list[Light]) -> Lamps:
+        """Blender's lights, and what they send to the middle of the scene."""
+        self._lamps = Lamps([])
+        if lights:
+            low, high = self._scene.bvh.bounds()
+            self._lamps = Lamps(lights, 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low)))
+        return self._lamps
 
 
 def _check_surface(state: ObjectState, asset: Asset, with_surfels: bool) -> None:

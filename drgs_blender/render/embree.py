@@ -70,6 +70,7 @@ def library() -> ctypes.CDLL:
         ("rtcSetSceneFlags", None, [pointer, ctypes.c_int]),
         ("rtcSetSceneBuildQuality", None, [pointer, ctypes.c_int]),
         ("rtcCommitScene", None, [pointer]),
+        ("rtcGetSceneBounds", None, [pointer, pointer]),
         ("rtcNewGeometry", pointer, [pointer, ctypes.c_int]),
         ("rtcReleaseGeometry", None, [pointer]),
         ("rtcSetGeometryBuildQuality", None, [pointer, ctypes.c_int]),

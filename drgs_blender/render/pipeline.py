@@ -13,14 +13,16 @@ import numpy as np
 
 from ..asset.model import PosedSurfels
 from ..errors import Cancelled, UsageError
-from ..frame import Frame, RenderSettings
+from ..frame import Frame
 from ..jit import use_threads
 from ..passes import BY_NAME
+from .adaptive import part_count, sample_adaptively
 from .camera import camera_parameters
 from .denoise import denoise
 from .film import COMPONENTS, Film
 from .gbuffer import GBuffer
 from .integrate import integrate
+from .lamps import Lamps
 from .light import EnvironmentLight
 from .oidn import denoise_oidn, require
 from .points import Radiance, ShadingPoints
@@ -46,6 +48,7 @@ def render(
     frame: Frame,
     progress: Progress | None = None,
     cancelled: Callable[[], bool] | None = None,
+    lamps: Lamps | None = None,
 ) -> dict[str, Array]:
     """Render the passes of a frame.
 
@@ -56,6 +59,7 @@ def render(
     posed : surfels of all objects, world space; not used when ``frame.settings.primary`` is "mesh"
     progress : called with the part done in [0, 1] and the name of the phase
     cancelled : asked several times a second
+    lamps : the frame's lights
 
     Returns
     -------
@@ -88,7 +92,7 @@ def render(
     film = Film(camera, settings, parameters)
     _, top, _, bottom = camera.window
     end = 1.0 if settings.denoise == "none" else 0.9
-    batches = _Batches(settings)
+    batches = _Batches(scene, light, lamps, frame, check)
     height = strip_height(camera.window[2] - camera.window[0], settings.aa)
     for y0 in range(top, bottom, height):
         tell(end * (y0 - top) / (bottom - top), "Rendering")
@@ -98,7 +102,7 @@ def render(
         else:
             buffer = primary_mesh(scene, camera, parameters, y0, y1)
         check()
-        radiance = batches.light(scene, light, buffer, frame.number, check)
+        radiance = batches.light(buffer)
         film.add(buffer, radiance, scene.pass_index, light)
     components = None
     if settings.denoise != "none":
@@ -120,28 +124,45 @@ def strip_height(width: int, aa: int) -> int:
 class _Batches:
     """Integrates points in batches as long as `BATCH_SECONDS`, learning how many points these are."""
 
-    def __init__(self, settings: RenderSettings) -> None:
-        self.settings = settings
-        self.size = max(FEWEST_POINTS, FIRST_SAMPLES // max(1, settings.rays))
+    def __init__(
+        self, scene: TraceScene, light: EnvironmentLight, lamps: Lamps | None, frame: Frame, check: Check
+    ) -> None:
+        self._scene, self._light, self._lamps, self._frame, self._check = scene, light, lamps, frame, check
+        self._parts = part_count(frame.settings)
+        self._size = max(FEWEST_POINTS, FIRST_SAMPLES * self._parts // max(1, frame.settings.rays))
 
-    def light(
-        self, scene: TraceScene, light: EnvironmentLight, buffer: GBuffer, frame_number: int, check: Check
-    ) -> Radiance:
+    def light(self, buffer: GBuffer) -> Radiance:
         """Light of all points of `buffer`."""
-        points: ShadingPoints = buffer.points
+        if self._parts == 1:
+            return self._trace(buffer.points, (0, 1))
+        threshold = self._frame.settings.noise_threshold
+        return sample_adaptively(buffer.points, self._frame.camera.width, self._parts, threshold, self._trace)
+
+    def _trace(self, points: ShadingPoints, part: tuple[int, int]) -> Radiance:
         n = len(points)
         out = Radiance(np.empty((n, 4, 3), np.float32), np.empty((n, 2), np.float32))
         first = 0
         while first < n:
-            last = min(first + self.size, n)
+            last = min(first + self._size, n)
             began = time.perf_counter()
-            part = integrate(scene, light, points[first:last], self.settings, frame_number)
-            out.components[first:last], out.variance[first:last] = part.components, part.variance
-            if last - first == self.size:
+            found = integrate(
+                self._scene,
+                self._light,
+                points[first:last],
+                self._frame.settings,
+                self._frame.number,
+                self._lamps,
+                part,
+            )
+            out.components[first:last], out.variance[first:last] = found.components, found.variance
+            if found.unshadowed is not None:
+                out.unshadowed = np.zeros(n, np.float32) if out.unshadowed is None else out.unshadowed
+                out.unshadowed[first:last] = found.unshadowed
+            if last - first == self._size:
                 pace = BATCH_SECONDS / max(time.perf_counter() - began, 1e-6)
-                self.size = int(min(max(self.size * min(max(pace, 0.25), 4.0), FEWEST_POINTS), 1 << 20))
+                self._size = int(min(max(self._size * min(max(pace, 0.25), 4.0), FEWEST_POINTS), 1 << 20))
             first = last
-            check()
+            self._check()
         return out
 
 

@@ -324,6 +324,14 @@ class TriangleBVH:
             part.release()
         self._parts = []
 
+    def bounds(self) -> tuple[Array, Array]:
+        """Lowest and highest corner of the box around everything, (3,) float32 each; zeros when there is nothing."""
+        box = np.zeros(8, np.float32)
+        if self.scene:
+            self._lib.rtcGetSceneBounds(self.scene, box.ctypes.data)
+        low, high = box[:3].copy(), box[4:7].copy()
+        return (low, high) if (low <= high).all() else (np.zeros(3, np.float32), np.zeros(3, np.float32))
+
     def close(self) -> None:
         """Give the trees' memory back; the object cannot be used afterwards."""
         self._release()
