@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
+from typing import Any
 
 import numpy as np
 
@@ -93,6 +94,9 @@ class TraceScene:
         self.extent = 0.0
         self.faults: list[ObjectFaults] = []
         self._parts: list[Part] = []
+        self._known: list[tuple[MeshState, Places]] = []
+        self._given: list[Any] = []  # lists of materials, images
+        self._first_material: list[int] = []
         self._groups: list[list[int]] = []  # parts of each group
         self._vertex_count = 0
         self._place_normal: Array = np.empty((0, 3, 3), np.float32)
@@ -147,19 +151,19 @@ class TraceScene:
             When an object's arrays do not fit together; names the object.
         """
         items: list[TraceObject | MeshState] = [*objects, *meshes]
-        places: list[Places | None] = [None] * len(objects)
-        places += [usable_places(mesh) for mesh in meshes]
         # An update that fails half way leaves nothing to be taken for current.
-        parts, self._parts = self._parts, []
+        (parts, self._parts), (known, self._known) = (self._parts, []), (self._known, [])
+        kept = [k[1] if k[0] is mesh else None for k, mesh in zip(known, meshes)]
+        kept += [None] * (len(meshes) - len(kept))
+        stands = [old or usable_places(mesh) for old, mesh in zip(kept, meshes)]
+        places: list[Places | None] = [*([None] * len(objects)), *stands]
         order = _order(items, places)
-        same = [part.source for part in parts] == order and all(
-            p.fits(items[p.source], places[p.source]) for p in parts
-        )
+        same = [p.source for p in parts] == order and all(p.fits(items[p.source], places[p.source]) for p in parts)
         if not same:
             parts = self._lay_out(items, places, order)
         before = [part.item for part in parts]
         vertices = self.bvh.vertices if same else np.zeros((self._vertex_count, 3), np.float32)
-        moved, died = [], not same
+        moved, elsewhere, died = set(), set(), not same
         for index, part in enumerate(parts):
             item, where = items[part.source], places[part.source]
             if part.item is item:
@@ -169,20 +173,20 @@ class TraceScene:
             else:
                 assert where is not None
                 change = take_mesh(part, item, where, vertices, self.normals)
-            if change[0]:
-                moved.append(index)
+                elsewhere |= {index} if where.instanced else set()
+            moved |= {index} if change[0] else set()
             died |= change[1]
-        self._number(objects, meshes, places)
+        if not same or elsewhere or len(known) != len(meshes):
+            self._place(stands, len(items))
+        self._number(objects, meshes, stands)
         self._take_materials(parts, before, meshes, images, len(objects))
-        self._commit(parts, vertices, places, set(moved), died)
-        self.faults = [
-            ObjectFaults(item.name, 0, 0, 0, where.bad if where else 0) for item, where in zip(items, places)
-        ]
+        self._commit(parts, vertices, places, moved, elsewhere, died)
+        self.faults = [ObjectFaults(item.name, 0, 0, 0, p.bad if p else 0) for item, p in zip(items, places)]
         for part in parts:
             fault = self.faults[part.source]
             fault.bad_vertices, fault.empty_faces = part.bad_vertices, part.empty_faces
             fault.bad_faces = 0 if part.dead is None else int(part.dead.sum())
-        self._parts = parts
+        self._parts, self._known = parts, list(zip(meshes, stands))
 
     def close(self) -> None:
         """Give the tree's memory back."""
@@ -222,26 +226,24 @@ class TraceScene:
         self._groups = [list(members) for _, members in alike]
         return parts
 
-    def _number(
-        self, objects: Sequence[TraceObject], meshes: Sequence[MeshState], places: Sequence[Places | None]
-    ) -> None:
-        """Number objects and places; see the class."""
-        count = len(objects)
-        where = [p for p in places[count:] if p is not None]
+    def _place(self, where: Sequence[Places], first: int) -> None:
+        """List the places of meshes in several; their objects are numbered from `first`."""
+        matrices = np.concatenate([np.empty((0, 3, 4)), *(p.matrices for p in where if p.instanced)])
+        self.places = np.ascontiguousarray(matrices, np.float32)
+        self._place_normal = normal_matrices(matrices)
+        self.place_object = np.arange(first, first + len(matrices), dtype=np.int32)
+
+    def _number(self, objects: Sequence[TraceObject], meshes: Sequence[MeshState], where: Sequence[Places]) -> None:
+        """Pass index and flags of all objects and places; see the class."""
         index = [np.array([o.pass_index for o in objects], np.int32)]
         index.append(np.array([p.pass_index[0] if len(p.pass_index) else 0 for p in where], np.int32))
         index += [p.pass_index for p in where if p.instanced]
         self.pass_index = np.concatenate(index)
         seen = [o.visibility for o in objects] + [mesh.visibility for mesh in meshes]
         flags = np.array([object_flags(visibility) for visibility in seen], np.int32)
-        repeat = [(count + i, len(p.matrices)) for i, p in enumerate(where) if p.instanced]
-        of_places = np.repeat([source for source, _ in repeat], [n for _, n in repeat]).astype(np.int64)
-        self.object_flags = np.concatenate([flags, flags[of_places]])
+        counts = [0] * len(objects) + [len(p.matrices) if p.instanced else 0 for p in where]
+        self.object_flags = np.concatenate([flags, np.repeat(flags, counts)])
         self.any_ordinary = any(mesh.visibility.camera and len(p.matrices) > 0 for mesh, p in zip(meshes, where))
-        matrices = np.concatenate([np.empty((0, 3, 4)), *(p.matrices for p in where if p.instanced)])
-        self.places = np.ascontiguousarray(matrices, np.float32)
-        self._place_normal = normal_matrices(matrices)
-        self.place_object = np.arange(len(flags), len(flags) + len(matrices), dtype=np.int32)
 
     def _take_materials(
         self,
@@ -252,9 +254,13 @@ class TraceScene:
         count: int,
     ) -> None:
         """Bring materials and texture coordinates of meshes up to date."""
-        self.materials = MaterialTable([m for mesh in meshes for m in mesh.materials], list(images), self.materials)
-        self._material_tables = np.array(self.materials.addresses, np.int64)
-        first = np.cumsum([0, *(len(mesh.materials) for mesh in meshes)])
+        given: list[Any] = [mesh.materials for mesh in meshes]
+        first = [int(n) for n in np.cumsum([0, *(len(own) for own in given)])]
+        given += images
+        if first != self._first_material or [id(g) for g in given] != [id(g) for g in self._given]:
+            self.materials = MaterialTable([m for mesh in meshes for m in mesh.materials], list(images), self.materials)
+            self._material_tables = np.array(self.materials.addresses, np.int64)
+            self._given = given
         if any(mesh.uvs is not None for mesh in meshes) and not len(self._uvs):
             self._uvs = np.zeros((len(self._material), 3, 2), np.float32)
             before = [None] * len(before)
@@ -263,10 +269,11 @@ class TraceScene:
             if not isinstance(mesh, MeshState):
                 continue
             rows = slice(part.face.start - self.vertex_faces, part.face.stop - self.vertex_faces)
-            own = _material_index(mesh, len(part.faces))
-            self._material[rows] = first[part.source - count] + own
+            if old is not mesh or first != self._first_material:
+                self._material[rows] = first[part.source - count] + _material_index(mesh, len(part.faces))
             if mesh.uvs is not None and (not isinstance(old, MeshState) or old.uvs is not mesh.uvs):
                 self._uvs[rows] = as_float(mesh.uvs, (len(part.faces), 3, 2), f"texture coordinates of {mesh.name}")
+        self._first_material = first
 
     def _commit(
         self,
@@ -274,9 +281,10 @@ class TraceScene:
         vertices: Array,
         places: Sequence[Places | None],
         moved: set[int],
+        elsewhere: set[int],
         other_faces: bool,
     ) -> None:
-        """Bring the tree up to date."""
+        """Bring the tree up to date: parts whose vertices `moved`, shapes that stand `elsewhere`."""
         first_place, count = [], 0
         matrices: dict[int, Array] = {}
         for index, members in enumerate(self._groups):
@@ -294,7 +302,9 @@ class TraceScene:
             ]
             self.bvh.build(vertices, np.concatenate([np.empty((0, 3), np.int32), *faces]), groups)
         else:
-            self.bvh.refit(None, [i for i, members in enumerate(self._groups) if moved & set(members)], matrices)
+            changed = [i for i, members in enumerate(self._groups) if moved.intersection(members)]
+            placed = {i: m for i, m in matrices.items() if elsewhere.intersection(self._groups[i])}
+            self.bvh.refit(None, changed, placed)
         reach = [part.reach for part in parts if not part.instanced]
         for index, m in matrices.items():
             part = parts[self._groups[index][0]]
