@@ -121,7 +121,8 @@ def test_the_whole_picture_does_not_depend_on_strips(primary: str, monkeypatch: 
     scene.update([thing], [small, wall(2.0), mesh_state(SQUARE * 0.3, FACES, matrix((0.9, -1.5, 0.9)),
                  visibility=Visibility(holdout=True))])  # fmt: skip
     settings = RenderSettings(aa=AA, cosine=4, ggx=2, environment=2, primary=primary, threads=1)  # type: ignore[arg-type]
-    frame = Frame(3, look_along_y(SIZE, focal=20.0), [ObjectState("ball", "key")], settings=settings, passes=tuple(BY_NAME))
+    states = [ObjectState("ball", "key")]
+    frame = Frame(3, look_along_y(SIZE, focal=20.0), states, settings=settings, passes=tuple(BY_NAME))
     posed = sphere_surfels(1.0, 3000)
     whole = pipeline.render(scene, light, posed, frame)
     assert {10, 11, 12} <= set(np.unique(whole["IndexOB"]).astype(int))
