@@ -6,8 +6,9 @@ import numpy as np
 from judge import to_srgb
 from scipy.ndimage import map_coordinates
 
+from drgs_blender.colour import LUMINANCE
+
 Array = np.ndarray
-LUMINANCE = np.float32([0.2126, 0.7152, 0.0722])
 
 
 def flicker(pictures: Array, mask: Array, vectors: Array | None = None) -> float:

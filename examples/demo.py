@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from drgs_blender.formats.colour import linear_to_srgb
+from drgs_blender.colour import linear_to_srgb
 from drgs_blender.render.frames import read_frame
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -15,11 +15,13 @@ import bpy
 import numpy as np
 from mathutils import Euler, Matrix
 
+from ...drgs_blender.colour import LUMINANCE as REC709
+
 Warn = Callable[[str], None]
 Array = np.ndarray
 
 #: Luminance weights of Rec.709.
-LUMINANCE = np.array((0.2126, 0.7152, 0.0722))
+LUMINANCE = np.array(REC709)
 #: Colours with which a function is probed for being a plain scaling of each channel.
 _PROBES = np.array(((0.9, 0.6, 0.3), (0.2, 0.5, 0.8), (0.04, 0.02, 0.07)))
 

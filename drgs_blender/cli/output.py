@@ -73,7 +73,7 @@ def write_preview(path: Path, combined: np.ndarray) -> None:
     """
     from PIL import Image
 
-    from ..formats.colour import linear_to_srgb
+    from ..colour import linear_to_srgb
 
     alpha = np.clip(np.nan_to_num(combined[..., 3:4]), 0, 1)
     linear = np.clip(np.nan_to_num(combined[..., :3]) / np.maximum(alpha, 1e-6), 0, 1)

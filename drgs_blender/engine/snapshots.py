@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from .slots import keep, same_bits
+from ..arrays import keep, same_bits
 
 T = TypeVar("T")
 

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from ..asset import Surfels
+from ..colour import srgb_to_linear
 from ..errors import AssetError
 from .axes import multiply_quaternions
-from .colour import srgb_to_linear
 from .files import SurfelFile
 from .ply import Header, Rows, read_ply
 

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from ..asset import Environment
+from ..colour import srgb_to_linear
 from ..errors import AssetError, DeviceError
-from .colour import srgb_to_linear
 from .files import EnvironmentFile
 from .latlong import directions, nvdiffrec_cube, sample_cube
 

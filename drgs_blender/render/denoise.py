@@ -28,8 +28,10 @@ from typing import Any
 
 import numpy as np
 
+from ..colour import LUMINANCE as REC709
 from ..jit import njit, prange
 from .rows import over_rows
+from .sampling import luminance
 
 Array = np.ndarray
 
@@ -159,11 +161,6 @@ def _colour(lobe: Any, albedo: Any, metallic: Any, y: Any, x: Any) -> Any:
     return max(base + m * r, floor), max(base + m * g, floor), max(base + m * b, floor)
 
 
-@njit(inline="always")
-def _luminance(r: Any, g: Any, b: Any) -> Any:
-    return np.float32(0.2126) * r + np.float32(0.7152) * g + np.float32(0.0722) * b
-
-
 @njit(parallel=True)
 def _demodulate(
     components: Any, variance: Any, coverage: Any, position: Any, normal: Any, albedo: Any, roughness: Any,
@@ -192,7 +189,7 @@ def _demodulate(
             valid = True
             for lobe in range(2):
                 colour = _colour(lobe, albedo, metallic, y, x)
-                shade = cover * _luminance(colour[0], colour[1], colour[2])
+                shade = cover * luminance(colour[0], colour[1], colour[2])
                 base = LIGHT + 3 * parts * lobe
                 for k in range(3):
                     scale = np.float32(1.0) / (cover * colour[k])
@@ -222,7 +219,7 @@ def _lobe_luminance(light: Any, y: Any, c: Any, lobe: Any, parts: Any) -> Any:
     total = np.float32(0.0)
     for part in range(parts):
         k = LIGHT + 3 * (parts * lobe + part)
-        total += _luminance(light[y, k, c], light[y, k + 1, c], light[y, k + 2, c])
+        total += luminance(light[y, k, c], light[y, k + 1, c], light[y, k + 2, c])
     return total
 
 
@@ -417,7 +414,7 @@ def _a_trous(y0: Any, y1: Any, step: Any, guide: Any, spans: Any, light: Any, ou
 @njit(inline="always")
 def _share(k: Any) -> Any:
     """Share of colour channel `k` in luminance."""
-    return np.float32(0.2126) if k == 0 else np.float32(0.7152) if k == 1 else np.float32(0.0722)
+    return np.float32(REC709[0]) if k == 0 else np.float32(REC709[1]) if k == 1 else np.float32(REC709[2])
 
 
 @njit(parallel=True)

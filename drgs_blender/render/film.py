@@ -26,8 +26,9 @@ from ..jit import njit, prange
 from .camera import FX, FY, ORTHOGRAPHIC, WIDTH, sample_ray
 from .denoise import Guides
 from .gbuffer import GBuffer
-from .light import EnvironmentLight, radiance_at, to_map
+from .light import EnvironmentLight, map_at, sky_radiance
 from .points import CATCHER, Radiance
+from .sampling import luminance
 
 Array = np.ndarray
 
@@ -35,7 +36,6 @@ EMPTY_DEPTH = 1e10
 #: Samples of one pixel within this many pixel widths of depth are of one surface (a slope of 83 degrees).
 SAME_SURFACE = 8.0
 
-_RED, _GREEN, _BLUE = np.float32(0.2126), np.float32(0.7152), np.float32(0.0722)
 
 COMPONENTS = ("DiffDir", "DiffInd", "GlossDir", "GlossInd")
 
@@ -119,12 +119,12 @@ class Film:
         if buffer.hole is not None:
             self.hole[rows] = buffer.hole.mean(axis=2)
         if not self.transparent and not light.black:
-            _background(self.parameters, x0, y0, buffer.alpha, light.texels, light.rotation, self.environment[rows])
+            _background(self.parameters, x0, y0, buffer.alpha, light.sky, self.environment[rows])
             caught = np.flatnonzero(points.flags & CATCHER)
             if len(caught):
                 _behind(
                     self.parameters, x0, y0, points.pixel[caught], points.sample[caught], points.weight[caught],
-                    light.texels, light.rotation, self.veiled[rows],
+                    light.sky, self.veiled[rows],
                 )  # fmt: skip
 
     def guides(self) -> Guides:
@@ -234,7 +234,7 @@ def _develop(
                 if flags[i] & CATCHER:
                     shine = zero
                     for c in range(4):
-                        shine += _RED * light[i, c, 0] + _GREEN * light[i, c, 1] + _BLUE * light[i, c, 2]
+                        shine += luminance(light[i, c, 0], light[i, c, 1], light[i, c, 2])
                     out_catcher[y, x, 0] += weight[i]
                     out_catcher[y, x, 1] += weight[i] * shine
                     out_catcher[y, x, 2] += weight[i] * unshadowed[i]
@@ -287,18 +287,16 @@ def _develop(
 
 
 @njit
-def _world(p: Any, pixel: Any, sample: Any, radiance: Any, rotation: Any) -> Any:
+def _world(p: Any, pixel: Any, sample: Any, sky: Any) -> Any:
     """The world's radiance along the ray of a sub-pixel sample."""
-    if radiance.shape[0] * radiance.shape[1] == 1:
-        return radiance[0, 0, 0], radiance[0, 0, 1], radiance[0, 0, 2]
     _, _, _, dx, dy, dz = sample_ray(p, pixel, sample)
     scale = 1.0 / np.sqrt(dx * dx + dy * dy + dz * dz)
-    u, v = to_map(np.float32(dx * scale), np.float32(dy * scale), np.float32(dz * scale), rotation)
-    return radiance_at(u, v, radiance)
+    u, v = map_at(np.float32(dx * scale), np.float32(dy * scale), np.float32(dz * scale), sky)
+    return sky_radiance(u, v, sky)
 
 
 @njit(parallel=True)
-def _background(p: Any, x0: Any, y0: Any, alpha: Any, radiance: Any, rotation: Any, out: Any) -> None:
+def _background(p: Any, x0: Any, y0: Any, alpha: Any, sky: Any, out: Any) -> None:
     """Add the world's radiance along every sub-pixel ray, weighted by what the surfaces leave uncovered."""
     width = np.int64(p[WIDTH])
     rows, columns, aa = alpha.shape
@@ -310,20 +308,18 @@ def _background(p: Any, x0: Any, y0: Any, alpha: Any, radiance: Any, rotation: A
                 left = (np.float32(1.0) - alpha[y, x, k]) * share
                 if left <= np.float32(0.0):
                     continue
-                r, g, b = _world(p, (y0 + y) * width + x0 + x, k, radiance, rotation)
+                r, g, b = _world(p, (y0 + y) * width + x0 + x, k, sky)
                 red, green, blue = red + left * r, green + left * g, blue + left * b
             out[y, x, 0], out[y, x, 1], out[y, x, 2] = red, green, blue
 
 
 @njit
-def _behind(
-    p: Any, x0: Any, y0: Any, pixel: Any, sample: Any, weight: Any, radiance: Any, rotation: Any, out: Any
-) -> None:
+def _behind(p: Any, x0: Any, y0: Any, pixel: Any, sample: Any, weight: Any, sky: Any, out: Any) -> None:
     """Add the world's radiance behind some points, by weight."""
     width = np.int64(p[WIDTH])
     for i in range(len(pixel)):
         y, x = pixel[i] // width - y0, pixel[i] % width - x0
-        r, g, b = _world(p, pixel[i], sample[i], radiance, rotation)
+        r, g, b = _world(p, pixel[i], sample[i], sky)
         out[y, x, 0] += weight[i] * r
         out[y, x, 1] += weight[i] * g
         out[y, x, 2] += weight[i] * b

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from ..colour import LUMINANCE
 from ..errors import UsageError
 from ..frame import RenderSettings
 from ..jit import get_num_threads, njit, prange
@@ -21,7 +22,7 @@ from .lamps import Lamps, lamps_along
 from .light import EnvironmentLight, sky_radiance
 from .paths import CARRIED, EMITTED, FOUND, INDIRECT, add_path, lifted, trace_paths
 from .points import CATCHER, SECOND, Radiance, ShadingPoints
-from .sampling import GOLDEN, ONE, ZERO, F, U, mix, unit
+from .sampling import GOLDEN, ONE, ZERO, F, U, luminance, mix, unit
 from .scene import TraceScene
 from .surface import nearest
 
@@ -131,7 +132,7 @@ def integrate(
         alone = np.zeros((len(caught), 4, 3), np.float32)
         run(points[caught], masks.WITHOUT, alone, np.zeros((len(caught), 2), np.float32))
         unshadowed = np.zeros(n, np.float32)
-        unshadowed[caught] = alone.sum(axis=1) @ np.array([0.2126, 0.7152, 0.0722], np.float32)
+        unshadowed[caught] = alone.sum(axis=1) @ np.array(LUMINANCE, np.float32)
     return Radiance(components, variance, unshadowed)
 
 
@@ -206,10 +207,10 @@ def _add(sums: Any, h: Any, kind: Any, qr: Any, qg: Any, qb: Any, sr: Any, sg: A
     sums[h, k + 3] += sr
     sums[h, k + 4] += sg
     sums[h, k + 5] += sb
-    value = w.luminance(qr, qg, qb)
+    value = luminance(qr, qg, qb)
     sums[h, k + 6] += value
     sums[h, k + 7] += value * value
-    value = w.luminance(sr, sg, sb)
+    value = luminance(sr, sg, sb)
     sums[h, k + 8] += value
     sums[h, k + 9] += value * value
 

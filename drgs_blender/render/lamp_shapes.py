@@ -11,6 +11,7 @@ import math
 
 import numpy as np
 
+from ..colour import LUMINANCE
 from ..frame import Light
 from ..jit import njit
 from .sampling import HALF, ONE, PI, TWO, ZERO, F, basis, sincos_turns, unit
@@ -33,7 +34,6 @@ BARE_POINT, BARE_SUN, SOFT_POINT, SPHERE, SUN, RECTANGLE, ELLIPSE = range(7)
 #: Bits of FLAGS: rays that see the lamp, and whether things block it.
 CAMERA, DIFFUSE, GLOSSY, SHADOW = 1, 2, 4, 8
 
-_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 #: Smaller radii (metres, radians) are points; Cycles' parallel area light (spread 0) gets this spread, in radians.
 _LEAST_RADIUS, _LEAST_ANGLE, _LEAST_SPREAD = 1e-6, 1e-5, 1e-3
 _FAR = F(np.inf)
@@ -77,8 +77,8 @@ def lamp_row(light: Light) -> Array | str:
     if radiance is None:
         return "its size or scale is zero"
     row[RADIANCE : RADIANCE + 3] = radiance * colour
-    row[INTENSITY] *= radiance * float(colour @ _LUMINANCE)
-    row[FLUX] *= radiance * float(colour @ _LUMINANCE)
+    row[INTENSITY] *= radiance * float(colour @ np.array(LUMINANCE))
+    row[FLUX] *= radiance * float(colour @ np.array(LUMINANCE))
     with np.errstate(over="ignore"):
         row32 = row.astype(np.float32)
     return row32 if np.isfinite(row32).all() else "it is too bright or too far away"

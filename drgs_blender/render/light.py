@@ -13,16 +13,14 @@ from typing import NamedTuple
 import numpy as np
 
 from ..asset.model import as_float
+from ..colour import LUMINANCE
 from ..errors import UsageError
 from ..frame import World
 from ..jit import njit
 from .memory import address, load_float, load_int32, load_uint32
-from .sampling import fast_acos, fast_atan2_turns, sincos_turns
+from .sampling import fast_acos, fast_atan2_turns, sincos_turns, unit
 
 Array = np.ndarray
-
-#: Rec.709 luminance.
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
 #: Cells of the sampling table at most; larger pictures are averaged down for sampling (never for the lookup).
 _MOST_CELLS = 1 << 22
@@ -133,7 +131,7 @@ class EnvironmentLight:
         self._make_table()
 
     def _make_table(self) -> None:
-        means = _texel_means(self.texels[..., :3].astype(np.float64) @ LUMINANCE.astype(np.float64))
+        means = _texel_means(self.texels[..., :3].astype(np.float64) @ np.array(LUMINANCE))
         h, w = means.shape
         step = 1
         while (h // step) * (w // step) > _MOST_CELLS or h % step or w % step:
@@ -192,16 +190,16 @@ class EnvironmentLight:
 
     def lookup(self, directions: Array) -> Array:
         """(n, 3) radiance from (n, 3) unit world directions."""
-        return _lookup_many(np.ascontiguousarray(directions, np.float32), self.texels, self.rotation)
+        return _lookup_many(np.ascontiguousarray(directions, np.float32), self.sky)
 
     def pdf(self, directions: Array) -> Array:
         """(n,) density per solid angle with which ``sample`` draws (n, 3) unit world directions."""
-        return _pdf_many(np.ascontiguousarray(directions, np.float32), self.texels, self.rotation)
+        return _pdf_many(np.ascontiguousarray(directions, np.float32), self.sky)
 
     def sample(self, numbers: Array) -> tuple[Array, Array]:
         """World directions (n, 3) and densities (n,) from (n, 3) uint32 random numbers."""
         numbers = np.ascontiguousarray(numbers, np.uint32)
-        return _sample_many(numbers, self.texels, self.cells, self.guide, self.row_z, self.rotation)
+        return _sample_many(numbers, self.sky)
 
 
 @njit
@@ -266,92 +264,47 @@ def cell_at(place, sky):  # type: ignore[no-untyped-def]
 
 
 @njit
-def to_map(dx, dy, dz, rotation):  # type: ignore[no-untyped-def]
-    """Lat-long coordinates (u, v) in [0, 1] of a world direction; row 0 at +Z, +X at u = 1/2."""
-    x = rotation[0, 0] * dx + rotation[0, 1] * dy + rotation[0, 2] * dz
-    y = rotation[1, 0] * dx + rotation[1, 1] * dy + rotation[1, 2] * dz
-    z = rotation[2, 0] * dx + rotation[2, 1] * dy + rotation[2, 2] * dz
-    return np.float32(0.5) - fast_atan2_turns(y, x), fast_acos(z) * np.float32(1.0 / math.pi)
-
-
-@njit
-def density_at(u, v, texels):  # type: ignore[no-untyped-def]
-    """Density per solid angle of the sampling cell that holds (u, v)."""
-    h, w = texels.shape[0], texels.shape[1]
-    return texels[
-        min(np.int32(h - 1), np.int32(v * np.float32(h))), min(np.int32(w - 1), np.int32(u * np.float32(w))), 3
-    ]
-
-
-@njit
-def radiance_at(u, v, texels):  # type: ignore[no-untyped-def]
-    """Bilinear lookup, wrapped in u and clamped in v."""
-    h, w = texels.shape[0], texels.shape[1]
-    x, y = u * np.float32(w) - np.float32(0.5), v * np.float32(h) - np.float32(0.5)
-    y = min(max(y, np.float32(0.0)), np.float32(h - 1))
-    c0, r0 = np.int32(x + np.float32(1.0)) - np.int32(1), np.int32(y)
-    a, b = x - np.float32(c0), y - np.float32(r0)
-    c1 = c0 + 1 if c0 + 1 < w else 0
-    if c0 < 0:
-        c0 = w - 1
-    r1 = min(r0 + 1, h - 1)
-    one = np.float32(1.0)
-    p00, p01, p10, p11 = (one - a) * (one - b), a * (one - b), (one - a) * b, a * b
-    red = p00 * texels[r0, c0, 0] + p01 * texels[r0, c1, 0] + p10 * texels[r1, c0, 0] + p11 * texels[r1, c1, 0]
-    green = p00 * texels[r0, c0, 1] + p01 * texels[r0, c1, 1] + p10 * texels[r1, c0, 1] + p11 * texels[r1, c1, 1]
-    blue = p00 * texels[r0, c0, 2] + p01 * texels[r0, c1, 2] + p10 * texels[r1, c0, 2] + p11 * texels[r1, c1, 2]
-    return red, green, blue
-
-
-@njit
-def sample_map(n0, n1, n2, texels, cells, guide, row_z, rotation):  # type: ignore[no-untyped-def]
-    """World direction, its (u, v) and its density from three uint32: the cell, and the place inside it."""
-    step = texels.shape[0] // (len(row_z) - 1)
-    columns = texels.shape[1] // step
-    i = np.int64(guide[np.int64((np.uint64(n0) * np.uint64(len(guide))) >> np.uint64(32))])
-    while n0 > cells[i, 0]:
-        i += 1
-    cell = np.int64(cells[i, 1])
-    r, c = cell // columns, cell % columns
-    scale = np.float32(1.0 / 16777216.0)
-    u = (np.float32(c) + np.float32(n1 >> np.uint32(8)) * scale) / np.float32(columns)
-    t = np.float32(n2 >> np.uint32(8)) * scale
-    z = row_z[r] + t * (row_z[r + 1] - row_z[r])
-    s, k = sincos_turns(np.float32(0.5) - u)
+def direction_in_cell(column, upper, lower, n0, n1, sky):  # type: ignore[no-untyped-def]
+    """World direction within a cell, from two uint32, and its lat-long coordinates (u, v)."""
+    u = (np.float32(column) + unit(n0)) / np.float32(sky.columns)
+    z = upper + unit(n1) * (lower - upper)
+    s, c = sincos_turns(np.float32(0.5) - u)
     ring = math.sqrt(max(np.float32(0.0), np.float32(1.0) - z * z))
-    x, y = ring * k, ring * s
-    dx = rotation[0, 0] * x + rotation[1, 0] * y + rotation[2, 0] * z
-    dy = rotation[0, 1] * x + rotation[1, 1] * y + rotation[2, 1] * z
-    dz = rotation[0, 2] * x + rotation[1, 2] * y + rotation[2, 2] * z
-    v = fast_acos(z) * np.float32(1.0 / math.pi)
-    return dx, dy, dz, u, v, texels[r * step, c * step, 3]
+    x, y = ring * c, ring * s
+    dx = sky.xx * x + sky.yx * y + sky.zx * z
+    dy = sky.xy * x + sky.yy * y + sky.zy * z
+    dz = sky.xz * x + sky.yz * y + sky.zz * z
+    return dx, dy, dz, u, fast_acos(z) * np.float32(1.0 / math.pi)
 
 
 @njit
-def _lookup_many(directions, texels, rotation):  # type: ignore[no-untyped-def]
+def _lookup_many(directions, sky):  # type: ignore[no-untyped-def]
     out = np.empty((len(directions), 3), np.float32)
     for i in range(len(directions)):
-        u, v = to_map(directions[i, 0], directions[i, 1], directions[i, 2], rotation)
-        out[i, 0], out[i, 1], out[i, 2] = radiance_at(u, v, texels)
+        u, v = map_at(directions[i, 0], directions[i, 1], directions[i, 2], sky)
+        out[i, 0], out[i, 1], out[i, 2] = sky_radiance(u, v, sky)
     return out
 
 
 @njit
-def _pdf_many(directions, texels, rotation):  # type: ignore[no-untyped-def]
+def _pdf_many(directions, sky):  # type: ignore[no-untyped-def]
     out = np.empty(len(directions), np.float32)
     for i in range(len(directions)):
-        u, v = to_map(directions[i, 0], directions[i, 1], directions[i, 2], rotation)
-        out[i] = density_at(u, v, texels)
+        u, v = map_at(directions[i, 0], directions[i, 1], directions[i, 2], sky)
+        out[i] = sky_density(u, v, sky)
     return out
 
 
 @njit
-def _sample_many(numbers, texels, cells, guide, row_z, rotation):  # type: ignore[no-untyped-def]
+def _sample_many(numbers, sky):  # type: ignore[no-untyped-def]
     n = len(numbers)
     directions, pdf = np.empty((n, 3), np.float32), np.empty(n, np.float32)
     for i in range(n):
-        x, y, z, _, _, p = sample_map(
-            numbers[i, 0], numbers[i, 1], numbers[i, 2], texels, cells, guide, row_z, rotation
+        place = first_cell(numbers[i, 0], sky)
+        while numbers[i, 0] > cell_end(place, sky):
+            place += 1
+        _, column, upper, lower, pdf[i] = cell_at(place, sky)
+        directions[i, 0], directions[i, 1], directions[i, 2], _, _ = direction_in_cell(
+            column, upper, lower, numbers[i, 1], numbers[i, 2], sky
         )
-        directions[i, 0], directions[i, 1], directions[i, 2], pdf[i] = x, y, z, p
     return directions, pdf

@@ -11,6 +11,7 @@ import math
 
 import numpy as np
 
+from ..colour import LUMINANCE
 from ..jit import njit
 
 Array = np.ndarray
@@ -21,6 +22,12 @@ ZERO, HALF, ONE, TWO, PI = F(0.0), F(0.5), F(1.0), F(2.0), F(math.pi)
 INVERSE_PI = F(1.0 / math.pi)
 GOLDEN = U(0x9E3779B9)
 _UNIT = F(1.0 / 16777216.0)
+
+
+@njit
+def luminance(r, g, b):  # type: ignore[no-untyped-def]
+    """Luminance of linear Rec.709."""
+    return F(LUMINANCE[0]) * r + F(LUMINANCE[1]) * g + F(LUMINANCE[2]) * b
 
 
 @njit

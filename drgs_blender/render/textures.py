@@ -23,12 +23,12 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from ..engine.slots import frozen
+from ..arrays import frozen
+from ..colour import srgb_to_linear, to_unit
 from ..errors import UsageError
-from ..formats.colour import srgb_to_linear, to_unit
 from ..frame import Image, Material, Texture
 from ..jit import njit
-from .sampling import HALF, ONE, TWO, ZERO, F
+from .sampling import HALF, ONE, TWO, ZERO, F, luminance
 
 Array = np.ndarray
 
@@ -41,7 +41,6 @@ _EXTENSIONS = {"repeat": 0, "extend": 1, "mirror": 2, "clip": 3}
 _REPEAT, _EXTEND, _MIRROR, _CLIP = range(4)
 _SLOTS = ("base_colour_texture", "roughness_texture", "metallic_texture", "emission_texture")
 #: Rec.709 luminance.
-_RED, _GREEN, _BLUE = F(0.2126), F(0.7152), F(0.0722)
 #: What Blender shows of an image that is not there.
 _MISSING = np.array([[[255, 0, 255, 255]]], np.uint8)
 #: Radiance above this is cut: its square is still a float32.
@@ -340,7 +339,7 @@ def _number(row, u, v, addresses):  # type: ignore[no-untyped-def]
     red, green, blue, alpha = _lookup(row, u, v, addresses)
     channel = _int32(addresses[2], 4 * row + 1)
     if channel >= _LUMINANCE:
-        return _RED * red + _GREEN * green + _BLUE * blue
+        return luminance(red, green, blue)
     if channel == _A:
         return alpha
     return red if channel == 0 else (green if channel == 1 else blue)

@@ -18,8 +18,8 @@ from . import brdf, sampling
 from .lamp_shapes import DIFFUSE, GLOSSY
 from .lamp_shapes import SHADOW as SHADOWED
 from .lamps import lamp_flags, sample_lamp
-from .light import cell_at, cell_end, first_cell, map_at, sky_density
-from .sampling import HALF, INVERSE_PI, ONE, TWO, ZERO, F, U, mix, sincos_turns, unit
+from .light import cell_at, cell_end, direction_in_cell, first_cell, map_at, sky_density
+from .sampling import INVERSE_PI, ONE, TWO, ZERO, F, U, luminance, mix, unit
 from .surface import shadowed
 
 Array = np.ndarray
@@ -157,20 +157,13 @@ def light_directions(s: Any, ints: Any, count: Any, sky: Any) -> None:
         i, c = at(slot)
         _, column, s[i + MV], s[i + LZ], s[i + PE] = cell_at(ints[c + CELL], sky)
         s[i + MU] = F(column)
-    per_column = ONE / F(sky.columns)
     for p in range(packets(count)):
         b, c = p * _FLOATS, p * _INTS
         for k in range(LANES):
             i = b + k
-            u = (s[i + MU] + unit(ints[c + k + N0])) * per_column
-            z = s[i + MV] + unit(ints[c + k + N1]) * (s[i + LZ] - s[i + MV])
-            sine, cosine = sincos_turns(HALF - u)
-            ring = math.sqrt(max(ZERO, ONE - z * z))
-            x, y = ring * cosine, ring * sine
-            s[i + LX] = sky.xx * x + sky.yx * y + sky.zx * z
-            s[i + LY] = sky.xy * x + sky.yy * y + sky.zy * z
-            s[i + LZ] = sky.xz * x + sky.yz * y + sky.zz * z
-            s[i + MU], s[i + MV] = u, sampling.fast_acos(z) * INVERSE_PI
+            s[i + LX], s[i + LY], s[i + LZ], s[i + MU], s[i + MV] = direction_in_cell(
+                s[i + MU], s[i + MV], s[i + LZ], ints[c + k + N0], ints[c + k + N1], sky
+            )
 
 
 @njit
@@ -308,9 +301,3 @@ def fresh_numbers(ints: Any, count: Any, step: Any) -> None:
             ints[i + N0] = mix(key)
             ints[i + N1] = mix(U(key + U(0x68E31DA4)))
             ints[i + N2] = mix(U(key + U(0xB5297A4D)))
-
-
-@njit
-def luminance(r: Any, g: Any, b: Any) -> Any:
-    """Rec.709 luminance."""
-    return F(0.2126) * r + F(0.7152) * g + F(0.0722) * b

@@ -102,7 +102,7 @@ def test_objects_of_one_name_get_slots_of_their_own():
         ("camera.clip_end", float("inf")),
         ("camera.width", 3.5),
         ("camera.region", (1, 2, 3)),
-        ("settings.denoise", "oidn"),
+        ("settings.denoise", "blur"),
         ("settings.seed", 2**64),
         ("settings.film_transparent", 1),
         ("world.environment", [[0.0]]),

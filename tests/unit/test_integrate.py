@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 import trimesh
 
+from drgs_blender.colour import LUMINANCE
 from drgs_blender.errors import UsageError
 from drgs_blender.frame import RenderSettings, World
 from drgs_blender.jit import get_num_threads, use_threads
 from drgs_blender.render.integrate import integrate
-from drgs_blender.render.light import LUMINANCE, EnvironmentLight
+from drgs_blender.render.light import EnvironmentLight
 from drgs_blender.render.points import DIFFUSE_DIRECT, DIFFUSE_INDIRECT, Radiance, ShadingPoints
 from drgs_blender.render.scene import TraceObject, TraceScene
 

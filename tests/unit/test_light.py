@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from drgs_blender.colour import LUMINANCE
 from drgs_blender.errors import UsageError
 from drgs_blender.frame import World
-from drgs_blender.render.light import LUMINANCE, EnvironmentLight, _texel_means
+from drgs_blender.render.light import EnvironmentLight, _texel_means
 
 
 def picture(kind: str) -> np.ndarray | None:

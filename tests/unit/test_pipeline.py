@@ -156,7 +156,7 @@ def test_cancel_at_once(ball: tuple[TraceScene, PosedSurfels, EnvironmentLight])
     [
         ({"aa": 0}, ALL, "sub-pixel"),
         ({"primary": "voxels"}, ALL, "voxels"),
-        ({"denoise": "oidn"}, ALL, "oidn"),
+        ({"denoise": "blur"}, ALL, "oidn"),
         ({}, ("Combined", "Shadow"), "Shadow"),
     ],
 )

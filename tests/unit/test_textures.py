@@ -8,8 +8,8 @@ import weakref
 import numpy as np
 import pytest
 
+from drgs_blender.colour import srgb_to_linear
 from drgs_blender.errors import UsageError
-from drgs_blender.formats.colour import srgb_to_linear
 from drgs_blender.frame import Image, Material, Texture
 from drgs_blender.render.textures import MaterialTable
 

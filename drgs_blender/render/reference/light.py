@@ -12,10 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ...colour import LUMINANCE
 from ...frame import World
-
-#: Weights of the luminance of linear Rec.709.
-LUMINANCE = (0.2126, 0.7152, 0.0722)
 
 
 def directions_of(u: Tensor, v: Tensor) -> Tensor:

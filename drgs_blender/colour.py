@@ -1,10 +1,13 @@
-"""The sRGB transfer function (IEC 61966-2-1)."""
+"""Colour: the sRGB transfer function (IEC 61966-2-1), luminance of linear Rec.709."""
 
 from __future__ import annotations
 
 import numpy as np
 
 Array = np.ndarray
+
+#: Luminance of linear Rec.709 red, green and blue (ITU-R BT.709).
+LUMINANCE = (0.2126, 0.7152, 0.0722)
 
 
 def srgb_to_linear(encoded: Array) -> Array:
