@@ -121,7 +121,6 @@ def address(function: Any) -> int:
 _WORDS = 24
 _TFAR, _MASK, _NORMAL, _U, _V = 8, 9, 12, 15, 16
 _PRIMITIVE, _GEOMETRY, _INSTANCE, _INSTANCE_PRIMITIVE = 17, 18, 19, 20
-_ALL = -1  # a mask that meets everything
 
 
 def _emit_call(builder: Any, arguments: Any, words: int) -> Any:
@@ -135,7 +134,7 @@ def _emit_call(builder: Any, arguments: Any, words: int) -> Any:
         place = builder.gep(memory, [ir.Constant(word, 0), ir.Constant(word, index)])
         return builder.bitcast(place, kind.as_pointer())
 
-    ox, oy, oz, dx, dy, dz, tnear, tfar, mask = ray if len(ray) == 9 else (*ray, ir.Constant(word, _ALL))
+    ox, oy, oz, dx, dy, dz, tnear, tfar, mask = ray
     for index, value in enumerate((ox, oy, oz, tnear, dx, dy, dz, ir.Constant(single, 0.0), tfar)):
         builder.store(value, slot(index, single))
     builder.store(mask, slot(_MASK, word))
@@ -152,8 +151,7 @@ def _emit_call(builder: Any, arguments: Any, words: int) -> Any:
     return lambda index, kind: builder.load(slot(index, kind))
 
 
-_ARGUMENTS = (types.int64, types.int64) + (types.float32,) * 8
-_HIT = types.Tuple((types.float32, types.int32) + (types.float32,) * 5)
+_ARGUMENTS = (types.int64, types.int64) + (types.float32,) * 8 + (types.int32,)
 _TRACED = types.Tuple((types.float32,) + (types.int32,) * 3 + (types.float32,) * 5)
 
 
@@ -182,13 +180,7 @@ def trace(typing: Any, address: Any, scene: Any, ox: Any, oy: Any, oz: Any, dx: 
         values += [load(i, single) for i in (_U, _V, _NORMAL, _NORMAL + 1, _NORMAL + 2)]
         return context.make_tuple(builder, signature.return_type, values)
 
-    return _TRACED(*_ARGUMENTS, types.int32), codegen
-
-
-def _emit_occluded(builder: Any, arguments: Any) -> Any:
-    load = _emit_call(builder, arguments, 12)
-    # Embree sets tfar to -inf when the ray is blocked.
-    return builder.fcmp_ordered("<", load(_TFAR, ir.FloatType()), ir.Constant(ir.FloatType(), 0.0))
+    return _TRACED(*_ARGUMENTS), codegen
 
 
 @intrinsic
@@ -200,32 +192,8 @@ def blocked(typing: Any, address: Any, scene: Any, ox: Any, oy: Any, oz: Any, dx
     """
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return _emit_occluded(builder, arguments)
-
-    return types.boolean(*_ARGUMENTS, types.int32), codegen
-
-
-@intrinsic
-def closest_hit(typing: Any, address: Any, scene: Any, ox: Any, oy: Any, oz: Any, dx: Any, dy: Any, dz: Any,
-                tnear: Any, tfar: Any) -> Any:  # fmt: skip
-    """`trace` of everything in a tree of a single group without instances: ``(t, face, u, v, gx, gy, gz)``."""
-
-    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        load = _emit_call(builder, arguments, _WORDS)
-        single = ir.FloatType()
-        values = [load(_TFAR, single), load(_PRIMITIVE, ir.IntType(32))]
-        values += [load(i, single) for i in (_U, _V, _NORMAL, _NORMAL + 1, _NORMAL + 2)]
-        return context.make_tuple(builder, signature.return_type, values)
-
-    return _HIT(*_ARGUMENTS), codegen
-
-
-@intrinsic
-def occluded(typing: Any, address: Any, scene: Any, ox: Any, oy: Any, oz: Any, dx: Any, dy: Any, dz: Any,
-             tnear: Any, tfar: Any) -> Any:  # fmt: skip
-    """`blocked` by anything at all."""
-
-    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return _emit_occluded(builder, arguments)
+        load = _emit_call(builder, arguments, 12)
+        # Embree sets tfar to -inf when the ray is blocked.
+        return builder.fcmp_ordered("<", load(_TFAR, ir.FloatType()), ir.Constant(ir.FloatType(), 0.0))
 
     return types.boolean(*_ARGUMENTS), codegen
