@@ -51,6 +51,7 @@ class Lamps:
     power : estimated luminance that arrives at the sphere from all directions together (cd / m^2 sr), as the integral
         of an environment over all directions is
     rays_differ : bool: there is a lamp that diffuse rays see and glossy ones do not, or the other way
+    seen : bool: there is a lamp that the camera sees
     warnings : list of str: lights that are left out, and why
     """
 
@@ -73,6 +74,7 @@ class Lamps:
         self.power = self._power(np.zeros(3) if centre is None else np.asarray(centre, np.float64), radius)
         flags = self.table[:, FLAGS].astype(int)
         self.rays_differ = bool(((flags >> 1 ^ flags >> 2) & 1).any())
+        self.seen = bool((flags & CAMERA).any())
 
     def sample(self, numbers: Array, points: Array) -> tuple[Array, Array, Array, Array, Array]:
         """``sample_lamp`` for (n, 3) uint32 and (n, 3) or (3,) points.

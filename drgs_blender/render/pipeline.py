@@ -29,6 +29,7 @@ from .points import Radiance, ShadingPoints
 from .primary_mesh import primary_mesh
 from .primary_surfels import primary_surfels, snap_windows
 from .scene import TraceScene
+from .seen_lamps import seen_lamps
 from .splats import prepare
 
 Array = np.ndarray
@@ -104,6 +105,8 @@ def render(
         check()
         radiance = batches.light(buffer)
         film.add(buffer, radiance, scene.pass_index, light)
+        if lamps is not None and lamps.seen:
+            film.emission[y0 - top : y1 - top] += seen_lamps(lamps, parameters, camera.window[0], buffer)
     components = None
     if settings.denoise != "none":
         tell(end, "Denoising")
