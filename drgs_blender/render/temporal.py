@@ -8,9 +8,9 @@ tangent plane there and are turned alike. Where none does, a surface has just co
 with v the variance of this frame and h that of the past, both known from the integrator, the best mixture takes
 (h + b) / (h + b + v) of this frame, b being the square by which the past is wrong. As long as the light stands still,
 b = 0 and this is 1 / N in frame N. b is measured as what the difference of both, averaged over the neighbourhood, has
-beyond its own noise: light that turns does not trail.
+beyond its own noise. Changes that hide in the noise are bounded by a least weight of the present.
 
-`window` is for final frames: the mean over the frames k - 2 .. k + 2, weighted in the same way. It looks ahead as far
+`window` is for final frames: the mean over the frames k - 2 .. k + 2, weighted by v / (v + b). It looks ahead as far
 as back, so a steady change cancels, and depends on these frames alone, so that it does not matter in which runs and on
 which machines a sequence is made.
 """
@@ -46,8 +46,11 @@ from .rows import over_rows
 
 Array = np.ndarray
 
-#: Least weight of the present, so that errors which the neighbourhood's mean hides fade too.
-LEAST_GAIN = 0.1
+#: Least weight of the present where anything moves, diffuse and glossy, since small changes hide in the noise. Glossy
+#: reflections do not even move with the surface.
+LEAST_GAIN = (0.2, 0.6)
+#: Most weight in a window of the frames next to the middle one, diffuse and glossy; its square for those after them.
+MOST_WEIGHT = (1.0, 0.4)
 #: Distance from the tangent plane, in pixel widths, up to which a pixel of another frame shows the same surface.
 SAME_PLANE = 2.0
 #: Cosine of the angle by which its normal may differ; surfaces turn between frames.
@@ -79,6 +82,7 @@ def denoise_next(
     shot: Shot,
     history: Signal | None,
     split: bool = True,
+    still: bool = False,
     check: Callable[[], None] = lambda: None,
 ) -> tuple[Array, Signal]:
     """Denoise a picture with the help of those before it.
@@ -86,6 +90,8 @@ def denoise_next(
     Parameters
     ----------
     history : what this function returned for the frame before; None starts anew
+    still : nothing in the scene has changed since then (camera, objects, light), only the noise: pictures are then
+        gathered without end, with equal weights
     split, check : see `denoise.denoise`; a history made with another `split` or size is not used
 
     Returns
@@ -95,16 +101,19 @@ def denoise_next(
     signal = demodulate(shot.components, shot.variance, shot.guides, split)
     check()
     if history is not None and shot.motion is not None and history.light.shape == signal.light.shape:
-        signal = accumulate(history, signal, shot.motion)
+        signal = accumulate(history, signal, shot.motion, still)
     return modulate(smooth(signal, check), shot.guides), signal
 
 
-def accumulate(history: Signal, signal: Signal, motion: Motion) -> Signal:
-    """Mix what earlier frames saw of the same surfaces into a frame's light."""
+def accumulate(history: Signal, signal: Signal, motion: Motion, still: bool = False) -> Signal:
+    """Mix what earlier frames saw of the same surfaces into a frame's light; see `denoise_next`."""
     past, source = _warp(history, signal, motion.vector, motion.previous)
     change = _change(signal, past, source)
+    if still:
+        change[:, _BIAS : _BIAS + 2] = 0.0
+    least = np.zeros(2, np.float32) if still else np.array(LEAST_GAIN, np.float32)
     guide, light = signal.guide.copy(), np.zeros_like(signal.light)
-    over_rows(_mix, len(light), signal.spans, signal.light, past, source, change, guide, light)
+    over_rows(_mix, len(light), least, signal.spans, signal.light, past, source, change, guide, light)
     return Signal(guide, light, signal.spans)
 
 
@@ -130,20 +139,31 @@ def window(shots: Sequence[Shot | None], split: bool = True, check: Callable[[],
     signal = demodulate(shot.components, shot.variance, shot.guides, split)
     total, weights = np.zeros_like(signal.light), np.zeros((len(signal.light), 2, signal.light.shape[2]), np.float32)
     still = np.zeros((len(signal.light), _CHANGES, signal.light.shape[2]), np.float32)
-    over_rows(_add, len(total), signal.spans, signal.light, signal.guide[:, SOURCE], still, total, weights)
-    for neighbour, (vector, expected) in _neighbours(shots):
+    over_rows(
+        _add,
+        len(total),
+        np.ones(2, np.float32),
+        signal.spans,
+        signal.light,
+        signal.guide[:, SOURCE],
+        still,
+        total,
+        weights,
+    )
+    for distance, neighbour, vector, expected in _neighbours(shots):
         check()
+        most = np.array(MOST_WEIGHT, np.float32) ** np.float32(distance)
         other = demodulate(neighbour.components, neighbour.variance, neighbour.guides, split)
         seen, source = _warp(other, signal, vector, expected)
-        over_rows(_add, len(total), signal.spans, seen, source, _change(signal, seen, source), total, weights)
+        over_rows(_add, len(total), most, signal.spans, seen, source, _change(signal, seen, source), total, weights)
     guide = signal.guide.copy()
     over_rows(_divide, len(total), signal.spans, weights, guide, total)
     return modulate(smooth(Signal(guide, total, signal.spans), check), shot.guides)
 
 
-def _neighbours(shots: Sequence[Shot | None]) -> Iterator[tuple[Shot, tuple[Array, Array]]]:
-    """The other pictures that can be reached, and for each pixel of the middle one (h, w): the vector to its place in
-    them (pixels), and the world position it has there."""
+def _neighbours(shots: Sequence[Shot | None]) -> Iterator[tuple[int, Shot, Array, Array]]:
+    """The other pictures that can be reached: how many frames away, the picture, and for each pixel of the middle one
+    (h, w) the vector to its place there (pixels) and the world position it has there."""
     middle = len(shots) // 2
     centre = shots[middle]
     for direction in (-1, 1):
@@ -164,7 +184,7 @@ def _neighbours(shots: Sequence[Shot | None]) -> Iterator[tuple[Shot, tuple[Arra
                 kernel, len(vector), motion.vector, motion.previous, g.position, g.normal, g.footprint, g.index,
                 centre.guides.index, vector, expected,
             )  # fmt: skip
-            yield there, (vector, expected)
+            yield abs(k - middle), there, vector, expected
             here = there
 
 
@@ -282,7 +302,7 @@ def _compare(y0: Any, y1: Any, guide: Any, spans: Any, light: Any, past: Any, so
 
 @njit
 def _mix(
-    y0: Any, y1: Any, spans: Any, light: Any, past: Any, source: Any, change: Any, guide: Any, out: Any
+    y0: Any, y1: Any, least: Any, spans: Any, light: Any, past: Any, source: Any, change: Any, guide: Any, out: Any
 ) -> None:  # fmt: skip
     """Kalman's update; a pixel that holds no number takes over the past."""
     planes = light.shape[1]
@@ -298,7 +318,7 @@ def _mix(
                 if known and usable:
                     error = change[y, _PAST + lobe, c] + change[y, _BIAS + lobe, c]
                     whole = error + change[y, _NOW + lobe, c]
-                    gain = max(error / whole, np.float32(LEAST_GAIN)) if whole > zero else one
+                    gain = max(error / whole, least[lobe]) if whole > zero else one
                 elif known:
                     gain = zero
                 rest = one - gain
@@ -312,7 +332,7 @@ def _mix(
 
 @njit
 def _add(
-    y0: Any, y1: Any, spans: Any, light: Any, source: Any, change: Any, total: Any, weights: Any
+    y0: Any, y1: Any, most: Any, spans: Any, light: Any, source: Any, change: Any, total: Any, weights: Any
 ) -> None:  # fmt: skip
     """Add a picture to the window's sums, by the variance of the present against that plus the error."""
     width = (light.shape[1] - LIGHT) // 2
@@ -323,7 +343,7 @@ def _add(
                 continue
             for lobe in range(2):
                 noise, bias = change[y, _NOW + lobe, c], change[y, _BIAS + lobe, c]
-                weight = noise / (noise + bias) if bias > zero else one
+                weight = most[lobe] * (noise / (noise + bias) if bias > zero else one)
                 weights[y, lobe, c] += weight
                 total[y, VARIANCE + lobe, c] += weight * weight * light[y, VARIANCE + lobe, c]
                 total[y, LUMINANCE + lobe, c] += weight * light[y, LUMINANCE + lobe, c]
