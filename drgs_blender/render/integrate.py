@@ -321,7 +321,7 @@ def _trace(
         if begun == _BATCH:
             trace_paths(p, path_ints, begun, scene, _path_lights(lights, shares), look, table, bounces, shift, found)
             _deliver(begun, found, limit, sums)
-            begun = 0
+            begun = np.int64(0)
         add_path(p, path_ints, begun, position, direction, hit, ints[c + w.KEY], begun)
         found[begun, CARRIED], found[begun, CARRIED + 1], found[begun, CARRIED + 2] = (
             s[i + w.QR], s[i + w.QG], s[i + w.QB],
@@ -376,90 +376,123 @@ def _divided(number: Any, threshold: Any) -> Any:
     return False, U(((n - whole) << np.uint64(32)) // (np.uint64(1 << 32) - whole))
 
 
+@njit
+def _lane(
+    lane: Any, keys: Any, frames: Any, surfaces: Any, tracer: Any, geometry: Any, extent: Any, sky: Any, sky_rules: Any,
+    lamps: Any, table: Any, numbers: Any, aa: Any, part: Any, shares: Any, bounces: Any, look: Any, seed: Any,
+    limit: Any, differ: Any, shift: Any, lanes: Any, components: Any, variance: Any,
+) -> None:  # fmt: skip
+    """Every so-manyth block of points, from the `lane`-th on."""
+    pixel, sample, flags = keys
+    sequence, counts, strata = numbers
+    n = len(pixel)
+    blocks = (n + _BLOCK - 1) // _BLOCK
+    scene, lights = (tracer, geometry, extent), (sky, sky_rules[0], lamps, sky_rules[1])
+    rays, paths = w.batch(_BATCH), w.batch(_BATCH)
+    s, ints = rays
+    found = np.zeros((_BATCH, FOUND), np.float32)
+    sums = np.empty((_BLOCK, 3 * _KIND), np.float32)
+    head = np.empty((_BLOCK, 8), np.float32)
+    total = np.empty(_BLOCK, np.int64)
+    for block in range(lane, blocks, lanes):
+        start = block * _BLOCK
+        end = min(n, start + _BLOCK)
+        sums[:] = ZERO
+        total[:] = 0
+        _heads(start, end, frames, surfaces, extent, look, table, head)
+        begun = np.int64(0)
+        for strategy in range(4):
+            if strategy >= _SKY and shares[strategy] == ZERO:
+                continue
+            source = min(strategy, _SKY)
+            both = strategy >= _SKY and shares[_SKY] > ZERO and shares[_LAMPS] > ZERO
+            # The point set fills strata of 2^32 / n; below them every point is moved by itself.
+            below = strata[source]
+            step = F(counts[source]) / F(aa)
+            count = np.int64(0)
+            for i in range(start, end):
+                h = i - start
+                if head[h, 3] < ZERO:
+                    continue
+                own = U(seed ^ mix(U(pixel[i])))
+                if flags[i] & SECOND:
+                    own = U(own ^ U(0x5BD1E995))
+                key = mix(U(mix(own) + U(U(source + 1) * GOLDEN)))
+                shift_0, shift_1 = U(mix(U(key + U(1))) & ~below), U(mix(U(key + U(2))) & ~below)
+                shift_2 = U(mix(U(key + U(3))) & ~below)
+                # This sub-sample's part of the pixel's samples: n / aa on average, n over all sub-samples together.
+                dither = unit(mix(U(key + U(4)))) if counts[source] % aa else ZERO
+                first = np.int64(F(sample[i]) * step + dither)
+                past = np.int64(F(sample[i] + 1) * step + dither)
+                if sample[i] + 1 == aa:
+                    past = np.int64(counts[source])
+                if part[1] > 1:
+                    size = past - first
+                    first, past = first + size * part[0] // part[1], first + size * (part[0] + 1) // part[1]
+                for j in range(first, past):
+                    key_j = mix(U(key ^ U(U(j + 1) * U(0x85EBCA6B))))
+                    number = U(0)
+                    if strategy >= _SKY:
+                        number = U((sequence[j, 2] ^ shift_2) + (mix(U(key_j + U(7))) & below))
+                        if both:
+                            towards_sky, number = _divided(number, lights[3])
+                            if towards_sky != (strategy == _SKY):
+                                continue
+                    if count == _BATCH:
+                        begun = _trace(
+                            strategy, count, rays, paths, begun, found, scene, lights, table, shares, bounces,
+                            look, below, limit, differ, shift, sums,
+                        )  # fmt: skip
+                        count = np.int64(0)
+                    total[h] += 1
+                    _put(s, ints, count, i, h, frames, surfaces, head)
+                    _, c = w.at(count)
+                    ints[c + w.KEY] = key_j
+                    ints[c + w.N0] = U(sequence[j, 0] ^ shift_0)
+                    ints[c + w.N1] = U(sequence[j, 1] ^ shift_1)
+                    ints[c + w.N2] = number
+                    count += 1
+            begun = _trace(
+                strategy, count, rays, paths, begun, found, scene, lights, table, shares, bounces, look, below,
+                limit, differ, shift, sums,
+            )  # fmt: skip
+        trace_paths(paths[0], paths[1], begun, scene, _path_lights(lights, shares), look, table, bounces, shift, found)
+        _deliver(begun, found, limit, sums)
+        for i in range(start, end):
+            _finish(sums, i - start, total[i - start], components, variance, i)
+
+
 @njit(parallel=True)
 def _kernel(
     keys: Any, frames: Any, surfaces: Any, tracer: Any, geometry: Any, extent: Any, sky: Any, sky_rules: Any,
     lamps: Any, table: Any, numbers: Any, aa: Any, part: Any, shares: Any, bounces: Any, look: Any, seed: Any,
     limit: Any, differ: Any, shift: Any, lanes: Any, components: Any, variance: Any,
 ) -> None:  # fmt: skip
-    pixel, sample, flags = keys
-    sequence, counts, strata = numbers
-    n = len(pixel)
-    blocks = (n + _BLOCK - 1) // _BLOCK
     # Threads get neighbouring lanes, lanes get every so-manyth block: no thread is left with all the costly ones.
     for lane in prange(lanes):
-        scene, lights = (tracer, geometry, extent), (sky, sky_rules[0], lamps, sky_rules[1])
-        rays, paths = w.batch(_BATCH), w.batch(_BATCH)
-        s, ints = rays
-        found = np.zeros((_BATCH, FOUND), np.float32)
-        sums = np.empty((_BLOCK, 3 * _KIND), np.float32)
-        head = np.empty((_BLOCK, 8), np.float32)
-        total = np.empty(_BLOCK, np.int64)
-        for block in range(lane, blocks, lanes):
-            start = block * _BLOCK
-            end = min(n, start + _BLOCK)
-            sums[:] = ZERO
-            total[:] = 0
-            _heads(start, end, frames, surfaces, extent, look, table, head)
-            begun = 0
-            for strategy in range(4):
-                if strategy >= _SKY and shares[strategy] == ZERO:
-                    continue
-                source = min(strategy, _SKY)
-                both = strategy >= _SKY and shares[_SKY] > ZERO and shares[_LAMPS] > ZERO
-                # The point set fills strata of 2^32 / n; below them every point is moved by itself.
-                below = strata[source]
-                step = F(counts[source]) / F(aa)
-                count = 0
-                for i in range(start, end):
-                    h = i - start
-                    if head[h, 3] < ZERO:
-                        continue
-                    own = U(seed ^ mix(U(pixel[i])))
-                    if flags[i] & SECOND:
-                        own = U(own ^ U(0x5BD1E995))
-                    key = mix(U(mix(own) + U(U(source + 1) * GOLDEN)))
-                    shift_0, shift_1 = U(mix(U(key + U(1))) & ~below), U(mix(U(key + U(2))) & ~below)
-                    shift_2 = U(mix(U(key + U(3))) & ~below)
-                    # This sub-sample's part of the pixel's samples: n / aa on average, n over all sub-samples together.
-                    dither = unit(mix(U(key + U(4)))) if counts[source] % aa else ZERO
-                    first = np.int64(F(sample[i]) * step + dither)
-                    past = np.int64(F(sample[i] + 1) * step + dither)
-                    if sample[i] + 1 == aa:
-                        past = np.int64(counts[source])
-                    if part[1] > 1:
-                        size = past - first
-                        first, past = first + size * part[0] // part[1], first + size * (part[0] + 1) // part[1]
-                    for j in range(first, past):
-                        key_j = mix(U(key ^ U(U(j + 1) * U(0x85EBCA6B))))
-                        number = U(0)
-                        if strategy >= _SKY:
-                            number = U((sequence[j, 2] ^ shift_2) + (mix(U(key_j + U(7))) & below))
-                            if both:
-                                towards_sky, number = _divided(number, lights[3])
-                                if towards_sky != (strategy == _SKY):
-                                    continue
-                        if count == _BATCH:
-                            begun = _trace(
-                                strategy, count, rays, paths, begun, found, scene, lights, table, shares, bounces,
-                                look, below, limit, differ, shift, sums,
-                            )  # fmt: skip
-                            count = 0
-                        total[h] += 1
-                        _put(s, ints, count, i, h, frames, surfaces, head)
-                        _, c = w.at(count)
-                        ints[c + w.KEY] = key_j
-                        ints[c + w.N0] = U(sequence[j, 0] ^ shift_0)
-                        ints[c + w.N1] = U(sequence[j, 1] ^ shift_1)
-                        ints[c + w.N2] = number
-                        count += 1
-                begun = _trace(
-                    strategy, count, rays, paths, begun, found, scene, lights, table, shares, bounces, look, below,
-                    limit, differ, shift, sums,
-                )  # fmt: skip
-            trace_paths(
-                paths[0], paths[1], begun, scene, _path_lights(lights, shares), look, table, bounces, shift, found
-            )
-            _deliver(begun, found, limit, sums)
-            for i in range(start, end):
-                _finish(sums, i - start, total[i - start], components, variance, i)
+        _lane(
+            np.int64(lane),
+            keys,
+            frames,
+            surfaces,
+            tracer,
+            geometry,
+            extent,
+            sky,
+            sky_rules,
+            lamps,
+            table,
+            numbers,
+            aa,
+            part,
+            shares,
+            bounces,
+            look,
+            seed,
+            limit,
+            differ,
+            shift,
+            lanes,
+            components,
+            variance,
+        )
