@@ -1,6 +1,6 @@
 """Does a sequence under a light that turns flicker? Noisy, denoised one by one, over time, and in a window.
 
-python bench/bench_flicker.py [--frames 8] [--size 256] [--rays 32] [--reference 1024]
+python bench/bench_flicker.py [--frames 8] [--size 256] [--rays 32] [--reference 1024] [--step 1]
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=256)
     parser.add_argument("--rays", type=int, default=32)
     parser.add_argument("--reference", type=int, default=1024)
-    parser.add_argument("--step", type=float, default=4.0, help="degrees a frame")
+    parser.add_argument("--step", type=float, default=1.0, help="degrees a frame")
     options = parser.parse_args()
     pipeline.Film = KeptFilm  # type: ignore[misc]
     rows = []
@@ -101,7 +101,7 @@ def main() -> None:
             rows.append((environment, name, f"{1e3 * (flicker(shown, mask) - rest):.2f}", f"{np.mean(later):.2f}"))
     body = (
         f"cat, {options.size}x{options.size}, {options.rays} rays, {options.frames} frames, the world turns "
-        f"{options.step:g} degrees a frame. Flicker: mean absolute second difference in time of sRGB luminance, less "
+        f"{options.step:g} degree(s) a frame. Flicker: mean absolute second difference in time of sRGB luminance, less "
         f"that of {options.reference} rays, in thousandths. PSNR: against {options.reference} rays, foreground, sRGB, "
         "from the third frame on.\n\n" + table(("World", "Denoiser", "Flicker", "PSNR, dB"), rows)
     )
