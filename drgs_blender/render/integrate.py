@@ -81,8 +81,8 @@ def integrate(
     n = len(points)
     components, variance = np.zeros((n, 4, 3), np.float32), np.zeros((n, 2), np.float32)
     lamps = lamps or _NO_LAMPS
-    only_objects = scene.vertex_faces == len(scene.faces)  # which emit nothing
-    if n == 0 or sum(counts) == 0 or (light.black and not lamps.count and only_objects):
+    glows = scene.materials.glows
+    if n == 0 or sum(counts) == 0 or (light.black and not lamps.count and not glows):
         return Radiance(components, variance)
     share = sky_share(light, lamps)
     tables = (
@@ -100,12 +100,14 @@ def integrate(
         ),
     )
     samples = [count / settings.aa / part[1] for count in counts]
-    shares = (F(samples[0]), F(samples[1]), F(samples[2] * share), F(samples[2] * (1.0 - share)))
+    # Where neither shines, nothing is drawn by its light, though surfaces may emit some.
+    sky_samples, lamp_samples = samples[2] * share * (not light.black), samples[2] * (1.0 - share) * (lamps.count > 0)
+    shares = (F(samples[0]), F(samples[1]), F(sky_samples), F(lamp_samples))
     rules = (
         settings.aa,
         part,
         shares,
-        settings.bounces,
+        (settings.bounces, glows),
         brdf.LOOKS[settings.look],
         U(mixed(settings.seed, frame_number)),
         F(settings.clamp_indirect / max(1.0, sum(samples))),
@@ -316,7 +318,7 @@ def _trace(
         if hit[1] < 0:
             continue
         s[i + w.LIVE] = ZERO
-        if bounces == 0:
+        if bounces[0] == 0 and not bounces[1]:
             continue
         if begun == _BATCH:
             trace_paths(p, path_ints, begun, scene, _path_lights(lights, shares), look, table, bounces, shift, found)

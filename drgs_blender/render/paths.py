@@ -179,18 +179,20 @@ def trace_paths(
     ----------
     scene : (Tracer, Geometry, extent)
     lights : (Sky, whether the sky shines, tables of lamps, number of lamp samples)
+    bounces : vertices of a path, and whether light that surfaces emit is looked for beyond the last of them
     shift : 0, or ``masks.WITHOUT``
     found : (capacity, FOUND) float32; INDIRECT and EMITTED are written
     """
     tracer, geometry, extent = scene
     sky, sky_shines, lamps, lamp_share = lights
+    vertices, glows = bounces
     for slot in range(count):
         i, c = w.at(slot)
         s[i + w.TR], s[i + w.TG], s[i + w.TB] = ONE, ONE, ONE
         owner = np.int64(ints[c + w.OWNER])
         for k in range(CARRIED):
             found[owner, k] = ZERO
-    for bounce in range(bounces):
+    for bounce in range(vertices):
         _surfaces(s, ints, count, geometry, extent, look, table, found, EMITTED if bounce == 0 else INDIRECT)
         w.lobe_shares(s, count, look)
         if sky_shines:
@@ -208,5 +210,7 @@ def trace_paths(
         w.brdf_directions(s, ints, count)
         w.evaluate(s, count, look)
         w.carry(s, count, ZERO)
-        last = bounce + 1 == bounces
+        last = bounce + 1 == vertices and not glows
         count = _onwards(s, ints, count, bounce, last, sky, lamps, lamp_share, tracer, shift, found)
+    if glows:
+        _surfaces(s, ints, count, geometry, extent, look, table, found, EMITTED if vertices == 0 else INDIRECT)
