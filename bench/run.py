@@ -1,6 +1,7 @@
 """Run benchmark programs one after the other; each writes its section of docs/benchmarks.md.
 
-python bench/run.py [NAME ...]      # parity primary frame engine deform embree; all by default
+python bench/run.py [NAME ...]      # parity primary frame light engine deform ...; all by default
+python bench/run.py light --part equal-psnr --size 128      # what follows the names goes to the programs
 """
 
 from __future__ import annotations
@@ -12,13 +13,19 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 
 
-def main(names: list[str]) -> int:
+def run(program: Path, options: list[str]) -> int:
+    return subprocess.run([sys.executable, str(program), *options]).returncode
+
+
+def main(arguments: list[str]) -> int:
+    first = next((i for i, argument in enumerate(arguments) if argument.startswith("-")), len(arguments))
+    names, options = arguments[:first], arguments[first:]
     programs = {p.stem.removeprefix("bench_"): p for p in sorted(HERE.glob("bench_*.py"))}
     unknown = set(names) - set(programs)
     if unknown:
         print(f"no such benchmark: {', '.join(sorted(unknown))}; there are {', '.join(programs)}", file=sys.stderr)
         return 64
-    failed = [name for name in names or programs if subprocess.run([sys.executable, str(programs[name])]).returncode]
+    failed = [name for name in names or programs if run(programs[name], options)]
     if failed:
         print(f"failed: {', '.join(failed)}", file=sys.stderr)
     return 1 if failed else 0

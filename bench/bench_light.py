@@ -1,0 +1,59 @@
+"""What light costs: time to equal quality against Cycles and Mitsuba, what makes the time, and what it buys.
+
+python bench/bench_light.py [--part equal-psnr mitsuba denoised relmse cost efficiency] [--size 200] [--seeds 3]
+
+Each part writes its own section. Everything runs on two processors, as far as the system can be told so.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+
+import light_cost
+import light_efficiency
+import light_renderers
+from light_cases import AA, CASES, FOLDER
+from report import write_section
+
+PARTS = {
+    "equal-psnr": ("Light: time to equal PSNR, Cycles", light_renderers.equal_psnr),
+    "mitsuba": ("Light: time to equal PSNR, Mitsuba", light_renderers.against_mitsuba),
+    "denoised": ("Light: time to equal PSNR, denoised", light_renderers.denoised),
+    "relmse": ("Light: relative error at 32 samples", light_renderers.relative_error),
+    "cost": ("Light: what makes the time", light_cost.cost),
+    "efficiency": ("Light: what denoiser, MIS and mesh bring", light_efficiency.efficiency),
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--part", nargs="+", choices=PARTS, default=list(PARTS), metavar="PART")
+    parser.add_argument("--cases", nargs="+", choices=[c.name for c in CASES], default=[c.name for c in CASES])
+    parser.add_argument("--size", type=int, default=200, help="of the pictures that are compared")
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--aa", type=int, default=AA, help="sub-pixel positions of ours")
+    parser.add_argument("--rays", type=int, nargs="+", default=(8, 32, 128, 256), help="of ours")
+    parser.add_argument("--spp", type=int, nargs="+", default=(8, 32, 128), help="of Cycles and Mitsuba")
+    parser.add_argument("--denoised-spp", type=int, nargs="+", default=(4, 16, 64), help="of Cycles with OIDN")
+    parser.add_argument("--reference-rays", type=int, default=2048)
+    parser.add_argument("--reference-spp", type=int, default=1024)
+    parser.add_argument("--levels", type=float, nargs="+", default=(28, 30, 32, 34, 36, 38), help="dB")
+    parser.add_argument("--denoised-levels", type=float, nargs="+", default=(30, 32, 34, 36, 38, 40), help="dB")
+    parser.add_argument("--cost-size", type=int, default=800, help="of the pictures of part cost")
+    parser.add_argument("--memory-size", type=int, nargs=2, default=(1920, 1080))
+    parser.add_argument("--million", type=int, default=1_000_000, help="triangles and surfels of the memory test")
+    parser.add_argument("--efficiency-rays", type=int, nargs="+", default=(4, 8, 16, 32, 64, 128, 256, 512))
+    parser.add_argument("--surfel-rays", type=int, nargs="+", default=(4, 8, 16, 32), help="with rays against surfels")
+    parser.add_argument("--surfel-reference-rays", type=int, default=256)
+    options = parser.parse_args()
+    if hasattr(os, "sched_setaffinity"):  # inherited by every process that is started from here
+        os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:2])
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    for part in options.part:
+        title, run = PARTS[part]
+        write_section(f"light-{part}", title, run(options))
+
+
+if __name__ == "__main__":
+    main()

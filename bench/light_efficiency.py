@@ -1,0 +1,170 @@
+"""What denoiser, MIS and tracing the mesh bring, over the number of samples. Part of bench_light.py; draws a figure."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from judge import frame_camera, psnr
+from light_cases import BOUNCES, REFERENCE_AA, Case, Reference
+from report import OUT, ROOT, table
+from subjects import spread_materials
+
+from drgs_blender.asset import Asset, Mesh
+from drgs_blender.asset.container import read_asset, write_asset
+from drgs_blender.build.make import make_asset
+from drgs_blender.jit import source_digest
+
+FIGURE = ROOT / "docs" / "images" / "efficiency.png"
+MESH = Path("data/meshes/odedstein/armadillo/armadillo.obj")
+SURFELS = "no mesh acceleration (rays meet surfels)"
+#: What a variant changes of the full method; "cosine" says that all samples are of the cosine.
+VARIANTS: dict[str, dict[str, Any]] = {
+    "full": {},
+    "no denoiser": {"denoise": "none"},
+    "no MIS (cosine samples alone)": {"cosine_only": True},
+    SURFELS: {"tracer": "surfels"},
+}
+
+
+@dataclass(frozen=True)
+class Armadillo(Case):
+    """The scan of the development data with spread materials."""
+
+    @property
+    def files(self) -> tuple[Path, Path]:  # type: ignore[override]
+        path = OUT / source_digest() / "armadillo-spread.drgs"
+        if not path.exists():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            asset = make_asset(scan(), up="y")
+            data = spread_materials(asset.mesh)
+            colours = {k: data[k] for k in ("albedo", "roughness", "metallic")}
+            surfels = replace(asset.surfels, **at_surfels(asset, colours))
+            write_asset(path, Asset(surfels, Mesh(**data), asset.binding, None, {"source": "armadillo"}))
+        return path, path
+
+    def camera(self, size: int) -> dict[str, Any]:
+        return frame_camera(read_asset(self.files[0]).mesh.vertices, size, azimuth=-90, fill=0.8)
+
+
+def at_surfels(asset: Asset, materials: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Materials of the vertices interpolated at the surfels."""
+    corners, weights = asset.mesh.faces[asset.binding.face], asset.binding.barycentric
+    return {k: np.einsum("nk,nk...->n...", weights, v[corners]) for k, v in materials.items()}
+
+
+def scan() -> Path:
+    """The mesh in the development data, see tests/conftest.py."""
+    return Path(os.environ.get("DRGS_SHARED", ROOT.parent / "shared")) / MESH
+
+
+@dataclass
+class Curve:
+    """One line of the figure."""
+
+    name: str
+    rays: list[int]
+    decibels: list[float]
+    seconds: list[float]
+
+
+def settings_of(change: dict[str, Any], rays: int) -> dict[str, Any]:
+    """Fields of RenderSettings of a variant."""
+    chosen = {"primary": "surfels", "denoise": "svgf"} | change
+    if chosen.pop("cosine_only", False):
+        chosen |= {"cosine": rays, "ggx": 0, "environment": 0}
+    return chosen
+
+
+def traces_surfels(case: Case) -> bool:
+    """Whether the tracer setting changes the picture at all."""
+    mesh, surfels = (case.picture(24, 8, primary="surfels", tracer=tracer)[0] for tracer in ("mesh", "surfels"))
+    return not np.array_equal(mesh, surfels)
+
+
+def measure(case: Case, options: argparse.Namespace) -> list[Curve]:
+    curves = []
+    references: dict[str, Reference] = {}
+    with_surfels = traces_surfels(case)
+    for name, change in VARIANTS.items():
+        if name == SURFELS and not with_surfels:
+            continue
+        tracer = change.get("tracer", "mesh")
+        if tracer not in references:
+            rays = options.reference_rays if tracer == "mesh" else options.surfel_reference_rays
+            converged = {"primary": "surfels", "tracer": tracer, "aa": REFERENCE_AA}
+            references[tracer] = Reference.of(case.picture(options.size, rays, 1000, **converged)[0], alpha=0.99)
+        reference = references[tracer]
+        curve = Curve(name, list(options.efficiency_rays if tracer == "mesh" else options.surfel_rays), [], [])
+        case.picture(options.size, 4, **settings_of(change, 4))  # kernels
+        for rays in curve.rays:
+            picture, seconds = case.picture(options.size, rays, **settings_of(change, rays))
+            curve.decibels.append(psnr(picture, reference.picture, reference.mask))
+            curve.seconds.append(seconds)
+        curves.append(curve)
+    return curves
+
+
+def draw(curves: list[Curve]) -> None:
+    """Quality and time over samples, side by side."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, (left, right) = pyplot.subplots(1, 2, figsize=(9, 3.6), constrained_layout=True)
+    for curve in curves:
+        left.plot(curve.rays, curve.decibels, marker="o", markersize=3, label=curve.name)
+        right.plot(curve.rays, curve.seconds, marker="o", markersize=3, label=curve.name)
+    right.set_yscale("log")
+    for axes, what in ((left, "PSNR, dB"), (right, "seconds a frame")):
+        axes.set_xscale("log", base=2)
+        axes.set_xlabel("samples a pixel")
+        axes.set_ylabel(what)
+        axes.grid(alpha=0.3)
+        axes.xaxis.set_major_formatter("{x:.0f}")
+    left.legend(fontsize="small")
+    FIGURE.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(FIGURE, dpi=120)
+    pyplot.close(figure)
+
+
+def efficiency(options: argparse.Namespace) -> str:
+    """The part's text; draws the figure."""
+    if not scan().exists():
+        return f"Not measured: {MESH.name} is not among the development data here (DRGS_SHARED)."
+    case = Armadillo("armadillo", "armadillo", "city")
+    curves = measure(case, options)
+    draw(curves)
+    mesh = read_asset(case.files[0]).mesh
+    text = (
+        f"Armadillo, {len(mesh.faces):,} triangles, spread materials, {case.light}.exr, {options.size}x{options.size}, "
+        f"{BOUNCES} indirect bounce, surfels as primary surface, SVGF unless said, one picture a point; PSNR over the "
+        f"subject against {options.reference_rays} rays without denoiser. Seconds: whole frame, everything built anew."
+        " Without MIS, all samples at the visible point are of the cosine; further hits are as always.\n\n"
+        f"![PSNR and time over samples](images/{FIGURE.name})\n\n"
+    )
+    columns = ("Samples", *(f"{c.name}: dB / s" for c in curves))
+    rows = [
+        (
+            rays,
+            *(
+                f"{c.decibels[c.rays.index(rays)]:.1f} / {c.seconds[c.rays.index(rays)]:.2f}" if rays in c.rays else "-"
+                for c in curves
+            ),
+        )
+        for rays in options.efficiency_rays
+    ]
+    text += table(columns, rows)
+    if any(c.name == SURFELS for c in curves):
+        text += (
+            f"\n\nRays against surfels: a scene of its own, so against its own picture of "
+            f"{options.surfel_reference_rays} rays."
+        )
+    else:
+        text += f"\n\n{SURFELS.capitalize()}: not measured, frames are not rendered with that tracer."
+    return text
