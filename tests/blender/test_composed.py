@@ -9,7 +9,7 @@ import numpy as np
 from mathutils import Vector
 from scenes import mesh_object, new_world, read_exr
 
-SIZE, BLOCK, SEEDS = 40, 8, 3
+SIZE, BLOCK, SEEDS = 40, 8, 4
 CUBE = [(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
 SIDES = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
 
@@ -77,12 +77,12 @@ def test_a_whole_scene_agrees_with_cycles(ball, scene):
     render, cycles, settings = scene.render, scene.cycles, scene.drgs
     render.resolution_x = render.resolution_y = SIZE
     render.film_transparent = True
-    cycles.device, cycles.samples, cycles.use_adaptive_sampling, cycles.use_denoising = "CPU", 128, False, False
+    cycles.device, cycles.samples, cycles.use_adaptive_sampling, cycles.use_denoising = "CPU", 256, False, False
     cycles.pixel_filter_type, cycles.filter_width = "BOX", 1.0
     cycles.max_bounces = cycles.diffuse_bounces = cycles.glossy_bounces = settings.bounces = 2
     cycles.sample_clamp_direct = cycles.sample_clamp_indirect = cycles.blur_glossy = cycles.light_sampling_threshold = 0
     cycles.caustics_reflective = True
-    settings.use_custom_split, settings.rays, settings.aa, settings.primary = False, 256, 16, "mesh"
+    settings.use_custom_split, settings.rays, settings.aa, settings.primary = False, 512, 16, "mesh"
     pictures = {}
     for engine in ("CYCLES", "DRGS"):
         render.engine = engine
