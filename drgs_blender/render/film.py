@@ -10,9 +10,9 @@ that describe the surface are not premultiplied, so that the object has no dark 
 
 Combined is DiffDir + DiffInd + GlossDir + GlossInd + Env + Emit, added in this order, to the last bit.
 
-A holdout leaves a hole: black, alpha 0. A shadow catcher is seen by its shadow alone, a black veil as dense as the part
-of its light that the rest of the scene takes from it: 1 - (light in the scene) / (light among catchers alone), both
-summed over the pixel first, so that the quotient is not one of noise.
+A holdout leaves black, and alpha 0 where the film is transparent. A shadow catcher is seen by its shadow alone, a black
+veil as dense as the part of its light that the rest of the scene takes from it: 1 - (light in the scene) / (light among
+catchers alone), both summed over the pixel first, so that the quotient is not one of noise.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Film:
     variance : (h, w, 2) float32 of the luminance of the premultiplied diffuse and glossy sums
     environment : (h, w, 3) float32 light straight from the world, as if catchers had no shadow
     emission : (h, w, 3) float32 light that seen surfaces emit
-    coverage, hole : (h, w) float32, by surfaces and by holdouts
+    coverage : (h, w) float32
     catcher : (h, w, 3) float32 sums by weight over the points of catchers: one, luminance, unshadowed luminance
     veiled : (h, w, 3) float32 the part of ``environment`` that is seen through catchers
     depth, position, normal, albedo, roughness, metallic, index : (h, w) or (h, w, 3) float32
@@ -65,7 +65,6 @@ class Film:
         self.variance = np.zeros((*size, 2), np.float32)
         self.environment = np.zeros((*size, 3), np.float32)
         self.emission, self.catcher, self.veiled = (np.zeros((*size, 3), np.float32) for _ in range(3))
-        self.hole = np.zeros(size, np.float32)
         self.coverage, self.roughness, self.metallic, self.index = (np.zeros(size, np.float32) for _ in range(4))
         self.depth = np.full(size, EMPTY_DEPTH, np.float32)
         self.position, self.normal, self.albedo = (np.zeros((*size, 3), np.float32) for _ in range(3))
@@ -116,8 +115,6 @@ class Film:
             self.emission[rows],
             self.catcher[rows],
         )
-        if buffer.hole is not None:
-            self.hole[rows] = buffer.hole.mean(axis=2)
         if not self.transparent and not light.black:
             _background(self.parameters, x0, y0, buffer.alpha, light.sky, self.environment[rows])
             caught = np.flatnonzero(points.flags & CATCHER)
@@ -179,8 +176,6 @@ class Film:
         out[..., :3] = light[:, :, 0] + light[:, :, 1] + light[:, :, 2] + light[:, :, 3] + environment + self.emission
         if self.transparent:
             out[..., 3] = self.coverage + self.catcher[:, :, 0] * shadow
-        else:
-            out[..., 3] -= self.hole
         return out
 
 

@@ -31,7 +31,6 @@ class GBuffer:
     object_index : (n,) int32, as numbered by `scene.TraceScene`
     emission : (n, 3) float32 radiance that the surface itself sends to the camera
     alpha : (rows, width, aa) float32: what of each sub-pixel sample hides the background; shadow catchers do not
-    hole : (rows, width, aa) float32: what of it holdouts hide, or None for nothing
     """
 
     rows: tuple[int, int]
@@ -41,7 +40,6 @@ class GBuffer:
     object_index: Array
     emission: Array
     alpha: Array
-    hole: Array | None = None
 
     def mark_catchers(self, object_flags: Array) -> None:
         """Flag the points of shadow catchers."""

@@ -32,15 +32,13 @@ class Layers:
     ----------
     first : surfels
     second : ordinary meshes, or None when there are none
-    opaque : what hides the background
-    hole : what holdouts hide, or None when there are none
+    opaque : what hides the background, holdouts included
     hits : of ordinary meshes, or None when there are none
     """
 
     first: Array
     second: Array | None
     opaque: Array
-    hole: Array | None
     hits: MeshHits | None
 
 
@@ -54,9 +52,9 @@ def combine(samples: SurfelSamples, scene: TraceScene, parameters: Array, x0: in
     """
     special = bool((scene.object_flags & (HOLDOUT | CATCHER)).any())
     if not scene.any_ordinary and not special:
-        return Layers(samples.alpha, None, samples.alpha, None, None)
+        return Layers(samples.alpha, None, samples.alpha, None)
     hits = trace_camera(scene, parameters, x0, y0, samples.alpha.shape, ORDINARY if scene.any_ordinary else 0)
-    first, second, opaque, hole = (np.empty_like(samples.alpha) for _ in range(4))
+    first, second, opaque = (np.empty_like(samples.alpha) for _ in range(3))
     _combine(
         samples.alpha,
         samples.depth,
@@ -67,18 +65,17 @@ def combine(samples: SurfelSamples, scene: TraceScene, parameters: Array, x0: in
         first,
         second,
         opaque,
-        hole,
     )
-    return Layers(first, second, opaque, hole, hits)
+    return Layers(first, second, opaque, hits)
 
 
 def lone(hits: MeshHits, scene: TraceScene) -> Layers:
     """Layers of meshes alone."""
     nothing = np.zeros(hits.depth.shape, np.float32)
-    first, second, opaque, hole = (np.empty_like(nothing) for _ in range(4))
+    first, second, opaque = (np.empty_like(nothing) for _ in range(3))
     none = np.zeros(hits.depth.shape, np.int32)
-    _combine(nothing, nothing, none, hits.depth, hits.owner, scene.object_flags, first, second, opaque, hole)
-    return Layers(second, None, opaque, hole, hits)
+    _combine(nothing, nothing, none, hits.depth, hits.owner, scene.object_flags, first, second, opaque)
+    return Layers(second, None, opaque, hits)
 
 
 @njit(parallel=True)
@@ -92,7 +89,6 @@ def _combine(
     first: Any,
     second: Any,
     opaque: Any,
-    hole: Any,
 ) -> None:
     zero, one = np.float32(0.0), np.float32(1.0)
     rows, columns, aa = alpha.shape
@@ -107,19 +103,17 @@ def _combine(
                     elif one - a < _LEAST:
                         a, m = one, -1
                 b = one - a if m >= 0 else zero
-                hidden, held = a + b, zero
+                hidden = a + b
                 if a > zero:
                     flags = object_flags[owner[y, x, k]]
                     if flags & HOLDOUT:
-                        held += a
                         a = zero
                     elif flags & CATCHER:
                         hidden -= a
                 if b > zero:
                     flags = object_flags[m]
                     if flags & HOLDOUT:
-                        held += b
                         b = zero
                     elif flags & CATCHER:
                         hidden -= b
-                first[y, x, k], second[y, x, k], opaque[y, x, k], hole[y, x, k] = a, b, hidden, held
+                first[y, x, k], second[y, x, k], opaque[y, x, k] = a, b, hidden

@@ -29,7 +29,7 @@ def primary_mesh(scene: TraceScene, camera: Camera, parameters: Array, y0: int, 
     hits = trace_camera(scene, parameters, x0, y0, (y1 - y0, x1 - x0, int(parameters[AA])), CAMERA)
     layers = lone(hits, scene)
     buffer, start = compact(layers.first, parameters, x0, y0)
-    buffer.alpha, buffer.hole = layers.opaque, layers.hole
+    buffer.alpha = layers.opaque
     shade_mesh(scene, hits, parameters, x0, start, buffer, 0)
     buffer.mark_catchers(scene.object_flags)
     return buffer

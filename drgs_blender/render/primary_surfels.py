@@ -68,7 +68,7 @@ def primary_surfels(splats: Splats, scene: TraceScene, windows: Array, camera: C
     samples = rasterise(splats, y0, y1)
     layers = combine(samples, scene, splats.parameters, camera.window[0], y0)
     buffer, start = compact(layers.first, splats.parameters, camera.window[0], y0, layers.second)
-    buffer.alpha, buffer.hole = layers.opaque, layers.hole
+    buffer.alpha = layers.opaque
     points = buffer.points
     _attach(
         scene.bvh.intersect_address,
