@@ -90,7 +90,7 @@ def integrate(
         scene.geometry,
         F(scene.extent),
         light.sky,
-        (not light.black, U(min(share * 2.0**32, 2.0**32 - 1))),
+        (not light.black, U(min(share * 2.0**32, 2.0**32 - 1)), lamps.count > 0),
         (lamps.table, lamps.pick),
         brdf.layer_table(),
         (
@@ -285,7 +285,7 @@ def _trace(
     s, ints = rays
     p, path_ints = paths
     tracer = scene[0]
-    sky, sky_shines, lamps, _ = lights
+    sky, sky_shines, lamps, _, any_lamps = lights
     w.jitter(ints, count, below)
     if strategy == _LAMPS:
         _trace_lamps(count, s, ints, scene, lamps, shares, look, shift, sums)
@@ -302,7 +302,8 @@ def _trace(
     w.evaluate(s, count, look)
     if strategy != _SKY:
         w.look_up(s, count, sky)
-    see_lamps = strategy != _SKY and shares[_LAMPS] > ZERO
+    w.warm(s, count, sky)
+    see_lamps = strategy != _SKY and any_lamps
     # Lamps are seen before the BRDF is weighed, for they have densities of their own: such rays are traced first.
     if not see_lamps:
         w.weigh(s, count, shares[_COSINE], shares[_GGX], shares[_SKY])
@@ -321,7 +322,7 @@ def _trace(
         if bounces[0] == 0 and not bounces[1]:
             continue
         if begun == _BATCH:
-            trace_paths(p, path_ints, begun, scene, _path_lights(lights, shares), look, table, bounces, shift, found)
+            trace_paths(p, path_ints, begun, scene, _path_lights(lights), look, table, bounces, shift, found)
             _deliver(begun, found, limit, sums)
             begun = np.int64(0)
         add_path(p, path_ints, begun, position, direction, hit, ints[c + w.KEY], begun)
@@ -347,9 +348,9 @@ def _trace(
 
 
 @njit
-def _path_lights(lights: Any, shares: Any) -> Any:
+def _path_lights(lights: Any) -> Any:
     """Lights as `trace_paths` takes them: one sample of the lamps a vertex where there are any."""
-    return lights[0], lights[1], lights[2], ONE if shares[_LAMPS] > ZERO else ZERO
+    return lights[0], lights[1], lights[2], ONE if lights[4] else ZERO
 
 
 @njit
@@ -389,7 +390,7 @@ def _lane(
     sequence, counts, strata = numbers
     n = len(pixel)
     blocks = (n + _BLOCK - 1) // _BLOCK
-    scene, lights = (tracer, geometry, extent), (sky, sky_rules[0], lamps, sky_rules[1])
+    scene, lights = (tracer, geometry, extent), (sky, sky_rules[0], lamps, sky_rules[1], sky_rules[2])
     rays, paths = w.batch(_BATCH), w.batch(_BATCH)
     s, ints = rays
     found = np.zeros((_BATCH, FOUND), np.float32)
@@ -458,7 +459,7 @@ def _lane(
                 strategy, count, rays, paths, begun, found, scene, lights, table, shares, bounces, look, below,
                 limit, differ, shift, sums,
             )  # fmt: skip
-        trace_paths(paths[0], paths[1], begun, scene, _path_lights(lights, shares), look, table, bounces, shift, found)
+        trace_paths(paths[0], paths[1], begun, scene, _path_lights(lights), look, table, bounces, shift, found)
         _deliver(begun, found, limit, sums)
         for i in range(start, end):
             _finish(sums, i - start, total[i - start], components, variance, i)

@@ -243,6 +243,16 @@ def sky_radiance(u, v, sky):  # type: ignore[no-untyped-def]
 
 
 @njit
+def sky_touch(u, v, sky):  # type: ignore[no-untyped-def]
+    """Some value from both rows of texels that `sky_radiance` will read there: brings them into the cache."""
+    h, w = sky.height, sky.width
+    y = min(max(v * np.float32(h) - np.float32(0.5), np.float32(0.0)), np.float32(h - 1))
+    column, row = min(np.int64(u * np.float32(w)), w - 1), np.int64(y)
+    upper, lower = 4 * (row * w + column), 4 * (min(row + 1, h - 1) * w + column)
+    return load_float(sky.texels, upper) + load_float(sky.texels, lower)
+
+
+@njit
 def first_cell(n, sky):  # type: ignore[no-untyped-def]
     """Place in the sampling cells where the search for the random number n (uint32) starts."""
     return load_int32(sky.guide, np.int64((np.uint64(n) * np.uint64(sky.guide_size)) >> np.uint64(32)))

@@ -18,7 +18,7 @@ from . import brdf, sampling
 from .lamp_shapes import DIFFUSE, GLOSSY
 from .lamp_shapes import SHADOW as SHADOWED
 from .lamps import lamp_flags, sample_lamp
-from .light import cell_at, cell_end, direction_in_cell, first_cell, map_at, sky_density
+from .light import cell_at, cell_end, direction_in_cell, first_cell, map_at, sky_density, sky_touch
 from .sampling import INVERSE_PI, ONE, TWO, ZERO, F, U, luminance, mix, unit
 from .surface import shadowed
 
@@ -212,6 +212,15 @@ def look_up(s: Any, count: Any, sky: Any) -> None:
         i, _ = at(slot)
         if s[i + LIVE] > ZERO:
             s[i + PE] = sky_density(s[i + MU], s[i + MV], sky)
+
+
+@njit
+def warm(s: Any, count: Any, sky: Any) -> None:
+    """Fetch what `sky_radiance` will read, all at once, long before it waits for it."""
+    for slot in range(count):
+        i, _ = at(slot)
+        if s[i + LIVE] > ZERO:
+            s[i + ER] = sky_touch(s[i + MU], s[i + MV], sky)
 
 
 @njit

@@ -10,9 +10,10 @@ import trimesh
 
 from drgs_blender.colour import LUMINANCE
 from drgs_blender.errors import UsageError
-from drgs_blender.frame import RenderSettings, World
+from drgs_blender.frame import Light, RenderSettings, World
 from drgs_blender.jit import get_num_threads, use_threads
 from drgs_blender.render.integrate import integrate
+from drgs_blender.render.lamps import Lamps
 from drgs_blender.render.light import EnvironmentLight
 from drgs_blender.render.points import DIFFUSE_DIRECT, DIFFUSE_INDIRECT, Radiance, ShadingPoints
 from drgs_blender.render.scene import TraceObject, TraceScene
@@ -404,3 +405,74 @@ def test_nothing_to_do_is_done() -> None:
 def test_settings_that_make_no_sense_are_refused(wrong: dict) -> None:
     with pytest.raises(UsageError, match="render settings"):
         integrate(EMPTY, WHITE, points(1), replace(settings(4), **wrong), 0)
+
+
+# --- lamps ---------------------------------------------------------------------------------------------------------
+
+
+def area_lamp(**changes: object) -> Lamps:
+    """A square of one metre, two metres above the origin, shining down."""
+    matrix = np.eye(4)
+    matrix[:3, 3] = (0.3, 0.2, 2.0)
+    return Lamps([replace(Light("panel", "area", matrix, power=30.0), **changes)], radius=1.0)  # type: ignore[arg-type]
+
+
+DARK = EnvironmentLight(World(colour=(0.0, 0.0, 0.0)))
+
+
+@pytest.mark.parametrize(
+    "strategies", [{"cosine": 512}, {"environment": 512}, {"cosine": 64, "ggx": 64, "environment": 64}]
+)
+def test_every_strategy_finds_the_same_lamp(strategies: dict) -> None:
+    """Irradiance below a panel by quadrature over its area, against rays that meet it and samples drawn from it."""
+    cells = (np.arange(200) + 0.5) / 200 - 0.5
+    x, y = np.meshgrid(cells + 0.3, cells + 0.2)
+    square = x**2 + y**2 + 4.0
+    radiance = 30.0 / np.pi  # of one square metre, normalised
+    expected = float(np.mean(radiance * 4.0 / square**2)) * 0.5 / np.pi
+    got = integrate(EMPTY, DARK, points(400, albedo=0.5), settings(**strategies), 3, area_lamp())
+    values = got.components[:, DIFFUSE_DIRECT, 0]
+    assert values.mean() == pytest.approx(expected, abs=max(4 * float(values.std()) / 20, 1e-4 * expected))
+    assert values.std() / 20 < 0.02 * expected
+
+
+def test_sky_and_lamps_share_the_light_samples_without_bias() -> None:
+    sky, counts = EnvironmentLight(World(sun_picture())), settings(cosine=16, ggx=16, environment=64)
+    some = points(3000, albedo=0.7, roughness=0.3)
+    together, alone, lamps = (
+        luminance(integrate(EMPTY, light, some, counts, 8, lamp))
+        for light, lamp in ((sky, area_lamp()), (sky, None), (DARK, area_lamp()))
+    )
+    noise = np.sqrt(sum(v.var() for v in (together, alone, lamps)) / 3000)
+    assert together.mean() == pytest.approx(alone.mean() + lamps.mean(), abs=4 * noise)
+    assert noise < 0.01 * together.mean()
+
+
+def test_a_lamp_without_shadow_shines_through() -> None:
+    wall = scene_of((np.float32([[-9, -9, 1], [9, -9, 1], [0, 9, 1]]), np.int32([[0, 1, 2]])))
+    through = integrate(wall, DARK, points(50), settings(environment=64), 0, area_lamp(cast_shadow=False))
+    free = integrate(EMPTY, DARK, points(50), settings(environment=64), 0, area_lamp(cast_shadow=False))
+    blocked = integrate(wall, DARK, points(50), settings(environment=64), 0, area_lamp())
+    np.testing.assert_allclose(through.components, free.components, rtol=1e-4)  # rays start a little higher
+    assert free.components.max() > 0.1 and not blocked.components.any()
+
+
+def test_lobes_that_do_not_see_a_lamp_get_nothing_of_it() -> None:
+    some, counts = points(50, roughness=0.4), settings(cosine=32, ggx=32, environment=32)
+    both = integrate(EMPTY, DARK, some, counts, 0, area_lamp())
+    diffuse = integrate(EMPTY, DARK, some, counts, 0, area_lamp(glossy=False))
+    assert both.components[:, 2].any() and not diffuse.components[:, 2].any()
+    np.testing.assert_allclose(diffuse.components[:, 0], both.components[:, 0], rtol=1e-5)
+
+
+def test_the_clamp_bounds_every_indirect_sample_and_nothing_else() -> None:
+    box = trimesh.creation.box((4, 4, 4))
+    inside = scene_of((np.asarray(box.vertices), np.asarray(box.faces)[:10]), albedo=0.9)  # open to one side
+    sky, counts = EnvironmentLight(World(sun_picture())), settings(cosine=32, environment=32, bounces=2)
+    free = integrate(inside, sky, points(400), counts, 0)
+    limit = 0.02
+    clamped = integrate(inside, sky, points(400), replace(counts, clamp_indirect=limit), 0)
+    np.testing.assert_array_equal(clamped.components[:, DIFFUSE_DIRECT], free.components[:, DIFFUSE_DIRECT])
+    indirect = clamped.components[:, [1, 3]].sum(axis=(1, 2)) / 3
+    assert indirect.max() <= limit * 1.001
+    assert free.components[:, [1, 3]].sum(axis=(1, 2)).max() / 3 > 2 * limit
