@@ -111,7 +111,7 @@ def integrate(
         brdf.LOOKS[settings.look],
         U(mixed(settings.seed, frame_number)),
         F(settings.clamp_indirect / max(1.0, sum(samples))),
-        lamps.rays_differ,
+        (lamps.rays_differ, scene.rays_differ and min(counts[:2]) > 0),
     )
 
     def run(some: ShadingPoints, shift: int, components: Array, variance: Array) -> None:
@@ -238,18 +238,18 @@ def _deliver(count: Any, found: Any, limit: Any, sums: Any) -> None:
 
 @njit
 def _see_lamps(
-    strategy: Any, slot: Any, s: Any, ints: Any, distance: Any, shares: Any, lamps: Any, differ: Any, sums: Any
+    slot: Any, s: Any, ints: Any, distance: Any, cosine: Any, ggx: Any, share: Any, lamps: Any, differ: Any, sums: Any
 ) -> None:
     """Lamps between a point and what its ray hit; the BRDF is not yet weighed."""
     i, c = w.at(slot)
     position, direction = (s[i + w.OX], s[i + w.OY], s[i + w.OZ]), (s[i + w.LX], s[i + w.LY], s[i + w.LZ])
-    others = shares[_COSINE] * s[i + w.PC] + shares[_GGX] * s[i + w.PG]
+    others = cosine * s[i + w.PC] + ggx * s[i + w.PG]
     if not others > ZERO:
         return
-    dr, dg, db = lamps_along(*position, *direction, distance, others, shares[_LAMPS], DIFFUSE, *lamps)
+    dr, dg, db = lamps_along(*position, *direction, distance, others, share, DIFFUSE, *lamps)
     gr, gg, gb = dr, dg, db
     if differ:
-        gr, gg, gb = lamps_along(*position, *direction, distance, others, shares[_LAMPS], GLOSSY, *lamps)
+        gr, gg, gb = lamps_along(*position, *direction, distance, others, share, GLOSSY, *lamps)
     if dr + dg + db + gr + gg + gb > ZERO:
         _add(
             sums, np.int64(ints[c + w.OWNER]), 0, s[i + w.QR] * dr, s[i + w.QG] * dg, s[i + w.QB] * db,
@@ -259,7 +259,7 @@ def _see_lamps(
 
 @njit
 def _trace_lamps(
-    count: Any, s: Any, ints: Any, scene: Any, lamps: Any, shares: Any, look: Any, shift: Any, sums: Any
+    count: Any, s: Any, ints: Any, scene: Any, lamps: Any, shares: Any, look: Any, apart: Any, shift: Any, sums: Any
 ) -> None:
     """Lamp samples: draw, trace, add."""
     w.lamp_directions(s, ints, count, lamps)
@@ -267,8 +267,12 @@ def _trace_lamps(
     mask = np.int32(masks.SHADOW << shift)
     for slot in range(count):
         i, c = w.at(slot)
-        others = shares[_COSINE] * s[i + w.PC] + shares[_GGX] * s[i + w.PG]
-        dr, dg, db, gr, gg, gb = w.lamp_light(s, ints, slot, others, shares[_LAMPS], lamps, scene[0], mask)
+        others, glossy_others = shares[_COSINE] * s[i + w.PC], shares[_GGX] * s[i + w.PG]
+        if not apart:
+            others = glossy_others = others + glossy_others
+        dr, dg, db, gr, gg, gb = w.lamp_light(
+            s, ints, slot, others, glossy_others, shares[_LAMPS], lamps, scene[0], mask
+        )
         if dr + dg + db + gr + gg + gb > ZERO:
             _add(
                 sums, np.int64(ints[c + w.OWNER]), 0, s[i + w.QR] * dr, s[i + w.QG] * dg, s[i + w.QB] * db,
@@ -286,10 +290,12 @@ def _trace(
     p, path_ints = paths
     tracer = scene[0]
     sky, sky_shines, lamps, _, any_lamps = lights
+    lamps_differ, apart = differ
     w.jitter(ints, count, below)
     if strategy == _LAMPS:
-        _trace_lamps(count, s, ints, scene, lamps, shares, look, shift, sums)
+        _trace_lamps(count, s, ints, scene, lamps, shares, look, apart, shift, sums)
         return begun
+    cosine, ggx = shares[_COSINE], shares[_GGX]
     if strategy == _COSINE:
         w.cosine_directions(s, ints, count)
         mask = np.int32(masks.DIFFUSE << shift)
@@ -302,11 +308,19 @@ def _trace(
     w.evaluate(s, count, look)
     if strategy != _SKY:
         w.look_up(s, count, sky)
+    if apart and strategy == _COSINE:
+        ggx = ZERO
+        w.drop(s, count, w.SR)
+    if apart and strategy == _GGX:
+        cosine = ZERO
+        w.drop(s, count, w.QR)
     w.warm(s, count, sky)
     see_lamps = strategy != _SKY and any_lamps
     # Lamps are seen before the BRDF is weighed, for they have densities of their own: such rays are traced first.
-    if not see_lamps:
-        w.weigh(s, count, shares[_COSINE], shares[_GGX], shares[_SKY])
+    if apart and strategy == _SKY:
+        w.weigh_apart(s, count, cosine, ggx, shares[_SKY])
+    elif not see_lamps:
+        w.weigh(s, count, cosine, ggx, shares[_SKY])
     for slot in range(count):
         i, c = w.at(slot)
         if not s[i + w.LIVE] > ZERO:
@@ -314,8 +328,8 @@ def _trace(
         position, direction = (s[i + w.OX], s[i + w.OY], s[i + w.OZ]), (s[i + w.LX], s[i + w.LY], s[i + w.LZ])
         hit = nearest(tracer, *position, *direction, ZERO, _FAR, mask)
         if see_lamps:
-            _see_lamps(strategy, slot, s, ints, hit[0], shares, lamps, differ, sums)
-            w.weigh_one(s, i, shares[_COSINE], shares[_GGX], shares[_SKY])
+            _see_lamps(slot, s, ints, hit[0], cosine, ggx, shares[_LAMPS], lamps, lamps_differ, sums)
+            w.weigh_one(s, i, cosine, ggx, shares[_SKY])
         if hit[1] < 0:
             continue
         s[i + w.LIVE] = ZERO

@@ -107,7 +107,7 @@ def _towards_lamps(s: Any, ints: Any, count: Any, lamps: Any, tracer: Any, shift
         i, c = w.at(slot)
         others = s[i + w.SHARE] * s[i + w.PC] + (ONE - s[i + w.SHARE]) * s[i + w.PG]
         dr, dg, db, gr, gg, gb = w.lamp_light(
-            s, ints, slot, others, ONE, lamps, tracer, np.int32(masks.SHADOW << shift)
+            s, ints, slot, others, others, ONE, lamps, tracer, np.int32(masks.SHADOW << shift)
         )
         if dr + dg + db + gr + gg + gb > ZERO:
             owner = np.int64(ints[c + w.OWNER])

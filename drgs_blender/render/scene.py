@@ -71,6 +71,7 @@ class TraceScene:
     vertex_faces : how many faces are of DR-GS objects; those come first
     places : (p, 3, 4) float32 object-to-world matrices of meshes in several places
     place_object : (p,) int32: object of each place
+    rays_differ : whether there is an object that diffuse rays meet and glossy ones do not, or the other way
     pass_index, object_flags : (objects,) int32: Blender's object index pass; bits HOLDOUT and CATCHER
     any_ordinary : whether the camera may see an ordinary mesh
     materials : MaterialTable of the meshes
@@ -88,6 +89,7 @@ class TraceScene:
         self.places: Array = np.empty((0, 3, 4), np.float32)
         self.pass_index: Array = np.empty(0, np.int32)
         self.object_flags: Array = np.empty(0, np.int32)
+        self.rays_differ = False
         self.any_ordinary = False
         self.materials = MaterialTable([], [])
         self._material_tables: Array = np.array(self.materials.addresses, np.int64)
@@ -240,6 +242,7 @@ class TraceScene:
         index += [p.pass_index for p in where if p.instanced]
         self.pass_index = np.concatenate(index)
         seen = [o.visibility for o in objects] + [mesh.visibility for mesh in meshes]
+        self.rays_differ = any(v.diffuse != v.glossy for v in seen)
         flags = np.array([object_flags(visibility) for visibility in seen], np.int32)
         counts = [0] * len(objects) + [len(p.matrices) if p.instanced else 0 for p in where]
         self.object_flags = np.concatenate([flags, np.repeat(flags, counts)])

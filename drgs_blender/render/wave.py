@@ -181,10 +181,13 @@ def lamp_directions(s: Any, ints: Any, count: Any, lamps: Any) -> None:
 
 
 @njit
-def lamp_light(s: Any, ints: Any, slot: Any, others: Any, share: Any, lamps: Any, tracer: Any, mask: Any) -> Any:
+def lamp_light(
+    s: Any, ints: Any, slot: Any, others: Any, glossy_others: Any, share: Any, lamps: Any, tracer: Any, mask: Any
+) -> Any:  # fmt: skip
     """What a lamp sample brings: radiance over density for the diffuse and for the glossy lobe, 0 when in shadow.
 
-    `others` and `share` are the balance heuristic's densities of other strategies and number of lamp samples.
+    `others` and `share` are the balance heuristic's densities of other strategies, for the diffuse and for the glossy
+    lobe, and number of lamp samples.
     """
     i, c = at(slot)
     density = s[i + MV]
@@ -196,9 +199,11 @@ def lamp_light(s: Any, ints: Any, slot: Any, others: Any, share: Any, lamps: Any
         tracer, s[i + OX], s[i + OY], s[i + OZ], s[i + LX], s[i + LY], s[i + LZ], ZERO, s[i + MU] * F(0.9999), mask
     ):
         return ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
-    weight = ONE / (others + share * density) if density > ZERO else ONE / (share * -density)
-    diffuse = weight if flags & DIFFUSE else ZERO
-    glossy = weight if flags & GLOSSY else ZERO
+    if density < ZERO:
+        others = glossy_others = ZERO
+    density = share * abs(density)
+    diffuse = ONE / (others + density) if flags & DIFFUSE else ZERO
+    glossy = ONE / (glossy_others + density) if flags & GLOSSY else ZERO
     return r * diffuse, g * diffuse, b * diffuse, r * glossy, g * glossy, b * glossy
 
 
@@ -268,6 +273,25 @@ def weigh(s: Any, count: Any, cosine: Any, ggx: Any, light: Any) -> None:
     for p in range(packets(count)):
         for i in range(p * _FLOATS, p * _FLOATS + LANES):
             weigh_one(s, i, cosine, ggx, light)
+
+
+@njit
+def weigh_apart(s: Any, count: Any, cosine: Any, ggx: Any, light: Any) -> None:
+    """`weigh` where cosine sampling is of the diffuse lobe alone, GGX sampling of the specular one alone."""
+    for p in range(packets(count)):
+        for i in range(p * _FLOATS, p * _FLOATS + LANES):
+            k = ONE / max(cosine * s[i + PC] + light * s[i + PE], _TINY)
+            s[i + QR], s[i + QG], s[i + QB] = s[i + QR] * k, s[i + QG] * k, s[i + QB] * k
+            k = ONE / max(ggx * s[i + PG] + light * s[i + PE], _TINY)
+            s[i + SR], s[i + SG], s[i + SB] = s[i + SR] * k, s[i + SG] * k, s[i + SB] * k
+
+
+@njit
+def drop(s: Any, count: Any, lobe: Any) -> None:
+    """Take the lobe whose fields begin at `lobe` (QR or SR) out of the BRDF."""
+    for p in range(packets(count)):
+        for i in range(p * _FLOATS + lobe, p * _FLOATS + lobe + 3 * LANES):
+            s[i] = ZERO
 
 
 @njit
