@@ -127,7 +127,9 @@ def report(options: argparse.Namespace, rows: list[tuple[str, ...]]) -> str:
         f"Cycles of bpy 5.0.1 (Principled, GGX) and through the extension, primary mesh, aa 16, {BOUNCES} bounces in "
         f"both. Each picture is the mean of {options.seeds} with independent random numbers, of {options.samples} spp "
         f"and {options.rays} rays. Cycles' shadow terminator offsets and clamps are off. *No noise* and *Cycles "
-        "itself* as in the section on parity.\n\n" + table(columns, rows)
+        "itself* as in the section on parity.\n\n" + table(columns, rows) + "\n\n"
+        "In the last two scenes sky and lamps stand next to objects that only some rays meet, where a picture depends "
+        "on how strategies are weighed (docs/rendering.md)."
     )
 
 
