@@ -111,8 +111,12 @@ def read_corner_normals(mesh: bpy.types.Mesh) -> Array:
 
 
 def smooth_or_corner_normals(mesh: bpy.types.Mesh) -> Array | None:
-    """(l, 3) float32 unit normals, object space, of all corners; None where smooth vertex normals are the same."""
-    if mesh.normals_domain == "POINT" and not mesh.has_custom_normals:
+    """(l, 3) float32 unit normals, object space, of all corners; None where smooth vertex normals are the same.
+
+    They are not where the engine gets triangles of polygons: those of a bent quad differ from it, in normal and angle.
+    """
+    triangles = len(mesh.loops) == 3 * len(mesh.polygons)
+    if triangles and mesh.normals_domain == "POINT" and not mesh.has_custom_normals:
         return None
     normals = np.empty((len(mesh.loops), 3), np.float32)
     mesh.corner_normals.foreach_get("vector", normals.ravel())

@@ -42,7 +42,7 @@ def test_mesh_is_described_in_object_space(scene, export):
 
 def test_arrays_can_be_kept_by_the_client(scene, export):
     """Frozen arrays of their own are compared by identity and never copied."""
-    frozen = part("drgs_blender.engine.slots").frozen
+    frozen = part("drgs_blender.arrays").frozen
     for faces in (QUADS, [q[:3] for q in QUADS]):  # triangulated, and triangles already
         obj = mesh_object("Shape", CUBE, faces)
         obj.data.uv_layers.new()
@@ -208,6 +208,18 @@ def test_custom_normals_of_vertices_are_not_taken_for_smooth_ones(scene, export)
     up = np.tile(np.float32((0, 0, 1)), (len(obj.data.vertices), 1))
     obj.data.normals_split_custom_set_from_vertices(up.tolist())
     np.testing.assert_allclose(export()[0].meshes[0].corner_normals.reshape(-1, 3)[:, 2], 1, atol=1e-3)
+
+
+def test_smooth_quads_keep_blenders_normals(scene, export):
+    """A bent quad's triangles would weigh otherwise in the normals of its corners."""
+    obj = mesh_object(
+        "Bent", [(0, 0, 0), (1, 0, 0.4), (1, 1, 0), (0, 1, 0.4), (2, 0, 0), (2, 1, 0.3)], [(0, 1, 2, 3), (1, 4, 5, 2)]
+    )
+    obj.data.shade_smooth()
+    (state,) = export()[0].meshes
+    obj.data.calc_loop_triangles()
+    expected = [[obj.data.vertices[v].normal[:] for v in t.vertices] for t in obj.data.loop_triangles]
+    np.testing.assert_allclose(state.corner_normals, expected, atol=1e-6)
 
 
 def test_smooth_and_sharp_corners_follow_their_triangles(scene, export):
