@@ -11,10 +11,10 @@ from report import table, write_section
 
 from drgs_blender.formats.registry import read_environment
 from drgs_blender.frame import RenderSettings, World
-from drgs_blender.render.integrate import integrate
-from drgs_blender.render.light import EnvironmentLight
+from drgs_blender.render.lights.light import EnvironmentLight
 from drgs_blender.render.points import ShadingPoints
-from drgs_blender.render.scene import TraceScene
+from drgs_blender.render.shade.integrate import integrate
+from drgs_blender.render.trace.scene import TraceScene
 
 EMPTY = TraceScene()
 

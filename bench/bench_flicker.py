@@ -18,11 +18,11 @@ from drgs_blender.asset.container import read_asset
 from drgs_blender.formats.registry import read_environment
 from drgs_blender.frame import Frame, ObjectState, RenderSettings, World, split_rays
 from drgs_blender.render import pipeline
-from drgs_blender.render.denoise import denoise
-from drgs_blender.render.film import Film
-from drgs_blender.render.motion import Motion
-from drgs_blender.render.oidn import available, denoise_oidn
-from drgs_blender.render.temporal import REACH, Shot, denoise_next, window
+from drgs_blender.render.picture.denoise import denoise
+from drgs_blender.render.picture.film import Film
+from drgs_blender.render.picture.motion import Motion
+from drgs_blender.render.picture.oidn import available, denoise_oidn
+from drgs_blender.render.picture.temporal import REACH, Shot, denoise_next, window
 
 Array = np.ndarray
 

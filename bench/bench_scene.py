@@ -16,7 +16,7 @@ from report import table, write_section
 
 from drgs_blender.asset import Asset, Binding, Mesh, Surfels
 from drgs_blender.asset.container import read_asset, write_asset
-from drgs_blender.render.scene import TraceObject, TraceScene
+from drgs_blender.render.trace.scene import TraceObject, TraceScene
 
 
 def median_ms(work: Callable[[], object], runs: int) -> float:

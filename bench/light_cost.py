@@ -28,11 +28,11 @@ from drgs_blender.frame import Frame
 from drgs_blender.jit import njit, prange, source_digest, use_threads
 from drgs_blender.passes import PASSES
 from drgs_blender.render.camera import camera_parameters
-from drgs_blender.render.integrate import integrate
-from drgs_blender.render.light import EnvironmentLight
+from drgs_blender.render.lights.light import EnvironmentLight
 from drgs_blender.render.points import ShadingPoints
-from drgs_blender.render.primary_mesh import primary_mesh
-from drgs_blender.render.scene import TraceObject, TraceScene
+from drgs_blender.render.primary.primary_mesh import primary_mesh
+from drgs_blender.render.shade.integrate import integrate
+from drgs_blender.render.trace.scene import TraceObject, TraceScene
 
 Array = np.ndarray
 RAYS, RUNS = 32, 3

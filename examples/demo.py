@@ -18,7 +18,7 @@ import numpy as np
 from PIL import Image
 
 from drgs_blender.colour import linear_to_srgb
-from drgs_blender.render.frames import read_frame
+from drgs_blender.render.picture.frames import read_frame
 
 ROOT = Path(__file__).resolve().parent.parent
 BIN = "Scripts" if sys.platform == "win32" else "bin"

@@ -22,8 +22,8 @@ from ..frame import Camera, RenderSettings
 from ..geometry import rotation_matrices
 from ..jit import njit, prange
 from ..render.camera import camera_parameters
-from ..render.raster import rasterise
-from ..render.splats import prepare
+from ..render.surfels.raster import rasterise
+from ..render.surfels.splats import prepare
 
 Array = np.ndarray
 log = logging.getLogger(__name__)

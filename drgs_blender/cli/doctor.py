@@ -107,7 +107,7 @@ def cache(args: argparse.Namespace) -> str:
 
 def embree(args: argparse.Namespace) -> str:
     """Embree, loaded as the renderer loads it."""
-    from ..render.embree import library
+    from ..render.trace.embree import library
 
     return f"embreex {importlib.metadata.version('embreex')}, {Path(library()._name).name}"
 

@@ -19,7 +19,7 @@ from ..engine.codec import encode_frame
 from ..errors import AssetError
 from ..frame import Frame
 from ..passes import BY_NAME
-from ..render.frames import read_frame, write_frame
+from ..render.picture.frames import read_frame, write_frame
 from ..version import __version__
 
 logger = logging.getLogger(__name__)

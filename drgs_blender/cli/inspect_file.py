@@ -69,7 +69,7 @@ def inspect_file(path: Path) -> dict[str, Any]:
 
 def inspect_frame(path: Path) -> dict[str, Any] | None:
     """Describe a frame written by DR-GS; None when the EXR was written by another program."""
-    from ..render.frames import read_frame
+    from ..render.picture.frames import read_frame
 
     try:
         pictures, metadata = read_frame(path)

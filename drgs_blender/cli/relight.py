@@ -90,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
         write_preview(args.out, picture["Combined"])
     else:
         from ..asset.container import digest_asset
-        from ..render.frames import write_frame
+        from ..render.picture.frames import write_frame
 
         write_frame(args.out, picture, {"asset": digest_asset(key), "seed": str(settings.seed)})
     return 0

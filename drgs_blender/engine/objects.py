@@ -10,7 +10,7 @@ from ..asset.model import MATERIAL_CHANNELS, Asset, PosedSurfels, as_float
 from ..deform.mesh_driven import MeshDriven
 from ..errors import AssetError, UsageError
 from ..frame import ObjectState
-from ..render.scene import TraceObject
+from ..render.trace.scene import TraceObject
 
 Array = np.ndarray
 

@@ -19,10 +19,10 @@ from ..deform.mesh_driven import MeshDriven
 from ..errors import AssetError, Cancelled, UsageError
 from ..frame import Frame, Image, Light, MeshState, ObjectState, World
 from ..jit import use_threads
-from ..render.lamps import Lamps
-from ..render.light import EnvironmentLight
+from ..render.lights.lamps import Lamps
+from ..render.lights.light import EnvironmentLight
 from ..render.pipeline import render
-from ..render.scene import TraceObject, TraceScene
+from ..render.trace.scene import TraceObject, TraceScene
 from .objects import join, posed_surfels, traced_object
 from .protocol import Passes
 from .snapshots import renewed

@@ -16,21 +16,21 @@ from ..errors import Cancelled, UsageError
 from ..frame import Frame
 from ..jit import use_threads
 from ..passes import BY_NAME
-from .adaptive import part_count, sample_adaptively
 from .camera import camera_parameters
-from .denoise import denoise
-from .film import COMPONENTS, Film
-from .gbuffer import GBuffer
-from .integrate import integrate
-from .lamps import Lamps
-from .light import EnvironmentLight
-from .oidn import denoise_oidn, require
+from .lights.lamps import Lamps
+from .lights.light import EnvironmentLight
+from .picture.denoise import denoise
+from .picture.film import COMPONENTS, Film
+from .picture.oidn import denoise_oidn, require
 from .points import Radiance, ShadingPoints
-from .primary_mesh import primary_mesh
-from .primary_surfels import primary_surfels, snap_windows
-from .scene import TraceScene
-from .seen_lamps import seen_lamps
-from .splats import prepare
+from .primary.gbuffer import GBuffer
+from .primary.primary_mesh import primary_mesh
+from .primary.primary_surfels import primary_surfels, snap_windows
+from .primary.seen_lamps import seen_lamps
+from .shade.adaptive import part_count, sample_adaptively
+from .shade.integrate import integrate
+from .surfels.splats import prepare
+from .trace.scene import TraceScene
 
 Array = np.ndarray
 Progress = Callable[[float, str], None]

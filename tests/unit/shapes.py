@@ -6,7 +6,7 @@ import numpy as np
 
 from drgs_blender.asset.model import PosedSurfels
 from drgs_blender.frame import Camera
-from drgs_blender.render.scene import TraceObject, TraceScene
+from drgs_blender.render.trace.scene import TraceObject, TraceScene
 
 
 def look_along_y(size: int = 48, distance: float = 4.0, focal: float = 70.0, **more: object) -> Camera:

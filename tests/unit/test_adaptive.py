@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from drgs_blender.frame import RenderSettings, World
-from drgs_blender.render.adaptive import part_count, sample_adaptively
-from drgs_blender.render.integrate import integrate
-from drgs_blender.render.light import EnvironmentLight
+from drgs_blender.render.lights.light import EnvironmentLight
 from drgs_blender.render.points import Radiance, ShadingPoints
-from drgs_blender.render.scene import TraceScene
+from drgs_blender.render.shade.adaptive import part_count, sample_adaptively
+from drgs_blender.render.shade.integrate import integrate
+from drgs_blender.render.trace.scene import TraceScene
 
 WIDTH = 40
 

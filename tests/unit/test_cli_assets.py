@@ -13,7 +13,7 @@ from drgs_blender.asset.container import read_asset
 from drgs_blender.cli import doctor
 from drgs_blender.cli.main import main
 from drgs_blender.formats.gltf import read_gltf
-from drgs_blender.render.frames import write_frame
+from drgs_blender.render.picture.frames import write_frame
 
 #: Unit cube, each face on the whole texture.
 CUBE = """mtllib cube.mtl

@@ -17,7 +17,7 @@ from drgs_blender.asset.model import Asset, Environment, Mesh
 from drgs_blender.cli.main import main
 from drgs_blender.deform.attach import attach
 from drgs_blender.passes import BY_NAME
-from drgs_blender.render.frames import read_frame
+from drgs_blender.render.picture.frames import read_frame
 
 # Stands at -Y and looks along +Y; the picture's right is +X.
 FRONT = {"matrix_world": [[1, 0, 0, 0], [0, 0, -1, -6], [0, 1, 0, 0], [0, 0, 0, 1]], "width": 40, "height": 30}

@@ -21,7 +21,7 @@ from drgs_blender.cli.find_blender import CHECKOUT, find_blender
 from drgs_blender.cli.main import main
 from drgs_blender.deform.attach import attach
 from drgs_blender.errors import DeviceError, EngineError
-from drgs_blender.render.frames import read_frame
+from drgs_blender.render.picture.frames import read_frame
 
 BUILD = """
 import importlib, os, runpy, sys, tempfile

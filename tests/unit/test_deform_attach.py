@@ -13,8 +13,8 @@ from drgs_blender.deform.mesh_driven import MeshDriven
 from drgs_blender.frame import Camera, RenderSettings
 from drgs_blender.geometry import rotation_matrices
 from drgs_blender.render.camera import camera_parameters
-from drgs_blender.render.raster import rasterise
-from drgs_blender.render.splats import prepare
+from drgs_blender.render.surfels.raster import rasterise
+from drgs_blender.render.surfels.splats import prepare
 
 
 def as_mesh(source: trimesh.Trimesh) -> Mesh:

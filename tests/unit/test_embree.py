@@ -13,8 +13,8 @@ import pytest
 import trimesh
 
 from drgs_blender.errors import DeviceError, UsageError
-from drgs_blender.render import embree
-from drgs_blender.render.tree import ALL, Group, TriangleBVH
+from drgs_blender.render.trace import embree
+from drgs_blender.render.trace.tree import ALL, Group, TriangleBVH
 
 
 def rays(count: int, seed: int = 0, spread: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
@@ -134,7 +134,7 @@ def test_a_wheel_without_embree_is_a_device_error(tmp_path: Path, monkeypatch: p
 
 _PROGRAM = """
 import numpy as np
-from drgs_blender.render import tree
+from drgs_blender.render.trace import tree
 bvh = tree.TriangleBVH()
 bvh.build([[0, 0, 1], [1, 0, 1], [0, 1, 1]], [[0, 1, 2]])
 t, face, u, v = bvh.intersect([[0.25, 0.25, 0]], [[0, 0, 1]])

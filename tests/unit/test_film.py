@@ -8,10 +8,10 @@ import pytest
 from drgs_blender.frame import Camera, RenderSettings, World
 from drgs_blender.passes import BY_NAME
 from drgs_blender.render.camera import camera_parameters, sample_ray
-from drgs_blender.render.film import EMPTY_DEPTH, Film
-from drgs_blender.render.gbuffer import GBuffer, compact
-from drgs_blender.render.light import EnvironmentLight
+from drgs_blender.render.lights.light import EnvironmentLight
+from drgs_blender.render.picture.film import EMPTY_DEPTH, Film
 from drgs_blender.render.points import Radiance
+from drgs_blender.render.primary.gbuffer import GBuffer, compact
 
 ALL = tuple(BY_NAME)
 AA = 4

@@ -15,8 +15,8 @@ import pytest
 
 from drgs_blender.errors import AssetError, UsageError, WriteError
 from drgs_blender.passes import BY_NAME, PASSES
-from drgs_blender.render import frames
-from drgs_blender.render.frames import read_frame, write_frame
+from drgs_blender.render.picture import frames
+from drgs_blender.render.picture.frames import read_frame, write_frame
 
 ROOT = Path(__file__).resolve().parents[2]
 BLENDER_PYTHON = ROOT / ".venv-blender" / "bin" / "python"

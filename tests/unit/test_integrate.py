@@ -12,11 +12,11 @@ from drgs_blender.colour import LUMINANCE
 from drgs_blender.errors import UsageError
 from drgs_blender.frame import Light, RenderSettings, World
 from drgs_blender.jit import get_num_threads, use_threads
-from drgs_blender.render.integrate import integrate
-from drgs_blender.render.lamps import Lamps
-from drgs_blender.render.light import EnvironmentLight
+from drgs_blender.render.lights.lamps import Lamps
+from drgs_blender.render.lights.light import EnvironmentLight
 from drgs_blender.render.points import DIFFUSE_DIRECT, DIFFUSE_INDIRECT, Radiance, ShadingPoints
-from drgs_blender.render.scene import TraceObject, TraceScene
+from drgs_blender.render.shade.integrate import integrate
+from drgs_blender.render.trace.scene import TraceObject, TraceScene
 
 WHITE = EnvironmentLight(World())
 

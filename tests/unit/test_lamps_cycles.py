@@ -15,8 +15,8 @@ import pytest
 from test_lamps import light
 
 from drgs_blender.frame import Light
-from drgs_blender.render.lamp_shapes import CAMERA, DIFFUSE, GLOSSY, SHADOW
-from drgs_blender.render.lamps import Lamps, lamp_flags
+from drgs_blender.render.lights.lamp_shapes import CAMERA, DIFFUSE, GLOSSY, SHADOW
+from drgs_blender.render.lights.lamps import Lamps, lamp_flags
 from drgs_blender.render.sampling import sobol
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -14,14 +14,14 @@ from drgs_blender.frame import Camera, Frame, Material, ObjectState, RenderSetti
 from drgs_blender.passes import BY_NAME
 from drgs_blender.render import pipeline
 from drgs_blender.render.camera import camera_parameters
-from drgs_blender.render.film import Film
-from drgs_blender.render.gbuffer import GBuffer
-from drgs_blender.render.light import EnvironmentLight
+from drgs_blender.render.lights.light import EnvironmentLight
+from drgs_blender.render.picture.film import Film
 from drgs_blender.render.points import CATCHER, SECOND, Radiance
-from drgs_blender.render.primary_mesh import primary_mesh
-from drgs_blender.render.primary_surfels import primary_surfels, snap_windows
-from drgs_blender.render.scene import TraceObject, TraceScene
-from drgs_blender.render.splats import prepare
+from drgs_blender.render.primary.gbuffer import GBuffer
+from drgs_blender.render.primary.primary_mesh import primary_mesh
+from drgs_blender.render.primary.primary_surfels import primary_surfels, snap_windows
+from drgs_blender.render.surfels.splats import prepare
+from drgs_blender.render.trace.scene import TraceObject, TraceScene
 
 AA = 2
 SIZE = 24

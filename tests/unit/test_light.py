@@ -8,7 +8,7 @@ import pytest
 from drgs_blender.colour import LUMINANCE
 from drgs_blender.errors import UsageError
 from drgs_blender.frame import World
-from drgs_blender.render.light import EnvironmentLight, _texel_means
+from drgs_blender.render.lights.light import EnvironmentLight, _texel_means
 
 
 def picture(kind: str) -> np.ndarray | None:

@@ -11,10 +11,10 @@ torch = pytest.importorskip("torch")
 
 from drgs_blender.asset.model import PosedSurfels  # noqa: E402
 from drgs_blender.frame import Camera, RenderSettings  # noqa: E402
-from drgs_blender.render import raster as kernel  # noqa: E402
 from drgs_blender.render.camera import camera_parameters, lattice, pixel_shift  # noqa: E402
 from drgs_blender.render.reference import raster as reference  # noqa: E402
-from drgs_blender.render.splats import prepare  # noqa: E402
+from drgs_blender.render.surfels import raster as kernel  # noqa: E402
+from drgs_blender.render.surfels.splats import prepare  # noqa: E402
 
 torch.set_num_threads(1)
 AA = 2

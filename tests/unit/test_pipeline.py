@@ -13,8 +13,8 @@ from drgs_blender.errors import Cancelled, UsageError
 from drgs_blender.frame import Camera, Frame, ObjectState, RenderSettings, World
 from drgs_blender.passes import BY_NAME
 from drgs_blender.render import pipeline
-from drgs_blender.render.light import EnvironmentLight
-from drgs_blender.render.scene import TraceScene
+from drgs_blender.render.lights.light import EnvironmentLight
+from drgs_blender.render.trace.scene import TraceScene
 
 ALL = tuple(BY_NAME)
 

@@ -10,9 +10,9 @@ import pytest
 from drgs_blender.asset.model import PosedSurfels
 from drgs_blender.errors import UsageError
 from drgs_blender.frame import Camera, RenderSettings
-from drgs_blender.render import raster
-from drgs_blender.render import splats as screen
 from drgs_blender.render.camera import camera_parameters, lattice, pixel_shift
+from drgs_blender.render.surfels import raster
+from drgs_blender.render.surfels import splats as screen
 
 FIELDS = ("centre", "tangent_u", "tangent_v", "normal", "opacity", "albedo", "roughness", "metallic", "object_index")
 

@@ -10,10 +10,10 @@ from test_glow import lamp, panel, wall
 from test_integrate import points, settings, sun_picture
 
 from drgs_blender.frame import Light, MeshState, Visibility, World
-from drgs_blender.render.integrate import integrate
-from drgs_blender.render.lamps import Lamps
-from drgs_blender.render.light import EnvironmentLight
-from drgs_blender.render.scene import TraceScene
+from drgs_blender.render.lights.lamps import Lamps
+from drgs_blender.render.lights.light import EnvironmentLight
+from drgs_blender.render.shade.integrate import integrate
+from drgs_blender.render.trace.scene import TraceScene
 
 DARK = World(strength=0.0)
 

@@ -12,10 +12,10 @@ from test_layers import FACES, SIZE, SQUARE, veil, wall
 from test_surface import matrix, mesh_state
 
 from drgs_blender.frame import Frame, Light, Material, RenderSettings, Visibility, World
-from drgs_blender.render.lamps import Lamps
-from drgs_blender.render.light import EnvironmentLight
+from drgs_blender.render.lights.lamps import Lamps
+from drgs_blender.render.lights.light import EnvironmentLight
 from drgs_blender.render.pipeline import render
-from drgs_blender.render.scene import TraceScene
+from drgs_blender.render.trace.scene import TraceScene
 
 BLACK = Material("black", (0.0, 0.0, 0.0), 1.0)
 #: Radiance of `panel`: power times colour over pi times its area.

@@ -14,9 +14,9 @@ from shapes import sphere_surfels
 
 from drgs_blender.asset.model import PosedSurfels
 from drgs_blender.errors import UsageError
-from drgs_blender.render.surfel_bvh import SurfelBVH
-from drgs_blender.render.surfel_query import CAPACITY
-from drgs_blender.render.surfel_tracer import Starts, SurfelHits, trace, transmittance_many
+from drgs_blender.render.surfels.surfel_bvh import SurfelBVH
+from drgs_blender.render.surfels.surfel_query import CAPACITY
+from drgs_blender.render.surfels.surfel_tracer import Starts, SurfelHits, trace, transmittance_many
 
 Array = np.ndarray
 
@@ -353,8 +353,8 @@ import sys
 sys.path.insert(0, {tests!r})
 import numpy as np
 from shapes import sphere_surfels
-from drgs_blender.render import surfel_tracer
-from drgs_blender.render.surfel_bvh import SurfelBVH
+from drgs_blender.render.surfels import surfel_tracer
+from drgs_blender.render.surfels.surfel_bvh import SurfelBVH
 bvh = SurfelBVH()
 bvh.update(sphere_surfels(1.0, 500))
 through = surfel_tracer.transmittance_many(bvh, [[0, 0, 3], [0, 0, 3]], [[0, 0, -1], [0, 0, 1]])

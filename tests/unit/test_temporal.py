@@ -8,9 +8,9 @@ import pytest
 from drgs_blender.frame import Camera, RenderSettings
 from drgs_blender.jit import get_num_threads, use_threads
 from drgs_blender.render.camera import camera_parameters, camera_ray
-from drgs_blender.render.denoise import LIGHT, PAD, Guides, Signal, demodulate
-from drgs_blender.render.motion import Motion, MotionFilm, previous_positions, project
-from drgs_blender.render.temporal import Shot, denoise_next, window
+from drgs_blender.render.picture.denoise import LIGHT, PAD, Guides, Signal, demodulate
+from drgs_blender.render.picture.motion import Motion, MotionFilm, previous_positions, project
+from drgs_blender.render.picture.temporal import Shot, denoise_next, window
 
 H, W = 48, 64
 PITCH = 1e-3  # metres a pixel
@@ -163,8 +163,8 @@ def test_vectors_lead_to_the_place_in_the_picture_before() -> None:
 
 def test_samples_make_up_a_pixels_motion_as_they_make_up_its_position() -> None:
     """Two samples near, one far behind, one of a shadow catcher in front: the near ones count, by weight."""
-    from drgs_blender.render.gbuffer import compact
     from drgs_blender.render.points import CATCHER
+    from drgs_blender.render.primary.gbuffer import compact
 
     alpha = np.zeros((H, W, 4), np.float32)
     alpha[7, 9] = 1.0

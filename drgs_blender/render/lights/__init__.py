@@ -1,0 +1,1 @@
+"""What shines: the world and Blender's lights."""

@@ -1,0 +1,320 @@
+"""The environment light: radiance from a direction, and directions in proportion to radiance.
+
+A texel's directions are drawn uniformly over its solid angle (uniform in azimuth and in z), so its density is one
+constant, finite at the poles. Its probability is the luminance, averaged over the texel as the bilinear lookup sees it,
+times the solid angle: wherever a lookup can be positive, so is the density.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from ...asset.model import as_float
+from ...colour import LUMINANCE
+from ...errors import UsageError
+from ...frame import World
+from ...jit import njit
+from ..memory import address, load_float, load_int32, load_uint32
+from ..sampling import fast_acos, fast_atan2_turns, sincos_turns, unit
+
+Array = np.ndarray
+
+#: Cells of the sampling table at most; larger pictures are averaged down for sampling (never for the lookup).
+_MOST_CELLS = 1 << 22
+
+
+def _morton(rows: Array, columns: Array) -> Array:
+    """Interleave the bits of two indices below 2^16: neighbours in the map stay near in the order."""
+
+    def spread(x: Array) -> Array:
+        x = x.astype(np.uint32)
+        for shift, mask in ((8, 0x00FF00FF), (4, 0x0F0F0F0F), (2, 0x33333333), (1, 0x55555555)):
+            x = (x | (x << np.uint32(shift))) & np.uint32(mask)
+        return x
+
+    return (spread(rows) << np.uint32(1)) | spread(columns)
+
+
+@njit
+def _guide_table(cells, guide):  # type: ignore[no-untyped-def]
+    """First cell of each equal slice of the random numbers: the inversion starts there (Chen and Asau 1974)."""
+    width = np.uint64(1 << 32) // np.uint64(len(guide))
+    i = np.int64(0)
+    for g in range(len(guide)):
+        while np.uint64(cells[i, 0]) < np.uint64(g) * width:
+            i += 1
+        guide[g] = i
+
+
+def _whole_widths(share: Array) -> Array:
+    """Divide the 2^32 random numbers among cells by their `share` (sums to 1), at least one each; int64."""
+    width = np.diff(np.rint(np.cumsum(share) / share.sum() * 2.0**32).astype(np.int64), prepend=0)
+    # What the darkest cells get on top of their share comes from all others, in proportion.
+    owed = int(np.maximum(1 - width, 0).sum())
+    width = np.maximum(width, 1)
+    spare = width - 1
+    taken = spare * owed // max(int(spare.sum()), 1)
+    width -= taken
+    width[np.argsort(-width, kind="stable")[: owed - int(taken.sum())]] -= 1
+    return width
+
+
+def _texel_means(luminance: Array) -> Array:
+    """Mean over each texel of the bilinear interpolant (wraps in columns, clamps in rows)."""
+    rows = np.concatenate([luminance[:1], luminance, luminance[-1:]])
+    rows = 0.75 * luminance + 0.125 * (rows[:-2] + rows[2:])
+    return 0.75 * rows + 0.125 * (np.roll(rows, 1, axis=1) + np.roll(rows, -1, axis=1))
+
+
+class Sky(NamedTuple):
+    """An `EnvironmentLight` for compiled code: addresses of its arrays, their sizes, and its rotation row by row."""
+
+    texels: int
+    height: int
+    width: int
+    cells: int
+    guide: int
+    guide_size: int
+    row_z: int
+    step: int
+    columns: int
+    xx: np.float32
+    xy: np.float32
+    xz: np.float32
+    yx: np.float32
+    yy: np.float32
+    yz: np.float32
+    zx: np.float32
+    zy: np.float32
+    zz: np.float32
+
+
+class EnvironmentLight:
+    """A `World` made ready for lookups and sampling by compiled code.
+
+    Attributes
+    ----------
+    texels : (h, w, 4) float32: lat-long radiance times colour and strength, linear Rec.709, and in the last place the
+        density of the sampling cell that the texel lies in: one cache line serves both
+    density : (rows, columns) float32: probability per solid angle of each sampling cell; 0 everywhere when black
+    cells : (k, 2) uint32: last random number that falls on a cell, and the cell; the lit cells in Morton order, so that
+        equal strata of one random number are compact regions of equal power
+    guide : (2^b,) int32: where to start looking in `cells`
+    row_z : (rows + 1,) float32: z at the upper edge of each row of cells, from 1 to -1
+    rotation : (3, 3) float32: world direction to environment direction
+    bad_texels : int: NaN, infinite or negative texels, taken as black
+    black : bool: no light at all
+    """
+
+    def __init__(self, world: World) -> None:
+        if world.environment is None:
+            image = np.ones((1, 1, 3), np.float32)
+        else:
+            image = as_float(world.environment, (-1, -1, 3), "environment")
+            if image.size == 0:
+                raise UsageError("environment", "has no pixels", "Choose another picture or a colour")
+        rotation = np.asarray(world.rotation, np.float64).reshape(3, 3)
+        tint = np.asarray(world.colour, np.float64) * float(world.strength)
+        if not (np.isfinite(rotation).all() and np.isfinite(tint).all()):
+            raise UsageError("world", "has a colour, strength or rotation that is not finite", "Check its settings")
+        with np.errstate(all="ignore"):
+            tinted = image * tint.astype(np.float32)
+            bad = ~np.asarray((tinted >= 0) & (tinted < 1e30)).all(axis=2, keepdims=True)
+        self.bad_texels = int(bad.sum())
+        h, w = image.shape[:2]
+        self.texels = np.zeros((h, w, 4), np.float32)
+        self.texels[..., :3] = np.where(bad, np.float32(0), tinted)
+        self.rotation = np.ascontiguousarray(rotation, np.float32)
+        self._make_table()
+
+    def _make_table(self) -> None:
+        means = _texel_means(self.texels[..., :3].astype(np.float64) @ np.array(LUMINANCE))
+        h, w = means.shape
+        step = 1
+        while (h // step) * (w // step) > _MOST_CELLS or h % step or w % step:
+            step += 1
+            if step > min(h, w):
+                step = 1
+                break
+        if step > 1:
+            means = means.reshape(h // step, step, w // step, step).mean(axis=(1, 3))
+        rows, columns = means.shape
+        edges = np.cos(np.pi * np.arange(rows + 1) / rows)
+        edges[0], edges[-1] = 1.0, -1.0
+        solid = -np.diff(edges) * (2.0 * math.pi / columns)
+        weights = (means * solid[:, None]).ravel()
+        total = weights.sum()
+        self.black = not total > 0.0
+        self._power = float(total)
+        self.row_z = edges.astype(np.float32)
+        every = np.arange(rows * columns)
+        lit = every if self.black else every[weights > 0]
+        lit = lit[np.argsort(_morton(lit // columns, lit % columns), kind="stable")]
+        # Widths in whole random numbers, at least one where there is light; the density follows from them exactly.
+        share = np.full(len(lit), 1.0 / len(lit)) if self.black else weights[lit] / total
+        width = _whole_widths(share)
+        self.cells = np.stack([np.cumsum(width) - 1, lit], axis=1).astype(np.uint32)
+        self.guide = np.zeros(1 << max(0, (len(every) - 1).bit_length()), np.int32)
+        _guide_table(self.cells, self.guide)
+        density = np.zeros(len(every))
+        if not self.black:
+            density[lit] = width * 2.0**-32
+        self.density = (density.reshape(rows, columns) / solid[:, None]).astype(np.float32)
+        self.texels[..., 3] = self.density.repeat(step, axis=0).repeat(step, axis=1)
+
+    @property
+    def sky(self) -> Sky:
+        """What compiled code reads; valid while this light lives and its rotation is not replaced."""
+        height, width = self.texels.shape[:2]
+        step = height // (len(self.row_z) - 1)
+        return Sky(
+            address(self.texels),
+            height,
+            width,
+            address(self.cells),
+            address(self.guide),
+            len(self.guide),
+            address(self.row_z),
+            step,
+            width // step,
+            *self.rotation.ravel(),
+        )
+
+    @property
+    def power(self) -> float:
+        """Luminance integrated over all directions."""
+        return self._power
+
+    def lookup(self, directions: Array) -> Array:
+        """(n, 3) radiance from (n, 3) unit world directions."""
+        return _lookup_many(np.ascontiguousarray(directions, np.float32), self.sky)
+
+    def pdf(self, directions: Array) -> Array:
+        """(n,) density per solid angle with which ``sample`` draws (n, 3) unit world directions."""
+        return _pdf_many(np.ascontiguousarray(directions, np.float32), self.sky)
+
+    def sample(self, numbers: Array) -> tuple[Array, Array]:
+        """World directions (n, 3) and densities (n,) from (n, 3) uint32 random numbers."""
+        numbers = np.ascontiguousarray(numbers, np.uint32)
+        return _sample_many(numbers, self.sky)
+
+
+@njit
+def map_at(dx, dy, dz, sky):  # type: ignore[no-untyped-def]
+    """Lat-long coordinates (u, v) in [0, 1] of a world direction; row 0 at +Z, +X at u = 1/2."""
+    x = sky.xx * dx + sky.xy * dy + sky.xz * dz
+    y = sky.yx * dx + sky.yy * dy + sky.yz * dz
+    z = sky.zx * dx + sky.zy * dy + sky.zz * dz
+    return np.float32(0.5) - fast_atan2_turns(y, x), fast_acos(z) * np.float32(1.0 / math.pi)
+
+
+@njit
+def sky_density(u, v, sky):  # type: ignore[no-untyped-def]
+    """Density per solid angle of the sampling cell that holds (u, v)."""
+    row = min(np.int64(sky.height - 1), np.int64(v * np.float32(sky.height)))
+    column = min(np.int64(sky.width - 1), np.int64(u * np.float32(sky.width)))
+    return load_float(sky.texels, 4 * (row * sky.width + column) + 3)
+
+
+@njit
+def sky_radiance(u, v, sky):  # type: ignore[no-untyped-def]
+    """Bilinear lookup, wrapped in u and clamped in v."""
+    h, w = sky.height, sky.width
+    x, y = u * np.float32(w) - np.float32(0.5), v * np.float32(h) - np.float32(0.5)
+    y = min(max(y, np.float32(0.0)), np.float32(h - 1))
+    c0, r0 = np.int64(x + np.float32(1.0)) - 1, np.int64(y)
+    a, b = x - np.float32(c0), y - np.float32(r0)
+    c1 = c0 + 1 if c0 + 1 < w else 0
+    c0 = w - 1 if c0 < 0 else c0
+    r1 = min(r0 + 1, h - 1)
+    one = np.float32(1.0)
+    p00, p01, p10, p11 = (one - a) * (one - b), a * (one - b), (one - a) * b, a * b
+    i00, i01, i10, i11 = 4 * (r0 * w + c0), 4 * (r0 * w + c1), 4 * (r1 * w + c0), 4 * (r1 * w + c1)
+    t = sky.texels
+    red = p00 * load_float(t, i00) + p01 * load_float(t, i01) + p10 * load_float(t, i10) + p11 * load_float(t, i11)
+    i00, i01, i10, i11 = i00 + 1, i01 + 1, i10 + 1, i11 + 1
+    green = p00 * load_float(t, i00) + p01 * load_float(t, i01) + p10 * load_float(t, i10) + p11 * load_float(t, i11)
+    i00, i01, i10, i11 = i00 + 1, i01 + 1, i10 + 1, i11 + 1
+    blue = p00 * load_float(t, i00) + p01 * load_float(t, i01) + p10 * load_float(t, i10) + p11 * load_float(t, i11)
+    return red, green, blue
+
+
+@njit
+def sky_touch(u, v, sky):  # type: ignore[no-untyped-def]
+    """Some value from both rows of texels that `sky_radiance` will read there: brings them into the cache."""
+    h, w = sky.height, sky.width
+    y = min(max(v * np.float32(h) - np.float32(0.5), np.float32(0.0)), np.float32(h - 1))
+    column, row = min(np.int64(u * np.float32(w)), w - 1), np.int64(y)
+    upper, lower = 4 * (row * w + column), 4 * (min(row + 1, h - 1) * w + column)
+    return load_float(sky.texels, upper) + load_float(sky.texels, lower)
+
+
+@njit
+def first_cell(n, sky):  # type: ignore[no-untyped-def]
+    """Place in the sampling cells where the search for the random number n (uint32) starts."""
+    return load_int32(sky.guide, np.int64((np.uint64(n) * np.uint64(sky.guide_size)) >> np.uint64(32)))
+
+
+@njit
+def cell_end(place, sky):  # type: ignore[no-untyped-def]
+    """Last random number (uint32) that falls on the cell at a place."""
+    return load_uint32(sky.cells, 2 * np.int64(place))
+
+
+@njit
+def cell_at(place, sky):  # type: ignore[no-untyped-def]
+    """(row, column) of the cell at a place, upper and lower z of its row, density per solid angle."""
+    cell = np.int64(load_uint32(sky.cells, 2 * np.int64(place) + 1))
+    row, column = cell // sky.columns, cell % sky.columns
+    density = load_float(sky.texels, 4 * (row * sky.step * sky.width + column * sky.step) + 3)
+    return row, column, load_float(sky.row_z, row), load_float(sky.row_z, row + 1), density
+
+
+@njit
+def direction_in_cell(column, upper, lower, n0, n1, sky):  # type: ignore[no-untyped-def]
+    """World direction within a cell, from two uint32, and its lat-long coordinates (u, v)."""
+    u = (np.float32(column) + unit(n0)) / np.float32(sky.columns)
+    z = upper + unit(n1) * (lower - upper)
+    s, c = sincos_turns(np.float32(0.5) - u)
+    ring = math.sqrt(max(np.float32(0.0), np.float32(1.0) - z * z))
+    x, y = ring * c, ring * s
+    dx = sky.xx * x + sky.yx * y + sky.zx * z
+    dy = sky.xy * x + sky.yy * y + sky.zy * z
+    dz = sky.xz * x + sky.yz * y + sky.zz * z
+    return dx, dy, dz, u, fast_acos(z) * np.float32(1.0 / math.pi)
+
+
+@njit
+def _lookup_many(directions, sky):  # type: ignore[no-untyped-def]
+    out = np.empty((len(directions), 3), np.float32)
+    for i in range(len(directions)):
+        u, v = map_at(directions[i, 0], directions[i, 1], directions[i, 2], sky)
+        out[i, 0], out[i, 1], out[i, 2] = sky_radiance(u, v, sky)
+    return out
+
+
+@njit
+def _pdf_many(directions, sky):  # type: ignore[no-untyped-def]
+    out = np.empty(len(directions), np.float32)
+    for i in range(len(directions)):
+        u, v = map_at(directions[i, 0], directions[i, 1], directions[i, 2], sky)
+        out[i] = sky_density(u, v, sky)
+    return out
+
+
+@njit
+def _sample_many(numbers, sky):  # type: ignore[no-untyped-def]
+    n = len(numbers)
+    directions, pdf = np.empty((n, 3), np.float32), np.empty(n, np.float32)
+    for i in range(n):
+        place = first_cell(numbers[i, 0], sky)
+        while numbers[i, 0] > cell_end(place, sky):
+            place += 1
+        _, column, upper, lower, pdf[i] = cell_at(place, sky)
+        directions[i, 0], directions[i, 1], directions[i, 2], _, _ = direction_in_cell(
+            column, upper, lower, numbers[i, 1], numbers[i, 2], sky
+        )
+    return directions, pdf

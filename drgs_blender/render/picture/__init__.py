@@ -1,0 +1,1 @@
+"""From light to pixels: film, denoising, frames on disk."""

@@ -1,0 +1,74 @@
+"""Intel's Open Image Denoise as an alternative to `denoise`, where the wheel `pyoidn` is installed.
+
+A trained network: smoother than SVGF on single pictures, but it takes seconds to load, knows nothing of neighbouring
+frames, and is no part of this package.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from ...errors import DeviceError
+from .denoise import Guides
+
+Array = np.ndarray
+
+
+def available() -> bool:
+    """Whether `denoise_oidn` can work here."""
+    try:
+        require()
+    except DeviceError:
+        return False
+    return True
+
+
+def require() -> Callable[..., Array]:
+    """The wheel's function; DeviceError, with what to do, where it is not installed or its libraries do not load."""
+    try:
+        from pyoidn import denoise
+    except (ImportError, OSError) as error:
+        raise DeviceError(
+            "denoiser OIDN",
+            f"cannot be loaded in the engine's Python ({error})",
+            "Install it there with `pip install pyoidn`, or choose SVGF",
+        ) from error
+    return denoise
+
+
+def denoise_oidn(
+    components: Array, guides: Guides, split: bool = True, check: Callable[[], None] = lambda: None
+) -> Array:
+    """Filter the light of a picture on the processor.
+
+    Parameters
+    ----------
+    components : (h, w, 4, 3) float32 premultiplied light, see `points.Radiance`; non-finite values count as black
+    guides : its coverage, albedo and normals; taken as free of noise
+    split : filter each of the four components; else their sum alone, returned as the first (four times as fast)
+    check : called between runs; may raise to stop
+
+    Returns
+    -------
+    (h, w, 4, 3) float32
+
+    Raises
+    ------
+    DeviceError: the wheel is not installed, or it cannot work on this machine.
+    """
+    run = require()
+    cover = guides.coverage[..., None]
+    albedo = np.ascontiguousarray(guides.albedo * cover, np.float32)
+    normal = np.ascontiguousarray(guides.normal * cover, np.float32)
+    light = np.nan_to_num(components, nan=0.0, posinf=0.0, neginf=0.0)
+    out = np.zeros_like(light)
+    noisy = [light[:, :, k] for k in range(4)] if split else [light.sum(axis=2)]
+    for k, colour in enumerate(noisy):
+        check()
+        try:
+            out[:, :, k] = run(np.ascontiguousarray(colour), albedo, normal, hdr=True, clean_aux=True)
+        except RuntimeError as error:
+            raise DeviceError("denoiser OIDN", f"failed ({error})", "Choose SVGF") from error
+    return out

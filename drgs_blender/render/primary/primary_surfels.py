@@ -1,0 +1,262 @@
+"""From blended surfels to shading points whose secondary rays are safe.
+
+Rays that light a surfel meet the mesh, and the mesh is not where the surfels are: a ray that starts at a surfel below
+the mesh is blocked by its own surface, one that starts above misses contact shadows. Every point is therefore moved to
+the mesh point that belongs to it:
+
+1. along the camera ray, within a window of depths around the surfel: the first face that is turned as the surfel is;
+2. else the first face along it that is turned to the viewer: the surfel overhangs a fold, and what is seen beyond the
+   fold is lit as the face there, with that face's normal;
+3. else (the surfel overhangs the mesh's silhouette) within the window along its normal, inwards, then outwards;
+4. else the nearest face along the camera ray within the window, whichever way it is turned;
+5. else (no mesh near) the point stays where it is, lifted by the window along its normal.
+
+A surfel's normal that is turned away from its face by more than 60 degrees would lose most of the light between both;
+the face's own is used then.
+
+The window is `WINDOW_SCALES` standard deviations of the surfels or `WINDOW_EDGES` mean edge lengths of the object's
+mesh, whichever is larger. The seen position and depth stay those of the surfels.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ...frame import Camera
+from ...jit import njit, prange
+from ..camera import WIDTH, sample_ray
+from ..points import SECOND
+from ..surfels.raster import rasterise
+from ..surfels.splats import Splats
+from ..trace.embree import trace
+from ..trace.masks import SURFELS
+from ..trace.scene import TraceScene
+from .camera_hits import shade_mesh
+from .gbuffer import GBuffer, compact, face_viewer
+from .layers import combine
+
+Array = np.ndarray
+
+WINDOW_SCALES = 4.0
+WINDOW_EDGES = 2.0
+#: A surfel off the mesh's silhouette counts as seen from behind only when this cosine says so clearly.
+RIM = 0.3
+#: Cosine between a surfel's normal and a face's from which they are turned alike.
+ALIKE = 0.5
+
+# How a surfel's mesh point was found.
+NOWHERE, ALONG_VIEW, ALONG_NORMAL, ANY_SIDE, FACING = 0, 1, 2, 3, 4
+
+
+def snap_windows(scene: TraceScene, object_count: int) -> Array:
+    """(max(object_count, 1),) float32 metres: `WINDOW_EDGES` times the mean edge length of each object's mesh."""
+    total, count = np.zeros((2, max(object_count, 1)))
+    _edge_lengths(scene.vertices, scene.faces, scene.face_object, total, count)
+    return (WINDOW_EDGES * total / np.maximum(count, 1)).astype(np.float32)
+
+
+def primary_surfels(splats: Splats, scene: TraceScene, windows: Array, camera: Camera, y0: int, y1: int) -> GBuffer:
+    """Blend the surfels of the rows ``y0 .. y1`` (full-picture pixels) and tie them to the mesh.
+
+    Parameters
+    ----------
+    splats : `prepare` of this frame
+    windows : `snap_windows` of this frame
+    """
+    samples = rasterise(splats, y0, y1)
+    layers = combine(samples, scene, splats.parameters, camera.window[0], y0)
+    buffer, start = compact(layers.first, splats.parameters, camera.window[0], y0, layers.second)
+    buffer.alpha = layers.opaque
+    points = buffer.points
+    _attach(
+        scene.bvh.intersect_address,
+        scene.bvh.scene,
+        scene.vertex_faces > 0,
+        splats.parameters,
+        windows,
+        camera.window[0],
+        start,
+        samples.depth,
+        samples.surface,
+        samples.object_index,
+        points.pixel,
+        points.sample,
+        points.flags,
+        points.origin,
+        points.normal,
+        points.geometric_normal,
+        points.view,
+        points.albedo,
+        points.roughness,
+        points.metallic,
+        buffer.position,
+        buffer.depth,
+        buffer.object_index,
+    )
+    if layers.hits is not None:
+        shade_mesh(scene, layers.hits, splats.parameters, camera.window[0], start, buffer, SECOND)
+    buffer.mark_catchers(scene.object_flags)
+    return buffer
+
+
+@njit
+def _edge_lengths(vertices: Any, faces: Any, face_object: Any, total: Any, count: Any) -> None:
+    """Sum and number of edge lengths an object, from at most about 100,000 evenly chosen faces."""
+    step = max(1, len(faces) // 100_000)
+    for f in range(0, len(faces), step):
+        owner = face_object[f]
+        for k in range(3):
+            a, b = faces[f, k], faces[f, (k + 1) % 3]
+            x = vertices[b, 0] - vertices[a, 0]
+            y = vertices[b, 1] - vertices[a, 1]
+            z = vertices[b, 2] - vertices[a, 2]
+            if owner < len(total):
+                total[owner] += np.sqrt(x * x + y * y + z * z)
+                count[owner] += 1
+
+
+@njit(inline="always")
+def _shoot(address: Any, bvh: Any, x: Any, y: Any, z: Any, dx: Any, dy: Any, dz: Any, reach: Any) -> Any:
+    """Closest hit on the segment from (x, y, z) along (dx, dy, dz): its parameter, unit face normal, and whether.
+
+    Short segments that start near the surface keep float32 exact where a ray from a distant camera would not.
+    """
+    t, group, _, _, _, _, gx, gy, gz = trace(
+        address, bvh, np.float32(x), np.float32(y), np.float32(z), np.float32(dx), np.float32(dy), np.float32(dz),
+        np.float32(0.0), np.float32(reach), np.int32(SURFELS),
+    )  # fmt: skip
+    length = np.sqrt(np.float64(gx) * gx + np.float64(gy) * gy + np.float64(gz) * gz)
+    if group < 0 or length == 0.0:
+        return np.float64(0.0), 0.0, 0.0, 0.0, False
+    return np.float64(t), gx / length, gy / length, gz / length, True
+
+
+@njit(inline="always")
+def _find(
+    address: Any,
+    bvh: Any,
+    x: Any,
+    y: Any,
+    z: Any,
+    nx: Any,
+    ny: Any,
+    nz: Any,
+    vx: Any,
+    vy: Any,
+    vz: Any,
+    ahead: Any,
+    window: Any,
+) -> Any:
+    """Mesh point of the surfel point (x, y, z) with normal n, seen from v: how it was found, point, face normal."""
+    how = NOWHERE
+    hx, hy, hz, gx, gy, gz = x, y, z, nx, ny, nz
+    left = ahead + window
+    sx, sy, sz = x + ahead * vx, y + ahead * vy, z + ahead * vz
+    for _ in range(3):
+        t, fx, fy, fz, hit = _shoot(address, bvh, sx, sy, sz, -vx, -vy, -vz, left)
+        if not hit:
+            break
+        sx, sy, sz = sx - t * vx, sy - t * vy, sz - t * vz
+        agrees = fx * nx + fy * ny + fz * nz > ALIKE
+        facing = fx * vx + fy * vy + fz * vz > 0.0
+        if agrees or how == NOWHERE or (facing and how == ANY_SIDE):
+            how = ALONG_VIEW if agrees else FACING if facing else ANY_SIDE
+            hx, hy, hz, gx, gy, gz = sx, sy, sz, fx, fy, fz
+        past = 1e-3 * window
+        left -= t + past
+        if agrees or left <= 0.0:
+            break
+        sx, sy, sz = sx - past * vx, sy - past * vy, sz - past * vz
+    if how != ALONG_VIEW and how != FACING:
+        for side in (-1.0, 1.0):
+            t, fx, fy, fz, hit = _shoot(address, bvh, x, y, z, side * nx, side * ny, side * nz, window)
+            if hit and fx * nx + fy * ny + fz * nz > ALIKE:
+                t *= side
+                return ALONG_NORMAL, x + t * nx, y + t * ny, z + t * nz, fx, fy, fz
+    return how, hx, hy, hz, gx, gy, gz
+
+
+@njit(parallel=True)
+def _attach(
+    address: Any,
+    bvh: Any,
+    any_mesh: Any,
+    p: Any,
+    windows: Any,
+    x0: Any,
+    start: Any,
+    sample_depth: Any,
+    surface: Any,
+    sample_object: Any,
+    pixel: Any,
+    sample: Any,
+    flags: Any,
+    origin: Any,
+    normal: Any,
+    geometric: Any,
+    view: Any,
+    albedo: Any,
+    roughness: Any,
+    metallic: Any,
+    position: Any,
+    depth: Any,
+    owner: Any,
+) -> None:
+    """Fill the shading points row by row; see the module's head for the order of attempts."""
+    width = np.int64(p[WIDTH])
+    for row in prange(len(start) - 1):
+        for n in range(start[row], start[row + 1]):
+            if flags[n] & SECOND:
+                continue
+            column, k = pixel[n] % width - x0, sample[n]
+            s = np.float64(sample_depth[row, column, k])
+            who = sample_object[row, column, k]
+            ox, oy, oz, dx, dy, dz = sample_ray(p, pixel[n], sample[n])
+            x, y, z = ox + s * dx, oy + s * dy, oz + s * dz
+            slope = np.sqrt(dx * dx + dy * dy + dz * dz)
+            vx, vy, vz = -dx / slope, -dy / slope, -dz / slope
+            nx, ny, nz = (
+                np.float64(surface[row, column, k, 0]),
+                np.float64(surface[row, column, k, 1]),
+                np.float64(surface[row, column, k, 2]),
+            )
+            if nx * nx + ny * ny + nz * nz < 0.5:
+                nx, ny, nz = vx, vy, vz
+            window = np.float64(WINDOW_SCALES) * surface[row, column, k, 8]
+            if who < len(windows):
+                window = max(window, np.float64(windows[who]))
+            # The window starts in front of the surfel, yet not behind the camera.
+            ahead = min(window, 0.999 * s * slope)
+            how = NOWHERE
+            hx, hy, hz, gx, gy, gz = x, y, z, nx, ny, nz
+            if any_mesh:
+                how, hx, hy, hz, gx, gy, gz = _find(
+                    address, bvh, x, y, z, nx, ny, nz, vx, vy, vz, ahead, window
+                )  # fmt: skip
+            # A face met by the camera ray shows which side is seen; else the surfel tells, save at its rim.
+            if how in (ALONG_VIEW, ANY_SIDE, FACING):
+                behind = gx * vx + gy * vy + gz * vz < 0.0
+            else:
+                behind = nx * vx + ny * vy + nz * vz < -RIM
+            if behind:
+                gx, gy, gz = -gx, -gy, -gz
+            gx, gy, gz = face_viewer(gx, gy, gz, gx, gy, gz, vx, vy, vz)
+            nx, ny, nz = face_viewer(nx, ny, nz, gx, gy, gz, vx, vy, vz)
+            if nx * gx + ny * gy + nz * gz < ALIKE:
+                nx, ny, nz = gx, gy, gz
+            if how == NOWHERE:
+                hx, hy, hz = x + window * gx, y + window * gy, z + window * gz
+            origin[n, 0], origin[n, 1], origin[n, 2] = hx, hy, hz
+            normal[n, 0], normal[n, 1], normal[n, 2] = nx, ny, nz
+            geometric[n, 0], geometric[n, 1], geometric[n, 2] = gx, gy, gz
+            view[n, 0], view[n, 1], view[n, 2] = vx, vy, vz
+            albedo[n, 0], albedo[n, 1], albedo[n, 2] = (
+                surface[row, column, k, 3],
+                surface[row, column, k, 4],
+                surface[row, column, k, 5],
+            )
+            roughness[n], metallic[n] = surface[row, column, k, 6], surface[row, column, k, 7]
+            position[n, 0], position[n, 1], position[n, 2] = x, y, z
+            depth[n], owner[n] = s, who

@@ -1,0 +1,1 @@
+"""Light at the visible points: BRDF, sampling, paths."""

@@ -1,0 +1,193 @@
+"""The surface: GGX over Lambert, in two looks, as scalar functions for compiled code.
+
+``paper`` (0): Cook-Torrance GGX with height-correlated Smith and Schlick Fresnel, F0 = 0.04 (1 - m) + m a; diffuse
+(1 - m) a / pi. ``principled`` (1): Blender's Principled BSDF (distribution GGX, IOR 1.5, no other lobe): a metallic
+lobe with Schlick F0 = a, a dielectric lobe with exact Fresnel, and a diffuse lobe below the latter that gets what
+Cycles' estimate of the dielectric albedo leaves. Sources: Heitz 2014 (Smith), Eto and Tokuyoshi 2023 (bounded VNDF
+sampling), Cycles' closures of Blender 5.0 (layering).
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import numpy as np
+
+from ...jit import njit
+from ..sampling import HALF, INVERSE_PI, ONE, PI, TWO, ZERO, F, sincos_turns
+
+Array = np.ndarray
+
+PAPER, PRINCIPLED = 0, 1
+LOOKS = {"paper": PAPER, "principled": PRINCIPLED}
+
+_IOR = 1.5
+_F0 = F(0.04)
+_NODES = 16
+
+
+@njit
+def alpha_squared(roughness):  # type: ignore[no-untyped-def]
+    """Square of GGX's alpha = max(roughness^2, 1e-3)."""
+    alpha = max(roughness * roughness, F(1e-3))
+    return alpha * alpha
+
+
+@njit
+def fresnel_dielectric(c):  # type: ignore[no-untyped-def]
+    """Unpolarised Fresnel reflectance of IOR 1.5 at cosine c from outside."""
+    eta2 = F(_IOR * _IOR)
+    g = math.sqrt(eta2 - ONE + c * c)
+    a = (g - c) / (g + c)
+    b = (c * (g + c) - ONE) / (c * (g - c) + ONE)
+    return HALF * a * a * (ONE + b * b)
+
+
+@njit
+def layer_albedo(roughness, nv, table):  # type: ignore[no-untyped-def]
+    """Cycles' estimate of the dielectric lobe's directional albedo: bilinear in (n . v, roughness)."""
+    last = F(_NODES - 1)
+    x, y = min(max(roughness, ZERO), ONE) * last, min(max(nv, ZERO), ONE) * last
+    i, j = min(np.int32(x), np.int32(_NODES - 2)), min(np.int32(y), np.int32(_NODES - 2))
+    a, b = x - F(i), y - F(j)
+    low = table[j, i] + a * (table[j, i + 1] - table[j, i])
+    high = table[j + 1, i] + a * (table[j + 1, i + 1] - table[j + 1, i])
+    return low + b * (high - low)
+
+
+@njit
+def diffuse_weight(roughness, metallic, nv, look, table):  # type: ignore[no-untyped-def]
+    """What multiplies albedo / pi in the diffuse lobe."""
+    if look == PAPER:
+        return ONE - metallic
+    return (ONE - metallic) * (ONE - layer_albedo(roughness, nv, table))
+
+
+@njit
+def fresnel(vh, r, g, b, metallic, look):  # type: ignore[no-untyped-def]
+    """Reflectance (RGB) of the specular lobes at half-vector cosine vh."""
+    x = max(ZERO, ONE - vh)
+    s = x * x
+    s = s * s * x
+    if look == PAPER:
+        dielectric = (ONE - metallic) * _F0
+        r, g, b = dielectric + metallic * r, dielectric + metallic * g, dielectric + metallic * b
+        return r + (ONE - r) * s, g + (ONE - g) * s, b + (ONE - b) * s
+    dielectric = (ONE - metallic) * fresnel_dielectric(vh)
+    return (
+        dielectric + metallic * (r + (ONE - r) * s),
+        dielectric + metallic * (g + (ONE - g) * s),
+        dielectric + metallic * (b + (ONE - b) * s),
+    )
+
+
+@njit
+def glossy_normal(nx, ny, nz, gx, gy, gz, vx, vy, vz):  # type: ignore[no-untyped-def]
+    """Shading normal of the specular lobe: turned until the mirror direction is just above the face.
+
+    A smooth normal far from the geometric normal g would mirror the viewer v into the surface; Cycles turns it as far
+    as needed (``ensure_valid_specular_reflection``), in the plane of both normals. All of unit length, g.v >= 0.
+    """
+    nv = nx * vx + ny * vy + nz * vz
+    gv = gx * vx + gy * vy + gz * vz
+    ng = nx * gx + ny * gy + nz * gz
+    least = min(F(0.9) * gv, F(0.01))
+    if TWO * nv * ng - gv >= least or ng > F(0.999999):
+        return nx, ny, nz
+    tx, ty, tz = nx - ng * gx, ny - ng * gy, nz - ng * gz
+    scale = ONE / math.sqrt(max(tx * tx + ty * ty + tz * tz, F(1e-30)))
+    tx, ty, tz = tx * scale, ty * scale, tz * scale
+    tv = tx * vx + ty * vy + tz * vz
+    # With m = cos(a) g + sin(a) t, the mirror direction's height above the face is |(tv, gv)| cos(2 a - angle(tv, gv)).
+    length = max(math.sqrt(tv * tv + gv * gv), F(1e-30))
+    angle = HALF * (F(math.atan2(tv, gv)) + F(math.acos(min(ONE, least / length))))
+    s, c = F(math.sin(angle)), F(math.cos(angle))
+    return c * gx + s * tx, c * gy + s * ty, c * gz + s * tz
+
+
+@njit
+def ggx(nl, nv, nh2, sin2, a2):  # type: ignore[no-untyped-def]
+    """D G / (4 nl nv) of GGX with height-correlated Smith, and D; nh2 = cos^2, sin2 = sin^2 of the half vector.
+
+    The sine comes apart, because 1 - cos^2 loses the whole lobe to rounding when alpha is small.
+    """
+    k = a2 * nh2 + sin2
+    d = a2 / (PI * k * k)
+    smith = nl * math.sqrt(a2 + (ONE - a2) * nv * nv) + nv * math.sqrt(a2 + (ONE - a2) * nl * nl)
+    return d * HALF / smith, d
+
+
+@njit
+def vndf_terms(nv, a2):  # type: ignore[no-untyped-def]
+    """(bound, norm): the cap's lower bound factor k, and what turns D into the density of reflected directions."""
+    s = ONE + math.sqrt(max(ZERO, ONE - nv * nv))
+    s2 = s * s
+    bound = (ONE - a2) * s2 / (s2 + a2 * nv * nv)
+    return bound, HALF / (bound * nv + math.sqrt(a2 + (ONE - a2) * nv * nv))
+
+
+@njit
+def sample_vndf(u, v, ix, iy, iz, alpha, bound):  # type: ignore[no-untyped-def]
+    """Reflected direction for view (ix, iy, iz), iz > 0, in the frame of the normal."""
+    x, y = ix * alpha, iy * alpha
+    scale = ONE / math.sqrt(x * x + y * y + iz * iz)
+    x, y, z = x * scale, y * scale, iz * scale
+    edge = bound * z
+    oz = (ONE - v) * (ONE + edge) - edge
+    ring = math.sqrt(max(ZERO, ONE - oz * oz))
+    s, c = sincos_turns(u)
+    hx, hy, hz = alpha * (x + ring * c), alpha * (y + ring * s), z + oz
+    scale = ONE / math.sqrt(max(hx * hx + hy * hy + hz * hz, F(1e-30)))
+    hx, hy, hz = hx * scale, hy * scale, hz * scale
+    twice = TWO * (ix * hx + iy * hy + iz * hz)
+    return twice * hx - ix, twice * hy - iy, twice * hz - iz
+
+
+@njit
+def evaluate(nl, nv, vl, nh2, sin2, r, g, b, kd, metallic, a2, norm, look):  # type: ignore[no-untyped-def]
+    """Diffuse and specular (RGB each) BRDF values and the density of ``sample_vndf``; all without the cosine.
+
+    nl > 0; where nv <= 0 the specular lobe is black, as in Cycles. Without branches, so that loops over it vectorise.
+    """
+    k = kd * INVERSE_PI
+    value, d = ggx(nl, nv, nh2, sin2, a2)
+    value, d = value if nv > ZERO else ZERO, d if nv > ZERO else ZERO
+    fr, fg, fb = fresnel(math.sqrt(max(ZERO, HALF + HALF * vl)), r, g, b, metallic, look)
+    return k * r, k * g, k * b, value * fr, value * fg, value * fb, d * norm
+
+
+@functools.cache
+def layer_table() -> Array:
+    """(16, 16) float32, rows n . v, columns roughness: albedo of the dielectric layer as Cycles estimates it.
+
+    Cycles tabulates s = mean over visible normals of (F - F0) / (1 - F0), where reflections below the horizon count as
+    0, at 16 values each of roughness, cosine and z = F0^(1/4), and returns F0 + (1 - F0) s. For IOR 1.5, z lies between
+    the sixth and the seventh value.
+    """
+    n = 2048
+    i = np.arange(n)
+    u = (i + 0.5) / n
+    angle = 2 * np.pi * ((i * 0.6180339887498949) % 1.0)
+    nodes = np.clip(np.arange(_NODES) / (_NODES - 1), 1e-4, 1.0)
+    mu, rough = np.meshgrid(nodes, nodes, indexing="ij")
+    alpha = (rough**2)[..., None]
+    vx, vz = np.sqrt(1 - mu**2)[..., None], mu[..., None]
+    # Visible normals by a uniform spherical cap (Dupuy and Benyoub 2023).
+    length = np.sqrt((alpha * vx) ** 2 + vz**2)
+    sx, sz = alpha * vx / length, vz / length
+    z = (1 - u) * (1 + sz) - sz
+    ring = np.sqrt(np.maximum(0, 1 - z * z))
+    hx, hy, hz = alpha * (sx + ring * np.cos(angle)), alpha * ring * np.sin(angle), sz + z
+    length = np.sqrt(hx**2 + hy**2 + hz**2)
+    vh = (vx * hx + vz * hz) / length
+    above = 2 * vh * hz / length - vz > 0
+    lower, part = divmod(0.04**0.25 * (_NODES - 1), 1.0)
+    s = np.zeros_like(mu)
+    for node, share in ((lower, 1 - part), (lower + 1, part)):
+        f0 = (node / (_NODES - 1)) ** 4
+        eta = (1 + math.sqrt(f0)) / (1 - math.sqrt(f0))
+        g = np.sqrt(eta * eta - 1 + vh * vh)
+        f = 0.5 * ((g - vh) / (g + vh)) ** 2 * (1 + ((vh * (g + vh) - 1) / (vh * (g - vh) + 1)) ** 2)
+        s += share * np.where(above, (f - f0) / (1 - f0), 0.0).mean(axis=-1)
+    return (0.04 + 0.96 * np.clip(s, 0, 1)).astype(np.float32)

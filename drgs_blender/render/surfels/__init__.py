@@ -1,0 +1,1 @@
+"""Surfels on the screen and along rays."""

@@ -1,0 +1,157 @@
+"""The contributions of one sample: sorted by depth, weighed front to back, averaged.
+
+A sample's contributions are `n` entries from `base` on of three flat arrays: depth, strength, and number of the splat.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ...jit import njit
+from .splats import ALBEDO, METALLIC, NORMAL, ROUGHNESS, SIZE
+
+#: Samples that vector code works on at a time; a tile's side and the room for contributions are multiples of it.
+LANES = 16
+#: Contributions beyond which sorting by merging is faster than by counting.
+MANY = 128
+#: Depth jump that separates two surfaces, in units of the mean of the two surfels' sizes.
+GAP = 3.0
+MIN_TRANSMITTANCE = 1e-4
+
+_1, _2, _3, _4, _5, _6, _7 = (np.uintp(k) for k in range(1, 8))
+
+
+@njit
+def merge_sort(z: Any, base: Any, n: Any, order: Any) -> None:
+    """Stable order of z[base .. base + n] when these are many."""
+    by_depth = np.argsort(z[base : base + n], kind="mergesort")
+    for k in range(n):
+        order[k] = by_depth[k]
+
+
+@njit
+def rank_sort(z: Any, base: Any, n: Any, rank: Any, order: Any) -> None:
+    """Stable order of z[base .. base + n] by counting, for each, how many come before it: vector code, no branch."""
+    for k in range(n, (n + LANES - 1) // LANES * LANES):
+        z[np.uintp(base + k)] = np.float32(np.inf)
+    for at in range(0, n, LANES):
+        mine = np.uintp(base + at)
+        for k in range(LANES):
+            rank[k] = 0
+        for j in range(0, n, 8):
+            # Eight at once: fewer would make LLVM unroll the loop over lanes instead.
+            other, distance = np.uintp(base + j), np.int32(j - at)
+            z0, z1, z2, z3 = z[other], z[other + _1], z[other + _2], z[other + _3]
+            z4, z5, z6, z7 = z[other + _4], z[other + _5], z[other + _6], z[other + _7]
+            for k in range(LANES):
+                zk = z[mine + np.uintp(k)]
+                later = np.int32(np.int32(k) - distance)
+                rank[k] = np.int32(
+                    rank[k]
+                    + np.int32((z0 < zk) | ((z0 == zk) & (later > np.int32(0))))
+                    + np.int32((z1 < zk) | ((z1 == zk) & (later > np.int32(1))))
+                    + np.int32((z2 < zk) | ((z2 == zk) & (later > np.int32(2))))
+                    + np.int32((z3 < zk) | ((z3 == zk) & (later > np.int32(3))))
+                    + np.int32((z4 < zk) | ((z4 == zk) & (later > np.int32(4))))
+                    + np.int32((z5 < zk) | ((z5 == zk) & (later > np.int32(5))))
+                    + np.int32((z6 < zk) | ((z6 == zk) & (later > np.int32(6))))
+                    + np.int32((z7 < zk) | ((z7 == zk) & (later > np.int32(7))))
+                )
+        for k in range(min(LANES, n - at)):
+            order[np.uintp(rank[np.uintp(k)])] = at + k
+
+
+@njit
+def prune(z: Any, alpha: Any, splat: Any, base: Any, n: Any, rank: Any, order: Any) -> Any:
+    """Sort the contributions of a sample, drop those behind the point where it is opaque; how many remain."""
+    if n > MANY:
+        merge_sort(z, base, n, order)
+    else:
+        rank_sort(z, base, n, rank, order)
+    old_z, old_alpha, old_splat = (
+        z[base : base + n].copy(),
+        alpha[base : base + n].copy(),
+        splat[base : base + n].copy(),
+    )
+    t = np.float32(1.0)
+    kept = 0
+    for k in range(n):
+        z[base + k], alpha[base + k], splat[base + k] = old_z[order[k]], old_alpha[order[k]], old_splat[order[k]]
+        t *= np.float32(1.0) - alpha[base + k]
+        kept += 1
+        if t < np.float32(MIN_TRANSMITTANCE):
+            break
+    return kept
+
+
+@njit
+def widen(values: Any, room: Any) -> Any:
+    """The same lists with twice the room."""
+    lists = len(values) // room
+    wider = np.empty(2 * len(values), values.dtype)
+    for at in range(lists):
+        wider[2 * room * at : 2 * room * at + room] = values[room * at : room * at + room]
+    return wider
+
+
+@njit
+def weigh(
+    surface: Any, lists_z: Any, lists_a: Any, lists_i: Any, base: Any, n: Any, order: Any, weights: Any,
+    pixel_base: Any, pixel: Any,
+) -> Any:  # fmt: skip
+    """Weights of the sorted contributions of a sample.
+
+    Returns its transmittance, and the weight, depth times weight, heaviest splat, first and last contribution of the
+    heaviest cluster. ``pixel_base + pixel z`` is the width of a pixel at depth z, metres.
+    """
+    zero, one, stop = np.float32(0.0), np.float32(1.0), np.float32(MIN_TRANSMITTANCE)
+    t, last, last_size = one, zero, np.float32(1e30)
+    weight, depth, heaviest, owner, begin = zero, zero, zero, np.int32(0), 0
+    best_weight, best_depth, best_owner, best_begin, best_end = zero, zero, np.int32(0), 0, 0
+    k = 0
+    while (k < n) & (t >= stop):
+        at = np.uintp(base + order[np.uintp(k)])
+        z, alpha, i = lists_z[at], lists_a[at], np.uintp(lists_i[at])
+        share = t * alpha
+        t = t * (one - alpha)
+        size = max(surface[i, SIZE], pixel_base + pixel * z)
+        if z - last > np.float32(0.5 * GAP) * (size + last_size):
+            if weight > best_weight:
+                best_weight, best_depth, best_owner, best_begin, best_end = weight, depth, owner, begin, k
+            weight, depth, heaviest, begin = zero, zero, zero, k
+        weights[np.uintp(k)] = share
+        weight += share
+        depth += share * z
+        owner = np.int32(i) if share > heaviest else owner
+        heaviest = max(share, heaviest)
+        last, last_size = z, size
+        k += 1
+    if weight > best_weight:
+        best_weight, best_depth, best_owner, best_begin, best_end = weight, depth, owner, begin, k
+    return t, best_weight, best_depth, best_owner, best_begin, best_end
+
+
+@njit
+def mean(surface: Any, lists_i: Any, base: Any, order: Any, weights: Any, total: Any, begin: Any, end: Any) -> Any:
+    """Unit normal and mean attributes of the contributions begin .. end, whose weights sum to `total`."""
+    zero, one = np.float32(0.0), np.float32(1.0)
+    nx = ny = nz = red = green = blue = roughness = metallic = size = zero
+    for k in range(begin, end):
+        i, w = np.uintp(lists_i[np.uintp(base + order[np.uintp(k)])]), weights[np.uintp(k)]
+        # Both sides of a thin sheet may lie in one cluster: normals agree with the nearest one.
+        signed = -w if nx * surface[i, NORMAL] + ny * surface[i, NORMAL + 1] + nz * surface[i, NORMAL + 2] < zero else w
+        nx += signed * surface[i, NORMAL]
+        ny += signed * surface[i, NORMAL + 1]
+        nz += signed * surface[i, NORMAL + 2]
+        red += w * surface[i, ALBEDO]
+        green += w * surface[i, ALBEDO + 1]
+        blue += w * surface[i, ALBEDO + 2]
+        roughness += w * surface[i, ROUGHNESS]
+        metallic += w * surface[i, METALLIC]
+        size += w * surface[i, SIZE]
+    g = one / total
+    length = np.sqrt(nx * nx + ny * ny + nz * nz)
+    f = one / length if length > np.float32(1e-6) * total else zero
+    return f * nx, f * ny, f * nz, red * g, green * g, blue * g, roughness * g, metallic * g, size * g

@@ -1,0 +1,326 @@
+"""Surfels on the screen: projected, culled, sorted by depth and listed by tile, ready to be blended by `raster`.
+
+A surfel is the plane p(u, v) = c + u a + v b with kernel exp(-(u^2 + v^2) / 2); a and b are its scaled tangents and
+need not be orthogonal. In camera coordinates x right, y down, s forward, the ray through a pixel is a linear function
+of the pixel, so by Cramer's rule u, v and the depth s are quotients of linear functions of the pixel that share one
+denominator. They are written relative to the projected centre, where u = v = 0: no cancellation far from the camera.
+The same form holds for orthographic cameras. (Huang et al., "2D Gaussian Splatting", 2024, section 4, states it
+through two planes.)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ...asset.model import PosedSurfels
+from ...frame import Camera
+from ...jit import njit, prange
+from ..camera import AA, CLIP_END, CLIP_START, CX, CY, FX, FY, ORTHOGRAPHIC, POSITION
+
+Array = np.ndarray
+
+#: Side of a tile, pixels.
+TILE = 16
+#: Fainter contributions are skipped.
+MIN_ALPHA = 1.0 / 255.0
+
+# Columns of a splat's screen record. A_, B_, N_, D_: constant, x and y coefficients of u, v, denominator and depth.
+RX, RY, A, B, N, D, ZC, CUT, LOW, RECORD = 0, 1, 2, 5, 8, 11, 14, 15, 16, 20
+# Columns of a splat's surface record: normal, albedo, roughness, metallic, size, opacity.
+NORMAL, ALBEDO, ROUGHNESS, METALLIC, SIZE, OPACITY, SURFACE = 0, 3, 6, 7, 8, 9, 10
+
+
+@dataclass(slots=True)
+class Splats:
+    """Surfels of one frame on the screen, sorted by the depth of their centres.
+
+    Attributes
+    ----------
+    screen : (m, RECORD) float32 coefficients in pixels of the full picture
+    surface : (m, SURFACE) float32 world-space normal, material, size (metres, larger standard deviation), opacity
+    box : (m, 4) int32 pixels (x0, y0, x1, y1), half-open, inside the window; conservative
+    nearest : (m,) float32 least depth of any contribution
+    object_index : (m,) int32
+    tile_start : (tiles + 1,) int64 and tile_list (k,) int32: splats of each tile, in order
+    window : (x0, y0, x1, y1), the camera's
+    parameters : see `camera.camera_parameters`
+    """
+
+    screen: Array
+    surface: Array
+    box: Array
+    nearest: Array
+    object_index: Array
+    tile_start: Array
+    tile_list: Array
+    window: tuple[int, int, int, int]
+    parameters: Array
+
+    def __len__(self) -> int:
+        return len(self.screen)
+
+
+def prepare(posed: PosedSurfels, camera: Camera, parameters: Array) -> Splats:
+    """Project, cull and sort the surfels of a frame, and list them by tile.
+
+    Parameters
+    ----------
+    posed : surfels in world space; a surfel with a non-finite number is left out
+    camera : gives the window
+    parameters : `camera.camera_parameters`
+    """
+    x0, y0, x1, y1 = camera.window
+    n = len(posed)
+    screen = np.empty((n, RECORD), np.float32)
+    box = np.empty((n, 4), np.int32)
+    nearest = np.empty(n, np.float32)
+    _project(
+        posed.centre, posed.tangent_u, posed.tangent_v, posed.opacity, parameters, x0, y0, x1, y1, screen, box, nearest
+    )
+    order = _depth_order(screen, box)
+    surface = np.empty((len(order), SURFACE), np.float32)
+    _gather_surface(
+        order,
+        posed.tangent_u,
+        posed.tangent_v,
+        posed.normal,
+        posed.albedo,
+        posed.roughness,
+        posed.metallic,
+        posed.opacity,
+        surface,
+    )
+    box = box[order]
+    tiles_x = (x1 - 1) // TILE - x0 // TILE + 1
+    tiles_y = (y1 - 1) // TILE - y0 // TILE + 1
+    start, listed = _list_by_tile(box, x0 // TILE, y0 // TILE, tiles_x, tiles_y)
+    return Splats(
+        screen[order], surface, box, nearest[order], posed.object_index[order], start, listed, camera.window, parameters
+    )
+
+
+@njit(inline="always")
+def _to_camera(p: Any, x: Any, y: Any, z: Any) -> Any:
+    """World direction to camera coordinates (right, down, forward)."""
+    return (
+        p[0] * x + p[3] * y + p[6] * z,
+        -(p[1] * x + p[4] * y + p[7] * z),
+        -(p[2] * x + p[5] * y + p[8] * z),
+    )
+
+
+@njit(inline="always")
+def _span(focal: Any, centre: Any, sc: Any, pa: Any, pb: Any, sa: Any, sb: Any, r2: Any) -> Any:
+    """Least and greatest screen coordinate of the disc u^2 + v^2 <= r2, wholly in front of the camera.
+
+    The tangent lines x = x0 + t of the disc's outline solve a quadratic in t; ``pa``, ``pb`` are the tangents'
+    components minus x0 times their depth components, x0 the centre's coordinate.
+    """
+    qa = sc * sc - r2 * (sa * sa + sb * sb)
+    qb = r2 * (pa * sa + pb * sb)
+    root = np.sqrt(max(qb * qb + qa * r2 * (pa * pa + pb * pb), 0.0))
+    return centre + focal * (-qb - root) / qa, centre + focal * (-qb + root) / qa
+
+
+@njit(inline="always")
+def _clipped_bounds(c: Any, a: Any, b: Any, r: Any, near: Any, p: Any) -> Any:
+    """Screen bounds of the square c +- r a +- r b cut at depth `near` (camera coordinates): for discs that cross it."""
+    x0 = y0 = np.inf
+    x1 = y1 = -np.inf
+    for k in range(4):
+        su, sv = (r, r) if k == 0 else (-r, r) if k == 1 else (-r, -r) if k == 2 else (r, -r)
+        tu, tv = (-r, r) if k == 0 else (-r, -r) if k == 1 else (r, -r) if k == 2 else (r, r)
+        ax, ay, az = c[0] + su * a[0] + sv * b[0], c[1] + su * a[1] + sv * b[1], c[2] + su * a[2] + sv * b[2]
+        bx, by, bz = c[0] + tu * a[0] + tv * b[0], c[1] + tu * a[1] + tv * b[1], c[2] + tu * a[2] + tv * b[2]
+        for end in range(2):
+            # The corner itself if it is in front, and the point where the edge to the next corner meets the plane.
+            if end == 0 and az >= near:
+                x, y, z = ax, ay, az
+            elif end == 1 and (az - near) * (bz - near) < 0.0:
+                t = (near - az) / (bz - az)
+                x, y, z = ax + t * (bx - ax), ay + t * (by - ay), near
+            else:
+                continue
+            px, py = p[CX] + p[FX] * x / z, p[CY] + p[FY] * y / z
+            x0, x1, y0, y1 = min(x0, px), max(x1, px), min(y0, py), max(y1, py)
+    return x0, x1, y0, y1
+
+
+@njit(parallel=True)
+def _project(
+    centre: Any,
+    tangent_u: Any,
+    tangent_v: Any,
+    opacity: Any,
+    p: Any,
+    wx0: Any,
+    wy0: Any,
+    wx1: Any,
+    wy1: Any,
+    screen: Any,
+    box: Any,
+    nearest: Any,
+) -> None:
+    """Fill screen records, boxes and nearest depths; a culled surfel has an empty box (x1 = x0 = 0)."""
+    near, far, ortho = p[CLIP_START], p[CLIP_END], p[ORTHOGRAPHIC] != 0.0
+    fx, fy = p[FX], p[FY]
+    for i in prange(len(centre)):
+        box[i] = 0
+        ox = np.float64(centre[i, 0]) - p[POSITION]
+        oy = np.float64(centre[i, 1]) - p[POSITION + 1]
+        oz = np.float64(centre[i, 2]) - p[POSITION + 2]
+        c = _to_camera(p, ox, oy, oz)
+        a = _to_camera(p, np.float64(tangent_u[i, 0]), np.float64(tangent_u[i, 1]), np.float64(tangent_u[i, 2]))
+        b = _to_camera(p, np.float64(tangent_v[i, 0]), np.float64(tangent_v[i, 1]), np.float64(tangent_v[i, 2]))
+        alpha = np.float64(opacity[i])
+        total = c[0] + c[1] + c[2] + a[0] + a[1] + a[2] + b[0] + b[1] + b[2] + alpha
+        if not abs(total) < 1e30 or not alpha > MIN_ALPHA:
+            continue
+        cut = 2.0 * np.log(alpha / MIN_ALPHA)
+        reach = np.sqrt(cut * (a[2] * a[2] + b[2] * b[2]))
+        if c[2] + reach <= near or c[2] - reach >= far:
+            continue
+        # Normal of the plane, scaled to one so that float32 holds tiny surfels.
+        nx = a[1] * b[2] - a[2] * b[1]
+        ny = a[2] * b[0] - a[0] * b[2]
+        nz = a[0] * b[1] - a[1] * b[0]
+        length = np.sqrt(nx * nx + ny * ny + nz * nz)
+        in_front = c[2] > near
+        # The record is relative to the projected centre, or to the picture's centre when that is behind the camera.
+        rx, ry = p[CX], p[CY]
+        if ortho:
+            rx, ry = p[CX] + fx * c[0], p[CY] + fy * c[1]
+        elif in_front:
+            rx, ry = p[CX] + fx * c[0] / c[2], p[CY] + fy * c[1] / c[2]
+        s = screen[i]
+        s[:] = 0.0
+        s[RX], s[RY], s[ZC], s[CUT] = rx, ry, c[2], cut
+        s[LOW] = 2.0 * p[AA] if in_front else 1e30
+        if length <= 0.0:
+            s[A], s[N], s[D] = 1e15, 1.0, c[2]  # a point: only the low-pass sees it
+        elif ortho:
+            k = 1.0 / length
+            s[A + 1], s[A + 2] = k * b[1] / fx, -k * b[0] / fy
+            s[B + 1], s[B + 2] = -k * a[1] / fx, k * a[0] / fy
+            s[N] = k * nz
+            s[D], s[D + 1], s[D + 2] = k * c[2] * nz, -k * nx / fx, -k * ny / fy
+        else:
+            k = 1.0 / length
+            bcx, bcy = k * (b[1] * c[2] - b[2] * c[1]), k * (b[2] * c[0] - b[0] * c[2])
+            cax, cay = k * (c[1] * a[2] - c[2] * a[1]), k * (c[2] * a[0] - c[0] * a[2])
+            s[A + 1], s[A + 2] = bcx / fx, bcy / fy
+            s[B + 1], s[B + 2] = cax / fx, cay / fy
+            s[N + 1], s[N + 2] = k * nx / fx, k * ny / fy
+            s[D] = k * (c[0] * nx + c[1] * ny + c[2] * nz)
+            if in_front:
+                s[N] = s[D] / c[2]
+            else:
+                s[A] = k * (b[0] * c[1] - b[1] * c[0])
+                s[B] = k * (c[0] * a[1] - c[1] * a[0])
+                s[N] = k * nz
+        # Screen bounds.
+        low = np.sqrt(0.5 * cut / p[AA])
+        if ortho:
+            lo_x, hi_x = _span(fx, rx, 1.0, a[0], b[0], 0.0, 0.0, cut)
+            lo_y, hi_y = _span(fy, ry, 1.0, a[1], b[1], 0.0, 0.0, cut)
+        elif c[2] - reach > near:
+            x, y = c[0] / c[2], c[1] / c[2]
+            lo_x, hi_x = _span(fx, rx, c[2], a[0] - x * a[2], b[0] - x * b[2], a[2], b[2], cut)
+            lo_y, hi_y = _span(fy, ry, c[2], a[1] - y * a[2], b[1] - y * b[2], a[2], b[2], cut)
+        else:
+            lo_x, hi_x, lo_y, hi_y = _clipped_bounds(c, a, b, np.sqrt(cut), near, p)
+        if in_front:
+            lo_x, hi_x = min(lo_x, rx - low), max(hi_x, rx + low)
+            lo_y, hi_y = min(lo_y, ry - low), max(hi_y, ry + low)
+        if not (lo_x < wx1 and hi_x > wx0 and lo_y < wy1 and hi_y > wy0):
+            continue
+        box[i, 0] = np.int32(np.floor(max(lo_x, float(wx0))))
+        box[i, 1] = np.int32(np.floor(max(lo_y, float(wy0))))
+        box[i, 2] = np.int32(min(np.floor(hi_x), wx1 - 1.0)) + 1
+        box[i, 3] = np.int32(min(np.floor(hi_y), wy1 - 1.0)) + 1
+        nearest[i] = max(c[2] - reach, near)
+
+
+@njit
+def _depth_order(screen: Any, box: Any) -> Any:
+    """Indices of the surfels with a box, by centre depth; equal depths keep their order. Radix sort, 3 x 11 bits."""
+    n = 0
+    for i in range(len(box)):
+        if box[i, 2] > box[i, 0]:
+            n += 1
+    order, other = np.empty(n, np.int64), np.empty(n, np.int64)
+    depth = np.empty(n, np.float32)
+    n = 0
+    for i in range(len(box)):
+        if box[i, 2] > box[i, 0]:
+            order[n] = i
+            depth[n] = screen[i, ZC]
+            n += 1
+    # Bits of a float32 compare like integers once negative numbers are reversed.
+    keys = depth.view(np.uint32)
+    for i in range(n):
+        keys[i] = ~keys[i] if keys[i] >> np.uint32(31) else keys[i] | np.uint32(0x80000000)
+    other_keys = np.empty(n, np.uint32)
+    for shift in (0, 11, 22):
+        count = np.zeros(2049, np.int64)
+        for i in range(n):
+            count[((keys[i] >> np.uint32(shift)) & np.uint32(2047)) + 1] += 1
+        for d in range(2048):
+            count[d + 1] += count[d]
+        for i in range(n):
+            d = (keys[i] >> np.uint32(shift)) & np.uint32(2047)
+            other[count[d]] = order[i]
+            other_keys[count[d]] = keys[i]
+            count[d] += 1
+        order, other = other, order
+        keys, other_keys = other_keys, keys
+    return order
+
+
+@njit(parallel=True)
+def _gather_surface(
+    order: Any,
+    tangent_u: Any,
+    tangent_v: Any,
+    normal: Any,
+    albedo: Any,
+    roughness: Any,
+    metallic: Any,
+    opacity: Any,
+    out: Any,
+) -> None:
+    """Pack what blending reads of a splat, in depth order."""
+    for k in prange(len(order)):
+        i = order[k]
+        uu = vv = np.float32(0.0)
+        for c in range(3):
+            out[k, NORMAL + c] = normal[i, c]
+            out[k, ALBEDO + c] = albedo[i, c]
+            uu += tangent_u[i, c] * tangent_u[i, c]
+            vv += tangent_v[i, c] * tangent_v[i, c]
+        out[k, ROUGHNESS], out[k, METALLIC], out[k, OPACITY] = roughness[i], metallic[i], opacity[i]
+        out[k, SIZE] = np.sqrt(max(uu, vv))
+
+
+@njit
+def _list_by_tile(box: Any, tile_x0: Any, tile_y0: Any, tiles_x: Any, tiles_y: Any) -> Any:
+    """Counting sort of (tile, splat) pairs: start of each tile's list, and the lists, in splat order."""
+    start = np.zeros(tiles_x * tiles_y + 1, np.int64)
+    for i in range(len(box)):
+        for ty in range(box[i, 1] // TILE - tile_y0, (box[i, 3] - 1) // TILE - tile_y0 + 1):
+            for tx in range(box[i, 0] // TILE - tile_x0, (box[i, 2] - 1) // TILE - tile_x0 + 1):
+                start[ty * tiles_x + tx + 1] += 1
+    for t in range(tiles_x * tiles_y):
+        start[t + 1] += start[t]
+    listed = np.empty(start[-1], np.int32)
+    fill = start[:-1].copy()
+    for i in range(len(box)):
+        for ty in range(box[i, 1] // TILE - tile_y0, (box[i, 3] - 1) // TILE - tile_y0 + 1):
+            for tx in range(box[i, 0] // TILE - tile_x0, (box[i, 2] - 1) // TILE - tile_x0 + 1):
+                t = ty * tiles_x + tx
+                listed[fill[t]] = i
+                fill[t] += 1
+    return start, listed

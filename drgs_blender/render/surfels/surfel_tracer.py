@@ -1,0 +1,289 @@
+"""2D Gaussian ray tracing: rays that meet surfels instead of a mesh.
+
+All surfels on a ray are blended in the order of depth, front to back, each with its opacity times its kernel at the
+exact point where the ray meets its plane: the rasteriser's rule without its low-pass filter (Gu et al., "IRGS:
+Inter-Reflective Gaussian Splatting with 2D Gaussian Ray Tracing", 2025). What comes back is a virtual hit: what the
+surfels let through, and depth, normals and material of what they stop.
+
+Surfels are two-sided: each one's normals are turned towards the ray before they are blended. Where the depth jumps by
+more than `gap` times the mean of the sizes on both sides, a new surface begins, and the hit is the heaviest surface
+alone, as in `raster`: no point lies in the air between two. An infinite gap blends the whole ray, as the paper does.
+
+Rays that start on surfels must not be stopped by those very surfels; see OWN_REACH in `surfel_query` for the rule,
+which needs the object, normal and size of what the ray starts on. Only surfels of that object are ever left out.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...asset.model import as_float
+from ...errors import UsageError
+from ...jit import get_num_threads, njit, prange
+from ..sampling import ONE, ZERO, F
+from .raster import GAP
+from .surfel_bvh import ALBEDO, METALLIC, NORMAL, PLANE, ROUGHNESS, SIZE, SurfelBVH
+from .surfel_query import (
+    ALPHAS,
+    CAPACITY,
+    COUNT,
+    DEPTHS,
+    INDICES,
+    LAST_INDEX,
+    LAST_T,
+    MIN_TRANSMITTANCE,
+    PRODUCT,
+    begin_query,
+    cast,
+    load_double,
+    load_single,
+    load_word,
+    query_memory,
+    store_double,
+    store_single,
+    store_word,
+)
+
+Array = np.ndarray
+
+_BEFORE, _TINY = F(1.0 - 5e-7), F(1e-30)
+_NOTHING = (ZERO,) * 14
+
+
+@njit
+def transmittance(  # type: ignore[no-untyped-def]
+    address, scene, ox, oy, oz, dx, dy, dz, tnear, tfar, mask, own, gx, gy, gz, size
+):
+    """Share of light that passes the surfels between `tnear` and `tfar`, 0 where that is below MIN_TRANSMITTANCE.
+
+    Parameters
+    ----------
+    address, scene : ``SurfelBVH.occluded_address`` and ``scene``
+    ox .. dz : float32 origin and unit direction, world space
+    mask : int32, see ``SurfelBVH.update``; -1 meets all
+    own : int32: object that the ray starts on, or -1; then the rest does not matter
+    gx, gy, gz, size : float32: unit geometric normal (either side) and mean surfel size (metres) where the ray starts
+    """
+    query = query_memory()
+    context = begin_query(query, ox, oy, oz, dx, dy, dz, mask, own, gx, gy, gz, size)
+    cast(address, scene, query, tnear, tfar)
+    product = load_double(context + 4 * PRODUCT, 0)
+    return F(product) if product >= MIN_TRANSMITTANCE else ZERO
+
+
+@njit
+def trace_surfels(  # type: ignore[no-untyped-def]
+    address, scene, surface, objects, ox, oy, oz, dx, dy, dz, tnear, tfar, mask, own, gx, gy, gz, size, gap
+):
+    """Blend the surfels on a ray: ``(through, t, n (3), g (3), albedo (3), roughness, metallic, size, object)``.
+
+    Parameters as for `transmittance`, but `address` is ``SurfelBVH.intersect_address``; `surface` and `objects` are the
+    tree's; `gap` is the jump of depth that separates surfaces, in sizes.
+
+    ``through`` is the share of light that passes (of all surfaces), t the mean depth by weight, n the shading and g the
+    geometric normal: both of unit length, g towards the ray's origin; size the mean larger standard deviation, metres;
+    object that of the heaviest surfel. Where nothing is met ``through`` is 1 and the object -1.
+    """
+    query = query_memory()
+    context = begin_query(query, ox, oy, oz, dx, dy, dz, mask, own, gx, gy, gz, size)
+    through = 1.0
+    near, last, last_size, heaviest = tnear, ZERO, ZERO, ZERO
+    number = owner = best_owner = np.int32(-1)
+    sums = best = _NOTHING
+    while True:
+        cast(address, scene, query, near, tfar)
+        count = np.int64(load_word(context, COUNT))
+        for k in range(count):
+            number = load_word(context, INDICES + k)
+            t, alpha = load_single(context, DEPTHS + k), load_single(context, ALPHAS + k)
+            wide = surface[number, SIZE]
+            if sums[0] > ZERO and t - last > F(0.5) * gap * (wide + last_size):
+                if sums[0] > best[0]:
+                    best, best_owner = sums, owner
+                sums, heaviest = _NOTHING, ZERO
+            weight = F(through) * alpha
+            sums = _add(sums, surface, number, weight, t, dx, dy, dz)
+            if weight > heaviest:
+                heaviest, owner = weight, objects[number]
+            last, last_size = t, wide
+            through *= 1.0 - alpha
+            if through < MIN_TRANSMITTANCE:
+                break
+        if count < CAPACITY or through < MIN_TRANSMITTANCE:
+            break
+        # The list was full: go on behind its last entry.
+        near = max(tnear, last * _BEFORE)
+        store_single(context, LAST_T, last)
+        store_word(context, LAST_INDEX, number)
+        store_word(context, COUNT, np.int32(0))
+        store_double(context + 4 * PRODUCT, 0, through)
+    if sums[0] > best[0]:
+        best, best_owner = sums, owner
+    weight, t, nx, ny, nz, px, py, pz, red, green, blue, roughness, metallic, wide = best
+    if weight <= ZERO:
+        return ONE, F(tfar), ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, np.int32(-1)
+    left = F(through) if through >= MIN_TRANSMITTANCE else ZERO
+    inverse = ONE / weight
+    scale = ONE / math.sqrt(max(px * px + py * py + pz * pz, _TINY))
+    px, py, pz = px * scale, py * scale, pz * scale
+    length = math.sqrt(nx * nx + ny * ny + nz * nz)
+    if length > F(1e-3) * weight:
+        scale = ONE / length
+        nx, ny, nz = nx * scale, ny * scale, nz * scale
+    else:
+        nx, ny, nz = px, py, pz
+    return (
+        left, t * inverse, nx, ny, nz, px, py, pz, red * inverse, green * inverse, blue * inverse,
+        roughness * inverse, metallic * inverse, wide * inverse, best_owner,
+    )  # fmt: skip
+
+
+@njit(inline="always")
+def _add(sums, surface, i, w, t, dx, dy, dz):  # type: ignore[no-untyped-def]
+    """Add a contribution of weight w at depth t: sums of one, depth, normals towards the ray, material, size."""
+    weight, depth, nx, ny, nz, px, py, pz, red, green, blue, roughness, metallic, wide = sums
+    fx, fy, fz = surface[i, PLANE], surface[i, PLANE + 1], surface[i, PLANE + 2]
+    mx, my, mz = surface[i, NORMAL], surface[i, NORMAL + 1], surface[i, NORMAL + 2]
+    side = -w if fx * dx + fy * dy + fz * dz > ZERO else w
+    px, py, pz = px + side * fx, py + side * fy, pz + side * fz
+    if mx * fx + my * fy + mz * fz < ZERO:
+        side = -side
+    return (
+        weight + w, depth + w * t, nx + side * mx, ny + side * my, nz + side * mz, px, py, pz,
+        red + w * surface[i, ALBEDO], green + w * surface[i, ALBEDO + 1], blue + w * surface[i, ALBEDO + 2],
+        roughness + w * surface[i, ROUGHNESS], metallic + w * surface[i, METALLIC], wide + w * surface[i, SIZE],
+    )  # fmt: skip
+
+
+@dataclass(slots=True)
+class SurfelHits:
+    """What many rays met; where ``object_index`` is -1 the rest but ``through`` is undefined.
+
+    Attributes
+    ----------
+    through : (n,) float32: share of light that passes
+    depth : (n,) float32, in units of the direction
+    normal, geometric_normal : (n, 3) float32 unit, world space
+    albedo, roughness, metallic : (n, 3), (n,), (n,) float32 in [0, 1]; linear Rec.709
+    size : (n,) float32 metres: mean larger standard deviation of the surfels
+    object_index : (n,) int32
+    """
+
+    through: Array
+    depth: Array
+    normal: Array
+    geometric_normal: Array
+    albedo: Array
+    roughness: Array
+    metallic: Array
+    size: Array
+    object_index: Array
+
+
+@dataclass(slots=True)
+class Starts:
+    """The surfaces that rays start on, so that these do not stop them.
+
+    Attributes
+    ----------
+    object_index : (n,) int32, -1 for rays that start anywhere else
+    normal : (n, 3) float32 unit geometric normals, either side, world space
+    size : (n,) float32 metres: mean larger standard deviation of the surfels there
+    """
+
+    object_index: Array
+    normal: Array
+    size: Array
+
+    def __post_init__(self) -> None:
+        self.object_index = np.ascontiguousarray(self.object_index, np.int32)
+        self.normal = as_float(self.normal, (len(self.object_index), 3), "normals of starts")
+        self.size = as_float(self.size, (len(self.object_index),), "sizes of starts")
+
+
+def trace(
+    bvh: SurfelBVH,
+    origins: Array,
+    directions: Array,
+    tnear: float = 0.0,
+    tfar: float = math.inf,
+    *,
+    mask: int = -1,
+    starts: Starts | None = None,
+    gap: float = GAP,
+) -> SurfelHits:
+    """Blend the surfels on many rays; origins and unit directions (n, 3), world space. See `trace_surfels`."""
+    origins, directions, starts = _checked(origins, directions, starts)
+    n = len(origins)
+    numbers, index = np.empty((n, 14), np.float32), np.empty(n, np.int32)
+    _trace(
+        (bvh.intersect_address, bvh.scene, bvh.surface, bvh.objects), origins, directions, F(tnear), F(tfar),
+        np.int32(mask), (starts.object_index, starts.normal, starts.size), F(gap), 8 * get_num_threads(),
+        numbers, index,
+    )  # fmt: skip
+    return SurfelHits(
+        numbers[:, 0], numbers[:, 1], numbers[:, 2:5], numbers[:, 5:8], numbers[:, 8:11], numbers[:, 11],
+        numbers[:, 12], numbers[:, 13], index,
+    )  # fmt: skip
+
+
+def transmittance_many(
+    bvh: SurfelBVH,
+    origins: Array,
+    directions: Array,
+    tnear: float = 0.0,
+    tfar: float = math.inf,
+    *,
+    mask: int = -1,
+    starts: Starts | None = None,
+) -> Array:
+    """(n,) float32: the share of light that passes along many rays. See `transmittance`."""
+    origins, directions, starts = _checked(origins, directions, starts)
+    out = np.empty(len(origins), np.float32)
+    _shadow(
+        (bvh.occluded_address, bvh.scene), origins, directions, F(tnear), F(tfar), np.int32(mask),
+        (starts.object_index, starts.normal, starts.size), 8 * get_num_threads(), out,
+    )  # fmt: skip
+    return out
+
+
+def _checked(origins: Array, directions: Array, starts: Starts | None) -> tuple[Array, Array, Starts]:
+    origins = as_float(origins, (-1, 3), "ray origins")
+    n = len(origins)
+    if starts is None:
+        starts = Starts(np.full(n, -1), np.zeros((n, 3)), np.zeros(n))
+    if len(starts.object_index) != n:
+        raise UsageError("ray starts", f"are {len(starts.object_index)} for {n} rays", "Give one start a ray")
+    return origins, as_float(directions, (n, 3), "ray directions"), starts
+
+
+@njit(parallel=True)
+def _trace(tree, origins, directions, tnear, tfar, mask, starts, gap, lanes, numbers, index):  # type: ignore[no-untyped-def]
+    address, scene, surface, objects = tree
+    own, normal, size = starts
+    for lane in prange(lanes):
+        for i in range(lane, len(origins), lanes):
+            hit = trace_surfels(
+                address, scene, surface, objects, origins[i, 0], origins[i, 1], origins[i, 2],
+                directions[i, 0], directions[i, 1], directions[i, 2], tnear, tfar, mask,
+                own[i], normal[i, 0], normal[i, 1], normal[i, 2], size[i], gap,
+            )  # fmt: skip
+            values = hit[:14]
+            for k in range(14):
+                numbers[i, k] = values[k]
+            index[i] = hit[14]
+
+
+@njit(parallel=True)
+def _shadow(tree, origins, directions, tnear, tfar, mask, starts, lanes, out):  # type: ignore[no-untyped-def]
+    address, scene = tree
+    own, normal, size = starts
+    for lane in prange(lanes):
+        for i in range(lane, len(origins), lanes):
+            out[i] = transmittance(
+                address, scene, origins[i, 0], origins[i, 1], origins[i, 2], directions[i, 0], directions[i, 1],
+                directions[i, 2], tnear, tfar, mask, own[i], normal[i, 0], normal[i, 1], normal[i, 2], size[i],
+            )  # fmt: skip

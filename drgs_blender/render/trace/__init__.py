@@ -1,0 +1,1 @@
+"""What rays meet: triangles, instances, materials, in one tree."""

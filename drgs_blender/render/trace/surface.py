@@ -1,0 +1,221 @@
+"""What a ray meets, for compiled code: from a hit to normals, material, emission and object.
+
+Two kinds of faces lie in one numbering. DR-GS faces come first; they carry materials at their vertices. Those of
+ordinary meshes follow; they refer to materials, with textures. Faces of shapes that stand in several places are in
+object space, and the hit says in which place it is.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from ...jit import njit
+from ..memory import load_float, load_int32, load_int64
+from ..sampling import ONE, ZERO, F
+from .embree import blocked, trace
+from .textures import material_at
+
+_TINY = F(1e-30)
+
+
+class Tracer(NamedTuple):
+    """How rays are cast; valid until the next update of the scene. All are int64.
+
+    Attributes
+    ----------
+    intersect, occluded, scene : addresses, see `tree.TriangleBVH`
+    first_face : address of (groups,) int32, the first face of each group
+    first_place : address of (groups,) int32, the first row of each group's places in ``Geometry.place_*``
+    """
+
+    intersect: int
+    occluded: int
+    scene: int
+    first_face: int
+    first_place: int
+
+
+class Geometry(NamedTuple):
+    """What lies behind the faces; valid until the next update of the scene. Addresses of arrays, save for two numbers.
+
+    Attributes
+    ----------
+    shading_faces : (m, 3) int32, rows of ``shading`` (faces below ``vertex_faces``) or of ``normals`` (the others)
+    shading : (k, 8) float32: unit normal, albedo, roughness, metallic
+    normals : (r, 3) float32 unit; object space for faces of shapes in places
+    face_object : (m,) int32, object of each face; not used for faces of shapes in places
+    vertex_faces : how many faces carry materials at their vertices
+    material : (m - vertex_faces,) int32, rows of ``materials``
+    uvs : (m - vertex_faces, 3, 2) float32, or 0 when no mesh has any
+    place_normal : (p, 3, 3) float32, matrices of normals
+    place_object : (p,) int32
+    materials : (6,) int64, ``textures.MaterialTable.addresses``
+    """
+
+    shading_faces: int
+    shading: int
+    normals: int
+    face_object: int
+    vertex_faces: int
+    material: int
+    uvs: int
+    place_normal: int
+    place_object: int
+    materials: int
+
+
+@njit
+def nearest(tracer, ox, oy, oz, dx, dy, dz, tnear, tfar, mask):  # type: ignore[no-untyped-def]
+    """Closest hit of one ray: ``(t, face, place, u, v, gx, gy, gz)``, all float32 or int32.
+
+    ``face`` is -1 when nothing is hit (t is then `tfar`), ``place`` -1 outside shapes in places. The hit is
+    (1 - u - v) v0 + u v1 + v v2; g is for `surface_at`. `mask` (int32) tells what the ray meets, see `masks`.
+    """
+    t, group, face, place, u, v, gx, gy, gz = trace(
+        tracer.intersect, tracer.scene, ox, oy, oz, dx, dy, dz, tnear, tfar, mask
+    )
+    if group >= 0:
+        face = np.int32(face + load_int32(tracer.first_face, group))
+        if place >= 0:
+            place = np.int32(place + load_int32(tracer.first_place, group))
+    return t, face, place, u, v, gx, gy, gz
+
+
+@njit
+def shadowed(tracer, ox, oy, oz, dx, dy, dz, tnear, tfar, mask):  # type: ignore[no-untyped-def]
+    """Whether anything lies on the ray that `mask` tells it to meet."""
+    return blocked(tracer.occluded, tracer.scene, ox, oy, oz, dx, dy, dz, tnear, tfar, mask)
+
+
+@njit(inline="always")
+def _blend(rows, i, j, k, w, u, v):  # type: ignore[no-untyped-def]
+    """A float32 column blended over a face, from where its corners' values lie."""
+    return w * load_float(rows, i) + u * load_float(rows, j) + v * load_float(rows, k)
+
+
+@njit
+def _turned(matrices, place, x, y, z):  # type: ignore[no-untyped-def]
+    """A normal of a shape as a unit vector in world space; (0, 0, 0) when it has no direction."""
+    m = 9 * np.int64(place)
+    a = load_float(matrices, m) * x + load_float(matrices, m + 1) * y + load_float(matrices, m + 2) * z
+    b = load_float(matrices, m + 3) * x + load_float(matrices, m + 4) * y + load_float(matrices, m + 5) * z
+    c = load_float(matrices, m + 6) * x + load_float(matrices, m + 7) * y + load_float(matrices, m + 8) * z
+    length = a * a + b * b + c * c
+    scale = ONE / math.sqrt(length) if length > _TINY else ZERO
+    return a * scale, b * scale, c * scale
+
+
+@njit
+def _normal_of_place(normals, i, j, k, w, u, v, matrices, place):  # type: ignore[no-untyped-def]
+    """Each corner's normal is turned before they are blended, as it is for a mesh in a single place."""
+    ax, ay, az = _turned(
+        matrices, place, load_float(normals, i), load_float(normals, i + 1), load_float(normals, i + 2)
+    )
+    bx, by, bz = _turned(
+        matrices, place, load_float(normals, j), load_float(normals, j + 1), load_float(normals, j + 2)
+    )
+    cx, cy, cz = _turned(
+        matrices, place, load_float(normals, k), load_float(normals, k + 1), load_float(normals, k + 2)
+    )
+    return w * ax + u * bx + v * cx, w * ay + u * by + v * cy, w * az + u * bz + v * cz
+
+
+@njit
+def surface_at(face, place, u, v, gx, gy, gz, dx, dy, dz, geometry):  # type: ignore[no-untyped-def]
+    """The surface at a hit of `nearest`, seen along the ray's direction d.
+
+    Both sides are the same: the geometric normal faces the ray's origin, the shading normal follows it.
+
+    Parameters
+    ----------
+    face, place, u, v, gx, gy, gz : of the hit; face >= 0
+    dx, dy, dz : float32 direction of the ray
+    geometry : Geometry
+
+    Returns
+    -------
+    nx, ny, nz, gx, gy, gz, r, g, b, roughness, metallic, er, eg, eb : float32, object : int32
+        Unit shading and geometric normal, albedo, emitted radiance; linear Rec.709.
+    """
+    corner = 3 * np.int64(face)
+    i = np.int64(load_int32(geometry.shading_faces, corner))
+    j = np.int64(load_int32(geometry.shading_faces, corner + 1))
+    k = np.int64(load_int32(geometry.shading_faces, corner + 2))
+    w = ONE - u - v
+    er = eg = eb = ZERO
+    owner = load_int32(geometry.face_object, np.int64(face))
+    if face < geometry.vertex_faces:
+        rows = geometry.shading
+        i, j, k = 8 * i, 8 * j, 8 * k
+        nx = _blend(rows, i, j, k, w, u, v)
+        ny = _blend(rows, i + 1, j + 1, k + 1, w, u, v)
+        nz = _blend(rows, i + 2, j + 2, k + 2, w, u, v)
+        r = _blend(rows, i + 3, j + 3, k + 3, w, u, v)
+        g = _blend(rows, i + 4, j + 4, k + 4, w, u, v)
+        b = _blend(rows, i + 5, j + 5, k + 5, w, u, v)
+        roughness = _blend(rows, i + 6, j + 6, k + 6, w, u, v)
+        metallic = _blend(rows, i + 7, j + 7, k + 7, w, u, v)
+    else:
+        own = np.int64(face) - geometry.vertex_faces
+        s = t = ZERO
+        if geometry.uvs != 0:
+            c = 6 * own
+            s = _blend(geometry.uvs, c, c + 2, c + 4, w, u, v)
+            t = _blend(geometry.uvs, c + 1, c + 3, c + 5, w, u, v)
+        material = load_int32(geometry.material, own)
+        m = geometry.materials
+        tables = (
+            load_int64(m, 0), load_int64(m, 1), load_int64(m, 2), load_int64(m, 3), load_int64(m, 4), load_int64(m, 5),
+        )  # fmt: skip
+        r, g, b, roughness, metallic, er, eg, eb = material_at(material, s, t, tables)
+        rows = geometry.normals
+        i, j, k = 3 * i, 3 * j, 3 * k
+        if place < 0:
+            nx = _blend(rows, i, j, k, w, u, v)
+            ny = _blend(rows, i + 1, j + 1, k + 1, w, u, v)
+            nz = _blend(rows, i + 2, j + 2, k + 2, w, u, v)
+        else:
+            nx, ny, nz = _normal_of_place(rows, i, j, k, w, u, v, geometry.place_normal, place)
+            scale = ONE / max(abs(gx), max(abs(gy), max(abs(gz), _TINY)))
+            gx, gy, gz = _turned(geometry.place_normal, place, gx * scale, gy * scale, gz * scale)
+            owner = load_int32(geometry.place_object, np.int64(place))
+    scale = ONE / math.sqrt(max(gx * gx + gy * gy + gz * gz, _TINY))
+    if gx * dx + gy * dy + gz * dz > ZERO:
+        scale = -scale
+    gx, gy, gz = gx * scale, gy * scale, gz * scale
+    length = nx * nx + ny * ny + nz * nz
+    if length > F(1e-12):
+        scale = ONE / math.sqrt(length)
+        if gx * nx + gy * ny + gz * nz < ZERO:
+            scale = -scale
+        nx, ny, nz = nx * scale, ny * scale, nz * scale
+    else:
+        nx, ny, nz = gx, gy, gz
+    return nx, ny, nz, gx, gy, gz, r, g, b, roughness, metallic, er, eg, eb, owner
+
+
+@njit
+def position_at(face, place, u, v, vertices, faces, places):  # type: ignore[no-untyped-def]
+    """World-space point of a hit, float64, blended from the corners: nearer to the face than origin + t direction.
+
+    Parameters
+    ----------
+    vertices, faces : ``TriangleBVH``'s
+    places : (p, 3, 4) float32, ``TraceScene.places``
+    """
+    w = 1.0 - np.float64(u) - np.float64(v)
+    a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
+    x = w * vertices[a, 0] + u * vertices[b, 0] + v * vertices[c, 0]
+    y = w * vertices[a, 1] + u * vertices[b, 1] + v * vertices[c, 1]
+    z = w * vertices[a, 2] + u * vertices[b, 2] + v * vertices[c, 2]
+    if place < 0:
+        return x, y, z
+    m = places
+    return (
+        m[place, 0, 0] * x + m[place, 0, 1] * y + m[place, 0, 2] * z + m[place, 0, 3],
+        m[place, 1, 0] * x + m[place, 1, 1] * y + m[place, 1, 2] * z + m[place, 1, 3],
+        m[place, 2, 0] * x + m[place, 2, 1] * y + m[place, 2, 2] * z + m[place, 2, 3],
+    )
