@@ -37,7 +37,7 @@ Progress = Callable[[float, str], None]
 Check = Callable[[], None]
 
 #: Memory a strip may take, and what a sub-pixel sample takes of it at most (samples, points, light).
-STRIP_BYTES, SAMPLE_BYTES = 64 << 20, 250
+STRIP_BYTES, SAMPLE_BYTES = 64 << 20, 310
 #: Seconds a batch of points should take, how many samples (points times rays) the first one has, fewest points of any.
 BATCH_SECONDS, FIRST_SAMPLES, FEWEST_POINTS = 0.1, 1 << 17, 16
 

@@ -16,18 +16,15 @@ the tables too: arrays that are passed on from function to function are counted 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from llvmlite import ir
-from numba import types
-from numba.extending import intrinsic
 
 from ...arrays import frozen
 from ...colour import srgb_to_linear, to_unit
 from ...errors import UsageError
 from ...frame import Image, Material, Texture
 from ...jit import njit
+from ..memory import address, load_float, load_int32, load_int64, load_uint32
 from ..sampling import HALF, ONE, TWO, ZERO, F, luminance
 
 Array = np.ndarray
@@ -40,17 +37,12 @@ _INTERPOLATIONS = {"closest": 0, "linear": 1}
 _EXTENSIONS = {"repeat": 0, "extend": 1, "mirror": 2, "clip": 3}
 _REPEAT, _EXTEND, _MIRROR, _CLIP = range(4)
 _SLOTS = ("base_colour_texture", "roughness_texture", "metallic_texture", "emission_texture")
-#: Rec.709 luminance.
 #: What Blender shows of an image that is not there.
 _MISSING = np.array([[[255, 0, 255, 255]]], np.uint8)
 #: Radiance above this is cut: its square is still a float32.
 _BRIGHTEST = F(1e15)
 _INFINITE = F(np.inf)
 _BYTE_SCALE = F(1.0 / 255.0)
-
-
-def _address(array: Array) -> int:
-    return int(array.__array_interface__["data"][0])
 
 
 @dataclass(slots=True)
@@ -70,7 +62,7 @@ class _Texels:
     def row(self) -> tuple[int, int, int, int]:
         """Address, width, height, kind."""
         height, width = self.texels.shape[:2]
-        return _address(self.texels), width, height, self.kind
+        return address(self.texels), width, height, self.kind
 
 
 class MaterialTable:
@@ -128,7 +120,7 @@ class MaterialTable:
             srgb_to_linear(np.arange(256) / 255.0),
         )
         self.glows = bool((constants[:, 5:] > 0.0).any())
-        self.addresses = tuple(_address(array) for array in self.arrays)
+        self.addresses = tuple(address(array) for array in self.arrays)
         # Only needed above; they would keep the pixels of the frame before alive.
         self._given, self._known = {}, {}
 
@@ -221,40 +213,18 @@ def _read(image: Image) -> _Texels:
     return _Texels(given, image.encoding, texels, _FLOAT, problem)
 
 
-def _load(scalar: Any, kind: Any) -> Any:
-    """Intrinsic that reads element `index` of an array of `scalar` at `address`, wherever it is aligned."""
-
-    @intrinsic
-    def load(typing: Any, address: Any, index: Any) -> Any:
-        def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            start = builder.inttoptr(arguments[0], kind.as_pointer())
-            value = builder.load(builder.gep(start, [arguments[1]]))
-            value.align = 1
-            return value
-
-        return scalar(types.int64, types.int64), codegen
-
-    return load
-
-
-_word = _load(types.uint32, ir.IntType(32))
-_int32 = _load(types.int32, ir.IntType(32))
-_int64 = _load(types.int64, ir.IntType(64))
-_float = _load(types.float32, ir.FloatType())
-
-
 @njit
 def _texel(address, kind, index, weight, red, green, blue, alpha):  # type: ignore[no-untyped-def]
     """Add `weight` times a texel, as stored."""
     if kind == _FLOAT:
         index *= 4
         return (
-            red + weight * _float(address, index),
-            green + weight * _float(address, index + 1),
-            blue + weight * _float(address, index + 2),
-            alpha + weight * _float(address, index + 3),
+            red + weight * load_float(address, index),
+            green + weight * load_float(address, index + 1),
+            blue + weight * load_float(address, index + 2),
+            alpha + weight * load_float(address, index + 3),
         )
-    word = np.int64(_word(address, index))
+    word = np.int64(load_uint32(address, index))
     return (
         red + weight * F(word & 255),
         green + weight * F((word >> 8) & 255),
@@ -297,8 +267,8 @@ def _axis(u, n, interpolation, extension):  # type: ignore[no-untyped-def]
 def _decoded(x, decode):  # type: ignore[no-untyped-def]
     """Linear value of an sRGB value in [0, 255], to 6e-6."""
     i = min(np.int64(x), 254)
-    below = _float(decode, i)
-    return below + (x - F(i)) * (_float(decode, i + 1) - below)
+    below = load_float(decode, i)
+    return below + (x - F(i)) * (load_float(decode, i + 1) - below)
 
 
 @njit
@@ -306,18 +276,18 @@ def _lookup(row, u, v, addresses):  # type: ignore[no-untyped-def]
     """Red, green, blue, alpha of a texture."""
     _, _, textures, transforms, images, decode = addresses
     i = 6 * row
-    s = _float(transforms, i) * u + _float(transforms, i + 1) * v + _float(transforms, i + 2)
-    t = _float(transforms, i + 3) * u + _float(transforms, i + 4) * v + _float(transforms, i + 5)
+    s = load_float(transforms, i) * u + load_float(transforms, i + 1) * v + load_float(transforms, i + 2)
+    t = load_float(transforms, i + 3) * u + load_float(transforms, i + 4) * v + load_float(transforms, i + 5)
     if not (abs(s) < _INFINITE and abs(t) < _INFINITE):
         return ZERO, ZERO, ZERO, ZERO
     i = 4 * row
-    interpolation, extension = _int32(textures, i + 2), _int32(textures, i + 3)
-    i = 4 * np.int64(_int32(textures, i))
+    interpolation, extension = load_int32(textures, i + 2), load_int32(textures, i + 3)
+    i = 4 * np.int64(load_int32(textures, i))
     address, width, height, kind = (
-        _int64(images, i),
-        _int64(images, i + 1),
-        _int64(images, i + 2),
-        _int64(images, i + 3),
+        load_int64(images, i),
+        load_int64(images, i + 1),
+        load_int64(images, i + 2),
+        load_int64(images, i + 3),
     )
     left, right, a, b = _axis(s, width, interpolation, extension)
     low, high, c, d = _axis(t, height, interpolation, extension)
@@ -339,7 +309,7 @@ def _lookup(row, u, v, addresses):  # type: ignore[no-untyped-def]
 def _number(row, u, v, addresses):  # type: ignore[no-untyped-def]
     """One number of a texture; of a colour its luminance, as where Blender plugs a colour into a number."""
     red, green, blue, alpha = _lookup(row, u, v, addresses)
-    channel = _int32(addresses[2], 4 * row + 1)
+    channel = load_int32(addresses[2], 4 * row + 1)
     if channel >= _LUMINANCE:
         return luminance(red, green, blue)
     if channel == _A:
@@ -350,7 +320,7 @@ def _number(row, u, v, addresses):  # type: ignore[no-untyped-def]
 @njit
 def _colour(row, u, v, addresses):  # type: ignore[no-untyped-def]
     """Colour of a texture; of one channel a grey."""
-    if _int32(addresses[2], 4 * row + 1) == _RGB:
+    if load_int32(addresses[2], 4 * row + 1) == _RGB:
         red, green, blue, _ = _lookup(row, u, v, addresses)
         return red, green, blue
     grey = _number(row, u, v, addresses)
@@ -380,12 +350,12 @@ def material_at(material, u, v, addresses):  # type: ignore[no-untyped-def]
     """
     constants, slots = addresses[0], addresses[1]
     i = 8 * np.int64(material)
-    r, g, b = _float(constants, i), _float(constants, i + 1), _float(constants, i + 2)
-    roughness, metallic = _float(constants, i + 3), _float(constants, i + 4)
-    er, eg, eb = _float(constants, i + 5), _float(constants, i + 6), _float(constants, i + 7)
+    r, g, b = load_float(constants, i), load_float(constants, i + 1), load_float(constants, i + 2)
+    roughness, metallic = load_float(constants, i + 3), load_float(constants, i + 4)
+    er, eg, eb = load_float(constants, i + 5), load_float(constants, i + 6), load_float(constants, i + 7)
     i = 4 * np.int64(material)
-    first, second = np.int64(_int32(slots, i)), np.int64(_int32(slots, i + 1))
-    third, last = np.int64(_int32(slots, i + 2)), np.int64(_int32(slots, i + 3))
+    first, second = np.int64(load_int32(slots, i)), np.int64(load_int32(slots, i + 1))
+    third, last = np.int64(load_int32(slots, i + 2)), np.int64(load_int32(slots, i + 3))
     # Only if all are -1 are all bits set.
     if (first & second & third & last) == -1:
         return r, g, b, roughness, metallic, er, eg, eb
