@@ -69,6 +69,24 @@ def test_lower_ranks_never_import_higher_ones():
     assert not wrong, "\n".join(wrong)
 
 
+def test_folders_of_the_renderer_use_those_on_their_left():
+    page = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
+    line = next(line for line in page.splitlines() if line.endswith("<- pipeline"))
+    order = {name: rank for rank, names in enumerate(line.split("<-")) for name in names.split()}
+    folder = PACKAGE / "render"
+    assert {p.stem for p in folder.iterdir() if p.stem not in ("__init__", "__pycache__", "reference")} == set(order)
+    wrong = []
+    for path in sources(folder):
+        own = path.relative_to(folder).parts[0].removesuffix(".py")
+        for number, module, _ in imports(path, ROOT):
+            parts = module.split(".")
+            if own not in order or parts[:2] != ["drgs_blender", "render"] or len(parts) < 3 or parts[2] == own:
+                continue
+            if order.get(parts[2], len(order)) >= order[own] and not order[own] == order.get(parts[2]) == 0:
+                wrong.append(f"{path.relative_to(ROOT)}:{number} imports {module}")
+    assert not wrong, "\n".join(wrong)
+
+
 def test_the_engine_never_imports_blender():
     wrong = [
         f"{path.relative_to(ROOT)}:{line} imports {module}"
