@@ -83,15 +83,6 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
         ),
         default="surfels",
     )
-    tracer: EnumProperty(
-        name="Rays Meet",
-        description="What shadows, reflections and passed-on light see of DR-GS objects",
-        items=(
-            ("mesh", "Mesh", "The triangle mesh that carries the surfels: fast"),
-            ("surfels", "Surfels", "The captured Gaussians themselves: fine detail in reflections and shadows"),
-        ),
-        default="mesh",
-    )
     denoise: EnumProperty(
         name="Denoise",
         description="Filter that takes the noise out of the picture",
@@ -130,7 +121,6 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
             threads=threads,
             noise_threshold=self.noise_threshold if self.use_noise_threshold else 0.0,
             clamp_indirect=self.clamp_indirect,
-            tracer=self.tracer,
         )
 
 

@@ -44,8 +44,6 @@ def main() -> None:
     parser.add_argument("--memory-size", type=int, nargs=2, default=(1920, 1080))
     parser.add_argument("--million", type=int, default=1_000_000, help="triangles and surfels of the memory test")
     parser.add_argument("--efficiency-rays", type=int, nargs="+", default=(4, 8, 16, 32, 64, 128, 256, 512))
-    parser.add_argument("--surfel-rays", type=int, nargs="+", default=(4, 8, 16, 32), help="with rays against surfels")
-    parser.add_argument("--surfel-reference-rays", type=int, default=256)
     options = parser.parse_args()
     if hasattr(os, "sched_setaffinity"):  # inherited by every process that is started from here
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:2])

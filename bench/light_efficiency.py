@@ -23,13 +23,11 @@ FIGURE = ROOT / "docs" / "images" / "efficiency.png"
 MESH = Path("data/meshes/odedstein/armadillo/armadillo.obj")
 #: Rays of each picture that a reference is the mean of.
 PART = 128
-SURFELS = "no mesh acceleration (rays meet surfels)"
 #: What a variant changes of the full method; "cosine" says that all samples are of the cosine.
 VARIANTS: dict[str, dict[str, Any]] = {
     "full": {},
     "no denoiser": {"denoise": "none"},
     "no MIS (cosine samples alone)": {"cosine_only": True},
-    SURFELS: {"tracer": "surfels"},
 }
 
 
@@ -82,37 +80,21 @@ def settings_of(change: dict[str, Any], rays: int) -> dict[str, Any]:
     return chosen
 
 
-def traces_surfels(case: Case) -> bool:
-    """Whether the tracer setting changes the picture at all."""
-    mesh, surfels = (case.picture(24, 8, primary="surfels", tracer=tracer)[0] for tracer in ("mesh", "surfels"))
-    return not np.array_equal(mesh, surfels)
-
-
-def converged(case: Case, size: int, rays: int, tracer: str) -> Reference:
+def converged(case: Case, size: int, rays: int) -> Reference:
     """Mean of pictures with different seeds and the aa that is measured, of `rays` in all.
 
     One picture of more sub-pixel positions would be another picture: the low-pass of surfels follows their number.
     """
     count = max(1, rays // PART)
-    pictures = [
-        case.picture(size, rays // count, 1000 + seed, primary="surfels", tracer=tracer)[0] for seed in range(count)
-    ]
+    pictures = [case.picture(size, rays // count, 1000 + seed, primary="surfels")[0] for seed in range(count)]
     return Reference.of(np.mean(pictures, axis=0), alpha=0.99)
 
 
 def measure(case: Case, options: argparse.Namespace) -> list[Curve]:
     curves = []
-    references: dict[str, Reference] = {}
-    with_surfels = traces_surfels(case)
+    reference = converged(case, options.size, options.reference_rays)
     for name, change in VARIANTS.items():
-        if name == SURFELS and not with_surfels:
-            continue
-        tracer = change.get("tracer", "mesh")
-        if tracer not in references:
-            rays = options.reference_rays if tracer == "mesh" else options.surfel_reference_rays
-            references[tracer] = converged(case, options.size, rays, tracer)
-        reference = references[tracer]
-        curve = Curve(name, list(options.efficiency_rays if tracer == "mesh" else options.surfel_rays), [], [])
+        curve = Curve(name, list(options.efficiency_rays), [], [])
         case.picture(options.size, 4, **settings_of(change, 4))  # kernels
         for rays in curve.rays:
             picture, seconds = case.picture(options.size, rays, **settings_of(change, rays))
@@ -174,11 +156,4 @@ def efficiency(options: argparse.Namespace) -> str:
         for rays in options.efficiency_rays
     ]
     text += table(columns, rows)
-    if any(c.name == SURFELS for c in curves):
-        text += (
-            f"\n\nRays against surfels: a scene of its own, so against its own picture of "
-            f"{options.surfel_reference_rays} rays."
-        )
-    else:
-        text += f"\n\n{SURFELS.capitalize()}: not measured, frames are not rendered with that tracer."
     return text

@@ -247,7 +247,7 @@ class RenderSettings:
     "principled" (Blender's Principled BSDF, GGX) or "paper" (the paper's BRDF). ``threads`` 0 is all cores.
     ``noise_threshold`` above 0 stops sampling a pixel once its estimated error (as Cycles defines it) is below it; the
     samples above are then the most a pixel gets. ``clamp_indirect`` above 0 limits the brightness of a single indirect
-    sample, which loses energy. ``tracer`` says what rays meet of DR-GS objects: their mesh or their surfels.
+    sample, which loses energy.
     """
 
     cosine: int = 16
@@ -263,7 +263,6 @@ class RenderSettings:
     threads: int = 0
     noise_threshold: float = 0.0
     clamp_indirect: float = 0.0
-    tracer: Literal["mesh", "surfels"] = "mesh"
 
     @property
     def rays(self) -> int:

@@ -52,7 +52,7 @@ class DRGS_PT_light(_RenderPanel, bpy.types.Panel):
         layout.use_property_split = True
         layout.use_property_decorate = False
         settings = context.scene.drgs
-        for name in ("bounces", "clamp_indirect", "look", "primary", "tracer"):
+        for name in ("bounces", "clamp_indirect", "look", "primary"):
             layout.prop(settings, name)
 
 

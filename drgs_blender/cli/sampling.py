@@ -30,6 +30,18 @@ def add_arguments(parser: argparse.ArgumentParser, *, defaults: bool) -> None:
 
     add("--rays", "rays", "rays a pixel: half by cosine, a quarter GGX, a quarter environment", type=whole(1, 65536))
     add("--bounces", "bounces", "indirect bounces", type=whole(0, 64))
+    add(
+        "--noise-threshold",
+        "noise_threshold",
+        "stop sampling a pixel below this error, as Cycles defines it; 0 never stops",
+        type=at_least_zero,
+    )
+    add(
+        "--clamp-indirect",
+        "clamp_indirect",
+        "limit of one indirect sample: fewer fireflies, less light; 0 for no limit",
+        type=at_least_zero,
+    )
     add("--aa", "aa", "sub-pixel positions among which the rays are divided", type=whole(1, 1024))
     add("--primary", "primary", "what the camera sees: surfels or the mesh", choices=choices("primary"))
     add("--denoise", "denoise", "denoiser", choices=choices("denoise"))
@@ -65,6 +77,14 @@ def whole(low: int, high: int) -> Any:
     return parse
 
 
+def at_least_zero(text: str) -> float:
+    """A finite number that is not negative."""
+    value = float(text)
+    if not 0.0 <= value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text} is not a number of at least 0")
+    return value
+
+
 def passes(text: str) -> tuple[str, ...]:
     """``Combined,Depth`` or ``all`` -> names of the pass table, in its order; Combined is always among them."""
     if text == "all":
@@ -90,7 +110,8 @@ def check_size(camera: Camera, passes: Sequence[str]) -> None:
 
 def override(settings: RenderSettings, args: argparse.Namespace) -> RenderSettings:
     """`settings` with every option that was given."""
-    names = ("bounces", "aa", "primary", "denoise", "look", "seed", "threads", "film_transparent")
+    names = ("bounces", "noise_threshold", "clamp_indirect", "aa", "primary", "denoise", "look", "seed", "threads")
+    names += ("film_transparent",)
     given = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
     if args.rays is not None:
         given |= dict(zip(("cosine", "ggx", "environment"), split_rays(args.rays), strict=True))

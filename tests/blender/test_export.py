@@ -297,7 +297,7 @@ def test_settings_and_passes_reach_the_frame(ball, scene, captured):
     s = frame.settings
     assert (s.cosine, s.ggx, s.environment, s.bounces, s.aa, s.seed) == (32, 16, 16, 3, 8, 5)
     assert (s.look, s.denoise, s.primary, s.film_transparent) == ("paper", "svgf", "mesh", True)
-    assert (s.noise_threshold, s.clamp_indirect, s.tracer) == (0, 10, "surfels"), "the threshold is off"
+    assert (s.noise_threshold, s.clamp_indirect) == (0, 10), "the threshold is off"
     assert frame.passes == ("Combined", "Depth", "Albedo", "IndexOB", "Noisy Image")
     assert frame.number == 12
     settings.use_animated_seed, settings.use_noise_threshold = False, True
@@ -310,6 +310,6 @@ def test_settings_offer_what_the_engine_knows():
     hints = typing.get_type_hints(part("drgs_blender.frame").RenderSettings)
     defaults = part("drgs_blender.frame").RenderSettings()
     properties = part("addon.properties").DrgsSceneSettings.bl_rna.properties
-    for name in ("primary", "denoise", "look", "tracer"):
+    for name in ("primary", "denoise", "look"):
         assert {i.identifier for i in properties[name].enum_items} == set(typing.get_args(hints[name])), name
         assert properties[name].default == getattr(defaults, name)
