@@ -110,8 +110,8 @@ def check_size(camera: Camera, passes: Sequence[str]) -> None:
 
 def override(settings: RenderSettings, args: argparse.Namespace) -> RenderSettings:
     """`settings` with every option that was given."""
-    names = ("bounces", "noise_threshold", "clamp_indirect", "aa", "primary", "denoise", "look", "seed", "threads")
-    names += ("film_transparent",)
+    numbers = ("bounces", "noise_threshold", "clamp_indirect", "aa", "seed", "threads")
+    names = (*numbers, "primary", "denoise", "look", "film_transparent")
     given = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
     if args.rays is not None:
         given |= dict(zip(("cosine", "ggx", "environment"), split_rays(args.rays), strict=True))

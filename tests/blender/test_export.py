@@ -289,7 +289,7 @@ def test_settings_and_passes_reach_the_frame(ball, scene, captured):
     settings.use_custom_split, settings.rays = False, 64
     settings.bounces, settings.aa, settings.look, settings.denoise, settings.seed = 3, 8, "paper", "svgf", 5
     settings.primary, scene.render.film_transparent = "mesh", True
-    settings.noise_threshold, settings.clamp_indirect, settings.tracer = 0.02, 10, "surfels"
+    settings.noise_threshold, settings.clamp_indirect = 0.02, 10
     layer.use_pass_z = layer.use_pass_object_index = layer.drgs.use_pass_albedo = layer.drgs.use_pass_noisy_image = True
     scene.frame_set(12)
     bpy.ops.render.render()
