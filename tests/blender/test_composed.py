@@ -73,7 +73,8 @@ def test_a_whole_scene_agrees_with_cycles(ball, scene):
     for material in bpy.data.materials:
         next(n for n in material.node_tree.nodes if n.type == "BSDF_PRINCIPLED").distribution = "GGX"
     for obj in bpy.data.objects:
-        obj.shadow_terminator_geometry_offset = obj.shadow_terminator_shading_offset = 0.0
+        holder = obj if hasattr(obj, "shadow_terminator_geometry_offset") else obj.cycles  # the latter before 5.0
+        holder.shadow_terminator_geometry_offset = 0.0
     render, cycles, settings = scene.render, scene.cycles, scene.drgs
     render.resolution_x = render.resolution_y = SIZE
     render.film_transparent = True
