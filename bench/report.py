@@ -34,7 +34,9 @@ def table(columns: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
     """A Markdown table; floats are shown with three significant figures."""
 
     def cell(value: object) -> str:
-        return f"{value:.3g}" if isinstance(value, float) and abs(value) < 1e3 else str(value)
+        if not isinstance(value, float):
+            return str(value)
+        return f"{value:.3g}" if abs(value) < 1e3 else f"{value:.0f}"
 
     lines = ["| " + " | ".join(columns) + " |", "|" + "---|" * len(columns)]
     lines += ["| " + " | ".join(cell(v) for v in row) + " |" for row in rows]

@@ -17,7 +17,7 @@ Warn = Callable[[str], None]
 def export_light(item: Visible, warn: Warn) -> Light | None:
     """Describe a visible instance of a light; None for portals, which give no light of their own."""
     obj, light = item.object, item.object.data
-    if light.type == "AREA" and light.cycles.is_portal:
+    if light.type == "AREA" and getattr(getattr(light, "cycles", None), "is_portal", False):
         return None
     name = f'Light "{obj.name}"'
     linking = obj.light_linking

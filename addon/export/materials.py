@@ -220,7 +220,7 @@ class _Tree(Walker):
         mean = values.mean(axis=0, dtype=np.float64)
         if output.socket.name == "Alpha":
             return plain(mean[3] if len(mean) == 4 else 1)
-        return plain(mean[:3].mean()) if output.socket.name == "Fac" else plain(mean[:3])
+        return plain(mean[:3].mean()) if output.socket.identifier == "Fac" else plain(mean[:3])
 
     def node_ambient_occlusion(self, output: Place) -> Paint:
         if output.socket.type == "RGBA":

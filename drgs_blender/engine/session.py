@@ -17,11 +17,12 @@ from ..asset.container import read_asset
 from ..asset.model import Asset, PosedSurfels
 from ..deform.mesh_driven import MeshDriven
 from ..errors import AssetError, Cancelled, UsageError
-from ..frame import Frame, Image, Light, MeshState, ObjectState, World
+from ..frame import Frame, Image, Light, MeshState, ObjectState, RenderSettings, World
 from ..jit import use_threads
 from ..render.lights.lamps import Lamps
 from ..render.lights.light import EnvironmentLight
 from ..render.pipeline import render
+from ..render.shade.adaptive import part_count
 from ..render.trace.scene import TraceObject, TraceScene
 from .objects import join, posed_surfels, traced_object
 from .protocol import Passes
@@ -149,7 +150,7 @@ class Session:
             "surfels": float(len(posed)),
             "samples": float((x1 - x0) * (y1 - y0) * frame.settings.rays),
         }
-        return Passes(pictures, self._warnings(), statistics)
+        return Passes(pictures, self._warnings() + _unheeded(frame.settings), statistics)
 
     # --- objects ---------------------------------------------------------------------------------------------------
 
@@ -236,6 +237,16 @@ class Session:
             low, high = self._scene.bvh.bounds()
             self._lamps = Lamps(lights, 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low)))
         return self._lamps
+
+
+def _unheeded(settings: RenderSettings) -> list[str]:
+    """Settings that cannot be followed together with the others."""
+    if settings.noise_threshold > 0.0 and part_count(settings) == 1:
+        return [
+            f"noise threshold: {settings.cosine} + {settings.ggx} + {settings.environment} rays cannot be drawn "
+            f"in parts by its {settings.aa} sub-samples, so all are traced; use a multiple of 128"
+        ]
+    return []
 
 
 def _check_surface(state: ObjectState, asset: Asset, with_surfels: bool) -> None:

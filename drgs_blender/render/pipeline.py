@@ -139,7 +139,7 @@ class _Batches:
         if self._parts == 1:
             return self._trace(buffer.points, (0, 1))
         threshold = self._frame.settings.noise_threshold
-        return sample_adaptively(buffer.points, self._frame.camera.width, self._parts, threshold, self._trace)
+        return sample_adaptively(buffer.points, self._frame.settings.rays, self._parts, threshold, self._trace)
 
     def _trace(self, points: ShadingPoints, part: tuple[int, int]) -> Radiance:
         n = len(points)

@@ -476,3 +476,16 @@ def test_the_clamp_bounds_every_indirect_sample_and_nothing_else() -> None:
     indirect = clamped.components[:, [1, 3]].sum(axis=(1, 2)) / 3
     assert indirect.max() <= limit * 1.001
     assert free.components[:, [1, 3]].sum(axis=(1, 2)).max() / 3 > 2 * limit
+
+
+def test_no_bit_depends_on_the_neighbours_where_batches_overflow() -> None:
+    """Samples of a point that fall into two batches of rays, paths too many for one, lamps and sky at once."""
+    box = trimesh.creation.box((4, 4, 4))
+    room = scene_of((np.asarray(box.vertices), np.asarray(box.faces)[:10]), albedo=0.9)
+    sky, counts = EnvironmentLight(World(sun_picture())), settings(cosine=40, ggx=12, environment=12, bounces=2)
+    some = points(64)
+    whole = integrate(room, sky, some, counts, 0, area_lamp())
+    for first, last in ((37, 64), (10, 50)):
+        cut = integrate(room, sky, some[first:last], counts, 0, area_lamp())
+        np.testing.assert_array_equal(cut.components, whole.components[first:last])
+        np.testing.assert_array_equal(cut.variance, whole.variance[first:last])

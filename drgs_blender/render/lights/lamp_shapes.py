@@ -15,6 +15,7 @@ from ...colour import LUMINANCE
 from ...frame import Light
 from ...jit import njit
 from ..sampling import HALF, ONE, PI, TWO, ZERO, F, basis, sincos_turns, unit
+from .light import BRIGHTEST
 
 Array = np.ndarray
 
@@ -81,7 +82,8 @@ def lamp_row(light: Light) -> Array | str:
     row[FLUX] *= radiance * float(colour @ np.array(LUMINANCE))
     with np.errstate(over="ignore"):
         row32 = row.astype(np.float32)
-    return row32 if np.isfinite(row32).all() else "it is too bright or too far away"
+    usable = np.isfinite(row32).all() and (row32[RADIANCE : RADIANCE + 3] <= BRIGHTEST).all()
+    return row32 if usable else "it is too bright or too far away"
 
 
 def _sun(row: Array, light: Light) -> float:

@@ -51,7 +51,7 @@ def build(table: Array) -> tuple[Array, Array]:
         node[_LOW : _LOW + 3], node[_HIGH : _HIGH + 3] = low - pad, high + pad
         node[_CONE : _CONE + 3], node[_REACH] = _common_cone(table[own].astype(np.float64))
         # Mean intensity over the cone: what a lamp of unknown direction sends to a point in it.
-        cone = 2.0 * np.pi * (1.0 - node[_REACH])
+        cone = 2.0 * np.pi * max(1.0 - node[_REACH], 1e-6)
         node[_POWER], node[FIRST], node[PAST] = table[own, FLUX].sum(dtype=np.float64) / cone, first, past
         if past - first > _LEAF:
             side = int(np.argmax(np.ptp(places[own], axis=0)))

@@ -22,6 +22,9 @@ from ..sampling import fast_acos, fast_atan2_turns, sincos_turns, unit
 
 Array = np.ndarray
 
+#: Radiance above this is cut: its square is still a float32.
+BRIGHTEST = np.float32(1e15)
+
 #: Cells of the sampling table at most; larger pictures are averaged down for sampling (never for the lookup).
 _MOST_CELLS = 1 << 22
 
@@ -122,11 +125,11 @@ class EnvironmentLight:
             raise UsageError("world", "has a colour, strength or rotation that is not finite", "Check its settings")
         with np.errstate(all="ignore"):
             tinted = image * tint.astype(np.float32)
-            bad = ~np.asarray((tinted >= 0) & (tinted < 1e30)).all(axis=2, keepdims=True)
+            bad = ~np.asarray((tinted >= 0) & (tinted < np.inf)).all(axis=2, keepdims=True)
         self.bad_texels = int(bad.sum())
         h, w = image.shape[:2]
         self.texels = np.zeros((h, w, 4), np.float32)
-        self.texels[..., :3] = np.where(bad, np.float32(0), tinted)
+        self.texels[..., :3] = np.where(bad, np.float32(0), np.minimum(tinted, BRIGHTEST))
         self.rotation = np.ascontiguousarray(rotation, np.float32)
         self._make_table()
 

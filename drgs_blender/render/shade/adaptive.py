@@ -14,6 +14,8 @@ Array = np.ndarray
 Trace = Callable[[ShadingPoints, tuple[int, int]], Radiance]
 
 _MOST_PARTS = 32
+#: Samples of a pixel before its error is believed.
+_FEWEST = 16
 #: Mean absolute deviation of a normal variable, in standard deviations.
 _MEAN_DEVIATION = 0.7979
 _CHANNELS = 3.0
@@ -29,16 +31,18 @@ def part_count(settings: RenderSettings) -> int:
     return min(common & -common, _MOST_PARTS)
 
 
-def sample_adaptively(points: ShadingPoints, width: int, parts: int, threshold: float, trace: Trace) -> Radiance:
+def sample_adaptively(points: ShadingPoints, samples: int, parts: int, threshold: float, trace: Trace) -> Radiance:
     """Draw part after part until the error of every pixel is below `threshold`, or all parts are drawn.
 
     The error is the one Cycles compares with its noise threshold: the expected deviation of a pixel, summed over the
-    channels, over the square root of their sum. A pixel goes on while it or one of its eight neighbours is above.
+    channels, over the square root of their sum. Each pixel decides for itself, whatever strip or region it lies in, and
+    not before it has had `_FEWEST` samples. A pixel whose samples all missed a small bright light stops too early: what
+    is so found too rarely is lost, as in every renderer that stops by its own estimate.
 
     Parameters
     ----------
     points : ordered by pixel
-    width : of the full picture, to tell neighbours
+    samples : of a pixel, all parts together
     parts : power of two, see `part_count`
     """
     n = len(points)
@@ -59,14 +63,13 @@ def sample_adaptively(points: ShadingPoints, width: int, parts: int, threshold: 
             caught = True
         if part + 1 == parts:
             break
+        if (part + 1) * samples < _FEWEST * parts:
+            continue
         share = points.weight / np.maximum(drawn, 1)
         spread = np.bincount(of_point, share**2 * variance.sum(axis=1), len(pixels))
         colour = np.bincount(of_point, share * light.sum(axis=(1, 2)), len(pixels))
         error = _CHANNELS * _MEAN_DEVIATION * np.sqrt(spread) / (_DARK + np.sqrt(colour))
-        rough = pixels[error >= threshold]
-        around = (np.arange(-1, 2)[:, None] * width + np.arange(-1, 2)).ravel()
-        # Points that stopped once stay so: their later parts would follow parts that they lack.
-        going = going[np.isin(points.pixel[going], (rough[:, None] + around).ravel())]
+        going = going[error[of_point[going]] >= threshold]
         if not len(going):
             break
     scale = 1.0 / np.maximum(drawn, 1).astype(np.float32)

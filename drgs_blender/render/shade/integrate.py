@@ -35,9 +35,9 @@ _FAR = F(np.inf)
 _BLOCK, _BATCH = 64, 512
 #: Strategies in the order of ``RenderSettings``' counts; the samples of the last are divided between sky and lamps.
 _COSINE, _GGX, _SKY, _LAMPS = range(4)
-#: Columns of a block's sums, once each for direct and indirect light and that of emitting surfaces: diffuse and glossy
-#: light, then sum and sum of squares of the luminance of each.
-_KIND, _MOMENTS = 10, 6
+#: Columns of a block's sums, once each for light of the sky and lamp samples, indirect light, that of emitting surfaces
+#: and of lamps that rays met: diffuse and glossy light, then sum and sum of squares of the luminance of each.
+_KINDS, _KIND, _MOMENTS = 4, 10, 6
 #: Least share of the light samples that go to sky or lamps when both shine.
 _LEAST_SHARE = 0.1
 
@@ -78,6 +78,8 @@ def integrate(
         raise UsageError(
             "render settings", "samples, bounces or aa are negative", "Use counts of zero or more, aa >= 1"
         )
+    if not (0.0 <= settings.clamp_indirect < np.inf and 0.0 <= settings.noise_threshold < np.inf):
+        raise UsageError("render settings", "the clamp or the threshold is no number of at least 0", "Use 0 for none")
     if settings.look not in brdf.LOOKS:
         raise UsageError("render settings", f"look {settings.look!r} is unknown", "Use principled or paper")
     n = len(points)
@@ -92,7 +94,12 @@ def integrate(
         scene.geometry,
         F(scene.extent),
         light.sky,
-        (not light.black, U(min(share * 2.0**32, 2.0**32 - 1)), lamps.count > 0),
+        (
+            not light.black,
+            U(min(share * 2.0**32, 2.0**32 - 1)),
+            lamps.count > 0,
+            not light.black and not scene.materials.glows,
+        ),
         (lamps.table, lamps.pick),
         brdf.layer_table(),
         (
@@ -254,7 +261,7 @@ def _see_lamps(
         gr, gg, gb = lamps_along(*position, *direction, distance, others, share, GLOSSY, *lamps)
     if dr + dg + db + gr + gg + gb > ZERO:
         _add(
-            sums, np.int64(ints[c + w.OWNER]), 0, s[i + w.QR] * dr, s[i + w.QG] * dg, s[i + w.QB] * db,
+            sums, np.int64(ints[c + w.OWNER]), 3, s[i + w.QR] * dr, s[i + w.QG] * dg, s[i + w.QB] * db,
             s[i + w.SR] * gr, s[i + w.SG] * gg, s[i + w.SB] * gb,
         )  # fmt: skip
 
@@ -316,13 +323,13 @@ def _trace(
     if apart and strategy == _GGX:
         cosine = ZERO
         w.drop(s, count, w.QR)
-    w.warm(s, count, sky)
     see_lamps = strategy != _SKY and any_lamps
     # Lamps are seen before the BRDF is weighed, for they have densities of their own: such rays are traced first.
     if apart and strategy == _SKY:
         w.weigh_apart(s, count, cosine, ggx, shares[_SKY])
     elif not see_lamps:
         w.weigh(s, count, cosine, ggx, shares[_SKY])
+    w.warm(s, count, sky)
     for slot in range(count):
         i, c = w.at(slot)
         if not s[i + w.LIVE] > ZERO:
@@ -375,11 +382,13 @@ def _finish(sums: Any, h: Any, total: Any, components: Any, variance: Any, i: An
     for lobe in range(2):
         for k in range(3):
             c = 3 * lobe + k
-            components[i, 2 * lobe, k] = sums[h, c] + sums[h, 2 * _KIND + c]
+            components[i, 2 * lobe, k] = sums[h, c] + sums[h, 2 * _KIND + c] + sums[h, 3 * _KIND + c]
             components[i, 2 * lobe + 1, k] = sums[h, _KIND + c]
         m = _MOMENTS + 2 * lobe
-        mean = sums[h, m] + sums[h, _KIND + m] + sums[h, 2 * _KIND + m]
-        square = sums[h, m + 1] + sums[h, _KIND + m + 1] + sums[h, 2 * _KIND + m + 1]
+        mean, square = ZERO, ZERO
+        for kind in range(_KINDS):
+            mean += sums[h, kind * _KIND + m]
+            square += sums[h, kind * _KIND + m + 1]
         if total > 1:
             n = F(total)
             square = max(ZERO, square - mean * mean / n) * (n / (n - ONE))
@@ -410,7 +419,7 @@ def _lane(
     rays, paths = w.batch(_BATCH), w.batch(_BATCH)
     s, ints = rays
     found = np.zeros((_BATCH, FOUND), np.float32)
-    sums = np.empty((_BLOCK, 3 * _KIND), np.float32)
+    sums = np.empty((_BLOCK, _KINDS * _KIND), np.float32)
     head = np.empty((_BLOCK, 8), np.float32)
     total = np.empty(_BLOCK, np.int64)
     for block in range(lane, blocks, lanes):

@@ -274,7 +274,9 @@ class TraceScene:
             rows = slice(part.face.start - self.vertex_faces, part.face.stop - self.vertex_faces)
             if old is not mesh or first != self._first_material:
                 self._material[rows] = first[part.source - count] + _material_index(mesh, len(part.faces))
-            if mesh.uvs is not None and (not isinstance(old, MeshState) or old.uvs is not mesh.uvs):
+            if mesh.uvs is None and len(self._uvs):
+                self._uvs[rows] = 0.0
+            elif mesh.uvs is not None and (not isinstance(old, MeshState) or old.uvs is not mesh.uvs):
                 self._uvs[rows] = as_float(mesh.uvs, (len(part.faces), 3, 2), f"texture coordinates of {mesh.name}")
         self._first_material = first
 

@@ -35,7 +35,7 @@ _CHANNELS = {"r": 0, "g": 1, "b": 2, "a": 3, "luminance": 4, "rgb": 5}
 _A, _LUMINANCE, _RGB = 3, 4, 5
 _INTERPOLATIONS = {"closest": 0, "linear": 1}
 _EXTENSIONS = {"repeat": 0, "extend": 1, "mirror": 2, "clip": 3}
-_REPEAT, _EXTEND, _MIRROR, _CLIP = range(4)
+_REPEAT, _, _MIRROR, _CLIP = range(4)
 _SLOTS = ("base_colour_texture", "roughness_texture", "metallic_texture", "emission_texture")
 #: What Blender shows of an image that is not there.
 _MISSING = np.array([[[255, 0, 255, 255]]], np.uint8)
