@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from drgs_blender.engine.objects import traced_object
 from drgs_blender.engine.session import Session
 from drgs_blender.engine.snapshots import renewed
 from drgs_blender.errors import AssetError, Cancelled, UsageError
-from drgs_blender.frame import Image, Material, MeshState, ObjectState, Texture, Visibility, World
+from drgs_blender.frame import Image, Light, Material, MeshState, ObjectState, Texture, Visibility, World
 
 
 @pytest.fixture
@@ -331,3 +332,25 @@ def test_statistics_and_stages(session, make_frame):
     assert all(passes.statistics[name] >= 0 for name in stages)
     assert passes.statistics["surfels"] == len(session.asset(make_frame().objects[0].asset).surfels)
     assert passes.statistics["samples"] == 48 * 36 * 6
+
+
+def test_a_threshold_that_cannot_be_followed_is_named(session, make_frame):
+    frame = make_frame()
+    frame.settings = replace(frame.settings, noise_threshold=0.1, cosine=3, ggx=2, environment=2, aa=4)
+    assert any("noise threshold" in text and "3 + 2 + 2" in text for text in session.render(frame).warnings)
+    frame.settings = replace(frame.settings, cosine=8, ggx=8, environment=8)
+    assert not any("noise threshold" in text for text in session.render(frame).warnings)
+
+
+def test_regions_and_history_do_not_show_in_adaptive_frames(session, make_frame, asset_path):
+    """Whether a pixel goes on is its own affair: a region is a crop, with a lamp in the scene too."""
+    frame = make_frame(0.2)
+    frame.settings = replace(frame.settings, noise_threshold=0.2, cosine=32, ggx=16, environment=16, aa=2)
+    place = np.eye(4)
+    place[:3, 3] = (0.5, -1.0, 3.0)
+    frame.lights = [Light("Panel", "area", place, power=60.0, size_x=0.5)]
+    whole = session.render(frame)["Combined"]
+    camera = frame.camera
+    x0, y0, x1, y1 = camera.width // 4, camera.height // 4, camera.width // 2 + 3, camera.height // 2 + 5
+    frame.camera = replace(camera, region=(x0, y0, x1, y1))
+    np.testing.assert_array_equal(fresh(asset_path, frame)["Combined"], whole[y0:y1, x0:x1])
