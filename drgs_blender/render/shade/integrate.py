@@ -227,6 +227,18 @@ def _add(sums: Any, h: Any, kind: Any, qr: Any, qg: Any, qb: Any, sr: Any, sg: A
 
 
 @njit
+def _reflect(
+    sums: Any, s: Any, ints: Any, slot: Any, kind: Any, dr: Any, dg: Any, db: Any, gr: Any, gg: Any, gb: Any
+) -> None:
+    """Add what a slot's point reflects of the light that its diffuse and its glossy lobe get along the ray."""
+    i, c = w.at(slot)
+    _add(
+        sums, np.int64(ints[c + w.OWNER]), kind, s[i + w.QR] * dr, s[i + w.QG] * dg, s[i + w.QB] * db,
+        s[i + w.SR] * gr, s[i + w.SG] * gg, s[i + w.SB] * gb,
+    )  # fmt: skip
+
+
+@njit
 def _deliver(count: Any, found: Any, limit: Any, sums: Any) -> None:
     """Add the light of finished paths to their points; `limit` bounds the mean of an indirect sample's channels."""
     for path in range(count):
@@ -250,7 +262,7 @@ def _see_lamps(
     slot: Any, s: Any, ints: Any, distance: Any, cosine: Any, ggx: Any, share: Any, lamps: Any, differ: Any, sums: Any
 ) -> None:
     """Lamps between a point and what its ray hit; the BRDF is not yet weighed."""
-    i, c = w.at(slot)
+    i, _ = w.at(slot)
     position, direction = (s[i + w.OX], s[i + w.OY], s[i + w.OZ]), (s[i + w.LX], s[i + w.LY], s[i + w.LZ])
     others = cosine * s[i + w.PC] + ggx * s[i + w.PG]
     if not others > ZERO:
@@ -260,10 +272,7 @@ def _see_lamps(
     if differ:
         gr, gg, gb = lamps_along(*position, *direction, distance, others, share, GLOSSY, *lamps)
     if dr + dg + db + gr + gg + gb > ZERO:
-        _add(
-            sums, np.int64(ints[c + w.OWNER]), 3, s[i + w.QR] * dr, s[i + w.QG] * dg, s[i + w.QB] * db,
-            s[i + w.SR] * gr, s[i + w.SG] * gg, s[i + w.SB] * gb,
-        )  # fmt: skip
+        _reflect(sums, s, ints, slot, 3, dr, dg, db, gr, gg, gb)
 
 
 @njit
@@ -275,7 +284,7 @@ def _trace_lamps(
     w.evaluate(s, count, look)
     mask = np.int32(masks.SHADOW << shift)
     for slot in range(count):
-        i, c = w.at(slot)
+        i, _ = w.at(slot)
         others, glossy_others = shares[_COSINE] * s[i + w.PC], shares[_GGX] * s[i + w.PG]
         if not apart:
             others = glossy_others = others + glossy_others
@@ -283,10 +292,7 @@ def _trace_lamps(
             s, ints, slot, others, glossy_others, shares[_LAMPS], lamps, scene[0], mask
         )
         if dr + dg + db + gr + gg + gb > ZERO:
-            _add(
-                sums, np.int64(ints[c + w.OWNER]), 0, s[i + w.QR] * dr, s[i + w.QG] * dg, s[i + w.QB] * db,
-                s[i + w.SR] * gr, s[i + w.SG] * gg, s[i + w.SB] * gb,
-            )  # fmt: skip
+            _reflect(sums, s, ints, slot, 0, dr, dg, db, gr, gg, gb)
 
 
 @njit
@@ -329,7 +335,8 @@ def _trace(
         w.weigh_apart(s, count, cosine, ggx, shares[_SKY])
     elif not see_lamps:
         w.weigh(s, count, cosine, ggx, shares[_SKY])
-    w.warm(s, count, sky)
+    if sky_shines:
+        w.warm(s, count, sky)
     for slot in range(count):
         i, c = w.at(slot)
         if not s[i + w.LIVE] > ZERO:
@@ -363,10 +370,7 @@ def _trace(
         i, c = w.at(slot)
         if s[i + w.LIVE] > ZERO:
             r, g, b = sky_radiance(s[i + w.MU], s[i + w.MV], sky)
-            _add(
-                sums, np.int64(ints[c + w.OWNER]), 0, r * s[i + w.QR], g * s[i + w.QG], b * s[i + w.QB],
-                r * s[i + w.SR], g * s[i + w.SG], b * s[i + w.SB],
-            )  # fmt: skip
+            _reflect(sums, s, ints, slot, 0, r, g, b, r, g, b)
     return begun
 
 

@@ -205,6 +205,17 @@ def take_mesh(part: Part, item: MeshState, places: Places, vertices: Array, norm
     return moved, died
 
 
+@njit
+def _usable(x: Any, y: Any, z: Any) -> Any:
+    """The vertex and its largest coordinate, or the origin for an unusable one; how many of these (0 or 1)."""
+    size = max(abs(x), max(abs(y), abs(z)))
+    # A NaN may hide in the maximum, yet not in the sum.
+    if size < FARTHEST and abs(x + y + z) < 4 * FARTHEST:
+        return x, y, z, size, 0
+    zero = np.float32(0.0)
+    return zero, zero, zero, zero, 1
+
+
 @njit(parallel=True)
 def _copy_vertices(source: Any, target: Any) -> Any:
     """Copy usable vertices, put the others at the origin: how many those are, how many moved, largest coordinate."""
@@ -216,11 +227,8 @@ def _copy_vertices(source: Any, target: Any) -> Any:
         far = np.float32(0.0)
         for i in range(block * _BLOCK, min(n, (block + 1) * _BLOCK)):
             x, y, z = source[i, 0], source[i, 1], source[i, 2]
-            size = max(abs(x), max(abs(y), abs(z)))
-            # A NaN may hide in the maximum, yet not in the sum.
-            if not (size < FARTHEST and abs(x + y + z) < 4 * FARTHEST):
-                x = y = z = size = np.float32(0.0)
-                lost += 1
+            x, y, z, size, unusable = _usable(x, y, z)
+            lost += unusable
             if x != target[i, 0] or y != target[i, 1] or z != target[i, 2]:
                 target[i, 0], target[i, 1], target[i, 2] = x, y, z
                 changed += 1
@@ -248,10 +256,8 @@ def _move_vertices(source: Any, matrix: Any, target: Any) -> Any:
             x = np.float32(m00 * a + m01 * b + m02 * c + m03)
             y = np.float32(m10 * a + m11 * b + m12 * c + m13)
             z = np.float32(m20 * a + m21 * b + m22 * c + m23)
-            size = max(abs(x), max(abs(y), abs(z)))
-            if not (size < FARTHEST and abs(x + y + z) < 4 * FARTHEST):
-                x = y = z = size = np.float32(0.0)
-                lost += 1
+            x, y, z, size, unusable = _usable(x, y, z)
+            lost += unusable
             if x != target[i, 0] or y != target[i, 1] or z != target[i, 2]:
                 target[i, 0], target[i, 1], target[i, 2] = x, y, z
                 changed += 1
