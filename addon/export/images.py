@@ -10,6 +10,7 @@ from typing import Any
 import bpy
 import numpy as np
 
+from ...drgs_blender.colour import linear_to_srgb, srgb_to_linear
 from ...drgs_blender.frame import Image
 
 Array = np.ndarray
@@ -57,7 +58,7 @@ def mean_colour(picture: Image) -> Array:
     if picture.pixels.dtype == np.uint8:
         some /= 255
     if picture.encoding == "srgb":
-        some[:, :3] = decoded(some[:, :3])
+        some[:, :3] = srgb_to_linear(some[:, :3])
     some = some[np.isfinite(some).all(axis=1)]
     return some.mean(axis=0) if len(some) else np.zeros(4)
 
@@ -79,7 +80,7 @@ def export_curved(image: bpy.types.Image, straight: bool, source: str, curve: by
     plain = export_image(image, straight, warn)
     values = np.frombuffer(curve, np.float32).reshape(256, 3)
     number = bool((np.ptp(values, axis=1) < 1e-6).all()) and source != "rgb"
-    table = np.rint(255 * (values if number else encoded(values))).astype(np.uint8)
+    table = np.rint(255 * (values if number else linear_to_srgb(values))).astype(np.uint8)
 
     def make(_: bpy.types.Image) -> Image:
         pixels = plain.pixels.copy()
@@ -96,16 +97,6 @@ def is_grey(picture: Image) -> bool:
     """Whether red, green and blue are the same, in some 65 thousand of its pixels at most."""
     some = _some(picture)
     return bool((some[:, 0] == some[:, 1]).all() and (some[:, 0] == some[:, 2]).all())
-
-
-def decoded(values: Array) -> Array:
-    """sRGB -> linear."""
-    return np.where(values <= 0.04045, values / 12.92, ((np.maximum(values, 0) + 0.055) / 1.055) ** 2.4)
-
-
-def encoded(values: Array) -> Array:
-    """Linear -> sRGB."""
-    return np.where(values <= 0.0031308, values * 12.92, 1.055 * np.maximum(values, 0) ** (1 / 2.4) - 0.055)
 
 
 def end_export() -> None:
@@ -152,7 +143,7 @@ def _linear(image: bpy.types.Image) -> Array | None:
         return None
     pixels = pixels[..., :3] if pixels.shape[2] >= 3 else np.repeat(pixels[..., :1], 3, axis=2)
     if _is_srgb(image):
-        pixels = decoded(pixels)
+        pixels = srgb_to_linear(pixels)
     pixels = np.array(pixels, np.float32, order="C")
     pixels.flags.writeable = False
     return pixels

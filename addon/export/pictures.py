@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import bpy
 import numpy as np
 
+from ...drgs_blender.colour import srgb_to_linear
 from ...drgs_blender.frame import Image, Texture
 from . import images
 from .nodes import LUMINANCE
@@ -97,7 +98,7 @@ class Picture:
         else:
             values = np.repeat(np.arange(256)[:, None] / 255, 3, axis=1)
             if plain.encoding == "srgb" and self.channel != "a":
-                values = images.decoded(values)
+                values = srgb_to_linear(values)
         if self.channel == "rgb":
             return values, self.source
         if self.channel == "luminance":
