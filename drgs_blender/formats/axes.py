@@ -11,6 +11,7 @@ import numpy as np
 
 from ..asset import Surfels
 from .files import MeshFile
+from .harmonics import rotate_harmonics, whole_bands
 
 Array = np.ndarray
 
@@ -39,16 +40,32 @@ def vectors_to_z_up(vectors: Array, up: str = "y") -> Array:
     return np.ascontiguousarray(vectors[..., source] * sign)
 
 
-def surfels_to_z_up(surfels: Surfels, up: str = "y") -> Surfels:
-    """Turn surfels from `up` to Z up: centres and rotations.
+def vectors_from_z_up(vectors: Array, up: str = "y") -> Array:
+    """Turn (..., 3) positions or directions from Z up to `up`; same dtype."""
+    return vectors_to_z_up(vectors, {"y": "-y", "-y": "y"}.get(up, up))  # the turns about X undo each other
 
-    Spherical harmonics stay in the old axes (they are kept as captured, not shaded with).
-    """
+
+def from_z_up(up: str) -> tuple[Array, Array]:
+    """The rotation from Z up to `up`: (3, 3) matrix and wxyz quaternion."""
+    return UP_AXES[up].T, _QUATERNIONS[up] * np.array([1.0, -1.0, -1.0, -1.0])
+
+
+def surfels_to_z_up(surfels: Surfels, up: str = "y") -> Surfels:
+    """Turn surfels from `up` to Z up: centres, rotations and captured colours."""
+    sh = surfels.sh
     return replace(
         surfels,
         centre=vectors_to_z_up(surfels.centre, up),
         rotation=multiply_quaternions(_QUATERNIONS[up], surfels.rotation).astype(np.float32),
+        sh=sh if sh is None or up == "z" else rotate_harmonics(whole_bands(sh), UP_AXES[up]),
     )
+
+
+def scaled_surfels(surfels: Surfels, factor: float) -> Surfels:
+    """Surfels with all lengths times `factor`."""
+    by = np.float32(factor)
+    extras = {name: v * by if name == "thickness" else v for name, v in surfels.extras.items()}
+    return replace(surfels, centre=surfels.centre * by, scale=surfels.scale * by, extras=extras)
 
 
 def mesh_to_z_up(mesh: MeshFile, up: str = "y") -> MeshFile:

@@ -1,13 +1,16 @@
-"""Radiance out of OpenEXR files: whichever part or layer holds R, G and B, or luminance alone."""
+"""Radiance out of OpenEXR files, whichever part or layer holds R, G and B, or luminance alone; and into them."""
 
 from __future__ import annotations
 
+import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..errors import AssetError
+from ..asset import Environment
+from ..asset.archive import replace_file
+from ..errors import AssetError, WriteError
 
 Array = np.ndarray
 
@@ -119,3 +122,27 @@ def _rgb_to_xyz(chromaticities: Array) -> Array:
     x, y = chromaticities[0::2], chromaticities[1::2]
     xyz = np.stack([x / y, np.ones(4), (1 - x - y) / y])
     return xyz[:, :3] * np.linalg.solve(xyz[:, :3], xyz[:, 3])
+
+
+def write_exr_environment(path: Path, environment: Environment) -> None:
+    """Write distant light as a lat-long picture in Blender's mapping: 32-bit R, G, B. Raises WriteError."""
+    write_exr_picture(path, environment.radiance)
+
+
+def write_exr_picture(path: Path, pixels: Array) -> None:
+    """Write (h, w, 3 or 4) float32, linear Rec.709, row 0 at the top, as 32-bit R, G, B (, A). Raises WriteError."""
+    import OpenEXR
+
+    header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
+    planes = {
+        name: np.ascontiguousarray(pixels[..., i], np.float32) for i, name in enumerate("RGBA"[: pixels.shape[2]])
+    }
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            temporary = Path(folder) / "picture.exr"
+            with OpenEXR.File(header, planes) as file:
+                file.write(str(temporary))
+            data = temporary.read_bytes()
+    except (OSError, RuntimeError, ValueError) as error:
+        raise WriteError(str(path), f"cannot be written ({error})", "Check the free space on the disk") from error
+    replace_file(path, [data])

@@ -26,12 +26,14 @@ class SurfelFile:
     layout : which program writes such files
     unknown : properties of the file that the layout does not name
     notes : what was converted, dropped or assumed
+    up : the up axis that the format prescribes (a key of ``axes.UP_AXES``); None where it prescribes none
     """
 
     surfels: Surfels
     layout: str
     unknown: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    up: str | None = None
 
 
 @dataclass(slots=True)

@@ -6,6 +6,7 @@ that never confuses two layouts. Sources: the public training code of each proje
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -165,8 +166,11 @@ def read_gaussian_ply(path: Path) -> SurfelFile:
     return decode_splats(header, elements.get("vertex"), str(path))
 
 
-def decode_splats(header: Header, rows: Rows | None, subject: str) -> SurfelFile:
-    """Turn the rows of the element ``vertex`` into activated surfels."""
+def decode_splats(header: Header, rows: Rows | None, subject: str, sh: Array | None = None) -> SurfelFile:
+    """Turn the rows of the element ``vertex`` into activated surfels.
+
+    `sh` (n, k, 3) stands for the columns of harmonics where a format stores them otherwise.
+    """
     if rows is None or rows.lists:
         raise AssetError(subject, "has no element 'vertex' of plain numbers", _REMEDY)
     columns = rows.columns
@@ -193,7 +197,8 @@ def decode_splats(header: Header, rows: Rows | None, subject: str) -> SurfelFile
         extras: dict[str, Array] = {}
         if layout.name == "GaussianMesh":
             centre, extras["barycentric"] = _decode_face_positions(columns, centre, notes)
-        sh = _harmonics(columns, names, used, subject)
+        if sh is None:
+            sh = _harmonics(columns, names, used, subject)
         material = {
             "albedo": _albedo(layout, take, sh, notes),
             "roughness": _scalar(layout.roughness, take, 0.5, len(centre)),
@@ -202,11 +207,16 @@ def decode_splats(header: Header, rows: Rows | None, subject: str) -> SurfelFile
     if layout.roughness is None:
         notes.append("has no materials: roughness 0.5 and metallic 0 are used")
     if axes.shape[1] == 3:
+        extras["thickness"] = axes.min(axis=1)
         rotation, axes = _flatten(rotation, axes, notes)
     finite = np.ones(len(centre), bool)
     for array in (centre, opacity, axes, rotation, *material.values(), *([] if sh is None else [sh])):
-        finite &= np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
-    finite &= (np.abs(centre) <= FARTHEST).all(axis=1)
+        good = np.isfinite(array)
+        if not good.all():  # almost never; row by row takes many times as long
+            finite &= good.reshape(len(centre), math.prod(array.shape[1:])).all(axis=1)
+    near = np.abs(centre) <= FARTHEST
+    if not near.all():
+        finite &= near.all(axis=1)
     extras |= _extras(columns, names - used)
     keep: Array | slice = slice(None)
     if dropped := int(np.count_nonzero(~finite)):
@@ -230,17 +240,26 @@ def decode_splats(header: Header, rows: Rows | None, subject: str) -> SurfelFile
 
 def stack(columns: Columns, names: tuple[str, ...]) -> Array:
     """Columns side by side as (n, len(names)) float32."""
+    result = np.empty((len(columns[names[0]]), len(names)), np.float32)
+    beside = _beside(columns, names)
+    if beside is not None:
+        result[:] = beside
+    else:
+        for i, name in enumerate(names):
+            result[:, i] = columns[name]
+    return result
+
+
+def _beside(columns: Columns, names: tuple[str, ...]) -> Array | None:
+    """Columns that are neighbours in the file as one view of it, which is passed over once; None where they are not."""
     arrays = [columns[name] for name in names]
     first = arrays[0]
-    result = np.empty((len(first), len(names)), np.float32)
-    if all(a.dtype == np.float32 and a.strides == first.strides for a in arrays) and all(
-        a.ctypes.data == first.ctypes.data + 4 * i for i, a in enumerate(arrays)
-    ):  # neighbours in the file: one pass over memory
-        result[:] = np.lib.stride_tricks.as_strided(first, result.shape, (*first.strides, 4), writeable=False)
-    else:
-        for i, array in enumerate(arrays):
-            result[:, i] = array
-    return result
+    if not all(a.dtype == np.float32 and a.strides == first.strides for a in arrays):
+        return None
+    if not all(a.ctypes.data == first.ctypes.data + 4 * i for i, a in enumerate(arrays)):
+        return None
+    shape = (len(first), len(names))
+    return np.lib.stride_tricks.as_strided(first, shape, (*first.strides, 4), writeable=False)
 
 
 def _albedo(layout: Layout, take: Callable[[tuple[str, ...]], Array], sh: Array | None, notes: list[str]) -> Array:
@@ -274,7 +293,10 @@ def _harmonics(columns: Columns, names: set[str], used: set[str], subject: str) 
     sh = np.empty((len(columns["x"]), 1 + per_channel, 3), np.float32)
     sh[:, 0] = stack(columns, dc)
     if rest:
-        sh[:, 1:] = stack(columns, tuple(rest)).reshape(-1, 3, per_channel).transpose(0, 2, 1)
+        beside = _beside(columns, tuple(rest))
+        for channel in range(3):
+            names_of = slice(channel * per_channel, (channel + 1) * per_channel)
+            sh[:, 1:, channel] = stack(columns, tuple(rest[names_of])) if beside is None else beside[:, names_of]
     return sh
 
 

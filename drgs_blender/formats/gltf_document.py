@@ -231,8 +231,10 @@ def _split_glb(data: bytes, subject: str) -> tuple[bytes, bytes | None]:
     if len(data) < 20:
         raise AssetError(subject, "is a truncated GLB", _DAMAGED)
     _, version, length = struct.unpack_from("<4sII", data)
-    if version != 2 or length > len(data):
-        raise AssetError(subject, f"is GLB of version {version} or truncated ({length} of {len(data)} bytes)", _DAMAGED)
+    if version != 2:
+        raise AssetError(subject, f"is GLB of version {version}; 2 is read", _DAMAGED)
+    if length > len(data):
+        raise AssetError(subject, f"is a truncated GLB: {len(data)} of {length} bytes are there", _DAMAGED)
     chunks: list[tuple[bytes, bytes]] = []
     position = 12
     while position + 8 <= length:

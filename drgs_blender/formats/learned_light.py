@@ -5,7 +5,7 @@ Torch is imported only here, and files are loaded with ``weights_only=True``: no
 
 from __future__ import annotations
 
-import pickle
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -54,15 +54,29 @@ def read_learned_light(path: Path) -> EnvironmentFile:
 
 
 def _load(path: Path) -> Any:
+    _refuse_bomb(path)
     try:
         import torch
     except ImportError as error:
         raise DeviceError(str(path), "needs torch to be read", "Install it: pip install torch") from error
     try:
         return torch.load(path, map_location="cpu", weights_only=True)
-    except (RuntimeError, OSError, EOFError, ValueError, KeyError, pickle.UnpicklingError) as error:
-        reason = str(error).splitlines()[0][:120]
+    except Exception as error:  # torch's unpickler raises whatever a damaged file leads it to
+        reason = str(error).strip().partition("\n")[0][:120] or type(error).__name__
         raise AssetError(str(path), f"cannot be loaded safely ({reason})", "Export the light as .exr") from error
+
+
+def _refuse_bomb(path: Path) -> None:
+    """Torch does not compress: a zip whose members are larger than it is was not written by it."""
+    if not zipfile.is_zipfile(path):
+        return
+    try:
+        with zipfile.ZipFile(path) as archive:
+            size = sum(member.file_size for member in archive.infolist())
+    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as error:
+        raise AssetError(str(path), f"is a damaged zip ({error})", "Restore it from a copy") from error
+    if size > path.stat().st_size:
+        raise AssetError(str(path), f"would unpack to {size} bytes", "Save the light with torch again")
 
 
 def _base(content: Any, subject: str) -> Any:

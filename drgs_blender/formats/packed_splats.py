@@ -1,6 +1,6 @@
 """Small containers of 3D splats: ``.splat`` (32 bytes a splat) and PlayCanvas's compressed PLY.
 
-They hold position, scale, rotation, opacity and colour only; decoding yields the columns of a 3DGS file.
+Decoding yields the columns of a 3DGS file.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from ..errors import AssetError
 from .files import SurfelFile
 from .gaussian_ply import SH_C0, decode_splats
 from .ply import Element, Header, Property, Rows, read_ply
+from .quaternions import from_smallest_three
 
 Array = np.ndarray
 
@@ -45,7 +46,9 @@ def read_splat(path: Path) -> SurfelFile:
     table = np.frombuffer(data, _SPLAT)
     colour = table["colour"].astype(np.float32) / 255.0
     rotation = (table["rotation"].astype(np.float32) - 128.0) / 128.0
-    return _decode(table["position"], _log(table["scale"]), rotation, colour, path, "splat")
+    return decode_arrays(
+        table["position"], log_scale(table["scale"]), rotation, colour[:, 3], dc_of(colour), path, "splat"
+    )
 
 
 def is_compressed(header: Header) -> bool:
@@ -82,7 +85,26 @@ def read_compressed_ply(path: Path) -> SurfelFile:
     if "min_r" in chunk and "max_b" in chunk:
         colour[:, :3] = between(colour[:, :3], ("r", "g", "b"))
     rotation = _smallest_three(vertex["packed_rotation"])
-    return _decode(position, scale, rotation, colour, path, "compressed PLY")
+    sh = _harmonics(dc_of(colour), elements["sh"].columns if "sh" in elements else {}, str(path))
+    return decode_arrays(position, scale, rotation, colour[:, 3], sh, path, "compressed PLY")
+
+
+def _harmonics(dc: Array, columns: dict[str, Array], subject: str) -> Array:
+    """`dc` (n, 1, 3) with the higher bands after it: bytes over -4 to 4, all of red, then green, then blue."""
+    per_channel = len(columns) // 3
+    if per_channel not in (3, 8, 15):
+        return dc
+    names = [f"f_rest_{i}" for i in range(3 * per_channel)]
+    if any(n not in columns or columns[n].dtype != np.uint8 or len(columns[n]) != len(dc) for n in names):
+        raise AssetError(subject, "has harmonics that do not fit its splats", "Export it again")
+    sh = np.empty((len(dc), 1 + per_channel, 3), np.float32)
+    sh[:, :1] = dc
+    # The outermost bytes stand for the ends of the range, the others for the middles of equal steps.
+    values = ((np.arange(256, dtype=np.float32) + 0.5) / 256 - 0.5) * 8
+    values[0], values[255] = -4, 4
+    for i, name in enumerate(names):
+        sh[:, 1 + i % per_channel, i // per_channel] = values[columns[name]]
+    return sh
 
 
 def _bits(packed: Array, widths: tuple[int, ...]) -> Array:
@@ -99,33 +121,38 @@ def _smallest_three(packed: Array) -> Array:
     """wxyz quaternions: two bits say which component is the largest, ten bits hold each of the others."""
     fields = _bits(packed, (2, 10, 10, 10))
     largest = np.rint(fields[:, 0] * 3).astype(np.int64)
-    others = (fields[:, 1:] - 0.5) * np.sqrt(np.float32(2))
-    rotation = np.empty((len(packed), 4), np.float32)
-    for k in range(4):
-        here = largest == k
-        rotation[np.ix_(here, [i for i in range(4) if i != k])] = others[here]
-        rotation[here, k] = np.sqrt(np.maximum(1.0 - np.square(others[here]).sum(axis=1), 0.0))
-    return rotation
+    return from_smallest_three(largest, (fields[:, 1:] - 0.5) * np.sqrt(np.float32(2)))
 
 
-def _log(values: Array) -> Array:
+def log_scale(scale: Array) -> Array:
+    """Logarithm of linear scales; -inf and NaN are dealt with where splats are decoded."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.log(values)
+        return np.log(scale)
 
 
-def _decode(position: Array, log_scale: Array, rotation: Array, colour: Array, path: Path, layout: str) -> SurfelFile:
-    """Give the values the names of a 3DGS file and decode that. `colour` is RGB and opacity in [0, 1]."""
-    opacity = np.clip(colour[:, 3].astype(np.float64), 1e-6, 1 - 1e-6)
-    columns: dict[str, Array] = {"opacity": np.log(opacity / (1 - opacity)).astype(np.float32)}
+def dc_of(colour: Array) -> Array:
+    """(n, 1, 3) harmonics of colours (n, 3 or more) in [0, 1] as 3DGS shows them."""
+    return ((colour[:, None, :3] - 0.5) / SH_C0).astype(np.float32)
+
+
+def decode_arrays(
+    position: Array, scale: Array, rotation: Array, opacity: Array, sh: Array, path: Path, layout: str
+) -> SurfelFile:
+    """Give the values the names of a 3DGS file and decode that.
+
+    `scale` is logarithmic, `opacity` in [0, 1], `rotation` wxyz, `sh` (n, k, 3) float32.
+    """
+    clipped = np.clip(opacity.astype(np.float64), 1e-6, 1 - 1e-6)
+    columns: dict[str, Array] = {"opacity": np.log(clipped / (1 - clipped)).astype(np.float32)}
     groups: list[tuple[tuple[str, ...], Any]] = [
         (("x", "y", "z"), position),
-        (("scale_0", "scale_1", "scale_2"), log_scale),
+        (("scale_0", "scale_1", "scale_2"), scale),
         (("rot_0", "rot_1", "rot_2", "rot_3"), rotation),
-        (("f_dc_0", "f_dc_1", "f_dc_2"), (colour[:, :3] - 0.5) / SH_C0),
     ]
     for names, values in groups:
-        columns |= {name: np.asarray(values[:, i], np.float32) for i, name in enumerate(names)}
+        table = np.ascontiguousarray(values, np.float32)
+        columns |= {name: table[:, i] for i, name in enumerate(names)}
     element = Element("vertex", len(position), tuple(Property(name, "f4") for name in columns))
-    file = decode_splats(Header((element,), "<", 0), Rows(element, columns), str(path))
+    file = decode_splats(Header((element,), "<", 0), Rows(element, columns), str(path), sh)
     file.layout = layout
     return file

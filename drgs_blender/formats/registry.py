@@ -8,17 +8,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
 from ..asset import Environment
 from ..errors import AssetError
+from ..filetypes import READ, Kind
 from .environment import read_exr_environment, read_hdr_environment, read_picture_environment
 from .files import EnvironmentFile, MaterialsFile, MeshFile, SurfelFile
 from .gaussian_ply import LAYOUTS, is_gaussian, read_gaussian_ply
 from .gltf import read_gltf
 from .gltf_nodes import Pose
+from .gltf_splats import has_splats, read_gltf_splats
+from .ksplat import read_ksplat, sniff_ksplat
 from .learned_light import LEGACY, ZIP, read_learned_light
 from .materials import is_nero_folder, read_nero_materials
 from .mesh import sanitise
@@ -26,8 +28,11 @@ from .obj import read_obj
 from .packed_splats import is_compressed, read_compressed_ply, read_splat, sniff_splat
 from .ply import HEADER_LIMIT, parse_header
 from .ply_mesh import read_ply_mesh
+from .sog import read_sog, sniff_sog
+from .spz import read_spz, sniff_spz
+from .usd_splats import read_usd_splats, sniff_usd
+from .writers import WRITERS
 
-Kind = Literal["surfels", "mesh", "environment", "materials"]
 AnyFile = SurfelFile | MeshFile | EnvironmentFile | MaterialsFile
 
 
@@ -37,20 +42,26 @@ class Format:
 
     Attributes
     ----------
-    name : shown to users
-    extensions : usual file names, for file dialogs; never decides alone
-    kind : what comes out
+    name : shown to users; the key of its `filetypes.ReadType`
     sniff : (first bytes, path) -> whether the file is of this format
     read : path -> what comes out
     note : one line for the documentation
     """
 
     name: str
-    extensions: tuple[str, ...]
-    kind: Kind
     sniff: Callable[[bytes, Path], bool]
     read: Callable[[Path], AnyFile]
     note: str
+
+    @property
+    def extensions(self) -> tuple[str, ...]:
+        """Usual endings of file names."""
+        return READ[self.name].extensions
+
+    @property
+    def kind(self) -> Kind:
+        """What comes out."""
+        return READ[self.name].kind
 
 
 def _ply(test: Callable[..., bool]) -> Callable[[bytes, Path], bool]:
@@ -95,76 +106,86 @@ def _read_gltf(path: Path, pose: Pose = "rest") -> MeshFile:
 FORMATS: tuple[Format, ...] = (
     Format(
         "Gaussian PLY",
-        (".ply",),
-        "surfels",
         _ply(is_gaussian),
         read_gaussian_ply,
         f"{', '.join(dict.fromkeys(layout.name for layout in LAYOUTS))}; gsplat and SuGaR write 3DGS's",
     ),
     Format(
         "compressed PLY",
-        (".ply",),
-        "surfels",
         _ply(is_compressed),
         read_compressed_ply,
-        "PlayCanvas and SuperSplat; 3D splats, flattened",
+        "PlayCanvas and SuperSplat, with harmonics; 3D splats, flattened",
     ),
-    Format("splat", (".splat",), "surfels", sniff_splat, read_splat, "32 bytes a splat; 3D splats, flattened"),
+    Format(
+        "SPZ",
+        sniff_spz,
+        read_spz,
+        "Niantic, versions 2 to 4; 3D splats, flattened; Y up, turned to Z up on import",
+    ),
+    Format(
+        "SOG",
+        sniff_sog,
+        read_sog,
+        "PlayCanvas, versions 1 and 2, zipped or meta.json beside its pictures; 3D splats, flattened",
+    ),
+    Format(
+        "glTF splats",
+        lambda head, path: _sniff_gltf(head, path) and has_splats(head),
+        read_gltf_splats,
+        "KHR_gaussian_splatting; 3D splats, flattened; Y up, turned to Z up on import; not compressed ones",
+    ),
+    Format(
+        "USD",
+        sniff_usd,
+        read_usd_splats,
+        "ParticleField3DGaussianSplat; 3D splats, flattened; turned to Z up on import; needs usd-core",
+    ),
+    Format("splat", sniff_splat, read_splat, "32 bytes a splat; 3D splats, flattened"),
+    Format(
+        "ksplat",
+        sniff_ksplat,
+        read_ksplat,
+        "GaussianSplats3D, all compression levels; 3D splats, flattened",
+    ),
     Format(
         "PLY mesh",
-        (".ply",),
-        "mesh",
         _ply(lambda header: header.element("vertex") is not None),
         lambda path: sanitise(read_ply_mesh(path)),
         "any encoding; polygons, strips, points; sRGB vertex colours or DR-GS's own linear channels",
     ),
     Format(
         "glTF 2.0",
-        (".glb", ".gltf"),
-        "mesh",
         _sniff_gltf,
         _read_gltf,
         "metallic-roughness materials; skins in Blender's rest pose; turned to Z up; not Draco or meshopt",
     ),
     Format(
         "Wavefront OBJ",
-        (".obj",),
-        "mesh",
         _sniff_obj,
         lambda path: sanitise(read_obj(path)),
         "with MTL (Kd, map_Kd, Ns, Pr, Pm)",
     ),
-    Format(
-        "Radiance HDR", (".hdr",), "environment", _magic(b"#?"), read_hdr_environment, "RGBE and XYZE, old and new runs"
-    ),
+    Format("Radiance HDR", _magic(b"#?"), read_hdr_environment, "RGBE and XYZE, old and new runs"),
     Format(
         "OpenEXR",
-        (".exr",),
-        "environment",
         _magic(b"\x76\x2f\x31\x01"),
         read_exr_environment,
         "lat-long or cube map; any part or layer with RGB, or luminance",
     ),
     Format(
         "picture",
-        (".png", ".jpg", ".jpeg", ".webp"),
-        "environment",
         lambda head, path: head.startswith((b"\x89PNG", b"\xff\xd8\xff")) or head[8:12] == b"WEBP",
         read_picture_environment,
         "display-referred, decoded from sRGB",
     ),
     Format(
         "learned light",
-        (".map", ".pth"),
-        "environment",
         _sniff_torch,
         read_learned_light,
         "IRGS and Ref-Gaussian; needs torch",
     ),
     Format(
         "NeRO materials",
-        (".npy",),
-        "materials",
         lambda head, path: is_nero_folder(path) or (head.startswith(b"\x93NUMPY") and is_nero_folder(path.parent)),
         read_nero_materials,
         "folder with albedo.npy, metallic.npy, roughness.npy, one row a vertex",
@@ -260,14 +281,35 @@ def read_materials(path: str | Path) -> MaterialsFile:
 def document() -> str:
     """The text of docs/formats.md."""
     lines = [
-        "# Files that can be read",
+        "# Files that are read and written",
         "",
-        "Made from the table in `drgs_blender/formats/registry.py`; a test holds them together. Files are recognised",
-        "by their content; the extensions are only what such files are usually called.",
+        "Made from the tables in `drgs_blender/formats/registry.py` and `writers.py`; a test holds them together.",
+        "",
+        "## Read",
+        "",
+        "Files are recognised by their content; the extensions are only what such files are usually called. Splats of",
+        "three scales become surfels: the shortest axis is dropped and becomes the normal, and the report counts those",
+        "that were far from flat. Where a file has no materials, the albedo is the captured colour decoded from sRGB,",
+        "the roughness 0.5 and the metallic 0; `drgs import --remove-light` estimates the albedo instead, from the",
+        "light of the capture.",
         "",
         "| Format | Usual names | Becomes | Remarks |",
         "|---|---|---|---|",
         *(f"| {f.name} | {' '.join(f.extensions)} | {f.kind} | {f.note} |" for f in FORMATS),
+        "",
+        "## Written",
+        "",
+        "`drgs convert IN OUT` writes them, and Blender's File > Export. An asset is Z up. A surfel becomes a splat",
+        "whose third axis, along the normal, is that of the splat it was read from, else a hundredth of the shorter of",
+        "the others. Both read and write sequences, a file a frame.",
+        "",
+        "| Format | Names | From | Up axis | Kept | Lost |",
+        "|---|---|---|---|---|---|",
+        *(
+            f"| {w.name} | {' '.join(w.extensions)} | {w.kind} | {w.up.upper()}{'' if w.fixed else ', or --up'} "
+            f"| {w.kept} | {w.lost} |"
+            for w in WRITERS
+        ),
         "",
         "## Gaussian PLY layouts",
         "",

@@ -253,6 +253,17 @@ def test_faces_beyond_the_vertices_are_refused(tmp_path: Path) -> None:
         read_mesh(b.write(tmp_path / "a.gltf"))
 
 
+def test_truncated_glb_says_how_much_of_it_is_there(tmp_path: Path) -> None:
+    path = quad().write(tmp_path / "a.glb", True)
+    data = path.read_bytes()
+    path.write_bytes(data[:100])
+    with pytest.raises(AssetError, match=f"truncated GLB: 100 of {len(data)} bytes"):
+        read_mesh(path)
+    path.write_bytes(data[:4] + struct.pack("<I", 1) + data[8:])
+    with pytest.raises(AssetError, match="version 1; 2 is read"):
+        read_mesh(path)
+
+
 @pytest.mark.parametrize("glb", [False, True])
 def test_gltf_mutants_never_crash(tmp_path: Path, glb: bool) -> None:
     data = quad({"rotation": [0, 0, 0, 1]}).write(tmp_path / "a.gltf", glb).read_bytes()

@@ -1,0 +1,114 @@
+"""The materials of a mesh as pictures that every engine knows: a place in them for each triangle."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+
+import numpy as np
+from PIL import Image as Pillow
+
+from ..asset import Mesh
+from ..colour import linear_to_srgb
+from ..errors import UsageError
+
+Array = np.ndarray
+
+#: Texels along the side of a square that two triangles share. The corners of each lie on the centres of texels one
+#: apart, and all texels that filtering can touch from inside a triangle are its own.
+CELL = 4
+#: The three texels of a triangle and the others that it touches, from its first corner; the other triangle of the
+#: square is turned by half a turn.
+_OFFSETS = np.array([(i, j) for i in range(CELL - 1) for j in range(CELL - 1 - i)])
+#: Largest side of a texture that everything reads.
+_LARGEST = 16384
+#: Materials that differ by less than this are one.
+_SAME = 1 / 512
+
+
+@dataclass(slots=True)
+class Plain:
+    """One material for the whole mesh; linear Rec.709."""
+
+    colour: tuple[float, float, float]
+    roughness: float
+    metallic: float
+
+
+@dataclass(slots=True)
+class Textured:
+    """Materials in pictures.
+
+    Attributes
+    ----------
+    colour : PNG of the base colour, sRGB
+    surface : PNG whose green is the roughness and whose blue is the metallic (glTF)
+    uvs : (m, 3, 2) float32 of the corners of the triangles, the origin at the upper left (glTF)
+    """
+
+    colour: bytes
+    surface: bytes
+    uvs: Array
+
+
+def mesh_material(mesh: Mesh, subject: str) -> Plain | Textured:
+    """What the surface of `mesh` looks like to other programs.
+
+    Each triangle has a place of its own in the pictures, where they hold the interpolation of its corners' materials;
+    without mip maps that is what is shown.
+
+    Raises
+    ------
+    UsageError
+        The mesh has no faces, or more than a picture has room for; names `subject`.
+    """
+    if not len(mesh.faces):
+        raise UsageError(subject, "would hold a mesh without faces", "Choose an asset that has a mesh, or --as splats")
+    values = np.concatenate([mesh.albedo, mesh.roughness[:, None], mesh.metallic[:, None]], axis=1).clip(0, 1)
+    used = values[np.unique(mesh.faces)]
+    if np.ptp(used, axis=0).max() < _SAME:
+        red, green, blue, roughness, metallic = np.median(used, axis=0).tolist()
+        return Plain((red, green, blue), roughness, metallic)
+    texels, uvs = bake_atlas(values[mesh.faces], subject)
+    surface = np.insert(texels[..., 3:], 0, 0.0, axis=2)
+    return Textured(_png(linear_to_srgb(texels[..., :3])), _png(surface), uvs)
+
+
+def bake_atlas(corner_values: Array, subject: str) -> tuple[Array, Array]:
+    """Textures in which each triangle has a place of its own.
+
+    Parameters
+    ----------
+    corner_values : (m, 3, c) values at the corners of triangles
+    subject : named in errors
+
+    Returns
+    -------
+    texels : (s, s, c) float32, row 0 at the top; filtered linearly they are the interpolation of the corners' values
+    uvs : (m, 3, 2) float32, the origin at the upper left (glTF)
+    """
+    m, _, channels = corner_values.shape
+    squares = -(-m // 2)
+    across = int(np.ceil(np.sqrt(squares)))
+    size = across * CELL
+    if size > _LARGEST:
+        raise UsageError(subject, f"would need a texture {size} texels wide for {m} triangles", "Reduce the mesh first")
+    square = np.arange(m) // 2
+    second = np.arange(m) % 2 == 1
+    origin = np.stack([square % across, square // across], axis=1) * CELL
+    direction = np.where(second, -1, 1)
+    start = origin + np.where(second, CELL - 1, 0)[:, None]
+    texels = np.zeros((size, size, channels), np.float32)
+    a, b, c = (corner_values[:, k].astype(np.float32) for k in range(3))
+    for i, j in _OFFSETS.tolist():
+        place = start + direction[:, None] * [i, j]
+        texels[place[:, 1], place[:, 0]] = np.clip(a + i * (b - a) + j * (c - a), 0, 1)
+    steps = np.array([[0, 0], [1, 0], [0, 1]])
+    centres = start[:, None] + direction[:, None, None] * steps + 0.5
+    return texels, (centres / size).astype(np.float32)
+
+
+def _png(picture: Array) -> bytes:
+    data = io.BytesIO()
+    Pillow.fromarray(np.rint(np.clip(picture, 0, 1) * 255).astype(np.uint8)).save(data, "PNG", compress_level=4)
+    return data.getvalue()

@@ -1,0 +1,44 @@
+"""Splats written as the PLY of 3D Gaussian Splatting, which every viewer of splats reads."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from ..asset.archive import replace_file
+from .splats import Splats
+
+Array = np.ndarray
+
+#: Splats turned into rows at once; bounds the memory.
+_BLOCK = 1 << 16
+#: Opacities of 0 and 1 have no finite logit.
+_EDGE = 1e-6
+
+
+def write_splat_ply(path: Path, splats: Splats) -> None:
+    """Write `splats` to `path`, in the axes they have. Raises WriteError."""
+    replace_file(path, _parts(splats))
+
+
+def _parts(splats: Splats) -> Iterator[bytes | memoryview]:
+    n, k = splats.sh.shape[:2]
+    names = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3))]
+    names += [f"f_rest_{i}" for i in range(3 * (k - 1))]
+    names += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {n}"]
+    header += [f"property float {name}" for name in names]
+    yield "\n".join([*header, "end_header\n"]).encode()
+    for start in range(0, n, _BLOCK):
+        rows = slice(start, min(start + _BLOCK, n))
+        table = np.zeros((rows.stop - start, len(names)), "<f4")
+        table[:, :3] = splats.centre[rows]
+        table[:, 6:9] = splats.sh[rows, 0]
+        table[:, 9 : 9 + 3 * (k - 1)] = splats.sh[rows, 1:].transpose(0, 2, 1).reshape(len(table), -1)  # R, G, B
+        opacity = np.clip(splats.opacity[rows].astype(np.float64), _EDGE, 1 - _EDGE)
+        table[:, -8] = np.log(opacity / (1 - opacity))
+        table[:, -7:-4] = np.log(splats.scale[rows])
+        table[:, -4:] = splats.rotation[rows]
+        yield memoryview(table).cast("B")

@@ -1,0 +1,102 @@
+"""3D Gaussian splats as every other program knows them, and the way from surfels to them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..asset import Surfels
+from ..colour import linear_to_srgb
+from .axes import from_z_up, multiply_quaternions, vectors_from_z_up
+from .gaussian_ply import SH_C0
+from .harmonics import rotate_harmonics, whole_bands
+
+Array = np.ndarray
+
+#: Thickness of an exported surfel as part of its shorter axis: flat to every reader, and no singular matrix.
+THICKNESS = 0.01
+#: Shortest axis written, metres: the logarithm of 0 is not finite.
+SHORTEST = 1e-9
+
+
+@dataclass(slots=True)
+class Splats:
+    """3D Gaussians, activated.
+
+    Attributes
+    ----------
+    centre : (n, 3) float32, metres
+    scale : (n, 3) float32, metres, linear: standard deviations along the rotated X, Y and Z axes
+    rotation : (n, 4) float32 unit quaternion wxyz
+    opacity : (n,) float32 in [0, 1]
+    sh : (n, k, 3) float32 with k = 1, 4, 9 or 16: outgoing colour, display-referred, in the basis and order of 3DGS
+    """
+
+    centre: Array
+    scale: Array
+    rotation: Array
+    opacity: Array
+    sh: Array
+
+    def __len__(self) -> int:
+        return len(self.centre)
+
+
+def splats_of(surfels: Surfels, colour: Array | None = None) -> Splats:
+    """Surfels as splats with a third axis along the normal: as thick as the splats they were read from, else thin.
+
+    Parameters
+    ----------
+    surfels : any space
+    colour : (n, 3) linear Rec.709 colour to show from all sides; None is the captured colour (``surfels.sh``) where
+        there is one, else the albedo. Linear colour is encoded as sRGB, which is what viewers of splats expect.
+    """
+    if colour is None and surfels.sh is not None:
+        sh = whole_bands(surfels.sh)
+    else:
+        shown = linear_to_srgb(np.clip(surfels.albedo if colour is None else colour, 0.0, 1.0))
+        sh = ((shown - 0.5) / SH_C0).astype(np.float32)[:, None]
+    scale = np.empty((len(surfels), 3), np.float32)
+    scale[:, :2] = np.maximum(surfels.scale, SHORTEST)
+    thickness = surfels.extras.get("thickness")
+    if thickness is None:
+        scale[:, 2] = scale[:, :2].min(axis=1) * THICKNESS
+    else:
+        scale[:, 2] = np.maximum(thickness, SHORTEST)
+    return Splats(surfels.centre, scale, surfels.rotation, surfels.opacity, sh)
+
+
+def scaled(splats: Splats, factor: float) -> Splats:
+    """Splats with all lengths times `factor`."""
+    by = np.float32(factor)
+    return replace(splats, centre=splats.centre * by, scale=splats.scale * by)
+
+
+def join_splats(parts: list[Splats]) -> Splats:
+    """All splats as one, harmonics filled up with zeros."""
+    if len(parts) == 1:
+        return parts[0]
+    sh = np.zeros((sum(map(len, parts)), max(splats.sh.shape[1] for splats in parts), 3), np.float32)
+    first = 0
+    for splats in parts:
+        sh[first : first + len(splats), : splats.sh.shape[1]] = splats.sh
+        first += len(splats)
+
+    def joined(name: str) -> Array:
+        return np.concatenate([getattr(splats, name) for splats in parts])
+
+    return Splats(joined("centre"), joined("scale"), joined("rotation"), joined("opacity"), sh)
+
+
+def splats_from_z_up(splats: Splats, up: str) -> Splats:
+    """Turn splats from Z up to the up axis `up` (a key of `axes.UP_AXES`), their colours with them."""
+    if up == "z":
+        return splats
+    turn, quaternion = from_z_up(up)
+    return replace(
+        splats,
+        centre=vectors_from_z_up(splats.centre, up),
+        rotation=multiply_quaternions(quaternion, splats.rotation).astype(np.float32),
+        sh=rotate_harmonics(splats.sh, turn),
+    )

@@ -1,0 +1,88 @@
+"""Simulated frames in OpenUSD: the moving mesh and its particles, written with usd-core."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ..asset.archive import replace_file
+from ..errors import DeviceError, WriteError
+from ..particle_cache import ParticleFrame
+
+Array = np.ndarray
+
+SUFFIXES = (".usd", ".usda", ".usdc")
+
+
+def check_usd(path: Path) -> None:
+    """Raise DeviceError where usd-core is not installed: before frames are computed for `path`."""
+    try:
+        import pxr  # noqa: F401
+    except ImportError as error:
+        raise DeviceError(str(path), "needs the package usd-core", "Install it: pip install usd-core") from error
+
+
+def write_usd_points(
+    path: Path,
+    frames: Iterable[ParticleFrame],
+    faces: Array,
+    first: int,
+    fps: float,
+    matrix_world: Sequence[Sequence[float]],
+) -> None:
+    """Write a stage, Z up, in metres: ``/Matter/Mesh`` and ``/Matter/Points`` with a time sample a frame.
+
+    Parameters
+    ----------
+    frames : in their order, object space
+    faces : (m, 3) int, triangles of the mesh
+    first, fps : number of the first frame, frames a second
+    matrix_world : (4, 4) object to world: the transform of ``/Matter``
+
+    Raises
+    ------
+    DeviceError
+        usd-core is not installed.
+    WriteError
+        Naming the file and the system's reason.
+    """
+    check_usd(path)
+    from pxr import Gf, Usd, UsdGeom, Vt
+
+    def vectors(values: Array) -> Vt.Vec3fArray:
+        return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(values, np.float32))
+
+    def extent(values: Array) -> Vt.Vec3fArray:
+        return vectors(np.stack([values.min(axis=0), values.max(axis=0)]))
+
+    try:
+        stage = Usd.Stage.CreateInMemory()
+        UsdGeom.SetStageUpAxis(stage, "Z")
+        UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+        root = UsdGeom.Xform.Define(stage, "/Matter")
+        # USD's matrices take rows for vectors.
+        root.AddTransformOp().Set(Gf.Matrix4d(np.asarray(matrix_world, np.float64).T.tolist()))
+        mesh, points = UsdGeom.Mesh.Define(stage, "/Matter/Mesh"), UsdGeom.Points.Define(stage, "/Matter/Points")
+        mesh.CreateFaceVertexCountsAttr(Vt.IntArray([3] * len(faces)))
+        mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.ascontiguousarray(faces, np.int32).reshape(-1)))
+        mesh.CreateSubdivisionSchemeAttr("none")
+        last = first
+        for last, frame in enumerate(frames, first):
+            for prim, values in ((mesh, frame.vertices), (points, frame.points)):
+                prim.GetPointsAttr().Set(vectors(values), last)
+                prim.GetExtentAttr().Set(extent(values), last)
+        stage.SetDefaultPrim(root.GetPrim())
+        stage.SetStartTimeCode(first)
+        stage.SetEndTimeCode(last)
+        stage.SetTimeCodesPerSecond(fps)
+        stage.SetFramesPerSecond(fps)
+        with tempfile.TemporaryDirectory() as folder:
+            temporary = Path(folder) / f"points{path.suffix.lower()}"
+            stage.GetRootLayer().Export(str(temporary))
+            data = temporary.read_bytes()
+    except (RuntimeError, OSError) as error:  # RuntimeError is what errors of USD derive from
+        raise WriteError(str(path), f"cannot be written ({error})", "Check the free space on the disk") from error
+    replace_file(path, [data])

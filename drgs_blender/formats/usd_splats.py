@@ -1,0 +1,137 @@
+"""Splats in OpenUSD: the schema ParticleField3DGaussianSplat of UsdVol, read and written with usd-core.
+
+https://openusd.org/release/user_guides/schemas/usdVol/ParticleField3DGaussianSplat.html
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..asset.archive import replace_file
+from ..asset.tensors import decode
+from ..errors import AssetError, DeviceError, WriteError
+from . import usd_stage
+from .axes import UP_AXES
+from .files import SurfelFile
+from .splat_scene import Piece, join_pieces
+from .splats import Splats
+from .usd_crate import check_crate
+from .usd_stage import DEGREE, HARMONICS, LACKING, REFUSED, REMEDY, SCHEMA, UP
+
+Array = np.ndarray
+
+#: Time and memory for a file: some for the library, and in proportion to its bytes.
+_SECONDS, _PACE = 30.0, 1 << 20
+_MEMORY, _RATIO = 8 << 30, 32
+_NAMES = (b".usda", b".usdc", b".usd")
+
+
+def sniff_usd(head: bytes, path: Path) -> bool:
+    """Whether a file is USD: text, crate, or a zip that starts with one."""
+    if head.startswith(b"PK\x03\x04"):
+        return any(name in head[:512].lower() for name in _NAMES)
+    return head.startswith((b"PXR-USDC", b"#usda "))
+
+
+def read_usd_splats(path: Path) -> SurfelFile:
+    """Read all splats of a USD stage at its earliest time, in metres; up as the stage says.
+
+    Raises
+    ------
+    AssetError
+        The file is damaged or has no splats.
+    DeviceError
+        usd-core is not installed.
+    """
+    check_crate(path)
+    arrays = _read_apart(path)
+    up = arrays.pop(UP).tobytes().decode(errors="replace")
+    pieces = []
+    for i in range(sum(name.endswith("/matrix") for name in arrays)):
+        of = {name: arrays[f"{i}/{name}"] for name in ("centre", "scale", "rotation", "opacity", "sh")}
+        pieces.append(Piece(Splats(**of), arrays[f"{i}/matrix"]))
+    return join_pieces(pieces, path, "USD", up if up in UP_AXES else "y")
+
+
+def _read_apart(path: Path) -> dict[str, Array]:
+    """The arrays of `usd_stage`, from a process that may take time and memory in proportion to the file."""
+    subject, size = str(path), path.stat().st_size
+    with tempfile.TemporaryDirectory() as folder:
+        target = Path(folder) / "splats"
+        # The package as it is here, wherever that comes from.
+        code = (
+            f"import sys; sys.path.insert(0, sys.argv[1]); from {usd_stage.__name__} import main; main(*sys.argv[2:])"
+        )
+        given = Path(__file__).resolve().parents[2], path.absolute(), target, _MEMORY + _RATIO * size
+        command = [sys.executable, "-c", code, *map(str, given)]
+        try:
+            done = subprocess.run(
+                command, capture_output=True, timeout=_SECONDS + size / _PACE, stdin=subprocess.DEVNULL
+            )
+        except subprocess.TimeoutExpired as error:
+            raise AssetError(subject, "keeps USD busy for longer than such a file can take", REMEDY) from error
+        except OSError as error:
+            raise DeviceError(subject, f"cannot be read: Python does not start ({error})", "See drgs doctor") from error
+        if done.returncode == LACKING:
+            raise DeviceError(subject, "needs the package usd-core", "Install it: pip install usd-core")
+        if done.returncode:
+            said = done.stderr.decode(errors="replace").strip().splitlines()
+            known = done.returncode == REFUSED and said
+            raise AssetError(subject, said[-1][:300] if known else "cannot be read: USD crashes on it", REMEDY)
+        return decode(np.fromfile(target, np.uint8), subject)
+
+
+def write_usd_splats(path: Path, splats: Splats) -> None:
+    """Write a stage with `splats`, which are Z up, in metres.
+
+    Raises DeviceError (usd-core is not installed) or WriteError.
+    """
+    usd, geometry = _usd(str(path))
+    from pxr import Gf, Sdf, Vt
+
+    types = Sdf.ValueTypeNames
+    k = splats.sh.shape[1]
+    reach = 3 * splats.scale.max(axis=1, keepdims=True)
+    extent = np.zeros((2, 3))
+    if len(splats):
+        extent = np.stack([(splats.centre - reach).min(axis=0), (splats.centre + reach).max(axis=0)])
+    quaternions = np.ascontiguousarray(splats.rotation[:, [1, 2, 3, 0]])
+    values = [
+        ("positions", types.Point3fArray, Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(splats.centre))),
+        ("scales", types.Float3Array, Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(splats.scale))),
+        ("orientations", types.QuatfArray, Vt.QuatfArray.FromNumpy(quaternions)),
+        ("opacities", types.FloatArray, Vt.FloatArray.FromNumpy(np.ascontiguousarray(splats.opacity))),
+        (HARMONICS, types.Float3Array, Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(splats.sh).reshape(-1, 3))),
+        ("extent", types.Float3Array, Vt.Vec3fArray([Gf.Vec3f(*row.tolist()) for row in extent])),
+    ]
+    try:
+        stage = usd.Stage.CreateInMemory()
+        geometry.SetStageUpAxis(stage, "Z")
+        geometry.SetStageMetersPerUnit(stage, 1.0)
+        prim = stage.DefinePrim("/Splats", SCHEMA)
+        stage.SetDefaultPrim(prim)
+        for name, kind, value in values:
+            prim.CreateAttribute(name, kind, custom=False).Set(value)
+        degree = prim.CreateAttribute(DEGREE, types.Int, custom=False, variability=Sdf.VariabilityUniform)
+        degree.Set(int(np.sqrt(k)) - 1)
+        with tempfile.TemporaryDirectory() as folder:
+            temporary = Path(folder) / f"splats{path.suffix.lower()}"
+            stage.GetRootLayer().Export(str(temporary))
+            data = temporary.read_bytes()
+    except (RuntimeError, OSError) as error:
+        raise WriteError(str(path), f"cannot be written ({error})", "Check the free space on the disk") from error
+    replace_file(path, [data])
+
+
+def _usd(subject: str) -> tuple[Any, Any]:
+    try:
+        from pxr import Usd, UsdGeom
+    except ImportError as error:
+        raise DeviceError(subject, "needs the package usd-core", "Install it: pip install usd-core") from error
+    return Usd, UsdGeom

@@ -1,0 +1,127 @@
+"""Every format that can be written, in one table. ``docs/formats.md`` is made from it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..errors import UsageError
+from ..filetypes import WRITTEN, Held
+from .exr import write_exr_environment
+from .gltf_mesh import write_gltf_mesh
+from .gltf_splats import write_gltf_splats
+from .sog_writer import write_sog
+from .splat_ply import write_splat_ply
+from .spz import write_spz
+from .usd_mesh import write_usd_mesh
+from .usd_splats import write_usd_splats
+
+
+@dataclass(frozen=True, slots=True)
+class Writer:
+    """A format that can be written.
+
+    Attributes
+    ----------
+    name : shown to users; the key of its `filetypes.WriteType`
+    write : (path, what goes in) -> None, where what goes in is `splats.Splats`, `asset.Mesh` or `asset.Environment`;
+        raises WriteError
+    kept, lost : for the documentation
+    """
+
+    name: str
+    write: Callable[[Path, Any], None]
+    kept: str
+    lost: str
+
+    @property
+    def extensions(self) -> tuple[str, ...]:
+        """Names that choose it."""
+        return WRITTEN[self.name].extensions
+
+    @property
+    def kind(self) -> Held:
+        """What goes in."""
+        return WRITTEN[self.name].kind
+
+    @property
+    def up(self) -> str:
+        """The up axis, a key of ``axes.UP_AXES``, that is written unless asked otherwise."""
+        return WRITTEN[self.name].up
+
+    @property
+    def fixed(self) -> bool:
+        """Whether no other up axis can be asked for."""
+        return WRITTEN[self.name].fixed
+
+
+WRITERS: tuple[Writer, ...] = (
+    Writer(
+        "3DGS PLY",
+        write_splat_ply,
+        "centres, scales, rotations, opacities, colour with harmonics, as 32-bit numbers",
+        "materials; opacity within 1e-6 of 0 and 1",
+    ),
+    Writer(
+        "SPZ",
+        write_spz,
+        "centres to 1/8192 m within 2 km of the origin, scales to 3.2 %, opacities to 1/510, colours to 1/270",
+        "materials; scales below 0.05 mm or above 380 m; harmonics outside -1 to 1, and all finer than 1/16 (first "
+        "band) or 1/8; colours outside -0.44 to 1.44",
+    ),
+    Writer(
+        "SOG",
+        write_sog,
+        "centres to 1/131070 of the range of log(1 + distance), opacities to 1/510, rotations to 1.1 degrees; "
+        "scales, colours and harmonics as the 256 numbers that tell them best",
+        "materials; the order of the splats; where there are more than 65536, harmonics become those of a palette",
+    ),
+    Writer(
+        "glTF splats",
+        write_gltf_splats,
+        "everything, as KHR_gaussian_splatting and 32-bit numbers; coloured points for viewers that do not know it",
+        "materials",
+    ),
+    Writer(
+        "USD splats",
+        write_usd_splats,
+        "everything, as ParticleField3DGaussianSplat and 32-bit numbers; needs usd-core",
+        "materials",
+    ),
+    Writer(
+        "glTF mesh",
+        write_gltf_mesh,
+        "the mesh, posed or not, with its materials as metallic-roughness textures, a place in them for each triangle",
+        "surfels; materials to 1/510 (base colour as sRGB); shared vertices, unless the mesh is of one material",
+    ),
+    Writer(
+        "USD mesh",
+        write_usd_mesh,
+        "the mesh, posed or not, with its materials as the textures of a UsdPreviewSurface; shared vertices",
+        "surfels; materials to 1/510 (base colour as sRGB)",
+    ),
+    Writer(
+        "OpenEXR",
+        write_exr_environment,
+        "radiance as 32-bit numbers, lat-long in Blender's mapping",
+        "nothing",
+    ),
+)
+
+
+def find_writer(path: Path, kind: Held) -> Writer:
+    """The writer of `kind` that the extension of `path` names.
+
+    Raises
+    ------
+    UsageError
+        There is none; lists those of `kind`.
+    """
+    suffix = path.suffix.lower()
+    for writer in WRITERS:
+        if writer.kind == kind and suffix in writer.extensions:
+            return writer
+    names = "; ".join(f"{w.name} ({' '.join(w.extensions)})" for w in WRITERS if w.kind == kind)
+    raise UsageError(str(path), f"is no name under which {kind} can be written", f"Choose from {names}")

@@ -1,0 +1,103 @@
+"""The mesh of an asset as glTF: the textures show what the vertices say."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from shapes import sphere_mesh
+
+from drgs_blender.asset import Mesh
+from drgs_blender.build.texture import Materials
+from drgs_blender.errors import UsageError
+from drgs_blender.formats.atlas import bake_atlas
+from drgs_blender.formats.axes import vectors_from_z_up
+from drgs_blender.formats.gltf_mesh import write_gltf_mesh
+from drgs_blender.formats.registry import read_mesh
+
+
+def painted() -> Mesh:
+    """A sphere whose materials vary from vertex to vertex."""
+    vertices, faces = sphere_mesh(3)
+    rng = np.random.default_rng(1)
+    n = len(vertices)
+    return Mesh(vertices, faces, rng.uniform(0.2, 0.8, (n, 3)), rng.uniform(0.1, 0.9, n), rng.uniform(0, 1, n))
+
+
+def random_points(faces: int, count: int = 4000) -> tuple[np.ndarray, np.ndarray]:
+    """(face, barycentric) of points, some of them on edges and corners."""
+    rng = np.random.default_rng(2)
+    weights = rng.dirichlet((1, 1, 1), count)
+    weights[: count // 4, rng.integers(3)] = 0
+    weights /= weights.sum(axis=1, keepdims=True)
+    weights[:30] = np.eye(3)[rng.integers(0, 3, 30)]
+    return rng.integers(0, faces, count), weights
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 1000])
+def test_filtering_the_atlas_interpolates_the_corners(count: int) -> None:
+    rng = np.random.default_rng(count)
+    values = rng.uniform(0.35, 0.65, (count, 3, 2)).astype(np.float32)
+    texels, uvs = bake_atlas(values, "mesh")
+    face, weights = random_points(count)
+    place = np.einsum("nk,nkj->nj", weights, uvs[face]) * len(texels) - 0.5
+    low = np.floor(place).astype(int)
+    part = place - low
+    found = np.zeros((len(face), 2))
+    for i in (0, 1):
+        for j in (0, 1):
+            weight = np.where(i, part[:, 0], 1 - part[:, 0]) * np.where(j, part[:, 1], 1 - part[:, 1])
+            column, row = np.minimum(low + np.array([i, j]), len(texels) - 1).T
+            found += weight[:, None] * texels[row, column]
+    np.testing.assert_allclose(found, np.einsum("nk,nkj->nj", weights, values[face]), atol=2e-4)
+
+
+def test_a_mesh_comes_back_with_its_materials(tmp_path: Path) -> None:
+    mesh = painted()
+    turned = vectors_from_z_up(mesh.vertices, "y")
+    write_gltf_mesh(tmp_path / "a.glb", Mesh(turned, mesh.faces, mesh.albedo, mesh.roughness, mesh.metallic))
+    file = read_mesh(tmp_path / "a.glb")
+    assert len(file.faces) == len(mesh.faces) and file.corner_uvs is not None and file.corner_normals is not None
+    np.testing.assert_allclose(file.vertices[file.faces], mesh.vertices[mesh.faces], atol=1e-6)
+    outwards = mesh.vertices / np.linalg.norm(mesh.vertices, axis=1, keepdims=True)
+    assert (file.corner_normals * outwards[mesh.faces]).sum(axis=-1).min() > 0.99
+    corners = np.arange(3 * len(mesh.faces))
+    uvs = file.corner_uvs.reshape(-1, 2)[corners]
+    found = Materials(file.materials).sample(np.zeros(len(uvs), np.int64), uvs, np.zeros((len(uvs), 2)))
+    wanted = np.concatenate([mesh.albedo, mesh.roughness[:, None], mesh.metallic[:, None]], axis=1)[mesh.faces.ravel()]
+    # Eight bits: of sRGB for the albedo, which is coarser where it is bright.
+    np.testing.assert_allclose(found[:, :3], wanted[:, :3], atol=0.005)
+    np.testing.assert_allclose(found[:, 3:], wanted[:, 3:], atol=0.003)
+
+
+def test_another_reader_finds_the_same_object(tmp_path: Path) -> None:
+    mesh = painted()
+    write_gltf_mesh(tmp_path / "a.glb", mesh)
+    found = trimesh.load(tmp_path / "a.glb", force="mesh", process=False)
+    assert len(found.faces) == len(mesh.faces)
+    np.testing.assert_allclose(found.triangles, mesh.vertices[mesh.faces], atol=1e-6)
+    material = found.visual.material
+    assert material.baseColorTexture.size == material.metallicRoughnessTexture.size
+    assert material.doubleSided
+
+
+def test_a_mesh_of_one_material_needs_no_textures(tmp_path: Path) -> None:
+    vertices, faces = sphere_mesh(2)
+    n = len(vertices)
+    write_gltf_mesh(
+        tmp_path / "a.glb", Mesh(vertices, faces, np.full((n, 3), [0.7, 0.2, 0.1]), np.full(n, 0.3), np.full(n, 1.0))
+    )
+    file = read_mesh(tmp_path / "a.glb")
+    assert len(file.vertices) == n and len(file.faces) == len(faces)
+    material = file.materials[0]
+    assert material.base_colour_image is None and material.metallic_roughness_image is None
+    np.testing.assert_allclose(material.base_colour, [0.7, 0.2, 0.1], atol=1e-6)
+    assert (material.roughness, material.metallic) == (pytest.approx(0.3), 1.0)
+
+
+def test_a_mesh_without_faces_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="without faces"):
+        write_gltf_mesh(tmp_path / "a.glb", Mesh.empty())
+    assert not (tmp_path / "a.glb").exists()
