@@ -14,6 +14,20 @@ EXIT_CANNOT_WRITE = 73
 EXIT_RETRY = 75
 EXIT_VERSION = 78
 
+#: Exit code -> word in the last line of ``drgs render`` and ``drgs denoise``, which farms parse.
+EXIT_CLASSES = {
+    EXIT_OK: "ok",
+    EXIT_USAGE: "usage",
+    EXIT_BAD_ASSET: "bad-asset",
+    EXIT_NO_DEVICE: "no-device",
+    EXIT_INTERNAL: "internal",
+    EXIT_CANNOT_WRITE: "cannot-write",
+    EXIT_RETRY: "retry",
+    EXIT_VERSION: "version",
+    130: "interrupted",
+    143: "terminated",
+}
+
 
 class DrgsError(Exception):
     """Base of every error meant for a user.

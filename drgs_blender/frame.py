@@ -66,6 +66,27 @@ class Visibility:
 
 
 @dataclass(slots=True)
+class Adjustment:
+    """Changes to the look of an object, on top of its materials; of its surfels and its mesh alike.
+
+    Attributes
+    ----------
+    tint : linear Rec.709 factors on the albedo, after hue, saturation and value
+    hue : turns, added to the hue of the albedo; saturation and value are factors (HSV, as Blender's node)
+    roughness, metallic : gain, offset, lowest, highest: new = clip(gain * old + offset, lowest, highest)
+    mask : (n,) float32, how much of it a vertex gets, in [0, 1]; None: all of it everywhere
+    """
+
+    tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    hue: float = 0.0
+    saturation: float = 1.0
+    value: float = 1.0
+    roughness: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 1.0)
+    metallic: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 1.0)
+    mask: Array | None = None
+
+
+@dataclass(slots=True)
 class ObjectState:
     """One DR-GS object in one frame.
 
@@ -80,6 +101,7 @@ class ObjectState:
     albedo, roughness, metallic : per-vertex overrides (n, 3), (n,), (n,); None keeps the asset's
     pass_index : Blender's object index pass
     visibility : which rays meet it
+    adjustment : changes to the materials, after the overrides
     """
 
     name: str
@@ -92,6 +114,7 @@ class ObjectState:
     metallic: Array | None = None
     pass_index: int = 0
     visibility: Visibility = field(default_factory=Visibility)
+    adjustment: Adjustment | None = None
 
 
 @dataclass(slots=True)
@@ -134,8 +157,8 @@ class Material:
 
     Attributes
     ----------
-    base_colour : linear Rec.709, [0, 1]
-    roughness, metallic : [0, 1]
+    base_colour : linear Rec.709; above 1, as in Cycles, diffuse light grows and that of metals does not
+    roughness, metallic : [0, 1], with a texture factors that may be larger
     emission : linear Rec.709 radiance, colour times strength
     """
 
@@ -242,20 +265,23 @@ class World:
 class RenderSettings:
     """How a frame is solved.
 
-    ``cosine``, ``ggx``, ``environment`` are samples a pixel of each strategy (their sum is "rays"); ``aa`` is the
-    number of sub-pixel positions among which they are divided. ``bounces`` counts indirect bounces. ``look`` is
-    "principled" (Blender's Principled BSDF, GGX) or "paper" (the paper's BRDF). ``threads`` 0 is all cores.
+    ``cosine``, ``ggx``, ``environment`` are samples a pixel of each strategy, their sum is "rays"; with ``split``
+    "auto" the sum alone counts, and each point divides it by its material. ``aa`` is the number of sub-pixel positions
+    among which samples are divided; 0 chooses it by their number (`positions`). ``bounces`` counts indirect bounces.
+    ``look`` is "principled" (Blender's Principled BSDF, GGX) or "paper" (the paper's BRDF). ``threads`` 0 is all cores.
     ``noise_threshold`` above 0 stops sampling a pixel once its estimated error (as Cycles defines it) is below it; the
     samples above are then the most a pixel gets. ``clamp_indirect`` above 0 limits the brightness of a single indirect
-    sample, which loses energy.
+    sample, which loses energy. ``primary`` is what the camera sees of DR-GS objects; ``tracer`` is what light meets of
+    them: their meshes, or the surfels themselves, blended along each ray (slower; for thin things without a good mesh).
     """
 
     cosine: int = 16
     ggx: int = 8
     environment: int = 8
     bounces: int = 1
-    aa: int = 4
+    aa: int = 0
     primary: Literal["surfels", "mesh"] = "surfels"
+    tracer: Literal["mesh", "surfels"] = "mesh"
     denoise: Literal["none", "svgf", "oidn"] = "none"
     look: Literal["principled", "paper"] = "principled"
     film_transparent: bool = False
@@ -263,16 +289,61 @@ class RenderSettings:
     threads: int = 0
     noise_threshold: float = 0.0
     clamp_indirect: float = 0.0
+    split: Literal["auto", "counts"] = "auto"
 
     @property
     def rays(self) -> int:
         """Samples a pixel over all strategies."""
         return self.cosine + self.ggx + self.environment
 
+    @property
+    def positions(self) -> int:
+        """Sub-pixel positions: ``aa``, or as many as let edges and textures keep up with the noise."""
+        if self.aa:
+            return self.aa
+        # Another position costs surfels more than a mesh, and they come filtered.
+        share, most = (8, 16) if self.primary == "surfels" else (2, 64)
+        return min(max(self.rays // share, 4), most, max(self.rays, 1))
+
+
+@dataclass(slots=True)
+class Pose:
+    """Where one shape is at another time.
+
+    Attributes
+    ----------
+    name : of the object, used in messages
+    matrices : (k, 4, 4) float64 object-to-world, one an instance; an `ObjectState` has one
+    vertices : (n, 3) float32, object space; None: as in the frame itself
+    """
+
+    name: str
+    matrices: Array
+    vertices: Array | None = None
+
+
+@dataclass(slots=True)
+class Moment:
+    """Camera and shapes at another time, for motion.
+
+    ``objects`` and ``meshes`` are in the order of the frame's own; what is None has not moved.
+    """
+
+    camera: Camera
+    objects: list[Pose | None]
+    meshes: list[Pose | None] = field(default_factory=list)
+
 
 @dataclass(slots=True)
 class Frame:
-    """Everything the engine needs, next to loaded assets, to render one picture."""
+    """Everything the engine needs, next to loaded assets, to render one picture.
+
+    Attributes
+    ----------
+    previous, next : one frame earlier and later, for the passes of motion; None: nothing moves
+    history : name of the sequence of pictures that this one continues. With the denoiser SVGF, what the engine rendered
+        before under this name is mixed in; "" stands alone, as every final frame must
+    """
 
     number: int
     camera: Camera
@@ -283,9 +354,12 @@ class Frame:
     meshes: list[MeshState] = field(default_factory=list)
     lights: list[Light] = field(default_factory=list)
     images: list[Image] = field(default_factory=list)
+    previous: Moment | None = None
+    next: Moment | None = None
+    history: str = ""
 
 
 def split_rays(rays: int) -> tuple[int, int, int]:
-    """Divide `rays` as the paper does: half cosine, a quarter GGX, a quarter environment; each at least 1."""
+    """Divide `rays` as the paper does: half cosine, a quarter GGX, a quarter light; each at least 1."""
     ggx = environment = max(1, rays // 4)
     return max(1, rays - ggx - environment), ggx, environment

@@ -66,6 +66,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import numba  # noqa: E402
 from numba import get_num_threads, prange, set_num_threads  # noqa: E402
+from numba.extending import overload as _overload  # noqa: E402
 
 if "NUMBA_CACHE_DIR" not in os.environ:
     numba.config.CACHE_DIR = str(current_cache())
@@ -82,10 +83,23 @@ def njit(function: Any = None, **options: Any) -> Any:
     return numba.njit(function, **options)
 
 
+def inlined(function: Any) -> Any:
+    """`njit` for small arithmetic in loops that are to vectorise: no call is left of it wherever it is used."""
+    return njit(function, forceinline=True)
+
+
+def overload(function: Any) -> Any:
+    """``numba.extending.overload`` with the options of `njit`, except for caching, which is the caller's."""
+    return _overload(function, jit_options={"nogil": True, "error_model": "numpy"})
+
+
 def use_threads(count: int) -> None:
     """Run kernels on `count` threads; 0 is all the threads Numba has."""
     limit = numba.config.NUMBA_NUM_THREADS
     set_num_threads(limit if count <= 0 else min(count, limit))
 
 
-__all__ = ["cache_folder", "get_num_threads", "njit", "prange", "set_num_threads", "source_digest", "use_threads"]
+__all__ = [
+    "cache_folder", "get_num_threads", "inlined", "njit", "overload", "prange", "set_num_threads", "source_digest",
+    "use_threads",
+]  # fmt: skip

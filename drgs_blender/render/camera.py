@@ -66,11 +66,11 @@ def camera_parameters(camera: Camera, settings: RenderSettings, frame_number: in
 
     Raises
     ------
-    UsageError: the camera cannot take a picture, or ``settings.aa`` is below one.
+    UsageError: the camera cannot take a picture, or ``settings.aa`` is negative.
     """
     check_camera(camera)
-    if settings.aa < 1:
-        raise UsageError("sub-pixel samples", f"are {settings.aa}", "Choose at least one")
+    if settings.aa < 0:
+        raise UsageError("sub-pixel samples", f"are {settings.aa}", "Choose some, or 0 for as many as suit the rays")
     matrix = np.asarray(camera.matrix_world, dtype=np.float64)
     out = np.empty(PARAMETERS)
     out[:9] = matrix[:3, :3].ravel()
@@ -79,7 +79,7 @@ def camera_parameters(camera: Camera, settings: RenderSettings, frame_number: in
     out[ORTHOGRAPHIC] = camera.orthographic
     out[CLIP_START], out[CLIP_END], out[WIDTH] = camera.clip_start, camera.clip_end, camera.width
     out[SEED] = mix(np.uint32(settings.seed & 0xFFFFFFFF) ^ mix(np.uint32(frame_number & 0xFFFFFFFF)))
-    out[AA] = settings.aa
+    out[AA] = settings.positions
     return out
 
 

@@ -19,9 +19,12 @@ from ..passes import BY_NAME
 from .camera import camera_parameters
 from .lights.lamps import Lamps
 from .lights.light import EnvironmentLight
+from .picture.cryptomatte import KINDS, CryptoFilm
 from .picture.denoise import denoise
 from .picture.film import COMPONENTS, Film
+from .picture.motion import Instant, MotionFilm, vector_pass
 from .picture.oidn import denoise_oidn, require
+from .picture.temporal import History, Shot, denoise_next
 from .points import Radiance, ShadingPoints
 from .primary.gbuffer import GBuffer
 from .primary.primary_mesh import primary_mesh
@@ -29,7 +32,8 @@ from .primary.primary_surfels import primary_surfels, snap_windows
 from .primary.seen_lamps import seen_lamps
 from .shade.adaptive import part_count, sample_adaptively
 from .shade.integrate import integrate
-from .surfels.splats import prepare
+from .surfels.splats import Splats, prepare
+from .surfels.surfel_bvh import SurfelBVH
 from .trace.scene import TraceScene
 
 Array = np.ndarray
@@ -37,9 +41,9 @@ Progress = Callable[[float, str], None]
 Check = Callable[[], None]
 
 #: Memory a strip may take, and what a sub-pixel sample takes of it at most (samples, points, light).
-STRIP_BYTES, SAMPLE_BYTES = 64 << 20, 310
+STRIP_BYTES, SAMPLE_BYTES = 64 << 20, 326
 #: Seconds a batch of points should take, how many samples (points times rays) the first one has, fewest points of any.
-BATCH_SECONDS, FIRST_SAMPLES, FEWEST_POINTS = 0.1, 1 << 17, 16
+BATCH_SECONDS, FIRST_SAMPLES, FEWEST_POINTS = 0.03, 1 << 17, 16
 
 
 def render(
@@ -50,6 +54,10 @@ def render(
     progress: Progress | None = None,
     cancelled: Callable[[], bool] | None = None,
     lamps: Lamps | None = None,
+    tree: SurfelBVH | None = None,
+    previous: Instant | None = None,
+    following: Instant | None = None,
+    history: History | None = None,
 ) -> dict[str, Array]:
     """Render the passes of a frame.
 
@@ -61,6 +69,9 @@ def render(
     progress : called with the part done in [0, 1] and the name of the phase
     cancelled : asked several times a second
     lamps : the frame's lights
+    tree : the surfels that light meets, when ``frame.settings.tracer`` is "surfels"
+    previous, following : the scene one frame earlier and later; None: nothing moves
+    history : what earlier pictures leave to the denoiser SVGF; brought up to date when the picture is done
 
     Returns
     -------
@@ -72,7 +83,7 @@ def render(
     Cancelled: `cancelled` said so.
     """
     settings, camera = frame.settings, frame.camera
-    _check(frame)
+    check_frame(frame)
     use_threads(settings.threads)
     parameters = camera_parameters(camera, settings, frame.number)
 
@@ -86,37 +97,97 @@ def render(
             progress(part, phase)
 
     tell(0.0, "Projecting")
-    surfels = settings.primary == "surfels"
-    if surfels:
-        splats = prepare(posed, camera, parameters)
-        windows = snap_windows(scene, len(frame.objects))
+    primary = Primary(scene, posed, frame, parameters, tree)
     film = Film(camera, settings, parameters)
-    _, top, _, bottom = camera.window
+    mattes = [
+        CryptoFilm(kind, scene, frame)
+        for kind, name in KINDS.items()
+        if any(wanted.startswith(name) for wanted in frame.passes)
+    ]
+    if settings.denoise != "svgf":
+        history = None
+    left, top, right, bottom = camera.window
+    now = Instant(scene.vertices, scene.places, parameters)
+    past = None if history is None else history.instant
+    moving = [
+        None if then is None else MotionFilm((bottom - top, right - left), (left, top), now, then)
+        for then in (previous, following, past)
+    ]
     end = 1.0 if settings.denoise == "none" else 0.9
-    batches = _Batches(scene, light, lamps, frame, check)
-    height = strip_height(camera.window[2] - camera.window[0], settings.aa)
+    batches = Batches(scene, light, lamps, tree, frame, check)
+    height = strip_height(right - left, settings.positions)
     for y0 in range(top, bottom, height):
         tell(end * (y0 - top) / (bottom - top), "Rendering")
         y1 = min(y0 + height, bottom)
-        if surfels:
-            buffer = primary_surfels(splats, scene, windows, camera, y0, y1)
-        else:
-            buffer = primary_mesh(scene, camera, parameters, y0, y1)
+        buffer = primary.rows(y0, y1)
         check()
         radiance = batches.light(buffer)
         film.add(buffer, radiance, scene.pass_index, light)
+        for matte in mattes:
+            matte.add(buffer)
         if lamps is not None and lamps.seen:
-            film.emission[y0 - top : y1 - top] += seen_lamps(lamps, parameters, camera.window[0], buffer)
-    components = None
+            film.emission[y0 - top : y1 - top] += seen_lamps(lamps, parameters, left, buffer)
+        for motion in moving:
+            if motion is not None:
+                motion.add(buffer, scene)
+    motions = [None if motion is None else motion.motion(film.position, film.coverage) for motion in moving]
+    signal = None
     if settings.denoise != "none":
         tell(end, "Denoising")
-        split = any(name in frame.passes for name in COMPONENTS)
-        if settings.denoise == "oidn":
-            components = denoise_oidn(film.components, film.guides(), split, check)
-        else:
-            components = denoise(film.components, film.variance, film.guides(), split, check)
+    if history is None:
+        components = denoised(film, frame, check)
+    else:
+        shot = Shot(film.components, film.variance, film.guides(), motions[2])
+        components, signal = denoise_next(shot, history.signal, split_light(frame), history.still, check)
     tell(1.0, "Done")
-    return film.passes(frame.passes, components)
+    if history is not None:
+        history.signal = signal
+    before, after = motions[:2]
+    made = {name: values for matte in mattes for name, values in matte.passes().items()}
+    made |= film.passes(
+        tuple(name for name in frame.passes if name not in made),
+        components,
+        vector_pass(before, after, film.coverage.shape) if "Vector" in frame.passes else None,
+        None if before is None else before.previous,
+    )
+    return {name: made[name] for name in frame.passes}
+
+
+def denoised(film: Film, frame: Frame, check: Check) -> Array | None:
+    """(h, w, 4, 3) light of the film without noise, by the denoiser of the frame; None without one."""
+    if frame.settings.denoise == "oidn":
+        return denoise_oidn(film.components, film.guides(), split_light(frame), check)
+    if frame.settings.denoise == "svgf":
+        return denoise(film.components, film.variance, film.guides(), split_light(frame), check)
+    return None
+
+
+def split_light(frame: Frame) -> bool:
+    """Whether direct and indirect light are wanted apart."""
+    return any(name in frame.passes for name in COMPONENTS)
+
+
+class Primary:
+    """What the camera sees of a frame, strip by strip."""
+
+    def __init__(
+        self, scene: TraceScene, posed: PosedSurfels, frame: Frame, parameters: Array, tree: SurfelBVH | None
+    ) -> None:
+        self._scene, self._camera, self._parameters = scene, frame.camera, parameters
+        self._tree, self._objects = tree, len(frame.objects)
+        self._splats: Splats | None = None
+        if frame.settings.primary == "surfels":
+            self._splats = prepare(posed, frame.camera, parameters)
+            self._windows = snap_windows(scene, len(frame.objects))
+
+    def rows(self, y0: int, y1: int) -> GBuffer:
+        """The samples of the rows ``y0 .. y1`` of the full picture."""
+        if self._splats is None:
+            buffer = primary_mesh(self._scene, self._camera, self._parameters, y0, y1)
+            if self._tree is not None:
+                _own_surfels(buffer, self._tree, self._objects)
+            return buffer
+        return primary_surfels(self._splats, self._scene, self._windows, self._camera, y0, y1, self._tree is None)
 
 
 def strip_height(width: int, aa: int) -> int:
@@ -124,29 +195,40 @@ def strip_height(width: int, aa: int) -> int:
     return max(1, STRIP_BYTES // (SAMPLE_BYTES * width * aa))
 
 
-class _Batches:
+def _own_surfels(buffer: GBuffer, tree: SurfelBVH, objects: int) -> None:
+    """Tell the points on meshes of DR-GS objects which surfels are their own: those about as large as usual there."""
+    points, owner = buffer.points, buffer.object_index
+    points.own = np.where(owner < objects, owner, -1).astype(np.int32)
+    points.size = np.append(tree.sizes(objects), np.float32(0.0))[points.own]
+
+
+class Batches:
     """Integrates points in batches as long as `BATCH_SECONDS`, learning how many points these are."""
 
     def __init__(
-        self, scene: TraceScene, light: EnvironmentLight, lamps: Lamps | None, frame: Frame, check: Check
-    ) -> None:
+        self, scene: TraceScene, light: EnvironmentLight, lamps: Lamps | None, tree: SurfelBVH | None, frame: Frame,
+        check: Check,
+    ) -> None:  # fmt: skip
         self._scene, self._light, self._lamps, self._frame, self._check = scene, light, lamps, frame, check
+        self._tree = tree
         self._parts = part_count(frame.settings)
         self._size = max(FEWEST_POINTS, FIRST_SAMPLES * self._parts // max(1, frame.settings.rays))
 
     def light(self, buffer: GBuffer) -> Radiance:
         """Light of all points of `buffer`."""
         if self._parts == 1:
-            return self._trace(buffer.points, (0, 1))
+            return self.trace(buffer.points, (0, 1))
         threshold = self._frame.settings.noise_threshold
-        return sample_adaptively(buffer.points, self._frame.settings.rays, self._parts, threshold, self._trace)
+        return sample_adaptively(buffer.points, self._frame.settings.rays, self._parts, threshold, self.trace)
 
-    def _trace(self, points: ShadingPoints, part: tuple[int, int]) -> Radiance:
+    def trace(self, points: ShadingPoints, part: tuple[int, int]) -> Radiance:
+        """Light of `points`, ordered by pixel, from one part of their samples, see `integrate`."""
         n = len(points)
-        out = Radiance(np.empty((n, 4, 3), np.float32), np.empty((n, 2), np.float32))
+        out = Radiance.dark(n)
         first = 0
         while first < n:
-            last = min(first + self._size, n)
+            # A pixel's points stay together: their variance is estimated together.
+            last = int(np.searchsorted(points.pixel, points.pixel[min(first + self._size, n) - 1], side="right"))
             began = time.perf_counter()
             found = integrate(
                 self._scene,
@@ -156,12 +238,14 @@ class _Batches:
                 self._frame.number,
                 self._lamps,
                 part,
+                self._tree,
             )
             out.components[first:last], out.variance[first:last] = found.components, found.variance
+            out.moments[first:last] = found.moments
             if found.unshadowed is not None:
                 out.unshadowed = np.zeros(n, np.float32) if out.unshadowed is None else out.unshadowed
                 out.unshadowed[first:last] = found.unshadowed
-            if last - first == self._size:
+            if last - first >= self._size:
                 pace = BATCH_SECONDS / max(time.perf_counter() - began, 1e-6)
                 self._size = int(min(max(self._size * min(max(pace, 0.25), 4.0), FEWEST_POINTS), 1 << 20))
             first = last
@@ -169,7 +253,7 @@ class _Batches:
         return out
 
 
-def _check(frame: Frame) -> None:
+def check_frame(frame: Frame) -> None:
     """Raise UsageError on what the stages below would misunderstand."""
     settings = frame.settings
     for name in frame.passes:
@@ -177,6 +261,8 @@ def _check(frame: Frame) -> None:
             raise UsageError(f"pass {name!r}", "does not exist", f"Choose from {', '.join(BY_NAME)}")
     if settings.primary not in ("surfels", "mesh"):
         raise UsageError("primary visibility", f"is {settings.primary!r}", "Choose surfels or mesh")
+    if settings.tracer not in ("mesh", "surfels"):
+        raise UsageError("tracer", f"is {settings.tracer!r}", "Choose mesh or surfels")
     if settings.denoise not in ("none", "svgf", "oidn"):
         raise UsageError("denoiser", f"is {settings.denoise!r}", "Choose none, svgf or oidn")
     if settings.denoise == "oidn":

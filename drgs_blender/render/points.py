@@ -38,6 +38,9 @@ class ShadingPoints:
     view : (n, 3) float32 unit: towards the camera
     albedo, roughness, metallic : (n, 3), (n,), (n,) float32 in [0, 1]; linear Rec.709
     flags : (n,) uint8: SECOND, CATCHER; 0 when not given
+    own : (n,) int32: object whose surfels the point lies on, so that those near it do not shade it; -1: none. For rays
+        that meet surfels; empty where they meet meshes alone
+    size : (n,) float32 metres: mean larger standard deviation of these surfels; as long as ``own``
     """
 
     pixel: Array
@@ -51,6 +54,8 @@ class ShadingPoints:
     roughness: Array
     metallic: Array
     flags: Array = field(default_factory=lambda: np.zeros(0, np.uint8))
+    own: Array = field(default_factory=lambda: np.zeros(0, np.int32))
+    size: Array = field(default_factory=lambda: np.zeros(0, np.float32))
 
     def __post_init__(self) -> None:
         self.pixel = np.ascontiguousarray(self.pixel, np.int32)
@@ -59,13 +64,16 @@ class ShadingPoints:
         for name, width in _WIDTHS.items():
             setattr(self, name, as_float(getattr(self, name), (n, *width), f"shading point {name}"))
         self.flags = np.ascontiguousarray(self.flags if len(self.flags) else np.zeros(n), np.uint8)
+        self.own = np.ascontiguousarray(self.own, np.int32)
+        self.size = as_float(self.size, (len(self.own),), "shading point size")
 
     def __len__(self) -> int:
         return len(self.pixel)
 
     def __getitem__(self, rows: slice | Array) -> ShadingPoints:
         """Return the points that `rows` (slice, mask or indices) selects."""
-        return ShadingPoints(*(getattr(self, f.name)[rows] for f in fields(self)))
+        values = (getattr(self, f.name) for f in fields(self))
+        return ShadingPoints(*(value[rows] if len(value) else value for value in values))
 
 
 @dataclass(slots=True)
@@ -79,11 +87,19 @@ class Radiance:
     variance : (n, 2) float32: estimated variance of the luminance of the diffuse and of the glossy sum
     unshadowed : (n,) float32 or None: for points flagged CATCHER the luminance that would leave them if rays met
         shadow catchers alone (masks shifted by `masks.WITHOUT`); not read elsewhere
+    moments : (n, 5) float32, what ``variance`` is made of (`shade.spread`): number of samples, then sum and sum of
+        squares of their luminance, diffuse and glossy; may be empty
     """
 
     components: Array
     variance: Array
     unshadowed: Array | None = None
+    moments: Array = field(default_factory=lambda: np.zeros((0, 5), np.float32))
+
+    @classmethod
+    def dark(cls, n: int) -> Radiance:
+        """No light of `n` points, from no samples."""
+        return cls(np.zeros((n, 4, 3), np.float32), np.zeros((n, 2), np.float32), None, np.zeros((n, 5), np.float32))
 
     @property
     def total(self) -> Array:

@@ -1,18 +1,19 @@
 """Numbers for Monte Carlo and the maps from the unit square, as small scalar functions for compiled code.
 
 Every number is a pure function of (seed, frame, pixel, strategy, sample index, dimension): pictures do not depend on
-strips, threads or order. The samples of one strategy in one pixel are a Sobol' point set, randomised by a digital shift
-hashed from the rest (Kollig and Keller 2002); deeper dimensions are hashed alone.
+strips, threads or order. The samples of one strategy in one pixel are a Sobol' point set, scrambled as Owen does by a
+hash of the rest (Laine and Karras 2011, Burley 2020); deeper dimensions are hashed alone.
 """
 
 from __future__ import annotations
 
+import functools
 import math
 
 import numpy as np
 
 from ..colour import LUMINANCE
-from ..jit import njit
+from ..jit import inlined
 
 Array = np.ndarray
 
@@ -24,13 +25,13 @@ GOLDEN = U(0x9E3779B9)
 _UNIT = F(1.0 / 16777216.0)
 
 
-@njit
+@inlined
 def luminance(r, g, b):  # type: ignore[no-untyped-def]
     """Luminance of linear Rec.709."""
     return F(LUMINANCE[0]) * r + F(LUMINANCE[1]) * g + F(LUMINANCE[2]) * b
 
 
-@njit
+@inlined
 def mix(x):  # type: ignore[no-untyped-def]
     """Hash of a uint32 (the "lowbias32" constants of C. Wellons' search)."""
     x = U(x ^ (x >> U(16)))
@@ -40,10 +41,29 @@ def mix(x):  # type: ignore[no-untyped-def]
     return U(x ^ (x >> U(16)))
 
 
-@njit
+@inlined
 def unit(x):  # type: ignore[no-untyped-def]
     """float32 in [0, 1) from a uint32."""
     return F(np.int32(x >> U(8))) * _UNIT
+
+
+@inlined
+def scrambled(number, key):  # type: ignore[no-untyped-def]
+    """Owen scrambling of a number given with its bits reversed: each digit is flipped by a hash of those above it.
+
+    The hash is Laine and Karras' with the constants of N. Vegdahl's search.
+    """
+    x = U(number)
+    x = U(x ^ U(x * U(0x3D20ADEA)))
+    x = U(x + key)
+    x = U(x * ((key >> U(16)) | U(1)))
+    x = U(x ^ U(x * U(0x05526C56)))
+    x = U(x ^ U(x * U(0x53A22864)))
+    x = U(((x & U(0x55555555)) << U(1)) | ((x >> U(1)) & U(0x55555555)))
+    x = U(((x & U(0x33333333)) << U(2)) | ((x >> U(2)) & U(0x33333333)))
+    x = U(((x & U(0x0F0F0F0F)) << U(4)) | ((x >> U(4)) & U(0x0F0F0F0F)))
+    x = U(((x & U(0x00FF00FF)) << U(8)) | ((x >> U(8)) & U(0x00FF00FF)))
+    return U((x << U(16)) | (x >> U(16)))
 
 
 def sobol(count: int) -> Array:
@@ -69,7 +89,20 @@ def sobol(count: int) -> Array:
     return points.astype(np.uint32)
 
 
-@njit
+def reversed_bits(numbers: Array) -> Array:
+    """uint32 `numbers` with their bits in the opposite order, as `scrambled` takes them."""
+    bits = np.unpackbits(np.ascontiguousarray(numbers, ">u4").view(np.uint8)[..., None], axis=-1)
+    bits = bits.reshape(*numbers.shape, 32)[..., ::-1]
+    return np.packbits(bits, axis=-1).view(">u4")[..., 0].astype(np.uint32)
+
+
+@functools.lru_cache(maxsize=8)
+def point_set(count: int) -> Array:
+    """`sobol` for `scrambled`; the same array for every batch of a picture, not to be written to."""
+    return reversed_bits(sobol(count))
+
+
+@inlined
 def sincos_turns(q):  # type: ignore[no-untyped-def]
     """sin and cos of 2 pi q, -2 < q < 2, to 4e-7, by minimax polynomials on an eighth of a turn."""
     turn = np.int32(q * F(4.0) + F(8.5)) - np.int32(8)
@@ -84,7 +117,7 @@ def sincos_turns(q):  # type: ignore[no-untyped-def]
     return s, c
 
 
-@njit
+@inlined
 def fast_acos(x):  # type: ignore[no-untyped-def]
     """acos to 1e-6 radians, by a minimax polynomial; arguments beyond [-1, 1] are clamped."""
     a = min(abs(x), ONE)
@@ -93,7 +126,7 @@ def fast_acos(x):  # type: ignore[no-untyped-def]
     return y if x >= ZERO else PI - y
 
 
-@njit
+@inlined
 def fast_atan2_turns(y, x):  # type: ignore[no-untyped-def]
     """atan2 / 2 pi in [-1/2, 1/2] to 3e-7 turns, by a minimax polynomial."""
     ax, ay = abs(x), abs(y)
@@ -109,7 +142,7 @@ def fast_atan2_turns(y, x):  # type: ignore[no-untyped-def]
     return r if y >= ZERO else -r
 
 
-@njit
+@inlined
 def basis(nx, ny, nz):  # type: ignore[no-untyped-def]
     """Two unit tangents of a unit normal (Duff et al. 2017)."""
     sign = ONE if nz >= ZERO else -ONE
@@ -118,7 +151,7 @@ def basis(nx, ny, nz):  # type: ignore[no-untyped-def]
     return ONE + sign * nx * nx * a, sign * b, -sign * nx, b, sign + ny * ny * a, -ny
 
 
-@njit
+@inlined
 def cosine_hemisphere(u, v):  # type: ignore[no-untyped-def]
     """Direction about +Z with density z / pi."""
     s, c = sincos_turns(u)

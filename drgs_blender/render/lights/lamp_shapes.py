@@ -74,6 +74,8 @@ def lamp_row(light: Light) -> Array | str:
         if light.kind == "spot":
             if not lengths.min() > 0:
                 return "its scale is zero"
+            if not light.spot_size > 0:
+                return "its cone is closed"
             _cone(row, light, columns, lengths)
     if radiance is None:
         return "its size or scale is zero"

@@ -1,6 +1,6 @@
-"""Blender's lights: a direction towards one of them, and those that a ray meets.
+"""What shines next to the sky, Blender's lights and surfaces that emit: directions towards them, those that rays meet.
 
-``lamp_tree`` says which lamp to sample from a point, ``lamp_shapes`` what one lamp is.
+``lamp_tree`` says which lamp to sample from a point, ``lamp_shapes`` what one lamp is; ``emitters`` are the surfaces.
 """
 
 from __future__ import annotations
@@ -9,13 +9,16 @@ import numpy as np
 
 from ...frame import Light
 from ...jit import njit
-from ..sampling import ONE, ZERO, F
+from ..sampling import ONE, ZERO, F, U
+from ..trace.surface import emitted
+from .emitters import Emitters, emitter_bits, emitter_pdf, emitter_row, emitters_luminance, sample_emitter
 from .lamp_shapes import (
     BARE_SUN,
     BOUND,
     CAMERA,
     DIFFUSE,
     FLAGS,
+    GLOSSY,
     INTENSITY,
     KIND,
     PLACE,
@@ -28,7 +31,21 @@ from .lamp_shapes import (
     lamp_hit,
     lamp_row,
 )
-from .lamp_tree import COUNT, END, FIRST, NEXT, PAST, SECOND, SUNS, box_hit, build, is_sun, pick_lamp, pick_probability
+from .lamp_tree import (
+    COUNT,
+    END,
+    FIRST,
+    NEXT,
+    PAST,
+    SECOND,
+    SUNS,
+    box_hit,
+    build,
+    is_sun,
+    lamps_weight,
+    pick_lamp,
+    pick_probability,
+)
 
 Array = np.ndarray
 
@@ -40,6 +57,7 @@ class Lamps:
     ----------
     lights : Blender's lights of one frame
     centre, radius : a sphere around what they shine on, world space; only for `power`
+    emitters : surfaces that emit light; those that are not among them are found by chance alone
 
     Attributes
     ----------
@@ -47,15 +65,22 @@ class Lamps:
         none)
     pick : (m, 16) float32: the tree, see the columns above
     order : (count,) int: which of `lights` each row is
-    count : int: lamps that shine
+    count : int: lamps that shine, and triangles
     power : estimated luminance that arrives at the sphere from all directions together (cd / m^2 sr), as the integral
         of an environment over all directions is
-    rays_differ : bool: there is a lamp that diffuse rays see and glossy ones do not, or the other way
+    rays_differ : bool: there is one that diffuse rays see and glossy ones do not, or the other way
     seen : bool: there is a lamp that the camera sees
     warnings : list of str: lights that are left out, and why
     """
 
-    def __init__(self, lights: list[Light], centre: Array | None = None, radius: float = 1.0) -> None:
+    def __init__(
+        self,
+        lights: list[Light],
+        centre: Array | None = None,
+        radius: float = 1.0,
+        emitters: Emitters | None = None,
+    ) -> None:
+        self.emitters = emitters or _NO_EMITTERS
         rows: list[Array] = []
         kept: list[int] = []
         self.warnings: list[str] = []
@@ -66,15 +91,22 @@ class Lamps:
             else:
                 rows.append(row)
                 kept.append(i)
-        self.count = len(rows)
+        self.warnings += self.emitters.warnings
+        self.count = len(rows) + self.emitters.count
         table = np.array(rows, np.float32).reshape(-1, WIDTH)
         order, self.pick = build(table)
-        self.table = table[order] if self.count else np.zeros((1, WIDTH), np.float32)
+        self.table = table[order] if rows else np.zeros((1, WIDTH), np.float32)
         self.order = np.array(kept, np.int64)[order]
-        self.power = self._power(np.zeros(3) if centre is None else np.asarray(centre, np.float64), radius)
+        middle = np.zeros(3) if centre is None else np.asarray(centre, np.float64)
+        self.power = self._power(middle, radius) + self.emitters.power(middle, radius)
         flags = self.table[:, FLAGS].astype(int)
-        self.rays_differ = bool(((flags >> 1 ^ flags >> 2) & 1).any())
+        self.rays_differ = bool(((flags >> 1 ^ flags >> 2) & 1).any()) or self.emitters.rays_differ
         self.seen = bool((flags & CAMERA).any())
+
+    @property
+    def tables(self) -> tuple[Array, Array, int]:
+        """What compiled code takes as `lamps`; until the next update of the emitters' scene."""
+        return self.table, self.pick, self.emitters.address
 
     def sample(self, numbers: Array, points: Array) -> tuple[Array, Array, Array, Array, Array]:
         """``sample_lamp`` for (n, 3) uint32 and (n, 3) or (3,) points.
@@ -84,14 +116,14 @@ class Lamps:
         (directions (n, 3), distances (n,), radiance (n, 3), densities (n,), rows (n,))
         """
         numbers = np.ascontiguousarray(numbers, np.uint32)
-        out, rows = _sample_many(numbers, _rows(points, numbers), self.table, self.pick)
+        out, rows = _sample_many(numbers, _rows(points, numbers), *self.tables)
         return out[:, :3], out[:, 3], out[:, 4:7], out[:, 7], rows
 
     def pdf(self, rows: Array, points: Array, directions: Array) -> Array:
         """(n,) ``pdf_lamp`` of table rows (n,) for (n, 3) unit directions at (n, 3) or (3,) points."""
         directions = np.ascontiguousarray(directions, np.float32)
         rows = np.ascontiguousarray(np.broadcast_to(rows, len(directions)), np.int64)
-        return _pdf_many(rows, _rows(points, directions), directions, self.table, self.pick)
+        return _pdf_many(rows, _rows(points, directions), directions, *self.tables)
 
     def along(
         self,
@@ -105,9 +137,7 @@ class Lamps:
         """(n, 3) ``lamps_along`` for (n, 3) unit directions from (n, 3) or (3,) origins."""
         directions = np.ascontiguousarray(directions, np.float32)
         others = np.ascontiguousarray(np.broadcast_to(np.asarray(others, np.float32), len(directions)))
-        return _along_many(
-            _rows(origins, directions), directions, F(tmax), others, F(share), seen_by, self.table, self.pick
-        )
+        return _along_many(_rows(origins, directions), directions, F(tmax), others, F(share), seen_by, *self.tables)
 
     def _power(self, centre: Array, radius: float) -> float:
         table = self.table.astype(np.float64)
@@ -122,19 +152,43 @@ def _rows(values: Array, like: Array) -> Array:
     return np.ascontiguousarray(np.broadcast_to(values, (len(like), 3)))
 
 
+_NO_EMITTERS = Emitters()
+
+
 @njit
-def sample_lamp(n0, n1, n2, px, py, pz, table, pick):  # type: ignore[no-untyped-def]
-    """A direction from a point towards one of the lamps, from three uint32.
+def _emitters_share(px, py, pz, table, pick, emitters):  # type: ignore[no-untyped-def]
+    """How often surfaces are sampled from a point, rather than lamps; float64."""
+    if emitters == 0:
+        return 0.0
+    if pick[0, END] == ZERO:
+        return 1.0
+    own = emitters_luminance(px, py, pz, emitters)
+    both = own + np.float64(lamps_weight(px, py, pz, table, pick))
+    return own / both if both > 0.0 else 0.0
+
+
+@njit
+def sample_lamp(n0, n1, n2, px, py, pz, table, pick, emitters):  # type: ignore[no-untyped-def]
+    """A direction from a point towards one of the lamps or surfaces, from three uint32.
 
     Returns
     -------
     (lx, ly, lz, distance, r, g, b, pdf, index)
         World direction of unit length, distance to the lamp (infinite for suns), radiance, density per solid angle
-        times the probability of the pick, row of the table. A negative density marks a lamp that no other strategy
-        finds (without size, or one that nothing shadows): what it adds is f cos rgb / |pdf| without a further weight.
+        times the probability of the pick, row of the table or, behind those, of the emitters. A negative density
+        marks a lamp that no other strategy finds (without size, or one that nothing shadows): what it adds is
+        f cos rgb / |pdf| without a further weight.
         (..., 0, 0, 0, 0, -1 or the lamp) when the lamp sends nothing here.
     """
+    share = _emitters_share(px, py, pz, table, pick, emitters)
+    if share > 0.0:
+        rest = np.float64(n0) * (1.0 / 4294967296.0)
+        if rest < share:
+            lx, ly, lz, t, r, g, b, pdf, i = sample_emitter(rest / share, n1, n2, px, py, pz, emitters)
+            return lx, ly, lz, t, r, g, b, pdf * F(share), i + len(table) if i >= 0 else i
+        n0 = U(np.int64(min((rest - share) / (1.0 - share), 1.0) * 4294967295.0))
     i, probability = pick_lamp(n0, px, py, pz, table, pick)
+    probability *= F(1.0 - share)
     if i < 0:
         return ZERO, ZERO, ONE, ZERO, ZERO, ZERO, ZERO, ZERO, np.int64(-1)
     lx, ly, lz, t = lamp_direction(i, n1, n2, px, py, pz, table)
@@ -147,23 +201,25 @@ def sample_lamp(n0, n1, n2, px, py, pz, table, pick):  # type: ignore[no-untyped
         pdf = probability * lamp_density(i, px, py, pz, lx, ly, lz, t, table)
         if not np.int64(table[i, FLAGS]) & SHADOW:
             pdf = -pdf
-    share = lamp_emission(i, lx, ly, lz, table)
+    part = lamp_emission(i, lx, ly, lz, table)
     if bare and table[i, KIND] != F(BARE_SUN):
-        share /= t * t
-    r, g, b = share * table[i, RADIANCE], share * table[i, RADIANCE + 1], share * table[i, RADIANCE + 2]
+        part /= t * t
+    r, g, b = part * table[i, RADIANCE], part * table[i, RADIANCE + 1], part * table[i, RADIANCE + 2]
     if not (r + g + b < F(np.inf) and abs(pdf) > ZERO and abs(pdf) < F(np.inf)):
         return lx, ly, lz, t, ZERO, ZERO, ZERO, ZERO, i
     return lx, ly, lz, t, r, g, b, pdf, i
 
 
 @njit
-def lamp_flags(index, table):  # type: ignore[no-untyped-def]
-    """Bits CAMERA, DIFFUSE, GLOSSY (rays that see the lamp) and SHADOW (things block it) of a sampled lamp."""
+def lamp_flags(index, table, emitters):  # type: ignore[no-untyped-def]
+    """Bits CAMERA, DIFFUSE, GLOSSY (rays that see it), SHADOW (things block it) and ABSENT of what was sampled."""
+    if index >= len(table):
+        return emitter_bits(index - len(table), emitters)
     return np.int64(table[index, FLAGS])
 
 
 @njit
-def pdf_lamp(index, px, py, pz, lx, ly, lz, table, pick):  # type: ignore[no-untyped-def]
+def pdf_lamp(index, px, py, pz, lx, ly, lz, table, pick, emitters):  # type: ignore[no-untyped-def]
     """Density per solid angle, pick included, with which ``sample_lamp`` draws this unit direction by this lamp.
 
     0 where the lamp sends nothing from there: the density of samples whose radiance is not 0. 0 for lamps without size.
@@ -172,11 +228,50 @@ def pdf_lamp(index, px, py, pz, lx, ly, lz, table, pick):  # type: ignore[no-unt
     if not (t >= ZERO and lamp_emission(index, lx, ly, lz, table) > ZERO):
         return ZERO
     density = lamp_density(index, px, py, pz, lx, ly, lz, t, table)
-    return density * pick_probability(index, px, py, pz, table, pick) if density > ZERO else ZERO
+    if not density > ZERO:
+        return ZERO
+    return density * _probability(index, px, py, pz, table, pick, emitters)
 
 
 @njit
-def _add_lamp(i, ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, pick):  # type: ignore[no-untyped-def]
+def _probability(index, px, py, pz, table, pick, emitters):  # type: ignore[no-untyped-def]
+    """With which a lamp is picked."""
+    share = F(1.0 - _emitters_share(px, py, pz, table, pick, emitters))
+    return share * pick_probability(index, px, py, pz, table, pick)
+
+
+@njit
+def emission_along(ox, oy, oz, dx, dy, dz, hit, geometry, table, pick, emitters):  # type: ignore[no-untyped-def]
+    """What the surface that a ray meets emits, and how it is found by ``sample_lamp``.
+
+    Parameters
+    ----------
+    ox .. dz : origin and unit direction, world space
+    hit : what ``trace.surface.nearest`` returned
+    geometry : the scene's
+
+    Returns
+    -------
+    (r, g, b, diffuse, glossy)
+        Radiance, 0 without a hit; density per solid angle, pick included, with which ``sample_lamp`` draws this
+        direction by this surface, for either lobe.
+    """
+    if hit[1] < 0:
+        return ZERO, ZERO, ZERO, ZERO, ZERO
+    r, g, b = emitted(hit[1], hit[3], hit[4], geometry)
+    if not r + g + b > ZERO:
+        return ZERO, ZERO, ZERO, ZERO, ZERO
+    i = emitter_row(hit[1], hit[2], emitters)
+    if i < 0:
+        return r, g, b, ZERO, ZERO
+    pdf = emitter_pdf(i, ox, oy, oz, dx, dy, dz, hit[0], emitters)
+    pdf *= F(_emitters_share(ox, oy, oz, table, pick, emitters))
+    flags = lamp_flags(len(table) + i, table, emitters)
+    return r, g, b, pdf if flags & DIFFUSE else ZERO, pdf if flags & GLOSSY else ZERO
+
+
+@njit
+def _add_lamp(i, ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, pick, emitters):  # type: ignore[no-untyped-def]
     flags = np.int64(table[i, FLAGS])
     # What nothing shadows is left to ``sample_lamp``: only the camera looks at it along rays.
     if not flags & seen_by or not (flags & SHADOW or seen_by & CAMERA):
@@ -189,14 +284,14 @@ def _add_lamp(i, ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, pi
         return ZERO, ZERO, ZERO
     if share > ZERO:
         density = lamp_density(i, ox, oy, oz, dx, dy, dz, t, table)
-        weight /= others + share * density * pick_probability(i, ox, oy, oz, table, pick)
+        weight /= others + share * density * _probability(i, ox, oy, oz, table, pick, emitters)
     else:
         weight /= others
     return weight * table[i, RADIANCE], weight * table[i, RADIANCE + 1], weight * table[i, RADIANCE + 2]
 
 
 @njit
-def lamps_along(ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, pick):  # type: ignore[no-untyped-def]
+def lamps_along(ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, pick, emitters):  # type: ignore[no-untyped-def]
     """Sum over the lamps with size that a ray meets of L / (others + share * pick * density).
 
     Parameters
@@ -218,21 +313,29 @@ def lamps_along(ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, pic
             continue
         if pick[node, SECOND] == ZERO:
             for i in range(np.int64(pick[node, FIRST]), np.int64(pick[node, PAST])):
-                r, g, b = _add_lamp(i, ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, pick)
+                r, g, b = _add_lamp(i, ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, pick, emitters)
                 red, green, blue = red + r, green + g, blue + b
         node += 1
     for i in range(np.int64(pick[0, SUNS]), np.int64(pick[0, END])):
-        r, g, b = _add_lamp(i, ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, pick)
+        r, g, b = _add_lamp(i, ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, pick, emitters)
         red, green, blue = red + r, green + g, blue + b
     return red, green, blue
 
 
 @njit
-def _sample_many(numbers, points, table, pick):  # type: ignore[no-untyped-def]
+def _sample_many(numbers, points, table, pick, emitters):  # type: ignore[no-untyped-def]
     out, rows = np.empty((len(numbers), 8), np.float32), np.empty(len(numbers), np.int64)
     for j in range(len(numbers)):
         lx, ly, lz, t, r, g, b, pdf, i = sample_lamp(
-            numbers[j, 0], numbers[j, 1], numbers[j, 2], points[j, 0], points[j, 1], points[j, 2], table, pick
+            numbers[j, 0],
+            numbers[j, 1],
+            numbers[j, 2],
+            points[j, 0],
+            points[j, 1],
+            points[j, 2],
+            table,
+            pick,
+            emitters,
         )
         out[j, 0], out[j, 1], out[j, 2], out[j, 3] = lx, ly, lz, t
         out[j, 4], out[j, 5], out[j, 6], out[j, 7] = r, g, b, pdf
@@ -241,22 +344,22 @@ def _sample_many(numbers, points, table, pick):  # type: ignore[no-untyped-def]
 
 
 @njit
-def _pdf_many(rows, points, directions, table, pick):  # type: ignore[no-untyped-def]
+def _pdf_many(rows, points, directions, table, pick, emitters):  # type: ignore[no-untyped-def]
     out = np.empty(len(points), np.float32)
     for j in range(len(points)):
         out[j] = pdf_lamp(
             rows[j], points[j, 0], points[j, 1], points[j, 2], directions[j, 0], directions[j, 1], directions[j, 2],
-            table, pick,
+            table, pick, emitters,
         )  # fmt: skip
     return out
 
 
 @njit
-def _along_many(origins, directions, tmax, others, share, seen_by, table, pick):  # type: ignore[no-untyped-def]
+def _along_many(origins, directions, tmax, others, share, seen_by, table, pick, emitters):  # type: ignore[no-untyped-def]
     out = np.empty((len(origins), 3), np.float32)
     for j in range(len(origins)):
         out[j, 0], out[j, 1], out[j, 2] = lamps_along(
             origins[j, 0], origins[j, 1], origins[j, 2], directions[j, 0], directions[j, 1], directions[j, 2],
-            tmax, others[j], share, seen_by, table, pick,
+            tmax, others[j], share, seen_by, table, pick, emitters,
         )  # fmt: skip
     return out

@@ -19,26 +19,44 @@ from ...frame import World
 from ...jit import njit
 from ..memory import address, load_float, load_int32, load_uint32
 from ..sampling import fast_acos, fast_atan2_turns, sincos_turns, unit
+from .facing import Facing, block_of, facing_ratio, facing_row, in_cells_order
 
 Array = np.ndarray
 
 #: Radiance above this is cut: its square is still a float32.
 BRIGHTEST = np.float32(1e15)
 
+#: A constant world as a picture: fine enough to be sampled as a surface faces it.
+_CONSTANT = (16, 32, 3)
 #: Cells of the sampling table at most; larger pictures are averaged down for sampling (never for the lookup).
 _MOST_CELLS = 1 << 22
 
 
-def _morton(rows: Array, columns: Array) -> Array:
-    """Interleave the bits of two indices below 2^16: neighbours in the map stay near in the order."""
-
-    def spread(x: Array) -> Array:
-        x = x.astype(np.uint32)
-        for shift, mask in ((8, 0x00FF00FF), (4, 0x0F0F0F0F), (2, 0x33333333), (1, 0x55555555)):
-            x = (x | (x << np.uint32(shift))) & np.uint32(mask)
-        return x
-
-    return (spread(rows) << np.uint32(1)) | spread(columns)
+@njit
+def _morton_order(rows, columns):  # type: ignore[no-untyped-def]
+    """Cells of a grid in the order of their interleaved index bits: neighbours in the grid stay near each other."""
+    order = np.empty(rows * columns, np.int64)
+    side = 1
+    while side < max(rows, columns):
+        side *= 2
+    found = 0
+    for code in range(side * side):
+        row, column = np.uint32(code >> 1), np.uint32(code)
+        row, column = row & np.uint32(0x55555555), column & np.uint32(0x55555555)
+        row, column = (row | row >> np.uint32(1)), (column | column >> np.uint32(1))
+        row, column = row & np.uint32(0x33333333), column & np.uint32(0x33333333)
+        row, column = (row | row >> np.uint32(2)), (column | column >> np.uint32(2))
+        row, column = row & np.uint32(0x0F0F0F0F), column & np.uint32(0x0F0F0F0F)
+        row, column = (row | row >> np.uint32(4)), (column | column >> np.uint32(4))
+        row, column = row & np.uint32(0x00FF00FF), column & np.uint32(0x00FF00FF)
+        row, column = (
+            (row | row >> np.uint32(8)) & np.uint32(0xFFFF),
+            (column | column >> np.uint32(8)) & np.uint32(0xFFFF),
+        )
+        if row < rows and column < columns:
+            order[found] = np.int64(row) * columns + np.int64(column)
+            found += 1
+    return order
 
 
 @njit
@@ -61,7 +79,9 @@ def _whole_widths(share: Array) -> Array:
     spare = width - 1
     taken = spare * owed // max(int(spare.sum()), 1)
     width -= taken
-    width[np.argsort(-width, kind="stable")[: owed - int(taken.sum())]] -= 1
+    rest = owed - int(taken.sum())
+    if rest:
+        width[np.argpartition(-width, rest - 1)[:rest]] -= 1
     return width
 
 
@@ -84,6 +104,14 @@ class Sky(NamedTuple):
     row_z: int
     step: int
     columns: int
+    starts: int
+    slices: int
+    ratio: int
+    first: int
+    block: int
+    blocks: int
+    block_columns: int
+    shift: int
     xx: np.float32
     xy: np.float32
     xz: np.float32
@@ -107,6 +135,7 @@ class EnvironmentLight:
         equal strata of one random number are compact regions of equal power
     guide : (2^b,) int32: where to start looking in `cells`
     row_z : (rows + 1,) float32: z at the upper edge of each row of cells, from 1 to -1
+    facing : the cells weighed by the cosine at a surface
     rotation : (3, 3) float32: world direction to environment direction
     bad_texels : int: NaN, infinite or negative texels, taken as black
     black : bool: no light at all
@@ -114,7 +143,7 @@ class EnvironmentLight:
 
     def __init__(self, world: World) -> None:
         if world.environment is None:
-            image = np.ones((1, 1, 3), np.float32)
+            image = np.ones(_CONSTANT, np.float32)
         else:
             image = as_float(world.environment, (-1, -1, 3), "environment")
             if image.size == 0:
@@ -153,26 +182,26 @@ class EnvironmentLight:
         self.black = not total > 0.0
         self._power = float(total)
         self.row_z = edges.astype(np.float32)
-        every = np.arange(rows * columns)
-        lit = every if self.black else every[weights > 0]
-        lit = lit[np.argsort(_morton(lit // columns, lit % columns), kind="stable")]
+        lit = _morton_order(rows, columns)
+        lit = lit if self.black else lit[weights[lit] > 0]
         # Widths in whole random numbers, at least one where there is light; the density follows from them exactly.
         share = np.full(len(lit), 1.0 / len(lit)) if self.black else weights[lit] / total
         width = _whole_widths(share)
         self.cells = np.stack([np.cumsum(width) - 1, lit], axis=1).astype(np.uint32)
-        self.guide = np.zeros(1 << max(0, (len(every) - 1).bit_length()), np.int32)
+        self.guide = np.zeros(1 << max(0, (rows * columns - 1).bit_length()), np.int32)
         _guide_table(self.cells, self.guide)
-        density = np.zeros(len(every))
+        density = np.zeros(rows * columns)
         if not self.black:
             density[lit] = width * 2.0**-32
         self.density = (density.reshape(rows, columns) / solid[:, None]).astype(np.float32)
+        self.facing = Facing(density.reshape(rows, columns), edges, self.cells)
         self.texels[..., 3] = self.density.repeat(step, axis=0).repeat(step, axis=1)
 
     @property
     def sky(self) -> Sky:
         """What compiled code reads; valid while this light lives and its rotation is not replaced."""
         height, width = self.texels.shape[:2]
-        step = height // (len(self.row_z) - 1)
+        step, facing = height // (len(self.row_z) - 1), self.facing
         return Sky(
             address(self.texels),
             height,
@@ -183,6 +212,14 @@ class EnvironmentLight:
             address(self.row_z),
             step,
             width // step,
+            address(facing.starts),
+            address(facing.slices),
+            address(facing.ratio),
+            address(facing.first),
+            address(facing.block),
+            len(facing.first),
+            facing.block.shape[1],
+            facing.shift,
             *self.rotation.ravel(),
         )
 
@@ -195,14 +232,22 @@ class EnvironmentLight:
         """(n, 3) radiance from (n, 3) unit world directions."""
         return _lookup_many(np.ascontiguousarray(directions, np.float32), self.sky)
 
-    def pdf(self, directions: Array) -> Array:
+    def pdf(self, directions: Array, normal: Array | None = None) -> Array:
         """(n,) density per solid angle with which ``sample`` draws (n, 3) unit world directions."""
-        return _pdf_many(np.ascontiguousarray(directions, np.float32), self.sky)
+        directions = np.ascontiguousarray(directions, np.float32)
+        return _pdf_many(directions, self._rows(normal, len(directions)), self.sky)
 
-    def sample(self, numbers: Array) -> tuple[Array, Array]:
-        """World directions (n, 3) and densities (n,) from (n, 3) uint32 random numbers."""
-        numbers = np.ascontiguousarray(numbers, np.uint32)
-        return _sample_many(numbers, self.sky)
+    def sample(self, numbers: Array, normal: Array | None = None) -> tuple[Array, Array]:
+        """World directions (n, 3) and densities (n,) from (n, 3) uint32 random numbers.
+
+        `normal`, unit world vectors (3,) or (n, 3), is that of the surface which is to be lit; None is of no surface.
+        """
+        return _sample_many(np.ascontiguousarray(numbers, np.uint32), self._rows(normal, len(numbers)), self.sky)
+
+    def _rows(self, normal: Array | None, count: int) -> Array:
+        if normal is None:
+            return np.full(count, len(self.facing.ratio) - 1, np.int32)
+        return _rows_many(np.broadcast_to(np.asarray(normal, np.float32), (count, 3)), self.sky)
 
 
 @njit
@@ -215,11 +260,14 @@ def map_at(dx, dy, dz, sky):  # type: ignore[no-untyped-def]
 
 
 @njit
-def sky_density(u, v, sky):  # type: ignore[no-untyped-def]
-    """Density per solid angle of the sampling cell that holds (u, v)."""
+def sky_density(u, v, facing, sky):  # type: ignore[no-untyped-def]
+    """Density per solid angle at (u, v) of light sampling at a surface whose `facing_row` is `facing`."""
     row = min(np.int64(sky.height - 1), np.int64(v * np.float32(sky.height)))
     column = min(np.int64(sky.width - 1), np.int64(u * np.float32(sky.width)))
-    return load_float(sky.texels, 4 * (row * sky.width + column) + 3)
+    density = load_float(sky.texels, 4 * (row * sky.width + column) + 3)
+    if sky.step > 1:
+        row, column = row // sky.step, column // sky.step
+    return density * facing_ratio(facing, row, column, sky)
 
 
 @njit
@@ -300,23 +348,35 @@ def _lookup_many(directions, sky):  # type: ignore[no-untyped-def]
 
 
 @njit
-def _pdf_many(directions, sky):  # type: ignore[no-untyped-def]
-    out = np.empty(len(directions), np.float32)
-    for i in range(len(directions)):
-        u, v = map_at(directions[i, 0], directions[i, 1], directions[i, 2], sky)
-        out[i] = sky_density(u, v, sky)
+def _rows_many(normals, sky):  # type: ignore[no-untyped-def]
+    out = np.empty(len(normals), np.int32)
+    for i in range(len(normals)):
+        out[i] = facing_row(normals[i, 0], normals[i, 1], normals[i, 2], sky)
     return out
 
 
 @njit
-def _sample_many(numbers, sky):  # type: ignore[no-untyped-def]
+def _pdf_many(directions, facing, sky):  # type: ignore[no-untyped-def]
+    out = np.empty(len(directions), np.float32)
+    for i in range(len(directions)):
+        u, v = map_at(directions[i, 0], directions[i, 1], directions[i, 2], sky)
+        out[i] = sky_density(u, v, facing[i], sky)
+    return out
+
+
+@njit
+def _sample_many(numbers, facing, sky):  # type: ignore[no-untyped-def]
     n = len(numbers)
     directions, pdf = np.empty((n, 3), np.float32), np.empty(n, np.float32)
     for i in range(n):
-        place = first_cell(numbers[i, 0], sky)
-        while numbers[i, 0] > cell_end(place, sky):
+        number, ratio = in_cells_order(
+            facing[i], block_of(facing[i], numbers[i, 0], sky), numbers[i, 0], numbers[i, 1], sky
+        )
+        place = first_cell(number, sky)
+        while number > cell_end(place, sky):
             place += 1
         _, column, upper, lower, pdf[i] = cell_at(place, sky)
+        pdf[i] *= ratio
         directions[i, 0], directions[i, 1], directions[i, 2], _, _ = direction_in_cell(
             column, upper, lower, numbers[i, 1], numbers[i, 2], sky
         )

@@ -126,8 +126,6 @@ class Film:
 
     def guides(self) -> Guides:
         """What the denoiser tells surfaces apart by."""
-        per_metre = np.float32(1.0 / min(self.parameters[FX], self.parameters[FY]))
-        flat = self.parameters[ORTHOGRAPHIC] != 0.0
         return Guides(
             self.coverage,
             self.position,
@@ -136,22 +134,31 @@ class Film:
             self.roughness,
             self.metallic,
             self.index,
-            np.full_like(self.depth, per_metre) if flat else self.depth * per_metre,
+            footprints(self.depth, self.parameters),
         )
 
-    def passes(self, names: tuple[str, ...], components: Array | None = None) -> dict[str, Array]:
+    def passes(
+        self,
+        names: tuple[str, ...],
+        components: Array | None = None,
+        vector: Array | None = None,
+        previous: Array | None = None,
+    ) -> dict[str, Array]:
         """Passes by name, (h, w, channels) float32.
 
         Parameters
         ----------
         components : (h, w, 4, 3) denoised light; that of the film when None
+        vector, previous : the passes of motion; nothing moves when None
         """
         light = self.components if components is None else components
         made = {name: np.ascontiguousarray(light[:, :, i]) for i, name in enumerate(COMPONENTS)}
         shadow = self._shadow()
         made["Env"] = self.environment - self.veiled * shadow[..., None] if shadow.any() else self.environment
         made["Emit"] = self.emission
-        made |= {"Position": self.position, "Normal": self.normal, "Albedo": self.albedo}
+        made |= {"Position": self.position, "Normal": self.normal, "Albedo": self.albedo, "Variance": self.variance}
+        made["Vector"] = np.zeros((*self.coverage.shape, 4), np.float32) if vector is None else vector
+        made["Previous Position"] = self.position if previous is None else previous
         scalars = {
             "Depth": self.depth,
             "Roughness": self.roughness,
@@ -172,11 +179,22 @@ class Film:
         return np.where(unshadowed > 0, np.clip(1 - light / np.where(unshadowed > 0, unshadowed, 1), 0, 1), 0)
 
     def _beauty(self, light: Array, environment: Array, shadow: Array) -> Array:
-        out = np.ones((*self.coverage.shape, 4), np.float32)
-        out[..., :3] = light[:, :, 0] + light[:, :, 1] + light[:, :, 2] + light[:, :, 3] + environment + self.emission
-        if self.transparent:
-            out[..., 3] = self.coverage + self.catcher[:, :, 0] * shadow
-        return out
+        opaque = self.coverage + self.catcher[:, :, 0] * shadow if self.transparent else np.float32(1.0)
+        return add_light(light, environment, self.emission, opaque)
+
+
+def footprints(depth: Array, parameters: Array) -> Array:
+    """(h, w) float32 metres: width of a pixel at `depth` (h, w) before the camera of `parameters`."""
+    per_metre = np.float32(1.0 / min(parameters[FX], parameters[FY]))
+    return np.full_like(depth, per_metre) if parameters[ORTHOGRAPHIC] != 0.0 else depth * per_metre
+
+
+def add_light(light: Array, environment: Array, emission: Array, opaque: Array | np.float32) -> Array:
+    """(h, w, 4) float32 Combined of (h, w, 4, 3) light, what is behind it and what surfaces emit."""
+    out = np.empty((*light.shape[:2], 4), np.float32)
+    out[..., :3] = light[:, :, 0] + light[:, :, 1] + light[:, :, 2] + light[:, :, 3] + environment + emission
+    out[..., 3] = opaque
+    return out
 
 
 @njit(parallel=True)

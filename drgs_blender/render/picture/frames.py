@@ -110,6 +110,23 @@ def read_frame(path: str | Path) -> tuple[dict[str, Array], dict[str, str]]:
     return passes, metadata
 
 
+def read_checksum(path: str | Path) -> str:
+    """Checksum of pixels and metadata that the frame at `path` carries; only its header is read.
+
+    Raises
+    ------
+    AssetError: there is no such file, or it is no frame of DR-GS.
+    """
+    try:
+        with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
+            checksum = file.header().get(PREFIX + _CHECKSUM)
+    except _FAILURES as error:
+        raise AssetError(str(path), f"cannot be read as OpenEXR ({error})", "Render this frame again") from error
+    if not isinstance(checksum, str):
+        raise AssetError(str(path), "was not written by DR-GS", "Choose another output folder or file name")
+    return checksum
+
+
 def _channel_name(name: str, channel: str) -> str:
     return channel if name == "Combined" else f"{name}.{channel}"
 
@@ -127,7 +144,7 @@ def _channels(path: Path, passes: dict[str, Array], half: bool) -> dict[str, Arr
         size = values.shape[:2]
         for i, letter in enumerate(kind.channels):
             channel = np.ascontiguousarray(values[:, :, i], dtype=np.float32)
-            if half and kind.kind == "COLOR":
+            if half and kind.kind == "COLOR" and not kind.exact:
                 channel = np.clip(channel, -_LARGEST_HALF, _LARGEST_HALF).astype(np.float16)
             channels[_channel_name(name, letter)] = channel
     if size is None or 0 in size:

@@ -1,4 +1,4 @@
-"""Where every visible surface point was in the frame before: on its mesh, in the world, in the picture.
+"""Where every visible surface point is at another time: on its mesh, in the world, in the picture.
 
 A point is tied to the mesh by a face and barycentric coordinates. What stands off the mesh (a surfel is not quite on
 it) keeps its coordinates in the basis of the face's two edges and unit normal, as surfels do when they are posed, so
@@ -8,7 +8,7 @@ that a seen point moves exactly as its surfel.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,20 +16,36 @@ from ...jit import njit, prange
 from ..camera import CX, CY, FX, FY, ORTHOGRAPHIC, POSITION, WIDTH
 from ..points import CATCHER
 from ..primary.gbuffer import GBuffer
+from ..trace.scene import TraceScene
+from ..trace.surface import position_at
 from .film import SAME_SURFACE
 
 Array = np.ndarray
 
 
+class Instant(NamedTuple):
+    """The shapes of a scene and its camera at one time.
+
+    Attributes
+    ----------
+    vertices, places : laid out as those of `trace.scene.TraceScene`
+    parameters : `camera.camera_parameters`
+    """
+
+    vertices: Array
+    places: Array
+    parameters: Array
+
+
 @dataclass(slots=True)
 class Motion:
-    """Where the surfaces of a picture come from.
+    """Where the surfaces of a picture are at another time, mostly one frame earlier.
 
     Attributes
     ----------
     vector : (h, w, 2) float32 pixels, x to the right and y down: what must be added to a pixel's position to find its
-        surface in the frame before; NaN where that is unknown (nothing covered, or it was behind the camera)
-    previous : (h, w, 3) float32 metres, world space: where the surface at ``Position`` was
+        surface in the other frame; NaN where that is unknown (nothing covered, or it is behind the camera)
+    previous : (h, w, 3) float32 metres, world space: where the surface at ``Position`` is then
     """
 
     vector: Array
@@ -37,15 +53,15 @@ class Motion:
 
 
 def previous_positions(
-    faces: Array, vertices: Array, previous_vertices: Array, face: Array, barycentric: Array, position: Array
+    faces: Array, now: Instant, then: Instant, face: Array, place: Array, barycentric: Array, position: Array
 ) -> Array:
-    """World positions of surface points in the frame before.
+    """World positions of surface points at another time.
 
     Parameters
     ----------
     faces : (m, 3) int32
-    vertices, previous_vertices : (k, 3) float32 metres, world space: the mesh now and before
     face : (n,) int32, the face each point is tied to; negative for points that are tied to nothing and do not move
+    place : (n,) int32, the row of ``places`` that the face stands in; negative for a face in world space
     barycentric : (n, 2) float32 weights of the face's second and third corner, as Embree gives them
     position : (n, 3) float32 where the points are now
 
@@ -54,7 +70,9 @@ def previous_positions(
     (n, 3) float32
     """
     out = np.empty((len(face), 3), np.float32)
-    _previous(faces, vertices, previous_vertices, face, barycentric, position, out)
+    _previous(
+        faces, now.vertices, now.places, then.vertices, then.places, face, place, barycentric, position, out
+    )  # fmt: skip
     return out
 
 
@@ -65,31 +83,55 @@ class MotionFilm:
     ----------
     shape : (h, w) of the camera's window
     origin : (x0, y0) of it
-    parameters : `camera.camera_parameters` of this frame
+    now, then : this time and the other one
     """
 
-    def __init__(self, shape: tuple[int, int], origin: tuple[int, int], parameters: Array) -> None:
-        self.origin, self.parameters = origin, parameters
+    def __init__(self, shape: tuple[int, int], origin: tuple[int, int], now: Instant, then: Instant) -> None:
+        self.origin, self.now, self.then = origin, now, then
         self.displacement = np.zeros((*shape, 3), np.float32)
 
-    def add(self, buffer: GBuffer, previous: Array) -> None:
-        """Take the strip `buffer` whose samples were at `previous` (n, 3), see `previous_positions`."""
+    def add(self, buffer: GBuffer, scene: TraceScene) -> None:
+        """Take the samples of the strip `buffer`."""
+        position = buffer.position
+        if self.then.vertices is not self.now.vertices or self.then.places is not self.now.places:
+            tied = buffer.face, buffer.place, buffer.barycentric
+            self.displace(buffer, previous_positions(scene.faces, self.now, self.then, *tied, position))
+
+    def displace(self, buffer: GBuffer, previous: Array) -> None:
+        """Take samples that are at `previous` (n, 3) at the other time."""
         x0, top = self.origin
         y0, y1 = buffer.rows
-        points = buffer.points
-        start = np.searchsorted(points.pixel, np.arange(y0, y1 + 1, dtype=np.int64) * int(self.parameters[WIDTH]))
+        points, parameters = buffer.points, self.now.parameters
+        start = np.searchsorted(points.pixel, np.arange(y0, y1 + 1, dtype=np.int64) * int(parameters[WIDTH]))
         _displace(
-            start, x0, self.parameters, points.pixel, points.weight, points.flags, buffer.depth, buffer.position,
-            previous, self.displacement[y0 - top : y1 - top],
+            start, x0, parameters, points.pixel, points.weight, points.flags, buffer.face, buffer.depth,
+            buffer.position, previous, self.displacement[y0 - top : y1 - top],
         )  # fmt: skip
 
-    def motion(self, position: Array, coverage: Array, before: Array) -> Motion:
-        """Motion of the picture whose passes are `position` and `coverage`; `before` are the parameters of the camera
-        in the frame before."""
-        vector = np.full((*coverage.shape, 2), np.nan, np.float32)
-        previous = position + self.displacement
-        _vectors(self.parameters, before, position, previous, coverage, vector)
-        return Motion(vector, previous)
+    def motion(self, position: Array, coverage: Array) -> Motion:
+        """Motion of the picture whose passes are `position` and `coverage`."""
+        return motion(position, position + self.displacement, coverage, self.now.parameters, self.then.parameters)
+
+
+def motion(position: Array, previous: Array, coverage: Array, now: Array, then: Array) -> Motion:
+    """Motion of surfaces seen at `position` (h, w, 3) that are at `previous` at the other time; `now` and `then` are
+    the parameters of the cameras."""
+    vector = np.full((*coverage.shape, 2), np.nan, np.float32)
+    _vectors(now, then, position, previous, coverage, vector)
+    return Motion(vector, previous)
+
+
+def vector_pass(before: Motion | None, after: Motion | None, shape: tuple[int, int]) -> Array:
+    """(h, w, 4) float32: motion as Blender's Vector pass has it, zero where it is unknown.
+
+    As Cycles writes it, in pixels, x to the right and y up: the place in the previous frame less that in this one, and
+    the place in this frame less that in the next one.
+    """
+    out = np.zeros((*shape, 4), np.float32)
+    for known, first, side in ((before, 0, 1.0), (after, 2, -1.0)):
+        if known is not None:
+            out[..., first : first + 2] = np.nan_to_num(known.vector * np.array([side, -side], np.float32), nan=0.0)
+    return out
 
 
 @njit(inline="always")
@@ -118,12 +160,22 @@ def _basis(v: Any, faces: Any, f: Any) -> Any:
 
 @njit(parallel=True)
 def _previous(
-    faces: Any, vertices: Any, before: Any, face: Any, barycentric: Any, position: Any, out: Any
+    faces: Any, vertices: Any, places: Any, before: Any, places_before: Any, face: Any, place: Any, barycentric: Any,
+    position: Any, out: Any,
 ) -> None:  # fmt: skip
     for i in prange(len(face)):
-        f = face[i]
+        f, stand = face[i], place[i]
         if f < 0:
             out[i, 0], out[i, 1], out[i, 2] = position[i, 0], position[i, 1], position[i, 2]
+            continue
+        if stand >= 0:
+            x, y, z = position_at(f, stand, barycentric[i, 0], barycentric[i, 1], vertices, faces, places)
+            u, v, w = position_at(f, stand, barycentric[i, 0], barycentric[i, 1], before, faces, places_before)
+            out[i, 0], out[i, 1], out[i, 2] = (
+                position[i, 0] + (u - x),
+                position[i, 1] + (v - y),
+                position[i, 2] + (w - z),
+            )
             continue
         b, c = np.float64(barycentric[i, 0]), np.float64(barycentric[i, 1])
         x, y, z, ux, uy, uz, wx, wy, wz, nx, ny, nz, size = _basis(vertices, faces, f)
@@ -145,9 +197,13 @@ def _previous(
 
 @njit(parallel=True)
 def _displace(
-    start: Any, x0: Any, p: Any, pixel: Any, weight: Any, flags: Any, depth: Any, position: Any, previous: Any, out: Any
-) -> None:
-    """Mean displacement of the samples on the surface nearest to the camera, the same that make up Position."""
+    start: Any, x0: Any, p: Any, pixel: Any, weight: Any, flags: Any, face: Any, depth: Any, position: Any,
+    previous: Any, out: Any,
+) -> None:  # fmt: skip
+    """Mean displacement of the samples on the surface nearest to the camera, the same that make up Position.
+
+    Samples that are tied to no face follow the others.
+    """
     width = np.int64(p[WIDTH])
     flat = p[ORTHOGRAPHIC] != 0.0
     slope = SAME_SURFACE / min(p[FX], p[FY])
@@ -164,7 +220,7 @@ def _displace(
             limit = nearest * (np.float32(1.0) + per_depth) + fixed
             total = dx = dy = dz = np.float32(0.0)
             for i in range(first, last):
-                if depth[i] <= limit and not flags[i] & CATCHER:
+                if depth[i] <= limit and face[i] >= 0 and not flags[i] & CATCHER:
                     w = weight[i]
                     total += w
                     dx += w * (previous[i, 0] - position[i, 0])

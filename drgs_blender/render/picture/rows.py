@@ -8,12 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from typing import Any
 
 from ...jit import get_num_threads
 
-#: Runs of rows a thread, so that those who are done early have something to take.
-_RUNS = 8
+#: Runs of rows a thread, so that those who are done early have something to take; fewest rows of a run, because handing
+#: one over costs as much as some of them.
+_RUNS, _FEWEST = 8, 24
+
+
+@cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, "drgs-rows")
 
 
 def over_rows(kernel: Callable[..., Any], rows: int, *arguments: Any) -> None:
@@ -27,8 +34,8 @@ def over_rows(kernel: Callable[..., Any], rows: int, *arguments: Any) -> None:
     if threads == 1:
         kernel(0, rows, *arguments)
         return
-    size = -(-rows // (threads * _RUNS))
+    size = max(-(-rows // (threads * _RUNS)), min(_FEWEST, -(-rows // threads)))
     kernel(0, 0, *arguments)  # compiled once, before the threads ask for it
-    with ThreadPoolExecutor(threads) as pool:
-        for done in [pool.submit(kernel, y, min(y + size, rows), *arguments) for y in range(0, rows, size)]:
-            done.result()
+    pool = _pool(threads)
+    for done in [pool.submit(kernel, y, min(y + size, rows), *arguments) for y in range(0, rows, size)]:
+        done.result()

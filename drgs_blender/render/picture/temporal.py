@@ -41,7 +41,7 @@ from .denoise import (
     modulate,
     smooth,
 )
-from .motion import Motion
+from .motion import Instant, Motion
 from .rows import over_rows
 
 Array = np.ndarray
@@ -76,6 +76,22 @@ class Shot:
     variance: Array
     guides: Guides
     motion: Motion | None = None
+
+
+@dataclass(slots=True)
+class History:
+    """What the pictures of a sequence leave for the next one.
+
+    Attributes
+    ----------
+    signal : what `denoise_next` returned for the last picture; None before the first
+    instant : the scene as it was in that picture
+    still : nothing has changed since then, save the noise
+    """
+
+    signal: Signal | None = None
+    instant: Instant | None = None
+    still: bool = False
 
 
 def denoise_next(

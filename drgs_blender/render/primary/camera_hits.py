@@ -87,6 +87,9 @@ def shade_mesh(
         buffer.depth,
         buffer.object_index,
         buffer.emission,
+        buffer.face,
+        buffer.place,
+        buffer.barycentric,
     )
 
 
@@ -153,6 +156,9 @@ def _shade(
     depth: Any,
     owner: Any,
     emission: Any,
+    out_face: Any,
+    out_place: Any,
+    barycentric: Any,
 ) -> None:
     """Fill the shading points from the hits, row by row."""
     width = np.int64(p[WIDTH])
@@ -183,3 +189,4 @@ def _shade(
             roughness[n], metallic[n] = rough, metal
             depth[n], owner[n] = hit_depth[y, x, k], who
             emission[n, 0], emission[n, 1], emission[n, 2] = er, eg, eb
+            out_face[n], out_place[n], barycentric[n, 0], barycentric[n, 1] = face, place, u, v

@@ -30,6 +30,9 @@ class GBuffer:
     depth : (n,) float32, metres along the view axis
     object_index : (n,) int32, as numbered by `scene.TraceScene`
     emission : (n, 3) float32 radiance that the surface itself sends to the camera
+    face, place : (n,) int32: what the point is tied to, as `surface.nearest` numbers it; face -1 for a surfel off all
+        meshes
+    barycentric : (n, 2) float32 weights of the face's second and third corner
     alpha : (rows, width, aa) float32: what of each sub-pixel sample hides the background; shadow catchers do not
     """
 
@@ -39,6 +42,9 @@ class GBuffer:
     depth: Array
     object_index: Array
     emission: Array
+    face: Array
+    place: Array
+    barycentric: Array
     alpha: Array
 
     def mark_catchers(self, object_flags: Array) -> None:
@@ -67,7 +73,7 @@ def compact(alpha: Array, parameters: Array, x0: int, y0: int, second: Array | N
         counts = counts + np.count_nonzero(second, axis=(1, 2))
     np.cumsum(counts, out=start[1:])
     n = int(start[-1])
-    pixel, sample, owner = np.empty((3, n), np.int32)
+    pixel, sample, owner, face, place = np.empty((5, n), np.int32)
     weight, roughness, metallic, depth = np.empty((4, n), np.float32)
     origin, normal, geometric, view, albedo, position = (np.empty((n, 3), np.float32) for _ in range(6))
     flags = np.zeros(n, np.uint8)
@@ -75,7 +81,8 @@ def compact(alpha: Array, parameters: Array, x0: int, y0: int, second: Array | N
     _number(alpha, none if second is None else second, parameters, x0, y0, pixel, sample, weight, flags)
     points = ShadingPoints(pixel, sample, weight, origin, normal, geometric, view, albedo, roughness, metallic, flags)
     emission = np.zeros((n, 3), np.float32)
-    return GBuffer((y0, y0 + len(alpha)), points, position, depth, owner, emission, alpha), start
+    tied = face, place, np.empty((n, 2), np.float32)
+    return GBuffer((y0, y0 + len(alpha)), points, position, depth, owner, emission, *tied, alpha), start
 
 
 @njit

@@ -11,6 +11,8 @@ the mesh point that belongs to it:
 4. else the nearest face along the camera ray within the window, whichever way it is turned;
 5. else (no mesh near) the point stays where it is, lifted by the window along its normal.
 
+Where light meets the surfels themselves, points stay where they are, and say which surfels are their own.
+
 A surfel's normal that is turned away from its face by more than 60 degrees would lose most of the light between both;
 the face's own is used then.
 
@@ -29,10 +31,10 @@ from ...jit import njit, prange
 from ..camera import WIDTH, sample_ray
 from ..points import SECOND
 from ..surfels.raster import rasterise
-from ..surfels.splats import Splats
-from ..trace.embree import trace
+from ..surfels.splats import SIZE, Splats
 from ..trace.masks import SURFELS
 from ..trace.scene import TraceScene
+from ..trace.surface import nearest
 from .camera_hits import shade_mesh
 from .gbuffer import GBuffer, compact, face_viewer
 from .layers import combine
@@ -57,13 +59,16 @@ def snap_windows(scene: TraceScene, object_count: int) -> Array:
     return (WINDOW_EDGES * total / np.maximum(count, 1)).astype(np.float32)
 
 
-def primary_surfels(splats: Splats, scene: TraceScene, windows: Array, camera: Camera, y0: int, y1: int) -> GBuffer:
+def primary_surfels(
+    splats: Splats, scene: TraceScene, windows: Array, camera: Camera, y0: int, y1: int, tied: bool = True
+) -> GBuffer:
     """Blend the surfels of the rows ``y0 .. y1`` (full-picture pixels) and tie them to the mesh.
 
     Parameters
     ----------
     splats : `prepare` of this frame
     windows : `snap_windows` of this frame
+    tied : False: rays meet surfels, and nothing is tied
     """
     samples = rasterise(splats, y0, y1)
     layers = combine(samples, scene, splats.parameters, camera.window[0], y0)
@@ -71,8 +76,8 @@ def primary_surfels(splats: Splats, scene: TraceScene, windows: Array, camera: C
     buffer.alpha = layers.opaque
     points = buffer.points
     _attach(
-        scene.bvh.intersect_address,
-        scene.bvh.scene,
+        scene.tracer,
+        tied,
         scene.vertex_faces > 0,
         splats.parameters,
         windows,
@@ -94,7 +99,14 @@ def primary_surfels(splats: Splats, scene: TraceScene, windows: Array, camera: C
         buffer.position,
         buffer.depth,
         buffer.object_index,
+        buffer.face,
+        buffer.place,
+        buffer.barycentric,
     )
+    if not tied:
+        row, column = np.divmod(points.pixel, splats.parameters[WIDTH].astype(np.int64))
+        points.own = np.where(points.flags & SECOND, -1, buffer.object_index).astype(np.int32)
+        points.size = samples.surface[row - y0, column - camera.window[0], points.sample, SIZE]
     if layers.hits is not None:
         shade_mesh(scene, layers.hits, splats.parameters, camera.window[0], start, buffer, SECOND)
     buffer.mark_catchers(scene.object_flags)
@@ -118,25 +130,26 @@ def _edge_lengths(vertices: Any, faces: Any, face_object: Any, total: Any, count
 
 
 @njit(inline="always")
-def _shoot(address: Any, bvh: Any, x: Any, y: Any, z: Any, dx: Any, dy: Any, dz: Any, reach: Any) -> Any:
-    """Closest hit on the segment from (x, y, z) along (dx, dy, dz): its parameter, unit face normal, and whether.
+def _shoot(tracer: Any, x: Any, y: Any, z: Any, dx: Any, dy: Any, dz: Any, reach: Any) -> Any:
+    """Closest hit on the segment from (x, y, z) along (dx, dy, dz): its parameter, unit face normal, face and u, v.
+
+    The face is -1 when nothing is hit.
 
     Short segments that start near the surface keep float32 exact where a ray from a distant camera would not.
     """
-    t, group, _, _, _, _, gx, gy, gz = trace(
-        address, bvh, np.float32(x), np.float32(y), np.float32(z), np.float32(dx), np.float32(dy), np.float32(dz),
+    t, face, _, u, v, gx, gy, gz = nearest(
+        tracer, np.float32(x), np.float32(y), np.float32(z), np.float32(dx), np.float32(dy), np.float32(dz),
         np.float32(0.0), np.float32(reach), np.int32(SURFELS),
     )  # fmt: skip
     length = np.sqrt(np.float64(gx) * gx + np.float64(gy) * gy + np.float64(gz) * gz)
-    if group < 0 or length == 0.0:
-        return np.float64(0.0), 0.0, 0.0, 0.0, False
-    return np.float64(t), gx / length, gy / length, gz / length, True
+    if face < 0 or length == 0.0:
+        return np.float64(0.0), 0.0, 0.0, 0.0, np.int32(-1), u, v
+    return np.float64(t), gx / length, gy / length, gz / length, face, u, v
 
 
 @njit(inline="always")
 def _find(
-    address: Any,
-    bvh: Any,
+    tracer: Any,
     x: Any,
     y: Any,
     z: Any,
@@ -149,14 +162,16 @@ def _find(
     ahead: Any,
     window: Any,
 ) -> Any:
-    """Mesh point of the surfel point (x, y, z) with normal n, seen from v: how it was found, point, face normal."""
+    """Mesh point of the surfel point (x, y, z) with normal n, seen from v: how it was found, point, face normal, and
+    the face with u and v (-1: none)."""
     how = NOWHERE
+    face, a, b = np.int32(-1), np.float32(0.0), np.float32(0.0)
     hx, hy, hz, gx, gy, gz = x, y, z, nx, ny, nz
     left = ahead + window
     sx, sy, sz = x + ahead * vx, y + ahead * vy, z + ahead * vz
     for _ in range(3):
-        t, fx, fy, fz, hit = _shoot(address, bvh, sx, sy, sz, -vx, -vy, -vz, left)
-        if not hit:
+        t, fx, fy, fz, hit, u, v = _shoot(tracer, sx, sy, sz, -vx, -vy, -vz, left)
+        if hit < 0:
             break
         sx, sy, sz = sx - t * vx, sy - t * vy, sz - t * vz
         agrees = fx * nx + fy * ny + fz * nz > ALIKE
@@ -164,6 +179,7 @@ def _find(
         if agrees or how == NOWHERE or (facing and how == ANY_SIDE):
             how = ALONG_VIEW if agrees else FACING if facing else ANY_SIDE
             hx, hy, hz, gx, gy, gz = sx, sy, sz, fx, fy, fz
+            face, a, b = hit, u, v
         past = 1e-3 * window
         left -= t + past
         if agrees or left <= 0.0:
@@ -171,17 +187,17 @@ def _find(
         sx, sy, sz = sx - past * vx, sy - past * vy, sz - past * vz
     if how != ALONG_VIEW and how != FACING:
         for side in (-1.0, 1.0):
-            t, fx, fy, fz, hit = _shoot(address, bvh, x, y, z, side * nx, side * ny, side * nz, window)
-            if hit and fx * nx + fy * ny + fz * nz > ALIKE:
+            t, fx, fy, fz, hit, u, v = _shoot(tracer, x, y, z, side * nx, side * ny, side * nz, window)
+            if hit >= 0 and fx * nx + fy * ny + fz * nz > ALIKE:
                 t *= side
-                return ALONG_NORMAL, x + t * nx, y + t * ny, z + t * nz, fx, fy, fz
-    return how, hx, hy, hz, gx, gy, gz
+                return ALONG_NORMAL, x + t * nx, y + t * ny, z + t * nz, fx, fy, fz, hit, u, v
+    return how, hx, hy, hz, gx, gy, gz, face, a, b
 
 
 @njit(parallel=True)
 def _attach(
-    address: Any,
-    bvh: Any,
+    tracer: Any,
+    tied: Any,
     any_mesh: Any,
     p: Any,
     windows: Any,
@@ -203,6 +219,9 @@ def _attach(
     position: Any,
     depth: Any,
     owner: Any,
+    tied_face: Any,
+    tied_place: Any,
+    barycentric: Any,
 ) -> None:
     """Fill the shading points row by row; see the module's head for the order of attempts."""
     width = np.int64(p[WIDTH])
@@ -231,22 +250,27 @@ def _attach(
             ahead = min(window, 0.999 * s * slope)
             how = NOWHERE
             hx, hy, hz, gx, gy, gz = x, y, z, nx, ny, nz
+            face, u, v = np.int32(-1), np.float32(0.0), np.float32(0.0)
             if any_mesh:
-                how, hx, hy, hz, gx, gy, gz = _find(
-                    address, bvh, x, y, z, nx, ny, nz, vx, vy, vz, ahead, window
+                how, hx, hy, hz, gx, gy, gz, face, u, v = _find(
+                    tracer, x, y, z, nx, ny, nz, vx, vy, vz, ahead, window
                 )  # fmt: skip
+            if not tied:  # the face says how the point moves, nothing else
+                how, hx, hy, hz, gx, gy, gz = NOWHERE, x, y, z, nx, ny, nz
             # A face met by the camera ray shows which side is seen; else the surfel tells, save at its rim.
             if how in (ALONG_VIEW, ANY_SIDE, FACING):
                 behind = gx * vx + gy * vy + gz * vz < 0.0
             else:
-                behind = nx * vx + ny * vy + nz * vz < -RIM
+                # Without a mesh it may be a leaf, of which the back is as good as the front.
+                closed = who < len(windows) and windows[who] > 0.0
+                behind = nx * vx + ny * vy + nz * vz < (-RIM if closed else 0.0)
             if behind:
                 gx, gy, gz = -gx, -gy, -gz
             gx, gy, gz = face_viewer(gx, gy, gz, gx, gy, gz, vx, vy, vz)
             nx, ny, nz = face_viewer(nx, ny, nz, gx, gy, gz, vx, vy, vz)
             if nx * gx + ny * gy + nz * gz < ALIKE:
                 nx, ny, nz = gx, gy, gz
-            if how == NOWHERE:
+            if tied and how == NOWHERE:
                 hx, hy, hz = x + window * gx, y + window * gy, z + window * gz
             origin[n, 0], origin[n, 1], origin[n, 2] = hx, hy, hz
             normal[n, 0], normal[n, 1], normal[n, 2] = nx, ny, nz
@@ -260,3 +284,4 @@ def _attach(
             roughness[n], metallic[n] = surface[row, column, k, 6], surface[row, column, k, 7]
             position[n, 0], position[n, 1], position[n, 2] = x, y, z
             depth[n], owner[n] = s, who
+            tied_face[n], tied_place[n], barycentric[n, 0], barycentric[n, 1] = face, -1, u, v

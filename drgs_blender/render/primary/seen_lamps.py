@@ -43,7 +43,7 @@ def seen_lamps(lamps: Lamps, parameters: Array, x0: int, buffer: GBuffer) -> Arr
     out = np.zeros((*buffer.alpha.shape[:2], 3), np.float32)
     _look(
         parameters, x0, y0, start, buffer.alpha, points.pixel, points.sample, points.weight, points.flags, buffer.depth,
-        (lamps.table, lamps.pick), out,
+        lamps.tables, out,
     )  # fmt: skip
     return out
 

@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 
-from ...jit import njit
+from ...jit import inlined, njit
 from ..sampling import HALF, INVERSE_PI, ONE, PI, TWO, ZERO, F, sincos_turns
 
 Array = np.ndarray
@@ -24,17 +24,19 @@ LOOKS = {"paper": PAPER, "principled": PRINCIPLED}
 
 _IOR = 1.5
 _F0 = F(0.04)
+#: Metallic from which a surface is a metal and nothing else.
+_METAL = F(1.0 - 1e-5)
 _NODES = 16
 
 
-@njit
+@inlined
 def alpha_squared(roughness):  # type: ignore[no-untyped-def]
     """Square of GGX's alpha = max(roughness^2, 1e-3)."""
     alpha = max(roughness * roughness, F(1e-3))
     return alpha * alpha
 
 
-@njit
+@inlined
 def fresnel_dielectric(c):  # type: ignore[no-untyped-def]
     """Unpolarised Fresnel reflectance of IOR 1.5 at cosine c from outside."""
     eta2 = F(_IOR * _IOR)
@@ -59,14 +61,17 @@ def layer_albedo(roughness, nv, table):  # type: ignore[no-untyped-def]
 @njit
 def diffuse_weight(roughness, metallic, nv, look, table):  # type: ignore[no-untyped-def]
     """What multiplies albedo / pi in the diffuse lobe."""
+    # Metals interpolated over a triangle are 1 to rounding, above or below: none has a diffuse lobe.
+    rest = ONE - metallic if metallic < _METAL else ZERO
     if look == PAPER:
-        return ONE - metallic
-    return (ONE - metallic) * (ONE - layer_albedo(roughness, nv, table))
+        return rest
+    return rest * (ONE - layer_albedo(roughness, nv, table))
 
 
-@njit
+@inlined
 def fresnel(vh, r, g, b, metallic, look):  # type: ignore[no-untyped-def]
-    """Reflectance (RGB) of the specular lobes at half-vector cosine vh."""
+    """Reflectance (RGB) of the specular lobes at half-vector cosine vh; metals end at white, as in Cycles."""
+    r, g, b = min(r, ONE), min(g, ONE), min(b, ONE)
     x = max(ZERO, ONE - vh)
     s = x * x
     s = s * s * x
@@ -106,7 +111,7 @@ def glossy_normal(nx, ny, nz, gx, gy, gz, vx, vy, vz):  # type: ignore[no-untype
     return c * gx + s * tx, c * gy + s * ty, c * gz + s * tz
 
 
-@njit
+@inlined
 def ggx(nl, nv, nh2, sin2, a2):  # type: ignore[no-untyped-def]
     """D G / (4 nl nv) of GGX with height-correlated Smith, and D; nh2 = cos^2, sin2 = sin^2 of the half vector.
 
@@ -118,7 +123,7 @@ def ggx(nl, nv, nh2, sin2, a2):  # type: ignore[no-untyped-def]
     return d * HALF / smith, d
 
 
-@njit
+@inlined
 def vndf_terms(nv, a2):  # type: ignore[no-untyped-def]
     """(bound, norm): the cap's lower bound factor k, and what turns D into the density of reflected directions."""
     s = ONE + math.sqrt(max(ZERO, ONE - nv * nv))
@@ -127,7 +132,7 @@ def vndf_terms(nv, a2):  # type: ignore[no-untyped-def]
     return bound, HALF / (bound * nv + math.sqrt(a2 + (ONE - a2) * nv * nv))
 
 
-@njit
+@inlined
 def sample_vndf(u, v, ix, iy, iz, alpha, bound):  # type: ignore[no-untyped-def]
     """Reflected direction for view (ix, iy, iz), iz > 0, in the frame of the normal."""
     x, y = ix * alpha, iy * alpha
@@ -144,7 +149,7 @@ def sample_vndf(u, v, ix, iy, iz, alpha, bound):  # type: ignore[no-untyped-def]
     return twice * hx - ix, twice * hy - iy, twice * hz - iz
 
 
-@njit
+@inlined
 def evaluate(nl, nv, vl, nh2, sin2, r, g, b, kd, metallic, a2, norm, look):  # type: ignore[no-untyped-def]
     """Diffuse and specular (RGB each) BRDF values and the density of ``sample_vndf``; all without the cosine.
 

@@ -11,25 +11,25 @@ from typing import Any
 import numpy as np
 
 from ...jit import njit
+from ..lights.facing import facing_row
 from ..lights.lamp_shapes import DIFFUSE, GLOSSY
-from ..lights.lamps import lamps_along
+from ..lights.lamps import emission_along, lamps_along
 from ..lights.light import map_at, sky_density, sky_radiance
 from ..sampling import GOLDEN, ONE, ZERO, F, U, mix, unit
 from ..trace import masks
-from ..trace.surface import nearest, shadowed, surface_at
 from . import brdf
 from . import wave as w
+from .rays import FAR, lamp_light, meet, passed, put_hit, surface_of
 
 Array = np.ndarray
 
-_FAR = F(np.inf)
 #: Ray offset from the surface: relative to the point's own and to the scene's largest coordinate.
 _OFFSET_POINT, _OFFSET_SCENE = F(1e-5), F(2e-6)
 #: Russian roulette starts after this many bounces.
 _SURE_BOUNCES = 3
-#: Columns of `found`: indirect light, light of emitting surfaces at the first vertex; then the caller's.
-INDIRECT, EMITTED, CARRIED = 0, 3, 6
-FOUND = 13
+#: Columns of `found`: indirect light, then the caller's.
+INDIRECT, CARRIED = 0, 3
+FOUND = 10
 
 
 @njit
@@ -40,45 +40,22 @@ def lifted(px: Any, py: Any, pz: Any, gx: Any, gy: Any, gz: Any, extent: Any) ->
 
 
 @njit
-def add_path(s: Any, ints: Any, slot: Any, position: Any, direction: Any, hit: Any, key: Any, owner: Any) -> None:
-    """Put the end of a ray into a slot: `position` its start, `hit` what ``surface.nearest`` returned."""
-    t, face, place, u, v, gx, gy, gz = hit
-    i, c = w.at(slot)
-    s[i + w.OX] = position[0] + t * direction[0]
-    s[i + w.OY] = position[1] + t * direction[1]
-    s[i + w.OZ] = position[2] + t * direction[2]
-    s[i + w.VX], s[i + w.VY], s[i + w.VZ] = -direction[0], -direction[1], -direction[2]
-    s[i + w.GX], s[i + w.GY], s[i + w.GZ] = gx, gy, gz
-    s[i + w.MU], s[i + w.MV] = u, v
-    ints[c + w.N0], ints[c + w.N1] = U(face), U(place)
-    ints[c + w.KEY], ints[c + w.OWNER] = key, U(owner)
-
-
-@njit
-def _surfaces(
-    s: Any, ints: Any, count: Any, geometry: Any, extent: Any, look: Any, table: Any, found: Any, column: Any
-) -> None:
-    """Normals and materials where the rays hit; what the surfaces emit goes to ``found[owner, column:]``."""
+def _surfaces(s: Any, ints: Any, count: Any, scene: Any, look: Any, table: Any, sky: Any) -> None:
+    """Normals and materials where the rays hit. What the surfaces emit was taken where the rays left (`_onwards`)."""
+    tracer, geometry, extent = scene
     for slot in range(count):
         a, c = w.at(slot)
         vx, vy, vz = s[a + w.VX], s[a + w.VY], s[a + w.VZ]
-        nx, ny, nz, gx, gy, gz, r, g, b, roughness, metallic, er, eg, eb, _ = surface_at(
-            np.int32(ints[c + w.N0]), np.int32(ints[c + w.N1]), s[a + w.MU], s[a + w.MV],
-            s[a + w.GX], s[a + w.GY], s[a + w.GZ], -vx, -vy, -vz, geometry,
-        )  # fmt: skip
+        nx, ny, nz, gx, gy, gz, r, g, b, roughness, metallic, _, _, _ = surface_of(tracer, s, ints, slot, geometry)
         mx, my, mz = brdf.glossy_normal(nx, ny, nz, gx, gy, gz, vx, vy, vz)
         s[a + w.NX], s[a + w.NY], s[a + w.NZ] = nx, ny, nz
         s[a + w.MX], s[a + w.MY], s[a + w.MZ] = mx, my, mz
         s[a + w.GX], s[a + w.GY], s[a + w.GZ] = gx, gy, gz
+        ints[c + w.ROW] = U(facing_row(nx, ny, nz, sky))
         s[a + w.OX], s[a + w.OY], s[a + w.OZ] = lifted(s[a + w.OX], s[a + w.OY], s[a + w.OZ], gx, gy, gz, extent)
         s[a + w.AR], s[a + w.AG], s[a + w.AB] = r, g, b
         s[a + w.METALLIC], s[a + w.A2] = metallic, brdf.alpha_squared(roughness)
         s[a + w.KD] = brdf.diffuse_weight(roughness, metallic, mx * vx + my * vy + mz * vz, look, table)
-        if er + eg + eb > ZERO:
-            owner = np.int64(ints[c + w.OWNER])
-            found[owner, column] += s[a + w.TR] * er
-            found[owner, column + 1] += s[a + w.TG] * eg
-            found[owner, column + 2] += s[a + w.TB] * eb
 
 
 @njit
@@ -91,14 +68,12 @@ def _towards_sky(s: Any, ints: Any, count: Any, sky: Any, tracer: Any, shift: An
         red, green, blue = sky_radiance(s[i + w.MU], s[i + w.MV], sky)
         weight = ONE / s[i + w.PE]
         red, green, blue = red * s[i + w.QR] * weight, green * s[i + w.QG] * weight, blue * s[i + w.QB] * weight
-        if red + green + blue > ZERO and not shadowed(
-            tracer, s[i + w.OX], s[i + w.OY], s[i + w.OZ], s[i + w.LX], s[i + w.LY], s[i + w.LZ], ZERO, _FAR,
-            np.int32(masks.SHADOW << shift),
-        ):  # fmt: skip
+        if red + green + blue > ZERO:
+            through = passed(tracer, s, ints, slot, FAR, np.int32(masks.SHADOW << shift))
             owner = np.int64(ints[c + w.OWNER])
-            found[owner, INDIRECT] += red
-            found[owner, INDIRECT + 1] += green
-            found[owner, INDIRECT + 2] += blue
+            found[owner, INDIRECT] += red * through
+            found[owner, INDIRECT + 1] += green * through
+            found[owner, INDIRECT + 2] += blue * through
 
 
 @njit
@@ -107,7 +82,7 @@ def _towards_lamps(s: Any, ints: Any, count: Any, lamps: Any, tracer: Any, shift
     for slot in range(count):
         i, c = w.at(slot)
         others = s[i + w.SHARE] * s[i + w.PC] + (ONE - s[i + w.SHARE]) * s[i + w.PG]
-        dr, dg, db, gr, gg, gb = w.lamp_light(
+        dr, dg, db, gr, gg, gb = lamp_light(
             s, ints, slot, others, others, ONE, lamps, tracer, np.int32(masks.SHADOW << shift)
         )
         if dr + dg + db + gr + gg + gb > ZERO:
@@ -119,10 +94,11 @@ def _towards_lamps(s: Any, ints: Any, count: Any, lamps: Any, tracer: Any, shift
 
 @njit
 def _onwards(
-    s: Any, ints: Any, count: Any, bounce: Any, last: Any, sky: Any, lamps: Any, lamp_share: Any, tracer: Any,
-    shift: Any, found: Any,
+    s: Any, ints: Any, count: Any, bounce: Any, last: Any, sky: Any, lamps: Any, lamp_share: Any, glows: Any,
+    scene: Any, shift: Any, found: Any,
 ) -> Any:  # fmt: skip
     """The BRDF samples; return how many paths go on, in slots 0, 1, ..."""
+    tracer, geometry, _ = scene
     going = 0
     for slot in range(count):
         i, c = w.at(slot)
@@ -132,29 +108,34 @@ def _onwards(
         direction = (s[i + w.LX], s[i + w.LY], s[i + w.LZ])
         diffuse = ints[c + w.CELL] == U(1)
         mask = np.int32((masks.DIFFUSE if diffuse else masks.GLOSSY) << shift)
-        hit = (_FAR, np.int32(-1), np.int32(-1), ZERO, ZERO, ZERO, ZERO, ZERO)
-        if last and lamp_share == ZERO:
-            free = not shadowed(tracer, *position, *direction, ZERO, _FAR, mask)
+        ends = last and lamp_share == ZERO and not glows
+        if ends:
+            through = passed(tracer, s, ints, slot, FAR, mask)
         else:
-            hit = nearest(tracer, *position, *direction, ZERO, _FAR, mask)
-            free = hit[1] < 0
+            through, reach, hit = meet(tracer, s, ints, slot, mask)
         owner = np.int64(ints[c + w.OWNER])
         fr, fg, fb = s[i + w.QR], s[i + w.QG], s[i + w.QB]
         if lamp_share > ZERO:
             seen_by = DIFFUSE if diffuse else GLOSSY
-            red, green, blue = lamps_along(*position, *direction, hit[0], s[i + w.PG], lamp_share, seen_by, *lamps)
+            red, green, blue = lamps_along(*position, *direction, reach, s[i + w.PG], lamp_share, seen_by, *lamps)
             found[owner, INDIRECT] += fr * red
             found[owner, INDIRECT + 1] += fg * green
             found[owner, INDIRECT + 2] += fb * blue
-        if free:
-            u, v = map_at(*direction, sky)
-            red, green, blue = sky_radiance(u, v, sky)
-            weight = ONE / (s[i + w.PG] + sky_density(u, v, sky))
+        if glows:
+            red, green, blue, own, glossy = emission_along(*position, *direction, hit, geometry, *lamps)
+            weight = ONE / (s[i + w.PG] + lamp_share * (own if diffuse else glossy))
             found[owner, INDIRECT] += fr * red * weight
             found[owner, INDIRECT + 1] += fg * green * weight
             found[owner, INDIRECT + 2] += fb * blue * weight
-        elif not last:
-            weight = ONE / s[i + w.PG]
+        if through > ZERO:
+            u, v = map_at(*direction, sky)
+            red, green, blue = sky_radiance(u, v, sky)
+            weight = through / (s[i + w.PG] + sky_density(u, v, ints[c + w.ROW], sky))
+            found[owner, INDIRECT] += fr * red * weight
+            found[owner, INDIRECT + 1] += fg * green * weight
+            found[owner, INDIRECT + 2] += fb * blue * weight
+        if through < ONE and not last:
+            weight = (ONE - through) / s[i + w.PG]
             fr, fg, fb = fr * weight, fg * weight, fb * weight
             key = ints[c + w.KEY]
             if bounce + 1 >= _SURE_BOUNCES:
@@ -163,7 +144,7 @@ def _onwards(
                     continue
                 fr, fg, fb = fr / survive, fg / survive, fb / survive
             # The slots before this one are done with.
-            add_path(s, ints, going, position, direction, hit, key, owner)
+            put_hit(tracer, s, ints, going, *position, *direction, hit, key, owner)
             i, _ = w.at(going)
             s[i + w.TR], s[i + w.TG], s[i + w.TB] = fr, fg, fb
             going += 1
@@ -174,17 +155,17 @@ def _onwards(
 def trace_paths(
     s: Any, ints: Any, count: Any, scene: Any, lights: Any, look: Any, table: Any, bounces: Any, shift: Any, found: Any
 ) -> None:  # fmt: skip
-    """Follow `count` paths that `add_path` began in slots 0, 1, ...; their light goes to rows OWNER of `found`.
+    """Follow `count` paths that `put_hit` began in slots 0, 1, ...; their light goes to rows OWNER of `found`.
 
     Parameters
     ----------
-    scene : (Tracer, Geometry, extent)
+    scene : (Tracer or MixedTracer, Geometry, extent)
     lights : (Sky, whether the sky shines, tables of lamps, number of lamp samples)
-    bounces : vertices of a path, and whether light that surfaces emit is looked for beyond the last of them
+    bounces : vertices of a path, and whether there are surfaces that emit, which are looked for beyond the last too
     shift : 0, or ``masks.WITHOUT``
-    found : (capacity, FOUND) float32; INDIRECT and EMITTED are written
+    found : (capacity, FOUND) float32; INDIRECT is written
     """
-    tracer, geometry, extent = scene
+    tracer, _, _ = scene
     sky, sky_shines, lamps, lamp_share = lights
     vertices, glows = bounces
     for slot in range(count):
@@ -194,7 +175,7 @@ def trace_paths(
         for k in range(CARRIED):
             found[owner, k] = ZERO
     for bounce in range(vertices):
-        _surfaces(s, ints, count, geometry, extent, look, table, found, EMITTED if bounce == 0 else INDIRECT)
+        _surfaces(s, ints, count, scene, look, table, sky)
         w.lobe_shares(s, count, look)
         if sky_shines:
             w.fresh_numbers(ints, count, GOLDEN)
@@ -211,7 +192,5 @@ def trace_paths(
         w.brdf_directions(s, ints, count)
         w.evaluate(s, count, look)
         w.carry(s, count, ZERO)
-        last = bounce + 1 == vertices and not glows
-        count = _onwards(s, ints, count, bounce, last, sky, lamps, lamp_share, tracer, shift, found)
-    if glows:
-        _surfaces(s, ints, count, geometry, extent, look, table, found, EMITTED if vertices == 0 else INDIRECT)
+        last = bounce + 1 == vertices
+        count = _onwards(s, ints, count, bounce, last, sky, lamps, lamp_share, glows, scene, shift, found)

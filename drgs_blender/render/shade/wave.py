@@ -13,14 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from ...jit import njit
+from ...jit import inlined, njit
 from .. import sampling
-from ..lights.lamp_shapes import DIFFUSE, GLOSSY
-from ..lights.lamp_shapes import SHADOW as SHADOWED
-from ..lights.lamps import lamp_flags, sample_lamp
+from ..lights.facing import block_of, in_cells_order
+from ..lights.lamps import sample_lamp
 from ..lights.light import cell_at, cell_end, direction_in_cell, first_cell, map_at, sky_density, sky_touch
-from ..sampling import INVERSE_PI, ONE, TWO, ZERO, F, U, luminance, mix, unit
-from ..trace.surface import shadowed
+from ..sampling import INVERSE_PI, ONE, TWO, ZERO, F, U, luminance, mix, scrambled, unit
 from . import brdf
 
 Array = np.ndarray
@@ -38,10 +36,13 @@ LX, LY, LZ, LIVE, QR, QG, QB, SR, SG, SB, PC, PG = (LANES * i for i in range(21,
 MU, MV, PE = (LANES * i for i in range(33, 36))
 # of paths: throughput, part of the diffuse lobe in sampling; of lamp samples: radiance (distance in MU, density in MV)
 TR, TG, TB, SHARE, ER, EG, EB = (LANES * i for i in range(36, 43))
-_FLOATS = 43 * LANES
-# uint32 fields: three random numbers, the key of more, the owner (a point, or a path), a place in a table
-N0, N1, N2, KEY, OWNER, CELL = (LANES * i for i in range(6))
-_INTS = 6 * LANES
+# of a point's samples: how many each strategy draws there; where rays meet surfels: size of those that they start on
+WC, WG, WE, WL, SIZE = (LANES * i for i in range(43, 48))
+_FLOATS = 48 * LANES
+# uint32 fields: three random numbers, the key of more, the owner (a point, or a path), a place in a table, the row of
+# the normal in the light's tables, the object of the surfels that the ray starts on (or -1)
+N0, N1, N2, KEY, OWNER, CELL, ROW, OWN = (LANES * i for i in range(8))
+_INTS = 8 * LANES
 
 _TINY = F(1e-30)
 
@@ -53,31 +54,32 @@ def batch(capacity: Any) -> Any:
     return np.zeros(packets * _FLOATS, np.float32), np.zeros(packets * _INTS, np.uint32)
 
 
-@njit
+@inlined
 def at(slot: Any) -> Any:
     """Places of a slot's field 0 in the two arrays."""
     packet, lane = slot // LANES, slot % LANES
     return packet * _FLOATS + lane, packet * _INTS + lane
 
 
-@njit
+@inlined
 def packets(count: Any) -> Any:
     """Packets that hold `count` slots."""
     return (count + LANES - 1) // LANES
 
 
 @njit
-def jitter(ints: Any, count: Any, below: Any) -> None:
-    """Move two random numbers of each slot within their strata, the bits `below`; the third is drawn with the slot."""
+def scramble(ints: Any, count: Any) -> None:
+    """Turn N0 to N2, a Sobol' point with reversed bits, into random numbers; CELL is the key of the point set."""
     for p in range(packets(count)):
         c = p * _INTS
         for i in range(c, c + LANES):
-            key = ints[i + KEY]
-            ints[i + N0] = U(ints[i + N0] + (mix(U(key + U(5))) & below))
-            ints[i + N1] = U(ints[i + N1] + (mix(U(key + U(6))) & below))
+            key = ints[i + CELL]
+            ints[i + N0] = scrambled(ints[i + N0], mix(U(key + U(1))))
+            ints[i + N1] = scrambled(ints[i + N1], mix(U(key + U(2))))
+            ints[i + N2] = scrambled(ints[i + N2], mix(U(key + U(3))))
 
 
-@njit
+@inlined
 def _cosine_direction(s: Any, i: Any, u: Any, v: Any) -> Any:
     """World direction in proportion to the cosine."""
     nx, ny, nz = s[i + NX], s[i + NY], s[i + NZ]
@@ -86,7 +88,7 @@ def _cosine_direction(s: Any, i: Any, u: Any, v: Any) -> Any:
     return x * bx + y * cx + z * nx, x * by + y * cy + z * ny, x * bz + y * cz + z * nz
 
 
-@njit
+@inlined
 def _ggx_direction(s: Any, i: Any, u: Any, v: Any) -> Any:
     """World direction by visible normals."""
     mx, my, mz, vx, vy, vz = s[i + MX], s[i + MY], s[i + MZ], s[i + VX], s[i + VY], s[i + VZ]
@@ -140,7 +142,14 @@ def brdf_directions(s: Any, ints: Any, count: Any) -> None:
 
 @njit
 def light_directions(s: Any, ints: Any, count: Any, sky: Any) -> None:
-    """Directions towards the environment in proportion to its light, with MU, MV and PE."""
+    """Directions towards the environment in proportion to its light on the surface, with MU, MV and PE."""
+    for slot in range(count):
+        _, c = at(slot)
+        ints[c + CELL] = U(block_of(ints[c + ROW], ints[c + N2], sky))
+    for slot in range(count):
+        i, c = at(slot)
+        block = np.int64(ints[c + CELL])
+        ints[c + N2], s[i + ER] = in_cells_order(ints[c + ROW], block, ints[c + N2], mix(ints[c + N2]), sky)
     # One loop a table, without a branch that waits for the table: the cache misses of many slots overlap.
     for slot in range(count):
         _, c = at(slot)
@@ -156,8 +165,8 @@ def light_directions(s: Any, ints: Any, count: Any, sky: Any) -> None:
         ints[c + CELL] = place
     for slot in range(count):
         i, c = at(slot)
-        _, column, s[i + MV], s[i + LZ], s[i + PE] = cell_at(ints[c + CELL], sky)
-        s[i + MU] = F(column)
+        _, column, s[i + MV], s[i + LZ], density = cell_at(ints[c + CELL], sky)
+        s[i + MU], s[i + PE] = F(column), density * s[i + ER]
     for p in range(packets(count)):
         b, c = p * _FLOATS, p * _INTS
         for k in range(LANES):
@@ -170,11 +179,10 @@ def light_directions(s: Any, ints: Any, count: Any, sky: Any) -> None:
 @njit
 def lamp_directions(s: Any, ints: Any, count: Any, lamps: Any) -> None:
     """Directions towards lamps, with ER, EG, EB, distance, density (see ``sample_lamp``) and the lamp in CELL."""
-    table, pick = lamps
     for slot in range(count):
         i, c = at(slot)
         lx, ly, lz, distance, r, g, b, density, lamp = sample_lamp(
-            ints[c + N2], ints[c + N0], ints[c + N1], s[i + OX], s[i + OY], s[i + OZ], table, pick
+            ints[c + N2], ints[c + N0], ints[c + N1], s[i + OX], s[i + OY], s[i + OZ], *lamps
         )
         s[i + LX], s[i + LY], s[i + LZ], s[i + MU], s[i + MV] = lx, ly, lz, distance, density
         s[i + ER], s[i + EG], s[i + EB] = r, g, b
@@ -182,42 +190,15 @@ def lamp_directions(s: Any, ints: Any, count: Any, lamps: Any) -> None:
 
 
 @njit
-def lamp_light(
-    s: Any, ints: Any, slot: Any, others: Any, glossy_others: Any, share: Any, lamps: Any, tracer: Any, mask: Any
-) -> Any:  # fmt: skip
-    """What a lamp sample brings: radiance over density for the diffuse and for the glossy lobe, 0 when in shadow.
-
-    `others` and `share` are the balance heuristic's densities of other strategies, for the diffuse and for the glossy
-    lobe, and number of lamp samples.
-    """
-    i, c = at(slot)
-    density = s[i + MV]
-    r, g, b = s[i + ER], s[i + EG], s[i + EB]
-    if not (s[i + LIVE] > ZERO and r + g + b > ZERO and density != ZERO):
-        return ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
-    flags = lamp_flags(np.int64(ints[c + CELL]), lamps[0])
-    if flags & SHADOWED and shadowed(
-        tracer, s[i + OX], s[i + OY], s[i + OZ], s[i + LX], s[i + LY], s[i + LZ], ZERO, s[i + MU] * F(0.9999), mask
-    ):
-        return ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
-    if density < ZERO:
-        others = glossy_others = ZERO
-    density = share * abs(density)
-    diffuse = ONE / (others + density) if flags & DIFFUSE else ZERO
-    glossy = ONE / (glossy_others + density) if flags & GLOSSY else ZERO
-    return r * diffuse, g * diffuse, b * diffuse, r * glossy, g * glossy, b * glossy
-
-
-@njit
-def look_up(s: Any, count: Any, sky: Any) -> None:
+def look_up(s: Any, ints: Any, count: Any, sky: Any) -> None:
     """MU, MV and PE of directions that were not drawn from the environment."""
     for p in range(packets(count)):
         for i in range(p * _FLOATS, p * _FLOATS + LANES):
             s[i + MU], s[i + MV] = map_at(s[i + LX], s[i + LY], s[i + LZ], sky)
     for slot in range(count):
-        i, _ = at(slot)
+        i, c = at(slot)
         if s[i + LIVE] > ZERO:
-            s[i + PE] = sky_density(s[i + MU], s[i + MV], sky)
+            s[i + PE] = sky_density(s[i + MU], s[i + MV], ints[c + ROW], sky)
 
 
 @njit
@@ -260,30 +241,46 @@ def evaluate(s: Any, count: Any, look: Any) -> None:
             s[i + LIVE] = ONE if out > ZERO else ZERO
 
 
-@njit
-def weigh_one(s: Any, i: Any, cosine: Any, ggx: Any, light: Any) -> None:
-    """`weigh` for the slot at i."""
-    k = ONE / max(cosine * s[i + PC] + ggx * s[i + PG] + light * s[i + PE], _TINY)
+@inlined
+def _factor(s: Any, i: Any, cosine: Any, ggx: Any) -> Any:
+    """One over the density of all strategies together for the slot at i."""
+    brdf_density = cosine * s[i + WC] * s[i + PC] + ggx * s[i + WG] * s[i + PG]
+    return ONE / max(brdf_density + s[i + WE] * s[i + PE], _TINY)
+
+
+@inlined
+def _scale(s: Any, i: Any, k: Any) -> None:
+    """Multiply both lobes of the slot at i."""
     s[i + QR], s[i + QG], s[i + QB] = s[i + QR] * k, s[i + QG] * k, s[i + QB] * k
     s[i + SR], s[i + SG], s[i + SB] = s[i + SR] * k, s[i + SG] * k, s[i + SB] * k
 
 
+@inlined
+def weigh_one(s: Any, i: Any, cosine: Any, ggx: Any) -> None:
+    """`weigh` for the slot at i."""
+    _scale(s, i, _factor(s, i, cosine, ggx))
+
+
 @njit
-def weigh(s: Any, count: Any, cosine: Any, ggx: Any, light: Any) -> None:
-    """Divide by the density of all strategies together; the arguments are samples of each."""
+def weigh(s: Any, count: Any, cosine: Any, ggx: Any) -> None:
+    """Divide by the density of all strategies together; the arguments (1 or 0) say whether these two take part."""
     for p in range(packets(count)):
+        # Two loops, for LLVM vectorises none with so many places that are read and written.
         for i in range(p * _FLOATS, p * _FLOATS + LANES):
-            weigh_one(s, i, cosine, ggx, light)
+            s[i + ER] = _factor(s, i, cosine, ggx)
+        for i in range(p * _FLOATS, p * _FLOATS + LANES):
+            _scale(s, i, s[i + ER])
 
 
 @njit
-def weigh_apart(s: Any, count: Any, cosine: Any, ggx: Any, light: Any) -> None:
+def weigh_apart(s: Any, count: Any) -> None:
     """`weigh` where cosine sampling is of the diffuse lobe alone, GGX sampling of the specular one alone."""
     for p in range(packets(count)):
         for i in range(p * _FLOATS, p * _FLOATS + LANES):
-            k = ONE / max(cosine * s[i + PC] + light * s[i + PE], _TINY)
+            light = s[i + WE] * s[i + PE]
+            k = ONE / max(s[i + WC] * s[i + PC] + light, _TINY)
             s[i + QR], s[i + QG], s[i + QB] = s[i + QR] * k, s[i + QG] * k, s[i + QB] * k
-            k = ONE / max(ggx * s[i + PG] + light * s[i + PE], _TINY)
+            k = ONE / max(s[i + WG] * s[i + PG] + light, _TINY)
             s[i + SR], s[i + SG], s[i + SB] = s[i + SR] * k, s[i + SG] * k, s[i + SB] * k
 
 
@@ -295,17 +292,23 @@ def drop(s: Any, count: Any, lobe: Any) -> None:
             s[i] = ZERO
 
 
+@inlined
+def diffuse_share(mv: Any, r: Any, g: Any, b: Any, kd: Any, metallic: Any, look: Any) -> Any:
+    """How often the diffuse lobe is sampled, from what both reflect towards the viewer."""
+    fr, fg, fb = brdf.fresnel(max(mv, ZERO), r, g, b, metallic, look)
+    diffuse = kd * luminance(r, g, b)
+    share = min(max(diffuse / max(diffuse + luminance(fr, fg, fb), _TINY), F(0.1)), F(0.8))
+    share = share if mv > ZERO else ONE
+    return share if kd > ZERO else ZERO
+
+
 @njit
 def lobe_shares(s: Any, count: Any, look: Any) -> None:
-    """SHARE: how often the diffuse lobe is sampled, from what both reflect towards the viewer."""
+    """SHARE: how often the diffuse lobe is sampled."""
     for p in range(packets(count)):
         for i in range(p * _FLOATS, p * _FLOATS + LANES):
             mv = s[i + MX] * s[i + VX] + s[i + MY] * s[i + VY] + s[i + MZ] * s[i + VZ]
-            ar, ag, ab = s[i + AR], s[i + AG], s[i + AB]
-            fr, fg, fb = brdf.fresnel(max(mv, ZERO), ar, ag, ab, s[i + METALLIC], look)
-            diffuse = s[i + KD] * luminance(ar, ag, ab)
-            share = min(max(diffuse / max(diffuse + luminance(fr, fg, fb), _TINY), F(0.1)), F(0.9))
-            s[i + SHARE] = share if mv > ZERO else ONE
+            s[i + SHARE] = diffuse_share(mv, s[i + AR], s[i + AG], s[i + AB], s[i + KD], s[i + METALLIC], look)
 
 
 @njit

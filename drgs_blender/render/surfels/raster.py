@@ -119,7 +119,7 @@ def rasterise(splats: Splats, y0: int, y1: int) -> SurfelSamples:
 
 
 @njit(inline="always")
-def _gaussian(q: Any) -> Any:
+def gaussian(q: Any) -> Any:
     """exp(-q / 2) for 0 <= q <= 12, relative error below 4e-6: Taylor's series of exp(-q / 32) to the 16th power.
 
     Branch-free, so that a loop over samples becomes vector code.
@@ -167,7 +167,7 @@ def _meet(screen: Any, i: Any, opacity: Any, near: Any, far: Any, state: Any, fi
         before, farthest = state[at + _LEFT], state[at + _FARTHEST]
         inside = (np.int32(j) >= first) & (np.int32(j) < last)
         seen = inside & (q < cut) & (z > near) & (z < far) & ((before >= stop) | (z < farthest))
-        alpha = min(opacity * _gaussian(q), np.float32(MAX_ALPHA)) if seen else zero
+        alpha = min(opacity * gaussian(q), np.float32(MAX_ALPHA)) if seen else zero
         state[at + _ALPHA] = alpha
         state[at + _DEPTH] = z
         state[at + _LEFT] = before * (one - alpha)

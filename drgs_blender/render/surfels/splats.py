@@ -80,7 +80,7 @@ def prepare(posed: PosedSurfels, camera: Camera, parameters: Array) -> Splats:
     _project(
         posed.centre, posed.tangent_u, posed.tangent_v, posed.opacity, parameters, x0, y0, x1, y1, screen, box, nearest
     )
-    order = _depth_order(screen, box)
+    order = depth_order(screen[:, ZC], box)
     surface = np.empty((len(order), SURFACE), np.float32)
     _gather_surface(
         order,
@@ -96,14 +96,14 @@ def prepare(posed: PosedSurfels, camera: Camera, parameters: Array) -> Splats:
     box = box[order]
     tiles_x = (x1 - 1) // TILE - x0 // TILE + 1
     tiles_y = (y1 - 1) // TILE - y0 // TILE + 1
-    start, listed = _list_by_tile(box, x0 // TILE, y0 // TILE, tiles_x, tiles_y)
+    start, listed = list_by_tile(box, x0 // TILE, y0 // TILE, tiles_x, tiles_y)
     return Splats(
         screen[order], surface, box, nearest[order], posed.object_index[order], start, listed, camera.window, parameters
     )
 
 
 @njit(inline="always")
-def _to_camera(p: Any, x: Any, y: Any, z: Any) -> Any:
+def to_camera(p: Any, x: Any, y: Any, z: Any) -> Any:
     """World direction to camera coordinates (right, down, forward)."""
     return (
         p[0] * x + p[3] * y + p[6] * z,
@@ -113,7 +113,7 @@ def _to_camera(p: Any, x: Any, y: Any, z: Any) -> Any:
 
 
 @njit(inline="always")
-def _span(focal: Any, centre: Any, sc: Any, pa: Any, pb: Any, sa: Any, sb: Any, r2: Any) -> Any:
+def span(focal: Any, centre: Any, sc: Any, pa: Any, pb: Any, sa: Any, sb: Any, r2: Any) -> Any:
     """Least and greatest screen coordinate of the disc u^2 + v^2 <= r2, wholly in front of the camera.
 
     The tangent lines x = x0 + t of the disc's outline solve a quadratic in t; ``pa``, ``pb`` are the tangents'
@@ -172,9 +172,9 @@ def _project(
         ox = np.float64(centre[i, 0]) - p[POSITION]
         oy = np.float64(centre[i, 1]) - p[POSITION + 1]
         oz = np.float64(centre[i, 2]) - p[POSITION + 2]
-        c = _to_camera(p, ox, oy, oz)
-        a = _to_camera(p, np.float64(tangent_u[i, 0]), np.float64(tangent_u[i, 1]), np.float64(tangent_u[i, 2]))
-        b = _to_camera(p, np.float64(tangent_v[i, 0]), np.float64(tangent_v[i, 1]), np.float64(tangent_v[i, 2]))
+        c = to_camera(p, ox, oy, oz)
+        a = to_camera(p, np.float64(tangent_u[i, 0]), np.float64(tangent_u[i, 1]), np.float64(tangent_u[i, 2]))
+        b = to_camera(p, np.float64(tangent_v[i, 0]), np.float64(tangent_v[i, 1]), np.float64(tangent_v[i, 2]))
         alpha = np.float64(opacity[i])
         total = c[0] + c[1] + c[2] + a[0] + a[1] + a[2] + b[0] + b[1] + b[2] + alpha
         if not abs(total) < 1e30 or not alpha > MIN_ALPHA:
@@ -224,12 +224,12 @@ def _project(
         # Screen bounds.
         low = np.sqrt(0.5 * cut / p[AA])
         if ortho:
-            lo_x, hi_x = _span(fx, rx, 1.0, a[0], b[0], 0.0, 0.0, cut)
-            lo_y, hi_y = _span(fy, ry, 1.0, a[1], b[1], 0.0, 0.0, cut)
+            lo_x, hi_x = span(fx, rx, 1.0, a[0], b[0], 0.0, 0.0, cut)
+            lo_y, hi_y = span(fy, ry, 1.0, a[1], b[1], 0.0, 0.0, cut)
         elif c[2] - reach > near:
             x, y = c[0] / c[2], c[1] / c[2]
-            lo_x, hi_x = _span(fx, rx, c[2], a[0] - x * a[2], b[0] - x * b[2], a[2], b[2], cut)
-            lo_y, hi_y = _span(fy, ry, c[2], a[1] - y * a[2], b[1] - y * b[2], a[2], b[2], cut)
+            lo_x, hi_x = span(fx, rx, c[2], a[0] - x * a[2], b[0] - x * b[2], a[2], b[2], cut)
+            lo_y, hi_y = span(fy, ry, c[2], a[1] - y * a[2], b[1] - y * b[2], a[2], b[2], cut)
         else:
             lo_x, hi_x, lo_y, hi_y = _clipped_bounds(c, a, b, np.sqrt(cut), near, p)
         if in_front:
@@ -245,8 +245,11 @@ def _project(
 
 
 @njit
-def _depth_order(screen: Any, box: Any) -> Any:
-    """Indices of the surfels with a box, by centre depth; equal depths keep their order. Radix sort, 3 x 11 bits."""
+def depth_order(centre_depth: Any, box: Any) -> Any:
+    """Indices of the surfels with a box (n, 4), by centre depth (n,) float32; equal depths keep their order.
+
+    Radix sort, 3 x 11 bits.
+    """
     n = 0
     for i in range(len(box)):
         if box[i, 2] > box[i, 0]:
@@ -257,7 +260,7 @@ def _depth_order(screen: Any, box: Any) -> Any:
     for i in range(len(box)):
         if box[i, 2] > box[i, 0]:
             order[n] = i
-            depth[n] = screen[i, ZC]
+            depth[n] = centre_depth[i]
             n += 1
     # Bits of a float32 compare like integers once negative numbers are reversed.
     keys = depth.view(np.uint32)
@@ -306,7 +309,7 @@ def _gather_surface(
 
 
 @njit
-def _list_by_tile(box: Any, tile_x0: Any, tile_y0: Any, tiles_x: Any, tiles_y: Any) -> Any:
+def list_by_tile(box: Any, tile_x0: Any, tile_y0: Any, tiles_x: Any, tiles_y: Any) -> Any:
     """Counting sort of (tile, splat) pairs: start of each tile's list, and the lists, in splat order."""
     start = np.zeros(tiles_x * tiles_y + 1, np.int64)
     for i in range(len(box)):

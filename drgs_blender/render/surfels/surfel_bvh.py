@@ -11,7 +11,7 @@ from ...asset.model import PosedSurfels
 from ...errors import DeviceError, UsageError
 from ...jit import njit
 from ..trace.embree import QUALITY_LOW, QUALITY_REFIT, SCENE_DYNAMIC, address, device, library
-from ..trace.tree import aligned, looseness, neighbours
+from ..trace.tree import aligned, box_of, looseness, neighbours
 from .surfel_query import CUT, MASK, MIN_ALPHA, OBJECT, OPACITY, RECORD, TANGENT_U, TANGENT_V, WIDTH, callbacks
 
 Array = np.ndarray
@@ -162,6 +162,23 @@ class SurfelBVH:
             self._construct(boxes)
         elif n:
             self._commit()
+
+    def bounds(self) -> tuple[Array, Array]:
+        """Lowest and highest corner of the box around all discs, (3,) float32 each; zeros when there are none."""
+        return box_of(self.scene)
+
+    @property
+    def extent(self) -> float:
+        """The largest absolute coordinate of the discs, metres."""
+        return float(np.abs(self.bounds()).max())
+
+    def sizes(self, count: int) -> Array:
+        """(count,) float32 metres: mean larger standard deviation of each object's surfels, 0 without any."""
+        if not len(self):
+            return np.zeros(count, np.float32)
+        number = np.bincount(self.objects, minlength=count)
+        total = np.bincount(self.objects, self.surface[:, SIZE], minlength=count)
+        return (total / np.maximum(number, 1)).astype(np.float32)
 
     def _construct(self, boxes: Array) -> None:
         self._release_scene()

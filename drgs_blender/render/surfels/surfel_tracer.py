@@ -8,6 +8,7 @@ surfels let through, and depth, normals and material of what they stop.
 Surfels are two-sided: each one's normals are turned towards the ray before they are blended. Where the depth jumps by
 more than `gap` times the mean of the sizes on both sides, a new surface begins, and the hit is the heaviest surface
 alone, as in `raster`: no point lies in the air between two. An infinite gap blends the whole ray, as the paper does.
+Light transport picks one of the surfaces by chance instead, each as often as its share of what is stopped.
 
 Rays that start on surfels must not be stopped by those very surfels; see OWN_REACH in `surfel_query` for the rule,
 which needs the object, normal and size of what the ray starts on. Only surfels of that object are ever left out.
@@ -17,15 +18,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from ...asset.model import as_float
 from ...errors import UsageError
 from ...jit import get_num_threads, njit, prange
+from ..memory import address, load_float, load_int32
 from ..sampling import ONE, ZERO, F
 from .raster import GAP
-from .surfel_bvh import ALBEDO, METALLIC, NORMAL, PLANE, ROUGHNESS, SIZE, SurfelBVH
+from .surfel_bvh import ALBEDO, METALLIC, NORMAL, PLANE, ROUGHNESS, SIZE, SURFACE, SurfelBVH
 from .surfel_query import (
     ALPHAS,
     CAPACITY,
@@ -51,17 +54,42 @@ Array = np.ndarray
 
 _BEFORE, _TINY = F(1.0 - 5e-7), F(1e-30)
 _NOTHING = (ZERO,) * 14
+#: In place of a random number: the heaviest surface on a ray, not one by chance.
+HEAVIEST = F(-1.0)
+
+
+class SurfelTracer(NamedTuple):
+    """How rays are cast at surfels; valid until the next update of the tree. All are int64.
+
+    Attributes
+    ----------
+    surfel_intersect, surfel_occluded, surfel_scene : addresses, see `SurfelBVH`
+    surface : address of (n, SURFACE) float32, ``SurfelBVH.surface``
+    surfel_object : address of (n,) int32, ``SurfelBVH.objects``
+    """
+
+    surfel_intersect: int
+    surfel_occluded: int
+    surfel_scene: int
+    surface: int
+    surfel_object: int
+
+
+def tracer_of(bvh: SurfelBVH) -> SurfelTracer:
+    """How compiled code casts rays at the surfels of `bvh`; until its next update."""
+    tables = address(bvh.surface), address(bvh.objects)
+    return SurfelTracer(bvh.intersect_address, bvh.occluded_address, bvh.scene, *tables)
 
 
 @njit
 def transmittance(  # type: ignore[no-untyped-def]
-    address, scene, ox, oy, oz, dx, dy, dz, tnear, tfar, mask, own, gx, gy, gz, size
+    tracer, ox, oy, oz, dx, dy, dz, tnear, tfar, mask, own, gx, gy, gz, size
 ):
     """Share of light that passes the surfels between `tnear` and `tfar`, 0 where that is below MIN_TRANSMITTANCE.
 
     Parameters
     ----------
-    address, scene : ``SurfelBVH.occluded_address`` and ``scene``
+    tracer : SurfelTracer, or anything that has its fields
     ox .. dz : float32 origin and unit direction, world space
     mask : int32, see ``SurfelBVH.update``; -1 meets all
     own : int32: object that the ray starts on, or -1; then the rest does not matter
@@ -69,47 +97,52 @@ def transmittance(  # type: ignore[no-untyped-def]
     """
     query = query_memory()
     context = begin_query(query, ox, oy, oz, dx, dy, dz, mask, own, gx, gy, gz, size)
-    cast(address, scene, query, tnear, tfar)
+    cast(tracer.surfel_occluded, tracer.surfel_scene, query, tnear, tfar)
     product = load_double(context + 4 * PRODUCT, 0)
     return F(product) if product >= MIN_TRANSMITTANCE else ZERO
 
 
 @njit
 def trace_surfels(  # type: ignore[no-untyped-def]
-    address, scene, surface, objects, ox, oy, oz, dx, dy, dz, tnear, tfar, mask, own, gx, gy, gz, size, gap
+    tracer, ox, oy, oz, dx, dy, dz, tnear, tfar, mask, own, gx, gy, gz, size, gap, number
 ):
-    """Blend the surfels on a ray: ``(through, t, n (3), g (3), albedo (3), roughness, metallic, size, object)``.
+    """Blend the surfels on a ray: ``(through, t, n (3), g (3), albedo (3), roughness, metallic, size, object, stop)``.
 
-    Parameters as for `transmittance`, but `address` is ``SurfelBVH.intersect_address``; `surface` and `objects` are the
-    tree's; `gap` is the jump of depth that separates surfaces, in sizes.
+    Parameters as for `transmittance`; `gap` is the jump of depth that separates surfaces, in sizes; `number` a float32
+    random number in [0, 1) that picks one of the surfaces by its weight, or HEAVIEST.
 
     ``through`` is the share of light that passes (of all surfaces), t the mean depth by weight, n the shading and g the
     geometric normal: both of unit length, g towards the ray's origin; size the mean larger standard deviation, metres;
-    object that of the heaviest surfel. Where nothing is met ``through`` is 1 and the object -1.
+    object that of the heaviest surfel. Where nothing is met ``through`` is 1 and the object -1. ``stop`` is the depth
+    where the transmittance falls to `number`, else `tfar`: as often as light passes to some depth, it lies beyond.
     """
     query = query_memory()
     context = begin_query(query, ox, oy, oz, dx, dy, dz, mask, own, gx, gy, gz, size)
-    through = 1.0
-    near, last, last_size, heaviest = tnear, ZERO, ZERO, ZERO
-    number = owner = best_owner = np.int32(-1)
+    through, total, pick = 1.0, ZERO, number
+    near, last, last_size, heaviest, stop = tnear, ZERO, ZERO, ZERO, F(tfar)
+    index = owner = best_owner = np.int32(-1)
     sums = best = _NOTHING
     while True:
-        cast(address, scene, query, near, tfar)
+        cast(tracer.surfel_intersect, tracer.surfel_scene, query, near, tfar)
         count = np.int64(load_word(context, COUNT))
         for k in range(count):
-            number = load_word(context, INDICES + k)
+            index = load_word(context, INDICES + k)
             t, alpha = load_single(context, DEPTHS + k), load_single(context, ALPHAS + k)
-            wide = surface[number, SIZE]
+            row = tracer.surface + 4 * SURFACE * np.int64(index)
+            wide = load_float(row, SIZE)
             if sums[0] > ZERO and t - last > F(0.5) * gap * (wide + last_size):
-                if sums[0] > best[0]:
+                better, pick, total = _prefer(sums[0], best[0], pick, total)
+                if better:
                     best, best_owner = sums, owner
                 sums, heaviest = _NOTHING, ZERO
             weight = F(through) * alpha
-            sums = _add(sums, surface, number, weight, t, dx, dy, dz)
+            sums = _add(sums, row, weight, t, dx, dy, dz)
             if weight > heaviest:
-                heaviest, owner = weight, objects[number]
+                heaviest, owner = weight, load_int32(tracer.surfel_object, np.int64(index))
             last, last_size = t, wide
-            through *= 1.0 - alpha
+            before, through = through, through * (1.0 - alpha)
+            if before > number >= through:
+                stop = t
             if through < MIN_TRANSMITTANCE:
                 break
         if count < CAPACITY or through < MIN_TRANSMITTANCE:
@@ -117,14 +150,16 @@ def trace_surfels(  # type: ignore[no-untyped-def]
         # The list was full: go on behind its last entry.
         near = max(tnear, last * _BEFORE)
         store_single(context, LAST_T, last)
-        store_word(context, LAST_INDEX, number)
+        store_word(context, LAST_INDEX, index)
         store_word(context, COUNT, np.int32(0))
         store_double(context + 4 * PRODUCT, 0, through)
-    if sums[0] > best[0]:
+    if sums[0] > ZERO and _prefer(sums[0], best[0], pick, total)[0]:
         best, best_owner = sums, owner
     weight, t, nx, ny, nz, px, py, pz, red, green, blue, roughness, metallic, wide = best
     if weight <= ZERO:
-        return ONE, F(tfar), ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, np.int32(-1)
+        return (
+            ONE, F(tfar), ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, np.int32(-1), stop,
+        )  # fmt: skip
     left = F(through) if through >= MIN_TRANSMITTANCE else ZERO
     inverse = ONE / weight
     scale = ONE / math.sqrt(max(px * px + py * py + pz * pz, _TINY))
@@ -137,24 +172,40 @@ def trace_surfels(  # type: ignore[no-untyped-def]
         nx, ny, nz = px, py, pz
     return (
         left, t * inverse, nx, ny, nz, px, py, pz, red * inverse, green * inverse, blue * inverse,
-        roughness * inverse, metallic * inverse, wide * inverse, best_owner,
+        roughness * inverse, metallic * inverse, wide * inverse, best_owner, stop,
     )  # fmt: skip
 
 
 @njit(inline="always")
-def _add(sums, surface, i, w, t, dx, dy, dz):  # type: ignore[no-untyped-def]
+def _prefer(weight, best, pick, total):  # type: ignore[no-untyped-def]
+    """Whether a surface takes the place of the one chosen so far; the random number, renewed; all weight so far.
+
+    Of a row of surfaces each is chosen in proportion to its weight; the heaviest when `pick` is negative.
+    """
+    total += weight
+    if pick < ZERO:
+        return weight > best, pick, total
+    share = weight / total
+    if pick < share:
+        return True, pick / share, total
+    return False, (pick - share) / (ONE - share), total
+
+
+@njit(inline="always")
+def _add(sums, row, w, t, dx, dy, dz):  # type: ignore[no-untyped-def]
     """Add a contribution of weight w at depth t: sums of one, depth, normals towards the ray, material, size."""
     weight, depth, nx, ny, nz, px, py, pz, red, green, blue, roughness, metallic, wide = sums
-    fx, fy, fz = surface[i, PLANE], surface[i, PLANE + 1], surface[i, PLANE + 2]
-    mx, my, mz = surface[i, NORMAL], surface[i, NORMAL + 1], surface[i, NORMAL + 2]
+    fx, fy, fz = load_float(row, PLANE), load_float(row, PLANE + 1), load_float(row, PLANE + 2)
+    mx, my, mz = load_float(row, NORMAL), load_float(row, NORMAL + 1), load_float(row, NORMAL + 2)
     side = -w if fx * dx + fy * dy + fz * dz > ZERO else w
     px, py, pz = px + side * fx, py + side * fy, pz + side * fz
     if mx * fx + my * fy + mz * fz < ZERO:
         side = -side
     return (
         weight + w, depth + w * t, nx + side * mx, ny + side * my, nz + side * mz, px, py, pz,
-        red + w * surface[i, ALBEDO], green + w * surface[i, ALBEDO + 1], blue + w * surface[i, ALBEDO + 2],
-        roughness + w * surface[i, ROUGHNESS], metallic + w * surface[i, METALLIC], wide + w * surface[i, SIZE],
+        red + w * load_float(row, ALBEDO), green + w * load_float(row, ALBEDO + 1),
+        blue + w * load_float(row, ALBEDO + 2), roughness + w * load_float(row, ROUGHNESS),
+        metallic + w * load_float(row, METALLIC), wide + w * load_float(row, SIZE),
     )  # fmt: skip
 
 
@@ -220,7 +271,7 @@ def trace(
     n = len(origins)
     numbers, index = np.empty((n, 14), np.float32), np.empty(n, np.int32)
     _trace(
-        (bvh.intersect_address, bvh.scene, bvh.surface, bvh.objects), origins, directions, F(tnear), F(tfar),
+        tracer_of(bvh), origins, directions, F(tnear), F(tfar),
         np.int32(mask), (starts.object_index, starts.normal, starts.size), F(gap), 8 * get_num_threads(),
         numbers, index,
     )  # fmt: skip
@@ -244,7 +295,7 @@ def transmittance_many(
     origins, directions, starts = _checked(origins, directions, starts)
     out = np.empty(len(origins), np.float32)
     _shadow(
-        (bvh.occluded_address, bvh.scene), origins, directions, F(tnear), F(tfar), np.int32(mask),
+        tracer_of(bvh), origins, directions, F(tnear), F(tfar), np.int32(mask),
         (starts.object_index, starts.normal, starts.size), 8 * get_num_threads(), out,
     )  # fmt: skip
     return out
@@ -261,15 +312,14 @@ def _checked(origins: Array, directions: Array, starts: Starts | None) -> tuple[
 
 
 @njit(parallel=True)
-def _trace(tree, origins, directions, tnear, tfar, mask, starts, gap, lanes, numbers, index):  # type: ignore[no-untyped-def]
-    address, scene, surface, objects = tree
+def _trace(tracer, origins, directions, tnear, tfar, mask, starts, gap, lanes, numbers, index):  # type: ignore[no-untyped-def]
     own, normal, size = starts
     for lane in prange(lanes):
         for i in range(lane, len(origins), lanes):
             hit = trace_surfels(
-                address, scene, surface, objects, origins[i, 0], origins[i, 1], origins[i, 2],
+                tracer, origins[i, 0], origins[i, 1], origins[i, 2],
                 directions[i, 0], directions[i, 1], directions[i, 2], tnear, tfar, mask,
-                own[i], normal[i, 0], normal[i, 1], normal[i, 2], size[i], gap,
+                own[i], normal[i, 0], normal[i, 1], normal[i, 2], size[i], gap, HEAVIEST,
             )  # fmt: skip
             values = hit[:14]
             for k in range(14):
@@ -278,12 +328,11 @@ def _trace(tree, origins, directions, tnear, tfar, mask, starts, gap, lanes, num
 
 
 @njit(parallel=True)
-def _shadow(tree, origins, directions, tnear, tfar, mask, starts, lanes, out):  # type: ignore[no-untyped-def]
-    address, scene = tree
+def _shadow(tracer, origins, directions, tnear, tfar, mask, starts, lanes, out):  # type: ignore[no-untyped-def]
     own, normal, size = starts
     for lane in prange(lanes):
         for i in range(lane, len(origins), lanes):
             out[i] = transmittance(
-                address, scene, origins[i, 0], origins[i, 1], origins[i, 2], directions[i, 0], directions[i, 1],
+                tracer, origins[i, 0], origins[i, 1], origins[i, 2], directions[i, 0], directions[i, 1],
                 directions[i, 2], tnear, tfar, mask, own[i], normal[i, 0], normal[i, 1], normal[i, 2], size[i],
             )  # fmt: skip

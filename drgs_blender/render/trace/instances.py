@@ -25,12 +25,14 @@ class Places:
     ----------
     matrices : (k, 3, 4) float64 object-to-world
     pass_index : (k,) int32
+    kept : (places of the mesh,) bool: which of them these are
     bad : how many places were left out
     instanced : whether the shape keeps its own tree and stands in its places; else it goes into the world as it is
     """
 
     matrices: Array
     pass_index: Array
+    kept: Array
     bad: int
     instanced: bool
 
@@ -54,7 +56,7 @@ def usable_places(mesh: MeshState) -> Places:
             f"its matrices have shape {matrices.shape} and its pass indices {index.shape}",
             "Give one 4 x 4 matrix and one index an instance",
         )
-    usable = np.isfinite(matrices).all(axis=(1, 2))
+    usable = np.asarray(np.isfinite(matrices).all(axis=(1, 2)))
     if len(matrices) > 1:
         with np.errstate(all="ignore"):
             linear = matrices[:, :3, :3]
@@ -64,7 +66,24 @@ def usable_places(mesh: MeshState) -> Places:
             usable &= np.abs(np.linalg.det(linear / np.where(lengths > 0, lengths, 1)[:, None])) > _FLAT
     kept = np.ascontiguousarray(matrices[usable, :3])
     bad = len(matrices) - len(kept)
-    return Places(kept, index[usable].astype(np.int32), bad, len(kept) > 1)
+    return Places(kept, index[usable].astype(np.int32), usable, bad, len(kept) > 1)
+
+
+def other_matrices(matrices: Array, places: Places) -> Array:
+    """(k, 3, 4) float64: where the usable `places` are at another time; as now where that is unknown or no number."""
+    given = np.asarray(matrices, np.float64)
+    if given.shape != (len(places.kept), 4, 4):
+        return places.matrices
+    chosen = given[places.kept, :3]
+    return np.where(np.isfinite(chosen).all(axis=(1, 2), keepdims=True), chosen, places.matrices)
+
+
+def flattens(matrix: Array) -> bool:
+    """Whether faces may lose their area in a (3, 4) matrix: it is flat, or too small for float32."""
+    linear = matrix[:, :3]
+    with np.errstate(over="ignore", invalid="ignore"):
+        lengths = np.linalg.norm(linear, axis=0)
+        return bool(lengths.min() < _SMALLEST or abs(np.linalg.det(linear / lengths)) < _FLAT)
 
 
 def normal_matrices(matrices: Array) -> Array:

@@ -17,15 +17,18 @@ WITHOUT = 8
 HOLDOUT, CATCHER = 1, 2
 
 
-def group_mask(visibility: Visibility, surfels: bool) -> int:
-    """Mask of what has this visibility; `surfels` tells DR-GS meshes from ordinary ones."""
+def group_mask(visibility: Visibility, surfels: bool, seen_only: bool = False) -> int:
+    """Mask of what has this visibility; `surfels` tells DR-GS meshes from ordinary ones.
+
+    Of a DR-GS mesh that is `seen_only`, light does not meet the triangles.
+    """
     v = visibility
     kinds = DIFFUSE * v.diffuse | GLOSSY * v.glossy | SHADOW * v.shadow
     mask = CAMERA * v.camera | kinds
     if v.shadow_catcher:
         mask |= kinds << WITHOUT
     if surfels:
-        return mask | SURFELS
+        return (mask & CAMERA if seen_only else mask) | SURFELS
     return mask | ORDINARY * v.camera
 
 

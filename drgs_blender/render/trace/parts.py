@@ -16,7 +16,7 @@ from ...errors import UsageError
 from ...frame import MeshState, Visibility
 from ...geometry import VertexNormals
 from ...jit import njit, prange
-from .instances import Places, normal_matrices
+from .instances import Places, flattens, normal_matrices
 from .masks import group_mask
 
 Array = np.ndarray
@@ -42,6 +42,7 @@ class TraceObject:
     corner_normals : (m, 3, 3) float32, world space, or None: smooth angle-weighted vertex normals
     pass_index : Blender's object index pass
     visibility : which rays meet it
+    seen_only : whether only the camera meets its triangles, light its surfels
     """
 
     name: str
@@ -53,6 +54,7 @@ class TraceObject:
     corner_normals: Array | None = None
     pass_index: int = 0
     visibility: Visibility = field(default_factory=Visibility)
+    seen_only: bool = False
 
 
 @dataclass(slots=True)
@@ -70,6 +72,7 @@ class Part:
     instanced : whether its vertices are in object space
     dead : (m,) bool, faces that touch an unusable vertex, or None
     reach : metres, the largest coordinate of its vertices
+    empty_faces, flat_faces : without area as a shape, and where its matrix puts it
     """
 
     source: int
@@ -86,6 +89,7 @@ class Part:
     reach: float = 0.0
     bad_vertices: int = 0
     empty_faces: int = 0
+    flat_faces: int = 0
     smoother: VertexNormals | None = None
     own_normals: Array | None = None  # of meshes, object space
 
@@ -128,6 +132,12 @@ class Part:
         same = before is dead or (before is not None and dead is not None and np.array_equal(before, dead))
         return bool(moved), not same
 
+    def count_empty(self, vertices: Array) -> int:
+        """Living faces without area."""
+        a, b, c = np.moveaxis(vertices[self.faces], 1, 0)
+        empty = ~((np.cross(b - a, c - a) ** 2).sum(axis=1) > 0)
+        return int((empty if self.dead is None else empty & ~self.dead).sum())
+
     def smooth_normals(self, vertices: Array, out: Array) -> None:
         """Normals of `vertices` from the living faces, into (n, 3) `out`."""
         if self.smoother is None:
@@ -144,7 +154,9 @@ class Part:
 
 def mask_of(item: TraceObject | MeshState) -> int:
     """Group mask of an object or a mesh."""
-    return group_mask(item.visibility, isinstance(item, TraceObject))
+    if isinstance(item, TraceObject):
+        return group_mask(item.visibility, True, item.seen_only)
+    return group_mask(item.visibility, False)
 
 
 def own_faces(item: TraceObject | MeshState) -> Array:
@@ -201,8 +213,25 @@ def take_mesh(part: Part, item: MeshState, places: Places, vertices: Array, norm
             part.given_normals(item.corner_normals, given, part.own_normals)
     if matrix is not None:
         _turn_normals(part.own_normals, normal_matrices(places.matrices[:1])[0], rows)
+        part.flat_faces = part.count_empty(own) if flattens(matrix) else 0
     part.item = item
     return moved, died
+
+
+def place_vertices(vertices: Array | None, matrix: Array | None, target: Array) -> None:
+    """Bring (n, 3) `vertices`, moved by a (3, 4) matrix, to `target`; what is unusable or None leaves it as it is."""
+    if vertices is None or np.shape(vertices) != target.shape:
+        return
+    moved = np.empty_like(target)
+    given = np.ascontiguousarray(vertices, np.float32)
+    bad, _, _ = _copy_vertices(given, moved) if matrix is None else _move_vertices(given, matrix, moved)
+    if bad:
+        with np.errstate(invalid="ignore", over="ignore"):
+            world = given if matrix is None else given @ matrix[:, :3].T + matrix[:, 3]
+            usable = (np.abs(world) < FARTHEST).all(axis=1)
+        target[usable] = moved[usable]
+    else:
+        target[:] = moved
 
 
 @njit

@@ -15,10 +15,10 @@ import numpy as np
 
 from ...asset.model import as_float
 from ...errors import UsageError
-from ...frame import Image, MeshState
+from ...frame import Image, MeshState, Pose
 from ..memory import address
 from ..sampling import F
-from .instances import Places, normal_matrices, usable_places
+from .instances import Places, normal_matrices, other_matrices, usable_places
 from .masks import object_flags
 from .parts import (
     ALBEDO,
@@ -30,6 +30,7 @@ from .parts import (
     TraceObject,
     mask_of,
     own_faces,
+    place_vertices,
     take_mesh,
     take_object,
 )
@@ -53,6 +54,28 @@ class ObjectFaults:
     bad_places: int = 0  # matrices that are not finite, or flatten one of several places
 
 
+@dataclass(slots=True)
+class Glowing:
+    """A mesh with materials that emit light.
+
+    Attributes
+    ----------
+    mesh : as given
+    shape : all faces of the mesh, among the scene's
+    faces : (k,) int64, those that emit
+    material : (k,) int32, of ``TraceScene.materials``
+    uvs : (k, 3, 2) float32, or None
+    places : rows of ``TraceScene.places``, or None where the faces are in world space
+    """
+
+    mesh: MeshState
+    shape: slice
+    faces: Array
+    material: Array
+    uvs: Array | None
+    places: range | None
+
+
 class TraceScene:
     """All objects and meshes of a frame.
 
@@ -62,6 +85,7 @@ class TraceScene:
     Attributes
     ----------
     bvh : TriangleBVH over everything
+    layout : another object whenever vertices and faces are numbered anew
     vertices : (n, 3) float32, faces : (m, 3) int32: as traced (``bvh``'s own arrays), world space save for meshes in
         several places; a face with a bad vertex is collapsed to one point
     face_object : (m,) int32: object of each face (of a mesh in several places: the mesh)
@@ -73,6 +97,7 @@ class TraceScene:
     place_object : (p,) int32: object of each place
     rays_differ : whether there is an object that diffuse rays meet and glossy ones do not, or the other way
     pass_index, object_flags : (objects,) int32: Blender's object index pass; bits HOLDOUT and CATCHER
+    source : (objects,) int64: which of the frame's objects, or behind them which of its meshes, each is
     any_ordinary : whether the camera may see an ordinary mesh
     materials : MaterialTable of the meshes
     extent : float, metres: the largest absolute coordinate, the scale of rounding errors
@@ -81,6 +106,7 @@ class TraceScene:
 
     def __init__(self) -> None:
         self.bvh = TriangleBVH()
+        self.layout = object()
         self.shading_faces: Array = np.empty((0, 3), np.int32)
         self.shading: Array = np.empty((0, SHADING_WIDTH), np.float32)
         self.normals: Array = np.empty((0, 3), np.float32)
@@ -88,6 +114,7 @@ class TraceScene:
         self.vertex_faces = 0
         self.places: Array = np.empty((0, 3, 4), np.float32)
         self.pass_index: Array = np.empty(0, np.int32)
+        self.source: Array = np.empty(0, np.int64)
         self.object_flags: Array = np.empty(0, np.int32)
         self.rays_differ = False
         self.any_ordinary = False
@@ -140,6 +167,29 @@ class TraceScene:
             address(self._material_tables),
         )
 
+    @property
+    def glowing(self) -> list[Glowing]:
+        """What emits light, in the order of the scene's faces."""
+        found: list[Glowing] = []
+        if not self.materials.glows:
+            return found
+        glows = np.any(self.materials.arrays[0][:, 5:] > 0.0, axis=1)
+        objects = len(self.faults) - len(self._known)
+        for group, members in enumerate(self._groups):
+            for part in (self._parts[i] for i in members):
+                if not isinstance(part.item, MeshState):
+                    continue
+                rows = slice(part.face.start - self.vertex_faces, part.face.stop - self.vertex_faces)
+                own = np.flatnonzero(glows[self._material[rows]]) + rows.start
+                if not len(own):
+                    continue
+                first, where = int(self._first_place[group]), None
+                if part.instanced:
+                    where = range(first, first + len(self._known[part.source - objects][1].matrices))
+                uvs = self._uvs[own] if len(self._uvs) else None
+                found.append(Glowing(part.item, part.face, own + self.vertex_faces, self._material[own], uvs, where))
+        return found
+
     def update(
         self, objects: Sequence[TraceObject], meshes: Sequence[MeshState] = (), images: Sequence[Image] = ()
     ) -> None:
@@ -186,9 +236,35 @@ class TraceScene:
         self.faults = [ObjectFaults(item.name, 0, 0, 0, p.bad if p else 0) for item, p in zip(items, places)]
         for part in parts:
             fault = self.faults[part.source]
-            fault.bad_vertices, fault.empty_faces = part.bad_vertices, part.empty_faces
+            fault.bad_vertices, fault.empty_faces = part.bad_vertices, max(part.empty_faces, part.flat_faces)
             fault.bad_faces = 0 if part.dead is None else int(part.dead.sum())
         self._parts, self._known = parts, list(zip(meshes, stands))
+
+    def at(self, objects: Sequence[Array | None], meshes: Sequence[Pose | None]) -> tuple[Array, Array]:
+        """`vertices` and `places` as they would be with everything at another time, for motion.
+
+        Parameters
+        ----------
+        objects : (n, 3) world-space vertices of every DR-GS object of the last update, or None: as now
+        meshes : of every mesh, or None; vertices or matrices of another number than now are ignored, unusable ones too
+        """
+        vertices, places = self.vertices.copy(), self.places.copy()
+        first = np.cumsum([0, *(len(p.matrices) if p.instanced else 0 for _, p in self._known)])
+        for part in self._parts:
+            own = vertices[part.vertex]
+            if isinstance(part.item, TraceObject):
+                place_vertices(objects[part.source], None, own)
+                continue
+            index = part.source - len(objects)
+            pose, (mesh, now) = meshes[index], self._known[index]
+            if pose is None:
+                continue
+            given = mesh.vertices if pose.vertices is None else pose.vertices
+            moved = other_matrices(pose.matrices, now)
+            if now.instanced:
+                places[first[index] : first[index + 1]] = moved
+            place_vertices(given, None if now.instanced else moved[0], own)
+        return vertices, places
 
     def close(self) -> None:
         """Give the tree's memory back."""
@@ -217,7 +293,7 @@ class TraceScene:
             parts.append(Part(source, item.name, own, *spans, mask_of(item), smooth, instanced))
             vertex, face = vertex + n, face + m
             self.vertex_faces += m if surfels else 0
-        self._vertex_count = vertex
+        self._vertex_count, self.layout = vertex, object()
         self.shading_faces, self.face_object = np.concatenate(faces), np.concatenate(owners)
         self.shading = np.zeros((rows[True], SHADING_WIDTH), np.float32)
         self.normals = np.zeros((rows[False], 3), np.float32)
@@ -245,8 +321,23 @@ class TraceScene:
         self.rays_differ = any(v.diffuse != v.glossy for v in seen)
         flags = np.array([object_flags(visibility) for visibility in seen], np.int32)
         counts = [0] * len(objects) + [len(p.matrices) if p.instanced else 0 for p in where]
-        self.object_flags = np.concatenate([flags, np.repeat(flags, counts)])
+        self.source = np.concatenate([np.arange(len(seen)), np.repeat(np.arange(len(seen)), counts)])
+        self.object_flags = flags[self.source]
         self.any_ordinary = any(mesh.visibility.camera and len(p.matrices) > 0 for mesh, p in zip(meshes, where))
+
+    @property
+    def material_names(self) -> list[str]:
+        """Names of the materials of all meshes, in the order of ``materials``."""
+        given = self._given[: max(len(self._first_material) - 1, 0)]
+        return [material.name for materials in given for material in materials]
+
+    def material_of(self, face: Array) -> Array:
+        """(n,) int64 place of materials of faces in ``material_names``; one behind the last for DR-GS objects."""
+        own, none = face - self.vertex_faces, len(self.material_names)
+        found = np.full(len(face), none, np.int64)
+        meshes = own >= 0
+        found[meshes] = self._material[own[meshes]]
+        return found
 
     def _take_materials(
         self,
@@ -329,7 +420,7 @@ def _order(items: Sequence[TraceObject | MeshState], places: Sequence[Places | N
             return 0, mask_of(items[source])
         return (2, 0) if where.instanced else (1, mask_of(items[source]))
 
-    here = [i for i, where in enumerate(places) if where is None or len(where.matrices)]
+    here = [i for i, where in enumerate(places) if (len(items[i].faces) if where is None else len(where.matrices))]
     return sorted(here, key=kind)
 
 

@@ -16,7 +16,7 @@ from ...jit import njit
 from ..memory import load_float, load_int32, load_int64
 from ..sampling import ONE, ZERO, F
 from .embree import blocked, trace
-from .textures import material_at
+from .textures import emission_at, emits, material_at
 
 _TINY = F(1e-30)
 
@@ -124,6 +124,34 @@ def _normal_of_place(normals, i, j, k, w, u, v, matrices, place):  # type: ignor
 
 
 @njit
+def _texture_place(own, u, v, geometry):  # type: ignore[no-untyped-def]
+    """Texture coordinates on a mesh's face, numbered without those of DR-GS objects."""
+    if geometry.uvs == 0:
+        return ZERO, ZERO
+    c, w = 6 * own, ONE - u - v
+    return _blend(geometry.uvs, c, c + 2, c + 4, w, u, v), _blend(geometry.uvs, c + 1, c + 3, c + 5, w, u, v)
+
+
+@njit
+def _tables(geometry):  # type: ignore[no-untyped-def]
+    m = geometry.materials
+    return load_int64(m, 0), load_int64(m, 1), load_int64(m, 2), load_int64(m, 3), load_int64(m, 4), load_int64(m, 5)
+
+
+@njit
+def emitted(face, u, v, geometry):  # type: ignore[no-untyped-def]
+    """(er, eg, eb) of `surface_at`: radiance that leaves a point of a face, on both sides."""
+    if face < geometry.vertex_faces:
+        return ZERO, ZERO, ZERO
+    own = np.int64(face) - geometry.vertex_faces
+    material, tables = load_int32(geometry.material, own), _tables(geometry)
+    if not emits(material, tables):
+        return ZERO, ZERO, ZERO
+    s, t = _texture_place(own, u, v, geometry)
+    return emission_at(material, s, t, tables)
+
+
+@njit
 def surface_at(face, place, u, v, gx, gy, gz, dx, dy, dz, geometry):  # type: ignore[no-untyped-def]
     """The surface at a hit of `nearest`, seen along the ray's direction d.
 
@@ -160,17 +188,9 @@ def surface_at(face, place, u, v, gx, gy, gz, dx, dy, dz, geometry):  # type: ig
         metallic = _blend(rows, i + 7, j + 7, k + 7, w, u, v)
     else:
         own = np.int64(face) - geometry.vertex_faces
-        s = t = ZERO
-        if geometry.uvs != 0:
-            c = 6 * own
-            s = _blend(geometry.uvs, c, c + 2, c + 4, w, u, v)
-            t = _blend(geometry.uvs, c + 1, c + 3, c + 5, w, u, v)
+        s, t = _texture_place(own, u, v, geometry)
         material = load_int32(geometry.material, own)
-        m = geometry.materials
-        tables = (
-            load_int64(m, 0), load_int64(m, 1), load_int64(m, 2), load_int64(m, 3), load_int64(m, 4), load_int64(m, 5),
-        )  # fmt: skip
-        r, g, b, roughness, metallic, er, eg, eb = material_at(material, s, t, tables)
+        r, g, b, roughness, metallic, er, eg, eb = material_at(material, s, t, _tables(geometry))
         rows = geometry.normals
         i, j, k = 3 * i, 3 * j, 3 * k
         if place < 0:

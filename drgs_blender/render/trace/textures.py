@@ -15,12 +15,13 @@ the tables too: arrays that are passed on from function to function are counted 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from ...arrays import frozen
-from ...colour import srgb_to_linear, to_unit
+from ...colour import LUMINANCE, srgb_to_linear, to_unit
 from ...errors import UsageError
 from ...frame import Image, Material, Texture
 from ...jit import njit
@@ -39,6 +40,8 @@ _REPEAT, _, _MIRROR, _CLIP = range(4)
 _SLOTS = ("base_colour_texture", "roughness_texture", "metallic_texture", "emission_texture")
 #: What Blender shows of an image that is not there.
 _MISSING = np.array([[[255, 0, 255, 255]]], np.uint8)
+#: Base colours above this are cut: the light of many bounces must stay a float32. So are factors of textures.
+_WHITEST = F(1e3)
 #: Radiance above this is cut: its square is still a float32.
 _BRIGHTEST = F(1e15)
 _INFINITE = F(np.inf)
@@ -58,6 +61,17 @@ class _Texels:
     def fits(self, image: Image) -> bool:
         """Whether this is still what `image` gives."""
         return self.given is image.pixels and frozen(self.given) and self.encoding == image.encoding
+
+    def mean(self) -> Array:
+        """(4,) float64 linear mean, of about a million texels at most."""
+        step = max(1, math.isqrt(self.texels.shape[0] * self.texels.shape[1] >> 20))
+        some = self.texels[::step, ::step].reshape(-1, 4)
+        if self.kind == _FLOAT:
+            return np.maximum(some, 0.0).mean(axis=0, dtype=np.float64)
+        levels = np.arange(256) / 255.0
+        decoded = srgb_to_linear(levels) if self.kind == _BYTE_SRGB else levels
+        shares = [np.bincount(some[:, k], minlength=256) / len(some) for k in range(4)]
+        return np.array([*(share @ decoded for share in shares[:3]), shares[3] @ levels])
 
     def row(self) -> tuple[int, int, int, int]:
         """Address, width, height, kind."""
@@ -132,11 +146,25 @@ class MaterialTable:
         )
         return out
 
+    def mean_emission(self, material: int) -> Array:
+        """(3,) float64: emitted radiance, with the mean of the texture that it has."""
+        constants, slots, textures = self.arrays[:3]
+        radiance = constants[material, 5:].astype(np.float64)
+        texture = slots[material, 3]
+        if texture < 0 or not radiance.any():
+            return radiance
+        image, channel = textures[texture, :2]
+        mean = list(self._images.values())[image].mean()
+        if channel == _RGB:
+            return radiance * mean[:3]
+        return radiance * (mean[:3] @ np.array(LUMINANCE) if channel == _LUMINANCE else mean[channel])
+
     def _constants(self, material: Material) -> Array:
         given = np.array(
             [*material.base_colour[:3], material.roughness, material.metallic, *material.emission[:3]], np.float64
         )
-        highest = np.array([1.0] * 5 + [float(_BRIGHTEST)] * 3)
+        factors = [float(_WHITEST) if t else 1.0 for t in (material.roughness_texture, material.metallic_texture)]
+        highest = np.array([float(_WHITEST)] * 3 + factors + [float(_BRIGHTEST)] * 3)
         kept = np.clip(np.where(np.isnan(given), 0.0, given), 0.0, highest)
         parts = {"base colour": (0, 3), "roughness": (3, 4), "metallic": (4, 5), "emission": (5, 8)}
         for name, (first, last) in parts.items():
@@ -346,7 +374,8 @@ def material_at(material, u, v, addresses):  # type: ignore[no-untyped-def]
     Returns
     -------
     r, g, b, roughness, metallic, er, eg, eb : float32
-        Base colour, linear Rec.709, roughness and metallic in [0, 1]; emitted radiance, linear Rec.709, finite, >= 0.
+        Base colour, linear Rec.709, above 1 where it was given so; roughness and metallic in [0, 1]; emitted radiance,
+        linear Rec.709, finite, >= 0.
     """
     constants, slots = addresses[0], addresses[1]
     i = 8 * np.int64(material)
@@ -361,15 +390,39 @@ def material_at(material, u, v, addresses):  # type: ignore[no-untyped-def]
         return r, g, b, roughness, metallic, er, eg, eb
     if first >= 0:
         x, y, z = _colour(first, u, v, addresses)
-        r, g, b = _within(r * x, ONE), _within(g * y, ONE), _within(b * z, ONE)
+        r, g, b = _within(r * x, _WHITEST), _within(g * y, _WHITEST), _within(b * z, _WHITEST)
     if second >= 0:
         roughness = _within(roughness * _number(second, u, v, addresses), ONE)
     if third >= 0:
         metallic = _within(metallic * _number(third, u, v, addresses), ONE)
-    if last >= 0:
-        x, y, z = _colour(last, u, v, addresses)
-        er, eg, eb = _within(er * x, _BRIGHTEST), _within(eg * y, _BRIGHTEST), _within(eb * z, _BRIGHTEST)
+    er, eg, eb = _emission(last, er, eg, eb, u, v, addresses)
     return r, g, b, roughness, metallic, er, eg, eb
+
+
+@njit
+def _emission(row, er, eg, eb, u, v, addresses):  # type: ignore[no-untyped-def]
+    """Radiance times a texture, if there is one."""
+    if row < 0:
+        return er, eg, eb
+    x, y, z = _colour(row, u, v, addresses)
+    return _within(er * x, _BRIGHTEST), _within(eg * y, _BRIGHTEST), _within(eb * z, _BRIGHTEST)
+
+
+@njit
+def emits(material, addresses):  # type: ignore[no-untyped-def]
+    """Whether a material emits light, its texture apart."""
+    i = 8 * np.int64(material)
+    return (
+        max(load_float(addresses[0], i + 5), max(load_float(addresses[0], i + 6), load_float(addresses[0], i + 7))) > 0
+    )
+
+
+@njit
+def emission_at(material, u, v, addresses):  # type: ignore[no-untyped-def]
+    """(er, eg, eb) of `material_at`."""
+    i, row = 8 * np.int64(material), np.int64(load_int32(addresses[1], 4 * np.int64(material) + 3))
+    er, eg, eb = load_float(addresses[0], i + 5), load_float(addresses[0], i + 6), load_float(addresses[0], i + 7)
+    return _emission(row, er, eg, eb, u, v, addresses)
 
 
 @njit

@@ -206,6 +206,15 @@ def new_scene() -> int:
     return int(scene)
 
 
+def box_of(scene: int) -> tuple[Array, Array]:
+    """Lowest and highest corner of the box around a committed scene, (3,) float32 each; zeros when it is empty."""
+    box = np.zeros(8, np.float32)
+    if scene:
+        embree.library().rtcGetSceneBounds(scene, box.ctypes.data)
+    low, high = box[:3].copy(), box[4:7].copy()
+    return (low, high) if (low <= high).all() else (np.zeros(3, np.float32), np.zeros(3, np.float32))
+
+
 class TriangleBVH:
     """Triangles ready for ray casting, whose vertices may move.
 
@@ -326,11 +335,7 @@ class TriangleBVH:
 
     def bounds(self) -> tuple[Array, Array]:
         """Lowest and highest corner of the box around everything, (3,) float32 each; zeros when there is nothing."""
-        box = np.zeros(8, np.float32)
-        if self.scene:
-            self._lib.rtcGetSceneBounds(self.scene, box.ctypes.data)
-        low, high = box[:3].copy(), box[4:7].copy()
-        return (low, high) if (low <= high).all() else (np.zeros(3, np.float32), np.zeros(3, np.float32))
+        return box_of(self.scene)
 
     def close(self) -> None:
         """Give the trees' memory back; the object cannot be used afterwards."""

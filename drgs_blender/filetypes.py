@@ -1,0 +1,77 @@
+"""The names of files that are read and written, for file dialogs and drag and drop; `formats` knows what is in them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+Kind = Literal["surfels", "mesh", "environment", "materials"]
+Held = Literal["splats", "mesh", "environment"]
+
+
+@dataclass(frozen=True, slots=True)
+class ReadType:
+    """Files that can be read.
+
+    Attributes
+    ----------
+    extensions : usual endings; they never decide alone
+    kind : what comes out
+    """
+
+    extensions: tuple[str, ...]
+    kind: Kind
+
+
+@dataclass(frozen=True, slots=True)
+class WriteType:
+    """Files that can be written.
+
+    Attributes
+    ----------
+    extensions : endings that choose it
+    kind : what goes in
+    up : the up axis that the format prescribes, or that is written unless asked otherwise
+    fixed : no other up axis can be asked for
+    """
+
+    extensions: tuple[str, ...]
+    kind: Held
+    up: Literal["z", "y"]
+    fixed: bool
+
+
+READ: dict[str, ReadType] = {
+    "Gaussian PLY": ReadType((".ply",), "surfels"),
+    "compressed PLY": ReadType((".ply",), "surfels"),
+    "SPZ": ReadType((".spz",), "surfels"),
+    "SOG": ReadType((".sog", ".json"), "surfels"),
+    "glTF splats": ReadType((".glb", ".gltf"), "surfels"),
+    "USD": ReadType((".usd", ".usda", ".usdc", ".usdz"), "surfels"),
+    "splat": ReadType((".splat",), "surfels"),
+    "ksplat": ReadType((".ksplat",), "surfels"),
+    "PLY mesh": ReadType((".ply",), "mesh"),
+    "glTF 2.0": ReadType((".glb", ".gltf"), "mesh"),
+    "Wavefront OBJ": ReadType((".obj",), "mesh"),
+    "Radiance HDR": ReadType((".hdr",), "environment"),
+    "OpenEXR": ReadType((".exr",), "environment"),
+    "picture": ReadType((".png", ".jpg", ".jpeg", ".webp"), "environment"),
+    "learned light": ReadType((".map", ".pth"), "environment"),
+    "NeRO materials": ReadType((".npy",), "materials"),
+}
+
+WRITTEN: dict[str, WriteType] = {
+    "3DGS PLY": WriteType((".ply",), "splats", "z", False),
+    "SPZ": WriteType((".spz",), "splats", "y", True),
+    "SOG": WriteType((".sog",), "splats", "z", False),
+    "glTF splats": WriteType((".glb",), "splats", "y", True),
+    "USD splats": WriteType((".usd", ".usda", ".usdc"), "splats", "z", True),
+    "glTF mesh": WriteType((".glb",), "mesh", "y", True),
+    "USD mesh": WriteType((".usdz",), "mesh", "z", True),
+    "OpenEXR": WriteType((".exr",), "environment", "z", True),
+}
+
+
+def extensions(*kinds: Kind) -> tuple[str, ...]:
+    """Usual endings of what is read, each once."""
+    return tuple(dict.fromkeys(e for t in READ.values() if t.kind in kinds for e in t.extensions))

@@ -1,0 +1,227 @@
+"""Simulated frames on disk: one file a frame, complete or not there, in a folder that can be read while it grows.
+
+    CACHE/cache.json            what was simulated: settings, their digest, counts, frames a second
+    CACHE/rest.drgp             points and vertices at rest
+    CACHE/frame_000012.drgp     points (float32), their deformation gradients (float16), vertices (float32)
+    CACHE/state.drgp            all that the next frame depends on, to go on after an interruption
+
+Positions are in the space that `cache.json` names: that of the object. The files are stored zips (asset.archive); numpy
+alone reads them.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .asset.archive import read_archive, replace_file, write_archive
+from .errors import AssetError, UsageError, WriteError
+
+Array = np.ndarray
+
+VERSION = 1
+_HEADER, _REST, _STATE = "cache.json", "rest.drgp", "state.drgp"
+_NAME = re.compile(r"frame_(-?\d+)\.drgp")
+_AGAIN = "Bake again"
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """What a cache holds.
+
+    Attributes
+    ----------
+    digest : of the settings and the mesh; another one means other frames
+    points, vertices : counts
+    first : frame at which all is at rest
+    fps : frames a second
+    settings : JSON-able, as they were given
+    """
+
+    digest: str
+    points: int
+    vertices: int
+    first: int
+    fps: float
+    settings: dict[str, Any] = field(default_factory=dict)
+    version: int = VERSION
+
+
+@dataclass(slots=True)
+class ParticleFrame:
+    """Particles in one frame, object space.
+
+    Attributes
+    ----------
+    points : (n, 3) float32, metres
+    gradients : (n, 3, 3) float16, deformation gradient of each since rest
+    vertices : (k, 3) float32, metres: the mesh
+    """
+
+    points: Array
+    gradients: Array
+    vertices: Array
+
+
+class ParticleCache:
+    """A folder of frames.
+
+    Parameters
+    ----------
+    folder : need not exist before `create`
+    """
+
+    def __init__(self, folder: str | os.PathLike[str]) -> None:
+        self.folder = Path(folder)
+
+    def path(self, frame: int) -> Path:
+        """File of a frame."""
+        return self.folder / f"frame_{frame:06d}.drgp"
+
+    def create(self, header: Header, rest: ParticleFrame) -> None:
+        """Begin a cache: remove frames of other settings, write the header last.
+
+        Raises
+        ------
+        WriteError
+            Naming the file and the system's reason.
+        """
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise WriteError(
+                str(self.folder), f"cannot be made ({error.strerror or error})", "Choose another folder"
+            ) from error
+        self.clear()
+        _write(self.folder / _REST, _members_of(rest))
+        replace_file(self.folder / _HEADER, [json.dumps(asdict(header), indent=1).encode()])
+
+    def clear(self) -> None:
+        """Remove all files of a cache, the header first: what is left then is no cache."""
+        for path in [self.folder / name for name in (_HEADER, _STATE, _REST)] + [self.path(f) for f in self.frames()]:
+            try:
+                path.unlink(missing_ok=True)
+            except OSError as error:
+                raise WriteError(
+                    str(path), f"cannot be removed ({error.strerror or error})", "Check permissions"
+                ) from error
+        with suppress(OSError):
+            for stray in self.folder.glob(".*.drgp.*.tmp"):
+                stray.unlink(missing_ok=True)
+
+    def header(self) -> Header | None:
+        """What the folder holds; None where it is no cache.
+
+        Raises
+        ------
+        AssetError
+            The header is damaged, or of a later version of DR-GS.
+        """
+        path = self.folder / _HEADER
+        try:
+            text = path.read_text(encoding="utf-8")
+        except FileNotFoundError:
+            return None
+        except (OSError, UnicodeDecodeError) as error:
+            raise AssetError(str(path), f"cannot be read ({error})", _AGAIN) from error
+        try:
+            header = Header(**json.loads(text))
+        except (ValueError, TypeError) as error:
+            raise AssetError(str(path), "is not the header of a particle cache", _AGAIN) from error
+        if header.version != VERSION:
+            raise AssetError(str(path), f"is of version {header.version}, not {VERSION}", "Use the DR-GS that baked it")
+        return header
+
+    def frames(self) -> list[int]:
+        """Frames that are there, ascending; may grow at any time."""
+        if not self.folder.is_dir():
+            return []
+        names = (_NAME.fullmatch(name) for name in os.listdir(self.folder))
+        return sorted(int(match[1]) for match in names if match)
+
+    def rest(self) -> ParticleFrame:
+        """Particles and mesh at rest."""
+        return _frame(self.folder / _REST)
+
+    def read(self, frame: int) -> ParticleFrame:
+        """One frame; before the first it is at rest.
+
+        Raises
+        ------
+        UsageError
+            It is not baked (yet), saying which frames are.
+        AssetError
+            Its file is damaged.
+        """
+        path = self.path(frame)
+        if not path.exists():
+            there = self.frames()
+            held = f"There are frames {there[0]} to {there[-1]}" if there else "Bake first: the cache has no frame"
+            raise UsageError(f"{self.folder}, frame {frame}", "is not baked", held)
+        return _frame(path)
+
+    def write(self, frame: int, particles: ParticleFrame) -> None:
+        """Write a frame in one step: a reader sees all of it or nothing."""
+        _write(self.path(frame), _members_of(particles))
+
+    def write_state(self, frame: int, arrays: dict[str, Array]) -> None:
+        """Keep what the frame after `frame` depends on."""
+        _write(self.folder / _STATE, {"frame": np.array([frame], np.int64)} | arrays)
+
+    def read_state(self) -> tuple[int, dict[str, Array]] | None:
+        """The last frame kept by `write_state` and its arrays; None where there is none that can be read."""
+        try:
+            arrays = _read(self.folder / _STATE)
+            return int(arrays.pop("frame")[0]), arrays
+        except (AssetError, KeyError):
+            return None
+
+
+def _members_of(particles: ParticleFrame) -> dict[str, Array]:
+    top = float(np.finfo(np.float16).max)
+    return {
+        "points": np.ascontiguousarray(particles.points, np.float32),
+        "gradients": np.clip(particles.gradients, -top, top).astype(np.float16),
+        "vertices": np.ascontiguousarray(particles.vertices, np.float32),
+    }
+
+
+def _frame(path: Path) -> ParticleFrame:
+    arrays = _read(path)
+    try:
+        points, gradients, vertices = arrays["points"], arrays["gradients"], arrays["vertices"]
+    except KeyError as error:
+        raise AssetError(str(path), f"lacks {error.args[0]}", _AGAIN) from error
+    if points.ndim != 2 or points.shape[1:] != (3,) or gradients.shape != (len(points), 3, 3):
+        raise AssetError(str(path), "holds arrays that do not fit each other", _AGAIN)
+    return ParticleFrame(points, gradients, vertices)
+
+
+def _write(path: Path, arrays: dict[str, Array]) -> None:
+    """Arrays and, as the first member, their shapes and types."""
+    kept = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+    index = {name: [array.dtype.str, list(array.shape)] for name, array in kept.items()}
+    text = json.dumps(index, separators=(",", ":")).encode()
+    members = [("index.json", [memoryview(text)])]
+    members += [(name, [memoryview(array.reshape(-1).view(np.uint8))]) for name, array in kept.items()]
+    write_archive(path, members)
+
+
+def _read(path: Path) -> dict[str, Array]:
+    """Arrays of a file, each checked against its CRC."""
+    try:
+        names = read_archive(path)
+        views = read_archive(path, check=tuple(names))
+        index = json.loads(views["index.json"].tobytes())
+        return {name: views[name].view(np.dtype(kind)).reshape(shape) for name, (kind, shape) in index.items()}
+    except AssetError as error:
+        raise AssetError(error.subject, error.problem, _AGAIN) from error
+    except (KeyError, ValueError, TypeError) as error:
+        raise AssetError(str(path), "is not a file of a particle cache", _AGAIN) from error

@@ -1,0 +1,310 @@
+"""A picture that grows: every step gives all its pixels one more part of their samples.
+
+For viewports. The parts are those of the whole picture (`pipeline.render`), drawn in another order: once all are there,
+it is the same picture to the rounding of sums, and to the last bit where a noise threshold decides who gets them. No
+step depends on the time that others took.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+
+from ..asset.model import PosedSurfels
+from ..errors import Cancelled
+from ..frame import Camera, Frame, RenderSettings
+from ..jit import njit, use_threads
+from .camera import camera_parameters
+from .lights.lamps import Lamps
+from .lights.light import EnvironmentLight
+from .picture.film import Film
+from .pipeline import Batches, Primary, check_frame, denoised, strip_height
+from .points import Radiance, ShadingPoints
+from .primary.gbuffer import GBuffer
+from .primary.seen_lamps import seen_lamps
+from .shade.adaptive import Sampling, part_count
+from .shade.spread import variances
+from .surfels.surfel_bvh import SurfelBVH
+from .trace.scene import TraceScene
+
+Array = np.ndarray
+
+#: Bytes of camera samples that a picture keeps between its steps; those of further strips are found again in each step.
+KEPT_BYTES = 512 << 20
+#: Surfels of a first picture, at most twice as many.
+SURFELS_PER_PIXEL = 3
+#: Parts of a sub-pixel sample at most, and rays of a part.
+_MOST_PARTS, _FEWEST = 32, 4
+
+
+def parts_of(settings: RenderSettings) -> list[tuple[int, tuple[int, int]]]:
+    """The steps of a picture: (sub-pixel sample, (i, n) as of `integrate`), n times round all sub-pixel samples.
+
+    With a noise threshold n is that of the whole picture, which decides after every part. Otherwise n is 1 for SVGF: it
+    is guided by the variance, which is then that of the whole to the last bit.
+    """
+    n = part_count(settings)
+    if n > 1:
+        return [(sample, (i, n)) for i in range(n) for sample in range(settings.positions)]
+    n = settings.rays // (settings.positions * _FEWEST)
+    n = 1 if settings.denoise == "svgf" or n < 1 else min(1 << n.bit_length() - 1, _MOST_PARTS)
+    return [(sample, (i, n)) for i in range(n) for sample in range(settings.positions)]
+
+
+def coarse(frame: Frame, size: int, by_mesh: bool = False) -> Frame:
+    """The frame with pixels of `size` by `size`, one sample each of every strategy, for a first picture.
+
+    Its picture covers exactly the window of ``frame.camera``. Where the frame is to be denoised, or names a ``history``
+    to continue, it is by SVGF. With `by_mesh` the camera sees meshes: surfels are never smaller than a pixel, and large
+    pixels let them grow beyond their object.
+    """
+    camera = frame.camera
+    x0, y0, x1, y1 = camera.window
+    width, height = max(1, round((x1 - x0) / size)), max(1, round((y1 - y0) / size))
+    sx, sy = width / (x1 - x0), height / (y1 - y0)
+    view = Camera(
+        matrix_world=camera.matrix_world,
+        width=width,
+        height=height,
+        fx=camera.fx * sx,
+        fy=camera.fy * sy,
+        cx=(camera.cx - x0) * sx,
+        cy=(camera.cy - y0) * sy,
+        orthographic=camera.orthographic,
+        clip_start=camera.clip_start,
+        clip_end=camera.clip_end,
+    )
+    few = {name: min(1, getattr(frame.settings, name)) for name in ("cosine", "ggx", "environment")}
+    settings = replace(frame.settings, aa=1, noise_threshold=0.0, **few)
+    if by_mesh:
+        settings.primary = "mesh"
+    if settings.denoise != "none" or frame.history:
+        settings.denoise = "svgf"
+    return replace(frame, camera=view, settings=settings, previous=None, next=None)
+
+
+def thinned(posed: PosedSurfels, pixels: int) -> PosedSurfels:
+    """Every so-manyth surfel, as much larger, where there are far more than a picture of so many `pixels` can show."""
+    step = len(posed) // max(1, SURFELS_PER_PIXEL * pixels)
+    if step < 2:
+        return posed
+    few = {f.name: np.ascontiguousarray(getattr(posed, f.name)[::step]) for f in fields(posed)}
+    larger = np.float32(np.sqrt(step))
+    return PosedSurfels(**few | {name: few[name] * larger for name in ("tangent_u", "tangent_v")})
+
+
+@dataclass(slots=True)
+class _Strip:
+    """Rows of the picture: their camera samples while they are kept, and the light of their points so far.
+
+    ``moments`` are sums over the parts drawn, ``latest`` those of the part that is being drawn.
+    """
+
+    rows: tuple[int, int]
+    buffer: GBuffer | None = None
+    light: Sampling | None = None
+    moments: Array | None = None
+    latest: Array | None = None
+
+    def begin(self, points: int, settings: RenderSettings, parts: int) -> None:
+        """Make room for the light of so many points."""
+        self.light = Sampling(points, settings.rays, parts, settings.noise_threshold)
+        self.moments, self.latest = np.zeros((points, 5), np.float32), np.zeros((points, 5), np.float32)
+
+    def add(self, chosen: Array, found: Radiance) -> None:
+        """Take the light of one part of the points `chosen`."""
+        assert self.light is not None and self.moments is not None and self.latest is not None
+        self.light.add(chosen, found)
+        self.moments[chosen] += found.moments
+        self.latest[chosen] = found.moments
+
+    def end(self, points: ShadingPoints) -> None:
+        """All points have had the part."""
+        assert self.light is not None and self.latest is not None
+        going = self.light.going
+        self.light.decide(points.pixel, points.weight, variances(points.pixel[going], self.latest[going]))
+
+    def radiance(self, points: ShadingPoints, exact: bool) -> Radiance:
+        """The light as far as it is known; points that have none yet get that of their pixel.
+
+        With `exact` the variance is that which the noise threshold decides by, which is known at the end of a part;
+        else it is that of all samples taken together.
+        """
+        assert self.light is not None and self.moments is not None
+        found, drawn = self.light.radiance(), self.light.drawn
+        if exact:
+            return found
+        scale = 1.0 / np.maximum(drawn, 1).astype(np.float32)
+        once = np.ones_like(scale)
+        moments = self.moments * np.stack([once, scale, scale**2, scale, scale**2], axis=1)
+        found.variance = variances(points.pixel, moments)
+        if not drawn.all():
+            unshadowed = np.zeros(len(scale), np.float32) if found.unshadowed is None else found.unshadowed
+            _spread(points.pixel, points.flags, points.weight, drawn, found.components, found.variance, unshadowed)
+        return found
+
+
+class Progressive:
+    """One picture in steps.
+
+    Parameters
+    ----------
+    frame : as of `pipeline.render`
+    """
+
+    def __init__(self, frame: Frame) -> None:
+        check_frame(frame)
+        self.frame = frame
+        self._parts = parts_of(frame.settings)
+        self._adaptive = part_count(frame.settings) > 1
+        self._next = 0
+        self._parameters = camera_parameters(frame.camera, frame.settings, frame.number)
+        _, top, _, bottom = frame.camera.window
+        height = strip_height(frame.camera.window[2] - frame.camera.window[0], frame.settings.positions)
+        self._strips = [_Strip((y, min(y + height, bottom))) for y in range(top, bottom, height)]
+        self._primary: Primary | None = None
+        self._left = KEPT_BYTES
+
+    @property
+    def fraction(self) -> float:
+        """Part of the samples that the picture has, in [0, 1]; 1 too where no pixel needs the others."""
+        return self._next / len(self._parts)
+
+    def advance(
+        self,
+        scene: TraceScene,
+        light: EnvironmentLight,
+        posed: PosedSurfels,
+        lamps: Lamps | None,
+        tree: SurfelBVH | None,
+        seconds: float = 0.0,
+        cancelled: Callable[[], bool] | None = None,
+    ) -> dict[str, Array]:
+        """Draw parts until `seconds` have passed, at least one; return the passes as `pipeline.render` does.
+
+        The scene and its light must be those of the first call. Cancelled half way, nothing of the part is kept.
+
+        Raises
+        ------
+        Cancelled, UsageError
+        """
+
+        def check() -> None:
+            if cancelled is not None and cancelled():
+                raise Cancelled
+
+        use_threads(self.frame.settings.threads)
+        check()
+        if self._primary is None:
+            self._primary = Primary(scene, posed, self.frame, self._parameters, tree)
+        batches = Batches(scene, light, lamps, tree, self.frame, check)
+        began = time.perf_counter()
+        while self._next < len(self._parts):
+            self._draw(batches, check)
+            if time.perf_counter() - began >= seconds:
+                break
+        return self._develop(scene, light, lamps, check)
+
+    def _draw(self, batches: Batches, check: Callable[[], None]) -> None:
+        sample, part = self._parts[self._next]
+        last = sample == self.frame.settings.positions - 1
+        found = []
+        for strip in self._strips:
+            if strip.light is not None and not len(strip.light.going):
+                continue
+            points = self._samples(strip).points
+            check()
+            assert strip.light is not None
+            chosen = strip.light.going[points.sample[strip.light.going] == sample]
+            found.append((strip, points, chosen, batches.trace(points[chosen], part)))
+        for strip, points, chosen, radiance in found:
+            strip.add(chosen, radiance)
+            if last:
+                strip.end(points)
+        self._next += 1
+        if not any(len(strip.light.going) for strip in self._strips if strip.light is not None):
+            self._next = len(self._parts)
+
+    def _samples(self, strip: _Strip) -> GBuffer:
+        """The strip's camera samples, kept while there is room."""
+        if strip.buffer is not None:
+            return strip.buffer
+        assert self._primary is not None
+        buffer = self._primary.rows(*strip.rows)
+        if strip.light is None:
+            strip.begin(len(buffer.points), self.frame.settings, self._parts[-1][1][1])
+        size = _bytes_of(buffer)
+        if size <= self._left:
+            strip.buffer, self._left = buffer, self._left - size
+        return buffer
+
+    def _develop(
+        self, scene: TraceScene, light: EnvironmentLight, lamps: Lamps | None, check: Callable[[], None]
+    ) -> dict[str, Array]:
+        camera = self.frame.camera
+        film = Film(camera, self.frame.settings, self._parameters)
+        for strip in self._strips:
+            buffer = self._samples(strip)
+            check()
+            exact = self._adaptive and self.fraction == 1.0
+            film.add(buffer, strip.radiance(buffer.points, exact), scene.pass_index, light)
+            if lamps is not None and lamps.seen:
+                rows = slice(strip.rows[0] - camera.window[1], strip.rows[1] - camera.window[1])
+                film.emission[rows] += seen_lamps(lamps, self._parameters, camera.window[0], buffer)
+        return film.passes(self.frame.passes, denoised(film, self.frame, check))
+
+
+def _bytes_of(buffer: GBuffer) -> int:
+    """Bytes of a strip's samples."""
+    values = [getattr(part, f.name) for part in (buffer, buffer.points) for f in fields(part)]
+    return sum(value.nbytes for value in values if isinstance(value, np.ndarray))
+
+
+@njit
+def _spread(pixel: Any, flags: Any, weight: Any, drawn: Any, light: Any, variance: Any, unshadowed: Any) -> None:
+    """Give points without light the mean of those of the same pixel and kind, else of the same pixel."""
+    n = len(pixel)
+    zero = np.float32(0.0)
+    mean = np.empty(15, np.float32)
+    first = 0
+    while first < n:
+        last = first + 1
+        while last < n and pixel[last] == pixel[first]:
+            last += 1
+        for i in range(first, last):
+            if drawn[i]:
+                continue
+            for alike in (True, False):
+                mean[:] = zero
+                total = zero
+                for j in range(first, last):
+                    if drawn[j] and (not alike or flags[j] == flags[i]):
+                        w = weight[j]
+                        total += w
+                        for c in range(4):
+                            for k in range(3):
+                                mean[3 * c + k] += w * light[j, c, k]
+                        mean[12] += w * variance[j, 0]
+                        mean[13] += w * variance[j, 1]
+                        mean[14] += w * unshadowed[j]
+                if total > zero:
+                    for c in range(4):
+                        for k in range(3):
+                            light[i, c, k] = mean[3 * c + k] / total
+                    variance[i, 0], variance[i, 1] = mean[12] / total, mean[13] / total
+                    unshadowed[i] = mean[14] / total
+                    break
+        # What is copied is no further sample: the pixel's variance is that of the points drawn.
+        lit = 0
+        for i in range(first, last):
+            lit += 1 if drawn[i] else 0
+        if 0 < lit < last - first:
+            more = np.float32((last - first) / lit)
+            for i in range(first, last):
+                variance[i, 0] *= more
+                variance[i, 1] *= more
+        first = last

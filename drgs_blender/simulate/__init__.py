@@ -1,0 +1,1 @@
+"""Matter: particles that fill a mesh, their motion, and the frames that it leaves on disk."""

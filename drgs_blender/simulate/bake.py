@@ -1,0 +1,98 @@
+"""Frames of a job into a cache; what is there already stays."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+
+from ..errors import UsageError
+from ..particle_cache import Header, ParticleCache
+from .job import Job
+
+log = logging.getLogger(__name__)
+
+#: Seconds of computing that an interruption may cost.
+_KEEP_EVERY = 5.0
+
+
+def bake(
+    job: Job,
+    cache: ParticleCache,
+    *,
+    overwrite: bool = False,
+    cancelled: Callable[[], bool] | None = None,
+    progress: Callable[[int, float], None] | None = None,
+) -> int:
+    """Simulate the frames of a job that are not in the cache.
+
+    A bake that was stopped in any way goes on where it was, with the same bits as if it had not been.
+
+    Parameters
+    ----------
+    job : at its beginning
+    overwrite : frames of other settings are removed; otherwise they are an error
+    cancelled : asked before every time step
+    progress : told the frame that is computed and which part of it is done
+
+    Returns
+    -------
+    int
+        Frames computed.
+
+    Raises
+    ------
+    UsageError
+        The cache holds another simulation, or this one ran into trouble: frames up to there stay.
+    Cancelled, WriteError
+        What was done stays.
+    """
+    settings, solver = job.settings, job.solver
+    start = _resume(job, cache, overwrite)
+    if start is None:
+        rest = job.rest()
+        header = Header(
+            job.digest, len(rest.points), len(rest.vertices), settings.first, settings.fps, asdict(settings)
+        )
+        cache.create(header, rest)
+        cache.write(settings.first, rest)
+        start = settings.first
+    done, kept, kept_at = 0, start, time.monotonic()
+    frame = start
+    try:
+        for frame in range(start + 1, settings.last + 1):
+            told = None if progress is None else (lambda part, f=frame: progress(f, part))
+            solver.advance(1 / settings.fps, job.pin_targets(frame - settings.first), cancelled, told)
+            cache.write(frame, job.now())
+            done += 1
+            if time.monotonic() - kept_at > _KEEP_EVERY:
+                cache.write_state(frame, solver.arrays())
+                kept, kept_at = frame, time.monotonic()
+    finally:
+        now = settings.first + solver.frame
+        if now > kept and cache.path(now).exists():
+            cache.write_state(now, solver.arrays())
+    return done
+
+
+def _resume(job: Job, cache: ParticleCache, overwrite: bool) -> int | None:
+    """The last frame of this simulation in the cache, with the solver put there; None to begin anew."""
+    header = cache.header()
+    if header is None:
+        return None
+    if header.digest != job.digest:
+        if not overwrite:
+            raise UsageError(
+                str(cache.folder), "holds another simulation", "Choose another folder, or overwrite it (--overwrite)"
+            )
+        return None
+    state, first = cache.read_state(), job.settings.first
+    if state is None:
+        return None
+    frame, arrays = state
+    whole = set(range(first, frame + 1)) <= set(cache.frames())
+    if not whole or not job.solver.restore(frame - first, arrays):
+        log.info("%s: does not hold all that is needed to go on; begins again", cache.folder)
+        return None
+    return frame

@@ -1,0 +1,75 @@
+"""Singular values of 3 x 3 matrices in compiled code."""
+
+from __future__ import annotations
+
+import math
+
+from ..jit import njit
+
+
+@njit(inline="always")
+def _turn(spp, sqq, spq, spr, sqr):  # type: ignore[no-untyped-def]
+    """One Jacobi rotation in the plane (p, q) that zeroes spq: (c, s, spp, sqq, spr, sqr)."""
+    if abs(spq) <= 1e-14 * (abs(spp) + abs(sqq)):
+        return 1.0, 0.0, spp, sqq, spr, sqr
+    theta = (sqq - spp) / (2.0 * spq)
+    t = 1.0 / (abs(theta) + math.sqrt(theta * theta + 1.0))
+    t = -t if theta < 0.0 else t
+    c = 1.0 / math.sqrt(t * t + 1.0)
+    s = t * c
+    return c, s, spp - t * spq, sqq + t * spq, c * spr - s * sqr, s * spr + c * sqr
+
+
+@njit
+def svd3(f):  # type: ignore[no-untyped-def]
+    """A = U diag(sigma) V^T of a row-major matrix of nine numbers, by Jacobi rotations of A^T A in double precision.
+
+    Returns
+    -------
+    u, sigma, v : tuples of 9, 3 and 9 floats
+        Row-major. V is a rotation; sigma is not sorted and not negative; where A mirrors or is singular, so does U
+        or U has a made-up column.
+    """
+    a, b, c, d, e, g, h, i, j = (
+        float(f[0]), float(f[1]), float(f[2]), float(f[3]), float(f[4]), float(f[5]), float(f[6]), float(f[7]),
+        float(f[8]),
+    )  # fmt: skip
+    xx, yy, zz = a * a + d * d + h * h, b * b + e * e + i * i, c * c + g * g + j * j
+    xy, xz, yz = a * b + d * e + h * i, a * c + d * g + h * j, b * c + e * g + i * j
+    v0, v1, v2, v3, v4, v5, v6, v7, v8 = 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0
+    for _ in range(8):
+        if abs(xy) + abs(xz) + abs(yz) <= 1e-13 * (xx + yy + zz):
+            break
+        p, s, xx, yy, xz, yz = _turn(xx, yy, xy, xz, yz)
+        xy = 0.0
+        v0, v1, v3, v4, v6, v7 = p * v0 - s * v1, s * v0 + p * v1, p * v3 - s * v4, s * v3 + p * v4, p * v6 - s * v7, s * v6 + p * v7  # fmt: skip  # noqa: E501
+        p, s, xx, zz, xy, yz = _turn(xx, zz, xz, xy, yz)
+        xz = 0.0
+        v0, v2, v3, v5, v6, v8 = p * v0 - s * v2, s * v0 + p * v2, p * v3 - s * v5, s * v3 + p * v5, p * v6 - s * v8, s * v6 + p * v8  # fmt: skip  # noqa: E501
+        p, s, yy, zz, xy, xz = _turn(yy, zz, yz, xy, xz)
+        yz = 0.0
+        v1, v2, v4, v5, v7, v8 = p * v1 - s * v2, s * v1 + p * v2, p * v4 - s * v5, s * v4 + p * v5, p * v7 - s * v8, s * v7 + p * v8  # fmt: skip  # noqa: E501
+    ux, uy, uz = a * v0 + b * v3 + c * v6, d * v0 + e * v3 + g * v6, h * v0 + i * v3 + j * v6
+    wx, wy, wz = a * v1 + b * v4 + c * v7, d * v1 + e * v4 + g * v7, h * v1 + i * v4 + j * v7
+    qx, qy, qz = a * v2 + b * v5 + c * v8, d * v2 + e * v5 + g * v8, h * v2 + i * v5 + j * v8
+    s0, s1, s2 = (
+        math.sqrt(ux * ux + uy * uy + uz * uz), math.sqrt(wx * wx + wy * wy + wz * wz),
+        math.sqrt(qx * qx + qy * qy + qz * qz),
+    )  # fmt: skip
+    tiny = 1e-9 * (s0 + s1 + s2) + 1e-300
+    # A direction that collapsed is made up from the other two; matter that is integrated well never has one.
+    if s2 <= tiny:
+        qx, qy, qz, r = uy * wz - uz * wy, uz * wx - ux * wz, ux * wy - uy * wx, s0 * s1
+    elif s1 <= tiny:
+        wx, wy, wz = qy * uz - qz * uy, qz * ux - qx * uz, qx * uy - qy * ux
+        r = s2
+    elif s0 <= tiny:
+        ux, uy, uz = wy * qz - wz * qy, wz * qx - wx * qz, wx * qy - wy * qx
+        r = s2
+    else:
+        r = s2
+    l0 = math.sqrt(ux * ux + uy * uy + uz * uz) + 1e-300
+    l1 = math.sqrt(wx * wx + wy * wy + wz * wz) + 1e-300
+    l2 = (r if s2 <= tiny else s2) + 1e-300
+    u = (ux / l0, wx / l1, qx / l2, uy / l0, wy / l1, qy / l2, uz / l0, wz / l1, qz / l2)
+    return u, (s0, s1, s2), (v0, v1, v2, v3, v4, v5, v6, v7, v8)

@@ -1,0 +1,306 @@
+"""MLS-MPM from frame to frame: time steps, sorting, checks.
+
+What happens in a frame depends on the state at its beginning alone, in particles' own order, so that a bake that was
+interrupted goes on with the same bits, on any number of threads.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+
+from ..errors import Cancelled, UsageError
+from ..matter import FLUID, SNOW, Matter
+from .blocks import Arrangement, Domain, arrange
+from .colliders import Collider, MovingCollider, check_apart
+from .contact import CONTACTS, Plane, bound, collide, plane_rows
+from .fields import FieldRows, ForceField, blow_nodes
+from .stepper import Stepper
+from .transfer import advance_nodes, gather, hold_pins, scatter
+
+Array = np.ndarray
+log = logging.getLogger(__name__)
+
+#: Cells that particles may have moved since they were sorted; they may be one cell off at most.
+_DRIFT = 0.85
+#: Cells that matter or a collider moves at most in a step.
+_FASTEST = 0.5
+#: A step so many times shorter than the stiffness asks for means that the motion has run away.
+_RUNAWAY = 200.0
+
+
+@dataclass(frozen=True, slots=True)
+class Forces:
+    """What acts on all matter: gravity (m/s^2), wind (m/s) that pulls with drag (1/s), damping (1/s), fields."""
+
+    gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
+    wind: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    drag: float = 0.0
+    damping: float = 0.0
+    fields: tuple[ForceField, ...] = ()
+
+
+@dataclass(slots=True)
+class State:
+    """All that the future depends on, one row a particle.
+
+    Attributes
+    ----------
+    x : (n, 3) float64, metres, world
+    v : (n, 3) float32, m/s
+    affine : (n, 9) float32, velocity gradient of APIC, 1/s
+    elastic : (n, 9) float32, elastic deformation gradient
+    total : (n, 9) float32, deformation gradient since the start; no rows where no matter is plastic
+    tau : (n, 6) float32, Kirchhoff stress, Pa: xx, yy, zz, xy, xz, yz
+    memory : (n,) float32, see `stress.respond`
+    """
+
+    x: Array
+    v: Array
+    affine: Array
+    elastic: Array
+    total: Array
+    tau: Array
+    memory: Array
+
+    def taken(self, order: Array) -> State:
+        """The rows in another order."""
+        parts = (getattr(self, f.name) for f in fields(self))
+        return State(*(a[order] if len(a) else a for a in parts))
+
+
+@dataclass(slots=True)
+class Body:
+    """Matter at rest.
+
+    Attributes
+    ----------
+    points : (n, 3) float64, metres, world
+    volume : (n,) cubic metres
+    matter : of the points
+    riders : (k, 3) float64, points without mass that move along
+    pinned : (n,) bool, points that only move as they are told
+    velocity : (3,) or (n, 3), m/s, at the start
+    """
+
+    points: Array
+    volume: Array
+    matter: Matter
+    riders: Array = field(default_factory=lambda: np.empty((0, 3)))
+    pinned: Array | None = None
+    velocity: Array | Sequence[float] = (0.0, 0.0, 0.0)
+
+
+class Solver(Stepper):
+    """A body, what it is in and what it meets.
+
+    Parameters
+    ----------
+    body : Body
+    domain : Domain
+        Where particles may be; leaving it is an error.
+    forces, colliders, planes : what acts
+    courant : time step in units of spacing over the speed of elastic waves; above 1 is unstable
+
+    Attributes
+    ----------
+    state : State
+        In the order of ``body.points`` and then ``body.riders``.
+    """
+
+    def __init__(
+        self,
+        body: Body,
+        domain: Domain,
+        forces: Forces | None = None,
+        colliders: Sequence[Collider] = (),
+        planes: Sequence[Plane] = (),
+        courant: float = 0.5,
+    ) -> None:
+        self.body, self.domain, self.forces = body, domain, forces or Forces()
+        self.colliders = [MovingCollider(c, domain.spacing, domain.low, domain.high) for c in colliders]
+        self._planes, self._fields = plane_rows(planes), FieldRows(self.forces.fields)
+        n, riders = len(body.points), len(body.riders)
+        matter = body.matter
+        self._mass = np.concatenate([body.volume * matter.density, np.zeros(riders)]).astype(np.float32)
+        self._least = np.float32(1e-9 * self._mass[:n].min(initial=np.inf))
+        self._volume = np.concatenate([body.volume, np.zeros(riders)]).astype(np.float32)
+
+        def padded(values: Array) -> Array:
+            return np.concatenate([values, np.zeros((riders, *values.shape[1:]), values.dtype)])
+
+        self._model, self._parameters = padded(matter.model), padded(matter.parameters)
+        self._solid = padded(matter.keeps_shape)
+        self._pins = np.flatnonzero(body.pinned) if body.pinned is not None else np.empty(0, np.int64)
+        still = bool(len(self._pins) == n)
+        self._slowest_step = np.inf if still else courant * domain.spacing / float(matter.wave_speed.max())
+        self.state = self._at_rest()
+        self._check_start()
+
+    def _at_rest(self) -> State:
+        body, n = self.body, len(self.body.points)
+        x = np.concatenate([body.points, body.riders]).astype(np.float64)
+        v = np.zeros((len(x), 3), np.float32)
+        v[:n] = np.asarray(body.velocity, np.float32)
+        if len(x) > n:
+            v[n:] = v[:n].mean(axis=0)
+        v[self._pins] = 0
+        one = np.tile(np.eye(3, dtype=np.float32).reshape(9), (len(x), 1))
+        plastic = bool((body.matter.model > 1).any())
+        memory = np.isin(self._model, (FLUID, SNOW)).astype(np.float32)
+        return State(
+            x, v, np.zeros((len(x), 9), np.float32), one, one.copy() if plastic else np.empty((0, 9), np.float32),
+            np.zeros((len(x), 6), np.float32), memory,
+        )  # fmt: skip
+
+    def _check_start(self) -> None:
+        """Refuse what cannot go well, with what to do about it."""
+        if not len(self.body.points):
+            raise UsageError("simulation", "has no particles", "Fill the mesh first")
+        self._arranged(self.state.x)
+        check_apart(self.body.points, self.domain.spacing, self.colliders, self._planes)
+
+    @property
+    def gradients(self) -> Array:
+        total = self.state.total if len(self.state.total) else self.state.elastic
+        return total[: len(self.body.points)].reshape(-1, 3, 3)
+
+    @property
+    def points(self) -> Array:
+        return self.state.x[: len(self.body.points)]
+
+    @property
+    def riders(self) -> Array:
+        return self.state.x[len(self.body.points) :]
+
+    def arrays(self) -> dict[str, Array]:
+        return {f.name: getattr(self.state, f.name) for f in fields(self.state)}
+
+    def _put(self, arrays: dict[str, Array]) -> None:
+        self.state = State(**arrays)
+
+    def steps_of(self, seconds: float) -> int:
+        return max(1, int(np.ceil(seconds / self._slowest_step)))
+
+    def _advance(
+        self,
+        seconds: float,
+        pin_targets: Array | None,
+        cancelled: Callable[[], bool] | None,
+        progress: Callable[[float], None] | None,
+    ) -> None:
+        domain, forces = self.domain, self.forces
+        h = domain.spacing
+        n = len(self.body.points)
+        pin_velocity = np.zeros((len(self._pins), 3), np.float32)
+        if pin_targets is not None:
+            pin_velocity = ((pin_targets - self.state.x[self._pins]) / seconds).astype(np.float32)
+        low, high = self.state.x[:n].min(axis=0), self.state.x[:n].max(axis=0)
+        outside = 0.0
+        for moving in self.colliders:
+            moving.enter(self.frame, seconds, low, high)
+            outside = max(outside, moving.speed)
+        if len(pin_velocity):
+            outside = max(outside, float(np.linalg.norm(pin_velocity, axis=1).max()))
+        gravity = np.asarray(forces.gravity, np.float64)
+        wind = np.asarray(forces.wind, np.float64)
+        push = float(np.linalg.norm(gravity)) + self._fields.push
+        speed = float(np.sqrt((self.state.v.astype(np.float64) ** 2).sum(axis=1).max(initial=0)))
+        if not np.isfinite(speed):
+            raise self._error("has velocities that are not finite", "Bake again from the start")
+        speed = max(speed, outside)
+
+        done, drift, arrangement = 0.0, np.inf, None
+        order = np.arange(len(self.state.x))
+        while done < seconds * (1 - 1e-9):
+            if cancelled is not None and cancelled():
+                raise Cancelled
+            if arrangement is None or drift > _DRIFT:
+                arrangement, state, order = self._sorted(order, self.state)
+                drift = 0.0
+                self.state = state
+                mass, volume, solid = self._mass[order], self._volume[order], self._solid[order]
+                model, parameters = self._model[order], self._parameters[order]
+                place = np.empty(len(order), np.int64)
+                place[order] = np.arange(len(order))
+                pins = place[self._pins]
+                nodes = np.empty((len(arrangement.active), 64, 4), np.float32)
+                held = np.zeros_like(nodes) if len(pins) else nodes[:0]
+                fastest = np.empty(len(arrangement.block), np.float32)
+            longest = min(self._slowest_step, seconds)
+            longest = min(longest, _FASTEST * h / max(speed + push * longest, 1e-12))
+            if longest < self._slowest_step / _RUNAWAY and speed > outside:
+                raise self._error(
+                    f"ran away: matter moves at {speed:.3g} m/s",
+                    "Make the material stiffer or the particles finer, or slow down what hits it",
+                )
+            dt = (seconds - done) / np.ceil((seconds - done) / longest - 1e-9)
+
+            s, a = self.state, arrangement
+            grid = (domain.origin, h)
+            scatter(s.x, s.v, s.affine, s.tau, mass, volume, *grid, dt, a.block, a.parity, a.start, a.neighbour, nodes)
+            advance_nodes(nodes, self._least, dt, gravity, wind, forces.drag, forces.damping)
+            if len(self._fields):
+                blow_nodes(nodes, a.active, *grid, self._fields.at(self.frame, (done + 0.5 * dt) / seconds), dt)
+            for moving in self.colliders:
+                self._touch(moving, (done + 0.5 * dt) / seconds, nodes, a)
+            if len(self._planes):
+                bound(nodes, a.active, *grid, self._planes)
+            if len(pins):
+                hold_pins(s.x, pins, pin_velocity, mass, *grid, a.slot, nodes, held)
+                kept = s.x[pins] + dt * pin_velocity
+            gather(
+                s.x, s.v, s.affine, s.elastic, s.total, s.tau, s.memory, model, parameters, mass, solid, *grid, dt,
+                a.block, a.start, a.neighbour, nodes, fastest,
+            )  # fmt: skip
+            if len(pins):
+                s.x[pins], s.v[pins] = kept, pin_velocity
+            top = float(fastest.max())
+            if not np.isfinite(top):
+                raise self._error("became infinite", "Use a lower Courant number (0.3) or finer particles")
+            speed = max(top, outside)
+            drift += speed * dt / h
+            done += dt
+            self.steps += 1
+            if progress is not None:
+                progress(done / seconds)
+        back = np.empty_like(order)
+        back[order] = np.arange(len(order))
+        self.state = self.state.taken(back)
+        self._arranged(self.state.x)
+
+    def _sorted(self, order: Array, state: State) -> tuple[Arrangement, State, Array]:
+        arrangement = self._arranged(state.x)
+        return arrangement, state.taken(arrangement.order), order[arrangement.order]
+
+    def _arranged(self, x: Array) -> Arrangement:
+        """Sort; refuse particles outside of the domain."""
+        arrangement, lost = arrange(x, self.domain)
+        if len(lost):
+            where = x[lost[0]]
+            finite = bool(np.isfinite(where).all())
+            place = f"({where[0]:.3g}, {where[1]:.3g}, {where[2]:.3g})" if finite else "no finite place"
+            low, high = (np.array2string(c, precision=3, separator=", ") for c in (self.domain.low, self.domain.high))
+            raise self._error(
+                f"has {len(lost)} particles outside the domain from {low} to {high}, one at {place}",
+                "Give a larger domain, put a floor or a collider where it falls, or let the domain have walls"
+                if finite
+                else "Use a lower Courant number (0.3) or finer particles",
+            )
+        return arrangement
+
+    def _error(self, problem: str, remedy: str) -> UsageError:
+        return UsageError(f"simulation, frame {self.frame + 1} after the start", problem, remedy)
+
+    def _touch(self, moving: MovingCollider, part: float, nodes: Array, a: Arrangement) -> None:
+        place, rotation, shift, linear, spin = moving.at(part)
+        if place is None:
+            return
+        c = moving.collider
+        collide(
+            nodes, a.active, self.domain.origin, self.domain.spacing, place.distance, place.velocity, place.origin,
+            place.spacing, rotation, shift, linear, spin, c.thickness, CONTACTS[c.contact], c.friction,
+        )  # fmt: skip
