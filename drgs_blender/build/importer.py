@@ -13,7 +13,7 @@ from ..asset.model import Asset, Mesh, Surfels
 from ..deform.binding import bind, project
 from ..deform.faces import Faces
 from ..errors import AssetError
-from ..formats.axes import surfels_to_z_up
+from ..formats.axes import scaled_surfels, surfels_to_z_up
 from ..formats.files import MaterialsFile, MeshFile, SurfelFile
 from ..formats.gaussian_ply import LAYOUTS
 from .make import TOLERANCE, mesh_with_materials, read_environment_of, read_mesh_file
@@ -30,6 +30,9 @@ APART = 0.1
 RATIO = 8.0
 #: Surfels whose distance to the mesh is measured.
 SAMPLE = 2000
+#: Where materials come from that only the surfels have, by whether their file knows any.
+CAPTURED = "captured colour of the surfels, light included"
+_SURFELS_OWN = {True: "of the surfels", False: CAPTURED}
 
 
 def import_asset(
@@ -41,6 +44,8 @@ def import_asset(
     materials: str | Path | MaterialsFile | None = None,
     resolution: int = 192,
     max_triangles: int = 300_000,
+    meshless: bool = False,
+    scale: float = 1.0,
 ) -> Asset:
     """Read captured surfels and what belongs to them, and bind them.
 
@@ -54,6 +59,8 @@ def import_asset(
     materials : materials of the mesh's vertices kept apart from it (NeRO's folder), or such a file already read
     resolution : voxels along the longest side of a mesh that is built
     max_triangles : budget for texture detail of a textured mesh
+    meshless : build no mesh: the surfels follow their object's matrix, and light meets them alone
+    scale : factor on all lengths of surfels and mesh
 
     Returns
     -------
@@ -65,8 +72,17 @@ def import_asset(
     file = surfels if isinstance(surfels, SurfelFile) else _read_surfels(surfels)
     report: dict[str, Any] = {"layout": file.layout, "surfel_notes": list(file.notes)}
     captured, report["not_finite"] = _finite(file.surfels, surfel_name)
-    if up:
-        captured = surfels_to_z_up(captured, up)
+    if turned := up or file.up:
+        captured = surfels_to_z_up(captured, turned)
+    captured = scaled_surfels(captured, scale)
+
+    surfels_known = any(layout.name == file.layout and layout.albedo is not None for layout in LAYOUTS)
+    provenance: dict[str, Any] = {"surfels": Path(surfel_name).name, "report": report}
+    if environment is not None:
+        provenance["environment"] = Path(environment).name
+    if meshless:
+        provenance["materials"] = _SURFELS_OWN[surfels_known]
+        return Asset(captured, Mesh.empty(), None, read_environment_of(environment), provenance)
 
     if mesh is None:
         mesh_name, surface_known = "mesh built from the surfels", False
@@ -78,10 +94,10 @@ def import_asset(
         surface, report["mesh"] = mesh_with_materials(
             mesh_file, mesh_name, up=up, max_triangles=max_triangles, tolerance=TOLERANCE
         )
+        surface.vertices = surface.vertices * np.float32(scale)
         _check_overlap(captured, surface, surfel_name, mesh_name)
 
     binding, report["binding"] = bind(surface, captured)
-    surfels_known = any(layout.name == file.layout and layout.albedo is not None for layout in LAYOUTS)
     if surface_known and not surfels_known:
         vertices_to_surfels(surface, captured, binding)
         origin = "of the mesh, carried to the surfels"
@@ -89,16 +105,8 @@ def import_asset(
         origin = "of the surfels and of the mesh, as they are"
     else:
         report["vertices_without_surfels"] = surfels_to_vertices(surface, captured, binding)
-        origin = "of the surfels" if surfels_known else "captured colour of the surfels, light included"
-        origin += ", carried to the mesh"
-    provenance = {
-        "surfels": Path(surfel_name).name,
-        "mesh": Path(mesh_name).name,
-        "materials": origin,
-        "report": report,
-    }
-    if environment is not None:
-        provenance["environment"] = Path(environment).name
+        origin = f"{_SURFELS_OWN[surfels_known]}, carried to the mesh"
+    provenance |= {"mesh": Path(mesh_name).name, "materials": origin}
     log.info("imported %d surfels of %s: %s", len(captured), surfel_name, report)
     return Asset(captured, surface, binding, read_environment_of(environment), provenance)
 

@@ -47,6 +47,7 @@ def make_asset(
     pretrained: Surfels | None = None,
     environment: Environment | str | Path | None = None,
     pose: Pose = "rest",
+    scale: float = 1.0,
 ) -> Asset:
     """Make an asset from a mesh with textures: glTF, GLB, OBJ, PLY and whatever else `formats` reads.
 
@@ -60,6 +61,7 @@ def make_asset(
     pretrained : surfels whose place and opacity the attached ones take over (Algorithm 1)
     environment : light kept in the asset
     pose : of a skinned glTF file, "rest" as Blender's importer rests it or "default" as viewers show the file
+    scale : factor on all lengths
 
     Returns
     -------
@@ -69,6 +71,7 @@ def make_asset(
     name = "mesh" if isinstance(source, MeshFile) else str(source)
     file = read_mesh_file(source, pose)
     mesh, report = mesh_with_materials(file, name, up=up, max_triangles=max_triangles, tolerance=tolerance)
+    mesh.vertices = mesh.vertices * np.float32(scale)
     surfels, binding, report["surfels"] = attach(mesh, pretrained, density=density)
     provenance = {"mesh": Path(name).name, "made": "surfels attached to the mesh", "report": report}
     return Asset(surfels, mesh, binding, read_environment_of(environment), provenance)
@@ -169,7 +172,9 @@ def _net(file: MeshFile, name: str, report: dict[str, Any]) -> Net:
     keep = ~Faces.of(net.vertices, net.faces).degenerate
     net.faces, net.uvs, net.tags = net.faces[keep], net.uvs[keep], net.tags[keep]
     report["not_finite_faces"] = int((~finite).sum())
-    report["degenerate_faces"] = int((finite & ~proper).sum() + (~keep).sum())
+    report["degenerate_faces"] = removed = int((finite & ~proper).sum() + (~keep).sum())
+    if removed:
+        report["notes"].append(f"{removed} faces without area removed")
     return net
 
 

@@ -92,7 +92,7 @@ def mesh_from_surfels(surfels: Surfels, *, resolution: int = 192, views: int = 6
         raise AssetError("surfels", "enclose no volume", "Give the mesh that they were captured with")
     vertices, faces, _, _ = marching_cubes(field, 0.0)
     vertices = (vertices - 1) * voxel + low
-    vertices, faces, dropped, volume = _main_parts(vertices, faces)
+    vertices, faces, dropped, volume = main_parts(vertices, faces)
     n = len(vertices)
     mesh = Mesh(vertices, faces, np.full((n, 3), 0.5), np.full(n, 0.5), np.zeros(n))
     report = {
@@ -205,7 +205,7 @@ def _fuse(
                     count[i, j, k] += 1
 
 
-def _main_parts(vertices: Array, faces: Array) -> tuple[Array, Array, int, float]:
+def main_parts(vertices: Array, faces: Array) -> tuple[Array, Array, int, float]:
     """Keep the components that matter, facing outwards; (vertices, faces, components dropped, volume)."""
     n = len(vertices)
     links = coo_matrix((np.ones(2 * len(faces)), (faces[:, [0, 1]].reshape(-1), faces[:, [1, 2]].reshape(-1))), (n, n))

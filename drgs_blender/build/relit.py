@@ -1,0 +1,159 @@
+"""The light of an environment on an asset's surfels, one colour each: what splats without materials can show."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from ..asset.model import Asset, Binding, Surfels
+from ..errors import UsageError
+from ..frame import RenderSettings, World
+from ..geometry import rotation_matrices
+from ..render.lights.lamps import Lamps
+from ..render.lights.light import EnvironmentLight
+from ..render.points import ShadingPoints
+from ..render.shade.integrate import integrate
+from ..render.surfels.surfel_bvh import SurfelBVH
+from ..render.trace.scene import TraceObject, TraceScene
+
+Array = np.ndarray
+Progress = Callable[[str, float], None]
+
+#: Surfels lit at once: bounds memory and the time until a cancel is seen.
+_BLOCK = 1 << 15
+
+
+def relit_colours(
+    asset: Asset,
+    surfels: Surfels,
+    vertices: Array,
+    world: World,
+    settings: RenderSettings,
+    progress: Progress | None = None,
+) -> Array:
+    """Light that leaves each surfel along its normal, with shadows and indirect light of the asset's mesh.
+
+    Parameters
+    ----------
+    asset : its mesh is what light meets; object space is the world
+    surfels : the asset's surfels, posed as `vertices` are
+    vertices : (n, 3) float32, the mesh's vertices
+    world : the light
+    settings : samples a surfel, bounces, look, seed
+    progress : called with the name of the phase and the part of it that is done, in [0, 1]
+
+    Returns
+    -------
+    (n, 3) float32, linear Rec.709, scene-referred
+
+    Raises
+    ------
+    UsageError
+        The asset has no mesh, or the settings are out of range.
+    """
+    mesh = asset.mesh
+    if asset.binding is None:
+        raise UsageError("relit colours", "need a mesh for the light to meet", "Import the surfels with a mesh")
+    scene = TraceScene()
+    scene.update([TraceObject("asset", vertices, mesh.faces, mesh.albedo, mesh.roughness, mesh.metallic)])
+    points = points_on_mesh(surfels, vertices, mesh.faces, asset.binding)
+    try:
+        return lit_colours(scene, EnvironmentLight(world), points, settings, progress=progress)
+    finally:
+        scene.close()
+
+
+def lit_colours(
+    scene: TraceScene,
+    light: EnvironmentLight,
+    points: ShadingPoints,
+    settings: RenderSettings,
+    lamps: Lamps | None = None,
+    tree: SurfelBVH | None = None,
+    progress: Progress | None = None,
+) -> Array:
+    """Light that leaves `points`, (n, 3) float32 linear Rec.709; what is given is as for `integrate`."""
+    return light_components(scene, light, points, settings, lamps, tree, progress).sum(axis=1)
+
+
+def light_components(
+    scene: TraceScene,
+    light: EnvironmentLight,
+    points: ShadingPoints,
+    settings: RenderSettings,
+    lamps: Lamps | None = None,
+    tree: SurfelBVH | None = None,
+    progress: Progress | None = None,
+) -> Array:
+    """As `lit_colours`, (n, 4, 3): diffuse direct and indirect, glossy direct and indirect light."""
+    n = len(points)
+    components = np.empty((n, 4, 3), np.float32)
+    for start in range(0, n, _BLOCK):
+        if progress is not None:
+            progress("Lighting", start / n)
+        rows = slice(start, start + _BLOCK)
+        components[rows] = integrate(scene, light, points[rows], settings, 0, lamps, surfels=tree).components
+    if progress is not None:
+        progress("Done", 1.0)
+    return components
+
+
+def points_on_mesh(
+    surfels: Surfels, vertices: Array, faces: Array, binding: Binding, *, mirrored: bool = False
+) -> ShadingPoints:
+    """The places on a mesh, (n, 3) `vertices` and (m, 3) `faces`, where its `surfels` hang, seen along their normals.
+
+    `mirrored`: the faces are clockwise seen from outside.
+    """
+    corners = vertices[faces[binding.face]].astype(np.float64)
+    normal = rotation_matrices(surfels.rotation.astype(np.float64))[..., 2]
+    geometric = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    geometric *= -1.0 if mirrored else 1.0
+    length = np.linalg.norm(geometric, axis=1, keepdims=True)
+    geometric = np.where(length > 1e-30, geometric / np.maximum(length, 1e-30), normal)
+    # Surfels of captures face either way; what is seen of them is the outside of the mesh.
+    normal *= np.where(np.sum(normal * geometric, axis=1, keepdims=True) < 0, -1.0, 1.0)
+    return _points(surfels, np.einsum("nk,nkj->nj", binding.barycentric, corners), normal, geometric)
+
+
+def points_of_surfels(surfels: Surfels, owner: int, size: float) -> ShadingPoints:
+    """The centres of `surfels` without a mesh, seen along their normals.
+
+    Parameters
+    ----------
+    owner : the object, by its number in the tree of surfels, that does not shade itself nearby
+    size : mean larger standard deviation of its surfels, metres
+    """
+    normal = rotation_matrices(surfels.rotation.astype(np.float64))[..., 2]
+    return own_surfels(_points(surfels, surfels.centre, normal, normal), owner, size)
+
+
+def own_surfels(points: ShadingPoints, owner: int, size: float) -> ShadingPoints:
+    """The same `points`, which know which surfels are their own, see `points_of_surfels`."""
+    n = len(points)
+    return replace(points, own=np.full(n, owner, np.int32), size=np.full(n, size, np.float32))
+
+
+def _points(surfels: Surfels, origin: Array, normal: Array, geometric: Array) -> ShadingPoints:
+    return points_along(origin, normal, geometric, surfels.albedo, surfels.roughness, surfels.metallic)
+
+
+def points_along(
+    origin: Array, normal: Array, geometric: Array, albedo: Array, roughness: Array, metallic: Array
+) -> ShadingPoints:
+    """Points seen along their `normal`, a pixel each; arrays as in `ShadingPoints`."""
+    n = len(origin)
+    return ShadingPoints(
+        pixel=np.arange(n),
+        sample=np.zeros(n),
+        weight=np.ones(n),
+        origin=origin,
+        normal=normal,
+        geometric_normal=geometric,
+        view=normal,
+        albedo=albedo,
+        roughness=roughness,
+        metallic=metallic,
+    )

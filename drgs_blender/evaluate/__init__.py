@@ -1,0 +1,1 @@
+"""How good an asset is: metrics, scenes with known truth, tables."""

@@ -1,0 +1,286 @@
+"""An asset against what is known of the object: views left out, other lights, other poses, materials, shape."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..asset import Asset
+from ..deform.gmls import bind_points, carry
+from ..deform.sources import MeshSource
+from ..errors import UsageError
+from ..frame import Camera
+from ..reconstruct.capture import Capture, View
+from .flip import flip
+from .metrics import depth_error, material_scores, mean_psnr, normal_error, on_white, relight_scores, ssim
+from .truth import Truth, TruthSet
+
+Array = np.ndarray
+logger = logging.getLogger(__name__)
+
+#: (camera, radiance of the light (h, w, 3), vertices of the asset's mesh or None at rest) -> pass name -> (h, w, c):
+#: the passes `PASSES`, on a transparent film.
+Renderer = Callable[[Camera, Array, Array | None], dict[str, Array]]
+PASSES = ("Combined", "Depth", "Normal", "Albedo", "Roughness", "Metallic", "Coverage")
+#: A perceptual distance of two encoded pictures.
+Distance = Callable[[Array, Array], float]
+#: Called with the part done and what is rendered.
+Progress = Callable[[float, str], None]
+#: Where files of pictures go: (name of the set, number of the view, ours and the true one, encoded).
+Show = Callable[[str, int, Array, Array], None]
+
+
+def compare(
+    asset: Asset,
+    capture: Capture,
+    truth: Truth | None,
+    renderer: Renderer,
+    lpips: Distance | None = None,
+    progress: Progress | None = None,
+    show: Show | None = None,
+) -> dict[str, Any]:
+    """Score an asset.
+
+    Parameters
+    ----------
+    capture : its views left out are rendered under the asset's own light, at the size they have there
+    truth : sets under known lights, at rest and posed, with maps
+    lpips : None where it is not computed
+
+    Returns
+    -------
+    dict
+        JSON-able: "novel" (views left out), "lights" (one entry a set of the truth), "materials", "geometry"; None for
+        what cannot be measured. Decibels, degrees, metres.
+
+    Raises
+    ------
+    UsageError
+        There is nothing to compare with.
+    """
+    novel = capture.testing
+    if asset.environment is None or not novel:
+        reason = "no environment of its own" if novel else "no views left out"
+        logger.warning("views left out are not rendered: %s", reason)
+        novel = []
+    if not novel and truth is None:
+        raise UsageError(str(capture.source), "has nothing to compare with", "Leave views out with --test-every 8")
+    total = len(novel) + (sum(len(item.views) for item in truth.sets) if truth else 0)
+    done = 0
+
+    def render(view: View, radiance: Array, vertices: Array | None, name: str) -> dict[str, Array]:
+        nonlocal done
+        if progress is not None:
+            progress(done / total, name)
+        done += 1
+        return renderer(view.camera, radiance, vertices)
+
+    report: dict[str, Any] = {"novel": None, "lights": [], "materials": None, "geometry": None, "posed_geometry": None}
+    if novel:
+        assert asset.environment is not None
+        radiance = asset.environment.radiance
+        pictures = [render(view, radiance, None, "views left out") for view in novel]
+        report["novel"] = _novel(novel, pictures, capture.background, lpips, show)
+    if truth is not None:
+        vertices = posed_vertices(asset, truth) if any(item.posed for item in truth.sets) else None
+        for item in truth.sets:
+            pose = vertices if item.posed else None
+            pictures = [render(view, item.radiance, pose, item.name) for view in item.views]
+            entry = _relit(item, pictures, lpips, show)
+            entry["training_light"] = item.light == truth.training_light
+            report["lights"].append(entry)
+            if item.maps:
+                report["posed_geometry" if item.posed else "geometry"] = _geometry(item, pictures)
+                if not item.posed:
+                    report["materials"] = _materials(item, pictures)
+    return _without_nan(report)
+
+
+def posed_vertices(asset: Asset, truth: Truth) -> Array:
+    """(n, 3) float32 vertices of the asset's mesh, carried along by the true mesh around them."""
+    assert truth.rest is not None and truth.posed is not None and truth.faces is not None
+    source = MeshSource(truth.rest, truth.faces)
+    used = np.unique(truth.faces)
+    weights = bind_points(asset.mesh.vertices, truth.rest[used])
+    points, _, turned = carry(weights, truth.posed[used], source.gradients(truth.posed)[used])
+    if turned:
+        logger.info("%d vertices are carried by their nearest neighbour alone", turned)
+    return points.astype(np.float32)
+
+
+def _straight(picture: dict[str, Array]) -> tuple[Array, Array]:
+    """((h, w, 3) linear, not premultiplied; (h, w) alpha) of a picture."""
+    combined = np.nan_to_num(picture["Combined"])
+    alpha = np.clip(combined[..., 3], 0, 1)
+    return combined[..., :3] / np.maximum(alpha, 1e-6)[..., None] * (alpha > 0)[..., None], alpha
+
+
+def _white(view: View, background: tuple[float, float, float] | None) -> tuple[Array, Array]:
+    """((h, w, 3) encoded picture on white, (h, w) mask) of a photograph."""
+    if view.mask is None:
+        return view.colour, np.ones(view.colour.shape[:2], np.float32)
+    mask = view.mask[..., None]
+    if background is None:  # real surroundings: cut out
+        return view.colour * mask + (1 - mask), view.mask
+    return np.clip(view.colour + (1 - np.asarray(background, np.float32)) * (1 - mask), 0, 1), view.mask
+
+
+def _looks(
+    ours: Sequence[Array] | Array, true: Sequence[Array] | Array, lpips: Distance | None
+) -> dict[str, float | None]:
+    """Means of the measures that look at whole pictures."""
+    pairs = list(zip(ours, true))
+    return {
+        "ssim": float(np.mean([ssim(a, b) for a, b in pairs])),
+        "flip": float(np.mean([flip(a, b) for a, b in pairs])),
+        "lpips": None if lpips is None else float(np.mean([lpips(a, b) for a, b in pairs])),
+    }
+
+
+def _novel(
+    views: list[View], pictures: list[dict[str, Array]], background: tuple[float, float, float] | None,
+    lpips: Distance | None, show: Show | None,
+) -> dict[str, Any]:  # fmt: skip
+    wanted = [_white(view, background) for view in views]
+    ours = []
+    for view, picture in zip(views, pictures):
+        linear, alpha = _straight(picture)
+        # Surroundings that were photographed and not cut out are not ours to show.
+        ours.append(on_white(linear, alpha if view.mask is not None else np.ones_like(alpha)))
+    true = [picture for picture, _ in wanted]
+    inside = [mask > 0.5 for _, mask in wanted]
+    for k, (a, b) in enumerate(zip(ours, true)):
+        if show is not None:
+            show("novel", k, a, b)
+    return {
+        "views": len(views),
+        "coverage": float(np.mean([m.mean() for m in inside])),
+        "psnr": mean_psnr(ours, true),
+        "psnr_foreground": float(
+            np.mean([mean_psnr([a], [b], m[None]) for a, b, m in zip(ours, true, inside) if m.any()])
+        ),
+        **_looks(ours, true, lpips),
+    }
+
+
+def _relit(
+    item: TruthSet, pictures: list[dict[str, Array]], lpips: Distance | None, show: Show | None
+) -> dict[str, Any]:
+    straight = [_straight(picture) for picture in pictures]
+    linear, alpha = (np.stack(parts) for parts in zip(*straight))
+    wanted = [_white(view, (1.0, 1.0, 1.0)) for view in item.views]
+    true, mask = (np.stack(parts) for parts in zip(*wanted))
+    scores = relight_scores(linear, alpha, true, mask)
+    ours = on_white(linear * np.array(scores["scale"]), alpha)
+    for k, (a, b) in enumerate(zip(ours, true)):
+        if show is not None:
+            show(item.name, k, a, b)
+    about = {"name": item.name, "light": item.light, "posed": item.posed, "views": len(item.views)}
+    return {**about, **scores, **_looks(ours, true, lpips)}
+
+
+def _inside(item: TruthSet) -> Array:
+    """(n, h, w) bool: pixels that the true object covers whole."""
+    return np.stack([maps["Coverage"][..., 0] > 0.99 for maps in item.maps])
+
+
+def _geometry(item: TruthSet, pictures: list[dict[str, Array]]) -> dict[str, float]:
+    inside = _inside(item)
+    rows = []
+    for ours, true, mask in zip(pictures, item.maps, inside):
+        unknown = (float("nan"), float("nan"))
+        depths = depth_error(ours["Depth"][..., 0], true["Depth"][..., 0], mask) if "Depth" in true else unknown
+        cover = ours["Coverage"][..., 0] > 0.5
+        both = (cover & (true["Coverage"][..., 0] > 0.5)).sum() / max(
+            (cover | (true["Coverage"][..., 0] > 0.5)).sum(), 1
+        )
+        rows.append((normal_error(ours["Normal"], true["Normal"], mask), *depths, both))
+    normal, mean, median, overlap = (_mean_of_numbers(column) for column in np.array(rows).T)
+    return {
+        "normal_degrees": normal,
+        "depth_mean": mean,
+        "depth_median": median,
+        "silhouette_iou": overlap,
+    }
+
+
+def _mean_of_numbers(values: Array) -> float:
+    values = values[np.isfinite(values)]
+    return float(values.mean()) if len(values) else float("nan")
+
+
+def _materials(item: TruthSet, pictures: list[dict[str, Array]]) -> dict[str, object]:
+    def stack(source: list[dict[str, Array]]) -> dict[str, Array]:
+        known = [name for name in ("Roughness", "Metallic") if name in item.maps[0]]
+        planes = {name.lower(): np.stack([p[name][..., 0] for p in source]) for name in known}
+        return {"albedo": np.stack([p["Albedo"] for p in source]), **planes}
+
+    seen = np.stack([p["Coverage"][..., 0] > 0.5 for p in pictures])
+    return material_scores(stack(pictures), stack(item.maps), _inside(item) & seen)
+
+
+def _without_nan(value: Any) -> Any:
+    """None in place of what is not a number, so that the report is JSON."""
+    if isinstance(value, dict):
+        return {key: _without_nan(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_without_nan(item) for item in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def table(report: dict[str, Any]) -> list[str]:
+    """The report as lines for a person."""
+    lines = []
+    novel = report["novel"]
+    if novel:
+        lines.append(
+            f"views left out ({novel['views']}, {novel['coverage']:.0%} foreground): PSNR {novel['psnr']:.2f} dB, "
+            f"foreground {novel['psnr_foreground']:.2f} dB, SSIM {_number(novel['ssim'])}, "
+            f"FLIP {_number(novel['flip'])}, LPIPS {_number(novel['lpips'])}"
+        )
+    if geometry := report["geometry"]:
+        lines.append(_shape("shape", geometry))
+    if geometry := report["posed_geometry"]:
+        lines.append(_shape("shape, posed", geometry))
+    if materials := report["materials"]:
+        scale = ", ".join(f"{factor:.2f}" for factor in materials["albedo_scale"])
+        lines.append(
+            f"materials: albedo PSNR {materials['albedo_psnr']:.2f} dB, {materials['albedo_psnr_scaled']:.2f} dB "
+            f"scaled (by {scale}); RMSE of roughness {_number(materials.get('roughness_rmse'))}, "
+            f"of metallic {_number(materials.get('metallic_rmse'))}"
+        )
+    if report["lights"]:
+        lines += ["", "PSNR in dB        |  foreground     |  all, on white         |"]
+        lines += ["light             |  raw   scaled   |  raw   scaled  publ.  |  SSIM    FLIP    LPIPS"]
+        for row in report["lights"]:
+            raw, scaled = row["raw"], row["scaled"]
+            name = row["light"] + (" posed" if row["posed"] else "") + ("*" if row["training_light"] else "")
+            lines.append(
+                f"{name:<18}| {raw['foreground']:6.2f} {scaled['foreground']:6.2f}   | {raw['full']:6.2f} "
+                f"{scaled['full']:6.2f} {row['published']:6.2f}  | {_number(row['ssim'])}  {_number(row['flip'])}  "
+                f"{_number(row['lpips'])}"
+            )
+        lines.append("* the light of the training views. SSIM, FLIP and LPIPS are of the scaled pictures on white.")
+    return lines
+
+
+def _number(value: float | None) -> str:
+    return "not computed" if value is None else f"{value:.4f}"
+
+
+def _shape(name: str, geometry: dict[str, float]) -> str:
+    normal, median, mean, overlap = (
+        _number(geometry[key]) for key in ("normal_degrees", "depth_median", "depth_mean", "silhouette_iou")
+    )
+    return (
+        f"{name}: normals {normal} degrees off; depth {median} (median), {mean} (mean); silhouettes overlap {overlap}"
+    )
+
+
+def source_name(path: Path) -> str:
+    """What a capture is called in a report."""
+    return path.resolve().name if path.is_dir() else f"{path.resolve().parent.name}/{path.name}"

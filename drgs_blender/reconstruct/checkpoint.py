@@ -1,0 +1,53 @@
+"""State of an optimisation on disk: named arrays and what they belong to, written in one step."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..arrays import Array
+from ..asset.archive import replace_file
+from ..asset.tensors import decode, encode
+from ..errors import AssetError
+from .capture import Capture
+
+log = logging.getLogger(__name__)
+
+
+def fingerprint(capture: Capture, **settings: Any) -> str:
+    """Digest of what a state depends on: the photographs, their cameras, and settings that JSON can hold."""
+    digest = hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode())
+    for view in capture.views:
+        camera = view.camera
+        digest.update(f"{view.name} {view.test} {camera.width} {camera.height}".encode())
+        digest.update(np.asarray(camera.matrix_world, np.float64).tobytes())
+        digest.update(np.array([camera.fx, camera.fy, camera.cx, camera.cy]).tobytes())
+        digest.update(np.ascontiguousarray(view.colour[::7, ::7]).tobytes())
+    return digest.hexdigest()
+
+
+def save(path: Path, arrays: dict[str, Array], key: str) -> None:
+    """Write `arrays` under the fingerprint `key`; WriteError names the path."""
+    label = np.frombuffer(key.encode(), np.uint8)
+    replace_file(path, encode({"fingerprint": label, **{k: np.atleast_1d(v) for k, v in arrays.items()}}))
+
+
+def load(path: Path, key: str) -> dict[str, Array] | None:
+    """What `save` wrote, or None where there is nothing, or something else, said in a warning."""
+    if not path.exists():
+        return None
+    try:
+        arrays = decode(np.fromfile(path, np.uint8), str(path))
+        found = bytes(arrays.pop("fingerprint")).decode()
+    except (OSError, AssetError, KeyError, UnicodeDecodeError) as error:
+        log.warning("%s cannot be used (%s); starting anew", path, error)
+        return None
+    if found != key:
+        log.warning("%s belongs to other photographs or settings; starting anew", path)
+        return None
+    return arrays

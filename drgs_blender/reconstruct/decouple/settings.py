@@ -1,0 +1,89 @@
+"""How the light and the materials of an object are pulled apart."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Literal
+
+from ...errors import UsageError
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Settings of `decouple`.
+
+    Attributes
+    ----------
+    iterations : steps of the optimiser
+    seconds : stop after so much time of the wall clock, the schedule squeezed to fit; 0 is no limit
+    pixels : drawn in each step, over all training views
+    cosine, ggx, light : directions that each strategy draws at a pixel, even numbers
+    look : BRDF, "principled" (Blender's) or "paper"
+    indirect : light that other parts of the object send is what the photographs show of them; else it is black
+    environment : rows of the learned lat-long light at the end, a power of two
+    coarse_to_fine : begin with a quarter of the rows and double them on a schedule
+    rate, light_rate : first step sizes of materials and light (Adam), in logits and log radiance
+    coarse : also learn materials on this many nested grids of cells, which carry what many pixels agree on quickly
+    smoothness : weight of the differences of materials along edges, less where the photographs differ
+    light_smoothness : weight of the differences of log radiance between neighbours in the environment
+    white : weight that pulls the environment towards grey
+    bimodal : weight that pulls metallic to 0 or 1
+    unbiased : compare two independent estimates of each pixel, so that their noise is not learned from
+    parametrisation : "metallic" learns albedo and metallic; "specular" diffuse and specular colour, turned into the
+        former at the end
+    normals : also learn an offset of each vertex normal, held by `normal_smoothness`
+    exposure : also learn the brightness of every photograph
+    most_pixels : foreground pixels kept in memory, evenly over all views
+    seed : of all random numbers
+    """
+
+    iterations: int = 2500
+    seconds: float = 0.0
+    pixels: int = 2048
+    cosine: int = 16
+    ggx: int = 8
+    light: int = 8
+    look: Literal["principled", "paper"] = "principled"
+    indirect: bool = True
+    environment: int = 32
+    coarse_to_fine: bool = True
+    rate: float = 0.02
+    light_rate: float = 0.1
+    coarse: int = 3
+    smoothness: float = 0.01
+    light_smoothness: float = 0.001
+    white: float = 0.0003
+    bimodal: float = 0.0
+    unbiased: bool = True
+    parametrisation: Literal["metallic", "specular"] = "metallic"
+    normals: bool = False
+    normal_smoothness: float = 0.3
+    exposure: bool = False
+    most_pixels: int = 2_000_000
+    seed: int = 0
+
+    def check(self) -> None:
+        """Raise UsageError on what cannot be used."""
+        counts = (self.cosine, self.ggx, self.light)
+        rows = self.environment
+        wrong = {
+            "iterations": self.iterations < 1,
+            "pixels": self.pixels < 1,
+            "most_pixels": self.most_pixels < 1,
+            "cosine, ggx, light": min(counts) < 0 or sum(counts) == 0 or any(c % 2 for c in counts),
+            "environment": not 8 <= rows <= 1024 or rows & (rows - 1) != 0,
+            "look": self.look not in ("principled", "paper"),
+            "parametrisation": self.parametrisation not in ("metallic", "specular"),
+            "coarse": not 0 <= self.coarse <= 8,
+        }
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, float) and not 0.0 <= value < float("inf"):
+                wrong[field.name] = True
+        bad = [name for name, is_wrong in wrong.items() if is_wrong]
+        if bad:
+            raise UsageError(
+                "decoupling settings",
+                f"{', '.join(bad)} cannot be used",
+                "Numbers are positive, samples even, rows of the environment a power of two from 8 to 1024",
+            )

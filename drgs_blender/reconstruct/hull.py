@@ -1,0 +1,227 @@
+"""Where the object is: a region from the cameras, and the visual hull of the masks as the first surface.
+
+A point belongs to the visual hull when no view that has it in its picture shows background there (Laurentini 1994).
+Surfels that start on it need not be found by gradients.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.ndimage import gaussian_filter, label
+
+from ..arrays import Array
+from ..errors import AssetError, UsageError
+from ..frame import Camera
+from ..jit import njit, prange
+from .capture import Capture, View
+
+log = logging.getLogger(__name__)
+
+#: Colours farther than this from the background are the object, where nobody drew masks.
+DISTINCT = 0.03
+#: Part of the views of a point of the hull that may call it background: masks are not perfect.
+DISSENT = 0.03
+#: Part of the views that must have a point of the hull in their picture.
+WITNESSES = 0.2
+#: Cells along the longest side of the hull's box.
+CELLS = 96
+
+
+@dataclass(slots=True)
+class Region:
+    """Where surfels may be.
+
+    Attributes
+    ----------
+    centre : (3,) float64, metres
+    radius : of a sphere around the object, metres
+    low, high : (3,) float64 corners of the object's box
+    points, normals : (n, 3) float32 on the first surface, unit normals outwards
+    spacing : distance between those points, metres
+    """
+
+    centre: Array
+    radius: float
+    low: Array
+    high: Array
+    points: Array
+    normals: Array
+    spacing: float
+
+
+def silhouettes(capture: Capture) -> list[Array] | None:
+    """Masks of the training views, (h, w) float32 each: drawn, or told from a background of one colour; or None."""
+    views = capture.training
+    if all(view.mask is not None for view in views):
+        return [np.ascontiguousarray(view.mask, np.float32) for view in views]
+    if capture.background is None:
+        return None
+    colour = np.asarray(capture.background, np.float32)
+    return [(np.abs(view.colour - colour).max(axis=-1) > DISTINCT).astype(np.float32) for view in views]
+
+
+def aim(cameras: list[Camera]) -> tuple[Array, float]:
+    """Point nearest to all optical axes, and the radius of the sphere there that the median camera sees whole."""
+    matrices = np.stack([np.asarray(c.matrix_world, np.float64) for c in cameras])
+    eye, axis = matrices[:, :3, 3], -matrices[:, :3, 2]
+    across = np.eye(3) - axis[:, :, None] * axis[:, None, :]
+    if np.linalg.cond(across.sum(0)) > 1e6:
+        raise UsageError(
+            "cameras", "all look in one direction: depth cannot be told", "Photograph the object from around it"
+        )
+    middle = np.linalg.solve(across.sum(0), (across @ eye[:, :, None]).sum(0))[:, 0]
+    half = [min(c.width / c.fx, c.height / c.fy) / 2 for c in cameras]
+    distance = np.linalg.norm(eye - middle, axis=1)
+    return middle, float(np.median(distance * np.asarray(half)))
+
+
+def find_region(capture: Capture) -> Region:
+    """The visual hull where there are silhouettes; else the sparse points, or a sphere that the cameras look at.
+
+    Raises
+    ------
+    UsageError: fewer than three views, or cameras that all look the same way.
+    AssetError: masks that have no point in common: cameras and pictures do not belong together.
+    """
+    views = capture.training
+    if len(views) < 3:
+        raise UsageError(
+            str(capture.source),
+            f"has {len(views)} views to learn from",
+            "A surface needs three or more, from all around",
+        )
+    masks = silhouettes(capture)
+    if masks is None:
+        return _without_masks(capture, views)
+    if not any(mask.max() > 0.5 for mask in masks):
+        raise AssetError(str(capture.source), "shows no object in any mask", "Check masks and background")
+    centre, radius = aim([view.camera for view in views])
+    low, high = centre - 1.5 * radius, centre + 1.5 * radius
+    # Coarse first, to find the box; cells of the second time are as fine as the object allows.
+    for cells in (64, CELLS):
+        origin, spacing = low, float((high - low).max()) / cells
+        shape = np.ceil((high - low) / spacing).astype(int) + 1
+        inside = _main_parts(_carve(origin, spacing, shape, views, masks))
+        if not inside.any():
+            raise AssetError(
+                str(capture.source),
+                "has masks that no common point projects into: cameras and pictures do not agree",
+                "Check the convention of the cameras' axes and their order",
+            )
+        corners = np.argwhere(inside)
+        low, high = origin + (corners.min(0) - 1.5) * spacing, origin + (corners.max(0) + 1.5) * spacing
+    points, normals = _surface(inside, origin, spacing)
+    middle = 0.5 * (low + high)
+    log.info("visual hull: %d cells, %d surface points, box %s", int(inside.sum()), len(points), high - low)
+    return Region(middle, 0.5 * float(np.linalg.norm(high - low)), low, high, points, normals, spacing)
+
+
+def _main_parts(inside: Array) -> Array:
+    """The solid without parts smaller than a hundredth of the largest."""
+    parts, count = label(inside)
+    sizes = np.bincount(parts.reshape(-1), minlength=count + 1)
+    sizes[0] = 0
+    return (sizes >= max(0.01 * sizes.max(), 1))[parts]
+
+
+def _surface(inside: Array, origin: Array, spacing: float) -> tuple[Array, Array]:
+    """Cells at the border of the solid, moved onto the smoothed surface, and normals (n, 3) from the smoothed solid."""
+    padded = np.pad(inside, 3)
+    smooth = gaussian_filter(padded.astype(np.float32), 1.5)
+    slope = np.stack(np.gradient(smooth), -1)
+    core = padded.copy()
+    for axis in range(3):
+        core &= np.roll(padded, 1, axis) & np.roll(padded, -1, axis)
+    border = padded & ~core
+    steep = slope[border]
+    length = np.linalg.norm(steep, axis=1)
+    solid = length > 1e-3
+    at, steep, length = np.argwhere(border)[solid], steep[solid], length[solid]
+    normals = -steep / length[:, None]
+    offset = np.clip((smooth[border][solid] - 0.5) / length, -1, 1)
+    points = (at - 3 + offset[:, None] * normals) * spacing + origin
+    return points.astype(np.float32), normals.astype(np.float32)
+
+
+def _without_masks(capture: Capture, views: list[View]) -> Region:
+    """Sparse points where there are enough, else points in the sphere that the cameras look at."""
+    log.warning(
+        "%s: neither masks nor a background of one colour: the surroundings are learned with the object, which takes "
+        "longer and gives a worse shape; masks tell them apart",
+        capture.source,
+    )
+    centre, radius = aim([view.camera for view in views])
+    rng = np.random.default_rng(0)
+    points = None if capture.points is None else capture.points[np.isfinite(capture.points).all(axis=1)]
+    if points is not None and len(points) >= 100:
+        low, high = np.quantile(points, 0.02, axis=0), np.quantile(points, 0.98, axis=0)
+        centre, radius = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
+    else:
+        directions = rng.normal(size=(8000, 3))
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        points = centre + radius * rng.uniform(size=(len(directions), 1)) ** (1 / 3) * directions
+        low, high = centre - radius, centre + radius
+    normals = points - centre
+    normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
+    spacing = radius * (4.2 / len(points)) ** (1 / 3)
+    return Region(
+        centre.astype(np.float64), radius, low.astype(np.float64), high.astype(np.float64),
+        points.astype(np.float32), normals.astype(np.float32), spacing,
+    )  # fmt: skip
+
+
+def _carve(low: Array, spacing: float, shape: Array, views: list[View], masks: list[Array]) -> Array:
+    """(shape) bool: points of a grid that enough views see, and no more than `DISSENT` of those call background."""
+    seen, background = np.zeros(tuple(shape), np.int32), np.zeros(tuple(shape), np.int32)
+    for view, mask in zip(views, masks, strict=True):
+        _count(low, spacing, world_to_pixel(view.camera), mask, seen, background)
+    return (seen >= max(3, int(WITNESSES * len(views)))) & (background <= DISSENT * seen)
+
+
+def world_to_pixel(camera: Camera) -> Array:
+    """(3, 4) float64: rows give x z, y z and z of a world point, (x, y) its pixel position, z its depth."""
+    matrix = np.linalg.inv(np.asarray(camera.matrix_world, np.float64))
+    right, up, back = matrix[0], matrix[1], matrix[2]
+    return np.stack([camera.fx * right - camera.cx * back, -camera.fy * up - camera.cy * back, -back])
+
+
+def colours_of(points: Array, normals: Array, views: list[View]) -> Array:
+    """Mean colour (n, 3) of the views that see points (n, 3) from the front, sRGB; grey where none does."""
+    total, weight = np.zeros((len(points), 3)), np.zeros(len(points))
+    for view in views:
+        eye = np.asarray(view.camera.matrix_world)[:3, 3]
+        towards = eye - points
+        facing = np.einsum("nc,nc->n", towards, normals) / np.maximum(np.linalg.norm(towards, axis=1), 1e-9)
+        matrix = world_to_pixel(view.camera)
+        position = points @ matrix[:, :3].T + matrix[:, 3]
+        x, y = (np.floor(position[:, k] / np.maximum(position[:, 2], 1e-9)).astype(int) for k in (0, 1))
+        inside = (position[:, 2] > 0) & (x >= 0) & (y >= 0) & (x < view.camera.width) & (y < view.camera.height)
+        w = np.where(inside, np.maximum(facing, 0) ** 2, 0)
+        x, y = np.where(inside, x, 0), np.where(inside, y, 0)
+        total += w[:, None] * view.colour[y, x]
+        weight += w
+    return np.where(weight[:, None] > 1e-3, total / np.maximum(weight, 1e-3)[:, None], 0.5).astype(np.float32)
+
+
+@njit(parallel=True)
+def _count(low: Any, spacing: Any, p: Any, mask: Any, seen: Any, background: Any) -> None:
+    """Count views that have grid points in their picture, and those that show background there."""
+    height, width = mask.shape
+    for i in prange(seen.shape[0]):
+        for j in range(seen.shape[1]):
+            for k in range(seen.shape[2]):
+                x, y, z = low[0] + i * spacing, low[1] + j * spacing, low[2] + k * spacing
+                depth = p[2, 0] * x + p[2, 1] * y + p[2, 2] * z + p[2, 3]
+                if depth <= 0.0:
+                    continue
+                px = (p[0, 0] * x + p[0, 1] * y + p[0, 2] * z + p[0, 3]) / depth
+                py = (p[1, 0] * x + p[1, 1] * y + p[1, 2] * z + p[1, 3]) / depth
+                if px < 0.0 or py < 0.0 or px >= width or py >= height:
+                    continue
+                seen[i, j, k] += 1
+                if mask[int(py), int(px)] < 0.5:
+                    background[i, j, k] += 1

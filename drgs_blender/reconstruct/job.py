@@ -1,0 +1,254 @@
+"""Photographs to an asset: surfels, mesh, surfels on the mesh or bound to it, materials and light."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+
+from ..arrays import Array
+from ..asset.model import Asset, Binding, Environment, Mesh, Surfels
+from ..build.transfer import surfels_to_vertices
+from ..deform.binding import bind
+from ..errors import Cancelled
+from . import checkpoint
+from .attached import attach_learned, bound
+from .capture import Capture, View
+from .decouple.run import decouple
+from .decouple.settings import Settings as Decoupling
+from .gaussians import Gaussians
+from .hull import Region, find_region
+from .photometric import Photograph, structural_similarity
+from .targets import background_of, composed
+from .train import Schedule, Training
+from .tsdf import fuse
+
+log = logging.getLogger(__name__)
+
+#: Seconds between two checkpoints, and two previews.
+SAVE_EVERY, SHOW_EVERY = 20.0, 5.0
+#: Steps on the mesh, as a part of those before.
+ON_MESH = 0.4
+#: Parts of the minutes that the surfels get, and their second round on the mesh.
+SHARE, SHARE_ON_MESH = 0.45, 0.15
+#: Part of the minutes for materials and light.
+SHARE_OF_MATERIALS = 0.35
+#: Fainter surfels do not come into the asset.
+UNSEEN = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What is made of a capture.
+
+    Attributes
+    ----------
+    variant : "p" keeps the free surfels (driven by particles or mesh), "m" makes surfels on the mesh's faces
+    schedule : how surfels are learned
+    mesh_resolution : most voxels along the mesh's longest side
+    minutes : all stages together; None: the steps of the schedule decide
+    materials : pull materials and light apart; else albedo is the photographed colour
+    decoupling : how; its ``seconds`` follow from `minutes`. Normals are learned too: a mesh of photographs has errors
+    fixed : parameters of surfels on faces that are not learned: "offset", "opacity" (the paper's ablation)
+    """
+
+    variant: Literal["p", "m"] = "p"
+    schedule: Schedule = field(default_factory=Schedule)
+    mesh_resolution: int = 256
+    minutes: float | None = None
+    materials: bool = True
+    decoupling: Decoupling = field(default_factory=lambda: Decoupling(normals=True))
+    fixed: tuple[str, ...] = ()
+
+
+@dataclass(slots=True)
+class Progress:
+    """Where a reconstruction stands.
+
+    Attributes
+    ----------
+    phase : "surfels", "mesh", "surfels on the mesh", "materials"
+    part : what is done of all, 0..1
+    surfels : how many there are
+    psnr : of the latest training views, decibels
+    picture : (h, w, 3) float32, sRGB: a view as it looks now, beside its photograph; None: not drawn this time
+    """
+
+    phase: str
+    part: float
+    surfels: int = 0
+    psnr: float = 0.0
+    picture: Array | None = None
+
+
+def reconstruct(
+    capture: Capture,
+    settings: Settings | None = None,
+    on_progress: Callable[[Progress], None] | None = None,
+    cancelled: Callable[[], bool] | None = None,
+    folder: Path | None = None,
+) -> Asset:
+    """Make an asset from photographs.
+
+    Parameters
+    ----------
+    on_progress : called about every second, with a picture every few seconds
+    cancelled : asked between steps; a checkpoint is left and Cancelled raised
+    folder : of checkpoints; a run that was stopped goes on from there, bit for bit unless `minutes` are given
+
+    Returns
+    -------
+    Asset
+        In the capture's world space. ``provenance["report"]`` holds counts, "psnr" and "ssim" of the views left out.
+
+    Raises
+    ------
+    UsageError, AssetError: what cannot be reconstructed, see `hull.find_region`, `targets.targets` and `tsdf.fuse`.
+    """
+    settings = settings or Settings()
+    work = _Work(capture, settings, on_progress or (lambda _: None), cancelled or (lambda: False), folder)
+    region = find_region(capture)
+    free = work.learn("surfels", Training(capture, region, settings.schedule, seconds=work.seconds(SHARE)), 0.0, 0.5)
+    work.tell(Progress("mesh", 0.5, len(free)))
+    report: dict[str, Any] = {"views": len(capture.training), "left_out": len(capture.testing)}
+    mesh, report["mesh"] = fuse(free, [view.camera for view in capture.training], region, settings.mesh_resolution)
+    final: Gaussians = free
+    binding: Binding | None = None
+    if settings.variant == "m":
+        final, binding = _on_mesh(work, mesh, free, region, report)
+    report |= judge(final, capture)
+    visible = final.opacities().detach().numpy() >= UNSEEN
+    surfels = _kept(final, visible)
+    if binding is None:
+        binding, report["binding"] = bind(mesh, surfels)
+    else:
+        binding = _rows(binding, visible)
+    environment, origin = _materials(work, mesh, surfels, binding, report)
+    provenance = {"capture": capture.source.name, "variant": settings.variant, "materials": origin, "report": report}
+    return Asset(surfels, mesh, binding, environment, provenance)
+
+
+class _Work:
+    """What all phases of a run share."""
+
+    def __init__(
+        self, capture: Capture, settings: Settings, tell: Callable[[Progress], None], cancelled: Callable[[], bool],
+        folder: Path | None,
+    ) -> None:  # fmt: skip
+        self.capture, self.settings, self.tell, self.cancelled, self.folder = capture, settings, tell, cancelled, folder
+        self.key = checkpoint.fingerprint(capture, **asdict(settings))
+        if folder is not None:
+            folder.mkdir(parents=True, exist_ok=True)
+
+    def seconds(self, share: float) -> float | None:
+        """Time of a phase."""
+        return None if self.settings.minutes is None else 60 * share * self.settings.minutes
+
+    def file(self, phase: str) -> Path | None:
+        """Checkpoint of a phase."""
+        return None if self.folder is None else self.folder / f"{phase.replace(' ', '-')}.state"
+
+    def learn(self, phase: str, training: Training, begin: float, end: float) -> Gaussians:
+        """Run a training to its end, from its checkpoint if there is one."""
+        file = self.file(phase)
+        if file is not None and (state := checkpoint.load(file, self.key)) is not None:
+            training.restore(state)
+            log.info("%s: going on at step %d", phase, training.iteration)
+        saved = shown = told = time.monotonic()
+        while not training.finished:
+            training.step()
+            now = time.monotonic()
+            stop = self.cancelled()
+            if file is not None and (stop or training.finished or now - saved > SAVE_EVERY):
+                checkpoint.save(file, training.arrays(), self.key)
+                saved = time.monotonic()
+            if stop:
+                raise Cancelled
+            if now - told > 1 or training.finished:
+                draw = now - shown > SHOW_EVERY or training.finished
+                picture = preview(training.gaussians, self.capture) if draw else None
+                part = begin + (end - begin) * training.part
+                self.tell(Progress(phase, part, len(training.gaussians), training.psnr, picture))
+                told, shown = now, now if draw else shown
+        return training.gaussians
+
+
+def _on_mesh(
+    work: _Work, mesh: Mesh, free: Gaussians, region: Region, report: dict[str, Any]
+) -> tuple[Gaussians, Binding]:
+    """Algorithm 1, and what it leaves to learn."""
+    settings = work.settings
+    attached, binding, report["attach"] = attach_learned(mesh, free, settings.fixed)
+    training = Training(
+        work.capture, region, settings.schedule.on_mesh(ON_MESH), attached, seconds=work.seconds(SHARE_ON_MESH)
+    )
+    final = work.learn("surfels on the mesh", training, 0.55, 0.7)
+    return final, bound(binding, final)  # type: ignore[arg-type]
+
+
+def _materials(
+    work: _Work, mesh: Mesh, surfels: Surfels, binding: Binding, report: dict[str, Any]
+) -> tuple[Environment | None, str]:
+    """Materials of mesh and surfels, in place; the light, and where the materials come from."""
+    if not work.settings.materials:
+        report["vertices_without_surfels"] = surfels_to_vertices(mesh, surfels, binding)
+        return None, "photographed colour, light included"
+    found = decouple(
+        work.capture,
+        mesh,
+        replace(work.settings.decoupling, seconds=work.seconds(SHARE_OF_MATERIALS) or 0.0),
+        lambda at: work.tell(Progress("materials", 0.7 + 0.3 * at.part, len(surfels), at.psnr)),
+        work.cancelled,
+        work.file("materials"),
+    )
+    # Without the clock: the same run gives the same bytes.
+    report["decoupling"] = {key: value for key, value in found.report.items() if key != "seconds"}
+    corners, share = mesh.faces[binding.face], binding.barycentric
+    for name in ("albedo", "roughness", "metallic"):
+        values = getattr(found, name)
+        setattr(mesh, name, values)
+        blended = np.einsum("nk,nk...->n...", share, values[corners])
+        setattr(surfels, name, np.clip(blended, 0, 1).astype(np.float32))
+    return Environment(found.environment), "pulled apart from the light"
+
+
+def _kept(gaussians: Gaussians, visible: Array) -> Surfels:
+    """Surfels that can be seen."""
+    surfels = gaussians.surfels()
+    rows = {name: getattr(surfels, name)[visible] for name in Surfels.__dataclass_fields__ if name != "extras"}
+    return Surfels(**rows)
+
+
+def _rows(binding: Binding, keep: Array) -> Binding:
+    return Binding(*(getattr(binding, name)[keep] for name in Binding.__dataclass_fields__))
+
+
+def _drawn(gaussians: Gaussians, view: View, capture: Capture) -> Array:
+    """(h, w, 3) sRGB in 0..1."""
+    with torch.no_grad():
+        look = gaussians.look(view.camera, torch.tensor(background_of(capture), dtype=torch.float32))
+    return np.clip(look.colour.numpy(), 0, 1)
+
+
+def preview(gaussians: Gaussians, capture: Capture) -> Array:
+    """A view, left out if there is one, beside its photograph: (h, 2 w, 3) sRGB."""
+    view = (capture.testing or capture.training)[0]
+    return np.concatenate([_drawn(gaussians, view, capture), composed(view, capture)], axis=1)
+
+
+def judge(gaussians: Gaussians, capture: Capture) -> dict[str, float]:
+    """ "psnr" (batched: of the mean squared error over all views, whole pictures) and "ssim" of the views left out."""
+    if not capture.testing:
+        return {}
+    errors, similar = [], []
+    for view in capture.testing:
+        drawn, truth = _drawn(gaussians, view, capture), composed(view, capture)
+        errors.append(float(np.square(drawn - truth).mean()))
+        similar.append(structural_similarity(drawn, Photograph.of(truth)))
+    return {"psnr": -10 * float(np.log10(max(float(np.mean(errors)), 1e-10))), "ssim": float(np.mean(similar))}

@@ -1,0 +1,169 @@
+"""Captures of every layout, recognised by what lies in the folder."""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ...errors import AssetError, UsageError
+from ...formats.axes import UP_AXES
+from ..capture import Capture
+from . import colmap, llff, nero, tensoir, transforms
+from .develop import develop, find_background
+from .layout import Layout
+from .lens import Lens
+from .world import AXES, check_places, check_silhouettes, turn_upright
+
+logger = logging.getLogger(__name__)
+
+__all__ = ["AXES", "LAYOUTS", "Reader", "read_capture"]
+
+
+@dataclass(frozen=True, slots=True)
+class Reader:
+    """A layout of captures: its name, how it is recognised, how it is read, one line of documentation.
+
+    ``read`` of a layout with ``lights``, which holds pictures under several, takes the name of one of them as well.
+    """
+
+    name: str
+    sniff: Callable[[Path], bool]
+    read: Callable[..., Layout]
+    about: str
+    lights: bool = False
+
+
+#: The table; the first that recognises a path reads it.
+LAYOUTS = (
+    Reader("transforms", transforms.sniff, transforms.read, "transforms*.json of NeRF-synthetic, NGP, nerfstudio"),
+    Reader("NeRO", nero.sniff, nero.read, "GlossySynthetic: k.png, k-depth.png, k-camera.pkl"),
+    Reader("TensoIR", tensoir.sniff, tensoir.read, "train_000/{metadata.json, rgba_LIGHT.png} ...", lights=True),
+    Reader("COLMAP", colmap.sniff, colmap.read, "sparse/0 with cameras and images, text or binary, beside images"),
+    Reader("LLFF", llff.sniff, llff.read, "poses_bounds.npy beside images"),
+)
+#: Bytes that are kept of every pixel (colour, mask) and taken on the way (a photograph while it is developed).
+_BYTES_A_PIXEL = 16
+
+
+def read_capture(
+    path: str | Path,
+    resolution: int | None = None,
+    test_every: int | None = None,
+    axes: str = "opengl",
+    up: str | None = None,
+    light: str | None = None,
+) -> Capture:
+    """Read calibrated photographs of one object.
+
+    Parameters
+    ----------
+    path : a folder of any layout of `LAYOUTS`, or its transforms.json
+    resolution : pixels of the longer side at most; None keeps the photographs' size
+    test_every : leave out every so many views, from the first in the order of their names; where the capture itself
+        says which views are left out, that counts instead
+    axes : what the matrices of a file are taken for, a key of `AXES`; "opengl" is each layout's own convention
+    up : the world's up axis, a key of `formats.axes.UP_AXES`; None: as the layout prescribes, else found from the
+        cameras, which people hold level
+    light : which pictures to read where a layout has every view under several lights
+
+    Returns
+    -------
+    Capture
+        Lenses straightened, Z up. Pictures with alpha are laid on white. Black photographs are left out with a warning.
+
+    Raises
+    ------
+    AssetError
+        Naming the file: nothing is recognised, images are missing or of another shape than their mask or calibration,
+        fewer than two cameras, cameras whose silhouettes do not meet.
+    UsageError
+        A parameter out of range, or more pixels than the memory holds.
+    """
+    path = Path(path)
+    _check_parameters(resolution, test_every, axes, up)
+    reader = find_layout(path)
+    layout = reader.read(path, light) if reader.lights else reader.read(path)
+    photographs = sorted(layout.photographs, key=lambda photograph: _natural(photograph.name))
+    matrices = np.stack([AXES[axes](photograph.matrix) for photograph in photographs])
+    check_places(matrices, str(path))
+    turn = _turn(layout, matrices, axes, up)
+    for photograph, matrix in zip(photographs, matrices):
+        photograph.matrix = turn @ matrix
+    _check_memory(layout, resolution, path)
+    known: dict[Lens, tuple[Lens, np.ndarray]] = {}
+    developed = [(p.image, develop(p, layout, resolution, known)) for p in photographs]
+    views = [view for _, view in developed if view is not None]
+    if black := [image.name for image, view in developed if view is None]:
+        named = ", ".join(black[:3]) + (", ..." if len(black) > 3 else "")
+        if len(views) < max(2, len(black)):
+            raise AssetError(str(path), f"has {len(black)} black images ({named})", "Export the photographs again")
+        logger.warning("%s: %d black images are left out: %s", path, len(black), named)
+    if all(view.mask is None or view.mask.min() >= 1 for view in views):  # an alpha channel that says nothing
+        for view in views:
+            view.mask = None
+    if not layout.split and test_every is not None:
+        for index, view in enumerate(views):
+            view.test = index % test_every == 0
+    check_silhouettes([view for view in views if not view.test], str(path), axes)
+    points = None if layout.points is None else (layout.points @ turn[:3, :3].T).astype(np.float32)
+    return Capture(path, views, find_background(views), points)
+
+
+def find_layout(path: Path) -> Reader:
+    """The layout of the capture at `path`. Raises AssetError, listing what is understood."""
+    understood = "Understood: " + "; ".join(f"{reader.name} ({reader.about})" for reader in LAYOUTS)
+    if not path.exists():
+        raise AssetError(str(path), "does not exist", "Check the path")
+    for reader in LAYOUTS:
+        if reader.sniff(path):
+            return reader
+    raise AssetError(str(path), "is no capture", understood)
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    """Sorting key by which r_2 comes before r_10."""
+    return [(int(part or -1), text) for text, part in re.findall(r"(\D*)(\d*)", name)]
+
+
+def _check_parameters(resolution: int | None, test_every: int | None, axes: str, up: str | None) -> None:
+    if resolution is not None and resolution < 8:
+        raise UsageError("resolution", f"is {resolution} pixels", "Choose at least 8")
+    if test_every is not None and test_every < 2:
+        raise UsageError("test-every", f"is {test_every}, which leaves nothing to learn from", "Choose at least 2")
+    if axes not in AXES:
+        raise UsageError("axes", f"is {axes!r}", f"Choose from {', '.join(AXES)}")
+    if up is not None and up not in UP_AXES:
+        raise UsageError("up", f"is {up!r}", f"Choose from {', '.join(UP_AXES)}")
+
+
+def _turn(layout: Layout, matrices: np.ndarray, axes: str, up: str | None) -> np.ndarray:
+    """(4, 4) rotation of the capture's world to Z up."""
+    turn = np.eye(4)
+    if up is not None:
+        turn[:3, :3] = UP_AXES[up]
+    elif not layout.upright:
+        turn[:3, :3] = turn_upright(matrices)
+    return turn
+
+
+def _check_memory(layout: Layout, resolution: int | None, path: Path) -> None:
+    """Raise UsageError where the pixels of all views would not fit in half of the memory."""
+    if not hasattr(os, "sysconf"):
+        return
+    pixels = 0.0
+    for photograph in layout.photographs:
+        width, height = photograph.lens.width, photograph.lens.height
+        factor = 1.0 if resolution is None else min(1.0, resolution / max(width, height))
+        pixels += width * height * factor**2
+    needed, memory = pixels * _BYTES_A_PIXEL, os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if needed > memory / 2:
+        largest = max(max(p.lens.width, p.lens.height) for p in layout.photographs)
+        fitting = int((resolution or largest) * (memory / 2 / needed) ** 0.5)
+        problem = f"is {needed / 2**30:.0f} GiB of pixels, this machine has {memory / 2**30:.0f} GiB of memory"
+        raise UsageError(str(path), problem, f"Give --resolution {fitting} or less")

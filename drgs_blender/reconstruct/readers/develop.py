@@ -1,0 +1,122 @@
+"""Photographs to views: decoded, straightened, scaled down, laid on one background."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+from PIL import Image
+
+from ...colour import to_unit
+from ...errors import AssetError
+from ...formats.images import load_image
+from ...frame import Camera
+from ..capture import View
+from .layout import Layout, Photograph
+from .lens import Lens, resample, undistorted
+
+Array = np.ndarray
+logger = logging.getLogger(__name__)
+
+#: What pictures with alpha are laid on, sRGB; the published figures are measured on white.
+WHITE = (1.0, 1.0, 1.0)
+#: Pixels darker than this everywhere are no photograph.
+_BLACK = 0.02
+#: How much the surroundings may vary, and how much of the pixels must be surroundings, to be called one colour.
+_PLAIN, _ENOUGH = 0.01, 0.05
+
+
+def develop(
+    photograph: Photograph, layout: Layout, resolution: int | None, known: dict[Lens, tuple[Lens, Array]]
+) -> View | None:
+    """Read one photograph; None where it is black.
+
+    Parameters
+    ----------
+    resolution : pixels of the longer side at most; None keeps the size
+    known : what `undistorted` says of lenses that distort, filled as they are met
+
+    Raises
+    ------
+    AssetError
+        The file cannot be decoded; photograph, mask and calibration have different shapes.
+    """
+    subject = str(photograph.image)
+    pixels = to_unit(load_image(photograph.image))
+    height, width = pixels.shape[:2]
+    lens = _fitting(photograph.lens, width, height, subject)
+    mask = _mask(photograph, layout, pixels)
+    if mask is not None and pixels.shape[2] == 4 and photograph.mask is None:
+        # Premultiplied: colours of pixels that are not there must not bleed into those that are.
+        pixels = pixels[..., :3] * mask[..., None]
+        premultiplied = True
+    else:
+        pixels, premultiplied = pixels[..., :3], False
+    layers = pixels if mask is None else np.dstack([pixels, mask])
+    if lens.distorts:
+        if lens not in known:
+            known[lens] = undistorted(lens)
+        lens, positions = known[lens]
+        layers = resample(layers, positions)
+    if resolution is not None and max(width, height) > resolution:
+        factor = resolution / max(width, height)
+        width, height = max(1, round(width * factor)), max(1, round(height * factor))
+        layers = shrink(layers, width, height)
+        lens = lens.scaled(width, height)
+    colour = layers[..., :3]
+    mask = np.clip(layers[..., 3], 0, 1) if mask is not None else None
+    if colour.max(initial=0.0) < _BLACK and (mask is None or mask.any()):
+        return None
+    if premultiplied:
+        assert mask is not None
+        colour = colour + (1 - mask[..., None]) * np.asarray(WHITE, np.float32)
+    camera = Camera(photograph.matrix, width, height, lens.fx, lens.fy, lens.cx, lens.cy)
+    colour = np.ascontiguousarray(np.clip(colour, 0, 1), np.float32)
+    mask = None if mask is None else np.ascontiguousarray(mask, np.float32)
+    return View(photograph.name, camera, colour, mask, photograph.test)
+
+
+def _fitting(lens: Lens, width: int, height: int, subject: str) -> Lens:
+    """The lens for a picture of this size, when it is the calibrated one made smaller or larger."""
+    if (lens.width, lens.height) == (width, height):
+        return lens
+    x, y = width / lens.width, height / lens.height
+    if abs(x - y) * max(lens.width, lens.height) > 2:
+        problem = f"is {width} x {height} pixels, but its camera was calibrated for {lens.width} x {lens.height}"
+        raise AssetError(subject, problem, "Use the photographs that were calibrated, or calibrate these")
+    return lens.scaled(width, height)
+
+
+def _mask(photograph: Photograph, layout: Layout, pixels: Array) -> Array | None:
+    """(h, w) float32 of a mask file, or of the photograph's own alpha."""
+    if photograph.mask is None:
+        return pixels[..., 3] if pixels.shape[2] == 4 else None
+    mask = layout.decode_mask(photograph.mask)
+    if mask.shape != pixels.shape[:2]:
+        (h, w), (height, width) = mask.shape, pixels.shape[:2]
+        if abs(w / width - h / height) * max(width, height) > 2:
+            problem = f"is {w} x {h} pixels, its photograph {photograph.image.name} {width} x {height}"
+            raise AssetError(str(photograph.mask), problem, "Make the mask again from this photograph")
+        mask = np.asarray(Image.fromarray(mask).resize((width, height), Image.Resampling.BILINEAR))
+    return mask.astype(np.float32)
+
+
+def shrink(layers: Array, width: int, height: int) -> Array:
+    """(h, w, c) float32 to (height, width, c): every pixel the mean of the area it covers."""
+    channels = [
+        np.asarray(Image.fromarray(np.ascontiguousarray(layers[..., c])).resize((width, height), Image.Resampling.BOX))
+        for c in range(layers.shape[2])
+    ]
+    return np.stack(channels, axis=-1)
+
+
+def find_background(views: list[View]) -> tuple[float, float, float] | None:
+    """The one colour outside of all masks; None where the surroundings are real, or there are none."""
+    outside = [view.colour[view.mask < 0.004] for view in views if view.mask is not None]
+    if len(outside) < len(views) or not outside:
+        return None
+    pixels = np.concatenate([part[:: max(1, len(part) // 4096)] for part in outside])
+    if len(pixels) < _ENOUGH * 4096 or pixels.std(axis=0).max() > _PLAIN:
+        return None
+    r, g, b = (round(255 * float(c)) / 255 for c in pixels.mean(axis=0, dtype=np.float64))
+    return r, g, b

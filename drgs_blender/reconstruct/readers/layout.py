@@ -1,0 +1,159 @@
+"""What every reader of captures returns: where the photographs are, and what is known about each."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from ...colour import to_unit
+from ...errors import AssetError
+from ...formats.images import load_image
+from .lens import Lens
+
+Array = np.ndarray
+
+#: Camera axes: OpenCV's (x right, y down, z forward) to Blender's and OpenGL's (y up, z backward), applied from the
+#: right to a camera-to-world matrix.
+OPENCV_TO_BLENDER = np.diag([1.0, -1.0, -1.0, 1.0])
+#: Extensions of photographs, in the order in which they are looked for.
+PICTURES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG", ".JPEG", ".webp", ".tif", ".tiff", ".bmp")
+#: Bytes of a JSON file; 10,000 frames take about 10 MB.
+LARGEST_JSON = 256 << 20
+
+
+def decode_mask(path: Path) -> Array:
+    """(h, w) float32 in 0..1 of a mask file: alpha where it has one that says something, else brightness."""
+    pixels = to_unit(load_image(path))
+    if pixels.shape[2] == 4 and pixels[..., 3].min() < 1:
+        return pixels[..., 3]
+    return pixels[..., :3].mean(axis=-1)
+
+
+@dataclass(slots=True)
+class Photograph:
+    """One photograph, not yet read.
+
+    Attributes
+    ----------
+    name : unique
+    image : file
+    matrix : (4, 4) float64 camera-to-world, rigid, Blender's camera convention, world of the capture
+    lens : calibrated for a picture that may have another size than `image`, not another shape
+    mask : file, or None
+    test : left out of training by whoever made the capture
+    """
+
+    name: str
+    image: Path
+    matrix: Array
+    lens: Lens
+    mask: Path | None = None
+    test: bool = False
+
+
+@dataclass(slots=True)
+class Layout:
+    """A capture, not yet read.
+
+    Attributes
+    ----------
+    photographs : at least one
+    upright : the world is known to be Z up; else "up" is found from the cameras
+    split : `Photograph.test` says which are left out
+    points : (n, 3) float64 sparse points in the capture's world, or None
+    decode_mask : reads a mask file to (h, w) float32 in 0..1
+    """
+
+    photographs: list[Photograph]
+    upright: bool
+    split: bool = False
+    points: Array | None = None
+    decode_mask: Callable[[Path], Array] = decode_mask
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """The object in a JSON file. Raises AssetError."""
+    try:
+        if path.stat().st_size > LARGEST_JSON:
+            raise AssetError(str(path), f"has {path.stat().st_size >> 20} MiB", "Choose the file of a capture")
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise AssetError(str(path), f"cannot be read ({error.strerror or error})", "Check the path") from error
+    except (ValueError, RecursionError) as error:
+        raise AssetError(str(path), f"is not JSON ({error})", "Export the capture again") from error
+    if not isinstance(data, dict):
+        raise AssetError(str(path), "is not a JSON object", "Export the capture again")
+    return data
+
+
+def rigid(values: Any, subject: str) -> Array:
+    """(4, 4) float64 camera-to-world from numbers in rows, (3, 4) or (4, 4); a common scale is taken out.
+
+    Raises
+    ------
+    AssetError
+        Not such a matrix, or it mirrors or shears.
+    """
+    try:
+        matrix = np.array(values, np.float64)
+    except (TypeError, ValueError):
+        matrix = np.empty(0)
+    if matrix.shape not in ((4, 4), (3, 4)) or not np.isfinite(matrix).all():
+        raise AssetError(subject, "has no camera matrix of 4 rows of 4 finite numbers", "Export the cameras again")
+    matrix = np.vstack([matrix[:3], [0, 0, 0, 1]])
+    rotation = matrix[:3, :3]
+    size = abs(np.linalg.det(rotation)) ** (1 / 3)
+    if size < 1e-9 or not np.allclose(rotation @ rotation.T, size**2 * np.eye(3), atol=2e-2 * size**2):
+        raise AssetError(subject, "has a camera matrix that is no rotation (sheared?)", "Export the cameras again")
+    if np.linalg.det(rotation) < 0:
+        raise AssetError(subject, "has a camera matrix that mirrors", "Export the cameras in a right-handed system")
+    u, _, v = np.linalg.svd(rotation)  # the closest rotation: files often hold few digits
+    matrix[:3, :3] = u @ v
+    return matrix
+
+
+def invert(matrix: Array) -> Array:
+    """Inverse of a rigid (4, 4) matrix."""
+    out = np.eye(4)
+    out[:3, :3] = matrix[:3, :3].T
+    out[:3, 3] = -matrix[:3, :3].T @ matrix[:3, 3]
+    return out
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """(width, height) from the header of an image file. Raises AssetError."""
+    try:
+        with Image.open(path) as image:
+            return image.size
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise AssetError(str(path), f"is no image that can be read ({error})", "Convert it to PNG or JPEG") from error
+
+
+def find_picture(stem: Path) -> Path | None:
+    """The image file `stem`, with its extension or without; None where there is none."""
+    if stem.suffix and stem.is_file():
+        return stem
+    return next((found for end in PICTURES if (found := stem.with_name(stem.name + end)).is_file()), None)
+
+
+def find_mask(folder: Path, image: Path, relative: str = "") -> Path | None:
+    """The mask of `image` in `folder`: the same name, the same stem, or COLMAP's NAME.png."""
+    if not folder.is_dir():
+        return None
+    name = Path(relative or image.name)
+    candidates = [folder / name, folder / f"{name}.png", *(folder / name.with_suffix(end) for end in PICTURES)]
+    return next((found for found in candidates if found.is_file()), None)
+
+
+def complain_of_missing(subject: str, missing: list[str], total: int) -> None:
+    """Raise AssetError where photographs are absent."""
+    if missing:
+        named = ", ".join(missing[:3]) + (", ..." if len(missing) > 3 else "")
+        problem = f"names {len(missing)} of {total} images that are not there: {named}"
+        raise AssetError(subject, problem, "Put the images back, or take their frames out of the file")

@@ -1,0 +1,152 @@
+"""Surfels on the screen, forwards and backwards: what `raster` blends, as functions of centre and tangents.
+
+In camera coordinates (x right, y down, depth along the view) the ray of a pixel at (ex, ey) from the projected centre
+meets the plane c + u a + v b where, by Cramer's rule and with n = a x b, d = c . n,
+
+    1 / z = (1, ex / fx, ey / fy) . (1 / c_z, n_x / d, n_y / d),
+    u = z (ex / fx, ey / fy) . (b x c)_xy / d,    v = z (ex / fx, ey / fy) . (c x a)_xy / d:
+
+nine numbers a surfel, the record. `render.surfels.splats` states the same, unscaled, for planes behind the camera too.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ..jit import njit, prange
+from ..render.camera import CLIP_END, CLIP_START, CX, CY, FX, FY, POSITION
+from ..render.surfels.splats import MIN_ALPHA, span, to_camera
+
+# Columns of a record: projected centre, coefficients of u, v and 1 / z; what follows is not differentiated here.
+RX, RY, UX, UY, VX, VY, I0, IX, IY, OPACITY, CUT, DIM, RECORD = 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12
+#: Columns that have a gradient.
+PARAMETERS = 10
+#: Surfels seen at a smaller cosine are edge-on: not seen at all.
+EDGE_ON = 1e-3
+#: Inverse variance of the screen-space filter, per square pixel: that of pictures with four samples a pixel. What it
+#: shows is weakened by the cosine at which the surfel is seen (without a gradient): the many surfels edge-on along a
+#: silhouette would else widen it by most of a pixel, and the shape would shrink by as much to fit the masks.
+LOW_PASS = 8.0
+
+
+@njit
+def _cross(ax: Any, ay: Any, az: Any, bx: Any, by: Any, bz: Any) -> Any:
+    return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+
+
+@njit
+def _in_camera(p: Any, centre: Any, tangent_u: Any, tangent_v: Any, i: Any) -> Any:
+    """Centre and tangents of surfel i in camera coordinates, float64."""
+    c = to_camera(
+        p,
+        np.float64(centre[i, 0]) - p[POSITION],
+        np.float64(centre[i, 1]) - p[POSITION + 1],
+        np.float64(centre[i, 2]) - p[POSITION + 2],
+    )
+    a = to_camera(p, np.float64(tangent_u[i, 0]), np.float64(tangent_u[i, 1]), np.float64(tangent_u[i, 2]))
+    b = to_camera(p, np.float64(tangent_v[i, 0]), np.float64(tangent_v[i, 1]), np.float64(tangent_v[i, 2]))
+    return c, a, b
+
+
+@njit(parallel=True)
+def project(
+    centre: Any, tangent_u: Any, tangent_v: Any, opacity: Any, p: Any, width: Any, height: Any, record: Any, depth: Any,
+    box: Any,
+) -> None:  # fmt: skip
+    """Fill records, centre depths and boxes; what is not seen, or reaches behind the clip start, has an empty box.
+
+    Parameters
+    ----------
+    p : `render.camera.camera_parameters` of a perspective camera
+    record, depth, box : (n, RECORD) float32, (n,) float32, (n, 4) int32 to fill
+    """
+    near, far, fx, fy = p[CLIP_START], p[CLIP_END], p[FX], p[FY]
+    for i in prange(len(centre)):
+        box[i] = 0
+        c, a, b = _in_camera(p, centre, tangent_u, tangent_v, i)
+        alpha = np.float64(opacity[i])
+        total = c[0] + c[1] + c[2] + a[0] + a[1] + a[2] + b[0] + b[1] + b[2] + alpha
+        if not abs(total) < 1e30 or not alpha > MIN_ALPHA:
+            continue
+        cut = 2.0 * np.log(alpha / MIN_ALPHA)
+        reach = np.sqrt(cut * (a[2] * a[2] + b[2] * b[2]))
+        if c[2] - reach <= near or c[2] >= far:
+            continue
+        nx, ny, nz = _cross(a[0], a[1], a[2], b[0], b[1], b[2])
+        d = c[0] * nx + c[1] * ny + c[2] * nz
+        size = np.sqrt((c[0] * c[0] + c[1] * c[1] + c[2] * c[2]) * (nx * nx + ny * ny + nz * nz))
+        if not abs(d) > EDGE_ON * size:
+            continue
+        rx, ry = p[CX] + fx * c[0] / c[2], p[CY] + fy * c[1] / c[2]
+        x, y = c[0] / c[2], c[1] / c[2]
+        lo_x, hi_x = span(fx, rx, c[2], a[0] - x * a[2], b[0] - x * b[2], a[2], b[2], cut)
+        lo_y, hi_y = span(fy, ry, c[2], a[1] - y * a[2], b[1] - y * b[2], a[2], b[2], cut)
+        low = np.sqrt(cut / LOW_PASS)
+        lo_x, hi_x = min(lo_x, rx - low), max(hi_x, rx + low)
+        lo_y, hi_y = min(lo_y, ry - low), max(hi_y, ry + low)
+        if not (lo_x < width and hi_x > 0.0 and lo_y < height and hi_y > 0.0):
+            continue
+        r = record[i]
+        px, py, _ = _cross(b[0], b[1], b[2], c[0], c[1], c[2])
+        qx, qy, _ = _cross(c[0], c[1], c[2], a[0], a[1], a[2])
+        r[RX], r[RY], r[I0], r[OPACITY], r[CUT] = rx, ry, 1.0 / c[2], alpha, cut
+        r[UX], r[UY], r[VX], r[VY] = px / (d * fx), py / (d * fy), qx / (d * fx), qy / (d * fy)
+        r[IX], r[IY], r[DIM] = nx / (d * fx), ny / (d * fy), 2.0 * np.log(size / abs(d))
+        depth[i] = c[2]
+        box[i, 0], box[i, 1] = np.int32(max(lo_x, 0.0)), np.int32(max(lo_y, 0.0))
+        box[i, 2] = np.int32(min(np.floor(hi_x), width - 1.0)) + 1
+        box[i, 3] = np.int32(min(np.floor(hi_y), height - 1.0)) + 1
+
+
+@njit(parallel=True)
+def project_backward(
+    centre: Any, tangent_u: Any, tangent_v: Any, p: Any, index: Any, gradient: Any, g_centre: Any, g_u: Any, g_v: Any
+) -> None:
+    """Gradients of centre and tangents from those of the records.
+
+    Parameters
+    ----------
+    index : (m,) surfel of each row of `gradient` (m, at least PARAMETERS)
+    g_centre, g_u, g_v : (n, 3) float32, world space; rows of surfels that were not seen stay as they are
+    """
+    fx, fy = p[FX], p[FY]
+    for k in prange(len(index)):
+        i = index[k]
+        c, a, b = _in_camera(p, centre, tangent_u, tangent_v, i)
+        g = gradient[k]
+        gx, gy, gi = np.float64(g[RX]), np.float64(g[RY]), np.float64(g[I0])
+        z = c[2]
+        gc = np.array([gx * fx / z, gy * fy / z, -(gx * fx * c[0] + gy * fy * c[1] + gi) / (z * z)])
+        ga, gb = np.zeros(3), np.zeros(3)
+        nx, ny, nz = _cross(a[0], a[1], a[2], b[0], b[1], b[2])
+        d = c[0] * nx + c[1] * ny + c[2] * nz
+        px, py, _ = _cross(b[0], b[1], b[2], c[0], c[1], c[2])
+        qx, qy, _ = _cross(c[0], c[1], c[2], a[0], a[1], a[2])
+        # Gradients of b x c, c x a and a x b, and of d that divides them.
+        ux, uy = g[UX] / (d * fx), g[UY] / (d * fy)
+        vx, vy = g[VX] / (d * fx), g[VY] / (d * fy)
+        ix, iy = g[IX] / (d * fx), g[IY] / (d * fy)
+        gd = -(ux * px + uy * py + vx * qx + vy * qy + ix * nx + iy * ny) / d
+        ix, iy, iz = ix + gd * c[0], iy + gd * c[1], gd * z
+        # g . (s x t) has the gradients t x g and g x s.
+        s = _cross(c[0], c[1], z, ux, uy, 0.0)
+        gb[0], gb[1], gb[2] = gb[0] + s[0], gb[1] + s[1], gb[2] + s[2]
+        s = _cross(ux, uy, 0.0, b[0], b[1], b[2])
+        gc[0], gc[1], gc[2] = gc[0] + s[0], gc[1] + s[1], gc[2] + s[2]
+        s = _cross(a[0], a[1], a[2], vx, vy, 0.0)
+        gc[0], gc[1], gc[2] = gc[0] + s[0], gc[1] + s[1], gc[2] + s[2]
+        s = _cross(vx, vy, 0.0, c[0], c[1], z)
+        ga[0], ga[1], ga[2] = ga[0] + s[0], ga[1] + s[1], ga[2] + s[2]
+        s = _cross(b[0], b[1], b[2], ix, iy, iz)
+        ga[0], ga[1], ga[2] = ga[0] + s[0], ga[1] + s[1], ga[2] + s[2]
+        s = _cross(ix, iy, iz, a[0], a[1], a[2])
+        gb[0], gb[1], gb[2] = gb[0] + s[0], gb[1] + s[1], gb[2] + s[2]
+        gc[0], gc[1], gc[2] = gc[0] + gd * nx, gc[1] + gd * ny, gc[2] + gd * nz
+        for axis in range(3):
+            # Camera to world: x right, y down, depth forward are columns 0, -1, -2 of the camera's matrix.
+            x, y, w = p[3 * axis], -p[3 * axis + 1], -p[3 * axis + 2]
+            g_centre[i, axis] = x * gc[0] + y * gc[1] + w * gc[2]
+            g_u[i, axis] = x * ga[0] + y * ga[1] + w * ga[2]
+            g_v[i, axis] = x * gb[0] + y * gb[1] + w * gb[2]

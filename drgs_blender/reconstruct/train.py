@@ -1,0 +1,252 @@
+"""Stage (i): surfels optimised until they look like the photographs and lie on one surface.
+
+Each step renders one view. The loss is L1 and SSIM of the picture, the mask, distortion and the agreement of the
+surfels' normals with those of the depth map (Huang et al. 2024, "2D Gaussian Splatting"), the last two once shape has
+begun to form. The first part runs at half size, where a step costs a quarter.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..arrays import Array
+from .adam import Adam
+from .capture import Capture
+from .density import densify
+from .gaussians import Gaussians, Look
+from .hull import Region, colours_of
+from .photometric import difference
+from .raster import Tally
+from .targets import Target, background_of, targets
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Schedule:
+    """How surfels are learned.
+
+    Attributes
+    ----------
+    iterations : steps, one view each
+    surfels : how many there are at the end of densification
+    coarse : part of the steps that is done at half size
+    densify : parts of the steps between which surfels are cut; `rounds` times
+    shape : part of the steps after which distortion and normals count
+    mask, distortion, consistency : weights of the losses
+    mirrors : part of the steps after which reflections are learned; 1 never
+    bands : highest band of the colour's harmonics
+    """
+
+    iterations: int = 3000
+    surfels: int = 16000
+    coarse: float = 0.3
+    densify: tuple[float, float] = (0.08, 0.6)
+    rounds: int = 16
+    shape: float = 0.15
+    mask: float = 0.1
+    distortion: float = 1.0
+    consistency: float = 0.25
+    mirrors: float = 0.1
+    bands: int = 2
+    seed: int = 0
+
+    def on_mesh(self, part: float) -> Schedule:
+        """For surfels that have their place: `part` of the steps, in full size, and no more surfels."""
+        return replace(
+            self, iterations=max(int(part * self.iterations), 1), coarse=0.0, rounds=0, shape=0.0, mirrors=0.0
+        )
+
+
+#: Learning rates at the start, and what is left of them at the end; of centres a part of the object's radius.
+RATES = {"centre": (1.5e-3, 0.01), "scale": (8e-3, 0.2), "rotation": (4e-3, 0.2), "opacity": (4e-2, 0.3)}
+RATES |= {"tint": (6e-2, 0.2), "blur": (6e-2, 0.2)}
+LIGHT_RATE = (4e-2, 0.1)
+COLOUR_RATE, HIGHER_BANDS = (2e-2, 0.1), 0.1
+
+
+class Training:
+    """The state of stage (i), one `step` at a time.
+
+    Parameters
+    ----------
+    capture : its training views are learned from
+    region : where the object is
+    schedule : how
+    gaussians : to go on with; None starts on the region's first surface
+    seconds : where the steps would take longer, the schedule runs by the clock
+    """
+
+    def __init__(
+        self,
+        capture: Capture,
+        region: Region,
+        schedule: Schedule,
+        gaussians: Gaussians | None = None,
+        seconds: float | None = None,
+    ) -> None:
+        self.schedule, self.region, self.limit = schedule, region, seconds
+        self.targets = targets(capture)
+        self.background = torch.tensor(background_of(capture), dtype=torch.float32)
+        if gaussians is None:
+            gaussians = _first(capture, region, schedule)
+        self.gaussians = gaussians
+        self.start = len(gaussians)
+        self.optimiser = Adam(gaussians.parameters)
+        self.light = Adam({} if gaussians.light is None else {"light": gaussians.light})
+        self.tally = Tally.of(len(gaussians))
+        self.iteration, self.seconds, self.rounds = 0, 0.0, 0
+        self.error = 0.0  # running mean of the squared error
+
+    @property
+    def part(self) -> float:
+        """What is done of the schedule, 0..1."""
+        by_steps = self.iteration / self.schedule.iterations
+        return min(max(by_steps, self.seconds / self.limit if self.limit else 0.0), 1.0)
+
+    @property
+    def finished(self) -> bool:
+        """Nothing is left to do."""
+        return self.part >= 1
+
+    def step(self) -> None:
+        """One view."""
+        started = time.monotonic()
+        schedule, part = self.schedule, self.part
+        target = self._next()
+        bands = min(schedule.bands, int(part * 8))
+        growing = part < schedule.densify[1]
+        mirrors = part >= schedule.mirrors < 1
+        tally = self.tally if growing else None
+        look = self.gaussians.look(target.camera, self.background, bands, tally, target.rays, mirrors)
+        loss = self._loss(look, target, part)
+        loss.backward()
+        self.optimiser.step(self.gaussians.parameters, self._rates(part))
+        if self.gaussians.light is not None:
+            self.light.step({"light": self.gaussians.light}, {"light": LIGHT_RATE[0] * LIGHT_RATE[1] ** part})
+        drawn = np.clip(look.colour.detach().numpy(), 0, 1)
+        squared = float(np.square(drawn - target.photograph.colour).mean())
+        self.error = squared if not self.iteration else 0.98 * self.error + 0.02 * squared
+        self.iteration += 1
+        self._maybe_densify()
+        self.seconds += time.monotonic() - started
+
+    @property
+    def psnr(self) -> float:
+        """Of the latest training views, decibels."""
+        return -10 * float(np.log10(max(self.error, 1e-10)))
+
+    def _next(self) -> Target:
+        """The view of this step: all in turn, in an order drawn anew each time."""
+        scale = 1 if self.part < self.schedule.coarse else 0
+        views = self.targets[scale]
+        turn, place = divmod(self.iteration, len(views))
+        return views[np.random.default_rng([self.schedule.seed, turn]).permutation(len(views))[place]]
+
+    def _loss(self, look: Look, target: Target, part: float) -> Tensor:
+        schedule = self.schedule
+        loss = difference(look.colour, target.photograph)
+        if target.mask is not None:
+            loss = loss + schedule.mask * (look.maps.alpha - target.mask).abs().mean()
+        if part >= schedule.shape:
+            if schedule.distortion:
+                loss = loss + schedule.distortion / self.region.radius**2 * look.maps.distortion.mean()
+            if schedule.consistency:
+                loss = loss + schedule.consistency * normal_disagreement(look, target)
+        return loss
+
+    def _rates(self, part: float) -> dict[str, float | Array]:
+        rates: dict[str, float | Array] = {k: first * rest**part for k, (first, rest) in RATES.items()}
+        rates["centre"] = float(rates["centre"]) * self.region.radius
+        rates["offset"] = RATES["centre"][0] * RATES["centre"][1] ** part * 30
+        colour = COLOUR_RATE[0] * COLOUR_RATE[1] ** part
+        count = self.gaussians.parameters["sh"].shape[1]
+        rates["sh"] = np.repeat(np.where(np.arange(count) == 0, colour, HIGHER_BANDS * colour), 3)
+        return rates
+
+    def _maybe_densify(self) -> None:
+        schedule = self.schedule
+        begin, end = schedule.densify
+        grown = min(max((self.part - begin) / (end - begin), 0.0), 1.0)
+        due = int(grown * schedule.rounds)
+        if due <= self.rounds:
+            return
+        self.rounds = due
+        budget = int(self.start + (schedule.surfels - self.start) * grown)
+        self.gaussians, report = densify(
+            self.gaussians, self.optimiser, self.tally, budget, 0.5 * self.region.radius, 1e-3 * self.region.radius
+        )
+        self.tally = Tally.of(len(self.gaussians))
+        log.debug("step %d: %d surfels, %s", self.iteration, len(self.gaussians), report)
+
+    def arrays(self) -> dict[str, Array]:
+        """All that `restore` needs to go on bit for bit."""
+        state = {f"value.{k}": v for k, v in self.gaussians.arrays().items()}
+        state |= {f"first.{k}": v for k, v in self.optimiser.first.items()}
+        state |= {f"second.{k}": v for k, v in self.optimiser.second.items()}
+        if self.gaussians.light is not None:
+            state |= {"light": self.gaussians.light.detach().numpy(), "light.first": self.light.first["light"]}
+            state["light.second"] = self.light.second["light"]
+        state |= {"travel": self.tally.travel, "views": self.tally.views}
+        state["counts"] = np.array(
+            [self.iteration, self.optimiser.steps, self.start, self.rounds, self.light.steps], np.int64
+        )
+        state["numbers"] = np.array([self.error, self.seconds])
+        return state
+
+    def restore(self, state: dict[str, Array]) -> None:
+        """Go on from what `arrays` returned."""
+        part = lambda name: {  # noqa: E731
+            k.removeprefix(name): np.array(v) for k, v in state.items() if k.startswith(name)
+        }
+        if self.gaussians.light is not None:
+            self.gaussians.light = torch.from_numpy(np.array(state["light"])).requires_grad_(True)
+            self.light.first = {"light": np.array(state["light.first"])}
+            self.light.second = {"light": np.array(state["light.second"])}
+        self.gaussians = self.gaussians.like({k: torch.from_numpy(v) for k, v in part("value.").items()})
+        self.optimiser.first, self.optimiser.second = part("first."), part("second.")
+        self.tally = Tally(np.array(state["travel"]), np.array(state["views"]))
+        self.iteration, self.optimiser.steps, self.start, self.rounds, self.light.steps = map(int, state["counts"])
+        self.error, self.seconds = (float(x) for x in state["numbers"])
+
+
+def _first(capture: Capture, region: Region, schedule: Schedule) -> Gaussians:
+    """Surfels on the first surface, no more than half of the schedule's."""
+    points, normals, most = region.points, region.normals, max(schedule.surfels // 2, 1)
+    spacing = region.spacing
+    if len(points) > most:
+        kept = np.sort(np.random.default_rng(schedule.seed).choice(len(points), most, replace=False))
+        spacing *= (len(points) / most) ** 0.5
+        points, normals = points[kept], normals[kept]
+    return Gaussians.on_surface(
+        points, normals, colours_of(points, normals, capture.training), 0.6 * spacing, schedule.bands
+    )
+
+
+def depth_normals(depth: Tensor, eye: Tensor, rays: Tensor) -> Tensor:
+    """Normals (h - 2, w - 2, 3) of a depth map (h, w) by central differences, towards the viewer, not normalised.
+
+    Parameters
+    ----------
+    rays : (h, w, 3) of unit depth, from `eye` (3,)
+    """
+    points = eye + depth[..., None] * rays
+    across, down = points[1:-1, 2:] - points[1:-1, :-2], points[2:, 1:-1] - points[:-2, 1:-1]
+    return torch.linalg.cross(down, across)
+
+
+def normal_disagreement(look: Look, target: Target) -> Tensor:
+    """Mean over the picture of alpha (1 - cosine) between blended normals and those of the mean depth."""
+    alpha = look.maps.alpha
+    depth = look.maps.depth / alpha.clamp(min=1e-3)
+    eye = torch.as_tensor(np.asarray(target.camera.matrix_world)[:3, 3], dtype=torch.float32)
+    slope = torch.nn.functional.normalize(depth_normals(depth, eye, target.rays), dim=-1)
+    inner = alpha.detach()[1:-1, 1:-1]
+    covered = torch.where(inner > 0.5, inner, torch.zeros_like(inner))
+    return (covered - (slope * look.normal[1:-1, 1:-1]).sum(-1) * (covered > 0)).clamp(min=0).mean()
