@@ -104,6 +104,12 @@ class Mesh:
         self.roughness = as_float(self.roughness, (n,), "mesh roughness")
         self.metallic = as_float(self.metallic, (n,), "mesh metallic")
 
+    @classmethod
+    def empty(cls) -> Mesh:
+        """No mesh: of surfels that follow their object's matrix alone."""
+        vertices, numbers = np.empty((0, 3), np.float32), np.empty(0, np.float32)
+        return cls(vertices, np.empty((0, 3), np.int32), vertices, numbers, numbers)
+
 
 @dataclass(slots=True)
 class Binding:
@@ -149,8 +155,8 @@ class Environment:
 class Asset:
     """Everything that does not change during an animation.
 
-    ``binding`` is None only until the surfels are bound. ``provenance`` is JSON-able: where each part came from,
-    conversions done, counts dropped.
+    ``binding`` is None only until the surfels are bound, and where the mesh has no faces. ``provenance`` is JSON-able:
+    where each part came from, conversions done, counts dropped.
     """
 
     surfels: Surfels

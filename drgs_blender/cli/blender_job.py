@@ -32,8 +32,7 @@ def main() -> None:
     try:
         do(job, reader, writer)
     finally:
-        if job["repository"]:  # the parent made it, and may have been killed
-            shutil.rmtree(job["repository"], ignore_errors=True)
+        shutil.rmtree(job["folder"], ignore_errors=True)  # the parent made it, and may have been killed
 
 
 def do(job: dict[str, Any], reader: io.FileIO, writer: io.FileIO) -> None:
@@ -46,7 +45,7 @@ def do(job: dict[str, Any], reader: io.FileIO, writer: io.FileIO) -> None:
     link.send(protocol.Hello(protocol.PROTOCOL, version, os.getpid()))
     threading.Thread(target=say_alive, args=(link, protocol), daemon=True).start()
     try:
-        render_frames(Exporter(link, package), job)
+        render_frames(Exporter(link, package, job["passes"]), job)
         link.send(protocol.Shutdown())
     except errors.DrgsError as error:
         link.send(protocol.Failed(0, type(error).__name__, error.subject, error.problem, error.remedy))
@@ -113,8 +112,8 @@ def enable_extension(repository: str | None) -> str:
 class Exporter:
     """Sends evaluated frames over the link and waits until the parent has dealt with each."""
 
-    def __init__(self, link: Any, package: str) -> None:
-        self.link = link
+    def __init__(self, link: Any, package: str, passes: list[str] | None) -> None:
+        self.link, self.passes = link, tuple(passes) if passes else None
         self.protocol = importlib.import_module(f"{package}.drgs_blender.engine.protocol")
         self.errors = importlib.import_module(f"{package}.drgs_blender.errors")
         self.export_frame = importlib.import_module(f"{package}.addon.export").export_frame
@@ -142,20 +141,57 @@ class Exporter:
             raise ParentGone
         return answer[0]
 
-    def send(self, depsgraph: Any) -> None:
-        """Describe the evaluated view layer."""
+    def more(self) -> list[int]:
+        """Further frames from the parent, none when it has no more."""
+        answer = self.ask(self.protocol.Render(0, {}, {}))
+        return answer.frame["frames"] if isinstance(answer, self.protocol.Render) else []
+
+    def send(self, depsgraph: Any, frame_set: Any) -> None:
+        """Describe the evaluated view layer; `frame_set` evaluates it at another frame."""
         warnings: list[str] = []
-        frame, arrays = self.encode_frame(self.export_frame(depsgraph, self.key_of, warnings.append))
-        scene, layers = depsgraph.scene, [layer for layer in depsgraph.scene.view_layers if layer.use]
+        number = depsgraph.scene.frame_current
+        described = self.export_frame(depsgraph, self.key_of, warnings.append, frame_set=frame_set, passes=self.passes)
+        frame, arrays = self.encode_frame(described)
+        layers = [layer for layer in depsgraph.scene.view_layers if layer.use]
         slots, changed = self.sent.changes(arrays)
         self.requests += 1
         description = {
-            "number": scene.frame_current,
+            "number": number,
             "layer": depsgraph.view_layer.name if len(layers) > 1 else "",
             "warnings": warnings,
             "frame": frame,
         }
         self.ask(self.protocol.Render(self.requests, description, slots), changed)
+
+
+def outside_files() -> list[tuple[str, str]]:
+    """What the open file refers to outside of itself, as stored and as found here."""
+    import bpy
+
+    stored = bpy.utils.blend_paths(absolute=False, packed=False, local=False)
+    found = bpy.utils.blend_paths(absolute=True, packed=False, local=False)
+    return sorted(set(zip(stored, found)))
+
+
+def differences(scene: Any) -> list[str]:
+    """What the file asks for and a batch render does without."""
+    import bpy
+
+    notes = []
+    if bpy.data.version[:2] > bpy.app.version[:2]:
+        saved, here = (".".join(map(str, version[:2])) for version in (bpy.data.version, bpy.app.version))
+        notes.append(f"The file was saved by Blender {saved}, this is Blender {here}")
+    if bpy.app.autoexec_fail:
+        notes.append(f"The file has scripts that do not run without --enable-scripts ({bpy.app.autoexec_fail_message})")
+    if bpy.app.version >= (5, 0, 0):
+        composited, strips = scene.compositing_node_group is not None, "strips_all"
+    else:
+        composited, strips = scene.use_nodes and scene.node_tree is not None, "sequences_all"
+    if scene.render.use_compositing and composited:
+        notes.append("The compositor is not run; give it the finished frames")
+    if scene.render.use_sequencer and scene.sequence_editor and len(getattr(scene.sequence_editor, strips)):
+        notes.append("The sequencer is not run; give it the finished frames")
+    return notes
 
 
 def render_frames(exporter: Exporter, job: dict[str, Any]) -> None:
@@ -172,10 +208,13 @@ def render_frames(exporter: Exporter, job: dict[str, Any]) -> None:
         def render(self, depsgraph: Any) -> None:
             try:
                 if exporter.error is None:
-                    exporter.send(depsgraph)
+                    exporter.send(depsgraph, self.evaluate)
             except Exception as error:
                 # Blender prints and forgets what is raised here; it is raised again below.
                 exporter.error = error
+
+        def evaluate(self, frame: int, subframe: float) -> None:
+            self.frame_set(frame, subframe=subframe)
 
     try:
         bpy.ops.wm.open_mainfile(filepath=job["scene"], load_ui=False, use_scripts=job["scripts"])
@@ -185,19 +224,25 @@ def render_frames(exporter: Exporter, job: dict[str, Any]) -> None:
     bpy.utils.register_class(BatchEngine)
     try:
         scene = bpy.context.scene
+        if job.get("report"):
+            about = {"files": outside_files(), "notes": differences(scene)}
+            exporter.ask(exporter.protocol.Render(0, about, {}))
         scene.render.engine = ENGINE
         scene.render.use_compositing = scene.render.use_sequencer = False
         scene.render.use_persistent_data = True
-        if min(job["frames"]) < 0:
-            bpy.context.preferences.edit.use_negative_frames = True  # else Blender stops at 0
-        for number in job["frames"]:
-            scene.frame_current = number
-            if scene.frame_current != number:
-                problem = f"cannot be reached, Blender goes to {scene.frame_current}"
-                raise exporter.errors.UsageError(f"frame {number}", problem, "Choose other frames")
-            bpy.ops.render.render()
-            if exporter.error:
-                raise exporter.error
+        frames = job["frames"]
+        while frames:
+            if min(frames) < 0:
+                bpy.context.preferences.edit.use_negative_frames = True  # else Blender stops at 0
+            for number in frames:
+                scene.frame_current = number
+                if scene.frame_current != number:
+                    problem = f"cannot be reached, Blender goes to {scene.frame_current}"
+                    raise exporter.errors.UsageError(f"frame {number}", problem, "Choose other frames")
+                bpy.ops.render.render()
+                if exporter.error:
+                    raise exporter.error
+            frames = exporter.more() if job.get("keep") else []
     finally:
         bpy.utils.unregister_class(BatchEngine)
 

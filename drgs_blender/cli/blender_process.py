@@ -5,13 +5,14 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
+import os
 import shutil
 import subprocess
 import tempfile
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -43,26 +44,36 @@ class BlenderProcess:
     Parameters
     ----------
     blender : which Blender
-    job : what it should do, JSON-able: ``scene``, ``frames``, ``scripts``
+    job : what it should do, JSON-able: ``scene``, ``frames``, ``scripts``, ``passes``; with ``report`` the attribute
+        of that name has its ``files`` (as stored and as found) and ``notes`` before the first frame comes; with
+        ``keep`` it waits for `more` frames after these
     key_of : gives the engine's key of the asset at a path
+    timeout : seconds that the evaluation of one frame may take, the first with the loading of the file
     """
 
-    def __init__(self, blender: Blender, job: dict[str, Any], key_of: Callable[[Path], str]) -> None:
-        self._blender, self._job, self._key_of = blender, job, key_of
+    def __init__(
+        self, blender: Blender, job: dict[str, Any], key_of: Callable[[Path], str], timeout: float = np.inf
+    ) -> None:
+        self._blender, self._job, self._key_of, self._timeout = blender, job, key_of, timeout
         self._words: deque[str] = deque(maxlen=50)
         self._held = HeldSlots()
         self._ended = threading.Event()
         self._deadline: float | None = None  # set while this side waits
-        self._silent = False
+        self.report: dict[str, Any] = {}  # about the file, when the job asks for it
+        self._latest = np.inf  # when the frame has to be there
+        self._silent = self._late = False
 
     def __enter__(self) -> BlenderProcess:
         self._folder = tempfile.mkdtemp(prefix="drgs-")
         source = extension_source()
         repository = self._repository(source) if source else None
+        temporary = Path(self._folder) / "temp"  # Blender leaves a folder where it is killed
+        temporary.mkdir()
+        environment = os.environ | dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(temporary))
         command = self._blender.command(Path(__file__).with_name("blender_job.py"))
         pipe = subprocess.PIPE
         try:
-            self._process = subprocess.Popen(command, bufsize=0, stdin=pipe, stdout=pipe, stderr=pipe)
+            self._process = subprocess.Popen(command, bufsize=0, stdin=pipe, stdout=pipe, stderr=pipe, env=environment)
         except OSError as error:
             shutil.rmtree(self._folder, ignore_errors=True)
             raise DeviceError(f"Blender at {self._blender.program}", f"does not start ({error})") from error
@@ -71,7 +82,7 @@ class BlenderProcess:
         self._link = Link(self._process.stdout, self._process.stdin, self._hear)  # type: ignore[arg-type]
         threading.Thread(target=self._watch, daemon=True).start()
         try:
-            self._greet(self._job | {"repository": repository})
+            self._greet(self._job | {"repository": repository, "folder": self._folder})
         except BaseException:
             self.__exit__()
             raise
@@ -84,6 +95,16 @@ class BlenderProcess:
         self._listener.join(5)
         shutil.rmtree(self._folder, ignore_errors=True)
 
+    @property
+    def running(self) -> bool:
+        """Whether Blender is there."""
+        return self._process.poll() is None
+
+    def more(self, frames: Sequence[int]) -> Iterator[Evaluated]:
+        """As `frames`, for a Blender that was kept and has finished those it was given before."""
+        self._answer(protocol.Render(0, {"frames": list(frames)}, {}))
+        yield from self.frames()
+
     def frames(self) -> Iterator[Evaluated]:
         """Evaluated view layers in the order of the job; Blender goes on when the next one is asked for.
 
@@ -92,21 +113,29 @@ class BlenderProcess:
         DrgsError
             What Blender's side reports; EngineError when it died.
         """
+        self._latest = time.monotonic() + self._timeout
         while True:
             message, arrays = self._receive()
             if isinstance(message, protocol.Shutdown):
                 return
             if isinstance(message, protocol.LoadAsset):
-                self._link.send(protocol.Loaded(message.id, self._key_of(Path(message.path)), 0, 0))
+                self._answer(protocol.Loaded(message.id, self._key_of(Path(message.path)), 0, 0))
             elif isinstance(message, protocol.Render):
-                yield self._evaluated(message, arrays)
-                self._link.send(protocol.Result(message.id, [], {}))
+                if message.id == 0:  # no frame
+                    if not message.frame:
+                        return  # it waits for more
+                    self.report = message.frame
+                else:
+                    yield self._evaluated(message, arrays)
+                self._latest = time.monotonic() + self._timeout
+                self._answer(protocol.Result(message.id, [], {}))
             else:
                 raise EngineError("Blender", f"sent {type(message).__name__}, which makes no sense here", "Try again")
 
     def _repository(self, source: Path) -> str:
         """A local extension repository that holds this package's own extension, so that both are one version."""
-        target = Path(self._folder) / "drgs"
+        target = Path(self._folder) / "repository" / "drgs"
+        target.parent.mkdir()
         try:
             target.symlink_to(source, target_is_directory=True)
         except OSError as error:
@@ -116,7 +145,7 @@ class BlenderProcess:
                 shutil.copy2(source / part, target / part)
             for part in ("addon", "operators", "drgs_blender"):
                 shutil.copytree(source / part, target / part, ignore=shutil.ignore_patterns("__pycache__"))
-        return self._folder
+        return str(target.parent)
 
     def _greet(self, job: dict[str, Any]) -> None:
         stream = self._process.stdout
@@ -156,6 +185,12 @@ class BlenderProcess:
             raise ERROR_CLASSES.get(message.error, DrgsError)(message.subject, message.problem, message.remedy)
         return received
 
+    def _answer(self, message: Any) -> None:
+        try:
+            self._link.send(message)
+        except OSError as error:  # it died while this side worked
+            raise EngineError("Blender", f"ended before the job: {self._epitaph()}", "Try again") from error
+
     def _evaluated(self, message: protocol.Render, sent: dict[str, np.ndarray]) -> Evaluated:
         arrays, missing = self._held.update(message.slots, sent)
         if missing:
@@ -170,13 +205,15 @@ class BlenderProcess:
     def _watch(self) -> None:
         """End a Blender from which nothing is heard for too long while this side waits."""
         while not self._ended.wait(0.5):
-            deadline = self._deadline
-            if deadline is not None and time.monotonic() > deadline:
-                self._silent = True
+            deadline, now = self._deadline, time.monotonic()
+            if deadline is not None and now > min(deadline, self._latest):
+                self._silent, self._late = now > deadline, now > self._latest
                 self._process.kill()
                 return
 
     def _complain_of_silence(self, seconds: float) -> None:
+        if self._late:
+            raise EngineError("Blender", f"evaluated one frame for more than {self._timeout:g} s", "Raise --timeout")
         if self._silent:
             raise EngineError("Blender", f"did not answer for {seconds:g} s and was ended", "Try again")
 

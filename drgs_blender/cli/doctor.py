@@ -22,6 +22,7 @@ from ..version import __version__
 EXAMPLES = """examples:
   drgs doctor
   drgs doctor --json
+  drgs doctor --node
   DRGS_BLENDER=/opt/blender/blender drgs doctor
 """
 
@@ -44,6 +45,7 @@ class Finding:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of ``drgs doctor``."""
     parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.add_argument("--node", action="store_true", help="as a node of a farm: Blender and extension are needed")
     parser.add_argument(
         "--blender", metavar="PATH", help="blender program, or a Python (or its environment) that has bpy"
     )
@@ -51,7 +53,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Check everything, print what was found."""
-    findings = [check(name, essential, test, args) for name, essential, test in CHECKS]
+    checks = NODE_CHECKS if args.node else CHECKS
+    findings = [check(name, essential, test, args) for name, essential, test in checks]
     healthy = all(finding.state != "missing" for finding in findings)
     if args.json:
         print(json.dumps({"healthy": healthy, "checks": [asdict(finding) for finding in findings]}, indent=2))
@@ -141,6 +144,16 @@ def blender(args: argparse.Namespace) -> str:
     return f"{found.version()}, {found.program} ({found.origin})"
 
 
+def extension(args: argparse.Namespace) -> str:
+    """The extension in that Blender, enabled and greeted as for a render."""
+    from .blender_process import BlenderProcess
+    from .find_blender import extension_source, find_blender
+
+    job = {"scene": "", "frames": [], "scripts": False, "passes": None}
+    with BlenderProcess(find_blender(args.blender), job, str):
+        return f"answers, {extension_source() or 'installed there'}"
+
+
 def scikit_image(args: argparse.Namespace) -> str:
     """scikit-image, which builds the mesh of a capture that has none."""
     from skimage.measure import marching_cubes
@@ -178,3 +191,6 @@ CHECKS: tuple[tuple[str, bool, Callable[[argparse.Namespace], str]], ...] = (
     ("torch", False, torch),
     ("variables", False, variables),
 )
+
+#: Those of a node of a farm: what it renders with has to be there, in one version.
+NODE_CHECKS = (*(c for c in CHECKS if c[2] is not blender), ("Blender", True, blender), ("extension", True, extension))

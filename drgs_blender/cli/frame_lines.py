@@ -13,11 +13,15 @@ PROGRESS_SECONDS = 5.0
 class FrameLines:
     """Prints to stdout; a context manager that keeps a heartbeat going.
 
+    With `openjd`, the number of frames of the job, sessions of Open Job Description are told how much of it is done.
     The words "Error:", "Exception:" and "Warning" never occur in benign lines: strict workers fail a task on them.
     """
 
-    def __init__(self, heartbeat: float = HEARTBEAT_SECONDS, interval: float = PROGRESS_SECONDS) -> None:
+    def __init__(
+        self, heartbeat: float = HEARTBEAT_SECONDS, interval: float = PROGRESS_SECONDS, openjd: int = 0
+    ) -> None:
         self._heartbeat, self._interval = heartbeat, interval
+        self._openjd, self._finished = openjd, 0
         self._lock = threading.Lock()
         self._ended = threading.Event()
         self._last = self._started = time.monotonic()
@@ -42,6 +46,12 @@ class FrameLines:
         self._doing = f"Fra:{frame} | {phase.capitalize()} | Sample {int(100 * min(max(fraction, 0), 1))}/100"
         if time.monotonic() - self._last >= self._interval:
             self._say(self._doing)
+            self._tell_openjd(fraction, f"frame {frame}, {phase}")
+
+    def finished(self, frames: int) -> None:
+        """So many frames of the job are there, made or found."""
+        self._finished = frames
+        self._tell_openjd(0.0, f"{frames} of {self._openjd} frames")
 
     def saved(self, path: object) -> None:
         """A frame is on disk and verified."""
@@ -55,6 +65,11 @@ class FrameLines:
     def note(self, text: str) -> None:
         """Something the user should know that does not stop the job."""
         self._say(f"Note: {text}")
+
+    def _tell_openjd(self, fraction: float, status: str) -> None:
+        if self._openjd:
+            done = 100 * (self._finished + min(max(fraction, 0.0), 1.0)) / self._openjd
+            self._say(f"openjd_progress: {min(done, 100.0):.1f}\nopenjd_status: {status}")
 
     def _say(self, line: str, doing: bool = False) -> None:
         with self._lock:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 from ..errors import UsageError
 
-_TERM = re.compile(r"(?P<first>-?\d{1,20})(?:-(?P<last>-?\d{1,20})(?:[x:](?P<step>-?\d{1,20}))?)?")
+_TERM = re.compile(r"(?P<first>-?\d{1,20})(?:(?:-|\.\.)(?P<last>-?\d{1,20})(?:[x:](?P<step>-?\d{1,20}))?)?")
 #: Far beyond any shot; a mistyped range must not fill the memory.
 MOST_FRAMES = 1_000_000
 #: Blender's MAXFRAME; it silently stops there in both directions.
@@ -20,8 +21,8 @@ def parse_frames(text: str) -> list[int]:
     Parameters
     ----------
     text : str
-        Terms separated by commas: ``7``, ``1-24``, every second frame ``1-24x2`` or ``1-24:2``, downwards
-        ``24-1x-2``. Numbers may be negative: ``-5--1``.
+        Terms separated by commas: ``7``, ``1-24`` (or ``1..24``, as Blender writes it), every second frame ``1-24x2``
+        or ``1-24:2``, downwards ``24-1x-2``. Numbers may be negative: ``-5--1``.
 
     Returns
     -------
@@ -55,18 +56,40 @@ def parse_frames(text: str) -> list[int]:
     return list(frames)
 
 
-def frame_path(template: str, frame: int) -> Path:
-    """Path of a frame: the last run of ``#`` in the file's name becomes the number, padded with zeros."""
-    folder, name = Path(template).parent, Path(template).name
-    runs = list(re.finditer("#+", name))
-    if not runs:
-        return folder / name
-    start, end = runs[-1].span()
-    number = f"{'-' if frame < 0 else ''}{abs(frame):0{end - start}d}"
-    return folder / (name[:start] + number + name[end:])
+def write_frames(frames: Sequence[int]) -> str:
+    """The frames, in their order, as text that `parse_frames` and OpenJD read: ``1-24:2,30``.
+
+    Parameters
+    ----------
+    frames : at least one, none twice
+    """
+    terms: list[str] = []
+    start = 0
+    while start < len(frames):
+        end = start + 1
+        step = frames[end] - frames[start] if end < len(frames) else 1
+        while end + 1 < len(frames) and frames[end + 1] - frames[end] == step:
+            end += 1
+        if end - start < 2:  # two frames are no range
+            terms.append(str(frames[start]))
+            start += 1
+        else:
+            terms.append(f"{frames[start]}-{frames[end]}" + ("" if step == 1 else f":{step}"))
+            start = end + 1
+    return ",".join(terms)
+
+
+def cut_frames(frames: Sequence[int], size: int) -> list[list[int]]:
+    """The frames in parts of `size`, the last perhaps of fewer."""
+    return [list(frames[i : i + size]) for i in range(0, len(frames), size)]
+
+
+def absolute_template(template: str, scene: Path) -> str:
+    """The pattern of the files with its whole path; a leading ``//`` is the folder of `scene`."""
+    return str(scene.parent / template[2:] if template.startswith("//") else Path(template).absolute())
 
 
 def check_template(template: str, frames: list[int]) -> None:
     """Refuse a template that would write several frames to one file."""
     if len(frames) > 1 and "#" not in Path(template).name:
-        raise UsageError(f"--out {template}", "has no # for the frame's number", "Write it as out/####.exr")
+        raise UsageError(f"output {template}", "has no # for the frame's number", "Write it as out/####.exr")

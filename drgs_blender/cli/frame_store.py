@@ -20,6 +20,7 @@ from ..errors import AssetError
 from ..frame import Frame
 from ..passes import BY_NAME
 from ..render.picture.frames import read_frame, write_frame
+from ..render.picture.shots import describe
 from ..version import __version__
 
 logger = logging.getLogger(__name__)
@@ -51,17 +52,26 @@ def settings_hash(frame: Frame, assets: Mapping[str, Path]) -> str:
 
 def is_complete(path: Path, frame: Frame, settings: str) -> bool:
     """Whether `path` is a frame that decodes, has the right size and passes, and was made with these settings."""
-    if not path.is_file():
-        return False
-    try:
-        with quiet_descriptors():
-            pictures, metadata = read_frame(path)
-    except AssetError as error:
-        logger.info("rendered again: %s", error)
-        return False
+    whole = read_whole(path)
     x0, y0, x1, y1 = frame.camera.window
     expected = {name: (y1 - y0, x1 - x0, len(BY_NAME[name].channels)) for name in frame.passes}
-    return metadata.get(SETTINGS) == settings and {name: p.shape for name, p in pictures.items()} == expected
+    return (
+        whole is not None
+        and whole[1].get(SETTINGS) == settings
+        and {name: p.shape for name, p in whole[0].items()} == expected
+    )
+
+
+def read_whole(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]] | None:
+    """Passes and metadata of the frame at `path`; None where there is none that decodes."""
+    if not path.is_file():
+        return None
+    try:
+        with quiet_descriptors():
+            return read_frame(path)
+    except AssetError as error:
+        logger.info("made again: %s", error)
+        return None
 
 
 @contextlib.contextmanager
@@ -87,4 +97,5 @@ def quiet_descriptors() -> Iterator[None]:
 
 def save(path: Path, pictures: Mapping[str, np.ndarray], frame: Frame, number: int, settings: str) -> None:
     """Write a frame; WriteError when it cannot be written and read back."""
-    write_frame(path, dict(pictures), {SETTINGS: settings, "frame": str(number), "seed": str(frame.settings.seed)})
+    metadata = {SETTINGS: settings, "frame": str(number), "seed": str(frame.settings.seed)}
+    write_frame(path, dict(pictures), metadata | describe(frame))

@@ -8,15 +8,22 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from ..errors import UsageError
 from ..formats.axes import UP_AXES
+from ..sequence import frame_path, frames_of
+from .frame_range import check_template, parse_frames
 from .output import check_suffix, check_writable, write_and_report
-from .progress import clock
+from .progress import FractionBar, clock
+from .relight import positive
 from .sampling import whole
 
 EXAMPLES = """examples:
   drgs import point_cloud.ply --mesh fuse_post.ply --out capture.drgs
   drgs import point_cloud.ply --mesh fuse_post.ply --env room.exr --up y --out capture.drgs
+  drgs import fern.ply --no-mesh --out fern.drgs
   drgs import splats.compressed.ply --up=-y --resolution 256 --out splats.drgs
+  drgs import 'dance/####.spz' --no-mesh --frames 1-24 --out 'dance/####.drgs'
+  drgs import statue.ply --env garden.hdr --remove-light --out statue.drgs
 """
 
 
@@ -24,8 +31,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of ``drgs import``."""
     parser.add_argument("surfels", type=Path, metavar="SURFELS", help="surfels or splats")
     parser.add_argument("--out", type=Path, required=True, metavar="A.drgs", help="asset to write")
-    parser.add_argument("--mesh", type=Path, help="their mesh; default: one is built around them")
+    mesh = parser.add_mutually_exclusive_group()
+    mesh.add_argument("--mesh", type=Path, help="their mesh; default: one is built around them")
+    mesh.add_argument(
+        "--no-mesh", action="store_true", help="surfels alone, for --tracer surfels: foliage, hair, anything thin"
+    )
+    parser.add_argument("--scale", type=positive, default=1.0, metavar="S", help="factor on all lengths")
     parser.add_argument("--env", type=Path, help="environment of the capture, kept in the asset")
+    parser.add_argument(
+        "--frames", nargs="?", const="",
+        help="frames, one asset each: #### in the names becomes the number; 1-24, or nothing for those of SURFELS",
+    )  # fmt: skip
+    light = parser.add_argument_group("light in the colours of surfels without materials")
+    light.add_argument(
+        "--remove-light", action="store_true", help="estimate the albedo: the captured colour over the light of --env"
+    )
+    light.add_argument(
+        "--exposure", type=positive, metavar="E",
+        help="linear captured colour that radiance 1 of the environment gives; default: what makes the albedo of the "
+        "brightest tenth 0.8",
+    )  # fmt: skip
     parser.add_argument(
         "--up",
         choices=tuple(UP_AXES),
@@ -40,14 +65,37 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Import and write one asset."""
+    """Import and write one asset, or those of all frames."""
+    if args.frames is None:
+        return _import(args)
+    frames = parse_frames(args.frames) if args.frames else frames_of(str(args.surfels))
+    check_template(str(args.out), frames)
+    for frame in frames:
+        paths = {name: path for name in ("surfels", "mesh", "env", "out") if (path := getattr(args, name)) is not None}
+        of_frame = {name: frame_path(str(path), frame) for name, path in paths.items()}
+        _import(argparse.Namespace(**(vars(args) | of_frame)))
+    return 0
+
+
+def _import(args: argparse.Namespace) -> int:
     check_suffix(args.out, (".drgs",))
     check_writable(args.out)
+    if args.remove_light and args.env is None:
+        raise UsageError("--remove-light", "needs the light of the capture", "Give it with --env")
+    if args.exposure is not None and not args.remove_light:
+        raise UsageError("--exposure", "belongs to --remove-light", "Give both")
 
     from ..build.importer import import_asset
 
     given = {name: value for name in ("resolution", "max_triangles") if (value := getattr(args, name)) is not None}
     with clock(args, "importing"):
-        asset = import_asset(args.surfels, args.mesh, args.env, args.up, **given)
+        asset = import_asset(
+            args.surfels, args.mesh, args.env, args.up, meshless=args.no_mesh, scale=args.scale, **given
+        )
+    if args.remove_light:
+        from ..build.delight import remove_light
+
+        with FractionBar(args, "removing light") as progress:
+            remove_light(asset, args.exposure, progress=progress)
     write_and_report(args.out, asset)
     return 0

@@ -12,7 +12,7 @@ import logging
 import re
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NoReturn
 
@@ -38,25 +38,22 @@ class Command:
 COMMANDS: tuple[Command, ...] = (
     Command("make", "make", "make an asset from a textured mesh"),
     Command("import", "import_surfels", "make an asset from captured surfels or splats"),
+    Command("reconstruct", "reconstruct", "make an asset from calibrated photographs"),
+    Command("convert", "convert", "write an asset, splats, a mesh or a light in a format of other programs"),
+    Command("bake", "bake", "bake the light on the objects of a frame to their vertices or to images"),
     Command("inspect", "inspect_file", "say what a file holds: asset, mesh, surfels, environment or rendered frame"),
     Command("relight", "relight", "render an asset under an environment, without Blender"),
     Command("render", "render", "render frames of a .blend file through Blender"),
+    Command("simulate", "simulate", "simulate the matter that fills an asset, without Blender"),
+    Command("evaluate", "evaluate", "score an asset against its capture, or render scenes with known truth"),
+    Command("denoise", "denoise", "denoise rendered frames with the help of their neighbours"),
+    Command("submit", "submit", "write a job for OpenJD, Slurm or Flamenco"),
+    Command("session", "session", "keep Blender and an engine from one chunk of frames to the next"),
     Command("doctor", "doctor", "check what DR-GS needs and say what is missing"),
 )
 
-#: Exit code -> word in the last line of ``drgs render``, which farms parse.
-EXIT_CLASSES = {
-    errors.EXIT_OK: "ok",
-    errors.EXIT_USAGE: "usage",
-    errors.EXIT_BAD_ASSET: "bad-asset",
-    errors.EXIT_NO_DEVICE: "no-device",
-    errors.EXIT_INTERNAL: "internal",
-    errors.EXIT_CANNOT_WRITE: "cannot-write",
-    errors.EXIT_RETRY: "retry",
-    errors.EXIT_VERSION: "version",
-    130: "interrupted",
-    143: "terminated",
-}
+#: Options whose values may begin with a dash.
+_SIGNED = ("--up", "--from-up", "--frames", "--sequence", "--gravity", "--velocity", "--floor")
 
 
 class Parser(argparse.ArgumentParser):
@@ -108,24 +105,25 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     code = run_command(arguments)
     command = next((word for word in arguments if not word.startswith("-")), None)
-    if command == "render" and not {"-h", "--help"} & set(arguments):
+    if command in ("render", "denoise") and not {"-h", "--help"} & set(arguments):
         # Farms read this last line.
-        print(f"DRGS_EXIT class={EXIT_CLASSES.get(code, 'internal')}", flush=True)
+        print(f"DRGS_EXIT class={errors.EXIT_CLASSES.get(code, 'internal')}", flush=True)
     return code
 
 
-def run_command(arguments: Sequence[str]) -> int:
-    """Parse and run; every way to end becomes an exit code here."""
+def run_command(arguments: Sequence[str], run: Callable[[argparse.Namespace], int] | None = None) -> int:
+    """Parse and run; every way to end becomes an exit code here. `run` does it instead of the command's own module."""
     verbose = 0
     try:
         args = build_parser().parse_args(join_values(arguments))
         verbose = getattr(args, "verbose", 0)
         args.verbose, args.quiet = verbose, getattr(args, "quiet", False)
         args.progress = getattr(args, "progress", None)
+        args.words = list(arguments)
         set_up_logging(verbose, args.quiet)
         previous = signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
         try:
-            return args.run(args)
+            return (run or args.run)(args)
         finally:
             signal.signal(signal.SIGTERM, previous)
     except errors.DrgsError as error:
@@ -156,7 +154,7 @@ def join_values(arguments: Sequence[str]) -> list[str]:
     """``--up -y`` and ``--frames -5--1`` as ``--up=-y`` and ``--frames=-5--1``: argparse takes a dash for an option."""
     joined: list[str] = []
     for word in arguments:
-        if joined and joined[-1] in ("--up", "--frames") and re.match(r"-[yz\d]", word):
+        if joined and joined[-1] in _SIGNED and re.match(r"-[yz.\d]", word):
             joined[-1] += f"={word}"
         else:
             joined.append(word)

@@ -11,6 +11,7 @@ from pathlib import Path
 from ..formats.axes import UP_AXES
 from .output import check_suffix, check_writable, write_and_report
 from .progress import clock
+from .relight import positive
 from .sampling import whole
 
 EXAMPLES = """examples:
@@ -31,6 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="rest",
         help="of a skinned glTF: as Blender's importer rests it, for Bind to Rig (default), or as viewers show it",
     )
+    parser.add_argument("--scale", type=positive, default=1.0, metavar="S", help="factor on all lengths")
     parser.add_argument("--env", type=Path, help="environment kept in the asset")
     parser.add_argument(
         "--max-triangles", type=whole(1, 10**8), metavar="N", help="budget when the mesh is divided for texture detail"
@@ -49,6 +51,6 @@ def run(args: argparse.Namespace) -> int:
 
     given = {name: value for name in ("max_triangles", "density") if (value := getattr(args, name)) is not None}
     with clock(args, "making the asset"):
-        asset = make_asset(args.mesh, up=args.up, environment=args.env, pose=args.pose, **given)
+        asset = make_asset(args.mesh, up=args.up, environment=args.env, pose=args.pose, scale=args.scale, **given)
     write_and_report(args.out, asset)
     return 0

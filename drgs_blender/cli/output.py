@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -11,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from ..asset import Asset
-from ..asset.archive import replace_file
 from ..errors import UsageError, WriteError
 
 
@@ -71,13 +69,10 @@ def write_preview(path: Path, combined: np.ndarray) -> None:
     combined : (h, w, 4) float32, linear Rec.709, premultiplied alpha; written as 8-bit sRGB, straight alpha, clipped
         to [0, 1]. Nothing else is done to it: view transforms belong to Blender.
     """
-    from PIL import Image
-
     from ..colour import linear_to_srgb
+    from ..formats.images import write_png
 
     alpha = np.clip(np.nan_to_num(combined[..., 3:4]), 0, 1)
     linear = np.clip(np.nan_to_num(combined[..., :3]) / np.maximum(alpha, 1e-6), 0, 1)
     pixels = (np.concatenate([linear_to_srgb(linear), alpha], axis=-1) * 255 + 0.5).astype(np.uint8)
-    encoded = io.BytesIO()
-    Image.fromarray(pixels).save(encoded, "PNG")
-    replace_file(path, [encoded.getvalue()])
+    write_png(path, pixels)

@@ -1,4 +1,4 @@
-"""Render an asset under an environment, without Blender: one picture, from a camera in a JSON file.
+"""Render an asset under an environment, without Blender: a picture, or those of a simulation, from a camera in a file.
 
 The camera file holds matrix_world (4 rows of 4 numbers, camera to world, Blender's convention: looks down -Z, Y up),
 width, height, and fov_x in degrees or fx, fy, cx, cy in pixels; optionally orthographic, clip_start, clip_end.
@@ -10,6 +10,7 @@ import argparse
 import logging
 import math
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -18,8 +19,11 @@ import numpy as np
 from ..asset import Asset
 from ..errors import UsageError
 from ..frame import Frame, ObjectState, RenderSettings, World
+from ..particle_cache import ParticleCache
+from ..sequence import frame_path
 from . import sampling
 from .camera_file import read_camera
+from .frame_range import check_template, parse_frames
 from .output import check_suffix, check_writable, write_preview
 from .progress import FractionBar
 
@@ -30,6 +34,7 @@ EXAMPLES = """examples:
   drgs relight helmet.drgs --env city.exr --env-rotation 90 --camera front.json --rays 128 --denoise svgf \\
       --passes all --transparent --out helmet.exr
   drgs relight robot.drgs --env city.exr --camera front.json --vertices pose.npy --out pose.png
+  drgs relight cat.drgs --env city.exr --camera front.json --cache bake --frames 1-48 --out 'cat/####.exr'
 """
 
 
@@ -41,59 +46,90 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     light = parser.add_argument_group("light")
     light.add_argument("--env", type=Path, help="lat-long environment (EXR, HDR); default: the asset's own")
     light.add_argument(
-        "--env-rotation", type=_finite, default=0.0, metavar="DEG", help="Rotation Z of a World Mapping node, degrees"
+        "--env-rotation", type=finite, default=0.0, metavar="DEG", help="Rotation Z of a World Mapping node, degrees"
     )
-    light.add_argument("--env-strength", type=_finite, default=1.0, metavar="S", help="factor on the environment")
-    parser.add_argument(
+    light.add_argument("--env-strength", type=finite, default=1.0, metavar="S", help="factor on the environment")
+    pose = parser.add_argument_group("pose").add_mutually_exclusive_group()
+    pose.add_argument("--cache", type=Path, metavar="CACHE", help="folder that `drgs simulate` wrote")
+    pose.add_argument(
         "--vertices", type=Path, metavar="V.npy", help="pose: (n, 3) array, the mesh's vertices in object space, metres"
     )
+    parser.add_argument("--frames", metavar="RANGE", help="of the cache: 12, 1-24, 1-24x2; default: all that are there")
     sampling.add_arguments(parser, defaults=True)
 
 
-def _finite(text: str) -> float:
+def finite(text: str) -> float:
+    """Parser of a finite number."""
     value = float(text)
     if not math.isfinite(value):
         raise argparse.ArgumentTypeError(f"{text} is not a finite number")
     return value
 
 
+def positive(text: str) -> float:
+    """Parser of a finite number above 0."""
+    value = finite(text)
+    if value <= 0:
+        raise argparse.ArgumentTypeError(f"{text} is not above 0")
+    return value
+
+
 def run(args: argparse.Namespace) -> int:
-    """Render one picture."""
+    """Render."""
     check_suffix(args.out, (".exr", ".png"))
     camera = read_camera(args.camera)
     settings = sampling.override(RenderSettings(), args)
     sampling.check_size(camera, args.passes)
-    vertices = read_vertices(args.vertices) if args.vertices else None
-    check_writable(args.out)
+    poses = _poses(args)
+    for number, _ in poses:
+        check_writable(frame_path(args.out, number))
 
     from ..engine.session import Session
 
     session = Session()
     key = session.load_asset(args.asset)
-    frame = Frame(
-        number=1,
-        camera=camera,
-        objects=[ObjectState(name=args.asset.stem, asset=key, vertices=vertices)],
-        world=World(
-            read_environment(args, session.asset(key)), rotation_z(args.env_rotation), strength=args.env_strength
-        ),
-        settings=settings,
-        passes=args.passes,
-    )
-    started = time.perf_counter()
-    with FractionBar(args, "rendering") as progress:
-        picture = session.render(frame, progress)
-    for warning in picture.warnings:
-        logger.warning("%s", warning)
-    logger.info("rendered in %.2f s", time.perf_counter() - started)
-    if args.out.suffix.lower() == ".png":
-        write_preview(args.out, picture["Combined"])
-    else:
-        from ..asset.container import digest_asset
-        from ..render.picture.frames import write_frame
+    world = World(read_environment(args, session.asset(key)), rotation_z(args.env_rotation), strength=args.env_strength)
+    for number, vertices in poses:
+        frame = Frame(
+            number=number,
+            camera=camera,
+            objects=[ObjectState(name=args.asset.stem, asset=key, vertices=vertices())],
+            world=world,
+            settings=settings,
+            passes=args.passes,
+        )
+        started = time.perf_counter()
+        with FractionBar(args, "rendering") as progress:
+            picture = session.render(frame, progress)
+        for warning in picture.warnings:
+            logger.warning("%s", warning)
+        logger.info("frame %d rendered in %.2f s", number, time.perf_counter() - started)
+        path = frame_path(args.out, number)
+        if path.suffix.lower() == ".png":
+            write_preview(path, picture["Combined"])
+        else:
+            from ..asset.container import digest_asset
+            from ..render.picture.frames import write_frame
 
-        write_frame(args.out, picture, {"asset": digest_asset(key), "seed": str(settings.seed)})
+            write_frame(path, picture, {"asset": digest_asset(key), "seed": str(settings.seed)})
     return 0
+
+
+def _poses(args: argparse.Namespace) -> list[tuple[int, Callable[[], np.ndarray | None]]]:
+    """Number of each picture, and what gives its pose."""
+    if args.cache is None:
+        if args.frames:
+            raise UsageError("--frames", "are those of a cache", "Give one with --cache")
+        vertices = read_vertices(args.vertices) if args.vertices else None
+        return [(1, lambda: vertices)]
+    cache = ParticleCache(args.cache)
+    if cache.header() is None:
+        raise UsageError(f"--cache {args.cache}", "is not the cache of a simulation", "Make one with `drgs simulate`")
+    frames = parse_frames(args.frames) if args.frames else cache.frames()
+    if missing := sorted(set(frames) - set(cache.frames())):
+        cache.read(missing[0])  # says which are there
+    check_template(str(args.out), frames)
+    return [(frame, lambda frame=frame: cache.read(frame).vertices) for frame in frames]  # type: ignore[misc]
 
 
 def read_vertices(path: Path) -> np.ndarray:

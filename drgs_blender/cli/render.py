@@ -13,22 +13,32 @@ The last line is DRGS_EXIT class=ok, or the class of what went wrong.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import logging
 import re
-import sys
+import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from ..errors import AssetError, EngineError, UsageError
+from ..errors import AssetError, Cancelled, DeviceError, EngineError, UsageError
+from ..sequence import frame_path
 from . import sampling
 from .find_blender import find_blender
 from .frame_lines import FrameLines
-from .frame_range import check_template, frame_path, parse_frames
+from .frame_range import absolute_template, check_template, parse_frames
 from .output import check_suffix, check_writable
 from .progress import bar
 
+if TYPE_CHECKING:
+    from ..engine.client import EngineClient, OnProgress, Passes
+    from ..frame import Frame
+    from .machine import Machine
+
 logger = logging.getLogger(__name__)
+
+DEVICES = ("cpu",)
 
 EXAMPLES = """examples:
   drgs render shot.blend --frames 1-24 --out 'frames/####.exr'
@@ -54,68 +64,108 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--enable-scripts", action="store_true", help="let the file run its own Python scripts and drivers"
     )
+    parser.add_argument(
+        "--session", type=Path, metavar="FOLDER", help="let the Blender and engine of `drgs session start` render"
+    )
+    parser.add_argument("--openjd", action="store_true", help="tell an Open Job Description session the progress")
+    group = parser.add_argument_group("machine")
+    group.add_argument("--device", default="cpu", help="what computes: cpu")
+    group.add_argument(
+        "--memory-mb", type=sampling.whole(256, 1 << 24), metavar="MB", help="most memory of the engine (Linux)"
+    )
+    group.add_argument(
+        "--timeout", type=seconds, metavar="S", default=float("inf"), help="most seconds for a frame; then exit code 75"
+    )
     sampling.add_arguments(parser, defaults=False)
 
 
+def seconds(text: str) -> float:
+    """A time that is longer than nothing."""
+    value = float(text)
+    if not value > 0:
+        raise argparse.ArgumentTypeError(f"{text} is not a time")
+    return value
+
+
 def run(args: argparse.Namespace) -> int:
-    """Render every frame that is not there yet."""
+    """Render every frame that is not there yet, here or by the session's engine."""
+    if args.session:
+        from .session_link import hand_on
+
+        code = hand_on(args.session, args.words)
+        if code is not None:
+            return code
+        logger.info("session %s: has no engine, the frames are rendered by one of their own", args.session)
+    from .machine import Machine
+
+    with Machine() as machine:
+        return render(args, machine)
+
+
+def render(args: argparse.Namespace, machine: Machine) -> int:
+    """Render every frame that is not there yet on `machine`."""
     frames = parse_frames(args.frames)
     scene = args.scene.resolve()
-    template = str(scene.parent / args.out[2:]) if args.out.startswith("//") else args.out
+    template = absolute_template(args.out, scene)
     check_template(template, frames)
     check_suffix(Path(template), (".exr",))
     if not scene.is_file():
         raise AssetError(str(args.scene), "does not exist", "Check the path of the .blend file")
+    if args.device not in DEVICES:
+        raise DeviceError(f"--device {args.device}", "is not something DR-GS computes on", "Use --device cpu")
     check_writable(frame_path(template, frames[0]))
     blender = find_blender(args.blender)
     logger.info("Blender: %s (%s)", blender.program, blender.origin)
 
-    from ..engine.client import EngineClient, engine_command
     from . import frame_store
-    from .blender_process import BlenderProcess
 
-    job = {"scene": str(scene), "frames": frames, "scripts": args.enable_scripts}
-    assets: dict[str, Path] = {}
+    job = {"scene": str(scene), "frames": frames, "scripts": args.enable_scripts, "passes": args.passes}
     noted: set[str] = set()
     done: set[int] = set()
     files: dict[str, str] = {}
-    with FrameLines() as lines, EngineClient(engine_command(sys.executable)) as engine:
-
-        def key_of(path: Path) -> str:
-            key = engine.load_asset(str(path))
-            assets[key] = path
-            return key
+    engine = machine.engine(args.memory_mb)
+    with (
+        FrameLines(openjd=args.openjd and len(frames)) as lines,
+        contextlib.closing(machine.frames(blender, job, args.timeout)) as evaluated,
+        bar(args, "frames", len(frames)) as progress,
+    ):
 
         def note(texts: list[str]) -> None:
             for text in sorted(set(texts) - noted):
                 lines.note(text)
             noted.update(texts)
 
-        with BlenderProcess(blender, job, key_of) as process, bar(args, "frames", len(frames)) as progress:
-            for number, layer, scene_frame, warnings in process.frames():
-                note(warnings)
-                path = layer_path(frame_path(template, number), layer)
-                claim(files, path, layer)
-                frame = replace(
-                    scene_frame,
-                    settings=sampling.override(scene_frame.settings, args),
-                    passes=args.passes or scene_frame.passes,
-                )
-                sampling.check_size(frame.camera, frame.passes)
-                settings = frame_store.settings_hash(frame, assets)
-                if not args.overwrite and frame_store.is_complete(path, frame, settings):
-                    lines.skipped(path)
-                else:
-                    lines.begin(number)
-                    pictures = engine.render(frame, partial(lines.progress, number))
-                    note(pictures.warnings)
-                    frame_store.save(path, pictures, frame, number, settings)
-                    lines.saved(path)
-                progress.update(number not in done)
-                done.add(number)
+        for number, layer, scene_frame, warnings in evaluated:
+            note(warnings)
+            path = layer_path(frame_path(template, number), layer)
+            claim(files, path, layer)
+            frame = replace(scene_frame, settings=sampling.override(scene_frame.settings, args))
+            sampling.check_size(frame.camera, frame.passes)
+            settings = frame_store.settings_hash(frame, machine.assets)
+            if not args.overwrite and frame_store.is_complete(path, frame, settings):
+                lines.skipped(path)
+            else:
+                lines.begin(number)
+                pictures = render_in_time(engine, frame, partial(lines.progress, number), args.timeout)
+                note(pictures.warnings)
+                frame_store.save(path, pictures, frame, number, settings)
+                lines.saved(path)
+            progress.update(number not in done)
+            done.add(number)
+            lines.finished(len(done))
     if missing := [number for number in frames if number not in done]:
         raise EngineError("Blender", f"did not evaluate frame {missing[0]} and {len(missing) - 1} more", "Try again")
     return 0
+
+
+def render_in_time(engine: EngineClient, frame: Frame, on_progress: OnProgress, timeout: float) -> Passes:
+    """Render `frame`; EngineError when that takes longer than `timeout` seconds."""
+    latest = time.monotonic() + timeout
+    try:
+        return engine.render(frame, on_progress, lambda: time.monotonic() > latest)
+    except Cancelled as end:
+        problem, remedy = f"took longer than {timeout:g} s", "Raise --timeout, or use fewer rays"
+        raise EngineError(f"frame {frame.number}", problem, remedy) from end
 
 
 def layer_path(path: Path, layer: str) -> Path:

@@ -9,14 +9,17 @@ from typing import Any, get_args, get_type_hints
 
 from ..errors import UsageError
 from ..frame import Camera, RenderSettings, split_rays
-from ..passes import BY_NAME, PASSES
+from ..passes import BY_NAME, PASSES, TEMPORAL
 
 #: Pixels times passes of one picture; 16k x 16k with one pass.
 MOST_PIXEL_PASSES = 1 << 28
 
 
-def add_arguments(parser: argparse.ArgumentParser, *, defaults: bool) -> None:
-    """Add the sampling options; without `defaults` an absent option stays None and the scene decides."""
+def add_arguments(parser: argparse.ArgumentParser, *, defaults: bool, output: bool = True) -> None:
+    """Add the sampling options; without `defaults` an absent option stays None and the scene decides.
+
+    Without `output`, what is written is not the user's to choose: film and passes have no options.
+    """
     settings, hints = RenderSettings(), get_type_hints(RenderSettings)
     group = parser.add_argument_group("solution" if defaults else "solution (default: what the scene says)")
 
@@ -28,7 +31,13 @@ def add_arguments(parser: argparse.ArgumentParser, *, defaults: bool) -> None:
     def choices(field: str) -> tuple[str, ...]:
         return get_args(hints[field])
 
-    add("--rays", "rays", "rays a pixel: half by cosine, a quarter GGX, a quarter environment", type=whole(1, 65536))
+    add("--rays", "rays", "rays a pixel, divided among light and lobes by the material", type=whole(1, 65536))
+    group.add_argument(
+        "--split",
+        type=split,
+        metavar="C,G,L",
+        help="rays a pixel by cosine, by GGX and towards light, instead of --rays (the paper has 16,8,8)",
+    )
     add("--bounces", "bounces", "indirect bounces", type=whole(0, 64))
     add(
         "--noise-threshold",
@@ -42,12 +51,20 @@ def add_arguments(parser: argparse.ArgumentParser, *, defaults: bool) -> None:
         "limit of one indirect sample: fewer fireflies, less light; 0 for no limit",
         type=at_least_zero,
     )
-    add("--aa", "aa", "sub-pixel positions among which the rays are divided", type=whole(1, 1024))
+    add(
+        "--aa",
+        "aa",
+        "sub-pixel positions among which the rays are divided, 0 for as many as suit them",
+        type=whole(0, 1024),
+    )
     add("--primary", "primary", "what the camera sees: surfels or the mesh", choices=choices("primary"))
+    add("--tracer", "tracer", "what light meets of DR-GS objects: the mesh or the surfels", choices=choices("tracer"))
     add("--denoise", "denoise", "denoiser", choices=choices("denoise"))
     add("--look", "look", "material model", choices=choices("look"))
     add("--seed", "seed", "seed of the noise", type=whole(0, 2**31 - 1))
     add("--threads", "threads", "threads, 0 for all cores", type=whole(0, 1024))
+    if not output:
+        return
     group.add_argument(
         "--transparent",
         dest="film_transparent",
@@ -60,7 +77,8 @@ def add_arguments(parser: argparse.ArgumentParser, *, defaults: bool) -> None:
         type=passes,
         default=("Combined",) if defaults else None,
         metavar="NAMES",
-        help=f"passes to write, separated by commas, or `all`: {', '.join(p.name for p in PASSES)}",
+        help="passes to write, separated by commas, `all`, or `temporal` for what `drgs denoise` needs: "
+        f"{', '.join(p.name for p in PASSES)}",
     )
 
 
@@ -77,6 +95,14 @@ def whole(low: int, high: int) -> Any:
     return parse
 
 
+def split(text: str) -> tuple[int, int, int]:
+    """``16,8,8`` -> counts of the three strategies."""
+    counts = [int(word) for word in text.split(",")]
+    if len(counts) != 3 or min(counts) < 0 or not 1 <= sum(counts) <= 65536:
+        raise argparse.ArgumentTypeError(f"{text} is not three numbers of rays, such as 16,8,8")
+    return counts[0], counts[1], counts[2]
+
+
 def at_least_zero(text: str) -> float:
     """A finite number that is not negative."""
     value = float(text)
@@ -86,12 +112,16 @@ def at_least_zero(text: str) -> float:
 
 
 def passes(text: str) -> tuple[str, ...]:
-    """``Combined,Depth`` or ``all`` -> names of the pass table, in its order; Combined is always among them."""
+    """``Combined,Depth``, ``temporal`` (what ``drgs denoise`` needs) or ``all`` -> names of the pass table, in its
+    order; Combined is always among them."""
     if text == "all":
         return tuple(BY_NAME)
     known = {name.lower(): name for name in BY_NAME}
     wanted = {"Combined"}
     for word in text.split(","):
+        if word.strip().lower() == "temporal":
+            wanted.update(TEMPORAL)
+            continue
         if word.strip().lower() not in known:
             raise argparse.ArgumentTypeError(f"there is no pass {word.strip()!r}; there are {', '.join(BY_NAME)}")
         wanted.add(known[word.strip().lower()])
@@ -111,11 +141,13 @@ def check_size(camera: Camera, passes: Sequence[str]) -> None:
 def override(settings: RenderSettings, args: argparse.Namespace) -> RenderSettings:
     """`settings` with every option that was given."""
     numbers = ("bounces", "noise_threshold", "clamp_indirect", "aa", "seed", "threads")
-    names = (*numbers, "primary", "denoise", "look", "film_transparent")
+    names = (*numbers, "primary", "tracer", "denoise", "look", "film_transparent")
     given = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
-    if args.rays is not None:
-        given |= dict(zip(("cosine", "ggx", "environment"), split_rays(args.rays), strict=True))
+    counts = args.split or (args.rays and split_rays(args.rays))
+    if counts:
+        given |= dict(zip(("cosine", "ggx", "environment"), counts, strict=True))
+        given["split"] = "counts" if args.split else "auto"
     result = replace(settings, **given)
-    if result.aa > result.rays:
+    if result.positions > result.rays:
         raise UsageError("--aa", f"{result.aa} is more than the {result.rays} rays of a pixel", "Use more rays or less")
     return result

@@ -46,7 +46,8 @@ class Child:
 
     Attributes
     ----------
-    inbox : (message, arrays) as they arrive; at the end one exception that says why there will be no more
+    inbox : (message, arrays) as they arrive; at the end one exception that says why there will be no more. None only
+        wakes whoever waits
     heard : grows with every byte that arrives
     steps, preparing : the last `protocol.Alive`
     idle : set while no request is unanswered
@@ -56,7 +57,7 @@ class Child:
 
     def __init__(self, command: list[str], shared: bool) -> None:
         self.command = command
-        self.inbox: queue.Queue[tuple[Any, dict[str, Array]] | Exception] = queue.Queue()
+        self.inbox: queue.Queue[tuple[Any, dict[str, Array]] | Exception | None] = queue.Queue()
         self.heard = 0
         self.steps = 0
         self.preparing = False

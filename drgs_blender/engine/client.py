@@ -143,24 +143,53 @@ class EngineClient:
             When the engine died or fell silent, and once more when the frame was repeated.
         DeviceError, VersionError, Cancelled
         """
-        try:
-            description, arrays = encode_frame(frame)
-            ready = {slot: sendable(array) for slot, array in arrays.items()}
-        except CodecError as error:
-            raise UsageError(f"frame {frame.number}", str(error), "Correct the setting or object it names") from error
+        description, ready = _encoded(frame)
 
         def work() -> Passes:
-            for _ in range(2):
-                versions, changed = self._sent.changes(ready)
-                message = protocol.Render(self._next(), description, versions)
-                answer, pictures = self._request(message, changed, on_progress, cancelled)
-                if isinstance(answer, protocol.Result):
-                    return Passes(pictures, answer.warnings, answer.statistics)
-                self._sent.forget()
-            raise Lost("keeps asking for arrays it was sent")
+            return self._picture(
+                ready, lambda number, slots: protocol.Render(number, description, slots), on_progress, cancelled
+            )
 
         with self._exclusive(cancelled):
             return self._repeating(work, on_progress, cancelled)
+
+    def view(
+        self,
+        name: str,
+        frame: Frame,
+        go_on: bool = False,
+        on_progress: OnProgress | None = None,
+        cancelled: IsCancelled | None = None,
+    ) -> Passes:
+        """The first picture of `frame` in the viewport `name`; with `go_on` the next one, of more samples.
+
+        ``statistics["view.fraction"]`` is the part of all samples that the picture has. A coarse picture has fewer
+        pixels than the window of the frame's camera, which they cover evenly. A new engine that does not know the
+        viewport begins it again.
+
+        Raises
+        ------
+        As `render`; after `Cancelled` the viewport is as it was, or not known.
+        """
+        description, ready = _encoded(frame)
+
+        def work() -> Passes:
+            if go_on:
+                answer, pictures = self._request(protocol.Refine(self._next(), name), {}, on_progress, cancelled)
+                if isinstance(answer, protocol.Result):
+                    return Passes(pictures, answer.warnings, answer.statistics)
+            return self._picture(
+                ready, lambda number, slots: protocol.View(number, name, description, slots), on_progress, cancelled
+            )
+
+        with self._exclusive(cancelled):
+            return self._repeating(work, on_progress, cancelled)
+
+    def wake(self) -> None:
+        """Have a request under way ask its `cancelled` at once. May be called from any thread, and never waits."""
+        child = self._child
+        if child is not None:
+            child.inbox.put(None)
 
     def close(self) -> None:
         """End the engine; a request under way ends with `Cancelled`, a later one starts a new engine."""
@@ -182,6 +211,22 @@ class EngineClient:
         child = getattr(self, "_child", None)
         if child is not None:
             child.kill()
+
+    def _picture(
+        self,
+        ready: dict[str, Array],
+        message: Callable[[int, dict[str, int]], Any],
+        on_progress: OnProgress | None,
+        cancelled: IsCancelled | None,
+    ) -> Passes:
+        """Send what changed of the arrays `ready` with a `message`, everything when the engine lacks something."""
+        for _ in range(2):
+            versions, changed = self._sent.changes(ready)
+            answer, pictures = self._request(message(self._next(), versions), changed, on_progress, cancelled)
+            if isinstance(answer, protocol.Result):
+                return Passes(pictures, answer.warnings, answer.statistics)
+            self._sent.forget()
+        raise Lost("keeps asking for arrays it was sent")
 
     # --- one request -----------------------------------------------------------------------------------------------
 
@@ -278,6 +323,8 @@ class EngineClient:
             if isinstance(item, Exception):
                 problem = f"did not start as an engine: it {child.epitaph()}"
                 raise DeviceError(self.command[0], problem, remedy) from item
+            if item is None:
+                continue
             greeting = item[0]
             if not isinstance(greeting, protocol.Hello):
                 raise DeviceError(self.command[0], "does not greet as an engine does", remedy)
@@ -348,6 +395,8 @@ class EngineClient:
             if child.preparing and on_progress is not None:
                 on_progress(_PREPARING, 0.0)
             return None
+        if item is None:  # see `wake`
+            return None
         if isinstance(item, CodecError):
             raise UsageError("frame", str(item), "Correct the setting or object it names") from item
         if isinstance(item, Exception):
@@ -359,6 +408,15 @@ class EngineClient:
         if isinstance(item[0], protocol.Failed) and item[0].id == 0:
             raise Lost(f"refused a message: {item[0].problem}")
         return item
+
+
+def _encoded(frame: Frame) -> tuple[dict[str, Any], dict[str, Array]]:
+    """Description and arrays of a frame; UsageError where it cannot be sent."""
+    try:
+        description, arrays = encode_frame(frame)
+        return description, {slot: sendable(array) for slot, array in arrays.items()}
+    except CodecError as error:
+        raise UsageError(f"frame {frame.number}", str(error), "Correct the setting or object it names") from error
 
 
 def _as_error(failure: protocol.Failed) -> DrgsError:

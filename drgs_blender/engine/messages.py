@@ -118,6 +118,24 @@ class Render:
 
 
 @dataclass(slots=True)
+class View:
+    """Begin the picture of the viewport `view`: fields as of Render. The answer is its first, rough state."""
+
+    id: int
+    view: str
+    frame: dict[str, Any]
+    slots: dict[str, int]
+
+
+@dataclass(slots=True)
+class Refine:
+    """The next state of the picture of `view`, with more samples; answered by Need where it is not known."""
+
+    id: int
+    view: str
+
+
+@dataclass(slots=True)
 class Cancel:
     """Stop the request."""
 
@@ -130,7 +148,7 @@ class Shutdown:
 
 
 _FROM_ENGINE: tuple[type, ...] = (Hello, Loaded, Progress, Result, Need, Stopped, Failed, Alive)
-_FROM_CLIENT: tuple[type, ...] = (Welcome, LoadAsset, Render, Cancel, Shutdown)
+_FROM_CLIENT: tuple[type, ...] = (Welcome, LoadAsset, Render, View, Refine, Cancel, Shutdown)
 MESSAGES: dict[str, type] = {c.__name__: c for c in (*_FROM_ENGINE, *_FROM_CLIENT)}
 
 

@@ -6,10 +6,12 @@ import dataclasses
 
 import numpy as np
 
-from ..asset.model import MATERIAL_CHANNELS, Asset, PosedSurfels, as_float
+from ..adjust import adjusted
+from ..asset.model import MATERIAL_CHANNELS, Asset, PosedSurfels, Surfels, as_float
+from ..deform.matrix_driven import pose_by_matrix
 from ..deform.mesh_driven import MeshDriven
 from ..errors import AssetError, UsageError
-from ..frame import ObjectState
+from ..frame import ObjectState, Pose
 from ..render.trace.scene import TraceObject
 
 Array = np.ndarray
@@ -32,10 +34,79 @@ def _given(state: ObjectState, name: str, shape: tuple[int, ...], what: str) -> 
     return array
 
 
-def traced_object(state: ObjectState, asset: Asset) -> TraceObject:
+def world_vertices(vertices: Array, matrix: Array) -> Array:
+    """(n, 3) float32 vertices in world space, moved by a (4, 4) float64 matrix."""
+    return (vertices @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32)
+
+
+def moved_vertices(state: ObjectState, asset: Asset, pose: Pose) -> Array | None:
+    """World-space vertices of an object at another time; None where its matrix is no matrix.
+
+    Vertices of another number than now are taken as they are now.
+    """
+    now = asset.mesh.vertices if state.vertices is None else state.vertices
+    if np.shape(pose.matrices) != (1, 4, 4):
+        return None
+    vertices = now if pose.vertices is None or pose.vertices.shape != now.shape else pose.vertices
+    with np.errstate(over="ignore", invalid="ignore"):  # what is unusable, the scene leaves where it is
+        return world_vertices(vertices, np.asarray(pose.matrices[0], np.float64))
+
+
+def _material(state: ObjectState, name: str, rest: Array, what: str) -> Array:
+    """Material channel `name` within [0, 1]; the asset's, `rest`, where there is none or it is not a number."""
+    given = _given(state, name, rest.shape, what)
+    if given is None:
+        return rest
+    if given.min(initial=0) >= 0 and given.max(initial=1) <= 1:  # both are NaN where one value is
+        return given
+    return np.where(np.isnan(given), rest, np.clip(given, 0, 1))
+
+
+def _mask(state: ObjectState, vertices: int) -> Array | None:
+    """How much of the object's adjustment each vertex gets; AssetError where that is not one number a vertex."""
+    mask = None if state.adjustment is None else state.adjustment.mask
+    if mask is not None and mask.shape != (vertices,):
+        raise AssetError(
+            f"object {state.name}",
+            f"the mask of its adjustments has shape {mask.shape}, its asset has {vertices} vertices",
+            "Choose another mask",
+        )
+    return mask
+
+
+def _adjusted_surfels(state: ObjectState, posed: PosedSurfels, driven: MeshDriven | Surfels) -> PosedSurfels:
+    """Surfels with the object's adjustment; the mask is interpolated where they hang on the mesh."""
+    if state.adjustment is None:
+        return posed
+    mask = None
+    if isinstance(driven, MeshDriven):
+        mask = _mask(state, len(driven.mesh.vertices))
+        if mask is not None:
+            corners = driven.mesh.faces[driven.binding.face]
+            mask = np.einsum("nk,nk->n", driven.binding.barycentric, mask[corners])
+    own = {name: getattr(posed, name) for name in MATERIAL_CHANNELS}
+    return dataclasses.replace(posed, **adjusted(own, state.adjustment, mask))
+
+
+def material_faults(state: ObjectState) -> list[str]:
+    """What is wrong with the material channels of an object, in words for the user."""
+    counts = {name: int(np.isnan(getattr(state, name)).sum()) for name in MATERIAL_CHANNELS if _has(state, name)}
+    return [
+        f"{state.name}: {count} values of its {name} are not numbers; the asset's are used there"
+        for name, count in counts.items()
+        if count
+    ]
+
+
+def _has(state: ObjectState, name: str) -> bool:
+    return getattr(state, name) is not None
+
+
+def traced_object(state: ObjectState, asset: Asset, seen_only: bool = False) -> TraceObject:
     """The object's mesh in world space with this frame's materials.
 
-    Faces are counter-clockwise seen from outside also where the object's matrix mirrors it.
+    Faces are counter-clockwise seen from outside also where the object's matrix mirrors it. `seen_only`: light meets
+    the object's surfels instead.
 
     Raises
     ------
@@ -57,14 +128,14 @@ def traced_object(state: ObjectState, asset: Asset) -> TraceObject:
     vertices = _given(state, "vertices", (n, 3), f"{n} vertices")
     vertices = mesh.vertices if vertices is None else vertices
     normals = _given(state, "corner_normals", (m, 3, 3), f"{m} faces")
-    albedo = _given(state, "albedo", (n, 3), f"{n} vertices")
-    roughness = _given(state, "roughness", (n,), f"{n} vertices")
-    metallic = _given(state, "metallic", (n,), f"{n} vertices")
+    materials = {name: _material(state, name, getattr(mesh, name), f"{n} vertices") for name in MATERIAL_CHANNELS}
+    if state.adjustment is not None:
+        materials = adjusted(materials, state.adjustment, _mask(state, n))
     linear = matrix[:3, :3]
-    determinant = float(np.linalg.det(linear))
     faces = mesh.faces
     with np.errstate(over="ignore", invalid="ignore"):  # bad vertices are counted by the scene
-        world = (vertices @ linear.T + matrix[:3, 3]).astype(np.float32)
+        determinant = float(np.linalg.det(linear))
+        world = world_vertices(vertices, matrix)
         if normals is not None:
             # Normals go through the cofactor matrix, which is defined for flattened objects too.
             turned = normals.reshape(-1, 3).astype(np.float64) @ _cofactors(linear).T
@@ -78,12 +149,11 @@ def traced_object(state: ObjectState, asset: Asset) -> TraceObject:
         name=state.name,
         vertices=world,
         faces=faces,
-        albedo=mesh.albedo if albedo is None else albedo,
-        roughness=mesh.roughness if roughness is None else roughness,
-        metallic=mesh.metallic if metallic is None else metallic,
+        **materials,
         corner_normals=normals,
         pass_index=state.pass_index,
         visibility=state.visibility,
+        seen_only=seen_only,
     )
 
 
@@ -93,15 +163,26 @@ def _cofactors(matrix: Array) -> Array:
     return np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)])
 
 
-def posed_surfels(state: ObjectState, index: int, driven: MeshDriven, traced: TraceObject) -> tuple[PosedSurfels, int]:
-    """The object's surfels in this frame, and how many are hidden because their vertices are not finite."""
+def posed_surfels(
+    state: ObjectState, index: int, driven: MeshDriven | Surfels, traced: TraceObject
+) -> tuple[PosedSurfels, int]:
+    """The object's surfels in this frame, and how many are hidden because their vertices are not finite.
+
+    `driven` is what poses them; surfels without a mesh follow the object's matrix.
+    """
     matrix = np.asarray(state.matrix_world, np.float64)
+    if isinstance(driven, Surfels):
+        return _adjusted_surfels(state, pose_by_matrix(driven, matrix, index), driven), 0
     normals = traced.corner_normals
     if normals is not None and np.linalg.det(matrix[:3, :3]) < 0:
         normals = np.ascontiguousarray(normals[:, _MIRRORED])  # back to the order of the asset's corners
-    materials = {name: getattr(state, name) for name in MATERIAL_CHANNELS}
+    mesh = driven.mesh
+    materials = {
+        name: _material(state, name, getattr(mesh, name), "a mesh") if _has(state, name) else None
+        for name in MATERIAL_CHANNELS
+    }
     posed = driven.pose(traced.vertices, normals, materials, matrix_world=matrix, object_index=index)
-    return posed, driven.lost
+    return _adjusted_surfels(state, posed, driven), driven.lost
 
 
 def join(parts: list[PosedSurfels]) -> PosedSurfels:

@@ -30,10 +30,12 @@ from .messages import (
     Need,
     Passes,
     Progress,
+    Refine,
     Render,
     Result,
     Shutdown,
     Stopped,
+    View,
     Welcome,
 )
 from .shared import Region
@@ -62,10 +64,12 @@ __all__ = [  # the messages are part of it
     "Progress",
     "ProtocolError",
     "RawIO",
+    "Refine",
     "Render",
     "Result",
     "Shutdown",
     "Stopped",
+    "View",
     "Welcome",
     "__version__",
     "pack",
@@ -77,7 +81,7 @@ __all__ = [  # the messages are part of it
 Array = np.ndarray
 
 #: Raised with every change of the messages. Two sides work together only when it and the version are the same.
-PROTOCOL = 1
+PROTOCOL = 3
 
 MAGIC = b"DRGS"
 PREFIX = struct.Struct("<4sIQ")  # magic, bytes of the header, bytes of arrays behind it in the pipe

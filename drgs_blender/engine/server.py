@@ -23,6 +23,7 @@ from ..errors import EXIT_INTERNAL, EXIT_OK, EXIT_VERSION, Cancelled, DeviceErro
 from ..version import __version__
 from . import protocol
 from .codec import CodecError, decode_frame
+from .limits import limit_memory, memory_wanted
 from .protocol import PROTOCOL, Link, ProtocolError
 from .shared import Region
 from .slots import HeldSlots
@@ -66,7 +67,7 @@ class Server:
                     self._last_cancelled = max(self._last_cancelled, message.id)
                 elif isinstance(message, protocol.Shutdown):
                     break
-                elif isinstance(message, (protocol.LoadAsset, protocol.Render)):
+                elif isinstance(message, (protocol.LoadAsset, protocol.Render, protocol.View, protocol.Refine)):
                     self._requests.put((message, arrays))
                 else:
                     raise ProtocolError(f"{type(message).__name__} is not for the engine, or not now")
@@ -109,7 +110,7 @@ class Server:
             except MemoryError:
                 logger.exception("request %d", message.id)
                 remedy = "Close other programs, or choose a lower resolution or fewer sub-pixel samples"
-                self._fail(message.id, "DrgsError", "engine", "ran out of memory", remedy)
+                self._fail(message.id, "EngineError", "engine", "ran out of memory", remedy)
             except Exception as error:
                 logger.exception("request %d", message.id)
                 problem = f"met an unexpected {type(error).__name__}: {str(error)[:500]}"
@@ -123,6 +124,9 @@ class Server:
             asset = session.asset(key)
             self._answer(protocol.Loaded(message.id, key, len(asset.mesh.vertices), len(asset.surfels)))
             return
+        if isinstance(message, protocol.Refine):
+            self._show(message, self._open_session().refine(message.view, self._progress, self._cancelled))
+            return
         held, missing = self.held.update(message.slots, arrays)
         if missing:
             self._answer(protocol.Need(message.id, missing))
@@ -131,8 +135,18 @@ class Server:
             frame = decode_frame(message.frame, held)
         except CodecError as error:
             raise DrgsError("frame", f"cannot be read: {error}", "Report it with the engine's log") from error
-        passes = self._open_session().render(frame, self._progress, self._cancelled)
-        self._answer(protocol.Result(message.id, passes.warnings, passes.statistics), passes)
+        session = self._open_session()
+        if isinstance(message, protocol.View):
+            self._show(message, session.view(message.view, frame, self._progress, self._cancelled))
+        else:
+            self._show(message, session.render(frame, self._progress, self._cancelled))
+
+    def _show(self, message: Any, passes: Any) -> None:
+        """Answer with a picture; with Need where there is none."""
+        if passes is None:
+            self._answer(protocol.Need(message.id, []))
+        else:
+            self._answer(protocol.Result(message.id, passes.warnings, passes.statistics), passes)
 
     def _open_session(self) -> Any:
         if self.session is None:
@@ -247,5 +261,7 @@ def main() -> None:
     faulthandler.enable(sys.stderr)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C in the terminal is for the client, which ends us
     die_with_parent()
+    if megabytes := memory_wanted(sys.argv):
+        limit_memory(megabytes)
     shake_hands(link)
     Server(link).serve()

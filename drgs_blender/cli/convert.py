@@ -1,0 +1,121 @@
+"""Write what a file holds in another format: assets, splats, meshes and environments for other programs.
+
+The format read is found from the content, the format written from the name of the output.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import UsageError
+from ..filetypes import Held
+from ..formats.axes import UP_AXES
+from ..sequence import frame_path, frames_of
+from .frame_range import check_template, parse_frames
+from .output import check_writable
+from .progress import clock
+from .relight import finite, positive
+from .sampling import whole
+
+EXAMPLES = """examples:
+  drgs convert capture.ply capture.spz
+  drgs convert helmet.drgs helmet.glb
+  drgs convert helmet.drgs helmet.ply --env studio.hdr --env-rotation 90
+  drgs convert robot.drgs robot.spz --vertices pose.npy
+  drgs convert robot.drgs 'splats/####.ply' --vertices 'poses/####.npy' --frames 1-24
+  drgs convert 'in/####.ply' 'out/####.spz' --frames
+  drgs convert splats.spz splats.ply --up=-y
+  drgs convert helmet.drgs light.exr
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``drgs convert``."""
+    parser.add_argument(
+        "input", type=Path, metavar="IN", help="asset, splats, mesh, environment, or a frame that Blender exported"
+    )
+    parser.add_argument("output", type=Path, metavar="OUT", help="file to write; its extension chooses the format")
+    parser.add_argument(
+        "--as", dest="kind", choices=("splats", "mesh", "environment"),
+        help="what to write of an asset; default: what OUT can hold, its mesh rather than its splats",
+    )  # fmt: skip
+    parser.add_argument(
+        "--up", choices=tuple(UP_AXES), help="up axis of the file written; default: what its format prescribes, else z"
+    )
+    parser.add_argument(
+        "--from-up", choices=tuple(UP_AXES), help="up axis of the file read; default: what its format says, else z"
+    )
+    parser.add_argument("--scale", type=positive, default=1.0, metavar="S", help="factor on all lengths")
+    parser.add_argument(
+        "--vertices", type=Path, metavar="V.npy", help="pose of an asset: (n, 3) array, the mesh's vertices, metres"
+    )
+    parser.add_argument(
+        "--frames", nargs="?", const="",
+        help="frames, one file each: #### in IN, OUT and V.npy becomes the number; 1-24, or nothing for those of IN",
+    )  # fmt: skip
+    splats = parser.add_argument_group("colour of splats")
+    splats.add_argument(
+        "--colour", choices=("captured", "albedo", "relit"),
+        help="the captured colour where there is one, else the albedo (default); the albedo; or that under the "
+        "environment (default with --env)",
+    )  # fmt: skip
+    splats.add_argument("--env", type=Path, help="environment that lights an asset (EXR, HDR); default: its own")
+    splats.add_argument("--env-rotation", type=finite, default=0.0, metavar="DEG", help="as in `drgs relight`")
+    splats.add_argument("--env-strength", type=finite, default=1.0, metavar="S", help="factor on the environment")
+    splats.add_argument("--rays", type=whole(1, 65536), default=256, metavar="N", help="samples a surfel; default 256")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Convert one file, or those of all frames."""
+    if args.frames is None:
+        convert(args)
+        return 0
+    frames = parse_frames(args.frames) if args.frames else frames_of(str(args.input))
+    check_template(str(args.output), frames)
+    for frame in frames:
+        paths = {name: path for name in ("input", "output", "vertices") if (path := getattr(args, name)) is not None}
+        of_frame = {name: frame_path(str(path), frame) for name, path in paths.items()}
+        convert(argparse.Namespace(**(vars(args) | of_frame)))
+    return 0
+
+
+def convert(args: argparse.Namespace) -> None:
+    """Read, convert, write, and say what was converted."""
+    from ..formats.writers import WRITERS, find_writer
+    from .convert_source import open_source
+
+    with clock(args, "reading"):
+        source = open_source(args)
+    kinds: list[Held] = [args.kind] if args.kind else list(source.kinds)
+    suffix = args.output.suffix.lower()
+    kind = next((k for k in kinds if any(w.kind == k and suffix in w.extensions for w in WRITERS)), kinds[0])
+    if kind not in source.kinds:
+        raise UsageError(str(args.input), f"holds no {kind}, but {', '.join(source.kinds)}", "Choose another --as")
+    writer = find_writer(args.output, kind)
+    if writer.fixed and args.up not in (None, writer.up):
+        raise UsageError("--up", f"is {args.up}, but {writer.name} is {writer.up} up", "Leave --up out")
+    check_writable(args.output)
+    up = args.up or writer.up
+    if kind == "environment":
+        environment = source.environment()
+        writer.write(args.output, environment)
+        height, width = environment.radiance.shape[:2]
+        print(f"{args.output}: {width} x {height} environment, {writer.name}")
+    elif kind == "mesh":
+        from ..formats.axes import vectors_from_z_up
+
+        mesh = source.mesh()
+        writer.write(args.output, replace(mesh, vertices=vectors_from_z_up(mesh.vertices * np.float32(args.scale), up)))
+        print(f"{args.output}: {len(mesh.faces)} triangles, {writer.name}, {up} up")
+    else:
+        from ..formats.splats import scaled, splats_from_z_up
+
+        splats, shown = source.splats()
+        writer.write(args.output, splats_from_z_up(scaled(splats, args.scale), up))
+        print(f"{args.output}: {len(splats)} splats, {writer.name}, {up} up, showing the {shown}")
+    for note in source.notes:
+        print(f"  {note}")

@@ -1,0 +1,224 @@
+"""What ``drgs convert`` reads: splats, mesh and light of a file, as far as it has them; Z up, in the chosen colour."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from typing import Protocol
+
+import numpy as np
+
+from ..asset import Asset, Environment, Mesh, Surfels
+from ..errors import UsageError
+from ..filetypes import Held
+from ..formats.splats import Splats, join_splats, splats_of
+from ..frame import RenderSettings, World, split_rays
+from .placed_frame import surface_frame
+from .progress import FractionBar
+from .relight import read_environment, read_vertices, rotation_z
+
+Array = np.ndarray
+
+_SHOWN = {
+    "captured": "captured colour",
+    "albedo": "albedo",
+    "relit": "colour under the environment",
+    "scene": "colour in the light of the scene",
+}
+#: Rows of an environment that has no picture.
+_PLAIN = 8
+
+
+class Source(Protocol):
+    """What a file holds.
+
+    Attributes
+    ----------
+    kinds : best first
+    notes : what its reader converted or assumed
+    """
+
+    kinds: tuple[Held, ...]
+    notes: list[str]
+
+    def splats(self) -> tuple[Splats, str]:
+        """The splats, and what their colour is."""
+
+    def mesh(self) -> Mesh:
+        """The mesh with its materials."""
+
+    def environment(self) -> Environment:
+        """The light."""
+
+
+def open_source(args: argparse.Namespace) -> Source:
+    """Read ``args.input``. Raises AssetError, or UsageError for options that do not go with it."""
+    from ..engine.frame_file import SUFFIX
+    from ..formats.axes import surfels_to_z_up
+    from ..formats.files import EnvironmentFile, MeshFile, SurfelFile
+    from ..formats.registry import read
+
+    suffix = args.input.suffix.lower()
+    if suffix in (".drgs", SUFFIX) and args.from_up not in (None, "z"):
+        raise UsageError("--from-up", "is given for what is always Z up", "Leave it out")
+    if suffix == ".drgs":
+        from ..asset.container import read_asset
+
+        return AssetSource(args, read_asset(args.input))
+    if args.vertices:
+        raise UsageError("--vertices", "poses an asset, but the input is none", "Leave it out")
+    if suffix == SUFFIX:
+        return FrameSource(args)
+    file = read(args.input)
+    if isinstance(file, SurfelFile):
+        surfels = surfels_to_z_up(file.surfels, args.from_up or file.up or "z")
+        return AssetSource(args, Asset(surfels, Mesh.empty()), file.notes)
+    if isinstance(file, EnvironmentFile):
+        return AssetSource(args, Asset(_nothing(), Mesh.empty(), environment=file.environment), file.notes)
+    if isinstance(file, MeshFile):
+        from ..build.make import mesh_with_materials
+
+        mesh, report = mesh_with_materials(file, str(args.input), up=args.from_up)
+        return AssetSource(args, Asset(_nothing(), mesh), report["notes"])
+    raise UsageError(str(args.input), "holds materials alone", "Make an asset of it and its mesh first")
+
+
+class AssetSource:
+    """An asset, or what another file holds of one."""
+
+    def __init__(self, args: argparse.Namespace, asset: Asset, notes: list[str] | None = None) -> None:
+        self._args, self._asset, self.notes = args, asset, notes or []
+        self._vertices = asset.mesh.vertices
+        self._posed = args.vertices is not None
+        if self._posed:
+            given = read_vertices(args.vertices)
+            if given.shape != self._vertices.shape:
+                problem = f"are {len(given)}, but the mesh has {len(self._vertices)}"
+                raise UsageError("--vertices", problem, "Pose this asset")
+            self._vertices = given
+        held: dict[Held, bool] = {
+            "mesh": len(asset.mesh.faces) > 0,
+            "splats": len(asset.surfels) > 0,
+            "environment": asset.environment is not None,
+        }
+        self.kinds: tuple[Held, ...] = tuple(kind for kind, there in held.items() if there)
+        if not self.kinds:
+            raise UsageError(str(args.input), "holds neither splats nor a mesh nor an environment", "Choose another")
+
+    def environment(self) -> Environment:
+        """The light of the file."""
+        assert self._asset.environment is not None
+        return self._asset.environment
+
+    def mesh(self) -> Mesh:
+        """The mesh, posed."""
+        return replace(self._asset.mesh, vertices=self._vertices)
+
+    def splats(self) -> tuple[Splats, str]:
+        """The surfels, posed, in the colour that was chosen."""
+        args, asset, surfels = self._args, self._asset, self._asset.surfels
+        if self._posed:
+            from ..build.export import posed_surfels
+
+            surfels = posed_surfels(asset, self._vertices)
+        choice = args.colour or ("relit" if args.env else "captured")
+        if choice != "relit":
+            return _unlit(surfels, choice)
+        from ..build.relit import relit_colours
+
+        args.asset = args.input  # as `drgs relight` names it in messages
+        world = World(read_environment(args, asset), rotation_z(args.env_rotation), strength=args.env_strength)
+        cosine, ggx, environment = split_rays(args.rays)
+        settings = RenderSettings(cosine=cosine, ggx=ggx, environment=environment, aa=1)
+        with FractionBar(args, "lighting") as progress:
+            colour = relit_colours(asset, surfels, self._vertices, world, settings, progress)
+        return splats_of(surfels, colour), _SHOWN["relit"]
+
+
+class FrameSource:
+    """The DR-GS objects that the camera may see in a frame of Blender's, where they are in the world, and the light."""
+
+    def __init__(self, args: argparse.Namespace) -> None:
+        from ..engine.session import Session
+
+        if args.env:
+            raise UsageError("--env", "is given for a frame, which has its own light", "Leave it out")
+        self._args, session = args, Session()
+        self._frame = surface_frame(args.input, args.rays, session)
+        self.notes: list[str] = []
+        (self._scene, self._light, _, self._lamps, self._tree), self._objects = session.place(self._frame)
+        self._seen = [i for i, item in enumerate(self._objects) if item.state.visibility.camera]
+        self._session = session  # keeps the scene
+        faces = any(len(self._objects[i].mesh.faces) for i in self._seen)
+        kinds: list[Held] = ["mesh"] if faces else []
+        self.kinds: tuple[Held, ...] = (*kinds, "splats", "environment") if self._seen else ("environment",)
+
+    def environment(self) -> Environment:
+        """The World, turned as it is in the scene."""
+        from ..formats.latlong import directions
+
+        picture = self._frame.world.environment
+        look = directions(_PLAIN if picture is None else len(picture))
+        radiance = self._light.lookup(look.reshape(-1, 3).astype(np.float32)).reshape(look.shape)
+        return Environment(radiance)
+
+    def mesh(self) -> Mesh:
+        """All meshes as one, with the materials they have in the frame."""
+        meshes = [self._objects[i].mesh for i in self._seen]
+        first = np.cumsum([0, *(len(m.vertices) for m in meshes)])
+
+        def joined(name: str) -> Array:
+            return np.concatenate([getattr(mesh, name) for mesh in meshes])
+
+        return Mesh(
+            joined("vertices"),
+            np.concatenate([m.faces + start for m, start in zip(meshes, first, strict=False)]),
+            joined("albedo"),
+            joined("roughness"),
+            joined("metallic"),
+        )
+
+    def splats(self) -> tuple[Splats, str]:
+        """The surfels of all objects, in the colour that was chosen."""
+        choice = self._args.colour or "captured"
+        if choice != "relit":
+            parts = [_unlit(self._surfels(i), choice) for i in self._seen]
+            return join_splats([splats for splats, _ in parts]), " or the ".join(dict.fromkeys(s for _, s in parts))
+        with FractionBar(self._args, "lighting") as progress:
+            lit = [self._lit(i, progress) for i in self._seen]
+        return join_splats(lit), _SHOWN["scene"]
+
+    def _surfels(self, index: int) -> Surfels:
+        from ..build.export import surfels_of_pose
+
+        item = self._objects[index]
+        return surfels_of_pose(item.asset.surfels, item.surfels)
+
+    def _lit(self, index: int, progress: FractionBar) -> Splats:
+        from ..build.relit import lit_colours, own_surfels, points_of_surfels, points_on_mesh
+
+        item, surfels, tree = self._objects[index], self._surfels(index), self._tree
+        size = 0.0 if tree is None else float(tree.sizes(len(self._objects))[index])
+        if item.asset.binding is None:
+            points = points_of_surfels(surfels, index, size)
+        else:
+            faces, binding = item.asset.mesh.faces, item.asset.binding
+            mirrored = np.linalg.det(item.state.matrix_world[:3, :3]) < 0
+            points = points_on_mesh(surfels, item.mesh.vertices, faces, binding, mirrored=bool(mirrored))
+            points = points if tree is None else own_surfels(points, index, size)
+        settings = self._frame.settings
+        colour = lit_colours(self._scene, self._light, points, settings, self._lamps, tree, progress)
+        return splats_of(surfels, colour)
+
+
+def _unlit(surfels: Surfels, choice: str) -> tuple[Splats, str]:
+    """Splats in the captured colour or the albedo, and which of them it is."""
+    if choice == "albedo" or surfels.sh is None:
+        return splats_of(surfels, surfels.albedo), _SHOWN["albedo"]
+    return splats_of(surfels), _SHOWN["captured"]
+
+
+def _nothing() -> Surfels:
+    """No surfels."""
+    rows, numbers = np.empty((0, 3), np.float32), np.empty(0, np.float32)
+    return Surfels(rows, rows[:, :2], np.empty((0, 4), np.float32), numbers, rows, numbers, numbers)

@@ -1,0 +1,189 @@
+"""Denoise rendered frames with the help of their neighbours: the second step after `drgs render`.
+
+Each frame is made from the noisy frames around it (two before and two after by default), read from disk, whatever is
+denoised in the same run: however a sequence is divided among runs and machines, the frames have the same bits. Motion
+is followed, cuts are found by the cameras that the frames name. The first and last frames have fewer neighbours: those
+that are there, or that --sequence names.
+
+The noisy frames come from `drgs render --denoise none --passes temporal`, or from a scene in which For Temporal
+Denoising is on. Frames that are already denoised, from the same noisy ones, are skipped.
+
+The last line is DRGS_EXIT class=ok, or the class of what went wrong.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..errors import AssetError, UsageError
+from ..passes import BY_NAME
+from ..sequence import frame_path
+from ..version import __version__
+from . import sampling
+from .frame_lines import FrameLines
+from .frame_range import check_template, parse_frames
+from .output import check_suffix, check_writable
+from .progress import bar
+
+if TYPE_CHECKING:
+    from ..render.picture.shots import NoisyFrame
+
+EXAMPLES = """examples:
+  drgs denoise 'noisy/####.exr' --frames 1-24 --out 'clean/####.exr'
+  drgs denoise 'noisy/####.exr' --frames 9-16 --sequence 1-24 --out 'clean/####.exr' --passes Combined,Depth
+the frames for it:
+  drgs render shot.blend --frames 1-24 --denoise none --passes temporal --out 'noisy/####.exr'
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``drgs denoise``."""
+    parser.add_argument("noisy", metavar="PATTERN", help="noisy EXR files; #### is the frame's number")
+    parser.add_argument("--frames", required=True, help="frames to denoise: 1-24, 1-24x2,30")
+    parser.add_argument("--out", required=True, metavar="PATTERN", help="EXR files to write")
+    parser.add_argument("--window", type=odd, default=5, metavar="N", help="frames that make one, odd; default 5")
+    parser.add_argument(
+        "--sequence",
+        metavar="FRAMES",
+        help="all frames of the shot: one that is missing is an error. Default: the neighbours that are there",
+    )
+    parser.add_argument(
+        "--passes", type=sampling.passes, metavar="NAMES", help="passes to write; default: what the noisy frames hold"
+    )
+    parser.add_argument(
+        "--threads", type=sampling.whole(0, 1024), default=0, help="threads, 0 for all cores; default 0"
+    )
+    parser.add_argument("--overwrite", action="store_true", help="denoise frames that are already there, too")
+
+
+def odd(text: str) -> int:
+    """An odd whole number from 1 to 15."""
+    value = sampling.whole(1, 15)(text)
+    if value % 2 == 0:
+        raise argparse.ArgumentTypeError(f"{value} is not odd")
+    return value
+
+
+def run(args: argparse.Namespace) -> int:
+    """Denoise every frame that is not there yet."""
+    frames = parse_frames(args.frames)
+    sequence = None if args.sequence is None else set(parse_frames(args.sequence))
+    for template in (args.noisy, args.out):
+        check_template(template, frames)
+        check_suffix(Path(template), (".exr",))
+    if frame_path(args.noisy, frames[0]).resolve() == frame_path(args.out, frames[0]).resolve():
+        raise UsageError(f"--out {args.out}", "is where the noisy frames are", "Choose another folder or name")
+    if sequence is not None and not sequence.issuperset(frames):
+        raise UsageError("--frames", "has frames that are not in --sequence", "Give all frames of the shot there")
+    check_writable(frame_path(args.out, frames[0]))
+
+    from ..jit import use_threads
+    from . import frame_store
+
+    use_threads(args.threads)
+    source = _Source(args.noisy, sequence, args.window)
+    same_noise = False
+    with FrameLines() as lines, bar(args, "frames", len(frames)) as progress:
+        for number in frames:
+            lines.begin(number)
+            path, settings = frame_path(args.out, number), source.settings(number, args.passes)
+            whole = None if args.overwrite else frame_store.read_whole(path)
+            if whole is not None and whole[1].get(frame_store.SETTINGS) == settings:
+                lines.skipped(path)
+            else:
+                middle, pictures, repeated = source.denoise(number, args.passes)
+                if repeated and not same_noise:
+                    lines.note("neighbours have the same noise, which stays; switch on Animated Seed")
+                same_noise |= repeated
+                kept = {k: v for k, v in middle.metadata.items() if k in ("frame", "seed", "camera")}
+                extra = {frame_store.SETTINGS: settings, "denoise": f"svgf, window of {args.window}"}
+                frame_store.write_frame(path, pictures, kept | extra)
+                lines.saved(path)
+            progress.update()
+    return 0
+
+
+def _held(noisy: NoisyFrame) -> tuple[str, ...]:
+    """Passes of a noisy frame that a denoised one has as well: all that are not for this step alone."""
+    from ..render.picture.film import COMPONENTS
+
+    return tuple(name for name in BY_NAME if name in noisy.passes or name in COMPONENTS)
+
+
+class _Source:
+    """The noisy frames, of which a window is kept in memory."""
+
+    def __init__(self, template: str, sequence: set[int] | None, window: int) -> None:
+        self._template, self._sequence = template, sequence
+        self._reach = window // 2
+        self._held: dict[int, NoisyFrame] = {}
+
+    def _path(self, number: int) -> Path | None:
+        """File of a frame; None where the sequence has none."""
+        path = frame_path(self._template, number)
+        if self._sequence is None:
+            return path if path.is_file() else None
+        return path if number in self._sequence else None
+
+    def _window(self, number: int) -> list[int | None]:
+        """The frames that decide on one, None where the sequence has ended."""
+        if self._path(number) is None:
+            path = frame_path(self._template, number)
+            raise AssetError(str(path), "does not exist", "Render this frame first")
+        around = range(number - self._reach, number + self._reach + 1)
+        return [k if self._path(k) is not None else None for k in around]
+
+    def settings(self, number: int, passes: tuple[str, ...] | None) -> str:
+        """SHA-256 over all that decides what the denoised frame is."""
+        from ..render.picture.frames import read_checksum
+
+        sums = [None if k is None else read_checksum(frame_path(self._template, k)) for k in self._window(number)]
+        return hashlib.sha256(json.dumps([__version__, passes, sums]).encode()).hexdigest()
+
+    def frame(self, number: int) -> NoisyFrame:
+        """A noisy frame, read when first needed."""
+        from ..render.picture.shots import read_noisy
+
+        if number not in self._held:
+            path = frame_path(self._template, number)
+            noisy = read_noisy(path)
+            if noisy.metadata.get("frame", str(number)) != str(number):
+                raise AssetError(str(path), f"is frame {noisy.metadata['frame']}", "Give it the name of its number")
+            self._held[number] = noisy
+        return self._held[number]
+
+    def denoise(self, number: int, passes: tuple[str, ...] | None) -> tuple[NoisyFrame, dict[str, np.ndarray], bool]:
+        """The noisy frame, its denoised passes, and whether a neighbour has the very same noise."""
+        from ..render.picture.film import COMPONENTS
+        from ..render.picture.temporal import Shot, window
+
+        around = self._window(number)
+        for old in [k for k in self._held if k not in around]:
+            del self._held[old]
+        noisy = [None if k is None else self.frame(k) for k in around]
+        middle = self.frame(number)
+        shots: list[Shot | None] = []
+        for before, item in zip([None, *noisy], noisy):
+            if item is None:
+                shots.append(None)
+                continue
+            shot = item.shot
+            linked = before is not None and item.follows(before)
+            shots.append(Shot(shot.components, shot.variance, shot.guides, shot.motion if linked else None))
+        wanted = passes or _held(middle)
+        light = window(shots, split=any(name in COMPONENTS for name in wanted))
+        made = {name: light[:, :, i] for i, name in enumerate(COMPONENTS)}
+        made |= middle.passes | {"Combined": middle.beauty(light), "Noisy Image": middle.passes["Combined"]}
+        absent = [name for name in wanted if name not in made]
+        if absent:
+            raise UsageError(
+                f"pass {absent[0]!r}", "is not in the noisy frames", "Render it, or leave it out of --passes"
+            )
+        noises = [(n.metadata.get("seed"), n.metadata.get("noise")) for n in noisy if n is not None]
+        return middle, {name: made[name] for name in wanted}, len(set(noises)) < len(noises)

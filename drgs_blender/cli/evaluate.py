@@ -1,0 +1,190 @@
+"""Score an asset against its capture: views left out, and lights, poses, materials and shape where they are known.
+
+With --make-scenes, Cycles renders scenes of which everything is known, for this command and any other program.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..errors import UsageError
+from ..formats.axes import UP_AXES
+from ..frame import Camera, Frame, ObjectState, RenderSettings, World
+from . import sampling
+from .output import check_writable
+from .progress import FractionBar
+
+if TYPE_CHECKING:
+    from ..engine.session import Session
+    from ..evaluate.compare import Renderer
+    from ..evaluate.scenes import Plan
+
+logger = logging.getLogger(__name__)
+
+EXAMPLES = """examples:
+  drgs evaluate head.drgs photographs/head --test-every 8
+  drgs evaluate spot.drgs scenes/spot --json
+  drgs evaluate lego.drgs TensoIR/lego --relit TensoIR/lego lights/city.hdr --relit TensoIR/lego lights/night.hdr
+  drgs evaluate --make-scenes scenes
+  drgs evaluate --make-scenes scenes --objects spot fern --size 128 --train 40 --test 8 --samples 24
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``drgs evaluate``."""
+    parser.add_argument("asset", type=Path, nargs="?", metavar="A.drgs", help="asset")
+    parser.add_argument("capture", type=Path, nargs="?", metavar="CAPTURE", help="folder or file of the photographs")
+    parser.add_argument("--json", action="store_true", help="write the figures as JSON")
+    parser.add_argument("--pictures", type=Path, metavar="DIR", help="write ours beside the true ones")
+    parser.add_argument(
+        "--test-every", type=sampling.whole(2, 10**6), metavar="N", help="views left out, if the capture does not say"
+    )
+    parser.add_argument(
+        "--resolution", type=sampling.whole(8, 65536), metavar="N", help="longer side of the views left out"
+    )
+    parser.add_argument("--axes", default="opengl", help="as given to drgs reconstruct")
+    parser.add_argument("--up", choices=tuple(UP_AXES), help="as given to drgs reconstruct")
+    parser.add_argument(
+        "--lpips",
+        type=Path,
+        nargs=2,
+        metavar=("ALEXNET", "HEADS"),
+        help="weights for LPIPS: torchvision's AlexNet and LPIPS's linear layers; without them it is not computed",
+    )
+    parser.add_argument(
+        "--relit",
+        type=Path,
+        nargs=2,
+        action="append",
+        default=[],
+        metavar=("CAPTURE", "LIGHT"),
+        help="a capture of the object under a known light (EXR, HDR), which is named as the pictures where a layout "
+        "has several lights (TensoIR); may be given several times",
+    )
+    scenes = parser.add_argument_group("scenes with known truth")
+    scenes.add_argument("--make-scenes", type=Path, metavar="OUT", help="render them; goes on where it was stopped")
+    scenes.add_argument("--small", action="store_true", help="one object, small and few views, in two minutes")
+    scenes.add_argument("--objects", nargs="+", metavar="NAME", help="which objects")
+    scenes.add_argument("--size", type=sampling.whole(16, 4096), help="pixels of a side")
+    scenes.add_argument("--train", type=sampling.whole(2, 10000), metavar="N", help="training views")
+    scenes.add_argument("--test", type=sampling.whole(2, 10000), metavar="N", help="views left out")
+    scenes.add_argument("--samples", type=sampling.whole(1, 65536), help="of Cycles, a pixel, before denoising")
+    scenes.add_argument(
+        "--lights", nargs="+", metavar="NAME", help="Blender's studio lights or files; the first is for training"
+    )
+    scenes.add_argument("--meshes", type=Path, metavar="DIR", help="folder of the example meshes")
+    scenes.add_argument("--blender", metavar="PATH", help="Blender, or a Python that has bpy")
+    sampling.add_arguments(parser, defaults=True, output=False)
+    parser.set_defaults(rays=128, film_transparent=True)  # sampling.override looks for both
+
+
+def run(args: argparse.Namespace) -> int:
+    """Make scenes, or score one asset."""
+    if args.make_scenes is not None:
+        if args.asset is not None:
+            raise UsageError("--make-scenes", "takes no asset", "Score assets in a second command")
+        return make(args)
+    if args.asset is None or args.capture is None:
+        raise UsageError("drgs evaluate", "needs an asset and its capture", "See `drgs evaluate --help`")
+    return score(args)
+
+
+def make(args: argparse.Namespace) -> int:
+    """Render scenes with known truth."""
+    from ..evaluate.scenes import make_scenes
+    from .find_blender import CHECKOUT, find_blender
+
+    plan = plan_of(args)
+    check_writable(args.make_scenes / "plan.json")
+    script = Path(__file__).resolve().parents[1] / "evaluate" / "scene_job.py"
+    command = find_blender(args.blender).command(script)
+    meshes = args.meshes or CHECKOUT / "examples"
+    with FractionBar(args, "rendering") as bar:
+        folders = make_scenes(
+            args.make_scenes, plan, command, meshes, lambda done, of, name: bar(name, done / of), args.threads
+        )
+    for folder in folders:
+        print(folder)
+    return 0
+
+
+def plan_of(args: argparse.Namespace) -> Plan:
+    """What the options ask for."""
+    from ..evaluate.scenes import SMALL, Plan
+
+    given: dict[str, Any] = {
+        name: value for name in ("size", "train", "test", "samples") if (value := getattr(args, name)) is not None
+    }
+    given |= {name: tuple(value) for name in ("objects", "lights") if (value := getattr(args, name)) is not None}
+    return replace(SMALL if args.small else Plan(), **given)
+
+
+def score(args: argparse.Namespace) -> int:
+    """Compare one asset with its capture."""
+    settings = sampling.override(RenderSettings(), args)
+    if args.pictures is not None:
+        check_writable(args.pictures / "novel-000.png")
+
+    from ..asset.container import digest_asset
+    from ..engine.session import Session
+    from ..evaluate.compare import compare, source_name, table
+    from ..evaluate.lpips import Lpips
+    from ..evaluate.truth import Truth, read_relit, read_truth
+    from ..reconstruct.readers import read_capture
+
+    lpips = Lpips(*args.lpips) if args.lpips else None
+    session = Session()
+    key = session.load_asset(args.asset)
+    capture = read_capture(args.capture, args.resolution, args.test_every, args.axes, args.up)
+    truth = read_truth(args.capture)
+    relit = [read_relit(folder, light, args.resolution, args.axes, args.up) for folder, light in args.relit]
+    if relit:
+        truth = truth or Truth([])
+        truth.sets += relit
+
+    with FractionBar(args, "rendering") as bar:
+        report = compare(
+            session.asset(key),
+            capture,
+            truth,
+            session_renderer(session, key, settings),
+            lpips,
+            lambda part, name: bar(name, part),
+            writer(args.pictures) if args.pictures is not None else None,
+        )
+    report = {"asset": digest_asset(key), "capture": source_name(args.capture), "rays": settings.rays, **report}
+    print(json.dumps(report, indent=1) if args.json else "\n".join(table(report)))
+    return 0
+
+
+def session_renderer(session: Session, key: str, settings: RenderSettings) -> Renderer:
+    """Renders the loaded asset `key` for `evaluate.compare`, with `settings` on a transparent film."""
+    from ..evaluate.compare import PASSES
+
+    settings = replace(settings, film_transparent=True)
+
+    def render(camera: Camera, radiance: np.ndarray, vertices: np.ndarray | None) -> dict[str, np.ndarray]:
+        state = ObjectState(name=Path(key).stem, asset=key, vertices=vertices)
+        world = World(radiance)
+        frame = Frame(number=1, camera=camera, objects=[state], world=world, settings=settings, passes=PASSES)
+        return dict(session.render(frame))
+
+    return render
+
+
+def writer(folder: Path) -> Any:
+    """Writes pictures: ours on the left, the true one in the middle, their difference on the right."""
+    from ..formats.images import write_png
+
+    def show(name: str, number: int, ours: np.ndarray, true: np.ndarray) -> None:
+        strip = np.concatenate([ours, true, np.abs(ours - true)], axis=1)
+        write_png(folder / f"{name}-{number:03d}.png", (np.clip(strip, 0, 1) * 255 + 0.5).astype(np.uint8))
+
+    return show

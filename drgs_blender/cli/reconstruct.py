@@ -1,0 +1,130 @@
+"""Make an asset from calibrated photographs: surfels, a closed mesh, materials and light.
+
+CAPTURE is a folder or file of NeRF-synthetic, nerfstudio, COLMAP, LLFF, NeRO GlossySynthetic or TensoIR. A run that
+was stopped goes on when the same command is given again. While it works, a picture beside the output,
+A.preview.png, shows a view as it is now and its photograph.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import math
+import shutil
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ..formats.axes import UP_AXES
+from .output import check_suffix, check_writable, write_and_report
+from .progress import FractionBar
+from .sampling import whole
+
+if TYPE_CHECKING:
+    from ..reconstruct.job import Progress
+
+logger = logging.getLogger(__name__)
+
+EXAMPLES = """examples:
+  drgs reconstruct lego --out lego.drgs --resolution 400 --minutes 10
+  drgs reconstruct statue/colmap --out statue.drgs --test-every 8 --variant m
+"""
+
+#: Seconds between two lines of progress on stdout.
+_TELL_EVERY = 10.0
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``drgs reconstruct``."""
+    parser.add_argument("capture", type=Path, metavar="CAPTURE", help="folder or file of photographs with cameras")
+    parser.add_argument("--out", type=Path, required=True, metavar="A.drgs", help="asset to write")
+    parser.add_argument(
+        "--variant",
+        choices=("p", "m"),
+        default="p",
+        help="p keeps free surfels, for particles and for meshes (default); m hangs them on the mesh's faces",
+    )
+    parser.add_argument("--resolution", type=whole(8, 1 << 16), metavar="N", help="pixels of the longer side, at most")
+    parser.add_argument("--iterations", type=whole(1, 10**7), metavar="N", help="steps of the surfels; default 3000")
+    parser.add_argument("--surfels", type=whole(10, 5_000_000), metavar="N", help="how many; default 16000")
+    parser.add_argument("--voxels", type=whole(16, 1024), metavar="N", help="of the mesh's longest side; default 256")
+    parser.add_argument("--minutes", type=_minutes, metavar="M", help="all stages together, about")
+    parser.add_argument(
+        "--test-every", type=whole(2, 10**6), metavar="K", help="leave out every K-th view, and measure on those"
+    )
+    parser.add_argument(
+        "--materials",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="pull materials and light apart; without, the albedo is the photographed colour",
+    )
+    parser.add_argument("--axes", default="opengl", metavar="NAME", help="what the cameras' matrices are taken for")
+    parser.add_argument("--up", choices=tuple(UP_AXES), help="up axis of the capture's world; default: found")
+
+
+def _minutes(text: str) -> float:
+    value = float(text)
+    if not (math.isfinite(value) and value > 0):
+        raise argparse.ArgumentTypeError(f"{text} is not a time above zero")
+    return value
+
+
+def run(args: argparse.Namespace) -> int:
+    """Reconstruct one capture."""
+    check_suffix(args.out, (".drgs",))
+    check_writable(args.out)
+
+    from ..errors import DeviceError
+
+    try:
+        from ..reconstruct.job import Settings, reconstruct
+    except ImportError as error:
+        if error.name != "torch":
+            raise
+        raise DeviceError("drgs reconstruct", "needs PyTorch", 'Install it: pip install "torch>=2.5"') from error
+    from ..reconstruct.readers import read_capture
+    from ..reconstruct.train import Schedule
+
+    capture = read_capture(args.capture, args.resolution, args.test_every, args.axes, args.up)
+    logger.info("%d views to learn from, %d left out", len(capture.training), len(capture.testing))
+    given = {"iterations": args.iterations, "surfels": args.surfels}
+    settings = Settings(
+        variant=args.variant,
+        schedule=Schedule(**{name: value for name, value in given.items() if value is not None}),
+        mesh_resolution=args.voxels or Settings().mesh_resolution,
+        minutes=args.minutes,
+        materials=args.materials,
+    )
+    work = args.out.with_name(f"{args.out.stem}.reconstruct")
+    with FractionBar(args, "reconstructing") as bar:
+        teller = _Teller(args, bar)
+        asset = reconstruct(capture, settings, teller, folder=work)
+    write_and_report(args.out, asset)
+    shutil.rmtree(work, ignore_errors=True)
+    report = asset.provenance["report"]
+    if "psnr" in report:
+        print(f"  views left out: PSNR {report['psnr']:.2f} dB, SSIM {report['ssim']:.4f}")
+    return 0
+
+
+class _Teller:
+    """Shows progress: a bar, lines on stdout that programs may read, the preview."""
+
+    def __init__(self, args: argparse.Namespace, bar: FractionBar) -> None:
+        self._bar, self._quiet, self._next = bar, args.quiet, 0.0
+        self._preview = args.out.with_name(f"{args.out.stem}.preview.png")
+
+    def __call__(self, progress: Progress) -> None:
+        self._bar(f"{progress.phase}, {progress.surfels} surfels, {progress.psnr:.1f} dB", progress.part)
+        now = time.monotonic()
+        if not self._quiet and now >= self._next:
+            self._next = now + _TELL_EVERY
+            print(
+                f"DRGS_PROGRESS part={progress.part:.3f} surfels={progress.surfels} psnr={progress.psnr:.2f} "
+                f'phase="{progress.phase}"',
+                flush=True,
+            )
+        if progress.picture is not None:
+            from ..formats.images import write_png
+
+            write_png(self._preview, (progress.picture * 255 + 0.5).astype("uint8"))

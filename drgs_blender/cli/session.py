@@ -1,0 +1,199 @@
+"""Keep Blender, with its scene, and an engine from one chunk of frames to the next: for farms that run many tasks on
+a node one after the other.
+
+`start` begins a process in the background, `drgs render --session FOLDER` has it render, `stop` ends it. It ends by
+itself when the folder or the program that started it (Linux) is gone, and when nothing was asked of it for long.
+`serve` is that process in the foreground.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import logging
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ..asset.archive import replace_file
+from ..errors import EngineError, UsageError
+from . import sampling
+from .session_link import FORGOTTEN_SECONDS, POLL_SECONDS, Lock, end, is_running, own_folder
+
+if TYPE_CHECKING:
+    from .machine import Machine
+
+logger = logging.getLogger(__name__)
+
+START_SECONDS = 60.0
+#: After so long the command that started the session has ended, and who lives of its ancestors is the farm's worker.
+_SETTLED_SECONDS = 5.0
+
+EXAMPLES = """examples:
+  drgs session start /tmp/warm
+  drgs render shot.blend --frames 1-8 --out 'frames/####.exr' --session /tmp/warm
+  drgs render shot.blend --frames 9-16 --out 'frames/####.exr' --session /tmp/warm
+  drgs session stop /tmp/warm
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``drgs session``."""
+    parser.add_argument("action", choices=("start", "stop", "serve"))
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="of the session, for its owner alone")
+    parser.add_argument(
+        "--idle", type=sampling.whole(1, 1 << 20), default=1800, metavar="S", help="ends unused after; default 1800"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Start, stop or be the session's process."""
+    folder = args.folder.absolute()
+    if args.action == "stop":
+        end(folder)
+        return 0
+    own_folder(folder)
+    return start(folder, args.idle) if args.action == "start" else serve(folder, args.idle)
+
+
+def start(folder: Path, idle: int) -> int:
+    """Begin the process, and wait until it is there."""
+    if is_running(folder):
+        raise UsageError(f"session {folder}", "is running", "Stop it, or choose another folder")
+    command = [sys.executable, "-m", "drgs_blender.cli.main", "session", "serve", str(folder), f"--idle={idle}"]
+    # It inherits no stream: whoever runs this command would wait until it ends.
+    log = folder / "log"
+    apart = {"creationflags": 0x208} if os.name == "nt" else {"start_new_session": True}  # detached, in a group
+    with open(log, "wb") as out:
+        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=out, stderr=out, **apart)
+    deadline = time.monotonic() + START_SECONDS
+    while not is_running(folder):
+        if process.poll() is not None or time.monotonic() > deadline:
+            process.kill()
+            words = log.read_text("utf-8", "replace").strip().splitlines() or ["no words"]
+            raise EngineError(f"session {folder}", f"does not start: {words[-1]}", "Run `drgs doctor`")
+        time.sleep(POLL_SECONDS)
+    print(f"session {folder}: process {process.pid}")
+    return 0
+
+
+def serve(folder: Path, idle: int) -> int:
+    """Render what is asked for, until the session ends."""
+    from .machine import Machine
+
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+    with Machine(keep=True) as machine:
+        machine.engine().start()
+        lock = Lock(folder / "lock")
+        if not lock.take():
+            raise UsageError(f"session {folder}", "is running", "Stop it, or choose another folder")
+        for old in folder.iterdir():  # of a session that was killed
+            if old.name not in ("lock", "log"):
+                old.unlink()
+        (folder / "pid").write_text(str(os.getpid()))
+        life = _Life(folder, idle)
+        while True:
+            for request in folder.glob("request-*.json"):
+                with life.at_work(request):
+                    code = _answer(folder, request, machine)
+                if code in (130, 143):  # it was asked to end while it rendered
+                    return 0
+            time.sleep(POLL_SECONDS)
+
+
+def _answer(folder: Path, request: Path, machine: Machine) -> int:
+    """Run one command line; its exit code."""
+    from .main import run_command, set_up_logging
+    from .render import render
+
+    about = json.loads(request.read_text())
+    name = about["name"]
+    with contextlib.suppress(OSError):  # relative paths do not exist either where the folder is gone
+        os.chdir(about["cwd"])
+    with (
+        open(folder / f"{name}.out", "w", encoding="utf-8", buffering=1) as out,
+        open(folder / f"{name}.err", "w", encoding="utf-8", buffering=1) as err,
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+    ):
+        code = run_command(about["words"], lambda args: render(args, machine))
+    set_up_logging(0, False)  # it wrote to the file just closed
+    request.unlink(missing_ok=True)
+    replace_file(folder / f"{name}.code", [str(code).encode()])
+    return code
+
+
+class _Life:
+    """Asks this process to end when nobody needs it any more."""
+
+    def __init__(self, folder: Path, idle: int) -> None:
+        self._folder, self._idle = folder, idle
+        self._request: Path | None = None
+        self._since = self._born = time.monotonic()
+        self._ancestors = _ancestors()
+        threading.Thread(target=self._watch, daemon=True).start()
+
+    @contextlib.contextmanager
+    def at_work(self, request: Path) -> Iterator[None]:
+        """While a chunk is rendered somebody has to wait for it."""
+        self._request = request
+        try:
+            yield
+        finally:
+            self._request, self._since = None, time.monotonic()
+
+    def _watch(self) -> None:
+        worker: tuple[int, str] | None = None
+        while True:
+            time.sleep(0.5)
+            if worker is None and time.monotonic() - self._born > _SETTLED_SECONDS:
+                worker = next((each for each in self._ancestors if _alive(each)), None)
+            if (reason := self._reason(worker)) is not None:
+                logger.info("session %s: ends, %s", self._folder, reason)
+                os.kill(os.getpid(), signal.SIGTERM)
+                return
+
+    def _reason(self, worker: tuple[int, str] | None) -> str | None:
+        if not self._folder.is_dir():
+            return "its folder is gone"
+        if (self._folder / "stop").exists():
+            return "it was asked to"
+        if worker is not None and not _alive(worker):
+            return "who started it is gone"
+        request = self._request
+        if request is None:
+            return "nothing was asked of it" if time.monotonic() - self._since > self._idle else None
+        with contextlib.suppress(OSError):  # it has just been answered
+            if time.time() - request.stat().st_mtime > FORGOTTEN_SECONDS:
+                return "nobody waits for its frames"
+        return None
+
+
+def _ancestors() -> list[tuple[int, str]]:
+    """(process id, time of its start) of parent, grandparent and so on, without the system's first; Linux only."""
+    found: list[tuple[int, str]] = []
+    pid = os.getppid()
+    while pid > 1 and (fields := _stat(pid)):
+        found.append((pid, fields[19]))
+        pid = int(fields[1])
+    return found
+
+
+def _alive(process: tuple[int, str]) -> bool:
+    fields = _stat(process[0])
+    return bool(fields) and fields[19] == process[1] and fields[0] != "Z"
+
+
+def _stat(pid: int) -> list[str]:
+    """Fields of /proc/PID/stat from the state on."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+    except OSError:
+        return []

@@ -1,0 +1,162 @@
+"""How a chunk of frames reaches the engine of its session: files in a folder that only its owner may use.
+
+| File | |
+|---|---|
+| ``lock`` | locked as long as the session's process lives, whatever ends it |
+| ``request-N.json`` | command line and folder of a chunk; its date is renewed while somebody waits for the answer |
+| ``N.out``, ``N.err``, ``N.code`` | what the command printed so far, and at its end the exit code |
+| ``stop`` | asks the process to end |
+"""
+
+from __future__ import annotations
+
+import codecs
+import contextlib
+import json
+import os
+import secrets
+import signal
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import IO
+
+from ..asset.archive import replace_file
+from ..errors import EngineError, UsageError
+
+POLL_SECONDS = 0.05
+#: A chunk for which nobody has waited for so long is given up, with the process: its client was killed.
+FORGOTTEN_SECONDS = 30.0
+#: How long a process that was asked to end may take.
+END_SECONDS = 4.0
+
+
+class Lock:
+    """A lock on a file that ends with the process which holds it."""
+
+    def __init__(self, path: Path) -> None:
+        self._file: IO[bytes] = open(path, "a+b")  # noqa: SIM115 - open as long as it is locked
+
+    def take(self) -> bool:
+        """Lock it, unless another process has."""
+        try:
+            if sys.platform == "win32":
+                import msvcrt
+
+                self._file.seek(0)
+                msvcrt.locking(self._file.fileno(), msvcrt.LK_NBLCK, 1)
+            else:
+                import fcntl
+
+                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            return False
+        return True
+
+    def close(self) -> None:
+        """Give it back."""
+        self._file.close()
+
+
+def own_folder(folder: Path) -> None:
+    """Make `folder`; refuse one in which others may write: what lies there is executed.
+
+    Raises
+    ------
+    UsageError
+    """
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    about = folder.stat()
+    if os.name != "nt" and (about.st_uid != os.getuid() or about.st_mode & 0o022):
+        raise UsageError(f"session {folder}", "is a folder in which others may write", "Choose a folder of your own")
+
+
+def is_running(folder: Path) -> bool:
+    """Whether a session's process lives."""
+    if not (folder / "lock").is_file():
+        return False
+    lock = Lock(folder / "lock")
+    try:
+        return not lock.take()
+    finally:
+        lock.close()
+
+
+def end(folder: Path) -> None:
+    """End the session's process: ask it, after `END_SECONDS` kill it; nothing when there is none."""
+    if not is_running(folder):
+        return
+    (folder / "stop").touch()
+    if not _until_gone(folder, END_SECONDS):
+        with contextlib.suppress(OSError, ValueError):  # it ended just now
+            os.kill(int((folder / "pid").read_text()), signal.SIGTERM if os.name == "nt" else signal.SIGKILL)
+        _until_gone(folder, END_SECONDS)
+
+
+def _until_gone(folder: Path, seconds: float) -> bool:
+    deadline = time.monotonic() + seconds
+    while running := is_running(folder):
+        if time.monotonic() > deadline:
+            break
+        time.sleep(POLL_SECONDS)
+    return not running
+
+
+def hand_on(folder: Path, words: Sequence[str]) -> int | None:
+    """Have the session's process run the command `words`, and print what it prints.
+
+    Returns
+    -------
+    int or None
+        Its exit code; None when there is no such process.
+
+    Raises
+    ------
+    EngineError
+        The process died of it.
+    """
+    folder = folder.absolute()
+    if not is_running(folder):
+        return None
+    own_folder(folder)
+    name = secrets.token_hex(4)
+    request = folder / f"request-{name}.json"
+    files = {stream: folder / f"{name}.{stream}" for stream in ("out", "err", "code")}
+    replace_file(request, [json.dumps({"name": name, "words": list(words), "cwd": os.getcwd()}).encode()])
+    try:
+        tails = [_tail(files["out"], sys.stdout), _tail(files["err"], sys.stderr)]
+        renewed = time.monotonic()
+        while True:
+            ended = files["code"].exists()
+            dead = not ended and not is_running(folder)
+            for tail in tails:
+                next(tail)
+            if ended:
+                return int(files["code"].read_text())
+            if dead and not files["code"].exists():
+                raise EngineError(f"session {folder}", "its process died", "Try again")
+            if time.monotonic() - renewed > 1.0 and request.exists():
+                os.utime(request)
+                renewed = time.monotonic()
+            time.sleep(POLL_SECONDS)
+    except BaseException as error:
+        if not isinstance(error, EngineError):
+            end(folder)  # this side was asked to end, and what it asked for with it
+        raise
+    finally:
+        for path in (request, *files.values()):
+            path.unlink(missing_ok=True)
+
+
+def _tail(path: Path, stream: IO[str]) -> Iterator[None]:
+    """Each step prints what was added to a file."""
+    while not path.exists():
+        yield
+    decoder = codecs.getincrementaldecoder("utf-8")("replace")
+    with open(path, "rb") as source:
+        while True:
+            if text := decoder.decode(source.read()):
+                stream.write(text)
+                stream.flush()
+            yield

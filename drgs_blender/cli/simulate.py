@@ -1,0 +1,182 @@
+"""Simulate the matter that fills an asset, without Blender: particles and mesh of every frame into a cache folder.
+
+What is simulated is in a JSON file (docs/simulation.md lists its keys), in options, or both; options win. A bake that
+was stopped goes on when the same command is given again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+import logging
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..errors import UsageError
+from ..particle_cache import ParticleCache
+from ..sequence import frame_path
+from .output import check_suffix, check_writable
+from .progress import FractionBar, clock
+from .sampling import whole
+
+if TYPE_CHECKING:
+    from ..simulate.settings import Settings
+
+logger = logging.getLogger(__name__)
+
+EXAMPLES = """examples:
+  drgs simulate cat.drgs --material jelly --young 1e5 --floor 0 --frames 48 --out bake
+  drgs simulate cat.drgs --settings drop.json --out bake --vertices 'poses/####.npy' --export cat.pc2
+  drgs relight cat.drgs --env studio.hdr --camera front.json --cache bake --frames 24 --out 24.png
+"""
+
+#: Options that are a number of the material.
+_MATTER = ("young", "poisson", "density")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``drgs simulate``."""
+    parser.add_argument("asset", type=Path, metavar="ASSET", help=".drgs file")
+    parser.add_argument("--out", type=Path, required=True, metavar="CACHE", help="folder of the frames")
+    parser.add_argument("--settings", type=Path, metavar="S.json", help="what is simulated")
+    parser.add_argument("--overwrite", action="store_true", help="remove what the folder holds of other settings")
+    parser.add_argument("--threads", type=whole(0, 1024), default=0, help="threads, 0 for all cores")
+    group = parser.add_argument_group("settings, over those of the file")
+    group.add_argument("--material", metavar="NAME", help="jelly, rubber, metal, clay, foam, sand, snow, water, ...")
+    group.add_argument("--young", type=float, metavar="PA", help="stiffness: Young's modulus")
+    group.add_argument("--poisson", type=float, metavar="NU", help="Poisson's ratio, below 0.5")
+    group.add_argument("--density", type=float, metavar="KG/M3", help="density")
+    group.add_argument("--resolution", type=int, metavar="N", help="grid cells along the longest side; default 48")
+    group.add_argument("--solver", metavar="NAME", help="mpm, or xpbd for a quick look")
+    group.add_argument("--gravity", type=_vector, metavar="X,Y,Z", help="m/s^2; default 0,0,-9.81")
+    group.add_argument("--velocity", type=_vector, metavar="X,Y,Z", help="m/s, at the start")
+    group.add_argument("--floor", type=float, metavar="Z", help="height of a floor, metres")
+    group.add_argument(
+        "--pin", action="append", default=[], metavar="GROUP", help="vertex group that stays; repeatable"
+    )
+    group.add_argument("--collider", action="append", default=[], metavar="MESH", help="mesh in the way; repeatable")
+    group.add_argument("--frames", type=whole(1, 1_000_000), metavar="N", help="frames, the one at rest included")
+    group.add_argument("--fps", type=float, help="frames a second; default 24")
+    made = parser.add_argument_group("also written")
+    made.add_argument("--vertices", metavar="V####.npy", help="the mesh of each frame, for `drgs relight --vertices`")
+    made.add_argument(
+        "--export",
+        type=Path,
+        metavar="FILE",
+        help="all frames: the mesh as .pc2 or .mdd, mesh and particles as .usd, .usda or .usdc",
+    )
+
+
+def _vector(text: str) -> list[float]:
+    values = [float(word) for word in text.split(",")]
+    if len(values) != 3:
+        raise argparse.ArgumentTypeError(f"{text} is not three numbers X,Y,Z")
+    return values
+
+
+def run(args: argparse.Namespace) -> int:
+    """Simulate."""
+    from ..formats.point_cache import SUFFIXES
+    from ..formats.usd_points import SUFFIXES as USD_SUFFIXES
+    from ..formats.usd_points import check_usd
+
+    if args.export:
+        check_suffix(args.export, (*SUFFIXES, *USD_SUFFIXES))
+        if args.export.suffix.lower() in USD_SUFFIXES:
+            check_usd(args.export)
+        check_writable(args.export)
+    if args.vertices:
+        if "#" not in Path(args.vertices).name:
+            raise UsageError(f"--vertices {args.vertices}", "has no # for the frame's number", "Write it as v/####.npy")
+        check_writable(frame_path(args.vertices, 1))
+    check_writable(args.out / "cache.json")
+
+    from ..asset.container import read_asset
+    from ..jit import use_threads
+    from ..simulate.bake import bake
+    from ..simulate.job import prepare
+
+    settings = _settings(args)
+    use_threads(args.threads)
+    asset = read_asset(args.asset)
+    with clock(args, "filling"):
+        job = prepare(asset.mesh, settings)
+    report = job.filling.report
+    parts = f" in {report['parts']} parts" if report["parts"] > 1 else ""
+    steps = job.solver.steps_of(1 / settings.fps)
+    print(
+        f"{report['particles']} particles{parts} ({report['method']}), at least {steps} time steps a frame", flush=True
+    )
+    if report["dropped_parts"]:
+        logger.warning("%d small parts of the mesh's interior are left out", report["dropped_parts"])
+    if report["bare_vertices"]:
+        logger.warning("%d vertices are on walls too thin to fill; they follow what is near", report["bare_vertices"])
+    cache = ParticleCache(args.out)
+    count = settings.last - settings.first + 1
+    with FractionBar(args, "simulating") as bar:
+
+        def progress(frame: int, part: float) -> None:
+            bar(f"frame {frame}", (frame - settings.first - 1 + part) / max(count - 1, 1))
+
+        done = bake(job, cache, overwrite=args.overwrite, progress=progress)
+    print(f"{args.out}: frames {settings.first} to {settings.last}, {done} of them computed now")
+    _write_others(args, cache, asset.mesh.faces, settings)
+    return 0
+
+
+def _settings(args: argparse.Namespace) -> Settings:
+    """Settings of the file with those of the options."""
+    from ..simulate.settings import parse_settings
+
+    data: dict[str, Any] = {}
+    folder = Path()
+    if args.settings:
+        try:
+            data = json.loads(args.settings.read_text(encoding="utf-8"))
+        except (OSError, ValueError, RecursionError) as error:
+            raise UsageError(str(args.settings), f"cannot be read as JSON ({error})", "Check the file") from error
+        folder = args.settings.parent
+    if isinstance(data, dict):
+        data = dict(data)
+        changes = {name: getattr(args, name) for name in _MATTER if getattr(args, name) is not None}
+        if args.material:
+            data["material"] = args.material
+        if changes:
+            own = data.get("material", "jelly")
+            data["material"] = ({"name": own} if isinstance(own, str) else own) | changes
+        for name in ("resolution", "solver", "gravity", "velocity", "floor", "fps"):
+            if getattr(args, name) is not None:
+                data[name] = getattr(args, name)
+        if args.frames:
+            data["last"] = data.get("first", 1) + args.frames - 1
+        if args.pin:
+            data["pins"] = [*data.get("pins", []), *({"group": name} for name in args.pin)]
+        if args.collider:
+            here = [{"mesh": str(Path(path).resolve())} for path in args.collider]
+            data["colliders"] = [*data.get("colliders", []), *here]
+    return parse_settings(data, str(args.settings or "settings"), folder)
+
+
+def _write_others(args: argparse.Namespace, cache: ParticleCache, faces: np.ndarray, settings: Settings) -> None:
+    """Poses as arrays and a file for other programs, from the cache."""
+    from ..asset.archive import replace_file
+    from ..formats.point_cache import write_point_cache
+    from ..formats.usd_points import SUFFIXES, write_usd_points
+
+    first, fps = settings.first, settings.fps
+    frames = range(first, settings.last + 1)
+    if args.vertices:
+        for frame in frames:
+            encoded = io.BytesIO()
+            np.save(encoded, cache.read(frame).vertices)
+            replace_file(frame_path(args.vertices, frame), [encoded.getvalue()])
+    if args.export is None:
+        return
+    if args.export.suffix.lower() in SUFFIXES:
+        write_usd_points(args.export, map(cache.read, frames), faces, first, fps, settings.matrix_world)
+    else:
+        moving = (cache.read(frame).vertices for frame in frames)
+        write_point_cache(args.export, moving, len(frames), len(cache.rest().vertices), first, fps)

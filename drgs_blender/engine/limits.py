@@ -1,0 +1,36 @@
+"""How much memory an engine may take, on machines that many programs share."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+
+logger = logging.getLogger(__name__)
+
+#: Environment variable with the most megabytes, for engines that the extension starts; `OPTION` wins.
+VARIABLE = "DRGS_MEMORY_MB"
+OPTION = "--memory-mb"
+
+
+def memory_wanted(arguments: list[str]) -> int | None:
+    """Megabytes that the command line or the environment allow; None for no limit, also where they make no sense."""
+    text = arguments[arguments.index(OPTION) + 1] if OPTION in arguments[:-1] else os.environ.get(VARIABLE, "")
+    return int(text) if text.isdecimal() and int(text) > 0 else None
+
+
+def limit_memory(megabytes: int) -> bool:
+    """Let allocations of this process fail beyond `megabytes` of private memory, instead of the system killing it.
+
+    Linux counts what is writable and private (``RLIMIT_DATA``, since 4.7): arrays, trees, stacks; not mapped assets.
+    Returns False on other systems, which have no such limit.
+    """
+    if not sys.platform.startswith("linux"):
+        logger.warning("there is no limit of memory on this system")
+        return False
+    import resource
+
+    wanted = megabytes << 20
+    _, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    resource.setrlimit(resource.RLIMIT_DATA, (wanted if hard < 0 else min(wanted, hard), hard))
+    return True
