@@ -2,10 +2,36 @@
 
 from __future__ import annotations
 
-from . import engine_link, handlers, panels, preferences, properties, render_engine
+from . import (
+    engine_link,
+    farm,
+    handlers,
+    matter,
+    panels,
+    preferences,
+    presets,
+    properties,
+    render_engine,
+    setup_job,
+    submit,
+    viewport,
+)
 
 #: In order of registration; undone in reverse.
-MODULES = (preferences, properties, engine_link, handlers, render_engine, panels)
+MODULES = (
+    preferences,
+    matter,
+    submit,
+    properties,
+    presets,
+    engine_link,
+    setup_job,
+    handlers,
+    farm,
+    viewport,
+    render_engine,
+    panels,
+)
 
 
 def register() -> None:

@@ -14,19 +14,60 @@ from pathlib import Path
 import bpy
 
 from ..drgs_blender.engine.client import EngineClient, Passes, locate_engine
+from ..drgs_blender.engine.locate import VARIABLE
+from ..drgs_blender.errors import DeviceError
 from ..drgs_blender.frame import Frame
-from . import messages, preferences
+from . import engine_setup, messages, preferences
+
+SET_UP = f"Press Set Up Engine in sidebar > DR-GS, or name an environment in the preferences or in {VARIABLE}"
+UPDATE = "Press Set Up Engine in sidebar > DR-GS; nothing need be fetched for it"
 
 OnProgress = Callable[[str, float], None]
 IsCancelled = Callable[[], bool]
 
 _lock = threading.Lock()
 _client: EngineClient | None = None
+#: Of the last final picture, name -> value; seconds.total, samples, surfels, ...
+statistics: dict[str, float] = {}
+
+
+def own_folder(create: bool = False) -> Path:
+    """The environment that Set Up Engine makes."""
+    return Path(bpy.utils.extension_path_user(preferences.ROOT, path="engine", create=create))
 
 
 def command_line() -> list[str]:
-    """Command of the engine that DRGS_ENGINE or the preferences name; see locate_engine for the errors."""
-    return locate_engine(bpy.path.abspath(preferences.read("engine_python", "")) or None)
+    """Command of the engine that DRGS_ENGINE or the preferences name, else of the one that was set up here.
+
+    Raises
+    ------
+    DeviceError
+        There is none; says what to do.
+    """
+    named = bpy.path.abspath(preferences.read("engine_python", ""))
+    if named or os.environ.get(VARIABLE):
+        return locate_engine(named or None)
+    folder = own_folder()
+    found = engine_setup.state(folder)
+    if found == "ready":
+        return locate_engine(engine_setup.interpreter(folder))
+    if found == "old":
+        raise DeviceError("engine", "belongs to another version of the extension", UPDATE)
+    if found == "partial":
+        raise DeviceError("engine", "is not completely set up", SET_UP)
+    try:
+        return locate_engine()
+    except DeviceError as error:
+        raise DeviceError("engine", "is not set up", SET_UP) from error
+
+
+def problem() -> str:
+    """What is wrong with the engine's place, "" when it is there. Starts nothing."""
+    try:
+        command_line()
+    except DeviceError as error:
+        return f"{error.subject[:1].upper()}{error.subject[1:]} {error.problem}"
+    return ""
 
 
 def client() -> EngineClient:
@@ -51,7 +92,10 @@ def client() -> EngineClient:
 
 def render(frame: Frame, on_progress: OnProgress | None = None, cancelled: IsCancelled | None = None) -> Passes:
     """Passes of a frame, name -> (h, w, c) float32, row 0 at the top; see EngineClient.render for the errors."""
-    return client().render(frame, on_progress, cancelled)
+    global statistics
+    passes = client().render(frame, on_progress, cancelled)
+    statistics = passes.statistics
+    return passes
 
 
 def load_asset(path: Path, cancelled: IsCancelled | None = None) -> str:

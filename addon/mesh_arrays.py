@@ -14,6 +14,10 @@ ATTRIBUTES = {
     name: ("FLOAT_COLOR", "color", 4) if width == 3 else ("FLOAT", "value", 1)
     for name, width in MATERIAL_CHANNELS.items()
 }
+#: Types of attributes that brushes can paint.
+COLOURS = ("FLOAT_COLOR", "BYTE_COLOR")
+#: Types of attributes besides colours that can be masks.
+MASKS = {"BOOLEAN": bool, "FLOAT": np.float32}
 
 
 def new_mesh(name: str, source: Mesh) -> bpy.types.Mesh:
@@ -21,7 +25,8 @@ def new_mesh(name: str, source: Mesh) -> bpy.types.Mesh:
     mesh = bpy.data.meshes.new(name)
     faces = len(source.faces)
     mesh.vertices.add(len(source.vertices))
-    mesh.attributes["position"].data.foreach_set("vector", source.vertices.ravel())
+    if len(source.vertices):  # else Blender has no such attribute
+        mesh.attributes["position"].data.foreach_set("vector", source.vertices.ravel())
     mesh.loops.add(3 * faces)
     mesh.loops.foreach_set("vertex_index", source.faces.ravel())
     mesh.polygons.add(faces)
@@ -53,8 +58,24 @@ def write_channel(mesh: bpy.types.Mesh, channel: str, values: Array) -> None:
     mesh.update_tag()
 
 
+def make_paintable(mesh: bpy.types.Mesh, channel: str, values: Array) -> None:
+    """Set a material channel, (n, 3) or (n,) float32, as the active colour attribute, which brushes can paint."""
+    attribute = mesh.attributes.get(channel)
+    if attribute is None or attribute.data_type not in COLOURS or attribute.domain != "POINT":
+        if attribute is not None:
+            mesh.attributes.remove(attribute)
+        attribute = mesh.attributes.new(channel, "FLOAT_COLOR", "POINT")
+        colours = np.ones((len(values), 4), np.float32)
+        colours[:, :3] = values if values.ndim == 2 else values[:, None]
+        attribute.data.foreach_set("color", colours.ravel())
+    mesh.attributes.active_color_name = channel
+    mesh.update_tag()
+
+
 def read_channel(mesh: bpy.types.Mesh, channel: str) -> Array | None:
-    """The point attribute of a material channel, linear and clamped to [0, 1]; None where there is none.
+    """The point attribute of a material channel, linear and clamped to [0, 1], NaN kept; None where there is none.
+
+    Of a number that is stored as a colour, as brushes need it, the mean of red, green and blue.
 
     Raises
     ------
@@ -64,15 +85,54 @@ def read_channel(mesh: bpy.types.Mesh, channel: str) -> Array | None:
     attribute = mesh.attributes.get(channel)
     if attribute is None:
         return None
-    _, prop, width = ATTRIBUTES[channel]
-    kinds = ("FLOAT_COLOR", "BYTE_COLOR") if width == 4 else ("FLOAT",)
-    if attribute.domain != "POINT" or attribute.data_type not in kinds:
-        raise TypeError(f"{attribute.data_type} on {attribute.domain}, expected {kinds[0]} on POINT")
-    values = np.empty(len(mesh.vertices) * width, np.float32)
-    attribute.data.foreach_get(prop, values)
-    if width == 4:
-        values = np.ascontiguousarray(values.reshape(-1, 4)[:, :3])
-    return np.clip(np.nan_to_num(values, copy=False), 0, 1, out=values)
+    kind, _, width = ATTRIBUTES[channel]
+    painted = attribute.data_type in COLOURS
+    if attribute.domain != "POINT" or not (painted or attribute.data_type == kind):
+        raise TypeError(f"{attribute.data_type} on {attribute.domain}, expected {kind} on POINT")
+    values = np.empty(len(mesh.vertices) * (4 if painted else 1), np.float32)
+    attribute.data.foreach_get("color" if painted else "value", values)
+    if painted:
+        colours = values.reshape(-1, 4)
+        values = np.empty((len(colours), 3), np.float32)
+        for i in range(3):  # several times faster than all at once
+            values[:, i] = colours[:, i]
+        if width == 1:
+            values = values.mean(axis=1)
+    return np.clip(values, 0, 1, out=values)
+
+
+def is_mask(attribute: bpy.types.Attribute) -> bool:
+    """Whether an attribute has a number for each vertex that says how much of something it gets."""
+    return attribute.domain == "POINT" and attribute.data_type in (*MASKS, *COLOURS)
+
+
+def read_mask(obj: bpy.types.Object, mesh: bpy.types.Mesh, name: str) -> Array | None:
+    """(n,) float32: the vertex group `name` of `obj`, or the attribute of its evaluated `mesh`; None where neither is.
+
+    Of a colour the mean of red, green and blue.
+    """
+    group, attribute = obj.vertex_groups.get(name), mesh.attributes.get(name)
+    if group is not None:
+        return group_weights(obj.original.data, group.index)
+    if attribute is None or not is_mask(attribute):
+        return None
+    if attribute.data_type in COLOURS:
+        colours = np.empty(len(mesh.vertices) * 4, np.float32)
+        attribute.data.foreach_get("color", colours)
+        return colours.reshape(-1, 4)[:, :3].mean(axis=1)
+    values = np.empty(len(mesh.vertices), MASKS[attribute.data_type])
+    attribute.data.foreach_get("value", values)
+    return values.astype(np.float32)
+
+
+def group_weights(mesh: bpy.types.Mesh, index: int) -> Array:
+    """(n,) float32 weights in the vertex group of number `index`."""
+    weights = np.zeros(len(mesh.vertices), np.float32)
+    for vertex in mesh.vertices:
+        for group in vertex.groups:
+            if group.group == index:
+                weights[vertex.index] = group.weight
+    return weights
 
 
 def read_vertices(mesh: bpy.types.Mesh) -> Array:
@@ -86,12 +146,16 @@ def read_vertices(mesh: bpy.types.Mesh) -> Array:
 def read_triangles(mesh: bpy.types.Mesh) -> Array | None:
     """(m, 3) int32 vertices of every polygon, or None where one is no triangle."""
     if len(mesh.loops) != 3 * len(mesh.polygons):
-        return None
-    starts = np.empty(len(mesh.polygons), np.int32)
-    mesh.polygons.foreach_get("loop_start", starts)
-    if not np.array_equal(starts, np.arange(0, 3 * len(starts), 3, dtype=np.int32)):
-        return None
+        return None  # none has fewer corners than three, so none may have more; they come one after the other
     return read_corner_vertices(mesh).reshape(-1, 3)
+
+
+def loop_triangles(mesh: bpy.types.Mesh) -> Array:
+    """(m, 3) int32 vertices of the triangles that polygons are cut into."""
+    mesh.calc_loop_triangles()
+    triangles = np.empty(3 * len(mesh.loop_triangles), np.int32)
+    mesh.loop_triangles.foreach_get("vertices", triangles)
+    return triangles.reshape(-1, 3)
 
 
 def read_edges(mesh: bpy.types.Mesh) -> Array:

@@ -6,8 +6,10 @@ Plain data, so that it may be written from the render thread and drawn from the 
 from __future__ import annotations
 
 import logging
+import re
 import time
 from collections import deque
+from collections.abc import Container
 from typing import NamedTuple
 
 log = logging.getLogger("drgs")
@@ -33,6 +35,11 @@ def note(level: str, text: str) -> None:
     if history and history[-1][1:] == (level, text):
         history.pop()
     history.append(Message(time.time(), level, text))
+
+
+def named_in(text: str, known: Container[str]) -> str:
+    """The first name in quotation marks that is `known`, else ""."""
+    return next((name for name in re.findall(r'"([^"]+)"', text) if name in known), "")
 
 
 class Warnings:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-from ..drgs_blender.passes import PASSES, Pass
+from ..drgs_blender.passes import PASSES, TEMPORAL, Pass
 from .properties import switch_of
 
 #: Names that Blender 5.0 spelled out; compositor nodes and its EXR files know only these.
@@ -29,12 +29,14 @@ def blender_name(render_pass: Pass) -> str:
     return label(render_pass) if bpy.app.version >= (5, 0, 0) else render_pass.name
 
 
-def enabled(view_layer: bpy.types.ViewLayer) -> list[Pass]:
-    """The passes switched on in a view layer; Combined always, as Blender always has it."""
+def enabled(scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer) -> list[Pass]:
+    """The passes switched on in a view layer of a scene; Combined always, as Blender always has it."""
     extra = view_layer.drgs
+    needed = TEMPORAL if scene.drgs.use_temporal else ()
     return [
         p
         for p in PASSES
         if p.name == "Combined"
+        or p.name in needed
         or (getattr(view_layer, p.blender, False) if p.blender else getattr(extra, switch_of(p)))
     ]

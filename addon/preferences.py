@@ -20,7 +20,7 @@ class DrgsPreferences(bpy.types.AddonPreferences):
         name="Engine Python",
         description=(
             "Python interpreter of the environment in which the DR-GS engine is installed. "
-            "Empty: the variable DRGS_ENGINE, then the usual places"
+            "Empty: the one that Set Up Engine made. The variable DRGS_ENGINE comes first"
         ),
         subtype="FILE_PATH",
     )
@@ -33,6 +33,9 @@ class DrgsPreferences(bpy.types.AddonPreferences):
         layout.use_property_split = True
         layout.prop(self, "engine_python")
         layout.prop(self, "threads")
+        from .panels.tour import draw_engine
+
+        draw_engine(layout, context, always=True)
         row = layout.row()
         row.operator("drgs.engine_test", icon="CHECKMARK")
         row.operator("drgs.engine_stop", icon="CANCEL")
@@ -42,6 +45,15 @@ def read(name: str, default: Any) -> Any:
     """One preference; `default` where the extension runs without stored preferences (a test, a bare script)."""
     addon = bpy.context.preferences.addons.get(ROOT)
     return getattr(addon.preferences, name, default) if addon and addon.preferences else default
+
+
+def write(name: str, value: Any) -> bool:
+    """Set one preference; return whether there are any."""
+    addon = bpy.context.preferences.addons.get(ROOT)
+    if addon is None or addon.preferences is None:
+        return False
+    setattr(addon.preferences, name, value)
+    return True
 
 
 def register() -> None:

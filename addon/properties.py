@@ -9,6 +9,9 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, Po
 
 from ..drgs_blender.frame import RenderSettings, split_rays
 from ..drgs_blender.passes import PASSES, Pass
+from .adjustment import DrgsAdjustment
+from .matter.properties import DrgsMatterSettings
+from .submit import DrgsSubmitSettings
 
 _DENOISERS = {
     "none": ("None", "Keep the noise"),
@@ -19,12 +22,18 @@ _DENOISERS = {
 DENOISE_ITEMS = [(n, *_DENOISERS[n]) for n in typing.get_args(typing.get_type_hints(RenderSettings)["denoise"])]
 
 
+def _switch_overlay(settings: DrgsSceneSettings, context: bpy.types.Context) -> None:
+    from .viewport import overlay
+
+    overlay.switched(settings.id_data)
+
+
 class DrgsSceneSettings(bpy.types.PropertyGroup):
     """How DR-GS solves a frame; see drgs_blender.frame.RenderSettings."""
 
     rays: IntProperty(
         name="Rays",
-        description="Light samples a pixel, divided among the three strategies",
+        description="Light samples a pixel, divided by the material: towards light, and along what is reflected",
         min=3,
         soft_max=1024,
         default=32,
@@ -69,10 +78,10 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
     )
     aa: IntProperty(
         name="Anti-aliasing",
-        description="Positions inside a pixel among which its rays are divided",
-        min=1,
-        soft_max=16,
-        default=4,
+        description="Positions inside a pixel among which its rays are divided; 0 chooses by their number",
+        min=0,
+        soft_max=64,
+        default=0,
     )
     primary: EnumProperty(
         name="Primary",
@@ -83,11 +92,63 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
         ),
         default="surfels",
     )
+    tracer: EnumProperty(
+        name="Tracer",
+        description="What shadows, reflections and passed-on light meet of DR-GS objects",
+        items=(
+            ("mesh", "Mesh", "The triangle mesh that carries the surfels; fast"),
+            (
+                "surfels",
+                "Surfels",
+                "The captured Gaussians themselves, for foliage, hair and fur; slower",
+            ),
+        ),
+        default="mesh",
+    )
     denoise: EnumProperty(
         name="Denoise",
         description="Filter that takes the noise out of the picture",
         items=DENOISE_ITEMS,
         default="none",
+    )
+    use_temporal: BoolProperty(
+        name="For Temporal Denoising",
+        description="Keep the noise and write every pass that the command `drgs denoise` needs to take it out of the "
+        "finished frames, each with the help of its neighbours",
+        default=False,
+    )
+    blur_steps: IntProperty(
+        name="Blur Steps",
+        description="Pictures at other times and other places of the lens whose mean has motion blur and depth of "
+        "field; the rays are divided among them, at least three for each",
+        min=2,
+        soft_max=64,
+        max=1024,
+        default=16,
+    )
+    use_viewport_denoise: BoolProperty(
+        name="Denoise First Pictures",
+        description="Take the noise out of the coarse pictures that the viewport shows while something moves, with the "
+        "help of those before",
+        default=True,
+    )
+    overlay: EnumProperty(
+        name="DR-GS Objects",
+        description="How DR-GS objects are drawn in viewports that another engine or no engine renders",
+        items=(
+            ("OFF", "Mesh", "As the mesh that carries them"),
+            ("SURFELS", "Surfels", "As discs with their colour, without light and without the engine"),
+            ("LIT", "Lit", "As DR-GS renders them, in front of and behind the scene's other objects"),
+        ),
+        default="OFF",
+        options=set(),
+        update=_switch_overlay,
+    )
+    over: PointerProperty(
+        type=bpy.types.Scene,
+        name="Over",
+        description="The scene of another engine over whose picture this one is laid, and whose resolution and render "
+        "region it has",
     )
     look: EnumProperty(
         name="Look",
@@ -102,6 +163,7 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
     use_animated_seed: BoolProperty(
         name="Animated Seed", description="Other noise in every frame", default=True, options=set()
     )
+    submit: PointerProperty(type=DrgsSubmitSettings, name="Farm")
 
     def to_settings(self, film_transparent: bool, threads: int) -> RenderSettings:
         """The engine's settings."""
@@ -114,13 +176,15 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
             bounces=self.bounces,
             aa=self.aa,
             primary=self.primary,
-            denoise=self.denoise,
+            tracer=self.tracer,
+            denoise="none" if self.use_temporal else self.denoise,
             look=self.look,
             film_transparent=film_transparent,
             seed=self.seed,
             threads=threads,
             noise_threshold=self.noise_threshold if self.use_noise_threshold else 0.0,
             clamp_indirect=self.clamp_indirect,
+            split="counts" if self.use_custom_split else "auto",
         )
 
 
@@ -135,6 +199,20 @@ class DrgsViewLayerSettings(bpy.types.PropertyGroup):
     __annotations__ = {  # Blender reads properties from here; they follow the one table
         switch_of(p): BoolProperty(name=p.name, description=p.about, default=False) for p in PASSES if not p.blender
     }
+    __annotations__["others"] = EnumProperty(
+        name="Other Objects",
+        description="What the camera sees of objects that are not DR-GS objects",
+        items=(
+            ("SEEN", "Seen", "The objects themselves"),
+            (
+                "CATCHER",
+                "Shadow Catchers",
+                "Only the shadows on them, and that they hide what is behind; for laying over another engine's picture",
+            ),
+            ("HOLDOUT", "Holdouts", "Only that they hide what is behind"),
+        ),
+        default="SEEN",
+    )
 
 
 def _get_path(group: DrgsObjectSettings) -> str:
@@ -162,6 +240,12 @@ class DrgsObjectSettings(bpy.types.PropertyGroup):
         set=_set_path,
     )
 
+    adjustment: PointerProperty(type=DrgsAdjustment, name="Adjustments")
+    matter: PointerProperty(type=DrgsMatterSettings, name="Matter")
+    shown_as: StringProperty(
+        name="Display As", description="How the mesh is displayed when it is not drawn as a box", options={"HIDDEN"}
+    )
+
     @property
     def is_drgs(self) -> bool:
         """Whether the object is rendered by DR-GS."""
@@ -176,6 +260,7 @@ GROUPS = (
 
 
 def register() -> None:
+    bpy.utils.register_class(DrgsAdjustment)
     for group, owner in GROUPS:
         bpy.utils.register_class(group)
         owner.drgs = PointerProperty(type=group, name="DR-GS")
@@ -185,3 +270,4 @@ def unregister() -> None:
     for group, owner in reversed(GROUPS):
         del owner.drgs
         bpy.utils.unregister_class(group)
+    bpy.utils.unregister_class(DrgsAdjustment)

@@ -4,9 +4,53 @@ from __future__ import annotations
 
 import bpy
 
-from . import bind, engine, import_asset, import_parts
+from . import (
+    bake,
+    bind,
+    bind_armature,
+    bind_cage,
+    bind_lattice,
+    compositing,
+    convert,
+    engine,
+    engine_setup,
+    export,
+    import_asset,
+    import_parts,
+    light,
+    mark_assets,
+    material,
+    matter,
+    presets,
+    report,
+    save_asset,
+    steps,
+    submit,
+)
 
-MODULES = (import_asset, import_parts, bind, engine)
+MODULES = (
+    import_asset,
+    import_parts,
+    export,
+    convert,
+    mark_assets,
+    bind,
+    bind_armature,
+    bind_lattice,
+    bind_cage,
+    matter,
+    steps,
+    light,
+    material,
+    save_asset,
+    bake,
+    compositing,
+    presets,
+    submit,
+    report,
+    engine,
+    engine_setup,
+)
 
 
 def _file_import(menu: bpy.types.Menu, context: bpy.types.Context) -> None:
@@ -14,15 +58,34 @@ def _file_import(menu: bpy.types.Menu, context: bpy.types.Context) -> None:
     menu.layout.operator("drgs.import_parts", text="DR-GS from surfels and mesh")
 
 
+def _file_export(menu: bpy.types.Menu, context: bpy.types.Context) -> None:
+    menu.layout.operator("drgs.export", text="DR-GS as splats, mesh or light")
+
+
+def _object_convert(menu: bpy.types.Menu, context: bpy.types.Context) -> None:
+    menu.layout.separator()
+    menu.layout.operator("drgs.convert", text="DR-GS")
+
+
+#: Where our operators stand in Blender's own menus.
+_MENUS = (
+    (bpy.types.TOPBAR_MT_file_import, _file_import),
+    (bpy.types.TOPBAR_MT_file_export, _file_export),
+    (bpy.types.VIEW3D_MT_object_convert, _object_convert),
+)
+
+
 def register() -> None:
     for module in MODULES:
         for cls in module.CLASSES:
             bpy.utils.register_class(cls)
-    bpy.types.TOPBAR_MT_file_import.append(_file_import)
+    for menu, draw in _MENUS:
+        menu.append(draw)
 
 
 def unregister() -> None:
-    bpy.types.TOPBAR_MT_file_import.remove(_file_import)
+    for menu, draw in _MENUS:
+        menu.remove(draw)
     for module in reversed(MODULES):
         for cls in reversed(module.CLASSES):
             bpy.utils.unregister_class(cls)

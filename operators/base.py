@@ -31,3 +31,13 @@ class DrgsOperator:
         """Report something that went otherwise than expected."""
         messages.note("WARNING", text)
         self.report({"WARNING"}, text)
+
+
+class DropTarget:
+    """Base of file handlers: where files may be dropped."""
+
+    areas: tuple[str, ...] = ("VIEW_3D", "OUTLINER")
+
+    @classmethod
+    def poll_drop(cls, context: bpy.types.Context) -> bool:
+        return context.area is not None and context.area.type in cls.areas

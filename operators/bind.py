@@ -12,6 +12,7 @@ from mathutils.bvhtree import BVHTree
 
 from ..addon import assets, mesh_arrays
 from ..drgs_blender.errors import UsageError
+from . import targets
 from .base import DrgsOperator
 from .shape_keys import transfer_shape_keys
 from .vertex_weights import Weights, read_weights, write_weights
@@ -43,7 +44,7 @@ class Match:
 
 
 class DRGS_OT_bind_to_rig(DrgsOperator, bpy.types.Operator):
-    """Let the active DR-GS object follow the rig of the other selected meshes: copy their weights and shape keys"""
+    """Let the selected DR-GS objects follow the rig of the other selected meshes: copy their weights and shape keys"""
 
     bl_idname = "drgs.bind_to_rig"
     bl_label = "Bind to Rig"
@@ -57,11 +58,16 @@ class DRGS_OT_bind_to_rig(DrgsOperator, bpy.types.Operator):
         return True
 
     def run(self, context: bpy.types.Context) -> set[str]:
-        target = context.active_object
-        sources = [o for o in context.selected_objects if o is not target and o.type == "MESH"]
-        distance = bind_to_rig(context, target, sources)
-        if distance > DOUBTFUL:
-            self.warn(f'"{target.name}" lies {distance:.1%} of its size away from the meshes it was bound to')
+        active = context.active_object
+        sources = [o for o in context.selected_objects if o is not active and o.type == "MESH"]
+        objects = [active]
+        if not all(map(assets.is_drgs, sources)):  # else one DR-GS object takes the rig of others
+            objects = targets.selected(context)
+            sources = [o for o in sources if not assets.is_drgs(o)]
+        for target in targets.editable(objects, data=True):
+            distance = bind_to_rig(context, target, sources)
+            if distance > DOUBTFUL:
+                self.warn(f'"{target.name}" lies {distance:.1%} of its size away from the meshes it was bound to')
         return {"FINISHED"}
 
 
@@ -89,7 +95,7 @@ def bind_to_rig(context: bpy.types.Context, target: bpy.types.Object, sources: l
         )
     armature = armature_of(target.name, sources)
     with rest_pose(context, armature):
-        places = [_source(o) for o in sources]
+        places = [source_of(o) for o in sources]
         matrix = np.array(target.matrix_world, np.float64)
         armature_matrix = armature.matrix_world.copy() if armature else None
     vertices = mesh_arrays.read_vertices(target.data).astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
@@ -148,20 +154,19 @@ def rest_pose(context: bpy.types.Context, armature: bpy.types.Object | None) -> 
         context.view_layer.update()
 
 
-def _source(obj: bpy.types.Object) -> Source:
+def source_of(obj: bpy.types.Object) -> Source:
+    """The undeformed mesh of `obj` in the world; UsageError where it has no faces."""
     mesh = obj.data
     if mesh.shape_keys:
         local = np.empty((len(mesh.vertices), 3), np.float32)
         mesh.shape_keys.reference_key.points.foreach_get("co", local.ravel())
     else:
         local = mesh_arrays.read_vertices(mesh)
-    mesh.calc_loop_triangles()
-    triangles = np.empty(3 * len(mesh.loop_triangles), np.int32)
-    mesh.loop_triangles.foreach_get("vertices", triangles)
+    triangles = mesh_arrays.loop_triangles(mesh)
     if not len(triangles):
         raise UsageError(f'Object "{obj.name}"', "has no faces", "Deselect it")
     matrix = np.array(obj.matrix_world, np.float64)
-    return Source(obj, local @ matrix[:3, :3].T + matrix[:3, 3], triangles.reshape(-1, 3), matrix)
+    return Source(obj, local @ matrix[:3, :3].T + matrix[:3, 3], triangles, matrix)
 
 
 def nearest(points: Array, sources: list[Source]) -> Match:

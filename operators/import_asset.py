@@ -11,7 +11,8 @@ from bpy.props import BoolProperty, CollectionProperty, StringProperty
 from ..addon import assets, mesh_arrays
 from ..drgs_blender.asset import Asset, Environment
 from ..drgs_blender.asset.container import read_asset
-from .base import DrgsOperator
+from .base import DrgsOperator, DropTarget
+from .mark_assets import mark
 
 MATERIAL = "DR-GS"
 
@@ -30,6 +31,7 @@ class DRGS_OT_import_asset(DrgsOperator, bpy.types.Operator):
     use_environment: BoolProperty(
         name="Set World", description="Light the scene with the environment of the asset, if it has one", default=False
     )
+    use_mark: BoolProperty(name="Mark as Asset", description="Offer the objects in the asset browser", default=False)
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         if self.filepath or self.files:  # dropped on the window
@@ -39,12 +41,16 @@ class DRGS_OT_import_asset(DrgsOperator, bpy.types.Operator):
 
     def run(self, context: bpy.types.Context) -> set[str]:
         paths = [Path(self.directory) / f.name for f in self.files if f.name] or [Path(self.filepath)]
-        import_assets(context, paths, self.use_environment)
+        objects = import_assets(context, paths, self.use_environment)
+        if self.use_mark:
+            mark(objects)
         return {"FINISHED"}
 
 
-def import_assets(context: bpy.types.Context, paths: list[Path], use_environment: bool = False) -> None:
-    """Add an object for every asset and select them; the last one is active.
+def import_assets(
+    context: bpy.types.Context, paths: list[Path], use_environment: bool = False
+) -> list[bpy.types.Object]:
+    """Add an object for every asset and select them; the last one is active. Return them.
 
     Raises
     ------
@@ -56,13 +62,16 @@ def import_assets(context: bpy.types.Context, paths: list[Path], use_environment
         bpy.ops.object.mode_set(mode="OBJECT")
     for selected in context.selected_objects:
         selected.select_set(False)
+    objects = []
     for path, asset in loaded:
         obj = new_object(path, asset)
+        objects.append(obj)
         context.collection.objects.link(obj)
         obj.select_set(True)
         context.view_layer.objects.active = obj
         if use_environment and asset.environment is not None:
             context.scene.world = new_world(path.stem, asset.environment)
+    return objects
 
 
 def new_object(path: Path, asset: Asset) -> bpy.types.Object:
@@ -115,17 +124,13 @@ def new_world(name: str, environment: Environment) -> bpy.types.World:
     return world
 
 
-class DRGS_FH_asset(bpy.types.FileHandler):
+class DRGS_FH_asset(DropTarget, bpy.types.FileHandler):
     """Drop .drgs files on the viewport or the outliner."""
 
     bl_idname = "DRGS_FH_asset"
     bl_label = "DR-GS asset"
     bl_import_operator = "import_scene.drgs"
     bl_file_extensions = ".drgs"
-
-    @classmethod
-    def poll_drop(cls, context: bpy.types.Context) -> bool:
-        return context.area is not None and context.area.type in ("VIEW_3D", "OUTLINER")
 
 
 CLASSES = (DRGS_OT_import_asset, DRGS_FH_asset)

@@ -2,21 +2,38 @@
 
 from __future__ import annotations
 
-import subprocess
-import tempfile
 from pathlib import Path
-from typing import IO
 
 import bpy
-from bpy.props import BoolProperty, EnumProperty, StringProperty
+from bpy.props import BoolProperty, CollectionProperty, EnumProperty, FloatProperty, StringProperty
 
-from ..addon import engine_link, messages
-from ..drgs_blender.errors import AssetError, UsageError
-from .base import DrgsOperator
+from ..drgs_blender.errors import UsageError
+from ..drgs_blender.filetypes import READ, extensions
+from ..drgs_blender.sequence import frame_path, frames_of, template_of
+from . import sequences
+from .base import DropTarget
 from .import_asset import import_assets
+from .program import ProgramOperator
+
+#: Bytes in which the header of a PLY or glTF file says what it holds, and what only those of splats hold.
+HEADER = 65536
+SPLATS = {
+    ".ply": (b" opacity\n", b" opacity\r", b" packed_position"),
+    ".glb": (b'"KHR_gaussian_splatting"',),
+    ".gltf": (b'"KHR_gaussian_splatting"',),
+}
+#: A name that says too little to be caught by it.
+GENERAL = (".json",)
+UP_ITEMS = (
+    ("auto", "Automatic", "As the formats say"),
+    ("z", "Z", ""),
+    ("y", "Y", ""),
+    ("-y", "-Y", "Most photogrammetry"),
+    ("-z", "-Z", ""),
+)
 
 
-class DRGS_OT_import_parts(DrgsOperator, bpy.types.Operator):
+class DRGS_OT_import_parts(ProgramOperator, bpy.types.Operator):
     """Make a .drgs asset from surfels or splats and their mesh, or from a textured mesh alone, and load it"""
 
     bl_idname = "drgs.import_parts"
@@ -24,7 +41,9 @@ class DRGS_OT_import_parts(DrgsOperator, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
 
     surfels: StringProperty(
-        name="Surfels", description="PLY, SPZ, SOG, ... with surfels or splats", subtype="FILE_PATH"
+        name="Surfels",
+        description="PLY, SPZ, SOG, ... with surfels or splats; #### stands for the number of a sequence",
+        subtype="FILE_PATH",
     )
     mesh: StringProperty(
         name="Mesh",
@@ -35,55 +54,64 @@ class DRGS_OT_import_parts(DrgsOperator, bpy.types.Operator):
     out: StringProperty(
         name="Asset", description="The file to write; empty is beside the first file", subtype="FILE_PATH"
     )
-    up: EnumProperty(
-        name="Up",
-        description="Axis that points up in the files",
-        items=(
-            ("auto", "Automatic", "As the file formats say"),
-            ("z", "Z", ""),
-            ("y", "Y", ""),
-            ("-y", "-Y", "Most photogrammetry"),
-            ("-z", "-Z", ""),
-        ),
-        default="auto",
+    up: EnumProperty(name="Up", description="Axis that points up in the files", items=UP_ITEMS, default="auto")
+    scale: FloatProperty(name="Scale", description="Factor on all lengths", default=1.0, min=1e-6, max=1e6)
+    use_mesh: BoolProperty(
+        name="Build Mesh",
+        description="Where none is given, build one around the surfels, so that they can be bent and cast shadows. "
+        "Else light meets the surfels themselves: for foliage, hair, anything thin",
+        default=True,
+    )
+    use_remove_light: BoolProperty(
+        name="Remove Light",
+        description="Estimate the albedo of surfels without materials: their captured colour divided by the light that "
+        "the environment sends there, with shadows",
+        default=False,
     )
     use_environment: BoolProperty(name="Set World", description="Light the scene with the environment", default=False)
+    filepath: StringProperty(subtype="FILE_PATH", options={"SKIP_SAVE", "HIDDEN"})
+    directory: StringProperty(subtype="DIR_PATH", options={"SKIP_SAVE", "HIDDEN"})
+    files: CollectionProperty(type=bpy.types.OperatorFileListElement, options={"SKIP_SAVE", "HIDDEN"})
 
-    _process: subprocess.Popen | None = None
-    _log: IO[bytes] | None = None
-    _timer: bpy.types.Timer | None = None
+    _frames: tuple[int, ...] = ()
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        try:
+            self._take_dropped()
+        except UsageError as error:
+            return self.fail(error)
         return context.window_manager.invoke_props_dialog(self, width=420)
 
     def run(self, context: bpy.types.Context) -> set[str]:
-        self._start()
-        if bpy.app.background or context.window is None:
-            self._process.wait()
-            return self._finish(context)
-        self._timer = context.window_manager.event_timer_add(0.25, window=context.window)
-        context.window_manager.modal_handler_add(self)
-        context.workspace.status_text_set(f"Making {self._target().name}: Esc cancels")
-        return {"RUNNING_MODAL"}
+        self._take_dropped()
+        arguments = self._arguments()
+        name = Path(self.surfels or self.mesh).name
+        status = f"Making {self._target().name}"
+        return self.start(context, arguments, name, status, "could not be made into an asset")
 
-    def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        if event.type == "ESC":
-            self.cancel(context)
-            return {"CANCELLED"}
-        if event.type != "TIMER" or self._process.poll() is None:
-            return {"PASS_THROUGH"}
-        self._release(context)
-        try:
-            return self._finish(context)
-        except AssetError as error:
-            return self.fail(error)
+    def done(self, context: bpy.types.Context) -> set[str]:
+        target = self._target()
+        if not self._frames:
+            import_assets(context, [target], self.use_environment)
+            return {"FINISHED"}
+        written = [frame_path(str(target), frame) for frame in self._frames]
+        objects = import_assets(context, written, self.use_environment)
+        sequences.play(objects, list(self._frames), target.stem.rstrip("#_-. ") or target.stem)
+        return {"FINISHED"}
 
-    def cancel(self, context: bpy.types.Context) -> None:
-        """End the process; called by Esc and when Blender closes."""
-        self._process.terminate()
-        self._process.wait()
-        self._log.close()
-        self._release(context)
+    def _take_dropped(self) -> None:
+        """Files that were dropped, each where it belongs; what was dropped before does not stay."""
+        paths = [Path(self.directory) / f.name for f in self.files if f.name]
+        paths = paths or ([Path(self.filepath)] if self.filepath else [])
+        if paths:
+            self.surfels = self.mesh = self.environment = ""
+        kinds: dict[str, list[Path]] = {}
+        for path in paths:
+            kinds.setdefault(kind_of(path), []).append(path)
+        for kind, found in kinds.items():
+            setattr(self, kind, template_of(found)[0] if len(found) > 1 else str(found[0]))
+        self.filepath = ""
+        self.files.clear()
 
     def _target(self) -> Path:
         """The asset to write."""
@@ -95,48 +123,51 @@ class DRGS_OT_import_parts(DrgsOperator, bpy.types.Operator):
         if not surfels and not mesh:
             raise UsageError("Import", "neither surfels nor a mesh are given", "Choose at least one file")
         arguments = ["import", surfels] if surfels else ["make", mesh]
+        self._frames = tuple(frames_of(surfels)) if "#" in Path(surfels).name else ()
+        if self._frames:
+            if "#" not in self._target().name:
+                raise UsageError(self._target().name, "has no # for the number of each frame", "Write asset_####.drgs")
+            arguments += ["--frames", ",".join(map(str, self._frames))]
         if surfels and mesh:
             arguments += ["--mesh", mesh]
+        elif surfels and not self.use_mesh:
+            arguments.append("--no-mesh")
         if light:
             arguments += ["--env", light]
+        if surfels and self.use_remove_light:
+            if not light:
+                raise UsageError("Remove Light", "needs the light of the capture", "Choose its environment")
+            arguments.append("--remove-light")
         if self.up != "auto":
             arguments.append(f"--up={self.up}")
+        if self.scale != 1.0:
+            arguments.append(f"--scale={self.scale:.9g}")
         return [*arguments, "--out", str(self._target())]
 
-    def _start(self) -> None:
-        arguments = self._arguments()
-        command = engine_link.command_line()
-        python = command[: command.index("-m")]
-        self._log = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the process
-        try:
-            self._process = subprocess.Popen(
-                [*python, "-m", "drgs_blender.cli.main", "--no-progress", *arguments],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                stderr=self._log,
-            )
-        except OSError as error:
-            self._log.close()
-            raise UsageError("Engine", f"{python[0]} cannot be started ({error})", "See the preferences") from error
 
-    def _finish(self, context: bpy.types.Context) -> set[str]:
-        """Load what was made, or say why it was not."""
-        self._log.seek(0)
-        lines = self._log.read().decode(errors="replace").strip().splitlines()
-        self._log.close()
-        if self._process.returncode:
-            reason = lines[-1].removeprefix("drgs: ") if lines else f"exit code {self._process.returncode}"
-            raise AssetError(
-                Path(self.surfels or self.mesh).name, f"could not be made into an asset: {reason.rstrip('.')}"
-            )
-        for line in lines:
-            messages.note("INFO", line)
-        import_assets(context, [self._target()], self.use_environment)
-        return {"FINISHED"}
-
-    def _release(self, context: bpy.types.Context) -> None:
-        context.window_manager.event_timer_remove(self._timer)
-        context.workspace.status_text_set(None)
+def kind_of(path: Path) -> str:
+    """What a file is taken for: "surfels", "mesh" or "environment". Whether it can be read, the engine says."""
+    suffix = path.suffix.lower()
+    kinds = [t.kind for t in READ.values() if suffix in t.extensions]
+    if suffix not in SPLATS:
+        return kinds[0] if kinds and kinds[0] != "materials" else "mesh"
+    try:
+        with open(path, "rb") as file:
+            head = file.read(HEADER)
+    except OSError:
+        return "mesh"
+    if suffix == ".ply":
+        head = head.partition(b"end_header")[0]
+    return "surfels" if any(word in head for word in SPLATS[suffix]) else "mesh"
 
 
-CLASSES = (DRGS_OT_import_parts,)
+class DRGS_FH_parts(DropTarget, bpy.types.FileHandler):
+    """Drop surfels, splats or textured meshes on the viewport."""
+
+    bl_idname = "DRGS_FH_parts"
+    bl_label = "Captured object (DR-GS)"
+    bl_import_operator = "drgs.import_parts"
+    bl_file_extensions = ";".join(e for e in extensions("surfels", "mesh") if e not in GENERAL)
+
+
+CLASSES = (DRGS_OT_import_parts, DRGS_FH_parts)

@@ -38,6 +38,10 @@ class Weights:
         rows = np.repeat(np.repeat(rows, 3), count)
         return _summed(self.groups, rows, group[entry], weight[entry] * np.repeat(share, count))
 
+    def totals(self, count: int) -> Array:
+        """(count,) float64 sum of the weights of each vertex."""
+        return np.bincount(self.vertex, self.weight, count)
+
     @staticmethod
     def joined(groups: list[str], parts: list[Weights]) -> Weights:
         """Several sets of weights with the same groups as one."""

@@ -9,6 +9,8 @@ from mathutils import Matrix
 from ...drgs_blender.errors import UsageError
 from ...drgs_blender.frame import Camera
 
+#: For frames whose camera has no part in what is made of them.
+NO_CAMERA = Camera(np.eye(4), 1, 1, 1.0, 1.0, 0.5, 0.5)
 #: Camera type -> orthographic? What is not here cannot be rendered.
 SUPPORTED = {"PERSP": False, "ORTHO": True}
 
@@ -17,6 +19,11 @@ def resolution(render: bpy.types.RenderSettings) -> tuple[int, int]:
     """Full picture in pixels, rounded as Blender rounds it."""
     percentage = render.resolution_percentage
     return max(1, render.resolution_x * percentage // 100), max(1, render.resolution_y * percentage // 100)
+
+
+def picture_of(scene: bpy.types.Scene) -> bpy.types.RenderSettings:
+    """Settings that say how large a scene's picture is: those of the scene over which it is laid, or its own."""
+    return (scene.drgs.over or scene).render
 
 
 def border(render: bpy.types.RenderSettings, width: int, height: int) -> tuple[int, int, int, int] | None:

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import bpy
 
 from ...drgs_blender.errors import UsageError
 from ...drgs_blender.frame import Camera, Frame
-from .. import assets, preferences
+from .. import assets, compositing, preferences
 from ..passes import enabled
-from .camera import export_camera
+from .camera import export_camera, picture_of
 from .images import end_export
-from .instances import UNRENDERED, Unrendered, visible
+from .instances import UNRENDERED, Unrendered, Visible, uncancelled, visible
 from .lights import export_light
 from .materials import Materials
+from .memory import Memory, uid
 from .meshes import Meshes
+from .moments import FrameSet, add_moments
 from .objects import DrgsObjects
 from .world import export_world
 
@@ -28,7 +31,14 @@ def export_frame(
     depsgraph: bpy.types.Depsgraph,
     key_of: Callable[[Path], str],
     warn: Callable[[str], None],
+    *,
     camera: Camera | None = None,
+    frame_set: FrameSet | None = None,
+    memory: Memory | None = None,
+    shown: Callable[[bpy.types.Object], bool] | None = None,
+    passes: tuple[str, ...] | None = None,
+    cancelled: Callable[[], bool] | None = None,
+    blurred: bool = False,
 ) -> Frame:
     """Describe the frame that `depsgraph` was evaluated for.
 
@@ -37,6 +47,12 @@ def export_frame(
     key_of : gives the engine's key of the asset at a path
     warn : told of everything that cannot be rendered as the scene has it
     camera : replaces the scene's camera
+    frame_set : evaluates the scene at another frame, for passes of motion; without it nothing moves
+    memory : what earlier exports of the same depsgraph made and is still true
+    shown : whether an evaluated object is in the picture; all are when None
+    passes : replace those of the view layer
+    blurred : the caller sees to motion blur and depth of field, see `render_engine.blur`
+    cancelled : asked before each object
 
     Raises
     ------
@@ -44,20 +60,28 @@ def export_frame(
         There is no camera, or it cannot be rendered.
     AssetError
         From `DrgsObjects.add`.
+    Cancelled
     """
     scene = depsgraph.scene_eval
+    own_camera = camera is None
     if camera is None:
         if scene.camera is None:
             raise UsageError(f'Scene "{scene.name}"', "has no camera", "Add a camera, or make one active with Ctrl 0")
-        camera = export_camera(scene.camera.evaluated_get(depsgraph), scene.render)
-        _check_features(scene, warn)
+        camera = export_camera(scene.camera.evaluated_get(depsgraph), picture_of(scene))
+        _check_features(scene, depsgraph.view_layer, warn, blurred)
     materials, unrendered, lights = Materials(warn), Unrendered(), []
-    objects, meshes = DrgsObjects(depsgraph, key_of, warn), Meshes(depsgraph, materials, warn)
-    for item in visible(depsgraph):
+    memory = Memory() if memory is None else memory
+    objects, meshes = DrgsObjects(depsgraph, key_of, warn, memory), Meshes(depsgraph, materials, warn, memory)
+    others = depsgraph.view_layer.drgs.others
+    for item in uncancelled(visible(depsgraph), cancelled):
+        if shown is not None and not shown(item.object):
+            continue
+        if others != "SEEN" and not assets.is_drgs(item.object):
+            item = _unseen(item, others)
         if item.object.type == "LIGHT":
             light = export_light(item, warn)
             if light is not None:
-                lights.append(light)
+                lights.append(light if others == "SEEN" else replace(light, camera=False))
         elif item.object.type in UNRENDERED:
             unrendered.add(item.object)
         elif assets.is_drgs(item.object):
@@ -71,18 +95,29 @@ def export_frame(
         number=scene.frame_current if settings.use_animated_seed else 0,
         camera=camera,
         objects=objects.states,
-        world=export_world(scene.world, warn),
+        world=memory.recall(("world", uid(scene.world)), (), lambda: export_world(scene.world, warn)),
         settings=settings.to_settings(scene.render.film_transparent, preferences.read("threads", 0)),
-        passes=tuple(p.name for p in enabled(depsgraph.view_layer)),
+        passes=passes or tuple(p.name for p in enabled(scene, depsgraph.view_layer)),
         meshes=meshes.states(),
         lights=lights,
         images=list(materials.images.values()),
     )
+    memory.end()
     end_export()
+    if frame_set is not None and own_camera:
+        add_moments(frame, depsgraph, frame_set, objects.keys, meshes.keys(), cancelled)
     return frame
 
 
-def _check_features(scene: bpy.types.Scene, warn: Callable[[str], None]) -> None:
+def _unseen(item: Visible, others: str) -> Visible:
+    """Another engine's object in a picture that is laid over that engine's."""
+    catches = others == "CATCHER" and not item.visibility.holdout
+    return replace(item, visibility=replace(item.visibility, shadow_catcher=catches, holdout=not catches))
+
+
+def _check_features(
+    scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer, warn: Callable[[str], None], blurred: bool
+) -> None:
     """Say which features of the scene the picture will lack.
 
     Raises
@@ -100,7 +135,13 @@ def _check_features(scene: bpy.types.Scene, warn: Callable[[str], None]) -> None
     space = getattr(getattr(bpy.data, "colorspace", None), "working_space", WORKING_SPACE)
     if space != WORKING_SPACE:
         warn(f"The file works in {space}; DR-GS renders {WORKING_SPACE}, so colours will differ")
+    if scene.drgs.over is not None and (changed := compositing.differences(scene)):
+        warn(f'Scene "{scene.drgs.over.name}" has another {", ".join(changed)} now: press Set Up Compositing again')
+    if view_layer.use_pass_cryptomatte_asset:
+        warn(f'Cryptomatte of assets of view layer "{view_layer.name}" is not rendered by DR-GS')
+    if blurred:
+        return
     if scene.render.use_motion_blur:
-        warn("Motion blur is not rendered by DR-GS")
+        warn("Motion blur is rendered by F12 and `blender -b` alone, not here")
     if scene.camera.data.dof.use_dof:
-        warn(f'Depth of field of camera "{scene.camera.name}" is not rendered by DR-GS')
+        warn(f'Depth of field of camera "{scene.camera.name}" is rendered by F12 and `blender -b` alone, not here')

@@ -2,24 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from typing import TypeVar
 
 import bpy
 import numpy as np
 
+from ...drgs_blender.errors import Cancelled
 from ...drgs_blender.frame import Visibility
 
+T = TypeVar("T")
 Warn = Callable[[str], None]
 
 #: What has a surface that a picture without it would lack, by the type of the object.
 UNRENDERED = {"CURVES": "hair", "POINTCLOUD": "point cloud", "VOLUME": "volume"}
 
 
+#: Tells an instance from all others, at any time: its object, what makes it, its number there.
+Key = tuple[int, int, tuple[int, ...]]
+
+
 @dataclass(frozen=True, slots=True)
 class Visible:
     """One visible instance: an evaluated object, where it stands and which rays meet it."""
 
+    key: Key
     object: bpy.types.Object
     matrix_world: np.ndarray
     visibility: Visibility
@@ -43,7 +51,16 @@ def visible(depsgraph: bpy.types.Depsgraph) -> Iterator[Visible]:
             known[key] = _visibility(obj, parent, layer)
         visibility = known[key]
         if visibility is not None:
-            yield Visible(obj, np.array(instance.matrix_world, np.float64), visibility)
+            number = tuple(instance.persistent_id) if parent else ()
+            yield Visible((*key, number), obj, np.array(instance.matrix_world, np.float64, order="C"), visibility)
+
+
+def uncancelled(items: Iterable[T], cancelled: Callable[[], bool] | None) -> Iterator[T]:
+    """The `items`, for as long as nobody says `cancelled`; then `Cancelled` is raised."""
+    for item in items:
+        if cancelled is not None and cancelled():
+            raise Cancelled
+        yield item
 
 
 def _visibility(

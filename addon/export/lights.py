@@ -9,7 +9,7 @@ import numpy as np
 
 from ...drgs_blender.frame import Light
 from .instances import Visible
-from .nodes import Paint, Place, Walker, plain, surface_of
+from .nodes import Paint, Place, Walker, once, plain, surface_of
 
 Warn = Callable[[str], None]
 
@@ -87,6 +87,7 @@ class _Tree(Walker):
         surface = surface_of(self.tree)
         return np.zeros(3) if surface is None else self.shader(surface)
 
+    @once(lambda self: np.ones(3))
     def shader(self, place: Place) -> np.ndarray:
         """(3,) of a shader input."""
         origin = place.origin()

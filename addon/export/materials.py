@@ -10,7 +10,7 @@ import numpy as np
 
 from ...drgs_blender.frame import Image, Material, Texture
 from . import images
-from .nodes import Paint, Place, Walker, constant, euler, plain, surface_of, vector_rotate
+from .nodes import Paint, Place, Walker, constant, euler, once, plain, reflectance, surface_of, vector_rotate
 from .pictures import Picture
 
 Warn = Callable[[str], None]
@@ -112,7 +112,7 @@ def _usable(tree: _Tree, name: str, paint: Paint, default: tuple[float, float, f
         tree.say(f"its {name.replace('_', ' ')} is not finite; Blender's default is used")
         colour = np.broadcast_to(default, 3)
     colour = np.maximum(colour, 0)
-    if name != "emission" and paint.texture is None:
+    if name in ("roughness", "metallic") and paint.texture is None:
         colour = np.minimum(colour, 1)
     return tuple(map(float, colour)) if name in ("base_colour", "emission") else float(colour[0])
 
@@ -231,15 +231,14 @@ class _Tree(Walker):
     def node_fresnel(self, output: Place) -> Paint:
         ior = self.value(output.input("IOR"))
         self.warn(output.node, "it cannot depend on the direction; the value when seen from the front is used")
-        return plain(((ior - 1) / (ior + 1)) ** 2)
+        return plain(reflectance(ior))
 
     def node_layer_weight(self, output: Place) -> Paint:
         blend = np.clip(self.value(output.input("Blend")), 0, 0.99999)
         self.warn(output.node, "it cannot depend on the direction; the value when seen from the front is used")
         if output.socket.name == "Facing":
             return plain(0)
-        ior = 1 / (1 - blend)
-        return plain(((ior - 1) / (ior + 1)) ** 2)
+        return plain(reflectance(1 / (1 - blend)))
 
     # Coordinates
 
@@ -298,6 +297,7 @@ class _Tree(Walker):
 
     # Shaders
 
+    @once(lambda self: Surface(plain(self.unknown), scattered=1))
     def shader(self, place: Place) -> Surface:
         """What a shader input does."""
         origin = place.origin()
@@ -331,7 +331,7 @@ class _Tree(Walker):
         ior, level = output.input("IOR").origin().socket, output.input("Specular IOR Level").origin().socket
         if ior.is_output or level.is_output:
             return float("nan")
-        return ((ior.default_value - 1) / (ior.default_value + 1)) ** 2 * 2 * level.default_value
+        return reflectance(ior.default_value) * 2 * level.default_value
 
     def opacity(self, place: Place) -> float:
         """A constant alpha; where it varies, the surface is there."""

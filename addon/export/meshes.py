@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+import contextlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
 
 import bpy
 import numpy as np
 
-from ...drgs_blender.frame import MeshState
+from ...drgs_blender.frame import Image, Material, MeshState
 from .. import mesh_arrays
-from .instances import Visible
+from .instances import Key, Visible
 from .materials import DEFAULT, Look, Materials
+from .memory import Memory, uid
 
 Warn = Callable[[str], None]
 Array = np.ndarray
@@ -24,13 +26,37 @@ class _Shape:
     state: MeshState | None
     matrices: list[Array] = field(default_factory=list)
     pass_indices: list[int] = field(default_factory=list)
+    keys: list[Key] = field(default_factory=list)
+
+
+@dataclass(frozen=True, slots=True)
+class _Arrays:
+    """What of a mesh does not depend on its materials; see `mesh_arrays`."""
+
+    vertices: Array
+    corners: Array
+    polygons: Array
+    corner_vertices: Array
+    material_index: Array | None
+    normals: Array | None
+
+    @classmethod
+    def read(cls, mesh: bpy.types.Mesh) -> _Arrays:
+        """Read them, vertices frozen."""
+        return cls(
+            _frozen(mesh_arrays.read_vertices(mesh)),
+            *mesh_arrays.read_loop_triangles(mesh),
+            mesh_arrays.read_corner_vertices(mesh),
+            mesh_arrays.read_material_index(mesh),
+            mesh_arrays.smooth_or_corner_normals(mesh),
+        )
 
 
 class Meshes:
     """Collects the meshes of one export. Those with the same data, materials and visibility are one shape."""
 
-    def __init__(self, depsgraph: bpy.types.Depsgraph, materials: Materials, warn: Warn) -> None:
-        self._depsgraph, self._materials, self._warn = depsgraph, materials, warn
+    def __init__(self, depsgraph: bpy.types.Depsgraph, materials: Materials, warn: Warn, memory: Memory) -> None:
+        self._depsgraph, self._materials, self._warn, self._memory = depsgraph, materials, warn, memory
         self._shapes: dict[tuple[object, ...], _Shape] = {}
 
     def add(self, item: Visible) -> None:
@@ -44,50 +70,61 @@ class Meshes:
         )
         shape = self._shapes.get(key)
         if shape is None:
-            shape = self._shapes[key] = _Shape(self._state(item, slots))
+            owners = uid(obj.data), uid(obj)
+            stands = (*owners, obj.data.as_pointer(), obj.data.is_editmode)
+            arrays = self._memory.recall(("arrays", *stands), owners, lambda: self._arrays(obj))
+            state, pictures = self._memory.recall(
+                ("mesh", *stands, obj.name, *key), owners, lambda: self._state(item, slots, arrays)
+            )
+            self._materials.images |= pictures
+            shape = self._shapes[key] = _Shape(state)
         shape.matrices.append(item.matrix_world)
         shape.pass_indices.append(obj.pass_index)
+        shape.keys.append(item.key)
 
     def states(self) -> list[MeshState]:
         """One a shape."""
         found = []
         for shape in self._shapes.values():
             if shape.state is not None:
-                shape.state.matrices = _frozen(np.array(shape.matrices, np.float64))
-                shape.state.pass_indices = _frozen(np.array(shape.pass_indices, np.int32))
-                found.append(shape.state)
+                matrices = _frozen(np.array(shape.matrices, np.float64))
+                indices = _frozen(np.array(shape.pass_indices, np.int32))
+                found.append(replace(shape.state, matrices=matrices, pass_indices=indices))
         return found
 
-    def _state(self, item: Visible, slots: list[bpy.types.Material | None]) -> MeshState | None:
-        """What all instances share; None where the mesh has no faces that are seen."""
-        obj = item.object
-        # While a mesh is edited, its evaluated data is a wrapper without arrays; a converted copy has them.
-        editing = obj.data.is_editmode
-        mesh = obj.to_mesh(preserve_all_data_layers=True, depsgraph=self._depsgraph) if editing else obj.data
-        try:
-            return self._describe(item, mesh, slots)
-        finally:
-            if editing:
-                obj.to_mesh_clear()
+    def keys(self) -> list[list[Key]]:
+        """Which instance each place of each of `states` is."""
+        return [shape.keys for shape in self._shapes.values() if shape.state is not None]
+
+    def _arrays(self, obj: bpy.types.Object) -> _Arrays:
+        with _read(obj, self._depsgraph) as mesh:
+            return _Arrays.read(mesh)
+
+    def _state(
+        self, item: Visible, slots: list[bpy.types.Material | None], arrays: _Arrays
+    ) -> tuple[MeshState | None, dict[str, Image]]:
+        """What all instances share, and the images on it; None where the mesh has no faces that are seen."""
+        with _read(item.object, self._depsgraph) as mesh:
+            state = self._describe(item, mesh, slots, arrays)
+        return state, {name: self._materials.images[name] for name in _images_of(state)}
 
     def _describe(
-        self, item: Visible, mesh: bpy.types.Mesh, slots: list[bpy.types.Material | None]
+        self, item: Visible, mesh: bpy.types.Mesh, slots: list[bpy.types.Material | None], arrays: _Arrays
     ) -> MeshState | None:
         if len(mesh.polygons) == 0:
             return None
         looks = [self._materials.look(material, mesh) for material in slots or [None]]
-        corners, polygons = mesh_arrays.read_loop_triangles(mesh)
-        index = mesh_arrays.read_material_index(mesh)
+        corners, polygons, index = arrays.corners, arrays.polygons, arrays.material_index
         if index is not None:
             index = np.clip(index, 0, len(looks) - 1)[polygons]  # as Cycles reads what is out of range
         corners, index = _seen(corners, index, looks)
         if len(corners) == 0:
             return None
-        normals = mesh_arrays.smooth_or_corner_normals(mesh)
+        normals = arrays.normals
         return MeshState(
             name=item.object.name,
-            vertices=_frozen(mesh_arrays.read_vertices(mesh)),
-            faces=_frozen(mesh_arrays.read_corner_vertices(mesh)[corners]),
+            vertices=arrays.vertices,
+            faces=_frozen(arrays.corner_vertices[corners]),
             matrices=np.empty((0, 4, 4)),
             pass_indices=np.empty(0, np.int32),
             corner_normals=None if normals is None else _frozen(normals[corners]),
@@ -117,6 +154,30 @@ class Meshes:
                 faces = np.isin(index, [i for i, u in enumerate(wanted) if u == uv_map])
             uvs[faces] = values[corners[faces]]
         return _frozen(uvs)
+
+
+@contextlib.contextmanager
+def _read(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Iterator[bpy.types.Mesh]:
+    """The evaluated mesh of an object with all its arrays.
+
+    While a mesh is edited, its evaluated data is a wrapper without arrays; a converted copy has them.
+    """
+    if not obj.data.is_editmode:
+        yield obj.data
+        return
+    try:
+        yield obj.to_mesh(preserve_all_data_layers=True, depsgraph=depsgraph)
+    finally:
+        obj.to_mesh_clear()
+
+
+def _images_of(state: MeshState | None) -> set[str]:
+    """Names of the images that its textures refer to."""
+    if state is None:
+        return set()
+    names = [name for name in Material.__dataclass_fields__ if name.endswith("_texture")]
+    textures = [getattr(material, name) for material in state.materials for name in names]
+    return {texture.image for texture in textures if texture is not None}
 
 
 def _seen(corners: Array, index: Array | None, looks: list[Look]) -> tuple[Array, Array | None]:

@@ -9,7 +9,8 @@ from __future__ import annotations
 import colorsys
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from functools import wraps
+from typing import Any, NamedTuple
 
 import bpy
 import numpy as np
@@ -22,6 +23,8 @@ Array = np.ndarray
 
 #: Luminance weights of Rec.709.
 LUMINANCE = np.array(REC709)
+#: Nodes that may follow each other; Python's own limit is some six times that.
+DEEPEST = 100
 #: Colours with which a function is probed for being a plain scaling of each channel.
 _PROBES = np.array(((0.9, 0.6, 0.3), (0.2, 0.5, 0.8), (0.04, 0.02, 0.07)))
 
@@ -105,6 +108,33 @@ def constant(socket: bpy.types.NodeSocket) -> Array:
     return np.array(value[:3] if hasattr(value, "__len__") else (value,) * 3, np.float64)
 
 
+def once(fallback: Callable[[Any], Any]) -> Callable[..., Any]:
+    """Let a method of a `Walker` work out what a place holds only once, however many nodes ask.
+
+    Without that, nodes whose inputs share a source double the work each. Nodes before the `DEEPEST` are left out: then
+    the method gives ``fallback(walker)``.
+    """
+
+    def decorate(method: Callable[[Any, Place], Any]) -> Callable[[Any, Place], Any]:
+        @wraps(method)
+        def remembered(self: Any, place: Place) -> Any:
+            key = method.__name__, place
+            if key not in self.found:
+                if self.depth >= DEEPEST and place.socket.is_linked:
+                    self.warn(place.node, f"more than {DEEPEST} nodes follow; what comes before is left out")
+                    return fallback(self)
+                self.depth += 1
+                try:
+                    self.found[key] = method(self, place)
+                finally:
+                    self.depth -= 1
+            return self.found[key]
+
+        return remembered
+
+    return decorate
+
+
 class Walker:
     """Evaluates the sockets of one node tree. A method ``node_<type>`` gives the paint of an output of such nodes."""
 
@@ -115,6 +145,8 @@ class Walker:
         self.owner = owner
         self._warn = warn
         self._said: set[str] = set()
+        self.found: dict[tuple[str, Place], Any] = {}
+        self.depth = 0
 
     def warn(self, node: bpy.types.Node, problem: str) -> None:
         """Say `problem` once."""
@@ -139,6 +171,7 @@ class Walker:
 
     # Sockets
 
+    @once(lambda self: plain(self.unknown))
     def colour(self, place: Place) -> Paint:
         """Value of a colour or vector input."""
         origin = place.origin()
@@ -383,8 +416,7 @@ class Walker:
         mode = getattr(node, "mode", "RGB")
         if mode == "RGB":
             return self.part(node, colour, index)
-        convert = colorsys.rgb_to_hsv if mode == "HSV" else _rgb_to_hsl
-        return plain(convert(*self.flat(node, colour))[index])
+        return plain((_hsv if mode == "HSV" else _hsl)(self.flat(node, colour))[index])
 
     node_seprgb = node_sepxyz = node_separate_color
 
@@ -393,10 +425,10 @@ class Walker:
 
         @_by_row
         def joined(r: Array, g: Array, b: Array) -> Array:
-            rgb = r[0], g[1], b[2]
-            if mode == "HSV":
-                return np.array(colorsys.hsv_to_rgb(*rgb))
-            return np.array(colorsys.hls_to_rgb(rgb[0], rgb[2], rgb[1]) if mode == "HSL" else rgb)
+            values = np.array((r[0], g[1], b[2]))
+            if mode == "HSL":
+                return _system(colorsys.hls_to_rgb, values[[0, 2, 1]])
+            return _system(colorsys.hsv_to_rgb, values) if mode == "HSV" else values
 
         return self.combine(output.node, joined, *(self.number(output.input(i)) for i in range(3)))
 
@@ -429,16 +461,24 @@ def _overlay(a: Array, b: Array) -> Array:
     return np.where(a < 0.5, 2 * a * b, 1 - 2 * (1 - a) * (1 - b))
 
 
-def _rgb_to_hsl(r: float, g: float, b: float) -> tuple[float, float, float]:
-    hue, lightness, saturation = colorsys.rgb_to_hls(r, g, b)
-    return hue, saturation, lightness
+def _system(convert: Callable[..., tuple[float, float, float]], values: Array) -> Array:
+    """(3,) in another colour system; NaN, which `convert` refuses, where a value is not finite."""
+    return np.array(convert(*values)) if np.isfinite(values).all() else np.full(3, np.nan)
+
+
+def _hsv(colour: Array) -> Array:
+    return _system(colorsys.rgb_to_hsv, np.maximum(colour, 0))
+
+
+def _hsl(colour: Array) -> Array:
+    return _system(colorsys.rgb_to_hls, np.maximum(colour, 0))[[0, 2, 1]]
 
 
 @_by_row
 def _hue_saturation(hue: Array, saturation: Array, value: Array, factor: Array, colour: Array) -> Array:
-    h, s, v = colorsys.rgb_to_hsv(*colour)
-    turned = colorsys.hsv_to_rgb((h + hue[0] + 0.5) % 1, np.clip(s * saturation[0], 0, 1), v * value[0])
-    return colour + factor * (np.maximum(turned, 0) - colour)
+    h, s, v = _hsv(colour)
+    turned = np.array(((h + hue[0] + 0.5) % 1, np.clip(s * saturation[0], 0, 1), v * value[0]))
+    return colour + factor * (np.maximum(_system(colorsys.hsv_to_rgb, turned), 0) - colour)
 
 
 #: Blend type -> what the second colour does to the first at factor 1.
@@ -497,6 +537,12 @@ def blackbody(kelvin: float) -> Array:
     z = 1.217 * lobe(437.0, 0.0845, 0.0278) + 0.681 * lobe(459.0, 0.0385, 0.0725)
     to_rec709 = np.array(((3.2406, -1.5372, -0.4986), (-0.9689, 1.8758, 0.0415), (0.0557, -0.2040, 1.0570)))
     return np.maximum(to_rec709 @ (light @ np.stack((x, y, z), 1)), 0) / (light @ y)
+
+
+def reflectance(ior: float) -> float:
+    """Of a dielectric in air, seen from the front; below 0 as at 0, where there is nothing to enter."""
+    ior = max(ior, 0.0)
+    return ((ior - 1) / (ior + 1)) ** 2
 
 
 def euler(angles: Array) -> Array:

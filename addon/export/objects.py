@@ -10,10 +10,11 @@ import bpy
 import numpy as np
 
 from ...drgs_blender.asset import MATERIAL_CHANNELS, Asset
-from ...drgs_blender.frame import ObjectState
+from ...drgs_blender.frame import Adjustment, ObjectState
 from .. import assets, mesh_arrays
 from .fit import check_fit, check_modifiers
-from .instances import Visible
+from .instances import Key, Visible
+from .memory import Memory, uid
 
 Warn = Callable[[str], None]
 #: Gives the engine's key of the asset at a path.
@@ -23,10 +24,10 @@ KeyOf = Callable[[Path], str]
 class DrgsObjects:
     """Collects the DR-GS objects of one export."""
 
-    def __init__(self, depsgraph: bpy.types.Depsgraph, key_of: KeyOf, warn: Warn) -> None:
-        self._depsgraph, self._key_of, self._warn = depsgraph, key_of, warn
-        self._shapes: dict[tuple[int, int], ObjectState] = {}
+    def __init__(self, depsgraph: bpy.types.Depsgraph, key_of: KeyOf, warn: Warn, memory: Memory) -> None:
+        self._depsgraph, self._key_of, self._warn, self._memory = depsgraph, key_of, warn, memory
         self.states: list[ObjectState] = []
+        self.keys: list[Key] = []
 
     def add(self, item: Visible) -> None:
         """Take in a visible instance.
@@ -38,13 +39,16 @@ class DrgsObjects:
         """
         obj = item.object
         check_modifiers(obj, self._depsgraph)
-        shape_of = (obj.original.as_pointer(), obj.data.as_pointer())
-        if shape_of not in self._shapes:
-            self._shapes[shape_of] = _shape(obj, self._depsgraph, self._key_of, self._warn)
-        shape = self._shapes[shape_of]
+        look = obj.drgs.adjustment.values()
+        shape = self._memory.recall(
+            ("object", uid(obj), obj.name, obj.data.as_pointer(), obj.mode, str(assets.file_of(obj)), look),
+            (uid(obj), uid(obj.data)),
+            lambda: _shape(obj, self._depsgraph, self._key_of, self._warn),
+        )
         self.states.append(
             replace(shape, matrix_world=item.matrix_world, pass_index=obj.pass_index, visibility=item.visibility)
         )
+        self.keys.append(item.key)
 
 
 def _shape(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, key_of: KeyOf, warn: Warn) -> ObjectState:
@@ -56,18 +60,31 @@ def _shape(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, key_of: KeyOf,
     mesh = obj.to_mesh(preserve_all_data_layers=True, depsgraph=depsgraph) if editing else obj.data
     try:
         same_faces = check_fit(obj, mesh, asset.mesh, warn)
-        vertices = mesh_arrays.read_vertices(mesh)
-        vertices.flags.writeable = False  # so that the engine's client need not copy it
-        return ObjectState(
-            name=obj.name,
-            asset=key_of(path),
-            vertices=vertices,
-            corner_normals=_corner_normals(obj, mesh, same_faces, warn),
+        arrays = {
+            "vertices": mesh_arrays.read_vertices(mesh),
+            "corner_normals": _corner_normals(obj, mesh, same_faces, warn),
             **{channel: _edited(obj, mesh, asset, channel, warn) for channel in MATERIAL_CHANNELS},
-        )
+        }
+        for array in arrays.values():
+            if array is not None:
+                array.flags.writeable = False  # so that the engine's client need not copy it
+        return ObjectState(name=obj.name, asset=key_of(path), adjustment=_adjustment(obj, mesh, warn), **arrays)
     finally:
         if editing:
             obj.to_mesh_clear()
+
+
+def look_of(obj: bpy.types.Object, asset: Asset, warn: Warn) -> tuple[dict[str, np.ndarray], Adjustment | None]:
+    """What an evaluated object in Object Mode has painted, where it differs from its asset, and its adjustments.
+
+    Raises
+    ------
+    AssetError
+        Its mesh is not the asset's, moved; names the object.
+    """
+    check_fit(obj, obj.data, asset.mesh, warn)
+    painted = {channel: _edited(obj, obj.data, asset, channel, warn) for channel in MATERIAL_CHANNELS}
+    return {name: values for name, values in painted.items() if values is not None}, _adjustment(obj, obj.data, warn)
 
 
 def _corner_normals(obj: bpy.types.Object, mesh: bpy.types.Mesh, same_faces: bool, warn: Warn) -> np.ndarray | None:
@@ -80,6 +97,23 @@ def _corner_normals(obj: bpy.types.Object, mesh: bpy.types.Mesh, same_faces: boo
     return mesh_arrays.read_corner_normals(mesh)
 
 
+def _adjustment(obj: bpy.types.Object, mesh: bpy.types.Mesh, warn: Warn) -> Adjustment | None:
+    """The adjustments of an object; None where they change nothing."""
+    settings = obj.drgs.adjustment
+    if not settings.values():
+        return None
+    mask = None
+    if settings.mask:
+        mask = mesh_arrays.read_mask(obj, mesh, settings.mask)
+        if mask is None:
+            warn(
+                f'"{obj.name}": its adjustments want the mask "{settings.mask}", which is no vertex group or number of '
+                "points; they are applied nowhere"
+            )
+            return None
+    return settings.to_frame(mask)
+
+
 def _edited(obj: bpy.types.Object, mesh: bpy.types.Mesh, asset: Asset, channel: str, warn: Warn) -> np.ndarray | None:
     """A material channel where it differs from the asset's, else None."""
     try:
@@ -87,6 +121,10 @@ def _edited(obj: bpy.types.Object, mesh: bpy.types.Mesh, asset: Asset, channel: 
     except TypeError as error:
         warn(f'"{obj.name}": attribute {channel} is {error}; the asset\'s values are used')
         return None
-    if values is None or np.array_equal(values, getattr(asset.mesh, channel)):
+    if values is None:
         return None
-    return values
+    own, lost = getattr(asset.mesh, channel), np.isnan(values)
+    if lost.any():
+        warn(f'"{obj.name}": {lost.sum()} values of attribute {channel} are not numbers; the asset\'s are used there')
+        values[lost] = own[lost]
+    return None if np.array_equal(values, own) else values

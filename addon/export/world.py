@@ -11,7 +11,7 @@ import numpy as np
 from ...drgs_blender.errors import UsageError
 from ...drgs_blender.frame import World
 from .images import linear_pixels
-from .nodes import Paint, Place, Walker, euler, plain, surface_of, vector_rotate
+from .nodes import Paint, Place, Walker, euler, once, plain, surface_of, vector_rotate
 
 Warn = Callable[[str], None]
 
@@ -94,6 +94,7 @@ class _Tree(Walker):
 
     # Shaders
 
+    @once(lambda self: plain(self.unknown))
     def shader(self, place: Place) -> Paint:
         """Light of a shader input."""
         origin = place.origin()

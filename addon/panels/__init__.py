@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import bpy
 
-from . import object_data, rays, render, sidebar, view_layer
+from . import adjustment, compositing, matter, object_data, rays, render, sidebar, submit, tour, view_layer
 
-CLASSES = (*render.CLASSES, *view_layer.CLASSES, *object_data.CLASSES, *rays.CLASSES, *sidebar.CLASSES)
+CLASSES = (
+    *render.CLASSES,
+    *submit.CLASSES,
+    *view_layer.CLASSES,
+    *object_data.CLASSES,
+    *matter.CLASSES,
+    *rays.CLASSES,
+    *compositing.CLASSES,
+    *tour.CLASSES,
+    *sidebar.CLASSES,
+    *adjustment.CLASSES,
+)
 
-
-def register() -> None:
-    for cls in CLASSES:
-        bpy.utils.register_class(cls)
-
-
-def unregister() -> None:
-    for cls in reversed(CLASSES):
-        bpy.utils.unregister_class(cls)
+register, unregister = bpy.utils.register_classes_factory(CLASSES)

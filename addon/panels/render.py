@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import bpy
+from bl_ui.utils import PresetPanel
+
+from .. import presets
 
 
 class _RenderPanel:
@@ -17,8 +20,18 @@ class _RenderPanel:
         return context.engine == "DRGS"
 
 
+class DRGS_PT_presets(PresetPanel, bpy.types.Panel):
+    bl_label = "Render Presets"
+    preset_subdir = presets.FOLDER
+    preset_operator = "drgs.render_preset"
+    preset_add_operator = "drgs.render_preset_add"
+
+
 class DRGS_PT_sampling(_RenderPanel, bpy.types.Panel):
     bl_label = "Sampling"
+
+    def draw_header_preset(self, context: bpy.types.Context) -> None:
+        DRGS_PT_presets.draw_panel_header(self.layout)
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
@@ -38,10 +51,16 @@ class DRGS_PT_sampling(_RenderPanel, bpy.types.Panel):
         value.active = settings.use_noise_threshold
         value.prop(settings, "noise_threshold", text="")
         layout.prop(settings, "aa")
-        layout.prop(settings, "denoise")
+        row = layout.row()
+        row.active = not settings.use_temporal
+        row.prop(settings, "denoise")
+        layout.prop(settings, "use_temporal")
         row = layout.row(align=True)
         row.prop(settings, "seed")
         row.prop(settings, "use_animated_seed", text="", icon="TIME")
+        column = layout.column(heading="Viewport")
+        column.prop(settings, "use_viewport_denoise")
+        column.prop(context.scene.render, "preview_pixel_size")
 
 
 class DRGS_PT_light(_RenderPanel, bpy.types.Panel):
@@ -52,8 +71,26 @@ class DRGS_PT_light(_RenderPanel, bpy.types.Panel):
         layout.use_property_split = True
         layout.use_property_decorate = False
         settings = context.scene.drgs
-        for name in ("bounces", "clamp_indirect", "look", "primary"):
+        for name in ("bounces", "clamp_indirect", "look", "primary", "tracer"):
             layout.prop(settings, name)
+
+
+class DRGS_PT_blur(_RenderPanel, bpy.types.Panel):
+    bl_label = "Blur"
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012 - read by Blender
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout
+        layout.use_property_split = True
+        render, camera = context.scene.render, context.scene.camera
+        layout.prop(render, "use_motion_blur", text="Motion Blur")
+        column = layout.column()
+        column.active = render.use_motion_blur
+        column.prop(render, "motion_blur_position", text="Position")
+        column.prop(render, "motion_blur_shutter")
+        if camera is not None and camera.type == "CAMERA":
+            layout.prop(camera.data.dof, "use_dof", text="Depth of Field")
+        layout.prop(context.scene.drgs, "blur_steps")
 
 
 class DRGS_PT_film(_RenderPanel, bpy.types.Panel):
@@ -64,4 +101,4 @@ class DRGS_PT_film(_RenderPanel, bpy.types.Panel):
         self.layout.prop(context.scene.render, "film_transparent", text="Transparent")
 
 
-CLASSES = (DRGS_PT_sampling, DRGS_PT_light, DRGS_PT_film)
+CLASSES = (DRGS_PT_presets, DRGS_PT_sampling, DRGS_PT_light, DRGS_PT_blur, DRGS_PT_film)

@@ -1,14 +1,16 @@
-"""The DR-GS tab of the 3D viewport's sidebar: import, bind, engine, messages."""
+"""The DR-GS tab of the 3D viewport's sidebar, below the steps: object, engine, messages."""
 
 from __future__ import annotations
 
-import textwrap
+import os
 import time
 
 import bpy
 
-from .. import assets, engine_link, messages
+from ...drgs_blender.version import __version__
+from .. import assets, engine_link, messages, preferences
 from .object_data import draw_asset
+from .tour import wrapped
 
 ICONS = {"INFO": "INFO", "WARNING": "ERROR", "ERROR": "CANCEL"}
 SHOWN = 8
@@ -20,26 +22,41 @@ class _SidebarPanel:
     bl_category = "DR-GS"
 
 
-class DRGS_PT_objects(_SidebarPanel, bpy.types.Panel):
-    bl_label = "Objects"
+class DRGS_PT_object(_SidebarPanel, bpy.types.Panel):
+    bl_label = "Object"
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012 - read by Blender
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return assets.is_drgs(context.object)
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = self.layout
-        column = layout.column(align=True)
-        column.operator("import_scene.drgs", text="Import Asset", icon="IMPORT")
-        column.operator("drgs.import_parts", icon="FILE_NEW")
-        if assets.is_drgs(context.object):
-            draw_asset(layout.box(), context.object)
-        layout.operator("drgs.bind_to_rig", icon="ARMATURE_DATA")
+        draw_asset(self.layout, context.object)
+        row = self.layout.row(align=True)
+        row.operator_menu_enum("drgs.set_material", "preset", icon="MATERIAL")
+        row.operator("drgs.restore_material", text="", icon="LOOP_BACK")
+        row.operator("drgs.copy_material", text="", icon="COPYDOWN")
+        self.layout.operator_menu_enum("drgs.paint", "channel", icon="BRUSH_DATA")
+        column = self.layout.column(align=True)
+        column.operator("drgs.save_asset", icon="FILE_TICK")
+        column.operator("drgs.bake_light", icon="RENDER_RESULT")
 
 
 class DRGS_PT_engine(_SidebarPanel, bpy.types.Panel):
     bl_label = "Engine"
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012 - read by Blender
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
         running = engine_link.is_running()
-        layout.label(text="Running" if running else "Not running", icon="CHECKMARK" if running else "RADIOBUT_OFF")
+        state = "Running" if running else "Not running"
+        layout.label(text=f"{state}, version {__version__}", icon="CHECKMARK" if running else "RADIOBUT_OFF")
+        threads = preferences.read("threads", 0) or os.cpu_count()
+        layout.label(text=f"Processor, {threads} threads", icon="BLANK1")
+        last = engine_link.statistics
+        if last:
+            seconds, rays = last.get("seconds.total", 0.0), last.get("samples", 0.0) / 1e6
+            wrapped(layout, context, f"Last picture: {seconds:.1f} s, {rays:.1f} million rays", "BLANK1")
         row = layout.row(align=True)
         row.operator("drgs.engine_test")
         row.operator("drgs.engine_stop", text="Stop")
@@ -56,12 +73,15 @@ class DRGS_PT_messages(_SidebarPanel, bpy.types.Panel):
         column = layout.column(align=True)
         for message in list(messages.history)[: -SHOWN - 1 : -1]:
             stamp = time.strftime("%H:%M", time.localtime(message.time))
-            lines = textwrap.wrap(
-                f"{stamp} {message.text}", max(24, context.region.width // 8 if context.region else 40)
-            )
-            for i, line in enumerate(lines):
-                column.label(text=line, icon="BLANK1" if i else ICONS[message.level])
-        layout.operator("drgs.clear_messages", icon="X")
+            wrapped(column, context, f"{stamp} {message.text}", ICONS[message.level])
+            name = messages.named_in(message.text, context.view_layer.objects)
+            if name:
+                button = column.operator("drgs.select_named", text=f"Select {name}", icon="RESTRICT_SELECT_OFF")
+                button.name = name
+        row = layout.row(align=True)
+        row.operator("drgs.copy_messages", icon="COPYDOWN")
+        row.operator("drgs.clear_messages", icon="X")
+        layout.operator("drgs.report", icon="TEXT")
 
 
-CLASSES = (DRGS_PT_objects, DRGS_PT_engine, DRGS_PT_messages)
+CLASSES = (DRGS_PT_object, DRGS_PT_engine, DRGS_PT_messages)

@@ -24,10 +24,14 @@ class DRGS_PT_passes(bpy.types.Panel):
         layout.use_property_split = True
         layout.use_property_decorate = False
         view_layer = context.view_layer
+        layout.prop(view_layer.drgs, "others")
         column = layout.column(heading="Include")
+        switches = {}  # one for all passes of a kind
         for p in PASSES:
             owner, name = (view_layer, p.blender) if p.blender else (view_layer.drgs, switch_of(p))
-            column.prop(owner, name, text=label(p))
+            switches.setdefault(name, (owner, label(p).removesuffix("00")))
+        for name, (owner, text) in switches.items():
+            column.prop(owner, name, text=text)
 
 
 CLASSES = (DRGS_PT_passes,)

@@ -1,15 +1,21 @@
-"""Final renders: F12, ``blender -b``, animations."""
+"""Final renders (F12, ``blender -b``, animations) and rendered viewports."""
 
 from __future__ import annotations
+
+from collections.abc import Callable, Iterator
 
 import bpy
 import numpy as np
 
-from ...drgs_blender.errors import Cancelled, DrgsError
+from ...drgs_blender.engine.protocol import Passes
+from ...drgs_blender.errors import EXIT_INTERNAL, Cancelled, DrgsError
 from ...drgs_blender.frame import Frame
-from .. import engine_link, messages
+from .. import engine_link, farm, messages
 from ..export import export_frame
+from ..export.instances import uncancelled
 from ..passes import blender_name, enabled
+from ..viewport import views
+from . import blur
 
 
 class DrgsRenderEngine(bpy.types.RenderEngine):
@@ -22,55 +28,142 @@ class DrgsRenderEngine(bpy.types.RenderEngine):
 
     def update_render_passes(self, scene: bpy.types.Scene, renderlayer: bpy.types.ViewLayer) -> None:
         """Tell the compositor which passes a view layer has."""
-        for p in enabled(renderlayer):
+        for p in enabled(scene, renderlayer):
             self.register_pass(scene, renderlayer, blender_name(p), len(p.channels), p.channels, p.kind)
 
     def render(self, depsgraph: bpy.types.Depsgraph) -> None:
         """Render one view layer. Whatever fails is reported, which also stops an animation and writes no file."""
+        views.worker.hold()
         try:
             self._render(depsgraph)
         except Cancelled:
             self.update_stats("", "Cancelled")
         except DrgsError as error:
-            self._fail(str(error))
+            self._fail(str(error), error.exit_code)
         except Exception as error:
             messages.log.exception("render failed")
             self._fail(
-                f"DR-GS failed ({type(error).__name__}: {error}). The console has the details; please report it."
+                f"DR-GS failed ({type(error).__name__}: {error}). The console has the details; please report it.",
+                EXIT_INTERNAL,
             )
+        finally:
+            views.worker.release()
 
-    def _fail(self, text: str) -> None:
+    def view_update(self, context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
+        """The scene changed."""
+        self._show_view(context, depsgraph, False)
+
+    def view_draw(self, context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
+        """Draw the viewport; it may have moved since the last time."""
+        with views.timed():
+            self._show_view(context, depsgraph, True)
+
+    def _show_view(self, context: bpy.types.Context, depsgraph: bpy.types.Depsgraph, draw: bool) -> None:
+        name = views.name_of(context.region)
+        try:
+            error = views.update(context, depsgraph, name)
+            info = ""
+            if draw:
+                views.show(name)
+                info, late = views.tell(name)
+                error = error or late
+        except Exception as failure:  # an exception here would come with every redraw
+            messages.log.exception("viewport failed")
+            info, error = "", f"DR-GS failed ({type(failure).__name__}: {failure}); the console has the details"
+        if error:
+            messages.note("ERROR", error)
+        self.update_stats("", error or info)
+
+    def _fail(self, text: str, code: int) -> None:
         """Report an error. `error_set` would let Blender write a black picture and go on."""
         messages.note("ERROR", text)
         self.report({"ERROR"}, text)
+        farm.fail(text, code)
 
     def _render(self, depsgraph: bpy.types.Depsgraph) -> None:
         warn = messages.Warnings()
         self.update_stats("", "Exporting the scene")
-        frame = export_frame(depsgraph, lambda path: engine_link.load_asset(path, self.test_break), warn)
-        passes = engine_link.render(frame, self._progress, self.test_break)
+
+        def export(moments: bool) -> Frame:
+            return export_frame(
+                depsgraph,
+                lambda path: engine_link.load_asset(path, self._stopped),
+                warn,
+                frame_set=self._frame_set if moments else None,
+                blurred=True,
+                cancelled=self._stopped,
+            )
+
+        frame = export(True)
+        scene = depsgraph.scene_eval
+        steps = blur.steps(scene, scene.camera.evaluated_get(depsgraph), warn)
+        if steps:
+            passes = self._blurred(frame, steps, depsgraph, lambda: export(False))
+        else:
+            passes = engine_link.render(frame, self._progress, self._stopped)
         for text in passes.warnings:
             warn(text)
         for text in warn.texts:
             self.report({"WARNING"}, text)
-        self._show(depsgraph.view_layer, frame, passes)
-        self.update_stats("", f"{frame.settings.rays} rays")
+        self._show(depsgraph, frame, passes)
+        self.update_stats("", summary(frame, passes.statistics))
+
+    def _stopped(self) -> bool:
+        """Whether Esc was pressed."""
+        return self.test_break()
+
+    def _blurred(
+        self, frame: Frame, steps: list[blur.Step], depsgraph: bpy.types.Depsgraph, export: Callable[[], Frame]
+    ) -> Passes:
+        """The mean of the pictures of `steps`, in place of that of `frame`."""
+        done = 0
+
+        def tell(phase: str, fraction: float) -> None:
+            self._progress(f"Blur {done}/{len(steps)}: {phase}", min(1.0, (done + fraction) / (len(steps) + 1)))
+
+        def parts() -> Iterator[Passes]:
+            nonlocal done
+            for step in blur.pictures(frame, steps, depsgraph, export, self._frame_set):
+                yield engine_link.render(step, tell, self._stopped)
+                done += 1
+
+        passes = blur.averaged(parts(), len(steps))
+        engine_link.statistics = passes.statistics
+        return passes
+
+    def _frame_set(self, frame: int, subframe: float) -> None:
+        self.frame_set(frame, subframe=subframe)
 
     def _progress(self, phase: str, fraction: float) -> None:
         self.update_stats("", phase)
         self.update_progress(fraction)
 
-    def _show(self, view_layer: bpy.types.ViewLayer, frame: Frame, passes: dict[str, np.ndarray]) -> None:
+    def _show(self, depsgraph: bpy.types.Depsgraph, frame: Frame, passes: dict[str, np.ndarray]) -> None:
         """Hand the passes to Blender, whose rows run upwards."""
         x0, y0, x1, y1 = frame.camera.window
-        table = enabled(view_layer)
+        view_layer = depsgraph.view_layer
+        table = enabled(depsgraph.scene, view_layer)
         for p in table:
             if p.name != "Combined":
                 self.add_pass(blender_name(p), len(p.channels), p.channels, layer=view_layer.name)
         result = self.begin_result(0, 0, x1 - x0, y1 - y0, layer=view_layer.name)
+        stopped = True
         try:
             layer = result.layers[0]
-            for p in table:
+            for p in uncancelled(table, self._stopped):
                 layer.passes[blender_name(p)].rect.foreach_set(np.ascontiguousarray(passes[p.name][::-1]).ravel())
+            stopped = False
         finally:
-            self.end_result(result)
+            self.end_result(result, cancel=stopped)
+
+
+def summary(frame: Frame, statistics: dict[str, float]) -> str:
+    """What a picture was made of, for the line above it."""
+    parts = [f"{frame.settings.rays} rays"]
+    parts += [f"{int(statistics[name]):,} {name}" for name in ("surfels", "triangles") if statistics.get(name)]
+    seconds = statistics.get("seconds.total")
+    if seconds:
+        parts.append(
+            f"{seconds:.2f} s in the engine, {statistics.get('samples', 0) / 1e6 / seconds:.1f} million rays/s"
+        )
+    return " | ".join(parts)

@@ -1,0 +1,120 @@
+"""Adjustments of a DR-GS object: how it looks next to how it was captured or painted, with keyframes and a way back."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+import bpy
+import numpy as np
+from bpy.props import BoolProperty, FloatProperty, FloatVectorProperty, StringProperty
+
+from ..drgs_blender.frame import Adjustment
+from . import mesh_arrays
+
+Array = np.ndarray
+
+#: Settings that are numbers, and the values of all, the tint first, that change nothing.
+NUMBERS = (
+    *("hue", "saturation", "value"),
+    *(f"{channel}_{part}" for channel in ("roughness", "metallic") for part in ("gain", "offset", "low", "high")),
+)
+_NEUTRAL = ((1.0, 1.0, 1.0), 0.0, 1.0, 1.0, *(2 * (1.0, 0.0, 0.0, 1.0)))
+
+
+def _masks(settings: DrgsAdjustment, context: bpy.types.Context, typed: str) -> Iterable[str]:
+    """Names that the mask may have."""
+    obj = settings.id_data
+    if obj.type != "MESH":
+        return []
+    attributes = (a.name for a in obj.data.attributes if mesh_arrays.is_mask(a) and not a.name.startswith("."))
+    return [name for name in (*(g.name for g in obj.vertex_groups), *attributes) if typed.lower() in name.lower()]
+
+
+def _tell(settings: DrgsAdjustment, context: bpy.types.Context) -> None:
+    """Have viewports and exports see a change that a script made; those in the interface they see anyway."""
+    settings.id_data.update_tag(refresh={"OBJECT"})
+
+
+def _number(label: str, about: str, **limits: float) -> FloatProperty:
+    return FloatProperty(name=label, description=about, precision=3, step=1, update=_tell, **limits)
+
+
+class DrgsAdjustment(bpy.types.PropertyGroup):
+    """Changes on top of the material attributes of an object; see drgs_blender.frame.Adjustment."""
+
+    use: BoolProperty(
+        name="Adjustments",
+        description="Show the object with its adjustments, or as it was before",
+        default=True,
+        update=_tell,
+    )
+    tint: FloatVectorProperty(
+        name="Tint",
+        description="Colour that the albedo is multiplied with",
+        subtype="COLOR",
+        size=3,
+        min=0.0,
+        soft_max=1.0,
+        max=10.0,
+        default=(1.0, 1.0, 1.0),
+        update=_tell,
+    )
+    hue: FloatProperty(
+        name="Hue",
+        description="Turn of the albedo's hue, in degrees",
+        subtype="ANGLE",
+        soft_min=-math.pi,
+        soft_max=math.pi,
+        default=0.0,
+        update=_tell,
+    )
+    saturation: _number(
+        "Saturation", "Factor on the albedo's saturation; 0 is grey", min=0.0, soft_max=2.0, default=1.0
+    )
+    value: _number("Value", "Factor on the albedo's brightness", min=0.0, soft_max=2.0, max=100.0, default=1.0)
+    roughness_gain: _number("Roughness", "Factor on the roughness", min=0.0, soft_max=4.0, default=1.0)
+    roughness_offset: _number("Offset", "Added to the roughness after the factor", min=-1.0, max=1.0, default=0.0)
+    roughness_low: _number("Lowest", "The roughness becomes no lower than this", min=0.0, max=1.0, default=0.0)
+    roughness_high: _number("Highest", "The roughness becomes no higher than this", min=0.0, max=1.0, default=1.0)
+    metallic_gain: _number("Metallic", "Factor on the metallic channel", min=0.0, soft_max=4.0, default=1.0)
+    metallic_offset: _number("Offset", "Added to the metallic channel after the factor", min=-1.0, max=1.0, default=0.0)
+    metallic_low: _number("Lowest", "The metallic channel becomes no lower than this", min=0.0, max=1.0, default=0.0)
+    metallic_high: _number("Highest", "The metallic channel becomes no higher than this", min=0.0, max=1.0, default=1.0)
+    mask: StringProperty(
+        name="Mask",
+        description="Vertex group or point attribute that says where, and how much of it; empty is everywhere",
+        search=_masks,
+        update=_tell,
+    )
+    use_invert: BoolProperty(name="Invert", description="Where the mask is not", default=False, update=_tell)
+
+    def values(self) -> tuple[object, ...]:
+        """All settings, to be compared; () where they change nothing."""
+        made = (tuple(self.tint), *(getattr(self, name) for name in NUMBERS))
+        return (*made, self.mask, self.use_invert) if self.use and made != _NEUTRAL else ()
+
+    def reset(self) -> None:
+        """Change nothing any more."""
+        for name in ("use", "tint", *NUMBERS, "mask", "use_invert"):
+            self.property_unset(name)
+        self.id_data.update_tag(refresh={"OBJECT"})
+
+    def take(self, other: DrgsAdjustment) -> None:
+        """Have the values of another object's."""
+        for name in ("use", "tint", *NUMBERS, "mask", "use_invert"):
+            setattr(self, name, getattr(other, name))
+
+    def to_frame(self, mask: Array | None) -> Adjustment:
+        """The engine's description; `mask` (n,) is the one named here, None for everywhere."""
+        if mask is not None and self.use_invert:
+            mask = 1 - mask
+        return Adjustment(
+            tint=tuple(self.tint),
+            hue=self.hue / (2 * math.pi),
+            saturation=self.saturation,
+            value=self.value,
+            roughness=tuple(getattr(self, f"roughness_{part}") for part in ("gain", "offset", "low", "high")),
+            metallic=tuple(getattr(self, f"metallic_{part}") for part in ("gain", "offset", "low", "high")),
+            mask=mask,
+        )

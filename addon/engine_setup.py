@@ -1,0 +1,304 @@
+"""The engine's own environment: made by one command after another, none of which is waited for.
+
+Standard library only. What was finished stays finished: after a cancellation, a lost connection or a crash the same
+set-up goes on, and packages that pip has already fetched come from its cache. Blender's own Python is only asked to
+make an environment somewhere else; nothing is ever installed into it.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import logging
+import os
+import re
+import shutil
+import signal
+import subprocess
+import tomllib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+
+from ..drgs_blender.engine.child import clean_environment
+from ..drgs_blender.engine.locate import VARIABLE
+from ..drgs_blender.errors import DeviceError
+
+log = logging.getLogger("drgs")
+
+#: The extension's folder: what the engine needs and the engine itself come with it.
+SOURCE = Path(__file__).resolve().parents[1]
+PACKAGE = "drgs_blender"
+#: What a set-up fetches and what it takes on disk, about; measured with Python 3.11 on Linux.
+DOWNLOAD_BYTES, DISK_BYTES = 175e6, 650e6
+PYTHONS = "3.11 to 3.13"
+
+_STAMP = "drgs-engine.json"
+#: Apart from the user's own Python settings; lines arrive as they are written, in UTF-8.
+_FLAGS = ("-I", "-u", "-X", "utf8")
+#: Shares of the time; the rest is the last check.
+_MADE, _FETCHED, _INSTALLED = 0.1, 0.7, 0.9
+#: Lines of venv, pip and `drgs doctor` that say why.
+_REASON = re.compile(r"error|^missing|not created|no module", re.IGNORECASE)
+_WINDOWS = os.name == "nt"
+
+
+@functools.cache
+def requirements(source: Path = SOURCE) -> tuple[str, ...]:
+    """The packages that the engine needs, as pip knows them."""
+    return tuple(tomllib.loads((source / "pyproject.toml").read_text(encoding="utf-8"))["project"]["dependencies"])
+
+
+@functools.cache
+def digest(source: Path = SOURCE) -> str:
+    """What tells one state of the engine's sources from another."""
+    found = hashlib.sha256()
+    for path in sorted((source / PACKAGE).rglob("*.py")):
+        found.update(path.relative_to(source).as_posix().encode())
+        found.update(path.read_bytes())
+    return found.hexdigest()
+
+
+def interpreter(folder: Path) -> Path:
+    """Where the Python of the environment `folder` is, or will be."""
+    return folder / ("Scripts/python.exe" if _WINDOWS else "bin/python")
+
+
+def state(folder: Path, source: Path = SOURCE) -> str:
+    """What `folder` is: "absent", "partial" (a set-up was not finished), "old" (of another version), or "ready"."""
+    if not _alive(folder):
+        return "partial" if folder.is_dir() and any(folder.iterdir()) else "absent"
+    sources = _read_stamp(folder).get("sources")
+    if sources is None or needs_network(folder, source):
+        return "partial"
+    return "ready" if sources == digest(source) else "old"
+
+
+def needs_network(folder: Path, source: Path = SOURCE) -> bool:
+    """Whether a set-up of `folder` has packages to fetch."""
+    return not _alive(folder) or _read_stamp(folder).get("packages") != list(requirements(source))
+
+
+def _alive(folder: Path) -> bool:
+    """Whether `folder` is an environment whose Python is there, and the one that it was made with too."""
+    if not interpreter(folder).is_file():
+        return False
+    try:
+        text = (folder / "pyvenv.cfg").read_text(encoding="utf-8")
+    except OSError:
+        return False
+    home = re.search(r"^home\s*=\s*(.+?)\s*$", text, re.MULTILINE)
+    return home is not None and Path(home[1]).is_dir()
+
+
+def _read_stamp(folder: Path) -> dict[str, object]:
+    try:
+        found = json.loads((folder / _STAMP).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+@dataclass(slots=True)
+class Step:
+    """One command, and what is done when it has succeeded."""
+
+    text: str
+    command: list[str]
+    end: float  # of the whole, 0..1, when it is done
+    then: Callable[[], None] = lambda: None
+
+
+class EngineSetup:
+    """A set-up under way. Call `poll` now and then; it never waits.
+
+    Parameters
+    ----------
+    folder : the environment to make or to go on with
+    python : interpreter that makes it
+    source : folder that holds pyproject.toml and drgs_blender
+    afresh : take nothing of an earlier set-up
+
+    Attributes
+    ----------
+    text : what is done now, for people
+    fraction : 0..1
+    fetched : bytes of packages that came so far
+    log_file : beside the folder; what the commands wrote
+    error : why it ended, or None
+    done : whether nothing more will happen
+    """
+
+    def __init__(self, folder: Path, python: Path, source: Path = SOURCE, afresh: bool = False) -> None:
+        self.folder, self.source = folder, source
+        self.log_file = folder.with_name(f"{folder.name}-setup.log")
+        self.text, self.fraction, self.fetched = "Starting", 0.0, 0.0
+        self.error: DeviceError | None = None
+        self.done = False
+        self._began = 0.0
+        self._process: subprocess.Popen[bytes] | None = None
+        self._lines: IO[bytes] | None = None
+        self._tail: list[str] = []
+        self._package_bytes = 0.0
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            free = shutil.disk_usage(folder).free
+            if needs_network(folder, source) and free < DISK_BYTES:
+                raise DeviceError(
+                    str(folder),
+                    f"has {free / 1e6:.0f} MB left, the engine needs {DISK_BYTES / 1e6:.0f}",
+                    "Make room, or install the engine elsewhere and choose that environment",
+                )
+        except OSError as error:
+            raise DeviceError(str(folder), f"cannot be made ({error})", "Check its permissions") from error
+        self._steps = self._plan(python, afresh)
+        self._next()
+
+    def poll(self) -> bool:
+        """Take note of what happened; return `done`."""
+        if self.done or self._process is None:
+            return self.done
+        code = self._process.poll()
+        self._read()
+        if code is None:
+            return False
+        step = self._steps.pop(0)
+        self._close()
+        if code:
+            reason = next((t for t in reversed(self._tail) if _REASON.search(t)), None)
+            self._fail(f"{step.text} failed: {(reason or ' '.join(self._tail[-2:]) or f'exit code {code}')[:300]}")
+            return True
+        try:
+            step.then()
+        except OSError as error:
+            self._fail(f"{step.text} failed: {error}")
+            return True
+        self.fraction = step.end
+        self._next()
+        return self.done
+
+    def cancel(self) -> None:
+        """End the command under way and all it started. What was finished stays."""
+        if self._process is not None and self._process.poll() is None:
+            if _WINDOWS:
+                self._process.terminate()
+            else:
+                os.killpg(self._process.pid, signal.SIGKILL)
+            self._process.wait()
+        self._close()
+        self.done, self.text = True, "Cancelled"
+
+    def _plan(self, python: Path, afresh: bool) -> list[Step]:
+        """What is left to do."""
+        own = interpreter(self.folder)
+        pip = [str(own), *_FLAGS, "-m", "pip", "install", "--no-input", "--disable-pip-version-check"]
+        needed = list(requirements(self.source))
+        steps = []
+        if afresh or needs_network(self.folder, self.source):
+            clear = afresh or (own.is_symlink() and not own.exists()) or (own.is_file() and not _alive(self.folder))
+            make = [str(python), *_FLAGS, "-m", "venv", *(["--clear"] if clear else []), str(self.folder)]
+            fetch = [*pip, "--only-binary=:all:", "--progress-bar=raw", *needed]
+            steps += [
+                Step("Making an environment", make, _MADE / 2),
+                Step("Preparing pip", [*pip, "--quiet", "pip>=24.1"], _MADE),
+                Step("Installing packages", fetch, _INSTALLED, lambda: self._stamp(packages=needed)),
+            ]
+        else:
+            self.fraction = _INSTALLED
+        doctor = [str(own), *_FLAGS, "-m", f"{PACKAGE}.cli.main", "doctor"]
+        steps.append(Step("Trying the engine", doctor, 1.0, lambda: self._stamp(sources=digest(self.source))))
+        return steps
+
+    def _next(self) -> None:
+        """Start the next command, or end."""
+        if not self._steps:
+            self.done, self.text, self.fraction = True, "Ready", 1.0
+            return
+        step = self._steps[0]
+        self.text, self._tail, self._began = step.text, [], self.fraction
+        try:
+            if len(self._steps) == 1:
+                self._copy()
+            with open(self.log_file, "ab") as out:
+                self._lines = open(self.log_file, "rb")  # noqa: SIM115 - lives as long as the process
+                self._lines.seek(0, os.SEEK_END)
+                environment = clean_environment()
+                environment.pop(VARIABLE, None)
+                self._process = subprocess.Popen(
+                    step.command,
+                    stdin=subprocess.DEVNULL,
+                    stdout=out,
+                    stderr=subprocess.STDOUT,
+                    env=environment,
+                    start_new_session=not _WINDOWS,
+                    creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
+                )
+        except OSError as error:
+            self._fail(f"{step.text} failed: {error}")
+
+    def _copy(self) -> None:
+        """Put the engine's sources into the environment; the old ones go only when the new ones are there."""
+        target = self._packages() / PACKAGE
+        fresh, old = target.with_name(f"{PACKAGE}.new"), target.with_name(f"{PACKAGE}.old")
+        for stale in (fresh, old):
+            shutil.rmtree(stale, ignore_errors=True)
+        shutil.copytree(self.source / PACKAGE, fresh, ignore=shutil.ignore_patterns("__pycache__"))
+        if target.exists():
+            target.replace(old)
+        fresh.replace(target)
+        shutil.rmtree(old, ignore_errors=True)
+
+    def _packages(self) -> Path:
+        """The environment's site-packages."""
+        if _WINDOWS:
+            return self.folder / "Lib" / "site-packages"
+        found = sorted((self.folder / "lib").glob("python3*/site-packages"))
+        if not found:
+            raise FileNotFoundError(f"{self.folder / 'lib'} holds no site-packages")
+        return found[-1]
+
+    def _read(self) -> None:
+        """Follow the output of the command."""
+        for raw in self._lines.readlines() if self._lines is not None else ():
+            line = raw.decode(errors="replace").strip()
+            if progress := re.fullmatch(r"Progress (\d+) of (\d+)", line):
+                self._package_bytes = float(progress[1])
+            elif line:
+                self._tail = [*self._tail[-9:], line]
+                self._follow(line)
+        if self._steps[0].end == _INSTALLED:
+            share = min((self.fetched + self._package_bytes) / DOWNLOAD_BYTES, 1.0) * (_FETCHED - self._began)
+            self.fraction = max(self.fraction, self._began + share)
+
+    def _follow(self, line: str) -> None:
+        """What a line of pip says about how far it is."""
+        if package := re.match(r"(?:Downloading|Using cached|Processing) (?:\S*/)?([A-Za-z0-9_.]+?)-\d\S*(.*)", line):
+            self.fetched, self._package_bytes = self.fetched + self._package_bytes, 0.0
+            self.text = f"Fetching {package[1]}{package[2]}"
+        elif line.startswith("Installing collected packages"):
+            self.text, self.fraction = "Installing packages", _FETCHED
+
+    def _stamp(self, **entries: object) -> None:
+        """Remember what is done."""
+        partial = self.folder / f"{_STAMP}.part"
+        partial.write_text(json.dumps(_read_stamp(self.folder) | entries, indent=2), encoding="utf-8")
+        partial.replace(self.folder / _STAMP)
+
+    def _fail(self, problem: str) -> None:
+        self._close()
+        self.done, self.text = True, "Failed"
+        self.error = DeviceError(
+            "Engine set-up",
+            problem.rstrip(". "),
+            f"Press Set Up Engine to go on; it needs a network and a Python of version {PYTHONS}. "
+            f"{self.log_file} has the details",
+        )
+        log.error("%s", self.error)
+
+    def _close(self) -> None:
+        if self._lines is not None:
+            self._lines.close()
+            self._lines = None
+        self._process = None

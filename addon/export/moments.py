@@ -1,0 +1,98 @@
+"""Camera and shapes at another time -> frame.Moment, for passes of motion."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import bpy
+import numpy as np
+
+from ...drgs_blender.arrays import same_bits
+from ...drgs_blender.frame import Frame, Moment, Pose
+from .. import mesh_arrays
+from .camera import export_camera, picture_of
+from .instances import Key, uncancelled, visible
+
+Array = np.ndarray
+#: Evaluates the scene of the depsgraph at another frame, a whole number and a part in [0, 1).
+FrameSet = Callable[[int, float], None]
+
+#: Passes that need another time, by which one.
+BEFORE, AFTER = frozenset({"Vector", "Previous Position"}), frozenset({"Vector"})
+
+
+def add_moments(
+    frame: Frame,
+    depsgraph: bpy.types.Depsgraph,
+    frame_set: FrameSet,
+    object_keys: list[Key],
+    mesh_keys: list[list[Key]],
+    cancelled: Callable[[], bool] | None = None,
+) -> None:
+    """Fill in where everything is one frame earlier and later, as far as the passes of `frame` need it.
+
+    The scene is evaluated at these frames and then at its own again, as Cycles does, so that a frame is the same
+    whichever were rendered before it.
+
+    Parameters
+    ----------
+    object_keys, mesh_keys : which instance each of the frame's objects, and each place of its meshes, is
+    cancelled : asked before each object; then `Cancelled` is raised, the scene being at its own frame again
+    """
+    scene = depsgraph.scene
+    now, part = scene.frame_current, scene.frame_subframe
+    camera = depsgraph.scene_eval.camera.original
+    wanted = set(frame.passes)
+    try:
+        if BEFORE & wanted:
+            frame_set(now - 1, part)
+            frame.previous = _moment(frame, depsgraph, camera, object_keys, mesh_keys, cancelled)
+        if AFTER & wanted:
+            frame_set(now + 1, part)
+            frame.next = _moment(frame, depsgraph, camera, object_keys, mesh_keys, cancelled)
+    finally:
+        if BEFORE & wanted:
+            frame_set(now, part)
+
+
+def _moment(
+    frame: Frame,
+    depsgraph: bpy.types.Depsgraph,
+    camera: bpy.types.Object,
+    object_keys: list[Key],
+    mesh_keys: list[list[Key]],
+    cancelled: Callable[[], bool] | None,
+) -> Moment:
+    """The scene as `depsgraph` is evaluated now; what is not there any more is taken as not moved."""
+    shape_of = {key: ("object", i) for i, key in enumerate(object_keys)}
+    shape_of |= {key: ("mesh", i) for i, keys in enumerate(mesh_keys) for key in keys}
+    matrices: dict[Key, Array] = {}
+    read: dict[int, Array] = {}
+    vertices: dict[tuple[str, int], Array] = {}
+    for item in uncancelled(visible(depsgraph), cancelled):
+        if item.key not in shape_of:
+            continue
+        matrices[item.key] = item.matrix_world
+        shape, mesh = shape_of[item.key], item.object.data
+        # While a mesh is edited, its evaluated data has no arrays; nor does it move.
+        if shape not in vertices and not mesh.is_editmode:
+            pointer = mesh.as_pointer()
+            if pointer not in read:
+                read[pointer] = mesh_arrays.read_vertices(mesh)
+                read[pointer].flags.writeable = False
+            vertices[shape] = read[pointer]
+
+    def moved(shape: tuple[str, int], now: Array | None) -> Array | None:
+        other = vertices.get(shape)
+        return None if other is None or (now is not None and same_bits(other, now)) else other
+
+    objects: list[Pose | None] = []
+    for i, (key, state) in enumerate(zip(object_keys, frame.objects)):
+        known = key in matrices
+        objects.append(Pose(state.name, matrices[key][None], moved(("object", i), state.vertices)) if known else None)
+    meshes: list[Pose | None] = []
+    for i, (keys, mesh) in enumerate(zip(mesh_keys, frame.meshes)):
+        places = np.stack([matrices.get(key, now) for key, now in zip(keys, mesh.matrices)])
+        meshes.append(Pose(mesh.name, places, moved(("mesh", i), mesh.vertices)))
+    scene = depsgraph.scene_eval
+    return Moment(export_camera(camera.evaluated_get(depsgraph), picture_of(scene)), objects, meshes)

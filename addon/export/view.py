@@ -1,0 +1,132 @@
+"""A 3D viewport -> frame.Camera: whatever it looks through, to the pixel of its region."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+from mathutils import Matrix, Vector
+
+from ...drgs_blender.errors import UsageError
+from ...drgs_blender.frame import Camera
+from .camera import export_camera, picture_of, resolution
+
+#: Part of the picture's side by which two cameras differ that are the same but for rounding.
+_SAME = 1e-4
+
+
+def view_camera(
+    region: bpy.types.Region, space: bpy.types.SpaceView3D, rv3d: bpy.types.RegionView3D, scene: bpy.types.Scene
+) -> Camera | None:
+    """The camera whose picture covers the region, border included; None where there is nothing to render.
+
+    Zoom, offset, shift and lens of a camera view are in the viewport's own projection, which is read here.
+    """
+    size = pixel_size(scene)
+    width, height = max(1, round(region.width / size)), max(1, round(region.height / size))
+    projection = np.array(rv3d.window_matrix, np.float64)
+    pose = np.array(rv3d.view_matrix.inverted().normalized(), np.float64)
+    if not (np.isfinite(projection).all() and np.isfinite(pose).all()) or projection[0, 0] * projection[1, 1] <= 0:
+        return None
+    orthographic = not rv3d.is_perspective
+    column, sign = (3, 1.0) if orthographic else (2, -1.0)
+    near, far = _clip(projection, orthographic, space, rv3d)
+    back = setback(rv3d)
+    pose[:3, 3] += back * pose[:3, 2]
+    window = _border(space, rv3d, scene, width, height)
+    if window is not None and (window[2] <= window[0] or window[3] <= window[1]):
+        return None
+    found = Camera(
+        matrix_world=pose,
+        width=width,
+        height=height,
+        fx=width / 2 * projection[0, 0],
+        fy=height / 2 * projection[1, 1],
+        cx=width / 2 * (1 + sign * projection[0, column]),
+        cy=height / 2 * (1 - sign * projection[1, column]),
+        orthographic=orthographic,
+        clip_start=max(near + back, 0.0) if orthographic else near,
+        clip_end=far + back,
+        region=window,
+    )
+    if rv3d.view_perspective == "CAMERA" and space.camera == scene.camera:
+        return _final(found, scene) or found
+    return found
+
+
+def _final(seen: Camera, scene: bpy.types.Scene) -> Camera | None:
+    """The camera of the final picture where the region shows exactly that, pixel by pixel.
+
+    The viewport's projection is rounded to single precision; with the same camera the pictures are the same.
+    """
+    render = picture_of(scene)
+    if (seen.width, seen.height) != resolution(render):
+        return None
+    try:
+        final = export_camera(scene.camera, render)
+    except UsageError:
+        return None
+    if seen.orthographic != final.orthographic or (seen.region is None) != (final.region is None):
+        return None
+    names = ("fx", "fy", "cx", "cy")
+    off = [abs(getattr(seen, n) - getattr(final, n)) / max(seen.width, seen.height) for n in names]
+    return final if max(off) < _SAME and np.allclose(seen.matrix_world, final.matrix_world, atol=1e-4) else None
+
+
+def pixel_size(scene: bpy.types.Scene) -> int:
+    """Side of the viewport's pixels in those of the screen, as Render > Performance > Viewport says."""
+    size = scene.render.preview_pixel_size
+    if size == "AUTO":
+        return 2 if bpy.context.preferences.system.pixel_size > 1.5 else 1
+    return int(size)
+
+
+def setback(rv3d: bpy.types.RegionView3D) -> float:
+    """Metres by which a view is taken from farther behind: an orthographic one sees what is behind its own place.
+
+    Not from behind everything that it could see, where single precision would be lost.
+    """
+    if rv3d.is_perspective:
+        return 0.0
+    near = (rv3d.window_matrix[2][3] + 1) / rv3d.window_matrix[2][2]
+    return min(-near, 100 * rv3d.view_distance) if near < 0 else 0.0
+
+
+def _clip(
+    projection: np.ndarray, orthographic: bool, space: bpy.types.SpaceView3D, rv3d: bpy.types.RegionView3D
+) -> tuple[float, float]:
+    """Distances between which things are seen; negative ones are behind the view."""
+    if orthographic:
+        return (projection[2, 3] + 1) / projection[2, 2], (projection[2, 3] - 1) / projection[2, 2]
+    lens = space.camera.data if rv3d.view_perspective == "CAMERA" and space.camera.type == "CAMERA" else space
+    return lens.clip_start, lens.clip_end
+
+
+def _border(
+    space: bpy.types.SpaceView3D, rv3d: bpy.types.RegionView3D, scene: bpy.types.Scene, width: int, height: int
+) -> tuple[int, int, int, int] | None:
+    """(x0, y0, x1, y1) in pixels, row 0 at the top: what the user wants to see rendered; None for everything."""
+    if rv3d.view_perspective == "CAMERA":
+        used, owner, prefix = scene.render.use_border, scene.render, "border"
+        frame = _camera_frame(space.camera, rv3d, scene)
+    else:
+        used, owner, prefix = space.use_render_border, space, "render_border"
+        frame = (0.0, 0.0, 1.0, 1.0)
+    if not used or frame is None:
+        return None
+    low_x, low_y, high_x, high_y = (getattr(owner, f"{prefix}_{name}") for name in ("min_x", "min_y", "max_x", "max_y"))
+    x0, y0, x1, y1 = frame
+    left, right = (round(width * (x0 + (x1 - x0) * x)) for x in (low_x, high_x))
+    bottom, top = (round(height * (1 - (y0 + (y1 - y0) * y))) for y in (low_y, high_y))
+    return max(left, 0), max(top, 0), min(right, width), min(bottom, height)
+
+
+def _camera_frame(
+    camera: bpy.types.Object | None, rv3d: bpy.types.RegionView3D, scene: bpy.types.Scene
+) -> tuple[float, float, float, float] | None:
+    """(x0, y0, x1, y1) of the camera's frame in the region, 0 to 1, y upwards."""
+    if camera is None or camera.type != "CAMERA":
+        return None
+    place = rv3d.window_matrix @ rv3d.view_matrix @ Matrix(camera.matrix_world.normalized())
+    corners = [place @ Vector((*corner, 1.0)) for corner in camera.data.view_frame(scene=scene)]
+    points = np.array([(c.x / c.w, c.y / c.w) for c in corners if abs(c.w) > 1e-9]) / 2 + 0.5
+    return (*points.min(axis=0), *points.max(axis=0)) if len(points) == 4 else None

@@ -1,0 +1,62 @@
+"""Renders without a window (``blender -b SCENE -a``): frames that Blender writes are read back, failures get a code.
+
+Blender says "Saved" of the empty files that a full disk leaves, and exits with 0 whatever failed.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+import bpy
+import imbuf
+
+from ..drgs_blender.errors import EXIT_CANNOT_WRITE, EXIT_CLASSES
+from . import engine_link, messages
+
+#: Environment variable with which a failure ends a Blender that has no window.
+VARIABLE = "DRGS_FARM"
+
+
+def fail(text: str, code: int) -> None:
+    """On a farm, end Blender with the exit code of a failure; elsewhere do nothing."""
+    if not (bpy.app.background and os.environ.get(VARIABLE)):
+        return
+    engine_link.stop()
+    sys.stderr.write(f"drgs: {text}\n")
+    sys.stdout.write(f"DRGS_EXIT class={EXIT_CLASSES[code]}\n")
+    sys.stderr.flush()
+    sys.stdout.flush()
+    os._exit(code)  # Blender goes on after whatever is raised in a render
+
+
+@bpy.app.handlers.persistent
+def verify(scene: bpy.types.Scene, *_: object) -> None:
+    """Remove the frame just written where it cannot be read back."""
+    if scene.render.engine != "DRGS" or scene.render.is_movie_format:
+        return
+    path = Path(bpy.path.abspath(scene.render.frame_path()))
+    if not path.is_file() or _readable(path):
+        return
+    path.unlink()
+    text = f"{path}: was not written whole, and is removed. Look at the room on its disk."
+    messages.note("ERROR", text)
+    fail(text, EXIT_CANNOT_WRITE)
+
+
+def _readable(path: Path) -> bool:
+    """Whether Blender can decode a picture."""
+    try:
+        picture = imbuf.load(str(path))
+    except (ValueError, OSError):
+        return False
+    return picture is not None and min(picture.size) > 0
+
+
+def register() -> None:
+    bpy.app.handlers.render_write.append(verify)
+
+
+def unregister() -> None:
+    bpy.app.handlers.render_write.remove(verify)

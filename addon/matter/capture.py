@@ -1,0 +1,313 @@
+"""What the engine needs of the scene, as files: the body, its pins and regions, its motion, and the colliders'.
+
+Capturing is a generator that goes on by a frame at a time, so that Blender's window stays alive meanwhile.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import bpy
+import numpy as np
+
+from ...drgs_blender.asset import Asset, Binding, Mesh, Surfels
+from ...drgs_blender.asset.archive import replace_file
+from ...drgs_blender.asset.container import write_asset
+from ...drgs_blender.errors import UsageError, WriteError
+from .. import assets, mesh_arrays, messages
+from ..export.fit import check_fit, check_modifiers
+from . import playback
+from .describe import PANEL, describe, subject_of
+from .forces import describe_field, fields_on, row_of
+from .properties import DrgsMatterCollider
+
+Array = np.ndarray
+
+BODY, SETTINGS, MATRICES, MOTION = "body.drgs", "settings.json", "matrices.npy", "motion.npy"
+_COLLIDER = "collider_"
+#: What the engine's program says is kept beside what it was given.
+SAID, LOG = "said.txt", "log.txt"
+#: Types of attributes that can mark a part of a mesh.
+_KINDS = {"BOOLEAN": bool, "FLOAT": np.float32, "INT": np.int32}
+
+
+def capture(obj: bpy.types.Object, scene: bpy.types.Scene, folder: Path, *, still: bool = False) -> Iterator[float]:
+    """Write body, settings and all that moves into `folder`, which is emptied before.
+
+    The scene is evaluated at every frame of the bake if anything in it may matter, and at its own again in the end,
+    also when the generator is closed early.
+
+    Parameters
+    ----------
+    obj : DR-GS object; what it was baked to before plays no part
+    still : only the body, at the first frame
+
+    Yields
+    ------
+    float
+        The part that is done.
+
+    Raises
+    ------
+    AssetError, UsageError
+        Naming the object that is in the way, and the remedy.
+    WriteError
+        Naming file and reason.
+    """
+    matter = obj.drgs.matter
+    frames = range(matter.frame_start, matter.frame_end + 1)
+    now = scene.frame_current, scene.frame_subframe
+    with _writing(folder), playback.hidden(obj):
+        clear(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            scene.frame_set(frames[0])
+            data = describe(obj, scene)
+            vertices, faces, matrix = _read(obj, fits=True)
+            data["matrix_world"] = matrix.tolist()
+            _write_body(folder / BODY, obj, data, vertices, faces)
+            if still:
+                data |= {"pins": [], "last": frames[0]}
+            else:
+                yield from _capture_motion(obj, scene, frames, folder, data, (vertices, matrix))
+            text = json.dumps(data, indent=1, sort_keys=True)
+            replace_file(folder / SETTINGS, [text.encode()])
+        finally:
+            scene.frame_set(now[0], subframe=now[1])
+    yield 1.0
+
+
+def stored(folder: Path) -> dict[str, Any] | None:
+    """The settings that `capture` wrote last; None without."""
+    try:
+        data = json.loads((folder / SETTINGS).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return data if isinstance(data, dict) else None
+
+
+def clear(folder: Path) -> None:
+    """Remove what `capture` wrote and the folder, as far as nothing else is in it."""
+    with suppress(OSError):
+        for path in folder.iterdir():
+            if path.name in (BODY, SETTINGS, MATRICES, MOTION, SAID, LOG) or path.name.startswith(_COLLIDER):
+                path.unlink(missing_ok=True)
+        os.rmdir(folder)
+
+
+@contextmanager
+def _writing(folder: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise WriteError(
+            str(error.filename or folder), f"cannot be written ({reason})", "Free some space or choose another folder"
+        ) from error
+
+
+def _capture_motion(
+    obj: bpy.types.Object,
+    scene: bpy.types.Scene,
+    frames: range,
+    folder: Path,
+    data: dict[str, Any],
+    rest: tuple[Array, Array],
+) -> Iterator[float]:
+    """Where colliders, fields, pinned parts and the object itself are in every frame; completes `data`."""
+    vertices, matrix = rest
+    obstacles, pushing = list(_obstacles(obj)), fields_on(obj, scene)
+    rows = [[row_of(other, obj.drgs.matter.fields, _depsgraph())] for other in pushing]
+    motion = _Track(folder / MOTION, vertices, len(frames)) if data["pins"] else None
+    matrices, tracks = [matrix], []
+    data["colliders"] = []
+    for i, (other, settings) in enumerate(obstacles):
+        local, faces, placed = _read(other)
+        world = _moved(local, placed)
+        name = f"{_COLLIDER}{i:03d}_{bpy.path.clean_name(other.name)}"  # the engine's messages name the file
+        _write_ply(folder / f"{name}.ply", world, faces)
+        data["colliders"].append(
+            {
+                "mesh": f"{name}.ply",
+                "contact": settings.contact,
+                "friction": float(f"{settings.friction:.6g}"),
+                "thickness": float(f"{settings.thickness:.6g}"),
+            }
+        )
+        tracks.append(_Track(folder / f"{name}.npy", world, len(frames)))
+    if tracks or pushing or motion is not None or _may_move(obj):
+        to_rest = np.linalg.inv(matrix)
+        for i, frame in enumerate(frames[1:], 1):
+            scene.frame_set(frame)
+            if motion is not None:
+                now, _, placed = _read(obj, fits=True)
+                motion.add(i, now if np.array_equal(placed, matrix) else _moved(now, to_rest @ placed))
+            matrices.append(np.array(obj.evaluated_get(_depsgraph()).matrix_world, np.float64))
+            for other, pushes in zip(pushing, rows):
+                pushes.append(row_of(other, obj.drgs.matter.fields, _depsgraph()))
+            for (other, _), track in zip(obstacles, tracks):
+                local, _, placed = _read(other)
+                if local.shape != track.first.shape:
+                    raise UsageError(
+                        subject_of(other),
+                        f"has {len(local)} vertices in frame {frame} and {len(track.first)} at the start",
+                        "A collider must keep them: remove the modifier that changes their number",
+                    )
+                track.add(i, _moved(local, placed))
+            yield i / len(frames)
+    data["fields"] = [
+        describe_field(other) | {"frames": pushes if pushes != pushes[:1] * len(pushes) else pushes[:1]}
+        for other, pushes in zip(pushing, rows)
+    ]
+    if motion is not None and motion.close():
+        data["motion"] = motion.path.name
+    for entry, track in zip(data["colliders"], tracks):
+        if track.close():
+            entry["vertices"] = track.path.name
+    if any(not np.array_equal(m, matrix) for m in matrices):
+        np.save(folder / MATRICES, np.stack(matrices))
+
+
+class _Track:
+    """Vertices of every frame on disk, for as long as they do not turn out to stand still."""
+
+    def __init__(self, path: Path, first: Array, frames: int) -> None:
+        self.path, self.first = path, first
+        self._frames = frames
+        self._file: np.memmap | None = None
+
+    def add(self, index: int, vertices: Array) -> None:
+        """Take the vertices of a frame in; frames come in order."""
+        if self._file is None:
+            if np.array_equal(vertices, self.first):
+                return
+            shape = (self._frames, *self.first.shape)
+            self._file = np.lib.format.open_memmap(self.path, "w+", np.float32, shape)
+            self._file[:index] = self.first
+        self._file[index] = vertices
+
+    def close(self) -> bool:
+        """Whether anything moved, so that the file exists."""
+        if self._file is None:
+            return False
+        self._file.flush()
+        self._file = None
+        return True
+
+
+def _depsgraph() -> bpy.types.Depsgraph:
+    return bpy.context.evaluated_depsgraph_get()
+
+
+def _read(obj: bpy.types.Object, *, fits: bool = False) -> tuple[Array, Array, Array]:
+    """Vertices (n, 3) float32, triangles (m, 3) int32, matrix to world (4, 4) float64, as evaluated now.
+
+    Parameters
+    ----------
+    fits : the mesh must be the object's asset, moved
+    """
+    depsgraph = _depsgraph()
+    evaluated = obj.evaluated_get(depsgraph)
+    if not (evaluated.is_evaluated and obj.visible_get()):  # Blender does not evaluate the modifiers of others
+        raise UsageError(subject_of(obj), "is hidden or in no collection of this view layer", "Show it while baking")
+    if fits:
+        check_modifiers(evaluated, depsgraph)
+    mesh = evaluated.to_mesh(preserve_all_data_layers=True, depsgraph=depsgraph)
+    try:
+        if fits:
+            check_fit(evaluated, mesh, assets.load(assets.file_of(obj)).mesh, lambda text: messages.note("INFO", text))
+        vertices = mesh_arrays.read_vertices(mesh)
+        corners, _ = mesh_arrays.read_loop_triangles(mesh)
+        faces = mesh_arrays.read_corner_vertices(mesh)[corners]
+    finally:
+        evaluated.to_mesh_clear()
+    if not len(faces):
+        raise UsageError(subject_of(obj), "has no faces", f"Remove it from {PANEL}")
+    return vertices, faces, np.array(evaluated.matrix_world, np.float64)
+
+
+def _moved(vertices: Array, matrix: Array) -> Array:
+    """(n, 3) float32 points by a (4, 4) matrix."""
+    return (vertices @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32)
+
+
+def _may_move(obj: bpy.types.Object) -> bool:
+    """Whether the object's transform may be animated."""
+    while obj is not None:
+        if obj.animation_data or obj.constraints or obj.parent_type in ("BONE", "VERTEX", "VERTEX_3"):
+            return True
+        obj = obj.parent
+    return False
+
+
+def _obstacles(obj: bpy.types.Object) -> Iterator[tuple[bpy.types.Object, DrgsMatterCollider]]:
+    """Every collider once, with its settings; a row without anything chosen is none."""
+    seen = {obj.name_full}
+    for settings in obj.drgs.matter.colliders:
+        chosen = [settings.object] if settings.object else []
+        if settings.collection:
+            chosen += settings.collection.all_objects
+        for other in chosen:
+            if other.type == "MESH" and other.name_full not in seen:
+                seen.add(other.name_full)
+                yield other, settings
+
+
+def _write_body(path: Path, obj: bpy.types.Object, data: dict[str, Any], vertices: Array, faces: Array) -> None:
+    """The mesh at rest, with the groups that the settings name, as an asset without surfels."""
+    names = [entry["group"] for entry in (*data["regions"], *data["pins"])]
+    groups = {name: _members(obj, name) for name in names}
+    n = len(vertices)
+    empty = np.empty((0, 3), np.float32)
+    surfels = Surfels(
+        centre=empty,
+        scale=empty[:, :2],
+        rotation=np.empty((0, 4), np.float32),
+        opacity=empty[:, 0],
+        albedo=empty,
+        roughness=empty[:, 0],
+        metallic=empty[:, 0],
+    )
+    mesh = Mesh(vertices, faces, np.ones((n, 3), np.float32), np.ones(n, np.float32), np.zeros(n, np.float32), groups)
+    write_asset(path, Asset(surfels, mesh, Binding(np.empty(0, np.int32), empty, empty[:, 0], empty), None))
+
+
+def _members(obj: bpy.types.Object, name: str) -> Array:
+    """(k,) int32 vertices of a vertex group or an attribute, those of 0.5 and more."""
+    if not name:
+        raise UsageError(subject_of(obj), "a region has no group", f"Choose one in {PANEL} > Regions, or remove it")
+    mesh = obj.data
+    attribute = mesh.attributes.get(name)
+    group = obj.vertex_groups.get(name)
+    if group is not None:
+        index = group.index
+        found = [v.index for v in mesh.vertices for g in v.groups if g.group == index and g.weight >= 0.5]
+        members = np.array(found, np.int32)
+    elif attribute is not None and attribute.domain == "POINT" and attribute.data_type in _KINDS:
+        values = np.empty(len(mesh.vertices), _KINDS[attribute.data_type])
+        attribute.data.foreach_get("value", values)
+        members = np.flatnonzero(values >= 0.5).astype(np.int32)
+    else:
+        raise UsageError(
+            subject_of(obj), f'has no vertex group or point attribute "{name}"', f"Choose another in {PANEL}"
+        )
+    if not len(members):
+        raise UsageError(subject_of(obj), f'"{name}" marks no vertex with 0.5 or more', "Paint it, or choose another")
+    return members
+
+
+def _write_ply(path: Path, vertices: Array, faces: Array) -> None:
+    """A binary PLY of triangles."""
+    head = (
+        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n"
+        "property float x\nproperty float y\nproperty float z\n"
+        f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    rows = np.empty(len(faces), [("count", "u1"), ("index", "<i4", 3)])
+    rows["count"], rows["index"] = 3, faces
+    path.write_bytes(head.encode() + np.ascontiguousarray(vertices, "<f4").tobytes() + rows.tobytes())

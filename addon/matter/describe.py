@@ -1,0 +1,146 @@
+"""The artist's settings as the engine reads them (docs/simulation.md), and the folder they are baked into."""
+
+from __future__ import annotations
+
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+import bpy
+import numpy as np
+
+from ...drgs_blender.errors import UsageError
+from ...drgs_blender.matter import MATERIALS
+from .properties import ANGLES, DrgsMatterSettings, numbers_of
+
+#: Where to look for the settings, in messages.
+PANEL = "Physics > DR-GS Matter"
+
+
+def subject_of(obj: bpy.types.Object) -> str:
+    """How messages call an object."""
+    return f'Object "{obj.name}"'
+
+
+def folder_of(obj: bpy.types.Object) -> Path:
+    """The cache of an object.
+
+    Raises
+    ------
+    UsageError
+        Its path is relative to a .blend that was never saved.
+    """
+    path = _path_of(obj)
+    if path.startswith("//") and not bpy.data.filepath:
+        raise UsageError(
+            subject_of(obj),
+            "its cache lies beside the .blend, which is not saved",
+            f"Save the file, or choose a folder in {PANEL} > Cache",
+        )
+    return Path(os.path.normpath(bpy.path.abspath(path, library=obj.library)))
+
+
+def _path_of(obj: bpy.types.Object) -> str:
+    """The cache of an object as the artist wrote it, or the one that it has by itself."""
+    return obj.drgs.matter.folder.rstrip("/\\") or f"//drgs_cache/{bpy.path.clean_name(obj.name)}"
+
+
+def check(obj: bpy.types.Object) -> None:
+    """Refuse what cannot be simulated.
+
+    Raises
+    ------
+    UsageError
+        Naming object and remedy.
+    """
+    matter = obj.drgs.matter
+    if obj.library or (obj.override_library and obj.override_library.is_system_override):
+        raise UsageError(subject_of(obj), "is linked from another file", "Make it local, or bake it there")
+    if obj.mode == "EDIT":
+        raise UsageError(subject_of(obj), "is being edited", "Leave Edit Mode")
+    if matter.frame_end <= matter.frame_start:
+        raise UsageError(
+            subject_of(obj),
+            f"ends at frame {matter.frame_end}, not after its first, {matter.frame_start}",
+            f"Change the frames in {PANEL} > Cache",
+        )
+
+
+def own_folder(obj: bpy.types.Object, scene: bpy.types.Scene) -> Path:
+    """The cache of an object, which no other object may have.
+
+    Raises
+    ------
+    UsageError
+        Naming both, or what `folder_of` says.
+    """
+    own = folder_of(obj)
+    for other in scene.objects:
+        if other != obj and other.type == "MESH" and other.drgs.matter.use and _path_of(other) == _path_of(obj):
+            raise UsageError(
+                subject_of(obj), f'has the same cache as "{other.name}", {own}', f"Choose another in {PANEL} > Cache"
+            )
+    return own
+
+
+def describe(obj: bpy.types.Object, scene: bpy.types.Scene) -> dict[str, Any]:
+    """Settings for the engine but for what is captured from the scene: meshes, matrices and motion.
+
+    Values are those of the current frame.
+    """
+    matter = obj.drgs.matter
+    wind = _numbers(matter.wind)
+    data: dict[str, Any] = {
+        "material": _material(matter),
+        "regions": [{"group": region.group, "material": _material(region)} for region in matter.regions],
+        "solver": matter.solver,
+        "resolution": matter.resolution,
+        "seed": matter.seed,
+        "gravity": _numbers(matter.gravity * g for g in scene.gravity) if scene.use_gravity else [0.0] * 3,
+        "wind": wind,
+        "drag": _number(matter.drag) if any(wind) else 0.0,
+        "damping": _number(matter.damping),
+        "velocity": _numbers(matter.velocity),
+        "spin": _numbers(matter.spin),
+        "pins": [{"group": matter.pin_group}] if matter.pin_group else [],
+        "walls": matter.walls,
+        "first": matter.frame_start,
+        "last": matter.frame_end,
+        "fps": scene.render.fps / _number(scene.render.fps_base),
+    }
+    if matter.use_floor:
+        data["floor"] = _number(matter.floor)
+        data["floor_contact"] = matter.floor_contact
+        data["floor_friction"] = _number(matter.floor_friction)
+    if matter.domain is not None:
+        corners = np.array(matter.domain.bound_box, np.float64)
+        matrix = np.array(matter.domain.matrix_world, np.float64)
+        world = corners @ matrix[:3, :3].T + matrix[:3, 3]
+        low, high = world.min(axis=0), world.max(axis=0)
+        if (high - low).min() <= 0:
+            raise UsageError(
+                f'Object "{matter.domain.name}"', "has no volume, so it is no domain", "Choose a box, or none"
+            )
+        data["domain"] = [_numbers(low), _numbers(high)]
+    return data
+
+
+def _material(matter: DrgsMatterSettings) -> dict[str, Any]:
+    """The row of the table, and the numbers that differ from it."""
+    row = MATERIALS[matter.material]
+    found: dict[str, Any] = {"name": matter.material}
+    for name in numbers_of(matter.material):
+        value = _number(math.degrees(getattr(matter, name)) if name in ANGLES else getattr(matter, name))
+        if value != _number(getattr(row, name)):
+            found[name] = value
+    return found
+
+
+def _number(value: float) -> float:
+    """What the artist wrote: Blender keeps six or seven digits of it."""
+    return float(f"{value:.6g}")
+
+
+def _numbers(values: Any) -> list[float]:
+    return [_number(value) for value in values]

@@ -1,0 +1,177 @@
+"""The object's mesh follows the cache: a PC2 file that grows with it, played by a Mesh Cache modifier.
+
+Blender itself plays it, by its own frame number: the same in viewports, F12, `blender -b` and on farms that lack the
+extension, in any order of frames, between them (motion vectors), after undo and after loading, and nothing is called at
+a frame change. What is in the file is in the cache as well; it can be thrown away at any time.
+
+Layout after Autodesk's PointCache 2, as Blender's MOD_meshcache_pc2.c reads it. The header's count of frames is changed
+after the frames are written, so a reader never sees a part of one.
+"""
+
+from __future__ import annotations
+
+import logging
+import struct
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+from ...drgs_blender.asset.archive import replace_file
+from ...drgs_blender.errors import UsageError, WriteError
+from ...drgs_blender.particle_cache import Header, ParticleCache
+
+Array = np.ndarray
+log = logging.getLogger(__name__)
+
+MODIFIER = "DR-GS Matter"
+FILE = "mesh.pc2"
+_HEAD = struct.Struct("<12s2i2fi")
+_COUNT = struct.Struct("<i")
+_COUNT_AT = _HEAD.size - _COUNT.size
+_MAGIC = b"POINTCACHE2\0"
+
+
+class Playback:
+    """Keeps the PC2 file of a cache up to date.
+
+    Parameters
+    ----------
+    folder : of the cache
+    matrices : (k, 4, 4) object to world in every frame, where it moves by itself: the cache is in the object space of
+        the first
+    """
+
+    def __init__(self, folder: Path, matrices: Array | None = None) -> None:
+        self.path = folder / FILE
+        self.count = 0
+        self._cache, self._matrices = ParticleCache(folder), matrices
+        self._checked = ""
+
+    def follow(self, seconds: float = float("inf")) -> int:
+        """Append frames that the cache has and the file lacks, for about `seconds`.
+
+        Returns
+        -------
+        int
+            Frames in the file, from the first on.
+
+        Raises
+        ------
+        AssetError
+            A frame of the cache is damaged.
+        WriteError
+            The file cannot be written.
+        """
+        header = self._cache.header()
+        if header is None:
+            return 0
+        until = time.monotonic() + seconds
+        there = set(self._cache.frames())
+        try:
+            if self._checked != header.digest:
+                self.count = self._count_of(header, there)
+                self._checked = header.digest
+            while header.first + self.count in there:
+                self._append(header)
+                if time.monotonic() > until:
+                    break
+        except UsageError:  # another bake began and removed the frame just now
+            log.debug("%s: the cache begins anew", self.path)
+        except OSError as error:
+            raise WriteError(
+                str(self.path),
+                f"cannot be written ({error.strerror or error})",
+                "Free some space or choose another folder, and bake again: it goes on",
+            ) from error
+        return self.count
+
+    def _append(self, header: Header) -> None:
+        frame = self._vertices(header, self.count)
+        if self.count == 0:
+            head = _HEAD.pack(_MAGIC, 1, len(frame), float(header.first), 1.0, 1)
+            replace_file(self.path, [head, frame.tobytes()])
+        else:
+            with open(self.path, "r+b") as file:
+                file.seek(_HEAD.size + self.count * frame.nbytes)
+                file.write(frame.tobytes())
+                file.flush()
+                file.seek(_COUNT_AT)
+                file.write(_COUNT.pack(self.count + 1))
+        self.count += 1
+
+    def _vertices(self, header: Header, index: int) -> Array:
+        """(n, 3) <f4 vertices of a frame in the object space of that frame."""
+        vertices = self._cache.read(header.first + index).vertices
+        if self._matrices is not None:
+            now = self._matrices[min(index, len(self._matrices) - 1)]
+            turn = np.linalg.inv(now) @ self._matrices[0]
+            vertices = vertices @ turn[:3, :3].T + turn[:3, 3]
+        return np.ascontiguousarray(vertices, "<f4")
+
+    def _count_of(self, header: Header, there: set[int]) -> int:
+        """Frames in the file that are those of the cache; 0 where its first or last is not, to begin anew."""
+        if self._matrices is not None:
+            return 0  # the cache does not tell whether these have changed
+        try:
+            with open(self.path, "rb") as file:
+                magic, _, points, _, _, count = _HEAD.unpack(file.read(_HEAD.size))
+                if magic != _MAGIC or points != header.vertices or count < 1 or header.first + count - 1 not in there:
+                    return 0
+                for index in {0, count - 1}:
+                    file.seek(_HEAD.size + index * points * 12)
+                    if file.read(points * 12) != self._vertices(header, index).tobytes():
+                        return 0
+                return count
+        except (FileNotFoundError, struct.error):
+            return 0
+
+
+def modifier_of(obj: bpy.types.Object) -> bpy.types.Modifier | None:
+    """The modifier that plays the cache of an object."""
+    return next((m for m in obj.modifiers if m.type == "MESH_CACHE" and m.name.startswith(MODIFIER)), None)
+
+
+def attach(obj: bpy.types.Object, path: Path, first: int) -> None:
+    """Let the object play the file; a new modifier is the last of all, and stays where it is moved."""
+    modifier = modifier_of(obj) or obj.modifiers.new(MODIFIER, "MESH_CACHE")
+    modifier.cache_format, modifier.filepath = "PC2", _relative(path)
+    modifier.interpolation, modifier.time_mode, modifier.play_mode = "LINEAR", "FRAME", "SCENE"
+    modifier.deform_mode, modifier.forward_axis, modifier.up_axis = "OVERWRITE", "POS_Y", "POS_Z"
+    modifier.frame_start, modifier.frame_scale = first, 1.0
+
+
+def detach(obj: bpy.types.Object) -> None:
+    """The object is itself again."""
+    modifier = modifier_of(obj)
+    if modifier is not None:
+        obj.modifiers.remove(modifier)
+
+
+@contextmanager
+def hidden(obj: bpy.types.Object) -> Iterator[None]:
+    """The object as it is before the modifier; what comes after that acts on the result and is off as well."""
+    own = modifier_of(obj)
+    stack = list(obj.modifiers)
+    later = stack[stack.index(own) :] if own is not None else []
+    shown = [(m.name, m.show_viewport) for m in later]
+    try:
+        for modifier in later:
+            modifier.show_viewport = False
+        yield
+    finally:
+        for name, value in shown:
+            if name in obj.modifiers:
+                obj.modifiers[name].show_viewport = value
+
+
+def _relative(path: Path) -> str:
+    if not bpy.data.filepath:
+        return str(path)
+    try:
+        return bpy.path.relpath(str(path))
+    except ValueError:  # another drive on Windows
+        return str(path)

@@ -1,0 +1,134 @@
+"""The engine's program at work: ``drgs simulate`` in a process of its own, which Blender only watches."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from pathlib import Path
+
+from ...drgs_blender.engine.child import clean_environment
+from ...drgs_blender.errors import AssetError, EngineError, UsageError
+from .. import engine_link
+from . import capture
+
+#: Seconds that Blender waits for a program that is ended, and seconds after which that is killed: saving what it needs
+#: to go on takes some.
+_WAIT, _PATIENCE = 0.2, 5.0
+#: Runs ``drgs`` and ends it together with Blender, however that ends: its standard input is closed then.
+_MAIN = """
+import os, signal, sys, threading
+
+def watch():
+    while os.read(0, 1):
+        pass
+    os.kill(os.getpid(), signal.SIGTERM)
+
+threading.Thread(target=watch, daemon=True).start()
+from drgs_blender.cli.main import main
+sys.exit(main())
+"""
+_COUNTS = re.compile(r"(\d+) particles.*at least (\d+) time steps")
+
+
+#: Programs that were asked to end and have not yet, with the time until which they may take.
+_ending: list[tuple[subprocess.Popen[bytes], float]] = []
+
+
+def ending() -> bool:
+    """Whether a program that was ended still saves what it needs to go on; kills one that takes too long."""
+    for entry in list(_ending):
+        process, until = entry
+        if process.poll() is not None:
+            _ending.remove(entry)
+        elif time.monotonic() > until:
+            process.kill()
+    return bool(_ending)
+
+
+class Program:
+    """One run on what `capture` wrote.
+
+    Parameters
+    ----------
+    inputs : folder of the capture
+    folder : the cache; what it holds of other settings is removed
+    threads : 0 for all cores
+
+    Raises
+    ------
+    DeviceError, UsageError
+        There is no engine, or it cannot be started.
+    """
+
+    def __init__(self, inputs: Path, folder: Path, threads: int = 0) -> None:
+        self._counts: tuple[int, int] | None = None
+        self._said, self._log = inputs / capture.SAID, inputs / capture.LOG
+        command = engine_link.command_line()
+        python = command[: command.index("-m")]
+        options = {"creationflags": subprocess.CREATE_NO_WINDOW} if sys.platform == "win32" else {}
+        arguments = [inputs / capture.BODY, "--settings", inputs / capture.SETTINGS, "--out", folder]
+        arguments += ["--overwrite", "--threads", str(threads)]
+        try:
+            with open(self._said, "wb") as said, open(self._log, "wb") as log:
+                self._process = subprocess.Popen(
+                    [*python, "-c", _MAIN, "--no-progress", "simulate", *map(str, arguments)],
+                    stdin=subprocess.PIPE,
+                    stdout=said,
+                    stderr=log,
+                    env=clean_environment(),
+                    **options,
+                )
+        except OSError as error:
+            raise UsageError("Engine", f"{python[0]} cannot be started ({error})", "See the preferences") from error
+
+    @property
+    def alive(self) -> bool:
+        """Whether it still works."""
+        return self._process.poll() is None
+
+    @property
+    def counts(self) -> tuple[int, int] | None:
+        """Particles, and time steps a frame at least; None until the body is filled."""
+        if self._counts is None:
+            with suppress(OSError):
+                found = _COUNTS.search(self._said.read_text(encoding="utf-8", errors="replace"))
+                self._counts = (int(found[1]), int(found[2])) if found else None
+        return self._counts
+
+    def end(self, save: bool = True) -> None:
+        """End it if it runs; while it saves what it needs to go on, `ending` is true. Without, it is killed."""
+        if self.alive:
+            (self._process.terminate if save else self._process.kill)()
+            try:
+                self._process.wait(_WAIT)
+            except subprocess.TimeoutExpired:
+                _ending.append((self._process, time.monotonic() + _PATIENCE))
+        self._process.stdin.close()
+
+    def result(self, subject: str, held: str = "") -> list[str]:
+        """The lines of its log, after it has ended by itself.
+
+        Parameters
+        ----------
+        subject : what messages are about
+        held : a sentence about what there is all the same
+
+        Raises
+        ------
+        AssetError, EngineError
+            It could not do its work.
+        """
+        lines = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+        code = self._process.wait()
+        self._process.stdin.close()
+        if code == 0:
+            return lines
+        said = next((line for line in reversed(lines) if line.startswith("drgs: ")), "")
+        if said:
+            raise AssetError(subject, said.removeprefix("drgs: ").rstrip("."), held)
+        last = lines[-1][:300] if lines else "it said nothing"
+        remedy = "Bake again: it goes on" + (f". {held}" if held else "")
+        raise EngineError(subject, f"the engine's program ended ({code}): {last.rstrip('.')}", remedy)

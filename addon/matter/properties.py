@@ -1,0 +1,316 @@
+"""What the artist sets: material, regions, pins, colliders, space, frames, folder. The state of a bake is not."""
+
+from __future__ import annotations
+
+import math
+
+import bpy
+from bpy.props import (
+    BoolProperty,
+    CollectionProperty,
+    EnumProperty,
+    FloatProperty,
+    FloatVectorProperty,
+    IntProperty,
+    PointerProperty,
+    StringProperty,
+)
+
+from ...drgs_blender.matter import MATERIALS
+
+#: Numbers of every material, and those that some kinds of matter have besides.
+BASIC = ("young", "poisson", "density")
+OF_MODEL = {
+    "plastic": ("yield_stress", "hardening", "viscosity"),
+    "sand": ("friction_angle", "cohesion"),
+    "snow": ("compression", "stretch", "hardening"),
+    "fluid": ("viscosity",),
+}
+#: Numbers that Blender keeps in radians and the engine in degrees.
+ANGLES = ("friction_angle",)
+_FIRST = MATERIALS["jelly"]
+#: Newer Blenders want to be told that a path may start with "//".
+_BLEND_RELATIVE = "is_path_supports_blend_relative" in bpy.types.StringProperty.bl_rna.properties
+_RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"} if _BLEND_RELATIVE else set()
+
+MATERIAL_ITEMS = [(name, name.title(), row.about[:1].upper() + row.about[1:]) for name, row in MATERIALS.items()]
+CONTACT_ITEMS = (
+    ("separate", "Separate", "Matter slides with friction and may leave the surface"),
+    ("slip", "Slip", "Matter slides without friction and stays on the surface"),
+    ("sticky", "Sticky", "Matter that touches the surface stays where it is on it"),
+)
+WALL_ITEMS = (("open", "Open", "Matter that leaves stops the bake with a message"), *CONTACT_ITEMS)
+
+
+def numbers_of(material: str) -> tuple[str, ...]:
+    """The numbers that matter for a material of the table."""
+    return BASIC + OF_MODEL.get(MATERIALS[material].model, ())
+
+
+def _take_preset(settings: _Matter, context: bpy.types.Context) -> None:
+    """Fill the numbers in when another material is chosen."""
+    row = MATERIALS[settings.material]
+    for name in BASIC + tuple({n for names in OF_MODEL.values() for n in names}):
+        value = getattr(row, name)
+        setattr(settings, name, math.radians(value) if name in ANGLES else value)
+
+
+class _Matter:
+    """A material: a row of the engine's table and the numbers of it."""
+
+    material: EnumProperty(
+        name="Material",
+        description="What it is made of. Choosing one fills in its numbers",
+        items=MATERIAL_ITEMS,
+        default=_FIRST.name,
+        update=_take_preset,
+        options=set(),
+    )
+    young: FloatProperty(
+        name="Stiffness (Pa)",
+        description="Young's modulus, pascals. A hundred times as stiff takes ten times as long",
+        min=1.0,
+        soft_min=1e3,
+        soft_max=1e8,
+        max=1e12,
+        default=_FIRST.young,
+        precision=0,
+        step=100,
+    )
+    poisson: FloatProperty(
+        name="Poisson's Ratio",
+        description="How much it bulges when it is squeezed: 0 not at all, 0.49 keeps its volume",
+        min=0.0,
+        max=0.495,
+        default=_FIRST.poisson,
+        precision=3,
+    )
+    density: FloatProperty(
+        name="Density (kg/m³)",
+        description="Kilograms a cubic metre",
+        min=0.01,
+        max=1e5,
+        soft_max=1e4,
+        default=_FIRST.density,
+        precision=0,
+        step=100,
+    )
+    yield_stress: FloatProperty(
+        name="Yield Stress (Pa)",
+        description="Pascals beyond which it does not spring back",
+        min=0.0,
+        max=1e12,
+        soft_max=1e7,
+        precision=0,
+        step=100,
+    )
+    hardening: FloatProperty(
+        name="Hardening",
+        description="Metal, clay and foam: pascals that the yield stress gains as it deforms, less than 0 softens. "
+        "Snow: how fast it gets hard when pressed",
+        soft_min=-1e6,
+        soft_max=1e6,
+        precision=1,
+        step=100,
+    )
+    viscosity: FloatProperty(
+        name="Viscosity (Pa s)",
+        description="Resistance to flowing, pascal seconds: water 0, honey 50",
+        min=0.0,
+        max=1e6,
+        soft_max=1e3,
+    )
+    friction_angle: FloatProperty(
+        name="Friction Angle",
+        description="The slope at which a pile of it comes to rest",
+        subtype="ANGLE",
+        min=0.0,
+        max=math.radians(89),
+    )
+    cohesion: FloatProperty(
+        name="Cohesion",
+        description="Share of its volume by which it may be pulled apart before it comes apart",
+        min=0.0,
+        max=1.0,
+        soft_max=0.1,
+        precision=4,
+    )
+    compression: FloatProperty(
+        name="Crushes At",
+        description="Share by which it is pressed together until it crushes",
+        min=1e-5,
+        max=1.0,
+        default=_FIRST.compression,
+        precision=4,
+    )
+    stretch: FloatProperty(
+        name="Tears At",
+        description="Share by which it is pulled apart until it tears",
+        min=1e-5,
+        max=1.0,
+        default=_FIRST.stretch,
+        precision=4,
+    )
+
+
+class DrgsMatterRegion(_Matter, bpy.types.PropertyGroup):
+    """A part of the object that is made of something else."""
+
+    group: StringProperty(
+        name="Group",
+        description="Vertex group (weights of 0.5 and more) or point attribute that marks the part. The last region "
+        "that holds a place counts",
+    )
+
+
+class DrgsMatterCollider(bpy.types.PropertyGroup):
+    """A mesh, or the meshes of a collection, that matter meets."""
+
+    object: PointerProperty(
+        type=bpy.types.Object,
+        name="Object",
+        description="Mesh that matter collides with, also animated",
+        poll=lambda self, obj: obj.type == "MESH",
+    )
+    collection: PointerProperty(
+        type=bpy.types.Collection, name="Collection", description="All meshes of it are colliders"
+    )
+    contact: EnumProperty(name="Contact", description="What the surface does to matter", items=CONTACT_ITEMS)
+    friction: FloatProperty(
+        name="Friction", description="Coulomb friction: 0 is ice", min=0.0, soft_max=2.0, max=1e6, default=0.5
+    )
+    thickness: FloatProperty(
+        name="Thickness",
+        description="Distance from the surface at which matter is stopped, metres",
+        unit="LENGTH",
+        soft_min=0.0,
+        soft_max=1.0,
+        min=-1e3,
+        max=1e3,
+    )
+
+
+class DrgsMatterSettings(_Matter, bpy.types.PropertyGroup):
+    """The matter that fills an object. Animated and driven values count as they are in the first frame."""
+
+    use: BoolProperty(
+        name="Matter",
+        description="Fill the object with matter and let the engine simulate it; its surface follows",
+        default=False,
+        options=set(),
+    )
+    regions: CollectionProperty(type=DrgsMatterRegion, name="Regions")
+    colliders: CollectionProperty(type=DrgsMatterCollider, name="Colliders")
+    solver: EnumProperty(
+        name="Solver",
+        description="How motion is computed",
+        items=(
+            ("mpm", "Simulation", "Material points on a grid (MLS-MPM): every material"),
+            ("xpbd", "Quick Look", "A lattice that springs back (XPBD): fast, and everything is elastic"),
+        ),
+        options=set(),
+    )
+    resolution: IntProperty(
+        name="Resolution",
+        description="Cells along the longest side of the object; each holds eight particles. Twice as many take up to "
+        "sixteen times as long",
+        min=4,
+        soft_max=160,
+        max=400,
+        default=48,
+        options=set(),
+    )
+    seed: IntProperty(name="Seed", description="Another number gives other disorder to sand and fluids", min=0)
+    gravity: FloatProperty(
+        name="Gravity",
+        description="Share of the scene's gravity that acts on it",
+        default=1.0,
+        soft_min=0.0,
+        soft_max=1.0,
+        min=-200.0,
+        max=200.0,
+    )
+    fields: FloatProperty(
+        name="Force Fields",
+        description="Share of the scene's forces, winds, vortices and turbulence that acts on it; a strength of 1 "
+        "accelerates by 1 m/s²",
+        default=1.0,
+        soft_min=0.0,
+        soft_max=1.0,
+        min=-200.0,
+        max=200.0,
+    )
+    field_collection: PointerProperty(
+        type=bpy.types.Collection,
+        name="Effector Collection",
+        description="Only force fields of this collection act on it",
+    )
+    wind: FloatVectorProperty(
+        name="Wind", description="Velocity of the air, metres a second, world", subtype="XYZ", unit="VELOCITY"
+    )
+    drag: FloatProperty(
+        name="Drag",
+        description="How the wind takes it along: share of the difference in speed that is lost in a second. Without "
+        "wind there is none",
+        min=0.0,
+        max=1e4,
+        soft_max=10.0,
+        default=1.0,
+    )
+    damping: FloatProperty(
+        name="Damping", description="Share of its speed that it loses in a second", min=0.0, max=1e4, soft_max=10.0
+    )
+    velocity: FloatVectorProperty(
+        name="Velocity", description="At the start, metres a second, world", subtype="XYZ", unit="VELOCITY"
+    )
+    spin: FloatVectorProperty(
+        name="Spin",
+        description="At the start, about the object's centre: angle turned in a second about each axis of the world",
+        subtype="XYZ",
+        unit="ROTATION",
+    )
+    pin_group: StringProperty(
+        name="Pinned",
+        description="Vertex group (weights of 0.5 and more) or point attribute of what is held; it follows the "
+        "object's own animation: armature, shape keys, transforms",
+    )
+    use_floor: BoolProperty(name="Floor", description="A level floor without end", default=False, options=set())
+    floor: FloatProperty(name="Height", description="Height of the floor in the world, metres", unit="LENGTH")
+    floor_contact: EnumProperty(name="Contact", description="What the floor does to matter", items=CONTACT_ITEMS)
+    floor_friction: FloatProperty(
+        name="Friction", description="Coulomb friction of the floor: 0 is ice", min=0.0, soft_max=2.0, default=0.5
+    )
+    domain: PointerProperty(
+        type=bpy.types.Object,
+        name="Domain",
+        description="Mesh whose bounding box, in the world, is the space simulated; none is three sizes around",
+        poll=lambda self, obj: obj.type == "MESH",
+    )
+    walls: EnumProperty(name="Walls", description="What the sides of the domain do", items=WALL_ITEMS)
+    frame_start: IntProperty(
+        name="First Frame",
+        description="Frame in which all is at rest and the simulation begins",
+        default=1,
+        min=-1_048_574,
+        max=1_048_574,
+        options=set(),
+    )
+    frame_end: IntProperty(
+        name="Last Frame",
+        description="Last frame that is baked; the object stays so after it",
+        default=100,
+        min=-1_048_574,
+        max=1_048_574,
+        options=set(),
+    )
+    folder: StringProperty(
+        name="Cache",
+        description="Folder of the frames; empty is drgs_cache/OBJECT beside the .blend. One folder an object",
+        subtype="DIR_PATH",
+        options=_RELATIVE,
+    )
+
+
+CLASSES = (DrgsMatterRegion, DrgsMatterCollider, DrgsMatterSettings)
+
+register, unregister = bpy.utils.register_classes_factory(CLASSES)

@@ -1,0 +1,345 @@
+"""Bakes and previews: from the scene over the engine's program to what is shown, in steps that Blender does not feel.
+
+What runs is known to this module alone; nothing of it is stored in the .blend.
+"""
+
+from __future__ import annotations
+
+import atexit
+import os
+import shutil
+import tempfile
+import time
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+from ...drgs_blender.errors import DrgsError, UsageError
+from ...drgs_blender.particle_cache import ParticleCache
+from .. import messages
+from ..export.memory import uid
+from . import capture, playback, points
+from .describe import check, describe, folder_of, own_folder, subject_of
+from .program import Program, ending
+
+#: Where a capture lies inside the cache.
+INPUT = "drgs_input"
+#: Steps of particles that a core makes in a second at best (bench/bench_simulate.py measures it); seconds that a frame
+#: takes besides, and the start.
+_RATE, _FRAME, _START = 5e6, 0.1, 5.0
+
+#: What is being done, by the `uid` of its object.
+running: dict[int, Work] = {}
+
+
+class Work:
+    """Something the engine's program does for an object.
+
+    Parameters
+    ----------
+    inputs : folder for what is captured
+    folder : of the cache
+    still : only the first frame counts
+
+    Attributes
+    ----------
+    cancelled : asked to end before its time
+
+    Raises
+    ------
+    UsageError
+        The object cannot be simulated as it is, or already is.
+    """
+
+    #: Whether the program needs time at its end to keep what it has done.
+    _saves = True
+
+    def __init__(self, obj: bpy.types.Object, scene: bpy.types.Scene, inputs: Path, folder: Path, still: bool) -> None:
+        self.key, self.subject = uid(obj), subject_of(obj)
+        if self.key in running:
+            raise UsageError(self.subject, "is at work already", "Wait until it is done, or cancel it")
+        check(obj)
+        self.folder, self.cancelled = folder, False
+        self._inputs = inputs
+        self._threads = scene.render.threads if scene.render.threads_mode == "FIXED" else 0
+        self._capture = capture.capture(obj, scene, inputs, still=still)
+        self._captured = 0.0
+        self._program: Program | None = None
+        running[self.key] = self
+
+    @property
+    def capturing(self) -> bool:
+        """Whether the scene is still being read: it must not be edited meanwhile."""
+        return self._program is None
+
+    def step(self, seconds: float = float("inf")) -> bool:
+        """Go on for about `seconds`; return whether all is done.
+
+        Raises
+        ------
+        DrgsError
+            Whatever went wrong; `close` it then.
+        """
+        if self._program is None:
+            until = time.monotonic() + seconds
+            for part in self._capture:
+                self._captured = part
+                if time.monotonic() > until:
+                    return False
+            if ending():
+                return False
+            self._program = Program(self._inputs, self.folder, self._threads)
+            return False
+        alive = self._program.alive
+        if self._take(seconds) or alive:
+            return False
+        for line in self._program.result(self.subject, self._held()):
+            messages.note("INFO", line)
+        self._finish()
+        return True
+
+    def close(self) -> None:
+        """End whatever runs. What is done stays."""
+        self._capture.close()
+        self.end_program()
+        running.pop(self.key, None)
+
+    def end_program(self) -> None:
+        """End the engine's program if it runs."""
+        if self._program is not None:
+            self._program.end(self._saves)
+
+    def target(self) -> bpy.types.Object:
+        """The object; undo makes new ones, so none is kept.
+
+        Raises
+        ------
+        UsageError
+            It was removed.
+        """
+        found = object_of(self.key)
+        if found is None:
+            raise UsageError(self.subject, "was removed while it was simulated", "Undo, and bake again: it goes on")
+        return found
+
+    def progress(self) -> tuple[float, str]:
+        """The part that is done, and words for it."""
+        if self._program is None:
+            return 0.0, f"Reading the scene {self._captured:.0%}"
+        counts = self._program.counts
+        return 0.0, "Filling the object" if counts is None else f"{counts[0]:,} particles"
+
+    def _take(self, seconds: float) -> bool:
+        """Take in what is new, for about `seconds`; whether there was anything."""
+        return False
+
+    def _held(self) -> str:
+        """What can be said of what there is when it ends early."""
+        return ""
+
+    def _finish(self) -> None:
+        """The program has done its work."""
+
+
+class Bake(Work):
+    """Frames into the object's cache and its mesh.
+
+    Attributes
+    ----------
+    frames : how many there will be
+    count : how many can be played
+    """
+
+    def __init__(self, obj: bpy.types.Object, scene: bpy.types.Scene) -> None:
+        folder = own_folder(obj, scene)
+        super().__init__(obj, scene, folder / INPUT, folder, still=False)
+        matter = obj.drgs.matter
+        self.first, self.frames, self.count = matter.frame_start, matter.frame_end - matter.frame_start + 1, 0
+        self._playback: playback.Playback | None = None
+        self._begun = 0, time.monotonic()
+        points.hide(obj)
+
+    def progress(self) -> tuple[float, str]:
+        """The part that is done, and words for it."""
+        if not self.count:
+            return super().progress()
+        text = f"Frame {min(self.count, self.frames)} of {self.frames}"
+        fresh, spent = self.count - self._begun[0], time.monotonic() - self._begun[1]
+        if fresh > 0 and self.count < self.frames:
+            text += f", {clock(spent / fresh * (self.frames - self.count))} left"
+        return min(1.0, self.count / self.frames), text
+
+    def cancel(self) -> bool:
+        """End before its time; whether there are frames to play. Another bake goes on from them."""
+        self.close()
+        if self._program is not None and not self.count:
+            with suppress(DrgsError):  # whatever it is, the next bake says it
+                self._take(0.0)
+        return self.count > 0
+
+    def _take(self, seconds: float) -> bool:
+        if self._program.counts is None:
+            return False  # until then the folder holds what was there before
+        if self._playback is None:
+            path = self._inputs / capture.MATRICES
+            self._playback = playback.Playback(self.folder, np.load(path) if path.exists() else None)
+        before, self.count = self.count, self._playback.follow(seconds)
+        if self.count == before:
+            return False
+        if not before or self.count < before:
+            self._begun = self.count, time.monotonic()
+        self._show(renew=not before)
+        return True
+
+    def _held(self) -> str:
+        return f"The first {self.count} frames can be played" if self.count else ""
+
+    def _finish(self) -> None:
+        self._show(renew=True)
+
+    def _show(self, renew: bool) -> None:
+        if not self.count:
+            return
+        obj = self.target()
+        if renew or playback.modifier_of(obj) is None:
+            playback.attach(obj, self._playback.path, self.first)
+        obj.update_tag(refresh={"DATA"})
+
+
+class Preview(Work):
+    """The particles that the object is filled with, as points in viewports.
+
+    Attributes
+    ----------
+    counts : particles, time steps a frame at least; known in the end
+    """
+
+    _saves = False
+
+    def __init__(self, obj: bpy.types.Object, scene: bpy.types.Scene) -> None:
+        self._temporary = Path(tempfile.mkdtemp(prefix="drgs-fill-"))
+        self.counts = (0, 0)
+        try:
+            super().__init__(obj, scene, self._temporary / INPUT, self._temporary, still=True)
+        except DrgsError:
+            shutil.rmtree(self._temporary, ignore_errors=True)
+            raise
+
+    def close(self) -> None:
+        """End whatever runs."""
+        super().close()
+        shutil.rmtree(self._temporary, ignore_errors=True)
+
+    def _finish(self) -> None:
+        self.counts = self._program.counts
+        points.show(self.target(), ParticleCache(self.folder).rest().points, self.counts)
+
+
+@dataclass(frozen=True, slots=True)
+class Cached:
+    """What the cache of an object holds.
+
+    Attributes
+    ----------
+    frames : how many, from the first on
+    wanted : how many a bake makes
+    changed : settings are not those of the frames, so that a bake begins anew
+    """
+
+    frames: int
+    wanted: int
+    changed: bool
+
+
+def cached(obj: bpy.types.Object, scene: bpy.types.Scene) -> Cached:
+    """What is baked already.
+
+    Raises
+    ------
+    DrgsError
+        The folder cannot be told or read.
+    """
+    folder, matter = folder_of(obj), obj.drgs.matter
+    frames = ParticleCache(folder).frames()
+    known = capture.stored(folder / INPUT)
+    changed = False
+    # Values that are animated are those of the first frame, so that only there can be told whether they changed.
+    if frames and known is not None and (obj.animation_data is None or scene.frame_current == matter.frame_start):
+        now = describe(obj, scene)
+        changed = any(known.get(key) != now.get(key) for key in (set(now) | {"floor", "domain"}) - {"last"})
+    return Cached(len(frames), matter.frame_end - matter.frame_start + 1, changed)
+
+
+def free(obj: bpy.types.Object) -> None:
+    """Remove all files of an object's cache, the folder if nothing else is in it, and what plays them.
+
+    Raises
+    ------
+    DrgsError
+        Naming the file that stays, or why the folder cannot be told.
+    """
+    folder = folder_of(obj)
+    while ending():
+        time.sleep(0.02)
+    ParticleCache(folder).clear()
+    capture.clear(folder / INPUT)
+    playback.detach(obj)
+    with suppress(OSError):
+        (folder / playback.FILE).unlink(missing_ok=True)
+        os.rmdir(folder)
+
+
+def of(obj: bpy.types.Object | None) -> Work | None:
+    """What is being done for an object."""
+    return None if obj is None else running.get(uid(obj))
+
+
+def object_of(key: int) -> bpy.types.Object | None:
+    """The object that has this `uid`."""
+    return next((obj for obj in bpy.data.objects if obj.session_uid == key), None)
+
+
+def estimate(counts: tuple[int, int], frames: int, cores: int) -> float:
+    """Seconds that a bake takes at least, from particles and time steps a frame."""
+    return _START + frames * (_FRAME + counts[0] * counts[1] / (_RATE * max(1, cores) ** 0.85))
+
+
+def clock(seconds: float) -> str:
+    """A duration in words."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    if hours:
+        return f"{hours} h {minutes:02d} min"
+    return f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"
+
+
+def end_all() -> None:
+    """End everything that runs."""
+    for work in list(running.values()):
+        work.close()
+
+
+def _end_programs() -> None:
+    """Blender closes: what it has in memory may be gone already, but the programs must not go on."""
+    for work in running.values():
+        work.end_program()
+
+
+@bpy.app.handlers.persistent
+def _before_loading(*_: object) -> None:
+    """Another file is about to be loaded."""
+    end_all()
+
+
+def register() -> None:
+    bpy.app.handlers.load_pre.append(_before_loading)
+    atexit.register(_end_programs)
+
+
+def unregister() -> None:
+    bpy.app.handlers.load_pre.remove(_before_loading)
+    atexit.unregister(_end_programs)
+    end_all()

@@ -1,0 +1,53 @@
+"""Adjustments of a DR-GS object: in the sidebar and in its data properties."""
+
+from __future__ import annotations
+
+import bpy
+
+from .. import assets
+
+
+class _Adjustments:
+    bl_label = "Adjustments"
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012 - read by Blender
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return assets.is_drgs(context.object)
+
+    def draw_header(self, context: bpy.types.Context) -> None:
+        self.layout.prop(context.object.drgs.adjustment, "use", text="")
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout
+        layout.use_property_split = True
+        settings = context.object.drgs.adjustment
+        layout.active = settings.use
+        column = layout.column(align=True)
+        for name in ("tint", "hue", "saturation", "value"):
+            column.prop(settings, name)
+        for channel in ("roughness", "metallic"):
+            column = layout.column(align=True)
+            for part in ("gain", "offset", "low", "high"):
+                column.prop(settings, f"{channel}_{part}")
+        row = layout.row(align=True)
+        row.prop(settings, "mask")
+        row.prop(settings, "use_invert", text="", icon="ARROW_LEFTRIGHT")
+        layout.operator("drgs.reset_adjustments", icon="LOOP_BACK")
+
+
+class DRGS_PT_adjust(_Adjustments, bpy.types.Panel):
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+    bl_category = "DR-GS"
+    bl_parent_id = "DRGS_PT_object"
+
+
+class DRGS_PT_adjust_data(_Adjustments, bpy.types.Panel):
+    bl_space_type = "PROPERTIES"
+    bl_region_type = "WINDOW"
+    bl_context = "data"
+    bl_parent_id = "DRGS_PT_asset"
+
+
+CLASSES = (DRGS_PT_adjust, DRGS_PT_adjust_data)

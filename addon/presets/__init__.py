@@ -1,0 +1,33 @@
+"""Settings of the render by name: those that come with the extension, and the user's own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+
+#: Below the folders in which Blender looks for presets.
+FOLDER = "drgs/render"
+#: What a preset sets, of `settings = bpy.context.scene.drgs`.
+VALUES = (
+    "rays",
+    "use_custom_split",
+    "cosine",
+    "ggx",
+    "environment",
+    "bounces",
+    "use_noise_threshold",
+    "noise_threshold",
+    "clamp_indirect",
+    "aa",
+    "denoise",
+)
+_ROOT = str(Path(__file__).parent)
+
+
+def register() -> None:
+    bpy.utils.register_preset_path(_ROOT)
+
+
+def unregister() -> None:
+    bpy.utils.unregister_preset_path(_ROOT)

@@ -1,0 +1,252 @@
+"""Jobs for farm managers: what the artist sets, and the one run of ``drgs submit`` under way, followed by a timer."""
+
+from __future__ import annotations
+
+import shlex
+import subprocess
+import sys
+import tempfile
+import time
+
+import bpy
+from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
+
+from ..drgs_blender.engine.child import clean_environment
+from ..drgs_blender.errors import DeviceError, UsageError
+from . import engine_link, messages
+
+INTERVAL = 0.2
+#: Newer Blenders warn of a leading // where a property does not say that it may have one.
+_RELATIVE = (
+    {"PATH_SUPPORTS_BLEND_RELATIVE"}
+    if "is_path_supports_blend_relative" in bpy.types.StringProperty.bl_rna.properties
+    else set()
+)
+MANAGERS = (
+    ("openjd", "OpenJD", "A job bundle of the Open Job Description, for Deadline Cloud and other schedulers"),
+    ("slurm", "Slurm", "An array job"),
+    ("flamenco", "Flamenco", "A job and its job type for a Flamenco Manager"),
+)
+
+
+class DrgsSubmitSettings(bpy.types.PropertyGroup):
+    """How frames are rendered on a farm; see `drgs submit`."""
+
+    manager: EnumProperty(name="Manager", description="Who runs the job", items=MANAGERS, default="openjd")
+    out: StringProperty(
+        name="Frames",
+        description="EXR files; #### becomes the frame's number, // is the folder of the .blend",
+        default="//frames/####.exr",
+        subtype="FILE_PATH",
+        options=_RELATIVE,
+    )
+    use_denoise: BoolProperty(
+        name="Temporal Denoising",
+        description="Let a second step take the noise out of finished frames, each with the help of its neighbours",
+        default=False,
+    )
+    denoised: StringProperty(
+        name="Denoised Frames",
+        description="EXR files of the second step",
+        default="//denoised/####.exr",
+        subtype="FILE_PATH",
+        options=_RELATIVE,
+    )
+    chunk: IntProperty(name="Chunk", description="Frames of one task", min=1, soft_max=100, default=5)
+    folder: StringProperty(
+        name="Job Folder",
+        description="Where the job is written",
+        default="//job",
+        subtype="DIR_PATH",
+        options=_RELATIVE,
+    )
+    use_check: BoolProperty(
+        name="Check Scene",
+        description="First open the saved file as a node would, and name what a node would miss",
+        default=True,
+    )
+    shared: StringProperty(
+        name="Shared Folder",
+        description="What all nodes see under the same path; files outside of it are faults. Empty: not looked at",
+        subtype="DIR_PATH",
+        options=_RELATIVE,
+    )
+    program: StringProperty(name="Program", description="How a node starts drgs", default="drgs")
+    options: StringProperty(
+        name="Options", description="Further options of drgs render, such as --threads 8 --memory-mb 6000"
+    )
+    retries: IntProperty(
+        name="Retries", description="How often a chunk is queued again whose engine died", min=0, soft_max=10, default=3
+    )
+    sbatch: StringProperty(
+        name="Options of sbatch", description="Divided by blanks, such as --partition=farm --cpus-per-task=8"
+    )
+    manager_url: StringProperty(name="Address", description="Of the Flamenco Manager", default="http://localhost:8080")
+
+
+class Submission:
+    """One run of ``drgs submit`` for the saved file of a scene.
+
+    Attributes
+    ----------
+    text : what it does or has done
+    notes : what a node would do differently
+    command : what submits the job, "" until it is written
+    error : why there is no job, "" when there is none
+
+    Raises
+    ------
+    DeviceError, UsageError
+        There is no engine, or it cannot be started; the options cannot be divided into words.
+    """
+
+    def __init__(self, scene: bpy.types.Scene) -> None:
+        settings = scene.drgs.submit
+        self.text = "Checking the scene" if settings.use_check else "Writing the job"
+        self.notes: list[str] = []
+        self.command = self.error = ""
+        engine = engine_link.command_line()
+        python = engine[: engine.index("-m")]
+        words = [*python, "-m", "drgs_blender.cli.main", "--no-progress", "submit", *arguments(scene)]
+        options = {"creationflags": subprocess.CREATE_NO_WINDOW} if sys.platform == "win32" else {}
+        self._said, self._log = tempfile.TemporaryFile(), tempfile.TemporaryFile()  # noqa: SIM115 - until it has ended
+        try:
+            self._process = subprocess.Popen(
+                words, stdin=subprocess.DEVNULL, stdout=self._said, stderr=self._log, env=clean_environment(), **options
+            )
+        except OSError as error:
+            raise DeviceError(f"engine {python[0]}", f"cannot be started ({error})", engine_link.SET_UP) from error
+        self.done = False
+
+    def poll(self) -> bool:
+        """Whether it has ended; reads what it said then."""
+        if not self.done and self._process.poll() is not None:
+            self._finish()
+        return self.done
+
+    def cancel(self) -> None:
+        """End it."""
+        if not self.done:
+            self._process.terminate()
+            try:
+                self._process.wait(5)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+            self._finish()
+            self.error = ""
+            self.text = "Cancelled"
+
+    def _finish(self) -> None:
+        said, log = (self._read(stream) for stream in (self._said, self._log))
+        marks = ("note ", "missing ")
+        self.notes = [line.partition(" ")[2].strip() for line in said if line.startswith(marks)]
+        if self._process.returncode == 0 and len(said) >= 2:
+            self.text, self.command = said[-2].removesuffix(". Submit with"), said[-1]
+        else:
+            last = log[-1] if log else f"ended with code {self._process.returncode} and no word"
+            self.text, self.error = "No job was written", last.removeprefix("drgs: ")
+        self.done = True
+
+    @staticmethod
+    def _read(stream) -> list[str]:
+        stream.seek(0)
+        with stream:
+            return stream.read().decode("utf-8", "replace").splitlines()
+
+
+#: The last run of this session, finished or not.
+job: Submission | None = None
+
+
+def arguments(scene: bpy.types.Scene) -> list[str]:
+    """Command line of ``drgs submit`` for the settings of `scene`.
+
+    Raises
+    ------
+    UsageError
+    """
+    settings = scene.drgs.submit
+    words = [settings.manager, bpy.data.filepath, f"--frames={frames(scene)}"]
+    words += [f"--out={bpy.path.abspath(settings.out)}", f"--to={bpy.path.abspath(settings.folder)}"]
+    words += [
+        f"--chunk={settings.chunk}",
+        f"--name={scene.name}",
+        f"--drgs={settings.program}",
+        f"--options={settings.options}",
+    ]
+    if settings.use_denoise:
+        words.append(f"--denoised={bpy.path.abspath(settings.denoised)}")
+    if settings.use_check:
+        words.append(f"--blender={bpy.app.binary_path or sys.executable}")
+        words += [f"--shared={bpy.path.abspath(settings.shared)}"] if settings.shared else []
+    else:
+        words.append("--no-check")
+    if settings.manager == "slurm":
+        try:
+            words += [f"--retries={settings.retries}", *(f"--sbatch={word}" for word in shlex.split(settings.sbatch))]
+        except ValueError as error:
+            raise UsageError(
+                "Options of sbatch", f"cannot be divided into words ({error})", "Close the quotes"
+            ) from error
+    elif settings.manager == "flamenco":
+        words.append(f"--manager-url={settings.manager_url}")
+    return words
+
+
+def frames(scene: bpy.types.Scene) -> str:
+    """The scene's range in the notation of ``drgs render``."""
+    step = f"x{scene.frame_step}" if scene.frame_step > 1 else ""
+    return f"{scene.frame_start}-{scene.frame_end}{step}"
+
+
+def running() -> bool:
+    """Whether a job is being written."""
+    return job is not None and not job.done
+
+
+def start(scene: bpy.types.Scene) -> Submission:
+    """Begin; without a window wait until it has ended."""
+    global job
+    job = Submission(scene)
+    if bpy.app.background:
+        while not job.poll():
+            time.sleep(0.02)
+        _tell()
+    elif not bpy.app.timers.is_registered(follow):
+        bpy.app.timers.register(follow, first_interval=INTERVAL, persistent=True)
+    return job
+
+
+def follow() -> float | None:
+    """Look whether it has ended; called by Blender. Returns seconds to the next call."""
+    if job is None:
+        return None
+    ended = job.poll()
+    if ended:
+        _tell()
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type == "PROPERTIES":
+                area.tag_redraw()
+    return None if ended else INTERVAL
+
+
+def _tell() -> None:
+    for note in job.notes:
+        messages.note("WARNING", note)
+    messages.note("ERROR" if job.error else "INFO", job.error or job.text)
+
+
+def register() -> None:
+    bpy.utils.register_class(DrgsSubmitSettings)
+
+
+def unregister() -> None:
+    global job
+    if bpy.app.timers.is_registered(follow):
+        bpy.app.timers.unregister(follow)
+    if running():
+        job.cancel()
+    job = None
+    bpy.utils.unregister_class(DrgsSubmitSettings)

@@ -1,0 +1,97 @@
+"""The scene of every viewport as a Frame, exported again when it changes, and then only what changed."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import bpy
+
+from ...drgs_blender.engine.snapshots import renewed
+from ...drgs_blender.errors import DrgsError
+from ...drgs_blender.frame import Frame
+from .. import messages
+from ..export import export_frame
+from ..export.camera import NO_CAMERA
+from ..export.memory import Memory
+
+#: Scene, view layer, and the local view of a viewport ("" for none).
+Key = tuple[str, str, str]
+
+
+@dataclass(slots=True)
+class Exported:
+    """A scene as it was exported last.
+
+    Attributes
+    ----------
+    frame : without a camera of its own; None where it cannot be rendered
+    assets : of its objects, see `worker.Request`
+    error : why there is no frame
+    """
+
+    frame: Frame | None = None
+    assets: tuple[tuple[str, tuple[int, int]], ...] = ()
+    error: str = ""
+
+
+@dataclass(slots=True)
+class _Scene:
+    memory: Memory = field(default_factory=Memory)
+    exported: Exported | None = None
+    current: bool = False
+
+
+_scenes: dict[Key, _Scene] = {}
+
+
+def exported(
+    depsgraph: bpy.types.Depsgraph, local: str = "", shown: Callable[[bpy.types.Object], bool] | None = None
+) -> Exported:
+    """The scene of an evaluated viewport `depsgraph`; the same object for as long as nothing changes.
+
+    Parameters
+    ----------
+    local : name of the local view that `shown` is of
+    """
+    key = depsgraph.scene.name_full, depsgraph.view_layer.name, local
+    scene = _scenes.setdefault(key, _Scene())
+    if not scene.current or scene.exported is None:
+        made = _export(depsgraph, scene.memory, shown)
+        scene.exported, scene.current = renewed(made, scene.exported), True
+    return scene.exported
+
+
+def _export(
+    depsgraph: bpy.types.Depsgraph, memory: Memory, shown: Callable[[bpy.types.Object], bool] | None
+) -> Exported:
+    assets: dict[str, tuple[int, int]] = {}
+
+    def key_of(path: Path) -> str:
+        return os.path.realpath(path)  # as the engine makes it; it is asked later, by the worker
+
+    try:
+        frame = export_frame(depsgraph, key_of, messages.Warnings(), camera=NO_CAMERA, memory=memory, shown=shown)
+    except DrgsError as error:
+        messages.note("ERROR", str(error))
+        return Exported(error=str(error))
+    for state in frame.objects:
+        status = os.stat(state.asset)
+        assets[state.asset] = status.st_mtime_ns, status.st_size
+    return Exported(frame, tuple(assets.items()))
+
+
+def changed(depsgraph: bpy.types.Depsgraph) -> None:
+    """Take note of what the depsgraph of a viewport was updated for."""
+    names = depsgraph.scene.name_full, depsgraph.view_layer.name
+    for key, scene in _scenes.items():
+        if key[:2] == names:
+            scene.memory.note(depsgraph)
+            scene.current = False
+
+
+def forget() -> None:
+    """Nothing that was exported is true any more."""
+    _scenes.clear()

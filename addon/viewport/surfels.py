@@ -1,0 +1,65 @@
+"""Surfels without the engine: discs with their albedo where the deformed mesh has carried them."""
+
+from __future__ import annotations
+
+import bpy
+import gpu
+import numpy as np
+from mathutils import Matrix
+
+from ...drgs_blender.asset import Asset
+from ...drgs_blender.errors import DrgsError
+from .. import assets, mesh_arrays
+from ..export.memory import Memory, uid
+from . import draw
+
+Array = np.ndarray
+
+#: Diameter of a disc in standard deviations of its surfel: neighbours just overlap.
+_WIDTH = 2.5
+memory = Memory()
+
+
+def places(asset: Asset, vertices: Array) -> Array:
+    """(n, 3) float32: where the surfels are when the mesh has these (v, 3) vertices; bound ones follow their face."""
+    binding = asset.binding
+    if binding is None or len(vertices) != len(asset.mesh.vertices):
+        return asset.surfels.centre
+    corners = vertices[asset.mesh.faces[binding.face]]
+    found = np.einsum("nk,nkc->nc", binding.barycentric, corners)
+    if binding.offset.any():
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+        rest = asset.mesh.vertices[asset.mesh.faces[binding.face]]
+        edge = np.linalg.norm(rest - np.roll(rest, 1, axis=1), axis=2).mean(axis=1)
+        found += (binding.offset * edge)[:, None] * normal
+    return np.ascontiguousarray(found, np.float32)
+
+
+def show(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
+    """Draw the surfels of all visible DR-GS objects."""
+    region, rv3d = context.region, context.region_data
+    for instance in depsgraph.object_instances:
+        obj = instance.object
+        if not instance.show_self or not assets.is_drgs(obj):
+            continue
+        batch = memory.recall(
+            ("object", uid(obj), obj.data.as_pointer()), (uid(obj), uid(obj.data)), lambda obj=obj: _batch(obj)
+        )
+        if batch is None:
+            continue
+        matrix: Matrix = instance.matrix_world
+        scale = 0.5 * region.height * rv3d.window_matrix[1][1] * matrix.median_scale
+        draw.discs(batch, rv3d.perspective_matrix @ matrix, scale, rv3d.is_perspective)
+    memory.end()
+
+
+def _batch(obj: bpy.types.Object) -> gpu.types.GPUBatch | None:
+    try:
+        asset = assets.load(assets.file_of(obj))
+    except DrgsError:  # told by whoever wants to render the object
+        return None
+    found = asset.surfels
+    vertices = mesh_arrays.read_vertices(obj.data)
+    sizes = _WIDTH * found.scale.max(axis=1)
+    return draw.disc_batch(places(asset, vertices), found.albedo, sizes.astype(np.float32))

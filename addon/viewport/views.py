@@ -1,0 +1,266 @@
+"""The viewports: what each wants to see, and the newest picture of it.
+
+Everything here runs on Blender's own thread and returns at once; the `worker` waits for the engine. A timer looks
+whether there is news and has the regions drawn again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import bpy
+
+from ...drgs_blender.errors import DrgsError
+from ...drgs_blender.frame import Camera, Frame
+from .. import engine_link, messages, preferences
+from ..export.view import view_camera
+from . import draw, scenes
+from .worker import Picture, Request, Worker
+
+#: Seconds between two looks for news, while something is rendered and while nothing is.
+_BUSY, _IDLE = 0.01, 0.1
+#: Pixels that one redraw brings to the graphics card: some milliseconds.
+STRIP_PIXELS = 1 << 20
+
+worker = Worker()
+_shown: dict[str, Shown] = {}
+_seen_news = 0
+#: Seconds that redraws took, and those that Blender's thread worked in them, for `bench/bench_viewport.py`.
+redraws: deque[tuple[float, float]] = deque(maxlen=10_000)
+
+
+@dataclass(slots=True)
+class Shown:
+    """One viewport.
+
+    Attributes
+    ----------
+    wanted : exported scene, camera and settings that were asked for last
+    picture, strips : what is on the screen
+    arriving, arrived : the picture that comes next, and as much of it as redraws have had time for
+    since : when the first picture of this request was drawn
+    """
+
+    wanted: tuple[object, ...] = ()
+    picture: Picture | None = None
+    strips: list[draw.Strip] = field(default_factory=list)
+    arriving: Picture | None = None
+    arrived: list[draw.Strip] = field(default_factory=list)
+    since: float = 0.0
+    told: set[str] = field(default_factory=set)
+
+
+def name_of(region: bpy.types.Region) -> str:
+    """What the engine calls a viewport."""
+    return f"viewport {region.as_pointer():x}"
+
+
+def update(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph, name: str, composited: bool = False) -> str:
+    """Ask for the picture of a viewport as it is now; return an error or "".
+
+    Parameters
+    ----------
+    composited : of the DR-GS objects alone, lit by everything, to be drawn among the others
+    """
+    region, space, rv3d = context.region, context.space_data, context.region_data
+    exported = _export(depsgraph, space)
+    if exported.frame is None:
+        return exported.error
+    camera = view_camera(region, space, rv3d, depsgraph.scene)
+    if camera is None:
+        return ""
+    shown = _shown.setdefault(name, Shown())
+    options = _options(depsgraph.scene, name, composited)
+    wanted = exported, _values(camera), options
+    if shown.wanted and shown.wanted[0] is exported and shown.wanted[1:] == wanted[1:]:
+        return ""
+    try:
+        client = engine_link.client()
+    except DrgsError as error:
+        return str(error)
+    shown.wanted = wanted
+    frame = replace(exported.frame, camera=camera, **options)
+    if composited:
+        frame = _alone(frame)
+    worker.submit(name, Request(frame, client, exported.assets))
+    _start()
+    return ""
+
+
+def newest(name: str) -> Shown | None:
+    """The newest picture of a viewport that is on the graphics card, None before there is one.
+
+    Another one is brought there, as much of it as a redraw has time for.
+    """
+    shown = _shown.get(name)
+    if shown is None:
+        return None
+    picture = worker.picture(name)
+    if shown.arriving is None and picture is not shown.picture:  # what is half there is finished first
+        shown.arriving = picture
+    if shown.arriving is not None:
+        _bring(shown, shown.arriving)
+    return shown if shown.picture is not None else None
+
+
+def _bring(shown: Shown, picture: Picture) -> None:
+    """The next rows of the picture that is arriving; show it when it is whole."""
+    passes = {n: picture.passes[n] for n in draw.KINDS if n in picture.passes}
+    height, width = picture.passes["Combined"].shape[:2]
+    rows = rows_of_strip(height, width)
+    top = rows * len(shown.arrived)
+    shown.arrived.append(draw.strip(passes, top, min(top + rows, height)))
+    if top + rows < height:
+        return
+    if shown.picture is None or shown.picture.request is not picture.request:
+        shown.since = time.perf_counter()
+    shown.picture, shown.strips = picture, shown.arrived
+    shown.arriving, shown.arrived = None, []
+    for text in picture.passes.warnings:
+        if text not in shown.told:
+            shown.told.add(text)
+            messages.note("WARNING", text)
+
+
+def rows_of_strip(height: int, width: int) -> int:
+    """Rows of a picture that one redraw brings to the graphics card: equal parts of at most `STRIP_PIXELS`."""
+    strips = -(-height * width // STRIP_PIXELS)
+    return -(-height // strips)
+
+
+def show(name: str) -> None:
+    """Draw the newest picture of a rendered viewport into its region."""
+    shown = newest(name)
+    if shown is not None and shown.picture is not None:
+        draw.picture(shown.strips, rect_of(shown.picture))
+
+
+def tell(name: str) -> tuple[str, str]:
+    """What to say of a viewport: (what is being done, an error or "")."""
+    shown = _shown.get(name)
+    phase, error = worker.state(name)
+    if shown is None or error:
+        return "", error
+    if shown.picture is None:
+        return phase or "Starting the engine", ""
+    rays = shown.picture.request.frame.settings.rays
+    return phase if phase == "Preparing kernels" else f"Ray {round(shown.picture.fraction * rays)}/{rays}", ""
+
+
+def forget() -> None:
+    """Nothing of the last file is seen in the next."""
+    for name in list(_shown):
+        worker.drop(name)
+    _shown.clear()
+    scenes.forget()
+
+
+def stop() -> None:
+    """Forget everything and end what runs."""
+    forget()
+    if bpy.app.timers.is_registered(_look):
+        bpy.app.timers.unregister(_look)
+    worker.stop()
+
+
+def _export(depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D) -> scenes.Exported:
+    if space.local_view is None:
+        return scenes.exported(depsgraph)
+
+    def shown(obj: bpy.types.Object) -> bool:
+        return obj.type == "LIGHT" or obj.original.local_view_get(space)  # lights shine in every view
+
+    return scenes.exported(depsgraph, f"{space.as_pointer():x}", shown)
+
+
+def _options(scene: bpy.types.Scene, name: str, composited: bool) -> dict[str, Any]:
+    """What of a frame a viewport chooses itself.
+
+    Settings are those of the scene itself: Blender evaluates no copy of them when they are changed by hand.
+    """
+    options = scene.drgs
+    settings = options.to_settings(composited or scene.render.film_transparent, preferences.read("threads", 0))
+    return {
+        "number": scene.frame_current if options.use_animated_seed else 0,
+        "settings": settings,
+        "passes": ("Combined", "Depth") if composited else ("Combined",),
+        "history": name if options.use_viewport_denoise else "",
+    }
+
+
+def _alone(frame: Frame) -> Frame:
+    """The frame in which the camera sees DR-GS objects only; everything else still gives light and shadow."""
+    return replace(
+        frame,
+        meshes=[replace(mesh, visibility=replace(mesh.visibility, camera=False)) for mesh in frame.meshes],
+        lights=[replace(light, camera=False) for light in frame.lights],
+    )
+
+
+def _values(camera: Camera) -> tuple[object, ...]:
+    """Everything about a camera, comparable."""
+    return tuple(
+        value.tobytes() if name == "matrix_world" else value
+        for name, value in ((n, getattr(camera, n)) for n in camera.__slots__)
+    )
+
+
+def rect_of(picture: Picture) -> tuple[float, float, float, float]:
+    """Part of the region that a picture covers, y upwards."""
+    camera = picture.request.frame.camera
+    x0, y0, x1, y1 = camera.window
+    return x0 / camera.width, 1 - y1 / camera.height, x1 / camera.width, 1 - y0 / camera.height
+
+
+# --- the timer ------------------------------------------------------------------------------------------------------
+
+
+def _start() -> None:
+    if not bpy.app.timers.is_registered(_look):
+        bpy.app.timers.register(_look, first_interval=_BUSY)
+
+
+def _look() -> float | None:
+    """Have the viewports drawn again that have news; end when there are none left."""
+    global _seen_news
+    live = dict(_live())
+    for name in set(_shown) - set(live):
+        worker.drop(name)
+        del _shown[name]
+    arriving = {name for name, shown in _shown.items() if shown.arriving is not None}
+    news = worker.news  # once: the worker goes on counting
+    for name, area in live.items():
+        if news != _seen_news or name in arriving:
+            area.tag_redraw()
+    _seen_news = news
+    if not _shown:
+        return None
+    return _BUSY if worker.busy() or arriving else _IDLE
+
+
+def is_rendered(space: bpy.types.SpaceView3D, scene: bpy.types.Scene) -> bool:
+    """Whether DR-GS makes the whole picture of a viewport."""
+    return scene.render.engine == "DRGS" and space.shading.type == "RENDERED"
+
+
+def _live() -> Iterator[tuple[str, bpy.types.Area]]:
+    """Viewports on the screen that show pictures of ours, by name."""
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type != "VIEW_3D":
+                continue
+            if is_rendered(area.spaces.active, window.scene) or window.scene.drgs.overlay == "LIT":
+                yield from ((name_of(region), area) for region in area.regions if region.type == "WINDOW")
+
+
+@contextlib.contextmanager
+def timed() -> Iterator[None]:
+    """Note how long a redraw takes Blender's thread."""
+    began, worked = time.perf_counter(), time.thread_time()
+    yield
+    redraws.append((time.perf_counter() - began, time.thread_time() - worked))

@@ -1,0 +1,222 @@
+"""The thread between the viewports and the engine. It never touches Blender, and Blender never waits for it.
+
+The newest frame of a viewport wins: one that was not begun yet is replaced, a picture that is being refined is
+interrupted. A first picture is always finished, so that something is seen however quickly frames follow each other.
+Of several viewports the one that waits longest for its first picture goes first, then the one with the fewest samples.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from ...drgs_blender.engine.client import EngineClient, Passes
+from ...drgs_blender.errors import Cancelled, DrgsError
+from ...drgs_blender.frame import Frame
+
+log = logging.getLogger("drgs")
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """What a viewport wants to see.
+
+    Attributes
+    ----------
+    assets : path of every asset in the frame, with what tells whether the file changed
+    """
+
+    frame: Frame
+    client: EngineClient
+    assets: tuple[tuple[str, tuple[int, int]], ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A picture of a request; ``fraction`` of its samples are in it."""
+
+    request: Request
+    passes: Passes
+    fraction: float
+    seconds: float  # from the request to the picture
+
+
+@dataclass(slots=True)
+class _View:
+    name: str
+    request: Request
+    asked: float
+    begun: bool = False
+    fraction: float = 0.0
+    picture: Picture | None = None
+    error: str = ""
+    phase: str = ""
+
+
+class Worker:
+    """Keeps the pictures of all viewports growing. Its methods may be called from any thread and return at once."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._views: dict[str, _View] = {}
+        self._loaded: tuple[object, dict[str, object]] = None, {}
+        self._thread: threading.Thread | None = None
+        self._held = 0
+        self._ending = False
+        self.news = 0
+
+    def submit(self, name: str, request: Request) -> None:
+        """Show something else in the viewport `name`."""
+        with self._changed:
+            view = self._views.get(name)
+            if view is None:
+                view = self._views[name] = _View(name, request, time.perf_counter())
+            elif view.begun:
+                view.asked = time.perf_counter()
+            view.request, view.begun, view.error = request, False, ""
+            if self._thread is None:
+                self._ending = False
+                self._thread = threading.Thread(target=self._run, name="drgs-viewport", daemon=True)
+                self._thread.start()
+            self._changed.notify()
+        request.client.wake()
+
+    def drop(self, name: str) -> None:
+        """The viewport is gone."""
+        with self._changed:
+            view = self._views.pop(name, None)
+        if view is not None:
+            view.request.client.wake()
+
+    def names(self) -> list[str]:
+        """The viewports that were not dropped."""
+        with self._changed:
+            return list(self._views)
+
+    def picture(self, name: str) -> Picture | None:
+        """The newest picture of a viewport."""
+        view = self._views.get(name)
+        return None if view is None else view.picture
+
+    def state(self, name: str) -> tuple[str, str]:
+        """What to tell of a viewport: (what is being done, an error or "")."""
+        view = self._views.get(name)
+        return ("", "") if view is None else (view.phase, view.error)
+
+    def busy(self) -> bool:
+        """Whether there is something to do."""
+        with self._changed:
+            return not self._held and any(_unfinished(view) for view in self._views.values())
+
+    def hold(self) -> None:
+        """Leave the engine to somebody else until `release`."""
+        with self._changed:
+            self._held += 1
+            clients = {view.request.client for view in self._views.values()}
+        for client in clients:
+            client.wake()
+
+    def release(self) -> None:
+        """Undo one `hold`."""
+        with self._changed:
+            self._held -= 1
+            self._changed.notify()
+
+    def stop(self) -> None:
+        """Drop everything and end the thread."""
+        with self._changed:
+            thread, self._thread = self._thread, None
+            views, self._views = self._views, {}
+            self._ending = True
+            self._changed.notify()
+        for view in views.values():
+            view.request.client.wake()
+        if thread is not None:
+            thread.join(2.0)
+
+    # --- the thread ------------------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                while (view := self._next()) is None and not self._ending:
+                    self._changed.wait()
+                if self._ending or view is None:
+                    return
+                request, first, asked = view.request, not view.begun, view.asked
+                view.begun = True
+            try:
+                self._load(request)
+                passes = request.client.view(
+                    view.name,
+                    request.frame,
+                    not first,
+                    lambda phase, part, view=view: self._tell(view, phase),
+                    self._stop_begin(view) if first else self._stop_refining(view, request),
+                )
+            except Cancelled:
+                with self._changed:
+                    view.begun = view.begun and not first
+                continue
+            except DrgsError as error:
+                self._fail(view, request, str(error))
+                continue
+            except Exception as error:  # nobody else would hear of it, and the viewport would stand still
+                log.exception("viewport %s", view.name)
+                self._fail(view, request, f"DR-GS failed ({type(error).__name__}: {error})")
+                continue
+            now = time.perf_counter()
+            view.fraction = passes.statistics.get("view.fraction", 1.0)
+            view.phase = ""
+            view.picture = Picture(request, passes, view.fraction, now - asked)
+            self.news += 1
+
+    def _next(self) -> _View | None:
+        """The view to work on; called with the lock held."""
+        if self._held:
+            return None
+        waiting = [view for view in self._views.values() if not view.begun]
+        if waiting:
+            return min(waiting, key=lambda view: view.asked)
+        growing = [view for view in self._views.values() if _unfinished(view)]
+        return min(growing, key=lambda view: view.fraction, default=None)
+
+    def _stop_begin(self, view: _View) -> Callable[[], bool]:
+        return lambda: self._ending or self._held > 0 or self._views.get(view.name) is not view
+
+    def _stop_refining(self, view: _View, request: Request) -> Callable[[], bool]:
+        begin = self._stop_begin(view)
+
+        def stop() -> bool:
+            return begin() or view.request is not request or any(not v.begun for v in list(self._views.values()))
+
+        return stop
+
+    def _load(self, request: Request) -> None:
+        """Have the engine map the assets that it has not, or not as they are now."""
+        client, loaded = self._loaded
+        if client is not request.client:
+            loaded = {}
+            self._loaded = request.client, loaded
+        for path, stamp in request.assets:
+            if loaded.get(path) != stamp:
+                request.client.load_asset(path, cancelled=lambda: self._ending or self._held > 0)
+                loaded[path] = stamp
+
+    def _tell(self, view: _View, phase: str) -> None:
+        if phase != view.phase:
+            view.phase = phase
+            self.news += 1
+
+    def _fail(self, view: _View, request: Request, text: str) -> None:
+        with self._changed:
+            if view.request is request:
+                view.error, view.fraction = text, 1.0
+        self.news += 1
+
+
+def _unfinished(view: _View) -> bool:
+    return not view.begun or view.fraction < 1.0

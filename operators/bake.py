@@ -1,0 +1,170 @@
+"""Bake Light: what DR-GS sees on the selected objects, for other engines: colour attributes or images."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import bpy
+import numpy as np
+from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
+
+from ..addon import assets, mesh_arrays, messages
+from ..addon.export import export_frame
+from ..addon.export.camera import NO_CAMERA
+from ..addon.export.fit import check_fit
+from ..drgs_blender.engine.frame_file import SUFFIX, write_frame_file
+from ..drgs_blender.errors import UsageError
+from ..drgs_blender.sequence import frame_path
+from . import targets
+from .program import ProgramOperator
+
+_NUMBER = "####"
+
+
+class DRGS_OT_bake_light(ProgramOperator, targets.ObjectMode, bpy.types.Operator):
+    """Bake the light of the scene on the selected DR-GS objects to colour attributes, or to images by their UV maps"""
+
+    bl_idname = "drgs.bake_light"
+    bl_label = "Bake Light"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
+
+    target: EnumProperty(
+        name="To",
+        description="Where the colour goes",
+        items=(
+            ("ATTRIBUTE", "Attribute", "A colour attribute of the vertices; one for each frame of an animation"),
+            ("IMAGE", "Image", "An EXR file for each object, and for each frame of an animation, by its UV map"),
+        ),
+        default="ATTRIBUTE",
+    )
+    name: StringProperty(
+        name="Name", description="Of the attribute; the number of a frame of an animation is added", default="relit"
+    )
+    directory: StringProperty(
+        name="Folder", description="Where the images go", subtype="DIR_PATH", default="//", options={"SKIP_SAVE"}
+    )
+    size: IntProperty(name="Size", description="Texels along a side of the images", default=1024, min=16, max=16384)
+    light: EnumProperty(
+        name="Light",
+        description="What is baked",
+        items=(
+            ("all", "All", "Diffuse light and highlights, these as seen along the normal"),
+            ("diffuse", "Diffuse", "What looks the same from everywhere"),
+        ),
+        default="all",
+    )
+    rays: IntProperty(name="Rays", description="Samples of light a vertex or texel", default=256, min=3, max=65536)
+    use_animation: BoolProperty(name="Animation", description="All frames of the scene's range", default=False)
+
+    _names: tuple[str, ...] = ()
+    _frames: tuple[int, ...] = ()
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        return context.window_manager.invoke_props_dialog(self)
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout
+        layout.use_property_split = True
+        layout.prop(self, "target", expand=True)
+        for name in ("name",) if self.target == "ATTRIBUTE" else ("directory", "size"):
+            layout.prop(self, name)
+        for name in ("light", "rays", "use_animation"):
+            layout.prop(self, name)
+
+    def run(self, context: bpy.types.Context) -> set[str]:
+        objects = targets.editable(targets.selected(context), data=True)
+        if self.target == "ATTRIBUTE" and (not self.name or self.name in mesh_arrays.ATTRIBUTES):
+            raise UsageError("Name", f'"{self.name}" is none for baked light', "Choose another")
+        scene = context.scene
+        frames = range(scene.frame_start, scene.frame_end + 1, scene.frame_step)
+        self._frames = tuple(frames) if self.use_animation else (scene.frame_current,)
+        self._names = tuple(obj.name for obj in objects)
+        with self.folder("drgs-bake-") as folder:
+            scenes = str(folder / f"{_NUMBER}{SUFFIX}")
+            arguments = ["bake", scenes, "--rays", str(self.rays), "--light", self.light]
+            arguments += ["--size", str(self.size), f"--frames={','.join(map(str, self._frames))}"]
+            for number in self._visited(context):
+                frame = export_frame(context.evaluated_depsgraph_get(), str, messages.Warnings(), camera=NO_CAMERA)
+                known = {state.name for state in frame.objects}
+                for name in set(self._names) - known:
+                    raise UsageError(f'Object "{name}"', "is not rendered", "Enable it in renders, or deselect it")
+                write_frame_file(frame_path(scenes, number), frame)
+            for i, obj in enumerate(objects):
+                arguments += ["--object", obj.name, *self._place(context, i, obj)]
+        return self.start(context, arguments, "Light", "Baking light", "could not be baked")
+
+    def done(self, context: bpy.types.Context) -> set[str]:
+        """Put what the program wrote where it belongs."""
+        for i, name in enumerate(self._names):
+            obj = context.scene.objects.get(name)
+            if obj is None:
+                self.warn(f'Object "{name}" is gone; its light is lost')
+            elif self.target == "IMAGE":
+                image = bpy.data.images.load(str(frame_path(self._image(obj), self._frames[0])), check_existing=True)
+                image.source = "SEQUENCE" if len(self._frames) > 1 else "FILE"
+            else:
+                for number in self._frames:
+                    colours = np.load(frame_path(self._attribute(i), number), allow_pickle=False)
+                    single = not self.use_animation
+                    write_colours(obj.data, self.name if single else f"{self.name}.{number:04}", colours)
+        self.report({"INFO"}, f"Baked the light of {len(self._frames)} frames on {len(self._names)} objects")
+        return {"FINISHED"}
+
+    def _visited(self, context: bpy.types.Context) -> Iterator[int]:
+        """Have the scene at every frame, one after the other, and at its own again."""
+        scene = context.scene
+        now = scene.frame_current, scene.frame_subframe
+        if not self.use_animation:
+            yield now[0]
+            return
+        try:
+            for number in self._frames:
+                scene.frame_set(number)
+                yield number
+        finally:
+            scene.frame_set(now[0], subframe=now[1])
+
+    def _attribute(self, index: int) -> str:
+        """Pattern of the files with the colours of an object's vertices."""
+        return str(self._folder / f"{_NUMBER}_{index}.npy")
+
+    def _image(self, obj: bpy.types.Object) -> str:
+        """Pattern of the images of an object."""
+        return str(Path(bpy.path.abspath(self.directory)) / f"{bpy.path.clean_name(obj.name)}_{_NUMBER}.exr")
+
+    def _place(self, context: bpy.types.Context, index: int, obj: bpy.types.Object) -> list[str]:
+        """Where the program writes the light of an object, and the UV map where that is an image."""
+        if self.target == "ATTRIBUTE":
+            return [self._attribute(index)]
+        if not bpy.data.filepath and self.directory.startswith("//"):
+            raise UsageError("Folder", f"{self.directory} lies beside the .blend, which is not saved", "Save it first")
+        evaluated = obj.evaluated_get(context.evaluated_depsgraph_get())
+        same = check_fit(evaluated, evaluated.data, assets.load(assets.file_of(obj)).mesh, messages.Warnings())
+        uvs = mesh_arrays.read_uvs(evaluated.data, "")
+        if not same or uvs is None:
+            raise UsageError(
+                f'Object "{obj.name}"',
+                "has no UV map" if same else "has other faces than its asset, which UV maps are of",
+                "Unwrap it in Edit Mode, or bake to an attribute",
+            )
+        path = self._folder / f"{index}_uvs.npy"
+        np.save(path, uvs.reshape(-1, 3, 2), allow_pickle=False)
+        return [self._image(obj), str(path)]
+
+
+def write_colours(mesh: bpy.types.Mesh, name: str, colours: np.ndarray) -> None:
+    """Set a colour attribute of the vertices, (n, 3) linear Rec.709; one of that name and another type is replaced."""
+    attribute = mesh.attributes.get(name)
+    if attribute is not None and (attribute.data_type, attribute.domain) != ("FLOAT_COLOR", "POINT"):
+        mesh.attributes.remove(attribute)
+        attribute = None
+    if attribute is None:
+        attribute = mesh.attributes.new(name, "FLOAT_COLOR", "POINT")
+    values = np.ones((len(colours), 4), np.float32)
+    values[:, :3] = colours
+    attribute.data.foreach_set("color", values.ravel())
+    mesh.update_tag()
+
+
+CLASSES = (DRGS_OT_bake_light,)

@@ -1,0 +1,136 @@
+"""Bind to Cage: a low-poly mesh carries the selected objects along (Surface Deform)."""
+
+from __future__ import annotations
+
+import bmesh
+import bpy
+import numpy as np
+from bpy.props import IntProperty
+
+from ..addon import mesh_arrays
+from ..drgs_blender.errors import UsageError
+from . import targets
+from .base import DrgsOperator
+
+NAME = "DR-GS Cage"
+#: Voxels along the diagonal from which a new cage is made, before it is thinned out.
+VOXELS = 48
+
+
+class DRGS_OT_bind_to_cage(DrgsOperator, targets.ObjectMode, bpy.types.Operator):
+    """Let a low-poly mesh carry the selected DR-GS objects: the mesh that is selected too, or a new one around them"""
+
+    bl_idname = "drgs.bind_to_cage"
+    bl_label = "Add Cage"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
+
+    faces: IntProperty(
+        name="Faces", description="About so many triangles has a new cage", min=50, soft_max=5000, default=400
+    )
+
+    def run(self, context: bpy.types.Context) -> set[str]:
+        objects = targets.editable(targets.selected(context))
+        cages = list(targets.of_type(context.selected_objects, "MESH"))
+        if len(cages) > 1:
+            raise UsageError("Selection", f"holds {len(cages)} other meshes", "Select one cage, or none for a new one")
+        cage = cages[0] if cages else new_cage(context, objects, self.faces)
+        try:
+            bind_to_cage(context, objects, cage)
+        except UsageError:
+            if not cages:
+                bpy.data.meshes.remove(cage.data)
+            raise
+        targets.select_only(context, [cage], cage)
+        return {"FINISHED"}
+
+
+def bind_to_cage(context: bpy.types.Context, objects: list[bpy.types.Object], cage: bpy.types.Object) -> None:
+    """Bind `objects` as they are now to `cage` as it is now; the cage is shown as wires and not rendered.
+
+    Raises
+    ------
+    UsageError
+        Blender cannot bind to that mesh; nothing has been changed then.
+    """
+    done = []
+    for obj in objects:
+        modifier = targets.add_modifier(obj, "SURFACE_DEFORM", NAME, target=cage)
+        done.append((obj, modifier))
+        context.view_layer.update()
+        with context.temp_override(object=obj, active_object=obj, selected_objects=[obj]):
+            try:
+                bpy.ops.object.surfacedeform_bind(modifier=modifier.name)
+                reason = ""
+            except RuntimeError as error:
+                reason = str(error).removeprefix("Error: ").strip().rstrip(".")
+        context.view_layer.update()
+        if not modifier.is_bound:
+            for changed, added in done:
+                changed.modifiers.remove(added)
+            raise UsageError(
+                f'Cage "{cage.name}"',
+                f'cannot carry "{obj.name}"' + (f" ({reason})" if reason else ""),
+                "It must have faces, none of them concave, and no edge of more than two faces",
+            )
+    cage.display_type, cage.hide_render = "WIRE", True
+
+
+def new_cage(context: bpy.types.Context, objects: list[bpy.types.Object], faces: int) -> bpy.types.Object:
+    """A closed mesh of about `faces` triangles around the undeformed `objects`, in their collection."""
+    vertices = [targets.world_vertices(o) for o in objects]
+    starts = np.cumsum([0, *map(len, vertices)])
+    everything = np.concatenate(vertices)
+    triangles = np.concatenate([mesh_arrays.loop_triangles(o.data) + start for o, start in zip(objects, starts)])
+    mesh = bpy.data.meshes.new(NAME)
+    mesh.from_pydata(everything.tolist(), [], triangles.tolist())
+    cage = bpy.data.objects.new(NAME, mesh)
+    context.collection.objects.link(cage)
+    size = float(np.linalg.norm(np.ptp(everything, axis=0)))
+    try:
+        for kind, values in (
+            ("SOLIDIFY", {"thickness": 2 * size / VOXELS, "offset": 0.0}),
+            ("REMESH", {"mode": "VOXEL", "voxel_size": size / VOXELS}),
+        ):
+            targets.add_modifier(cage, kind, kind, **values)
+        _apply(context, cage)
+        count = len(mesh_arrays.loop_triangles(cage.data))
+        if not count:
+            raise UsageError(
+                "Cage", "nothing is left of the objects at this size", "Make the cage by hand and select it"
+            )
+        ratio = min(1.0, faces / count)
+        targets.add_modifier(cage, "DECIMATE", "DECIMATE", ratio=ratio, use_collapse_triangulate=True)
+        _apply(context, cage)
+        clean(cage.data, 1e-4 * size)
+    except UsageError:
+        bpy.data.meshes.remove(cage.data)
+        raise
+    return cage
+
+
+def clean(mesh: bpy.types.Mesh, distance: float) -> None:
+    """Take away what Surface Deform refuses: slivers, and edges of more than two faces."""
+    work = bmesh.new()
+    work.from_mesh(mesh)
+    bmesh.ops.dissolve_degenerate(work, dist=distance, edges=work.edges)
+    crowded = [e for e in work.edges if len(e.link_faces) > 2]
+    bmesh.ops.split_edges(work, edges=crowded)
+    bmesh.ops.triangulate(work, faces=work.faces)
+    slivers = [f for f in work.faces if f.calc_area() < distance**2]
+    bmesh.ops.delete(work, geom=slivers, context="FACES_ONLY")
+    work.to_mesh(mesh)
+    work.free()
+
+
+def _apply(context: bpy.types.Context, obj: bpy.types.Object) -> None:
+    """Replace the mesh by what its modifiers make of it."""
+    context.view_layer.update()
+    old = obj.data
+    evaluated = obj.evaluated_get(context.evaluated_depsgraph_get())
+    obj.data = bpy.data.meshes.new_from_object(evaluated)
+    obj.modifiers.clear()
+    bpy.data.meshes.remove(old)
+    obj.data.name = NAME
+
+
+CLASSES = (DRGS_OT_bind_to_cage,)

@@ -1,0 +1,112 @@
+"""Convert to DR-GS: splats and meshes that other importers made become DR-GS objects at the same place."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+from bpy.props import BoolProperty, StringProperty
+
+from ..addon import assets, splat_attributes
+from ..drgs_blender.errors import UsageError
+from .import_asset import import_assets
+from .program import ProgramOperator
+
+
+class DRGS_OT_convert(ProgramOperator, bpy.types.Operator):
+    """Make the active object, a cloud of splats or a textured mesh, a DR-GS object at the same place"""
+
+    bl_idname = "drgs.convert"
+    bl_label = "Convert to DR-GS"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
+
+    out: StringProperty(name="Asset", description="The file to write; empty is beside the .blend", subtype="FILE_PATH")
+    use_mesh: BoolProperty(
+        name="Build Mesh",
+        description="Build a mesh around splats, so that they can be bent and cast shadows. Else light meets the "
+        "splats themselves",
+        default=True,
+    )
+    use_original: BoolProperty(name="Keep Original", description="Leave the original visible", default=False)
+
+    _name = ""
+    _placed = False
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        cls.poll_message_set("Select a cloud of splats or a mesh in Object Mode")
+        return context.mode == "OBJECT" and context.active_object is not None
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        return context.window_manager.invoke_props_dialog(self, width=420)
+
+    def run(self, context: bpy.types.Context) -> set[str]:
+        obj = context.active_object
+        subject = f'Object "{obj.name}"'
+        if assets.is_drgs(obj):
+            raise UsageError(subject, "is a DR-GS object already", "Choose another")
+        if not self.out and not bpy.data.filepath:
+            raise UsageError(subject, "has no place for its asset", "Save the .blend, or name the asset's file")
+        target = self._target(obj)
+        self._name = obj.name
+        with self.folder("drgs-convert-"):
+            arguments = self._source(context, obj)
+        arguments += ["--out", str(target)]
+        return self.start(context, arguments, subject, f"Making {target.name}", "could not be made into an asset")
+
+    def done(self, context: bpy.types.Context) -> set[str]:
+        original = bpy.data.objects.get(self._name)
+        if original is None:
+            raise UsageError(f'Object "{self._name}"', "is gone", "Undo what removed it")
+        (made,) = import_assets(context, [self._target(original)])
+        if not self._placed:
+            made.matrix_world = original.matrix_world
+        if not self.use_original:
+            original.hide_set(True)
+            original.hide_render = True
+        return {"FINISHED"}
+
+    def _target(self, obj: bpy.types.Object) -> Path:
+        """The asset to write."""
+        named = self.out or f"//{bpy.path.clean_name(obj.name)}"
+        return Path(bpy.path.abspath(named)).absolute().with_suffix(".drgs")
+
+    def _source(self, context: bpy.types.Context, obj: bpy.types.Object) -> list[str]:
+        """Write what the object is, and return the arguments that make an asset of it."""
+        subject = f'Object "{obj.name}"'
+        data = obj.evaluated_get(context.evaluated_depsgraph_get()).data
+        self._placed = False
+        if obj.type in ("MESH", "POINTCLOUD") and splat_attributes.is_splats(data):
+            try:
+                columns = splat_attributes.read_splats(data)
+            except TypeError as error:
+                raise UsageError(subject, f"has splats of an unknown kind ({error})", "Import their file") from error
+            if not len(columns["x"]):
+                raise UsageError(subject, "has no points", "Choose another")
+            path = self._folder / "splats.ply"
+            splat_attributes.write_ply(path, columns)
+            return ["import", str(path), "--up", "z", *([] if self.use_mesh else ["--no-mesh"])]
+        if obj.type != "MESH" or not len(data.polygons):
+            raise UsageError(subject, "has neither faces nor the attributes of splats", "Choose splats or a mesh")
+        path = self._folder / "mesh.glb"
+        selected, active = context.selected_objects, context.view_layer.objects.active
+        for other in selected:
+            other.select_set(other is obj)
+        obj.select_set(True)
+        try:
+            bpy.ops.export_scene.gltf(
+                filepath=str(path), use_selection=True, export_apply=True, export_skins=False, export_morph=False,
+                export_animations=False,
+            )  # fmt: skip
+        except (RuntimeError, AttributeError) as error:
+            problem = f"cannot be written by Blender's glTF exporter ({str(error).strip()[:200]})"
+            raise UsageError(subject, problem, "Enable the add-on glTF 2.0 format") from error
+        finally:
+            for other in selected:
+                other.select_set(True)
+            context.view_layer.objects.active = active
+        self._placed = True  # the file is in world space
+        return ["make", str(path)]
+
+
+CLASSES = (DRGS_OT_convert,)

@@ -1,0 +1,128 @@
+"""Set Up Engine: an environment for the engine, made here after a click, or one that exists already."""
+
+from __future__ import annotations
+
+import os
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import bpy
+from bpy.props import BoolProperty, StringProperty
+
+from ..addon import engine_link, engine_setup, preferences, setup_job
+from ..drgs_blender.engine.locate import VARIABLE, locate_engine
+from ..drgs_blender.errors import UsageError
+from .base import DrgsOperator
+
+
+class DRGS_OT_engine_setup(DrgsOperator, bpy.types.Operator):
+    """Make an environment for the DR-GS engine, apart from Blender's own Python. Asks first; can be cancelled"""
+
+    bl_idname = "drgs.engine_setup"
+    bl_label = "Set Up Engine"
+
+    python: StringProperty(
+        name="Python",
+        description=f"Python {engine_setup.PYTHONS} that makes the environment. Empty: the one that Blender brings, "
+        "which stays as it is",
+        subtype="FILE_PATH",
+        options={"SKIP_SAVE"},
+    )
+
+    afresh: BoolProperty(
+        name="Start Afresh",
+        description="Take nothing of an earlier set-up: makes the environment and fetches the packages anew",
+        default=False,
+        options={"SKIP_SAVE"},
+    )
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        if setup_job.running():
+            cls.poll_message_set("It is being set up")
+            return False
+        return True
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        return context.window_manager.invoke_props_dialog(self, width=440, confirm_text="Set Up")
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout
+        folder = engine_link.own_folder()
+        state = engine_setup.state(folder)
+        fetch, disk = engine_setup.DOWNLOAD_BYTES / 1e6, engine_setup.DISK_BYTES / 1e6
+        text = {
+            "absent": f"Fetches about {fetch:.0f} MB from the Python package index and takes {disk:.0f} MB in",
+            "partial": "Goes on with what was begun; what has been fetched is not fetched again. The folder is",
+            "old": "Brings the engine to the version of the extension. Nothing is fetched. The folder is",
+            "ready": "Tries the engine and repairs it. The folder is",
+        }[state]
+        column = layout.column(align=True)
+        for line in textwrap.wrap(text, 70) + textwrap.wrap(str(folder), 70):
+            column.label(text=line)
+        layout.prop(self, "python")
+        if state != "absent":
+            layout.prop(self, "afresh")
+
+    def run(self, context: bpy.types.Context) -> set[str]:
+        folder = engine_link.own_folder()
+        if (self.afresh or engine_setup.needs_network(folder)) and not bpy.app.online_access:
+            raise UsageError(
+                "Engine set-up",
+                "needs packages from the network, and Blender is offline",
+                "Allow Online Access in Preferences > System, or choose an environment that has the engine",
+            )
+        python = Path(bpy.path.abspath(self.python) or sys.executable)
+        if not python.is_file():
+            raise UsageError("Python", f"{python} does not exist", f"Choose a Python of version {engine_setup.PYTHONS}")
+        job = setup_job.start(python, self.afresh)
+        if os.environ.get(VARIABLE):
+            self.warn(f"The variable {VARIABLE} names another engine, which is used as long as it is set")
+        if bpy.app.background:
+            while setup_job.follow() is not None:
+                time.sleep(setup_job.INTERVAL)
+            if job.error is not None:
+                raise job.error
+        return {"FINISHED"}
+
+
+class DRGS_OT_engine_setup_cancel(DrgsOperator, bpy.types.Operator):
+    """End the set-up under way. Set Up Engine goes on with it later"""
+
+    bl_idname = "drgs.engine_setup_cancel"
+    bl_label = "Cancel"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return setup_job.running()
+
+    def run(self, context: bpy.types.Context) -> set[str]:
+        setup_job.cancel()
+        return {"FINISHED"}
+
+
+class DRGS_OT_engine_choose(DrgsOperator, bpy.types.Operator):
+    """Use an engine that is installed already: choose its environment's folder, its Python or its drgs program"""
+
+    bl_idname = "drgs.engine_choose"
+    bl_label = "Choose Engine"
+
+    filepath: StringProperty(name="Engine", subtype="FILE_PATH", options={"SKIP_SAVE"})
+    filter_folder: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def run(self, context: bpy.types.Context) -> set[str]:
+        path = bpy.path.abspath(self.filepath)
+        if not os.environ.get(VARIABLE):
+            locate_engine(path)  # refused before anything is changed
+        if not preferences.write("engine_python", path):
+            raise UsageError("Preferences", "the extension is not enabled", "Enable it in Preferences > Add-ons")
+        return bpy.ops.drgs.engine_test()
+
+
+CLASSES = (DRGS_OT_engine_setup, DRGS_OT_engine_setup_cancel, DRGS_OT_engine_choose)

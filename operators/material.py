@@ -1,0 +1,216 @@
+"""Materials by one click: presets on the attributes of the selected objects, and back to what was captured."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import bpy
+import numpy as np
+from bpy.props import BoolProperty, EnumProperty, FloatProperty
+
+from ..addon import assets, mesh_arrays
+from ..drgs_blender.asset import MATERIAL_CHANNELS
+from ..drgs_blender.errors import AssetError, UsageError
+from . import targets
+from .base import DrgsOperator
+from .bind import nearest, source_of
+
+Array = np.ndarray
+Change = Callable[[Array], Array]
+
+
+def _all(*value: float) -> Change:
+    """The same value for every vertex."""
+    return lambda old: np.broadcast_to(np.float32(value if old.ndim == 2 else value[0]), old.shape)
+
+
+class Preset(NamedTuple):
+    """What becomes of the channels that it names; albedo is linear Rec.709."""
+
+    label: str
+    about: str
+    changes: dict[str, Change]
+
+
+#: Albedo of metals: reflectance at normal incidence, as tabulated for rendering.
+PRESETS = {
+    "GOLD": Preset(
+        "Gold", "Polished gold", {"albedo": _all(1.0, 0.78, 0.34), "roughness": _all(0.2), "metallic": _all(1)}
+    ),
+    "COPPER": Preset(
+        "Copper", "Brushed copper", {"albedo": _all(0.96, 0.64, 0.54), "roughness": _all(0.35), "metallic": _all(1)}
+    ),
+    "CHROME": Preset(
+        "Chrome", "A mirror of chrome", {"albedo": _all(0.55, 0.56, 0.55), "roughness": _all(0.03), "metallic": _all(1)}
+    ),
+    "CLAY": Preset(
+        "Clay",
+        "Matte grey, shows the shape alone",
+        {"albedo": _all(0.5, 0.5, 0.5), "roughness": _all(0.9), "metallic": _all(0)},
+    ),
+    "PLASTIC": Preset("Plastic", "The own colours, smooth", {"roughness": _all(0.25), "metallic": _all(0)}),
+    "WET": Preset(
+        "Wet",
+        "Darker and smoother",
+        {"albedo": lambda old: old * 0.6, "roughness": lambda old: np.maximum(old * 0.3, 0.04)},
+    ),
+}
+
+
+class DRGS_OT_set_material(DrgsOperator, targets.ObjectMode, bpy.types.Operator):
+    """Give the selected DR-GS objects, or the parts that their active vertex groups weight, another material"""
+
+    bl_idname = "drgs.set_material"
+    bl_label = "Set Material"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
+
+    preset: EnumProperty(
+        name="Material",
+        description="What it becomes",
+        items=[(key, p.label, p.about) for key, p in PRESETS.items()],
+        default="GOLD",
+    )
+    factor: FloatProperty(
+        name="Factor",
+        description="How much of it; 0 is as before, 1 is all",
+        subtype="FACTOR",
+        min=0.0,
+        max=1.0,
+        default=1.0,
+    )
+    use_group: BoolProperty(
+        name="Active Vertex Group", description="Only where the active vertex group has weight", default=False
+    )
+
+    def run(self, context: bpy.types.Context) -> set[str]:
+        for obj in targets.editable(targets.selected(context), data=True):
+            weight = np.full(len(obj.data.vertices), self.factor, np.float32)
+            if self.use_group:
+                active = obj.vertex_groups.active
+                weight *= 0 if active is None else mesh_arrays.group_weights(obj.data, active.index)
+            set_material(obj, PRESETS[self.preset], weight)
+        return {"FINISHED"}
+
+
+class DRGS_OT_restore_material(DrgsOperator, targets.ObjectMode, bpy.types.Operator):
+    """Give the selected DR-GS objects back the materials of their assets, without adjustments"""
+
+    bl_idname = "drgs.restore_material"
+    bl_label = "Restore Captured Material"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
+
+    def run(self, context: bpy.types.Context) -> set[str]:
+        for obj in targets.editable(targets.selected(context), data=True):
+            for channel in MATERIAL_CHANNELS:
+                mesh_arrays.write_channel(obj.data, channel, captured(obj, channel))
+            obj.drgs.adjustment.reset()
+        return {"FINISHED"}
+
+
+class DRGS_OT_copy_material(DrgsOperator, targets.ObjectMode, bpy.types.Operator):
+    """Copy the material of the active DR-GS object to the other selected ones, from the nearest places, with its
+    adjustments"""
+
+    bl_idname = "drgs.copy_material"
+    bl_label = "Copy Material to Selected"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
+
+    def run(self, context: bpy.types.Context) -> set[str]:
+        *objects, source = targets.selected(context)
+        if source is not context.active_object or not objects:
+            raise UsageError(
+                "Selection", "holds no two DR-GS objects", "Select those to change, then the one to copy from"
+            )
+        place = source_of(source)
+        values = {channel: present(source, channel) for channel in MATERIAL_CHANNELS}
+        for obj in targets.editable(objects, data=True):
+            match = nearest(targets.world_vertices(obj), [place])
+            for channel, own in values.items():
+                copied = np.einsum("nc,nc...->n...", match.barycentric, own[match.corners])
+                mesh_arrays.write_channel(obj.data, channel, copied)
+            obj.drgs.adjustment.take(source.drgs.adjustment)
+        return {"FINISHED"}
+
+
+class DRGS_OT_reset_adjustments(DrgsOperator, targets.ObjectMode, bpy.types.Operator):
+    """Take the adjustments of the selected DR-GS objects back; what is painted stays"""
+
+    bl_idname = "drgs.reset_adjustments"
+    bl_label = "Reset Adjustments"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
+
+    def run(self, context: bpy.types.Context) -> set[str]:
+        for obj in targets.editable(targets.selected(context), vertices=False):
+            obj.drgs.adjustment.reset()
+        return {"FINISHED"}
+
+
+class DRGS_OT_paint(DrgsOperator, targets.ObjectMode, bpy.types.Operator):
+    """Paint a material channel of the active DR-GS object with Blender's brushes"""
+
+    bl_idname = "drgs.paint"
+    bl_label = "Paint"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
+
+    channel: EnumProperty(
+        name="Channel",
+        description="What is painted",
+        items=(
+            ("albedo", "Albedo", "The colour of the surface without light"),
+            ("roughness", "Roughness", "Black is a mirror, white is matte"),
+            ("metallic", "Metallic", "Black is no metal, white is metal"),
+        ),
+        default="albedo",
+    )
+
+    def run(self, context: bpy.types.Context) -> set[str]:
+        (obj,) = targets.editable(targets.selected(context)[-1:], data=True)
+        mesh_arrays.make_paintable(obj.data, self.channel, present(obj, self.channel))
+        targets.select_only(context, [obj], obj)
+        bpy.ops.object.mode_set(mode="VERTEX_PAINT")
+        return {"FINISHED"}
+
+
+def set_material(obj: bpy.types.Object, preset: Preset, weight: Array) -> None:
+    """Change the material attributes of `obj` towards `preset` by `weight`, (n,) in [0, 1]."""
+    for channel, change in preset.changes.items():
+        old = present(obj, channel)
+        share = weight[:, None] if old.ndim == 2 else weight
+        mesh_arrays.write_channel(obj.data, channel, old + share * (change(old) - old))
+
+
+def present(obj: bpy.types.Object, channel: str) -> Array:
+    """A material channel as it is rendered now, without modifiers; see `captured` for the errors."""
+    try:
+        values = mesh_arrays.read_channel(obj.data, channel)
+    except TypeError:  # an attribute of another kind, which the render does not heed either
+        values = None
+    return captured(obj, channel) if values is None else values
+
+
+def captured(obj: bpy.types.Object, channel: str) -> Array:
+    """A material channel of the asset, one value a vertex of `obj`.
+
+    Raises
+    ------
+    AssetError
+        The file is absent, or the mesh is not the asset's any more.
+    """
+    own = getattr(assets.load(assets.file_of(obj)).mesh, channel)
+    if len(own) != len(obj.data.vertices):
+        raise AssetError(
+            f'Object "{obj.name}"',
+            f"its mesh has {len(obj.data.vertices)} vertices, the asset {len(own)}",
+            "Undo the edit, or import the asset again",
+        )
+    return own
+
+
+CLASSES = (
+    DRGS_OT_set_material,
+    DRGS_OT_restore_material,
+    DRGS_OT_copy_material,
+    DRGS_OT_reset_adjustments,
+    DRGS_OT_paint,
+)

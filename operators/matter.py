@@ -1,0 +1,227 @@
+"""Simulate an object: preview its particles, bake, cancel, free. The engine works in a process of its own."""
+
+from __future__ import annotations
+
+import time
+
+import bpy
+from bpy.props import EnumProperty, IntProperty
+
+from ..addon import assets, messages
+from ..addon.matter import points, work
+from ..drgs_blender.errors import DrgsError
+from .base import DrgsOperator
+
+#: Seconds between two looks at what the engine does, and at most spent on one.
+_TICK, _SHARE = 0.1, 0.05
+
+
+def _has_matter(obj: bpy.types.Object | None) -> bool:
+    return assets.is_drgs(obj) and obj.drgs.matter.use
+
+
+class _Worker(DrgsOperator):
+    """Runs a `work.Work`: step by step beside Blender's window, at once in background mode and without a window."""
+
+    _work: work.Work
+    _timer: bpy.types.Timer | None = None
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return _has_matter(context.object) and work.of(context.object) is None
+
+    def begin(self, context: bpy.types.Context) -> work.Work:
+        """The work to do."""
+        raise TypeError(f"{type(self).__name__} has no work")
+
+    def done(self, context: bpy.types.Context) -> str:
+        """What to tell when it is done."""
+        return ""
+
+    def stopped(self) -> set[str]:
+        """End the work before its time; what the operator returns then."""
+        self._work.close()
+        return {"CANCELLED"}
+
+    def run(self, context: bpy.types.Context) -> set[str]:
+        self._work = self.begin(context)
+        if not bpy.app.background and context.window is not None:
+            self._timer = context.window_manager.event_timer_add(_TICK, window=context.window)
+            context.window_manager.modal_handler_add(self)
+            return {"RUNNING_MODAL"}
+        try:
+            while not self._work.step():
+                time.sleep(_SHARE)
+            return self._tell(context)
+        finally:
+            self._work.close()
+
+    def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        if self._work.cancelled or (event.type == "ESC" and event.value == "PRESS"):
+            self._release(context)
+            return self.stopped()
+        if event.type != "TIMER":
+            return {"RUNNING_MODAL"} if self._work.capturing else {"PASS_THROUGH"}
+        try:
+            if not self._work.step(_SHARE):
+                context.workspace.status_text_set(f"{self._work.subject}: {self._work.progress()[1]}. Esc cancels")
+                _redraw(context, "PROPERTIES")
+                return {"PASS_THROUGH"}
+            result = self._tell(context)
+        except DrgsError as error:
+            result = self.fail(error)
+        except Exception:
+            self.cancel(context)
+            raise
+        self.cancel(context)
+        return result
+
+    def cancel(self, context: bpy.types.Context) -> None:
+        """End the work; also called when Blender closes or loads a file."""
+        self._work.close()
+        self._release(context)
+
+    def _tell(self, context: bpy.types.Context) -> set[str]:
+        text = self.done(context)
+        messages.note("INFO", text)
+        self.report({"INFO"}, text)
+        return {"FINISHED"}
+
+    def _release(self, context: bpy.types.Context) -> None:
+        if self._timer is not None:
+            context.window_manager.event_timer_remove(self._timer)
+            self._timer = None
+            context.workspace.status_text_set(None)
+        _redraw(context)
+
+
+class DRGS_OT_bake_matter(_Worker, bpy.types.Operator):
+    """Simulate all frames with the engine"""
+
+    bl_idname = "drgs.bake_matter"
+    bl_label = "Bake"
+    bl_description = (
+        "Simulate all frames with the engine. Frames that are baked with these settings stay, others are replaced. "
+        "Esc cancels, and the next bake goes on"
+    )
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
+
+    def begin(self, context: bpy.types.Context) -> work.Work:
+        return work.Bake(context.object, context.scene)
+
+    def stopped(self) -> set[str]:
+        kept = self._work.cancel()
+        text = f"{self._work.subject}: stopped at {self._work.progress()[1].split(',')[0].lower()}; Bake goes on"
+        messages.note("INFO", text)
+        self.report({"INFO"}, text)
+        return {"FINISHED"} if kept else {"CANCELLED"}
+
+    def done(self, context: bpy.types.Context) -> str:
+        return f"{self._work.subject}: {self._work.frames} frames baked in {self._work.folder}"
+
+
+class DRGS_OT_preview_matter(_Worker, bpy.types.Operator):
+    """Show the particles that fill the object, and how long a bake takes at least"""
+
+    bl_idname = "drgs.preview_matter"
+    bl_label = "Preview Filling"
+
+    def begin(self, context: bpy.types.Context) -> work.Work:
+        return work.Preview(context.object, context.scene)
+
+    def done(self, context: bpy.types.Context) -> str:
+        particles, steps = self._work.counts
+        return f"{self._work.subject}: {particles:,} particles, at least {steps} time steps a frame"
+
+
+class DRGS_OT_hide_preview(DrgsOperator, bpy.types.Operator):
+    """Show the particles no more"""
+
+    bl_idname = "drgs.hide_preview"
+    bl_label = "Hide Preview"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return context.object is not None and points.of(context.object) is not None
+
+    def run(self, context: bpy.types.Context) -> set[str]:
+        points.hide(context.object)
+        _redraw(context)
+        return {"FINISHED"}
+
+
+class DRGS_OT_cancel_matter(DrgsOperator, bpy.types.Operator):
+    """Stop what is being done for this object; Bake goes on later"""
+
+    bl_idname = "drgs.cancel_matter"
+    bl_label = "Cancel"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return work.of(context.object) is not None
+
+    def run(self, context: bpy.types.Context) -> set[str]:
+        work.of(context.object).cancelled = True  # its own operator ends it
+        return {"FINISHED"}
+
+
+class DRGS_OT_free_matter(DrgsOperator, bpy.types.Operator):
+    """Remove the baked frames from the disk; the object is as it was before. Files cannot be brought back by undo"""
+
+    bl_idname = "drgs.free_matter"
+    bl_label = "Free Cache"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return _has_matter(context.object) and work.of(context.object) is None
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        return context.window_manager.invoke_confirm(self, event)
+
+    def run(self, context: bpy.types.Context) -> set[str]:
+        work.free(context.object)
+        return {"FINISHED"}
+
+
+class DRGS_OT_matter_row(DrgsOperator, bpy.types.Operator):
+    """Add or remove a region or a collider"""
+
+    bl_idname = "drgs.matter_row"
+    bl_label = "Add or Remove"
+    bl_options = {"REGISTER", "UNDO", "INTERNAL"}  # noqa: RUF012 - read by Blender
+
+    rows: EnumProperty(
+        name="Rows", description="Which list", items=(("regions", "Regions", ""), ("colliders", "Colliders", ""))
+    )
+    remove: IntProperty(name="Remove", description="Number of the row to remove; -1 adds one", default=-1, min=-1)
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return _has_matter(context.object)
+
+    def run(self, context: bpy.types.Context) -> set[str]:
+        rows = getattr(context.object.drgs.matter, self.rows)
+        if self.remove < 0:
+            rows.add()
+        else:
+            rows.remove(self.remove)
+        return {"FINISHED"}
+
+
+def _redraw(context: bpy.types.Context, *kinds: str) -> None:
+    """Draw editors of these kinds again, by default those that show anything of matter."""
+    for window in context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type in (kinds or ("PROPERTIES", "VIEW_3D")):
+                area.tag_redraw()
+
+
+CLASSES = (
+    DRGS_OT_bake_matter,
+    DRGS_OT_preview_matter,
+    DRGS_OT_hide_preview,
+    DRGS_OT_cancel_matter,
+    DRGS_OT_free_matter,
+    DRGS_OT_matter_row,
+)

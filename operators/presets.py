@@ -1,0 +1,48 @@
+"""Render presets: use one, keep the present settings as one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+from bl_operators.presets import AddPresetBase
+from bpy.props import StringProperty
+
+from ..addon import presets
+from ..drgs_blender.errors import UsageError
+from .base import DrgsOperator
+
+
+class DRGS_OT_render_preset(DrgsOperator, bpy.types.Operator):
+    """Render with these settings"""
+
+    bl_idname = "drgs.render_preset"
+    bl_label = "Render Preset"
+    bl_options = {"REGISTER", "UNDO", "INTERNAL"}  # noqa: RUF012 - read by Blender
+
+    filepath: StringProperty(subtype="FILE_PATH", options={"SKIP_SAVE", "HIDDEN"})
+    menu_idname: StringProperty(options={"SKIP_SAVE", "HIDDEN"})
+
+    def run(self, context: bpy.types.Context) -> set[str]:
+        path = Path(self.filepath)
+        folders = [Path(p).resolve() for p in bpy.utils.preset_paths(presets.FOLDER)]
+        if path.suffix != ".py" or path.resolve().parent not in folders:
+            raise UsageError(str(path), "is no render preset", "Choose one of the list")
+        if not context.scene.is_editable:
+            raise UsageError(f'Scene "{context.scene.name}"', "comes from a library", "Make it local")
+        bpy.utils.execfile(str(path))
+        return {"FINISHED"}
+
+
+class DRGS_OT_render_preset_add(AddPresetBase, bpy.types.Operator):
+    """Keep the present settings as a preset, or remove one"""
+
+    bl_idname = "drgs.render_preset_add"
+    bl_label = "Add Render Preset"
+    preset_menu = "DRGS_PT_presets"
+    preset_subdir = presets.FOLDER
+    preset_defines = ("settings = bpy.context.scene.drgs",)
+    preset_values = tuple(f"settings.{name}" for name in presets.VALUES)
+
+
+CLASSES = (DRGS_OT_render_preset, DRGS_OT_render_preset_add)

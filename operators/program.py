@@ -1,0 +1,137 @@
+"""Operators whose work the command ``drgs`` does, in a process of its own: Blender goes on, Esc ends it."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO
+
+import bpy
+
+from ..addon import engine_link, messages
+from ..drgs_blender.engine.child import clean_environment
+from ..drgs_blender.errors import AssetError, DrgsError, UsageError
+from .base import DrgsOperator
+
+_INTERVAL = 0.25
+
+
+class ProgramOperator(DrgsOperator):
+    """Base of operators that give `start` the arguments of ``drgs`` and go on in `done` when it has done its work."""
+
+    _process: subprocess.Popen | None = None
+    _log: IO[bytes] | None = None
+    _timer: bpy.types.Timer | None = None
+    _subject, _failure = "", ""
+    _folder: Path | None = None
+
+    def done(self, context: bpy.types.Context) -> set[str]:
+        """What follows the work; returns what execute returns."""
+        return {"FINISHED"}
+
+    @contextlib.contextmanager
+    def folder(self, prefix: str) -> Iterator[Path]:
+        """A temporary folder for what the program reads and writes; it goes with the work, and when this fails."""
+        self._folder = Path(tempfile.mkdtemp(prefix=prefix))
+        try:
+            yield self._folder
+        except BaseException:
+            self.clear()
+            raise
+
+    def clear(self) -> None:
+        """Remove what was made for the program alone; called however it ends."""
+        if self._folder is not None:
+            shutil.rmtree(self._folder, ignore_errors=True)
+
+    def start(
+        self, context: bpy.types.Context, arguments: list[str], subject: str, status: str, failure: str
+    ) -> set[str]:
+        """Run ``drgs`` with `arguments`; in the background, wait for it.
+
+        Parameters
+        ----------
+        subject : what messages are about
+        status : what the status bar says meanwhile
+        failure : what became of the subject where the program fails: "could not be ..."
+        """
+        self._subject, self._failure = subject, failure
+        try:
+            self._spawn(arguments)
+            if bpy.app.background or context.window is None:
+                self._process.wait()
+                return self._finish(context)
+        except DrgsError:
+            self.clear()
+            raise
+        self._timer = context.window_manager.event_timer_add(_INTERVAL, window=context.window)
+        context.window_manager.modal_handler_add(self)
+        context.workspace.status_text_set(f"{status}: Esc cancels")
+        return {"RUNNING_MODAL"}
+
+    def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        if event.type == "ESC":
+            self.cancel(context)
+            return {"CANCELLED"}
+        if event.type != "TIMER" or self._process.poll() is None:
+            return {"PASS_THROUGH"}
+        self._release(context)
+        try:
+            return self._finish(context)
+        except DrgsError as error:
+            return self.fail(error)
+
+    def cancel(self, context: bpy.types.Context) -> None:
+        """End the process; called by Esc and when Blender closes."""
+        if self._process is not None:
+            self._process.terminate()
+            try:
+                self._process.wait(2)  # a kernel that is under way hears of it late; Blender's window waits
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+            self._log.close()
+            self._release(context)
+            self.clear()
+
+    def _spawn(self, arguments: list[str]) -> None:
+        command = engine_link.command_line()
+        python = command[: command.index("-m")]
+        self._log = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the process
+        try:
+            self._process = subprocess.Popen(
+                [*python, "-m", "drgs_blender.cli.main", "--no-progress", *arguments],
+                stdin=subprocess.DEVNULL,
+                stdout=self._log,
+                stderr=self._log,
+                env=clean_environment(),
+            )
+        except OSError as error:
+            self._log.close()
+            raise UsageError("Engine", f"{python[0]} cannot be started ({error})", "See the preferences") from error
+
+    def _finish(self, context: bpy.types.Context) -> set[str]:
+        """Tell what the program said, and go on, or say why it could not do its work."""
+        self._log.seek(0)
+        lines = self._log.read().decode(errors="replace").strip().splitlines()
+        self._log.close()
+        try:
+            if self._process.returncode:
+                said = [line for line in lines if line.startswith("drgs: ")] or lines
+                reason = said[-1].removeprefix("drgs: ") if said else f"exit code {self._process.returncode}"
+                raise AssetError(self._subject, f"{self._failure}: {reason.rstrip('.')}")
+            for line in lines:
+                messages.note("INFO", line)
+            return self.done(context)
+        finally:
+            self.clear()
+
+    def _release(self, context: bpy.types.Context) -> None:
+        if self._timer is not None:
+            context.window_manager.event_timer_remove(self._timer)
+            context.workspace.status_text_set(None)
+            self._timer = None

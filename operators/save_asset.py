@@ -1,0 +1,97 @@
+"""Save the edited object as a new .drgs file: what is painted and adjusted becomes what is captured."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import bpy
+from bpy.props import BoolProperty, StringProperty
+
+from ..addon import assets, mesh_arrays, messages
+from ..addon.export.objects import look_of
+from ..drgs_blender.adjust import edited_asset
+from ..drgs_blender.asset import MATERIAL_CHANNELS
+from ..drgs_blender.asset.container import write_asset
+from ..drgs_blender.errors import UsageError
+from . import targets
+from .base import DrgsOperator
+
+SUFFIX = ".drgs"
+
+
+class DRGS_OT_save_asset(DrgsOperator, targets.ObjectMode, bpy.types.Operator):
+    """Write the selected DR-GS objects with their painted and adjusted materials as new .drgs assets"""
+
+    bl_idname = "drgs.save_asset"
+    bl_label = "Save Edited Asset"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
+
+    filepath: StringProperty(
+        name="File",
+        description="The .drgs file to write; of several objects, each gets one of its own name beside it",
+        subtype="FILE_PATH",
+        options={"SKIP_SAVE"},
+    )
+    filter_glob: StringProperty(default="*.drgs", options={"HIDDEN"})
+    check_existing: BoolProperty(default=True, options={"HIDDEN"})
+    use_saved: BoolProperty(
+        name="Use It",
+        description="Make the objects those of the new files, without adjustments of their own",
+        default=False,
+    )
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        if not self.filepath:
+            name = bpy.path.clean_name(targets.selected(context)[-1].name)
+            self.filepath = os.path.join(os.path.dirname(bpy.data.filepath), f"{name} edited{SUFFIX}")
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def run(self, context: bpy.types.Context) -> set[str]:
+        if not self.filepath:
+            raise UsageError("Asset", "has no file to go to", "Choose one")
+        path = Path(bpy.path.ensure_ext(bpy.path.abspath(self.filepath), SUFFIX))
+        objects = targets.editable(targets.selected(context), vertices=False)
+        paths = [path] if len(objects) == 1 else [path.with_name(bpy.path.clean_name(o.name) + SUFFIX) for o in objects]
+        if len(set(paths)) < len(paths):
+            raise UsageError("Objects", "have names that make the same file name", "Rename one")
+        for obj, target in zip(objects, paths):
+            save(obj, target, context.evaluated_depsgraph_get())
+        if self.use_saved:
+            for obj, target in zip(targets.editable(objects, vertices=False, data=True), paths):
+                obj.drgs.asset = assets.anchor(target)
+                obj.drgs.adjustment.reset()
+                mesh = assets.load(target).mesh
+                for channel in MATERIAL_CHANNELS:
+                    mesh_arrays.write_channel(obj.data, channel, getattr(mesh, channel))
+        self.report({"INFO"}, f"Saved {', '.join(map(str, paths))}")
+        return {"FINISHED"}
+
+
+def save(obj: bpy.types.Object, path: Path, depsgraph: bpy.types.Depsgraph) -> None:
+    """Write `obj` as `depsgraph` evaluates it to `path`; pose and shape are not part of it.
+
+    Raises
+    ------
+    UsageError
+        `path` is a file that the object itself, or another one, is made of.
+    AssetError
+        The mesh is not the asset's; names the object.
+    WriteError
+        The file cannot be written.
+    """
+    for other in filter(assets.is_drgs, bpy.data.objects):
+        if os.path.realpath(bpy.path.abspath(other.drgs.path)) == os.path.realpath(path):
+            raise UsageError(
+                f'Object "{other.name}"', f"is made of {path}, which would be lost", "Choose another file name"
+            )
+    source = assets.file_of(obj)
+    asset = assets.load(source)
+    painted, adjustment = look_of(obj.evaluated_get(depsgraph), asset, messages.Warnings())
+    edited = edited_asset(asset, painted, adjustment)
+    write_asset(path, replace(edited, provenance={**asset.provenance, "edited_from": source.name}))
+
+
+CLASSES = (DRGS_OT_save_asset,)

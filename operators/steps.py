@@ -1,0 +1,103 @@
+"""The small steps between import and picture: pose, look through DR-GS, add a camera."""
+
+from __future__ import annotations
+
+import bpy
+from mathutils import Vector
+
+from ..addon import assets
+from ..addon.tour import poser_of, target
+from ..drgs_blender.errors import UsageError
+from . import targets
+from .base import DrgsOperator
+
+ENGINE = "DRGS"
+#: Kind of object -> the mode in which it is posed.
+MODES = {"ARMATURE": "POSE", "LATTICE": "EDIT", "MESH": "EDIT"}
+
+
+class DRGS_OT_pose(DrgsOperator, bpy.types.Operator):
+    """Go to what bends the active DR-GS object: its armature in Pose Mode, its lattice or cage in Edit Mode"""
+
+    bl_idname = "drgs.pose"
+    bl_label = "Pose"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        if context.mode != "OBJECT" or target(context) is None:
+            cls.poll_message_set("There must be a DR-GS object, in Object Mode")
+            return False
+        return True
+
+    def run(self, context: bpy.types.Context) -> set[str]:
+        obj = target(context)
+        poser = poser_of(obj)
+        if poser is None:
+            raise UsageError(
+                f'Object "{obj.name}"', "follows no armature, lattice or cage", "Bind it first, in sidebar > DR-GS"
+            )
+        if poser.name not in context.view_layer.objects or poser.hide_get():
+            raise UsageError(f'Object "{poser.name}"', f'moves "{obj.name}" but is hidden', "Show it in the Outliner")
+        if poser.library is not None:
+            raise UsageError(
+                f'Object "{poser.name}"', "comes from a library", "Choose Object > Library Override > Make"
+            )
+        targets.select_only(context, [poser], poser)
+        bpy.ops.object.mode_set(mode=MODES[poser.type])
+        return {"FINISHED"}
+
+
+class DRGS_OT_show_rendered(DrgsOperator, bpy.types.Operator):
+    """Make DR-GS the render engine of the scene and show this viewport as it renders"""
+
+    bl_idname = "drgs.show_rendered"
+    bl_label = "Show Rendered"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
+
+    def run(self, context: bpy.types.Context) -> set[str]:
+        context.scene.render.engine = ENGINE
+        if context.area is not None and context.area.type == "VIEW_3D":
+            context.space_data.shading.type = "RENDERED"
+        return {"FINISHED"}
+
+
+class DRGS_OT_add_camera(DrgsOperator, bpy.types.Operator):
+    """Add a camera that sees what this viewport sees, or all DR-GS objects from the front, and make it active"""
+
+    bl_idname = "drgs.add_camera"
+    bl_label = "Add Camera"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return context.mode == "OBJECT"
+
+    def run(self, context: bpy.types.Context) -> set[str]:
+        camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
+        context.collection.objects.link(camera)
+        context.scene.camera = camera
+        view = context.region_data if context.area is not None and context.area.type == "VIEW_3D" else None
+        if view is not None:
+            camera.matrix_world = view.view_matrix.inverted()
+        else:
+            objects = [o for o in context.scene.objects if assets.is_drgs(o)]
+            frame(context, camera, objects)
+        return {"FINISHED"}
+
+
+def frame(context: bpy.types.Context, camera: bpy.types.Object, objects: list[bpy.types.Object]) -> None:
+    """Put `camera` in front (-Y) of `objects` so that they fill its picture."""
+    camera.rotation_euler = (1.5707963, 0, 0)
+    context.view_layer.update()
+    corners = [o.matrix_world @ Vector(c) for o in objects for c in o.bound_box]
+    if not corners:
+        camera.location = (0, -5, 0)
+        return
+    depsgraph = context.evaluated_depsgraph_get()
+    camera.location, _ = camera.camera_fit_coords(depsgraph, [x for c in corners for x in c])
+    middle = sum(corners, Vector()) / len(corners)
+    camera.location = middle + (camera.location - middle) * 1.1
+
+
+CLASSES = (DRGS_OT_pose, DRGS_OT_show_rendered, DRGS_OT_add_camera)

@@ -1,0 +1,97 @@
+"""What operators work on: the selected DR-GS objects that may be changed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+import bpy
+import numpy as np
+
+from ..addon import assets, mesh_arrays
+from ..drgs_blender.errors import UsageError
+
+Array = np.ndarray
+
+
+def selected(context: bpy.types.Context) -> list[bpy.types.Object]:
+    """The selected DR-GS objects and the active one, the active one last."""
+    chosen = [o for o in context.selected_objects if assets.is_drgs(o) and o is not context.active_object]
+    return [*chosen, context.active_object] if assets.is_drgs(context.active_object) else chosen
+
+
+def editable(
+    objects: Iterable[bpy.types.Object], *, vertices: bool = True, data: bool = False
+) -> list[bpy.types.Object]:
+    """`objects` as a list, when all may be changed, with their meshes (`data`), and have `vertices`.
+
+    Raises
+    ------
+    UsageError
+        One comes from a library, or has no vertices; names it. Or there is none.
+    """
+    found = list(objects)
+    for obj in found:
+        if not obj.is_editable or (data and not obj.data.is_editable):
+            raise UsageError(
+                f'Object "{obj.name}"',
+                "comes from a library and cannot be changed here",
+                "Choose Object > Relations > Make Local" + ("" if data else ", or Library Override > Make"),
+            )
+        if vertices and not len(obj.data.vertices):
+            raise UsageError(
+                f'Object "{obj.name}"',
+                "has surfels but no mesh that could be bent",
+                "Move it as a whole, or import it with a mesh",
+            )
+    if not found:
+        raise UsageError("Selection", "holds no DR-GS object", "Select one or several")
+    return found
+
+
+def bounds(objects: Iterable[bpy.types.Object]) -> tuple[Array, Array]:
+    """Lowest and highest corner, (3,) float64 metres in the world, of undeformed meshes."""
+    points = np.concatenate([world_vertices(o) for o in objects])
+    return points.min(axis=0), points.max(axis=0)
+
+
+def world_vertices(obj: bpy.types.Object) -> Array:
+    """(n, 3) float64 undeformed vertices in the world."""
+    matrix = np.array(obj.matrix_world, np.float64)
+    return mesh_arrays.read_vertices(obj.data) @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+class ObjectMode:
+    """Poll of operators that need Object Mode and a selected DR-GS object."""
+
+    needs = "Select one or several DR-GS objects in Object Mode"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        if context.mode != "OBJECT" or not selected(context):
+            cls.poll_message_set(cls.needs)
+            return False
+        return True
+
+
+def add_modifier(obj: bpy.types.Object, kind: str, name: str, **values: object) -> bpy.types.Modifier:
+    """A modifier with `values`; one of the same name is replaced."""
+    if (old := obj.modifiers.get(name)) is not None:
+        obj.modifiers.remove(old)
+    modifier = obj.modifiers.new(name, kind)
+    for key, value in values.items():
+        setattr(modifier, key, value)
+    return modifier
+
+
+def select_only(context: bpy.types.Context, objects: Iterable[bpy.types.Object], active: bpy.types.Object) -> None:
+    """Make `objects` the selection and `active` its active object."""
+    for obj in context.selected_objects:
+        obj.select_set(False)
+    for obj in objects:
+        obj.select_set(True)
+    context.view_layer.objects.active = active
+
+
+def of_type(objects: Iterable[bpy.types.Object], kind: str) -> Iterator[bpy.types.Object]:
+    """Those of `objects` that are of a type and no DR-GS objects."""
+    return (o for o in objects if o.type == kind and not assets.is_drgs(o))
