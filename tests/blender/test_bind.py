@@ -66,6 +66,17 @@ def test_coincident_vertices_follow_exactly(ball, rig, export):
     )
 
 
+def test_several_objects_are_bound_at_once(ball, ball_file, rig):
+    bpy.ops.import_scene.drgs(filepath=str(ball_file))
+    other = bpy.context.active_object
+    source = skinned("Source", rig, *sphere())
+    select(other)
+    bind(ball, source, other)
+    pose(rig)
+    for obj in (ball, other):
+        np.testing.assert_allclose(world_vertices(obj), world_vertices(source), atol=2e-6)
+
+
 def test_binding_in_a_pose_and_with_other_transforms_gives_the_same(ball, rig):
     """The rig is posed while binding, the target's object space is turned and scaled, the source's as well."""
     vertices, faces = sphere()

@@ -250,9 +250,6 @@ def test_edited_materials_are_sent_and_only_those(ball, export):
     (state,) = export()[0].objects
     np.testing.assert_array_equal(state.albedo, paint)
     assert state.roughness is None and state.metallic is None
-    ball.data.attributes["roughness"].data.foreach_set("value", np.full(count, np.nan, np.float32))
-    ball.data.update()
-    assert (export()[0].objects[0].roughness == 0).all()
 
 
 def test_attribute_of_a_wrong_kind_is_named_and_ignored(ball, export):
@@ -261,6 +258,16 @@ def test_attribute_of_a_wrong_kind_is_named_and_ignored(ball, export):
     frame, warnings = export()
     assert frame.objects[0].albedo is None
     assert any('"ball"' in w and "albedo" in w for w in warnings)
+
+
+def test_attribute_values_that_are_no_numbers_are_named_and_the_assets(ball, export):
+    values = ball.data.attributes["roughness"].data
+    own = np.array([v.value for v in values], np.float32)
+    values[3].value, values[5].value, values[7].value = np.nan, 0.875, 9.0
+    frame, (warning,) = export()
+    assert '"ball": 1 values of attribute roughness' in warning
+    own[5], own[7] = 0.875, 1.0
+    np.testing.assert_array_equal(frame.objects[0].roughness, own)
 
 
 def test_missing_asset_is_named(ball, ball_file, export):
@@ -288,7 +295,7 @@ def test_settings_and_passes_reach_the_frame(ball, scene, captured):
     settings, layer = scene.drgs, scene.view_layers[0]
     settings.use_custom_split, settings.rays = False, 64
     settings.bounces, settings.aa, settings.look, settings.denoise, settings.seed = 3, 8, "paper", "svgf", 5
-    settings.primary, scene.render.film_transparent = "mesh", True
+    settings.primary, settings.tracer, scene.render.film_transparent = "mesh", "surfels", True
     settings.noise_threshold, settings.clamp_indirect = 0.02, 10
     layer.use_pass_z = layer.use_pass_object_index = layer.drgs.use_pass_albedo = layer.drgs.use_pass_noisy_image = True
     scene.frame_set(12)
@@ -296,7 +303,8 @@ def test_settings_and_passes_reach_the_frame(ball, scene, captured):
     frame = captured[0]
     s = frame.settings
     assert (s.cosine, s.ggx, s.environment, s.bounces, s.aa, s.seed) == (32, 16, 16, 3, 8, 5)
-    assert (s.look, s.denoise, s.primary, s.film_transparent) == ("paper", "svgf", "mesh", True)
+    assert (s.look, s.denoise, s.primary, s.tracer, s.film_transparent) == ("paper", "svgf", "mesh", "surfels", True)
+    assert s.split == "auto"
     assert (s.noise_threshold, s.clamp_indirect) == (0, 10), "the threshold is off"
     assert frame.passes == ("Combined", "Depth", "Albedo", "IndexOB", "Noisy Image")
     assert frame.number == 12
@@ -310,6 +318,6 @@ def test_settings_offer_what_the_engine_knows():
     hints = typing.get_type_hints(part("drgs_blender.frame").RenderSettings)
     defaults = part("drgs_blender.frame").RenderSettings()
     properties = part("addon.properties").DrgsSceneSettings.bl_rna.properties
-    for name in ("primary", "denoise", "look"):
+    for name in ("primary", "tracer", "denoise", "look"):
         assert {i.identifier for i in properties[name].enum_items} == set(typing.get_args(hints[name])), name
         assert properties[name].default == getattr(defaults, name)

@@ -9,7 +9,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 import pytest
-from scenes import ROOT, part, read_exr, sphere, write_ball
+from scenes import ROOT, asset_of, part, read_exr, sphere, write_ball
 
 
 def channel(mesh, name):
@@ -41,6 +41,20 @@ def test_path_is_relative_and_known_to_blenders_path_tools(ball, ball_file, tmp_
         part("addon.assets").file_of(ball)
     bpy.ops.file.find_missing_files(directory=str(moved))
     assert part("addon.assets").file_of(ball) == moved / "ball.drgs"
+
+
+def test_asset_without_a_mesh_is_rendered_by_its_surfels(scene, tmp_path):
+    """The object has no vertices; it moves with its matrix."""
+    model, path = part("drgs_blender.asset"), tmp_path / "leaves.drgs"
+    part("drgs_blender.asset.container").write_asset(path, model.Asset(asset_of(*sphere()).surfels, model.Mesh.empty()))
+    bpy.ops.import_scene.drgs(filepath=str(path))
+    leaves = bpy.context.active_object
+    assert leaves.drgs.is_drgs and not len(leaves.data.vertices)
+    leaves.location.x = 1.0
+    scene.drgs.tracer, scene.render.film_transparent = "surfels", True
+    bpy.ops.render.render(write_still=True)
+    alpha = read_exr(scene.render.filepath, 64, 48)[..., 3]
+    assert alpha[24, 46] > 0.9 and not alpha[:, :20].any()
 
 
 def test_packed_asset_renders_without_its_file(ball, ball_file, export, tmp_path):

@@ -11,6 +11,7 @@ from pathlib import Path
 import bpy
 import extension
 import pytest
+from bl_ui.utils import PresetPanel
 from scenes import PACKAGE, ROOT, part
 
 
@@ -68,21 +69,48 @@ class Layout:
     def row(self, **_):
         return Layout()
 
-    column = box = row
+    column = box = grid_flow = row
 
     def prop(self, data, name, icon="NONE", **_):
         assert name in data.bl_rna.properties, f"{data} has no property {name}"
         assert icon in ICONS
 
+    def menu(self, name, icon="NONE", **_):
+        assert hasattr(bpy.types, name) and icon in ICONS
+
+    def popover(self, panel, icon="NONE", **_):
+        self.menu(panel, icon)
+
+    def progress(self, text="", factor=0.0):
+        assert text and 0 <= factor <= 1
+
     template_ID = prop
+
+    def prop_search(self, data, name, among, names, **_):
+        self.prop(data, name)
+        self.prop(among, names)
 
     def operator(self, name, icon="NONE", **_):
         group, verb = name.split(".")
-        assert getattr(getattr(bpy.ops, group), verb).get_rna_type().name
-        assert icon in ICONS
+        known = getattr(getattr(bpy.ops, group), verb).get_rna_type()
+        assert known.name and icon in ICONS
+        return Choices(known)
+
+    def operator_menu_enum(self, name, prop, icon="NONE", **_):
+        assert self.operator(name, icon).known.properties[prop].enum_items
 
     def label(self, text="", icon="NONE"):
         assert isinstance(text, str) and icon in ICONS
+
+
+class Choices:
+    """Stands in for the properties of a button's operator."""
+
+    def __init__(self, known):
+        self.__dict__["known"] = known
+
+    def __setattr__(self, name, value):
+        assert name in self.known.properties, name
 
 
 @pytest.mark.parametrize("loaded", [False, True])
@@ -90,15 +118,22 @@ def test_every_panel_draws_and_every_poll_answers(scene, ball_file, loaded):
     if loaded:
         bpy.ops.import_scene.drgs(filepath=str(ball_file))
         part("addon.messages").note("WARNING", "a rather long message " * 6)
+        matter = bpy.context.object.drgs.matter
+        matter.use = matter.use_floor = True
+        for rows in ("regions", "colliders"):
+            bpy.ops.drgs.matter_row(rows=rows)
     classes = part("addon.panels").CLASSES
     assert len(classes) >= 8
     drawn = 0
     for cls in classes:
         if getattr(cls, "poll", lambda _: True)(bpy.context):
             stand_in = type("StandIn", (), {"layout": Layout()})()
-            cls.draw(stand_in, bpy.context)
+            if issubclass(cls, PresetPanel):  # Blender draws its list of files
+                assert {Path(f).stem for p in bpy.utils.preset_paths(cls.preset_subdir) for f in Path(p).iterdir()}
+            else:
+                cls.draw(stand_in, bpy.context)
             drawn += 1
-    assert drawn >= (8 if loaded else 7)
+    assert drawn >= (13 if loaded else 7)
     for module in part("operators").MODULES:
         for cls in module.CLASSES:
             if hasattr(cls, "bl_idname") and "." in cls.bl_idname:

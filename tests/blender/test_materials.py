@@ -477,6 +477,55 @@ def test_loops_of_nodes_end(scene, export):
     assert min(found.base_colour) > 0 and min(found.emission) > 0
 
 
+def test_nodes_that_share_a_source_are_worked_out_once(scene, export):
+    """40 nodes in a row, each of which takes the one before twice: 2^40 ways from the first to the last."""
+    tree, principled = material()
+    value, shader = add(tree, "Value"), principled.outputs[0]
+    value.default_value = 2.0**-41
+    for _ in range(40):
+        value = add(tree, "Math", value, value, operation="ADD")
+        shader = add(tree, "MixShader", 0.5, shader, shader)
+    tree.links.new(value, principled.inputs["Roughness"])
+    tree.links.new(shader, output_of(tree).inputs["Surface"])
+    swatch(bpy.data.materials["Material"])
+    frame, warnings = export()
+    assert not warnings
+    assert frame.meshes[0].materials[0].roughness == pytest.approx(0.5)
+
+
+def test_very_long_rows_of_nodes_are_cut_off_and_named(scene, export):
+    tree, principled = material()
+    value, shader = add(tree, "Value"), principled.outputs[0]
+    for i in range(400):
+        value = add(tree, "Math", value, 0.0, operation="ADD", label=f"Sum {i}")
+        shader = add(tree, "AddShader", shader, None)
+    tree.links.new(value, principled.inputs["Roughness"])
+    swatch(bpy.data.materials["Material"])
+    frame, (warning,) = export()
+    assert 'node "Sum 3' in warning and "left out" in warning
+    assert frame.meshes[0].materials[0].roughness == 0.5
+    tree.links.new(shader, output_of(tree).inputs["Surface"])
+    _, warnings = export()
+    assert any('node "Add Shader' in w and "left out" in w for w in warnings)
+
+
+def test_senseless_numbers_are_named_and_stop_nothing(scene, export):
+    tree, principled = material()
+    principled.inputs["IOR"].default_value = -1
+    hue = add(tree, "HueSaturation")
+    hue.node.inputs["Color"].default_value = (np.nan, -1, 0, 1)
+    split = add(tree, "SeparateColor", (-1.0, -2.0, 0.0), mode="HSV")
+    split.node.inputs[0].default_value = (-1, -2, 0, 1)
+    tree.links.new(hue, principled.inputs["Base Color"])
+    tree.links.new(split.node.outputs[1], principled.inputs["Metallic"])
+    tree.links.new(add(tree, "Fresnel", -1.0), principled.inputs["Roughness"])
+    swatch(bpy.data.materials["Material"])
+    frame, warnings = export()
+    assert any("IOR" in w for w in warnings) and any("base colour is not finite" in w for w in warnings)
+    found = frame.meshes[0].materials[0]
+    assert found.base_colour == pytest.approx((0.8, 0.8, 0.8)) and found.metallic == 0 and 0 <= found.roughness <= 1
+
+
 def test_one_warning_names_all_that_a_material_lacks(scene, export):
     tree, principled = material()
     for name in ("Coat Weight", "Transmission Weight", "Sheen Weight", "Subsurface Weight"):

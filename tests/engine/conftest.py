@@ -13,6 +13,7 @@ from drgs_blender.asset.container import write_asset
 from drgs_blender.asset.model import Asset, Mesh
 from drgs_blender.deform.attach import attach
 from drgs_blender.engine.client import EngineClient
+from drgs_blender.engine.session import Session
 from drgs_blender.frame import Camera, Frame, ObjectState, RenderSettings, World
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -83,6 +84,13 @@ def make_frame(asset_path: Path, mesh: Mesh) -> Callable[..., Frame]:
         )
 
     return make
+
+
+@pytest.fixture
+def session(asset_path):
+    made = Session()
+    made.load_asset(asset_path)
+    return made
 
 
 @pytest.fixture

@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import pytest
+from processes import gone, open_files
 
 from drgs_blender.engine import protocol
 from drgs_blender.engine.child import clean_environment
@@ -31,14 +32,6 @@ from drgs_blender.version import __version__
 from .conftest import ROOT, engine_program
 
 linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
-
-
-def gone(pid: int) -> bool:
-    """Whether the process has ended (a zombie that nobody collects has)."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] == "Z"
-    except FileNotFoundError:
-        return True
 
 
 def wait_until(condition, seconds: float) -> float:
@@ -159,7 +152,7 @@ def test_garbage_ends_the_engine_with_a_message(after_handshake):
         link.send(protocol.Welcome(protocol.PROTOCOL, __version__, -1, -1))
     assert engine.stdin is not None
     engine.stdin.write(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
-    while isinstance((answer := link.receive())[0], protocol.Alive):  # type: ignore[index]
+    while isinstance((answer := link.receive())[0], protocol.Alive | protocol.Progress):  # type: ignore[index]
         pass
     assert answer is not None
     assert answer[0].error == "EngineError"
@@ -215,7 +208,7 @@ def test_no_socket_is_ever_open(make_client, make_frame, asset_path):
     client = make_client()
     client.load_asset(str(asset_path))
     client.render(make_frame())
-    files = [os.readlink(f) for f in Path(f"/proc/{client.pid}/fd").iterdir() if f.is_symlink()]
+    files = open_files(client.pid)
     assert [name for name in files if name.startswith("pipe:")]
     assert not [name for name in files if name.startswith("socket:")]
 

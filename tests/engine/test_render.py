@@ -152,7 +152,7 @@ def test_engine_killed_again_and_again_is_an_error(client, make_frame, expected)
 
 
 @posix
-@pytest.mark.parametrize("restarts", [0, 1])
+@pytest.mark.parametrize("restarts", [0, 1] * (5 if os.environ.get("DRGS_FAULTS") == "whole" else 1))
 def test_stopped_engine_meets_the_deadline(make_client, make_frame, asset_path, expected, restarts):
     client = make_client(silence=2.0, restarts=restarts)
     client.load_asset(str(asset_path))

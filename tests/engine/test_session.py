@@ -7,32 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pictures import assert_same_bits, fresh, with_meshes
 
 from drgs_blender.asset.container import read_asset, write_asset
 from drgs_blender.asset.model import Asset, Mesh, Surfels
 from drgs_blender.engine.objects import traced_object
-from drgs_blender.engine.session import Session
 from drgs_blender.engine.snapshots import renewed
 from drgs_blender.errors import AssetError, Cancelled, UsageError
-from drgs_blender.frame import Image, Light, Material, MeshState, ObjectState, Texture, Visibility, World
-
-
-@pytest.fixture
-def session(asset_path):
-    made = Session()
-    made.load_asset(asset_path)
-    return made
-
-
-def fresh(asset_path, frame):
-    """The frame in a session that has seen nothing else."""
-    made = Session()
-    made.load_asset(asset_path)
-    return made.render(frame)
-
-
-def assert_same_bits(a, b):
-    assert {name: array.tobytes() for name, array in a.items()} == {name: array.tobytes() for name, array in b.items()}
+from drgs_blender.frame import Adjustment, Light, Material, MeshState, ObjectState, Visibility, World
 
 
 def turned(degrees):
@@ -58,30 +40,10 @@ def test_history_does_not_show(session, make_frame, asset_path):
     painted.objects[0].albedo = np.full_like(painted.objects[0].vertices, 0.9)
     twins = make_frame(0.1)
     twins.objects = [two.objects[0], ObjectState("Ball", second.asset, second.matrix_world)]
-    for frame in (*frames, two, swapped, twins, mesh, constant, painted, frames[0]):
+    tinted = make_frame()
+    tinted.objects[0].adjustment = Adjustment(tint=(0.2, 1.0, 0.5), mask=painted.objects[0].albedo[:, 0].copy())
+    for frame in (*frames, two, swapped, twins, mesh, constant, painted, tinted, frames[0]):
         assert_same_bits(session.render(frame), fresh(asset_path, frame))
-
-
-def with_meshes(frame, **changes):
-    """The frame with a floor and two small squares in front of it, the latter with an image."""
-    square = np.float32([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
-    faces = np.int32([[0, 1, 2], [0, 2, 3]])
-    floor = np.diag([5.0, 5.0, 1.0, 1.0])
-    floor[2, 3] = -1.2
-    places = np.stack([np.diag([0.2, 0.2, 0.2, 1.0])] * 2)
-    places[:, :3, 3] = (0.8, 0.5, -0.5), (-0.8, 0.5, 0.5)
-    picture = Image("Picture", np.full((2, 2, 4), 200, np.uint8), "srgb")
-    painted = Material("Painted", (1, 1, 1), base_colour_texture=Texture("Picture"), emission=(0.1, 0.2, 0.3))
-    uvs = square[faces][:, :, :2].copy()
-    frame.meshes = [
-        MeshState("Floor", square.copy(), faces, floor[None], np.int32([5])),
-        MeshState("Squares", square.copy(), faces, places, np.int32([6, 7]), uvs=uvs, materials=[painted]),
-    ]
-    frame.images = [picture]
-    for path, value in changes.items():
-        index, name = path.split("_", 1)
-        setattr(frame.meshes["ab".index(index)], name, value)
-    return frame
 
 
 def test_history_of_meshes_does_not_show(session, make_frame, asset_path):
@@ -261,6 +223,30 @@ def test_unusable_settings_are_refused(session, make_frame):
         session.render(frame)
 
 
+@pytest.mark.parametrize("primary", ["surfels", "mesh"])
+def test_materials_out_of_range_are_as_at_its_end_on_surfels_and_mesh_alike(session, make_frame, mesh, primary):
+    def picture(**materials):
+        frame = make_frame(primary=primary)
+        frame.passes = ("Combined", "Albedo", "Roughness", "Metallic", "DiffDir")
+        for name, value in materials.items():
+            setattr(frame.objects[0], name, np.full_like(getattr(mesh, name), value))
+        return session.render(frame)
+
+    for name, beyond, end in (("albedo", -1, 0), ("metallic", 5, 1), ("roughness", np.inf, 1), ("roughness", -3, 0)):
+        assert_same_bits(picture(**{name: beyond}), picture(**{name: end}))
+    own, lost = picture(), picture(metallic=np.nan)
+    assert_same_bits(own, lost)
+    (text,) = lost.warnings
+    assert text.startswith("Ball: ") and "metallic" in text and str(len(mesh.vertices)) in text
+
+
+def test_environment_that_is_not_only_turned_is_refused(session, make_frame):
+    frame = make_frame()
+    frame.world.rotation = np.eye(3) * 1e20
+    with pytest.raises(UsageError, match=r"rotation.*scales"):
+        session.render(frame)
+
+
 def test_vertices_of_a_huge_object_are_not_called_infinite_alone(session, make_frame, caplog):
     frame = make_frame(primary="mesh")
     frame.objects[0].matrix_world[:3, :3] *= 1e20
@@ -338,7 +324,7 @@ def test_a_threshold_that_cannot_be_followed_is_named(session, make_frame):
     frame = make_frame()
     frame.settings = replace(frame.settings, noise_threshold=0.1, cosine=3, ggx=2, environment=2, aa=4)
     assert any("noise threshold" in text and "3 + 2 + 2" in text for text in session.render(frame).warnings)
-    frame.settings = replace(frame.settings, cosine=8, ggx=8, environment=8)
+    frame.settings = replace(frame.settings, cosine=16, ggx=8, environment=8)
     assert not any("noise threshold" in text for text in session.render(frame).warnings)
 
 
@@ -354,3 +340,31 @@ def test_regions_and_history_do_not_show_in_adaptive_frames(session, make_frame,
     x0, y0, x1, y1 = camera.width // 4, camera.height // 4, camera.width // 2 + 3, camera.height // 2 + 5
     frame.camera = replace(camera, region=(x0, y0, x1, y1))
     np.testing.assert_array_equal(fresh(asset_path, frame)["Combined"], whole[y0:y1, x0:x1])
+
+
+@pytest.mark.parametrize("primary", ["surfels", "mesh"])
+def test_an_adjustment_changes_what_is_seen_and_keeps_its_detail(session, make_frame, primary):
+    """A tint is a factor on every pixel's albedo, whatever stands between vertices; a mask leaves a half alone."""
+    names = ("Combined", "Albedo", "Roughness", "Coverage", "Position")
+    frame = replace(make_frame(primary=primary), passes=names)
+    before = session.render(frame)
+    frame.objects[0].adjustment = Adjustment(tint=(0.5, 1.0, 0.25), roughness=(0.5, 0.1, 0.0, 1.0))
+    after = session.render(frame)
+    covered = before["Coverage"][..., 0] > 0
+    np.testing.assert_allclose(
+        after["Albedo"][covered], before["Albedo"][covered] * np.float32([0.5, 1, 0.25]), atol=1e-5
+    )
+    np.testing.assert_allclose(
+        after["Roughness"], np.where(covered[..., None], before["Roughness"] / 2 + 0.1, 0), atol=1e-5
+    )
+    asset = session.asset(frame.objects[0].asset)
+    frame.objects[0].adjustment.mask = (asset.mesh.vertices[:, 2] > 0).astype(np.float32)
+    masked, height = session.render(frame), before["Position"][..., 2]
+    far = 0.35 if primary == "mesh" else 0.75  # surfels are as wide as faces, and soft
+    low, high = covered & (height < -far), covered & (height > far)
+    assert low.any() and high.any()
+    np.testing.assert_allclose(masked["Albedo"][low], before["Albedo"][low], atol=1e-6)
+    np.testing.assert_allclose(masked["Albedo"][high], after["Albedo"][high], atol=1e-6)
+    frame.objects[0].adjustment.mask = np.ones(3, np.float32)
+    with pytest.raises(AssetError, match="mask of its adjustments"):
+        session.render(frame)

@@ -36,9 +36,10 @@ def lively_light() -> EnvironmentLight:
     ("changes", "expected"),
     [
         ({}, 1),  # no threshold
-        ({"noise_threshold": 0.1}, 2),  # 4, 2 and 2 samples a sub-sample
-        ({"noise_threshold": 0.1, "aa": 1}, 8),
-        ({"noise_threshold": 0.1, "cosine": 3}, 1),  # cannot be divided by aa
+        ({"noise_threshold": 0.1}, 2),  # parts of 16 rays
+        ({"noise_threshold": 0.1, "cosine": 3}, 1),
+        ({"noise_threshold": 0.1, "split": "counts"}, 8),
+        ({"noise_threshold": 0.1, "cosine": 3, "split": "counts"}, 1),  # no common divisor
         ({"noise_threshold": 0.1, "cosine": 4096, "ggx": 2048, "environment": 2048}, 32),
     ],
 )

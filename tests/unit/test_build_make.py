@@ -170,6 +170,7 @@ def test_bad_faces_are_removed_and_counted():
     mesh, report = mesh_with_materials(MeshFile(vertices, faces), "bad")
     assert len(mesh.faces) == 8 and np.isfinite(mesh.vertices).all()
     assert report["degenerate_faces"] == 2 and report["not_finite_faces"] == 1
+    assert "2 faces without area removed" in report["notes"]  # which the command line prints
 
 
 def test_meshes_without_a_surface_are_refused_by_name():

@@ -11,7 +11,9 @@ from PIL import Image
 
 from drgs_blender.asset.container import read_asset
 from drgs_blender.cli import doctor
+from drgs_blender.cli.find_blender import find_blender
 from drgs_blender.cli.main import main
+from drgs_blender.errors import DeviceError
 from drgs_blender.formats.gltf import read_gltf
 from drgs_blender.render.picture.frames import write_frame
 
@@ -117,6 +119,34 @@ def test_import_builds_a_mesh_around_splats(tmp_path, capsys):
     assert report["provenance"]["surfels"] == "s.ply" and report["counts"]["faces"] == len(asset.mesh.faces)
 
 
+def test_import_without_a_mesh_and_a_picture_of_it(tmp_path, capsys):
+    """Surfels alone: described, refused where light would meet a mesh, rendered where it meets surfels."""
+    Image.fromarray(np.full((4, 8, 3), 255, np.uint8)).save(tmp_path / "white.png")
+    out, png = tmp_path / "ball.drgs", tmp_path / "ball.png"
+    source = ["import", str(splats(tmp_path / "s.ply")), "--no-mesh", "--env", str(tmp_path / "white.png")]
+    assert main([*source, "--out", str(out)]) == 0
+    report = described(out, capsys)
+    assert report["counts"]["faces"] == 0 and report["counts"]["surfels"] == 400 and not report["bound"]
+    camera = {"matrix_world": [[1, 0, 0, 0], [0, 0, -1, -4], [0, 1, 0, 0], [0, 0, 0, 1]], "fov_x": 40}
+    (tmp_path / "c.json").write_text(json.dumps(camera | {"width": 16, "height": 16}))
+    picture = ["relight", str(out), "--camera", str(tmp_path / "c.json"), "--rays", "16", "--out", str(png)]
+    assert main(picture) != 0 and not png.exists()
+    assert main([*picture, "--tracer", "surfels", "--transparent"]) == 0
+    pixels = np.asarray(Image.open(png))
+    assert pixels[8, 8, 3] > 240 and 100 < pixels[8, 8, 0] < 255 and pixels[0, 0, 3] == 0
+
+
+def test_scale_is_of_all_lengths(cube, tmp_path):
+    for command in (["make", str(cube)], ["import", str(splats(tmp_path / "s.ply")), "--mesh", str(cube)]):
+        sizes = []
+        for scale in ("1", "0.01"):
+            assert main([*command, "--up", "z", "--scale", scale, "--out", str(tmp_path / "a.drgs")]) == 0
+            asset = read_asset(tmp_path / "a.drgs")
+            lengths = asset.mesh.vertices, asset.surfels.centre, asset.surfels.scale
+            sizes.append([np.abs(values).max() for values in lengths] + [len(asset.surfels)])
+        np.testing.assert_allclose(sizes[1], np.multiply(sizes[0], [0.01, 0.01, 0.01, 1]), rtol=1e-3)
+
+
 def test_import_with_its_mesh_and_light(cube, tmp_path):
     Image.fromarray(np.full((4, 8, 3), 255, np.uint8)).save(tmp_path / "white.png")
     out = tmp_path / "a.drgs"
@@ -199,6 +229,26 @@ def test_doctor_only_notes_the_absence_of_what_is_optional(monkeypatch, capsys, 
     assert main(["doctor"]) == 0
     text = capsys.readouterr().out
     assert "absent   Blender" in text and "DRGS_BLENDER" in text
+
+
+def test_a_node_needs_blender_and_its_extension(monkeypatch, capsys, tmp_path):
+    """What `drgs render` would start is started: without it a node is no node."""
+    checks = [c for c in doctor.NODE_CHECKS if c[0] in ("Blender", "extension")]
+    assert len(checks) == 2 and all(essential for _, essential, _ in checks)
+    monkeypatch.setattr(doctor, "NODE_CHECKS", checks)
+    empty = tmp_path / "python"
+    empty.write_text("#!/bin/sh\nexit 3\n")
+    empty.chmod(0o755)
+    assert main(["doctor", "--node", "--json", "--blender", str(empty)]) == 69
+    found = json.loads(capsys.readouterr().out)["checks"]
+    assert [check["state"] for check in found] == ["missing", "missing"]
+    assert "exit code 3" in found[1]["detail"]
+    try:
+        find_blender()
+    except DeviceError as error:
+        pytest.skip(str(error))
+    assert main(["doctor", "--node"]) == 0
+    assert "answers" in capsys.readouterr().out
 
 
 def test_doctor_says_a_name_once(monkeypatch, capsys):

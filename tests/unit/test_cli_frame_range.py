@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from drgs_blender.cli.frame_range import MOST_FRAMES, check_template, frame_path, parse_frames
+from drgs_blender.cli.frame_range import MOST_FRAMES, check_template, parse_frames
 from drgs_blender.errors import UsageError
+from drgs_blender.sequence import frame_path
 
 
 @pytest.mark.parametrize(
@@ -16,6 +17,7 @@ from drgs_blender.errors import UsageError
         ("7", [7]),
         ("1-4", [1, 2, 3, 4]),
         ("1-24x2,30", [*range(1, 25, 2), 30]),
+        ("1..5,9..7x-1", [1, 2, 3, 4, 5, 9, 8, 7]),
         ("1-24:2", list(range(1, 25, 2))),
         ("20-30:2", [20, 22, 24, 26, 28, 30]),
         ("9,10,20,22", [9, 10, 20, 22]),

@@ -16,6 +16,7 @@ from drgs_blender.asset.container import read_asset, write_asset
 from drgs_blender.asset.model import Asset, Environment, Mesh
 from drgs_blender.cli.main import main
 from drgs_blender.deform.attach import attach
+from drgs_blender.particle_cache import Header, ParticleCache, ParticleFrame
 from drgs_blender.passes import BY_NAME
 from drgs_blender.render.picture.frames import read_frame
 
@@ -120,6 +121,32 @@ def test_vertices_pose_the_asset(relight, folder, tmp_path):
     ]
     # 0.5 m at 6 m distance, times fx pixels.
     assert centre[1] - centre[0] == pytest.approx(0.5 / 6 * 20 / np.tan(np.radians(15)), rel=0.05)
+
+
+def test_a_simulation_poses_the_asset_frame_by_frame(relight, folder, tmp_path, capsys):
+    """Frame 2 of a cache is the picture of its vertices; without a range there is a file for every frame."""
+    rest = read_asset(folder / "lit.drgs").mesh.vertices
+    cache = ParticleCache(tmp_path / "cache")
+    still = ParticleFrame(rest[:4], np.tile(np.eye(3), (4, 1, 1)), rest)
+    cache.create(Header("digest", 4, len(rest), 1, 24.0), still)
+    cache.write(1, still)
+    moved = rest * np.float32(0.8) + np.float32([0.2, 0, 0.1])
+    cache.write(2, ParticleFrame(still.points, still.gradients, moved))
+    np.save(tmp_path / "v.npy", moved)
+    expected, _ = relight("--vertices", str(tmp_path / "v.npy"), "--aa", "1")
+    one, _ = relight("--cache", str(cache.folder), "--frames", "2", "--aa", "1")
+    alpha = expected["Combined"][..., 3]
+    assert np.abs(one["Combined"][..., 3] - alpha).max() < 0.3 and one["Combined"].shape == expected["Combined"].shape
+    common = ["relight", str(folder / "lit.drgs"), "--camera", str(folder / "front.json"), "--rays", "4"]
+    common += ["--cache", str(cache.folder)]
+    assert main([*common, "--out", str(tmp_path / "all/##.exr")]) == 0
+    sums = [read_frame(tmp_path / f"all/{k:02d}.exr")[0]["Combined"][..., :3].sum() for k in (1, 2)]
+    assert sums[1] != sums[0]
+    for more, said in ((["--frames", "1-3"], "frame 3: is not baked"), ([], "has no #"), (["--frames", "x"], "'x' is")):
+        assert main([*common, *more, "--out", str(tmp_path / "o.exr")]) == 64
+        assert said in capsys.readouterr().err
+    assert main([*common[:-1], str(tmp_path), "--out", str(tmp_path / "o.exr")]) == 64
+    assert "is not the cache of a simulation" in capsys.readouterr().err
 
 
 def test_mesh_and_surfels_show_the_same_object(relight):

@@ -13,81 +13,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from blend_files import make_blend_files
+from processes import children
 
-from drgs_blender.asset.container import write_asset
-from drgs_blender.asset.model import Asset, Mesh
 from drgs_blender.cli import blender_process
-from drgs_blender.cli.find_blender import CHECKOUT, find_blender
+from drgs_blender.cli.find_blender import find_blender
 from drgs_blender.cli.main import main
-from drgs_blender.deform.attach import attach
-from drgs_blender.errors import DeviceError, EngineError
+from drgs_blender.errors import EngineError
 from drgs_blender.render.picture.frames import read_frame
-
-BUILD = """
-import importlib, os, runpy, sys, tempfile
-from pathlib import Path
-import bpy
-checkout, folder = {checkout!r}, Path({folder!r})
-job = runpy.run_path(checkout + "/drgs_blender/cli/blender_job.py")
-bpy.ops.wm.read_factory_settings(use_empty=True)
-with tempfile.TemporaryDirectory() as repository:
-    os.symlink(checkout, repository + "/drgs", target_is_directory=True)
-    package = job["enable_extension"](repository)
-    importlib.import_module(package + ".operators.import_asset").import_assets(bpy.context, [folder / "tile.drgs"])
-scene = bpy.context.scene
-tile = bpy.context.object
-tile.keyframe_insert("location", frame=1)
-tile.location.x = 1
-tile.keyframe_insert("location", frame=3)
-hidden = tile.copy()
-hidden.name, hidden.hide_render, hidden.location.z = "Hidden", True, 1
-hidden.animation_data_clear()
-scene.collection.objects.link(hidden)
-camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
-camera.location, camera.rotation_euler = (0, -6, 0), (1.5707963, 0, 0)
-scene.collection.objects.link(camera)
-scene.camera = camera
-scene.world = bpy.data.worlds.new("World")
-scene.world.use_nodes = True
-scene.render.engine = "BLENDER_WORKBENCH"
-scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = 64, 48, 50
-scene.drgs.rays = 4
-bpy.ops.wm.save_as_mainfile(filepath=str(folder / "shot.blend"))
-text = bpy.data.texts.new("stop.py")
-text.write("import os; os._exit(9)")
-text.use_module = True
-bpy.ops.wm.save_as_mainfile(filepath=str(folder / "script.blend"))
-bpy.data.texts.remove(text)
-scene.view_layers.new("Second layer")
-bpy.ops.wm.save_as_mainfile(filepath=str(folder / "layers.blend"))
-scene.view_layers.remove(scene.view_layers["Second layer"])
-scene.camera = None
-bpy.ops.wm.save_as_mainfile(filepath=str(folder / "blind.blend"))
-sys.stdout.flush()
-os._exit(0)
-"""
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An asset and Blender files that show it moving to the right from frame 1 to 3."""
-    try:
-        blender = find_blender()
-        blender.version()
-    except DeviceError as error:
-        pytest.skip(str(error))
     folder = tmp_path_factory.mktemp("render")
-    x, z = np.meshgrid(np.linspace(-0.5, 0.5, 9), np.linspace(-0.5, 0.5, 9))
-    vertices = np.stack([x.ravel(), np.zeros(81), z.ravel()], axis=1)
-    quads = (np.arange(8)[:, None] * 9 + np.arange(8)).ravel()
-    faces = np.concatenate([quads[:, None] + (0, 1, 10), quads[:, None] + (0, 10, 9)])
-    mesh = Mesh(vertices, faces, np.full((81, 3), 0.8), np.full(81, 0.5), np.zeros(81))
-    surfels, binding, _ = attach(mesh, density=30)
-    write_asset(folder / "tile.drgs", Asset(surfels, mesh, binding))
-    script = folder / "build.py"
-    script.write_text(BUILD.format(checkout=str(CHECKOUT), folder=str(folder)))
-    result = subprocess.run(blender.command(script), capture_output=True, text=True, timeout=120)
-    assert (folder / "blind.blend").exists(), result.stdout + result.stderr
+    make_blend_files(folder)
     return folder
 
 
@@ -194,7 +134,7 @@ def test_job_that_is_killed_leaves_no_folder(folder, tmp_path):
 @pytest.mark.skipif(os.name == "nt", reason="there are no such signals there")
 def test_blender_that_stops_answering_is_ended(folder, monkeypatch):
     monkeypatch.setattr(blender_process, "SILENT_SECONDS", 7.0)
-    job = {"scene": str(folder / "shot.blend"), "frames": list(range(1, 9)), "scripts": False}
+    job = {"scene": str(folder / "shot.blend"), "frames": list(range(1, 9)), "scripts": False, "passes": None}
     with blender_process.BlenderProcess(find_blender(), job, lambda path: "key") as process:
         frames = process.frames()
         next(frames)
@@ -254,27 +194,54 @@ def test_termination_leaves_nothing_behind(folder, tmp_path):
             time.sleep(0.05)
 
 
+def engines_of(process: subprocess.Popen) -> list[int]:
+    """Process ids of the engines that `process` runs."""
+    return [pid for pid, command in children(process.pid).items() if "drgs_blender.engine" in command]
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="finds the engine in /proc")
-def test_engine_killed_in_the_middle_of_a_frame_costs_no_pixel(render, folder, tmp_path):
+@pytest.mark.parametrize(("deaths", "code"), [(1, 0), (2, 0), (3, 75)])
+def test_engine_killed_in_the_middle_of_a_frame_costs_no_pixel(render, folder, tmp_path, deaths, code):
+    """Two engines may die of one frame; the third death gives the frame back to the farm."""
     assert render("--rays", "2048", frames="1")[0] == 0
     (tmp_path / "0001.exr").rename(tmp_path / "calm.exr")
     command = [sys.executable, "-m", "drgs_blender.cli.main", "render", str(folder / "shot.blend"), "--frames", "1"]
     command += ["--out", str(tmp_path / "####.exr"), "--rays", "2048"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    killed: set[int] = set()
     try:
         while not process.stdout.readline().startswith("Fra:1 "):
             assert process.poll() is None
-        children = Path(f"/proc/{process.pid}/task").glob("*/children")
-        pids = [int(pid) for listing in children for pid in listing.read_text().split()]
-        engines = [pid for pid in pids if b"drgs_blender.engine" in Path(f"/proc/{pid}/cmdline").read_bytes()]
-        assert len(engines) == 1
-        os.kill(engines[0], signal.SIGKILL)
+        while len(killed) < deaths:
+            for pid in set(engines_of(process)) - killed:
+                os.kill(pid, signal.SIGKILL)
+                killed.add(pid)
+            assert process.poll() is None or len(killed) == deaths
+            time.sleep(0.02)
         rest, _ = process.communicate(timeout=120)
     finally:
         process.kill()
-    assert process.returncode == 0 and rest.splitlines()[-1] == "DRGS_EXIT class=ok"
-    calm, shaken = (read_frame(tmp_path / name)[0]["Combined"] for name in ("calm.exr", "0001.exr"))
-    assert np.array_equal(calm, shaken)
+    assert process.returncode == code
+    assert rest.splitlines()[-1] == f"DRGS_EXIT class={'retry' if code else 'ok'}"
+    if code:
+        assert [p.name for p in tmp_path.iterdir()] == ["calm.exr"]
+    else:
+        calm, shaken = (read_frame(tmp_path / name)[0]["Combined"] for name in ("calm.exr", "0001.exr"))
+        assert np.array_equal(calm, shaken)
+
+
+def test_a_frame_that_takes_too_long_is_given_back(render, tmp_path):
+    options = ("--rays", "65536", "--noise-threshold", "0", "--timeout", "4")
+    code, lines, errors = render(*options, scene="large.blend", frames="1")
+    assert (code, lines[-1]) == (75, "DRGS_EXIT class=retry") and "took longer than 4 s" in errors[-1]
+    code, lines, errors = render("--enable-scripts", "--timeout", "6", scene="slow.blend", frames="1")
+    assert code == 75 and "evaluated one frame for more than 6 s" in errors[-1]
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_computes_nowhere_is_refused_before_anything_starts(render):
+    code, lines, errors = render("--device", "cuda")
+    assert (code, lines) == (69, ["DRGS_EXIT class=no-device"]) and "cuda" in errors[-1]
 
 
 def test_nothing_is_left_in_the_temporary_folder(render, tmp_path_factory, monkeypatch):
@@ -283,3 +250,19 @@ def test_nothing_is_left_in_the_temporary_folder(render, tmp_path_factory, monke
     assert render(frames="1")[0] == 0
     assert render(scene="blind.blend")[0] == 64
     assert not list(scratch.iterdir())
+
+
+def test_frames_with_the_passes_for_it_are_denoised_over_time(render, tmp_path, capsys):
+    """The cameras that neighbours name are the same, so the tile is followed; motion is what Blender's keys say."""
+    assert render("--passes", "temporal,Vector", "--denoise", "none")[0] == 0
+    code = main(["denoise", str(tmp_path / "####.exr"), "--frames", "1-3", "--out", str(tmp_path / "clean/####.exr")])
+    assert code == 0 and "Note" not in capsys.readouterr().out
+    from drgs_blender.render.picture.shots import read_noisy
+
+    frames = [read_noisy(tmp_path / f"000{n}.exr") for n in (1, 2, 3)]
+    assert frames[1].follows(frames[0]) and frames[2].follows(frames[1])
+    vector = frames[1].passes["Vector"][frames[1].shot.guides.coverage > 0.99]
+    step = column(tmp_path / "0002.exr") - column(tmp_path / "0001.exr")
+    assert step > 1 and abs(np.median(vector[:, 0]) + step) < 0.1 and abs(np.median(vector[:, 1])) < 0.01
+    clean = read_frame(tmp_path / "clean" / "0002.exr")[0]
+    assert "Vector" in clean and "Variance" not in clean

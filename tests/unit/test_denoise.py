@@ -207,7 +207,7 @@ def exposed(monkeypatch: pytest.MonkeyPatch, rays: int, seed: int) -> Film:
         1,
         Camera(matrix, 96, 80, 110.0, 110.0, 48.0, 40.0),
         [ObjectState("ball", "a"), ObjectState("floor", "a")],
-        settings=RenderSettings(cosine, ggx, environment, 1, aa=4, primary="mesh", seed=seed),
+        settings=RenderSettings(cosine, ggx, environment, 1, aa=4, primary="mesh", seed=seed, split="counts"),
     )
     pipeline.render(scene(), EnvironmentLight(World(environment=sky)), None, frame)  # type: ignore[arg-type]
     return films[0]

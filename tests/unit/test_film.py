@@ -13,7 +13,7 @@ from drgs_blender.render.picture.film import EMPTY_DEPTH, Film
 from drgs_blender.render.points import Radiance
 from drgs_blender.render.primary.gbuffer import GBuffer, compact
 
-ALL = tuple(BY_NAME)
+ALL = tuple(name for name in BY_NAME if not name.startswith("Crypto"))  # these have a film of their own
 AA = 4
 
 

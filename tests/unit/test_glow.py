@@ -10,6 +10,7 @@ from test_integrate import points, settings
 from test_surface import mesh_state
 
 from drgs_blender.frame import Light, Material, MeshState, World
+from drgs_blender.render.lights.emitters import Emitters
 from drgs_blender.render.lights.lamps import Lamps
 from drgs_blender.render.lights.light import EnvironmentLight
 from drgs_blender.render.shade.integrate import integrate
@@ -49,7 +50,8 @@ def total(meshes: list[MeshState], lights: list[Light], bounces: int, strength: 
     seen = points(4000, albedo=0.8, roughness=0.4, origin=(0.3, 0.1, 0.0))
     light = EnvironmentLight(World(strength=strength))
     how = settings(16, 8, 8, bounces=bounces, look="principled")
-    found = integrate(scene, light, seen, how, 0, Lamps(lights)).components.astype(float)
+    lamps = Lamps(lights, emitters=Emitters(scene))
+    found = integrate(scene, light, seen, how, 0, lamps).components.astype(float)
     return found.mean(0), found.std(0) / math.sqrt(len(found))
 
 

@@ -14,7 +14,7 @@ from drgs_blender.frame import Light, RenderSettings, World
 from drgs_blender.jit import get_num_threads, use_threads
 from drgs_blender.render.lights.lamps import Lamps
 from drgs_blender.render.lights.light import EnvironmentLight
-from drgs_blender.render.points import DIFFUSE_DIRECT, DIFFUSE_INDIRECT, Radiance, ShadingPoints
+from drgs_blender.render.points import DIFFUSE_DIRECT, DIFFUSE_INDIRECT, GLOSSY_DIRECT, Radiance, ShadingPoints
 from drgs_blender.render.shade.integrate import integrate
 from drgs_blender.render.trace.scene import TraceObject, TraceScene
 
@@ -22,7 +22,7 @@ WHITE = EnvironmentLight(World())
 
 
 def settings(cosine: int = 0, ggx: int = 0, environment: int = 0, **changes: object) -> RenderSettings:
-    return replace(RenderSettings(cosine, ggx, environment, bounces=0, aa=1, look="paper"), **changes)  # type: ignore[arg-type]
+    return replace(RenderSettings(cosine, ggx, environment, split="counts", bounces=0, aa=1, look="paper"), **changes)  # type: ignore[arg-type]
 
 
 def points(
@@ -81,6 +81,13 @@ def test_white_furnace_of_the_diffuse_lobe_is_exact() -> None:
     result = integrate(EMPTY, WHITE, points(200), settings(cosine=16), 0)
     np.testing.assert_allclose(result.components[:, DIFFUSE_DIRECT], 1.0, atol=1e-4)
     np.testing.assert_array_equal(result.components[:, DIFFUSE_INDIRECT], 0.0)
+
+
+@pytest.mark.parametrize("look", ["paper", "principled"])
+def test_metals_have_no_diffuse_light_to_the_rounding_of_interpolation(look: str) -> None:
+    for metallic in np.nextafter(np.float32(1), np.float32([0, 1, 2])):
+        result = integrate(EMPTY, WHITE, points(20, metallic=metallic), settings(8, 8, 8, look=look), 0)
+        assert not result.components[:, :2].any() and result.components[:, 2].min() > 0
 
 
 def directional_albedo(mu: float, roughness: float, metallic: float, look: str) -> float:
@@ -177,7 +184,10 @@ def test_each_strategy_alone_agrees_with_all_together(alone: dict, look: str) ->
     light = EnvironmentLight(World(environment=sun_picture()))
     seen = points(3000, albedo=0.7, roughness=0.55, metallic=0.4)
     together = settings(32, 16, 16, bounces=2, look=look)
-    assert (agreement(scene, light, seen, settings(**alone, bounces=2, look=look), together) < 4.5).all()
+    found = agreement(scene, light, seen, settings(**alone, bounces=2, look=look), together)
+    # Samples of the environment are shadow rays: they bring no light of surfaces.
+    direct = [DIFFUSE_DIRECT, GLOSSY_DIRECT]
+    assert (found[direct if "environment" in alone else slice(None)] < 4.5).all()
 
 
 def test_a_shiny_surface_sees_the_sun_by_any_strategy() -> None:
@@ -337,7 +347,9 @@ def test_strips_threads_and_order_change_no_bit(busy: tuple) -> None:
     finally:
         use_threads(before)
     np.testing.assert_array_equal(single.components, whole.components)
-    parts = [integrate(scene, light, seen[rows], how, 5) for rows in (slice(0, 1001), slice(1001, None))]
+    parts = [
+        integrate(scene, light, seen[rows], how, 5) for rows in (slice(0, 1000), slice(1000, None))
+    ]  # whole pixels
     np.testing.assert_array_equal(np.concatenate([p.components for p in parts]), whole.components)
     np.testing.assert_array_equal(np.concatenate([p.variance for p in parts]), whole.variance)
     shuffled = np.random.default_rng(0).permutation(len(seen))
@@ -401,7 +413,7 @@ def test_nothing_to_do_is_done() -> None:
     assert integrate(EMPTY, WHITE, points(0), settings(4), 0).components.shape == (0, 4, 3)
 
 
-@pytest.mark.parametrize("wrong", [{"cosine": -1}, {"bounces": -1}, {"aa": 0}, {"look": "toon"}])
+@pytest.mark.parametrize("wrong", [{"cosine": -1}, {"bounces": -1}, {"aa": -1}, {"look": "toon"}])
 def test_settings_that_make_no_sense_are_refused(wrong: dict) -> None:
     with pytest.raises(UsageError, match="render settings"):
         integrate(EMPTY, WHITE, points(1), replace(settings(4), **wrong), 0)
@@ -436,8 +448,9 @@ def test_every_strategy_finds_the_same_lamp(strategies: dict) -> None:
     assert values.std() / 20 < 0.02 * expected
 
 
-def test_sky_and_lamps_share_the_light_samples_without_bias() -> None:
-    sky, counts = EnvironmentLight(World(sun_picture())), settings(cosine=16, ggx=16, environment=64)
+@pytest.mark.parametrize("split", ["counts", "auto"])
+def test_sky_and_lamps_share_the_light_samples_without_bias(split: str) -> None:
+    sky, counts = EnvironmentLight(World(sun_picture())), settings(cosine=16, ggx=16, environment=64, split=split)
     some = points(3000, albedo=0.7, roughness=0.3)
     together, alone, lamps = (
         luminance(integrate(EMPTY, light, some, counts, 8, lamp))
@@ -455,6 +468,27 @@ def test_a_lamp_without_shadow_shines_through() -> None:
     blocked = integrate(wall, DARK, points(50), settings(environment=64), 0, area_lamp())
     np.testing.assert_allclose(through.components, free.components, rtol=1e-4)  # rays start a little higher
     assert free.components.max() > 0.1 and not blocked.components.any()
+
+
+@pytest.mark.parametrize(
+    "changes", [{"kind": "sun", "angle": 0.0}, {"cast_shadow": False, "size_x": 0.02, "size_y": 0.02}]
+)
+@pytest.mark.parametrize("rays", [(1, 1, 1), (16, 8, 8)])
+def test_mirrors_reflect_lamps_that_only_lamp_samples_find(changes: dict, rays: tuple[int, int, int]) -> None:
+    """Where next to no light samples are allotted to a surface, some are left for them."""
+    some = points(400, roughness=0.03, metallic=1.0)
+    mirrored = 2 * some.view[0, 2] * some.normal[0] - some.view[0]
+    matrix = np.eye(4)
+    matrix[:3, 2], matrix[:3, 3] = mirrored, 2 * mirrored  # it shines along its own -Z
+    matrix[:3, 0] = np.cross([0, 1, 0], mirrored) / np.linalg.norm(np.cross([0, 1, 0], mirrored))
+    matrix[:3, 1] = np.cross(mirrored, matrix[:3, 0])
+    lamps = Lamps([replace(Light("lamp", "area", matrix, power=30.0), **changes)], radius=1.0)  # type: ignore[arg-type]
+    found = {}
+    for split, counts in (("counts", (16, 8, 64)), ("auto", rays)):
+        value = luminance(integrate(EMPTY, DARK, some, settings(*counts, split=split), 0, lamps)).astype(float)
+        found[split] = value.mean(), value.std() / 20
+    (whole, a), (allotted, b) = found["counts"], found["auto"]
+    assert whole > 1.0 and abs(allotted - whole) < 4.5 * np.hypot(a, b) + 1e-3 * whole
 
 
 def test_lobes_that_do_not_see_a_lamp_get_nothing_of_it() -> None:
@@ -478,6 +512,37 @@ def test_the_clamp_bounds_every_indirect_sample_and_nothing_else() -> None:
     assert free.components[:, [1, 3]].sum(axis=(1, 2)).max() / 3 > 2 * limit
 
 
+def test_the_clamp_is_the_same_in_parts() -> None:
+    """A part of a position's samples is less than one sample, of which each weighs the more."""
+    box = trimesh.creation.box((4, 4, 4))
+    inside = scene_of((np.asarray(box.vertices), np.asarray(box.faces)[:10]), albedo=0.9)
+    counts = settings(cosine=16, environment=16, bounces=2, aa=16, clamp_indirect=0.05)
+    some = replace(points(320), pixel=np.arange(320) // 16, sample=np.arange(320) % 16)
+    sky = EnvironmentLight(World(sun_picture()))
+    whole = integrate(inside, sky, some, counts, 0).components
+    parts = [integrate(inside, sky, some, counts, 0, part=(i, 8)).components for i in range(8)]
+    np.testing.assert_allclose(np.mean(parts, axis=0), whole, rtol=1e-4, atol=1e-6)
+    assert (whole[:, DIFFUSE_INDIRECT] > 0).any()
+
+
+@pytest.mark.parametrize(
+    ("changes", "gain"),
+    [
+        ({"roughness": 0.5}, 1.5),
+        ({"roughness": 0.2, "metallic": 1.0}, 1.5),
+        ({"roughness": 0.02, "metallic": 1.0}, 1.5),
+    ],
+)
+def test_samples_are_allotted_where_they_tell_most(changes: dict, gain: float) -> None:
+    """The spread of pixels under a sky with a bright spot, next to that with the paper's 16 + 8 + 8."""
+    sky, some = EnvironmentLight(World(sun_picture())), points(1000, albedo=0.7, **changes)
+    spread = {}
+    for split in ("counts", "auto"):
+        value = luminance(integrate(EMPTY, sky, some, settings(16, 8, 8, split=split, look="principled"), 0))
+        spread[split] = value.var()
+    assert spread["counts"] > gain * spread["auto"]
+
+
 def test_no_bit_depends_on_the_neighbours_where_batches_overflow() -> None:
     """Samples of a point that fall into two batches of rays, paths too many for one, lamps and sky at once."""
     box = trimesh.creation.box((4, 4, 4))
@@ -489,3 +554,16 @@ def test_no_bit_depends_on_the_neighbours_where_batches_overflow() -> None:
         cut = integrate(room, sky, some[first:last], counts, 0, area_lamp())
         np.testing.assert_array_equal(cut.components, whole.components[first:last])
         np.testing.assert_array_equal(cut.variance, whole.variance[first:last])
+
+
+@pytest.mark.parametrize("aa", [1, 4, 16, 32])
+def test_the_variance_of_a_pixel_does_not_depend_on_its_positions(aa: int) -> None:
+    """Points of few samples, of one at last, are estimated together with those of their pixel."""
+    pixels = 400
+    sky = EnvironmentLight(World(np.random.default_rng(3).random((8, 16, 3)).astype(np.float32) ** 4))
+    seen = points(aa * pixels, mu=0.8, metallic=0.0)
+    seen = replace(seen, pixel=np.repeat(np.arange(pixels), aa), sample=np.tile(np.arange(aa), pixels))
+    found = integrate(EMPTY, sky, seen, RenderSettings(bounces=0, aa=aa), 0)
+    light = (found.components.sum(axis=1) @ LUMINANCE).reshape(pixels, aa).mean(axis=1)
+    estimated = found.variance.sum(axis=1).reshape(pixels, aa).sum(axis=1).mean() / aa**2
+    assert 1.0 < estimated / light.var() < 4.0

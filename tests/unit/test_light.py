@@ -15,6 +15,10 @@ def picture(kind: str) -> np.ndarray | None:
     rng = np.random.default_rng(5)
     if kind == "constant":
         return None
+    if kind == "large":  # blocks of 4 x 4 cells, those of the last row of 2 x 4, some without any light
+        image = rng.random((30, 120, 3)) ** 4
+        image[11, 77], image[16:, :48] = 500.0, 0.0
+        return image.astype(np.float32)
     image = rng.random((16, 32, 3)) ** 4 if kind == "random" else np.zeros((16, 32, 3))
     if kind == "sun":
         image[5, 31] = 1000.0
@@ -105,19 +109,20 @@ def test_every_lit_cell_of_a_large_map_has_its_density(size: tuple[int, int], sk
     assert (np.diff(light.cells[:, 0].astype(np.int64)) >= 1).all() and light.cells[-1, 0] == 2**32 - 1
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [*KINDS, "large"])
 @pytest.mark.parametrize("turned", [False, True])
-def test_samples_follow_the_density(kind: str, turned: bool) -> None:
+@pytest.mark.parametrize("normal", [None, (0.6, 0.0, 0.8), (-0.36, 0.48, -0.8)])
+def test_samples_follow_the_density(kind: str, turned: bool, normal: tuple[float, float, float] | None) -> None:
     rotation = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0] if turned else np.eye(3)
     light = EnvironmentLight(World(environment=picture(kind), rotation=rotation))
     count = 200_000
-    directions, pdf = light.sample(numbers(count))
+    directions, pdf = light.sample(numbers(count), normal)
     np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-5)
     # On a cell's very border the lookup may fall to the neighbour.
-    assert (np.abs(light.pdf(directions) - pdf) <= 1e-4 * pdf).mean() > 0.999
+    assert (np.abs(light.pdf(directions, normal) - pdf) <= 1e-4 * pdf).mean() > 0.999
     # Histogram over octants and over bands, against the density's integral.
-    grid, angle = sphere_grid(480, 960)
-    weights = light.pdf(grid @ rotation) * angle  # the grid keeps to the cells in the environment's own frame
+    grid, angle = sphere_grid(1920, 960)  # borders of bands run through bright rows
+    weights = light.pdf(grid @ rotation, normal) * angle  # the grid keeps to the cells in the environment's own frame
 
     def cells(d: np.ndarray) -> np.ndarray:
         return (d > 0) @ [1, 2, 4] * 4 + np.minimum((np.abs(d[:, 2]) * 4).astype(int), 3)
@@ -127,7 +132,7 @@ def test_samples_follow_the_density(kind: str, turned: bool) -> None:
     np.testing.assert_allclose(found, expected, atol=5 * np.sqrt(0.25 / count))
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [*KINDS, "large"])
 def test_sampling_integrates_the_radiance(kind: str) -> None:
     light = EnvironmentLight(World(environment=picture(kind)))
     directions, pdf = light.sample(numbers(100_000, seed=1))
@@ -140,13 +145,27 @@ def test_sampling_integrates_the_radiance(kind: str) -> None:
         np.testing.assert_allclose(pdf, 1 / (4 * np.pi), rtol=1e-5)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("normal", [(0, 0, 1), (0.6, 0.0, 0.8), (0.48, -0.64, -0.6)])
+def test_light_on_a_surface_is_found_with_little_noise(normal: tuple[float, float, float], turned: bool) -> None:
+    """The constant light of a hemisphere is pi; from all directions alike its samples would spread by 1.29 of that."""
+    rotation = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0] if turned else np.eye(3)
+    light = EnvironmentLight(World(rotation=rotation))
+    directions, pdf = light.sample(numbers(100_000, seed=1), normal)
+    value = np.maximum(directions @ np.array(normal), 0) / pdf
+    assert value.mean() == pytest.approx(np.pi, rel=5 * value.std() / np.pi / np.sqrt(len(value)))
+    assert value.std() < 0.4 * np.pi
+    assert (directions @ np.array(normal) < -0.2).mean() < 0.05
+
+
+@pytest.mark.parametrize("kind", [*KINDS, "large"])
 def test_where_light_is_there_is_density(kind: str) -> None:
     light = EnvironmentLight(World(environment=picture(kind)))
     directions, _ = sphere_grid(300, 600)
     lit = light.lookup(directions).sum(axis=1) > 0
     assert lit.any()
     assert (light.pdf(directions)[lit] > 0).all()
+    assert (light.pdf(directions, (0, 0, 1))[lit] > 0).all()
 
 
 def test_bad_texels_are_black_and_counted() -> None:

@@ -115,10 +115,12 @@ def judge(found: np.ndarray, truth: np.ndarray, error: np.ndarray) -> None:
 
 
 COMBINATIONS = {
-    "cosine alone": RenderSettings(cosine=8, ggx=0, environment=0, aa=1),
-    "environment alone": RenderSettings(cosine=0, ggx=0, environment=8, aa=1),
-    "all": RenderSettings(cosine=8, ggx=4, environment=4, aa=1),
-    "counts that the sub-samples do not divide": RenderSettings(cosine=5, ggx=3, environment=6, aa=AA),
+    "cosine alone": RenderSettings(cosine=8, ggx=0, environment=0, aa=1, split="counts"),
+    "environment alone": RenderSettings(cosine=0, ggx=0, environment=8, aa=1, split="counts"),
+    "all": RenderSettings(cosine=8, ggx=4, environment=4, aa=1, split="counts"),
+    "counts that the sub-samples do not divide": RenderSettings(5, 3, 6, aa=AA, split="counts"),
+    "allotted by the material": RenderSettings(aa=1),
+    "allotted by the material, to sub-samples": RenderSettings(cosine=7, aa=AA),
 }
 
 

@@ -130,7 +130,7 @@ def test_progress_rises_to_one(ball: tuple[TraceScene, PosedSurfels, Environment
 def test_cancel_is_seen_soon(ball: tuple[TraceScene, PosedSurfels, EnvironmentLight]) -> None:
     """The time between two questions stays short even when a whole strip would take many seconds."""
     scene, posed, light = ball
-    this = frame(look_along_y(200, focal=300.0), aa=4, cosine=256, ggx=128, environment=128)
+    this = frame(look_along_y(200, focal=300.0), aa=4, cosine=4096, ggx=2048, environment=2048)
     pipeline.render(scene, light, posed, frame(look_along_y(16)))  # compile
     asked: list[float] = [time.process_time()]
 
@@ -154,7 +154,7 @@ def test_cancel_at_once(ball: tuple[TraceScene, PosedSurfels, EnvironmentLight])
 @pytest.mark.parametrize(
     ("settings", "passes", "message"),
     [
-        ({"aa": 0}, ALL, "sub-pixel"),
+        ({"aa": -1}, ALL, "sub-pixel"),
         ({"primary": "voxels"}, ALL, "voxels"),
         ({"denoise": "blur"}, ALL, "oidn"),
         ({}, ("Combined", "Shadow"), "Shadow"),

@@ -14,7 +14,8 @@ ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "drgs_blender"
 #: What the extension may use of the engine's package.
 LIGHT_MODULES = tuple(
-    f"engine.{name}" for name in ("protocol", "client", "codec", "slots", "shared", "child", "locate")
+    f"engine.{name}"
+    for name in ("protocol", "client", "codec", "slots", "shared", "child", "locate", "snapshots", "frame_file")
 )
 
 
@@ -71,7 +72,7 @@ def test_lower_ranks_never_import_higher_ones():
 
 def test_folders_of_the_renderer_use_those_on_their_left():
     page = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
-    line = next(line for line in page.splitlines() if line.endswith("<- pipeline"))
+    line = next(line for line in page.splitlines() if line.endswith("<- progressive"))
     order = {name: rank for rank, names in enumerate(line.split("<-")) for name in names.split()}
     folder = PACKAGE / "render"
     assert {p.stem for p in folder.iterdir() if p.stem not in ("__init__", "__pycache__", "reference")} == set(order)
@@ -91,7 +92,7 @@ def test_the_engine_never_imports_blender():
     wrong = [
         f"{path.relative_to(ROOT)}:{line} imports {module}"
         for path in sources(PACKAGE)
-        if path.name != "blender_job.py"  # the one script of the package that runs inside Blender
+        if path.name not in ("blender_job.py", "scene_job.py")  # the scripts of the package that run inside Blender
         for line, module, _ in imports(path, ROOT)
         if module.split(".")[0] in ("bpy", "mathutils", "bl_ext", "addon_utils")
     ]

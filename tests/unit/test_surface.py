@@ -205,7 +205,7 @@ def test_what_moves_is_followed_as_if_it_were_new() -> None:
         ([thing], [lone, replace(many, uvs=many.uvs[::-1].copy(), material_index=1 - many.material_index)], True),
         ([thing], [lone, replace(many, materials=many.materials[::-1])], True),
         ([thing], [replace(lone, visibility=Visibility(glossy=False)), many], False),
-        ([thing], [replace(lone, matrices=np.stack(MATRICES), pass_indices=np.arange(4)), many], False),
+        ([thing], [replace(lone, matrices=np.stack(MATRICES) + 0.2, pass_indices=np.arange(4)), many], False),
         ([thing], [many, lone], False),
         ([], [many], False),
         ([thing, thing], [], False),
@@ -253,6 +253,16 @@ def test_visibility_decides_what_rays_meet() -> None:
         assert (numbers[0, 2], numbers[0, 3]) == (owner, owner >= 0), mask
     np.testing.assert_array_equal(scene.object_flags, [0, masks.CATCHER, 0, 0, masks.HOLDOUT, 0, 0])
     assert scene.any_ordinary
+
+
+def test_faces_that_a_matrix_flattens_are_counted_while_it_does() -> None:
+    vertices, faces = lumpy(2)
+    scene = TraceScene()
+    mesh = mesh_state(vertices, faces, matrix((0, 0, 0), (1, 1, 1)))
+    for scale, lost in (((1, 1, 1), 0), ((0, 0, 0), 1), ((1, 0, 0), 1), ((1e-20,) * 3, 1), ((1e-3,) * 3, 0)):
+        mesh = replace(mesh, matrices=np.array([matrix((0, 0, 0), scale)]))
+        scene.update([], [mesh])
+        assert scene.faults[0].empty_faces == lost * len(faces)
 
 
 def bad(value: float) -> np.ndarray:

@@ -9,7 +9,7 @@ from drgs_blender.frame import Camera, RenderSettings
 from drgs_blender.jit import get_num_threads, use_threads
 from drgs_blender.render.camera import camera_parameters, camera_ray
 from drgs_blender.render.picture.denoise import LIGHT, PAD, Guides, Signal, demodulate
-from drgs_blender.render.picture.motion import Motion, MotionFilm, previous_positions, project
+from drgs_blender.render.picture.motion import Instant, Motion, MotionFilm, previous_positions, project
 from drgs_blender.render.picture.temporal import Shot, denoise_next, window
 
 H, W = 48, 64
@@ -106,6 +106,12 @@ def test_projection_inverts_the_camera_ray(orthographic: bool) -> None:
         assert np.allclose(project(p, *(o[:3] + depth * o[3:])), (x, y, depth), atol=1e-9)
 
 
+def instant(vertices: np.ndarray | None = None, places: object = (), **changes: object) -> Instant:
+    """The given shapes before the camera."""
+    shapes = np.zeros((0, 3), np.float32) if vertices is None else vertices
+    return Instant(shapes, np.array(places, np.float32).reshape(-1, 3, 4), parameters(**changes))
+
+
 def mesh(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     return rng.normal(size=(60, 3)).astype(np.float32), rng.permutation(60).reshape(20, 3).astype(np.int32)
 
@@ -124,13 +130,14 @@ def test_points_move_with_their_faces() -> None:
     turn *= np.sign(np.linalg.det(turn))
     before = (vertices @ turn.T + [1, 2, 3]).astype(np.float32)
     for points in (on, on + tilt):  # on the mesh, and off it
-        found = previous_positions(faces, vertices, before, face, weights[:, 1:], points.astype(np.float32))
+        tied = face, np.full(200, -1, np.int32), weights[:, 1:]
+        found = previous_positions(faces, instant(vertices), instant(before), *tied, points.astype(np.float32))
         assert np.abs(found - (points @ turn.T + [1, 2, 3])).max() < 2e-5
     # Any affine map: what lies in the face's plane follows exactly, what stands off keeps its distance.
     matrix = rng.normal(size=(3, 3))
     before = (vertices @ matrix.T).astype(np.float32)
     shifted = on + 0.05 * (corners[:, 1] - corners[:, 0])
-    found = previous_positions(faces, vertices, before, face, weights[:, 1:], shifted.astype(np.float32))
+    found = previous_positions(faces, instant(vertices), instant(before), *tied, shifted.astype(np.float32))
     assert np.abs(found - shifted @ matrix.T).max() < 2e-4
 
 
@@ -139,25 +146,28 @@ def test_points_without_a_face_stand_still_and_flat_faces_do_no_harm() -> None:
     vertices[faces[3]] = vertices[faces[3, 0]]
     points = np.random.default_rng(3).normal(size=(2, 3)).astype(np.float32)
     third = np.full((2, 2), 1 / 3, np.float32)
-    found = previous_positions(faces, vertices, vertices + np.float32(1), np.array([-1, 3], np.int32), third, points)
+    tied = np.array([-1, 3], np.int32), np.array([-1, -1], np.int32), third
+    found = previous_positions(faces, instant(vertices), instant(vertices + np.float32(1)), *tied, points)
     assert (found[0] == points[0]).all()
     assert np.allclose(found[1], points[1] + 1, atol=1e-5)
 
 
 def test_vectors_lead_to_the_place_in_the_picture_before() -> None:
     guides = wall()
-    film = MotionFilm((H, W), (0, 0), parameters())
-    rest = film.motion(guides.position, guides.coverage, parameters())
+    film = MotionFilm((H, W), (0, 0), instant(), instant())
+    rest = film.motion(guides.position, guides.coverage)
     assert (rest.vector == 0).all() and (rest.previous == guides.position).all()
     matrix = camera().matrix_world.copy()
     matrix[0, 3] = 3 * PITCH  # the camera was three pixels further right: the wall, further left in its picture
-    found = film.motion(guides.position, guides.coverage, parameters(matrix_world=matrix))
+    film.then = instant(matrix_world=matrix)
+    found = film.motion(guides.position, guides.coverage)
     assert np.allclose(found.vector, [-3, 0], atol=1e-4)
     film.displacement[..., 2] = 2 * PITCH  # the wall was higher
-    found = film.motion(guides.position, guides.coverage, parameters())
+    film.then = instant()
+    found = film.motion(guides.position, guides.coverage)
     assert np.allclose(found.vector, [0, -2], atol=1e-4)
     film.displacement[..., 1] = -5  # it was behind the camera
-    found = film.motion(guides.position, np.where(np.arange(W) < 5, 0, guides.coverage), parameters())
+    found = film.motion(guides.position, np.where(np.arange(W) < 5, 0, guides.coverage))
     assert np.isnan(found.vector).all()
 
 
@@ -175,9 +185,13 @@ def test_samples_make_up_a_pixels_motion_as_they_make_up_its_position() -> None:
     buffer.points.weight[:] = [0.25, 0.75, 1.0, 1.0]
     buffer.points.flags[3] = CATCHER
     previous = np.float32([[4, 0, 0], [0, 4, 0], [9, 9, 9], [7, 7, 7]])
-    film = MotionFilm((H, W), (0, 0), p)
-    film.add(buffer, previous)
+    film = MotionFilm((H, W), (0, 0), instant(), instant())
+    buffer.face[:] = 3
+    film.displace(buffer, previous)
     assert np.allclose(film.displacement[7, 9], [1, 3, 0])
+    buffer.face[1] = -1  # of a surfel off the mesh: it follows the others
+    film.displace(buffer, previous)
+    assert np.allclose(film.displacement[7, 9], [4, 0, 0])
     film.displacement[7, 9] = 0
     assert (film.displacement == 0).all()
 

@@ -1,0 +1,74 @@
+"""Bake Light: through Blender's evaluation and the program, back to attributes and images."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+import pytest
+from scenes import new_world, read_exr, select, write_ball
+
+
+@pytest.fixture
+def lit(ball, scene):
+    """The ball, white and rough, under a world whose strength grows with the frames."""
+    _, background = new_world(scene)
+    background.inputs["Color"].default_value = (1, 1, 1, 1)
+    for number in (1, 2):
+        background.inputs["Strength"].default_value = number
+        background.inputs["Strength"].keyframe_insert("default_value", frame=number)
+    for name, value in (("albedo", (0.5, 0.25, 0.1, 1)), ("roughness", 1.0), ("metallic", 0.0)):
+        values = np.tile(np.float32(value), (len(ball.data.vertices), 1)).ravel()
+        ball.data.attributes[name].data.foreach_set("color" if name == "albedo" else "value", values)
+    ball.data.update_tag()
+    scene.drgs.look, scene.drgs.bounces = "paper", 0
+    scene.frame_start, scene.frame_end = 1, 2
+    scene.frame_set(1)
+    return ball
+
+
+def colours(obj, name: str) -> np.ndarray:
+    values = np.empty(4 * len(obj.data.vertices), np.float32)
+    obj.data.attributes[name].data.foreach_get("color", values)
+    return values.reshape(-1, 4)
+
+
+def test_a_frame_and_an_animation_go_to_attributes_of_all_objects(lit, scene, tmp_path):
+    bpy.ops.import_scene.drgs(filepath=str(write_ball(tmp_path / "two.drgs")))
+    second = bpy.context.active_object
+    second.location.x = 50
+    select(second, lit)
+    assert bpy.ops.drgs.bake_light(light="diffuse", rays=1024) == {"FINISHED"}
+    np.testing.assert_allclose(colours(lit, "relit"), np.tile([0.5, 0.25, 0.1, 1], (86, 1)), rtol=0.03)
+    assert np.ptp(colours(second, "relit")[:, 0]) > 0.2  # its colours vary over the mesh
+    select(lit)
+    assert bpy.ops.drgs.bake_light(light="diffuse", rays=1024, use_animation=True) == {"FINISHED"}
+    for number in (1, 2):
+        np.testing.assert_allclose(colours(lit, f"relit.{number:04}")[:, 0], 0.5 * number, rtol=0.03)
+    assert scene.frame_current == 1 and "relit.0001" not in second.data.attributes
+
+
+def test_images_are_written_by_the_uv_map(lit, scene, tmp_path):
+    with pytest.raises(RuntimeError, match="has no UV map"):
+        bpy.ops.drgs.bake_light(target="IMAGE", directory=str(tmp_path))
+    layer = lit.data.uv_layers.new(name="Box")
+    corners = np.array([v.co[:2] for v in lit.data.vertices])[[loop.vertex_index for loop in lit.data.loops]]
+    layer.uv.foreach_set("vector", (corners / 2 + 0.5).astype(np.float32).ravel())
+    options = {"target": "IMAGE", "directory": str(tmp_path), "size": 32, "rays": 32, "light": "diffuse"}
+    assert bpy.ops.drgs.bake_light(**options, use_animation=True) == {"FINISHED"}
+    first, second = (read_exr(tmp_path / f"ball_{number:04}.exr", 32, 32)[8:24, 8:24] for number in (1, 2))
+    # Smooth normals of coarse faces lose what lies below the face itself, in the renderer as well: at most a tenth.
+    assert 0.45 < first[..., 0].mean() < 0.5 and (first[..., 3] == 1).all()
+    np.testing.assert_allclose(first[..., 1:3], first[..., :1] * [0.5, 0.2], rtol=1e-3)
+    np.testing.assert_allclose(second[..., :3].mean(), 2 * first[..., :3].mean(), rtol=0.02)
+    image = bpy.data.images["ball_0001.exr"]
+    assert image.source == "SEQUENCE"
+
+
+def test_nothing_is_baked_over_a_material_or_of_what_is_not_rendered(lit):
+    for name in ("", "albedo"):
+        with pytest.raises(RuntimeError, match="Choose another"):
+            bpy.ops.drgs.bake_light(name=name)
+    lit.visible_camera = lit.visible_diffuse = lit.visible_glossy = lit.visible_shadow = False
+    with pytest.raises(RuntimeError, match="is not rendered"):
+        bpy.ops.drgs.bake_light()
+    assert "relit" not in lit.data.attributes

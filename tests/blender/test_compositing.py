@@ -1,0 +1,118 @@
+"""DR-GS over another engine's picture: the same picture as that of one engine which renders everything."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+import pytest
+from scenes import mesh_object, new_world, part, read_exr
+from test_composed import CUBE, SIDES, lamp, painted
+
+WIDTH, HEIGHT, BLOCK = 64, 48, 8
+
+
+@pytest.fixture
+def shared_scene(ball, scene):
+    """The ball on a floor in the sun, a cube in front of a part of it and one behind; Cycles renders."""
+    _, background = new_world(scene)
+    background.inputs["Color"].default_value, background.inputs["Strength"].default_value = (1, 1, 1, 1), 0.3
+    square = [(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)]
+    floor = painted(mesh_object("Floor", square, [(0, 1, 2, 3)]), (0.5, 0.5, 0.5), 1.0)
+    floor.scale, floor.location = (6, 6, 1), (0, 0, -1)
+    front = painted(mesh_object("Front", CUBE, SIDES), (0.8, 0.2, 0.1), 1.0)
+    front.scale, front.location = (0.3, 0.3, 0.6), (0.5, -1.5, -0.4)
+    back = painted(mesh_object("Back", CUBE, SIDES), (0.1, 0.3, 0.8), 1.0)
+    back.scale, back.location = (0.5, 0.5, 0.9), (-1.0, 1.8, -0.1)
+    lamp(scene, "SUN", 2, (2, -2, 3), angle=0.05)
+    scene.camera.location, scene.camera.rotation_euler = (0, -5, 1), (np.pi / 2 - 0.2, 0, 0)
+    scene.render.engine = "CYCLES"
+    cycles = scene.cycles
+    cycles.device, cycles.samples, cycles.use_adaptive_sampling, cycles.use_denoising = "CPU", 128, False, False
+    cycles.pixel_filter_type, cycles.filter_width, cycles.max_bounces = "BOX", 1.0, 0
+    settings = scene.drgs
+    settings.use_custom_split, settings.rays, settings.aa, settings.bounces = False, 128, 16, 0
+    settings.primary = "mesh"
+    return scene
+
+
+def picture(scene) -> np.ndarray:
+    bpy.ops.render.render(write_still=True)
+    return read_exr(scene.render.filepath, WIDTH, HEIGHT)
+
+
+def blocks(image: np.ndarray) -> np.ndarray:
+    return image.reshape(HEIGHT // BLOCK, BLOCK, WIDTH // BLOCK, BLOCK, 4).mean(axis=(1, 3))
+
+
+@pytest.mark.parametrize("options", [{}, {"shadows": "HOLDOUT"}, {"compare": True}])
+def test_the_composite_is_the_picture_of_one_engine(shared_scene, options):
+    """In front, behind, on the floor: shadows and edges are where Cycles alone has them."""
+    alone = blocks(picture(shared_scene))
+    assert bpy.ops.drgs.set_up_compositing(**options) == {"FINISHED"}
+    both = blocks(picture(shared_scene))
+    np.testing.assert_allclose(both, alone, atol=0.03, rtol=0.03)
+    bpy.ops.drgs.clear_compositing()
+    np.testing.assert_allclose(blocks(picture(shared_scene)), alone, atol=1e-4)
+    assert len(bpy.data.scenes) == 1
+
+
+def test_the_nodes_of_others_stay_between_picture_and_result(shared_scene):
+    """What the artist does with the picture is done with both; again and again gives the same nodes."""
+    compositing = part("addon.compositing")
+    scene = shared_scene
+    tree = compositing.tree_of(scene, create=True)
+    for node in list(tree.nodes):
+        tree.nodes.remove(node)
+    below, blur = tree.nodes.new("CompositorNodeRLayers"), tree.nodes.new("CompositorNodeBlur")
+    tree.links.new(below.outputs["Image"], blur.inputs["Image"])
+    before = {n.name for n in tree.nodes}
+    for shadows in ("CATCHER", "HOLDOUT", "CATCHER"):
+        bpy.ops.drgs.set_up_compositing(shadows=shadows)
+        (over,) = (n for n in tree.nodes if n.bl_idname == "CompositorNodeAlphaOver")
+        assert blur.inputs["Image"].links[0].from_node == over
+        pictures = [s.links[0].from_node for s in over.inputs if s.type == "RGBA"]
+        assert pictures[0] == below and pictures[1].scene == compositing.partner_of(scene)
+        assert len(tree.nodes) == len(before) + 2 and len(bpy.data.scenes) == 2
+    bpy.ops.drgs.clear_compositing()
+    assert {n.name for n in tree.nodes} == before and blur.inputs["Image"].links[0].from_node == below
+
+
+def test_settings_of_the_second_scene_survive_and_what_it_lacks_is_named(shared_scene, captured, ball):
+    scene = shared_scene
+    bpy.ops.drgs.set_up_compositing()
+    compositing = part("addon.compositing")
+    partner = compositing.partner_of(scene)
+    partner.drgs.rays = 77
+    scene.render.resolution_x, scene.render.use_border, scene.render.border_max_x = 40, True, 0.5
+    mesh_object("New", CUBE, SIDES)
+    second = ball.copy()
+    scene.collection.objects.link(second)
+    bpy.ops.render.render()
+    (frame,) = captured
+    assert (frame.camera.width, frame.camera.region) == (40, (0, 0, 20, HEIGHT)) and frame.settings.rays == 77
+    assert all(m.visibility.shadow_catcher for m in frame.meshes) and len(frame.objects) == 1
+    last = part("addon.messages").history[-1]
+    assert '"New"' in last.text and f'"{second.name}"' in last.text and "again" in last.text
+    bpy.ops.drgs.set_up_compositing()
+    partner = compositing.partner_of(scene)
+    assert partner.drgs.rays == 77 and not compositing.differences(partner)
+    bpy.ops.render.render()
+    assert len(captured[1].objects) == 2 and len(captured[1].meshes) == 4
+
+
+def test_what_cannot_be_composited_is_refused_in_words(shared_scene, ball):
+    scene = shared_scene
+    scene.render.engine = "DRGS"
+    with pytest.raises(RuntimeError, match="Choose Cycles or EEVEE"):
+        bpy.ops.drgs.set_up_compositing()
+    scene.render.engine = "BLENDER_EEVEE" if bpy.app.version >= (5, 0, 0) else "BLENDER_EEVEE_NEXT"
+    with pytest.raises(RuntimeError, match="need Cycles"):
+        bpy.ops.drgs.set_up_compositing(shadows="HOLDOUT")
+    camera, scene.camera = scene.camera, None
+    with pytest.raises(RuntimeError, match="has no camera"):
+        bpy.ops.drgs.set_up_compositing()
+    scene.camera = camera
+    bpy.data.objects.remove(ball)
+    with pytest.raises(RuntimeError, match="has no DR-GS object"):
+        bpy.ops.drgs.set_up_compositing()
+    assert len(bpy.data.scenes) == 1

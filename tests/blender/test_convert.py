@@ -1,0 +1,144 @@
+"""Convert to DR-GS: what other importers left in the scene."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+import pytest
+from mathutils import Matrix
+from scenes import asset_of, mesh_object, part, select, sphere
+
+
+def columns() -> dict[str, np.ndarray]:
+    """Splats on a sphere, as a PLY names them, with harmonics of degree 1."""
+    surfels = asset_of(*sphere(12, 20)).surfels
+    n = len(surfels.centre)
+    rng = np.random.default_rng(1)
+    found = {name: surfels.centre[:, i] for i, name in enumerate("xyz")}
+    found |= {f"f_dc_{i}": rng.normal(scale=0.5, size=n) for i in range(3)}
+    found |= {f"f_rest_{i}": rng.normal(scale=0.1, size=n) for i in range(9)}
+    found |= {"opacity": np.full(n, 3.0)} | {f"scale_{i}": np.log(surfels.scale[:, i]) for i in range(2)}
+    found |= {"scale_2": np.full(n, np.log(1e-4))} | {f"rot_{i}": surfels.rotation[:, i] for i in range(4)}
+    return {name: np.asarray(values, np.float32) for name, values in found.items()}
+
+
+def cloud(attributes: dict[str, tuple[str, np.ndarray]]) -> bpy.types.Object:
+    """A mesh of points with these attributes: name -> (type, values)."""
+    given = columns()
+    obj = mesh_object("Cloud", np.stack([given[a] for a in "xyz"], axis=1), [])
+    for name, (kind, values) in attributes.items():
+        prop = {"FLOAT_VECTOR": "vector", "FLOAT_COLOR": "color"}.get(kind, "value")
+        data = obj.data.attributes.new(name, kind, "POINT").data
+        data.foreach_set(prop, np.ascontiguousarray(values, np.float32).ravel())
+    select(obj)
+    return obj
+
+
+def of_ply() -> dict:
+    return {name: ("FLOAT", v) for name, v in columns().items() if name not in "xyz"}
+
+
+def native() -> dict:
+    """Blender's own names: linear scale, activated opacity."""
+    given = columns()
+    stack = lambda *names: np.stack([given[n] for n in names], axis=1)  # noqa: E731
+    opacity = 1 / (1 + np.exp(-given["opacity"]))
+    found = {
+        "scale": ("FLOAT_VECTOR", np.exp(stack("scale_0", "scale_1", "scale_2"))),
+        "rotation": ("QUATERNION", stack("rot_0", "rot_1", "rot_2", "rot_3")),
+        "radiance:base": ("FLOAT_COLOR", np.column_stack((stack("f_dc_0", "f_dc_1", "f_dc_2"), opacity))),
+    }
+    for k in range(3):
+        found[f"radiance:sh_{k}"] = ("FLOAT_VECTOR", stack(*(f"f_rest_{c * 3 + k}" for c in range(3))))
+    return found
+
+
+def of_addon() -> dict:
+    """Those of gaussian-splatting-blender-addon."""
+    given = columns()
+    stack = lambda *names: np.stack([given[n] for n in names], axis=1)  # noqa: E731
+    found = {
+        "logscale": ("FLOAT_VECTOR", stack("scale_0", "scale_1", "scale_2")),
+        "log_opacity": ("FLOAT", given["opacity"]),
+        "quatxyz": ("FLOAT_VECTOR", stack("rot_1", "rot_2", "rot_3")),
+        "quatw": ("FLOAT", given["rot_0"]),
+        "sh0": ("FLOAT_VECTOR", stack("f_dc_0", "f_dc_1", "f_dc_2")),
+    }
+    for k in range(3):
+        found[f"sh{k + 1}"] = ("FLOAT_VECTOR", stack(*(f"f_rest_{c * 3 + k}" for c in range(3))))
+    return found
+
+
+@pytest.mark.parametrize("kind", [of_ply, native, of_addon])
+@pytest.mark.parametrize("points", [False, True])
+def test_attributes_are_read_as_the_columns_of_a_ply(scene, kind, points):
+    obj = cloud(kind())
+    if points:
+        targets = bpy.ops.object.convert.get_rna_type().properties["target"].enum_items
+        if "POINTCLOUD" not in targets:
+            pytest.skip("this Blender does not convert meshes to point clouds")
+        bpy.ops.object.convert(target="POINTCLOUD")
+        assert obj.type == "POINTCLOUD"
+    attributes = part("addon.splat_attributes")
+    assert attributes.is_splats(obj.data)
+    found, wanted = attributes.read_splats(obj.data), columns()
+    assert set(found) - {"radius"} == set(wanted)
+    for name, values in wanted.items():
+        np.testing.assert_allclose(found[name], values, atol=2e-3 if name == "opacity" else 2e-5, err_msg=name)
+
+
+def test_splats_become_an_object_at_their_place(scene, tmp_path):
+    obj = cloud(of_ply())
+    obj.matrix_world = Matrix.Translation((4, 5, 6)) @ Matrix.Rotation(1, 4, "Y") @ Matrix.Scale(3, 4)
+    assert bpy.ops.drgs.convert(use_mesh=False) == {"FINISHED"}
+    made = bpy.context.active_object
+    assert made.drgs.is_drgs and made.name.startswith("Cloud") and obj.hide_render
+    np.testing.assert_allclose(np.array(made.matrix_world), np.array(obj.matrix_world), atol=1e-6)
+    asset = part("addon.assets").load(tmp_path / "Cloud.drgs")
+    np.testing.assert_allclose(asset.surfels.centre, np.stack([columns()[a] for a in "xyz"], axis=1), atol=1e-6)
+    np.testing.assert_allclose(asset.surfels.sh[:, 1, 0], columns()["f_rest_0"], atol=1e-6)
+
+
+def test_a_textured_mesh_becomes_an_object_at_its_place(scene, tmp_path):
+    obj = mesh_object("Ball", *sphere(16, 24))
+    obj.location = (1, 2, 3)
+    image = bpy.data.images.new("Red", 4, 4)
+    image.pixels.foreach_set(np.tile(np.float32((0.5, 0, 0, 1)), 16))
+    image.pack()
+    material = bpy.data.materials.new("Paint")
+    if material.node_tree is None:
+        material.use_nodes = True
+    nodes = material.node_tree.nodes
+    texture = nodes.new("ShaderNodeTexImage")
+    texture.image = image
+    surface = next(n for n in nodes if n.type == "BSDF_PRINCIPLED")
+    surface.inputs["Roughness"].default_value = 0.25
+    material.node_tree.links.new(texture.outputs["Color"], surface.inputs["Base Color"])
+    obj.data.materials.append(material)
+    obj.data.uv_layers.new()
+    select(obj)
+    assert bpy.ops.drgs.convert(out=str(tmp_path / "red.drgs"), use_original=True) == {"FINISHED"}
+    made = bpy.context.active_object
+    assert made.name == "red" and made.drgs.is_drgs and not obj.hide_render
+    points = np.array([made.matrix_world @ v.co for v in made.data.vertices])
+    np.testing.assert_allclose([points.min(axis=0), points.max(axis=0)], [[0, 1, 2], [2, 3, 4]], atol=0.02)
+    mesh = part("addon.assets").load(tmp_path / "red.drgs").mesh
+    np.testing.assert_allclose(mesh.albedo, np.tile([0.214, 0, 0], (len(mesh.albedo), 1)), atol=0.01)  # sRGB 0.5
+    np.testing.assert_allclose(mesh.roughness, 0.25, atol=0.01)
+
+
+def test_what_cannot_be_converted_is_said(ball, scene, tmp_path):
+    select(ball)
+    with pytest.raises(RuntimeError, match="is a DR-GS object already"):
+        bpy.ops.drgs.convert()
+    light = bpy.data.objects.new("Lamp", bpy.data.lights.new("Lamp", "POINT"))
+    scene.collection.objects.link(light)
+    select(light)
+    with pytest.raises(RuntimeError, match="neither faces nor the attributes of splats"):
+        bpy.ops.drgs.convert()
+    broken = of_ply()
+    obj = cloud({"opacity": ("FLOAT", broken["opacity"][1]), "scale_0": ("FLOAT", broken["scale_0"][1]),
+                 "rot_0": ("FLOAT", broken["rot_0"][1])})  # fmt: skip
+    with pytest.raises(RuntimeError, match=r'"Cloud".*could not be made into an asset'):
+        bpy.ops.drgs.convert()
+    assert not obj.hide_render

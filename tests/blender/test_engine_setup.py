@@ -1,0 +1,191 @@
+"""The engine's own environment: made, cancelled, resumed, repaired; real pip, a small engine."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sys
+import time
+import zipfile
+from pathlib import Path
+
+import bpy
+import pytest
+from scenes import PACKAGE, part
+
+setup = part("addon.engine_setup")
+job = part("addon.setup_job")
+errors = part("drgs_blender.errors")
+
+DOCTOR = "import {0}\nprint('DR-GS can render here.')\n"
+
+
+def wheel(folder: Path, name: str) -> str:
+    """A package of one empty module; its requirement."""
+    path, info = folder / f"{name}-1.0-py3-none-any.whl", f"{name}-1.0.dist-info"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr(f"{name}.py", "")
+        archive.writestr(f"{info}/METADATA", f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+        archive.writestr(f"{info}/WHEEL", "Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n")
+        archive.writestr(f"{info}/RECORD", "")
+    return f"{name} @ {path.as_uri()}"
+
+
+def engine_source(folder: Path, requirement: str, program: str) -> Path:
+    """Sources of an engine with one requirement, whose `drgs doctor` is `program`."""
+    cli = folder / "drgs_blender" / "cli"
+    cli.mkdir(parents=True)
+    (folder / "pyproject.toml").write_text(f'[project]\nname = "small"\ndependencies = ["{requirement}"]\n')
+    for path, text in ((cli.parent / "__init__.py", ""), (cli / "__init__.py", ""), (cli / "main.py", program)):
+        path.write_text(text)
+    return folder
+
+
+def until_done(running, seconds: float = 120) -> list[float]:
+    """Poll to the end; the fractions that were seen. No poll may take long."""
+    fractions, end = [], time.monotonic() + seconds
+    while True:
+        begin = time.thread_time()
+        done = running.poll()
+        assert time.thread_time() - begin < 0.5
+        fractions.append(running.fraction)
+        if done:
+            if running.error is not None and "Preparing pip" in str(running.error):
+                pytest.skip("no package index can be reached")
+            return fractions
+        assert time.monotonic() < end, running.text
+        time.sleep(0.02)
+
+
+def packages_of_this_python() -> str:
+    """What tells one state of the installed packages from another."""
+    found = sorted(p.name for p in Path(bpy.__file__).parents[1].iterdir())
+    return hashlib.sha256("\n".join(found).encode()).hexdigest()
+
+
+def alive(group: int) -> list[str]:
+    """States of the processes of a group that have not ended."""
+    found = []
+    for status in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            state, _, own = status.read_text().rpartition(")")[2].split()[:3]
+        except OSError:  # it has just ended
+            continue
+        if int(own) == group and state != "Z":
+            found.append(state)
+    return found
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> tuple[Path, Path]:
+    """An environment whose set-up was cancelled and went on, and the sources of its engine."""
+    top = tmp_path_factory.mktemp("setup")
+    source = engine_source(top / "source", wheel(top, "tinydep"), DOCTOR.format("tinydep"))
+    folder, before = top / "engine", packages_of_this_python()
+    assert setup.state(folder, source) == "absent" and setup.needs_network(folder, source)
+    running = setup.EngineSetup(folder, Path(sys.executable), source)
+    process = running._process
+    time.sleep(0.3)
+    begin = time.monotonic()
+    running.cancel()
+    assert time.monotonic() - begin < 2 and process.poll() is not None and running.done
+    assert setup.state(folder, source) == "partial"
+    if sys.platform == "linux":
+        while alive(process.pid) and time.monotonic() - begin < 5:  # killed, and a moment away from its end
+            time.sleep(0.02)
+        assert not alive(process.pid)
+    more = setup.EngineSetup(folder, Path(sys.executable), source)
+    fractions = until_done(more)
+    assert more.error is None and more.text == "Ready"
+    assert fractions == sorted(fractions) and fractions[-1] == 1 and len(set(fractions)) > 3
+    assert packages_of_this_python() == before
+    return folder, source
+
+
+def test_another_version_of_the_engine_needs_no_network(made):
+    folder, source = made
+    assert setup.state(folder, source) == "ready" and not setup.needs_network(folder, source)
+    (source / "drgs_blender" / "new.py").write_text("")
+    setup.digest.cache_clear()
+    assert setup.state(folder, source) == "old"
+    again = setup.EngineSetup(folder, Path("/no/python/is/needed"), source)
+    assert again.fraction > 0.8
+    until_done(again)
+    assert again.error is None and setup.state(folder, source) == "ready"
+    assert list(folder.rglob("new.py")) and not list(folder.rglob("drgs_blender.old"))
+
+
+def test_an_engine_that_does_not_work_is_not_ready(made):
+    folder, source = made
+    program = source / "drgs_blender" / "cli" / "main.py"
+    before = program.read_text()
+    try:
+        program.write_text("raise SystemExit('error: no Embree')")
+        setup.digest.cache_clear()
+        running = setup.EngineSetup(folder, Path(sys.executable), source)
+        until_done(running)
+        assert "no Embree" in str(running.error) and "setup.log" in str(running.error)
+        assert setup.state(folder, source) == "old"
+    finally:
+        program.write_text(before)
+        setup.digest.cache_clear()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="environments have no links there")
+def test_an_environment_whose_python_has_gone_is_made_anew(made, tmp_path):
+    folder, source = made
+    own = setup.interpreter(folder)
+    kept = own.readlink()
+    own.unlink()
+    own.symlink_to(tmp_path / "gone")
+    try:
+        assert setup.state(folder, source) == "partial" and setup.needs_network(folder, source)
+        running = setup.EngineSetup(folder, tmp_path / "no-python", source)
+        assert "--clear" in running._plan(Path(sys.executable), False)[0].command
+    finally:
+        own.unlink()
+        own.symlink_to(kept)
+
+
+def test_a_python_that_is_none_is_named(tmp_path):
+    source = engine_source(tmp_path / "source", "x", "")
+    running = setup.EngineSetup(tmp_path / "engine", tmp_path / "no-python", source)
+    assert running.done and "no-python" in str(running.error)
+
+
+def test_too_little_room_is_told_before_anything_is_fetched(tmp_path, monkeypatch):
+    monkeypatch.setattr(setup, "DISK_BYTES", 1e18)
+    with pytest.raises(errors.DeviceError, match="MB left"):
+        setup.EngineSetup(tmp_path / "engine", Path(sys.executable))
+
+
+def test_the_extension_brings_what_the_engine_needs():
+    assert any(r.startswith("numba") for r in setup.requirements())
+    assert (setup.SOURCE / "drgs_blender" / "cli" / "doctor.py").is_file()
+
+
+def test_offline_nothing_begins(scene, monkeypatch):
+    if bpy.app.online_access:
+        pytest.skip("this Blender is online")
+    with pytest.raises(RuntimeError, match="Allow Online Access"):
+        bpy.ops.drgs.engine_setup()
+    assert not job.running() and setup.state(part("addon.engine_link").own_folder()) == "absent"
+
+
+def test_an_existing_engine_is_chosen_and_another_program_refused(scene, monkeypatch, tmp_path):
+    place = os.environ["DRGS_ENGINE"]
+    monkeypatch.delenv("DRGS_ENGINE")
+    link, settings = part("addon.engine_link"), bpy.context.preferences.addons[PACKAGE].preferences
+    link.stop()
+    assert "not set up" in link.problem()
+    with pytest.raises(RuntimeError, match="Press Set Up Engine"):
+        bpy.ops.drgs.engine_test()
+    (tmp_path / "text").write_text("no program")
+    with pytest.raises(RuntimeError, match="is not an interpreter"):
+        bpy.ops.drgs.engine_choose(filepath=str(tmp_path / "text"))
+    assert not settings.engine_python
+    try:
+        assert bpy.ops.drgs.engine_choose(filepath=place) == {"FINISHED"}
+        assert settings.engine_python == place and link.is_running() and not link.problem()
+    finally:
+        settings.engine_python = ""

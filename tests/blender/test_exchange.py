@@ -1,0 +1,169 @@
+"""What leaves Blender as files of other programs, read by Blender's own importers, and what comes back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+from mathutils import Matrix
+from scenes import part, read_exr, write_exr
+
+
+def imported(operator, path: Path) -> list:
+    """What an importer of Blender adds to the scene."""
+    before = set(bpy.data.objects)
+    assert operator(filepath=str(path)) == {"FINISHED"}
+    return [o for o in bpy.data.objects if o not in before]
+
+
+def world_points(objects) -> np.ndarray:
+    points = [np.array(o.matrix_world @ v.co) for o in objects if o.type == "MESH" for v in o.data.vertices]
+    return np.array(points)
+
+
+def attribute(obj, name: str) -> np.ndarray:
+    values = np.empty(len(obj.data.vertices), np.float32)
+    obj.data.attributes[name].data.foreach_get("value", values)
+    return values
+
+
+def centres(path: Path) -> np.ndarray:
+    """Where the splats of an asset are."""
+    return np.array(part("drgs_blender.asset.container").read_asset(path).surfels.centre)
+
+
+def test_splats_stand_in_the_file_as_in_the_scene(ball, ball_file, scene, tmp_path):
+    """Blender's own PLY importer finds them, turned, moved and scaled, in the painted colour."""
+    ball.matrix_world = Matrix.Translation((1, 2, 3)) @ Matrix.Rotation(0.5, 4, "X") @ Matrix.Scale(2, 4)
+    count = len(ball.data.vertices)
+    part("addon.mesh_arrays").write_channel(ball.data, "albedo", np.tile(np.float32((0.9, 0.2, 0.1)), (count, 1)))
+    bpy.context.view_layer.update()
+    out, temporary = tmp_path / "ball", Path(bpy.app.tempdir).parent
+    before = set(temporary.glob("drgs-export-*"))
+    assert bpy.ops.drgs.export(filepath=str(out), format="3DGS PLY", colour="albedo", scale=10) == {"FINISHED"}
+    (cloud,) = imported(bpy.ops.wm.ply_import, tmp_path / "ball.ply")
+    matrix = np.array(ball.matrix_world)
+    wanted = 10 * (centres(ball_file) @ matrix[:3, :3].T + matrix[:3, 3])
+    np.testing.assert_allclose(world_points([cloud]), wanted, atol=1e-4)
+    red = 0.5 + 0.28209479 * attribute(cloud, "f_dc_0")
+    np.testing.assert_allclose(red, 1.055 * 0.9 ** (1 / 2.4) - 0.055, atol=2e-3)
+    assert set(temporary.glob("drgs-export-*")) <= before
+
+
+@pytest.mark.parametrize(("name", "end"), [("glTF mesh", ".glb"), ("USD mesh", ".usdz")])
+def test_the_mesh_opens_with_its_materials(ball, scene, tmp_path, name, end):
+    ball.location, ball.rotation_euler = (1, -2, 3), (0.4, 0, 0.2)
+    bpy.context.view_layer.update()
+    assert bpy.ops.drgs.export(filepath=str(tmp_path / "ball.xyz"), format=name) == {"FINISHED"}
+    path = tmp_path / f"ball.xyz{end}"
+    found = imported(bpy.ops.import_scene.gltf if end == ".glb" else bpy.ops.wm.usd_import, path)
+    points, wanted = world_points(found), world_points([ball])
+    apart = np.abs(points[:, None] - wanted[None]).max(axis=2)
+    assert apart.min(axis=1).max() < 1e-4 and apart.min(axis=0).max() < 1e-4
+    (shape,) = [o for o in found if o.type == "MESH"]
+    nodes = shape.data.materials[0].node_tree.nodes
+    images = {n.image.size[0] for n in nodes if n.type == "TEX_IMAGE" and n.image}
+    assert images and min(images) > 8 and any(n.type == "BSDF_PRINCIPLED" for n in nodes)
+
+
+def test_selected_objects_frame_by_frame_and_back(ball, ball_file, scene, tmp_path):
+    other = ball.copy()
+    scene.collection.objects.link(other)
+    other.location.x = 50
+    for number in (3, 5):
+        ball.location.z = number
+        ball.keyframe_insert("location", frame=number)
+    scene.frame_set(1)
+    for obj in scene.objects:
+        obj.select_set(obj is ball)
+    out = str(tmp_path / "walk.spz")
+    frames = {"use_animation": True, "frame_start": 3, "frame_end": 5, "frame_step": 2}
+    assert bpy.ops.drgs.export(filepath=out, format="SPZ", use_selection=True, **frames) == {"FINISHED"}
+    assert sorted(p.name for p in tmp_path.glob("*.spz")) == ["walk_0003.spz", "walk_0005.spz"]
+    assert scene.frame_current == 1
+    pattern = str(tmp_path / "walk_####.spz")
+    assert bpy.ops.drgs.import_parts(surfels=pattern, use_mesh=False) == {"FINISHED"}
+    carrier = bpy.data.objects["walk"]
+    parts = sorted(carrier.children, key=lambda o: o.name)
+    assert [o.name for o in parts] == ["walk_0003", "walk_0005"]
+    for number in (3, 5):
+        found, rest = centres(tmp_path / f"walk_{number:04d}.drgs"), centres(ball_file)
+        np.testing.assert_allclose(found, rest + np.float32([0, 0, number]), atol=2e-4)
+    shown = []
+    for number in (2, 3, 4, 5, 9):
+        scene.frame_set(number)
+        shown.append([not o.hide_render for o in parts])
+    assert shown == [[True, False], [True, False], [True, False], [False, True], [False, True]]
+
+
+def test_the_light_of_the_scene_is_in_the_colours(ball, scene, tmp_path):
+    """Under a sun from above, in a black world, the upper half of the ball is bright and the lower one black."""
+    scene.world = bpy.data.worlds.new("Black")
+    scene.world.color = (0, 0, 0)
+    if scene.world.node_tree:
+        background = next(n for n in scene.world.node_tree.nodes if n.type == "BACKGROUND")
+        background.inputs["Color"].default_value = (0, 0, 0, 1)
+    sun = bpy.data.objects.new("Sun", bpy.data.lights.new("Sun", "SUN"))
+    sun.data.energy = 3
+    scene.collection.objects.link(sun)
+    scene.drgs.bounces = 0
+    out = tmp_path / "lit.ply"
+    assert bpy.ops.drgs.export(filepath=str(out), format="3DGS PLY", colour="relit", rays=32) == {"FINISHED"}
+    (cloud,) = imported(bpy.ops.wm.ply_import, out)
+    green = 0.5 + 0.28209479 * attribute(cloud, "f_dc_1")
+    height = world_points([cloud])[:, 2]
+    assert green[height > 0.5].min() > 0.3 and np.abs(green[height < -0.3]).max() < 0.01
+
+
+def test_the_world_leaves_as_a_picture(scene, tmp_path):
+    """Without any object: turned as the World is."""
+    pixels = np.random.default_rng(1).uniform(0, 9, (8, 16, 3)).astype(np.float32)
+    write_exr(tmp_path / "sky.exr", pixels)
+    bpy.ops.drgs.choose_light(filepath=str(tmp_path / "sky.exr"), rotation=np.pi / 2, strength=2.0)
+    assert bpy.ops.drgs.export(filepath=str(tmp_path / "out.exr"), format="OpenEXR") == {"FINISHED"}
+    found = read_exr(tmp_path / "out.exr", 16, 8)[..., :3]
+    np.testing.assert_allclose(found, 2 * np.roll(pixels, 4, axis=1), rtol=2e-3)
+
+
+def test_the_dialogs_show_what_goes_with_the_format(ball, scene):
+    from test_install import Layout
+
+    shown = []
+
+    class Noted(Layout):
+        def prop(self, data, name, **more):
+            assert name in bpy.ops.drgs.export.get_rna_type().properties
+            shown.append(name)
+
+        column = lambda self, **_: self  # noqa: E731
+
+    operator = part("operators.export").DRGS_OT_export
+    values = {"colour": "relit", "use_animation": True}
+    for format_, wanted, unwanted in (
+        ("SPZ", {"rays", "scale", "use_selection", "frame_end"}, {"up"}),
+        ("3DGS PLY", {"up", "colour"}, set()),
+        ("glTF mesh", {"scale"}, {"colour", "up"}),
+        ("OpenEXR", {"format"}, {"scale", "use_selection", "colour"}),
+    ):
+        shown.clear()
+        stand_in = type("StandIn", (), {"layout": Noted(), "format": format_, **values})()
+        operator.draw(stand_in, bpy.context)
+        assert wanted <= set(shown) and not unwanted & set(shown)
+        stand_in.filepath = "/tmp/a.ply"
+        operator.check(stand_in, bpy.context)
+        ends = part("drgs_blender.filetypes").WRITTEN[format_].extensions
+        assert Path(stand_in.filepath).suffix in ends
+
+
+def test_what_cannot_be_exported_is_refused_in_words(ball, scene, tmp_path):
+    ball.select_set(False)
+    with pytest.raises(RuntimeError, match="no selected object is a DR-GS object"):
+        bpy.ops.drgs.export(filepath=str(tmp_path / "a.ply"), use_selection=True)
+    with pytest.raises(RuntimeError, match="frames 9 to 2 are none"):
+        bpy.ops.drgs.export(filepath=str(tmp_path / "a.ply"), use_animation=True, frame_start=9, frame_end=2)
+    (tmp_path / "folder.ply").mkdir()
+    with pytest.raises(RuntimeError, match=r"folder\.ply"):
+        bpy.ops.drgs.export(filepath=str(tmp_path / "folder.ply"))
+    assert sorted(p.name for p in tmp_path.iterdir() if p.suffix == ".ply") == ["folder.ply"]

@@ -1,0 +1,214 @@
+"""Materials by one click, the way back, and what is told about a fault."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+import pytest
+from scenes import part, select, write_ball
+
+CHANNELS = ("albedo", "roughness", "metallic")
+
+
+def channels(obj) -> dict[str, np.ndarray]:
+    read = part("addon.mesh_arrays").read_channel
+    return {name: read(obj.data, name) for name in CHANNELS}
+
+
+def test_gold_is_what_the_engine_gets_and_the_captured_comes_back(ball, export):
+    before = channels(ball)
+    assert bpy.ops.drgs.set_material(preset="GOLD") == {"FINISHED"}
+    state = export()[0].objects[0]
+    assert (state.metallic == 1).all() and np.ptp(state.albedo, axis=0).max() < 1e-6
+    assert state.albedo[0, 0] > state.albedo[0, 1] > state.albedo[0, 2]
+    assert bpy.ops.drgs.restore_material() == {"FINISHED"}
+    for name, values in channels(ball).items():
+        np.testing.assert_array_equal(values, before[name])
+    state = export()[0].objects[0]
+    assert state.albedo is None and state.metallic is None
+
+
+def test_factor_mixes_and_the_vertex_group_masks(ball):
+    before = channels(ball)
+    group = ball.vertex_groups.new(name="Top")
+    group.add(list(range(10)), 0.5, "REPLACE")
+    bpy.ops.drgs.set_material(preset="CLAY", factor=0.5, use_group=True)
+    after = channels(ball)
+    share = np.where(np.arange(len(ball.data.vertices)) < 10, 0.25, 0)
+    np.testing.assert_allclose(after["roughness"], before["roughness"] * (1 - share) + 0.9 * share, atol=1e-6)
+    np.testing.assert_allclose(
+        after["albedo"], before["albedo"] * (1 - share[:, None]) + 0.5 * share[:, None], atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("preset", ["GOLD", "COPPER", "CHROME", "CLAY", "PLASTIC", "WET"])
+def test_every_preset_gives_values_that_are_colours_on_several_objects(ball, tmp_path, preset):
+    bpy.ops.import_scene.drgs(filepath=str(write_ball(tmp_path / "two.drgs")))
+    both = [ball, bpy.context.active_object]
+    select(*both)
+    bpy.ops.drgs.set_material(preset=preset)
+    first, second = map(channels, both)
+    for name in CHANNELS:
+        np.testing.assert_array_equal(first[name], second[name])
+        assert np.isfinite(first[name]).all() and (first[name] >= 0).all() and (first[name] <= 1).all()
+
+
+def test_a_mesh_that_is_not_the_assets_is_not_restored(ball):
+    ball.data.clear_geometry()
+    ball.data.from_pydata([(0, 0, 0), (1, 0, 0), (0, 1, 0)], [], [(0, 1, 2)])
+    with pytest.raises(RuntimeError, match=r'"ball".*3 vertices'):
+        bpy.ops.drgs.restore_material()
+
+
+def test_a_report_tells_of_engine_scene_and_messages(ball, tmp_path):
+    part("addon.messages").note("WARNING", "something about the light")
+    path = tmp_path / "report.txt"
+    assert bpy.ops.drgs.report(filepath=str(path)) == {"FINISHED"}
+    text = path.read_text(encoding="utf-8")
+    for expected in (bpy.app.version_string, "DR-GS can render here", '"ball"', "something about the light", "rays = "):
+        assert expected in text
+    with pytest.raises(RuntimeError, match="cannot be written"):
+        bpy.ops.drgs.report(filepath=str(tmp_path / "absent" / "report.txt"))
+
+
+def test_the_object_of_a_message_is_found_and_selected(ball, tmp_path):
+    named_in = part("addon.messages").named_in
+    objects = bpy.context.view_layer.objects
+    assert named_in('Object "ball": modifier "X" changes', objects) == "ball"
+    assert named_in('"Y" is 3" wide', objects) == ""
+    bpy.ops.import_scene.drgs(filepath=str(write_ball(tmp_path / "two.drgs")))
+    assert bpy.ops.drgs.select_named(name="ball") == {"FINISHED"}
+    assert bpy.context.active_object.name == "ball" and len(bpy.context.selected_objects) == 1
+    with pytest.raises(RuntimeError, match="not in this view layer"):
+        bpy.ops.drgs.select_named(name="nobody")
+
+
+@pytest.mark.parametrize("channel", CHANNELS)
+def test_a_painted_channel_is_what_the_engine_gets(ball, export, channel):
+    before = channels(ball)
+    assert bpy.ops.drgs.paint(channel=channel) == {"FINISHED"}
+    assert bpy.context.mode == "PAINT_VERTEX" and ball.data.attributes.active_color.name == channel
+    for name, values in channels(ball).items():  # nothing has been painted yet
+        np.testing.assert_allclose(values, before[name], atol=1e-6)
+    ball.data.attributes[channel].data[0].color = (0.3, 0.3, 0.3, 1)
+    bpy.ops.object.mode_set(mode="OBJECT")
+    ball.data.update_tag()
+    painted = getattr(export()[0].objects[0], channel)
+    np.testing.assert_allclose(painted[0], 0.3, atol=1e-6)
+    np.testing.assert_allclose(painted[1:], before[channel][1:], atol=1e-6)
+    bpy.ops.drgs.restore_material()
+    np.testing.assert_array_equal(channels(ball)[channel], before[channel])
+
+
+def test_a_material_is_copied_from_the_nearest_places(ball, tmp_path):
+    bpy.ops.import_scene.drgs(filepath=str(write_ball(tmp_path / "two.drgs")))
+    other = bpy.context.active_object
+    bpy.ops.drgs.set_material(preset="COPPER", factor=0.5)
+    select(ball, other)
+    assert bpy.ops.drgs.copy_material() == {"FINISHED"}
+    for name, values in channels(other).items():
+        np.testing.assert_allclose(channels(ball)[name], values, atol=1e-5)
+    select(ball)
+    with pytest.raises(RuntimeError, match="no two DR-GS objects"):
+        bpy.ops.drgs.copy_material()
+
+
+def adjustment(ball):
+    return ball.drgs.adjustment
+
+
+def test_adjustments_reach_the_engine_and_go_away_by_the_switch(ball, export):
+    settings = adjustment(ball)
+    assert export()[0].objects[0].adjustment is None
+    settings.tint, settings.hue, settings.roughness_gain, settings.metallic_offset = (1, 0.5, 0.25), np.pi, 0.5, 0.2
+    sent = export()[0].objects[0].adjustment
+    assert sent.tint == (1, 0.5, 0.25) and sent.hue == pytest.approx(0.5) and sent.mask is None
+    assert sent.roughness == (0.5, 0, 0, 1) and sent.metallic == pytest.approx((1, 0.2, 0, 1))
+    settings.use = False
+    assert export()[0].objects[0].adjustment is None
+    settings.use = True
+    bpy.ops.drgs.reset_adjustments()
+    assert export()[0].objects[0].adjustment is None and settings.roughness_gain == 1
+
+
+def test_the_mask_is_a_vertex_group_or_an_attribute(ball, export):
+    settings, count = adjustment(ball), len(ball.data.vertices)
+    settings.value = 0.5
+    ball.vertex_groups.new(name="Top").add(list(range(10)), 0.25, "REPLACE")
+    numbers = np.linspace(0, 1, count).astype(np.float32)
+    ball.data.attributes.new("wear", "FLOAT", "POINT").data.foreach_set("value", numbers)
+    ball.data.attributes.new("faces", "FLOAT", "FACE")
+    settings.mask = "Top"
+    np.testing.assert_allclose(export()[0].objects[0].adjustment.mask, np.where(np.arange(count) < 10, 0.25, 0))
+    settings.mask, settings.use_invert = "wear", True
+    np.testing.assert_allclose(export()[0].objects[0].adjustment.mask, 1 - numbers)
+    for name in ("faces", "nobody"):
+        settings.mask = name
+        frame, warnings = export()
+        assert frame.objects[0].adjustment is None and f'"{name}"' in warnings[0] and '"ball"' in warnings[0]
+
+
+def test_adjustments_follow_keyframes_and_are_exported_anew_by_viewports(ball, scene):
+    settings = adjustment(ball)
+    for number, value in ((1, 1.0), (11, 0.0)):
+        settings.saturation = value
+        ball.keyframe_insert("drgs.adjustment.saturation", frame=number)
+    export_frame, memory = part("addon.export").export_frame, part("addon.export.memory").Memory()
+    seen = []
+    for number in (1, 6, 11):
+        scene.frame_set(number)
+        depsgraph = bpy.context.evaluated_depsgraph_get()
+        state = export_frame(depsgraph, str, lambda text: None, memory=memory).objects[0]
+        seen.append(1.0 if state.adjustment is None else state.adjustment.saturation)
+    assert seen == pytest.approx([1, 0.5, 0], abs=1e-6)
+
+
+def test_copying_a_material_copies_its_adjustments(ball, tmp_path):
+    adjustment(ball).tint = (1, 0, 0)
+    bpy.ops.import_scene.drgs(filepath=str(write_ball(tmp_path / "two.drgs")))
+    second = bpy.context.active_object
+    select(second, ball)
+    bpy.ops.drgs.copy_material()
+    assert tuple(adjustment(second).tint) == (1, 0, 0)
+    select(second)
+    bpy.ops.drgs.restore_material()
+    assert tuple(adjustment(second).tint) == (1, 1, 1) and tuple(adjustment(ball).tint) == (1, 0, 0)
+
+
+def test_a_saved_asset_looks_as_the_edited_object(ball, export, tmp_path, ball_file):
+    """Written, imported again: the same materials and nothing on top; the pose is not part of it."""
+    bpy.ops.drgs.set_material(preset="COPPER", factor=0.5)
+    adjustment(ball).tint, adjustment(ball).roughness_offset = (0.5, 1, 1), 0.1
+    ball.location.x, ball.rotation_euler.z = 2, 1
+    state, asset = export()[0].objects[0], part("addon.assets").load(ball_file)
+    expected = part("drgs_blender.adjust").edited_asset(
+        asset, {name: getattr(state, name) for name in CHANNELS}, state.adjustment
+    )
+    path = tmp_path / "edited"
+    assert bpy.ops.drgs.save_asset(filepath=str(path)) == {"FINISHED"}
+    saved = part("drgs_blender.asset.container").read_asset(path.with_suffix(".drgs"))
+    for name in CHANNELS:
+        np.testing.assert_allclose(getattr(saved.mesh, name), getattr(expected.mesh, name), atol=1e-6)
+        np.testing.assert_allclose(getattr(saved.surfels, name), getattr(expected.surfels, name), atol=1e-6)
+    assert np.abs(saved.surfels.albedo - asset.surfels.albedo).max() > 0.1
+    np.testing.assert_array_equal(saved.mesh.vertices, asset.mesh.vertices)
+    np.testing.assert_array_equal(saved.binding.barycentric, asset.binding.barycentric)
+    bpy.ops.drgs.save_asset(filepath=str(tmp_path / "again"), use_saved=True)
+    state = export()[0].objects[0]
+    assert state.asset == str(tmp_path / "again.drgs") and state.adjustment is None
+    # What stood in the attributes is not added a second time, and a picture of either is the same.
+    np.testing.assert_allclose(channels(ball)["albedo"], expected.mesh.albedo, atol=1e-6)
+
+
+def test_no_asset_is_written_over_or_lost(ball, tmp_path, ball_file):
+    before = ball_file.read_bytes()
+    with pytest.raises(RuntimeError, match="would be lost"):
+        bpy.ops.drgs.save_asset(filepath=str(ball_file))
+    with pytest.raises(RuntimeError, match="cannot be written"):
+        bpy.ops.drgs.save_asset(filepath=str(tmp_path / "absent" / "x.drgs"))
+    assert ball_file.read_bytes() == before
+    second = ball.copy()
+    bpy.context.scene.collection.objects.link(second)
+    select(second, ball)
+    assert bpy.ops.drgs.save_asset(filepath=str(tmp_path / "out.drgs")) == {"FINISHED"}
+    assert sorted(p.name for p in tmp_path.glob("*.drgs")) == ["ball.drgs", f"{bpy.path.clean_name(second.name)}.drgs"]

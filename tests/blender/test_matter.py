@@ -1,0 +1,317 @@
+"""Simulated matter from Blender: the real engine bakes, and Blender's own modifier plays what it made."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import time
+
+import bpy
+import numpy as np
+import pytest
+from scenes import mesh_object, part, select, sphere
+
+work, points, describe = (part(f"addon.matter.{name}") for name in ("work", "points", "describe"))
+playback, capture = part("addon.matter.playback"), part("addon.matter.capture")
+particle_cache = part("drgs_blender.particle_cache")
+FRAMES = 6
+#: Vertices of a frame, in a Blender without the extension.
+PLAIN = """
+import os, sys, bpy, numpy as np
+bpy.ops.wm.open_mainfile(filepath=sys.argv[1])
+bpy.context.scene.frame_set(int(sys.argv[2]))
+mesh = bpy.data.objects["ball"].evaluated_get(bpy.context.evaluated_depsgraph_get()).data
+found = np.empty((len(mesh.vertices), 3), np.float32)
+mesh.attributes["position"].data.foreach_get("vector", found.ravel())
+np.save(sys.argv[3], found)
+sys.stdout.flush()
+os._exit(0)
+"""
+
+
+@pytest.fixture
+def body(ball):
+    """The sphere, coarse and soft, that falls for a few frames."""
+    matter = ball.drgs.matter
+    matter.use = True
+    matter.young, matter.resolution, matter.frame_end = 2e4, 8, FRAMES
+    return ball
+
+
+def vertices(obj, frame, between=0.0):
+    """(n, 3) evaluated vertices, object space."""
+    bpy.context.scene.frame_set(frame, subframe=between)
+    return part("addon.mesh_arrays").read_vertices(obj.evaluated_get(bpy.context.evaluated_depsgraph_get()).data)
+
+
+def world(obj, frame):
+    """(n, 3) evaluated vertices, world."""
+    local = vertices(obj, frame)
+    matrix = np.array(obj.evaluated_get(bpy.context.evaluated_depsgraph_get()).matrix_world)
+    return local @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def cache_of(obj):
+    return particle_cache.ParticleCache(describe.folder_of(obj))
+
+
+def computed_last(obj) -> int:
+    """Frames that the last bake did not find in the cache."""
+    said = (describe.folder_of(obj) / work.INPUT / capture.SAID).read_text()
+    return int(re.search(r"(\d+) of them computed now", said)[1])
+
+
+def box_object(name, low, high):
+    """A box, world."""
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+    faces = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    return mesh_object(name, np.add(low, corners * np.subtract(high, low)), faces)
+
+
+def test_frames_are_played_in_any_order_by_any_blender(body, scene, captured, tmp_path):
+    scene.frame_set(3)
+    bpy.ops.drgs.bake_matter()
+    assert scene.frame_current == 3 and not work.running
+    cache = cache_of(body)
+    assert cache.frames() == list(range(1, FRAMES + 1))
+    baked = {frame: cache.read(frame).vertices for frame in cache.frames()}
+    for frame in (4, 1, 6, 2, 3, 5, 2):
+        np.testing.assert_array_equal(vertices(body, frame), baked[frame])
+    np.testing.assert_allclose(vertices(body, 3, 0.25), 0.75 * baked[3] + 0.25 * baked[4], atol=1e-6)
+    np.testing.assert_array_equal(vertices(body, -7), baked[1])
+    np.testing.assert_array_equal(vertices(body, 99), baked[FRAMES])
+    # It falls by the scene's gravity and frame rate; a time step adds up to a fifth.
+    np.testing.assert_allclose(baked[1], sphere()[0], atol=1e-6)
+    seconds = (FRAMES - 1) / 24
+    fall = (baked[1] - baked[FRAMES])[:, 2].mean() / (9.81 * seconds**2 / 2)
+    assert 0.98 < fall < 1.2
+    scene.frame_set(FRAMES)
+    bpy.ops.render.render()
+    np.testing.assert_array_equal(captured[0].objects[0].vertices, baked[FRAMES])
+    # The folder is moved, and opened where the extension is not.
+    scene.frame_set(1)
+    bpy.ops.wm.save_mainfile()
+    moved = tmp_path.parent / f"{tmp_path.name}-moved"
+    shutil.copytree(tmp_path, moved)
+    shutil.rmtree(describe.folder_of(body))
+    (moved / "user").mkdir()
+    arguments = [str(moved / "scene.blend"), "4", str(moved / "found.npy")]
+    plain = dict(os.environ, BLENDER_USER_RESOURCES=str(moved / "user"))
+    subprocess.run([sys.executable, "-c", PLAIN, *arguments], check=True, timeout=120, env=plain)
+    np.testing.assert_array_equal(np.load(moved / "found.npy"), baked[4])
+
+
+def test_a_bake_is_stopped_at_once_and_goes_on(body, scene):
+    matter = body.drgs.matter
+    matter.frame_end, matter.gravity, matter.spin = 5000, 0.0, (0, 0, 3)
+    bake = work.Bake(body, scene)
+    with pytest.raises(RuntimeError, match="poll"):
+        bpy.ops.drgs.bake_matter()
+    until = time.monotonic() + 120
+    while bake.count < 3 and time.monotonic() < until:
+        assert not bake.step(0.05)
+        time.sleep(0.01)
+    begin = time.monotonic()
+    assert bake.cancel()
+    assert time.monotonic() - begin < 0.5
+    assert not work.running
+    bake._program._process.wait(5)
+    done = bake.count
+    assert 3 <= done < 5000
+    np.testing.assert_array_equal(vertices(body, 3), cache_of(body).read(3).vertices)
+    assert np.abs(vertices(body, 3) - vertices(body, 1)).max() > 0.1, "it spins"
+    found = work.cached(body, scene)
+    assert done <= found.frames < found.wanted == 5000 and not found.changed
+    # So does one whose Blender dies: the pipe that it holds is closed then.
+    again = work.Bake(body, scene)
+    while again.count <= found.frames and time.monotonic() < until:
+        assert not again.step(0.05)
+        time.sleep(0.01)
+    again._program._process.stdin.close()
+    with pytest.raises(part("drgs_blender.errors").EngineError, match=r"Bake again: it goes on\. The first"):
+        while not again.step():
+            time.sleep(0.01)
+    again.close()
+    found = work.cached(body, scene)
+    matter.frame_end = found.frames + 2
+    bpy.ops.drgs.bake_matter()
+    assert computed_last(body) < matter.frame_end - 1, "it goes on where it was"
+    np.testing.assert_array_equal(vertices(body, matter.frame_end), cache_of(body).read(matter.frame_end).vertices)
+    matter.density = 900
+    assert work.cached(body, scene).changed
+    # Freeing takes away what is ours and nothing else.
+    folder = describe.folder_of(body)
+    (folder / "notes.txt").write_text("mine")
+    bpy.ops.drgs.free_matter()
+    assert [path.name for path in folder.iterdir()] == ["notes.txt"]
+    assert not body.modifiers
+    np.testing.assert_allclose(vertices(body, 3), sphere()[0], atol=1e-6)
+
+
+def test_pins_regions_and_colliders_take_part(body, scene):
+    """Pinned at the top and carried aside by its own keys, while a table rises from below."""
+    matter = body.drgs.matter
+    height = sphere()[0][:, 2]
+    body.vertex_groups.new(name="Other").add([0], 1.0, "REPLACE")
+    group = body.vertex_groups.new(name="Top")
+    group.add(np.flatnonzero(height > 0.3).tolist(), 1.0, "REPLACE")
+    group.add(np.flatnonzero(height < -0.5).tolist(), 0.2, "REPLACE")
+    stiff = body.data.attributes.new("stiff", "BOOLEAN", "POINT")
+    stiff.data.foreach_set("value", sphere()[0][:, 0] > 0)
+    matter.pin_group = "Top"
+    bpy.ops.drgs.matter_row(rows="regions")
+    matter.regions[0].group, matter.regions[0].material = "stiff", "rubber"
+    matter.regions[0].young = 4e4
+    table = box_object("Table", (-2, -2, -1.6), (2, 2, -1.1))
+    bpy.ops.drgs.matter_row(rows="colliders")
+    matter.colliders[0].object = table
+    for frame, x, z, young in ((1, 0.0, 0.0, 2e4), (FRAMES, 0.5, 0.5, 9e4)):
+        for obj, index, value in ((body, 0, x), (table, 2, z)):
+            obj.location[index] = value
+            obj.keyframe_insert("location", index=index, frame=frame)
+        matter.young = young
+        body.keyframe_insert("drgs.matter.young", frame=frame)
+    scene.frame_set(FRAMES)
+    assert matter.young == 9e4
+    bpy.ops.drgs.bake_matter()
+    data = json.loads((describe.folder_of(body) / work.INPUT / capture.SETTINGS).read_text())
+    assert data["material"] == {"name": "jelly", "young": 2e4}, "as in the first frame"
+    assert data["regions"] == [{"group": "stiff", "material": {"name": "rubber", "young": 4e4}}]
+    assert "motion" in data and "vertices" in data["colliders"][0] and "Table" in data["colliders"][0]["mesh"]
+    np.testing.assert_allclose(world(body, 1), sphere()[0], atol=1e-5)
+    now = world(body, FRAMES)
+    np.testing.assert_allclose(now[height == 1], [[0.5, 0, 1]], atol=0.02)
+    assert -0.8 < now[:, 2].min() < -0.4, "the table, at -0.6, has pushed it in"
+    np.testing.assert_allclose(vertices(body, 3)[height == 1], [[0, 0, 1]], atol=0.02, err_msg="it follows its object")
+
+
+def test_force_fields_of_the_scene_act_on_it(body, scene):
+    """A wind that turns up carries it along, a vortex of another collection does not, and a magnet is named."""
+    matter = body.drgs.matter
+    matter.gravity, matter.fields, matter.resolution, matter.young = 0.0, 0.5, 6, 1e6
+    made = {}
+    for kind in ("WIND", "VORTEX", "MAGNET"):
+        bpy.ops.object.effector_add(type=kind, rotation=(0, np.pi / 2, 0))
+        made[kind] = bpy.context.object
+    wind = made["WIND"].field
+    wind.flow = 0.0
+    for frame, strength in ((1, 0.0), (FRAMES, 40.0)):
+        wind.strength = strength
+        made["WIND"].keyframe_insert("field.strength", frame=frame)
+    fields = bpy.data.collections.new("Fields")
+    scene.collection.children.link(fields)
+    for kind in ("WIND", "MAGNET"):
+        fields.objects.link(made[kind])
+    matter.field_collection = fields
+    select(body)
+    bpy.ops.drgs.bake_matter()
+    (field,) = json.loads((describe.folder_of(body) / work.INPUT / capture.SETTINGS).read_text())["fields"]
+    assert field["kind"] == "wind" and field["shape"] == "plane" and len(field["frames"]) == FRAMES
+    assert field["frames"][-1][3:] == pytest.approx([1, 0, 0, 20, 0], abs=1e-5)
+    moved = (vertices(body, FRAMES) - vertices(body, 1)).mean(axis=0)
+    strengths = np.interp(np.linspace(1, FRAMES, 2001), range(1, FRAMES + 1), [row[6] for row in field["frames"]])
+    span = (FRAMES - 1) / 24
+    expected = (np.cumsum(np.cumsum(strengths)) * (span / 2000) ** 2)[-1]
+    np.testing.assert_allclose(moved, [expected, 0, 0], atol=0.05 * expected)
+    said = [line.text for line in part("addon.messages").history]
+    assert any(made["MAGNET"].name in text and "(Magnet) plays no part" in text for text in said)
+
+
+def test_faults_name_the_object_and_the_remedy(body, scene):
+    matter = body.drgs.matter
+
+    def fails(match):
+        scene.frame_set(2)
+        with pytest.raises(RuntimeError, match=match):
+            bpy.ops.drgs.bake_matter()
+        assert not work.running and scene.frame_current == 2
+
+    matter.pin_group = "Nope"
+    fails('Object "ball": has no vertex group or point attribute "Nope".*Physics > DR-GS Matter')
+    matter.pin_group = ""
+    bpy.ops.drgs.matter_row(rows="colliders")
+    hidden = box_object("Hidden", (3, 3, 3), (4, 4, 4))
+    matter.colliders[0].object = hidden
+    scene.collection.objects.unlink(hidden)
+    fails('Object "Hidden": is hidden.*Show it')
+    bpy.ops.drgs.matter_row(rows="colliders", remove=0)
+    divided = body.modifiers.new("Finer", "SUBSURF")
+    fails('Object "ball": modifier "Finer"')
+    body.modifiers.remove(divided)
+    matter.frame_end = 1
+    fails('Object "ball": ends at frame 1')
+    other = body.copy()
+    scene.collection.objects.link(other)
+    matter.frame_end = 40
+    matter.folder = other.drgs.matter.folder = "//shared/"
+    fails('Object "ball": has the same cache as "ball.001"')
+    other.drgs.matter.use = False
+    # What goes wrong in the engine is told in the same way, and what was done can be played.
+    matter.domain = box_object("Room", (-1.5, -1.5, -1.5), (1.5, 1.5, 1.5))
+    select(body)
+    fails('Object "ball": simulation, frame .*outside the domain.*The first [0-9]+ frames can be played')
+    assert (vertices(body, 4)[:, 2].mean() - vertices(body, 1)[:, 2].mean()) < -0.03
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    obj = mesh_object("plain", *sphere())
+    with pytest.raises(describe.UsageError, match=r'"plain".*not saved\. Save the file'):
+        describe.folder_of(obj)
+
+
+def test_preview_shows_the_particles_without_touching_the_cache(body, scene):
+    bpy.ops.drgs.preview_matter()
+    fill = points.of(body)
+    assert fill.counts[0] == len(fill.points) > 500 and fill.counts[1] >= 1
+    radius = np.linalg.norm(fill.points, axis=1)
+    assert radius.max() < 1.01 and abs(np.median(radius) - 0.5 ** (1 / 3)) < 0.1, "all of the sphere and nothing else"
+    assert not describe.folder_of(body).exists() and not body.modifiers
+    bpy.ops.drgs.hide_preview()
+    assert points.of(body) is None
+
+
+@pytest.mark.parametrize("name", ["jelly", "metal", "sand", "snow", "honey"])
+def test_a_material_fills_its_numbers_in(body, scene, name):
+    matter = body.drgs.matter
+    matter.material = name
+    assert describe.describe(body, scene)["material"] == {"name": name}, "the row of the table, nothing changed"
+    matter.density = 777
+    assert describe.describe(body, scene)["material"] == {"name": name, "density": 777}
+
+
+def test_the_played_file_is_never_of_two_bakes(tmp_path):
+    """It grows by what is new; another bake in the same folder begins it anew, a kill between two writes does not."""
+    cache = particle_cache.ParticleCache(tmp_path)
+    rng = np.random.default_rng(1)
+
+    def frame():
+        return particle_cache.ParticleFrame(np.zeros((2, 3)), np.zeros((2, 3, 3)), rng.random((5, 3), np.float32))
+
+    def begin(digest, count):
+        made = [frame() for _ in range(count)]
+        cache.create(particle_cache.Header(digest, 2, 5, 10, 24.0), made[0])
+        for i, one in enumerate(made):
+            cache.write(10 + i, one)
+        return made
+
+    def played():
+        data = (tmp_path / playback.FILE).read_bytes()
+        count = int.from_bytes(data[28:32], "little")
+        return np.frombuffer(data[32 : 32 + count * 60], "<f4").reshape(count, 5, 3)
+
+    player = playback.Playback(tmp_path)
+    assert player.follow() == 0
+    made = begin("a", 3)
+    assert player.follow() == 3
+    np.testing.assert_array_equal(played(), [one.vertices for one in made])
+    made.append(frame())
+    cache.write(13, made[-1])
+    with open(tmp_path / playback.FILE, "ab") as file:
+        file.write(b"half a frame")
+    assert playback.Playback(tmp_path).follow() == 4
+    np.testing.assert_array_equal(played(), [one.vertices for one in made])
+    made = begin("b", 2)
+    assert player.follow() == 2
+    np.testing.assert_array_equal(played(), [one.vertices for one in made])

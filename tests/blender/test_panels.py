@@ -1,0 +1,155 @@
+"""Every panel and menu drawn, in every state of the scene, onto a layout that knows what Blender's would refuse.
+
+In a window Blender only prints such errors, panel by panel, when somebody looks; here nothing of it is missed.
+"""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import bpy
+import pytest
+from scenes import PACKAGE, armature_object, mesh_object, new_world, part, select
+
+FUNCTIONS = bpy.types.UILayout.bl_rna.functions
+PROPERTIES = bpy.types.UILayout.bl_rna.properties
+
+
+class Values:
+    """What an operator's button is given; only what the operator has."""
+
+    def __init__(self, operator: str) -> None:
+        group, name = operator.split(".")
+        object.__setattr__(self, "known", getattr(getattr(bpy.ops, group), name).get_rna_type().properties)
+        object.__setattr__(self, "operator", operator)
+
+    def __setattr__(self, name, value):
+        assert name in self.known, f"{self.operator} has no property {name}"
+        kind = self.known[name]
+        if kind.type == "ENUM" and kind.enum_items:
+            assert value in kind.enum_items, f"{self.operator}.{name} is never {value}"
+
+
+class Layout:
+    """Blender's layout as its own description has it: functions, their arguments, icons, what they name."""
+
+    def __init__(self, drawn: list[str]) -> None:
+        object.__setattr__(self, "drawn", drawn)
+
+    def __setattr__(self, name, value):
+        assert name in PROPERTIES, f"a layout has no property {name}"
+
+    def __getattr__(self, name):
+        assert name in FUNCTIONS, f"a layout cannot {name}"
+        parameters = FUNCTIONS[name].parameters
+        order = [p.identifier for p in parameters if not p.is_output]
+
+        def draw(*values, **named):
+            named |= dict(zip(order, values))
+            self.drawn.append(name)
+            for key, value in named.items():
+                assert key in parameters, f"{name} takes no {key}"
+                kind = parameters[key]
+                if kind.type == "ENUM" and isinstance(value, str):
+                    assert value in kind.enum_items or (key == "icon" and value == ""), f"{name}({key}={value!r})"
+                if kind.type == "STRING" and key in ("text", "heading"):
+                    assert isinstance(value, str)
+            return self.check(name, named) or self
+
+        return draw
+
+    def check(self, name, named):
+        """What is named must be there."""
+        if name.startswith("operator"):
+            values = Values(named["operator"])
+            if name.startswith("operator_") and "property" in named:
+                assert named["property"] in values.known
+            return values
+        for data, prop in (("data", "property"), ("search_data", "search_property"), ("dataptr", "propname")):
+            owner, wanted = named.get(data), named.get(prop)
+            if owner is not None and wanted is not None and not wanted.startswith("["):
+                assert wanted in owner.bl_rna.properties, f"{owner!r} has no {wanted}"
+        for key, types in (("menu", bpy.types), ("panel", bpy.types), ("listtype_name", bpy.types)):
+            if key in named:
+                assert hasattr(types, named[key]), f"{named[key]} is not registered"
+        return None
+
+
+def drawables() -> list[type]:
+    """All panels and menus of the extension."""
+    kinds = (bpy.types.Panel, bpy.types.Menu)
+    return [c for kind in kinds for c in kind.__subclasses__() if c.__module__.startswith(PACKAGE)]
+
+
+def empty(ball_file):
+    bpy.context.scene.camera = None
+
+
+def imported(ball_file):
+    bpy.ops.import_scene.drgs(filepath=str(ball_file))
+
+
+def unselected(ball_file):
+    imported(ball_file)
+    select(bpy.context.scene.camera)
+    bpy.context.view_layer.objects.active = None
+
+
+def damaged(ball_file):
+    imported(ball_file)
+    ball_file.unlink()
+    part("addon.messages").note("ERROR", 'Object "ball": its file is gone. Find it')
+
+
+def bound(ball_file):
+    imported(ball_file)
+    new_world(bpy.context.scene)
+    bpy.ops.drgs.bind_to_lattice()
+    bpy.ops.drgs.pose()
+
+
+def painted(ball_file):
+    imported(ball_file)
+    bpy.ops.drgs.paint(channel="roughness")
+
+
+def others(ball_file):
+    imported(ball_file)
+    plane = mesh_object("Plane", [(0, 0, 0), (1, 0, 0), (0, 1, 0)], [(0, 1, 2)])
+    lamp = bpy.data.objects.new("Lamp", bpy.data.lights.new("Lamp", "AREA"))
+    bpy.context.scene.collection.objects.link(lamp)
+    select(armature_object({"Bone": ((0, 0, 0), (0, 0, 1))}), plane, lamp)
+
+
+def elsewhere(ball_file):
+    imported(ball_file)
+    bpy.context.scene.render.engine = "CYCLES"
+    bpy.context.scene.drgs.overlay = "SURFELS"
+
+
+@pytest.mark.parametrize("state", [empty, imported, unselected, damaged, bound, painted, others, elsewhere])
+@pytest.mark.parametrize("engine", [True, False])
+def test_every_panel_and_menu_is_drawn(scene, ball_file, state, engine, monkeypatch):
+    state(ball_file)
+    if not engine:
+        monkeypatch.setenv("DRGS_ENGINE", "/nowhere")
+    drawn: dict[str, list[str]] = {}
+    for cls in drawables():
+        if hasattr(cls, "poll") and not cls.poll(bpy.context):
+            continue
+        calls = drawn[cls.__name__] = []
+        stand_in = SimpleNamespace(layout=Layout(calls), is_popover=False, bl_space_type="", **_own(cls))
+        for name in ("draw_header", "draw_header_preset", "draw"):
+            draw = cls.__dict__.get(name) or getattr(cls, name, None)
+            if draw is not None and getattr(draw, "__module__", "").startswith(PACKAGE):
+                draw(stand_in, bpy.context)
+    if bpy.context.mode != "OBJECT":
+        bpy.ops.object.mode_set(mode="OBJECT")
+    assert "DRGS_PT_tour" in drawn and len(drawn["DRGS_PT_tour"]) > 10
+    assert all(drawn[name] for name in ("DRGS_PT_messages", "DRGS_PT_engine"))
+
+
+def _own(cls: type) -> dict[str, object]:
+    """Methods and values of a class that its drawing may use."""
+    names = (n for c in cls.__mro__ if c.__module__.startswith(PACKAGE) for n in vars(c))
+    return {n: getattr(cls, n) for n in names if not n.startswith(("__", "draw", "poll", "bl_"))}

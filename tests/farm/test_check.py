@@ -1,0 +1,45 @@
+"""``drgs submit check``: what a node would miss, said before it does."""
+
+from __future__ import annotations
+
+from drgs_blender.engine import protocol
+
+
+def check(drgs, folder, name, *options):
+    return drgs("submit", "check", folder / name, "--frames", "1-3", "--out", "//f/####.exr", *options)
+
+
+def test_files_and_settings_that_a_node_would_do_without_are_named(drgs, folder):
+    code, lines, error = check(drgs, folder, "faulty.blend")
+    assert code == 65 and "a node would miss" in error
+    assert [line for line in lines if line.startswith("missing")] == ["missing  //gone.png: does not exist"]
+    notes = [line for line in lines if line.startswith("note")]
+    assert any("there.png: is an absolute path" in line for line in notes)
+    assert any("Motion blur" in line for line in notes)
+
+
+def test_scene_that_takes_everything_along_is_fine(drgs, folder, tmp_path):
+    code, lines, error = check(drgs, folder, "relative.blend", "--shared", folder)
+    assert (code, len(lines)) == (0, 1), (error, lines)
+    assert lines[0].startswith("ok") and "1 files, frames 1-3" in lines[0]
+    code, lines, _ = check(drgs, folder, "relative.blend", "--shared", tmp_path)
+    assert code == 65
+    assert [line.rsplit(": ", 1)[1] for line in lines] == ["is not in a shared folder"] * 2
+
+
+def test_scene_that_cannot_be_rendered_is_refused_as_by_a_node(drgs, folder, monkeypatch):
+    code, lines, error = check(drgs, folder, "blind.blend")
+    assert code == 64 and "has no camera" in error and "has no camera" in "".join(lines)
+    (folder / "tile.drgs").rename(folder / "away.drgs")
+    try:
+        code, lines, _ = check(drgs, folder, "relative.blend")
+    finally:
+        (folder / "away.drgs").rename(folder / "tile.drgs")
+    assert code == 65 and "missing  //tile.drgs: does not exist" in lines
+    monkeypatch.setattr(protocol, "__version__", "9.8.7")
+    assert check(drgs, folder, "relative.blend")[0] == 78
+
+
+def test_scripts_that_will_not_run_are_named(drgs, folder):
+    code, lines, _ = check(drgs, folder, "script.blend")
+    assert code == 0 and any("--enable-scripts" in line for line in lines)

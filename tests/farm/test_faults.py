@@ -1,0 +1,116 @@
+"""Real faults of a node: every frame under its name is whole, every other ends with the code that farms expect."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from processes import children, gone, open_files
+
+from .conftest import PROGRAM, WHOLE, same_pixels
+
+linux = pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
+
+
+def start(folder: Path, out: Path, frames: str, *options: str, scratch: Path | None = None) -> subprocess.Popen[str]:
+    """``drgs render`` in a process of its own, whose temporary files are in `scratch`."""
+    environment = os.environ | ({"TMPDIR": str(scratch)} if scratch else {})
+    command = [*PROGRAM.split(), "render", str(folder / "shot.blend"), "--frames", frames]
+    command += ["--out", str(out / "####.exr"), *options]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
+
+
+def test_full_disk_gives_no_frame_and_the_frame_once_there_is_room(drgs, folder, small_disk):
+    disk = small_disk("size=16k")
+    (disk / "filler").write_bytes(bytes(16 << 10))
+    job = ("render", folder / "shot.blend", "--frames", "1-2", "--out", disk / "####.exr", "--rays", 4)
+    code, lines, error = drgs(*job)
+    assert (code, lines[-1]) == (73, "DRGS_EXIT class=cannot-write")
+    assert "0001.exr" in error and not any(line.startswith("Saved") for line in lines)
+    assert [path.name for path in disk.iterdir()] == ["filler"]
+    small_disk("size=1m")
+    code, lines, _ = drgs(*job)
+    assert code == 0 and sum(line.startswith("Saved") for line in lines) == 2
+
+
+def test_folder_that_cannot_be_written_is_found_before_anything_is_rendered(drgs, folder, small_disk):
+    disk = small_disk("ro")
+    code, lines, error = drgs("render", folder / "shot.blend", "--frames", "1", "--out", disk / "####.exr")
+    assert (code, lines) == (73, ["DRGS_EXIT class=cannot-write"]) and "ead-only" in error
+
+
+def sockets(pid: int) -> set[str]:
+    """Sockets of a process on which it listens, whatever the family."""
+    own = {link[8:-1] for link in open_files(pid) if link.startswith("socket:[")}
+    found = set()
+    for table in ("tcp", "tcp6", "udp", "udp6"):
+        lines = [line.split() for line in Path(f"/proc/{pid}/net/{table}").read_text().splitlines()[1:]]
+        found |= {fields[1] for fields in lines if fields[9] in own}
+    lines = [line.split() for line in Path(f"/proc/{pid}/net/unix").read_text().splitlines()[1:]]
+    return found | {fields[6] for fields in lines if fields[6] in own and fields[3] == "00010000"}
+
+
+@linux
+@pytest.mark.parametrize("attempt", range(20 if WHOLE else 1))
+def test_killed_blender_gives_the_job_back_and_takes_the_engine_along(folder, tmp_path, attempt):
+    shared = set(os.listdir("/dev/shm"))
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    process = start(folder, tmp_path / "out", "1-9", "--rays", "8192", scratch=scratch)
+    try:
+        while not process.stdout.readline().startswith("Fra:1 "):
+            assert process.poll() is None
+        time.sleep(0.02 * attempt)
+        started = children(process.pid)
+        assert not set().union(*(sockets(pid) for pid in (process.pid, *started)))
+        blender = [pid for pid, line in started.items() if "blender_job.py" in line]
+        assert len(blender) == 1 and len(started) == 2
+        os.kill(blender[0], signal.SIGKILL)
+        out, error = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == 75 and out.splitlines()[-1] == "DRGS_EXIT class=retry" and "Blender" in error
+    deadline = time.monotonic() + 2
+    while not all(gone(pid) for pid in started) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert all(gone(pid) for pid in started)
+    assert all(path.suffix == ".exr" and path.name[0] != "." for path in (tmp_path / "out").iterdir())
+    assert not list(scratch.iterdir()) and set(os.listdir("/dev/shm")) <= shared
+
+
+def test_two_jobs_on_one_folder_do_not_disturb_each_other(drgs, folder, tmp_path):
+    alone, both = tmp_path / "alone", tmp_path / "both"
+    assert drgs("render", folder / "shot.blend", "--frames", "1-3", "--out", alone / "####.exr", "--rays", 4)[0] == 0
+    jobs = [start(folder, both, "1-3", "--rays", "4") for _ in range(2)]
+    results = [job.communicate(timeout=120) for job in jobs]
+    assert [job.returncode for job in jobs] == [0, 0], results
+    assert sorted(path.name for path in both.iterdir()) == ["0001.exr", "0002.exr", "0003.exr"]
+    assert all(same_pixels(alone / path.name, path) for path in both.iterdir())
+
+
+@linux
+@pytest.mark.skipif(not WHOLE, reason="slow; DRGS_FAULTS=whole runs it")
+def test_fifty_engines_killed_in_the_middle_of_frames_cost_no_pixel(drgs, folder, tmp_path):
+    """Killed at moments that are spread over the frame; each is noticed, and the frame made by the next engine."""
+    calm, shaken = tmp_path / "calm", tmp_path / "shaken"
+    rays = ("--rays", "16384")  # longer than the longest delay
+    assert drgs("render", folder / "shot.blend", "--frames", "1-50", "--out", calm / "####.exr", *rays)[0] == 0
+    process = start(folder, shaken, "1-50", *rays)
+    killed = 0
+    try:
+        for line in process.stdout:
+            if line.startswith("Fra:") and line.endswith("| Rendering | Sample 0/100\n"):
+                time.sleep(0.02 * (killed % 10))
+                for pid, command in children(process.pid).items():
+                    if "drgs_blender.engine" in command:
+                        os.kill(pid, signal.SIGKILL)
+                        killed += 1
+    finally:
+        process.kill()
+    assert process.wait() == 0 and killed == 50, process.stderr.read()
+    assert all(same_pixels(calm / path.name, path) for path in sorted(shaken.iterdir()))

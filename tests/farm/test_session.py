@@ -1,0 +1,179 @@
+"""A Blender and an engine that stay from chunk to chunk: the same frames, and gone with whoever needs them."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from processes import children, gone
+
+from drgs_blender.cli import session_link
+from drgs_blender.render.picture.frames import read_frame
+
+from .conftest import PROGRAM, same_pixels
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
+
+
+@pytest.fixture
+def warm(tmp_path) -> Iterator[Path]:
+    """Folder of a running session."""
+    place = tmp_path / "session"
+    subprocess.run([*PROGRAM.split(), "session", "start", str(place)], check=True, timeout=90)
+    yield place
+    session_link.end(place)
+
+
+def server(place: Path) -> int:
+    """Process id of a session."""
+    return int((place / "pid").read_text())
+
+
+def chunk(scene: Path, out: Path, place: Path, frames: str, *options: str) -> subprocess.Popen[str]:
+    """``drgs render`` of a task."""
+    command = [*PROGRAM.split(), "render", str(scene), "--frames", frames, "--out", str(out / "####.exr")]
+    command += ["--session", str(place), *options]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def told(scene: Path, out: Path, place: Path, frames: str, *options: str) -> tuple[int, list[str], str]:
+    """(exit code, lines, errors) of a task."""
+    process = chunk(scene, out, place, frames, "--rays", "4", *options)
+    text, errors = process.communicate(timeout=400)  # the first may compile kernels
+    return process.returncode, text.splitlines(), errors
+
+
+def family(pid: int) -> set[int]:
+    """A process and all it started."""
+    return {pid, *children(pid, recursive=True)}
+
+
+def all_gone(pids: set[int], seconds: float = 5.0) -> bool:
+    """Whether processes end in time."""
+    return soon(lambda: all(gone(pid) for pid in pids), seconds)
+
+
+def soon(condition: Callable[[], bool], seconds: float = 20.0) -> bool:
+    """Whether `condition` holds in time."""
+    deadline = time.monotonic() + seconds
+    while not condition() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    return condition()
+
+
+def test_chunks_share_blender_and_engine_and_have_the_same_bits(drgs, folder, warm, tmp_path):
+    scene, out, alone = folder / "relative.blend", tmp_path / "out", tmp_path / "alone"
+    code, lines, errors = told(scene, out, warm, "3,-2", "--openjd")
+    assert (code, errors) == (0, "") and lines[-1] == "DRGS_EXIT class=ok"
+    assert lines.count("openjd_progress: 100.0") == 1
+    used = family(server(warm))
+    assert len(used) == 3  # itself, the engine and Blender
+    assert told(scene, out, warm, "1-2")[0] == 0
+    code, lines, _ = told(scene, out, warm, "2-3")
+    assert code == 0 and sum(line.startswith("skipping") for line in lines) == 2
+    assert family(server(warm)) == used
+    assert drgs("render", scene, "--frames=-2,1-3", "--out", alone / "####.exr", "--rays", 4)[0] == 0
+    assert sorted(p.name for p in out.iterdir()) == ["-0002.exr", "0001.exr", "0002.exr", "0003.exr"]
+    assert all(same_pixels(path, alone / path.name) for path in out.iterdir())
+    session_link.end(warm)
+    assert all_gone(used) and sorted(p.name for p in warm.iterdir() if "-" in p.name or p.suffix) == []
+
+
+def test_what_fails_has_its_code_and_the_session_goes_on(folder, warm, tmp_path, small_disk):
+    scene, out = folder / "relative.blend", tmp_path / "out"
+    code, lines, errors = told(folder / "blind.blend", out, warm, "1")
+    assert (code, lines) == (64, ["DRGS_EXIT class=usage"]) and "has no camera" in errors
+    disk = small_disk("size=16k")
+    (disk / "filler").write_bytes(bytes(16 << 10))
+    assert told(scene, disk, warm, "1")[0] == 73
+    assert told(scene, out, warm, "1")[0] == 0
+
+
+def test_scene_saved_anew_is_opened_anew(folder, warm, tmp_path):
+    scene = tmp_path / "scene.blend"
+    (tmp_path / "tile.drgs").write_bytes((folder / "tile.drgs").read_bytes())
+    shapes = []
+    for source in ("relative.blend", "large.blend"):
+        scene.write_bytes((folder / source).read_bytes())
+        assert told(scene, tmp_path / source, warm, "1", "--noise-threshold", "0.5")[0] == 0
+        shapes.append(read_frame(tmp_path / source / "0001.exr")[0]["Combined"].shape)
+    assert shapes == [(24, 32, 4), (480, 640, 4)]
+
+
+def test_dead_blender_or_engine_costs_nothing_afterwards(folder, warm, tmp_path):
+    scene = folder / "relative.blend"
+    assert told(scene, tmp_path / "out", warm, "1")[0] == 0
+    for pid in family(server(warm)) - {server(warm)}:
+        os.kill(pid, signal.SIGKILL)
+    assert told(scene, tmp_path / "out", warm, "2-3")[0] == 0
+
+
+def test_dead_session_gives_the_chunk_back_and_the_next_one_renders_by_itself(folder, warm, tmp_path):
+    scene, out = folder / "relative.blend", tmp_path / "out"
+    process = chunk(scene, out, warm, "1", "--rays", "65536")
+    assert process.stdout.readline().startswith("Fra:1")
+    all_of_it = family(server(warm))
+    os.kill(server(warm), signal.SIGKILL)
+    text, errors = process.communicate(timeout=30)
+    assert process.returncode == 75 and "its process died" in errors and "class=retry" in text
+    assert all_gone(all_of_it)
+    assert told(scene, out, warm, "1")[0] == 0
+
+
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
+def test_task_that_is_ended_takes_its_frame_along(folder, warm, tmp_path, how):
+    process = chunk(folder / "relative.blend", tmp_path / "out", warm, "1", "--rays", "65536")
+    assert process.stdout.readline().startswith("Fra:1")
+    all_of_it = family(server(warm))
+    if how == signal.SIGKILL:
+        process.kill()
+        (request,) = warm.glob("request-*.json")
+        process.wait()
+        os.utime(request, (0, 0))  # long ago
+        assert all_gone(all_of_it)
+    else:
+        process.send_signal(how)
+        started = time.monotonic()
+        text, _ = process.communicate(timeout=20)
+        assert process.returncode == 143 and text.splitlines()[-1] == "DRGS_EXIT class=terminated"
+        assert all_gone(all_of_it, started + 5 - time.monotonic())
+    assert not list((tmp_path / "out").iterdir())
+
+
+def test_session_ends_without_its_folder_its_farm_or_work(tmp_path):
+    start = [*PROGRAM.split(), "session", "start"]
+    places = [tmp_path / name for name in ("folder", "farm", "work")]
+    worker = subprocess.Popen(
+        ["sh", "-c", f"(PATH=$PATH; {' '.join(start)} {places[1]}); sleep 60"], stdout=subprocess.DEVNULL
+    )
+    subprocess.run([*start, str(places[0])], check=True, timeout=90)
+    subprocess.run([*start, str(places[2]), "--idle", "1"], check=True, timeout=90)
+    try:
+        assert soon(lambda: session_link.is_running(places[1]))
+        assert soon(lambda: not session_link.is_running(places[2]))
+        pid = server(places[0])
+        assert session_link.is_running(places[0])
+        for path in places[0].iterdir():
+            path.unlink()
+        places[0].rmdir()
+        assert all_gone({pid})
+        time.sleep(max(0.0, 6 - (time.time() - (places[1] / "pid").stat().st_mtime)))
+        assert session_link.is_running(places[1])
+    finally:
+        subprocess.run(["pkill", "-P", str(worker.pid)], check=False)
+        worker.kill()
+        worker.wait()
+    assert soon(lambda: not session_link.is_running(places[1]))
+
+
+def test_folder_in_which_others_write_is_refused(drgs, tmp_path):
+    (tmp_path / "open").mkdir()
+    (tmp_path / "open").chmod(0o777)
+    code, _, error = drgs("session", "start", tmp_path / "open")
+    assert code == 64 and "others may write" in error

@@ -1,0 +1,36 @@
+"""Other processes as tests see them: a process that ends while one looks is no error."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from pathlib import Path
+
+import psutil
+
+
+def gone(pid: int) -> bool:
+    """Whether a process has ended (a zombie that nobody collects has)."""
+    try:
+        return psutil.Process(pid).status() == psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return True
+
+
+def children(pid: int, recursive: bool = False) -> dict[int, str]:
+    """Process id -> command line of all that `pid` started and that still runs."""
+    found: dict[int, str] = {}
+    with contextlib.suppress(psutil.NoSuchProcess):
+        for child in psutil.Process(pid).children(recursive):
+            with contextlib.suppress(psutil.NoSuchProcess):
+                found[child.pid] = " ".join(child.cmdline())
+    return found
+
+
+def open_files(pid: int) -> list[str]:
+    """What the open descriptors of a process name: paths, ``socket:[…]``, ``pipe:[…]`` (Linux)."""
+    found = []
+    for link in Path(f"/proc/{pid}/fd").iterdir():
+        with contextlib.suppress(OSError):  # closed just now
+            found.append(os.readlink(link))
+    return found

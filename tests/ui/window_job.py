@@ -1,0 +1,176 @@
+"""Runs inside Blender with a window, for test_window.py: goes the tour, notes what it finds, asks for photographs."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import time
+import traceback
+from collections.abc import Iterator
+from pathlib import Path
+
+import bpy
+
+FOLDER = Path(os.environ["DRGS_WINDOW_JOB"])
+ASSET = os.environ["DRGS_WINDOW_ASSET"]
+PACKAGE = "bl_ext.user_default.drgs"
+#: Seconds to wait for a picture.
+PATIENCE = 400
+found: dict[str, object] = {"blender": bpy.app.version_string}
+
+
+def part(name: str):
+    return importlib.import_module(f"{PACKAGE}.{name}")
+
+
+def area(kind: str = "VIEW_3D") -> bpy.types.Area:
+    return next(a for w in bpy.context.window_manager.windows for a in w.screen.areas if a.type == kind)
+
+
+def in_viewport():
+    """Context of the 3D viewport, as a click there has it."""
+    view = area()
+    region = next(r for r in view.regions if r.type == "WINDOW")
+    return bpy.context.temp_override(window=bpy.context.window_manager.windows[0], area=view, region=region)
+
+
+def press(operator: str, **values: object) -> None:
+    """Run an operator as a button does: with an undo step of its own."""
+    group, name = operator.split(".")
+    getattr(getattr(bpy.ops, group), name)("EXEC_DEFAULT", True, **values)
+
+
+def following() -> str:
+    """Key of the step that the sidebar marks."""
+    tour = part("addon.tour")
+    return tour.next_step(tour.steps(bpy.context)).key
+
+
+def show_tab(view: bpy.types.Area) -> bool:
+    """Turn to the tab DR-GS; not possible before the sidebar has been drawn once."""
+    try:
+        next(r for r in view.regions if r.type == "UI").active_panel_category = "DR-GS"
+    except AttributeError:
+        return False
+    return True
+
+
+def photograph(name: str) -> Iterator[float]:
+    """Have the window drawn and photographed."""
+    view = area()
+    view.spaces.active.show_region_ui = True
+    while not show_tab(view):
+        yield 0.2
+    for a in bpy.context.screen.areas:
+        a.tag_redraw()
+    yield 1.5
+    request = FOLDER / f"{name}.photo"
+    request.write_text("")
+    while request.exists():
+        yield 0.2
+
+
+def modifiers() -> list[str]:
+    return [m.name for o in bpy.context.scene.objects if o.type == "MESH" for m in o.modifiers]
+
+
+def select(obj: bpy.types.Object) -> None:
+    bpy.ops.object.select_all(action="DESELECT")
+    obj.select_set(True)
+    bpy.context.view_layer.objects.active = obj
+
+
+def tour() -> Iterator[float]:
+    """From an empty file to the picture."""
+    for obj in list(bpy.data.objects):
+        bpy.data.objects.remove(obj)
+    bpy.context.scene.world = None
+    area("PROPERTIES").spaces.active.context = "RENDER"
+    engine = os.environ.pop("DRGS_ENGINE")
+    found["first"] = following()
+    yield from photograph("1-engine")
+    os.environ["DRGS_ENGINE"] = engine
+    found["with engine"] = following()
+    press("import_scene.drgs", filepath=ASSET)
+    bpy.ops.view3d.view_selected()
+    found["imported"] = following()
+    lights = {s.name: s.path for s in bpy.context.preferences.studio_lights if s.type == "WORLD"}
+    press("drgs.choose_light", filepath=lights["forest.exr"])
+    found["lit"] = following()
+    press("drgs.show_rendered")
+    found["seen"] = following()
+    press("drgs.add_camera")
+    found["camera"] = following()
+    yield from wait_for_picture()
+    yield from photograph("2-rendered")
+    mesh = next(o for o in bpy.context.scene.objects if o.type == "MESH")
+    select(mesh)
+    press("drgs.bind_to_lattice")
+    found["bound"] = modifiers()
+    bpy.ops.ed.undo()
+    found["undone"] = modifiers(), len(bpy.data.lattices)
+    bpy.ops.ed.redo()
+    found["redone"] = modifiers(), len(bpy.data.lattices)
+    select(next(o for o in bpy.context.scene.objects if o.type == "MESH"))
+    press("drgs.mark_assets")
+    press("drgs.bind_to_cage", faces=200)
+    area().spaces.active.shading.type = "SOLID"
+    select(next(o for o in bpy.context.scene.objects if o.asset_data is not None))
+    press("drgs.pose")
+    found["mode"] = bpy.context.mode
+    yield from photograph("3-posing")
+    bpy.ops.object.mode_set(mode="OBJECT")
+    yield from export()
+    bpy.ops.drgs.engine_setup("INVOKE_DEFAULT")
+    yield from photograph("4-dialog")
+    found["messages"] = [m.text for m in part("addon.messages").history if m.level == "ERROR"]
+
+
+def export() -> Iterator[float]:
+    """File > Export: its dialog, and a file that is written while the window lives."""
+    bpy.ops.drgs.export("INVOKE_DEFAULT")
+    yield from photograph("5-export")
+    for window in bpy.context.window_manager.windows:
+        for other in window.screen.areas:
+            if other.type == "FILE_BROWSER":
+                with bpy.context.temp_override(window=window, area=other):
+                    bpy.ops.file.cancel()
+    yield 0.5
+    target, end = FOLDER / "window.spz", time.monotonic() + PATIENCE
+    press("drgs.export", filepath=str(target), format="SPZ")
+    while not target.exists() and time.monotonic() < end:
+        yield 0.2
+    found["exported"] = target.exists()
+
+
+def wait_for_picture() -> Iterator[float]:
+    """Until the viewport shows every ray; the first time kernels are compiled."""
+    views = part("addon.viewport.views")
+    name = views.name_of(next(r for r in area().regions if r.type == "WINDOW"))
+    end = time.monotonic() + PATIENCE
+    picture = None
+    while (picture is None or picture.fraction < 1) and time.monotonic() < end:
+        yield 0.2
+        picture = views.worker.picture(name)
+    found["fraction"] = 0.0 if picture is None else picture.fraction
+
+
+def go() -> float | None:
+    """The next part of the tour; called by Blender's timer."""
+    try:
+        with in_viewport():
+            return next(steps)
+    except StopIteration:
+        pass
+    except Exception:
+        found["error"] = traceback.format_exc()
+    part_file = FOLDER / "result.part"
+    part_file.write_text(json.dumps(found))
+    part_file.replace(FOLDER / "result.json")
+    bpy.ops.wm.quit_blender()
+    return None
+
+
+steps = tour()
+bpy.app.timers.register(go, first_interval=1.0, persistent=True)

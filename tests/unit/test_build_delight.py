@@ -1,0 +1,160 @@
+"""The estimate that removes the captured light, on a corner whose albedo, light and shadows are known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drgs_blender.asset import Asset, Environment, Mesh, Surfels
+from drgs_blender.asset.container import read_asset
+from drgs_blender.build.delight import captured_along, remove_light
+from drgs_blender.build.relit import relit_colours
+from drgs_blender.cli.main import main
+from drgs_blender.colour import linear_to_srgb, srgb_to_linear
+from drgs_blender.deform.binding import bind
+from drgs_blender.errors import UsageError
+from drgs_blender.formats.exr import write_exr_environment
+from drgs_blender.formats.gaussian_ply import SH_C0
+from drgs_blender.formats.splat_ply import write_splat_ply
+from drgs_blender.formats.splats import splats_of
+from drgs_blender.frame import RenderSettings, World
+
+#: Floor (+Z) and wall (facing -X, at x = 1), n x n squares each.
+N = 12
+FORWARD = RenderSettings(cosine=512, ggx=128, environment=256, aa=1, bounces=1, look="principled", seed=99)
+FEW = RenderSettings(cosine=96, ggx=32, environment=64, aa=1, bounces=1, look="principled")
+
+
+def sky() -> np.ndarray:
+    """A blue sky with a bright, warm patch, over dark ground."""
+    picture = np.zeros((32, 64, 3), np.float32)
+    picture[:16] = (0.3, 0.4, 0.7)
+    picture[4:9, 36:44] = (14.0, 11.0, 7.0)
+    picture[16:] = 0.05
+    return picture
+
+
+def corner() -> tuple[Asset, np.ndarray]:
+    """An asset without captured colours, and the true albedo of its surfels: squares of two paints."""
+    line = np.linspace(-1, 1, N + 1)
+    a, b = (v.ravel() for v in np.meshgrid(line, line, indexing="ij"))
+    floor = np.stack([a, b, 0 * a - 1], axis=1)
+    wall = np.stack([0 * a + 1, a, b], axis=1)
+    row = np.arange(N)[:, None] * (N + 1) + np.arange(N)
+    quad = np.stack([row, row + N + 1, row + N + 2, row + 1], axis=-1).reshape(-1, 4)
+    faces = np.concatenate([quad[:, [0, 1, 2]], quad[:, [0, 2, 3]]])
+    # The wall's normal along (0, 1, 0) x (0, 0, 1) is +X: turned over, it faces the floor.
+    vertices = np.concatenate([floor, wall]).astype(np.float32)
+    faces = np.concatenate([faces, faces[:, ::-1] + len(floor)]).astype(np.int32)
+    corners = vertices[faces]
+    centre = corners.mean(axis=1)
+    n = len(centre)
+    on_wall = np.arange(n) >= n // 2
+    half = np.sqrt(0.5)
+    rotation = np.where(on_wall[:, None], [half, 0, -half, 0], [1.0, 0, 0, 0])
+    cells = np.floor(centre * 2).astype(int).sum(axis=1) % 2
+    albedo = np.where(cells[:, None] == 1, [0.75, 0.5, 0.3], [0.15, 0.25, 0.5])
+    k = len(vertices)
+    mesh = Mesh(vertices, faces, np.full((k, 3), 0.4), np.full(k, 0.5), np.zeros(k))
+    surfels = Surfels(centre, np.full((n, 2), 0.06), rotation, np.full(n, 0.95), albedo, np.full(n, 0.5), np.zeros(n))
+    return Asset(surfels, mesh, bind(mesh, surfels)[0], Environment(sky())), albedo
+
+
+def photographed(asset: Asset, exposure: float) -> None:
+    """Give the surfels the colours that a camera of this exposure sees, and forget their materials."""
+    from drgs_blender.build.transfer import surfels_to_vertices
+
+    assert asset.binding is not None and asset.environment is not None
+    surfels_to_vertices(asset.mesh, asset.surfels, asset.binding)
+    world = World(asset.environment.radiance)
+    seen = exposure * relit_colours(asset, asset.surfels, asset.mesh.vertices, world, FORWARD)
+    shown = linear_to_srgb(np.clip(seen, 0, 1))
+    asset.surfels.sh = ((shown - 0.5) / SH_C0).astype(np.float32)[:, None]
+    asset.surfels.albedo = srgb_to_linear(shown)
+    asset.mesh.albedo = np.full_like(asset.mesh.albedo, 0.4)
+
+
+@pytest.fixture(scope="module")
+def capture() -> tuple[Asset, np.ndarray, np.ndarray]:
+    """(asset, its true albedo, the albedo that it was read with), taken at an exposure of 0.4."""
+    asset, truth = corner()
+    photographed(asset, 0.4)
+    return asset, truth, asset.surfels.albedo.copy()
+
+
+def copied(asset: Asset) -> Asset:
+    s, m = asset.surfels, asset.mesh
+    surfels = Surfels(
+        s.centre, s.scale, s.rotation, s.opacity, s.albedo.copy(), s.roughness.copy(), s.metallic.copy(), s.sh
+    )
+    mesh = Mesh(m.vertices, m.faces, m.albedo.copy(), m.roughness.copy(), m.metallic.copy())
+    return Asset(surfels, mesh, asset.binding, asset.environment, {})
+
+
+def test_the_light_goes_and_the_paint_stays(capture: tuple[Asset, np.ndarray, np.ndarray]) -> None:
+    asset, truth, read = capture
+    asset = copied(asset)
+    remove_light(asset, 0.4, FEW)
+    error, before = np.abs(asset.surfels.albedo - truth), np.abs(read / 0.4 - truth)
+    assert np.median(error) < 0.02 and np.quantile(error, 0.9) < 0.06
+    assert np.median(before) > 5 * np.median(error)
+    # The shadow of the wall, or the colour of the sky, is in neither paint.
+    bright = truth[:, 0] > 0.5
+    for paint in (bright, ~bright):
+        assert asset.surfels.albedo[paint].std(axis=0).max() < 0.25 * (read[paint] / 0.4).std(axis=0).max()
+    assert asset.provenance["materials"].startswith("estimated")
+    assert asset.provenance["report"]["remove_light"]["notes"]
+
+
+def test_an_unknown_exposure_changes_the_brightness_alone(capture: tuple[Asset, np.ndarray, np.ndarray]) -> None:
+    asset, truth, _ = capture
+    asset = copied(asset)
+    remove_light(asset, None, FEW)
+    luminance = asset.surfels.albedo @ [0.2126, 0.7152, 0.0722]
+    assert np.quantile(luminance, 0.9) == pytest.approx(0.8, abs=0.05)
+    bright = truth[:, 0] > 0.5
+    ratio = np.median(asset.surfels.albedo[~bright], axis=0) / np.median(asset.surfels.albedo[bright], axis=0)
+    # What is clipped at white is not counted: blue of the dark paint against that of the bright one.
+    np.testing.assert_allclose(ratio[1:], np.array([0.25, 0.5])[:2] / [0.5, 0.3], rtol=0.35)
+
+
+def test_captured_colour_is_that_seen_from_the_direction() -> None:
+    """Harmonics of 3DGS are evaluated along the ray from the camera: the first band of a splat seen from +Z."""
+    sh = np.zeros((1, 4, 3), np.float32)
+    sh[0, 2] = 0.5
+    surfels = Surfels(np.zeros((1, 3)), np.ones((1, 2)), [[1, 0, 0, 0]], [1], [[0, 0, 0]], [0.5], [0], sh)
+    seen = captured_along(surfels, np.array([[0.0, 0, 1]]))
+    np.testing.assert_allclose(seen, srgb_to_linear(np.full((1, 3), 0.5 - 0.5 * 0.4886025)), rtol=1e-5)
+
+
+def test_what_is_lacking_is_said(capture: tuple[Asset, np.ndarray, np.ndarray]) -> None:
+    asset = copied(capture[0])
+    dark = Asset(asset.surfels, asset.mesh, asset.binding, Environment(np.zeros((4, 8, 3))), {})
+    with pytest.raises(UsageError, match="does not reach"):
+        remove_light(dark, 1.0, FEW)
+    known = Asset(asset.surfels, asset.mesh, asset.binding, asset.environment, {"materials": "of the surfels"})
+    with pytest.raises(UsageError, match="these are of the surfels"):
+        remove_light(known)
+    with pytest.raises(UsageError, match="needs an environment"):
+        remove_light(Asset(asset.surfels, asset.mesh, asset.binding))
+    with pytest.raises(UsageError, match="needs a mesh"):
+        remove_light(Asset(asset.surfels, Mesh.empty()))
+
+
+def test_the_command_removes_the_light(capture: tuple[Asset, np.ndarray, np.ndarray], tmp_path: Path) -> None:
+    asset, truth, _ = capture
+    write_splat_ply(tmp_path / "s.ply", splats_of(asset.surfels))
+    write_exr_environment(tmp_path / "sky.exr", Environment(sky()))
+    obj = "".join(f"v {x} {y} {z}\n" for x, y, z in asset.mesh.vertices)
+    obj += "".join(f"f {a + 1} {b + 1} {c + 1}\n" for a, b, c in asset.mesh.faces)
+    (tmp_path / "m.obj").write_text(obj)
+    files = ["import", str(tmp_path / "s.ply"), "--mesh", str(tmp_path / "m.obj"), "--up", "z"]
+    out = tmp_path / "a.drgs"
+    assert main([*files, "--out", str(out), "--remove-light"]) == 64
+    light = ["--env", str(tmp_path / "sky.exr"), "--remove-light", "--exposure", "0.4"]
+    assert main([*files, *light, "--out", str(out)]) == 0
+    found = read_asset(out)
+    assert np.median(np.abs(found.surfels.albedo - truth)) < 0.03
+    assert found.provenance["materials"].startswith("estimated")

@@ -1,0 +1,68 @@
+"""Light baked into surfels: what a point of the mesh would show."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drgs_blender.asset import Asset, Mesh, Surfels
+from drgs_blender.build.relit import relit_colours
+from drgs_blender.deform.binding import bind
+from drgs_blender.errors import UsageError
+from drgs_blender.frame import RenderSettings, World
+from drgs_blender.render.lights.light import EnvironmentLight
+
+SETTINGS = RenderSettings(cosine=128, ggx=64, environment=64, aa=1, bounces=0, look="paper")
+
+
+def plate(albedo: float = 0.6, flip: bool = False) -> Asset:
+    """Surfels facing +Z on a square; `flip` turns every second one over."""
+    vertices = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
+    mesh = Mesh(vertices, np.array([[0, 1, 2], [0, 2, 3]]), np.full((4, 3), albedo), np.ones(4), np.zeros(4))
+    rng = np.random.default_rng(3)
+    n = 64
+    centre = np.concatenate([rng.uniform(-0.9, 0.9, (n, 2)), np.zeros((n, 1))], axis=1)
+    rotation = np.tile([1.0, 0, 0, 0], (n, 1))
+    if flip:
+        rotation[::2] = [0, 1, 0, 0]
+    surfels = Surfels(
+        centre, np.full((n, 2), 0.05), rotation, np.ones(n), np.full((n, 3), albedo), np.ones(n), np.zeros(n)
+    )
+    return Asset(surfels, mesh, bind(mesh, surfels)[0])
+
+
+def lit_half() -> np.ndarray:
+    """Radiance 1 where x > 0, else 0."""
+    picture = np.zeros((32, 64, 3), np.float32)
+    picture[:, 16:48] = 1  # +X is in the middle
+    return picture
+
+
+@pytest.mark.parametrize("flip", [False, True])
+def test_a_plate_under_half_a_sky(flip: bool) -> None:
+    """Half of the sky sends half of the light, whichever way the surfels face; a rough surface adds little to it."""
+    asset = plate(flip=flip)
+    colour = relit_colours(asset, asset.surfels, asset.mesh.vertices, World(lit_half()), SETTINGS)
+    whole = relit_colours(asset, asset.surfels, asset.mesh.vertices, World(np.ones((8, 16, 3))), SETTINGS)
+    np.testing.assert_allclose(colour.mean(axis=0), whole.mean(axis=0) / 2, rtol=0.03)
+    assert 0.55 < whole.mean() < 0.75
+    assert EnvironmentLight(World(lit_half())).bad_texels == 0
+
+
+def test_a_lid_keeps_the_light_out() -> None:
+    asset = plate()
+    lid = np.array([[-9, -9, 0.1], [9, -9, 0.1], [9, 9, 0.1], [-9, 9, 0.1]], np.float32)
+    mesh = asset.mesh
+    covered = Mesh(
+        np.concatenate([mesh.vertices, lid]), np.concatenate([mesh.faces, mesh.faces + 4]),
+        np.tile(mesh.albedo, (2, 1)), np.tile(mesh.roughness, 2), np.tile(mesh.metallic, 2),
+    )  # fmt: skip
+    under = Asset(asset.surfels, covered, asset.binding)
+    world = World(np.ones((8, 16, 3)))
+    assert relit_colours(under, asset.surfels, covered.vertices, world, SETTINGS).max() < 0.05
+
+
+def test_without_a_mesh_there_is_nothing_to_light() -> None:
+    asset = Asset(plate().surfels, Mesh.empty())
+    with pytest.raises(UsageError, match="mesh"):
+        relit_colours(asset, asset.surfels, asset.mesh.vertices, World(), SETTINGS)

@@ -1,0 +1,345 @@
+"""Readers of captures: every layout gives the cameras and pixels it was written from; bad ones are refused."""
+
+from __future__ import annotations
+
+import json
+import pickle
+
+import captures
+import numpy as np
+import pytest
+from PIL import Image
+
+from drgs_blender.errors import AssetError, UsageError
+from drgs_blender.reconstruct.readers import read_capture
+from drgs_blender.reconstruct.readers.lens import MODELS, Lens, distort, lens_of, resample, undistorted
+from drgs_blender.reconstruct.readers.world import turn_upright
+
+WRITERS = {
+    "nerf": lambda scene: captures.write_nerf(scene),
+    "nerfstudio": captures.write_nerfstudio,
+    "colmap text": lambda scene: captures.write_colmap(scene, False),
+    "colmap binary": lambda scene: captures.write_colmap(scene, True),
+    "llff": captures.write_llff,
+    "nero": captures.write_nero,
+    "tensoir": captures.write_tensoir,
+}
+
+
+@pytest.mark.parametrize("layout", WRITERS)
+def test_every_layout_gives_the_cameras_and_pixels_it_was_written_from(tmp_path, layout):
+    scene = captures.make(tmp_path / "c")
+    WRITERS[layout](scene)
+    capture = read_capture(scene.folder)
+    assert len(capture.views) == len(scene.cameras)
+    found = {view.name: view for view in capture.views}
+    assert len(found) == len(capture.views)
+    # Names differ from layout to layout; cameras are matched by place.
+    for matrix in scene.cameras:
+        view = min(capture.views, key=lambda v: np.linalg.norm(v.camera.matrix_world[:3, 3] - matrix[:3, 3]))
+        np.testing.assert_allclose(view.camera.matrix_world, matrix, atol=2e-5)
+        assert (view.camera.width, view.camera.height) == (captures.WIDTH, captures.HEIGHT)
+        assert view.camera.fx == pytest.approx(captures.FOCAL) and view.camera.cy == captures.HEIGHT / 2
+        wanted = captures.picture(matrix)
+        inside = wanted[..., 3] > 0
+        np.testing.assert_array_equal(view.mask > 0.5, inside)
+        np.testing.assert_allclose(view.colour[inside], wanted[inside, :3] / 255, atol=1e-6)
+    rgba = layout in ("nerf", "tensoir")
+    assert capture.background == ((1.0, 1.0, 1.0) if rgba else (0.0, 0.0, 0.0))
+    assert all(np.allclose(view.colour[view.mask == 0], capture.background) for view in capture.views)
+
+
+def test_a_set_made_for_learning_and_one_for_testing(tmp_path):
+    scene = captures.make(tmp_path)
+    captures.write_nerf(scene, "train")
+    captures.write_nerf(captures.make(tmp_path, 5), "test")
+    capture = read_capture(tmp_path, test_every=2)  # the files' own split counts
+    assert (len(capture.training), len(capture.testing)) == (12, 5)
+    assert {view.name for view in capture.testing} == {f"test/r_{k}" for k in range(5)}
+    alone = read_capture(tmp_path / "transforms_train.json", test_every=4)
+    assert [view.name for view in alone.testing] == ["r_0", "r_4", "r_8"]  # r_10 comes after r_9
+
+
+def test_sparse_points_turn_with_the_cameras(tmp_path):
+    # A world on its side: both must come back upright together.
+    scene = captures.make(tmp_path)
+    turn = np.eye(4)
+    turn[:3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
+    upright = scene.cameras
+    scene.cameras = [turn @ m for m in upright]
+    captures.write_colmap(scene, True)
+    for camera, matrix in zip(scene.cameras, upright):  # the pictures are those of the upright scene
+        name = f"{next(k for k, m in enumerate(scene.cameras) if m is camera):03d}.png"
+        Image.fromarray(captures.picture(matrix)[..., :3]).save(tmp_path / "images" / name)
+        Image.fromarray(captures.picture(matrix)[..., 3]).save(tmp_path / "masks" / name)
+    capture = read_capture(tmp_path)
+    for view in capture.views:
+        assert view.camera.matrix_world[2, 1] > 0.8  # the camera's up is the world's
+        assert abs(view.camera.matrix_world[2, 0]) < 1e-6  # level
+    centres = np.array([v.camera.matrix_world[:3, 3] for v in capture.views])
+    wanted = np.array([m[:3, 3] for m in upright])
+    points = np.array([[0.5, 0, 0], [0, 0.25, 0], [0, 0, 0.125]]) @ turn[:3, :3]
+    distances = np.linalg.norm(centres[:, None] - capture.points[None], axis=-1)
+    np.testing.assert_allclose(distances, np.linalg.norm(wanted[:, None] - points[None], axis=-1), atol=1e-5)
+
+
+def test_any_tilt_of_the_world_is_taken_out():
+    from scipy.spatial.transform import Rotation
+
+    cameras = np.stack(captures.ring(9))
+    for seed in range(20):
+        turned = cameras.copy()
+        turned[:, :3] = Rotation.random(random_state=seed).as_matrix() @ cameras[:, :3]
+        found = turn_upright(turned)
+        np.testing.assert_allclose(found @ found.T, np.eye(3), atol=1e-9)
+        assert np.linalg.det(found) == pytest.approx(1)
+        np.testing.assert_allclose((found @ turned[:, :3, 0].T)[2], 0, atol=1e-9)
+        assert ((found @ turned[:, :3, 1].T)[2] > 0).all()
+
+
+def test_resolution_means_the_mean_of_what_a_pixel_covers(tmp_path):
+    captures.write_nerf(captures.make(tmp_path))
+    full, half = read_capture(tmp_path), read_capture(tmp_path, resolution=24)
+    a, b = full.views[3], half.views[3]
+    assert (b.camera.width, b.camera.height, b.camera.fx) == (24, 20, captures.FOCAL / 2)
+    np.testing.assert_allclose(b.mask, a.mask.reshape(20, 2, 24, 2).mean((1, 3)), atol=1e-6)
+    np.testing.assert_allclose(b.colour, a.colour.reshape(20, 2, 24, 2, 3).mean((1, 3)), atol=1e-6)
+    for bad in ({"resolution": 4}, {"test_every": 1}, {"axes": "maya"}, {"up": "x"}):
+        with pytest.raises(UsageError):
+            read_capture(tmp_path, **bad)
+
+
+#: model -> (coefficients, pixels of (.4, -.7) and (-.9, .2) with f 500 (and 480), centre (321, 243)); by pycolmap 4.2.
+PYCOLMAP = {
+    "SIMPLE_PINHOLE": ([], [[521.0, -107.0], [-129.0, 343.0]]),
+    "PINHOLE": ([], [[521.0, -93.0], [-129.0, 339.0]]),
+    "SIMPLE_RADIAL": ([0.1], [[534.0, -129.75], [-167.25, 351.5]]),
+    "RADIAL": ([0.1, -0.03], [[531.465, -125.31375], [-157.49625, 349.3325]]),
+    "OPENCV": ([0.1, -0.03, 0.004, -0.002], [[529.375, -106.914], [-160.68625, 347.2104]]),
+    "OPENCV_FISHEYE": ([0.05, -0.02, 0.01, 0.003], [[492.669613, -45.404949], [-51.108412, 322.383128]]),
+    "FULL_OPENCV": (
+        [0.1, -0.03, 0.004, -0.002, 0.01, 0.02, -0.01, 0.005],
+        [[527.804364, -104.275331], [-157.346135, 346.497842]],
+    ),
+    "FOV": ([0.9], [[503.398264, -63.429083], [-73.628212, 327.187352]]),
+    "SIMPLE_RADIAL_FISHEYE": ([0.06], [[493.971177, -59.69956], [-54.638742, 326.475276]]),
+    "RADIAL_FISHEYE": ([0.06, -0.02], [[493.25761, -58.450818], [-52.401209, 325.978046]]),
+    "THIN_PRISM_FISHEYE": (
+        [0.05, -0.02, 0.004, -0.002, 0.01, 0.003, 0.006, -0.005],
+        [[492.57045, -43.912413], [-51.526103, 322.442649]],
+    ),
+    "RAD_TAN_THIN_PRISM_FISHEYE": (
+        [0.05, -0.02, 0.01, 0.003, -0.001, 0.0005, 0.004, -0.002, 0.006, -0.005, 0.003, 0.002],
+        [[495.372103, -46.435696], [-46.571752, 322.458287]],
+    ),
+}
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_every_lens_distorts_as_colmap_says(model):
+    coefficients, pixels = PYCOLMAP[model]
+    focal = [500.0, 480.0][: MODELS[model][0]]
+    lens = lens_of(model, 640, 480, np.array([*focal, 321.0, 243.0, *coefficients]), "test")
+    found = np.stack(distort(lens, np.array([0.4, -0.9]), np.array([-0.7, 0.2])), -1)
+    np.testing.assert_allclose(found, pixels, atol=1e-5)
+
+
+@pytest.mark.parametrize("model", [m for m, (c, _) in PYCOLMAP.items() if c])
+def test_straightened_photographs_show_what_a_pinhole_would(model):
+    # A photograph whose pixels hold their own place: straightened, each pixel says which place it came from.
+    lens = Lens(64, 48, 50.0, 50.0, 32.5, 23.0, model, tuple(PYCOLMAP[model][0]))
+    pinhole, positions = undistorted(lens)
+    py, px = np.mgrid[:48, :64] + 0.5
+    photograph = np.stack([px, py], -1).astype(np.float32)
+    straight = resample(photograph, positions)
+    x, y = (px - pinhole.cx) / pinhole.fx, (py - pinhole.cy) / pinhole.fy
+    wanted = np.stack(distort(lens, x, y), -1)
+    # Nothing outside of the photograph is needed, and some border pixel touches its edge.
+    assert wanted.min() > -0.6 and (wanted[..., 0].max(), wanted[..., 1].max()) < (64.6, 48.6)
+    edge = min(wanted.min(), 64 - wanted[..., 0].max(), 48 - wanted[..., 1].max())
+    assert edge < 1.5
+    inner = (wanted > 0.5).all(-1) & (wanted[..., 0] < 63.5) & (wanted[..., 1] < 47.5)
+    np.testing.assert_allclose(straight[inner], wanted[inner], atol=1e-3)
+
+
+def test_a_distorted_capture_is_read_as_a_pinhole(tmp_path):
+    scene = captures.make(tmp_path)
+    captures.write_nerfstudio(scene, k1=0.2)
+    view = read_capture(tmp_path).views[0]
+    pinhole, _ = undistorted(Lens(48, 40, 60.0, 60.0, 24.0, 20.0, "OPENCV", (0.2, 0, 0, 0)))
+    assert view.camera.fx == pytest.approx(pinhole.fx) and pinhole.fx > captures.FOCAL
+
+
+def test_pixels_that_are_not_square_keep_their_two_focal_lengths(tmp_path):
+    captures.write_nerfstudio(captures.make(tmp_path), fl_y=1.25 * captures.FOCAL)
+    camera = read_capture(tmp_path, resolution=24).views[0].camera
+    assert (camera.fx, camera.fy) == (captures.FOCAL / 2, 1.25 * captures.FOCAL / 2)
+
+
+# --- bad input ------------------------------------------------------------------------------------------------------
+
+
+def refused(path, *words, error=AssetError, **options):
+    with pytest.raises(error) as caught:
+        read_capture(path, **options)
+    for word in words:
+        assert word in str(caught.value), str(caught.value)
+
+
+@pytest.mark.parametrize("axes", ["opencv", "opengl-inverse", "opencv-inverse"])
+def test_cameras_of_another_convention_are_named_by_their_silhouettes(tmp_path, axes):
+    convert = {
+        "opencv": lambda m: m @ captures.OPENCV,
+        "opengl-inverse": np.linalg.inv,
+        "opencv-inverse": lambda m: np.linalg.inv(m @ captures.OPENCV),
+    }[axes]
+    scene = captures.make(tmp_path)
+    captures.write_nerf(scene, convert=convert)
+    refused(tmp_path, "silhouettes do not meet", f"--axes {axes}")
+    view = read_capture(tmp_path, axes=axes).views[0]
+    np.testing.assert_allclose(view.camera.matrix_world, scene.cameras[0], atol=1e-9)
+
+
+def test_silhouettes_of_other_objects_are_refused(tmp_path):
+    captures.write_nerf(captures.make(tmp_path))
+    rng = np.random.default_rng(0)
+    for k in range(12):
+        pixels = np.zeros((40, 48, 4), np.uint8)
+        x, y = rng.integers(0, 40), rng.integers(0, 32)
+        pixels[y : y + 6, x : x + 6] = 255
+        Image.fromarray(pixels).save(tmp_path / "train" / f"r_{k}.png")
+    refused(tmp_path, "no common shape")
+
+
+def test_close_ups_of_parts_are_not_taken_for_wrong_cameras(tmp_path):
+    # Hardly any two pictures show the same part: there is no common shape, and nothing is wrong with the cameras.
+    rng = np.random.default_rng(0)
+    scene = captures.make(tmp_path, 16)
+    for k, a in enumerate(np.arange(16) * 2 * np.pi / 16):
+        eye = np.array([4 * np.cos(a), 4 * np.sin(a), 1 + k % 2])
+        scene.cameras[k] = captures.look_at(eye, rng.uniform(-0.9, 0.9, 3) * captures.AXES)
+    captures.write_nerfstudio(scene, fl_x=300.0, fl_y=300.0)
+    for k, matrix in enumerate(scene.cameras):
+        pixels = captures.picture(matrix, focal=300.0)
+        Image.fromarray(pixels[..., :3]).save(tmp_path / "images" / f"frame_{k:05d}.png")
+        Image.fromarray(pixels[..., 3]).save(tmp_path / "masks" / f"frame_{k:05d}.png")
+    assert len(read_capture(tmp_path).views) >= 8
+
+
+def test_missing_images_are_counted_and_named(tmp_path):
+    captures.write_nerf(captures.make(tmp_path))
+    (tmp_path / "train" / "r_3.png").unlink()
+    refused(tmp_path, "1 of 12 images", "train/r_3")
+    scene = captures.make(tmp_path / "colmap")
+    captures.write_colmap(scene, True)
+    (scene.folder / "images" / "005.png").unlink()
+    refused(scene.folder, "1 of 12 images", "005.png")
+    scene = captures.make(tmp_path / "llff")
+    captures.write_llff(scene)
+    (scene.folder / "images" / "005.png").unlink()
+    refused(scene.folder, "12 cameras", "images: 11")
+
+
+def test_masks_and_photographs_of_another_shape_are_refused(tmp_path):
+    scene = captures.make(tmp_path)
+    captures.write_nerfstudio(scene)
+    mask = tmp_path / "masks" / "frame_00002.png"
+    Image.new("L", (40, 48)).save(mask)
+    refused(tmp_path, "frame_00002.png", "40 x 48")
+    Image.fromarray(captures.picture(scene.cameras[2], 96, 80)[..., 3]).save(mask)  # the same shape, larger
+    capture = read_capture(tmp_path)
+    assert abs(capture.views[2].mask.mean() - capture.views[8].mask.mean()) < 0.05
+    image = tmp_path / "images" / "frame_00004.png"
+    Image.new("RGB", (40, 48), "red").save(image)
+    refused(tmp_path, "calibrated for 48 x 40")
+    mask.unlink()
+    refused(tmp_path, "names the mask")
+
+
+def test_black_photographs_are_left_out_and_a_black_capture_is_refused(tmp_path, caplog):
+    captures.write_nerfstudio(captures.make(tmp_path))
+    for k in range(12):
+        if k == 3:
+            assert len(read_capture(tmp_path).views) == 11
+            assert "frame_00002.png" in caplog.text
+        if k >= 2:
+            Image.new("RGB", (48, 40)).save(tmp_path / "images" / f"frame_{k:05d}.png")
+    refused(tmp_path, "black images")
+
+
+def test_one_camera_or_one_place_is_no_capture(tmp_path):
+    captures.write_nerf(captures.make(tmp_path / "one", 1))
+    refused(tmp_path / "one", "one camera")
+    scene = captures.make(tmp_path / "spot")
+    for matrix in scene.cameras:
+        matrix[:3, 3] = [1, 2, 3]
+    captures.write_nerf(scene)
+    refused(scene.folder, "in one place")
+
+
+def test_damaged_files_are_refused_by_name(tmp_path):
+    refused(tmp_path / "nothing", "does not exist")
+    refused(tmp_path, "is no capture", "COLMAP")
+    file = tmp_path / "transforms.json"
+    for text, word in (
+        ("{", "not JSON"),
+        ("[]", "not a JSON object"),
+        ("{}", "no list of frames"),
+        ('{"frames": []}', "no list of frames"),
+        ('{"frames": [{"transform_matrix": 1}]}', "no file_path"),
+    ):
+        file.write_text(text)
+        refused(tmp_path, str(file), word)
+    scene = captures.make(tmp_path / "c")
+    path = captures.write_nerfstudio(scene)
+    good = json.loads(path.read_text())
+    for change, word in (
+        ({"fl_x": "wide"}, "fl_x"),
+        ({"fl_x": -3}, "impossible"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "EQUIRECTANGULAR"),
+        ({"frames": [good["frames"][0] | {"transform_matrix": [[1, 2], [3, 4]]}]}, "4 rows of 4"),
+        ({"frames": [good["frames"][0] | {"transform_matrix": np.diag([1, 1, -1, 1]).tolist()}]}, "mirrors"),
+        ({"frames": [good["frames"][0] | {"transform_matrix": np.diag([1, 2, 1, 1]).tolist()}]}, "no rotation"),
+    ):
+        path.write_text(json.dumps(good | change))
+        refused(scene.folder, word)
+    colmap = captures.make(tmp_path / "colmap")
+    captures.write_colmap(colmap, True)
+    images = colmap.folder / "sparse/0/images.bin"
+    images.write_bytes(images.read_bytes()[:-40])
+    refused(colmap.folder, "damaged")
+
+
+def test_a_pickle_that_would_run_code_is_refused(tmp_path):
+    scene = captures.make(tmp_path)
+    captures.write_nero(scene)
+
+    class Evil:
+        def __reduce__(self):
+            return (exec, (f"open({str(tmp_path / 'ran')!r}, 'w')",))
+
+    (tmp_path / "3-camera.pkl").write_bytes(pickle.dumps(Evil()))
+    refused(tmp_path, "3-camera.pkl", "exec")
+    assert not (tmp_path / "ran").exists()
+
+
+def test_more_pixels_than_memory_are_refused_before_they_are_read(tmp_path):
+    scene = captures.make(tmp_path)
+    path = captures.write_nerfstudio(scene)
+    data = json.loads(path.read_text())
+    factor = 40000
+    for key in ("fl_x", "fl_y", "cx", "cy", "w", "h"):
+        data[key] *= factor
+    path.write_text(json.dumps(data))
+    refused(tmp_path, "memory", "--resolution", error=UsageError)
+    assert len(read_capture(tmp_path, resolution=24).views) == 12
+
+
+def test_real_captures(shared_data):
+    head = read_capture(shared_data / "multiview" / "ethiopianHead_1000", resolution=64, test_every=8)
+    assert (len(head.training), len(head.testing)) == (57, 9)
+    assert head.background is None and all(view.mask is not None for view in head.views)
+    heights = [view.camera.matrix_world[2, 1] for view in head.views]
+    assert np.mean(heights) > 0.8  # the head stands upright
+    lego = read_capture(shared_data / "multiview" / "lego_400", resolution=64)
+    assert len(lego.views) == 50 and lego.background == (1.0, 1.0, 1.0)

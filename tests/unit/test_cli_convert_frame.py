@@ -1,0 +1,157 @@
+"""Frames that Blender exported, written as splats, meshes and light."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from splat_files import covariance, random_splats
+
+from drgs_blender.asset import Asset, Mesh, Surfels
+from drgs_blender.asset.container import write_asset
+from drgs_blender.cli.main import main
+from drgs_blender.deform.binding import bind
+from drgs_blender.engine.frame_file import read_frame_file, write_frame_file
+from drgs_blender.errors import AssetError, VersionError
+from drgs_blender.formats.registry import read_environment, read_mesh, read_surfels
+from drgs_blender.frame import Camera, Frame, Light, MeshState, ObjectState, RenderSettings, Visibility, World
+
+SQUARE = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
+FACES = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+
+
+def plate(path: Path, albedo: float = 0.5, meshless: bool = False) -> Path:
+    """Rough surfels with captured colours on a square that faces +Z."""
+    splats = random_splats(60, 9)
+    n = len(splats)
+    centre = splats.centre * [0.3, 0.3, 0]
+    turn = np.random.default_rng(2).uniform(0, np.pi, n)
+    rotation = np.stack([np.cos(turn / 2), 0 * turn, 0 * turn, np.sin(turn / 2)], axis=1)
+    grey = np.full((n, 3), albedo)
+    surfels = Surfels(centre, splats.scale[:, :2], rotation, np.full(n, 0.9), grey, np.ones(n), np.zeros(n), splats.sh)
+    mesh = Mesh(SQUARE, FACES, np.full((4, 3), albedo), np.ones(4), np.zeros(4))
+    asset = Asset(surfels, Mesh.empty()) if meshless else Asset(surfels, mesh, bind(mesh, surfels)[0])
+    write_asset(path, asset)
+    return path
+
+
+def frame_of(objects: list[ObjectState], **more: object) -> Frame:
+    camera = Camera(np.eye(4), 8, 8, 8.0, 8.0, 4.0, 4.0)
+    settings = RenderSettings(bounces=0, look="paper")
+    return Frame(1, camera, objects, settings=more.pop("settings", settings), **more)  # type: ignore[arg-type]
+
+
+def test_frame_files_keep_the_frame(tmp_path: Path) -> None:
+    state = ObjectState("ball", "//ball.drgs", vertices=SQUARE, albedo=np.full((4, 3), 0.2, np.float32))
+    frame = frame_of(
+        [state], lights=[Light("sun", "sun", np.eye(4), power=3.0)], world=World(np.ones((2, 4, 3), np.float32))
+    )
+    write_frame_file(tmp_path / "a.drgsframe", frame)
+    back = read_frame_file(tmp_path / "a.drgsframe")
+    np.testing.assert_array_equal(back.objects[0].vertices, SQUARE)
+    assert back.objects[0].asset == "//ball.drgs" and back.lights[0].power == 3 and back.settings == frame.settings
+    np.testing.assert_array_equal(back.world.environment, frame.world.environment)
+
+
+def test_damaged_frame_files_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.drgsframe"
+    write_frame_file(path, frame_of([ObjectState("ball", "b.drgs", vertices=SQUARE)]))
+    data = path.read_bytes()
+    rng = np.random.default_rng(1)
+    refused = 0
+    for _ in range(200):
+        changed = bytearray(data[: rng.integers(len(data))] if rng.random() < 0.3 else data)
+        if changed:
+            changed[rng.integers(len(changed))] = rng.integers(256)
+        path.write_bytes(bytes(changed))
+        try:
+            read_frame_file(path)
+        except AssetError as error:
+            refused += 1
+            assert str(path) in str(error)
+        except VersionError:  # a digit of the version was hit
+            refused += 1
+    assert refused > 100
+    assert main(["convert", str(tmp_path / "none.drgsframe"), str(tmp_path / "a.ply")]) == 65
+
+
+def test_objects_stand_where_their_matrices_put_them(tmp_path: Path) -> None:
+    """Two instances of an asset, one of them mirrored and larger; a third that the camera does not see is left out."""
+    asset = str(plate(tmp_path / "plate.drgs"))
+    matrix = np.array([[0, -2, 0, 5], [-2, 0, 0, 1], [0, 0, 2, -3], [0, 0, 0, 1.0]])
+    states = [
+        ObjectState("a", asset),
+        ObjectState("b", asset, matrix_world=matrix),
+        ObjectState("c", asset, matrix_world=5 * matrix, visibility=Visibility(camera=False)),
+    ]
+    write_frame_file(tmp_path / "f.drgsframe", frame_of(states))
+    assert main(["convert", str(tmp_path / "f.drgsframe"), str(tmp_path / "f.ply"), "--as", "splats"]) == 0
+    found = read_surfels(tmp_path / "f.ply").surfels
+    assert len(found) == 120
+    np.testing.assert_allclose(found.centre[60:], found.centre[:60] @ matrix[:3, :3].T + matrix[:3, 3], atol=1e-5)
+    first = covariance(found.rotation[:60], found.scale[:60])
+    wanted = matrix[:3, :3] @ first @ matrix[:3, :3].T
+    np.testing.assert_allclose(covariance(found.rotation[60:], found.scale[60:]), wanted, atol=1e-5)
+    assert main(["convert", str(tmp_path / "f.drgsframe"), str(tmp_path / "f.glb"), "--scale", "2"]) == 0
+    mesh = read_mesh(tmp_path / "f.glb")
+    assert len(mesh.faces) == 4
+    np.testing.assert_allclose(mesh.vertices.min(axis=0), [-2, -2, -6], atol=1e-5)
+
+
+@pytest.mark.parametrize("tracer", ["mesh", "surfels"])
+def test_the_light_of_the_scene_is_baked_with_its_lamps_and_shadows(tmp_path: Path, tracer: str) -> None:
+    """A sun from above of 1 W/m2 on a plate of albedo a leaves a / pi; half of it lies in the shadow of a mesh."""
+    asset = str(plate(tmp_path / "plate.drgs", 0.8, meshless=tracer == "surfels"))
+    settings = RenderSettings(bounces=0, look="paper", tracer=tracer)  # type: ignore[arg-type]
+    sun = Light("sun", "sun", np.eye(4), power=np.pi * 0.5)
+    lid = MeshState("lid", SQUARE * [1, 2, 1] + np.float32([1, 0, 0.5]), FACES, np.eye(4)[None], np.zeros(1, np.int32))
+    black = World(None, colour=(0.0, 0.0, 0.0))
+    for name, meshes in (("open", []), ("half", [lid])):
+        frame = frame_of([ObjectState("a", asset)], world=black, lights=[sun], meshes=meshes, settings=settings)
+        write_frame_file(tmp_path / f"{name}.drgsframe", frame)
+        options = ["--as", "splats", "--colour", "relit", "--rays", "64"]
+        assert main(["convert", str(tmp_path / f"{name}.drgsframe"), str(tmp_path / f"{name}.ply"), *options]) == 0
+    surfels = [read_surfels(tmp_path / f"{name}.ply").surfels for name in ("open", "half")]
+    lit = surfels[0].albedo.mean()
+    assert 0.4 < lit < 0.44  # 0.8 / 2 of diffuse light, and a little that is glossy
+    under = surfels[1].centre[:, 0] > 0.05
+    assert surfels[1].albedo[under].max() < 0.02
+    np.testing.assert_allclose(surfels[1].albedo[surfels[1].centre[:, 0] < -0.05].mean(), lit, rtol=0.05)
+
+
+def test_painted_materials_are_what_is_written(tmp_path: Path) -> None:
+    asset = str(plate(tmp_path / "plate.drgs"))
+    state = ObjectState("a", asset, albedo=np.tile(np.float32([0.9, 0.1, 0.2]), (4, 1)))
+    write_frame_file(tmp_path / "f.drgsframe", frame_of([state]))
+    assert (
+        main(
+            ["convert", str(tmp_path / "f.drgsframe"), str(tmp_path / "f.ply"), "--as", "splats", "--colour", "albedo"]
+        )
+        == 0
+    )
+    np.testing.assert_allclose(read_surfels(tmp_path / "f.ply").surfels.albedo.mean(axis=0), [0.9, 0.1, 0.2], atol=1e-3)
+
+
+def test_the_world_is_written_as_it_is_turned(tmp_path: Path) -> None:
+    """A quarter turn about Z moves the columns of the picture by a quarter of its width."""
+    picture = np.random.default_rng(4).uniform(0, 9, (8, 16, 3)).astype(np.float32)
+    quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    write_frame_file(tmp_path / "f.drgsframe", frame_of([], world=World(picture, quarter, (1.0, 0.5, 2.0), 3.0)))
+    assert main(["convert", str(tmp_path / "f.drgsframe"), str(tmp_path / "f.exr")]) == 0
+    found = read_environment(tmp_path / "f.exr").radiance
+    np.testing.assert_allclose(found, np.roll(picture, 4, axis=1) * np.float32([3, 1.5, 6]), rtol=1e-3)
+    assert main(["convert", str(tmp_path / "f.drgsframe"), str(tmp_path / "f.ply")]) == 64
+
+
+def test_a_file_a_frame(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    asset = str(plate(tmp_path / "plate.drgs"))
+    for number in (1, 2, 3):
+        moved = SQUARE + np.float32([0, 0, number])
+        write_frame_file(tmp_path / f"f{number:04d}.drgsframe", frame_of([ObjectState("a", asset, vertices=moved)]))
+    arguments = [str(tmp_path / "f####.drgsframe"), str(tmp_path / "o##.spz"), "--frames", "1-3", "--as", "splats"]
+    assert main(["convert", *arguments]) == 0
+    for number in (1, 2, 3):
+        np.testing.assert_allclose(
+            read_surfels(tmp_path / f"o{number:02d}.spz").surfels.centre[:, 1], number, atol=2e-4
+        )

@@ -1,0 +1,378 @@
+"""Decoupling: its estimator against the reference and the renderer, its losses, and materials found again."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+torch = pytest.importorskip("torch")
+
+from drgs_blender.asset import Mesh  # noqa: E402
+from drgs_blender.asset.model import PosedSurfels  # noqa: E402
+from drgs_blender.colour import linear_to_srgb  # noqa: E402
+from drgs_blender.errors import Cancelled, UsageError  # noqa: E402
+from drgs_blender.frame import Camera, Frame, ObjectState, RenderSettings, World  # noqa: E402
+from drgs_blender.geometry import VertexNormals  # noqa: E402
+from drgs_blender.reconstruct.capture import Capture, View  # noqa: E402
+from drgs_blender.reconstruct.decouple.cache import radiance_cache  # noqa: E402
+from drgs_blender.reconstruct.decouple.gather import Gatherer, Points  # noqa: E402
+from drgs_blender.reconstruct.decouple.light import LearnedLight, colour_cast  # noqa: E402
+from drgs_blender.reconstruct.decouple.losses import log_loss, unbiased_loss  # noqa: E402
+from drgs_blender.reconstruct.decouple.materials import Materials, from_specular  # noqa: E402
+from drgs_blender.reconstruct.decouple.pixels import Pixels, foreground_pixels  # noqa: E402
+from drgs_blender.reconstruct.decouple.run import Decoupled, decouple  # noqa: E402
+from drgs_blender.reconstruct.decouple.settings import Settings  # noqa: E402
+from drgs_blender.render.lights.light import EnvironmentLight  # noqa: E402
+from drgs_blender.render.pipeline import render  # noqa: E402
+from drgs_blender.render.points import ShadingPoints  # noqa: E402
+from drgs_blender.render.reference.integrate import EmptyTracer, SurfacePoints, integrate_quadrature  # noqa: E402
+from drgs_blender.render.reference.light import Light  # noqa: E402
+from drgs_blender.render.shade.integrate import integrate as kernel_integrate  # noqa: E402
+from drgs_blender.render.trace.scene import TraceObject, TraceScene  # noqa: E402
+from drgs_blender.render.trace.tree import TriangleBVH  # noqa: E402
+
+torch.set_num_threads(1)
+
+#: Roughness (n,), and views of a floor at z = 0: cosines from steep to grazing.
+ROUGHNESS = np.array([0.15, 0.3, 0.6, 0.9], np.float32)
+ALPHA2 = (ROUGHNESS**4).astype(np.float32)
+
+
+def sky(rows: int = 16) -> np.ndarray:
+    """A coloured gradient with a lamp."""
+    image = np.random.default_rng(3).uniform(0.2, 1.0, (rows, 2 * rows, 3)).astype(np.float32)
+    image[rows // 4, rows // 2] = 12.0
+    return image
+
+
+def gatherer(mesh: Mesh, samples: int, normals: bool = False, cache: np.ndarray | None = None) -> Gatherer:
+    tree = TriangleBVH()
+    tree.build(mesh.vertices, mesh.faces)
+    return Gatherer(mesh, tree, cache, (samples // 2, samples // 4, samples // 4), normals)
+
+
+def plain_mesh(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
+    n = len(vertices)
+    return Mesh(vertices, faces, np.full((n, 3), 0.5), np.full(n, 0.5), np.zeros(n))
+
+
+def floor_points(count: int = len(ROUGHNESS)) -> tuple[Mesh, Points, np.ndarray]:
+    """A face far below, points above it that look up, and their normals."""
+    mesh = plain_mesh(np.array([[0, 0, -9], [1, 0, -9], [0, 1, -9.0]]), np.array([[0, 1, 2]]))
+    up = np.tile(np.float32([0, 0, 1]), (count, 1))
+    cosine = np.linspace(0.9, 0.35, count)
+    towards = np.stack([np.sqrt(1 - cosine**2), 0 * cosine, cosine], -1).astype(np.float32)
+    return mesh, Points(0 * up, up, towards, np.arange(count, dtype=np.uint32) + 7), up
+
+
+def quadrature(
+    image: torch.Tensor, normal: torch.Tensor, view: torch.Tensor, values: torch.Tensor, look: str
+) -> object:
+    """Radiance (n, 3) of points in the open, materials (n, 5), without chance."""
+    points = SurfacePoints(
+        torch.zeros(len(view), 3, dtype=torch.float64), normal, normal.detach(), view, values[:, :3], values[:, 3],
+        values[:, 4],
+    )  # fmt: skip
+    light = Light(image, torch.eye(3, dtype=torch.float64), torch.ones(3, dtype=torch.float64))
+    return integrate_quadrature(EmptyTracer(), light, points, 128, look).sum(1)
+
+
+@pytest.mark.parametrize("look", ["principled", "paper"])
+def test_radiance_and_its_derivatives_match_the_reference(look):
+    """Value, and derivatives by roughness, normal and light, against a quadrature that torch differentiates."""
+    mesh, points, up = floor_points()
+    image = sky()
+    columns = torch.tensor([[0.6, 0.4, 0.2, 0.0, 0.3]]).repeat(len(up), 1)
+    materials = Materials(mesh, "metallic", 0)
+    columns[:, 3] = (torch.from_numpy(ROUGHNESS) - 0.03) / 0.97
+    columns.requires_grad_(True)
+    normal = torch.from_numpy(up).clone().requires_grad_(True)
+    radiance = torch.from_numpy(image).clone().requires_grad_(True)
+    towards = torch.from_numpy(points.towards)
+    draw = gatherer(mesh, 1 << 15, normals=True)
+    unit = normal / normal.norm(dim=1, keepdim=True)
+    roughness = materials.roughness(columns)
+    sums = draw(points, unit, roughness**4, radiance)
+    nv = (unit * towards).sum(1)
+    ours = materials.reflect(columns, sums, nv, look)
+    assert ours[:, 0].detach().numpy() == pytest.approx(ours[:, 1].detach().numpy(), rel=0.03)  # independent halves
+    total = ours.mean(1)
+
+    wide = torch.from_numpy(image).double().clone().requires_grad_(True)
+    n64 = torch.from_numpy(up).double().requires_grad_(True)
+    values = columns.detach().double()
+    values[:, 3] = roughness.detach().double()
+    values.requires_grad_(True)
+    true = quadrature(wide, n64 / n64.norm(dim=1, keepdim=True), towards.double(), values, look)
+    assert total.detach().numpy() == pytest.approx(true.detach().numpy(), rel=0.01)
+
+    weight = torch.tensor([1.0, 0.5, 2.0])
+    own = torch.autograd.grad((total * weight).sum(), [columns, normal, radiance])
+    theirs = torch.autograd.grad((true * weight.double()).sum(), [values, n64, wide])
+    assert own[0][:, [0, 1, 2, 4]].numpy() == pytest.approx(theirs[0][:, [0, 1, 2, 4]].numpy(), rel=0.02, abs=0.01)
+    assert own[0][:, 3].numpy() / 0.97 == pytest.approx(theirs[0][:, 3].numpy(), rel=0.04, abs=0.02)
+    scale = float(theirs[1].abs().max())
+    assert own[1].numpy() == pytest.approx(theirs[1].numpy(), abs=0.03 * scale)
+    # Texels are found by chance one by one; bands of them, averaged, are compared.
+    bands = [g.double().reshape(4, 4, 4, 8, 3).sum((1, 3)) for g in (own[2], theirs[2])]
+    assert bands[0].numpy() == pytest.approx(bands[1].numpy(), abs=0.02 * float(bands[1].abs().max()))
+
+
+def test_derivative_by_radiance_is_that_of_a_finite_difference():
+    """The estimate is linear in the radiance, whatever was drawn: the difference quotient is exact."""
+    mesh, points, up = floor_points()
+    draw, image = gatherer(mesh, 64), sky(8)
+    draw.aim(image)
+    weights = torch.from_numpy(np.random.default_rng(1).normal(size=(len(up), 2, 4, 3)).astype(np.float32))
+    radiance = torch.from_numpy(image).requires_grad_(True)
+
+    def value(image: torch.Tensor) -> torch.Tensor:
+        return (draw(points, torch.from_numpy(up), torch.from_numpy(ALPHA2), image) * weights).sum()
+
+    (slope,) = torch.autograd.grad(value(radiance), radiance)
+    step = torch.from_numpy(np.random.default_rng(2).uniform(0, 1, image.shape).astype(np.float32))
+    with torch.no_grad():
+        quotient = (value(radiance + step) - value(radiance - step)) / 2
+    assert float((slope * step).sum()) == pytest.approx(float(quotient), rel=1e-3)
+
+
+def test_white_furnace():
+    """Under light of one everywhere a white Lambert surface sends one, and no lobe sends more."""
+    mesh, points, up = floor_points()
+    sums = gatherer(mesh, 8192).run(points, up, ALPHA2, np.ones((8, 16, 3), np.float32))[0].mean(1)
+    assert sums[:, 0] == pytest.approx(1.0, rel=0.01)
+    mirror = sums[:, 1] + sums[:, 2]
+    assert (mirror < 1.01).all() and mirror[0] == pytest.approx(1.0, abs=0.03)
+    assert (sums[:, 3] < 0.3).all()
+
+
+def test_shading_matches_the_renderer_where_the_mesh_shadows_itself():
+    """A ball over a floor: visibility, both lobes and the light's table, against the engine's own integrator."""
+    ball = trimesh.creation.icosphere(3, 1.0)
+    low = np.array([[-6, -6, -1.1], [6, -6, -1.1], [6, 6, -1.1], [-6, 6, -1.1]])
+    vertices = np.concatenate([ball.vertices, low]).astype(np.float32)
+    n = len(ball.vertices)
+    faces = np.concatenate([ball.faces, [[n, n + 1, n + 2], [n, n + 2, n + 3]]]).astype(np.int32)
+    mesh, image = plain_mesh(vertices, faces), sky()
+    rng = np.random.default_rng(4)
+    origin = np.concatenate([rng.uniform(-1.5, 1.5, (24, 2)), np.full((24, 1), -1.1)], 1).astype(np.float32)
+    up = np.tile(np.float32([0, 0, 1]), (24, 1))
+    view = np.array([0, -4, 3]) - origin
+    view = (view / np.linalg.norm(view, axis=1, keepdims=True)).astype(np.float32)
+    albedo, roughness, metallic = np.full((24, 3), 0.6, np.float32), np.full(24, 0.4), np.full(24, 0.5)
+    columns = torch.from_numpy(np.column_stack([albedo, (roughness - 0.03) / 0.97, metallic]).astype(np.float32))
+    draw = gatherer(mesh, 4096)
+    sums = draw.run(Points(origin, up, view, np.arange(24, dtype=np.uint32)), up, (roughness**4).astype("f4"), image)[0]
+    materials = Materials(mesh, "metallic", 0)
+    ours = materials.reflect(columns, torch.from_numpy(sums), torch.from_numpy(view[:, 2]), "principled").mean(1)
+
+    scene = TraceScene()
+    scene.update([TraceObject("both", mesh.vertices, mesh.faces, mesh.albedo, mesh.roughness, mesh.metallic)], [], [])
+    number, zero = np.arange(24, dtype=np.int32), np.zeros(24, np.int32)
+    points = ShadingPoints(
+        number, zero, np.ones(24, np.float32), origin, up, up, view, albedo, roughness.astype(np.float32),
+        metallic.astype(np.float32), np.zeros(24, np.uint8), zero - 1, np.zeros(24, np.float32),
+    )  # fmt: skip
+    settings = RenderSettings(cosine=2048, ggx=1024, environment=1024, bounces=0, aa=1)
+    theirs = kernel_integrate(scene, EnvironmentLight(World(image)), points, settings, 1).components.sum(1)
+    # Next to the contact, rays that start a little higher see a little less.
+    assert ours.numpy() == pytest.approx(theirs, rel=0.03, abs=0.006)
+    open_floor = gatherer(plain_mesh(low.astype(np.float32), np.array([[0, 1, 2], [0, 2, 3]])), 4096)
+    alone = open_floor.run(
+        Points(origin, up, view, np.arange(24, dtype=np.uint32)), up, (roughness**4).astype("f4"), image
+    )[0]
+    assert (sums[:, :, 0].mean((1, 2)) < 0.97 * alone[:, :, 0].mean((1, 2))).any()  # the ball does shadow
+
+
+def test_only_the_unbiased_loss_leaves_noise_alone():
+    """Two noisy estimates with the true mean: its slope is zero there, that of the common loss pulls."""
+    generator = torch.Generator().manual_seed(5)
+    photographed = torch.full((40000, 3), 0.3)
+    factor = torch.ones(1, requires_grad=True)
+    # Monte Carlo noise is one-sided: seldom much, mostly too little.
+    noise = torch.rand(40000, 2, 3, generator=generator) ** 3 * 4
+    shown = photographed[:, None] * noise * factor
+    (pull,) = torch.autograd.grad(unbiased_loss(shown, photographed), factor)
+    (biased,) = torch.autograd.grad(log_loss((photographed[:, None] * noise * factor).mean(1), photographed), factor)
+    curvature = float((photographed / (photographed + 0.03) ** 0.6).square().mean())
+    assert abs(float(pull)) < 0.02 * curvature
+    assert abs(float(biased)) > 0.02
+
+
+def test_clipped_photographs_set_no_upper_bound():
+    white = torch.ones(4, 3)
+    assert float(log_loss(torch.full((4, 3), 3.0), white)) == 0
+    assert float(unbiased_loss(torch.full((4, 2, 3), 3.0), white)) == 0
+    assert float(log_loss(torch.full((4, 3), 0.5), white)) > 0
+
+
+def test_specular_colours_and_back():
+    rng = np.random.default_rng(6)
+    albedo, metallic = rng.uniform(0.05, 0.95, (200, 3)), rng.uniform(0.02, 0.98, 200)
+    diffuse = (1 - metallic[:, None]) * albedo
+    specular = 0.04 * (1 - metallic[:, None]) + metallic[:, None] * albedo
+    found, metal = from_specular(diffuse, specular)
+    assert metal == pytest.approx(metallic, abs=2e-3) and found == pytest.approx(albedo, abs=2e-3)
+
+
+def test_growing_light_keeps_what_it_was():
+    light = LearnedLight(8, 1.5)
+    assert light.radiance().numpy() == pytest.approx(1.5, rel=1e-5)
+    u = torch.arange(16) / 16 * 2 * np.pi
+    light.log = light.log + 0.2 * torch.cos(u)[None, :, None]
+    before = light.log.mean()
+    light.grow()
+    assert light.log.shape == (16, 32, 3) and float(light.log.mean()) == pytest.approx(float(before), abs=1e-5)
+    fine = (torch.arange(32) + 0.5) / 32 * 2 * np.pi - np.pi / 16
+    wave = light.log[5, :, 0] - light.log[5, :, 0].mean()
+    assert wave.numpy() == pytest.approx(0.2 * torch.cos(fine).numpy(), abs=0.01)
+    assert float(colour_cast(light.radiance())) == pytest.approx(0, abs=1e-6)
+    assert float(colour_cast(light.radiance() * torch.tensor([1.0, 0.5, 0.2]))) > 0.1
+
+
+# A small capture: a ball with a painted and a metal half.
+
+
+def camera_at(angle: float, height: float, size: int) -> Camera:
+    eye = 4 * np.array([np.cos(angle) * np.cos(height), np.sin(angle) * np.cos(height), np.sin(height)])
+    back = eye / np.linalg.norm(eye)
+    right = np.cross([0, 0, 1], back)
+    right /= np.linalg.norm(right)
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.stack([right, np.cross(back, right), back], -1)
+    matrix[:3, 3] = eye
+    return Camera(matrix, size, size, 1.7 * size, 1.7 * size, size / 2, size / 2)
+
+
+@pytest.fixture(scope="module")
+def ball() -> Mesh:
+    shape = trimesh.creation.icosphere(4)
+    v = np.asarray(shape.vertices)
+    albedo = np.where(v[:, 2:] > 0, [0.8, 0.3, 0.15], [0.3, 0.5, 0.7]) * np.where(v[:, :1] > 0, 1.0, 0.45)
+    return Mesh(v, shape.faces, albedo, np.where(v[:, 1] > 0, 0.3, 0.6), np.where(v[:, 1] > 0.2, 1.0, 0.0))
+
+
+@pytest.fixture(scope="module")
+def capture(ball) -> Capture:
+    """14 photographs of 32 x 32 pixels by the engine."""
+    scene = TraceScene()
+    scene.update([TraceObject("ball", ball.vertices, ball.faces, ball.albedo, ball.roughness, ball.metallic)], [], [])
+    rows = np.linspace(0, np.pi, 33)[:-1, None]
+    columns = np.linspace(0, 2 * np.pi, 65)[None, :-1]
+    image = 0.1 + 1.0 * np.exp(-20 * ((rows - 0.9) ** 2 + (columns - 2.0) ** 2))
+    image = (image + 0.9 * np.exp(-20 * ((rows - 1.6) ** 2 + (columns - 4.6) ** 2)))[..., None] * np.float32([1, 1, 1])
+    world = World(image.astype(np.float32))
+    light, none, column = EnvironmentLight(world), np.empty((0, 3), np.float32), np.empty(0, np.float32)
+    posed = PosedSurfels(none, none, none, none, column, none, column, column, np.empty(0, np.int32))
+    settings = RenderSettings(cosine=64, ggx=32, environment=32, bounces=0, primary="mesh", aa=4, film_transparent=True)
+    views = []
+    for k in range(14):
+        camera = camera_at(2.4 * k, -0.6 + 0.12 * k, 32)
+        frame = Frame(1, camera, [ObjectState("ball", "")], world, settings)
+        picture = render(scene, light, posed, frame)["Combined"]
+        views.append(View(f"{k:02d}", camera, linear_to_srgb(np.clip(picture[..., :3], 0, 1)), picture[..., 3]))
+    return Capture(Path("ball"), views, (0.0, 0.0, 0.0))
+
+
+SMALL = Settings(iterations=12, pixels=128, cosine=4, ggx=4, light=4, environment=8, coarse=1)
+
+
+def arrays(found: Decoupled) -> list[np.ndarray]:
+    return [found.albedo, found.roughness, found.metallic, found.environment, found.normals]
+
+
+def test_materials_and_light_are_found_again(ball, capture):
+    found = decouple(capture, ball, Settings(iterations=250, pixels=512, environment=16, smoothness=0.002, seed=3))
+    scale = (found.albedo * ball.albedo).sum(0) / (found.albedo**2).sum(0)
+    error = np.sqrt(((found.albedo * scale - ball.albedo) ** 2).mean())
+    assert error < 0.45 * ball.albedo.std(axis=0).mean()
+    bright = np.unravel_index(found.environment.sum(-1).argmax(), (16, 32))
+    # Lamps at rows and columns (4.6, 10.2) and (8.1, 23.4) of 16 x 32.
+    assert min(np.hypot(bright[0] - 4.6, bright[1] - 10.2), np.hypot(bright[0] - 8.1, bright[1] - 23.4)) < 2, bright
+    assert found.report["psnr"] > 34
+    assert found.report["views"] == 14 and found.report["unseen_vertices"] < 0.2 * len(ball.vertices)
+
+
+@pytest.mark.parametrize("more", [{}, {"normals": True, "exposure": True, "parametrisation": "specular"}])
+def test_an_interrupted_run_ends_where_an_undisturbed_one_does(ball, capture, tmp_path, more):
+    settings = replace(SMALL, **more)
+    whole = decouple(capture, ball, settings)
+    path, asked = tmp_path / "materials.state", []
+
+    def cancelled() -> bool:
+        asked.append(0)
+        return len(asked) > 7
+
+    with pytest.raises(Cancelled):
+        decouple(capture, ball, settings, cancelled=cancelled, checkpoint=path)
+    assert path.exists()
+    seen = []
+    resumed = decouple(capture, ball, settings, on_progress=seen.append, checkpoint=path)
+    assert seen[-1].iteration == 12 and not path.exists()
+    for a, b in zip(arrays(whole), arrays(resumed)):
+        assert np.array_equal(a, b)
+    other = decouple(capture, ball, replace(settings, seed=1))
+    assert not np.array_equal(other.albedo, whole.albedo)
+
+
+def test_a_damaged_or_foreign_checkpoint_is_not_used(ball, capture, tmp_path, caplog):
+    whole = decouple(capture, ball, SMALL)
+    path = tmp_path / "materials.state"
+    path.write_bytes(b"PK not a checkpoint" * 9)
+    assert np.array_equal(decouple(capture, ball, SMALL, checkpoint=path).albedo, whole.albedo)
+    assert "cannot be used" in caplog.text
+    with pytest.raises(Cancelled):
+        decouple(capture, ball, replace(SMALL, seed=9), cancelled=lambda: True, checkpoint=path)
+    assert np.array_equal(decouple(capture, ball, SMALL, checkpoint=path).albedo, whole.albedo)
+    assert "other photographs or settings" in caplog.text
+
+
+def test_cache_shows_what_was_photographed(ball, capture):
+    tree = TriangleBVH()
+    tree.build(ball.vertices, ball.faces)
+    pixels = foreground_pixels(capture.views, ball, tree, 10**6)
+    constant = Pixels(
+        pixels.view, pixels.face, pixels.corners, pixels.origin, pixels.flat, pixels.towards,
+        np.full((len(pixels), 3), 0.3, np.float32),
+    )  # fmt: skip
+    harmonics, weight = radiance_cache(constant, ball)
+    assert harmonics[:, 0] * 0.28209479 == pytest.approx(0.3, abs=0.02)  # those that no photograph shows as well
+    assert (weight == 0).any()
+    assert abs(harmonics[weight > 3, 1:]).max() < 0.05
+    few = foreground_pixels(capture.views, ball, tree, 140)
+    assert len(few) == 140 and set(few.view) == set(range(14))
+
+
+def test_normals_are_the_meshs_where_none_are_learned(ball, capture):
+    found = decouple(capture, ball, replace(SMALL, iterations=2))
+    assert found.report["iterations"] == 2 and found.environment.shape == (8, 16, 3)
+    assert found.normals == pytest.approx(VertexNormals(ball.faces, len(ball.vertices))(ball.vertices), abs=1e-6)
+
+
+def test_bad_input_is_named(ball, capture):
+    for wrong in ({"iterations": 0}, {"cosine": 3}, {"environment": 24}, {"smoothness": -1.0}, {"look": "flat"}):
+        with pytest.raises(UsageError, match=next(iter(wrong))):
+            decouple(capture, ball, replace(SMALL, **wrong))
+    with pytest.raises(UsageError, match="no training view"):
+        decouple(Capture(Path("x"), []), ball, SMALL)
+    away = [replace(view, mask=np.zeros_like(view.mask)) for view in capture.views]
+    with pytest.raises(UsageError, match="none of its 14 training views sees the mesh"):
+        decouple(replace(capture, views=away), ball, SMALL)
+    small = [replace(view, colour=view.colour[:-1]) for view in capture.views]
+    with pytest.raises(UsageError, match="32 x 31 pixels"):
+        decouple(replace(capture, views=small), ball, SMALL)
+    with pytest.raises(Exception, match="no faces"):
+        decouple(capture, Mesh.empty(), SMALL)
+
+
+def test_black_and_unfinished_photographs_do_no_harm(ball, capture):
+    """A black frame and pixels that are no numbers: what is found stays finite."""
+    views = [replace(view, colour=view.colour.copy()) for view in capture.views[:6]]
+    views[0].colour[:] = 0
+    views[1].colour[10:20] = np.nan
+    found = decouple(replace(capture, views=views), ball, replace(SMALL, exposure=True))
+    assert all(np.isfinite(array).all() for array in arrays(found))

@@ -1,0 +1,218 @@
+"""From photographs of known shapes to an asset."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("skimage")
+
+from capture_cases import balls, colour_of_balls, distance_to_balls  # noqa: E402
+
+from drgs_blender.asset.container import read_asset, write_asset  # noqa: E402
+from drgs_blender.colour import linear_to_srgb  # noqa: E402
+from drgs_blender.errors import AssetError, Cancelled, UsageError  # noqa: E402
+from drgs_blender.geometry import VertexNormals  # noqa: E402
+from drgs_blender.reconstruct.capture import Capture  # noqa: E402
+from drgs_blender.reconstruct.decouple.settings import Settings as Decoupling  # noqa: E402
+from drgs_blender.reconstruct.hull import find_region  # noqa: E402
+from drgs_blender.reconstruct.job import Settings, reconstruct  # noqa: E402
+from drgs_blender.reconstruct.train import Schedule  # noqa: E402
+
+QUICK = Schedule(iterations=240, surfels=2500)
+
+
+@pytest.fixture(scope="module")
+def capture() -> Capture:
+    return balls()
+
+
+@pytest.fixture(scope="module")
+def settings() -> Settings:
+    return Settings(schedule=QUICK, mesh_resolution=64, materials=False)
+
+
+@pytest.fixture(scope="module")
+def asset(capture, settings):
+    return reconstruct(capture, settings)
+
+
+def closed(faces: np.ndarray) -> bool:
+    """Whether every edge has two faces that run along it in opposite directions."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    forth, back = {tuple(e) for e in edges}, {tuple(e) for e in edges[:, ::-1]}
+    return len(forth) == len(edges) and forth == back
+
+
+def test_hull_holds_the_object_and_touches_it(capture):
+    region = find_region(capture)
+    distance, outward = distance_to_balls(region.points)
+    assert distance.min() > -2.5 * region.spacing
+    assert np.median(np.abs(distance)) < region.spacing
+    assert np.einsum("nc,nc->n", outward, region.normals).mean() > 0.8
+    assert (region.low < (-0.85, -0.5, -0.45)).all() and (region.high > (0.8, 0.5, 0.6)).all()
+
+
+def test_mesh_is_closed_faces_outwards_and_lies_on_the_surface(asset, capture):
+    mesh = asset.mesh
+    assert closed(mesh.faces)
+    distance, outward = distance_to_balls(mesh.vertices)
+    pixel = 4.0 / capture.views[0].camera.fx
+    assert np.median(np.abs(distance)) < 0.5 * pixel and np.quantile(np.abs(distance), 0.95) < pixel
+    normals = VertexNormals(mesh.faces, len(mesh.vertices))(mesh.vertices)
+    angle = np.degrees(np.arccos(np.clip(np.einsum("nc,nc->n", normals, outward), -1, 1)))
+    assert np.median(angle) < 8  # turned inside out it would be 180
+
+
+def test_views_left_out_are_predicted(asset):
+    report = asset.provenance["report"]
+    assert report["left_out"] == 3 and report["psnr"] > 27 and report["ssim"] > 0.93
+
+
+def test_asset_is_whole(asset, tmp_path):
+    write_asset(tmp_path / "a.drgs", asset)
+    again = read_asset(tmp_path / "a.drgs")
+    assert len(again.surfels) == len(asset.surfels) == len(again.binding.face)
+    assert np.abs(distance_to_balls(again.surfels.centre)[0]).mean() < 0.05
+    # The colour was carried to the mesh, in linear values.
+    error = np.abs(linear_to_srgb(again.mesh.albedo) - colour_of_balls(again.mesh.vertices))
+    assert np.median(error) < 0.04
+
+
+def test_surfels_on_the_mesh_lie_where_their_binding_says(capture, settings):
+    asset = reconstruct(capture, replace(settings, variant="m", schedule=replace(QUICK, iterations=150)))
+    corners = asset.mesh.vertices[asset.mesh.faces[asset.binding.face]].astype(np.float64)
+    on_face = np.einsum("nk,nkc->nc", asset.binding.barycentric, corners)
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    edge = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2).mean(1)
+    expected = on_face + (asset.binding.offset * edge)[:, None] * normal
+    assert np.abs(expected - asset.surfels.centre).max() < 1e-5
+    assert np.abs(asset.binding.offset).max() > 1e-3  # it was learned
+    assert asset.provenance["report"]["psnr"] > 24
+
+
+def test_a_run_that_was_stopped_goes_on_bit_for_bit(capture, tmp_path):
+    short = Settings(schedule=replace(QUICK, iterations=40, surfels=1500), mesh_resolution=32, materials=False)
+    whole = reconstruct(capture, short)
+    steps = iter(range(1000))
+    with pytest.raises(Cancelled):
+        reconstruct(capture, short, cancelled=lambda: next(steps) == 17, folder=tmp_path)
+    resumed = reconstruct(capture, short, folder=tmp_path)
+    for name in ("centre", "scale", "rotation", "opacity", "sh"):
+        assert np.array_equal(getattr(whole.surfels, name), getattr(resumed.surfels, name)), name
+    assert np.array_equal(whole.mesh.vertices, resumed.mesh.vertices)
+
+
+def test_materials_and_light_come_with_the_asset(capture, tmp_path):
+    quick = Decoupling(iterations=30, pixels=256, cosine=4, ggx=4, light=4, environment=8)
+    short = Settings(schedule=replace(QUICK, iterations=60, surfels=1500), mesh_resolution=32, decoupling=quick)
+    told = []
+    asset = reconstruct(capture, short, told.append, folder=tmp_path)
+    assert asset.environment.radiance.shape == (8, 16, 3) and asset.environment.radiance.min() > 0
+    assert asset.provenance["report"]["decoupling"]["iterations"] == 30
+    assert told[-1].phase == "materials" and told[-1].part == 1.0
+    # A surfel has the mean of its face's corners, which have learned something.
+    corners = asset.mesh.faces[asset.binding.face]
+    expected = np.einsum("nk,nkc->nc", asset.binding.barycentric, asset.mesh.albedo[corners])
+    assert np.abs(asset.surfels.albedo - np.clip(expected, 0, 1)).max() < 1e-5
+    assert asset.mesh.albedo.std(axis=0).max() > 0.01
+
+
+def test_a_damaged_or_foreign_checkpoint_is_not_used(capture, tmp_path, caplog):
+    short = Settings(schedule=replace(QUICK, iterations=3, surfels=500), mesh_resolution=32, materials=False)
+    (tmp_path / "surfels.state").write_bytes(b"\x08\0\0\0\0\0\0\0{broken")
+    reconstruct(capture, short, folder=tmp_path)
+    assert "starting anew" in caplog.text
+    caplog.clear()
+    reconstruct(capture, replace(short, schedule=replace(short.schedule, seed=1)), folder=tmp_path)
+    assert "other photographs or settings" in caplog.text
+
+
+def test_progress_tells_phases_and_shows_pictures(capture):
+    told = []
+    short = Settings(schedule=replace(QUICK, iterations=5, surfels=500), mesh_resolution=32, materials=False)
+    reconstruct(capture, short, told.append)
+    assert [p.phase for p in told][:2] == ["surfels", "mesh"]
+    assert all(a.part <= b.part for a, b in pairwise(told))
+    picture = told[0].picture
+    assert picture.shape == (48, 96, 3) and 0 <= picture.min() <= picture.max() <= 1
+
+
+def test_without_masks_the_background_says_where_the_object_is():
+    region = find_region(balls(masks=False))
+    assert np.median(np.abs(distance_to_balls(region.points)[0])) < region.spacing
+
+
+def test_without_any_silhouette_the_user_is_told_and_points_are_used(caplog):
+    capture = balls(12, 24, masks=False)
+    capture.background = None
+    capture.points = np.random.default_rng(0).normal(size=(500, 3)).astype(np.float32)
+    region = find_region(capture)
+    assert "masks" in caplog.text
+    assert np.array_equal(region.points, capture.points)
+    capture.points = None
+    spread = find_region(capture)
+    assert np.linalg.norm(spread.points - spread.centre, axis=1).max() <= spread.radius * 1.001
+
+
+@pytest.mark.parametrize("case", ["two views", "one direction", "no mask", "other cameras", "mask size", "black"])
+def test_what_cannot_be_reconstructed_is_refused_by_name(case):
+    capture = balls(12, 24)
+    error, text = AssetError, ""
+    if case == "two views":
+        capture.views, error, text = capture.views[1:3], UsageError, "2 views"
+    elif case == "one direction":
+        for k, view in enumerate(capture.views):
+            matrix = capture.views[0].camera.matrix_world.copy()
+            matrix[0, 3] += 0.01 * k
+            view.camera = replace(view.camera, matrix_world=matrix)
+        error, text = UsageError, "one direction"
+    elif case == "no mask":
+        for view in capture.views:
+            view.mask[:] = 0
+        text = "no object"
+    elif case == "other cameras":
+        for view in capture.views:  # the camera looks the other way
+            view.camera = replace(view.camera, matrix_world=view.camera.matrix_world @ np.diag([1.0, -1, -1, 1]))
+        text = "no common point"
+    elif case == "mask size":
+        capture.views[3].mask = capture.views[3].mask[:-1]
+        text = "mask of 24 x 23"
+    elif case == "black":
+        for view in capture.views:
+            view.colour[:] = 0
+        text = "black"
+    with pytest.raises(error, match=text):
+        reconstruct(capture, Settings(schedule=Schedule(iterations=2)))
+
+
+def test_the_command_writes_an_asset_and_its_preview(tmp_path, capsys):
+    import json
+
+    from PIL import Image
+
+    from drgs_blender.cli.main import main
+
+    capture, frames = balls(10, 32), []
+    for view in capture.views:
+        rgba = np.concatenate([view.colour / np.maximum(view.mask[..., None], 1e-6), view.mask[..., None]], -1)
+        Image.fromarray((rgba.clip(0, 1) * 255).astype(np.uint8)).save(tmp_path / f"{view.name}.png")
+        frames.append({"file_path": view.name, "transform_matrix": view.camera.matrix_world.tolist()})
+    angle = 2 * np.arctan(0.5 * 32 / capture.views[0].camera.fx)
+    (tmp_path / "transforms.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
+    out = tmp_path / "made" / "balls.drgs"
+    options = ["--iterations", "30", "--surfels", "800", "--voxels", "32", "--test-every", "5", "--no-materials"]
+    code = main(["reconstruct", str(tmp_path), "--out", str(out), *options])
+    said = capsys.readouterr().out
+    assert code == 0 and "DRGS_PROGRESS" in said and "views left out: PSNR" in said
+    assert len(read_asset(out).surfels) > 100
+    assert Image.open(out.with_name("balls.preview.png")).size == (64, 32)
+    assert not Path(out.with_name("balls.reconstruct")).exists()
+    assert main(["reconstruct", str(tmp_path / "none"), "--out", str(out)]) == 65
+    assert main(["reconstruct", str(tmp_path), "--out", str(tmp_path / "a.blend")]) == 64

@@ -1,0 +1,300 @@
+"""Bakes: frames on disk that survive anything, and what is made of them."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import struct
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from drgs_blender.asset.container import write_asset
+from drgs_blender.asset.model import Asset, Mesh
+from drgs_blender.cli.main import main
+from drgs_blender.deform.attach import attach
+from drgs_blender.errors import AssetError, Cancelled, UsageError, WriteError
+from drgs_blender.formats.usd_points import write_usd_points
+from drgs_blender.particle_cache import ParticleCache
+from drgs_blender.simulate.bake import bake
+from drgs_blender.simulate.job import prepare
+from drgs_blender.simulate.settings import parse_settings
+
+DROP = {"resolution": 8, "floor": 0.0, "material": {"name": "jelly", "young": 2e4}, "last": 6}
+
+
+def block(levels: int = 2) -> Mesh:
+    body = trimesh.creation.box((0.5, 0.4, 0.3))
+    for _ in range(levels):
+        body = body.subdivide()
+    n = len(body.vertices)
+    left = np.flatnonzero(body.vertices[:, 0] < -0.1).astype(np.int32)
+    vertices = np.add(body.vertices, [0, 0, 0.2])
+    return Mesh(vertices, body.faces, np.full((n, 3), 0.5), np.full(n, 0.5), np.zeros(n), {"left": left})
+
+
+def job_of(data: dict | None = None, **more):
+    return prepare(block(), parse_settings((data or DROP) | more))
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted(folder.glob("frame_*"))}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> Path:
+    """A bake that nothing disturbed."""
+    folder = tmp_path_factory.mktemp("whole")
+    assert bake(job_of(), ParticleCache(folder)) == 5
+    return folder
+
+
+def test_frames_can_be_read_in_any_order(whole):
+    cache = ParticleCache(whole)
+    assert cache.frames() == [1, 2, 3, 4, 5, 6]
+    header = cache.header()
+    assert header.first == 1 and header.fps == 24 and header.settings["resolution"] == 8
+    rest = cache.rest()
+    for frame in (4, 1, 6, 2):
+        read = cache.read(frame)
+        assert read.points.shape == (header.points, 3) and read.points.dtype == np.float32
+        assert read.gradients.shape == (header.points, 3, 3) and read.gradients.dtype == np.float16
+        assert read.vertices.shape == (header.vertices, 3) == block().vertices.shape
+    assert np.array_equal(cache.read(1).points, rest.points)
+    assert cache.read(6).points[:, 2].mean() < rest.points[:, 2].mean() - 0.03
+    with pytest.raises(UsageError, match=r"frame 9: is not baked.*1 to 6"):
+        cache.read(9)
+    size = cache.path(3).stat().st_size
+    assert size < 30 * header.points + 12 * header.vertices + 1000
+
+
+def test_a_bake_goes_on_with_the_same_bits(tmp_path, whole):
+    cache = ParticleCache(tmp_path)
+    assert bake(job_of(last=3), cache) == 2
+    assert bake(job_of(last=3), cache) == 0
+    assert bake(job_of(), cache) == 3
+    assert content(tmp_path) == content(whole)
+
+
+def test_the_quick_solver_fills_the_same_cache(tmp_path):
+    cache, other = ParticleCache(tmp_path / "a"), ParticleCache(tmp_path / "b")
+    bake(job_of(solver="xpbd"), cache)
+    bake(job_of(solver="xpbd", last=3), other)
+    bake(job_of(solver="xpbd"), other)
+    assert content(tmp_path / "a") == content(tmp_path / "b")
+    assert cache.read(6).vertices[:, 2].min() > -0.02
+
+
+def test_a_cancelled_bake_keeps_its_frames(tmp_path, whole):
+    cache, job = ParticleCache(tmp_path), job_of()
+    with pytest.raises(Cancelled):
+        bake(job, cache, cancelled=lambda: len(cache.frames()) >= 3)
+    assert cache.frames() == [1, 2, 3]
+    bake(job_of(), cache)
+    assert content(tmp_path) == content(whole)
+
+
+def asset_file(tmp_path: Path) -> Path:
+    mesh = block()
+    surfels, binding, _ = attach(mesh)
+    path = tmp_path / "block.drgs"
+    write_asset(path, Asset(surfels, mesh, binding))
+    return path
+
+
+def test_kill_9_leaves_a_cache_that_loads_and_goes_on_with_the_same_bits(tmp_path, whole):
+    asset, folder = asset_file(tmp_path), tmp_path / "bake"
+    (tmp_path / "s.json").write_text(json.dumps(DROP | {"last": 400}))
+    command = [sys.executable, "-m", "drgs_blender.cli.main", "simulate", str(asset), "--settings",
+               str(tmp_path / "s.json"), "--out", str(folder)]  # fmt: skip
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, env=os.environ | {"NUMBA_NUM_THREADS": "2"})
+    cache = ParticleCache(folder)
+    for _ in range(1200):
+        if len(cache.frames()) > 3:
+            break
+        time.sleep(0.1)
+        assert process.poll() is None
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    seen = cache.frames()
+    assert 3 < len(seen) < 400
+    for frame in seen:
+        cache.read(frame)
+    (tmp_path / "s.json").write_text(json.dumps(DROP | {"last": 6}))
+    assert main(["simulate", str(asset), "--settings", str(tmp_path / "s.json"), "--out", str(folder)]) == 0
+    baked = content(folder)
+    for name, data in content(whole).items():
+        assert baked[name] == data, name
+
+
+@pytest.mark.parametrize("damage", ["state", "state bytes", "frame missing"])
+def test_a_cache_that_lost_something_is_baked_anew(tmp_path, whole, damage):
+    cache = ParticleCache(tmp_path)
+    bake(job_of(last=4), cache)
+    if damage == "state":
+        (tmp_path / "state.drgp").unlink()
+    elif damage == "state bytes":
+        data = bytearray((tmp_path / "state.drgp").read_bytes())
+        data[len(data) // 2] ^= 1
+        (tmp_path / "state.drgp").write_bytes(data)
+    else:
+        cache.path(2).unlink()
+    assert bake(job_of(), cache) == 5
+    assert content(tmp_path) == content(whole)
+
+
+def test_other_settings_are_not_mixed_in(tmp_path):
+    cache = ParticleCache(tmp_path)
+    bake(job_of(last=3), cache)
+    stiff = {"material": {"name": "jelly", "young": 4e4}, "last": 2}
+    with pytest.raises(UsageError, match=r"holds another simulation.*overwrite"):
+        bake(job_of(**stiff), cache)
+    assert cache.frames() == [1, 2, 3]
+    assert bake(job_of(**stiff), cache, overwrite=True) == 1
+    assert cache.frames() == [1, 2]
+
+
+def test_damaged_frames_are_named(tmp_path):
+    cache = ParticleCache(tmp_path)
+    bake(job_of(last=2), cache)
+    data = bytearray(cache.path(2).read_bytes())
+    data[len(data) // 2] ^= 4
+    cache.path(2).write_bytes(data)
+    with pytest.raises(AssetError, match=r"frame_000002.*Bake again"):
+        cache.read(2)
+    cache.path(2).write_bytes(data[:100])
+    with pytest.raises(AssetError, match=r"frame_000002.*Bake again"):
+        cache.read(2)
+    (tmp_path / "cache.json").write_text('{"no": 1}')
+    with pytest.raises(AssetError, match=r"cache\.json.*Bake again"):
+        cache.header()
+
+
+def test_a_full_disk_leaves_what_was_baked(tmp_path, monkeypatch):
+    cache, job = ParticleCache(tmp_path), job_of()
+    written = []
+    real = os.fsync
+
+    def full(descriptor):
+        written.append(1)
+        if len(written) > 12:
+            raise OSError(28, "No space left on device")
+        real(descriptor)
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(WriteError, match="No space left"):
+        bake(job, cache)
+    monkeypatch.undo()
+    assert len(cache.frames()) >= 2
+    assert not list(tmp_path.glob(".*.tmp"))
+    assert bake(job_of(), cache) > 0
+    assert cache.frames() == [1, 2, 3, 4, 5, 6]
+
+
+def test_vertex_groups_pin_and_differ(tmp_path):
+    regions = [{"group": "left", "material": {"name": "rubber", "young": 3e5, "density": 500}}]
+    job = job_of(pins=[{"group": "left"}], regions=regions, floor=None, last=3)
+    left = job.filling.points[:, 0] < -0.12
+    density = job.solver.body.matter.density
+    assert (density[left] == 500).all() and (density[~left & (job.filling.points[:, 0] > -0.03)] == 1000).all()
+    for _ in range(4):
+        job.solver.advance(1 / 24)
+    moved = np.abs(job.solver.points - job.filling.points).max(axis=1)
+    assert moved[left].max() < 1e-9 and moved[job.filling.points[:, 0] > 0.15].min() > 1e-3
+    with pytest.raises(UsageError, match=r"group 'right'.*There are left"):
+        job_of(pins=[{"group": "right"}])
+    with pytest.raises(UsageError, match="domain: does not contain the body"):
+        job_of(domain=[[0, 0, 0], [1, 1, 1]])
+
+
+def test_pins_follow_the_animated_mesh(tmp_path):
+    mesh = block()
+    path = np.stack([np.add(mesh.vertices, [0.02 * f, 0, 0]) for f in range(5)])
+    np.save(tmp_path / "motion.npy", path)
+    job = job_of(pins=[{"group": "left"}], gravity=[0, 0, 0], motion=str(tmp_path / "motion.npy"), last=5, floor=None)
+    bake(job, ParticleCache(tmp_path / "c"))
+    left = job.filling.points[:, 0] < -0.12
+    assert np.abs((job.solver.points - job.filling.points)[left] - [0.08, 0, 0]).max() < 1e-5
+
+
+def test_an_object_that_is_placed_moves_in_its_own_space(tmp_path):
+    """Turned on its side, moved and half as large: gravity in the world is along its own axis."""
+    turn = 0.5 * np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0.0]])
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = turn, [3, 2, 1]
+    job = job_of(matrix_world=matrix.tolist(), floor=None, last=3)
+    before = job.rest()
+    assert np.abs(before.vertices - block().vertices).max() < 1e-6
+    job.solver.advance(0.1)
+    now = job.now()
+    n = job.solver.steps
+    fall = -9.81 * 0.1**2 * (n + 1) / (2 * n)
+    assert np.abs(now.vertices - before.vertices - np.linalg.inv(turn) @ [0, 0, fall]).max() < 1e-4
+    assert np.abs(now.gradients - np.eye(3)).max() < 1e-3
+
+
+@pytest.mark.parametrize("suffix", [".pc2", ".mdd"])
+def test_exports_hold_every_vertex(tmp_path, whole, suffix):
+    asset = asset_file(tmp_path)
+    (tmp_path / "s.json").write_text(json.dumps(DROP))
+    out = tmp_path / f"block{suffix}"
+    poses = tmp_path / "v/####.npy"
+    code = main(["simulate", str(asset), "--settings", str(tmp_path / "s.json"), "--out", str(tmp_path / "c"),
+                 "--export", str(out), "--vertices", str(poses)])  # fmt: skip
+    assert code == 0
+    data = out.read_bytes()
+    n = len(block().vertices)
+    if suffix == ".pc2":
+        assert struct.unpack("<12s2i2fi", data[:32]) == (b"POINTCACHE2\0", 1, n, 1.0, 1.0, 6)
+        moving = np.frombuffer(data[32:], "<f4").reshape(6, n, 3)
+    else:
+        assert struct.unpack(">2i", data[:8]) == (6, n)
+        assert np.frombuffer(data[8:32], ">f4") == pytest.approx(np.arange(6) / 24)
+        moving = np.frombuffer(data[32:], ">f4").reshape(6, n, 3)
+    cache = ParticleCache(whole)
+    for frame in range(1, 7):
+        assert np.array_equal(moving[frame - 1], cache.read(frame).vertices)
+        assert np.array_equal(np.load(tmp_path / f"v/{frame:04d}.npy"), cache.read(frame).vertices)
+
+
+@pytest.mark.parametrize("suffix", [".usda", ".usdc"])
+def test_mesh_and_particles_are_exported_as_usd(tmp_path, whole, suffix):
+    usd = pytest.importorskip("pxr.Usd", reason="usd-core is an optional package")
+    from pxr import UsdGeom
+
+    cache, mesh = ParticleCache(whole), block()
+    matrix = np.diag([2.0, 2, 2, 1])
+    matrix[:3, 3] = 1, 2, 3
+    path = tmp_path / f"block{suffix}"
+    write_usd_points(path, (cache.read(f) for f in range(1, 7)), mesh.faces, 1, 24.0, matrix)
+    stage = usd.Stage.Open(str(path))
+    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode(), stage.GetTimeCodesPerSecond()) == (1, 6, 24)
+    shape, points = (UsdGeom.PointBased(stage.GetPrimAtPath(f"/Matter/{name}")) for name in ("Mesh", "Points"))
+    assert np.array_equal(np.array(UsdGeom.Mesh(shape).GetFaceVertexIndicesAttr().Get()), mesh.faces.reshape(-1))
+    for frame in (5, 2):
+        assert np.array_equal(np.array(shape.GetPointsAttr().Get(frame)), cache.read(frame).vertices)
+        assert np.array_equal(np.array(points.GetPointsAttr().Get(frame)), cache.read(frame).points)
+    placed = UsdGeom.XformCache(3).GetLocalToWorldTransform(shape.GetPrim()).Transform((1.0, 1.0, 1.0))
+    assert tuple(placed) == (3, 4, 5)
+
+
+def test_options_of_the_command_win_over_the_file(tmp_path, capsys):
+    asset = asset_file(tmp_path)
+    (tmp_path / "s.json").write_text(json.dumps(DROP | {"material": "sand"}))
+    command = ["simulate", str(asset), "--settings", str(tmp_path / "s.json"), "--out", str(tmp_path / "c")]
+    code = main(
+        [*command, "--material", "rubber", "--young", "5e4", "--gravity", "-1,0,-2", "--pin", "left", "--frames", "2"]
+    )
+    assert code == 0
+    assert "particles (winding number)" in capsys.readouterr().out
+    settings = ParticleCache(tmp_path / "c").header().settings
+    assert settings["material"]["name"] == "rubber" and settings["material"]["young"] == 5e4
+    assert settings["gravity"] == [-1, 0, -2] and settings["last"] == 2 and settings["pins"][0]["group"] == "left"
+    assert main([*command, "--poisson", "0.6"]) == 64
+    assert "poisson: is 0.6" in capsys.readouterr().err

@@ -1,0 +1,214 @@
+"""Materials one particle at a time: stress is the slope of the energy, turns with the matter, and yields."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from drgs_blender.errors import UsageError
+from drgs_blender.matter import MATERIALS, MODELS, make_material
+from drgs_blender.simulate.decompose import svd3
+from drgs_blender.simulate.settings import parse_settings
+from drgs_blender.simulate.stress import respond
+
+SOLID = [name for name, m in MATERIALS.items() if m.model != "fluid"]
+
+
+def stress(material, f, memory=0.0, affine=None, dt=1e-4):
+    """(tau, F after flow, memory) of one particle with deformation gradient f."""
+    own = np.array(f, np.float32).reshape(9).copy()
+    tau = np.zeros(6, np.float32)
+    row = np.array(material.row(), np.float32)
+    gradient = np.zeros(9, np.float32) if affine is None else np.asarray(affine, np.float32).reshape(9)
+    left = respond(MODELS[material.model], row, own, tau, np.float32(memory), gradient, dt)
+    full = np.array([[tau[0], tau[3], tau[4]], [tau[3], tau[1], tau[5]], [tau[4], tau[5], tau[2]]], float)
+    return full, own.reshape(3, 3).astype(float), float(left)
+
+
+def gradients(seed: int, size: float, n: int = 40) -> np.ndarray:
+    f = np.eye(3) + size * np.random.default_rng(seed).normal(size=(n, 3, 3))
+    return f[np.linalg.det(f) > 0.2]
+
+
+def start(material) -> float:
+    return 1.0 if material.model in ("snow", "fluid") else 0.0
+
+
+@pytest.mark.parametrize("kind", ["any", "equal", "flat"])
+def test_singular_values(kind):
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        a = rng.normal(size=(3, 3))
+        if kind != "any":
+            turn, other = Rotation.random(2, random_state=rng).as_matrix()
+            a = turn @ np.diag({"equal": [2.0, 2.0, 0.5], "flat": [1.0, 0.3, 0.0]}[kind]) @ other
+        u, s, v = (np.array(part) for part in svd3(a.reshape(9)))
+        u, v = u.reshape(3, 3), v.reshape(3, 3)
+        assert np.abs(u @ np.diag(s) @ v.T - a).max() < 1e-9
+        assert np.sort(s) == pytest.approx(np.sort(np.linalg.svd(a)[1]), abs=1e-7)
+        assert np.abs(v.T @ v - np.eye(3)).max() < 1e-12
+        assert np.abs(u.T @ u - np.eye(3)).max() < 1e-6
+
+
+def energy_of(material, f: np.ndarray) -> float:
+    first, mu = material.moduli()
+    s = np.linalg.svd(f)[1]
+    j, log = s.prod(), np.log(s)
+    if material.model == "elastic":
+        return 0.5 * mu * ((s**2).sum() - 3) - mu * np.log(j) + 0.5 * first * np.log(j) ** 2
+    if material.model == "corotated":
+        return mu * ((s - 1) ** 2).sum() + 0.5 * first * (j - 1) ** 2
+    return mu * (log**2).sum() + 0.5 * first * log.sum() ** 2  # Hencky
+
+
+@pytest.mark.parametrize("name", ["jelly", "rubber", "elastic", "metal"])
+def test_stress_is_the_slope_of_the_energy(name):
+    material = make_material(name, {"yield_stress": 1e12} if name == "metal" else None)
+    for f in gradients(0, 0.2):
+        f = f.astype(np.float32).astype(float)
+        slope = np.zeros((3, 3))
+        for i in range(3):
+            for k in range(3):
+                step = np.zeros((3, 3))
+                step[i, k] = 1e-5
+                slope[i, k] = (energy_of(material, f + step) - energy_of(material, f - step)) / 2e-5
+        expected = slope @ f.T
+        assert np.abs(stress(material, f)[0] - expected).max() < 2e-5 * max(np.abs(expected).max(), material.young)
+
+
+@pytest.mark.parametrize("name", list(MATERIALS))
+def test_stress_turns_with_the_matter(name):
+    material = MATERIALS[name]
+    turn = Rotation.from_rotvec([0.5, -1.1, 0.4]).as_matrix()
+    velocity = np.random.default_rng(1).normal(size=(3, 3)) * 20
+    for f in gradients(2, 0.1, 10):
+        a, fa, ma = stress(material, f, start(material), velocity)
+        b, fb, mb = stress(material, turn @ f, start(material), turn @ velocity @ turn.T)
+        assert np.abs(turn @ a @ turn.T - b).max() < 3e-4 * max(np.abs(a).max(), 1.0)
+        if material.model != "fluid":
+            assert np.abs(turn @ fa - fb).max() < 1e-5
+        assert ma == pytest.approx(mb, abs=1e-5)
+
+
+@pytest.mark.parametrize("name", SOLID)
+def test_matter_at_rest_has_no_stress_and_small_strain_is_hookes(name):
+    material = MATERIALS[name]
+    tau, f, _ = stress(material, np.eye(3), start(material))
+    assert np.abs(tau).max() < 1e-6 * material.young
+    assert np.abs(f - np.eye(3)).max() < 1e-6
+    if name == "sand":
+        return  # bears no tension
+    strain = 1e-3 * np.array([[1.0, 0.4, 0.1], [0.4, -0.5, 0.2], [0.1, 0.2, 0.3]])
+    first, mu = material.moduli()
+    expected = 2 * mu * strain + first * np.trace(strain) * np.eye(3)
+    assert (
+        np.abs(stress(material, np.eye(3) + strain, start(material))[0] - expected).max()
+        < 0.02 * np.abs(expected).max()
+    )
+
+
+@pytest.mark.parametrize("name", ["metal", "clay"])
+def test_metal_flows_on_its_yield_surface(name):
+    material = make_material(name, {"hardening": 0.0})
+    for f in gradients(3, 0.3):
+        tau, left, plastic = stress(material, f)
+        deviator = tau - np.trace(tau) / 3 * np.eye(3)
+        assert np.linalg.norm(deviator) <= math.sqrt(2 / 3) * material.yield_stress * (1 + 1e-3)
+        assert plastic > 0
+        assert np.linalg.det(left) == pytest.approx(np.linalg.det(f), rel=1e-4)  # volume is kept in flow
+
+
+def test_hardening_strengthens_and_viscosity_delays():
+    shear = np.array([[1, 0.2, 0], [0, 1, 0], [0, 0, 1.0]])
+    norms = {}
+    for name, numbers in {
+        "plain": {}, "hard": {"hardening": 1e6}, "slow": {"viscosity": 1e5}, "soft": {"hardening": -1e5},
+    }.items():  # fmt: skip
+        tau = stress(make_material("metal", {"hardening": 0.0, "young": 1e6} | numbers), shear, 0.05)[0]
+        norms[name] = np.linalg.norm(tau - np.trace(tau) / 3 * np.eye(3))
+    assert norms["soft"] < norms["plain"] < norms["hard"]
+    assert norms["plain"] < norms["slow"]
+
+
+def test_sand_bears_shear_in_proportion_to_pressure_and_no_tension():
+    material = make_material("sand", {"friction_angle": 30.0})
+    sine = math.sin(math.radians(30))
+    seen = 0
+    for f in gradients(4, 0.02, 200):
+        f = f * 0.985
+        tau, left, _ = stress(material, f)
+        pressure = -np.trace(tau) / 3
+        shear = np.linalg.norm(tau + pressure * np.eye(3))
+        assert pressure >= -1e-3 * material.young * 1e-3
+        assert shear <= math.sqrt(2 / 3) * 6 * sine / (3 - sine) * pressure * 1.01 + 1e-3
+        seen += shear > 0.9 * math.sqrt(2 / 3) * 6 * sine / (3 - sine) * pressure
+    assert seen > 20
+    tau, left, memory = stress(material, np.eye(3) * 1.05)
+    assert np.abs(tau).max() == 0 and memory == pytest.approx(3 * math.log(1.05), rel=1e-4)
+    assert np.abs(left - np.eye(3)).max() < 1e-6
+    # Closing the gap again raises no pressure before it is closed.
+    tau, _, memory = stress(material, np.eye(3) * 0.97, memory)
+    assert np.abs(tau).max() == 0 and memory > 0
+
+
+def test_snow_crushes_hardens_and_tears():
+    snow = MATERIALS["snow"]
+    _, elastic, plastic = stress(snow, np.eye(3) * 0.9, 1.0)
+    assert np.allclose(np.diag(elastic), 1 - snow.compression, atol=1e-5)
+    assert plastic < 1
+    packed = stress(snow, np.eye(3) * 0.99, plastic)[0]
+    fresh = stress(snow, np.eye(3) * 0.99, 1.0)[0]
+    assert -np.trace(packed) > -1.5 * np.trace(fresh)
+    _, elastic, torn = stress(snow, np.eye(3) * 1.1, 1.0)
+    assert np.allclose(np.diag(elastic), 1 + snow.stretch, atol=1e-5) and torn > 1
+
+
+def test_water_pushes_back_and_honey_resists_shear():
+    water, honey = MATERIALS["water"], MATERIALS["honey"]
+    squeezed, _, j = stress(water, np.eye(3), 1.0, -np.eye(3) * 10, 1e-3)
+    assert j == pytest.approx(1 - 30e-3)
+    assert -squeezed[0, 0] == pytest.approx(2e5 / 0.6 / 7 * (j**-7 - 1) * j, rel=1e-4)
+    shear = np.array([[0, 4.0, 0], [0, 0, 0], [0, 0, 0]])
+    assert stress(honey, np.eye(3), 1.0, shear)[0][0, 1] == pytest.approx(50.0 * 4.0, rel=1e-4)
+    assert stress(water, np.eye(3), 1.0, shear)[0][0, 1] == 0
+
+
+@pytest.mark.parametrize("name", list(MATERIALS))
+def test_wild_deformation_stays_finite(name):
+    material = MATERIALS[name]
+    rng = np.random.default_rng(5)
+    for f in [*(rng.normal(size=(20, 3, 3)) * 3), np.zeros((3, 3)), np.diag([1, 1, 0.0]), np.diag([1, 1, -1.0])]:
+        tau, left, memory = stress(material, f, start(material))
+        assert np.isfinite(tau).all() and np.isfinite(left).all() and math.isfinite(memory)
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        ({"material": "jello"}, "there is no material 'jello'.*jelly"),
+        ({"material": {"name": "jelly", "poisson": 0.5}}, "poisson: is 0.5.*0.49"),
+        ({"material": {"name": "jelly", "young": 0}}, "young: is 0.*from 1 to"),
+        ({"material": {"name": "jelly", "colour": 1}}, "colour: is not a setting"),
+        ({"resolution": 3}, "resolution: is 3.*from 4 to 400"),
+        ({"gravity": [0, 1]}, "gravity.*three numbers"),
+        ({"gravity": [0, 1, "nan"]}, "gravity.*three numbers"),
+        ({"domain": [[0, 0, 0], [1, 1, 0]]}, "two corners"),
+        ({"pins": [{}]}, "pins 1: names no part"),
+        ({"colliders": [{"friction": 1}]}, "colliders 1: names no mesh"),
+        ({"walls": "soft"}, "walls.*separate"),
+        ({"frames": 3}, "frames: is not a setting"),
+        ({"first": 5, "last": 4}, "ends at frame 4"),
+        ({"matrix_world": [[0] * 4] * 4}, "can be inverted"),
+        ([], "not a JSON object"),
+    ],
+)
+def test_settings_that_cannot_be_are_named(data, said):
+    with pytest.raises(UsageError, match=said):
+        parse_settings(data)
+
+
+def test_extreme_stiffness_is_possible():
+    assert make_material("jelly", {"young": 2e9}).wave_speed() == pytest.approx(1640, rel=0.01)

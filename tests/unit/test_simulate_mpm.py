@@ -1,0 +1,410 @@
+"""The particle solver against mechanics: free fall, momenta, energy, beams, bars, drops, friction, sand, water."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from matter_cases import cantilever, energy, lattice, masses, momenta, solver_of, timoshenko
+from plain_mpm import PlainMpm
+from scipy.spatial.transform import Rotation
+
+from drgs_blender.errors import Cancelled, UsageError
+from drgs_blender.jit import get_num_threads, set_num_threads
+from drgs_blender.simulate.colliders import Collider
+from drgs_blender.simulate.contact import Plane
+
+FRAME = 1 / 24
+
+
+def test_free_fall_is_the_discrete_solution():
+    solver = solver_of(lattice((0.4, 0.4, 0.4), 0.05), 0.1, gravity=(0, 0, -9.81), low=(-1, -1, -3), young=1e5)
+    rest = solver.points.copy()
+    solver.advance(0.5)
+    n = solver.steps
+    expected = -9.81 * (0.5 / n) ** 2 * n * (n + 1) / 2
+    assert np.abs(solver.points - rest - [0, 0, expected]).max() < 1e-5 * abs(expected)
+
+
+def spinning_jelly(h: float = 0.1) -> object:
+    points = lattice((0.5, 0.4, 0.3), h / 2)
+    centre = points.mean(axis=0)
+    turning = np.cross([1.0, -2.0, 4.0], points - centre) + 0.3 * np.sin(7 * points[:, [1, 2, 0]])
+    turning -= turning.mean(axis=0) - [0.01, 0.02, 0.03]
+    return solver_of(points, h, young=2e4, velocity=turning, low=points.min(axis=0) - 1, high=points.max(axis=0) + 1)
+
+
+def test_momenta_are_kept_over_3000_steps():
+    solver = spinning_jelly()
+    linear, angular = momenta(solver)
+    moving = masses(solver) * np.linalg.norm(solver.state.v, axis=1)
+    arm = np.linalg.norm(solver.points, axis=1)
+    while solver.steps < 3000:
+        solver.advance(0.5)
+    later, turned = momenta(solver)
+    assert np.abs(later - linear).max() < 1e-5 * moving.sum()
+    assert np.abs(turned - angular).max() < 1e-5 * (moving * arm).sum()
+    assert np.linalg.norm(angular) > 0.2 * (moving * arm).sum()
+
+
+def test_energy_only_falls_and_slowly():
+    """A body that vibrates in its lowest mode."""
+    h = 0.0625
+    points = lattice((1, 0.5, 0.5), h / 2)
+    stretch = 0.5 * np.sin(np.pi * (points[:, 0] - 0.5))
+    solver = solver_of(points, h, young=1e5, poisson=0.3, velocity=np.stack([stretch, 0 * stretch, 0 * stretch], -1))
+    start, step = energy(solver)[0], 0.4 / solver.steps_of(0.4)
+    for _ in range(4):
+        solver.advance(0.3 / 4)
+        stored = energy(solver)[1]
+        solver.advance(step)
+        kinetic, later = energy(solver)
+        # Velocities belong to the middle of a step, deformation to its ends.
+        now = kinetic + 0.5 * (stored + later)
+        assert now < 1.001 * start
+    assert now > 0.93 * start
+
+
+def test_another_solver_goes_the_same_way():
+    """1500 steps of one and the same state, against plain numpy in double precision."""
+    h = 0.1
+    points = lattice((0.3, 0.2, 0.2), h / 2)
+    velocity = np.cross([2.0, -2.0, 4.0], points - points.mean(axis=0)) + 2 * np.sin(9 * points[:, [1, 2, 0]])
+    solver = solver_of(
+        points, h, young=1e6, velocity=velocity - velocity.mean(axis=0), gravity=(0.1, 0, -0.2),
+        low=points.min(axis=0) - 0.4, high=points.max(axis=0) + 0.3,
+    )  # fmt: skip
+    plain = PlainMpm(solver)
+    steps = 1500
+    dt = 0.999 * 0.5 * h / float(solver.body.matter.wave_speed.max())
+    for _ in range(5):
+        solver.advance(steps / 5 * dt)
+    assert solver.steps == steps
+    for _ in range(steps):
+        plain.step(dt)
+    moved = np.linalg.norm(plain.x - points, axis=1) / h
+    apart = np.sqrt((np.linalg.norm(plain.x - solver.points, axis=1) ** 2).mean()) / h
+    assert moved.mean() > 2
+    assert apart < 5e-4
+    assert np.abs(plain.f - solver.gradients).max() < 1e-3
+
+
+def tip_of(solver) -> np.ndarray:
+    """Particles at the end of a cantilever."""
+    x = solver.points[:, 0]
+    return x > x.max() - solver.domain.spacing
+
+
+def test_cantilever_droops_as_timoshenko_says():
+    solver = cantilever(4, length=0.75, gravity=(0, 0, -0.1), damping=14.0)
+    rest, tip = solver.points.copy(), tip_of(solver)
+    for _ in range(28):
+        solver.advance(FRAME)
+    assert (rest - solver.points)[tip, 2].mean() == pytest.approx(timoshenko(100.0, length=0.75), rel=0.03)
+
+
+def test_cantilever_swings_at_its_first_frequency():
+    """Against Euler and Bernoulli, whose beam is a little too stiff."""
+    solver = cantilever(4, length=0.75, gravity=(0, 0, -0.1))
+    rest, tip = solver.points.copy(), tip_of(solver)
+    droop = []
+    for _ in range(24):
+        solver.advance(0.025)
+        droop.append((rest - solver.points)[tip, 2].mean())
+    # Released at rest it swings as 1 - cos: its lowest point is half a period from the start.
+    top = int(np.argmax(droop))
+    a, b, c = droop[top - 1 : top + 2]
+    half = (top + 1 + 0.5 * (a - c) / (a - 2 * b + c)) * 0.025
+    exact = 3.516 / (2 * np.pi) * np.sqrt(1e6 * 0.125**2 / 12 / 1000) / 0.75**2
+    assert 0.93 < 0.5 / half / exact < 0.98
+
+
+def test_a_hanging_bar_stretches_by_half_its_weight():
+    h = 0.0625
+    points = lattice((0.25, 0.25, 1 + 2 * h), h / 2)
+    solver = solver_of(
+        points,
+        h,
+        young=1e5,
+        poisson=0.0,
+        gravity=(0, 0, -0.5),
+        damping=20,
+        pinned=points[:, 2] > 1,
+        low=(-0.2, -0.2, -1),
+    )
+    for _ in range(36):
+        solver.advance(FRAME)
+    end = points[:, 2] < h
+    stretch = (points - solver.points)[end, 2].mean()
+    assert stretch == pytest.approx(1000 * 0.5 * 1.0**2 / (2 * 1e5), rel=0.03)
+
+
+def box(low, high) -> tuple[np.ndarray, np.ndarray]:
+    import trimesh
+
+    mesh = trimesh.creation.box(np.subtract(high, low))
+    return mesh.vertices + np.add(low, high) / 2, np.asarray(mesh.faces)
+
+
+@pytest.mark.parametrize("obstacle", ["plane", "mesh", "single face"])
+@pytest.mark.parametrize("young", [3e4, 5e5])
+def test_a_dropped_block_neither_sinks_in_nor_shrinks(obstacle, young):
+    h = 0.1
+    points = np.add(lattice((0.6, 0.6, 0.6), h / 2), [0, 0, 0.2])
+    colliders, planes = [], []
+    if obstacle == "plane":
+        planes = [Plane((0, 0, 0), (0, 0, 1))]
+    elif obstacle == "mesh":
+        vertices, faces = box((-1, -1, -0.5), (2, 2, 0))
+        colliders = [Collider("slab", faces, vertices)]
+    else:
+        corners = np.array([[-3, -3, 0], [3, -3, 0], [3, 3, 0], [-3, 3, 0.0]])
+        colliders = [Collider("face", np.array([[0, 1, 2], [0, 2, 3]]), corners)]
+    solver = solver_of(
+        points, h, young=young, gravity=(0, 0, -9.81), damping=2, colliders=colliders, planes=planes,
+        low=(-0.8, -0.8, -0.4), high=(1.4, 1.4, 1.4),
+    )  # fmt: skip
+    lowest = np.inf
+    for _ in range(24):
+        solver.advance(FRAME)
+        lowest = min(lowest, float(solver.points[:, 2].min()))
+    assert lowest > -0.75 * h
+    volume = (np.linalg.det(solver.gradients.astype(float)) * solver.body.volume).sum()
+    sag = 1000 * 9.81 * 0.3 / young  # what its own weight presses out of it
+    assert volume > (0.96 - sag) * solver.body.volume.sum()
+    assert solver.points[:, 2].max() < 0.8 + h
+
+
+@pytest.mark.parametrize("friction", [0.2, 1.0])
+def test_coulomb_friction_on_a_slope(friction):
+    """A block on a slope of 30 degrees slides with g (sin - mu cos), or stays."""
+    h, slope = 0.05, np.radians(30)
+    points = lattice((0.4, 0.4, 0.2), h / 2)
+    gravity = 9.81 * np.array([np.sin(slope), 0, -np.cos(slope)])
+    solver = solver_of(
+        points, h, young=1e6, gravity=tuple(gravity), planes=[Plane((0, 0, 0), (0, 0, 1), friction=friction)],
+        low=(-0.2, -0.2, -0.2), high=(2.5, 0.6, 0.6),
+    )  # fmt: skip
+    solver.advance(0.1)  # settles
+    start, speed = solver.points[:, 0].mean(), solver.state.v[:, 0].mean()
+    solver.advance(0.3)
+    expected = max(0.0, 9.81 * (np.sin(slope) - friction * np.cos(slope)))
+    moved = solver.points[:, 0].mean() - start
+    assert moved == pytest.approx(speed * 0.3 + 0.5 * expected * 0.3**2, abs=0.02)
+
+
+def test_a_lift_carries_what_is_on_it_and_a_turntable_turns_it():
+    h = 0.1
+    points = lattice((0.4, 0.4, 0.3), h / 2) - [0.2, 0.2, 0]
+    vertices, faces = box((-0.6, -0.6, -0.4), (0.6, 0.6, 0))
+    frames = np.arange(13)
+    turn = Rotation.from_rotvec(np.outer(frames * FRAME, [0, 0, 1.0])).as_matrix()
+    path = np.stack([vertices @ r.T + [0, 0, f * FRAME * 0.5] for f, r in zip(frames, turn)])
+    lift = Collider("lift", faces, path, contact="sticky")
+    solver = solver_of(
+        points, h, young=2e5, gravity=(0, 0, -9.81), colliders=[lift], low=(-1, -1, -0.6), high=(1, 1, 1.2), damping=1.0
+    )
+    for _ in range(12):
+        solver.advance(FRAME)
+    assert solver.points[:, 2].mean() == pytest.approx(0.15 + 0.25, abs=0.05)
+    low = points[:, 2] < 0.1
+    expected = points[low] @ turn[-1].T
+    assert np.abs(solver.points[low, :2] - expected[:, :2]).max() < 0.06
+
+
+def test_a_collider_that_deforms_pushes():
+    """A sheet that bulges upwards under a block."""
+    h = 0.1
+    points = lattice((0.4, 0.4, 0.2), h / 2) - [0.2, 0.2, -0.05]
+    u, v = np.meshgrid(np.linspace(-1, 1, 21), np.linspace(-1, 1, 21), indexing="ij")
+    corner = (np.arange(20)[:, None] * 21 + np.arange(20)).reshape(-1)
+    faces = np.concatenate(
+        [np.stack([corner, corner + 21, corner + 22], -1), np.stack([corner, corner + 22, corner + 1], -1)]
+    )
+    bulge = np.exp(-4 * (u**2 + v**2))
+    path = np.stack([np.stack([u, v, bulge * 0.04 * f], -1).reshape(-1, 3) for f in range(11)])
+    solver = solver_of(
+        points, h, young=2e5, gravity=(0, 0, -9.81), damping=2, colliders=[Collider("sheet", faces, path)],
+        low=(-1, -1, -0.4), high=(1, 1, 1.2),
+    )  # fmt: skip
+    for _ in range(10):
+        solver.advance(FRAME)
+    middle = np.abs(points[:, :2]).max(axis=1) < 0.06
+    assert solver.points[middle, 2].min() > 0.4 - 0.75 * h
+
+
+def test_pins_follow_their_targets_and_pull_the_rest():
+    h = 0.1
+    points = lattice((0.8, 0.3, 0.3), h / 2)
+    pinned = points[:, 0] < 0.2
+    solver = solver_of(points, h, young=1e5, damping=5, pinned=pinned, low=(-0.5, -0.5, -0.5), high=(3, 1, 1))
+    for k in range(1, 25):
+        solver.advance(FRAME, points[pinned] + [0.02 * k, 0, 0])
+    assert np.abs(solver.points[pinned] - points[pinned] - [0.48, 0, 0]).max() < 1e-6
+    assert (solver.points - points)[~pinned, 0].mean() == pytest.approx(0.48, abs=0.12)
+
+
+def slope_of_pile(solver) -> float:
+    """Degrees: how steeply the surface of a round pile falls between a quarter and three quarters of its height."""
+    x = solver.points - [*solver.points[:, :2].mean(axis=0), 0]
+    radius = np.linalg.norm(x[:, :2], axis=1)
+    edges = np.quantile(radius, np.linspace(0, 0.98, 13))
+    height = np.array([np.quantile(x[(radius >= a) & (radius < b), 2], 0.97) for a, b in pairwise(edges)])
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    use = (height > 0.2 * height.max()) & (height < 0.8 * height.max())
+    return float(np.degrees(np.arctan(-np.polyfit(middle[use], height[use], 1)[0])))
+
+
+def test_sand_holds_a_slope_below_its_angle_of_friction_only():
+    """A cone of 27 degrees."""
+    h = 0.08
+    points = lattice((1.28, 1.28, 0.4), h / 2) - [0.64, 0.64, 0]
+    points = points[points[:, 2] < 0.36 - 0.51 * np.linalg.norm(points[:, :2], axis=1)]
+    slopes = {}
+    for angle in (45.0, 12.0):
+        solver = solver_of(
+            points, h, "sand", gravity=(0, 0, -9.81), young=1e5, planes=[Plane((0, 0, 0), (0, 0, 1), friction=1.0)],
+            low=(-1.5, -1.5, -0.3), high=(1.5, 1.5, 1), friction_angle=angle,
+        )  # fmt: skip
+        for _ in range(24):
+            solver.advance(FRAME)
+        slopes[angle] = slope_of_pile(solver)
+    assert 22 < slopes[45.0] < 30
+    assert slopes[12.0] < 16
+
+
+def test_standing_water_bears_its_weight():
+    """A full box of water keeps its height but for its compressibility, and comes to rest."""
+    h = 0.1
+    points = lattice((0.8, 0.8, 0.8), h / 2)
+    walls = [Plane((0, 0, 0), n, "slip") for n in ((1, 0, 0), (0, 1, 0), (0, 0, 1))]
+    walls += [Plane((0.8, 0.8, 0), n, "slip") for n in ((-1, 0, 0), (0, -1, 0))]
+    solver = solver_of(points, h, "water", gravity=(0, 0, -9.81), planes=walls, damping=10.0)
+    for _ in range(24):
+        solver.advance(FRAME)
+    assert solver.points[:, 2].mean() == pytest.approx(0.4, abs=0.02)
+    depth = 0.8 - points[:, 2]
+    pressure = -solver.state.tau[:, :3].mean(axis=1)
+    deep = (points[:, 2] < 0.5) & (points[:, 2] > 0.1)
+    assert pressure[deep].mean() == pytest.approx(1000 * 9.81 * depth[deep].mean(), rel=0.05)
+
+
+def test_metal_stays_bent_and_jelly_does_not():
+    """Both are pressed by a plate to two thirds of their height, which then lifts."""
+    h = 0.1
+    points = lattice((0.4, 0.4, 0.6), h / 2)
+    vertices, faces = box((-0.5, -0.5, 0.62), (0.9, 0.9, 0.9))
+    down = np.concatenate([np.linspace(0, -0.22, 11), np.linspace(-0.22, 0.3, 14)[1:], np.full(12, 0.3)])
+    plate = Collider("plate", faces, vertices + down[:, None, None] * [0, 0, 1], friction=0.0)
+    heights = {}
+    for name in ("metal", "jelly"):
+        solver = solver_of(
+            points, h, name, planes=[Plane((0, 0, 0), (0, 0, 1), "separate", 0.0)], colliders=[plate], damping=3.0,
+            young=1e5, **({"yield_stress": 3e3, "hardening": 0.0} if name == "metal" else {}),
+        )  # fmt: skip
+        for _ in range(len(down) - 1):
+            solver.advance(FRAME)
+        heights[name] = float(np.ptp(solver.points[:, 2]))
+        if name == "metal":
+            elastic, total = (np.linalg.norm(f.reshape(-1, 3, 3) - np.eye(3), axis=(1, 2)).mean() for f in (
+                solver.state.elastic, solver.state.total))  # fmt: skip
+            assert total > 2 * elastic  # the surfels follow the whole deformation, not what springs back
+    assert heights["metal"] < 0.5
+    assert heights["jelly"] > 0.54
+
+
+def test_turning_everything_turns_the_result():
+    """A quarter turn maps the grid to itself: the motion is the same but for rounding."""
+    h = 0.1
+    points = lattice((0.5, 0.3, 0.2), h / 2) - [0.25, 0.15, 0.1]
+    turn = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0.0]])
+    results = []
+    for r in (np.eye(3), turn):
+        solver = solver_of(
+            points @ r.T, h, "clay", velocity=(points * [1, -2, 1] @ r.T), gravity=tuple(r @ [0.3, 0.2, -2.0]),
+            low=(-1.6,) * 3, high=(1.6,) * 3, domain=None,
+        )  # fmt: skip
+        solver.advance(0.2)
+        results.append(solver.points @ r)
+    assert np.abs(results[0] - results[1]).max() < 1e-5
+
+
+def test_any_number_of_threads_gives_the_same_bits():
+    threads = get_num_threads()
+    results = []
+    try:
+        for count in (1, threads):
+            set_num_threads(count)
+            solver = spinning_jelly()
+            solver.advance(0.3)
+            results.append(solver.arrays())
+    finally:
+        set_num_threads(threads)
+    for name in results[0]:
+        assert results[0][name].tobytes() == results[1][name].tobytes()
+
+
+def test_riders_move_with_the_matter():
+    from drgs_blender.matter import make_material, matter_of
+    from drgs_blender.simulate.blocks import Domain
+    from drgs_blender.simulate.solver import Body, Forces, Solver
+
+    h = 0.1
+    points = lattice((0.5, 0.5, 0.5), h / 2)
+    corners = np.array([[x, y, z] for x in (0, 0.5) for y in (0, 0.5) for z in (0, 0.5)])
+    matter = matter_of([make_material("sand")], np.zeros(len(points), int))
+    body = Body(points, np.full(len(points), (h / 2) ** 3), matter, corners, velocity=(0.5, 0.2, 1.0))
+    solver = Solver(body, Domain.around([-1] * 3, [2] * 3, h), Forces(gravity=(0, 0, 0)))
+    mass = momenta(solver_of(points, h, "sand", velocity=(0.5, 0.2, 1.0)))[0]
+    solver.advance(0.4)
+    assert np.abs(solver.riders - corners - [0.2, 0.08, 0.4]).max() < 1e-4
+    m = masses(solver)[:, None]
+    assert (m * solver.state.v[: len(points)]).sum(axis=0) == pytest.approx(mass, rel=1e-4)  # riders weigh nothing
+
+
+def test_what_goes_wrong_is_said_with_frame_cause_and_remedy():
+    points = lattice((0.4, 0.4, 0.4), 0.05)
+    falling = solver_of(points, 0.1, gravity=(0, 0, -9.81))
+    with pytest.raises(UsageError, match=r"frame \d+ .*particles outside the domain.*Give a larger domain"):
+        for _ in range(48):
+            falling.advance(FRAME)
+    before = falling.arrays()
+    assert falling.points[:, 2].min() > falling.domain.low[2]  # the last whole frame is kept
+    assert np.isfinite(before["x"]).all()
+
+    vertices, faces = box((0.1, 0.1, 0.1), (1, 1, 1))
+    with pytest.raises(UsageError, match=r"wall: overlaps the body.*Move one of the two apart"):
+        solver_of(points, 0.1, colliders=[Collider("wall", faces, vertices)])
+
+    broken = solver_of(points, 0.1)
+    broken.state.v[5] = np.nan
+    with pytest.raises(UsageError, match="velocities that are not finite"):
+        broken.advance(FRAME)
+    broken = solver_of(points, 0.1)
+    broken.state.tau[5] = np.nan
+    with pytest.raises(UsageError, match="became infinite"):
+        broken.advance(FRAME)
+
+
+def test_a_cancelled_frame_leaves_the_state_at_its_beginning():
+    solver = solver_of(lattice((0.4, 0.4, 0.4), 0.05), 0.1, gravity=(0, 0, -1.0))
+    solver.advance(FRAME)
+    before = {k: v.copy() for k, v in solver.arrays().items()}
+    calls = iter([False, False, True])
+    with pytest.raises(Cancelled):
+        solver.advance(FRAME, cancelled=lambda: next(calls))
+    after = solver.arrays()
+    assert solver.frame == 1
+    assert all(np.array_equal(before[k], after[k]) for k in before)
+
+
+def test_a_collider_faster_than_the_grid_shortens_the_step():
+    h = 0.1
+    points = lattice((0.4, 0.4, 0.4), h / 2)
+    vertices, faces = box((-0.5, -0.2, -0.2), (-0.2, 0.6, 0.6))
+    path = np.stack([vertices, np.add(vertices, [2.0, 0, 0])])  # 20 cells in a frame
+    solver = solver_of(points, h, young=1e3, density=1000, colliders=[Collider("bat", faces, path)], high=(8, 1.5, 1.5))
+    solver.advance(FRAME)
+    assert solver.steps >= 2.0 / (0.5 * h)
+    assert solver.points[:, 0].min() > 1.8 - 1.5 * h  # the bat is before it, it has not passed through
