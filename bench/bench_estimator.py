@@ -32,7 +32,7 @@ def points(n: int, mu: float, albedo: float, roughness: float, metallic: float) 
 
 def solve(light: EnvironmentLight, seen: ShadingPoints, counts: tuple[int, int, int], look: str) -> np.ndarray:
     """(n,) mean radiance of each point."""
-    settings = RenderSettings(*counts, aa=1, bounces=0, look=look)  # type: ignore[arg-type]
+    settings = RenderSettings(*counts, split="counts", aa=1, bounces=0, look=look)  # type: ignore[arg-type]
     return integrate(EMPTY, light, seen, settings, 0).total.mean(axis=1)
 
 

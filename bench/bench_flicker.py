@@ -6,6 +6,9 @@ python bench/bench_flicker.py [--frames 8] [--size 256] [--rays 32] [--reference
 from __future__ import annotations
 
 import argparse
+import tempfile
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from flicker import flicker
@@ -15,61 +18,60 @@ from report import table, write_section
 from subjects import asset_path
 
 from drgs_blender.asset.container import read_asset
+from drgs_blender.cli import frame_store
+from drgs_blender.cli.main import main as drgs
 from drgs_blender.formats.registry import read_environment
-from drgs_blender.frame import Frame, ObjectState, RenderSettings, World, split_rays
-from drgs_blender.render import pipeline
-from drgs_blender.render.picture.denoise import denoise
-from drgs_blender.render.picture.film import Film
-from drgs_blender.render.picture.motion import Motion
-from drgs_blender.render.picture.oidn import available, denoise_oidn
-from drgs_blender.render.picture.temporal import REACH, Shot, denoise_next, window
+from drgs_blender.frame import Frame, Moment, ObjectState, RenderSettings, World, split_rays
+from drgs_blender.passes import TEMPORAL
+from drgs_blender.render.picture.frames import read_frame
+from drgs_blender.render.picture.oidn import available
 
 Array = np.ndarray
 
 
-class KeptFilm(Film):
-    """A film that can be found again after the picture was made."""
-
-    last: Film
-
-    def __init__(self, *arguments: object) -> None:
-        super().__init__(*arguments)  # type: ignore[arg-type]
-        KeptFilm.last = self
-
-
-def shots(options: argparse.Namespace, environment: str, rays: int) -> list[Shot]:
+def frames(options: argparse.Namespace, environment: str) -> list[Frame]:
     """The sequence: the world turns about the vertical axis, all else stands still."""
     path = asset_path("cat", max_triangles=82000)
     key = SESSION.load_asset(path)
     radiance = read_environment(environments() / f"{environment}.exr").radiance
     camera = pinhole(frame_camera(read_asset(path).mesh.vertices, options.size, azimuth=-60, fill=0.66))
+    settings = RenderSettings(*split_rays(options.rays), film_transparent=True, aa=4)
     out = []
     for number in range(options.frames):
         a = np.radians(options.step * number)
         turn = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])
-        settings = RenderSettings(*split_rays(rays), film_transparent=True, aa=4)
-        SESSION.render(Frame(number, camera, [ObjectState("cat", key)], World(radiance, turn), settings))
-        film = KeptFilm.last
-        still = Motion(np.zeros((*film.coverage.shape, 2), np.float32), film.position.copy())
-        out.append(Shot(film.components, film.variance, film.guides(), still))
+        world = World(radiance, turn)
+        out.append(Frame(number, camera, [ObjectState("cat", key)], world, settings, previous=Moment(camera, [None])))
     return out
 
 
-def one_by_one(noisy: list[Shot]) -> list[Array]:
-    return [denoise(s.components, s.variance, s.guides, split=False) for s in noisy]
-
-
-def over_time(noisy: list[Shot]) -> list[Array]:
-    out, history = [], None
-    for s in noisy:
-        picture, history = denoise_next(s, history, split=False)
-        out.append(picture)
+def rendered(sequence: list[Frame], history: str = "", **settings: object) -> list[Array]:
+    """(h, w, 3) pictures of the sequence with some settings changed."""
+    out = []
+    for frame in sequence:
+        changed = replace(frame, settings=replace(frame.settings, **settings), history=history)  # type: ignore[arg-type]
+        out.append(SESSION.render(changed)["Combined"][..., :3])
     return out
 
 
-def in_windows(noisy: list[Shot]) -> list[Array]:
-    padded = [None] * REACH + noisy + [None] * REACH
-    return [window(padded[k : k + 2 * REACH + 1], split=False) for k in range(len(noisy))]
+def in_windows(sequence: list[Frame]) -> tuple[list[Array], list[Array], list[Array]]:
+    """Noisy pictures, those of ``drgs denoise`` on the files of these, and coverage."""
+    with tempfile.TemporaryDirectory() as folder:
+        noisy, clean = (str(Path(folder) / name / "####.exr") for name in ("noisy", "clean"))
+        Path(noisy).parent.mkdir()
+        pictures, coverage = [], []
+        for frame in sequence:
+            passes = SESSION.render(replace(frame, passes=TEMPORAL))
+            path = Path(noisy.replace("####", f"{frame.number:04d}"))
+            frame_store.save(path, passes, frame, frame.number, "")
+            pictures.append(passes["Combined"][..., :3])
+            coverage.append(passes["Coverage"][..., 0])
+        numbers = f"0-{len(sequence) - 1}"
+        code = drgs(["denoise", noisy, "--frames", numbers, "--out", clean, "--passes", "Combined"])
+        if code:
+            raise SystemExit(code)
+        found = [read_frame(clean.replace("####", f"{f.number:04d}"))[0]["Combined"][..., :3] for f in sequence]
+    return pictures, found, coverage
 
 
 def main() -> None:
@@ -80,23 +82,24 @@ def main() -> None:
     parser.add_argument("--reference", type=int, default=1024)
     parser.add_argument("--step", type=float, default=1.0, help="degrees a frame")
     options = parser.parse_args()
-    pipeline.Film = KeptFilm  # type: ignore[misc]
     rows = []
     for environment in ("city", "studio"):
-        noisy = shots(options, environment, options.rays)
-        truth = np.stack([s.components.sum(2) for s in shots(options, environment, options.reference)])
-        mask = np.stack([foreground(s.guides.coverage, 1) for s in noisy])
+        sequence = frames(options, environment)
+        noisy, windows, coverage = in_windows(sequence)
+        cosine, ggx, light = split_rays(options.reference)
+        truth = np.stack(rendered(sequence, cosine=cosine, ggx=ggx, environment=light))
+        mask = np.stack([foreground(c, 1) for c in coverage])
         rest = flicker(truth, mask)
         ways: dict[str, list[Array]] = {
-            "noisy": [s.components for s in noisy],
-            "SVGF, each frame alone": one_by_one(noisy),
-            "SVGF, over time": over_time(noisy),
-            "SVGF, window of 5": in_windows(noisy),
+            "noisy": noisy,
+            "SVGF, each frame alone": rendered(sequence, denoise="svgf"),
+            "SVGF, over time": rendered(sequence, environment, denoise="svgf"),
+            "SVGF, window of 5": windows,
         }
         if available():
-            ways["OIDN, each frame alone"] = [denoise_oidn(s.components, s.guides, split=False) for s in noisy]
+            ways["OIDN, each frame alone"] = rendered(sequence, denoise="oidn")
         for name, pictures in ways.items():
-            shown = np.stack([p.sum(2) for p in pictures])
+            shown = np.stack(pictures)
             later = [psnr(a, b, m) for a, b, m in zip(shown[2:], truth[2:], mask[2:])]
             rows.append((environment, name, f"{1e3 * (flicker(shown, mask) - rest):.2f}", f"{np.mean(later):.2f}"))
     body = (

@@ -13,7 +13,7 @@ import os
 import light_cost
 import light_efficiency
 import light_renderers
-from light_cases import AA, CASES, FOLDER
+from light_cases import CASES, FOLDER
 from report import write_section
 
 PARTS = {
@@ -32,7 +32,7 @@ def main() -> None:
     parser.add_argument("--cases", nargs="+", choices=[c.name for c in CASES], default=[c.name for c in CASES])
     parser.add_argument("--size", type=int, default=200, help="of the pictures that are compared")
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--aa", type=int, default=AA, help="sub-pixel positions of ours")
+    parser.add_argument("--aa", type=int, default=0, help="sub-pixel positions of ours, 0 as the settings choose")
     parser.add_argument("--rays", type=int, nargs="+", default=(8, 32, 128, 256), help="of ours")
     parser.add_argument("--spp", type=int, nargs="+", default=(2, 8, 32, 128), help="of Cycles and Mitsuba")
     parser.add_argument("--denoised-spp", type=int, nargs="+", default=(1, 4, 16), help="of Cycles with OIDN")

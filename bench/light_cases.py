@@ -26,8 +26,8 @@ Array = np.ndarray
 FOLDER = OUT / "light"
 #: Indirect bounces in every renderer.
 BOUNCES = 1
-#: Sub-pixel positions of our pictures, and of our references.
-AA, REFERENCE_AA = 4, 64
+#: Sub-pixel positions of our references; other pictures have as many as the settings choose for their rays.
+REFERENCE_AA = 64
 #: Strength of the world, as in the parity bench: hardly a pixel is clipped.
 STRENGTH = 0.35
 #: Triangles of the subjects at most.
@@ -88,7 +88,6 @@ class Case:
         """A frame of ours; reads the environment's file."""
         chosen: dict[str, Any] = {
             "primary": "mesh",
-            "aa": AA,
             "bounces": BOUNCES,
             "film_transparent": True,
             "threads": 2,

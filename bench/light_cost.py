@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from light_cases import AA, CASES, Case
+from light_cases import CASES, Case
 from report import OUT, table
 
 from drgs_blender.asset import Asset, Binding, Mesh, Surfels
@@ -36,6 +36,8 @@ from drgs_blender.render.trace.scene import TraceObject, TraceScene
 
 Array = np.ndarray
 RAYS, RUNS = 32, 3
+#: The paper's counts, so that the floor can trace the same rays.
+FIXED = {"aa": 4, "split": "counts"}
 #: What a plain loop must gain by a second thread for the machine to count as free.
 FREE = 1.8
 #: The subject of all but the memory test.
@@ -63,7 +65,7 @@ class Stage:
 
     @classmethod
     def of(cls, case: Case, mesh: Mesh, size: int) -> Stage:
-        frame = case.frame("", size, RAYS)
+        frame = case.frame("", size, RAYS, **FIXED)
         scene = TraceScene()
         scene.update([TraceObject("subject", mesh.vertices, mesh.faces, mesh.albedo, mesh.roughness, mesh.metallic)])
         parameters = camera_parameters(frame.camera, frame.settings, frame.number)
@@ -140,7 +142,7 @@ def floor(size: int) -> list[list[object]]:
     """A frame against tracing as many rays of the same kinds one by one, and nothing else."""
     stage = Stage.of(CASE, read_asset(CASE.files[0]).mesh, size)
     session = Session()
-    frame = CASE.frame(session.load_asset(CASE.files[0]), size, RAYS)
+    frame = CASE.frame(session.load_asset(CASE.files[0]), size, RAYS, **FIXED)
     whole = median_seconds(lambda: session.render(frame))
     nearest, shadow = rays_of(stage, np.random.default_rng(0))
     bvh = stage.scene.bvh
@@ -148,7 +150,7 @@ def floor(size: int) -> list[list[object]]:
     traced += median_seconds(lambda: bvh.occluded_many(*shadow))
     count = sum(len(rays[0]) for rays in nearest) + len(shadow[0])
     return [
-        [f"frame, {RAYS} rays, aa {AA}", f"{whole:.2f} s", f"{whole / traced:.2f} times the floor"],
+        [f"frame, {RAYS} rays, aa {FIXED['aa']}", f"{whole:.2f} s", f"{whole / traced:.2f} times the floor"],
         [f"floor: the same {count / 1e6:.1f} million rays", f"{traced:.2f} s", f"{count / traced / 1e6:.1f} million/s"],
     ]
 
@@ -167,7 +169,7 @@ def rays_of(stage: Stage, rng: np.random.Generator) -> tuple[list[tuple[Array, A
     for count, draw in (
         (settings.cosine, lambda i: cosine(points.normal[i], rng)),
         (settings.ggx, lambda i: ggx(points.normal[i], points.view[i], points.roughness[i], rng)),
-        (settings.environment, lambda i: stage.light.sample(rng.random((len(i), 3), np.float32))[0]),
+        (settings.environment, lambda i: stage.light.sample(whole(len(i), rng), points.normal[i])[0]),
     ):
         of = np.repeat(np.arange(len(points)), np.floor(count / settings.aa + rng.random(len(points))).astype(int))
         towards = draw(of)
@@ -183,13 +185,18 @@ def rays_of(stage: Stage, rng: np.random.Generator) -> tuple[list[tuple[Array, A
     normal *= -np.sign((normal * first[1][met]).sum(axis=1, keepdims=True))
     hit = first[0][met] + t[met, None] * first[1][met]
     hit += (1e-5 * np.abs(hit).max(axis=1) + 2e-6 * scene.extent)[:, None] * normal
-    towards = [stage.light.sample(rng.random((len(met), 3), np.float32))[0], cosine(normal, rng)]
+    towards = [stage.light.sample(whole(len(met), rng), normal)[0], cosine(normal, rng)]
     good = [above(d, normal) for d in towards]
     shadow = (
         np.concatenate([hit[g] for g in good]).astype(np.float32),
         np.concatenate([d[g] for d, g in zip(towards, good)]).astype(np.float32),
     )
     return [camera, first], shadow
+
+
+def whole(count: int, rng: np.random.Generator) -> Array:
+    """(count, 3) random numbers as light sampling takes them."""
+    return rng.integers(0, 2**32, (count, 3), dtype=np.uint32)
 
 
 def camera_rays(frame: Frame, rng: np.random.Generator) -> tuple[Array, Array]:
@@ -228,7 +235,7 @@ def ggx(normals: Array, views: Array, roughness: Array, rng: np.random.Generator
 def svgf(size: int) -> list[object]:
     """Time between the phases Denoising and Done of a frame."""
     session = Session()
-    frame = CASE.frame(session.load_asset(CASE.files[0]), size, RAYS, denoise="svgf")
+    frame = CASE.frame(session.load_asset(CASE.files[0]), size, RAYS, **FIXED, denoise="svgf")
     times: list[float] = []
     for _ in range(RUNS + 1):
         began: dict[str, float] = {}
@@ -289,7 +296,7 @@ def large_frame(path: Path, width: int, height: int) -> dict[str, float]:
     """Render the ball so that it fills the picture's height; largest memory of this process so far."""
     session = Session()
     key = session.load_asset(path)
-    frame = CASE.frame(key, height, RAYS, primary="surfels", denoise="svgf")
+    frame = CASE.frame(key, height, RAYS, **FIXED, primary="surfels", denoise="svgf")
     camera = frame.camera
     distance = 1.2 / np.sin(np.arctan(height / 2 / camera.fy))
     camera.matrix_world = np.array([[1, 0, 0, 0], [0, 0, -1, -distance], [0, 1, 0, 0], [0, 0, 0, 1]], float)
@@ -317,13 +324,13 @@ def cost(options: argparse.Namespace) -> str:
         rows.append(memory(options))
     except RuntimeError as error:
         rows.append(["memory", "not measured", str(error).strip().splitlines()[-1]])
-    settings = CASE.frame("", 8, RAYS).settings
+    settings = CASE.frame("", 8, RAYS, **FIXED).settings
     return (
         f"{CASE.mesh}, {size}x{size}, {RAYS} rays ({settings.cosine} cosine, {settings.ggx} GGX, "
-        f"{settings.environment} environment), {settings.bounces} indirect bounce, aa {AA}, mesh as primary surface, 2 "
-        f"threads unless said; medians of {RUNS}. The floor traces as many rays of the same kinds (camera, first hits, "
-        "shadow rays of the bounce) in batches, single rays, no packets. Memory: peak of a process of its own, surfels "
-        "as primary surface.\n\n" + table(("What", "Measured", ""), rows)
+        f"{settings.environment} environment), {settings.bounces} indirect bounce, aa {settings.aa}, mesh as primary "
+        f"surface, 2 threads unless said; medians of {RUNS}. The floor traces as many rays of the same kinds (camera, "
+        "first hits, shadow rays of the bounce) in batches, single rays, no packets. Memory: peak of a process of its "
+        "own, surfels as primary surface.\n\n" + table(("What", "Measured", ""), rows)
     )
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 from judge import frame_camera, psnr
-from light_cases import AA, BOUNCES, Case, Reference
+from light_cases import BOUNCES, Case, Reference
 from report import OUT, ROOT, table
 from subjects import spread_materials
 
@@ -23,11 +23,14 @@ FIGURE = ROOT / "docs" / "images" / "efficiency.png"
 MESH = Path("data/meshes/odedstein/armadillo/armadillo.obj")
 #: Rays of each picture that a reference is the mean of.
 PART = 128
+#: Sub-pixel positions of all pictures.
+AA = 4
 #: What a variant changes of the full method; "cosine" says that all samples are of the cosine.
 VARIANTS: dict[str, dict[str, Any]] = {
     "full": {},
     "no denoiser": {"denoise": "none"},
     "no MIS (cosine samples alone)": {"cosine_only": True},
+    "no mesh (light meets surfels)": {"tracer": "surfels"},
 }
 
 
@@ -74,26 +77,33 @@ class Curve:
 
 def settings_of(change: dict[str, Any], rays: int) -> dict[str, Any]:
     """Fields of RenderSettings of a variant."""
-    chosen = {"primary": "surfels", "denoise": "svgf"} | change
+    chosen = {"primary": "surfels", "aa": AA, "denoise": "svgf"} | change
     if chosen.pop("cosine_only", False):
-        chosen |= {"cosine": rays, "ggx": 0, "environment": 0}
+        chosen |= {"cosine": rays, "ggx": 0, "environment": 0, "split": "counts"}
     return chosen
 
 
-def converged(case: Case, size: int, rays: int) -> Reference:
+def converged(case: Case, size: int, rays: int, tracer: str) -> Reference:
     """Mean of pictures with different seeds and the aa that is measured, of `rays` in all.
 
     One picture of more sub-pixel positions would be another picture: the low-pass of surfels follows their number.
     """
     count = max(1, rays // PART)
-    pictures = [case.picture(size, rays // count, 1000 + seed, primary="surfels")[0] for seed in range(count)]
+    pictures = [
+        case.picture(size, rays // count, 1000 + seed, primary="surfels", aa=AA, tracer=tracer)[0]
+        for seed in range(count)
+    ]
     return Reference.of(np.mean(pictures, axis=0), alpha=0.99)
 
 
 def measure(case: Case, options: argparse.Namespace) -> list[Curve]:
     curves = []
-    reference = converged(case, options.size, options.reference_rays)
+    references: dict[str, Reference] = {}
     for name, change in VARIANTS.items():
+        tracer = change.get("tracer", "mesh")
+        if tracer not in references:
+            references[tracer] = converged(case, options.size, options.reference_rays, tracer)
+        reference = references[tracer]
         curve = Curve(name, list(options.efficiency_rays), [], [])
         case.picture(options.size, 4, **settings_of(change, 4))  # kernels
         for rays in curve.rays:
@@ -139,9 +149,9 @@ def efficiency(options: argparse.Namespace) -> str:
     text = (
         f"Armadillo, {len(mesh.faces):,} triangles, spread materials, {case.light}.exr, {options.size}x{options.size}, "
         f"{BOUNCES} indirect bounce, surfels as primary surface, aa {AA}, SVGF unless said, one picture a point; PSNR "
-        f"over the subject against {options.reference_rays} rays (mean over seeds, same aa) without denoiser. Seconds: "
-        "whole frame, everything built anew. Without MIS, all samples at the visible point are of the cosine; further "
-        "hits are as always.\n\n"
+        f"over the subject against {options.reference_rays} rays (mean over seeds, same aa and tracer) without "
+        "denoiser. Seconds: whole frame, everything built anew. Without MIS, all samples at the visible point are of "
+        "the cosine; further hits are as always.\n\n"
         f"![PSNR and time over samples](images/{FIGURE.name})\n\n"
     )
     columns = ("Samples", *(f"{c.name}: dB / s" for c in curves))

@@ -217,12 +217,13 @@ def subjects_text(options: argparse.Namespace) -> str:
     cases = "; ".join(f"{c.name}: {c.mesh}, {c.materials}, {c.light}" for c in chosen(options))
     return (
         f"{options.size}x{options.size}, {BOUNCES} indirect bounce, 2 threads, {options.seeds} seeds. Subjects: "
-        f"{cases}. Ours: mesh as primary surface, aa {options.aa}, {_list(options.rays)} rays. Each program against "
-        f"its own converged picture (ours {options.reference_rays} rays, aa {REFERENCE_AA}; theirs "
-        f"{options.reference_spp} spp), PSNR in sRGB over the subject (mask eroded by 2 px). Seconds from arrays in "
-        "memory to pixels: scene, environment map and acceleration structure are made anew each time, program and "
-        f"kernels were loaded before. *Sampling alone*: less the setup, the time of a picture of {TINY}x{TINY} pixels, "
-        "which decides in pictures as small as these and counts little in large ones. log(time) is linear over dB."
+        f"{cases}. Ours: mesh as primary surface, aa {options.aa or 'by the rays'}, {_list(options.rays)} rays. "
+        f"Each program against its own converged picture (ours {options.reference_rays} rays, aa {REFERENCE_AA}; "
+        f"theirs {options.reference_spp} spp), PSNR in sRGB over the subject (mask eroded by 2 px). Seconds from "
+        "arrays in memory to pixels: scene, environment map and acceleration structure are made anew each time, "
+        "program and kernels were loaded before. *Sampling alone*: less the setup, the time of a picture of "
+        f"{TINY}x{TINY} pixels, which decides in pictures as small as these and counts little in large ones. "
+        "log(time) is linear over dB."
     )
 
 

@@ -6,6 +6,7 @@ python bench/run.py light --part equal-psnr --size 128      # what follows the n
 
 from __future__ import annotations
 
+import argparse
 import subprocess
 import sys
 from pathlib import Path
@@ -17,19 +18,19 @@ def run(program: Path, options: list[str]) -> int:
     return subprocess.run([sys.executable, str(program), *options]).returncode
 
 
-def main(arguments: list[str]) -> int:
-    first = next((i for i, argument in enumerate(arguments) if argument.startswith("-")), len(arguments))
-    names, options = arguments[:first], arguments[first:]
+def main() -> int:
     programs = {p.stem.removeprefix("bench_"): p for p in sorted(HERE.glob("bench_*.py"))}
-    unknown = set(names) - set(programs)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"{', '.join(programs)}; all by default")
+    chosen, options = parser.parse_known_args()
+    unknown = set(chosen.names) - set(programs)
     if unknown:
-        print(f"no such benchmark: {', '.join(sorted(unknown))}; there are {', '.join(programs)}", file=sys.stderr)
-        return 64
-    failed = [name for name in names or programs if run(programs[name], options)]
+        parser.error(f"no such benchmark: {', '.join(sorted(unknown))}; there are {', '.join(programs)}")
+    failed = [name for name in chosen.names or programs if run(programs[name], options)]
     if failed:
         print(f"failed: {', '.join(failed)}", file=sys.stderr)
     return 1 if failed else 0
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main())

@@ -48,6 +48,8 @@ APT_PACKAGES = {
     "libxkbcommon.so.0": "libxkbcommon0",
 }
 SUITES = ("lint", "engine", "blender", "floor")
+#: Only when asked for: needs a Blender with a window, see tests/ui.
+WINDOW = "window"
 TEST_SECONDS = 1200
 
 
@@ -85,7 +87,9 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     )
     command("system", run_system, "print the system packages that Blender needs and that are missing (Linux)")
     test = command("test", run_test, "format, types and every test suite; exit code 0 only when all pass")
-    test.add_argument("suites", nargs="*", metavar="SUITE", help=f"any of {', '.join(SUITES)}; default: all")
+    test.add_argument(
+        "suites", nargs="*", metavar="SUITE", help=f"any of {', '.join(SUITES)} (the default) or {WINDOW}"
+    )
     demo = command("demo", run_demo, "render the demo through Blender; further arguments go to examples/demo.py")
     extension = command("extension", run_extension, "build the extension's zip; arguments go to tools/extension.py")
     bench = command("bench", run_bench, "measure; further arguments go to bench/run.py")
@@ -123,7 +127,7 @@ def ensure_engine() -> Path:
         "optional": project["optional-dependencies"],
         "scripts": project["scripts"],
     }
-    return ensure(ROOT / ".venv", wanted, [torch, ["-e", f"{ROOT}[reconstruct,dev]"]], "import drgs_blender")
+    return ensure(ROOT / ".venv", wanted, [torch, ["-e", f"{ROOT}[reconstruct,oidn,dev]"]], "import drgs_blender")
 
 
 def ensure_blender(version: str = BLENDER) -> Path:
@@ -222,8 +226,8 @@ def loads(library: str) -> bool:
 def run_test(args: argparse.Namespace) -> int:
     """Run the chosen suites one after another and sum up what they report."""
     suites = args.suites or SUITES
-    if unknown := sorted(set(suites) - set(SUITES)):
-        raise Failure(f"unknown suite {', '.join(unknown)}; there are {', '.join(SUITES)}")
+    if unknown := sorted(set(suites) - {*SUITES, WINDOW}):
+        raise Failure(f"unknown suite {', '.join(unknown)}; there are {', '.join((*SUITES, WINDOW))}")
     engine = ensure_engine()
     if "blender" in suites:
         ensure_blender()  # the engine's suite runs `drgs render` through it where it is there
@@ -237,6 +241,8 @@ def run_test(args: argparse.Namespace) -> int:
         tally.pytest(f"Blender {BLENDER}", ensure_blender(), "tests/blender")
     if "floor" in suites:
         tally.pytest(f"Blender {BLENDER_FLOOR}", ensure_blender(BLENDER_FLOOR), "tests/blender")
+    if WINDOW in suites:
+        tally.pytest("a window", engine, "tests/ui")
     return tally.finish()
 
 

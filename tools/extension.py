@@ -18,8 +18,17 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent
 #: What the zip holds, relative to the root. Of folders, only the files with these endings.
-CONTENTS = ("__init__.py", "blender_manifest.toml", "LICENSE", "README.md", "addon", "operators", "drgs_blender")
-SUFFIXES = {".py", ".typed", ".md", ".toml", ".json"}
+CONTENTS = (
+    "__init__.py",
+    "blender_manifest.toml",
+    "LICENSE",
+    "README.md",
+    "pyproject.toml",
+    "addon",
+    "operators",
+    "drgs_blender",
+)
+SUFFIXES = {".py", ".typed", ".md", ".toml", ".json", ".js"}
 REQUIRED = {
     "schema_version": str,
     "id": str,

@@ -1,0 +1,204 @@
+"""Stage (ii): materials and light from photographs by Cycles and a mesh, and what each part of it is worth.
+
+python bench/bench_decouple.py [--part NAME ...] [--scene FOLDER] [--iterations 1000]
+
+Parts: `truth` (the photographs, if need be, and the ceiling), `long`, `estimator`, `light`, `materials`, `priors`,
+`mesh` and `mitsuba`. Each runs on its own in a few minutes of two cores and adds its rows to those measured before.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from decouple_score import COLUMNS, Scene, score
+from report import OUT, ROOT, processor_seconds, table, write_section
+
+from drgs_blender.asset import Mesh
+from drgs_blender.colour import srgb_to_linear
+from drgs_blender.reconstruct.decouple.run import Decoupled, decouple
+from drgs_blender.reconstruct.decouple.settings import Settings
+
+FOLDER = OUT / "decouple"
+SIZE, TRAIN, TEST, SAMPLES = 128, 40, 8, 32
+
+#: Part -> row -> what differs from the settings that the rows share.
+VARIANTS: dict[str, dict[str, dict[str, Any]]] = {
+    "estimator": {
+        "as it is": {},
+        "loss that noise pulls (log, L1)": {"unbiased": False},
+        "cosine samples alone (no MIS)": {"cosine": 32, "ggx": 0, "light": 0},
+        "four times the rays on a quarter of the pixels": {"pixels": 512, "cosine": 64, "ggx": 32, "light": 32},
+    },
+    "light": {
+        "without inter-reflection": {"indirect": False},
+        "environment fine from the start": {"coarse_to_fine": False},
+        "environment of 64 rows": {"environment": 64},
+        "white-light weight .003": {"white": 0.003},
+        "white-light weight 0": {"white": 0.0},
+    },
+    "materials": {
+        "without nested grids": {"coarse": 0},
+        "without smoothness": {"smoothness": 0.0},
+        "specular-glossiness": {"parametrisation": "specular"},
+        "the paper's BRDF": {"look": "paper"},
+    },
+    "priors": {
+        "metallic pulled to 0 or 1": {"bimodal": 0.01},
+        "learned exposure of each photograph": {"exposure": True},
+        "learned normals": {"normals": True},
+    },
+}
+
+
+def scene_folder(given: Path | None) -> Path:
+    """The scene, rendered by Cycles if need be (about three minutes)."""
+    if given is not None:
+        return given
+    from drgs_blender.cli.find_blender import find_blender
+    from drgs_blender.evaluate.scenes import Plan, make_scenes
+
+    plan = Plan(("spot",), SIZE, TRAIN, TEST, SAMPLES)
+    command = find_blender().command(ROOT / "drgs_blender" / "evaluate" / "scene_job.py")
+    return make_scenes(FOLDER / f"scenes-{SIZE}", plan, command, ROOT / "examples")[0]
+
+
+def measured(scene: Scene, mesh: Mesh, settings: Settings) -> list[float]:
+    """One row: processor seconds and scores."""
+    before = processor_seconds()
+    found = decouple(scene.capture, mesh, settings)
+    return [processor_seconds() - before, *score(scene, finished(mesh, found))]
+
+
+def finished(mesh: Mesh, found: Decoupled) -> Mesh:
+    """`mesh` with the materials that were found."""
+    return Mesh(mesh.vertices, mesh.faces, found.albedo, found.roughness, found.metallic)
+
+
+def warm(scene: Scene) -> None:
+    """Compile before anything is timed."""
+    decouple(scene.capture, scene.mesh, Settings(iterations=2, pixels=64, normals=True))
+
+
+def variants(part: str, scene: Scene, iterations: int) -> dict[str, list[float]]:
+    """Rows of `VARIANTS`."""
+    base = Settings(iterations=iterations)
+    return {name: measured(scene, scene.mesh, replace(base, **change)) for name, change in VARIANTS[part].items()}
+
+
+def ceiling(scene: Scene) -> dict[str, list[float]]:
+    """True materials, rendered by our own renderer."""
+    return {"true materials and mesh (the ceiling)": [0.0, *score(scene, scene.mesh)]}
+
+
+def long_run(scene: Scene, iterations: int) -> dict[str, list[float]]:
+    """The settings as they are by default."""
+    settings = Settings()
+    return {f"default, {settings.iterations} steps": measured(scene, scene.mesh, settings)}
+
+
+def own_mesh(scene: Scene, iterations: int) -> dict[str, list[float]]:
+    """On the mesh of stage (i)."""
+    from drgs_blender.reconstruct.hull import find_region
+    from drgs_blender.reconstruct.train import Schedule, Training
+    from drgs_blender.reconstruct.tsdf import fuse
+
+    path = FOLDER / "own-mesh.npz"
+    if not path.exists():
+        region = find_region(scene.capture)
+        training = Training(scene.capture, region, Schedule(iterations=1500))
+        while not training.finished:
+            training.step()
+        mesh, _ = fuse(training.gaussians, [view.camera for view in scene.capture.training], region, 192)
+        np.savez(path, vertices=mesh.vertices, faces=mesh.faces)
+    with np.load(path) as arrays:
+        v, f = arrays["vertices"], arrays["faces"]
+    mesh = Mesh(v, f, np.zeros_like(v), np.zeros(len(v)), np.zeros(len(v)))
+    rows = {}
+    for name, change in {"mesh of stage (i)": {}, "mesh of stage (i), learned normals": {"normals": True}}.items():
+        rows[name] = measured(scene, mesh, replace(Settings(iterations=iterations), **change))
+    return rows
+
+
+def mitsuba(scene: Scene, iterations: int) -> dict[str, list[float]]:
+    """Mitsuba's differentiable renderer on the same photographs and mesh, for as long as ours takes by default."""
+    from light_renderers import mitsuba_python
+
+    views = scene.capture.training
+    source, out = FOLDER / "mitsuba-capture.npz", FOLDER / "mitsuba-found.npz"
+    np.savez(
+        source,
+        vertices=scene.mesh.vertices,
+        faces=scene.mesh.faces,
+        matrices=np.stack([view.camera.matrix_world for view in views]),
+        fov_x=[2 * np.degrees(np.arctan(view.camera.width / 2 / view.camera.fx)) for view in views],
+        pictures=srgb_to_linear(np.stack([view.colour for view in views])),
+        masks=np.stack([view.mask for view in views]),
+    )
+    before = processor_seconds()
+    ours = decouple(scene.capture, scene.mesh, Settings(iterations=iterations))
+    spent, seconds = processor_seconds() - before, float(ours.report["seconds"])
+    rows = {f"ours, {iterations} steps": [spent, *score(scene, finished(scene.mesh, ours))]}
+    program = Path(__file__).with_name("mitsuba_inverse.py")
+    libraries = sorted((ROOT / "build" / "llvm").rglob("libLLVM.so*"))
+    environment = ({"DRJIT_LIBLLVM_PATH": str(libraries[-1])} if libraries else {}) | os.environ
+    command = [str(mitsuba_python()), str(program), str(source), str(out), str(seconds)]
+    subprocess.run(command, check=True, timeout=seconds + 600, env=environment)
+    with np.load(out) as file:
+        found = {name: file[name] for name in file.files}
+    mesh = Mesh(scene.mesh.vertices, scene.mesh.faces, found["albedo"], found["roughness"], found["metallic"])
+    rows[f"Mitsuba 3, prb, {found['steps']} steps in the same time"] = [float(found["spent"]), *score(scene, mesh)]
+    return rows
+
+
+PARTS: dict[str, Callable[[Scene, int], dict[str, list[float]]]] = {
+    "truth": lambda scene, iterations: ceiling(scene),
+    "long": long_run,
+    **{part: lambda scene, iterations, part=part: variants(part, scene, iterations) for part in VARIANTS},  # type: ignore[misc]
+    "mesh": own_mesh,
+    "mitsuba": mitsuba,
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--part", nargs="+", choices=list(PARTS), default=list(PARTS))
+    parser.add_argument("--scene", type=Path, help="a folder with truth.json; default: made by Cycles")
+    parser.add_argument("--iterations", type=int, default=1000, help="of all rows but the long one")
+    options = parser.parse_args()
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    scene = Scene.read(scene_folder(options.scene))
+    warm(scene)
+    store = FOLDER / "rows.json"
+    kept: dict[str, dict[str, list[float]]] = json.loads(store.read_text()) if store.exists() else {}
+    for part in options.part:
+        kept[part] = PARTS[part](scene, options.iterations)
+        store.write_text(json.dumps(kept))
+        print(table(("", *COLUMNS), [(name, *row) for name, row in kept[part].items()]), flush=True)
+    rows = [(name, *row) for part in PARTS for name, row in kept.get(part, {}).items()]
+    write_section("decouple", "Materials and light from photographs", text(scene, rows, options.iterations))
+
+
+def text(scene: Scene, rows: list[tuple[Any, ...]], iterations: int) -> str:
+    """The section."""
+    height, width = scene.capture.training[0].colour.shape[:2]
+    settings = asdict(Settings())
+    rays = settings["cosine"] + settings["ggx"] + settings["light"]
+    return (
+        f"Spot with materials from matte paint to polished gold, {len(scene.capture.training)} photographs of "
+        f"{width} x {height} pixels by Cycles; {iterations} steps of {settings['pixels']} pixels and {rays} rays on "
+        f"the true mesh unless said, each row one change. Relit: foreground PSNR in dB against Cycles under "
+        f"{len(scene.relit)} other lights, raw and with one factor a channel. Albedo: dB of linear values, one factor "
+        f"a channel. Processor seconds of two cores together.\n\n{table(('', *COLUMNS), rows)}"
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,274 @@
+"""Photographs to surfels and mesh: time of the rasteriser, views left out, the mesh against the truth, ablations.
+
+python bench/bench_reconstruct.py --part raster
+python bench/bench_reconstruct.py --part surfels --capture scenes/spot [--minutes 2] [--size 200]
+python bench/bench_reconstruct.py --part photographs --capture lego_400 [--minutes 2] [--size 256]
+python bench/bench_reconstruct.py --part ablations --capture scenes/spot [--iterations 800] [--only NAME ...]
+python bench/bench_reconstruct.py --part variants --capture scenes/spot [--iterations 1500]
+
+Scenes are those of `drgs evaluate --make-scenes scenes`. Rows are kept, so that captures may be measured one by one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from embreex import rtcore_scene
+from embreex.mesh_construction import TriangleMesh
+from report import OUT, processor_seconds, table, write_section
+
+from drgs_blender.frame import Camera
+from drgs_blender.geometry import VertexNormals
+from drgs_blender.jit import get_num_threads
+from drgs_blender.reconstruct.attached import attach_learned
+from drgs_blender.reconstruct.capture import Capture
+from drgs_blender.reconstruct.gaussians import Gaussians
+from drgs_blender.reconstruct.hull import find_region
+from drgs_blender.reconstruct.job import ON_MESH, judge
+from drgs_blender.reconstruct.raster import rasterise
+from drgs_blender.reconstruct.readers import read_capture
+from drgs_blender.reconstruct.train import Schedule, Training
+from drgs_blender.reconstruct.tsdf import fuse
+
+ROWS = OUT / "reconstruct.json"
+#: Ablations of stage (i): name -> change of the schedule.
+ABLATIONS: dict[str, dict[str, Any]] = {
+    "as it is": {},
+    "harmonics alone, nothing mirrored": {"mirrors": 1.0},
+    "without normal consistency": {"consistency": 0.0},
+    "without distortion": {"distortion": 0.0},
+    "without mask": {"mask": 0.0},
+    "without harmonics beyond the mean": {"bands": 0},
+    "full size from the start": {"coarse": 0.0},
+    "without densification": {"rounds": 0},
+}
+
+
+def timed(work: Callable[[], Any], times: int = 10) -> tuple[float, float]:
+    """Median wall and processor milliseconds of `work`."""
+    walls, processor = [], []
+    for _ in range(times):
+        begun, wall = processor_seconds(), time.perf_counter()
+        work()
+        walls.append(1e3 * (time.perf_counter() - wall))
+        processor.append(1e3 * (processor_seconds() - begun))
+    return float(np.median(walls)), float(np.median(processor))
+
+
+def raster(options: argparse.Namespace) -> None:
+    """20,000 surfels on a sphere that fills half of 200 x 200 pixels."""
+    rng = np.random.default_rng(0)
+    n, size = 20000, 200
+    normal = rng.normal(size=(n, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    u = np.cross(normal, [0.3, 0.2, 1.0])
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    scale = rng.uniform(0.006, 0.018, (n, 2, 1))
+    values = (normal, u * scale[:, 0], np.cross(normal, u) * scale[:, 1], rng.uniform(0.3, 0.95, n))
+    matrix = np.eye(4)
+    matrix[2, 3] = 4.0
+    camera = Camera(matrix, size, size, 330.0, 330.0, 100.0, 100.0)
+    rows = []
+    for channels in (6, 11):
+        tensors = [torch.tensor(v, dtype=torch.float32, requires_grad=True) for v in values]
+        features = torch.tensor(rng.uniform(size=(n, channels)), dtype=torch.float32, requires_grad=True)
+        maps = rasterise(*tensors, features, camera)
+
+        def loss(tensors: Any = tensors, features: Any = features) -> torch.Tensor:
+            maps = rasterise(*tensors, features, camera)
+            return maps.features.sum() + maps.depth.sum() + maps.distortion.sum() + maps.alpha.sum()
+
+        loss().backward()
+        forward = timed(lambda: rasterise(*tensors, features, camera))  # noqa: B023
+        losses = [loss() for _ in range(10)]
+        backward = timed(lambda: losses.pop().backward())  # noqa: B023
+        rows.append((channels, *forward, *backward, float(maps.alpha.detach().mean())))
+    head = ("Channels", "Forward ms", "processor ms", "Backward ms", "processor ms", "Covered")
+    body = (
+        f"20,000 surfels, 200x200 pixels, {get_num_threads()} threads; besides the channels depth, median, alpha and "
+        "distortion. Gradients agree with a float64 brute force to 1e-4 (tests/unit/test_reconstruct_raster.py).\n\n"
+    )
+    write_section("reconstruct-raster", "Differentiable rasteriser", body + table(head, rows))
+
+
+def first_hits(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Smooth unit normal (p, 3), whether something is hit (p,), and depth (p,) at the pixels' centres."""
+    scene = rtcore_scene.EmbreeScene()
+    TriangleMesh(scene, np.ascontiguousarray(vertices, np.float32), np.ascontiguousarray(faces, np.int32))
+    x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
+    y = -(np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
+    local = np.stack([*np.meshgrid(x, y), np.full((camera.height, camera.width), -1.0)], -1).reshape(-1, 3)
+    rays = (local @ camera.matrix_world[:3, :3].T).astype(np.float32)
+    found = scene.run(np.tile(camera.matrix_world[:3, 3].astype(np.float32), (len(rays), 1)), rays, output=1)
+    corner = faces[np.maximum(found["primID"], 0)]
+    smooth = VertexNormals(faces, len(vertices))(vertices)
+    share = np.stack([1 - found["u"] - found["v"], found["u"], found["v"]], -1)
+    normal = np.einsum("pk,pkc->pc", share, smooth[corner])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
+    return normal, found["primID"] >= 0, found["tfar"]
+
+
+def against_truth(gaussians: Gaussians, training: Training, capture: Capture, folder: Path) -> dict[str, Any]:
+    """Mean angle between the normals of the fused and the true mesh, median depth error, as the test views see them."""
+    truth = np.load(folder / "mesh.npz")
+    mesh, report = fuse(gaussians, [v.camera for v in capture.training], training.region)
+    angles, depths = [], []
+    for view in capture.testing:
+        normal, hit, depth = first_hits(mesh.vertices, mesh.faces, view.camera)
+        true_normal, true_hit, true_depth = first_hits(truth["vertices"], truth["faces"], view.camera)
+        both = hit & true_hit
+        cosine = np.einsum("pc,pc->p", normal, true_normal)[both].clip(-1, 1)
+        angles.append(np.degrees(np.arccos(cosine)))
+        depths.append(np.abs(depth - true_depth)[both])
+    return {
+        "normal": float(np.concatenate(angles).mean()), "depth": float(np.median(np.concatenate(depths))),
+        "faces": len(mesh.faces), "dropped": report["components_dropped"],
+    }  # fmt: skip
+
+
+def trained(capture: Capture, schedule: Schedule, seconds: float | None) -> tuple[Training, dict[str, Any]]:
+    """A finished training, and what it cost and reached."""
+    begun, wall = processor_seconds(), time.perf_counter()
+    training = Training(capture, find_region(capture), schedule, seconds=seconds)
+    while not training.finished:
+        training.step()
+    cost = {"cpu": processor_seconds() - begun, "wall": time.perf_counter() - wall, "steps": training.iteration}
+    return training, cost | {"surfels": len(training.gaussians)} | judge(training.gaussians, capture)
+
+
+def kept(part: str, name: str, row: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """All rows of a part, with this one in its place."""
+    ROWS.parent.mkdir(parents=True, exist_ok=True)
+    rows = json.loads(ROWS.read_text()) if ROWS.exists() else {}
+    rows.setdefault(part, {})[name] = row
+    ROWS.write_text(json.dumps(rows, indent=1))
+    return rows[part]
+
+
+def warm(capture: Capture) -> None:
+    """Compile every kernel, so that it is not measured."""
+    training, _ = trained(capture, Schedule(iterations=12, surfels=500), None)
+    fuse(training.gaussians, [v.camera for v in capture.training], training.region, 32)
+
+
+def surfels(options: argparse.Namespace, part: str = "surfels") -> None:
+    """Stage (i) within the minutes."""
+    capture = read_capture(options.capture, options.size, 8)
+    warm(capture)
+    schedule = Schedule(iterations=options.iterations or 6000)
+    training, row = trained(capture, schedule, 60 * options.minutes)
+    if (options.capture / "mesh.npz").exists():
+        row |= against_truth(training.gaussians, training, capture, options.capture)
+    row |= {"views": len(capture.training), "size": capture.views[0].camera.width}
+    rows = kept(part, options.capture.name, row)
+    names = ("size", "views", "wall", "cpu", "steps", "surfels", "psnr", "ssim", "normal", "depth")
+    head = (
+        "Capture",
+        "Pixels",
+        "Views",
+        "s",
+        "processor s",
+        "Steps",
+        "Surfels",
+        "PSNR dB",
+        "SSIM",
+        "Normals deg",
+        "Depth",
+    )
+    title = {"surfels": "Stage (i) on scenes with known truth", "photographs": "Stage (i) on published photographs"}[
+        part
+    ]
+    body = (
+        f"{options.minutes:g} minutes at most; PSNR over whole pictures of the views left out; normals (mean angle, "
+        "degrees) and depth (median, metres) of the fused mesh against the true one.\n\n"
+    )
+    cells = [(name, *(shown(r.get(key, "-")) for key in names)) for name, r in rows.items()]
+    write_section(f"reconstruct-{part}", title, body + table(head, cells))
+
+
+def shown(value: Any) -> Any:
+    """Two decimals for decibels and degrees alike, four for small numbers."""
+    return value if not isinstance(value, float) else f"{value:.4f}" if abs(value) < 1 else f"{value:.2f}"
+
+
+def ablations(options: argparse.Namespace) -> None:
+    """What each part of stage (i) is worth, at equal steps."""
+    capture = read_capture(options.capture, options.size, 8)
+    warm(capture)
+    base = Schedule(iterations=options.iterations or 800, surfels=8000)
+    rows: dict[str, Any] = {}
+    for name, change in ABLATIONS.items():
+        if options.only and name not in options.only:
+            continue
+        training, row = trained(capture, replace(base, **change), None)
+        row |= against_truth(training.gaussians, training, capture, options.capture)
+        rows = kept("ablations", name, row)
+    cells = [
+        (name, *(shown(row[key]) for key in ("psnr", "ssim", "normal", "depth", "cpu"))) for name, row in rows.items()
+    ]
+    head = ("Stage (i)", "PSNR dB", "SSIM", "Normals deg", "Depth", "processor s")
+    pixels = capture.views[0].camera.width
+    body = f"{options.capture.name}, {base.iterations} steps, {base.surfels} surfels, {pixels} pixels.\n\n"
+    write_section("reconstruct-ablations", "Ablations of stage (i)", body + table(head, cells))
+
+
+def variants(options: argparse.Namespace) -> None:
+    """Free surfels against surfels on the mesh, with and without what the paper lets them learn."""
+    capture = read_capture(options.capture, options.size, 8)
+    warm(capture)
+    schedule = Schedule(iterations=options.iterations or 1500, surfels=10000)
+    training, row = trained(capture, schedule, None)
+    rows = kept("variants", "P: free surfels", row)
+    mesh, _ = fuse(training.gaussians, [v.camera for v in capture.training], training.region)
+    light = training.gaussians.light
+    for name, fixed in (
+        ("M: on the mesh", ()), ("M without d", ("offset",)), ("M without alpha", ("opacity",)),
+        ("M without both", ("offset", "opacity")),
+    ):  # fmt: skip
+        begun = processor_seconds()
+        attached, _, _ = attach_learned(mesh, training.gaussians, fixed)
+        attached.light = None if light is None else light.detach().clone().requires_grad_(True)
+        again = Training(capture, training.region, schedule.on_mesh(ON_MESH), attached)
+        while not again.finished:
+            again.step()
+        result = {"surfels": len(attached), "cpu": processor_seconds() - begun} | judge(again.gaussians, capture)
+        rows = kept("variants", name, result)
+    cells = [(n, r["surfels"], *(shown(r[k]) for k in ("psnr", "ssim", "cpu"))) for n, r in rows.items()]
+    head = ("Variant", "Surfels", "PSNR dB", "SSIM", "processor s")
+    body = f"{options.capture.name}, {schedule.iterations} steps, and {ON_MESH:g} of them again on the mesh.\n\n"
+    write_section("reconstruct-variants", "Free surfels and surfels on the mesh", body + table(head, cells))
+
+
+PARTS: dict[str, Callable[[argparse.Namespace], None]] = {
+    "raster": raster,
+    "surfels": surfels,
+    "photographs": lambda options: surfels(options, "photographs"),
+    "ablations": ablations,
+    "variants": variants,
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--part", choices=tuple(PARTS), default="raster")
+    parser.add_argument("--capture", type=Path)
+    parser.add_argument("--size", type=int, default=200)
+    parser.add_argument("--minutes", type=float, default=2.0)
+    parser.add_argument("--iterations", type=int)
+    parser.add_argument("--only", nargs="+", choices=tuple(ABLATIONS))
+    options = parser.parse_args()
+    if options.part != "raster" and options.capture is None:
+        parser.error(f"--part {options.part} needs --capture")
+    PARTS[options.part](options)
+
+
+if __name__ == "__main__":
+    main()

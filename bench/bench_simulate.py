@@ -1,0 +1,278 @@
+"""Simulated matter: what the solver costs, and how its motion compares with mechanics.
+
+python bench/bench_simulate.py [--part throughput taichi body surfels fill motion] [--taichi PYTHON] [--short]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import igl
+import numpy as np
+import trimesh
+from report import table, write_section
+from simulate_motion import motion
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "unit"))
+from matter_cases import aligned, lattice, solver_of
+
+from drgs_blender.deform.gmls import bind_points, carry
+from drgs_blender.deform.source_driven import _update
+from drgs_blender.jit import get_num_threads, set_num_threads
+from drgs_blender.simulate.blocks import arrange
+from drgs_blender.simulate.contact import Plane
+from drgs_blender.simulate.fill import fill
+from drgs_blender.simulate.lattice import Lattice
+from drgs_blender.simulate.solver import Forces, Solver
+
+HERE = Path(__file__).resolve().parent
+FRAME = 1 / 24
+
+
+def clock(call) -> tuple[float, float]:  # type: ignore[no-untyped-def]
+    """Processor and wall seconds."""
+    p, w = time.process_time(), time.perf_counter()
+    call()
+    return time.process_time() - p, time.perf_counter() - w
+
+
+def box_of(particles: int, material: str) -> Solver:
+    """A moving cube of about so many particles, 8 a cell, on a grid of 64 cells."""
+    side = (particles / 8) ** (1 / 3) / 64
+    points = lattice((side,) * 3, 1 / 128) + 0.2
+    velocity = 0.3 * np.sin(9 * points[:, [1, 2, 0]])
+    return solver_of(points, 1 / 64, material, velocity=velocity, low=(0,) * 3, high=(1,) * 3)
+
+
+def throughput(options: argparse.Namespace) -> str:
+    """Million particle-steps a second, per core (one thread, processor time) and on all threads (wall time)."""
+    threads = get_num_threads()
+    rows: list[list[object]] = []
+    for material in ("jelly", "elastic", "metal", "sand", "snow", "water"):
+        speeds = []
+        for count in (1, threads):
+            set_num_threads(count)
+            solver = box_of(options.particles, material)
+            step = 0.9 * FRAME / solver.steps_of(FRAME)
+            solver.advance(2 * step)
+            before = solver.steps
+            p, w = clock(lambda: solver.advance(20 * step))  # noqa: B023
+            speeds.append(len(solver.points) * (solver.steps - before) / (p if count == 1 else w) / 1e6)
+        rows.append([material, len(solver.points), *speeds])
+    set_num_threads(threads)
+    hold = f"jelly: 5.5 on one core, 10 on {threads}" if threads == 2 else "jelly: 5.5 on one core"
+    rows.append(["hold to", "", hold, ""])
+    return table(["material", "particles", "M steps/s, one core", f"M steps/s, {threads} threads"], rows)
+
+
+def in_taichi(python: Path, solver: Solver, dt: float, steps: int, threads: int, double: bool) -> tuple[dict, dict]:  # type: ignore[type-arg]
+    """What Taichi makes of the state of a solver: seconds a step, and the arrays in the order of its particles."""
+    s, matter = solver.state, solver.body.matter
+    order = arrange(s.x, solver.domain)[0].order
+    n = len(s.x)
+    columns = {
+        "x": s.x, "v": s.v, "c": s.affine.reshape(n, 3, 3), "f": s.elastic.reshape(n, 3, 3),
+        "mass": solver.body.volume * matter.density, "volume": solver.body.volume,
+        "mu": matter.parameters[:, 0], "lam": matter.parameters[:, 1],
+    }  # fmt: skip
+    domain = solver.domain
+    grid = {"origin": domain.origin, "spacing": domain.spacing, "size": 4 * np.array(domain.blocks)}
+    with tempfile.TemporaryDirectory() as folder:
+        given, made = Path(folder) / "in.npz", Path(folder) / "out.npz"
+        np.savez(given, **{k: a[order] for k, a in columns.items()}, **grid, gravity=solver.forces.gravity, dt=dt)
+        command = [python, HERE / "taichi_mpm.py", given, made, "--steps", steps, "--threads", threads]
+        said = subprocess.run(
+            [str(part) for part in command] + ["--double"] * double, check=True, capture_output=True, text=True
+        ).stdout
+        back = np.argsort(order)
+        with np.load(made) as found:
+            return json.loads(said.strip().splitlines()[-1]), {k: found[k][back] for k in found.files}
+
+
+def against_taichi(options: argparse.Namespace) -> str:
+    """Speed of both on the same matter in one run, and whether 1500 steps of one state lead to the same place."""
+    how = "Taichi has an interpreter of its own: `python -m venv V; V/bin/pip install taichi==1.7.4`, `--taichi V/bin/python`."  # noqa: E501
+    if options.taichi is None:
+        return f"{how} Not given."
+    threads, rows = get_num_threads(), []
+    version = ""
+    for count in (1, threads):
+        set_num_threads(count)
+        solver = box_of(options.particles, "jelly")
+        dt = 0.9 * FRAME / solver.steps_of(FRAME)
+        solver.advance(2 * dt)
+        theirs, _ = in_taichi(options.taichi, solver, dt, 20 if options.short else 100, count, False)
+        before = solver.steps
+        p, w = clock(lambda: solver.advance(20 * dt))  # noqa: B023
+        kind = "cpu" if count == 1 else "wall"
+        n = len(solver.points) / 1e6
+        ours = n * (solver.steps - before) / (p if count == 1 else w)
+        rows.append([count, ours, n / theirs[kind], ours * theirs[kind] / n, "2.0" if count == 1 else "1.6"])
+        version = theirs["version"]
+    set_num_threads(threads)
+    h = 0.05
+    points = lattice((0.4, 0.3, 0.3), h / 2)
+    velocity = np.cross([2.0, -2.0, 4.0], points - points.mean(axis=0)) + 2 * np.sin(9 * points[:, [1, 2, 0]])
+    velocity -= velocity.mean(axis=0)
+    solver = solver_of(points, h, young=1e6, velocity=velocity, gravity=(0.1, 0, -0.2))
+    dt, steps = 0.999 * 0.5 * h / float(solver.body.matter.wave_speed.max()), 1500
+    _, found = in_taichi(options.taichi, solver, dt, steps, 1, True)
+    for _ in range(5):
+        solver.advance(steps / 5 * dt)
+    apart = np.sqrt(((found["x"] - solver.points) ** 2).sum(axis=1).mean()) / h
+    moved = np.linalg.norm(solver.points - points, axis=1).mean() / h
+    return "\n\n".join([
+        table(["threads", "M steps/s", f"Taichi {version}", "ratio", "hold to"], rows),
+        f"The state of {len(points)} particles that moved by {moved:.3g} cells on average in {solver.steps} steps, "
+        f"stepped by Taichi in double precision: {apart:.2g} cells apart (rms); hold to 5e-4. {how}",
+    ])  # fmt: skip
+
+
+def body() -> trimesh.Trimesh:
+    """Something like an animal: a trunk, a neck and four legs, one metre long."""
+
+    def limb(length: float, radius: float, tilt: float, middle: tuple[float, float, float]) -> trimesh.Trimesh:
+        part = trimesh.creation.capsule(length, radius, count=[24, 24])
+        part.apply_transform(trimesh.transformations.rotation_matrix(tilt, (0, 1, 0)))
+        part.apply_translation(np.subtract(middle, part.bounds.mean(axis=0)))
+        return part
+
+    parts = [limb(0.5, 0.16, np.pi / 2, (0, 0, 0.55)), limb(0.35, 0.09, 0.7, (0.31, 0, 0.73))]
+    parts += [limb(0.45, 0.055, 0, (x, y, 0.28)) for x in (-0.28, 0.26) for y in (-0.09, 0.09)]
+    return trimesh.util.concatenate(parts)
+
+
+def jelly(options: argparse.Namespace) -> str:
+    """Frames a second of a standing body, E = 1e5, 24 fps."""
+    frames = 2 if options.short else 12
+    mesh = body()
+    spacing = (0.055 / options.particles) ** (1 / 3)
+    points = fill(mesh.vertices, mesh.faces, spacing).points
+    h = 2 * spacing
+    domain = aligned(points.min(axis=0) - 0.6, points.max(axis=0) + 0.6, h)
+    floor = [Plane((0, 0, 0), (0, 0, 1))]
+    solver = solver_of(points, h, young=1e5, gravity=(0, 0, -9.81), planes=floor, domain=domain)
+    solver.advance(FRAME)
+    before = solver.steps
+    cost = [clock(lambda: solver.advance(FRAME)) for _ in range(frames)]
+    quick = Lattice(solver.body, Forces(), (), floor)
+
+    def look() -> None:
+        quick.advance(FRAME)
+        _ = quick.points, quick.gradients
+
+    look()
+    seen = [clock(look) for _ in range(frames)]
+    rows: list[list[object]] = []
+    for name, steps, times, hold in (
+        ("MPM", (solver.steps - before) / frames, cost, "1.5 frames/s, 250 frames in 180 s"),
+        ("XPBD", quick.steps / (frames + 1), seen, "tens of frames/s"),
+    ):
+        cpu, wall = np.median(times, axis=0)
+        rows.append([name, len(points), steps, 1 / cpu, 1 / wall, 250 * wall, hold])
+    columns = [
+        "solver",
+        "particles",
+        "steps a frame",
+        "frames a processor second",
+        "frames a second",
+        "250 frames, s",
+        "hold to",
+    ]
+    return table(columns, rows)
+
+
+def carrying(options: argparse.Namespace) -> str:
+    """300k surfels on 16 neighbours each, milliseconds."""
+    side = round(options.particles ** (1 / 3))
+    sources = lattice((1, 1, 1), 1 / side)
+    points = np.random.default_rng(0).random((300_000, 3))
+    cell = (points * 64).astype(int)
+    points = points[np.lexsort(cell.T)]
+    gradients = np.tile(np.eye(3, dtype=np.float32), (len(sources), 1, 1))
+    x = sources.astype(np.float32)
+    bind_points(points[:100], sources)
+    holder = []
+    bound = clock(lambda: holder.append(bind_points(points, sources)))
+    u, v, n = (np.ones((len(points), 3), np.float32) for _ in range(3))
+    out = [np.empty_like(u) for _ in range(3)]
+
+    def frame() -> None:
+        _, at, _ = carry(holder[0], x, gradients)
+        _update(at.reshape(-1, 9), u, v, n, *out)
+
+    frame()
+    cost = np.median([clock(frame) for _ in range(9)], axis=0)
+    rows = [
+        ["bind (once)", *(1e3 * np.array(bound)), "1500"],
+        ["GMLS and surfel update, a frame", *(1e3 * cost), "40 of processor time"],
+    ]
+    return table(["step", "processor ms", "wall ms", "hold to"], rows)
+
+
+def filling(options: argparse.Namespace) -> str:
+    """128 cells along the longest side: seconds, and overlap with the inside of the undamaged mesh."""
+    mesh = body().subdivide().subdivide()
+    extent = float(np.ptp(mesh.vertices, axis=0).max())
+    spacing = extent / 126
+    rng = np.random.default_rng(1)
+    keep = mesh.triangles_center[:, 2] > mesh.triangles_center[:, 2].min() + 0.02 * extent  # open feet
+    for place in mesh.vertices[rng.integers(len(mesh.vertices), size=6)]:
+        keep &= np.linalg.norm(mesh.triangles_center - place, axis=1) > 0.03 * extent
+    noisy = mesh.vertices + 0.003 * extent * rng.normal(size=mesh.vertices.shape)
+    fill(noisy, mesh.faces[keep], 4 * spacing)
+    whole = len(fill(mesh.vertices, mesh.faces, spacing).points)
+    rows = []
+    for name, vertices, faces in (
+        ("whole", mesh.vertices, mesh.faces),
+        ("open feet, 6 holes", mesh.vertices, mesh.faces[keep]),
+        ("and noise of 0.4 cells", noisy, mesh.faces[keep]),
+    ):
+        for method in ("auto", "parity"):
+            found = []
+            p, w = clock(lambda: found.append(fill(vertices, faces, spacing, method=method)))  # noqa: B023
+            points = found[0].points
+            both = int((igl.fast_winding_number(mesh.vertices, np.asarray(mesh.faces), points) > 0.5).sum())
+            overlap = both / (whole + len(points) - both)
+            hold = "0.95 within 2 s" if method == "auto" else ""
+            rows.append([name, found[0].report["method"], len(points), overlap, p, w, hold])
+    columns = ["mesh", "method", "particles", "overlap with the inside", "processor s", "wall s", "hold to"]
+    return table(columns, rows)
+
+
+#: Part -> title and what measures it.
+PARTS = {
+    "throughput": ("Simulated matter: speed by material", throughput),
+    "taichi": ("Simulated matter: against Taichi", against_taichi),
+    "body": ("Simulated matter: a body with legs, E = 1e5 Pa, 24 frames a second", jelly),
+    "surfels": ("Simulated matter: 300,000 surfels carried by 16 neighbours each", carrying),
+    "fill": ("Simulated matter: filling, 128 cells along the longest side", filling),
+    "motion": ("Simulated matter: motion against mechanics", motion),
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--part", nargs="+", choices=PARTS, default=list(PARTS), metavar="PART")
+    parser.add_argument("--particles", type=int, default=100_000)
+    parser.add_argument("--taichi", type=Path, metavar="PYTHON", help="interpreter with taichi 1.7")
+    parser.add_argument("--short", action="store_true", help="fewer frames and cases, to see that it works")
+    parser.add_argument("--no-write", action="store_true", help="print, and leave docs/benchmarks.md as it is")
+    options = parser.parse_args()
+    for part in options.part:
+        title, run = PARTS[part]
+        text = run(options)
+        if options.no_write:
+            print(f"{title}\n\n{text}\n", flush=True)
+        else:
+            write_section(f"simulate-{part}", title, text)
+
+
+if __name__ == "__main__":
+    main()
