@@ -152,7 +152,9 @@ def jelly(options: argparse.Namespace) -> str:
     """Frames a second of a standing body, E = 1e5, 24 fps."""
     frames = 2 if options.short else 12
     mesh = body()
-    spacing = (0.055 / options.particles) ** (1 / 3)
+    rough = 0.02
+    volume = len(fill(mesh.vertices, mesh.faces, rough).points) * rough**3
+    spacing = (volume / options.particles) ** (1 / 3)
     points = fill(mesh.vertices, mesh.faces, spacing).points
     h = 2 * spacing
     domain = aligned(points.min(axis=0) - 0.6, points.max(axis=0) + 0.6, h)

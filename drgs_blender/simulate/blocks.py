@@ -8,15 +8,19 @@ does not depend on the number of threads. Particles may drift one cell from wher
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
-from ..jit import njit, prange
+from ..jit import get_num_threads, njit, prange
 
 Array = np.ndarray
 
 #: Cells of the domain on every side that particles must keep clear of.
 MARGIN = 4
+
+#: What a block costs by itself, in particles.
+_BLOCK = 32
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +65,8 @@ class Arrangement:
     ----------
     order : (n,) int64, the particles block by block
     block : (b, 3) int32, blocks with particles, those of one parity together
-    parity : (9,) int64, where the blocks of each parity begin
+    shares : (9, threads + 1) int64, blocks cut into as many parts as there are threads, alike in work: those of each
+        parity, and all
     start : (b + 1,) int64, where the particles of each block begin
     neighbour : (b, 27) int32, the slot of each block around, x slowest
     active : (a, 3) int32, blocks that have memory, by slot
@@ -70,7 +75,7 @@ class Arrangement:
 
     order: Array
     block: Array
-    parity: Array
+    shares: Array
     start: Array
     neighbour: Array
     active: Array
@@ -143,7 +148,7 @@ def arrange(x: Array, domain: Domain) -> tuple[Arrangement, Array]:
     lost = np.flatnonzero(number < 0)
     empty = np.empty((0, 3), np.int32)
     if len(lost):
-        return Arrangement(lost, empty, np.zeros(9, np.int64), lost, empty, empty, empty), lost
+        return Arrangement(lost, empty, np.zeros((9, 2), np.int64), lost, empty, empty, empty), lost
     order, counts = _counting_sort(number, bx * by * bz)
     used = np.flatnonzero(counts)
     first = (np.cumsum(counts) - counts)[used]
@@ -157,5 +162,9 @@ def arrange(x: Array, domain: Domain) -> tuple[Arrangement, Array]:
     block = np.ascontiguousarray(block[by_parity])
     slot = np.full(domain.blocks, -1, np.int32)
     neighbour, active = _activate(block, slot)
-    bounds = np.concatenate([[0], np.cumsum(np.bincount(parity, minlength=8))]).astype(np.int64)
-    return Arrangement(order, block, bounds, start.astype(np.int64), neighbour, active, slot), lost
+    bounds = np.concatenate([[0], np.cumsum(np.bincount(parity, minlength=8))])
+    work = start + _BLOCK * np.arange(len(start))
+    ranges = [*pairwise(bounds), (0, len(block))]
+    parts = np.linspace(0, 1, get_num_threads() + 1)
+    shares = np.array([np.searchsorted(work, work[a] + parts * (work[b] - work[a])) for a, b in ranges])
+    return Arrangement(order, block, shares, start.astype(np.int64), neighbour, active, slot), lost

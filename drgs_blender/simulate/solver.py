@@ -69,7 +69,7 @@ class State:
     def taken(self, order: Array) -> State:
         """The rows in another order."""
         parts = (getattr(self, f.name) for f in fields(self))
-        return State(*(a[order] if len(a) else a for a in parts))
+        return State(*(a.take(order, axis=0) if len(a) else a for a in parts))
 
 
 @dataclass(slots=True)
@@ -241,7 +241,7 @@ class Solver(Stepper):
 
             s, a = self.state, arrangement
             grid = (domain.origin, h)
-            scatter(s.x, s.v, s.affine, s.tau, mass, volume, *grid, dt, a.block, a.parity, a.start, a.neighbour, nodes)
+            scatter(s.x, s.v, s.affine, s.tau, mass, volume, *grid, dt, a.block, a.shares, a.start, a.neighbour, nodes)
             advance_nodes(nodes, self._least, dt, gravity, wind, forces.drag, forces.damping)
             if len(self._fields):
                 blow_nodes(nodes, a.active, *grid, self._fields.at(self.frame, (done + 0.5 * dt) / seconds), dt)
@@ -254,7 +254,7 @@ class Solver(Stepper):
                 kept = s.x[pins] + dt * pin_velocity
             gather(
                 s.x, s.v, s.affine, s.elastic, s.total, s.tau, s.memory, model, parameters, mass, solid, *grid, dt,
-                a.block, a.start, a.neighbour, nodes, fastest,
+                a.block, a.shares, a.start, a.neighbour, nodes, fastest,
             )  # fmt: skip
             if len(pins):
                 s.x[pins], s.v[pins] = kept, pin_velocity

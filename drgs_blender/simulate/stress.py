@@ -20,93 +20,103 @@ _FLOOR = np.float32(0.02)  # of the volume ratio in logarithms and powers
 
 
 @njit(inline="always")
-def _put(tau, u, a, b, c):  # type: ignore[no-untyped-def]
+def _put(tau, p, u, a, b, c):  # type: ignore[no-untyped-def]
     """tau = U diag(a, b, c) U^T."""
-    tau[0] = a * u[0] * u[0] + b * u[1] * u[1] + c * u[2] * u[2]
-    tau[1] = a * u[3] * u[3] + b * u[4] * u[4] + c * u[5] * u[5]
-    tau[2] = a * u[6] * u[6] + b * u[7] * u[7] + c * u[8] * u[8]
-    tau[3] = a * u[0] * u[3] + b * u[1] * u[4] + c * u[2] * u[5]
-    tau[4] = a * u[0] * u[6] + b * u[1] * u[7] + c * u[2] * u[8]
-    tau[5] = a * u[3] * u[6] + b * u[4] * u[7] + c * u[5] * u[8]
+    tau[p, 0] = a * u[0] * u[0] + b * u[1] * u[1] + c * u[2] * u[2]
+    tau[p, 1] = a * u[3] * u[3] + b * u[4] * u[4] + c * u[5] * u[5]
+    tau[p, 2] = a * u[6] * u[6] + b * u[7] * u[7] + c * u[8] * u[8]
+    tau[p, 3] = a * u[0] * u[3] + b * u[1] * u[4] + c * u[2] * u[5]
+    tau[p, 4] = a * u[0] * u[6] + b * u[1] * u[7] + c * u[2] * u[8]
+    tau[p, 5] = a * u[3] * u[6] + b * u[4] * u[7] + c * u[5] * u[8]
 
 
 @njit(inline="always")
-def _compose(f, u, a, b, c, v):  # type: ignore[no-untyped-def]
+def _compose(f, p, u, a, b, c, v):  # type: ignore[no-untyped-def]
     """F = U diag(a, b, c) V^T."""
     for r in range(3):
         for k in range(3):
-            f[3 * r + k] = a * u[3 * r] * v[3 * k] + b * u[3 * r + 1] * v[3 * k + 1] + c * u[3 * r + 2] * v[3 * k + 2]
+            f[p, 3 * r + k] = (
+                a * u[3 * r] * v[3 * k] + b * u[3 * r + 1] * v[3 * k + 1] + c * u[3 * r + 2] * v[3 * k + 2]
+            )
 
 
 @njit(inline="always")
-def neo_hookean(f, mu, first, tau):  # type: ignore[no-untyped-def]
-    """tau = mu (F F^T - 1) + lambda log(J) 1."""
-    j = f[0] * (f[4] * f[8] - f[5] * f[7]) - f[1] * (f[3] * f[8] - f[5] * f[6]) + f[2] * (f[3] * f[7] - f[4] * f[6])
+def neo_hookean(f, p, mu, first, tau):  # type: ignore[no-untyped-def]
+    """tau = mu (F F^T - 1) + lambda log(J) 1, for row p."""
+    a, b, c, d, e, g, h, i, k = f[p, 0], f[p, 1], f[p, 2], f[p, 3], f[p, 4], f[p, 5], f[p, 6], f[p, 7], f[p, 8]
+    j = a * (e * k - g * i) - b * (d * k - g * h) + c * (d * i - e * h)
     pressure = first * np.log(max(j, _FLOOR)) - mu
-    tau[0] = mu * (f[0] * f[0] + f[1] * f[1] + f[2] * f[2]) + pressure
-    tau[1] = mu * (f[3] * f[3] + f[4] * f[4] + f[5] * f[5]) + pressure
-    tau[2] = mu * (f[6] * f[6] + f[7] * f[7] + f[8] * f[8]) + pressure
-    tau[3] = mu * (f[0] * f[3] + f[1] * f[4] + f[2] * f[5])
-    tau[4] = mu * (f[0] * f[6] + f[1] * f[7] + f[2] * f[8])
-    tau[5] = mu * (f[3] * f[6] + f[4] * f[7] + f[5] * f[8])
+    tau[p, 0] = mu * (a * a + b * b + c * c) + pressure
+    tau[p, 1] = mu * (d * d + e * e + g * g) + pressure
+    tau[p, 2] = mu * (h * h + i * i + k * k) + pressure
+    tau[p, 3] = mu * (a * d + b * e + c * g)
+    tau[p, 4] = mu * (a * h + b * i + c * k)
+    tau[p, 5] = mu * (d * h + e * i + g * k)
 
 
 @njit
-def respond(model, q, f, tau, memory, affine, dt):  # type: ignore[no-untyped-def]
-    """Let one particle flow and find its stress.
+def respond(p, model, parameters, f, tau, memories, affine, dt):  # type: ignore[no-untyped-def]
+    """Let particle p flow and find its stress. Arrays are whole: rows of them would be counted, by both threads.
 
     Parameters
     ----------
-    model, q : its model and row of parameters
-    f : (9,) float32, elastic deformation gradient, changed in place where matter flows
-    tau : (6,) float32, written
-    memory : what the model remembers: plastic strain (plastic), volume correction (sand), plastic volume (snow),
-        volume ratio (fluid)
-    affine : (9,) float32 velocity gradient, 1/s
+    model, parameters : (n,) uint8, (n, k) float32
+    f : (n, 9) float32, elastic deformation gradient, changed in place where matter flows
+    tau : (n, 6) float32, written
+    memories : (n,) float32, changed: what the model remembers: plastic strain (plastic), volume correction (sand),
+        plastic volume (snow), volume ratio (fluid)
+    affine : (n, 9) float32 velocity gradient, 1/s
     dt : seconds
-
-    Returns
-    -------
-    float
-        The new memory.
     """
-    mu, first = float(q[MU]), float(q[LAMBDA])
-    if model == ELASTIC:
-        neo_hookean(f, q[MU], q[LAMBDA], tau)
-        return memory
-    if model == FLUID:
+    kind = model[p]
+    if kind == ELASTIC:
+        neo_hookean(f, p, parameters[p, MU], parameters[p, LAMBDA], tau)
+        return
+    mu, first, memory = float(parameters[p, MU]), float(parameters[p, LAMBDA]), memories[p]
+    if kind == FLUID:
         # Equation of state p = K / g (J^-g - 1); J alone is remembered.
-        trace = float(affine[0] + affine[4] + affine[8])
+        trace = float(affine[p, 0] + affine[p, 4] + affine[p, 8])
         j = min(max(float(memory) * (1.0 + dt * trace), 0.2), 1.1)
-        gamma = float(q[FIRST])
+        gamma = float(parameters[p, FIRST])
         pressure = -first / gamma * (j ** (-gamma) - 1.0) * j
         for k in range(3):
-            tau[k] = pressure + 2.0 * mu * j * (affine[4 * k] - trace / 3.0)
-        tau[3] = mu * j * (affine[1] + affine[3])
-        tau[4] = mu * j * (affine[2] + affine[6])
-        tau[5] = mu * j * (affine[5] + affine[7])
-        return np.float32(j)
+            tau[p, k] = pressure + 2.0 * mu * j * (affine[p, 4 * k] - trace / 3.0)
+        tau[p, 3] = mu * j * (affine[p, 1] + affine[p, 3])
+        tau[p, 4] = mu * j * (affine[p, 2] + affine[p, 6])
+        tau[p, 5] = mu * j * (affine[p, 5] + affine[p, 7])
+        memories[p] = np.float32(j)
+        return
 
-    u, s, v = svd3(f)
-    if model == COROTATED:
+    u, s, v = svd3(f, p)
+    if kind == COROTATED:
         j = s[0] * s[1] * s[2]
-        p = first * (j - 1.0) * j
-        _put(tau, u, 2 * mu * (s[0] - 1) * s[0] + p, 2 * mu * (s[1] - 1) * s[1] + p, 2 * mu * (s[2] - 1) * s[2] + p)
-        return memory
+        push = first * (j - 1.0) * j
+        _put(
+            tau,
+            p,
+            u,
+            2 * mu * (s[0] - 1) * s[0] + push,
+            2 * mu * (s[1] - 1) * s[1] + push,
+            2 * mu * (s[2] - 1) * s[2] + push,
+        )
+        memories[p] = memory
+        return
 
-    if model in (PLASTIC, SAND):
+    if kind in (PLASTIC, SAND):
         a, b, c = math.log(max(s[0], 1e-4)), math.log(max(s[1], 1e-4)), math.log(max(s[2], 1e-4))
         flows = False
-        if model == PLASTIC:
+        if kind == PLASTIC:
             mean = (a + b + c) / 3.0
             x, y, z = a - mean, b - mean, c - mean
             length = math.sqrt(x * x + y * y + z * z)
-            strength = max(float(q[FIRST]) + float(q[SECOND]) * memory, 0.1 * float(q[FIRST]))
+            strength = max(
+                float(parameters[p, FIRST]) + float(parameters[p, SECOND]) * memory, 0.1 * float(parameters[p, FIRST])
+            )
             excess = 2.0 * mu * length - 0.816496580927726 * strength
             if excess > 0.0:
                 flows = True
                 stiff = 2.0 * mu * (s[0] * s[0] + s[1] * s[1] + s[2] * s[2]) / 3.0
-                step = excess / (2.0 * mu) / (1.0 + float(q[THIRD]) / (stiff * dt))
+                step = excess / (2.0 * mu) / (1.0 + float(parameters[p, THIRD]) / (stiff * dt))
                 keep = 1.0 - step / length
                 a, b, c = mean + keep * x, mean + keep * y, mean + keep * z
                 memory = np.float32(memory + step)
@@ -114,7 +124,7 @@ def respond(model, q, f, tau, memory, affine, dt):  # type: ignore[no-untyped-de
             # Volume lost or gained in earlier flow is taken up before new stress arises.
             given = float(memory) / 3.0
             a, b, c = a + given, b + given, c + given
-            trace = a + b + c - float(q[SECOND])
+            trace = a + b + c - float(parameters[p, SECOND])
             mean = (a + b + c) / 3.0
             x, y, z = a - mean, b - mean, c - mean
             length = math.sqrt(x * x + y * y + z * z)
@@ -124,24 +134,25 @@ def respond(model, q, f, tau, memory, affine, dt):  # type: ignore[no-untyped-de
                 a = b = c = 0.0
             else:
                 memory = np.float32(0.0)
-                step = length + (3.0 * first + 2.0 * mu) / (2.0 * mu) * trace * float(q[FIRST])
+                step = length + (3.0 * first + 2.0 * mu) / (2.0 * mu) * trace * float(parameters[p, FIRST])
                 if step > 0.0:
                     keep = 1.0 - step / length
                     a, b, c = mean + keep * x, mean + keep * y, mean + keep * z
         if flows:
-            _compose(f, u, math.exp(a), math.exp(b), math.exp(c), v)
-        p = first * (a + b + c)
-        _put(tau, u, 2 * mu * a + p, 2 * mu * b + p, 2 * mu * c + p)
-        return memory
+            _compose(f, p, u, math.exp(a), math.exp(b), math.exp(c), v)
+        push = first * (a + b + c)
+        _put(tau, p, u, 2 * mu * a + push, 2 * mu * b + push, 2 * mu * c + push)
+        memories[p] = memory
+        return
 
     # Snow: strain beyond the critical compression and stretch becomes plastic, and hardens or softens.
-    low, high = 1.0 - float(q[FIRST]), 1.0 + float(q[SECOND])
+    low, high = 1.0 - float(parameters[p, FIRST]), 1.0 + float(parameters[p, SECOND])
     a, b, c = min(max(s[0], low), high), min(max(s[1], low), high), min(max(s[2], low), high)
     j = a * b * c
     plastic = min(max(float(memory) * s[0] * s[1] * s[2] / j, 0.1), 4.0)
-    _compose(f, u, a, b, c, v)
-    harder = min(max(math.exp(float(q[THIRD]) * (1.0 - plastic)), 0.05), MOST_HARDENING)
+    _compose(f, p, u, a, b, c, v)
+    harder = min(max(math.exp(float(parameters[p, THIRD]) * (1.0 - plastic)), 0.05), MOST_HARDENING)
     mu, first = mu * harder, first * harder
-    p = first * (j - 1.0) * j
-    _put(tau, u, 2 * mu * (a - 1) * a + p, 2 * mu * (b - 1) * b + p, 2 * mu * (c - 1) * c + p)
-    return np.float32(plastic)
+    push = first * (j - 1.0) * j
+    _put(tau, p, u, 2 * mu * (a - 1) * a + push, 2 * mu * (b - 1) * b + push, 2 * mu * (c - 1) * c + push)
+    memories[p] = np.float32(plastic)

@@ -10,11 +10,16 @@ from __future__ import annotations
 import numpy as np
 
 from ..jit import njit, prange
-from .stress import respond
+from ..matter import ELASTIC, LAMBDA, MU
+from ..simd import fold, load, quads, repeat, spread, store
+from .stress import neo_hookean, respond
 
 Array = np.ndarray
 
-_HALF, _ONE, _ONE_HALF = np.float32(0.5), np.float32(1.0), np.float32(1.5)
+_ZERO, _HALF, _ONE, _ONE_HALF = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(1.5)
+
+#: 8^3 nodes of momentum (or velocity) and mass, and one more, as rows are loaded four nodes at a time.
+_SCRATCH = 2048 + 4
 
 #: Share of a node's matter that is pinned from which on the node is. On a flat border between pinned and free matter
 #: the last node held is then, over all positions of the grid, on average on the border itself.
@@ -45,9 +50,42 @@ def _node(neighbour, b, i, j, k):  # type: ignore[no-untyped-def]
     return neighbour[b, e], n, ((i * 8 + j) * 8 + k) * 4
 
 
+@njit(inline="always")
+def _steps():  # type: ignore[no-untyped-def]
+    """How many spacings each node of a row is from its first."""
+    return quads(_ZERO, _ONE, np.float32(2.0), np.float32(3.0))
+
+
+@njit(inline="always")
+def _covered(scratch, base, wx, wy, wz):  # type: ignore[no-untyped-def]
+    """Weight of the nodes that have matter."""
+    covered = _ZERO
+    for ii in range(3):
+        for jj in range(3):
+            for kk in range(3):
+                if scratch[base + ii * 256 + jj * 32 + 4 * kk + 3] > _ZERO:
+                    covered += wx[ii] * wy[jj] * wz[kk]
+    return covered
+
+
+@njit(inline="always")
+def _stretch(f, p, step, g0, g1, g2, g3, g4, g5, g6, g7, g8):  # type: ignore[no-untyped-def]
+    """F = (1 + step grad v) F, in place."""
+    f0, f1, f2, f3, f4, f5, f6, f7, f8 = f[p, 0], f[p, 1], f[p, 2], f[p, 3], f[p, 4], f[p, 5], f[p, 6], f[p, 7], f[p, 8]
+    f[p, 0] = f0 + step * (g0 * f0 + g1 * f3 + g2 * f6)
+    f[p, 1] = f1 + step * (g0 * f1 + g1 * f4 + g2 * f7)
+    f[p, 2] = f2 + step * (g0 * f2 + g1 * f5 + g2 * f8)
+    f[p, 3] = f3 + step * (g3 * f0 + g4 * f3 + g5 * f6)
+    f[p, 4] = f4 + step * (g3 * f1 + g4 * f4 + g5 * f7)
+    f[p, 5] = f5 + step * (g3 * f2 + g4 * f5 + g5 * f8)
+    f[p, 6] = f6 + step * (g6 * f0 + g7 * f3 + g8 * f6)
+    f[p, 7] = f7 + step * (g6 * f1 + g7 * f4 + g8 * f7)
+    f[p, 8] = f8 + step * (g6 * f2 + g7 * f5 + g8 * f8)
+
+
 @njit(parallel=True)
 def scatter(  # type: ignore[no-untyped-def]
-    x, v, affine, tau, mass, volume, origin, spacing, dt, block, parity, start, neighbour, nodes
+    x, v, affine, tau, mass, volume, origin, spacing, dt, block, shares, start, neighbour, nodes
 ):  # fmt: skip
     """Particles to grid.
 
@@ -64,49 +102,43 @@ def scatter(  # type: ignore[no-untyped-def]
     for s in prange(len(nodes)):
         nodes[s] = np.float32(0.0)
     for colour in range(8):
-        for b in prange(parity[colour], parity[colour + 1]):
-            scratch = np.zeros(2048, np.float32)
-            cx, cy, cz = 4 * block[b, 0] - 1, 4 * block[b, 1] - 1, 4 * block[b, 2] - 1
-            for p in range(start[b], start[b + 1]):
-                m = mass[p]
-                if m == np.float32(0.0):
-                    continue
-                i, j, k, fx, fy, fz = _cell(x, p, origin, scale)
-                wx, wy, wz = _weights(fx), _weights(fy), _weights(fz)
-                q = -factor * volume[p]
-                # Momentum of a node: m v + (m C - factor V tau) d, with d from the particle to the node.
-                a00, a01, a02 = (m * affine[p, 0] + q * tau[p, 0]) * h, (m * affine[p, 1] + q * tau[p, 3]) * h, (m * affine[p, 2] + q * tau[p, 4]) * h  # noqa: E501  # fmt: skip
-                a10, a11, a12 = (m * affine[p, 3] + q * tau[p, 3]) * h, (m * affine[p, 4] + q * tau[p, 1]) * h, (m * affine[p, 5] + q * tau[p, 5]) * h  # noqa: E501  # fmt: skip
-                a20, a21, a22 = (m * affine[p, 6] + q * tau[p, 4]) * h, (m * affine[p, 7] + q * tau[p, 5]) * h, (m * affine[p, 8] + q * tau[p, 2]) * h  # noqa: E501  # fmt: skip
-                mx = m * v[p, 0] - a00 * fx - a01 * fy - a02 * fz
-                my = m * v[p, 1] - a10 * fx - a11 * fy - a12 * fz
-                mz = m * v[p, 2] - a20 * fx - a21 * fy - a22 * fz
-                base = (((i - cx) * 8 + (j - cy)) * 8 + (k - cz)) * 4
-                for ii in range(3):
-                    di = np.float32(ii)
-                    for jj in range(3):
-                        dj = np.float32(jj)
-                        w = wx[ii] * wy[jj]
-                        nx = mx + di * a00 + dj * a01
-                        ny = my + di * a10 + dj * a11
-                        nz = mz + di * a20 + dj * a21
-                        at = base + ii * 256 + jj * 32
-                        for kk in range(3):
-                            dk = np.float32(kk)
-                            ww = w * wz[kk]
-                            o = at + 4 * kk
-                            scratch[o] += ww * (nx + dk * a02)
-                            scratch[o + 1] += ww * (ny + dk * a12)
-                            scratch[o + 2] += ww * (nz + dk * a22)
-                            scratch[o + 3] += ww * m
-            for i in range(8):
-                for j in range(8):
-                    for k in range(8):
-                        s, n, o = _node(neighbour, b, i, j, k)
-                        nodes[s, n, 0] += scratch[o]
-                        nodes[s, n, 1] += scratch[o + 1]
-                        nodes[s, n, 2] += scratch[o + 2]
-                        nodes[s, n, 3] += scratch[o + 3]
+        for t in prange(shares.shape[1] - 1):
+            for b in range(shares[colour, t], shares[colour, t + 1]):
+                scratch = np.zeros(_SCRATCH, np.float32)
+                cx, cy, cz = 4 * block[b, 0] - 1, 4 * block[b, 1] - 1, 4 * block[b, 2] - 1
+                for p in range(start[b], start[b + 1]):
+                    m = mass[p]
+                    if m == np.float32(0.0):
+                        continue
+                    i, j, k, fx, fy, fz = _cell(x, p, origin, scale)
+                    wx, wy, wz = _weights(fx), _weights(fy), _weights(fz)
+                    q = -factor * volume[p]
+                    # Momentum of a node: m v + (m C - factor V tau) d, with d from the particle to the node.
+                    a00, a01, a02 = (m * affine[p, 0] + q * tau[p, 0]) * h, (m * affine[p, 1] + q * tau[p, 3]) * h, (m * affine[p, 2] + q * tau[p, 4]) * h  # noqa: E501  # fmt: skip
+                    a10, a11, a12 = (m * affine[p, 3] + q * tau[p, 3]) * h, (m * affine[p, 4] + q * tau[p, 1]) * h, (m * affine[p, 5] + q * tau[p, 5]) * h  # noqa: E501  # fmt: skip
+                    a20, a21, a22 = (m * affine[p, 6] + q * tau[p, 4]) * h, (m * affine[p, 7] + q * tau[p, 5]) * h, (m * affine[p, 8] + q * tau[p, 2]) * h  # noqa: E501  # fmt: skip
+                    mx = m * v[p, 0] - a00 * fx - a01 * fy - a02 * fz
+                    my = m * v[p, 1] - a10 * fx - a11 * fy - a12 * fz
+                    mz = m * v[p, 2] - a20 * fx - a21 * fy - a22 * fz
+                    base = (((i - cx) * 8 + (j - cy)) * 8 + (k - cz)) * 4
+                    # A row of nodes along z at once; the fourth has no weight.
+                    along = quads(wz[0], wz[1], wz[2], _ZERO)
+                    here = along * (repeat(mx, my, mz, m) + _steps() * repeat(a02, a12, a22, _ZERO))
+                    per_x, per_y = along * repeat(a00, a10, a20, _ZERO), along * repeat(a01, a11, a21, _ZERO)
+                    for ii in range(3):
+                        line = here + np.float32(ii) * per_x
+                        for jj in range(3):
+                            at = base + ii * 256 + jj * 32
+                            row = (wx[ii] * wy[jj]) * (line + np.float32(jj) * per_y)
+                            store(scratch, at, load(scratch, at) + row)
+                for i in range(8):
+                    for j in range(8):
+                        for k in range(8):
+                            s, n, o = _node(neighbour, b, i, j, k)
+                            nodes[s, n, 0] += scratch[o]
+                            nodes[s, n, 1] += scratch[o + 1]
+                            nodes[s, n, 2] += scratch[o + 2]
+                            nodes[s, n, 3] += scratch[o + 3]
 
 
 @njit(parallel=True)
@@ -141,7 +173,7 @@ def advance_nodes(nodes, least, dt, force, wind, drag, damping):  # type: ignore
 @njit(parallel=True)
 def gather(  # type: ignore[no-untyped-def]
     x, v, affine, elastic, total, tau, memory, model, parameters, mass, solid, origin, spacing, dt,
-    block, start, neighbour, nodes, fastest,
+    block, shares, start, neighbour, nodes, fastest,
 ):  # fmt: skip
     """Grid to particles: move them, deform them, and find their stress for the next step.
 
@@ -157,81 +189,65 @@ def gather(  # type: ignore[no-untyped-def]
     to_gradient = np.float32(4.0 * scale)
     step = np.float32(dt)
     apart = len(total) > 0
-    for b in prange(len(block)):
-        scratch = np.empty(2048, np.float32)
-        for i in range(8):
-            for j in range(8):
-                for k in range(8):
-                    s, n, o = _node(neighbour, b, i, j, k)
-                    scratch[o] = nodes[s, n, 0]
-                    scratch[o + 1] = nodes[s, n, 1]
-                    scratch[o + 2] = nodes[s, n, 2]
-                    scratch[o + 3] = nodes[s, n, 3]
-        cx, cy, cz = 4 * block[b, 0] - 1, 4 * block[b, 1] - 1, 4 * block[b, 2] - 1
-        top = np.float32(0.0)
-        for p in range(start[b], start[b + 1]):
-            i, j, k, fx, fy, fz = _cell(x, p, origin, scale)
-            wx, wy, wz = _weights(fx), _weights(fy), _weights(fz)
-            base = (((i - cx) * 8 + (j - cy)) * 8 + (k - cz)) * 4
-            zero = np.float32(0.0)
-            vx = vy = vz = zero
-            b0 = b1 = b2 = b3 = b4 = b5 = b6 = b7 = b8 = zero
-            covered = zero
-            for ii in range(3):
-                di = np.float32(ii) - fx
-                for jj in range(3):
-                    dj = np.float32(jj) - fy
-                    w = wx[ii] * wy[jj]
-                    at = base + ii * 256 + jj * 32
-                    sx = sy = sz = zero  # sums along the row, and the same times the offset along it
-                    tx = ty = tz = zero
-                    for kk in range(3):
-                        o = at + 4 * kk
-                        ww = w * wz[kk]
-                        dk = np.float32(kk) - fz
-                        px, py, pz = ww * scratch[o], ww * scratch[o + 1], ww * scratch[o + 2]
-                        if scratch[o + 3] > zero:
-                            covered += ww
-                        sx, sy, sz = sx + px, sy + py, sz + pz
-                        tx, ty, tz = tx + dk * px, ty + dk * py, tz + dk * pz
-                    vx, vy, vz = vx + sx, vy + sy, vz + sz
-                    b0, b1, b2 = b0 + di * sx, b1 + dj * sx, b2 + tx
-                    b3, b4, b5 = b3 + di * sy, b4 + dj * sy, b5 + ty
-                    b6, b7, b8 = b6 + di * sz, b7 + dj * sz, b8 + tz
-            if mass[p] == zero:
-                # Riders may be where some nodes have no matter: what there is counts fully; F follows no riders.
-                if covered > np.float32(1e-6):
-                    vx, vy, vz = vx / covered, vy / covered, vz / covered
+    for t in prange(shares.shape[1] - 1):
+        for b in range(shares[8, t], shares[8, t + 1]):
+            scratch = np.zeros(_SCRATCH, np.float32)
+            for i in range(8):
+                for j in range(8):
+                    for k in range(8):
+                        s, n, o = _node(neighbour, b, i, j, k)
+                        scratch[o] = nodes[s, n, 0]
+                        scratch[o + 1] = nodes[s, n, 1]
+                        scratch[o + 2] = nodes[s, n, 2]
+                        scratch[o + 3] = nodes[s, n, 3]
+            cx, cy, cz = 4 * block[b, 0] - 1, 4 * block[b, 1] - 1, 4 * block[b, 2] - 1
+            top = np.float32(0.0)
+            for p in range(start[b], start[b + 1]):
+                i, j, k, fx, fy, fz = _cell(x, p, origin, scale)
+                wx, wy, wz = _weights(fx), _weights(fy), _weights(fz)
+                base = (((i - cx) * 8 + (j - cy)) * 8 + (k - cz)) * 4
+                blend = per_x = per_y = spread(_ZERO)
+                for ii in range(3):
+                    for jj in range(3):
+                        row = (wx[ii] * wy[jj]) * load(scratch, base + ii * 256 + jj * 32)
+                        blend = blend + row
+                        per_x = per_x + (np.float32(ii) - fx) * row
+                        per_y = per_y + (np.float32(jj) - fy) * row
+                along = quads(wz[0], wz[1], wz[2], _ZERO)
+                blend = along * blend
+                vx, vy, vz, _ = fold(blend)
+                if mass[p] == _ZERO:
+                    # Riders may be where some nodes have no matter: what there is counts fully; F follows no riders.
+                    covered = _covered(scratch, base, wx, wy, wz)
+                    if covered > np.float32(1e-6):
+                        vx, vy, vz = vx / covered, vy / covered, vz / covered
+                    else:
+                        vx, vy, vz = v[p, 0], v[p, 1], v[p, 2]
+                v[p, 0], v[p, 1], v[p, 2] = vx, vy, vz
+                x[p, 0] += dt * vx
+                x[p, 1] += dt * vy
+                x[p, 2] += dt * vz
+                speed = vx * vx + vy * vy + vz * vz
+                top = top if speed <= top or top != top else speed  # NaN stays
+                if mass[p] == _ZERO:
+                    continue
+                b0, b3, b6, _ = fold(along * per_x)
+                b1, b4, b7, _ = fold(along * per_y)
+                b2, b5, b8, _ = fold((_steps() - spread(fz)) * blend)
+                g0, g1, g2 = to_gradient * b0, to_gradient * b1, to_gradient * b2
+                g3, g4, g5 = to_gradient * b3, to_gradient * b4, to_gradient * b5
+                g6, g7, g8 = to_gradient * b6, to_gradient * b7, to_gradient * b8
+                affine[p, 0], affine[p, 1], affine[p, 2] = g0, g1, g2
+                affine[p, 3], affine[p, 4], affine[p, 5] = g3, g4, g5
+                affine[p, 6], affine[p, 7], affine[p, 8] = g6, g7, g8
+                _stretch(elastic, p, step, g0, g1, g2, g3, g4, g5, g6, g7, g8)
+                if apart and solid[p]:
+                    _stretch(total, p, step, g0, g1, g2, g3, g4, g5, g6, g7, g8)
+                if model[p] == ELASTIC:
+                    neo_hookean(elastic, p, parameters[p, MU], parameters[p, LAMBDA], tau)
                 else:
-                    vx, vy, vz = v[p, 0], v[p, 1], v[p, 2]
-            v[p, 0], v[p, 1], v[p, 2] = vx, vy, vz
-            x[p, 0] += dt * vx
-            x[p, 1] += dt * vy
-            x[p, 2] += dt * vz
-            speed = vx * vx + vy * vy + vz * vz
-            top = top if speed <= top or top != top else speed  # NaN stays
-            if mass[p] == zero:
-                continue
-            g = to_gradient
-            c = affine[p]
-            c[0], c[1], c[2] = g * b0, g * b1, g * b2
-            c[3], c[4], c[5] = g * b3, g * b4, g * b5
-            c[6], c[7], c[8] = g * b6, g * b7, g * b8
-            f = elastic[p]
-            for column in range(3):
-                f0, f1, f2 = f[column], f[3 + column], f[6 + column]
-                f[column] = f0 + step * (c[0] * f0 + c[1] * f1 + c[2] * f2)
-                f[3 + column] = f1 + step * (c[3] * f0 + c[4] * f1 + c[5] * f2)
-                f[6 + column] = f2 + step * (c[6] * f0 + c[7] * f1 + c[8] * f2)
-            if apart and solid[p]:
-                f = total[p]
-                for column in range(3):
-                    f0, f1, f2 = f[column], f[3 + column], f[6 + column]
-                    f[column] = f0 + step * (c[0] * f0 + c[1] * f1 + c[2] * f2)
-                    f[3 + column] = f1 + step * (c[3] * f0 + c[4] * f1 + c[5] * f2)
-                    f[6 + column] = f2 + step * (c[6] * f0 + c[7] * f1 + c[8] * f2)
-            memory[p] = respond(model[p], parameters[p], elastic[p], tau[p], memory[p], c, dt)
-        fastest[b] = np.sqrt(top)
+                    respond(p, model, parameters, elastic, tau, memory, affine, dt)
+            fastest[b] = np.sqrt(top)
 
 
 @njit

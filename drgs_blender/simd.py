@@ -1,0 +1,146 @@
+"""Sixteen single-precision numbers at once, for loops that LLVM does not vectorise by itself.
+
+``float32x16`` is a type of compiled code only: `load`, `repeat`, `quads` and `spread` make such values, ``+``, ``-``
+and ``*`` act on each of the sixteen, `store` and `fold` end them. LLVM makes of it what the processor has (one register
+of AVX-512, two of AVX, four of SSE or NEON) with the same results: nothing is reordered, no operations are fused.
+"""
+
+from __future__ import annotations
+
+import operator
+from typing import Any
+
+from llvmlite import ir
+
+from .jit import overload  # first: it sets Numba up
+
+from numba.core import cgutils, types  # isort: skip
+from numba.extending import intrinsic, models, register_model  # isort: skip
+
+LANES = 16
+_VECTOR = ir.VectorType(ir.FloatType(), LANES)
+
+
+class Float32x16(types.Type):
+    """The type, as Numba sees it."""
+
+    def __init__(self) -> None:
+        super().__init__(name="float32x16")
+
+
+float32x16 = Float32x16()
+
+
+@register_model(Float32x16)
+class _Model(models.PrimitiveModel):
+    def __init__(self, manager: Any, fe_type: Any) -> None:
+        super().__init__(manager, fe_type, _VECTOR)
+
+
+def _mask(lanes: list[int]) -> ir.Constant:
+    return ir.Constant(ir.VectorType(ir.IntType(32), len(lanes)), lanes)
+
+
+def _four(builder: Any, values: Any, lanes: list[int]) -> Any:
+    """A vector whose lane i is value lanes[i] of four."""
+    vector = ir.Constant(ir.VectorType(ir.FloatType(), 4), ir.Undefined)
+    for i, value in enumerate(values):
+        vector = builder.insert_element(vector, value, ir.Constant(ir.IntType(32), i))
+    return builder.shuffle_vector(vector, ir.Constant(vector.type, ir.Undefined), _mask(lanes))
+
+
+@intrinsic
+def repeat(typingctx, a, b, c, d):  # type: ignore[no-untyped-def]
+    """a, b, c, d four times over."""
+    single = types.float32
+    return float32x16(single, single, single, single), lambda context, builder, signature, values: _four(
+        builder, values, [i % 4 for i in range(LANES)]
+    )
+
+
+@intrinsic
+def quads(typingctx, a, b, c, d):  # type: ignore[no-untyped-def]
+    """Four times a, four times b, four times c, four times d."""
+    single = types.float32
+    return float32x16(single, single, single, single), lambda context, builder, signature, values: _four(
+        builder, values, [i // 4 for i in range(LANES)]
+    )
+
+
+@intrinsic
+def spread(typingctx, a):  # type: ignore[no-untyped-def]
+    """Sixteen times a."""
+    return float32x16(types.float32), lambda context, builder, signature, values: _four(
+        builder, [values[0]] * 4, [0] * LANES
+    )
+
+
+def _place(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+    array = context.make_array(signature.args[0])(context, builder, values[0])
+    return builder.bitcast(builder.gep(array.data, [values[1]]), _VECTOR.as_pointer())
+
+
+def _check(array: Any) -> None:
+    if not (isinstance(array, types.Array) and array.dtype == types.float32 and array.layout == "C"):
+        raise TypeError("float32x16 is loaded from and stored to contiguous arrays of float32")
+
+
+@intrinsic
+def load(typingctx, array, at):  # type: ignore[no-untyped-def]
+    """The sixteen elements from `at` on; nothing checks that the array has them."""
+    _check(array)
+
+    def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        return builder.load(_place(context, builder, signature, values), align=4)
+
+    return float32x16(array, types.intp), code
+
+
+@intrinsic
+def store(typingctx, array, at, value):  # type: ignore[no-untyped-def]
+    """Put sixteen elements at `at`."""
+    _check(array)
+
+    def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        builder.store(values[2], _place(context, builder, signature, values), align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, float32x16), code
+
+
+@intrinsic
+def fold(typingctx, vector):  # type: ignore[no-untyped-def]
+    """(a, b, c, d): the sums of every fourth element, from the first, second, third and fourth on."""
+
+    def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        total = values[0]
+        for half in (8, 4):
+            low = builder.shuffle_vector(total, total, _mask(list(range(half))))
+            high = builder.shuffle_vector(total, total, _mask(list(range(half, 2 * half))))
+            total = builder.fadd(low, high)
+        parts = [builder.extract_element(total, ir.Constant(ir.IntType(32), i)) for i in range(4)]
+        return cgutils.pack_array(builder, parts)
+
+    return types.UniTuple(types.float32, 4)(float32x16), code
+
+
+def _arithmetic(symbol: Any, instruction: str) -> None:
+    """Let `symbol` act on two vectors, or on a number and a vector."""
+
+    @intrinsic
+    def act(typingctx, a, b):  # type: ignore[no-untyped-def]
+        return float32x16(float32x16, float32x16), lambda context, builder, signature, values: getattr(
+            builder, instruction
+        )(*values)
+
+    @overload(symbol)
+    def _on_vectors(a, b):  # type: ignore[no-untyped-def]
+        if a is float32x16 and b is float32x16:
+            return lambda a, b: act(a, b)
+        if a is types.float32 and b is float32x16:
+            return lambda a, b: act(spread(a), b)
+        return None
+
+
+for _symbol, _instruction in ((operator.add, "fadd"), (operator.sub, "fsub"), (operator.mul, "fmul")):
+    _arithmetic(_symbol, _instruction)
