@@ -9,7 +9,8 @@ import numpy as np
 
 from ...drgs_blender.frame import Light
 from .instances import Visible
-from .nodes import Paint, Place, Walker, once, plain, surface_of
+from .nodes import Paint, Walker, once, plain
+from .sockets import Place, surface_of
 
 Warn = Callable[[str], None]
 

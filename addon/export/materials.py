@@ -10,8 +10,10 @@ import numpy as np
 
 from ...drgs_blender.frame import Image, Material, Texture
 from . import images
-from .nodes import Paint, Place, Walker, constant, euler, once, plain, reflectance, surface_of, vector_rotate
+from .node_math import reflectance
+from .nodes import Paint, Walker, constant, euler, once, plain, vector_rotate
 from .pictures import Picture
+from .sockets import Place, surface_of
 
 Warn = Callable[[str], None]
 Array = np.ndarray

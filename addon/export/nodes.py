@@ -10,13 +10,15 @@ import colorsys
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
 from functools import wraps
-from typing import Any, NamedTuple
+from typing import Any
 
 import bpy
 import numpy as np
 from mathutils import Euler, Matrix
 
 from ...drgs_blender.colour import LUMINANCE as REC709
+from .node_math import BLENDS, OPERATIONS, blackbody, by_row, divide, hsl, hsv, hue_saturation, in_system
+from .sockets import Place
 
 Warn = Callable[[str], None]
 Array = np.ndarray
@@ -27,58 +29,6 @@ LUMINANCE = np.array(REC709)
 DEEPEST = 100
 #: Colours with which a function is probed for being a plain scaling of each channel.
 _PROBES = np.array(((0.9, 0.6, 0.3), (0.2, 0.5, 0.8), (0.04, 0.02, 0.07)))
-
-
-class Place(NamedTuple):
-    """A socket, and the group nodes that were entered to come to it, outermost first."""
-
-    socket: bpy.types.NodeSocket
-    groups: tuple[bpy.types.Node, ...] = ()
-
-    @property
-    def node(self) -> bpy.types.Node:
-        return self.socket.node
-
-    def input(self, key: int | str) -> Place:
-        """An input of the same node by index or name."""
-        return Place(self.node.inputs[key], self.groups)
-
-    def inputs(self) -> dict[str, Place]:
-        """The inputs of the same node by identifier, which is unique."""
-        return {s.identifier: Place(s, self.groups) for s in self.node.inputs}
-
-    def origin(self) -> Place:
-        """The output that feeds this input, through reroutes, muted nodes and groups; where nothing does, the input
-        whose own value counts."""
-        own = place = self
-        while place.socket.is_linked:
-            link = place.socket.links[0]
-            if link.is_muted or not link.is_valid:  # a loop has a link that is not valid
-                return own
-            source = Place(link.from_socket, place.groups)
-            node = source.node
-            if node.mute:
-                passed = [i.from_socket for i in node.internal_links if i.to_socket == source.socket]
-                if not passed:
-                    return own
-                place = Place(passed[0], place.groups)
-            elif node.type == "REROUTE":
-                place = source.input(0)
-            elif node.type == "GROUP" and node.node_tree is not None:
-                exits = [n for n in node.node_tree.nodes if n.type == "GROUP_OUTPUT" and n.is_active_output]
-                if not exits:
-                    return source
-                own = place = Place(_same(exits[0].inputs, source.socket), (*place.groups, node))
-            elif node.type == "GROUP_INPUT" and place.groups:
-                own = place = Place(_same(place.groups[-1].inputs, source.socket), place.groups[:-1])
-            else:
-                return source
-        return own
-
-
-def _same(sockets: bpy.types.bpy_prop_collection, socket: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
-    """The socket on the other side of a group's border."""
-    return next(s for s in sockets if s.identifier == socket.identifier)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -317,22 +267,22 @@ class Walker:
         self, node: bpy.types.Node, kind: str, clamp_factor: bool, clamp: bool, factor: Paint, a: Paint, b: Paint
     ) -> Paint:
         """Mix Color: from `a` to what `kind` makes of both."""
-        if kind not in _BLEND:
+        if kind not in BLENDS:
             self.warn(node, f"blending by {kind.title()} is not supported; its first colour is used")
             return a
 
         def mix(f: Array, x: Array, y: Array) -> Array:
             f = np.clip(f, 0, 1) if clamp_factor else f
-            mixed = x + f * (_BLEND[kind](x, y) - x)
+            mixed = x + f * (BLENDS[kind](x, y) - x)
             return np.clip(mixed, 0, 1) if clamp else mixed
 
         return self.combine(node, mix, factor, a, b)
 
     def node_math(self, output: Place) -> Paint:
         node = output.node
-        if node.operation not in _MATH:
+        if node.operation not in OPERATIONS:
             return self.first_input(output)
-        count, function = _MATH[node.operation]
+        count, function = OPERATIONS[node.operation]
         operands = [self.number(output.input(i)) for i in range(count)]
         return self.combine(node, (lambda *v: np.clip(function(*v), 0, 1)) if node.use_clamp else function, *operands)
 
@@ -341,9 +291,9 @@ class Walker:
         if node.operation == "SCALE":
             scale = self.number(output.input("Scale"))
             return self.combine(node, np.multiply, self.colour(output.input(0)), scale)
-        if node.operation not in _MATH or _MATH[node.operation][0] > 2:
+        if node.operation not in OPERATIONS or OPERATIONS[node.operation][0] > 2:
             return self.first_input(output)
-        count, function = _MATH[node.operation]
+        count, function = OPERATIONS[node.operation]
         return self.combine(node, function, *(self.colour(output.input(i)) for i in range(count)))
 
     def first_input(self, output: Place) -> Paint:
@@ -362,7 +312,7 @@ class Walker:
 
         def mapped(v: Array, from_min: Array, from_max: Array, to_min: Array, to_max: Array) -> Array:
             span = from_max - from_min
-            part = _divide(v - from_min, span)
+            part = divide(v - from_min, span)
             return to_min + (np.clip(part, 0, 1) if node.clamp else part) * (to_max - to_min)
 
         names = ("Value", "From Min", "From Max", "To Min", "To Max")
@@ -384,13 +334,13 @@ class Walker:
     def node_hue_sat(self, output: Place) -> Paint:
         inputs = output.inputs()
         operands = [self.number(inputs[name]) for name in ("Hue", "Saturation", "Value", "Fac")]
-        return self.combine(output.node, _hue_saturation, *operands, self.colour(inputs["Color"]))
+        return self.combine(output.node, hue_saturation, *operands, self.colour(inputs["Color"]))
 
     def node_curve_rgb(self, output: Place) -> Paint:
         mapping = output.node.mapping
         mapping.initialize()
 
-        @_by_row
+        @by_row
         def curved(f: Array, colour: Array) -> Array:
             once = [mapping.evaluate(mapping.curves[3], c) for c in colour]
             twice = np.array([mapping.evaluate(mapping.curves[i], c) for i, c in enumerate(once)])
@@ -401,7 +351,7 @@ class Walker:
     def node_valtorgb(self, output: Place) -> Paint:
         ramp, alpha = output.node.color_ramp, output.socket.name == "Alpha"
 
-        @_by_row
+        @by_row
         def ramped(f: Array) -> Array:
             return np.array([ramp.evaluate(v)[3 if alpha else i] for i, v in enumerate(f)])
 
@@ -416,19 +366,19 @@ class Walker:
         mode = getattr(node, "mode", "RGB")
         if mode == "RGB":
             return self.part(node, colour, index)
-        return plain((_hsv if mode == "HSV" else _hsl)(self.flat(node, colour))[index])
+        return plain((hsv if mode == "HSV" else hsl)(self.flat(node, colour))[index])
 
     node_seprgb = node_sepxyz = node_separate_color
 
     def node_combine_color(self, output: Place) -> Paint:
         mode = getattr(output.node, "mode", "RGB")
 
-        @_by_row
+        @by_row
         def joined(r: Array, g: Array, b: Array) -> Array:
             values = np.array((r[0], g[1], b[2]))
             if mode == "HSL":
-                return _system(colorsys.hls_to_rgb, values[[0, 2, 1]])
-            return _system(colorsys.hsv_to_rgb, values) if mode == "HSV" else values
+                return in_system(colorsys.hls_to_rgb, values[[0, 2, 1]])
+            return in_system(colorsys.hsv_to_rgb, values) if mode == "HSV" else values
 
         return self.combine(output.node, joined, *(self.number(output.input(i)) for i in range(3)))
 
@@ -440,109 +390,6 @@ def _fixed_but(paint: Paint, texture: Hashable, means: dict[Hashable, Array]) ->
     if paint.texture is None or paint.texture == texture:
         return paint
     return Paint(paint.colour * means.get(paint.texture, 0))
-
-
-def _by_row(function: Callable[..., Array]) -> Callable[..., Array]:
-    """A function of (3,) arrays as one of (..., 3) arrays."""
-
-    def many(*values: Array) -> Array:
-        shape = np.broadcast_shapes(*(np.shape(v) for v in values))
-        rows = zip(*(np.broadcast_to(v, shape).reshape(-1, 3) for v in values))
-        return np.array([function(*row) for row in rows]).reshape(shape)
-
-    return many
-
-
-def _divide(a: Array, b: Array) -> Array:
-    return np.divide(a, b, out=np.zeros(np.broadcast_shapes(np.shape(a), np.shape(b))), where=b != 0)
-
-
-def _overlay(a: Array, b: Array) -> Array:
-    return np.where(a < 0.5, 2 * a * b, 1 - 2 * (1 - a) * (1 - b))
-
-
-def _system(convert: Callable[..., tuple[float, float, float]], values: Array) -> Array:
-    """(3,) in another colour system; NaN, which `convert` refuses, where a value is not finite."""
-    return np.array(convert(*values)) if np.isfinite(values).all() else np.full(3, np.nan)
-
-
-def _hsv(colour: Array) -> Array:
-    return _system(colorsys.rgb_to_hsv, np.maximum(colour, 0))
-
-
-def _hsl(colour: Array) -> Array:
-    return _system(colorsys.rgb_to_hls, np.maximum(colour, 0))[[0, 2, 1]]
-
-
-@_by_row
-def _hue_saturation(hue: Array, saturation: Array, value: Array, factor: Array, colour: Array) -> Array:
-    h, s, v = _hsv(colour)
-    turned = np.array(((h + hue[0] + 0.5) % 1, np.clip(s * saturation[0], 0, 1), v * value[0]))
-    return colour + factor * (np.maximum(_system(colorsys.hsv_to_rgb, turned), 0) - colour)
-
-
-#: Blend type -> what the second colour does to the first at factor 1.
-_BLEND: dict[str, Callable[[Array, Array], Array]] = {
-    "MIX": lambda a, b: b,
-    "MULTIPLY": np.multiply,
-    "ADD": np.add,
-    "SUBTRACT": np.subtract,
-    "DIVIDE": _divide,
-    "SCREEN": lambda a, b: 1 - (1 - a) * (1 - b),
-    "OVERLAY": _overlay,
-    "DIFFERENCE": lambda a, b: np.abs(a - b),
-    "EXCLUSION": lambda a, b: a + b - 2 * a * b,
-    "DARKEN": np.minimum,
-    "LIGHTEN": np.maximum,
-}
-
-#: Operation -> number of operands, function.
-_MATH: dict[str, tuple[int, Callable[..., Array]]] = {
-    "ADD": (2, np.add),
-    "SUBTRACT": (2, np.subtract),
-    "MULTIPLY": (2, np.multiply),
-    "DIVIDE": (2, _divide),
-    "MULTIPLY_ADD": (3, lambda a, b, c: a * b + c),
-    "POWER": (2, lambda a, b: np.abs(a) ** b),
-    "SQRT": (1, lambda a: np.sqrt(np.maximum(a, 0))),
-    "ABSOLUTE": (1, np.abs),
-    "MINIMUM": (2, np.minimum),
-    "MAXIMUM": (2, np.maximum),
-    "LESS_THAN": (2, lambda a, b: np.where(a < b, 1.0, 0.0)),
-    "GREATER_THAN": (2, lambda a, b: np.where(a > b, 1.0, 0.0)),
-    "ROUND": (1, lambda a: np.floor(a + 0.5)),
-    "FLOOR": (1, np.floor),
-    "CEIL": (1, np.ceil),
-    "FRACT": (1, lambda a: a - np.floor(a)),
-    "SINE": (1, np.sin),
-    "COSINE": (1, np.cos),
-}
-
-
-def blackbody(kelvin: float) -> Array:
-    """(3,) linear Rec.709 colour of a glowing body, luminance 1, as Blender's Blackbody node.
-
-    Planck's law under the CIE 1931 observer, whose functions are the fits of Wyman, Sloan and Shirley, "Simple analytic
-    approximations to the CIE XYZ color matching functions", JCGT 2 (2013); within 2 % from 1900 K on. Below 800 and
-    above 12000 K as at these.
-    """
-    wave = np.arange(380.0, 781.0, 5.0)
-    light = wave**-5 / np.expm1(1.4387769e7 / (wave * np.clip(kelvin, 800, 12000)))
-
-    def lobe(peak: float, below: float, above: float) -> Array:
-        return np.exp(-0.5 * ((wave - peak) * np.where(wave < peak, below, above)) ** 2)
-
-    x = 1.056 * lobe(599.8, 0.0264, 0.0323) + 0.362 * lobe(442.0, 0.0624, 0.0374) - 0.065 * lobe(501.1, 0.0490, 0.0382)
-    y = 0.821 * lobe(568.8, 0.0213, 0.0247) + 0.286 * lobe(530.9, 0.0613, 0.0322)
-    z = 1.217 * lobe(437.0, 0.0845, 0.0278) + 0.681 * lobe(459.0, 0.0385, 0.0725)
-    to_rec709 = np.array(((3.2406, -1.5372, -0.4986), (-0.9689, 1.8758, 0.0415), (0.0557, -0.2040, 1.0570)))
-    return np.maximum(to_rec709 @ (light @ np.stack((x, y, z), 1)), 0) / (light @ y)
-
-
-def reflectance(ior: float) -> float:
-    """Of a dielectric in air, seen from the front; below 0 as at 0, where there is nothing to enter."""
-    ior = max(ior, 0.0)
-    return ((ior - 1) / (ior + 1)) ** 2
 
 
 def euler(angles: Array) -> Array:
@@ -560,9 +407,3 @@ def vector_rotate(walker: Walker, output: Place) -> Array:
         axis = axes.get(node.rotation_type) or walker.fixed(output.input("Axis"))
         turn = np.array(Matrix.Rotation(walker.value(output.input("Angle")), 3, tuple(axis)))
     return turn.T if node.invert else turn
-
-
-def surface_of(tree: bpy.types.NodeTree | None) -> Place | None:
-    """The surface socket of the output that Cycles would use; None without one."""
-    output = tree and (tree.get_output_node("CYCLES") or tree.get_output_node("ALL"))
-    return Place(output.inputs["Surface"]) if output else None

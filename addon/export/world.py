@@ -11,7 +11,8 @@ import numpy as np
 from ...drgs_blender.errors import UsageError
 from ...drgs_blender.frame import World
 from .images import linear_pixels
-from .nodes import Paint, Place, Walker, euler, once, plain, surface_of, vector_rotate
+from .nodes import Paint, Walker, euler, once, plain, vector_rotate
+from .sockets import Place, surface_of
 
 Warn = Callable[[str], None]
 

@@ -78,7 +78,7 @@ def test_exposure_temperature_and_size(scene, export):
 def test_glowing_bodies_have_blenders_colour(scene, kelvin):
     light = lamp(scene, "POINT", use_temperature=True, temperature=kelvin).data
     theirs = np.array(light.temperature_color)
-    ours = part("addon.export.nodes").blackbody(kelvin)
+    ours = part("addon.export.node_math").blackbody(kelvin)
     np.testing.assert_allclose(ours, theirs, rtol=0.02, atol=0.02)
 
 

@@ -1,0 +1,65 @@
+"""Where a socket gets its value from: through links, reroutes, muted nodes and groups."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import bpy
+
+
+class Place(NamedTuple):
+    """A socket, and the group nodes that were entered to come to it, outermost first."""
+
+    socket: bpy.types.NodeSocket
+    groups: tuple[bpy.types.Node, ...] = ()
+
+    @property
+    def node(self) -> bpy.types.Node:
+        return self.socket.node
+
+    def input(self, key: int | str) -> Place:
+        """An input of the same node by index or name."""
+        return Place(self.node.inputs[key], self.groups)
+
+    def inputs(self) -> dict[str, Place]:
+        """The inputs of the same node by identifier, which is unique."""
+        return {s.identifier: Place(s, self.groups) for s in self.node.inputs}
+
+    def origin(self) -> Place:
+        """The output that feeds this input, through reroutes, muted nodes and groups; where nothing does, the input
+        whose own value counts."""
+        own = place = self
+        while place.socket.is_linked:
+            link = place.socket.links[0]
+            if link.is_muted or not link.is_valid:  # a loop has a link that is not valid
+                return own
+            source = Place(link.from_socket, place.groups)
+            node = source.node
+            if node.mute:
+                passed = [i.from_socket for i in node.internal_links if i.to_socket == source.socket]
+                if not passed:
+                    return own
+                place = Place(passed[0], place.groups)
+            elif node.type == "REROUTE":
+                place = source.input(0)
+            elif node.type == "GROUP" and node.node_tree is not None:
+                exits = [n for n in node.node_tree.nodes if n.type == "GROUP_OUTPUT" and n.is_active_output]
+                if not exits:
+                    return source
+                own = place = Place(_same(exits[0].inputs, source.socket), (*place.groups, node))
+            elif node.type == "GROUP_INPUT" and place.groups:
+                own = place = Place(_same(place.groups[-1].inputs, source.socket), place.groups[:-1])
+            else:
+                return source
+        return own
+
+
+def _same(sockets: bpy.types.bpy_prop_collection, socket: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+    """The socket on the other side of a group's border."""
+    return next(s for s in sockets if s.identifier == socket.identifier)
+
+
+def surface_of(tree: bpy.types.NodeTree | None) -> Place | None:
+    """The surface socket of the output that Cycles would use; None without one."""
+    output = tree and (tree.get_output_node("CYCLES") or tree.get_output_node("ALL"))
+    return Place(output.inputs["Surface"]) if output else None
