@@ -179,7 +179,7 @@ def test_coarse_pixels_cover_the_window(make_frame, size):
 
 def test_thin_surfels_cover_as_much(session, make_frame):
     session.render(make_frame())
-    posed = session._objects[0].posed
+    posed = session._stage.objects[0].posed
     n = len(posed)
     assert thinned(posed, n) is posed
     few = thinned(posed, n // 30)
@@ -203,7 +203,7 @@ def test_coarse_pictures_are_like_the_last(session, make_frame, monkeypatch):
         return np.abs(first - final.reshape(144 // size, size, 192 // size, size, 4).mean(axis=(1, 3))).mean()
 
     of_mesh = {size: error(size) for size in (2, 4)}
-    monkeypatch.setattr("drgs_blender.engine.session._SURFELS_A_VERTEX", 0)
+    monkeypatch.setattr("drgs_blender.engine.stage._SURFELS_A_VERTEX", 0)
     of_surfels = {size: error(size) for size in (2, 4)}
     assert max(of_mesh.values()) < 0.1
     assert max(of_surfels.values()) < 0.2
