@@ -20,6 +20,8 @@ from typing import Any
 
 log = logging.getLogger(__name__)
 _MONTH = 30 * 24 * 3600.0
+#: Folders without kernels, in which no kernel's folder may import (their rank is higher).
+WITHOUT_KERNELS = ("engine", "evaluate", "cli")
 
 
 def cache_folder() -> Path:
@@ -36,14 +38,15 @@ def cache_folder() -> Path:
 
 
 def source_digest() -> str:
-    """Digest of the package's sources.
+    """Digest of the package's sources, but for those above all kernels.
 
     Numba notices that a kernel's own file changed, but not the files of the functions that it calls: kernels of
     different sources must not share a cache.
     """
-    digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.rglob("*.py")):
-        digest.update(path.read_bytes())
+    package, digest = Path(__file__).parent, hashlib.sha256()
+    for path in sorted(package.rglob("*.py")):
+        if path.relative_to(package).parts[0] not in WITHOUT_KERNELS:
+            digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
 
 

@@ -70,6 +70,20 @@ def test_lower_ranks_never_import_higher_ones():
     assert not wrong, "\n".join(wrong)
 
 
+def test_kernels_do_not_depend_on_the_folders_without_any():
+    """Their compiled forms are kept when those folders change."""
+    (line,) = [t for t in (PACKAGE / "jit.py").read_text().splitlines() if t.startswith("WITHOUT_KERNELS")]
+    apart = set(re.findall(r'"(\w+)"', line))
+    assert apart
+    for path in sources(PACKAGE):
+        kernels = "njit" in path.read_text(encoding="utf-8")
+        if top_level(path) in apart:
+            assert not kernels, f"{path} has kernels"
+        elif kernels:
+            used = {module.split(".")[1] for _, module, _ in imports(path, ROOT) if module.startswith("drgs_blender.")}
+            assert not used & apart, f"{path} uses {used & apart}"
+
+
 def test_folders_of_the_renderer_use_those_on_their_left():
     page = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
     line = next(line for line in page.splitlines() if line.endswith("<- progressive"))
