@@ -1,7 +1,7 @@
-"""Splats that other programs left in Blender as point attributes, told as the columns of a 3DGS PLY.
+"""Splats as point attributes in Blender, told as the columns of a 3DGS PLY.
 
-Known are the names of PLY files, which Blender's PLY importer keeps; those of Blender's own splats; and those of
-gaussian-splatting-blender-addon.
+Read are the names of PLY files, which Blender's PLY importer keeps; those of Blender's own splats, which it has from
+version 5.3 on; and those of gaussian-splatting-blender-addon. Written are Blender's own.
 """
 
 from __future__ import annotations
@@ -13,17 +13,11 @@ import numpy as np
 
 Array = np.ndarray
 
-#: Type of an attribute -> (its value property, values an element).
-_TYPES = {
-    "FLOAT": ("value", 1),
-    "FLOAT_VECTOR": ("vector", 3),
-    "FLOAT_COLOR": ("color", 4),
-    "FLOAT4": ("value", 4),
-    "QUATERNION": ("value", 4),
-}
 #: Harmonics beyond the first of degree 3.
 _REST = 15
 _EDGE, _SHORTEST = 1e-6, 1e-9
+#: Blender's own splats: first harmonic and opacity; the others are numbered.
+_BASE, _OTHERS = "radiance:base", "radiance:sh_"
 
 
 def is_splats(data: bpy.types.ID) -> bool:
@@ -31,7 +25,7 @@ def is_splats(data: bpy.types.ID) -> bool:
     names = getattr(data, "attributes", {}).keys()
     kinds = (
         ("opacity", "scale_0", "rot_0"),
-        ("scale", "rotation", "radiance:base"),
+        ("scale", "rotation", _BASE),
         ("log_opacity", "logscale", "sh0"),
     )
     return any(all(name in names for name in kind) for kind in kinds)
@@ -44,10 +38,10 @@ def read_splats(data: bpy.types.Mesh | bpy.types.PointCloud) -> dict[str, Array]
     if "scale_0" in names:
         own = [a.name for a in data.attributes if a.domain == "POINT" and a.data_type == "FLOAT"]
         return columns | {n: _read(data, n)[:, 0] for n in own if n not in columns and n.isidentifier()}
-    if "radiance:base" in names:
-        base = _read(data, "radiance:base")
+    if _BASE in names:
+        base = _read(data, _BASE)
         opacity = np.clip(base[:, 3], _EDGE, 1 - _EDGE)
-        harmonics = [base[:, :3], *_numbered(data, "radiance:sh_", 0)]
+        harmonics = [base[:, :3], *_numbered(data, _OTHERS, 0)]
         scale, rotation = np.log(np.maximum(_read(data, "scale"), _SHORTEST)), _read(data, "rotation")
         logit = np.log(opacity / (1 - opacity))
     else:
@@ -70,6 +64,45 @@ def write_ply(path: Path, columns: dict[str, Array]) -> None:
     path.write_bytes("\n".join(head).encode() + table.tobytes())
 
 
+def read_ply(path: Path) -> dict[str, Array]:
+    """Columns of a PLY as ``drgs`` and `write_ply` write them."""
+    head, _, body = path.read_bytes().partition(b"end_header\n")
+    names = [line.split()[2].decode() for line in head.splitlines() if line.startswith(b"property float ")]
+    return dict(zip(names, np.frombuffer(body, "<f4").reshape(-1, len(names)).T))
+
+
+def new_object(context: bpy.types.Context, name: str, columns: dict[str, Array]) -> bpy.types.Object:
+    """A point cloud of Blender's own splats, selected; before version 5.3, of points with the same attributes."""
+    mesh = bpy.data.meshes.new(name)
+    mesh.vertices.add(len(columns["x"]))
+
+    def beside(*names: str) -> Array:
+        return np.stack([columns[n] for n in names], axis=1).astype(np.float32)
+
+    opacity = 1 / (1 + np.exp(-columns["opacity"].astype(np.float64)))
+    types = mesh.attributes.bl_rna.functions["new"].parameters["type"].enum_items
+    _write(mesh, "position", "FLOAT_VECTOR", beside("x", "y", "z"))
+    _write(mesh, "scale", "FLOAT_VECTOR", np.exp(beside("scale_0", "scale_1", "scale_2")))
+    _write(mesh, "rotation", "QUATERNION", beside("rot_0", "rot_1", "rot_2", "rot_3"))
+    base = np.column_stack([beside("f_dc_0", "f_dc_1", "f_dc_2"), opacity])
+    _write(mesh, _BASE, "FLOAT4" if "FLOAT4" in types else "FLOAT_COLOR", base)
+    rest = sum(n.startswith("f_rest_") for n in columns) // 3
+    for k in range(rest):
+        _write(mesh, f"{_OTHERS}{k}", "FLOAT_VECTOR", beside(*(f"f_rest_{i * rest + k}" for i in range(3))))
+    obj = bpy.data.objects.new(name, mesh)
+    context.collection.objects.link(obj)
+    for selected in context.selected_objects:
+        selected.select_set(False)
+    obj.select_set(True)
+    context.view_layer.objects.active = obj
+    bpy.ops.object.convert(target="POINTCLOUD")  # a script cannot give a point cloud its points before version 5.2
+    if not mesh.users:
+        bpy.data.meshes.remove(mesh)
+    if hasattr(obj.data, "type"):
+        obj.data.type = "GAUSSIAN_SPLAT"
+    return obj
+
+
 def _numbered(data: bpy.types.ID, prefix: str, first: int) -> list[Array]:
     """(n, 3) harmonics of the whole bands that are there."""
     found: list[Array] = []
@@ -87,9 +120,24 @@ def _read(data: bpy.types.ID, name: str) -> Array:
         It is no numbers, or not one value a point.
     """
     attribute = data.attributes.get(name)
-    if attribute is None or attribute.domain != "POINT" or attribute.data_type not in _TYPES:
-        raise TypeError(f"attribute {name} is {'missing' if attribute is None else attribute.data_type}")
-    prop, width = _TYPES[attribute.data_type]
+    if attribute is None or attribute.domain != "POINT":
+        raise TypeError(f"attribute {name} is {'missing' if attribute is None else 'not one value a point'}")
+    prop, width = _layout(attribute)
     values = np.empty(len(attribute.data) * width, np.float32)
     attribute.data.foreach_get(prop, values)
     return values.reshape(-1, width)
+
+
+def _write(data: bpy.types.ID, name: str, kind: str, values: Array) -> None:
+    attribute = data.attributes.get(name) or data.attributes.new(name, kind, "POINT")
+    attribute.data.foreach_set(_layout(attribute)[0], np.ascontiguousarray(values, np.float32).ravel())
+
+
+def _layout(attribute: bpy.types.Attribute) -> tuple[str, int]:
+    """(property, numbers) of an element, as Blender describes the type: new versions bring new types."""
+    element = attribute.bl_rna.properties["data"].fixed_type
+    for name in ("value", "vector", "color"):
+        found = element.properties.get(name)
+        if found is not None and found.type == "FLOAT":
+            return name, found.array_length or 1
+    raise TypeError(f"attribute {attribute.name} is {attribute.data_type}")

@@ -24,6 +24,7 @@ from . import (
     presets,
     report,
     save_asset,
+    splats,
     steps,
     submit,
 )
@@ -33,6 +34,7 @@ MODULES = (
     import_parts,
     export,
     convert,
+    splats,
     mark_assets,
     bind,
     bind_armature,
@@ -65,6 +67,7 @@ def _file_export(menu: bpy.types.Menu, context: bpy.types.Context) -> None:
 def _object_convert(menu: bpy.types.Menu, context: bpy.types.Context) -> None:
     menu.layout.separator()
     menu.layout.operator("drgs.convert", text="DR-GS")
+    menu.layout.operator("drgs.splats", text="Splats from DR-GS")
 
 
 #: Where our operators stand in Blender's own menus.
