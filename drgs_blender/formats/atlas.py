@@ -98,7 +98,13 @@ def bake_atlas(corner_values: Array, subject: str) -> tuple[Array, Array]:
     origin = np.stack([square % across, square // across], axis=1) * CELL
     direction = np.where(second, -1, 1)
     start = origin + np.where(second, CELL - 1, 0)[:, None]
-    texels = np.zeros((size, size, channels), np.float32)
+    # What filtering inside a triangle never meets, mip maps of other programs do: no other colour may be there.
+    middle = corner_values.mean(axis=1, dtype=np.float32)
+    texels = np.empty((size, size, channels), np.float32)
+    texels[:] = middle.mean(axis=0)
+    for i in range(CELL):
+        place = start + direction[:, None] * [i, CELL - 1 - i]
+        texels[place[:, 1], place[:, 0]] = middle
     a, b, c = (corner_values[:, k].astype(np.float32) for k in range(3))
     for i, j in _OFFSETS.tolist():
         place = start + direction[:, None] * [i, j]

@@ -22,7 +22,7 @@ from .files import SurfelFile
 from .splat_scene import Piece, join_pieces
 from .splats import Splats
 from .usd_crate import check_crate
-from .usd_stage import DEGREE, HARMONICS, LACKING, REFUSED, REMEDY, SCHEMA, UP
+from .usd_stage import DEGREE, HARMONICS, LACKING, REFUSED, REMEDY, SCHEMA, SPACE, UP
 
 Array = np.ndarray
 
@@ -55,7 +55,7 @@ def read_usd_splats(path: Path) -> SurfelFile:
     pieces = []
     for i in range(sum(name.endswith("/matrix") for name in arrays)):
         of = {name: arrays[f"{i}/{name}"] for name in ("centre", "scale", "rotation", "opacity", "sh")}
-        pieces.append(Piece(Splats(**of), arrays[f"{i}/matrix"]))
+        pieces.append(Piece(Splats(**of), arrays[f"{i}/matrix"], bool(arrays[f"{i}/linear"][0])))
     return join_pieces(pieces, path, "USD", up if up in UP_AXES else "y")
 
 
@@ -120,6 +120,9 @@ def write_usd_splats(path: Path, splats: Splats) -> None:
             prim.CreateAttribute(name, kind, custom=False).Set(value)
         degree = prim.CreateAttribute(DEGREE, types.Int, custom=False, variability=Sdf.VariabilityUniform)
         degree.Set(int(np.sqrt(k)) - 1)
+        prim.AddAppliedSchema("ColorSpaceAPI")
+        space = prim.CreateAttribute(SPACE, types.Token, custom=False, variability=Sdf.VariabilityUniform)
+        space.Set("srgb_rec709_scene")  # of the names that USD knows; without one, colours are linear to it
         with tempfile.TemporaryDirectory() as folder:
             temporary = Path(folder) / f"splats{path.suffix.lower()}"
             stage.GetRootLayer().Export(str(temporary))

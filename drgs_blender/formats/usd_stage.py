@@ -17,6 +17,8 @@ Array = np.ndarray
 SCHEMA = "ParticleField3DGaussianSplat"
 DEGREE = "radiance:sphericalHarmonicsDegree"
 HARMONICS = "radiance:sphericalHarmonicsCoefficients"
+#: Attribute of UsdColorSpaceAPI, and how the names of linear light with our primaries start.
+SPACE, LINEAR = "colorSpace:name", "lin_rec709"
 #: Codes to leave with: the file is refused (the reason is the last line of stderr), USD is not installed.
 REFUSED, LACKING = 65, 69
 #: Name of the text that says which axis is up.
@@ -63,8 +65,19 @@ def read_stage(subject: str, usd: Any, geometry: Any) -> dict[str, Array]:
     for i, prim in enumerate(prims):
         # USD's matrices take rows for vectors.
         arrays[f"{i}/matrix"] = metres @ np.array(places.GetLocalToWorldTransform(prim), np.float64).T
+        arrays[f"{i}/linear"] = np.array([_space(prim).startswith(LINEAR)])
         arrays |= {f"{i}/{name}": array for name, array in _splats(prim, time, subject).items()}
     return arrays
+
+
+def _space(prim: Any) -> str:
+    """The colour space of a prim, which those below inherit; empty where none is given: the harmonics of captures."""
+    while prim:
+        attribute = prim.GetAttribute(SPACE)
+        if attribute and (name := attribute.Get()):
+            return str(name)
+        prim = prim.GetParent()
+    return ""
 
 
 def _splats(prim: Any, time: Any, subject: str) -> dict[str, Array]:

@@ -57,6 +57,9 @@ class Writer:
         return WRITTEN[self.name].fixed
 
 
+#: What is lost in the pictures of `atlas`.
+_TEXTURES = "materials to 1/510 (base colour as sRGB), halfway between vertices as different as can be to 1/4"
+
 WRITERS: tuple[Writer, ...] = (
     Writer(
         "3DGS PLY",
@@ -94,13 +97,13 @@ WRITERS: tuple[Writer, ...] = (
         "glTF mesh",
         write_gltf_mesh,
         "the mesh, posed or not, with its materials as metallic-roughness textures, a place in them for each triangle",
-        "surfels; materials to 1/510 (base colour as sRGB); shared vertices, unless the mesh is of one material",
+        f"surfels; {_TEXTURES}; shared vertices, unless the mesh is of one material",
     ),
     Writer(
         "USD mesh",
         write_usd_mesh,
         "the mesh, posed or not, with its materials as the textures of a UsdPreviewSurface; shared vertices",
-        "surfels; materials to 1/510 (base colour as sRGB)",
+        f"surfels; {_TEXTURES}",
     ),
     Writer(
         "OpenEXR",

@@ -7,6 +7,7 @@ import json
 import struct
 import sys
 import zipfile
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -17,11 +18,14 @@ from scipy.spatial.transform import Rotation
 from splat_files import covariance, damaged, random_splats, refusals
 
 from drgs_blender.asset import Surfels
+from drgs_blender.colour import linear_to_srgb, srgb_to_linear
 from drgs_blender.errors import AssetError, DeviceError
 from drgs_blender.formats.axes import surfels_to_z_up
 from drgs_blender.formats.files import MeshFile
 from drgs_blender.formats.glb import Glb
+from drgs_blender.formats.gltf_document import Document
 from drgs_blender.formats.gltf_splats import EXTENSION, write_gltf_splats
+from drgs_blender.formats.harmonics import rotate_harmonics
 from drgs_blender.formats.quaternions import from_smallest_three, to_smallest_three
 from drgs_blender.formats.registry import find_format, read, read_surfels
 from drgs_blender.formats.splat_scene import encoded
@@ -138,8 +142,9 @@ def test_a_real_sog_is_the_capture_it_was_made_of(shared_data: Path) -> None:
     assert np.quantile(np.abs(packed.opacity - source.opacity[nearest]), 0.95) < 0.01
     # One codebook of 256 colours serves all splats.
     assert np.median(np.abs(packed.sh[:, 0] - source.sh[nearest, 0])) < 0.02
-    scale = np.abs(np.log(np.sort(packed.scale, axis=1) / np.sort(source.scale[nearest], axis=1)))
-    assert np.median(scale) < 0.05
+    own, wanted = (covariance(s.rotation, s.scale) for s in (packed, source))
+    size = np.trace(wanted[nearest], axis1=1, axis2=2)
+    assert np.quantile(np.abs(own - wanted[nearest]).max(axis=(1, 2)) / size, 0.9) < 0.1
 
 
 @pytest.mark.parametrize("version", [1, 2])
@@ -267,7 +272,62 @@ def test_damaged_ksplat_is_refused_or_read_sensibly(tmp_path: Path, level: int) 
     assert refusals(path, data, 200, damage) > 60
 
 
-# compressed PLY with harmonics
+# .splat and compressed PLY
+
+
+def test_splat_means_what_its_definition_says(tmp_path: Path) -> None:
+    """Linear scales, colours as shown, rotations wxyz around 128."""
+    n, rng = 50, np.random.default_rng(4)
+    rows = np.zeros(n, [("p", "<f4", 3), ("s", "<f4", 3), ("c", "u1", 4), ("q", "u1", 4)])
+    rows["p"], rows["s"] = rng.normal(size=(n, 3)), np.sort(rng.uniform(0.01, 1, (n, 3)))[:, ::-1]
+    rows["c"], rows["q"] = rng.integers(1, 255, (n, 4)), rng.integers(0, 256, (n, 4))
+    (tmp_path / "a.splat").write_bytes(rows.tobytes())
+    found = splats_of(read_surfels(tmp_path / "a.splat").surfels)
+    np.testing.assert_array_equal(found.centre, rows["p"])
+    rotation = (rows["q"] - 128.0) / 128
+    rotation /= np.linalg.norm(rotation, axis=1, keepdims=True)
+    wanted = covariance(rotation, rows["s"])
+    np.testing.assert_allclose(covariance(found.rotation, found.scale), wanted, atol=1e-5)
+    np.testing.assert_allclose(0.28209479 * found.sh[:, 0] + 0.5, rows["c"][:, :3] / 255, atol=1e-5)
+    np.testing.assert_allclose(found.opacity, rows["c"][:, 3] / 255, atol=1e-5)
+
+
+@pytest.mark.parametrize("coloured", [False, True])
+def test_compressed_ply_means_what_its_definition_says(tmp_path: Path, coloured: bool) -> None:
+    """Bits of 32, the highest first, between the ends of a chunk of 256; two of them tell the largest of wxyz."""
+    n, rng = 300, np.random.default_rng(5)
+    names = ["x", "y", "z", "scale_x", "scale_y", "scale_z", *("rgb" if coloured else "")]
+    low = np.float32([-1, -2, -3, -6, -5, -4, -0.2, 0.1, 0.2][: len(names)]) + np.float32([[0], [0.5]])
+    high = low + np.float32([2, 3, 4, 1, 2, 3, 1, 0.5, 0.25][: len(names)])
+    packed = rng.integers(0, 2**32, (n, 4), np.uint32)
+    words = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+    lines = ["ply", "format binary_little_endian 1.0", "element chunk 2"]
+    lines += [f"property float {end}_{name}" for end in ("min", "max") for name in names]
+    lines += [f"element vertex {n}", *(f"property uint {word}" for word in words), "end_header", ""]
+    chunk = np.concatenate([low, high], axis=1)
+    path = tmp_path / "a.ply"
+    path.write_bytes("\n".join(lines).encode() + chunk.astype("<f4").tobytes() + packed.tobytes())
+
+    def fields(word: int, *widths: int) -> np.ndarray:
+        text = f"{word:032b}"
+        ends = np.cumsum([0, *widths])
+        return np.array([int(text[a:b], 2) / (2 ** (b - a) - 1) for a, b in pairwise(ends)])
+
+    found = splats_of(read_surfels(path).surfels)
+    for i, (place, turn, size, colour) in enumerate(packed.tolist()):
+        start, span = low[i // 256], (high - low)[i // 256]
+        np.testing.assert_allclose(found.centre[i], start[:3] + span[:3] * fields(place, 11, 10, 11), atol=1e-5)
+        scale = np.exp(start[3:6] + span[3:6] * fields(size, 11, 10, 11))
+        shown = fields(colour, 8, 8, 8, 8)
+        three = (fields(turn & (1 << 30) - 1, 2, 10, 10, 10)[1:] - 0.5) * np.sqrt(2)
+        rotation = np.insert(three, turn >> 30, np.sqrt(max(0, 1 - three @ three)))[None]
+        wanted = covariance(rotation / np.linalg.norm(rotation), scale[None])[0]
+        own = covariance(found.rotation[i : i + 1], found.scale[i : i + 1])[0]
+        np.testing.assert_allclose(own, wanted, atol=1e-5 * scale.max() ** 2)
+        if coloured:
+            shown[:3] = start[6:] + span[6:] * shown[:3]
+        np.testing.assert_allclose(0.28209479 * found.sh[i, 0] + 0.5, shown[:3], atol=1e-5)
+        np.testing.assert_allclose(found.opacity[i], shown[3].clip(1e-6, 1 - 1e-6), atol=1e-5)
 
 
 def test_compressed_ply_keeps_its_harmonics(tmp_path: Path) -> None:
@@ -327,6 +387,18 @@ def test_gltf_splats_stand_where_their_nodes_are(tmp_path: Path, even: bool) -> 
     np.testing.assert_allclose(covariance(found.rotation[60:], found.scale[60:]), moved, rtol=1e-3, atol=5e-6)
     np.testing.assert_allclose(found.centre[60:], splats.centre @ linear.T + [1, 2, 3], atol=1e-5)
     np.testing.assert_array_equal(found.sh[:60], splats.sh)
+    np.testing.assert_allclose(found.sh[60:], rotate_harmonics(splats.sh, turn), atol=1e-5)
+
+
+def test_viewers_without_the_extension_see_points_in_the_same_colours(tmp_path: Path) -> None:
+    """COLOR_0 is linear (glTF), what splats show is not."""
+    splats = random_splats(60, 4)
+    write_gltf_splats(tmp_path / "a.glb", splats)
+    document = Document(tmp_path / "a.glb")
+    index = document.item("meshes", 0)["primitives"][0]["attributes"]["COLOR_0"]
+    shown = srgb_to_linear((0.5 + 0.28209479 * splats.sh[:, 0]).clip(0, 1))
+    wanted = np.column_stack([shown, splats.opacity])
+    np.testing.assert_allclose(document.accessor(index, ("VEC4",)), wanted, atol=1e-5)
 
 
 def test_the_conformance_file_is_read(shared_data: Path) -> None:
@@ -385,13 +457,27 @@ def test_usd_keeps_everything(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"
     write_usd_splats(path, splats)
     file = read_surfels(path)
-    assert file.layout == "USD" and file.up == "z"
+    assert file.layout == "USD" and file.up == "z" and not any("linear" in note for note in file.notes)
     found = splats_of(file.surfels)
     np.testing.assert_allclose(found.centre, splats.centre, atol=1e-6)
     np.testing.assert_allclose(found.opacity, splats.opacity, atol=1e-6)
     np.testing.assert_allclose(found.sh, splats.sh, atol=1e-6)
     own = covariance(splats.rotation, splats.scale)
     np.testing.assert_allclose(covariance(found.rotation, found.scale), own, rtol=1e-3, atol=1e-6)
+
+
+def test_usd_finds_nothing_wrong_with_the_splats(tmp_path: Path) -> None:
+    pytest.importorskip("pxr", reason="usd-core is not installed")
+    from pxr import Usd, UsdValidation, UsdVol
+
+    write_usd_splats(tmp_path / "a.usdc", random_splats(20, 4))
+    stage = Usd.Stage.Open(str(tmp_path / "a.usdc"))
+    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    assert len(validators) > 10 and not UsdValidation.ValidationContext(validators).Validate(stage)
+    prim = stage.GetDefaultPrim()
+    assert prim.IsA(UsdVol.ParticleField) and Usd.ColorSpaceAPI.ComputeColorSpaceName(prim, None) == "srgb_rec709_scene"
+    for name in ("positions", "scales", "orientations", "opacities"):
+        assert not prim.GetAttribute(name).IsCustom() and len(prim.GetAttribute(name).Get()) == 20
 
 
 def test_usd_of_another_hand(tmp_path: Path) -> None:
@@ -426,6 +512,18 @@ def Xform "Root"
     np.testing.assert_allclose(surfels.opacity, [0.5, 0.25], atol=1e-4)
     # The second is turned by a quarter about Z of the file, which is -Y here: X becomes Y of the file, Z here.
     np.testing.assert_allclose(covariance(surfels.rotation, surfels.scale)[1], np.diag([0.04, 0, 0.01]), atol=1e-4)
+    shown = 0.5 + 0.28209479 * surfels.sh[:, 0]
+    text = (
+        (tmp_path / "a.usda")
+        .read_text()
+        .replace('Xform "Root"', 'Xform "Root" (\n    prepend apiSchemas = ["ColorSpaceAPI"]\n)')
+    )
+    text = text.replace("double3 xform", 'uniform token colorSpace:name = "lin_rec709_scene"\n    double3 xform')
+    (tmp_path / "c.usda").write_text(text)
+    linear = read_surfels(tmp_path / "c.usda")
+    assert any("linear" in note for note in linear.notes)
+    encoded_ = 0.5 + 0.28209479 * linear.surfels.sh[:, 0]
+    np.testing.assert_allclose(encoded_, linear_to_srgb(shown.clip(0, 1)), atol=1e-4)
     (tmp_path / "b.usda").write_text("#usda 1.0\ndef Xform 'A' {\n")
     with pytest.raises(AssetError, match="USD"):
         read_surfels(tmp_path / "b.usda")
