@@ -31,6 +31,8 @@ ROOT = Path(__file__).resolve().parent.parent
 TORCH = "torch==2.13.0"
 BLENDER = "5.0.1"
 BLENDER_FLOOR = "4.2.23"
+#: Programs of npm that read our files in the tests and write others for us.
+NODE_PACKAGES = ("@adobe/spz@0.2.2", "@playcanvas/splat-transform@2.7.1", "gltf-validator@2.0.0-dev.3.10")
 #: Shared library that Blender needs -> the Debian package that holds it.
 APT_PACKAGES = {
     "libEGL.so.1": "libegl1",
@@ -166,6 +168,20 @@ def ensure(
     return interpreter
 
 
+def ensure_node() -> None:
+    """Fetch the programs of npm that tests compare with, where npm is there; without them those tests are skipped."""
+    folder, npm, text = ROOT / ".venv-node", shutil.which("npm"), json.dumps(NODE_PACKAGES)
+    stamp = folder / "drgs-stamp.json"
+    if npm is None or (stamp.exists() and stamp.read_text(encoding="utf-8") == text):
+        return
+    folder.mkdir(exist_ok=True)
+    command = [npm, "install", "--prefix", folder, "--no-save", "--no-audit", "--no-fund", "--loglevel=error"]
+    if subprocess.run([*command, *NODE_PACKAGES], cwd=folder).returncode:
+        print("npm could not fetch what some tests compare with: they are skipped", flush=True)
+        return
+    stamp.write_text(text, encoding="utf-8")
+
+
 def python311() -> Path:
     """A Python 3.11, the only version for which Blender 4.2 to 5.0 exist as a module."""
     if sys.version_info[:2] == (3, 11):
@@ -236,6 +252,7 @@ def run_test(args: argparse.Namespace) -> int:
         for tool in (["ruff", "check", "."], ["ruff", "format", "--check", "."], ["mypy"]):
             tally.check(" ".join(tool), [engine, "-m", *tool])
     if "engine" in suites:
+        ensure_node()
         tally.pytest("engine", engine, "tests/unit", "tests/engine")
     if "blender" in suites:
         tally.pytest(f"Blender {BLENDER}", ensure_blender(), "tests/blender")
