@@ -77,7 +77,7 @@ def in_taichi(python: Path, solver: Solver, dt: float, steps: int, threads: int,
     order = arrange(s.x, solver.domain)[0].order
     n = len(s.x)
     columns = {
-        "x": s.x, "v": s.v, "c": s.affine.reshape(n, 3, 3), "f": s.elastic.reshape(n, 3, 3),
+        "x": s.x, "v": s.v, "c": s.affine.reshape(n, 3, 3), "f": solver.gradients,
         "mass": solver.body.volume * matter.density, "volume": solver.body.volume,
         "mu": matter.parameters[:, 0], "lam": matter.parameters[:, 1],
     }  # fmt: skip

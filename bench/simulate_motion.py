@@ -75,8 +75,11 @@ def beams(options: argparse.Namespace) -> Rows:
     """Cantilevers against theory."""
     rows: Rows = []
     for per in (4,) if options.short else (4, 8):
-        ratio = droop(per, 1e6, 0.1, 60, damping=8.0) / timoshenko(100.0)
-        rows.append([f"cantilever of {per} cells, droop over Timoshenko's", ratio, "0.97 to 1.03"])
+        # The clamp ends at a node: how long the beam is depends on where the grid lies.
+        ratios = [droop(per, 1e6, 0.1, 60, damping=8.0, offset=k / 4) / timoshenko(100.0) for k in range(4)]
+        told = f"{np.mean(ratios):.3f} ({min(ratios):.3f} to {max(ratios):.3f})"
+        what = f"cantilever of {per} cells, droop over Timoshenko's: mean and range of four places in the grid"
+        rows.append([what, told, "mean 0.97 to 1.03"])
     beam = cantilever(4, length=0.75, gravity=(0, 0, -0.1))
     rest = beam.points.copy()
     tip = rest[:, 0] > rest[:, 0].max() - beam.domain.spacing

@@ -22,7 +22,7 @@ def _turn(spp, sqq, spq, spr, sqr):  # type: ignore[no-untyped-def]
 
 @njit
 def svd3(f, n):  # type: ignore[no-untyped-def]
-    """A = U diag(sigma) V^T of row n of `f`, a row-major matrix, by Jacobi rotations of A^T A in double precision.
+    """A = U diag(sigma) V^T, by Jacobi rotations of A^T A in double precision; row n of `f` is A - 1, row-major.
 
     Returns
     -------
@@ -30,9 +30,9 @@ def svd3(f, n):  # type: ignore[no-untyped-def]
         Row-major. V is a rotation; sigma is not sorted and not negative; where A mirrors or is singular, so does U
         or U has a made-up column.
     """
-    a, b, c = float(f[n, 0]), float(f[n, 1]), float(f[n, 2])
-    d, e, g = float(f[n, 3]), float(f[n, 4]), float(f[n, 5])
-    h, i, j = float(f[n, 6]), float(f[n, 7]), float(f[n, 8])
+    a, b, c = 1.0 + float(f[n, 0]), float(f[n, 1]), float(f[n, 2])
+    d, e, g = float(f[n, 3]), 1.0 + float(f[n, 4]), float(f[n, 5])
+    h, i, j = float(f[n, 6]), float(f[n, 7]), 1.0 + float(f[n, 8])
     xx, yy, zz = a * a + d * d + h * h, b * b + e * e + i * i, c * c + g * g + j * j
     xy, xz, yz = a * b + d * e + h * i, a * c + d * g + h * j, b * c + e * g + i * j
     v0, v1, v2, v3, v4, v5, v6, v7, v8 = 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0

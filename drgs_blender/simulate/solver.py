@@ -52,8 +52,8 @@ class State:
     x : (n, 3) float64, metres, world
     v : (n, 3) float32, m/s
     affine : (n, 9) float32, velocity gradient of APIC, 1/s
-    elastic : (n, 9) float32, elastic deformation gradient
-    total : (n, 9) float32, deformation gradient since the start; no rows where no matter is plastic
+    elastic : (n, 9) float32, elastic deformation gradient less 1
+    total : (n, 9) float32, deformation gradient since the start less 1; no rows where no matter is plastic
     tau : (n, 6) float32, Kirchhoff stress, Pa: xx, yy, zz, xy, xz, yz
     memory : (n,) float32, see `stress.respond`
     """
@@ -148,13 +148,11 @@ class Solver(Stepper):
         if len(x) > n:
             v[n:] = v[:n].mean(axis=0)
         v[self._pins] = 0
-        one = np.tile(np.eye(3, dtype=np.float32).reshape(9), (len(x), 1))
         plastic = bool((body.matter.model > 1).any())
         memory = np.isin(self._model, (FLUID, SNOW)).astype(np.float32)
-        return State(
-            x, v, np.zeros((len(x), 9), np.float32), one, one.copy() if plastic else np.empty((0, 9), np.float32),
-            np.zeros((len(x), 6), np.float32), memory,
-        )  # fmt: skip
+        total = np.zeros((len(x) if plastic else 0, 9), np.float32)
+        affine, elastic = np.zeros((2, len(x), 9), np.float32)
+        return State(x, v, affine, elastic, total, np.zeros((len(x), 6), np.float32), memory)
 
     def _check_start(self) -> None:
         """Refuse what cannot go well, with what to do about it."""
@@ -166,7 +164,7 @@ class Solver(Stepper):
     @property
     def gradients(self) -> Array:
         total = self.state.total if len(self.state.total) else self.state.elastic
-        return total[: len(self.body.points)].reshape(-1, 3, 3)
+        return total[: len(self.body.points)].reshape(-1, 3, 3) + np.eye(3, dtype=np.float32)
 
     @property
     def points(self) -> Array:

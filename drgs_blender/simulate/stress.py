@@ -2,6 +2,7 @@
 
 Return mappings: von Mises with viscosity after Simo and Hughes (Computational Inelasticity, ch. 3), sand after Klar et
 al. 2016, snow after Stomakhin et al. 2013. Stresses are Kirchhoff's, tau = P F^T, kept as xx, yy, zz, xy, xz, yz.
+Deformation gradients are kept less 1: small strains have all digits of single precision then.
 """
 
 from __future__ import annotations
@@ -32,18 +33,18 @@ def _put(tau, p, u, a, b, c):  # type: ignore[no-untyped-def]
 
 @njit(inline="always")
 def _compose(f, p, u, a, b, c, v):  # type: ignore[no-untyped-def]
-    """F = U diag(a, b, c) V^T."""
+    """F = U diag(a, b, c) V^T, where `f` holds F - 1."""
     for r in range(3):
         for k in range(3):
-            f[p, 3 * r + k] = (
-                a * u[3 * r] * v[3 * k] + b * u[3 * r + 1] * v[3 * k + 1] + c * u[3 * r + 2] * v[3 * k + 2]
-            )
+            whole = a * u[3 * r] * v[3 * k] + b * u[3 * r + 1] * v[3 * k + 1] + c * u[3 * r + 2] * v[3 * k + 2]
+            f[p, 3 * r + k] = whole - 1.0 if r == k else whole
 
 
 @njit(inline="always")
 def neo_hookean(f, p, mu, first, tau):  # type: ignore[no-untyped-def]
-    """tau = mu (F F^T - 1) + lambda log(J) 1, for row p."""
-    a, b, c, d, e, g, h, i, k = f[p, 0], f[p, 1], f[p, 2], f[p, 3], f[p, 4], f[p, 5], f[p, 6], f[p, 7], f[p, 8]
+    """tau = mu (F F^T - 1) + lambda log(J) 1, for row p, where `f` holds F - 1."""
+    one = np.float32(1.0)
+    a, b, c, d, e, g, h, i, k = one + f[p, 0], f[p, 1], f[p, 2], f[p, 3], one + f[p, 4], f[p, 5], f[p, 6], f[p, 7], one + f[p, 8]  # noqa: E501  # fmt: skip
     j = a * (e * k - g * i) - b * (d * k - g * h) + c * (d * i - e * h)
     pressure = first * np.log(max(j, _FLOOR)) - mu
     tau[p, 0] = mu * (a * a + b * b + c * c) + pressure
@@ -61,7 +62,7 @@ def respond(p, model, parameters, f, tau, memories, affine, dt):  # type: ignore
     Parameters
     ----------
     model, parameters : (n,) uint8, (n, k) float32
-    f : (n, 9) float32, elastic deformation gradient, changed in place where matter flows
+    f : (n, 9) float32, elastic deformation gradient less 1, changed in place where matter flows
     tau : (n, 6) float32, written
     memories : (n,) float32, changed: what the model remembers: plastic strain (plastic), volume correction (sand),
         plastic volume (snow), volume ratio (fluid)

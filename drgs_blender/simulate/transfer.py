@@ -2,7 +2,7 @@
 
 After Hu et al. 2018 (moving least squares MPM) with APIC (Jiang et al. 2015) and quadratic B-splines. A block's nodes
 are gathered in a scratch of 8^3 nodes from cell -1 to 6 of the block, which lets particles drift by a cell.
-Positions are double precision: single precision stalls slow motion.
+Single precision stalls slow motion and slow strain: positions are double, and deformation gradients are kept less 1.
 """
 
 from __future__ import annotations
@@ -70,17 +70,18 @@ def _covered(scratch, base, wx, wy, wz):  # type: ignore[no-untyped-def]
 
 @njit(inline="always")
 def _stretch(f, p, step, g0, g1, g2, g3, g4, g5, g6, g7, g8):  # type: ignore[no-untyped-def]
-    """F = (1 + step grad v) F, in place."""
-    f0, f1, f2, f3, f4, f5, f6, f7, f8 = f[p, 0], f[p, 1], f[p, 2], f[p, 3], f[p, 4], f[p, 5], f[p, 6], f[p, 7], f[p, 8]
-    f[p, 0] = f0 + step * (g0 * f0 + g1 * f3 + g2 * f6)
+    """F = (1 + step grad v) F, in place, where `f` holds F - 1."""
+    h0, h4, h8 = f[p, 0], f[p, 4], f[p, 8]
+    f0, f1, f2, f3, f4, f5, f6, f7, f8 = _ONE + h0, f[p, 1], f[p, 2], f[p, 3], _ONE + h4, f[p, 5], f[p, 6], f[p, 7], _ONE + h8  # noqa: E501  # fmt: skip
+    f[p, 0] = h0 + step * (g0 * f0 + g1 * f3 + g2 * f6)
     f[p, 1] = f1 + step * (g0 * f1 + g1 * f4 + g2 * f7)
     f[p, 2] = f2 + step * (g0 * f2 + g1 * f5 + g2 * f8)
     f[p, 3] = f3 + step * (g3 * f0 + g4 * f3 + g5 * f6)
-    f[p, 4] = f4 + step * (g3 * f1 + g4 * f4 + g5 * f7)
+    f[p, 4] = h4 + step * (g3 * f1 + g4 * f4 + g5 * f7)
     f[p, 5] = f5 + step * (g3 * f2 + g4 * f5 + g5 * f8)
     f[p, 6] = f6 + step * (g6 * f0 + g7 * f3 + g8 * f6)
     f[p, 7] = f7 + step * (g6 * f1 + g7 * f4 + g8 * f7)
-    f[p, 8] = f8 + step * (g6 * f2 + g7 * f5 + g8 * f8)
+    f[p, 8] = h8 + step * (g6 * f2 + g7 * f5 + g8 * f8)
 
 
 @njit(parallel=True)

@@ -49,14 +49,15 @@ def solver_of(
     return Solver(body, domain or aligned(low, high, h), forces, colliders, planes, courant)
 
 
-def cantilever(per: int, *, length: float = 1.0, height: float = 0.125, young: float = 1e6, **more: Any) -> Solver:
-    """A beam along x, clamped at x < 0, `per` cells high."""
+def cantilever(
+    per: int, *, length: float = 1.0, height: float = 0.125, young: float = 1e6, offset: float = 0.0, **more: Any
+) -> Solver:
+    """A beam along x, clamped at x < 0, `per` cells high; the clamp is `offset` cells before a node of the grid."""
     h = height / per
     points = lattice((length + 2 * h, height, height), h / 2) - [2 * h, 0, 0]
-    return solver_of(
-        points, h, low=(-4 * h, -2 * h, -length), high=(1.2 * length, height + 2 * h, height + 0.3 * length),
-        pinned=points[:, 0] < 0, young=young, poisson=0.3, density=1000, **more,
-    )  # fmt: skip
+    low, high = (-4 * h, -2 * h, -length), (1.2 * length + h, height + 2 * h, height + 0.3 * length)
+    domain = Domain.around(np.add(aligned(low, high, h).low, [offset * h, 0, 0]), np.asarray(high), h)
+    return solver_of(points, h, domain=domain, pinned=points[:, 0] < 0, young=young, poisson=0.3, density=1000, **more)
 
 
 def timoshenko(load: float, *, length: float = 1.0, height: float = 0.125, young: float = 1e6) -> float:
@@ -85,7 +86,7 @@ def energy(solver: Solver) -> tuple[float, float]:
     m, s = masses(solver), solver.state
     c, v = s.affine.astype(np.float64), s.v.astype(np.float64)
     kinetic = 0.5 * (m * ((v**2).sum(axis=1) + solver.domain.spacing**2 / 4 * (c**2).sum(axis=1))).sum()
-    f = s.elastic.astype(np.float64).reshape(-1, 3, 3)
+    f = s.elastic.astype(np.float64).reshape(-1, 3, 3) + np.eye(3)
     mu, first = solver.body.matter.parameters[0, :2].astype(np.float64)
     log = np.log(np.linalg.det(f))
     density = 0.5 * mu * ((f**2).sum(axis=(1, 2)) - 3) - mu * log + 0.5 * first * log**2

@@ -17,7 +17,8 @@ class PlainMpm:
         s, body = solver.state, solver.body
         self.x = s.x.astype(float)
         self.v = s.v.astype(float)
-        self.c, self.f = (a.astype(float).reshape(-1, 3, 3) for a in (s.affine, s.elastic))
+        self.c = s.affine.astype(float).reshape(-1, 3, 3)
+        self.f = s.elastic.astype(float).reshape(-1, 3, 3) + np.eye(3)
         self.mu, self.lam = body.matter.parameters[:, :2].astype(float).T
         self.volume = body.volume.astype(float)
         self.mass = self.volume * body.matter.density

@@ -19,13 +19,13 @@ SOLID = [name for name, m in MATERIALS.items() if m.model != "fluid"]
 
 def stress(material, f, memory=0.0, affine=None, dt=1e-4):
     """(tau, F after flow, memory) of one particle with deformation gradient f."""
-    own = np.array(f, np.float32).reshape(1, 9).copy()
+    own = (np.asarray(f, np.float64) - np.eye(3)).astype(np.float32).reshape(1, 9)
     stress, memories = np.zeros((1, 6), np.float32), np.float32([memory])
     gradient = np.zeros((1, 9), np.float32) if affine is None else np.asarray(affine, np.float32).reshape(1, 9)
     respond(0, np.uint8([MODELS[material.model]]), np.float32([material.row()]), own, stress, memories, gradient, dt)
     (tau,) = stress
     full = np.array([[tau[0], tau[3], tau[4]], [tau[3], tau[1], tau[5]], [tau[4], tau[5], tau[2]]], float)
-    return full, own.reshape(3, 3).astype(float), float(memories[0])
+    return full, own.reshape(3, 3).astype(float) + np.eye(3), float(memories[0])
 
 
 def gradients(seed: int, size: float, n: int = 40) -> np.ndarray:
@@ -45,7 +45,7 @@ def test_singular_values(kind):
         if kind != "any":
             turn, other = Rotation.random(2, random_state=rng).as_matrix()
             a = turn @ np.diag({"equal": [2.0, 2.0, 0.5], "flat": [1.0, 0.3, 0.0]}[kind]) @ other
-        u, s, v = (np.array(part) for part in svd3(a.reshape(1, 9), 0))
+        u, s, v = (np.array(part) for part in svd3((a - np.eye(3)).reshape(1, 9), 0))
         u, v = u.reshape(3, 3), v.reshape(3, 3)
         assert np.abs(u @ np.diag(s) @ v.T - a).max() < 1e-9
         assert np.sort(s) == pytest.approx(np.sort(np.linalg.svd(a)[1]), abs=1e-7)
