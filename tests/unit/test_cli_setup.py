@@ -72,6 +72,20 @@ def suite(dev, tmp_path: Path, text: str):
     return tally
 
 
+def test_every_folder_of_tests_is_run(dev, monkeypatch):
+    """Those that need a window only when they are asked for."""
+    run = []
+    monkeypatch.setattr(dev, "ensure_engine", lambda: None)
+    monkeypatch.setattr(dev, "ensure_blender", lambda version="": None)
+    monkeypatch.setattr(dev.Tally, "check", lambda *_: None)
+    monkeypatch.setattr(dev.Tally, "pytest", lambda self, title, python, *folders: run.extend(folders))
+    assert dev.main(["test"]) == 0
+    there = {f"tests/{path.parent.name}" for path in (ROOT / "tests").glob("*/test_*.py")}
+    assert set(run) == there - {"tests/ui"} and "tests/farm" in run
+    dev.main(["test", "window"])
+    assert set(run) == there
+
+
 def test_counts_are_summed(dev, tmp_path, capfd):
     text = "import pytest\ndef test_a(): pass\ndef test_b(): assert 0\n@pytest.mark.skip\ndef test_c(): pass\n"
     assert suite(dev, tmp_path, text).finish() == 1
