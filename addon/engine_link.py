@@ -86,7 +86,8 @@ def client() -> EngineClient:
             _client = None
         if _client is None:
             messages.note("INFO", f"Engine: {command[0]}")
-            _client = EngineClient(command)
+            # Nobody watches a Blender without a window: as often as `drgs render` it tries again.
+            _client = EngineClient(command, restarts=2 if bpy.app.background else 1)
         return _client
 
 

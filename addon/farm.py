@@ -13,6 +13,7 @@ import bpy
 import imbuf
 
 from ..drgs_blender.errors import EXIT_CANNOT_WRITE, EXIT_CLASSES
+from ..drgs_blender.wholeness import is_whole
 from . import engine_link, messages
 
 #: Environment variable with which a failure ends a Blender that has no window.
@@ -46,7 +47,9 @@ def verify(scene: bpy.types.Scene, *_: object) -> None:
 
 
 def _readable(path: Path) -> bool:
-    """Whether Blender can decode a picture."""
+    """Whether a picture is whole, and Blender can decode it."""
+    if not is_whole(path):  # looked at first: of a part of a file Blender makes a picture, or crashes
+        return False
     try:
         picture = imbuf.load(str(path))
     except (ValueError, OSError):

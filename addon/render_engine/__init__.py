@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-from .engine import DrgsRenderEngine
+from .engine import DrgsRenderEngine, end_renders
 from .panels import share_panels, withdraw_panels
 
 
@@ -14,5 +14,6 @@ def register() -> None:
 
 
 def unregister() -> None:
+    end_renders()
     withdraw_panels()
     bpy.utils.unregister_class(DrgsRenderEngine)

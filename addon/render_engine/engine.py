@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+import time
 from collections.abc import Callable, Iterator
 
 import bpy
@@ -16,6 +18,25 @@ from ..export.instances import uncancelled
 from ..passes import blender_name, enabled
 from ..viewport import views
 from . import blur
+
+#: What Blender does with a picture when `DrgsRenderEngine.render` has come back takes no longer.
+_AFTERWARDS = 0.5
+
+#: Threads that render a final picture.
+_rendering: set[int] = set()
+#: Set while the extension is switched off.
+_ending = threading.Event()
+
+
+def end_renders(seconds: float = 10.0) -> None:
+    """Have final pictures cancelled and wait for their threads: Blender crashes where a class goes that renders."""
+    _ending.set()
+    deadline, others = time.monotonic() + seconds, _rendering - {threading.get_ident()}
+    while others & _rendering and time.monotonic() < deadline:
+        time.sleep(0.02)
+    if others:
+        time.sleep(_AFTERWARDS)
+    _ending.clear()
 
 
 class DrgsRenderEngine(bpy.types.RenderEngine):
@@ -33,6 +54,10 @@ class DrgsRenderEngine(bpy.types.RenderEngine):
 
     def render(self, depsgraph: bpy.types.Depsgraph) -> None:
         """Render one view layer. Whatever fails is reported, which also stops an animation and writes no file."""
+        if _ending.is_set():  # the next frame of an animation
+            self.report({"ERROR"}, "DR-GS is switched off")
+            return
+        _rendering.add(threading.get_ident())
         views.worker.hold()
         try:
             self._render(depsgraph)
@@ -48,6 +73,7 @@ class DrgsRenderEngine(bpy.types.RenderEngine):
             )
         finally:
             views.worker.release()
+            _rendering.discard(threading.get_ident())
 
     def view_update(self, context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
         """The scene changed."""
@@ -109,8 +135,8 @@ class DrgsRenderEngine(bpy.types.RenderEngine):
         self.update_stats("", summary(frame, passes.statistics))
 
     def _stopped(self) -> bool:
-        """Whether Esc was pressed."""
-        return self.test_break()
+        """Whether Esc was pressed, or the extension goes."""
+        return self.test_break() or _ending.is_set()
 
     def _blurred(
         self, frame: Frame, steps: list[blur.Step], depsgraph: bpy.types.Depsgraph, export: Callable[[], Frame]

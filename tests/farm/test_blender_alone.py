@@ -4,45 +4,74 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
 import OpenEXR
+import psutil
+import pytest
+from processes import children, gone
 
 from drgs_blender.cli.find_blender import CHECKOUT, find_blender
 from drgs_blender.render.picture.frames import read_frame
 
+from .conftest import WHOLE
+
+linux = pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
+
 #: Factory settings and no preferences: what the engine is, a variable alone says.
-ANIMATION = """
+BEGIN = """
 import os, runpy, sys, tempfile
 import bpy
 job = runpy.run_path({checkout!r} + "/drgs_blender/cli/blender_job.py")
 bpy.ops.wm.read_factory_settings(use_empty=True)
-with tempfile.TemporaryDirectory() as repository:
-    os.symlink({checkout!r}, repository + "/drgs", target_is_directory=True)
-    job["enable_extension"](repository)
+repository = tempfile.mkdtemp(prefix="repository-")
+os.symlink({checkout!r}, repository + "/drgs", target_is_directory=True)
+package = job["enable_extension"](repository)
+def opened():
     bpy.ops.wm.open_mainfile(filepath={scene!r}, load_ui=False)
     scene = bpy.context.scene
     scene.render.engine = "DRGS"
-    scene.frame_start, scene.frame_end, scene.frame_step = 1, 3, 2
-    scene.render.filepath = {out!r}
     image = scene.render.image_settings
     image.file_format, image.color_depth, image.color_mode, image.exr_codec = "OPEN_EXR", "32", "RGBA", "ZIP"
-    bpy.ops.render.render(animation=True)
+    return scene
+"""
+ANIMATION = """
+scene = opened()
+scene.frame_start, scene.frame_end, scene.frame_step = 1, 3, 2
+scene.render.filepath = {out!r} + "/####"
+scene.drgs.rays = {rays}
+bpy.ops.render.render(animation=True)
+"""
+END = """
 sys.stdout.flush()
 os._exit(0)
 """
 
 
-def animate(scene: Path, out: Path, tmp_path: Path, **environment: str) -> subprocess.CompletedProcess[str]:
+def begin(scene: Path, tmp_path: Path, body: str, **environment: str) -> subprocess.Popen[str]:
+    """A Blender in which `body` runs."""
+    script = tmp_path / "script.py"
+    script.write_text(BEGIN.format(checkout=str(CHECKOUT), scene=str(scene)) + body + END)
+    environment = os.environ | {"DRGS_ENGINE": sys.executable, "TMPDIR": str(tmp_path)} | environment
+    command, pipe = find_blender().command(script), subprocess.PIPE
+    return subprocess.Popen(command, env=environment, stdout=pipe, stderr=pipe, text=True)
+
+
+def animate(
+    scene: Path, out: Path, tmp_path: Path, rays: int = 4, **environment: str
+) -> subprocess.CompletedProcess[str]:
     """Frames 1 and 3 of `scene`, rendered and written by Blender."""
-    script = tmp_path / "animation.py"
-    script.write_text(ANIMATION.format(checkout=str(CHECKOUT), scene=str(scene), out=str(out / "####")))
-    environment = os.environ | {"DRGS_ENGINE": sys.executable} | environment
-    command = find_blender().command(script)
-    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
+    process = begin(scene, tmp_path, ANIMATION.format(out=str(out), rays=rays), **environment)
+    try:
+        said, errors = process.communicate(timeout=400)  # the first may compile kernels
+    finally:
+        process.kill()
+    return subprocess.CompletedProcess(process.args, process.returncode, said, errors)
 
 
 def test_animation_rendered_by_blender_has_the_same_bits(drgs, folder, tmp_path):
@@ -71,6 +100,166 @@ def test_frame_that_blender_writes_on_a_full_disk_does_not_stay(folder, tmp_path
     result = animate(folder / "relative.blend", disk, tmp_path, DRGS_FARM="1")
     assert (result.returncode, result.stdout.splitlines()[-1]) == (73, "DRGS_EXIT class=cannot-write")
     assert [path.name for path in disk.iterdir()] == ["filler"]
+
+
+@pytest.mark.parametrize("pages", [1, 4, 16])
+def test_frame_that_finds_room_for_a_part_of_it_does_not_stay(folder, tmp_path, small_disk, pages):
+    disk = small_disk(f"size={4 * pages + 4}k")
+    (disk / "filler").write_bytes(bytes(4 << 10))
+    result = animate(folder / "large.blend", disk, tmp_path, DRGS_FARM="1")
+    assert (result.returncode, result.stdout.splitlines()[-1]) == (73, "DRGS_EXIT class=cannot-write")
+    assert [path.name for path in disk.iterdir()] == ["filler"]
+
+
+def engines_of(process: subprocess.Popen[str]) -> list[int]:
+    """Process ids of the engines of a Blender."""
+    return [pid for pid, line in children(process.pid).items() if "drgs_blender.engine" in line]
+
+
+@linux
+@pytest.mark.parametrize(("deaths", "code"), [(2, 0), (3, 75)])
+def test_two_engines_may_die_of_a_frame(folder, tmp_path, deaths, code):
+    """As under `drgs render`: the third death gives the frame back."""
+    scene, rays = folder / "relative.blend", 8192
+    body = ANIMATION.format(out=str(tmp_path / "shaken"), rays=rays).replace("= 1, 3, 2", "= 1, 1, 1")
+    process = begin(scene, tmp_path, body, DRGS_FARM="1")
+    killed: set[int] = set()
+    try:
+        while len(killed) < deaths:
+            assert process.poll() is None
+            for pid in set(engines_of(process)) - killed:
+                os.kill(pid, signal.SIGKILL)
+                killed.add(pid)
+            time.sleep(0.02)
+        said, errors = process.communicate(timeout=400)  # the first may compile kernels
+    finally:
+        process.kill()
+    assert process.returncode == code, errors
+    if code:
+        assert said.splitlines()[-1] == "DRGS_EXIT class=retry" and not (tmp_path / "shaken").exists()
+    else:
+        assert animate(scene, tmp_path / "calm", tmp_path, rays).returncode == 0
+        calm, shaken = (written_by_blender(tmp_path / name / "0001.exr") for name in ("calm", "shaken"))
+        assert np.array_equal(calm, shaken)
+
+
+@linux
+@pytest.mark.parametrize("attempt", range(20 if WHOLE else 1))
+def test_killed_blender_takes_its_engine_along(folder, tmp_path, attempt):
+    shared = set(os.listdir("/dev/shm"))
+    process = begin(folder / "large.blend", tmp_path, ANIMATION.format(out=str(tmp_path / "out"), rays=65536))
+    try:
+        while not (found := engines_of(process)):
+            assert process.poll() is None
+            time.sleep(0.02)
+        (engine,) = found
+        while psutil.Process(engine).cpu_times().user < 2 + 0.1 * attempt:
+            time.sleep(0.02)
+    finally:
+        process.kill()
+        process.communicate()
+    deadline = time.monotonic() + 2
+    while not gone(engine) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert gone(engine) and set(os.listdir("/dev/shm")) <= shared
+    # Blender leaves a folder of its own where it is killed.
+    left = {path.name.split("-")[0].split("_")[0] for path in tmp_path.iterdir()}
+    assert left <= {"script.py", "repository", "blender"}
+
+
+#: What an artist does a hundred times between two pictures of one frame; the engine stays the same one.
+ARTIST = """
+import importlib
+link = importlib.import_module(package + ".addon.engine_link")
+def picture(name):
+    scene = bpy.context.scene
+    scene.render.filepath = {out!r} + "/" + name
+    bpy.ops.render.render(write_still=True)
+    engines.add(link.client().pid)
+engines = set()
+opened()
+picture("before.exr")
+{body}
+picture("after.exr")
+assert len(engines) == 1, engines
+"""
+UNDO = """
+def height():
+    return round(bpy.data.objects["tile"].scale.z, 3)
+bpy.ops.ed.undo_push(message="begin")
+for k in range({count}):
+    bpy.data.objects["tile"].scale.z = 0.125 * (k % 3 + 1)
+    bpy.ops.ed.undo_push(message="moved")
+    if k % 10 == 0:
+        picture("moved.exr")
+    bpy.ops.ed.undo()
+    assert height() == 1
+    bpy.ops.ed.redo()
+    assert height() == 0.125 * (k % 3 + 1)
+    bpy.ops.ed.undo()
+"""
+RELOAD = """
+for k in range({count}):
+    bpy.data.objects["tile"].scale.z = 0.5
+    if k % 5 == 0:
+        picture("moved.exr")
+    opened()
+"""
+
+
+@pytest.mark.parametrize(("body", "few", "many"), [(UNDO, 12, 200), (RELOAD, 5, 50)], ids=["undo", "reload"])
+def test_a_picture_is_the_same_after_all_that_was_taken_back(folder, tmp_path, body, few, many):
+    out = tmp_path / "out"
+    out.mkdir()
+    body = ARTIST.format(out=str(out), body=body.format(count=many if WHOLE else few))
+    process = begin(folder / "relative.blend", tmp_path, body)
+    said, errors = process.communicate(timeout=400)
+    assert process.returncode == 0, said + errors
+    before, moved, after = (written_by_blender(out / f"{name}.exr") for name in ("before", "moved", "after"))
+    assert np.array_equal(before, after) and not np.array_equal(before, moved)
+
+
+#: The extension is switched off while its picture is rendered, and on again.
+DISABLE = """
+import addon_utils, importlib, threading, time
+out, count = {out!r}, {count}
+def picture(rays, name=""):
+    scene = opened()
+    scene.drgs.rays = rays
+    scene.render.filepath = out + "/" + name
+    try:
+        bpy.ops.render.render(write_still=bool(name))
+    except RuntimeError as error:
+        print("told", error)
+def disable(wait):
+    link = importlib.import_module(package + ".addon.engine_link")
+    while not (link.is_running() and not link._client._child.idle.is_set()):
+        time.sleep(0.01)
+    time.sleep(wait)
+    began.append(time.monotonic())
+    addon_utils.disable(package)
+picture(4, "before.exr")
+for k in range(count):
+    began = []
+    thread = threading.Thread(target=disable, args=(0.1 + 0.05 * k,))
+    thread.start()
+    picture(65536)
+    assert began and time.monotonic() - began[0] < 10, "it was rendered to its end"
+    thread.join()
+    assert not hasattr(bpy.types.Scene, "drgs")
+    assert addon_utils.enable(package) is not None
+picture(4, "after.exr")
+"""
+
+
+@linux
+def test_extension_may_be_switched_off_while_it_renders(folder, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    process = begin(folder / "large.blend", tmp_path, DISABLE.format(out=str(out), count=20 if WHOLE else 2))
+    said, errors = process.communicate(timeout=400)
+    assert process.returncode == 0, said + errors
+    assert np.array_equal(*(written_by_blender(out / f"{name}.exr") for name in ("before", "after")))
 
 
 def written_by_blender(path: Path) -> np.ndarray:
