@@ -150,13 +150,15 @@ def overhead(scene: Path, folder: Path, count: int, rays: int) -> str:
         warm = [_chunk(scene, folder / "warm", k, rays, "--session", str(place)) for k in range(count)]
     finally:
         drgs("session", "stop", str(place))
-    tasks = _tasks(scene, folder / "openjd", count, rays)
+    tasks, second = _tasks(scene, folder / "openjd", count, rays)
     rows = [
         ["drgs render, a process for each chunk", statistics.median(cold), max(cold)],
         ["drgs render --session, first chunk (Blender opens the scene)", warm[0], warm[0]],
         ["drgs render --session, later chunks", statistics.median(warm[1:]), max(warm[1:])],
         ["first task of a session of OpenJD", tasks[0], tasks[0]],
         ["later tasks", statistics.median(tasks[1:]), max(tasks[1:])],
+        ["first task of the second step, which denoises", second[0], second[0]],
+        ["its later tasks", statistics.median(second[1:]), max(second[1:])],
     ]
     return (
         f"{count} chunks of 2 frames of 32 x 24 pixels. Seconds from start to end of the command or task, less those "
@@ -164,11 +166,12 @@ def overhead(scene: Path, folder: Path, count: int, rays: int) -> str:
     )
 
 
-def _tasks(scene: Path, out: Path, count: int, rays: int) -> list[float]:
-    """Seconds of every task of a session of OpenJD beyond those of its frames."""
+def _tasks(scene: Path, out: Path, count: int, rays: int) -> tuple[list[float], list[float]]:
+    """Seconds of every task of both steps of a session of OpenJD beyond those of its frames."""
     command = drgs(
         "submit", "openjd", str(scene), "--no-check", "--to", str(out / "job"), "--drgs", PROGRAM, "--frames",
         f"1-{2 * count}", "--chunk", "2", f"--options=--rays {rays}", "--out", str(out / "####.exr"),
+        "--denoised", str(out / "clean" / "####.exr"),
     ).stdout.splitlines()[-1]  # fmt: skip
     words = [farm_slurm.OPENJD, *shlex.split(command)[1:]]
     done = subprocess.run(words, capture_output=True, text=True, timeout=900)
@@ -180,7 +183,7 @@ def _tasks(scene: Path, out: Path, count: int, rays: int) -> list[float]:
         times = [(3600 * int(h) + 60 * int(m) + float(s), line) for h, m, s, line in stamps]
         end = next(stamp for stamp, line in times if "exited with code" in line)
         found.append(end - times[0][0] - _of_frames(text))
-    return found
+    return found[:count], found[count:]
 
 
 def _of_frames(text: str) -> float:

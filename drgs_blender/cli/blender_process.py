@@ -22,7 +22,7 @@ from ..engine import protocol
 from ..engine.codec import decode_frame
 from ..engine.protocol import Link, ProtocolError
 from ..engine.slots import HeldSlots
-from ..errors import ERROR_CLASSES, DeviceError, DrgsError, EngineError, VersionError
+from ..errors import ERROR_CLASSES, DeviceError, DrgsError, EngineError, VersionError, WriteError
 from ..frame import Frame
 from ..version import __version__
 from .blender_job import READY
@@ -55,6 +55,7 @@ class BlenderProcess:
         self, blender: Blender, job: dict[str, Any], key_of: Callable[[Path], str], timeout: float = np.inf
     ) -> None:
         self._blender, self._job, self._key_of, self._timeout = blender, job, key_of, timeout
+        self._folder = ""
         self._words: deque[str] = deque(maxlen=50)
         self._held = HeldSlots()
         self._ended = threading.Event()
@@ -64,11 +65,7 @@ class BlenderProcess:
         self._silent = self._late = False
 
     def __enter__(self) -> BlenderProcess:
-        self._folder = tempfile.mkdtemp(prefix="drgs-")
-        source = extension_source()
-        repository = self._repository(source) if source else None
-        temporary = Path(self._folder) / "temp"  # Blender leaves a folder where it is killed
-        temporary.mkdir()
+        repository, temporary = self._make_folders()
         environment = os.environ | dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(temporary))
         command = self._blender.command(Path(__file__).with_name("blender_job.py"))
         pipe = subprocess.PIPE
@@ -131,6 +128,18 @@ class BlenderProcess:
                 self._answer(protocol.Result(message.id, [], {}))
             else:
                 raise EngineError("Blender", f"sent {type(message).__name__}, which makes no sense here", "Try again")
+
+    def _make_folders(self) -> tuple[str | None, Path]:
+        """The extension's repository, and where Blender's temporary files go: it leaves some where it is killed."""
+        try:
+            self._folder = tempfile.mkdtemp(prefix="drgs-")
+            source, temporary = extension_source(), Path(self._folder) / "temp"
+            temporary.mkdir()
+            return self._repository(source) if source else None, temporary
+        except OSError as error:
+            shutil.rmtree(self._folder, ignore_errors=True)
+            problem, remedy = f"cannot be written ({error.strerror or error})", "Make room, or set TMPDIR"
+            raise WriteError("the folder of temporary files", problem, remedy) from error
 
     def _repository(self, source: Path) -> str:
         """A local extension repository that holds this package's own extension, so that both are one version."""

@@ -21,11 +21,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..errors import AssetError, UsageError
+from ..errors import AssetError, EngineError, UsageError
 from ..passes import BY_NAME
 from ..sequence import frame_path
 from ..version import __version__
-from . import sampling
+from . import sampling, session_link
 from .frame_lines import FrameLines
 from .frame_range import check_template, parse_frames
 from .output import check_suffix, check_writable
@@ -60,6 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--threads", type=sampling.whole(0, 1024), default=0, help="threads, 0 for all cores; default 0"
     )
     parser.add_argument("--overwrite", action="store_true", help="denoise frames that are already there, too")
+    session_link.add_arguments(parser)
 
 
 def odd(text: str) -> int:
@@ -71,6 +72,13 @@ def odd(text: str) -> int:
 
 
 def run(args: argparse.Namespace) -> int:
+    """Denoise every frame that is not there yet, here or in the session's process."""
+    if args.session and (code := session_link.hand_on(args.session, args.words)) is not None:
+        return code
+    return denoise(args)
+
+
+def denoise(args: argparse.Namespace) -> int:
     """Denoise every frame that is not there yet."""
     frames = parse_frames(args.frames)
     sequence = None if args.sequence is None else set(parse_frames(args.sequence))
@@ -86,11 +94,12 @@ def run(args: argparse.Namespace) -> int:
     from ..jit import use_threads
     from . import frame_store
 
+    frame_store.remove_abandoned(args.out)
     use_threads(args.threads)
     source = _Source(args.noisy, sequence, args.window)
     same_noise = False
-    with FrameLines() as lines, bar(args, "frames", len(frames)) as progress:
-        for number in frames:
+    with FrameLines(openjd=args.openjd and len(frames)) as lines, bar(args, "frames", len(frames)) as progress:
+        for done, number in enumerate(frames, 1):
             lines.begin(number)
             path, settings = frame_path(args.out, number), source.settings(number, args.passes)
             whole = None if args.overwrite else frame_store.read_whole(path)
@@ -98,6 +107,8 @@ def run(args: argparse.Namespace) -> int:
                 lines.skipped(path)
             else:
                 middle, pictures, repeated = source.denoise(number, args.passes)
+                if source.settings(number, args.passes) != settings:
+                    raise EngineError(str(path), "its noisy frames were written anew meanwhile", "Try again")
                 if repeated and not same_noise:
                     lines.note("neighbours have the same noise, which stays; switch on Animated Seed")
                 same_noise |= repeated
@@ -106,6 +117,7 @@ def run(args: argparse.Namespace) -> int:
                 frame_store.write_frame(path, pictures, kept | extra)
                 lines.saved(path)
             progress.update()
+            lines.finished(done)
     return 0
 
 
@@ -122,7 +134,7 @@ class _Source:
     def __init__(self, template: str, sequence: set[int] | None, window: int) -> None:
         self._template, self._sequence = template, sequence
         self._reach = window // 2
-        self._held: dict[int, NoisyFrame] = {}
+        self._held: dict[int, tuple[str, NoisyFrame]] = {}  # with the checksum of the file
 
     def _path(self, number: int) -> Path | None:
         """File of a frame; None where the sequence has none."""
@@ -147,16 +159,18 @@ class _Source:
         return hashlib.sha256(json.dumps([__version__, passes, sums]).encode()).hexdigest()
 
     def frame(self, number: int) -> NoisyFrame:
-        """A noisy frame, read when first needed."""
+        """A noisy frame, read when first needed, and when its file is another one."""
+        from ..render.picture.frames import read_checksum
         from ..render.picture.shots import read_noisy
 
-        if number not in self._held:
-            path = frame_path(self._template, number)
+        path = frame_path(self._template, number)
+        checksum = read_checksum(path)
+        if number not in self._held or self._held[number][0] != checksum:
             noisy = read_noisy(path)
             if noisy.metadata.get("frame", str(number)) != str(number):
                 raise AssetError(str(path), f"is frame {noisy.metadata['frame']}", "Give it the name of its number")
-            self._held[number] = noisy
-        return self._held[number]
+            self._held[number] = checksum, noisy
+        return self._held[number][1]
 
     def denoise(self, number: int, passes: tuple[str, ...] | None) -> tuple[NoisyFrame, dict[str, np.ndarray], bool]:
         """The noisy frame, its denoised passes, and whether a neighbour has the very same noise."""

@@ -2,12 +2,33 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 import time
+from typing import IO
 
 HEARTBEAT_SECONDS = 30.0
 #: Between two progress lines of one frame.
 PROGRESS_SECONDS = 5.0
+
+
+def say(text: str, stream: IO[str] | None) -> None:
+    """Write a text at once. A log that cannot be written, as its disk is full, costs words and no frames.
+
+    Raises
+    ------
+    BrokenPipeError
+        The reader is gone.
+    """
+    if stream is None:  # given up before
+        return
+    try:
+        stream.write(text)
+        stream.flush()
+    except BrokenPipeError:
+        raise
+    except OSError:
+        pass  # there is nobody to tell
 
 
 class FrameLines:
@@ -76,7 +97,7 @@ class FrameLines:
             if doing:
                 self._doing = line
             self._last = time.monotonic()
-            print(line, flush=True)
+            say(line + "\n", sys.stdout)
 
     def _beat(self) -> None:
         while not self._ended.wait(min(1.0, self._heartbeat / 4)):

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import glob
 import hashlib
 import io
 import json
 import logging
 import os
+import re
 import sys
+import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
@@ -27,6 +30,8 @@ logger = logging.getLogger(__name__)
 
 #: Name of the settings hash in a frame's metadata.
 SETTINGS = "settings"
+#: Longer than the writing of any frame takes.
+ABANDONED_SECONDS = 900.0
 
 
 def settings_hash(frame: Frame, assets: Mapping[str, Path]) -> str:
@@ -72,6 +77,22 @@ def read_whole(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]] | Non
     except AssetError as error:
         logger.info("made again: %s", error)
         return None
+
+
+def remove_abandoned(template: str) -> None:
+    """Remove unfinished frames whose writers were killed: those that nobody has added to for long.
+
+    Parameters
+    ----------
+    template : pattern of the frames, with ``#``
+    """
+    folder, name = Path(template).parent, re.sub("#+", "*", glob.escape(Path(template).name))
+    stem, suffix = os.path.splitext(name)
+    with contextlib.suppress(OSError), tempfile.TemporaryFile(dir=folder) as new:
+        now = os.fstat(new.fileno()).st_mtime  # by the clock of the disk, which may not be that of this machine
+        for found in glob.glob(f".{stem}*{suffix}.*.tmp", root_dir=folder):
+            if now - (folder / found).stat().st_mtime > ABANDONED_SECONDS:
+                (folder / found).unlink()
 
 
 @contextlib.contextmanager

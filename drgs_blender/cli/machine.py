@@ -10,8 +10,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from ..asset.container import digest_asset
 from ..engine.client import EngineClient, engine_command
 from ..engine.limits import OPTION
+from ..errors import EngineError
 from .blender_process import BlenderProcess, Evaluated
 from .find_blender import Blender
 
@@ -39,6 +41,7 @@ class Machine:
         self._blender: BlenderProcess | None = None
         self._opened: tuple[object, ...] = ()
         self.assets: dict[str, Path] = {}
+        self._contents: dict[Path, str] = {}
 
     def __enter__(self) -> Machine:
         return self
@@ -84,9 +87,25 @@ class Machine:
                 self._close_blender()
 
     def _load(self, path: Path) -> str:
+        self._contents[path] = digest_asset(path)
         key = self.engine_in_use.load_asset(str(path))
         self.assets[key] = path
+        self._check(path)
         return key
+
+    def check_assets(self) -> None:
+        """Refuse what was rendered while an asset was written anew: nobody knows of which of its contents it is.
+
+        Raises
+        ------
+        EngineError, AssetError
+        """
+        for path in self.assets.values():
+            self._check(path)
+
+    def _check(self, path: Path) -> None:
+        if digest_asset(path) != self._contents[path]:
+            raise EngineError(str(path), "was written anew while frames were rendered", "Try again")
 
     @property
     def engine_in_use(self) -> EngineClient:

@@ -7,6 +7,7 @@ Exit codes are those of `drgs_blender.errors` (0 done, 64 usage, 65 bad asset, 6
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib
 import logging
 import re
@@ -18,6 +19,7 @@ from typing import NoReturn
 
 from .. import errors
 from ..version import __version__
+from .frame_lines import say
 
 logger = logging.getLogger(__name__)
 
@@ -105,9 +107,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     code = run_command(arguments)
     command = next((word for word in arguments if not word.startswith("-")), None)
-    if command in ("render", "denoise") and not {"-h", "--help"} & set(arguments):
-        # Farms read this last line.
-        print(f"DRGS_EXIT class={errors.EXIT_CLASSES.get(code, 'internal')}", flush=True)
+    with contextlib.suppress(BrokenPipeError):
+        if command in ("render", "denoise") and not {"-h", "--help"} & set(arguments):
+            # Farms read this last line.
+            say(f"DRGS_EXIT class={errors.EXIT_CLASSES.get(code, 'internal')}\n", sys.stdout)
+    for name in ("stdout", "stderr"):
+        try:
+            getattr(sys, name).flush()
+        except (OSError, AttributeError):
+            setattr(sys, name, None)  # Python would end with a code of its own for what cannot be written
     return code
 
 
@@ -127,10 +135,10 @@ def run_command(arguments: Sequence[str], run: Callable[[argparse.Namespace], in
         finally:
             signal.signal(signal.SIGTERM, previous)
     except errors.DrgsError as error:
-        print(f"drgs: {error}", file=sys.stderr)
+        say(f"drgs: {error}\n", sys.stderr)
         return error.exit_code
     except (KeyboardInterrupt, errors.Cancelled):
-        print("drgs: interrupted", file=sys.stderr)
+        say("drgs: interrupted\n", sys.stderr)
         return 130
     except BrokenPipeError:
         sys.stdout = None  # the reader left; nothing may be flushed at exit
@@ -140,13 +148,13 @@ def run_command(arguments: Sequence[str], run: Callable[[argparse.Namespace], in
     except MemoryError as error:
         logger.info("out of memory", exc_info=True)
         reason = f" ({error})" if str(error) else ""
-        print(f"drgs: the memory is not enough for this{reason}. Use a smaller picture or file.", file=sys.stderr)
+        say(f"drgs: the memory is not enough for this{reason}. Use a smaller picture or file.\n", sys.stderr)
         return errors.EXIT_RETRY
     except Exception as error:
         # The one place where any exception ends: a user gets a sentence, -v a traceback, a farm its exit code.
         logger.info("internal error", exc_info=True)
         hint = "" if verbose else " Run again with -v for details and report it."
-        print(f"drgs: internal: {type(error).__name__}: {error}.{hint}", file=sys.stderr)
+        say(f"drgs: internal: {type(error).__name__}: {error}.{hint}\n", sys.stderr)
         return errors.EXIT_INTERNAL
 
 

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING
 
 from ..errors import AssetError, Cancelled, DeviceError, EngineError, UsageError
 from ..sequence import frame_path
-from . import sampling
+from . import sampling, session_link
 from .find_blender import find_blender
 from .frame_lines import FrameLines
 from .frame_range import absolute_template, check_template, parse_frames
@@ -64,10 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--enable-scripts", action="store_true", help="let the file run its own Python scripts and drivers"
     )
-    parser.add_argument(
-        "--session", type=Path, metavar="FOLDER", help="let the Blender and engine of `drgs session start` render"
-    )
-    parser.add_argument("--openjd", action="store_true", help="tell an Open Job Description session the progress")
+    session_link.add_arguments(parser)
     group = parser.add_argument_group("machine")
     group.add_argument("--device", default="cpu", help="what computes: cpu")
     group.add_argument(
@@ -89,13 +86,8 @@ def seconds(text: str) -> float:
 
 def run(args: argparse.Namespace) -> int:
     """Render every frame that is not there yet, here or by the session's engine."""
-    if args.session:
-        from .session_link import hand_on
-
-        code = hand_on(args.session, args.words)
-        if code is not None:
-            return code
-        logger.info("session %s: has no engine, the frames are rendered by one of their own", args.session)
+    if args.session and (code := session_link.hand_on(args.session, args.words)) is not None:
+        return code
     from .machine import Machine
 
     with Machine() as machine:
@@ -119,6 +111,7 @@ def render(args: argparse.Namespace, machine: Machine) -> int:
 
     from . import frame_store
 
+    frame_store.remove_abandoned(template)
     job = {"scene": str(scene), "frames": frames, "scripts": args.enable_scripts, "passes": args.passes}
     noted: set[str] = set()
     done: set[int] = set()
@@ -148,6 +141,7 @@ def render(args: argparse.Namespace, machine: Machine) -> int:
                 lines.begin(number)
                 pictures = render_in_time(engine, frame, partial(lines.progress, number), args.timeout)
                 note(pictures.warnings)
+                machine.check_assets()
                 frame_store.save(path, pictures, frame, number, settings)
                 lines.saved(path)
             progress.update(number not in done)

@@ -18,14 +18,14 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ..asset.archive import replace_file
 from ..errors import EngineError, UsageError
 from . import sampling
-from .session_link import FORGOTTEN_SECONDS, POLL_SECONDS, Lock, end, is_running, own_folder
+from .session_link import POLL_SECONDS, Lock, end, is_running, own_folder
 
 if TYPE_CHECKING:
     from .machine import Machine
@@ -92,7 +92,7 @@ def serve(folder: Path, idle: int) -> int:
     with Machine(keep=True) as machine:
         machine.engine().start()
         lock = Lock(folder / "lock")
-        if not lock.take():
+        if not lock.take(1.0):
             raise UsageError(f"session {folder}", "is running", "Stop it, or choose another folder")
         for old in folder.iterdir():  # of a session that was killed
             if old.name not in ("lock", "log"):
@@ -101,19 +101,24 @@ def serve(folder: Path, idle: int) -> int:
         life = _Life(folder, idle)
         while True:
             for request in folder.glob("request-*.json"):
-                with life.at_work(request):
-                    code = _answer(folder, request, machine)
-                if code in (130, 143):  # it was asked to end while it rendered
+                about = json.loads(request.read_text())
+                with life.at_work(folder / f"{about['name']}.waits"):
+                    code = _answer(folder, about, machine)
+                replace_file(folder / f"{about['name']}.code", [str(code).encode()])
+                request.unlink(missing_ok=True)
+                if code in (130, 143):  # it was asked to end while it worked
                     return 0
             time.sleep(POLL_SECONDS)
 
 
-def _answer(folder: Path, request: Path, machine: Machine) -> int:
+def _answer(folder: Path, about: dict[str, Any], machine: Machine) -> int:
     """Run one command line; its exit code."""
+    from .denoise import denoise
     from .main import run_command, set_up_logging
     from .render import render
 
-    about = json.loads(request.read_text())
+    work: dict[str, Callable[[argparse.Namespace], int]]
+    work = {"render": lambda args: render(args, machine), "denoise": denoise}
     name = about["name"]
     with contextlib.suppress(OSError):  # relative paths do not exist either where the folder is gone
         os.chdir(about["cwd"])
@@ -123,10 +128,8 @@ def _answer(folder: Path, request: Path, machine: Machine) -> int:
         contextlib.redirect_stdout(out),
         contextlib.redirect_stderr(err),
     ):
-        code = run_command(about["words"], lambda args: render(args, machine))
+        code = run_command(about["words"], lambda args: work[args.command](args))
     set_up_logging(0, False)  # it wrote to the file just closed
-    request.unlink(missing_ok=True)
-    replace_file(folder / f"{name}.code", [str(code).encode()])
     return code
 
 
@@ -135,19 +138,19 @@ class _Life:
 
     def __init__(self, folder: Path, idle: int) -> None:
         self._folder, self._idle = folder, idle
-        self._request: Path | None = None
+        self._waits: Path | None = None
         self._since = self._born = time.monotonic()
         self._ancestors = _ancestors()
         threading.Thread(target=self._watch, daemon=True).start()
 
     @contextlib.contextmanager
-    def at_work(self, request: Path) -> Iterator[None]:
-        """While a chunk is rendered somebody has to wait for it."""
-        self._request = request
+    def at_work(self, waits: Path) -> Iterator[None]:
+        """While a chunk is worked at, somebody has to wait for it, who locks that file."""
+        self._waits = waits
         try:
             yield
         finally:
-            self._request, self._since = None, time.monotonic()
+            self._waits, self._since = None, time.monotonic()
 
     def _watch(self) -> None:
         worker: tuple[int, str] | None = None
@@ -167,11 +170,14 @@ class _Life:
             return "it was asked to"
         if worker is not None and not _alive(worker):
             return "who started it is gone"
-        request = self._request
-        if request is None:
+        waits = self._waits
+        if waits is None:
             return "nothing was asked of it" if time.monotonic() - self._since > self._idle else None
-        with contextlib.suppress(OSError):  # it has just been answered
-            if time.time() - request.stat().st_mtime > FORGOTTEN_SECONDS:
+        with contextlib.suppress(OSError):  # the folder went just now
+            lock = Lock(waits)
+            free = lock.take()
+            lock.close()
+            if free and self._waits is waits:  # else it has just been answered
                 return "nobody waits for its frames"
         return None
 

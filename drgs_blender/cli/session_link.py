@@ -3,16 +3,19 @@
 | File | |
 |---|---|
 | ``lock`` | locked as long as the session's process lives, whatever ends it |
-| ``request-N.json`` | command line and folder of a chunk; its date is renewed while somebody waits for the answer |
+| ``request-N.json`` | command line and folder of a chunk; goes when it is answered |
+| ``N.waits`` | locked as long as somebody waits for the answer |
 | ``N.out``, ``N.err``, ``N.code`` | what the command printed so far, and at its end the exit code |
 | ``stop`` | asks the process to end |
 """
 
 from __future__ import annotations
 
+import argparse
 import codecs
 import contextlib
 import json
+import logging
 import os
 import secrets
 import signal
@@ -24,10 +27,13 @@ from typing import IO
 
 from ..asset.archive import replace_file
 from ..errors import EngineError, UsageError
+from .frame_lines import HEARTBEAT_SECONDS, say
+
+logger = logging.getLogger(__name__)
 
 POLL_SECONDS = 0.05
-#: A chunk for which nobody has waited for so long is given up, with the process: its client was killed.
-FORGOTTEN_SECONDS = 30.0
+#: A process that works says something at least every `HEARTBEAT_SECONDS`.
+SILENT_SECONDS = 4 * HEARTBEAT_SECONDS
 #: How long a process that was asked to end may take.
 END_SECONDS = 4.0
 
@@ -38,8 +44,14 @@ class Lock:
     def __init__(self, path: Path) -> None:
         self._file: IO[bytes] = open(path, "a+b")  # noqa: SIM115 - open as long as it is locked
 
-    def take(self) -> bool:
-        """Lock it, unless another process has."""
+    def take(self, patience: float = 0.0) -> bool:
+        """Lock it, unless another process has, and keeps it for `patience` seconds: who only looks, takes it too."""
+        deadline = time.monotonic() + patience
+        while not (taken := self._take()) and time.monotonic() < deadline:
+            time.sleep(POLL_SECONDS / 5)
+        return taken
+
+    def _take(self) -> bool:
         try:
             if sys.platform == "win32":
                 import msvcrt
@@ -103,6 +115,14 @@ def _until_gone(folder: Path, seconds: float) -> bool:
     return not running
 
 
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of commands that a session can run."""
+    parser.add_argument(
+        "--session", type=Path, metavar="FOLDER", help="let the process of `drgs session start` do it, which is warm"
+    )
+    parser.add_argument("--openjd", action="store_true", help="tell an Open Job Description session the progress")
+
+
 def hand_on(folder: Path, words: Sequence[str]) -> int | None:
     """Have the session's process run the command `words`, and print what it prints.
 
@@ -114,49 +134,60 @@ def hand_on(folder: Path, words: Sequence[str]) -> int | None:
     Raises
     ------
     EngineError
-        The process died of it.
+        The process died of it, or says nothing any more.
     """
     folder = folder.absolute()
     if not is_running(folder):
+        logger.info("session %s: is not there, this process does the work", folder)
         return None
     own_folder(folder)
     name = secrets.token_hex(4)
     request = folder / f"request-{name}.json"
-    files = {stream: folder / f"{name}.{stream}" for stream in ("out", "err", "code")}
+    files = {kind: folder / f"{name}.{kind}" for kind in ("out", "err", "code", "waits")}
+    waits = Lock(files["waits"])
+    waits.take()
     replace_file(request, [json.dumps({"name": name, "words": list(words), "cwd": os.getcwd()}).encode()])
     try:
         tails = [_tail(files["out"], sys.stdout), _tail(files["err"], sys.stderr)]
-        renewed = time.monotonic()
+        heard = time.monotonic()
         while True:
+            # Looked at in this order: the code is there before the request goes, and before the process ends.
+            gone = not request.exists() or not is_running(folder)
             ended = files["code"].exists()
-            dead = not ended and not is_running(folder)
-            for tail in tails:
-                next(tail)
+            news = [next(tail) for tail in tails]
             if ended:
                 return int(files["code"].read_text())
-            if dead and not files["code"].exists():
+            if gone:
                 raise EngineError(f"session {folder}", "its process died", "Try again")
-            if time.monotonic() - renewed > 1.0 and request.exists():
-                os.utime(request)
-                renewed = time.monotonic()
+            if any(news) or (not files["out"].exists() and _others_wait(folder, request)):
+                heard = time.monotonic()
+            if time.monotonic() - heard > SILENT_SECONDS:
+                end(folder)
+                problem = f"said nothing for {SILENT_SECONDS:g} s and was ended"
+                raise EngineError(f"session {folder}", problem, "Try again")
             time.sleep(POLL_SECONDS)
     except BaseException as error:
         if not isinstance(error, EngineError):
             end(folder)  # this side was asked to end, and what it asked for with it
         raise
     finally:
+        waits.close()
         for path in (request, *files.values()):
             path.unlink(missing_ok=True)
 
 
-def _tail(path: Path, stream: IO[str]) -> Iterator[None]:
-    """Each step prints what was added to a file."""
+def _others_wait(folder: Path, request: Path) -> bool:
+    """Whether another chunk may be the one that is worked at."""
+    return any(other != request for other in folder.glob("request-*.json"))
+
+
+def _tail(path: Path, stream: IO[str]) -> Iterator[bool]:
+    """Each step prints what was added to a file, and says whether there was anything."""
     while not path.exists():
-        yield
+        yield False
     decoder = codecs.getincrementaldecoder("utf-8")("replace")
     with open(path, "rb") as source:
         while True:
             if text := decoder.decode(source.read()):
-                stream.write(text)
-                stream.flush()
-            yield
+                say(text, stream)
+            yield bool(text)

@@ -147,6 +147,9 @@ def check(job: Job, args: argparse.Namespace) -> list[Path]:
         print(f"missing  {text}")
     for text in report.notes:
         print(f"note     {text}")
+    if args.manager == "check":
+        for path in report.files:
+            print(f"file     {path}")
     report.raise_fault(job.scene)
     print(f"ok       {job.scene}: {len(report.files)} files, frames {job.range}")
     return report.files

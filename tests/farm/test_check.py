@@ -20,11 +20,13 @@ def test_files_and_settings_that_a_node_would_do_without_are_named(drgs, folder)
 
 def test_scene_that_takes_everything_along_is_fine(drgs, folder, tmp_path):
     code, lines, error = check(drgs, folder, "relative.blend", "--shared", folder)
-    assert (code, len(lines)) == (0, 1), (error, lines)
-    assert lines[0].startswith("ok") and "1 files, frames 1-3" in lines[0]
+    assert (code, len(lines)) == (0, 2), (error, lines)
+    assert lines[0].split() == ["file", str(folder / "tile.drgs")]
+    assert lines[1].startswith("ok") and "1 files, frames 1-3" in lines[1]
     code, lines, _ = check(drgs, folder, "relative.blend", "--shared", tmp_path)
     assert code == 65
-    assert [line.rsplit(": ", 1)[1] for line in lines] == ["is not in a shared folder"] * 2
+    missing = [line for line in lines if line.startswith("missing")]
+    assert [line.rsplit(": ", 1)[1] for line in missing] == ["is not in a shared folder"] * 2
 
 
 def test_scene_that_cannot_be_rendered_is_refused_as_by_a_node(drgs, folder, monkeypatch):

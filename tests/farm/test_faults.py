@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from processes import children, gone, open_files
+
+from drgs_blender.asset.container import read_asset, write_asset
 
 from .conftest import PROGRAM, WHOLE, same_pixels
 
@@ -42,6 +46,81 @@ def test_folder_that_cannot_be_written_is_found_before_anything_is_rendered(drgs
     disk = small_disk("ro")
     code, lines, error = drgs("render", folder / "shot.blend", "--frames", "1", "--out", disk / "####.exr")
     assert (code, lines) == (73, ["DRGS_EXIT class=cannot-write"]) and "ead-only" in error
+
+
+def test_denoised_frames_meet_full_and_sealed_disks_as_rendered_ones_do(drgs, folder, small_disk, tmp_path):
+    noisy = tmp_path / "noisy" / "####.exr"
+    options = ("--rays", 4, "--denoise", "none", "--passes", "temporal")
+    assert drgs("render", folder / "shot.blend", "--frames", "1-2", "--out", noisy, *options)[0] == 0
+    disk = small_disk("size=16k")
+    job = ("denoise", noisy, "--frames", "1-2", "--out", disk / "####.exr")
+    (disk / "filler").write_bytes(bytes(16 << 10))
+    code, lines, error = drgs(*job)
+    assert (code, lines[-1]) == (73, "DRGS_EXIT class=cannot-write") and "0001.exr" in error
+    assert [path.name for path in disk.iterdir()] == ["filler"]
+    small_disk("ro")
+    code, lines, _ = drgs(*job)
+    assert (code, lines) == (73, ["DRGS_EXIT class=cannot-write"])
+    small_disk("rw,size=1m")
+    code, lines, _ = drgs(*job)
+    assert code == 0 and sum(line.startswith("Saved") for line in lines) == 2
+
+
+@linux
+def test_log_on_a_full_disk_costs_neither_frame_nor_code(folder, tmp_path):
+    """Logs lie on the disk of the frames as a rule; when it has room again the job goes on."""
+    for scene, code in (("shot.blend", 0), ("blind.blend", 64)):
+        command = [*PROGRAM.split(), "render", str(folder / scene), "--frames", "1-2", "--rays", "4"]
+        command += ["--out", str(tmp_path / "####.exr")]
+        with open("/dev/full", "w") as full:
+            done = subprocess.run(command, stdout=full, stderr=full, timeout=120)
+        assert done.returncode == code
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["0001.exr", "0002.exr"]
+
+
+def test_full_disk_of_temporary_files_is_said_and_can_be_tried_again(folder, small_disk, tmp_path):
+    disk = small_disk("size=16k,nr_inodes=3")
+    (disk / "filler").touch()
+    process = start(folder, tmp_path / "out", "1", scratch=disk)
+    out, error = process.communicate(timeout=60)
+    assert (process.returncode, out.splitlines()[-1]) == (73, "DRGS_EXIT class=cannot-write"), error
+    assert "temporary files" in error and "TMPDIR" in error
+    assert [path.name for path in disk.iterdir()] == ["filler"]
+
+
+def test_frames_of_an_asset_that_changes_meanwhile_are_not_kept(folder, tmp_path):
+    """They would be of the old content and bear the hash of the new one."""
+    for name in ("relative.blend", "tile.drgs"):
+        shutil.copy(folder / name, tmp_path)
+    (tmp_path / "relative.blend").rename(tmp_path / "shot.blend")
+    asset = read_asset(tmp_path / "tile.drgs")
+    process = start(tmp_path, tmp_path / "out", "1-9", "--rays", "8192")
+    while not process.stdout.readline().startswith("Fra:1 "):
+        assert process.poll() is None
+    write_asset(tmp_path / "tile.drgs", replace(asset, mesh=replace(asset.mesh, albedo=0.5 * asset.mesh.albedo)))
+    _, error = process.communicate(timeout=60)
+    assert process.returncode == 75 and "tile.drgs" in error and "written anew" in error
+    assert not list((tmp_path / "out").iterdir())
+
+
+def test_memory_that_does_not_do_gives_the_frame_back(drgs, folder, tmp_path):
+    job = ("render", folder / "large.blend", "--frames", "1", "--rays", "4", "--passes", "all")
+    code, lines, error = drgs(*job, "--memory-mb", 256, "--out", tmp_path / "####.exr")
+    assert (code, lines[-1]) == (75, "DRGS_EXIT class=retry"), error
+    assert not list(tmp_path.iterdir())
+    code, _, error = drgs(*job, "--memory-mb", 4000, "--out", tmp_path / "####.exr")
+    assert code == 0, error
+
+
+def test_unfinished_frames_of_killed_writers_go(drgs, folder, tmp_path):
+    """Those of the same job that nobody adds to; other files stay."""
+    names = [".a_0007.exr.x1.tmp", ".a_0001.exr.x2.tmp", ".b_0001.exr.x3.tmp", "notes.tmp"]
+    for name in names:
+        (tmp_path / name).touch()
+    for name in (names[0], *names[2:]):
+        os.utime(tmp_path / name, (0, 0))
+    assert drgs("render", folder / "shot.blend", "--frames", "1", "--out", tmp_path / "a_####.exr", "--rays", 4)[0] == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*names[1:], "a_0001.exr"])
 
 
 def sockets(pid: int) -> set[str]:

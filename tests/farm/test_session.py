@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 from processes import children, gone
 
-from drgs_blender.cli import session_link
+from drgs_blender.cli import denoise, session_link
+from drgs_blender.errors import EngineError
 from drgs_blender.render.picture.frames import read_frame
 
 from .conftest import PROGRAM, same_pixels
@@ -133,9 +134,7 @@ def test_task_that_is_ended_takes_its_frame_along(folder, warm, tmp_path, how):
     all_of_it = family(server(warm))
     if how == signal.SIGKILL:
         process.kill()
-        (request,) = warm.glob("request-*.json")
         process.wait()
-        os.utime(request, (0, 0))  # long ago
         assert all_gone(all_of_it)
     else:
         process.send_signal(how)
@@ -144,6 +143,41 @@ def test_task_that_is_ended_takes_its_frame_along(folder, warm, tmp_path, how):
         assert process.returncode == 143 and text.splitlines()[-1] == "DRGS_EXIT class=terminated"
         assert all_gone(all_of_it, started + 5 - time.monotonic())
     assert not list((tmp_path / "out").iterdir())
+
+
+def test_session_that_hangs_is_ended_and_the_chunk_given_back(folder, warm, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(session_link, "SILENT_SECONDS", 3.0)
+    assert told(folder / "relative.blend", tmp_path / "out", warm, "1")[0] == 0
+    all_of_it = family(server(warm))
+    os.kill(server(warm), signal.SIGSTOP)
+    started = time.monotonic()
+    with pytest.raises(EngineError, match="said nothing for 3 s"):
+        session_link.hand_on(warm, ["render", "a.blend", "--frames", "1", "--out", "#.exr"])
+    assert time.monotonic() - started < 15
+    assert all_gone(all_of_it) and not session_link.is_running(warm)
+
+
+def test_request_that_is_lost_is_given_back(folder, warm, tmp_path):
+    process = chunk(folder / "relative.blend", tmp_path / "out", warm, "1", "--rays", "65536")
+    assert process.stdout.readline().startswith("Fra:1")
+    for request in warm.glob("request-*.json"):
+        request.unlink()
+    _, errors = process.communicate(timeout=30)
+    assert process.returncode == 75 and "Try again" in errors
+
+
+def test_frames_are_denoised_by_the_warm_process(drgs, folder, warm, tmp_path, monkeypatch):
+    noisy, here, there = (tmp_path / name / "####.exr" for name in ("noisy", "here", "there"))
+    options = ("--rays", 4, "--denoise", "none", "--passes", "temporal")
+    assert drgs("render", folder / "relative.blend", "--frames", "1-3", "--out", noisy, *options)[0] == 0
+    job = ("denoise", noisy, "--frames", "1-3", "--openjd", "--out")
+    with monkeypatch.context() as patch:
+        patch.setattr(denoise, "denoise", None)  # this process does not
+        code, lines, errors = drgs(*job, there, "--session", warm)
+    assert (code, errors, lines[-1]) == (0, "", "DRGS_EXIT class=ok") and "openjd_progress: 100.0" in lines
+    assert drgs(*job, here)[0] == 0
+    assert len(list(here.parent.iterdir())) == 3
+    assert all(path.read_bytes() == (there.parent / path.name).read_bytes() for path in here.parent.iterdir())
 
 
 def test_session_ends_without_its_folder_its_farm_or_work(tmp_path):

@@ -74,6 +74,17 @@ def test_chunk_that_ends_with_75_is_queued_again_and_the_second_step_waits(drgs,
         assert (tmp_path / "clean" / name).is_file()
 
 
+def test_chunk_that_met_a_full_disk_is_queued_again(drgs, trio, scene, tmp_path, monkeypatch):
+    monkeypatch.setitem(trio.env, "DRGS_PAUSE", "1")
+    job = submit(
+        drgs, trio, scene, "--frames", "1", "--out", "//f/####.exr",
+        "--drgs", f"sh -c 'mkdir {tmp_path / 'mark'} && exit 73; exit 0'",
+    )  # fmt: skip
+    trio.until_done(60)
+    (told,) = logs(job, "render").values()
+    assert "wait for room" in told and "attempt 2" in told and "attempt 3" not in told
+
+
 def test_chunk_that_always_ends_with_75_is_given_up(drgs, trio, scene):
     job = submit(
         drgs, trio, scene, "--frames", "1-2", "--out", "//f/####.exr", "--denoised", "//clean/####.exr",

@@ -13,6 +13,7 @@ from shapes import sphere_mesh
 from drgs_blender.asset.container import write_asset
 from drgs_blender.asset.model import Asset, Mesh
 from drgs_blender.cli import frame_store
+from drgs_blender.cli.frame_lines import FrameLines
 from drgs_blender.cli.main import main
 from drgs_blender.deform.attach import attach
 from drgs_blender.engine.session import Session
@@ -170,6 +171,26 @@ def test_resumes_and_sees_what_changed(denoise, rendered, tmp_path):
     assert saved == ["0002", "0003", "0004", "0005"]
     _, lines, _ = denoise("1-5", "--overwrite", source=source)
     assert sum(line.startswith("Saved") for line in lines) == 5
+
+
+def test_frames_written_anew_meanwhile_are_not_passed_off_as_read(denoise, rendered, tmp_path, monkeypatch):
+    """What is held in memory of a neighbour is of the file that the hash is of."""
+    source, said = tmp_path / "copy", FrameLines.saved
+    shutil.copytree(rendered / "noisy", source)
+
+    def saved(lines: FrameLines, path: Path) -> None:
+        said(lines, path)
+        if Path(path).name == "0003.exr":
+            passes, metadata = read_frame(source / "0004.exr")
+            write_frame(source / "0004.exr", passes | {"DiffDir": 2 * passes["DiffDir"]}, metadata)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(FrameLines, "saved", saved)
+        assert denoise("3-4", source=source)[0] == 0
+    assert denoise("4", source=source, out="fresh")[0] == 0
+    assert (tmp_path / "out" / "0004.exr").read_bytes() == (tmp_path / "fresh" / "0004.exr").read_bytes()
+    lines = denoise("3", source=source)[1]
+    assert any(line.startswith("Saved") for line in lines)  # it is of the old one
 
 
 def test_what_is_wrong_is_named(denoise, rendered, tmp_path):

@@ -139,6 +139,21 @@ def test_a_failed_rename_leaves_the_old_frame_and_nothing_else(tmp_path: Path, m
     assert os.listdir(tmp_path) == ["f.exr"]
 
 
+def test_disks_that_cannot_flush_a_folder_hold_frames_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Some network file systems refuse it, after the frame has its name."""
+    flush, refused = os.fsync, []
+
+    def fsync(handle: int) -> None:
+        if stat.S_ISDIR(os.fstat(handle).st_mode):
+            refused.append(handle)
+            raise OSError(22, "Invalid argument")
+        flush(handle)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    write_frame(tmp_path / "f.exr", some_passes((2, 2)), {"run": "1"})
+    assert refused and read_frame(tmp_path / "f.exr")[1] == {"run": "1"}
+
+
 def test_missing_folder(tmp_path: Path) -> None:
     with pytest.raises(WriteError):
         write_frame(tmp_path / "absent" / "f.exr", some_passes((2, 2)), {})

@@ -69,12 +69,10 @@ def template(job: Job, seconds: int = 0) -> dict[str, Any]:
     """The job template (specification 2023-09 with TASK_CHUNKING)."""
     out = f"{{{{Param.{_OUT}}}}}/{Path(job.out).name}"
     frames = "{{Task.Param.Frame}}"
-    command = [*job.render(frames, f"{{{{Param.{_SCENE}}}}}", out), "--openjd", f"--session={_SESSION}"]
-    steps = [_step("Render", job, seconds, command)]
-    steps[0]["stepEnvironments"].append(_warm_engine(job))
+    steps = [_step("Render", seconds, job.render(frames, f"{{{{Param.{_SCENE}}}}}", out))]
     if job.clean:
         clean = f"{{{{Param.{_CLEAN}}}}}/{Path(job.clean).name}"
-        steps.append(_step("Denoise", job, seconds, job.denoise(frames, out, clean, "{{Param.Frames}}")))
+        steps.append(_step("Denoise", seconds, job.denoise(frames, out, clean, "{{Param.Frames}}")))
         steps[1]["dependencies"] = [{"dependsOn": "Render"}]
     every = write_frames(sorted(job.frames))  # its ranges may not overlap
     parameters = [
@@ -90,6 +88,7 @@ def template(job: Job, seconds: int = 0) -> dict[str, Any]:
         "extensions": ["TASK_CHUNKING"],
         "name": job.name,
         "parameterDefinitions": parameters,
+        "jobEnvironments": [_checked_node(job), _warm_engine(job)],
         "steps": steps,
     }
 
@@ -99,8 +98,8 @@ def _path(name: str, kind: str, flow: str, about: str) -> dict[str, Any]:
     return {"name": name, "type": "PATH", "objectType": kind, "dataFlow": flow, "description": about}
 
 
-def _step(name: str, job: Job, seconds: int, command: list[str]) -> dict[str, Any]:
-    """A step that runs `command` for chunks of frames, in sessions that first check the node."""
+def _step(name: str, seconds: int, command: list[str]) -> dict[str, Any]:
+    """A step that runs `command` for chunks of frames in the warm process of the session."""
     # Chunks that must be contiguous would be single frames wherever a range has steps.
     chunks: dict[str, Any] = {"defaultTaskCount": "{{Param.ChunkSize}}", "rangeConstraint": "NONCONTIGUOUS"}
     if seconds:
@@ -109,14 +108,16 @@ def _step(name: str, job: Job, seconds: int, command: list[str]) -> dict[str, An
     return {
         "name": name,
         "parameterSpace": {"taskParameterDefinitions": [frame]},
-        "stepEnvironments": [
-            {
-                "name": "CheckedNode",
-                "description": "Ends the session where DR-GS cannot render",
-                "script": {"actions": {"onEnter": _action([*job.program, "doctor", "--node"])}},
-            }
-        ],
-        "script": {"actions": {"onRun": _action(command)}},
+        "script": {"actions": {"onRun": _action([*command, "--openjd", f"--session={_SESSION}"])}},
+    }
+
+
+def _checked_node(job: Job) -> dict[str, Any]:
+    """An environment that cannot be entered where DR-GS cannot render."""
+    return {
+        "name": "CheckedNode",
+        "description": "Ends the session where DR-GS cannot render",
+        "script": {"actions": {"onEnter": _action([*job.program, "doctor", "--node"])}},
     }
 
 

@@ -12,6 +12,7 @@ OpenEXR itself accepts many damaged files; `read_frame` checks it.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import tempfile
 import zlib
@@ -68,7 +69,8 @@ def write_frame(path: str | Path, passes: dict[str, Array], metadata: dict[str, 
         _verify(temporary, channels, checksum)
         temporary.chmod(0o666 & ~_umask())
         os.replace(temporary, path)
-        _flush(path.parent)
+        with contextlib.suppress(OSError):  # the frame is there; some network disks cannot flush a folder
+            _flush(path.parent)
     except _FAILURES as error:
         remedy = "Check the folder's permissions and the free space on its disk"
         raise WriteError(str(path), f"cannot be written ({str(error).strip()})", remedy) from error
