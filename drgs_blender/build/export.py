@@ -28,7 +28,7 @@ def posed_surfels(asset: Asset, vertices: Array) -> Surfels:
     return surfels_of_pose(asset.surfels, MeshDriven(asset.mesh, asset.surfels, asset.binding).pose(vertices))
 
 
-def surfels_of_pose(rest: Surfels, posed: PosedSurfels) -> Surfels:
+def surfels_of_pose(rest: Surfels, posed: PosedSurfels, *, mirrored: bool = False) -> Surfels:
     """Surfels as a pose has them, in its space.
 
     A tangent pair that shear has made oblique becomes the axes of the same ellipse; captured colours turn with the
@@ -37,6 +37,7 @@ def surfels_of_pose(rest: Surfels, posed: PosedSurfels) -> Surfels:
     Parameters
     ----------
     rest : the same surfels before they were posed
+    mirrored : the pose contains a matrix that mirrors
     """
     tangents = np.stack([posed.tangent_u, posed.tangent_v], axis=-1).astype(np.float64)
     axes, scale, _ = np.linalg.svd(tangents, full_matrices=True)
@@ -47,7 +48,7 @@ def surfels_of_pose(rest: Surfels, posed: PosedSurfels) -> Surfels:
     frame = np.stack([axes[..., 0], np.cross(normal, axes[..., 0]), normal], axis=-1)
     sh = rest.sh
     if sh is not None:
-        sh = rotate_harmonics(whole_bands(sh), _turns(rest, tangents, normal))
+        sh = rotate_harmonics(whole_bands(sh), _turns(rest, tangents, normal, mirrored))
     thickness = rest.extras.get("thickness")
     extras = {}
     if thickness is not None:
@@ -66,15 +67,18 @@ def surfels_of_pose(rest: Surfels, posed: PosedSurfels) -> Surfels:
     )
 
 
-def _turns(rest: Surfels, tangents: Array, normal: Array) -> Array:
-    """(n, 3, 3) rotations that carry each surfel's frame at rest to its posed one: first tangent and normal."""
+def _turns(rest: Surfels, tangents: Array, normal: Array, mirrored: bool) -> Array:
+    """(n, 3, 3) rotations, mirrored or not, that carry each surfel's frame at rest to its posed one.
+
+    `normal` is that of the tangents: where they are mirrored, the other side is the one that `rest` has there.
+    """
     first = tangents[..., 0]
     length = np.linalg.norm(first, axis=1, keepdims=True)
     before = rotation_matrices(rest.rotation.astype(np.float64))
     first = np.where(length > 1e-30, first / np.maximum(length, 1e-30), before[..., 0])
     first = first - normal * np.sum(first * normal, axis=1, keepdims=True)
     first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-30)
-    after = np.stack([first, np.cross(normal, first), normal], axis=-1)
+    after = np.stack([first, np.cross(normal, first), -normal if mirrored else normal], axis=-1)
     return after @ before.transpose(0, 2, 1)
 
 

@@ -192,7 +192,7 @@ class FrameSource:
         from ..build.export import surfels_of_pose
 
         item = self._objects[index]
-        return surfels_of_pose(item.asset.surfels, item.surfels)
+        return surfels_of_pose(item.asset.surfels, item.surfels, mirrored=_mirrors(item.state.matrix_world))
 
     def _lit(self, index: int, progress: FractionBar) -> Splats:
         from ..build.relit import lit_colours, own_surfels, points_of_surfels, points_on_mesh
@@ -203,8 +203,8 @@ class FrameSource:
             points = points_of_surfels(surfels, index, size)
         else:
             faces, binding = item.asset.mesh.faces, item.asset.binding
-            mirrored = np.linalg.det(item.state.matrix_world[:3, :3]) < 0
-            points = points_on_mesh(surfels, item.mesh.vertices, faces, binding, mirrored=bool(mirrored))
+            mirrored = _mirrors(item.state.matrix_world)
+            points = points_on_mesh(surfels, item.mesh.vertices, faces, binding, mirrored=mirrored)
             points = points if tree is None else own_surfels(points, index, size)
         settings = self._frame.settings
         colour = lit_colours(self._scene, self._light, points, settings, self._lamps, tree, progress)
@@ -216,6 +216,10 @@ def _unlit(surfels: Surfels, choice: str) -> tuple[Splats, str]:
     if choice == "albedo" or surfels.sh is None:
         return splats_of(surfels, surfels.albedo), _SHOWN["albedo"]
     return splats_of(surfels), _SHOWN["captured"]
+
+
+def _mirrors(matrix: Array) -> bool:
+    return bool(np.linalg.det(matrix[:3, :3]) < 0)
 
 
 def _nothing() -> Surfels:

@@ -51,7 +51,7 @@ def rotate_harmonics(sh: Array, rotation: Array) -> Array:
     Parameters
     ----------
     sh : (n, k, 3) float32, k = 1, 4, 9 or 16
-    rotation : (3, 3), or (n, 3, 3) one a function
+    rotation : (3, 3), or (n, 3, 3) one a function; orthogonal: it may mirror
 
     Returns
     -------

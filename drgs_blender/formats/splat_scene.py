@@ -38,7 +38,7 @@ class Piece:
 
 
 def join_pieces(pieces: list[Piece], path: Path, layout: str, up: str) -> SurfelFile:
-    """All splats of a scene as surfels. A node that mirrors or flattens loses its splats, which is said."""
+    """All splats of a scene as surfels. A node that flattens loses its splats, which is said."""
     with np.errstate(all="ignore"):
         placed = [place(piece) for piece in pieces]
     whole = join_splats(placed)
@@ -57,7 +57,7 @@ def place(piece: Piece) -> Splats:
     linear = matrix[:3, :3]
     if not len(own) or np.array_equal(matrix, np.eye(4)):
         return Splats(own.centre, own.scale, own.rotation, own.opacity, sh)
-    if not (np.abs(matrix) <= FARTHEST).all() or not np.linalg.det(linear) > 0:
+    if not (np.abs(matrix) <= FARTHEST).all() or not np.abs(np.linalg.det(linear)) > 0:
         return Splats(np.full_like(own.centre, np.nan), own.scale, own.rotation, own.opacity, sh)
     left, size, right = np.linalg.svd(linear)
     turn = left @ right
@@ -70,7 +70,7 @@ def place(piece: Piece) -> Splats:
         frame, scale = turn @ axes, own.scale * np.float32(size.mean())
     else:
         frame, scale, _ = np.linalg.svd(linear @ axes * np.where(usable[:, None], own.scale, 0)[:, None, :])
-        frame[..., 2] *= np.sign(np.linalg.det(frame))[:, None]
+    frame[..., 2] *= np.sign(np.linalg.det(frame))[:, None]
     rotation = Rotation.from_matrix(frame).as_quat()[:, [3, 0, 1, 2]].astype(np.float32)
     rotation[~usable] = np.nan
     return Splats(centre, scale.astype(np.float32), rotation, own.opacity, rotate_harmonics(sh, turn))

@@ -14,6 +14,7 @@ from drgs_blender.cli.main import main
 from drgs_blender.deform.binding import bind
 from drgs_blender.engine.frame_file import read_frame_file, write_frame_file
 from drgs_blender.errors import AssetError, VersionError
+from drgs_blender.formats.harmonics import rotate_harmonics
 from drgs_blender.formats.registry import read_environment, read_mesh, read_surfels
 from drgs_blender.frame import Camera, Frame, Light, MeshState, ObjectState, RenderSettings, Visibility, World
 
@@ -93,6 +94,7 @@ def test_objects_stand_where_their_matrices_put_them(tmp_path: Path) -> None:
     first = covariance(found.rotation[:60], found.scale[:60])
     wanted = matrix[:3, :3] @ first @ matrix[:3, :3].T
     np.testing.assert_allclose(covariance(found.rotation[60:], found.scale[60:]), wanted, atol=1e-5)
+    np.testing.assert_allclose(found.sh[60:], rotate_harmonics(found.sh[:60], matrix[:3, :3] / 2), atol=1e-4)
     assert main(["convert", str(tmp_path / "f.drgsframe"), str(tmp_path / "f.glb"), "--scale", "2"]) == 0
     mesh = read_mesh(tmp_path / "f.glb")
     assert len(mesh.faces) == 4
