@@ -68,6 +68,24 @@ def test_the_mesh_opens_with_its_materials(ball, scene, tmp_path, name, end):
     assert images and min(images) > 8 and any(n.type == "BSDF_PRINCIPLED" for n in nodes)
 
 
+def test_splats_in_gltf_are_coloured_points_to_who_knows_no_splats(ball, ball_file, scene, tmp_path):
+    """Blender's importer among them: upright, linear colours, opacity in the fourth number."""
+    ball.location = (1, -2, 3)
+    bpy.context.view_layer.update()
+    out = tmp_path / "ball.glb"
+    assert bpy.ops.drgs.export(filepath=str(out), format="glTF splats", colour="albedo") == {"FINISHED"}
+    found = imported(bpy.ops.import_scene.gltf, out)
+    wanted = part("drgs_blender.asset.container").read_asset(ball_file).surfels
+    np.testing.assert_allclose(world_points(found), wanted.centre + np.float32((1, -2, 3)), atol=1e-5)
+    (points,) = [o.data for o in found if o.type == "MESH"]
+    (colour,) = [a for a in points.color_attributes if a.domain == "POINT"]
+    values = np.empty(4 * len(points.vertices), np.float32)
+    colour.data.foreach_get("color", values)
+    values = values.reshape(-1, 4)
+    np.testing.assert_allclose(values[:, :3], wanted.albedo, atol=0.01)
+    np.testing.assert_allclose(values[:, 3], wanted.opacity, atol=0.01)
+
+
 def test_selected_objects_frame_by_frame_and_back(ball, ball_file, scene, tmp_path):
     other = ball.copy()
     scene.collection.objects.link(other)

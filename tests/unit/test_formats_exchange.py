@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from splat_files import covariance, random_splats, refusals
 
@@ -205,6 +206,11 @@ def test_two_packings_of_one_capture_agree(shared_data: Path) -> None:
     for name in ("centre", "opacity", "albedo"):
         a, b = (getattr(s, name).mean(axis=0) for s in (spz, ply))
         np.testing.assert_allclose(a, b, atol=0.01)
+    distance, nearest = cKDTree(ply.centre).query(spz.centre[::10])
+    assert np.quantile(distance, 0.99) < 5e-4
+    first, second = covariance(spz.rotation, spz.scale)[::10], covariance(ply.rotation, ply.scale)[nearest]
+    size = np.trace(second, axis1=1, axis2=2)
+    assert np.quantile(np.abs(first - second).max(axis=(1, 2)) / size, 0.99) < 0.1
 
 
 def spz_3(splats: Splats, path: Path) -> bytes:
