@@ -70,7 +70,8 @@ WRITERS: tuple[Writer, ...] = (
     Writer(
         "SPZ",
         write_spz,
-        "centres to 1/8192 m within 2 km of the origin, scales to 3.2 %, opacities to 1/510, colours to 1/270",
+        "centres to 1/8192 m within 2 km of the origin, scales to 3.2 %, rotations to 0.4 degrees, "
+        "opacities to 1/510, colours to 1/270",
         "materials; scales below 0.05 mm or above 380 m; harmonics outside -1 to 1, and all finer than 1/16 (first "
         "band) or 1/8; colours outside -0.44 to 1.44",
     ),
