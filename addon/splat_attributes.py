@@ -71,6 +71,11 @@ def read_ply(path: Path) -> dict[str, Array]:
     return dict(zip(names, np.frombuffer(body, "<f4").reshape(-1, len(names)).T))
 
 
+def can_write() -> bool:
+    """Whether this Blender makes point clouds of meshes, and so for scripts."""
+    return "POINTCLOUD" in bpy.ops.object.convert.get_rna_type().properties["target"].enum_items
+
+
 def new_object(context: bpy.types.Context, name: str, columns: dict[str, Array]) -> bpy.types.Object:
     """A point cloud of Blender's own splats, selected; before version 5.3, of points with the same attributes."""
     mesh = bpy.data.meshes.new(name)

@@ -19,6 +19,11 @@ class DRGS_OT_splats(SceneFrames, bpy.types.Operator):
 
     _splats: Path
 
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        cls.poll_message_set("This Blender makes no point clouds")
+        return splat_attributes.can_write()
+
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         return context.window_manager.invoke_props_dialog(self)
 

@@ -76,8 +76,7 @@ def of_addon() -> dict:
 def test_attributes_are_read_as_the_columns_of_a_ply(scene, kind, points):
     obj = cloud(kind())
     if points:
-        targets = bpy.ops.object.convert.get_rna_type().properties["target"].enum_items
-        if "POINTCLOUD" not in targets:
+        if not part("addon.splat_attributes").can_write():
             pytest.skip("this Blender does not convert meshes to point clouds")
         bpy.ops.object.convert(target="POINTCLOUD")
         assert obj.type == "POINTCLOUD"
@@ -109,6 +108,9 @@ def test_values_are_found_in_attributes_of_every_type(scene):
 def test_objects_become_splats_of_blenders_own_and_come_back(ball, scene, tmp_path):
     """The numbers that a PLY of the same scene has, in the world; converted again, the same splats."""
     attributes = part("addon.splat_attributes")
+    if not attributes.can_write():
+        assert not bpy.ops.drgs.splats.poll()
+        pytest.skip("this Blender does not convert meshes to point clouds")
     ball.matrix_world = Matrix.Translation((1, 2, 3)) @ Matrix.Rotation(0.5, 4, "X") @ Matrix.Scale(2, 4)
     bpy.context.view_layer.update()
     chosen = {"colour": "albedo", "use_selection": True}
@@ -129,6 +131,8 @@ def test_objects_become_splats_of_blenders_own_and_come_back(ball, scene, tmp_pa
 def test_clouds_keep_the_order_of_harmonics(scene):
     """What is written of columns is read as the same columns, red apart from green."""
     attributes = part("addon.splat_attributes")
+    if not attributes.can_write():
+        pytest.skip("this Blender does not convert meshes to point clouds")
     found = attributes.read_splats(attributes.new_object(bpy.context, "Cloud", columns()).data)
     assert "Cloud" not in bpy.data.meshes
     assert set(found) == set(columns())
