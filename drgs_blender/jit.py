@@ -9,6 +9,8 @@ parallel kernel may run at a time in a process (workqueue is not re-entrant).
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import hashlib
 import logging
 import os
@@ -69,10 +71,31 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import numba  # noqa: E402
 from numba import get_num_threads, prange, set_num_threads  # noqa: E402
+from numba.core.caching import Cache as _Cache  # noqa: E402
 from numba.extending import overload as _overload  # noqa: E402
 
 if "NUMBA_CACHE_DIR" not in os.environ:
     numba.config.CACHE_DIR = str(current_cache())
+
+
+def _forgiving(method: Any) -> Any:
+    """A cache that cannot be written, as its disk is full, or read, as the power went, costs time and nothing else."""
+
+    @functools.wraps(method)
+    def tried(cache: Any, *arguments: Any) -> Any:
+        try:
+            return method(cache, *arguments)
+        except Exception as error:  # of what is damaged, unpickling makes anything
+            log.info("compiled kernels in %s: %s: %s", cache.cache_path, type(error).__name__, error)
+            with contextlib.suppress(OSError):
+                cache.flush()
+            return None
+
+    return tried
+
+
+for _name in ("load_overload", "save_overload"):
+    setattr(_Cache, _name, _forgiving(getattr(_Cache, _name)))
 
 
 def njit(function: Any = None, **options: Any) -> Any:

@@ -34,3 +34,14 @@ def open_files(pid: int) -> list[str]:
         with contextlib.suppress(OSError):  # closed just now
             found.append(os.readlink(link))
     return found
+
+
+def listening(pid: int) -> set[str]:
+    """Sockets on which a process listens, whatever the family (Linux)."""
+    own = {link[8:-1] for link in open_files(pid) if link.startswith("socket:[")}
+    found = set()
+    for table in ("tcp", "tcp6", "udp", "udp6"):
+        lines = [line.split() for line in Path(f"/proc/{pid}/net/{table}").read_text().splitlines()[1:]]
+        found |= {fields[1] for fields in lines if fields[9] in own}
+    lines = [line.split() for line in Path(f"/proc/{pid}/net/unix").read_text().splitlines()[1:]]
+    return found | {fields[6] for fields in lines if fields[6] in own and fields[3] == "00010000"}

@@ -298,6 +298,34 @@ def test_bad_vertices_are_counted_and_leave_no_bad_pixel(session, make_frame):
     assert session.render(make_frame()).warnings == []
 
 
+def test_every_fault_of_a_scene_is_counted_by_the_name_of_its_object(session, make_frame):
+    """Vertices that are no numbers, faces without area, texels that are no light; no pixel shows it."""
+    frame = make_frame()
+    corners = np.float32([[-9, 2, -1], [9, 2, -1], [9, 2, 9], [np.nan, 2, 9], [0, 2, 0]])
+    faces = np.int32([[0, 1, 2], [0, 2, 3], [4, 4, 1], [0, 0, 0]])
+    frame.meshes = [MeshState("Wall", corners, faces, np.eye(4)[None], np.int32([0]))]
+    frame.objects[0].vertices[7] = np.inf
+    frame.world.environment[3, 4], frame.world.environment[0, 0] = np.nan, -1.0
+    passes = session.render(frame)
+    assert all(np.isfinite(array).all() for array in passes.values())
+    ball, wall, empty, world = passes.warnings
+    assert ball.startswith("Ball: 1 vertices are not finite")
+    assert wall.startswith("Wall: 1 vertices are not finite") and "1 faces are left out" in wall
+    assert empty == "Wall: 2 faces have no area; light passes through them"
+    assert world.startswith("world: 2 texels are not finite or negative")
+
+
+@pytest.mark.parametrize("index", [-1, 4, 2**31 - 1])
+def test_faces_of_vertices_that_are_not_there_are_refused_by_name(session, make_frame, index):
+    frame = make_frame()
+    square = np.float32([[-1, 2, -1], [1, 2, -1], [1, 2, 1], [-1, 2, 1]])
+    frame.meshes = [MeshState("Wall", square, np.int32([[0, 1, index]]), np.eye(4)[None], np.int32([0]))]
+    with pytest.raises(UsageError, match=r"Wall: faces refer to vertices outside 0\.\.3"):
+        session.render(frame)
+    frame.meshes = []
+    assert np.isfinite(session.render(frame)["Combined"]).all()
+
+
 def test_unbound_surfels_need_binding_or_the_mesh(tmp_path, session, make_frame, asset_path):
     asset = read_asset(asset_path)
     path = tmp_path / "unbound.drgs"

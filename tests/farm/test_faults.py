@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
 import signal
@@ -12,9 +13,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from processes import children, gone, open_files
+from processes import children, gone, listening
 
 from drgs_blender.asset.container import read_asset, write_asset
+from drgs_blender.cli.find_blender import CHECKOUT
 
 from .conftest import PROGRAM, WHOLE, same_pixels
 
@@ -123,15 +125,38 @@ def test_unfinished_frames_of_killed_writers_go(drgs, folder, tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*names[1:], "a_0001.exr"])
 
 
-def sockets(pid: int) -> set[str]:
-    """Sockets of a process on which it listens, whatever the family."""
-    own = {link[8:-1] for link in open_files(pid) if link.startswith("socket:[")}
-    found = set()
-    for table in ("tcp", "tcp6", "udp", "udp6"):
-        lines = [line.split() for line in Path(f"/proc/{pid}/net/{table}").read_text().splitlines()[1:]]
-        found |= {fields[1] for fields in lines if fields[9] in own}
-    lines = [line.split() for line in Path(f"/proc/{pid}/net/unix").read_text().splitlines()[1:]]
-    return found | {fields[6] for fields in lines if fields[6] in own and fields[3] == "00010000"}
+#: A kernel that says whether it was compiled.
+KERNEL = """
+from drgs_blender.jit import njit
+@njit
+def double(x):
+    return 2 * x
+print(double(21), *double.stats.cache_hits.values())
+"""
+
+
+def test_kernels_are_compiled_where_they_cannot_be_kept_or_read(small_disk, tmp_path):
+    """A full disk; and files that a node left empty or cut off when it lost its power."""
+    program = tmp_path / "kernel.py"
+    program.write_text(KERNEL)
+
+    def said(folder: Path) -> str:
+        environment = os.environ | {"DRGS_CACHE_DIR": str(folder), "PYTHONPATH": str(CHECKOUT)}
+        done = subprocess.run([sys.executable, str(program)], env=environment, capture_output=True, text=True)
+        assert (done.returncode, done.stderr) == (0, "")
+        return done.stdout.strip()
+
+    kept = tmp_path / "kept"
+    assert [said(kept), said(kept)] == ["42", "42 1"]
+    for kind in ("nbi", "nbc"):
+        for length in (0, 20):
+            for path in kept.rglob(f"*.{kind}"):
+                path.write_bytes(path.read_bytes()[:length])
+            assert [said(kept), said(kept)] == ["42", "42 1"]
+    disk = small_disk("size=16k")
+    with contextlib.suppress(OSError), open(disk / "filler", "wb") as file:
+        file.write(bytes(16 << 10))
+    assert said(disk) == "42"
 
 
 @linux
@@ -146,7 +171,7 @@ def test_killed_blender_gives_the_job_back_and_takes_the_engine_along(folder, tm
             assert process.poll() is None
         time.sleep(0.02 * attempt)
         started = children(process.pid)
-        assert not set().union(*(sockets(pid) for pid in (process.pid, *started)))
+        assert not set().union(*(listening(pid) for pid in (process.pid, *started)))
         blender = [pid for pid, line in started.items() if "blender_job.py" in line]
         assert len(blender) == 1 and len(started) == 2
         os.kill(blender[0], signal.SIGKILL)

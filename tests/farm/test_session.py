@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from processes import children, gone
+from processes import children, gone, listening
 
 from drgs_blender.cli import denoise, session_link
 from drgs_blender.errors import EngineError
@@ -75,6 +75,7 @@ def test_chunks_share_blender_and_engine_and_have_the_same_bits(drgs, folder, wa
     assert lines.count("openjd_progress: 100.0") == 1
     used = family(server(warm))
     assert len(used) == 3  # itself, the engine and Blender
+    assert not set().union(*(listening(pid) for pid in used))
     assert told(scene, out, warm, "1-2")[0] == 0
     code, lines, _ = told(scene, out, warm, "2-3")
     assert code == 0 and sum(line.startswith("skipping") for line in lines) == 2

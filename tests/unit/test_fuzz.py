@@ -38,7 +38,8 @@ def problems(names: list[str], count: int, folder: Path, seconds: int = 5) -> li
     first = 0
     while True:
         command = [sys.executable, str(PROGRAM), str(folder), str(first), str(count), *names]
-        result = subprocess.run(command, capture_output=True, text=True, timeout=900, env=environment)
+        limit = 7200 if WHOLE else 900  # a hang ends the program itself, long before
+        result = subprocess.run(command, capture_output=True, text=True, timeout=limit, env=environment)
         lines = [json.loads(line) for line in result.stdout.splitlines() if line.startswith("[")]
         if lines and lines[-1][0] == "done":
             return found + lines[:-1]
