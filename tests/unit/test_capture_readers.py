@@ -97,6 +97,46 @@ def test_any_tilt_of_the_world_is_taken_out():
         assert ((found @ turned[:, :3, 1].T)[2] > 0).all()
 
 
+@pytest.mark.parametrize("backdrop", [255, 0, 90, None])
+def test_an_object_before_a_plain_backdrop_needs_no_masks(tmp_path, backdrop, caplog):
+    """Not even where the backdrop is noisy and each photograph exposed in its own way (None)."""
+    scene = captures.make(tmp_path)
+    path = captures.write_nerf(scene)
+    rng = np.random.default_rng(0)
+    for k, matrix in enumerate(scene.cameras):
+        pixels = captures.picture(matrix)
+        behind = 150 + 4 * k + rng.normal(scale=1.5, size=pixels.shape[:2]) if backdrop is None else backdrop
+        behind = np.broadcast_to(np.asarray(behind, float)[..., None], (*pixels.shape[:2], 3))
+        inside = pixels[..., 3:] > 0
+        # A speck of the backdrop's colour within the object is of the object.
+        pixels[18:20, 22, :3] = behind[18:20, 22].round()
+        Image.fromarray(np.where(inside, pixels[..., :3], behind).round().astype(np.uint8)).save(
+            tmp_path / "train" / f"r_{k}.png"
+        )
+    capture = read_capture(path)
+    assert "has no masks" in caplog.text
+    for view in capture.views:
+        matrix = min(scene.cameras, key=lambda m: np.abs(m - view.camera.matrix_world).max())
+        np.testing.assert_array_equal(view.mask >= 0.5, captures.picture(matrix)[..., 3] > 0)
+    if backdrop is None:
+        assert capture.background is None
+    else:
+        np.testing.assert_allclose(capture.background, backdrop / 255)
+
+
+def test_real_surroundings_are_not_taken_for_a_backdrop(tmp_path, caplog):
+    scene = captures.make(tmp_path)
+    path = captures.write_nerf(scene)
+    rng = np.random.default_rng(0)
+    for k, matrix in enumerate(scene.cameras):
+        pixels = captures.picture(matrix)
+        behind = rng.integers(0, 255, pixels[..., :3].shape)
+        pixels = np.where(pixels[..., 3:] > 0, pixels[..., :3], behind).astype(np.uint8)
+        Image.fromarray(pixels).save(tmp_path / "train" / f"r_{k}.png")
+    capture = read_capture(path)
+    assert all(view.mask is None for view in capture.views) and "has no masks" not in caplog.text
+
+
 def test_resolution_means_the_mean_of_what_a_pixel_covers(tmp_path):
     captures.write_nerf(captures.make(tmp_path))
     full, half = read_capture(tmp_path), read_capture(tmp_path, resolution=24)

@@ -15,7 +15,7 @@ from ...errors import AssetError, UsageError
 from ...formats.axes import UP_AXES
 from ..capture import Capture
 from . import colmap, llff, nero, tensoir, transforms
-from .develop import develop, find_background
+from .develop import cut_out, develop, find_background
 from .layout import Layout
 from .lens import Lens
 from .world import AXES, check_places, check_silhouettes, turn_upright
@@ -75,7 +75,9 @@ def read_capture(
     Returns
     -------
     Capture
-        Lenses straightened, Z up. Pictures with alpha are laid on white. Black photographs are left out with a warning.
+        Lenses straightened, Z up. Pictures with alpha are laid on white. Where there are neither alpha nor masks but
+        every picture has a border of one colour, what differs from it is the mask. Black photographs are left out with
+        a warning.
 
     Raises
     ------
@@ -107,6 +109,12 @@ def read_capture(
     if all(view.mask is None or view.mask.min() >= 1 for view in views):  # an alpha channel that says nothing
         for view in views:
             view.mask = None
+    if all(view.mask is None for view in views) and cut_out(views):
+        logger.warning(
+            "%s: has no masks; what differs from the colour of the pictures' borders is taken for the object. "
+            "Draw masks if it has parts of that colour",
+            path,
+        )
     if not layout.split and test_every is not None:
         for index, view in enumerate(views):
             view.test = index % test_every == 0

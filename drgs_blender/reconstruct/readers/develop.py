@@ -6,6 +6,7 @@ import logging
 
 import numpy as np
 from PIL import Image
+from scipy.ndimage import binary_erosion, binary_fill_holes, label
 
 from ...colour import to_unit
 from ...errors import AssetError
@@ -24,6 +25,9 @@ WHITE = (1.0, 1.0, 1.0)
 _BLACK = 0.02
 #: How much the surroundings may vary, and how much of the pixels must be surroundings, to be called one colour.
 _PLAIN, _ENOUGH = 0.01, 0.05
+#: Without masks: width of the border that shows the backdrop, in parts of the picture; part of it that must have one
+#: colour, and how far from it that may be. Holes in the object's outline below this part of the picture are its own.
+_BORDER, _MOST, _NEAR, _SPECK = 0.02, 0.7, 0.06, 0.002
 
 
 def develop(
@@ -120,3 +124,39 @@ def find_background(views: list[View]) -> tuple[float, float, float] | None:
         return None
     r, g, b = (round(255 * float(c)) / 255 for c in pixels.mean(axis=0, dtype=np.float64))
     return r, g, b
+
+
+def cut_out(views: list[View]) -> bool:
+    """Give views without masks those of what differs from the colour of their borders; whether all have such a colour.
+
+    Nothing is changed where one has not: its surroundings are real, or the object covers its border.
+    """
+    masks = [_standing_out(view.colour) for view in views]
+    if not masks or any(mask is None for mask in masks):
+        return False
+    for view, mask in zip(views, masks):
+        view.mask = mask
+    return True
+
+
+def _standing_out(colour: Array) -> Array | None:
+    """(h, w) float32 mask of what in (h, w, 3) `colour` is not the border's, small holes closed; None without such.
+
+    The outermost pixels of the object show both, as much of either on average: one half.
+    """
+    width = max(1, round(_BORDER * min(colour.shape[:2])))
+    frame = np.ones(colour.shape[:2], bool)
+    frame[width:-width, width:-width] = False
+    border = colour[frame]
+    backdrop = np.median(border, axis=0)
+    distance = np.abs(border - backdrop).max(axis=1)
+    near = distance[distance < _NEAR]
+    if len(near) < _MOST * len(border):
+        return None
+    # Its own noise or shading says how far from it a pixel must be.
+    object_ = np.abs(colour - backdrop).max(axis=2) > 0.01 + 2 * float(np.quantile(near, 0.98))
+    holes, count = label(binary_fill_holes(object_) & ~object_)
+    small = np.bincount(holes.reshape(-1), minlength=count + 1) < _SPECK * holes.size
+    small[0] = False
+    object_ |= small[holes]
+    return 0.5 * (object_.astype(np.float32) + binary_erosion(object_, border_value=1))
