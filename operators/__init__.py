@@ -22,6 +22,7 @@ from . import (
     material,
     matter,
     presets,
+    reconstruct,
     report,
     save_asset,
     splats,
@@ -32,6 +33,7 @@ from . import (
 MODULES = (
     import_asset,
     import_parts,
+    reconstruct,
     export,
     convert,
     splats,
@@ -58,6 +60,7 @@ MODULES = (
 def _file_import(menu: bpy.types.Menu, context: bpy.types.Context) -> None:
     menu.layout.operator("import_scene.drgs", text="DR-GS asset (.drgs)")
     menu.layout.operator("drgs.import_parts", text="DR-GS from surfels and mesh")
+    menu.layout.operator("drgs.reconstruct", text="DR-GS from photographs")
 
 
 def _file_export(menu: bpy.types.Menu, context: bpy.types.Context) -> None:

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import shutil
 import subprocess
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import IO
 
 import bpy
 
 from ..addon import engine_link, messages
+from ..addon.matter.program import MAIN
 from ..drgs_blender.engine.child import clean_environment
 from ..drgs_blender.errors import AssetError, DrgsError, UsageError
 from .base import DrgsOperator
@@ -24,7 +25,7 @@ class ProgramOperator(DrgsOperator):
     """Base of operators that give `start` the arguments of ``drgs`` and go on in `done` when it has done its work."""
 
     _process: subprocess.Popen | None = None
-    _log: IO[bytes] | None = None
+    _log: Path | None = None
     _timer: bpy.types.Timer | None = None
     _subject, _failure = "", ""
     _folder: Path | None = None
@@ -32,6 +33,13 @@ class ProgramOperator(DrgsOperator):
     def done(self, context: bpy.types.Context) -> set[str]:
         """What follows the work; returns what execute returns."""
         return {"FINISHED"}
+
+    def follow(self, context: bpy.types.Context, said: str) -> None:
+        """Told now and then while the program works: all that it has said."""
+
+    def stopped(self, event: bpy.types.Event) -> bool:
+        """Whether the work is to end before its time."""
+        return event.type == "ESC"
 
     @contextlib.contextmanager
     def folder(self, prefix: str) -> Iterator[Path]:
@@ -74,10 +82,13 @@ class ProgramOperator(DrgsOperator):
         return {"RUNNING_MODAL"}
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        if event.type == "ESC":
+        if self.stopped(event):
             self.cancel(context)
             return {"CANCELLED"}
-        if event.type != "TIMER" or self._process.poll() is None:
+        if event.type != "TIMER":
+            return {"PASS_THROUGH"}
+        if self._process.poll() is None:
+            self.follow(context, self._said())
             return {"PASS_THROUGH"}
         self._release(context)
         try:
@@ -94,31 +105,41 @@ class ProgramOperator(DrgsOperator):
             except subprocess.TimeoutExpired:
                 self._process.kill()
                 self._process.wait()
-            self._log.close()
+            self._said(last=True)
             self._release(context)
             self.clear()
 
     def _spawn(self, arguments: list[str]) -> None:
         command = engine_link.command_line()
         python = command[: command.index("-m")]
-        self._log = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the process
+        handle, name = tempfile.mkstemp(prefix="drgs-", suffix=".log")
+        self._log = Path(name)
         try:
             self._process = subprocess.Popen(
-                [*python, "-m", "drgs_blender.cli.main", "--no-progress", *arguments],
-                stdin=subprocess.DEVNULL,
-                stdout=self._log,
-                stderr=self._log,
+                [*python, "-c", MAIN, "--no-progress", *arguments],
+                stdin=subprocess.PIPE,
+                stdout=handle,
+                stderr=handle,
                 env=clean_environment(),
             )
         except OSError as error:
-            self._log.close()
+            self._log.unlink()
             raise UsageError("Engine", f"{python[0]} cannot be started ({error})", "See the preferences") from error
+        finally:
+            os.close(handle)
+
+    def _said(self, last: bool = False) -> str:
+        """What the program has said; when it has ended, for the last time."""
+        said = self._log.read_text(encoding="utf-8", errors="replace")
+        if last:
+            self._process.stdin.close()
+            with contextlib.suppress(OSError):  # Windows lets go of it late
+                self._log.unlink()
+        return said
 
     def _finish(self, context: bpy.types.Context) -> set[str]:
         """Tell what the program said, and go on, or say why it could not do its work."""
-        self._log.seek(0)
-        lines = self._log.read().decode(errors="replace").strip().splitlines()
-        self._log.close()
+        lines = [line for line in self._said(last=True).strip().splitlines() if not line.startswith("DRGS_")]
         try:
             if self._process.returncode:
                 said = [line for line in lines if line.startswith("drgs: ")] or lines

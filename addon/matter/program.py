@@ -18,7 +18,7 @@ from . import capture
 #: to go on takes some.
 _WAIT, _PATIENCE = 0.2, 5.0
 #: Runs ``drgs`` and ends it together with Blender, however that ends: its standard input is closed then.
-_MAIN = """
+MAIN = """
 import os, signal, sys, threading
 
 def watch():
@@ -74,7 +74,7 @@ class Program:
         try:
             with open(self._said, "wb") as said, open(self._log, "wb") as log:
                 self._process = subprocess.Popen(
-                    [*python, "-c", _MAIN, "--no-progress", "simulate", *map(str, arguments)],
+                    [*python, "-c", MAIN, "--no-progress", "simulate", *map(str, arguments)],
                     stdin=subprocess.PIPE,
                     stdout=said,
                     stderr=log,

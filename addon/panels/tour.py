@@ -6,7 +6,7 @@ import textwrap
 
 import bpy
 
-from .. import engine_link, engine_setup, lighting, setup_job, tour
+from .. import engine_link, engine_setup, lighting, reconstruction, setup_job, tour
 
 #: Pixels of a letter, about, at a scale of 1.
 LETTER = 7.5
@@ -46,6 +46,14 @@ def _import(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     row.operator("drgs.import_parts", text="Make", icon="FILE_NEW")
     if tour.target(context) is not None:
         row.operator("drgs.mark_assets", text="", icon="ASSET_MANAGER")
+    job = reconstruction.job
+    if job is None:
+        layout.operator("drgs.reconstruct", text="From Photographs", icon="CAMERA_DATA")
+        return
+    if icon := job.icon():
+        layout.template_icon(icon, scale=8.0)
+    layout.progress(text=f"{job.text}  {job.part:.0%}", factor=job.part)
+    layout.operator("drgs.reconstruct_cancel", icon="CANCEL")
 
 
 def _bind(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:

@@ -31,7 +31,7 @@ EXAMPLES = """examples:
 """
 
 #: Seconds between two lines of progress on stdout.
-_TELL_EVERY = 10.0
+_TELL_EVERY = 2.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

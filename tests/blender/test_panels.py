@@ -127,9 +127,20 @@ def elsewhere(ball_file):
     bpy.context.scene.drgs.overlay = "SURFELS"
 
 
-@pytest.mark.parametrize("state", [empty, imported, unselected, damaged, bound, painted, others, elsewhere])
+def reconstructing(ball_file):
+    reconstruction = part("addon.reconstruction")
+    reconstruction.job = reconstruction.Reconstruction(ball_file)
+    image = bpy.data.images.new("Preview", 8, 4)
+    image.file_format, image.filepath_raw = "PNG", str(ball_file.with_name("ball.preview.png"))
+    image.save()
+
+
+@pytest.mark.parametrize(
+    "state", [empty, imported, unselected, damaged, bound, painted, others, elsewhere, reconstructing]
+)
 @pytest.mark.parametrize("engine", [True, False])
 def test_every_panel_and_menu_is_drawn(scene, ball_file, state, engine, monkeypatch):
+    monkeypatch.setattr(part("addon.reconstruction"), "job", None)
     state(ball_file)
     if not engine:
         monkeypatch.setenv("DRGS_ENGINE", "/nowhere")

@@ -1,0 +1,137 @@
+"""Photographs to a DR-GS object: ``drgs reconstruct`` works for minutes while Blender goes on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
+
+from ..addon import reconstruction
+from ..drgs_blender.errors import UsageError
+from .base import DrgsOperator
+from .import_asset import import_assets
+from .program import ProgramOperator
+
+
+class DRGS_OT_reconstruct(ProgramOperator, bpy.types.Operator):
+    """Make a DR-GS object of photographs with known cameras (COLMAP, NeRF, nerfstudio). Blender goes on meanwhile"""
+
+    bl_idname = "drgs.reconstruct"
+    bl_label = "Reconstruct from Photographs"
+    bl_options = {"REGISTER", "UNDO", "PRESET"}  # noqa: RUF012 - read by Blender
+
+    filepath: StringProperty(subtype="FILE_PATH", options={"SKIP_SAVE"})
+    filter_folder: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
+    out: StringProperty(
+        name="Asset",
+        description="The file to write; empty is beside the .blend",
+        subtype="FILE_PATH",
+        options={"SKIP_SAVE"},
+    )
+    minutes: FloatProperty(name="Minutes", description="About how long it may take", default=10.0, min=0.1, max=1e4)
+    resolution: IntProperty(
+        name="Resolution", description="Longer side of the photographs, reduced; 0 is as they are", default=400, min=0
+    )
+    variant: EnumProperty(
+        name="Surfels",
+        description="What becomes of the surfels",
+        items=(
+            ("p", "Free", "Stay where they were learned, bound to the mesh"),
+            ("m", "On the Mesh", "New ones hang on the mesh's faces"),
+        ),
+        default="p",
+    )
+    use_materials: BoolProperty(
+        name="Materials", description="Pull materials apart from the light of the photographs", default=True
+    )
+    test_every: IntProperty(
+        name="Test Every",
+        description="Leave out every so-manyth view, and measure on those; 0 leaves out what the capture says",
+        default=0,
+        min=0,
+    )
+    use_environment: BoolProperty(
+        name="Set World", description="Light the scene with the light of the photographs", default=False
+    )
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        cls.poll_message_set("One is under way already")
+        return reconstruction.job is None
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def run(self, context: bpy.types.Context) -> set[str]:
+        capture = Path(bpy.path.abspath(self.filepath)).absolute()
+        if not self.filepath or not capture.exists():
+            raise UsageError(
+                str(capture if self.filepath else "Photographs"),
+                "is not there",
+                "Choose the folder of the photographs and their cameras, or its transforms.json",
+            )
+        folder = capture if capture.is_dir() else capture.parent
+        if not self.out and not bpy.data.filepath:
+            raise UsageError(
+                f'Capture "{folder.name}"', "has no place for its asset", "Save the .blend, or name the asset's file"
+            )
+        out = Path(bpy.path.abspath(self.out or f"//{bpy.path.clean_name(folder.name)}"))
+        out = out.absolute().with_suffix(".drgs")
+        arguments = ["reconstruct", str(capture), "--out", str(out), "--minutes", f"{self.minutes:g}"]
+        arguments += ["--variant", self.variant]
+        if self.resolution:
+            # Eight is the least that the program takes.
+            arguments += ["--resolution", str(max(self.resolution, 8))]
+        if self.test_every > 1:
+            arguments += ["--test-every", str(self.test_every)]
+        if not self.use_materials:
+            arguments.append("--no-materials")
+        reconstruction.job = reconstruction.Reconstruction(out)
+        subject = f'Capture "{folder.name}"'
+        return self.start(context, arguments, subject, f"Making {out.name}", "could not be reconstructed")
+
+    def stopped(self, event: bpy.types.Event) -> bool:
+        return reconstruction.job.cancelled  # Esc may be meant for anything else in so many minutes
+
+    def follow(self, context: bpy.types.Context, said: str) -> None:
+        job = reconstruction.job
+        job.follow(said)
+        context.workspace.status_text_set(f"{self._subject}: {job.text}, {job.part:.0%}. Cancel is in the sidebar")
+        _redraw(context)
+
+    def done(self, context: bpy.types.Context) -> set[str]:
+        import_assets(context, [reconstruction.job.out], self.use_environment)
+        return {"FINISHED"}
+
+    def clear(self) -> None:
+        ProgramOperator.clear(self)
+        reconstruction.job = None
+        _redraw(bpy.context)
+
+
+class DRGS_OT_reconstruct_cancel(DrgsOperator, bpy.types.Operator):
+    """End the reconstruction under way; another one with the same settings goes on where it stopped"""
+
+    bl_idname = "drgs.reconstruct_cancel"
+    bl_label = "Cancel"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return reconstruction.job is not None
+
+    def run(self, context: bpy.types.Context) -> set[str]:
+        reconstruction.job.cancelled = True  # its own operator ends it
+        return {"FINISHED"}
+
+
+def _redraw(context: bpy.types.Context) -> None:
+    """Draw the sidebars again."""
+    for window in context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type == "VIEW_3D":
+                area.tag_redraw()
+
+
+CLASSES = (DRGS_OT_reconstruct, DRGS_OT_reconstruct_cancel)

@@ -1,0 +1,126 @@
+"""Photographs to an object: the real program, in a process of its own."""
+
+from __future__ import annotations
+
+import json
+from types import SimpleNamespace
+
+import bpy
+import numpy as np
+import pytest
+from scenes import part
+
+reconstruction, operator = part("addon.reconstruction"), part("operators.reconstruct")
+SIZE, FOCAL = 32, 40.0
+
+
+def png(path, pixels):
+    """Write (h, w, 4) sRGB values in 0..1, top row first."""
+    height, width = pixels.shape[:2]
+    image = bpy.data.images.new(path.stem, width, height, alpha=True)
+    image.alpha_mode = "STRAIGHT"
+    image.pixels.foreach_set(np.ascontiguousarray(pixels[::-1], np.float32).ravel())
+    image.file_format, image.filepath_raw = "PNG", str(path)
+    image.save()
+    bpy.data.images.remove(image)
+
+
+@pytest.fixture
+def photographs(tmp_path):
+    """A folder with photographs of the unit sphere, coloured by position, and their cameras."""
+    folder = tmp_path / "Sphere"
+    folder.mkdir()
+    frames = []
+    for k, angle in enumerate(np.arange(8) * np.pi / 4):
+        back = np.array([np.cos(angle), np.sin(angle), 0.5 - k % 2])
+        back /= np.linalg.norm(back)
+        right = np.cross([0, 0, 1.0], back)
+        right /= np.linalg.norm(right)
+        matrix = np.eye(4)
+        matrix[:3] = np.column_stack([right, np.cross(back, right), back, 4 * back])
+        y, x = (np.mgrid[:SIZE, :SIZE] + 0.5 - SIZE / 2) / FOCAL
+        rays = np.stack([x, -y, -np.ones_like(x)], -1) @ matrix[:3, :3].T
+        a, b = (rays**2).sum(-1), rays @ matrix[:3, 3]
+        root = b * b - a * 15
+        points = matrix[:3, 3] + ((-b - np.sqrt(np.maximum(root, 0))) / a)[..., None] * rays
+        png(folder / f"{k}.png", np.dstack([np.clip(0.5 + 0.4 * points, 0, 1), root > 0]))
+        frames.append({"file_path": f"{k}", "transform_matrix": matrix.tolist()})
+    text = json.dumps({"camera_angle_x": 2 * np.arctan(SIZE / 2 / FOCAL), "frames": frames})
+    (folder / "transforms.json").write_text(text)
+    return folder
+
+
+def test_photographs_become_an_object(scene, photographs, tmp_path):
+    assert bpy.ops.drgs.reconstruct(filepath=str(photographs), minutes=0.1, use_environment=True) == {"FINISHED"}
+    obj = bpy.context.active_object
+    assert obj.name == "Sphere" and obj.drgs.is_drgs and reconstruction.job is None
+    points = np.array([v.co for v in obj.data.vertices])
+    assert abs(np.median(np.linalg.norm(points, axis=1)) - 1) < 0.15
+    assert part("addon.assets").load(tmp_path / "Sphere.drgs").environment is not None
+    assert scene.world is not None and scene.world.name.startswith("Sphere")
+    assert not (tmp_path / "Sphere.reconstruct").exists()
+    said = [message.text for message in part("addon.messages").history]
+    assert not any("DRGS_" in text for text in said)
+    # The preview that the panel shows is the one that the program left.
+    state = reconstruction.Reconstruction(tmp_path / "Sphere.drgs")
+    assert state.icon() == state.icon()
+    (preview,) = reconstruction._previews.values()
+    assert preview.image_size[0] == 2 * preview.image_size[1]
+
+
+def test_progress_is_what_the_program_says(tmp_path):
+    state = reconstruction.Reconstruction(tmp_path / "a.drgs")
+    state.follow("drgs: a note\n")
+    assert state.part == 0 and not state.icon()
+    state.follow('DRGS_PROGRESS part=0.1 surfels=9 psnr=20.5 phase="surfels"\nDRGS_PROGRESS part=0.25 surfels=12')
+    assert state.part == 0.1 and state.text == "Surfels, 20.5 dB"
+    state.follow('DRGS_PROGRESS part=0.5 surfels=12000 psnr=0.00 phase="mesh"\n')
+    assert state.part == 0.5 and state.text == "Mesh, 12,000 surfels"
+
+
+def test_what_is_no_capture_is_said(scene, tmp_path):
+    with pytest.raises(RuntimeError, match="is not there"):
+        bpy.ops.drgs.reconstruct(filepath=str(tmp_path / "none"))
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(RuntimeError, match=r'"empty".*could not be reconstructed'):
+        bpy.ops.drgs.reconstruct(filepath=str(tmp_path / "empty"))
+    assert reconstruction.job is None
+
+
+class Window(SimpleNamespace):
+    """A window manager and a workspace that remember what was asked of them."""
+
+    def __init__(self) -> None:
+        texts: list = []
+        manager = SimpleNamespace(
+            windows=[], event_timer_add=lambda *_, **__: "timer", event_timer_remove=lambda _: None,
+            modal_handler_add=lambda _: None,
+        )  # fmt: skip
+        super().__init__(
+            texts=texts,
+            window=object(),
+            window_manager=manager,
+            workspace=SimpleNamespace(status_text_set=texts.append),
+        )
+
+
+def test_it_works_beside_the_window_until_cancelled(scene, photographs, tmp_path, monkeypatch):
+    """The operator's own steps, on a window that stands in for Blender's: there is none in the background."""
+    program = part("operators.program")
+    monkeypatch.setattr(program, "bpy", SimpleNamespace(app=SimpleNamespace(background=False), types=bpy.types))
+    context = Window()
+    cls = operator.DRGS_OT_reconstruct
+    own = {name: value for name, value in vars(cls).items() if not name.startswith(("__", "bl_"))}
+    stand_in = type("StandIn", (program.ProgramOperator,), own)()
+    values = {"filepath": str(photographs), "out": "", "minutes": 5.0, "resolution": 0, "variant": "p"}
+    for name, value in (values | {"use_materials": True, "test_every": 0, "use_environment": False}).items():
+        setattr(stand_in, name, value)
+    assert stand_in.run(context) == {"RUNNING_MODAL"}
+    process = stand_in._process
+    tick, escape = SimpleNamespace(type="TIMER"), SimpleNamespace(type="ESC")
+    assert stand_in.modal(context, tick) == {"PASS_THROUGH"} and not cls.poll(context)
+    assert stand_in.modal(context, escape) == {"PASS_THROUGH"} and process.poll() is None
+    assert "Reading the photographs" in context.texts[-1]
+    assert bpy.ops.drgs.reconstruct_cancel() == {"FINISHED"}
+    assert stand_in.modal(context, tick) == {"CANCELLED"}
+    assert process.poll() is not None and reconstruction.job is None and context.texts[-1] is None
