@@ -35,7 +35,7 @@ def to_picture(linear: np.ndarray) -> Image.Image:
     return Image.fromarray((linear_to_srgb(np.clip(linear[..., :3], 0, 1)) * 255 + 0.5).astype(np.uint8))
 
 
-def publish(frames: list[Path], out: Path) -> None:
+def publish(frames: list[Path], out: Path, fps: int = 24) -> None:
     pictures = [to_picture(read_frame(path)[0]["Combined"]) for path in frames]
     chosen = pictures[:: max(1, len(pictures) // 8)][:8]
     width, height = chosen[0].size
@@ -44,7 +44,7 @@ def publish(frames: list[Path], out: Path) -> None:
         sheet.paste(picture, (i % 4 * width, i // 4 * height))
     sheet.save(out / "contact-sheet.png")
     pictures[0].save(
-        out / "animation.webp", save_all=True, append_images=pictures[1:], duration=1000 // 24, loop=0, quality=90
+        out / "animation.webp", save_all=True, append_images=pictures[1:], duration=1000 // fps, loop=0, quality=90
     )
 
 

@@ -115,12 +115,12 @@ def add_turning_world(name: str) -> None:
         rotation.keyframe_insert("default_value", index=2, frame=frame)
 
 
-def add_camera(target: Vector, distance: float) -> None:
+def add_camera(target: Vector, distance: float, height: float = 0.28) -> None:
     data = bpy.data.cameras.new("Camera")
     data.lens = 50
     camera = bpy.data.objects.new("Camera", data)
     bpy.context.collection.objects.link(camera)
-    direction = Vector((0.25, -1.0, 0.28)).normalized()
+    direction = Vector((0.25, -1.0, height)).normalized()
     camera.location = target + direction * distance
     camera.rotation_euler = direction.to_track_quat("Z", "Y").to_euler()
     bpy.context.scene.camera = camera

@@ -95,9 +95,10 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
         "suites", nargs="*", metavar="SUITE", help=f"any of {', '.join(SUITES)} (the default) or {WINDOW}"
     )
     demo = command("demo", run_demo, "render the demo through Blender; further arguments go to examples/demo.py")
+    matter = command("demo-simulation", run_demo_simulation, "bake and render matter; see examples/demo_simulation.py")
     extension = command("extension", run_extension, "build the extension's zip; arguments go to tools/extension.py")
     bench = command("bench", run_bench, "measure; further arguments go to bench/run.py")
-    for sub in (demo, extension, bench):
+    for sub in (demo, matter, extension, bench):
         sub.set_defaults(passes_on=True)
     clean = command("clean", run_clean, "remove build products and caches")
     clean.add_argument("--all", action="store_true", help="also the environments")
@@ -313,6 +314,11 @@ class Tally:
 def run_demo(args: argparse.Namespace) -> int:
     """Render the demo with both environments."""
     return with_both("examples/demo.py", args.rest)
+
+
+def run_demo_simulation(args: argparse.Namespace) -> int:
+    """Bake and render simulated matter with both environments."""
+    return with_both("examples/demo_simulation.py", args.rest)
 
 
 def run_bench(args: argparse.Namespace) -> int:

@@ -34,6 +34,8 @@ _CANDIDATES = 3
 _WIDTH = 1.5
 #: r = RIDGE * sigma^2
 RIDGE = 0.01
+#: Matter is torn where neighbours have moved apart, or believe to be stretched, this much more than the other says.
+_TORN = 3.0
 
 
 @dataclass(slots=True)
@@ -46,6 +48,7 @@ class Weights:
     value : (n, k) float32, N
     slope : (n, k, 3) float32, Q, metres
     offset : (n, 3) float32, from the first neighbour to the point, metres
+    reach : (n,) float32, from the first neighbour to the farthest that is of use, metres
     separated : number of points that had neighbours across a gap, which are not used
     stranded : number of points all of whose neighbours were across a gap; the nearest carries them
     """
@@ -54,6 +57,7 @@ class Weights:
     value: Array
     slope: Array
     offset: Array
+    reach: Array
     separated: int = 0
     stranded: int = 0
 
@@ -111,14 +115,21 @@ def bind_points(
     distance = np.where(np.take_along_axis(usable, order, 1), np.take_along_axis(distance, order, 1), -1.0)
     value = np.empty(index.shape, np.float32)
     slope = np.empty((*index.shape, 3), np.float32)
-    _weigh(points, sources, index, distance, value, slope)
+    reach = np.zeros(len(points), np.float32)
+    _weigh(points, sources, index, distance, value, slope, reach)
     offset = (points - sources[index[:, 0]]).astype(np.float32)
-    return Weights(index.astype(np.int32), value, slope, offset, separated, int(stranded.sum()))
+    return Weights(index.astype(np.int32), value, slope, offset, reach, separated, int(stranded.sum()))
+
+
+@njit(inline="always")
+def _squared(x, a, b):  # type: ignore[no-untyped-def]
+    """Squared distance between two rows."""
+    return (x[a, 0] - x[b, 0]) ** 2 + (x[a, 1] - x[b, 1]) ** 2 + (x[a, 2] - x[b, 2]) ** 2
 
 
 @njit(parallel=True)
-def _weigh(points, sources, index, distance, value, slope):  # type: ignore[no-untyped-def]
-    """N and Q of each point; a neighbour with a negative distance does not count."""
+def _weigh(points, sources, index, distance, value, slope, reach):  # type: ignore[no-untyped-def]
+    """N, Q and reach of each point; a neighbour with a negative distance does not count."""
     count = index.shape[1]
     for i in prange(len(points)):
         far = 0.0
@@ -132,6 +143,7 @@ def _weigh(points, sources, index, distance, value, slope):  # type: ignore[no-u
             if distance[i, k] >= 0.0:
                 w[k] = np.exp(-((distance[i, k] / sigma) ** 2))
                 total += w[k]
+                reach[i] = max(reach[i], np.float32(np.sqrt(_squared(sources, index[i, k], index[i, 0]))))
         for k in range(count):  # coordinates from the point itself, so that nothing is lost far from the origin
             w[k] /= total
             s = index[i, k]
@@ -182,14 +194,15 @@ def carry(weights: Weights, x: Array, gradients: Array) -> tuple[Array, Array, i
     points : (n, 3) of the type of x
     gradients : (n, 3, 3) float32
     turned : int
-        Points where blending would have turned matter inside out; the nearest neighbour alone carries those.
+        Points where blending would have turned matter inside out or spanned a tear; the nearest neighbour alone
+        carries those, stretched no more than the neighbours have moved apart.
     """
     n = len(weights.source)
     x = np.ascontiguousarray(x)
     points, out = np.empty((n, 3), x.dtype), np.empty((n, 9), np.float32)
     turned = np.zeros(n, np.bool_)
     flat = np.ascontiguousarray(gradients, np.float32).reshape(-1, 9)
-    _carry(weights.source, weights.value, weights.slope, weights.offset, x, flat, points, out, turned)
+    _carry(weights.source, weights.value, weights.slope, weights.offset, weights.reach, x, flat, points, out, turned)
     return points, out.reshape(n, 3, 3), int(np.count_nonzero(turned))
 
 
@@ -199,13 +212,14 @@ def _determinant(f):  # type: ignore[no-untyped-def]
 
 
 @njit(parallel=True)
-def _carry(source, value, slope, offset, x, gradients, points, out, turned):  # type: ignore[no-untyped-def]
+def _carry(source, value, slope, offset, reach, x, gradients, points, out, turned):  # type: ignore[no-untyped-def]
     for i in prange(len(source)):
         first = source[i, 0]
         ox, oy, oz = x[first, 0], x[first, 1], x[first, 2]
         px = py = pz = 0.0
         f = out[i]
         f[:] = np.float32(0.0)
+        apart = 0.0
         for k in range(source.shape[1]):
             s, n = source[i, k], value[i, k]
             g = gradients[s]
@@ -216,9 +230,17 @@ def _carry(source, value, slope, offset, x, gradients, points, out, turned):  # 
             pz += n * (x[s, 2] - oz) + (g[6] * qx + g[7] * qy + g[8] * qz)
             for c in range(9):
                 f[c] += n * g[c]
-        if not (_determinant(f) > np.float32(0.0)) and _determinant(gradients[first]) > np.float32(0.0):
+            if n != 0.0:
+                apart = max(apart, _squared(x, s, first))
+        nearest = gradients[first]
+        grown, believed = np.sqrt(apart) / max(reach[i], np.float32(1e-30)), np.sqrt((nearest * nearest).sum() / 3.0)
+        most = max(believed, np.sqrt((f * f).sum() / 3.0))
+        torn = reach[i] > 0.0 and max(grown, most / max(grown, 1e-30)) > _TORN
+        if torn or (not (_determinant(f) > np.float32(0.0)) and _determinant(nearest) > np.float32(0.0)):
             turned[i] = True
-            f[:] = gradients[first]
+            keep = min(1.0, max(grown, 1.0) / believed) if torn and believed > 0.0 else 1.0
+            for c in range(9):
+                f[c] = np.float32(keep) * nearest[c]
             qx, qy, qz = offset[i, 0], offset[i, 1], offset[i, 2]
             px = np.float64(f[0] * qx + f[1] * qy + f[2] * qz)
             py = np.float64(f[3] * qx + f[4] * qy + f[5] * qz)

@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from ..errors import Cancelled, UsageError
 from ..matter import FLUID, SNOW, Matter
@@ -134,6 +135,7 @@ class Solver(Stepper):
 
         self._model, self._parameters = padded(matter.model), padded(matter.parameters)
         self._solid = padded(matter.keeps_shape)
+        self._reach = np.maximum(self._nearest(body.points, body.riders)[0], domain.spacing)
         self._pins = np.flatnonzero(body.pinned) if body.pinned is not None else np.empty(0, np.int64)
         still = bool(len(self._pins) == n)
         self._slowest_step = np.inf if still else courant * domain.spacing / float(matter.wave_speed.max())
@@ -268,7 +270,26 @@ class Solver(Stepper):
         back = np.empty_like(order)
         back[order] = np.arange(len(order))
         self.state = self.state.taken(back)
+        self._rejoin()
         self._arranged(self.state.x)
+
+    @staticmethod
+    def _nearest(points: Array, riders: Array) -> tuple[Array, Array]:
+        """Distance (k,) of each rider from the particle nearest to it, and which that is."""
+        if not len(riders):
+            return np.empty(0), np.empty(0, np.int64)
+        found: tuple[Array, Array] = cKDTree(points).query(riders, workers=-1)
+        return found
+
+    def _rejoin(self) -> None:
+        """Bring riders that matter has left behind back to it: the nearest particle carries them."""
+        n, state = len(self.body.points), self.state
+        distance, nearest = self._nearest(state.x[:n], state.x[n:])
+        lost = np.flatnonzero(distance > self._reach)
+        if len(lost):
+            at = state.x[nearest[lost]]
+            state.x[n + lost] = at + (state.x[n + lost] - at) * (self._reach[lost] / distance[lost])[:, None]
+            state.v[n + lost] = state.v[nearest[lost]]
 
     def _sorted(self, order: Array, state: State) -> tuple[Arrangement, State, Array]:
         arrangement = self._arranged(state.x)

@@ -25,6 +25,10 @@ _SCRATCH = 2048 + 4
 #: the last node held is then, over all positions of the grid, on average on the border itself.
 _PINNED = np.float32(0.2)
 
+#: Share of the matter of the fullest node around below which a node says nothing about how a rider moves: the few
+#: grains at its rim, pushed by all others, are no surface.
+_BARE = np.float32(0.1)
+
 
 @njit(inline="always")
 def _weights(f):  # type: ignore[no-untyped-def]
@@ -57,15 +61,24 @@ def _steps():  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def _covered(scratch, base, wx, wy, wz):  # type: ignore[no-untyped-def]
-    """Weight of the nodes that have matter."""
-    covered = _ZERO
+def _carried(scratch, base, wx, wy, wz):  # type: ignore[no-untyped-def]
+    """Velocity that matter gives to a rider, and the weight of the nodes it comes from: 0 where there is no matter."""
+    heaviest = _ZERO
     for ii in range(3):
         for jj in range(3):
             for kk in range(3):
-                if scratch[base + ii * 256 + jj * 32 + 4 * kk + 3] > _ZERO:
-                    covered += wx[ii] * wy[jj] * wz[kk]
-    return covered
+                heaviest = max(heaviest, scratch[base + ii * 256 + jj * 32 + 4 * kk + 3])
+    x = y = z = weight = _ZERO
+    for ii in range(3):
+        for jj in range(3):
+            for kk in range(3):
+                n = base + ii * 256 + jj * 32 + 4 * kk
+                if scratch[n + 3] > _BARE * heaviest:
+                    w = wx[ii] * wy[jj] * wz[kk]
+                    x, y, z, weight = x + w * scratch[n], y + w * scratch[n + 1], z + w * scratch[n + 2], weight + w
+    if weight > _ZERO:
+        x, y, z = x / weight, y / weight, z / weight
+    return x, y, z, weight
 
 
 @njit(inline="always")
@@ -219,10 +232,8 @@ def gather(  # type: ignore[no-untyped-def]
                 vx, vy, vz, _ = fold(blend)
                 if mass[p] == _ZERO:
                     # Riders may be where some nodes have no matter: what there is counts fully; F follows no riders.
-                    covered = _covered(scratch, base, wx, wy, wz)
-                    if covered > np.float32(1e-6):
-                        vx, vy, vz = vx / covered, vy / covered, vz / covered
-                    else:
+                    vx, vy, vz, weight = _carried(scratch, base, wx, wy, wz)
+                    if weight <= _ZERO:
                         vx, vy, vz = v[p, 0], v[p, 1], v[p, 2]
                 v[p, 0], v[p, 1], v[p, 2] = vx, vy, vz
                 x[p, 0] += dt * vx

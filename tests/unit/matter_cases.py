@@ -34,6 +34,7 @@ def solver_of(
     damping: float = 0.0,
     velocity: Any = (0, 0, 0),
     pinned: np.ndarray | None = None,
+    riders: Any = (),
     colliders: Any = (),
     planes: Any = (),
     courant: float = 0.5,
@@ -44,7 +45,8 @@ def solver_of(
     matter = matter_of([make_material(material, numbers)], np.zeros(len(points), int))
     low = points.min(axis=0) - 8 * h if low is None else low
     high = points.max(axis=0) + 8 * h if high is None else high
-    body = Body(points, np.full(len(points), (h / 2) ** 3, np.float32), matter, pinned=pinned, velocity=velocity)
+    volume = np.full(len(points), (h / 2) ** 3, np.float32)
+    body = Body(points, volume, matter, np.reshape(riders, (-1, 3)), pinned, velocity)
     forces = Forces(gravity=gravity, damping=damping)
     return Solver(body, domain or aligned(low, high, h), forces, colliders, planes, courant)
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from matter_cases import cantilever, energy, lattice, masses, momenta, solver_of, timoshenko
 from plain_mpm import PlainMpm
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from drgs_blender.errors import Cancelled, UsageError
@@ -357,6 +358,25 @@ def test_any_number_of_threads_gives_the_same_bits():
         set_num_threads(threads)
     for name in results[0]:
         assert results[0][name].tobytes() == results[1][name].tobytes()
+
+
+def test_riders_are_not_lost_when_sand_falls_apart():
+    """A block of sand hits a thin plate and runs over its rim: its surface stays with the grains."""
+    h = 0.05
+    points = np.add(lattice((0.3, 0.3, 0.5), h / 2), [0, 0, 0.05])
+    rng = np.random.default_rng(0)
+    on = points.min(axis=0) - h / 4 + (np.ptp(points, axis=0) + h / 2) * rng.random((400, 3))
+    side, axis = rng.integers(2, size=400), rng.integers(3, size=400)
+    on[np.arange(400), axis] = np.where(side, points.max(axis=0)[axis] + h / 4, points.min(axis=0)[axis] - h / 4)
+    solver = solver_of(
+        points, h, "sand", riders=on, gravity=(0, 0, -9.81), velocity=(0, 0, -2.0), low=(-1.5, -1.5, -1.6),
+        high=(1.8, 1.8, 0.8), colliders=[Collider("plate", *box((0, 0, -0.12), (0.3, 0.3, 0)))],
+    )  # fmt: skip
+    for _ in range(7):
+        solver.advance(FRAME)
+        apart = cKDTree(solver.points).query(solver.riders)[0]
+        assert apart.max() <= h * (1 + 1e-6)
+        assert np.isfinite(solver.riders).all()
 
 
 def test_riders_move_with_the_matter():
