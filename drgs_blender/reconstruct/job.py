@@ -13,18 +13,20 @@ import numpy as np
 import torch
 
 from ..arrays import Array
-from ..asset.model import Asset, Binding, Environment, Mesh, Surfels
+from ..asset.model import MATERIAL_CHANNELS, Asset, Binding, Environment, Mesh, Surfels
 from ..build.transfer import surfels_to_vertices
 from ..deform.binding import bind
+from ..deform.mesh_driven import MeshDriven
 from ..errors import Cancelled
 from . import checkpoint
 from .attached import attach_learned, bound
 from .capture import Capture, View
-from .decouple.run import decouple
+from .decouple.run import Decoupled, decouple
 from .decouple.settings import Settings as Decoupling
 from .gaussians import Gaussians
 from .hull import Region, find_region
 from .photometric import Photograph, structural_similarity
+from .relief import follow_normals, shaded_by
 from .targets import background_of, composed
 from .train import Schedule, Training
 from .tsdf import fuse
@@ -125,11 +127,24 @@ def reconstruct(
     report |= judge(final, capture)
     visible = final.opacities().detach().numpy() >= UNSEEN
     surfels = _kept(final, visible)
+    found = _decoupled(work, mesh, len(surfels), report) if settings.materials else None
+    if found is not None:
+        mesh = replace(mesh, albedo=found.albedo, roughness=found.roughness, metallic=found.metallic)
+        if settings.decoupling.normals:
+            mesh.vertices = follow_normals(mesh, found.normals)
     if binding is None:
         binding, report["binding"] = bind(mesh, surfels)
     else:
         binding = _rows(binding, visible)
-    environment, origin = _materials(work, mesh, surfels, binding, report)
+        surfels.centre = MeshDriven(mesh, surfels, binding).pose(mesh.vertices).centre
+    environment, origin = None, "photographed colour, light included"
+    if found is None:
+        report["vertices_without_surfels"] = surfels_to_vertices(mesh, surfels, binding)
+    else:
+        if settings.decoupling.normals:
+            binding = shaded_by(binding, mesh, found.normals)
+        _take_materials(surfels, mesh, binding)
+        environment, origin = Environment(found.environment), "pulled apart from the light"
     provenance = {"capture": capture.source.name, "variant": settings.variant, "materials": origin, "report": report}
     return Asset(surfels, mesh, binding, environment, provenance)
 
@@ -192,30 +207,27 @@ def _on_mesh(
     return final, bound(binding, final)  # type: ignore[arg-type]
 
 
-def _materials(
-    work: _Work, mesh: Mesh, surfels: Surfels, binding: Binding, report: dict[str, Any]
-) -> tuple[Environment | None, str]:
-    """Materials of mesh and surfels, in place; the light, and where the materials come from."""
-    if not work.settings.materials:
-        report["vertices_without_surfels"] = surfels_to_vertices(mesh, surfels, binding)
-        return None, "photographed colour, light included"
+def _decoupled(work: _Work, mesh: Mesh, surfels: int, report: dict[str, Any]) -> Decoupled:
+    """Materials, normals and light."""
     found = decouple(
         work.capture,
         mesh,
         replace(work.settings.decoupling, seconds=work.seconds(SHARE_OF_MATERIALS) or 0.0),
-        lambda at: work.tell(Progress("materials", 0.7 + 0.3 * at.part, len(surfels), at.psnr)),
+        lambda at: work.tell(Progress("materials", 0.7 + 0.3 * at.part, surfels, at.psnr)),
         work.cancelled,
         work.file("materials"),
     )
     # Without the clock: the same run gives the same bytes.
     report["decoupling"] = {key: value for key, value in found.report.items() if key != "seconds"}
+    return found
+
+
+def _take_materials(surfels: Surfels, mesh: Mesh, binding: Binding) -> None:
+    """Give surfels the materials of the mesh where they hang on it, in place."""
     corners, share = mesh.faces[binding.face], binding.barycentric
-    for name in ("albedo", "roughness", "metallic"):
-        values = getattr(found, name)
-        setattr(mesh, name, values)
-        blended = np.einsum("nk,nk...->n...", share, values[corners])
+    for name in MATERIAL_CHANNELS:
+        blended = np.einsum("nk,nk...->n...", share, getattr(mesh, name)[corners])
         setattr(surfels, name, np.clip(blended, 0, 1).astype(np.float32))
-    return Environment(found.environment), "pulled apart from the light"
 
 
 def _kept(gaussians: Gaussians, visible: Array) -> Surfels:
