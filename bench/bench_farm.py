@@ -24,7 +24,7 @@ from pathlib import Path
 import farm_slurm
 import numpy as np
 from bench_engine import plane_asset
-from farm_tools import PROGRAM, drgs, leftovers, processes
+from farm_tools import MARK, PROGRAM, drgs, leftovers, processes
 from report import table, write_section
 
 from drgs_blender.asset.container import read_asset
@@ -126,13 +126,10 @@ def _disturbed(what: str, scene: Path, scratch: Path, out: Path) -> int:
         if job.poll() is not None:
             raise SystemExit(f"drgs render ended: {job.communicate()[1]}")
     time.sleep(0.3)
-    mark = f"TMPDIR={scratch}"
-    if what == "engine killed":
-        for pid in processes("drgs_blender.engine", mark):
-            os.kill(pid, signal.SIGKILL)
-    elif what == "Blender killed":
-        for pid in processes("blender_job.py", mark):
-            os.kill(pid, signal.SIGKILL)
+    victims = {"engine killed": "drgs_blender.engine", "Blender killed": "blender_job.py"}
+    if what in victims:
+        (pid,) = processes(victims[what], MARK)  # exactly one, or the row would say nothing
+        os.kill(pid, signal.SIGKILL)
     elif what == "session killed":
         os.kill(int((place / "pid").read_text()), signal.SIGKILL)
     else:

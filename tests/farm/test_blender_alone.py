@@ -213,7 +213,7 @@ def test_a_picture_is_the_same_after_all_that_was_taken_back(folder, tmp_path, b
     out.mkdir()
     body = ARTIST.format(out=str(out), body=body.format(count=many if WHOLE else few))
     process = begin(folder / "relative.blend", tmp_path, body)
-    said, errors = process.communicate(timeout=400)
+    said, errors = process.communicate(timeout=3000 if WHOLE else 400)
     assert process.returncode == 0, said + errors
     before, moved, after = (written_by_blender(out / f"{name}.exr") for name in ("before", "moved", "after"))
     assert np.array_equal(before, after) and not np.array_equal(before, moved)
@@ -257,7 +257,7 @@ def test_extension_may_be_switched_off_while_it_renders(folder, tmp_path):
     out = tmp_path / "out"
     out.mkdir()
     process = begin(folder / "large.blend", tmp_path, DISABLE.format(out=str(out), count=20 if WHOLE else 2))
-    said, errors = process.communicate(timeout=400)
+    said, errors = process.communicate(timeout=3000 if WHOLE else 400)
     assert process.returncode == 0, said + errors
     assert np.array_equal(*(written_by_blender(out / f"{name}.exr") for name in ("before", "after")))
 
