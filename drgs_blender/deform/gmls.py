@@ -225,16 +225,21 @@ def _carry(source, value, slope, offset, reach, x, gradients, points, out, turne
             g = gradients[s]
             qx, qy, qz = slope[i, k, 0], slope[i, k, 1], slope[i, k, 2]
             # Relative to the first neighbour: N sums to 1 in exact arithmetic alone.
-            px += n * (x[s, 0] - ox) + (g[0] * qx + g[1] * qy + g[2] * qz)
-            py += n * (x[s, 1] - oy) + (g[3] * qx + g[4] * qy + g[5] * qz)
-            pz += n * (x[s, 2] - oz) + (g[6] * qx + g[7] * qy + g[8] * qz)
+            dx, dy, dz = x[s, 0] - ox, x[s, 1] - oy, x[s, 2] - oz
+            px += n * dx + (g[0] * qx + g[1] * qy + g[2] * qz)
+            py += n * dy + (g[3] * qx + g[4] * qy + g[5] * qz)
+            pz += n * dz + (g[6] * qx + g[7] * qy + g[8] * qz)
             for c in range(9):
                 f[c] += n * g[c]
-            if n != 0.0:
-                apart = max(apart, _squared(x, s, first))
+            squared = dx * dx + dy * dy + dz * dz
+            apart = squared if squared > apart and n != 0.0 else apart
         nearest = gradients[first]
-        grown, believed = np.sqrt(apart) / max(reach[i], np.float32(1e-30)), np.sqrt((nearest * nearest).sum() / 3.0)
-        most = max(believed, np.sqrt((f * f).sum() / 3.0))
+        own = blended = 0.0
+        for c in range(9):
+            own += nearest[c] * nearest[c]
+            blended += f[c] * f[c]
+        grown, believed = np.sqrt(apart) / max(reach[i], np.float32(1e-30)), np.sqrt(own / 3.0)
+        most = np.sqrt(max(own, blended) / 3.0)
         torn = reach[i] > 0.0 and max(grown, most / max(grown, 1e-30)) > _TORN
         if torn or (not (_determinant(f) > np.float32(0.0)) and _determinant(nearest) > np.float32(0.0)):
             turned[i] = True
