@@ -1,6 +1,7 @@
-"""Farms: frames on three nodes while things fail, chunks, killed engines, what is left, overhead, scaling, endurance.
+"""Farms: frames on three nodes while things fail, chunks, killed engines, what is left, overhead, scaling, other
+processors, endurance.
 
-    python bench/bench_farm.py [--part faults chunks kills leftovers overhead scaling soak] [--count N]
+    python bench/bench_farm.py [--part faults chunks kills leftovers overhead scaling processors soak] [--count N]
 
 Each part writes its own section. Linux; `faults` and `chunks` need root and Slurm (docs/farm/slurm.md).
 """
@@ -271,6 +272,33 @@ def soak(scene: Path, folder: Path, count: int, rays: int) -> str:
 
 
 #: part -> title, function, frames (or other counts), rays
+def processors(scene: Path, folder: Path, count: int, rays: int) -> str:
+    """The same frames with kernels compiled for this processor and for older ones."""
+    path, vertices = sheet(folder)
+    made: dict[str, list[np.ndarray]] = {}
+    before = os.environ.get("NUMBA_CPU_NAME")
+    try:
+        for name in ("", "haswell", "nehalem"):
+            os.environ["NUMBA_CPU_NAME"] = name
+            with EngineClient(engine_command(sys.executable)) as client:
+                key = client.load_asset(str(path))
+                frames = [picture(key, vertices, number, 96, rays) for number in range(1, count + 1)]
+                made[name] = [client.render(frame)["Combined"] for frame in frames]
+    finally:
+        os.environ.pop("NUMBA_CPU_NAME")
+        os.environ |= {} if before is None else {"NUMBA_CPU_NAME": before}
+    rows: list[list[object]] = []
+    ours = np.array(made[""])
+    for name, what in (("haswell", "AVX2"), ("nehalem", "SSE 4.2")):
+        apart = np.abs(np.array(made[name]) - ours)
+        relative = apart / np.maximum(np.abs(ours), 1e-3)
+        rows.append([what, f"{(apart.max(axis=-1) > 0).mean():.2%}", float(relative.max()), float(apart.max())])
+    return (
+        f"{count} frames of 96 x 96 pixels, {3 * rays} rays, by engines whose kernels were compiled for older "
+        "instruction sets (`NUMBA_CPU_NAME`), against this processor's; Embree takes the best that there is.\n\n"
+    ) + table(["kernels for", "pixels that differ", "largest relative difference", "largest difference"], rows)
+
+
 PARTS: dict[str, tuple[str, Callable[[Path, Path, int, int], str], int, int]] = {
     "faults": ("Frames on three nodes while things fail", farm_slurm.faults, 240, 1024),
     "chunks": ("Chunks of any size give the same files", farm_slurm.chunks, 48, 64),
@@ -278,6 +306,7 @@ PARTS: dict[str, tuple[str, Callable[[Path, Path, int, int], str], int, int]] = 
     "leftovers": ("What faults leave behind", left, 0, 0),
     "overhead": ("Overhead of a farm's task", overhead, 12, 64),
     "scaling": ("Workers on one machine", scaling, 10, 65536),
+    "processors": ("Nodes with other processors", processors, 3, 16),
     "soak": ("Endurance of an engine", soak, 2000, 0),
 }
 
