@@ -29,7 +29,7 @@ EXAMPLES = """examples:
   drgs convert robot.drgs 'splats/####.ply' --vertices 'poses/####.npy' --frames 1-24
   drgs convert 'in/####.ply' 'out/####.spz' --frames
   drgs convert splats.spz splats.ply --up=-y
-  drgs convert helmet.drgs light.exr
+  drgs convert lego.drgs light.exr
 """
 
 
@@ -90,12 +90,13 @@ def convert(args: argparse.Namespace) -> None:
 
     with clock(args, "reading"):
         source = open_source(args)
-    kinds: list[Held] = [args.kind] if args.kind else list(source.kinds)
     suffix = args.output.suffix.lower()
-    kind = next((k for k in kinds if any(w.kind == k and suffix in w.extensions for w in WRITERS)), kinds[0])
-    if kind not in source.kinds:
-        raise UsageError(str(args.input), f"holds no {kind}, but {', '.join(source.kinds)}", "Choose another --as")
-    writer = find_writer(args.output, kind)
+    wanted: list[Held] = [args.kind] if args.kind else list({w.kind: 0 for w in WRITERS if suffix in w.extensions})
+    if wanted and not set(wanted) & set(source.kinds):
+        lacking, held = " or ".join(wanted), ", ".join(source.kinds)
+        raise UsageError(str(args.input), f"holds no {lacking}, but {held}", "Choose another OUT or --as")
+    writer = find_writer(args.output, [args.kind] if args.kind else source.kinds)
+    kind = writer.kind
     if writer.fixed and args.up not in (None, writer.up):
         raise UsageError("--up", f"is {args.up}, but {writer.name} is {writer.up} up", "Leave --up out")
     check_writable(args.output)

@@ -92,4 +92,6 @@ def absolute_template(template: str, scene: Path) -> str:
 def check_template(template: str, frames: list[int]) -> None:
     """Refuse a template that would write several frames to one file."""
     if len(frames) > 1 and "#" not in Path(template).name:
-        raise UsageError(f"output {template}", "has no # for the frame's number", "Write it as out/####.exr")
+        raise UsageError(
+            f"output {template}", "has no # for the frame's number", f"Write it as out/####{Path(template).suffix}"
+        )

@@ -57,7 +57,7 @@ def read_stage(subject: str, usd: Any, geometry: Any) -> dict[str, Array]:
     stage = usd.Stage.Open(subject)
     prims = [prim for prim in stage.Traverse() if prim.GetTypeName() == SCHEMA]
     if not prims:
-        raise AssetError(subject, f"has no {SCHEMA}")
+        raise AssetError(subject, f"has no {SCHEMA}, and of USD nothing else is read (meshes are, of glTF)")
     time = usd.TimeCode.EarliestTime()
     places = geometry.XformCache(time)
     metres = np.diag([*[geometry.GetStageMetersPerUnit(stage)] * 3, 1.0])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -115,17 +115,18 @@ WRITERS: tuple[Writer, ...] = (
 )
 
 
-def find_writer(path: Path, kind: Held) -> Writer:
-    """The writer of `kind` that the extension of `path` names.
+def find_writer(path: Path, kinds: Sequence[Held]) -> Writer:
+    """The writer of the first of `kinds` that the extension of `path` can name.
 
     Raises
     ------
     UsageError
-        There is none; lists those of `kind`.
+        There is none; lists those of `kinds`.
     """
     suffix = path.suffix.lower()
-    for writer in WRITERS:
-        if writer.kind == kind and suffix in writer.extensions:
+    able = [writer for kind in kinds for writer in WRITERS if writer.kind == kind]
+    for writer in able:
+        if suffix in writer.extensions:
             return writer
-    names = "; ".join(f"{w.name} ({' '.join(w.extensions)})" for w in WRITERS if w.kind == kind)
-    raise UsageError(str(path), f"is no name under which {kind} can be written", f"Choose from {names}")
+    names = "; ".join(f"{w.name} ({' '.join(w.extensions)})" for w in able)
+    raise UsageError(str(path), f"is no name under which {' or '.join(kinds)} can be written", f"Choose from {names}")

@@ -361,7 +361,6 @@ def test_convert_writes_the_mesh_and_the_light_of_an_asset(tmp_path: Path) -> No
     np.testing.assert_array_equal(light, asset.environment.radiance)
     assert main(["convert", str(tmp_path / "a.exr"), str(tmp_path / "b.exr")]) == 0
     np.testing.assert_array_equal(read_environment(tmp_path / "b.exr").radiance, light)
-    assert main(["convert", str(tmp_path / "a.glb"), str(tmp_path / "b.ply")]) == 64
 
 
 def test_convert_bakes_the_light_of_an_environment(tmp_path: Path) -> None:
@@ -411,3 +410,14 @@ def test_convert_names_what_it_cannot_write(tmp_path: Path, capsys: pytest.Captu
     assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "a.spz"), "--up", "z"]) == 64
     assert "SPZ is y up" in capsys.readouterr().err
     assert not (tmp_path / "a.spz").exists()
+
+
+def test_convert_names_what_a_file_does_not_hold(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_asset(tmp_path / "a.drgs", asset_on_a_square())
+    assert main(["convert", str(tmp_path / "a.drgs"), str(tmp_path / "a.exr")]) == 64
+    assert "a.drgs: holds no environment, but mesh, splats." in capsys.readouterr().err
+    assert main(["convert", str(tmp_path / "a.drgs"), str(tmp_path / "a.xyz")]) == 64
+    assert "glTF mesh (.glb); USD mesh (.usdz); 3DGS PLY (.ply)" in capsys.readouterr().err
+    assert main(["convert", str(tmp_path / "a.drgs"), str(tmp_path / "a.glb")]) == 0
+    assert main(["convert", str(tmp_path / "a.glb"), str(tmp_path / "b.ply")]) == 64
+    assert "a.glb: holds no splats, but mesh." in capsys.readouterr().err
