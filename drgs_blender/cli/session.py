@@ -123,7 +123,7 @@ def _answer(folder: Path, about: dict[str, Any], machine: Machine) -> int:
     with contextlib.suppress(OSError):  # relative paths do not exist either where the folder is gone
         os.chdir(about["cwd"])
     with (
-        open(folder / f"{name}.out", "w", encoding="utf-8", buffering=1) as out,
+        open(folder / f"{name}.out", "w", encoding="utf-8", errors="backslashreplace", buffering=1) as out,
         open(folder / f"{name}.err", "w", encoding="utf-8", buffering=1) as err,
         contextlib.redirect_stdout(out),
         contextlib.redirect_stderr(err),

@@ -17,6 +17,7 @@ import contextlib
 import json
 import logging
 import os
+import re
 import secrets
 import signal
 import sys
@@ -26,12 +27,14 @@ from pathlib import Path
 from typing import IO
 
 from ..asset.archive import replace_file
-from ..errors import EngineError, UsageError
+from ..errors import EngineError, UsageError, WriteError
 from .frame_lines import HEARTBEAT_SECONDS, say
 
 logger = logging.getLogger(__name__)
 
 POLL_SECONDS = 0.05
+#: Names of the files above, and of those that are being written.
+_OWN = re.compile(r"lock|log|pid|stop|\.?(request-)?[0-9a-f]{8}\.(json|waits|out|err|code)(\.[0-9a-f]{8}\.tmp)?")
 #: A process that works says something at least every `HEARTBEAT_SECONDS`.
 SILENT_SECONDS = 4 * HEARTBEAT_SECONDS
 #: How long a process that was asked to end may take.
@@ -72,21 +75,28 @@ class Lock:
 
 
 def own_folder(folder: Path) -> None:
-    """Make `folder`; refuse one in which others may write: what lies there is executed.
+    """Make `folder`; refuse one in which others may write, as what lies there is executed, or that holds other files.
 
     Raises
     ------
-    UsageError
+    UsageError, WriteError
     """
-    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    about = folder.stat()
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        about, names = folder.stat(), os.listdir(folder)
+    except OSError as error:
+        problem = f"cannot be made ({error.strerror or error})"
+        raise WriteError(f"session {folder}", problem, "Choose another folder") from error
+    if foreign := next((name for name in names if not _OWN.fullmatch(name)), None):
+        problem = f"is a folder with other files ({foreign!r}), and sessions empty theirs"
+        raise UsageError(f"session {folder}", problem, "Choose a new folder")
     if os.name != "nt" and (about.st_uid != os.getuid() or about.st_mode & 0o022):
         raise UsageError(f"session {folder}", "is a folder in which others may write", "Choose a folder of your own")
 
 
 def is_running(folder: Path) -> bool:
     """Whether a session's process lives."""
-    if not (folder / "lock").is_file():
+    if not os.path.isfile(folder / "lock"):  # unlike a Path's, False for any name that cannot be
         return False
     lock = Lock(folder / "lock")
     try:

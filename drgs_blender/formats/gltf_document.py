@@ -9,6 +9,7 @@ import base64
 import binascii
 import json
 import struct
+import sys
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -52,6 +53,7 @@ class Document:
         data = path.read_bytes()
         text, self._binary = _split_glb(data, self.subject) if data[:4] == b"glTF" else (data, None)
         self.json = _parse(text, self.subject)
+        self._items: dict[str, list[dict[str, Any]]] = {}
         version = self.get(self.get(self.json, "asset", dict, {}), "version", str, "")
         if not version.startswith("2."):
             raise AssetError(self.subject, f"is glTF of version {version or 'unknown'}; 2 is read", _DAMAGED)
@@ -66,10 +68,12 @@ class Document:
 
     def items(self, key: str) -> list[dict[str, Any]]:
         """The top-level list `key` (empty when absent), all of whose entries are objects."""
-        entries = self.get(self.json, key, list, [])
-        if not all(isinstance(e, dict) for e in entries):
-            raise AssetError(self.subject, f"has an entry of {key!r} of the wrong type", _DAMAGED)
-        return entries
+        if key not in self._items:
+            entries = self.get(self.json, key, list, [])
+            if not all(isinstance(e, dict) for e in entries):
+                raise AssetError(self.subject, f"has an entry of {key!r} of the wrong type", _DAMAGED)
+            self._items[key] = entries
+        return self._items[key]
 
     def item(self, key: str, index: Any) -> dict[str, Any]:
         """Entry `index` of the top-level list `key`."""
@@ -97,10 +101,9 @@ class Document:
         good = isinstance(value, list) and len(value) == len(default)
         if not good or not all(isinstance(v, int | float) and not isinstance(v, bool) for v in value):
             raise AssetError(self.subject, f"has {key!r} of the wrong type ({str(value)[:40]})", _DAMAGED)
-        array = np.array([float(v) for v in value])
-        if not np.isfinite(array).all():
+        if not all(abs(v) <= sys.float_info.max for v in value):  # Python's integers have no end
             raise AssetError(self.subject, f"has {key!r} that is not finite", _DAMAGED)
-        return array
+        return np.array(value, np.float64)
 
     def accessor(self, index: Any, kinds: tuple[str, ...]) -> Array:
         """Values of an accessor as (count, width) array; integers that are normalised become float32 in [-1, 1].
@@ -179,7 +182,7 @@ class Document:
                 raise AssetError(self.subject, f"has damaged embedded data ({error})", _DAMAGED) from error
             return np.frombuffer(data, np.uint8)
         name = unquote(uri)
-        if not name or "\0" in name or ":" in name or not below(name):
+        if not is_name(name) or ":" in name or not below(name):
             raise AssetError(self.subject, f"refers to {uri[:60]!r}, which is no file beside or below it", _DAMAGED)
         try:
             if (self.path.parent / name).exists() and not (self.path.parent / name).is_file():
@@ -214,6 +217,11 @@ class Document:
         values = values.copy()
         values[indices] = self._strided(self.index(what, "bufferView") or 0, offsets[1], count, dtype, shape)
         return values
+
+
+def is_name(text: str) -> bool:
+    """Whether a file can have the name: neither empty nor with characters that no system takes."""
+    return bool(text) and "\0" not in text and not any("\ud800" <= c <= "\udfff" for c in text)
 
 
 def below(name: str) -> bool:

@@ -10,6 +10,7 @@ armature, but steps back by the undivided length.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any, Literal
 
 import numpy as np
@@ -147,14 +148,15 @@ class NodeTree:
         bones: dict[int, int] = {}  # bone -> its armature
         for skin, (joints, inverse_bind) in zip(self.document.items("skins"), self.skins, strict=True):
             skeleton = self.document.index(skin, "skeleton")
-            paths = [self._path(node) for node in (*joints, *([] if skeleton is None else [skeleton]))]
-            armature = next(reversed([p[0] for p in zip(*paths, strict=False) if len(set(p)) == 1]))
+            armature = self._above([*joints, *([] if skeleton is None else [skeleton])])
             if armature in joints:
                 armature = self.parent[armature]
+            found: set[int] = {armature, ROOT}
             for joint in joints:
                 node: int = joint
-                while node not in (armature, ROOT):
+                while node not in found:
                     bones[node] = armature
+                    found.add(node)
                     node = self.parent[node]
             if "inverseBindMatrices" in skin:
                 if skeleton is not None:
@@ -167,16 +169,18 @@ class NodeTree:
                 matrix = inverse[parent] @ np.linalg.inv(inverse[bone])
             self._bind_local[bone] = _without_scale(matrix)
         lengths: dict[int, float] = {}
-        for bone in sorted(bones, key=lambda b: len(self._path(b))):
-            length = lengths[bone] = self._bone_length(bone, lengths)
+        children: dict[int, list[int]] = {}
+        for bone in bones:
+            children.setdefault(self.parent[bone], []).append(bone)
+        for bone in self._parents_first(bones):
+            length = lengths[bone] = self._bone_length(bone, children.get(bone, []), lengths)
             armature = bones[bone]
             scale = 1.0 if armature == ROOT else float(np.linalg.norm(self.local[armature][:3, :3], axis=0).max())
             self._tip[bone] = np.eye(4)
             self._tip[bone][1, 3] = length / scale - length if scale > 0 else 0.0
 
-    def _bone_length(self, bone: int, known: dict[int, float]) -> float:
+    def _bone_length(self, bone: int, children: list[int], known: dict[int, float]) -> float:
         """The length Blender gives a bone: to its nearest child, else that of its parent, else its own distance."""
-        children = [b for b in self._bind_local if self.parent[b] == bone]
         distances = [float(np.linalg.norm(self._bind_local[b][:3, 3])) for b in children]
         distances = [d for d in distances if d > SHORTEST_BONE]
         own = float(np.linalg.norm(self._bind_local[bone][:3, 3]))
@@ -186,12 +190,38 @@ class NodeTree:
             return known[self.parent[bone]]
         return own if own > SHORTEST_BONE else 1.0
 
-    def _path(self, node: int) -> list[int]:
-        """Nodes from the root to `node`."""
-        path = [node]
-        while path[-1] != ROOT:
-            path.append(self.parent[path[-1]])
-        return path[::-1]
+    def _above(self, nodes: list[int]) -> int:
+        """The deepest node that is or contains all of `nodes`; every node is passed once."""
+        top = nodes[0]
+        below = {top}
+        for start in nodes[1:]:
+            node, path = start, []
+            while node not in below and node != ROOT:
+                path.append(node)
+                node = self.parent[node]
+            if node not in below:  # `start` is elsewhere
+                passed = {*path, ROOT}
+                while top not in passed:
+                    top = self.parent[top]
+                    below.add(top)
+                if top == ROOT:
+                    return ROOT
+                path = path[: path.index(top)]
+            below.update(path)
+        return top
+
+    def _parents_first(self, bones: Iterable[int]) -> list[int]:
+        """`bones` by their depth."""
+        depth = {ROOT: 0}
+        for bone in bones:
+            path = []
+            node = bone
+            while node not in depth:
+                path.append(node)
+                node = self.parent[node]
+            for passed in reversed(path):
+                depth[passed] = depth[self.parent[passed]] + 1
+        return sorted(bones, key=depth.__getitem__)
 
 
 def rotation_matrix(w: float, x: float, y: float, z: float) -> Array:

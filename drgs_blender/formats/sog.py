@@ -18,6 +18,7 @@ import numpy as np
 from ..errors import AssetError
 from .files import SurfelFile
 from .gaussian_ply import sigmoid
+from .gltf_document import is_name
 from .images import decode_image
 from .packed_splats import decode_arrays
 from .quaternions import from_smallest_three
@@ -80,7 +81,7 @@ class _Files:
 
     def read(self, name: str) -> bytes:
         """A file of the zip, or one beside meta.json."""
-        if Path(name).name != name or not name:
+        if Path(name).name != name or not is_name(name):
             raise AssetError(self.subject, f"refers to {name[:60]!r}, which is no file beside it", _REMEDY)
         if self._zip is None:
             return self._plain(self.path.parent / name)
@@ -140,12 +141,12 @@ class _Meta:
     def numbers(self, entry: str, key: str, length: int) -> Array:
         """(length,) float32 of a list, or of one number repeated."""
         value = self.entry(entry).get(key)
-        values = value if isinstance(value, list) else [value] * length
+        values: list[Any] = value if isinstance(value, list) else [value] * length
         good = len(values) == length and all(isinstance(v, int | float) and not isinstance(v, bool) for v in values)
-        array = np.array(values, np.float64) if good else np.zeros(0)
-        if not good or not (np.abs(array) < 1e30).all():
+        # Compared before they are converted: Python's integers have no end.
+        if not good or not all(abs(v) < 1e30 for v in values):
             raise AssetError(self.subject, f"has {entry}.{key} that are not {length} numbers", _REMEDY)
-        return array.astype(np.float32)
+        return np.array(values, np.float64).astype(np.float32)
 
     def _names(self, entry: str, count: int) -> list[str]:
         names = self.entry(entry).get("files")

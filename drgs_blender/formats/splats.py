@@ -8,6 +8,7 @@ import numpy as np
 
 from ..asset import Surfels
 from ..colour import linear_to_srgb
+from ..errors import UsageError
 from .axes import from_z_up, multiply_quaternions, vectors_from_z_up
 from .gaussian_ply import SH_C0
 from .harmonics import rotate_harmonics, whole_bands
@@ -68,9 +69,13 @@ def splats_of(surfels: Surfels, colour: Array | None = None) -> Splats:
 
 
 def scaled(splats: Splats, factor: float) -> Splats:
-    """Splats with all lengths times `factor`."""
-    by = np.float32(factor)
-    return replace(splats, centre=splats.centre * by, scale=splats.scale * by)
+    """Splats with all lengths times `factor`; UsageError where that is more, or less, than numbers of 32 bits hold."""
+    with np.errstate(all="ignore"):
+        by = np.float32(factor)
+        centre, scale = splats.centre * by, splats.scale * by
+    if not (np.isfinite(centre).all() and np.isfinite(scale).all() and (scale > 0).all()):
+        raise UsageError(f"--scale {factor:g}", "makes lengths that numbers of 32 bits do not hold", "Choose another")
+    return replace(splats, centre=centre, scale=scale)
 
 
 def join_splats(parts: list[Splats]) -> Splats:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
 import random
 import re
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -120,6 +122,26 @@ def test_what_a_node_would_refuse_is_refused_here(drgs, tmp_path, options):
 
 
 @node
+@pytest.mark.parametrize("place", ["--sbatch=--partition=farm\ntouch ran", "--to=job\ntouch ran"])
+def test_line_breaks_become_no_lines_of_the_script(drgs, tmp_path, monkeypatch, place):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a.blend").touch()
+    job = ["submit", "slurm", "a.blend", "--frames", "1-2", "--out", "f/####.exr", "--no-check", "--to", "job"]
+    code, _, error = drgs(*job, place)
+    assert code == 64 and "line break" in error
+    assert not list(tmp_path.rglob("*.sbatch"))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="where names are bytes")
+def test_names_of_any_bytes_reach_the_script(drgs, tmp_path):
+    folder = tmp_path / os.fsdecode(b"\xff")
+    folder.mkdir()
+    (folder / "a.blend").touch()
+    job = ["submit", "slurm", folder / "a.blend", "--frames", "1-2", "--out", folder / "####.exr", "--no-check"]
+    assert drgs(*job, "--to", folder / "job")[0] == 0
+    assert os.fsencode(folder / "a.blend") in (folder / "job" / "render.sbatch").read_bytes()
+
+
 def test_flamenco_chunks_as_its_own_tests_say():
     for (frames, size), chunks in CHUNKS.items():
         assert manager(chunk=[frames, size]) == chunks

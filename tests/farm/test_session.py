@@ -207,6 +207,24 @@ def test_session_ends_without_its_folder_its_farm_or_work(tmp_path):
     assert soon(lambda: not session_link.is_running(places[1]))
 
 
+@pytest.mark.parametrize("action", ["start", "serve"])
+def test_folder_with_other_files_is_left_as_it_is(drgs, tmp_path, action):
+    (tmp_path / "lock").touch()
+    (tmp_path / "letter.txt").write_text("dear")
+    (tmp_path / "log").write_text("mine")
+    code, _, error = drgs("session", action, tmp_path)
+    assert code == 64 and "letter.txt" in error
+    assert (tmp_path / "letter.txt").read_text() == "dear" and (tmp_path / "log").read_text() == "mine"
+
+
+def test_folders_that_cannot_be_are_said(drgs, tmp_path):
+    (tmp_path / "file").touch()
+    for folder in (tmp_path / "file", tmp_path / "file" / "below", tmp_path / ("x" * 300)):
+        code, _, error = drgs("session", "start", folder)
+        assert code == 73 and str(folder) in error
+        assert drgs("session", "stop", folder)[0] == 0
+
+
 def test_folder_in_which_others_write_is_refused(drgs, tmp_path):
     (tmp_path / "open").mkdir()
     (tmp_path / "open").chmod(0o777)

@@ -421,3 +421,15 @@ def test_convert_names_what_a_file_does_not_hold(tmp_path: Path, capsys: pytest.
     assert main(["convert", str(tmp_path / "a.drgs"), str(tmp_path / "a.glb")]) == 0
     assert main(["convert", str(tmp_path / "a.glb"), str(tmp_path / "b.ply")]) == 64
     assert "a.glb: holds no splats, but mesh." in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("suffix", ["ply", "spz", "sog", "glb"])
+@pytest.mark.parametrize("scale", ["1e39", "1e-50"])
+def test_convert_refuses_scales_that_numbers_do_not_hold(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], suffix: str, scale: str
+) -> None:
+    write_splat_ply(tmp_path / "a.ply", random_splats(5))
+    out = tmp_path / f"b.{suffix}"
+    assert main(["convert", str(tmp_path / "a.ply"), str(out), "--scale", scale]) == 64
+    assert f"--scale {float(scale):g}: makes lengths" in capsys.readouterr().err
+    assert not out.exists()

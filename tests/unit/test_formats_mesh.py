@@ -6,6 +6,7 @@ import base64
 import json
 import struct
 import subprocess
+import time
 from pathlib import Path
 from typing import Any
 
@@ -205,7 +206,9 @@ def test_sparse_accessors_replace_values(tmp_path: Path) -> None:
         (lambda j: j["meshes"][0]["primitives"][0].update(indices=7), "number 7 of 2"),
         (lambda j: j["accessors"][0].update(type="VEC2"), "VEC3"),
         (lambda j: j["nodes"][0].update(scale=[1, "2", 3]), "wrong type"),
+        (lambda j: j["nodes"][0].update(scale=[1, 10**400, 3]), "not finite"),
         (lambda j: j["nodes"][0].update(mesh=True), "wrong type"),
+        (lambda j: j.update(buffers=[{"uri": "\ud800.bin"}]), "no file beside or below"),
         (lambda j: j["asset"].update(version="1.0"), "version"),
         (lambda j: j.update(extensionsRequired=["KHR_draco_mesh_compression"]), "compressed"),
         (lambda j: j["meshes"][0]["primitives"][0].update(extensions={"KHR_draco_mesh_compression": {}}), "Draco"),
@@ -213,9 +216,24 @@ def test_sparse_accessors_replace_values(tmp_path: Path) -> None:
 )
 def test_damaged_gltf_is_refused_with_the_reason(tmp_path: Path, change: Any, words: str) -> None:
     b = quad()
+    path = b.write(tmp_path / "a.gltf")
     change(b.json)
+    path.write_text(json.dumps(b.json))
     with pytest.raises(AssetError, match=words):
-        read_mesh(b.write(tmp_path / "a.gltf"))
+        read_mesh(path)
+
+
+@pytest.mark.parametrize("deep", [False, True])
+def test_many_nodes_and_joints_are_read_in_time(tmp_path: Path, deep: bool) -> None:
+    """In proportion to their number: 10 000 are a file of some 100 kB."""
+    b, count = quad({"skin": 0}), 10_000
+    joints = list(range(1, count + 1))
+    b.json["nodes"] += [{"children": [joint + 1]} if deep and joint < count else {} for joint in joints]
+    b.json |= {"skins": [{"joints": joints}], "scenes": [{"nodes": [0, 1] if deep else [0, *joints]}]}
+    path = b.write(tmp_path / "a.gltf")
+    start = time.process_time()
+    assert len(read_mesh(path).faces) == 2
+    assert time.process_time() - start < 5
 
 
 @pytest.mark.parametrize(

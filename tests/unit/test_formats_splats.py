@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 import struct
 import sys
 import zipfile
@@ -184,6 +185,30 @@ def test_sog_reads_no_file_elsewhere(tmp_path: Path) -> None:
     (tmp_path / "b" / "meta.json").write_text(json.dumps(meta))
     with pytest.raises(AssetError, match="no file beside it"):
         read_surfels(tmp_path / "b" / "meta.json")
+
+
+@pytest.mark.parametrize("name", ["", "a\0b", "\ud800", "x" * 5000])
+@pytest.mark.parametrize("zipped", [True, False])
+def test_names_that_no_file_can_have_are_refused(tmp_path: Path, name: str, zipped: bool) -> None:
+    meta, files, _ = sog(2)
+    meta["quats"]["files"] = [name]
+    path = tmp_path / ("a.sog" if zipped else "meta.json")
+    if zipped:
+        write_sog(path, meta, files)
+    else:
+        path.write_text(json.dumps(meta))
+        for other, data in files.items():
+            (tmp_path / other).write_bytes(data)
+    with pytest.raises(AssetError, match=re.escape(path.name)):
+        read_surfels(path)
+
+
+def test_integers_without_end_are_refused(tmp_path: Path) -> None:
+    meta, files, _ = sog(2)
+    meta["means"]["mins"] = [10**400, 0, 0]
+    write_sog(tmp_path / "a.sog", meta, files)
+    with pytest.raises(AssetError, match=r"means\.mins"):
+        read_surfels(tmp_path / "a.sog")
 
 
 # ksplat

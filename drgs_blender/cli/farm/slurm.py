@@ -7,7 +7,7 @@ import shlex
 from pathlib import Path
 
 from ...asset.archive import replace_file
-from ...errors import EXIT_CANNOT_WRITE, EXIT_RETRY
+from ...errors import EXIT_CANNOT_WRITE, EXIT_RETRY, UsageError
 from .job import Job
 
 #: How often a chunk is queued again that ended with code 75 (an engine died), or 73 (a disk was full) after a pause.
@@ -71,8 +71,13 @@ def write_job(job: Job, folder: Path, retries: int = RETRIES, directives: tuple[
 
     Raises
     ------
+    UsageError
+        An option or the folder has a line break, after which the script would run what follows.
     WriteError
     """
+    for text in (*directives, str(folder)):
+        if len(text.splitlines()) > 1:
+            raise UsageError(repr(text), "has a line break, at which an option of Slurm ends", "Leave it out")
     (folder / "logs").mkdir(parents=True, exist_ok=True)
     steps = {"render": job.render("$frames")}
     if job.clean:
@@ -86,10 +91,10 @@ def write_job(job: Job, folder: Path, retries: int = RETRIES, directives: tuple[
             full=EXIT_CANNOT_WRITE,
             retries=retries,
         )
-        replace_file(folder / f"{name}.sbatch", [text.encode()])
+        replace_file(folder / f"{name}.sbatch", [text.encode(errors="surrogateescape")])
     scripts = {name: shlex.quote(str(folder / f"{name}.sbatch")) for name in steps}
     submit = _SUBMIT.format(**scripts) + (_THEN.format(**scripts) if job.clean else "")
-    replace_file(folder / "submit.sh", [submit.encode()])
+    replace_file(folder / "submit.sh", [submit.encode(errors="surrogateescape")])
     return f"sh {shlex.quote(str(folder / 'submit.sh'))}"
 
 
