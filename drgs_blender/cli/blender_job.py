@@ -165,12 +165,13 @@ class Exporter:
 
 
 def outside_files() -> list[tuple[str, str]]:
-    """What the open file refers to outside of itself, as stored and as found here."""
+    """What the open file refers to outside of itself, as stored and as found here; not the brushes of its tools."""
     import bpy
 
     stored = bpy.utils.blend_paths(absolute=False, packed=False, local=False)
     found = bpy.utils.blend_paths(absolute=True, packed=False, local=False)
-    return sorted(set(zip(stored, found)))
+    brushes = f"{os.sep}{os.path.join('datafiles', 'assets', 'brushes')}{os.sep}"  # Blender's own, on every node
+    return sorted({pair for pair in zip(stored, found) if brushes not in pair[1]})
 
 
 def differences(scene: Any) -> list[str]:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+
+from drgs_blender.cli.find_blender import find_blender
 from drgs_blender.engine import protocol
 
 
@@ -45,3 +48,13 @@ def test_scene_that_cannot_be_rendered_is_refused_as_by_a_node(drgs, folder, mon
 def test_scripts_that_will_not_run_are_named(drgs, folder):
     code, lines, _ = check(drgs, folder, "script.blend")
     assert code == 0 and any("--enable-scripts" in line for line in lines)
+
+
+def test_brushes_of_blender_are_no_files_of_the_scene(drgs, folder, tmp_path):
+    """A file begun as Blender starts names the brushes that come with Blender."""
+    scene = tmp_path / "begun.blend"
+    script = tmp_path / "begin.py"
+    script.write_text(f"import bpy; bpy.ops.wm.save_as_mainfile(filepath={str(scene)!r})")
+    subprocess.run(find_blender().command(script), check=True, timeout=120)
+    code, lines, error = check(drgs, tmp_path, scene.name, "--shared", tmp_path)
+    assert (code, len(lines)) == (0, 1) and "0 files" in lines[0], (lines, error)
