@@ -2,49 +2,24 @@
 
 from __future__ import annotations
 
-import importlib
-import json
 import os
+import sys
 import time
-import traceback
 from collections.abc import Iterator
 from pathlib import Path
 
 import bpy
 
-FOLDER = Path(os.environ["DRGS_WINDOW_JOB"])
-ASSET = os.environ["DRGS_WINDOW_ASSET"]
-PACKAGE = "bl_ext.user_default.drgs"
-#: Seconds to wait for a picture.
-PATIENCE = 400
-found: dict[str, object] = {"blender": bpy.app.version_string}
+sys.path.insert(0, str(Path(__file__).parent))
 
-
-def part(name: str):
-    return importlib.import_module(f"{PACKAGE}.{name}")
-
-
-def area(kind: str = "VIEW_3D") -> bpy.types.Area:
-    return next(a for w in bpy.context.window_manager.windows for a in w.screen.areas if a.type == kind)
-
-
-def in_viewport():
-    """Context of the 3D viewport, as a click there has it."""
-    view = area()
-    region = next(r for r in view.regions if r.type == "WINDOW")
-    return bpy.context.temp_override(window=bpy.context.window_manager.windows[0], area=view, region=region)
+import hands
+from hands import ASSET, FOLDER, PATIENCE, context_of, following, found, part, where
 
 
 def press(operator: str, **values: object) -> None:
     """Run an operator as a button does: with an undo step of its own."""
     group, name = operator.split(".")
     getattr(getattr(bpy.ops, group), name)("EXEC_DEFAULT", True, **values)
-
-
-def following() -> str:
-    """Key of the step that the sidebar marks."""
-    tour = part("addon.tour")
-    return tour.next_step(tour.steps(bpy.context)).key
 
 
 def show_tab(view: bpy.types.Area) -> bool:
@@ -57,18 +32,12 @@ def show_tab(view: bpy.types.Area) -> bool:
 
 
 def photograph(name: str) -> Iterator[float]:
-    """Have the window drawn and photographed."""
-    view = area()
+    """Photograph the window with the tab DR-GS."""
+    view = where()[1]
     view.spaces.active.show_region_ui = True
     while not show_tab(view):
         yield 0.2
-    for a in bpy.context.screen.areas:
-        a.tag_redraw()
-    yield 1.5
-    request = FOLDER / f"{name}.photo"
-    request.write_text("")
-    while request.exists():
-        yield 0.2
+    yield from hands.photograph(name)
 
 
 def modifiers() -> list[str]:
@@ -86,7 +55,7 @@ def tour() -> Iterator[float]:
     for obj in list(bpy.data.objects):
         bpy.data.objects.remove(obj)
     bpy.context.scene.world = None
-    area("PROPERTIES").spaces.active.context = "RENDER"
+    where("PROPERTIES")[1].spaces.active.context = "RENDER"
     engine = os.environ.pop("DRGS_ENGINE")
     found["first"] = following()
     yield from photograph("1-engine")
@@ -102,7 +71,7 @@ def tour() -> Iterator[float]:
     found["seen"] = following()
     press("drgs.add_camera")
     found["camera"] = following()
-    yield from wait_for_picture()
+    yield from hands.settled()
     yield from photograph("2-rendered")
     mesh = next(o for o in bpy.context.scene.objects if o.type == "MESH")
     select(mesh)
@@ -115,7 +84,7 @@ def tour() -> Iterator[float]:
     select(next(o for o in bpy.context.scene.objects if o.type == "MESH"))
     press("drgs.mark_assets")
     press("drgs.bind_to_cage", faces=200)
-    area().spaces.active.shading.type = "SOLID"
+    where()[1].spaces.active.shading.type = "SOLID"
     select(next(o for o in bpy.context.scene.objects if o.asset_data is not None))
     press("drgs.pose")
     found["mode"] = bpy.context.mode
@@ -144,33 +113,16 @@ def export() -> Iterator[float]:
     found["exported"] = target.exists()
 
 
-def wait_for_picture() -> Iterator[float]:
-    """Until the viewport shows every ray; the first time kernels are compiled."""
-    views = part("addon.viewport.views")
-    name = views.name_of(next(r for r in area().regions if r.type == "WINDOW"))
-    end = time.monotonic() + PATIENCE
-    picture = None
-    while (picture is None or picture.fraction < 1) and time.monotonic() < end:
-        yield 0.2
-        picture = views.worker.picture(name)
-    found["fraction"] = 0.0 if picture is None else picture.fraction
+def in_viewport() -> Iterator[float]:
+    """The tour, with the context that a click in the viewport has."""
+    steps = tour()
+    while True:
+        with context_of():
+            try:
+                wait = next(steps)
+            except StopIteration:
+                return
+        yield wait
 
 
-def go() -> float | None:
-    """The next part of the tour; called by Blender's timer."""
-    try:
-        with in_viewport():
-            return next(steps)
-    except StopIteration:
-        pass
-    except Exception:
-        found["error"] = traceback.format_exc()
-    part_file = FOLDER / "result.part"
-    part_file.write_text(json.dumps(found))
-    part_file.replace(FOLDER / "result.json")
-    bpy.ops.wm.quit_blender()
-    return None
-
-
-steps = tour()
-bpy.app.timers.register(go, first_interval=1.0, persistent=True)
+hands.run(in_viewport())
