@@ -2,8 +2,7 @@
 
 Every number is a pure function of (seed, frame, pixel, strategy, sample index, dimension): pictures do not depend on
 strips, threads or order. The samples of one strategy in one pixel are a Sobol' point set, scrambled as Owen does by a
-hash of the rest (Laine and Karras 2011, Burley 2020); which part of the environment they go to is a lattice, even for
-any count; deeper dimensions are hashed alone.
+hash of the rest (Laine and Karras 2011, Burley 2020); deeper dimensions are hashed alone.
 """
 
 from __future__ import annotations
@@ -101,20 +100,6 @@ def reversed_bits(numbers: Array) -> Array:
 def point_set(count: int) -> Array:
     """`sobol` for `scrambled`; the same array for every batch of a picture, not to be written to."""
     return reversed_bits(sobol(count))
-
-
-@functools.lru_cache(maxsize=8)
-def lattice_steps(count: int) -> Array:
-    """(count,) uint32: the n-th one's multiples 0 to n - 1 lie one in each of n equal strata of the uint32, or a shift.
-
-    Each is about the golden ratio of them, so that short runs of multiples are spread well, too.
-    """
-    steps = np.zeros(count, np.uint32)
-    for n in range(1, count):
-        near = round(n * 0.6180339887498949)
-        factor = next(g for far in range(n) for g in (near - far, near + far) if g > 0 and math.gcd(g, n) == 1)
-        steps[n] = round(factor * 2**32 / n) % 2**32
-    return steps
 
 
 @inlined

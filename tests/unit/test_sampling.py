@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drgs_blender.render.sampling import lattice_steps, mix, reversed_bits, scrambled, sobol
+from drgs_blender.render.sampling import mix, reversed_bits, scrambled, sobol
 
 
 def points(count: int, seed: int) -> np.ndarray:
@@ -41,9 +41,3 @@ def test_bits_are_reversed() -> None:
     numbers = np.array([[0, 1, 0x80000000], [0xF0000001, 2**32 - 1, 6]], np.uint32)
     expected = [[int(f"{n:032b}"[::-1], 2) for n in row] for row in numbers.tolist()]
     np.testing.assert_array_equal(reversed_bits(numbers), expected)
-
-
-def test_a_lattice_has_a_point_in_every_stratum_whatever_their_number() -> None:
-    for n, step in enumerate(lattice_steps(300).tolist()):
-        points = (np.arange(n) * step + 2**31 // max(n, 1)) % 2**32
-        assert sorted(points * n >> 32) == list(range(n))

@@ -100,7 +100,6 @@ def integrate(
         lamps.tables,
         brdf.layer_table(),
         sampling.point_set(sum(counts) + 1),
-        sampling.lattice_steps(sum(counts) + 1),
     )
     rules = (
         (settings.split == "auto", *map(F, counts), F(sky_part), F(lamp_part), _APART if scene.rays_differ else ONE),
@@ -161,8 +160,8 @@ def mixed(seed: int, frame_number: int) -> int:
 @njit
 def _lane(
     lane: Any, keys: Any, frames: Any, surfaces: Any, tracer: Any, geometry: Any, extent: Any, sky: Any, sky_rules: Any,
-    lamps: Any, table: Any, sequence: Any, steps: Any, split: Any, aa: Any, part: Any, bounces: Any, look: Any,
-    seed: Any, limit: Any, differ: Any, shift: Any, lanes: Any, components: Any, moments: Any,
+    lamps: Any, table: Any, sequence: Any, split: Any, aa: Any, part: Any, bounces: Any, look: Any, seed: Any,
+    limit: Any, differ: Any, shift: Any, lanes: Any, components: Any, moments: Any,
 ) -> None:  # fmt: skip
     """Every so-manyth block of points, from the `lane`-th on."""
     pixel, sample, flags = keys
@@ -201,7 +200,6 @@ def _lane(
                 turn = np.int64((np.uint64(U(U(sample[i]) * GOLDEN)) * np.uint64(part[1])) >> np.uint64(32))
                 place = F(sample[i] * part[1] + (part[0] + turn) % part[1])
                 first, past = np.int64(place * step + dither), np.int64((place + ONE) * step + dither)
-                apart = steps[np.int64(head[h, COUNTS + strategy] + F(0.99))]
                 for j in range(first, past):
                     if count == BATCH:
                         begun = trace_batch(
@@ -212,7 +210,7 @@ def _lane(
                     total[h] += 1
                     put_sample(tracer, s, ints, count, i, h, frames, surfaces, head, rate)
                     _, c = w.at(count)
-                    ints[c + w.KEY] = U(key + U(U(j) * apart))
+                    ints[c + w.KEY] = mix(U(key ^ U(U(j + 1) * U(0x85EBCA6B))))
                     ints[c + w.CELL], ints[c + w.ROW] = key, row[h]
                     ints[c + w.N0], ints[c + w.N1], ints[c + w.N2] = sequence[j, 0], sequence[j, 1], sequence[j, 2]
                     count += 1
@@ -230,8 +228,8 @@ def _lane(
 @njit(parallel=True)
 def _kernel(
     keys: Any, frames: Any, surfaces: Any, tracer: Any, geometry: Any, extent: Any, sky: Any, sky_rules: Any,
-    lamps: Any, table: Any, sequence: Any, steps: Any, split: Any, aa: Any, part: Any, bounces: Any, look: Any,
-    seed: Any, limit: Any, differ: Any, shift: Any, lanes: Any, components: Any, moments: Any,
+    lamps: Any, table: Any, sequence: Any, split: Any, aa: Any, part: Any, bounces: Any, look: Any, seed: Any,
+    limit: Any, differ: Any, shift: Any, lanes: Any, components: Any, moments: Any,
 ) -> None:  # fmt: skip
     # Threads get neighbouring lanes, lanes get every so-manyth block: no thread is left with all the costly ones.
     for lane in prange(lanes):
@@ -248,7 +246,6 @@ def _kernel(
             lamps,
             table,
             sequence,
-            steps,
             split,
             aa,
             part,

@@ -132,7 +132,6 @@ def _trace_sky(
     count: Any, s: Any, ints: Any, tracer: Any, sky: Any, look: Any, apart: Any, shift: Any, sums: Any
 ) -> None:
     """Samples of the environment: draw, weigh, trace, add."""
-    w.keyed(ints, count)
     w.light_directions(s, ints, count, sky)
     w.evaluate(s, count, look)
     if apart:

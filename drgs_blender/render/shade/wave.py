@@ -79,15 +79,6 @@ def scramble(ints: Any, count: Any) -> None:
             ints[i + N2] = scrambled(ints[i + N2], mix(U(key + U(3))))
 
 
-@njit
-def keyed(ints: Any, count: Any) -> None:
-    """Take the key for N2: the keys of one strategy's samples in a pixel are a lattice."""
-    for p in range(packets(count)):
-        c = p * _INTS
-        for i in range(c, c + LANES):
-            ints[i + N2] = ints[i + KEY]
-
-
 @inlined
 def _cosine_direction(s: Any, i: Any, u: Any, v: Any) -> Any:
     """World direction in proportion to the cosine."""
