@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import os
+import time
+from collections.abc import Iterable
 from pathlib import Path
 
 import psutil
@@ -15,6 +17,15 @@ def gone(pid: int) -> bool:
         return psutil.Process(pid).status() == psutil.STATUS_ZOMBIE
     except psutil.NoSuchProcess:
         return True
+
+
+def all_gone(pids: Iterable[int], seconds: float) -> bool:
+    """Whether processes end in time."""
+    deadline, left = time.monotonic() + seconds, set(pids)
+    while left and time.monotonic() < deadline:
+        time.sleep(0.02)
+        left = {pid for pid in left if not gone(pid)}
+    return not left
 
 
 def children(pid: int, recursive: bool = False) -> dict[int, str]:

@@ -14,7 +14,7 @@ import numpy as np
 import OpenEXR
 import psutil
 import pytest
-from processes import children, gone
+from processes import all_gone, children
 
 from drgs_blender.cli.find_blender import CHECKOUT, find_blender
 from drgs_blender.render.picture.frames import read_frame
@@ -158,10 +158,7 @@ def test_killed_blender_takes_its_engine_along(folder, tmp_path, attempt):
     finally:
         process.kill()
         process.communicate()
-    deadline = time.monotonic() + 2
-    while not gone(engine) and time.monotonic() < deadline:
-        time.sleep(0.02)
-    assert gone(engine) and set(os.listdir("/dev/shm")) <= shared
+    assert all_gone([engine], 2) and set(os.listdir("/dev/shm")) <= shared
     # Blender leaves a folder of its own where it is killed.
     left = {path.name.split("-")[0].split("_")[0] for path in tmp_path.iterdir()}
     assert left <= {"script.py", "repository", "blender"}

@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from processes import children, gone, listening
+from processes import all_gone, children, listening
 
 from drgs_blender.asset.container import read_asset, write_asset
 from drgs_blender.cli.find_blender import CHECKOUT
@@ -179,10 +179,7 @@ def test_killed_blender_gives_the_job_back_and_takes_the_engine_along(folder, tm
     finally:
         process.kill()
     assert process.returncode == 75 and out.splitlines()[-1] == "DRGS_EXIT class=retry" and "Blender" in error
-    deadline = time.monotonic() + 2
-    while not all(gone(pid) for pid in started) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert all(gone(pid) for pid in started)
+    assert all_gone(started, 2)
     assert all(path.suffix == ".exr" and path.name[0] != "." for path in (tmp_path / "out").iterdir())
     assert not list(scratch.iterdir()) and set(os.listdir("/dev/shm")) <= shared
 

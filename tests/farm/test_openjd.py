@@ -10,8 +10,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-import psutil
 import pytest
+from processes import all_gone
 
 from .conftest import PROGRAM, same_pixels
 
@@ -50,7 +50,7 @@ def test_bundle_renders_and_denoises_what_one_machine_does(drgs, folder, tmp_pat
         assert all(same_pixels(node / kind / name, alone / kind / name) for name in names)
     assert len(re.findall("DRGS_EXIT class=ok", result.stdout)) == 4
     (pid,) = re.findall(r"session \S+: process (\d+)", result.stdout)
-    assert not psutil.pid_exists(int(pid))
+    assert all_gone([int(pid)], 5)
     assert "openjd_progress: 100.0" in result.stdout
 
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from processes import children, gone, listening
+from processes import all_gone, children, listening
 
 from drgs_blender.cli import denoise, session_link
 from drgs_blender.errors import EngineError
@@ -55,11 +55,6 @@ def family(pid: int) -> set[int]:
     return {pid, *children(pid, recursive=True)}
 
 
-def all_gone(pids: set[int], seconds: float = 5.0) -> bool:
-    """Whether processes end in time."""
-    return soon(lambda: all(gone(pid) for pid in pids), seconds)
-
-
 def soon(condition: Callable[[], bool], seconds: float = 20.0) -> bool:
     """Whether `condition` holds in time."""
     deadline = time.monotonic() + seconds
@@ -84,7 +79,7 @@ def test_chunks_share_blender_and_engine_and_have_the_same_bits(drgs, folder, wa
     assert sorted(p.name for p in out.iterdir()) == ["-0002.exr", "0001.exr", "0002.exr", "0003.exr"]
     assert all(same_pixels(path, alone / path.name) for path in out.iterdir())
     session_link.end(warm)
-    assert all_gone(used) and sorted(p.name for p in warm.iterdir() if "-" in p.name or p.suffix) == []
+    assert all_gone(used, 5) and sorted(p.name for p in warm.iterdir() if "-" in p.name or p.suffix) == []
 
 
 def test_what_fails_has_its_code_and_the_session_goes_on(folder, warm, tmp_path, small_disk):
@@ -124,7 +119,7 @@ def test_dead_session_gives_the_chunk_back_and_the_next_one_renders_by_itself(fo
     os.kill(server(warm), signal.SIGKILL)
     text, errors = process.communicate(timeout=30)
     assert process.returncode == 75 and "its process died" in errors and "class=retry" in text
-    assert all_gone(all_of_it)
+    assert all_gone(all_of_it, 5)
     assert told(scene, out, warm, "1")[0] == 0
 
 
@@ -136,7 +131,7 @@ def test_task_that_is_ended_takes_its_frame_along(folder, warm, tmp_path, how):
     if how == signal.SIGKILL:
         process.kill()
         process.wait()
-        assert all_gone(all_of_it)
+        assert all_gone(all_of_it, 5)
     else:
         process.send_signal(how)
         started = time.monotonic()
@@ -155,7 +150,7 @@ def test_session_that_hangs_is_ended_and_the_chunk_given_back(folder, warm, tmp_
     with pytest.raises(EngineError, match="said nothing for 3 s"):
         session_link.hand_on(warm, ["render", "a.blend", "--frames", "1", "--out", "#.exr"])
     assert time.monotonic() - started < 15
-    assert all_gone(all_of_it) and not session_link.is_running(warm)
+    assert all_gone(all_of_it, 5) and not session_link.is_running(warm)
 
 
 def test_request_that_is_lost_is_given_back(folder, warm, tmp_path):
@@ -197,7 +192,7 @@ def test_session_ends_without_its_folder_its_farm_or_work(tmp_path):
         for path in places[0].iterdir():
             path.unlink()
         places[0].rmdir()
-        assert all_gone({pid})
+        assert all_gone({pid}, 5)
         time.sleep(max(0.0, 6 - (time.time() - (places[1] / "pid").stat().st_mtime)))
         assert session_link.is_running(places[1])
     finally:
