@@ -118,6 +118,7 @@ def bind_points(
     reach = np.zeros(len(points), np.float32)
     _weigh(points, sources, index, distance, value, slope, reach)
     offset = (points - sources[index[:, 0]]).astype(np.float32)
+    index = np.where(distance < 0.0, index[:, :1], index)  # of no use, and not to be taken for one that moved apart
     return Weights(index.astype(np.int32), value, slope, offset, reach, separated, int(stranded.sum()))
 
 
@@ -207,8 +208,12 @@ def carry(weights: Weights, x: Array, gradients: Array) -> tuple[Array, Array, i
 
 
 @njit(inline="always")
-def _determinant(f):  # type: ignore[no-untyped-def]
-    return f[0] * (f[4] * f[8] - f[5] * f[7]) - f[1] * (f[3] * f[8] - f[5] * f[6]) + f[2] * (f[3] * f[7] - f[4] * f[6])
+def _determinant(f, i):  # type: ignore[no-untyped-def]
+    return (
+        f[i, 0] * (f[i, 4] * f[i, 8] - f[i, 5] * f[i, 7])
+        - f[i, 1] * (f[i, 3] * f[i, 8] - f[i, 5] * f[i, 6])
+        + f[i, 2] * (f[i, 3] * f[i, 7] - f[i, 4] * f[i, 6])
+    )
 
 
 @njit(parallel=True)
@@ -217,37 +222,39 @@ def _carry(source, value, slope, offset, reach, x, gradients, points, out, turne
         first = source[i, 0]
         ox, oy, oz = x[first, 0], x[first, 1], x[first, 2]
         px = py = pz = 0.0
-        f = out[i]
-        f[:] = np.float32(0.0)
+        f0 = f1 = f2 = f3 = f4 = f5 = f6 = f7 = f8 = np.float32(0.0)
         apart = 0.0
         for k in range(source.shape[1]):
             s, n = source[i, k], value[i, k]
-            g = gradients[s]
+            g0, g1, g2 = gradients[s, 0], gradients[s, 1], gradients[s, 2]
+            g3, g4, g5 = gradients[s, 3], gradients[s, 4], gradients[s, 5]
+            g6, g7, g8 = gradients[s, 6], gradients[s, 7], gradients[s, 8]
             qx, qy, qz = slope[i, k, 0], slope[i, k, 1], slope[i, k, 2]
             # Relative to the first neighbour: N sums to 1 in exact arithmetic alone.
             dx, dy, dz = x[s, 0] - ox, x[s, 1] - oy, x[s, 2] - oz
-            px += n * dx + (g[0] * qx + g[1] * qy + g[2] * qz)
-            py += n * dy + (g[3] * qx + g[4] * qy + g[5] * qz)
-            pz += n * dz + (g[6] * qx + g[7] * qy + g[8] * qz)
-            for c in range(9):
-                f[c] += n * g[c]
-            squared = dx * dx + dy * dy + dz * dz
-            apart = squared if squared > apart and n != 0.0 else apart
-        nearest = gradients[first]
+            px += n * dx + (g0 * qx + g1 * qy + g2 * qz)
+            py += n * dy + (g3 * qx + g4 * qy + g5 * qz)
+            pz += n * dz + (g6 * qx + g7 * qy + g8 * qz)
+            f0, f1, f2 = f0 + n * g0, f1 + n * g1, f2 + n * g2
+            f3, f4, f5 = f3 + n * g3, f4 + n * g4, f5 + n * g5
+            f6, f7, f8 = f6 + n * g6, f7 + n * g7, f8 + n * g8
+            apart = max(apart, dx * dx + dy * dy + dz * dz)
+        out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4] = f0, f1, f2, f3, f4
+        out[i, 5], out[i, 6], out[i, 7], out[i, 8] = f5, f6, f7, f8
         own = blended = 0.0
         for c in range(9):
-            own += nearest[c] * nearest[c]
-            blended += f[c] * f[c]
+            own += gradients[first, c] * gradients[first, c]
+            blended += out[i, c] * out[i, c]
         grown, believed = np.sqrt(apart) / max(reach[i], np.float32(1e-30)), np.sqrt(own / 3.0)
         most = np.sqrt(max(own, blended) / 3.0)
         torn = reach[i] > 0.0 and max(grown, most / max(grown, 1e-30)) > _TORN
-        if torn or (not (_determinant(f) > np.float32(0.0)) and _determinant(nearest) > np.float32(0.0)):
+        if torn or (not (_determinant(out, i) > np.float32(0.0)) and _determinant(gradients, first) > np.float32(0.0)):
             turned[i] = True
             keep = min(1.0, max(grown, 1.0) / believed) if torn and believed > 0.0 else 1.0
             for c in range(9):
-                f[c] = np.float32(keep) * nearest[c]
+                out[i, c] = np.float32(keep) * gradients[first, c]
             qx, qy, qz = offset[i, 0], offset[i, 1], offset[i, 2]
-            px = np.float64(f[0] * qx + f[1] * qy + f[2] * qz)
-            py = np.float64(f[3] * qx + f[4] * qy + f[5] * qz)
-            pz = np.float64(f[6] * qx + f[7] * qy + f[8] * qz)
+            px = np.float64(out[i, 0] * qx + out[i, 1] * qy + out[i, 2] * qz)
+            py = np.float64(out[i, 3] * qx + out[i, 4] * qy + out[i, 5] * qz)
+            pz = np.float64(out[i, 6] * qx + out[i, 7] * qy + out[i, 8] * qz)
         points[i, 0], points[i, 1], points[i, 2] = ox + px, oy + py, oz + pz
