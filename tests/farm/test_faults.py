@@ -96,7 +96,7 @@ def test_frames_of_an_asset_that_changes_meanwhile_are_not_kept(folder, tmp_path
         shutil.copy(folder / name, tmp_path)
     (tmp_path / "relative.blend").rename(tmp_path / "shot.blend")
     asset = read_asset(tmp_path / "tile.drgs")
-    process = start(tmp_path, tmp_path / "out", "1-9", "--rays", "8192")
+    process = start(tmp_path, tmp_path / "out", "1-9", "--rays", "65536")
     while not process.stdout.readline().startswith("Fra:1 "):
         assert process.poll() is None
     write_asset(tmp_path / "tile.drgs", replace(asset, mesh=replace(asset.mesh, albedo=0.5 * asset.mesh.albedo)))
@@ -165,7 +165,7 @@ def test_killed_blender_gives_the_job_back_and_takes_the_engine_along(folder, tm
     shared = set(os.listdir("/dev/shm"))
     scratch = tmp_path / "scratch"
     scratch.mkdir()
-    process = start(folder, tmp_path / "out", "1-9", "--rays", "8192", scratch=scratch)
+    process = start(folder, tmp_path / "out", "1-9", "--rays", "65536", scratch=scratch)
     try:
         while not process.stdout.readline().startswith("Fra:1 "):
             assert process.poll() is None

@@ -43,6 +43,11 @@ def chunk(scene: Path, out: Path, place: Path, frames: str, *options: str) -> su
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
+def long_chunk(folder: Path, out: Path, place: Path) -> subprocess.Popen[str]:
+    """A task of one frame that lasts longer than any test looks at it."""
+    return chunk(folder / "large.blend", out, place, "1", "--rays", "65536")
+
+
 def told(scene: Path, out: Path, place: Path, frames: str, *options: str) -> tuple[int, list[str], str]:
     """(exit code, lines, errors) of a task."""
     process = chunk(scene, out, place, frames, "--rays", "4", *options)
@@ -113,7 +118,7 @@ def test_dead_blender_or_engine_costs_nothing_afterwards(folder, warm, tmp_path)
 
 def test_dead_session_gives_the_chunk_back_and_the_next_one_renders_by_itself(folder, warm, tmp_path):
     scene, out = folder / "relative.blend", tmp_path / "out"
-    process = chunk(scene, out, warm, "1", "--rays", "65536")
+    process = long_chunk(folder, out, warm)
     assert process.stdout.readline().startswith("Fra:1")
     all_of_it = family(server(warm))
     os.kill(server(warm), signal.SIGKILL)
@@ -125,7 +130,7 @@ def test_dead_session_gives_the_chunk_back_and_the_next_one_renders_by_itself(fo
 
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
 def test_task_that_is_ended_takes_its_frame_along(folder, warm, tmp_path, how):
-    process = chunk(folder / "relative.blend", tmp_path / "out", warm, "1", "--rays", "65536")
+    process = long_chunk(folder, tmp_path / "out", warm)
     assert process.stdout.readline().startswith("Fra:1")
     all_of_it = family(server(warm))
     if how == signal.SIGKILL:
@@ -154,7 +159,7 @@ def test_session_that_hangs_is_ended_and_the_chunk_given_back(folder, warm, tmp_
 
 
 def test_request_that_is_lost_is_given_back(folder, warm, tmp_path):
-    process = chunk(folder / "relative.blend", tmp_path / "out", warm, "1", "--rays", "65536")
+    process = long_chunk(folder, tmp_path / "out", warm)
     assert process.stdout.readline().startswith("Fra:1")
     for request in warm.glob("request-*.json"):
         request.unlink()
