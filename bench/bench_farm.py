@@ -25,7 +25,7 @@ from pathlib import Path
 import farm_slurm
 import numpy as np
 from bench_engine import plane_asset
-from farm_tools import MARK, PROGRAM, drgs, leftovers, processes
+from farm_tools import MARK, PROGRAM, drgs, leftovers, marked
 from report import table, write_section
 
 from drgs_blender.asset.container import read_asset
@@ -129,7 +129,7 @@ def _disturbed(what: str, scene: Path, scratch: Path, out: Path) -> int:
     time.sleep(0.3)
     victims = {"engine killed": "drgs_blender.engine", "Blender killed": "blender_job.py"}
     if what in victims:
-        (pid,) = processes(victims[what], MARK)  # exactly one, or the row would say nothing
+        (pid,) = marked(MARK, command=victims[what])  # exactly one, or the row would say nothing
         os.kill(pid, signal.SIGKILL)
     elif what == "session killed":
         os.kill(int((place / "pid").read_text()), signal.SIGKILL)

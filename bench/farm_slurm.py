@@ -13,7 +13,7 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from farm_tools import PROGRAM, drgs, frames_differ, leftovers, processes
+from farm_tools import PROGRAM, drgs, frames_differ, leftovers, marked
 from report import table
 
 sys.path[:0] = [str(Path(__file__).resolve().parent.parent / "tests" / name) for name in ("farm", "unit")]
@@ -84,7 +84,7 @@ def faults(scene: Path, folder: Path, count: int, rays: int) -> str:
     with small_disk(disk, 64), cluster() as trio:
         submit(trio, scene, to, *options, "--out", str(disk / "####.exr"))
         node = lambda name: f"SLURMD_NODENAME={name}"  # noqa: E731
-        engine = lambda name: processes("drgs_blender.engine", node(name))  # noqa: E731
+        engine = lambda name: marked(node(name), command="drgs_blender.engine")  # noqa: E731
         started = time.monotonic()
         trio.until(lambda: len(saved(to)) >= count // 8 and engine("n2"), 300)
         trio.kill_node("n2")

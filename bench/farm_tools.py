@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import subprocess
 import sys
@@ -11,6 +10,9 @@ from pathlib import Path
 
 import numpy as np
 from report import ROOT
+
+sys.path.append(str(ROOT / "tests"))
+from processes import marked
 
 from drgs_blender.render.picture.frames import read_frame
 
@@ -43,19 +45,6 @@ def frames_differ(first: Path, second: Path, count: int) -> int:
     return wrong
 
 
-def processes(command: str, *environment: str) -> list[int]:
-    """Ids of processes whose command line has `command` in it and whose environment has all of `environment`."""
-    found = []
-    for path in Path("/proc").glob("[0-9]*"):
-        with contextlib.suppress(OSError):  # it ended just now
-            line = (path / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
-            if command in line and int(path.name) != os.getpid():
-                names = set((path / "environ").read_bytes().split(b"\0"))
-                if {text.encode() for text in environment} <= names:
-                    found.append(int(path.name))
-    return found
-
-
 def listening() -> set[str]:
     """Addresses on which somebody listens on this machine."""
     found = set()
@@ -74,7 +63,7 @@ def leftovers(before: set[str] | None = None, folder: Path | None = None, second
     """
 
     def now() -> set[str]:
-        found = {f"process {pid}" for pid in processes("drgs_blender", MARK)}
+        found = {f"process {pid}" for pid in marked(MARK, command="drgs_blender")}
         found |= {f"/dev/shm/{name}" for name in os.listdir("/dev/shm")} | listening()
         return found | ({str(path) for path in folder.iterdir()} if folder else set())
 

@@ -10,7 +10,7 @@ import sys
 import time
 
 import pytest
-from processes import gone, open_files
+from processes import all_gone, gone, open_files
 
 from drgs_blender.engine import protocol
 from drgs_blender.engine.child import clean_environment
@@ -236,7 +236,7 @@ client.render(frame, lambda phase, part: print(client.pid, phase, flush=True))
     assert not gone(pid)
     parent.kill()
     parent.wait()
-    wait_until(lambda: gone(pid), 2.0)
+    assert all_gone([pid], 2.0)
     parent.stdout.close()
     assert set(os.listdir("/dev/shm")) <= before
     assert list(tmp_path.iterdir()) == []
@@ -248,7 +248,7 @@ def test_engine_ends_on_sigterm(make_client):
     client.start()
     pid = client.pid
     os.kill(pid, signal.SIGTERM)
-    wait_until(lambda: gone(pid), 5.0)
+    assert all_gone([pid], 5.0)
     with pytest.raises(AssetError):  # the next request starts another one
         client.load_asset("/nowhere")
     assert client.pid not in (0, pid)
@@ -259,4 +259,4 @@ def test_forgotten_client_takes_its_engine_along(make_client):
     client.start()
     pid = client.pid
     del client
-    wait_until(lambda: gone(pid), 2.0)
+    assert all_gone([pid], 2.0)

@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import psutil
+from processes import marked
 
 PROGRAMS = ("munged", "slurmctld", "slurmd", "sbatch")
 NODES = ("n1", "n2", "n3")
@@ -130,13 +131,7 @@ class Trio:
 
     def _of_this_cluster(self, *marks: str) -> list[int]:
         """Processes with the cluster, and `marks`, in their environment; not this one."""
-        wanted = {mark.encode() for mark in (f"SLURM_CONF={self.root}/slurm.conf", *marks)}
-        found = []
-        for environ in Path("/proc").glob("[0-9]*/environ"):
-            with contextlib.suppress(OSError):  # it ended just now
-                if wanted <= set(environ.read_bytes().split(b"\0")):
-                    found.append(int(environ.parent.name))
-        return found
+        return marked(f"SLURM_CONF={self.root}/slurm.conf", *marks)
 
     def _start(self, name: str, *command: str) -> None:
         with open(self.root / f"{name}.out", "wb") as out:
