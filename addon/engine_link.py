@@ -61,6 +61,14 @@ def command_line() -> list[str]:
         raise DeviceError("engine", "is not set up", SET_UP) from error
 
 
+def lacks_reconstruction() -> bool:
+    """Whether the engine in use is the one that was set up here, without what reconstruction needs. Starts nothing."""
+    named = preferences.read("engine_python", "") or os.environ.get(VARIABLE)
+    folder = own_folder()
+    ready = not named and engine_setup.state(folder) == "ready"
+    return ready and engine_setup.needs_network(folder, group=engine_setup.RECONSTRUCT)
+
+
 def problem() -> str:
     """What is wrong with the engine's place, "" when it is there. Starts nothing."""
     try:

@@ -20,7 +20,7 @@ import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
+from typing import IO, NamedTuple
 
 from ..drgs_blender.engine.child import clean_environment
 from ..drgs_blender.engine.locate import VARIABLE
@@ -31,24 +31,43 @@ log = logging.getLogger("drgs")
 #: The extension's folder: what the engine needs and the engine itself come with it.
 SOURCE = Path(__file__).resolve().parents[1]
 PACKAGE = "drgs_blender"
-#: What a set-up fetches and what it takes on disk, about; measured with Python 3.11 on Linux.
-DOWNLOAD_BYTES, DISK_BYTES = 175e6, 650e6
 PYTHONS = "3.11 to 3.13"
+
+
+class Group(NamedTuple):
+    """Packages that are set up together.
+
+    Attributes
+    ----------
+    extra : their name in pyproject.toml, "" for what every engine needs
+    download, disk : bytes that are fetched and that they take, about; measured with Python 3.11 on Linux
+    """
+
+    extra: str
+    download: float
+    disk: float
+
+
+ENGINE = Group("", 175e6, 650e6)
+#: PyTorch. On Linux the package index has it with CUDA, which the engine does not use; measured without.
+RECONSTRUCT = Group("reconstruct", 200e6, 900e6)
+CUDA_BYTES = 3e9
 
 _STAMP = "drgs-engine.json"
 #: Apart from the user's own Python settings; lines arrive as they are written, in UTF-8.
 _FLAGS = ("-I", "-u", "-X", "utf8")
-#: Shares of the time; the rest is the last check.
-_MADE, _FETCHED, _INSTALLED = 0.1, 0.7, 0.9
+#: Share of a step with packages after which they are there and are only unpacked.
+_FETCHED = 0.75
 #: Lines of venv, pip and `drgs doctor` that say why.
 _REASON = re.compile(r"error|^missing|not created|no module", re.IGNORECASE)
 _WINDOWS = os.name == "nt"
 
 
 @functools.cache
-def requirements(source: Path = SOURCE) -> tuple[str, ...]:
-    """The packages that the engine needs, as pip knows them."""
-    return tuple(tomllib.loads((source / "pyproject.toml").read_text(encoding="utf-8"))["project"]["dependencies"])
+def requirements(source: Path = SOURCE, group: Group = ENGINE) -> tuple[str, ...]:
+    """The packages of a group, as pip knows them."""
+    project = tomllib.loads((source / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    return tuple(project["optional-dependencies"][group.extra] if group.extra else project["dependencies"])
 
 
 @functools.cache
@@ -76,9 +95,14 @@ def state(folder: Path, source: Path = SOURCE) -> str:
     return "ready" if sources == digest(source) else "old"
 
 
-def needs_network(folder: Path, source: Path = SOURCE) -> bool:
-    """Whether a set-up of `folder` has packages to fetch."""
-    return not _alive(folder) or _read_stamp(folder).get("packages") != list(requirements(source))
+def needs_network(folder: Path, source: Path = SOURCE, group: Group = ENGINE) -> bool:
+    """Whether packages of a group are to be fetched for `folder`."""
+    return not _alive(folder) or _read_stamp(folder).get(_entry(group)) != list(requirements(source, group))
+
+
+def _entry(group: Group) -> str:
+    """Where the stamp keeps what was installed of a group."""
+    return group.extra or "packages"
 
 
 def _alive(folder: Path) -> bool:
@@ -107,8 +131,10 @@ class Step:
 
     text: str
     command: list[str]
-    end: float  # of the whole, 0..1, when it is done
+    weight: float  # its part of the time
     then: Callable[[], None] = lambda: None
+    download: float = 0.0  # bytes that it fetches, about
+    before: Callable[[], None] = lambda: None
 
 
 class EngineSetup:
@@ -120,40 +146,55 @@ class EngineSetup:
     python : interpreter that makes it
     source : folder that holds pyproject.toml and drgs_blender
     afresh : take nothing of an earlier set-up
+    reconstruct : with the packages for reconstruction from photographs too
+    index : address of a package index that is asked besides those that pip knows
 
     Attributes
     ----------
     text : what is done now, for people
     fraction : 0..1
-    fetched : bytes of packages that came so far
+    fetched : bytes of packages that came so far, of the step under way
     log_file : beside the folder; what the commands wrote
     error : why it ended, or None
     done : whether nothing more will happen
     """
 
-    def __init__(self, folder: Path, python: Path, source: Path = SOURCE, afresh: bool = False) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        python: Path,
+        source: Path = SOURCE,
+        afresh: bool = False,
+        reconstruct: bool = False,
+        index: str = "",
+    ) -> None:
         self.folder, self.source = folder, source
         self.log_file = folder.with_name(f"{folder.name}-setup.log")
         self.text, self.fraction, self.fetched = "Starting", 0.0, 0.0
         self.error: DeviceError | None = None
         self.done = False
+        self._share = 0.0  # of the whole, of the step under way
         self._began = 0.0
         self._process: subprocess.Popen[bytes] | None = None
         self._lines: IO[bytes] | None = None
         self._tail: list[str] = []
-        self._package_bytes = 0.0
+        self._package, self._package_bytes = "", 0.0
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            free = shutil.disk_usage(folder).free
-            if needs_network(folder, source) and free < DISK_BYTES:
+            groups = (ENGINE, RECONSTRUCT) if reconstruct else (ENGINE,)
+            missing = [g for g in groups if afresh or needs_network(folder, source, g)]
+            free, needed = shutil.disk_usage(folder).free, sum(g.disk for g in missing)
+            if free < needed:
                 raise DeviceError(
                     str(folder),
-                    f"has {free / 1e6:.0f} MB left, the engine needs {DISK_BYTES / 1e6:.0f}",
+                    f"has {free / 1e6:.0f} MB left, the engine needs {needed / 1e6:.0f}",
                     "Make room, or install the engine elsewhere and choose that environment",
                 )
         except OSError as error:
             raise DeviceError(str(folder), f"cannot be made ({error})", "Check its permissions") from error
-        self._steps = self._plan(python, afresh)
+        self._steps = self._plan(python, afresh, missing, index)
+        self.fraction = 0.0 if missing else 0.9  # a trial alone is the end of a set-up
+        self._whole = sum(s.weight for s in self._steps) / (1 - self.fraction)
         self._next()
 
     def poll(self) -> bool:
@@ -175,7 +216,7 @@ class EngineSetup:
         except OSError as error:
             self._fail(f"{step.text} failed: {error}")
             return True
-        self.fraction = step.end
+        self.fraction = self._began + self._share
         self._next()
         return self.done
 
@@ -190,25 +231,31 @@ class EngineSetup:
         self._close()
         self.done, self.text = True, "Cancelled"
 
-    def _plan(self, python: Path, afresh: bool) -> list[Step]:
-        """What is left to do."""
+    def _plan(self, python: Path, afresh: bool, missing: list[Group], index: str) -> list[Step]:
+        """What is left to do. Reconstruction comes last: without it the engine renders."""
         own = interpreter(self.folder)
         pip = [str(own), *_FLAGS, "-m", "pip", "install", "--no-input", "--disable-pip-version-check"]
-        needed = list(requirements(self.source))
+        pip += ["--extra-index-url", index] if index else []
+
+        def fetch(text: str, group: Group) -> Step:
+            needed = list(requirements(self.source, group))
+            command = [*pip, "--only-binary=:all:", "--progress-bar=raw", *needed]
+            return Step(text, command, 0.8, lambda: self._stamp(**{_entry(group): needed}), group.download)
+
         steps = []
-        if afresh or needs_network(self.folder, self.source):
+        if ENGINE in missing:
             clear = afresh or (own.is_symlink() and not own.exists()) or (own.is_file() and not _alive(self.folder))
             make = [str(python), *_FLAGS, "-m", "venv", *(["--clear"] if clear else []), str(self.folder)]
-            fetch = [*pip, "--only-binary=:all:", "--progress-bar=raw", *needed]
             steps += [
-                Step("Making an environment", make, _MADE / 2),
-                Step("Preparing pip", [*pip, "--quiet", "pip>=24.1"], _MADE),
-                Step("Installing packages", fetch, _INSTALLED, lambda: self._stamp(packages=needed)),
+                Step("Making an environment", make, 0.05),
+                Step("Preparing pip", [*pip, "--quiet", "pip>=24.1"], 0.05),
+                fetch("Installing packages", ENGINE),
             ]
-        else:
-            self.fraction = _INSTALLED
         doctor = [str(own), *_FLAGS, "-m", f"{PACKAGE}.cli.main", "doctor"]
-        steps.append(Step("Trying the engine", doctor, 1.0, lambda: self._stamp(sources=digest(self.source))))
+        ready = lambda: self._stamp(sources=digest(self.source))  # noqa: E731
+        steps.append(Step("Trying the engine", doctor, 0.1, ready, before=self._copy))
+        if RECONSTRUCT in missing:
+            steps.append(fetch("Installing PyTorch", RECONSTRUCT))
         return steps
 
     def _next(self) -> None:
@@ -218,9 +265,10 @@ class EngineSetup:
             return
         step = self._steps[0]
         self.text, self._tail, self._began = step.text, [], self.fraction
+        self._share = step.weight / self._whole
+        self.fetched = self._package_bytes = 0.0
         try:
-            if len(self._steps) == 1:
-                self._copy()
+            step.before()
             with open(self.log_file, "ab") as out:
                 self._lines = open(self.log_file, "rb")  # noqa: SIM115 - lives as long as the process
                 self._lines.seek(0, os.SEEK_END)
@@ -264,21 +312,24 @@ class EngineSetup:
         for raw in self._lines.readlines() if self._lines is not None else ():
             line = raw.decode(errors="replace").strip()
             if progress := re.fullmatch(r"Progress (\d+) of (\d+)", line):
-                self._package_bytes = float(progress[1])
+                self._package_bytes, size = float(progress[1]), float(progress[2])
+                if size > 5e6:
+                    self.text = f"Fetching {self._package}, {self._package_bytes / 1e6:.0f} of {size / 1e6:.0f} MB"
             elif line:
                 self._tail = [*self._tail[-9:], line]
                 self._follow(line)
-        if self._steps[0].end == _INSTALLED:
-            share = min((self.fetched + self._package_bytes) / DOWNLOAD_BYTES, 1.0) * (_FETCHED - self._began)
-            self.fraction = max(self.fraction, self._began + share)
+        if expected := self._steps[0].download:
+            part = min((self.fetched + self._package_bytes) / expected, 1.0) * _FETCHED
+            self.fraction = max(self.fraction, self._began + part * self._share)
 
     def _follow(self, line: str) -> None:
         """What a line of pip says about how far it is."""
         if package := re.match(r"(?:Downloading|Using cached|Processing) (?:\S*/)?([A-Za-z0-9_.]+?)-\d\S*(.*)", line):
             self.fetched, self._package_bytes = self.fetched + self._package_bytes, 0.0
+            self._package = package[1]
             self.text = f"Fetching {package[1]}{package[2]}"
         elif line.startswith("Installing collected packages"):
-            self.text, self.fraction = "Installing packages", _FETCHED
+            self.text, self.fraction = self._steps[0].text, self._began + _FETCHED * self._share
 
     def _stamp(self, **entries: object) -> None:
         """Remember what is done."""

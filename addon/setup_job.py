@@ -20,8 +20,8 @@ def running() -> bool:
     return job is not None and not job.done
 
 
-def start(python: Path, afresh: bool = False) -> EngineSetup:
-    """Begin, or go on where the last one ended.
+def start(python: Path, afresh: bool = False, reconstruct: bool = False, index: str = "") -> EngineSetup:
+    """Begin, or go on where the last one ended; the arguments are those of EngineSetup.
 
     Raises
     ------
@@ -30,7 +30,7 @@ def start(python: Path, afresh: bool = False) -> EngineSetup:
     """
     global job
     engine_link.stop()  # Windows does not let go of files in use
-    job = EngineSetup(engine_link.own_folder(create=True), python, afresh=afresh)
+    job = EngineSetup(engine_link.own_folder(create=True), python, afresh=afresh, reconstruct=reconstruct, index=index)
     messages.note("INFO", f"Setting up the engine in {job.folder}")
     if not bpy.app.background and not bpy.app.timers.is_registered(follow):
         bpy.app.timers.register(follow, first_interval=INTERVAL, persistent=True)

@@ -38,6 +38,18 @@ class DRGS_OT_engine_setup(DrgsOperator, bpy.types.Operator):
         options={"SKIP_SAVE"},
     )
 
+    reconstruct: BoolProperty(
+        name="Reconstruction from Photographs",
+        description="Also fetch PyTorch, which the engine needs for photographs and for nothing else",
+        default=False,
+        options={"SKIP_SAVE"},
+    )
+    index: StringProperty(
+        name="Extra Index",
+        description="Address of a package index that is asked too. Empty: those that pip is configured with",
+        options={"SKIP_SAVE"},
+    )
+
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         if setup_job.running():
@@ -46,29 +58,52 @@ class DRGS_OT_engine_setup(DrgsOperator, bpy.types.Operator):
         return True
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        folder = engine_link.own_folder()
+        if engine_setup.state(folder) != "absent" and not self._missing(engine_setup.RECONSTRUCT):
+            self.reconstruct = True
         return context.window_manager.invoke_props_dialog(self, width=440, confirm_text="Set Up")
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
         folder = engine_link.own_folder()
         state = engine_setup.state(folder)
-        fetch, disk = engine_setup.DOWNLOAD_BYTES / 1e6, engine_setup.DISK_BYTES / 1e6
         text = {
-            "absent": f"Fetches about {fetch:.0f} MB from the Python package index and takes {disk:.0f} MB in",
+            "absent": "Makes a Python environment for the engine. The folder is",
             "partial": "Goes on with what was begun; what has been fetched is not fetched again. The folder is",
-            "old": "Brings the engine to the version of the extension. Nothing is fetched. The folder is",
+            "old": "Brings the engine to the version of the extension. The folder is",
             "ready": "Tries the engine and repairs it. The folder is",
         }[state]
         column = layout.column(align=True)
-        for line in textwrap.wrap(text, 70) + textwrap.wrap(str(folder), 70):
+        for line in textwrap.wrap(text, 70) + textwrap.wrap(str(folder), 70, break_on_hyphens=False):
             column.label(text=line)
+        layout.prop(self, "reconstruct")
+        groups = [g for g in self._groups() if self._missing(g)]
+        column = layout.column(align=True)
+        if groups:
+            fetch, disk = (sum(getattr(g, size) for g in groups) / 1e6 for size in ("download", "disk"))
+            column.label(text=f"To fetch: about {fetch:.0f} MB from the Python package index; {disk:.0f} MB on disk")
+        else:
+            column.label(text="Nothing is fetched")
+        if engine_setup.RECONSTRUCT in groups and sys.platform == "linux":
+            more = f"{engine_setup.CUDA_BYTES / 1e9:.0f} GB more"
+            column.label(text=f"Linux: PyTorch comes with CUDA, {more} and of no use here,")
+            column.label(text="unless an index has a build for processors alone")
         layout.prop(self, "python")
+        if groups:
+            layout.prop(self, "index")
         if state != "absent":
             layout.prop(self, "afresh")
 
+    def _groups(self) -> list[engine_setup.Group]:
+        """What is wanted."""
+        return [engine_setup.ENGINE, *([engine_setup.RECONSTRUCT] if self.reconstruct else [])]
+
+    def _missing(self, group: engine_setup.Group) -> bool:
+        """Whether it is to be fetched."""
+        return self.afresh or engine_setup.needs_network(engine_link.own_folder(), group=group)
+
     def run(self, context: bpy.types.Context) -> set[str]:
-        folder = engine_link.own_folder()
-        if (self.afresh or engine_setup.needs_network(folder)) and not bpy.app.online_access:
+        if any(map(self._missing, self._groups())) and not bpy.app.online_access:
             raise UsageError(
                 "Engine set-up",
                 "needs packages from the network, and Blender is offline",
@@ -77,7 +112,7 @@ class DRGS_OT_engine_setup(DrgsOperator, bpy.types.Operator):
         python = Path(bpy.path.abspath(self.python) or sys.executable)
         if not python.is_file():
             raise UsageError("Python", f"{python} does not exist", f"Choose a Python of version {engine_setup.PYTHONS}")
-        job = setup_job.start(python, self.afresh)
+        job = setup_job.start(python, self.afresh, self.reconstruct, self.index.strip())
         if os.environ.get(VARIABLE):
             self.warn(f"The variable {VARIABLE} names another engine, which is used as long as it is set")
         if bpy.app.background:

@@ -7,7 +7,7 @@ from pathlib import Path
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
 
-from ..addon import reconstruction
+from ..addon import engine_link, reconstruction
 from ..drgs_blender.errors import UsageError
 from .base import DrgsOperator
 from .import_asset import import_assets
@@ -61,10 +61,19 @@ class DRGS_OT_reconstruct(ProgramOperator, bpy.types.Operator):
         return reconstruction.job is None
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        if engine_link.lacks_reconstruction():
+            bpy.ops.drgs.engine_setup("INVOKE_DEFAULT", reconstruct=True)
+            return {"CANCELLED"}
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
     def run(self, context: bpy.types.Context) -> set[str]:
+        if engine_link.lacks_reconstruction():
+            raise UsageError(
+                "Engine",
+                "was set up without PyTorch, which reconstruction needs",
+                "Press Set Up Engine with Reconstruction from Photographs",
+            )
         capture = Path(bpy.path.abspath(self.filepath)).absolute()
         if not self.filepath or not capture.exists():
             raise UsageError(

@@ -11,6 +11,7 @@ import argparse
 import logging
 import math
 import shutil
+import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -81,7 +82,9 @@ def run(args: argparse.Namespace) -> int:
     except ImportError as error:
         if error.name != "torch":
             raise
-        raise DeviceError("drgs reconstruct", "needs PyTorch", 'Install it: pip install "torch>=2.5"') from error
+        raise DeviceError(
+            "drgs reconstruct", "needs PyTorch", f'Install it: "{sys.executable}" -m pip install "torch>=2.5"'
+        ) from error
     from ..reconstruct.readers import read_capture
     from ..reconstruct.train import Schedule
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import sys
 import time
@@ -15,6 +16,7 @@ from scenes import PACKAGE, part
 
 setup = part("addon.engine_setup")
 job = part("addon.setup_job")
+requirements = setup.requirements
 errors = part("drgs_blender.errors")
 
 DOCTOR = "import {0}\nprint('DR-GS can render here.')\n"
@@ -35,7 +37,11 @@ def engine_source(folder: Path, requirement: str, program: str) -> Path:
     """Sources of an engine with one requirement, whose `drgs doctor` is `program`."""
     cli = folder / "drgs_blender" / "cli"
     cli.mkdir(parents=True)
-    (folder / "pyproject.toml").write_text(f'[project]\nname = "small"\ndependencies = ["{requirement}"]\n')
+    extra = wheel(folder, "tinytorch")
+    (folder / "pyproject.toml").write_text(
+        f'[project]\nname = "small"\ndependencies = ["{requirement}"]\n'
+        f'[project.optional-dependencies]\nreconstruct = ["{extra}"]\n'
+    )
     for path, text in ((cli.parent / "__init__.py", ""), (cli / "__init__.py", ""), (cli / "main.py", program)):
         path.write_text(text)
     return folder
@@ -115,6 +121,46 @@ def test_another_version_of_the_engine_needs_no_network(made):
     assert list(folder.rglob("new.py")) and not list(folder.rglob("drgs_blender.old"))
 
 
+def test_reconstruction_is_added_to_an_engine_that_is_ready(made):
+    folder, source = made
+    assert setup.needs_network(folder, source, setup.RECONSTRUCT) and not list(folder.rglob("tinytorch.py"))
+    running = setup.EngineSetup(folder, Path("/no/python/is/needed"), source, reconstruct=True)
+    assert running.fraction < 0.1
+    fractions = until_done(running)
+    assert running.error is None and fractions == sorted(fractions) and fractions[-1] == 1
+    assert setup.state(folder, source) == "ready" and list(folder.rglob("tinytorch.py"))
+    assert not setup.needs_network(folder, source, setup.RECONSTRUCT)
+
+
+def test_an_engine_without_reconstruction_renders_and_says_so(made, monkeypatch):
+    """Packages that cannot be had leave a working engine, and their want is told before files are chosen."""
+    folder, source = made
+    stamp = folder / setup._STAMP
+    before = stamp.read_text()
+    entries = json.loads(before)
+    entries.pop("reconstruct", None)
+    stamp.write_text(json.dumps(entries))
+    text = (source / "pyproject.toml").read_text()
+    try:
+        (source / "pyproject.toml").write_text(text.replace("tinytorch-1.0", "tinytorch-2.0"))
+        setup.requirements.cache_clear()
+        running = setup.EngineSetup(folder, Path("/no/python/is/needed"), source, reconstruct=True)
+        until_done(running)
+        assert "Installing PyTorch" in str(running.error) and setup.state(folder, source) == "ready"
+        link = part("addon.engine_link")
+        monkeypatch.delenv("DRGS_ENGINE")
+        monkeypatch.setattr(link, "own_folder", lambda create=False: folder)
+        monkeypatch.setattr(setup, "digest", lambda where=None: json.loads(before)["sources"])
+        monkeypatch.setattr(setup, "requirements", lambda where=None, group=setup.ENGINE: requirements(source, group))
+        assert link.lacks_reconstruction()
+        with pytest.raises(RuntimeError, match="without PyTorch"):
+            bpy.ops.drgs.reconstruct(filepath=str(source))
+    finally:
+        (source / "pyproject.toml").write_text(text)
+        requirements.cache_clear()
+        stamp.write_text(before)
+
+
 def test_an_engine_that_does_not_work_is_not_ready(made):
     folder, source = made
     program = source / "drgs_blender" / "cli" / "main.py"
@@ -141,7 +187,7 @@ def test_an_environment_whose_python_has_gone_is_made_anew(made, tmp_path):
     try:
         assert setup.state(folder, source) == "partial" and setup.needs_network(folder, source)
         running = setup.EngineSetup(folder, tmp_path / "no-python", source)
-        assert "--clear" in running._plan(Path(sys.executable), False)[0].command
+        assert "--clear" in running._plan(Path(sys.executable), False, [setup.ENGINE], "")[0].command
     finally:
         own.unlink()
         own.symlink_to(kept)
@@ -154,7 +200,7 @@ def test_a_python_that_is_none_is_named(tmp_path):
 
 
 def test_too_little_room_is_told_before_anything_is_fetched(tmp_path, monkeypatch):
-    monkeypatch.setattr(setup, "DISK_BYTES", 1e18)
+    monkeypatch.setattr(setup, "ENGINE", setup.ENGINE._replace(disk=1e18))
     with pytest.raises(errors.DeviceError, match="MB left"):
         setup.EngineSetup(tmp_path / "engine", Path(sys.executable))
 

@@ -75,6 +75,10 @@ def bring_in() -> Iterator[float]:
     yield from press("directory", "FILE_BROWSER", "UI", times=2)
     yield from key("A", window, ctrl=True)
     yield from hands.write(hands.ASSET, window)
+    yield from move(hands.middle("FILE_BROWSER"), window)
+    yield 1.0
+    if hands.beneath("FILE_BROWSER", "UI"):  # later Blenders take a path first and end the writing with a second Return
+        yield from key("RET", window)
     yield 1.0
     yield from press("file.execute", "FILE_BROWSER", "EXECUTE")
     yield from hands.until(lambda: not hands.there("FILE_BROWSER"), "the end of the import", 60)

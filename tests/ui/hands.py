@@ -25,7 +25,7 @@ FOLDER = Path(os.environ["DRGS_WINDOW_JOB"])
 ASSET = os.environ["DRGS_WINDOW_ASSET"]
 PACKAGE = "bl_ext.user_default.drgs"
 #: Seconds to wait for a picture.
-PATIENCE = 400
+PATIENCE = 1200
 found: dict[str, object] = {"blender": bpy.app.version_string}
 
 Place = tuple[int, int]

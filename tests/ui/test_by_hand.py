@@ -2,7 +2,7 @@
 
     DRGS_UI_BLENDER="path/to/blender" python -m pytest tests/ui/test_by_hand.py
 
-Photographs of the window are left in ``out/ui/hand-*.png``: look at them.
+Photographs of the window are left in ``out/ui``: look at them.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ OTHER = 0.1
 
 @pytest.fixture(scope="module")
 def seen(tmp_path_factory: pytest.TempPathFactory) -> window.Seen:
-    return window.run("by_hand_job.py", tmp_path_factory.mktemp("hand"), seconds=1100)
+    return window.run("by_hand_job.py", tmp_path_factory.mktemp("hand"))
 
 
 def changed(seen: window.Seen, before: str, after: str) -> np.ndarray:

@@ -19,7 +19,7 @@ COUNTS = (200, 50, 20) if WHOLE else (20, 4, 3)
 @pytest.fixture(scope="module")
 def seen(tmp_path_factory: pytest.TempPathFactory) -> window.Seen:
     folder = tmp_path_factory.mktemp("soak")
-    found = window.run("soak_job.py", folder, seconds=1700 if WHOLE else 900, DRGS_SOAK=" ".join(map(str, COUNTS)))
+    found = window.run("soak_job.py", folder, seconds=7200 if WHOLE else 1800, DRGS_SOAK=" ".join(map(str, COUNTS)))
     found.result["folder"] = str(folder)
     return found
 

@@ -31,6 +31,7 @@ bpy.ops.extensions.package_install_files(filepath={!r}, repo="user_default", ena
 bpy.context.preferences.view.show_splash = False
 bpy.ops.wm.save_userpref()
 """
+#: Photographs lie here, in a folder for each version of Blender.
 PICTURES = ROOT / "out" / "ui"
 
 
@@ -41,12 +42,13 @@ class Seen:
     result: dict
     log: str
     pid: int
+    pictures: Path
 
     def photograph(self, name: str) -> np.ndarray:
         """(h, w, 3) float32 in [0, 1]; the test is skipped where there is none."""
         if not shutil.which("import"):
             pytest.skip("no photographs without ImageMagick")
-        return picture(PICTURES / f"{name}.png")
+        return picture(self.pictures / f"{name}.png")
 
 
 def picture(path: Path | str) -> np.ndarray:
@@ -55,11 +57,14 @@ def picture(path: Path | str) -> np.ndarray:
         return np.asarray(image.convert("RGB"), np.float32) / 255
 
 
-def run(job: str, folder: Path, seconds: float = 600, **variables: str) -> Seen:
+def run(job: str, folder: Path, seconds: float = 1800, **variables: str) -> Seen:
     """Run the script `job` of this folder in the window; skip where there is no Blender or no display."""
     command = blender_command()
     if command is None:
         pytest.skip("no Blender program (set DRGS_UI_BLENDER)")
+    said = subprocess.run([*command, "--version"], capture_output=True, text=True, timeout=180).stdout
+    pictures = PICTURES / said.split()[1]  # Blender 5.0.1 ...
+    pictures.mkdir(parents=True, exist_ok=True)
     archive = extension.build(folder / "drgs.zip")
     with display() as screen:
         if screen is None:
@@ -71,30 +76,31 @@ def run(job: str, folder: Path, seconds: float = 600, **variables: str) -> Seen:
             install = [*command, "-b", "--python-expr", INSTALL.format(str(archive))]
             subprocess.run(install, env=environment, stdout=out, stderr=out, timeout=180)
             window = [*command, "--gpu-backend", "opengl", "--window-geometry", "0", "0", "1280", "800"]
-            script = ["--enable-event-simulate", "--python", str(Path(__file__).with_name(job))]
+            script = ["--enable-event-simulate", "--python", str(Path(__file__).parent / job)]
             running = subprocess.Popen([*window, *script], env=environment, stdout=out, stderr=out)
             try:
-                _follow(running, folder, environment, seconds)
+                _follow(running, folder, environment, seconds, pictures)
                 running.wait(60)
             finally:
                 if running.poll() is None:
                     running.kill()
                 running.wait()
     log = (folder / "log.txt").read_text(errors="replace")
-    return Seen(json.loads((folder / "result.json").read_text()), log, running.pid)
+    return Seen(json.loads((folder / "result.json").read_text()), log, running.pid, pictures)
 
 
-def _follow(running: subprocess.Popen, folder: Path, environment: dict[str, str], seconds: float) -> None:
+def _follow(
+    running: subprocess.Popen, folder: Path, environment: dict[str, str], seconds: float, pictures: Path
+) -> None:
     """Take the photographs that the job asks for, until it has ended."""
     camera = shutil.which("import")
-    PICTURES.mkdir(parents=True, exist_ok=True)
     end = time.monotonic() + seconds
     while not (folder / "result.json").exists():
         log = (folder / "log.txt").read_text(errors="replace")
         assert running.poll() is None and time.monotonic() < end, f"the window did not come to its end:\n{log[-3000:]}"
         for request in folder.glob("*.photo"):
             if camera:
-                picture = PICTURES / f"{request.stem}.png"
+                picture = pictures / f"{request.stem}.png"
                 subprocess.run([camera, "-window", "root", str(picture)], env=environment, check=True, timeout=60)
             request.unlink()
         time.sleep(0.1)

@@ -180,6 +180,15 @@ def test_bad_texels_are_black_and_counted() -> None:
     assert np.isfinite(pdf).all() and (pdf > 0).all()
 
 
+def test_ringing_of_filters_costs_its_texels_nothing() -> None:
+    """Every HDRI that Blender brings has a few values just below zero: no fault to tell an artist of."""
+    image = np.ones((8, 16, 3), np.float32)
+    image[2, 3, 2] = -1e-3
+    light = EnvironmentLight(World(environment=image))
+    assert light.bad_texels == 0
+    assert (light.texels[2, 3, :3] == [1, 1, 0]).all()
+
+
 def test_black_worlds_are_black() -> None:
     for world in (World(strength=0.0), World(environment=np.zeros((4, 8, 3), np.float32))):
         light = EnvironmentLight(world)

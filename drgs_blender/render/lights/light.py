@@ -28,6 +28,8 @@ BRIGHTEST = np.float32(1e15)
 
 #: A constant world as a picture: fine enough to be sampled as a surface faces it.
 _CONSTANT = (16, 32, 3)
+#: Negative light, as a part of all light, up to which it is the ringing of a picture's filter.
+_RINGING = 1e-5
 #: Cells of the sampling table at most; larger pictures are averaged down for sampling (never for the lookup).
 _MOST_CELLS = 1 << 22
 
@@ -123,6 +125,12 @@ class Sky(NamedTuple):
     zz: np.float32
 
 
+def _bad(radiance: Array) -> Array:
+    """(h, w, 1): the texels that are no light."""
+    light = np.asarray((radiance >= 0) & (radiance < np.inf))
+    return np.asarray(~light.all(axis=2, keepdims=True))
+
+
 class EnvironmentLight:
     """A `World` made ready for lookups and sampling by compiled code.
 
@@ -137,7 +145,8 @@ class EnvironmentLight:
     row_z : (rows + 1,) float32: z at the upper edge of each row of cells, from 1 to -1
     facing : the cells weighed by the cosine at a surface
     rotation : (3, 3) float32: world direction to environment direction
-    bad_texels : int: NaN, infinite or negative texels, taken as black
+    bad_texels : int: NaN, infinite or negative texels, taken as black; not those of filters that ring, whose negative
+        values are 0
     black : bool: no light at all
     """
 
@@ -154,7 +163,10 @@ class EnvironmentLight:
             raise UsageError("world", "has a colour, strength or rotation that is not finite", "Check its settings")
         with np.errstate(all="ignore"):
             tinted = image * tint.astype(np.float32)
-            bad = ~np.asarray((tinted >= 0) & (tinted < np.inf)).all(axis=2, keepdims=True)
+            bad = _bad(tinted)
+            if bad.any() and np.minimum(tinted, 0).sum() > -_RINGING * np.maximum(tinted, 0).sum():
+                np.maximum(tinted, 0, out=tinted)
+                bad = _bad(tinted)
         self.bad_texels = int(bad.sum())
         h, w = image.shape[:2]
         self.texels = np.zeros((h, w, 4), np.float32)
