@@ -102,6 +102,8 @@ class ObjectState:
     pass_index : Blender's object index pass
     visibility : which rays meet it
     adjustment : changes to the materials, after the overrides
+    tear : metres, object space: faces with an edge that is longer than in the asset by more than this, and more than
+        three times as long, span a tear and are left out with their surfels; 0: none
     """
 
     name: str
@@ -115,6 +117,7 @@ class ObjectState:
     pass_index: int = 0
     visibility: Visibility = field(default_factory=Visibility)
     adjustment: Adjustment | None = None
+    tear: float = 0.0
 
 
 @dataclass(slots=True)

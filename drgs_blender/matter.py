@@ -71,6 +71,11 @@ class Material:
         """Whether neighbours stay neighbours, so that a surface can follow the deformation of what is near it."""
         return self.model not in ("sand", "fluid")
 
+    @property
+    def gap(self) -> float:
+        """Cells between neighbours on a surface from which nothing joins them; what flows is spread thin before."""
+        return 1.0 if self.keeps_shape else 4.0
+
     def moduli(self) -> tuple[float, float]:
         """Lame's parameters (lambda, mu), Pa."""
         mu = self.young / (2 * (1 + self.poisson))

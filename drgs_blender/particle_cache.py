@@ -43,6 +43,7 @@ class Header:
     first : frame at which all is at rest
     fps : frames a second
     settings : JSON-able, as they were given
+    tear : see `frame.ObjectState`
     """
 
     digest: str
@@ -52,6 +53,7 @@ class Header:
     fps: float
     settings: dict[str, Any] = field(default_factory=dict)
     version: int = VERSION
+    tear: float = 0.0
 
 
 @dataclass(slots=True)

@@ -12,6 +12,7 @@ import numpy as np
 from ...drgs_blender.asset import MATERIAL_CHANNELS, Asset
 from ...drgs_blender.frame import Adjustment, ObjectState
 from .. import assets, mesh_arrays
+from ..matter import playback
 from .fit import check_fit, check_modifiers
 from .instances import Key, Visible
 from .memory import Memory, uid
@@ -39,7 +40,7 @@ class DrgsObjects:
         """
         obj = item.object
         check_modifiers(obj, self._depsgraph)
-        look = obj.drgs.adjustment.values()
+        look = obj.drgs.adjustment.values(), playback.tear_of(obj)
         shape = self._memory.recall(
             ("object", uid(obj), obj.name, obj.data.as_pointer(), obj.mode, str(assets.file_of(obj)), look),
             (uid(obj), uid(obj.data)),
@@ -68,7 +69,8 @@ def _shape(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, key_of: KeyOf,
         for array in arrays.values():
             if array is not None:
                 array.flags.writeable = False  # so that the engine's client need not copy it
-        return ObjectState(name=obj.name, asset=key_of(path), adjustment=_adjustment(obj, mesh, warn), **arrays)
+        adjustment, tear = _adjustment(obj, mesh, warn), playback.tear_of(obj)
+        return ObjectState(name=obj.name, asset=key_of(path), adjustment=adjustment, tear=tear, **arrays)
     finally:
         if editing:
             obj.to_mesh_clear()

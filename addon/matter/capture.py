@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -30,8 +31,12 @@ Array = np.ndarray
 
 BODY, SETTINGS, MATRICES, MOTION = "body.drgs", "settings.json", "matrices.npy", "motion.npy"
 _COLLIDER = "collider_"
+#: A file of a collider, as `_capture_motion` calls it after the object.
+COLLIDER_FILE = re.compile(_COLLIDER + r"\d{3}_(.*?)\.(?:ply|npy)")
 #: What the engine's program says is kept beside what it was given.
 SAID, LOG = "said.txt", "log.txt"
+#: Least volume to which the object may scale a cubic metre, as the engine holds it.
+_FLATTEST = 1e-12
 #: Types of attributes that can mark a part of a mesh.
 _KINDS = {"BOOLEAN": bool, "FLOAT": np.float32, "INT": np.int32}
 
@@ -69,6 +74,8 @@ def capture(obj: bpy.types.Object, scene: bpy.types.Scene, folder: Path, *, stil
             scene.frame_set(frames[0])
             data = describe(obj, scene)
             vertices, faces, matrix = _read(obj, fits=True)
+            if abs(np.linalg.det(matrix[:3, :3])) < _FLATTEST:
+                raise UsageError(subject_of(obj), "is scaled to nothing in the first frame", "Give it a size")
             data["matrix_world"] = matrix.tolist()
             _write_body(folder / BODY, obj, data, vertices, faces)
             if still:
@@ -77,6 +84,10 @@ def capture(obj: bpy.types.Object, scene: bpy.types.Scene, folder: Path, *, stil
                 yield from _capture_motion(obj, scene, frames, folder, data, (vertices, matrix))
             text = json.dumps(data, indent=1, sort_keys=True)
             replace_file(folder / SETTINGS, [text.encode()])
+        except ReferenceError as error:
+            raise UsageError(
+                subject_of(obj), "a collider or force field was removed while the scene was read", "Bake again"
+            ) from error
         finally:
             scene.frame_set(now[0], subframe=now[1])
     yield 1.0

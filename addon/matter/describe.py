@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -67,8 +68,8 @@ def check(obj: bpy.types.Object) -> None:
         )
 
 
-def own_folder(obj: bpy.types.Object, scene: bpy.types.Scene) -> Path:
-    """The cache of an object, which no other object may have.
+def own_folder(obj: bpy.types.Object) -> Path:
+    """The cache of an object, which no other object of any scene may have.
 
     Raises
     ------
@@ -76,12 +77,22 @@ def own_folder(obj: bpy.types.Object, scene: bpy.types.Scene) -> Path:
         Naming both, or what `folder_of` says.
     """
     own = folder_of(obj)
-    for other in scene.objects:
-        if other != obj and other.type == "MESH" and other.drgs.matter.use and _path_of(other) == _path_of(obj):
+    for other in bpy.data.objects:
+        if other != obj and _has_matter(other) and _same_place(other, own):
             raise UsageError(
                 subject_of(obj), f'has the same cache as "{other.name}", {own}', f"Choose another in {PANEL} > Cache"
             )
     return own
+
+
+def _has_matter(obj: bpy.types.Object) -> bool:
+    return obj.type == "MESH" and obj.drgs.matter.use and not obj.library and bool(obj.users_scene)
+
+
+def _same_place(obj: bpy.types.Object, folder: Path) -> bool:
+    with suppress(UsageError):  # it has no place yet
+        return os.path.normcase(os.path.realpath(folder_of(obj))) == os.path.normcase(os.path.realpath(folder))
+    return False
 
 
 def describe(obj: bpy.types.Object, scene: bpy.types.Scene) -> dict[str, Any]:

@@ -14,14 +14,14 @@ import logging
 import struct
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import bpy
 import numpy as np
 
 from ...drgs_blender.asset.archive import replace_file
-from ...drgs_blender.errors import UsageError, WriteError
+from ...drgs_blender.errors import DrgsError, UsageError, WriteError
 from ...drgs_blender.particle_cache import Header, ParticleCache
 
 Array = np.ndarray
@@ -133,6 +133,18 @@ class Playback:
 def modifier_of(obj: bpy.types.Object) -> bpy.types.Modifier | None:
     """The modifier that plays the cache of an object."""
     return next((m for m in obj.modifiers if m.type == "MESH_CACHE" and m.name.startswith(MODIFIER)), None)
+
+
+def tear_of(obj: bpy.types.Object) -> float:
+    """From what on faces of the played mesh span a tear, see `frame.ObjectState`; 0 where nothing is played."""
+    modifier = modifier_of(obj)
+    if modifier is None or not obj.drgs.matter.tear:
+        return 0.0
+    with suppress(DrgsError):  # a damaged cache plays all the same; the next bake says it
+        path = Path(bpy.path.abspath(modifier.filepath, library=obj.library))
+        header = ParticleCache(path.parent).header()
+        return 0.0 if header is None else header.tear
+    return 0.0
 
 
 def attach(obj: bpy.types.Object, path: Path, first: int) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -65,6 +66,7 @@ class Program:
 
     def __init__(self, inputs: Path, folder: Path, threads: int = 0) -> None:
         self._counts: tuple[int, int] | None = None
+        self._inputs = inputs
         self._said, self._log = inputs / capture.SAID, inputs / capture.LOG
         command = engine_link.command_line()
         python = command[: command.index("-m")]
@@ -125,10 +127,15 @@ class Program:
         code = self._process.wait()
         self._process.stdin.close()
         if code == 0:
-            return lines
+            return [self._in_words(line) for line in lines]
         said = next((line for line in reversed(lines) if line.startswith("drgs: ")), "")
         if said:
-            raise AssetError(subject, said.removeprefix("drgs: ").rstrip("."), held)
+            raise AssetError(subject, self._in_words(said.removeprefix("drgs: ")).rstrip("."), held)
         last = lines[-1][:300] if lines else "it said nothing"
         remedy = "Bake again: it goes on" + (f". {held}" if held else "")
         raise EngineError(subject, f"the engine's program ended ({code}): {last.rstrip('.')}", remedy)
+
+    def _in_words(self, line: str) -> str:
+        """A line of the engine's program without the files that `capture` wrote: the artist knows objects."""
+        line = line.replace(f"{self._inputs / capture.BODY}: ", "").replace(f"{self._inputs}{os.sep}", "")
+        return capture.COLLIDER_FILE.sub(r'collider "\1"', line)

@@ -210,6 +210,12 @@ class DrgsMatterSettings(_Matter, bpy.types.PropertyGroup):
         ),
         options=set(),
     )
+    tear: BoolProperty(
+        name="Show Tears",
+        description="Leave out faces that span a gap where matter has come apart, with their surfels",
+        default=True,
+        options=set(),
+    )
     resolution: IntProperty(
         name="Resolution",
         description="Cells along the longest side of the object; each holds eight particles. Twice as many take up to "

@@ -154,7 +154,7 @@ class Bake(Work):
     """
 
     def __init__(self, obj: bpy.types.Object, scene: bpy.types.Scene) -> None:
-        folder = own_folder(obj, scene)
+        folder = own_folder(obj)
         super().__init__(obj, scene, folder / INPUT, folder, still=False)
         matter = obj.drgs.matter
         self.first, self.frames, self.count = matter.frame_start, matter.frame_end - matter.frame_start + 1, 0

@@ -81,6 +81,7 @@ class DRGS_PT_matter(_Physics, bpy.types.Panel):
         _draw_material(column, matter)
         column.prop(matter, "solver")
         column.prop(matter, "resolution")
+        column.prop(matter, "tear")
         row = self.layout.row(align=True)
         row.operator("drgs.preview_matter", icon="POINTCLOUD_DATA")
         fill = points.of(obj)

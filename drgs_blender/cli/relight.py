@@ -80,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
     camera = read_camera(args.camera)
     settings = sampling.override(RenderSettings(), args)
     sampling.check_size(camera, args.passes)
-    poses = _poses(args)
+    poses, tear = _poses(args)
     for number, _ in poses:
         check_writable(frame_path(args.out, number))
 
@@ -93,7 +93,7 @@ def run(args: argparse.Namespace) -> int:
         frame = Frame(
             number=number,
             camera=camera,
-            objects=[ObjectState(name=args.asset.stem, asset=key, vertices=vertices())],
+            objects=[ObjectState(name=args.asset.stem, asset=key, vertices=vertices(), tear=tear)],
             world=world,
             settings=settings,
             passes=args.passes,
@@ -115,21 +115,22 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _poses(args: argparse.Namespace) -> list[tuple[int, Callable[[], np.ndarray | None]]]:
-    """Number of each picture, and what gives its pose."""
+def _poses(args: argparse.Namespace) -> tuple[list[tuple[int, Callable[[], np.ndarray | None]]], float]:
+    """Number of each picture with what gives its pose, and from what faces are torn."""
     if args.cache is None:
         if args.frames:
             raise UsageError("--frames", "are those of a cache", "Give one with --cache")
         vertices = read_vertices(args.vertices) if args.vertices else None
-        return [(1, lambda: vertices)]
+        return [(1, lambda: vertices)], 0.0
     cache = ParticleCache(args.cache)
-    if cache.header() is None:
+    header = cache.header()
+    if header is None:
         raise UsageError(f"--cache {args.cache}", "is not the cache of a simulation", "Make one with `drgs simulate`")
     frames = parse_frames(args.frames) if args.frames else cache.frames()
     if missing := sorted(set(frames) - set(cache.frames())):
         cache.read(missing[0])  # says which are there
     check_template(str(args.out), frames)
-    return [(frame, lambda frame=frame: cache.read(frame).vertices) for frame in frames]  # type: ignore[misc]
+    return [(frame, lambda frame=frame: cache.read(frame).vertices) for frame in frames], header.tear  # type: ignore[misc]
 
 
 def read_vertices(path: Path) -> np.ndarray:

@@ -33,6 +33,8 @@ EXAMPLES = """examples:
   drgs relight cat.drgs --env studio.hdr --camera front.json --cache bake --frames 24 --out 24.png
 """
 
+#: Time steps a frame from which a bake is slower than its settings let expect.
+_MANY_STEPS = 2000
 #: Options that are a number of the material.
 _MATTER = ("young", "poisson", "density")
 
@@ -103,13 +105,18 @@ def run(args: argparse.Namespace) -> int:
     use_threads(args.threads)
     asset = read_asset(args.asset)
     with clock(args, "filling"):
-        job = prepare(asset.mesh, settings)
+        job = prepare(asset.mesh, settings, str(args.asset))
     report = job.filling.report
     parts = f" in {report['parts']} parts" if report["parts"] > 1 else ""
     steps = job.solver.steps_of(1 / settings.fps)
     print(
         f"{report['particles']} particles{parts} ({report['method']}), at least {steps} time steps a frame", flush=True
     )
+    if steps > _MANY_STEPS:
+        logger.warning(
+            "%s: %d time steps a frame take long; a lower stiffness or resolution, or a larger body, needs fewer",
+            args.asset, steps,
+        )  # fmt: skip
     if report["dropped_parts"]:
         logger.warning("%d small parts of the mesh's interior are left out", report["dropped_parts"])
     if report["bare_vertices"]:

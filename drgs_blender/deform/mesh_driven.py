@@ -76,6 +76,7 @@ class MeshDriven:
         *,
         matrix_world: Array | None = None,
         object_index: int = 0,
+        torn: Array | None = None,
     ) -> PosedSurfels:
         """Surfels of one frame.
 
@@ -90,6 +91,7 @@ class MeshDriven:
         matrix_world : (4, 4) object-to-world that `vertices_world` contain. Needed where it mirrors or scales: it
             says which side of a face is out, and scales what stands off the surface. None is rigid.
         object_index : index into Frame.objects, copied to every surfel
+        torn : (m,) bool, faces that are not there: their surfels are transparent, and they bend no smooth normals
 
         Returns
         -------
@@ -105,7 +107,9 @@ class MeshDriven:
         side = -1.0 if np.linalg.det(linear) < 0 else 1.0
         by_corner = corner_normals_world is not None
         if corner_normals_world is None:
-            normals = self.normals(vertices)
+            normals = np.empty_like(vertices)
+            faces = self.normals.faces if torn is None else np.where(torn[:, None], np.int32(0), self.normals.faces)
+            self.normals.into(vertices, faces, normals)
             if side < 0:
                 normals = -normals
         else:
@@ -125,6 +129,8 @@ class MeshDriven:
         self.lost = int(np.count_nonzero(opacity != self.surfels.opacity))
         if self.lost:
             log.debug("%d surfels hang on vertices that are not finite; they are hidden", self.lost)
+        if torn is not None:
+            opacity[torn[binding.face]] = 0
         channels = {name: self._channel(name, (materials or {}).get(name)) for name in MATERIAL_CHANNELS}
         return PosedSurfels(
             centre, tangent_u, tangent_v, normal, opacity, **channels, object_index=np.full(n, object_index, np.int32)

@@ -10,6 +10,7 @@ from ..adjust import adjusted
 from ..asset.model import MATERIAL_CHANNELS, Asset, PosedSurfels, Surfels, as_float
 from ..deform.matrix_driven import pose_by_matrix
 from ..deform.mesh_driven import MeshDriven
+from ..deform.tears import torn_faces
 from ..errors import AssetError, UsageError
 from ..frame import ObjectState, Pose
 from ..render.trace.scene import TraceObject
@@ -133,6 +134,7 @@ def traced_object(state: ObjectState, asset: Asset, seen_only: bool = False) -> 
         materials = adjusted(materials, state.adjustment, _mask(state, n))
     linear = matrix[:3, :3]
     faces = mesh.faces
+    torn = torn_faces(mesh.vertices, vertices, faces, state.tear) if state.tear > 0 else None
     with np.errstate(over="ignore", invalid="ignore"):  # bad vertices are counted by the scene
         determinant = float(np.linalg.det(linear))
         world = world_vertices(vertices, matrix)
@@ -154,6 +156,7 @@ def traced_object(state: ObjectState, asset: Asset, seen_only: bool = False) -> 
         pass_index=state.pass_index,
         visibility=state.visibility,
         seen_only=seen_only,
+        torn=torn if torn is not None and torn.any() else None,
     )
 
 
@@ -181,7 +184,7 @@ def posed_surfels(
         name: _material(state, name, getattr(mesh, name), "a mesh") if _has(state, name) else None
         for name in MATERIAL_CHANNELS
     }
-    posed = driven.pose(traced.vertices, normals, materials, matrix_world=matrix, object_index=index)
+    posed = driven.pose(traced.vertices, normals, materials, matrix_world=matrix, object_index=index, torn=traced.torn)
     return _adjusted_surfels(state, posed, driven), driven.lost
 
 

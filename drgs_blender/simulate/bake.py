@@ -53,8 +53,9 @@ def bake(
     if start is None:
         rest = job.rest()
         header = Header(
-            job.digest, len(rest.points), len(rest.vertices), settings.first, settings.fps, asdict(settings)
-        )
+            job.digest, len(rest.points), len(rest.vertices), settings.first, settings.fps, asdict(settings),
+            tear=job.tear,
+        )  # fmt: skip
         cache.create(header, rest)
         cache.write(settings.first, rest)
         start = settings.first
@@ -64,6 +65,7 @@ def bake(
         for frame in range(start + 1, settings.last + 1):
             told = None if progress is None else (lambda part, f=frame: progress(f, part))
             solver.advance(1 / settings.fps, job.pin_targets(frame - settings.first), cancelled, told)
+            _check_own(cache, job)
             cache.write(frame, job.now())
             done += 1
             if time.monotonic() - kept_at > _KEEP_EVERY:
@@ -71,9 +73,22 @@ def bake(
                 kept, kept_at = frame, time.monotonic()
     finally:
         now = settings.first + solver.frame
-        if now > kept and cache.path(now).exists():
+        if now > kept and cache.path(now).exists() and _owned(cache, job):
             cache.write_state(now, solver.arrays())
     return done
+
+
+def _owned(cache: ParticleCache, job: Job) -> bool:
+    header = cache.header()
+    return header is not None and header.digest == job.digest
+
+
+def _check_own(cache: ParticleCache, job: Job) -> None:
+    """Frames of two simulations must never lie in one folder."""
+    if not _owned(cache, job):
+        raise UsageError(
+            str(cache.folder), "was given to another simulation, or emptied, meanwhile", "Bake again, one at a time"
+        )
 
 
 def _resume(job: Job, cache: ParticleCache, overwrite: bool) -> int | None:

@@ -53,8 +53,11 @@ class Collider:
         if self.contact not in CONTACTS:
             raise UsageError(self.name, f"has contact {self.contact!r}", f"There are {', '.join(CONTACTS)}")
         shaped = self.vertices.ndim == 3 and self.vertices.shape[2] == 3 and self.faces.ndim == 2
-        if not shaped or not len(self.faces) or self.faces.max() >= self.vertices.shape[1] or self.faces.min() < 0:
+        if not shaped or not len(self.vertices) or not len(self.faces) or self.faces.min() < 0:
             raise AssetError(self.name, "is not a mesh with faces", "Choose a mesh for the collider")
+        if self.faces.max() >= self.vertices.shape[1]:
+            problem = f"has {self.vertices.shape[1]} vertices in its animation, its faces need {self.faces.max() + 1}"
+            raise AssetError(self.name, problem, "Export its vertices from this mesh")
         if not np.isfinite(self.vertices).all():
             raise AssetError(self.name, "has vertices that are not finite", "Clean the mesh up")
         if not 0 <= self.friction < np.inf:

@@ -52,7 +52,14 @@ class Filling:
 
 
 def fill(
-    vertices: Array, faces: Array, spacing: float, *, jitter: float = 0.0, seed: int = 0, method: str = "auto"
+    vertices: Array,
+    faces: Array,
+    spacing: float,
+    *,
+    jitter: float = 0.0,
+    seed: int = 0,
+    method: str = "auto",
+    name: str = "mesh",
 ) -> Filling:
     """Put one particle into every cell of side `spacing` whose centre is inside the mesh.
 
@@ -64,6 +71,7 @@ def fill(
     jitter : random displacement of particles, in cells, up to 1: sand and snow show no rows then
     seed : of the jitter
     method : "winding", "parity" or "auto"
+    name : of the mesh, in messages
 
     Raises
     ------
@@ -75,7 +83,7 @@ def fill(
     vertices = np.ascontiguousarray(vertices, np.float64)
     faces = np.ascontiguousarray(faces, np.int64)
     if not len(faces) or not np.isfinite(vertices[faces]).all():
-        raise AssetError("mesh", "has no faces, or vertices that are not finite", "Clean the mesh up")
+        raise AssetError(name, "has no faces, or vertices that are not finite", "Clean the mesh up")
     if not (np.isfinite(spacing) and spacing > 0):
         raise UsageError("particle spacing", f"is {spacing}", "Give a positive number of metres")
     low, high = vertices[faces].min(axis=(0, 1)), vertices[faces].max(axis=(0, 1))
@@ -88,12 +96,12 @@ def fill(
         )
     # The mesh in the middle of its cells, so that a symmetric mesh is filled symmetrically.
     origin = 0.5 * (low + high) - 0.5 * size * spacing
-    inside, used = _inside(vertices, faces, origin, spacing, size, method)
+    inside, used = _inside(vertices, faces, origin, spacing, size, method, name)
     part, report = _parts(inside)
     report["method"] = used
     if not report["parts"]:
         raise AssetError(
-            "mesh",
+            name,
             f"has no interior at a particle spacing of {spacing:.3g} m",
             "Close its large holes, give it thickness (Solidify), or use a smaller spacing",
         )
@@ -109,7 +117,7 @@ def fill(
 
 
 def _inside(
-    vertices: Array, faces: Array, origin: Array, spacing: float, size: Array, method: str
+    vertices: Array, faces: Array, origin: Array, spacing: float, size: Array, method: str, name: str
 ) -> tuple[Array, str]:
     """Which cells are inside, (nx, ny, nz) bool, and the method that said so."""
     odd, deep = np.zeros(size, np.uint8), np.zeros(size, np.uint8)
@@ -126,7 +134,7 @@ def _inside(
     # Rays in all three directions count alike but for holes, unless faces point anywhere: then only parity does.
     mixed = np.count_nonzero(disputed) > 2 * np.count_nonzero(torn) + UNDECIDED * np.count_nonzero(deep >= 2)
     if method == "auto" and mixed:
-        log.warning("mesh: its faces are not oriented alike; its interior is found by ray parity")
+        log.warning("%s: its faces are not oriented alike; its interior is found by ray parity", name)
     if method == "parity" or (method == "auto" and mixed):
         return odd >= 2, "ray parity"
     if importlib.util.find_spec("igl") is None:

@@ -36,6 +36,8 @@ log = logging.getLogger(__name__)
 PER_CELL = 2
 #: Displacement of particles, in their spacings, of matter that shows rows of particles otherwise.
 _JITTER = 0.8
+#: Blocks of cells that a domain may have: a body of 400 cells and three times its size around it.
+_MOST_BLOCKS = 1 << 29
 
 
 @dataclass(slots=True)
@@ -48,12 +50,14 @@ class Job:
     filling : particles at rest, world
     solver : at the beginning
     digest : names the settings and all that went into it; frames of equal digests are equal
+    tear : see `frame.ObjectState`
     """
 
     settings: Settings
     filling: Filling
     solver: Stepper
     digest: str
+    tear: float
     _vertices: Array
     _weights: Weights | None
     _pins: _PinMotion | None
@@ -107,12 +111,13 @@ class _PinMotion:
         return carry(self._weights, now, self._source.gradients(now))[0]
 
 
-def prepare(mesh: Mesh, settings: Settings) -> Job:
+def prepare(mesh: Mesh, settings: Settings, name: str = "mesh") -> Job:
     """Fill the mesh and set its simulation up.
 
     Parameters
     ----------
     mesh : the asset's, object space
+    name : of it, in messages
 
     Raises
     ------
@@ -124,14 +129,14 @@ def prepare(mesh: Mesh, settings: Settings) -> Job:
     faces = mesh.faces if np.linalg.det(matrix[:3, :3]) > 0 else mesh.faces[:, ::-1]
     used = vertices[np.unique(faces)] if len(faces) else vertices[:0]
     if not len(used) or not np.isfinite(used).all():
-        raise AssetError("mesh", "has no faces, or vertices that are not finite", "Clean the mesh up")
+        raise AssetError(name, "has no faces, or vertices that are not finite", "Clean the mesh up")
     spacing = float(np.ptp(used, axis=0).max()) / settings.resolution
     if spacing <= 0:
-        raise AssetError("mesh", "has no size", "Choose a mesh with an interior")
+        raise AssetError(name, "has no size", "Choose a mesh with an interior")
     materials = [settings.material, *(material for _, material in settings.regions)]
     loose = [not m.keeps_shape for m in materials]
     jitter = settings.jitter if settings.jitter is not None else (_JITTER if any(loose) else 0.0)
-    filling = fill(vertices, faces, spacing / PER_CELL, jitter=jitter, seed=settings.seed)
+    filling = fill(vertices, faces, spacing / PER_CELL, jitter=jitter, seed=settings.seed, name=name)
     points = filling.points
     nearest = cKDTree(vertices).query(points, workers=-1)[1]
 
@@ -147,7 +152,8 @@ def prepare(mesh: Mesh, settings: Settings) -> Job:
             low, high = np.asarray(region.box)
             mask &= ((points >= low) & (points <= high)).all(axis=1)
         if not mask.any():
-            raise UsageError(f"{what}", "contains no particle", "Choose a larger group or box")
+            part = f"{what}, group {region.group!r}" if region.group is not None else what
+            raise UsageError(part, "contains no particle", "Choose a larger group or box")
         return mask
 
     which = np.zeros(len(points), np.int64)
@@ -172,7 +178,9 @@ def prepare(mesh: Mesh, settings: Settings) -> Job:
     if settings.motion is not None and pinned.any():
         motion = _PinMotion(mesh, _load(settings.motion), points[pinned], matrix)
     log.info("%d particles, %d time steps a frame at least", len(points), solver.steps_of(1 / settings.fps))
-    return Job(settings, filling, solver, _digest(mesh, settings, colliders, motion), vertices, weights, motion)
+    digest = _digest(mesh, settings, colliders, motion)
+    tear = max(m.gap for m in materials) * spacing / abs(float(np.linalg.det(matrix[:3, :3]))) ** (1 / 3)
+    return Job(settings, filling, solver, digest, tear, vertices, weights, motion)
 
 
 def _has(names: Sequence[str]) -> str:
@@ -217,7 +225,12 @@ def _domain(settings: Settings, points: Array, spacing: float, colliders: list[C
     if settings.floor is not None:
         # A layer of nodes on the floor itself.
         low[2] = settings.floor - (np.ceil((settings.floor - low[2]) / spacing) + 0.5) * spacing
-    return Domain.around(low, high, spacing)
+    domain = Domain.around(low, high, spacing)
+    if np.prod(domain.blocks, dtype=float) > _MOST_BLOCKS:
+        sides = " x ".join(f"{length:.3g}" for length in high - low)
+        problem = f"of {sides} m is too large for cells of {spacing:.3g} m"
+        raise UsageError("domain", problem, "Make it smaller, or the resolution lower")
+    return domain
 
 
 def _colliders(settings: Settings) -> list[Collider]:
@@ -235,8 +248,10 @@ def _load(path: str) -> Array:
     """Numbers of a .npy file."""
     try:
         array = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise UsageError(path, f"cannot be read ({error})", "Save it with numpy.save") from error
+    except OSError as error:
+        raise UsageError(path, f"cannot be read ({error.strerror or error})", "Check the path") from error
+    except (ValueError, EOFError) as error:  # numpy's own words recommend pickle
+        raise UsageError(path, "is no .npy file of numbers", "Save it with numpy.save") from error
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu" or not np.isfinite(array).all():
         raise UsageError(path, "does not hold finite numbers", "Save positions in metres with numpy.save")
     return array.astype(np.float64)

@@ -230,9 +230,9 @@ class Solver(Stepper):
                 nodes = np.empty((len(arrangement.active), 64, 4), np.float32)
                 held = np.zeros_like(nodes) if len(pins) else nodes[:0]
                 fastest = np.empty(len(arrangement.block), np.float32)
-            longest = min(self._slowest_step, seconds)
-            longest = min(longest, _FASTEST * h / max(speed + push * longest, 1e-12))
-            if longest < self._slowest_step / _RUNAWAY and speed > outside:
+            usual = min(self._slowest_step, seconds)
+            longest = min(usual, _FASTEST * h / max(speed + push * usual, 1e-12))
+            if longest < usual / _RUNAWAY and speed > outside:
                 raise self._error(
                     f"ran away: matter moves at {speed:.3g} m/s",
                     "Make the material stiffer or the particles finer, or slow down what hits it",

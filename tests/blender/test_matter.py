@@ -6,6 +6,7 @@ import json
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -19,6 +20,8 @@ work, points, describe = (part(f"addon.matter.{name}") for name in ("work", "poi
 playback, capture = part("addon.matter.playback"), part("addon.matter.capture")
 particle_cache = part("drgs_blender.particle_cache")
 FRAMES = 6
+#: Seconds after which something hangs, also where kernels are compiled and the machine has other work.
+PATIENCE = 1800
 #: Vertices of a frame, in a Blender without the extension.
 PLAIN = """
 import os, sys, bpy, numpy as np
@@ -59,6 +62,15 @@ def cache_of(obj):
     return particle_cache.ParticleCache(describe.folder_of(obj))
 
 
+def begin_of(bake, count):
+    """A bake of which so many frames can be played."""
+    until = time.monotonic() + PATIENCE
+    while bake.count < count:
+        assert not bake.step(0.05) and time.monotonic() < until
+        time.sleep(0.01)
+    return bake
+
+
 def computed_last(obj) -> int:
     """Frames that the last bake did not find in the cache."""
     said = (describe.folder_of(obj) / work.INPUT / capture.SAID).read_text()
@@ -92,6 +104,10 @@ def test_frames_are_played_in_any_order_by_any_blender(body, scene, captured, tm
     scene.frame_set(FRAMES)
     bpy.ops.render.render()
     np.testing.assert_array_equal(captured[0].objects[0].vertices, baked[FRAMES])
+    assert captured[0].objects[0].tear == pytest.approx(2 / 8), "a cell: where matter tears, faces are left out"
+    body.drgs.matter.tear = False
+    bpy.ops.render.render()
+    assert captured[1].objects[0].tear == 0
     # The folder is moved, and opened where the extension is not.
     scene.frame_set(1)
     bpy.ops.wm.save_mainfile()
@@ -101,36 +117,42 @@ def test_frames_are_played_in_any_order_by_any_blender(body, scene, captured, tm
     (moved / "user").mkdir()
     arguments = [str(moved / "scene.blend"), "4", str(moved / "found.npy")]
     plain = dict(os.environ, BLENDER_USER_RESOURCES=str(moved / "user"))
-    subprocess.run([sys.executable, "-c", PLAIN, *arguments], check=True, timeout=120, env=plain)
+    subprocess.run([sys.executable, "-c", PLAIN, *arguments], check=True, timeout=900, env=plain)
     np.testing.assert_array_equal(np.load(moved / "found.npy"), baked[4])
 
 
 def test_a_bake_is_stopped_at_once_and_goes_on(body, scene):
     matter = body.drgs.matter
-    matter.frame_end, matter.gravity, matter.spin = 5000, 0.0, (0, 0, 3)
+    wanted = matter.frame_end = 500_000
+    matter.gravity, matter.spin = 0.0, (0, 0, 3)
     bake = work.Bake(body, scene)
     with pytest.raises(RuntimeError, match="poll"):
         bpy.ops.drgs.bake_matter()
-    until = time.monotonic() + 120
-    while bake.count < 3 and time.monotonic() < until:
-        assert not bake.step(0.05)
-        time.sleep(0.01)
-    begin = time.monotonic()
-    assert bake.cancel()
-    assert time.monotonic() - begin < 0.5
-    assert not work.running
-    bake._program._process.wait(5)
-    done = bake.count
-    assert 3 <= done < 5000
+    begin_of(bake, 3)
+    # The program hangs and never ends by itself: Blender goes on all the same. Other work on the machine may hold this
+    # process up, so that several attempts are made: waiting for the program would make all of them slow.
+    took = []
+    while len(took) < 5 and min(took, default=1.0) >= 0.5:
+        os.kill(bake._program._process.pid, signal.SIGSTOP)
+        begin = time.monotonic()
+        assert bake.cancel()
+        took.append(time.monotonic() - begin)
+        assert not work.running
+        os.kill(bake._program._process.pid, signal.SIGCONT)
+        bake._program._process.wait(PATIENCE)
+        done = bake.count
+        if took[-1] >= 0.5:
+            bake = begin_of(work.Bake(body, scene), done)
+    bake.close()
+    assert min(took) < 0.5
+    assert 3 <= done < wanted
     np.testing.assert_array_equal(vertices(body, 3), cache_of(body).read(3).vertices)
     assert np.abs(vertices(body, 3) - vertices(body, 1)).max() > 0.1, "it spins"
     found = work.cached(body, scene)
-    assert done <= found.frames < found.wanted == 5000 and not found.changed
+    assert done <= found.frames < found.wanted == wanted and not found.changed
     # So does one whose Blender dies: the pipe that it holds is closed then.
     again = work.Bake(body, scene)
-    while again.count <= found.frames and time.monotonic() < until:
-        assert not again.step(0.05)
-        time.sleep(0.01)
+    begin_of(again, found.frames + 1)
     again._program._process.stdin.close()
     with pytest.raises(part("drgs_blender.errors").EngineError, match=r"Bake again: it goes on\. The first"):
         while not again.step():
@@ -221,7 +243,7 @@ def test_force_fields_of_the_scene_act_on_it(body, scene):
     assert any(made["MAGNET"].name in text and "(Magnet) plays no part" in text for text in said)
 
 
-def test_faults_name_the_object_and_the_remedy(body, scene):
+def test_faults_name_the_object_and_the_remedy(body, scene, tmp_path):
     matter = body.drgs.matter
 
     def fails(match):
@@ -239,6 +261,20 @@ def test_faults_name_the_object_and_the_remedy(body, scene):
     scene.collection.objects.unlink(hidden)
     fails('Object "Hidden": is hidden.*Show it')
     bpy.ops.drgs.matter_row(rows="colliders", remove=0)
+    matter.colliders.add().object = wall = box_object("Sea Wall", (-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
+    fails(r'Object "ball": collider "Sea_Wall": overlaps the body at the start')
+    wall.keyframe_insert("location", frame=1)
+    bake = work.Bake(body, scene)
+    next(bake._capture)
+    bpy.data.objects.remove(wall)
+    with pytest.raises(describe.UsageError, match=r'"ball": a collider or force field was removed.*Bake again'):
+        bake.step()
+    bake.close()
+    assert scene.frame_current == 2
+    matter.colliders.clear()
+    body.scale.x = 0.0
+    fails('Object "ball": is scaled to nothing.*Give it a size')
+    body.scale.x = 1.0
     divided = body.modifiers.new("Finer", "SUBSURF")
     fails('Object "ball": modifier "Finer"')
     body.modifiers.remove(divided)
@@ -247,8 +283,17 @@ def test_faults_name_the_object_and_the_remedy(body, scene):
     other = body.copy()
     scene.collection.objects.link(other)
     matter.frame_end = 40
-    matter.folder = other.drgs.matter.folder = "//shared/"
-    fails('Object "ball": has the same cache as "ball.001"')
+    elsewhere = bpy.data.scenes.new("Elsewhere")
+    for own, theirs, where in (
+        ("//shared/", "//shared/", scene),
+        ("//shared", str(tmp_path / "a/../shared"), elsewhere),
+    ):
+        scene.collection.objects.unlink(other)
+        where.collection.objects.link(other)
+        matter.folder, other.drgs.matter.folder = own, theirs
+        fails('Object "ball": has the same cache as "ball.001"')
+        where.collection.objects.unlink(other)
+        scene.collection.objects.link(other)
     other.drgs.matter.use = False
     # What goes wrong in the engine is told in the same way, and what was done can be played.
     matter.domain = box_object("Room", (-1.5, -1.5, -1.5), (1.5, 1.5, 1.5))

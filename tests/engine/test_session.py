@@ -195,6 +195,30 @@ def test_mirrored_object_is_lit_from_outside(session, make_frame, mesh):
     np.testing.assert_allclose(np.linalg.norm(traced.corner_normals, axis=2), 1, atol=1e-5)
 
 
+@pytest.mark.parametrize("surface", ["mesh", "surfels"])
+def test_a_torn_body_leaves_its_gap_free(session, make_frame, surface):
+    """The upper half is carried off: with `tear`, neither camera nor rays meet the faces that join the halves."""
+    frame = make_frame(size=(40, 60), rays=1, primary=surface, tracer=surface)
+    whole = frame.objects[0].vertices
+
+    def alpha(lifted, tear):
+        moved = whole + np.where(whole[:, 2:] > 0.1, np.float32([[0, 0, lifted]]), 0)
+        frame.objects[0].vertices, frame.objects[0].tear = moved.astype(np.float32), tear
+        return session.render(frame)["Combined"][..., 3]
+
+    gap = slice(17, 25)  # rows between the halves
+    still = alpha(0.0, 0.3)
+    joined = alpha(1.2, 0.0)
+    assert joined[gap].max() > 0.99
+    torn = alpha(1.2, 0.3)
+    assert torn[gap].max() < 0.02, "surfels reach a little beyond their faces"
+    assert torn[30:].sum() == pytest.approx(joined[30:].sum(), rel=0.05)
+    assert torn[:14].sum() > 20, "the upper half is there"
+    assert not session.render(frame).warnings
+    np.testing.assert_array_equal(alpha(0.0, 0.3), still)
+    np.testing.assert_array_equal(alpha(1.2, 1.5), joined, err_msg="less apart than that")
+
+
 def test_unfit_objects_are_named_with_both_counts(session, make_frame):
     def refused(error, *words, **change):
         frame = make_frame()

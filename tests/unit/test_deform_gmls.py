@@ -12,6 +12,7 @@ from drgs_blender.deform.gmls import bind_points, carry
 from drgs_blender.deform.mesh_driven import MeshDriven
 from drgs_blender.deform.source_driven import SourceDriven
 from drgs_blender.deform.sources import MeshSource, PointSource
+from drgs_blender.deform.tears import torn_faces
 from drgs_blender.errors import AssetError, UsageError
 from drgs_blender.simulate.fill import fill
 
@@ -83,6 +84,15 @@ def test_a_blend_that_is_inside_out_is_counted_and_replaced():
     _, gradients, turned = carry(weights, sources, turns)
     assert turned > 0
     assert (np.linalg.det(gradients) > 0).all()
+
+
+def test_faces_across_a_tear_are_those_that_have_grown_by_much_and_by_more_than_the_gap():
+    rest = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [10, 0, 0], [0.0, 10, 0], [0.01, 0, 0], [0, 0.01, 0]])
+    faces = np.array([[0, 1, 2], [0, 3, 4], [0, 5, 6]])  # of 1, of 10 and of 0.01
+    for scale, torn in ((1.0, [0, 0, 0]), (2.9, [0, 0, 0]), (3.1, [1, 1, 0]), (200.0, [1, 1, 1])):
+        assert torn_faces(rest, scale * rest, faces, 1.5).tolist() == torn
+    assert torn_faces(rest, 3.1 * rest, faces, 5.0).tolist() == [False, True, False]
+    assert not torn_faces(rest, np.full_like(rest, np.nan), faces, 1.5).any()
 
 
 def test_a_point_at_a_tear_goes_with_its_nearest_neighbour():

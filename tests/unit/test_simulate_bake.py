@@ -70,6 +70,7 @@ def test_frames_can_be_read_in_any_order(whole):
     assert cache.read(6).points[:, 2].mean() < rest.points[:, 2].mean() - 0.03
     with pytest.raises(UsageError, match=r"frame 9: is not baked.*1 to 6"):
         cache.read(9)
+    assert header.tear == pytest.approx(0.5 / 8), "a cell"
     size = cache.path(3).stat().st_size
     assert size < 30 * header.points + 12 * header.vertices + 1000
 
@@ -110,20 +111,19 @@ def asset_file(tmp_path: Path) -> Path:
 
 def test_kill_9_leaves_a_cache_that_loads_and_goes_on_with_the_same_bits(tmp_path, whole):
     asset, folder = asset_file(tmp_path), tmp_path / "bake"
-    (tmp_path / "s.json").write_text(json.dumps(DROP | {"last": 400}))
+    (tmp_path / "s.json").write_text(json.dumps(DROP | {"last": 1_000_000}))
     command = [sys.executable, "-m", "drgs_blender.cli.main", "simulate", str(asset), "--settings",
                str(tmp_path / "s.json"), "--out", str(folder)]  # fmt: skip
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, env=os.environ | {"NUMBA_NUM_THREADS": "2"})
     cache = ParticleCache(folder)
-    for _ in range(1200):
-        if len(cache.frames()) > 3:
-            break
+    until = time.monotonic() + 1800  # kernels may be compiled before, on a machine that has other work
+    while len(cache.frames()) <= 3 and time.monotonic() < until:
         time.sleep(0.1)
         assert process.poll() is None
     process.send_signal(signal.SIGKILL)
     process.wait()
     seen = cache.frames()
-    assert 3 < len(seen) < 400
+    assert len(seen) > 3
     for frame in seen:
         cache.read(frame)
     (tmp_path / "s.json").write_text(json.dumps(DROP | {"last": 6}))
@@ -158,6 +158,51 @@ def test_other_settings_are_not_mixed_in(tmp_path):
     assert cache.frames() == [1, 2, 3]
     assert bake(job_of(**stiff), cache, overwrite=True) == 1
     assert cache.frames() == [1, 2]
+
+
+def test_two_bakes_at_once_never_mix_their_frames(tmp_path):
+    """Another process begins a bake of other settings in the folder; the first notices before its next frame."""
+    cache, first, second = ParticleCache(tmp_path), job_of(), job_of(gravity=[0, 0, 1])
+    taken = []
+
+    def meanwhile(frame, part):
+        if frame == 4 and not taken:
+            taken.append(bake(second, ParticleCache(tmp_path), overwrite=True))
+
+    with pytest.raises(UsageError, match=r"given to another simulation.*one at a time"):
+        bake(first, cache, progress=meanwhile)
+    assert taken == [5] and cache.header().digest == second.digest
+    baked = content(tmp_path)
+    bake(job_of(gravity=[0, 0, 1]), ParticleCache(tmp_path / "alone"))
+    assert baked == content(tmp_path / "alone")
+    assert bake(job_of(gravity=[0, 0, 1]), cache) == 0, "the state is that of the second, too"
+
+
+@pytest.mark.parametrize(
+    ("settings", "named"),
+    [
+        ({"domain": [[-1e5] * 3, [1e5] * 3]}, r"domain: of 2e\+05 x 2e\+05 x 2e\+05 m is too large.*smaller"),
+        ({"pins": [{"group": "nobody"}]}, r"pin 1, group 'nobody': contains no particle"),
+        ({"colliders": [{"mesh": "box.ply", "vertices": "few.npy"}]}, r"box.ply: has 2 vertices in its anim.*need 8"),
+        ({"colliders": [{"mesh": "box.ply", "vertices": "text.npy"}]}, r"text.npy: is no .npy file(?!.*pickle)"),
+    ],
+)
+def test_what_cannot_be_simulated_is_named_with_the_remedy(tmp_path, settings, named):
+    trimesh.creation.box((9, 9, 1)).export(tmp_path / "box.ply")
+    np.save(tmp_path / "few.npy", np.zeros((3, 2, 3)))
+    (tmp_path / "text.npy").write_text("hello")
+    mesh = block()
+    mesh.groups["nobody"] = np.empty(0, np.int32)
+    with pytest.raises((UsageError, AssetError), match=named):
+        prepare(mesh, parse_settings(DROP | settings, folder=tmp_path))
+
+
+def test_a_mesh_without_an_inside_is_named_by_its_file(tmp_path, capsys):
+    mesh = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], np.ones((3, 3)), np.ones(3), np.ones(3))
+    surfels, binding, _ = attach(mesh)
+    write_asset(tmp_path / "leaf.drgs", Asset(surfels, mesh, binding))
+    assert main(["simulate", str(tmp_path / "leaf.drgs"), "--out", str(tmp_path / "c")]) == 65
+    assert "leaf.drgs: has no interior at a particle spacing" in capsys.readouterr().err
 
 
 def test_damaged_frames_are_named(tmp_path):
@@ -229,6 +274,7 @@ def test_an_object_that_is_placed_moves_in_its_own_space(tmp_path):
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = turn, [3, 2, 1]
     job = job_of(matrix_world=matrix.tolist(), floor=None, last=3)
+    assert job.tear == pytest.approx(0.5 / 8), "object space"
     before = job.rest()
     assert np.abs(before.vertices - block().vertices).max() < 1e-6
     job.solver.advance(0.1)

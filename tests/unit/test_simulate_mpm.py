@@ -442,3 +442,15 @@ def test_a_collider_faster_than_the_grid_shortens_the_step():
     solver.advance(FRAME)
     assert solver.steps >= 2.0 / (0.5 * h)
     assert solver.points[:, 0].min() > 1.8 - 1.5 * h  # the bat is before it, it has not passed through
+
+
+def test_only_what_is_too_fast_for_its_size_has_run_away():
+    """Soft matter as large as a hill needs few steps, and is not told to slow down."""
+    size = 1e4
+    points = lattice((0.4 * size,) * 3, 0.05 * size)
+    hill = solver_of(points, 0.1 * size, gravity=(0, 0, -9.81))
+    for _ in range(3):
+        hill.advance(1 / 24)
+    assert hill.steps == 3 and (hill.points - points)[:, 2].max() < 0
+    with pytest.raises(UsageError, match="ran away: matter moves at 1e"):
+        solver_of(points / size, 0.1, velocity=(1e6, 0, 0)).advance(1 / 24)

@@ -43,6 +43,7 @@ class TraceObject:
     pass_index : Blender's object index pass
     visibility : which rays meet it
     seen_only : whether only the camera meets its triangles, light its surfels
+    torn : (m,) bool, faces that no ray meets, or None
     """
 
     name: str
@@ -55,6 +56,7 @@ class TraceObject:
     pass_index: int = 0
     visibility: Visibility = field(default_factory=Visibility)
     seen_only: bool = False
+    torn: Array | None = None
 
 
 @dataclass(slots=True)
@@ -70,8 +72,9 @@ class Part:
     mask : of its group
     smooth : whether normals are made from the faces
     instanced : whether its vertices are in object space
-    dead : (m,) bool, faces that touch an unusable vertex, or None
+    dead : (m,) bool, faces that touch an unusable vertex or are torn, or None
     reach : metres, the largest coordinate of its vertices
+    bad_vertices, bad_faces : that are unusable, or touch one that is
     empty_faces, flat_faces : without area as a shape, and where its matrix puts it
     """
 
@@ -88,6 +91,7 @@ class Part:
     dead: Array | None = None
     reach: float = 0.0
     bad_vertices: int = 0
+    bad_faces: int = 0
     empty_faces: int = 0
     flat_faces: int = 0
     smoother: VertexNormals | None = None
@@ -112,7 +116,9 @@ class Part:
         faces[self.dead] = 0
         return faces
 
-    def take_vertices(self, vertices: Array, matrix: Array | None, target: Array) -> tuple[bool, bool]:
+    def take_vertices(
+        self, vertices: Array, matrix: Array | None, target: Array, torn: Array | None = None
+    ) -> tuple[bool, bool]:
         """Bring (n, 3) `vertices`, moved by a (3, 4) matrix, to `target`; returns (anything moved, other dead faces).
 
         Unusable vertices are put at the origin.
@@ -121,13 +127,15 @@ class Part:
             bad, moved, self.reach = _copy_vertices(vertices, target)
         else:
             bad, moved, self.reach = _move_vertices(vertices, matrix, target)
-        self.bad_vertices = int(bad)
-        before, dead = self.dead, None
+        self.bad_vertices, self.bad_faces = int(bad), 0
+        before, dead = self.dead, torn
         if bad:
             with np.errstate(invalid="ignore", over="ignore"):
                 world = vertices if matrix is None else vertices @ matrix[:, :3].T + matrix[:, 3]
                 unusable = ~(np.abs(world) < FARTHEST).all(axis=1)
             dead = unusable[self.faces].any(axis=1)
+            self.bad_faces = int(dead.sum())
+            dead = dead if torn is None else dead | torn
         self.dead = dead
         same = before is dead or (before is not None and dead is not None and np.array_equal(before, dead))
         return bool(moved), not same
@@ -173,9 +181,9 @@ def take_object(part: Part, item: TraceObject, vertices: Array, shading: Array) 
     before = part.item if isinstance(part.item, TraceObject) else None
     moved, died = False, False
     own, rows = vertices[part.vertex], shading[part.row]
-    if before is None or before.vertices is not item.vertices:
+    if before is None or before.vertices is not item.vertices or before.torn is not item.torn:
         given = as_float(item.vertices, (-1, 3), f"vertices of {item.name}")
-        moved, died = part.take_vertices(given, None, own)
+        moved, died = part.take_vertices(given, None, own, item.torn)
     if before is None or moved or died or before.corner_normals is not item.corner_normals:
         if item.corner_normals is None:
             part.smooth_normals(own, rows[:, NORMAL])

@@ -237,7 +237,7 @@ class TraceScene:
         for part in parts:
             fault = self.faults[part.source]
             fault.bad_vertices, fault.empty_faces = part.bad_vertices, max(part.empty_faces, part.flat_faces)
-            fault.bad_faces = 0 if part.dead is None else int(part.dead.sum())
+            fault.bad_faces = part.bad_faces
         self._parts, self._known = parts, list(zip(meshes, stands))
 
     def at(self, objects: Sequence[Array | None], meshes: Sequence[Pose | None]) -> tuple[Array, Array]:
