@@ -197,8 +197,10 @@ def carrying(options: argparse.Namespace) -> str:
     points = np.random.default_rng(0).random((300_000, 3))
     cell = (points * 64).astype(int)
     points = points[np.lexsort(cell.T)]
-    gradients = np.tile(np.eye(3, dtype=np.float32), (len(sources), 1, 1))
-    x = sources.astype(np.float32)
+    bend = np.zeros((len(sources), 3, 3), np.float32)
+    bend[:, 0, 2] = 0.6 * np.cos(3 * sources[:, 2])
+    gradients = np.eye(3, dtype=np.float32) + bend
+    x = (sources + np.stack([0.2 * np.sin(3 * sources[:, 2]), *np.zeros((2, len(sources)))], -1)).astype(np.float32)
     bind_points(points[:100], sources)
     holder = []
     bound = clock(lambda: holder.append(bind_points(points, sources)))
@@ -229,7 +231,11 @@ def filling(options: argparse.Namespace) -> str:
         keep &= np.linalg.norm(mesh.triangles_center - place, axis=1) > 0.03 * extent
     noisy = mesh.vertices + 0.003 * extent * rng.normal(size=mesh.vertices.shape)
     fill(noisy, mesh.faces[keep], 4 * spacing)
-    whole = len(fill(mesh.vertices, mesh.faces, spacing).points)
+    cells = fill(mesh.vertices, mesh.faces, spacing).space
+    centres = cells.origin + (np.indices(cells.part.shape).reshape(3, -1).T + 0.5) * spacing
+    whole = int(
+        (igl.fast_winding_number(mesh.vertices, np.asarray(mesh.faces), centres) > 0.5).sum()
+    )  # not what is filled
     rows = []
     for name, vertices, faces in (
         ("whole", mesh.vertices, mesh.faces),

@@ -117,7 +117,7 @@ def drops(options: argparse.Namespace) -> Rows:
         lowest = np.inf
         for _ in range(8 if options.short else 48):
             solver.advance(FRAME)
-            lowest = min(lowest, float(solver.points[:, 2].min()))
+            lowest = min(lowest, float(solver.points[:, 2].min()) - h / 4)  # the surface is half a spacing below
         # Its own weight presses this much out of it: a pillar's mean strain times the share that is of volume.
         pressed = 1000 * 9.81 * 0.3 / young * (1 - 2 * 0.3)
         volume = (np.linalg.det(solver.gradients.astype(float)) * solver.body.volume).sum() / solver.body.volume.sum()

@@ -104,6 +104,7 @@ class ObjectState:
     adjustment : changes to the materials, after the overrides
     tear : metres, object space: faces with an edge that is longer than in the asset by more than this, and more than
         three times as long, span a tear and are left out with their surfels; 0: none
+    grain : how much surfels that are stretched are grains instead, see `deform.grains`; 0: not at all
     """
 
     name: str
@@ -118,6 +119,7 @@ class ObjectState:
     visibility: Visibility = field(default_factory=Visibility)
     adjustment: Adjustment | None = None
     tear: float = 0.0
+    grain: float = 0.0
 
 
 @dataclass(slots=True)

@@ -76,6 +76,11 @@ class Material:
         """Cells between neighbours on a surface from which nothing joins them; what flows is spread thin before."""
         return 1.0 if self.keeps_shape else 4.0
 
+    @property
+    def grain(self) -> float:
+        """Disorder of the grains that it shows where it runs, see `frame.ObjectState`."""
+        return 0.35 if self.model == "sand" else 0.0
+
     def moduli(self) -> tuple[float, float]:
         """Lame's parameters (lambda, mu), Pa."""
         mu = self.young / (2 * (1 + self.poisson))

@@ -43,7 +43,7 @@ class Header:
     first : frame at which all is at rest
     fps : frames a second
     settings : JSON-able, as they were given
-    tear : see `frame.ObjectState`
+    tear, grain : see `frame.ObjectState`
     """
 
     digest: str
@@ -54,6 +54,7 @@ class Header:
     settings: dict[str, Any] = field(default_factory=dict)
     version: int = VERSION
     tear: float = 0.0
+    grain: float = 0.0
 
 
 @dataclass(slots=True)

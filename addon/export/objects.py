@@ -40,7 +40,7 @@ class DrgsObjects:
         """
         obj = item.object
         check_modifiers(obj, self._depsgraph)
-        look = obj.drgs.adjustment.values(), playback.tear_of(obj)
+        look = obj.drgs.adjustment.values(), *playback.look_of(obj).items()
         shape = self._memory.recall(
             ("object", uid(obj), obj.name, obj.data.as_pointer(), obj.mode, str(assets.file_of(obj)), look),
             (uid(obj), uid(obj.data)),
@@ -69,8 +69,8 @@ def _shape(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, key_of: KeyOf,
         for array in arrays.values():
             if array is not None:
                 array.flags.writeable = False  # so that the engine's client need not copy it
-        adjustment, tear = _adjustment(obj, mesh, warn), playback.tear_of(obj)
-        return ObjectState(name=obj.name, asset=key_of(path), adjustment=adjustment, tear=tear, **arrays)
+        look = playback.look_of(obj)
+        return ObjectState(name=obj.name, asset=key_of(path), adjustment=_adjustment(obj, mesh, warn), **arrays, **look)
     finally:
         if editing:
             obj.to_mesh_clear()

@@ -135,16 +135,17 @@ def modifier_of(obj: bpy.types.Object) -> bpy.types.Modifier | None:
     return next((m for m in obj.modifiers if m.type == "MESH_CACHE" and m.name.startswith(MODIFIER)), None)
 
 
-def tear_of(obj: bpy.types.Object) -> float:
-    """From what on faces of the played mesh span a tear, see `frame.ObjectState`; 0 where nothing is played."""
-    modifier = modifier_of(obj)
-    if modifier is None or not obj.drgs.matter.tear:
-        return 0.0
+def look_of(obj: bpy.types.Object) -> dict[str, float]:
+    """`tear` and `grain` of the played mesh, see `frame.ObjectState`; empty where nothing is played."""
+    modifier, matter = modifier_of(obj), obj.drgs.matter
+    if modifier is None:
+        return {}
     with suppress(DrgsError):  # a damaged cache plays all the same; the next bake says it
         path = Path(bpy.path.abspath(modifier.filepath, library=obj.library))
         header = ParticleCache(path.parent).header()
-        return 0.0 if header is None else header.tear
-    return 0.0
+        if header is not None:
+            return {"tear": header.tear * matter.tear, "grain": header.grain * matter.grain}
+    return {}
 
 
 def attach(obj: bpy.types.Object, path: Path, first: int) -> None:

@@ -216,6 +216,12 @@ class DrgsMatterSettings(_Matter, bpy.types.PropertyGroup):
         default=True,
         options=set(),
     )
+    grain: BoolProperty(
+        name="Show Grains",
+        description="Surfels of sand are grains where it runs, instead of a skin that is stretched",
+        default=True,
+        options=set(),
+    )
     resolution: IntProperty(
         name="Resolution",
         description="Cells along the longest side of the object; each holds eight particles. Twice as many take up to "

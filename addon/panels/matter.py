@@ -7,6 +7,7 @@ import os
 import bpy
 
 from ...drgs_blender.errors import DrgsError
+from ...drgs_blender.matter import MATERIALS
 from .. import assets
 from ..matter import points, work
 from ..matter.properties import DrgsMatterRegion, DrgsMatterSettings, numbers_of
@@ -82,6 +83,8 @@ class DRGS_PT_matter(_Physics, bpy.types.Panel):
         column.prop(matter, "solver")
         column.prop(matter, "resolution")
         column.prop(matter, "tear")
+        if MATERIALS[matter.material].grain:
+            column.prop(matter, "grain")
         row = self.layout.row(align=True)
         row.operator("drgs.preview_matter", icon="POINTCLOUD_DATA")
         fill = points.of(obj)

@@ -10,7 +10,8 @@ import argparse
 import logging
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -80,7 +81,7 @@ def run(args: argparse.Namespace) -> int:
     camera = read_camera(args.camera)
     settings = sampling.override(RenderSettings(), args)
     sampling.check_size(camera, args.passes)
-    poses, tear = _poses(args)
+    poses, (tear, grain) = _poses(args)
     for number, _ in poses:
         check_writable(frame_path(args.out, number))
 
@@ -93,7 +94,7 @@ def run(args: argparse.Namespace) -> int:
         frame = Frame(
             number=number,
             camera=camera,
-            objects=[ObjectState(name=args.asset.stem, asset=key, vertices=vertices(), tear=tear)],
+            objects=[ObjectState(name=args.asset.stem, asset=key, vertices=vertices(), tear=tear, grain=grain)],
             world=world,
             settings=settings,
             passes=args.passes,
@@ -115,13 +116,15 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _poses(args: argparse.Namespace) -> tuple[list[tuple[int, Callable[[], np.ndarray | None]]], float]:
-    """Number of each picture with what gives its pose, and from what faces are torn."""
+def _poses(
+    args: argparse.Namespace,
+) -> tuple[Sequence[tuple[int, Callable[[], np.ndarray | None]]], tuple[float, float]]:
+    """Number of each picture with what gives its pose, and `tear` and `grain` of the object."""
     if args.cache is None:
         if args.frames:
             raise UsageError("--frames", "are those of a cache", "Give one with --cache")
         vertices = read_vertices(args.vertices) if args.vertices else None
-        return [(1, lambda: vertices)], 0.0
+        return [(1, lambda: vertices)], (0.0, 0.0)
     cache = ParticleCache(args.cache)
     header = cache.header()
     if header is None:
@@ -130,7 +133,12 @@ def _poses(args: argparse.Namespace) -> tuple[list[tuple[int, Callable[[], np.nd
     if missing := sorted(set(frames) - set(cache.frames())):
         cache.read(missing[0])  # says which are there
     check_template(str(args.out), frames)
-    return [(frame, lambda frame=frame: cache.read(frame).vertices) for frame in frames], header.tear  # type: ignore[misc]
+    poses = [(frame, partial(_pose, cache, frame)) for frame in frames]
+    return poses, (header.tear, header.grain)
+
+
+def _pose(cache: ParticleCache, frame: int) -> np.ndarray:
+    return cache.read(frame).vertices
 
 
 def read_vertices(path: Path) -> np.ndarray:

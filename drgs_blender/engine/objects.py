@@ -8,6 +8,7 @@ import numpy as np
 
 from ..adjust import adjusted
 from ..asset.model import MATERIAL_CHANNELS, Asset, PosedSurfels, Surfels, as_float
+from ..deform.grains import grainy
 from ..deform.matrix_driven import pose_by_matrix
 from ..deform.mesh_driven import MeshDriven
 from ..deform.tears import torn_faces
@@ -185,6 +186,9 @@ def posed_surfels(
         for name in MATERIAL_CHANNELS
     }
     posed = driven.pose(traced.vertices, normals, materials, matrix_world=matrix, object_index=index, torn=traced.torn)
+    if state.grain > 0:
+        larger = abs(float(np.linalg.det(matrix[:3, :3]))) ** (1 / 3)
+        posed = grainy(posed, larger * driven.surfels.scale, state.grain)
     return _adjusted_surfels(state, posed, driven), driven.lost
 
 

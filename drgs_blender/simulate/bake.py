@@ -54,7 +54,7 @@ def bake(
         rest = job.rest()
         header = Header(
             job.digest, len(rest.points), len(rest.vertices), settings.first, settings.fps, asdict(settings),
-            tear=job.tear,
+            tear=job.tear, grain=job.grain,
         )  # fmt: skip
         cache.create(header, rest)
         cache.write(settings.first, rest)

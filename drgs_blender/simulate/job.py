@@ -50,7 +50,7 @@ class Job:
     filling : particles at rest, world
     solver : at the beginning
     digest : names the settings and all that went into it; frames of equal digests are equal
-    tear : see `frame.ObjectState`
+    tear, grain : see `frame.ObjectState`
     """
 
     settings: Settings
@@ -58,6 +58,7 @@ class Job:
     solver: Stepper
     digest: str
     tear: float
+    grain: float
     _vertices: Array
     _weights: Weights | None
     _pins: _PinMotion | None
@@ -180,7 +181,8 @@ def prepare(mesh: Mesh, settings: Settings, name: str = "mesh") -> Job:
     log.info("%d particles, %d time steps a frame at least", len(points), solver.steps_of(1 / settings.fps))
     digest = _digest(mesh, settings, colliders, motion)
     tear = max(m.gap for m in materials) * spacing / abs(float(np.linalg.det(matrix[:3, :3]))) ** (1 / 3)
-    return Job(settings, filling, solver, digest, tear, vertices, weights, motion)
+    grain = min(m.grain for m in materials)
+    return Job(settings, filling, solver, digest, tear, grain, vertices, weights, motion)
 
 
 def _has(names: Sequence[str]) -> str:

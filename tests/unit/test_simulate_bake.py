@@ -252,6 +252,8 @@ def test_vertex_groups_pin_and_differ(tmp_path):
         job.solver.advance(1 / 24)
     moved = np.abs(job.solver.points - job.filling.points).max(axis=1)
     assert moved[left].max() < 1e-9 and moved[job.filling.points[:, 0] > 0.15].min() > 1e-3
+    assert job.grain == 0 < job_of(material="sand").grain, "grains are what runs"
+    assert job_of(material="sand", regions=regions).grain == 0 and job_of(material="sand").tear > job.tear
     with pytest.raises(UsageError, match=r"group 'right'.*There are left"):
         job_of(pins=[{"group": "right"}])
     with pytest.raises(UsageError, match="domain: does not contain the body"):
