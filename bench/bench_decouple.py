@@ -20,14 +20,21 @@ from typing import Any
 import numpy as np
 from decouple_score import COLUMNS, Scene, score
 from report import OUT, ROOT, processor_seconds, table, write_section
+from scipy.spatial import cKDTree
 
 from drgs_blender.asset import Mesh
+from drgs_blender.asset.model import MATERIAL_CHANNELS
 from drgs_blender.colour import srgb_to_linear
 from drgs_blender.reconstruct.decouple.run import Decoupled, decouple
 from drgs_blender.reconstruct.decouple.settings import Settings
 
 FOLDER = OUT / "decouple"
 SIZE, TRAIN, TEST, SAMPLES = 128, 40, 8, 32
+
+#: The paper's BRDF and losses: L1 of noisy estimates, white light, neither grids nor smoothness of materials.
+PAPER: dict[str, Any] = {
+    "look": "paper", "unbiased": False, "white": 0.003, "coarse": 0, "smoothness": 0.0, "coarse_to_fine": False,
+}  # fmt: skip
 
 #: Part -> row -> what differs from the settings that the rows share.
 VARIANTS: dict[str, dict[str, dict[str, Any]]] = {
@@ -104,27 +111,51 @@ def long_run(scene: Scene, iterations: int) -> dict[str, list[float]]:
     return {f"default, {settings.iterations} steps": measured(scene, scene.mesh, settings)}
 
 
-def own_mesh(scene: Scene, iterations: int) -> dict[str, list[float]]:
-    """On the mesh of stage (i)."""
-    from drgs_blender.reconstruct.hull import find_region
+def own_meshes(scene: Scene) -> tuple[Mesh, Mesh]:
+    """The mesh of stage (i) as it is fused, and with the outlines of the masks."""
+    from drgs_blender.reconstruct.hull import find_region, silhouettes
+    from drgs_blender.reconstruct.silhouette import fill_silhouettes
     from drgs_blender.reconstruct.train import Schedule, Training
     from drgs_blender.reconstruct.tsdf import fuse
 
-    path = FOLDER / "own-mesh.npz"
+    path = FOLDER / "own-meshes.npz"
     if not path.exists():
-        region = find_region(scene.capture)
+        region, cameras = find_region(scene.capture), [view.camera for view in scene.capture.training]
         training = Training(scene.capture, region, Schedule(iterations=1500))
         while not training.finished:
             training.step()
-        mesh, _ = fuse(training.gaussians, [view.camera for view in scene.capture.training], region, 192)
-        np.savez(path, vertices=mesh.vertices, faces=mesh.faces)
+        mesh, _ = fuse(training.gaussians, cameras, region)
+        filled = fill_silhouettes(mesh, cameras, silhouettes(scene.capture) or [])
+        np.savez(path, faces=mesh.faces, fused=mesh.vertices, filled=filled)
     with np.load(path) as arrays:
-        v, f = arrays["vertices"], arrays["faces"]
-    mesh = Mesh(v, f, np.zeros_like(v), np.zeros(len(v)), np.zeros(len(v)))
+        vertices, f = (arrays["fused"], arrays["filled"]), arrays["faces"]
+    fused, filled = (Mesh(v, f, np.zeros_like(v), np.zeros(len(v)), np.zeros(len(v))) for v in vertices)
+    return fused, filled
+
+
+def own_mesh(scene: Scene, iterations: int) -> dict[str, list[float]]:
+    """On the mesh of stage (i): what its outlines and learned normals are worth, and the paper's way on it."""
+    from drgs_blender.reconstruct.relief import follow_normals
+
+    fused, mesh = own_meshes(scene)
+    base = Settings(iterations=iterations)
     rows = {}
-    for name, change in {"mesh of stage (i)": {}, "mesh of stage (i), learned normals": {"normals": True}}.items():
-        rows[name] = measured(scene, mesh, replace(Settings(iterations=iterations), **change))
+    for name, one in {"mesh of stage (i) as fused": fused, "mesh of stage (i)": mesh}.items():
+        rows[f"{name}, true materials"] = [0.0, *score(scene, with_truth(scene, one))]
+        rows[name] = measured(scene, one, base)
+    before = processor_seconds()
+    found = decouple(scene.capture, mesh, replace(base, normals=True))
+    spent = processor_seconds() - before
+    bent = replace(finished(mesh, found), vertices=follow_normals(mesh, found.normals))
+    rows["mesh of stage (i), shaped by learned normals"] = [spent, *score(scene, bent)]
+    rows["mesh of stage (i) as fused, the paper's way"] = measured(scene, fused, replace(base, **PAPER))
     return rows
+
+
+def with_truth(scene: Scene, mesh: Mesh) -> Mesh:
+    """`mesh` with the true materials of the nearest vertices."""
+    _, nearest = cKDTree(scene.mesh.vertices).query(mesh.vertices)
+    return replace(mesh, **{name: getattr(scene.mesh, name)[nearest] for name in MATERIAL_CHANNELS})
 
 
 def mitsuba(scene: Scene, iterations: int) -> dict[str, list[float]]:

@@ -32,11 +32,10 @@ from drgs_blender.reconstruct.attached import attach_learned
 from drgs_blender.reconstruct.capture import Capture
 from drgs_blender.reconstruct.gaussians import Gaussians
 from drgs_blender.reconstruct.hull import find_region
-from drgs_blender.reconstruct.job import ON_MESH, judge
+from drgs_blender.reconstruct.job import ON_MESH, judge, mesh_of
 from drgs_blender.reconstruct.raster import rasterise
 from drgs_blender.reconstruct.readers import read_capture
 from drgs_blender.reconstruct.train import Schedule, Training
-from drgs_blender.reconstruct.tsdf import fuse
 
 ROWS = OUT / "reconstruct.json"
 #: Ablations of stage (i): name -> change of the schedule.
@@ -117,10 +116,10 @@ def first_hits(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> tuple
 
 
 def against_truth(gaussians: Gaussians, training: Training, capture: Capture, folder: Path) -> dict[str, Any]:
-    """Mean angle between the normals of the fused and the true mesh, median depth error, as the test views see them."""
+    """Our mesh and the true one in the test views: mean angle between normals, median depth error, overlap."""
     truth = np.load(folder / "mesh.npz")
-    mesh, report = fuse(gaussians, [v.camera for v in capture.training], training.region)
-    angles, depths = [], []
+    mesh, report = mesh_of(gaussians, capture, training.region)
+    angles, depths, overlaps = [], [], []
     for view in capture.testing:
         normal, hit, depth = first_hits(mesh.vertices, mesh.faces, view.camera)
         true_normal, true_hit, true_depth = first_hits(truth["vertices"], truth["faces"], view.camera)
@@ -128,9 +127,10 @@ def against_truth(gaussians: Gaussians, training: Training, capture: Capture, fo
         cosine = np.einsum("pc,pc->p", normal, true_normal)[both].clip(-1, 1)
         angles.append(np.degrees(np.arccos(cosine)))
         depths.append(np.abs(depth - true_depth)[both])
+        overlaps.append(both.sum() / max((hit | true_hit).sum(), 1))
     return {
         "normal": float(np.concatenate(angles).mean()), "depth": float(np.median(np.concatenate(depths))),
-        "faces": len(mesh.faces), "dropped": report["components_dropped"],
+        "overlap": float(np.mean(overlaps)), "faces": len(mesh.faces), "dropped": report["components_dropped"],
     }  # fmt: skip
 
 
@@ -156,7 +156,7 @@ def kept(part: str, name: str, row: dict[str, Any]) -> dict[str, dict[str, Any]]
 def warm(capture: Capture) -> None:
     """Compile every kernel, so that it is not measured."""
     training, _ = trained(capture, Schedule(iterations=12, surfels=500), None)
-    fuse(training.gaussians, [v.camera for v in capture.training], training.region, 32)
+    mesh_of(training.gaussians, capture, training.region, 32)
 
 
 def surfels(options: argparse.Namespace, part: str = "surfels") -> None:
@@ -164,31 +164,23 @@ def surfels(options: argparse.Namespace, part: str = "surfels") -> None:
     capture = read_capture(options.capture, options.size, 8)
     warm(capture)
     schedule = Schedule(iterations=options.iterations or 6000)
-    training, row = trained(capture, schedule, 60 * options.minutes)
+    training, row = trained(capture, schedule, 60 * options.minutes if options.minutes else None)
     if (options.capture / "mesh.npz").exists():
         row |= against_truth(training.gaussians, training, capture, options.capture)
     row |= {"views": len(capture.training), "size": capture.views[0].camera.width}
     rows = kept(part, options.capture.name, row)
-    names = ("size", "views", "wall", "cpu", "steps", "surfels", "psnr", "ssim", "normal", "depth")
+    names = ("size", "views", "wall", "cpu", "steps", "surfels", "psnr", "ssim", "normal", "depth", "overlap")
     head = (
-        "Capture",
-        "Pixels",
-        "Views",
-        "s",
-        "processor s",
-        "Steps",
-        "Surfels",
-        "PSNR dB",
-        "SSIM",
-        "Normals deg",
-        "Depth",
-    )
+        "Capture", "Pixels", "Views", "s", "processor s", "Steps", "Surfels", "PSNR dB", "SSIM", "Normals deg", "Depth",
+        "Silhouettes",
+    )  # fmt: skip
     title = {"surfels": "Stage (i) on scenes with known truth", "photographs": "Stage (i) on published photographs"}[
         part
     ]
+    limit = f"{options.minutes:g} minutes at most" if options.minutes else f"{schedule.iterations} steps"
     body = (
-        f"{options.minutes:g} minutes at most; PSNR over whole pictures of the views left out; normals (mean angle, "
-        "degrees) and depth (median, metres) of the fused mesh against the true one.\n\n"
+        f"{limit}; PSNR over whole pictures of the views left out; normals (mean angle, degrees), depth (median, "
+        "metres) and silhouettes (intersection over union) of the mesh against the true one.\n\n"
     )
     cells = [(name, *(shown(r.get(key, "-")) for key in names)) for name, r in rows.items()]
     write_section(f"reconstruct-{part}", title, body + table(head, cells))
@@ -212,9 +204,10 @@ def ablations(options: argparse.Namespace) -> None:
         row |= against_truth(training.gaussians, training, capture, options.capture)
         rows = kept("ablations", name, row)
     cells = [
-        (name, *(shown(row[key]) for key in ("psnr", "ssim", "normal", "depth", "cpu"))) for name, row in rows.items()
+        (name, *(shown(row[key]) for key in ("psnr", "ssim", "normal", "depth", "overlap", "cpu")))
+        for name, row in rows.items()
     ]
-    head = ("Stage (i)", "PSNR dB", "SSIM", "Normals deg", "Depth", "processor s")
+    head = ("Stage (i)", "PSNR dB", "SSIM", "Normals deg", "Depth", "Silhouettes", "processor s")
     pixels = capture.views[0].camera.width
     body = f"{options.capture.name}, {base.iterations} steps, {base.surfels} surfels, {pixels} pixels.\n\n"
     write_section("reconstruct-ablations", "Ablations of stage (i)", body + table(head, cells))
@@ -227,7 +220,7 @@ def variants(options: argparse.Namespace) -> None:
     schedule = Schedule(iterations=options.iterations or 1500, surfels=10000)
     training, row = trained(capture, schedule, None)
     rows = kept("variants", "P: free surfels", row)
-    mesh, _ = fuse(training.gaussians, [v.camera for v in capture.training], training.region)
+    mesh, _ = mesh_of(training.gaussians, capture, training.region)
     light = training.gaussians.light
     for name, fixed in (
         ("M: on the mesh", ()), ("M without d", ("offset",)), ("M without alpha", ("opacity",)),
@@ -261,7 +254,7 @@ def main() -> None:
     parser.add_argument("--part", choices=tuple(PARTS), default="raster")
     parser.add_argument("--capture", type=Path)
     parser.add_argument("--size", type=int, default=200)
-    parser.add_argument("--minutes", type=float, default=2.0)
+    parser.add_argument("--minutes", type=float, default=2.0, help="of stage (i); 0: the steps alone decide")
     parser.add_argument("--iterations", type=int)
     parser.add_argument("--only", nargs="+", choices=tuple(ABLATIONS))
     options = parser.parse_args()

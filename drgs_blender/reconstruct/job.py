@@ -24,9 +24,10 @@ from .capture import Capture, View
 from .decouple.run import Decoupled, decouple
 from .decouple.settings import Settings as Decoupling
 from .gaussians import Gaussians
-from .hull import Region, find_region
+from .hull import Region, find_region, silhouettes
 from .photometric import Photograph, structural_similarity
 from .relief import follow_normals, shaded_by
+from .silhouette import fill_silhouettes
 from .targets import background_of, composed
 from .train import Schedule, Training
 from .tsdf import fuse
@@ -119,7 +120,7 @@ def reconstruct(
     free = work.learn("surfels", Training(capture, region, settings.schedule, seconds=work.seconds(SHARE)), 0.0, 0.5)
     work.tell(Progress("mesh", 0.5, len(free)))
     report: dict[str, Any] = {"views": len(capture.training), "left_out": len(capture.testing)}
-    mesh, report["mesh"] = fuse(free, [view.camera for view in capture.training], region, settings.mesh_resolution)
+    mesh, report["mesh"] = mesh_of(free, capture, region, settings.mesh_resolution)
     final: Gaussians = free
     binding: Binding | None = None
     if settings.variant == "m":
@@ -147,6 +148,15 @@ def reconstruct(
         environment, origin = Environment(found.environment), "pulled apart from the light"
     provenance = {"capture": capture.source.name, "variant": settings.variant, "materials": origin, "report": report}
     return Asset(surfels, mesh, binding, environment, provenance)
+
+
+def mesh_of(gaussians: Gaussians, capture: Capture, region: Region, resolution: int = 256) -> tuple[Mesh, dict]:
+    """The surface of surfels as the training views see it, with the outlines of their masks; see `tsdf.fuse`."""
+    cameras = [view.camera for view in capture.training]
+    mesh, report = fuse(gaussians, cameras, region, resolution)
+    if (masks := silhouettes(capture)) is not None:
+        mesh.vertices = fill_silhouettes(mesh, cameras, masks)
+    return mesh, report
 
 
 class _Work:

@@ -1,0 +1,104 @@
+"""Meshes that fill the masks, and depth maps that become a mesh: against a ball, known exactly."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch")
+pytest.importorskip("skimage")
+
+from capture_cases import camera
+from shapes import sphere_mesh
+
+from drgs_blender.asset.model import Mesh
+from drgs_blender.frame import Camera
+from drgs_blender.reconstruct import tsdf
+from drgs_blender.reconstruct.hull import Region
+from drgs_blender.reconstruct.silhouette import FARTHEST, fill_silhouettes
+from drgs_blender.reconstruct.targets import pixel_rays
+
+SIZE, RADIUS = 96, 0.7
+PIXEL = 4.0 / camera(0, 1, SIZE).fx
+
+
+@pytest.fixture(scope="module")
+def cameras() -> list[Camera]:
+    return [camera(k, 24, SIZE) for k in range(24)]
+
+
+def hit(view: Camera, radius: float = RADIUS, middle: tuple[float, float, float] = (0, 0, 0)) -> tuple:
+    """Depth (h, w) of a ball along rays of unit depth, inf beside it, and the cosine at which it is seen."""
+    rays, eye = pixel_rays(view).numpy().astype(np.float64), view.matrix_world[:3, 3] - middle
+    a, b = (rays * rays).sum(-1), rays @ eye
+    root = b * b - a * (eye @ eye - radius**2)
+    depth = np.where(root > 0, (-b - np.sqrt(np.maximum(root, 0))) / a, np.inf)
+    cosine = np.sqrt(np.maximum(root, 0) / a) / radius
+    return depth.astype(np.float32), np.where(root > 0, cosine, 1).astype(np.float32)
+
+
+def mask_of(view: Camera, **ball: object) -> np.ndarray:
+    """(h, w) coverage by a ball."""
+    k = 4
+    fine = replace(
+        view, width=k * view.width, height=k * view.height, fx=k * view.fx, fy=k * view.fy, cx=k * view.cx,
+        cy=k * view.cy,
+    )  # fmt: skip
+    depth, _ = hit(fine, **ball)  # type: ignore[arg-type]
+    return np.isfinite(depth).reshape(view.height, k, view.width, k).mean(axis=(1, 3)).astype(np.float32)
+
+
+def plain(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
+    n = len(vertices)
+    return Mesh(vertices.astype(np.float32), faces, np.full((n, 3), 0.5), np.full(n, 0.5), np.zeros(n))
+
+
+def off(vertices: np.ndarray) -> np.ndarray:
+    """Distance from the ball's surface, pixels."""
+    return (np.linalg.norm(vertices, axis=1) - RADIUS) / PIXEL
+
+
+def test_exact_depth_maps_make_an_exact_mesh(cameras, monkeypatch):
+    monkeypatch.setattr(tsdf, "surface_maps", lambda _, view: hit(view))
+    low = np.full(3, -RADIUS)
+    region = Region(np.zeros(3), 2 * RADIUS, low, -low, np.zeros((0, 3)), np.zeros((0, 3)), PIXEL)
+    mesh, report = tsdf.fuse(None, cameras, region)  # type: ignore[arg-type]
+    assert report["voxel"] == pytest.approx(PIXEL, rel=0.05)
+    assert -0.3 < off(mesh.vertices).mean() < 0  # what the smoothing takes
+    filled = off(fill_silhouettes(mesh, cameras, [mask_of(view) for view in cameras]))
+    assert abs(filled.mean()) < 0.03 and np.abs(filled).max() < 0.2
+
+
+@pytest.mark.parametrize("pixels", [-1.2, 0.8])
+def test_outlines_become_those_of_the_masks(cameras, pixels):
+    vertices, faces = sphere_mesh(5)
+    mesh = plain((RADIUS + pixels * PIXEL) * vertices, faces)
+    moved = off(fill_silhouettes(mesh, cameras, [mask_of(view) for view in cameras]))
+    assert abs(moved.mean()) < 0.03 and np.abs(moved).max() < 0.06
+
+
+def test_a_dent_that_outlines_show_is_filled_where_it_is(cameras):
+    vertices, faces = sphere_mesh(5)
+    deep = np.exp(-8 * ((vertices - (1, 0, 0)) ** 2).sum(1))  # towards +X, about half a radius wide
+    mesh = plain((RADIUS - PIXEL * deep[:, None]) * vertices, faces)
+    moved = off(fill_silhouettes(mesh, cameras, [mask_of(view) for view in cameras]))
+    assert np.abs(moved[deep > 0.5]).mean() < 0.35 * deep[deep > 0.5].mean()
+    assert np.abs(moved[deep < 0.01]).mean() < 0.03
+
+
+def test_parts_that_the_mesh_lacks_do_not_inflate_the_rest(cameras):
+    vertices, faces = sphere_mesh(5)
+    beside = {"radius": 0.12, "middle": (0.0, 0.0, 0.88)}
+    masks = [np.maximum(mask_of(view), mask_of(view, **beside)) for view in cameras]
+    moved = off(fill_silhouettes(plain(RADIUS * vertices, faces), cameras, masks))
+    far = vertices[:, 2] < 0.3
+    assert np.abs(moved[far]).max() < 0.06 and moved.max() <= FARTHEST + 0.01
+
+
+def test_a_mesh_that_no_camera_sees_stays(cameras):
+    vertices, faces = sphere_mesh(2)
+    mesh = plain(0.1 * vertices + (0, 0, 50), faces)
+    empty = [np.zeros((SIZE, SIZE), np.float32)] * len(cameras)
+    assert np.array_equal(fill_silhouettes(mesh, cameras, empty), mesh.vertices)
