@@ -60,6 +60,10 @@ _FLAGS = ("-I", "-u", "-X", "utf8")
 _FETCHED = 0.75
 #: Lines of venv, pip and `drgs doctor` that say why.
 _REASON = re.compile(r"error|^missing|not created|no module", re.IGNORECASE)
+#: Words of pip where an index does not answer; what it says last is that there is no such package.
+_UNREACHED = re.compile(r"^Could not fetch URL (\S+?):? .*?\((?:Caused by )?(\w+)|after connection broken by '(\w+)")
+#: Name and size of a package that pip begins with.
+_PACKAGE = re.compile(r"(?:Downloading|Using cached|Processing) (?:\S*/)?([A-Za-z0-9_.]+?)-\d\S*( \([\d.]+ \wB\))?")
 _WINDOWS = os.name == "nt"
 
 
@@ -208,8 +212,7 @@ class EngineSetup:
         step = self._steps.pop(0)
         self._close()
         if code:
-            reason = next((t for t in reversed(self._tail) if _REASON.search(t)), None)
-            self._fail(f"{step.text} failed: {(reason or ' '.join(self._tail[-2:]) or f'exit code {code}')[:300]}")
+            self._fail(f"{step.text} failed: {self._reason(code)[:300]}")
             return True
         try:
             step.then()
@@ -219,6 +222,15 @@ class EngineSetup:
         self.fraction = self._began + self._share
         self._next()
         return self.done
+
+    def _reason(self, code: int) -> str:
+        """Why a command failed, in its own words, as far as they can be told from the others."""
+        for line in self._tail:
+            if unreached := _UNREACHED.search(line):
+                kind = unreached[2] or unreached[3]
+                return f"the package index does not answer ({kind})"
+        said = next((t for t in reversed(self._tail) if _REASON.search(t)), None)
+        return said or " ".join(self._tail[-2:]) or f"exit code {code}"
 
     def cancel(self) -> None:
         """End the command under way and all it started. What was finished stays."""
@@ -248,7 +260,7 @@ class EngineSetup:
             make = [str(python), *_FLAGS, "-m", "venv", *(["--clear"] if clear else []), str(self.folder)]
             steps += [
                 Step("Making an environment", make, 0.05),
-                Step("Preparing pip", [*pip, "--quiet", "pip>=24.1"], 0.05),
+                Step("Preparing pip", [*pip, "pip>=24.1"], 0.05),
                 fetch("Installing packages", ENGINE),
             ]
         doctor = [str(own), *_FLAGS, "-m", f"{PACKAGE}.cli.main", "doctor"]
@@ -324,10 +336,10 @@ class EngineSetup:
 
     def _follow(self, line: str) -> None:
         """What a line of pip says about how far it is."""
-        if package := re.match(r"(?:Downloading|Using cached|Processing) (?:\S*/)?([A-Za-z0-9_.]+?)-\d\S*(.*)", line):
+        if package := _PACKAGE.match(line):
             self.fetched, self._package_bytes = self.fetched + self._package_bytes, 0.0
             self._package = package[1]
-            self.text = f"Fetching {package[1]}{package[2]}"
+            self.text = f"Fetching {package[1]}{package[2] or ''}"
         elif line.startswith("Installing collected packages"):
             self.text, self.fraction = self._steps[0].text, self._began + _FETCHED * self._share
 

@@ -73,11 +73,13 @@ class DRGS_OT_engine_setup(DrgsOperator, bpy.types.Operator):
             "old": "Brings the engine to the version of the extension. The folder is",
             "ready": "Tries the engine and repairs it. The folder is",
         }[state]
+        groups = [g for g in self._groups() if self._missing(g)]
+        if state == "ready" and groups == [engine_setup.RECONSTRUCT]:
+            text = "Adds PyTorch, which From Photographs needs. The folder is"
         column = layout.column(align=True)
         for line in textwrap.wrap(text, 70) + textwrap.wrap(str(folder), 70, break_on_hyphens=False):
             column.label(text=line)
         layout.prop(self, "reconstruct")
-        groups = [g for g in self._groups() if self._missing(g)]
         column = layout.column(align=True)
         if groups:
             fetch, disk = (sum(getattr(g, size) for g in groups) / 1e6 for size in ("download", "disk"))

@@ -31,6 +31,8 @@ ROOT = Path(__file__).resolve().parent.parent
 TORCH = "torch==2.13.0"
 BLENDER = "5.0.1"
 BLENDER_FLOOR = "4.2.23"
+#: The LTS between them, tested when asked for.
+BLENDER_LTS = "4.5.15"
 #: Programs of npm that read our files in the tests and write others for us.
 NODE_PACKAGES = ("@adobe/spz@0.2.2", "@playcanvas/splat-transform@2.7.1", "gltf-validator@2.0.0-dev.3.10")
 #: Shared library that Blender needs -> the Debian package that holds it.
@@ -50,9 +52,12 @@ APT_PACKAGES = {
     "libxkbcommon.so.0": "libxkbcommon0",
 }
 SUITES = ("lint", "engine", "farm", "blender", "floor")
-#: Only when asked for: needs a Blender with a window, see tests/ui.
+#: Among the others where there is a Blender with a window, see tests/ui.
 WINDOW = "window"
+LTS = "lts"
 TEST_SECONDS = 1200
+#: An artist's work at an artist's pace takes as many times as long.
+WINDOW_TIMES = 3
 #: The slow faults, of which `DRGS_FAULTS=whole` runs all, take as many times as long.
 WHOLE_TIMES = 15
 
@@ -91,9 +96,8 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     )
     command("system", run_system, "print the system packages that Blender needs and that are missing (Linux)")
     test = command("test", run_test, "format, types and every test suite; exit code 0 only when all pass")
-    test.add_argument(
-        "suites", nargs="*", metavar="SUITE", help=f"any of {', '.join(SUITES)} (the default) or {WINDOW}"
-    )
+    names = ", ".join((*SUITES, WINDOW, LTS))
+    test.add_argument("suites", nargs="*", metavar="SUITE", help=f"any of {names}; all but {LTS} by default")
     demo = command("demo", run_demo, "render the demo through Blender; further arguments go to examples/demo.py")
     matter = command("demo-simulation", run_demo_simulation, "bake and render matter; see examples/demo_simulation.py")
     extension = command("extension", run_extension, "build the extension's zip; arguments go to tools/extension.py")
@@ -244,9 +248,9 @@ def loads(library: str) -> bool:
 
 def run_test(args: argparse.Namespace) -> int:
     """Run the chosen suites one after another and sum up what they report."""
-    suites = args.suites or SUITES
-    if unknown := sorted(set(suites) - {*SUITES, WINDOW}):
-        raise Failure(f"unknown suite {', '.join(unknown)}; there are {', '.join((*SUITES, WINDOW))}")
+    suites = args.suites or [*SUITES, *own_window()]
+    if unknown := sorted(set(suites) - {*SUITES, WINDOW, LTS}):
+        raise Failure(f"unknown suite {', '.join(unknown)}; there are {', '.join((*SUITES, WINDOW, LTS))}")
     engine = ensure_engine()
     if {"farm", "blender"} & set(suites):
         ensure_blender()  # the engine's suite runs `drgs render` through it where it is there
@@ -263,9 +267,42 @@ def run_test(args: argparse.Namespace) -> int:
         tally.pytest(f"Blender {BLENDER}", ensure_blender(), "tests/blender")
     if "floor" in suites:
         tally.pytest(f"Blender {BLENDER_FLOOR}", ensure_blender(BLENDER_FLOOR), "tests/blender")
+    if LTS in suites:
+        tally.pytest(f"Blender {BLENDER_LTS}", ensure_blender(BLENDER_LTS), "tests/blender")
     if WINDOW in suites:
-        tally.pytest("a window", engine, "tests/ui")
+        tally.pytest("a window", engine, "tests/ui", times=WINDOW_TIMES)
     return tally.finish()
+
+
+def own_window() -> list[str]:
+    """The window's suite where a Blender is named for it, or there is one and Xvfb; otherwise say why not."""
+    reason = no_window()
+    if not reason and not os.environ.get("DRGS_UI_BLENDER") and not shutil.which("Xvfb"):
+        reason = "Xvfb is not installed, and the screen is yours: ask for it by name"
+    if reason:
+        print(f"== tests: a window: skipped, {reason}", flush=True)
+    return [] if reason else [WINDOW]
+
+
+def no_window() -> str:
+    """Why there is no Blender with a window, "" where there is one."""
+    program = os.environ.get("DRGS_UI_BLENDER") or shutil.which("blender")
+    if not program:
+        return "there is no Blender on the PATH, and DRGS_UI_BLENDER names none"
+    command = [program] if Path(program).is_file() else shlex.split(program)
+    try:
+        said = subprocess.run([*command, "--version"], capture_output=True, text=True, timeout=120).stdout
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return f"{program} does not start ({error})"
+    found = re.match(r"Blender (\d+)\.(\d+)", said)
+    if found is None:
+        return f"{program} does not say which Blender it is"
+    oldest = tuple(int(part) for part in BLENDER_FLOOR.split(".")[:2])
+    if (int(found[1]), int(found[2])) < oldest:
+        return f"Blender {found[1]}.{found[2]} is older than {oldest[0]}.{oldest[1]}"
+    if sys.platform == "linux" and not os.environ.get("DISPLAY") and not shutil.which("Xvfb"):
+        return "there is no display, and no Xvfb"
+    return ""
 
 
 class Tally:
@@ -281,13 +318,13 @@ class Tally:
         if run(command, timeout=TEST_SECONDS):
             self.wrong.append(title)
 
-    def pytest(self, title: str, python: Path, *folders: str) -> None:
+    def pytest(self, title: str, python: Path, *folders: str, times: int = 1) -> None:
         """Run pytest on `folders` and add its counts."""
         print(f"== tests: {title}", flush=True)
         report = ROOT / "build" / f"tests-{re.sub(r'[^a-z0-9.]+', '-', title.lower())}.xml"
         report.parent.mkdir(exist_ok=True)
         report.unlink(missing_ok=True)
-        seconds = TEST_SECONDS * (WHOLE_TIMES if os.environ.get("DRGS_FAULTS") == "whole" else 1)
+        seconds = times * TEST_SECONDS * (WHOLE_TIMES if os.environ.get("DRGS_FAULTS") == "whole" else 1)
         code = run([python, "-m", "pytest", "-q", f"--junitxml={report}", *folders], timeout=seconds)
         counts = {"tests": 0, "failures": 0, "errors": 0, "skipped": 0}
         if report.exists():

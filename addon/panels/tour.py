@@ -17,7 +17,7 @@ def wrapped(layout: bpy.types.UILayout, context: bpy.types.Context, text: str, i
     width = context.region.width if context.region else 240
     letters = max(24, int(width / (LETTER * (context.preferences.system.ui_scale or 1))) - 4)
     column = layout.column(align=True)
-    for i, line in enumerate(textwrap.wrap(text, letters)):
+    for i, line in enumerate(textwrap.wrap(text, letters, break_on_hyphens=False)):
         column.label(text=line, icon="BLANK1" if i and icon != "NONE" else icon)
 
 

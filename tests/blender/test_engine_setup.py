@@ -199,6 +199,22 @@ def test_a_python_that_is_none_is_named(tmp_path):
     assert running.done and "no-python" in str(running.error)
 
 
+def test_an_index_that_does_not_answer_is_told_from_a_package_that_is_not_there(tmp_path, monkeypatch):
+    """What pip says last is the same for both."""
+    monkeypatch.setenv("PIP_RETRIES", "1")
+    monkeypatch.setenv("PIP_INDEX_URL", "http://localhost:9/simple")
+    monkeypatch.setenv("PIP_CONFIG_FILE", os.devnull)
+    for name in ("PIP_EXTRA_INDEX_URL", "PIP_FIND_LINKS"):
+        monkeypatch.delenv(name, raising=False)
+    source = engine_source(tmp_path / "source", "drgs-no-such-package", "")
+    running = setup.EngineSetup(tmp_path / "engine", Path(sys.executable), source)
+    end = time.monotonic() + 240
+    while not running.poll():
+        assert time.monotonic() < end, running.text
+        time.sleep(0.05)
+    assert "the package index does not answer (" in str(running.error)
+
+
 def test_too_little_room_is_told_before_anything_is_fetched(tmp_path, monkeypatch):
     monkeypatch.setattr(setup, "ENGINE", setup.ENGINE._replace(disk=1e18))
     with pytest.raises(errors.DeviceError, match="MB left"):

@@ -176,11 +176,13 @@ def paint_it() -> Iterator[float]:
 
 def brush() -> Iterator[float]:
     """Some Blenders come without the brushes of the essentials library; there one is made in the file."""
-    if bpy.context.tool_settings.vertex_paint.brush is None:
+    tools = bpy.context.tool_settings
+    if tools.vertex_paint.brush is None:
         bpy.data.brushes.new("Paint", mode="VERTEX_PAINT").asset_mark()
         with hands.context_of():
             bpy.ops.brush.asset_activate(asset_library_type="LOCAL", relative_asset_identifier="Brush/Paint")
-    found["brush"] = bpy.context.tool_settings.unified_paint_settings.size
+    unified = getattr(tools.vertex_paint, "unified_paint_settings", None)  # of each mode from 5.0 on
+    found["brush"] = (unified or tools.unified_paint_settings).size
     yield 0.5
 
 

@@ -31,10 +31,11 @@ def work() -> Iterator[float]:
     os.environ.pop("DRGS_ENGINE")
     found["before"] = state()
     yield from hands.show_tab()
-    yield from press("use_online_access")
+    x, y = yield from hands.find("drgs.engine_setup")
+    yield from hands.click((x, y + 29))  # Allow Online Access: preferences have no path to be found by
     found["online"] = bpy.app.online_access
     yield from begin("1-dialog")
-    yield from until(lambda: fraction() > 0.2, "the first packages")
+    yield from until(lambda: fraction() > 0.2 or not running(), "the first packages")
     yield from photograph("set-up-2-fetching")
     yield from press("drgs.engine_setup_cancel")
     found["cancelled"] = state(), running()

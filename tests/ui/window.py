@@ -21,6 +21,7 @@ from PIL import Image
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT / "tools"), str(ROOT / "bench")]
 
+import dev  # noqa: E402
 import extension  # noqa: E402
 from bench_viewport import blender_command, display  # noqa: E402
 from subjects import asset_path  # noqa: E402
@@ -59,16 +60,14 @@ def picture(path: Path | str) -> np.ndarray:
 
 def run(job: str, folder: Path, seconds: float = 1800, **variables: str) -> Seen:
     """Run the script `job` of this folder in the window; skip where there is no Blender or no display."""
+    if reason := dev.no_window():
+        pytest.skip(reason)
     command = blender_command()
-    if command is None:
-        pytest.skip("no Blender program (set DRGS_UI_BLENDER)")
     said = subprocess.run([*command, "--version"], capture_output=True, text=True, timeout=180).stdout
     pictures = PICTURES / said.split()[1]  # Blender 5.0.1 ...
     pictures.mkdir(parents=True, exist_ok=True)
     archive = extension.build(folder / "drgs.zip")
     with display() as screen:
-        if screen is None:
-            pytest.skip("no display, and no Xvfb")
         environment = os.environ | screen | {"BLENDER_USER_RESOURCES": str(folder / "user")} | variables
         environment |= {"DRGS_WINDOW_JOB": str(folder), "DRGS_WINDOW_ASSET": str(asset_path("robot"))}
         environment.setdefault("DRGS_ENGINE", sys.executable)
