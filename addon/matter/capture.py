@@ -142,14 +142,7 @@ def _capture_motion(
         world = _moved(local, placed)
         name = f"{_COLLIDER}{i:03d}_{bpy.path.clean_name(other.name)}"  # the engine's messages name the file
         _write_ply(folder / f"{name}.ply", world, faces)
-        data["colliders"].append(
-            {
-                "mesh": f"{name}.ply",
-                "contact": settings.contact,
-                "friction": float(f"{settings.friction:.6g}"),
-                "thickness": float(f"{settings.thickness:.6g}"),
-            }
-        )
+        data["colliders"].append({"mesh": f"{name}.ply"} | _contact(settings))
         tracks.append(_Track(folder / f"{name}.npy", world, len(frames)))
     if tracks or pushing or motion is not None or _may_move(obj):
         to_rest = np.linalg.inv(matrix)
@@ -182,6 +175,16 @@ def _capture_motion(
             entry["vertices"] = track.path.name
     if any(not np.array_equal(m, matrix) for m in matrices):
         np.save(folder / MATRICES, np.stack(matrices))
+
+
+def contacts(obj: bpy.types.Object) -> list[dict[str, Any]]:
+    """What each collider does to matter, as `capture` writes it."""
+    return [_contact(settings) for _, settings in _obstacles(obj)]
+
+
+def _contact(settings: DrgsMatterCollider) -> dict[str, Any]:
+    numbers = {name: float(f"{getattr(settings, name):.6g}") for name in ("friction", "thickness")}
+    return {"contact": settings.contact} | numbers
 
 
 class _Track:

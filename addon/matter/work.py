@@ -270,6 +270,8 @@ def cached(obj: bpy.types.Object, scene: bpy.types.Scene) -> Cached:
     if frames and known is not None and (obj.animation_data is None or scene.frame_current == matter.frame_start):
         now = describe(obj, scene)
         changed = any(known.get(key) != now.get(key) for key in (set(now) | {"floor", "domain"}) - {"last"})
+        before = [{k: v for k, v in row.items() if k not in ("mesh", "vertices")} for row in known.get("colliders", [])]
+        changed |= before != capture.contacts(obj)
     return Cached(len(frames), matter.frame_end - matter.frame_start + 1, changed)
 
 

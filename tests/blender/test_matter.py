@@ -209,6 +209,13 @@ def test_pins_regions_and_colliders_take_part(body, scene):
     assert data["regions"] == [{"group": "stiff", "material": {"name": "rubber", "young": 4e4}}]
     assert "motion" in data and "vertices" in data["colliders"][0] and "Table" in data["colliders"][0]["mesh"]
     np.testing.assert_allclose(world(body, 1), sphere()[0], atol=1e-5)
+    assert not work.cached(body, scene).changed
+    for name, value in (("friction", 0.7), ("contact", "slip"), ("object", None)):
+        before = getattr(matter.colliders[0], name)
+        setattr(matter.colliders[0], name, value)
+        assert work.cached(body, scene).changed, name
+        setattr(matter.colliders[0], name, before)
+    assert not work.cached(body, scene).changed
     now = world(body, FRAMES)
     np.testing.assert_allclose(now[height == 1], [[0.5, 0, 1]], atol=0.02)
     assert -0.8 < now[:, 2].min() < -0.4, "the table, at -0.6, has pushed it in"
