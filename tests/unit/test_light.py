@@ -8,7 +8,8 @@ import pytest
 from drgs_blender.colour import LUMINANCE
 from drgs_blender.errors import UsageError
 from drgs_blender.frame import World
-from drgs_blender.render.lights.light import EnvironmentLight, _texel_means
+from drgs_blender.jit import get_num_threads, set_num_threads
+from drgs_blender.render.lights.light import EnvironmentLight
 
 
 def picture(kind: str) -> np.ndarray | None:
@@ -38,6 +39,13 @@ def sphere_grid(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
     theta, phi = (a.ravel() for a in np.meshgrid(theta, phi, indexing="ij"))
     directions = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=1)
     return directions, np.repeat(angle, columns)
+
+
+def texel_means(luminance: np.ndarray) -> np.ndarray:
+    """Mean over each texel of the bilinear interpolant: wraps in columns, clamps in rows."""
+    rows = np.concatenate([luminance[:1], luminance, luminance[-1:]])
+    rows = 0.75 * luminance + 0.125 * (rows[:-2] + rows[2:])
+    return 0.75 * rows + 0.125 * (np.roll(rows, 1, axis=1) + np.roll(rows, -1, axis=1))
 
 
 def numbers(count: int, seed: int = 0) -> np.ndarray:
@@ -78,15 +86,15 @@ def test_rotation_colour_and_strength() -> None:
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_density_integrates_to_one(kind: str) -> None:
     light = EnvironmentLight(World(environment=picture(kind)))
-    columns = light.density.shape[1]
+    columns = light.cells.density.shape[1]
     # Rows of cells have unequal heights in z: integrate cell by cell.
     solid = -np.diff(light.row_z.astype(float)) * 2 * np.pi / columns
-    assert (light.density * solid[:, None]).sum() == pytest.approx(1.0, abs=1e-5)
+    assert (light.cells.density * solid[:, None]).sum() == pytest.approx(1.0, abs=1e-5)
     directions, angle = sphere_grid(160, 320)
     assert light.pdf(directions).astype(float) @ angle == pytest.approx(1.0, abs=1e-4)
-    assert (light.density > 0).sum() == len(light.cells)
-    assert len(np.unique(light.cells[:, 1])) == len(light.cells)
-    assert light.cells[-1, 0] == 2**32 - 1
+    assert (light.cells.density > 0).sum() == len(light.cells.runs)
+    assert len(np.unique(light.cells.runs[:, 1])) == len(light.cells.runs)
+    assert light.cells.runs[-1, 0] == 2**32 - 1
 
 
 @pytest.mark.parametrize("size", [(1000, 2000), (1024, 2048), (1448, 2896)])
@@ -99,14 +107,34 @@ def test_every_lit_cell_of_a_large_map_has_its_density(size: tuple[int, int], sk
         image *= 1e-5
         image[size[0] // 3, 70:73] = 1e5
     light = EnvironmentLight(World(environment=image))
-    solid = -np.diff(light.row_z.astype(float)) * 2 * np.pi / light.density.shape[1]
-    expected = _texel_means(image @ LUMINANCE)
-    probability = light.density * solid[:, None]
+    solid = -np.diff(light.row_z.astype(float)) * 2 * np.pi / light.cells.density.shape[1]
+    expected = texel_means(image @ LUMINANCE)
+    probability = light.cells.density * solid[:, None]
     expected = expected * solid[:, None] / (expected * solid[:, None]).sum()
     # Half a random number of rounding at either edge, and what the darkest cells were raised to one.
     assert np.abs(probability - expected).max() < 2.0**-32 * 2 + 1e-3 * expected.max()
-    assert light.density.min() > 0
-    assert (np.diff(light.cells[:, 0].astype(np.int64)) >= 1).all() and light.cells[-1, 0] == 2**32 - 1
+    assert light.cells.density.min() > 0
+    assert (np.diff(light.cells.runs[:, 0].astype(np.int64)) >= 1).all() and light.cells.runs[-1, 0] == 2**32 - 1
+
+
+def test_any_number_of_threads_makes_the_same_cells() -> None:
+    world = World(environment=np.random.default_rng(0).random((96, 192, 3)).astype(np.float32) ** 4)
+    before = get_num_threads()
+    try:
+        set_num_threads(1)
+        one = EnvironmentLight(world)
+    finally:
+        set_num_threads(before)
+    many = EnvironmentLight(world)
+    for name in ("runs", "guide", "density", "first", "parts"):
+        np.testing.assert_array_equal(getattr(one.cells, name), getattr(many.cells, name))
+    np.testing.assert_array_equal(one.facing.starts, many.facing.starts)
+
+
+def test_the_search_of_a_number_starts_at_the_first_cell_of_its_slice() -> None:
+    light = EnvironmentLight(World(environment=picture("large")))
+    ends, size = light.cells.runs[:, 0].astype(np.int64), len(light.cells.guide)
+    np.testing.assert_array_equal(light.cells.guide, np.searchsorted(ends, np.arange(size) * (2**32 // size)))
 
 
 @pytest.mark.parametrize("kind", [*KINDS, "large"])

@@ -8,19 +8,16 @@ random number is first moved to the block's run, then inverted as without the ta
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from ...jit import njit, prange
 from ..memory import load_float, load_int32, load_uint32
+from .cells import Cells
 
 Array = np.ndarray
 
 #: Normals along a side of the octahedral map.
 SIDE = 24
-#: Blocks at most, and parts along a side of a block at which the cosine is taken.
-_MOST_BLOCKS, _PARTS = 512, 4
 #: Equal slices of the random numbers, each of 2^_SLICE of them, for which the first block is known.
 _SLICES, _SLICE = 256, 24
 #: Part of the random numbers that keeps to the power alone.
@@ -63,70 +60,42 @@ class Facing:
     slices : (SIDE^2 + 1, _SLICES) int32: block of the first number of each slice of the random numbers
     ratio : (SIDE^2 + 1, 2^b) float32: density of a block's cells over that without regard to the normal
     first : (2^b,) uint32: first random number of each block in the cells' own order
-    block : (rows, columns) int32: the block at a coarse place of the map
-    shift : int: cells along a side of a block are 2^shift
 
     Parameters
     ----------
-    weights : (rows, columns) power of the sampling cells
-    edges : (rows + 1,) z at the upper edge of each row, from 1 to -1
-    cells : (k, 2) uint32, see ``EnvironmentLight``
+    cells : what the tables weigh again
     """
 
-    def __init__(self, weights: Array, edges: Array, cells: Array) -> None:
-        rows, columns = weights.shape
-        self.shift = 0
-        while -(-rows >> self.shift) * -(-columns >> self.shift) > _MOST_BLOCKS:
-            self.shift += 1
-        height, width = -(-rows >> self.shift), -(-columns >> self.shift)
-        # Blocks in the order of their cells; one that holds no cell is none.
-        place = (cells[:, 1] // columns >> self.shift) * width + (cells[:, 1] % columns >> self.shift)
-        starts = np.flatnonzero(np.diff(place.astype(np.int64), prepend=-1))
-        ends = np.append(starts[1:], len(cells)) - 1
-        first = np.where(starts > 0, cells[starts - 1, 0].astype(np.int64) + 1, 0)
-        power = (cells[ends, 0].astype(np.int64) + 1 - first) * 2.0**-32
-        self.block = np.zeros((height, width), np.int32)
-        self.block.ravel()[place[starts]] = np.arange(len(starts))
-        directions, share, owner = self._parts(weights, edges)
-        size = 1 << (len(starts) - 1).bit_length()
+    def __init__(self, cells: Cells) -> None:
+        blocks = len(cells.first)
+        size = 1 << (blocks - 1).bit_length()
         self.first = np.zeros(size, np.uint32)
-        self.first[: len(starts)] = first
+        self.first[:blocks] = cells.first
         self.starts = np.full((SIDE * SIDE + 1, size), 2**32 - 1, np.uint32)
         self.ratio = np.ones((SIDE * SIDE + 1, size), np.float32)
-        _fill(normals(), directions, share, owner, power, self.starts, self.ratio)
-        self.starts[-1, : len(starts)] = first
+        power = np.diff(cells.first.astype(np.int64), append=1 << 32) * 2.0**-32
+        share = cells.parts.astype(np.float32) if cells.power > 0.0 else np.zeros_like(cells.parts, np.float32)
+        _fill(normals(), cells.part_directions(), share, power, self.starts, self.ratio)
+        self.starts[-1, :blocks] = cells.first
         self.slices = np.empty((SIDE * SIDE + 1, _SLICES), np.int32)
-        _find_slices(self.starts, len(starts), self.slices)
-
-    def _parts(self, weights: Array, edges: Array) -> tuple[Array, Array, Array]:
-        """Directions (n, 3) in the environment's frame, powers (n,) and blocks (n,) of the lit parts of blocks."""
-        rows, columns = weights.shape
-        shift = max(0, self.shift - int(math.log2(_PARTS)))
-        side = 1 << shift
-        tops, lefts = np.arange(0, rows, side), np.arange(0, columns, side)
-        power = np.add.reduceat(np.add.reduceat(weights, tops, axis=0), lefts, axis=1)
-        z = 0.5 * (edges[tops] + edges[np.minimum(tops + side, rows)])
-        turn = 0.5 - 0.5 * (lefts + np.minimum(lefts + side, columns)) / columns
-        ring = np.sqrt(np.maximum(0, 1 - z * z))
-        x, y = ring[:, None] * np.cos(2 * np.pi * turn), ring[:, None] * np.sin(2 * np.pi * turn)
-        directions = np.stack([x, y, np.broadcast_to(z[:, None], x.shape)], axis=-1)
-        down = self.shift - shift
-        owner = self.block[np.arange(len(tops))[:, None] >> down, np.arange(len(lefts)) >> down]
-        lit = power > 0
-        return directions[lit].astype(np.float32), power[lit].astype(np.float32), owner[lit]
+        _find_slices(self.starts, blocks, self.slices)
 
 
 @njit(parallel=True)
-def _fill(normals, directions, share, owner, power, starts, ratio):  # type: ignore[no-untyped-def]
+def _fill(normals, directions, share, power, starts, ratio):  # type: ignore[no-untyped-def]
     """Write all rows but the last."""
-    blocks = len(power)
+    parts, blocks = share.shape
+    x, y, z = directions[0], directions[1], directions[2]
     for row in prange(len(normals)):
-        weight = np.zeros(blocks, np.float64)
+        weight = np.zeros(blocks, np.float32)
         nx, ny, nz = normals[row, 0], normals[row, 1], normals[row, 2]
-        for k in range(len(share)):
-            cosine = nx * directions[k, 0] + ny * directions[k, 1] + nz * directions[k, 2]
-            weight[owner[k]] += share[k] * max(cosine, np.float32(0.0))
-        total = weight.sum()
+        for p in range(parts):
+            for b in range(blocks):
+                cosine = nx * x[p, b] + ny * y[p, b] + nz * z[p, b]
+                weight[b] += share[p, b] * max(cosine, np.float32(0.0))
+        total = 0.0
+        for b in range(blocks):
+            total += weight[b]
         kept = _KEPT if total > 0.0 else 1.0
         scale = (1.0 - kept) / total if total > 0.0 else 0.0
         # Every block gets one random number, and its share of the others.
@@ -140,9 +109,9 @@ def _fill(normals, directions, share, owner, power, starts, ratio):  # type: ign
             start = end
 
 
-@njit
+@njit(parallel=True)
 def _find_slices(starts, blocks, slices):  # type: ignore[no-untyped-def]
-    for row in range(len(starts)):
+    for row in prange(len(starts)):
         block = 0
         for k in range(_SLICES):
             while block + 1 < blocks and np.int64(starts[row, block + 1]) <= k << _SLICE:

@@ -13,12 +13,12 @@ from typing import NamedTuple
 import numpy as np
 
 from ...asset.model import as_float
-from ...colour import LUMINANCE
 from ...errors import UsageError
 from ...frame import World
-from ...jit import njit
+from ...jit import njit, prange
 from ..memory import address, load_float, load_int32, load_uint32
 from ..sampling import fast_acos, fast_atan2_turns, sincos_turns, unit
+from .cells import Cells
 from .facing import Facing, block_of, facing_ratio, facing_row, in_cells_order
 
 Array = np.ndarray
@@ -30,68 +30,32 @@ BRIGHTEST = np.float32(1e15)
 _CONSTANT = (16, 32, 3)
 #: Negative light, as a part of all light, up to which it is the ringing of a picture's filter.
 _RINGING = 1e-5
-#: Cells of the sampling table at most; larger pictures are averaged down for sampling (never for the lookup).
-_MOST_CELLS = 1 << 22
 
 
-@njit
-def _morton_order(rows, columns):  # type: ignore[no-untyped-def]
-    """Cells of a grid in the order of their interleaved index bits: neighbours in the grid stay near each other."""
-    order = np.empty(rows * columns, np.int64)
-    side = 1
-    while side < max(rows, columns):
-        side *= 2
-    found = 0
-    for code in range(side * side):
-        row, column = np.uint32(code >> 1), np.uint32(code)
-        row, column = row & np.uint32(0x55555555), column & np.uint32(0x55555555)
-        row, column = (row | row >> np.uint32(1)), (column | column >> np.uint32(1))
-        row, column = row & np.uint32(0x33333333), column & np.uint32(0x33333333)
-        row, column = (row | row >> np.uint32(2)), (column | column >> np.uint32(2))
-        row, column = row & np.uint32(0x0F0F0F0F), column & np.uint32(0x0F0F0F0F)
-        row, column = (row | row >> np.uint32(4)), (column | column >> np.uint32(4))
-        row, column = row & np.uint32(0x00FF00FF), column & np.uint32(0x00FF00FF)
-        row, column = (
-            (row | row >> np.uint32(8)) & np.uint32(0xFFFF),
-            (column | column >> np.uint32(8)) & np.uint32(0xFFFF),
-        )
-        if row < rows and column < columns:
-            order[found] = np.int64(row) * columns + np.int64(column)
-            found += 1
-    return order
+@njit(parallel=True)
+def _clean(image, tint, rings, texels, found):  # type: ignore[no-untyped-def]
+    """Write the tinted picture: black where a texel is no light, but for its negative part if the picture `rings`.
 
-
-@njit
-def _guide_table(cells, guide):  # type: ignore[no-untyped-def]
-    """First cell of each equal slice of the random numbers: the inversion starts there (Chen and Asau 1974)."""
-    width = np.uint64(1 << 32) // np.uint64(len(guide))
-    i = np.int64(0)
-    for g in range(len(guide)):
-        while np.uint64(cells[i, 0]) < np.uint64(g) * width:
-            i += 1
-        guide[g] = i
-
-
-def _whole_widths(share: Array) -> Array:
-    """Divide the 2^32 random numbers among cells by their `share` (sums to 1), at least one each; int64."""
-    width = np.diff(np.rint(np.cumsum(share) / share.sum() * 2.0**32).astype(np.int64), prepend=0)
-    # What the darkest cells get on top of their share comes from all others, in proportion.
-    owed = int(np.maximum(1 - width, 0).sum())
-    width = np.maximum(width, 1)
-    spare = width - 1
-    taken = spare * owed // max(int(spare.sum()), 1)
-    width -= taken
-    rest = owed - int(taken.sum())
-    if rest:
-        width[np.argpartition(-width, rest - 1)[:rest]] -= 1
-    return width
-
-
-def _texel_means(luminance: Array) -> Array:
-    """Mean over each texel of the bilinear interpolant (wraps in columns, clamps in rows)."""
-    rows = np.concatenate([luminance[:1], luminance, luminance[-1:]])
-    rows = 0.75 * luminance + 0.125 * (rows[:-2] + rows[2:])
-    return 0.75 * rows + 0.125 * (np.roll(rows, 1, axis=1) + np.roll(rows, -1, axis=1))
+    Writes for each row how many texels are no light, and how much of them is negative and positive.
+    """
+    zero = np.float32(0.0)
+    for row in prange(len(image)):
+        bad, dark, bright = 0, 0.0, 0.0
+        for column in range(image.shape[1]):
+            r, g, b = image[row, column, 0] * tint[0], image[row, column, 1] * tint[1], image[row, column, 2] * tint[2]
+            if not (abs(r) < np.inf and abs(g) < np.inf and abs(b) < np.inf):
+                bad += 1
+                dark = -np.inf
+                continue
+            dark += min(r, zero) + min(g, zero) + min(b, zero)
+            bright += max(r, zero) + max(g, zero) + max(b, zero)
+            if min(r, g, b) >= zero or rings:
+                texels[row, column, 0] = min(max(r, zero), BRIGHTEST)
+                texels[row, column, 1] = min(max(g, zero), BRIGHTEST)
+                texels[row, column, 2] = min(max(b, zero), BRIGHTEST)
+            else:
+                bad += 1
+        found[row, 0], found[row, 1], found[row, 2] = bad, dark, bright
 
 
 class Sky(NamedTuple):
@@ -125,12 +89,6 @@ class Sky(NamedTuple):
     zz: np.float32
 
 
-def _bad(radiance: Array) -> Array:
-    """(h, w, 1): the texels that are no light."""
-    light = np.asarray((radiance >= 0) & (radiance < np.inf))
-    return np.asarray(~light.all(axis=2, keepdims=True))
-
-
 class EnvironmentLight:
     """A `World` made ready for lookups and sampling by compiled code.
 
@@ -138,16 +96,12 @@ class EnvironmentLight:
     ----------
     texels : (h, w, 4) float32: lat-long radiance times colour and strength, linear Rec.709, and in the last place the
         density of the sampling cell that the texel lies in: one cache line serves both
-    density : (rows, columns) float32: probability per solid angle of each sampling cell; 0 everywhere when black
-    cells : (k, 2) uint32: last random number that falls on a cell, and the cell; the lit cells in Morton order, so that
-        equal strata of one random number are compact regions of equal power
-    guide : (2^b,) int32: where to start looking in `cells`
+    cells : the cells in which it is sampled
     row_z : (rows + 1,) float32: z at the upper edge of each row of cells, from 1 to -1
     facing : the cells weighed by the cosine at a surface
     rotation : (3, 3) float32: world direction to environment direction
     bad_texels : int: NaN, infinite or negative texels, taken as black; not those of filters that ring, whose negative
         values are 0
-    black : bool: no light at all
     """
 
     def __init__(self, world: World) -> None:
@@ -161,84 +115,56 @@ class EnvironmentLight:
         tint = np.asarray(world.colour, np.float64) * float(world.strength)
         if not (np.isfinite(rotation).all() and np.isfinite(tint).all()):
             raise UsageError("world", "has a colour, strength or rotation that is not finite", "Check its settings")
-        with np.errstate(all="ignore"):
-            tinted = image * tint.astype(np.float32)
-            bad = _bad(tinted)
-            if bad.any() and np.minimum(tinted, 0).sum() > -_RINGING * np.maximum(tinted, 0).sum():
-                np.maximum(tinted, 0, out=tinted)
-                bad = _bad(tinted)
-        self.bad_texels = int(bad.sum())
-        h, w = image.shape[:2]
-        self.texels = np.zeros((h, w, 4), np.float32)
-        self.texels[..., :3] = np.where(bad, np.float32(0), np.minimum(tinted, BRIGHTEST))
+        self.texels = np.zeros((*image.shape[:2], 4), np.float32)
+        found = np.zeros((len(image), 3))
+        with np.errstate(over="ignore"):
+            tinted = tint.astype(np.float32)
+        _clean(image, tinted, False, self.texels, found)
+        bad, dark, bright = found.sum(axis=0)
+        if bad and dark > -_RINGING * bright:
+            _clean(image, tinted, True, self.texels, found)
+            bad = 0
+        self.bad_texels = int(bad)
         self.rotation = np.ascontiguousarray(rotation, np.float32)
-        self._make_table()
+        self.cells = Cells(self.texels)
+        self.row_z = self.cells.edges.astype(np.float32)
+        self.facing = Facing(self.cells)
 
-    def _make_table(self) -> None:
-        means = _texel_means(self.texels[..., :3].astype(np.float64) @ np.array(LUMINANCE))
-        h, w = means.shape
-        step = 1
-        while (h // step) * (w // step) > _MOST_CELLS or h % step or w % step:
-            step += 1
-            if step > min(h, w):
-                step = 1
-                break
-        if step > 1:
-            means = means.reshape(h // step, step, w // step, step).mean(axis=(1, 3))
-        rows, columns = means.shape
-        edges = np.cos(np.pi * np.arange(rows + 1) / rows)
-        edges[0], edges[-1] = 1.0, -1.0
-        solid = -np.diff(edges) * (2.0 * math.pi / columns)
-        weights = (means * solid[:, None]).ravel()
-        total = weights.sum()
-        self.black = not total > 0.0
-        self._power = float(total)
-        self.row_z = edges.astype(np.float32)
-        lit = _morton_order(rows, columns)
-        lit = lit if self.black else lit[weights[lit] > 0]
-        # Widths in whole random numbers, at least one where there is light; the density follows from them exactly.
-        share = np.full(len(lit), 1.0 / len(lit)) if self.black else weights[lit] / total
-        width = _whole_widths(share)
-        self.cells = np.stack([np.cumsum(width) - 1, lit], axis=1).astype(np.uint32)
-        self.guide = np.zeros(1 << max(0, (rows * columns - 1).bit_length()), np.int32)
-        _guide_table(self.cells, self.guide)
-        density = np.zeros(rows * columns)
-        if not self.black:
-            density[lit] = width * 2.0**-32
-        self.density = (density.reshape(rows, columns) / solid[:, None]).astype(np.float32)
-        self.facing = Facing(density.reshape(rows, columns), edges, self.cells)
-        self.texels[..., 3] = self.density.repeat(step, axis=0).repeat(step, axis=1)
+    @property
+    def black(self) -> bool:
+        """No light at all."""
+        return not self.cells.power > 0.0
 
     @property
     def sky(self) -> Sky:
         """What compiled code reads; valid while this light lives and its rotation is not replaced."""
         height, width = self.texels.shape[:2]
-        step, facing = height // (len(self.row_z) - 1), self.facing
+        cells, facing = self.cells, self.facing
         return Sky(
             address(self.texels),
             height,
             width,
-            address(self.cells),
-            address(self.guide),
-            len(self.guide),
+            address(cells.runs),
+            address(cells.guide),
+            len(cells.guide),
             address(self.row_z),
-            step,
-            width // step,
+            cells.step,
+            width // cells.step,
             address(facing.starts),
             address(facing.slices),
             address(facing.ratio),
             address(facing.first),
-            address(facing.block),
+            address(cells.block),
             len(facing.first),
-            facing.block.shape[1],
-            facing.shift,
+            cells.block.shape[1],
+            cells.shift,
             *self.rotation.ravel(),
         )
 
     @property
     def power(self) -> float:
         """Luminance integrated over all directions."""
-        return self._power
+        return self.cells.power
 
     def lookup(self, directions: Array) -> Array:
         """(n, 3) radiance from (n, 3) unit world directions."""
