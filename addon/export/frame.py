@@ -38,9 +38,8 @@ def export_frame(
     shown: Callable[[bpy.types.Object], bool] | None = None,
     passes: tuple[str, ...] | None = None,
     cancelled: Callable[[], bool] | None = None,
-    blurred: bool = False,
 ) -> Frame:
-    """Describe the frame that `depsgraph` was evaluated for.
+    """Describe the frame that `depsgraph` was evaluated for, without its blur: see `render_engine.blur`.
 
     Parameters
     ----------
@@ -51,7 +50,6 @@ def export_frame(
     memory : what earlier exports of the same depsgraph made and is still true
     shown : whether an evaluated object is in the picture; all are when None
     passes : replace those of the view layer
-    blurred : the caller sees to motion blur and depth of field, see `render_engine.blur`
     cancelled : asked before each object
 
     Raises
@@ -68,7 +66,7 @@ def export_frame(
         if scene.camera is None:
             raise UsageError(f'Scene "{scene.name}"', "has no camera", "Add a camera, or make one active with Ctrl 0")
         camera = export_camera(scene.camera.evaluated_get(depsgraph), picture_of(scene))
-        _check_features(scene, depsgraph.view_layer, warn, blurred)
+        _check_features(scene, depsgraph.view_layer, warn)
     materials, unrendered, lights = Materials(warn), Unrendered(), []
     memory = Memory() if memory is None else memory
     objects, meshes = DrgsObjects(depsgraph, key_of, warn, memory), Meshes(depsgraph, materials, warn, memory)
@@ -115,9 +113,7 @@ def _unseen(item: Visible, others: str) -> Visible:
     return replace(item, visibility=replace(item.visibility, shadow_catcher=catches, holdout=not catches))
 
 
-def _check_features(
-    scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer, warn: Callable[[str], None], blurred: bool
-) -> None:
+def _check_features(scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer, warn: Callable[[str], None]) -> None:
     """Say which features of the scene the picture will lack.
 
     Raises
@@ -139,9 +135,3 @@ def _check_features(
         warn(f'Scene "{scene.drgs.over.name}" has another {", ".join(changed)} now: press Set Up Compositing again')
     if view_layer.use_pass_cryptomatte_asset:
         warn(f'Cryptomatte of assets of view layer "{view_layer.name}" is not rendered by DR-GS')
-    if blurred:
-        return
-    if scene.render.use_motion_blur:
-        warn("Motion blur is rendered by F12 and `blender -b` alone, not here")
-    if scene.camera.data.dof.use_dof:
-        warn(f'Depth of field of camera "{scene.camera.name}" is rendered by F12 and `blender -b` alone, not here')

@@ -13,17 +13,13 @@ from dataclasses import dataclass, replace
 import bpy
 import numpy as np
 
-from ...drgs_blender.engine.protocol import Passes
-from ...drgs_blender.frame import Camera, Frame, RenderSettings
-from ...drgs_blender.passes import BY_NAME
+from ...drgs_blender.engine import blur
+from ...drgs_blender.frame import Frame
 
-Array = np.ndarray
 Warn = Callable[[str], None]
 
 #: Share of the open shutter that lies before the frame.
 _BEFORE = {"START": 0.0, "CENTER": 0.5, "END": 1.0}
-#: Passes that are not blurred: what they say of a surface has no mean.
-SHARP = frozenset(name for name, p in BY_NAME.items() if p.kind != "COLOR" or p.exact or name == "Albedo")
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,28 +90,6 @@ def focus_distance(camera: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> 
     return max(abs((matrix.translation - pose.translation).dot(pose.col[2].xyz)), 1e-4)
 
 
-def through(camera: Camera, lens: tuple[float, float], distance: float) -> Camera:
-    """`camera` from another place of its lens; what is at `distance` stays where it is in the picture."""
-    x, y = lens
-    pose = np.array(camera.matrix_world)
-    pose[:3, 3] += x * pose[:3, 0] + y * pose[:3, 1]
-    cx, cy = camera.cx + camera.fx * x / distance, camera.cy - camera.fy * y / distance
-    return replace(camera, matrix_world=pose, cx=cx, cy=cy)
-
-
-def shared(settings: RenderSettings, count: int, index: int) -> RenderSettings:
-    """The settings of one of `count` pictures: its part of the samples, with noise of its own."""
-    return replace(
-        settings,
-        cosine=-(-settings.cosine // count),
-        ggx=-(-settings.ggx // count),
-        environment=-(-settings.environment // count),
-        aa=-(-settings.aa // count),
-        noise_threshold=0.0,
-        seed=(settings.seed + 0x9E3779B1 * index) % 2**31,
-    )
-
-
 def pictures(
     sharp: Frame,
     wanted: list[Step],
@@ -123,7 +97,7 @@ def pictures(
     export: Callable[[], Frame],
     frame_set: Callable[[int, float], None],
 ) -> Iterator[Frame]:
-    """The frames to render: one with the sharp passes where any is wanted, then those that are averaged.
+    """The frame `sharp` at each time and place on the lens, as yet with all of its passes and rays.
 
     Parameters
     ----------
@@ -132,47 +106,17 @@ def pictures(
     """
     own = depsgraph.scene.frame_current, depsgraph.scene.frame_subframe
     now = sum(own)
-    names = tuple(name for name in sharp.passes if name in SHARP)
-    if names:
-        cheap = replace(sharp.settings, cosine=1, ggx=1, environment=1, bounces=0, denoise="none", noise_threshold=0.0)
-        yield replace(sharp, passes=names, settings=cheap)
-    blurred = tuple(name for name in sharp.passes if name not in SHARP)
     moves = any(step.time for step in wanted)
     try:
-        for index, step in enumerate(wanted):
+        for step in wanted:
             frame = sharp
             if moves:
                 whole = math.floor(now + step.time)
                 frame_set(whole, now + step.time - whole)
                 frame = export()
             camera = depsgraph.scene_eval.camera.evaluated_get(depsgraph)
-            yield replace(
-                frame,
-                number=sharp.number,
-                camera=through(frame.camera, step.lens, focus_distance(camera, depsgraph)),
-                settings=shared(frame.settings, len(wanted), index),
-                passes=blurred,
-                previous=None,
-                next=None,
-            )
+            seen = blur.through(frame.camera, step.lens, focus_distance(camera, depsgraph))
+            yield replace(frame, number=sharp.number, camera=seen, previous=None, next=None)
     finally:
         if moves:
             frame_set(*own)
-
-
-def averaged(parts: Iterator[Passes], count: int) -> Passes:
-    """One picture of the sharp passes and `count` that are averaged; seconds and samples are added up."""
-    sums: dict[str, Array] = {}
-    sharp, warnings, statistics = {}, [], {}
-    for part in parts:
-        for name, values in part.items():
-            if name in SHARP:
-                sharp[name] = values
-            else:
-                sums[name] = values.astype(np.float64) if name not in sums else sums[name] + values
-        warnings += [text for text in part.warnings if text not in warnings]
-        for name, value in part.statistics.items():
-            added = name.startswith("seconds.") or name == "samples"
-            statistics[name] = statistics.get(name, 0.0) + value if added else value
-    means = {name: (total / count).astype(np.float32) for name, total in sums.items()}
-    return Passes(sharp | means, warnings, statistics)

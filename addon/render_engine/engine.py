@@ -9,6 +9,8 @@ from collections.abc import Callable, Iterator
 import bpy
 import numpy as np
 
+from ...drgs_blender import mattes
+from ...drgs_blender.engine.blur import averaged, share, sharp
 from ...drgs_blender.engine.protocol import Passes
 from ...drgs_blender.errors import EXIT_INTERNAL, Cancelled, DrgsError
 from ...drgs_blender.frame import Frame
@@ -116,7 +118,6 @@ class DrgsRenderEngine(bpy.types.RenderEngine):
                 lambda path: engine_link.load_asset(path, self._stopped),
                 warn,
                 frame_set=self._frame_set if moments else None,
-                blurred=True,
                 cancelled=self._stopped,
             )
 
@@ -149,11 +150,13 @@ class DrgsRenderEngine(bpy.types.RenderEngine):
 
         def parts() -> Iterator[Passes]:
             nonlocal done
+            if (still := sharp(frame)) is not None:
+                yield engine_link.render(still, tell, self._stopped)
             for step in blur.pictures(frame, steps, depsgraph, export, self._frame_set):
-                yield engine_link.render(step, tell, self._stopped)
+                yield engine_link.render(share(step, len(steps), done), tell, self._stopped)
                 done += 1
 
-        passes = blur.averaged(parts(), len(steps))
+        passes = averaged(parts(), len(steps))
         engine_link.statistics = passes.statistics
         return passes
 
@@ -181,6 +184,8 @@ class DrgsRenderEngine(bpy.types.RenderEngine):
             stopped = False
         finally:
             self.end_result(result, cancel=stopped)
+        for key, text in mattes.metadata(frame, f"{view_layer.name}.").items():
+            self.get_result().stamp_data_add_field(key, text)
 
 
 def summary(frame: Frame, statistics: dict[str, float]) -> str:

@@ -117,6 +117,7 @@ class Exporter:
         self.protocol = importlib.import_module(f"{package}.drgs_blender.engine.protocol")
         self.errors = importlib.import_module(f"{package}.drgs_blender.errors")
         self.export_frame = importlib.import_module(f"{package}.addon.export").export_frame
+        self.blur = importlib.import_module(f"{package}.addon.render_engine.blur")
         self.encode_frame = importlib.import_module(f"{package}.drgs_blender.engine.codec").encode_frame
         self.sent = importlib.import_module(f"{package}.drgs_blender.engine.slots").SentSlots()
         self.keys: dict[Path, str] = {}
@@ -147,21 +148,42 @@ class Exporter:
         return answer.frame["frames"] if isinstance(answer, self.protocol.Render) else []
 
     def send(self, depsgraph: Any, frame_set: Any) -> None:
-        """Describe the evaluated view layer; `frame_set` evaluates it at another frame."""
+        """Describe the evaluated view layer; `frame_set` evaluates it at another time.
+
+        Of a blurred one the pictures follow, which are averaged, as often as the parent asks for them.
+        """
         warnings: list[str] = []
-        number = depsgraph.scene.frame_current
-        described = self.export_frame(depsgraph, self.key_of, warnings.append, frame_set=frame_set, passes=self.passes)
-        frame, arrays = self.encode_frame(described)
+
+        def warn(text: str) -> None:
+            if text not in warnings:
+                warnings.append(text)
+
+        def export(moments: bool) -> Any:
+            set_moments = frame_set if moments else None
+            passes = self.passes
+            return self.export_frame(depsgraph, self.key_of, warn, frame_set=set_moments, passes=passes)
+
+        frame = export(True)
+        scene = depsgraph.scene_eval
+        steps = self.blur.steps(scene, scene.camera.evaluated_get(depsgraph), warn)
         layers = [layer for layer in depsgraph.scene.view_layers if layer.use]
+        about = {
+            "number": depsgraph.scene.frame_current,
+            "layer": depsgraph.view_layer.name if len(layers) > 1 else "",
+            "pictures": len(steps),
+        }
+        while isinstance(self.tell(frame, about, warnings), self.protocol.Render):
+            for picture in self.blur.pictures(frame, steps, depsgraph, lambda: export(False), frame_set):
+                self.tell(picture, {}, warnings)
+
+    def tell(self, frame: Any, about: dict[str, Any], warnings: list[str]) -> Any:
+        """Send a frame with what is said `about` it, and return the answer."""
+        described, arrays = self.encode_frame(frame)
         slots, changed = self.sent.changes(arrays)
         self.requests += 1
-        description = {
-            "number": number,
-            "layer": depsgraph.view_layer.name if len(layers) > 1 else "",
-            "warnings": warnings,
-            "frame": frame,
-        }
-        self.ask(self.protocol.Render(self.requests, description, slots), changed)
+        return self.ask(
+            self.protocol.Render(self.requests, about | {"warnings": warnings, "frame": described}, slots), changed
+        )
 
 
 def outside_files() -> list[tuple[str, str]]:
@@ -228,6 +250,9 @@ def render_frames(exporter: Exporter, job: dict[str, Any]) -> None:
         if job.get("report"):
             about = {"files": outside_files(), "notes": differences(scene)}
             exporter.ask(exporter.protocol.Render(0, about, {}))
+        if not any(layer.use for layer in scene.view_layers):  # Blender would crash
+            problem, remedy = "has no view layer that is rendered", "Switch on Use for Rendering of one"
+            raise exporter.errors.UsageError(f'scene "{scene.name}"', problem, remedy)
         scene.render.engine = ENGINE
         scene.render.use_compositing = scene.render.use_sequencer = False
         scene.render.use_persistent_data = True
@@ -240,7 +265,12 @@ def render_frames(exporter: Exporter, job: dict[str, Any]) -> None:
                 if scene.frame_current != number:
                     problem = f"cannot be reached, Blender goes to {scene.frame_current}"
                     raise exporter.errors.UsageError(f"frame {number}", problem, "Choose other frames")
-                bpy.ops.render.render()
+                try:
+                    bpy.ops.render.render()
+                except RuntimeError as error:
+                    problem = f"is refused by Blender ({str(error).strip().removeprefix('Error: ')})"
+                    remedy = "Check its resolution, render region and camera"
+                    raise exporter.errors.UsageError(f'scene "{scene.name}"', problem, remedy) from error
                 if exporter.error:
                     raise exporter.error
             frames = exporter.more() if job.get("keep") else []

@@ -13,6 +13,8 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,8 +36,26 @@ logger = logging.getLogger(__name__)
 SILENT_SECONDS, START_SECONDS = 120.0, 300.0
 _CHECK = "Run `drgs doctor`; -vv shows what Blender prints"
 
-#: One evaluated view layer: frame number, layer ("" when there is only one), description, warnings of the export.
-Evaluated = tuple[int, str, Frame, list[str]]
+
+@dataclass(slots=True)
+class Evaluated:
+    """One evaluated view layer.
+
+    Attributes
+    ----------
+    number, layer : of the frame; its view layer, "" when there is only one
+    frame : its description, without blur
+    warnings : of the export, those of `pictures` too when these have come
+    count : of pictures whose mean is the blurred one; 0 where nothing is blurred
+    pictures : has these described, each with all passes and rays of the frame; may be called again
+    """
+
+    number: int
+    layer: str
+    frame: Frame
+    warnings: list[str]
+    count: int
+    pictures: Callable[[], Iterator[Frame]]
 
 
 class BlenderProcess:
@@ -110,24 +130,39 @@ class BlenderProcess:
         DrgsError
             What Blender's side reports; EngineError when it died.
         """
+        while True:
+            message, arrays = self._next()
+            if isinstance(message, protocol.Shutdown):
+                return
+            if message.id == 0:  # no frame
+                if not message.frame:
+                    return  # it waits for more
+                self.report = message.frame
+            else:
+                yield self._evaluated(message, arrays)
+            self._answer(protocol.Result(message.id, [], {}))
+
+    def _next(self) -> tuple[Any, dict[str, np.ndarray]]:
+        """What Blender sends next, assets being loaded for it: Render or Shutdown, and arrays."""
         self._latest = time.monotonic() + self._timeout
         while True:
             message, arrays = self._receive()
-            if isinstance(message, protocol.Shutdown):
-                return
-            if isinstance(message, protocol.LoadAsset):
-                self._answer(protocol.Loaded(message.id, self._key_of(Path(message.path)), 0, 0))
-            elif isinstance(message, protocol.Render):
-                if message.id == 0:  # no frame
-                    if not message.frame:
-                        return  # it waits for more
-                    self.report = message.frame
-                else:
-                    yield self._evaluated(message, arrays)
-                self._latest = time.monotonic() + self._timeout
-                self._answer(protocol.Result(message.id, [], {}))
-            else:
+            if isinstance(message, (protocol.Render, protocol.Shutdown)):
+                return message, arrays
+            if not isinstance(message, protocol.LoadAsset):
                 raise EngineError("Blender", f"sent {type(message).__name__}, which makes no sense here", "Try again")
+            self._answer(protocol.Loaded(message.id, self._key_of(Path(message.path)), 0, 0))
+
+    def _pictures(self, count: int, warnings: list[str]) -> Iterator[Frame]:
+        """The pictures of a blurred frame; behind them Blender announces the frame again and waits as before."""
+        self._answer(protocol.Render(0, {}, {}))
+        for _ in range(count):
+            message, arrays = self._next()
+            frame = self._frame(message, arrays)
+            warnings[:] = message.frame["warnings"]
+            yield frame
+            self._answer(protocol.Result(message.id, [], {}))
+        self._frame(*self._next())
 
     def _make_folders(self) -> tuple[str | None, Path]:
         """The extension's repository, and where Blender's temporary files go: it leaves some where it is killed."""
@@ -201,11 +236,18 @@ class BlenderProcess:
             raise EngineError("Blender", f"ended before the job: {self._epitaph()}", "Try again") from error
 
     def _evaluated(self, message: protocol.Render, sent: dict[str, np.ndarray]) -> Evaluated:
+        frame, about = self._frame(message, sent), message.frame
+        count, warnings = about["pictures"], about["warnings"]
+        pictures = partial(self._pictures, count, warnings)
+        return Evaluated(about["number"], about["layer"], frame, warnings, count, pictures)
+
+    def _frame(self, message: Any, sent: dict[str, np.ndarray]) -> Frame:
+        if not isinstance(message, protocol.Render):
+            raise EngineError("Blender", "did not finish a frame", "Try again")
         arrays, missing = self._held.update(message.slots, sent)
         if missing:
             raise EngineError("Blender", f"did not send {missing[0]}", "Try again")
-        about = message.frame
-        return about["number"], about["layer"], decode_frame(about["frame"], arrays), about["warnings"]
+        return decode_frame(message.frame["frame"], arrays)
 
     def _hear(self) -> None:
         """Something arrived, or waiting begins."""

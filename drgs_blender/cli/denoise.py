@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..errors import AssetError, EngineError, UsageError
+from ..mattes import METADATA
 from ..passes import BY_NAME
 from ..sequence import frame_path
 from ..version import __version__
@@ -112,7 +113,8 @@ def denoise(args: argparse.Namespace) -> int:
                 if repeated and not same_noise:
                     lines.note("neighbours have the same noise, which stays; switch on Animated Seed")
                 same_noise |= repeated
-                kept = {k: v for k, v in middle.metadata.items() if k in ("frame", "seed", "camera")}
+                known = ("frame", "seed", "camera")
+                kept = {k: v for k, v in middle.metadata.items() if k in known or k.startswith(METADATA)}
                 extra = {frame_store.SETTINGS: settings, "denoise": f"svgf, window of {args.window}"}
                 frame_store.write_frame(path, pictures, kept | extra)
                 lines.saved(path)

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
+from .. import mattes
 from ..asset.container import digest_asset
 from ..engine.codec import encode_frame
 from ..errors import AssetError
@@ -119,4 +120,4 @@ def quiet_descriptors() -> Iterator[None]:
 def save(path: Path, pictures: Mapping[str, np.ndarray], frame: Frame, number: int, settings: str) -> None:
     """Write a frame; WriteError when it cannot be written and read back."""
     metadata = {SETTINGS: settings, "frame": str(number), "seed": str(frame.settings.seed)}
-    write_frame(path, dict(pictures), metadata | describe(frame))
+    write_frame(path, dict(pictures), metadata | describe(frame) | mattes.metadata(frame))

@@ -17,6 +17,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from .. import mattes
 from ..asset import Asset
 from ..errors import UsageError
 from ..frame import Frame, ObjectState, RenderSettings, World
@@ -112,7 +113,8 @@ def run(args: argparse.Namespace) -> int:
             from ..asset.container import digest_asset
             from ..render.picture.frames import write_frame
 
-            write_frame(path, picture, {"asset": digest_asset(key), "seed": str(settings.seed)})
+            about = {"asset": digest_asset(key), "seed": str(settings.seed)}
+            write_frame(path, picture, about | mattes.metadata(frame))
     return 0
 
 

@@ -16,13 +16,11 @@ import argparse
 import contextlib
 import logging
 import re
-import time
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..errors import AssetError, Cancelled, DeviceError, EngineError, UsageError
+from ..errors import AssetError, DeviceError, EngineError, UsageError
 from ..sequence import frame_path
 from . import sampling, session_link
 from .find_blender import find_blender
@@ -32,8 +30,6 @@ from .output import check_suffix, check_writable
 from .progress import bar
 
 if TYPE_CHECKING:
-    from ..engine.client import EngineClient, OnProgress, Passes
-    from ..frame import Frame
     from .machine import Machine
 
 logger = logging.getLogger(__name__)
@@ -110,6 +106,7 @@ def render(args: argparse.Namespace, machine: Machine) -> int:
     logger.info("Blender: %s (%s)", blender.program, blender.origin)
 
     from . import frame_store
+    from .picture import Picture
 
     frame_store.remove_abandoned(template)
     job = {"scene": str(scene), "frames": frames, "scripts": args.enable_scripts, "passes": args.passes}
@@ -128,21 +125,24 @@ def render(args: argparse.Namespace, machine: Machine) -> int:
                 lines.note(text)
             noted.update(texts)
 
-        for number, layer, scene_frame, warnings in evaluated:
-            note(warnings)
-            path = layer_path(frame_path(template, number), layer)
-            claim(files, path, layer)
-            frame = replace(scene_frame, settings=sampling.override(scene_frame.settings, args))
-            sampling.check_size(frame.camera, frame.passes)
-            settings = frame_store.settings_hash(frame, machine.assets)
-            if not args.overwrite and frame_store.is_complete(path, frame, settings):
+        for shot in evaluated:
+            note(shot.warnings)
+            number, path = shot.number, layer_path(frame_path(template, shot.number), shot.layer)
+            claim(files, path, shot.layer)
+            picture = Picture(shot, partial(sampling.override, args=args))
+            sampling.check_size(picture.frame.camera, picture.frame.passes)
+            if (
+                not args.overwrite
+                and path.is_file()
+                and frame_store.is_complete(path, picture.frame, picture.settings_hash(machine.assets))
+            ):
                 lines.skipped(path)
             else:
                 lines.begin(number)
-                pictures = render_in_time(engine, frame, partial(lines.progress, number), args.timeout)
-                note(pictures.warnings)
+                passes, settings = picture.render(engine, machine.assets, partial(lines.progress, number), args.timeout)
+                note(shot.warnings + passes.warnings)
                 machine.check_assets()
-                frame_store.save(path, pictures, frame, number, settings)
+                frame_store.save(path, passes, picture.frame, number, settings)
                 lines.saved(path)
             progress.update(number not in done)
             done.add(number)
@@ -150,16 +150,6 @@ def render(args: argparse.Namespace, machine: Machine) -> int:
     if missing := [number for number in frames if number not in done]:
         raise EngineError("Blender", f"did not evaluate frame {missing[0]} and {len(missing) - 1} more", "Try again")
     return 0
-
-
-def render_in_time(engine: EngineClient, frame: Frame, on_progress: OnProgress, timeout: float) -> Passes:
-    """Render `frame`; EngineError when that takes longer than `timeout` seconds."""
-    latest = time.monotonic() + timeout
-    try:
-        return engine.render(frame, on_progress, lambda: time.monotonic() > latest)
-    except Cancelled as end:
-        problem, remedy = f"took longer than {timeout:g} s", "Raise --timeout, or use fewer rays"
-        raise EngineError(f"frame {frame.number}", problem, remedy) from end
 
 
 def layer_path(path: Path, layer: str) -> Path:

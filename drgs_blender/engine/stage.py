@@ -222,7 +222,10 @@ class Stage:
         found += self.scene.materials.warnings
         found += self.lamps.warnings
         if self.light is not None and self.light.bad_texels:
-            found.append(f"world: {self.light.bad_texels} texels are not finite or negative; they are black")
+            found.append(
+                f"world: {self.light.bad_texels} pixels of the environment are negative, infinite or no number, and "
+                "give no light; where that shows, repair the image"
+            )
         return found
 
     def light_of(self, world: World) -> EnvironmentLight:

@@ -15,11 +15,12 @@ from ..asset.model import PosedSurfels
 from ..errors import Cancelled, UsageError
 from ..frame import Frame
 from ..jit import use_threads
+from ..mattes import KINDS
 from ..passes import BY_NAME
 from .camera import camera_parameters
 from .lights.lamps import Lamps
 from .lights.light import EnvironmentLight
-from .picture.cryptomatte import KINDS, CryptoFilm
+from .picture.cryptomatte import CryptoFilm
 from .picture.denoise import denoise
 from .picture.film import COMPONENTS, Film
 from .picture.motion import Instant, MotionFilm, vector_pass

@@ -9,7 +9,7 @@ from scenes import mesh_object, new_world, part, read_exr
 from test_composed import CUBE, SIDES, painted
 
 WIDTH, HEIGHT = 64, 48
-blur = part("addon.render_engine.blur")
+blur = part("drgs_blender.engine.blur")
 
 
 @pytest.fixture

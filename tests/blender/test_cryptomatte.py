@@ -2,11 +2,59 @@
 
 from __future__ import annotations
 
+import json
+import os
+import subprocess
+
+import bpy
 import numpy as np
 import pytest
 from scenes import mesh_object, new_world
 from test_composed import CUBE, SIDES, painted
 from test_motion import layers_of
+
+#: Run by the engine's Python, which has OpenEXR: texts of a file's header.
+HEADER = """
+import json, sys, OpenEXR
+with OpenEXR.File(sys.argv[1]) as file:
+    print(json.dumps({k: v for k, v in file.header().items() if k.startswith("cryptomatte/")}))
+"""
+
+
+def header_of(path) -> dict[str, str]:
+    command = [os.environ["DRGS_ENGINE"], "-c", HEADER, str(path)]
+    return json.loads(subprocess.run(command, check=True, capture_output=True, timeout=100).stdout)
+
+
+def test_files_name_their_mattes_as_those_of_cycles_do(ball, scene, tmp_path):
+    """Blender's own Cryptomatte node finds both in the file."""
+    new_world(scene)
+    painted(mesh_object('A "cube"', CUBE, SIDES), (0.5, 0.5, 0.5))
+    layer = scene.view_layers[0]
+    layer.use_pass_cryptomatte_object = layer.use_pass_cryptomatte_material = True
+    scene.cycles.device, scene.cycles.samples = "CPU", 1
+    said = {}
+    for engine in ("DRGS", "CYCLES"):
+        layers_of(scene, engine, tmp_path)
+        said[engine] = header_of(tmp_path / f"{engine}.exr")
+    ours, theirs = said["DRGS"], said["CYCLES"]
+    assert ours.keys() == theirs.keys() and len(ours) == 8
+    manifests = 0
+    for key in ours:
+        if not key.endswith("/manifest"):
+            assert ours[key] == theirs[key]
+            continue
+        mine = json.loads(ours[key])
+        known = json.loads(theirs[key].replace('A "cube"', 'A \\"cube\\"'))  # Cycles forgets to
+        assert mine == {name: known.get(name, mine[name]) for name in mine}
+        assert {"ball", 'A "cube"'} <= mine.keys() or "DR-GS" in mine
+        manifests += 1
+    assert manifests == 2
+    kind = "CompositorNodeTree"
+    node = bpy.data.node_groups.new("Mattes", kind).nodes.new("CompositorNodeCryptomatteV2")
+    node.source, node.image = "IMAGE", bpy.data.images.load(str(tmp_path / "DRGS.exr"))
+    for name in ("CryptoObject", "CryptoMaterial"):
+        node.layer_name = f"{layer.name}.{name}"
 
 
 @pytest.mark.parametrize("of", ["Object", "Material"])

@@ -74,10 +74,11 @@ def animate(
     return subprocess.CompletedProcess(process.args, process.returncode, said, errors)
 
 
-def test_animation_rendered_by_blender_has_the_same_bits(drgs, folder, tmp_path):
+@pytest.mark.parametrize("scene", ["relative.blend", "blurred.blend"])
+def test_animation_rendered_by_blender_has_the_same_bits(drgs, folder, tmp_path, scene):
     own, blender = tmp_path / "drgs", tmp_path / "blender"
-    result = animate(folder / "relative.blend", blender, tmp_path)
-    assert drgs("render", folder / "relative.blend", "--frames", "1-3x2", "--out", own / "####.exr")[0] == 0
+    result = animate(folder / scene, blender, tmp_path)
+    assert drgs("render", folder / scene, "--frames", "1-3x2", "--out", own / "####.exr")[0] == 0
     names = ["0001.exr", "0003.exr"]
     assert sorted(path.name for path in own.iterdir()) == names
     assert sorted(path.name for path in blender.iterdir()) == names, result.stdout + result.stderr

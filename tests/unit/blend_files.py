@@ -54,7 +54,7 @@ bpy.ops.wm.save_as_mainfile(filepath=str(folder / "script.blend"))
 text.from_string("import bpy, time; bpy.app.handlers.frame_change_pre.append(lambda *_: time.sleep(30))")
 bpy.ops.wm.save_as_mainfile(filepath=str(folder / "slow.blend"))
 bpy.data.texts.remove(text)
-scene.render.use_motion_blur = True
+scene.view_layers[0].use_pass_cryptomatte_asset = True
 for name, path in (("gone", "//gone.png"), ("there", str(folder / "there.png"))):
     image = bpy.data.images.new(name, 4, 4)
     image.source, image.filepath, image.use_fake_user = "FILE", path, True
@@ -62,12 +62,22 @@ for name, path in (("gone", "//gone.png"), ("there", str(folder / "there.png")))
 bpy.ops.wm.save_as_mainfile(filepath=str(folder / "faulty.blend"))
 for image in list(bpy.data.images):
     bpy.data.images.remove(image)
-scene.render.use_motion_blur = False
+scene.view_layers[0].use_pass_cryptomatte_asset = False
 bpy.ops.file.make_paths_relative()
 bpy.ops.wm.save_as_mainfile(filepath=str(folder / "relative.blend"))
+scene.render.use_motion_blur = scene.view_layers[0].use_pass_z = camera.data.dof.use_dof = True
+camera.data.dof.focus_distance, camera.data.dof.aperture_fstop, scene.drgs.blur_steps = 3, 0.3, 3
+bpy.ops.wm.save_as_mainfile(filepath=str(folder / "blurred.blend"))
+scene.render.use_motion_blur = scene.view_layers[0].use_pass_z = camera.data.dof.use_dof = False
 scene.view_layers.new("Second layer")
 bpy.ops.wm.save_as_mainfile(filepath=str(folder / "layers.blend"))
 scene.view_layers.remove(scene.view_layers["Second layer"])
+scene.view_layers[0].use = False
+bpy.ops.wm.save_as_mainfile(filepath=str(folder / "layerless.blend"))
+scene.view_layers[0].use = scene.render.use_border = True
+scene.render.border_min_x = scene.render.border_max_x = 0.5
+bpy.ops.wm.save_as_mainfile(filepath=str(folder / "empty.blend"))
+scene.render.use_border = False
 scene.camera = None
 bpy.ops.wm.save_as_mainfile(filepath=str(folder / "blind.blend"))
 sys.stdout.flush()

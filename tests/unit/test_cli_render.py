@@ -90,6 +90,23 @@ def test_other_settings_are_rendered_again(render, tmp_path):
     assert np.array_equal(read_frame(path)[0]["Combined"], after)
 
 
+def test_blur_is_rendered_skipped_and_made_again(render, folder, tmp_path):
+    """The shutter is open over half a frame in which the tile, 4.6 pixels wide, moves by 1.2 pixels."""
+    options = ("--passes", "Coverage", "--primary", "mesh")
+    code, lines, _ = render(*options, scene="blurred.blend", frames="2")
+    assert code == 0 and not [line for line in lines if line.startswith("Note")]
+    path = tmp_path / "0002.exr"
+    blurred, coverage = (read_frame(path)[0][name] for name in ("Combined", "Coverage"))
+    assert any("skipping" in line for line in render(*options, scene="blurred.blend", frames="2")[1])
+    assert any("Saved" in line for line in render(*options, scene="shot.blend", frames="2")[1])
+    sharp = read_frame(path)[0]
+    assert np.array_equal(sharp["Coverage"] > 0, coverage > 0) and not np.array_equal(sharp["Combined"], blurred)
+    assert any("Saved" in line for line in render(*options, scene="blurred.blend", frames="2")[1])
+    assert np.array_equal(read_frame(path)[0]["Combined"], blurred)
+    assert any("Saved" in line for line in render(*options, "--seed", "3", scene="blurred.blend", frames="2")[1])
+    assert not np.array_equal(read_frame(path)[0]["Combined"], blurred)
+
+
 def test_a_frame_does_not_depend_on_its_chunk(render, tmp_path):
     render(frames="1-3")
     together = read_frame(tmp_path / "0003.exr")[0]["Combined"]
@@ -151,8 +168,10 @@ def test_scripts_in_the_file_run_only_when_allowed(render):
 
 
 def test_scene_faults_have_their_exit_code(render, folder, tmp_path):
-    code, lines, errors = render(scene="blind.blend")
-    assert (code, lines[-1]) == (64, "DRGS_EXIT class=usage") and "has no camera" in errors[-1]
+    faults = {"blind": "has no camera", "layerless": "has no view layer that is rendered", "empty": "render region"}
+    for name, fault in faults.items():
+        code, lines, errors = render(scene=f"{name}.blend")
+        assert (code, lines[-1]) == (64, "DRGS_EXIT class=usage") and fault in errors[-1], name
     (folder / "torn.blend").write_bytes((folder / "shot.blend").read_bytes()[:200])
     code, lines, errors = render(scene="torn.blend")
     assert (code, lines[-1]) == (65, "DRGS_EXIT class=bad-asset") and "torn.blend" in errors[-1]

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
+import OpenEXR
 import pytest
 from shapes import look_along_y, sphere_mesh
 
 from drgs_blender.asset.model import PosedSurfels
 from drgs_blender.frame import Frame, Material, MeshState, ObjectState, RenderSettings, World
+from drgs_blender.mattes import identities, metadata, name_hash
 from drgs_blender.render.lights.light import EnvironmentLight
-from drgs_blender.render.picture.cryptomatte import identities, name_hash
+from drgs_blender.render.picture.frames import read_frame, write_frame
 from drgs_blender.render.pipeline import render
 from drgs_blender.render.trace.scene import TraceObject, TraceScene
 
@@ -20,6 +24,26 @@ def test_hash_is_murmur3_with_usable_exponents():
     assert name_hash("The quick brown fox jumps over the lazy dog") == 0x2E4FF723
     many = identities([f"thing {i}" for i in range(5000)])
     assert np.isfinite(many).all() and (np.abs(many) >= np.finfo(np.float32).tiny).all()
+
+
+def test_files_say_which_number_is_whose_name(tmp_path):
+    """As the specification's readers look for it: under the layer's own hash, in JSON, one name for the passes."""
+    names = ['a "quoted"\\', "line\nbreak", "ünï 球", "plain"]
+    passes = ("Combined", "CryptoObject00")
+    frame = Frame(1, look_along_y(), [ObjectState(name, "") for name in names], passes=passes)
+    pictures = {name: np.ones((2, 2, 4), np.float32) for name in passes}
+    write_frame(tmp_path / "a.exr", pictures, {"seed": "1"} | metadata(frame))
+    with OpenEXR.File(str(tmp_path / "a.exr"), separate_channels=True) as file:
+        header = {k: v for k, v in dict(file.header()).items() if k.startswith("cryptomatte/")}
+        assert {c.split("00.")[0] for c in file.channels() if "Crypto" in c} == {"CryptoObject"}
+    key = f"cryptomatte/{name_hash('CryptoObject'):08x}"[:-1]
+    assert header.keys() == {f"{key}/{field}" for field in ("name", "hash", "conversion", "manifest")}
+    assert header[f"{key}/name"] == "CryptoObject" and header[f"{key}/conversion"] == "uint32_to_float32"
+    assert header[f"{key}/hash"] == "MurmurHash3_32"
+    manifest = json.loads(header[f"{key}/manifest"])
+    numbers = np.array([int(manifest[name], 16) for name in names], np.uint32).view(np.float32)
+    np.testing.assert_array_equal(numbers, identities(names))
+    assert read_frame(tmp_path / "a.exr")[1] == {"seed": "1"} | header
 
 
 @pytest.fixture(scope="module")

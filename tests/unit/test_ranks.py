@@ -15,7 +15,7 @@ PACKAGE = ROOT / "drgs_blender"
 #: What the extension may use of the engine's package.
 LIGHT_MODULES = tuple(
     f"engine.{name}"
-    for name in ("protocol", "client", "codec", "slots", "shared", "child", "locate", "snapshots", "frame_file")
+    for name in ("protocol", "client", "codec", "slots", "shared", "child", "locate", "snapshots", "frame_file", "blur")
 )
 
 

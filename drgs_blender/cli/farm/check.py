@@ -60,8 +60,8 @@ def check_scene(
     try:
         with BlenderProcess(blender, job, str) as process:
             try:
-                for _, _, _, texts in process.frames():
-                    warnings.update(dict.fromkeys(texts))
+                for evaluated in process.frames():
+                    warnings.update(dict.fromkeys(evaluated.warnings))
             finally:
                 about = process.report
                 _check_files(report, about.get("files", []), shared)

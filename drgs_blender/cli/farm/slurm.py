@@ -72,12 +72,16 @@ def write_job(job: Job, folder: Path, retries: int = RETRIES, directives: tuple[
     Raises
     ------
     UsageError
-        An option or the folder has a line break, after which the script would run what follows.
+        An option or the folder has a line break, after which the script would run what follows; or the folder has a
+        backslash, which Slurm takes for the end of all patterns in the name of a log.
     WriteError
     """
     for text in (*directives, str(folder)):
         if len(text.splitlines()) > 1:
             raise UsageError(repr(text), "has a line break, at which an option of Slurm ends", "Leave it out")
+    if "\\" in folder.as_posix():
+        problem, remedy = "has a backslash, and Slurm would write no log into it", "Choose another folder"
+        raise UsageError(f"folder {folder}", problem, remedy)
     (folder / "logs").mkdir(parents=True, exist_ok=True)
     steps = {"render": job.render("$frames")}
     if job.clean:
@@ -101,8 +105,8 @@ def write_job(job: Job, folder: Path, retries: int = RETRIES, directives: tuple[
 def _directives(job: Job, step: str, folder: Path, more: tuple[str, ...]) -> list[str]:
     """Options of sbatch, those of the user last: they win."""
     name = re.sub(r"[^\w.-]+", "_", f"{job.name}-{step}")
-    # A percent sign begins a pattern of Slurm's own.
-    logs = str(folder / "logs").replace("%", "%%")
+    # A percent sign begins a pattern of Slurm's own, a quotation mark ends the name.
+    logs = (folder / "logs").as_posix().replace("%", "%%").replace('"', r"\"")
     return [
         f"--job-name={name}",
         f"--array=0-{len(job.chunks) - 1}",

@@ -1,56 +1,28 @@
 """Cryptomatte: which objects and materials a pixel shows, and how much of each (Friedman and Jones 2015).
 
-A name is a number, the MurmurHash3 of its UTF-8 text read as float32. A pixel holds the numbers and coverages of what
-it shows, most first, two in every RGBA pass.
+A pixel holds the numbers of the names (`mattes`) and the coverages of what it shows, most first, two in every RGBA
+pass.
 """
 
 from __future__ import annotations
 
-import struct
 from typing import Any
 
 import numpy as np
 
 from ...frame import Frame
 from ...jit import njit, prange
+from ...mattes import DRGS_MATERIAL, KINDS, identities
 from ..points import CATCHER
 from ..primary.gbuffer import GBuffer
 from ..trace.scene import TraceScene
 
 Array = np.ndarray
 
-#: What is told apart -> the beginning of its passes, and passes of each.
-KINDS = {"object": "CryptoObject", "material": "CryptoMaterial"}
+#: Passes of each kind.
 PASSES = 3
 #: Things that are told apart in one pixel before the least are left out.
 _SLOTS = 24
-#: The material of DR-GS objects, as Blender's add-on names it.
-DRGS_MATERIAL = "DR-GS"
-_MASK = 0xFFFFFFFF
-
-
-def name_hash(name: str) -> int:
-    """MurmurHash3_x86_32 of a name, seed 0, with an exponent that no special float32 has."""
-    data = name.encode()
-    value, whole = 0, len(data) // 4 * 4
-    for (k,) in struct.iter_unpack("<I", data[:whole]):
-        value ^= _scrambled(k)
-        value = ((value << 13 | value >> 19) * 5 + 0xE6546B64) & _MASK
-    value ^= _scrambled(int.from_bytes(data[whole:], "little")) ^ len(data)
-    value = ((value ^ value >> 16) * 0x85EBCA6B) & _MASK
-    value = ((value ^ value >> 13) * 0xC2B2AE35) & _MASK
-    value ^= value >> 16
-    return value ^ (1 << 23) if (value >> 23 & 0xFF) in (0, 0xFF) else value
-
-
-def _scrambled(k: int) -> int:
-    k = k * 0xCC9E2D51 & _MASK
-    return (k << 15 | k >> 17) * 0x1B873593 & _MASK
-
-
-def identities(names: list[str]) -> Array:
-    """(n,) float32 number of each name."""
-    return np.array([name_hash(name) for name in names], np.uint32).view(np.float32)
 
 
 class CryptoFilm:

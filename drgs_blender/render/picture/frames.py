@@ -6,7 +6,8 @@ Combined, Depth, Normal ...; writing the beauty a second time as ``ViewLayer.Com
 Data passes are 32-bit floats always, colour passes are as well unless half floats are asked for. Compression is ZIP,
 lossless, 16 scan lines a block.
 
-Metadata lie in the header as string attributes named ``drgs:<key>``. ``drgs:crc32`` covers pixels and metadata, because
+Metadata lie in the header as string attributes named ``drgs:<key>``, those of Cryptomatte under the names that every
+reader of it knows. ``drgs:crc32`` covers pixels and metadata, because
 OpenEXR itself accepts many damaged files; `read_frame` checks it.
 """
 
@@ -23,6 +24,7 @@ import numpy as np
 import OpenEXR
 
 from ...errors import AssetError, UsageError, WriteError
+from ...mattes import METADATA
 from ...passes import BY_NAME
 
 Array = np.ndarray
@@ -56,7 +58,7 @@ def write_frame(path: str | Path, passes: dict[str, Array], metadata: dict[str, 
     channels = _channels(path, passes, half)
     checksum = _checksum(channels, metadata)
     header: dict[str, Any] = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
-    header |= {PREFIX + key: str(value) for key, value in metadata.items()}
+    header |= {key if key.startswith(METADATA) else PREFIX + key: str(value) for key, value in metadata.items()}
     header[PREFIX + _CHECKSUM] = checksum
     temporary: Path | None = None
     try:
@@ -98,7 +100,8 @@ def read_frame(path: str | Path) -> tuple[dict[str, Array], dict[str, str]]:
             channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
     except _FAILURES as error:
         raise AssetError(str(path), f"cannot be read as OpenEXR ({error})", "Render this frame again") from error
-    metadata = {k[len(PREFIX) :]: v for k, v in header.items() if k.startswith(PREFIX) and isinstance(v, str)}
+    texts = {k: v for k, v in header.items() if k.startswith((PREFIX, METADATA)) and isinstance(v, str)}
+    metadata = {k.removeprefix(PREFIX): v for k, v in texts.items()}
     checksum = metadata.pop(_CHECKSUM, None)
     if checksum is None:
         raise AssetError(str(path), "was not written by DR-GS", "Choose another output folder or file name")
