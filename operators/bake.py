@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from ..addon import assets, mesh_arrays, messages
 from ..addon.export import export_frame
 from ..addon.export.camera import NO_CAMERA
 from ..addon.export.fit import check_fit
+from ..addon.export.frame import WORKING_SPACE
 from ..drgs_blender.engine.frame_file import SUFFIX, write_frame_file
 from ..drgs_blender.errors import UsageError
 from ..drgs_blender.sequence import frame_path
@@ -80,6 +82,7 @@ class DRGS_OT_bake_light(ProgramOperator, targets.ObjectMode, bpy.types.Operator
         frames = range(scene.frame_start, scene.frame_end + 1, scene.frame_step)
         self._frames = tuple(frames) if self.use_animation else (scene.frame_current,)
         self._names = tuple(obj.name for obj in objects)
+        self._check_places(objects)
         with self.folder("drgs-bake-") as folder:
             scenes = str(folder / f"{_NUMBER}{SUFFIX}")
             arguments = ["bake", scenes, "--rays", str(self.rays), "--light", self.light]
@@ -101,8 +104,7 @@ class DRGS_OT_bake_light(ProgramOperator, targets.ObjectMode, bpy.types.Operator
             if obj is None:
                 self.warn(f'Object "{name}" is gone; its light is lost')
             elif self.target == "IMAGE":
-                image = bpy.data.images.load(str(frame_path(self._image(obj), self._frames[0])), check_existing=True)
-                image.source = "SEQUENCE" if len(self._frames) > 1 else "FILE"
+                show_image(frame_path(self._image(obj), self._frames[0]), len(self._frames) > 1)
             else:
                 for number in self._frames:
                     colours = np.load(frame_path(self._attribute(i), number), allow_pickle=False)
@@ -131,7 +133,23 @@ class DRGS_OT_bake_light(ProgramOperator, targets.ObjectMode, bpy.types.Operator
 
     def _image(self, obj: bpy.types.Object) -> str:
         """Pattern of the images of an object."""
-        return str(Path(bpy.path.abspath(self.directory)) / f"{bpy.path.clean_name(obj.name)}_{_NUMBER}.exr")
+        clean = re.sub(r"[^\w.-]+", "_", obj.name)
+        return str(Path(bpy.path.abspath(self.directory)) / f"{clean}_{_NUMBER}.exr")
+
+    def _check_places(self, objects: list[bpy.types.Object]) -> None:
+        """Refuse objects of which one would get the light of another."""
+        taken: dict[object, bpy.types.Object] = {}
+        for obj in objects:
+            # Some disks do not tell capital letters from small ones.
+            other = taken.setdefault(self._image(obj).casefold() if self.target == "IMAGE" else obj.data, obj)
+            if other is obj:
+                continue
+            if self.target == "IMAGE":
+                problem, remedy = f"would be baked to the same files, {self._image(obj)}", "Rename one of them"
+            else:
+                problem = f'share the mesh "{obj.data.name}"'
+                remedy = "Choose Object > Relations > Make Single User, or bake to images"
+            raise UsageError(f'Objects "{other.name}" and "{obj.name}"', problem, remedy)
 
     def _place(self, context: bpy.types.Context, index: int, obj: bpy.types.Object) -> list[str]:
         """Where the program writes the light of an object, and the UV map where that is an image."""
@@ -151,6 +169,19 @@ class DRGS_OT_bake_light(ProgramOperator, targets.ObjectMode, bpy.types.Operator
         path = self._folder / f"{index}_uvs.npy"
         np.save(path, uvs.reshape(-1, 3, 2), allow_pickle=False)
         return [self._image(obj), str(path)]
+
+
+def show_image(path: Path, sequence: bool) -> None:
+    """Have Blender show the file at `path` as it is now, also where an image of it is there with what it was before."""
+    image = bpy.data.images.load(str(path), check_existing=True)
+    if not image.is_editable:  # of a library
+        image = bpy.data.images.load(str(path))
+    if image.packed_file is not None:
+        image.unpack(method="REMOVE")
+    image.source = "SEQUENCE" if sequence else "FILE"
+    image.colorspace_settings.name = WORKING_SPACE
+    image.alpha_mode = "PREMUL"
+    image.reload()
 
 
 def write_colours(mesh: bpy.types.Mesh, name: str, colours: np.ndarray) -> None:

@@ -50,9 +50,7 @@ def test_a_frame_and_an_animation_go_to_attributes_of_all_objects(lit, scene, tm
 def test_images_are_written_by_the_uv_map(lit, scene, tmp_path):
     with pytest.raises(RuntimeError, match="has no UV map"):
         bpy.ops.drgs.bake_light(target="IMAGE", directory=str(tmp_path))
-    layer = lit.data.uv_layers.new(name="Box")
-    corners = np.array([v.co[:2] for v in lit.data.vertices])[[loop.vertex_index for loop in lit.data.loops]]
-    layer.uv.foreach_set("vector", (corners / 2 + 0.5).astype(np.float32).ravel())
+    with_uvs(lit)
     options = {"target": "IMAGE", "directory": str(tmp_path), "size": 32, "rays": 32, "light": "diffuse"}
     assert bpy.ops.drgs.bake_light(**options, use_animation=True) == {"FINISHED"}
     first, second = (read_exr(tmp_path / f"ball_{number:04}.exr", 32, 32)[8:24, 8:24] for number in (1, 2))
@@ -62,6 +60,52 @@ def test_images_are_written_by_the_uv_map(lit, scene, tmp_path):
     np.testing.assert_allclose(second[..., :3].mean(), 2 * first[..., :3].mean(), rtol=0.02)
     image = bpy.data.images["ball_0001.exr"]
     assert image.source == "SEQUENCE"
+
+
+def with_uvs(obj):
+    layer = obj.data.uv_layers.new(name="Box")
+    corners = np.array([v.co[:2] for v in obj.data.vertices])[[loop.vertex_index for loop in obj.data.loops]]
+    layer.uv.foreach_set("vector", (corners / 2 + 0.5).astype(np.float32).ravel())
+
+
+def test_an_image_shows_what_was_baked_last(lit, scene, tmp_path):
+    """Whatever it was before: other pixels, another size, another colour space, packed."""
+    with_uvs(lit)
+    options = {"target": "IMAGE", "directory": str(tmp_path), "rays": 8, "light": "diffuse"}
+    bpy.ops.drgs.bake_light(**options, size=32)
+    image = bpy.data.images["ball_0001.exr"]
+    dark = np.array(image.pixels).reshape(32, 32, 4)[8:24, 8:24].mean(axis=(0, 1))
+    image.pack()
+    image.colorspace_settings.name = "Non-Color"
+    scene.frame_set(2)
+    tmp_path.joinpath("ball_0001.exr").rename(tmp_path / "ball_0002.exr")
+    image.filepath = str(tmp_path / "ball_0002.exr")
+    bpy.ops.drgs.bake_light(**options, size=64)
+    assert [i.name for i in bpy.data.images if "ball" in i.name] == [image.name] and tuple(image.size) == (64, 64)
+    assert image.colorspace_settings.name == "Linear Rec.709" and image.packed_file is None
+    bright = np.array(image.pixels).reshape(64, 64, 4)[16:48, 16:48].mean(axis=(0, 1))
+    np.testing.assert_allclose(bright[:3], 2 * dark[:3], rtol=0.1)
+
+
+def test_one_object_does_not_get_the_light_of_another(lit, scene, tmp_path):
+    bpy.ops.import_scene.drgs(filepath=str(write_ball(tmp_path / "two.drgs")))
+    second = bpy.context.active_object
+    lit.name, second.name = "A ball", "a_ball"
+    select(lit, second)
+    with pytest.raises(RuntimeError, match='"A ball" and "a_ball": would be baked to the same files') as told:
+        bpy.ops.drgs.bake_light(target="IMAGE", directory=str(tmp_path))
+    assert "Rename one" in str(told.value)
+    twin = second.copy()
+    scene.collection.objects.link(twin)
+    select(twin, second)
+    with pytest.raises(RuntimeError, match="share the mesh"):
+        bpy.ops.drgs.bake_light()
+    lit.name, second.name = "Tür", "Tör"
+    with_uvs(lit)
+    with_uvs(second)
+    select(lit, second)
+    bpy.ops.drgs.bake_light(target="IMAGE", directory=str(tmp_path), size=16, rays=3)
+    assert sorted(path.name for path in tmp_path.glob("*.exr")) == ["Tör_0001.exr", "Tür_0001.exr"]
 
 
 def test_nothing_is_baked_over_a_material_or_of_what_is_not_rendered(lit):
