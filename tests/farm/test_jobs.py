@@ -132,6 +132,15 @@ def test_line_breaks_become_no_lines_of_the_script(drgs, tmp_path, monkeypatch, 
     assert not list(tmp_path.rglob("*.sbatch"))
 
 
+@pytest.mark.skipif(os.name == "nt", reason="backslashes part folders there")
+def test_folder_whose_logs_slurm_would_lose_is_refused(drgs, tmp_path):
+    (tmp_path / "a.blend").touch()
+    job = ["submit", "slurm", tmp_path / "a.blend", "--frames", "1-2", "--out", tmp_path / "####.exr", "--no-check"]
+    code, _, error = drgs(*job, "--to", tmp_path / "a\\b")
+    assert code == 64 and "backslash" in error and "Choose another folder" in error
+    assert not list(tmp_path.rglob("*.sbatch"))
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="where names are bytes")
 def test_names_of_any_bytes_reach_the_script(drgs, tmp_path):
     folder = tmp_path / os.fsdecode(b"\xff")

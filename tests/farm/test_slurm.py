@@ -74,6 +74,17 @@ def test_chunk_that_ends_with_75_is_queued_again_and_the_second_step_waits(drgs,
         assert (tmp_path / "clean" / name).is_file()
 
 
+@pytest.mark.parametrize("name", ["50%A of \"a\" 'b'", "#c $HOME;`d` ünï "])
+def test_logs_lie_in_the_folder_whatever_its_name(drgs, trio, scene, tmp_path, name):
+    folder = tmp_path / name
+    folder.mkdir()
+    scene = scene.rename(folder / scene.name)
+    job = submit(drgs, trio, scene, "--frames", "1", "--out", "//f/####.exr", "--drgs", "sh -c 'echo here'")
+    trio.until_done(60)
+    (told,) = logs(job, "render").values()
+    assert "here" in told
+
+
 def test_chunk_that_met_a_full_disk_is_queued_again(drgs, trio, scene, tmp_path, monkeypatch):
     monkeypatch.setitem(trio.env, "DRGS_PAUSE", "1")
     job = submit(
