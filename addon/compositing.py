@@ -61,13 +61,16 @@ def set_up(scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer, others: str,
             partner.view_layers.remove(layer)
     shown = partner.view_layers[0]
     shown.use = True
+    # The nodes below read picture and depth alone; who wants mattes of DR-GS objects switches them on in the partner.
+    for kind in ("object", "material"):
+        name = f"use_pass_cryptomatte_{kind}"
+        setattr(shown, name, old is not None and getattr(old.view_layers[0], name))
+    shown.use_pass_cryptomatte_asset = False
     if old is not None:
         _copy(old.view_layers[0].drgs, shown.drgs)
         _remove(old)
     shown.drgs.others = others
     shown.use_pass_z = True
-    for kind in ("object", "material", "asset"):
-        setattr(shown, f"use_pass_cryptomatte_{kind}", False)
     rendered = bpy.data.collections.new(RENDERED)
     partner.collection.children.link(rendered)
     for obj in collection.objects:
