@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ..addon import messages
-from ..drgs_blender.errors import DrgsError
+from ..drgs_blender.errors import DrgsError, UsageError
 
 
 class DrgsOperator:
@@ -20,6 +20,12 @@ class DrgsOperator:
             return self.run(context)
         except DrgsError as error:
             return self.fail(error)
+
+    def chosen(self, subject: str) -> str:
+        """The operator's file; UsageError about `subject` where none is given."""
+        if not self.filepath:
+            raise UsageError(subject, "no file is given", "Choose one")
+        return self.filepath
 
     def fail(self, error: DrgsError) -> set[str]:
         """Report an error; from a script it is raised as RuntimeError."""

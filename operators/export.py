@@ -88,11 +88,10 @@ class DRGS_OT_export(SceneFrames, bpy.types.Operator):
             column.prop(self, "frame_step")
 
     def run(self, context: bpy.types.Context) -> set[str]:
-        if not self.filepath:
-            raise UsageError("Export", "no file is given", "Choose one")
+        path = self.chosen("Export")
         self.check(context)
         kind = WRITTEN[self.format]
-        target = Path(bpy.path.abspath(self.filepath)).absolute()
+        target = Path(bpy.path.abspath(path)).absolute()
         frames = range(self.frame_start, self.frame_end + 1, self.frame_step) if self.use_animation else None
         if frames is not None and not frames:
             raise UsageError("Export", f"frames {self.frame_start} to {self.frame_end} are none", "Change the range")

@@ -40,7 +40,7 @@ class DRGS_OT_import_asset(DrgsOperator, bpy.types.Operator):
         return {"RUNNING_MODAL"}
 
     def run(self, context: bpy.types.Context) -> set[str]:
-        paths = [Path(self.directory) / f.name for f in self.files if f.name] or [Path(self.filepath)]
+        paths = [Path(self.directory) / f.name for f in self.files if f.name] or [Path(self.chosen("Import"))]
         objects = import_assets(context, paths, self.use_environment)
         if self.use_mark:
             mark(objects)

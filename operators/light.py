@@ -47,13 +47,14 @@ class DRGS_OT_choose_light(DrgsOperator, bpy.types.Operator):
         return {"RUNNING_MODAL"}
 
     def run(self, context: bpy.types.Context) -> set[str]:
+        path = Path(bpy.path.abspath(self.chosen("Light")))
         given = self.properties.is_property_set
         if (now := nodes_of(context.scene.world)) is not None:  # another image, turned and as strong as the last
             if not given("rotation"):
                 self.rotation = now[1].inputs["Rotation"].default_value[2]
             if not given("strength"):
                 self.strength = now[2].inputs["Strength"].default_value
-        choose_light(context.scene, Path(bpy.path.abspath(self.filepath)), self.rotation, self.strength)
+        choose_light(context.scene, path, self.rotation, self.strength)
         return {"FINISHED"}
 
 

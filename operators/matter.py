@@ -10,14 +10,25 @@ from bpy.props import EnumProperty, IntProperty
 from ..addon import assets, messages
 from ..addon.matter import points, work
 from ..drgs_blender.errors import DrgsError
+from . import targets
 from .base import DrgsOperator
 
 #: Seconds between two looks at what the engine does, and at most spent on one.
 _TICK, _SHARE = 0.1, 0.05
 
 
+NEEDS = "Make a DR-GS object the active one, and switch Matter on"
+
+
 def _has_matter(obj: bpy.types.Object | None) -> bool:
     return assets.is_drgs(obj) and obj.drgs.matter.use
+
+
+def _idle(cls: type[bpy.types.Operator], context: bpy.types.Context) -> bool:
+    """Poll of what needs matter for which nothing is being done."""
+    has = _has_matter(context.object)
+    cls.poll_message_set("Wait for what is being done, or cancel it" if has else NEEDS)
+    return has and work.of(context.object) is None
 
 
 class _Worker(DrgsOperator):
@@ -28,7 +39,7 @@ class _Worker(DrgsOperator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return _has_matter(context.object) and work.of(context.object) is None
+        return _idle(cls, context)
 
     def begin(self, context: bpy.types.Context) -> work.Work:
         """The work to do."""
@@ -142,6 +153,7 @@ class DRGS_OT_hide_preview(DrgsOperator, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
+        cls.poll_message_set("The active object shows no particles")
         return context.object is not None and points.of(context.object) is not None
 
     def run(self, context: bpy.types.Context) -> set[str]:
@@ -158,6 +170,7 @@ class DRGS_OT_cancel_matter(DrgsOperator, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
+        cls.poll_message_set("Nothing is being done for the active object")
         return work.of(context.object) is not None
 
     def run(self, context: bpy.types.Context) -> set[str]:
@@ -174,12 +187,13 @@ class DRGS_OT_free_matter(DrgsOperator, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return _has_matter(context.object) and work.of(context.object) is None
+        return _idle(cls, context)
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         return context.window_manager.invoke_confirm(self, event)
 
     def run(self, context: bpy.types.Context) -> set[str]:
+        targets.editable([context.object], vertices=False)
         work.free(context.object)
         return {"FINISHED"}
 
@@ -198,9 +212,11 @@ class DRGS_OT_matter_row(DrgsOperator, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
+        cls.poll_message_set(NEEDS)
         return _has_matter(context.object)
 
     def run(self, context: bpy.types.Context) -> set[str]:
+        targets.editable([context.object], vertices=False)
         rows = getattr(context.object.drgs.matter, self.rows)
         if self.remove < 0:
             rows.add()

@@ -24,13 +24,17 @@ class DRGS_OT_render_preset(DrgsOperator, bpy.types.Operator):
     menu_idname: StringProperty(options={"SKIP_SAVE", "HIDDEN"})
 
     def run(self, context: bpy.types.Context) -> set[str]:
-        path = Path(self.filepath)
+        path = Path(self.chosen("Render preset"))
         folders = [Path(p).resolve() for p in bpy.utils.preset_paths(presets.FOLDER)]
         if path.suffix != ".py" or path.resolve().parent not in folders:
             raise UsageError(str(path), "is no render preset", "Choose one of the list")
         if not context.scene.is_editable:
             raise UsageError(f'Scene "{context.scene.name}"', "comes from a library", "Make it local")
-        bpy.utils.execfile(str(path))
+        try:
+            bpy.utils.execfile(str(path))
+        except Exception as error:  # whatever a program may raise; of another version, or edited
+            problem, remedy = f"cannot be used ({type(error).__name__}: {error})", "Remove it, or keep it anew"
+            raise UsageError(str(path), problem, remedy) from error
         return {"FINISHED"}
 
 

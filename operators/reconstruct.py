@@ -128,6 +128,7 @@ class DRGS_OT_reconstruct_cancel(DrgsOperator, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
+        cls.poll_message_set("No reconstruction is under way")
         return reconstruction.job is not None
 
     def run(self, context: bpy.types.Context) -> set[str]:

@@ -32,6 +32,7 @@ class DRGS_OT_select_named(DrgsOperator, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
+        cls.poll_message_set("Go to Object Mode")
         return context.mode == "OBJECT"
 
     def run(self, context: bpy.types.Context) -> set[str]:
@@ -69,9 +70,7 @@ class DRGS_OT_report(DrgsOperator, bpy.types.Operator):
         return {"RUNNING_MODAL"}
 
     def run(self, context: bpy.types.Context) -> set[str]:
-        if not self.filepath:
-            raise UsageError("Report", "has no file to go to", "Choose one")
-        path = Path(bpy.path.abspath(self.filepath))
+        path = Path(bpy.path.abspath(self.chosen("Report")))
         try:
             path.write_text(report(context), encoding="utf-8")
         except OSError as error:
@@ -89,16 +88,31 @@ def told() -> str:
 def report(context: bpy.types.Context) -> str:
     """What a developer wants to know; takes a second or two."""
     scene, settings = context.scene, context.scene.drgs
-    values = (f"{p.identifier} = {getattr(settings, p.identifier)}" for p in settings.bl_rna.properties)
     parts = {
         "Program": f"DR-GS {__version__}, Blender {bpy.app.version_string}, {platform.platform()}",
         "Engine": engine(),
         "Scene": f"{scene.render.engine}, {scene.render.resolution_x} x {scene.render.resolution_y}\n"
-        + "\n".join(v for v in values if not v.startswith(("rna_type", "name"))),
+        + "\n".join(values(settings)),
         "Objects": "\n".join(map(described, filter(assets.is_drgs, scene.objects))) or "none",
         "Messages": told() or "none",
     }
     return "\n\n".join(f"== {title}\n{text}" for title, text in parts.items()) + "\n"
+
+
+def values(group: bpy.types.PropertyGroup, prefix: str = "") -> list[str]:
+    """What is set in a group and in those inside it, a line each."""
+    lines = []
+    for prop in group.bl_rna.properties:
+        if prop.identifier in ("rna_type", "name"):
+            continue
+        value, name = getattr(group, prop.identifier), prefix + prop.identifier
+        if isinstance(value, bpy.types.PropertyGroup):
+            lines += values(value, f"{name}.")
+        elif isinstance(value, bpy.types.ID):
+            lines.append(f'{name} = "{value.name}"')
+        else:
+            lines.append(f"{name} = {value}")
+    return lines
 
 
 def described(obj: bpy.types.Object) -> str:

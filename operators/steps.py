@@ -71,6 +71,7 @@ class DRGS_OT_add_camera(DrgsOperator, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
+        cls.poll_message_set("Go to Object Mode")
         return context.mode == "OBJECT"
 
     def run(self, context: bpy.types.Context) -> set[str]:

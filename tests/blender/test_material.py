@@ -67,6 +67,7 @@ def test_a_report_tells_of_engine_scene_and_messages(ball, tmp_path):
     text = path.read_text(encoding="utf-8")
     for expected in (bpy.app.version_string, "DR-GS can render here", '"ball"', "something about the light", "rays = "):
         assert expected in text
+    assert "\nsubmit.chunk = " in text and "bpy_struct" not in text and "bl_ext" not in text
     with pytest.raises(RuntimeError, match="cannot be written"):
         bpy.ops.drgs.report(filepath=str(tmp_path / "absent" / "report.txt"))
 
