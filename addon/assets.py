@@ -10,7 +10,7 @@ import bpy
 
 from ..drgs_blender.asset import Asset
 from ..drgs_blender.asset.container import read_asset
-from ..drgs_blender.errors import AssetError
+from ..drgs_blender.errors import AssetError, UsageError
 from .preferences import ROOT
 
 #: (path, mtime_ns, size) -> asset, arrays memory-mapped. A changed file gets a new key; `forget` empties it.
@@ -20,6 +20,20 @@ _open: dict[tuple[str, int, int], Asset] = {}
 def is_drgs(obj: bpy.types.Object | None) -> bool:
     """Whether `obj` is a mesh object with a DR-GS asset."""
     return obj is not None and obj.type == "MESH" and obj.drgs.asset is not None
+
+
+def collection(context: bpy.types.Context) -> bpy.types.Collection:
+    """Where new objects go: the active collection, or the scene's own where that one is of a library.
+
+    Raises
+    ------
+    UsageError
+        The scene comes from a library as well.
+    """
+    found = next((c for c in (context.collection, context.scene.collection) if c.is_editable), None)
+    if found is None:
+        raise UsageError(f'Scene "{context.scene.name}"', "comes from a library", "Choose a scene of this file")
+    return found
 
 
 def anchor(path: Path) -> bpy.types.Volume:

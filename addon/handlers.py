@@ -1,4 +1,4 @@
-"""What must happen when Blender loads another file."""
+"""What must happen when Blender loads another file or begins to render."""
 
 from __future__ import annotations
 
@@ -16,10 +16,18 @@ def forget_everything(*_: object) -> None:
     messages.history.clear()
 
 
+@bpy.app.handlers.persistent
+def begin_render(*_: object) -> None:
+    """A picture or an animation begins: what it warns of is told once, not with every frame."""
+    messages.warned.clear()
+
+
 def register() -> None:
     bpy.app.handlers.load_post.append(forget_everything)
+    bpy.app.handlers.render_init.append(begin_render)
 
 
 def unregister() -> None:
     bpy.app.handlers.load_post.remove(forget_everything)
+    bpy.app.handlers.render_init.remove(begin_render)
     forget_everything()

@@ -42,13 +42,19 @@ def named_in(text: str, known: Container[str]) -> str:
     return next((name for name in re.findall(r'"([^"]+)"', text) if name in known), "")
 
 
-class Warnings:
-    """Collects the warnings of one export; every text once."""
+#: What the render under way has warned of, in this frame or in those before.
+warned: set[str] = set()
 
-    def __init__(self) -> None:
+
+class Warnings:
+    """Collects the warnings of one export; every text once, and none that is `known`, to which they are added."""
+
+    def __init__(self, known: set[str] | None = None) -> None:
         self.texts: list[str] = []
+        self._known = set() if known is None else known
 
     def __call__(self, text: str) -> None:
-        if text not in self.texts:
+        if text not in self._known:
+            self._known.add(text)
             self.texts.append(text)
             note("WARNING", text)

@@ -11,6 +11,8 @@ from pathlib import Path
 import bpy
 import numpy as np
 
+from . import assets
+
 Array = np.ndarray
 
 #: Harmonics beyond the first of degree 3.
@@ -95,7 +97,7 @@ def new_object(context: bpy.types.Context, name: str, columns: dict[str, Array])
     for k in range(rest):
         _write(mesh, f"{_OTHERS}{k}", "FLOAT_VECTOR", beside(*(f"f_rest_{i * rest + k}" for i in range(3))))
     obj = bpy.data.objects.new(name, mesh)
-    context.collection.objects.link(obj)
+    assets.collection(context).objects.link(obj)
     for selected in context.selected_objects:
         selected.select_set(False)
     obj.select_set(True)

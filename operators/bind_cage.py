@@ -7,7 +7,7 @@ import bpy
 import numpy as np
 from bpy.props import IntProperty
 
-from ..addon import mesh_arrays
+from ..addon import assets, mesh_arrays
 from ..drgs_blender.errors import UsageError
 from . import targets
 from .base import DrgsOperator
@@ -84,7 +84,7 @@ def new_cage(context: bpy.types.Context, objects: list[bpy.types.Object], faces:
     mesh = bpy.data.meshes.new(NAME)
     mesh.from_pydata(everything.tolist(), [], triangles.tolist())
     cage = bpy.data.objects.new(NAME, mesh)
-    context.collection.objects.link(cage)
+    assets.collection(context).objects.link(cage)
     size = float(np.linalg.norm(np.ptp(everything, axis=0)))
     try:
         for kind, values in (

@@ -6,6 +6,7 @@ import bpy
 import numpy as np
 from bpy.props import IntVectorProperty
 
+from ..addon import assets
 from ..drgs_blender.errors import UsageError
 from . import targets
 from .base import DrgsOperator
@@ -54,7 +55,7 @@ def new_lattice(
     lattice = bpy.data.objects.new("DR-GS Lattice", data)
     lattice.location = (low + high) / 2
     lattice.scale = np.maximum((high - low) * MARGIN, 1e-4)
-    context.collection.objects.link(lattice)
+    assets.collection(context).objects.link(lattice)
     return lattice
 
 

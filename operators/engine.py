@@ -34,6 +34,7 @@ class DRGS_OT_engine_stop(DrgsOperator, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
+        cls.poll_message_set("The engine does not run")
         return engine_link.is_running()
 
     def run(self, context: bpy.types.Context) -> set[str]:

@@ -133,6 +133,7 @@ class DRGS_OT_engine_setup_cancel(DrgsOperator, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
+        cls.poll_message_set("No engine is being set up")
         return setup_job.running()
 
     def run(self, context: bpy.types.Context) -> set[str]:

@@ -57,6 +57,7 @@ def import_assets(
     AssetError
         A file is damaged, named in the message. Nothing has been added then.
     """
+    into = assets.collection(context)
     loaded = [(path, read_asset(path)) for path in (Path(bpy.path.abspath(str(p))).absolute() for p in paths)]
     if context.mode != "OBJECT":
         bpy.ops.object.mode_set(mode="OBJECT")
@@ -66,7 +67,7 @@ def import_assets(
     for path, asset in loaded:
         obj = new_object(path, asset)
         objects.append(obj)
-        context.collection.objects.link(obj)
+        into.objects.link(obj)
         obj.select_set(True)
         context.view_layer.objects.active = obj
         if use_environment and asset.environment is not None:

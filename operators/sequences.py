@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import bpy
 
+from ..addon import assets
+
 
 def play(objects: list[bpy.types.Object], frames: list[int], name: str) -> bpy.types.Object:
     """Show each object from its frame to the next one's, in viewports and pictures; return the Empty above them."""
     carrier = bpy.data.objects.new(name, None)
-    bpy.context.collection.objects.link(carrier)
+    assets.collection(bpy.context).objects.link(carrier)
     for i, (obj, frame) in enumerate(zip(objects, frames)):
         obj.parent = carrier
         keys = {frame: False}

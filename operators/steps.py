@@ -76,7 +76,7 @@ class DRGS_OT_add_camera(DrgsOperator, bpy.types.Operator):
 
     def run(self, context: bpy.types.Context) -> set[str]:
         camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
-        context.collection.objects.link(camera)
+        assets.collection(context).objects.link(camera)
         context.scene.camera = camera
         view = context.region_data if context.area is not None and context.area.type == "VIEW_3D" else None
         if view is not None:

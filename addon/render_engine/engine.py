@@ -109,7 +109,7 @@ class DrgsRenderEngine(bpy.types.RenderEngine):
         farm.fail(text, code)
 
     def _render(self, depsgraph: bpy.types.Depsgraph) -> None:
-        warn = messages.Warnings()
+        warn = messages.Warnings(messages.warned)
         self.update_stats("", "Exporting the scene")
 
         def export(moments: bool) -> Frame:

@@ -56,6 +56,15 @@ def test_the_composite_is_the_picture_of_one_engine(shared_scene, options):
     assert len(bpy.data.scenes) == 1
 
 
+def test_mattes_of_the_second_scene_are_the_artists_to_switch_on(shared_scene):
+    shared_scene.view_layers[0].use_pass_cryptomatte_object = True
+    for wanted in (False, True):
+        bpy.ops.drgs.set_up_compositing()
+        layer = next(s for s in bpy.data.scenes if s is not shared_scene).view_layers[0]
+        assert layer.use_pass_cryptomatte_object == wanted
+        layer.use_pass_cryptomatte_object = True
+
+
 def test_the_nodes_of_others_stay_between_picture_and_result(shared_scene):
     """What the artist does with the picture is done with both; again and again gives the same nodes."""
     compositing = part("addon.compositing")

@@ -9,7 +9,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 import pytest
-from scenes import ROOT, asset_of, part, read_exr, sphere, write_ball
+from scenes import ROOT, asset_of, part, read_exr, select, sphere, write_ball
 
 
 def channel(mesh, name):
@@ -159,3 +159,40 @@ def test_a_failed_conversion_says_why(scene, tmp_path):
     with pytest.raises(RuntimeError, match="neither surfels nor a mesh"):
         bpy.ops.drgs.import_parts()
     assert not [o for o in scene.objects if o.type == "MESH"]
+
+
+def test_nothing_is_put_into_a_collection_of_a_library(scene, tmp_path):
+    """Blender lets the artist make it the active one; what is new goes beside it."""
+    asset = str(write_ball(tmp_path / "ball.drgs"))
+    own = bpy.data.collections.new("Library")
+    bpy.data.libraries.write(str(tmp_path / "library.blend"), {own})
+    bpy.data.collections.remove(own)
+    with bpy.data.libraries.load(str(tmp_path / "library.blend"), link=True) as (_, wanted):
+        wanted.collections = ["Library"]
+    layer = bpy.context.view_layer
+    scene.collection.children.link(bpy.data.collections["Library"])
+    layer.active_layer_collection = layer.layer_collection.children["Library"]
+    assert bpy.context.collection.library
+    assert bpy.ops.import_scene.drgs(filepath=asset) == {"FINISHED"}
+    obj = bpy.context.active_object
+    for operator in (bpy.ops.drgs.add_camera, bpy.ops.drgs.bind_to_lattice, bpy.ops.drgs.bind_to_cage):
+        select(obj)
+        assert operator() == {"FINISHED"}
+    assert len(scene.collection.objects) == 5
+
+
+def test_operators_without_a_file_ask_for_one(scene):
+    for operator in (bpy.ops.import_scene.drgs, bpy.ops.drgs.choose_light, bpy.ops.drgs.export, bpy.ops.drgs.report):
+        with pytest.raises(RuntimeError, match="no file is given"):
+            operator()
+
+
+def test_operators_that_cannot_run_say_what_they_need(scene):
+    drgs, mute = bpy.ops.drgs, []
+    for name in dir(drgs):
+        try:
+            if not getattr(drgs, name).poll():
+                getattr(drgs, name)()
+        except RuntimeError as error:
+            mute += [name] if "context is incorrect" in str(error) else []
+    assert not mute

@@ -43,6 +43,19 @@ def render(scene, width=64, height=48):
     return read_exr(scene.render.filepath, width, height)
 
 
+def test_an_animation_warns_once_of_what_is_in_every_frame(ball, scene, captured, tmp_path):
+    history = part("addon.messages").history
+    scene.view_layers[0].use_pass_cryptomatte_asset = True
+    scene.collection.objects.link(bpy.data.objects.new("Fog", bpy.data.volumes.new("Fog")))
+    scene.frame_start, scene.frame_end = 1, 3
+    scene.render.filepath = str(tmp_path / "####")
+    history.clear()
+    bpy.ops.render.render(animation=True)
+    assert len(captured) == 3 and len(history) == 2
+    bpy.ops.render.render()
+    assert len(history) == 4
+
+
 def test_f12_writes_exactly_the_pixels_of_a_session(ball, scene, tmp_path, captured, monkeypatch):
     light(scene)
     ball.rotation_euler = (0.3, 0.2, 0.1)
