@@ -26,11 +26,8 @@ from drgs_blender.frame import RenderSettings, split_rays
 from drgs_blender.reconstruct.readers import read_capture
 
 
-def score(folder: Path, primary: str, rays: int) -> dict:
-    """The report of the true asset of a scene."""
-    path = folder.parent / f"{folder.name}-true.drgs"
-    if not path.exists():
-        write_asset(path, true_asset(folder))
+def score(path: Path, folder: Path, primary: str, rays: int) -> dict:
+    """The report of an asset of a scene."""
     session = Session()
     key = session.load_asset(path)
     cosine, ggx, environment = split_rays(rays)
@@ -38,6 +35,19 @@ def score(folder: Path, primary: str, rays: int) -> dict:
     return compare(
         session.asset(key), read_capture(folder), read_truth(folder), session_renderer(session, key, settings)
     )
+
+
+def of_truth(folder: Path) -> Path:
+    """The true asset of a scene."""
+    path = folder.parent / f"{folder.name}-true.drgs"
+    if not path.exists():
+        write_asset(path, true_asset(folder))
+    return path
+
+
+def under_other_lights(report: dict, posed: bool) -> list[dict]:
+    """The rows of a report under lights that the photographs do not show."""
+    return [row for row in report["lights"] if row["posed"] == posed and not row["training_light"]]
 
 
 def mean(rows: list[dict], kind: str, region: str) -> float:
@@ -63,9 +73,8 @@ def main() -> None:
     rows = []
     for folder in folders:
         for primary in ("mesh", "surfels"):
-            report = score(folder, primary, args.rays)
-            rest = [row for row in report["lights"] if not row["posed"] and not row["training_light"]]
-            posed = [row for row in report["lights"] if row["posed"] and not row["training_light"]]
+            report = score(of_truth(folder), folder, primary, args.rays)
+            rest, posed = under_other_lights(report, False), under_other_lights(report, True)
             materials, geometry = report["materials"], report["geometry"]
             rows.append(
                 (

@@ -99,7 +99,7 @@ def raster(options: argparse.Namespace) -> None:
 
 
 def first_hits(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Smooth unit normal (p, 3), whether something is hit (p,), and depth (p,) at the pixels' centres."""
+    """At the pixels' centres: smooth unit normal (p, 3) towards the viewer, whether there is a hit (p,), depth (p,)."""
     scene = rtcore_scene.EmbreeScene()
     TriangleMesh(scene, np.ascontiguousarray(vertices, np.float32), np.ascontiguousarray(faces, np.int32))
     x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
@@ -112,6 +112,7 @@ def first_hits(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> tuple
     share = np.stack([1 - found["u"] - found["v"], found["u"], found["v"]], -1)
     normal = np.einsum("pk,pkc->pc", share, smooth[corner])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
+    normal[np.einsum("pc,pc->p", normal, rays) > 0] *= -1  # open surfaces are seen from both sides
     return normal, found["primID"] >= 0, found["tfar"]
 
 

@@ -10,13 +10,13 @@ import pytest
 pytest.importorskip("torch")
 pytest.importorskip("skimage")
 
-from capture_cases import camera
+from capture_cases import balls, camera
 from shapes import sphere_mesh
 
 from drgs_blender.asset.model import Mesh
 from drgs_blender.frame import Camera
 from drgs_blender.reconstruct import tsdf
-from drgs_blender.reconstruct.hull import Region
+from drgs_blender.reconstruct.hull import Region, silhouettes
 from drgs_blender.reconstruct.silhouette import FARTHEST, fill_silhouettes
 from drgs_blender.reconstruct.targets import pixel_rays
 
@@ -102,3 +102,12 @@ def test_a_mesh_that_no_camera_sees_stays(cameras):
     mesh = plain(0.1 * vertices + (0, 0, 50), faces)
     empty = [np.zeros((SIZE, SIZE), np.float32)] * len(cameras)
     assert np.array_equal(fill_silhouettes(mesh, cameras, empty), mesh.vertices)
+
+
+def test_outlines_before_a_backdrop_are_as_exact_as_masks():
+    """Pixels that the object covers in part count in part."""
+    known, told = (silhouettes(balls(8, 128, masks=masks)) for masks in (True, False))
+    assert known is not None and told is not None
+    for mask, found in zip(known, told, strict=True):
+        border = np.count_nonzero((mask > 0) & (mask < 1))
+        assert abs(float(found.sum() - mask.sum())) < 0.1 * border
