@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import bpy
 import numpy as np
@@ -11,6 +11,7 @@ from bpy.props import BoolProperty, FloatProperty, FloatVectorProperty, StringPr
 
 from ..drgs_blender.frame import Adjustment
 from . import mesh_arrays
+from .sound import Sound
 
 Array = np.ndarray
 
@@ -105,16 +106,17 @@ class DrgsAdjustment(bpy.types.PropertyGroup):
         for name in ("use", "tint", *NUMBERS, "mask", "use_invert"):
             setattr(self, name, getattr(other, name))
 
-    def to_frame(self, mask: Array | None) -> Adjustment:
+    def to_frame(self, mask: Array | None, warn: Callable[[str], None]) -> Adjustment:
         """The engine's description; `mask` (n,) is the one named here, None for everywhere."""
+        own = Sound(self, f'Object "{self.id_data.name}"', warn)
         if mask is not None and self.use_invert:
             mask = 1 - mask
         return Adjustment(
-            tint=tuple(self.tint),
-            hue=self.hue / (2 * math.pi),
-            saturation=self.saturation,
-            value=self.value,
-            roughness=tuple(getattr(self, f"roughness_{part}") for part in ("gain", "offset", "low", "high")),
-            metallic=tuple(getattr(self, f"metallic_{part}") for part in ("gain", "offset", "low", "high")),
+            tint=tuple(own.tint),
+            hue=own.hue / (2 * math.pi),
+            saturation=own.saturation,
+            value=own.value,
+            roughness=tuple(getattr(own, f"roughness_{part}") for part in ("gain", "offset", "low", "high")),
+            metallic=tuple(getattr(own, f"metallic_{part}") for part in ("gain", "offset", "low", "high")),
             mask=mask,
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import typing
+from collections.abc import Callable
 
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, PointerProperty, StringProperty
@@ -11,6 +12,7 @@ from ..drgs_blender.frame import RenderSettings, split_rays
 from ..drgs_blender.passes import PASSES, Pass
 from .adjustment import DrgsAdjustment
 from .matter.properties import DrgsMatterSettings
+from .sound import Sound
 from .submit import DrgsSubmitSettings
 
 _DENOISERS = {
@@ -36,22 +38,43 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
         description="Light samples a pixel, divided by the material: towards light, and along what is reflected",
         min=3,
         soft_max=1024,
+        max=65536,
         default=32,
     )
     use_custom_split: BoolProperty(
         name="Custom Split", description="Choose the number of rays of each sampling strategy", default=False
     )
     cosine: IntProperty(
-        name="Cosine", description="Rays a pixel drawn by the cosine of the angle", min=1, soft_max=512, default=16
+        name="Cosine",
+        description="Rays a pixel drawn by the cosine of the angle",
+        min=1,
+        soft_max=512,
+        max=65536,
+        default=16,
     )
     ggx: IntProperty(
-        name="GGX", description="Rays a pixel drawn by the shape of the highlight", min=1, soft_max=256, default=8
+        name="GGX",
+        description="Rays a pixel drawn by the shape of the highlight",
+        min=1,
+        soft_max=256,
+        max=65536,
+        default=8,
     )
     environment: IntProperty(
-        name="Environment", description="Rays a pixel drawn towards bright light", min=1, soft_max=256, default=8
+        name="Environment",
+        description="Rays a pixel drawn towards bright light",
+        min=1,
+        soft_max=256,
+        max=65536,
+        default=8,
     )
     bounces: IntProperty(
-        name="Bounces", description="Times that light is passed on between surfaces", min=0, soft_max=8, default=1
+        name="Bounces",
+        description="Times that light is passed on between surfaces",
+        min=0,
+        soft_max=8,
+        max=64,
+        default=1,
     )
     use_noise_threshold: BoolProperty(
         name="Noise Threshold",
@@ -81,6 +104,7 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
         description="Positions inside a pixel among which its rays are divided; 0 chooses by their number",
         min=0,
         soft_max=64,
+        max=1024,
         default=0,
     )
     primary: EnumProperty(
@@ -165,26 +189,29 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
     )
     submit: PointerProperty(type=DrgsSubmitSettings, name="Farm")
 
-    def to_settings(self, film_transparent: bool, threads: int) -> RenderSettings:
-        """The engine's settings."""
-        split = (self.cosine, self.ggx, self.environment) if self.use_custom_split else split_rays(self.rays)
+    def to_settings(
+        self, film_transparent: bool, threads: int, warn: Callable[[str], None] = lambda text: None
+    ) -> RenderSettings:
+        """The engine's settings; `warn` is told of those that cannot be."""
+        own = Sound(self, f'Scene "{self.id_data.name}"', warn)
+        split = (own.cosine, own.ggx, own.environment) if own.use_custom_split else split_rays(own.rays)
         cosine, ggx, environment = split
         return RenderSettings(
             cosine=cosine,
             ggx=ggx,
             environment=environment,
-            bounces=self.bounces,
-            aa=self.aa,
-            primary=self.primary,
-            tracer=self.tracer,
-            denoise="none" if self.use_temporal else self.denoise,
-            look=self.look,
+            bounces=own.bounces,
+            aa=own.aa,
+            primary=own.primary,
+            tracer=own.tracer,
+            denoise="none" if own.use_temporal else own.denoise,
+            look=own.look,
             film_transparent=film_transparent,
-            seed=self.seed,
+            seed=own.seed,
             threads=threads,
-            noise_threshold=self.noise_threshold if self.use_noise_threshold else 0.0,
-            clamp_indirect=self.clamp_indirect,
-            split="counts" if self.use_custom_split else "auto",
+            noise_threshold=own.noise_threshold if own.use_noise_threshold else 0.0,
+            clamp_indirect=own.clamp_indirect,
+            split="counts" if own.use_custom_split else "auto",
         )
 
 

@@ -12,6 +12,7 @@ from ...drgs_blender.errors import UsageError
 from ...drgs_blender.frame import Camera, Frame
 from .. import assets, compositing, preferences
 from ..passes import enabled
+from ..sound import Sound
 from .camera import export_camera, picture_of
 from .images import end_export
 from .instances import UNRENDERED, Unrendered, Visible, uncancelled, visible
@@ -70,7 +71,7 @@ def export_frame(
     materials, unrendered, lights = Materials(warn), Unrendered(), []
     memory = Memory() if memory is None else memory
     objects, meshes = DrgsObjects(depsgraph, key_of, warn, memory), Meshes(depsgraph, materials, warn, memory)
-    others = depsgraph.view_layer.drgs.others
+    others = Sound(depsgraph.view_layer.drgs, f'View layer "{depsgraph.view_layer.name}"', warn).others
     for item in uncancelled(visible(depsgraph), cancelled):
         if shown is not None and not shown(item.object):
             continue
@@ -94,7 +95,7 @@ def export_frame(
         camera=camera,
         objects=objects.states,
         world=memory.recall(("world", uid(scene.world)), (), lambda: export_world(scene.world, warn)),
-        settings=settings.to_settings(scene.render.film_transparent, preferences.read("threads", 0)),
+        settings=settings.to_settings(scene.render.film_transparent, preferences.read("threads", 0), warn),
         passes=passes or tuple(p.name for p in enabled(scene, depsgraph.view_layer)),
         meshes=meshes.states(),
         lights=lights,

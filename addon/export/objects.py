@@ -113,7 +113,7 @@ def _adjustment(obj: bpy.types.Object, mesh: bpy.types.Mesh, warn: Warn) -> Adju
                 "points; they are applied nowhere"
             )
             return None
-    return settings.to_frame(mask)
+    return settings.to_frame(mask, warn)
 
 
 def _edited(obj: bpy.types.Object, mesh: bpy.types.Mesh, asset: Asset, channel: str, warn: Warn) -> np.ndarray | None:

@@ -319,3 +319,32 @@ def test_settings_offer_what_the_engine_knows():
     for name in ("primary", "tracer", "denoise", "look"):
         assert {i.identifier for i in properties[name].enum_items} == set(typing.get_args(hints[name])), name
         assert properties[name].default == getattr(defaults, name)
+
+
+def stored(group):
+    """Where Blender keeps the values of a property group, as no limit holds them."""
+    return group.bl_system_properties_get(do_create=True) if hasattr(group, "bl_system_properties_get") else group
+
+
+def test_settings_of_another_version_become_sound_and_are_named(ball, scene, export):
+    """A number out of its limits, no number, an entry that this version does not know, another type."""
+    blur = part("addon.render_engine.blur")
+    kept = {"rays": 2**31 - 1, "primary": 7, "bounces": -3, "clamp_indirect": float("nan"), "look": "another"}
+    for name, value in (kept | {"blur_steps": 2**31 - 1}).items():
+        stored(scene.drgs)[name] = value
+    stored(scene.view_layers[0].drgs)["others"] = 9
+    ball.drgs.adjustment.use = True
+    stored(ball.drgs.adjustment)["roughness_gain"] = float("nan")
+    scene.render.use_motion_blur, scene.drgs.use_custom_split = True, False
+    frame, warnings = export()
+    settings = frame.settings
+    assert (settings.rays, settings.bounces, settings.clamp_indirect) == (65536, 0, 0)
+    assert (settings.primary, settings.look) == ("surfels", "principled")
+    assert frame.objects[0].adjustment.roughness[0] == 1 and not frame.objects[0].visibility.holdout
+    assert len(blur.steps(scene, scene.camera, warnings.append)) == 1024
+    named = {w.split(" is ")[0] for w in warnings}
+    assert named == {
+        'Scene "Scene": Rays', 'Scene "Scene": Primary', 'Scene "Scene": Bounces', 'Scene "Scene": Clamp Indirect',
+        'Scene "Scene": Blur Steps', 'View layer "ViewLayer": Other Objects', 'Object "ball": Roughness',
+    }  # fmt: skip
+    assert all("is used. Set it anew" in w for w in warnings)

@@ -181,6 +181,29 @@ def test_nothing_is_put_into_a_collection_of_a_library(scene, tmp_path):
     assert len(scene.collection.objects) == 5
 
 
+def test_matter_of_a_linked_object_stays_as_it_is(scene, ball, tmp_path):
+    """Blender would change it in memory and lose it with the file."""
+    ball.drgs.matter.use = True
+    bpy.data.libraries.write(str(tmp_path / "library.blend"), {ball})
+    bpy.data.objects.remove(ball)
+    with bpy.data.libraries.load(str(tmp_path / "library.blend"), link=True) as (_, wanted):
+        wanted.objects = ["ball"]
+    linked = bpy.data.objects["ball"]
+    scene.collection.objects.link(linked)
+    select(linked)
+    for operator in (bpy.ops.drgs.matter_row, bpy.ops.drgs.free_matter):
+        with pytest.raises(RuntimeError, match=r'"ball".*comes from a library.*Make Local'):
+            operator()
+    assert not linked.drgs.matter.regions
+
+
+def test_a_preset_that_cannot_be_used_is_named(scene, monkeypatch, tmp_path):
+    (tmp_path / "Broken.py").write_text("import bpy\nbpy.context.scene.drgs.rays = 'many'\n")
+    monkeypatch.setattr(bpy.utils, "preset_paths", lambda folder: [str(tmp_path)])
+    with pytest.raises(RuntimeError, match=r"Broken.py: cannot be used \(TypeError.*Remove it"):
+        bpy.ops.drgs.render_preset(filepath=str(tmp_path / "Broken.py"))
+
+
 def test_operators_without_a_file_ask_for_one(scene):
     for operator in (bpy.ops.import_scene.drgs, bpy.ops.drgs.choose_light, bpy.ops.drgs.export, bpy.ops.drgs.report):
         with pytest.raises(RuntimeError, match="no file is given"):
