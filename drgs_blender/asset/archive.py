@@ -9,11 +9,14 @@ symbolic links, hidden data, overlapping members) as well as any damaged header.
 from __future__ import annotations
 
 import os
+import re
 import secrets
+import shutil
+import stat
 import struct
 import zlib
-from collections.abc import Collection, Iterable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -130,14 +133,17 @@ def _framing(members: Sequence[Member]) -> tuple[list[bytes], list[int], bytes]:
 def _map(path: Path) -> Array:
     """The bytes of `path`, mapped read-only."""
     try:
-        size = path.stat().st_size
-        if size < _END.size:
+        about = path.stat()
+        if not stat.S_ISREG(about.st_mode):  # a pipe or a device may never end
+            raise AssetError(str(path), "cannot be read (it is no regular file)", "Choose a file")
+        if (size := about.st_size) < _END.size:
             raise AssetError(str(path), f"is {size} bytes long, too short for a .drgs file", _RESTORE)
         return np.asarray(np.memmap(path, dtype=np.uint8, mode="r"))
     except FileNotFoundError as error:
         raise AssetError(str(path), "does not exist", "Check the path, or find the missing file in Blender") from error
     except (OSError, ValueError) as error:
-        raise AssetError(str(path), f"cannot be read ({error})", "Check the path and its permissions") from error
+        reason = getattr(error, "strerror", None) or error
+        raise AssetError(str(path), f"cannot be read ({reason})", "Check the path and its permissions") from error
 
 
 def _central_directory(data: Array, subject: str) -> tuple[list[Member], int]:
@@ -171,6 +177,8 @@ def _central_directory(data: Array, subject: str) -> tuple[list[Member], int]:
             raise AssetError(f"{subject}, {name}", problem, "Write the asset with DR-GS, not with a zip program")
         members.append(Member(name, size, crc))
         position += _CENTRAL.size + width
+    if sum(member.size for member in members) > start:  # also more than headers could be rebuilt for
+        raise AssetError(subject, "has members that are larger than the file", _RESTORE)
     return members, start
 
 
@@ -199,25 +207,70 @@ def _check_names(members: Sequence[Member], subject: str) -> None:
 
 
 def replace_file(path: Path, parts: Iterable[bytes | memoryview]) -> None:
-    """Write `parts` beside `path`, make them durable, and give them its name."""
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+    """Write `parts` beside `path`, make them durable, and give them its name; a symbolic link is followed.
+
+    Raises
+    ------
+    WriteError
+        Naming `path`, whatever stopped the write. No part of a file stays behind.
+    """
+    with _writing(path) as target:
+        temporary = _temporary(target)
+        try:
+            with open(temporary, "xb") as file:
+                for part in parts:
+                    file.write(part)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(temporary, target)
+            _sync_folder(target.parent)
+        finally:
+            with suppress(OSError):  # after success it is gone already
+                temporary.unlink()
+
+
+def replace_by(path: Path, save: Callable[[Path], object]) -> None:
+    """As `replace_file`, for libraries that write files themselves: `save` gets a path of the same extension.
+
+    It lies in a folder beside `path` and not in the system's for temporary files, which may be full or small.
+    """
+    with _writing(path) as target:
+        folder = target.with_name(f".{secrets.token_hex(4)}.tmp")  # libraries take no names that are not text
+        try:
+            folder.mkdir()
+            temporary = folder / f"file{path.suffix.lower()}"
+            save(temporary)
+            with open(temporary, "rb+") as file:
+                os.fsync(file.fileno())
+            os.replace(temporary, target)
+            _sync_folder(target.parent)
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _temporary(path: Path) -> Path:
+    return path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+
+
+@contextmanager
+def _writing(path: Path) -> Iterator[Path]:
+    """What `path` stands for once links are followed; what goes wrong while it is written is a WriteError.
+
+    RuntimeError is what pathlib raises for links in a circle, and what errors of libraries in C++ derive from.
+    """
     try:
-        with open(temporary, "xb") as file:
-            for part in parts:
-                file.write(part)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-        _sync_folder(path.parent)
-    except OSError as error:
-        raise WriteError(
-            str(path),
-            f"cannot be written ({error.strerror or error})",
-            "Check free space and permissions",
-        ) from error
-    finally:
-        with suppress(OSError):  # after success it is gone already
-            temporary.unlink()
+        yield path.resolve() if path.is_symlink() else path
+    except UnicodeError as error:
+        raise WriteError(str(path), "is no name that the format's library takes", "Use plain letters") from error
+    except (OSError, RuntimeError) as error:
+        reason = (error.strerror if isinstance(error, OSError) else None) or first_reason(str(error))
+        raise WriteError(str(path), f"cannot be written ({reason})", "Check free space and permissions") from error
+
+
+def first_reason(text: str) -> str:
+    """The first thing that a library says went wrong; USD's puts it in quotes behind the place in its source."""
+    said = re.search(r"Error in .*? : '([^']*)'", text)
+    return (said[1] if said else next(iter(text.strip().splitlines()), "no reason given"))[:200]
 
 
 def _sync_folder(folder: Path) -> None:

@@ -14,9 +14,9 @@ from ..deform.binding import bind, project
 from ..deform.faces import Faces
 from ..errors import AssetError
 from ..formats.axes import scaled_surfels, surfels_to_z_up
-from ..formats.files import MaterialsFile, MeshFile, SurfelFile
+from ..formats.files import MaterialsFile, MeshFile, SurfelFile, plain_name
 from ..formats.gaussian_ply import LAYOUTS
-from .make import TOLERANCE, mesh_with_materials, read_environment_of, read_mesh_file
+from .make import TOLERANCE, mesh_with_materials, read_environment_of, read_mesh_file, scale_mesh
 from .proxy import mesh_from_surfels
 from .transfer import surfels_to_vertices, vertices_to_surfels
 
@@ -77,9 +77,9 @@ def import_asset(
     captured = scaled_surfels(captured, scale)
 
     surfels_known = any(layout.name == file.layout and layout.albedo is not None for layout in LAYOUTS)
-    provenance: dict[str, Any] = {"surfels": Path(surfel_name).name, "report": report}
+    provenance: dict[str, Any] = {"surfels": plain_name(surfel_name), "report": report}
     if environment is not None:
-        provenance["environment"] = Path(environment).name
+        provenance["environment"] = plain_name(environment)
     if meshless:
         provenance["materials"] = _SURFELS_OWN[surfels_known]
         return Asset(captured, Mesh.empty(), None, read_environment_of(environment), provenance)
@@ -94,7 +94,7 @@ def import_asset(
         surface, report["mesh"] = mesh_with_materials(
             mesh_file, mesh_name, up=up, max_triangles=max_triangles, tolerance=TOLERANCE
         )
-        surface.vertices = surface.vertices * np.float32(scale)
+        scale_mesh(surface, scale, mesh_name)
         _check_overlap(captured, surface, surfel_name, mesh_name)
 
     binding, report["binding"] = bind(surface, captured)
@@ -106,7 +106,7 @@ def import_asset(
     else:
         report["vertices_without_surfels"] = surfels_to_vertices(surface, captured, binding)
         origin = f"{_SURFELS_OWN[surfels_known]}, carried to the mesh"
-    provenance |= {"mesh": Path(mesh_name).name, "materials": origin}
+    provenance |= {"mesh": plain_name(mesh_name), "materials": origin}
     log.info("imported %d surfels of %s: %s", len(captured), surfel_name, report)
     return Asset(captured, surface, binding, read_environment_of(environment), provenance)
 

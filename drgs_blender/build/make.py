@@ -13,8 +13,9 @@ from ..deform.attach import attach
 from ..deform.faces import Faces
 from ..errors import AssetError
 from ..formats.axes import mesh_to_z_up
-from ..formats.files import MeshFile
+from ..formats.files import MeshFile, plain_name
 from ..formats.gltf_nodes import Pose
+from ..formats.mesh import check_extent
 from .texture import CHANNELS, Materials
 from .topology import Net, close_marks, edge_lengths, edges, subdivide, weld
 
@@ -31,8 +32,6 @@ FINEST = 1 / 1500
 FOOTPRINT = 0.7
 #: Texture compared with the interpolation is averaged over this part of an edge, so that finer detail is noticed.
 LOOK = 0.1
-#: Sizes of a mesh in metres: the squared areas of its faces stay within the range of 32-bit floats.
-SMALLEST, LARGEST = 1e-6, 1e9
 #: Rounds of subdivision at most.
 ROUNDS = 16
 
@@ -71,10 +70,17 @@ def make_asset(
     name = "mesh" if isinstance(source, MeshFile) else str(source)
     file = read_mesh_file(source, pose)
     mesh, report = mesh_with_materials(file, name, up=up, max_triangles=max_triangles, tolerance=tolerance)
-    mesh.vertices = mesh.vertices * np.float32(scale)
+    scale_mesh(mesh, scale, name)
     surfels, binding, report["surfels"] = attach(mesh, pretrained, density=density)
-    provenance = {"mesh": Path(name).name, "made": "surfels attached to the mesh", "report": report}
+    provenance = {"mesh": plain_name(name), "made": "surfels attached to the mesh", "report": report}
     return Asset(surfels, mesh, binding, read_environment_of(environment), provenance)
+
+
+def scale_mesh(mesh: Mesh, scale: float, name: str) -> None:
+    """Multiply all lengths of `mesh` by `scale`. Raises UsageError where no mesh can be as small or large."""
+    with np.errstate(all="ignore"):
+        mesh.vertices = mesh.vertices * np.float32(scale)
+    check_extent(mesh.vertices, name, scale)
 
 
 def read_mesh_file(source: str | Path | MeshFile, pose: Pose = "rest") -> MeshFile:
@@ -145,10 +151,7 @@ def _net(file: MeshFile, name: str, report: dict[str, Any]) -> Net:
         proper = finite & ~Faces.of(file.vertices, file.faces).degenerate
     if not proper.any():
         raise AssetError(name, f"has {m} faces, none with an area", "Export the mesh again")
-    extent = float(np.ptp(file.vertices[file.faces[proper]].reshape(-1, 3).astype(np.float64), axis=0).max())
-    if not SMALLEST <= extent <= LARGEST:
-        problem = f"measures {extent:.3g} m, at which 32-bit numbers cannot hold the areas of its faces"
-        raise AssetError(name, problem, "Export it at its true size")
+    check_extent(file.vertices[file.faces[proper]], name)
     faces = file.faces[proper].astype(np.int64)
     material = np.asarray(file.face_material, np.int64)[proper]
     used, faces = np.unique(faces, return_inverse=True)

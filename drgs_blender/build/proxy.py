@@ -18,6 +18,8 @@ from scipy.sparse.csgraph import connected_components
 
 from ..asset.model import Mesh, PosedSurfels, Surfels
 from ..errors import AssetError, DeviceError
+from ..formats.axes import scaled_surfels
+from ..formats.mesh import check_extent
 from ..frame import Camera, RenderSettings
 from ..geometry import rotation_matrices
 from ..jit import njit, prange
@@ -34,6 +36,8 @@ BAND = 3.0
 WITNESSES = 3
 #: Surfels fainter than this do not shape the mesh.
 FAINT = 0.05
+#: Sizes in metres at which cameras are set up around surfels; others are scaled for it.
+SIZES = 0.01, 1e5
 #: Components smaller than this part of the largest one's area are dropped.
 CRUMB = 0.01
 
@@ -60,8 +64,14 @@ def mesh_from_surfels(surfels: Surfels, *, resolution: int = 192, views: int = 6
         raise DeviceError(
             "a mesh from surfels", "needs scikit-image", "Install it: pip install scikit-image; or give a mesh"
         ) from error
-    posed = _as_posed(surfels)
     low, high = _bounds(surfels)
+    check_extent(np.stack([low, high]), "surfels")
+    size = float((high - low).max())
+    if not SIZES[0] <= size <= SIZES[1]:
+        mesh, report = mesh_from_surfels(scaled_surfels(surfels, 1 / size), resolution=resolution, views=views)
+        mesh.vertices = mesh.vertices * np.float32(size)
+        return mesh, report | {"voxel": report["voxel"] * size, "volume": report["volume"] * size**3}
+    posed = _as_posed(surfels)
     voxel = float((high - low).max()) / resolution
     low, high = low - 4 * voxel, high + 4 * voxel
     shape = np.ceil((high - low) / voxel).astype(int) + 1

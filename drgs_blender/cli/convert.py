@@ -9,13 +9,11 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from ..errors import UsageError
 from ..filetypes import Held
 from ..formats.axes import UP_AXES
-from ..sequence import frame_path, frames_of
-from .frame_range import check_template, parse_frames
+from ..sequence import frame_path
+from .frame_range import frames_wanted
 from .output import check_writable
 from .progress import clock
 from .relight import finite, positive
@@ -71,11 +69,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Convert one file, or those of all frames."""
-    if args.frames is None:
+    frames = frames_wanted(args.frames, args.input, args.output)
+    if frames is None:
         convert(args)
         return 0
-    frames = parse_frames(args.frames) if args.frames else frames_of(str(args.input))
-    check_template(str(args.output), frames)
     for frame in frames:
         paths = {name: path for name in ("input", "output", "vertices") if (path := getattr(args, name)) is not None}
         of_frame = {name: frame_path(str(path), frame) for name, path in paths.items()}
@@ -107,10 +104,12 @@ def convert(args: argparse.Namespace) -> None:
         height, width = environment.radiance.shape[:2]
         print(f"{args.output}: {width} x {height} environment, {writer.name}")
     elif kind == "mesh":
+        from ..build.make import scale_mesh
         from ..formats.axes import vectors_from_z_up
 
-        mesh = source.mesh()
-        writer.write(args.output, replace(mesh, vertices=vectors_from_z_up(mesh.vertices * np.float32(args.scale), up)))
+        mesh = replace(source.mesh())
+        scale_mesh(mesh, args.scale, str(args.output))
+        writer.write(args.output, replace(mesh, vertices=vectors_from_z_up(mesh.vertices, up)))
         print(f"{args.output}: {len(mesh.faces)} triangles, {writer.name}, {up} up")
     else:
         from ..formats.splats import scaled, splats_from_z_up

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
 
 from ..errors import UsageError
+from ..sequence import frames_of
 
 _TERM = re.compile(r"(?P<first>-?\d{1,20})(?:(?:-|\.\.)(?P<last>-?\d{1,20})(?:[x:](?P<step>-?\d{1,20}))?)?")
 #: Far beyond any shot; a mistyped range must not fill the memory.
@@ -54,6 +56,27 @@ def parse_frames(text: str) -> list[int]:
             raise UsageError(f"frame range {text!r}", problem, f"They are {-LAST_FRAME} to {LAST_FRAME}")
         frames.update(dict.fromkeys(range(first, first + count * step, step)))
     return list(frames)
+
+
+def frames_wanted(text: str | None, source: Path, output: Path) -> list[int] | None:
+    """The frames of a sequence of files, one file each; None where `source` is a single file.
+
+    Parameters
+    ----------
+    text : the value of ``--frames``: a range, "" for those that are there, None where it is not given, which means the
+        same for a `source` that is no file but a pattern of files
+    source, output : with a run of ``#`` for the number
+
+    Raises
+    ------
+    UsageError
+        There are no such files, or several would be written to one.
+    """
+    if text is None and ("#" not in source.name or os.path.lexists(source)):
+        return None
+    frames = parse_frames(text) if text else frames_of(str(source))
+    check_template(str(output), frames)
+    return frames
 
 
 def write_frames(frames: Sequence[int]) -> str:

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from ..errors import UsageError
 from ..formats.axes import UP_AXES
-from ..sequence import frame_path, frames_of
-from .frame_range import check_template, parse_frames
+from ..sequence import frame_path
+from .frame_range import frames_wanted
 from .output import check_suffix, check_writable, write_and_report
 from .progress import FractionBar, clock
 from .relight import positive
@@ -66,10 +66,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Import and write one asset, or those of all frames."""
-    if args.frames is None:
+    frames = frames_wanted(args.frames, args.surfels, args.out)
+    if frames is None:
         return _import(args)
-    frames = parse_frames(args.frames) if args.frames else frames_of(str(args.surfels))
-    check_template(str(args.out), frames)
     for frame in frames:
         paths = {name: path for name in ("surfels", "mesh", "env", "out") if (path := getattr(args, name)) is not None}
         of_frame = {name: frame_path(str(path), frame) for name, path in paths.items()}

@@ -30,12 +30,15 @@ def check_writable(path: Path) -> None:
     try:
         if path.is_dir():
             raise WriteError(str(path), "is a folder", "Choose the name of a file")
-        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.exists() and not path.is_file():  # it would be replaced by a file, and who reads a pipe would wait
+            raise WriteError(str(path), "is a pipe or a device", "Choose the name of a file")
+        target = path.resolve() if path.is_symlink() else path  # where it leads is where the file will be written
+        target.parent.mkdir(parents=True, exist_ok=True)
         # As long as the temporary name under which the file will be written: a long name must not fail last either.
-        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp"):
+        with tempfile.NamedTemporaryFile(dir=target.parent, prefix=f".{target.name}.", suffix=".tmp"):
             pass
-    except OSError as error:
-        reason = error.strerror or str(error)
+    except (OSError, RuntimeError) as error:  # pathlib's RuntimeError: links in a circle
+        reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
         raise WriteError(str(path), f"cannot be written ({reason})", "Check the folder and its permissions") from error
 
 

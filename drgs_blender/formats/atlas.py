@@ -10,7 +10,8 @@ from PIL import Image as Pillow
 
 from ..asset import Mesh
 from ..colour import linear_to_srgb
-from ..errors import UsageError
+from ..errors import AssetError, UsageError
+from .mesh import check_extent
 
 Array = np.ndarray
 
@@ -61,10 +62,15 @@ def mesh_material(mesh: Mesh, subject: str) -> Plain | Textured:
     ------
     UsageError
         The mesh has no faces, or more than a picture has room for; names `subject`.
+    AssetError
+        It has values that are not finite, or a size that no reader takes.
     """
     if not len(mesh.faces):
         raise UsageError(subject, "would hold a mesh without faces", "Choose an asset that has a mesh, or --as splats")
+    check_extent(mesh.vertices, subject)
     values = np.concatenate([mesh.albedo, mesh.roughness[:, None], mesh.metallic[:, None]], axis=1).clip(0, 1)
+    if not np.isfinite(values).all():
+        raise AssetError(subject, "would hold materials that are NaN", "Make the asset again")
     used = values[np.unique(mesh.faces)]
     if np.ptp(used, axis=0).max() < _SAME:
         red, green, blue, roughness, metallic = np.median(used, axis=0).tolist()

@@ -10,11 +10,14 @@ from dataclasses import replace
 import numpy as np
 
 from ..asset import Surfels
+from ..errors import UsageError
 from .files import MeshFile
 from .harmonics import rotate_harmonics, whole_bands
 
 Array = np.ndarray
 
+#: A centre beyond this is damage: squares of distances would leave the range of 32-bit floats soon.
+FARTHEST = 1e15
 #: Up axis of a file -> (3, 3) rotation that brings it to Z up; entries are exact.
 UP_AXES: dict[str, Array] = {
     "z": np.eye(3),
@@ -62,10 +65,31 @@ def surfels_to_z_up(surfels: Surfels, up: str = "y") -> Surfels:
 
 
 def scaled_surfels(surfels: Surfels, factor: float) -> Surfels:
-    """Surfels with all lengths times `factor`."""
+    """Surfels with all lengths times `factor`. Raises UsageError, see `scaled_lengths`."""
+    if factor == 1:
+        return surfels
+    centre, scale = scaled_lengths(surfels.centre, surfels.scale, factor)
     by = np.float32(factor)
     extras = {name: v * by if name == "thickness" else v for name, v in surfels.extras.items()}
-    return replace(surfels, centre=surfels.centre * by, scale=surfels.scale * by, extras=extras)
+    return replace(surfels, centre=centre, scale=scale, extras=extras)
+
+
+def scaled_lengths(centre: Array, scale: Array, factor: float) -> tuple[Array, Array]:
+    """Centres and scales times `factor`.
+
+    Raises
+    ------
+    UsageError
+        That is more, or less, than numbers of 32 bits hold, or farther away than splats are read.
+    """
+    with np.errstate(all="ignore"):
+        by = np.float32(factor)
+        far, scales = centre * by, scale * by
+        largest = np.abs(far).max(initial=0)
+    if not largest <= FARTHEST or not np.isfinite(scales).all() or not ((scales > 0) | (scale <= 0)).all():
+        problem = f"makes lengths that numbers of 32 bits do not hold, or places beyond {FARTHEST:g} m"
+        raise UsageError(f"--scale {factor:g}", problem, "Choose another")
+    return far, scales
 
 
 def mesh_to_z_up(mesh: MeshFile, up: str = "y") -> MeshFile:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..asset import Environment
-from ..asset.archive import replace_file
-from ..errors import AssetError, WriteError
+from ..asset.archive import replace_by
+from ..errors import AssetError
 
 Array = np.ndarray
 
@@ -137,12 +136,12 @@ def write_exr_picture(path: Path, pixels: Array) -> None:
     planes = {
         name: np.ascontiguousarray(pixels[..., i], np.float32) for i, name in enumerate("RGBA"[: pixels.shape[2]])
     }
-    try:
-        with tempfile.TemporaryDirectory() as folder:
-            temporary = Path(folder) / "picture.exr"
+
+    def save(temporary: Path) -> None:
+        try:
             with OpenEXR.File(header, planes) as file:
                 file.write(str(temporary))
-            data = temporary.read_bytes()
-    except (OSError, RuntimeError, ValueError) as error:
-        raise WriteError(str(path), f"cannot be written ({error})", "Check the free space on the disk") from error
-    replace_file(path, [data])
+        except ValueError as error:  # the library raises these, too
+            raise RuntimeError(str(error)) from error
+
+    replace_by(path, save)

@@ -5,7 +5,9 @@ Colours are linear Rec.709 already; positions are in the axes of the file unless
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -27,6 +29,7 @@ class SurfelFile:
     unknown : properties of the file that the layout does not name
     notes : what was converted, dropped or assumed
     up : the up axis that the format prescribes (a key of ``axes.UP_AXES``); None where it prescribes none
+    assumed : those of the notes that are of surfels and their materials; whoever wants the splats lost nothing
     """
 
     surfels: Surfels
@@ -34,6 +37,7 @@ class SurfelFile:
     unknown: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     up: str | None = None
+    assumed: list[str] = field(default_factory=list)
 
 
 @dataclass(slots=True)
@@ -142,3 +146,8 @@ class MaterialsFile:
     metallic: Array
     layout: str
     notes: list[str] = field(default_factory=list)
+
+
+def plain_name(path: str | Path) -> str:
+    """The name of a file as text that every program can show: bytes of it that are no UTF-8 as \\xe9."""
+    return os.fsencode(Path(path).name).decode(errors="backslashreplace")

@@ -17,7 +17,7 @@ import numpy as np
 from ..asset import Surfels
 from ..colour import srgb_to_linear
 from ..errors import AssetError
-from .axes import multiply_quaternions
+from .axes import FARTHEST, multiply_quaternions
 from .files import SurfelFile
 from .ply import Header, Rows, read_ply
 
@@ -133,8 +133,6 @@ LAYOUTS: tuple[Layout, ...] = (
     Layout("3DGS"),
 )
 
-#: A centre beyond this is damage: squares of distances would leave the range of 32-bit floats soon.
-FARTHEST = 1e15
 _GEOMETRY = ("x", "y", "z", "opacity", "scale_0", "scale_1", "rot_0", "rot_1", "rot_2", "rot_3")
 _REMEDY = "Export the point cloud again with the program that trained it"
 
@@ -179,6 +177,7 @@ def decode_splats(header: Header, rows: Rows | None, subject: str, sh: Array | N
         raise AssetError(subject, f"is not a complete splat file: it lacks {', '.join(missing)}", _REMEDY)
     layout = find_layout(names)
     notes = [layout.note] if layout.note else []
+    assumed: list[str] = []
     used = {*_GEOMETRY}
 
     def take(wanted: tuple[str, ...]) -> Array:
@@ -200,15 +199,16 @@ def decode_splats(header: Header, rows: Rows | None, subject: str, sh: Array | N
         if sh is None:
             sh = _harmonics(columns, names, used, subject)
         material = {
-            "albedo": _albedo(layout, take, sh, notes),
+            "albedo": _albedo(layout, take, sh, assumed),
             "roughness": _scalar(layout.roughness, take, 0.5, len(centre)),
             "metallic": _scalar(layout.metallic, take, 0.0, len(centre)),
         }
     if layout.roughness is None:
-        notes.append("has no materials: roughness 0.5 and metallic 0 are used")
+        assumed.append("has no materials: roughness 0.5 and metallic 0 are used")
     if axes.shape[1] == 3:
         extras["thickness"] = axes.min(axis=1)
-        rotation, axes = _flatten(rotation, axes, notes)
+        rotation, axes = _flatten(rotation, axes, assumed)
+    notes += assumed
     finite = np.ones(len(centre), bool)
     for array in (centre, opacity, axes, rotation, *material.values(), *([] if sh is None else [sh])):
         good = np.isfinite(array)
@@ -235,7 +235,7 @@ def decode_splats(header: Header, rows: Rows | None, subject: str, sh: Array | N
         sh=None if sh is None else sh[keep],
         extras=_sanitised({name: array[keep] for name, array in extras.items()}, notes),
     )
-    return SurfelFile(surfels, layout.name, unknown, notes)
+    return SurfelFile(surfels, layout.name, unknown, notes, assumed=assumed)
 
 
 def stack(columns: Columns, names: tuple[str, ...]) -> Array:

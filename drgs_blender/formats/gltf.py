@@ -17,6 +17,7 @@ from .images import decode_image
 Array = np.ndarray
 
 _WRAP = {33071: "clamp", 33648: "mirror", 10497: "repeat"}
+_INSTANCES = "EXT_mesh_gpu_instancing"
 #: Required extensions that change nothing of what is read here, or that are read.
 _UNDERSTOOD = {
     "KHR_texture_transform",
@@ -52,6 +53,8 @@ def read_gltf(path: Path, pose: Pose = "rest") -> MeshFile:
         if mesh_index is None:
             continue
         mesh = document.item("meshes", mesh_index)
+        if _INSTANCES in document.get(node, "extensions", dict, {}):
+            notes.append(f"{_INSTANCES} ignored: one copy stands for all")
         name = str(node.get("name") or mesh.get("name") or f"mesh {mesh_index}")
         for primitive in document.get(mesh, "primitives", list, []):
             if not isinstance(primitive, dict):

@@ -32,6 +32,9 @@ _WIDTHS = {
 }
 #: An accessor without data (all zeros) is not longer than this.
 EMPTY_LIMIT = 10_000_000
+#: Bytes of values that may be taken from a file: all of it some times over, and enough for honest copies. Nodes can
+#: place a mesh, and meshes name an accessor, without end.
+_TIMES, _COPIES = 4, 64 << 20
 _DAMAGED = "Export the file again, or restore it from a copy"
 
 
@@ -58,6 +61,7 @@ class Document:
         if not version.startswith("2."):
             raise AssetError(self.subject, f"is glTF of version {version or 'unknown'}; 2 is read", _DAMAGED)
         self._buffers: dict[int, Array] = {}
+        self._room = _COPIES + _TIMES * len(data)
 
     def get(self, entry: dict[str, Any], key: str, kind: type | tuple[type, ...], default: Any = None) -> Any:
         """``entry[key]`` when it is there and of type `kind`; `default` when it is absent."""
@@ -122,6 +126,7 @@ class Document:
         elif count > EMPTY_LIMIT:
             raise AssetError(self.subject, f"declares {count} values without data", _DAMAGED)
         else:
+            self._take(count * width * dtype.itemsize)
             values = np.zeros((count, width), dtype)
         if sparse := self.get(entry, "sparse", dict):
             values = self._sparse(sparse, values, dtype, shape)
@@ -163,6 +168,7 @@ class Document:
         if index not in self._buffers:
             if "uri" in entry:
                 data = self._uri(self.get(entry, "uri", str))
+                self._room += _TIMES * len(data)
             elif index == 0 and self._binary is not None:
                 data = np.frombuffer(self._binary, np.uint8)
             else:
@@ -203,8 +209,16 @@ class Document:
             raise AssetError(self.subject, f"has an accessor that leaves buffer view {view}", _DAMAGED)
         if not count:
             return np.zeros((0, rows * columns), dtype)
+        self._take(count * size)
         block = np.lib.stride_tricks.as_strided(buffer[first:], (count, columns, column), (stride, pitch, 1))
         return np.ascontiguousarray(block).view(dtype).reshape(count, rows * columns)
+
+    def _take(self, size: int) -> None:
+        """Note that `size` bytes of values are made of the file. Raises AssetError where they become too many."""
+        self._room -= size
+        if self._room < 0:
+            problem = "repeats its meshes until they are far more than is in it"
+            raise AssetError(self.subject, problem, "Export the object once, without its copies")
 
     def _sparse(self, sparse: dict[str, Any], values: Array, dtype: np.dtype[Any], shape: tuple[int, int]) -> Array:
         count = self.index(sparse, "count") or 0

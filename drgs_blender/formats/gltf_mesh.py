@@ -10,6 +10,7 @@ import numpy as np
 from ..asset import Mesh
 from ..geometry import VertexNormals
 from .atlas import Plain, mesh_material
+from .files import plain_name
 from .glb import Glb
 
 
@@ -52,8 +53,8 @@ def write_gltf_mesh(path: Path, mesh: Mesh) -> None:
     glb.json |= {
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "name": path.stem}],
+        "nodes": [{"mesh": 0, "name": plain_name(path.stem)}],
         "meshes": [{"primitives": [primitive]}],
-        "materials": [{"name": path.stem, "pbrMetallicRoughness": pbr, "doubleSided": True}],
+        "materials": [{"name": plain_name(path.stem), "pbrMetallicRoughness": pbr, "doubleSided": True}],
     }
     glb.write(path)

@@ -12,13 +12,13 @@ import numpy as np
 
 from ..colour import srgb_to_linear
 from ..errors import AssetError, UsageError
-from .files import SurfelFile
+from .files import SurfelFile, plain_name
 from .gaussian_ply import SH_C0
 from .glb import Glb
 from .gltf_document import Document
 from .gltf_nodes import NodeTree
 from .splat_scene import Piece, join_pieces
-from .splats import Splats
+from .splats import Splats, writable
 
 Array = np.ndarray
 
@@ -100,10 +100,11 @@ def _primitive(document: Document, primitive: dict[str, Any], settings: dict[str
 def write_gltf_splats(path: Path, splats: Splats) -> None:
     """Write a GLB with `splats`, which are Y up; viewers that do not know the extension show coloured points.
 
-    Raises UsageError (nothing to write, or too much for a GLB) or WriteError.
+    Raises UsageError (nothing to write, or too much for a GLB), AssetError (see `splats.writable`) or WriteError.
     """
     if not len(splats):
         raise UsageError(str(path), "would hold no splats, which glTF does not allow", "Choose another input")
+    splats = writable(splats, str(path))
     glb = Glb()
     shown = srgb_to_linear(np.clip(0.5 + SH_C0 * splats.sh[:, 0], 0, 1))
     colour = np.rint(np.concatenate([shown, splats.opacity[:, None]], axis=1) * 65535).astype(np.uint16)
@@ -130,7 +131,7 @@ def write_gltf_splats(path: Path, splats: Splats) -> None:
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "name": path.stem}],
+        "nodes": [{"mesh": 0, "name": plain_name(path.stem)}],
         "meshes": [{"primitives": [primitive]}],
     }
     glb.write(path)

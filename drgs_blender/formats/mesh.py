@@ -4,9 +4,35 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..errors import AssetError, UsageError
 from .files import MeshFile
 
 Array = np.ndarray
+
+#: Sizes of a mesh in metres: the squared areas of its faces stay within the range of 32-bit floats.
+SMALLEST, LARGEST = 1e-6, 1e9
+
+
+def check_extent(vertices: Array, subject: str, scale: float = 1.0) -> None:
+    """Refuse a mesh that is too small or too large to be worked with; `vertices` are those of its faces.
+
+    Raises
+    ------
+    UsageError
+        It is the factor `scale`, by which it has been multiplied, that makes it so.
+    AssetError
+        It is so of itself, or has vertices that are not finite.
+    """
+    with np.errstate(all="ignore"):
+        extent = float(np.ptp(vertices.reshape(-1, 3).astype(np.float64), axis=0).max()) if vertices.size else 1.0
+    if SMALLEST <= extent <= LARGEST:
+        return
+    held = "at which 32-bit numbers cannot hold the areas of its faces"
+    if not np.isfinite(extent):
+        raise AssetError(subject, "has vertices that are NaN or infinite", "Export it, or its pose, again")
+    if scale != 1.0:
+        raise UsageError(f"--scale {scale:g}", f"makes {subject} measure {extent:.3g} m, {held}", "Choose another")
+    raise AssetError(subject, f"measures {extent:.3g} m, {held}", "Export it at its true size")
 
 
 def sanitise(mesh: MeshFile) -> MeshFile:

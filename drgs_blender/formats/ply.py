@@ -136,7 +136,7 @@ def read_ply(path: Path) -> tuple[Header, dict[str, Rows]]:
         The header or the data are damaged or truncated.
     """
     subject = str(path)
-    data = np.asarray(np.memmap(path, np.uint8, "r")) if path.stat().st_size else np.zeros(0, np.uint8)
+    data = np.fromfile(path, np.uint8)  # not mapped: a trainer may be writing it, and what it cuts off would be missed
     header = parse_header(data[:HEADER_LIMIT].tobytes(), subject)
     if not header.order:
         return header, _read_ascii(data[header.size :].tobytes(), header, subject)

@@ -30,7 +30,7 @@ from .ply import HEADER_LIMIT, parse_header
 from .ply_mesh import read_ply_mesh
 from .sog import read_sog, sniff_sog
 from .spz import read_spz, sniff_spz
-from .usd_splats import read_usd_splats, sniff_usd
+from .usd_splats import MESHES, read_usd_splats, sniff_usd
 from .writers import WRITERS
 
 AnyFile = SurfelFile | MeshFile | EnvironmentFile | MaterialsFile
@@ -46,12 +46,14 @@ class Format:
     sniff : (first bytes, path) -> whether the file is of this format
     read : path -> what comes out
     note : one line for the documentation
+    instead : what to do where something else than `kind` is wanted of such a file
     """
 
     name: str
     sniff: Callable[[bytes, Path], bool]
     read: Callable[[Path], AnyFile]
     note: str
+    instead: str = ""
 
     @property
     def extensions(self) -> tuple[str, ...]:
@@ -138,7 +140,9 @@ FORMATS: tuple[Format, ...] = (
         "USD",
         sniff_usd,
         read_usd_splats,
-        "ParticleField3DGaussianSplat; 3D splats, flattened; turned to Z up on import; needs usd-core",
+        "ParticleField3DGaussianSplat; 3D splats, flattened; turned to Z up on import; a .usdz reads no file "
+        "but itself; needs usd-core",
+        MESHES,
     ),
     Format("splat", sniff_splat, read_splat, "32 bytes a splat; 3D splats, flattened"),
     Format(
@@ -223,7 +227,8 @@ def find_format(path: Path, kind: Kind | None = None) -> Format:
         found = f"is {recognised[0].name}, not {kind}"
     else:
         found = "is a folder" if folder else "is of no known format" if head else "is empty"
-    raise AssetError(str(path), found, f"Understood: {understood}")
+    instead = recognised[0].instead + ". " if recognised and recognised[0].instead else ""
+    raise AssetError(str(path), found, f"{instead}Understood: {understood}")
 
 
 def read(path: str | Path, *, kind: Kind | None = None) -> AnyFile:

@@ -17,12 +17,14 @@ from ..errors import UsageError
 from ..version import __version__
 from .palette import codebook, palette
 from .quaternions import to_smallest_three
-from .splats import Splats
+from .splats import Splats, writable
 
 Array = np.ndarray
 
 #: Entries of the palette of harmonics, and how many stand in a row of its picture.
 _PALETTE, _ROW = 1 << 16, 64
+#: Largest harmonic: one splat that is brighter would take the numbers that tell all others apart.
+_BRIGHTEST = np.float32(100)
 #: Largest side of a WebP picture.
 _LARGEST = 16383
 #: Bits a coordinate of the order in which splats are written: neighbours in space are neighbours in the pictures.
@@ -36,12 +38,16 @@ def write_sog(path: Path, splats: Splats) -> None:
     ------
     UsageError
         There are none, or more than a picture has room for.
+    AssetError
+        See `splats.writable`.
     WriteError
         The file cannot be written.
     """
     n = len(splats)
     if not 0 < n <= _LARGEST * _LARGEST:
         raise UsageError(str(path), f"cannot hold {n} splats", "Choose another format")
+    splats = writable(splats, str(path))
+    harmonics = splats.sh.clip(-_BRIGHTEST, _BRIGHTEST)
     level, low, high = _means(splats.centre)
     order = _neighbours(level)
 
@@ -63,7 +69,7 @@ def write_sog(path: Path, splats: Splats) -> None:
         largest, others = to_smallest_three(splats.rotation)
         quats = picture("quats", rows(_byte(others * np.sqrt(0.5) + 0.5), (252 + largest).astype(np.uint8)))
         sizes, scale = codebook(np.log(splats.scale))
-        colours, dc = codebook(splats.sh[:, 0])
+        colours, dc = codebook(harmonics[:, 0])
         meta: dict[str, Any] = {
             "version": 2,
             "asset": {"generator": f"DR-GS {__version__}"},
@@ -75,7 +81,7 @@ def write_sog(path: Path, splats: Splats) -> None:
             "sh0": {"codebook": colours.tolist(), "files": [picture("sh0", rows(dc, _byte(splats.opacity)))]},
         }
         if splats.sh.shape[1] > 1:
-            entries, index = palette(splats.sh.reshape(n, -1)[:, 3:], _PALETTE)
+            entries, index = palette(harmonics.reshape(n, -1)[:, 3:], _PALETTE)
             steps, stored = codebook(entries)
             label = np.stack([index & 255, index >> 8], axis=1)
             meta["shN"] = {

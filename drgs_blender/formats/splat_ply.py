@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ..asset.archive import replace_file
-from .splats import Splats
+from .splats import Splats, writable
 
 Array = np.ndarray
 
@@ -19,8 +19,8 @@ _EDGE = 1e-6
 
 
 def write_splat_ply(path: Path, splats: Splats) -> None:
-    """Write `splats` to `path`, in the axes they have. Raises WriteError."""
-    replace_file(path, _parts(splats))
+    """Write `splats` to `path`, in the axes they have. Raises AssetError or WriteError."""
+    replace_file(path, _parts(writable(splats, str(path))))
 
 
 def _parts(splats: Splats) -> Iterator[bytes | memoryview]:

@@ -9,8 +9,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..colour import linear_to_srgb
+from .axes import FARTHEST
 from .files import SurfelFile
-from .gaussian_ply import FARTHEST, SH_C0
+from .gaussian_ply import SH_C0
 from .harmonics import rotate_harmonics
 from .packed_splats import decode_arrays, log_scale
 from .splats import Splats, join_splats

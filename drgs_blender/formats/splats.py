@@ -8,8 +8,8 @@ import numpy as np
 
 from ..asset import Surfels
 from ..colour import linear_to_srgb
-from ..errors import UsageError
-from .axes import from_z_up, multiply_quaternions, vectors_from_z_up
+from ..errors import AssetError
+from .axes import FARTHEST, from_z_up, multiply_quaternions, scaled_lengths, vectors_from_z_up
 from .gaussian_ply import SH_C0
 from .harmonics import rotate_harmonics, whole_bands
 
@@ -19,6 +19,9 @@ Array = np.ndarray
 THICKNESS = 0.01
 #: Shortest axis written, metres: the logarithm of 0 is not finite.
 SHORTEST = 1e-9
+#: Sizes whose logarithm comes back as a number of 32 bits; shorter quaternions are no rotation.
+THINNEST, WIDEST = np.float32(1e-37), np.float32(1e37)
+SHORT = 1e-15
 
 
 @dataclass(slots=True)
@@ -69,13 +72,40 @@ def splats_of(surfels: Surfels, colour: Array | None = None) -> Splats:
 
 
 def scaled(splats: Splats, factor: float) -> Splats:
-    """Splats with all lengths times `factor`; UsageError where that is more, or less, than numbers of 32 bits hold."""
-    with np.errstate(all="ignore"):
-        by = np.float32(factor)
-        centre, scale = splats.centre * by, splats.scale * by
-    if not (np.isfinite(centre).all() and np.isfinite(scale).all() and (scale > 0).all()):
-        raise UsageError(f"--scale {factor:g}", "makes lengths that numbers of 32 bits do not hold", "Choose another")
+    """Splats with all lengths times `factor`. Raises UsageError, see `axes.scaled_lengths`."""
+    if factor == 1:
+        return splats
+    centre, scale = scaled_lengths(splats.centre, splats.scale, factor)
     return replace(splats, centre=centre, scale=scale)
+
+
+def writable(splats: Splats, subject: str) -> Splats:
+    """Splats that every reader takes: opacities and sizes within their limits, rotations of unit length.
+
+    Raises
+    ------
+    AssetError
+        Some have numbers that readers drop: NaN, infinite, too far away, no size, no rotation. Names `subject`.
+    """
+    with np.errstate(over="ignore"):
+        length = np.linalg.norm(splats.rotation, axis=1)
+    numbers = (splats.centre, splats.scale, splats.rotation, splats.opacity, splats.sh)
+    good = all(np.isfinite(f(array, initial=0)) for array in numbers for f in (np.min, np.max))  # NaN shows in both
+    if len(splats) and not (
+        good
+        and np.abs(splats.centre).max() <= FARTHEST
+        and splats.scale.min() > 0
+        and SHORT < length.min() <= length.max() < np.inf
+    ):
+        problem = f"would hold splats whose numbers are NaN, infinite, not above 0 or beyond {FARTHEST:g} m"
+        raise AssetError(subject, problem, "Choose another input, pose or scale")
+    if np.abs(length - 1).max(initial=0) > 1e-3:
+        splats = replace(splats, rotation=(splats.rotation / length[:, None]).astype(np.float32))
+    if splats.opacity.min(initial=0) < 0 or splats.opacity.max(initial=0) > 1:
+        splats = replace(splats, opacity=splats.opacity.clip(0, 1))
+    if splats.scale.min(initial=1) < THINNEST or splats.scale.max(initial=1) > WIDEST:
+        splats = replace(splats, scale=splats.scale.clip(THINNEST, WIDEST))
+    return splats
 
 
 def join_splats(parts: list[Splats]) -> Splats:

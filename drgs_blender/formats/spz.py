@@ -18,7 +18,7 @@ from ..errors import AssetError, DeviceError
 from .files import SurfelFile
 from .packed_splats import decode_arrays
 from .quaternions import from_smallest_three, to_smallest_three
-from .splats import Splats
+from .splats import Splats, writable
 
 Array = np.ndarray
 
@@ -35,6 +35,8 @@ _COLOUR = 0.15
 _RATIO = 128
 #: Most fractional bits tried for positions; 24 bits hold the whole number.
 _FRACTION = 12
+#: Size below which all are the same, metres.
+_SMALLEST = float(np.exp(-10))
 #: Steps of the harmonics that are written: 5 bits for the first band, 4 for the others, as the reference does.
 _STEPS = (8, 16)
 _STEPS_OF_128 = (np.arange(256, dtype=np.float32) - 128) / 128
@@ -213,20 +215,25 @@ def _smallest_three(stored: Array) -> Array:
     return from_smallest_three(words >> np.uint32(30), others)[:, [3, 0, 1, 2]]
 
 
+@np.errstate(over="ignore")  # what is brighter than the format holds becomes the brightest that it does
 def write_spz(path: Path, splats: Splats) -> None:
     """Write an SPZ file of version 4. `splats` are Y up.
 
     Raises
     ------
     AssetError
-        The splats are too far apart for 24 bits a coordinate.
+        The splats are too far apart for 24 bits a coordinate, or too small; see also `splats.writable`.
     DeviceError
         The package zstandard is missing.
     WriteError
         The file cannot be written.
     """
     subject = str(path)
+    splats = writable(splats, subject)
     zstandard = _zstandard(subject)
+    if len(splats) and splats.scale.max() < _SMALLEST:
+        problem = f"would hold splats of {splats.scale.max():.2g} m at most, all below the {_SMALLEST:.2g} m of SPZ"
+        raise AssetError(subject, problem, "Choose another --scale or format")
     far = float(np.abs(splats.centre).max(initial=0.0))
     fraction = next((bits for bits in range(_FRACTION, -1, -1) if far * 2**bits < 2**23 - 1), None)
     if fraction is None:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from ..asset.archive import replace_file
+from ..asset.archive import replace_by
 from ..errors import DeviceError, WriteError
 from ..particle_cache import ParticleFrame
 
@@ -79,10 +78,6 @@ def write_usd_points(
         stage.SetEndTimeCode(last)
         stage.SetTimeCodesPerSecond(fps)
         stage.SetFramesPerSecond(fps)
-        with tempfile.TemporaryDirectory() as folder:
-            temporary = Path(folder) / f"points{path.suffix.lower()}"
-            stage.GetRootLayer().Export(str(temporary))
-            data = temporary.read_bytes()
-    except (RuntimeError, OSError) as error:  # RuntimeError is what errors of USD derive from
-        raise WriteError(str(path), f"cannot be written ({error})", "Check the free space on the disk") from error
-    replace_file(path, [data])
+    except RuntimeError as error:  # what errors of USD derive from
+        raise WriteError(str(path), f"cannot be written ({error})", "Report it") from error
+    replace_by(path, lambda temporary: stage.GetRootLayer().Export(str(temporary)))

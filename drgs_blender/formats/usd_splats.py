@@ -13,22 +13,24 @@ from typing import Any
 
 import numpy as np
 
-from ..asset.archive import replace_file
+from ..asset.archive import replace_by
 from ..asset.tensors import decode
 from ..errors import AssetError, DeviceError, WriteError
 from . import usd_stage
 from .axes import UP_AXES
 from .files import SurfelFile
 from .splat_scene import Piece, join_pieces
-from .splats import Splats
+from .splats import Splats, writable
 from .usd_crate import check_crate
-from .usd_stage import DEGREE, HARMONICS, LACKING, REFUSED, REMEDY, SCHEMA, SPACE, UP
+from .usd_stage import DEGREE, FULL, HARMONICS, LACKING, NO_SPLATS, REFUSED, REMEDY, SCHEMA, SPACE, UP
 
 Array = np.ndarray
 
 #: Time and memory for a file: some for the library, and in proportion to its bytes.
 _SECONDS, _PACE = 30.0, 1 << 20
 _MEMORY, _RATIO = 8 << 30, 32
+#: What to do for what is not read.
+MESHES = "For its meshes, import it in Blender and export glTF (.glb), which is read"
 _NAMES = (b".usda", b".usdc", b".usd")
 
 
@@ -80,18 +82,23 @@ def _read_apart(path: Path) -> dict[str, Array]:
             raise DeviceError(subject, f"cannot be read: Python does not start ({error})", "See drgs doctor") from error
         if done.returncode == LACKING:
             raise DeviceError(subject, "needs the package usd-core", "Install it: pip install usd-core")
+        said = (done.stderr.decode(errors="replace").strip().splitlines() or [""])[-1][:300]
+        if done.returncode == FULL:
+            problem = f"cannot hold the splats of {subject} ({said})"
+            raise WriteError(folder, problem, "Free space there, or name another folder by the variable TMPDIR")
         if done.returncode:
-            said = done.stderr.decode(errors="replace").strip().splitlines()
             known = done.returncode == REFUSED and said
-            raise AssetError(subject, said[-1][:300] if known else "cannot be read: USD crashes on it", REMEDY)
+            remedy = MESHES if said == NO_SPLATS else REMEDY
+            raise AssetError(subject, said if known else "cannot be read: USD crashes on it", remedy)
         return decode(np.fromfile(target, np.uint8), subject)
 
 
 def write_usd_splats(path: Path, splats: Splats) -> None:
     """Write a stage with `splats`, which are Z up, in metres.
 
-    Raises DeviceError (usd-core is not installed) or WriteError.
+    Raises DeviceError (usd-core is not installed), AssetError (see `splats.writable`) or WriteError.
     """
+    splats = writable(splats, str(path))
     usd, geometry = _usd(str(path))
     from pxr import Gf, Sdf, Vt
 
@@ -123,13 +130,9 @@ def write_usd_splats(path: Path, splats: Splats) -> None:
         prim.AddAppliedSchema("ColorSpaceAPI")
         space = prim.CreateAttribute(SPACE, types.Token, custom=False, variability=Sdf.VariabilityUniform)
         space.Set("srgb_rec709_scene")  # of the names that USD knows; without one, colours are linear to it
-        with tempfile.TemporaryDirectory() as folder:
-            temporary = Path(folder) / f"splats{path.suffix.lower()}"
-            stage.GetRootLayer().Export(str(temporary))
-            data = temporary.read_bytes()
-    except (RuntimeError, OSError) as error:
-        raise WriteError(str(path), f"cannot be written ({error})", "Check the free space on the disk") from error
-    replace_file(path, [data])
+    except RuntimeError as error:
+        raise WriteError(str(path), f"cannot be written ({error})", "Report it") from error
+    replace_by(path, lambda temporary: stage.GetRootLayer().Export(str(temporary)))
 
 
 def _usd(subject: str) -> tuple[Any, Any]:

@@ -4,11 +4,13 @@ damaged files. `usd_splats` runs it with limits.
 
 from __future__ import annotations
 
+import os
 import sys
 from typing import Any
 
 import numpy as np
 
+from ..asset.archive import first_reason
 from ..asset.tensors import encode
 from ..errors import AssetError
 
@@ -19,11 +21,16 @@ DEGREE = "radiance:sphericalHarmonicsDegree"
 HARMONICS = "radiance:sphericalHarmonicsCoefficients"
 #: Attribute of UsdColorSpaceAPI, and how the names of linear light with our primaries start.
 SPACE, LINEAR = "colorSpace:name", "lin_rec709"
-#: Codes to leave with: the file is refused (the reason is the last line of stderr), USD is not installed.
-REFUSED, LACKING = 65, 69
+#: Codes to leave with: the file is refused (the reason is the last line of stderr), USD is not installed, what was read
+#: cannot be handed over (likewise).
+REFUSED, LACKING, FULL = 65, 69, 73
+#: Splats may be repeated by references until they are so many bytes, some and in proportion to the files.
+_SPLATS, _RATIO = 64 << 20, 32
 #: Name of the text that says which axis is up.
 UP = "up"
 REMEDY = "Export it again, or restore it from a copy"
+_ELSEWHERE = "which is not in this package"
+NO_SPLATS = f"holds no splats ({SCHEMA}), and of USD nothing else is read"
 
 
 def main(source: str, target: str, most_bytes: str) -> None:
@@ -40,34 +47,78 @@ def main(source: str, target: str, most_bytes: str) -> None:
         sys.exit(LACKING)
     try:
         arrays = read_stage(source, Usd, UsdGeom)
-        with open(target, "wb") as file:
-            file.writelines(encode(arrays))
     except AssetError as error:
         sys.stderr.write(f"\n{error.problem}\n")
+        sys.exit(REFUSED)
     except (RuntimeError, TypeError, ValueError, MemoryError, OverflowError) as error:  # what USD's library raises
-        reason = str(error).strip().splitlines()[-1:] or ["no reason given"]
-        sys.stderr.write(f"\ncannot be read as USD ({reason[0][:200]})\n")
-    else:
-        sys.exit(0)
-    sys.exit(REFUSED)
+        sys.stderr.write(f"\ncannot be read as USD ({first_reason(str(error))})\n")
+        sys.exit(REFUSED)
+    try:
+        with open(target, "wb") as file:
+            file.writelines(encode(arrays))
+    except OSError as error:
+        sys.stderr.write(f"\n{error.strerror or error}\n")
+        sys.exit(FULL)
 
 
 def read_stage(subject: str, usd: Any, geometry: Any) -> dict[str, Array]:
     """Arrays of each piece, "0/centre" and so on, at the earliest time, with its matrix to the stage in metres."""
+    package = _check_package(subject)
     stage = usd.Stage.Open(subject)
     prims = [prim for prim in stage.Traverse() if prim.GetTypeName() == SCHEMA]
     if not prims:
-        raise AssetError(subject, f"has no {SCHEMA}, and of USD nothing else is read (meshes are, of glTF)")
+        raise AssetError(subject, NO_SPLATS)
     time = usd.TimeCode.EarliestTime()
     places = geometry.XformCache(time)
     metres = np.diag([*[geometry.GetStageMetersPerUnit(stage)] * 3, 1.0])
     arrays: dict[str, Array] = {UP: np.frombuffer(str(geometry.GetStageUpAxis(stage)).lower().encode(), np.uint8)}
+    files = {_outer(layer.identifier) for layer in stage.GetUsedLayers(True) if not layer.anonymous}
+    room = _SPLATS + _RATIO * sum(os.path.getsize(file) for file in files if os.path.isfile(file))
     for i, prim in enumerate(prims):
         # USD's matrices take rows for vectors.
         arrays[f"{i}/matrix"] = metres @ np.array(places.GetLocalToWorldTransform(prim), np.float64).T
         arrays[f"{i}/linear"] = np.array([_space(prim).startswith(LINEAR)])
-        arrays |= {f"{i}/{name}": array for name, array in _splats(prim, time, subject).items()}
+        splats = _splats(prim, time, subject)
+        room -= sum(array.nbytes for array in splats.values())
+        if room < 0:
+            raise AssetError(subject, "refers to its splats so often that they are more than such files can hold")
+        arrays |= {f"{i}/{name}": array for name, array in splats.items()}
+    if package:  # also against layers that only values name
+        for layer in stage.GetUsedLayers(True):
+            if not layer.anonymous and _outer(layer.identifier) != package:
+                raise AssetError(subject, f"refers to {layer.identifier!r}, {_ELSEWHERE}")
     return arrays
+
+
+def _check_package(subject: str) -> str:
+    """The file of a package (.usdz), empty where `subject` is none.
+
+    A package comes from elsewhere and is whole: it may not lead to other files of this machine, which USD would open.
+    Stages of other kinds may: a studio's layers refer to each other across folders.
+    """
+    from pxr import Sdf
+
+    root = Sdf.Layer.FindOrOpen(subject)
+    if not root or not root.GetFileFormat().IsPackage():
+        return ""
+    package, waiting, seen = _outer(subject), [root], {root.identifier}
+    while waiting:
+        layer = waiting.pop()
+        for name in layer.GetCompositionAssetDependencies():
+            found = Sdf.ComputeAssetPathRelativeToLayer(layer, name) if name else ""
+            if found and _outer(found) != package:
+                raise AssetError(subject, f"refers to {name!r}, {_ELSEWHERE}")
+            if found and found not in seen and (other := Sdf.Layer.FindOrOpen(found)):
+                waiting.append(other)
+            seen.add(found)
+    return package
+
+
+def _outer(identifier: str) -> str:
+    """The file on the disk in which a layer lies."""
+    from pxr import Ar
+
+    return os.path.realpath(Ar.SplitPackageRelativePathOuter(identifier)[0])
 
 
 def _space(prim: Any) -> str:
