@@ -31,10 +31,18 @@ def corner_table(faces: Array, n_vertices: int) -> tuple[Array, Array]:
         Corner index: 3 x face + position in the face.
     """
     flat = np.asarray(faces).reshape(-1)
-    corner = np.argsort(flat, kind="stable").astype(np.int32)
     start = np.zeros(n_vertices + 1, np.int32)
     np.cumsum(np.bincount(flat, minlength=n_vertices), out=start[1:])
+    corner = np.empty(len(flat), np.int32)
+    _sort_corners(flat, start[:-1].copy(), corner)
     return start, corner
+
+
+@njit
+def _sort_corners(vertex, place, corner):  # type: ignore[no-untyped-def]
+    for c in range(len(vertex)):
+        corner[place[vertex[c]]] = c
+        place[vertex[c]] += 1
 
 
 class VertexNormals:

@@ -92,18 +92,44 @@ def looseness(vertices, faces, runs):  # type: ignore[no-untyped-def]
     return total / whole if whole > 0.0 else 0.0
 
 
+@njit(parallel=True)
+def _centres(vertices, faces, out):  # type: ignore[no-untyped-def]
+    for i in prange(len(faces)):
+        a, b, c = faces[i, 0], faces[i, 1], faces[i, 2]
+        for k in range(3):
+            out[i, k] = (vertices[a, k] + vertices[b, k] + vertices[c, k]) * np.float32(1 / 3)
+
+
+@njit
+def _spread(x):  # type: ignore[no-untyped-def]
+    """The lowest ten bits of a number with two free ones after each."""
+    for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
+        x = (x | x << shift) & mask
+    return x
+
+
+@njit(parallel=True)
+def _keys(centre, low, scale, out):  # type: ignore[no-untyped-def]
+    """Morton code of each centre and, below it, its index: no two are alike."""
+    for i in prange(len(centre)):
+        x = _spread(np.int64((centre[i, 0] - low[0]) * scale[0]))
+        y = _spread(np.int64((centre[i, 1] - low[1]) * scale[1]))
+        z = _spread(np.int64((centre[i, 2] - low[2]) * scale[2]))
+        out[i] = np.uint64((x | y << 1 | z << 2) << 32 | i)
+
+
 def neighbours(vertices: Array, faces: Array) -> Array:
     """(g, 32) int32: runs of faces along a Morton curve through the centroids, evenly chosen."""
     m = len(faces)
     if m < 4 * _RUN:
         return np.empty((0, _RUN), np.int32)
-    centre = vertices[faces].mean(axis=1)
-    low, high = centre.min(axis=0), centre.max(axis=0)
-    cell = ((centre - low) / np.maximum(high - low, 1e-30) * 1023).astype(np.uint32)
-    for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
-        cell = (cell | cell << np.uint32(shift)) & np.uint32(mask)
-    code = cell[:, 0] | cell[:, 1] << np.uint32(1) | cell[:, 2] << np.uint32(2)
-    order = np.argsort(code, kind="stable").astype(np.int32)
+    centre = np.empty((m, 3), np.float32)
+    _centres(vertices, faces, centre)
+    low, high = (np.array([f(x) for x in centre.T]) for f in (np.min, np.max))  # along an axis is 20 times slower
+    key = np.empty(m, np.uint64)
+    _keys(centre, low, np.float32(1023) / np.maximum(high - low, np.float32(1e-30)), key)
+    key.sort()
+    order = key.astype(np.uint32).view(np.int32)
     runs = order[: m // _RUN * _RUN].reshape(-1, _RUN)
     return np.ascontiguousarray(runs[:: max(1, math.ceil(len(runs) / _RUNS))])
 
