@@ -10,6 +10,7 @@ import numpy as np
 from ..asset import Environment
 from ..asset.archive import replace_by
 from ..errors import AssetError
+from ..jit import get_num_threads
 
 Array = np.ndarray
 
@@ -36,6 +37,7 @@ def read_exr(path: Path) -> tuple[Array, bool, list[str]]:
 
     subject = str(path)
     notes: list[str] = []
+    OpenEXR.set_global_thread_count(get_num_threads())
     try:
         with OpenEXR.File(subject, header_only=True) as file:
             for part in file.parts:

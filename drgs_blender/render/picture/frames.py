@@ -24,6 +24,7 @@ import numpy as np
 import OpenEXR
 
 from ...errors import AssetError, UsageError, WriteError
+from ...jit import get_num_threads
 from ...mattes import METADATA
 from ...passes import BY_NAME
 
@@ -61,6 +62,7 @@ def write_frame(path: str | Path, passes: dict[str, Array], metadata: dict[str, 
     header |= {key if key.startswith(METADATA) else PREFIX + key: str(value) for key, value in metadata.items()}
     header[PREFIX + _CHECKSUM] = checksum
     temporary: Path | None = None
+    OpenEXR.set_global_thread_count(get_num_threads())
     try:
         handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
         temporary = Path(name)
@@ -94,6 +96,7 @@ def read_frame(path: str | Path) -> tuple[dict[str, Array], dict[str, str]]:
     AssetError: there is no such file, it is damaged or cut short, or it is no frame of DR-GS.
     """
     path = Path(path)
+    OpenEXR.set_global_thread_count(get_num_threads())
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             header = dict(file.header())  # a copy: OpenEXR empties it when the file closes
