@@ -11,7 +11,7 @@ from bpy.props import BoolProperty, FloatProperty, FloatVectorProperty, StringPr
 
 from ..drgs_blender.frame import Adjustment
 from . import mesh_arrays
-from .sound import Sound
+from .limits import Limited
 
 Array = np.ndarray
 
@@ -108,7 +108,7 @@ class DrgsAdjustment(bpy.types.PropertyGroup):
 
     def to_frame(self, mask: Array | None, warn: Callable[[str], None]) -> Adjustment:
         """The engine's description; `mask` (n,) is the one named here, None for everywhere."""
-        own = Sound(self, f'Object "{self.id_data.name}"', warn)
+        own = Limited(self, f'Object "{self.id_data.name}"', warn)
         if mask is not None and self.use_invert:
             mask = 1 - mask
         return Adjustment(

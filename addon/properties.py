@@ -11,8 +11,8 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, Po
 from ..drgs_blender.frame import RenderSettings, split_rays
 from ..drgs_blender.passes import PASSES, Pass
 from .adjustment import DrgsAdjustment
+from .limits import Limited
 from .matter.properties import DrgsMatterSettings
-from .sound import Sound
 from .submit import DrgsSubmitSettings
 
 _DENOISERS = {
@@ -193,7 +193,7 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
         self, film_transparent: bool, threads: int, warn: Callable[[str], None] = lambda text: None
     ) -> RenderSettings:
         """The engine's settings; `warn` is told of those that cannot be."""
-        own = Sound(self, f'Scene "{self.id_data.name}"', warn)
+        own = Limited(self, f'Scene "{self.id_data.name}"', warn)
         split = (own.cosine, own.ggx, own.environment) if own.use_custom_split else split_rays(own.rays)
         cosine, ggx, environment = split
         return RenderSettings(

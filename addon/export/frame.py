@@ -11,8 +11,8 @@ import bpy
 from ...drgs_blender.errors import UsageError
 from ...drgs_blender.frame import Camera, Frame
 from .. import assets, compositing, preferences
+from ..limits import Limited
 from ..passes import enabled
-from ..sound import Sound
 from .camera import export_camera, picture_of
 from .images import end_export
 from .instances import UNRENDERED, Unrendered, Visible, uncancelled, visible
@@ -71,7 +71,7 @@ def export_frame(
     materials, unrendered, lights = Materials(warn), Unrendered(), []
     memory = Memory() if memory is None else memory
     objects, meshes = DrgsObjects(depsgraph, key_of, warn, memory), Meshes(depsgraph, materials, warn, memory)
-    others = Sound(depsgraph.view_layer.drgs, f'View layer "{depsgraph.view_layer.name}"', warn).others
+    others = Limited(depsgraph.view_layer.drgs, f'View layer "{depsgraph.view_layer.name}"', warn).others
     for item in uncancelled(visible(depsgraph), cancelled):
         if shown is not None and not shown(item.object):
             continue

@@ -15,7 +15,7 @@ import numpy as np
 
 from ...drgs_blender.engine import blur
 from ...drgs_blender.frame import Frame
-from ..sound import Sound
+from ..limits import Limited
 
 Warn = Callable[[str], None]
 
@@ -47,7 +47,7 @@ def steps(scene: bpy.types.Scene, camera: bpy.types.Object, warn: Warn) -> list[
     shutter = render.motion_blur_shutter if render.use_motion_blur else 0.0
     if not (radius or shutter):
         return []
-    count = Sound(scene.drgs, f'Scene "{scene.name}"', warn).blur_steps
+    count = Limited(scene.drgs, f'Scene "{scene.name}"', warn).blur_steps
     start = -shutter * _BEFORE[render.motion_blur_position]
     # Times are even; places on the lens are of a low-discrepancy sequence (Roberts 2018, R2), new at each time.
     square = np.mod(0.5 + np.arange(count)[:, None] * (0.7548776662466927, 0.5698402909980532), 1.0)

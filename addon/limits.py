@@ -8,7 +8,7 @@ from typing import Any
 import bpy
 
 
-class Sound:
+class Limited:
     """The values of a property group; one that is out of its limits, or unknown, is replaced and warned of.
 
     Parameters
