@@ -55,7 +55,7 @@ SUITES = ("lint", "engine", "farm", "blender", "floor")
 #: Among the others where there is a Blender with a window, see tests/ui.
 WINDOW = "window"
 LTS = "lts"
-TEST_SECONDS = 1200
+TEST_SECONDS = 2400
 #: An artist's work at an artist's pace takes as many times as long.
 WINDOW_TIMES = 3
 #: The slow faults, of which `DRGS_FAULTS=whole` runs all, take as many times as long.
