@@ -88,10 +88,10 @@ class DRGS_OT_export(SceneFrames, bpy.types.Operator):
             column.prop(self, "frame_step")
 
     def run(self, context: bpy.types.Context) -> set[str]:
-        path = self.chosen("Export")
-        self.check(context)
+        self.chosen("Export")
+        self.check(context)  # gives the path the format's ending
         kind = WRITTEN[self.format]
-        target = Path(bpy.path.abspath(path)).absolute()
+        target = Path(bpy.path.abspath(self.filepath)).absolute()
         frames = range(self.frame_start, self.frame_end + 1, self.frame_step) if self.use_animation else None
         if frames is not None and not frames:
             raise UsageError("Export", f"frames {self.frame_start} to {self.frame_end} are none", "Change the range")

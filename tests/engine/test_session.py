@@ -336,7 +336,7 @@ def test_every_fault_of_a_scene_is_counted_by_the_name_of_its_object(session, ma
     assert ball.startswith("Ball: 1 vertices are not finite")
     assert wall.startswith("Wall: 1 vertices are not finite") and "1 faces are left out" in wall
     assert empty == "Wall: 2 faces have no area; light passes through them"
-    assert world.startswith("world: 2 texels are not finite or negative")
+    assert world.startswith("world: 2 pixels of the environment are negative, infinite or no number")
 
 
 @pytest.mark.parametrize("index", [-1, 4, 2**31 - 1])
