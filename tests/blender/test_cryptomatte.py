@@ -50,8 +50,12 @@ def test_files_name_their_mattes_as_those_of_cycles_do(ball, scene, tmp_path):
         assert {"ball", 'A "cube"'} <= mine.keys() or "DR-GS" in mine
         manifests += 1
     assert manifests == 2
-    kind = "CompositorNodeTree"
-    node = bpy.data.node_groups.new("Mattes", kind).nodes.new("CompositorNodeCryptomatteV2")
+    if bpy.app.version < (5, 0):  # there only a scene's own tree takes the node
+        scene.use_nodes = True
+        tree = scene.node_tree
+    else:
+        tree = bpy.data.node_groups.new("Mattes", "CompositorNodeTree")
+    node = tree.nodes.new("CompositorNodeCryptomatteV2")
     node.source, node.image = "IMAGE", bpy.data.images.load(str(tmp_path / "DRGS.exr"))
     for name in ("CryptoObject", "CryptoMaterial"):
         node.layer_name = f"{layer.name}.{name}"
