@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import bpy
-import gpu
 
 sys.path.insert(0, str(Path(__file__).parent))
 
@@ -98,22 +97,13 @@ def overlays() -> Iterator[float]:
 
 def blue_is_seen() -> Iterator[float]:
     """Until Blender draws the cube in front."""
-    _, area, r = where()
-    spot = location_3d_to_region_2d(r, area.spaces.active.region_3d, Vector(CUBES["front"]))
-    colours: list[list[float]] = []
-
-    def read() -> None:
-        buffer = gpu.state.active_framebuffer_get().read_color(int(spot.x), int(spot.y), 1, 1, 3, 0, "FLOAT")
-        colours.append(buffer.to_list()[0][0])
-
-    handle = bpy.types.SpaceView3D.draw_handler_add(read, (), "WINDOW", "POST_PIXEL")
-
-    def seen() -> bool:
-        area.tag_redraw()
-        return bool(colours) and colours[-1][2] > colours[-1][0] + 0.2
-
-    yield from hands.until(seen, "Blender's own picture")
-    bpy.types.SpaceView3D.draw_handler_remove(handle, "WINDOW")
+    for _ in range(hands.PATIENCE // 5):
+        yield from hands.photograph("looks-waiting")
+        red, _, colour = hands.colour_in("looks-waiting", place_of(CUBES["front"]))
+        if colour > red + 0.2:
+            return
+        yield 4.0
+    raise TimeoutError("Blender does not draw a blue cube")
 
 
 def has_engine(name: str) -> bool:
