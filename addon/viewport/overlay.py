@@ -1,7 +1,8 @@
 """DR-GS objects in viewports of any shading: lit by the engine, or as plain discs without it.
 
 Both are drawn after Blender's own objects and tested against their depth: nearer ones hide those, farther ones stay
-behind them. The meshes that carry the surfels would hide them too, so they are shown as boxes meanwhile.
+behind them. The meshes that carry the surfels would hide them too, so they are shown as boxes meanwhile. Where Blender
+has no depth, as in EEVEE without overlays, the engine's picture has holes where other meshes are nearer.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ def _lit(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> str:
         if not bpy.app.timers.is_registered(_make_table) and key not in _failed:
             bpy.app.timers.register(_make_table, first_interval=0.0)
         return ""
-    error = views.update(context, depsgraph, name, composited=True)
+    error = views.update(context, depsgraph, name, composited=True, depthless=_lacks_depth(context.space_data))
     shown = views.newest(name)
     if shown is not None and shown.picture is not None and "Depth" in shown.picture.passes:
         view = scene.view_settings
@@ -42,6 +43,11 @@ def _lit(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> str:
             (2.0**view.exposure, 1.0 / max(view.gamma, 1e-3)),
         )
     return error or views.tell(name)[1]
+
+
+def _lacks_depth(space: bpy.types.SpaceView3D) -> bool:
+    """Whether Blender leaves no depth behind: renderers write it for overlays alone."""
+    return space.shading.type in ("MATERIAL", "RENDERED") and not space.overlay.show_overlays
 
 
 def _from_behind(rv3d: bpy.types.RegionView3D) -> np.ndarray:
@@ -69,6 +75,8 @@ def _draw() -> None:
         return
     try:
         with views.timed():
+            if _lacks_depth(context.space_data):
+                gpu.state.active_framebuffer_get().clear(depth=1.0)
             error = draws(context, context.view_layer.depsgraph)
     except Exception as failure:  # else it would be printed with every redraw, and told to nobody
         messages.log.exception("overlay failed")

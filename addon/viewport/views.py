@@ -60,12 +60,19 @@ def name_of(region: bpy.types.Region) -> str:
     return f"viewport {region.as_pointer():x}"
 
 
-def update(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph, name: str, composited: bool = False) -> str:
+def update(
+    context: bpy.types.Context,
+    depsgraph: bpy.types.Depsgraph,
+    name: str,
+    composited: bool = False,
+    depthless: bool = False,
+) -> str:
     """Ask for the picture of a viewport as it is now; return an error or "".
 
     Parameters
     ----------
     composited : of the DR-GS objects alone, lit by everything, to be drawn among the others
+    depthless : the depth of the others is not known when it is drawn: what they hide is left out of the picture
     """
     region, space, rv3d = context.region, context.space_data, context.region_data
     exported = _export(depsgraph, space)
@@ -76,7 +83,7 @@ def update(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph, name: str
         return ""
     shown = _shown.setdefault(name, Shown())
     options = _options(depsgraph.scene, name, composited)
-    wanted = exported, _values(camera), options
+    wanted = exported, _values(camera), (options, depthless)
     if shown.wanted and shown.wanted[0] is exported and shown.wanted[1:] == wanted[1:]:
         return ""
     try:
@@ -86,7 +93,7 @@ def update(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph, name: str
     shown.wanted = wanted
     frame = replace(exported.frame, camera=camera, **options)
     if composited:
-        frame = _alone(frame)
+        frame = _alone(frame, depthless)
     worker.submit(name, Request(frame, client, exported.assets))
     _start()
     return ""
@@ -193,11 +200,15 @@ def _options(scene: bpy.types.Scene, name: str, composited: bool) -> dict[str, A
     }
 
 
-def _alone(frame: Frame) -> Frame:
-    """The frame in which the camera sees DR-GS objects only; everything else still gives light and shadow."""
+def _alone(frame: Frame, holes: bool = False) -> Frame:
+    """The frame in which the camera sees DR-GS objects only, with `holes` where others stand before them.
+
+    Everything else still gives light and shadow.
+    """
+    change = {"holdout": True} if holes else {"camera": False}
     return replace(
         frame,
-        meshes=[replace(mesh, visibility=replace(mesh.visibility, camera=False)) for mesh in frame.meshes],
+        meshes=[replace(mesh, visibility=replace(mesh.visibility, **change)) for mesh in frame.meshes],
         lights=[replace(light, camera=False) for light in frame.lights],
     )
 

@@ -561,6 +561,8 @@ def test_composited_frame_shows_our_objects_alone(crowd):
     assert frame.meshes[0].visibility.camera and not alone.meshes[0].visibility.camera
     assert alone.meshes[0].visibility.shadow and alone.meshes[0].vertices is frame.meshes[0].vertices
     assert not alone.lights[0].camera and alone.objects is frame.objects
+    holes = views._alone(frame, True).meshes[0].visibility
+    assert holes.holdout and holes.camera and holes.shadow, "what stands before ours cuts them"
     options = views._options(crowd.scene, "a", True)
     assert options["passes"] == ("Combined", "Depth") and options["settings"].film_transparent
     assert not views._options(crowd.scene, "a", False)["settings"].film_transparent

@@ -82,13 +82,16 @@ def overlays() -> Iterator[float]:
     """The relit object among Blender's own, in each of its shadings."""
     scene, shading = bpy.context.scene, where()[1].spaces.active.shading
     scene.render.engine = next(e for e in ("BLENDER_EEVEE", "BLENDER_EEVEE_NEXT") if has_engine(e))
+    overlay = where()[1].spaces.active.overlay
     for kind in ("SOLID", "MATERIAL", "RENDERED"):
         scene.drgs.overlay = "OFF"
         shading.type = kind
         yield from blue_is_seen()  # Blender compiles its own shaders, and shows nothing meanwhile
         scene.drgs.overlay = "LIT"
-        yield from settled()
-        yield from hands.photograph(f"looks-1-{kind.lower()}")
+        for clean in (False, True):
+            overlay.show_overlays = not clean
+            yield from settled()
+            yield from hands.photograph(f"looks-1-{kind.lower()}{'-clean' * clean}")
     scene.drgs.overlay = "OFF"
     scene.render.engine = "DRGS"
     yield from settled()

@@ -23,9 +23,12 @@ def test_nothing_fails(seen):
     assert "Traceback" not in seen.log, seen.log[-3000:]
 
 
-@pytest.mark.parametrize("name", ["1-solid", "1-material", "1-rendered", "2-rendered"])
+BLENDERS_OWN = [f"1-{kind}{clean}" for kind in ("solid", "material", "rendered") for clean in ("", "-clean")]
+
+
+@pytest.mark.parametrize("name", [*BLENDERS_OWN, "2-rendered"])
 def test_what_is_nearer_hides_what_is_farther(seen, name):
-    """A blue cube before the object is seen, one behind it is not."""
+    """A blue cube before the object is seen, one behind it is not; without Blender's overlays too."""
     photograph = seen.photograph(f"looks-{name}")
     blue = {}
     for cube, (x, y) in seen.result["places"].items():
