@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import bpy
 import numpy as np
 import pytest
-from mathutils import Matrix
+from mathutils import Euler, Matrix
 from scenes import armature_object, part, select, write_exr
 
 
@@ -95,6 +96,16 @@ def test_a_new_camera_sees_the_whole_object(ball, scene):
     seen = np.array([world_to_camera_view(scene, scene.camera, ball.matrix_world @ v.co) for v in ball.data.vertices])
     assert (seen[:, :2] > 0).all() and (seen[:, :2] < 1).all() and (seen[:, 2] > 0).all()
     assert np.ptp(seen[:, :2], axis=0).max() > 0.6
+
+
+@pytest.mark.parametrize("perspective", ["ORTHO", "PERSP"])
+def test_a_new_camera_stands_before_what_the_viewport_looks_at(perspective):
+    """The view matrices are those that Blender has, from the front at (1, 2, 3), seven metres away."""
+    turned = Euler((np.pi / 2, 0, 0)).to_matrix().to_4x4()
+    distance = 7.0 if perspective == "PERSP" else 0.0
+    matrix = (Matrix.Translation((1, 2, 3)) @ turned @ Matrix.Translation((0, 0, distance))).inverted()
+    view = SimpleNamespace(view_matrix=matrix, view_distance=7.0, view_perspective=perspective)
+    assert np.allclose(part("operators.steps").standing(view).translation, (1, -5, 3), atol=1e-4)
 
 
 def test_show_rendered_makes_drgs_the_engine(ball, scene):

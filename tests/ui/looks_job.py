@@ -134,7 +134,7 @@ def region() -> Iterator[float]:
 
 
 def camera() -> Iterator[float]:
-    """Through the camera that the step adds."""
+    """Through the camera that the step adds where the view stands."""
     with hands.context_of():
         bpy.ops.drgs.add_camera()
     yield from move(hands.middle())
@@ -142,6 +142,7 @@ def camera() -> Iterator[float]:
         yield from key("NUMPAD_0")
     yield from settled()
     found["perspective"] = where()[1].spaces.active.region_3d.view_perspective
+    found["head"] = place_of((0, -1, 1.4))
     yield from hands.photograph("looks-5-camera")
 
 

@@ -50,6 +50,9 @@ def test_a_region_is_rendered_alone(seen):
 def test_the_camera_is_looked_through(seen):
     assert seen.result["perspective"] == "CAMERA"
     assert np.abs(viewport(seen, "5-camera") - viewport(seen, "4-whole")).mean() > 0.02
+    x, y = seen.result["head"]
+    red, _, blue = seen.photograph("looks-5-camera")[y - 2 : y + 3, x - 2 : x + 3].mean(axis=(0, 1))
+    assert red > blue + 0.2, "the robot's orange head"
 
 
 def test_time_runs_and_no_picture_is_stale(seen):
