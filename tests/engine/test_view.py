@@ -76,18 +76,13 @@ def test_last_picture_is_the_final_one(session, make_frame, settings):
     assert fractions[0] == 0.0 and fractions == sorted(fractions)
 
 
-#: On some processors (seen on an EPYC with AVX-512) Embree's AVX2 and AVX-512 paths give a ray of these scenes another
-#: last bit when it is cast again; with its SSE 4.2 path they never do.
-other_bits = pytest.mark.xfail(sys.platform == "linux", reason="Embree's wide paths on some processors", strict=False)
-
-
 @pytest.mark.parametrize(
     "settings",
     [
         {"rays": 64, "aa": 4},
         {"rays": 128, "aa": 2, "denoise": "svgf"},
         {"rays": 32, "aa": 3, "split": "counts"},
-        pytest.param({"rays": 64, "primary": "mesh"}, marks=other_bits),
+        {"rays": 64, "primary": "mesh"},
     ],
 )
 def test_noise_threshold_stops_where_the_final_frame_does(session, make_frame, settings, monkeypatch):
@@ -123,7 +118,6 @@ def test_every_picture_is_as_bright_as_the_last(session, make_frame, monkeypatch
         np.testing.assert_allclose(early, mean[-1], rtol=0.05)
 
 
-@other_bits
 def test_samples_kept_or_found_again_are_the_same(session, make_frame, monkeypatch):
     monkeypatch.setattr("drgs_blender.engine.view.STEP_SECONDS", 0.0)
     frame = lit(make_frame(0.2, rays=4))

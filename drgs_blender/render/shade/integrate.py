@@ -132,7 +132,8 @@ def integrate(
         alone = Radiance.dark(len(caught))
         run(points[caught], masks.WITHOUT, alone)
         out.unshadowed = np.zeros(n, np.float32)
-        out.unshadowed[caught] = alone.total @ np.array(LUMINANCE, np.float32)
+        # Not a matrix product: BLAS rounds a row by how many rows there are.
+        out.unshadowed[caught] = (alone.total * np.array(LUMINANCE, np.float32)).sum(axis=1)
     return out
 
 
