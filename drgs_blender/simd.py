@@ -1,8 +1,9 @@
 """Sixteen single-precision numbers at once, for loops that LLVM does not vectorise by itself.
 
 ``float32x16`` is a type of compiled code only: `load`, `repeat`, `quads` and `spread` make such values, ``+``, ``-``
-and ``*`` act on each of the sixteen, `store` and `fold` end them. LLVM makes of it what the processor has (one register
-of AVX-512, two of AVX, four of SSE or NEON) with the same results: nothing is reordered, no operations are fused.
+and ``*`` act on each of the sixteen, `store`, `fold` and `lanes` end them. LLVM makes of it what the processor has (one
+register of AVX-512, two of AVX, four of SSE or NEON) with the same results: nothing is reordered, no operations are
+fused.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import operator
 from typing import Any
 
+import numpy as np
 from llvmlite import ir
 
 from .jit import overload  # first: it sets Numba up
@@ -19,6 +21,13 @@ from numba.extending import intrinsic, models, register_model  # isort: skip
 
 LANES = 16
 _VECTOR = ir.VectorType(ir.FloatType(), LANES)
+
+
+def aligned(count: int, kind: type) -> np.ndarray:
+    """1-D array of 4-byte items on a cache line's boundary, zeros, with room behind it for wide loads."""
+    raw = np.zeros(count * 4 + 128, np.uint8)
+    start = -raw.ctypes.data % 64
+    return raw[start : start + count * 4 + 16].view(kind)[:count]
 
 
 class Float32x16(types.Type):
@@ -122,6 +131,17 @@ def fold(typingctx, vector):  # type: ignore[no-untyped-def]
         return cgutils.pack_array(builder, parts)
 
     return types.UniTuple(types.float32, 4)(float32x16), code
+
+
+@intrinsic
+def lanes(typingctx, vector):  # type: ignore[no-untyped-def]
+    """The sixteen elements as a tuple."""
+
+    def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        at = (ir.Constant(ir.IntType(32), i) for i in range(LANES))
+        return cgutils.pack_array(builder, [builder.extract_element(values[0], i) for i in at])
+
+    return types.UniTuple(types.float32, LANES)(float32x16), code
 
 
 def _arithmetic(symbol: Any, instruction: str) -> None:

@@ -22,6 +22,7 @@ from scipy.spatial import cKDTree
 
 from ..errors import UsageError
 from ..jit import njit, prange
+from ..simd import LANES, aligned, fold, lanes, load, quads, repeat, spread
 from ..volume import Volume, crosses_gap
 
 Array = np.ndarray
@@ -45,8 +46,7 @@ class Weights:
     Attributes
     ----------
     source : (n, k) int32, neighbours, the first one always of use; N and Q are 0 where fewer than k are of use
-    value : (n, k) float32, N
-    slope : (n, k, 3) float32, Q, metres
+    weight : (n, k, 4) float32, Q in metres, and N
     offset : (n, 3) float32, from the first neighbour to the point, metres
     reach : (n,) float32, from the first neighbour to the farthest that is of use, metres
     separated : number of points that had neighbours across a gap, which are not used
@@ -54,8 +54,7 @@ class Weights:
     """
 
     source: Array
-    value: Array
-    slope: Array
+    weight: Array
     offset: Array
     reach: Array
     separated: int = 0
@@ -113,13 +112,12 @@ def bind_points(
     order = np.argsort(~usable, axis=1, kind="stable")[:, :wanted]
     index = np.take_along_axis(index, order, 1)
     distance = np.where(np.take_along_axis(usable, order, 1), np.take_along_axis(distance, order, 1), -1.0)
-    value = np.empty(index.shape, np.float32)
-    slope = np.empty((*index.shape, 3), np.float32)
+    weight = np.empty((*index.shape, 4), np.float32)
     reach = np.zeros(len(points), np.float32)
-    _weigh(points, sources, index, distance, value, slope, reach)
+    _weigh(points, sources, index, distance, weight, reach)
     offset = (points - sources[index[:, 0]]).astype(np.float32)
     index = np.where(distance < 0.0, index[:, :1], index)  # of no use, and not to be taken for one that moved apart
-    return Weights(index.astype(np.int32), value, slope, offset, reach, separated, int(stranded.sum()))
+    return Weights(index.astype(np.int32), weight, offset, reach, separated, int(stranded.sum()))
 
 
 @njit(inline="always")
@@ -129,7 +127,7 @@ def _squared(x, a, b):  # type: ignore[no-untyped-def]
 
 
 @njit(parallel=True)
-def _weigh(points, sources, index, distance, value, slope, reach):  # type: ignore[no-untyped-def]
+def _weigh(points, sources, index, distance, weight, reach):  # type: ignore[no-untyped-def]
     """N, Q and reach of each point; a neighbour with a negative distance does not count."""
     count = index.shape[1]
     for i in prange(len(points)):
@@ -176,10 +174,10 @@ def _weigh(points, sources, index, distance, value, slope, reach):  # type: igno
             sx, sy, sz = sx - n * x, sy - n * y, sz - n * z
         for k in range(count):
             s = index[i, k]
-            value[i, k] = w[k]
-            slope[i, k, 0] = 0.5 * w[k] * (px - sources[s, 0] + sx)
-            slope[i, k, 1] = 0.5 * w[k] * (py - sources[s, 1] + sy)
-            slope[i, k, 2] = 0.5 * w[k] * (pz - sources[s, 2] + sz)
+            weight[i, k, 0] = 0.5 * w[k] * (px - sources[s, 0] + sx)
+            weight[i, k, 1] = 0.5 * w[k] * (py - sources[s, 1] + sy)
+            weight[i, k, 2] = 0.5 * w[k] * (pz - sources[s, 2] + sz)
+            weight[i, k, 3] = w[k]
 
 
 def carry(weights: Weights, x: Array, gradients: Array) -> tuple[Array, Array, int]:
@@ -200,61 +198,97 @@ def carry(weights: Weights, x: Array, gradients: Array) -> tuple[Array, Array, i
     """
     n = len(weights.source)
     x = np.ascontiguousarray(x)
-    points, out = np.empty((n, 3), x.dtype), np.empty((n, 9), np.float32)
+    points, out = np.empty((n, 3), x.dtype), np.empty((n, 3, 3), np.float32)
     turned = np.zeros(n, np.bool_)
-    flat = np.ascontiguousarray(gradients, np.float32).reshape(-1, 9)
-    _carry(weights.source, weights.value, weights.slope, weights.offset, weights.reach, x, flat, points, out, turned)
-    return points, out.reshape(n, 3, 3), int(np.count_nonzero(turned))
+    centre = _centre(x)
+    # Sixteen numbers a source, one cache line: the columns of its gradient and its place, each with a free one.
+    rows = aligned(LANES * len(x), np.float32)
+    _pack(x, np.ascontiguousarray(gradients, np.float32).reshape(-1, 3, 3), centre, rows)
+    weight = weights.weight.reshape(-1)
+    _carry(weights.source, weight, weights.offset, weights.reach, rows, centre, points, out, turned)
+    return points, out, int(np.count_nonzero(turned))
 
 
-@njit(inline="always")
-def _determinant(f, i):  # type: ignore[no-untyped-def]
-    return (
-        f[i, 0] * (f[i, 4] * f[i, 8] - f[i, 5] * f[i, 7])
-        - f[i, 1] * (f[i, 3] * f[i, 8] - f[i, 5] * f[i, 6])
-        + f[i, 2] * (f[i, 3] * f[i, 7] - f[i, 4] * f[i, 6])
-    )
+@njit
+def _centre(x):  # type: ignore[no-untyped-def]
+    """(3,) float64 mean of the positions that are finite."""
+    total, count = np.zeros(3), 0
+    for i in range(len(x)):
+        a, b, c = np.float64(x[i, 0]), np.float64(x[i, 1]), np.float64(x[i, 2])
+        if np.isfinite(a + b + c):
+            total[0], total[1], total[2] = total[0] + a, total[1] + b, total[2] + c
+            count += 1
+    return total / max(count, 1)
 
 
 @njit(parallel=True)
-def _carry(source, value, slope, offset, reach, x, gradients, points, out, turned):  # type: ignore[no-untyped-def]
+def _pack(x, gradients, centre, rows):  # type: ignore[no-untyped-def]
+    for s in prange(len(x)):
+        row = LANES * s
+        for c in range(3):
+            for j in range(3):
+                rows[row + 4 * j + c] = gradients[s, c, j]
+            rows[row + 12 + c] = np.float32(x[s, c] - centre[c])
+
+
+@njit
+def _determinant(f):  # type: ignore[no-untyped-def]
+    return f[0] * (f[4] * f[8] - f[5] * f[7]) - f[1] * (f[3] * f[8] - f[5] * f[6]) + f[2] * (f[3] * f[7] - f[4] * f[6])
+
+
+@njit
+def _squares(f):  # type: ignore[no-untyped-def]
+    """Their sum."""
+    return (
+        f[0] * f[0] + f[1] * f[1] + f[2] * f[2] + f[3] * f[3] + f[4] * f[4] + f[5] * f[5] + f[6] * f[6] + f[7] * f[7]
+        + f[8] * f[8]
+    )  # fmt: skip
+
+
+@njit
+def _columns(a):  # type: ignore[no-untyped-def]
+    """A matrix, row by row, of a vector that holds it column by column."""
+    return a[0], a[4], a[8], a[1], a[5], a[9], a[2], a[6], a[10]
+
+
+@njit(parallel=True)
+def _carry(source, weight, offset, reach, rows, centre, points, out, turned):  # type: ignore[no-untyped-def]
+    zero, one = np.float32(0.0), np.float32(1.0)
     for i in prange(len(source)):
-        first = source[i, 0]
-        ox, oy, oz = x[first, 0], x[first, 1], x[first, 2]
-        px = py = pz = 0.0
-        f0 = f1 = f2 = f3 = f4 = f5 = f6 = f7 = f8 = np.float32(0.0)
-        apart = 0.0
+        first = LANES * source[i, 0]
+        ox, oy, oz = rows[first + 12], rows[first + 13], rows[first + 14]
+        # Relative to the first neighbour: N sums to 1 in exact arithmetic alone.
+        origin = quads(zero, zero, zero, one) * repeat(ox, oy, oz, zero)
+        place = gradient = spread(zero)
+        apart = zero
+        w = 4 * i * source.shape[1]
         for k in range(source.shape[1]):
-            s, n = source[i, k], value[i, k]
-            g0, g1, g2 = gradients[s, 0], gradients[s, 1], gradients[s, 2]
-            g3, g4, g5 = gradients[s, 3], gradients[s, 4], gradients[s, 5]
-            g6, g7, g8 = gradients[s, 6], gradients[s, 7], gradients[s, 8]
-            qx, qy, qz = slope[i, k, 0], slope[i, k, 1], slope[i, k, 2]
-            # Relative to the first neighbour: N sums to 1 in exact arithmetic alone.
-            dx, dy, dz = x[s, 0] - ox, x[s, 1] - oy, x[s, 2] - oz
-            px += n * dx + (g0 * qx + g1 * qy + g2 * qz)
-            py += n * dy + (g3 * qx + g4 * qy + g5 * qz)
-            pz += n * dz + (g6 * qx + g7 * qy + g8 * qz)
-            f0, f1, f2 = f0 + n * g0, f1 + n * g1, f2 + n * g2
-            f3, f4, f5 = f3 + n * g3, f4 + n * g4, f5 + n * g5
-            f6, f7, f8 = f6 + n * g6, f7 + n * g7, f8 + n * g8
+            s = LANES * source[i, k]
+            row = load(rows, s) - origin
+            n = weight[w + 3]
+            place = place + quads(weight[w], weight[w + 1], weight[w + 2], n) * row  # F Q + N x, column by column
+            gradient = gradient + n * row
+            dx, dy, dz = rows[s + 12] - ox, rows[s + 13] - oy, rows[s + 14] - oz
             apart = max(apart, dx * dx + dy * dy + dz * dz)
-        out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4] = f0, f1, f2, f3, f4
-        out[i, 5], out[i, 6], out[i, 7], out[i, 8] = f5, f6, f7, f8
-        own = blended = 0.0
-        for c in range(9):
-            own += gradients[first, c] * gradients[first, c]
-            blended += out[i, c] * out[i, c]
-        grown, believed = np.sqrt(apart) / max(reach[i], np.float32(1e-30)), np.sqrt(own / 3.0)
-        most = np.sqrt(max(own, blended) / 3.0)
-        torn = reach[i] > 0.0 and max(grown, most / max(grown, 1e-30)) > _TORN
-        if torn or (not (_determinant(out, i) > np.float32(0.0)) and _determinant(gradients, first) > np.float32(0.0)):
+            w += 4
+        px, py, pz, _ = fold(place)
+        f, g = _columns(lanes(gradient)), _columns(lanes(load(rows, first)))
+        own, blended = _squares(g), _squares(f)
+        grown, believed = np.sqrt(apart) / max(reach[i], np.float32(1e-30)), np.sqrt(own / np.float32(3.0))
+        most = np.sqrt(max(own, blended) / np.float32(3.0))
+        torn = reach[i] > zero and max(grown, most / max(grown, np.float32(1e-30))) > np.float32(_TORN)
+        if torn or (not (_determinant(f) > zero) and _determinant(g) > zero):
             turned[i] = True
-            keep = min(1.0, max(grown, 1.0) / believed) if torn and believed > 0.0 else 1.0
-            for c in range(9):
-                out[i, c] = np.float32(keep) * gradients[first, c]
+            keep = min(one, max(grown, one) / believed) if torn and believed > zero else one
+            f = (
+                keep * g[0], keep * g[1], keep * g[2], keep * g[3], keep * g[4], keep * g[5], keep * g[6],
+                keep * g[7], keep * g[8],
+            )  # fmt: skip
             qx, qy, qz = offset[i, 0], offset[i, 1], offset[i, 2]
-            px = np.float64(out[i, 0] * qx + out[i, 1] * qy + out[i, 2] * qz)
-            py = np.float64(out[i, 3] * qx + out[i, 4] * qy + out[i, 5] * qz)
-            pz = np.float64(out[i, 6] * qx + out[i, 7] * qy + out[i, 8] * qz)
-        points[i, 0], points[i, 1], points[i, 2] = ox + px, oy + py, oz + pz
+            px = f[0] * qx + f[1] * qy + f[2] * qz
+            py = f[3] * qx + f[4] * qy + f[5] * qz
+            pz = f[6] * qx + f[7] * qy + f[8] * qz
+        out[i, 0, 0], out[i, 0, 1], out[i, 0, 2] = f[0], f[1], f[2]
+        out[i, 1, 0], out[i, 1, 1], out[i, 1, 2] = f[3], f[4], f[5]
+        out[i, 2, 0], out[i, 2, 1], out[i, 2, 2] = f[6], f[7], f[8]
+        points[i, 0], points[i, 1], points[i, 2] = centre[0] + (ox + px), centre[1] + (oy + py), centre[2] + (oz + pz)

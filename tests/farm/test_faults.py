@@ -199,7 +199,7 @@ def test_two_jobs_on_one_folder_do_not_disturb_each_other(drgs, folder, tmp_path
 def test_fifty_engines_killed_in_the_middle_of_frames_cost_no_pixel(drgs, folder, tmp_path):
     """Killed at moments that are spread over the frame; each is noticed, and the frame made by the next engine."""
     calm, shaken = tmp_path / "calm", tmp_path / "shaken"
-    rays = ("--rays", "16384")  # longer than the longest delay
+    rays = ("--rays", "65536")  # longer than the longest delay
     assert drgs("render", folder / "shot.blend", "--frames", "1-50", "--out", calm / "####.exr", *rays)[0] == 0
     process = start(folder, shaken, "1-50", *rays)
     killed: set[str] = set()  # in which frames; a frame that is made again may say so twice

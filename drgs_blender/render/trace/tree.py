@@ -11,6 +11,7 @@ import numpy as np
 
 from ...errors import DeviceError, UsageError
 from ...jit import njit, prange
+from ...simd import aligned
 from . import embree
 from .embree import blocked, trace
 
@@ -132,13 +133,6 @@ def neighbours(vertices: Array, faces: Array) -> Array:
     order = key.astype(np.uint32).view(np.int32)
     runs = order[: m // _RUN * _RUN].reshape(-1, _RUN)
     return np.ascontiguousarray(runs[:: max(1, math.ceil(len(runs) / _RUNS))])
-
-
-def aligned(count: int, kind: type) -> Array:
-    """1-D array of 4-byte items on a 64-byte boundary, with room behind it for Embree's wide loads."""
-    raw = np.zeros(count * 4 + 128, np.uint8)
-    start = -raw.ctypes.data % 64
-    return raw[start : start + count * 4 + 16].view(kind)[:count]
 
 
 class _Part:
