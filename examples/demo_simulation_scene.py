@@ -22,7 +22,7 @@ from demo_scene import add_camera, add_turning_world, import_drgs, install, stan
 
 FRAMES = 48
 #: Young's moduli of the two cows, Pa.
-SOFT, FIRM = 1e5, 6e5
+SOFT, FIRM = 2e5, 8e5
 
 
 def add_mesh(name: str, vertices: np.ndarray, faces: Sequence[Sequence[int]], grey: float) -> bpy.types.Object:
