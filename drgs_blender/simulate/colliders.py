@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -22,6 +23,8 @@ log = logging.getLogger(__name__)
 #: Cells behind and before the surface of a mesh where its distance is known.
 _BAND = 8
 _MOST_CELLS = 1 << 23
+#: Cells between a surface that lies on a collider and the collider.
+_CLEARANCE = 0.02
 
 
 @dataclass(slots=True)
@@ -112,9 +115,7 @@ def make_field(
         size = np.ceil((high - low) / spacing).astype(np.int64) + 1
         log.warning("a collider is large: its surface is known to %.3g m only", spacing)
     nodes = low + np.stack(np.meshgrid(*(np.arange(n) for n in size), indexing="ij"), -1).reshape(-1, 3) * spacing
-    closed = _closed(faces)
-    kind = igl.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER if closed else igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
-    distance, face, closest, *_ = igl.signed_distance(nodes, vertices, faces, kind)
+    distance, face, closest, *_ = igl.signed_distance(nodes, vertices, faces, _sign(faces))
     velocity = _STILL
     if velocities is not None:
         corners = vertices[faces[face]]
@@ -124,10 +125,13 @@ def make_field(
     return Field(low, spacing, np.ascontiguousarray(distance, np.float32).reshape(size), velocity)
 
 
-def _closed(faces: Array) -> bool:
-    """Whether every edge has two faces."""
+def _sign(faces: Array) -> Any:
+    """How inside is told: by the winding number where every edge has two faces."""
+    import igl
+
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    return bool((np.unique(edges, axis=0, return_counts=True)[1] % 2 == 0).all())
+    closed = (np.unique(edges, axis=0, return_counts=True)[1] % 2 == 0).all()
+    return igl.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER if closed else igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
 
 
 def _barycentric(points: Array, corners: Array) -> Array:
@@ -203,6 +207,18 @@ class MovingCollider:
         # v(x) = linear + spin x (x - centre), told about the point `shift`.
         return self._own, turn, shift, linear + np.cross(spin, shift - centre), spin
 
+    def closest(self, points: Array) -> tuple[Array, Array, Array]:
+        """Signed distances (n,) from the mesh at the end of the frame, its closest points, and the way out, (n, 3)."""
+        import igl
+
+        faces = self.collider.faces
+        distance, face, closest, *_ = igl.signed_distance(points, self._after, faces, _sign(faces))
+        a, b, c = np.moveaxis(self._after[faces[face]], 1, 0)
+        normal = np.cross(b - a, c - a)
+        on = np.abs(distance) < 1e-6 * self.spacing
+        out = np.where(on[:, None], normal, (points - closest) * np.sign(distance)[:, None])
+        return distance, closest, out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-300)
+
     def _deforming(self, part: float) -> tuple[Field | None, Array, Array, Array, Array]:
         if (part - self._built_at) * self._seconds * self.speed > 0.5 * self.spacing or self._built_at < 0:
             vertices = (1 - part) * self._before + part * self._after
@@ -241,3 +257,33 @@ def check_apart(points: Array, depth: float, colliders: Sequence[MovingCollider]
                 f"overlaps the body at the start: {inside} of {len(points)} particles are inside it",
                 "Move one of the two apart, or simulate from a frame in which they are apart",
             )
+
+
+def lift_surface(points: Array, spacing: float, colliders: Sequence[MovingCollider], planes: Array) -> Array:
+    """A body's surface with what has sunk into obstacles, by a cell at most, lying on them.
+
+    Matter enters obstacles by parts of a cell, which its points do not mind; of a surface that much would be hidden,
+    and what looks out would get no light.
+
+    Parameters
+    ----------
+    points : (n, 3) float64, world, at the end of the frame that the colliders have entered
+    spacing : of the grid, metres
+    planes : rows of `contact.plane_rows`
+    """
+    points = np.array(points)
+    clearance = _CLEARANCE * spacing
+    for normal, offset in zip(planes[:, :3], planes[:, 3], strict=True):
+        sunk = offset + clearance - (points * normal).sum(axis=1)
+        points += np.where(sunk <= spacing, np.maximum(sunk, 0.0), 0.0)[:, None] * normal
+    for moving in colliders:
+        place, rotation, shift, _, _ = moving.at(1.0)
+        if place is None:
+            continue
+        distance = distances(points, place.distance, place.origin, place.spacing, rotation, shift)
+        near = np.flatnonzero(np.abs(distance) < 3 * spacing)  # of the nearest node
+        if len(near):
+            distance, closest, out = moving.closest(points[near])
+            sunk = (distance >= -spacing) & (distance < clearance)
+            points[near[sunk]] = closest[sunk] + clearance * out[sunk]
+    return points

@@ -21,7 +21,7 @@ from ..matter import matter_of
 from ..particle_cache import ParticleFrame
 from ..version import __version__
 from .blocks import Domain
-from .colliders import Collider
+from .colliders import Collider, lift_surface
 from .contact import Plane
 from .fill import Filling, fill
 from .lattice import Lattice
@@ -59,6 +59,7 @@ class Job:
     digest: str
     tear: float
     grain: float
+    _spacing: float
     _vertices: Array
     _weights: Weights | None
     _pins: _PinMotion | None
@@ -72,13 +73,20 @@ class Job:
     def now(self) -> ParticleFrame:
         """Particles and mesh as they are now, object space."""
         solver = self.solver
-        x, gradients = solver.points, solver.gradients
+        vertices = self._surface()
+        if solver.frame:
+            vertices = lift_surface(vertices, self._spacing, solver.colliders, solver.planes)
+        return self._to_object(solver.points, solver.gradients, vertices)
+
+    def _surface(self) -> Array:
+        """Vertices of the mesh as matter carries them, world."""
+        solver = self.solver
         if self._weights is None:
-            return self._to_object(x, gradients, solver.riders)
-        vertices, _, turned = carry(self._weights, x, gradients)
+            return solver.riders
+        vertices, _, turned = carry(self._weights, solver.points, solver.gradients)
         if turned:
             log.debug("frame %d: %d vertices where matter would be inside out", solver.frame, turned)
-        return self._to_object(x, gradients, vertices)
+        return vertices
 
     def _to_object(self, points: Array, gradients: Array, vertices: Array) -> ParticleFrame:
         matrix = np.asarray(self.settings.matrix_world)
@@ -182,7 +190,7 @@ def prepare(mesh: Mesh, settings: Settings, name: str = "mesh") -> Job:
     digest = _digest(mesh, settings, colliders, motion)
     tear = max(m.gap for m in materials) * spacing / abs(float(np.linalg.det(matrix[:3, :3]))) ** (1 / 3)
     grain = min(m.grain for m in materials)
-    return Job(settings, filling, solver, digest, tear, grain, vertices, weights, motion)
+    return Job(settings, filling, solver, digest, tear, grain, spacing, vertices, weights, motion)
 
 
 def _has(names: Sequence[str]) -> str:

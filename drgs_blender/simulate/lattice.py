@@ -119,11 +119,11 @@ class Lattice(Stepper):
         self.v[self._fixed] = 0.0
         self._nearest_pin = self._match_pins()
         self._rest_fixed = rest[self._fixed].copy()
-        self._planes, self._fields = plane_rows(planes), FieldRows(self.forces.fields)
+        self.planes, self._fields = plane_rows(planes), FieldRows(self.forces.fields)
         everywhere = points.min(axis=0) - 1e3 * size, points.max(axis=0) + 1e3 * size
         self.colliders = [MovingCollider(c, 0.5 * size, *everywhere) for c in colliders]
         self._shell = self._find_shell(place, shape)
-        check_apart(points, 0.5 * size, self.colliders, self._planes)
+        check_apart(points, 0.5 * size, self.colliders, self.planes)
 
     def _embed(self) -> None:
         """(n, 8) trilinear weights of the particles and (n, 8, 3) their slopes, 1/m."""
@@ -231,7 +231,7 @@ class Lattice(Stepper):
             start = self.x.copy()
             self.x += dt * self.v
             _solve(self.x, self._inverse_mass, self._corners, self._parity, self._gradient, terms)
-            _push_planes(self.x, start, self._inverse_mass, shell_nodes, shell_weights, self._planes)
+            _push_planes(self.x, start, self._inverse_mass, shell_nodes, shell_weights, self.planes)
             for moving in self.colliders:
                 field, rotation, shift, linear, spin = moving.at((step + 1) / count)
                 if field is not None:

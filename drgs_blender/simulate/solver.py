@@ -123,7 +123,7 @@ class Solver(Stepper):
     ) -> None:
         self.body, self.domain, self.forces = body, domain, forces or Forces()
         self.colliders = [MovingCollider(c, domain.spacing, domain.low, domain.high) for c in colliders]
-        self._planes, self._fields = plane_rows(planes), FieldRows(self.forces.fields)
+        self.planes, self._fields = plane_rows(planes), FieldRows(self.forces.fields)
         n, riders = len(body.points), len(body.riders)
         matter = body.matter
         self._mass = np.concatenate([body.volume * matter.density, np.zeros(riders)]).astype(np.float32)
@@ -161,7 +161,7 @@ class Solver(Stepper):
         if not len(self.body.points):
             raise UsageError("simulation", "has no particles", "Fill the mesh first")
         self._arranged(self.state.x)
-        check_apart(self.body.points, self.domain.spacing, self.colliders, self._planes)
+        check_apart(self.body.points, self.domain.spacing, self.colliders, self.planes)
 
     @property
     def gradients(self) -> Array:
@@ -247,8 +247,8 @@ class Solver(Stepper):
                 blow_nodes(nodes, a.active, *grid, self._fields.at(self.frame, (done + 0.5 * dt) / seconds), dt)
             for moving in self.colliders:
                 self._touch(moving, (done + 0.5 * dt) / seconds, nodes, a)
-            if len(self._planes):
-                bound(nodes, a.active, *grid, self._planes)
+            if len(self.planes):
+                bound(nodes, a.active, *grid, self.planes)
             if len(pins):
                 hold_pins(s.x, pins, pin_velocity, mass, *grid, a.slot, nodes, held)
                 kept = s.x[pins] + dt * pin_velocity

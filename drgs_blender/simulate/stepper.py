@@ -7,6 +7,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from .colliders import MovingCollider
+
 Array = np.ndarray
 
 
@@ -19,10 +21,14 @@ class Stepper(ABC):
         Frames done.
     steps : int
         Time steps taken in all.
+    colliders, planes
+        What matter cannot enter, the latter as rows of `contact.plane_rows`.
     """
 
     frame = 0
     steps = 0
+    colliders: list[MovingCollider]
+    planes: Array
 
     @property
     @abstractmethod

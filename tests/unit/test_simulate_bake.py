@@ -11,6 +11,7 @@ import sys
 import time
 from pathlib import Path
 
+import igl
 import numpy as np
 import pytest
 import trimesh
@@ -240,6 +241,27 @@ def test_a_full_disk_leaves_what_was_baked(tmp_path, monkeypatch):
     assert not list(tmp_path.glob(".*.tmp"))
     assert bake(job_of(), cache) > 0
     assert cache.frames() == [1, 2, 3, 4, 5, 6]
+
+
+@pytest.mark.parametrize("material", ["sand", "jelly"])
+def test_the_surface_lies_on_what_it_falls_on(tmp_path, material):
+    """Matter sinks into a ball and the floor beside it by parts of a cell; its surface does not."""
+    ball = trimesh.creation.icosphere(4, 0.25)
+    ball.apply_translation([0.1, 0, -0.21])
+    ball.export(tmp_path / "ball.ply")
+    collider = {"mesh": str(tmp_path / "ball.ply"), "friction": 0.0}
+    job = job_of(material={"name": material, "young": 2e4}, colliders=[collider], gravity=[0, 0, -30])
+    sunk, rests = 0.0, 0
+    for _ in range(8):
+        job.solver.advance(1 / 24)
+        raw, vertices = job._surface(), job.now().vertices
+        outside = [igl.signed_distance(v, ball.vertices, ball.faces)[0] for v in (raw, vertices.astype(float))]
+        sunk = min(sunk, raw[:, 2].min(), outside[0].min())
+        assert vertices[:, 2].min() > 0 and outside[1].min() > 0
+        far = (raw[:, 2] > 0.02) & (outside[0] > 0.02)
+        np.testing.assert_allclose(vertices[far], raw[far], atol=1e-6)
+        rests += int(np.count_nonzero(outside[1] < 0.002))
+    assert sunk < -0.002 and rests > 4, "there was something to lift"
 
 
 def test_vertex_groups_pin_and_differ(tmp_path):
