@@ -68,7 +68,10 @@ def export_frame(
             raise UsageError(f'Scene "{scene.name}"', "has no camera", "Add a camera, or make one active with Ctrl 0")
         camera = export_camera(scene.camera.evaluated_get(depsgraph), picture_of(scene))
         _check_features(scene, depsgraph.view_layer, warn)
-    materials, unrendered, lights = Materials(warn), Unrendered(), []
+    layer = depsgraph.view_layer_eval
+    # As in Cycles, a view layer may replace all materials and, in later Blenders, the world.
+    world = getattr(layer, "world_override", None) or scene.world
+    materials, unrendered, lights = Materials(warn, layer.material_override), Unrendered(), []
     memory = Memory() if memory is None else memory
     objects, meshes = DrgsObjects(depsgraph, key_of, warn, memory), Meshes(depsgraph, materials, warn, memory)
     others = Limited(depsgraph.view_layer.drgs, f'View layer "{depsgraph.view_layer.name}"', warn).others
@@ -89,12 +92,14 @@ def export_frame(
             meshes.add(item)
             unrendered.add(item.object)
     unrendered.tell(warn)
+    if materials.override is not None and objects.states:
+        warn(f'View layer "{layer.name}": its Material Override is of meshes; DR-GS objects keep their own materials')
     settings = scene.drgs
     frame = Frame(
         number=scene.frame_current if settings.use_animated_seed else 0,
         camera=camera,
         objects=objects.states,
-        world=memory.recall(("world", uid(scene.world)), (), lambda: export_world(scene.world, warn)),
+        world=memory.recall(("world", uid(world)), (), lambda: export_world(world, warn)),
         settings=settings.to_settings(scene.render.film_transparent, preferences.read("threads", 0), warn),
         passes=passes or tuple(p.name for p in enabled(scene, depsgraph.view_layer)),
         meshes=meshes.states(),

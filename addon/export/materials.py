@@ -57,12 +57,17 @@ DEFAULT = Look(Material("Default"))
 
 
 class Materials:
-    """All materials of one export, and the images they use."""
+    """All materials of one export, and the images they use. `override` takes the place of every one."""
 
-    def __init__(self, warn: Warn) -> None:
-        self._warn = warn
+    def __init__(self, warn: Warn, override: bpy.types.Material | None = None) -> None:
+        self._warn, self.override = warn, override
         self._known: dict[tuple[int, int], Look] = {}
         self.images: dict[str, Image] = {}
+
+    def slots(self, obj: bpy.types.Object) -> list[bpy.types.Material | None]:
+        """Materials in the slots of an evaluated object."""
+        own = [slot.material for slot in obj.material_slots]
+        return own if self.override is None else [self.override] * max(len(own), 1)
 
     def look(self, material: bpy.types.Material | None, mesh: bpy.types.Mesh) -> Look:
         """How an evaluated material shows on an evaluated mesh."""

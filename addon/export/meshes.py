@@ -62,7 +62,7 @@ class Meshes:
     def add(self, item: Visible) -> None:
         """Take in a visible instance of a mesh."""
         obj, rays = item.object, item.visibility
-        slots = [s.material for s in obj.material_slots]
+        slots = self._materials.slots(obj)
         key = (
             obj.data.as_pointer(),
             *(m.as_pointer() if m else 0 for m in slots),

@@ -47,7 +47,17 @@ def export_world(world: bpy.types.World | None, warn: Warn) -> World:
     colour = light.colour
     if world is not None:
         colour = _usable(colour, rotation, world.name, warn)
+        _check_rays(world, warn)
     return World(environment=pixels, rotation=rotation, colour=tuple(map(float, colour)))
+
+
+def _check_rays(world: bpy.types.World, warn: Warn) -> None:
+    """Say where rays are not to see the world, by Cycles' settings of it: here all do."""
+    rays = getattr(world, "cycles_visibility", None)  # the add-on Cycles may be off
+    blind = [name for name in ("camera", "diffuse", "glossy") if rays is not None and not getattr(rays, name)]
+    if blind:
+        hint = "; Film > Transparent hides it from the camera" if "camera" in blind else ""
+        warn(f'World "{world.name}": that {" and ".join(blind)} rays do not see it is not rendered{hint}')
 
 
 def _usable(colour: np.ndarray, rotation: np.ndarray, name: str, warn: Warn) -> np.ndarray:
@@ -131,6 +141,8 @@ class _Tree(Walker):
             return plain(FALLBACK)
         if node.type == "TEX_ENVIRONMENT" and node.projection != "EQUIRECTANGULAR":
             self.warn(node, "the Mirror Ball projection is read as Equirectangular")
+        if node.interpolation != "Linear":
+            self.warn(node, f"{node.interpolation} interpolation is read as Linear")
         turn = self.rotation(output.input("Vector"))
         return Paint(np.ones(3), Sky(node.image, tuple(map(tuple, turn.tolist()))))
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import bpy
 import numpy as np
 import pytest
-from scenes import mesh_object, part, read_exr
+from scenes import mesh_object, part, read_exr, sphere
 
 
 def material(name: str = "Material") -> tuple[bpy.types.NodeTree, bpy.types.Node]:
@@ -717,3 +717,19 @@ def test_images_that_no_export_uses_are_let_go(scene, export, tmp_path):
     for _ in range(images.KEPT + 2):
         export()
     assert not images._known
+
+
+def test_a_view_layers_override_replaces_all_materials(scene, export, ball):
+    """As in Cycles: of meshes with and without materials of their own, of every slot."""
+    plain, slots = mesh_object("Plain", *sphere(4, 4)), mesh_object("Slots", *sphere(4, 4))
+    for name in ("One", "Two"):
+        slots.data.materials.append(bpy.data.materials.new(name))
+    slots.data.polygons.foreach_set("material_index", np.arange(len(slots.data.polygons)) % 2)
+    export()
+    material("Clay")[1].inputs["Base Color"].default_value = (0.9, 0.1, 0.2, 1)
+    bpy.context.view_layer.material_override = bpy.data.materials["Clay"]
+    frame, warnings = export()
+    assert {mesh.name for mesh in frame.meshes} == {plain.name, slots.name}
+    assert {m.name for mesh in frame.meshes for m in mesh.materials} == {"Clay"}
+    np.testing.assert_allclose(frame.meshes[0].materials[0].base_colour, (0.9, 0.1, 0.2), rtol=1e-6)
+    assert len(warnings) == 1 and "Material Override" in warnings[0] and "DR-GS objects" in warnings[0]

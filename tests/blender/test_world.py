@@ -234,3 +234,29 @@ def test_texels_that_are_no_light_are_black_with_one_counted_warning(scene, sky,
         assert len(texts) == 1 and texts[0].startswith("world: 3 pixels of the environment are negative, infinite or")
     assert np.isfinite(read_exr(scene.render.filepath, 64, 48)).all()
     assert [m for m in messages.history if "no DR-GS object" in m.text], "the empty scene is said as well"
+
+
+@pytest.mark.skipif("world_override" not in bpy.types.ViewLayer.bl_rna.properties, reason="this Blender has none")
+def test_a_view_layer_may_have_a_world_of_its_own(scene, export):
+    new_world(scene)[1].inputs["Color"].default_value = (1, 0, 0, 1)
+    other = scene.world.copy()
+    next(n for n in other.node_tree.nodes if n.type == "BACKGROUND").inputs["Color"].default_value = (0, 0, 1, 1)
+    assert export()[0].world.colour == (1, 0, 0)
+    bpy.context.view_layer.world_override = other
+    assert export()[0].world.colour == (0, 0, 1)
+
+
+def test_rays_that_are_not_to_see_the_world_are_named(scene, export):
+    new_world(scene)
+    assert not export()[1]
+    scene.world.cycles_visibility.camera = scene.world.cycles_visibility.glossy = False
+    (warning,) = export()[1]
+    assert '"World"' in warning and "camera and glossy rays" in warning and "Film > Transparent" in warning
+
+
+def test_another_interpolation_of_the_picture_is_named(scene, export, sky):
+    texture = link_sky(scene, sky[0])[2]
+    assert not export()[1]
+    texture.interpolation = "Closest"
+    (warning,) = export()[1]
+    assert '"World"' in warning and "Closest interpolation is read as Linear" in warning
