@@ -5,6 +5,8 @@ https://openusd.org/release/user_guides/schemas/usdVol/ParticleField3DGaussianSp
 
 from __future__ import annotations
 
+import math
+import signal
 import subprocess
 import sys
 import tempfile
@@ -26,8 +28,10 @@ from .usd_stage import DEGREE, FULL, HARMONICS, LACKING, NO_SPLATS, REFUSED, REM
 
 Array = np.ndarray
 
-#: Time and memory for a file: some for the library, and in proportion to its bytes.
-_SECONDS, _PACE = 30.0, 1 << 20
+#: Processor time and memory for a file: some for the library, and in proportion to its bytes.
+_SECONDS, _PACE = 5.0, 1 << 20
+#: By the clock it may take so many times as long: the machine may be busy, and who waits takes no processor time.
+_PATIENCE = 20
 _MEMORY, _RATIO = 8 << 30, 32
 #: What to do for what is not read.
 MESHES = "For its meshes, import it in Blender and export glTF (.glb), which is read"
@@ -64,22 +68,28 @@ def read_usd_splats(path: Path) -> SurfelFile:
 def _read_apart(path: Path) -> dict[str, Array]:
     """The arrays of `usd_stage`, from a process that may take time and memory in proportion to the file."""
     subject, size = str(path), path.stat().st_size
+    try:
+        subject.encode()
+    except UnicodeEncodeError as error:
+        raise AssetError(subject, "has a path that is no text, and USD takes no other", "Rename it") from error
+    seconds = math.ceil(_SECONDS + size / _PACE)
+    slow = AssetError(subject, "keeps USD busy for longer than such a file can take", REMEDY)
     with tempfile.TemporaryDirectory() as folder:
         target = Path(folder) / "splats"
         # The package as it is here, wherever that comes from.
         code = (
             f"import sys; sys.path.insert(0, sys.argv[1]); from {usd_stage.__name__} import main; main(*sys.argv[2:])"
         )
-        given = Path(__file__).resolve().parents[2], path.absolute(), target, _MEMORY + _RATIO * size
+        given = Path(__file__).resolve().parents[2], path.absolute(), target, _MEMORY + _RATIO * size, seconds
         command = [sys.executable, "-c", code, *map(str, given)]
         try:
-            done = subprocess.run(
-                command, capture_output=True, timeout=_SECONDS + size / _PACE, stdin=subprocess.DEVNULL
-            )
+            done = subprocess.run(command, capture_output=True, timeout=_PATIENCE * seconds, stdin=subprocess.DEVNULL)
         except subprocess.TimeoutExpired as error:
-            raise AssetError(subject, "keeps USD busy for longer than such a file can take", REMEDY) from error
+            raise slow from error
         except OSError as error:
             raise DeviceError(subject, f"cannot be read: Python does not start ({error})", "See drgs doctor") from error
+        if done.returncode == -getattr(signal, "SIGXCPU", 0):  # Windows has no such signal
+            raise slow
         if done.returncode == LACKING:
             raise DeviceError(subject, "needs the package usd-core", "Install it: pip install usd-core")
         said = (done.stderr.decode(errors="replace").strip().splitlines() or [""])[-1][:300]

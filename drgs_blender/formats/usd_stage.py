@@ -33,14 +33,12 @@ _ELSEWHERE = "which is not in this package"
 NO_SPLATS = f"holds no splats ({SCHEMA}), and of USD nothing else is read"
 
 
-def main(source: str, target: str, most_bytes: str) -> None:
-    """Write the pieces of the stage `source` to `target` with at most so many bytes of memory; leave with a code."""
-    if sys.platform.startswith("linux"):
-        import resource
+def main(source: str, target: str, most_bytes: str, most_seconds: str) -> None:
+    """Write the pieces of the stage `source` to `target`; leave with a code.
 
-        now, most = resource.getrlimit(resource.RLIMIT_AS)
-        wanted = [int(most_bytes), *(v for v in (now, most) if v != resource.RLIM_INFINITY)]
-        resource.setrlimit(resource.RLIMIT_AS, (min(wanted), most))
+    At most so many bytes of memory (Linux) and seconds of processor time (not on Windows) are taken for it.
+    """
+    _limit(int(most_bytes), int(most_seconds))
     try:
         from pxr import Usd, UsdGeom
     except ImportError:
@@ -59,6 +57,21 @@ def main(source: str, target: str, most_bytes: str) -> None:
     except OSError as error:
         sys.stderr.write(f"\n{error.strerror or error}\n")
         sys.exit(FULL)
+
+
+def _limit(most_bytes: int, most_seconds: int) -> None:
+    """Let this process fail beyond these limits, and leave no image of its memory where it crashes."""
+    if sys.platform == "win32":
+        return
+    import resource
+
+    limits = {resource.RLIMIT_CPU: most_seconds, resource.RLIMIT_CORE: 0}
+    if sys.platform.startswith("linux"):
+        limits[resource.RLIMIT_AS] = most_bytes
+    for kind, wanted in limits.items():
+        now, most = resource.getrlimit(kind)
+        known = [limit for limit in (now, most) if limit != resource.RLIM_INFINITY]
+        resource.setrlimit(kind, (min([wanted, *known]), most))
 
 
 def read_stage(subject: str, usd: Any, geometry: Any) -> dict[str, Array]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import gzip
+import struct
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +35,36 @@ def covariance(rotation: np.ndarray, scale: np.ndarray) -> np.ndarray:
     """(n, 3, 3) covariances of surfels (two scales) or splats (three)."""
     axes = rotation_matrices(rotation.astype(np.float64))[..., : scale.shape[1]] * scale[:, None, :]
     return axes @ axes.transpose(0, 2, 1)
+
+
+def spz_blocks(data: bytes) -> list[bytes]:
+    """The attributes of an SPZ file of version 4."""
+    import zstandard
+
+    start, blocks = struct.unpack_from("<I", data, 16)[0], []
+    position = start + 16 * data[15]
+    for i in range(data[15]):
+        stored, _ = struct.unpack_from("<QQ", data, start + 16 * i)
+        blocks.append(zstandard.decompress(data[position : position + stored]))
+        position += stored
+    return blocks
+
+
+def build_spz(like: bytes, blocks: Sequence[bytes]) -> bytes:
+    """An SPZ file of version 4 with the header of `like`, these attributes, and a table that fits them."""
+    import zstandard
+
+    frames = [zstandard.compress(block) for block in blocks]
+    table = [struct.pack("<QQ", len(frame), len(block)) for frame, block in zip(frames, blocks)]
+    return like[:16] + struct.pack("<I12x", 32) + b"".join([*table, *frames])
+
+
+def old_spz(data: bytes, version: int) -> bytes:
+    """An SPZ file of version 4 as one of version 2 or 3: one gzip stream; rotations of version 2 are other ones."""
+    blocks = spz_blocks(data)
+    if version == 2:
+        blocks[4] = blocks[4][: 3 * (len(blocks[4]) // 4)]
+    return gzip.compress(data[:4] + struct.pack("<I", version) + data[8:15] + b"\0" + b"".join(blocks), 1, mtime=0)
 
 
 def damaged(data: bytes, rng: np.random.Generator) -> bytes:

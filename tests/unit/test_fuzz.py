@@ -98,6 +98,8 @@ def test_a_reader_that_fails_is_noticed(tmp_path: Path) -> None:
         "crash": "import os; os.kill(os.getpid(), 11)",
         "hang": "while True: pass",
         "appetite": "bytearray(200 << 20); raise fuzz_files.DrgsError(str(path), 'x')",
+        "hang apart": "run('while time.process_time() < 3: pass'); raise fuzz_files.DrgsError(str(path), 'x')",
+        "appetite apart": "run('bytearray(400 << 20)'); raise fuzz_files.DrgsError(str(path), 'x')",
         "credulity": "return [fuzz_files.np.full(3, fuzz_files.np.nan)]",
         "anonymity": "raise fuzz_files.DrgsError('a file', 'x')",
         "error": "raise KeyError(1)",
@@ -105,9 +107,11 @@ def test_a_reader_that_fails_is_noticed(tmp_path: Path) -> None:
     for name, body in bad.items():
         script = f"""
 import sys; sys.path.insert(0, {str(PROGRAM.parent)!r})
-import fuzz_files
+import fuzz_files, subprocess
 from pathlib import Path
 fuzz_files.SECONDS = 0.5
+def run(code):
+    subprocess.run([sys.executable, "-c", "import time\\n" + code])
 def read(path):
     {body}
 print(fuzz_files.attempt(fuzz_files.Kind("a", {{}}, read=read), Path({str(tmp_path / "here.ply")!r}), 1000))
