@@ -11,15 +11,15 @@ from ..errors import AssetError
 from .axes import vectors_to_z_up
 from .files import Image, MaterialFile, MeshFile
 from .gltf_document import Document
-from .gltf_nodes import NodeTree, Pose
+from .gltf_nodes import INSTANCES, NodeTree, Pose
 from .images import decode_image
 
 Array = np.ndarray
 
 _WRAP = {33071: "clamp", 33648: "mirror", 10497: "repeat"}
-_INSTANCES = "EXT_mesh_gpu_instancing"
 #: Required extensions that change nothing of what is read here, or that are read.
 _UNDERSTOOD = {
+    INSTANCES,
     "KHR_texture_transform",
     "KHR_mesh_quantization",
     "KHR_lights_punctual",
@@ -53,8 +53,6 @@ def read_gltf(path: Path, pose: Pose = "rest") -> MeshFile:
         if mesh_index is None:
             continue
         mesh = document.item("meshes", mesh_index)
-        if _INSTANCES in document.get(node, "extensions", dict, {}):
-            notes.append(f"{_INSTANCES} ignored: one copy stands for all")
         name = str(node.get("name") or mesh.get("name") or f"mesh {mesh_index}")
         for primitive in document.get(mesh, "primitives", list, []):
             if not isinstance(primitive, dict):
@@ -114,33 +112,49 @@ def _primitive(
     faces = _triangles(document, primitive, mode, len(vertices))
     if "targets" in primitive:
         notes.append("morph targets left at rest")
-    normals = _same_length(document, _float(document, attributes, "NORMAL", ("VEC3",)), vertices, "NORMAL")
-    matrix = tree.mesh_world(node_index)
+    material, uv_set = materials.use(document.index(primitive, "material"))
+
+    def beside(name: str, *kinds: str) -> Array | None:
+        values = _float(document, attributes, name, kinds)
+        if values is not None and len(values) != len(vertices):
+            raise AssetError(document.subject, f"has {len(values)} {name} for {len(vertices)} vertices")
+        return values
+
+    normals, uvs = beside("NORMAL", "VEC3"), beside(f"TEXCOORD_{uv_set}", "VEC2")
+    colours = beside("COLOR_0", "VEC3", "VEC4")
     skin = document.index(node, "skin")
     if skin is not None and "JOINTS_0" in attributes and "WEIGHTS_0" in attributes:
         blend = _blend_matrices(document, attributes, tree.skin_matrices(skin), len(vertices))
-        vertices = np.einsum("nij,nj->ni", blend[:, :, :3], vertices) + blend[:, :, 3]
+        piece = _Piece(np.einsum("nij,nj->ni", blend[:, :, :3], vertices) + blend[:, :, 3], faces, material)
         if normals is not None:
-            normals = np.einsum("nij,nj->ni", blend[:, :, :3], normals)
+            piece.normals = np.einsum("nij,nj->ni", blend[:, :, :3], normals)
     else:
-        with np.errstate(all="ignore"):  # values that overflow are refused when all is joined
-            vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
-            linear = matrix[:3, :3]
-            if normals is not None:
-                cofactors = np.stack([np.cross(linear[(i + 1) % 3], linear[(i + 2) % 3]) for i in range(3)])
-                normals = normals @ cofactors.T
-            if np.linalg.det(linear) < 0:  # a mirror: keep the outside outside
-                faces = faces[:, ::-1]
-                normals = None if normals is None else -normals
-    material, uv_set = materials.use(document.index(primitive, "material"))
-    piece = _Piece(vertices_up(vertices), faces, material)
-    if normals is not None:
+        places = tree.mesh_worlds(node_index)
+        document.take(max(len(places) - 1, 0) * (vertices.nbytes + faces.nbytes))
+        piece = _placed(vertices, faces, normals, places, material)
+        uvs, colours = (None if a is None else np.tile(a, (len(places), 1)) for a in (uvs, colours))
+    piece.vertices = vertices_up(piece.vertices)
+    if piece.normals is not None:
         with np.errstate(invalid="ignore", divide="ignore"):
-            piece.normals = vertices_up(normals / np.linalg.norm(normals, axis=1, keepdims=True))
-    uvs = _same_length(document, _float(document, attributes, f"TEXCOORD_{uv_set}", ("VEC2",)), vertices, "TEXCOORD")
+            piece.normals = vertices_up(piece.normals / np.linalg.norm(piece.normals, axis=1, keepdims=True))
     piece.uvs = None if uvs is None else np.stack([uvs[:, 0], 1.0 - uvs[:, 1]], axis=1)
-    colours = _same_length(document, _float(document, attributes, "COLOR_0", ("VEC3", "VEC4")), vertices, "COLOR_0")
     piece.colours = None if colours is None else colours[:, :3]
+    return piece
+
+
+def _placed(vertices: Array, faces: Array, normals: Array | None, places: Array, material: int) -> _Piece:
+    """A copy of a primitive for each of the matrices `places` (n, 4, 4), as one."""
+    with np.errstate(all="ignore"):  # values that overflow are refused when all is joined
+        linear = places[:, :3, :3]
+        moved = vertices @ linear.transpose(0, 2, 1) + places[:, None, :3, 3]
+        mirrored = np.linalg.det(linear) < 0  # the outside stays outside
+        corners = np.where(mirrored[:, None, None], faces[:, ::-1], faces)
+        corners += len(vertices) * np.arange(len(places))[:, None, None]
+        piece = _Piece(moved.reshape(-1, 3), corners.reshape(-1, 3), material)
+        if normals is not None:
+            cofactors = np.stack([np.cross(linear[:, (i + 1) % 3], linear[:, (i + 2) % 3]) for i in range(3)], axis=1)
+            cofactors[mirrored] *= -1
+            piece.normals = (normals @ cofactors.transpose(0, 2, 1)).reshape(-1, 3)
     return piece
 
 
@@ -154,12 +168,6 @@ def _float(document: Document, attributes: dict[str, Any], name: str, kinds: tup
     if name not in attributes:
         return None
     return document.accessor(attributes[name], kinds).astype(np.float64)
-
-
-def _same_length(document: Document, values: Array | None, vertices: Array, name: str) -> Array | None:
-    if values is not None and len(values) != len(vertices):
-        raise AssetError(document.subject, f"has {len(values)} {name} for {len(vertices)} vertices")
-    return values
 
 
 def _triangles(document: Document, primitive: dict[str, Any], mode: int | None, count: int) -> Array:

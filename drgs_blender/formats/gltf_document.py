@@ -126,7 +126,7 @@ class Document:
         elif count > EMPTY_LIMIT:
             raise AssetError(self.subject, f"declares {count} values without data", _DAMAGED)
         else:
-            self._take(count * width * dtype.itemsize)
+            self.take(count * width * dtype.itemsize)
             values = np.zeros((count, width), dtype)
         if sparse := self.get(entry, "sparse", dict):
             values = self._sparse(sparse, values, dtype, shape)
@@ -209,12 +209,12 @@ class Document:
             raise AssetError(self.subject, f"has an accessor that leaves buffer view {view}", _DAMAGED)
         if not count:
             return np.zeros((0, rows * columns), dtype)
-        self._take(count * size)
+        self.take(count * size)
         block = np.lib.stride_tricks.as_strided(buffer[first:], (count, columns, column), (stride, pitch, 1))
         return np.ascontiguousarray(block).view(dtype).reshape(count, rows * columns)
 
-    def _take(self, size: int) -> None:
-        """Note that `size` bytes of values are made of the file. Raises AssetError where they become too many."""
+    def take(self, size: int) -> None:
+        """Note that `size` bytes of values are made of the file; refuse it where they become too many."""
         self._room -= size
         if self._room < 0:
             problem = "repeats its meshes until they are far more than is in it"

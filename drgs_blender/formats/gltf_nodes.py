@@ -16,6 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ..errors import AssetError
+from ..geometry import rotation_matrices
 from .gltf_document import Document
 
 Array = np.ndarray
@@ -23,6 +24,8 @@ Pose = Literal["rest", "default"]
 
 #: Distances below it make no bone in Blender's importer.
 SHORTEST_BONE = 0.004
+#: The extension with which a node places its mesh many times.
+INSTANCES = "EXT_mesh_gpu_instancing"
 #: Stands above all root nodes.
 ROOT = -1
 
@@ -67,6 +70,32 @@ class NodeTree:
     def mesh_world(self, node: int) -> Array:
         """(4, 4) matrix of the mesh that the node carries: Blender makes it a child where the node is a bone."""
         return self.world(node) @ self._tip.get(node, np.eye(4))
+
+    def mesh_worlds(self, node: int) -> Array:
+        """(n, 4, 4) `mesh_world`, once or for each instance that the node makes of its mesh."""
+        document, world = self.document, self.mesh_world(node)
+        extensions = document.get(document.items("nodes")[node], "extensions", dict, {})
+        attributes = document.get(document.get(extensions, INSTANCES, dict, {}), "attributes", dict, {})
+        columns = {
+            name: document.accessor(attributes[name], (kind,)).astype(np.float64)
+            for name, kind in (("TRANSLATION", "VEC3"), ("ROTATION", "VEC4"), ("SCALE", "VEC3"))
+            if name in attributes
+        }
+        if not columns:
+            return world[None]
+        counts = {len(column) for column in columns.values()}
+        if len(counts) > 1:
+            raise AssetError(document.subject, f"has instances with {min(counts)} and {max(counts)} places")
+        places = np.tile(np.eye(4), (counts.pop(), 1, 1))
+        if "ROTATION" in columns:
+            wxyz = columns["ROTATION"][:, [3, 0, 1, 2]]
+            length = np.linalg.norm(wxyz, axis=1, keepdims=True)
+            places[:, :3, :3] = rotation_matrices(np.where(length > 0, wxyz / length, [1.0, 0.0, 0.0, 0.0]))
+        if "SCALE" in columns:
+            places[:, :3, :3] *= columns["SCALE"][:, None]
+        if "TRANSLATION" in columns:
+            places[:, :3, 3] = columns["TRANSLATION"]
+        return world @ places
 
     def skin_matrices(self, skin: int) -> Array:
         """(joints, 4, 4): from a skinned mesh's own space to the scene, one a joint."""

@@ -25,6 +25,8 @@ Array = np.ndarray
 EXTENSION = "KHR_gaussian_splatting"
 _WIDTHS = (1, 3, 5, 7)
 _LINEAR = "lin_rec709_display"
+#: Bytes that any instance counts for: each costs time, however small it is.
+_LEAST = 1 << 14
 
 
 def has_splats(head: bytes) -> bool:
@@ -52,16 +54,17 @@ def read_gltf_splats(path: Path) -> SurfelFile:
             extensions = document.get(primitive, "extensions", dict, {}) if isinstance(primitive, dict) else {}
             settings = document.get(extensions, EXTENSION, dict)
             if settings is not None:
-                splats = _primitive(document, primitive, settings)
-                pieces.append(Piece(splats, tree.mesh_world(index), settings.get("colorSpace") == _LINEAR))
+                splats, places = _primitive(document, primitive, settings), tree.mesh_worlds(index)
+                document.take(max(len(places) - 1, 0) * max(splats.sh.nbytes, _LEAST))
+                pieces += [Piece(splats, place, settings.get("colorSpace") == _LINEAR) for place in places]
     if not pieces:
         raise AssetError(document.subject, "has no splats in its scene", "Export it again")
     notes = []
     if any((piece.splats.scale < 0).any() for piece in pieces):
         notes.append("negative scales: taken for the logarithms that drafts of the extension had")
         with np.errstate(over="ignore", invalid="ignore"):
-            for piece in pieces:
-                piece.splats.scale = np.exp(piece.splats.scale)
+            for splats in {id(piece.splats): piece.splats for piece in pieces}.values():
+                splats.scale = np.exp(splats.scale)
     file = join_pieces(pieces, path, EXTENSION, "y")
     file.notes += notes
     return file

@@ -98,6 +98,48 @@ def test_node_transforms_compose_and_mirrors_keep_the_outside(tmp_path: Path) ->
     np.testing.assert_allclose(mesh.corner_normals[0, 0], [0, -1, 0], atol=1e-6)
 
 
+def test_instances_are_what_nodes_in_their_places_are(tmp_path: Path) -> None:
+    """EXT_mesh_gpu_instancing, with a mirrored instance, and one of other nodes with the same transforms."""
+    rng = np.random.default_rng(4)
+    turns = rng.normal(size=(3, 4))
+    columns = {
+        "translation": rng.normal(size=(3, 3)),
+        "rotation": turns / np.linalg.norm(turns, axis=1, keepdims=True),
+        "scale": rng.uniform(0.5, 2, (3, 3)) * [[1, 1, 1], [-1, 1, 1], [1, 1, 1]],
+    }
+    found = []
+    for instanced in (True, False):
+        b = quad({"translation": [1, 2, 3], "rotation": [0, 0.6, 0, 0.8], "scale": [1, 2, 3]})
+        rows = np.random.default_rng(5).uniform(0.1, 1, (4, 3)).astype(np.float32)
+        attributes = b.json["meshes"][0]["primitives"][0]["attributes"]
+        attributes |= {"NORMAL": b.accessor(rows, "VEC3"), "COLOR_0": b.accessor(rows, "VEC3")}
+        attributes["TEXCOORD_0"] = b.accessor(np.ascontiguousarray(rows[:, :2]), "VEC2")
+        if instanced:
+            places = {k.upper(): b.accessor(v.astype(np.float32), f"VEC{v.shape[1]}") for k, v in columns.items()}
+            b.json["nodes"][0]["extensions"] = {"EXT_mesh_gpu_instancing": {"attributes": places}}
+            b.json["extensionsRequired"] = ["EXT_mesh_gpu_instancing"]
+        else:
+            node = b.json["nodes"][0]
+            node["children"] = [1, 2, 3]
+            mesh = node.pop("mesh")
+            b.json["nodes"] += [{"mesh": mesh, **{k: v[i].tolist() for k, v in columns.items()}} for i in range(3)]
+        found.append(read_mesh(b.write(tmp_path / "a.gltf")))
+    ours, wanted = found
+    assert len(ours.faces) == 6 and not any("instancing" in note for note in ours.notes)
+    np.testing.assert_array_equal(ours.faces, wanted.faces)
+    for name in ("vertices", "corner_normals", "corner_uvs", "vertex_colours"):
+        np.testing.assert_allclose(getattr(ours, name), getattr(wanted, name), atol=1e-5, err_msg=name)
+
+
+def test_instances_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+    b = quad()
+    places = {"TRANSLATION": b.accessor(np.zeros((3, 3), np.float32), "VEC3")}
+    places["SCALE"] = b.accessor(np.ones((2, 3), np.float32), "VEC3")
+    b.json["nodes"][0]["extensions"] = {"EXT_mesh_gpu_instancing": {"attributes": places}}
+    with pytest.raises(AssetError, match="2 and 3 places"):
+        read_mesh(b.write(tmp_path / "a.gltf"))
+
+
 def test_strips_and_fans_are_the_same_quad(tmp_path: Path) -> None:
     for mode, order in ((5, [0, 1, 2, 3]), (6, [0, 1, 3, 2])):
         b = quad(mode=mode)
