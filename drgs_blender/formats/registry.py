@@ -161,7 +161,7 @@ FORMATS: tuple[Format, ...] = (
         "glTF 2.0",
         _sniff_gltf,
         _read_gltf,
-        "metallic-roughness materials; skins in Blender's rest pose; turned to Z up; not Draco or meshopt",
+        "metallic-roughness materials; instances; skins in Blender's rest pose; turned to Z up; not Draco or meshopt",
     ),
     Format(
         "Wavefront OBJ",

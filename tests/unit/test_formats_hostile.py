@@ -25,6 +25,7 @@ from drgs_blender.errors import AssetError, WriteError
 from drgs_blender.formats import gltf_document, usd_stage
 from drgs_blender.formats.axes import scaled_surfels
 from drgs_blender.formats.glb import Glb
+from drgs_blender.formats.gltf_nodes import INSTANCES
 from drgs_blender.formats.gltf_splats import write_gltf_splats
 from drgs_blender.formats.registry import read_mesh, read_surfels
 from drgs_blender.formats.splat_ply import write_splat_ply
@@ -36,25 +37,54 @@ SPLATS = {f".{w.extensions[-1][1:]}": w.write for w in WRITERS if w.kind == "spl
 MESHES = {w.extensions[0]: w.write for w in WRITERS if w.kind == "mesh"}
 
 
-def placed(path: Path, nodes: int) -> Path:
-    """A GLB with a mesh of 300 triangles that so many nodes place."""
+def placed(path: Path, count: int, instanced: bool) -> Path:
+    """A GLB with a mesh of 300 triangles that so many nodes, or one with so many instances, place."""
     glb, random = Glb(), np.random.default_rng(1)
     position = glb.accessor(random.normal(size=(900, 3)).astype(np.float32), bounds=True)
+    if instanced:
+        places = {"TRANSLATION": glb.accessor(np.zeros((count, 3), np.float32))}
+        nodes = [{"mesh": 0, "extensions": {INSTANCES: {"attributes": places}}}]
+    else:
+        nodes = [{"mesh": 0, "translation": [i, 0, 0]} for i in range(count)]
     glb.json |= {
         "scene": 0,
-        "scenes": [{"nodes": list(range(nodes))}],
-        "nodes": [{"mesh": 0, "translation": [i, 0, 0]} for i in range(nodes)],
+        "scenes": [{"nodes": list(range(len(nodes)))}],
+        "nodes": nodes,
         "meshes": [{"primitives": [{"attributes": {"POSITION": position}}]}],
     }
     glb.write(path)
     return path
 
 
-def test_meshes_are_not_placed_without_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gltf_document, "_COPIES", 1 << 18)
-    assert len(read_mesh(placed(tmp_path / "a.glb", 20)).faces) == 20 * 300
+@pytest.mark.parametrize("instanced", [False, True])
+def test_meshes_are_not_placed_without_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, instanced: bool) -> None:
+    monkeypatch.setattr(gltf_document, "_COPIES", 1 << 20)
+    assert len(read_mesh(placed(tmp_path / "a.glb", 20, instanced)).faces) == 20 * 300
     with pytest.raises(AssetError, match=r"b\.glb: repeats its meshes .* Export the object once"):
-        read_mesh(placed(tmp_path / "b.glb", 500))
+        read_mesh(placed(tmp_path / "b.glb", 2000, instanced))
+
+
+def test_splats_are_not_placed_without_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gltf_document, "_COPIES", 1 << 20)
+    for count in (9, 2000):
+        with monkeypatch.context() as patch:
+            patch.setattr(Glb, "write", instances(Glb.write, count))
+            write_gltf_splats(tmp_path / f"{count}.glb", random_splats(5))
+    wanted = random_splats(5).centre + np.arange(9)[:, None, None] * [1, 0, 0]
+    np.testing.assert_allclose(read_surfels(tmp_path / "9.glb").surfels.centre, wanted.reshape(-1, 3), atol=1e-5)
+    with pytest.raises(AssetError, match=r"2000\.glb: repeats its meshes"):
+        read_surfels(tmp_path / "2000.glb")
+
+
+def instances(write: Callable[[Glb, Path], None], count: int) -> Callable[[Glb, Path], None]:
+    """`Glb.write` of a file whose first node places its mesh `count` times, a metre apart."""
+
+    def changed(glb: Glb, path: Path) -> None:
+        along = np.arange(count, dtype=np.float32)[:, None] * np.float32([1, 0, 0])
+        glb.json["nodes"][0]["extensions"] = {INSTANCES: {"attributes": {"TRANSLATION": glb.accessor(along)}}}
+        write(glb, path)
+
+    return changed
 
 
 def test_accessors_without_data_are_not_taken_without_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -236,6 +266,9 @@ def test_names_that_are_no_text(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert r"caf\\xe9.ply" in capsys.readouterr().out
     write_gltf_splats(Path(name + ".glb"), random_splats(5))
     assert rb"caf\\xe9" in Path(name + ".glb").read_bytes()
+    Path(name + ".usda").write_text("#usda 1.0\n")
+    assert main(["import", name + ".usda", "--no-mesh", "--out", name + ".drgs"]) == 65
+    assert "is no text, and USD takes no other. Rename it" in capsys.readouterr().err
 
 
 def test_a_pattern_without_frames_is_those_that_are_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
