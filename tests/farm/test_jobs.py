@@ -121,7 +121,6 @@ def test_what_a_node_would_refuse_is_refused_here(drgs, tmp_path, options):
     assert not (tmp_path / "job").exists()
 
 
-@node
 @pytest.mark.parametrize("place", ["--sbatch=--partition=farm\ntouch ran", "--to=job\ntouch ran"])
 def test_line_breaks_become_no_lines_of_the_script(drgs, tmp_path, monkeypatch, place):
     monkeypatch.chdir(tmp_path)
@@ -130,6 +129,21 @@ def test_line_breaks_become_no_lines_of_the_script(drgs, tmp_path, monkeypatch, 
     code, _, error = drgs(*job, place)
     assert code == 64 and "line break" in error
     assert not list(tmp_path.rglob("*.sbatch"))
+
+
+@pytest.mark.skipif(not shutil.which("bash"), reason="the script is one of bash")
+@pytest.mark.parametrize(("code", "attempt", "ends"), [(75, 0, 75), (73, 0, 75), (65, 0, 65), (75, 3, 1), (73, 3, 1)])
+def test_chunks_are_given_back_where_users_may_not_requeue(drgs, tmp_path, code, attempt, ends):
+    """`RequeueExit=75` of slurm.conf does it then, of a chunk that met a full disk too."""
+    (tmp_path / "a.blend").touch()
+    (tmp_path / "scontrol").write_text("#!/bin/sh\nexit 1\n")
+    (tmp_path / "scontrol").chmod(0o755)
+    job = ["submit", "slurm", tmp_path / "a.blend", "--frames", "1", "--out", tmp_path / "####.exr", "--no-check"]
+    assert drgs(*job, "--to", tmp_path / "job", "--drgs", f"sh -c 'exit {code}'")[0] == 0
+    own = {"SLURM_ARRAY_TASK_ID": "0", "SLURM_ARRAY_JOB_ID": "1", "SLURM_RESTART_COUNT": str(attempt)}
+    environment = os.environ | own | {"DRGS_PAUSE": "0", "PATH": f"{tmp_path}:{os.environ['PATH']}"}
+    done = subprocess.run(["bash", tmp_path / "job" / "render.sbatch"], env=environment, capture_output=True)
+    assert done.returncode == ends, done.stdout
 
 
 @pytest.mark.skipif(os.name == "nt", reason="backslashes part folders there")
@@ -151,6 +165,7 @@ def test_names_of_any_bytes_reach_the_script(drgs, tmp_path):
     assert os.fsencode(folder / "a.blend") in (folder / "job" / "render.sbatch").read_bytes()
 
 
+@node
 def test_flamenco_chunks_as_its_own_tests_say():
     for (frames, size), chunks in CHUNKS.items():
         assert manager(chunk=[frames, size]) == chunks

@@ -37,6 +37,7 @@ if ((code == {again} || code == {full})); then
   # Slurm ends this script here. Where users may not requeue, RequeueExit={again} of slurm.conf does it.
   # SLURM_JOB_ID of the last task is that of the whole array.
   scontrol requeue "${{SLURM_ARRAY_JOB_ID}}_$SLURM_ARRAY_TASK_ID" && sleep 60
+  exit {again}
 fi
 exit $code
 """
