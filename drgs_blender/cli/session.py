@@ -91,14 +91,7 @@ def serve(folder: Path, idle: int) -> int:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     with Machine(keep=True) as machine:
         machine.engine().start()
-        lock = Lock(folder / "lock")
-        if not lock.take(1.0):
-            raise UsageError(f"session {folder}", "is running", "Stop it, or choose another folder")
-        for old in folder.iterdir():  # of a session that was killed
-            if old.name not in ("lock", "log"):
-                old.unlink()
-        (folder / "pid").write_text(str(os.getpid()))
-        life = _Life(folder, idle)
+        life = _Life(folder, idle, _take_over(folder))
         while True:
             for request in folder.glob("request-*.json"):
                 about = json.loads(request.read_text())
@@ -109,6 +102,19 @@ def serve(folder: Path, idle: int) -> int:
                 if code in (130, 143):  # it was asked to end while it worked
                     return 0
             time.sleep(POLL_SECONDS)
+
+
+def _take_over(folder: Path) -> Lock:
+    """Make `folder` that of this process: the lock on it."""
+    lock = Lock(folder / "lock")
+    # What a killed session left. It is listed before the lock is taken: from then on chunks may come.
+    old = [path for path in folder.iterdir() if path.name not in ("lock", "log")]
+    if not lock.take(1.0):
+        raise UsageError(f"session {folder}", "is running", "Stop it, or choose another folder")
+    for path in old:
+        path.unlink(missing_ok=True)
+    (folder / "pid").write_text(str(os.getpid()))
+    return lock
 
 
 def _answer(folder: Path, about: dict[str, Any], machine: Machine) -> int:
@@ -124,7 +130,7 @@ def _answer(folder: Path, about: dict[str, Any], machine: Machine) -> int:
         os.chdir(about["cwd"])
     with (
         open(folder / f"{name}.out", "w", encoding="utf-8", errors="backslashreplace", buffering=1) as out,
-        open(folder / f"{name}.err", "w", encoding="utf-8", buffering=1) as err,
+        open(folder / f"{name}.err", "w", encoding="utf-8", errors="backslashreplace", buffering=1) as err,
         contextlib.redirect_stdout(out),
         contextlib.redirect_stderr(err),
     ):
@@ -136,8 +142,9 @@ def _answer(folder: Path, about: dict[str, Any], machine: Machine) -> int:
 class _Life:
     """Asks this process to end when nobody needs it any more."""
 
-    def __init__(self, folder: Path, idle: int) -> None:
+    def __init__(self, folder: Path, idle: int, lock: Lock) -> None:
         self._folder, self._idle = folder, idle
+        self._lock = lock  # which goes with this process
         self._waits: Path | None = None
         self._since = self._born = time.monotonic()
         self._ancestors = _ancestors()

@@ -13,6 +13,8 @@ from pathlib import Path
 import pytest
 from processes import all_gone
 
+from drgs_blender.cli.frame_range import parse_frames
+
 from .conftest import PROGRAM, same_pixels
 
 pytest.importorskip("openjd.cli")
@@ -52,6 +54,31 @@ def test_bundle_renders_and_denoises_what_one_machine_does(drgs, folder, tmp_pat
     (pid,) = re.findall(r"session \S+: process (\d+)", result.stdout)
     assert all_gone([int(pid)], 5)
     assert "openjd_progress: 100.0" in result.stdout
+
+
+#: Stands for drgs: notes the frames it is given, and takes half a second for them.
+NOTES = """#!/bin/sh
+for word; do case $word in --frames=*) echo "$1 ${{word#*=}}" >>{log}; sleep 0.5;; esac; done
+"""
+
+
+def test_schedulers_adapt_chunks_and_every_frame_is_made_once(drgs, tmp_path):
+    (tmp_path / "a.blend").touch()
+    program, log = tmp_path / "drgs.sh", tmp_path / "log"
+    program.write_text(NOTES.format(log=log))
+    program.chmod(0o755)
+    frames = "-3-9x2,20,21,30-41"
+    job = ["submit", "openjd", tmp_path / "a.blend", "--no-check", "--to", tmp_path / "job", "--drgs", program]
+    job += [f"--frames={frames}", "--out", "//f/####.exr", "--denoised", "//g/####.exr"]
+    code, lines, error = drgs(*job, "--chunk", 1, "--chunk-seconds", 5)
+    assert code == 0, error
+    ran = subprocess.run([*OPENJD, *shlex.split(lines[-1])[1:]], capture_output=True, text=True, timeout=120)
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    told = [line.split() for line in log.read_text().splitlines()]
+    for command in ("render", "denoise"):
+        chunks = [parse_frames(text) for name, text in told if name == command]
+        assert sorted(frame for chunk in chunks for frame in chunk) == sorted(parse_frames(frames))
+        assert len(chunks[0]) == 1 < max(map(len, chunks))  # it begins with what it is told, and learns
 
 
 def test_template_is_valid_for_all_ranges_and_sessions_end_where_nothing_renders(drgs, tmp_path):

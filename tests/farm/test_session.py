@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from processes import all_gone, children, listening
 
-from drgs_blender.cli import denoise, session_link
+from drgs_blender.cli import denoise, session, session_link
 from drgs_blender.errors import EngineError
 from drgs_blender.render.picture.frames import read_frame
 
@@ -91,6 +91,8 @@ def test_what_fails_has_its_code_and_the_session_goes_on(folder, warm, tmp_path,
     scene, out = folder / "relative.blend", tmp_path / "out"
     code, lines, errors = told(folder / "blind.blend", out, warm, "1")
     assert (code, lines) == (64, ["DRGS_EXIT class=usage"]) and "has no camera" in errors
+    code, lines, errors = told(tmp_path / os.fsdecode(b"\xff.blend"), out, warm, "1")
+    assert (code, lines) == (65, ["DRGS_EXIT class=bad-asset"]) and "does not exist" in errors
     disk = small_disk("size=16k")
     (disk / "filler").write_bytes(bytes(16 << 10))
     assert told(scene, disk, warm, "1")[0] == 73
@@ -205,6 +207,22 @@ def test_session_ends_without_its_folder_its_farm_or_work(tmp_path):
         worker.kill()
         worker.wait()
     assert soon(lambda: not session_link.is_running(places[1]))
+
+
+def test_chunk_that_comes_at_once_is_not_taken_for_an_old_one(tmp_path, monkeypatch):
+    """Whoever sees the lock taken may ask, before the new session has tidied up what a killed one left."""
+    (tmp_path / "request-00000000.json").touch()
+
+    class Seen(session_link.Lock):
+        def take(self, patience: float = 0.0) -> bool:
+            taken = super().take(patience)
+            (tmp_path / "request-11111111.json").touch()
+            return taken
+
+    monkeypatch.setattr(session, "Lock", Seen)
+    lock = session._take_over(tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["lock", "pid", "request-11111111.json"]
+    lock.close()
 
 
 @pytest.mark.parametrize("action", ["start", "serve"])
