@@ -64,3 +64,22 @@ def test_the_pipeline_says_so_before_it_renders(monkeypatch: pytest.MonkeyPatch)
     frame = Frame(1, camera, [], settings=RenderSettings(denoise="oidn"))
     with pytest.raises(DeviceError, match="OIDN"):
         render(None, None, None, frame)  # type: ignore[arg-type]
+
+
+@pytest.mark.skipif(not available(), reason="the wheel pyoidn is not installed")
+def test_no_light_is_put_where_nothing_is_covered() -> None:
+    """It would shine in a transparent film, over whatever is laid behind."""
+    _, light, guides = noisy()
+    for split in (True, False):
+        found = denoise_oidn(light, guides, split)
+        assert found[:, 46:48].sum() > 0 and not found[guides.coverage == 0].any()
+
+
+@pytest.mark.skipif(not available(), reason="the wheel pyoidn is not installed")
+@pytest.mark.parametrize("shape", [(1, 1), (1, 40), (90, 1), (2, 3), (17, 30), (64, 64)])
+def test_even_light_stays_even_up_to_the_borders(shape: tuple[int, int]) -> None:
+    grey, flat = np.full((*shape, 3), 0.5, np.float32), np.zeros(shape, np.float32)
+    normal = np.broadcast_to(np.float32([0, -1, 0]), (*shape, 3))
+    guides = Guides(flat + 1, 0 * grey, normal, grey, flat, flat, flat, flat + 1)
+    light = np.full((*shape, 4, 3), 0.25, np.float32)
+    np.testing.assert_allclose(denoise_oidn(light, guides), light, rtol=0.01)

@@ -15,6 +15,10 @@ from .denoise import Guides
 
 Array = np.ndarray
 
+#: Pixels of its own mirror image around a picture while it is filtered. The network takes what lies beyond a picture
+#: for black: an even grey came out with 0.93 to 1.16 of its light along the borders, and with 0.4 in a single pixel.
+MARGIN = 16
+
 
 def available() -> bool:
     """Whether `denoise_oidn` can work here."""
@@ -52,7 +56,7 @@ def denoise_oidn(
 
     Returns
     -------
-    (h, w, 4, 3) float32
+    (h, w, 4, 3) float32; 0 where nothing is covered
 
     Raises
     ------
@@ -60,15 +64,21 @@ def denoise_oidn(
     """
     run = require()
     cover = guides.coverage[..., None]
-    albedo = np.ascontiguousarray(guides.albedo * cover, np.float32)
-    normal = np.ascontiguousarray(guides.normal * cover, np.float32)
+    albedo, normal = _widened(guides.albedo * cover), _widened(guides.normal * cover)
     light = np.nan_to_num(components, nan=0.0, posinf=0.0, neginf=0.0)
     out = np.zeros_like(light)
     noisy = [light[:, :, k] for k in range(4)] if split else [light.sum(axis=2)]
     for k, colour in enumerate(noisy):
         check()
         try:
-            out[:, :, k] = run(np.ascontiguousarray(colour), albedo, normal, hdr=True, clean_aux=True)
+            wide = run(_widened(colour), albedo, normal, hdr=True, clean_aux=True)
         except RuntimeError as error:
             raise DeviceError("denoiser OIDN", f"failed ({error})", "Choose SVGF") from error
+        out[:, :, k] = np.where(cover > 0, wide[MARGIN:-MARGIN, MARGIN:-MARGIN], 0)
     return out
+
+
+def _widened(picture: Array) -> Array:
+    """(h, w, 3) with the margin, contiguous."""
+    margin = (MARGIN, MARGIN)
+    return np.ascontiguousarray(np.pad(picture, (margin, margin, (0, 0)), mode="symmetric"), np.float32)
