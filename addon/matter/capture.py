@@ -168,10 +168,10 @@ def _capture_motion(
         describe_field(other) | {"frames": pushes if pushes != pushes[:1] * len(pushes) else pushes[:1]}
         for other, pushes in zip(pushing, rows)
     ]
-    if motion is not None and motion.close():
+    if motion is not None and motion.moved:
         data["motion"] = motion.path.name
     for entry, track in zip(data["colliders"], tracks):
-        if track.close():
+        if track.moved:
             entry["vertices"] = track.path.name
     if any(not np.array_equal(m, matrix) for m in matrices):
         np.save(folder / MATRICES, np.stack(matrices))
@@ -188,30 +188,35 @@ def _contact(settings: DrgsMatterCollider) -> dict[str, Any]:
 
 
 class _Track:
-    """Vertices of every frame on disk, for as long as they do not turn out to stand still."""
+    """Vertices of every frame on disk, for as long as they do not turn out to stand still.
+
+    They are appended, not mapped into memory: where the disk is full that is an error, and not the end of Blender.
+
+    Attributes
+    ----------
+    moved : whether anything did, so that the file exists
+    """
 
     def __init__(self, path: Path, first: Array, frames: int) -> None:
         self.path, self.first = path, first
         self._frames = frames
-        self._file: np.memmap | None = None
+        self.moved = False
 
     def add(self, index: int, vertices: Array) -> None:
         """Take the vertices of a frame in; frames come in order."""
-        if self._file is None:
-            if np.array_equal(vertices, self.first):
-                return
-            shape = (self._frames, *self.first.shape)
-            self._file = np.lib.format.open_memmap(self.path, "w+", np.float32, shape)
-            self._file[:index] = self.first
-        self._file[index] = vertices
+        if self.moved:
+            self._append([vertices])
+        elif not np.array_equal(vertices, self.first):
+            self.moved = True
+            with open(self.path, "wb") as file:
+                about = {"descr": "<f4", "fortran_order": False, "shape": (self._frames, *self.first.shape)}
+                np.lib.format.write_array_header_1_0(file, about)
+            self._append([self.first] * index + [vertices])
 
-    def close(self) -> bool:
-        """Whether anything moved, so that the file exists."""
-        if self._file is None:
-            return False
-        self._file.flush()
-        self._file = None
-        return True
+    def _append(self, frames: list[Array]) -> None:
+        with open(self.path, "ab") as file:
+            for vertices in frames:
+                file.write(np.ascontiguousarray(vertices, "<f4").tobytes())
 
 
 def _depsgraph() -> bpy.types.Depsgraph:

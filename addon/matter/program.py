@@ -11,7 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from ...drgs_blender.engine.child import clean_environment
-from ...drgs_blender.errors import AssetError, EngineError, UsageError
+from ...drgs_blender.errors import EXIT_CANNOT_WRITE, AssetError, EngineError, UsageError, WriteError
 from .. import engine_link
 from . import capture
 
@@ -66,7 +66,7 @@ class Program:
 
     def __init__(self, inputs: Path, folder: Path, threads: int = 0) -> None:
         self._counts: tuple[int, int] | None = None
-        self._inputs = inputs
+        self._inputs, self._folder = inputs, folder
         self._said, self._log = inputs / capture.SAID, inputs / capture.LOG
         command = engine_link.command_line()
         python = command[: command.index("-m")]
@@ -120,7 +120,7 @@ class Program:
 
         Raises
         ------
-        AssetError, EngineError
+        AssetError, WriteError, EngineError
             It could not do its work.
         """
         lines = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
@@ -131,6 +131,9 @@ class Program:
         said = next((line for line in reversed(lines) if line.startswith("drgs: ")), "")
         if said:
             raise AssetError(subject, self._in_words(said.removeprefix("drgs: ")).rstrip("."), held)
+        if code == EXIT_CANNOT_WRITE:  # nor could its log
+            remedy = "Free some space or choose another folder, and bake again"
+            raise WriteError(f"{subject}, {self._folder}", "cannot be written", f"{remedy}. {held}".rstrip(". "))
         last = lines[-1][:300] if lines else "it said nothing"
         remedy = "Bake again: it goes on" + (f". {held}" if held else "")
         raise EngineError(subject, f"the engine's program ended ({code}): {last.rstrip('.')}", remedy)

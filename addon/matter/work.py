@@ -18,18 +18,22 @@ import bpy
 import numpy as np
 
 from ...drgs_blender.errors import DrgsError, UsageError
+from ...drgs_blender.matter import MATERIALS
 from ...drgs_blender.particle_cache import ParticleCache
 from .. import messages
 from ..export.memory import uid
 from . import capture, playback, points
 from .describe import check, describe, folder_of, own_folder, subject_of
 from .program import Program, ending
+from .properties import DrgsMatterSettings
 
 #: Where a capture lies inside the cache.
 INPUT = "drgs_input"
-#: Steps of particles that a core makes in a second at best (bench/bench_simulate.py measures it); seconds that a frame
-#: takes besides, and the start.
-_RATE, _FRAME, _START = 5e6, 0.1, 5.0
+#: Steps of particles that a core makes in a second at best, by model of matter (bench/bench_simulate.py measures it);
+#: models that need singular values, and the quick look.
+_RATES, _SLOW, _QUICK = {"elastic": 1.2e7, "fluid": 1e7}, 2.7e6, 1.5e8
+#: Seconds that the start takes, a frame besides, and a particle in it.
+_START, _FRAME, _KEEP = 3.0, 0.02, 5e-7
 
 #: What is being done, by the `uid` of its object.
 running: dict[int, Work] = {}
@@ -130,7 +134,7 @@ class Work:
         if self._program is None:
             return 0.0, f"Reading the scene {self._captured:.0%}"
         counts = self._program.counts
-        return 0.0, "Filling the object" if counts is None else f"{counts[0]:,} particles"
+        return 0.0, "Preparing (longer the first time)" if counts is None else f"{counts[0]:,} particles"
 
     def _take(self, seconds: float) -> bool:
         """Take in what is new, for about `seconds`; whether there was anything."""
@@ -304,9 +308,14 @@ def object_of(key: int) -> bpy.types.Object | None:
     return next((obj for obj in bpy.data.objects if obj.session_uid == key), None)
 
 
-def estimate(counts: tuple[int, int], frames: int, cores: int) -> float:
+def estimate(matter: DrgsMatterSettings, counts: tuple[int, int], cores: int) -> float:
     """Seconds that a bake takes at least, from particles and time steps a frame."""
-    return _START + frames * (_FRAME + counts[0] * counts[1] / (_RATE * max(1, cores) ** 0.85))
+    particles, steps = counts
+    rate = max(_RATES.get(MATERIALS[part.material].model, _SLOW) for part in (matter, *matter.regions))
+    if matter.solver != "mpm":
+        rate = _QUICK
+    frame = _FRAME + _KEEP * particles + particles * steps / (rate * max(1, cores) ** 0.85)
+    return _START + (matter.frame_end - matter.frame_start) * frame
 
 
 def clock(seconds: float) -> str:

@@ -92,7 +92,7 @@ class DRGS_PT_matter(_Physics, bpy.types.Panel):
             row.operator("drgs.hide_preview", text="", icon="X")
             render = context.scene.render
             cores = render.threads if render.threads_mode == "FIXED" else os.cpu_count() or 1
-            least = work.clock(work.estimate(fill.counts, matter.frame_end - matter.frame_start, cores))
+            least = work.clock(work.estimate(matter, fill.counts, cores))
             column = self.layout.column(align=True)
             column.label(text=f"{fill.counts[0]:,} particles, {fill.counts[1]} steps a frame")
             column.label(text=f"At least {least} to bake")
