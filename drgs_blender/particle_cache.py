@@ -14,6 +14,7 @@ from __future__ import annotations
 import json
 import os
 import re
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -27,7 +28,7 @@ from .errors import AssetError, UsageError, WriteError
 Array = np.ndarray
 
 VERSION = 1
-_HEADER, _REST, _STATE = "cache.json", "rest.drgp", "state.drgp"
+HEADER, _REST, _STATE = "cache.json", "rest.drgp", "state.drgp"
 _NAME = re.compile(r"frame_(-?\d+)\.drgp")
 _AGAIN = "Bake again"
 
@@ -39,6 +40,7 @@ class Header:
     Attributes
     ----------
     digest : of the settings and the mesh; another one means other frames
+    moves : of what moves in each frame, see `simulate.digest`
     points, vertices : counts
     first : frame at which all is at rest
     fps : frames a second
@@ -55,6 +57,7 @@ class Header:
     version: int = VERSION
     tear: float = 0.0
     grain: float = 0.0
+    moves: list[str] = field(default_factory=list)
 
 
 @dataclass(slots=True)
@@ -104,20 +107,32 @@ class ParticleCache:
             ) from error
         self.clear()
         _write(self.folder / _REST, _members_of(rest))
-        replace_file(self.folder / _HEADER, [json.dumps(asdict(header), indent=1).encode()])
+        self._write_header(header)
+
+    def extend(self, header: Header, last: int) -> None:
+        """Go on under another header: frames after `last` are removed."""
+        self._remove([self.path(frame) for frame in self.frames() if frame > last])
+        self._write_header(header)
+
+    def _write_header(self, header: Header) -> None:
+        replace_file(self.folder / HEADER, [json.dumps(asdict(header), indent=1).encode()])
 
     def clear(self) -> None:
         """Remove all files of a cache, the header first: what is left then is no cache."""
-        for path in [self.folder / name for name in (_HEADER, _STATE, _REST)] + [self.path(f) for f in self.frames()]:
+        self._remove([self.folder / name for name in (HEADER, _STATE, _REST)] + [self.path(f) for f in self.frames()])
+        with suppress(OSError):
+            for stray in self.folder.glob(".*.drgp.*.tmp"):
+                stray.unlink(missing_ok=True)
+
+    @staticmethod
+    def _remove(paths: Iterable[Path]) -> None:
+        for path in paths:
             try:
                 path.unlink(missing_ok=True)
             except OSError as error:
                 raise WriteError(
                     str(path), f"cannot be removed ({error.strerror or error})", "Check permissions"
                 ) from error
-        with suppress(OSError):
-            for stray in self.folder.glob(".*.drgp.*.tmp"):
-                stray.unlink(missing_ok=True)
 
     def header(self) -> Header | None:
         """What the folder holds; None where it is no cache.
@@ -127,7 +142,7 @@ class ParticleCache:
         AssetError
             The header is damaged, or of a later version of DR-GS.
         """
-        path = self.folder / _HEADER
+        path = self.folder / HEADER
         try:
             text = path.read_text(encoding="utf-8")
         except FileNotFoundError:

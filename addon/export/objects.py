@@ -36,10 +36,12 @@ class DrgsObjects:
         Raises
         ------
         AssetError
-            Its asset is missing, or the evaluated mesh is not the asset's, moved; names object and modifiers.
+            Its asset or what it plays is missing, or the evaluated mesh is not the asset's, moved; names object and
+            modifiers.
         """
         obj = item.object
         check_modifiers(obj, self._depsgraph)
+        playback.check(obj, self._warn, final=self._depsgraph.mode == "RENDER")
         look = obj.drgs.adjustment.values(), *playback.look_of(obj).items()
         shape = self._memory.recall(
             ("object", uid(obj), obj.name, obj.data.as_pointer(), obj.mode, str(assets.file_of(obj)), look),

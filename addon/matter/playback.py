@@ -13,7 +13,7 @@ from __future__ import annotations
 import logging
 import struct
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -21,8 +21,8 @@ import bpy
 import numpy as np
 
 from ...drgs_blender.asset.archive import replace_file
-from ...drgs_blender.errors import DrgsError, UsageError, WriteError
-from ...drgs_blender.particle_cache import Header, ParticleCache
+from ...drgs_blender.errors import AssetError, DrgsError, UsageError, WriteError
+from ...drgs_blender.particle_cache import HEADER, Header, ParticleCache
 
 Array = np.ndarray
 log = logging.getLogger(__name__)
@@ -49,7 +49,7 @@ class Playback:
         self.path = folder / FILE
         self.count = 0
         self._cache, self._matrices = ParticleCache(folder), matrices
-        self._checked = ""
+        self._checked: tuple[str, list[str]] | None = None
 
     def follow(self, seconds: float = float("inf")) -> int:
         """Append frames that the cache has and the file lacks, for about `seconds`.
@@ -72,9 +72,9 @@ class Playback:
         until = time.monotonic() + seconds
         there = set(self._cache.frames())
         try:
-            if self._checked != header.digest:
+            if self._checked != (header.digest, header.moves):
                 self.count = self._count_of(header, there)
-                self._checked = header.digest
+                self._checked = header.digest, header.moves
             while header.first + self.count in there:
                 self._append(header)
                 if time.monotonic() > until:
@@ -135,14 +135,41 @@ def modifier_of(obj: bpy.types.Object) -> bpy.types.Modifier | None:
     return next((m for m in obj.modifiers if m.type == "MESH_CACHE" and m.name.startswith(MODIFIER)), None)
 
 
+def check(obj: bpy.types.Object, warn: Callable[[str], None], *, final: bool) -> None:
+    """See that what an object plays came along to this machine.
+
+    Raises
+    ------
+    AssetError
+        It did not: Blender would show the object as if it had never been simulated.
+    """
+    modifier = modifier_of(obj)
+    if modifier is None or not (modifier.show_render if final else modifier.show_viewport):
+        return
+    path = _path_of(obj, modifier)
+    if not path.exists():
+        raise AssetError(
+            f'Object "{obj.name}"',
+            f"its simulated frames are not there: {path} does not exist",
+            "Bring the folder along with the .blend, bake again, or use Free Cache",
+        )
+    matter = obj.drgs.matter
+    # While a bake begins anew there is none for a moment; then nobody waits for a final picture.
+    if final and (matter.tear or matter.grain) and not (path.parent / HEADER).exists():
+        warn(f'"{obj.name}": {path.parent / HEADER} does not exist; its tears and grains are not shown')
+
+
+def _path_of(obj: bpy.types.Object, modifier: bpy.types.Modifier) -> Path:
+    return Path(bpy.path.abspath(modifier.filepath, library=obj.library))
+
+
 def look_of(obj: bpy.types.Object) -> dict[str, float]:
     """`tear` and `grain` of the played mesh, see `frame.ObjectState`; empty where nothing is played."""
     modifier, matter = modifier_of(obj), obj.drgs.matter
     if modifier is None:
         return {}
     with suppress(DrgsError):  # a damaged cache plays all the same; the next bake says it
-        path = Path(bpy.path.abspath(modifier.filepath, library=obj.library))
-        header = ParticleCache(path.parent).header()
+        header = ParticleCache(_path_of(obj, modifier).parent).header()
         if header is not None:
             return {"tear": header.tear * matter.tear, "grain": header.grain * matter.grain}
     return {}

@@ -17,6 +17,7 @@ import sys
 import threading
 import time
 import traceback
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -193,7 +194,21 @@ def outside_files() -> list[tuple[str, str]]:
     stored = bpy.utils.blend_paths(absolute=False, packed=False, local=False)
     found = bpy.utils.blend_paths(absolute=True, packed=False, local=False)
     brushes = f"{os.sep}{os.path.join('datafiles', 'assets', 'brushes')}{os.sep}"  # Blender's own, on every node
-    return sorted({pair for pair in zip(stored, found) if brushes not in pair[1]})
+    return sorted({pair for pair in (*zip(stored, found), *_caches()) if brushes not in pair[1]})
+
+
+def _caches() -> Iterator[tuple[str, str]]:
+    """What Mesh Cache modifiers play, which Blender does not name; of simulated matter also what it was made of."""
+    import bpy
+
+    for obj in bpy.data.objects:
+        for modifier in obj.modifiers:
+            if modifier.type == "MESH_CACHE" and modifier.filepath:
+                stored, found = modifier.filepath, bpy.path.abspath(modifier.filepath, library=obj.library)
+                yield stored, found
+                if modifier.name.startswith("DR-GS Matter"):
+                    cut = len(os.path.basename(stored.replace("\\", "/")))
+                    yield stored[:-cut] + "cache.json", os.path.join(os.path.dirname(found), "cache.json")
 
 
 def differences(scene: Any) -> list[str]:

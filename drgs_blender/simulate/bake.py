@@ -9,6 +9,7 @@ from dataclasses import asdict
 
 from ..errors import UsageError
 from ..particle_cache import Header, ParticleCache
+from .digest import same_until
 from .job import Job
 
 log = logging.getLogger(__name__)
@@ -49,13 +50,13 @@ def bake(
         What was done stays.
     """
     settings, solver = job.settings, job.solver
-    start = _resume(job, cache, overwrite)
+    rest = job.rest()
+    header = Header(
+        job.digest, len(rest.points), len(rest.vertices), settings.first, settings.fps, asdict(settings),
+        tear=job.tear, grain=job.grain, moves=job.moves,
+    )  # fmt: skip
+    start = _resume(job, cache, header, overwrite)
     if start is None:
-        rest = job.rest()
-        header = Header(
-            job.digest, len(rest.points), len(rest.vertices), settings.first, settings.fps, asdict(settings),
-            tear=job.tear, grain=job.grain,
-        )  # fmt: skip
         cache.create(header, rest)
         cache.write(settings.first, rest)
         start = settings.first
@@ -80,7 +81,7 @@ def bake(
 
 def _owned(cache: ParticleCache, job: Job) -> bool:
     header = cache.header()
-    return header is not None and header.digest == job.digest
+    return header is not None and (header.digest, header.moves) == (job.digest, job.moves)
 
 
 def _check_own(cache: ParticleCache, job: Job) -> None:
@@ -91,23 +92,26 @@ def _check_own(cache: ParticleCache, job: Job) -> None:
         )
 
 
-def _resume(job: Job, cache: ParticleCache, overwrite: bool) -> int | None:
+def _resume(job: Job, cache: ParticleCache, header: Header, overwrite: bool) -> int | None:
     """The last frame of this simulation in the cache, with the solver put there; None to begin anew."""
-    header = cache.header()
-    if header is None:
+    found, first = cache.header(), job.settings.first
+    if found is None:
         return None
-    if header.digest != job.digest:
+    state = cache.read_state()
+    frame, arrays = state or (first, {})
+    needed = min(frame, job.settings.last) - first
+    if found.digest != job.digest or not same_until(needed, found.moves, job.moves):
         if not overwrite:
             raise UsageError(
                 str(cache.folder), "holds another simulation", "Choose another folder, or overwrite it (--overwrite)"
             )
         return None
-    state, first = cache.read_state(), job.settings.first
     if state is None:
         return None
-    frame, arrays = state
     whole = set(range(first, frame + 1)) <= set(cache.frames())
     if not whole or not job.solver.restore(frame - first, arrays):
         log.info("%s: does not hold all that is needed to go on; begins again", cache.folder)
         return None
+    if frame < job.settings.last and found.moves != job.moves:
+        cache.extend(header, frame)
     return frame

@@ -73,8 +73,15 @@ class FieldRows:
     def __init__(self, fields: Sequence[ForceField]) -> None:
         self._frames = [np.array(field.frames, np.float64).reshape(-1, MOVING) for field in fields]
         self._still = np.array([field.row() for field in fields], np.float64).reshape(len(fields), _COLUMNS - MOVING)
-        #: What they accelerate by at most, but for vortices, m/s^2.
-        self.push = float(sum(np.abs(frames[:, _STRENGTH]).max() for frames in self._frames))
+
+    def push(self, frame: int) -> float:
+        """What they accelerate by at most, but for vortices, from `frame` to the next, m/s^2."""
+        return float(sum(max(abs(row[_STRENGTH]) for row in self._around(f, frame)) for f in self._frames))
+
+    @staticmethod
+    def _around(frames: Array, frame: int) -> list[Array]:
+        """The rows of `frame` and of the next; the last one stays."""
+        return [frames[min(f, len(frames) - 1)] for f in (frame, frame + 1)]
 
     def __len__(self) -> int:
         return len(self._frames)
@@ -84,7 +91,7 @@ class FieldRows:
         rows = np.empty((len(self), _COLUMNS))
         rows[:, MOVING:] = self._still
         for row, frames in zip(rows, self._frames, strict=True):
-            before, after = (frames[min(f, len(frames) - 1)] for f in (frame, frame + 1))
+            before, after = self._around(frames, frame)
             row[:MOVING] = (1 - part) * before + part * after
             row[_AXIS : _AXIS + 3] /= max(float(np.linalg.norm(row[_AXIS : _AXIS + 3])), 1e-12)
         return rows

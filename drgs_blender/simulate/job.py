@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import logging
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,10 +17,10 @@ from ..errors import AssetError, UsageError
 from ..formats.registry import read_mesh
 from ..matter import matter_of
 from ..particle_cache import ParticleFrame
-from ..version import __version__
 from .blocks import Domain
 from .colliders import Collider, lift_surface
 from .contact import Plane
+from .digest import digest_of, moves_of
 from .fill import Filling, fill
 from .lattice import Lattice
 from .settings import Region, Settings
@@ -49,7 +47,7 @@ class Job:
     settings : Settings
     filling : particles at rest, world
     solver : at the beginning
-    digest : names the settings and all that went into it; frames of equal digests are equal
+    digest, moves : what frames depend on, see `digest`
     tear, grain : see `frame.ObjectState`
     """
 
@@ -57,6 +55,7 @@ class Job:
     filling: Filling
     solver: Stepper
     digest: str
+    moves: list[str]
     tear: float
     grain: float
     _spacing: float
@@ -109,14 +108,14 @@ class _PinMotion:
         if motion.ndim != 3 or motion.shape[1:] != mesh.vertices.shape:
             expected = f"(frames, {len(mesh.vertices)}, 3)"
             raise UsageError("motion", f"has shape {motion.shape}, expected {expected}", "Export it from this mesh")
-        self._motion = motion
+        self.rows = motion
         self._matrix = matrix
         rest = motion[0] @ matrix[:3, :3].T + matrix[:3, 3]
         self._source = MeshSource(rest, mesh.faces)
         self._weights = bind_points(points, rest)
 
     def at(self, frame: int) -> Array:
-        now = self._motion[min(frame, len(self._motion) - 1)] @ self._matrix[:3, :3].T + self._matrix[:3, 3]
+        now = self.rows[min(frame, len(self.rows) - 1)] @ self._matrix[:3, :3].T + self._matrix[:3, 3]
         return carry(self._weights, now, self._source.gradients(now))[0]
 
 
@@ -187,10 +186,11 @@ def prepare(mesh: Mesh, settings: Settings, name: str = "mesh") -> Job:
     if settings.motion is not None and pinned.any():
         motion = _PinMotion(mesh, _load(settings.motion), points[pinned], matrix)
     log.info("%d particles, %d time steps a frame at least", len(points), solver.steps_of(1 / settings.fps))
-    digest = _digest(mesh, settings, colliders, motion)
+    moved = None if motion is None else motion.rows
+    digest, moves = digest_of(mesh, settings, colliders, moved), moves_of(settings, colliders, moved)
     tear = max(m.gap for m in materials) * spacing / abs(float(np.linalg.det(matrix[:3, :3]))) ** (1 / 3)
     grain = min(m.grain for m in materials)
-    return Job(settings, filling, solver, digest, tear, grain, spacing, vertices, weights, motion)
+    return Job(settings, filling, solver, digest, moves, tear, grain, spacing, vertices, weights, motion)
 
 
 def _has(names: Sequence[str]) -> str:
@@ -265,17 +265,3 @@ def _load(path: str) -> Array:
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu" or not np.isfinite(array).all():
         raise UsageError(path, "does not hold finite numbers", "Save positions in metres with numpy.save")
     return array.astype(np.float64)
-
-
-def _digest(mesh: Mesh, settings: Settings, colliders: list[Collider], motion: _PinMotion | None) -> str:
-    described = asdict(settings)
-    del described["last"], described["colliders"], described["motion"]
-    described["contacts"] = [(c.contact, c.friction, c.thickness) for c in colliders]
-    digest = hashlib.sha256(json.dumps([__version__, described], sort_keys=True).encode())
-    arrays = [mesh.vertices, mesh.faces, *mesh.groups.values()]
-    arrays += [a for c in colliders for a in (c.vertices, c.faces)]
-    arrays += [] if motion is None else [motion._motion]
-    for array in arrays:
-        digest.update(f"{array.dtype.str} {array.shape}".encode())
-        digest.update(np.ascontiguousarray(array).reshape(-1).view(np.uint8))
-    return digest.hexdigest()

@@ -207,7 +207,7 @@ class Solver(Stepper):
             outside = max(outside, float(np.linalg.norm(pin_velocity, axis=1).max()))
         gravity = np.asarray(forces.gravity, np.float64)
         wind = np.asarray(forces.wind, np.float64)
-        push = float(np.linalg.norm(gravity)) + self._fields.push
+        push = float(np.linalg.norm(gravity)) + self._fields.push(self.frame)
         speed = float(np.sqrt((self.state.v.astype(np.float64) ** 2).sum(axis=1).max(initial=0)))
         if not np.isfinite(speed):
             raise self._error("has velocities that are not finite", "Bake again from the start")

@@ -58,3 +58,26 @@ def test_brushes_of_blender_are_no_files_of_the_scene(drgs, folder, tmp_path):
     subprocess.run(find_blender().command(script), check=True, timeout=120)
     code, lines, error = check(drgs, tmp_path, scene.name, "--shared", tmp_path)
     assert (code, len(lines)) == (0, 1) and "0 files" in lines[0], (lines, error)
+
+
+def test_simulated_frames_are_files_of_the_scene(drgs, folder, tmp_path):
+    scene, script = tmp_path / "matter.blend", tmp_path / "make.py"
+    script.write_text(f"""
+import bpy
+cube = bpy.data.objects["Cube"]
+cube.modifiers.new("DR-GS Matter", "MESH_CACHE").filepath = "//drgs_cache/Cube/mesh.pc2"
+bpy.ops.wm.save_as_mainfile(filepath={str(scene)!r})
+""")
+    subprocess.run(find_blender().command(script), check=True, timeout=600)
+    code, lines, _ = check(drgs, tmp_path, scene.name)
+    names = ("cache.json", "mesh.pc2")
+    assert code == 65
+    assert [line.split() for line in lines if line.startswith("missing")] == [
+        ["missing", f"//drgs_cache/Cube/{name}:", "does", "not", "exist"] for name in names
+    ]
+    cache = tmp_path / "drgs_cache/Cube"
+    cache.mkdir(parents=True)
+    for name in names:
+        (cache / name).write_text("x")
+    code, lines, _ = check(drgs, tmp_path, scene.name, "--shared", tmp_path)
+    assert code == 0 and [line.split()[1] for line in lines[:2]] == [str(cache / name) for name in names]

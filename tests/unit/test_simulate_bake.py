@@ -84,11 +84,12 @@ def test_a_bake_goes_on_with_the_same_bits(tmp_path, whole):
     assert content(tmp_path) == content(whole)
 
 
-def test_the_quick_solver_fills_the_same_cache(tmp_path):
+@pytest.mark.parametrize("solver", ["xpbd"])
+def test_other_solvers_fill_the_same_cache(tmp_path, solver):
     cache, other = ParticleCache(tmp_path / "a"), ParticleCache(tmp_path / "b")
-    bake(job_of(solver="xpbd"), cache)
-    bake(job_of(solver="xpbd", last=3), other)
-    bake(job_of(solver="xpbd"), other)
+    bake(job_of(solver=solver), cache)
+    bake(job_of(solver=solver, last=3), other)
+    bake(job_of(solver=solver), other)
     assert content(tmp_path / "a") == content(tmp_path / "b")
     assert cache.read(6).vertices[:, 2].min() > -0.02
 
@@ -177,6 +178,41 @@ def test_two_bakes_at_once_never_mix_their_frames(tmp_path):
     bake(job_of(gravity=[0, 0, 1]), ParticleCache(tmp_path / "alone"))
     assert baked == content(tmp_path / "alone")
     assert bake(job_of(gravity=[0, 0, 1]), cache) == 0, "the state is that of the second, too"
+
+
+def test_a_longer_bake_goes_on_also_where_things_move(tmp_path):
+    """What moves later does not change the frames before: no bit of them depends on it."""
+    wall = trimesh.creation.box((0.2, 0.6, 0.6))
+    wall.apply_translation([0.42, 0, 0.3])
+    wall.export(tmp_path / "wall.ply")
+    steps = np.arange(6)
+    wind = [[0, 0, 0, 1, 0, 0, 100.0 * (f == 5), 0] for f in steps]
+
+    def moving(last, far=0.0):
+        aside = 0.02 * steps[:last] + far * (steps[:last] == 5)
+        np.save(tmp_path / "wall.npy", wall.vertices - aside[:, None, None] * [1, 0, 0])
+        np.save(tmp_path / "body.npy", block().vertices + 0.1 * aside[:, None, None])
+        data = {"pins": [{"group": "left"}], "motion": "body.npy", "last": last}
+        data |= {"colliders": [{"mesh": "wall.ply", "vertices": "wall.npy"}]}
+        data |= {"fields": [{"kind": "wind", "frames": wind[:last]}]}
+        return prepare(block(), parse_settings(DROP | data, folder=tmp_path))
+
+    cache, fresh = ParticleCache(tmp_path / "long"), ParticleCache(tmp_path / "fresh")
+    assert bake(moving(3), cache) == 2
+    assert bake(moving(6), cache) == 3
+    assert bake(moving(6), fresh) == 5
+    assert content(cache.folder) == content(fresh.folder)
+    assert bake(moving(4), cache) == 0, "a part of what is there"
+    assert bake(moving(6), cache) == 0
+    with pytest.raises(UsageError, match="holds another simulation"):
+        bake(moving(6, far=0.05), cache)
+    mesh = block()
+    mesh.groups["another"] = np.arange(3, dtype=np.int32)
+    assert prepare(mesh, parse_settings(DROP)).digest == job_of().digest, "a group that plays no part"
+    swapped = block()
+    swapped.groups = {"left": mesh.groups["another"], "another": mesh.groups["left"]}
+    pins = parse_settings(DROP | {"pins": [{"group": "left"}]})
+    assert prepare(swapped, pins).digest != prepare(mesh, pins).digest
 
 
 @pytest.mark.parametrize(

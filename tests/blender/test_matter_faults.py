@@ -1,0 +1,120 @@
+"""Bakes that the machine disturbs: full disks, killed programs. What was done stays, and a message says what to do."""
+
+from __future__ import annotations
+
+import re
+import time
+
+import bpy
+import numpy as np
+import pytest
+from matter_scenes import begin_of, cache_of, computed_last, vertices, work
+from scenes import mesh_object, part, sphere
+
+errors = part("drgs_blender.errors")
+
+
+def whole(cache) -> list[int]:
+    """Frames of a cache, each of which can be read, without a gap."""
+    frames = cache.frames()
+    for frame in frames:
+        cache.read(frame)
+    assert frames == list(range(1, len(frames) + 1))
+    return frames
+
+
+def test_a_full_disk_ends_a_bake_with_a_word_and_what_was_done_stays(body, scene, small_disk):
+    matter, disk = body.drgs.matter, small_disk(1024)
+    matter.folder, matter.frame_end, matter.gravity = str(disk / "cache"), 500, 0.0
+    matter.spin = (0, 0, 3)
+    with pytest.raises(RuntimeError, match=r"[Ff]ree (some )?space.*The first [0-9]+ frames can be played") as caught:
+        bpy.ops.drgs.bake_matter()
+    assert 'Object "ball"' in str(caught.value) and str(disk / "cache") in str(caught.value)
+    assert not work.running
+    frames = whole(cache_of(body))
+    shown = int(re.search(r"The first (\d+) frames", str(caught.value))[1])
+    assert 2 <= shown <= len(frames) < 500
+    np.testing.assert_array_equal(vertices(body, shown), cache_of(body).read(shown).vertices)
+    assert not list((disk / "cache").glob(".*.tmp"))
+    small_disk(65536)
+    matter.frame_end = len(frames) + 2
+    bpy.ops.drgs.bake_matter()
+    assert whole(cache_of(body))[-1] == matter.frame_end
+    np.testing.assert_array_equal(vertices(body, matter.frame_end), cache_of(body).read(matter.frame_end).vertices)
+
+
+def test_a_disk_that_is_full_before_anything_is_computed_is_no_end_of_blender(body, scene, small_disk):
+    """What moves is written while the scene is read."""
+    matter, disk = body.drgs.matter, small_disk(512)
+    matter.folder, matter.frame_end = str(disk / "cache"), 60
+    at, faces = sphere(32, 48)
+    rolling = mesh_object("Rolling", np.add(at, [0, 0, -4]), faces)
+    for frame, x in ((1, 0.0), (60, 3.0)):
+        rolling.location.x = x
+        rolling.keyframe_insert("location", frame=frame)
+    bpy.ops.drgs.matter_row(rows="colliders")
+    matter.colliders[0].object = rolling
+    with pytest.raises(
+        RuntimeError, match=r"cannot be written \(No space left on device\)\. Free some space"
+    ) as caught:
+        bpy.ops.drgs.bake_matter()
+    assert str(disk / "cache") in str(caught.value) and not work.running
+    small_disk(65536)
+    matter.frame_end = 3
+    bpy.ops.drgs.bake_matter()
+    assert whole(cache_of(body)) == [1, 2, 3]
+
+
+def test_a_program_that_is_killed_leaves_its_frames_and_the_next_goes_on(body, scene):
+    matter = body.drgs.matter
+    matter.frame_end, matter.gravity, matter.spin = 500_000, 0.0, (0, 0, 3)
+    bake = work.Bake(body, scene)
+    begin_of(bake, 3)
+    while not (cache_of(body).folder / "state.drgp").exists():
+        begin_of(bake, bake.count + 1)
+    bake._program._process.kill()
+    with pytest.raises(errors.EngineError, match=r'"ball".*\(-9\).*Bake again: it goes on\. The first \d+ frames'):
+        while not bake.step():
+            time.sleep(0.01)
+    bake.close()
+    frames = whole(cache_of(body))
+    np.testing.assert_array_equal(vertices(body, bake.count), cache_of(body).read(bake.count).vertices)
+    assert frames[-1] >= 3
+    matter.frame_end = frames[-1] + 2
+    bpy.ops.drgs.bake_matter()
+    assert computed_last(body) < matter.frame_end - 1, "it goes on where it was"
+    assert whole(cache_of(body))[-1] == matter.frame_end
+
+
+def test_frames_that_were_left_behind_are_named_not_rendered_at_rest(body, scene, export, captured):
+    bpy.ops.drgs.bake_matter()
+    folder = cache_of(body).folder
+    bpy.ops.render.render()
+    assert captured[-1].objects[0].tear > 0
+    (folder / "cache.json").rename(folder / "away.json")
+    bpy.ops.render.render()
+    assert captured[-1].objects[0].tear == 0
+    said = [line.text for line in part("addon.messages").history]
+    assert any('"ball"' in text and "cache.json does not exist; its tears" in text for text in said)
+    (folder / "mesh.pc2").rename(folder / "away.pc2")
+    with pytest.raises(errors.AssetError, match=r'Object "ball": its simulated frames are not there.*mesh.pc2.*Bring'):
+        export()
+    body.modifiers[0].show_viewport = False
+    export()
+    (folder / "away.pc2").rename(folder / "mesh.pc2")
+
+
+def test_the_time_told_before_a_bake_is_that_of_its_matter(body):
+    matter, counts = body.drgs.matter, (100_000, 53)
+    matter.frame_end = 251
+    told = {}
+    for material in ("jelly", "water", "metal", "sand"):
+        matter.material = material
+        told[material] = work.estimate(matter, counts, 2)
+    assert 40 < told["jelly"] < 100, "bench/bench_simulate.py --part body takes longer"
+    assert told["jelly"] < told["water"] < told["metal"] == told["sand"] and told["sand"] > 3 * told["jelly"]
+    matter.material, matter.solver = "jelly", "xpbd"
+    assert work.estimate(matter, counts, 2) < 0.5 * told["jelly"]
+    matter.solver = "mpm"
+    matter.frame_end = 126
+    assert work.estimate(matter, counts, 2) == pytest.approx(told["jelly"] / 2, abs=2)
