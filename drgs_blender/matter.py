@@ -118,6 +118,7 @@ _ROWS = (
     Material("snow", "snow", "packs, tears, crumbles", 1.4e5, 0.2, 400, hardening=10.0),
     Material("water", "fluid", "splashes", 2e5, 0.4, 1000),
     Material("honey", "fluid", "flows slowly", 2e5, 0.4, 1400, viscosity=50.0),
+    Material("cloth", "corotated", "limp and light: sags and folds like a plush toy", 1e4, 0.1, 150),
 )
 #: Name -> material.
 MATERIALS: dict[str, Material] = {row.name: row for row in _ROWS}

@@ -207,6 +207,7 @@ class DrgsMatterSettings(_Matter, bpy.types.PropertyGroup):
         items=(
             ("mpm", "Simulation", "Material points on a grid (MLS-MPM): every material"),
             ("xpbd", "Quick Look", "A lattice that springs back (XPBD): fast, and everything is elastic"),
+            ("rigid", "Rigid", "Nothing bends: it falls, tumbles and comes to rest in one piece"),
         ),
         options=set(),
     )

@@ -47,12 +47,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--overwrite", action="store_true", help="remove what the folder holds of other settings")
     parser.add_argument("--threads", type=whole(0, 1024), default=0, help="threads, 0 for all cores")
     group = parser.add_argument_group("settings, over those of the file")
-    group.add_argument("--material", metavar="NAME", help="jelly, rubber, metal, clay, foam, sand, snow, water, ...")
+    group.add_argument(
+        "--material", metavar="NAME", help="jelly, rubber, cloth, metal, clay, foam, sand, snow, water, ..."
+    )
     group.add_argument("--young", type=float, metavar="PA", help="stiffness: Young's modulus")
     group.add_argument("--poisson", type=float, metavar="NU", help="Poisson's ratio, below 0.5")
     group.add_argument("--density", type=float, metavar="KG/M3", help="density")
     group.add_argument("--resolution", type=int, metavar="N", help="grid cells along the longest side; default 48")
-    group.add_argument("--solver", metavar="NAME", help="mpm, or xpbd for a quick look")
+    group.add_argument("--solver", metavar="NAME", help="mpm, xpbd for a quick look, or rigid")
     group.add_argument("--gravity", type=_vector, metavar="X,Y,Z", help="m/s^2; default 0,0,-9.81")
     group.add_argument("--velocity", type=_vector, metavar="X,Y,Z", help="m/s, at the start")
     group.add_argument("--floor", type=float, metavar="Z", help="height of a floor, metres")

@@ -23,6 +23,7 @@ from .contact import Plane
 from .digest import digest_of, moves_of
 from .fill import Filling, fill
 from .lattice import Lattice
+from .rigid import Rigid
 from .settings import Region, Settings
 from .solver import Body, Forces, Solver
 from .stepper import Stepper
@@ -210,8 +211,8 @@ def _solver(settings: Settings, body: Body, spacing: float, vertices: Array, col
                 # One cell inside: matter at a wall must not be outside the domain.
                 point = tuple((corner + sign * domain.spacing * np.asarray([1.0, 1.0, 1.0])).tolist())
                 planes.append(Plane(point, normal, settings.walls))  # type: ignore[arg-type]
-    if settings.solver == "xpbd":
-        return Lattice(body, forces, colliders, planes)
+    if settings.solver != "mpm":
+        return {"xpbd": Lattice, "rigid": Rigid}[settings.solver](body, forces, colliders, planes)
     return Solver(body, domain, forces, colliders, planes, settings.courant)
 
 

@@ -18,7 +18,7 @@ from .fields import FALLOFFS, FAR, KINDS, MOVING, SHAPES, SIDES, ForceField
 Array = np.ndarray
 Vector = tuple[float, float, float]
 
-SOLVERS = ("mpm", "xpbd")
+SOLVERS = ("mpm", "xpbd", "rigid")
 WALLS = ("open", *CONTACTS)
 
 
@@ -50,7 +50,7 @@ class Settings:
     material : of all matter that no region claims
     regions : parts of other matter; the last one that fits counts
     resolution : grid cells along the body's longest side; there are two particles a cell and axis
-    solver : "mpm", or "xpbd" for a quick look at what an elastic body does
+    solver : "mpm"; "xpbd" for a quick look at what an elastic body does; "rigid" for one that never bends
     gravity, wind : m/s^2 and m/s; drag (1/s) is how the wind pulls, damping (1/s) slows everything
     fields : of force
     velocity, spin : m/s and rad/s about the body's centre, at the start

@@ -84,7 +84,7 @@ def test_a_bake_goes_on_with_the_same_bits(tmp_path, whole):
     assert content(tmp_path) == content(whole)
 
 
-@pytest.mark.parametrize("solver", ["xpbd"])
+@pytest.mark.parametrize("solver", ["xpbd", "rigid"])
 def test_other_solvers_fill_the_same_cache(tmp_path, solver):
     cache, other = ParticleCache(tmp_path / "a"), ParticleCache(tmp_path / "b")
     bake(job_of(solver=solver), cache)
