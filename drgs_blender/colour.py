@@ -13,7 +13,8 @@ LUMINANCE = (0.2126, 0.7152, 0.0722)
 def srgb_to_linear(encoded: Array) -> Array:
     """Decode sRGB values; float32, any shape. Values outside [0, 1] follow the curve's extension."""
     x = np.asarray(encoded, np.float32)
-    power = ((np.maximum(x, 0.04045) + np.float32(0.055)) / np.float32(1.055)) ** np.float32(2.4)
+    # In double: powers in single precision have other last digits on other processors, and so would textures.
+    power = ((np.maximum(x, 0.04045).astype(np.float64) + 0.055) / 1.055) ** 2.4
     return np.where(x <= 0.04045, x / np.float32(12.92), power).astype(np.float32)
 
 
