@@ -1,0 +1,46 @@
+"""What the documentation tells people to type is what the program takes."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from drgs_blender.cli.main import build_parser, join_values
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+
+
+def typed() -> Iterator[tuple[str, str]]:
+    """(page, command line) of every command of `drgs` in a block of code."""
+    for page in PAGES:
+        for line in page.read_text(encoding="utf-8").replace("\\\n", " ").splitlines():
+            if found := re.match(r" {4,}(?:RUN |\.venv/bin/)?drgs (.*)", line):
+                yield page.name, found[1]
+
+
+COMMANDS = list(typed())
+
+
+@pytest.mark.parametrize(("page", "line"), COMMANDS, ids=[f"{page}-{i}" for i, (page, _) in enumerate(COMMANDS)])
+def test_commands_are_understood(page: str, line: str) -> None:
+    words = shlex.split(line, comments=True)
+    assert build_parser().parse_args(join_values(words)).command == words[0]
+
+
+def test_there_are_commands_and_options_to_look_at() -> None:
+    assert len(COMMANDS) > 20 and {page for page, _ in COMMANDS} >= {"README.md", "command-line.md", "nodes.md"}
+
+
+def test_options_that_are_named_exist() -> None:
+    parser = build_parser()
+    (commands,) = (action for action in parser._actions if isinstance(action, argparse._SubParsersAction))
+    known = {option for sub in commands.choices.values() for option in sub._option_string_actions}
+    text = (ROOT / "docs" / "command-line.md").read_text(encoding="utf-8")
+    named = {flag for code in re.findall(r"`([^`\n]+)`", text) for flag in re.findall(r"(?<![\w-])--[a-z][\w-]*", code)}
+    assert len(named) > 30 and not named - known - {"--help", "--version"}
