@@ -142,7 +142,7 @@ def camera() -> Iterator[float]:
         yield from key("NUMPAD_0")
     yield from settled()
     found["perspective"] = where()[1].spaces.active.region_3d.view_perspective
-    found["head"] = place_of((0, -1, 1.4))
+    found["head"] = place_of((0, -1, 1.2))  # between its bands
     yield from hands.photograph("looks-5-camera")
 
 
