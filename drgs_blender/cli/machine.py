@@ -13,7 +13,7 @@ from typing import Any
 from ..asset.container import digest_asset
 from ..engine.client import EngineClient, engine_command
 from ..engine.limits import OPTION
-from ..errors import EngineError
+from ..errors import AssetError, EngineError
 from .blender_process import BlenderProcess, Evaluated
 from .find_blender import Blender
 
@@ -98,14 +98,19 @@ class Machine:
 
         Raises
         ------
-        EngineError, AssetError
+        EngineError
         """
         for path in self.assets.values():
             self._check(path)
 
     def _check(self, path: Path) -> None:
-        if digest_asset(path) != self._contents[path]:
-            raise EngineError(str(path), "was written anew while frames were rendered", "Try again")
+        anew = EngineError(str(path), "was written anew while frames were rendered", "Try again")
+        try:
+            digest = digest_asset(path)
+        except AssetError as error:  # it was whole when it was loaded
+            raise anew from error
+        if digest != self._contents[path]:
+            raise anew
 
     @property
     def engine_in_use(self) -> EngineClient:

@@ -139,7 +139,12 @@ def render(args: argparse.Namespace, machine: Machine) -> int:
                 lines.skipped(path)
             else:
                 lines.begin(number)
-                passes, settings = picture.render(engine, machine.assets, partial(lines.progress, number), args.timeout)
+                tell = partial(lines.progress, number)
+                try:
+                    passes, settings = picture.render(engine, machine.assets, tell, args.timeout)
+                except AssetError:
+                    machine.check_assets()  # one that is just being written anew is not a damaged one
+                    raise
                 note(shot.warnings + passes.warnings)
                 machine.check_assets()
                 frame_store.save(path, passes, picture.frame, number, settings)

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import argparse
+import os
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from test_container import make_asset
 
-from drgs_blender.asset.container import write_asset
+from drgs_blender.asset.container import digest_asset, write_asset
 from drgs_blender.asset.model import Asset, Mesh
 from drgs_blender.cli import frame_store
-from drgs_blender.cli.render import claim, layer_path
+from drgs_blender.cli.blender_process import Evaluated
+from drgs_blender.cli.machine import Machine
+from drgs_blender.cli.main import build_parser
+from drgs_blender.cli.render import claim, layer_path, render
 from drgs_blender.deform.attach import attach
-from drgs_blender.errors import UsageError
+from drgs_blender.errors import AssetError, EngineError, UsageError
 from drgs_blender.frame import Camera, Frame, ObjectState, RenderSettings, World
 
 
@@ -102,3 +109,54 @@ def test_layers_never_share_a_file():
         claim(files, layer_path(Path("0002.exr"), first), first)
         with pytest.raises(UsageError, match=f"{first!r} and {second!r}"):
             claim(files, layer_path(Path("0002.exr"), second), second)
+
+
+def test_clocks_of_other_nodes_make_no_frame_abandoned(tmp_path):
+    """Neither one that is ahead, nor one that was set back while a frame is written."""
+    ages = {"old": -1e4, "new": 0.0, "ahead": 1e9}
+    for name, seconds in ages.items():
+        path = tmp_path / f".a_0001.exr.{name}.tmp"
+        path.touch()
+        now = path.stat().st_mtime
+        os.utime(path, (now + seconds, now + seconds))
+    frame_store.remove_abandoned(str(tmp_path / "a_####.exr"))
+    assert sorted(path.suffixes[-2] for path in tmp_path.iterdir()) == [".ahead", ".new"]
+
+
+@pytest.mark.parametrize("size", [100, 0])
+def test_asset_that_is_copied_over_in_place_gives_the_frame_back(tmp_path, size):
+    """As `cp` and `scp` do it, which first cut the file off: it was whole when it was loaded, and will be again."""
+    path = tmp_path / "a.drgs"
+    write_asset(path, make_asset())
+    machine = Machine()
+    machine.assets["key"], machine._contents[path] = path, digest_asset(path)
+    machine.check_assets()
+    os.truncate(path, size)
+    with pytest.raises(EngineError, match=r"a\.drgs: was written anew"):
+        machine.check_assets()
+
+
+class CutOff(Machine):
+    """A machine whose engine ends as it looks at mapped bytes that are gone, and refuses what is left of the asset."""
+
+    def engine(self, memory_mb=None):
+        return self
+
+    def frames(self, blender, job, timeout):
+        yield Evaluated(1, "", scene(), [], 0, lambda: iter(()))
+
+    def render(self, *_):
+        os.truncate(self.assets["key"], 100)
+        raise AssetError("a.drgs", "is truncated")
+
+
+def test_engine_that_refuses_what_is_being_copied_gives_the_frame_back(tmp_path):
+    path, blend, machine = tmp_path / "a.drgs", tmp_path / "a.blend", CutOff()
+    write_asset(path, make_asset())
+    blend.touch()
+    machine.assets["key"], machine._contents[path] = path, digest_asset(path)
+    job = ["render", str(blend), "--frames=1", f"--out={tmp_path}/#.exr", "--blender", sys.executable]
+    args = build_parser().parse_args(job, argparse.Namespace(quiet=True, progress=False))
+    with pytest.raises(EngineError, match=r"a\.drgs: was written anew"):
+        render(args, machine)
+    assert not list(tmp_path.glob("*.exr"))
