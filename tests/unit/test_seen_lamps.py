@@ -31,7 +31,9 @@ def panel(y: float, **settings: object) -> Light:
     return Light("panel", "area", place, (1.0, 0.5, 0.25), shape="rectangle", **values)  # type: ignore[arg-type]
 
 
-def picture(lights: list[Light], meshes: list, posed=None, objects=(), **settings) -> dict[str, np.ndarray]:
+def picture(
+    lights: list[Light], meshes: list, posed=None, objects=(), clip=(1e-3, 1e6), **settings
+) -> dict[str, np.ndarray]:
     scene = TraceScene()
     scene.update(list(objects), meshes)
     values = {
@@ -42,9 +44,8 @@ def picture(lights: list[Light], meshes: list, posed=None, objects=(), **setting
         "bounces": 0,
         "primary": "mesh" if posed is None else "surfels",
     }
-    frame = Frame(
-        1, look_along_y(SIZE), [], settings=RenderSettings(**(values | settings)), passes=("Combined", "Emit")
-    )
+    camera = look_along_y(SIZE, clip_start=clip[0], clip_end=clip[1])
+    frame = Frame(1, camera, [], settings=RenderSettings(**(values | settings)), passes=("Combined", "Emit"))
     return render(scene, EnvironmentLight(World(strength=0.0)), posed, frame, lamps=Lamps(lights))
 
 
@@ -73,6 +74,17 @@ def test_surfaces_hide_lamps_behind_them_and_lamps_hide_nothing() -> None:
     glow = wall(1.0)
     both = picture([panel(0.5), panel(0.9)], [glow])["Emit"][SIZE // 2, SIZE // 2]
     np.testing.assert_allclose(both, 2 * SHINE + (1, 2, 3), rtol=1e-5)
+
+
+@pytest.mark.parametrize(("clip", "factor"), [((3.9, 4.1), 1), ((4.1, 9), 0), ((0.1, 3.9), 0), ((0.1, 9), 1)])
+@pytest.mark.parametrize("meshes", [[], [wall(1.0, BLACK)]])
+def test_lamps_beyond_the_clip_distances_are_not_seen_and_suns_are(clip: tuple, factor: float, meshes: list) -> None:
+    """Measured in Cycles of Blender 5.0. A mesh beyond them hides nothing."""
+    lamp, sun = panel(0.0), replace(panel(0.0), kind="sun", angle=0.5, power=1.0)
+    found, middle = picture([lamp], meshes, clip=clip)["Emit"], (SIZE // 2, SIZE // 2)
+    np.testing.assert_allclose(found[middle], factor * SHINE, rtol=1e-5)
+    hidden = bool(meshes) and clip[1] > 5
+    assert picture([sun], meshes, clip=clip)["Emit"][middle].any() != hidden
 
 
 @pytest.mark.parametrize("opacity", [0.25, 0.75])

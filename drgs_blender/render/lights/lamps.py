@@ -316,6 +316,14 @@ def lamps_along(ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, pic
                 r, g, b = _add_lamp(i, ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, pick, emitters)
                 red, green, blue = red + r, green + g, blue + b
         node += 1
+    r, g, b = suns_along(ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, pick, emitters)
+    return red + r, green + g, blue + b
+
+
+@njit
+def suns_along(ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, pick, emitters):  # type: ignore[no-untyped-def]
+    """`lamps_along` of suns alone."""
+    red, green, blue = ZERO, ZERO, ZERO
     for i in range(np.int64(pick[0, SUNS]), np.int64(pick[0, END])):
         r, g, b = _add_lamp(i, ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, pick, emitters)
         red, green, blue = red + r, green + g, blue + b

@@ -1,8 +1,9 @@
 """Lamps that the camera sees.
 
-Blender's lights are seen only where their ray visibility says so. They hide nothing: a ray gathers the light of each
-lamp it meets before a surface, and goes on. Where a sub-pixel sample has several surfaces, or a surface that is not
-opaque, each part of it sees the lamps before its own depth. Lamps in front of a holdout are hidden by it.
+Blender's lights are seen only where their ray visibility says so, and between the camera's clip distances (suns: at
+any). They hide nothing: a ray gathers the light of each lamp it meets before a surface, and goes on. Where a sub-pixel
+sample has several surfaces, or a surface that is not opaque, each part of it sees the lamps before its own depth. Lamps
+in front of a holdout are hidden by it.
 """
 
 from __future__ import annotations
@@ -12,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from ...jit import njit, prange
-from ..camera import WIDTH, sample_ray
+from ..camera import CLIP_END, CLIP_START, WIDTH, sample_ray
 from ..lights.lamp_shapes import CAMERA
-from ..lights.lamps import Lamps, lamps_along
+from ..lights.lamps import Lamps, lamps_along, suns_along
 from ..points import CATCHER
 from ..sampling import ONE, ZERO, F
 from .gbuffer import GBuffer
@@ -53,7 +54,7 @@ def _look(
     p: Any, x0: Any, y0: Any, start: Any, alpha: Any, pixel: Any, sample: Any, weight: Any, flags: Any, depth: Any,
     lamps: Any, out: Any,
 ) -> None:  # fmt: skip
-    width = np.int64(p[WIDTH])
+    width, near = np.int64(p[WIDTH]), p[CLIP_START]
     rows, columns, aa = alpha.shape
     for y in prange(rows):
         n = start[y]
@@ -65,9 +66,13 @@ def _look(
                     n += 1
                 ox, oy, oz, dx, dy, dz = sample_ray(p, place, k)
                 length = np.sqrt(dx * dx + dy * dy + dz * dz)
-                origin = F(ox), F(oy), F(oz)
+                # As in Cycles, rays start at the clip distance: soft lamps face that place.
+                origin = F(ox + near * dx), F(oy + near * dy), F(oz + near * dz)
                 direction = F(dx / length), F(dy / length), F(dz / length)
-                r, g, b = lamps_along(*origin, *direction, _FAR, ONE, ZERO, CAMERA, *lamps)
+                end = F((p[CLIP_END] - near) * length)
+                r, g, b = lamps_along(*origin, *direction, end, ONE, ZERO, CAMERA, *lamps)
+                s, t, u = suns_along(*origin, *direction, _FAR, ONE, ZERO, CAMERA, *lamps)
+                r, g, b = r + s, g + t, b + u
                 if not r + g + b > ZERO:
                     continue
                 free = (ONE - alpha[y, x, k]) / F(aa)
@@ -75,7 +80,7 @@ def _look(
                 for i in range(first, n):
                     if flags[i] & CATCHER:
                         continue
-                    r, g, b = lamps_along(*origin, *direction, F(depth[i] * length), ONE, ZERO, CAMERA, *lamps)
+                    r, g, b = lamps_along(*origin, *direction, F((depth[i] - near) * length), ONE, ZERO, CAMERA, *lamps)
                     red, green, blue = red + weight[i] * r, green + weight[i] * g, blue + weight[i] * b
                 out[y, x, 0] += red
                 out[y, x, 1] += green
