@@ -82,6 +82,9 @@ class Machine:
         try:
             yield from self._blender.more(frames) if warm else self._blender.frames()
             whole = True
+        except AssetError:
+            self.check_assets()  # one that is just being written anew is not a damaged one
+            raise
         finally:
             if not (whole and self._keep):
                 self._close_blender()

@@ -160,3 +160,29 @@ def test_engine_that_refuses_what_is_being_copied_gives_the_frame_back(tmp_path)
     with pytest.raises(EngineError, match=r"a\.drgs: was written anew"):
         render(args, machine)
     assert not list(tmp_path.glob("*.exr"))
+
+
+def test_blender_that_refuses_what_is_being_copied_gives_the_frame_back(tmp_path, monkeypatch):
+    path = tmp_path / "a.drgs"
+    write_asset(path, make_asset())
+
+    class Blender:
+        running = True
+
+        def __init__(self, *_):
+            pass
+
+        __enter__ = __exit__ = __init__
+
+        def frames(self):
+            os.truncate(path, 100)
+            raise AssetError("a.drgs", "is truncated")
+            yield
+
+    monkeypatch.setattr("drgs_blender.cli.machine.BlenderProcess", Blender)
+    machine = Machine()
+    machine.assets["key"], machine._contents[path] = path, digest_asset(path)
+    monkeypatch.setattr(machine, "_close_blender", lambda: None)  # which forgets the assets of another scene
+    job = {"scene": str(tmp_path / "a.blend"), "frames": [1]}
+    with pytest.raises(EngineError, match=r"a\.drgs: was written anew"):
+        list(machine.frames(None, job, 1.0))
