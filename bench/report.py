@@ -52,8 +52,9 @@ def table(columns: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
 
 
 def command_line() -> str:
-    """How this program was called, from the checkout's folder."""
-    return " ".join(["python", f"bench/{Path(sys.argv[0]).name}", *sys.argv[1:]])
+    """How this program was called, from the checkout's folder; where files of this machine lie is left out."""
+    words = (f"/path/to/{Path(word).name}" if os.path.isabs(word) else word for word in sys.argv[1:])
+    return " ".join(["python", f"bench/{Path(sys.argv[0]).name}", *words])
 
 
 def write_section(name: str, title: str, body: str) -> None:

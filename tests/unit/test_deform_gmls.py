@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from matter_cases import lattice, solver_of
 from scipy.spatial.transform import Rotation
 
 from drgs_blender.asset.model import Asset, Mesh
@@ -14,6 +15,7 @@ from drgs_blender.deform.source_driven import SourceDriven
 from drgs_blender.deform.sources import MeshSource, PointSource
 from drgs_blender.deform.tears import torn_faces
 from drgs_blender.errors import AssetError, UsageError
+from drgs_blender.simulate.contact import Plane
 from drgs_blender.simulate.fill import fill
 
 CENTRE = np.array([5.0, -3.0, 2.0])
@@ -74,6 +76,19 @@ def test_bending_is_exact():
     assert turned == 0
     assert np.abs(moved - move(points)).max() < 1e-6
     assert np.abs(points + (move(CENTRE + grid) - sources)[0] - move(points)).max() > 1e-2  # there is something to bend
+
+
+def test_particles_left_out_of_a_simulation_are_where_the_others_carry_them():
+    h = 0.05
+    points = np.add(lattice((0.6, 0.3, 0.6), h / 2), [0, 0, 0.1])
+    floor = Plane((0, 0, 0), (0, 0, 1))
+    body = solver_of(points, h, young=5e4, gravity=(0, 0, -9.81), planes=[floor], velocity=(0.5, 0, -1))
+    for _ in range(10):
+        body.advance(1 / 24)
+    out = np.random.default_rng(0).random(len(points)) < 0.05
+    moved, _, _ = carry(bind_points(points[out], points[~out]), body.points[~out], body.gradients[~out])
+    assert np.linalg.norm(np.ptp(body.gradients, axis=0)) > 0.2, "it is deformed"
+    assert np.median(np.linalg.norm(moved - body.points[out], axis=1)) < 0.01 * h
 
 
 def test_a_blend_that_is_inside_out_is_counted_and_replaced():
