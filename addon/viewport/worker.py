@@ -76,7 +76,7 @@ class Worker:
                 view = self._views[name] = _View(name, request, time.perf_counter())
             elif view.begun:
                 view.asked = time.perf_counter()
-            view.request, view.begun, view.error = request, False, ""
+            view.request, view.begun, view.fraction, view.error = request, False, 0.0, ""
             if self._thread is None:
                 self._ending = False
                 self._thread = threading.Thread(target=self._run, name="drgs-viewport", daemon=True)
@@ -169,9 +169,11 @@ class Worker:
                 self._fail(view, request, f"DR-GS failed ({type(error).__name__}: {error})")
                 continue
             now = time.perf_counter()
-            view.fraction = passes.statistics.get("view.fraction", 1.0)
-            view.phase = ""
-            view.picture = Picture(request, passes, view.fraction, now - asked)
+            fraction = passes.statistics.get("view.fraction", 1.0)
+            with self._changed:
+                view.picture, view.phase = Picture(request, passes, fraction, now - asked), ""
+                if view.request is request:
+                    view.fraction = fraction
             self.news += 1
 
     def _next(self) -> _View | None:

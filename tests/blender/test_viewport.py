@@ -359,6 +359,20 @@ def test_pictures_grow_to_the_final_one_in_all_viewports(scene, ball, worker):
     assert not worker.busy()
 
 
+def test_it_is_busy_until_there_is_a_picture_of_what_was_asked_last(scene, ball, worker):
+    first = request(scene)
+    worker.submit("a", first)
+    wait(lambda: done(worker, "a", first))
+    for shift in (0.1, 0.2, 0.3):
+        latest = request(scene, shift)
+        worker.submit("a", latest)
+        shown = False
+        while not shown:
+            busy = worker.busy()
+            shown = worker.picture("a").request is latest
+            assert busy or shown
+
+
 @pytest.mark.parametrize("threshold", [0.0, 0.03])
 @pytest.mark.parametrize("border", [False, True])
 def test_f12_is_the_last_picture_of_the_camera_view(scene, ball, worker, threshold, border):
