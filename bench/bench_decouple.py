@@ -47,12 +47,14 @@ VARIANTS: dict[str, dict[str, dict[str, Any]]] = {
     "light": {
         "without inter-reflection": {"indirect": False},
         "environment fine from the start": {"coarse_to_fine": False},
-        "environment of 64 rows": {"environment": 64},
+        "environment of 32 rows": {"environment": 32},
+        "light learned a quarter as fast": {"light_rate": 0.1},
         "white-light weight .003": {"white": 0.003},
         "white-light weight 0": {"white": 0.0},
     },
     "materials": {
         "without nested grids": {"coarse": 0},
+        "learned half as fast": {"rate": 0.02},
         "without smoothness": {"smoothness": 0.0},
         "specular-glossiness": {"parametrisation": "specular"},
         "the paper's BRDF": {"look": "paper"},

@@ -45,10 +45,10 @@ class Settings:
     light: int = 8
     look: Literal["principled", "paper"] = "principled"
     indirect: bool = True
-    environment: int = 32
+    environment: int = 64
     coarse_to_fine: bool = True
-    rate: float = 0.02
-    light_rate: float = 0.1
+    rate: float = 0.04
+    light_rate: float = 0.4
     coarse: int = 3
     smoothness: float = 0.01
     light_smoothness: float = 0.001
