@@ -53,7 +53,8 @@ def export_world(world: bpy.types.World | None, warn: Warn) -> World:
 
 def _check_rays(world: bpy.types.World, warn: Warn) -> None:
     """Say where rays are not to see the world, by Cycles' settings of it: here all do."""
-    rays = getattr(world, "cycles_visibility", None)  # the add-on Cycles may be off
+    # The add-on Cycles may be off, and until Blender 5 an evaluated world has these as they were.
+    rays = getattr(world.original, "cycles_visibility", None)
     blind = [name for name in ("camera", "diffuse", "glossy") if rays is not None and not getattr(rays, name)]
     if blind:
         hint = "; Film > Transparent hides it from the camera" if "camera" in blind else ""

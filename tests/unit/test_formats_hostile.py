@@ -162,7 +162,7 @@ def test_splats_are_not_referred_to_without_end(tmp_path: Path, monkeypatch: pyt
 def test_what_a_full_disk_keeps_from_being_read_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("pxr")
     SPLATS[".usdc"](tmp_path / "a.usda", random_splats(7))
-    code = f"from {usd_stage.__name__} import main; main({str(tmp_path / 'a.usda')!r}, '/dev/full', {1 << 40})"
+    code = f"from {usd_stage.__name__} import main; main({str(tmp_path / 'a.usda')!r}, '/dev/full', {1 << 40}, 60)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == usd_stage.FULL and done.stderr.splitlines()[-1] == "No space left on device"
     monkeypatch.setattr(subprocess, "run", lambda *_, **__: done_bytes(done))
