@@ -7,6 +7,7 @@ import signal
 import sys
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -166,6 +167,30 @@ def test_stopped_engine_meets_the_deadline(make_client, make_frame, asset_path, 
             client.render(make_frame(0.2), stop)
     assert 2.0 <= time.monotonic() - start < 15
     assert_same_bits(client.render(make_frame(0.2)), expected)
+
+
+@posix
+def test_asset_that_is_cut_off_in_place_is_an_error_until_it_is_whole(make_client, make_frame, asset_path, tmp_path):
+    """The system ends an engine that looks at mapped bytes which are not there any more."""
+    path = tmp_path / "ball.drgs"
+    path.write_bytes(asset_path.read_bytes())
+    client = make_client()
+    key = client.load_asset(str(path))
+
+    def frame(bend: float):
+        made = make_frame(bend)
+        return replace(made, objects=[replace(made.objects[0], asset=key)])
+
+    before = client.render(frame(0.2))
+    os.truncate(path, 1000)
+    with pytest.raises((AssetError, EngineError)):
+        for bend in (0.3, 0.4):
+            client.load_asset(str(path))
+            client.render(frame(bend))
+    path.with_name("whole").write_bytes(asset_path.read_bytes())
+    path.with_name("whole").replace(path)
+    client.load_asset(str(path))
+    assert_same_bits(client.render(frame(0.2)), before)
 
 
 def test_closing_from_another_thread_ends_a_render(client, make_frame):

@@ -105,6 +105,21 @@ def test_frames_of_an_asset_that_changes_meanwhile_are_not_kept(folder, tmp_path
     assert not list((tmp_path / "out").iterdir())
 
 
+def test_asset_that_is_copied_over_in_place_gives_the_job_back(folder, tmp_path):
+    """As `cp` and `scp` do it: first the file is cut off, while the engine has it mapped."""
+    for name in ("relative.blend", "tile.drgs"):
+        shutil.copy(folder / name, tmp_path)
+    (tmp_path / "relative.blend").rename(tmp_path / "shot.blend")
+    process = start(tmp_path, tmp_path / "out", "1-9", "--rays", "65536")
+    while not process.stdout.readline().startswith("Fra:1 "):
+        assert process.poll() is None
+    os.truncate(tmp_path / "tile.drgs", 100)
+    out, error = process.communicate(timeout=60)
+    assert (process.returncode, out.splitlines()[-1]) == (75, "DRGS_EXIT class=retry"), error
+    assert "tile.drgs" in error and "written anew" in error
+    assert not list((tmp_path / "out").iterdir())
+
+
 def test_memory_that_does_not_do_gives_the_frame_back(drgs, folder, tmp_path):
     job = ("render", folder / "large.blend", "--frames", "1", "--rays", "4", "--passes", "all")
     code, lines, error = drgs(*job, "--memory-mb", 256, "--out", tmp_path / "####.exr")
@@ -115,14 +130,20 @@ def test_memory_that_does_not_do_gives_the_frame_back(drgs, folder, tmp_path):
 
 
 def test_unfinished_frames_of_killed_writers_go(drgs, folder, tmp_path):
-    """Those of the same job that nobody adds to; other files stay."""
-    names = [".a_0007.exr.x1.tmp", ".a_0001.exr.x2.tmp", ".b_0001.exr.x3.tmp", "notes.tmp"]
+    """Those of the same job that nobody adds to; other files stay, and those of a node whose clock is ahead."""
+    names = [".a_0007.exr.x1.tmp", ".a_0001.exr.x2.tmp", ".b_0001.exr.x3.tmp", "notes.tmp", ".a_0002.exr.x4.tmp"]
     for name in names:
         (tmp_path / name).touch()
-    for name in (names[0], *names[2:]):
+    for name in (names[0], *names[2:4]):
         os.utime(tmp_path / name, (0, 0))
-    assert drgs("render", folder / "shot.blend", "--frames", "1", "--out", tmp_path / "a_####.exr", "--rays", 4)[0] == 0
+    ahead = (4e9, 4e9)
+    os.utime(tmp_path / names[4], ahead)
+    job = ("render", folder / "shot.blend", "--frames", "1", "--out", tmp_path / "a_####.exr", "--rays", 4)
+    assert drgs(*job)[0] == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*names[1:], "a_0001.exr"])
+    for when in ((0, 0), ahead):  # what was made before what is nobody's business
+        os.utime(tmp_path / "a_0001.exr", when)
+        assert sum(line.startswith("skipping") for line in drgs(*job)[1]) == 1
 
 
 #: A kernel that says whether it was compiled.

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -186,7 +187,9 @@ def test_scene_faults_have_their_exit_code(render, folder, tmp_path):
 
 
 @pytest.mark.skipif(os.name == "nt", reason="SIGTERM ends a process at once there")
-def test_termination_leaves_nothing_behind(folder, tmp_path):
+@pytest.mark.parametrize(("how", "code", "word"), [("SIGTERM", 143, "terminated"), ("SIGINT", 130, "interrupted")])
+def test_termination_leaves_nothing_behind(folder, tmp_path, how, code, word):
+    """SIGINT as Ctrl+C gives it: to Blender and the engine, too."""
     scratch = tmp_path / "scratch"
     scratch.mkdir()
     command = [sys.executable, "-m", "drgs_blender.cli.main", "render", str(folder / "shot.blend"), "--frames", "1-9"]
@@ -197,14 +200,14 @@ def test_termination_leaves_nothing_behind(folder, tmp_path):
         while not process.stdout.readline().startswith("Fra:1 "):
             assert process.poll() is None
         time.sleep(0.3)
-        process.send_signal(signal.SIGTERM)
+        (process.send_signal if how == "SIGTERM" else partial(os.killpg, process.pid))(getattr(signal, how))
         started = time.monotonic()
         rest, _ = process.communicate(timeout=20)
     finally:
         process.kill()
     assert time.monotonic() - started < 5
-    assert process.returncode == 143
-    assert rest.splitlines()[-1] == "DRGS_EXIT class=terminated"
+    assert process.returncode == code
+    assert rest.splitlines()[-1] == f"DRGS_EXIT class={word}"
     assert [p.name for p in tmp_path.iterdir()] == ["scratch"]
     assert not list(scratch.glob("drgs-*"))
     with pytest.raises(ProcessLookupError):  # neither Blender nor the engine outlives it
