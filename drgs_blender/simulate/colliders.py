@@ -207,6 +207,13 @@ class MovingCollider:
         # v(x) = linear + spin x (x - centre), told about the point `shift`.
         return self._own, turn, shift, linear + np.cross(spin, shift - centre), spin
 
+    def roughly(self, points: Array, part: float) -> Array:
+        """(n,) signed distances of points at `part` of the frame, by the nearest node; infinite far away."""
+        place, rotation, shift, _, _ = self.at(part)
+        if place is None:
+            return np.full(len(points), np.inf)
+        return distances(points, place.distance, place.origin, place.spacing, rotation, shift)
+
     def closest(self, points: Array) -> tuple[Array, Array, Array]:
         """Signed distances (n,) from the mesh at the end of the frame, its closest points, and the way out, (n, 3)."""
         import igl
@@ -246,15 +253,13 @@ def check_apart(points: Array, depth: float, colliders: Sequence[MovingCollider]
     low, high = points.min(axis=0), points.max(axis=0)
     for moving in colliders:
         moving.enter(0, 1.0, low, high)
-        place, rotation, shift, _, _ = moving.at(0.0)
-        if place is not None:
-            distance = distances(points, place.distance, place.origin, place.spacing, rotation, shift)
-            found[moving.collider.name] = int(np.count_nonzero(distance < moving.collider.thickness - depth))
-    for name, inside in found.items():
-        if inside > 0.01 * len(points):
+        inside = moving.roughly(points, 0.0) < moving.collider.thickness - depth
+        found[moving.collider.name] = int(np.count_nonzero(inside))
+    for name, count in found.items():
+        if count > 0.01 * len(points):
             raise UsageError(
                 name,
-                f"overlaps the body at the start: {inside} of {len(points)} particles are inside it",
+                f"overlaps the body at the start: {count} of {len(points)} particles are inside it",
                 "Move one of the two apart, or simulate from a frame in which they are apart",
             )
 
@@ -277,11 +282,7 @@ def lift_surface(points: Array, spacing: float, colliders: Sequence[MovingCollid
         sunk = offset + clearance - (points * normal).sum(axis=1)
         points += np.where(sunk <= spacing, np.maximum(sunk, 0.0), 0.0)[:, None] * normal
     for moving in colliders:
-        place, rotation, shift, _, _ = moving.at(1.0)
-        if place is None:
-            continue
-        distance = distances(points, place.distance, place.origin, place.spacing, rotation, shift)
-        near = np.flatnonzero(np.abs(distance) < 3 * spacing)  # of the nearest node
+        near = np.flatnonzero(np.abs(moving.roughly(points, 1.0)) < 3 * spacing)
         if len(near):
             distance, closest, out = moving.closest(points[near])
             sunk = (distance >= -spacing) & (distance < clearance)

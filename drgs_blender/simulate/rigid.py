@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..errors import Cancelled, UsageError
+from ..errors import Cancelled
 from ..jit import njit, prange
 from .colliders import Collider, MovingCollider, check_apart, rigid_motion
 from .contact import CONTACTS, Plane, plane_rows, surface_near
@@ -184,9 +184,6 @@ class Rigid(Stepper):
         else:
             turn, shift, _ = rigid_motion(rest, targets)
         self.place, self.turn = turn @ self._centre + shift, np.ascontiguousarray(turn)
-
-    def _error(self, problem: str, remedy: str) -> UsageError:
-        return UsageError(f"simulation, frame {self.frame + 1} after the start", problem, remedy)
 
 
 def _moments(arm: Array, mass: Array) -> Array:

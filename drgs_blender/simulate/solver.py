@@ -311,9 +311,6 @@ class Solver(Stepper):
             )
         return arrangement
 
-    def _error(self, problem: str, remedy: str) -> UsageError:
-        return UsageError(f"simulation, frame {self.frame + 1} after the start", problem, remedy)
-
     def _touch(self, moving: MovingCollider, part: float, nodes: Array, a: Arrangement) -> None:
         place, rotation, shift, linear, spin = moving.at(part)
         if place is None:

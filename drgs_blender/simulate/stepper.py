@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from ..errors import UsageError
 from .colliders import MovingCollider
 
 Array = np.ndarray
@@ -108,3 +109,6 @@ class Stepper(ABC):
             self._put(before)
             raise
         self.frame += 1
+
+    def _error(self, problem: str, remedy: str) -> UsageError:
+        return UsageError(f"simulation, frame {self.frame + 1} after the start", problem, remedy)
