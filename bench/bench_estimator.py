@@ -5,6 +5,7 @@ python bench/bench_estimator.py
 
 from __future__ import annotations
 
+import irgs
 import numpy as np
 from judge import environments
 from report import table, write_section
@@ -75,12 +76,24 @@ def strategies() -> list[list[object]]:
     return rows
 
 
+def published() -> list[list[object]]:
+    rows: list[list[object]] = []
+    for roughness in (0.05, 0.1, 0.13, 0.2, 0.3, 0.6, 1.0):
+        found = (irgs.albedo(irgs.smith, 0.9, roughness), irgs.albedo(irgs.specular, 0.9, roughness),
+                 irgs.albedo(irgs.specular, 0.9, roughness, 0.0))  # fmt: skip
+        rows.append([roughness, *(f"{x:.3f}" for x in found)])
+    return rows
+
+
 def main() -> None:
     body = "White furnace: radiance of a white surface under light of one, seen at cosine 0.2 / 0.9. The loss of\n"
     body += (
         "metals is the single-scattering GGX lobe's; the paper's look adds its to a full Lambert base, and gains.\n\n"
     )
     body += table(["look", "metallic", "roughness .05", ".3", ".6", "1"], furnace())
+    body += "\n\nDirectional albedo of a white metal at cosine 0.9: the look *paper* against the form that IRGS\n"
+    body += "published, whose denominator is at least 1e-6, and the same without that clamp (bench/irgs.py):\n\n"
+    body += table(["roughness", "paper", "IRGS", "IRGS without the clamp"], published())
     body += "\n\nIntegral of the density of light sampling over the sphere (BRDF densities: tests/unit):\n\n"
     body += table(["density", "integral"], [[name, f"{value:.7f}"] for name, value in densities()])
     body += "\n\nEach strategy alone against all together under forest.exr (no sun to be missed), direct light,\n"

@@ -1,6 +1,6 @@
 """What light costs: time to equal quality against Cycles and Mitsuba, what makes the time, and what it buys.
 
-python bench/bench_light.py [--part equal-psnr mitsuba denoised relmse cost efficiency] [--size 200] [--seeds 3]
+python bench/bench_light.py [--part equal-psnr mitsuba denoised relmse cost efficiency ablation] [--size 200] ...
 
 Each part writes its own section. Everything runs on two processors, as far as the system can be told so.
 """
@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import os
 
+import light_ablation
 import light_cost
 import light_efficiency
 import light_renderers
@@ -23,6 +24,7 @@ PARTS = {
     "relmse": ("Light: relative error at 32 samples", light_renderers.relative_error),
     "cost": ("Light: what makes the time", light_cost.cost),
     "efficiency": ("Light: what denoiser, MIS and mesh bring", light_efficiency.efficiency),
+    "ablation": ("Light: inter-reflection, shadows and reflections", light_ablation.ablation),
 }
 
 
@@ -44,6 +46,8 @@ def main() -> None:
     parser.add_argument("--memory-size", type=int, nargs=2, default=(1920, 1080))
     parser.add_argument("--million", type=int, default=1_000_000, help="triangles and surfels of the memory test")
     parser.add_argument("--efficiency-rays", type=int, nargs="+", default=(4, 8, 16, 32, 64, 128, 256, 512))
+    parser.add_argument("--ablation-size", type=int, default=400, help="of the pictures of part ablation")
+    parser.add_argument("--ablation-rays", type=int, default=512)
     options = parser.parse_args()
     if hasattr(os, "sched_setaffinity"):  # inherited by every process that is started from here
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:2])
