@@ -10,7 +10,7 @@ import json
 import os
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 
 import bpy
@@ -42,17 +42,16 @@ class Run:
         self.result["size"] = region.width, region.height
         area().spaces.active.shading.type = "RENDERED"
         yield from self.until(self.finished)
-        for change in (self.turn, self.move, self.light):  # kernels of every kind of change are loaded
-            change(0)
+        changes = self.turn, self.move, self.light, self.bend
+        for change in changes:  # kernels of every kind of change are loaded
+            yield from self.changed(change, self.job["repeats"] + 1)
             yield from self.until(self.finished)
         self.views.redraws.clear()
-        for change in (self.turn, self.move, self.light, self.bend):
+        for change in changes:
             found: list[float] = []
             engine: list[dict[str, float]] = []
             for i in range(1, self.job["repeats"] + 1):
-                began = time.perf_counter()
-                change(i)
-                yield from self.until(lambda began=began: self.shown().since > began)
+                began = yield from self.changed(change, i)
                 found.append(self.shown().since - began)
                 shown = self.shown().picture
                 engine.append({"seconds.worker": shown.seconds, **shown.passes.statistics})
@@ -124,6 +123,13 @@ class Run:
         self.object.data.shape_keys.key_blocks["Bent"].value = 0.02 * i
 
     # Waiting
+
+    def changed(self, change: Callable[[int], None], i: int) -> Generator[float, None, float]:
+        """Make a change and wait for its first picture; when it was made."""
+        began = time.perf_counter()
+        change(i)
+        yield from self.until(lambda: self.shown().since > began)
+        return began
 
     def shown(self):
         return self.views._shown.get(self.name) or self.views.Shown()
