@@ -42,6 +42,11 @@ ON_MESH = 0.4
 SHARE, SHARE_ON_MESH = 0.45, 0.15
 #: Part of the minutes for materials and light.
 SHARE_OF_MATERIALS = 0.35
+#: Phase -> the settings that decide its result.
+DECIDES = {
+    "surfels": ("schedule", "minutes"),
+    "surfels on the mesh": ("schedule", "minutes", "mesh_resolution", "fixed"),
+}
 #: Fainter surfels do not come into the asset.
 UNSEEN = 0.05
 
@@ -167,7 +172,6 @@ class _Work:
         folder: Path | None,
     ) -> None:  # fmt: skip
         self.capture, self.settings, self.tell, self.cancelled, self.folder = capture, settings, tell, cancelled, folder
-        self.key = checkpoint.fingerprint(capture, **asdict(settings))
         if folder is not None:
             folder.mkdir(parents=True, exist_ok=True)
 
@@ -180,9 +184,12 @@ class _Work:
         return None if self.folder is None else self.folder / f"{phase.replace(' ', '-')}.state"
 
     def learn(self, phase: str, training: Training, begin: float, end: float) -> Gaussians:
-        """Run a training to its end, from its checkpoint if there is one."""
+        """Run a training to its end, from its checkpoint if there is one: that of a run with other settings of later
+        phases serves as well."""
         file = self.file(phase)
-        if file is not None and (state := checkpoint.load(file, self.key)) is not None:
+        settings = asdict(self.settings)
+        key = checkpoint.fingerprint(self.capture, **{name: settings[name] for name in DECIDES[phase]})
+        if file is not None and (state := checkpoint.load(file, key)) is not None:
             training.restore(state)
             log.info("%s: going on at step %d", phase, training.iteration)
         saved = shown = told = time.monotonic()
@@ -191,7 +198,7 @@ class _Work:
             now = time.monotonic()
             stop = self.cancelled()
             if file is not None and (stop or training.finished or now - saved > SAVE_EVERY):
-                checkpoint.save(file, training.arrays(), self.key)
+                checkpoint.save(file, training.arrays(), key)
                 saved = time.monotonic()
             if stop:
                 raise Cancelled

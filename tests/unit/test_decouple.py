@@ -219,6 +219,16 @@ def test_specular_colours_and_back():
     assert metal == pytest.approx(metallic, abs=2e-3) and found == pytest.approx(albedo, abs=2e-3)
 
 
+@pytest.mark.parametrize("look", ["principled", "paper"])
+def test_dielectrics_are_surfaces_without_metal(look):
+    mesh, points, up = floor_points()
+    sums = torch.rand(len(up), 2, 4, 3, generator=torch.Generator().manual_seed(2))
+    columns, nv = torch.tensor([[0.6, 0.4, 0.2, 0.3, 0.0]]).repeat(len(up), 1), torch.from_numpy(points.towards[:, 2])
+    metallic, plain = (Materials(mesh, kind, 0) for kind in ("metallic", "dielectric"))
+    assert torch.equal(plain.reflect(columns[:, :4], sums, nv, look), metallic.reflect(columns, sums, nv, look))
+    assert not plain.values()[2].any() and metallic.values()[2].all()
+
+
 def test_growing_light_keeps_what_it_was():
     light = LearnedLight(8, 1.5)
     assert light.radiance().numpy() == pytest.approx(1.5, rel=1e-5)
@@ -295,6 +305,17 @@ def test_materials_and_light_are_found_again(ball, capture):
     assert min(np.hypot(bright[0] - 4.6, bright[1] - 10.2), np.hypot(bright[0] - 8.1, bright[1] - 23.4)) < 2, bright
     assert found.report["psnr"] > 34
     assert found.report["views"] == 14 and found.report["unseen_vertices"] < 0.2 * len(ball.vertices)
+
+
+def test_without_shadows_a_room_around_all_does_not_stand_before_the_light(ball, capture):
+    room = trimesh.creation.icosphere(2, radius=9.0)
+    room.invert()
+    both = plain_mesh(
+        np.concatenate([ball.vertices, room.vertices]), np.concatenate([ball.faces, room.faces + len(ball.vertices)])
+    )
+    short = replace(SMALL, iterations=60, pixels=256, indirect=False)
+    dark, lit = (decouple(capture, both, replace(short, shadows=value)).report["psnr"] for value in (True, False))
+    assert lit > dark + 10, (dark, lit)
 
 
 @pytest.mark.parametrize("more", [{}, {"normals": True, "exposure": True, "parametrisation": "specular"}])

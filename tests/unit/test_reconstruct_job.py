@@ -126,6 +126,14 @@ def test_materials_and_light_come_with_the_asset(capture, tmp_path):
     assert asset.binding.normal[:, 2].min() > 0.9
 
 
+def test_settings_of_later_phases_leave_surfels_as_they_are(capture, tmp_path, caplog):
+    short = Settings(schedule=replace(QUICK, iterations=3, surfels=500), mesh_resolution=32, materials=False)
+    reconstruct(capture, short, folder=tmp_path)
+    with caplog.at_level("INFO"):
+        reconstruct(capture, replace(short, mesh_resolution=24), folder=tmp_path)
+    assert "surfels: going on at step 3" in caplog.text
+
+
 def test_a_damaged_or_foreign_checkpoint_is_not_used(capture, tmp_path, caplog):
     short = Settings(schedule=replace(QUICK, iterations=3, surfels=500), mesh_resolution=32, materials=False)
     (tmp_path / "surfels.state").write_bytes(b"\x08\0\0\0\0\0\0\0{broken")

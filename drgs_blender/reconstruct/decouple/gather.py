@@ -285,7 +285,7 @@ class Gatherer:
     Parameters
     ----------
     mesh : what rays meet
-    tree : of its triangles
+    tree : of its triangles, or of nothing where nothing is in the way
     cache : (v, 4, 3) float32, see `cache.radiance_cache`; None: what hits the mesh is black
     counts : even numbers of cosine, GGX and light samples a pixel
     normals : whether derivatives by the normals are wanted
@@ -297,7 +297,7 @@ class Gatherer:
         self._faces, self._tree, self._counts, self._normals = mesh.faces, tree, counts, normals
         self._seen = cache is not None
         self._cache = np.zeros((1, 4, 3), np.float32) if cache is None else np.ascontiguousarray(cache, np.float32)
-        low, high = tree.bounds()
+        low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
         self._lift = F(_LIFT * float(np.linalg.norm(high - low)))
         self._sequence = point_set(max(counts) + 1)
         self._light: EnvironmentLight | None = None

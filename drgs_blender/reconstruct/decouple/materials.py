@@ -55,12 +55,14 @@ class Materials:
     Attributes
     ----------
     parameters : name -> tensor: "detail" (v, c), "grid0" ... (corners, c). With "metallic" the c = 5 columns are
-        albedo, roughness, metallic; with "specular" c = 7: diffuse colour, roughness, specular colour
+        albedo, roughness, metallic; with "dielectric" c = 4, without the last; with "specular" c = 7: diffuse colour,
+        roughness, specular colour
     """
 
     def __init__(self, mesh: Mesh, parametrisation: str, coarse: int) -> None:
-        self.specular = parametrisation == "specular"
-        start = np.array([_ALBEDO] * 3 + [_ROUGHNESS] + ([_SPECULAR] * 3 if self.specular else [_METALLIC]))
+        self.specular, self.metallic = parametrisation == "specular", parametrisation == "metallic"
+        more = [_SPECULAR] * 3 if self.specular else [_METALLIC] * self.metallic
+        start = np.array([_ALBEDO] * 3 + [_ROUGHNESS] + more)
         self._start = torch.from_numpy(np.log(start / (1 - start)).astype(np.float32))
         self._grids = Grids(mesh.vertices, coarse)
         self._count, columns = len(mesh.vertices), len(start)
@@ -83,7 +85,7 @@ class Materials:
             white = white * (1 - layer_albedo(nv, roughness))[:, None, None]
         if self.specular:
             return colour * white + columns[:, None, 4:7] * mirror + edge
-        metal = columns[:, None, 4:5]
+        metal = columns[:, None, 4:5] if self.metallic else torch.zeros(())
         if look == "paper":
             f0 = _DIELECTRIC * (1 - metal) + colour * metal
             return (1 - metal) * colour * white + f0 * mirror + edge
@@ -102,7 +104,7 @@ class Materials:
         if self.specular:
             albedo, metallic = from_specular(values[:, :3], values[:, 4:7])
             return albedo, roughness, metallic
-        return values[:, :3].copy(), roughness, values[:, 4].copy()
+        return values[:, :3].copy(), roughness, values[:, 4].copy() if self.metallic else np.zeros_like(roughness)
 
 
 def from_specular(diffuse: Array, specular: Array) -> tuple[Array, Array]:

@@ -137,6 +137,9 @@ class _Job:
         self._pixels = foreground_pixels(capture.training, mesh, tree, settings.most_pixels, settings.seed)
         cache, self._weight = radiance_cache(self._pixels, mesh)
         counts = (settings.cosine, settings.ggx, settings.light)
+        if not settings.shadows:
+            tree = TriangleBVH()
+            tree.build(mesh.vertices, mesh.faces[:0])
         self._gatherer = Gatherer(mesh, tree, cache if settings.indirect else None, counts, settings.normals)
         self._normals = torch.from_numpy(VertexNormals(mesh.faces, len(mesh.vertices))(mesh.vertices))
         self._faces = torch.from_numpy(mesh.faces.astype(np.int64))
@@ -245,7 +248,7 @@ class _Job:
         likeness = torch.from_numpy(self._likeness[edge])[:, None]
         weights = torch.tensor(_SMOOTH[: columns.shape[1]])
         loss = loss + s.smoothness * ((likeness * differences).mean(0) * weights).sum()
-        if s.bimodal > 0 and not self.materials.specular:
+        if s.bimodal > 0 and self.materials.metallic:
             loss = loss + s.bimodal * (here[:, 4] * (1 - here[:, 4])).mean()
         if s.white > 0:
             loss = loss + s.white * colour_cast(radiance)

@@ -20,6 +20,8 @@ class Settings:
     cosine, ggx, light : directions that each strategy draws at a pixel, even numbers
     look : BRDF, "principled" (Blender's) or "paper"
     indirect : light that other parts of the object send is what the photographs show of them; else it is black
+    shadows : other parts of the object stand before the environment; without, every point sees all of it, as in the
+        split-sum shading of other methods
     environment : rows of the learned lat-long light at the end, a power of two
     coarse_to_fine : begin with a quarter of the rows and double them on a schedule
     rate, light_rate : first step sizes of materials and light (Adam), in logits and log radiance
@@ -30,7 +32,7 @@ class Settings:
     bimodal : weight that pulls metallic to 0 or 1
     unbiased : compare two independent estimates of each pixel, so that their noise is not learned from
     parametrisation : "metallic" learns albedo and metallic; "specular" diffuse and specular colour, turned into the
-        former at the end
+        former at the end; "dielectric" albedo alone, metallic is 0
     normals : also learn an offset of each vertex normal, held by `normal_smoothness`
     exposure : also learn the brightness of every photograph
     most_pixels : foreground pixels kept in memory, evenly over all views
@@ -45,6 +47,7 @@ class Settings:
     light: int = 8
     look: Literal["principled", "paper"] = "principled"
     indirect: bool = True
+    shadows: bool = True
     environment: int = 64
     coarse_to_fine: bool = True
     rate: float = 0.04
@@ -55,7 +58,7 @@ class Settings:
     white: float = 0.0003
     bimodal: float = 0.0
     unbiased: bool = True
-    parametrisation: Literal["metallic", "specular"] = "metallic"
+    parametrisation: Literal["metallic", "specular", "dielectric"] = "metallic"
     normals: bool = False
     normal_smoothness: float = 0.3
     exposure: bool = False
@@ -73,7 +76,7 @@ class Settings:
             "cosine, ggx, light": min(counts) < 0 or sum(counts) == 0 or any(c % 2 for c in counts),
             "environment": not 8 <= rows <= 1024 or rows & (rows - 1) != 0,
             "look": self.look not in ("principled", "paper"),
-            "parametrisation": self.parametrisation not in ("metallic", "specular"),
+            "parametrisation": self.parametrisation not in ("metallic", "specular", "dielectric"),
             "coarse": not 0 <= self.coarse <= 8,
         }
         for field in fields(self):
