@@ -24,7 +24,8 @@ class Camera:
 
     Attributes
     ----------
-    matrix_world : (4, 4) float64 camera-to-world, rigid, Blender's convention
+    matrix_world : (4, 4) float64 camera-to-world, rigid, Blender's convention; of an orthographic camera -Z may lean,
+        its part along the axis still of length 1
     width, height : full picture in pixels (after resolution %)
     fx, fy, cx, cy : pixels; fx != fy expresses pixel aspect
     region : (x0, y0, x1, y1) in pixels, half-open: what is rendered (border); None is everything. Results are always

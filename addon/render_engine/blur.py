@@ -41,9 +41,6 @@ def steps(scene: bpy.types.Scene, camera: bpy.types.Object, warn: Warn) -> list[
     """The pictures that make one of an evaluated scene; none where nothing is blurred."""
     render, dof = scene.render, camera.data.dof
     radius = _radius(camera.data)
-    if dof.use_dof and camera.data.type == "ORTHO":
-        warn(f'Depth of field of the orthographic camera "{camera.name}" is not rendered by DR-GS')
-        radius = 0.0
     shutter = render.motion_blur_shutter if render.use_motion_blur else 0.0
     if not (radius or shutter):
         return []
@@ -56,10 +53,11 @@ def steps(scene: bpy.types.Scene, camera: bpy.types.Object, warn: Warn) -> list[
 
 
 def _radius(camera: bpy.types.Camera) -> float:
-    """Metres from the middle of the lens to the rim; 0 where everything is sharp."""
-    if not camera.dof.use_dof or camera.type == "ORTHO":
+    """Metres from the middle of the lens to the rim, as in Cycles; 0 where everything is sharp."""
+    if not camera.dof.use_dof:
         return 0.0
-    return 0.5e-3 * camera.lens / max(camera.dof.aperture_fstop, 1e-5)
+    focal = 1.0 if camera.type == "ORTHO" else 1e-3 * camera.lens
+    return 0.5 * focal / max(camera.dof.aperture_fstop, 1e-5)
 
 
 def on_lens(u: float, v: float, dof: bpy.types.CameraDOFSettings) -> tuple[float, float]:

@@ -23,7 +23,11 @@ def through(camera: Camera, lens: tuple[float, float], distance: float) -> Camer
     """`camera` from another place of its lens, metres to the right and up; what is at `distance` stays in its pixel."""
     x, y = lens
     pose = np.array(camera.matrix_world)
-    pose[:3, 3] += x * pose[:3, 0] + y * pose[:3, 1]
+    aside = x * pose[:3, 0] + y * pose[:3, 1]
+    pose[:3, 3] += aside
+    if camera.orthographic:
+        pose[:3, 2] += aside / distance
+        return replace(camera, matrix_world=pose)
     cx, cy = camera.cx + camera.fx * x / distance, camera.cy - camera.fy * y / distance
     return replace(camera, matrix_world=pose, cx=cx, cy=cy)
 

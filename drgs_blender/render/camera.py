@@ -20,8 +20,8 @@ from .sampling import GOLDEN, mix
 Array = np.ndarray
 
 #: Offsets into the array of `camera_parameters`.
-POSITION, FX, FY, CX, CY, ORTHOGRAPHIC, CLIP_START, CLIP_END, WIDTH, SEED, AA, PARAMETERS = (
-    *(9, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21, 22),
+POSITION, FX, FY, CX, CY, ORTHOGRAPHIC, CLIP_START, CLIP_END, WIDTH, SEED, AA, LEAN, PARAMETERS = (
+    *(9, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21, 22, 24),
 )
 _GOLDEN_RATIO = 0.6180339887498949
 
@@ -35,7 +35,9 @@ def check_camera(camera: Camera) -> None:
     matrix = np.asarray(camera.matrix_world, dtype=np.float64)
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         refuse("its matrix is not a finite 4 x 4 matrix", "Check the camera's transform and its drivers")
-    rotation = matrix[:3, :3]
+    rotation = matrix[:3, :3].copy()
+    if camera.orthographic:
+        rotation[:, 2] -= rotation[:, :2] @ lean(camera)
     if np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-3:
         refuse("its matrix scales or shears", "Apply the scale of the camera and of its parents")
     if camera.width < 1 or camera.height < 1:
@@ -57,12 +59,19 @@ def check_camera(camera: Camera) -> None:
         refuse(f"the region {camera.window} is empty or leaves the picture", "Clear or redraw the render region")
 
 
+def lean(camera: Camera) -> Array:
+    """(2,) float64: how far rays go to the left and down on a metre along the view axis, which they leave where an
+    orthographic camera looks through one place of its lens (`engine.blur.through`)."""
+    matrix = np.asarray(camera.matrix_world, dtype=np.float64)
+    return matrix[:3, :2].T @ matrix[:3, 2] if camera.orthographic else np.zeros(2)
+
+
 def camera_parameters(camera: Camera, settings: RenderSettings, frame_number: int) -> Array:
     """Flatten the camera, sub-pixel count and seed for kernels.
 
     Returns
     -------
-    (PARAMETERS,) float64: the camera-to-world rotation (row-major), then the fields named by this module's offsets.
+    (PARAMETERS,) float64: the camera-to-world matrix (row-major), then the fields named by this module's offsets.
 
     Raises
     ------
@@ -80,6 +89,7 @@ def camera_parameters(camera: Camera, settings: RenderSettings, frame_number: in
     out[CLIP_START], out[CLIP_END], out[WIDTH] = camera.clip_start, camera.clip_end, camera.width
     out[SEED] = mix(np.uint32(settings.seed & 0xFFFFFFFF) ^ mix(np.uint32(frame_number & 0xFFFFFFFF)))
     out[AA] = settings.positions
+    out[LEAN : LEAN + 2] = lean(camera)
     return out
 
 

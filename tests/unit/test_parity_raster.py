@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,11 +11,13 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from drgs_blender.asset.model import PosedSurfels  # noqa: E402
+from drgs_blender.engine.blur import through  # noqa: E402
+from drgs_blender.errors import UsageError  # noqa: E402
 from drgs_blender.frame import Camera, RenderSettings  # noqa: E402
-from drgs_blender.render.camera import camera_parameters, lattice, pixel_shift  # noqa: E402
+from drgs_blender.render.camera import camera_parameters, camera_ray, check_camera, lattice, pixel_shift  # noqa: E402
 from drgs_blender.render.reference import raster as reference  # noqa: E402
 from drgs_blender.render.surfels import raster as kernel  # noqa: E402
-from drgs_blender.render.surfels.splats import prepare  # noqa: E402
+from drgs_blender.render.surfels.splats import prepare, to_camera  # noqa: E402
 
 torch.set_num_threads(1)
 AA = 2
@@ -99,3 +102,17 @@ def test_g_buffer(scene: str, orthographic: bool):
         # A jump of the depth close to the limit, or two equal depths, may be decided otherwise.
         assert (off > 1e-3).mean() < 5e-3, name
         assert np.median(off) < 2e-5, name
+
+
+def test_points_are_where_the_rays_of_a_place_on_the_lens_meet_them():
+    view = through(camera(True), (0.3, -0.2), 2.0)
+    parameters, matrix = camera_parameters(view, RenderSettings(), 1), np.asarray(view.matrix_world)
+    for direction in np.random.default_rng(5).normal(size=(20, 3)):
+        right, down, forward = to_camera(parameters, *direction)
+        assert matrix[:3, :3] @ (right, -down, -forward) == pytest.approx(direction, abs=1e-12)
+    x, y = view.cx + 0.7 * view.fx, view.cy - 0.4 * view.fy
+    ray = np.array(camera_ray(parameters, x, y)).reshape(2, 3)
+    sharp = np.asarray(camera(True).matrix_world)
+    assert ray[0] + 2.0 * ray[1] == pytest.approx((sharp @ (0.7, 0.4, -2.0, 1))[:3], abs=1e-12)
+    with pytest.raises(UsageError, match="scales or shears"):
+        check_camera(replace(view, orthographic=False))

@@ -18,7 +18,7 @@ import numpy as np
 from ...asset.model import PosedSurfels
 from ...frame import Camera
 from ...jit import njit, prange
-from ..camera import AA, CLIP_END, CLIP_START, CX, CY, FX, FY, ORTHOGRAPHIC, POSITION
+from ..camera import AA, CLIP_END, CLIP_START, CX, CY, FX, FY, LEAN, ORTHOGRAPHIC, POSITION
 
 Array = np.ndarray
 
@@ -105,11 +105,9 @@ def prepare(posed: PosedSurfels, camera: Camera, parameters: Array) -> Splats:
 @njit(inline="always")
 def to_camera(p: Any, x: Any, y: Any, z: Any) -> Any:
     """World direction to camera coordinates (right, down, forward)."""
-    return (
-        p[0] * x + p[3] * y + p[6] * z,
-        -(p[1] * x + p[4] * y + p[7] * z),
-        -(p[2] * x + p[5] * y + p[8] * z),
-    )
+    right, up = p[0] * x + p[3] * y + p[6] * z, p[1] * x + p[4] * y + p[7] * z
+    forward = p[LEAN] * right + p[LEAN + 1] * up - (p[2] * x + p[5] * y + p[8] * z)
+    return right + p[LEAN] * forward, -(up + p[LEAN + 1] * forward), forward
 
 
 @njit(inline="always")
