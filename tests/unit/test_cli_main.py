@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 import time
+import tomllib
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from PIL import Image
 from drgs_blender import errors
 from drgs_blender.cli import main as command_line
 from drgs_blender.cli import sampling
-from drgs_blender.cli.find_blender import find_blender
+from drgs_blender.cli.find_blender import CHECKOUT, find_blender
 from drgs_blender.cli.frame_lines import FrameLines
 from drgs_blender.cli.main import COMMANDS, main
 from drgs_blender.cli.output import check_writable, write_preview
@@ -234,3 +235,37 @@ def test_a_name_too_long_is_said_before_the_work(tmp_path, length):
     with pytest.raises(errors.WriteError, match="too long"):
         check_writable(tmp_path / ("n" * (length - 4) + ".exr"))
     assert not list(tmp_path.iterdir())
+
+
+#: The program as pip writes it, with Ctrl+C at the moment when it begins to import a module.
+BEGINS = """
+import os, signal, sys
+moment = sys.argv.pop(1)
+def interrupt(event, about):
+    if event == "import" and about[0] == moment:
+        os.kill(os.getpid(), signal.SIGINT)
+sys.addaudithook(interrupt)
+from {module} import {function}
+sys.exit({function}())
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="a process cannot send Ctrl+C to itself alone")
+@pytest.mark.parametrize(
+    "moment",
+    [
+        "drgs_blender.cli.main",
+        "argparse",
+        "drgs_blender.errors",
+        "drgs_blender.cli.frame_lines",
+        "drgs_blender.cli.sampling",
+        "drgs_blender.cli.find_blender",
+    ],
+)
+def test_ctrl_c_while_python_imports_has_its_exit_code_and_no_traceback(moment):
+    project = tomllib.loads((CHECKOUT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    module, function = project["scripts"]["drgs"].split(":")
+    program = BEGINS.format(module=module, function=function)
+    command = [sys.executable, "-c", program, moment, "doctor"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=CHECKOUT)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "drgs: interrupted\n")
