@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from disks import mount, unmount
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -17,3 +19,17 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"development data not found at {folder} (set DRGS_SHARED)")
     return folder
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Callable[[str], Path]]:
+    """Function that mounts a disk with the options given, or changes those it has; skips where that is not allowed."""
+    place = tmp_path / "disk"
+
+    def disk(options: str) -> Path:
+        if not mount(place, options):
+            pytest.skip("a disk cannot be mounted here")
+        return place
+
+    yield disk
+    unmount(place)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
@@ -90,24 +89,6 @@ def body(ball):
     matter.use = True
     matter.young, matter.resolution, matter.frame_end = 2e4, 8, FRAMES
     return ball
-
-
-@pytest.fixture
-def small_disk(tmp_path):
-    """Function that mounts a disk of so many KiB, or gives that one another size; skips where that is not allowed."""
-    place = tmp_path / "disk"
-
-    def mount(size):
-        again = place.is_mount()
-        place.mkdir(exist_ok=True)
-        command = ["mount", *([] if again else ["-t", "tmpfs"]), "-o", ("remount," if again else "") + f"size={size}k"]
-        if not shutil.which("mount") or subprocess.run([*command, "none", place], capture_output=True).returncode:
-            pytest.skip("a disk cannot be mounted here")
-        return place
-
-    yield mount
-    if place.is_mount():
-        subprocess.run(["umount", "-l", place], check=True)
 
 
 @pytest.fixture

@@ -24,7 +24,7 @@ def whole(cache) -> list[int]:
 
 
 def test_a_full_disk_ends_a_bake_with_a_word_and_what_was_done_stays(body, scene, small_disk):
-    matter, disk = body.drgs.matter, small_disk(1024)
+    matter, disk = body.drgs.matter, small_disk("size=1024k")
     matter.folder, matter.frame_end, matter.gravity = str(disk / "cache"), 500, 0.0
     matter.spin = (0, 0, 3)
     with pytest.raises(RuntimeError, match=r"[Ff]ree (some )?space.*The first [0-9]+ frames can be played") as caught:
@@ -36,7 +36,7 @@ def test_a_full_disk_ends_a_bake_with_a_word_and_what_was_done_stays(body, scene
     assert 2 <= shown <= len(frames) < 500
     np.testing.assert_array_equal(vertices(body, shown), cache_of(body).read(shown).vertices)
     assert not list((disk / "cache").glob(".*.tmp"))
-    small_disk(65536)
+    small_disk("size=65536k")
     matter.frame_end = len(frames) + 2
     bpy.ops.drgs.bake_matter()
     assert whole(cache_of(body))[-1] == matter.frame_end
@@ -45,7 +45,7 @@ def test_a_full_disk_ends_a_bake_with_a_word_and_what_was_done_stays(body, scene
 
 def test_a_disk_that_is_full_before_anything_is_computed_is_no_end_of_blender(body, scene, small_disk):
     """What moves is written while the scene is read."""
-    matter, disk = body.drgs.matter, small_disk(512)
+    matter, disk = body.drgs.matter, small_disk("size=512k")
     matter.folder, matter.frame_end = str(disk / "cache"), 60
     at, faces = sphere(32, 48)
     rolling = mesh_object("Rolling", np.add(at, [0, 0, -4]), faces)
@@ -59,7 +59,7 @@ def test_a_disk_that_is_full_before_anything_is_computed_is_no_end_of_blender(bo
     ) as caught:
         bpy.ops.drgs.bake_matter()
     assert str(disk / "cache") in str(caught.value) and not work.running
-    small_disk(65536)
+    small_disk("size=65536k")
     matter.frame_end = 3
     bpy.ops.drgs.bake_matter()
     assert whole(cache_of(body)) == [1, 2, 3]

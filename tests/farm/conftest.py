@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import os
-import shutil
-import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -42,24 +40,6 @@ def drgs(capsys: pytest.CaptureFixture) -> Callable[..., tuple[int, list[str], s
         return code, captured.out.splitlines(), captured.err
 
     return run
-
-
-@pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Callable[[str], Path]]:
-    """Function that mounts a disk with the options given, or changes those it has; skips where that is not allowed."""
-    place = tmp_path / "disk"
-
-    def mount(options: str) -> Path:
-        again = place.is_mount()
-        place.mkdir(exist_ok=True)
-        command = ["mount", *([] if again else ["-t", "tmpfs"]), "-o", ("remount," if again else "") + options]
-        if not shutil.which("mount") or subprocess.run([*command, "none", place], capture_output=True).returncode:
-            pytest.skip("a disk cannot be mounted here")
-        return place
-
-    yield mount
-    if place.is_mount():
-        subprocess.run(["umount", "-l", place], check=True)
 
 
 def same_pixels(first: Path, second: Path) -> bool:
