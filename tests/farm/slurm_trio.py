@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shlex
 import shutil
 import socket
 import subprocess
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import psutil
@@ -41,6 +43,15 @@ SwitchType=switch/none
 SchedulerParameters=sched_interval=1,bf_interval=1
 SlurmdParameters=config_overrides
 PartitionName=farm Nodes=ALL Default=YES MaxTime=INFINITE State=UP
+"""
+#: Sessions of OpenJD as tasks of an array, each with a part of the frames (docs/farm/openjd.md).
+_SESSIONS = """\
+#!/bin/bash
+#SBATCH --array=0-{last}
+#SBATCH --output={job}/logs/%x-%a.log
+frames=({parts})
+echo "drgs: node $SLURMD_NODENAME"
+exec {command} --step "$1" -p Frames="${{frames[SLURM_ARRAY_TASK_ID]}}"
 """
 
 
@@ -102,6 +113,27 @@ class Trio:
     def ask(self, *command: str) -> str:
         """What a command of Slurm prints."""
         return subprocess.run(command, env=self.env, capture_output=True, text=True, timeout=60).stdout.strip()
+
+    def submit_sessions(self, job: Path, openjd: Path, command: str, parts: Sequence[str]) -> None:
+        """Submit the array that renders and the one that denoises after it, of sessions of a bundle of OpenJD.
+
+        Parameters
+        ----------
+        job : folder of the bundle, with room for `logs`: render-0.log, ..., denoise-0.log, ...
+        openjd : the program
+        command : what `drgs submit openjd` printed, which would run the bundle in one session
+        parts : the frames of each session
+        """
+        words = shlex.split(command)
+        parameters = words[words.index("-p") :]
+        script = job / "sessions.sbatch"
+        (job / "logs").mkdir()
+        command = shlex.join([str(openjd), "run", str(job / "template.json"), *parameters])
+        script.write_text(_SESSIONS.format(last=len(parts) - 1, job=job, parts=" ".join(parts), command=command))
+        after: list[str] = []
+        for step in ("Render", "Denoise"):
+            number = self.ask("sbatch", "--parsable", f"--job-name={step.lower()}", *after, str(script), step)
+            after = [f"--dependency=afterok:{number}", "--kill-on-invalid-dep=yes"]
 
     def until(self, condition, seconds: float) -> None:
         """Wait until `condition` holds; fails when it does not in time."""

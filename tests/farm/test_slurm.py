@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import subprocess
 import sys
 import tempfile
@@ -107,34 +106,27 @@ def test_chunk_that_always_ends_with_75_is_given_up(drgs, trio, scene):
     assert not logs(job, "denoise")
 
 
-#: Sessions of several chunks each, as tasks of an array.
-SESSIONS = """#!/bin/bash
-#SBATCH --array=0-1
-#SBATCH --output={job}/session-%a.log
-sessions=('[{{"Frame":"1"}},{{"Frame":"2"}}]' '[{{"Frame":"3"}}]')
-exec {openjd} run {job}/template.json --step Render {parameters} --tasks "${{sessions[SLURM_ARRAY_TASK_ID]}}"
-"""
-
-
-def test_sessions_of_openjd_run_in_an_array(drgs, trio, scene, tmp_path):
+def test_sessions_of_openjd_in_an_array_render_and_denoise_what_one_machine_does(drgs, trio, scene, tmp_path):
     pytest.importorskip("openjd.cli")
     job = tmp_path / "job"
     code, lines, error = drgs(
-        "submit", "openjd", scene, "--frames", "1-3", "--chunk", 1, "--out", "//f/####.exr", "--no-check",
-        "--to", job, "--drgs", PROGRAM, "--options=--rays 4",
+        "submit", "openjd", scene, "--frames", "1-5", "--chunk", 1, "--chunk-seconds", 5, "--out", "//noisy/####.exr",
+        "--denoised", "//clean/####.exr", "--no-check", "--to", job, "--drgs", PROGRAM, "--options=--rays 4",
     )  # fmt: skip
     assert code == 0, error
-    openjd = Path(sys.executable).with_name("openjd")
-    parameters = shlex.join(shlex.split(lines[-1])[5:])
-    (job / "array.sbatch").write_text(SESSIONS.format(job=job, openjd=openjd, parameters=parameters))
-    assert trio.ask("sbatch", str(job / "array.sbatch")).startswith("Submitted")
+    trio.submit_sessions(job, Path(sys.executable).with_name("openjd"), lines[-1], ["1-2", "3-4", "5"])
     trio.until_done(300)
-    told = [(job / f"session-{k}.log").read_text() for k in (0, 1)]
-    assert [text.count("DRGS_EXIT class=ok") for text in told] == [2, 1], told
-    assert [text.count("Entering Environment: WarmEngine") for text in told] == [1, 1]
-    assert drgs("render", scene, "--frames", "1-3", "--out", tmp_path / "alone" / "####.exr", "--rays", 4)[0] == 0
-    frames = list((tmp_path / "alone").iterdir())
-    assert len(frames) == 3 and all(same_pixels(path, tmp_path / "f" / path.name) for path in frames)
+    for step in ("render", "denoise"):
+        told = [(job / f"logs/{step}-{k}.log").read_text() for k in range(3)]
+        assert [text.count("Saved: ") for text in told] == [2, 2, 1], told
+        assert [text.count("Entering Environment: WarmEngine") for text in told] == [1, 1, 1]
+    alone = tmp_path / "alone"
+    noisy, clean = alone / "noisy" / "####.exr", alone / "clean" / "####.exr"
+    rays = ("--rays", 4, "--denoise", "none", "--passes", "temporal")
+    assert drgs("render", scene, "--frames", "1-5", "--out", noisy, *rays)[0] == 0
+    assert drgs("denoise", noisy, "--frames", "1-5", "--out", clean)[0] == 0
+    for path in (*noisy.parent.iterdir(), *clean.parent.iterdir()):
+        assert same_pixels(path, tmp_path / path.parent.name / path.name)
 
 
 @pytest.mark.skipif(not WHOLE, reason="slow; DRGS_FAULTS=whole runs it")

@@ -72,7 +72,7 @@ def template(job: Job, seconds: int = 0) -> dict[str, Any]:
     steps = [_step("Render", seconds, job.render(frames, f"{{{{Param.{_SCENE}}}}}", out))]
     if job.clean:
         clean = f"{{{{Param.{_CLEAN}}}}}/{Path(job.clean).name}"
-        steps.append(_step("Denoise", seconds, job.denoise(frames, out, clean, "{{Param.Frames}}")))
+        steps.append(_step("Denoise", seconds, job.denoise(frames, out, clean, "{{Param.Sequence}}")))
         steps[1]["dependencies"] = [{"dependsOn": "Render"}]
     every = write_frames(sorted(job.frames))  # its ranges may not overlap
     parameters = [
@@ -83,6 +83,8 @@ def template(job: Job, seconds: int = 0) -> dict[str, Any]:
     ]
     if job.clean:
         parameters.append(_path(_CLEAN, "DIRECTORY", "OUT", "Folder of the denoised frames"))
+        about = "All frames of the shot, the neighbours of Frames, which may be a part of them"
+        parameters.append({"name": "Sequence", "type": "STRING", "default": every, "description": about})
     return {
         "specificationVersion": "jobtemplate-2023-09",
         "extensions": ["TASK_CHUNKING"],
