@@ -121,7 +121,8 @@ def main() -> None:
         f"{about}; the same photographs by Cycles, surfels and mesh for every row. What is left out is left out "
         "of learning and of rendering; the integrals are ours, so the rows show what the idea costs and not what the "
         "original programs reach. PSNR of the foreground in dB; all but the views left out scaled by one factor a "
-        "channel; relit: means over the lights that were not photographed.\n\n"
+        "channel; relit: means over the lights that were not photographed. Colours of the day are their mean over all "
+        "views: harmonics, which these methods have, would help them in the two columns of the day's light.\n\n"
     )
     cells = [(*key.split("|"), *found) for key, found in rows.items()]
     write_section("baselines", "What other methods leave out", body + table(COLUMNS, cells))
