@@ -111,7 +111,7 @@ _ROWS = (
     Material("jelly", "elastic", "soft, springs back, wobbles", 1e5, 0.3, 1000),
     Material("rubber", "elastic", "firm, springs back, keeps its volume", 2e6, 0.45, 1100),
     Material("elastic", "corotated", "springs back; survives rough handling", 2e5, 0.3, 1000),
-    Material("metal", "plastic", "stiff, dents and stays dented", 5e6, 0.3, 2700, yield_stress=4e4, hardening=2e5),
+    Material("metal", "plastic", "stiff, dents and stays dented", 4e7, 0.3, 2700, yield_stress=1e6, hardening=1e6),
     Material("clay", "plastic", "plasticine: gives way and stays", 4e5, 0.35, 1600, yield_stress=6e3, hardening=-2e3),
     Material("foam", "plastic", "gives way slowly, light", 1e5, 0.2, 200, yield_stress=8e2, viscosity=200.0),
     Material("sand", "sand", "runs and piles up", 1e6, 0.3, 1600, friction_angle=35.0),

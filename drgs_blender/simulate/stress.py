@@ -18,6 +18,7 @@ from .decompose import svd3
 Array = np.ndarray
 
 _FLOOR = np.float32(0.02)  # of the volume ratio in logarithms and powers
+_NORM = math.sqrt(2 / 3)  # of a deviator per uniaxial stress, and of equivalent plastic strain per norm of a strain
 
 
 @njit(inline="always")
@@ -64,8 +65,8 @@ def respond(p, model, parameters, f, tau, memories, affine, dt):  # type: ignore
     model, parameters : (n,) uint8, (n, k) float32
     f : (n, 9) float32, elastic deformation gradient less 1, changed in place where matter flows
     tau : (n, 6) float32, written
-    memories : (n,) float32, changed: what the model remembers: plastic strain (plastic), volume correction (sand),
-        plastic volume (snow), volume ratio (fluid)
+    memories : (n,) float32, changed: what the model remembers: equivalent plastic strain (plastic), volume correction
+        (sand), plastic volume (snow), volume ratio (fluid)
     affine : (n, 9) float32 velocity gradient, 1/s
     dt : seconds
     """
@@ -113,14 +114,15 @@ def respond(p, model, parameters, f, tau, memories, affine, dt):  # type: ignore
             strength = max(
                 float(parameters[p, FIRST]) + float(parameters[p, SECOND]) * memory, 0.1 * float(parameters[p, FIRST])
             )
-            excess = 2.0 * mu * length - 0.816496580927726 * strength
+            excess = 2.0 * mu * length - _NORM * strength
             if excess > 0.0:
                 flows = True
                 stiff = 2.0 * mu * (s[0] * s[0] + s[1] * s[1] + s[2] * s[2]) / 3.0
-                step = excess / (2.0 * mu) / (1.0 + float(parameters[p, THIRD]) / (stiff * dt))
+                slower = 1.0 + float(parameters[p, THIRD]) / (stiff * dt)
+                step = excess / (2.0 * mu * slower + 2.0 / 3.0 * max(float(parameters[p, SECOND]), 0.0))
                 keep = 1.0 - step / length
                 a, b, c = mean + keep * x, mean + keep * y, mean + keep * z
-                memory = np.float32(memory + step)
+                memory = np.float32(memory + _NORM * step)
         else:
             # Volume lost or gained in earlier flow is taken up before new stress arises.
             given = float(memory) / 3.0

@@ -121,13 +121,35 @@ def test_metal_flows_on_its_yield_surface(name):
         assert np.linalg.det(left) == pytest.approx(np.linalg.det(f), rel=1e-4)  # volume is kept in flow
 
 
+@pytest.mark.parametrize("steps", [1, 50])
+def test_metal_squeezed_yields_at_its_yield_stress_and_hardens_by_its_modulus(steps):
+    """Axial strain e at constant volume: below yield the stress is 3 mu e, above it Y + H x plastic strain."""
+    material = make_material("metal", {"young": 1e7, "poisson": 0.3, "yield_stress": 1e5, "hardening": 2e6})
+    mu = material.moduli()[1]
+
+    def squeezed(strain: float) -> tuple[float, float]:
+        f, plastic, part = np.eye(3), 0.0, np.diag(np.exp(strain / steps * np.array([-1, 0.5, 0.5])))
+        for _ in range(steps):
+            tau, f, plastic = stress(material, part @ f, plastic)
+        return float(tau[1, 1] - tau[0, 0]), plastic
+
+    limit = 1e5 / (3 * mu)
+    bears, plastic = squeezed(0.95 * limit)
+    assert bears == pytest.approx(0.95e5, rel=1e-3) and plastic == 0
+    for strain in (2 * limit, 10 * limit):
+        bears, plastic = squeezed(strain)
+        assert plastic == pytest.approx((3 * mu * strain - 1e5) / (3 * mu + 2e6), rel=2e-3)
+        assert bears == pytest.approx(1e5 + 2e6 * plastic, rel=2e-3)
+
+
 def test_hardening_strengthens_and_viscosity_delays():
     shear = np.array([[1, 0.2, 0], [0, 1, 0], [0, 0, 1.0]])
     norms = {}
     for name, numbers in {
         "plain": {}, "hard": {"hardening": 1e6}, "slow": {"viscosity": 1e5}, "soft": {"hardening": -1e5},
     }.items():  # fmt: skip
-        tau = stress(make_material("metal", {"hardening": 0.0, "young": 1e6} | numbers), shear, 0.05)[0]
+        common = {"yield_stress": 4e4, "hardening": 0.0, "young": 1e6}
+        tau = stress(make_material("metal", common | numbers), shear, 0.05)[0]
         norms[name] = np.linalg.norm(tau - np.trace(tau) / 3 * np.eye(3))
     assert norms["soft"] < norms["plain"] < norms["hard"]
     assert norms["plain"] < norms["slow"]
