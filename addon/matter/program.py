@@ -31,6 +31,8 @@ threading.Thread(target=watch, daemon=True).start()
 from drgs_blender.cli.main import main
 sys.exit(main())
 """
+#: How a line of the program's log begins.
+_SAYS = "drgs: "
 _COUNTS = re.compile(r"(\d+) particles.*at least (\d+) time steps")
 
 
@@ -111,7 +113,7 @@ class Program:
         self._process.stdin.close()
 
     def result(self, subject: str, held: str = "") -> list[str]:
-        """The lines of its log, after it has ended by itself.
+        """What it warned of, after it has ended by itself.
 
         Parameters
         ----------
@@ -127,10 +129,10 @@ class Program:
         code = self._process.wait()
         self._process.stdin.close()
         if code == 0:
-            return [self._in_words(line) for line in lines]
-        said = next((line for line in reversed(lines) if line.startswith("drgs: ")), "")
+            return [f"{subject}: {self._in_words(line.removeprefix(_SAYS))}" for line in lines]
+        said = next((line for line in reversed(lines) if line.startswith(_SAYS)), "")
         if said:
-            raise AssetError(subject, self._in_words(said.removeprefix("drgs: ")).rstrip("."), held)
+            raise AssetError(subject, self._in_words(said.removeprefix(_SAYS)).rstrip("."), held)
         if code == EXIT_CANNOT_WRITE:  # nor could its log
             remedy = "Free some space or choose another folder, and bake again"
             raise WriteError(f"{subject}, {self._folder}", "cannot be written", f"{remedy}. {held}".rstrip(". "))

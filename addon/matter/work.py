@@ -101,7 +101,7 @@ class Work:
         if self._take(seconds) or alive:
             return False
         for line in self._program.result(self.subject, self._held()):
-            messages.note("INFO", line)
+            messages.note("WARNING", line)
         self._finish()
         return True
 

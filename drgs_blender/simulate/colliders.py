@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..errors import AssetError, UsageError
-from .contact import CONTACTS, Contact, distances
+from .contact import CONTACTS, Contact, look
 
 Array = np.ndarray
 log = logging.getLogger(__name__)
@@ -25,6 +25,7 @@ _BAND = 8
 _MOST_CELLS = 1 << 23
 #: Cells between a surface that lies on a collider and the collider.
 _CLEARANCE = 0.02
+_OVERLAP = "%s: overlaps the body at the start: %d of %d particles are inside it, and begin there; move the two apart"
 
 
 @dataclass(slots=True)
@@ -92,7 +93,13 @@ _STILL = np.zeros((0, 0, 0, 3), np.float32)
 
 
 def make_field(
-    vertices: Array, faces: Array, spacing: float, low: Array, high: Array, velocities: Array | None = None
+    vertices: Array,
+    faces: Array,
+    closed: bool,
+    spacing: float,
+    low: Array,
+    high: Array,
+    velocities: Array | None = None,
 ) -> Field | None:
     """Signed distance from a mesh within the box from `low` to `high`; None where the two are apart.
 
@@ -101,6 +108,7 @@ def make_field(
 
     Parameters
     ----------
+    closed : see `is_closed`
     velocities : (n, 3) of the vertices, m/s
     """
     import igl
@@ -115,7 +123,7 @@ def make_field(
         size = np.ceil((high - low) / spacing).astype(np.int64) + 1
         log.warning("a collider is large: its surface is known to %.3g m only", spacing)
     nodes = low + np.stack(np.meshgrid(*(np.arange(n) for n in size), indexing="ij"), -1).reshape(-1, 3) * spacing
-    distance, face, closest, *_ = igl.signed_distance(nodes, vertices, faces, _sign(faces))
+    distance, face, closest, *_ = igl.signed_distance(nodes, vertices, faces, _sign(closed))
     velocity = _STILL
     if velocities is not None:
         corners = vertices[faces[face]]
@@ -125,12 +133,16 @@ def make_field(
     return Field(low, spacing, np.ascontiguousarray(distance, np.float32).reshape(size), velocity)
 
 
-def _sign(faces: Array) -> Any:
-    """How inside is told: by the winding number where every edge has two faces."""
+def is_closed(faces: Array) -> bool:
+    """Whether every edge has two faces, or four, ..."""
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    return bool((np.unique(edges, axis=0, return_counts=True)[1] % 2 == 0).all())
+
+
+def _sign(closed: bool) -> Any:
+    """How inside is told."""
     import igl
 
-    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    closed = (np.unique(edges, axis=0, return_counts=True)[1] % 2 == 0).all()
     return igl.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER if closed else igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
 
 
@@ -162,6 +174,7 @@ class MovingCollider:
         self.collider, self.spacing = collider, spacing
         self._low, self._high = low, high
         self._rest = collider.at(0)
+        self._closed = is_closed(collider.faces)
         self._own: Field | None = None  # in the collider's own space
         self._have_own = False
         self.speed = 0.0
@@ -197,7 +210,7 @@ class MovingCollider:
         if not self._have_own:
             still = len(self.collider.vertices) == 1
             low, high = (self._low, self._high) if still else (np.full(3, -np.inf), np.full(3, np.inf))
-            self._own = make_field(self._rest, self.collider.faces, self.spacing, low, high)
+            self._own = self._make_field(self._rest, low, high)
             self._have_own = True
         turn = Rotation.from_rotvec(part * self._spin).as_matrix() @ self._turn
         centre = (1 - part) * self._centre_before + part * self._centre_after
@@ -207,36 +220,44 @@ class MovingCollider:
         # v(x) = linear + spin x (x - centre), told about the point `shift`.
         return self._own, turn, shift, linear + np.cross(spin, shift - centre), spin
 
-    def roughly(self, points: Array, part: float) -> Array:
-        """(n,) signed distances of points at `part` of the frame, by the nearest node; infinite far away."""
-        place, rotation, shift, _, _ = self.at(part)
-        if place is None:
-            return np.full(len(points), np.inf)
-        return distances(points, place.distance, place.origin, place.spacing, rotation, shift)
+    def look(self, points: Array, part: float) -> Array | None:
+        """(n, 7) what `contact.surface_near` says of points at `part` of the frame; None where nothing is touched."""
+        field, *motion = self.at(part)
+        if field is None:
+            return None
+        return look(points, field.distance, field.velocity, field.origin, field.spacing, *motion)
+
+    def distances(self, points: Array, part: float) -> Array:
+        """(n,) signed distances of points at `part` of the frame, as matter feels them; infinite far away."""
+        seen = self.look(points, part)
+        return np.full(len(points), np.inf) if seen is None else seen[:, 0]
 
     def closest(self, points: Array) -> tuple[Array, Array, Array]:
         """Signed distances (n,) from the mesh at the end of the frame, its closest points, and the way out, (n, 3)."""
         import igl
 
         faces = self.collider.faces
-        distance, face, closest, *_ = igl.signed_distance(points, self._after, faces, _sign(faces))
+        distance, face, closest, *_ = igl.signed_distance(points, self._after, faces, _sign(self._closed))
         a, b, c = np.moveaxis(self._after[faces[face]], 1, 0)
         normal = np.cross(b - a, c - a)
         on = np.abs(distance) < 1e-6 * self.spacing
         out = np.where(on[:, None], normal, (points - closest) * np.sign(distance)[:, None])
         return distance, closest, out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-300)
 
+    def _make_field(self, vertices: Array, low: Array, high: Array, velocities: Array | None = None) -> Field | None:
+        return make_field(vertices, self.collider.faces, self._closed, self.spacing, low, high, velocities)
+
     def _deforming(self, part: float) -> tuple[Field | None, Array, Array, Array, Array]:
         if (part - self._built_at) * self._seconds * self.speed > 0.5 * self.spacing or self._built_at < 0:
             vertices = (1 - part) * self._before + part * self._after
             velocities = (self._after - self._before) / self._seconds
-            self._field = make_field(vertices, self.collider.faces, self.spacing, *self._near, velocities)
+            self._field = self._make_field(vertices, *self._near, velocities)
             self._built_at = part
         return self._field, np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3)
 
 
 def check_apart(points: Array, depth: float, colliders: Sequence[MovingCollider], planes: Array) -> None:
-    """Refuse a body that is inside of what it should meet, before anything moves.
+    """Refuse a body that is inside of what it should meet, and warn of one that is a little, before anything moves.
 
     Parameters
     ----------
@@ -249,19 +270,21 @@ def check_apart(points: Array, depth: float, colliders: Sequence[MovingCollider]
     UsageError
         More than a hundredth of the points are deeper inside than that.
     """
-    found = {"floor or wall": int(np.count_nonzero((points @ planes[:, :3].T < planes[:, 3] - depth).any(axis=1)))}
+    sunk = {"floor or wall": (planes[:, 3] - points @ planes[:, :3].T).max(axis=1, initial=-np.inf)}
     low, high = points.min(axis=0), points.max(axis=0)
     for moving in colliders:
         moving.enter(0, 1.0, low, high)
-        inside = moving.roughly(points, 0.0) < moving.collider.thickness - depth
-        found[moving.collider.name] = int(np.count_nonzero(inside))
-    for name, count in found.items():
-        if count > 0.01 * len(points):
+        sunk[moving.collider.name] = moving.collider.thickness - moving.distances(points, 0.0)
+    for name, depths in sunk.items():
+        count, deep = (int(np.count_nonzero(depths > part * depth)) for part in (0.5, 1.0))
+        if deep > 0.01 * len(points):
             raise UsageError(
                 name,
-                f"overlaps the body at the start: {count} of {len(points)} particles are inside it",
+                f"overlaps the body at the start: {deep} of {len(points)} particles are inside it",
                 "Move one of the two apart, or simulate from a frame in which they are apart",
             )
+        if count:
+            log.warning(_OVERLAP, name, count, len(points))
 
 
 def lift_surface(points: Array, spacing: float, colliders: Sequence[MovingCollider], planes: Array) -> Array:
@@ -282,7 +305,7 @@ def lift_surface(points: Array, spacing: float, colliders: Sequence[MovingCollid
         sunk = offset + clearance - (points * normal).sum(axis=1)
         points += np.where(sunk <= spacing, np.maximum(sunk, 0.0), 0.0)[:, None] * normal
     for moving in colliders:
-        near = np.flatnonzero(np.abs(moving.roughly(points, 1.0)) < 3 * spacing)
+        near = np.flatnonzero(np.abs(moving.distances(points, 1.0)) < 3 * spacing)
         if len(near):
             distance, closest, out = moving.closest(points[near])
             sunk = (distance >= -spacing) & (distance < clearance)

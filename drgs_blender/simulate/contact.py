@@ -160,15 +160,14 @@ def bound(nodes, active, origin, spacing, planes):  # type: ignore[no-untyped-de
 
 
 @njit(parallel=True)
-def distances(points, distance, field_origin, field_spacing, rotation, shift):  # type: ignore[no-untyped-def]
-    """Signed distance (n,) of world points by the nearest node of a field; infinite outside of it."""
-    nx, ny, nz = distance.shape
-    out = np.full(len(points), np.inf)
+def look(  # type: ignore[no-untyped-def]
+    points, distance, velocity, field_origin, field_spacing, rotation, shift, linear, spin
+):
+    """(n, 7) what `surface_near` says of each world point."""
+    out = np.empty((len(points), 7))
     for p in prange(len(points)):
-        wx, wy, wz = points[p, 0] - shift[0], points[p, 1] - shift[1], points[p, 2] - shift[2]
-        i = int(np.rint((rotation[0, 0] * wx + rotation[1, 0] * wy + rotation[2, 0] * wz - field_origin[0]) / field_spacing))  # noqa: E501  # fmt: skip
-        j = int(np.rint((rotation[0, 1] * wx + rotation[1, 1] * wy + rotation[2, 1] * wz - field_origin[1]) / field_spacing))  # noqa: E501  # fmt: skip
-        k = int(np.rint((rotation[0, 2] * wx + rotation[1, 2] * wy + rotation[2, 2] * wz - field_origin[2]) / field_spacing))  # noqa: E501  # fmt: skip
-        if 0 <= i < nx and 0 <= j < ny and 0 <= k < nz:
-            out[p] = distance[i, j, k]
+        out[p, 0], out[p, 1], out[p, 2], out[p, 3], out[p, 4], out[p, 5], out[p, 6] = surface_near(
+            points[p, 0] - shift[0], points[p, 1] - shift[1], points[p, 2] - shift[2],
+            distance, velocity, field_origin, field_spacing, rotation, linear, spin,
+        )  # fmt: skip
     return out

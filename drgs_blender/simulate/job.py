@@ -183,6 +183,7 @@ def prepare(mesh: Mesh, settings: Settings, name: str = "mesh") -> Job:
         weights = bind_points(vertices, points, space=filling.space, parts=filling.part)
     colliders = _colliders(settings)
     solver = _solver(settings, body, spacing, vertices, colliders)
+    solver.first = settings.first
     motion = None
     if settings.motion is not None and pinned.any():
         motion = _PinMotion(mesh, _load(settings.motion), points[pinned], matrix)

@@ -30,8 +30,6 @@ log = logging.getLogger(__name__)
 
 #: Cubes along the body's longest side.
 CUBES = 14
-#: Steps a second; each is one iteration.
-STEPS = 720
 #: Least mass of a node, in parts of the heaviest.
 _LIGHTEST = 0.02
 #: Corners of a cube, as offsets.
@@ -57,6 +55,8 @@ class Lattice(Stepper):
     body, forces, colliders, planes : as of `solver.Solver`
     cubes : along the longest side
     """
+
+    rate = 720.0  #: each step is one iteration
 
     def __init__(
         self,
@@ -193,9 +193,6 @@ class Lattice(Stepper):
     def _put(self, arrays: dict[str, Array]) -> None:
         self.x, self.v = arrays["nodes"], arrays["node_velocities"]
 
-    def steps_of(self, seconds: float) -> int:
-        return max(1, int(np.ceil(seconds * STEPS)))
-
     def _advance(
         self,
         seconds: float,
@@ -246,9 +243,7 @@ class Lattice(Stepper):
             if progress is not None:
                 progress((step + 1) / count)
         if not np.isfinite(self.x).all():
-            raise UsageError(
-                f"simulation, frame {self.frame + 1} after the start", "became infinite", "Use mpm, or lower velocities"
-            )
+            raise self._error("became infinite", "Use mpm, or lower velocities")
 
 
 @njit(parallel=True)
@@ -344,7 +339,10 @@ def _move(x, inverse_mass, nodes, weights, dx, dy, dz):  # type: ignore[no-untyp
 
 @njit(inline="always")
 def _contact(x, start, inverse_mass, nodes, weights, depth, nx, ny, nz, ux, uy, uz, contact, friction):  # type: ignore[no-untyped-def]
-    """Take an embedded point that is `depth` inside an obstacle out, which moved by u since the step began."""
+    """Take an embedded point that is `depth` inside an obstacle out, which moved by u since the step began.
+
+    Where it was inside before the step, the start of the step moves too: it gains no speed by that.
+    """
     rx, ry, rz = -ux, -uy, -uz
     for k in range(8):
         n = nodes[k]
@@ -354,6 +352,9 @@ def _contact(x, start, inverse_mass, nodes, weights, depth, nx, ny, nz, ux, uy, 
     along = rx * nx + ry * ny + rz * nz
     tx, ty, tz = rx - along * nx, ry - along * ny, rz - along * nz
     length = np.sqrt(tx * tx + ty * ty + tz * tz)
+    before = depth + min(along, 0.0)
+    if before > 0.0:
+        _move(start, inverse_mass, nodes, weights, before * nx, before * ny, before * nz)
     hold = 0.0
     if contact == 2:
         hold = 1.0

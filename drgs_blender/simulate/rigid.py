@@ -14,17 +14,17 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..errors import Cancelled
-from ..jit import njit, prange
+from ..jit import njit
 from .colliders import Collider, MovingCollider, check_apart, rigid_motion
-from .contact import CONTACTS, Plane, plane_rows, surface_near
+from .contact import CONTACTS, Plane, plane_rows
 from .fields import FieldRows, blow
 from .solver import Body, Forces
 from .stepper import Stepper
 
 Array = np.ndarray
 
-#: Steps a second at least, and in a frame at most.
-STEPS, _MOST_STEPS = 480, 100_000
+#: Steps in a frame at most.
+_MOST_STEPS = 100_000
 #: Times that all contacts of a step are looked at.
 _ITERATIONS = 24
 #: Radii of a ball by which it may stay inside of what it lies on, the part of the rest that it is pushed out in a step,
@@ -43,6 +43,8 @@ class Rigid(Stepper):
     ----------
     body, forces, colliders, planes : as of `solver.Solver`
     """
+
+    rate = 480.0
 
     def __init__(
         self,
@@ -92,9 +94,6 @@ class Rigid(Stepper):
     def _put(self, arrays: dict[str, Array]) -> None:
         self.place, self.turn = arrays["place"], arrays["turn"]
         self.motion, self.spin = arrays["motion"], arrays["spin"]
-
-    def steps_of(self, seconds: float) -> int:
-        return max(1, int(np.ceil(seconds * STEPS)))
 
     def _advance(
         self,
@@ -166,12 +165,10 @@ class Rigid(Stepper):
             near = gap < reach
             found.append(_rows(arm[near], plane[:3], np.zeros(3), gap[near], plane[4], plane[5]))
         for moving in self.colliders:
-            field, rotation, shift, linear, spin = moving.at(part)
-            if field is None:
+            seen = moving.look(at, part)
+            if seen is None:
                 continue
             c = moving.collider
-            seen = np.empty((len(at), 7))
-            _look(at, field.distance, field.velocity, field.origin, field.spacing, rotation, shift, linear, spin, seen)
             gap = seen[:, 0] - c.thickness - self._ball
             near = gap < reach
             found.append(_rows(arm[near], seen[near, 1:4], seen[near, 4:], gap[near], CONTACTS[c.contact], c.friction))
@@ -208,16 +205,6 @@ def _rows(arm: Array, normal: Array, velocity: Array, gap: Array, contact: float
         arm, normal, velocity, gap, contact, friction,
     )  # fmt: skip
     return rows
-
-
-@njit(parallel=True)
-def _look(points, distance, velocity, origin, spacing, rotation, shift, linear, spin, out):  # type: ignore[no-untyped-def]
-    """What `surface_near` says of each point."""
-    for i in prange(len(points)):
-        out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4], out[i, 5], out[i, 6] = surface_near(
-            points[i, 0] - shift[0], points[i, 1] - shift[1], points[i, 2] - shift[2],
-            distance, velocity, origin, spacing, rotation, linear, spin,
-        )  # fmt: skip
 
 
 @njit(inline="always")

@@ -138,7 +138,7 @@ class Solver(Stepper):
         self._reach = np.maximum(self._nearest(body.points, body.riders)[0], domain.spacing)
         self._pins = np.flatnonzero(body.pinned) if body.pinned is not None else np.empty(0, np.int64)
         still = bool(len(self._pins) == n)
-        self._slowest_step = np.inf if still else courant * domain.spacing / float(matter.wave_speed.max())
+        self.rate = 0.0 if still else float(matter.wave_speed.max()) / (courant * domain.spacing)
         self.state = self._at_rest()
         self._check_start()
 
@@ -181,9 +181,6 @@ class Solver(Stepper):
 
     def _put(self, arrays: dict[str, Array]) -> None:
         self.state = State(**arrays)
-
-    def steps_of(self, seconds: float) -> int:
-        return max(1, int(np.ceil(seconds / self._slowest_step)))
 
     def _advance(
         self,
@@ -230,7 +227,7 @@ class Solver(Stepper):
                 nodes = np.empty((len(arrangement.active), 64, 4), np.float32)
                 held = np.zeros_like(nodes) if len(pins) else nodes[:0]
                 fastest = np.empty(len(arrangement.block), np.float32)
-            usual = min(self._slowest_step, seconds)
+            usual = min(1 / self.rate if self.rate else np.inf, seconds)
             longest = min(usual, _FASTEST * h / max(speed + push * usual, 1e-12))
             if longest < usual / _RUNAWAY and speed > outside:
                 raise self._error(

@@ -20,14 +20,20 @@ class Stepper(ABC):
     ----------
     frame : int
         Frames done.
+    first : int
+        Number of the frame in which all is at rest, in messages.
     steps : int
         Time steps taken in all.
+    rate : float
+        Time steps a second, at least.
     colliders, planes
         What matter cannot enter, the latter as rows of `contact.plane_rows`.
     """
 
     frame = 0
+    first = 0
     steps = 0
+    rate: float
     colliders: list[MovingCollider]
     planes: Array
 
@@ -55,10 +61,6 @@ class Stepper(ABC):
         """Take over what `arrays` gave."""
 
     @abstractmethod
-    def steps_of(self, seconds: float) -> int:
-        """Least number of time steps in a time."""
-
-    @abstractmethod
     def _advance(
         self,
         seconds: float,
@@ -67,6 +69,10 @@ class Stepper(ABC):
         progress: Callable[[float], None] | None,
     ) -> None:
         """One frame; never changes arrays that `arrays` gave before."""
+
+    def steps_of(self, seconds: float) -> int:
+        """Least number of time steps in a time."""
+        return max(1, int(np.ceil(seconds * self.rate)))
 
     def restore(self, frame: int, arrays: dict[str, Array]) -> bool:
         """Go on from `arrays` after `frame` frames; False, and nothing changed, where they do not fit."""
@@ -111,4 +117,4 @@ class Stepper(ABC):
         self.frame += 1
 
     def _error(self, problem: str, remedy: str) -> UsageError:
-        return UsageError(f"simulation, frame {self.frame + 1} after the start", problem, remedy)
+        return UsageError(f"simulation, frame {self.first + self.frame + 1}", problem, remedy)

@@ -150,6 +150,16 @@ def test_threads_restoring_and_cancelling_change_no_bit():
     assert later.points.tobytes() == whole.points.tobytes()
 
 
+def test_what_begins_a_little_inside_of_the_floor_is_not_thrown(caplog):
+    quick = Lattice(block(), Forces(gravity=(0, 0, 0)), (), [Plane((0, 0, 0.06), (0, 0, 1))], cubes=4)
+    assert "floor or wall: overlaps the body at the start: 64 of 512 particles" in caplog.text
+    for _ in range(6):
+        quick.advance(FRAME)
+    risen = (quick.points - quick.body.points)[:, 2].mean()
+    assert risen < 0.5  # by what it was pressed together; 1.3 if each step took it for a hit
+    assert quick.points[:, 2].min() > 0.05
+
+
 def test_a_body_in_the_floor_is_refused():
     with pytest.raises(UsageError, match="overlaps the body at the start"):
         Lattice(block(), Forces(), (), [Plane((0, 0, 0.2), (0, 0, 1))], cubes=4)

@@ -340,6 +340,46 @@ def test_metal_stays_bent_and_jelly_does_not():
     assert heights["jelly"] > 0.54
 
 
+@pytest.mark.parametrize(("strength", "plastic"), [(2.0, 0.0), (0.5, 0.0125)])
+def test_a_bar_of_metal_bears_its_weight_or_is_upset_until_it_does(strength, plastic):
+    """Density x gravity x height is 1e4 Pa; below z the bar flows by (that of what is above - Y) / H."""
+    h, weight = 0.125, 1e4
+    points = lattice((0.25, 0.25, 1.0), h / 2)
+    numbers = {"young": 1e6, "poisson": 0.0, "density": weight / 9.81, "hardening": 1e5}
+    solver = solver_of(
+        points, h, "metal", gravity=(0, 0, -9.81), damping=150.0, yield_stress=strength * weight,
+        planes=[Plane((0, 0, 0), (0, 0, 1), "slip")], **numbers,
+    )  # fmt: skip
+    top = points[:, 2] > 1 - 0.6 * h
+    sunk = []
+    for _ in range(4):
+        solver.advance(1.0)
+        sunk.append(float((points - solver.points)[top, 2].mean()))
+    assert sunk[-1] - sunk[-2] < 0.02 * sunk[-1]  # at rest
+    assert sunk[-1] == pytest.approx(weight / 2e6 + plastic, rel=0.08)
+    assert (solver.state.memory.max() > 0) == (plastic > 0)
+
+
+def test_an_animal_of_metal_stands_and_a_fall_from_its_own_height_dents_it():
+    h = 1.7 / 17
+    body = np.add(lattice((0.9, 0.4, 0.9), h / 2), [0, 0, 0.8])
+    leg = lattice((0.2, 0.15, 0.8), h / 2)
+    points = np.concatenate([body, *(np.add(leg, [x, y, 0]) for x in (0.0, 0.7) for y in (0.0, 0.25))])
+    plastic = {}
+    for height in (0.0, 1.7):
+        solver = solver_of(
+            points, h, "metal", gravity=(0, 0, -9.81), low=(-2, -2, -2), high=(3, 3, 2),
+            planes=[Plane((0, 0, -height), (0, 0, 1))],
+        )  # fmt: skip
+        while solver.frame * FRAME < (0.75 if height else 0.4):
+            solver.advance(FRAME)
+        sunk = (points - solver.points)[: len(body), 2].mean() - height
+        plastic[height] = solver.state.memory
+        assert sunk < (0.5 if height else 0.02) * 1.7
+    assert (plastic[0.0] > 0.005).mean() < 0.02
+    assert (plastic[1.7] > 0.05).mean() > 0.02
+
+
 def test_turning_everything_turns_the_result():
     """A quarter turn maps the grid to itself: the motion is the same but for rounding."""
     h = 0.1
@@ -411,7 +451,8 @@ def test_riders_move_with_the_matter():
 def test_what_goes_wrong_is_said_with_frame_cause_and_remedy():
     points = lattice((0.4, 0.4, 0.4), 0.05)
     falling = solver_of(points, 0.1, gravity=(0, 0, -9.81))
-    with pytest.raises(UsageError, match=r"frame \d+ .*particles outside the domain.*Give a larger domain"):
+    falling.first = 100
+    with pytest.raises(UsageError, match=r"simulation, frame 1[0-4]\d: has .*outside the domain.*Give a larger domain"):
         for _ in range(48):
             falling.advance(FRAME)
     before = falling.arrays()
@@ -430,6 +471,19 @@ def test_what_goes_wrong_is_said_with_frame_cause_and_remedy():
     broken.state.tau[5] = np.nan
     with pytest.raises(UsageError, match="became infinite"):
         broken.advance(FRAME)
+
+
+@pytest.mark.parametrize("contact", ["separate", "slip", "sticky"])
+def test_a_collider_that_starts_inside_is_named_and_throws_nothing(contact, caplog):
+    points = lattice((0.4, 0.4, 0.4), 0.05)
+    vertices, faces = box((0.08, 0.08, 0.08), (0.32, 0.32, 0.32))
+    solver = solver_of(points, 0.1, colliders=[Collider("core", faces, vertices, contact)], gravity=(0, 0, -9.81))
+    assert "core: overlaps the body at the start" in caplog.text
+    fastest = 0.0
+    for _ in range(24):
+        solver.advance(FRAME)
+        fastest = max(fastest, float(np.abs(solver.state.v).max()))
+    assert fastest < 1.0  # it hangs on what is inside of it
 
 
 def test_a_cancelled_frame_leaves_the_state_at_its_beginning():
