@@ -171,7 +171,7 @@ def _tasks(scene: Path, out: Path, count: int, rays: int) -> tuple[list[float], 
         f"1-{2 * count}", "--chunk", "2", f"--options=--rays {rays}", "--out", str(out / "####.exr"),
         "--denoised", str(out / "clean" / "####.exr"),
     ).stdout.splitlines()[-1]  # fmt: skip
-    words = [farm_slurm.OPENJD, *shlex.split(command)[1:]]
+    words = [str(farm_slurm.OPENJD), *shlex.split(command)[1:]]
     done = subprocess.run(words, capture_output=True, text=True, timeout=900)
     if done.returncode:
         raise SystemExit(f"openjd run ended with {done.returncode}: {done.stdout[-2000:]}")

@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import contextlib
 import os
-import shlex
+import re
 import signal
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 from farm_tools import PROGRAM, drgs, frames_differ, leftovers, marked
 from report import table
 
-sys.path[:0] = [str(Path(__file__).resolve().parent.parent / "tests" / name) for name in ("farm", "unit")]
-from slurm_trio import Trio, absent  # noqa: E402
+from drgs_blender.cli.frame_range import cut_frames, write_frames
 
-OPENJD = str(Path(sys.executable).with_name("openjd"))
+sys.path[:0] = [str(Path(__file__).resolve().parent.parent / "tests" / name) for name in ("farm", "unit")]
+from disks import mount, unmount  # noqa: E402
+from slurm_trio import NODES, Trio, absent  # noqa: E402
+
+OPENJD = Path(sys.executable).with_name("openjd")
 PAUSE = 2
 
 
@@ -55,12 +58,12 @@ def saved(to: Path, step: str = "render") -> list[str]:
 @contextlib.contextmanager
 def small_disk(place: Path, megabytes: int) -> Iterator[None]:
     """A disk of that size mounted at `place`."""
-    place.mkdir(parents=True)
-    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={megabytes}m", "none", str(place)], check=True)
+    if not mount(place, f"size={megabytes}m"):
+        raise SystemExit(f"a disk cannot be mounted at {place}")
     try:
         yield
     finally:
-        subprocess.run(["umount", "-l", str(place)], check=True)
+        unmount(place)
 
 
 def fill(disk: Path, trio: Trio, to: Path) -> float:
@@ -117,45 +120,59 @@ def faults(scene: Path, folder: Path, count: int, rays: int) -> str:
 
 def chunks(scene: Path, folder: Path, count: int, rays: int) -> str:
     """The same frames, denoised over time, in chunks of several sizes on three nodes: the same files?"""
-    made: dict[str, tuple[Path, float]] = {}
+    seconds: dict[str, float] = {}
     with cluster() as trio:
-        for size in (1, 4, 10):
+        for size in ("1", "4", "10", "adaptive"):
             started = time.monotonic()
-            made[str(size)] = (_slurm(trio, scene, folder / str(size), count, rays, size), time.monotonic() - started)
-        started = time.monotonic()
-        made["adaptive"] = (_adaptive(trio, scene, folder / "adaptive", count, rays), time.monotonic() - started)
-    first = made["10"][0]
+            (_sessions if size == "adaptive" else _slurm)(trio, scene, folder / size, count, rays, size)
+            seconds[size] = time.monotonic() - started
     rows = []
-    for size, (clean, seconds) in made.items():
-        files = sorted(clean.glob("*.exr"))
-        same = sum(path.read_bytes() == (first / path.name).read_bytes() for path in files)
-        rows.append([size, len(files), same, seconds])
+    for size in seconds:
+        files = sorted((folder / size / "clean").glob("*.exr"))
+        same = sum(path.read_bytes() == (folder / "10/clean" / path.name).read_bytes() for path in files)
+        rows.append([size, len(files), same, seconds[size]])
+    steps = {step: _by_node(folder / "adaptive/job", step) for step in ("render", "denoise")}
+    if any(len(made) != len(NODES) for made in steps.values()):
+        raise SystemExit(f"not every node took part: {steps}")
+    nodes = [[node, *("; ".join(map(write_frames, made[node])) for made in steps.values())] for node in NODES]
     return (
         f"{count} frames of 32 x 24 pixels with {rays} rays, rendered and then denoised over a window of five frames, "
-        "on three nodes of Slurm; adaptive is a session of OpenJD on one of them, which chooses the size of its chunks "
-        "by their time. Files are compared byte for byte with those of chunks of 10.\n\n"
+        "on three nodes of Slurm; adaptive are arrays of sessions of OpenJD, each with a third of the frames, which "
+        "choose the size of their chunks by their time. Files are compared byte for byte with those of chunks of 10."
+        "\n\n"
         + table(["chunk", "denoised frames", "equal files", "seconds"], rows)
+        + "\n\nThe adaptive chunks, and where they were made:\n\n"
+        + table(["node", "rendered", "denoised"], nodes)
     )
 
 
-def _slurm(trio: Trio, scene: Path, folder: Path, count: int, rays: int, size: int) -> Path:
+def _slurm(trio: Trio, scene: Path, folder: Path, count: int, rays: int, size: str) -> None:
     submit(
-        trio, scene, folder / "job", "--frames", f"1-{count}", "--chunk", str(size), f"--options=--rays {rays}",
+        trio, scene, folder / "job", "--frames", f"1-{count}", "--chunk", size, f"--options=--rays {rays}",
         "--out", str(folder / "noisy/####.exr"), "--denoised", str(folder / "clean/####.exr"),
     )  # fmt: skip
     trio.until_done(900)
-    return folder / "clean"
 
 
-def _adaptive(trio: Trio, scene: Path, folder: Path, count: int, rays: int) -> Path:
+def _sessions(trio: Trio, scene: Path, folder: Path, count: int, rays: int, size: str) -> None:
+    """A session of OpenJD on every node, each with a part of the frames, and then with denoising it."""
     command = drgs(
         "submit", "openjd", str(scene), "--no-check", "--to", str(folder / "job"), "--drgs", PROGRAM,
-        "--frames", f"1-{count}", "--chunk", "2", "--chunk-seconds", "2", f"--options=--rays {rays}",
+        "--frames", f"1-{count}", "--chunk", "2", "--chunk-seconds", "5", f"--options=--rays {rays}",
         "--out", str(folder / "noisy/####.exr"), "--denoised", str(folder / "clean/####.exr"),
     ).stdout.splitlines()[-1]  # fmt: skip
-    words: Sequence[str] = [OPENJD, *shlex.split(command)[1:]]
-    script = folder / "job" / "session.sbatch"
-    script.write_text(f"#!/bin/sh\n#SBATCH --output={folder}/job/session.log\nexec {shlex.join(words)}\n")
-    subprocess.run(["sbatch", str(script)], env=trio.env, check=True, capture_output=True, timeout=60)
+    parts = [write_frames(part) for part in cut_frames(list(range(1, count + 1)), -(-count // len(NODES)))]
+    trio.submit_sessions(folder / "job", OPENJD, command, parts)
     trio.until_done(900)
-    return folder / "clean"
+
+
+def _by_node(to: Path, step: str) -> dict[str, list[list[int]]]:
+    """Node -> the frames that it made, chunk by chunk, as the logs of its sessions say."""
+    made: dict[str, list[list[int]]] = {}
+    for path in sorted((to / "logs").glob(f"{step}-*.log")):
+        head, *tasks = path.read_text().split("--------- Running Task")
+        node = re.search(r"^drgs: node (\S+)$", head, re.M)[1]
+        made.setdefault(node, []).extend(
+            [int(k) for k in re.findall(r"Saved: '.*?(\d+)\.exr'", text)] for text in tasks
+        )
+    return made
