@@ -92,6 +92,10 @@ class Material:
         modulus = first + (2 / 3 if self.model == "fluid" else 2) * mu
         return float(np.sqrt(modulus * (MOST_HARDENING if self.model == "snow" else 1) / self.density))
 
+    def diffusivity(self) -> float:
+        """Of the momentum in what flows, m^2 / s: it bounds time steps as the wave speed does."""
+        return 4 / 3 * self.viscosity / self.density if self.model == "fluid" else 0.0
+
     def row(self) -> list[float]:
         """The columns of compiled code."""
         first, mu = self.moduli()
@@ -112,12 +116,12 @@ _ROWS = (
     Material("rubber", "elastic", "firm, springs back, keeps its volume", 2e6, 0.45, 1100),
     Material("elastic", "corotated", "springs back; survives rough handling", 2e5, 0.3, 1000),
     Material("metal", "plastic", "stiff, dents and stays dented", 4e7, 0.3, 2700, yield_stress=1e6, hardening=1e6),
-    Material("clay", "plastic", "plasticine: gives way and stays", 4e5, 0.35, 1600, yield_stress=6e3, hardening=-2e3),
+    Material("clay", "plastic", "plasticine: gives way and stays", 4e5, 0.35, 1600, yield_stress=2e4),
     Material("foam", "plastic", "gives way slowly, light", 1e5, 0.2, 200, yield_stress=8e2, viscosity=200.0),
     Material("sand", "sand", "runs and piles up", 1e6, 0.3, 1600, friction_angle=35.0),
     Material("snow", "snow", "packs, tears, crumbles", 1.4e5, 0.2, 400, hardening=10.0),
     Material("water", "fluid", "splashes", 2e5, 0.4, 1000),
-    Material("honey", "fluid", "flows slowly", 2e5, 0.4, 1400, viscosity=50.0),
+    Material("honey", "fluid", "flows slowly", 2e5, 0.4, 1400, viscosity=300.0),
     Material("cloth", "corotated", "limp and light: sags and folds like a plush toy", 1e4, 0.1, 150),
 )
 #: Name -> material.
@@ -173,6 +177,7 @@ class Matter:
     parameters : (n, COLUMNS) float32, see `Material.row`
     density : (n,) float32, kg / m^3
     wave_speed : (n,) float32, m/s
+    diffusivity : (n,) float32, m^2 / s, of momentum
     keeps_shape : (n,) bool
     """
 
@@ -180,6 +185,7 @@ class Matter:
     parameters: Array
     density: Array
     wave_speed: Array
+    diffusivity: Array
     keeps_shape: Array
 
 
@@ -194,5 +200,6 @@ def matter_of(materials: list[Material], which: Array) -> Matter:
         pick([m.row() for m in materials], np.float32),
         pick([m.density for m in materials], np.float32),
         pick([m.wave_speed() for m in materials], np.float32),
+        pick([m.diffusivity() for m in materials], np.float32),
         pick([m.keeps_shape for m in materials], np.bool_),
     )

@@ -115,7 +115,7 @@ class _Matter:
     )
     viscosity: FloatProperty(
         name="Viscosity (Pa s)",
-        description="Resistance to flowing, pascal seconds: water 0, honey 50",
+        description="Resistance to flowing, pascal seconds: water 0, honey 300",
         min=0.0,
         max=1e6,
         soft_max=1e3,

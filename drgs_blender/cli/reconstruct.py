@@ -47,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--resolution", type=whole(8, 1 << 16), metavar="N", help="pixels of the longer side, at most")
     parser.add_argument("--iterations", type=whole(1, 10**7), metavar="N", help="steps of the surfels; default 3000")
-    parser.add_argument("--surfels", type=whole(10, 5_000_000), metavar="N", help="how many; default 16000")
+    parser.add_argument("--surfels", type=whole(10, 5_000_000), metavar="N", help="at most; default 16000")
     parser.add_argument("--voxels", type=whole(16, 1024), metavar="N", help="of the mesh's longest side; default 256")
     parser.add_argument("--minutes", type=_minutes, metavar="M", help="all stages together, about")
     parser.add_argument(

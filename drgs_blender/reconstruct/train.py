@@ -35,7 +35,7 @@ class Schedule:
     Attributes
     ----------
     iterations : steps, one view each
-    surfels : how many there are at the end of densification
+    surfels : how many there are at the end of densification, at most: see `enough`
     coarse : part of the steps that is done at half size
     densify : parts of the steps between which surfels are cut; `rounds` times
     shape : part of the steps after which distortion and normals count
@@ -64,6 +64,8 @@ class Schedule:
         )
 
 
+#: Most surfels for each pixel of a view that shows the object.
+PER_PIXEL = 1.5
 #: Learning rates at the start, and what is left of them at the end; of centres a part of the object's radius.
 RATES = {"centre": (1.5e-3, 0.01), "scale": (8e-3, 0.2), "rotation": (4e-3, 0.2), "opacity": (4e-2, 0.3)}
 RATES |= {"tint": (6e-2, 0.2), "blur": (6e-2, 0.2)}
@@ -91,8 +93,9 @@ class Training:
         gaussians: Gaussians | None = None,
         seconds: float | None = None,
     ) -> None:
-        self.schedule, self.region, self.limit = schedule, region, seconds
+        self.region, self.limit = region, seconds
         self.targets = targets(capture)
+        self.schedule = schedule = replace(schedule, surfels=min(schedule.surfels, enough(self.targets[0])))
         self.background = torch.tensor(background_of(capture), dtype=torch.float32)
         if gaussians is None:
             gaussians = _first(capture, region, schedule)
@@ -214,6 +217,12 @@ class Training:
         self.tally = Tally(np.array(state["travel"]), np.array(state["views"]))
         self.iteration, self.optimiser.steps, self.start, self.rounds, self.light.steps = map(int, state["counts"])
         self.error, self.seconds = (float(x) for x in state["numbers"])
+
+
+def enough(views: list[Target]) -> int:
+    """As many surfels as pictures of this size have use for: with more, the photographs are learned by heart."""
+    shown = [v.camera.width * v.camera.height if v.mask is None else float(v.mask.sum()) for v in views]
+    return max(int(PER_PIXEL * np.mean(shown)), 1)
 
 
 def _first(capture: Capture, region: Region, schedule: Schedule) -> Gaussians:

@@ -104,7 +104,7 @@ class Solver(Stepper):
     domain : Domain
         Where particles may be; leaving it is an error.
     forces, colliders, planes : what acts
-    courant : time step in units of spacing over the speed of elastic waves; above 1 is unstable
+    courant : time step in parts of what elastic waves and viscosity bear; above 1 is unstable
 
     Attributes
     ----------
@@ -138,7 +138,9 @@ class Solver(Stepper):
         self._reach = np.maximum(self._nearest(body.points, body.riders)[0], domain.spacing)
         self._pins = np.flatnonzero(body.pinned) if body.pinned is not None else np.empty(0, np.int64)
         still = bool(len(self._pins) == n)
-        self.rate = 0.0 if still else float(matter.wave_speed.max()) / (courant * domain.spacing)
+        h = domain.spacing
+        fastest = float((matter.wave_speed / h + 2 * matter.diffusivity / h**2).max())
+        self.rate = 0.0 if still else fastest / courant
         self.state = self._at_rest()
         self._check_start()
 
