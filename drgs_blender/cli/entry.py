@@ -12,5 +12,8 @@ def main() -> int:
 
         return run()
     except KeyboardInterrupt:
-        sys.stderr.write("drgs: interrupted\n")
+        from .frame_lines import say, say_end
+
+        say("drgs: interrupted\n", sys.stderr)
+        say_end(sys.argv[1:], 130)
         return 130

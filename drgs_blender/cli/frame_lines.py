@@ -5,7 +5,10 @@ from __future__ import annotations
 import sys
 import threading
 import time
+from collections.abc import Sequence
 from typing import IO
+
+from ..errors import EXIT_CLASSES
 
 HEARTBEAT_SECONDS = 30.0
 #: Between two progress lines of one frame.
@@ -29,6 +32,13 @@ def say(text: str, stream: IO[str] | None) -> None:
         raise
     except OSError:
         pass  # there is nobody to tell
+
+
+def say_end(arguments: Sequence[str], code: int) -> None:
+    """The last line of the commands that farms run, which they read."""
+    command = next((word for word in arguments if not word.startswith("-")), None)
+    if command in ("render", "denoise") and not {"-h", "--help"} & set(arguments):
+        say(f"DRGS_EXIT class={EXIT_CLASSES.get(code, 'internal')}\n", sys.stdout)
 
 
 class FrameLines:

@@ -20,7 +20,7 @@ from typing import NoReturn
 
 from .. import errors
 from ..version import __version__
-from .frame_lines import say
+from .frame_lines import say, say_end
 
 logger = logging.getLogger(__name__)
 
@@ -110,11 +110,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # names of files can have what the terminal has not
     code = run_command(arguments)
-    command = next((word for word in arguments if not word.startswith("-")), None)
     with contextlib.suppress(BrokenPipeError):
-        if command in ("render", "denoise") and not {"-h", "--help"} & set(arguments):
-            # Farms read this last line.
-            say(f"DRGS_EXIT class={errors.EXIT_CLASSES.get(code, 'internal')}\n", sys.stdout)
+        say_end(arguments, code)
     for name in ("stdout", "stderr"):
         try:
             getattr(sys, name).flush()

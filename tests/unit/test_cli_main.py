@@ -242,7 +242,9 @@ BEGINS = """
 import os, signal, sys
 moment = sys.argv.pop(1)
 def interrupt(event, about):
+    global moment
     if event == "import" and about[0] == moment:
+        moment = None
         os.kill(os.getpid(), signal.SIGINT)
 sys.addaudithook(interrupt)
 from {module} import {function}
@@ -266,6 +268,7 @@ def test_ctrl_c_while_python_imports_has_its_exit_code_and_no_traceback(moment):
     project = tomllib.loads((CHECKOUT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     module, function = project["scripts"]["drgs"].split(":")
     program = BEGINS.format(module=module, function=function)
-    command = [sys.executable, "-c", program, moment, "doctor"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=CHECKOUT)
-    assert (done.returncode, done.stdout, done.stderr) == (130, "", "drgs: interrupted\n")
+    for name, last in (("doctor", ""), ("render", "DRGS_EXIT class=interrupted\n")):
+        command = [sys.executable, "-c", program, moment, name]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=CHECKOUT)
+        assert (done.returncode, done.stdout, done.stderr) == (130, last, "drgs: interrupted\n")
