@@ -9,13 +9,12 @@ object of 256 pixels takes its minutes and three more for the pictures that scor
 from __future__ import annotations
 
 import argparse
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from bench_evaluate import mean, score, under_other_lights
-from report import OUT, table, write_section
+from report import OUT, keep, table, write_section
 
 from drgs_blender.asset.container import write_asset
 from drgs_blender.reconstruct.job import Settings, reconstruct
@@ -61,17 +60,15 @@ def main() -> None:
     parser.add_argument("--steps", type=int, nargs=2, default=(3000, 2500), help="of surfels, of materials and light")
     parser.add_argument("--rays", type=int, default=128)
     options = parser.parse_args()
-    FOLDER.mkdir(parents=True, exist_ok=True)
-    store = FOLDER / "rows.json"
-    rows: dict[str, list[str]] = json.loads(store.read_text()) if store.exists() else {}
     for name in options.objects:
         capture = read_capture(options.scenes / name)
         path = FOLDER / f"{name}.drgs"
+        path.parent.mkdir(parents=True, exist_ok=True)
         write_asset(path, reconstruct(capture, settings_of(options)))
         for primary in ("surfels", "mesh"):
-            rows[f"{name}|{primary}"] = row(score(path, options.scenes / name, primary, options.rays))
-            store.write_text(json.dumps(rows))
-            print(name, primary, *rows[f"{name}|{primary}"], flush=True)
+            found = row(score(path, options.scenes / name, primary, options.rays))
+            rows = keep(FOLDER / "rows.json", f"{name}|{primary}", found)
+            print(name, primary, *found, flush=True)
     side = max(capture.views[0].colour.shape[:2])
     bound = f"{options.minutes:g} minutes" if options.minutes else "{} and {} steps".format(*options.steps)
     body = (

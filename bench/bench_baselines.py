@@ -9,14 +9,13 @@ what is left out, is left out of learning and of rendering. Rows are kept; a row
 from __future__ import annotations
 
 import argparse
-import json
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from bench_evaluate import mean, under_other_lights
-from report import OUT, table, write_section
+from report import OUT, keep, table, write_section
 
 from drgs_blender.asset import Environment
 from drgs_blender.asset.container import write_asset
@@ -108,14 +107,11 @@ def main() -> None:
     parser.add_argument("--steps", type=int, nargs=2, default=(3000, 1000), help="of surfels, of materials and light")
     parser.add_argument("--rays", type=int, default=128)
     options = parser.parse_args()
-    FOLDER.mkdir(parents=True, exist_ok=True)
-    store = FOLDER / "rows.json"
-    rows: dict[str, list[str]] = json.loads(store.read_text()) if store.exists() else {}
     for name in options.objects:
         for method in options.methods:
-            rows[f"{name}|{method}"] = row(options.scenes / name, method, options)
-            store.write_text(json.dumps(rows))
-            print(name, method, *rows[f"{name}|{method}"], flush=True)
+            found = row(options.scenes / name, method, options)
+            rows = keep(FOLDER / "rows.json", f"{name}|{method}", found)
+            print(name, method, *found, flush=True)
     about = "{} and {} steps".format(*options.steps)
     body = (
         f"{about}; the same photographs by Cycles, surfels and mesh for every row. What is left out is left out "
@@ -124,7 +120,7 @@ def main() -> None:
         "channel; relit: means over the lights that were not photographed. Colours of the day are their mean over all "
         "views: harmonics, which these methods have, would help them in the two columns of the day's light.\n\n"
     )
-    cells = [(*key.split("|"), *found) for key, found in rows.items()]
+    cells = [(*key.split("|"), *cells) for key, cells in rows.items()]
     write_section("baselines", "What other methods leave out", body + table(COLUMNS, cells))
 
 

@@ -9,7 +9,6 @@ Parts: `truth` (the photographs, if need be, and the ceiling), `long`, `estimato
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import subprocess
 from collections.abc import Callable
@@ -19,7 +18,7 @@ from typing import Any
 
 import numpy as np
 from decouple_score import COLUMNS, Scene, score
-from report import OUT, ROOT, processor_seconds, table, write_section
+from report import OUT, ROOT, keep, processor_seconds, table, write_section
 from scipy.spatial import cKDTree
 
 from drgs_blender.asset import Mesh
@@ -209,11 +208,8 @@ def main() -> None:
     FOLDER.mkdir(parents=True, exist_ok=True)
     scene = Scene.read(scene_folder(options.scene))
     warm(scene)
-    store = FOLDER / "rows.json"
-    kept: dict[str, dict[str, list[float]]] = json.loads(store.read_text()) if store.exists() else {}
     for part in options.part:
-        kept[part] = PARTS[part](scene, options.iterations)
-        store.write_text(json.dumps(kept))
+        kept = keep(FOLDER / "rows.json", part, PARTS[part](scene, options.iterations))
         print(table(("", *COLUMNS), [(name, *row) for name, row in kept[part].items()]), flush=True)
     rows = [(name, *row) for part in PARTS for name, row in kept.get(part, {}).items()]
     write_section("decouple", "Materials and light from photographs", text(scene, rows, options.iterations))

@@ -12,7 +12,6 @@ Scenes are those of `drgs evaluate --make-scenes scenes`. Rows are kept, so that
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -23,7 +22,7 @@ import numpy as np
 import torch
 from embreex import rtcore_scene
 from embreex.mesh_construction import TriangleMesh
-from report import OUT, processor_seconds, table, write_section
+from report import OUT, keep, processor_seconds, table, write_section
 
 from drgs_blender.frame import Camera
 from drgs_blender.geometry import VertexNormals
@@ -37,7 +36,7 @@ from drgs_blender.reconstruct.raster import rasterise
 from drgs_blender.reconstruct.readers import read_capture
 from drgs_blender.reconstruct.train import Schedule, Training
 
-ROWS = OUT / "reconstruct.json"
+ROWS = OUT / "reconstruct"
 #: Ablations of stage (i): name -> change of the schedule.
 ABLATIONS: dict[str, dict[str, Any]] = {
     "as it is": {},
@@ -145,15 +144,6 @@ def trained(capture: Capture, schedule: Schedule, seconds: float | None) -> tupl
     return training, cost | {"surfels": len(training.gaussians)} | judge(training.gaussians, capture)
 
 
-def kept(part: str, name: str, row: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """All rows of a part, with this one in its place."""
-    ROWS.parent.mkdir(parents=True, exist_ok=True)
-    rows = json.loads(ROWS.read_text()) if ROWS.exists() else {}
-    rows.setdefault(part, {})[name] = row
-    ROWS.write_text(json.dumps(rows, indent=1))
-    return rows[part]
-
-
 def warm(capture: Capture) -> None:
     """Compile every kernel, so that it is not measured."""
     training, _ = trained(capture, Schedule(iterations=12, surfels=500), None)
@@ -169,7 +159,7 @@ def surfels(options: argparse.Namespace, part: str = "surfels") -> None:
     if (options.capture / "mesh.npz").exists():
         row |= against_truth(training.gaussians, training, capture, options.capture)
     row |= {"views": len(capture.training), "size": capture.views[0].camera.width}
-    rows = kept(part, options.capture.name, row)
+    rows = keep(ROWS / f"{part}.json", options.capture.name, row)
     names = ("size", "views", "wall", "cpu", "steps", "surfels", "psnr", "ssim", "normal", "depth", "overlap")
     head = (
         "Capture", "Pixels", "Views", "s", "processor s", "Steps", "Surfels", "PSNR dB", "SSIM", "Normals deg", "Depth",
@@ -203,7 +193,7 @@ def ablations(options: argparse.Namespace) -> None:
             continue
         training, row = trained(capture, replace(base, **change), None)
         row |= against_truth(training.gaussians, training, capture, options.capture)
-        rows = kept("ablations", name, row)
+        rows = keep(ROWS / "ablations.json", name, row)
     cells = [
         (name, *(shown(row[key]) for key in ("psnr", "ssim", "normal", "depth", "overlap", "cpu")))
         for name, row in rows.items()
@@ -220,7 +210,7 @@ def variants(options: argparse.Namespace) -> None:
     warm(capture)
     schedule = Schedule(iterations=options.iterations or 1500, surfels=10000)
     training, row = trained(capture, schedule, None)
-    rows = kept("variants", "P: free surfels", row)
+    rows = keep(ROWS / "variants.json", "P: free surfels", row)
     mesh, _ = mesh_of(training.gaussians, capture, training.region)
     light = training.gaussians.light
     for name, fixed in (
@@ -234,7 +224,7 @@ def variants(options: argparse.Namespace) -> None:
         while not again.finished:
             again.step()
         result = {"surfels": len(attached), "cpu": processor_seconds() - begun} | judge(again.gaussians, capture)
-        rows = kept("variants", name, result)
+        rows = keep(ROWS / "variants.json", name, result)
     cells = [(n, r["surfels"], *(shown(r[k]) for k in ("psnr", "ssim", "cpu"))) for n, r in rows.items()]
     head = ("Variant", "Surfels", "PSNR dB", "SSIM", "processor s")
     body = f"{options.capture.name}, {schedule.iterations} steps, and {ON_MESH:g} of them again on the mesh.\n\n"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import platform
 import re
@@ -9,6 +10,7 @@ import sys
 from collections.abc import Sequence
 from datetime import date
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCUMENT = ROOT / "docs" / "benchmarks.md"
@@ -55,6 +57,15 @@ def command_line() -> str:
     """How this program was called, from the checkout's folder; where files of this machine lie is left out."""
     words = (f"/path/to/{Path(word).name}" if os.path.isabs(word) else word for word in sys.argv[1:])
     return " ".join(["python", f"bench/{Path(sys.argv[0]).name}", *words])
+
+
+def keep(file: Path, name: str, value: Any) -> dict[str, Any]:
+    """Put what was measured to what `file` holds of earlier runs; all of it."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    rows: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {}
+    rows[name] = value
+    file.write_text(json.dumps(rows, indent=1))
+    return rows
 
 
 def write_section(name: str, title: str, body: str) -> None:
