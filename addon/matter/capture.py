@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import bpy
 import numpy as np
@@ -31,7 +32,7 @@ Array = np.ndarray
 
 BODY, SETTINGS, MATRICES, MOTION = "body.drgs", "settings.json", "matrices.npy", "motion.npy"
 _COLLIDER = "collider_"
-#: A file of a collider, as `_capture_motion` calls it after the object.
+#: A file of a collider, as `_capture_motion` calls it after the object, its name as in URLs.
 COLLIDER_FILE = re.compile(_COLLIDER + r"\d{3}_(.*?)\.(?:ply|npy)")
 #: What the engine's program says is kept beside what it was given.
 SAID, LOG = "said.txt", "log.txt"
@@ -140,7 +141,7 @@ def _capture_motion(
     for i, (other, settings) in enumerate(obstacles):
         local, faces, placed = _read(other)
         world = _moved(local, placed)
-        name = f"{_COLLIDER}{i:03d}_{bpy.path.clean_name(other.name)}"  # the engine's messages name the file
+        name = f"{_COLLIDER}{i:03d}_{quote(other.name, safe=' ')}"  # the engine's messages name the file
         _write_ply(folder / f"{name}.ply", world, faces)
         data["colliders"].append({"mesh": f"{name}.ply"} | _contact(settings))
         tracks.append(_Track(folder / f"{name}.npy", world, len(frames)))

@@ -9,6 +9,7 @@ import sys
 import time
 from contextlib import suppress
 from pathlib import Path
+from urllib.parse import unquote
 
 from ...drgs_blender.engine.child import clean_environment
 from ...drgs_blender.errors import EXIT_CANNOT_WRITE, AssetError, EngineError, UsageError, WriteError
@@ -143,4 +144,4 @@ class Program:
     def _in_words(self, line: str) -> str:
         """A line of the engine's program without the files that `capture` wrote: the artist knows objects."""
         line = line.replace(f"{self._inputs / capture.BODY}: ", "").replace(f"{self._inputs}{os.sep}", "")
-        return capture.COLLIDER_FILE.sub(r'collider "\1"', line)
+        return capture.COLLIDER_FILE.sub(lambda found: f'collider "{unquote(found[1])}"', line)

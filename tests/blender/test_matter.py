@@ -233,7 +233,7 @@ def test_faults_name_the_object_and_the_remedy(body, scene, tmp_path):
     fails('Object "Hidden": is hidden.*Show it')
     bpy.ops.drgs.matter_row(rows="colliders", remove=0)
     matter.colliders.add().object = wall = box_object("Sea Wall", (-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
-    fails(r'Object "ball": collider "Sea_Wall": overlaps the body at the start')
+    fails(r'Object "ball": collider "Sea Wall": overlaps the body at the start')
     wall.keyframe_insert("location", frame=1)
     bake = work.Bake(body, scene)
     next(bake._capture)
