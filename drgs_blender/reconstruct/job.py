@@ -183,12 +183,16 @@ class _Work:
         """Checkpoint of a phase."""
         return None if self.folder is None else self.folder / f"{phase.replace(' ', '-')}.state"
 
+    def key(self, phase: str) -> str:
+        """Which run a checkpoint of a phase is of: its photographs, and the settings that decide its result."""
+        settings = asdict(self.settings)
+        return checkpoint.fingerprint(self.capture, **{name: settings[name] for name in DECIDES[phase]})
+
     def learn(self, phase: str, training: Training, begin: float, end: float) -> Gaussians:
         """Run a training to its end, from its checkpoint if there is one: that of a run with other settings of later
         phases serves as well."""
         file = self.file(phase)
-        settings = asdict(self.settings)
-        key = checkpoint.fingerprint(self.capture, **{name: settings[name] for name in DECIDES[phase]})
+        key = "" if file is None else self.key(phase)
         if file is not None and (state := checkpoint.load(file, key)) is not None:
             training.restore(state)
             log.info("%s: going on at step %d", phase, training.iteration)
