@@ -19,10 +19,11 @@ from report import OUT, keep, table, write_section
 
 from drgs_blender.asset import Environment
 from drgs_blender.asset.container import write_asset
+from drgs_blender.cli.evaluate import session_renderer
 from drgs_blender.engine.session import Session
-from drgs_blender.evaluate.compare import PASSES, Renderer, compare
+from drgs_blender.evaluate.compare import Renderer, compare
 from drgs_blender.evaluate.truth import read_truth
-from drgs_blender.frame import Camera, Frame, ObjectState, RenderSettings, Visibility, World, split_rays
+from drgs_blender.frame import Camera, RenderSettings, Visibility, split_rays
 from drgs_blender.reconstruct.decouple.settings import Settings as Decoupling
 from drgs_blender.reconstruct.job import Settings, reconstruct
 from drgs_blender.reconstruct.readers import read_capture
@@ -66,16 +67,14 @@ METHODS = {
 
 def renderer(session: Session, key: str, method: Method, rays: int) -> Renderer:
     """Renders as `method` does."""
-    settings = RenderSettings(*split_rays(rays), film_transparent=True, **method.rendering)
+    lit = session_renderer(session, key, RenderSettings(*split_rays(rays), **method.rendering), method.visibility)
 
-    def render(camera: Camera, radiance: Array, vertices: Array | None) -> dict[str, Array]:
-        state = ObjectState("subject", key, vertices=vertices, visibility=method.visibility)
-        passes = dict(session.render(Frame(1, camera, [state], World(radiance), settings, PASSES)))
-        if method.learning is None:  # whatever the light, the colours are what was photographed
-            passes["Combined"] = np.concatenate([passes["Albedo"] * passes["Coverage"], passes["Coverage"]], axis=2)
+    def photographed(camera: Camera, radiance: Array, vertices: Array | None) -> dict[str, Array]:
+        passes = lit(camera, radiance, vertices)
+        passes["Combined"] = np.concatenate([passes["Albedo"] * passes["Coverage"], passes["Coverage"]], axis=2)
         return passes
 
-    return render
+    return photographed if method.learning is None else lit
 
 
 def row(folder: Path, name: str, options: argparse.Namespace) -> list[str]:

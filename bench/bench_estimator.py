@@ -77,9 +77,10 @@ def strategies() -> list[list[object]]:
 
 
 def published() -> list[list[object]]:
+    """Directional albedo by roughness: ours, IRGS's, IRGS's without its clamp."""
     rows: list[list[object]] = []
     for roughness in (0.05, 0.1, 0.13, 0.2, 0.3, 0.6, 1.0):
-        found = (irgs.albedo(irgs.smith, 0.9, roughness), irgs.albedo(irgs.specular, 0.9, roughness),
+        found = (irgs.albedo(irgs.paper, 0.9, roughness), irgs.albedo(irgs.specular, 0.9, roughness),
                  irgs.albedo(irgs.specular, 0.9, roughness, 0.0))  # fmt: skip
         rows.append([roughness, *(f"{x:.3f}" for x in found)])
     return rows

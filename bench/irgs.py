@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
+
+from drgs_blender.render.reference.brdf import alpha_of, fresnel_schlick, ggx_distribution, smith_visibility
 
 Array = np.ndarray
 
@@ -24,12 +27,13 @@ def specular(nl: Array, nv: Array, nh: Array, vh: Array, roughness: float, f0: f
     return fresnel * alpha * alpha / np.clip(below, clamp, 4 * np.pi)
 
 
-def smith(nl: Array, nv: Array, nh: Array, vh: Array, roughness: float, f0: float) -> Array:
+def paper(nl: Array, nv: Array, nh: Array, vh: Array, roughness: float, f0: float) -> Array:
     """BRDF value of the look *paper*: GGX, height-correlated Smith, Schlick's Fresnel."""
-    a2 = max(roughness * roughness, 1e-3) ** 2
-    k = a2 * nh * nh + (1 - nh) * (1 + nh)
-    root = nl * np.sqrt(a2 + (1 - a2) * nv * nv) + nv * np.sqrt(a2 + (1 - a2) * nl * nl)
-    return a2 / (np.pi * k * k) * 0.5 / root * (f0 + (1 - f0) * (1 - vh) ** 5)
+    nl, nv, nh, vh, up, edge = (torch.as_tensor(a, dtype=torch.float64) for a in (nl, nv, nh, vh, [0, 0, 1], [f0]))
+    alpha = alpha_of(torch.as_tensor(roughness, dtype=torch.float64))
+    half = torch.stack([torch.sqrt((1 - nh) * (1 + nh)), torch.zeros_like(nh), nh], -1)
+    lobe = ggx_distribution(up, half, alpha) * smith_visibility(nv, nl, alpha)
+    return (lobe * fresnel_schlick(vh, edge)[..., 0]).numpy()
 
 
 def albedo(lobe: object, mu: float, roughness: float, *more: float, steps: int = 3000, turns: int = 256) -> float:

@@ -16,7 +16,7 @@ import numpy as np
 
 from ..errors import UsageError
 from ..formats.axes import UP_AXES
-from ..frame import Camera, Frame, ObjectState, RenderSettings, World
+from ..frame import Camera, Frame, ObjectState, RenderSettings, Visibility, World
 from . import sampling
 from .output import check_writable
 from .progress import FractionBar
@@ -164,14 +164,16 @@ def score(args: argparse.Namespace) -> int:
     return 0
 
 
-def session_renderer(session: Session, key: str, settings: RenderSettings) -> Renderer:
+def session_renderer(
+    session: Session, key: str, settings: RenderSettings, visibility: Visibility | None = None
+) -> Renderer:
     """Renders the loaded asset `key` for `evaluate.compare`, with `settings` on a transparent film."""
     from ..evaluate.compare import PASSES
 
     settings = replace(settings, film_transparent=True)
 
     def render(camera: Camera, radiance: np.ndarray, vertices: np.ndarray | None) -> dict[str, np.ndarray]:
-        state = ObjectState(name=Path(key).stem, asset=key, vertices=vertices)
+        state = ObjectState(Path(key).stem, key, vertices=vertices, visibility=visibility or Visibility())
         world = World(radiance)
         frame = Frame(number=1, camera=camera, objects=[state], world=world, settings=settings, passes=PASSES)
         return dict(session.render(frame))
