@@ -25,7 +25,7 @@ _BAND = 8
 _MOST_CELLS = 1 << 23
 #: Cells between a surface that lies on a collider and the collider.
 _CLEARANCE = 0.02
-_OVERLAP = "%s: overlaps the body at the start: %d of %d particles are inside it, and begin there; move the two apart"
+_OVERLAP = "overlaps the body at the start: {} of {} particles are inside it"
 
 
 @dataclass(slots=True)
@@ -278,13 +278,10 @@ def check_apart(points: Array, depth: float, colliders: Sequence[MovingCollider]
     for name, depths in sunk.items():
         count, deep = (int(np.count_nonzero(depths > part * depth)) for part in (0.5, 1.0))
         if deep > 0.01 * len(points):
-            raise UsageError(
-                name,
-                f"overlaps the body at the start: {deep} of {len(points)} particles are inside it",
-                "Move one of the two apart, or simulate from a frame in which they are apart",
-            )
+            remedy = "Move one of the two apart, or simulate from a frame in which they are apart"
+            raise UsageError(name, _OVERLAP.format(deep, len(points)), remedy)
         if count:
-            log.warning(_OVERLAP, name, count, len(points))
+            log.warning("%s: %s, and begin there; move the two apart", name, _OVERLAP.format(count, len(points)))
 
 
 def lift_surface(points: Array, spacing: float, colliders: Sequence[MovingCollider], planes: Array) -> Array:
