@@ -85,7 +85,7 @@ def test_a_node_without_a_network_renders_what_the_checkout_does(source, folder,
     environment = node(tmp_path, BLENDER_USER_RESOURCES=str(tmp_path / "user"), DRGS_BLENDER=str(blender.program))
     (tmp_path / "user").mkdir()
     run(sys.executable, "-m", "venv", place)
-    python, program = (shutil.which(name, path=str(place / SCRIPTS)) for name in ("python", "drgs"))
+    python = shutil.which("python", path=str(place / SCRIPTS))
     run(python, "-m", "pip", "install", "--no-index", "--find-links", wheels, "drgs-blender", env=environment)
     run(blender.program, "-c", INSTALL.format(archive=str(archive)), env=environment)
     program = shutil.which("drgs", path=str(place / SCRIPTS))
