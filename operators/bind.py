@@ -67,7 +67,10 @@ class DRGS_OT_bind_to_rig(DrgsOperator, bpy.types.Operator):
         for target in targets.editable(objects, data=True):
             distance = bind_to_rig(context, target, sources)
             if distance > DOUBTFUL:
-                self.warn(f'"{target.name}" lies {distance:.1%} of its size away from the meshes it was bound to')
+                self.warn(
+                    f'"{target.name}" lies {distance:.1%} of its size away from the meshes it was bound to, and may '
+                    "bend wrongly. Undo, move it onto them, bind again"
+                )
         return {"FINISHED"}
 
 

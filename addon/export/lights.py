@@ -33,7 +33,7 @@ def export_light(item: Visible, warn: Warn) -> Light | None:
         colour *= _Tree(light, warn).emission()
     power = light.energy * 2.0 ** getattr(light, "exposure", 0.0)
     if not (np.isfinite(colour).all() and np.isfinite(power)):
-        warn(f"{name}: its colour or power is not finite; it is off")
+        warn(f"{name}: its colour or power is not finite; it is off. Check its values and their drivers")
         colour, power = np.zeros(3), 0.0
     kind = light.type.lower()
     rays = item.visibility

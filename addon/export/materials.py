@@ -116,7 +116,7 @@ def _usable(tree: _Tree, name: str, paint: Paint, default: tuple[float, float, f
     """The number or colour of a field of frame.Material, finite and where it can be."""
     colour = paint.colour
     if not np.isfinite(colour).all():
-        tree.say(f"its {name.replace('_', ' ')} is not finite; Blender's default is used")
+        tree.say(f"its {name.replace('_', ' ')} is not finite; Blender's default is used. Check its drivers")
         colour = np.broadcast_to(default, 3)
     colour = np.maximum(colour, 0)
     if name in ("roughness", "metallic") and paint.texture is None:
@@ -178,7 +178,7 @@ class _Tree(Walker):
         straight = node.outputs["Alpha"].is_linked
         if image is None or images.export_image(image, straight, self._warn) is None:
             name = "has no image" if image is None else f'image "{image.name}" cannot be read'
-            self.warn(node, f"{name}; as in Cycles it is magenta")
+            self.warn(node, f"{name}; as in Cycles it is magenta. Choose another, or find its file")
             return plain(1) if output.socket.name == "Alpha" else Paint(np.array(images.MISSING))
         if node.projection != "FLAT":
             self.warn(node, f"the {node.projection.title()} projection is not supported; the UV map is used")

@@ -146,7 +146,10 @@ class Meshes:
             values = mesh_arrays.read_uvs(mesh, uv_map)
             if values is None:
                 which = f'the UV map "{uv_map}"' if uv_map else "a UV map"
-                self._warn(f'"{name}": its textures need {which}, which it has not; they show a single texel')
+                self._warn(
+                    f'"{name}": its textures need {which}, which it has not; they show a single texel. Unwrap it, or '
+                    "choose a map that it has"
+                )
                 continue
             if index is None:
                 faces = slice(None) if wanted[0] == uv_map else slice(0)

@@ -42,7 +42,10 @@ def export_world(world: bpy.types.World | None, warn: Warn) -> World:
     if isinstance(light.texture, Sky):
         pixels, rotation = linear_pixels(light.texture.image, warn), np.array(light.texture.rotation)
         if pixels is None:
-            warn(f'World: image "{light.texture.image.name}" cannot be read; its colour is taken as grey')
+            warn(
+                f'World "{world.name}": image "{light.texture.image.name}" cannot be read; its colour is taken as '
+                "grey. Choose File > External Data > Find Missing Files, or another image"
+            )
             light = Paint(light.colour * FALLBACK)
     colour = light.colour
     if world is not None:
@@ -138,7 +141,7 @@ class _Tree(Walker):
     def node_tex_environment(self, output: Place) -> Paint:
         node = output.node
         if node.image is None:
-            self.warn(node, "has no image; Blender shows magenta, a dim grey is used")
+            self.warn(node, "has no image; Blender shows magenta, a dim grey is used. Choose one")
             return plain(FALLBACK)
         if node.type == "TEX_ENVIRONMENT" and node.projection != "EQUIRECTANGULAR":
             self.warn(node, "the Mirror Ball projection is read as Equirectangular")

@@ -156,7 +156,7 @@ def check(obj: bpy.types.Object, warn: Callable[[str], None], *, final: bool) ->
     matter = obj.drgs.matter
     # While a bake begins anew there is none for a moment; then nobody waits for a final picture.
     if final and (matter.tear or matter.grain) and not (path.parent / HEADER).exists():
-        warn(f'"{obj.name}": {path.parent / HEADER} does not exist; its tears and grains are not shown')
+        warn(f'"{obj.name}": {path.parent / HEADER} does not exist; its tears and grains are not shown. Bake again')
 
 
 def _path_of(obj: bpy.types.Object, modifier: bpy.types.Modifier) -> Path:

@@ -69,7 +69,7 @@ def _draw() -> None:
     except Exception as failure:  # else it would be printed with every redraw, and told to nobody
         messages.log.exception("preview failed")
         shown.clear()
-        messages.note("ERROR", f"Preview: cannot be drawn ({type(failure).__name__}: {failure})")
+        messages.note("ERROR", f"Preview: cannot be drawn ({type(failure).__name__}: {failure}). Bakes do not need it")
 
 
 def _draw_all() -> None:

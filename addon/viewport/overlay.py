@@ -95,7 +95,8 @@ def _make_table() -> None:
             _tables[key] = draw.texture(display.table(key))
         except (RuntimeError, OSError, TypeError) as error:
             _failed.add(key)
-            messages.note("ERROR", f"The view transform {key[1]} cannot be read ({error}); the overlay needs it")
+            problem = f"The view transform {key[1]} cannot be read ({error}), and Lit needs it"
+            messages.note("ERROR", f"{problem}. Choose another in Render > Color Management")
         for area in window.screen.areas:
             area.tag_redraw()
 

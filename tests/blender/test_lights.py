@@ -139,4 +139,5 @@ def test_what_cannot_be_done_to_a_light_is_said(scene, export):
     obj.data.energy = float("nan")
     frame, warnings = export()
     assert len(warnings) == 3 and all('Light "Lamp"' in w for w in warnings)
+    assert any("not finite; it is off. Check" in w for w in warnings), "and what to do"
     assert frame.lights[0].power == 0

@@ -188,7 +188,8 @@ def test_missing_image_is_named_and_not_black(scene, export, sky, tmp_path):
     texture.image.filepath = str(tmp_path / "gone.exr")
     texture.image.reload()
     frame, warnings = export()
-    assert len(warnings) == 1 and texture.image.name in warnings[0]
+    assert len(warnings) == 1 and texture.image.name in warnings[0] and "Find Missing Files" in warnings[0]
+    assert f'World "{scene.world.name}"' in warnings[0]
     assert frame.world.environment is None and max(frame.world.colour) > 0
 
 
