@@ -7,10 +7,12 @@ import gpu
 import numpy as np
 from mathutils import Matrix
 
+from ...drgs_blender.adjust import edited_asset
 from ...drgs_blender.asset import Asset
 from ...drgs_blender.errors import DrgsError
 from .. import assets, mesh_arrays
 from ..export.memory import Memory, uid
+from ..export.objects import look_of
 from . import draw
 
 Array = np.ndarray
@@ -43,9 +45,8 @@ def show(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
         obj = instance.object
         if not instance.show_self or not assets.is_drgs(obj):
             continue
-        batch = memory.recall(
-            ("object", uid(obj), obj.data.as_pointer()), (uid(obj), uid(obj.data)), lambda obj=obj: _batch(obj)
-        )
+        key = "object", uid(obj), obj.data.as_pointer(), obj.mode, obj.drgs.adjustment.values()
+        batch = memory.recall(key, (uid(obj), uid(obj.data)), lambda obj=obj: _batch(obj))
         if batch is None:
             continue
         matrix: Matrix = instance.matrix_world
@@ -59,7 +60,16 @@ def _batch(obj: bpy.types.Object) -> gpu.types.GPUBatch | None:
         asset = assets.load(assets.file_of(obj))
     except DrgsError:  # told by whoever wants to render the object
         return None
-    found = asset.surfels
     vertices = mesh_arrays.read_vertices(obj.data)
-    sizes = _WIDTH * found.scale.max(axis=1)
-    return draw.disc_batch(places(asset, vertices), found.albedo, sizes.astype(np.float32))
+    sizes = _WIDTH * asset.surfels.scale.max(axis=1)
+    return draw.disc_batch(places(asset, vertices), colours(obj, asset), sizes.astype(np.float32))
+
+
+def colours(obj: bpy.types.Object, asset: Asset) -> Array:
+    """(n, 3) float32 linear: the albedo of the surfels as it is painted and adjusted on the evaluated object."""
+    if obj.mode == "EDIT":  # its mesh is a wrapper without attributes
+        return asset.surfels.albedo
+    try:
+        return edited_asset(asset, *look_of(obj, asset, lambda text: None)).surfels.albedo
+    except DrgsError:  # told by whoever wants to render the object, as are warnings
+        return asset.surfels.albedo

@@ -567,6 +567,24 @@ def test_discs_follow_the_mesh(ball, ball_file):
     assert places(asset, asset.mesh.vertices[:5]) is asset.surfels.centre
 
 
+def test_discs_have_the_colours_that_are_painted_and_adjusted(ball, ball_file):
+    surfels, asset = part("addon.viewport.surfels"), part("addon.assets").load(ball_file)
+
+    def shown():
+        return surfels.colours(ball.evaluated_get(bpy.context.evaluated_depsgraph_get()), asset)
+
+    np.testing.assert_array_equal(shown(), asset.surfels.albedo)
+    bpy.ops.drgs.set_material(preset="GOLD")
+    np.testing.assert_allclose(shown(), np.broadcast_to((1.0, 0.78, 0.34), shown().shape), atol=1e-6)
+    ball.drgs.adjustment.tint = 0.5, 1, 1
+    np.testing.assert_allclose(shown()[:, 0], 0.5, atol=1e-6)
+    bpy.ops.object.mode_set(mode="EDIT")
+    try:
+        assert shown() is asset.surfels.albedo
+    finally:
+        bpy.ops.object.mode_set(mode="OBJECT")
+
+
 def test_composited_frame_shows_our_objects_alone(crowd):
     views = part("addon.viewport.views")
     crowd.lamp.visible_camera = True
