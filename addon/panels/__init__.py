@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-from . import adjustment, compositing, matter, object_data, rays, render, sidebar, submit, tour, view_layer
+from . import adjustment, compositing, header, matter, object_data, rays, render, sidebar, submit, tour, view_layer
 
 CLASSES = (
     *render.CLASSES,
@@ -19,4 +19,14 @@ CLASSES = (
     *adjustment.CLASSES,
 )
 
-register, unregister = bpy.utils.register_classes_factory(CLASSES)
+_register, _unregister = bpy.utils.register_classes_factory(CLASSES)
+
+
+def register() -> None:
+    _register()
+    header.register()
+
+
+def unregister() -> None:
+    header.unregister()
+    _unregister()

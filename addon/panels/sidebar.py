@@ -10,7 +10,7 @@ import bpy
 from ...drgs_blender.version import __version__
 from .. import assets, engine_link, messages, preferences
 from .object_data import draw_asset
-from .tour import wrapped
+from .tour import POPOVER, wrapped
 
 ICONS = {"INFO": "INFO", "WARNING": "ERROR", "ERROR": "CANCEL"}
 SHOWN = 8
@@ -64,6 +64,7 @@ class DRGS_PT_engine(_SidebarPanel, bpy.types.Panel):
 
 class DRGS_PT_messages(_SidebarPanel, bpy.types.Panel):
     bl_label = "Messages"
+    bl_ui_units_x = POPOVER // 20
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout

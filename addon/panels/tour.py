@@ -10,12 +10,15 @@ from .. import engine_link, engine_setup, lighting, reconstruction, setup_job, t
 
 #: Pixels of a letter, about, at a scale of 1.
 LETTER = 7.5
+#: Pixels of a panel that pops up, at a scale of 1.
+POPOVER = 400
 
 
 def wrapped(layout: bpy.types.UILayout, context: bpy.types.Context, text: str, icon: str = "NONE") -> None:
-    """A text in as many lines as the region needs."""
-    width = context.region.width if context.region else 240
-    letters = max(24, int(width / (LETTER * (context.preferences.system.ui_scale or 1))) - 4)
+    """A text in as many lines as the region needs; what pops up from a header has a width of its own."""
+    region, scale = context.region, context.preferences.system.ui_scale or 1
+    width = POPOVER * scale if region and region.type == "HEADER" else region.width if region else 240
+    letters = max(24, int(width / (LETTER * scale)) - 4)
     column = layout.column(align=True)
     for i, line in enumerate(textwrap.wrap(text, letters, break_on_hyphens=False)):
         column.label(text=line, icon="BLANK1" if i and icon != "NONE" else icon)

@@ -164,3 +164,21 @@ def _own(cls: type) -> dict[str, object]:
     """Methods and values of a class that its drawing may use."""
     names = (n for c in cls.__mro__ if c.__module__.startswith(PACKAGE) for n in vars(c))
     return {n: getattr(cls, n) for n in names if not n.startswith(("__", "draw", "poll", "bl_"))}
+
+
+def test_the_newest_problem_is_in_the_header_of_viewports(scene, monkeypatch):
+    messages = part("addon.messages")
+    monkeypatch.setattr(messages, "history", type(messages.history)(maxlen=3))
+    (draw,) = (f for f in bpy.types.VIEW3D_HT_header.draw._draw_funcs if f.__module__.startswith(PACKAGE))
+    told = []
+
+    class Header(Layout):
+        def check(self, name, named):
+            super().check(name, named)
+            told.append((named["text"], named["icon"]))
+
+    for level, text in (("INFO", "Engine"), ("WARNING", "word " * 20), ("ERROR", "Gone"), ("INFO", "Engine")):
+        messages.note(level, text)
+        draw(SimpleNamespace(layout=Header([])), bpy.context)
+    assert [icon for _, icon in told] == ["ERROR", "CANCEL", "CANCEL"] and told[1][0] == told[2][0] == "Gone"
+    assert told[0][0].startswith("word word") and len(told[0][0]) <= 40
