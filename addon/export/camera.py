@@ -38,6 +38,16 @@ def border(render: bpy.types.RenderSettings, width: int, height: int) -> tuple[i
     return x0, height - above, x1, height - below
 
 
+def check_lens(camera: bpy.types.Object) -> None:
+    """UsageError where a camera is of a type that the engine has no rays for."""
+    if camera.data.type not in SUPPORTED:
+        raise UsageError(
+            f'Camera "{camera.name}"',
+            f"is of type {camera.data.type.capitalize()}, which DR-GS cannot render",
+            "Set Lens > Type to Perspective or Orthographic",
+        )
+
+
 def export_camera(
     camera: bpy.types.Object,
     render: bpy.types.RenderSettings,
@@ -67,13 +77,8 @@ def export_camera(
             f"is the scene's camera, but of type {camera.type.capitalize()}",
             "Choose a camera in Scene > Camera",
         )
+    check_lens(camera)
     data = camera.data
-    if data.type not in SUPPORTED:
-        raise UsageError(
-            f'Camera "{camera.name}"',
-            f"is of type {data.type.capitalize()}, which DR-GS cannot render",
-            "Set Lens > Type to Perspective or Orthographic",
-        )
     orthographic = SUPPORTED[data.type]
     width, height = resolution(render)
     aspect = render.pixel_aspect_y / render.pixel_aspect_x

@@ -18,6 +18,7 @@ import bpy
 from ...drgs_blender.errors import DrgsError
 from ...drgs_blender.frame import Camera, Frame
 from .. import engine_link, messages, preferences
+from ..export.camera import check_lens
 from ..export.view import view_camera
 from . import draw, scenes
 from .worker import Picture, Request, Worker
@@ -78,6 +79,12 @@ def update(
     exported = _export(depsgraph, space)
     if exported.frame is None:
         return exported.error
+    through = space.camera if rv3d.view_perspective == "CAMERA" and not composited else None
+    if through is not None and through.type == "CAMERA":  # what others draw without such a lens, the overlay does, too
+        try:
+            check_lens(through)
+        except DrgsError as error:
+            return str(error)
     camera = view_camera(region, space, rv3d, depsgraph.scene)
     if camera is None:
         return ""

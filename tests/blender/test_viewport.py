@@ -267,6 +267,31 @@ def test_camera_view_is_the_final_frame(scene, kind, size, fit):
         assert getattr(seen, name) == pytest.approx(getattr(final, name), rel=2e-4), name
 
 
+def test_a_panoramic_camera_is_refused_in_its_view_as_by_f12(scene, ball, monkeypatch):
+    views = part("addon.viewport.views")
+    asked = []
+    monkeypatch.setattr(views.worker, "submit", lambda name, request: asked.append(name))
+    monkeypatch.setattr(views, "_start", lambda: None)
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    space = SimpleNamespace(camera=scene.camera, local_view=None, clip_start=0.1, clip_end=100, use_render_border=False)
+    projection = scene.camera.calc_matrix_camera(depsgraph, x=64, y=48)
+    place = {"view_matrix": scene.camera.matrix_world.inverted(), "is_perspective": True}
+    for kind, seen_through, composited, refused in (
+        ("PANO", "CAMERA", False, True),
+        ("PANO", "PERSP", False, False),
+        ("PANO", "CAMERA", True, False),
+        ("PERSP", "CAMERA", False, False),
+    ):
+        scene.camera.data.type = kind
+        rv3d = SimpleNamespace(window_matrix=projection, view_perspective=seen_through, **place)
+        context = SimpleNamespace(region=SimpleNamespace(width=64, height=48), space_data=space, region_data=rv3d)
+        views.forget()
+        asked.clear()
+        error = views.update(context, depsgraph, "view", composited)
+        assert ("Perspective or Orthographic" in error) == refused and bool(asked) != refused
+    views.forget()
+
+
 def test_orthographic_view_sees_behind_itself(scene):
     """As Blender's own does, from -clip_end on; the same points are on the same pixels and at the same clip planes."""
     projection = Matrix.Identity(4)
