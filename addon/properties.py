@@ -242,6 +242,11 @@ class DrgsViewLayerSettings(bpy.types.PropertyGroup):
     )
 
 
+def _tell(group: DrgsObjectSettings, context: bpy.types.Context) -> None:
+    """Have viewports see a change that a script made."""
+    group.id_data.update_tag(refresh={"OBJECT"})
+
+
 def _get_path(group: DrgsObjectSettings) -> str:
     return group.asset.filepath if group.asset else ""
 
@@ -268,6 +273,13 @@ class DrgsObjectSettings(bpy.types.PropertyGroup):
     )
 
     adjustment: PointerProperty(type=DrgsAdjustment, name="Adjustments")
+    show_captured: BoolProperty(
+        name="Show as Captured",
+        description="Before and after: render the object with the material of its asset, without what is painted, "
+        "preset or adjusted. Nothing of that is lost",
+        default=False,
+        update=_tell,
+    )
     matter: PointerProperty(type=DrgsMatterSettings, name="Matter")
     shown_as: StringProperty(
         name="Display As", description="How the mesh is displayed when it is not drawn as a box", options={"HIDDEN"}

@@ -42,7 +42,7 @@ class DrgsObjects:
         obj = item.object
         check_modifiers(obj, self._depsgraph)
         playback.check(obj, self._warn, final=self._depsgraph.mode == "RENDER")
-        look = obj.drgs.adjustment.values(), *playback.look_of(obj).items()
+        look = obj.drgs.show_captured, obj.drgs.adjustment.values(), *playback.look_of(obj).items()
         shape = self._memory.recall(
             ("object", uid(obj), obj.name, obj.data.as_pointer(), obj.mode, str(assets.file_of(obj)), look),
             (uid(obj), uid(obj.data)),
@@ -59,20 +59,21 @@ def _shape(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, key_of: KeyOf,
     path = assets.file_of(obj)
     asset = assets.load(path)
     # While a mesh is edited, its evaluated data is a wrapper without arrays; a converted copy has them.
-    editing = obj.mode == "EDIT"
+    editing, captured = obj.mode == "EDIT", obj.drgs.show_captured
     mesh = obj.to_mesh(preserve_all_data_layers=True, depsgraph=depsgraph) if editing else obj.data
     try:
         same_faces = check_fit(obj, mesh, asset.mesh, warn)
         arrays = {
             "vertices": mesh_arrays.read_vertices(mesh),
             "corner_normals": _corner_normals(obj, mesh, same_faces, warn),
-            **{channel: _edited(obj, mesh, asset, channel, warn) for channel in MATERIAL_CHANNELS},
+            **{c: None if captured else _edited(obj, mesh, asset, c, warn) for c in MATERIAL_CHANNELS},
         }
         for array in arrays.values():
             if array is not None:
                 array.flags.writeable = False  # so that the engine's client need not copy it
         look = playback.look_of(obj)
-        return ObjectState(name=obj.name, asset=key_of(path), adjustment=_adjustment(obj, mesh, warn), **arrays, **look)
+        adjustment = None if captured else _adjustment(obj, mesh, warn)
+        return ObjectState(name=obj.name, asset=key_of(path), adjustment=adjustment, **arrays, **look)
     finally:
         if editing:
             obj.to_mesh_clear()

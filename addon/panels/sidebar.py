@@ -37,6 +37,7 @@ class DRGS_PT_object(_SidebarPanel, bpy.types.Panel):
         row.operator("drgs.restore_material", text="", icon="LOOP_BACK")
         row.operator("drgs.copy_material", text="", icon="COPYDOWN")
         self.layout.operator_menu_enum("drgs.paint", "channel", icon="BRUSH_DATA")
+        self.layout.prop(context.object.drgs, "show_captured", toggle=True, icon="HIDE_OFF")
         column = self.layout.column(align=True)
         column.operator("drgs.save_asset", icon="FILE_TICK")
         column.operator("drgs.bake_light", icon="RENDER_RESULT")

@@ -45,7 +45,8 @@ def show(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
         obj = instance.object
         if not instance.show_self or not assets.is_drgs(obj):
             continue
-        key = "object", uid(obj), obj.data.as_pointer(), obj.mode, obj.drgs.adjustment.values()
+        look = obj.drgs.show_captured, obj.drgs.adjustment.values()
+        key = "object", uid(obj), obj.data.as_pointer(), obj.mode, look
         batch = memory.recall(key, (uid(obj), uid(obj.data)), lambda obj=obj: _batch(obj))
         if batch is None:
             continue
@@ -67,7 +68,7 @@ def _batch(obj: bpy.types.Object) -> gpu.types.GPUBatch | None:
 
 def colours(obj: bpy.types.Object, asset: Asset) -> Array:
     """(n, 3) float32 linear: the albedo of the surfels as it is painted and adjusted on the evaluated object."""
-    if obj.mode == "EDIT":  # its mesh is a wrapper without attributes
+    if obj.drgs.show_captured or obj.mode == "EDIT":  # then its mesh is a wrapper without attributes
         return asset.surfels.albedo
     try:
         return edited_asset(asset, *look_of(obj, asset, lambda text: None)).surfels.albedo

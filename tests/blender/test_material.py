@@ -132,6 +132,32 @@ def test_adjustments_reach_the_engine_and_go_away_by_the_switch(ball, export):
     assert export()[0].objects[0].adjustment is None and settings.roughness_gain == 1
 
 
+def test_before_and_after_is_a_switch_that_loses_nothing(ball, scene, ball_file):
+    """What is painted and adjusted goes and comes, in viewports that remember, in discs, and by keyframes."""
+    bpy.ops.drgs.set_material(preset="GOLD")
+    adjustment(ball).tint = (1, 0.5, 1)
+    export_frame, memory = part("addon.export").export_frame, part("addon.export.memory").Memory()
+    surfels, asset = part("addon.viewport.surfels"), part("addon.assets").load(ball_file)
+
+    def state():
+        depsgraph = bpy.context.evaluated_depsgraph_get()
+        discs = surfels.colours(ball.evaluated_get(depsgraph), asset)
+        return export_frame(depsgraph, str, lambda text: None, memory=memory).objects[0], discs
+
+    after = state()
+    for number, before in ((1, True), (2, False)):
+        ball.drgs.show_captured = before
+        ball.keyframe_insert("drgs.show_captured", frame=number)
+    for number, edited in ((1, False), (2, True)):
+        scene.frame_set(number)
+        now, discs = state()
+        assert (now.adjustment is not None) == edited
+        for channel in ("albedo", "roughness", "metallic"):
+            values = getattr(now, channel)
+            assert np.array_equal(values, getattr(after[0], channel)) if edited else values is None
+        np.testing.assert_array_equal(discs, after[1] if edited else asset.surfels.albedo)
+
+
 def test_the_mask_is_a_vertex_group_or_an_attribute(ball, export):
     settings, count = adjustment(ball), len(ball.data.vertices)
     settings.value = 0.5
