@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import bpy
 
-from . import assets, engine_link, lighting, setup_job
+from . import assets, cage_nodes, engine_link, lighting, setup_job
 
 ENGINE = "DRGS"
 #: Modifiers that follow another object, in the order in which an artist thinks of them.
@@ -56,7 +56,8 @@ def target(context: bpy.types.Context) -> bpy.types.Object | None:
 def poser_of(obj: bpy.types.Object) -> bpy.types.Object | None:
     """What bends a DR-GS object: armature, lattice or cage, in this order."""
     moved_by = {m.type: m.target if m.type == "SURFACE_DEFORM" else m.object for m in obj.modifiers if m.type in BENDS}
-    return next((moved_by[kind] for kind in BENDS if moved_by.get(kind) is not None), None)
+    carriers = (*(moved_by.get(kind) for kind in BENDS), *map(cage_nodes.cage_of, obj.modifiers))
+    return next((found for found in carriers if found is not None), None)
 
 
 def _steps(context: bpy.types.Context) -> Iterator[Step]:

@@ -1,4 +1,4 @@
-"""Bind to Cage: a low-poly mesh carries the selected objects along (Surface Deform)."""
+"""Bind to Cage: a low-poly mesh carries the selected objects along (Surface Deform, or nodes where that refuses)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import bpy
 import numpy as np
 from bpy.props import IntProperty
 
-from ..addon import assets, mesh_arrays
+from ..addon import assets, cage_nodes, mesh_arrays
 from ..drgs_blender.errors import UsageError
 from . import targets
 from .base import DrgsOperator
@@ -35,24 +35,34 @@ class DRGS_OT_bind_to_cage(DrgsOperator, targets.ObjectMode, bpy.types.Operator)
             raise UsageError("Selection", f"holds {len(cages)} other meshes", "Select one cage, or none for a new one")
         cage = cages[0] if cages else new_cage(context, objects, self.faces)
         try:
-            bind_to_cage(context, objects, cage)
+            refused = bind_to_cage(context, objects, cage)
         except UsageError:
             if not cages:
                 bpy.data.meshes.remove(cage.data)
             raise
+        for name, reason in refused.items():
+            self.report({"INFO"}, f'Surface Deform cannot bind "{name}" to "{cage.name}" ({reason}); nodes carry it')
         targets.select_only(context, [cage], cage)
         return {"FINISHED"}
 
 
-def bind_to_cage(context: bpy.types.Context, objects: list[bpy.types.Object], cage: bpy.types.Object) -> None:
+def bind_to_cage(context: bpy.types.Context, objects: list[bpy.types.Object], cage: bpy.types.Object) -> dict[str, str]:
     """Bind `objects` as they are now to `cage` as it is now; the cage is shown as wires and not rendered.
+
+    Returns
+    -------
+    dict
+        Object name -> why Surface Deform did not take it, so that `cage_nodes` carry it.
 
     Raises
     ------
     UsageError
-        Blender cannot bind to that mesh; nothing has been changed then.
+        That mesh cannot carry anything, or an object's mesh may not be changed; nothing has been changed then.
     """
-    done = []
+    shape = cage.evaluated_get(context.evaluated_depsgraph_get()).data
+    if not any(p.area > 0 for p in shape.polygons):
+        raise UsageError(f'Cage "{cage.name}"', "has no faces that could carry anything", "Give it faces")
+    refused, done = {}, []
     for obj in objects:
         modifier = targets.add_modifier(obj, "SURFACE_DEFORM", NAME, target=cage)
         done.append((obj, modifier))
@@ -65,14 +75,31 @@ def bind_to_cage(context: bpy.types.Context, objects: list[bpy.types.Object], ca
                 reason = str(error).removeprefix("Error: ").strip().rstrip(".")
         context.view_layer.update()
         if not modifier.is_bound:
-            for changed, added in done:
-                changed.modifiers.remove(added)
-            raise UsageError(
-                f'Cage "{cage.name}"',
-                f'cannot carry "{obj.name}"' + (f" ({reason})" if reason else ""),
-                "It must have faces, none of them concave, and no edge of more than two faces",
-            )
+            refused[obj.name] = reason or "a face is concave, or an edge has more than two"
+    left = [obj for obj in objects if obj.name in refused]
+    try:
+        _check_carried(left)
+    except UsageError:
+        for obj, modifier in done:
+            obj.modifiers.remove(modifier)
+        raise
+    for obj in left:
+        modifier = targets.add_modifier(obj, "NODES", NAME)
+        context.view_layer.update()
+        cage_nodes.carry(obj, cage, modifier)
     cage.display_type, cage.hide_render = "WIRE", True
+    return refused
+
+
+def _check_carried(objects: list[bpy.types.Object]) -> None:
+    """UsageError where nodes cannot carry an object: each vertex of its mesh keeps its place in the cage."""
+    for obj in targets.editable(objects, data=True) if objects else ():
+        if obj.data.users > 1:
+            raise UsageError(
+                f'Object "{obj.name}"',
+                f'shares its mesh "{obj.data.name}" with others, which are elsewhere in the cage',
+                "Choose Object > Relations > Make Single User > Object & Data",
+            )
 
 
 def new_cage(context: bpy.types.Context, objects: list[bpy.types.Object], faces: int) -> bpy.types.Object:

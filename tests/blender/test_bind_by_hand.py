@@ -118,13 +118,64 @@ def test_a_new_cage_carries_the_objects(pair):
 
 
 def test_a_mesh_that_cannot_carry_is_refused_and_nothing_changes(pair):
-    cage = mesh_object(
-        "Fin", [(0, 0, 0), (0, 0, 1), (1, 0, 0), (-1, 0, 0), (0, 1, 0)], [(0, 1, 2), (0, 1, 3), (0, 1, 4)]
-    )
+    for faces in ([], [(0, 1, 2)]):
+        cage = mesh_object("Fin", [(0, 0, 0), (0, 0, 1), (0, 0, 2)], faces)
+        select(cage, *pair)
+        with pytest.raises(RuntimeError, match='"Fin"'):
+            bpy.ops.drgs.bind_to_cage()
+        assert not any(o.modifiers for o in pair) and not cage.hide_render
+        bpy.data.objects.remove(cage)
+
+
+def rough_cage(size: float) -> bpy.types.Object:
+    """What Surface Deform refuses: a prism over an L, whose caps are concave, with a fin at one of its edges."""
+    shape = [(-1, -1), (1, -1), (1, 0), (0, 0), (0, 1), (-1, 1)]
+    corners = [(size * x, size * y, size * z) for z in (-1, 1) for x, y in shape] + [(2 * size, 0, 0)]
+    sides = [(i, (i + 1) % 6, 6 + (i + 1) % 6, 6 + i) for i in range(6)]
+    return mesh_object("Rough", corners, [tuple(range(5, -1, -1)), tuple(range(6, 12)), *sides, (1, 7, 12)])
+
+
+def test_what_surface_deform_refuses_carries_by_nodes(pair):
+    """Exactly along with a cage that is moved, turned and scaled; where it bends, near vertices go with their faces."""
+    before = [world_vertices(o) for o in pair]
+    cage = rough_cage(2.5)
+    cage.matrix_world = Matrix.Translation((1, 0, 0)) @ Matrix.Rotation(0.3, 4, "Z")
+    bpy.context.view_layer.update()
     select(cage, *pair)
-    with pytest.raises(RuntimeError, match='"Fin"'):
+    assert bpy.ops.drgs.bind_to_cage() == {"FINISHED"}
+    assert cage.hide_render and [m.type for o in pair for m in o.modifiers] == ["NODES", "NODES"]
+    assert part("addon.tour").poser_of(pair[0]) == cage
+    for obj, rest in zip(pair, before):
+        np.testing.assert_allclose(world_vertices(obj), rest, atol=1e-5)
+    turn = Matrix.Translation((0, 2, 1)) @ Matrix.Rotation(1.0, 4, (1, 2, 3)) @ Matrix.Scale(1.5, 4)
+    cage.data.transform(turn)
+    bpy.context.view_layer.update()
+    whole = np.array(cage.matrix_world @ turn @ cage.matrix_world.inverted())
+    for obj, rest in zip(pair, before):
+        np.testing.assert_allclose(world_vertices(obj), rest @ whole[:3, :3].T + whole[:3, 3], atol=2e-5)
+    cage.data.transform(turn.inverted())
+    for vertex in cage.data.vertices:
+        vertex.co.z *= 1 + 0.5 * (vertex.co.z > 0)
+    bpy.context.view_layer.update()
+    for obj, rest in zip(pair, before):
+        lifted = world_vertices(obj)[:, 2] - rest[:, 2]
+        assert lifted[rest[:, 2] > 0.5].min() > 0.1 and lifted.max() < 1.3
+        assert lifted[rest[:, 2].argmax()] > lifted[rest[:, 2].argmin()] + 0.2
+
+
+def test_nodes_of_a_cage_have_a_mesh_for_each_object(ball):
+    twin = ball.copy()
+    bpy.context.scene.collection.objects.link(twin)
+    cage = rough_cage(2.5)
+    select(cage, ball)
+    with pytest.raises(RuntimeError, match=r'"ball".*shares its mesh.*Single User'):
         bpy.ops.drgs.bind_to_cage()
-    assert not any(o.modifiers for o in pair) and not cage.hide_render
+    assert not ball.modifiers and not cage.hide_render
+    bpy.data.objects.remove(twin)
+    for _ in range(2):
+        select(cage, ball)
+        assert bpy.ops.drgs.bind_to_cage() == {"FINISHED"}
+    assert len(ball.modifiers) == 1 and len(bpy.data.node_groups) == 1
 
 
 @pytest.fixture
@@ -165,8 +216,8 @@ def test_what_surface_deform_refuses_is_taken_out_of_a_new_cage(ball):
     faces = [(0, 2, 1, 3), (0, 1, 4), (1, 3, 4), (1, 3, 5), (3, 2, 6), (3, 0, 4), (3, 7, 5)]
     cage = mesh_object("Rough", corners, faces)
     select(cage, ball)
-    with pytest.raises(RuntimeError, match='"Rough"'):
-        bpy.ops.drgs.bind_to_cage()
+    assert bpy.ops.drgs.bind_to_cage() == {"FINISHED"} and ball.modifiers[0].type == "NODES"
     part("operators.bind_cage").clean(cage.data, 1e-4)
-    assert bpy.ops.drgs.bind_to_cage() == {"FINISHED"}
+    select(cage, ball)
+    assert bpy.ops.drgs.bind_to_cage() == {"FINISHED"} and ball.modifiers[0].type == "SURFACE_DEFORM"
     assert {len(p.vertices) for p in cage.data.polygons} == {3} and len(cage.data.polygons) >= 6

@@ -1,0 +1,171 @@
+"""Any mesh with faces carries an object: what Surface Deform refuses, by Geometry Nodes.
+
+Each vertex keeps its place in the frames of the nearest faces (two edges and the normal) and goes to the mean of where
+they bring it: values and gradients blended, as by generalised moving least squares (Martin et al. 2010). A cage that is
+moved, turned and scaled as a whole does exactly that to the object.
+"""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+from mathutils.kdtree import KDTree
+
+from . import mesh_arrays
+
+Array = np.ndarray
+
+#: Faces that carry a vertex.
+FACES = 6
+#: Point attributes, one for each of them: its corners in the cage, their weights, and that of the normal.
+CORNERS, WEIGHTS, HEIGHT = (f"drgs_cage_{what}_{{}}" for what in ("corners", "weights", "height"))
+#: Name of the node that knows the cage.
+SOURCE = "DR-GS Cage"
+
+
+def cage_of(modifier: bpy.types.Modifier) -> bpy.types.Object | None:
+    """The mesh that carries an object by a modifier of `carry`; None of other modifiers."""
+    return _known(modifier.node_group) if modifier.type == "NODES" and modifier.node_group is not None else None
+
+
+def _known(tree: bpy.types.NodeTree) -> bpy.types.Object | None:
+    source = tree.nodes.get(SOURCE)
+    return None if source is None else source.inputs["Object"].default_value
+
+
+def carry(obj: bpy.types.Object, cage: bpy.types.Object, modifier: bpy.types.Modifier) -> None:
+    """Let a nodes `modifier` of `obj` follow `cage`, from where both are evaluated to be now."""
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    shape = cage.evaluated_get(depsgraph).data
+    points = mesh_arrays.read_vertices(obj.evaluated_get(depsgraph).data).astype(np.float64)
+    into = np.array(obj.matrix_world.inverted() @ cage.matrix_world, np.float64)
+    vertices = mesh_arrays.read_vertices(shape) @ into[:3, :3].T + into[:3, 3]
+    corners, weights, heights = frames(points, vertices, mesh_arrays.loop_triangles(shape))
+    for i in range(FACES):
+        _write(obj.data, CORNERS.format(i), "FLOAT_VECTOR", corners[:, i])
+        _write(obj.data, WEIGHTS.format(i), "FLOAT_VECTOR", weights[:, i])
+        _write(obj.data, HEIGHT.format(i), "FLOAT", heights[:, i])
+    trees = (t for t in bpy.data.node_groups if t.library is None and _known(t) == cage)
+    modifier.node_group = next(trees, None) or _tree(cage)
+
+
+def frames(points: Array, vertices: Array, triangles: Array) -> tuple[Array, Array, Array]:
+    """Where points are in the frames of the nearest faces of a cage, times the share that each face has in them.
+
+    Parameters
+    ----------
+    points : (n, 3)
+    vertices, triangles : (v, 3), (m, 3) of the cage, in the same space; at least one has an area
+
+    Returns
+    -------
+    (n, FACES, 3) int corners of the faces; (n, FACES, 3) their weights, which sum to one for each point; (n, FACES) the
+    weights of the normals, whose length is the root of that of the edges' cross product. Zero where there are no more
+    faces.
+    """
+    first, second, third = (vertices[triangles[:, i]] for i in range(3))
+    edges = np.stack((second - first, third - first), axis=2)
+    cross = np.cross(edges[..., 0], edges[..., 1])
+    area = np.linalg.norm(cross, axis=1)
+    sound = np.flatnonzero(area > 1e-9 * area.max())
+    tree = KDTree(len(sound))
+    for number, centre in enumerate(((first + second + third) / 3)[sound].tolist()):
+        tree.insert(centre, number)
+    tree.balance()
+    # The next face ends the reach of the others, lest vertices jump where the nearest change.
+    found = [tree.find_n(p, min(FACES + 1, len(sound))) for p in points.tolist()]
+    distance = np.array([[hit[2] for hit in hits] for hits in found])
+    reach = np.maximum(distance[:, -1:] * (1.0 if len(sound) > FACES else 1.5), 1e-30)
+    count = min(FACES, len(sound))
+    face = sound[np.array([[hit[1] for hit in hits[:count]] for hits in found])]
+    share = np.maximum(1 - (distance[:, :count] / reach) ** 2, 1e-6) ** 3
+    share /= share.sum(axis=1, keepdims=True)
+    away = points[:, None] - first[face]
+    a, b = np.moveaxis(np.einsum("nkij,nkj->nki", np.linalg.pinv(edges)[face], away), 2, 0)
+    missing = ((0, 0), (0, FACES - count))
+    return (
+        np.pad(triangles[face], (*missing, (0, 0))),
+        np.pad(share[..., None] * np.stack((1 - a - b, a, b), axis=2), (*missing, (0, 0))),
+        np.pad(share * np.einsum("nki,nki->nk", away, cross[face]) / area[face] ** 1.5, missing),
+    )
+
+
+def _write(mesh: bpy.types.Mesh, name: str, kind: str, values: Array) -> None:
+    if (old := mesh.attributes.get(name)) is not None:
+        mesh.attributes.remove(old)
+    attribute = mesh.attributes.new(name, kind, "POINT")
+    attribute.data.foreach_set("vector" if kind == "FLOAT_VECTOR" else "value", values.astype(np.float32).ravel())
+
+
+class _Builder:
+    """Adds nodes to a tree; what is linked to an input is a socket or a value."""
+
+    def __init__(self, tree: bpy.types.NodeTree) -> None:
+        self._tree = tree
+
+    def node(self, kind: str, *inputs: object, **values: object) -> bpy.types.Node:
+        """A node with `values` whose inputs, in their order, are linked or set."""
+        node = self._tree.nodes.new(kind)
+        for name, value in values.items():
+            setattr(node, name, value)
+        for socket, given in zip([s for s in node.inputs if s.enabled], inputs):
+            if isinstance(given, bpy.types.NodeSocket):
+                self._tree.links.new(given, socket)
+            elif given is not None:
+                socket.default_value = given
+        return node
+
+    def out(self, kind: str, *inputs: object, **values: object) -> bpy.types.NodeSocket:
+        """The first output of such a node."""
+        return next(s for s in self.node(kind, *inputs, **values).outputs if s.enabled)
+
+    def vector(self, operation: str, *inputs: object) -> bpy.types.NodeSocket:
+        """Vector Math."""
+        return self.out("ShaderNodeVectorMath", *inputs, operation=operation)
+
+    def scaled(self, vector: bpy.types.NodeSocket, factor: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+        """`vector` times the number `factor`."""
+        node = self.node("ShaderNodeVectorMath", vector, operation="SCALE")
+        self._tree.links.new(factor, node.inputs["Scale"])
+        return node.outputs["Vector"]
+
+    def attribute(self, name: str, kind: str) -> bpy.types.NodeSocket:
+        """A named attribute."""
+        return self.out("GeometryNodeInputNamedAttribute", name, data_type=kind)
+
+    def parts(self, vector: bpy.types.NodeSocket) -> list[bpy.types.NodeSocket]:
+        """X, Y, Z."""
+        return list(self.node("ShaderNodeSeparateXYZ", vector).outputs)
+
+
+def _tree(cage: bpy.types.Object) -> bpy.types.NodeTree:
+    """Nodes that bring each vertex to the mean of where its faces are on `cage` now."""
+    tree = bpy.data.node_groups.new(f"{SOURCE} {cage.name}", "GeometryNodeTree")
+    tree.is_modifier = True
+    for direction in ("INPUT", "OUTPUT"):
+        tree.interface.new_socket("Geometry", in_out=direction, socket_type="NodeSocketGeometry")
+    build = _Builder(tree)
+    source = build.node("GeometryNodeObjectInfo", cage, transform_space="RELATIVE", name=SOURCE)
+    position, shape = build.out("GeometryNodeInputPosition"), source.outputs["Geometry"]
+
+    def place(index: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+        return build.out("GeometryNodeSampleIndex", shape, position, index, data_type="FLOAT_VECTOR", domain="POINT")
+
+    total = None
+    for i in range(FACES):
+        corners = [place(index) for index in build.parts(build.attribute(CORNERS.format(i), "FLOAT_VECTOR"))]
+        weights = build.parts(build.attribute(WEIGHTS.format(i), "FLOAT_VECTOR"))
+        edges = [build.vector("SUBTRACT", corner, corners[0]) for corner in corners[1:]]
+        cross = build.vector("CROSS_PRODUCT", *edges)
+        length = build.node("ShaderNodeVectorMath", cross, operation="LENGTH").outputs["Value"]
+        root = build.out("ShaderNodeMath", length, operation="SQRT")
+        height = build.out("ShaderNodeMath", build.attribute(HEIGHT.format(i), "FLOAT"), root, operation="MULTIPLY")
+        terms = [build.scaled(build.vector("NORMALIZE", cross), height), *map(build.scaled, corners, weights)]
+        for term in terms:
+            total = term if total is None else build.vector("ADD", total, term)
+    given, result = tree.nodes.new("NodeGroupInput"), tree.nodes.new("NodeGroupOutput")
+    moved = tree.nodes.new("GeometryNodeSetPosition")
+    tree.links.new(given.outputs[0], moved.inputs["Geometry"])
+    tree.links.new(total, moved.inputs["Position"])
+    tree.links.new(moved.outputs["Geometry"], result.inputs[0])
+    return tree
