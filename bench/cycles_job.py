@@ -21,34 +21,13 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "drgs_blender" / "evaluate"))
+from scene_job import add_mesh, evaluated_vertices, two_bones
+
 
 def reset() -> bpy.types.Scene:
     bpy.ops.wm.read_factory_settings(use_empty=True)
     return bpy.context.scene
-
-
-def add_mesh(data: dict[str, np.ndarray], smooth: bool) -> bpy.types.Object:
-    mesh = bpy.data.meshes.new("subject")
-    mesh.from_pydata(data["vertices"], [], data["faces"], shade_flat=not smooth)
-    n = len(mesh.vertices)
-    rgba = np.ones((n, 4), np.float32)
-    rgba[:, :3] = data["albedo"]
-    mesh.attributes.new("albedo", "FLOAT_COLOR", "POINT").data.foreach_set("color", rgba.ravel())
-    for name in ("roughness", "metallic"):
-        mesh.attributes.new(name, "FLOAT", "POINT").data.foreach_set("value", np.ascontiguousarray(data[name]))
-    subject = bpy.data.objects.new("subject", mesh)
-    bpy.context.collection.objects.link(subject)
-    material = bpy.data.materials.new("subject")
-    material.use_nodes = True
-    nodes, links = material.node_tree.nodes, material.node_tree.links
-    principled = nodes["Principled BSDF"]
-    principled.distribution = "GGX"
-    for name, socket in (("albedo", "Base Color"), ("roughness", "Roughness"), ("metallic", "Metallic")):
-        node = nodes.new("ShaderNodeAttribute")
-        node.attribute_name = name
-        links.new(node.outputs["Color" if name == "albedo" else "Fac"], principled.inputs[socket])
-    mesh.materials.append(material)
-    return subject
 
 
 def add_world(scene: bpy.types.Scene, path: str, rotation_z: float, strength: float) -> None:
@@ -82,41 +61,16 @@ def deform(subject: bpy.types.Object) -> None:
     """Bend the upper half by 40 degrees with two bones and swell one side with a shape key."""
     points = np.array([v.co for v in subject.data.vertices])
     low, high = points.min(0), points.max(0)
-    middle, height = (low + high) / 2, float(high[2] - low[2])
+    middle = (low + high) / 2
     subject.shape_key_add(name="Basis")
     swell = subject.shape_key_add(name="swell")
     bulge = 0.12 * np.exp(-(((points - middle) / (high - low).max() * 4) ** 2).sum(1))[:, None]
     moved = points + bulge * (points - middle)
     swell.data.foreach_set("co", moved.astype(np.float32).ravel())
     swell.value = 1.0
-    armature = bpy.data.armatures.new("rig")
-    rig = bpy.data.objects.new("rig", armature)
-    bpy.context.collection.objects.link(rig)
-    bpy.context.view_layer.objects.active = rig
-    bpy.ops.object.mode_set(mode="EDIT")
-    lower, upper = armature.edit_bones.new("lower"), armature.edit_bones.new("upper")
-    lower.head, lower.tail = (middle[0], middle[1], low[2]), tuple(middle)
-    upper.head, upper.tail = tuple(middle), (middle[0], middle[1], high[2])
-    upper.parent = lower
-    bpy.ops.object.mode_set(mode="OBJECT")
-    blend = np.clip((points[:, 2] - middle[2]) / (0.5 * height) + 0.5, 0, 1)
-    blend = blend * blend * (3 - 2 * blend)
-    for name, weights in (("lower", 1 - blend), ("upper", blend)):
-        group = subject.vertex_groups.new(name=name)
-        for i, w in enumerate(weights):
-            group.add([i], float(w), "REPLACE")
-    subject.modifiers.new("rig", "ARMATURE").object = rig
-    bone = rig.pose.bones["upper"]
-    bone.rotation_mode = "XYZ"
+    bone = two_bones(subject, 0.5)
     bone.rotation_euler = (math.radians(25), 0, math.radians(20))
     bpy.context.view_layer.update()
-
-
-def evaluated_vertices(subject: bpy.types.Object) -> np.ndarray:
-    mesh = subject.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
-    out = np.empty(len(mesh.vertices) * 3, np.float32)
-    mesh.attributes["position"].data.foreach_get("vector", out)
-    return out.reshape(-1, 3)
 
 
 def render(scene: bpy.types.Scene, job: dict) -> tuple[np.ndarray, float]:

@@ -13,6 +13,7 @@ import json
 import math
 import os
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,12 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
+#: Material attribute -> socket of Principled, output of the attribute's node, kind of AOV.
+CHANNELS = {
+    "albedo": ("Base Color", "Color", "COLOR"),
+    "roughness": ("Roughness", "Fac", "VALUE"),
+    "metallic": ("Metallic", "Fac", "VALUE"),
+}
 #: Bend of the upper bone about X and Z, degrees, and how far the shape key pushes the middle out.
 BEND, SWELL = (25.0, 0.0, 20.0), 0.15
 
@@ -39,6 +46,7 @@ def main() -> None:
     scene = bpy.context.scene
     with np.load(job["mesh"]) as data:
         subject = add_mesh({name: data[name] for name in data.files})
+    show_materials(subject)
     set_up(scene, job)
     camera = add_camera(scene, job)
     pose = deform(subject)
@@ -59,10 +67,10 @@ def main() -> None:
         say.write(f"{word} done {render['index']}\n")
 
 
-def add_mesh(data: dict[str, np.ndarray]) -> bpy.types.Object:
-    """The object, smooth, with a Principled material that reads its attributes and shows them as AOVs."""
+def add_mesh(data: Mapping[str, np.ndarray], smooth: bool = True) -> bpy.types.Object:
+    """The object, with a Principled material that reads its attributes."""
     mesh = bpy.data.meshes.new("subject")
-    mesh.from_pydata(data["vertices"], [], data["faces"], shade_flat=False)
+    mesh.from_pydata(data["vertices"], [], data["faces"], shade_flat=not smooth)
     rgba = np.ones((len(mesh.vertices), 4), np.float32)
     rgba[:, :3] = data["albedo"]
     mesh.attributes.new("albedo", "FLOAT_COLOR", "POINT").data.foreach_set("color", rgba.ravel())
@@ -76,18 +84,23 @@ def add_mesh(data: dict[str, np.ndarray]) -> bpy.types.Object:
     nodes, links = material.node_tree.nodes, material.node_tree.links
     principled = next(node for node in nodes if node.type == "BSDF_PRINCIPLED")
     principled.distribution = "GGX"
-    layer = bpy.context.view_layer
-    for name, socket in (("albedo", "Base Color"), ("roughness", "Roughness"), ("metallic", "Metallic")):
-        attribute, output = nodes.new("ShaderNodeAttribute"), nodes.new("ShaderNodeOutputAOV")
-        attribute.attribute_name = name
-        source = attribute.outputs["Color" if name == "albedo" else "Fac"]
-        links.new(source, principled.inputs[socket])
-        links.new(source, output.inputs["Color" if name == "albedo" else "Value"])
-        aov = layer.aovs.add()
-        aov.name, aov.type = name, "COLOR" if name == "albedo" else "VALUE"
-        output.aov_name = name
+    for name, (socket, output, _) in CHANNELS.items():
+        attribute = nodes.new("ShaderNodeAttribute")
+        attribute.name = attribute.attribute_name = name
+        links.new(attribute.outputs[output], principled.inputs[socket])
     mesh.materials.append(material)
     return subject
+
+
+def show_materials(subject: bpy.types.Object) -> None:
+    """The attributes as AOVs of the view layer."""
+    tree, layer = subject.active_material.node_tree, bpy.context.view_layer
+    for name, (_, output, kind) in CHANNELS.items():
+        node = tree.nodes.new("ShaderNodeOutputAOV")
+        tree.links.new(tree.nodes[name].outputs[output], node.inputs[kind.capitalize()])
+        aov = layer.aovs.add()
+        aov.name, aov.type = name, kind
+        node.aov_name = name
 
 
 def set_up(scene: bpy.types.Scene, job: dict[str, Any]) -> None:
@@ -145,11 +158,31 @@ def deform(subject: bpy.types.Object) -> Any:
     """Rig the object; returns a function that poses it, or puts it at rest."""
     points = np.array([vertex.co for vertex in subject.data.vertices])
     low, high = points.min(axis=0), points.max(axis=0)
-    middle, height = (low + high) / 2, float(high[2] - low[2])
+    middle = (low + high) / 2
     subject.shape_key_add(name="Basis")
     swell = subject.shape_key_add(name="swell")
     bump = np.exp(-(((points - middle) / (0.35 * (high - low).max())) ** 2).sum(axis=1))
     swell.data.foreach_set("co", (points + SWELL * bump[:, None] * (points - middle)).astype(np.float32).ravel())
+    bone = two_bones(subject, 0.6)
+
+    def pose(on: bool) -> None:
+        swell.value = 1.0 if on else 0.0
+        bone.rotation_euler = [math.radians(angle) if on else 0.0 for angle in BEND]
+        bpy.context.view_layer.update()
+
+    return pose
+
+
+def two_bones(subject: bpy.types.Object, soft: float) -> bpy.types.PoseBone:
+    """Rig the object with two bones that meet in its middle; returns the upper one.
+
+    Parameters
+    ----------
+    soft : part of the height within which the weights go over from one bone to the other
+    """
+    points = np.array([vertex.co for vertex in subject.data.vertices])
+    low, high = points.min(axis=0), points.max(axis=0)
+    middle, height = (low + high) / 2, float(high[2] - low[2])
     armature = bpy.data.armatures.new("rig")
     rig = bpy.data.objects.new("rig", armature)
     bpy.context.collection.objects.link(rig)
@@ -160,7 +193,7 @@ def deform(subject: bpy.types.Object) -> Any:
     upper.head, upper.tail = tuple(middle), (middle[0], middle[1], high[2])
     upper.parent = lower
     bpy.ops.object.mode_set(mode="OBJECT")
-    part = np.clip((points[:, 2] - middle[2]) / (0.6 * height) + 0.5, 0, 1)
+    part = np.clip((points[:, 2] - middle[2]) / (soft * height) + 0.5, 0, 1)
     part = part * part * (3 - 2 * part)
     for name, weights in (("lower", 1 - part), ("upper", part)):
         group = subject.vertex_groups.new(name=name)
@@ -169,13 +202,7 @@ def deform(subject: bpy.types.Object) -> Any:
     subject.modifiers.new("rig", "ARMATURE").object = rig
     bone = rig.pose.bones["upper"]
     bone.rotation_mode = "XYZ"
-
-    def pose(on: bool) -> None:
-        swell.value = 1.0 if on else 0.0
-        bone.rotation_euler = [math.radians(angle) if on else 0.0 for angle in BEND]
-        bpy.context.view_layer.update()
-
-    return pose
+    return bone
 
 
 def evaluated_vertices(subject: bpy.types.Object) -> np.ndarray:
