@@ -11,7 +11,8 @@ from ..arrays import Array
 from ..jit import njit, prange
 
 _BETA1, _BETA2, _EPSILON = 0.9, 0.99, 1e-15
-_BLOCK = 4096
+#: Rows that a thread takes at a time, and numbers below which waking threads takes longer than the step.
+_BLOCK, _FEW = 1024, 200_000
 
 
 class Adam:
@@ -40,14 +41,16 @@ class Adam:
         for name, value in parameters.items():
             if value.grad is None:
                 continue
-            flat = value.detach().numpy().reshape(-1)
-            width = value.numel() // max(len(value), 1)
-            rate = np.broadcast_to(np.asarray(rates[name], np.float32), (max(width, 1),))
-            gradient = np.ascontiguousarray(value.grad.numpy(), np.float32).reshape(-1)
-            _step(
-                flat, gradient, self.first[name].reshape(-1), self.second[name].reshape(-1),
-                np.ascontiguousarray(rate * np.float32(correction)),
-            )  # fmt: skip
+            width = max(value.numel() // max(len(value), 1), 1)
+            rate = np.broadcast_to(np.asarray(rates[name], np.float32), (width,))
+            rows = [
+                a.reshape(-1, width) for a in (
+                    value.detach().numpy(), np.ascontiguousarray(value.grad.numpy(), np.float32), self.first[name],
+                    self.second[name],
+                )
+            ]  # fmt: skip
+            step = _step if value.numel() < _FEW else _step_by_all
+            step(*rows, np.ascontiguousarray(rate * np.float32(correction)))
             value.grad = None
 
     def take(self, rows: Array) -> None:
@@ -59,17 +62,29 @@ class Adam:
                 moments[name] = np.ascontiguousarray(kept)
 
 
-@njit(parallel=True)
-def _step(value: Any, gradient: Any, first: Any, second: Any, rate: Any) -> None:
-    width = len(rate)
+@njit
+def _some(value: Any, gradient: Any, first: Any, second: Any, rate: Any, begin: Any, end: Any) -> None:
+    """The rows from `begin` to `end`. No branch: vector code."""
     b1, b2, epsilon = np.float32(_BETA1), np.float32(_BETA2), np.float32(_EPSILON)
     one = np.float32(1.0)
+    for i in range(begin, end):
+        for k in range(value.shape[1]):
+            g = gradient[i, k]
+            m, v = b1 * first[i, k] + (one - b1) * g, b2 * second[i, k] + (one - b2) * g * g
+            # Else a surfel seen from within itself: its other views know better.
+            known = abs(g) < np.float32(np.inf)
+            first[i, k] = m if known else first[i, k]
+            second[i, k] = v if known else second[i, k]
+            after = value[i, k] - rate[k] * m / (np.sqrt(v) + epsilon)
+            value[i, k] = after if known else value[i, k]
+
+
+@njit
+def _step(value: Any, gradient: Any, first: Any, second: Any, rate: Any) -> None:
+    _some(value, gradient, first, second, rate, 0, len(value))
+
+
+@njit(parallel=True)
+def _step_by_all(value: Any, gradient: Any, first: Any, second: Any, rate: Any) -> None:
     for block in prange((len(value) + _BLOCK - 1) // _BLOCK):
-        for i in range(block * _BLOCK, min(len(value), (block + 1) * _BLOCK)):
-            g = gradient[i]
-            if not abs(g) < np.float32(np.inf):
-                continue  # a surfel seen from within itself: its other views know better
-            m = b1 * first[i] + (one - b1) * g
-            v = b2 * second[i] + (one - b2) * g * g
-            first[i], second[i] = m, v
-            value[i] -= rate[i % width] * m / (np.sqrt(v) + epsilon)
+        _some(value, gradient, first, second, rate, block * _BLOCK, min((block + 1) * _BLOCK, len(value)))

@@ -64,7 +64,7 @@ def _part(gaussians: Gaussians, first: Array, second: Array) -> None:
         scale = gaussians.parameters["scale"]
         rows = torch.from_numpy(first)
         along_u = scale[rows, 0] >= scale[rows, 1]
-        step = APART * torch.where(along_u[:, None], u[rows], v[rows])
+        step = APART * torch.where(along_u[:, None], torch.from_numpy(u)[rows], torch.from_numpy(v)[rows])
         long = torch.where(along_u, 0, 1)
         for half, sign in ((rows, 1.0), (torch.from_numpy(second), -1.0)):
             gaussians.parameters["centre"][half] += sign * step

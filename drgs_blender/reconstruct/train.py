@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,6 +25,7 @@ from .gaussians import Gaussians, Look
 from .hull import Region, colours_of
 from .photometric import difference
 from .raster import Tally
+from .shape import shape_loss
 from .targets import Target, background_of, targets
 
 log = logging.getLogger(__name__)
@@ -121,6 +124,13 @@ class Training:
     def step(self) -> None:
         """One view."""
         started = time.monotonic()
+        with _one_thread():
+            self._learn()
+        self.iteration += 1
+        self._maybe_densify()
+        self.seconds += time.monotonic() - started
+
+    def _learn(self) -> None:
         schedule, part = self.schedule, self.part
         target = self._next()
         bands = min(schedule.bands, int(part * 8))
@@ -136,9 +146,6 @@ class Training:
         drawn = np.clip(look.colour.detach().numpy(), 0, 1)
         squared = float(np.square(drawn - target.photograph.colour).mean())
         self.error = squared if not self.iteration else 0.98 * self.error + 0.02 * squared
-        self.iteration += 1
-        self._maybe_densify()
-        self.seconds += time.monotonic() - started
 
     @property
     def psnr(self) -> float:
@@ -153,16 +160,16 @@ class Training:
         return views[np.random.default_rng([self.schedule.seed, turn]).permutation(len(views))[place]]
 
     def _loss(self, look: Look, target: Target, part: float) -> Tensor:
-        schedule = self.schedule
-        loss = difference(look.colour, target.photograph)
-        if target.mask is not None:
-            loss = loss + schedule.mask * (look.maps.alpha - target.mask).abs().mean()
-        if part >= schedule.shape:
-            if schedule.distortion:
-                loss = loss + schedule.distortion / self.region.radius**2 * look.maps.distortion.mean()
-            if schedule.consistency:
-                loss = loss + schedule.consistency * normal_disagreement(look, target)
-        return loss
+        schedule, maps = self.schedule, look.maps
+        shaped = part >= schedule.shape
+        weights = (
+            schedule.mask,
+            schedule.distortion / self.region.radius**2 if shaped else 0.0,
+            schedule.consistency if shaped else 0.0,
+        )
+        mask = None if target.mask is None else target.mask.numpy()
+        shape = shape_loss(maps.alpha, maps.depth, maps.distortion, look.normal, mask, target.rays.numpy(), weights)
+        return difference(look.colour, target.photograph) + shape
 
     def _rates(self, part: float) -> dict[str, float | Array]:
         rates: dict[str, float | Array] = {k: first * rest**part for k, (first, rest) in RATES.items()}
@@ -225,6 +232,17 @@ def enough(views: list[Target]) -> int:
     return max(int(PER_PIXEL * np.mean(shown)), 1)
 
 
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Without torch's threads: what is left to it is so little that waking them takes longer."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
 def _first(capture: Capture, region: Region, schedule: Schedule) -> Gaussians:
     """Surfels on the first surface, no more than half of the schedule's."""
     points, normals, most = region.points, region.normals, max(schedule.surfels // 2, 1)
@@ -236,26 +254,3 @@ def _first(capture: Capture, region: Region, schedule: Schedule) -> Gaussians:
     return Gaussians.on_surface(
         points, normals, colours_of(points, normals, capture.training), 0.6 * spacing, schedule.bands
     )
-
-
-def depth_normals(depth: Tensor, eye: Tensor, rays: Tensor) -> Tensor:
-    """Normals (h - 2, w - 2, 3) of a depth map (h, w) by central differences, towards the viewer, not normalised.
-
-    Parameters
-    ----------
-    rays : (h, w, 3) of unit depth, from `eye` (3,)
-    """
-    points = eye + depth[..., None] * rays
-    across, down = points[1:-1, 2:] - points[1:-1, :-2], points[2:, 1:-1] - points[:-2, 1:-1]
-    return torch.linalg.cross(down, across)
-
-
-def normal_disagreement(look: Look, target: Target) -> Tensor:
-    """Mean over the picture of alpha (1 - cosine) between blended normals and those of the mean depth."""
-    alpha = look.maps.alpha
-    depth = look.maps.depth / alpha.clamp(min=1e-3)
-    eye = torch.as_tensor(np.asarray(target.camera.matrix_world)[:3, 3], dtype=torch.float32)
-    slope = torch.nn.functional.normalize(depth_normals(depth, eye, target.rays), dim=-1)
-    inner = alpha.detach()[1:-1, 1:-1]
-    covered = torch.where(inner > 0.5, inner, torch.zeros_like(inner))
-    return (covered - (slope * look.normal[1:-1, 1:-1]).sum(-1) * (covered > 0)).clamp(min=0).mean()

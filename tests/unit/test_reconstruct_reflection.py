@@ -7,7 +7,15 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from drgs_blender.reconstruct.reflection import LEVELS, dark_cube, pyramid, reflected  # noqa: E402
+from drgs_blender.reconstruct.reflection import BARE, LEVELS, dark_cube, mirrored, pyramid  # noqa: E402
+
+
+def reflected(normal, rays, blur, texels, tint=1.0, alpha=1.0):
+    """The light of a row of pixels with these blended normals (p, 3)."""
+    n = len(normal)
+    cover = torch.full((1, n), alpha) if isinstance(alpha, float) else alpha[None]
+    features = torch.cat([torch.zeros(n, 3), normal, torch.full((n, 3), tint), (blur * cover[0])[:, None]], 1)
+    return mirrored(features[None], cover, np.ascontiguousarray(rays.numpy())[None], texels)[0]
 
 
 def test_an_even_light_is_seen_evenly_from_everywhere():
@@ -52,3 +60,28 @@ def test_gradients_are_those_of_differences():
         shift = torch.tensor(rng.normal(size=cube.shape), dtype=torch.float32)
         change = value(normal, blur, cube + 1e-3 * shift).sum() - value(normal, blur, cube - 1e-3 * shift).sum()
         assert float(change / 2e-3) == pytest.approx(float((cube.grad * shift).sum()), rel=1e-2)
+
+
+def test_gradients_of_tint_and_coverage():
+    rng = np.random.default_rng(2)
+    cube = dark_cube(0.1)
+    cube[4] = 0.0
+    features = torch.tensor(rng.uniform(0.2, 0.8, (6, 5, 10)), dtype=torch.float32)
+    alpha = torch.tensor(rng.uniform(0.8, 1, (6, 5)), dtype=torch.float32)
+    rays = np.broadcast_to(np.float32([0.1, -0.2, -1]), (6, 5, 3)).copy()
+    pull = torch.tensor(rng.normal(size=(6, 5, 3)), dtype=torch.float32)
+    value = lambda f, a: (mirrored(f, a, rays, pyramid(cube)) * pull).sum()  # noqa: E731
+    f, a = features.clone().requires_grad_(), alpha.clone().requires_grad_()
+    value(f, a).backward()
+    seen = mirrored(features, alpha, rays, pyramid(cube)) / features[..., 6:9]
+    torch.testing.assert_close(f.grad[..., 6:9], seen * pull)
+    # What is blurred is the blend over the coverage: both times two is the same.
+    torch.testing.assert_close((f.grad[..., 9] * f[..., 9]).detach(), -(a.grad * alpha), rtol=1e-4, atol=1e-6)
+
+
+def test_pixels_hardly_covered_mirror_nothing():
+    n = torch.tensor([[0.0, 0, 1]] * 2)
+    cover = torch.tensor([0.9 * float(BARE), 1.1 * float(BARE)])
+    seen = reflected(n, -n, torch.zeros(2), pyramid(dark_cube(0.3)), alpha=cover)
+    assert not seen[0].any()
+    assert torch.allclose(seen[1], torch.tensor(0.3))
