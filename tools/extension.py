@@ -1,5 +1,7 @@
 """Build the Blender extension's zip and check what Blender's own validator lets through.
 
+With it goes ``dist/index.json``: the folder, on any web server, is a repository for Preferences > Get Extensions.
+
     python tools/extension.py [--out dist/drgs-0.1.0.zip]
 
 Pure standard library; the archive is the same bytes for the same sources.
@@ -8,6 +10,8 @@ Pure standard library; the archive is the same bytes for the same sources.
 from __future__ import annotations
 
 import argparse
+import hashlib
+import json
 import re
 import sys
 import tomllib
@@ -48,6 +52,11 @@ TAGS = {
     *("Tracking", "User Interface", "UV"),
 }
 PLATFORMS = {"windows-x64", "windows-arm64", "macos-x64", "macos-arm64", "linux-x64"}
+#: What Blender's index of a repository takes from a manifest.
+LISTED = (
+    *("schema_version", "id", "name", "tagline", "version", "type", "maintainer", "license", "blender_version_min"),
+    *("blender_version_max", "website", "permissions", "tags", "platforms"),
+)
 PERMISSIONS = {"files", "network", "clipboard", "camera", "microphone"}
 
 
@@ -122,12 +131,35 @@ def build(out: Path | None = None, root: Path = ROOT) -> Path:
     return out
 
 
+def write_index(archive: Path, root: Path = ROOT) -> Path:
+    """Write the index of a static repository that holds `archive`, beside it; returns its path.
+
+    The same as ``blender --command extension server-generate`` makes.
+    """
+    manifest = tomllib.loads((root / "blender_manifest.toml").read_text(encoding="utf-8"))
+    data = archive.read_bytes()
+    entry = {key: manifest[key] for key in LISTED if key in manifest} | {
+        "archive_url": f"./{archive.name}",
+        "archive_size": len(data),
+        "archive_hash": f"sha256:{hashlib.sha256(data).hexdigest()}",
+    }
+    path = archive.with_name("index.json")
+    partial = path.with_name(path.name + ".part")
+    partial.write_text(json.dumps({"version": "v1", "blocklist": [], "data": [entry]}, indent=2), encoding="utf-8")
+    partial.replace(path)
+    return path
+
+
 def main() -> int:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, help="the zip to write (default: dist/drgs-VERSION.zip)")
     try:
-        print(build(parser.parse_args().out))
+        out = parser.parse_args().out
+        archive = build(out)
+        print(archive)
+        if out is None:  # another folder may have an index of its own
+            print(write_index(archive))
     except (OSError, ValueError) as error:
         print(f"extension.py: {error}", file=sys.stderr)
         return 1

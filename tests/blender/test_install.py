@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 import tomllib
@@ -54,6 +55,17 @@ def test_zip_is_reproducible_and_equals_what_blenders_builder_takes(tmp_path):
     (built,) = tmp_path.glob("drgs-*.zip")
     with zipfile.ZipFile(built) as archive:
         assert {n for n in archive.namelist() if not n.endswith("/")} == ours
+
+
+def test_the_index_is_that_of_blenders_own_repositories(tmp_path):
+    archive = extension.build(tmp_path / "drgs.zip")
+    ours = json.loads(extension.write_index(archive).read_text(encoding="utf-8"))
+    (tmp_path / "index.json").unlink()
+    (builder,) = Path(bpy.utils.resource_path("LOCAL")).glob("scripts/addons_core/bl_pkg/cli/blender_ext.py")
+    command = [sys.executable, str(builder), "server-generate", "--repo-dir", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert ours == json.loads((tmp_path / "index.json").read_text(encoding="utf-8"))
 
 
 def test_no_absolute_import_of_the_engine_package():
