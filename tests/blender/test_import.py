@@ -81,6 +81,31 @@ def test_anchor_survives_saving_duplicating_and_appending(ball, tmp_path):
     assert Path(bpy.path.abspath(target.objects[0].drgs.path)) == tmp_path / "assets" / "ball.drgs"
 
 
+@pytest.mark.parametrize("kind", ["append", "link", "pack"])
+def test_the_asset_browser_brings_the_file_along(ball, ball_file, export, tmp_path, kind):
+    """As it is dragged from there, in a file that is saved elsewhere and opened again."""
+    if kind == "pack" and bpy.app.version < (5, 0, 0):
+        pytest.skip("linked data is packed from Blender 5.0 on")
+    bpy.ops.drgs.mark_assets()
+    library, shot = tmp_path / "library" / "ball.blend", tmp_path / "shots" / "one" / "shot.blend"
+    for path in (library, shot):
+        path.parent.mkdir(parents=True)
+    bpy.ops.wm.save_as_mainfile(filepath=str(library))
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    options = {"link": kind != "append"} | ({"pack": True} if kind == "pack" else {})
+    with bpy.data.libraries.load(str(library), assets_only=True, **options) as (source, target):
+        target.objects = source.objects
+    camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
+    for obj in (*target.objects, camera):
+        bpy.context.scene.collection.objects.link(obj)
+    bpy.context.scene.camera = camera
+    for _ in range(2):
+        frame, warnings = export()
+        assert Path(frame.objects[0].asset).resolve() == ball_file.resolve() and not warnings
+        bpy.ops.wm.save_as_mainfile(filepath=str(shot))
+        bpy.ops.wm.open_mainfile(filepath=str(shot))
+
+
 def test_several_files_share_one_anchor_each(scene, tmp_path):
     names = [write_ball(tmp_path / f"{n}.drgs").name for n in ("one", "two")]
     files = [{"name": n} for n in names]
