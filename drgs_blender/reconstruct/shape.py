@@ -21,7 +21,7 @@ _THIN, _COVERED = np.float32(1e-3), np.float32(0.5)
 
 def shape_loss(
     alpha: Tensor, depth: Tensor, distortion: Tensor, normal: Tensor, mask: Array | None, rays: Array,
-    weights: tuple[float, float, float],
+    counts: Array, weights: tuple[float, float, float],
 ) -> Tensor:  # fmt: skip
     """Weighted sum of the pictures' means; differentiable in the maps.
 
@@ -31,17 +31,18 @@ def shape_loss(
     normal : (h, w, 3) sum of weighted normals that face the viewer
     mask : (h, w) float32 in 0..1; None where nothing is known of it
     rays : (h, w, 3) float32, `targets.pixel_rays`
+    counts : (h, w) float32, how much the agreement of normals counts in each pixel
     weights : of |alpha - mask|, of the distortion, and of alpha (1 - cosine) between `normal` and that of the mean
         depth by central differences, where alpha is over one half; alpha itself is not a variable there
     """
-    return _Shape.apply(alpha, depth, distortion, normal, mask, rays, weights)
+    return _Shape.apply(alpha, depth, distortion, normal, mask, rays, counts, weights)
 
 
 class _Shape(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, alpha: Tensor, depth: Tensor, distortion: Tensor, normal: Tensor, mask: Array | None, rays: Array,
-        weights: tuple[float, float, float],
+        counts: Array, weights: tuple[float, float, float],
     ) -> Tensor:  # fmt: skip
         a, z, n = (np.ascontiguousarray(t.detach().numpy()) for t in (alpha, depth, normal))
         by_mask, by_distortion, by_normals = weights
@@ -56,7 +57,7 @@ class _Shape(torch.autograd.Function):
         if by_normals and min(a.shape) > 2:
             inner = (a.shape[0] - 2) * (a.shape[1] - 2)
             slopes, rows = np.zeros((2, *n.shape), np.float32), np.zeros(len(a))
-            _disagreement(a, z, n, rays, np.float32(by_normals / inner), slopes, to_normal, rows)
+            _disagreement(a, z, n, rays, counts, np.float32(by_normals / inner), slopes, to_normal, rows)
             _to_depth(a, z, rays, slopes, to_alpha, to_depth)
             loss += by_normals / inner * float(rows.sum())
         ctx.gradients = [to_alpha, to_depth, np.full_like(a, by_distortion / a.size), to_normal]
@@ -64,7 +65,7 @@ class _Shape(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Any, ...]:
-        return *(gradients[0] * torch.from_numpy(g) for g in ctx.gradients), None, None, None
+        return *(gradients[0] * torch.from_numpy(g) for g in ctx.gradients), None, None, None, None
 
 
 @njit(inline="always")
@@ -81,7 +82,7 @@ def _difference(alpha: Any, depth: Any, rays: Any, y1: Any, x1: Any, y0: Any, x0
 
 @njit(parallel=True)
 def _disagreement(
-    alpha: Any, depth: Any, normal: Any, rays: Any, weight: Any, slopes: Any, to_normal: Any, rows: Any
+    alpha: Any, depth: Any, normal: Any, rays: Any, counts: Any, most: Any, slopes: Any, to_normal: Any, rows: Any
 ) -> None:
     """Sums of the rows, gradients of the normals, and of the two differences of each pixel (2, h, w, 3)."""
     height, width = alpha.shape
@@ -100,7 +101,8 @@ def _disagreement(
             cosine = cx * nx + cy * ny + cz * nz
             if not covered - cosine > 0:
                 continue
-            total += covered - cosine
+            total += counts[y, x] * (covered - cosine)
+            weight = most * counts[y, x]
             to_normal[y, x, 0], to_normal[y, x, 1], to_normal[y, x, 2] = -weight * cx, -weight * cy, -weight * cz
             scale = -weight * r
             gx, gy, gz = scale * (nx - cosine * cx), scale * (ny - cosine * cy), scale * (nz - cosine * cz)
