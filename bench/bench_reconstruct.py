@@ -154,7 +154,7 @@ def surfels(options: argparse.Namespace, part: str = "surfels") -> None:
     """Stage (i) within the minutes."""
     capture = read_capture(options.capture, options.size, 8)
     warm(capture)
-    schedule = Schedule(iterations=options.iterations or 6000)
+    schedule = Schedule(iterations=options.iterations or 6000, surfels=options.surfels)
     training, row = trained(capture, schedule, 60 * options.minutes if options.minutes else None)
     if (options.capture / "mesh.npz").exists():
         row |= against_truth(training.gaussians, training, capture, options.capture)
@@ -246,6 +246,7 @@ def main() -> None:
     parser.add_argument("--capture", type=Path)
     parser.add_argument("--size", type=int, default=200)
     parser.add_argument("--minutes", type=float, default=2.0, help="of stage (i); 0: the steps alone decide")
+    parser.add_argument("--surfels", type=int, default=Schedule().surfels, help="at most")
     parser.add_argument("--iterations", type=int)
     parser.add_argument("--only", nargs="+", choices=tuple(ABLATIONS))
     options = parser.parse_args()

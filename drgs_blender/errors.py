@@ -39,14 +39,16 @@ class DrgsError(Exception):
     problem : str
         What is wrong with it.
     remedy : str
-        What the user can do.
+        What the user can do; None is what helps against most errors of the class.
     """
 
     exit_code = EXIT_INTERNAL
+    usual_remedy = ""
 
-    def __init__(self, subject: str, problem: str, remedy: str = "") -> None:
-        self.subject, self.problem, self.remedy = subject, problem, remedy
-        super().__init__(f"{subject}: {problem}." + (f" {remedy}." if remedy else ""))
+    def __init__(self, subject: str, problem: str, remedy: str | None = None) -> None:
+        self.subject, self.problem = subject, problem
+        self.remedy = self.usual_remedy if remedy is None else remedy
+        super().__init__(f"{subject}: {problem}." + (f" {self.remedy}." if self.remedy else ""))
 
     def __reduce__(self) -> tuple[type, tuple[str, str, str]]:
         return type(self), (self.subject, self.problem, self.remedy)
@@ -62,6 +64,7 @@ class AssetError(DrgsError):
     """A file (asset, mesh, surfels, environment) that is damaged, incomplete or does not fit."""
 
     exit_code = EXIT_BAD_ASSET
+    usual_remedy = "What wrote it is at fault or did not finish: make or export it again"
 
 
 class DeviceError(DrgsError):

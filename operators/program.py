@@ -144,7 +144,7 @@ class ProgramOperator(DrgsOperator):
             if self._process.returncode:
                 said = [line for line in lines if line.startswith("drgs: ")] or lines
                 reason = said[-1].removeprefix("drgs: ") if said else f"exit code {self._process.returncode}"
-                raise AssetError(self._subject, f"{self._failure}: {reason.rstrip('.')}")
+                raise AssetError(self._subject, f"{self._failure}: {reason.rstrip('.')}", "")
             for line in lines:
                 messages.note("INFO", line)
             return self.done(context)

@@ -47,9 +47,9 @@ def read_camera(path: str | Path) -> Camera:
     except OSError as error:
         raise UsageError(subject, f"cannot be read ({error.strerror})", "Check the path") from error
     except (ValueError, RecursionError) as error:
-        raise UsageError(subject, f"is not JSON ({error})") from error
+        raise UsageError(subject, f"is not JSON ({error})", "Choose a JSON file of a camera") from error
     if not isinstance(data, dict):
-        raise UsageError(subject, "is not a JSON object")
+        raise UsageError(subject, "is not a JSON object", "Choose a JSON file of a camera")
     if unknown := sorted(set(data) - _KEYS):
         raise UsageError(subject, f"has unknown keys {', '.join(unknown)}", f"The keys are {', '.join(sorted(_KEYS))}")
     return _Reader(subject, data).camera()

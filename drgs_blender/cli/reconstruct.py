@@ -106,7 +106,8 @@ def run(args: argparse.Namespace) -> int:
     shutil.rmtree(work, ignore_errors=True)
     report = asset.provenance["report"]
     if "psnr" in report:
-        print(f"  views left out: PSNR {report['psnr']:.2f} dB, SSIM {report['ssim']:.4f}")
+        # Not what `drgs evaluate` says, which renders the asset under the light that was found.
+        print(f"  colours as photographed, views left out: PSNR {report['psnr']:.2f} dB, SSIM {report['ssim']:.4f}")
     return 0
 
 

@@ -158,7 +158,7 @@ def read_gaussian_ply(path: Path) -> SurfelFile:
     Raises
     ------
     AssetError
-        The file is damaged, lacks properties its layout needs, or is of a kind that cannot be decoded (Mani-GS).
+        The file is damaged, lacks properties its layout needs, or is of a kind that cannot be decoded.
     """
     header, elements = read_ply(path)
     return decode_splats(header, elements.get("vertex"), str(path))

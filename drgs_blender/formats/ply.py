@@ -1,6 +1,6 @@
 """The PLY format: any element, any property, in all three encodings, without trusting a single number.
 
-Elements of fixed size are read by mapping the file; lists are walked by a small compiled loop. Every count is checked
+Elements of fixed size are read at once, lists are walked by a small compiled loop. Every count is checked
 against the bytes that are there before anything is allocated (G. Turk, "The PLY Polygon File Format", 1994).
 """
 
