@@ -26,10 +26,7 @@ _NEUTRAL = ((1.0, 1.0, 1.0), 0.0, 1.0, 1.0, *(2 * (1.0, 0.0, 0.0, 1.0)))
 def _masks(settings: DrgsAdjustment, context: bpy.types.Context, typed: str) -> Iterable[str]:
     """Names that the mask may have."""
     obj = settings.id_data
-    if obj.type != "MESH":
-        return []
-    attributes = (a.name for a in obj.data.attributes if mesh_arrays.is_mask(a) and not a.name.startswith("."))
-    return [name for name in (*(g.name for g in obj.vertex_groups), *attributes) if typed.lower() in name.lower()]
+    return mesh_arrays.mask_names(obj, typed) if obj.type == "MESH" else []
 
 
 def _tell(settings: DrgsAdjustment, context: bpy.types.Context) -> None:

@@ -97,13 +97,24 @@ def read_channel(mesh: bpy.types.Mesh, channel: str) -> Array | None:
         for i in range(3):  # several times faster than all at once
             values[:, i] = colours[:, i]
         if width == 1:
-            values = values.mean(axis=1)
+            values = _brightness(values)
     return np.clip(values, 0, 1, out=values)
+
+
+def _brightness(colours: Array) -> Array:
+    """(n,) float32 means of red, green and blue; of a grey its very number, so that what nobody painted stays."""
+    return colours.mean(axis=1, dtype=np.float64).astype(np.float32)
 
 
 def is_mask(attribute: bpy.types.Attribute) -> bool:
     """Whether an attribute has a number for each vertex that says how much of something it gets."""
     return attribute.domain == "POINT" and attribute.data_type in (*MASKS, *COLOURS)
+
+
+def mask_names(obj: bpy.types.Object, typed: str) -> list[str]:
+    """What `read_mask` can read of a mesh object and has `typed` in its name."""
+    attributes = (a.name for a in obj.data.attributes if is_mask(a) and not a.name.startswith("."))
+    return [name for name in (*(g.name for g in obj.vertex_groups), *attributes) if typed.lower() in name.lower()]
 
 
 def read_mask(obj: bpy.types.Object, mesh: bpy.types.Mesh, name: str) -> Array | None:
@@ -119,7 +130,7 @@ def read_mask(obj: bpy.types.Object, mesh: bpy.types.Mesh, name: str) -> Array |
     if attribute.data_type in COLOURS:
         colours = np.empty(len(mesh.vertices) * 4, np.float32)
         attribute.data.foreach_get("color", colours)
-        return colours.reshape(-1, 4)[:, :3].mean(axis=1)
+        return _brightness(colours.reshape(-1, 4)[:, :3])
     values = np.empty(len(mesh.vertices), MASKS[attribute.data_type])
     attribute.data.foreach_get("value", values)
     return values.astype(np.float32)

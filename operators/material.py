@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import bpy
 import numpy as np
-from bpy.props import BoolProperty, EnumProperty, FloatProperty
+from bpy.props import BoolProperty, EnumProperty, FloatProperty, StringProperty
 
 from ..addon import assets, mesh_arrays
 from ..drgs_blender.asset import MATERIAL_CHANNELS
@@ -58,8 +58,13 @@ PRESETS = {
 }
 
 
+def _masks(operator: DRGS_OT_set_material, context: bpy.types.Context, typed: str) -> Iterable[str]:
+    """Names that the mask may have, of all selected objects."""
+    return dict.fromkeys(name for o in targets.selected(context) for name in mesh_arrays.mask_names(o, typed))
+
+
 class DRGS_OT_set_material(DrgsOperator, targets.ObjectMode, bpy.types.Operator):
-    """Give the selected DR-GS objects, or the parts that their active vertex groups weight, another material"""
+    """Give the selected DR-GS objects, or the parts that a mask says, another material"""
 
     bl_idname = "drgs.set_material"
     bl_label = "Set Material"
@@ -79,18 +84,41 @@ class DRGS_OT_set_material(DrgsOperator, targets.ObjectMode, bpy.types.Operator)
         max=1.0,
         default=1.0,
     )
-    use_group: BoolProperty(
-        name="Active Vertex Group", description="Only where the active vertex group has weight", default=False
+    mask: StringProperty(
+        name="Mask",
+        description="Vertex group or point attribute that says where, and how much of it; empty is everywhere",
+        search=_masks,
+        options={"SKIP_SAVE"},
     )
+    use_invert: BoolProperty(name="Invert", description="Where the mask is not", default=False, options={"SKIP_SAVE"})
 
     def run(self, context: bpy.types.Context) -> set[str]:
-        for obj in targets.editable(targets.selected(context), data=True):
-            weight = np.full(len(obj.data.vertices), self.factor, np.float32)
-            if self.use_group:
-                active = obj.vertex_groups.active
-                weight *= 0 if active is None else mesh_arrays.group_weights(obj.data, active.index)
+        objects = targets.editable(targets.selected(context), data=True)
+        weights = [self.weight(obj) for obj in objects]  # all of them first: an error leaves every object as it was
+        for obj, weight in zip(objects, weights, strict=True):
             set_material(obj, PRESETS[self.preset], weight)
         return {"FINISHED"}
+
+    def weight(self, obj: bpy.types.Object) -> Array:
+        """(n,) float32 in [0, 1]: how much of the material each vertex of `obj` gets.
+
+        Raises
+        ------
+        UsageError
+            It has no such mask; names the object.
+        """
+        weight = np.full(len(obj.data.vertices), self.factor, np.float32)
+        if self.mask:
+            mask = mesh_arrays.read_mask(obj, obj.data, self.mask)
+            if mask is None:
+                raise UsageError(
+                    f'Object "{obj.name}"',
+                    f'has no vertex group or number of points "{self.mask}"',
+                    "Choose another mask",
+                )
+            mask = np.clip(np.nan_to_num(mask), 0, 1)
+            weight *= 1 - mask if self.use_invert else mask
+        return weight
 
 
 class DRGS_OT_restore_material(DrgsOperator, targets.ObjectMode, bpy.types.Operator):

@@ -28,17 +28,38 @@ def test_gold_is_what_the_engine_gets_and_the_captured_comes_back(ball, export):
     assert state.albedo is None and state.metallic is None
 
 
-def test_factor_mixes_and_the_vertex_group_masks(ball):
+def test_factor_mixes_and_a_vertex_group_masks(ball):
     before = channels(ball)
     group = ball.vertex_groups.new(name="Top")
     group.add(list(range(10)), 0.5, "REPLACE")
-    bpy.ops.drgs.set_material(preset="CLAY", factor=0.5, use_group=True)
+    bpy.ops.drgs.set_material(preset="CLAY", factor=0.5, mask="Top")
     after = channels(ball)
     share = np.where(np.arange(len(ball.data.vertices)) < 10, 0.25, 0)
     np.testing.assert_allclose(after["roughness"], before["roughness"] * (1 - share) + 0.9 * share, atol=1e-6)
     np.testing.assert_allclose(
         after["albedo"], before["albedo"] * (1 - share[:, None]) + 0.5 * share[:, None], atol=1e-6
     )
+
+
+def test_an_attribute_masks_a_preset_and_what_is_outside_keeps_every_bit(ball):
+    """Numbers outside [0, 1] and those that are none are held to it; a name that nothing has changes nothing."""
+    before, count = channels(ball), len(ball.data.vertices)
+    numbers = np.linspace(-1, 2, count).astype(np.float32)
+    numbers[0] = np.nan
+    ball.data.attributes.new("wear", "FLOAT", "POINT").data.foreach_set("value", numbers)
+    with pytest.raises(RuntimeError, match=r'"ball".*"nobody"'):
+        bpy.ops.drgs.set_material(preset="GOLD", mask="nobody")
+    for name, values in channels(ball).items():
+        np.testing.assert_array_equal(values, before[name])
+    for invert in (False, True):
+        share = np.clip(np.nan_to_num(numbers), 0, 1)
+        share = 1 - share if invert else share
+        bpy.ops.drgs.set_material(preset="GOLD", mask="wear", use_invert=invert)
+        after = channels(ball)
+        np.testing.assert_allclose(after["metallic"], before["metallic"] * (1 - share) + share, atol=1e-6)
+        for name, values in after.items():
+            np.testing.assert_array_equal(values[share == 0], before[name][share == 0])
+        bpy.ops.drgs.restore_material()
 
 
 @pytest.mark.parametrize("preset", ["GOLD", "COPPER", "CHROME", "CLAY", "PLASTIC", "WET"])
@@ -90,13 +111,13 @@ def test_a_painted_channel_is_what_the_engine_gets(ball, export, channel):
     assert bpy.ops.drgs.paint(channel=channel) == {"FINISHED"}
     assert bpy.context.mode == "PAINT_VERTEX" and ball.data.attributes.active_color.name == channel
     for name, values in channels(ball).items():  # nothing has been painted yet
-        np.testing.assert_allclose(values, before[name], atol=1e-6)
-    ball.data.attributes[channel].data[0].color = (0.3, 0.3, 0.3, 1)
+        np.testing.assert_array_equal(values, before[name])
+    ball.data.attributes[channel].data[0].color = (0.25, 0.25, 0.25, 1)
     bpy.ops.object.mode_set(mode="OBJECT")
     ball.data.update_tag()
     painted = getattr(export()[0].objects[0], channel)
-    np.testing.assert_allclose(painted[0], 0.3, atol=1e-6)
-    np.testing.assert_allclose(painted[1:], before[channel][1:], atol=1e-6)
+    np.testing.assert_allclose(painted[0], 0.25, atol=1e-6)
+    np.testing.assert_array_equal(painted[1:], before[channel][1:])
     bpy.ops.drgs.restore_material()
     np.testing.assert_array_equal(channels(ball)[channel], before[channel])
 
