@@ -10,7 +10,9 @@ from report import OUT, ROOT
 
 from drgs_blender.asset import Asset, Mesh
 from drgs_blender.asset.container import read_asset, write_asset
-from drgs_blender.build.make import make_asset
+from drgs_blender.build.make import make_asset, read_mesh_file
+from drgs_blender.formats.files import Image, MaterialFile
+from drgs_blender.formats.images import load_image
 from drgs_blender.jit import source_digest
 
 SOURCES = {
@@ -28,6 +30,20 @@ def asset_path(name: str, **options: Any) -> Path:
         path.parent.mkdir(parents=True, exist_ok=True)
         file, defaults = SOURCES[name]
         write_asset(path, make_asset(ROOT / "examples" / file, **defaults, **options))
+    return path
+
+
+def textured_spot() -> Path:
+    """`.drgs` of spot with its spots: the file of the example names no texture."""
+    path = OUT / source_digest() / "spot-textured.drgs"
+    if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file, options = SOURCES["spot"]
+        source = read_mesh_file(ROOT / "examples" / file)
+        image = Image(load_image(ROOT / "examples" / "spot" / "spot_texture.png"), srgb=True)
+        source.materials = [MaterialFile("Spot", (1.0, 1.0, 1.0), base_colour_image=image)]
+        source.face_material = np.zeros(len(source.faces), np.int32)
+        write_asset(path, make_asset(source, **options))
     return path
 
 
