@@ -122,7 +122,7 @@ def ablation(options: argparse.Namespace) -> str:
     draw(pictures)
     return (
         f"{options.ablation_size}x{options.ablation_size}, {options.ablation_rays} rays, mesh as primary surface, "
-        f"{BOUNCES} indirect bounces in full. One object: cat, roughness 0.1, metallic 1, studio.exr; composed: "
+        f"{BOUNCES} indirect bounces in full. One object: robot, roughness 0.1, metallic 1, forest.exr; composed: "
         "helmet, robot and a metallic spot on a glossy ground, sunset.exr. Without inter-reflection: no bounce, rays "
         "that meet something bring nothing. Without visibility: every point has the whole sky. Light and PSNR over "
         "what the objects cover.\n\n"
