@@ -62,14 +62,29 @@ def file_of(obj: bpy.types.Object) -> Path:
     volume = obj.original.drgs.asset
     if volume.packed_file:
         return _unpack(volume)
-    path = Path(bpy.path.abspath(volume.filepath, library=volume.library))
-    if not path.is_file():
+    path = _path(volume)
+    if not os.path.isfile(path):  # Path.is_file raises what names that are too long and closed folders give
         raise AssetError(
             f'Object "{obj.name}"',
             f"the asset {path} does not exist",
             "Choose File > External Data > Find Missing Files, or set the path in Object Data > DR-GS",
         )
     return path
+
+
+def check_unused(path: Path) -> None:
+    """Refuse to write to `path` where an object is made of that file.
+
+    Raises
+    ------
+    UsageError
+        Names the object.
+    """
+    for obj in filter(is_drgs, bpy.data.objects):
+        if _same(str(_path(obj.drgs.asset)), path):
+            raise UsageError(
+                f'Object "{obj.name}"', f"is made of {path}, which would be lost", "Choose another file name"
+            )
 
 
 def load(path: Path) -> Asset:
@@ -98,6 +113,11 @@ def _unpack(volume: bpy.types.Volume) -> Path:
         partial.write_bytes(data)
         partial.replace(path)
     return path
+
+
+def _path(volume: bpy.types.Volume) -> Path:
+    """Where the file of a datablock lies; relative paths of a library are relative to that."""
+    return Path(bpy.path.abspath(volume.filepath, library=volume.library))
 
 
 def _same(first: str, second: Path) -> bool:

@@ -48,6 +48,7 @@ class DRGS_OT_convert(ProgramOperator, bpy.types.Operator):
         if not self.out and not bpy.data.filepath:
             raise UsageError(subject, "has no place for its asset", "Save the .blend, or name the asset's file")
         target = self._target(obj)
+        assets.check_unused(target)
         self._name = obj.name
         with self.folder("drgs-convert-"):
             arguments = self._source(context, obj)

@@ -7,6 +7,7 @@ from pathlib import Path
 import bpy
 from bpy.props import BoolProperty, CollectionProperty, EnumProperty, FloatProperty, StringProperty
 
+from ..addon import assets
 from ..drgs_blender.errors import UsageError
 from ..drgs_blender.filetypes import READ, extensions
 from ..drgs_blender.sequence import frame_path, frames_of, template_of
@@ -128,6 +129,8 @@ class DRGS_OT_import_parts(ProgramOperator, bpy.types.Operator):
             if "#" not in self._target().name:
                 raise UsageError(self._target().name, "has no # for the number of each frame", "Write asset_####.drgs")
             arguments += ["--frames", ",".join(map(str, self._frames))]
+        for target in [frame_path(str(self._target()), frame) for frame in self._frames] or [self._target()]:
+            assets.check_unused(target)
         if surfels and mesh:
             arguments += ["--mesh", mesh]
         elif surfels and not self.use_mesh:

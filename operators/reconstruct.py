@@ -7,7 +7,7 @@ from pathlib import Path
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
 
-from ..addon import engine_link, reconstruction
+from ..addon import assets, engine_link, reconstruction
 from ..drgs_blender.errors import UsageError
 from .base import DrgsOperator
 from .import_asset import import_assets
@@ -88,6 +88,7 @@ class DRGS_OT_reconstruct(ProgramOperator, bpy.types.Operator):
             )
         out = Path(bpy.path.abspath(self.out or f"//{bpy.path.clean_name(folder.name)}"))
         out = out.absolute().with_suffix(".drgs")
+        assets.check_unused(out)
         arguments = ["reconstruct", str(capture), "--out", str(out), "--minutes", f"{self.minutes:g}"]
         arguments += ["--variant", self.variant]
         if self.resolution:

@@ -57,6 +57,10 @@ class DRGS_OT_save_asset(DrgsOperator, targets.ObjectMode, bpy.types.Operator):
         paths = [path] if len(objects) == 1 else [path.with_name(bpy.path.clean_name(o.name) + SUFFIX) for o in objects]
         if len(set(paths)) < len(paths):
             raise UsageError("Objects", "have names that make the same file name", "Rename one")
+        for target in paths:
+            assets.check_unused(target)
+            if len(objects) > 1 and os.path.exists(target):  # the file browser asked for another name
+                raise UsageError(str(target), "is there already", "Choose another folder, or save the objects singly")
         for obj, target in zip(objects, paths):
             save(obj, target, context.evaluated_depsgraph_get())
         if self.use_saved:
@@ -75,18 +79,11 @@ def save(obj: bpy.types.Object, path: Path, depsgraph: bpy.types.Depsgraph) -> N
 
     Raises
     ------
-    UsageError
-        `path` is a file that the object itself, or another one, is made of.
     AssetError
         The mesh is not the asset's; names the object.
     WriteError
         The file cannot be written.
     """
-    for other in filter(assets.is_drgs, bpy.data.objects):
-        if os.path.realpath(bpy.path.abspath(other.drgs.path)) == os.path.realpath(path):
-            raise UsageError(
-                f'Object "{other.name}"', f"is made of {path}, which would be lost", "Choose another file name"
-            )
     source = assets.file_of(obj)
     asset = assets.load(source)
     painted, adjustment = look_of(obj.evaluated_get(depsgraph), asset, messages.Warnings())

@@ -195,3 +195,8 @@ def test_what_cannot_be_converted_is_said(ball, scene, tmp_path):
     with pytest.raises(RuntimeError, match=r'"Cloud".*could not be made into an asset'):
         bpy.ops.drgs.convert()
     assert not obj.hide_render
+    before = (tmp_path / "assets" / "ball.drgs").read_bytes()
+    obj.name = "Other"
+    with pytest.raises(RuntimeError, match=r'"ball": is made of .*would be lost'):
+        bpy.ops.drgs.convert(out=str(tmp_path / "assets" / "ball"))
+    assert (tmp_path / "assets" / "ball.drgs").read_bytes() == before
