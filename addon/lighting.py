@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import bpy
@@ -31,7 +32,7 @@ def choose_light(scene: bpy.types.Scene, path: Path, rotation: float = 0.0, stre
     """
     if not scene.is_editable:
         raise UsageError(f'Scene "{scene.name}"', "comes from a library and cannot be changed here", "Make it local")
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise AssetError(str(path), "does not exist", "Choose another image")
     try:
         image = bpy.data.images.load(str(path), check_existing=True)

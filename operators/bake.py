@@ -76,11 +76,12 @@ class DRGS_OT_bake_light(ProgramOperator, targets.ObjectMode, bpy.types.Operator
 
     def run(self, context: bpy.types.Context) -> set[str]:
         objects = targets.editable(targets.selected(context), data=True)
-        if self.target == "ATTRIBUTE" and (not self.name or self.name in mesh_arrays.ATTRIBUTES):
-            raise UsageError("Name", f'"{self.name}" is none for baked light', "Choose another")
         scene = context.scene
         frames = range(scene.frame_start, scene.frame_end + 1, scene.frame_step)
         self._frames = tuple(frames) if self.use_animation else (scene.frame_current,)
+        if self.target == "ATTRIBUTE":
+            for name in map(self._attribute_name, self._frames):
+                check_name(name, objects)
         self._names = tuple(obj.name for obj in objects)
         self._check_places(objects)
         with self.folder("drgs-bake-") as folder:
@@ -99,6 +100,8 @@ class DRGS_OT_bake_light(ProgramOperator, targets.ObjectMode, bpy.types.Operator
 
     def done(self, context: bpy.types.Context) -> set[str]:
         """Put what the program wrote where it belongs."""
+        if context.mode != "OBJECT":
+            bpy.ops.object.mode_set(mode="OBJECT")
         for i, name in enumerate(self._names):
             obj = context.scene.objects.get(name)
             if obj is None:
@@ -108,8 +111,10 @@ class DRGS_OT_bake_light(ProgramOperator, targets.ObjectMode, bpy.types.Operator
             else:
                 for number in self._frames:
                     colours = np.load(frame_path(self._attribute(i), number), allow_pickle=False)
-                    single = not self.use_animation
-                    write_colours(obj.data, self.name if single else f"{self.name}.{number:04}", colours)
+                    if len(colours) != len(obj.data.vertices):
+                        self.warn(f'Object "{name}" has other vertices than before the bake; its light is lost')
+                        break
+                    write_colours(obj.data, self._attribute_name(number), colours)
         self.report({"INFO"}, f"Baked the light of {len(self._frames)} frames on {len(self._names)} objects")
         return {"FINISHED"}
 
@@ -126,6 +131,10 @@ class DRGS_OT_bake_light(ProgramOperator, targets.ObjectMode, bpy.types.Operator
                 yield number
         finally:
             scene.frame_set(now[0], subframe=now[1])
+
+    def _attribute_name(self, number: int) -> str:
+        """The colour attribute that holds the light of a frame."""
+        return f"{self.name}.{number:04}" if self.use_animation else self.name
 
     def _attribute(self, index: int) -> str:
         """Pattern of the files with the colours of an object's vertices."""
@@ -182,6 +191,19 @@ def show_image(path: Path, sequence: bool) -> None:
     image.colorspace_settings.name = WORKING_SPACE
     image.alpha_mode = "PREMUL"
     image.reload()
+
+
+def check_name(name: str, objects: list[bpy.types.Object]) -> None:
+    """UsageError where the colours of vertices cannot be called `name`, or where something else would be lost."""
+    trial = bpy.data.meshes.new("trial")
+    usable = name not in ("", *mesh_arrays.ATTRIBUTES) and trial.attributes.new(name, "FLOAT_COLOR", "POINT")
+    bpy.data.meshes.remove(trial)
+    if not usable:
+        raise UsageError("Name", f'"{name}" is none for baked light', "Choose another")
+    for obj in objects:
+        attribute = obj.data.attributes.get(name)
+        if name in obj.vertex_groups or (attribute and attribute.data_type not in mesh_arrays.COLOURS):
+            raise UsageError(f'Object "{obj.name}"', f'has "{name}" already, which is no colour', "Choose another name")
 
 
 def write_colours(mesh: bpy.types.Mesh, name: str, colours: np.ndarray) -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import bpy
 
 from ..addon import messages
-from ..drgs_blender.errors import DrgsError, UsageError
+from ..drgs_blender.errors import DrgsError, UsageError, WriteError
 
 
 class DrgsOperator:
@@ -16,10 +18,18 @@ class DrgsOperator:
         return {"FINISHED"}
 
     def execute(self, context: bpy.types.Context) -> set[str]:
+        return self.guard(self.run, context)
+
+    def guard(self, work: Callable[[bpy.types.Context], set[str]], context: bpy.types.Context) -> set[str]:
+        """Do `work`, and tell its errors."""
         try:
-            return self.run(context)
+            return work(context)
         except DrgsError as error:
             return self.fail(error)
+        except OSError as error:  # files, folders and disks that go away, refuse or have impossible names
+            subject = str(error.filename or self.bl_label)
+            problem = f"cannot be used ({error.strerror or error})"
+            return self.fail(WriteError(subject, problem, "Check that it exists, its permissions and the free space"))
 
     def chosen(self, subject: str) -> str:
         """The operator's file; UsageError about `subject` where none is given."""

@@ -88,7 +88,7 @@ def bind_to_rig(context: bpy.types.Context, target: bpy.types.Object, sources: l
     Raises
     ------
     UsageError
-        No usable source, several armatures, or the objects do not coincide.
+        No usable source, several armatures, an object that is scaled to nothing, or they do not coincide.
     """
     if not sources:
         raise UsageError(
@@ -97,12 +97,13 @@ def bind_to_rig(context: bpy.types.Context, target: bpy.types.Object, sources: l
             "Select the rigged meshes first and the DR-GS object last",
         )
     armature = armature_of(target.name, sources)
+    for obj in filter(None, (target, armature)):
+        targets.check_size(obj)
     with rest_pose(context, armature):
         places = [source_of(o) for o in sources]
         matrix = np.array(target.matrix_world, np.float64)
         armature_matrix = armature.matrix_world.copy() if armature else None
-    vertices = mesh_arrays.read_vertices(target.data).astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
-    match = nearest(vertices, places)
+    match = nearest(targets.world_vertices(target), places)
     everything = np.concatenate([s.vertices for s in places])
     distance = float(match.distance.mean() / max(np.linalg.norm(np.ptp(everything, axis=0)), 1e-12))
     if distance > WRONG:
@@ -169,7 +170,7 @@ def source_of(obj: bpy.types.Object) -> Source:
     if not len(triangles):
         raise UsageError(f'Object "{obj.name}"', "has no faces", "Deselect it")
     matrix = np.array(obj.matrix_world, np.float64)
-    return Source(obj, local @ matrix[:3, :3].T + matrix[:3, 3], triangles, matrix)
+    return Source(obj, targets.in_world(obj, local), triangles, matrix)
 
 
 def nearest(points: Array, sources: list[Source]) -> Match:

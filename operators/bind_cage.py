@@ -60,6 +60,7 @@ def bind_to_cage(context: bpy.types.Context, objects: list[bpy.types.Object], ca
         That mesh cannot carry anything, or an object's mesh may not be changed; nothing has been changed then.
     """
     shape = cage.evaluated_get(context.evaluated_depsgraph_get()).data
+    targets.in_world(cage, mesh_arrays.read_vertices(shape))
     if not any(p.area > 0 for p in shape.polygons):
         raise UsageError(f'Cage "{cage.name}"', "has no faces that could carry anything", "Give it faces")
     refused, done = {}, []
@@ -78,7 +79,7 @@ def bind_to_cage(context: bpy.types.Context, objects: list[bpy.types.Object], ca
             refused[obj.name] = reason or "a face is concave, or an edge has more than two"
     left = [obj for obj in objects if obj.name in refused]
     try:
-        _check_carried(left)
+        _check_carried(left, cage)
     except UsageError:
         for obj, modifier in done:
             obj.modifiers.remove(modifier)
@@ -91,9 +92,11 @@ def bind_to_cage(context: bpy.types.Context, objects: list[bpy.types.Object], ca
     return refused
 
 
-def _check_carried(objects: list[bpy.types.Object]) -> None:
+def _check_carried(objects: list[bpy.types.Object], cage: bpy.types.Object) -> None:
     """UsageError where nodes cannot carry an object: each vertex of its mesh keeps its place in the cage."""
     for obj in targets.editable(objects, data=True) if objects else ():
+        targets.check_size(obj)
+        targets.check_size(cage)
         if obj.data.users > 1:
             raise UsageError(
                 f'Object "{obj.name}"',

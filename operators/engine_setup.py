@@ -112,7 +112,7 @@ class DRGS_OT_engine_setup(DrgsOperator, bpy.types.Operator):
                 "Allow Online Access in Preferences > System, or choose an environment that has the engine",
             )
         python = Path(bpy.path.abspath(self.python) or sys.executable)
-        if not python.is_file():
+        if not os.path.isfile(python):
             raise UsageError("Python", f"{python} does not exist", f"Choose a Python of version {engine_setup.PYTHONS}")
         job = setup_job.start(python, self.afresh, self.reconstruct, self.index.strip())
         if os.environ.get(VARIABLE):

@@ -194,6 +194,8 @@ class DRGS_OT_paint(DrgsOperator, targets.ObjectMode, bpy.types.Operator):
 
     def run(self, context: bpy.types.Context) -> set[str]:
         (obj,) = targets.editable(targets.selected(context)[-1:], data=True)
+        if not obj.visible_get():
+            raise UsageError(f'Object "{obj.name}"', "is hidden", "Show it in the Outliner")
         mesh_arrays.make_paintable(obj.data, self.channel, present(obj, self.channel))
         targets.select_only(context, [obj], obj)
         bpy.ops.object.mode_set(mode="VERTEX_PAINT")

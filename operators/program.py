@@ -15,7 +15,7 @@ import bpy
 from ..addon import engine_link, messages
 from ..addon.matter.program import MAIN
 from ..drgs_blender.engine.child import clean_environment
-from ..drgs_blender.errors import AssetError, DrgsError, UsageError
+from ..drgs_blender.errors import AssetError, UsageError
 from .base import DrgsOperator
 
 _INTERVAL = 0.25
@@ -73,7 +73,7 @@ class ProgramOperator(DrgsOperator):
             if bpy.app.background or context.window is None:
                 self._process.wait()
                 return self._finish(context)
-        except DrgsError:
+        except BaseException:
             self.clear()
             raise
         self._timer = context.window_manager.event_timer_add(_INTERVAL, window=context.window)
@@ -91,10 +91,7 @@ class ProgramOperator(DrgsOperator):
             self.follow(context, self._said())
             return {"PASS_THROUGH"}
         self._release(context)
-        try:
-            return self._finish(context)
-        except DrgsError as error:
-            return self.fail(error)
+        return self.guard(self._finish, context)
 
     def cancel(self, context: bpy.types.Context) -> None:
         """End the process; called by Esc and when Blender closes."""

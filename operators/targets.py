@@ -12,6 +12,9 @@ from ..drgs_blender.errors import UsageError
 
 Array = np.ndarray
 
+#: Metres from the origin, squares of which single precision still holds.
+FARTHEST = 1e15
+
 
 def selected(context: bpy.types.Context) -> list[bpy.types.Object]:
     """The selected DR-GS objects and the active one, the active one last."""
@@ -55,9 +58,34 @@ def bounds(objects: Iterable[bpy.types.Object]) -> tuple[Array, Array]:
 
 
 def world_vertices(obj: bpy.types.Object) -> Array:
-    """(n, 3) float64 undeformed vertices in the world."""
+    """(n, 3) float64 undeformed vertices in the world; see `in_world` for the error."""
+    return in_world(obj, mesh_arrays.read_vertices(obj.data))
+
+
+def in_world(obj: bpy.types.Object, points: Array) -> Array:
+    """(n, 3) float64 in the world, of (n, 3) points of `obj`.
+
+    Raises
+    ------
+    UsageError
+        One is nowhere.
+    """
     matrix = np.array(obj.matrix_world, np.float64)
-    return mesh_arrays.read_vertices(obj.data) @ matrix[:3, :3].T + matrix[:3, 3]
+    placed = points @ matrix[:3, :3].T + matrix[:3, 3]
+    lost = np.count_nonzero(~(np.abs(placed) < FARTHEST).all(axis=1))
+    if lost:
+        raise UsageError(
+            f'Object "{obj.name}"',
+            f"has {lost} vertices that are not finite or too far away",
+            "Correct them, its transform and the drivers of that",
+        )
+    return placed
+
+
+def check_size(obj: bpy.types.Object) -> None:
+    """UsageError where `obj` has no volume to be bent in, as its scale is zero along an axis."""
+    if not abs(obj.matrix_world.to_3x3().determinant()) > 1e-30:
+        raise UsageError(f'Object "{obj.name}"', "is scaled to nothing", "Give it a size, then bind it")
 
 
 class ObjectMode:

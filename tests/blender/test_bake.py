@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 import numpy as np
 import pytest
-from scenes import new_world, read_exr, select, write_ball
+from scenes import new_world, part, read_exr, select, write_ball
 
 
 @pytest.fixture
@@ -112,7 +112,34 @@ def test_nothing_is_baked_over_a_material_or_of_what_is_not_rendered(lit):
     for name in ("", "albedo"):
         with pytest.raises(RuntimeError, match="Choose another"):
             bpy.ops.drgs.bake_light(name=name)
+    for name in ("position", "sharp_face", "n" * 68):  # Blender's own, and what it has no room for
+        with pytest.raises(RuntimeError, match=f'"{name}" is none for baked light'):
+            bpy.ops.drgs.bake_light(name=name)
+    with_uvs(lit)
+    lit.vertex_groups.new(name="Group")
+    for name in ("Box", "Group"):
+        with pytest.raises(RuntimeError, match=f'"ball": has "{name}" already'):
+            bpy.ops.drgs.bake_light(name=name)
+    assert len(lit.data.uv_layers) == 1
     lit.visible_camera = lit.visible_diffuse = lit.visible_glossy = lit.visible_shadow = False
     with pytest.raises(RuntimeError, match="is not rendered"):
         bpy.ops.drgs.bake_light()
     assert "relit" not in lit.data.attributes
+
+
+def test_a_mesh_that_is_edited_during_a_bake_is_told(lit, monkeypatch):
+    program = part("operators.program").ProgramOperator
+    finish = program._finish
+
+    def edited(self, context):
+        bpy.ops.object.mode_set(mode="EDIT")
+        if count < len(lit.data.vertices):
+            bpy.ops.mesh.delete(type="FACE")
+        return finish(self, context)
+
+    monkeypatch.setattr(program, "_finish", edited)
+    count = len(lit.data.vertices)
+    assert bpy.ops.drgs.bake_light(rays=3) == {"FINISHED"} and "relit" in lit.data.attributes
+    count, messages = 0, part("addon.messages")
+    bpy.ops.drgs.bake_light(rays=3, name="second")
+    assert 'Object "ball" has other vertices' in messages.history[-1].text and "second" not in lit.data.attributes

@@ -176,6 +176,34 @@ def test_shape_keys_follow_with_values_drivers_and_action(ball, rig, scene):
     assert [m.type for m in ball.modifiers] == ["ARMATURE"]
 
 
+def test_what_has_no_place_in_the_world_is_refused_by_name(ball, rig):
+    ghost = skinned("Ghost", rig, *sphere())
+    nowhere = r": has \d+ vertices that are not finite or too far away\. Correct them"
+    for obj in (ball, ghost):
+        obj.data.vertices[5].co.y = np.nan
+        select(ghost, ball)
+        with pytest.raises(RuntimeError, match=f'"{obj.name}"{nowhere}'):
+            bpy.ops.drgs.bind_to_rig()
+        obj.data.vertices[5].co = sphere()[0][5]
+        obj.location.y = np.nan
+        bpy.context.view_layer.update()
+        with pytest.raises(RuntimeError, match=f'"{obj.name}"'):
+            bpy.ops.drgs.bind_to_rig()
+        obj.location.y = 0
+        bpy.context.view_layer.update()
+    ghost.shape_key_add(name="Basis")
+    ghost.shape_key_add(name="Wide")
+    for obj in (ball, rig):
+        obj.scale = (1, 1, 0)
+        bpy.context.view_layer.update()
+        with pytest.raises(RuntimeError, match=f'"{obj.name}": is scaled to nothing'):
+            bpy.ops.drgs.bind_to_rig()
+        obj.scale = (1, 1, 1)
+        bpy.context.view_layer.update()
+    assert not ball.modifiers and ball.parent is None
+    bind(ball, ghost)
+
+
 def test_errors_name_the_object_and_the_remedy(ball, rig):
     select(ball)
     with pytest.raises(RuntimeError, match=r'"ball".*Select the rigged meshes first'):

@@ -127,6 +127,27 @@ def test_a_mesh_that_cannot_carry_is_refused_and_nothing_changes(pair):
         bpy.data.objects.remove(cage)
 
 
+@pytest.mark.parametrize("flat", ["object", "cage"])
+def test_what_is_scaled_to_nothing_is_refused_by_name_and_nothing_changes(ball, flat):
+    cage = rough_cage(2.5)
+    obj = ball if flat == "object" else cage
+    obj.scale.z = 0
+    bpy.context.view_layer.update()
+    select(cage, ball)
+    with pytest.raises(RuntimeError, match=rf'"{obj.name}": is scaled to nothing\. Give it a size'):
+        bpy.ops.drgs.bind_to_cage()
+    assert not ball.modifiers and not cage.hide_render
+
+
+@pytest.mark.parametrize("operator", ["bind_to_lattice", "bind_to_cage"])
+def test_vertices_that_are_nowhere_are_told(ball, operator):
+    ball.data.vertices[3].co.x = np.nan
+    ball.data.vertices[4].co.x = 1e38
+    with pytest.raises(RuntimeError, match=r'"ball": has 2 vertices that are not finite or too far away'):
+        getattr(bpy.ops.drgs, operator)()
+    assert not ball.modifiers and set(bpy.data.objects) == {bpy.context.scene.camera, ball}
+
+
 def rough_cage(size: float) -> bpy.types.Object:
     """What Surface Deform refuses: a prism over an L, whose caps are concave, with a fin at one of its edges."""
     shape = [(-1, -1), (1, -1), (1, 0), (0, 0), (0, 1), (-1, 1)]

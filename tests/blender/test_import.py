@@ -175,6 +175,29 @@ def test_surfels_become_an_asset_and_an_object(scene, tmp_path):
     obj = bpy.context.active_object
     assert obj.name == "toy" and obj.drgs.path == "//toy.drgs"
     assert len(part("addon.assets").load(tmp_path / "toy.drgs").surfels) == 400
+    before = (tmp_path / "toy.drgs").read_bytes()
+    with pytest.raises(RuntimeError, match=r'"toy": is made of .*would be lost'):
+        bpy.ops.drgs.import_parts(surfels=str(splats), up="z")
+    assert (tmp_path / "toy.drgs").read_bytes() == before
+
+
+def test_names_that_no_file_can_have_are_told(ball, tmp_path):
+    """Of some, the system says more than that there is no such file."""
+    name = str(tmp_path / ("n" * 300))
+    for operator, ending in (
+        (bpy.ops.import_scene.drgs, ".drgs"),
+        (bpy.ops.drgs.choose_light, ".hdr"),
+        (bpy.ops.drgs.save_asset, ".drgs"),
+        (bpy.ops.drgs.report, ".txt"),
+        (bpy.ops.drgs.reconstruct, ""),
+    ):
+        with pytest.raises(RuntimeError, match=r"n{300}") as told:
+            operator(filepath=name + ending)
+        assert "Traceback" not in str(told.value)
+    ball.drgs.path = f"{name}.drgs"
+    for operator in (bpy.ops.drgs.restore_material, bpy.ops.drgs.bake_light, bpy.ops.render.render):
+        with pytest.raises(RuntimeError, match=r'"ball": the asset .* does not exist'):
+            operator()
 
 
 def test_a_failed_conversion_says_why(scene, tmp_path):

@@ -105,6 +105,16 @@ def test_the_object_of_a_message_is_found_and_selected(ball, tmp_path):
         bpy.ops.drgs.select_named(name="nobody")
 
 
+def test_what_is_hidden_is_not_painted(ball):
+    for hide in (lambda on: ball.hide_set(on), lambda on: setattr(ball, "hide_viewport", on)):
+        hide(True)
+        bpy.context.view_layer.objects.active = ball
+        with pytest.raises(RuntimeError, match='"ball": is hidden'):
+            bpy.ops.drgs.paint(channel="roughness")
+        assert bpy.context.mode == "OBJECT" and ball.data.attributes["roughness"].data_type == "FLOAT"
+        hide(False)
+
+
 @pytest.mark.parametrize("channel", CHANNELS)
 def test_a_painted_channel_is_what_the_engine_gets(ball, export, channel):
     before = channels(ball)
@@ -130,6 +140,9 @@ def test_a_material_is_copied_from_the_nearest_places(ball, tmp_path):
     assert bpy.ops.drgs.copy_material() == {"FINISHED"}
     for name, values in channels(other).items():
         np.testing.assert_allclose(channels(ball)[name], values, atol=1e-5)
+    ball.data.vertices[7].co.z = np.nan
+    with pytest.raises(RuntimeError, match='"ball": has 1 vertices that are not finite'):
+        bpy.ops.drgs.copy_material()
     select(ball)
     with pytest.raises(RuntimeError, match="no two DR-GS objects"):
         bpy.ops.drgs.copy_material()
@@ -260,3 +273,28 @@ def test_no_asset_is_written_over_or_lost(ball, tmp_path, ball_file):
     select(second, ball)
     assert bpy.ops.drgs.save_asset(filepath=str(tmp_path / "out.drgs")) == {"FINISHED"}
     assert sorted(p.name for p in tmp_path.glob("*.drgs")) == ["ball.drgs", f"{bpy.path.clean_name(second.name)}.drgs"]
+    (tmp_path / f"{bpy.path.clean_name(second.name)}.drgs").unlink()
+    (tmp_path / "ball.drgs").write_bytes(b"somebody's")
+    with pytest.raises(RuntimeError, match=r"ball\.drgs: is there already"):  # the file browser asked for out.drgs
+        bpy.ops.drgs.save_asset(filepath=str(tmp_path / "out.drgs"))
+    assert [p.read_bytes() for p in tmp_path.glob("*.drgs")] == [b"somebody's"]
+
+
+def test_the_asset_of_a_library_is_not_written_over(ball, tmp_path):
+    """Its path is relative to the library, not to the file that links it."""
+    theirs = tmp_path / "library" / "theirs.drgs"
+    bpy.ops.import_scene.drgs(filepath=str(write_ball(theirs)))
+    bpy.ops.wm.save_as_mainfile(filepath=str(theirs.with_suffix(".blend")))
+    bpy.ops.file.make_paths_relative()
+    bpy.ops.wm.save_mainfile()
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "own.blend"))
+    with bpy.data.libraries.load(str(theirs.with_suffix(".blend")), link=True) as (_, target):
+        target.objects = ["theirs"]
+    bpy.context.scene.collection.objects.link(target.objects[0])
+    bpy.ops.import_scene.drgs(filepath=str(write_ball(tmp_path / "own.drgs")))
+    before = theirs.read_bytes()
+    bpy.ops.drgs.set_material()
+    with pytest.raises(RuntimeError, match=r'"theirs": is made of .*would be lost'):
+        bpy.ops.drgs.save_asset(filepath=str(theirs))
+    assert theirs.read_bytes() == before
