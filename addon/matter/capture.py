@@ -75,6 +75,9 @@ def capture(obj: bpy.types.Object, scene: bpy.types.Scene, folder: Path, *, stil
             scene.frame_set(frames[0])
             data = describe(obj, scene)
             vertices, faces, matrix = _read(obj, fits=True)
+            if not (np.isfinite(vertices).all() and np.isfinite(matrix).all()):
+                problem = "has vertices or a transform that are not finite in the first frame"
+                raise UsageError(subject_of(obj), problem, "Correct them and their drivers")
             if abs(np.linalg.det(matrix[:3, :3])) < _FLATTEST:
                 raise UsageError(subject_of(obj), "is scaled to nothing in the first frame", "Give it a size")
             data["matrix_world"] = matrix.tolist()

@@ -245,6 +245,8 @@ def test_faults_name_the_object_and_the_remedy(body, scene, tmp_path):
     matter.colliders.clear()
     body.scale.x = 0.0
     fails('Object "ball": is scaled to nothing.*Give it a size')
+    body.scale.x = np.nan
+    fails('Object "ball": has vertices or a transform that are not finite')
     body.scale.x = 1.0
     divided = body.modifiers.new("Finer", "SUBSURF")
     fails('Object "ball": modifier "Finer"')
