@@ -17,7 +17,6 @@ from pathlib import Path
 
 import numpy as np
 from judge import blender_python, environments, to_srgb
-from PIL import Image
 from report import OUT, ROOT, table, write_section
 from scipy.spatial import cKDTree
 from subjects import asset_path, textured_spot
@@ -166,9 +165,8 @@ def draw(pictures: dict[str, dict[str, Layers]]) -> None:
             panel.set_title(title.format(**PARTS[name]), fontsize=8)
             panel.axis("off")
     FIGURE.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(FIGURE, dpi=100)
+    figure.savefig(FIGURE, dpi=90)
     pyplot.close(figure)
-    Image.open(FIGURE).convert("RGB").quantize(256).save(FIGURE, optimize=True)  # half as large
 
 
 def main() -> None:
