@@ -132,6 +132,9 @@ def test_a_wheel_without_embree_is_a_device_error(tmp_path: Path, monkeypatch: p
         embree.library.__wrapped__()
 
 
+#: Embree divides by approximate reciprocals, of which every make of processor has its own, and refines them.
+ROUNDING = 4 * float(np.finfo(np.float32).eps)
+
 _PROGRAM = """
 import numpy as np
 from drgs_blender.render.trace import tree
@@ -151,8 +154,10 @@ def test_kernels_come_out_of_the_cache_in_another_process(tmp_path: Path) -> Non
         subprocess.run([sys.executable, "-c", _PROGRAM], env=environment, capture_output=True, text=True, check=True)
         for _ in range(2)
     ]
-    assert outputs[0].stdout.split() == ["1.0", "0", "0.25", "0.25", "0"]
-    assert outputs[1].stdout.split() == ["1.0", "0", "0.25", "0.25", "1"]
+    (*compiled, none), (*kept, one) = (output.stdout.split() for output in outputs)
+    assert [float(x) for x in compiled] == pytest.approx([1, 0, 0.25, 0.25], rel=ROUNDING)
+    assert kept == compiled
+    assert (none, one) == ("0", "1")
 
 
 # --- groups and places ---
@@ -230,7 +235,8 @@ def test_rays_meet_the_groups_of_their_mask() -> None:
     cases = ((1, 1, 0), (2, 2, 2), (4, 2, 2), (8, 3, 4), (1 | 8, 1, 0), (16, np.inf, -1), (ALL, 1, 0), (-(2**31), 3, 4))
     for mask, distance, face in cases:
         t, found, instance, _, _ = bvh.hits(origins, directions, mask=mask)
-        assert (t[0], found[0] // 2 * 2, instance[0]) == (distance, face if face >= 0 else -2, 0 if face == 4 else -1)
+        assert t[0] == pytest.approx(distance, rel=ROUNDING)
+        assert (found[0] // 2 * 2, instance[0]) == (face if face >= 0 else -2, 0 if face == 4 else -1)
         assert found[1] == -1
         np.testing.assert_array_equal(bvh.occluded_many(origins, directions, mask=mask), [face >= 0, False])
 
