@@ -151,7 +151,7 @@ def paint_it() -> Iterator[float]:
         yield from key("WHEELDOWNMOUSE")
     yield from photograph("hand-9-object")
     before = albedo()
-    x, y = yield from hands.find("drgs.save_asset")
+    x, y = yield from hands.find("show_captured")
     yield from hands.click((x, y + 26))  # a menu has no operator to be found by
     yield from photograph("hand-10-channels")
     yield from key("A")
