@@ -179,11 +179,14 @@ class ParticleCache:
             Its file is damaged.
         """
         path = self.path(frame)
-        if not path.exists():
-            there = self.frames()
-            held = f"There are frames {there[0]} to {there[-1]}" if there else "Bake first: the cache has no frame"
-            raise UsageError(f"{self.folder}, frame {frame}", "is not baked", held)
-        return _frame(path)
+        try:
+            return _frame(path)
+        except AssetError:
+            if path.exists():  # afterwards: another bake may begin anew, and remove it at any moment
+                raise
+        there = self.frames()
+        held = f"There are frames {there[0]} to {there[-1]}" if there else "Bake first: the cache has no frame"
+        raise UsageError(f"{self.folder}, frame {frame}", "is not baked", held)
 
     def write(self, frame: int, particles: ParticleFrame) -> None:
         """Write a frame in one step: a reader sees all of it or nothing."""

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from drgs_blender import particle_cache
 from drgs_blender.asset.container import write_asset
 from drgs_blender.asset.model import Asset, Mesh
 from drgs_blender.cli.main import main
@@ -404,3 +405,17 @@ def test_options_of_the_command_win_over_the_file(tmp_path, capsys):
     assert settings["gravity"] == [-1, 0, -2] and settings["last"] == 2 and settings["pins"][0]["group"] == "left"
     assert main([*command, "--poisson", "0.6"]) == 64
     assert "poisson: is 0.6" in capsys.readouterr().err
+
+
+def test_a_frame_that_goes_away_while_it_is_read_is_not_baked(tmp_path, monkeypatch):
+    """Another bake that begins anew removes frames; Blender, which follows it, waits for the new ones."""
+    cache, read = ParticleCache(tmp_path), particle_cache._read
+    cache.path(4).write_bytes(b"a frame")
+
+    def late(path):
+        path.unlink()
+        return read(path)
+
+    monkeypatch.setattr(particle_cache, "_read", late)
+    with pytest.raises(UsageError, match="frame 4: is not baked"):
+        cache.read(4)
