@@ -136,12 +136,13 @@ class Training:
     def _learn(self) -> None:
         schedule, part = self.schedule, self.part
         target = self._next()
+        rays = target.rays
         bands = min(schedule.bands, int(part * 8))
         growing = part < schedule.densify[1]
         mirrors = part >= schedule.mirrors < 1
         tally = self.tally if growing else None
-        look = self.gaussians.look(target.camera, self.background, bands, tally, target.rays, mirrors)
-        loss = self._loss(look, target, part)
+        look = self.gaussians.look(target.camera, self.background, bands, tally, rays, mirrors)
+        loss = self._loss(look, target, rays, part)
         loss.backward()
         self.optimiser.step(self.gaussians.parameters, self._rates(part))
         if self.gaussians.light is not None:
@@ -162,7 +163,7 @@ class Training:
         turn, place = divmod(self.iteration, len(views))
         return views[np.random.default_rng([self.schedule.seed, turn]).permutation(len(views))[place]]
 
-    def _loss(self, look: Look, target: Target, part: float) -> Tensor:
+    def _loss(self, look: Look, target: Target, rays: Tensor, part: float) -> Tensor:
         schedule, maps = self.schedule, look.maps
         shaped = part >= schedule.shape
         weights = (
@@ -172,7 +173,7 @@ class Training:
         )
         mask = None if target.mask is None else target.mask.numpy()
         shape = shape_loss(
-            maps.alpha, maps.depth, maps.distortion, look.normal, mask, target.rays.numpy(), _importance(maps.features),
+            maps.alpha, maps.depth, maps.distortion, look.normal, mask, rays.numpy(), _importance(maps.features),
             weights,
         )  # fmt: skip
         return difference(look.colour, target.photograph) + shape
