@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from ..errors import AssetError, UsageError
@@ -25,7 +26,12 @@ _BAND = 8
 _MOST_CELLS = 1 << 23
 #: Cells between a surface that lies on a collider and the collider.
 _CLEARANCE = 0.02
+#: Part of the depth from which on particles are said to be inside, and share of them that is refused where it is all.
+_SUNK, _REFUSED = 0.25, 0.01
 _OVERLAP = "overlaps the body at the start: {} of {} particles are inside it"
+_THROUGH = "passes through the body at the start: {} of {} particles have it between them and the next"
+#: Distance of neighbours in a body, in that of the nearest.
+_NEIGHBOURS = 1.5
 
 
 @dataclass(slots=True)
@@ -232,17 +238,37 @@ class MovingCollider:
         seen = self.look(points, part)
         return np.full(len(points), np.inf) if seen is None else seen[:, 0]
 
-    def closest(self, points: Array) -> tuple[Array, Array, Array]:
-        """Signed distances (n,) from the mesh at the end of the frame, its closest points, and the way out, (n, 3)."""
+    def closest(self, points: Array, start: bool = False) -> tuple[Array, Array, Array]:
+        """Signed distances (n,) from the mesh at the end or the `start` of the frame, its closest points, and the way
+        out, (n, 3)."""
         import igl
 
-        faces = self.collider.faces
-        distance, face, closest, *_ = igl.signed_distance(points, self._after, faces, _sign(self._closed))
-        a, b, c = np.moveaxis(self._after[faces[face]], 1, 0)
+        faces, vertices = self.collider.faces, self._before if start else self._after
+        distance, face, closest, *_ = igl.signed_distance(points, vertices, faces, _sign(self._closed))
+        a, b, c = np.moveaxis(vertices[faces[face]], 1, 0)
         normal = np.cross(b - a, c - a)
         on = np.abs(distance) < 1e-6 * self.spacing
         out = np.where(on[:, None], normal, (points - closest) * np.sign(distance)[:, None])
         return distance, closest, out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-300)
+
+    def count_divided(self, points: Array, distances: Array) -> int:
+        """How many of a body's points have the mesh between them and a neighbour at the start of the frame.
+
+        Parameters
+        ----------
+        distances : (n,) as `distances` has them, infinite also in the middle of what is as thick as a cell
+        """
+        low, high = self._before.min(axis=0) - self.spacing, self._before.max(axis=0) + self.spacing
+        far = np.isfinite(distances) & (np.abs(distances) >= self.spacing)
+        near = points[((points > low) & (points < high)).all(axis=1) & ~far]
+        if len(near) < 2:
+            return 0
+        tree = cKDTree(near)
+        reach = _NEIGHBOURS * float(np.median(tree.query(near[: 1 << 12], 2)[0][:, 1]))
+        pairs = tree.query_pairs(reach, output_type="ndarray")
+        out = self.closest(near, start=True)[2]
+        divided = (out[pairs[:, 0]] * out[pairs[:, 1]]).sum(axis=1) < -0.5
+        return len(np.unique(pairs[divided]))
 
     def _make_field(self, vertices: Array, low: Array, high: Array, velocities: Array | None = None) -> Field | None:
         return make_field(vertices, self.collider.faces, self._closed, self.spacing, low, high, velocities)
@@ -259,6 +285,8 @@ class MovingCollider:
 def check_apart(points: Array, depth: float, colliders: Sequence[MovingCollider], planes: Array) -> None:
     """Refuse a body that is inside of what it should meet, and warn of one that is a little, before anything moves.
 
+    What is thinner than a cell is not seen in the field of a collider: there the neighbours on its two sides tell.
+
     Parameters
     ----------
     points : (n, 3) of the body, world
@@ -272,16 +300,21 @@ def check_apart(points: Array, depth: float, colliders: Sequence[MovingCollider]
     """
     sunk = {"floor or wall": (planes[:, 3] - points @ planes[:, :3].T).max(axis=1, initial=-np.inf)}
     low, high = points.min(axis=0), points.max(axis=0)
+    through = {}
     for moving in colliders:
         moving.enter(0, 1.0, low, high)
-        sunk[moving.collider.name] = moving.collider.thickness - moving.distances(points, 0.0)
+        distances = moving.distances(points, 0.0)
+        sunk[moving.collider.name] = moving.collider.thickness - distances
+        through[moving.collider.name] = moving.count_divided(points, distances)
     for name, depths in sunk.items():
-        count, deep = (int(np.count_nonzero(depths > part * depth)) for part in (0.5, 1.0))
-        if deep > 0.01 * len(points):
+        count, deep = (int(np.count_nonzero(depths > part * depth)) for part in (_SUNK, 1.0))
+        if deep > _REFUSED * len(points):
             remedy = "Move one of the two apart, or simulate from a frame in which they are apart"
             raise UsageError(name, _OVERLAP.format(deep, len(points)), remedy)
         if count:
             log.warning("%s: %s, and begin there; move the two apart", name, _OVERLAP.format(count, len(points)))
+        elif divided := through.get(name, 0):
+            log.warning("%s: %s; move the two apart", name, _THROUGH.format(divided, len(points)))
 
 
 def lift_surface(points: Array, spacing: float, colliders: Sequence[MovingCollider], planes: Array) -> Array:

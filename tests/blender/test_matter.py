@@ -279,6 +279,15 @@ def test_faults_name_the_object_and_the_remedy(body, scene, tmp_path):
         describe.folder_of(obj)
 
 
+def test_a_thin_collider_inside_of_the_body_is_named(body):
+    """Thinner than a cell, so that no particle is inside of it."""
+    body.drgs.matter.frame_end = 2
+    body.drgs.matter.colliders.add().object = box_object("Sheet", (-0.5, -0.5, -0.01), (0.5, 0.5, 0.01))
+    bpy.ops.drgs.bake_matter()
+    said = part("addon.messages").history[-2]
+    assert said.level == "WARNING" and said.text.startswith('Object "ball": collider "Sheet": passes through the body')
+
+
 def test_preview_shows_the_particles_without_touching_the_cache(body, scene):
     bpy.ops.drgs.preview_matter()
     fill = points.of(body)
