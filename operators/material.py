@@ -175,7 +175,8 @@ class DRGS_OT_reset_adjustments(DrgsOperator, targets.ObjectMode, bpy.types.Oper
 
 
 class DRGS_OT_paint(DrgsOperator, targets.ObjectMode, bpy.types.Operator):
-    """Paint a material channel of the active DR-GS object with Blender's brushes"""
+    """Paint a material channel of the active DR-GS object, as all paint modes do, with Blender's brushes. Other
+    objects stay selected"""
 
     bl_idname = "drgs.paint"
     bl_label = "Paint"
@@ -197,7 +198,8 @@ class DRGS_OT_paint(DrgsOperator, targets.ObjectMode, bpy.types.Operator):
         if not obj.visible_get():
             raise UsageError(f'Object "{obj.name}"', "is hidden", "Show it in the Outliner")
         mesh_arrays.make_paintable(obj.data, self.channel, present(obj, self.channel))
-        targets.select_only(context, [obj], obj)
+        obj.select_set(True)
+        context.view_layer.objects.active = obj
         bpy.ops.object.mode_set(mode="VERTEX_PAINT")
         return {"FINISHED"}
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 import numpy as np
 import pytest
-from scenes import part, select, write_ball
+from scenes import mesh_object, part, select, sphere, write_ball
 
 CHANNELS = ("albedo", "roughness", "metallic")
 
@@ -113,6 +113,24 @@ def test_what_is_hidden_is_not_painted(ball):
             bpy.ops.drgs.paint(channel="roughness")
         assert bpy.context.mode == "OBJECT" and ball.data.attributes["roughness"].data_type == "FLOAT"
         hide(False)
+
+
+def test_of_several_the_active_one_is_painted_and_all_stay_selected(ball, tmp_path):
+    """As in Blender's own paint modes, so that what follows can be done to all of them again."""
+    bpy.ops.import_scene.drgs(filepath=str(write_ball(tmp_path / "two.drgs")))
+    other = bpy.context.active_object
+    select(other, ball)
+    assert bpy.ops.drgs.paint(channel="metallic") == {"FINISHED"}
+    assert (ball.mode, other.mode) == ("VERTEX_PAINT", "OBJECT") and set(bpy.context.selected_objects) == {ball, other}
+    types = [obj.data.attributes["metallic"].data_type for obj in (ball, other)]
+    assert types == ["FLOAT_COLOR", "FLOAT"], "the other is as it was"
+    plain = mesh_object("Plain", *sphere())
+    bpy.ops.object.mode_set(mode="OBJECT")
+    select(other, plain)  # the active one has no channels
+    assert bpy.ops.drgs.paint(channel="metallic") == {"FINISHED"}
+    assert bpy.context.active_object == other and other.mode == "VERTEX_PAINT" and plain.select_get()
+    about = bpy.ops.drgs.paint.get_rna_type().description
+    assert "active DR-GS object" in about and "stay selected" in about
 
 
 @pytest.mark.parametrize("channel", CHANNELS)
