@@ -1,15 +1,17 @@
-"""Simulate an object: preview its particles, bake, cancel, free. The engine works in a process of its own."""
+"""Simulate objects: preview their particles, bake, cancel, free. The engine works in a process of its own."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable
+from functools import partial
 
 import bpy
 from bpy.props import EnumProperty, IntProperty
 
 from ..addon import assets, messages
+from ..addon.export.memory import uid
 from ..addon.matter import points, work
-from ..drgs_blender.errors import DrgsError
 from . import targets
 from .base import DrgsOperator
 
@@ -24,25 +26,34 @@ def _has_matter(obj: bpy.types.Object | None) -> bool:
     return assets.is_drgs(obj) and obj.drgs.matter.use
 
 
-def _idle(cls: type[bpy.types.Operator], context: bpy.types.Context) -> bool:
+def _idle(cls: type[bpy.types.Operator], objects: Iterable[bpy.types.Object | None]) -> bool:
     """Poll of what needs matter for which nothing is being done."""
-    has = _has_matter(context.object)
+    objects = list(objects)
+    has = bool(objects) and all(map(_has_matter, objects))
     cls.poll_message_set("Wait for what is being done, or cancel it" if has else NEEDS)
-    return has and work.of(context.object) is None
+    return has and not any(work.of(obj) or work.is_waiting(obj) for obj in objects)
 
 
 class _Worker(DrgsOperator):
-    """Runs a `work.Work`: step by step beside Blender's window, at once in background mode and without a window."""
+    """Does a `work.Work` for each of some objects, one after another: step by step beside Blender's window, at once in
+    background mode and without a window. Where one fails, that is told, and the next begins."""
 
     _work: work.Work
+    _queue: list[int]
+    _succeeded = False
     _timer: bpy.types.Timer | None = None
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return _idle(cls, context)
+    def objects(cls, context: bpy.types.Context) -> list[bpy.types.Object]:
+        """Those to work for."""
+        return [context.object]
 
-    def begin(self, context: bpy.types.Context) -> work.Work:
-        """The work to do."""
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return _idle(cls, cls.objects(context))
+
+    def begin(self, obj: bpy.types.Object, scene: bpy.types.Scene) -> work.Work:
+        """The work to do for an object."""
         raise TypeError(f"{type(self).__name__} has no work")
 
     def done(self, context: bpy.types.Context) -> str:
@@ -55,11 +66,29 @@ class _Worker(DrgsOperator):
         return {"CANCELLED"}
 
     def run(self, context: bpy.types.Context) -> set[str]:
-        self._work = self.begin(context)
+        self._queue = list(map(uid, self.objects(context)))
+        work.waiting.update(self._queue)
+        try:
+            if not self._next(context):
+                return self._result()
+        except Exception:
+            self._abandon()
+            raise
         if not bpy.app.background and context.window is not None:
             self._timer = context.window_manager.event_timer_add(_TICK, window=context.window)
             context.window_manager.modal_handler_add(self)
             return {"RUNNING_MODAL"}
+        try:
+            going = True
+            while going:
+                self.guard(self._whole, context)
+                going = self._next(context)
+        finally:
+            self.cancel(context)
+        return self._result()
+
+    def _whole(self, context: bpy.types.Context) -> set[str]:
+        """Do the work under way, and wait for it."""
         try:
             while not self._work.step():
                 time.sleep(_SHARE)
@@ -67,35 +96,68 @@ class _Worker(DrgsOperator):
         finally:
             self._work.close()
 
+    def _next(self, context: bpy.types.Context) -> bool:
+        """Begin with the next object for which that can be done; whether there is one."""
+        while self._queue:
+            key = self._queue.pop(0)
+            if key not in work.waiting:  # the artist thought better of it
+                continue
+            work.waiting.discard(key)
+            obj = work.object_of(key)
+            if obj is not None and self.guard(partial(self._take_up, obj), context) == {"RUNNING_MODAL"}:
+                return True
+        return False
+
+    def _take_up(self, obj: bpy.types.Object, context: bpy.types.Context) -> set[str]:
+        self._work = self.begin(obj, context.scene)
+        return {"RUNNING_MODAL"}
+
+    def _result(self) -> set[str]:
+        return {"FINISHED"} if self._succeeded else {"CANCELLED"}
+
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         if self._work.cancelled or (event.type == "ESC" and event.value == "PRESS"):
+            self._abandon()
             self._release(context)
             return self.stopped()
         if event.type != "TIMER":
             return {"RUNNING_MODAL"} if self._work.capturing else {"PASS_THROUGH"}
         try:
-            if not self._work.step(_SHARE):
-                context.workspace.status_text_set(f"{self._work.subject}: {self._work.progress()[1]}. Esc cancels")
-                _redraw(context, "PROPERTIES")
+            if self.guard(self._part, context) == {"PASS_THROUGH"}:
                 return {"PASS_THROUGH"}
-            result = self._tell(context)
-        except DrgsError as error:
-            result = self.fail(error)
+            self._work.close()
+            if self._next(context):
+                return {"PASS_THROUGH"}
         except Exception:
             self.cancel(context)
             raise
-        self.cancel(context)
-        return result
+        self._release(context)
+        return self._result()
+
+    def _part(self, context: bpy.types.Context) -> set[str]:
+        """Go on with the work under way for a moment."""
+        if self._work.step(_SHARE):
+            return self._tell(context)
+        context.workspace.status_text_set(f"{self._work.subject}: {self._work.progress()[1]}. Esc cancels")
+        _redraw(context, "PROPERTIES")
+        return {"PASS_THROUGH"}
 
     def cancel(self, context: bpy.types.Context) -> None:
-        """End the work; also called when Blender closes or loads a file."""
+        """End the work, and what was to follow; also called when Blender closes or loads a file."""
+        self._abandon()
         self._work.close()
         self._release(context)
+
+    def _abandon(self) -> None:
+        """Nothing is to follow."""
+        work.waiting.difference_update(self._queue)
+        self._queue.clear()
 
     def _tell(self, context: bpy.types.Context) -> set[str]:
         text = self.done(context)
         messages.note("INFO", text)
         self.report({"INFO"}, text)
+        self._succeeded = True
         return {"FINISHED"}
 
     def _release(self, context: bpy.types.Context) -> None:
@@ -107,38 +169,42 @@ class _Worker(DrgsOperator):
 
 
 class DRGS_OT_bake_matter(_Worker, bpy.types.Operator):
-    """Simulate all frames with the engine"""
+    """Simulate all frames of the selected objects with the engine"""
 
     bl_idname = "drgs.bake_matter"
     bl_label = "Bake"
     bl_description = (
-        "Simulate all frames with the engine. Frames that are baked with these settings stay, others are replaced. "
-        "Esc cancels, and the next bake goes on"
+        "Simulate all frames of the selected objects with the engine, one object after another, the active one last. "
+        "Frames that are baked with these settings stay, others are replaced. Esc cancels, and the next bake goes on"
     )
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
 
-    def begin(self, context: bpy.types.Context) -> work.Work:
-        return work.Bake(context.object, context.scene)
+    @classmethod
+    def objects(cls, context: bpy.types.Context) -> list[bpy.types.Object]:
+        return work.chosen(context)
+
+    def begin(self, obj: bpy.types.Object, scene: bpy.types.Scene) -> work.Work:
+        return work.Bake(obj, scene)
 
     def stopped(self) -> set[str]:
         kept = self._work.cancel()
         text = f"{self._work.subject}: stopped at {self._work.progress()[1].split(',')[0].lower()}; Bake goes on"
         messages.note("INFO", text)
         self.report({"INFO"}, text)
-        return {"FINISHED"} if kept else {"CANCELLED"}
+        return {"FINISHED"} if kept or self._succeeded else {"CANCELLED"}
 
     def done(self, context: bpy.types.Context) -> str:
         return f"{self._work.subject}: {self._work.frames} frames baked in {self._work.folder}"
 
 
 class DRGS_OT_preview_matter(_Worker, bpy.types.Operator):
-    """Show the particles that fill the object, and how long a bake takes at least"""
+    """Show the particles that fill the active object, and how long a bake takes at least"""
 
     bl_idname = "drgs.preview_matter"
     bl_label = "Preview Filling"
 
-    def begin(self, context: bpy.types.Context) -> work.Work:
-        return work.Preview(context.object, context.scene)
+    def begin(self, obj: bpy.types.Object, scene: bpy.types.Scene) -> work.Work:
+        return work.Preview(obj, scene)
 
     def done(self, context: bpy.types.Context) -> str:
         particles, steps = self._work.counts
@@ -163,7 +229,7 @@ class DRGS_OT_hide_preview(DrgsOperator, bpy.types.Operator):
 
 
 class DRGS_OT_cancel_matter(DrgsOperator, bpy.types.Operator):
-    """Stop what is being done for this object; Bake goes on later"""
+    """Stop what is being done for this object, and what waits for that; Bake goes on later"""
 
     bl_idname = "drgs.cancel_matter"
     bl_label = "Cancel"
@@ -171,15 +237,19 @@ class DRGS_OT_cancel_matter(DrgsOperator, bpy.types.Operator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         cls.poll_message_set("Nothing is being done for the active object")
-        return work.of(context.object) is not None
+        return work.of(context.object) is not None or work.is_waiting(context.object)
 
     def run(self, context: bpy.types.Context) -> set[str]:
+        if work.is_waiting(context.object):
+            work.waiting.discard(uid(context.object))
+            return {"FINISHED"}
         work.of(context.object).cancelled = True  # its own operator ends it
         return {"FINISHED"}
 
 
 class DRGS_OT_free_matter(DrgsOperator, bpy.types.Operator):
-    """Remove the baked frames from the disk; the object is as it was before. Files cannot be brought back by undo"""
+    """Remove the active object's baked frames from the disk; it is as it was before. Files cannot be brought back by
+    undo"""
 
     bl_idname = "drgs.free_matter"
     bl_label = "Free Cache"
@@ -187,7 +257,7 @@ class DRGS_OT_free_matter(DrgsOperator, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return _idle(cls, context)
+        return _idle(cls, [context.object])
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         return context.window_manager.invoke_confirm(self, event)

@@ -61,6 +61,10 @@ class Program:
     folder : the cache; what it holds of other settings is removed
     threads : 0 for all cores
 
+    Attributes
+    ----------
+    name : in messages
+
     Raises
     ------
     DeviceError, UsageError
@@ -73,6 +77,7 @@ class Program:
         self._said, self._log = inputs / capture.SAID, inputs / capture.LOG
         command = engine_link.command_line()
         python = command[: command.index("-m")]
+        self.name = f"drgs simulate of {python[0]}"
         options = {"creationflags": subprocess.CREATE_NO_WINDOW} if sys.platform == "win32" else {}
         arguments = [inputs / capture.BODY, "--settings", inputs / capture.SETTINGS, "--out", folder]
         arguments += ["--overwrite", "--threads", str(threads)]

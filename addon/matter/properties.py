@@ -55,6 +55,14 @@ def _take_preset(settings: _Matter, context: bpy.types.Context) -> None:
         setattr(settings, name, math.radians(value) if name in ANGLES else value)
 
 
+def _take_range(settings: DrgsMatterSettings, context: bpy.types.Context) -> None:
+    """Take the scene's frames when matter is switched on for the first time, as Blender's own caches do."""
+    scene = context.scene
+    chosen = settings.is_property_set("frame_start") or settings.is_property_set("frame_end")
+    if settings.use and not chosen and scene.frame_end > scene.frame_start:
+        settings.frame_start, settings.frame_end = scene.frame_start, scene.frame_end
+
+
 class _Matter:
     """A material: a row of the engine's table and the numbers of it."""
 
@@ -197,6 +205,7 @@ class DrgsMatterSettings(_Matter, bpy.types.PropertyGroup):
         name="Matter",
         description="Fill the object with matter and let the engine simulate it; its surface follows",
         default=False,
+        update=_take_range,
         options=set(),
     )
     regions: CollectionProperty(type=DrgsMatterRegion, name="Regions")
@@ -302,7 +311,7 @@ class DrgsMatterSettings(_Matter, bpy.types.PropertyGroup):
     walls: EnumProperty(name="Walls", description="What the sides of the domain do", items=WALL_ITEMS)
     frame_start: IntProperty(
         name="First Frame",
-        description="Frame in which all is at rest and the simulation begins",
+        description="Frame in which all is at rest and the simulation begins; at first the scene's first one",
         default=1,
         min=-1_048_574,
         max=1_048_574,
@@ -310,7 +319,7 @@ class DrgsMatterSettings(_Matter, bpy.types.PropertyGroup):
     )
     frame_end: IntProperty(
         name="Last Frame",
-        description="Last frame that is baked; the object stays so after it",
+        description="Last frame that is baked; the object stays so after it. At first the scene's last one",
         default=100,
         min=-1_048_574,
         max=1_048_574,

@@ -13,14 +13,15 @@ import time
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NoReturn
 
 import bpy
 import numpy as np
 
-from ...drgs_blender.errors import DrgsError, UsageError
+from ...drgs_blender.errors import DrgsError, EngineError, UsageError
 from ...drgs_blender.matter import MATERIALS
 from ...drgs_blender.particle_cache import ParticleCache
-from .. import messages
+from .. import assets, messages, written
 from ..export.memory import uid
 from . import capture, playback, points
 from .describe import check, describe, folder_of, own_folder, subject_of
@@ -37,6 +38,8 @@ _START, _FRAME, _KEEP = 3.0, 0.02, 5e-7
 
 #: What is being done, by the `uid` of its object.
 running: dict[int, Work] = {}
+#: Objects whose bake begins when those before it have ended, by `uid`.
+waiting: set[int] = set()
 
 
 class Work:
@@ -147,6 +150,12 @@ class Work:
     def _finish(self) -> None:
         """The program has done its work."""
 
+    def _lacks(self, what: str) -> NoReturn:
+        """It says so, but has not written that."""
+        missing = [Path(f"{what} in {self.folder}")]
+        held = f". {self._held()}" if self._held() else ""
+        raise EngineError(self.subject, written.complaint(self._program.name, missing), written.REMEDY + held)
+
 
 class Bake(Work):
     """Frames into the object's cache and its mesh.
@@ -203,6 +212,8 @@ class Bake(Work):
 
     def _finish(self) -> None:
         self._show(renew=True)
+        if self.count < self.frames:
+            self._lacks(f"frames {self.first + self.count} to {self.first + self.frames - 1}")
 
     def _show(self, renew: bool) -> None:
         if not self.count:
@@ -238,8 +249,11 @@ class Preview(Work):
         shutil.rmtree(self._temporary, ignore_errors=True)
 
     def _finish(self) -> None:
+        cache = ParticleCache(self.folder)
+        if self._program.counts is None or cache.header() is None:
+            self._lacks("the particles")
         self.counts = self._program.counts
-        points.show(self.target(), ParticleCache(self.folder).rest().points, self.counts)
+        points.show(self.target(), cache.rest().points, self.counts)
 
 
 @dataclass(frozen=True, slots=True)
@@ -298,6 +312,21 @@ def free(obj: bpy.types.Object) -> None:
         os.rmdir(folder)
 
 
+def chosen(context: bpy.types.Context) -> list[bpy.types.Object]:
+    """What Bake bakes: the selected objects with matter, the active one last, or the one an editor is pinned to."""
+    active = context.active_object
+    if context.object != active:
+        found = [context.object]
+    else:
+        found = [*(obj for obj in context.selected_objects if obj != active), active]
+    return [obj for obj in found if assets.is_drgs(obj) and obj.drgs.matter.use]
+
+
+def is_waiting(obj: bpy.types.Object | None) -> bool:
+    """Whether the bake of an object begins when others have ended."""
+    return obj is not None and uid(obj) in waiting
+
+
 def of(obj: bpy.types.Object | None) -> Work | None:
     """What is being done for an object."""
     return None if obj is None else running.get(uid(obj))
@@ -329,6 +358,7 @@ def clock(seconds: float) -> str:
 
 def end_all() -> None:
     """End everything that runs."""
+    waiting.clear()
     for work in list(running.values()):
         work.close()
 

@@ -111,21 +111,28 @@ def _draw_bake(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
         row.progress(factor=part, text=text)
         row.operator("drgs.cancel_matter", text="", icon="CANCEL")
         return
+    if work.is_waiting(obj):
+        row = layout.row(align=True)
+        row.label(text="Waits for the bakes before it", icon="TIME")
+        row.operator("drgs.cancel_matter", text="", icon="CANCEL")
+        return
     try:
         found = work.cached(obj, context.scene)
     except DrgsError as error:
         layout.label(text=str(error), icon="ERROR")
         return
     row = layout.row(align=True)
+    count = len(work.chosen(context))
+    more = f" {count} Objects" if count > 1 else ""
     if not found.frames:
-        row.operator("drgs.bake_matter", icon="REC")
+        row.operator("drgs.bake_matter", text=f"Bake{more}", icon="REC")
         return
     if found.changed:
         layout.label(text="Settings have changed: a bake begins anew", icon="INFO")
         text = "Bake Anew"
     else:
         text = "Bake Again" if found.frames >= found.wanted else f"Resume ({found.frames} of {found.wanted})"
-    row.operator("drgs.bake_matter", text=text, icon="REC")
+    row.operator("drgs.bake_matter", text=f"Bake{more}" if more else text, icon="REC")
     row.operator("drgs.free_matter", text="", icon="TRASH")
 
 

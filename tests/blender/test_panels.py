@@ -135,12 +135,24 @@ def reconstructing(ball_file):
     image.save()
 
 
-@pytest.mark.parametrize(
-    "state", [empty, imported, unselected, damaged, bound, painted, others, elsewhere, reconstructing]
-)
+def matter(ball_file):
+    """Two objects of which one waits for the bake of the other."""
+    imported(ball_file)
+    bpy.context.active_object.drgs.matter.use = True
+    other = bpy.context.active_object.copy()
+    bpy.context.scene.collection.objects.link(other)
+    select(other, bpy.context.active_object)
+    part("addon.matter.work").waiting.add(part("addon.export.memory").uid(bpy.context.active_object))
+
+
+STATES = [empty, imported, unselected, damaged, bound, painted, others, elsewhere, reconstructing, matter]
+
+
+@pytest.mark.parametrize("state", STATES)
 @pytest.mark.parametrize("engine", [True, False])
 def test_every_panel_and_menu_is_drawn(scene, ball_file, state, engine, monkeypatch):
     monkeypatch.setattr(part("addon.reconstruction"), "job", None)
+    monkeypatch.setattr(part("addon.matter.work"), "waiting", set())
     state(ball_file)
     if not engine:
         monkeypatch.setenv("DRGS_ENGINE", "/nowhere")
@@ -164,6 +176,29 @@ def _own(cls: type) -> dict[str, object]:
     """Methods and values of a class that its drawing may use."""
     names = (n for c in cls.__mro__ if c.__module__.startswith(PACKAGE) for n in vars(c))
     return {n: getattr(cls, n) for n in names if not n.startswith(("__", "draw", "poll", "bl_"))}
+
+
+def test_the_bake_button_says_of_how_many_objects(scene, ball_file):
+    matter(ball_file)
+    work = part("addon.matter.work")
+    texts = []
+
+    class Panel(Layout):
+        def check(self, name, named):
+            texts.append(named.get("text"))
+            return super().check(name, named)
+
+    draw = part("addon.panels.matter")._draw_bake
+    draw(Panel([]), bpy.context)
+    assert texts[1:] == ["Waits for the bakes before it", ""]
+    work.waiting.clear()
+    texts.clear()
+    draw(Panel([]), bpy.context)
+    assert texts == [None, "Bake 2 Objects"]
+    select(bpy.context.active_object)
+    texts.clear()
+    draw(Panel([]), bpy.context)
+    assert texts == [None, "Bake"]
 
 
 def test_the_newest_problem_is_in_the_header_of_viewports(scene, monkeypatch):
