@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import os
+from collections.abc import Iterable
 from pathlib import Path
 
 import bpy
@@ -11,10 +13,13 @@ import bpy
 from ..drgs_blender.asset import Asset
 from ..drgs_blender.asset.container import read_asset
 from ..drgs_blender.errors import AssetError, UsageError
+from ..drgs_blender.sequence import frame_path
 from .preferences import ROOT
 
 #: (path, mtime_ns, size) -> asset, arrays memory-mapped. A changed file gets a new key; `forget` empties it.
 _open: dict[tuple[str, int, int], Asset] = {}
+#: Files that programs are writing, of which there will be objects.
+_coming: set[str] = set()
 
 
 def is_drgs(obj: bpy.types.Object | None) -> bool:
@@ -39,7 +44,7 @@ def collection(context: bpy.types.Context) -> bpy.types.Collection:
 def anchor(path: Path) -> bpy.types.Volume:
     """The Volume datablock that holds `path`; one per file. The path is relative once the .blend is saved."""
     for volume in bpy.data.volumes:
-        if not volume.library and volume.filepath and _same(bpy.path.abspath(volume.filepath), path):
+        if not volume.library and volume.filepath and _key(bpy.path.abspath(volume.filepath)) == _key(path):
             return volume
     volume = bpy.data.volumes.new(path.name)
     volume.filepath = str(path)
@@ -80,11 +85,42 @@ def check_unused(path: Path) -> None:
     UsageError
         Names the object.
     """
-    for obj in filter(is_drgs, bpy.data.objects):
-        if _same(str(_path(obj.drgs.asset)), path):
-            raise UsageError(
-                f'Object "{obj.name}"', f"is made of {path}, which would be lost", "Choose another file name"
-            )
+    if (obj := _users().get(_key(path))) is not None:
+        raise UsageError(f'Object "{obj.name}"', f"is made of {path}, which would be lost", "Choose another file name")
+    if _key(path) in _coming:
+        raise UsageError(str(path), "is being written already", "Wait until it is done, or choose another file name")
+
+
+def unused(path: Path, frames: Iterable[int] = ()) -> Path:
+    """`path`, or, where an object is made of it or will be, numbered as Blender numbers names.
+
+    Parameters
+    ----------
+    path : a pattern with ``#`` where there are frames
+    """
+    taken, numbers = _users().keys() | _coming, list(frames)
+
+    def files(template: Path) -> list[Path]:
+        return [frame_path(str(template), number) for number in numbers] or [template]
+
+    if taken.isdisjoint(map(_key, files(path))):
+        return path
+    name = path.stem.rstrip("#_-. ") or path.stem
+    for number in itertools.count(1):
+        other = path.with_name(f"{name}.{number:03}{path.stem[len(name) :]}{path.suffix}")
+        if not any(os.path.lexists(file) or _key(file) in taken for file in files(other)):
+            return other
+    raise AssertionError("numbers do not end")
+
+
+def announce(paths: Iterable[Path]) -> None:
+    """Have `unused` and `check_unused` heed files that a program begins to write."""
+    _coming.update(map(_key, paths))
+
+
+def renounce(paths: Iterable[Path]) -> None:
+    """The program has ended."""
+    _coming.difference_update(map(_key, paths))
 
 
 def load(path: Path) -> Asset:
@@ -120,5 +156,11 @@ def _path(volume: bpy.types.Volume) -> Path:
     return Path(bpy.path.abspath(volume.filepath, library=volume.library))
 
 
-def _same(first: str, second: Path) -> bool:
-    return os.path.normcase(os.path.realpath(first)) == os.path.normcase(os.path.realpath(second))
+def _users() -> dict[str, bpy.types.Object]:
+    """An object for each file of which there are any."""
+    return {_key(_path(obj.drgs.asset)): obj for obj in filter(is_drgs, bpy.data.objects)}
+
+
+def _key(path: str | Path) -> str:
+    """The same for every way to write the path of a file."""
+    return os.path.normcase(os.path.realpath(path))

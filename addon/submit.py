@@ -7,13 +7,14 @@ import subprocess
 import sys
 import tempfile
 import time
+from pathlib import Path
 
 import bpy
 from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
 
 from ..drgs_blender.engine.child import clean_environment
 from ..drgs_blender.errors import DeviceError, UsageError
-from . import engine_link, messages
+from . import engine_link, messages, written
 
 INTERVAL = 0.2
 #: Newer Blenders warn of a leading // where a property does not say that it may have one.
@@ -27,6 +28,8 @@ MANAGERS = (
     ("slurm", "Slurm", "An array job"),
     ("flamenco", "Flamenco", "A job and its job type for a Flamenco Manager"),
 )
+#: What each of them is given, in the job's folder.
+JOB_FILES = {"openjd": "template.json", "slurm": "submit.sh", "flamenco": "job.json"}
 
 
 class DrgsSubmitSettings(bpy.types.PropertyGroup):
@@ -108,6 +111,10 @@ class Submission:
         engine = engine_link.command_line()
         python = engine[: engine.index("-m")]
         words = [*python, "-m", "drgs_blender.cli.main", "--no-progress", "submit", *arguments(scene)]
+        self._program = f"drgs submit of {python[0]}"
+        self._expected = written.Expected(
+            [Path(bpy.path.abspath(settings.folder)).absolute() / JOB_FILES[settings.manager]]
+        )
         options = {"creationflags": subprocess.CREATE_NO_WINDOW} if sys.platform == "win32" else {}
         self._said, self._log = tempfile.TemporaryFile(), tempfile.TemporaryFile()  # noqa: SIM115 - until it has ended
         try:
@@ -141,7 +148,12 @@ class Submission:
         said, log = (self._read(stream) for stream in (self._said, self._log))
         marks = ("note ", "missing ")
         self.notes = [line.partition(" ")[2].strip() for line in said if line.startswith(marks)]
-        if self._process.returncode == 0 and len(said) >= 2:
+        missing = self._expected.missing()
+        if self._process.returncode == 0 and (missing or len(said) < 2):
+            self.text = "No job was written"
+            problem = written.complaint(self._program, missing) if missing else f"{self._program} named no command"
+            self.error = f"{problem}. {written.REMEDY}."
+        elif self._process.returncode == 0:
             self.text, self.command = said[-2].removesuffix(". Submit with"), said[-1]
         else:
             last = log[-1] if log else f"ended with code {self._process.returncode} and no word"

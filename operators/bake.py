@@ -94,9 +94,12 @@ class DRGS_OT_bake_light(ProgramOperator, targets.ObjectMode, bpy.types.Operator
                 for name in set(self._names) - known:
                     raise UsageError(f'Object "{name}"', "is not rendered", "Enable it in renders, or deselect it")
                 write_frame_file(frame_path(scenes, number), frame)
+            files = []
             for i, obj in enumerate(objects):
-                arguments += ["--object", obj.name, *self._place(context, i, obj)]
-        return self.start(context, arguments, "Light", "Baking light", "could not be baked")
+                place = self._place(context, i, obj)
+                arguments += ["--object", obj.name, *place]
+                files += [frame_path(place[0], number) for number in self._frames]
+        return self.start(context, arguments, "Light", "Baking light", "could not be baked", files)
 
     def done(self, context: bpy.types.Context) -> set[str]:
         """Put what the program wrote where it belongs."""

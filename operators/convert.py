@@ -20,7 +20,11 @@ class DRGS_OT_convert(ProgramOperator, bpy.types.Operator):
     bl_label = "Convert to DR-GS"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
 
-    out: StringProperty(name="Asset", description="The file to write; empty is beside the .blend", subtype="FILE_PATH")
+    out: StringProperty(
+        name="Asset",
+        description="The file to write; empty is beside the .blend, numbered where an object is made of that",
+        subtype="FILE_PATH",
+    )
     use_mesh: BoolProperty(
         name="Build Mesh",
         description="Build a mesh around splats, so that they can be bent and cast shadows. Else light meets the "
@@ -30,6 +34,7 @@ class DRGS_OT_convert(ProgramOperator, bpy.types.Operator):
     use_original: BoolProperty(name="Keep Original", description="Leave the original visible", default=False)
 
     _name = ""
+    _target = Path()
     _placed = False
 
     @classmethod
@@ -47,30 +52,29 @@ class DRGS_OT_convert(ProgramOperator, bpy.types.Operator):
             raise UsageError(subject, "is a DR-GS object already", "Choose another")
         if not self.out and not bpy.data.filepath:
             raise UsageError(subject, "has no place for its asset", "Save the .blend, or name the asset's file")
-        target = self._target(obj)
-        assets.check_unused(target)
+        named = self.out or f"//{bpy.path.clean_name(obj.name)}"
+        target = Path(bpy.path.abspath(named)).absolute().with_suffix(".drgs")
+        if self.out:
+            assets.check_unused(target)
+        self._target = target = target if self.out else assets.unused(target)
         self._name = obj.name
         with self.folder("drgs-convert-"):
             arguments = self._source(context, obj)
         arguments += ["--out", str(target)]
-        return self.start(context, arguments, subject, f"Making {target.name}", "could not be made into an asset")
+        status = f"Making {target.name}"
+        return self.start(context, arguments, subject, status, "could not be made into an asset", [target])
 
     def done(self, context: bpy.types.Context) -> set[str]:
         original = bpy.data.objects.get(self._name)
         if original is None:
             raise UsageError(f'Object "{self._name}"', "is gone", "Undo what removed it")
-        (made,) = import_assets(context, [self._target(original)])
+        (made,) = import_assets(context, [self._target])
         if not self._placed:
             made.matrix_world = original.matrix_world
         if not self.use_original:
             original.hide_set(True)
             original.hide_render = True
         return {"FINISHED"}
-
-    def _target(self, obj: bpy.types.Object) -> Path:
-        """The asset to write."""
-        named = self.out or f"//{bpy.path.clean_name(obj.name)}"
-        return Path(bpy.path.abspath(named)).absolute().with_suffix(".drgs")
 
     def _source(self, context: bpy.types.Context, obj: bpy.types.Object) -> list[str]:
         """Write what the object is, and return the arguments that make an asset of it."""

@@ -9,6 +9,7 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, St
 
 from ..drgs_blender.errors import UsageError
 from ..drgs_blender.filetypes import WRITTEN
+from ..drgs_blender.sequence import frame_path
 from .import_parts import UP_ITEMS
 from .scene_frames import NUMBER, SceneFrames, draw_colour
 
@@ -103,7 +104,8 @@ class DRGS_OT_export(SceneFrames, bpy.types.Operator):
             arguments.append(f"--scale={self.scale:.9g}")
         if not kind.fixed and self.up != "auto":
             arguments.append(f"--up={self.up}")
-        return self.start(context, arguments, target.name, f"Writing {target.name}", "could not be written")
+        files = [frame_path(str(target), n) for n in ([context.scene.frame_current] if frames is None else frames)]
+        return self.start(context, arguments, target.name, f"Writing {target.name}", "could not be written", files)
 
 
 CLASSES = (DRGS_OT_export,)

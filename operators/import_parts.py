@@ -53,7 +53,9 @@ class DRGS_OT_import_parts(ProgramOperator, bpy.types.Operator):
     )
     environment: StringProperty(name="Environment", description="EXR or HDR image of the light", subtype="FILE_PATH")
     out: StringProperty(
-        name="Asset", description="The file to write; empty is beside the first file", subtype="FILE_PATH"
+        name="Asset",
+        description="The file to write; empty is beside the first file, numbered where an object is made of that",
+        subtype="FILE_PATH",
     )
     up: EnumProperty(name="Up", description="Axis that points up in the files", items=UP_ITEMS, default="auto")
     scale: FloatProperty(name="Scale", description="Factor on all lengths", default=1.0, min=1e-6, max=1e6)
@@ -75,6 +77,7 @@ class DRGS_OT_import_parts(ProgramOperator, bpy.types.Operator):
     files: CollectionProperty(type=bpy.types.OperatorFileListElement, options={"SKIP_SAVE", "HIDDEN"})
 
     _frames: tuple[int, ...] = ()
+    _target = Path()
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         try:
@@ -87,17 +90,14 @@ class DRGS_OT_import_parts(ProgramOperator, bpy.types.Operator):
         self._take_dropped()
         arguments = self._arguments()
         name = Path(self.surfels or self.mesh).name
-        status = f"Making {self._target().name}"
-        return self.start(context, arguments, name, status, "could not be made into an asset")
+        status = f"Making {self._target.name}"
+        return self.start(context, arguments, name, status, "could not be made into an asset", self._files())
 
     def done(self, context: bpy.types.Context) -> set[str]:
-        target = self._target()
-        if not self._frames:
-            import_assets(context, [target], self.use_environment)
-            return {"FINISHED"}
-        written = [frame_path(str(target), frame) for frame in self._frames]
-        objects = import_assets(context, written, self.use_environment)
-        sequences.play(objects, list(self._frames), target.stem.rstrip("#_-. ") or target.stem)
+        objects = import_assets(context, self._files(), self.use_environment)
+        if self._frames:
+            stem = self._target.stem
+            sequences.play(objects, list(self._frames), stem.rstrip("#_-. ") or stem)
         return {"FINISHED"}
 
     def _take_dropped(self) -> None:
@@ -114,9 +114,18 @@ class DRGS_OT_import_parts(ProgramOperator, bpy.types.Operator):
         self.filepath = ""
         self.files.clear()
 
-    def _target(self) -> Path:
-        """The asset to write."""
-        return Path(bpy.path.abspath(self.out or self.surfels or self.mesh)).with_suffix(".drgs")
+    def _files(self) -> list[Path]:
+        """The assets to write."""
+        return [frame_path(str(self._target), frame) for frame in self._frames] or [self._target]
+
+    def _take_target(self) -> None:
+        """Find where to write: never over the asset of an object."""
+        target = Path(bpy.path.abspath(self.out or self.surfels or self.mesh)).with_suffix(".drgs")
+        if self._frames and "#" not in target.name:
+            raise UsageError(target.name, "has no # for the number of each frame", "Write asset_####.drgs")
+        self._target = target if self.out else assets.unused(target, self._frames)
+        for path in self._files():
+            assets.check_unused(path)
 
     def _arguments(self) -> list[str]:
         """Arguments of the command ``drgs``."""
@@ -125,12 +134,9 @@ class DRGS_OT_import_parts(ProgramOperator, bpy.types.Operator):
             raise UsageError("Import", "neither surfels nor a mesh are given", "Choose at least one file")
         arguments = ["import", surfels] if surfels else ["make", mesh]
         self._frames = tuple(frames_of(surfels)) if "#" in Path(surfels).name else ()
+        self._take_target()
         if self._frames:
-            if "#" not in self._target().name:
-                raise UsageError(self._target().name, "has no # for the number of each frame", "Write asset_####.drgs")
             arguments += ["--frames", ",".join(map(str, self._frames))]
-        for target in [frame_path(str(self._target()), frame) for frame in self._frames] or [self._target()]:
-            assets.check_unused(target)
         if surfels and mesh:
             arguments += ["--mesh", mesh]
         elif surfels and not self.use_mesh:
@@ -145,7 +151,7 @@ class DRGS_OT_import_parts(ProgramOperator, bpy.types.Operator):
             arguments.append(f"--up={self.up}")
         if self.scale != 1.0:
             arguments.append(f"--scale={self.scale:.9g}")
-        return [*arguments, "--out", str(self._target())]
+        return [*arguments, "--out", str(self._target)]
 
 
 def kind_of(path: Path) -> str:

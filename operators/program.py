@@ -7,15 +7,15 @@ import os
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import bpy
 
-from ..addon import engine_link, messages
+from ..addon import assets, engine_link, messages, written
 from ..addon.matter.program import MAIN
 from ..drgs_blender.engine.child import clean_environment
-from ..drgs_blender.errors import AssetError, UsageError
+from ..drgs_blender.errors import AssetError, EngineError, UsageError
 from .base import DrgsOperator
 
 _INTERVAL = 0.25
@@ -27,7 +27,8 @@ class ProgramOperator(DrgsOperator):
     _process: subprocess.Popen | None = None
     _log: Path | None = None
     _timer: bpy.types.Timer | None = None
-    _subject, _failure = "", ""
+    _subject, _failure, _program = "", "", ""
+    _expected = written.Expected()
     _folder: Path | None = None
 
     def done(self, context: bpy.types.Context) -> set[str]:
@@ -53,11 +54,18 @@ class ProgramOperator(DrgsOperator):
 
     def clear(self) -> None:
         """Remove what was made for the program alone; called however it ends."""
+        assets.renounce(self._expected.paths)
         if self._folder is not None:
             shutil.rmtree(self._folder, ignore_errors=True)
 
     def start(
-        self, context: bpy.types.Context, arguments: list[str], subject: str, status: str, failure: str
+        self,
+        context: bpy.types.Context,
+        arguments: list[str],
+        subject: str,
+        status: str,
+        failure: str,
+        files: Iterable[Path],
     ) -> set[str]:
         """Run ``drgs`` with `arguments`; in the background, wait for it.
 
@@ -66,8 +74,11 @@ class ProgramOperator(DrgsOperator):
         subject : what messages are about
         status : what the status bar says meanwhile
         failure : what became of the subject where the program fails: "could not be ..."
+        files : that it writes
         """
         self._subject, self._failure = subject, failure
+        self._expected = written.Expected(files)
+        assets.announce(self._expected.paths)
         try:
             self._spawn(arguments)
             if bpy.app.background or context.window is None:
@@ -109,6 +120,7 @@ class ProgramOperator(DrgsOperator):
     def _spawn(self, arguments: list[str]) -> None:
         command = engine_link.command_line()
         python = command[: command.index("-m")]
+        self._program = f"drgs {arguments[0]} of {python[0]}"
         handle, name = tempfile.mkstemp(prefix="drgs-", suffix=".log")
         self._log = Path(name)
         try:
@@ -144,6 +156,9 @@ class ProgramOperator(DrgsOperator):
                 raise AssetError(self._subject, f"{self._failure}: {reason.rstrip('.')}", "")
             for line in lines:
                 messages.note("INFO", line)
+            if missing := self._expected.missing():
+                problem = f"{self._failure}: {written.complaint(self._program, missing)}"
+                raise EngineError(self._subject, problem, written.REMEDY)
             return self.done(context)
         finally:
             self.clear()

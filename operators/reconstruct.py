@@ -25,7 +25,7 @@ class DRGS_OT_reconstruct(ProgramOperator, bpy.types.Operator):
     filter_folder: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
     out: StringProperty(
         name="Asset",
-        description="The file to write; empty is beside the .blend",
+        description="The file to write; empty is beside the .blend, numbered where an object is made of that",
         subtype="FILE_PATH",
         options={"SKIP_SAVE"},
     )
@@ -88,7 +88,10 @@ class DRGS_OT_reconstruct(ProgramOperator, bpy.types.Operator):
             )
         out = Path(bpy.path.abspath(self.out or f"//{bpy.path.clean_name(folder.name)}"))
         out = out.absolute().with_suffix(".drgs")
-        assets.check_unused(out)
+        if self.out:
+            assets.check_unused(out)
+        else:
+            out = assets.unused(out)
         arguments = ["reconstruct", str(capture), "--out", str(out), "--minutes", f"{self.minutes:g}"]
         arguments += ["--variant", self.variant]
         if self.resolution:
@@ -100,7 +103,7 @@ class DRGS_OT_reconstruct(ProgramOperator, bpy.types.Operator):
             arguments.append("--no-materials")
         reconstruction.job = reconstruction.Reconstruction(out)
         subject = f'Capture "{folder.name}"'
-        return self.start(context, arguments, subject, f"Making {out.name}", "could not be reconstructed")
+        return self.start(context, arguments, subject, f"Making {out.name}", "could not be reconstructed", [out])
 
     def stopped(self, event: bpy.types.Event) -> bool:
         return reconstruction.job.cancelled  # Esc may be meant for anything else in so many minutes

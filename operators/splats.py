@@ -37,7 +37,7 @@ class DRGS_OT_splats(SceneFrames, bpy.types.Operator):
         with self.folder("drgs-splats-") as folder:
             self._splats = folder / "splats.ply"
             arguments = [*self.describe(context, self._splats, "splats"), "--up=z"]
-        return self.start(context, arguments, "Splats", "Making splats", "could not be made")
+        return self.start(context, arguments, "Splats", "Making splats", "could not be made", [self._splats])
 
     def done(self, context: bpy.types.Context) -> set[str]:
         splat_attributes.new_object(context, "Splats", splat_attributes.read_ply(self._splats))

@@ -177,8 +177,38 @@ def test_surfels_become_an_asset_and_an_object(scene, tmp_path):
     assert len(part("addon.assets").load(tmp_path / "toy.drgs").surfels) == 400
     before = (tmp_path / "toy.drgs").read_bytes()
     with pytest.raises(RuntimeError, match=r'"toy": is made of .*would be lost'):
-        bpy.ops.drgs.import_parts(surfels=str(splats), up="z")
+        bpy.ops.drgs.import_parts(surfels=str(splats), up="z", out=str(tmp_path / "toy.drgs"))
     assert (tmp_path / "toy.drgs").read_bytes() == before
+
+
+def test_a_file_that_is_imported_again_is_another_object(scene, tmp_path):
+    """What the first is made of stays, and what another .blend may be made of."""
+    splats = few_splats(tmp_path / "toy.ply")
+    assert bpy.ops.drgs.import_parts(surfels=str(splats), up="y") == {"FINISHED"}
+    first, before = bpy.context.active_object, (tmp_path / "toy.drgs").read_bytes()
+    (tmp_path / "toy.001.drgs").write_bytes(b"another's")
+    assert bpy.ops.drgs.import_parts(surfels=str(splats), up="z") == {"FINISHED"}
+    second = bpy.context.active_object
+    assert (first.drgs.path, second.drgs.path) == ("//toy.drgs", "//toy.002.drgs") and second.name == "toy.002"
+    assert (tmp_path / "toy.drgs").read_bytes() == before and (tmp_path / "toy.001.drgs").read_bytes() == b"another's"
+    assert np.ptp(part("addon.assets").load(tmp_path / "toy.002.drgs").surfels.centre, axis=0) != pytest.approx(
+        np.ptp(part("addon.assets").load(tmp_path / "toy.drgs").surfels.centre, axis=0)
+    )
+    bpy.data.objects.remove(first)
+    assert bpy.ops.drgs.import_parts(surfels=str(splats), up="z") == {"FINISHED"}
+    assert bpy.context.active_object.drgs.path == "//toy.drgs"
+
+
+def test_a_file_that_a_program_is_writing_is_not_written_by_another(scene, tmp_path):
+    assets = part("addon.assets")
+    target, pattern = tmp_path / "toy.drgs", tmp_path / "dance_##.drgs"
+    assets.announce([target, tmp_path / "dance_02.drgs"])
+    assert assets.unused(target) == tmp_path / "toy.001.drgs"
+    assert assets.unused(pattern, [1, 2]) == tmp_path / "dance.001_##.drgs" and assets.unused(pattern, [1]) == pattern
+    with pytest.raises(part("drgs_blender.errors").UsageError, match=r"toy\.drgs: is being written already"):
+        assets.check_unused(target)
+    assets.renounce([target, tmp_path / "dance_02.drgs"])
+    assert assets.unused(target) == target and assets.unused(pattern, [1, 2]) == pattern
 
 
 def test_names_that_no_file_can_have_are_told(ball, tmp_path):
