@@ -24,6 +24,7 @@ class DRGS_OT_convert(ProgramOperator, bpy.types.Operator):
         name="Asset",
         description="The file to write; empty is beside the .blend, numbered where an object is made of that",
         subtype="FILE_PATH",
+        options={"SKIP_SAVE"},
     )
     use_mesh: BoolProperty(
         name="Build Mesh",

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 import textwrap
 import time
-from pathlib import Path
+from pathlib import Path, PurePath
 
 import bpy
 from bpy.props import BoolProperty, StringProperty
@@ -77,7 +78,7 @@ class DRGS_OT_engine_setup(DrgsOperator, bpy.types.Operator):
         if state == "ready" and groups == [engine_setup.RECONSTRUCT]:
             text = "Adds PyTorch, which From Photographs needs. The folder is"
         column = layout.column(align=True)
-        for line in textwrap.wrap(text, 70) + textwrap.wrap(str(folder), 70, break_on_hyphens=False):
+        for line in textwrap.wrap(text, 70) + path_lines(folder, 70):
             column.label(text=line)
         layout.prop(self, "reconstruct")
         column = layout.column(align=True)
@@ -161,6 +162,16 @@ class DRGS_OT_engine_choose(DrgsOperator, bpy.types.Operator):
         if not preferences.write("engine_python", path):
             raise UsageError("Preferences", "the extension is not enabled", "Enable it in Preferences > Add-ons")
         return bpy.ops.drgs.engine_test()
+
+
+def path_lines(path: PurePath, width: int) -> list[str]:
+    """A path in lines that end behind a folder, so that no name is torn apart that fits into one."""
+    lines = [""]
+    for name in re.split(r"(?<=[\\/])", str(path)):
+        if lines[-1] and len(lines[-1] + name) > width:
+            lines.append("")
+        lines[-1] += name
+    return [part for line in lines for part in textwrap.wrap(line, width, break_on_hyphens=False)]
 
 
 CLASSES = (DRGS_OT_engine_setup, DRGS_OT_engine_setup_cancel, DRGS_OT_engine_choose)

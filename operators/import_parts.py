@@ -56,6 +56,7 @@ class DRGS_OT_import_parts(ProgramOperator, bpy.types.Operator):
         name="Asset",
         description="The file to write; empty is beside the first file, numbered where an object is made of that",
         subtype="FILE_PATH",
+        options={"SKIP_SAVE"},
     )
     up: EnumProperty(name="Up", description="Axis that points up in the files", items=UP_ITEMS, default="auto")
     scale: FloatProperty(name="Scale", description="Factor on all lengths", default=1.0, min=1e-6, max=1e6)

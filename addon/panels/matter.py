@@ -115,6 +115,9 @@ def _draw_bake(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
         row = layout.row(align=True)
         row.label(text="Waits for the bakes before it", icon="TIME")
         row.operator("drgs.cancel_matter", text="", icon="CANCEL")
+        for other in work.running.values():
+            part, text = other.progress()
+            layout.progress(factor=part, text=f"{other.subject}: {text}")
         return
     try:
         found = work.cached(obj, context.scene)

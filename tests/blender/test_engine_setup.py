@@ -8,7 +8,7 @@ import os
 import sys
 import time
 import zipfile
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import bpy
 import pytest
@@ -251,3 +251,13 @@ def test_an_existing_engine_is_chosen_and_another_program_refused(scene, monkeyp
         assert settings.engine_python == place and link.is_running() and not link.problem()
     finally:
         settings.engine_python = ""
+
+
+def test_a_long_path_is_divided_between_its_folders():
+    lines = part("operators.engine_setup").path_lines
+    assert lines(PurePosixPath("/home/someone/a b/user_default/drgs"), 24) == [
+        "/home/someone/a b/",
+        "user_default/drgs",
+    ]
+    assert lines(PurePosixPath("/short"), 24) == ["/short"]
+    assert all(len(line) <= 24 for line in lines(PurePosixPath("/" + "x" * 60 + "/drgs"), 24))

@@ -199,6 +199,11 @@ def test_a_file_that_is_imported_again_is_another_object(scene, tmp_path):
     assert bpy.context.active_object.drgs.path == "//toy.drgs"
 
 
+def test_a_name_once_given_is_not_that_of_the_next_file():
+    for operator in (bpy.ops.drgs.import_parts, bpy.ops.drgs.convert, bpy.ops.drgs.reconstruct):
+        assert operator.get_rna_type().properties["out"].is_skip_save
+
+
 def test_a_file_that_a_program_is_writing_is_not_written_by_another(scene, tmp_path):
     assets = part("addon.assets")
     target, pattern = tmp_path / "toy.drgs", tmp_path / "dance_##.drgs"

@@ -178,9 +178,11 @@ def _own(cls: type) -> dict[str, object]:
     return {n: getattr(cls, n) for n in names if not n.startswith(("__", "draw", "poll", "bl_"))}
 
 
-def test_the_bake_button_says_of_how_many_objects(scene, ball_file):
+def test_the_bake_button_says_of_how_many_objects_and_what_is_waited_for(scene, ball_file, monkeypatch):
     matter(ball_file)
     work = part("addon.matter.work")
+    before = SimpleNamespace(subject='Object "A"', progress=lambda: (0.5, "Frame 3 of 6"))
+    monkeypatch.setattr(work, "running", {-1: before})
     texts = []
 
     class Panel(Layout):
@@ -190,7 +192,7 @@ def test_the_bake_button_says_of_how_many_objects(scene, ball_file):
 
     draw = part("addon.panels.matter")._draw_bake
     draw(Panel([]), bpy.context)
-    assert texts[1:] == ["Waits for the bakes before it", ""]
+    assert texts[1:] == ["Waits for the bakes before it", "", 'Object "A": Frame 3 of 6']
     work.waiting.clear()
     texts.clear()
     draw(Panel([]), bpy.context)
