@@ -27,3 +27,5 @@ def test_one_click_bakes_the_scenes_frames_of_both(seen):
 def test_escape_stops_the_one_and_what_waits(seen):
     going, waited = sorted(seen.result["stopped"], reverse=True)
     assert going > FRAMES and waited == FRAMES
+    stopped = [text for text in seen.result["messages"] if "stopped at" in text]
+    assert len(stopped) == 1 and '"robot.001": stopped at frame' in stopped[0], "the active one is last"
