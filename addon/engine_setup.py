@@ -17,7 +17,7 @@ import shutil
 import signal
 import subprocess
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, NamedTuple
@@ -51,6 +51,8 @@ class Group(NamedTuple):
 ENGINE = Group("", 175e6, 650e6)
 #: PyTorch. On Linux the package index has it with CUDA, which the engine does not use; measured without.
 RECONSTRUCT = Group("reconstruct", 200e6, 900e6)
+#: NVIDIA Warp, for graphics cards.
+GPU = Group("gpu", 150e6, 400e6)
 CUDA_BYTES = 3e9
 
 _STAMP = "drgs-engine.json"
@@ -150,7 +152,7 @@ class EngineSetup:
     python : interpreter that makes it
     source : folder that holds pyproject.toml and drgs_blender
     afresh : take nothing of an earlier set-up
-    reconstruct : with the packages for reconstruction from photographs too
+    extras : further groups of packages
     index : address of a package index that is asked besides those that pip knows
 
     Attributes
@@ -169,7 +171,7 @@ class EngineSetup:
         python: Path,
         source: Path = SOURCE,
         afresh: bool = False,
-        reconstruct: bool = False,
+        extras: Sequence[Group] = (),
         index: str = "",
     ) -> None:
         self.folder, self.source = folder, source
@@ -185,8 +187,7 @@ class EngineSetup:
         self._package, self._package_bytes = "", 0.0
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            groups = (ENGINE, RECONSTRUCT) if reconstruct else (ENGINE,)
-            missing = [g for g in groups if afresh or needs_network(folder, source, g)]
+            missing = [g for g in (ENGINE, *extras) if afresh or needs_network(folder, source, g)]
             free, needed = shutil.disk_usage(folder).free, sum(g.disk for g in missing)
             if free < needed:
                 raise DeviceError(
@@ -244,7 +245,7 @@ class EngineSetup:
         self.done, self.text = True, "Cancelled"
 
     def _plan(self, python: Path, afresh: bool, missing: list[Group], index: str) -> list[Step]:
-        """What is left to do. Reconstruction comes last: without it the engine renders."""
+        """What is left to do. Extras come last: without them the engine renders."""
         own = interpreter(self.folder)
         pip = [str(own), *_FLAGS, "-m", "pip", "install", "--no-input", "--disable-pip-version-check"]
         pip += ["--extra-index-url", index] if index else []
@@ -266,8 +267,8 @@ class EngineSetup:
         doctor = [str(own), *_FLAGS, "-m", f"{PACKAGE}.cli.main", "doctor"]
         ready = lambda: self._stamp(sources=digest(self.source))  # noqa: E731
         steps.append(Step("Trying the engine", doctor, 0.1, ready, before=self._copy))
-        if RECONSTRUCT in missing:
-            steps.append(fetch("Installing PyTorch", RECONSTRUCT))
+        names = {RECONSTRUCT: "PyTorch", GPU: "NVIDIA Warp"}
+        steps += [fetch(f"Installing {names[group]}", group) for group in missing if group in names]
         return steps
 
     def _next(self) -> None:

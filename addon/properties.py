@@ -76,6 +76,15 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
         max=64,
         default=1,
     )
+    device: EnumProperty(
+        name="Device",
+        description="What traces the light. Without a card the processor does all, and says so",
+        items=[
+            ("CPU", "CPU", "The processor"),
+            ("CUDA", "GPU (CUDA)", "An NVIDIA card; Set Up Engine fetches what it needs"),
+        ],
+        default="CPU",
+    )
     use_noise_threshold: BoolProperty(
         name="Noise Threshold",
         description="Stop sampling a pixel once its noise is below the threshold; Rays are then the most it gets",
@@ -212,6 +221,7 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
             noise_threshold=own.noise_threshold if own.use_noise_threshold else 0.0,
             clamp_indirect=own.clamp_indirect,
             split="counts" if own.use_custom_split else "auto",
+            device=own.device.lower(),
         )
 
 

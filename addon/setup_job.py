@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import bpy
 
 from . import engine_link, messages, preferences
-from .engine_setup import EngineSetup
+from .engine_setup import EngineSetup, Group
 
 INTERVAL = 0.2
 
@@ -20,7 +21,7 @@ def running() -> bool:
     return job is not None and not job.done
 
 
-def start(python: Path, afresh: bool = False, reconstruct: bool = False, index: str = "") -> EngineSetup:
+def start(python: Path, afresh: bool = False, extras: Sequence[Group] = (), index: str = "") -> EngineSetup:
     """Begin, or go on where the last one ended; the arguments are those of EngineSetup.
 
     Raises
@@ -30,7 +31,7 @@ def start(python: Path, afresh: bool = False, reconstruct: bool = False, index: 
     """
     global job
     engine_link.stop()  # Windows does not let go of files in use
-    job = EngineSetup(engine_link.own_folder(create=True), python, afresh=afresh, reconstruct=reconstruct, index=index)
+    job = EngineSetup(engine_link.own_folder(create=True), python, afresh=afresh, extras=extras, index=index)
     messages.note("INFO", f"Setting up the engine in {job.folder}")
     if not bpy.app.background and not bpy.app.timers.is_registered(follow):
         bpy.app.timers.register(follow, first_interval=INTERVAL, persistent=True)

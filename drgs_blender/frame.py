@@ -279,6 +279,7 @@ class RenderSettings:
     samples above are then the most a pixel gets. ``clamp_indirect`` above 0 limits the brightness of a single indirect
     sample, which loses energy. ``primary`` is what the camera sees of DR-GS objects; ``tracer`` is what light meets of
     them: their meshes, or the surfels themselves, blended along each ray (slower; for thin things without a good mesh).
+    ``device`` "cuda" has a graphics card do what it can, see docs/gpu.md; without one it is as "cpu", with a warning.
     """
 
     cosine: int = 16
@@ -296,6 +297,7 @@ class RenderSettings:
     noise_threshold: float = 0.0
     clamp_indirect: float = 0.0
     split: Literal["auto", "counts"] = "auto"
+    device: Literal["cpu", "cuda"] = "cpu"
 
     @property
     def rays(self) -> int:

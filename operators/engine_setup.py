@@ -45,6 +45,12 @@ class DRGS_OT_engine_setup(DrgsOperator, bpy.types.Operator):
         default=False,
         options={"SKIP_SAVE"},
     )
+    gpu: BoolProperty(
+        name="Graphics Card",
+        description="Also fetch NVIDIA Warp, which the engine needs to trace on an NVIDIA card; its driver is enough",
+        default=False,
+        options={"SKIP_SAVE"},
+    )
     index: StringProperty(
         name="Extra Index",
         description="Address of a package index that is asked too. Empty: those that pip is configured with",
@@ -60,8 +66,9 @@ class DRGS_OT_engine_setup(DrgsOperator, bpy.types.Operator):
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         folder = engine_link.own_folder()
-        if engine_setup.state(folder) != "absent" and not self._missing(engine_setup.RECONSTRUCT):
-            self.reconstruct = True
+        if engine_setup.state(folder) != "absent":
+            self.reconstruct = self.reconstruct or not self._missing(engine_setup.RECONSTRUCT)
+            self.gpu = self.gpu or not self._missing(engine_setup.GPU)
         return context.window_manager.invoke_props_dialog(self, width=440, confirm_text="Set Up")
 
     def draw(self, context: bpy.types.Context) -> None:
@@ -81,6 +88,7 @@ class DRGS_OT_engine_setup(DrgsOperator, bpy.types.Operator):
         for line in textwrap.wrap(text, 70) + path_lines(folder, 70):
             column.label(text=line)
         layout.prop(self, "reconstruct")
+        layout.prop(self, "gpu")
         column = layout.column(align=True)
         if groups:
             fetch, disk = (sum(getattr(g, size) for g in groups) / 1e6 for size in ("download", "disk"))
@@ -99,7 +107,11 @@ class DRGS_OT_engine_setup(DrgsOperator, bpy.types.Operator):
 
     def _groups(self) -> list[engine_setup.Group]:
         """What is wanted."""
-        return [engine_setup.ENGINE, *([engine_setup.RECONSTRUCT] if self.reconstruct else [])]
+        return [engine_setup.ENGINE, *self._extras()]
+
+    def _extras(self) -> list[engine_setup.Group]:
+        wanted = {engine_setup.RECONSTRUCT: self.reconstruct, engine_setup.GPU: self.gpu}
+        return [group for group, chosen in wanted.items() if chosen]
 
     def _missing(self, group: engine_setup.Group) -> bool:
         """Whether it is to be fetched."""
@@ -115,7 +127,7 @@ class DRGS_OT_engine_setup(DrgsOperator, bpy.types.Operator):
         python = Path(bpy.path.abspath(self.python) or sys.executable)
         if not os.path.isfile(python):
             raise UsageError("Python", f"{python} does not exist", f"Choose a Python of version {engine_setup.PYTHONS}")
-        job = setup_job.start(python, self.afresh, self.reconstruct, self.index.strip())
+        job = setup_job.start(python, self.afresh, self._extras(), self.index.strip())
         if os.environ.get(VARIABLE):
             self.warn(f"The variable {VARIABLE} names another engine, which is used as long as it is set")
         if bpy.app.background:

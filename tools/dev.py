@@ -136,7 +136,7 @@ def ensure_engine() -> Path:
         "optional": project["optional-dependencies"],
         "scripts": project["scripts"],
     }
-    return ensure(ROOT / ".venv", wanted, [torch, ["-e", f"{ROOT}[reconstruct,oidn,dev]"]], "import drgs_blender")
+    return ensure(ROOT / ".venv", wanted, [torch, ["-e", f"{ROOT}[reconstruct,oidn,gpu,dev]"]], "import drgs_blender")
 
 
 def ensure_blender(version: str = BLENDER) -> Path:

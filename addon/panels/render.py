@@ -38,6 +38,7 @@ class DRGS_PT_sampling(_RenderPanel, bpy.types.Panel):
         layout.use_property_split = True
         layout.use_property_decorate = False
         settings = context.scene.drgs
+        layout.prop(settings, "device")
         layout.prop(settings, "use_custom_split")
         column = layout.column(align=True)
         if settings.use_custom_split:

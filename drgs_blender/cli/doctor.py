@@ -179,6 +179,13 @@ def variables(args: argparse.Namespace) -> str:
 
 
 #: name, essential?, test
+def card(args: argparse.Namespace) -> str:
+    """The graphics card that `--device cuda` uses."""
+    from ..render.device.devices import card
+
+    return card()
+
+
 CHECKS: tuple[tuple[str, bool, Callable[[argparse.Namespace], str]], ...] = (
     ("Python", True, python),
     ("Numba", True, numba),
@@ -189,6 +196,7 @@ CHECKS: tuple[tuple[str, bool, Callable[[argparse.Namespace], str]], ...] = (
     ("Blender", False, blender),
     ("scikit-image", False, scikit_image),
     ("torch", False, torch),
+    ("card", False, card),
     ("variables", False, variables),
 )
 

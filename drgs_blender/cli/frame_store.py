@@ -39,14 +39,15 @@ def settings_hash(frame: Frame, assets: Mapping[str, Path]) -> str:
     """SHA-256 over all that decides what the picture is.
 
     That is the description of the frame down to the last vertex, the content of its assets, and the version of DR-GS;
-    not the number of threads.
+    not the number of threads or the device.
 
     Parameters
     ----------
     assets : path of the asset behind each ``ObjectState.asset``
     """
     description, arrays = encode_frame(frame)
-    del description["settings"]["threads"]
+    for name in ("threads", "device"):
+        del description["settings"][name]
     for state in description["objects"]:
         state["asset"] = digest_asset(assets[state["asset"]])
     digest = hashlib.sha256(json.dumps([__version__, description], sort_keys=True).encode())

@@ -20,7 +20,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..errors import AssetError, DeviceError, EngineError, UsageError
+from ..errors import AssetError, EngineError, UsageError
 from ..sequence import frame_path
 from . import sampling, session_link
 from .find_blender import find_blender
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-DEVICES = ("cpu",)
 
 EXAMPLES = """examples:
   drgs render shot.blend --frames 1-24 --out 'frames/####.exr'
@@ -62,7 +61,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     session_link.add_arguments(parser)
     group = parser.add_argument_group("machine")
-    group.add_argument("--device", default="cpu", help="what computes: cpu")
     group.add_argument(
         "--memory-mb", type=sampling.whole(256, 1 << 24), metavar="MB", help="most memory of the engine (Linux)"
     )
@@ -99,8 +97,6 @@ def render(args: argparse.Namespace, machine: Machine) -> int:
     check_suffix(Path(template), (".exr",))
     if not scene.is_file():
         raise AssetError(str(args.scene), "does not exist", "Check the path of the .blend file")
-    if args.device not in DEVICES:
-        raise DeviceError(f"--device {args.device}", "is not something DR-GS computes on", "Use --device cpu")
     check_writable(frame_path(template, frames[0]))
     blender = find_blender(args.blender)
     logger.info("Blender: %s (%s)", blender.program, blender.origin)

@@ -62,6 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser, *, defaults: bool, output: bo
     add("--denoise", "denoise", "denoiser", choices=choices("denoise"))
     add("--look", "look", "material model", choices=choices("look"))
     add("--seed", "seed", "seed of the noise", type=whole(0, 2**31 - 1))
+    add("--device", "device", "what traces light; without a card the processor does", choices=choices("device"))
     add("--threads", "threads", "threads, 0 for all cores", type=whole(0, 1024))
     if not output:
         return
@@ -141,7 +142,7 @@ def check_size(camera: Camera, passes: Sequence[str]) -> None:
 def override(settings: RenderSettings, args: argparse.Namespace) -> RenderSettings:
     """`settings` with every option that was given."""
     numbers = ("bounces", "noise_threshold", "clamp_indirect", "aa", "seed", "threads")
-    names = (*numbers, "primary", "tracer", "denoise", "look", "film_transparent")
+    names = (*numbers, "primary", "tracer", "denoise", "look", "device", "film_transparent")
     given = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
     counts = args.split or (args.rays and split_rays(args.rays))
     if counts:

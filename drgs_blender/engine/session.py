@@ -17,6 +17,7 @@ from ..asset.model import Asset, PosedSurfels
 from ..errors import Cancelled, UsageError
 from ..frame import Frame, Light, ObjectState, RenderSettings
 from ..jit import use_threads
+from ..render.device.devices import Devices
 from ..render.pipeline import Progress, render
 from ..render.shade.adaptive import part_count
 from ..render.trace.scene import TraceObject
@@ -80,6 +81,7 @@ class Session:
         self._views: dict[str, View] = {}
         self._pace = Pace()
         self._views_begun = 0
+        self._devices = Devices()
 
     def load_asset(self, path: str | os.PathLike[str]) -> str:
         """Map the asset file at `path`; return its key. See `Stage.load_asset`."""
@@ -113,7 +115,7 @@ class Session:
         x0, y0, x1, y1 = frame.camera.window
         passes.statistics |= self._statistics(frame, ready[2], lap)
         passes.statistics["samples"] = float((x1 - x0) * (y1 - y0) * frame.settings.rays)
-        passes.warnings = self._stage.warnings() + _unheeded(frame.settings)
+        passes.warnings = self._warnings(frame.settings) + _unheeded(frame.settings)
         return passes
 
     def place(self, frame: Frame, progress: OnProgress | None = None) -> tuple[Ready, list[Placed]]:
@@ -150,7 +152,13 @@ class Session:
         by_mesh = self._stage.detailed(frame)
         rough = replace(frame, settings=replace(frame.settings, primary="mesh")) if by_mesh else frame
         ready = self._prepare(rough, lap, progress)
-        view = View(self._stage.kept(frame), self._pace, self._views_begun, by_mesh)
+        view = View(
+            self._stage.kept(frame),
+            self._pace,
+            self._views_begun,
+            by_mesh,
+            self._devices.processor(frame.settings.device),
+        )
         self._views_begun += 1
         passes = view.begin(ready, lambda frame, ready, tell: self._draw(frame, ready, tell, cancelled))
         lap("render")
@@ -181,7 +189,7 @@ class Session:
     def _seen(self, view: View, passes: Passes, ready: Ready, lap: _Laps) -> Passes:
         passes.statistics |= self._statistics(view.frame, ready[2], lap)
         passes.statistics |= {"view.fraction": view.fraction, "view.pixel": float(view.pixel)}
-        passes.warnings = self._stage.warnings()
+        passes.warnings = self._warnings(view.frame.settings)
         return passes
 
     def _draw(self, frame: Frame, ready: Ready, tell: Progress | None, cancelled: IsCancelled | None) -> Passes:
@@ -205,6 +213,7 @@ class Session:
             self._stage.instant(frame, frame.previous),
             self._stage.instant(frame, frame.next),
             None if sequence is None else sequence.history,
+            self._devices.processor(frame.settings.device),
         )
         if sequence is not None:
             self._histories.keep(frame, sequence, scene)
@@ -221,6 +230,9 @@ class Session:
         light, lamps = self._stage.light_of(frame.world), self._stage.lamps_of(frame.lights)
         lap("light")
         return self._stage.scene, light, posed, lamps, self._stage.tree
+
+    def _warnings(self, settings: RenderSettings) -> list[str]:
+        return self._stage.warnings() + self._devices.warnings(settings)
 
     def _statistics(self, frame: Frame, posed: PosedSurfels, lap: _Laps) -> dict[str, float]:
         return lap.seconds | {

@@ -13,6 +13,7 @@ from ..render.lights.lamps import Lamps
 from ..render.lights.light import EnvironmentLight
 from ..render.pipeline import Progress
 from ..render.progressive import Progressive, coarse, thinned
+from ..render.shade.integrate import HERE, Processor
 from ..render.surfels.surfel_bvh import SurfelBVH
 from ..render.trace.scene import TraceScene
 from .protocol import Passes
@@ -70,14 +71,16 @@ class View:
     pace : for how coarse the first picture is
     number : another one for every view: in a history, the noise of one picture must differ from that of the next
     by_mesh : whether coarse pictures show the meshes, which are as detailed as those pictures
+    processor : where points are shaded
 
     Attributes
     ----------
     pixel : side of the pixels of the last picture, in those of the frame
     """
 
-    def __init__(self, frame: Frame, pace: Pace, number: int, by_mesh: bool) -> None:
+    def __init__(self, frame: Frame, pace: Pace, number: int, by_mesh: bool, processor: Processor = HERE) -> None:
         self.frame, self._pace, self._number, self._by_mesh = frame, pace, number, by_mesh
+        self._processor = processor
         self.pixel = 1
         self._picture: Progressive | None = None
 
@@ -99,7 +102,7 @@ class View:
             self.pixel //= 4
             return passes
         if self._picture is None:
-            picture, seconds = Progressive(self.frame), 0.0
+            picture, seconds = Progressive(self.frame, self._processor), 0.0
         else:
             picture, seconds = self._picture, STEP_SECONDS
         pictures = picture.advance(*ready, seconds, cancelled)

@@ -7,6 +7,7 @@ address keeps the array alive and in place.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,8 @@ from numba import types
 from numba.extending import intrinsic
 
 Array = np.ndarray
+#: Tells where compiled code finds an array: `address`, or where its copy on a device lies.
+Place = Callable[[Array], int]
 
 
 def address(array: Array) -> int:

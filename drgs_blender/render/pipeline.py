@@ -32,7 +32,7 @@ from .primary.primary_mesh import primary_mesh
 from .primary.primary_surfels import primary_surfels, snap_windows
 from .primary.seen_lamps import seen_lamps
 from .shade.adaptive import part_count, sample_adaptively
-from .shade.integrate import integrate
+from .shade.integrate import HERE, Processor, integrate
 from .surfels.splats import Splats, prepare
 from .surfels.surfel_bvh import SurfelBVH
 from .trace.scene import TraceScene
@@ -59,6 +59,7 @@ def render(
     previous: Instant | None = None,
     following: Instant | None = None,
     history: History | None = None,
+    processor: Processor = HERE,
 ) -> dict[str, Array]:
     """Render the passes of a frame.
 
@@ -73,6 +74,7 @@ def render(
     tree : the surfels that light meets, when ``frame.settings.tracer`` is "surfels"
     previous, following : the scene one frame earlier and later; None: nothing moves
     history : what earlier pictures leave to the denoiser SVGF; brought up to date when the picture is done
+    processor : where points are shaded
 
     Returns
     -------
@@ -115,7 +117,7 @@ def render(
         for then in (previous, following, past)
     ]
     end = 1.0 if settings.denoise == "none" else 0.9
-    batches = Batches(scene, light, lamps, tree, frame, check)
+    batches = Batches(scene, light, lamps, tree, frame, check, processor)
     height = strip_height(right - left, settings.positions)
     for y0 in range(top, bottom, height):
         tell(end * (y0 - top) / (bottom - top), "Rendering")
@@ -208,10 +210,10 @@ class Batches:
 
     def __init__(
         self, scene: TraceScene, light: EnvironmentLight, lamps: Lamps | None, tree: SurfelBVH | None, frame: Frame,
-        check: Check,
+        check: Check, processor: Processor = HERE,
     ) -> None:  # fmt: skip
         self._scene, self._light, self._lamps, self._frame, self._check = scene, light, lamps, frame, check
-        self._tree = tree
+        self._tree, self._processor = tree, processor
         self._parts = part_count(frame.settings)
         self._size = max(FEWEST_POINTS, FIRST_SAMPLES * self._parts // max(1, frame.settings.rays))
 
@@ -240,6 +242,7 @@ class Batches:
                 self._lamps,
                 part,
                 self._tree,
+                self._processor,
             )
             out.components[first:last], out.variance[first:last] = found.components, found.variance
             out.moments[first:last] = found.moments

@@ -27,6 +27,7 @@ from .points import Radiance, ShadingPoints
 from .primary.gbuffer import GBuffer
 from .primary.seen_lamps import seen_lamps
 from .shade.adaptive import Sampling, part_count
+from .shade.integrate import HERE, Processor
 from .shade.spread import variances
 from .surfels.surfel_bvh import SurfelBVH
 from .trace.scene import TraceScene
@@ -153,12 +154,12 @@ class Progressive:
 
     Parameters
     ----------
-    frame : as of `pipeline.render`
+    frame, processor : as of `pipeline.render`
     """
 
-    def __init__(self, frame: Frame) -> None:
+    def __init__(self, frame: Frame, processor: Processor = HERE) -> None:
         check_frame(frame)
-        self.frame = frame
+        self.frame, self._processor = frame, processor
         self._parts = parts_of(frame.settings)
         self._adaptive = part_count(frame.settings) > 1
         self._next = 0
@@ -201,7 +202,7 @@ class Progressive:
         check()
         if self._primary is None:
             self._primary = Primary(scene, posed, self.frame, self._parameters, tree)
-        batches = Batches(scene, light, lamps, tree, self.frame, check)
+        batches = Batches(scene, light, lamps, tree, self.frame, check, self._processor)
         began = time.perf_counter()
         while self._next < len(self._parts):
             self._draw(batches, check)

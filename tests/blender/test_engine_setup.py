@@ -124,7 +124,7 @@ def test_another_version_of_the_engine_needs_no_network(made):
 def test_reconstruction_is_added_to_an_engine_that_is_ready(made):
     folder, source = made
     assert setup.needs_network(folder, source, setup.RECONSTRUCT) and not list(folder.rglob("tinytorch.py"))
-    running = setup.EngineSetup(folder, Path("/no/python/is/needed"), source, reconstruct=True)
+    running = setup.EngineSetup(folder, Path("/no/python/is/needed"), source, extras=[setup.RECONSTRUCT])
     assert running.fraction < 0.1
     fractions = until_done(running)
     assert running.error is None and fractions == sorted(fractions) and fractions[-1] == 1
@@ -144,7 +144,7 @@ def test_an_engine_without_reconstruction_renders_and_says_so(made, monkeypatch)
     try:
         (source / "pyproject.toml").write_text(text.replace("tinytorch-1.0", "tinytorch-2.0"))
         setup.requirements.cache_clear()
-        running = setup.EngineSetup(folder, Path("/no/python/is/needed"), source, reconstruct=True)
+        running = setup.EngineSetup(folder, Path("/no/python/is/needed"), source, extras=[setup.RECONSTRUCT])
         until_done(running)
         assert "Installing PyTorch" in str(running.error) and setup.state(folder, source) == "ready"
         link = part("addon.engine_link")

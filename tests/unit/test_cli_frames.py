@@ -83,7 +83,7 @@ def test_content_of_the_asset_counts_not_its_place(asset):
 
 
 def test_threads_change_nothing(asset):
-    threaded = replace(scene(), settings=RenderSettings(threads=7))
+    threaded = replace(scene(), settings=RenderSettings(threads=7, device="cuda"))
     assert frame_store.settings_hash(threaded, {"key": asset}) == frame_store.settings_hash(scene(), {"key": asset})
 
 

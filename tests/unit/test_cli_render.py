@@ -263,8 +263,8 @@ def test_a_frame_that_takes_too_long_is_given_back(render, tmp_path):
 
 
 def test_what_computes_nowhere_is_refused_before_anything_starts(render):
-    code, lines, errors = render("--device", "cuda")
-    assert (code, lines) == (69, ["DRGS_EXIT class=no-device"]) and "cuda" in errors[-1]
+    code, lines, errors = render("--device", "abacus")
+    assert (code, lines) == (64, ["DRGS_EXIT class=usage"]) and "abacus" in errors[-1]
 
 
 def test_nothing_is_left_in_the_temporary_folder(render, tmp_path_factory, monkeypatch):

@@ -11,7 +11,7 @@ import numpy as np
 
 from ...colour import LUMINANCE as WEIGHTS
 from ...jit import njit
-from ..memory import address, load_float, load_int32, load_int64
+from ..memory import Place, address, load_float, load_int32, load_int64
 from ..sampling import ONE, ZERO, F, unit
 from ..trace.scene import Glowing, TraceScene
 from ..trace.surface import Geometry, emitted
@@ -118,12 +118,16 @@ class Emitters:
     @property
     def address(self) -> int:
         """What compiled code takes, 0 where there is none; until the next update of the scene."""
+        return self.address_at(address)
+
+    def address_at(self, place: Place) -> int:
+        """`address` of arrays that lie elsewhere."""
         if self._scene is None or not self.count:
             return 0
-        where = [address(array) for array in (self.rows, self.nodes, self.sums)] + [self.count, len(self.nodes) // 2]
-        where += [address(array) for array in (self.faces, self.slot, self.first, self.row)]
-        self._tables = np.array([*where, *self._scene.geometry], np.int64)
-        return address(self._tables)
+        where = [place(array) for array in (self.rows, self.nodes, self.sums)] + [self.count, len(self.nodes) // 2]
+        where += [place(array) for array in (self.faces, self.slot, self.first, self.row)]
+        self._tables = np.array([*where, *self._scene.geometry_at(place)], np.int64)
+        return place(self._tables)
 
     def power(self, centre: Array, radius: float) -> float:
         """Luminance that arrives at a sphere from all directions together, as `Lamps.power`."""
@@ -212,10 +216,13 @@ def _luminance(glow: Glowing, scene: TraceScene) -> Array:
 @njit
 def _tables(emitters):  # type: ignore[no-untyped-def]
     """EmitterTables, from where they stand."""
-    at = lambda i: load_int64(emitters, i)  # noqa: E731
-    tree = Tree(at(0), at(1), at(2), at(3), at(4))
-    geometry = Geometry(at(9), at(10), at(11), at(12), at(13), at(14), at(15), at(16), at(17), at(18))
-    return EmitterTables(tree, at(5), at(6), at(7), at(8), geometry)
+    e = emitters
+    tree = Tree(load_int64(e, 0), load_int64(e, 1), load_int64(e, 2), load_int64(e, 3), load_int64(e, 4))
+    geometry = Geometry(
+        load_int64(e, 9), load_int64(e, 10), load_int64(e, 11), load_int64(e, 12), load_int64(e, 13),
+        load_int64(e, 14), load_int64(e, 15), load_int64(e, 16), load_int64(e, 17), load_int64(e, 18),
+    )  # fmt: skip
+    return EmitterTables(tree, load_int64(e, 5), load_int64(e, 6), load_int64(e, 7), load_int64(e, 8), geometry)
 
 
 def _is_closed(faces: Array) -> bool:

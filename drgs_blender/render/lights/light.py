@@ -16,7 +16,7 @@ from ...asset.model import as_float
 from ...errors import UsageError
 from ...frame import World
 from ...jit import njit, prange
-from ..memory import address, load_float, load_int32, load_uint32
+from ..memory import Place, address, load_float, load_int32, load_uint32
 from ..sampling import fast_acos, fast_atan2_turns, sincos_turns, unit
 from .cells import Cells
 from .facing import Facing, block_of, facing_ratio, facing_row, in_cells_order
@@ -138,23 +138,27 @@ class EnvironmentLight:
     @property
     def sky(self) -> Sky:
         """What compiled code reads; valid while this light lives and its rotation is not replaced."""
+        return self.sky_at(address)
+
+    def sky_at(self, place: Place) -> Sky:
+        """`sky` of arrays that lie elsewhere."""
         height, width = self.texels.shape[:2]
         cells, facing = self.cells, self.facing
         return Sky(
-            address(self.texels),
+            place(self.texels),
             height,
             width,
-            address(cells.runs),
-            address(cells.guide),
+            place(cells.runs),
+            place(cells.guide),
             len(cells.guide),
-            address(self.row_z),
+            place(self.row_z),
             cells.step,
             width // cells.step,
-            address(facing.starts),
-            address(facing.slices),
-            address(facing.ratio),
-            address(facing.first),
-            address(cells.block),
+            place(facing.starts),
+            place(facing.slices),
+            place(facing.ratio),
+            place(facing.first),
+            place(cells.block),
             len(facing.first),
             cells.block.shape[1],
             cells.shift,

@@ -101,10 +101,15 @@ def _double(a):  # type: ignore[no-untyped-def]
 
 
 @njit
+def _single(a):  # type: ignore[no-untyped-def]
+    return F(a[0]), F(a[1]), F(a[2])
+
+
+@njit
 def _angle(corner, edge, side, near):  # type: ignore[no-untyped-def]
     """Solid angle by which a triangle is sampled (Van Oosterom, Strackee 1983), 0: by area; corners' directions."""
-    corner = _double(corner)
-    a, b, c = _unit(corner), _unit(_plus(corner, edge)), _unit(_plus(corner, side))
+    first = _double(corner)
+    a, b, c = _unit(first), _unit(_plus(first, edge)), _unit(_plus(first, side))
     solid = 0.0
     if near:
         volume = abs(_dot(*a, *_cross(*b, *c)))
@@ -147,8 +152,7 @@ def triangle_direction(i, n1, n2, px, py, pz, rows):  # type: ignore[no-untyped-
     normal, area = _vector(rows, k + NORMAL), load_float(rows, k + AREA)
     solid, a, b, c = _angle(corner, edge, side, near)
     if solid > 0.0:
-        x, y, z = _spherical(np.float64(n1), np.float64(n2), solid, a, b, c)
-        direction = F(x), F(y), F(z)
+        direction = _single(_spherical(np.float64(n1), np.float64(n2), solid, a, b, c))
         slope = _dot(*direction, *normal)
         t = _dot(*corner, *normal) / slope if slope != ZERO else -ONE
         # Where that is on the triangle, along both edges.

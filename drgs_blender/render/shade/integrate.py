@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ...colour import LUMINANCE
-from ...errors import UsageError
+from ...errors import DeviceError, UsageError
 from ...frame import RenderSettings
 from ...jit import get_num_threads, njit, prange
 from .. import sampling
@@ -30,7 +30,7 @@ from .heads import ALPHA, COUNTS, HEAD, put_sample, write_heads
 from .paths import FOUND, trace_paths
 from .rays import mixed_tracer
 from .spread import variances
-from .strategies import BATCH, KIND, KINDS, deliver, finish, path_lights, trace_batch
+from .strategies import BATCH, KIND, KINDS, deliver, finish, trace_batch
 
 Array = np.ndarray
 
@@ -43,6 +43,32 @@ _BLOCK = 64
 _LEAST_SHARE = 0.1
 
 
+class Processor:
+    """Where points are shaded: here, by all threads. `render.device` has the same for a graphics card.
+
+    Attributes
+    ----------
+    failed : why it is of no use any more, in words; what it was to do is done here
+    """
+
+    failed = ""
+
+    def takes(self, surfels: SurfelBVH | None) -> bool:
+        """Whether it can trace what rays are to meet next to meshes."""
+        return True
+
+    def tables(self, scene: TraceScene, light: EnvironmentLight, lamps: Lamps) -> tuple[Any, Any, Any, Any]:
+        """(tracer, geometry, sky, lamps) as `kernel` takes them; until the scene's next update."""
+        return scene.tracer, scene.geometry, light.sky, lamps.tables
+
+    def kernel(self, *arguments: Any) -> None:
+        """Shade all points; see `shade_points`."""
+        _kernel(*arguments, 8 * get_num_threads())
+
+
+HERE = Processor()
+
+
 def integrate(
     scene: TraceScene,
     light: EnvironmentLight,
@@ -52,6 +78,7 @@ def integrate(
     lamps: Lamps | None = None,
     part: tuple[int, int] = (0, 1),
     surfels: SurfelBVH | None = None,
+    processor: Processor = HERE,
 ) -> Radiance:
     """Light that leaves `points` towards the camera.
 
@@ -64,6 +91,7 @@ def integrate(
     frame_number : int, part of the seed
     part : (i, n): only the i-th of n equal parts of each sub-sample's samples; the mean over all parts is the whole
     surfels : what rays meet of DR-GS objects next to the scene's meshes; then `points` say which surfels are their own
+    processor : where
 
     Returns
     -------
@@ -75,6 +103,20 @@ def integrate(
     UsageError
         When settings are out of range.
     """
+    if not processor.failed and processor.takes(surfels):
+        try:
+            return _integrated(scene, light, points, settings, frame_number, lamps, part, surfels, processor)
+        except DeviceError as error:
+            if processor is HERE:
+                raise
+            processor.failed = str(error)
+    return _integrated(scene, light, points, settings, frame_number, lamps, part, surfels, HERE)
+
+
+def _integrated(
+    scene: TraceScene, light: EnvironmentLight, points: ShadingPoints, settings: RenderSettings, frame_number: int,
+    lamps: Lamps | None, part: tuple[int, int], surfels: SurfelBVH | None, processor: Processor,
+) -> Radiance:  # fmt: skip
     counts = (settings.cosine, settings.ggx, settings.environment)
     if min(counts) < 0 or settings.bounces < 0 or settings.aa < 0:
         raise UsageError("render settings", "samples, bounces or aa are negative", "Use counts of zero or more")
@@ -91,13 +133,14 @@ def integrate(
     share = sky_share(light, lamps)
     # Where neither shines, nothing is drawn by its light, though surfaces may emit some.
     sky_part, lamp_part = share * (not light.black), (1.0 - share) * (lamps.count > 0)
+    tracer, geometry, sky, lamp_tables = processor.tables(scene, light, lamps)
     tables = (
-        scene.tracer if surfels is None else mixed_tracer(scene.tracer, tracer_of(surfels)),
-        scene.geometry,
+        tracer if surfels is None else mixed_tracer(tracer, tracer_of(surfels)),
+        geometry,
         F(scene.extent if surfels is None else max(scene.extent, surfels.extent)),
-        light.sky,
+        sky,
         (not light.black, lamps.count > 0),
-        lamps.tables,
+        lamp_tables,
         brdf.layer_table(),
         sampling.point_set(sum(counts) + 1),
     )
@@ -113,16 +156,14 @@ def integrate(
     )
 
     def run(some: ShadingPoints, shift: int, found: Radiance) -> None:
-        _kernel(
+        processor.kernel(
             (some.pixel, some.sample, some.flags),
             (some.origin, some.normal, some.geometric_normal, some.view),
             (some.albedo, some.roughness, some.metallic, some.own, some.size),
             *tables,
             *rules,
             shift,
-            8 * get_num_threads(),
-            found.components,
-            found.moments,
+            (found.components, found.moments),
         )
 
     run(points, 0, out)
@@ -159,23 +200,26 @@ def mixed(seed: int, frame_number: int) -> int:
 
 
 @njit
-def _lane(
-    lane: Any, keys: Any, frames: Any, surfaces: Any, tracer: Any, geometry: Any, extent: Any, sky: Any, sky_rules: Any,
-    lamps: Any, table: Any, sequence: Any, split: Any, aa: Any, part: Any, bounces: Any, look: Any, seed: Any,
-    limit: Any, differ: Any, shift: Any, lanes: Any, components: Any, moments: Any,
+def shade_points(
+    lane: Any, lanes: Any, room: Any, keys: Any, frames: Any, surfaces: Any, tracer: Any, geometry: Any, extent: Any,
+    sky: Any, sky_rules: Any, lamps: Any, table: Any, sequence: Any, split: Any, aa: Any, part: Any, bounces: Any,
+    look: Any, seed: Any, limit: Any, differ: Any, shift: Any, out: Any,
 ) -> None:  # fmt: skip
-    """Every so-manyth block of points, from the `lane`-th on."""
+    """Shade every so-manyth (`lanes`) block of points, from the `lane`-th on.
+
+    Parameters
+    ----------
+    room : scratch memory, see `_room`
+    keys, frames, surfaces : arrays of the points
+    out : components and moments of their `Radiance`
+    """
     pixel, sample, flags = keys
+    components, moments = out
     n = len(pixel)
     blocks = (n + _BLOCK - 1) // _BLOCK
     scene, lights = (tracer, geometry, extent), (sky, sky_rules[0], lamps, sky_rules[1])
-    rays, paths = w.batch(BATCH), w.batch(BATCH)
+    rays, paths, found, sums, head, row, total = room
     s, ints = rays
-    found = np.zeros((BATCH, FOUND), np.float32)
-    sums = np.empty((_BLOCK, KINDS * KIND), np.float32)
-    head = np.zeros((_BLOCK, HEAD), np.float32)
-    row = np.zeros(_BLOCK, np.uint32)
-    total = np.empty(_BLOCK, np.int64)
     # Samples of a sub-sample's part lie next to each other among those of the pixel.
     rate = ONE / F(aa * part[1])
     for block in range(lane, blocks, lanes):
@@ -220,43 +264,35 @@ def _lane(
                     strategy, count, rays, paths, begun, found, scene, lights, table, bounces, look, limit, differ,
                     shift, sums,
                 )  # fmt: skip
-        trace_paths(paths[0], paths[1], begun, scene, path_lights(lights), look, table, bounces, shift, found)
+        trace_paths(paths[0], paths[1], begun, scene, lights, look, table, bounces, shift, found)
         deliver(begun, found, limit, sums)
         for i in range(start, end):
             finish(sums, i - start, total[i - start], components, moments, i)
+
+
+@njit
+def _room() -> Any:
+    """Scratch memory of `shade_points`."""
+    return (
+        w.batch(BATCH),
+        w.batch(BATCH),
+        np.zeros((BATCH, FOUND), np.float32),
+        np.empty((_BLOCK, KINDS * KIND), np.float32),
+        np.zeros((_BLOCK, HEAD), np.float32),
+        np.zeros(_BLOCK, np.uint32),
+        np.empty(_BLOCK, np.int64),
+    )
 
 
 @njit(parallel=True)
 def _kernel(
     keys: Any, frames: Any, surfaces: Any, tracer: Any, geometry: Any, extent: Any, sky: Any, sky_rules: Any,
     lamps: Any, table: Any, sequence: Any, split: Any, aa: Any, part: Any, bounces: Any, look: Any, seed: Any,
-    limit: Any, differ: Any, shift: Any, lanes: Any, components: Any, moments: Any,
+    limit: Any, differ: Any, shift: Any, out: Any, lanes: Any,
 ) -> None:  # fmt: skip
     # Threads get neighbouring lanes, lanes get every so-manyth block: no thread is left with all the costly ones.
     for lane in prange(lanes):
-        _lane(
-            np.int64(lane),
-            keys,
-            frames,
-            surfaces,
-            tracer,
-            geometry,
-            extent,
-            sky,
-            sky_rules,
-            lamps,
-            table,
-            sequence,
-            split,
-            aa,
-            part,
-            bounces,
-            look,
-            seed,
-            limit,
-            differ,
-            shift,
-            lanes,
-            components,
-            moments,
-        )
+        shade_points(
+            np.int64(lane), lanes, _room(), keys, frames, surfaces, tracer, geometry, extent, sky, sky_rules, lamps,
+            table, sequence, split, aa, part, bounces, look, seed, limit, differ, shift, out,
+        )  # fmt: skip

@@ -94,7 +94,7 @@ def _towards_lamps(s: Any, ints: Any, count: Any, lamps: Any, tracer: Any, shift
 
 @njit
 def _onwards(
-    s: Any, ints: Any, count: Any, bounce: Any, last: Any, sky: Any, lamps: Any, lamp_share: Any, glows: Any,
+    s: Any, ints: Any, count: Any, bounce: Any, last: Any, sky: Any, lamps: Any, any_lamps: Any, glows: Any,
     scene: Any, shift: Any, found: Any,
 ) -> Any:  # fmt: skip
     """The BRDF samples; return how many paths go on, in slots 0, 1, ..."""
@@ -108,22 +108,22 @@ def _onwards(
         direction = (s[i + w.LX], s[i + w.LY], s[i + w.LZ])
         diffuse = ints[c + w.CELL] == U(1)
         mask = np.int32((masks.DIFFUSE if diffuse else masks.GLOSSY) << shift)
-        ends = last and lamp_share == ZERO and not glows
+        ends = last and not any_lamps and not glows
         if ends:
             through = passed(tracer, s, ints, slot, FAR, mask)
         else:
             through, reach, hit = meet(tracer, s, ints, slot, mask)
         owner = np.int64(ints[c + w.OWNER])
         fr, fg, fb = s[i + w.QR], s[i + w.QG], s[i + w.QB]
-        if lamp_share > ZERO:
+        if any_lamps:
             seen_by = DIFFUSE if diffuse else GLOSSY
-            red, green, blue = lamps_along(*position, *direction, reach, s[i + w.PG], lamp_share, seen_by, *lamps)
+            red, green, blue = lamps_along(*position, *direction, reach, s[i + w.PG], ONE, seen_by, *lamps)
             found[owner, INDIRECT] += fr * red
             found[owner, INDIRECT + 1] += fg * green
             found[owner, INDIRECT + 2] += fb * blue
         if glows:
             red, green, blue, own, glossy = emission_along(*position, *direction, hit, geometry, *lamps)
-            weight = ONE / (s[i + w.PG] + lamp_share * (own if diffuse else glossy))
+            weight = ONE / (s[i + w.PG] + (own if diffuse else glossy))
             found[owner, INDIRECT] += fr * red * weight
             found[owner, INDIRECT + 1] += fg * green * weight
             found[owner, INDIRECT + 2] += fb * blue * weight
@@ -160,13 +160,13 @@ def trace_paths(
     Parameters
     ----------
     scene : (Tracer or MixedTracer, Geometry, extent)
-    lights : (Sky, whether the sky shines, tables of lamps, number of lamp samples)
+    lights : (Sky, whether it shines, tables of lamps, whether there are any: one of them is sampled at every vertex)
     bounces : vertices of a path, and whether there are surfaces that emit, which are looked for beyond the last too
     shift : 0, or ``masks.WITHOUT``
     found : (capacity, FOUND) float32; INDIRECT is written
     """
     tracer, _, _ = scene
-    sky, sky_shines, lamps, lamp_share = lights
+    sky, sky_shines, lamps, any_lamps = lights
     vertices, glows = bounces
     for slot in range(count):
         i, c = w.at(slot)
@@ -183,7 +183,7 @@ def trace_paths(
             w.evaluate(s, count, look)
             w.carry(s, count, ONE)
             _towards_sky(s, ints, count, sky, tracer, shift, found)
-        if lamp_share > ZERO:
+        if any_lamps:
             w.fresh_numbers(ints, count, U(0x2C1B3C6D))
             w.lamp_directions(s, ints, count, lamps)
             w.evaluate(s, count, look)
@@ -193,4 +193,4 @@ def trace_paths(
         w.evaluate(s, count, look)
         w.carry(s, count, ZERO)
         last = bounce + 1 == vertices
-        count = _onwards(s, ints, count, bounce, last, sky, lamps, lamp_share, glows, scene, shift, found)
+        count = _onwards(s, ints, count, bounce, last, sky, lamps, any_lamps, glows, scene, shift, found)

@@ -159,7 +159,7 @@ def trace_batch(
     sky, sky_shines, lamps, any_lamps = lights
     lamps_differ, apart = differ
     w.scramble(ints, count)
-    if strategy == LAMPS:
+    if any_lamps and strategy == LAMPS:
         _trace_lamps(count, s, ints, scene, lamps, look, apart, shift, sums)
         return begun
     if strategy == SKY:
@@ -202,7 +202,7 @@ def trace_batch(
         others = cosine * s[i + w.WC] * s[i + w.PC] + ggx * s[i + w.WG] * s[i + w.PG]
         rest = (ONE - through) * (ONE + s[i + w.WE] * s[i + w.PE] / max(others, F(1e-30)))
         if begun == BATCH:
-            trace_paths(p, path_ints, begun, scene, path_lights(lights), look, table, bounces, shift, found)
+            trace_paths(p, path_ints, begun, scene, lights, look, table, bounces, shift, found)
             deliver(begun, found, limit, sums)
             begun = np.int64(0)
         put_hit(tracer, p, path_ints, begun, *position, *direction, hit, ints[c + w.KEY], begun)
@@ -217,12 +217,6 @@ def trace_batch(
     if sky_shines:
         _see_sky(count, s, ints, sky, sums)
     return begun
-
-
-@njit
-def path_lights(lights: Any) -> Any:
-    """Lights as `trace_paths` takes them: one sample of the lamps a vertex where there are any."""
-    return lights[0], lights[1], lights[2], ONE if lights[3] else ZERO
 
 
 @njit

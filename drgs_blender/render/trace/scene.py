@@ -16,7 +16,7 @@ import numpy as np
 from ...asset.model import as_float
 from ...errors import UsageError
 from ...frame import Image, MeshState, Pose
-from ..memory import address
+from ..memory import Place, address
 from ..sampling import F
 from .instances import Places, normal_matrices, other_matrices, usable_places
 from .masks import object_flags
@@ -86,6 +86,7 @@ class TraceScene:
     ----------
     bvh : TriangleBVH over everything
     layout : another object whenever vertices and faces are numbered anew
+    version : another object after every update
     vertices : (n, 3) float32, faces : (m, 3) int32: as traced (``bvh``'s own arrays), world space save for meshes in
         several places; a face with a bad vertex is collapsed to one point
     face_object : (m,) int32: object of each face (of a mesh in several places: the mesh)
@@ -106,7 +107,7 @@ class TraceScene:
 
     def __init__(self) -> None:
         self.bvh = TriangleBVH()
-        self.layout = object()
+        self.layout = self.version = object()
         self.shading_faces: Array = np.empty((0, 3), np.int32)
         self.shading: Array = np.empty((0, SHADING_WIDTH), np.float32)
         self.normals: Array = np.empty((0, 3), np.float32)
@@ -154,18 +155,37 @@ class TraceScene:
     @property
     def geometry(self) -> Geometry:
         """What compiled code finds behind a hit; until the next update."""
+        return self.geometry_at(address)
+
+    def geometry_at(self, place: Place) -> Geometry:
+        """`geometry` of arrays that lie elsewhere."""
+        tables = self._material_tables if place is address else np.array(self.materials.addresses_at(place), np.int64)
         return Geometry(
-            address(self.shading_faces),
-            address(self.shading),
-            address(self.normals),
-            address(self.face_object),
+            place(self.shading_faces),
+            place(self.shading),
+            place(self.normals),
+            place(self.face_object),
             self.vertex_faces,
-            address(self._material),
-            address(self._uvs) if len(self._uvs) else 0,
-            address(self._place_normal),
-            address(self.place_object),
-            address(self._material_tables),
+            place(self._material),
+            place(self._uvs) if len(self._uvs) else 0,
+            place(self._place_normal),
+            place(self.place_object),
+            place(tables),
         )
+
+    def standing(self) -> tuple[Array, Array]:
+        """Every triangle of the scene where it stands: (k, 2) int32 face and place (or -1), and its (k,) int32 mask."""
+        rows, masks = [np.empty((0, 2), np.int32)], [np.empty(0, np.int32)]
+        for group, members in enumerate(self._groups):
+            for part in (self._parts[i] for i in members):
+                faces, places = np.arange(part.face.start, part.face.stop, dtype=np.int32), np.full(1, -1, np.int32)
+                if part.instanced:
+                    objects = len(self.faults) - len(self._known)
+                    count = len(self._known[part.source - objects][1].matrices)
+                    places = self._first_place[group] + np.arange(count, dtype=np.int32)
+                rows.append(np.stack([np.tile(faces, len(places)), np.repeat(places, len(faces))], axis=1))
+                masks.append(np.full(len(rows[-1]), part.mask, np.int32))
+        return np.concatenate(rows), np.concatenate(masks)
 
     @property
     def glowing(self) -> list[Glowing]:
@@ -233,6 +253,7 @@ class TraceScene:
         self._number(objects, meshes, stands)
         self._take_materials(parts, before, meshes, images, len(objects))
         self._commit(parts, vertices, places, moved, elsewhere, died)
+        self.version = object()
         self.faults = [ObjectFaults(item.name, 0, 0, 0, p.bad if p else 0) for item, p in zip(items, places)]
         for part in parts:
             fault = self.faults[part.source]

@@ -25,7 +25,7 @@ from ...colour import LUMINANCE, srgb_to_linear, to_unit
 from ...errors import UsageError
 from ...frame import Image, Material, Texture
 from ...jit import njit
-from ..memory import address, load_float, load_int32, load_int64, load_uint32
+from ..memory import Place, address, load_float, load_int32, load_int64, load_uint32
 from ..sampling import HALF, ONE, TWO, ZERO, F, luminance
 
 Array = np.ndarray
@@ -73,10 +73,10 @@ class _Texels:
         shares = [np.bincount(some[:, k], minlength=256) / len(some) for k in range(4)]
         return np.array([*(share @ decoded for share in shares[:3]), shares[3] @ levels])
 
-    def row(self) -> tuple[int, int, int, int]:
+    def row(self, place: Place = address) -> tuple[int, int, int, int]:
         """Address, width, height, kind."""
         height, width = self.texels.shape[:2]
-        return address(self.texels), width, height, self.kind
+        return place(self.texels), width, height, self.kind
 
 
 class MaterialTable:
@@ -134,9 +134,16 @@ class MaterialTable:
             srgb_to_linear(np.arange(256) / 255.0),
         )
         self.glows = bool((constants[:, 5:] > 0.0).any())
-        self.addresses = tuple(address(array) for array in self.arrays)
+        self.addresses = self.addresses_at(address)
         # Only needed above; they would keep the pixels of the frame before alive.
         self._given, self._known = {}, {}
+
+    def addresses_at(self, place: Place) -> tuple[int, ...]:
+        """`addresses` of arrays and pictures that lie elsewhere."""
+        constants, slots, textures, transforms, images, decode = self.arrays
+        if place is not address:
+            images = np.array([texels.row(place) for texels in self._images.values()], np.int64).reshape(-1, 4)
+        return tuple(place(array) for array in (constants, slots, textures, transforms, images, decode))
 
     def lookup(self, material: Array, uv: Array) -> Array:
         """(n, 8) float32, the results of ``material_at`` for (n,) integers and (n, 2) coordinates."""

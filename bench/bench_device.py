@@ -1,0 +1,96 @@
+"""The light of one picture on every device there is: the same samples, how alike they are, and seconds.
+
+python bench/bench_device.py [--size 800] [--runs 5]
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from dataclasses import replace
+
+import numpy as np
+from judge import environments, frame_camera
+from ours import pinhole
+from report import table, write_section
+from subjects import asset_path
+
+from drgs_blender.asset.container import read_asset
+from drgs_blender.device.warp import cuda_devices, warp
+from drgs_blender.errors import DeviceError
+from drgs_blender.formats.registry import read_environment
+from drgs_blender.frame import RenderSettings, World
+from drgs_blender.jit import use_threads
+from drgs_blender.render.camera import camera_parameters
+from drgs_blender.render.device.integrate import OnDevice
+from drgs_blender.render.lights.light import EnvironmentLight
+from drgs_blender.render.points import Radiance
+from drgs_blender.render.primary.primary_mesh import primary_mesh
+from drgs_blender.render.shade.integrate import HERE, Processor, integrate
+from drgs_blender.render.trace.scene import TraceObject, TraceScene
+
+#: Rows, and the processor for each; a card stands in its row whether there is one or not.
+ROWS = ("Numba, Embree, all threads", "Numba, Embree, 1 thread", "Warp on the processor, 1 thread", "Warp on CUDA")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--size", type=int, default=800)
+    parser.add_argument("--runs", type=int, default=5)
+    parser.add_argument("--asset", default="cat")
+    options = parser.parse_args()
+    mesh = read_asset(asset_path(options.asset, max_triangles=82000)).mesh
+    scene = TraceScene()
+    shades = mesh.albedo, mesh.roughness, mesh.metallic
+    scene.update([TraceObject(options.asset, mesh.vertices, mesh.faces, *shades)])
+    camera = pinhole(frame_camera(mesh.vertices, options.size, azimuth=-60, fill=0.66))
+    settings = RenderSettings(16, 8, 8, bounces=1, primary="mesh", aa=4)
+    points = primary_mesh(scene, camera, camera_parameters(camera, settings, 1), 0, options.size).points
+    light = EnvironmentLight(World(environment=read_environment(environments() / "city.exr").radiance))
+
+    def run(processor: Processor, threads: int) -> tuple[Radiance, float, float]:
+        """The light, seconds of the first time, and the median of the others."""
+        use_threads(threads)
+        seconds = []
+        for _ in range(options.runs + 1):
+            began = time.perf_counter()
+            found = integrate(scene, light, points, replace(settings, threads=threads), 1, processor=processor)
+            seconds.append(time.perf_counter() - began)
+        use_threads(0)
+        if processor.failed:
+            raise DeviceError("device", processor.failed, "")
+        return found, seconds[0], statistics.median(seconds[1:])
+
+    cards = cuda_devices()
+    made: dict[str, tuple[Radiance, float, float] | None] = {
+        ROWS[0]: run(HERE, 0),
+        ROWS[1]: run(HERE, 1),
+        ROWS[2]: run(OnDevice("cpu"), 1),
+        ROWS[3]: run(OnDevice(cards[0]), 0) if cards else None,
+    }
+    reference, _, whole = made[ROWS[0]] or (Radiance.dark(0), 0.0, 1.0)
+    rows = []
+    for name, result in made.items():
+        if result is None:
+            rows.append([name, *["not measured: no card"] * 5])
+            continue
+        found, first, seconds = result
+        error = np.mean((np.minimum(found.total, 1) - np.minimum(reference.total, 1)).astype(np.float64) ** 2)
+        alike = float((found.components == reference.components).all(axis=(1, 2)).mean())
+        psnr = "the reference" if found is reference else f"{-10 * np.log10(max(error, 1e-20)):.1f} dB"
+        rows.append([name, f"{first:.1f} s", f"{seconds:.3f} s", f"{whole / seconds:.2f}", psnr, f"{100 * alike:.1f} %"])
+    body = (
+        f"Light of {len(points)} points ({options.size}x{options.size}, 4 positions a pixel, 82k triangles, city HDRI, "
+        f"{settings.rays} rays, one bounce), the same samples and seeds everywhere; medians of {options.runs} runs, "
+        "copies to and from the device included. Held to: 60 dB between devices. Warp runs one thread on a processor: "
+        "its row there tells that the code is right, not how fast a card is.\n\n"
+        + table(["Where", "First time, with kernels", "Seconds", "Speed", "PSNR of the light, white 1", "Points alike to the last bit"], rows)
+    )
+    if cards:
+        body += f"\n\nCard: {warp().get_device(cards[0]).name}."
+    write_section("device", "Devices", body)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""The renderer's kernels on a graphics card; on the processor, by the same translation, for tests."""

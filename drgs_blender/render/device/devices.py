@@ -1,0 +1,69 @@
+"""Which processor shades a frame's points: the one asked for, or this one with a warning that says why."""
+
+from __future__ import annotations
+
+from ...device.warp import cuda_devices, warp
+from ...errors import DeviceError
+from ...frame import RenderSettings
+from ..shade.integrate import HERE, Processor
+from .integrate import OnDevice
+
+#: ``RenderSettings.device``, and what each stands for.
+DEVICES = {"cpu": "this processor", "cuda": "the first NVIDIA card"}
+
+
+class Devices:
+    """The processors of a session, each made when it is first asked for."""
+
+    def __init__(self) -> None:
+        self._known: dict[str, Processor] = {"cpu": HERE}
+        self._missing: dict[str, str] = {}
+
+    def processor(self, device: str) -> Processor:
+        """The processor for a setting; this one where that has none."""
+        if device not in self._known and device not in self._missing:
+            try:
+                self._known[device] = OnDevice(_name(device))
+            except DeviceError as error:
+                self._missing[device] = str(error)
+        return self._known.get(device, HERE)
+
+    def warnings(self, settings: RenderSettings) -> list[str]:
+        """What of the device asked for was not used, and why."""
+        device = settings.device
+        processor = self.processor(device)
+        why = self._missing.get(device) or processor.failed
+        if why:
+            return [f"{why} Rendered on the CPU"]
+        if processor is not HERE and settings.tracer == "surfels":
+            return ["tracer surfels: not on a graphics card; rendered on the CPU"]
+        return []
+
+
+def card() -> str:
+    """What is known of the card that "cuda" stands for.
+
+    Raises
+    ------
+    DeviceError
+        Where there is none.
+    """
+    device = warp().get_device(_name("cuda"))
+    return f"{device.name}, {device.total_memory / 2**30:.0f} GiB, sm_{device.arch}"
+
+
+def _name(device: str) -> str:
+    """Warp's name of a device.
+
+    Raises
+    ------
+    DeviceError
+        Where there is none.
+    """
+    if device not in DEVICES:
+        raise DeviceError(f"device {device!r}", "is unknown", f"Choose from {', '.join(DEVICES)}")
+    warp()
+    found = cuda_devices()
+    if not found:
+        raise DeviceError("device cuda", "no NVIDIA card with a driver was found", "Install its driver or use the CPU")
+    return found[0]

@@ -1,0 +1,54 @@
+"""Frames whose light is traced on a device: as on the processor; without a card on the processor, with a warning."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("warp", reason="warp-lang is not installed")
+
+from drgs_blender.engine.session import Session
+
+
+@pytest.fixture
+def warp_session(monkeypatch, asset_path):
+    """A session for which Warp's processor is the card: the same code, without the card."""
+    monkeypatch.setattr("drgs_blender.render.device.devices._name", lambda device: "cpu")
+    session = Session()
+    session.load_asset(asset_path)
+    return session
+
+
+def psnr(a, b):
+    error = np.mean((np.clip(a, 0, 1) - np.clip(b, 0, 1)).astype(np.float64) ** 2)
+    return -10 * np.log10(max(error, 1e-20))
+
+
+@pytest.mark.parametrize("changes", [{}, {"denoise": "svgf"}, {"primary": "mesh", "noise_threshold": 0.05}])
+def test_the_picture_is_the_processors(session, warp_session, make_frame, changes):
+    passes = ("Combined", "DiffDir", "GlossInd")
+    frames = [replace(make_frame(rays=4, bounces=2, device=d, **changes), passes=passes) for d in ("cpu", "cuda")]
+    here, there = session.render(frames[0]), warp_session.render(frames[1])
+    assert there.warnings == here.warnings
+    for name in passes:
+        assert here[name].any() and psnr(here[name], there[name]) > 60.0
+
+
+def test_viewports_grow_on_a_device(session, warp_session, make_frame):
+    last = []
+    for which, device in ((session, "cpu"), (warp_session, "cuda")):
+        passes = which.view("v", make_frame(rays=4, device=device))
+        while passes.statistics["view.fraction"] < 1.0:
+            passes = which.refine("v")
+        last.append(passes["Combined"])
+    assert psnr(*last) > 60.0
+
+
+def test_without_a_card_a_frame_is_rendered_here_with_a_warning(session, make_frame, monkeypatch):
+    monkeypatch.setattr("drgs_blender.render.device.devices.cuda_devices", list)
+    expected = session.render(make_frame())
+    found = session.render(make_frame(device="cuda"))
+    assert any("no NVIDIA card" in warning and "CPU" in warning for warning in found.warnings)
+    np.testing.assert_array_equal(found["Combined"], expected["Combined"])

@@ -1,0 +1,271 @@
+"""The integrator on a device, on Warp's device "cpu": the same light as by Numba and Embree, from the same source."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+pytest.importorskip("warp", reason="warp-lang is not installed")
+
+from drgs_blender.frame import Image, Light, Material, MeshState, RenderSettings, Texture, Visibility, World
+from drgs_blender.render.device.devices import Devices
+from drgs_blender.render.device.integrate import OnDevice
+from drgs_blender.render.lights.emitters import Emitters
+from drgs_blender.render.lights.lamps import Lamps
+from drgs_blender.render.lights.light import EnvironmentLight
+from drgs_blender.render.points import CATCHER, Radiance, ShadingPoints
+from drgs_blender.render.shade.integrate import HERE, integrate
+from drgs_blender.render.trace.scene import TraceObject, TraceScene
+
+BALL = trimesh.creation.icosphere(subdivisions=3)
+SETTINGS = RenderSettings(5, 5, 6, bounces=3, aa=2)
+DARK = EnvironmentLight(World(colour=(0.0, 0.0, 0.0)))
+
+
+@pytest.fixture(scope="module")
+def device() -> OnDevice:
+    return OnDevice("cpu")
+
+
+def sky(size: tuple[int, int] = (32, 64)) -> EnvironmentLight:
+    image = np.random.default_rng(2).random((*size, 3)).astype(np.float32)
+    image[5, 9] = 80.0
+    turn = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
+    return EnvironmentLight(World(environment=image, rotation=turn * np.linalg.det(turn)))
+
+
+def ball(centre: tuple, size: float, **changes: object) -> TraceObject:
+    rng, n = np.random.default_rng(4), len(BALL.vertices)
+    shades = rng.random((n, 3)), rng.random(n), (rng.random(n) > 0.5).astype(np.float32)
+    vertices = (BALL.vertices * size + centre).astype(np.float32)
+    return replace(TraceObject("ball", vertices, BALL.faces.astype(np.int32), *shades), **changes)  # type: ignore[arg-type]
+
+
+def floor(*matrices: np.ndarray, **changes: object) -> MeshState:
+    """A square of six metres at z = 0, checked, with corners of its own."""
+    vertices = np.float32([[-3, -3, 0], [3, -3, 0], [3, 3, 0], [-3, 3, 0]])
+    uvs = np.float32([[[0, 0], [1, 0], [1, 1]], [[0, 0], [1, 1], [0, 1]]])
+    state = MeshState(
+        "floor", vertices, np.int32([[0, 1, 2], [0, 2, 3]]), np.array(matrices or [np.eye(4)]),
+        np.zeros(max(len(matrices), 1), np.int32), uvs=uvs,
+    )  # fmt: skip
+    return replace(state, **changes)  # type: ignore[arg-type]
+
+
+def seen(count: int = 1500) -> ShadingPoints:
+    """Points on a unit sphere about (0, 0, 1.2), seen from outside, two a pixel."""
+    rng = np.random.default_rng(7)
+    normal = rng.normal(size=(count, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    view = normal + 0.8 * rng.normal(size=(count, 3))
+    view *= np.sign((view * normal).sum(axis=1, keepdims=True)) / np.linalg.norm(view, axis=1, keepdims=True)
+    return ShadingPoints(
+        np.arange(count) // 2, np.arange(count) % 2, np.ones(count), normal + np.array([0, 0, 1.2]), normal, normal,
+        view, rng.random((count, 3)), rng.random(count), rng.random(count),
+    )  # fmt: skip
+
+
+def placed(x: float, y: float, z: float, scale: float = 1.0) -> np.ndarray:
+    matrix = np.diag([scale, scale, scale, 1.0])
+    matrix[:3, 3] = x, y, z
+    return matrix
+
+
+def lamps() -> Lamps:
+    """Every kind that shines in another way, more than one leaf of the tree."""
+    down = placed(0.5, 0.4, 3.0)
+    side = placed(2.5, -1.0, 2.0) @ np.array([[0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1.0]])
+    kinds = [
+        Light("panel", "area", down, power=60.0),
+        Light("disk", "area", side, power=40.0, shape="disk", size_x=0.6, spread=1.2),
+        Light("point", "point", placed(-2.0, 1.0, 2.0), power=50.0),
+        Light("bulb", "point", placed(-1.5, -2.0, 1.5), power=80.0, radius=0.3, soft_falloff=False, glossy=False),
+        Light("soft", "point", placed(1.5, -2.5, 2.5), power=80.0, radius=0.3, cast_shadow=False),
+        Light("spot", "spot", placed(0.0, 2.0, 4.0), power=300.0, radius=0.1, spot_size=1.2),
+        Light("sun", "sun", side, power=1.5, angle=0.05),
+        Light("laser", "sun", down, power=0.4),
+    ]
+    return Lamps(kinds, np.array([0, 0, 1.2]), 1.0)
+
+
+def under_sky() -> tuple:
+    scene = TraceScene()
+    scene.update([ball((1.4, 0.6, 1.9), 0.7), ball((-1.2, -1.0, 0.4), 0.5)])
+    return scene, sky(), None, seen()
+
+
+def under_lamps() -> tuple:
+    scene = TraceScene()
+    scene.update([ball((1.6, 0.6, 1.9), 0.6)], [floor()])
+    return scene, sky(), lamps(), seen()
+
+
+def lamps_alone() -> tuple:
+    return (*under_lamps()[:1], DARK, *under_lamps()[2:])
+
+
+def among_meshes() -> tuple:
+    """Textures on every channel, a mesh that emits, in several places, one mirrored, kinds of rays that differ."""
+    rng = np.random.default_rng(5)
+    images = [
+        Image("checker", rng.integers(0, 255, (8, 8, 4), dtype=np.uint8), "srgb"),
+        Image("grey", rng.random((4, 4, 4), np.float32), "linear"),
+    ]
+    checked = Material(
+        "checked", base_colour_texture=Texture("checker", "rgb", interpolation="closest"),
+        roughness_texture=Texture("grey", "g"), metallic_texture=Texture("grey", "r", extension="mirror"),
+    )  # fmt: skip
+    glowing = Material("glowing", emission=(3.0, 2.0, 1.0), emission_texture=Texture("checker", "rgb"))
+    small = placed(0, 0, 0, 0.2)
+    lights = [
+        placed(-2.0, 0.5, 1.0) @ small,
+        placed(0.5, -2.2, 2.0) @ small,
+        placed(0, 2.0, 3.0) @ np.diag([-0.2, 0.2, 0.2, 1]),
+    ]
+    shut = Visibility(glossy=False)
+    meshes = [
+        floor(materials=[checked]),
+        floor(*lights, materials=[glowing], name="lights"),
+        floor(placed(0, 0, 4.5, 0.2), name="above", visibility=shut),
+    ]
+    scene = TraceScene()
+    scene.update([ball((1.6, 0.6, 1.9), 0.6)], meshes, images)
+    return scene, sky(), Lamps([], np.array([0, 0, 1.2]), 1.0, Emitters(scene)), seen()
+
+
+def caught() -> tuple:
+    scene = TraceScene()
+    scene.update([ball((0.6, 0.3, 0.8), 0.5)], [floor(visibility=Visibility(shadow_catcher=True))])
+    points = seen(600)
+    points.flags[:] = CATCHER
+    return scene, sky(), lamps(), points
+
+
+SCENES: dict[str, Callable[[], tuple]] = {
+    f.__name__: f for f in (under_sky, under_lamps, lamps_alone, among_meshes, caught)
+}
+
+
+def both(device: OnDevice, scene: tuple, settings: RenderSettings, part: tuple[int, int] = (0, 1)) -> list[Radiance]:
+    objects, light, shining, points = scene
+    return [
+        integrate(objects, light, points, settings, 3, shining, part, **where) for where in ({}, {"processor": device})
+    ]
+
+
+def psnr(a: np.ndarray, b: np.ndarray) -> float:
+    """Of pictures whose white is 1."""
+    error = np.mean((np.minimum(a, 1.0) - np.minimum(b, 1.0)).astype(np.float64) ** 2)
+    return float(-10 * np.log10(max(error, 1e-20)))
+
+
+@pytest.mark.parametrize("look", ["paper", "principled"])
+@pytest.mark.parametrize("name", SCENES)
+def test_a_device_finds_the_light_that_the_processor_finds(device: OnDevice, name: str, look: str) -> None:
+    scene = SCENES[name]()
+    here, there = both(device, scene, replace(SETTINGS, look=look))
+    assert here.total.max() > 0.1
+    assert psnr(here.total, there.total) > 60.0
+    # Nearly all samples agree to rounding; a ray along an edge may meet the other face.
+    apart = np.abs(here.components - there.components).max(axis=(1, 2)) > 1e-4 * (1.0 + here.total.max(axis=1))
+    assert apart.mean() < 0.01
+    np.testing.assert_array_equal(here.moments[:, 0], there.moments[:, 0])
+    np.testing.assert_allclose(here.variance.mean(axis=0), there.variance.mean(axis=0), rtol=1e-2)
+    if name == "caught":
+        np.testing.assert_allclose(here.unshadowed, there.unshadowed, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("settings", [
+    replace(SETTINGS, split="counts", bounces=0), replace(SETTINGS, bounces=8, clamp_indirect=0.5),
+    replace(SETTINGS, cosine=0, ggx=0, environment=8, split="counts"),
+])  # fmt: skip
+def test_settings_mean_the_same_on_a_device(device: OnDevice, settings: RenderSettings) -> None:
+    here, there = both(device, under_lamps(), settings, (1, 2))
+    assert here.total.max() > 0.1
+    assert psnr(here.total, there.total) > 60.0
+
+
+def test_points_give_the_same_bits_in_any_company(device: OnDevice) -> None:
+    scene, light, shining, points = under_lamps()
+    whole = integrate(scene, light, points, SETTINGS, 0, shining, processor=device)
+    part = integrate(scene, light, points[100:300], SETTINGS, 0, shining, processor=device)
+    np.testing.assert_array_equal(part.components, whole.components[100:300])
+
+
+def test_what_moves_is_followed(device: OnDevice) -> None:
+    """The tree is refitted, places and materials are taken anew."""
+    scene, points, light = TraceScene(), seen(), sky()
+    for shift in (0.0, 0.4, -0.3):
+        objects = [ball((1.4 + shift, 0.6, 1.9), 0.7)]
+        scene.update(objects, [floor(placed(0, 0, shift), placed(0, 0, 3.5 - shift, 0.2))])
+        here, there = both(device, (scene, light, None, points), SETTINGS)
+        assert psnr(here.total, there.total) > 60.0
+
+
+def test_an_empty_scene_and_hopeless_points_are_survived(device: OnDevice) -> None:
+    points = seen(50)
+    points.origin[3] = np.nan
+    points.normal[4] = np.inf
+    here, there = both(device, (TraceScene(), sky(), None, points), SETTINGS)
+    assert np.isfinite(there.components).all() and not there.components[3:5].any()
+    np.testing.assert_allclose(here.components, there.components, rtol=1e-4, atol=1e-5)
+
+
+# --- which device ----------------------------------------------------------------------------------------------------
+
+
+def test_without_a_card_the_processor_does_all_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("drgs_blender.render.device.devices.cuda_devices", list)
+    devices, settings = Devices(), replace(SETTINGS, device="cuda")
+    assert devices.processor("cuda") is HERE
+    (warning,) = devices.warnings(settings)
+    assert "no NVIDIA card" in warning and warning.endswith("Rendered on the CPU")
+    assert devices.warnings(SETTINGS) == []
+
+
+def test_a_device_that_fails_is_left_alone_and_its_work_done_here(device: OnDevice, monkeypatch) -> None:
+    scene, light, shining, points = under_lamps()
+    broken = OnDevice("cpu")
+    monkeypatch.setattr(
+        broken, "_launch", lambda *arguments: (_ for _ in ()).throw(RuntimeError("out of memory\nat 0"))
+    )
+    found = integrate(scene, light, points, SETTINGS, 3, shining, processor=broken)
+    np.testing.assert_array_equal(found.components, integrate(scene, light, points, SETTINGS, 3, shining).components)
+    devices = Devices()
+    devices._known["cuda"] = broken
+    (warning,) = devices.warnings(replace(SETTINGS, device="cuda"))
+    assert "out of memory" in warning and "at 0" not in warning and warning.endswith("Rendered on the CPU")
+
+
+def test_surfels_as_tracer_are_left_to_the_processor(device: OnDevice) -> None:
+    devices = Devices()
+    devices._known["cuda"] = device
+    (warning,) = devices.warnings(replace(SETTINGS, device="cuda", tracer="surfels"))
+    assert "surfels" in warning
+
+
+def test_every_array_is_copied_to_a_card(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A card cannot read this memory: here it is spoilt once the copies are made."""
+    scene, light, shining, points = among_meshes()
+    expected = integrate(scene, light, points, SETTINGS, 3, shining)
+    apart = OnDevice("cpu")
+    apart._mirror.copies = True
+    apart.tables(scene, light, shining)
+    spoilt = [
+        scene.shading_faces, scene.shading, scene.normals, scene.face_object, scene._material, scene._uvs,
+        scene._place_normal, scene.place_object, scene._material_tables, scene.vertices, *scene.materials.arrays,
+        *(texels.texels for texels in scene.materials._images.values()), light.texels, light.row_z, light.cells.runs,
+        light.cells.guide, light.cells.block, light.facing.starts, light.facing.slices, light.facing.ratio,
+        light.facing.first, shining.emitters.rows, shining.emitters.nodes, shining.emitters.sums,
+        shining.emitters.faces, shining.emitters.slot, shining.emitters.first, shining.emitters.row,
+        shining.emitters._tables,
+    ]  # fmt: skip
+    for array in spoilt:
+        array.setflags(write=True)
+        array.view(np.uint8)[...] = 0x7F
+    found = integrate(scene, light, points, SETTINGS, 3, shining, processor=apart)
+    assert psnr(found.total, expected.total) > 60.0

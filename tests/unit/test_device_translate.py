@@ -1,0 +1,257 @@
+"""Scalar code on a device: translated functions give Numba's results to the last bit, or are refused by name."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+pytest.importorskip("warp", reason="warp-lang is not installed")
+
+from drgs_blender.device.translate import Native, Translation
+from drgs_blender.device.typed import Array, Struct, TranslationError
+from drgs_blender.device.warp import load_module, warp
+from drgs_blender.frame import World
+from drgs_blender.jit import njit
+from drgs_blender.render import sampling
+from drgs_blender.render.device.natives import NATIVES
+from drgs_blender.render.lights import light
+from drgs_blender.render.shade import brdf
+
+F, U = np.float32, np.uint32
+ONE = F(1.0)
+_STEPS = 3
+
+
+class Scale(NamedTuple):
+    factor: np.float32
+    turns: int
+
+
+class Pair(NamedTuple):
+    first: Scale
+    second: Scale
+
+
+def on_device(function: Any, columns: list[np.ndarray], extra: tuple = (), natives: Any = NATIVES) -> np.ndarray:
+    """(n, results) float64 of a translated function for rows of numbers, followed by the same named tuples for all."""
+    translation = Translation(natives)
+    kinds = [column.dtype.name for column in columns]
+    made = translation.function(function, [*kinds, *(Struct(type(e)) for e in extra)])
+    results = len(made.result) if isinstance(made.result, tuple) else 1
+    names = [f"x{i}" for i in range(len(columns))]
+    arrays = [f"{name}: {Array(kind)}" for name, kind in zip(names, kinds)]
+    structs = [f"e{i}: {translation.struct(type(e))}" for i, e in enumerate(extra)]
+    call = f"{made.name}({', '.join([*(f'{n}[t]' for n in names), *(f'e{i}' for i in range(len(extra)))])})"
+    found = ", ".join(f"r{i}" for i in range(results))
+    writes = "\n".join(f"    out[t, {i}] = wp.float64(r{i})" for i in range(results))
+    translation.add(
+        f"@wp.kernel\ndef run({', '.join([*arrays, *structs])}, out: {Array('float64', 2)}):\n"
+        f"    t = wp.tid()\n    {found} = {call}\n{writes}"
+    )
+    wp, module = warp(), load_module(translation.source)
+    inputs = [wp.array(c, dtype=getattr(wp, k), device="cpu") for c, k in zip(columns, kinds)]
+    for value in extra:
+        struct = getattr(module, type(value).__name__)()
+        for name, part in value._asdict().items():
+            setattr(struct, name, part)
+        inputs.append(struct)
+    out = wp.zeros((len(columns[0]), results), dtype=wp.float64, device="cpu")
+    wp.launch(module.run, dim=len(columns[0]), inputs=[*inputs, out], device="cpu")
+    return out.numpy()
+
+
+def here(function: Any, columns: list[np.ndarray], extra: tuple = ()) -> np.ndarray:
+    """The same by Numba."""
+    compiled = function if hasattr(function, "py_func") else njit(function, cache=False)
+    rows = [compiled(*row, *extra) for row in zip(*columns)]
+    return np.array([row if isinstance(row, tuple) else (row,) for row in rows], np.float64)
+
+
+def floats(count: int, *bounds: tuple[float, float], seed: int = 0) -> list[np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return [rng.uniform(*b, count).astype(np.float32) for b in bounds]
+
+
+def units(count: int, seed: int = 0) -> list[np.ndarray]:
+    v = np.random.default_rng(seed).normal(size=(count, 3))
+    return list((v / np.linalg.norm(v, axis=1, keepdims=True)).astype(np.float32).T)
+
+
+KEYS = [np.random.default_rng(1).integers(0, 2**32, 2000, dtype=np.uint32) for _ in range(2)]
+RENDERER: dict[str, tuple[Any, list[np.ndarray]]] = {
+    "mix": (sampling.mix, KEYS[:1]),
+    "unit": (sampling.unit, KEYS[:1]),
+    "scrambled": (sampling.scrambled, KEYS),
+    "sincos_turns": (sampling.sincos_turns, floats(2000, (-2, 2))),
+    "fast_acos": (sampling.fast_acos, floats(2000, (-1.1, 1.1))),
+    "fast_atan2_turns": (sampling.fast_atan2_turns, floats(2000, (-1, 1), (-1, 1))),
+    "basis": (sampling.basis, units(2000)),
+    "cosine_hemisphere": (sampling.cosine_hemisphere, floats(2000, (0, 1), (0, 1))),
+    "glossy_normal": (brdf.glossy_normal, [*units(500), *units(500, 1), *units(500, 2)]),
+    "sample_vndf": (
+        brdf.sample_vndf,
+        [*floats(500, (0, 1), (0, 1)), *floats(500, (-0.5, 0.5), (-0.5, 0.5), (0.3, 0.7), (0.001, 1), (0, 1), seed=2)],
+    ),
+    "evaluate": (
+        brdf.evaluate,
+        [*floats(500, (0.01, 1), (-0.2, 1), (-1, 1), *[(0, 1)] * 8, (0.1, 2)), np.arange(500) % 2],
+    ),
+}
+
+
+@pytest.mark.parametrize("name", RENDERER)
+def test_the_renderers_arithmetic_is_the_same_to_the_last_bit(name: str) -> None:
+    function, columns = RENDERER[name]
+    expected, found = here(function, columns), on_device(function, columns)
+    if name == "glossy_normal":  # sines and arcs of two C libraries
+        np.testing.assert_allclose(found, expected, atol=3e-7)
+    else:
+        np.testing.assert_array_equal(found, expected)
+
+
+def test_the_sky_is_looked_up_to_the_last_bit() -> None:
+    image = np.random.default_rng(0).random((40, 80, 3)).astype(np.float32) ** 6
+    sky = light.EnvironmentLight(World(environment=image))
+    u, v = floats(3000, (0, 1), (0, 1))
+    rows = np.random.default_rng(3).integers(0, 576, 3000)
+    for function, columns in ((light.sky_radiance, [u, v]), (light.sky_density, [u, v, rows])):
+        np.testing.assert_array_equal(on_device(function, columns, (sky.sky,)), here(function, columns, (sky.sky,)))
+
+
+# --- the language ----------------------------------------------------------------------------------------------------
+
+
+@njit
+def _swapped(x, y):  # type: ignore[no-untyped-def]
+    return y, x
+
+
+def promotions(a, b, n):  # type: ignore[no-untyped-def]
+    small = np.int32(n)
+    return a * n, a * b, small + small, U(n) * U(3), n / 7, n // 3, n % 5, (n + 20) >> 1, -small, a + 0.1, n ^ 3
+
+
+def loops(a, b, n):  # type: ignore[no-untyped-def]
+    total, count, last = F(0.0), 1, -1
+    for i in range(n):
+        if i == 2:
+            continue
+        for j in range(i, 2 * i + 1, 2):
+            total += a * F(j)
+            if j > 9:
+                break
+        last = i
+    while count < n and not total > b * F(100.0):
+        count = 2 * count + 1
+        total, b = b, total
+    return total, count, last
+
+
+def constants(a, b, n):  # type: ignore[no-untyped-def]
+    """A variable that starts as a constant which the loop also reads: Warp once took both for one."""
+    node = 1
+    while node < 40:
+        node = 2 * node + 1
+    other = 1
+    return node, other, F(0.1), U(0xFFFFFFFF), 1 << 40, 1e-300, math.pi, ONE / F(3.0), _STEPS
+
+
+def choices(a, b, n):  # type: ignore[no-untyped-def]
+    x = a if a > b else (b if n & 1 else -a)
+    y = n > 3 and (a < b or n == 5)
+    z = 0 <= n < 4
+    if not y and z:
+        x, w = _swapped(x, b)
+    else:
+        w = min(a, max(b, F(0.25)))
+    return x, y, z, w, abs(a - b), math.copysign(a, b), min(n, 3), bool(n)
+
+
+def tuples(a, b, n):  # type: ignore[no-untyped-def]
+    pair = (a, b), n
+    first, _ = pair
+    both = _swapped(*first)
+    return both[0], both[1], pair[1], _swapped(a, n)[:1][0]
+
+
+def rebound(a, b, n):  # type: ignore[no-untyped-def]
+    a = a * b
+    n += 2
+    return a, n
+
+
+@pytest.mark.parametrize("function", [promotions, loops, constants, choices, tuples, rebound])
+def test_the_language_means_what_numba_takes_it_for(function: Callable) -> None:
+    columns = [*floats(64, (-1, 1), (-1, 1)), np.arange(64) % 8]
+    np.testing.assert_array_equal(on_device(function, columns), here(function, columns))
+
+
+def structures(a, scale):  # type: ignore[no-untyped-def]
+    pair = Pair(scale, Scale(a, 4))
+    return pair.first.factor * pair.second.factor, pair.second.turns + scale.turns
+
+
+def test_named_tuples_are_taken_and_made() -> None:
+    columns, extra = floats(20, (0, 1)), (Scale(F(0.3), 7),)
+    np.testing.assert_array_equal(on_device(structures, columns, extra), here(structures, columns, extra))
+
+
+def test_what_is_not_reached_is_not_read() -> None:
+    """Conditions end early on a device too: the second operand here would be read at address 0."""
+    from drgs_blender.render.memory import load_float
+
+    def guarded(n, scale):  # type: ignore[no-untyped-def]
+        if n > 5 and load_float(scale.turns, n) > ONE:
+            return ONE
+        return load_float(scale.turns, n) if n > 5 else F(2.0)
+
+    assert (on_device(guarded, [np.arange(4)], (Scale(ONE, 0),)) == 2.0).all()
+
+
+# --- what has no counterpart ---------------------------------------------------------------------------------------
+
+
+def _makes_a_list(a):  # type: ignore[no-untyped-def]
+    return [a][0]
+
+
+def _two_types(a):  # type: ignore[no-untyped-def]
+    x = a
+    x = np.float64(a)
+    return x
+
+
+def _unknown(a):  # type: ignore[no-untyped-def]
+    return np.linalg.norm(a)
+
+
+def _calls_it(a):  # type: ignore[no-untyped-def]
+    b = a + ONE
+    return _makes_a_list_compiled(b)
+
+
+_makes_a_list_compiled = njit(_makes_a_list)
+
+
+@pytest.mark.parametrize("function, words", [
+    (_makes_a_list, "[a]"), (_two_types, "x: is float32 here and float64 there"), (_unknown, "norm"),
+    (_calls_it, "[a]"),
+])  # fmt: skip
+def test_what_cannot_be_translated_is_named_with_its_line(function: Callable, words: str) -> None:
+    with pytest.raises(TranslationError) as caught:
+        Translation().function(function, ["float32"])
+    assert words in str(caught.value) and "test_device_translate.py:" in str(caught.value)
+
+
+def test_natives_stand_for_functions() -> None:
+    native = Native("@wp.func\ndef halved(x: wp.float32):\n    return x * 0.5", "halved", "float32")
+
+    def use(a):  # type: ignore[no-untyped-def]
+        return _makes_a_list_compiled(a) + ONE
+
+    found = on_device(use, floats(5, (0, 1)), natives={_makes_a_list: native})
+    np.testing.assert_array_equal(found[:, 0], floats(5, (0, 1))[0] * F(0.5) + ONE)
