@@ -79,13 +79,14 @@ def main() -> None:
         error = np.mean((np.minimum(found.total, 1) - np.minimum(reference.total, 1)).astype(np.float64) ** 2)
         alike = float((found.components == reference.components).all(axis=(1, 2)).mean())
         psnr = "the reference" if found is reference else f"{-10 * np.log10(max(error, 1e-20)):.1f} dB"
-        rows.append([name, f"{first:.1f} s", f"{seconds:.3f} s", f"{whole / seconds:.2f}", psnr, f"{100 * alike:.1f} %"])
+        times = f"{first:.1f} s", f"{seconds:.3f} s", f"{whole / seconds:.2f}"
+        rows.append([name, *times, psnr, f"{100 * alike:.1f} %"])
     body = (
         f"Light of {len(points)} points ({options.size}x{options.size}, 4 positions a pixel, 82k triangles, city HDRI, "
         f"{settings.rays} rays, one bounce), the same samples and seeds everywhere; medians of {options.runs} runs, "
         "copies to and from the device included. Held to: 60 dB between devices. Warp runs one thread on a processor: "
         "its row there tells that the code is right, not how fast a card is.\n\n"
-        + table(["Where", "First time, with kernels", "Seconds", "Speed", "PSNR of the light, white 1", "Points alike to the last bit"], rows)
+        + table(["Where", "First time", "Seconds", "Speed", "PSNR of the light", "Points alike to the last bit"], rows)
     )
     if cards:
         body += f"\n\nCard: {warp().get_device(cards[0]).name}."
