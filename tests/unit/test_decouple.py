@@ -188,7 +188,8 @@ def test_shading_matches_the_renderer_where_the_mesh_shadows_itself():
     assert (sums[:, :, 0].mean((1, 2)) < 0.97 * alone[:, :, 0].mean((1, 2))).any()  # the ball does shadow
 
 
-def test_only_the_unbiased_loss_leaves_noise_alone():
+@pytest.mark.parametrize("by_shown", (False, True))
+def test_only_the_unbiased_loss_leaves_noise_alone(by_shown: bool):
     """Two noisy estimates with the true mean: its slope is zero there, that of the common loss pulls."""
     generator = torch.Generator().manual_seed(5)
     photographed = torch.full((40000, 3), 0.3)
@@ -196,15 +197,43 @@ def test_only_the_unbiased_loss_leaves_noise_alone():
     # Monte Carlo noise is one-sided: seldom much, mostly too little.
     noise = torch.rand(40000, 2, 3, generator=generator) ** 3 * 4
     shown = photographed[:, None] * noise * factor
-    (pull,) = torch.autograd.grad(unbiased_loss(shown, photographed), factor)
+    (pull,) = torch.autograd.grad(unbiased_loss(shown, photographed, by_shown), factor)
     (biased,) = torch.autograd.grad(log_loss((photographed[:, None] * noise * factor).mean(1), photographed), factor)
     curvature = float((photographed / (photographed + 0.03) ** 0.6).square().mean())
     assert abs(float(pull)) < 0.02 * curvature
     assert abs(float(biased)) > 0.02
 
 
+def test_weights_by_what_is_shown_find_the_mean_of_what_was_photographed():
+    """One place that mirrors now bright, now dark, as under wrong normals: not a mean that the dark ones pull."""
+    photographed = torch.tensor([0.02, 0.05, 0.1, 0.9])[:, None].expand(4, 3)
+
+    def pull(value: float, by_shown: bool) -> float:
+        place = torch.tensor(value, requires_grad=True)
+        loss = unbiased_loss(place.expand(4, 2, 3), photographed, by_shown)
+        return float(torch.autograd.grad(loss, place)[0])
+
+    mean = float(photographed.mean())
+    assert abs(pull(mean, True)) < 1e-6
+    assert pull(0.95 * mean, True) < 0 < pull(1.05 * mean, True)
+    assert pull(0.5 * mean, False) > 0  # by the photographs, half of it is still too bright
+
+
+def test_both_weights_are_alike_near_the_truth():
+    """Losses and their slopes: the schedule may go over from one to the other."""
+    photographed = torch.rand(50, 3, generator=torch.Generator().manual_seed(2)) * 0.9
+    factor = torch.full((1,), 1.001, requires_grad=True)
+    losses = [
+        unbiased_loss((photographed * factor)[:, None].expand(50, 2, 3), photographed, way) for way in (False, True)
+    ]
+    slopes = [float(torch.autograd.grad(loss, factor)[0]) for loss in losses]
+    assert losses[1].item() == pytest.approx(losses[0].item(), rel=0.01)
+    assert slopes[1] == pytest.approx(slopes[0], rel=0.01)
+
+
 def test_clipped_photographs_set_no_upper_bound():
     white = torch.ones(4, 3)
+    assert float(unbiased_loss(torch.full((4, 2, 3), 3.0), white, by_shown=True)) == 0
     assert float(log_loss(torch.full((4, 3), 3.0), white)) == 0
     assert float(unbiased_loss(torch.full((4, 2, 3), 3.0), white)) == 0
     assert float(log_loss(torch.full((4, 3), 0.5), white)) > 0

@@ -21,13 +21,26 @@ def log_loss(shown: Tensor, photographed: Tensor) -> Tensor:
     return torch.where(photographed >= CLIPPED, difference.clamp(min=0), difference.abs()).mean()
 
 
-def unbiased_loss(shown: Tensor, photographed: Tensor) -> Tensor:
+def unbiased_loss(shown: Tensor, photographed: Tensor, by_shown: bool = False) -> Tensor:
     """Weighted squared error of two independent estimates (n, 2, 3) of each pixel.
 
     The product of both differences has the squared error of their mean value for expectation, without their variance,
     and so has its derivative: noise does not pull. A clipped photograph sets no upper bound.
+
+    Parameters
+    ----------
+    by_shown : weigh by what is shown, not by what was photographed. Where the mesh is a little off, one place mirrors
+        what the photographs show beside it, bright or dark; weights that are least for bright photographs make a mean
+        of these that is too dark
     """
-    difference = (shown - photographed[:, None]) / (photographed[:, None] + _KNEE) ** _EXPONENT
-    product = difference[:, 0] * difference[:, 1]
+    difference = shown - photographed[:, None]
+    if by_shown:
+        # The weight of an estimate goes with its own slope and the other's difference: it knows nothing of the latter.
+        weight = (shown.detach().clamp(min=0) + _KNEE) ** (-2 * _EXPONENT)
+        product = (difference.detach().flip(1) * weight * difference).sum(1)
+        product = product - product.detach() / 2  # the slope of a product, and its value
+    else:
+        weighed = difference / (photographed[:, None] + _KNEE) ** _EXPONENT
+        product = weighed[:, 0] * weighed[:, 1]
     above = (photographed >= CLIPPED) & (difference.detach().mean(1) > 0)
     return torch.where(above, torch.zeros_like(product), product).mean()

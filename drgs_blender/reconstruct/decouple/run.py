@@ -40,6 +40,8 @@ DEFAULT = Settings()
 _AIM, _REPORT, _SAVE = 25, 25, 20.0
 #: Where the environment grows and normals begin to turn (light comes first); the last step size in parts of the first.
 _GROWS, _NORMALS, _LAST_RATE = (0.2, 0.45), 0.4, 0.05
+#: Where weights by what is shown begin: before, they let light that is much too bright stay so.
+_BY_SHOWN = 0.3
 #: How much smoother than albedo roughness and metallic are (of diffuse and specular colour: diffuse, roughness, rest).
 _SMOOTH = (1.0, 1.0, 1.0, 2.0, 10.0, 10.0, 10.0)
 #: Edges that are smoothed a step; how much photographed chroma may differ along one that is.
@@ -240,7 +242,8 @@ class _Job:
             exposure = self._parameters["exposure"]
             shown = shown * torch.exp(exposure - exposure.mean())[torch.from_numpy(pixels.view).long()][:, None, None]
         photographed = torch.from_numpy(pixels.colour)
-        loss = unbiased_loss(shown, photographed) if s.unbiased else log_loss(shown.mean(1), photographed)
+        by_shown = s.by_shown and self.part >= _BY_SHOWN
+        loss = unbiased_loss(shown, photographed, by_shown) if s.unbiased else log_loss(shown.mean(1), photographed)
         self._note(float(loss.detach()), shown.detach().mean(1), photographed)
 
         pair = columns.index_select(0, end_place.flatten()).view(len(edge), 2, -1)

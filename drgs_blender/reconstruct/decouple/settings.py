@@ -31,6 +31,8 @@ class Settings:
     white : weight that pulls the environment towards grey
     bimodal : weight that pulls metallic to 0 or 1
     unbiased : compare two independent estimates of each pixel, so that their noise is not learned from
+    by_shown : weigh differences by what is shown, once that is near the photographs; else by the photographs, which
+        finds polished metal and the light in it too dark where the mesh is a little off
     parametrisation : "metallic" learns albedo and metallic; "specular" diffuse and specular colour, turned into the
         former at the end; "dielectric" albedo alone, metallic is 0
     normals : also learn an offset of each vertex normal, held by `normal_smoothness`
@@ -58,6 +60,7 @@ class Settings:
     white: float = 0.0003
     bimodal: float = 0.0
     unbiased: bool = True
+    by_shown: bool = True
     parametrisation: Literal["metallic", "specular", "dielectric"] = "metallic"
     normals: bool = False
     normal_smoothness: float = 0.3
