@@ -23,7 +23,7 @@ from drgs_blender.formats.registry import read_environment
 from drgs_blender.frame import RenderSettings, World
 from drgs_blender.jit import use_threads
 from drgs_blender.render.camera import camera_parameters
-from drgs_blender.render.device.integrate import OnDevice
+from drgs_blender.render.device.on_device import OnDevice
 from drgs_blender.render.lights.light import EnvironmentLight
 from drgs_blender.render.points import Radiance
 from drgs_blender.render.primary.primary_mesh import primary_mesh

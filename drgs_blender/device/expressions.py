@@ -281,6 +281,8 @@ class Expressions:
             return Value(text, kind)
         if function is abs:
             return Value(f"wp.abs({values[0].text})", values[0].type)
+        if function is math.floor:
+            return Value(f"wp.int64(wp.floor({values[0].text}))", INT64)
         if function is len:
             return Value(f"wp.int64({values[0].text}.shape[0])", INT64)
         if function in _MATHS:

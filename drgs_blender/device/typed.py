@@ -121,8 +121,8 @@ def spelled(kind: Type) -> str:
 
 
 def alike(a: str, b: str) -> bool:
-    """Whether a variable may be of both types: integers of 64 bits hold smaller ones."""
-    return a == b or (a in (INT32, INT64) and b in (INT32, INT64))
+    """Whether a variable may be of both types: integers of 64 bits hold smaller ones, and count on as these do."""
+    return a == b or {a, b} == {INT32, INT64} or {a, b} == {UINT32, UINT64}
 
 
 def flat(kind: Type) -> list[Type]:

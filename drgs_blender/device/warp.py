@@ -37,7 +37,9 @@ def warp() -> Any:
         import warp as wp
     except ImportError as error:
         raise DeviceError(
-            "device cuda", f"the package warp-lang cannot be imported ({error})", "Install drgs-blender[gpu]"
+            "device cuda",
+            f"the package warp-lang cannot be imported ({error})",
+            "Install it: pip install 'warp-lang>=1.19,<1.20', or Set Up Engine with Graphics Card",
         ) from None
     wp.config.quiet = True
     wp.config.kernel_cache_dir = str(cache_folder() / "warp")

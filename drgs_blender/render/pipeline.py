@@ -100,7 +100,7 @@ def render(
             progress(part, phase)
 
     tell(0.0, "Projecting")
-    primary = Primary(scene, posed, frame, parameters, tree)
+    primary = Primary(scene, posed, frame, parameters, tree, processor)
     film = Film(camera, settings, parameters)
     mattes = [
         CryptoFilm(kind, scene, frame)
@@ -174,10 +174,11 @@ class Primary:
     """What the camera sees of a frame, strip by strip."""
 
     def __init__(
-        self, scene: TraceScene, posed: PosedSurfels, frame: Frame, parameters: Array, tree: SurfelBVH | None
-    ) -> None:
+        self, scene: TraceScene, posed: PosedSurfels, frame: Frame, parameters: Array, tree: SurfelBVH | None,
+        processor: Processor = HERE,
+    ) -> None:  # fmt: skip
         self._scene, self._camera, self._parameters = scene, frame.camera, parameters
-        self._tree, self._objects = tree, len(frame.objects)
+        self._tree, self._objects, self._processor = tree, len(frame.objects), processor
         self._splats: Splats | None = None
         if frame.settings.primary == "surfels":
             self._splats = prepare(posed, frame.camera, parameters)
@@ -190,7 +191,8 @@ class Primary:
             if self._tree is not None:
                 _own_surfels(buffer, self._tree, self._objects)
             return buffer
-        return primary_surfels(self._splats, self._scene, self._windows, self._camera, y0, y1, self._tree is None)
+        tied = self._tree is None
+        return primary_surfels(self._splats, self._scene, self._windows, self._camera, y0, y1, tied, self._processor)
 
 
 def strip_height(width: int, aa: int) -> int:

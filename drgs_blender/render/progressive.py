@@ -201,7 +201,7 @@ class Progressive:
         use_threads(self.frame.settings.threads)
         check()
         if self._primary is None:
-            self._primary = Primary(scene, posed, self.frame, self._parameters, tree)
+            self._primary = Primary(scene, posed, self.frame, self._parameters, tree, self._processor)
         batches = Batches(scene, light, lamps, tree, self.frame, check, self._processor)
         began = time.perf_counter()
         while self._next < len(self._parts):

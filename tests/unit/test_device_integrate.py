@@ -13,7 +13,7 @@ pytest.importorskip("warp", reason="warp-lang is not installed")
 
 from drgs_blender.frame import Image, Light, Material, MeshState, RenderSettings, Texture, Visibility, World
 from drgs_blender.render.device.devices import Devices
-from drgs_blender.render.device.integrate import OnDevice
+from drgs_blender.render.device.on_device import OnDevice
 from drgs_blender.render.lights.emitters import Emitters
 from drgs_blender.render.lights.lamps import Lamps
 from drgs_blender.render.lights.light import EnvironmentLight
@@ -231,7 +231,7 @@ def test_a_device_that_fails_is_left_alone_and_its_work_done_here(device: OnDevi
     scene, light, shining, points = under_lamps()
     broken = OnDevice("cpu")
     monkeypatch.setattr(
-        broken, "_launch", lambda *arguments: (_ for _ in ()).throw(RuntimeError("out of memory\nat 0"))
+        broken.launcher, "_room", lambda *arguments: (_ for _ in ()).throw(RuntimeError("out of memory\nat 0"))
     )
     found = integrate(scene, light, points, SETTINGS, 3, shining, processor=broken)
     np.testing.assert_array_equal(found.components, integrate(scene, light, points, SETTINGS, 3, shining).components)
@@ -253,7 +253,7 @@ def test_every_array_is_copied_to_a_card(monkeypatch: pytest.MonkeyPatch) -> Non
     scene, light, shining, points = among_meshes()
     expected = integrate(scene, light, points, SETTINGS, 3, shining)
     apart = OnDevice("cpu")
-    apart._mirror.copies = True
+    apart.mirror.copies = True
     apart.tables(scene, light, shining)
     spoilt = [
         scene.shading_faces, scene.shading, scene.normals, scene.face_object, scene._material, scene._uvs,

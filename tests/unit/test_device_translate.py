@@ -132,7 +132,20 @@ def _swapped(x, y):  # type: ignore[no-untyped-def]
 
 def promotions(a, b, n):  # type: ignore[no-untyped-def]
     small = np.int32(n)
-    return a * n, a * b, small + small, U(n) * U(3), n / 7, n // 3, n % 5, (n + 20) >> 1, -small, a + 0.1, n ^ 3
+    return (
+        a * n,
+        a * b,
+        small + small,
+        U(n) * U(3),
+        n / 7,
+        math.floor(a * F(9.0)),
+        n // 3,
+        n % 5,
+        (n + 20) >> 1,
+        -small,
+        a + 0.1,
+        n ^ 3,
+    )
 
 
 def loops(a, b, n):  # type: ignore[no-untyped-def]

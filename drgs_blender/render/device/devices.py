@@ -6,7 +6,7 @@ from ...device.warp import cuda_devices, warp
 from ...errors import DeviceError
 from ...frame import RenderSettings
 from ..shade.integrate import HERE, Processor
-from .integrate import OnDevice
+from .on_device import OnDevice
 
 #: ``RenderSettings.device``, and what each stands for.
 DEVICES = {"cpu": "this processor", "cuda": "the first NVIDIA card"}

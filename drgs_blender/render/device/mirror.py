@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from ...device.kernels import Launcher
 from ...device.warp import warp
 from ..lights.lamps import Lamps
 from ..lights.light import EnvironmentLight, Sky
@@ -25,26 +26,20 @@ class Mirror:
 
     Parameters
     ----------
-    device : of Warp
+    launcher : of the device
 
     Attributes
     ----------
     copies : whether the device has memory of its own
     """
 
-    def __init__(self, device: Any) -> None:
-        self._device = device
-        self.copies = bool(device.is_cuda)
+    def __init__(self, launcher: Launcher) -> None:
+        self._device = launcher.device
+        self.copies = bool(self._device.is_cuda)
         self._kept: list[Any] = []
         self._sky: tuple[EnvironmentLight, Sky, list[Any]] | None = None
         self._tables: tuple[tuple[Any, ...], tuple[Any, Any, Any, Any]] | None = None
         self._mesh: tuple[tuple[object, int], Any] | None = None
-
-    def array(self, array: Array) -> Any:
-        """A Warp array of an array's content; on the processor it is the same memory."""
-        wp = warp()
-        array = np.ascontiguousarray(array)
-        return wp.array(array, dtype=getattr(wp, array.dtype.name), device=self._device, copy=self.copies)
 
     def tables(self, scene: TraceScene, light: EnvironmentLight, lamps: Lamps) -> tuple[Any, Any, Any, Any]:
         """(tracer, geometry, sky, lamps) with the device's addresses; until what they are of changes."""

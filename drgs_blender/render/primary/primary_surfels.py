@@ -30,7 +30,8 @@ from ...frame import Camera
 from ...jit import njit, prange
 from ..camera import WIDTH, sample_ray
 from ..points import SECOND
-from ..surfels.raster import rasterise
+from ..shade.integrate import HERE, Processor, tried
+from ..surfels.raster import SurfelSamples
 from ..surfels.splats import SIZE, Splats
 from ..trace.masks import SURFELS
 from ..trace.scene import TraceScene
@@ -60,7 +61,14 @@ def snap_windows(scene: TraceScene, object_count: int) -> Array:
 
 
 def primary_surfels(
-    splats: Splats, scene: TraceScene, windows: Array, camera: Camera, y0: int, y1: int, tied: bool = True
+    splats: Splats,
+    scene: TraceScene,
+    windows: Array,
+    camera: Camera,
+    y0: int,
+    y1: int,
+    tied: bool = True,
+    processor: Processor = HERE,
 ) -> GBuffer:
     """Blend the surfels of the rows ``y0 .. y1`` (full-picture pixels) and tie them to the mesh.
 
@@ -69,8 +77,9 @@ def primary_surfels(
     splats : `prepare` of this frame
     windows : `snap_windows` of this frame
     tied : False: rays meet surfels, and nothing is tied
+    processor : where surfels are blended
     """
-    samples = rasterise(splats, y0, y1)
+    samples: SurfelSamples = tried(processor, lambda by: by.rasterise(splats, y0, y1))
     layers = combine(samples, scene, splats.parameters, camera.window[0], y0)
     buffer, start = compact(layers.first, splats.parameters, camera.window[0], y0, layers.second)
     buffer.alpha = layers.opaque

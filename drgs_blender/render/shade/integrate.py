@@ -7,6 +7,7 @@ frame number.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,8 @@ from ..lights.lamps import Lamps
 from ..lights.light import EnvironmentLight
 from ..points import CATCHER, SECOND, Radiance, ShadingPoints
 from ..sampling import GOLDEN, ONE, ZERO, F, U, mix, unit
+from ..surfels.raster import SurfelSamples, rasterise
+from ..surfels.splats import Splats
 from ..surfels.surfel_bvh import SurfelBVH
 from ..surfels.surfel_tracer import tracer_of
 from ..trace import masks
@@ -44,7 +47,7 @@ _LEAST_SHARE = 0.1
 
 
 class Processor:
-    """Where points are shaded: here, by all threads. `render.device` has the same for a graphics card.
+    """Where points are shaded and surfels blended: here, by all threads; `render.device` has the same for a card.
 
     Attributes
     ----------
@@ -65,8 +68,22 @@ class Processor:
         """Shade all points; see `shade_points`."""
         _kernel(*arguments, 8 * get_num_threads())
 
+    def rasterise(self, splats: Splats, y0: int, y1: int) -> SurfelSamples:
+        """`surfels.raster.rasterise`."""
+        return rasterise(splats, y0, y1)
+
 
 HERE = Processor()
+
+
+def tried(processor: Processor, work: Callable[[Processor], Any]) -> Any:
+    """`work` done by a processor, or here once that has failed."""
+    if processor is not HERE and not processor.failed:
+        try:
+            return work(processor)
+        except DeviceError as error:
+            processor.failed = str(error)
+    return work(HERE)
 
 
 def integrate(
@@ -103,14 +120,9 @@ def integrate(
     UsageError
         When settings are out of range.
     """
-    if not processor.failed and processor.takes(surfels):
-        try:
-            return _integrated(scene, light, points, settings, frame_number, lamps, part, surfels, processor)
-        except DeviceError as error:
-            if processor is HERE:
-                raise
-            processor.failed = str(error)
-    return _integrated(scene, light, points, settings, frame_number, lamps, part, surfels, HERE)
+    arguments = scene, light, points, settings, frame_number, lamps, part, surfels
+    found: Radiance = tried(processor if processor.takes(surfels) else HERE, lambda by: _integrated(*arguments, by))
+    return found
 
 
 def _integrated(

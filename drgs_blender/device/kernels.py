@@ -1,0 +1,160 @@
+"""Kernels of translated functions: made when they are first needed, launched with arrays of this process or a device's.
+
+What is launched is a function ``f(lane, lanes, room, *arguments, out)`` that does every `lanes`-th piece of some work
+from the `lane`-th on, with scratch memory of its own, and writes to the arrays `out`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..errors import DeviceError
+from .translate import Constants, Translation
+from .typed import Array as ArrayType
+from .typed import Type, given, spelled
+from .warp import load_module, parts_of, type_for, warp
+
+Array = np.ndarray
+
+#: Lanes at most.
+LANES = 1 << 17
+
+
+class Room(NamedTuple):
+    """An array of scratch memory for one lane: type of its elements, and its shape."""
+
+    element: str
+    shape: tuple[int, ...]
+
+
+#: Scratch memory of a function: nested tuples of `Room`.
+Rooms = Any
+
+
+class Work:
+    """A function that can be launched.
+
+    Parameters
+    ----------
+    function : see this module's head
+    rooms : of what it takes as `room`
+    natives, constants : see `Translation`
+    """
+
+    def __init__(
+        self,
+        function: Callable[..., Any],
+        rooms: Rooms,
+        natives: Mapping[Any, Any],
+        constants: Constants = lambda module, name, value: value,
+    ) -> None:
+        self.function, self.rooms = function, rooms
+        self._natives, self._constants = natives, constants
+        self.module = functools.lru_cache(maxsize=16)(self._module)
+
+    def _module(self, types: tuple[Type, ...], fused: bool) -> ModuleType:
+        """Module whose ``run`` is the kernel for arguments of these types."""
+        translation = Translation(self._natives, self._constants, fused)
+        kinds = _types(self.rooms)
+        made = translation.function(self.function, ["int64", "int64", kinds, *types])
+        rooms = [f"r{i}" for i in range(len(given(kinds)))]
+        names = [f"a{i}" for i in range(len(given(types)))]
+        parameters = ["lanes: wp.int64"]
+        parameters += [f"{n}: {ArrayType(k.element, k.axes + 1)}" for n, k in zip(rooms, given(kinds))]
+        parameters += [f"{n}: {spelled(k)}" for n, k in zip(names, given(types))]
+        arguments = ["wp.int64(t)", "lanes", *(f"{n}[t]" for n in rooms), *names]
+        translation.add(
+            f"@wp.kernel\ndef run({', '.join(parameters)}):\n    t = wp.tid()\n    {made.name}({', '.join(arguments)})"
+        )
+        return load_module(translation.source)
+
+
+class Launcher:
+    """Launches work on one device.
+
+    Parameters
+    ----------
+    device : Warp's name of it: "cuda:0", "cpu"
+    """
+
+    def __init__(self, device: str) -> None:
+        self.device = warp().get_device(device)
+        self._rooms: dict[Work, list[Any]] = {}
+
+    def array(self, array: Array, copy: bool | None = None) -> Any:
+        """A Warp array of an array's content; on the processor it is the same memory unless told otherwise."""
+        wp = warp()
+        copy = self.device.is_cuda if copy is None else copy
+        array = np.ascontiguousarray(array)
+        return wp.array(array, dtype=getattr(wp, array.dtype.name), device=self.device, copy=copy)
+
+    def launch(self, work: Work, pieces: int, arguments: Sequence[Any], out: Sequence[Array]) -> None:
+        """Do `pieces` of work; `arguments` are numbers, arrays, named tuples of numbers, and tuples of all these.
+
+        Raises
+        ------
+        DeviceError
+            When the device fails, for one of the reasons that a device has.
+        """
+        wp = warp()
+        with self.failures(work.function.__name__.replace("_", " ")):
+            module = work.module(tuple(type_for(a) for a in (*arguments, tuple(out))), self.device.is_cuda)
+            lanes = min(pieces, LANES)
+            found = [wp.zeros(a.shape, dtype=getattr(wp, a.dtype.name), device=self.device) for a in out]
+            inputs = [self._argument(module, part) for part in parts_of(tuple(arguments))]
+            wp.launch(module.run, lanes, [lanes, *self._room(work, lanes), *inputs, *found], device=self.device)
+            for array, result in zip(out, found):
+                array[...] = result.numpy()
+
+    @contextlib.contextmanager
+    def failures(self, work: str) -> Iterator[None]:
+        """Name what the device could not do; Warp raises RuntimeError for all of it, and for memory that is lacking."""
+        try:
+            yield
+        except (RuntimeError, MemoryError) as error:
+            said = (str(error).strip() or type(error).__name__).splitlines()[0]
+            problem = f"{self.device.name} failed at {work} ({said})"
+            raise DeviceError("device cuda", problem, "Use fewer objects or the CPU") from error
+
+    def _argument(self, module: ModuleType, value: Any) -> Any:
+        if isinstance(value, np.ndarray):
+            return self.array(value)
+        if isinstance(value, tuple):
+            struct = getattr(module, type(value).__name__)()
+            for name, part in zip(value._fields, value):  # type: ignore[attr-defined]
+                setattr(struct, name, part)
+            return struct
+        return value.item() if isinstance(value, np.generic) else value
+
+    def _room(self, work: Work, lanes: int) -> list[Any]:
+        """Scratch memory; neighbouring lanes find theirs next to each other on a card."""
+        known = self._rooms.get(work)
+        if known and known[0].shape[0] >= lanes:
+            return known
+        wp = warp()
+        made = []
+        for room in _flat(work.rooms):
+            dtype, axes = getattr(wp, room.element), len(room.shape)
+            if self.device.is_cuda:
+                turned = wp.zeros((*room.shape, lanes), dtype=dtype, device=self.device)
+                made.append(turned.transpose((axes, *range(axes))))
+            else:
+                made.append(wp.zeros((lanes, *room.shape), dtype=dtype, device=self.device))
+        self._rooms[work] = made
+        return made
+
+
+def _flat(rooms: Rooms) -> list[Room]:
+    return [rooms] if isinstance(rooms, Room) else [room for inner in rooms for room in _flat(inner)]
+
+
+def _types(rooms: Rooms) -> Type:
+    if isinstance(rooms, Room):
+        return ArrayType(rooms.element, len(rooms.shape))
+    return tuple(_types(inner) for inner in rooms)

@@ -1,0 +1,68 @@
+"""Surfels blended on a device, on Warp's device "cpu": the samples that the processor finds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip("warp", reason="warp-lang is not installed")
+
+from test_raster import join, look_along_y, plane_of_surfels, random_surfels
+
+from drgs_blender.frame import RenderSettings
+from drgs_blender.render.camera import camera_parameters
+from drgs_blender.render.device import raster as device_raster
+from drgs_blender.render.device.on_device import OnDevice
+from drgs_blender.render.surfels.raster import SurfelSamples, rasterise
+from drgs_blender.render.surfels.splats import prepare
+
+SCENES = {
+    "cloud": (random_surfels(3000), {}),
+    "layers": (join(*(plane_of_surfels(y, 0.5, 0.05, 0.04, opacity=0.6) for y in (-0.4, 0.0, 0.02, 0.4))), {}),
+    "orthographic": (random_surfels(800, seed=3, size=0.1), {"orthographic": True, "focal": 20.0}),
+    "near": (random_surfels(500, seed=4, size=0.3), {"distance": 0.9}),
+}
+
+
+@pytest.fixture(scope="module")
+def device() -> OnDevice:
+    return OnDevice("cpu")
+
+
+def both(device: OnDevice, name: str, rows: tuple[int, int] = (0, 30)) -> tuple[SurfelSamples, SurfelSamples]:
+    posed, view = SCENES[name]
+    camera = look_along_y(40, 30, **view)
+    splats = prepare(posed, camera, camera_parameters(camera, RenderSettings(aa=3, seed=5), 2))
+    return rasterise(splats, *rows), device.rasterise(splats, *rows)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_a_device_finds_the_samples_that_the_processor_finds(device: OnDevice, name: str) -> None:
+    here, there = both(device, name)
+    seen = here.alpha > 0
+    assert seen.mean() > 0.1
+    np.testing.assert_array_equal(there.alpha > 0, seen)
+    np.testing.assert_allclose(there.alpha, here.alpha, atol=1e-6)
+    np.testing.assert_allclose(there.depth[seen], here.depth[seen], rtol=1e-5)
+    np.testing.assert_allclose(there.surface[seen], here.surface[seen], atol=1e-5)
+    np.testing.assert_array_equal(there.object_index[seen], here.object_index[seen])
+
+
+def test_rows_do_not_depend_on_those_rendered_with_them(device: OnDevice) -> None:
+    _, whole = both(device, "cloud")
+    _, part = both(device, "cloud", (11, 17))
+    np.testing.assert_array_equal(part.alpha, whole.alpha[11:17])
+
+
+def test_fog_of_any_depth_is_blended_in_exact_order(device: OnDevice) -> None:
+    """More contributions a sample than a list holds: the list is filled again."""
+    fog = join(*(plane_of_surfels(0.05 * i, 0.3, 0.05, 0.05, opacity=0.012) for i in range(16)))
+    camera = look_along_y(12, 12, focal=30.0)
+    splats = prepare(fog, camera, camera_parameters(camera, RenderSettings(aa=1), 0))
+    here, there = rasterise(splats, 0, 12), device.rasterise(splats, 0, 12)
+    assert 0.5 < here.alpha.max() < 0.999
+    assert len(splats.tile_list) / len(splats.tile_start) > 10 * device_raster.MOST
+    np.testing.assert_allclose(there.alpha, here.alpha, atol=1e-5)
+    seen = here.alpha > 0
+    np.testing.assert_allclose(there.depth[seen], here.depth[seen], rtol=1e-4)
+    np.testing.assert_allclose(there.surface[seen], here.surface[seen], atol=1e-4)
