@@ -187,6 +187,9 @@ class Expressions:
 
     def _of_Attribute(self, node: ast.Attribute) -> Value:
         owner = self.value(node.value)
+        if isinstance(owner.type, Array) and node.attr == "shape":
+            sizes = [f"wp.int64({owner.text}.shape[{axis}])" for axis in range(owner.type.axes)]
+            return together([Value(size, INT64) for size in sizes])
         if not isinstance(owner.type, Struct):
             raise TranslationError(ast.unparse(node), "is no field", "Use a named tuple")
         return Value(f"{owner.text}.{node.attr}", owner.type.fields[node.attr])

@@ -18,7 +18,7 @@ from ..errors import DeviceError
 from .translate import Constants, Translation
 from .typed import Array as ArrayType
 from .typed import Type, given, spelled
-from .warp import load_module, parts_of, type_for, warp
+from .warp import is_there, load_module, parts_of, type_for, warp
 
 Array = np.ndarray
 
@@ -94,8 +94,17 @@ class Launcher:
         array = np.ascontiguousarray(array)
         return wp.array(array, dtype=getattr(wp, array.dtype.name), device=self.device, copy=copy)
 
-    def launch(self, work: Work, pieces: int, arguments: Sequence[Any], out: Sequence[Array]) -> None:
-        """Do `pieces` of work; `arguments` are numbers, arrays, named tuples of numbers, and tuples of all these.
+    def zeros(self, shape: tuple[int, ...], element: str = "float32") -> Any:
+        """An array on the device."""
+        return warp().zeros(shape, dtype=getattr(warp(), element), device=self.device)
+
+    def launch(self, work: Work, pieces: int, arguments: Sequence[Any], out: Sequence[Any]) -> None:
+        """Do `pieces` of work.
+
+        Parameters
+        ----------
+        arguments : numbers, arrays here or on the device, named tuples of numbers, and tuples of all these
+        out : arrays that are written to: those of this process as a whole, those on the device where the work does
 
         Raises
         ------
@@ -106,11 +115,12 @@ class Launcher:
         with self.failures(work.function.__name__.replace("_", " ")):
             module = work.module(tuple(type_for(a) for a in (*arguments, tuple(out))), self.device.is_cuda)
             lanes = min(pieces, LANES)
-            found = [wp.zeros(a.shape, dtype=getattr(wp, a.dtype.name), device=self.device) for a in out]
+            found = [a if is_there(a) else self.zeros(a.shape, a.dtype.name) for a in out]
             inputs = [self._argument(module, part) for part in parts_of(tuple(arguments))]
             wp.launch(module.run, lanes, [lanes, *self._room(work, lanes), *inputs, *found], device=self.device)
             for array, result in zip(out, found):
-                array[...] = result.numpy()
+                if array is not result:
+                    array[...] = result.numpy()
 
     @contextlib.contextmanager
     def failures(self, work: str) -> Iterator[None]:

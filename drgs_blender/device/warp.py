@@ -58,8 +58,13 @@ def cuda_devices() -> list[str]:
         return []
 
 
+def is_there(value: Any) -> bool:
+    """Whether it is an array of a device."""
+    return hasattr(value, "ptr") and hasattr(value, "dtype")
+
+
 def type_for(value: Any) -> Type:
-    """Type of an argument as a kernel takes it: numbers, arrays, named tuples of numbers, tuples of all these.
+    """Type of an argument as a kernel takes it: numbers, arrays here or there, named tuples of numbers, tuples of all these.
 
     A kernel is made for the truth values that it is given.
 
@@ -70,6 +75,8 @@ def type_for(value: Any) -> Type:
     """
     if isinstance(value, np.ndarray):
         return ArrayType(value.dtype.name, value.ndim)
+    if is_there(value):
+        return ArrayType(value.dtype.__name__, value.ndim)
     if isinstance(value, tuple):
         return Struct(type(value)) if hasattr(value, "_fields") else tuple(type_for(part) for part in value)
     if isinstance(value, bool):

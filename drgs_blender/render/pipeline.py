@@ -32,7 +32,7 @@ from .primary.primary_mesh import primary_mesh
 from .primary.primary_surfels import primary_surfels, snap_windows
 from .primary.seen_lamps import seen_lamps
 from .shade.adaptive import part_count, sample_adaptively
-from .shade.integrate import HERE, Processor, integrate
+from .shade.integrate import HERE, Processor, integrate, tried
 from .surfels.splats import Splats, prepare
 from .surfels.surfel_bvh import SurfelBVH
 from .trace.scene import TraceScene
@@ -138,10 +138,13 @@ def render(
     if settings.denoise != "none":
         tell(end, "Denoising")
     if history is None:
-        components = denoised(film, frame, check)
+        components = denoised(film, frame, check, processor)
     else:
         shot = Shot(film.components, film.variance, film.guides(), motions[2])
-        components, signal = denoise_next(shot, history.signal, split_light(frame), history.still, check)
+        then, split = history, split_light(frame)
+        components, signal = tried(
+            processor, lambda by: denoise_next(shot, then.signal, split, then.still, check, by.smooth)
+        )
     tell(1.0, "Done")
     if history is not None:
         history.signal = signal
@@ -156,12 +159,14 @@ def render(
     return {name: made[name] for name in frame.passes}
 
 
-def denoised(film: Film, frame: Frame, check: Check) -> Array | None:
+def denoised(film: Film, frame: Frame, check: Check, processor: Processor = HERE) -> Array | None:
     """(h, w, 4, 3) light of the film without noise, by the denoiser of the frame; None without one."""
     if frame.settings.denoise == "oidn":
         return denoise_oidn(film.components, film.guides(), split_light(frame), check)
     if frame.settings.denoise == "svgf":
-        return denoise(film.components, film.variance, film.guides(), split_light(frame), check)
+        light, split = (film.components, film.variance, film.guides()), split_light(frame)
+        found: Array = tried(processor, lambda by: denoise(*light, split, check, by.smooth))
+        return found
     return None
 
 

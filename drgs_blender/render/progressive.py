@@ -256,7 +256,7 @@ class Progressive:
             if lamps is not None and lamps.seen:
                 rows = slice(strip.rows[0] - camera.window[1], strip.rows[1] - camera.window[1])
                 film.emission[rows] += seen_lamps(lamps, self._parameters, camera.window[0], buffer)
-        return film.passes(self.frame.passes, denoised(film, self.frame, check))
+        return film.passes(self.frame.passes, denoised(film, self.frame, check, self._processor))
 
 
 def _bytes_of(buffer: GBuffer) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,13 +16,14 @@ from ..surfels.raster import SurfelSamples
 from ..surfels.splats import TILE, Splats
 from ..surfels.surfel_bvh import SurfelBVH
 from ..trace.scene import TraceScene
+from .denoise import smooth
 from .integrate import SHADE
 from .mirror import Mirror
 from .raster import BLEND
 
 
 class OnDevice(Processor):
-    """Shades points and blends surfels on a device of Warp.
+    """Shades points, blends surfels and filters light on a device of Warp.
 
     Parameters
     ----------
@@ -31,6 +33,7 @@ class OnDevice(Processor):
     def __init__(self, device: str) -> None:
         self.launcher = Launcher(device)
         self.mirror = Mirror(self.launcher)
+        self.smooth = partial(smooth, self.launcher)
 
     def takes(self, surfels: SurfelBVH | None) -> bool:
         return surfels is None

@@ -91,9 +91,14 @@ class Signal:
     spans: Array
 
 
+#: Filters a signal: `smooth`, or the same on a device.
+Smooth = Callable[[Signal, Callable[[], None]], Signal]
+
+
 def denoise(
-    components: Array, variance: Array, guides: Guides, split: bool = True, check: Callable[[], None] = lambda: None
-) -> Array:
+    components: Array, variance: Array, guides: Guides, split: bool = True, check: Callable[[], None] = lambda: None,
+    by: Smooth | None = None,
+) -> Array:  # fmt: skip
     """Filter the light of a picture.
 
     Parameters
@@ -102,6 +107,7 @@ def denoise(
     variance : (h, w, 2) float32 of the luminance of the diffuse and the glossy sum
     split : keep direct and indirect light apart; else their sum is returned as direct light and indirect is 0 (faster)
     check : called between levels; may raise to stop
+    by : does the work of `smooth`
 
     Returns
     -------
@@ -109,7 +115,7 @@ def denoise(
     """
     signal = demodulate(components, variance, guides, split)
     check()
-    return modulate(smooth(signal, check), guides)
+    return modulate((by or smooth)(signal, check), guides)
 
 
 def demodulate(components: Array, variance: Array, guides: Guides, split: bool = True) -> Signal:
@@ -281,7 +287,7 @@ def _clamp_fireflies(y0: Any, y1: Any, guide: Any, spans: Any, light: Any, out: 
 
 
 @njit(inline="always")
-def _stop(x: Any) -> Any:
+def stop(x: Any) -> Any:
     """(1 - x / 8)^8 for x in [0, 8], beyond it 0."""
     u = max(np.float32(1.0) - np.float32(0.125) * x, np.float32(0.0))
     u *= u
@@ -384,8 +390,8 @@ def _a_trous(y0: Any, y1: Any, step: Any, guide: Any, spans: Any, light: Any, ou
                         far_d = abs(near[SURFACE + LUMINANCE, j] - own[SURFACE + 2, i]) * sure_d
                         far_g = abs(near[SURFACE + LUMINANCE + 1, j] - own[SURFACE + 3, i]) * sure_g
                         same = kernel if near[SOURCE, j] == own[SURFACE, i] else zero
-                        weight[0, i] = same * _stop(common + diffuse_power * turn + far_d)
-                        weight[1, i] = same * _stop(common + own[SURFACE + 6, i] * turn + rough + far_g)
+                        weight[0, i] = same * stop(common + diffuse_power * turn + far_d)
+                        weight[1, i] = same * stop(common + own[SURFACE + 6, i] * turn + rough + far_g)
                     for lobe in range(2):
                         for i in range(np.uint64(n)):
                             w = weight[lobe, i]
@@ -401,7 +407,7 @@ def _a_trous(y0: Any, y1: Any, step: Any, guide: Any, spans: Any, light: Any, ou
                     out[y, VARIANCE + lobe, x0 + i] = sums[2 + VARIANCE + lobe, i] * sums[lobe, i] * sums[lobe, i]
             for k in range(LIGHT, planes):
                 lobe = 1 if k >= first_glossy else 0
-                share = _share((k - LIGHT) % 3)
+                share = share_of((k - LIGHT) % 3)
                 for i in range(n):
                     value = sums[2 + k, i] * sums[lobe, i]
                     sums[2 + LUMINANCE + lobe, i] += share * value
@@ -412,7 +418,7 @@ def _a_trous(y0: Any, y1: Any, step: Any, guide: Any, spans: Any, light: Any, ou
 
 
 @njit(inline="always")
-def _share(k: Any) -> Any:
+def share_of(k: Any) -> Any:
     """Share of colour channel `k` in luminance."""
     return np.float32(REC709[0]) if k == 0 else np.float32(REC709[1]) if k == 1 else np.float32(REC709[2])
 

@@ -37,6 +37,7 @@ from .denoise import (
     WIDTH,
     Guides,
     Signal,
+    Smooth,
     demodulate,
     modulate,
     smooth,
@@ -100,6 +101,7 @@ def denoise_next(
     split: bool = True,
     still: bool = False,
     check: Callable[[], None] = lambda: None,
+    by: Smooth | None = None,
 ) -> tuple[Array, Signal]:
     """Denoise a picture with the help of those before it.
 
@@ -108,7 +110,7 @@ def denoise_next(
     history : what this function returned for the frame before; None starts anew
     still : nothing in the scene has changed since then (camera, objects, light), only the noise: pictures are then
         gathered without end, with equal weights
-    split, check : see `denoise.denoise`; a history made with another `split` or size is not used
+    split, check, by : see `denoise.denoise`; a history made with another `split` or size is not used
 
     Returns
     -------
@@ -118,7 +120,7 @@ def denoise_next(
     check()
     if history is not None and shot.motion is not None and history.light.shape == signal.light.shape:
         signal = accumulate(history, signal, shot.motion, still)
-    return modulate(smooth(signal, check), shot.guides), signal
+    return modulate((by or smooth)(signal, check), shot.guides), signal
 
 
 def accumulate(history: Signal, signal: Signal, motion: Motion, still: bool = False) -> Signal:

@@ -52,9 +52,11 @@ class Processor:
     Attributes
     ----------
     failed : why it is of no use any more, in words; what it was to do is done here
+    smooth : the denoiser's filter, as ``picture.denoise.smooth``, which it is where this is None
     """
 
     failed = ""
+    smooth: Callable[..., Any] | None = None
 
     def takes(self, surfels: SurfelBVH | None) -> bool:
         """Whether it can trace what rays are to meet next to meshes."""
