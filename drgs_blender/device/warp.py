@@ -64,7 +64,7 @@ def is_there(value: Any) -> bool:
 
 
 def type_for(value: Any) -> Type:
-    """Type of an argument as a kernel takes it: numbers, arrays here or there, named tuples of numbers, tuples of all these.
+    """Type of an argument as a kernel takes it: numbers, arrays here or there, named tuples, tuples of all these.
 
     A kernel is made for the truth values that it is given.
 
