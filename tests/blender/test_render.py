@@ -56,6 +56,20 @@ def test_an_animation_warns_once_of_what_is_in_every_frame(ball, scene, captured
     assert len(history) == 4
 
 
+def test_without_a_card_f12_is_rendered_on_the_processor_and_says_so(ball, scene):
+    history = part("addon.messages").history
+    light(scene)
+    here = render(scene)
+    history.clear()
+    scene.drgs.device = "CUDA"
+    there = render(scene)
+    if any("Rendered on the CPU" in message.text for message in history):
+        np.testing.assert_array_equal(there, here)
+    else:
+        np.testing.assert_allclose(there, here, atol=2e-3)
+        pytest.skip("this machine has a card, which gave the same picture")
+
+
 def test_f12_writes_exactly_the_pixels_of_a_session(ball, scene, tmp_path, captured, monkeypatch):
     light(scene)
     ball.rotation_euler = (0.3, 0.2, 0.1)
