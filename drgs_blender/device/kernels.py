@@ -7,7 +7,6 @@ from the `lane`-th on, with scratch memory of its own, and writes to the arrays 
 from __future__ import annotations
 
 import contextlib
-import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -18,7 +17,7 @@ from ..errors import DeviceError
 from .translate import Constants, Translation
 from .typed import Array as ArrayType
 from .typed import Type, given, spelled
-from .warp import is_there, load_module, parts_of, type_for, warp
+from .warp import is_there, load_module, parts_of, preparing, type_for, warp
 
 Array = np.ndarray
 
@@ -56,9 +55,8 @@ class Work:
     ) -> None:
         self.function, self.rooms = function, rooms
         self._natives, self._constants = natives, constants
-        self.module = functools.lru_cache(maxsize=16)(self._module)
 
-    def _module(self, types: tuple[Type, ...], fused: bool) -> ModuleType:
+    def module(self, types: tuple[Type, ...], fused: bool) -> ModuleType:
         """Module whose ``run`` is the kernel for arguments of these types."""
         translation = Translation(self._natives, self._constants, fused)
         kinds = _types(self.rooms)
@@ -86,6 +84,7 @@ class Launcher:
     def __init__(self, device: str) -> None:
         self.device = warp().get_device(device)
         self._rooms: dict[Work, list[Any]] = {}
+        self._modules: dict[tuple[Work, tuple[Type, ...]], ModuleType] = {}
 
     def array(self, array: Array, copy: bool | None = None) -> Any:
         """A Warp array of an array's content; on the processor it is the same memory unless told otherwise."""
@@ -113,7 +112,7 @@ class Launcher:
         """
         wp = warp()
         with self.failures(work.function.__name__.replace("_", " ")):
-            module = work.module(tuple(type_for(a) for a in (*arguments, tuple(out))), self.device.is_cuda)
+            module = self._ready(work, tuple(type_for(a) for a in (*arguments, tuple(out))))
             lanes = min(pieces, LANES)
             found = [a if is_there(a) else self.zeros(a.shape, a.dtype.name) for a in out]
             inputs = [self._argument(module, part) for part in parts_of(tuple(arguments))]
@@ -121,6 +120,15 @@ class Launcher:
             for array, result in zip(out, found):
                 if array is not result:
                     array[...] = result.numpy()
+
+    def _ready(self, work: Work, types: tuple[Type, ...]) -> ModuleType:
+        """The module for arguments of these types, compiled."""
+        if (work, types) not in self._modules:
+            with preparing():
+                module = work.module(types, self.device.is_cuda)
+                warp().load_module(module, self.device)
+            self._modules[work, types] = module
+        return self._modules[work, types]
 
     @contextlib.contextmanager
     def failures(self, work: str) -> Iterator[None]:

@@ -5,11 +5,12 @@ Warp is imported when it is first needed, for most machines have no use for it.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import importlib.util
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -22,6 +23,9 @@ from .typed import Array as ArrayType
 from .typed import Known, Struct, Type, type_of
 
 Array = np.ndarray
+
+#: Called with 1 when kernels begin to be made ready, which nothing interrupts, and with -1 when they are.
+watchers: list[Callable[[int], None]] = []
 
 
 @functools.cache
@@ -48,6 +52,18 @@ def warp() -> Any:
     except Exception as error:
         raise DeviceError("device cuda", f"Warp does not start ({error})", "Use the CPU") from error
     return wp
+
+
+@contextlib.contextmanager
+def preparing() -> Iterator[None]:
+    """While kernels are made ready: tells the `watchers`."""
+    for watcher in watchers:
+        watcher(1)
+    try:
+        yield
+    finally:
+        for watcher in watchers:
+            watcher(-1)
 
 
 def cuda_devices() -> list[str]:

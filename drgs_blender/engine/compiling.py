@@ -1,4 +1,4 @@
-"""Tells when Numba compiles a kernel: the one long wait of a first picture, which the user should understand."""
+"""Tells when Numba or Warp compile a kernel: the one long wait of a first picture, which the user should understand."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from .. import jit  # noqa: F401  (sets Numba up before it is imported)
+from ..device import warp
 
 from numba.core import event  # isort: skip
 
@@ -25,3 +26,4 @@ def watch(change: Callable[[int], None]) -> None:
     """Call `change` with 1 when a compilation begins and with -1 when it ends; they nest. Loading from the cache
     is no compilation."""
     event.register("numba:compile", _Listener(change))
+    warp.watchers.append(change)

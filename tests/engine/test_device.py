@@ -9,6 +9,7 @@ import pytest
 
 pytest.importorskip("warp", reason="warp-lang is not installed")
 
+from drgs_blender.engine import compiling
 from drgs_blender.engine.session import Session
 
 
@@ -52,3 +53,14 @@ def test_without_a_card_a_frame_is_rendered_here_with_a_warning(session, make_fr
     found = session.render(make_frame(device="cuda"))
     assert any("no NVIDIA card" in warning and "CPU" in warning for warning in found.warnings)
     np.testing.assert_array_equal(found["Combined"], expected["Combined"])
+
+
+def test_whoever_waits_is_told_that_kernels_are_made(warp_session, make_frame):
+    """They take a minute, and an engine that says nothing for so long is taken for dead."""
+    changes = []
+    compiling.watch(changes.append)
+    warp_session.render(make_frame(device="cuda"))
+    assert changes.count(1) == changes.count(-1) > 1 and changes[0] == 1
+    changes.clear()
+    warp_session.render(make_frame(0.1, device="cuda"))
+    assert not changes
