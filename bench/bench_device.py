@@ -27,7 +27,7 @@ from drgs_blender.render.device.on_device import OnDevice
 from drgs_blender.render.lights.light import EnvironmentLight
 from drgs_blender.render.points import Radiance
 from drgs_blender.render.primary.primary_mesh import primary_mesh
-from drgs_blender.render.shade.integrate import HERE, Processor, integrate
+from drgs_blender.render.processor import HERE, Processor
 from drgs_blender.render.trace.scene import TraceObject, TraceScene
 
 #: Rows, and the processor for each; a card stands in its row whether there is one or not.
@@ -55,7 +55,7 @@ def main() -> None:
         seconds = []
         for _ in range(options.runs + 1):
             began = time.perf_counter()
-            found = integrate(scene, light, points, replace(settings, threads=threads), 1, processor=processor)
+            found = processor.integrate(scene, light, points, replace(settings, threads=threads), 1)
             seconds.append(time.perf_counter() - began)
         use_threads(0)
         if processor.failed:

@@ -12,8 +12,8 @@ from ..frame import Frame
 from ..render.lights.lamps import Lamps
 from ..render.lights.light import EnvironmentLight
 from ..render.pipeline import Progress
+from ..render.processor import HERE, Processor
 from ..render.progressive import Progressive, coarse, thinned
-from ..render.shade.integrate import HERE, Processor
 from ..render.surfels.surfel_bvh import SurfelBVH
 from ..render.trace.scene import TraceScene
 from .protocol import Passes
@@ -71,7 +71,7 @@ class View:
     pace : for how coarse the first picture is
     number : another one for every view: in a history, the noise of one picture must differ from that of the next
     by_mesh : whether coarse pictures show the meshes, which are as detailed as those pictures
-    processor : where points are shaded
+    processor : who does the work
 
     Attributes
     ----------

@@ -31,8 +31,8 @@ from .primary.gbuffer import GBuffer
 from .primary.primary_mesh import primary_mesh
 from .primary.primary_surfels import primary_surfels, snap_windows
 from .primary.seen_lamps import seen_lamps
+from .processor import HERE, Processor
 from .shade.adaptive import part_count, sample_adaptively
-from .shade.integrate import HERE, Processor, integrate, tried
 from .surfels.splats import Splats, prepare
 from .surfels.surfel_bvh import SurfelBVH
 from .trace.scene import TraceScene
@@ -74,7 +74,7 @@ def render(
     tree : the surfels that light meets, when ``frame.settings.tracer`` is "surfels"
     previous, following : the scene one frame earlier and later; None: nothing moves
     history : what earlier pictures leave to the denoiser SVGF; brought up to date when the picture is done
-    processor : where points are shaded
+    processor : who does the work
 
     Returns
     -------
@@ -141,9 +141,8 @@ def render(
         components = denoised(film, frame, check, processor)
     else:
         shot = Shot(film.components, film.variance, film.guides(), motions[2])
-        then, split = history, split_light(frame)
-        components, signal = tried(
-            processor, lambda by: denoise_next(shot, then.signal, split, then.still, check, by.smooth)
+        components, signal = denoise_next(
+            shot, history.signal, split_light(frame), history.still, check, processor.smooth
         )
     tell(1.0, "Done")
     if history is not None:
@@ -165,8 +164,7 @@ def denoised(film: Film, frame: Frame, check: Check, processor: Processor = HERE
         return denoise_oidn(film.components, film.guides(), split_light(frame), check)
     if frame.settings.denoise == "svgf":
         light, split = (film.components, film.variance, film.guides()), split_light(frame)
-        found: Array = tried(processor, lambda by: denoise(*light, split, check, by.smooth))
-        return found
+        return denoise(*light, split, check, processor.smooth)
     return None
 
 
@@ -197,7 +195,9 @@ class Primary:
                 _own_surfels(buffer, self._tree, self._objects)
             return buffer
         tied = self._tree is None
-        return primary_surfels(self._splats, self._scene, self._windows, self._camera, y0, y1, tied, self._processor)
+        return primary_surfels(
+            self._splats, self._scene, self._windows, self._camera, y0, y1, tied, self._processor.rasterise
+        )
 
 
 def strip_height(width: int, aa: int) -> int:
@@ -240,7 +240,7 @@ class Batches:
             # A pixel's points stay together: their variance is estimated together.
             last = int(np.searchsorted(points.pixel, points.pixel[min(first + self._size, n) - 1], side="right"))
             began = time.perf_counter()
-            found = integrate(
+            found = self._processor.integrate(
                 self._scene,
                 self._light,
                 points[first:last],
@@ -248,8 +248,7 @@ class Batches:
                 self._frame.number,
                 self._lamps,
                 part,
-                self._tree,
-                self._processor,
+                surfels=self._tree,
             )
             out.components[first:last], out.variance[first:last] = found.components, found.variance
             out.moments[first:last] = found.moments

@@ -26,8 +26,8 @@ from .pipeline import Batches, Primary, check_frame, denoised, strip_height
 from .points import Radiance, ShadingPoints
 from .primary.gbuffer import GBuffer
 from .primary.seen_lamps import seen_lamps
+from .processor import HERE, Processor
 from .shade.adaptive import Sampling, part_count
-from .shade.integrate import HERE, Processor
 from .shade.spread import variances
 from .surfels.surfel_bvh import SurfelBVH
 from .trace.scene import TraceScene

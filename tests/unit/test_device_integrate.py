@@ -18,7 +18,8 @@ from drgs_blender.render.lights.emitters import Emitters
 from drgs_blender.render.lights.lamps import Lamps
 from drgs_blender.render.lights.light import EnvironmentLight
 from drgs_blender.render.points import CATCHER, Radiance, ShadingPoints
-from drgs_blender.render.shade.integrate import HERE, integrate
+from drgs_blender.render.processor import HERE
+from drgs_blender.render.shade.integrate import integrate
 from drgs_blender.render.trace.scene import TraceObject, TraceScene
 
 BALL = trimesh.creation.icosphere(subdivisions=3)
@@ -152,9 +153,7 @@ SCENES: dict[str, Callable[[], tuple]] = {
 
 def both(device: OnDevice, scene: tuple, settings: RenderSettings, part: tuple[int, int] = (0, 1)) -> list[Radiance]:
     objects, light, shining, points = scene
-    return [
-        integrate(objects, light, points, settings, 3, shining, part, **where) for where in ({}, {"processor": device})
-    ]
+    return [by(objects, light, points, settings, 3, shining, part) for by in (integrate, device.integrate)]
 
 
 def psnr(a: np.ndarray, b: np.ndarray) -> float:
@@ -191,8 +190,8 @@ def test_settings_mean_the_same_on_a_device(device: OnDevice, settings: RenderSe
 
 def test_points_give_the_same_bits_in_any_company(device: OnDevice) -> None:
     scene, light, shining, points = under_lamps()
-    whole = integrate(scene, light, points, SETTINGS, 0, shining, processor=device)
-    part = integrate(scene, light, points[100:300], SETTINGS, 0, shining, processor=device)
+    whole = device.integrate(scene, light, points, SETTINGS, 0, shining)
+    part = device.integrate(scene, light, points[100:300], SETTINGS, 0, shining)
     np.testing.assert_array_equal(part.components, whole.components[100:300])
 
 
@@ -233,7 +232,7 @@ def test_a_device_that_fails_is_left_alone_and_its_work_done_here(device: OnDevi
     monkeypatch.setattr(
         broken.launcher, "_room", lambda *arguments: (_ for _ in ()).throw(RuntimeError("out of memory\nat 0"))
     )
-    found = integrate(scene, light, points, SETTINGS, 3, shining, processor=broken)
+    found = broken.integrate(scene, light, points, SETTINGS, 3, shining)
     np.testing.assert_array_equal(found.components, integrate(scene, light, points, SETTINGS, 3, shining).components)
     devices = Devices()
     devices._known["cuda"] = broken
@@ -253,8 +252,8 @@ def test_every_array_is_copied_to_a_card(monkeypatch: pytest.MonkeyPatch) -> Non
     scene, light, shining, points = among_meshes()
     expected = integrate(scene, light, points, SETTINGS, 3, shining)
     apart = OnDevice("cpu")
-    apart.mirror.copies = True
-    apart.tables(scene, light, shining)
+    apart.kernel.mirror.copies = True
+    apart.kernel.tables(scene, light, shining)
     spoilt = [
         scene.shading_faces, scene.shading, scene.normals, scene.face_object, scene._material, scene._uvs,
         scene._place_normal, scene.place_object, scene._material_tables, scene.vertices, *scene.materials.arrays,
@@ -267,5 +266,5 @@ def test_every_array_is_copied_to_a_card(monkeypatch: pytest.MonkeyPatch) -> Non
     for array in spoilt:
         array.setflags(write=True)
         array.view(np.uint8)[...] = 0x7F
-    found = integrate(scene, light, points, SETTINGS, 3, shining, processor=apart)
+    found = apart.integrate(scene, light, points, SETTINGS, 3, shining)
     assert psnr(found.total, expected.total) > 60.0

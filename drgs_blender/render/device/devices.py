@@ -1,11 +1,11 @@
-"""Which processor shades a frame's points: the one asked for, or this one with a warning that says why."""
+"""Which processor does the work of a frame: the one asked for, or this one with a warning that says why."""
 
 from __future__ import annotations
 
 from ...device.warp import cuda_devices, warp
 from ...errors import DeviceError
 from ...frame import RenderSettings
-from ..shade.integrate import HERE, Processor
+from ..processor import HERE, Processor
 from .on_device import OnDevice
 
 #: ``RenderSettings.device``, and what each stands for.

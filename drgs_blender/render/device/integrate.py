@@ -5,8 +5,12 @@ from __future__ import annotations
 from types import ModuleType
 from typing import Any
 
-from ...device.kernels import Room, Work
+from ...device.kernels import Launcher, Room, Work
+from ..lights.lamps import Lamps
+from ..lights.light import EnvironmentLight
 from ..shade import heads, integrate, paths, strategies, wave
+from ..trace.scene import TraceScene
+from .mirror import Mirror
 from .natives import NATIVES
 
 
@@ -30,4 +34,20 @@ _ROOMS = (
     Room("uint32", (1,)),
     Room("int64", (1,)),
 )
-SHADE = Work(integrate.shade_points, _ROOMS, NATIVES, _constants)
+_SHADE = Work(integrate.shade_points, _ROOMS, NATIVES, _constants)
+
+
+class DeviceKernel(integrate.Kernel):
+    """`shade.integrate.Kernel` on a device."""
+
+    def __init__(self, launcher: Launcher) -> None:
+        self._launcher = launcher
+        self.mirror = Mirror(launcher)
+
+    def tables(self, scene: TraceScene, light: EnvironmentLight, lamps: Lamps) -> tuple[Any, Any, Any, Any]:
+        with self._launcher.failures("copying the scene"):
+            return self.mirror.tables(scene, light, lamps)
+
+    def shade(self, *arguments: Any) -> None:
+        *inwards, out = arguments
+        self._launcher.launch(_SHADE, len(out[0]), inwards, out)

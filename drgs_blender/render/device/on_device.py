@@ -1,29 +1,28 @@
-"""A processor that is a device of Warp: what the renderer hands it, and when it does the work."""
+"""A processor that is a device of Warp; what it fails at, and all that follows, is done here."""
 
 from __future__ import annotations
 
-from functools import partial
-from typing import Any
-
-import numpy as np
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 from ...device.kernels import Launcher
-from ..camera import AA
-from ..lights.lamps import Lamps
-from ..lights.light import EnvironmentLight
-from ..shade.integrate import Processor
+from ...errors import DeviceError
+from ..picture.denoise import Signal
+from ..points import Radiance
+from ..processor import Processor
+from ..shade.integrate import integrate
 from ..surfels.raster import SurfelSamples
-from ..surfels.splats import TILE, Splats
+from ..surfels.splats import Splats
 from ..surfels.surfel_bvh import SurfelBVH
-from ..trace.scene import TraceScene
 from .denoise import smooth
-from .integrate import SHADE
-from .mirror import Mirror
-from .raster import BLEND
+from .integrate import DeviceKernel
+from .raster import rasterise
+
+_T = TypeVar("_T")
 
 
 class OnDevice(Processor):
-    """Shades points, blends surfels and filters light on a device of Warp.
+    """A device of Warp.
 
     Parameters
     ----------
@@ -32,34 +31,29 @@ class OnDevice(Processor):
 
     def __init__(self, device: str) -> None:
         self.launcher = Launcher(device)
-        self.mirror = Mirror(self.launcher)
-        self.smooth = partial(smooth, self.launcher)
+        self.kernel = DeviceKernel(self.launcher)
 
-    def takes(self, surfels: SurfelBVH | None) -> bool:
-        return surfels is None
-
-    def tables(self, scene: TraceScene, light: EnvironmentLight, lamps: Lamps) -> tuple[Any, Any, Any, Any]:
-        with self.launcher.failures("copying the scene"):
-            return self.mirror.tables(scene, light, lamps)
-
-    def kernel(self, *arguments: Any) -> None:
-        *inwards, out = arguments
-        self.launcher.launch(SHADE, len(out[0]), inwards, out)
+    def integrate(self, *arguments: Any, surfels: SurfelBVH | None = None) -> Radiance:
+        here = super().integrate
+        if surfels is not None:
+            return here(*arguments, surfels=surfels)
+        return self._tried(lambda: integrate(*arguments, kernel=self.kernel), lambda: here(*arguments))
 
     def rasterise(self, splats: Splats, y0: int, y1: int) -> SurfelSamples:
+        here = super().rasterise
         if not len(splats):
-            return super().rasterise(splats, y0, y1)
-        x0, top, x1, _ = splats.window
-        aa = int(splats.parameters[AA])
-        shape = y1 - y0, x1 - x0, aa
-        samples = SurfelSamples(
-            np.empty(shape, np.float32),
-            np.empty(shape, np.float32),
-            np.empty((*shape, 9), np.float32),
-            np.empty(shape, np.int32),
-        )
-        arrays = splats.screen, splats.surface, splats.box, splats.nearest, splats.object_index
-        arguments = *arrays, splats.tile_start, splats.tile_list, splats.parameters, x0, x1, top // TILE, y0, y1, aa
-        out = samples.alpha, samples.depth, samples.surface, samples.object_index
-        self.launcher.launch(BLEND, samples.alpha.size, arguments, out)
-        return samples
+            return here(splats, y0, y1)
+        return self._tried(lambda: rasterise(self.launcher, splats, y0, y1), lambda: here(splats, y0, y1))
+
+    def smooth(self, signal: Signal, check: Callable[[], None] = lambda: None) -> Signal:
+        here = super().smooth
+        return self._tried(lambda: smooth(self.launcher, signal, check), lambda: here(signal, check))
+
+    def _tried(self, there: Callable[[], _T], here: Callable[[], _T]) -> _T:
+        """Work done there, or here once that has failed."""
+        if not self.failed:
+            try:
+                return there()
+            except DeviceError as error:
+                self.failed = str(error)
+        return here()

@@ -12,12 +12,30 @@ from typing import Any
 
 import numpy as np
 
-from ...device.kernels import Room, Work
+from ...device.kernels import Launcher, Room, Work
 from ..camera import AA, CLIP_END, CLIP_START, FX, FY, ORTHOGRAPHIC, WIDTH, lattice, pixel_shift
 from ..sampling import ONE, ZERO, F
 from ..surfels.blending import GAP, MIN_TRANSMITTANCE
-from ..surfels.raster import MAX_ALPHA, gaussian
-from ..surfels.splats import ALBEDO, CUT, LOW, METALLIC, NORMAL, OPACITY, ROUGHNESS, RX, RY, SIZE, TILE, ZC, A, B, D, N
+from ..surfels.raster import MAX_ALPHA, SurfelSamples, gaussian
+from ..surfels.splats import (
+    ALBEDO,
+    CUT,
+    LOW,
+    METALLIC,
+    NORMAL,
+    OPACITY,
+    ROUGHNESS,
+    RX,
+    RY,
+    SIZE,
+    TILE,
+    ZC,
+    A,
+    B,
+    D,
+    N,
+    Splats,
+)
 
 #: Contributions that a lane gathers at once.
 MOST = 64
@@ -177,3 +195,21 @@ _ROOMS = (
     Room("int32", (2,)),
 )
 BLEND = Work(blend_samples, _ROOMS, {})
+
+
+def rasterise(launcher: Launcher, splats: Splats, y0: int, y1: int) -> SurfelSamples:
+    """`surfels.raster.rasterise` on a device; where ``alpha`` is 0 the other arrays are undefined."""
+    x0, top, x1, _ = splats.window
+    aa = int(splats.parameters[AA])
+    shape = y1 - y0, x1 - x0, aa
+    samples = SurfelSamples(
+        np.empty(shape, np.float32),
+        np.empty(shape, np.float32),
+        np.empty((*shape, 9), np.float32),
+        np.empty(shape, np.int32),
+    )
+    arrays = splats.screen, splats.surface, splats.box, splats.nearest, splats.object_index
+    arguments = *arrays, splats.tile_start, splats.tile_list, splats.parameters, x0, x1, top // TILE, y0, y1, aa
+    out = samples.alpha, samples.depth, samples.surface, samples.object_index
+    launcher.launch(BLEND, samples.alpha.size, arguments, out)
+    return samples

@@ -22,6 +22,7 @@ mesh, whichever is larger. The seen position and depth stay those of the surfels
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -30,8 +31,7 @@ from ...frame import Camera
 from ...jit import njit, prange
 from ..camera import WIDTH, sample_ray
 from ..points import SECOND
-from ..shade.integrate import HERE, Processor, tried
-from ..surfels.raster import SurfelSamples
+from ..surfels.raster import SurfelSamples, rasterise
 from ..surfels.splats import SIZE, Splats
 from ..trace.masks import SURFELS
 from ..trace.scene import TraceScene
@@ -68,7 +68,7 @@ def primary_surfels(
     y0: int,
     y1: int,
     tied: bool = True,
-    processor: Processor = HERE,
+    rasterise: Callable[[Splats, int, int], SurfelSamples] = rasterise,
 ) -> GBuffer:
     """Blend the surfels of the rows ``y0 .. y1`` (full-picture pixels) and tie them to the mesh.
 
@@ -77,9 +77,9 @@ def primary_surfels(
     splats : `prepare` of this frame
     windows : `snap_windows` of this frame
     tied : False: rays meet surfels, and nothing is tied
-    processor : where surfels are blended
+    rasterise : blends the surfels
     """
-    samples: SurfelSamples = tried(processor, lambda by: by.rasterise(splats, y0, y1))
+    samples = rasterise(splats, y0, y1)
     layers = combine(samples, scene, splats.parameters, camera.window[0], y0)
     buffer, start = compact(layers.first, splats.parameters, camera.window[0], y0, layers.second)
     buffer.alpha = layers.opaque

@@ -7,13 +7,12 @@ frame number.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from ...colour import LUMINANCE
-from ...errors import DeviceError, UsageError
+from ...errors import UsageError
 from ...frame import RenderSettings
 from ...jit import get_num_threads, njit, prange
 from .. import sampling
@@ -21,8 +20,6 @@ from ..lights.lamps import Lamps
 from ..lights.light import EnvironmentLight
 from ..points import CATCHER, SECOND, Radiance, ShadingPoints
 from ..sampling import GOLDEN, ONE, ZERO, F, U, mix, unit
-from ..surfels.raster import SurfelSamples, rasterise
-from ..surfels.splats import Splats
 from ..surfels.surfel_bvh import SurfelBVH
 from ..surfels.surfel_tracer import tracer_of
 from ..trace import masks
@@ -46,46 +43,16 @@ _BLOCK = 64
 _LEAST_SHARE = 0.1
 
 
-class Processor:
-    """Where points are shaded and surfels blended: here, by all threads; `render.device` has the same for a card.
-
-    Attributes
-    ----------
-    failed : why it is of no use any more, in words; what it was to do is done here
-    smooth : the denoiser's filter, as ``picture.denoise.smooth``, which it is where this is None
-    """
-
-    failed = ""
-    smooth: Callable[..., Any] | None = None
-
-    def takes(self, surfels: SurfelBVH | None) -> bool:
-        """Whether it can trace what rays are to meet next to meshes."""
-        return True
+class Kernel:
+    """What shades points, and where it finds the scene: all threads here; `render.device` has the same for a card."""
 
     def tables(self, scene: TraceScene, light: EnvironmentLight, lamps: Lamps) -> tuple[Any, Any, Any, Any]:
-        """(tracer, geometry, sky, lamps) as `kernel` takes them; until the scene's next update."""
+        """(tracer, geometry, sky, lamps) as `shade` takes them; until the scene's next update."""
         return scene.tracer, scene.geometry, light.sky, lamps.tables
 
-    def kernel(self, *arguments: Any) -> None:
+    def shade(self, *arguments: Any) -> None:
         """Shade all points; see `shade_points`."""
         _kernel(*arguments, 8 * get_num_threads())
-
-    def rasterise(self, splats: Splats, y0: int, y1: int) -> SurfelSamples:
-        """`surfels.raster.rasterise`."""
-        return rasterise(splats, y0, y1)
-
-
-HERE = Processor()
-
-
-def tried(processor: Processor, work: Callable[[Processor], Any]) -> Any:
-    """`work` done by a processor, or here once that has failed."""
-    if processor is not HERE and not processor.failed:
-        try:
-            return work(processor)
-        except DeviceError as error:
-            processor.failed = str(error)
-    return work(HERE)
 
 
 def integrate(
@@ -96,8 +63,9 @@ def integrate(
     frame_number: int,
     lamps: Lamps | None = None,
     part: tuple[int, int] = (0, 1),
+    *,
     surfels: SurfelBVH | None = None,
-    processor: Processor = HERE,
+    kernel: Kernel | None = None,
 ) -> Radiance:
     """Light that leaves `points` towards the camera.
 
@@ -110,7 +78,7 @@ def integrate(
     frame_number : int, part of the seed
     part : (i, n): only the i-th of n equal parts of each sub-sample's samples; the mean over all parts is the whole
     surfels : what rays meet of DR-GS objects next to the scene's meshes; then `points` say which surfels are their own
-    processor : where
+    kernel : None: that of this processor
 
     Returns
     -------
@@ -122,15 +90,6 @@ def integrate(
     UsageError
         When settings are out of range.
     """
-    arguments = scene, light, points, settings, frame_number, lamps, part, surfels
-    found: Radiance = tried(processor if processor.takes(surfels) else HERE, lambda by: _integrated(*arguments, by))
-    return found
-
-
-def _integrated(
-    scene: TraceScene, light: EnvironmentLight, points: ShadingPoints, settings: RenderSettings, frame_number: int,
-    lamps: Lamps | None, part: tuple[int, int], surfels: SurfelBVH | None, processor: Processor,
-) -> Radiance:  # fmt: skip
     counts = (settings.cosine, settings.ggx, settings.environment)
     if min(counts) < 0 or settings.bounces < 0 or settings.aa < 0:
         raise UsageError("render settings", "samples, bounces or aa are negative", "Use counts of zero or more")
@@ -147,7 +106,8 @@ def _integrated(
     share = sky_share(light, lamps)
     # Where neither shines, nothing is drawn by its light, though surfaces may emit some.
     sky_part, lamp_part = share * (not light.black), (1.0 - share) * (lamps.count > 0)
-    tracer, geometry, sky, lamp_tables = processor.tables(scene, light, lamps)
+    kernel = kernel or Kernel()
+    tracer, geometry, sky, lamp_tables = kernel.tables(scene, light, lamps)
     tables = (
         tracer if surfels is None else mixed_tracer(tracer, tracer_of(surfels)),
         geometry,
@@ -170,7 +130,7 @@ def _integrated(
     )
 
     def run(some: ShadingPoints, shift: int, found: Radiance) -> None:
-        processor.kernel(
+        kernel.shade(
             (some.pixel, some.sample, some.flags),
             (some.origin, some.normal, some.geometric_normal, some.view),
             (some.albedo, some.roughness, some.metallic, some.own, some.size),

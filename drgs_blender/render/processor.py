@@ -1,0 +1,39 @@
+"""Who does the work of a frame: this processor; `render.device` has another for a card."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from .picture.denoise import Signal, smooth
+from .points import Radiance
+from .shade.integrate import integrate
+from .surfels.raster import SurfelSamples, rasterise
+from .surfels.splats import Splats
+from .surfels.surfel_bvh import SurfelBVH
+
+
+class Processor:
+    """This processor, by all threads.
+
+    Attributes
+    ----------
+    failed : of another one, why it is of no use any more, in words; what it was to do is done here
+    """
+
+    failed = ""
+
+    def integrate(self, *arguments: Any, surfels: SurfelBVH | None = None) -> Radiance:
+        """`shade.integrate.integrate`."""
+        return integrate(*arguments, surfels=surfels)
+
+    def rasterise(self, splats: Splats, y0: int, y1: int) -> SurfelSamples:
+        """`surfels.raster.rasterise`."""
+        return rasterise(splats, y0, y1)
+
+    def smooth(self, signal: Signal, check: Callable[[], None] = lambda: None) -> Signal:
+        """`picture.denoise.smooth`."""
+        return smooth(signal, check)
+
+
+HERE = Processor()
