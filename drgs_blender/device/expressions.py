@@ -229,6 +229,11 @@ class Expressions:
         return Value(f"({sides[0]} {_OPERATORS[type(operator)]} {sides[1]})", kind)
 
     def _of_Compare(self, node: ast.Compare) -> Value:
+        if isinstance(node.ops[0], (ast.In, ast.NotIn)):
+            own, among = self.value(node.left), self.value(node.comparators[0]).parts
+            equal = [f"({own.text} == {self._as(other, own.type)})" for other in among]
+            found = f"({' or '.join(equal)})"
+            return Value(found if isinstance(node.ops[0], ast.In) else f"(not {found})", BOOL)
         values = self._list([node.left, *node.comparators])
         tests = []
         for operator, left, right in zip(node.ops, values, values[1:]):

@@ -103,7 +103,8 @@ class Launcher:
         Parameters
         ----------
         arguments : numbers, arrays here or on the device, named tuples of numbers, and tuples of all these
-        out : arrays that are written to: those of this process as a whole, those on the device where the work does
+        out : arrays that are written to, or tuples of them: those of this process as a whole, those on the device where
+            the work does
 
         Raises
         ------
@@ -114,10 +115,11 @@ class Launcher:
         with self.failures(work.function.__name__.replace("_", " ")):
             module = self._ready(work, tuple(type_for(a) for a in (*arguments, tuple(out))))
             lanes = min(pieces, LANES)
-            found = [a if is_there(a) else self.zeros(a.shape, a.dtype.name) for a in out]
+            arrays = list(parts_of(tuple(out)))
+            found = [a if is_there(a) else self.zeros(a.shape, a.dtype.name) for a in arrays]
             inputs = [self._argument(module, part) for part in parts_of(tuple(arguments))]
             wp.launch(module.run, lanes, [lanes, *self._room(work, lanes), *inputs, *found], device=self.device)
-            for array, result in zip(out, found):
+            for array, result in zip(arrays, found):
                 if array is not result:
                     array[...] = result.numpy()
 

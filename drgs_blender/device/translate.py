@@ -44,12 +44,14 @@ class Native:
     name : unlike any other's
     result : type of what it returns
     structs : named tuples that it takes
+    uses : functions that natives stand for, which it calls
     """
 
     source: str
     name: str
     result: Type
     structs: tuple[type, ...] = ()
+    uses: tuple[Any, ...] = ()
 
 
 @dataclass
@@ -108,6 +110,8 @@ class Translation:
         if native is None and not isinstance(function, types.FunctionType):
             raise TranslationError(str(function), "has no counterpart", "Write it otherwise")
         if native is not None:
+            for used in native.uses:
+                self.function(used, ())
             self._natives[native.name] = native
             for kind in native.structs:
                 self.struct(kind)

@@ -195,9 +195,8 @@ class Primary:
                 _own_surfels(buffer, self._tree, self._objects)
             return buffer
         tied = self._tree is None
-        return primary_surfels(
-            self._splats, self._scene, self._windows, self._camera, y0, y1, tied, self._processor.rasterise
-        )
+        by = self._processor.rasterise, self._processor.tie
+        return primary_surfels(self._splats, self._scene, self._windows, self._camera, y0, y1, tied, *by)
 
 
 def strip_height(width: int, aa: int) -> int:

@@ -7,10 +7,12 @@ from typing import Any
 
 from .picture.denoise import Signal, smooth
 from .points import Radiance
+from .primary.primary_surfels import tie_to_mesh
 from .shade.integrate import integrate
 from .surfels.raster import SurfelSamples, rasterise
 from .surfels.splats import Splats
 from .surfels.surfel_bvh import SurfelBVH
+from .trace.scene import TraceScene
 
 
 class Processor:
@@ -30,6 +32,10 @@ class Processor:
     def rasterise(self, splats: Splats, y0: int, y1: int) -> SurfelSamples:
         """`surfels.raster.rasterise`."""
         return rasterise(splats, y0, y1)
+
+    def tie(self, scene: TraceScene, *arguments: Any) -> None:
+        """`primary.primary_surfels.tie_to_mesh`."""
+        tie_to_mesh(scene, *arguments)
 
     def smooth(self, signal: Signal, check: Callable[[], None] = lambda: None) -> Signal:
         """`picture.denoise.smooth`."""

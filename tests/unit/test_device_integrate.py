@@ -252,8 +252,8 @@ def test_every_array_is_copied_to_a_card(monkeypatch: pytest.MonkeyPatch) -> Non
     scene, light, shining, points = among_meshes()
     expected = integrate(scene, light, points, SETTINGS, 3, shining)
     apart = OnDevice("cpu")
-    apart.kernel.mirror.copies = True
-    apart.kernel.tables(scene, light, shining)
+    apart.mirror.copies = True
+    apart.mirror.tables(scene, light, shining)
     spoilt = [
         scene.shading_faces, scene.shading, scene.normals, scene.face_object, scene._material, scene._uvs,
         scene._place_normal, scene.place_object, scene._material_tables, scene.vertices, *scene.materials.arrays,

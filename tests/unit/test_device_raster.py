@@ -7,12 +7,15 @@ import pytest
 
 pytest.importorskip("warp", reason="warp-lang is not installed")
 
+from shapes import scene_of, sphere_mesh, sphere_surfels
 from test_raster import join, look_along_y, plane_of_surfels, random_surfels
 
-from drgs_blender.frame import RenderSettings
+from drgs_blender.frame import MeshState, RenderSettings
 from drgs_blender.render.camera import camera_parameters
 from drgs_blender.render.device import raster as device_raster
 from drgs_blender.render.device.on_device import OnDevice
+from drgs_blender.render.primary.primary_surfels import primary_surfels, snap_windows
+from drgs_blender.render.processor import HERE
 from drgs_blender.render.surfels.raster import SurfelSamples, rasterise
 from drgs_blender.render.surfels.splats import prepare
 
@@ -66,3 +69,28 @@ def test_fog_of_any_depth_is_blended_in_exact_order(device: OnDevice) -> None:
     seen = here.alpha > 0
     np.testing.assert_allclose(there.depth[seen], here.depth[seen], rtol=1e-4)
     np.testing.assert_allclose(there.surface[seen], here.surface[seen], atol=1e-4)
+
+
+@pytest.mark.parametrize("offset", [-0.02, 0.1])
+@pytest.mark.parametrize("tied", [True, False])
+def test_points_are_tied_to_the_mesh_as_the_processor_ties_them(device: OnDevice, offset: float, tied: bool) -> None:
+    """A sphere of surfels about its mesh, before an ordinary mesh that they must not be tied to."""
+    scene, camera = scene_of(sphere_mesh(3)), look_along_y(48, 40)
+    wall = np.float32([[-3, -0.5, -3], [3, -0.5, -3], [3, -0.5, 3], [-3, -0.5, 3]])
+    kept = scene_of(sphere_mesh(3))._parts[0].item
+    ordinary = MeshState("wall", wall, np.int32([[0, 1, 2], [0, 2, 3]]), np.eye(4)[None], np.zeros(1, np.int32))
+    scene.update([kept], [ordinary])
+    parameters = camera_parameters(camera, RenderSettings(aa=2), 1)
+    splats, windows = prepare(sphere_surfels(1 + offset), camera, parameters), snap_windows(scene, 1)
+    here, there = (
+        primary_surfels(splats, scene, windows, camera, 0, 40, tied, by.rasterise, by.tie) for by in (HERE, device)
+    )
+    for name in ("pixel", "sample", "flags", "own"):
+        np.testing.assert_array_equal(getattr(there.points, name), getattr(here.points, name))
+    for name in ("origin", "normal", "geometric_normal", "view", "albedo", "roughness"):
+        a, b = getattr(here.points, name), getattr(there.points, name)
+        far = np.abs(a - b).reshape(len(a), -1).max(axis=1) > 1e-4
+        assert far.mean() < 0.002, name  # a ray along an edge meets the other face
+    np.testing.assert_allclose(there.depth, here.depth, rtol=1e-4)
+    assert (here.face >= 0).mean() > 0.3
+    assert (there.face == here.face).mean() > 0.995

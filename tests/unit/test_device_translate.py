@@ -176,7 +176,7 @@ def constants(a, b, n):  # type: ignore[no-untyped-def]
 def choices(a, b, n):  # type: ignore[no-untyped-def]
     x = a if a > b else (b if n & 1 else -a)
     y = n > 3 and (a < b or n == 5)
-    z = 0 <= n < 4
+    z = 0 <= n < 4 and n not in (1, 2)
     if not y and z:
         x, w = _swapped(x, b)
     else:

@@ -40,13 +40,12 @@ _SHADE = Work(integrate.shade_points, _ROOMS, NATIVES, _constants)
 class DeviceKernel(integrate.Kernel):
     """`shade.integrate.Kernel` on a device."""
 
-    def __init__(self, launcher: Launcher) -> None:
-        self._launcher = launcher
-        self.mirror = Mirror(launcher)
+    def __init__(self, launcher: Launcher, mirror: Mirror) -> None:
+        self._launcher, self._mirror = launcher, mirror
 
     def tables(self, scene: TraceScene, light: EnvironmentLight, lamps: Lamps) -> tuple[Any, Any, Any, Any]:
         with self._launcher.failures("copying the scene"):
-            return self.mirror.tables(scene, light, lamps)
+            return self._mirror.tables(scene, light, lamps)
 
     def shade(self, *arguments: Any) -> None:
         *inwards, out = arguments

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -10,15 +11,15 @@ from ...device.kernels import Launcher
 from ...device.warp import warp
 from ..lights.lamps import Lamps
 from ..lights.light import EnvironmentLight, Sky
-from ..memory import address
-from ..trace.masks import DIFFUSE, GLOSSY, SHADOW, WITHOUT
+from ..memory import Place, address
+from ..trace.masks import DIFFUSE, GLOSSY, SHADOW, SURFELS, WITHOUT
 from ..trace.scene import TraceScene
 from .natives import MeshTracer
 
 Array = np.ndarray
 
-#: Kinds of rays that the integrator casts.
-_LIGHT = DIFFUSE | GLOSSY | SHADOW
+#: Kinds of rays that are cast here.
+_RAYS = DIFFUSE | GLOSSY | SHADOW | SURFELS
 
 
 class Mirror:
@@ -36,44 +37,49 @@ class Mirror:
     def __init__(self, launcher: Launcher) -> None:
         self._device = launcher.device
         self.copies = bool(self._device.is_cuda)
-        self._kept: list[Any] = []
-        self._sky: tuple[EnvironmentLight, Sky, list[Any]] | None = None
-        self._tables: tuple[tuple[Any, ...], tuple[Any, Any, Any, Any]] | None = None
+        #: Of every table: what it was made of, the table, and the arrays that it refers to.
+        self._known: dict[str, tuple[tuple[Any, ...], Any, list[Any]]] = {}
         self._mesh: tuple[tuple[object, int], Any] | None = None
 
     def tables(self, scene: TraceScene, light: EnvironmentLight, lamps: Lamps) -> tuple[Any, Any, Any, Any]:
         """(tracer, geometry, sky, lamps) with the device's addresses; until what they are of changes."""
-        known = scene, scene.version, light, lamps
-        if self._tables is not None and all(a is b for a, b in zip(self._tables[0], known)):
-            return self._tables[1]
-        self._tables, self._kept = None, []
-        table, pick, _ = lamps.tables
-        lights = table, pick, lamps.emitters.address_at(self._place)
-        tables = self._tracer(scene), scene.geometry_at(self._place), self._light(light), lights
-        self._tables = known, tables
-        return tables
+        state = scene, scene.version
+        geometry = self._table("geometry", state, scene.geometry_at)
+        lights = self._table(
+            "lamps", (lamps, *state), lambda place: (*lamps.tables[:2], lamps.emitters.address_at(place))
+        )
+        # Pictures of the environment are large, and stay; only how they are turned may have changed.
+        sky: Sky = self._table("sky", (light,), light.sky_at)
+        turn = {name: value for name, value in light.sky._asdict().items() if len(name) == 2}
+        return self.tracer(scene), geometry, sky._replace(**turn), lights
 
-    def _place(self, array: Array) -> int:
+    def tracer(self, scene: TraceScene) -> MeshTracer:
+        """How rays meet the scene; until its next update."""
+        found: MeshTracer = self._table("tracer", (scene, scene.version), lambda place: self._tracer(scene, place))
+        return found
+
+    def _table(self, name: str, made_of: tuple[Any, ...], make: Callable[[Place], Any]) -> Any:
+        """A table made anew where what it is made of is not the same as before."""
+        known = self._known.pop(name, None)
+        if known is None or any(a is not b for a, b in zip(known[0], made_of)):
+            del known  # gives the memory back before more is taken
+            kept: list[Any] = []
+            known = made_of, make(lambda array: self._place(array, kept)), kept
+        self._known[name] = known
+        return known[1]
+
+    def _place(self, array: Array, kept: list[Any]) -> int:
         """Where the device finds a copy of an array."""
         if not self.copies:
-            self._kept.append(array)
+            kept.append(array)
             return address(array)
         if not array.size:
             return 0
         copy = warp().array(array.reshape(-1).view(np.uint8), dtype=warp().uint8, device=self._device)
-        self._kept.append(copy)
+        kept.append(copy)
         return int(copy.ptr)
 
-    def _light(self, light: EnvironmentLight) -> Sky:
-        """The sky, copied once: pictures of the environment are large, and stay."""
-        if self._sky is None or self._sky[0] is not light:
-            kept, self._kept = self._kept, []
-            sky = light.sky_at(self._place)
-            self._sky = light, sky, self._kept
-            self._kept = kept
-        return self._sky[1]._replace(**{name: value for name, value in light.sky._asdict().items() if len(name) == 2})
-
-    def _tracer(self, scene: TraceScene) -> MeshTracer:
+    def _tracer(self, scene: TraceScene, place: Place) -> MeshTracer:
         wp = warp()
         rows, masks = scene.standing()
         if not len(rows):
@@ -91,9 +97,9 @@ class Mirror:
             wp.copy(self._mesh[1].points, points)
             self._mesh[1].refit()
         # Where every ray meets every face, none looks at masks.
-        plain = bool(((masks & _LIGHT) == _LIGHT).all()) and not (masks >> WITHOUT).any()
-        stands = (self._place(rows), self._place(corners)) if len(scene.places) else (0, 0)
-        return MeshTracer(int(self._mesh[1].id), 0 if plain else self._place(masks), *stands)
+        plain = bool(((masks & _RAYS) == _RAYS).all()) and not (masks >> WITHOUT).any()
+        stands = (place(rows), place(corners)) if len(scene.places) else (0, 0)
+        return MeshTracer(int(self._mesh[1].id), 0 if plain else place(masks), *stands)
 
 
 def _placed(corners: Array, places: Array, rows: Array) -> Array:

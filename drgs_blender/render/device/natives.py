@@ -103,15 +103,15 @@ def shadowed(
 
 _HIT = ("float32", "int32", "int32", "float32", "float32", "float32", "float32", "float32")
 
-#: What stands for functions that are not translated, in an order in which each may call those before it.
+#: What stands for functions that are not translated.
 NATIVES: dict[Any, Any] = {
     memory.load_float: _load("load_float", "float32", "float"),
     memory.load_double: _load("load_double", "float64", "double"),
     memory.load_int32: _load("load_int32", "int32", "int"),
     memory.load_uint32: _load("load_uint32", "uint32", "unsigned int"),
     memory.load_int64: _load("load_int64", "int64", "long long"),
-    surface.nearest.py_func: Native(_NEAREST, "nearest", _HIT, (MeshTracer,)),
-    surface.shadowed.py_func: Native(_SHADOWED, "shadowed", "bool", (MeshTracer,)),
+    surface.nearest.py_func: Native(_NEAREST, "nearest", _HIT, (MeshTracer,), (memory.load_float, memory.load_int32)),
+    surface.shadowed.py_func: Native(_SHADOWED, "shadowed", "bool", (MeshTracer,), (surface.nearest,)),
     # Rays meet meshes alone: `rays` has a function of each kind for them.
     **{
         getattr(rays, name): getattr(rays, f"_{name}")

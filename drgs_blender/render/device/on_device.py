@@ -14,8 +14,11 @@ from ..shade.integrate import integrate
 from ..surfels.raster import SurfelSamples
 from ..surfels.splats import Splats
 from ..surfels.surfel_bvh import SurfelBVH
+from ..trace.scene import TraceScene
+from .attach import tie
 from .denoise import smooth
 from .integrate import DeviceKernel
+from .mirror import Mirror
 from .raster import rasterise
 
 _T = TypeVar("_T")
@@ -31,19 +34,24 @@ class OnDevice(Processor):
 
     def __init__(self, device: str) -> None:
         self.launcher = Launcher(device)
-        self.kernel = DeviceKernel(self.launcher)
+        self.mirror = Mirror(self.launcher)
+        self._kernel = DeviceKernel(self.launcher, self.mirror)
 
     def integrate(self, *arguments: Any, surfels: SurfelBVH | None = None) -> Radiance:
         here = super().integrate
         if surfels is not None:
             return here(*arguments, surfels=surfels)
-        return self._tried(lambda: integrate(*arguments, kernel=self.kernel), lambda: here(*arguments))
+        return self._tried(lambda: integrate(*arguments, kernel=self._kernel), lambda: here(*arguments))
 
     def rasterise(self, splats: Splats, y0: int, y1: int) -> SurfelSamples:
         here = super().rasterise
         if not len(splats):
             return here(splats, y0, y1)
         return self._tried(lambda: rasterise(self.launcher, splats, y0, y1), lambda: here(splats, y0, y1))
+
+    def tie(self, scene: TraceScene, *arguments: Any) -> None:
+        here = super().tie
+        self._tried(lambda: tie(self.launcher, self.mirror, scene, *arguments), lambda: here(scene, *arguments))
 
     def smooth(self, signal: Signal, check: Callable[[], None] = lambda: None) -> Signal:
         here = super().smooth

@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from ...frame import Camera
-from ...jit import njit, prange
+from ...jit import get_num_threads, njit, prange
 from ..camera import WIDTH, sample_ray
 from ..points import SECOND
 from ..surfels.raster import SurfelSamples, rasterise
@@ -48,6 +48,9 @@ WINDOW_EDGES = 2.0
 RIM = 0.3
 #: Cosine between a surfel's normal and a face's from which they are turned alike.
 ALIKE = 0.5
+
+#: Points of a block.
+_BLOCK = 256
 
 # How a surfel's mesh point was found.
 NOWHERE, ALONG_VIEW, ALONG_NORMAL, ANY_SIDE, FACING = 0, 1, 2, 3, 4
@@ -69,6 +72,7 @@ def primary_surfels(
     y1: int,
     tied: bool = True,
     rasterise: Callable[[Splats, int, int], SurfelSamples] = rasterise,
+    tie: Callable[..., None] | None = None,
 ) -> GBuffer:
     """Blend the surfels of the rows ``y0 .. y1`` (full-picture pixels) and tie them to the mesh.
 
@@ -77,40 +81,22 @@ def primary_surfels(
     splats : `prepare` of this frame
     windows : `snap_windows` of this frame
     tied : False: rays meet surfels, and nothing is tied
-    rasterise : blends the surfels
+    rasterise, tie : who blends the surfels, and who ties their points; None: this processor
     """
     samples = rasterise(splats, y0, y1)
     layers = combine(samples, scene, splats.parameters, camera.window[0], y0)
     buffer, start = compact(layers.first, splats.parameters, camera.window[0], y0, layers.second)
     buffer.alpha = layers.opaque
     points = buffer.points
-    _attach(
-        scene.tracer,
-        tied,
-        scene.vertex_faces > 0,
-        splats.parameters,
-        windows,
-        camera.window[0],
-        start,
-        samples.depth,
-        samples.surface,
-        samples.object_index,
-        points.pixel,
-        points.sample,
-        points.flags,
-        points.origin,
-        points.normal,
-        points.geometric_normal,
-        points.view,
-        points.albedo,
-        points.roughness,
-        points.metallic,
-        buffer.position,
-        buffer.depth,
-        buffer.object_index,
-        buffer.face,
-        buffer.place,
-        buffer.barycentric,
+    (tie or tie_to_mesh)(
+        scene,
+        (tied, scene.vertex_faces > 0),
+        (splats.parameters, windows, camera.window[0], y0),
+        (samples.depth, samples.surface, samples.object_index),
+        (points.pixel, points.sample, points.flags),
+        (points.origin, points.normal, points.geometric_normal, points.view),
+        (points.albedo, points.roughness, points.metallic),
+        (buffer.position, buffer.depth, buffer.object_index, buffer.face, buffer.place, buffer.barycentric),
     )
     if not tied:
         row, column = np.divmod(points.pixel, splats.parameters[WIDTH].astype(np.int64))
@@ -195,7 +181,8 @@ def _find(
             break
         sx, sy, sz = sx - past * vx, sy - past * vy, sz - past * vz
     if how != ALONG_VIEW and how != FACING:
-        for side in (-1.0, 1.0):
+        for turn in range(2):
+            side = 2.0 * turn - 1.0
             t, fx, fy, fz, hit, u, v = _shoot(tracer, x, y, z, side * nx, side * ny, side * nz, window)
             if hit >= 0 and fx * nx + fy * ny + fz * nz > ALIKE:
                 t *= side
@@ -203,42 +190,31 @@ def _find(
     return how, hx, hy, hz, gx, gy, gz, face, a, b
 
 
-@njit(parallel=True)
-def _attach(
-    tracer: Any,
-    tied: Any,
-    any_mesh: Any,
-    p: Any,
-    windows: Any,
-    x0: Any,
-    start: Any,
-    sample_depth: Any,
-    surface: Any,
-    sample_object: Any,
-    pixel: Any,
-    sample: Any,
-    flags: Any,
-    origin: Any,
-    normal: Any,
-    geometric: Any,
-    view: Any,
-    albedo: Any,
-    roughness: Any,
-    metallic: Any,
-    position: Any,
-    depth: Any,
-    owner: Any,
-    tied_face: Any,
-    tied_place: Any,
-    barycentric: Any,
+@njit
+def attach_points(
+    lane: Any, lanes: Any, room: Any, tracer: Any, rules: Any, view_of: Any, samples: Any, keys: Any, out: Any
 ) -> None:
-    """Fill the shading points row by row; see the module's head for the order of attempts."""
+    """Fill every so-manyth (`lanes`) block of shading points, from the `lane`-th on; see the module's head.
+
+    Parameters
+    ----------
+    room : not used
+    rules, view_of, samples, keys, out : as of `tie_to_mesh`; the last is its three groups of arrays to be filled
+    """
+    tied, any_mesh = rules
+    p, windows, x0, y0 = view_of
+    sample_depth, surface, sample_object = samples
+    pixel, sample, flags = keys
+    frames, materials, seen = out
+    origin, normal, geometric, view = frames
+    albedo, roughness, metallic = materials
+    position, depth, owner, tied_face, tied_place, barycentric = seen
     width = np.int64(p[WIDTH])
-    for row in prange(len(start) - 1):
-        for n in range(start[row], start[row + 1]):
+    for block in range(lane, (len(pixel) + _BLOCK - 1) // _BLOCK, lanes):
+        for n in range(block * _BLOCK, min((block + 1) * _BLOCK, len(pixel))):
             if flags[n] & SECOND:
                 continue
-            column, k = pixel[n] % width - x0, sample[n]
+            row, column, k = pixel[n] // width - y0, pixel[n] % width - x0, sample[n]
             s = np.float64(sample_depth[row, column, k])
             who = sample_object[row, column, k]
             ox, oy, oz, dx, dy, dz = sample_ray(p, pixel[n], sample[n])
@@ -294,3 +270,24 @@ def _attach(
             position[n, 0], position[n, 1], position[n, 2] = x, y, z
             depth[n], owner[n] = s, who
             tied_face[n], tied_place[n], barycentric[n, 0], barycentric[n, 1] = face, -1, u, v
+
+
+@njit(parallel=True)
+def _attach(tracer: Any, rules: Any, view_of: Any, samples: Any, keys: Any, frames: Any, materials: Any, seen: Any,
+            lanes: Any) -> None:  # fmt: skip
+    for lane in prange(lanes):
+        attach_points(np.int64(lane), lanes, None, tracer, rules, view_of, samples, keys, (frames, materials, seen))
+
+
+def tie_to_mesh(scene: TraceScene, *arguments: Any) -> None:
+    """Tie shading points to the mesh.
+
+    Parameters
+    ----------
+    scene
+    arguments : tuples: whether points are tied at all, and whether there is a mesh; parameters of the camera, windows,
+        and the first column and row of the samples; depth, surface and object of these; pixel, sample and flags of the
+        points; and the arrays to be filled: origin, normal, geometric normal and view; albedo, roughness and metallic;
+        position, depth, object, face, place and barycentric coordinates
+    """
+    _attach(scene.tracer, *arguments, 8 * get_num_threads())

@@ -1,0 +1,29 @@
+"""Shading points tied to the mesh on a device: `primary.primary_surfels` with Warp's rays, from the same source."""
+
+from __future__ import annotations
+
+from types import ModuleType
+from typing import Any
+
+from ...device.kernels import Launcher, Work
+from ..primary import primary_surfels
+from ..trace.scene import TraceScene
+from .mirror import Mirror
+from .natives import NATIVES
+
+
+def _constants(module: ModuleType, name: str, value: Any) -> Any:
+    """One point a block."""
+    return 1 if module is primary_surfels and name == "_BLOCK" else value
+
+
+_ATTACH = Work(primary_surfels.attach_points, (), NATIVES, _constants)
+
+
+def tie(launcher: Launcher, mirror: Mirror, scene: TraceScene, *arguments: Any) -> None:
+    """`primary_surfels.tie_to_mesh` on a device."""
+    *inwards, frames, materials, seen = arguments
+    with launcher.failures("copying the scene"):
+        tracer = mirror.tracer(scene)
+    groups = frames, materials, seen
+    launcher.launch(_ATTACH, len(frames[0]), (tracer, *inwards), groups)
