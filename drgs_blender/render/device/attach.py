@@ -17,7 +17,7 @@ def _constants(module: ModuleType, name: str, value: Any) -> Any:
     return 1 if module is primary_surfels and name == "_BLOCK" else value
 
 
-_ATTACH = Work(primary_surfels.attach_points, (), NATIVES, _constants)
+ATTACH = Work(primary_surfels.attach_points, (), NATIVES, _constants)
 
 
 def tie(launcher: Launcher, mirror: Mirror, scene: TraceScene, *arguments: Any) -> None:
@@ -26,4 +26,4 @@ def tie(launcher: Launcher, mirror: Mirror, scene: TraceScene, *arguments: Any) 
     with launcher.failures("copying the scene"):
         tracer = mirror.tracer(scene)
     groups = frames, materials, seen
-    launcher.launch(_ATTACH, len(frames[0]), (tracer, *inwards), groups)
+    launcher.launch(ATTACH, len(frames[0]), (tracer, *inwards), groups)

@@ -131,8 +131,8 @@ def a_trous_pixels(lane: Any, lanes: Any, room: Any, step: Any, guide: Any, span
             filtered[y, LUMINANCE + lobe, c] = luminance
 
 
-_WEIGH = Work(weigh_pixels, (), {})
-_A_TROUS = Work(a_trous_pixels, (Room("float32", (_PLANES,)),), {})
+WEIGH = Work(weigh_pixels, (), {})
+A_TROUS = Work(a_trous_pixels, (Room("float32", (_PLANES,)),), {})
 
 
 def smooth(launcher: Launcher, signal: Signal, check: Callable[[], None] = lambda: None) -> Signal:
@@ -143,8 +143,8 @@ def smooth(launcher: Launcher, signal: Signal, check: Callable[[], None] = lambd
     for level in range(LEVELS):
         check()
         sigma = np.float32(SIGMA_LUMINANCE * SIGMA_DECAY**level)
-        launcher.launch(_WEIGH, pixels, (sigma, guide, spans), (light,))
-        launcher.launch(_A_TROUS, pixels, (1 << level, guide, spans, light), (other,))
+        launcher.launch(WEIGH, pixels, (sigma, guide, spans), (light,))
+        launcher.launch(A_TROUS, pixels, (1 << level, guide, spans, light), (other,))
         light, other = other, light
     with launcher.failures("denoising"):
         return Signal(signal.guide, light.numpy(), signal.spans)

@@ -34,7 +34,7 @@ _ROOMS = (
     Room("uint32", (1,)),
     Room("int64", (1,)),
 )
-_SHADE = Work(integrate.shade_points, _ROOMS, NATIVES, _constants)
+SHADE = Work(integrate.shade_points, _ROOMS, NATIVES, _constants)
 
 
 class DeviceKernel(integrate.Kernel):
@@ -49,4 +49,4 @@ class DeviceKernel(integrate.Kernel):
 
     def shade(self, *arguments: Any) -> None:
         *inwards, out = arguments
-        self._launcher.launch(_SHADE, len(out[0]), inwards, out)
+        self._launcher.launch(SHADE, len(out[0]), inwards, out)

@@ -1,0 +1,51 @@
+"""Kernels compiled for a card by NVIDIA's compiler, which Warp brings: it needs no card."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("warp", reason="warp-lang is not installed")
+
+import test_device_integrate
+import test_device_raster
+import warp
+from test_device_denoise import picture
+
+from drgs_blender.render.device import attach, denoise, integrate, raster
+from drgs_blender.render.device.on_device import OnDevice
+from drgs_blender.render.picture.denoise import denoise as denoised
+
+#: A100 and later.
+ARCHITECTURE = 80
+
+
+def made(works: tuple[object, ...], device: OnDevice, folder: Path) -> set[object]:
+    """Compile what a device was asked for, of some works; those that were."""
+    found = set()
+    for work, types in device.launcher._modules:
+        if work in works:
+            module = work.module(types, True)
+            (file,) = warp.compile_aot_module(module, arch=ARCHITECTURE, module_dir=str(folder))
+            assert Path(file).stat().st_size > 1000
+            found.add(work)
+    return found
+
+
+def test_pictures_kernels_compile_for_a_card(tmp_path: Path) -> None:
+    device = OnDevice("cpu")
+    test_device_raster.test_points_are_tied_to_the_mesh_as_the_processor_ties_them(device, 0.1, True)
+    denoised(*picture(), by=device.smooth)
+    works = raster.BLEND, attach.ATTACH, denoise.WEIGH, denoise.A_TROUS
+    assert made(works, device, tmp_path) == set(works)
+    assert not device.failed
+
+
+@pytest.mark.skipif(os.environ.get("DRGS_FAULTS") != "whole", reason="takes minutes; DRGS_FAULTS=whole runs it")
+def test_the_integrator_compiles_for_a_card(tmp_path: Path) -> None:
+    device = OnDevice("cpu")
+    for scene in (test_device_integrate.under_sky(), test_device_integrate.among_meshes()):
+        test_device_integrate.both(device, scene, test_device_integrate.SETTINGS)
+    assert made((integrate.SHADE,), device, tmp_path) == {integrate.SHADE}
