@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..errors import DeviceError
+from ..errors import Cancelled, DeviceError
 from .translate import Constants, Translation
 from .typed import Array as ArrayType
 from .typed import Type, given, spelled
@@ -79,17 +79,22 @@ class Launcher:
     Parameters
     ----------
     device : Warp's name of it: "cuda:0", "cpu"
+
+    Attributes
+    ----------
+    apart : whether it has memory of its own, as a card has
     """
 
     def __init__(self, device: str) -> None:
         self.device = warp().get_device(device)
+        self.apart = bool(self.device.is_cuda)
         self._rooms: dict[Work, list[Any]] = {}
         self._modules: dict[tuple[Work, tuple[Type, ...]], ModuleType] = {}
 
     def array(self, array: Array, copy: bool | None = None) -> Any:
         """A Warp array of an array's content; on the processor it is the same memory unless told otherwise."""
         wp = warp()
-        copy = self.device.is_cuda if copy is None else copy
+        copy = self.apart if copy is None else copy
         array = np.ascontiguousarray(array)
         return wp.array(array, dtype=getattr(wp, array.dtype.name), device=self.device, copy=copy)
 
@@ -134,10 +139,12 @@ class Launcher:
 
     @contextlib.contextmanager
     def failures(self, work: str) -> Iterator[None]:
-        """Name what the device could not do; Warp raises RuntimeError for all of it, and for memory that is lacking."""
+        """Name what the device could not do, whatever Warp raises for it: a compiler that fails is an Exception."""
         try:
             yield
-        except (RuntimeError, MemoryError) as error:
+        except (Cancelled, DeviceError):
+            raise
+        except Exception as error:
             said = (str(error).strip() or type(error).__name__).splitlines()[0]
             problem = f"{self.device.name} failed at {work} ({said})"
             raise DeviceError("device cuda", problem, "Use fewer objects or the CPU") from error
@@ -161,7 +168,7 @@ class Launcher:
         made = []
         for room in _flat(work.rooms):
             dtype, axes = getattr(wp, room.element), len(room.shape)
-            if self.device.is_cuda:
+            if self.apart:
                 turned = wp.zeros((*room.shape, lanes), dtype=dtype, device=self.device)
                 made.append(turned.transpose((axes, *range(axes))))
             else:

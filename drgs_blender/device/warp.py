@@ -9,7 +9,9 @@ import contextlib
 import functools
 import hashlib
 import importlib.util
+import os
 import sys
+import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from types import ModuleType
@@ -26,6 +28,9 @@ Array = np.ndarray
 
 #: Called with 1 when kernels begin to be made ready, which nothing interrupts, and with -1 when they are.
 watchers: list[Callable[[int], None]] = []
+#: Versions that the translation is made for; `pyproject.toml` has the same.
+VERSION = "1.19."
+_INSTALL = "Install it: pip install 'warp-lang>=1.19,<1.20', or Set Up Engine with Graphics Card"
 
 
 @functools.cache
@@ -35,20 +40,21 @@ def warp() -> Any:
     Raises
     ------
     DeviceError
-        When it is not installed, or cannot start.
+        When it is not installed, of another version, or cannot start.
     """
     try:
         import warp as wp
-    except ImportError as error:
-        raise DeviceError(
-            "device cuda",
-            f"the package warp-lang cannot be imported ({error})",
-            "Install it: pip install 'warp-lang>=1.19,<1.20', or Set Up Engine with Graphics Card",
-        ) from None
-    wp.config.quiet = True
-    wp.config.kernel_cache_dir = str(cache_folder() / "warp")
+    except Exception as error:
+        raise DeviceError("device cuda", f"the package warp-lang cannot be imported ({error})", _INSTALL) from None
+    version = str(getattr(wp, "__version__", "unknown"))
+    if not version.startswith(VERSION):
+        raise DeviceError("device cuda", f"warp-lang has version {version}, not {VERSION}x", _INSTALL)
+    folder = cache_folder() / "warp"
+    wp.config.log_level = wp.LOG_WARNING  # else it greets on stdout, which is read by programs
+    wp.config.kernel_cache_dir = str(folder)
     try:
         wp.init()
+        os.utime(folder)  # see `jit.current_cache`
     except Exception as error:
         raise DeviceError("device cuda", f"Warp does not start ({error})", "Use the CPU") from error
     return wp
@@ -117,12 +123,26 @@ def load_module(source: str) -> ModuleType:
     name = f"drgs_{hashlib.sha256(source.encode()).hexdigest()[:16]}"
     if name not in sys.modules:
         warp()
-        folder = cache_folder() / "warp"
-        folder.mkdir(parents=True, exist_ok=True)
-        path = Path(folder, f"{name}.py")
-        path.write_text(source, encoding="utf-8")
+        path = cache_folder() / "warp" / f"{name}.py"
+        _write(path, source)
         spec = importlib.util.spec_from_file_location(name, path)
         assert spec is not None and spec.loader is not None
         module = sys.modules[name] = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
+        try:
+            spec.loader.exec_module(module)
+        except BaseException:
+            del sys.modules[name]
+            raise
     return sys.modules[name]
+
+
+def _write(path: Path, text: str) -> None:
+    """Write a file at once: other processes may be reading it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(suffix=".part", dir=path.parent)
+    with os.fdopen(handle, "w", encoding="utf-8") as file:
+        file.write(text)
+    try:
+        os.replace(name, path)
+    except PermissionError:  # on Windows while it is read, which is the same text
+        os.unlink(name)

@@ -138,8 +138,9 @@ A_TROUS = Work(a_trous_pixels, (Room("float32", (_PLANES,)),), {})
 def smooth(launcher: Launcher, signal: Signal, check: Callable[[], None] = lambda: None) -> Signal:
     """`picture.denoise.smooth` on a device."""
     pixels = signal.guide.shape[0] * (signal.guide.shape[2] - 2 * PAD)
-    guide, spans = launcher.array(signal.guide), launcher.array(signal.spans)
-    light, other = launcher.array(signal.light, copy=True), launcher.zeros(signal.light.shape)
+    with launcher.failures("copying the picture"):
+        guide, spans = launcher.array(signal.guide), launcher.array(signal.spans)
+        light, other = launcher.array(signal.light, copy=True), launcher.zeros(signal.light.shape)
     for level in range(LEVELS):
         check()
         sigma = np.float32(SIGMA_LUMINANCE * SIGMA_DECAY**level)

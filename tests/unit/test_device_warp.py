@@ -1,0 +1,100 @@
+"""Whatever is wrong with Warp or the device is a warning by name, never a frame that fails; and Warp keeps quiet."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drgs_blender.device.kernels import Launcher, Work
+from drgs_blender.device.warp import VERSION, load_module, warp
+from drgs_blender.errors import Cancelled, DeviceError
+from drgs_blender.frame import RenderSettings
+from drgs_blender.render.device.devices import Devices
+from drgs_blender.render.shade.integrate import HERE
+
+CUDA = RenderSettings(device="cuda")
+
+
+@pytest.fixture(autouse=True)
+def afresh() -> Iterator[None]:
+    warp.cache_clear()
+    yield
+    warp.cache_clear()
+
+
+@pytest.mark.parametrize("module, words", [
+    (None, "cannot be imported"), (SimpleNamespace(__version__="1.5.0"), "version 1.5.0"),
+    (SimpleNamespace(), "version unknown"),
+])  # fmt: skip
+def test_warp_that_is_not_the_right_one_is_a_warning(monkeypatch: pytest.MonkeyPatch, module: Any, words: str) -> None:
+    monkeypatch.setitem(sys.modules, "warp", module)
+    devices = Devices()
+    assert devices.processor("cuda") is HERE
+    (warning,) = devices.warnings(CUDA)
+    assert words in warning and "pip install" in warning and warning.endswith("Rendered on the CPU")
+
+
+def test_the_version_is_that_of_the_packages() -> None:
+    text = (Path(__file__).parents[2] / "pyproject.toml").read_text()
+    assert f'"warp-lang>={VERSION[:-1]},' in text
+
+
+def test_warp_prints_nothing_where_programs_read() -> None:
+    pytest.importorskip("warp", reason="warp-lang is not installed")
+    code = """
+import numpy as np
+from drgs_blender.device.kernels import Launcher, Work
+def double(lane, lanes, room, x, out):
+    for i in range(lane, len(x), lanes):
+        out[0][i] = x[i] + x[i]
+found = np.zeros(3, np.float32)
+"""
+    script = f"{code}Launcher('cpu').launch(Work(double, (), {{}}), 3, [np.ones(3, np.float32)], [found])\n"
+    path = Path(__file__).with_name("_silent.py")
+    path.write_text(script + "assert (found == 2).all()\n")
+    try:
+        done = subprocess.run([sys.executable, path], capture_output=True, text=True, timeout=300, check=False)
+    finally:
+        path.unlink()
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == ""
+
+
+def test_whatever_warp_raises_is_the_devices_failure_but_a_stop_is_none() -> None:
+    pytest.importorskip("warp", reason="warp-lang is not installed")
+    launcher = Launcher("cpu")
+    with pytest.raises(DeviceError, match="kernel build failed"), launcher.failures("light"):
+        raise Exception("CUDA kernel build failed with error code 6\nlog")
+    with pytest.raises(Cancelled), launcher.failures("light"):
+        raise Cancelled
+
+
+def _nothing(lane, lanes, room, x, out):  # type: ignore[no-untyped-def]
+    pass
+
+
+def test_a_folder_of_kernels_that_cannot_be_written_is_the_devices_failure(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    pytest.importorskip("warp", reason="warp-lang is not installed")
+    launcher = Launcher("cpu")
+    (tmp_path / "file").write_bytes(b"")
+    monkeypatch.setenv("DRGS_CACHE_DIR", str(tmp_path / "file"))
+    with pytest.raises(DeviceError, match="nothing"):
+        launcher.launch(Work(_nothing, (), {}), 1, [np.ones(7, np.int8)], [np.zeros(1)])
+
+
+def test_a_module_that_does_not_load_is_not_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("drgs_blender.device.warp.warp", lambda: None)
+    monkeypatch.setenv("DRGS_CACHE_DIR", str(tmp_path))
+    for _ in range(2):
+        with pytest.raises(ZeroDivisionError):
+            load_module("1 / 0")
+    assert [path.suffix for path in (tmp_path / "warp").iterdir() if path.is_file()] == [".py"]
