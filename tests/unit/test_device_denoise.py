@@ -14,11 +14,6 @@ from drgs_blender.render.device.on_device import OnDevice
 from drgs_blender.render.picture.denoise import denoise
 
 
-@pytest.fixture(scope="module")
-def device() -> OnDevice:
-    return OnDevice("cpu")
-
-
 def picture() -> tuple:
     """Bent surfaces of three objects with holes between, some light that is no number, fireflies."""
     rng = np.random.default_rng(3)

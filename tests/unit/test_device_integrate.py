@@ -27,11 +27,6 @@ SETTINGS = RenderSettings(5, 5, 6, bounces=3, aa=2)
 DARK = EnvironmentLight(World(colour=(0.0, 0.0, 0.0)))
 
 
-@pytest.fixture(scope="module")
-def device() -> OnDevice:
-    return OnDevice("cpu")
-
-
 def sky(size: tuple[int, int] = (32, 64)) -> EnvironmentLight:
     image = np.random.default_rng(2).random((*size, 3)).astype(np.float32)
     image[5, 9] = 80.0
@@ -138,6 +133,21 @@ def among_meshes() -> tuple:
     return scene, sky(), Lamps([], np.array([0, 0, 1.2]), 1.0, Emitters(scene)), seen()
 
 
+def hidden() -> tuple:
+    """Twins in one place, each met by what does not meet the other; what no light meets; some stand in places."""
+    lid, wall = placed(0, 0, 2.8), placed(0, -2.0, 1.0, 0.3)
+    meshes = [
+        floor(lid, name="shade", visibility=Visibility(diffuse=False, glossy=False)),
+        floor(lid, name="lid", visibility=Visibility(shadow=False)),
+        floor(name="seen only", visibility=Visibility(diffuse=False, glossy=False, shadow=False)),
+        floor(wall, placed(1.9, 0, 0.7, 0.3), name="walls", visibility=Visibility(glossy=False)),
+        floor(wall, placed(1.9, 0, 0.7, 0.3), name="mirrors", visibility=Visibility(diffuse=False, shadow=False)),
+    ]
+    scene = TraceScene()
+    scene.update([ball((1.4, 0.6, 0.2), 0.4)], meshes)
+    return scene, sky(), lamps(), seen()
+
+
 def caught() -> tuple:
     scene = TraceScene()
     scene.update([ball((0.6, 0.3, 0.8), 0.5)], [floor(visibility=Visibility(shadow_catcher=True))])
@@ -147,7 +157,7 @@ def caught() -> tuple:
 
 
 SCENES: dict[str, Callable[[], tuple]] = {
-    f.__name__: f for f in (under_sky, under_lamps, lamps_alone, among_meshes, caught)
+    f.__name__: f for f in (under_sky, under_lamps, lamps_alone, among_meshes, hidden, caught)
 }
 
 
@@ -198,9 +208,9 @@ def test_points_give_the_same_bits_in_any_company(device: OnDevice) -> None:
 def test_what_moves_is_followed(device: OnDevice) -> None:
     """The tree is refitted, places and materials are taken anew."""
     scene, points, light = TraceScene(), seen(), sky()
-    for shift in (0.0, 0.4, -0.3):
+    for shift, visibility in ((0.0, Visibility()), (0.4, Visibility()), (-0.3, Visibility(shadow=False))):
         objects = [ball((1.4 + shift, 0.6, 1.9), 0.7)]
-        scene.update(objects, [floor(placed(0, 0, shift), placed(0, 0, 3.5 - shift, 0.2))])
+        scene.update(objects, [floor(placed(0, 0, shift), placed(0, 0, 3.5 - shift, 0.2), visibility=visibility)])
         here, there = both(device, (scene, light, None, points), SETTINGS)
         assert psnr(here.total, there.total) > 60.0
 
@@ -238,6 +248,11 @@ def test_a_device_that_fails_is_left_alone_and_its_work_done_here(device: OnDevi
     devices._known["cuda"] = broken
     (warning,) = devices.warnings(replace(SETTINGS, device="cuda"))
     assert "out of memory" in warning and "at 0" not in warning and warning.endswith("Rendered on the CPU")
+    assert devices.processor("cuda") is broken and not broken.failed  # what comes next may fit
+    for _ in range(2):
+        broken.integrate(scene, light, points, SETTINGS, 3, shining)
+        devices.processor("cuda")
+    assert broken.failed and devices.warnings(replace(SETTINGS, device="cuda")) == [warning]
 
 
 def test_surfels_as_tracer_are_left_to_the_processor(device: OnDevice) -> None:
@@ -248,11 +263,11 @@ def test_surfels_as_tracer_are_left_to_the_processor(device: OnDevice) -> None:
 
 
 def test_every_array_is_copied_to_a_card(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A card cannot read this memory: here it is spoilt once the copies are made."""
+    """A card cannot read this memory: here it is spoilt once the copies are made. Its scratch memory is turned."""
     scene, light, shining, points = among_meshes()
     expected = integrate(scene, light, points, SETTINGS, 3, shining)
     apart = OnDevice("cpu")
-    apart.mirror.copies = True
+    apart.launcher.apart = True
     apart.mirror.tables(scene, light, shining)
     spoilt = [
         scene.shading_faces, scene.shading, scene.normals, scene.face_object, scene._material, scene._uvs,
@@ -267,4 +282,6 @@ def test_every_array_is_copied_to_a_card(monkeypatch: pytest.MonkeyPatch) -> Non
         array.setflags(write=True)
         array.view(np.uint8)[...] = 0x7F
     found = apart.integrate(scene, light, points, SETTINGS, 3, shining)
+    (rooms,) = apart.launcher._rooms.values()
+    assert not apart.failed and not any(room.is_contiguous for room in rooms)
     assert psnr(found.total, expected.total) > 60.0

@@ -27,11 +27,6 @@ SCENES = {
 }
 
 
-@pytest.fixture(scope="module")
-def device() -> OnDevice:
-    return OnDevice("cpu")
-
-
 def both(device: OnDevice, name: str, rows: tuple[int, int] = (0, 30)) -> tuple[SurfelSamples, SurfelSamples]:
     posed, view = SCENES[name]
     camera = look_along_y(40, 30, **view)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -18,8 +19,9 @@ from .natives import MeshTracer
 
 Array = np.ndarray
 
-#: Kinds of rays that are cast here.
-_RAYS = DIFFUSE | GLOSSY | SHADOW | SURFELS
+_KINDS = DIFFUSE | GLOSSY | SHADOW
+#: Rays that are cast here.
+_RAYS = _KINDS | _KINDS << WITHOUT | SURFELS
 
 
 class Mirror:
@@ -28,18 +30,13 @@ class Mirror:
     Parameters
     ----------
     launcher : of the device
-
-    Attributes
-    ----------
-    copies : whether the device has memory of its own
     """
 
     def __init__(self, launcher: Launcher) -> None:
-        self._device = launcher.device
-        self.copies = bool(self._device.is_cuda)
+        self._launcher, self._device = launcher, launcher.device
         #: Of every table: what it was made of, the table, and the arrays that it refers to.
         self._known: dict[str, tuple[tuple[Any, ...], Any, list[Any]]] = {}
-        self._mesh: tuple[tuple[object, int], Any] | None = None
+        self._meshes: tuple[object, Array, list[Any]] | None = None
 
     def tables(self, scene: TraceScene, light: EnvironmentLight, lamps: Lamps) -> tuple[Any, Any, Any, Any]:
         """(tracer, geometry, sky, lamps) with the device's addresses; until what they are of changes."""
@@ -70,7 +67,7 @@ class Mirror:
 
     def _place(self, array: Array, kept: list[Any]) -> int:
         """Where the device finds a copy of an array."""
-        if not self.copies:
+        if not self._launcher.apart:
             kept.append(array)
             return address(array)
         if not array.size:
@@ -80,26 +77,37 @@ class Mirror:
         return int(copy.ptr)
 
     def _tracer(self, scene: TraceScene, place: Place) -> MeshTracer:
-        wp = warp()
         rows, masks = scene.standing()
         if not len(rows):
-            self._mesh = None
+            self._meshes = None
             return MeshTracer(0, 0, 0, 0)
+        # A mesh of Warp's for each kind of mask: its queries take none.
+        kinds, which = np.unique(masks & _RAYS, return_inverse=True)
+        order = np.argsort(which, kind="stable")
+        starts = np.searchsorted(which[order], np.arange(len(kinds) + 1))
         corners = scene.vertices[scene.faces]
         triangles = corners if not len(scene.places) else _placed(corners, scene.places, rows)
+        # What stands in places may have come or gone, and what sees it changed, without another layout.
+        if self._meshes is None or self._meshes[0] is not scene.layout or not np.array_equal(self._meshes[1], masks):
+            self._meshes = scene.layout, masks, [None] * len(kinds)
+        meshes = self._meshes[2]
+        for k, (first, last) in enumerate(pairwise(starts)):
+            meshes[k] = self._built(meshes[k], triangles[order[first:last]])
+        table = np.array([(mesh.id, *at) for mesh, *at in zip(meshes, kinds, starts)], np.int64)
+        plain = len(kinds) == 1 and not len(scene.places)
+        faces = 0 if plain else place(np.ascontiguousarray(rows[order]))
+        return MeshTracer(place(table), len(table), faces, place(corners) if len(scene.places) else 0)
+
+    def _built(self, mesh: Any, triangles: Array) -> Any:
+        """Warp's mesh of (k, 3, 3) corners; one that had as many takes them on."""
+        wp = warp()
         points = wp.array(triangles.reshape(-1, 3), dtype=wp.vec3, device=self._device)
-        # What stands in places may have come or gone without another layout.
-        known = scene.layout, len(rows)
-        if self._mesh is None or self._mesh[0] != known:
-            indices = wp.array(np.arange(3 * len(rows), dtype=np.int32), dtype=wp.int32, device=self._device)
-            self._mesh = known, wp.Mesh(points, indices)
-        else:
-            wp.copy(self._mesh[1].points, points)
-            self._mesh[1].refit()
-        # Where every ray meets every face, none looks at masks.
-        plain = bool(((masks & _RAYS) == _RAYS).all()) and not (masks >> WITHOUT).any()
-        stands = (place(rows), place(corners)) if len(scene.places) else (0, 0)
-        return MeshTracer(int(self._mesh[1].id), 0 if plain else place(masks), *stands)
+        if mesh is not None:
+            wp.copy(mesh.points, points)
+            mesh.refit()
+            return mesh
+        indices = wp.array(np.arange(len(points), dtype=np.int32), dtype=wp.int32, device=self._device)
+        return wp.Mesh(points, indices)
 
 
 def _placed(corners: Array, places: Array, rows: Array) -> Array:

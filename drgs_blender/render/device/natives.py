@@ -15,14 +15,15 @@ class MeshTracer(NamedTuple):
 
     Attributes
     ----------
-    mesh : Warp's mesh of all triangles, world space; 0 when there is none
-    masks : address of (k,) int32, which rays meet each triangle; 0: all do
+    meshes : address of (kinds, 3) int64: Warp's mesh of triangles in world space, the rays that meet them, and the
+        first of its rows in `faces`
+    kinds : int, of masks
     faces : address of (k, 2) int32, the scene's face and place of each triangle; 0: they are the scene's faces
     corners : address of (m, 3, 3) float32, corners of the scene's faces; read where a shape stands in places
     """
 
-    mesh: int
-    masks: int
+    meshes: int
+    kinds: int
     faces: int
     corners: int
 
@@ -50,32 +51,25 @@ def nearest(
     tracer: MeshTracer, ox: wp.float32, oy: wp.float32, oz: wp.float32, dx: wp.float32, dy: wp.float32,
     dz: wp.float32, tnear: wp.float32, tfar: wp.float32, mask: wp.int32,
 ):
-    origin, along = wp.vec3(ox, oy, oz), wp.vec3(dx, dy, dz)
-    t = wp.float32(tnear)
+    along = wp.vec3(dx, dy, dz)
+    start = wp.vec3(ox, oy, oz) + tnear * along
+    t = wp.float32(tfar)
     face = wp.int32(-1)
     place = wp.int32(-1)
     u = wp.float32(0.0)
     v = wp.float32(0.0)
     normal = wp.vec3(0.0, 0.0, 0.0)
-    while face < 0 and t < tfar and tracer.mesh != wp.int64(0):
-        query = wp.mesh_query_ray(wp.uint64(tracer.mesh), origin + t * along, along, tfar - t)
-        if not query.result:
-            t = tfar
-        else:
-            t = t + query.t
-            if tracer.masks == wp.int64(0):
-                face = query.face
-            else:
-                if (load_int32(tracer.masks, wp.int64(query.face)) & mask) != 0:
-                    face = query.face
-            # Warp's coordinates belong to the first and the second corner, Embree's to the second and the third.
-            u = query.v
-            v = 1.0 - query.u - query.v
-            normal = query.normal
-            if face < 0:
-                t = t * 1.000001 + 1.0e-7
-    if face < 0:
-        t = tfar
+    for k in range(wp.int32(tracer.kinds)):
+        row = wp.int64(3 * k)
+        if (wp.int32(load_int64(tracer.meshes, row + wp.int64(1))) & mask) != 0:
+            query = wp.mesh_query_ray(wp.uint64(load_int64(tracer.meshes, row)), start, along, t - tnear)
+            if query.result:
+                t = tnear + query.t
+                face = query.face + wp.int32(load_int64(tracer.meshes, row + wp.int64(2)))
+                # Warp's coordinates belong to the first and the second corner, Embree's to the second and the third.
+                u = query.v
+                v = 1.0 - query.u - query.v
+                normal = query.normal
     if face >= 0 and tracer.faces != wp.int64(0):
         i = wp.int64(2) * wp.int64(face)
         face = load_int32(tracer.faces, i)
@@ -92,13 +86,14 @@ def shadowed(
     tracer: MeshTracer, ox: wp.float32, oy: wp.float32, oz: wp.float32, dx: wp.float32, dy: wp.float32,
     dz: wp.float32, tnear: wp.float32, tfar: wp.float32, mask: wp.int32,
 ):
-    if tracer.mesh == wp.int64(0):
-        return wp.bool(False)
-    if tracer.masks == wp.int64(0):
-        origin, along = wp.vec3(ox, oy, oz), wp.vec3(dx, dy, dz)
-        return wp.mesh_query_ray_anyhit(wp.uint64(tracer.mesh), origin + tnear * along, along, tfar - tnear)
-    t, face, place, u, v, x, y, z = nearest(tracer, ox, oy, oz, dx, dy, dz, tnear, tfar, mask)
-    return face >= 0
+    along = wp.vec3(dx, dy, dz)
+    start = wp.vec3(ox, oy, oz) + tnear * along
+    hit = wp.bool(False)
+    for k in range(wp.int32(tracer.kinds)):
+        row = wp.int64(3 * k)
+        if not hit and (wp.int32(load_int64(tracer.meshes, row + wp.int64(1))) & mask) != 0:
+            hit = wp.mesh_query_ray_anyhit(wp.uint64(load_int64(tracer.meshes, row)), start, along, tfar - tnear)
+    return hit
 """
 
 _HIT = ("float32", "int32", "int32", "float32", "float32", "float32", "float32", "float32")
@@ -110,8 +105,10 @@ NATIVES: dict[Any, Any] = {
     memory.load_int32: _load("load_int32", "int32", "int"),
     memory.load_uint32: _load("load_uint32", "uint32", "unsigned int"),
     memory.load_int64: _load("load_int64", "int64", "long long"),
-    surface.nearest.py_func: Native(_NEAREST, "nearest", _HIT, (MeshTracer,), (memory.load_float, memory.load_int32)),
-    surface.shadowed.py_func: Native(_SHADOWED, "shadowed", "bool", (MeshTracer,), (surface.nearest,)),
+    surface.nearest.py_func: Native(
+        _NEAREST, "nearest", _HIT, (MeshTracer,), (memory.load_float, memory.load_int32, memory.load_int64)
+    ),
+    surface.shadowed.py_func: Native(_SHADOWED, "shadowed", "bool", (MeshTracer,), (memory.load_int64,)),
     # Rays meet meshes alone: `rays` has a function of each kind for them.
     **{
         getattr(rays, name): getattr(rays, f"_{name}")
