@@ -51,7 +51,8 @@ def warp() -> Any:
         raise DeviceError("device cuda", f"warp-lang has version {version}, not {VERSION}x", _INSTALL)
     folder = cache_folder() / "warp"
     wp.config.log_level = wp.LOG_WARNING  # else it greets on stdout, which is read by programs
-    wp.config.kernel_cache_dir = str(folder)
+    # Not the folder itself: Warp would take the sources there for what an older Warp has left, and warn.
+    wp.config.kernel_cache_dir = str(folder / "kernels")
     try:
         wp.init()
         os.utime(folder)  # see `jit.current_cache`

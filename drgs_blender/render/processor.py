@@ -20,10 +20,12 @@ class Processor:
 
     Attributes
     ----------
-    failed : of another one, why it is of no use any more, in words; what it was to do is done here
+    failed : of another one, why it is of no use to this picture any more, in words; what it was to do is done here
+    failures : how often that happened
     """
 
     failed = ""
+    failures = 0
 
     def integrate(self, *arguments: Any, surfels: SurfelBVH | None = None) -> Radiance:
         """`shade.integrate.integrate`."""

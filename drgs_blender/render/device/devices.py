@@ -10,6 +10,8 @@ from .on_device import OnDevice
 
 #: ``RenderSettings.device``, and what each stands for.
 DEVICES = {"cpu": "this processor", "cuda": "the first NVIDIA card"}
+#: Failures after which a device is left alone; before, the next picture tries it again: its scene may be smaller.
+_TRIES = 3
 
 
 class Devices:
@@ -20,7 +22,13 @@ class Devices:
         self._missing: dict[str, str] = {}
 
     def processor(self, device: str) -> Processor:
-        """The processor for a setting; this one where that has none."""
+        """The processor for a setting and a new picture; this one where that has none."""
+        found = self._found(device)
+        if found.failures < _TRIES:
+            found.failed = ""
+        return found
+
+    def _found(self, device: str) -> Processor:
         if device not in self._known and device not in self._missing:
             try:
                 self._known[device] = OnDevice(_name(device))
@@ -31,7 +39,7 @@ class Devices:
     def warnings(self, settings: RenderSettings) -> list[str]:
         """What of the device asked for was not used, and why."""
         device = settings.device
-        processor = self.processor(device)
+        processor = self._found(device)
         why = self._missing.get(device) or processor.failed
         if why:
             return [f"{why} Rendered on the CPU"]
@@ -65,5 +73,7 @@ def _name(device: str) -> str:
     warp()
     found = cuda_devices()
     if not found:
-        raise DeviceError("device cuda", "no NVIDIA card with a driver was found", "Install its driver or use the CPU")
+        raise DeviceError(
+            "device cuda", "no NVIDIA card with a driver was found", "Install or update its driver, or use the CPU"
+        )
     return found[0]

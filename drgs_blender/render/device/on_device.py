@@ -64,4 +64,5 @@ class OnDevice(Processor):
                 return there()
             except DeviceError as error:
                 self.failed = str(error)
+                self.failures += 1
         return here()
