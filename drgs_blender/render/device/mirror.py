@@ -72,7 +72,7 @@ class Mirror:
             return address(array)
         if not array.size:
             return 0
-        copy = warp().array(array.reshape(-1).view(np.uint8), dtype=warp().uint8, device=self._device)
+        copy = self._launcher.array(array.reshape(-1))  # as its own elements: Warp counts up to 2^31
         kept.append(copy)
         return int(copy.ptr)
 
