@@ -117,8 +117,10 @@ def among_meshes() -> tuple:
     )  # fmt: skip
     glowing = Material("glowing", emission=(3.0, 2.0, 1.0), emission_texture=Texture("checker", "rgb"))
     small = placed(0, 0, 0, 0.2)
+    turned = np.eye(4)
+    turned[:3, :3] = [[0.8, 0, 0.6], [0, 1, 0], [-0.6, 0, 0.8]]
     lights = [
-        placed(-2.0, 0.5, 1.0) @ small,
+        placed(-2.0, 0.5, 1.0) @ turned @ small,
         placed(0.5, -2.2, 2.0) @ small,
         placed(0, 2.0, 3.0) @ np.diag([-0.2, 0.2, 0.2, 1]),
     ]
@@ -126,6 +128,7 @@ def among_meshes() -> tuple:
     meshes = [
         floor(materials=[checked]),
         floor(*lights, materials=[glowing], name="lights"),
+        floor(placed(1.5, -1.5, 0.5) @ turned @ small, placed(-1.2, 1.8, 2.0, 0.3), name="plates"),
         floor(placed(0, 0, 4.5, 0.2), name="above", visibility=shut),
     ]
     scene = TraceScene()
