@@ -68,7 +68,7 @@ def type_of(value: Any) -> str | None:
         return BOOL
     if isinstance(value, int):
         return INT64 if value < 1 << 63 else UINT64
-    if isinstance(value, float) and not isinstance(value, np.floating):
+    if isinstance(value, float):
         return FLOAT64
     return type(value).__name__ if isinstance(value, np.generic) else None
 

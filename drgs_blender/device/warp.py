@@ -11,15 +11,14 @@ import hashlib
 import importlib.util
 import os
 import sys
-import tempfile
 from collections.abc import Callable, Iterable, Iterator
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 
-from ..errors import DeviceError
+from ..asset.archive import replace_file
+from ..errors import DeviceError, WriteError
 from ..jit import cache_folder
 from .typed import Array as ArrayType
 from .typed import Known, Struct, Type, type_of
@@ -125,7 +124,12 @@ def load_module(source: str) -> ModuleType:
     if name not in sys.modules:
         warp()
         path = cache_folder() / "warp" / f"{name}.py"
-        _write(path, source)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            replace_file(path, [source.encode()])  # at once: other processes may be reading it
+        except WriteError:
+            if not path.is_file():  # on Windows while it is read, which is the same text
+                raise
         spec = importlib.util.spec_from_file_location(name, path)
         assert spec is not None and spec.loader is not None
         module = sys.modules[name] = importlib.util.module_from_spec(spec)
@@ -135,15 +139,3 @@ def load_module(source: str) -> ModuleType:
             del sys.modules[name]
             raise
     return sys.modules[name]
-
-
-def _write(path: Path, text: str) -> None:
-    """Write a file at once: other processes may be reading it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(suffix=".part", dir=path.parent)
-    with os.fdopen(handle, "w", encoding="utf-8") as file:
-        file.write(text)
-    try:
-        os.replace(name, path)
-    except PermissionError:  # on Windows while it is read, which is the same text
-        os.unlink(name)

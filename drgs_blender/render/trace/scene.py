@@ -178,11 +178,8 @@ class TraceScene:
         rows, masks = [np.empty((0, 2), np.int32)], [np.empty(0, np.int32)]
         for group, members in enumerate(self._groups):
             for part in (self._parts[i] for i in members):
-                faces, places = np.arange(part.face.start, part.face.stop, dtype=np.int32), np.full(1, -1, np.int32)
-                if part.instanced:
-                    objects = len(self.faults) - len(self._known)
-                    count = len(self._known[part.source - objects][1].matrices)
-                    places = self._first_place[group] + np.arange(count, dtype=np.int32)
+                faces, where = np.arange(part.face.start, part.face.stop, dtype=np.int32), self._places_of(group, part)
+                places = np.array([-1] if where is None else where, np.int32)
                 rows.append(np.stack([np.tile(faces, len(places)), np.repeat(places, len(faces))], axis=1))
                 masks.append(np.full(len(rows[-1]), part.mask, np.int32))
         return np.concatenate(rows), np.concatenate(masks)
@@ -194,7 +191,6 @@ class TraceScene:
         if not self.materials.glows:
             return found
         glows = np.any(self.materials.arrays[0][:, 5:] > 0.0, axis=1)
-        objects = len(self.faults) - len(self._known)
         for group, members in enumerate(self._groups):
             for part in (self._parts[i] for i in members):
                 if not isinstance(part.item, MeshState):
@@ -203,12 +199,17 @@ class TraceScene:
                 own = np.flatnonzero(glows[self._material[rows]]) + rows.start
                 if not len(own):
                     continue
-                first, where = int(self._first_place[group]), None
-                if part.instanced:
-                    where = range(first, first + len(self._known[part.source - objects][1].matrices))
+                where = self._places_of(group, part)
                 uvs = self._uvs[own] if len(self._uvs) else None
                 found.append(Glowing(part.item, part.face, own + self.vertex_faces, self._material[own], uvs, where))
         return found
+
+    def _places_of(self, group: int, part: Part) -> range | None:
+        """Rows of `places` in which a part of a group stands; None where it is in world space."""
+        if not part.instanced:
+            return None
+        first, objects = int(self._first_place[group]), len(self.faults) - len(self._known)
+        return range(first, first + len(self._known[part.source - objects][1].matrices))
 
     def update(
         self, objects: Sequence[TraceObject], meshes: Sequence[MeshState] = (), images: Sequence[Image] = ()
