@@ -113,6 +113,20 @@ def unused(path: Path, frames: Iterable[int] = ()) -> Path:
     raise AssertionError("numbers do not end")
 
 
+def chosen(path: Path, named: bool) -> Path:
+    """The file to write: `path` where the artist named it, else one that is `unused`.
+
+    Raises
+    ------
+    UsageError
+        An object is made of the one that was named.
+    """
+    if not named:
+        return unused(path)
+    check_unused(path)
+    return path
+
+
 def announce(paths: Iterable[Path]) -> None:
     """Have `unused` and `check_unused` heed files that a program begins to write."""
     _coming.update(map(_key, paths))

@@ -55,9 +55,7 @@ class DRGS_OT_convert(ProgramOperator, bpy.types.Operator):
             raise UsageError(subject, "has no place for its asset", "Save the .blend, or name the asset's file")
         named = self.out or f"//{bpy.path.clean_name(obj.name)}"
         target = Path(bpy.path.abspath(named)).absolute().with_suffix(".drgs")
-        if self.out:
-            assets.check_unused(target)
-        self._target = target = target if self.out else assets.unused(target)
+        self._target = target = assets.chosen(target, bool(self.out))
         self._name = obj.name
         with self.folder("drgs-convert-"):
             arguments = self._source(context, obj)

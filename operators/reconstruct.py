@@ -87,11 +87,7 @@ class DRGS_OT_reconstruct(ProgramOperator, bpy.types.Operator):
                 f'Capture "{folder.name}"', "has no place for its asset", "Save the .blend, or name the asset's file"
             )
         out = Path(bpy.path.abspath(self.out or f"//{bpy.path.clean_name(folder.name)}"))
-        out = out.absolute().with_suffix(".drgs")
-        if self.out:
-            assets.check_unused(out)
-        else:
-            out = assets.unused(out)
+        out = assets.chosen(out.absolute().with_suffix(".drgs"), bool(self.out))
         arguments = ["reconstruct", str(capture), "--out", str(out), "--minutes", f"{self.minutes:g}"]
         arguments += ["--variant", self.variant]
         if self.resolution:
