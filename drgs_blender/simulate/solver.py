@@ -15,12 +15,12 @@ from scipy.spatial import cKDTree
 
 from ..errors import Cancelled, UsageError
 from ..matter import FLUID, SNOW, Matter
-from .blocks import Arrangement, Domain, arrange
+from .blocks import Domain, arrange
 from .colliders import Collider, MovingCollider, check_apart
-from .contact import CONTACTS, Plane, bound, collide, plane_rows
-from .fields import FieldRows, ForceField, blow_nodes
+from .contact import Plane, plane_rows
+from .fields import FieldRows
+from .grid import Forces, Grid, HostGrid, Limits, Scene, State
 from .stepper import Stepper
-from .transfer import advance_nodes, gather, hold_pins, scatter
 
 Array = np.ndarray
 log = logging.getLogger(__name__)
@@ -31,46 +31,6 @@ _DRIFT = 0.85
 _FASTEST = 0.5
 #: A step so many times shorter than the stiffness asks for means that the motion has run away.
 _RUNAWAY = 200.0
-
-
-@dataclass(frozen=True, slots=True)
-class Forces:
-    """What acts on all matter: gravity (m/s^2), wind (m/s) that pulls with drag (1/s), damping (1/s), fields."""
-
-    gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
-    wind: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    drag: float = 0.0
-    damping: float = 0.0
-    fields: tuple[ForceField, ...] = ()
-
-
-@dataclass(slots=True)
-class State:
-    """All that the future depends on, one row a particle.
-
-    Attributes
-    ----------
-    x : (n, 3) float64, metres, world
-    v : (n, 3) float32, m/s
-    affine : (n, 9) float32, velocity gradient of APIC, 1/s
-    elastic : (n, 9) float32, elastic deformation gradient less 1
-    total : (n, 9) float32, deformation gradient since the start less 1; no rows where no matter is plastic
-    tau : (n, 6) float32, Kirchhoff stress, Pa: xx, yy, zz, xy, xz, yz
-    memory : (n,) float32, see `stress.respond`
-    """
-
-    x: Array
-    v: Array
-    affine: Array
-    elastic: Array
-    total: Array
-    tau: Array
-    memory: Array
-
-    def taken(self, order: Array) -> State:
-        """The rows in another order."""
-        parts = (getattr(self, f.name) for f in fields(self))
-        return State(*(a.take(order, axis=0) if len(a) else a for a in parts))
 
 
 @dataclass(slots=True)
@@ -126,17 +86,21 @@ class Solver(Stepper):
         self.planes, self._fields = plane_rows(planes), FieldRows(self.forces.fields)
         n, riders = len(body.points), len(body.riders)
         matter = body.matter
-        self._mass = np.concatenate([body.volume * matter.density, np.zeros(riders)]).astype(np.float32)
-        self._least = np.float32(1e-9 * self._mass[:n].min(initial=np.inf))
-        self._volume = np.concatenate([body.volume, np.zeros(riders)]).astype(np.float32)
+        mass = np.concatenate([body.volume * matter.density, np.zeros(riders)]).astype(np.float32)
+        volume = np.concatenate([body.volume, np.zeros(riders)]).astype(np.float32)
 
         def padded(values: Array) -> Array:
             return np.concatenate([values, np.zeros((riders, *values.shape[1:]), values.dtype)])
 
-        self._model, self._parameters = padded(matter.model), padded(matter.parameters)
-        self._solid = padded(matter.keeps_shape)
+        self._model = padded(matter.model)
         self._reach = np.maximum(self._nearest(body.points, body.riders)[0], domain.spacing)
         self._pins = np.flatnonzero(body.pinned) if body.pinned is not None else np.empty(0, np.int64)
+        self._scene = Scene(
+            domain, self.forces, self._fields, self.colliders, self.planes, mass, volume, self._model,
+            padded(matter.parameters), padded(matter.keeps_shape), self._pins,
+            np.float32(1e-9 * mass[:n].min(initial=np.inf)),
+        )  # fmt: skip
+        self.grid: Grid = HostGrid(self._scene)
         still = bool(len(self._pins) == n)
         h = domain.spacing
         fastest = float((matter.wave_speed / h + 2 * matter.diffusivity / h**2).max())
@@ -162,7 +126,7 @@ class Solver(Stepper):
         """Refuse what cannot go well, with what to do about it."""
         if not len(self.body.points):
             raise UsageError("simulation", "has no particles", "Fill the mesh first")
-        self._arranged(self.state.x)
+        self._check_inside(self.state.x)
         check_apart(self.body.points, self.domain.spacing, self.colliders, self.planes)
 
     @property
@@ -191,8 +155,7 @@ class Solver(Stepper):
         cancelled: Callable[[], bool] | None,
         progress: Callable[[float], None] | None,
     ) -> None:
-        domain, forces = self.domain, self.forces
-        h = domain.spacing
+        h = self.domain.spacing
         n = len(self.body.points)
         pin_velocity = np.zeros((len(self._pins), 3), np.float32)
         if pin_targets is not None:
@@ -204,73 +167,52 @@ class Solver(Stepper):
             outside = max(outside, moving.speed)
         if len(pin_velocity):
             outside = max(outside, float(np.linalg.norm(pin_velocity, axis=1).max()))
-        gravity = np.asarray(forces.gravity, np.float64)
-        wind = np.asarray(forces.wind, np.float64)
-        push = float(np.linalg.norm(gravity)) + self._fields.push(self.frame)
+        push = float(np.linalg.norm(np.asarray(self.forces.gravity, np.float64))) + self._fields.push(self.frame)
         speed = float(np.sqrt((self.state.v.astype(np.float64) ** 2).sum(axis=1).max(initial=0)))
         if not np.isfinite(speed):
             raise self._error("has velocities that are not finite", "Bake again from the start")
         speed = max(speed, outside)
+        usual = min(1 / self.rate if self.rate else np.inf, seconds)
 
-        done, drift, arrangement = 0.0, np.inf, None
-        order = np.arange(len(self.state.x))
+        grid, done, drift = self.grid, 0.0, np.inf
+        grid.enter(self.state, self.frame, seconds, pin_velocity)
         while done < seconds * (1 - 1e-9):
             if cancelled is not None and cancelled():
                 raise Cancelled
-            if arrangement is None or drift > _DRIFT:
-                arrangement, state, order = self._sorted(order, self.state)
+            if drift > _DRIFT:
+                if not grid.sort():
+                    self._check_inside(grid.state().x)
                 drift = 0.0
-                self.state = state
-                mass, volume, solid = self._mass[order], self._volume[order], self._solid[order]
-                model, parameters = self._model[order], self._parameters[order]
-                place = np.empty(len(order), np.int64)
-                place[order] = np.arange(len(order))
-                pins = place[self._pins]
-                nodes = np.empty((len(arrangement.active), 64, 4), np.float32)
-                held = np.zeros_like(nodes) if len(pins) else nodes[:0]
-                fastest = np.empty(len(arrangement.block), np.float32)
-            usual = min(1 / self.rate if self.rate else np.inf, seconds)
             longest = min(usual, _FASTEST * h / max(speed + push * usual, 1e-12))
             if longest < usual / _RUNAWAY and speed > outside:
                 raise self._error(
                     f"ran away: matter moves at {speed:.3g} m/s",
                     "Make the material stiffer or the particles finer, or slow down what hits it",
                 )
-            dt = (seconds - done) / np.ceil((seconds - done) / longest - 1e-9)
-
-            s, a = self.state, arrangement
-            grid = (domain.origin, h)
-            scatter(s.x, s.v, s.affine, s.tau, mass, volume, *grid, dt, a.block, a.shares, a.start, a.neighbour, nodes)
-            advance_nodes(nodes, self._least, dt, gravity, wind, forces.drag, forces.damping)
-            if len(self._fields):
-                blow_nodes(nodes, a.active, *grid, self._fields.at(self.frame, (done + 0.5 * dt) / seconds), dt)
-            for moving in self.colliders:
-                self._touch(moving, (done + 0.5 * dt) / seconds, nodes, a)
-            if len(self.planes):
-                bound(nodes, a.active, *grid, self.planes)
-            if len(pins):
-                hold_pins(s.x, pins, pin_velocity, mass, *grid, a.slot, nodes, held)
-                kept = s.x[pins] + dt * pin_velocity
-            gather(
-                s.x, s.v, s.affine, s.elastic, s.total, s.tau, s.memory, model, parameters, mass, solid, *grid, dt,
-                a.block, a.shares, a.start, a.neighbour, nodes, fastest,
-            )  # fmt: skip
-            if len(pins):
-                s.x[pins], s.v[pins] = kept, pin_velocity
-            top = float(fastest.max())
-            if not np.isfinite(top):
-                raise self._error("became infinite", "Use a lower Courant number (0.3) or finer particles")
-            speed = max(top, outside)
-            drift += speed * dt / h
-            done += dt
-            self.steps += 1
+            times = self._times(seconds, done, longest, grid.most if longest == usual else 1)
+            limits = Limits(_DRIFT - drift, _FASTEST * h / usual - push * usual, outside)
+            for (_, dt), top in zip(times, grid.step(times, limits)):
+                if not np.isfinite(top):
+                    raise self._error("became infinite", "Use a lower Courant number (0.3) or finer particles")
+                speed = max(top, outside)
+                drift += speed * dt / h
+                done += dt
+                self.steps += 1
             if progress is not None:
                 progress(done / seconds)
-        back = np.empty_like(order)
-        back[order] = np.arange(len(order))
-        self.state = self.state.taken(back)
+        self.state = grid.state()
         self._rejoin()
-        self._arranged(self.state.x)
+        self._check_inside(self.state.x)
+
+    @staticmethod
+    def _times(seconds: float, done: float, longest: float, most: int) -> list[tuple[float, float]]:
+        """When the next steps begin and how long they take, as even as they come."""
+        found: list[tuple[float, float]] = []
+        while len(found) < most and done < seconds * (1 - 1e-9):
+            dt = (seconds - done) / np.ceil((seconds - done) / longest - 1e-9)
+            found.append((done, dt))
+            done += dt
+        return found
 
     @staticmethod
     def _nearest(points: Array, riders: Array) -> tuple[Array, Array]:
@@ -290,13 +232,9 @@ class Solver(Stepper):
             state.x[n + lost] = at + (state.x[n + lost] - at) * (self._reach[lost] / distance[lost])[:, None]
             state.v[n + lost] = state.v[nearest[lost]]
 
-    def _sorted(self, order: Array, state: State) -> tuple[Arrangement, State, Array]:
-        arrangement = self._arranged(state.x)
-        return arrangement, state.taken(arrangement.order), order[arrangement.order]
-
-    def _arranged(self, x: Array) -> Arrangement:
-        """Sort; refuse particles outside of the domain."""
-        arrangement, lost = arrange(x, self.domain)
+    def _check_inside(self, x: Array) -> None:
+        """Refuse particles outside of the domain."""
+        lost = arrange(x, self.domain)[1]
         if len(lost):
             where = x[lost[0]]
             finite = bool(np.isfinite(where).all())
@@ -308,14 +246,3 @@ class Solver(Stepper):
                 if finite
                 else "Use a lower Courant number (0.3) or finer particles",
             )
-        return arrangement
-
-    def _touch(self, moving: MovingCollider, part: float, nodes: Array, a: Arrangement) -> None:
-        place, rotation, shift, linear, spin = moving.at(part)
-        if place is None:
-            return
-        c = moving.collider
-        collide(
-            nodes, a.active, self.domain.origin, self.domain.spacing, place.distance, place.velocity, place.origin,
-            place.spacing, rotation, shift, linear, spin, c.thickness, CONTACTS[c.contact], c.friction,
-        )  # fmt: skip

@@ -23,15 +23,15 @@ _SCRATCH = 2048 + 4
 
 #: Share of a node's matter that is pinned from which on the node is. On a flat border between pinned and free matter
 #: the last node held is then, over all positions of the grid, on average on the border itself.
-_PINNED = np.float32(0.2)
+PINNED = np.float32(0.2)
 
 #: Share of the matter of the fullest node around below which a node says nothing about how a rider moves: the few
 #: grains at its rim, pushed by all others, are no surface.
-_BARE = np.float32(0.1)
+BARE = np.float32(0.1)
 
 
 @njit(inline="always")
-def _weights(f):  # type: ignore[no-untyped-def]
+def weights_of(f):  # type: ignore[no-untyped-def]
     """Quadratic B-spline weights of three nodes, `f` from the first one in spacings; they sum to 1 as rounded."""
     a, c = _ONE_HALF - f, f - _HALF
     first, last = _HALF * a * a, _HALF * c * c
@@ -39,7 +39,7 @@ def _weights(f):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def _cell(x, p, origin, scale):  # type: ignore[no-untyped-def]
+def cell_of(x, p, origin, scale):  # type: ignore[no-untyped-def]
     """The first of the three nodes around a particle along each axis, and how far after it the particle is."""
     gx, gy, gz = (x[p, 0] - origin[0]) * scale, (x[p, 1] - origin[1]) * scale, (x[p, 2] - origin[2]) * scale
     i, j, k = int(gx - 0.5), int(gy - 0.5), int(gz - 0.5)
@@ -47,7 +47,7 @@ def _cell(x, p, origin, scale):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def _node(neighbour, b, i, j, k):  # type: ignore[no-untyped-def]
+def node_of(neighbour, b, i, j, k):  # type: ignore[no-untyped-def]
     """Where node (i, j, k) of block b's scratch is: slot and number in the grid, and offset in the scratch."""
     e = (((i + 3) >> 2) * 3 + ((j + 3) >> 2)) * 3 + ((k + 3) >> 2)
     n = (((i + 3) & 3) * 4 + ((j + 3) & 3)) * 4 + ((k + 3) & 3)
@@ -73,7 +73,7 @@ def _carried(scratch, base, wx, wy, wz):  # type: ignore[no-untyped-def]
         for jj in range(3):
             for kk in range(3):
                 n = base + ii * 256 + jj * 32 + 4 * kk
-                if scratch[n + 3] > _BARE * heaviest:
+                if scratch[n + 3] > BARE * heaviest:
                     w = wx[ii] * wy[jj] * wz[kk]
                     x, y, z, weight = x + w * scratch[n], y + w * scratch[n + 1], z + w * scratch[n + 2], weight + w
     if weight > _ZERO:
@@ -82,7 +82,7 @@ def _carried(scratch, base, wx, wy, wz):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def _stretch(f, p, step, g0, g1, g2, g3, g4, g5, g6, g7, g8):  # type: ignore[no-untyped-def]
+def stretch(f, p, step, g0, g1, g2, g3, g4, g5, g6, g7, g8):  # type: ignore[no-untyped-def]
     """F = (1 + step grad v) F, in place, where `f` holds F - 1."""
     h0, h4, h8 = f[p, 0], f[p, 4], f[p, 8]
     f0, f1, f2, f3, f4, f5, f6, f7, f8 = _ONE + h0, f[p, 1], f[p, 2], f[p, 3], _ONE + h4, f[p, 5], f[p, 6], f[p, 7], _ONE + h8  # noqa: E501  # fmt: skip
@@ -95,6 +95,27 @@ def _stretch(f, p, step, g0, g1, g2, g3, g4, g5, g6, g7, g8):  # type: ignore[no
     f[p, 6] = f6 + step * (g6 * f0 + g7 * f3 + g8 * f6)
     f[p, 7] = f7 + step * (g6 * f1 + g7 * f4 + g8 * f7)
     f[p, 8] = h8 + step * (g6 * f2 + g7 * f5 + g8 * f8)
+
+
+@njit(inline="always")
+def momentum_of(p, v, affine, tau, m, q, h, fx, fy, fz):  # type: ignore[no-untyped-def]
+    """Momentum that particle p gives to the first node around it, and by how much more the next ones along x, y and z
+    get of it, row by row: m v + (m C - factor V tau) d, with d from the particle to the node and q = -factor V."""
+    a00, a01, a02 = (m * affine[p, 0] + q * tau[p, 0]) * h, (m * affine[p, 1] + q * tau[p, 3]) * h, (m * affine[p, 2] + q * tau[p, 4]) * h  # noqa: E501  # fmt: skip
+    a10, a11, a12 = (m * affine[p, 3] + q * tau[p, 3]) * h, (m * affine[p, 4] + q * tau[p, 1]) * h, (m * affine[p, 5] + q * tau[p, 5]) * h  # noqa: E501  # fmt: skip
+    a20, a21, a22 = (m * affine[p, 6] + q * tau[p, 4]) * h, (m * affine[p, 7] + q * tau[p, 5]) * h, (m * affine[p, 8] + q * tau[p, 2]) * h  # noqa: E501  # fmt: skip
+    mx = m * v[p, 0] - a00 * fx - a01 * fy - a02 * fz
+    my = m * v[p, 1] - a10 * fx - a11 * fy - a12 * fz
+    mz = m * v[p, 2] - a20 * fx - a21 * fy - a22 * fz
+    return mx, my, mz, a00, a01, a02, a10, a11, a12, a20, a21, a22
+
+
+@njit(inline="always")
+def pushed(x, y, z, gx, gy, gz, slow, pull, wx, wy, wz):  # type: ignore[no-untyped-def]
+    """A velocity after a step of what acts on all matter alike."""
+    # All forces alike, so that damping does not change where matter comes to rest.
+    x, y, z = slow * (x + gx), slow * (y + gy), slow * (z + gz)
+    return x + pull * (wx - x), y + pull * (wy - y), z + pull * (wz - z)
 
 
 @njit(parallel=True)
@@ -124,16 +145,12 @@ def scatter(  # type: ignore[no-untyped-def]
                     m = mass[p]
                     if m == np.float32(0.0):
                         continue
-                    i, j, k, fx, fy, fz = _cell(x, p, origin, scale)
-                    wx, wy, wz = _weights(fx), _weights(fy), _weights(fz)
+                    i, j, k, fx, fy, fz = cell_of(x, p, origin, scale)
+                    wx, wy, wz = weights_of(fx), weights_of(fy), weights_of(fz)
                     q = -factor * volume[p]
-                    # Momentum of a node: m v + (m C - factor V tau) d, with d from the particle to the node.
-                    a00, a01, a02 = (m * affine[p, 0] + q * tau[p, 0]) * h, (m * affine[p, 1] + q * tau[p, 3]) * h, (m * affine[p, 2] + q * tau[p, 4]) * h  # noqa: E501  # fmt: skip
-                    a10, a11, a12 = (m * affine[p, 3] + q * tau[p, 3]) * h, (m * affine[p, 4] + q * tau[p, 1]) * h, (m * affine[p, 5] + q * tau[p, 5]) * h  # noqa: E501  # fmt: skip
-                    a20, a21, a22 = (m * affine[p, 6] + q * tau[p, 4]) * h, (m * affine[p, 7] + q * tau[p, 5]) * h, (m * affine[p, 8] + q * tau[p, 2]) * h  # noqa: E501  # fmt: skip
-                    mx = m * v[p, 0] - a00 * fx - a01 * fy - a02 * fz
-                    my = m * v[p, 1] - a10 * fx - a11 * fy - a12 * fz
-                    mz = m * v[p, 2] - a20 * fx - a21 * fy - a22 * fz
+                    mx, my, mz, a00, a01, a02, a10, a11, a12, a20, a21, a22 = momentum_of(
+                        p, v, affine, tau, m, q, h, fx, fy, fz
+                    )
                     base = (((i - cx) * 8 + (j - cy)) * 8 + (k - cz)) * 4
                     # A row of nodes along z at once; the fourth has no weight.
                     along = quads(wz[0], wz[1], wz[2], _ZERO)
@@ -148,7 +165,7 @@ def scatter(  # type: ignore[no-untyped-def]
                 for i in range(8):
                     for j in range(8):
                         for k in range(8):
-                            s, n, o = _node(neighbour, b, i, j, k)
+                            s, n, o = node_of(neighbour, b, i, j, k)
                             nodes[s, n, 0] += scratch[o]
                             nodes[s, n, 1] += scratch[o + 1]
                             nodes[s, n, 2] += scratch[o + 2]
@@ -177,11 +194,7 @@ def advance_nodes(nodes, least, dt, force, wind, drag, damping):  # type: ignore
             else:
                 r = _ONE / m
                 x, y, z = nodes[s, n, 0] * r, nodes[s, n, 1] * r, nodes[s, n, 2] * r
-                # All forces alike, so that damping does not change where matter comes to rest.
-                x, y, z = slow * (x + gx), slow * (y + gy), slow * (z + gz)
-                nodes[s, n, 0] = x + pull * (wx - x)
-                nodes[s, n, 1] = y + pull * (wy - y)
-                nodes[s, n, 2] = z + pull * (wz - z)
+                nodes[s, n, 0], nodes[s, n, 1], nodes[s, n, 2] = pushed(x, y, z, gx, gy, gz, slow, pull, wx, wy, wz)
 
 
 @njit(parallel=True)
@@ -209,7 +222,7 @@ def gather(  # type: ignore[no-untyped-def]
             for i in range(8):
                 for j in range(8):
                     for k in range(8):
-                        s, n, o = _node(neighbour, b, i, j, k)
+                        s, n, o = node_of(neighbour, b, i, j, k)
                         scratch[o] = nodes[s, n, 0]
                         scratch[o + 1] = nodes[s, n, 1]
                         scratch[o + 2] = nodes[s, n, 2]
@@ -217,8 +230,8 @@ def gather(  # type: ignore[no-untyped-def]
             cx, cy, cz = 4 * block[b, 0] - 1, 4 * block[b, 1] - 1, 4 * block[b, 2] - 1
             top = np.float32(0.0)
             for p in range(start[b], start[b + 1]):
-                i, j, k, fx, fy, fz = _cell(x, p, origin, scale)
-                wx, wy, wz = _weights(fx), _weights(fy), _weights(fz)
+                i, j, k, fx, fy, fz = cell_of(x, p, origin, scale)
+                wx, wy, wz = weights_of(fx), weights_of(fy), weights_of(fz)
                 base = (((i - cx) * 8 + (j - cy)) * 8 + (k - cz)) * 4
                 blend = per_x = per_y = spread(_ZERO)
                 for ii in range(3):
@@ -252,9 +265,9 @@ def gather(  # type: ignore[no-untyped-def]
                 affine[p, 0], affine[p, 1], affine[p, 2] = g0, g1, g2
                 affine[p, 3], affine[p, 4], affine[p, 5] = g3, g4, g5
                 affine[p, 6], affine[p, 7], affine[p, 8] = g6, g7, g8
-                _stretch(elastic, p, step, g0, g1, g2, g3, g4, g5, g6, g7, g8)
+                stretch(elastic, p, step, g0, g1, g2, g3, g4, g5, g6, g7, g8)
                 if apart and solid[p]:
-                    _stretch(total, p, step, g0, g1, g2, g3, g4, g5, g6, g7, g8)
+                    stretch(total, p, step, g0, g1, g2, g3, g4, g5, g6, g7, g8)
                 if model[p] == ELASTIC:
                     neo_hookean(elastic, p, parameters[p, MU], parameters[p, LAMBDA], tau)
                 else:
@@ -276,8 +289,8 @@ def hold_pins(x, pinned, pin_velocity, mass, origin, spacing, slot, nodes, held)
     for turn in range(2):
         for q in range(len(pinned)):
             p = pinned[q]
-            i, j, k, fx, fy, fz = _cell(x, p, origin, scale)
-            wx, wy, wz = _weights(fx), _weights(fy), _weights(fz)
+            i, j, k, fx, fy, fz = cell_of(x, p, origin, scale)
+            wx, wy, wz = weights_of(fx), weights_of(fy), weights_of(fz)
             for ii in range(3):
                 for jj in range(3):
                     for kk in range(3):
@@ -290,7 +303,7 @@ def hold_pins(x, pinned, pin_velocity, mass, origin, spacing, slot, nodes, held)
                                 held[s, n, c] += w * pin_velocity[q, c]
                         else:
                             m = held[s, n, 3]
-                            if m > _PINNED * nodes[s, n, 3]:
+                            if m > PINNED * nodes[s, n, 3]:
                                 for c in range(3):
                                     nodes[s, n, c] = held[s, n, c] / m
                             held[s, n] = np.float32(0.0)
