@@ -118,11 +118,15 @@ def rasterise(
     ------
     UsageError: the camera is orthographic or cannot take a picture.
     """
+    parameters, size = view_of(camera)
+    return Maps(*_Rasterise.apply(centre, tangent_u, tangent_v, opacity, features, parameters, size, tally))
+
+
+def view_of(camera: Camera) -> tuple[Array, tuple[int, int]]:
+    """`camera_parameters` of a camera that photographs, and the picture's width and height; see `rasterise`."""
     if camera.orthographic:
         raise UsageError("camera", "is orthographic", "Photographs to learn from are perspective")
-    parameters = camera_parameters(camera, RenderSettings(aa=1), 0)
-    size = (camera.width, camera.height)
-    return Maps(*_Rasterise.apply(centre, tangent_u, tangent_v, opacity, features, parameters, size, tally))
+    return camera_parameters(camera, RenderSettings(aa=1), 0), (camera.width, camera.height)
 
 
 class _Rasterise(torch.autograd.Function):
@@ -177,7 +181,7 @@ class _Rasterise(torch.autograd.Function):
 
 
 @njit(inline="always")
-def _strength(
+def strength(
     ex: Any, ey: Any, ux: Any, uy: Any, vx: Any, vy: Any, i0: Any, ix: Any, iy: Any, zc: Any, dim: Any,
     near: Any, far: Any,
 ) -> Any:  # fmt: skip
@@ -206,7 +210,7 @@ def _blend(
     for j in range(LANES):
         at = base + np.uintp(j)
         ex, ey = dx + np.float32(j % SIDE), dy + np.float32(j // SIDE)
-        q, z, _, _, _ = _strength(ex, ey, ux, uy, vx, vy, i0, ix, iy, zc, dim, near, far)
+        q, z, _, _, _ = strength(ex, ey, ux, uy, vx, vy, i0, ix, iy, zc, dim, near, far)
         t, depth, square = state[at], state[at + np.uintp(_Z * LANES)], state[at + np.uintp(_ZZ * LANES)]
         seen = (q < cut) & (t >= stop)
         w = t * min(opacity * gaussian(q), np.float32(MAX_ALPHA)) if seen else zero
@@ -294,6 +298,30 @@ def _forward(
             )  # fmt: skip
 
 
+@njit(inline="always")
+def slopes(
+    g_alpha: Any, g_depth: Any, alpha: Any, ex: Any, ey: Any, z: Any, exact: Any, su: Any, sv: Any, ux: Any, uy: Any,
+    vx: Any, vy: Any, ix: Any, iy: Any,
+) -> Any:  # fmt: skip
+    """Gradients of a pixel's place (ex, ey), of u and v over z, of 1 / z, and the last where the place changes it."""
+    zero = np.float32(0.0)
+    g_q = np.float32(-0.5) * alpha * g_alpha
+    # Where the intersection decides, q = (su^2 + sv^2) z^2; else it is the squared distance on the screen.
+    by_su, by_sv = (g_q + g_q) * su * z * z, (g_q + g_q) * sv * z * z
+    by_i = -z * z * (g_depth + (g_q + g_q) * (su * su + sv * sv) * z)
+    by_ex, by_ey = by_su * ux + by_sv * vx + by_i * ix, by_su * uy + by_sv * vy + by_i * iy
+    low = np.float32(2.0 * LOW_PASS) * g_q
+    g_i = by_i if exact else -z * z * g_depth
+    return (
+        by_ex if exact else low * ex,
+        by_ey if exact else low * ey,
+        by_su if exact else zero,
+        by_sv if exact else zero,
+        g_i,
+        g_i if exact else zero,
+    )
+
+
 @njit
 def _blend_backward(
     record: Any, i: Any, values: Any, x: Any, y: Any, near: Any, far: Any, state: Any, base: Any, channels: Any,
@@ -317,7 +345,7 @@ def _blend_backward(
         lane = np.uintp(j)
         at = base + lane
         ex, ey = dx + np.float32(j % SIDE), dy + np.float32(j // SIDE)
-        q, z, exact, su, sv = _strength(ex, ey, ux, uy, vx, vy, i0, ix, iy, zc, dim, near, far)
+        q, z, exact, su, sv = strength(ex, ey, ux, uy, vx, vy, i0, ix, iy, zc, dim, near, far)
         t = state[at]
         seen = (q < cut) & (t >= stop)
         kernel = gaussian(q)
@@ -339,16 +367,9 @@ def _blend_backward(
         g_depth += state[at + np.uintp(_GM * LANES)] if middle else zero
         g_alpha = g_alpha if seen & (opacity * kernel < most) else zero
         g_depth = g_depth if seen else zero
-        g_q = np.float32(-0.5) * alpha * g_alpha
-        # Where the intersection decides, q = (su^2 + sv^2) z^2; else it is the squared distance on the screen.
-        g_su, g_sv = (g_q + g_q) * su * z * z, (g_q + g_q) * sv * z * z
-        g_i = -z * z * (g_depth + (g_q + g_q) * (su * su + sv * sv) * z)
-        g_ex, g_ey = g_su * ux + g_sv * vx + g_i * ix, g_su * uy + g_sv * vy + g_i * iy
-        g_su, g_sv = g_su if exact else zero, g_sv if exact else zero
-        g_i = g_i if exact else -z * z * g_depth
-        low = np.float32(2.0 * LOW_PASS) * g_q
-        g_ex, g_ey = g_ex if exact else low * ex, g_ey if exact else low * ey
-        slope = g_i if exact else zero
+        g_ex, g_ey, g_su, g_sv, g_i, slope = slopes(
+            g_alpha, g_depth, alpha, ex, ey, z, exact, su, sv, ux, uy, vx, vy, ix, iy
+        )
         sums[np.uintp(RX * LANES) + lane] -= g_ex
         sums[np.uintp(RY * LANES) + lane] -= g_ey
         sums[np.uintp(UX * LANES) + lane] += g_su * ex

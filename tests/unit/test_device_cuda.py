@@ -14,6 +14,7 @@ import test_device_raster
 import warp
 from test_device_denoise import picture
 
+from drgs_blender.device.kernels import Launcher
 from drgs_blender.render.device import attach, denoise, integrate, raster
 from drgs_blender.render.device.on_device import OnDevice
 from drgs_blender.render.picture.denoise import denoise as denoised
@@ -22,10 +23,10 @@ from drgs_blender.render.picture.denoise import denoise as denoised
 ARCHITECTURE = 80
 
 
-def made(works: tuple[object, ...], device: OnDevice, folder: Path) -> set[object]:
+def made(works: tuple[object, ...], launcher: Launcher, folder: Path) -> set[object]:
     """Compile what a device was asked for, of some works; those that were."""
     found = set()
-    for work, types in device.launcher._modules:
+    for work, types in launcher._modules:
         if work in works:
             module = work.module(types, True)
             (file,) = warp.compile_aot_module(module, arch=ARCHITECTURE, module_dir=str(folder))
@@ -39,8 +40,21 @@ def test_pictures_kernels_compile_for_a_card(tmp_path: Path) -> None:
     test_device_raster.test_points_are_tied_to_the_mesh_as_the_processor_ties_them(device, 0.1, True)
     denoised(*picture(), by=device.smooth)
     works = raster.BLEND, attach.ATTACH, denoise.WEIGH, denoise.A_TROUS
-    assert made(works, device, tmp_path) == set(works)
+    assert made(works, device.launcher, tmp_path) == set(works)
     assert not device.failed
+
+
+def test_learnings_kernels_compile_for_a_card(tmp_path: Path) -> None:
+    pytest.importorskip("torch")
+    import test_device_surfels
+
+    from drgs_blender.reconstruct.device import kernels
+    from drgs_blender.reconstruct.device.launch import TensorLauncher
+
+    launcher = TensorLauncher("cpu")
+    test_device_surfels.test_every_map_has_a_gradient_of_its_own(launcher)
+    works = tuple(work for work in vars(kernels).values() if isinstance(work, kernels.Work))
+    assert made(works, launcher, tmp_path) == set(works)
 
 
 @pytest.mark.skipif(os.environ.get("DRGS_FAULTS") != "whole", reason="takes minutes; DRGS_FAULTS=whole runs it")
@@ -48,4 +62,4 @@ def test_the_integrator_compiles_for_a_card(tmp_path: Path) -> None:
     device = OnDevice("cpu")
     for scene in (test_device_integrate.under_sky(), test_device_integrate.among_meshes()):
         test_device_integrate.both(device, scene, test_device_integrate.SETTINGS)
-    assert made((integrate.SHADE,), device, tmp_path) == {integrate.SHADE}
+    assert made((integrate.SHADE,), device.launcher, tmp_path) == {integrate.SHADE}

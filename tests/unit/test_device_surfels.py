@@ -1,0 +1,113 @@
+"""The differentiable rasteriser on a device, on Warp's device "cpu": what the processor finds, and the brute force."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("warp", reason="warp-lang is not installed")
+
+from test_reconstruct_raster import (  # noqa: E402
+    camera,
+    hold_against_brute_force,
+    hold_each_map_against_brute_force,
+    surfels,
+)
+
+from drgs_blender.errors import DeviceError  # noqa: E402
+from drgs_blender.reconstruct import raster as here  # noqa: E402
+from drgs_blender.reconstruct.device import raster as there  # noqa: E402
+from drgs_blender.reconstruct.device.launch import TensorLauncher  # noqa: E402
+from drgs_blender.reconstruct.raster import Tally  # noqa: E402
+
+
+@pytest.fixture(scope="module")
+def launcher() -> TensorLauncher:
+    return TensorLauncher("cpu")
+
+
+@pytest.fixture
+def of_its_own(monkeypatch: pytest.MonkeyPatch) -> Iterator[TensorLauncher]:
+    """A device with memory of its own: nothing on it may be read as an array of this process."""
+
+    def refuse(*_: Any) -> None:
+        raise TypeError("can't convert a tensor of a device to numpy")
+
+    monkeypatch.setattr(torch.Tensor, "numpy", refuse)
+    monkeypatch.setattr(torch.Tensor, "__array__", refuse)
+    launcher = TensorLauncher("cpu")
+    launcher.apart = True
+    yield launcher
+    monkeypatch.undo()
+
+
+def seen(rasterise: Any, tally: Tally, n: int, size: float, width: int, height: int) -> list[Any]:
+    """Maps, gradients and tally of random surfels."""
+    given = surfels(n, seed=n, size=size)
+    maps = rasterise(**given, camera=camera(width, height), tally=tally)
+    found = [maps.features, maps.alpha, maps.depth, maps.median, maps.distortion]
+    rng = np.random.default_rng(1)
+    sum((m * torch.tensor(rng.normal(size=m.shape), dtype=torch.float32)).sum() for m in found).backward()
+    return [*(m.detach() for m in found), *(v.grad for v in given.values()), tally.travel, tally.views]
+
+
+def noted(n: int) -> Tally:
+    """A tally on a device."""
+    return Tally(torch.zeros(n), torch.zeros(n, dtype=torch.int32))
+
+
+SIZES = [(60, 0.25, 37, 29), (12, 1.5, 100, 70), (2000, 0.08, 100, 70)]
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_maps_are_the_processors_to_the_last_bit_and_gradients_but_for_it(
+    launcher: TensorLauncher, size: tuple[Any, ...]
+) -> None:
+    expected = seen(here.rasterise, Tally.of(size[0]), *size)
+    found = seen(partial(there.rasterise, launcher), noted(size[0]), *size)
+    for a, b in zip(expected[:5], found[:5], strict=True):
+        assert a.abs().max() > 0
+        np.testing.assert_array_equal(b, a)
+    for a, b in zip(expected[5:-1], found[5:-1], strict=True):
+        a = torch.as_tensor(a)
+        assert (a - b).norm() < 2e-6 * a.norm()
+    np.testing.assert_array_equal(found[-1], expected[-1])
+
+
+@pytest.mark.parametrize(("n", "size"), [(1, 1.0), (60, 0.25), (400, 0.12)])
+def test_maps_and_gradients_are_those_of_the_brute_force(launcher: TensorLauncher, n: int, size: float) -> None:
+    hold_against_brute_force(partial(there.rasterise, launcher), n, size)
+
+
+def test_every_map_has_a_gradient_of_its_own(launcher: TensorLauncher) -> None:
+    hold_each_map_against_brute_force(partial(there.rasterise, launcher))
+
+
+def test_a_device_with_memory_of_its_own_finds_the_same_bits_each_time(
+    launcher: TensorLauncher, of_its_own: TensorLauncher
+) -> None:
+    results = [seen(partial(there.rasterise, by), noted(2000), *SIZES[2]) for by in (launcher, of_its_own, of_its_own)]
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+
+def test_nothing_to_see_and_damaged_surfels_give_no_gradients(launcher: TensorLauncher) -> None:
+    given = surfels(5)
+    with torch.no_grad():
+        given["centre"][:3] += torch.tensor([0.0, -50.0, 0.0])
+        given["centre"][3, 0] = float("nan")
+        given["tangent_u"][4] = 0
+    maps = there.rasterise(launcher, **given, camera=camera())
+    assert not maps.alpha.detach().any()
+    (maps.features.sum() + maps.depth.sum()).backward()
+    assert not any(v.grad.any() for v in given.values())
+
+
+def test_more_pixels_than_a_device_counts_are_its_failure() -> None:
+    with pytest.raises(DeviceError, match="4294967296 pixels"):
+        there.starts(torch.tensor([1 << 31, 1 << 31]))
