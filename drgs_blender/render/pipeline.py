@@ -33,7 +33,7 @@ from .primary.primary_surfels import primary_surfels, snap_windows
 from .primary.seen_lamps import seen_lamps
 from .processor import HERE, Processor
 from .shade.adaptive import part_count, sample_adaptively
-from .surfels.splats import Splats, prepare
+from .surfels.splats import Splats
 from .surfels.surfel_bvh import SurfelBVH
 from .trace.scene import TraceScene
 
@@ -184,7 +184,7 @@ class Primary:
         self._tree, self._objects, self._processor = tree, len(frame.objects), processor
         self._splats: Splats | None = None
         if frame.settings.primary == "surfels":
-            self._splats = prepare(posed, frame.camera, parameters)
+            self._splats = processor.prepare(posed, frame.camera, parameters)
             self._windows = snap_windows(scene, len(frame.objects))
 
     def rows(self, y0: int, y1: int) -> GBuffer:

@@ -5,14 +5,20 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+
+from ..asset.model import PosedSurfels
+from ..frame import Camera
 from .picture.denoise import Signal, smooth
 from .points import Radiance
 from .primary.primary_surfels import tie_to_mesh
 from .shade.integrate import integrate
 from .surfels.raster import SurfelSamples, rasterise
-from .surfels.splats import Splats
+from .surfels.splats import Splats, prepare
 from .surfels.surfel_bvh import SurfelBVH
 from .trace.scene import TraceScene
+
+Array = np.ndarray
 
 
 class Processor:
@@ -31,8 +37,12 @@ class Processor:
         """`shade.integrate.integrate`."""
         return integrate(*arguments, surfels=surfels)
 
+    def prepare(self, posed: PosedSurfels, camera: Camera, parameters: Array) -> Splats:
+        """`surfels.splats.prepare`."""
+        return prepare(posed, camera, parameters)
+
     def rasterise(self, splats: Splats, y0: int, y1: int) -> SurfelSamples:
-        """`surfels.raster.rasterise`."""
+        """`surfels.raster.rasterise`; of what this processor has prepared."""
         return rasterise(splats, y0, y1)
 
     def tie(self, scene: TraceScene, *arguments: Any) -> None:

@@ -15,7 +15,7 @@ import warp
 from test_device_denoise import picture
 
 from drgs_blender.device.kernels import Launcher
-from drgs_blender.render.device import attach, denoise, integrate, raster
+from drgs_blender.render.device import attach, denoise, integrate, raster, splats
 from drgs_blender.render.device.on_device import OnDevice
 from drgs_blender.render.picture.denoise import denoise as denoised
 
@@ -40,6 +40,7 @@ def test_pictures_kernels_compile_for_a_card(tmp_path: Path) -> None:
     test_device_raster.test_points_are_tied_to_the_mesh_as_the_processor_ties_them(device, 0.1, True)
     denoised(*picture(), by=device.smooth)
     works = raster.BLEND, attach.ATTACH, denoise.WEIGH, denoise.A_TROUS
+    works += splats.PROJECT, splats.KEY, splats.FIND, splats.GATHER, splats.LIST
     assert made(works, device.launcher, tmp_path) == set(works)
     assert not device.failed
 

@@ -30,8 +30,8 @@ SCENES = {
 def both(device: OnDevice, name: str, rows: tuple[int, int] = (0, 30)) -> tuple[SurfelSamples, SurfelSamples]:
     posed, view = SCENES[name]
     camera = look_along_y(40, 30, **view)
-    splats = prepare(posed, camera, camera_parameters(camera, RenderSettings(aa=3, seed=5), 2))
-    return rasterise(splats, *rows), device.rasterise(splats, *rows)
+    given = posed, camera, camera_parameters(camera, RenderSettings(aa=3, seed=5), 2)
+    return rasterise(prepare(*given), *rows), device.rasterise(device.prepare(*given), *rows)
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -76,9 +76,12 @@ def test_points_are_tied_to_the_mesh_as_the_processor_ties_them(device: OnDevice
     ordinary = MeshState("wall", wall, np.int32([[0, 1, 2], [0, 2, 3]]), np.eye(4)[None], np.zeros(1, np.int32))
     scene.update([kept], [ordinary])
     parameters = camera_parameters(camera, RenderSettings(aa=2), 1)
-    splats, windows = prepare(sphere_surfels(1 + offset), camera, parameters), snap_windows(scene, 1)
+    posed, windows = sphere_surfels(1 + offset), snap_windows(scene, 1)
     here, there = (
-        primary_surfels(splats, scene, windows, camera, 0, 40, tied, by.rasterise, by.tie) for by in (HERE, device)
+        primary_surfels(
+            by.prepare(posed, camera, parameters), scene, windows, camera, 0, 40, tied, by.rasterise, by.tie
+        )
+        for by in (HERE, device)
     )
     for name in ("pixel", "sample", "flags", "own"):
         np.testing.assert_array_equal(getattr(there.points, name), getattr(here.points, name))

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any, TypeVar
 
+import numpy as np
+
+from ...asset.model import PosedSurfels
 from ...device.kernels import Launcher
 from ...errors import DeviceError
+from ...frame import Camera
 from ..picture.denoise import Signal
 from ..points import Radiance
 from ..processor import Processor
 from ..shade.integrate import integrate
 from ..surfels.raster import SurfelSamples
+from ..surfels.raster import rasterise as rasterise_here
 from ..surfels.splats import Splats
 from ..surfels.surfel_bvh import SurfelBVH
 from ..trace.scene import TraceScene
@@ -20,7 +26,9 @@ from .denoise import smooth
 from .integrate import DeviceKernel
 from .mirror import Mirror
 from .raster import rasterise
+from .splats import SplatsThere, prepare
 
+Array = np.ndarray
 _T = TypeVar("_T")
 
 
@@ -43,11 +51,20 @@ class OnDevice(Processor):
             return here(*arguments, surfels=surfels)
         return self._tried(lambda: integrate(*arguments, kernel=self._kernel), lambda: here(*arguments))
 
+    def prepare(self, posed: PosedSurfels, camera: Camera, parameters: Array) -> Splats:
+        here = functools.partial(super().prepare, posed, camera, parameters)
+        if not len(posed):
+            return here()
+        return self._tried(lambda: prepare(self.launcher, posed, camera, parameters, functools.cache(here)), here)
+
     def rasterise(self, splats: Splats, y0: int, y1: int) -> SurfelSamples:
-        here = super().rasterise
+        def here() -> SurfelSamples:
+            own = splats.here() if isinstance(splats, SplatsThere) else splats
+            return rasterise_here(own, y0, y1)
+
         if not len(splats):
-            return here(splats, y0, y1)
-        return self._tried(lambda: rasterise(self.launcher, splats, y0, y1), lambda: here(splats, y0, y1))
+            return here()
+        return self._tried(lambda: rasterise(self.launcher, splats, y0, y1), here)
 
     def tie(self, scene: TraceScene, *arguments: Any) -> None:
         here = super().tie

@@ -32,6 +32,10 @@ RX, RY, A, B, N, D, ZC, CUT, LOW, RECORD = 0, 1, 2, 5, 8, 11, 14, 15, 16, 20
 # Columns of a splat's surface record: normal, albedo, roughness, metallic, size, opacity.
 NORMAL, ALBEDO, ROUGHNESS, METALLIC, SIZE, OPACITY, SURFACE = 0, 3, 6, 7, 8, 9, 10
 
+#: Of `PosedSurfels`: what projection reads, and what `pack_surface` does.
+PLACED = ("centre", "tangent_u", "tangent_v", "opacity")
+SHOWN = ("tangent_u", "tangent_v", "normal", "albedo", "roughness", "metallic", "opacity")
+
 
 @dataclass(slots=True)
 class Splats:
@@ -77,22 +81,10 @@ def prepare(posed: PosedSurfels, camera: Camera, parameters: Array) -> Splats:
     screen = np.empty((n, RECORD), np.float32)
     box = np.empty((n, 4), np.int32)
     nearest = np.empty(n, np.float32)
-    _project(
-        posed.centre, posed.tangent_u, posed.tangent_v, posed.opacity, parameters, x0, y0, x1, y1, screen, box, nearest
-    )
+    _project(*(getattr(posed, name) for name in PLACED), parameters, camera.window, screen, box, nearest)
     order = depth_order(screen[:, ZC], box)
     surface = np.empty((len(order), SURFACE), np.float32)
-    _gather_surface(
-        order,
-        posed.tangent_u,
-        posed.tangent_v,
-        posed.normal,
-        posed.albedo,
-        posed.roughness,
-        posed.metallic,
-        posed.opacity,
-        surface,
-    )
+    _gather_surface(order, tuple(getattr(posed, name) for name in SHOWN), surface)
     box = box[order]
     tiles_x = (x1 - 1) // TILE - x0 // TILE + 1
     tiles_y = (y1 - 1) // TILE - y0 // TILE + 1
@@ -149,97 +141,102 @@ def _clipped_bounds(c: Any, a: Any, b: Any, r: Any, near: Any, p: Any) -> Any:
 
 @njit(parallel=True)
 def _project(
-    centre: Any,
-    tangent_u: Any,
-    tangent_v: Any,
-    opacity: Any,
-    p: Any,
-    wx0: Any,
-    wy0: Any,
-    wx1: Any,
-    wy1: Any,
-    screen: Any,
-    box: Any,
-    nearest: Any,
+    centre: Any, tangent_u: Any, tangent_v: Any, opacity: Any, p: Any, window: Any, screen: Any, box: Any, nearest: Any
 ) -> None:
-    """Fill screen records, boxes and nearest depths; a culled surfel has an empty box (x1 = x0 = 0)."""
+    for i in prange(len(centre)):
+        project_surfel(i, centre, tangent_u, tangent_v, opacity, p, window, screen, box, nearest)
+
+
+@njit
+def project_surfel(
+    i: Any, centre: Any, tangent_u: Any, tangent_v: Any, opacity: Any, p: Any, window: Any, screen: Any, box: Any,
+    nearest: Any,
+) -> None:  # fmt: skip
+    """Fill screen record, box and nearest depth of surfel i; a culled surfel has an empty box (x1 = x0 = 0)."""
+    wx0, wy0, wx1, wy1 = window
     near, far, ortho = p[CLIP_START], p[CLIP_END], p[ORTHOGRAPHIC] != 0.0
     fx, fy = p[FX], p[FY]
-    for i in prange(len(centre)):
-        box[i] = 0
-        ox = np.float64(centre[i, 0]) - p[POSITION]
-        oy = np.float64(centre[i, 1]) - p[POSITION + 1]
-        oz = np.float64(centre[i, 2]) - p[POSITION + 2]
-        c = to_camera(p, ox, oy, oz)
-        a = to_camera(p, np.float64(tangent_u[i, 0]), np.float64(tangent_u[i, 1]), np.float64(tangent_u[i, 2]))
-        b = to_camera(p, np.float64(tangent_v[i, 0]), np.float64(tangent_v[i, 1]), np.float64(tangent_v[i, 2]))
-        alpha = np.float64(opacity[i])
-        total = c[0] + c[1] + c[2] + a[0] + a[1] + a[2] + b[0] + b[1] + b[2] + alpha
-        if not abs(total) < 1e30 or not alpha > MIN_ALPHA:
-            continue
-        cut = 2.0 * np.log(alpha / MIN_ALPHA)
-        reach = np.sqrt(cut * (a[2] * a[2] + b[2] * b[2]))
-        if c[2] + reach <= near or c[2] - reach >= far:
-            continue
-        # Normal of the plane, scaled to one so that float32 holds tiny surfels.
-        nx = a[1] * b[2] - a[2] * b[1]
-        ny = a[2] * b[0] - a[0] * b[2]
-        nz = a[0] * b[1] - a[1] * b[0]
-        length = np.sqrt(nx * nx + ny * ny + nz * nz)
-        in_front = c[2] > near
-        # The record is relative to the projected centre, or to the picture's centre when that is behind the camera.
-        rx, ry = p[CX], p[CY]
-        if ortho:
-            rx, ry = p[CX] + fx * c[0], p[CY] + fy * c[1]
-        elif in_front:
-            rx, ry = p[CX] + fx * c[0] / c[2], p[CY] + fy * c[1] / c[2]
-        s = screen[i]
-        s[:] = 0.0
-        s[RX], s[RY], s[ZC], s[CUT] = rx, ry, c[2], cut
-        s[LOW] = 2.0 * p[AA] if in_front else 1e30
-        if length <= 0.0:
-            s[A], s[N], s[D] = 1e15, 1.0, c[2]  # a point: only the low-pass sees it
-        elif ortho:
-            k = 1.0 / length
-            s[A + 1], s[A + 2] = k * b[1] / fx, -k * b[0] / fy
-            s[B + 1], s[B + 2] = -k * a[1] / fx, k * a[0] / fy
-            s[N] = k * nz
-            s[D], s[D + 1], s[D + 2] = k * c[2] * nz, -k * nx / fx, -k * ny / fy
-        else:
-            k = 1.0 / length
-            bcx, bcy = k * (b[1] * c[2] - b[2] * c[1]), k * (b[2] * c[0] - b[0] * c[2])
-            cax, cay = k * (c[1] * a[2] - c[2] * a[1]), k * (c[2] * a[0] - c[0] * a[2])
-            s[A + 1], s[A + 2] = bcx / fx, bcy / fy
-            s[B + 1], s[B + 2] = cax / fx, cay / fy
-            s[N + 1], s[N + 2] = k * nx / fx, k * ny / fy
-            s[D] = k * (c[0] * nx + c[1] * ny + c[2] * nz)
-            if in_front:
-                s[N] = s[D] / c[2]
-            else:
-                s[A] = k * (b[0] * c[1] - b[1] * c[0])
-                s[B] = k * (c[0] * a[1] - c[1] * a[0])
-                s[N] = k * nz
-        # Screen bounds.
-        low = np.sqrt(0.5 * cut / p[AA])
-        if ortho:
-            lo_x, hi_x = span(fx, rx, 1.0, a[0], b[0], 0.0, 0.0, cut)
-            lo_y, hi_y = span(fy, ry, 1.0, a[1], b[1], 0.0, 0.0, cut)
-        elif c[2] - reach > near:
-            x, y = c[0] / c[2], c[1] / c[2]
-            lo_x, hi_x = span(fx, rx, c[2], a[0] - x * a[2], b[0] - x * b[2], a[2], b[2], cut)
-            lo_y, hi_y = span(fy, ry, c[2], a[1] - y * a[2], b[1] - y * b[2], a[2], b[2], cut)
-        else:
-            lo_x, hi_x, lo_y, hi_y = _clipped_bounds(c, a, b, np.sqrt(cut), near, p)
+    for side in range(4):
+        box[i, side] = 0
+    ox = np.float64(centre[i, 0]) - p[POSITION]
+    oy = np.float64(centre[i, 1]) - p[POSITION + 1]
+    oz = np.float64(centre[i, 2]) - p[POSITION + 2]
+    c = to_camera(p, ox, oy, oz)
+    a = to_camera(p, np.float64(tangent_u[i, 0]), np.float64(tangent_u[i, 1]), np.float64(tangent_u[i, 2]))
+    b = to_camera(p, np.float64(tangent_v[i, 0]), np.float64(tangent_v[i, 1]), np.float64(tangent_v[i, 2]))
+    alpha = np.float64(opacity[i])
+    total = c[0] + c[1] + c[2] + a[0] + a[1] + a[2] + b[0] + b[1] + b[2] + alpha
+    if not abs(total) < 1e30 or not alpha > MIN_ALPHA:
+        return
+    cut = 2.0 * np.log(alpha / MIN_ALPHA)
+    reach = np.sqrt(cut * (a[2] * a[2] + b[2] * b[2]))
+    if c[2] + reach <= near or c[2] - reach >= far:
+        return
+    # Normal of the plane, scaled to one so that float32 holds tiny surfels.
+    nx = a[1] * b[2] - a[2] * b[1]
+    ny = a[2] * b[0] - a[0] * b[2]
+    nz = a[0] * b[1] - a[1] * b[0]
+    length = np.sqrt(nx * nx + ny * ny + nz * nz)
+    in_front = c[2] > near
+    # The record is relative to the projected centre, or to the picture's centre when that is behind the camera.
+    rx, ry = p[CX], p[CY]
+    if ortho:
+        rx, ry = p[CX] + fx * c[0], p[CY] + fy * c[1]
+    elif in_front:
+        rx, ry = p[CX] + fx * c[0] / c[2], p[CY] + fy * c[1] / c[2]
+    for column in range(RECORD):
+        screen[i, column] = 0.0
+    screen[i, RX], screen[i, RY], screen[i, ZC], screen[i, CUT] = rx, ry, c[2], cut
+    screen[i, LOW] = 2.0 * p[AA] if in_front else 1e30
+    if length <= 0.0:
+        screen[i, A], screen[i, N], screen[i, D] = 1e15, 1.0, c[2]  # a point: only the low-pass sees it
+    elif ortho:
+        k = 1.0 / length
+        screen[i, A + 1], screen[i, A + 2] = k * b[1] / fx, -k * b[0] / fy
+        screen[i, B + 1], screen[i, B + 2] = -k * a[1] / fx, k * a[0] / fy
+        screen[i, N] = k * nz
+        screen[i, D], screen[i, D + 1], screen[i, D + 2] = k * c[2] * nz, -k * nx / fx, -k * ny / fy
+    else:
+        k = 1.0 / length
+        bcx, bcy = k * (b[1] * c[2] - b[2] * c[1]), k * (b[2] * c[0] - b[0] * c[2])
+        cax, cay = k * (c[1] * a[2] - c[2] * a[1]), k * (c[2] * a[0] - c[0] * a[2])
+        screen[i, A + 1], screen[i, A + 2] = bcx / fx, bcy / fy
+        screen[i, B + 1], screen[i, B + 2] = cax / fx, cay / fy
+        screen[i, N + 1], screen[i, N + 2] = k * nx / fx, k * ny / fy
+        screen[i, D] = k * (c[0] * nx + c[1] * ny + c[2] * nz)
         if in_front:
-            lo_x, hi_x = min(lo_x, rx - low), max(hi_x, rx + low)
-            lo_y, hi_y = min(lo_y, ry - low), max(hi_y, ry + low)
-        if not (lo_x < wx1 and hi_x > wx0 and lo_y < wy1 and hi_y > wy0):
-            continue
-        box[i, 0] = np.int32(np.floor(max(lo_x, float(wx0))))
-        box[i, 1] = np.int32(np.floor(max(lo_y, float(wy0))))
-        box[i, 2] = np.int32(min(np.floor(hi_x), wx1 - 1.0)) + 1
-        box[i, 3] = np.int32(min(np.floor(hi_y), wy1 - 1.0)) + 1
-        nearest[i] = max(c[2] - reach, near)
+            screen[i, N] = screen[i, D] / c[2]
+        else:
+            screen[i, A] = k * (b[0] * c[1] - b[1] * c[0])
+            screen[i, B] = k * (c[0] * a[1] - c[1] * a[0])
+            screen[i, N] = k * nz
+    # Screen bounds.
+    low = np.sqrt(0.5 * cut / p[AA])
+    if ortho:
+        lo_x, hi_x = span(fx, rx, 1.0, a[0], b[0], 0.0, 0.0, cut)
+        lo_y, hi_y = span(fy, ry, 1.0, a[1], b[1], 0.0, 0.0, cut)
+    elif c[2] - reach > near:
+        x, y = c[0] / c[2], c[1] / c[2]
+        lo_x, hi_x = span(fx, rx, c[2], a[0] - x * a[2], b[0] - x * b[2], a[2], b[2], cut)
+        lo_y, hi_y = span(fy, ry, c[2], a[1] - y * a[2], b[1] - y * b[2], a[2], b[2], cut)
+    else:
+        lo_x, hi_x, lo_y, hi_y = _clipped_bounds(c, a, b, np.sqrt(cut), near, p)
+    if in_front:
+        lo_x, hi_x = min(lo_x, rx - low), max(hi_x, rx + low)
+        lo_y, hi_y = min(lo_y, ry - low), max(hi_y, ry + low)
+    if not (lo_x < wx1 and hi_x > wx0 and lo_y < wy1 and hi_y > wy0):
+        return
+    box[i, 0] = np.int32(np.floor(max(lo_x, float(wx0))))
+    box[i, 1] = np.int32(np.floor(max(lo_y, float(wy0))))
+    box[i, 2] = np.int32(min(np.floor(hi_x), wx1 - 1.0)) + 1
+    box[i, 3] = np.int32(min(np.floor(hi_y), wy1 - 1.0)) + 1
+    nearest[i] = max(c[2] - reach, near)
+
+
+@njit(inline="always")
+def depth_key(bits: Any) -> Any:
+    """Bits of a float32 as an integer that compares like the number: negative ones are reversed."""
+    return np.uint32(~bits if bits >> np.uint32(31) else bits | np.uint32(0x80000000))
 
 
 @njit
@@ -260,10 +257,9 @@ def depth_order(centre_depth: Any, box: Any) -> Any:
             order[n] = i
             depth[n] = centre_depth[i]
             n += 1
-    # Bits of a float32 compare like integers once negative numbers are reversed.
     keys = depth.view(np.uint32)
     for i in range(n):
-        keys[i] = ~keys[i] if keys[i] >> np.uint32(31) else keys[i] | np.uint32(0x80000000)
+        keys[i] = depth_key(keys[i])
     other_keys = np.empty(n, np.uint32)
     for shift in (0, 11, 22):
         count = np.zeros(2049, np.int64)
@@ -282,28 +278,29 @@ def depth_order(centre_depth: Any, box: Any) -> Any:
 
 
 @njit(parallel=True)
-def _gather_surface(
-    order: Any,
-    tangent_u: Any,
-    tangent_v: Any,
-    normal: Any,
-    albedo: Any,
-    roughness: Any,
-    metallic: Any,
-    opacity: Any,
-    out: Any,
-) -> None:
-    """Pack what blending reads of a splat, in depth order."""
+def _gather_surface(order: Any, posed: Any, out: Any) -> None:
     for k in prange(len(order)):
-        i = order[k]
-        uu = vv = np.float32(0.0)
-        for c in range(3):
-            out[k, NORMAL + c] = normal[i, c]
-            out[k, ALBEDO + c] = albedo[i, c]
-            uu += tangent_u[i, c] * tangent_u[i, c]
-            vv += tangent_v[i, c] * tangent_v[i, c]
-        out[k, ROUGHNESS], out[k, METALLIC], out[k, OPACITY] = roughness[i], metallic[i], opacity[i]
-        out[k, SIZE] = np.sqrt(max(uu, vv))
+        pack_surface(order[k], k, posed, out)
+
+
+@njit
+def pack_surface(i: Any, k: Any, posed: Any, out: Any) -> None:
+    """Pack what blending reads of surfel i as splat k; `posed` are its `SHOWN`."""
+    tangent_u, tangent_v, normal, albedo, roughness, metallic, opacity = posed
+    uu = vv = np.float32(0.0)
+    for c in range(3):
+        out[k, NORMAL + c] = normal[i, c]
+        out[k, ALBEDO + c] = albedo[i, c]
+        uu += tangent_u[i, c] * tangent_u[i, c]
+        vv += tangent_v[i, c] * tangent_v[i, c]
+    out[k, ROUGHNESS], out[k, METALLIC], out[k, OPACITY] = roughness[i], metallic[i], opacity[i]
+    out[k, SIZE] = np.sqrt(max(uu, vv))
+
+
+@njit(inline="always")
+def tiles_of(box: Any, i: Any) -> Any:
+    """Columns and rows of tiles (x0, y0, x1, y1), half-open, that the box of splat i touches."""
+    return box[i, 0] // TILE, box[i, 1] // TILE, (box[i, 2] - 1) // TILE + 1, (box[i, 3] - 1) // TILE + 1
 
 
 @njit
@@ -311,16 +308,18 @@ def list_by_tile(box: Any, tile_x0: Any, tile_y0: Any, tiles_x: Any, tiles_y: An
     """Counting sort of (tile, splat) pairs: start of each tile's list, and the lists, in splat order."""
     start = np.zeros(tiles_x * tiles_y + 1, np.int64)
     for i in range(len(box)):
-        for ty in range(box[i, 1] // TILE - tile_y0, (box[i, 3] - 1) // TILE - tile_y0 + 1):
-            for tx in range(box[i, 0] // TILE - tile_x0, (box[i, 2] - 1) // TILE - tile_x0 + 1):
+        x0, y0, x1, y1 = tiles_of(box, i)
+        for ty in range(y0 - tile_y0, y1 - tile_y0):
+            for tx in range(x0 - tile_x0, x1 - tile_x0):
                 start[ty * tiles_x + tx + 1] += 1
     for t in range(tiles_x * tiles_y):
         start[t + 1] += start[t]
     listed = np.empty(start[-1], np.int32)
     fill = start[:-1].copy()
     for i in range(len(box)):
-        for ty in range(box[i, 1] // TILE - tile_y0, (box[i, 3] - 1) // TILE - tile_y0 + 1):
-            for tx in range(box[i, 0] // TILE - tile_x0, (box[i, 2] - 1) // TILE - tile_x0 + 1):
+        x0, y0, x1, y1 = tiles_of(box, i)
+        for ty in range(y0 - tile_y0, y1 - tile_y0):
+            for tx in range(x0 - tile_x0, x1 - tile_x0):
                 t = ty * tiles_x + tx
                 listed[fill[t]] = i
                 fill[t] += 1
