@@ -177,7 +177,8 @@ class _Source:
     def denoise(self, number: int, passes: tuple[str, ...] | None) -> tuple[NoisyFrame, dict[str, np.ndarray], bool]:
         """The noisy frame, its denoised passes, and whether a neighbour has the very same noise."""
         from ..render.picture.film import COMPONENTS
-        from ..render.picture.temporal import Shot, window
+        from ..render.picture.temporal import Shot
+        from ..render.picture.window import window
 
         around = self._window(number)
         for old in [k for k in self._held if k not in around]:

@@ -21,11 +21,10 @@ from .camera import camera_parameters
 from .lights.lamps import Lamps
 from .lights.light import EnvironmentLight
 from .picture.cryptomatte import CryptoFilm
-from .picture.denoise import denoise
 from .picture.film import COMPONENTS, Film
 from .picture.motion import Instant, MotionFilm, vector_pass
 from .picture.oidn import denoise_oidn, require
-from .picture.temporal import History, Shot, denoise_next
+from .picture.temporal import History, Shot
 from .points import Radiance, ShadingPoints
 from .primary.gbuffer import GBuffer
 from .primary.primary_mesh import primary_mesh
@@ -141,9 +140,7 @@ def render(
         components = denoised(film, frame, check, processor)
     else:
         shot = Shot(film.components, film.variance, film.guides(), motions[2])
-        components, signal = denoise_next(
-            shot, history.signal, split_light(frame), history.still, check, processor.smooth
-        )
+        components, signal = processor.denoise_next(shot, history.signal, split_light(frame), history.still, check)
     tell(1.0, "Done")
     if history is not None:
         history.signal = signal
@@ -163,8 +160,7 @@ def denoised(film: Film, frame: Frame, check: Check, processor: Processor = HERE
     if frame.settings.denoise == "oidn":
         return denoise_oidn(film.components, film.guides(), split_light(frame), check)
     if frame.settings.denoise == "svgf":
-        light, split = (film.components, film.variance, film.guides()), split_light(frame)
-        return denoise(*light, split, check, processor.smooth)
+        return processor.denoise(film.components, film.variance, film.guides(), split_light(frame), check)
     return None
 
 

@@ -9,7 +9,9 @@ import numpy as np
 
 from ..asset.model import PosedSurfels
 from ..frame import Camera
-from .picture.denoise import Signal, smooth
+from .picture.denoise import denoise
+from .picture.signal import Guides, Signal
+from .picture.temporal import Shot, denoise_next
 from .points import Radiance
 from .primary.primary_surfels import tie_to_mesh
 from .shade.integrate import integrate
@@ -49,9 +51,17 @@ class Processor:
         """`primary.primary_surfels.tie_to_mesh`."""
         tie_to_mesh(scene, *arguments)
 
-    def smooth(self, signal: Signal, check: Callable[[], None] = lambda: None) -> Signal:
-        """`picture.denoise.smooth`."""
-        return smooth(signal, check)
+    def denoise(
+        self, components: Array, variance: Array, guides: Guides, split: bool, check: Callable[[], None]
+    ) -> Array:  # fmt: skip
+        """`picture.denoise.denoise`."""
+        return denoise(components, variance, guides, split, check)
+
+    def denoise_next(
+        self, shot: Shot, history: Signal | None, split: bool, still: bool, check: Callable[[], None]
+    ) -> tuple[Array, Signal]:
+        """`picture.temporal.denoise_next`."""
+        return denoise_next(shot, history, split, still, check)
 
 
 HERE = Processor()

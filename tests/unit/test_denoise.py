@@ -8,8 +8,9 @@ import pytest
 from drgs_blender.frame import Camera, Frame, ObjectState, RenderSettings, World, split_rays
 from drgs_blender.render import pipeline
 from drgs_blender.render.lights.light import EnvironmentLight
-from drgs_blender.render.picture.denoise import Guides, denoise
+from drgs_blender.render.picture.denoise import denoise
 from drgs_blender.render.picture.film import Film
+from drgs_blender.render.picture.signal import Guides
 from drgs_blender.render.trace.scene import TraceObject, TraceScene
 
 H, W = 40, 56

@@ -12,12 +12,11 @@ pytest.importorskip("warp", reason="warp-lang is not installed")
 import test_device_integrate
 import test_device_raster
 import warp
-from test_device_denoise import picture
+from test_device_denoise import nothing, shots
 
 from drgs_blender.device.kernels import Launcher
 from drgs_blender.render.device import attach, denoise, integrate, raster, splats
 from drgs_blender.render.device.on_device import OnDevice
-from drgs_blender.render.picture.denoise import denoise as denoised
 
 #: A100 and later.
 ARCHITECTURE = 80
@@ -38,8 +37,10 @@ def made(works: tuple[object, ...], launcher: Launcher, folder: Path) -> set[obj
 def test_pictures_kernels_compile_for_a_card(tmp_path: Path) -> None:
     device = OnDevice("cpu")
     test_device_raster.test_points_are_tied_to_the_mesh_as_the_processor_ties_them(device, 0.1, True)
-    denoised(*picture(), by=device.smooth)
-    works = raster.BLEND, attach.ATTACH, denoise.WEIGH, denoise.A_TROUS
+    history = None
+    for shot in shots(2):
+        _, history = device.denoise_next(shot, history, True, False, nothing)
+    works = raster.BLEND, attach.ATTACH, *denoise.WORKS
     works += splats.PROJECT, splats.KEY, splats.FIND, splats.GATHER, splats.LIST
     assert made(works, device.launcher, tmp_path) == set(works)
     assert not device.failed

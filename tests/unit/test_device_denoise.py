@@ -9,9 +9,14 @@ pytest.importorskip("warp", reason="warp-lang is not installed")
 
 from test_denoise import H, W, light_of, wall
 
-from drgs_blender.errors import Cancelled
+from drgs_blender.errors import Cancelled, DeviceError
+from drgs_blender.render.device.denoise import DeviceSignal
 from drgs_blender.render.device.on_device import OnDevice
 from drgs_blender.render.picture.denoise import denoise
+from drgs_blender.render.picture.motion import Motion
+from drgs_blender.render.picture.signal import Signal
+from drgs_blender.render.picture.temporal import Shot, denoise_next
+from drgs_blender.render.processor import HERE
 
 
 def picture() -> tuple:
@@ -31,26 +36,84 @@ def picture() -> tuple:
     return components, variance, guides
 
 
+def nothing() -> None:
+    """A caller who lets it go on."""
+
+
+def shots(count: int) -> list[Shot]:
+    """The same surfaces under light that changes, seen by a camera that moves; some light is no number."""
+    components, variance, guides = picture()
+    found = []
+    for k in range(count):
+        rng = np.random.default_rng(k)
+        light = (components * rng.uniform(0.7, 1.3, components.shape)).astype(np.float32)
+        light[3 + k, 7] = np.nan
+        vector = np.full((H, W, 2), (1.3, -0.6), np.float32)
+        vector[10, :5] = np.nan
+        previous = (guides.position + np.array([1.3e-3, 0, -0.6e-3])).astype(np.float32)
+        found.append(Shot(light, variance, guides, Motion(vector, previous)))
+    return found
+
+
 @pytest.mark.parametrize("split", [True, False])
 def test_a_device_filters_as_the_processor_does(device: OnDevice, split: bool) -> None:
     here = denoise(*picture(), split)
-    there = denoise(*picture(), split, by=device.smooth)
+    there = device.denoise(*picture(), split, nothing)
     assert np.isfinite(there).all() and np.abs(here - picture()[0])[:3].max() > 0.05
     np.testing.assert_allclose(there, here, rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.parametrize("still", [True, False])
+@pytest.mark.parametrize("split", [True, False])
+def test_pictures_are_gathered_over_time_as_the_processor_does(device: OnDevice, split: bool, still: bool) -> None:
+    here = there = None
+    for k, shot in enumerate(shots(3)):
+        expected, here = denoise_next(shot, here, split, still)
+        found, there = device.denoise_next(shot, there, split, still, nothing)
+        np.testing.assert_allclose(found, expected, rtol=2e-4, atol=1e-6)
+        alone = denoise(shot.components, shot.variance, shot.guides, split)
+        assert (np.abs(expected - alone).max() > 0.05) == (k > 0)
+    assert isinstance(there, DeviceSignal)
+    np.testing.assert_allclose(there.light.numpy(), here.light, rtol=2e-4, atol=1e-6)
+    np.testing.assert_array_equal(there.guide.numpy(), here.guide)
+
+
+def test_a_sequence_goes_on_where_the_device_fails_and_where_it_is_back(
+    device: OnDevice, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, second, third = shots(3)
+    expected = None
+    for shot in (first, second, third):
+        picture, expected = denoise_next(shot, expected)
+    _, history = device.denoise_next(first, None, True, False, nothing)
+    with monkeypatch.context() as broken:
+        broken.setattr(device.launcher, "launch", failing)
+        _, history = device.denoise_next(second, history, True, False, nothing)
+        assert "no memory" in device.failed and type(history) is Signal
+    device.failed = ""
+    found, _ = device.denoise_next(third, history, True, False, nothing)
+    np.testing.assert_allclose(found, picture, rtol=2e-4, atol=1e-6)
+
+
+def test_a_history_that_is_lost_with_its_device_starts_anew(device: OnDevice) -> None:
+    first, second, _ = shots(3)
+    _, history = device.denoise_next(first, None, True, False, nothing)
+    history.guide = None
+    found, _ = HERE.denoise_next(second, history, True, False, nothing)
+    np.testing.assert_array_equal(found, denoise(second.components, second.variance, second.guides))
+
+
+def failing(*_: object) -> None:
+    """A device that has gone."""
+    raise DeviceError("device cuda", "has no memory left", "Use the CPU")
+
+
 def test_nothing_seen_and_a_caller_who_stops(device: OnDevice) -> None:
     guides = wall(coverage=np.zeros((H, W)))
-    assert not denoise(*light_of(np.ones((H, W)), guides), guides, by=device.smooth).any()
+    assert not device.denoise(*light_of(np.ones((H, W)), guides), guides, True, nothing).any()
 
     def stop() -> None:
         raise Cancelled
 
     with pytest.raises(Cancelled):
-        device.smooth(signal(), stop)
-
-
-def signal():  # type: ignore[no-untyped-def]
-    from drgs_blender.render.picture.denoise import demodulate
-
-    return demodulate(*picture())
+        device.denoise(*picture(), True, stop)

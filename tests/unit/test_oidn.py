@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from drgs_blender.errors import DeviceError
-from drgs_blender.render.picture.denoise import Guides
 from drgs_blender.render.picture.oidn import available, denoise_oidn
+from drgs_blender.render.picture.signal import Guides
 
 SIZE = 64
 

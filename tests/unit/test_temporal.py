@@ -8,9 +8,11 @@ import pytest
 from drgs_blender.frame import Camera, RenderSettings
 from drgs_blender.jit import get_num_threads, use_threads
 from drgs_blender.render.camera import camera_parameters, camera_ray
-from drgs_blender.render.picture.denoise import LIGHT, PAD, Guides, Signal, demodulate
+from drgs_blender.render.picture.denoise import prepare
 from drgs_blender.render.picture.motion import Instant, Motion, MotionFilm, previous_positions, project
-from drgs_blender.render.picture.temporal import Shot, denoise_next, window
+from drgs_blender.render.picture.signal import LIGHT, PAD, Guides, Signal
+from drgs_blender.render.picture.temporal import Shot, denoise_next
+from drgs_blender.render.picture.window import window
 
 H, W = 48, 64
 PITCH = 1e-3  # metres a pixel
@@ -248,7 +250,7 @@ def test_what_comes_into_view_starts_anew() -> None:
     box = np.abs(x - (W / 2 + 8)) < 5
     fresh = (np.abs(x - (W / 2 + 4)) < 5) & ~box
     assert (last.index[0] == box).all() and fresh.sum() == 4
-    present = demodulate(shots[-1].components, shots[-1].variance, last, split=False)
+    present = prepare(shots[-1].components, shots[-1].variance, last, split=False)
     assert (found[:, fresh] == diffuse(present)[:, fresh]).all()
     old = np.abs(x - W / 2) > 20
     assert found[:, old].std() < 0.2 / np.sqrt(5) * 1.15

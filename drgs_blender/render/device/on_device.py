@@ -12,7 +12,8 @@ from ...asset.model import PosedSurfels
 from ...device.kernels import Launcher
 from ...errors import DeviceError
 from ...frame import Camera
-from ..picture.denoise import Signal
+from ..picture.signal import Guides, Signal
+from ..picture.temporal import Shot
 from ..points import Radiance
 from ..processor import Processor
 from ..shade.integrate import integrate
@@ -22,7 +23,7 @@ from ..surfels.splats import Splats
 from ..surfels.surfel_bvh import SurfelBVH
 from ..trace.scene import TraceScene
 from .attach import tie
-from .denoise import smooth
+from .denoise import denoise
 from .integrate import DeviceKernel
 from .mirror import Mirror
 from .raster import rasterise
@@ -70,9 +71,20 @@ class OnDevice(Processor):
         here = super().tie
         self._tried(lambda: tie(self.launcher, self.mirror, scene, *arguments), lambda: here(scene, *arguments))
 
-    def smooth(self, signal: Signal, check: Callable[[], None] = lambda: None) -> Signal:
-        here = super().smooth
-        return self._tried(lambda: smooth(self.launcher, signal, check), lambda: here(signal, check))
+    def denoise(
+        self, components: Array, variance: Array, guides: Guides, split: bool, check: Callable[[], None]
+    ) -> Array:  # fmt: skip
+        here, shot = super().denoise, Shot(components, variance, guides)
+        return self._tried(
+            lambda: denoise(self.launcher, shot, None, split, False, check)[0],
+            lambda: here(components, variance, guides, split, check),
+        )
+
+    def denoise_next(
+        self, shot: Shot, history: Signal | None, split: bool, still: bool, check: Callable[[], None]
+    ) -> tuple[Array, Signal]:
+        here, given = super().denoise_next, (shot, history, split, still, check)
+        return self._tried(lambda: denoise(self.launcher, *given), lambda: here(*given))
 
     def _tried(self, there: Callable[[], _T], here: Callable[[], _T]) -> _T:
         """Work done there, or here once that has failed."""

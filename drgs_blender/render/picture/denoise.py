@@ -15,27 +15,40 @@ texture is not blurred. Changes and their reasons:
   light) shut out the bright ones that these would average with: a tenth of the light went in glossy scenes.
 - Direct and indirect light share one set of weights, so their sum stays the sum to the last bit.
 - Edges are stopped by (1 - x / 8)^8 where the paper has exp(-x): much the same, but exactly zero from x = 8 on.
-
-Pictures are planar here, (rows, planes, columns), with `PAD` empty columns on either side: kernels work on runs of
-`TILE` pixels, plane by plane, with scratch arrays whose strides the compiler knows, so that all of it is SIMD.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from ...colour import LUMINANCE as REC709
-from ...jit import njit, prange
-from ..sampling import luminance
+from ...jit import njit
 from .rows import over_rows
+from .signal import (
+    CERTAINTY,
+    LEVELS,
+    LIGHT,
+    LUMINANCE,
+    NORMAL,
+    PAD,
+    POSITION,
+    ROUGHNESS,
+    SOURCE,
+    SURFACE,
+    TILE,
+    VARIANCE,
+    WIDTH,
+    Guides,
+    Signal,
+    demodulate,
+    modulate,
+)
 
 Array = np.ndarray
 
-LEVELS = 5
 #: Luminance differences that count, in deviations of the estimate: at the first level, and their ratio from level to
 #: level. The further apart pixels are, the more alike they must be.
 SIGMA_LUMINANCE, SIGMA_DECAY = 2.4, 0.8
@@ -44,60 +57,10 @@ SIGMA_PLANE = 1.0
 SIGMA_ROUGHNESS = 0.1
 NORMAL_POWER, ROUGH_NORMAL_POWER = 128.0, 32.0
 FIREFLY = 3.0
-#: Surface colours below this are not divided out, they would amplify noise.
-COLOUR_FLOOR = 0.02
-DIELECTRIC_F0 = 0.04
-
-#: Pixels a kernel works on at once; empty columns left and right of a picture (twice the last level's step).
-TILE, PAD = 128, 2 << (LEVELS - 1)
-#: Planes of a guide. ``SURFACE`` is the object's index, NaN where nothing is covered; ``SOURCE`` the same, NaN also
-#: where the light is no number. ``WIDTH`` is the inverse width of a pixel.
-POSITION, NORMAL, ROUGHNESS, SOURCE, SURFACE, WIDTH, GUIDES = 0, 3, 6, 7, 8, 9, 10
-#: Planes of a signal, two lobes each: luminance, its variance, the inverse of the difference that counts; the light.
-LUMINANCE, VARIANCE, CERTAINTY, LIGHT = 0, 2, 4, 6
-
-
-@dataclass(slots=True)
-class Guides:
-    """What tells surfaces apart, (h, w) or (h, w, 3) float32; see `film.Film`.
-
-    ``footprint`` (h, w) is the width of a pixel at the surface, metres.
-    """
-
-    coverage: Array
-    position: Array
-    normal: Array
-    albedo: Array
-    roughness: Array
-    metallic: Array
-    index: Array
-    footprint: Array
-
-
-@dataclass(slots=True)
-class Signal:
-    """Demodulated light of a picture and what guides its filters.
-
-    Attributes
-    ----------
-    guide : (h, GUIDES, w + 2 PAD) float32
-    light : (h, LIGHT + 6 parts, w + 2 PAD) float32; after ``LIGHT``: diffuse direct, (indirect,) glossy direct,
-        (indirect), three colours each, divided by surface colour and coverage
-    spans : (h, 2) int32: first and last + 1 column of each row that is covered, `PAD` not counted
-    """
-
-    guide: Array
-    light: Array
-    spans: Array
-
-
-#: Filters a signal: `smooth`, or the same on a device.
-Smooth = Callable[[Signal, Callable[[], None]], Signal]
 
 
 def denoise(
-    components: Array, variance: Array, guides: Guides, split: bool = True, check: Callable[[], None] = lambda: None,
-    by: Smooth | None = None,
+    components: Array, variance: Array, guides: Guides, split: bool = True, check: Callable[[], None] = lambda: None
 ) -> Array:  # fmt: skip
     """Filter the light of a picture.
 
@@ -107,32 +70,22 @@ def denoise(
     variance : (h, w, 2) float32 of the luminance of the diffuse and the glossy sum
     split : keep direct and indirect light apart; else their sum is returned as direct light and indirect is 0 (faster)
     check : called between levels; may raise to stop
-    by : does the work of `smooth`
 
     Returns
     -------
     (h, w, 4, 3) float32
     """
-    signal = demodulate(components, variance, guides, split)
+    signal = prepare(components, variance, guides, split)
     check()
-    return modulate((by or smooth)(signal, check), guides)
+    return modulate(smooth(signal, check), guides)
 
 
-def demodulate(components: Array, variance: Array, guides: Guides, split: bool = True) -> Signal:
-    """Divide light by surface colour and coverage, and clamp its fireflies; parameters as of `denoise`."""
-    h, w = guides.coverage.shape
-    planes = LIGHT + (12 if split else 6)
-    guide = np.zeros((h, GUIDES, w + 2 * PAD), np.float32)
-    light = np.zeros((h, planes, w + 2 * PAD), np.float32)
-    spans = np.zeros((h, 2), np.int32)
-    g = guides
-    _demodulate(
-        components, variance, g.coverage, g.position, g.normal, g.albedo, g.roughness, g.metallic, g.index,
-        g.footprint, guide, light, spans,
-    )  # fmt: skip
-    clamped = np.zeros_like(light)
-    over_rows(_clamp_fireflies, h, guide, spans, light, clamped)
-    return Signal(guide, clamped, spans)
+def prepare(components: Array, variance: Array, guides: Guides, split: bool = True) -> Signal:
+    """Light to be filtered: demodulated, its fireflies clamped; parameters as of `denoise`."""
+    signal = demodulate(components, variance, guides, split)
+    clamped = np.zeros_like(signal.light)
+    over_rows(_clamp_fireflies, len(clamped), signal.guide, signal.spans, signal.light, clamped)
+    return Signal(signal.guide, clamped, signal.spans)
 
 
 def smooth(signal: Signal, check: Callable[[], None] = lambda: None) -> Signal:
@@ -140,93 +93,15 @@ def smooth(signal: Signal, check: Callable[[], None] = lambda: None) -> Signal:
     light, out, other = signal.light, np.zeros_like(signal.light), np.zeros_like(signal.light)
     for level in range(LEVELS):
         check()
-        over_rows(
-            _weigh, len(light), np.float32(SIGMA_LUMINANCE * SIGMA_DECAY**level), signal.guide, signal.spans, light
-        )
+        over_rows(_weigh, len(light), sigma_of(level), signal.guide, signal.spans, light)
         over_rows(_a_trous, len(light), 1 << level, signal.guide, signal.spans, light, out)
         light, out, other = out, other, out
     return Signal(signal.guide, light, signal.spans)
 
 
-def modulate(signal: Signal, guides: Guides) -> Array:
-    """(h, w, 4, 3) float32: light multiplied by surface colour and coverage again."""
-    out = np.zeros((*guides.coverage.shape, 4, 3), np.float32)
-    _modulate(signal.light, signal.spans, guides.coverage, guides.albedo, guides.metallic, out)
-    return out
-
-
-@njit(inline="always")
-def _colour(lobe: Any, albedo: Any, metallic: Any, y: Any, x: Any) -> Any:
-    """Surface colour of a lobe's light, at least COLOUR_FLOOR: diffuse a (1 - m), glossy Fresnel's F0."""
-    floor = np.float32(COLOUR_FLOOR)
-    m, r, g, b = metallic[y, x], albedo[y, x, 0], albedo[y, x, 1], albedo[y, x, 2]
-    k = np.float32(1.0) - m
-    if lobe == 0:
-        return max(k * r, floor), max(k * g, floor), max(k * b, floor)
-    base = np.float32(DIELECTRIC_F0) * k
-    return max(base + m * r, floor), max(base + m * g, floor), max(base + m * b, floor)
-
-
-@njit(parallel=True)
-def _demodulate(
-    components: Any, variance: Any, coverage: Any, position: Any, normal: Any, albedo: Any, roughness: Any,
-    metallic: Any, index: Any, footprint: Any, guide: Any, light: Any, spans: Any,
-) -> None:  # fmt: skip
-    """Fill the planes of all covered pixels."""
-    h, w = coverage.shape
-    parts = (light.shape[1] - LIGHT) // 6
-    usable = np.float32(1e30)
-    nothing = np.float32(np.nan)
-    for y in prange(h):
-        guide[y, SOURCE] = nothing
-        guide[y, SURFACE] = nothing
-        first, last = w, 0
-        for x in range(w):
-            cover = coverage[y, x]
-            if not cover > np.float32(0.0):
-                continue
-            first, last = min(first, x), x + 1
-            c = x + PAD
-            for k in range(3):
-                guide[y, POSITION + k, c], guide[y, NORMAL + k, c] = position[y, x, k], normal[y, x, k]
-            guide[y, ROUGHNESS, c] = roughness[y, x]
-            guide[y, WIDTH, c] = np.float32(1.0) / footprint[y, x]
-            guide[y, SURFACE, c] = index[y, x]
-            valid = True
-            for lobe in range(2):
-                colour = _colour(lobe, albedo, metallic, y, x)
-                shade = cover * luminance(colour[0], colour[1], colour[2])
-                base = LIGHT + 3 * parts * lobe
-                for k in range(3):
-                    scale = np.float32(1.0) / (cover * colour[k])
-                    direct, indirect = components[y, x, 2 * lobe, k], components[y, x, 2 * lobe + 1, k]
-                    if not (abs(direct) < usable and abs(indirect) < usable):
-                        valid = False
-                    if parts == 2:
-                        light[y, base + k, c], light[y, base + 3 + k, c] = direct * scale, indirect * scale
-                    else:
-                        light[y, base + k, c] = (direct + indirect) * scale
-                spread = variance[y, x, lobe] / (shade * shade)
-                if not spread < usable:
-                    valid = False
-                light[y, VARIANCE + lobe, c] = max(spread, np.float32(0.0))
-            if valid:
-                guide[y, SOURCE, c] = index[y, x]
-                for lobe in range(2):
-                    light[y, LUMINANCE + lobe, c] = _lobe_luminance(light, y, c, lobe, parts)
-            else:
-                for k in range(light.shape[1]):
-                    light[y, k, c] = np.float32(0.0)
-        spans[y, 0], spans[y, 1] = first, max(last, first)
-
-
-@njit(inline="always")
-def _lobe_luminance(light: Any, y: Any, c: Any, lobe: Any, parts: Any) -> Any:
-    total = np.float32(0.0)
-    for part in range(parts):
-        k = LIGHT + 3 * (parts * lobe + part)
-        total += luminance(light[y, k, c], light[y, k + 1, c], light[y, k + 2, c])
-    return total
+def sigma_of(level: int) -> np.float32:
+    """`SIGMA_LUMINANCE` of a level."""
+    return np.float32(SIGMA_LUMINANCE * SIGMA_DECAY**level)
 
 
 @njit
@@ -421,19 +296,3 @@ def _a_trous(y0: Any, y1: Any, step: Any, guide: Any, spans: Any, light: Any, ou
 def share_of(k: Any) -> Any:
     """Share of colour channel `k` in luminance."""
     return np.float32(REC709[0]) if k == 0 else np.float32(REC709[1]) if k == 1 else np.float32(REC709[2])
-
-
-@njit(parallel=True)
-def _modulate(light: Any, spans: Any, coverage: Any, albedo: Any, metallic: Any, out: Any) -> None:
-    """Multiply by surface colour and coverage again."""
-    parts = (light.shape[1] - LIGHT) // 6
-    for y in prange(len(spans)):
-        for x in range(spans[y, 0], spans[y, 1]):
-            if not coverage[y, x] > np.float32(0.0):
-                continue
-            for lobe in range(2):
-                colour = _colour(lobe, albedo, metallic, y, x)
-                for part in range(parts):
-                    for k in range(3):
-                        value = light[y, LIGHT + 3 * (parts * lobe + part) + k, x + PAD]
-                        out[y, x, 2 * lobe + part, k] = value * colour[k] * coverage[y, x]

@@ -28,7 +28,7 @@ from ..lights.light import EnvironmentLight, map_at, sky_radiance
 from ..points import CATCHER, Radiance
 from ..primary.gbuffer import GBuffer
 from ..sampling import luminance
-from .denoise import Guides
+from .signal import Guides
 
 Array = np.ndarray
 

@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 
 from ...errors import DeviceError
-from .denoise import Guides
+from .signal import Guides
 
 Array = np.ndarray
 

@@ -17,10 +17,10 @@ from ...errors import AssetError
 from ...frame import Camera, Frame, RenderSettings
 from ...passes import TEMPORAL
 from ..camera import camera_parameters
-from .denoise import Guides
 from .film import COMPONENTS, add_light, footprints
 from .frames import read_frame
 from .motion import Motion, motion
+from .signal import Guides
 from .temporal import Shot
 
 Array = np.ndarray
