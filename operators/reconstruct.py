@@ -89,7 +89,7 @@ class DRGS_OT_reconstruct(ProgramOperator, bpy.types.Operator):
         out = Path(bpy.path.abspath(self.out or f"//{bpy.path.clean_name(folder.name)}"))
         out = assets.chosen(out.absolute().with_suffix(".drgs"), bool(self.out))
         arguments = ["reconstruct", str(capture), "--out", str(out), "--minutes", f"{self.minutes:g}"]
-        arguments += ["--variant", self.variant]
+        arguments += ["--variant", self.variant, "--device", context.scene.drgs.device.lower()]
         if self.resolution:
             # Eight is the least that the program takes.
             arguments += ["--resolution", str(max(self.resolution, 8))]

@@ -59,6 +59,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=True,
         help="pull materials and light apart; without, the albedo is the photographed colour",
     )
+    parser.add_argument(
+        "--device",
+        choices=("cpu", "cuda"),
+        default="cpu",
+        help="what the surfels are learned on; without a card the processor does. Default cpu",
+    )
     parser.add_argument("--axes", default="opengl", metavar="NAME", help="what the cameras' matrices are taken for")
     parser.add_argument("--up", choices=tuple(UP_AXES), help="up axis of the capture's world; default: found")
 
@@ -97,6 +103,7 @@ def run(args: argparse.Namespace) -> int:
         mesh_resolution=args.voxels or Settings().mesh_resolution,
         minutes=args.minutes,
         materials=args.materials,
+        device=args.device,
     )
     work = args.out.with_name(f"{args.out.stem}.reconstruct")
     with FractionBar(args, "reconstructing") as bar:

@@ -6,6 +6,7 @@ Real basis with the Condon-Shortley phase of 3DGS, order (l, m) = (0, 0), (1, -1
 from __future__ import annotations
 
 from functools import cache
+from typing import Any
 
 import numpy as np
 
@@ -18,8 +19,13 @@ _BLOCK = 1 << 16
 def basis(directions: Array, degree: int) -> Array:
     """Basis functions (..., (degree + 1)^2) at unit directions (..., 3); float64."""
     x, y, z = np.moveaxis(np.asarray(directions, np.float64), -1, 0)
+    return np.stack(polynomials(x, y, z, np.ones_like(x), degree), axis=-1)
+
+
+def polynomials(x: Any, y: Any, z: Any, one: Any, degree: int) -> list[Any]:
+    """Basis functions of unit directions; arrays or tensors, `one` full of ones."""
     xx, yy, zz = x * x, y * y, z * z
-    columns = [np.full_like(x, 0.28209479177387814)]
+    columns = [0.28209479177387814 * one]
     if degree >= 1:
         a = 0.4886025119029199
         columns += [-a * y, a * z, -a * x]
@@ -37,7 +43,7 @@ def basis(directions: Array, degree: int) -> Array:
             0.5 * b * z * (xx - yy),
             -a * x * (xx - 3 * yy),
         ]
-    return np.stack(columns, axis=-1)
+    return columns
 
 
 def whole_bands(sh: Array) -> Array:

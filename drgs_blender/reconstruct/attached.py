@@ -18,6 +18,7 @@ from ..asset.model import Binding, Mesh
 from ..deform.attach import attach
 from ..deform.faces import Faces
 from .gaussians import Gaussians
+from .processor import HERE, Processor
 
 #: Surfels are kept this far from 0 and 1 in opacity when they become logits.
 _MARGIN = 0.01
@@ -34,9 +35,9 @@ class Attached(Gaussians):
 
     def __init__(
         self, parameters: dict[str, Tensor], base: Tensor, normal: Tensor, edge: Tensor, fixed: tuple[str, ...] = (),
-        light: Tensor | None = None,
+        light: Tensor | None = None, by: Processor = HERE,
     ) -> None:  # fmt: skip
-        super().__init__(parameters, light)
+        super().__init__(parameters, light, by)
         self.base, self.normal, self.edge, self.fixed = base, normal, edge, fixed
         for name in fixed:
             parameters[name].requires_grad_(False)
@@ -47,7 +48,13 @@ class Attached(Gaussians):
 
     def like(self, parameters: dict[str, Tensor]) -> Attached:
         """The same faces with other parameters."""
-        return Attached(parameters, self.base, self.normal, self.edge, self.fixed, self.light)
+        return Attached(parameters, self.base, self.normal, self.edge, self.fixed, self.light, self.by)
+
+    def on(self, by: Processor) -> Attached:
+        """The same surfels where another processor has its tensors."""
+        parameters, light = self._there(by)
+        base, normal, edge = (t.to(by.place) for t in (self.base, self.normal, self.edge))
+        return Attached(parameters, base, normal, edge, self.fixed, light, by)
 
 
 def attach_learned(

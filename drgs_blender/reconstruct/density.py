@@ -39,14 +39,15 @@ def densify(
     -------
     surfels, and how many were "pruned" and "cut"
     """
-    opacity = gaussians.opacities().detach().numpy()
-    scale = np.exp(gaussians.parameters["scale"].detach().numpy())
-    finite = np.isfinite(gaussians.parameters["centre"].detach().numpy()).all(1) & np.isfinite(scale).all(1)
-    keep = finite & (opacity >= FAINT) & (scale.max(1) <= largest) & (tally.views > 0)
+    opacity = gaussians.opacities().numpy(force=True)
+    scale = np.exp(gaussians.parameters["scale"].numpy(force=True))
+    finite = np.isfinite(gaussians.parameters["centre"].numpy(force=True)).all(1) & np.isfinite(scale).all(1)
+    travel, views = tally.travel.numpy(force=True), tally.views.numpy(force=True)
+    keep = finite & (opacity >= FAINT) & (scale.max(1) <= largest) & (views > 0)
     if not keep.any():
         keep[:] = finite
     kept = np.flatnonzero(keep)
-    pull = np.where(scale.max(1) > smallest, tally.travel / np.maximum(tally.views, 1), 0)[kept]
+    pull = np.where(scale.max(1) > smallest, travel / np.maximum(views, 1), 0)[kept]
     count = min(max(budget - len(kept), 0), int((pull > 0).sum()))
     cut = np.sort(np.argsort(-pull, kind="stable")[:count])
     # The first half takes the place of the whole and keeps its moments.
@@ -60,12 +61,13 @@ def densify(
 def _part(gaussians: Gaussians, first: Array, second: Array) -> None:
     """Move the halves `first` and `second` (equal until now) apart."""
     with torch.no_grad():
-        u, v, _ = gaussians.frames()
         scale = gaussians.parameters["scale"]
-        rows = torch.from_numpy(first)
+        there = lambda a: torch.from_numpy(a).to(scale.device)  # noqa: E731
+        u, v, _ = (there(a[first]) for a in gaussians.frames())
+        rows = there(first)
         along_u = scale[rows, 0] >= scale[rows, 1]
-        step = APART * torch.where(along_u[:, None], torch.from_numpy(u)[rows], torch.from_numpy(v)[rows])
+        step = APART * torch.where(along_u[:, None], u, v)
         long = torch.where(along_u, 0, 1)
-        for half, sign in ((rows, 1.0), (torch.from_numpy(second), -1.0)):
+        for half, sign in ((rows, 1.0), (there(second), -1.0)):
             gaussians.parameters["centre"][half] += sign * step
             scale[half, long] += math.log(SHORTER)

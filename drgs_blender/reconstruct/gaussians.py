@@ -14,9 +14,10 @@ from ..asset.model import Surfels
 from ..colour import srgb_to_linear
 from ..frame import Camera
 from ..geometry import quaternions
-from .attributes import COEFFICIENTS, COLOUR, NORMAL, attributes, frames
-from .raster import Maps, Tally, rasterise
-from .reflection import dark_cube, mirrored, pyramid
+from .attributes import COEFFICIENTS, COLOUR, NORMAL, frames
+from .processor import HERE, Processor
+from .raster import Maps, Tally
+from .reflection import dark_cube, pyramid
 from .targets import pixel_rays
 
 #: Value of the constant harmonic.
@@ -51,10 +52,11 @@ class Gaussians:
     Parameters
     ----------
     light : the cube of `reflection`; None: nothing is mirrored
+    by : who shows them, where all their tensors are
     """
 
-    def __init__(self, parameters: dict[str, Tensor], light: Tensor | None = None) -> None:
-        self.parameters, self.light = parameters, light
+    def __init__(self, parameters: dict[str, Tensor], light: Tensor | None = None, by: Processor = HERE) -> None:
+        self.parameters, self.light, self.by = parameters, light, by
         if light is not None:
             light.requires_grad_(True)
         for value in parameters.values():
@@ -85,7 +87,7 @@ class Gaussians:
 
     def frames(self) -> tuple[Array, Array, Array]:
         """Scaled tangents and the normal, (n, 3) each; not differentiated."""
-        return frames(*(self.parameters[name].detach().numpy() for name in ("scale", "rotation")))
+        return frames(*(self.parameters[name].numpy(force=True) for name in ("scale", "rotation")))
 
     def centres(self) -> Tensor:
         """(n, 3) world positions."""
@@ -107,27 +109,36 @@ class Gaussians:
         """Render a view over `background` (3,); `rays` are `targets.pixel_rays` where they are at hand."""
         mirrors = mirrors and self.light is not None
         centre, eye = self.centres(), np.asarray(camera.matrix_world)[:3, 3]
-        u, v, opacity, features = attributes(self.parameters, centre, eye, bands, mirrors)
-        maps = rasterise(centre, u, v, opacity, features, camera, tally)
+        u, v, opacity, features = self.by.attributes(self.parameters, centre, eye, bands, mirrors)
+        maps = self.by.rasterise(centre, u, v, opacity, features, camera, tally)
         colour = maps.features[..., COLOUR : COLOUR + 3] + (1 - maps.alpha)[..., None] * background
         if mirrors:
             assert self.light is not None
-            rays = pixel_rays(camera) if rays is None else rays
-            colour = colour + mirrored(maps.features, maps.alpha, rays.numpy(), pyramid(self.light))
+            rays = pixel_rays(camera, self.by.place) if rays is None else rays
+            colour = colour + self.by.mirrored(maps.features, maps.alpha, rays, pyramid(self.light))
         return Look(colour, maps.features[..., NORMAL : NORMAL + 3], maps)
 
     def take(self, rows: Array) -> Gaussians:
         """The surfels `rows`, in this order, as a set of their own."""
-        index = torch.from_numpy(np.asarray(rows, np.int64))
+        index = torch.from_numpy(np.asarray(rows, np.int64)).to(self.by.place)
         return self.like({k: v.detach()[index].clone() for k, v in self.parameters.items()})
 
     def like(self, parameters: dict[str, Tensor]) -> Gaussians:
         """Surfels of the same kind with other parameters."""
-        return Gaussians(parameters, self.light)
+        return Gaussians(parameters, self.light, self.by)
+
+    def on(self, by: Processor) -> Gaussians:
+        """The same surfels where another processor has its tensors."""
+        return Gaussians(*self._there(by), by)
+
+    def _there(self, by: Processor) -> tuple[dict[str, Tensor], Tensor | None]:
+        """Parameters and light at a processor's place."""
+        light = None if self.light is None else self.light.detach().to(by.place)
+        return {k: v.detach().to(by.place) for k, v in self.parameters.items()}, light
 
     def arrays(self) -> dict[str, Array]:
         """The raw parameters."""
-        return {k: v.detach().numpy() for k, v in self.parameters.items()}
+        return {k: v.numpy(force=True) for k, v in self.parameters.items()}
 
     def surfels(self) -> Surfels:
         """What an asset holds. The albedo is the mean colour as photographed, light included, decoded."""

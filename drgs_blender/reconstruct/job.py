@@ -23,9 +23,11 @@ from .attached import attach_learned, bound
 from .capture import Capture, View
 from .decouple.run import Decoupled, decouple
 from .decouple.settings import Settings as Decoupling
+from .device.devices import learner
 from .gaussians import Gaussians
 from .hull import Region, find_region, silhouettes
 from .photometric import Photograph, structural_similarity
+from .processor import HERE
 from .relief import follow_normals, shaded_by
 from .silhouette import fill_silhouettes
 from .targets import background_of, composed
@@ -64,6 +66,7 @@ class Settings:
     materials : pull materials and light apart; else albedo is the photographed colour
     decoupling : how; its ``seconds`` follow from `minutes`. Normals are learned too: a mesh of photographs has errors
     fixed : parameters of surfels on faces that are not learned: "offset", "opacity" (the paper's ablation)
+    device : "cpu", or "cuda" for surfels learned on the first NVIDIA card; without one this processor learns them
     """
 
     variant: Literal["p", "m"] = "p"
@@ -73,6 +76,7 @@ class Settings:
     materials: bool = True
     decoupling: Decoupling = field(default_factory=lambda: Decoupling(normals=True))
     fixed: tuple[str, ...] = ()
+    device: Literal["cpu", "cuda"] = "cpu"
 
 
 @dataclass(slots=True)
@@ -122,7 +126,8 @@ def reconstruct(
     settings = settings or Settings()
     work = _Work(capture, settings, on_progress or (lambda _: None), cancelled or (lambda: False), folder)
     region = find_region(capture)
-    free = work.learn("surfels", Training(capture, region, settings.schedule, seconds=work.seconds(SHARE)), 0.0, 0.5)
+    training = Training(capture, region, settings.schedule, seconds=work.seconds(SHARE), by=work.by)
+    free = work.learn("surfels", training, 0.0, 0.5)
     work.tell(Progress("mesh", 0.5, len(free)))
     report: dict[str, Any] = {"views": len(capture.training), "left_out": len(capture.testing)}
     mesh, report["mesh"] = mesh_of(free, capture, region, settings.mesh_resolution)
@@ -172,6 +177,7 @@ class _Work:
         folder: Path | None,
     ) -> None:  # fmt: skip
         self.capture, self.settings, self.tell, self.cancelled, self.folder = capture, settings, tell, cancelled, folder
+        self.by = learner(settings.device)
         if folder is not None:
             folder.mkdir(parents=True, exist_ok=True)
 
@@ -208,11 +214,11 @@ class _Work:
                 raise Cancelled
             if now - told > 1 or training.finished:
                 draw = now - shown > SHOW_EVERY or training.finished
-                picture = preview(training.gaussians, self.capture) if draw else None
+                picture = training.attempt(lambda: preview(training.gaussians, self.capture)) if draw else None
                 part = begin + (end - begin) * training.part
                 self.tell(Progress(phase, part, len(training.gaussians), training.psnr, picture))
                 told, shown = now, now if draw else shown
-        return training.gaussians
+        return training.attempt(lambda: training.gaussians.on(HERE))
 
 
 def _on_mesh(
@@ -222,7 +228,7 @@ def _on_mesh(
     settings = work.settings
     attached, binding, report["attach"] = attach_learned(mesh, free, settings.fixed)
     training = Training(
-        work.capture, region, settings.schedule.on_mesh(ON_MESH), attached, seconds=work.seconds(SHARE_ON_MESH)
+        work.capture, region, settings.schedule.on_mesh(ON_MESH), attached, work.seconds(SHARE_ON_MESH), work.by
     )
     final = work.learn("surfels on the mesh", training, 0.55, 0.7)
     return final, bound(binding, final)  # type: ignore[arg-type]
@@ -265,8 +271,9 @@ def _rows(binding: Binding, keep: Array) -> Binding:
 def _drawn(gaussians: Gaussians, view: View, capture: Capture) -> Array:
     """(h, w, 3) sRGB in 0..1."""
     with torch.no_grad():
-        look = gaussians.look(view.camera, torch.tensor(background_of(capture), dtype=torch.float32))
-    return np.clip(look.colour.numpy(), 0, 1)
+        background = torch.tensor(background_of(capture), dtype=torch.float32, device=gaussians.by.place)
+        look = gaussians.look(view.camera, background)
+    return np.clip(look.colour.numpy(force=True), 0, 1)
 
 
 def preview(gaussians: Gaussians, capture: Capture) -> Array:

@@ -21,9 +21,9 @@ from ..jit import njit, prange
 DISSIMILARITY = 0.2
 #: Photographs are saturated from this value on.
 SATURATED = 0.998
-_C1, _C2 = np.float32(0.01**2), np.float32(0.03**2)
+C1, C2 = np.float32(0.01**2), np.float32(0.03**2)
 _TAPS = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
-_WINDOW = tuple(np.float32(x) for x in _TAPS / _TAPS.sum())
+WINDOW = tuple(np.float32(x) for x in _TAPS / _TAPS.sum())
 
 
 @dataclass(slots=True)
@@ -106,13 +106,13 @@ def _blur_row(pictures: Any, m: Any, y: Any, channels: Any, padded: Any, out: An
     for k in range(11):
         row = y + k - 5
         if 0 <= row < height:
-            weight = _WINDOW[k]
+            weight = WINDOW[k]
             for x in range(width):
                 padded[np.uintp(margin + x)] += weight * pictures[m, row, np.uintp(x)]
     for x in range(width):
-        out[m, y, np.uintp(x)] = _WINDOW[5] * padded[np.uintp(margin + x)]
+        out[m, y, np.uintp(x)] = WINDOW[5] * padded[np.uintp(margin + x)]
     for k in range(5):
-        weight, low, high = _WINDOW[k], k * channels, (10 - k) * channels
+        weight, low, high = WINDOW[k], k * channels, (10 - k) * channels
         for x in range(width):
             out[m, y, np.uintp(x)] += weight * (padded[np.uintp(low + x)] + padded[np.uintp(high + x)])
 
@@ -134,9 +134,9 @@ def _ssim(mean: Any, square: Any, product: Any, other: Any, other_square: Any, s
         for x in range(mean.shape[1]):
             for c in range(mean.shape[2]):
                 mx, my = mean[y, x, c], other[y, x, c]
-                a1, b1 = two * mx * my + _C1, mx * mx + my * my + _C1
-                a2 = two * (product[y, x, c] - mx * my) + _C2
-                b2 = square[y, x, c] - mx * mx + other_square[y, x, c] - my * my + _C2
+                a1, b1 = two * mx * my + C1, mx * mx + my * my + C1
+                a2 = two * (product[y, x, c] - mx * my) + C2
+                b2 = square[y, x, c] - mx * mx + other_square[y, x, c] - my * my + C2
                 inverse = np.float32(1.0) / (b1 * b2)
                 s = a1 * a2 * inverse
                 total += s

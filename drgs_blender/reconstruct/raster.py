@@ -86,13 +86,13 @@ class Tally:
     views : (n,) int32 += 1 where the surfel was listed in a tile
     """
 
-    travel: Array
-    views: Array
+    travel: Tensor
+    views: Tensor
 
     @classmethod
-    def of(cls, n: int) -> Tally:
+    def of(cls, n: int, place: torch.device | None = None) -> Tally:
         """Nothing noted yet about `n` surfels."""
-        return cls(np.zeros(n, np.float32), np.zeros(n, np.int32))
+        return cls(torch.zeros(n, device=place), torch.zeros(n, dtype=torch.int32, device=place))
 
 
 def rasterise(
@@ -175,8 +175,8 @@ class _Rasterise(torch.autograd.Function):
         g_opacity, g_values = np.zeros(n, np.float32), np.zeros((n, channels), np.float32)
         g_opacity[order], g_values[order] = total[:, OPACITY], total[:, BEFORE:]
         if tally is not None:
-            tally.travel[order] += total[:, TRAVEL]
-            tally.views[order] += 1
+            tally.travel.numpy()[order] += total[:, TRAVEL]
+            tally.views.numpy()[order] += 1
         return *(torch.from_numpy(g) for g in (*moved, g_opacity, g_values)), None, None, None
 
 

@@ -16,7 +16,7 @@ from ..arrays import Array
 from ..jit import njit, prange
 
 #: Mean depths are those of pixels covered at least so much, and normals are compared where they are covered more.
-_THIN, _COVERED = np.float32(1e-3), np.float32(0.5)
+THIN, COVERED = np.float32(1e-3), np.float32(0.5)
 
 
 def shape_loss(
@@ -71,8 +71,8 @@ class _Shape(torch.autograd.Function):
 @njit(inline="always")
 def _difference(alpha: Any, depth: Any, rays: Any, y1: Any, x1: Any, y0: Any, x0: Any) -> Any:
     """From the point seen in pixel 0 to that in pixel 1."""
-    far = depth[y1, x1] / max(alpha[y1, x1], _THIN)
-    near = depth[y0, x0] / max(alpha[y0, x0], _THIN)
+    far = depth[y1, x1] / max(alpha[y1, x1], THIN)
+    near = depth[y0, x0] / max(alpha[y0, x0], THIN)
     return (
         far * rays[y1, x1, 0] - near * rays[y0, x0, 0],
         far * rays[y1, x1, 1] - near * rays[y0, x0, 1],
@@ -90,7 +90,7 @@ def _disagreement(
         total = 0.0
         for x in range(1, width - 1):
             covered = alpha[y, x]
-            if not covered > _COVERED:
+            if not covered > COVERED:
                 continue
             ax, ay, az = _difference(alpha, depth, rays, y, x + 1, y, x - 1)
             dx, dy, dz = _difference(alpha, depth, rays, y + 1, x, y - 1, x)
@@ -131,7 +131,7 @@ def _to_depth(alpha: Any, depth: Any, rays: Any, slopes: Any, to_alpha: Any, to_
                 if y < height - 1:
                     p -= slopes[1, y + 1, x, c]
                 g += p * rays[y, x, c]
-            inverse = np.float32(1.0) / max(alpha[y, x], _THIN)
+            inverse = np.float32(1.0) / max(alpha[y, x], THIN)
             to_depth[y, x] += g * inverse
-            if alpha[y, x] >= _THIN:
+            if alpha[y, x] >= THIN:
                 to_alpha[y, x] -= g * depth[y, x] * inverse * inverse

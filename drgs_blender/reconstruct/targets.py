@@ -29,18 +29,19 @@ class Target:
     Attributes
     ----------
     camera : of that size
-    photograph : what it should look like
+    photograph : what it should look like; on a device the colour alone, (h, w, 3)
     mask : (h, w) tensor in 0..1, or None where nothing is known of it
     """
 
     camera: Camera
-    photograph: Photograph
+    photograph: Photograph | Tensor
     mask: Tensor | None
 
     @property
-    def rays(self) -> Tensor:
-        """See `pixel_rays`."""
-        return pixel_rays(self.camera)
+    def colour(self) -> Tensor:
+        """(h, w, 3) of the photograph."""
+        known = self.photograph
+        return torch.from_numpy(known.colour) if isinstance(known, Photograph) else known
 
 
 def background_of(capture: Capture) -> tuple[float, float, float]:
@@ -108,15 +109,18 @@ def half_size(picture: Array) -> Array:
     return np.ascontiguousarray(picture[: 2 * h, : 2 * w].reshape(h, 2, w, 2, -1).mean(axis=(1, 3)), np.float32)
 
 
-def pixel_rays(camera: Camera) -> Tensor:
-    """(h, w, 3) float32 directions of the pixels' centres, world space, of unit depth."""
-    local = _local_rays(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-    turn = torch.tensor(np.asarray(camera.matrix_world)[:3, :3].T, dtype=torch.float32)
+def pixel_rays(camera: Camera, place: torch.device | None = None) -> Tensor:
+    """(h, w, 3) float32 directions of the pixels' centres, world space, of unit depth; on the processor or a device."""
+    local = _local_rays(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, place)
+    turn = torch.tensor(np.asarray(camera.matrix_world)[:3, :3].T, dtype=torch.float32, device=place)
     return local @ turn
 
 
 @lru_cache(maxsize=8)
-def _local_rays(width: int, height: int, fx: float, fy: float, cx: float, cy: float) -> Tensor:
+def _local_rays(
+    width: int, height: int, fx: float, fy: float, cx: float, cy: float, place: torch.device | None
+) -> Tensor:
     """The same in the camera's own frame: views of one lens share it."""
     x, y = (np.arange(width) + 0.5 - cx) / fx, -(np.arange(height) + 0.5 - cy) / fy
-    return torch.tensor(np.stack([*np.meshgrid(x, y), np.full((height, width), -1.0)], -1), dtype=torch.float32)
+    rays = np.stack([*np.meshgrid(x, y), np.full((height, width), -1.0)], -1)
+    return torch.tensor(rays, dtype=torch.float32, device=place)

@@ -9,27 +9,29 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from ..arrays import Array
+from ..errors import DeviceError
 from .adam import Adam
 from .attributes import TINT
 from .capture import Capture
 from .density import densify
 from .gaussians import Gaussians, Look
 from .hull import Region, colours_of
-from .photometric import difference
+from .processor import HERE, Processor
 from .raster import Tally
-from .shape import shape_loss
-from .targets import Target, background_of, targets
+from .targets import Target, background_of, pixel_rays, targets
 
 log = logging.getLogger(__name__)
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +79,8 @@ RATES = {"centre": (1.5e-3, 0.01), "scale": (8e-3, 0.2), "rotation": (4e-3, 0.2)
 RATES |= {"tint": (6e-2, 0.2), "blur": (6e-2, 0.2)}
 LIGHT_RATE = (4e-2, 0.1)
 COLOUR_RATE, HIGHER_BANDS = (2e-2, 0.1), 0.1
+#: Seconds between two states that outlive the device.  Pixels of all views up to which these stay there, 16 bytes each.
+KEEP_EVERY, KEPT_THERE = 20.0, 100_000_000
 
 
 class Training:
@@ -89,6 +93,11 @@ class Training:
     schedule : how
     gaussians : to go on with; None starts on the region's first surface
     seconds : where the steps would take longer, the schedule runs by the clock
+    by : who does the steps; what it fails at, and all that follows, is done here
+
+    Attributes
+    ----------
+    failed : why another one than this processor is of no use any more, in words
     """
 
     def __init__(
@@ -98,20 +107,59 @@ class Training:
         schedule: Schedule,
         gaussians: Gaussians | None = None,
         seconds: float | None = None,
+        by: Processor = HERE,
     ) -> None:
         self.region, self.limit = region, seconds
         self.targets = targets(capture)
         self.schedule = schedule = replace(schedule, surfels=min(schedule.surfels, enough(self.targets[0])))
-        self.background = torch.tensor(background_of(capture), dtype=torch.float32)
-        if gaussians is None:
-            gaussians = _first(capture, region, schedule)
-        self.gaussians = gaussians
-        self.start = len(gaussians)
-        self.optimiser = Adam(gaussians.parameters)
-        self.light = Adam({} if gaussians.light is None else {"light": gaussians.light})
-        self.tally = Tally.of(len(gaussians))
+        self._behind = background_of(capture)
+        self._pixels = sum(view.camera.width * view.camera.height for views in self.targets for view in views)
+        self._begun = _first(capture, region, schedule) if gaussians is None else gaussians
+        self.start = len(self._begun)
         self.iteration, self.seconds, self.rounds = 0, 0.0, 0
         self.error = 0.0  # running mean of the squared error
+        self.failed = ""
+        self._take_on(HERE)
+        if by is not HERE:
+            self._keep()
+            self.attempt(lambda: None if self.failed else self._take_on(by), whole=False)
+
+    def _take_on(self, by: Processor) -> None:
+        """Have `by` do the steps, from the first one."""
+        self.by, self.gaussians = by, self._begun.on(by)
+        self.optimiser = Adam(self.gaussians.parameters, by.descend)
+        light = self.gaussians.light
+        self.light = Adam({} if light is None else {"light": light}, by.descend)
+        self.tally = Tally.of(len(self.gaussians), by.place)
+        self.background = torch.tensor(self._behind, dtype=torch.float32, device=by.place)
+        few = self._pixels <= KEPT_THERE
+        self._views = [[by.bring(view) for view in views] for views in self.targets] if few else self.targets
+
+    def attempt(self, work: Callable[[], _T], whole: bool = True) -> _T:
+        """Have the processor do some work; where it fails, this one does it, and goes on.
+
+        Parameters
+        ----------
+        whole : the state is of use when the work was left half-done; else the last one that was kept is
+        """
+        try:
+            return work()
+        except (DeviceError, RuntimeError) as error:
+            if self.by is HERE:
+                raise
+            self.failed = (str(error).strip() or type(error).__name__).splitlines()[0]
+            state = self._kept
+            with suppress(DeviceError, RuntimeError):
+                state = self._state() if whole else state
+            self._take_on(HERE)
+            self.restore(state)
+            log.warning("%s Learned on the CPU from step %d on", self.failed, self.iteration)
+        return work()
+
+    def _keep(self) -> None:
+        """Remember a state that the device cannot take along when it fails."""
+        self._kept = {name: np.array(value) for name, value in self.arrays().items()}
+        self._kept_at = time.monotonic()
 
     @property
     def part(self) -> float:
@@ -128,15 +176,17 @@ class Training:
         """One view."""
         started = time.monotonic()
         with _one_thread():
-            self._learn()
+            self.attempt(self._learn)
         self.iteration += 1
         self._maybe_densify()
+        if self.by is not HERE and time.monotonic() > self._kept_at + KEEP_EVERY:
+            self._keep()
         self.seconds += time.monotonic() - started
 
     def _learn(self) -> None:
         schedule, part = self.schedule, self.part
         target = self._next()
-        rays = target.rays
+        rays = pixel_rays(target.camera, self.by.place)
         bands = min(schedule.bands, int(part * 8))
         growing = part < schedule.densify[1]
         mirrors = part >= schedule.mirrors < 1
@@ -147,8 +197,7 @@ class Training:
         self.optimiser.step(self.gaussians.parameters, self._rates(part))
         if self.gaussians.light is not None:
             self.light.step({"light": self.gaussians.light}, {"light": LIGHT_RATE[0] * LIGHT_RATE[1] ** part})
-        drawn = np.clip(look.colour.detach().numpy(), 0, 1)
-        squared = float(np.square(drawn - target.photograph.colour).mean())
+        squared = float((look.colour.detach().clamp(0, 1) - target.colour).square().mean())
         self.error = squared if not self.iteration else 0.98 * self.error + 0.02 * squared
 
     @property
@@ -159,9 +208,9 @@ class Training:
     def _next(self) -> Target:
         """The view of this step: all in turn, in an order drawn anew each time."""
         scale = 1 if self.part < self.schedule.coarse else 0
-        views = self.targets[scale]
+        views = self._views[scale]
         turn, place = divmod(self.iteration, len(views))
-        return views[np.random.default_rng([self.schedule.seed, turn]).permutation(len(views))[place]]
+        return self.by.bring(views[np.random.default_rng([self.schedule.seed, turn]).permutation(len(views))[place]])
 
     def _loss(self, look: Look, target: Target, rays: Tensor, part: float) -> Tensor:
         schedule, maps = self.schedule, look.maps
@@ -171,12 +220,11 @@ class Training:
             schedule.distortion / self.region.radius**2 if shaped else 0.0,
             schedule.consistency if shaped else 0.0,
         )
-        mask = None if target.mask is None else target.mask.numpy()
-        shape = shape_loss(
-            maps.alpha, maps.depth, maps.distortion, look.normal, mask, rays.numpy(), _importance(maps.features),
-            weights,
-        )  # fmt: skip
-        return difference(look.colour, target.photograph) + shape
+        counts = _importance(maps.features)
+        shape = self.by.shape_loss(
+            maps.alpha, maps.depth, maps.distortion, look.normal, target.mask, rays, counts, weights
+        )
+        return self.by.difference(look.colour, target.photograph) + shape
 
     def _rates(self, part: float) -> dict[str, float | Array]:
         rates: dict[str, float | Array] = {k: first * rest**part for k, (first, rest) in RATES.items()}
@@ -194,23 +242,32 @@ class Training:
         due = int(grown * schedule.rounds)
         if due <= self.rounds:
             return
-        self.rounds = due
         budget = int(self.start + (schedule.surfels - self.start) * grown)
+        if self.by is not HERE:
+            self._keep()
+        self.attempt(lambda: self._densify(budget), whole=False)
+        self.rounds = due
+
+    def _densify(self, budget: int) -> None:
         self.gaussians, report = densify(
             self.gaussians, self.optimiser, self.tally, budget, 0.5 * self.region.radius, 1e-3 * self.region.radius
         )
-        self.tally = Tally.of(len(self.gaussians))
+        self.tally = Tally.of(len(self.gaussians), self.by.place)
         log.debug("step %d: %d surfels, %s", self.iteration, len(self.gaussians), report)
 
     def arrays(self) -> dict[str, Array]:
-        """All that `restore` needs to go on bit for bit."""
-        state = {f"value.{k}": v for k, v in self.gaussians.arrays().items()}
-        state |= {f"first.{k}": v for k, v in self.optimiser.first.items()}
-        state |= {f"second.{k}": v for k, v in self.optimiser.second.items()}
+        """All that `restore` needs to go on, with any processor; with the same one bit for bit."""
+        return self.attempt(self._state)
+
+    def _state(self) -> dict[str, Array]:
+        tensors = {"travel": self.tally.travel, "views": self.tally.views}
+        tensors |= {f"first.{k}": v for k, v in self.optimiser.first.items()}
+        tensors |= {f"second.{k}": v for k, v in self.optimiser.second.items()}
         if self.gaussians.light is not None:
-            state |= {"light": self.gaussians.light.detach().numpy(), "light.first": self.light.first["light"]}
-            state["light.second"] = self.light.second["light"]
-        state |= {"travel": self.tally.travel, "views": self.tally.views}
+            tensors |= {"light": self.gaussians.light, "light.first": self.light.first["light"]}
+            tensors["light.second"] = self.light.second["light"]
+        state = {f"value.{k}": v for k, v in self.gaussians.arrays().items()}
+        state |= {k: v.numpy(force=True) for k, v in tensors.items()}
         state["counts"] = np.array(
             [self.iteration, self.optimiser.steps, self.start, self.rounds, self.light.steps], np.int64
         )
@@ -219,16 +276,14 @@ class Training:
 
     def restore(self, state: dict[str, Array]) -> None:
         """Go on from what `arrays` returned."""
-        part = lambda name: {  # noqa: E731
-            k.removeprefix(name): np.array(v) for k, v in state.items() if k.startswith(name)
-        }
+        there = lambda name: torch.tensor(state[name], device=self.by.place)  # noqa: E731
+        part = lambda name: {k.removeprefix(name): there(k) for k in state if k.startswith(name)}  # noqa: E731
         if self.gaussians.light is not None:
-            self.gaussians.light = torch.from_numpy(np.array(state["light"])).requires_grad_(True)
-            self.light.first = {"light": np.array(state["light.first"])}
-            self.light.second = {"light": np.array(state["light.second"])}
-        self.gaussians = self.gaussians.like({k: torch.from_numpy(v) for k, v in part("value.").items()})
+            self.gaussians.light = there("light").requires_grad_(True)
+            self.light.first, self.light.second = {"light": there("light.first")}, {"light": there("light.second")}
+        self.gaussians = self.gaussians.like(part("value."))
         self.optimiser.first, self.optimiser.second = part("first."), part("second.")
-        self.tally = Tally(np.array(state["travel"]), np.array(state["views"]))
+        self.tally = Tally(there("travel"), there("views"))
         self.iteration, self.optimiser.steps, self.start, self.rounds, self.light.steps = map(int, state["counts"])
         self.error, self.seconds = (float(x) for x in state["numbers"])
 
@@ -239,14 +294,13 @@ def enough(views: list[Target]) -> int:
     return max(int(PER_PIXEL * np.mean(shown)), 1)
 
 
-def _importance(features: Tensor) -> Array:
+def _importance(features: Tensor) -> Tensor:
     """(h, w) float32 in 0..1, what the agreement of normals counts: where a surface mirrors, they decide its colour.
 
     Where it does not, the agreement mostly rounds off edges: on the toy bulldozer of NeRF-synthetic it cost 0.7 dB.
     """
-    tint = features.detach().numpy()[..., TINT : TINT + 3]
-    mirrored = tint.mean(-1) if tint.shape[-1] else np.float32(0.0)
-    return np.minimum(np.float32(MATTE) + np.float32(MIRRORED) * mirrored, np.ones(tint.shape[:2], np.float32))
+    # A sum: the mean of no channels is none.
+    return (MATTE + MIRRORED / 3 * features.detach()[..., TINT : TINT + 3].sum(-1)).clamp(max=1)
 
 
 @contextmanager

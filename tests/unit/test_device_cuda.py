@@ -48,15 +48,18 @@ def test_pictures_kernels_compile_for_a_card(tmp_path: Path) -> None:
 
 def test_learnings_kernels_compile_for_a_card(tmp_path: Path) -> None:
     pytest.importorskip("torch")
+    import test_device_learning
     import test_device_surfels
 
-    from drgs_blender.reconstruct.device import kernels
-    from drgs_blender.reconstruct.device.launch import TensorLauncher
+    from drgs_blender.reconstruct.device import kernels, losses, on_device
 
-    launcher = TensorLauncher("cpu")
-    test_device_surfels.test_every_map_has_a_gradient_of_its_own(launcher)
-    works = tuple(work for work in vars(kernels).values() if isinstance(work, kernels.Work))
-    assert made(works, launcher, tmp_path) == set(works)
+    device = on_device.OnDevice("cpu")
+    test_device_surfels.test_every_map_has_a_gradient_of_its_own(device.launcher)
+    test_device_learning.test_difference_from_a_photograph(device)
+    test_device_learning.test_a_step_down(device)
+    modules = kernels, losses, on_device
+    works = {work for module in modules for work in vars(module).values() if isinstance(work, kernels.Work)}
+    assert made(tuple(works), device.launcher, tmp_path) == works
 
 
 @pytest.mark.skipif(os.environ.get("DRGS_FAULTS") != "whole", reason="takes minutes; DRGS_FAULTS=whole runs it")

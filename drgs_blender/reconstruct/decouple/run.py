@@ -192,7 +192,7 @@ class _Job:
         while s.environment // len(self.light.log) > 1 << ahead:
             self.light.grow()
             for moments in (self._adam.first, self._adam.second):
-                moments["light"] = np.zeros(self.light.log.shape, np.float32)
+                moments["light"] = torch.zeros_like(self.light.log)
             stale = True
         if stale:
             self._aim(self.light.radiance().numpy())
@@ -310,7 +310,7 @@ class _Job:
             return
         state = {f"value/{name}": tensor.numpy() for name, tensor in self._learned().items()}
         for order, moments in (("first", self._adam.first), ("second", self._adam.second)):
-            state |= {f"{order}/{name}": value for name, value in moments.items()}
+            state |= {f"{order}/{name}": value.numpy() for name, value in moments.items()}
         state["aimed"] = self._aimed
         state["numbers"] = np.array([self.iteration, self._elapsed, self.loss, self._error])
         states.save(self._checkpoint, state, self._key)
@@ -322,7 +322,7 @@ class _Job:
         self.light.log = torch.from_numpy(state["value/light"].copy())
         for order, moments in (("first", self._adam.first), ("second", self._adam.second)):
             for name in moments:
-                moments[name] = state[f"{order}/{name}"].copy()
+                moments[name] = torch.from_numpy(state[f"{order}/{name}"].copy())
         self._aim(state["aimed"])
         iteration, self._spent, self.loss, self._error = (float(x) for x in state["numbers"])
         self.iteration = self._adam.steps = int(iteration)

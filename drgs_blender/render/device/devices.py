@@ -31,7 +31,7 @@ class Devices:
     def _found(self, device: str) -> Processor:
         if device not in self._known and device not in self._missing:
             try:
-                self._known[device] = OnDevice(_name(device))
+                self._known[device] = OnDevice(name_of(device))
             except DeviceError as error:
                 self._missing[device] = str(error)
         return self._known.get(device, HERE)
@@ -56,11 +56,11 @@ def card() -> str:
     DeviceError
         Where there is none.
     """
-    device = warp().get_device(_name("cuda"))
+    device = warp().get_device(name_of("cuda"))
     return f"{device.name}, {device.total_memory / 2**30:.0f} GiB, sm_{device.arch}"
 
 
-def _name(device: str) -> str:
+def name_of(device: str) -> str:
     """Warp's name of a device.
 
     Raises

@@ -1,0 +1,322 @@
+"""A step of learning on a device, on Warp's device "cpu": each piece and the whole, as this processor has them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("warp", reason="warp-lang is not installed")
+
+from capture_cases import balls  # noqa: E402
+from test_reconstruct_attributes import EYE, surfels  # noqa: E402
+
+from drgs_blender.device.kernels import Work  # noqa: E402
+from drgs_blender.device.warp import parts_of  # noqa: E402
+from drgs_blender.errors import DeviceError  # noqa: E402
+from drgs_blender.reconstruct.capture import Capture  # noqa: E402
+from drgs_blender.reconstruct.device import devices, kernels, look, losses  # noqa: E402
+from drgs_blender.reconstruct.device import raster as device_raster  # noqa: E402
+from drgs_blender.reconstruct.device.on_device import DESCEND, OnDevice  # noqa: E402
+from drgs_blender.reconstruct.hull import Region, find_region  # noqa: E402
+from drgs_blender.reconstruct.job import Settings, reconstruct  # noqa: E402
+from drgs_blender.reconstruct.photometric import Photograph  # noqa: E402
+from drgs_blender.reconstruct.processor import HERE, Processor  # noqa: E402
+from drgs_blender.reconstruct.reflection import BARE, pyramid  # noqa: E402
+from drgs_blender.reconstruct.targets import Target  # noqa: E402
+from drgs_blender.reconstruct.train import Schedule, Training  # noqa: E402
+
+HEIGHT, WIDTH = 23, 31
+
+
+@pytest.fixture(scope="module")
+def there() -> OnDevice:
+    return OnDevice("cpu")
+
+
+def random(*shape: int, seed: int = 0, low: float = 0.0, high: float = 1.0) -> Any:
+    return torch.tensor(np.random.default_rng([seed, *shape]).uniform(low, high, shape), dtype=torch.float32)
+
+
+def hold_alike(work: Callable[..., Any], inputs: list[Any], there: OnDevice, close: float = 1e-5) -> None:
+    """`work(processor, *inputs)` has the same values and gradients of all inputs on both processors."""
+    results = []
+    for by in (HERE, there):
+        given = [value.clone().requires_grad_() for value in inputs]
+        found = work(by, *given)
+        found = found if isinstance(found, tuple) else (found,)
+        sum((f * random(*f.shape, seed=9, low=-1)).sum() for f in found).backward()
+        grads = [torch.zeros_like(g) if g.grad is None else g.grad for g in given]
+        results.append([*(f.detach() for f in found), *grads])
+    for k, (a, b) in enumerate(zip(*results, strict=True)):
+        assert (a - b).norm() <= close * a.norm(), (k, float(a.norm()), float((a - b).norm()))
+
+
+@pytest.mark.parametrize(("bands", "mirrors"), [(0, True), (2, True), (1, False)])
+def test_attributes(there: OnDevice, bands: int, mirrors: bool) -> None:
+    raw, centre = surfels()
+    names = list(raw)
+    hold_alike(
+        lambda by, *values: by.attributes(dict(zip(names, values, strict=True)), centre, EYE, bands, mirrors),
+        list(raw.values()), there,
+    )  # fmt: skip
+
+
+def test_what_is_mirrored(there: OnDevice) -> None:
+    """Pixels hardly covered among them, and one without a normal."""
+    features, alpha = random(HEIGHT, WIDTH, 10, low=-1), random(HEIGHT, WIDTH, seed=1)
+    features[..., 6:] = 0.9 * alpha[..., None] * features[..., 6:].abs()
+    alpha[:3] = 0.9 * float(BARE)
+    features[4, 5, 3:6] = 0
+    rays, cube = random(HEIGHT, WIDTH, 3, seed=2, low=-1), random(6, 3, 32, 32, seed=3, low=-2)
+    hold_alike(lambda by, f, a, c: by.mirrored(f, a, rays, pyramid(c)), [features, alpha, cube], there)
+
+
+def test_gradients_of_shared_texels_do_not_depend_on_the_order() -> None:
+    table, index = random(50, 3).requires_grad_(), torch.randint(0, 50, (4000,))
+    pull = random(4000, 3, seed=1, low=-1e3, high=1e3)
+    pull[7] = float("nan")  # of a surfel that is damaged: it must not spoil the others
+    found = []
+    for order in (torch.arange(4000), torch.randperm(4000)):
+        table.grad = None
+        (look._Rows.apply(table, index[order]) * pull[order]).sum().backward()
+        found.append(table.grad)
+    assert torch.equal(*found)
+    exact = torch.zeros(50, 3, dtype=torch.float64).index_add(0, index, torch.nan_to_num(pull).double())
+    torch.testing.assert_close(found[0].double(), exact, rtol=1e-6, atol=1e-6)
+
+
+def test_difference_from_a_photograph(there: OnDevice) -> None:
+    """Saturated in part, where brighter is as good."""
+    colour = random(HEIGHT, WIDTH, 3)
+    colour[5:9] = 1.0
+    target = Target(None, Photograph.of(colour.numpy()), None)  # type: ignore[arg-type]
+    picture = random(HEIGHT, WIDTH, 3, seed=1, high=1.3)
+    hold_alike(lambda by, p: by.difference(p, by.bring(target).photograph), [picture], there)
+
+
+@pytest.mark.parametrize("weights", [(0.1, 0.0, 0.0), (0.0, 0.7, 0.0), (0.0, 0.0, 0.25)])
+def test_losses_of_the_shape(there: OnDevice, weights: tuple[float, float, float]) -> None:
+    alpha = random(HEIGHT, WIDTH, low=0.2)
+    alpha[:4, :5] = 0
+    maps = [alpha, alpha * (3 + 0.3 * random(HEIGHT, WIDTH, seed=1)), random(HEIGHT, WIDTH, seed=2)]
+    normal, mask = random(HEIGHT, WIDTH, 3, seed=3, low=-0.7, high=0.7), random(HEIGHT, WIDTH, seed=4)
+    rays, counts = random(HEIGHT, WIDTH, 3, seed=5, low=-1), random(HEIGHT, WIDTH, seed=6)
+    work = lambda by, a, z, d, n: by.shape_loss(a, z, d, n, mask, rays, counts, weights)  # noqa: E731
+    hold_alike(work, [*maps, normal], there)
+
+
+def test_a_step_down(there: OnDevice) -> None:
+    """To the last bit; gradients that are no numbers change nothing."""
+    found = []
+    for by in (HERE, there):
+        value, first, second = random(50, 6), random(50, 6, seed=1), random(50, 6, seed=2)
+        gradient = random(50, 6, seed=3, low=-1)
+        gradient[3, 2] = float("nan")
+        by.descend(value, gradient, first, second, np.linspace(0.01, 0.06, 6, dtype=np.float32))
+        found.append(torch.stack([value, first, second]))
+    assert torch.equal(*found)
+    assert found[0][0, 3, 2] == random(50, 6)[3, 2] != found[0][0, 3, 1]
+
+
+# --- whole steps -----------------------------------------------------------------------------------------------------
+
+SCHEDULE = Schedule(iterations=60, surfels=1200, rounds=4)
+
+
+@pytest.fixture(scope="module")
+def capture() -> Capture:
+    return balls(count=8, size=40)
+
+
+@pytest.fixture(scope="module")
+def region(capture: Capture) -> Region:
+    return find_region(capture)
+
+
+def learned(capture: Capture, region: Region, by: Processor, steps: int) -> Training:
+    training = Training(capture, region, SCHEDULE, by=by)
+    for _ in range(steps):
+        training.step()
+    return training
+
+
+def alike(a: Training, b: Training) -> float:
+    """Largest relative difference of what was learned."""
+    found, other = a.arrays(), b.arrays()
+    assert list(found) == list(other)
+    names = [name for name in found if name == "light" or name.startswith("value")]
+    return max(float(np.linalg.norm(found[n] - other[n]) / max(np.linalg.norm(found[n]), 1e-9)) for n in names)
+
+
+def test_first_steps_are_the_processors(capture: Capture, region: Region, there: OnDevice) -> None:
+    assert alike(learned(capture, region, HERE, 3), learned(capture, region, there, 3)) < 1e-5
+
+
+def test_a_device_learns_as_well_as_the_processor(capture: Capture, region: Region, there: OnDevice) -> None:
+    """All of the schedule: surfels cut, mirrors, shape. What begins as last digits grows, but leads no other way."""
+    here, other = (learned(capture, region, by, SCHEDULE.iterations) for by in (HERE, there))
+    assert here.rounds == other.rounds == SCHEDULE.rounds
+    assert here.psnr > 20
+    assert abs(here.psnr - other.psnr) < 0.1
+    assert not other.failed
+    assert other.gaussians.by is there
+
+
+def test_a_state_of_one_processor_is_of_use_to_the_other(capture: Capture, region: Region, there: OnDevice) -> None:
+    for one, other in ((HERE, there), (there, HERE)):
+        begun = learned(capture, region, one, 20)
+        going_on = Training(capture, region, SCHEDULE, by=other)
+        going_on.restore(begun.arrays())
+        assert going_on.iteration == 20
+        assert alike(begun, going_on) == 0
+        begun.step(), going_on.step()
+        assert alike(begun, going_on) < 1e-5
+
+
+@pytest.mark.parametrize("error", [DeviceError("device cuda", "failed"), RuntimeError("CUDA out of memory")])
+@pytest.mark.parametrize("work", [kernels.PROJECT, kernels.SUM_PIXELS, losses.ROWS], ids=["forth", "back", "loss"])
+def test_a_device_that_fails_is_a_warning_and_the_processor_goes_on(
+    capture: Capture, region: Region, work: Work, error: Exception, monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:  # fmt: skip
+    """From where it failed: nothing is lost."""
+    there = OnDevice("cpu")
+    training = learned(capture, region, there, 10)
+    expected = Training(capture, region, SCHEDULE)
+    expected.restore(training.arrays())
+    fail_at(work, there, error, monkeypatch)
+    for _ in range(10):
+        training.step()
+        expected.step()
+    (said,) = caplog.messages
+    assert str(error) in said and "on the CPU from step 10 on" in said
+    assert training.iteration == 20
+    assert training.by is HERE
+    assert training.failed == str(error)
+
+    assert alike(expected, training) == 0
+
+
+def fail_at(work: Work, there: OnDevice, error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have the device fail at some work from now on."""
+    launch = there.launcher.launch
+
+    def failing(asked: Work, *arguments: Any) -> None:
+        if asked is work:
+            raise error
+        launch(asked, *arguments)
+
+    monkeypatch.setattr(there.launcher, "launch", failing)
+
+
+def test_a_step_that_fails_half_done_is_done_again(
+    capture: Capture, region: Region, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    there = OnDevice("cpu")
+    training = learned(capture, region, there, 10)
+    fail_at(DESCEND, there, RuntimeError("CUDA error"), monkeypatch)
+    training.step()
+    assert training.iteration == 11
+    assert training.by is HERE
+
+
+def broken(*_: Any, **__: Any) -> None:
+    raise RuntimeError("an illegal memory access was encountered")
+
+
+def kept(capture: Capture, region: Region) -> tuple[Training, Training]:
+    """A training on a device that has kept its state, and one of this processor with the same."""
+    training, here = learned(capture, region, OnDevice("cpu"), 7), Training(capture, region, SCHEDULE)
+    training._keep()
+    here.restore(training.arrays())
+    return training, here
+
+
+def test_a_device_whose_memory_is_lost_goes_back_to_the_last_state_kept(
+    capture: Capture, region: Region, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After some failures of a card nothing can be read from it any more."""
+    training, here = kept(capture, region)
+    training.step()
+    with monkeypatch.context() as patch:
+        patch.setattr(training.by, "rasterise", broken)
+        patch.setattr(training, "_state", broken)
+        training.step()
+    here.step()
+    assert training.by is HERE
+    assert training.iteration == here.iteration == 8
+    assert alike(here, training) == 0
+
+
+def test_surfels_half_cut_are_of_no_use(capture: Capture, region: Region, monkeypatch: pytest.MonkeyPatch) -> None:
+    training, here = kept(capture, region)
+    monkeypatch.setattr(training.optimiser, "take", broken)
+    training.attempt(lambda: training._densify(900), whole=False)
+    here._densify(900)
+    assert training.by is HERE
+    assert len(training.gaussians) > 600
+    assert alike(here, training) == 0
+
+
+def test_without_a_card_the_processor_learns_and_a_warning_says_why(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def none(device: str) -> str:
+        raise DeviceError("device cuda", "no NVIDIA card with a driver was found")
+
+    monkeypatch.setattr(devices, "name_of", none)
+    assert devices.learner("cuda") is HERE
+    monkeypatch.setattr(devices, "name_of", lambda device: "cuda:0")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert devices.learner("cuda") is HERE
+    assert devices.learner("cpu") is HERE
+    first, second = caplog.messages
+    assert "no NVIDIA card" in first and "PyTorch" in second and "a build of it for CUDA" in second
+
+
+def test_nothing_of_this_process_meets_what_is_on_a_device(
+    capture: Capture, region: Region, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A whole step with tensors that have a place but no content: torch refuses what it would refuse on a card."""
+    asked = []
+
+    def launch(work: Work, pieces: int, arguments: Any, out: Any) -> None:
+        tensors = [part for part in parts_of((arguments, out)) if isinstance(part, torch.Tensor)]
+        assert {tensor.device.type for tensor in tensors} == {"meta"}, work.function.__name__
+        asked.append(work)
+
+    there = OnDevice("cpu")
+    there.place = torch.device("meta")
+    monkeypatch.setattr(there.launcher, "launch", launch)
+    ends = lambda counts: (torch.nn.functional.pad(torch.cumsum(counts, 0), (1, 0)), 1000)  # noqa: E731
+    monkeypatch.setattr(device_raster, "starts", ends)
+    monkeypatch.setattr(torch, "nonzero", lambda x: torch.zeros(90, x.dim(), dtype=torch.int64, device=x.device))
+    monkeypatch.setattr(torch.Tensor, "__float__", lambda _: 0.5)
+    training = Training(capture, region, replace(SCHEDULE, mirrors=0.0, shape=0.0))
+    training._take_on(there)
+    training._learn()
+    training.optimiser.take(np.array([0, -1, 2]))
+    training.gaussians.take(np.array([1, 2]))
+    assert set(asked) >= {kernels.SUM_PIXELS, losses.ROWS, DESCEND}
+
+
+def test_an_asset_is_learned_on_the_device_asked_for(
+    capture: Capture, there: OnDevice, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Surfels, mesh, surfels on the mesh: as on this processor, but for what begins as last digits."""
+    pytest.importorskip("skimage")
+    monkeypatch.setattr(devices, "name_of", lambda device: "cpu")
+    used = []
+    rasterise = OnDevice.rasterise
+    monkeypatch.setattr(OnDevice, "rasterise", lambda *a, **k: used.append(1) or rasterise(*a, **k))
+    settings = Settings(variant="m", schedule=SCHEDULE, mesh_resolution=32, materials=False)
+    expected, found = (reconstruct(capture, replace(settings, device=device)) for device in ("cpu", "cuda"))
+    assert len(used) >= 1.4 * SCHEDULE.iterations
+    reports = [asset.provenance["report"] for asset in (expected, found)]
+    assert abs(reports[0]["psnr"] - reports[1]["psnr"]) < 0.3
+    assert reports[0]["psnr"] > 18
