@@ -98,6 +98,7 @@ class Window(SimpleNamespace):
         )  # fmt: skip
         super().__init__(
             texts=texts,
+            scene=bpy.context.scene,
             window=object(),
             window_manager=manager,
             workspace=SimpleNamespace(status_text_set=texts.append),
@@ -115,8 +116,10 @@ def test_it_works_beside_the_window_until_cancelled(scene, photographs, tmp_path
     values = {"filepath": str(photographs), "out": "", "minutes": 5.0, "resolution": 0, "variant": "p"}
     for name, value in (values | {"use_materials": True, "test_every": 0, "use_environment": False}).items():
         setattr(stand_in, name, value)
+    scene.drgs.device = "CUDA"
     assert stand_in.run(context) == {"RUNNING_MODAL"}
     process = stand_in._process
+    assert process.args[process.args.index("--device") + 1] == "cuda"
     tick, escape = SimpleNamespace(type="TIMER"), SimpleNamespace(type="ESC")
     assert stand_in.modal(context, tick) == {"PASS_THROUGH"} and not cls.poll(context)
     assert stand_in.modal(context, escape) == {"PASS_THROUGH"} and process.poll() is None
