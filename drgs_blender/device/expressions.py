@@ -41,7 +41,8 @@ _OPERATORS = {
 _MATHS = {
     math.sqrt: "sqrt", math.sin: "sin", math.cos: "cos", math.tan: "tan", math.acos: "acos", math.asin: "asin",
     math.atan: "atan", math.atan2: "atan2", math.exp: "exp", math.log: "log", math.pow: "pow", np.sqrt: "sqrt",
-    np.floor: "floor", math.copysign: "copysign", np.exp: "exp", np.log: "log", np.abs: "abs",
+    np.floor: "floor", math.copysign: "copysign", np.exp: "exp", np.log: "log", np.abs: "abs", np.sin: "sin",
+    np.cos: "cos", np.arccos: "acos", np.degrees: "degrees",
 }  # fmt: skip
 _CASTS = {int: INT64, float: FLOAT64, bool: BOOL}
 _ANY = object()
@@ -197,13 +198,18 @@ class Expressions:
     def _of_Subscript(self, node: ast.Subscript) -> Value:
         owner = self.value(node.value)
         if isinstance(owner.type, Array):
-            return Value(f"{owner.text}[{self._place(node.slice)}]", owner.type.element)
+            fewer = owner.type.axes - (len(node.slice.elts) if isinstance(node.slice, ast.Tuple) else 1)
+            kind = Array(owner.type.element, fewer) if fewer else owner.type.element
+            return Value(f"{owner.text}[{self._place(node.slice)}]", kind)
         if not owner.parts:
             raise TranslationError(ast.unparse(node), "is no element", "Index arrays and tuples")
         if isinstance(node.slice, ast.Slice):
             bounds = [None if b is None else self._constant(b) for b in (node.slice.lower, node.slice.upper)]
             return together(list(owner.parts[slice(*bounds)]))
-        return owner.parts[self._constant(node.slice)]
+        which = self._constant(node.slice)
+        if which is _ANY:
+            raise TranslationError(ast.unparse(node), "is not known beforehand", "Index tuples by constants")
+        return owner.parts[which]
 
     def _of_UnaryOp(self, node: ast.UnaryOp) -> Value:
         value = self.value(node.operand)
@@ -217,6 +223,9 @@ class Expressions:
         return self._binary(node.op, self.value(node.left), self.value(node.right))
 
     def _binary(self, operator: ast.operator, left: Value, right: Value) -> Value:
+        if isinstance(operator, ast.Pow) and {left.type, right.type} <= {FLOAT32, FLOAT64}:
+            kind = promoted(left.type, right.type)
+            return Value(f"wp.pow({self._as(left, kind)}, {self._as(right, kind)})", kind)
         if type(operator) not in _OPERATORS:
             raise TranslationError(type(operator).__name__, "has no counterpart", "Write it otherwise")
         if isinstance(operator, (ast.LShift, ast.RShift)):

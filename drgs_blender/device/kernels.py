@@ -116,17 +116,39 @@ class Launcher:
         DeviceError
             When the device fails, for one of the reasons that a device has.
         """
-        wp = warp()
         with self.failures(work.function.__name__.replace("_", " ")):
-            module = self._ready(work, tuple(type_for(a) for a in (*arguments, tuple(out))))
-            lanes = min(pieces, LANES)
             arrays = list(parts_of(tuple(out)))
             found = [a if is_there(a) else self.zeros(a.shape, a.dtype.name) for a in arrays]
-            inputs = [self._argument(module, part) for part in parts_of(tuple(arguments))]
-            wp.launch(module.run, lanes, [lanes, *self._room(work, lanes), *inputs, *found], device=self.device)
+            self._launch(work, pieces, arguments, tuple(out), found)
             for array, result in zip(arrays, found):
                 if array is not result:
                     array[...] = result.numpy()
+
+    def recorded(self, work: Work, pieces: int, arguments: Sequence[Any], out: Sequence[Any]) -> Callable[[], None]:
+        """The same launch, not done now but whenever it is called, at little cost; all its arrays are the device's.
+
+        Raises
+        ------
+        DeviceError
+            As `launch`; what it does later belongs into `failures`.
+        """
+        with self.failures(work.function.__name__.replace("_", " ")):
+            made = self._launch(work, pieces, arguments, tuple(out), list(parts_of(tuple(out))), record_cmd=True)
+            kept = arguments, out, self._rooms.get(work)
+
+            def again(kept: Any = kept) -> None:
+                made.launch()
+
+            return again
+
+    def _launch(
+        self, work: Work, pieces: int, arguments: Sequence[Any], out: tuple[Any, ...], found: list[Any], **how: bool
+    ) -> Any:
+        module = self._ready(work, tuple(type_for(a) for a in (*arguments, out)))
+        lanes = min(pieces, LANES)
+        inputs = [self._argument(module, part) for part in parts_of(tuple(arguments))]
+        given = [lanes, *self._room(work, lanes), *inputs, *found]
+        return warp().launch(module.run, lanes, given, device=self.device, **how)
 
     def _ready(self, work: Work, types: tuple[Type, ...]) -> ModuleType:
         """The module for arguments of these types, compiled."""

@@ -25,6 +25,9 @@ from .typed import Known, Struct, Type, type_of
 
 Array = np.ndarray
 
+#: Devices that a user may ask for, and what each stands for.
+DEVICES = {"cpu": "this processor", "cuda": "the first NVIDIA card"}
+
 #: Called with 1 when kernels begin to be made ready, which nothing interrupts, and with -1 when they are.
 watchers: list[Callable[[int], None]] = []
 #: Versions that the translation is made for; `pyproject.toml` has the same.
@@ -78,6 +81,25 @@ def cuda_devices() -> list[str]:
         return [device.alias for device in warp().get_cuda_devices()]
     except DeviceError:
         return []
+
+
+def name_of(device: str) -> str:
+    """Warp's name of one of the `DEVICES` but the first.
+
+    Raises
+    ------
+    DeviceError
+        Where there is none.
+    """
+    if device not in DEVICES:
+        raise DeviceError(f"device {device!r}", "is unknown", f"Choose from {', '.join(DEVICES)}")
+    warp()
+    found = cuda_devices()
+    if not found:
+        raise DeviceError(
+            "device cuda", "no NVIDIA card with a driver was found", "Install or update its driver, or use the CPU"
+        )
+    return found[0]
 
 
 def is_there(value: Any) -> bool:

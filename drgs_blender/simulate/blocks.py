@@ -82,21 +82,23 @@ class Arrangement:
     slot: Array
 
 
+@njit(inline="always")
+def block_of(gx, gy, gz, bx, by, bz):  # type: ignore[no-untyped-def]
+    """Number of the block of a place, told in spacings from the origin; -1 if it is outside or not finite."""
+    low = MARGIN + 0.5
+    inside = low <= gx < 4 * (bx - 1) + 0.5 and low <= gy < 4 * (by - 1) + 0.5 and low <= gz < 4 * (bz - 1) + 0.5
+    if inside:  # not for NaN
+        return ((int(gx - 0.5) >> 2) * by + (int(gy - 0.5) >> 2)) * bz + (int(gz - 0.5) >> 2)
+    return -1
+
+
 @njit(parallel=True)
 def _blocks_of(x, origin, scale, bx, by, bz):  # type: ignore[no-untyped-def]
     """Block number of each particle; -1 where it is outside or not finite."""
     number = np.empty(len(x), np.int64)
     for p in prange(len(x)):
         gx, gy, gz = (x[p, 0] - origin[0]) * scale, (x[p, 1] - origin[1]) * scale, (x[p, 2] - origin[2]) * scale
-        low = MARGIN + 0.5
-        inside = (
-            low <= gx < 4 * (bx - 1) + 0.5 and low <= gy < 4 * (by - 1) + 0.5 and low <= gz < 4 * (bz - 1) + 0.5
-        )  # not for NaN
-        if inside:
-            i, j, k = int(gx - 0.5) >> 2, int(gy - 0.5) >> 2, int(gz - 0.5) >> 2
-            number[p] = (i * by + j) * bz + k
-        else:
-            number[p] = -1
+        number[p] = block_of(gx, gy, gz, bx, by, bz)
     return number
 
 
@@ -129,6 +131,11 @@ def _activate(block, slot):  # type: ignore[no-untyped-def]
                 n += 1
             neighbour[b, e] = slot[i, j, k]
     return neighbour, active[:n].copy()
+
+
+def outside(x: Array, domain: Domain) -> Array:
+    """(k,) indices of the particles (n, 3) outside the domain or not finite."""
+    return np.flatnonzero(_blocks_of(x, domain.origin, 1.0 / domain.spacing, *domain.blocks) < 0)
 
 
 def arrange(x: Array, domain: Domain) -> tuple[Arrangement, Array]:

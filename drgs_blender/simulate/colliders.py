@@ -202,6 +202,11 @@ class MovingCollider:
         self._centre_rest = self._rest.mean(axis=0)
         self._built_at = -np.inf
 
+    @property
+    def deforms(self) -> bool:
+        """Whether it changes its shape in this frame."""
+        return not self._rigid
+
     def at(self, part: float) -> tuple[Field | None, Array, Array, Array, Array]:
         """The field at `part` (0 to 1) of the frame, and its motion.
 
@@ -274,7 +279,7 @@ class MovingCollider:
         return make_field(vertices, self.collider.faces, self._closed, self.spacing, low, high, velocities)
 
     def _deforming(self, part: float) -> tuple[Field | None, Array, Array, Array, Array]:
-        if (part - self._built_at) * self._seconds * self.speed > 0.5 * self.spacing or self._built_at < 0:
+        if self._built_at < 0 or (part - self._built_at) * self._seconds * self.speed > 0.5 * self.spacing:
             vertices = (1 - part) * self._before + part * self._after
             velocities = (self._after - self._before) / self._seconds
             self._field = self._make_field(vertices, *self._near, velocities)

@@ -30,7 +30,7 @@ def digest_of(mesh: Mesh, settings: Settings, colliders: Sequence[Collider], mot
     motion : (k, n, 3) vertices of the mesh, that pins follow; None where they stay
     """
     described = asdict(settings)
-    for key in ("last", "colliders", "motion"):
+    for key in ("last", "colliders", "motion", "device"):
         del described[key]
     for field in described["fields"]:
         field["frames"] = field["frames"][:1]

@@ -22,7 +22,7 @@ FALLOFFS = {"sphere": 0, "tube": 1, "cone": 2}
 SIDES = {"both": 0, "above": 1, "below": 2}
 #: Columns of `FieldRows.at`; what may change from frame to frame comes first.
 _PLACE, _AXIS, _STRENGTH, _FLOW, MOVING = 0, 3, 6, 7, 8
-_KIND, _SHAPE, _FALLOFF, _SIDE, _POWER, _NEAR, _FAR, _RADIAL, _INNER, _OUTER, _SIZE, _COLUMNS = range(8, 20)
+_KIND, _SHAPE, _FALLOFF, _SIDE, _POWER, _NEAR, _FAR, _RADIAL, _INNER, _OUTER, _SIZE, COLUMNS = range(8, 20)
 #: Metres, beyond everything.
 FAR = 1e9
 
@@ -72,7 +72,7 @@ class FieldRows:
 
     def __init__(self, fields: Sequence[ForceField]) -> None:
         self._frames = [np.array(field.frames, np.float64).reshape(-1, MOVING) for field in fields]
-        self._still = np.array([field.row() for field in fields], np.float64).reshape(len(fields), _COLUMNS - MOVING)
+        self._still = np.array([field.row() for field in fields], np.float64).reshape(len(fields), COLUMNS - MOVING)
 
     def push(self, frame: int) -> float:
         """What they accelerate by at most, but for vortices, from `frame` to the next, m/s^2."""
@@ -88,7 +88,7 @@ class FieldRows:
 
     def at(self, frame: int, part: float) -> Array:
         """(k, columns) float64 at `part` (0 to 1) of the way from `frame`, counted from 0, to the next."""
-        rows = np.empty((len(self), _COLUMNS))
+        rows = np.empty((len(self), COLUMNS))
         rows[:, MOVING:] = self._still
         for row, frames in zip(rows, self._frames, strict=True):
             before, after = self._around(frames, frame)

@@ -213,8 +213,10 @@ def _solver(settings: Settings, body: Body, spacing: float, vertices: Array, col
                 point = tuple((corner + sign * domain.spacing * np.asarray([1.0, 1.0, 1.0])).tolist())
                 planes.append(Plane(point, normal, settings.walls))  # type: ignore[arg-type]
     if settings.solver != "mpm":
+        if settings.device != "cpu":
+            log.warning("device %s: only the solver mpm works on it; simulated on the CPU", settings.device)
         return {"xpbd": Lattice, "rigid": Rigid}[settings.solver](body, forces, colliders, planes)
-    return Solver(body, domain, forces, colliders, planes, settings.courant)
+    return Solver(body, domain, forces, colliders, planes, settings.courant, settings.device)
 
 
 def _domain(settings: Settings, points: Array, spacing: float, colliders: list[Collider]) -> Domain:

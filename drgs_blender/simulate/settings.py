@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from ..device.warp import DEVICES
 from ..errors import UsageError
 from ..matter import Material, make_material
 from .contact import CONTACTS, Contact
@@ -60,6 +61,7 @@ class Settings:
     domain : corners of the space that is simulated, world; None is chosen from the body and what is around it
     walls : what its sides do; "open" makes leaving an error
     first, last, fps : frames
+    device : what computes them, one of `DEVICES`; frames do not depend on it, but for last digits
     matrix_world : (4, 4) object to world
     """
 
@@ -88,6 +90,7 @@ class Settings:
     courant: float = 0.5
     jitter: float | None = None
     seed: int = 0
+    device: str = "cpu"
     matrix_world: tuple[tuple[float, ...], ...] = ((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1))
 
 
@@ -269,5 +272,6 @@ _KEYS: dict[str, Any] = {
     "courant": lambda r, k: r.number(k, 0.01, 1.0),
     "jitter": lambda r, k: r.optional(k, lambda key: r.number(key, 0, 1)),
     "seed": lambda r, k: r.whole(k, 0, 2**31 - 1),
+    "device": lambda r, k: r.choice(k, tuple(DEVICES)),
     "matrix_world": lambda r, k: r.matrix(k),
 }

@@ -13,9 +13,10 @@ from dataclasses import dataclass, field, fields
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..errors import Cancelled, UsageError
+from ..device.warp import DEVICES, name_of
+from ..errors import Cancelled, DeviceError, UsageError
 from ..matter import FLUID, SNOW, Matter
-from .blocks import Domain, arrange
+from .blocks import Domain, outside
 from .colliders import Collider, MovingCollider, check_apart
 from .contact import Plane, plane_rows
 from .fields import FieldRows
@@ -65,6 +66,7 @@ class Solver(Stepper):
         Where particles may be; leaving it is an error.
     forces, colliders, planes : what acts
     courant : time step in parts of what elastic waves and viscosity bear; above 1 is unstable
+    device : one of `DEVICES`; what it cannot do is done by this processor, with a warning
 
     Attributes
     ----------
@@ -80,6 +82,7 @@ class Solver(Stepper):
         colliders: Sequence[Collider] = (),
         planes: Sequence[Plane] = (),
         courant: float = 0.5,
+        device: str = "cpu",
     ) -> None:
         self.body, self.domain, self.forces = body, domain, forces or Forces()
         self.colliders = [MovingCollider(c, domain.spacing, domain.low, domain.high) for c in colliders]
@@ -100,13 +103,26 @@ class Solver(Stepper):
             padded(matter.parameters), padded(matter.keeps_shape), self._pins,
             np.float32(1e-9 * mass[:n].min(initial=np.inf)),
         )  # fmt: skip
-        self.grid: Grid = HostGrid(self._scene)
+        self.grid = self._grid_on(device)
         still = bool(len(self._pins) == n)
         h = domain.spacing
         fastest = float((matter.wave_speed / h + 2 * matter.diffusivity / h**2).max())
         self.rate = 0.0 if still else fastest / courant
         self.state = self._at_rest()
         self._check_start()
+
+    def _grid_on(self, device: str) -> Grid:
+        if device not in DEVICES:
+            raise UsageError(f"device {device!r}", "is unknown", f"Choose from {', '.join(DEVICES)}")
+        if device != "cpu":
+            from ..device.kernels import Launcher
+            from .device.grid import DeviceGrid
+
+            try:
+                return DeviceGrid(self._scene, Launcher(name_of(device)))
+            except DeviceError as error:
+                log.warning("%s Simulated on the CPU", error)
+        return HostGrid(self._scene)
 
     def _at_rest(self) -> State:
         body, n = self.body, len(self.body.points)
@@ -155,6 +171,22 @@ class Solver(Stepper):
         cancelled: Callable[[], bool] | None,
         progress: Callable[[float], None] | None,
     ) -> None:
+        steps = self.steps
+        try:
+            self._advance_on(self.grid, seconds, pin_targets, cancelled, progress)
+        except DeviceError as error:  # the state is still that at the beginning of the frame
+            log.warning("%s Simulated on the CPU from frame %d on", error, self.first + self.frame + 1)
+            self.grid, self.steps = HostGrid(self._scene), steps
+            self._advance_on(self.grid, seconds, pin_targets, cancelled, progress)
+
+    def _advance_on(
+        self,
+        grid: Grid,
+        seconds: float,
+        pin_targets: Array | None,
+        cancelled: Callable[[], bool] | None,
+        progress: Callable[[float], None] | None,
+    ) -> None:
         h = self.domain.spacing
         n = len(self.body.points)
         pin_velocity = np.zeros((len(self._pins), 3), np.float32)
@@ -174,7 +206,7 @@ class Solver(Stepper):
         speed = max(speed, outside)
         usual = min(1 / self.rate if self.rate else np.inf, seconds)
 
-        grid, done, drift = self.grid, 0.0, np.inf
+        done, drift = 0.0, np.inf
         grid.enter(self.state, self.frame, seconds, pin_velocity)
         while done < seconds * (1 - 1e-9):
             if cancelled is not None and cancelled():
@@ -234,7 +266,7 @@ class Solver(Stepper):
 
     def _check_inside(self, x: Array) -> None:
         """Refuse particles outside of the domain."""
-        lost = arrange(x, self.domain)[1]
+        lost = outside(x, self.domain)
         if len(lost):
             where = x[lost[0]]
             finite = bool(np.isfinite(where).all())

@@ -35,10 +35,15 @@ def _put(tau, p, u, a, b, c):  # type: ignore[no-untyped-def]
 @njit(inline="always")
 def _compose(f, p, u, a, b, c, v):  # type: ignore[no-untyped-def]
     """F = U diag(a, b, c) V^T, where `f` holds F - 1."""
-    for r in range(3):
-        for k in range(3):
-            whole = a * u[3 * r] * v[3 * k] + b * u[3 * r + 1] * v[3 * k + 1] + c * u[3 * r + 2] * v[3 * k + 2]
-            f[p, 3 * r + k] = whole - 1.0 if r == k else whole
+    f[p, 0] = a * u[0] * v[0] + b * u[1] * v[1] + c * u[2] * v[2] - 1.0
+    f[p, 1] = a * u[0] * v[3] + b * u[1] * v[4] + c * u[2] * v[5]
+    f[p, 2] = a * u[0] * v[6] + b * u[1] * v[7] + c * u[2] * v[8]
+    f[p, 3] = a * u[3] * v[0] + b * u[4] * v[1] + c * u[5] * v[2]
+    f[p, 4] = a * u[3] * v[3] + b * u[4] * v[4] + c * u[5] * v[5] - 1.0
+    f[p, 5] = a * u[3] * v[6] + b * u[4] * v[7] + c * u[5] * v[8]
+    f[p, 6] = a * u[6] * v[0] + b * u[7] * v[1] + c * u[8] * v[2]
+    f[p, 7] = a * u[6] * v[3] + b * u[7] * v[4] + c * u[8] * v[5]
+    f[p, 8] = a * u[6] * v[6] + b * u[7] * v[7] + c * u[8] * v[8] - 1.0
 
 
 @njit(inline="always")

@@ -16,7 +16,7 @@ from drgs_blender.engine.session import Session
 @pytest.fixture
 def warp_session(monkeypatch, asset_path):
     """A session for which Warp's processor is the card: the same code, without the card."""
-    monkeypatch.setattr("drgs_blender.render.device.devices._name", lambda device: "cpu")
+    monkeypatch.setattr("drgs_blender.render.device.devices.name_of", lambda device: "cpu")
     session = Session()
     session.load_asset(asset_path)
     return session
@@ -48,7 +48,7 @@ def test_viewports_grow_on_a_device(session, warp_session, make_frame):
 
 
 def test_without_a_card_a_frame_is_rendered_here_with_a_warning(session, make_frame, monkeypatch):
-    monkeypatch.setattr("drgs_blender.render.device.devices.cuda_devices", list)
+    monkeypatch.setattr("drgs_blender.device.warp.cuda_devices", list)
     expected = session.render(make_frame())
     found = session.render(make_frame(device="cuda"))
     assert any("no NVIDIA card" in warning and "CPU" in warning for warning in found.warnings)

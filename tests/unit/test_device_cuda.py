@@ -10,6 +10,7 @@ import pytest
 pytest.importorskip("warp", reason="warp-lang is not installed")
 
 import test_device_integrate
+import test_device_mpm
 import test_device_raster
 import warp
 from test_device_denoise import nothing, shots
@@ -17,6 +18,7 @@ from test_device_denoise import nothing, shots
 from drgs_blender.device.kernels import Launcher
 from drgs_blender.render.device import attach, denoise, integrate, raster, splats
 from drgs_blender.render.device.on_device import OnDevice
+from drgs_blender.simulate.device import cells, steps
 
 #: A100 and later.
 ARCHITECTURE = 80
@@ -60,6 +62,14 @@ def test_learnings_kernels_compile_for_a_card(tmp_path: Path) -> None:
     modules = kernels, losses, on_device
     works = {work for module in modules for work in vars(module).values() if isinstance(work, kernels.Work)}
     assert made(tuple(works), device.launcher, tmp_path) == works
+
+
+@pytest.mark.parametrize("case", ["all", "vortex"])
+def test_particles_kernels_compile_for_a_card(tmp_path: Path, case: str) -> None:
+    launcher = Launcher("cpu")
+    test_device_mpm.test_a_step_is_the_processors_to_the_last_digits(launcher, case)
+    works = cells.NUMBER, cells.LIST, cells.INDEX, cells.HOUSE, steps.PREPARE, steps.SOLVE, steps.MOVE, steps.TICK
+    assert made(works, launcher, tmp_path) == set(works)
 
 
 @pytest.mark.skipif(os.environ.get("DRGS_FAULTS") != "whole", reason="takes minutes; DRGS_FAULTS=whole runs it")

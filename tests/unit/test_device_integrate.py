@@ -231,7 +231,7 @@ def test_an_empty_scene_and_hopeless_points_are_survived(device: OnDevice) -> No
 
 
 def test_without_a_card_the_processor_does_all_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("drgs_blender.render.device.devices.cuda_devices", list)
+    monkeypatch.setattr("drgs_blender.device.warp.cuda_devices", list)
     devices, settings = Devices(), replace(SETTINGS, device="cuda")
     assert devices.processor("cuda") is HERE
     (warning,) = devices.warnings(settings)

@@ -11,6 +11,7 @@ import pytest
 
 pytest.importorskip("warp", reason="warp-lang is not installed")
 
+from drgs_blender.device.kernels import Launcher, Work
 from drgs_blender.device.translate import Native, Translation
 from drgs_blender.device.typed import Array, Struct, TranslationError
 from drgs_blender.device.warp import load_module, warp
@@ -213,6 +214,45 @@ def test_named_tuples_are_taken_and_made() -> None:
     np.testing.assert_array_equal(on_device(structures, columns, extra), here(structures, columns, extra))
 
 
+def powers(a, b, n):  # type: ignore[no-untyped-def]
+    x, y = float(abs(a)) + 0.1, float(b)
+    return x**-y, (abs(a) + ONE) ** b, np.sin(4 * x), np.cos(4 * x), np.arccos(b), np.degrees(y)
+
+
+def test_powers_and_angles() -> None:
+    """By another library than the processor's, so the last digits may differ."""
+    columns = [*floats(64, (-1, 1), (-1, 1)), np.arange(64)]
+    np.testing.assert_allclose(on_device(powers, columns), here(powers, columns), rtol=5e-7, atol=1e-7)
+
+
+def rows_of(lane, lanes, room, table, out):  # type: ignore[no-untyped-def]
+    for i in range(lane, len(table), lanes):
+        row = table[i]
+        out[0][i] = _inner(row[1], table[i, 0]) + len(row)
+
+
+@njit
+def _inner(a, b):  # type: ignore[no-untyped-def]
+    return a[0] * b[1] + a.shape[0]
+
+
+def test_rows_of_arrays_are_arrays() -> None:
+    table, found = np.random.default_rng(1).normal(size=(9, 2, 3)), np.zeros(9)
+    Launcher("cpu").launch(Work(rows_of, (), {}), 9, [table], [found])
+    np.testing.assert_array_equal(found, table[:, 1, 0] * table[:, 0, 1] + 3 + 2)
+
+
+def test_a_recorded_launch_does_its_work_whenever_it_is_called() -> None:
+    launcher = Launcher("cpu")
+    table, found = launcher.array(np.ones((9, 2, 3)), copy=True), launcher.zeros((9,), "float64")
+    again = launcher.recorded(Work(rows_of, (), {}), 9, [table], [found])
+    assert not found.numpy().any()
+    for value in (1.0, 2.0):
+        table.fill_(value)
+        again()
+        np.testing.assert_array_equal(found.numpy(), value * value + 3 + 2)
+
+
 def test_what_is_not_reached_is_not_read() -> None:
     """Conditions end early on a device too: the second operand here would be read at address 0."""
     from drgs_blender.render.memory import load_float
@@ -238,6 +278,11 @@ def _two_types(a):  # type: ignore[no-untyped-def]
     return x
 
 
+def _counts(a):  # type: ignore[no-untyped-def]
+    pair = a, a
+    return pair[int(a)]
+
+
 def _unknown(a):  # type: ignore[no-untyped-def]
     return np.linalg.norm(a)
 
@@ -252,6 +297,7 @@ _makes_a_list_compiled = njit(_makes_a_list)
 
 @pytest.mark.parametrize("function, words", [
     (_makes_a_list, "[a]"), (_two_types, "x: is float32 here and float64 there"), (_unknown, "norm"),
+    (_counts, "pair[int(a)]"),
     (_calls_it, "[a]"),
 ])  # fmt: skip
 def test_what_cannot_be_translated_is_named_with_its_line(function: Callable, words: str) -> None:

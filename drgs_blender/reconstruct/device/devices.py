@@ -6,8 +6,8 @@ import logging
 
 import torch
 
+from ...device.warp import name_of
 from ...errors import DeviceError
-from ...render.device.devices import name_of
 from ..processor import HERE, Processor
 from .on_device import OnDevice
 

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from ...device.warp import cuda_devices, warp
+from ...device.warp import name_of, warp
 from ...errors import DeviceError
 from ...frame import RenderSettings
 from ..processor import HERE, Processor
 from .on_device import OnDevice
 
-#: ``RenderSettings.device``, and what each stands for.
-DEVICES = {"cpu": "this processor", "cuda": "the first NVIDIA card"}
 #: Failures after which a device is left alone; before, the next picture tries it again: its scene may be smaller.
 _TRIES = 3
 
@@ -58,22 +56,3 @@ def card() -> str:
     """
     device = warp().get_device(name_of("cuda"))
     return f"{device.name}, {device.total_memory / 2**30:.0f} GiB, sm_{device.arch}"
-
-
-def name_of(device: str) -> str:
-    """Warp's name of a device.
-
-    Raises
-    ------
-    DeviceError
-        Where there is none.
-    """
-    if device not in DEVICES:
-        raise DeviceError(f"device {device!r}", "is unknown", f"Choose from {', '.join(DEVICES)}")
-    warp()
-    found = cuda_devices()
-    if not found:
-        raise DeviceError(
-            "device cuda", "no NVIDIA card with a driver was found", "Install or update its driver, or use the CPU"
-        )
-    return found[0]
