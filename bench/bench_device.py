@@ -1,6 +1,6 @@
-"""A picture and its light on every device there is: the same samples, how alike they are, and seconds.
+"""A picture, its light, and learning from photographs on every device there is: how alike they are, and seconds.
 
-python bench/bench_device.py [--size 800] [--runs 5]
+python bench/bench_device.py [--size 800] [--runs 5] [--learn-size 400] [--steps 1000] [--surfels 16000]
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 import ours
 from judge import environments, frame_camera
+from learning import learning
 from ours import pinhole
 from report import table, write_section
 from subjects import asset_path
@@ -78,6 +79,9 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=800)
     parser.add_argument("--runs", type=int, default=5)
     parser.add_argument("--asset", default="cat")
+    parser.add_argument("--learn-size", type=int, default=400, help="of the photographs that are learned from")
+    parser.add_argument("--steps", type=int, default=1000, help="of learning")
+    parser.add_argument("--surfels", type=int, default=16000, help="that are learned, at most")
     options = parser.parse_args()
     mesh = read_asset(asset_path(options.asset, max_triangles=82000)).mesh
     scene = TraceScene()
@@ -131,6 +135,9 @@ def main() -> None:
         "the session that Blender talks to. Held to: 60 a second on a data-centre card.\n\n"
     )
     body += frames(options, cards)
+    body += "\n\n" + learning(
+        asset_path(options.asset, max_triangles=82000), options.learn_size, options.steps, options.surfels, NOT_MEASURED
+    )
     if cards:
         body += f"\n\nCard: {warp().get_device(cards[0]).name}."
     write_section("device", "Devices", body)

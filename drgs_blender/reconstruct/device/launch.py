@@ -47,5 +47,5 @@ class TensorLauncher(Launcher):
             yield
             return
         wp = warp()
-        with wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(self.place))):
+        with wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(self.place)), sync_enter=False):
             yield
