@@ -1,6 +1,7 @@
-"""A picture, its light, and learning from photographs on every device there is: how alike they are, and seconds.
+"""A picture, its light, matter, and learning from photographs on every device: how alike they are, and seconds.
 
 python bench/bench_device.py [--size 800] [--runs 5] [--learn-size 400] [--steps 1000] [--surfels 16000]
+                             [--particles 100000]
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 import ours
+from device_matter import matter
 from judge import environments, frame_camera
 from learning import learning
 from ours import pinhole
@@ -82,6 +84,7 @@ def main() -> None:
     parser.add_argument("--learn-size", type=int, default=400, help="of the photographs that are learned from")
     parser.add_argument("--steps", type=int, default=1000, help="of learning")
     parser.add_argument("--surfels", type=int, default=16000, help="that are learned, at most")
+    parser.add_argument("--particles", type=int, default=100_000, help="of simulated matter")
     options = parser.parse_args()
     mesh = read_asset(asset_path(options.asset, max_triangles=82000)).mesh
     scene = TraceScene()
@@ -135,6 +138,7 @@ def main() -> None:
         "the session that Blender talks to. Held to: 60 a second on a data-centre card.\n\n"
     )
     body += frames(options, cards)
+    body += matter(options.particles, 24)
     body += "\n\n" + learning(
         asset_path(options.asset, max_triangles=82000), options.learn_size, options.steps, options.surfels, NOT_MEASURED
     )

@@ -60,6 +60,7 @@ class Program:
     inputs : folder of the capture
     folder : the cache; what it holds of other settings is removed
     threads : 0 for all cores
+    device : "cpu" or "cuda"
 
     Attributes
     ----------
@@ -71,7 +72,7 @@ class Program:
         There is no engine, or it cannot be started.
     """
 
-    def __init__(self, inputs: Path, folder: Path, threads: int = 0) -> None:
+    def __init__(self, inputs: Path, folder: Path, threads: int = 0, device: str = "cpu") -> None:
         self._counts: tuple[int, int] | None = None
         self._inputs, self._folder = inputs, folder
         self._said, self._log = inputs / capture.SAID, inputs / capture.LOG
@@ -80,7 +81,7 @@ class Program:
         self.name = f"drgs simulate of {python[0]}"
         options = {"creationflags": subprocess.CREATE_NO_WINDOW} if sys.platform == "win32" else {}
         arguments = [inputs / capture.BODY, "--settings", inputs / capture.SETTINGS, "--out", folder]
-        arguments += ["--overwrite", "--threads", str(threads)]
+        arguments += ["--overwrite", "--threads", str(threads), "--device", device]
         try:
             with open(self._said, "wb") as said, open(self._log, "wb") as log:
                 self._process = subprocess.Popen(

@@ -72,6 +72,7 @@ class Work:
         self.folder, self.cancelled = folder, False
         self._inputs = inputs
         self._threads = scene.render.threads if scene.render.threads_mode == "FIXED" else 0
+        self._device = scene.drgs.device.lower() if obj.drgs.matter.solver == "mpm" else "cpu"
         self._capture = capture.capture(obj, scene, inputs, still=still)
         self._captured = 0.0
         self._program: Program | None = None
@@ -98,7 +99,7 @@ class Work:
                     return False
             if ending():
                 return False
-            self._program = Program(self._inputs, self.folder, self._threads)
+            self._program = Program(self._inputs, self.folder, self._threads, self._device)
             return False
         alive = self._program.alive
         if self._take(seconds) or alive:

@@ -308,6 +308,22 @@ def test_a_material_fills_its_numbers_in(body, scene, name):
     assert describe.describe(body, scene)["material"] == {"name": name, "density": 777}
 
 
+def test_matter_is_baked_on_the_device_of_the_scene(body, scene):
+    """What has no form for a card is not asked of it, and another device is no other simulation."""
+    body.drgs.matter.frame_end = 3
+    asked = []
+    for device, solver in (("CPU", "mpm"), ("CUDA", "xpbd"), ("CUDA", "mpm")):
+        scene.drgs.device, body.drgs.matter.solver = device, solver
+        bake = begin_of(work.Bake(body, scene), 2)
+        arguments = bake._program._process.args
+        asked.append(arguments[arguments.index("--device") + 1])
+        bake.close()
+        assert not work.cached(body, scene).changed
+    assert asked == ["cpu", "cpu", "cuda"]
+    scene.drgs.device = "CPU"
+    assert not work.cached(body, scene).changed
+
+
 def test_the_played_file_is_never_of_two_bakes(tmp_path):
     """It grows by what is new; another bake in the same folder begins it anew, a kill between two writes does not."""
     cache = particle_cache.ParticleCache(tmp_path)
