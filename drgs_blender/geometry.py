@@ -55,14 +55,18 @@ class VertexNormals:
     ----------
     faces : (m, 3) int, counter-clockwise seen from outside
     n_vertices : number of vertices
+
+    Attributes
+    ----------
+    start, place : (n_vertices + 1,), (3 m,) int32: the rows of each vertex's corners, and the row of each corner
     """
 
     def __init__(self, faces: Array, n_vertices: int) -> None:
         self.faces = np.ascontiguousarray(faces, dtype=np.int32)
         self.n_vertices = int(n_vertices)
         self.start, corner = corner_table(self.faces, self.n_vertices)
-        self._place = np.empty(len(corner), np.int32)
-        self._place[corner] = np.arange(len(corner), dtype=np.int32)
+        self.place = np.empty(len(corner), np.int32)
+        self.place[corner] = np.arange(len(corner), dtype=np.int32)
         self._weighted = np.empty((len(corner), 3), np.float32)
 
     def __call__(self, vertices: Array) -> Array:
@@ -82,7 +86,7 @@ class VertexNormals:
         vertices : (n, 3) float32
         faces : (m, 3) int32: those of this object, of which some may be collapsed to a point
         """
-        empty = _weigh(vertices, faces, self._place, self._weighted)
+        empty = _weigh(vertices, faces, self.place, self._weighted)
         _sum(self._weighted, self.start, normals)
         return int(empty)
 
@@ -117,13 +121,46 @@ def _angle(y: Any, x: Any) -> Any:
     return np.float32(math.pi) - p if x < np.float32(0.0) else p
 
 
+@njit(inline="always")
+def face_normal(ux: Any, uy: Any, uz: Any, vx: Any, vy: Any, vz: Any) -> Any:
+    """Unit normal and the angles of a face with edges u, v at its first corner; zeros if it has no area."""
+    zero, one = np.float32(0.0), np.float32(1.0)
+    uu, vv, uv = ux * ux + uy * uy + uz * uz, vx * vx + vy * vy + vz * vz, ux * vx + uy * vy + uz * vz
+    nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+    area = np.sqrt(nx * nx + ny * ny + nz * nz)
+    proper = (area > np.float32(1e-10) * (uu + vv)) & (area < np.float32(1e18))
+    area = area if proper else one
+    scale = one / area
+    return (
+        nx * scale if proper else zero,
+        ny * scale if proper else zero,
+        nz * scale if proper else zero,
+        _angle(area, uv) if proper else zero,
+        _angle(area, uu - uv) if proper else zero,
+        _angle(area, vv - uv) if proper else zero,
+    )
+
+
+@njit(inline="always")
+def vertex_normal(weighted: Any, first: Any, last: Any) -> Any:
+    """Unit sum of the weighted normals in some rows, always in the same order."""
+    x = y = z = np.float32(0.0)
+    for i in range(first, last):
+        x, y, z = x + weighted[i, 0], y + weighted[i, 1], z + weighted[i, 2]
+    length = np.sqrt(x * x + y * y + z * z)
+    if length > np.float32(1e-6):
+        scale = np.float32(1.0) / length
+        return x * scale, y * scale, z * scale
+    return np.float32(0.0), np.float32(0.0), np.float32(1.0)
+
+
 @njit(parallel=True)
 def _weigh(vertices: Array, faces: Array, place: Array, weighted: Array) -> int:
     """Put angle x unit normal of each face corner where its vertex looks for it; return how many faces have no area.
 
     Scattering here lets `_sum` read in order: twice as fast as gathering there, where one misses the cache and waits.
     """
-    zero, one = np.float32(0.0), np.float32(1.0)
+    zero = np.float32(0.0)
     m = len(faces)
     empty = 0
     for block in prange((m + _BLOCK - 1) // _BLOCK):
@@ -138,19 +175,9 @@ def _weigh(vertices: Array, faces: Array, place: Array, weighted: Array) -> int:
             s[0, i], s[1, i], s[2, i] = vertices[b, 0] - x, vertices[b, 1] - y, vertices[b, 2] - z
             s[3, i], s[4, i], s[5, i] = vertices[c, 0] - x, vertices[c, 1] - y, vertices[c, 2] - z
         for i in range(count):
-            ux, uy, uz, vx, vy, vz = s[0, i], s[1, i], s[2, i], s[3, i], s[4, i], s[5, i]
-            uu, vv, uv = ux * ux + uy * uy + uz * uz, vx * vx + vy * vy + vz * vz, ux * vx + uy * vy + uz * vz
-            nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-            area = np.sqrt(nx * nx + ny * ny + nz * nz)
-            proper = (area > np.float32(1e-10) * (uu + vv)) & (area < np.float32(1e18))
-            area = area if proper else one
-            scale = one / area
-            s[0, i] = nx * scale if proper else zero
-            s[1, i] = ny * scale if proper else zero
-            s[2, i] = nz * scale if proper else zero
-            s[3, i] = _angle(area, uv) if proper else zero
-            s[4, i] = _angle(area, uu - uv) if proper else zero
-            s[5, i] = _angle(area, vv - uv) if proper else zero
+            s[0, i], s[1, i], s[2, i], s[3, i], s[4, i], s[5, i] = face_normal(
+                s[0, i], s[1, i], s[2, i], s[3, i], s[4, i], s[5, i]
+            )
         for i in range(count):
             x, y, z = s[0, i], s[1, i], s[2, i]
             lost += x == zero and y == zero and z == zero
@@ -163,17 +190,8 @@ def _weigh(vertices: Array, faces: Array, place: Array, weighted: Array) -> int:
 
 @njit(parallel=True)
 def _sum(weighted: Array, start: Array, normals: Array) -> None:
-    """Sum the weighted face normals of each vertex, always in the same order."""
     for v in prange(len(normals)):
-        x = y = z = np.float32(0.0)
-        for i in range(start[v], start[v + 1]):
-            x, y, z = x + weighted[i, 0], y + weighted[i, 1], z + weighted[i, 2]
-        length = np.sqrt(x * x + y * y + z * z)
-        if length > np.float32(1e-6):
-            scale = np.float32(1.0) / length
-            normals[v, 0], normals[v, 1], normals[v, 2] = x * scale, y * scale, z * scale
-        else:
-            normals[v, 0], normals[v, 1], normals[v, 2] = np.float32(0.0), np.float32(0.0), np.float32(1.0)
+        normals[v, 0], normals[v, 1], normals[v, 2] = vertex_normal(weighted, start[v], start[v + 1])
 
 
 def unit(vectors: Array, fallback: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> Array:

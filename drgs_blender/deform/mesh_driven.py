@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,6 +23,31 @@ from .faces import Faces
 
 Array = np.ndarray
 log = logging.getLogger(__name__)
+
+#: Surfels of a block.
+_BLOCK = 256
+
+
+class Posing(NamedTuple):
+    """What a pose is made from, checked.
+
+    Attributes
+    ----------
+    vertices : (n, 3) float32, world space
+    normals : (3 m, 3) float32 of the corners; None: smooth ones are to be made
+    bent : (m, 3) int32, faces that smooth normals are made from: those that are torn are points
+    linear, side : see `pose_surfels`
+    opacity : of the surfels where all vertices are finite
+    channels : materials of the surfels; the asset's own arrays where nothing was edited
+    """
+
+    vertices: Array
+    normals: Array | None
+    bent: Array
+    linear: Array
+    side: float
+    opacity: Array
+    channels: dict[str, Array]
 
 
 class MeshDriven:
@@ -38,6 +64,9 @@ class MeshDriven:
         face's edges, since such a face has no deformation gradient.
     lost : int
         Surfels of the last pose whose face had a vertex that was not finite; they are transparent.
+    rest : tuple of arrays
+        What `pose_surfels` reads of the binding: face, weights, offset in metres, the faces' mean edge where they have
+        no area (else 0), normal, and the tangents in the frame of edges and normal.
     """
 
     def __init__(self, mesh: Mesh, surfels: Surfels, binding: Binding) -> None:
@@ -55,8 +84,8 @@ class MeshDriven:
         self.degenerate_faces = int(faces.degenerate.sum())
         self.lost = 0
         face, corners = binding.face, faces.corners
-        self._offset = (binding.offset * faces.mean_edge[face]).astype(np.float32)
-        self._rest_edge = np.where(faces.degenerate, faces.mean_edge, 0).astype(np.float32)  # 0: a proper face
+        offset = (binding.offset * faces.mean_edge[face]).astype(np.float32)
+        rest_edge = np.where(faces.degenerate, faces.mean_edge, 0).astype(np.float32)  # 0: a proper face
 
         tangents = rotation_matrices(surfels.rotation.astype(np.float64))[..., :2] * surfels.scale[:, None, :]
         basis = np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], faces.normal], -1)
@@ -66,7 +95,8 @@ class MeshDriven:
             for f in np.flatnonzero(faces.degenerate):
                 frame = _tangent_frame(*basis[f, :, 0].tolist(), *basis[f, :, 1].tolist(), *smooth[f].tolist())
                 basis[f] = np.reshape(frame, (3, 3)).T
-        self._coordinates = np.ascontiguousarray(np.linalg.inv(basis)[face] @ tangents, dtype=np.float32)
+        coordinates = np.ascontiguousarray(np.linalg.inv(basis)[face] @ tangents, dtype=np.float32)
+        self.rest = binding.face, binding.barycentric, offset, rest_edge, binding.normal, coordinates
 
     def pose(
         self,
@@ -98,43 +128,49 @@ class MeshDriven:
         PosedSurfels
             Always finite. A collapsed face yields flat or vanishing tangents and a finite normal.
         """
+        posing = self.posing(vertices_world, corner_normals_world, materials, matrix_world, torn)
+        by_corner, normals = posing.normals is not None, posing.normals
+        if normals is None:
+            normals = np.empty_like(posing.vertices)
+            self.normals.into(posing.vertices, posing.bent, normals)
+            if posing.side < 0:
+                normals = -normals
+        n = len(self.surfels)
+        opacity = posing.opacity.copy()
+        centre, tangent_u, tangent_v, normal = (np.empty((n, 3), np.float32) for _ in range(4))
+        _pose(
+            (posing.vertices, self.mesh.faces, normals), by_corner, posing.linear, posing.side, self.rest,
+            (centre, tangent_u, tangent_v, normal, opacity),
+        )  # fmt: skip
+        self.lost = int(np.count_nonzero(opacity != posing.opacity))
+        if self.lost:
+            log.debug("%d surfels hang on vertices that are not finite; they are hidden", self.lost)
+        owner = np.full(n, object_index, np.int32)
+        return PosedSurfels(centre, tangent_u, tangent_v, normal, opacity, **posing.channels, object_index=owner)
+
+    def posing(
+        self, vertices_world: Array, corner_normals_world: Array | None, materials: Mapping[str, Array | None] | None,
+        matrix_world: Array | None, torn: Array | None,
+    ) -> Posing:  # fmt: skip
+        """What a pose is made from; parameters as of `pose`."""
         vertices = np.ascontiguousarray(vertices_world, dtype=np.float32)
         if vertices.shape != self.mesh.vertices.shape:
             raise AssetError(
                 "mesh", f"has {len(vertices)} vertices but was bound with {len(self.mesh.vertices)}", "Bind it again"
             )
-        linear = np.eye(3) if matrix_world is None else np.asarray(matrix_world, np.float64)[:3, :3]
-        side = -1.0 if np.linalg.det(linear) < 0 else 1.0
-        by_corner = corner_normals_world is not None
-        if corner_normals_world is None:
-            normals = np.empty_like(vertices)
-            faces = self.normals.faces if torn is None else np.where(torn[:, None], np.int32(0), self.normals.faces)
-            self.normals.into(vertices, faces, normals)
-            if side < 0:
-                normals = -normals
-        else:
-            normals = np.ascontiguousarray(corner_normals_world, dtype=np.float32).reshape(-1, 3)
+        linear = np.eye(3) if matrix_world is None else np.ascontiguousarray(matrix_world, np.float64)[:3, :3].copy()
+        normals = corner_normals_world
+        if normals is not None:
+            normals = np.ascontiguousarray(normals, dtype=np.float32).reshape(-1, 3)
             if len(normals) != 3 * len(self.mesh.faces):
                 raise AssetError("corner normals", f"are {len(normals)}, expected {3 * len(self.mesh.faces)}")
-
-        n = len(self.surfels)
-        centre, tangent_u, tangent_v, normal = (np.empty((n, 3), np.float32) for _ in range(4))
-        opacity = self.surfels.opacity.copy()
-        binding = self.binding
-        _pose(
-            vertices, self.mesh.faces, normals, by_corner, linear, side,
-            binding.face, binding.barycentric, self._offset, self._rest_edge, binding.normal, self._coordinates,
-            centre, tangent_u, tangent_v, normal, opacity,
-        )  # fmt: skip
-        self.lost = int(np.count_nonzero(opacity != self.surfels.opacity))
-        if self.lost:
-            log.debug("%d surfels hang on vertices that are not finite; they are hidden", self.lost)
+        bent, opacity = self.normals.faces, self.surfels.opacity
         if torn is not None:
-            opacity[torn[binding.face]] = 0
+            bent = np.where(torn[:, None], np.int32(0), bent)
+            opacity = np.where(torn[self.binding.face], np.float32(0.0), opacity)
         channels = {name: self._channel(name, (materials or {}).get(name)) for name in MATERIAL_CHANNELS}
-        return PosedSurfels(
-            centre, tangent_u, tangent_v, normal, opacity, **channels, object_index=np.full(n, object_index, np.int32)
-        )
+        side = -1.0 if np.linalg.det(linear) < 0 else 1.0
+        return Posing(vertices, normals, bent, linear, side, opacity, channels)
 
     def _channel(self, name: str, edited: Array | None) -> Array:
         """A material channel of the surfels after the vertices' values became `edited`."""
@@ -184,87 +220,108 @@ def _tangent_frame(
 
 
 @njit(parallel=True)
-def _pose(
-    vertices: Array, faces: Array, normals: Array, by_corner: bool, linear: Array, side: float,
-    face: Array, weights: Array, offset: Array, rest_edge: Array, local_normal: Array, coordinates: Array,
-    centre: Array, tangent_u: Array, tangent_v: Array, normal: Array, opacity: Array,
-) -> None:  # fmt: skip
-    """One surfel an iteration; arithmetic in double so that a small object far from the origin stays exact."""
-    for i in prange(len(face)):
-        f = face[i]
-        ia, ib, ic = faces[f, 0], faces[f, 1], faces[f, 2]
-        wa, wb, wc = np.float64(weights[i, 0]), np.float64(weights[i, 1]), np.float64(weights[i, 2])
-        ax, ay, az = np.float64(vertices[ia, 0]), np.float64(vertices[ia, 1]), np.float64(vertices[ia, 2])
-        ux, uy, uz = vertices[ib, 0] - ax, vertices[ib, 1] - ay, vertices[ib, 2] - az
-        vx, vy, vz = vertices[ic, 0] - ax, vertices[ic, 1] - ay, vertices[ic, 2] - az
-        size = abs(ax) + abs(ay) + abs(az) + abs(ux) + abs(uy) + abs(uz) + abs(vx) + abs(vy) + abs(vz)
-        if not (size < 1e30):  # a comparison: math.isfinite(a + b) is folded to True when sums may be reordered
-            opacity[i] = 0.0
-            for k in range(3):
-                centre[i, k] = tangent_u[i, k] = tangent_v[i, k] = 0.0
-                normal[i, k] = 1.0 if k == 2 else 0.0
-            continue
+def _pose(mesh: Any, by_corner: bool, linear: Array, side: float, rest: Any, out: Any) -> None:
+    blocks = (len(rest[0]) + _BLOCK - 1) // _BLOCK
+    for block in prange(blocks):
+        pose_surfels(block, blocks, 0, mesh, by_corner, linear, side, rest, out)
 
-        # Smooth normal: of the vertices or of the corners.
-        ja, jb, jc = (3 * f, 3 * f + 1, 3 * f + 2) if by_corner else (ia, ib, ic)
-        pa, pb, pc = max(wa, 0.0), max(wb, 0.0), max(wc, 0.0)  # weights may leave the face, its normal does not
-        sx = pa * normals[ja, 0] + pb * normals[jb, 0] + pc * normals[jc, 0]
-        sy = pa * normals[ja, 1] + pb * normals[jb, 1] + pc * normals[jc, 1]
-        sz = pa * normals[ja, 2] + pb * normals[jb, 2] + pc * normals[jc, 2]
 
-        # Outward unit face normal; a collapsed face takes the smooth one.
-        nx, ny, nz = side * (uy * vz - uz * vy), side * (uz * vx - ux * vz), side * (ux * vy - uy * vx)
-        length = math.sqrt(nx * nx + ny * ny + nz * nz)
-        uu, vv = ux * ux + uy * uy + uz * uz, vx * vx + vy * vy + vz * vz
-        if not (length > 1e-10 * (uu + vv)):
-            nx, ny, nz = sx, sy, sz
+@njit
+def pose_surfels(
+    lane: Any, lanes: Any, room: Any, mesh: Any, by_corner: Any, linear: Any, side: Any, rest: Any, out: Any
+) -> None:
+    """Pose every so-manyth (`lanes`) block of surfels, from the `lane`-th on.
+
+    Arithmetic in double so that a small object far from the origin stays exact.
+
+    Parameters
+    ----------
+    room : not used
+    mesh : posed vertices, faces, normals of the vertices or (`by_corner`) of the corners
+    linear, side : (3, 3) float64 of the object's matrix, and -1 if that mirrors, else 1
+    rest : `MeshDriven.rest`
+    out : centre, tangent_u, tangent_v, normal, opacity; the last is written where a vertex is not finite
+    """
+    vertices, faces, normals = mesh
+    face, weights, offset, rest_edge, local_normal, coordinates = rest
+    centre, tangent_u, tangent_v, normal, opacity = out
+    for block in range(lane, (len(face) + _BLOCK - 1) // _BLOCK, lanes):
+        for i in range(block * _BLOCK, min((block + 1) * _BLOCK, len(face))):
+            f = face[i]
+            ia, ib, ic = faces[f, 0], faces[f, 1], faces[f, 2]
+            wa, wb, wc = np.float64(weights[i, 0]), np.float64(weights[i, 1]), np.float64(weights[i, 2])
+            ax, ay, az = np.float64(vertices[ia, 0]), np.float64(vertices[ia, 1]), np.float64(vertices[ia, 2])
+            ux, uy, uz = vertices[ib, 0] - ax, vertices[ib, 1] - ay, vertices[ib, 2] - az
+            vx, vy, vz = vertices[ic, 0] - ax, vertices[ic, 1] - ay, vertices[ic, 2] - az
+            size = abs(ax) + abs(ay) + abs(az) + abs(ux) + abs(uy) + abs(uz) + abs(vx) + abs(vy) + abs(vz)
+            if not (size < 1e30):  # a comparison: math.isfinite(a + b) is folded to True when sums may be reordered
+                opacity[i] = 0.0
+                for k in range(3):
+                    centre[i, k] = tangent_u[i, k] = tangent_v[i, k] = 0.0
+                    normal[i, k] = 1.0 if k == 2 else 0.0
+                continue
+
+            # Smooth normal: of the vertices or of the corners.
+            ja, jb, jc = (3 * f, 3 * f + 1, 3 * f + 2) if by_corner else (ia, ib, ic)
+            pa, pb, pc = max(wa, 0.0), max(wb, 0.0), max(wc, 0.0)  # weights may leave the face, its normal does not
+            sx = pa * normals[ja, 0] + pb * normals[jb, 0] + pc * normals[jc, 0]
+            sy = pa * normals[ja, 1] + pb * normals[jb, 1] + pc * normals[jc, 1]
+            sz = pa * normals[ja, 2] + pb * normals[jb, 2] + pc * normals[jc, 2]
+
+            # Outward unit face normal; a collapsed face takes the smooth one.
+            nx, ny, nz = side * (uy * vz - uz * vy), side * (uz * vx - ux * vz), side * (ux * vy - uy * vx)
+            length = math.sqrt(nx * nx + ny * ny + nz * nz)
+            uu, vv = ux * ux + uy * uy + uz * uz, vx * vx + vy * vy + vz * vz
+            if not (length > 1e-10 * (uu + vv)):
+                nx, ny, nz = sx, sy, sz
+                length = math.sqrt(nx * nx + ny * ny + nz * nz)
+                if not (length > 1e-12):
+                    nx, ny, nz, length = 0.0, 0.0, 1.0, 1.0
+            nx, ny, nz = nx / length, ny / length, nz / length
+            if not (sx * sx + sy * sy + sz * sz > 1e-12):
+                sx, sy, sz = nx, ny, nz
+            tx, ty, tz, bx, by, bz, sx, sy, sz = _tangent_frame(ux, uy, uz, vx, vy, vz, sx, sy, sz)
+
+            # What stands off the surface goes through matrix_world: A normalise(A^T n), A its linear part.
+            ox = linear[0, 0] * nx + linear[1, 0] * ny + linear[2, 0] * nz
+            oy = linear[0, 1] * nx + linear[1, 1] * ny + linear[2, 1] * nz
+            oz = linear[0, 2] * nx + linear[1, 2] * ny + linear[2, 2] * nz
+            length = math.sqrt(ox * ox + oy * oy + oz * oz)
+            length = 1.0 / length if length > 1e-300 else 0.0
+            ox, oy, oz = ox * length, oy * length, oz * length
+            hx = linear[0, 0] * ox + linear[0, 1] * oy + linear[0, 2] * oz
+            hy = linear[1, 0] * ox + linear[1, 1] * oy + linear[1, 2] * oz
+            hz = linear[2, 0] * ox + linear[2, 1] * oy + linear[2, 2] * oz
+
+            d = np.float64(offset[i])
+            centre[i, 0] = ax + wb * ux + wc * vx + d * hx
+            centre[i, 1] = ay + wb * uy + wc * vy + d * hy
+            centre[i, 2] = az + wb * uz + wc * vz + d * hz
+
+            if rest_edge[f] > 0.0:
+                wx, wy, wz = vx - ux, vy - uy, vz - uz
+                edges = math.sqrt(uu) + math.sqrt(vv) + math.sqrt(wx * wx + wy * wy + wz * wz)
+                grow = edges / (3.0 * rest_edge[f])
+                ux, uy, uz = grow * tx, grow * ty, grow * tz
+                vx, vy, vz = side * grow * bx, side * grow * by, side * grow * bz
+                hx, hy, hz = grow * sx, grow * sy, grow * sz
+            p, q, r = coordinates[i, 0, 0], coordinates[i, 1, 0], coordinates[i, 2, 0]
+            tangent_u[i, 0] = ux * p + vx * q + hx * r
+            tangent_u[i, 1] = uy * p + vy * q + hy * r
+            tangent_u[i, 2] = uz * p + vz * q + hz * r
+            p, q, r = coordinates[i, 0, 1], coordinates[i, 1, 1], coordinates[i, 2, 1]
+            tangent_v[i, 0] = ux * p + vx * q + hx * r
+            tangent_v[i, 1] = uy * p + vy * q + hy * r
+            tangent_v[i, 2] = uz * p + vz * q + hz * r
+
+            lx, ly, lz = np.float64(local_normal[i, 0]), side * local_normal[i, 1], np.float64(local_normal[i, 2])
+            nx = tx * lx + bx * ly + sx * lz
+            ny = ty * lx + by * ly + sy * lz
+            nz = tz * lx + bz * ly + sz * lz
             length = math.sqrt(nx * nx + ny * ny + nz * nz)
             if not (length > 1e-12):
-                nx, ny, nz, length = 0.0, 0.0, 1.0, 1.0
-        nx, ny, nz = nx / length, ny / length, nz / length
-        if not (sx * sx + sy * sy + sz * sz > 1e-12):
-            sx, sy, sz = nx, ny, nz
-        tx, ty, tz, bx, by, bz, sx, sy, sz = _tangent_frame(ux, uy, uz, vx, vy, vz, sx, sy, sz)
-
-        # What stands off the surface goes through matrix_world: A normalise(A^T n), A its linear part.
-        ox = linear[0, 0] * nx + linear[1, 0] * ny + linear[2, 0] * nz
-        oy = linear[0, 1] * nx + linear[1, 1] * ny + linear[2, 1] * nz
-        oz = linear[0, 2] * nx + linear[1, 2] * ny + linear[2, 2] * nz
-        length = math.sqrt(ox * ox + oy * oy + oz * oz)
-        length = 1.0 / length if length > 1e-300 else 0.0
-        ox, oy, oz = ox * length, oy * length, oz * length
-        hx = linear[0, 0] * ox + linear[0, 1] * oy + linear[0, 2] * oz
-        hy = linear[1, 0] * ox + linear[1, 1] * oy + linear[1, 2] * oz
-        hz = linear[2, 0] * ox + linear[2, 1] * oy + linear[2, 2] * oz
-
-        d = np.float64(offset[i])
-        centre[i, 0] = ax + wb * ux + wc * vx + d * hx
-        centre[i, 1] = ay + wb * uy + wc * vy + d * hy
-        centre[i, 2] = az + wb * uz + wc * vz + d * hz
-
-        if rest_edge[f] > 0.0:
-            wx, wy, wz = vx - ux, vy - uy, vz - uz
-            edges = math.sqrt(uu) + math.sqrt(vv) + math.sqrt(wx * wx + wy * wy + wz * wz)
-            grow = edges / (3.0 * rest_edge[f])
-            ux, uy, uz = grow * tx, grow * ty, grow * tz
-            vx, vy, vz = side * grow * bx, side * grow * by, side * grow * bz
-            hx, hy, hz = grow * sx, grow * sy, grow * sz
-        c = coordinates[i]
-        tangent_u[i, 0] = ux * c[0, 0] + vx * c[1, 0] + hx * c[2, 0]
-        tangent_u[i, 1] = uy * c[0, 0] + vy * c[1, 0] + hy * c[2, 0]
-        tangent_u[i, 2] = uz * c[0, 0] + vz * c[1, 0] + hz * c[2, 0]
-        tangent_v[i, 0] = ux * c[0, 1] + vx * c[1, 1] + hx * c[2, 1]
-        tangent_v[i, 1] = uy * c[0, 1] + vy * c[1, 1] + hy * c[2, 1]
-        tangent_v[i, 2] = uz * c[0, 1] + vz * c[1, 1] + hz * c[2, 1]
-
-        lx, ly, lz = np.float64(local_normal[i, 0]), side * local_normal[i, 1], np.float64(local_normal[i, 2])
-        nx = tx * lx + bx * ly + sx * lz
-        ny = ty * lx + by * ly + sy * lz
-        nz = tz * lx + bz * ly + sz * lz
-        length = math.sqrt(nx * nx + ny * ny + nz * nz)
-        if not (length > 1e-12):
-            nx, ny, nz, length = sx, sy, sz, 1.0
-        normal[i, 0], normal[i, 1], normal[i, 2] = nx / length, ny / length, nz / length
+                nx, ny, nz, length = sx, sy, sz, 1.0
+            normal[i, 0], normal[i, 1], normal[i, 2] = nx / length, ny / length, nz / length
 
 
 @njit(parallel=True)

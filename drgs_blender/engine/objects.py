@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from ..deform.grains import grainy
 from ..deform.matrix_driven import pose_by_matrix
 from ..deform.mesh_driven import MeshDriven
 from ..deform.tears import torn_faces
+from ..device.posed import FIELDS, with_fields
 from ..errors import AssetError, UsageError
 from ..frame import ObjectState, Pose
 from ..render.trace.scene import TraceObject
@@ -87,7 +88,7 @@ def _adjusted_surfels(state: ObjectState, posed: PosedSurfels, driven: MeshDrive
             corners = driven.mesh.faces[driven.binding.face]
             mask = np.einsum("nk,nk->n", driven.binding.barycentric, mask[corners])
     own = {name: getattr(posed, name) for name in MATERIAL_CHANNELS}
-    return dataclasses.replace(posed, **adjusted(own, state.adjustment, mask))
+    return with_fields(posed, adjusted(own, state.adjustment, mask))
 
 
 def material_faults(state: ObjectState) -> list[str]:
@@ -168,11 +169,18 @@ def _cofactors(matrix: Array) -> Array:
 
 
 def posed_surfels(
-    state: ObjectState, index: int, driven: MeshDriven | Surfels, traced: TraceObject
+    state: ObjectState,
+    index: int,
+    driven: MeshDriven | Surfels,
+    traced: TraceObject,
+    pose: Callable[..., PosedSurfels] = MeshDriven.pose,
 ) -> tuple[PosedSurfels, int]:
     """The object's surfels in this frame, and how many are hidden because their vertices are not finite.
 
-    `driven` is what poses them; surfels without a mesh follow the object's matrix.
+    Parameters
+    ----------
+    driven : what poses them; surfels without a mesh follow the object's matrix
+    pose : `MeshDriven.pose`, or another that does the same elsewhere
     """
     matrix = np.asarray(state.matrix_world, np.float64)
     if isinstance(driven, Surfels):
@@ -185,7 +193,9 @@ def posed_surfels(
         name: _material(state, name, getattr(mesh, name), "a mesh") if _has(state, name) else None
         for name in MATERIAL_CHANNELS
     }
-    posed = driven.pose(traced.vertices, normals, materials, matrix_world=matrix, object_index=index, torn=traced.torn)
+    pose = pose if state.grain <= 0 else MeshDriven.pose  # grains are made here
+    given = driven, traced.vertices, normals, materials
+    posed = pose(*given, matrix_world=matrix, object_index=index, torn=traced.torn)
     if state.grain > 0:
         larger = abs(float(np.linalg.det(matrix[:3, :3]))) ** (1 / 3)
         posed = grainy(posed, larger * driven.surfels.scale, state.grain)
@@ -198,5 +208,4 @@ def join(parts: list[PosedSurfels]) -> PosedSurfels:
         return parts[0]
     empty, flat = np.empty((0, 3), np.float32), np.empty(0, np.float32)
     nothing = PosedSurfels(empty, empty, empty, empty, flat, empty, flat, flat, np.empty(0, np.int32))
-    names = [f.name for f in dataclasses.fields(PosedSurfels)]
-    return PosedSurfels(*(np.concatenate([getattr(part, name) for part in (nothing, *parts)]) for name in names))
+    return PosedSurfels(*(np.concatenate([getattr(part, name) for part in (nothing, *parts)]) for name in FIELDS))

@@ -19,6 +19,7 @@ from ..frame import Frame, Light, ObjectState, RenderSettings
 from ..jit import use_threads
 from ..render.device.devices import Devices
 from ..render.pipeline import Progress, render
+from ..render.processor import HERE, Processor
 from ..render.shade.adaptive import part_count
 from ..render.trace.scene import TraceObject
 from .histories import Histories
@@ -107,10 +108,10 @@ class Session:
             A setting cannot be used.
         Cancelled
         """
-        lap = _Laps(cancelled)
-        ready = self._prepare(frame, lap, progress)
+        lap, processor = _Laps(cancelled), self._devices.processor(frame.settings.device)
+        ready = self._prepare(frame, lap, progress, processor)
         tell = None if progress is None else lambda part, phase: progress(phase, part)
-        passes = self._draw(frame, ready, tell, cancelled)
+        passes = self._draw(frame, ready, tell, cancelled, processor)
         lap("render")
         x0, y0, x1, y1 = frame.camera.window
         passes.statistics |= self._statistics(frame, ready[2], lap)
@@ -148,19 +149,13 @@ class Session:
             As `render`.
         """
         self._views.pop(name, None)
-        lap = _Laps(cancelled)
+        lap, processor = _Laps(cancelled), self._devices.processor(frame.settings.device)
         by_mesh = self._stage.detailed(frame)
         rough = replace(frame, settings=replace(frame.settings, primary="mesh")) if by_mesh else frame
-        ready = self._prepare(rough, lap, progress)
-        view = View(
-            self._stage.kept(frame),
-            self._pace,
-            self._views_begun,
-            by_mesh,
-            self._devices.processor(frame.settings.device),
-        )
+        ready = self._prepare(rough, lap, progress, processor)
+        view = View(self._stage.kept(frame), self._pace, self._views_begun, by_mesh, processor)
         self._views_begun += 1
-        passes = view.begin(ready, lambda frame, ready, tell: self._draw(frame, ready, tell, cancelled))
+        passes = view.begin(ready, lambda frame, ready, tell: self._draw(frame, ready, tell, cancelled, processor))
         lap("render")
         self._views[name] = view
         while len(self._views) > _VIEWS:
@@ -181,8 +176,11 @@ class Session:
         if view is None:
             return None
         lap = _Laps(cancelled)
-        ready = self._prepare(view.frame, lap, progress)  # other views may have changed the scene
-        passes = view.advance(ready, lambda frame, ready, tell: self._draw(frame, ready, tell, cancelled), cancelled)
+        processor = view.processor
+        ready = self._prepare(view.frame, lap, progress, processor)  # other views may have changed the scene
+        passes = view.advance(
+            ready, lambda frame, ready, tell: self._draw(frame, ready, tell, cancelled, processor), cancelled
+        )
         lap("render")
         return self._seen(view, passes, ready, lap)
 
@@ -192,7 +190,9 @@ class Session:
         passes.warnings = self._warnings(view.frame.settings)
         return passes
 
-    def _draw(self, frame: Frame, ready: Ready, tell: Progress | None, cancelled: IsCancelled | None) -> Passes:
+    def _draw(
+        self, frame: Frame, ready: Ready, tell: Progress | None, cancelled: IsCancelled | None, processor: Processor
+    ) -> Passes:
         """The frame's picture as a whole, part of a sequence where it names one."""
         scene, light, posed, lamps, tree = ready
         sequence, statistics = None, {}
@@ -213,19 +213,19 @@ class Session:
             self._stage.instant(frame, frame.previous),
             self._stage.instant(frame, frame.next),
             None if sequence is None else sequence.history,
-            self._devices.processor(frame.settings.device),
+            processor,
         )
         if sequence is not None:
             self._histories.keep(frame, sequence, scene)
         return Passes(pictures, [], statistics)
 
-    def _prepare(self, frame: Frame, lap: _Laps, progress: OnProgress | None) -> Ready:
+    def _prepare(self, frame: Frame, lap: _Laps, progress: OnProgress | None, processor: Processor = HERE) -> Ready:
         """Bring scene and light up to date with the frame."""
         _check(frame)
         use_threads(frame.settings.threads)
         if progress is not None:
             progress("Deforming", 0.0)
-        posed = self._stage.pose(frame)
+        posed = self._stage.pose(frame, processor)
         lap("deform")
         light, lamps = self._stage.light_of(frame.world), self._stage.lamps_of(frame.lights)
         lap("light")

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import functools
 import os
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
 from ..asset.container import read_asset
 from ..asset.model import Asset, PosedSurfels, Surfels
+from ..deform.device.mesh_driven import Deformer
 from ..deform.mesh_driven import MeshDriven
+from ..device.posed import PosedThere, joined
 from ..errors import AssetError, UsageError
 from ..frame import Frame, Image, Light, MeshState, Moment, ObjectState, RenderSettings, World
 from ..render.camera import camera_parameters
@@ -17,6 +22,7 @@ from ..render.lights.emitters import Emitters
 from ..render.lights.lamps import Lamps
 from ..render.lights.light import EnvironmentLight
 from ..render.picture.motion import Instant
+from ..render.processor import HERE, Processor
 from ..render.surfels.surfel_bvh import SurfelBVH
 from ..render.trace.masks import group_mask
 from ..render.trace.scene import TraceObject, TraceScene
@@ -84,6 +90,7 @@ class Stage:
         self.light: EnvironmentLight | None = None
         self.lamps = Lamps([])
         self._emitters = Emitters()
+        self._deformer: Deformer | None = None
 
     @property
     def scenery(self) -> tuple[object, ...]:
@@ -129,8 +136,8 @@ class Stage:
         world = frame.world if self.world is None else self.world
         return renewed(replace(frame, objects=states, meshes=self.meshes, images=self.images, world=world), None)
 
-    def pose(self, frame: Frame) -> PosedSurfels:
-        """Bring the trace scene up to date; return the surfels of all objects."""
+    def pose(self, frame: Frame, processor: Processor = HERE) -> PosedSurfels:
+        """Bring the trace scene up to date; return the surfels of all objects, posed where they will be needed."""
         seen, met = frame.settings.primary == "surfels", frame.settings.tracer == "surfels"
         objects = []
         for index, state in enumerate(frame.objects):
@@ -149,7 +156,8 @@ class Stage:
             else:
                 item = Standing(kept, loaded, traced_object(kept, loaded.asset, met), faults=material_faults(kept))
             if (seen or met) and item.posed is None:
-                item.posed, item.lost = posed_surfels(item.state, index, loaded.surfels_of(item.state), item.traced)
+                given = item.state, index, loaded.surfels_of(item.state), item.traced
+                item.posed, item.lost = posed_surfels(*given, self._poser(processor))
             objects.append(item)
         meshes, images = renewed(frame.meshes, self.meshes), renewed(frame.images, self.images)
         same = len(objects) == len(self.objects) and all(a is b for a, b in zip(objects, self.objects))
@@ -164,7 +172,28 @@ class Stage:
                 loaded.driven = None
         self._plant(objects if met else None)
         shown = [item for item in objects if item.state.visibility.camera] if seen else []
-        return join([item.posed for item in shown if item.posed is not None])
+        return self._joined([item.posed for item in shown if item.posed is not None], processor)
+
+    def _poser(self, processor: Processor) -> Callable[..., PosedSurfels]:
+        """Who poses surfels: `MeshDriven.pose`, or a device as long as it can."""
+        launcher = processor.launcher
+        if launcher is None:
+            return MeshDriven.pose
+        if self._deformer is None or self._deformer.launcher is not launcher:
+            self._deformer = Deformer(launcher)
+        there = self._deformer.pose
+
+        def pose(*given: Any, **options: Any) -> PosedSurfels:
+            return processor.tried(lambda: there(*given, **options), lambda: MeshDriven.pose(*given, **options))
+
+        return pose
+
+    def _joined(self, parts: list[PosedSurfels], processor: Processor) -> PosedSurfels:
+        """The surfels of all objects as one, on a device if it has posed any."""
+        here, launcher = functools.partial(join, parts), processor.launcher
+        if launcher is None or len(parts) < 2 or not any(isinstance(part, PosedThere) for part in parts):
+            return here()
+        return processor.tried(lambda: joined(launcher, parts, here), here)
 
     def _plant(self, objects: list[Standing] | None) -> None:
         """Bring the tree of surfels up to date; None when light does not meet surfels."""

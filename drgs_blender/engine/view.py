@@ -76,11 +76,12 @@ class View:
     Attributes
     ----------
     pixel : side of the pixels of the last picture, in those of the frame
+    processor : as given
     """
 
     def __init__(self, frame: Frame, pace: Pace, number: int, by_mesh: bool, processor: Processor = HERE) -> None:
         self.frame, self._pace, self._number, self._by_mesh = frame, pace, number, by_mesh
-        self._processor = processor
+        self.processor = processor
         self.pixel = 1
         self._picture: Progressive | None = None
 
@@ -102,7 +103,7 @@ class View:
             self.pixel //= 4
             return passes
         if self._picture is None:
-            picture, seconds = Progressive(self.frame, self._processor), 0.0
+            picture, seconds = Progressive(self.frame, self.processor), 0.0
         else:
             picture, seconds = self._picture, STEP_SECONDS
         pictures = picture.advance(*ready, seconds, cancelled)

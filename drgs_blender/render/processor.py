@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from ..asset.model import PosedSurfels
+from ..device.kernels import Launcher
 from ..frame import Camera
 from .picture.denoise import denoise
 from .picture.signal import Guides, Signal
@@ -21,6 +22,7 @@ from .surfels.surfel_bvh import SurfelBVH
 from .trace.scene import TraceScene
 
 Array = np.ndarray
+T = TypeVar("T")
 
 
 class Processor:
@@ -30,10 +32,16 @@ class Processor:
     ----------
     failed : of another one, why it is of no use to this picture any more, in words; what it was to do is done here
     failures : how often that happened
+    launcher : of another one, what starts its kernels
     """
 
     failed = ""
     failures = 0
+    launcher: Launcher | None = None
+
+    def tried(self, there: Callable[[], T], here: Callable[[], T]) -> T:
+        """Work done there, on another processor, or here once that has failed."""
+        return here()
 
     def integrate(self, *arguments: Any, surfels: SurfelBVH | None = None) -> Radiance:
         """`shade.integrate.integrate`."""

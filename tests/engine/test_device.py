@@ -9,8 +9,10 @@ import pytest
 
 pytest.importorskip("warp", reason="warp-lang is not installed")
 
+from drgs_blender.deform.mesh_driven import MeshDriven
 from drgs_blender.engine import compiling
 from drgs_blender.engine.session import Session
+from drgs_blender.frame import Adjustment, ObjectState
 
 
 @pytest.fixture
@@ -35,6 +37,35 @@ def test_the_picture_is_the_processors(session, warp_session, make_frame, change
     assert there.warnings == here.warnings
     for name in passes:
         assert here[name].any() and psnr(here[name], there[name]) > 60.0
+
+
+def test_surfels_stay_on_a_device_from_deformation_to_picture(session, warp_session, make_frame, monkeypatch):
+    """Two objects that move, tear, are mirrored, tinted and grainy; this processor poses the grains alone."""
+    poses, pose = [], MeshDriven.pose
+    monkeypatch.setattr(MeshDriven, "pose", lambda *given, **options: poses.append(1) or pose(*given, **options))
+    for case in ("bent", "two", "torn", "tinted", "grainy", "again"):
+        pictures, counts = [], []
+        for which, device in ((session, "cpu"), (warp_session, "cuda")):
+            frame = make_frame(0.3, device=device, rays=1)
+            (item,) = frame.objects
+            if case != "bent":
+                other = ObjectState("Second", item.asset, np.diag([-0.5, 0.5, 0.5, 1.0]))
+                other.matrix_world[:3, 3] = 0.5, -1.0, 0.5
+                frame.objects.append(other)
+            if case == "torn":
+                item.vertices[item.vertices[:, 2] > 0.1, 2] += 0.4
+                item.tear = 0.3
+            if case == "tinted":
+                mask = (item.vertices[:, 2] > 0).astype(np.float32)
+                item.adjustment = Adjustment(tint=(0.5, 1.0, 0.25), mask=mask)
+            if case == "grainy":
+                item.vertices *= np.float32(1.6)
+                item.grain = 0.3
+            poses.clear()
+            pictures.append(which.render(frame)["Combined"])
+            counts.append(len(poses))
+        assert psnr(*pictures) > 60.0, case
+        assert counts[0] > 0 and counts[1] == (case == "grainy")
 
 
 def test_viewports_grow_on_a_device(session, warp_session, make_frame):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from ...frame import Camera
 from ..picture.signal import Guides, Signal
 from ..picture.temporal import Shot
 from ..points import Radiance
-from ..processor import Processor
+from ..processor import Processor, T
 from ..shade.integrate import integrate
 from ..surfels.raster import SurfelSamples
 from ..surfels.raster import rasterise as rasterise_here
@@ -30,7 +30,6 @@ from .raster import rasterise
 from .splats import SplatsThere, prepare
 
 Array = np.ndarray
-_T = TypeVar("_T")
 
 
 class OnDevice(Processor):
@@ -42,7 +41,7 @@ class OnDevice(Processor):
     """
 
     def __init__(self, device: str) -> None:
-        self.launcher = Launcher(device)
+        self.launcher: Launcher = Launcher(device)
         self.mirror = Mirror(self.launcher)
         self._kernel = DeviceKernel(self.launcher, self.mirror)
 
@@ -50,13 +49,13 @@ class OnDevice(Processor):
         here = super().integrate
         if surfels is not None:
             return here(*arguments, surfels=surfels)
-        return self._tried(lambda: integrate(*arguments, kernel=self._kernel), lambda: here(*arguments))
+        return self.tried(lambda: integrate(*arguments, kernel=self._kernel), lambda: here(*arguments))
 
     def prepare(self, posed: PosedSurfels, camera: Camera, parameters: Array) -> Splats:
         here = functools.partial(super().prepare, posed, camera, parameters)
         if not len(posed):
             return here()
-        return self._tried(lambda: prepare(self.launcher, posed, camera, parameters, functools.cache(here)), here)
+        return self.tried(lambda: prepare(self.launcher, posed, camera, parameters, functools.cache(here)), here)
 
     def rasterise(self, splats: Splats, y0: int, y1: int) -> SurfelSamples:
         def here() -> SurfelSamples:
@@ -65,17 +64,17 @@ class OnDevice(Processor):
 
         if not len(splats):
             return here()
-        return self._tried(lambda: rasterise(self.launcher, splats, y0, y1), here)
+        return self.tried(lambda: rasterise(self.launcher, splats, y0, y1), here)
 
     def tie(self, scene: TraceScene, *arguments: Any) -> None:
         here = super().tie
-        self._tried(lambda: tie(self.launcher, self.mirror, scene, *arguments), lambda: here(scene, *arguments))
+        self.tried(lambda: tie(self.launcher, self.mirror, scene, *arguments), lambda: here(scene, *arguments))
 
     def denoise(
         self, components: Array, variance: Array, guides: Guides, split: bool, check: Callable[[], None]
     ) -> Array:  # fmt: skip
         here, shot = super().denoise, Shot(components, variance, guides)
-        return self._tried(
+        return self.tried(
             lambda: denoise(self.launcher, shot, None, split, False, check)[0],
             lambda: here(components, variance, guides, split, check),
         )
@@ -84,9 +83,9 @@ class OnDevice(Processor):
         self, shot: Shot, history: Signal | None, split: bool, still: bool, check: Callable[[], None]
     ) -> tuple[Array, Signal]:
         here, given = super().denoise_next, (shot, history, split, still, check)
-        return self._tried(lambda: denoise(self.launcher, *given), lambda: here(*given))
+        return self.tried(lambda: denoise(self.launcher, *given), lambda: here(*given))
 
-    def _tried(self, there: Callable[[], _T], here: Callable[[], _T]) -> _T:
+    def tried(self, there: Callable[[], T], here: Callable[[], T]) -> T:
         """Work done there, or here once that has failed."""
         if not self.failed:
             try:

@@ -14,6 +14,7 @@ import numpy as np
 
 from ...asset.model import PosedSurfels
 from ...device.kernels import Launcher, Work
+from ...device.posed import arrays_of
 from ...device.warp import warp
 from ...frame import Camera
 from ..surfels.splats import (
@@ -128,7 +129,7 @@ def prepare(
     """
     n, zeros = len(posed), launcher.zeros
     with launcher.failures("copying surfels"):
-        given = {name: launcher.array(getattr(posed, name)) for name in {*PLACED, *SHOWN, "object_index"}}
+        given = arrays_of(posed, launcher)
         found = zeros((n, RECORD)), zeros((n, 4), "int32"), zeros((n,))
         depth, keys, order = zeros((n,)), zeros((2 * n,), "uint32"), zeros((2 * n,), "int32")
     placed, shown = (tuple(given[name] for name in names) for names in (PLACED, SHOWN))

@@ -1,0 +1,1 @@
+"""Deformation on a graphics card; on the processor, by the same translation, for tests."""
