@@ -19,7 +19,7 @@ from test_device_denoise import nothing, shots
 from drgs_blender.deform.device import mesh_driven as deformation
 from drgs_blender.deform.device.mesh_driven import Deformer
 from drgs_blender.device.kernels import Launcher
-from drgs_blender.render.device import attach, denoise, integrate, raster, splats
+from drgs_blender.render.device import attach, denoise, integrate, raster, splats, trees
 from drgs_blender.render.device.on_device import OnDevice
 from drgs_blender.simulate.device import cells, steps
 
@@ -51,6 +51,7 @@ def test_pictures_kernels_compile_for_a_card(tmp_path: Path) -> None:
         _, history = device.denoise_next(shot, history, True, False, nothing)
     works = raster.BLEND, attach.ATTACH, *denoise.WORKS
     works += deformation.WEIGH, deformation.SUM, deformation.POSE
+    works += (trees.PLACE,)
     works += splats.PROJECT, splats.KEY, splats.FIND, splats.GATHER, splats.LIST
     assert made(works, device.launcher, tmp_path) == set(works)
     assert not device.failed

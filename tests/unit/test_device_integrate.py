@@ -285,6 +285,6 @@ def test_every_array_is_copied_to_a_card(monkeypatch: pytest.MonkeyPatch) -> Non
         array.setflags(write=True)
         array.view(np.uint8)[...] = 0x7F
     found = apart.integrate(scene, light, points, SETTINGS, 3, shining)
-    (rooms,) = apart.launcher._rooms.values()
-    assert not apart.failed and not any(room.is_contiguous for room in rooms)
+    rooms = [room for own in apart.launcher._rooms.values() for room in own]
+    assert not apart.failed and rooms and not any(room.is_contiguous for room in rooms)
     assert psnr(found.total, expected.total) > 60.0

@@ -21,7 +21,7 @@ Array = np.ndarray
 ALL = -1
 
 #: Rebuild when the boxes of neighbouring triangles have grown this much against the whole scene's box.
-_DEGRADED = 2.0
+DEGRADED = 2.0
 _RUN = 32  # neighbouring triangles in one box of that measure
 _RUNS = 1024  # boxes looked at
 
@@ -177,9 +177,7 @@ class _Part:
 
     def refit(self) -> bool:
         """Follow moved vertices; True when the tree was worn out and built anew instead."""
-        worn = len(self._runs) > 0 and (
-            looseness(self._vertices, self._faces, self._runs) > _DEGRADED * self._looseness
-        )
+        worn = len(self._runs) > 0 and (looseness(self._vertices, self._faces, self._runs) > DEGRADED * self._looseness)
         if worn:
             self.build()
         else:
