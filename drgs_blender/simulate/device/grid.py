@@ -207,6 +207,9 @@ class DeviceGrid(Grid):
         """Where the colliders are in step s, at `part` of the frame."""
         plan, array = self._plan, self._launcher.array
         for c, moving in enumerate(self._scene.colliders):
+            if s and moving.speed == 0.0:
+                plan["turns"][s, c], plan["vectors"][s, c] = plan["turns"][s - 1, c], plan["vectors"][s - 1, c]
+                continue
             field, turn, shift, linear, spin = moving.at(part)
             if field is not self._fields[c][0]:
                 arrays = [] if field is None else [array(a) for a in (field.distance, field.velocity) if a.size]
