@@ -63,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--device",
         choices=("cpu", "cuda"),
         default="cpu",
-        help="what the surfels are learned on; without a card the processor does. Default cpu",
+        help="what learns; without a card the processor does. Default cpu",
     )
     parser.add_argument("--axes", default="opengl", metavar="NAME", help="what the cameras' matrices are taken for")
     parser.add_argument("--up", choices=tuple(UP_AXES), help="up axis of the capture's world; default: found")

@@ -66,7 +66,7 @@ class Settings:
     materials : pull materials and light apart; else albedo is the photographed colour
     decoupling : how; its ``seconds`` follow from `minutes`. Normals are learned too: a mesh of photographs has errors
     fixed : parameters of surfels on faces that are not learned: "offset", "opacity" (the paper's ablation)
-    device : "cpu", or "cuda" for surfels learned on the first NVIDIA card; without one this processor learns them
+    device : "cpu", or "cuda" to learn on the first NVIDIA card; without one this processor does
     """
 
     variant: Literal["p", "m"] = "p"
@@ -243,6 +243,7 @@ def _decoupled(work: _Work, mesh: Mesh, surfels: int, report: dict[str, Any]) ->
         lambda at: work.tell(Progress("materials", 0.7 + 0.3 * at.part, surfels, at.psnr)),
         work.cancelled,
         work.file("materials"),
+        work.by,
     )
     # Without the clock: the same run gives the same bytes.
     report["decoupling"] = {key: value for key, value in found.report.items() if key != "seconds"}

@@ -12,9 +12,12 @@ import torch
 from torch import Tensor
 
 from ..arrays import Array
+from ..asset.model import Mesh
 from ..frame import Camera
+from ..render.trace.tree import TriangleBVH
 from .adam import descend
 from .attributes import attributes
+from .decouple.gather import Gatherer
 from .photometric import difference
 from .raster import Maps, Tally, rasterise
 from .reflection import mirrored
@@ -68,6 +71,12 @@ class Processor:
     def descend(self, value: Tensor, gradient: Tensor, first: Tensor, second: Tensor, rate: Array) -> None:
         """`adam.descend`."""
         descend(value, gradient, first, second, rate)
+
+    def gatherer(
+        self, mesh: Mesh, tree: TriangleBVH, cache: Array | None, counts: tuple[int, int, int], normals: bool
+    ) -> Gatherer:
+        """`decouple.gather.Gatherer`."""
+        return Gatherer(mesh, tree, cache, counts, normals)
 
 
 HERE = Processor()

@@ -59,16 +59,18 @@ def test_pictures_kernels_compile_for_a_card(tmp_path: Path) -> None:
 
 def test_learnings_kernels_compile_for_a_card(tmp_path: Path) -> None:
     pytest.importorskip("torch")
+    import test_device_gather
     import test_device_learning
     import test_device_surfels
 
-    from drgs_blender.reconstruct.device import kernels, losses, on_device
+    from drgs_blender.reconstruct.device import gather, kernels, losses, on_device
 
     device = on_device.OnDevice("cpu")
     test_device_surfels.test_every_map_has_a_gradient_of_its_own(device.launcher)
     test_device_learning.test_difference_from_a_photograph(device)
     test_device_learning.test_a_step_down(device)
-    modules = kernels, losses, on_device
+    test_device_gather.test_what_arrives_and_its_derivatives(device, {})
+    modules = kernels, losses, on_device, gather
     works = {work for module in modules for work in vars(module).values() if isinstance(work, kernels.Work)}
     assert made(tuple(works), device.launcher, tmp_path) == works
 

@@ -255,7 +255,12 @@ def test_a_device_whose_memory_is_lost_goes_back_to_the_last_state_kept(
 
 def test_surfels_half_cut_are_of_no_use(capture: Capture, region: Region, monkeypatch: pytest.MonkeyPatch) -> None:
     training, here = kept(capture, region)
-    monkeypatch.setattr(training.optimiser, "take", broken)
+
+    def half(rows: Any) -> None:
+        training.optimiser.first.clear()
+        broken()
+
+    monkeypatch.setattr(training.optimiser, "take", half)
     training.iteration = here.iteration = 40
     training._maybe_densify()
     here._maybe_densify()

@@ -158,7 +158,14 @@ def _direction(strategy, n0, n1, n2, normal, view, alpha, bound, frame, row, sky
 
 
 @njit
-def _point(i, points, normals, a2s, counts, sequence, scene, faces, cache, radiance, shape, sky, seen, out):  # type: ignore[no-untyped-def]
+def _texels(radiance, t, p, k):  # type: ignore[no-untyped-def]
+    """Channel k of four texels by their shares."""
+    first = p[0] * radiance[t[0], k] + p[1] * radiance[t[1], k]
+    return first + p[2] * radiance[t[2], k] + p[3] * radiance[t[3], k]
+
+
+@njit
+def gather_point(i, points, normals, a2s, counts, sequence, scene, faces, cache, radiance, shape, sky, seen, out):  # type: ignore[no-untyped-def]
     """All samples of one pixel; see `gather` for what is written."""
     origin, flat, towards, key = points
     sums, by_a2, by_normal, texel, share, weights = out
@@ -221,13 +228,14 @@ def _point(i, points, normals, a2s, counts, sequence, scene, faces, cache, radia
                     green = _cached(cache, a, b, c, hu, hv, -dx, -dy, -dz, 1)
                     blue = _cached(cache, a, b, c, hu, hv, -dx, -dy, -dz, 2)
                 else:
-                    t, p = _bilinear(u, v, shape[0], shape[1])
-                    red, green, blue = ZERO, ZERO, ZERO
-                    for q in range(4):
-                        texel[i, s, q], share[i, s, q] = t[q], p[q]
-                        red += p[q] * radiance[t[q], 0]
-                        green += p[q] * radiance[t[q], 1]
-                        blue += p[q] * radiance[t[q], 2]
+                    four, parts = _bilinear(u, v, shape[0], shape[1])
+                    red, green, blue = (
+                        _texels(radiance, four, parts, 0),
+                        _texels(radiance, four, parts, 1),
+                        _texels(radiance, four, parts, 2),
+                    )
+                    texel[i, s, 0], texel[i, s, 1], texel[i, s, 2], texel[i, s, 3] = four
+                    share[i, s, 0], share[i, s, 1], share[i, s, 2], share[i, s, 3] = parts
                     weights[i, s, 0], weights[i, s, 1], weights[i, s, 2], weights[i, s, 3] = w0, w1, w2, w3
                 for k in range(3):
                     light = red if k == 0 else (green if k == 1 else blue)
@@ -247,10 +255,10 @@ def _point(i, points, normals, a2s, counts, sequence, scene, faces, cache, radia
                         slope = along * l + l_nv * e + l_nh * h
                         for k in range(3):
                             light = red if k == 0 else (green if k == 1 else blue)
-                            by_normal[i, half, 0, k, axis] += w0 / nl * l * light
-                            by_normal[i, half, 1, k, axis] += w1 * slope * light
-                            by_normal[i, half, 2, k, axis] += w2 * slope * light
-                            by_normal[i, half, 3, k, axis] += w3 * slope * light
+                            by_normal[i, half, 0, 3 * k + axis] += w0 / nl * l * light
+                            by_normal[i, half, 1, 3 * k + axis] += w1 * slope * light
+                            by_normal[i, half, 2, 3 * k + axis] += w2 * slope * light
+                            by_normal[i, half, 3, 3 * k + axis] += w3 * slope * light
 
 
 @njit(parallel=True)
@@ -258,7 +266,9 @@ def _gather(points, normals, a2s, counts, sequence, scene, faces, cache, radianc
     n = len(a2s)
     for block in prange((n + _BLOCK - 1) // _BLOCK):
         for i in range(block * _BLOCK, min(n, (block + 1) * _BLOCK)):
-            _point(i, points, normals, a2s, counts, sequence, scene, faces, cache, radiance, shape, sky, seen, out)
+            gather_point(
+                i, points, normals, a2s, counts, sequence, scene, faces, cache, radiance, shape, sky, seen, out
+            )
 
 
 @njit(parallel=True)
@@ -294,7 +304,8 @@ class Gatherer:
     def __init__(
         self, mesh: Mesh, tree: TriangleBVH, cache: Array | None, counts: tuple[int, int, int], normals: bool = False
     ) -> None:
-        self._faces, self._tree, self._counts, self._normals = mesh.faces, tree, counts, normals
+        self._faces, self._tree, self._normals = mesh.faces, tree, normals
+        self._counts = np.array(counts, np.int64)
         self._seen = cache is not None
         self._cache = np.zeros((1, 4, 3), np.float32) if cache is None else np.ascontiguousarray(cache, np.float32)
         low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
@@ -326,33 +337,38 @@ class Gatherer:
         if self._light is None:
             self.aim(radiance)
         assert self._light is not None
-        n, s = len(alpha2), sum(self._counts)
+        n, s = len(alpha2), int(self._counts.sum())
         sums, by_a2 = np.zeros((2, n, 2, SUMS, 3), np.float32)
-        by_normal = np.zeros((n if self._normals else 0, 2, SUMS, 3, 3), np.float32)
+        by_normal = np.zeros((n if self._normals else 0, 2, SUMS, 9), np.float32)
         samples = Samples(
             np.empty((n, s, 4), np.int32), np.empty((n, s, 4), np.float32), np.empty((n, s, 4), np.float32)
         )
         height, width = radiance.shape[:2]
-        _gather(
+        self._gather(
             (points.origin, points.flat, points.towards, points.key),
             np.ascontiguousarray(normal),
             np.ascontiguousarray(alpha2),
-            self._counts,
-            self._sequence,
-            (self._tree.intersect_address, self._tree.scene),
-            self._faces,
-            self._cache,
             np.ascontiguousarray(radiance).reshape(-1, 3),
             (np.int32(height), np.int32(width), self._lift),
-            self._light.sky,
-            self._seen,
+            self._light,
             (sums, by_a2, by_normal, *samples),
         )
         # Weights are of all samples together: either half alone has half of the sum.
         sums *= 2
         by_a2 *= 2
         by_normal *= 2
-        return sums, by_a2, by_normal, samples
+        return sums, by_a2, by_normal.reshape(*by_normal.shape[:3], 3, 3), samples
+
+    def _gather(
+        self, points: tuple[Array, ...], normal: Array, alpha2: Array, radiance: Array, shape: tuple[Any, ...],
+        light: EnvironmentLight, out: tuple[Array, ...],
+    ) -> None:  # fmt: skip
+        """`gather_point` of all points."""
+        scene = self._tree.intersect_address, self._tree.scene
+        _gather(
+            points, normal, alpha2, self._counts, self._sequence, scene, self._faces, self._cache, radiance, shape,
+            light.sky, self._seen, out,
+        )  # fmt: skip
 
 
 class _Gather(torch.autograd.Function):

@@ -23,9 +23,10 @@ from ...render.trace.tree import TriangleBVH
 from .. import checkpoint as states
 from ..adam import Adam
 from ..capture import Capture
+from ..processor import HERE, Processor
 from .blend import blend
 from .cache import edges_of, filled, radiance_cache
-from .gather import Gatherer, Points
+from .gather import Points
 from .light import LearnedLight, colour_cast
 from .losses import log_loss, unbiased_loss
 from .materials import Materials
@@ -88,6 +89,7 @@ def decouple(
     on_progress: Callable[[Progress], None] | None = None,
     cancelled: Callable[[], bool] | None = None,
     checkpoint: Path | None = None,
+    by: Processor = HERE,
 ) -> Decoupled:
     """Learn materials and light of an object from photographs and its geometry.
 
@@ -99,6 +101,7 @@ def decouple(
     on_progress : called every few steps
     cancelled : asked every step; then a checkpoint is left behind and Cancelled raised
     checkpoint : file to go on from when it lies there and fits, written every few seconds, removed at the end
+    by : who follows rays; the rest is done here
 
     Raises
     ------
@@ -115,7 +118,7 @@ def decouple(
         raise UsageError(str(capture.source), "has no training view", "Leave fewer views out for the test")
     if len(capture.training) < 4:
         log.warning("only %d views: light and materials can hardly be told apart", len(capture.training))
-    job = _Job(capture, mesh, settings, checkpoint)
+    job = _Job(capture, mesh, settings, checkpoint, by)
     while job.going():
         if cancelled is not None and cancelled():
             job.save()
@@ -132,7 +135,9 @@ def decouple(
 class _Job:
     """A run: what is learned, and everything a step needs."""
 
-    def __init__(self, capture: Capture, mesh: Mesh, settings: Settings, checkpoint: Path | None) -> None:
+    def __init__(
+        self, capture: Capture, mesh: Mesh, settings: Settings, checkpoint: Path | None, by: Processor
+    ) -> None:
         self._mesh, self._settings, self._checkpoint = mesh, settings, checkpoint
         tree = TriangleBVH()
         tree.build(mesh.vertices, mesh.faces)
@@ -142,7 +147,7 @@ class _Job:
         if not settings.shadows:
             tree = TriangleBVH()
             tree.build(mesh.vertices, mesh.faces[:0])
-        self._gatherer = Gatherer(mesh, tree, cache if settings.indirect else None, counts, settings.normals)
+        self._gatherer = by.gatherer(mesh, tree, cache if settings.indirect else None, counts, settings.normals)
         self._normals = torch.from_numpy(VertexNormals(mesh.faces, len(mesh.vertices))(mesh.vertices))
         self._faces = torch.from_numpy(mesh.faces.astype(np.int64))
 

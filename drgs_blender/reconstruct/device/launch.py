@@ -38,7 +38,8 @@ class TensorLauncher(Launcher):
     def _shared(self, value: Any) -> Any:
         if isinstance(value, torch.Tensor):
             return warp().from_torch(value.detach())
-        return tuple(map(self._shared, value)) if isinstance(value, tuple) else value
+        plain = isinstance(value, tuple) and not hasattr(value, "_fields")
+        return tuple(map(self._shared, value)) if plain else value
 
     @contextlib.contextmanager
     def _in_order(self) -> Iterator[None]:
@@ -47,5 +48,5 @@ class TensorLauncher(Launcher):
             yield
             return
         wp = warp()
-        with wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(self.place)), sync_enter=False):
+        with wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(self.place))):
             yield

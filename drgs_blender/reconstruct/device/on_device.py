@@ -9,13 +9,16 @@ import torch
 from torch import Tensor
 
 from ...arrays import Array
+from ...asset.model import Mesh
 from ...device.kernels import Work
 from ...frame import Camera
+from ...render.trace.tree import TriangleBVH
 from ..adam import some_rows
 from ..processor import Processor
 from ..raster import Maps, Tally
 from ..targets import Target
 from . import look, losses
+from .gather import DeviceGatherer
 from .launch import TensorLauncher
 from .raster import rasterise
 
@@ -74,3 +77,8 @@ class OnDevice(Processor):
     def descend(self, value: Tensor, gradient: Tensor, first: Tensor, second: Tensor, rate: Array) -> None:
         there = torch.from_numpy(rate).to(self.place)
         self.launcher.launch(DESCEND, len(value), (gradient, there), (value, first, second))
+
+    def gatherer(
+        self, mesh: Mesh, tree: TriangleBVH, cache: Array | None, counts: tuple[int, int, int], normals: bool
+    ) -> DeviceGatherer:
+        return DeviceGatherer(self.launcher, mesh, tree, cache, counts, normals)

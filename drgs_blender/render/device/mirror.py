@@ -44,10 +44,13 @@ class Mirror:
         lights = self._table(
             "lamps", (lamps, *state), lambda place: (*lamps.tables[:2], lamps.emitters.address_at(place))
         )
-        # Pictures of the environment are large, and stay; only how they are turned may have changed.
+        return self.tracer(scene), geometry, self.sky(light), lights
+
+    def sky(self, light: EnvironmentLight) -> Sky:
+        """The environment; until it is another one."""
+        # Its pictures are large, and stay; only how they are turned may have changed.
         sky: Sky = self._table("sky", (light,), light.sky_at)
-        turn = {name: value for name, value in light.sky._asdict().items() if len(name) == 2}
-        return self.tracer(scene), geometry, sky._replace(**turn), lights
+        return sky._replace(**{name: value for name, value in light.sky._asdict().items() if len(name) == 2})
 
     def tracer(self, scene: TraceScene) -> MeshTracer:
         """How rays meet the scene; until its next update."""
