@@ -202,7 +202,8 @@ def test_what_cannot_be_reconstructed_is_refused_by_name(case):
         reconstruct(capture, Settings(schedule=Schedule(iterations=2)))
 
 
-def test_the_command_writes_an_asset_and_its_preview(tmp_path, capsys):
+def test_the_command_writes_an_asset_and_its_preview(tmp_path, capsys, monkeypatch):
+    """Without a card too, though one was asked for."""
     import json
 
     from PIL import Image
@@ -218,8 +219,10 @@ def test_the_command_writes_an_asset_and_its_preview(tmp_path, capsys):
     (tmp_path / "transforms.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
     out = tmp_path / "made" / "balls.drgs"
     options = ["--iterations", "30", "--surfels", "800", "--voxels", "32", "--test-every", "5", "--no-materials"]
-    code = main(["reconstruct", str(tmp_path), "--out", str(out), *options])
-    said = capsys.readouterr().out
+    monkeypatch.setattr("drgs_blender.device.warp.cuda_devices", list)
+    code = main(["reconstruct", str(tmp_path), "--out", str(out), *options, "--device", "cuda"])
+    said, warned = capsys.readouterr()
+    assert "device cuda" in warned and "Learned on the CPU" in warned
     assert code == 0 and "DRGS_PROGRESS" in said and "views left out: PSNR" in said
     assert len(read_asset(out).surfels) > 100
     assert Image.open(out.with_name("balls.preview.png")).size == (64, 32)
