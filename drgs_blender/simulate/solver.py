@@ -221,7 +221,9 @@ class Solver(Stepper):
                     f"ran away: matter moves at {speed:.3g} m/s",
                     "Make the material stiffer or the particles finer, or slow down what hits it",
                 )
-            times = self._times(seconds, done, longest, grid.most if longest == usual else 1)
+            # As many as particles, as fast as they are now, need until they must be sorted again.
+            most = min(grid.most, int((_DRIFT - drift) * h / max(speed * longest, 1e-12)) + 2)
+            times = self._times(seconds, done, longest, most if longest == usual else 1)
             limits = Limits(_DRIFT - drift, _FASTEST * h / usual - push * usual, outside)
             for (_, dt), top in zip(times, grid.step(times, limits)):
                 if not np.isfinite(top):
