@@ -185,14 +185,14 @@ class Primary:
 
     def rows(self, y0: int, y1: int) -> GBuffer:
         """The samples of the rows ``y0 .. y1`` of the full picture."""
+        by = self._processor
         if self._splats is None:
-            buffer = primary_mesh(self._scene, self._camera, self._parameters, y0, y1)
+            buffer = primary_mesh(self._scene, self._camera, self._parameters, y0, y1, by.trace, by.shade)
             if self._tree is not None:
                 _own_surfels(buffer, self._tree, self._objects)
             return buffer
-        tied = self._tree is None
-        by = self._processor.rasterise, self._processor.tie
-        return primary_surfels(self._splats, self._scene, self._windows, self._camera, y0, y1, tied, *by)
+        given = self._splats, self._scene, self._windows, self._camera, y0, y1, self._tree is None
+        return primary_surfels(*given, by.rasterise, by.tie, by.trace, by.shade)
 
 
 def strip_height(width: int, aa: int) -> int:

@@ -14,6 +14,8 @@ from .picture.denoise import denoise
 from .picture.signal import Guides, Signal
 from .picture.temporal import Shot, denoise_next
 from .points import Radiance
+from .primary.camera_hits import MeshHits, shade_mesh, trace_camera
+from .primary.gbuffer import GBuffer
 from .primary.primary_surfels import tie_to_mesh
 from .shade.integrate import integrate
 from .surfels.raster import SurfelSamples, rasterise
@@ -50,6 +52,16 @@ class Processor:
     def prepare(self, posed: PosedSurfels, camera: Camera, parameters: Array) -> Splats:
         """`surfels.splats.prepare`."""
         return prepare(posed, camera, parameters)
+
+    def trace(self, scene: TraceScene, parameters: Array, x0: int, y0: int, shape: tuple[int, ...], mask: int) -> (
+        MeshHits
+    ):  # fmt: skip
+        """`primary.camera_hits.trace_camera`."""
+        return trace_camera(scene, parameters, x0, y0, shape, mask)
+
+    def shade(self, scene: TraceScene, hits: MeshHits, parameters: Array, x0: int, buffer: GBuffer, layer: int) -> None:
+        """`primary.camera_hits.shade_mesh`; of what this processor has traced."""
+        shade_mesh(scene, hits, parameters, x0, buffer, layer)
 
     def rasterise(self, splats: Splats, y0: int, y1: int) -> SurfelSamples:
         """`surfels.raster.rasterise`; of what this processor has prepared."""

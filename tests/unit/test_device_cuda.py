@@ -9,6 +9,7 @@ import pytest
 
 pytest.importorskip("warp", reason="warp-lang is not installed")
 
+import test_device_camera_hits
 import test_device_deform
 import test_device_integrate
 import test_device_mpm
@@ -19,7 +20,7 @@ from test_device_denoise import nothing, shots
 from drgs_blender.deform.device import mesh_driven as deformation
 from drgs_blender.deform.device.mesh_driven import Deformer
 from drgs_blender.device.kernels import Launcher
-from drgs_blender.render.device import attach, denoise, integrate, raster, splats, trees
+from drgs_blender.render.device import attach, camera_hits, denoise, integrate, raster, splats, trees
 from drgs_blender.render.device.on_device import OnDevice
 from drgs_blender.simulate.device import cells, steps
 
@@ -46,12 +47,14 @@ def test_pictures_kernels_compile_for_a_card(tmp_path: Path) -> None:
     deformer.pose(asset, asset.mesh.vertices)
     deformer.pose(asset, asset.mesh.vertices, test_device_deform.corner_normals(asset.mesh))
     test_device_raster.test_points_are_tied_to_the_mesh_as_the_processor_ties_them(device, 0.1, True)
+    scene, view = test_device_camera_hits.unseen()[0], test_device_camera_hits.VIEWS["perspective"]
+    test_device_camera_hits.seen(device, scene, view)
     history = None
     for shot in shots(2):
         _, history = device.denoise_next(shot, history, True, False, nothing)
     works = raster.BLEND, attach.ATTACH, *denoise.WORKS
     works += deformation.WEIGH, deformation.SUM, deformation.POSE
-    works += (trees.PLACE,)
+    works += trees.PLACE, camera_hits.TRACE, camera_hits.SHADE
     works += splats.PROJECT, splats.KEY, splats.FIND, splats.GATHER, splats.LIST
     assert made(works, device.launcher, tmp_path) == set(works)
     assert not device.failed

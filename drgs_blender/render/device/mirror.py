@@ -11,8 +11,9 @@ from ...device.kernels import Launcher
 from ..lights.lamps import Lamps
 from ..lights.light import EnvironmentLight, Sky
 from ..memory import Place, address
-from ..trace.masks import DIFFUSE, GLOSSY, SHADOW, SURFELS, WITHOUT
+from ..trace.masks import CAMERA, DIFFUSE, GLOSSY, ORDINARY, SHADOW, SURFELS, WITHOUT
 from ..trace.scene import TraceScene
+from ..trace.surface import Geometry
 from .natives import MeshTracer
 from .trees import Trees
 
@@ -20,7 +21,7 @@ Array = np.ndarray
 
 _KINDS = DIFFUSE | GLOSSY | SHADOW
 #: Rays that are cast here.
-_RAYS = _KINDS | _KINDS << WITHOUT | SURFELS
+_RAYS = CAMERA | ORDINARY | _KINDS | _KINDS << WITHOUT | SURFELS
 
 
 class Mirror:
@@ -40,17 +41,35 @@ class Mirror:
     def tables(self, scene: TraceScene, light: EnvironmentLight, lamps: Lamps) -> tuple[Any, Any, Any, Any]:
         """(tracer, geometry, sky, lamps) with the device's addresses; until what they are of changes."""
         state = scene, scene.version
-        geometry = self._table("geometry", state, scene.geometry_at)
         lights = self._table(
             "lamps", (lamps, *state), lambda place: (*lamps.tables[:2], lamps.emitters.address_at(place))
         )
-        return self.tracer(scene), geometry, self.sky(light), lights
+        return self.tracer(scene), self.geometry(scene), self.sky(light), lights
 
     def sky(self, light: EnvironmentLight) -> Sky:
         """The environment; until it is another one."""
         # Its pictures are large, and stay; only how they are turned may have changed.
         sky: Sky = self._table("sky", (light,), light.sky_at)
         return sky._replace(**{name: value for name, value in light.sky._asdict().items() if len(name) == 2})
+
+    def geometry(self, scene: TraceScene) -> Geometry:
+        """What lies behind the faces; until the scene's next update."""
+        found: Geometry = self._table("geometry", (scene, scene.version), scene.geometry_at)
+        return found
+
+    def owners(self, scene: TraceScene) -> tuple[Any, Any]:
+        """Objects of the scene's faces and places, as arrays; until its next update."""
+        copy = self._launcher.array
+        found: tuple[Any, Any] = self._table(
+            "owners", (scene, scene.version), lambda place: (copy(scene.face_object), copy(scene.place_object))
+        )
+        return found
+
+    def moving(self, scene: TraceScene) -> tuple[Any, Any, Any]:
+        """The scene's vertices, faces and places; until its next update."""
+        self.tracer(scene)
+        assert self._trees is not None
+        return self._trees.moving
 
     def tracer(self, scene: TraceScene) -> MeshTracer:
         """How rays meet the scene; until its next update."""

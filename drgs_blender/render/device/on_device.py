@@ -15,6 +15,7 @@ from ...frame import Camera
 from ..picture.signal import Guides, Signal
 from ..picture.temporal import Shot
 from ..points import Radiance
+from ..primary.camera_hits import MeshHits, shade_mesh
 from ..processor import Processor, T
 from ..shade.integrate import integrate
 from ..surfels.raster import SurfelSamples
@@ -23,6 +24,7 @@ from ..surfels.splats import Splats
 from ..surfels.surfel_bvh import SurfelBVH
 from ..trace.scene import TraceScene
 from .attach import tie
+from .camera_hits import HitsThere, shade, trace
 from .denoise import denoise
 from .integrate import DeviceKernel
 from .mirror import Mirror
@@ -56,6 +58,20 @@ class OnDevice(Processor):
         if not len(posed):
             return here()
         return self.tried(lambda: prepare(self.launcher, posed, camera, parameters, functools.cache(here)), here)
+
+    def trace(self, scene: TraceScene, *arguments: Any) -> MeshHits:
+        here = functools.partial(super().trace, scene, *arguments)
+        if not len(scene.faces):
+            return here()
+        return self.tried(lambda: trace(self.launcher, self.mirror, here, scene, *arguments), here)
+
+    def shade(self, scene: TraceScene, hits: MeshHits, *arguments: Any) -> None:
+        def here() -> None:
+            shade_mesh(scene, hits.here() if isinstance(hits, HitsThere) else hits, *arguments)
+
+        if not isinstance(hits, HitsThere):
+            return here()
+        return self.tried(lambda: shade(self.launcher, self.mirror, scene, hits, *arguments), here)
 
     def rasterise(self, splats: Splats, y0: int, y1: int) -> SurfelSamples:
         def here() -> SurfelSamples:

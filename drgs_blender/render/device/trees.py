@@ -100,6 +100,7 @@ class Trees:
     ----------
     rows : (k, 2) int32 on the device, those of each tree together
     table : (trees, 3) int64, now: each one's id, mask and first of its `rows`
+    moving : the scene's vertices, faces and places, on the device, now
     trees : as many as there are kinds
     """
 
@@ -124,7 +125,7 @@ class Trees:
         launcher = self._launcher
         if self._faces is None or self._faces[0] is not scene.faces:
             self._faces = scene.faces, launcher.array(scene.faces)
-        given = launcher.array(scene.vertices), self._faces[1], launcher.array(scene.places)
+        given = self.moving = launcher.array(scene.vertices), self._faces[1], launcher.array(scene.places)
         for tree in self.trees:
             tree.follow(scene, given)
         ids = np.array([tree.id for tree in self.trees], np.int64)

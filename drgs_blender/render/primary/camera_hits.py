@@ -7,13 +7,16 @@ from typing import Any
 
 import numpy as np
 
-from ...jit import njit, prange
-from ..camera import AA, CLIP_END, CLIP_START, WIDTH, camera_ray, lattice, pixel_shift, sample_ray
+from ...jit import get_num_threads, njit, prange
+from ..camera import CLIP_END, CLIP_START, WIDTH, sample_ray
 from ..trace.scene import TraceScene
 from ..trace.surface import nearest, position_at, surface_at
 from .gbuffer import GBuffer, face_viewer
 
 Array = np.ndarray
+
+#: Samples or points of a block.
+_BLOCK = 256
 
 
 @dataclass(slots=True)
@@ -34,6 +37,11 @@ class MeshHits:
     place: Array
     where: Array
 
+    @property
+    def arrays(self) -> tuple[Array, ...]:
+        """All of them."""
+        return self.depth, self.owner, self.face, self.place, self.where
+
 
 def trace_camera(scene: TraceScene, parameters: Array, x0: int, y0: int, shape: tuple[int, ...], mask: int) -> MeshHits:
     """Closest hits of the camera's rays with what `mask` lets them meet.
@@ -50,123 +58,110 @@ def trace_camera(scene: TraceScene, parameters: Array, x0: int, y0: int, shape: 
         hits.owner[:] = -1
         return hits
     owners = scene.face_object, scene.place_object
-    _trace(scene.tracer, parameters, x0, y0, np.int32(mask), *owners, hits.depth, hits.owner, hits.face, hits.place,
-           hits.where)  # fmt: skip
+    _trace(scene.tracer, (parameters, x0, y0), np.int32(mask), owners, hits.arrays, 8 * get_num_threads())
     return hits
 
 
-def shade_mesh(
-    scene: TraceScene, hits: MeshHits, parameters: Array, x0: int, start: Array, buffer: GBuffer, layer: int
-) -> None:
-    """Fill the points of `buffer` that have the flags `layer` from `hits`; `start` is the first point of each row."""
+def shade_mesh(scene: TraceScene, hits: MeshHits, parameters: Array, x0: int, buffer: GBuffer, layer: int) -> None:
+    """Fill the points of `buffer` that have the flags `layer` from `hits`."""
+    moving = scene.vertices, scene.faces, scene.places
+    view_of = parameters, x0, buffer.rows[0]
+    keys, out = arrays_of(buffer)
+    _shade(scene.geometry, moving, view_of, layer, hits.arrays, keys, *out, 8 * get_num_threads())
+
+
+def arrays_of(buffer: GBuffer) -> tuple[tuple[Array, ...], tuple[tuple[Array, ...], ...]]:
+    """Pixel, sample and flags of its points, and in three groups the arrays that `shade_hits` fills."""
     points = buffer.points
-    _shade(
-        parameters,
-        x0,
-        start,
-        np.uint8(layer),
-        hits.depth,
-        hits.face,
-        hits.place,
-        hits.where,
-        scene.geometry,
-        scene.vertices,
-        scene.faces,
-        scene.places,
-        points.pixel,
-        points.sample,
-        points.flags,
-        points.origin,
-        points.normal,
-        points.geometric_normal,
-        points.view,
-        points.albedo,
-        points.roughness,
-        points.metallic,
-        buffer.position,
-        buffer.depth,
-        buffer.object_index,
-        buffer.emission,
-        buffer.face,
-        buffer.place,
-        buffer.barycentric,
-    )
+    frames = points.origin, points.normal, points.geometric_normal, points.view
+    materials = points.albedo, points.roughness, points.metallic
+    seen = buffer.position, buffer.depth, buffer.object_index, buffer.emission
+    tied = buffer.face, buffer.place, buffer.barycentric
+    return (points.pixel, points.sample, points.flags), (frames, materials, (*seen, *tied))
 
 
 @njit(parallel=True)
-def _trace(
-    tracer: Any,
-    p: Any,
-    x0: Any,
-    y0: Any,
-    mask: Any,
-    face_object: Any,
-    place_object: Any,
-    depth: Any,
-    owner: Any,
-    face: Any,
-    place: Any,
-    where: Any,
+def _trace(tracer: Any, view_of: Any, mask: Any, owners: Any, out: Any, lanes: Any) -> None:
+    for lane in prange(lanes):
+        trace_samples(np.int64(lane), lanes, None, tracer, view_of, mask, owners, out)
+
+
+@njit(parallel=True)
+def _shade(geometry: Any, moving: Any, view_of: Any, layer: Any, hits: Any, keys: Any, frames: Any, materials: Any,
+           seen: Any, lanes: Any) -> None:  # fmt: skip
+    for lane in prange(lanes):
+        out = frames, materials, seen
+        shade_hits(np.int64(lane), lanes, None, geometry, moving, view_of, layer, hits, keys, out)
+
+
+@njit
+def trace_samples(
+    lane: Any, lanes: Any, room: Any, tracer: Any, view_of: Any, mask: Any, owners: Any, out: Any
 ) -> None:
-    """Closest hits of all sub-pixel samples."""
+    """Closest hits of every so-manyth (`lanes`) block of sub-pixel samples, from the `lane`-th on.
+
+    Parameters
+    ----------
+    room : not used
+    view_of : `camera.camera_parameters`, column and row of the first sample
+    owners : object of each face and of each place
+    out : `MeshHits.arrays`
+    """
+    p, x0, y0 = view_of
+    face_object, place_object = owners
+    depth, owner, face, place, where = out
     width = np.int64(p[WIDTH])
     rows, columns, aa = depth.shape
     near, far = np.float32(p[CLIP_START]), np.float32(p[CLIP_END])
-    for y in prange(rows):
-        for x in range(columns):
-            shift_x, shift_y = pixel_shift(p, (y0 + y) * width + x0 + x)
-            for k in range(aa):
-                jx, jy = lattice(shift_x, shift_y, k, p[AA])
-                ox, oy, oz, dx, dy, dz = camera_ray(p, x0 + x + jx, y0 + y + jy)
-                t, f, i, u, v, gx, gy, gz = nearest(
-                    tracer, np.float32(ox), np.float32(oy), np.float32(oz),
-                    np.float32(dx), np.float32(dy), np.float32(dz), near, far, mask,
-                )  # fmt: skip
-                depth[y, x, k], face[y, x, k], place[y, x, k] = t, f, i
-                where[y, x, k, 0], where[y, x, k, 1] = u, v
-                where[y, x, k, 2], where[y, x, k, 3], where[y, x, k, 4] = gx, gy, gz
-                owner[y, x, k] = -1 if f < 0 else (face_object[f] if i < 0 else place_object[i])
+    count = rows * columns * aa
+    for block in range(lane, (count + _BLOCK - 1) // _BLOCK, lanes):
+        for n in range(block * _BLOCK, min((block + 1) * _BLOCK, count)):
+            x, y, k = n // aa % columns, n // (aa * columns), n % aa
+            ox, oy, oz, dx, dy, dz = sample_ray(p, (y0 + y) * width + x0 + x, k)
+            t, f, i, u, v, gx, gy, gz = nearest(
+                tracer, np.float32(ox), np.float32(oy), np.float32(oz),
+                np.float32(dx), np.float32(dy), np.float32(dz), near, far, mask,
+            )  # fmt: skip
+            depth[y, x, k], face[y, x, k], place[y, x, k] = t, f, i
+            where[y, x, k, 0], where[y, x, k, 1] = u, v
+            where[y, x, k, 2], where[y, x, k, 3], where[y, x, k, 4] = gx, gy, gz
+            owner[y, x, k] = -1
+            if f >= 0 and i >= 0:
+                owner[y, x, k] = place_object[i]
+            elif f >= 0:
+                owner[y, x, k] = face_object[f]
 
 
-@njit(parallel=True)
-def _shade(
-    p: Any,
-    x0: Any,
-    start: Any,
-    layer: Any,
-    hit_depth: Any,
-    hit_face: Any,
-    hit_place: Any,
-    where: Any,
-    geometry: Any,
-    vertices: Any,
-    faces: Any,
-    places: Any,
-    pixel: Any,
-    sample: Any,
-    flags: Any,
-    origin: Any,
-    normal: Any,
-    geometric: Any,
-    view: Any,
-    albedo: Any,
-    roughness: Any,
-    metallic: Any,
-    position: Any,
-    depth: Any,
-    owner: Any,
-    emission: Any,
-    out_face: Any,
-    out_place: Any,
-    barycentric: Any,
-) -> None:
-    """Fill the shading points from the hits, row by row."""
+@njit
+def shade_hits(
+    lane: Any, lanes: Any, room: Any, geometry: Any, moving: Any, view_of: Any, layer: Any, hits: Any, keys: Any,
+    out: Any,
+) -> None:  # fmt: skip
+    """Fill every so-manyth (`lanes`) block of points from their hits, from the `lane`-th on.
+
+    Parameters
+    ----------
+    room : not used
+    geometry, moving : the scene's, and its vertices, faces and places
+    view_of : as of `trace_samples`
+    layer : flags that points must have
+    hits : `MeshHits.arrays`
+    keys, out : `arrays_of`
+    """
+    vertices, faces, places = moving
+    p, x0, y0 = view_of
+    hit_depth, _, hit_face, hit_place, where = hits
+    pixel, sample, flags = keys
+    frames, materials, seen = out
+    origin, normal, geometric, view = frames
+    albedo, roughness, metallic = materials
+    position, depth, owner, emission, out_face, out_place, barycentric = seen
     width = np.int64(p[WIDTH])
-    for y in prange(len(start) - 1):
-        for n in range(start[y], start[y + 1]):
+    for block in range(lane, (len(pixel) + _BLOCK - 1) // _BLOCK, lanes):
+        for n in range(block * _BLOCK, min((block + 1) * _BLOCK, len(pixel))):
             if flags[n] & layer != layer:
                 continue
-            x, k = pixel[n] % width - x0, sample[n]
+            y, x, k = pixel[n] // width - y0, pixel[n] % width - x0, sample[n]
             _, _, _, dx, dy, dz = sample_ray(p, pixel[n], sample[n])
             scale = -1.0 / np.sqrt(dx * dx + dy * dy + dz * dz)
             vx, vy, vz = scale * dx, scale * dy, scale * dz

@@ -7,6 +7,7 @@ hides nothing by itself.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -42,18 +43,26 @@ class Layers:
     hits: MeshHits | None
 
 
-def combine(samples: SurfelSamples, scene: TraceScene, parameters: Array, x0: int, y0: int) -> Layers:
+def combine(
+    samples: SurfelSamples,
+    scene: TraceScene,
+    parameters: Array,
+    x0: int,
+    y0: int,
+    trace: Callable[..., MeshHits] = trace_camera,
+) -> Layers:
     """Combine blended surfels with the ordinary meshes that the camera sees.
 
     Parameters
     ----------
     parameters : `camera.camera_parameters`
     x0, y0 : full-picture pixel of the first sample
+    trace : who casts the camera's rays
     """
     special = bool((scene.object_flags & (HOLDOUT | CATCHER)).any())
     if not scene.any_ordinary and not special:
         return Layers(samples.alpha, None, samples.alpha, None)
-    hits = trace_camera(scene, parameters, x0, y0, samples.alpha.shape, ORDINARY if scene.any_ordinary else 0)
+    hits = trace(scene, parameters, x0, y0, samples.alpha.shape, ORDINARY if scene.any_ordinary else 0)
     first, second, opaque = (np.empty_like(samples.alpha) for _ in range(3))
     _combine(
         samples.alpha,

@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from ...frame import Camera
 from ..camera import AA
 from ..trace.masks import CAMERA
 from ..trace.scene import TraceScene
-from .camera_hits import shade_mesh, trace_camera
+from .camera_hits import MeshHits, shade_mesh, trace_camera
 from .gbuffer import GBuffer, compact
 from .layers import lone
 
 Array = np.ndarray
 
 
-def primary_mesh(scene: TraceScene, camera: Camera, parameters: Array, y0: int, y1: int) -> GBuffer:
+def primary_mesh(
+    scene: TraceScene,
+    camera: Camera,
+    parameters: Array,
+    y0: int,
+    y1: int,
+    trace: Callable[..., MeshHits] = trace_camera,
+    shade: Callable[..., None] = shade_mesh,
+) -> GBuffer:
     """Trace camera rays through the sub-pixel positions of the rows ``y0 .. y1`` (full-picture pixels).
 
     Normals and materials are interpolated over the face that is hit. Faces seen from behind are shown, with their
@@ -24,12 +34,13 @@ def primary_mesh(scene: TraceScene, camera: Camera, parameters: Array, y0: int, 
     Parameters
     ----------
     parameters : `camera.camera_parameters`
+    trace, shade : who casts the rays, and who finds what they have met
     """
     x0, _, x1, _ = camera.window
-    hits = trace_camera(scene, parameters, x0, y0, (y1 - y0, x1 - x0, int(parameters[AA])), CAMERA)
+    hits = trace(scene, parameters, x0, y0, (y1 - y0, x1 - x0, int(parameters[AA])), CAMERA)
     layers = lone(hits, scene)
-    buffer, start = compact(layers.first, parameters, x0, y0)
+    buffer, _ = compact(layers.first, parameters, x0, y0)
     buffer.alpha = layers.opaque
-    shade_mesh(scene, hits, parameters, x0, start, buffer, 0)
+    shade(scene, hits, parameters, x0, buffer, 0)
     buffer.mark_catchers(scene.object_flags)
     return buffer

@@ -36,7 +36,7 @@ from ..surfels.splats import SIZE, Splats
 from ..trace.masks import SURFELS
 from ..trace.scene import TraceScene
 from ..trace.surface import nearest
-from .camera_hits import shade_mesh
+from .camera_hits import MeshHits, shade_mesh, trace_camera
 from .gbuffer import GBuffer, compact, face_viewer
 from .layers import combine
 
@@ -73,6 +73,8 @@ def primary_surfels(
     tied: bool = True,
     rasterise: Callable[[Splats, int, int], SurfelSamples] = rasterise,
     tie: Callable[..., None] | None = None,
+    trace: Callable[..., MeshHits] = trace_camera,
+    shade: Callable[..., None] = shade_mesh,
 ) -> GBuffer:
     """Blend the surfels of the rows ``y0 .. y1`` (full-picture pixels) and tie them to the mesh.
 
@@ -82,10 +84,11 @@ def primary_surfels(
     windows : `snap_windows` of this frame
     tied : False: rays meet surfels, and nothing is tied
     rasterise, tie : who blends the surfels, and who ties their points; None: this processor
+    trace, shade : as of `primary_mesh`, for ordinary meshes next to the surfels
     """
     samples = rasterise(splats, y0, y1)
-    layers = combine(samples, scene, splats.parameters, camera.window[0], y0)
-    buffer, start = compact(layers.first, splats.parameters, camera.window[0], y0, layers.second)
+    layers = combine(samples, scene, splats.parameters, camera.window[0], y0, trace)
+    buffer, _ = compact(layers.first, splats.parameters, camera.window[0], y0, layers.second)
     buffer.alpha = layers.opaque
     points = buffer.points
     (tie or tie_to_mesh)(
@@ -103,7 +106,7 @@ def primary_surfels(
         points.own = np.where(points.flags & SECOND, -1, buffer.object_index).astype(np.int32)
         points.size = samples.surface[row - y0, column - camera.window[0], points.sample, SIZE]
     if layers.hits is not None:
-        shade_mesh(scene, layers.hits, splats.parameters, camera.window[0], start, buffer, SECOND)
+        shade(scene, layers.hits, splats.parameters, camera.window[0], buffer, SECOND)
     buffer.mark_catchers(scene.object_flags)
     return buffer
 
