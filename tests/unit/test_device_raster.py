@@ -92,3 +92,26 @@ def test_points_are_tied_to_the_mesh_as_the_processor_ties_them(device: OnDevice
     np.testing.assert_allclose(there.depth, here.depth, rtol=1e-4)
     assert (here.face >= 0).mean() > 0.3
     assert (there.face == here.face).mean() > 0.995
+
+
+def test_blended_samples_are_not_copied_to_a_card_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    device, scene, camera, copied = OnDevice("cpu"), scene_of(sphere_mesh(2)), look_along_y(48, 40), []
+    device.launcher.apart, copy = True, device.launcher.array
+    monkeypatch.setattr(
+        device.launcher, "array", lambda array, *more, **how: copied.append(array) or copy(array, *more, **how)
+    )
+    parameters, windows = camera_parameters(camera, RenderSettings(aa=2), 1), snap_windows(scene, 1)
+    splats = device.prepare(sphere_surfels(1.0), camera, parameters)
+    given, samples = (scene, windows, camera, 0, 40, True), []
+
+    def rasterise_there(*arguments: object) -> SurfelSamples:
+        samples.append(device.rasterise(*arguments))  # type: ignore[arg-type]
+        return samples[-1]
+
+    found = primary_surfels(splats, *given, rasterise_there, device.tie)
+    assert not device.failed and not any(np.shares_memory(array, samples[0].surface) for array in copied)
+    other = device.rasterise(splats, 0, 40)  # other samples than the latest are copied
+    again = primary_surfels(splats, *given, lambda *arguments: samples[0], device.tie)
+    assert other.surface is not samples[0].surface
+    assert any(np.shares_memory(array, samples[0].surface) for array in copied)
+    np.testing.assert_array_equal(found.points.origin, again.points.origin)

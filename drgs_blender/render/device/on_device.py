@@ -28,7 +28,7 @@ from .camera_hits import HitsThere, shade, trace
 from .denoise import denoise
 from .integrate import DeviceKernel
 from .mirror import Mirror
-from .raster import rasterise
+from .raster import SamplesThere, rasterise
 from .splats import SplatsThere, prepare
 
 Array = np.ndarray
@@ -45,6 +45,7 @@ class OnDevice(Processor):
     def __init__(self, device: str) -> None:
         self.launcher: Launcher = Launcher(device)
         self.mirror = Mirror(self.launcher)
+        self._samples: SamplesThere | None = None
         self._kernel = DeviceKernel(self.launcher, self.mirror)
 
     def integrate(self, *arguments: Any, surfels: SurfelBVH | None = None) -> Radiance:
@@ -80,11 +81,20 @@ class OnDevice(Processor):
 
         if not len(splats):
             return here()
-        return self.tried(lambda: rasterise(self.launcher, splats, y0, y1), here)
+
+        def there() -> SurfelSamples:
+            self._samples = rasterise(self.launcher, splats, y0, y1)
+            return self._samples
+
+        return self.tried(there, here)
 
     def tie(self, scene: TraceScene, *arguments: Any) -> None:
-        here = super().tie
-        self.tried(lambda: tie(self.launcher, self.mirror, scene, *arguments), lambda: here(scene, *arguments))
+        here = functools.partial(super().tie, scene, *arguments)
+        rules, view_of, samples, *more = arguments
+        latest, self._samples = self._samples, None
+        if latest is not None and samples[1] is latest.surface:
+            samples = latest.there  # not to be copied again
+        self.tried(lambda: tie(self.launcher, self.mirror, scene, rules, view_of, samples, *more), here)
 
     def denoise(
         self, components: Array, variance: Array, guides: Guides, split: bool, check: Callable[[], None]

@@ -8,6 +8,7 @@ gathers those behind the last.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -197,19 +198,29 @@ _ROOMS = (
 BLEND = Work(blend_samples, _ROOMS, {})
 
 
-def rasterise(launcher: Launcher, splats: Splats, y0: int, y1: int) -> SurfelSamples:
+@dataclass(slots=True)
+class SamplesThere(SurfelSamples):
+    """`SurfelSamples` that have come back from a device.
+
+    Attributes
+    ----------
+    there : depth, surface and object index, where they still are
+    """
+
+    there: tuple[Any, Any, Any]
+
+
+def rasterise(launcher: Launcher, splats: Splats, y0: int, y1: int) -> SamplesThere:
     """`surfels.raster.rasterise` on a device; where ``alpha`` is 0 the other arrays are undefined."""
     x0, top, x1, _ = splats.window
     aa = int(splats.parameters[AA])
     shape = y1 - y0, x1 - x0, aa
-    samples = SurfelSamples(
-        np.empty(shape, np.float32),
-        np.empty(shape, np.float32),
-        np.empty((*shape, 9), np.float32),
-        np.empty(shape, np.int32),
-    )
+    with launcher.failures("blending surfels"):
+        alpha, depth, surface = (launcher.zeros(size) for size in (shape, shape, (*shape, 9)))
+        owner = launcher.zeros(shape, "int32")
     arrays = splats.screen, splats.surface, splats.box, splats.nearest, splats.object_index
     arguments = *arrays, splats.tile_start, splats.tile_list, splats.parameters, x0, x1, top // TILE, y0, y1, aa
-    out = samples.alpha, samples.depth, samples.surface, samples.object_index
-    launcher.launch(BLEND, samples.alpha.size, arguments, out)
-    return samples
+    launcher.launch(BLEND, int(np.prod(shape)), arguments, (alpha, depth, surface, owner))
+    with launcher.failures("blending surfels"):
+        there = depth, surface, owner
+        return SamplesThere(alpha.numpy(), depth.numpy(), surface.numpy(), owner.numpy(), there)
