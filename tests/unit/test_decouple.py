@@ -21,7 +21,7 @@ from drgs_blender.reconstruct.capture import Capture, View  # noqa: E402
 from drgs_blender.reconstruct.decouple.cache import radiance_cache  # noqa: E402
 from drgs_blender.reconstruct.decouple.gather import Gatherer, Points  # noqa: E402
 from drgs_blender.reconstruct.decouple.light import LearnedLight, colour_cast  # noqa: E402
-from drgs_blender.reconstruct.decouple.losses import log_loss, unbiased_loss  # noqa: E402
+from drgs_blender.reconstruct.decouple.losses import dullness, log_loss, unbiased_loss  # noqa: E402
 from drgs_blender.reconstruct.decouple.materials import Materials, from_specular  # noqa: E402
 from drgs_blender.reconstruct.decouple.pixels import Pixels, foreground_pixels  # noqa: E402
 from drgs_blender.reconstruct.decouple.run import Decoupled, decouple  # noqa: E402
@@ -237,6 +237,16 @@ def test_clipped_photographs_set_no_upper_bound():
     assert float(log_loss(torch.full((4, 3), 3.0), white)) == 0
     assert float(unbiased_loss(torch.full((4, 2, 3), 3.0), white)) == 0
     assert float(log_loss(torch.full((4, 3), 0.5), white)) > 0
+
+
+def test_metals_are_pulled_to_be_bright_keep_their_hue_and_paint_is_let_alone():
+    albedo = torch.tensor([[0.4, 0.3, 0.1], [0.95, 0.7, 0.4], [1.0, 1.0, 1.0], [0.4, 0.3, 0.1]], requires_grad=True)
+    loss = dullness(albedo, torch.tensor([1.0, 1.0, 1.0, 0.4]))
+    (slope,) = torch.autograd.grad(loss, albedo)
+    step = -slope
+    assert (step[0] > 0).all() and step[0] / step[0, 0] == pytest.approx(albedo[0].detach() / 0.4, rel=1e-5)
+    assert step[1].abs().max() < 1e-6 and (step[2] < 0).all()
+    assert 0 < step[3].max() < 0.01 * step[0].max()
 
 
 def test_specular_colours_and_back():

@@ -9,6 +9,9 @@ from torch import Tensor
 CLIPPED = 0.98
 #: Knee and exponent that weigh differences nearly as sRGB encoding does.
 _KNEE, _EXPONENT = 0.03, 0.6
+#: Reflectance of polished metals in their brightest channel (silver .97, gold 1, copper .96, aluminium .92), and the
+#: power of metallic that counts: the half-metals of the first steps must not be pulled, or bright paint becomes metal.
+_POLISHED, _SURELY = 0.95, 6
 
 
 def log_loss(shown: Tensor, photographed: Tensor) -> Tensor:
@@ -19,6 +22,19 @@ def log_loss(shown: Tensor, photographed: Tensor) -> Tensor:
     """
     difference = torch.log1p(photographed) - torch.log1p(shown)
     return torch.where(photographed >= CLIPPED, difference.clamp(min=0), difference.abs()).mean()
+
+
+def dullness(albedo: Tensor, metallic: Tensor) -> Tensor:
+    """How much less metals (n, 3), (n,) reflect than polished ones do, mean squared difference of their colours.
+
+    Where light is dim, nothing but metal tells how dim: dark metal in a light that is too even looks almost the same.
+    Metals that are used polished reflect nine tenths and more of their brightest channel. Gradients scale a colour and
+    leave its hue; what is not surely metal has none.
+    """
+    known = albedo.detach()
+    brightest = known.max(1, keepdim=True).values.clamp(min=1e-3)
+    share = metallic.detach()[:, None] ** _SURELY
+    return (share * (albedo - known * (_POLISHED / brightest)) ** 2).sum(1).mean()
 
 
 def unbiased_loss(shown: Tensor, photographed: Tensor, by_shown: bool = False) -> Tensor:

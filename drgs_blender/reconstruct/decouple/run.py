@@ -28,7 +28,7 @@ from .blend import blend
 from .cache import edges_of, filled, radiance_cache
 from .gather import Points
 from .light import LearnedLight, colour_cast
-from .losses import log_loss, unbiased_loss
+from .losses import dullness, log_loss, unbiased_loss
 from .materials import Materials
 from .pixels import Pixels, foreground_pixels
 from .settings import Settings
@@ -43,6 +43,8 @@ _AIM, _REPORT, _SAVE = 25, 25, 20.0
 _GROWS, _NORMALS, _LAST_RATE = (0.2, 0.45), 0.4, 0.05
 #: Where weights by what is shown begin: before, they let light that is much too bright stay so.
 _BY_SHOWN = 0.3
+#: From here on metals are told from paint well enough to say how bright they are.
+_POLISH = 0.2
 #: How much smoother than albedo roughness and metallic are (of diffuse and specular colour: diffuse, roughness, rest).
 _SMOOTH = (1.0, 1.0, 1.0, 2.0, 10.0, 10.0, 10.0)
 #: Edges that are smoothed a step; how much photographed chroma may differ along one that is.
@@ -258,6 +260,8 @@ class _Job:
         loss = loss + s.smoothness * ((likeness * differences).mean(0) * weights).sum()
         if s.bimodal > 0 and self.materials.metallic:
             loss = loss + s.bimodal * (here[:, 4] * (1 - here[:, 4])).mean()
+        if s.polish > 0 and self.materials.metallic and self.part >= _POLISH:
+            loss = loss + s.polish * dullness(here[:, :3], here[:, 4])
         if s.white > 0:
             loss = loss + s.white * colour_cast(radiance)
         if s.light_smoothness > 0:

@@ -30,6 +30,7 @@ class Settings:
     light_smoothness : weight of the differences of log radiance between neighbours in the environment
     white : weight that pulls the environment towards grey
     bimodal : weight that pulls metallic to 0 or 1
+    polish : weight that pulls the colours of metals towards as bright as polished metals are
     unbiased : compare two independent estimates of each pixel, so that their noise is not learned from
     by_shown : weigh differences by what is shown, once that is near the photographs; else by the photographs, which
         finds polished metal and the light in it too dark where the mesh is a little off
@@ -59,6 +60,7 @@ class Settings:
     light_smoothness: float = 0.001
     white: float = 0.0003
     bimodal: float = 0.0
+    polish: float = 0.05
     unbiased: bool = True
     by_shown: bool = True
     parametrisation: Literal["metallic", "specular", "dielectric"] = "metallic"
