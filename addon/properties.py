@@ -116,6 +116,17 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
         max=1024,
         default=0,
     )
+    filter_width: FloatProperty(
+        name="Filter Width",
+        description="Of the pixel filter, Blackman-Harris as in Cycles. Wider is smoother; 0 is a box of one pixel",
+        subtype="PIXEL",
+        min=0.0,
+        soft_max=3.0,
+        max=10.0,
+        default=1.5,
+        step=10,
+        precision=2,
+    )
     primary: EnumProperty(
         name="Primary",
         description="What the camera sees",
@@ -222,6 +233,7 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
             clamp_indirect=own.clamp_indirect,
             split="counts" if own.use_custom_split else "auto",
             device=own.device.lower(),
+            filter_width=own.filter_width,
         )
 
 

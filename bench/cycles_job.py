@@ -79,7 +79,8 @@ def render(scene: bpy.types.Scene, job: dict) -> tuple[np.ndarray, float]:
     cycles.device, cycles.samples = "CPU", job["samples"]
     cycles.use_adaptive_sampling = False
     cycles.use_denoising = bool(job.get("denoise"))
-    cycles.pixel_filter_type, cycles.filter_width = "BOX", 1.0
+    width = job.get("filter_width")
+    cycles.pixel_filter_type, cycles.filter_width = ("BLACKMAN_HARRIS", width) if width else ("BOX", 1.0)
     cycles.max_bounces = job["bounces"]
     cycles.diffuse_bounces = cycles.glossy_bounces = job["bounces"]
     cycles.sample_clamp_direct = cycles.sample_clamp_indirect = 0.0

@@ -279,6 +279,8 @@ class RenderSettings:
     samples above are then the most a pixel gets. ``clamp_indirect`` above 0 limits the brightness of a single indirect
     sample, which loses energy. ``primary`` is what the camera sees of DR-GS objects; ``tracer`` is what light meets of
     them: their meshes, or the surfels themselves, blended along each ray (slower; for thin things without a good mesh).
+    ``filter_width`` is that of the pixel filter as Cycles counts it, half of Blackman and Harris's window; 0 is a box
+    of one pixel.
     ``device`` "cuda" has a graphics card do what it can, see docs/gpu.md; without one it is as "cpu", with a warning.
     """
 
@@ -298,6 +300,7 @@ class RenderSettings:
     clamp_indirect: float = 0.0
     split: Literal["auto", "counts"] = "auto"
     device: Literal["cpu", "cuda"] = "cpu"
+    filter_width: float = 0.0
 
     @property
     def rays(self) -> int:

@@ -100,6 +100,7 @@ class DRGS_PT_film(_RenderPanel, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         self.layout.use_property_split = True
         self.layout.prop(context.scene.render, "film_transparent", text="Transparent")
+        self.layout.prop(context.scene.drgs, "filter_width")
 
 
 CLASSES = (DRGS_PT_presets, DRGS_PT_sampling, DRGS_PT_light, DRGS_PT_blur, DRGS_PT_film)

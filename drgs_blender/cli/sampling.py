@@ -57,6 +57,12 @@ def add_arguments(parser: argparse.ArgumentParser, *, defaults: bool, output: bo
         "sub-pixel positions among which the rays are divided, 0 for as many as suit them",
         type=whole(0, 1024),
     )
+    add(
+        "--filter-width",
+        "filter_width",
+        "pixels that the filter is wide (Blackman-Harris, Cycles has 1.5); 0 for a box of one pixel",
+        type=at_least_zero,
+    )
     add("--primary", "primary", "what the camera sees: surfels or the mesh", choices=choices("primary"))
     add("--tracer", "tracer", "what light meets of DR-GS objects: the mesh or the surfels", choices=choices("tracer"))
     add("--denoise", "denoise", "denoiser", choices=choices("denoise"))
@@ -141,7 +147,7 @@ def check_size(camera: Camera, passes: Sequence[str]) -> None:
 
 def override(settings: RenderSettings, args: argparse.Namespace) -> RenderSettings:
     """`settings` with every option that was given."""
-    numbers = ("bounces", "noise_threshold", "clamp_indirect", "aa", "seed", "threads")
+    numbers = ("bounces", "noise_threshold", "clamp_indirect", "aa", "filter_width", "seed", "threads")
     names = (*numbers, "primary", "tracer", "denoise", "look", "device", "film_transparent")
     given = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
     counts = args.split or (args.rays and split_rays(args.rays))

@@ -88,7 +88,7 @@ def test_vectors_are_those_of_cycles(moving, tmp_path):
     cycles.use_adaptive_sampling = cycles.use_denoising = False
     theirs = layers_of(moving, "CYCLES", tmp_path)
     settings = moving.drgs
-    settings.primary, settings.aa = "mesh", 64
+    settings.primary, settings.aa, settings.filter_width = "mesh", 64, 0
     settings.cosine, settings.ggx, settings.environment = 32, 16, 16
     ours = layers_of(moving, "DRGS", tmp_path)
     index = next(name for name in ours if name in ("IndexOB", "Object Index"))

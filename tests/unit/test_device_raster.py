@@ -27,16 +27,19 @@ SCENES = {
 }
 
 
-def both(device: OnDevice, name: str, rows: tuple[int, int] = (0, 30)) -> tuple[SurfelSamples, SurfelSamples]:
+def both(
+    device: OnDevice, name: str, rows: tuple[int, int] = (0, 30), width: float = 0.0
+) -> tuple[SurfelSamples, SurfelSamples]:
     posed, view = SCENES[name]
     camera = look_along_y(40, 30, **view)
-    given = posed, camera, camera_parameters(camera, RenderSettings(aa=3, seed=5), 2)
+    given = posed, camera, camera_parameters(camera, RenderSettings(aa=3, seed=5, filter_width=width), 2)
     return rasterise(prepare(*given), *rows), device.rasterise(device.prepare(*given), *rows)
 
 
+@pytest.mark.parametrize("width", [0.0, 1.5])
 @pytest.mark.parametrize("name", SCENES)
-def test_a_device_finds_the_samples_that_the_processor_finds(device: OnDevice, name: str) -> None:
-    here, there = both(device, name)
+def test_a_device_finds_the_samples_that_the_processor_finds(device: OnDevice, name: str, width: float) -> None:
+    here, there = both(device, name, width=width)
     seen = here.alpha > 0
     assert seen.mean() > 0.1
     np.testing.assert_array_equal(there.alpha > 0, seen)

@@ -70,7 +70,7 @@ def test_g_buffer(scene: str, orthographic: bool):
     for y, x in np.ndindex(view.height, view.width):
         shift = pixel_shift(parameters, y * view.width + x)
         for k in range(AA):
-            position[y, x, k] = np.float32(np.add((x, y), lattice(*shift, k, AA)))
+            position[y, x, k] = np.float32(np.add((x, y), lattice(*shift, k, parameters)))
     splats = reference.Splats.from_posed(posed)
     place = torch.from_numpy(position.reshape(-1, 2))
     with torch.no_grad():

@@ -156,6 +156,23 @@ def test_mesh_and_surfels_look_through_the_same_positions() -> None:
     assert np.allclose(a.points.view, b.points.view, atol=1e-6)
 
 
+@pytest.mark.parametrize("width", [0.75, 1.5])
+def test_an_edge_is_as_soft_as_the_pixel_filter(width: float) -> None:
+    """Coverage across a straight edge is the integral of the window, here of a mesh."""
+    edge = 0.3
+    plane = np.array([[-9, 0, -9], [edge, 0, -9], [edge, 0, 9], [-9, 0, 9]], np.float32)
+    scene = scene_of((plane, np.array([[0, 1, 2], [0, 2, 3]], np.int32)))
+    camera = look_along_y(24, focal=4.0, orthographic=True)
+    settings = RenderSettings(aa=64, primary="mesh", filter_width=width)
+    buffer = primary_mesh(scene, camera, camera_parameters(camera, settings, 1), 0, 24)
+    coverage = np.bincount(buffer.points.pixel, buffer.points.weight, 24 * 24).reshape(24, 24).mean(0)
+    a, k = np.array([0.48829, 0.14128, 0.01168]), 2 * np.pi * np.arange(1, 4)
+    x = np.clip((12 + 4 * edge - np.arange(24) - 0.5) / (2 * width), -0.5, 0.5)
+    expected = 0.5 + x + (a / k * np.sin(np.outer(x, k))).sum(1) / 0.35875
+    assert ((expected > 0.01) & (expected < 0.99)).any()
+    assert np.abs(coverage - expected).max() < 0.01
+
+
 def test_mesh_region_and_clipping() -> None:
     scene = scene_of(sphere_mesh(3))
     camera = look_along_y(40)

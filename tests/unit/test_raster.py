@@ -70,29 +70,30 @@ def random_surfels(n: int, seed: int = 0, size: float = 0.05) -> PosedSurfels:
     )
 
 
-def render(posed: PosedSurfels, camera: Camera, aa: int = 1, seed: int = 3) -> raster.SurfelSamples:
-    p = camera_parameters(camera, RenderSettings(aa=aa, seed=seed), 7)
+def render(posed: PosedSurfels, camera: Camera, aa: int = 1, seed: int = 3, **more: float) -> raster.SurfelSamples:
+    p = camera_parameters(camera, RenderSettings(aa=aa, seed=seed, **more), 7)
     return raster.rasterise(screen.prepare(posed, camera, p), camera.window[1], camera.window[3])
 
 
-def sample_positions(camera: Camera, aa: int, seed: int = 3) -> np.ndarray:
+def sample_positions(camera: Camera, aa: int, seed: int = 3, **more: float) -> np.ndarray:
     """(h, w, aa, 2) pixel positions of the samples of `render`."""
-    p = camera_parameters(camera, RenderSettings(aa=aa, seed=seed), 7)
+    p = camera_parameters(camera, RenderSettings(aa=aa, seed=seed, **more), 7)
     x0, y0, x1, y1 = camera.window
     out = np.empty((y1 - y0, x1 - x0, aa, 2))
     for y, x, k in np.ndindex(*out.shape[:3]):
         shift = pixel_shift(p, (y0 + y) * camera.width + x0 + x)
-        out[y, x, k] = np.add((x0 + x, y0 + y), lattice(*shift, k, aa))
+        out[y, x, k] = np.add((x0 + x, y0 + y), lattice(*shift, k, p))
     return out
 
 
+@pytest.mark.parametrize("width", [0.0, 1.5, 4.0])
 @pytest.mark.parametrize("orthographic", [False, True])
-def test_one_surfel_is_the_gaussian_it_should_be(orthographic: bool) -> None:
+def test_one_surfel_is_the_gaussian_it_should_be(orthographic: bool, width: float) -> None:
     camera = look_along_y(60, 50, distance=4, focal=20.0 if orthographic else 80.0, orthographic=orthographic)
     # Sheared tangents in the plane y = 0, depth 4; 1 m is 20 pixels there.
     u, v = np.array([0.3, 0, 0.1]), np.array([0.1, 0, 0.4])
-    got = render(surfels([[0.1, 0, -0.2]], u, v, opacity=0.8), camera, aa=2)
-    at = sample_positions(camera, 2)
+    got = render(surfels([[0.1, 0, -0.2]], u, v, opacity=0.8), camera, aa=2, filter_width=width)
+    at = sample_positions(camera, 2, filter_width=width)
     offset = np.stack([(at[..., 0] - 30) / 20 - 0.1, -(at[..., 1] - 25) / 20 + 0.2], -1)
     uv = offset @ np.linalg.inv(np.array([u[[0, 2]], v[[0, 2]]]))
     expected = 0.8 * np.exp(-0.5 * (uv**2).sum(-1))
@@ -116,11 +117,27 @@ def test_the_low_pass_follows_the_sampling_rate(aa: int) -> None:
         assert abs(got.alpha.mean(-1).sum() - np.pi / aa) < 0.3 * np.pi / aa
 
 
-def test_an_edge_on_surfel_stays_visible() -> None:
-    got = render(surfels([[0, 0, 0]], [0, 0.5, 0], [0, 0, 0.5], opacity=0.9), look_along_y(40, 40), aa=4)
-    column = got.alpha[:, 19:21].max(axis=(1, 2))
-    assert column[18:22].max() > 0.6
-    assert np.allclose(got.depth[got.alpha > 0], 4, atol=1e-4)
+@pytest.mark.parametrize("aa", [4, 16])
+def test_a_ball_is_as_large_as_it_is(aa: int) -> None:
+    """The many surfels edge-on along its outline do not widen it."""
+    camera = look_along_y(40, 40, focal=15.0, orthographic=True)
+    k = np.arange(6000) + 0.5
+    z, turn = 1 - k / 3000, k * np.pi * (3 - 5**0.5)
+    normal = np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], 1)
+    u = np.cross(normal, np.where(np.abs(z[:, None]) < 0.9, [[0.0, 0, 1]], [[1.0, 0, 0]]))
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    ball = surfels(normal, 0.03 * u, 0.03 * np.cross(normal, u), opacity=0.95)
+    radius = np.sqrt(render(ball, camera, aa).alpha.mean(-1).sum() / np.pi)
+    # The filter blurs the edge by 0.7 / sqrt(aa) pixels, and where surfels overlap more than half of that is opaque.
+    assert abs(radius - 15) < 0.6 / np.sqrt(aa)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 1e-3, 0.05])
+def test_a_surfel_fades_as_it_turns_edge_on(tilt: float) -> None:
+    """Narrower than the filter, it shows the filter, weakened by the cosine."""
+    got = render(surfels([[0, 0, 0]], [0.02 * tilt, 0.02, 0], [0, 0, 1e-4], opacity=0.9), look_along_y(41, 41), aa=16)
+    peak = 0.9 * tilt / np.hypot(tilt, 1)
+    assert (got.alpha == 0).all() if peak < 1 / 255 else 0.3 * peak < got.alpha.max() <= 1.01 * peak
 
 
 def plane_of_surfels(y: float, half: float, spacing: float, sigma: float, **values: object) -> PosedSurfels:
@@ -229,11 +246,12 @@ def test_the_order_of_the_input_does_not_matter() -> None:
     assert np.array_equal(a.surface[seen], b.surface[seen])
 
 
-def test_rows_and_regions_are_crops_of_the_picture() -> None:
+@pytest.mark.parametrize("width", [0.0, 3.0])
+def test_rows_and_regions_are_crops_of_the_picture(width: float) -> None:
     posed = random_surfels(500, seed=6)
     camera = look_along_y(70, 61)
-    whole = render(posed, camera, aa=3)
-    p = camera_parameters(camera, RenderSettings(aa=3, seed=3), 7)
+    whole = render(posed, camera, aa=3, filter_width=width)
+    p = camera_parameters(camera, RenderSettings(aa=3, seed=3, filter_width=width), 7)
     splats = screen.prepare(posed, camera, p)
     for y0, y1 in ((0, 1), (5, 38), (31, 61), (60, 61)):
         part = raster.rasterise(splats, y0, y1)
@@ -241,7 +259,7 @@ def test_rows_and_regions_are_crops_of_the_picture() -> None:
         seen = part.alpha > 0
         assert np.array_equal(part.surface[seen], whole.surface[y0:y1][seen])
     camera.region = (13, 7, 50, 41)
-    part = render(posed, camera, aa=3)
+    part = render(posed, camera, aa=3, filter_width=width)
     assert np.array_equal(part.alpha, whole.alpha[7:41, 13:50])
     seen = part.alpha > 0
     assert np.array_equal(part.depth[seen], whole.depth[7:41, 13:50][seen])
@@ -309,3 +327,26 @@ def test_sub_pixel_positions_are_stratified_and_uniform(aa: int) -> None:
         assert np.abs(gaps - 1 / aa).max() < 0.01
     other = sample_positions(camera, aa, seed=4) % 1.0
     assert np.abs(other - at).mean() > 0.1
+
+
+@pytest.mark.parametrize("width", [0.5, 1.5, 4.0])
+def test_the_pixel_filter_is_the_window_of_blackman_and_harris(width: float) -> None:
+    camera = look_along_y(64, 64)
+    centre = np.stack(np.meshgrid(np.arange(64), np.arange(64)), -1)[:, :, None] + 0.5
+    off = (sample_positions(camera, 16, filter_width=width) - centre) / (2 * width)
+    assert np.abs(off).max() <= 0.5
+    a = np.array([0.35875, 0.48829, 0.14128, 0.01168])
+    x = np.linspace(-0.45, 0.45, 19)
+    k = 2 * np.pi * np.arange(1, 4)
+    below = 0.5 + x + (a[1:] / k * np.sin(np.outer(x, k))).sum(1) / a[0]
+    for axis in range(2):
+        found = (off[..., axis].reshape(-1, 1) < x).mean(0)
+        assert np.abs(found - below).max() < 2e-3
+    gaps = np.diff(np.sort(off[..., 0], axis=2), axis=2)
+    assert gaps.min() > 0.01  # still stratified
+
+
+@pytest.mark.parametrize("width", [-1.0, 11.0, float("nan")])
+def test_pixel_filters_that_do_not_exist_are_refused(width: float) -> None:
+    with pytest.raises(UsageError, match="pixel filter"):
+        camera_parameters(look_along_y(32, 32), RenderSettings(filter_width=width), 1)

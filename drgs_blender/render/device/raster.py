@@ -21,6 +21,7 @@ from ..surfels.raster import MAX_ALPHA, SurfelSamples, gaussian
 from ..surfels.splats import (
     ALBEDO,
     CUT,
+    DIM,
     LOW,
     METALLIC,
     NORMAL,
@@ -54,7 +55,7 @@ def meet(screen: Any, i: Any, opacity: Any, near: Any, far: Any, x: Any, y: Any)
     v = (screen[i, B] + screen[i, B + 1] * ex + screen[i, B + 2] * ey) * inverse
     z = (screen[i, D] + screen[i, D + 1] * ex + screen[i, D + 2] * ey) * inverse
     exact = u * u + v * v if z > near and z < far else big
-    filtered = screen[i, LOW] * (ex * ex + ey * ey)
+    filtered = screen[i, LOW] * (ex * ex + ey * ey) + screen[i, DIM]
     q = exact if exact <= filtered else filtered
     depth = z if exact <= filtered else screen[i, ZC]
     if not (q < screen[i, CUT] and depth > near and depth < far):
@@ -149,7 +150,7 @@ def blend_samples(
         x, y = x0 + column, y0 + row
         tile = (y // TILE - tile_y0) * tiles_x + x // TILE - tile_x0
         shift_x, shift_y = pixel_shift(p, y * width + x)
-        jx, jy = lattice(shift_x, shift_y, number, p[AA])
+        jx, jy = lattice(shift_x, shift_y, number, p)
         for c in range(_SUMS):
             sums[0, c], sums[1, c] = ZERO, ZERO
         t, before, before_size = ONE, ZERO, F(1e30)

@@ -4,7 +4,8 @@ Rays that light a surfel meet the mesh, and the mesh is not where the surfels ar
 the mesh is blocked by its own surface, one that starts above misses contact shadows. Every point is therefore moved to
 the mesh point that belongs to it:
 
-1. along the camera ray, within a window of depths around the surfel: the first face that is turned as the surfel is;
+1. along the camera ray, within a window of depths around the surfel: the first face that is turned as the surfel is,
+   and to the viewer, unless the surfel is clearly seen from behind;
 2. else the first face along it that is turned to the viewer: the surfel overhangs a fold, and what is seen beyond the
    fold is lit as the face there, with that face's normal;
 3. else (the surfel overhangs the mesh's silhouette) within the window along its normal, inwards, then outwards;
@@ -165,6 +166,7 @@ def _find(
     how = NOWHERE
     face, a, b = np.int32(-1), np.float32(0.0), np.float32(0.0)
     hx, hy, hz, gx, gy, gz = x, y, z, nx, ny, nz
+    turned = nx * vx + ny * vy + nz * vz < -RIM
     left = ahead + window
     sx, sy, sz = x + ahead * vx, y + ahead * vy, z + ahead * vz
     for _ in range(3):
@@ -172,8 +174,8 @@ def _find(
         if hit < 0:
             break
         sx, sy, sz = sx - t * vx, sy - t * vy, sz - t * vz
-        agrees = fx * nx + fy * ny + fz * nz > ALIKE
         facing = fx * vx + fy * vy + fz * vz > 0.0
+        agrees = fx * nx + fy * ny + fz * nz > ALIKE and (facing or turned)
         if agrees or how == NOWHERE or (facing and how == ANY_SIDE):
             how = ALONG_VIEW if agrees else FACING if facing else ANY_SIDE
             hx, hy, hz, gx, gy, gz = sx, sy, sz, fx, fy, fz

@@ -127,10 +127,11 @@ def rasterise(
 ) -> ReferenceGBuffer:
     """G-buffer of surfels at pixel positions.
 
-    Contribution i has the strength a_i = opacity_i max(G_3d, G_2d), at most `MAX_ALPHA`, skipped below `MIN_ALPHA`.
-    Its depth is that of the ray's intersection where G_3d is the larger, else that of the centre. Sorted by depth,
-    T_i = prod_{j<i} (1 - a_j) and the weights of the means are T_i a_i / sum. A contribution counts while T_i is at
-    least `MIN_TRANSMITTANCE`. Normals are turned to agree with the nearest contribution's, their mean to the viewer.
+    Contribution i has the strength a_i = opacity_i max(G_3d, G_2d cosine), with the cosine at which it is seen, at most
+    `MAX_ALPHA`, skipped below `MIN_ALPHA`. Its depth is that of the ray's intersection where G_3d is the larger, else
+    that of the centre. Sorted by depth, T_i = prod_{j<i} (1 - a_j) and the weights of the means are T_i a_i / sum. A
+    contribution counts while T_i is at least `MIN_TRANSMITTANCE`. Normals are turned to agree with the nearest
+    contribution's, their mean to the viewer.
 
     Parameters
     ----------
@@ -163,6 +164,15 @@ def _heaviest_part(depth: Tensor, weight: Tensor, size: Tensor, gap: float) -> T
     return (run == total.argmax(1, keepdim=True)) & counts
 
 
+def _facing(splats: Splats, camera: Camera) -> Tensor:
+    """(n,) cosine at which each surfel is seen; 1 for one without area."""
+    matrix = torch.as_tensor(np.asarray(camera.matrix_world), dtype=splats.centre.dtype, device=splats.centre.device)
+    towards = matrix[:3, 2].expand_as(splats.centre) if camera.orthographic else matrix[:3, 3] - splats.centre
+    normal = torch.linalg.cross(splats.tangent_u, splats.tangent_v)
+    cosine = (dot(normal, towards) / (normal.norm(dim=1) * towards.norm(dim=1)).clamp(min=1e-30)).abs()
+    return torch.where(normal.norm(dim=1) > 0, cosine, torch.ones_like(cosine))
+
+
 def _blend(splats: Splats, camera: Camera, position: Tensor, gap: float | None, samples: int) -> ReferenceGBuffer:
     if not len(splats.centre):
         empty, rows = position.new_zeros(len(position)), position.new_zeros(len(position), 3)
@@ -175,6 +185,7 @@ def _blend(splats: Splats, camera: Camera, position: Tensor, gap: float | None, 
     distance2 = ((position[:, None] - centre) ** 2).sum(-1)
     seen = (centre_depth > camera.clip_start) & (centre_depth < camera.clip_end)
     around = torch.exp(-0.5 * samples / FILTER_VARIANCE * torch.where(seen, distance2, torch.inf))
+    around = around * _facing(splats, camera)
 
     depth = torch.where(inside >= around, t, centre_depth.expand_as(t))
     alpha = (splats.opacity * torch.maximum(inside, around)).clamp(max=MAX_ALPHA)

@@ -32,6 +32,7 @@ from ..camera import AA, CLIP_END, CLIP_START, FX, FY, ORTHOGRAPHIC, WIDTH, latt
 from .blending import GAP, LANES, MANY, MIN_TRANSMITTANCE, mean, merge_sort, prune, rank_sort, weigh, widen
 from .splats import (
     CUT,
+    DIM,
     LOW,
     OPACITY,
     RECORD,
@@ -145,7 +146,8 @@ def _meet(screen: Any, i: Any, opacity: Any, near: Any, far: Any, state: Any, fi
     One array, constant distances, no branch: the loop becomes vector code.
     """
     big, zero, one, stop = np.float32(1e30), np.float32(0.0), np.float32(1.0), np.float32(MIN_TRANSMITTANCE)
-    rx, ry, zc, cut, low = screen[i, RX], screen[i, RY], screen[i, ZC], screen[i, CUT], screen[i, LOW]
+    rx, ry, zc = screen[i, RX], screen[i, RY], screen[i, ZC]
+    cut, low, dim = screen[i, CUT], screen[i, LOW], screen[i, DIM]
     a0, a1, a2 = screen[i, A], screen[i, A + 1], screen[i, A + 2]
     b0, b1, b2 = screen[i, B], screen[i, B + 1], screen[i, B + 2]
     n0, n1, n2 = screen[i, N], screen[i, N + 1], screen[i, N + 2]
@@ -160,7 +162,7 @@ def _meet(screen: Any, i: Any, opacity: Any, near: Any, far: Any, state: Any, fi
         z = (d0 + d1 * ex + d2 * ey) * inverse
         # NaN and points outside the clip range leave the low-pass alone.
         exact = u * u + v * v if (z > near) & (z < far) else big
-        filtered = low * (ex * ex + ey * ey)
+        filtered = low * (ex * ex + ey * ey) + dim
         take = exact <= filtered
         q = exact if take else filtered
         z = z if take else zc
@@ -241,7 +243,7 @@ def _place(p: Any, width: Any, y: Any, tile_left: Any, left: Any, right: Any, fi
         state[_FARTHEST + k] = np.float32(-1e30)
         if left <= x < right:
             shift_x, shift_y = pixel_shift(p, y * width + x)
-            jx, jy = lattice(shift_x, shift_y, (first + lane) % aa, p[AA])
+            jx, jy = lattice(shift_x, shift_y, (first + lane) % aa, p)
             state[_X + k], state[_Y + k], state[_LEFT + k] = x + jx, y + jy, np.float32(1.0)
 
 

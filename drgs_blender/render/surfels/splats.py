@@ -18,7 +18,7 @@ import numpy as np
 from ...asset.model import PosedSurfels
 from ...frame import Camera
 from ...jit import njit, prange
-from ..camera import AA, CLIP_END, CLIP_START, CX, CY, FX, FY, LEAN, ORTHOGRAPHIC, POSITION
+from ..camera import AA, CLIP_END, CLIP_START, CX, CY, FX, FY, LEAN, ORTHOGRAPHIC, POSITION, filter_reach
 
 Array = np.ndarray
 
@@ -27,8 +27,11 @@ TILE = 16
 #: Fainter contributions are skipped.
 MIN_ALPHA = 1.0 / 255.0
 
-# Columns of a splat's screen record. A_, B_, N_, D_: constant, x and y coefficients of u, v, denominator and depth.
-RX, RY, A, B, N, D, ZC, CUT, LOW, RECORD = 0, 1, 2, 5, 8, 11, 14, 15, 16, 20
+# Columns of a splat's screen record. A_, B_, N_, D_: constant, x and y coefficients of u, v, denominator and depth; ZC:
+# depth of the centre; CUT: square radius at which a splat ends. The screen-space filter has the square radius
+# LOW d^2 + DIM, weakened by the cosine at which the surfel is seen: the many surfels edge-on along a silhouette would
+# else widen it.
+RX, RY, A, B, N, D, ZC, CUT, LOW, DIM, RECORD = 0, 1, 2, 5, 8, 11, 14, 15, 16, 17, 20
 # Columns of a splat's surface record: normal, albedo, roughness, metallic, size, opacity.
 NORMAL, ALBEDO, ROUGHNESS, METALLIC, SIZE, OPACITY, SURFACE = 0, 3, 6, 7, 8, 9, 10
 
@@ -169,8 +172,8 @@ def project_surfel(
     if not abs(total) < 1e30 or not alpha > MIN_ALPHA:
         return
     cut = 2.0 * np.log(alpha / MIN_ALPHA)
-    reach = np.sqrt(cut * (a[2] * a[2] + b[2] * b[2]))
-    if c[2] + reach <= near or c[2] - reach >= far:
+    deep = np.sqrt(cut * (a[2] * a[2] + b[2] * b[2]))
+    if c[2] + deep <= near or c[2] - deep >= far:
         return
     # Normal of the plane, scaled to one so that float32 holds tiny surfels.
     nx = a[1] * b[2] - a[2] * b[1]
@@ -195,6 +198,7 @@ def project_surfel(
         screen[i, A + 1], screen[i, A + 2] = k * b[1] / fx, -k * b[0] / fy
         screen[i, B + 1], screen[i, B + 2] = -k * a[1] / fx, k * a[0] / fy
         screen[i, N] = k * nz
+        screen[i, DIM] = _dim(k * nz, 1.0)
         screen[i, D], screen[i, D + 1], screen[i, D + 2] = k * c[2] * nz, -k * nx / fx, -k * ny / fy
     else:
         k = 1.0 / length
@@ -206,6 +210,7 @@ def project_surfel(
         screen[i, D] = k * (c[0] * nx + c[1] * ny + c[2] * nz)
         if in_front:
             screen[i, N] = screen[i, D] / c[2]
+            screen[i, DIM] = _dim(screen[i, D], np.sqrt(c[0] * c[0] + c[1] * c[1] + c[2] * c[2]))
         else:
             screen[i, A] = k * (b[0] * c[1] - b[1] * c[0])
             screen[i, B] = k * (c[0] * a[1] - c[1] * a[0])
@@ -215,7 +220,7 @@ def project_surfel(
     if ortho:
         lo_x, hi_x = span(fx, rx, 1.0, a[0], b[0], 0.0, 0.0, cut)
         lo_y, hi_y = span(fy, ry, 1.0, a[1], b[1], 0.0, 0.0, cut)
-    elif c[2] - reach > near:
+    elif c[2] - deep > near:
         x, y = c[0] / c[2], c[1] / c[2]
         lo_x, hi_x = span(fx, rx, c[2], a[0] - x * a[2], b[0] - x * b[2], a[2], b[2], cut)
         lo_y, hi_y = span(fy, ry, c[2], a[1] - y * a[2], b[1] - y * b[2], a[2], b[2], cut)
@@ -224,13 +229,21 @@ def project_surfel(
     if in_front:
         lo_x, hi_x = min(lo_x, rx - low), max(hi_x, rx + low)
         lo_y, hi_y = min(lo_y, ry - low), max(hi_y, ry + low)
+    reach = filter_reach(p)
+    lo_x, hi_x, lo_y, hi_y = lo_x - reach, hi_x + reach, lo_y - reach, hi_y + reach
     if not (lo_x < wx1 and hi_x > wx0 and lo_y < wy1 and hi_y > wy0):
         return
     box[i, 0] = np.int32(np.floor(max(lo_x, float(wx0))))
     box[i, 1] = np.int32(np.floor(max(lo_y, float(wy0))))
     box[i, 2] = np.int32(min(np.floor(hi_x), wx1 - 1.0)) + 1
     box[i, 3] = np.int32(min(np.floor(hi_y), wy1 - 1.0)) + 1
-    nearest[i] = max(c[2] - reach, near)
+    nearest[i] = max(c[2] - deep, near)
+
+
+@njit(inline="always")
+def _dim(along: Any, whole: Any) -> Any:
+    """-2 log of the cosine ``along / whole``."""
+    return 2.0 * np.log(whole / max(abs(along), 1e-6 * whole))
 
 
 @njit(inline="always")
