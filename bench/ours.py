@@ -22,9 +22,19 @@ def pinhole(camera: dict[str, Any]) -> Camera:
     return Camera(np.array(camera["matrix_world"], float), width, height, f, f, width / 2, height / 2)
 
 
-def relight(
+def relight(asset: Path, environment: Path | np.ndarray, camera: dict[str, Any], **more: Any) -> dict[str, np.ndarray]:
+    """Passes of one object under one HDRI; `more` as of `frame_of`."""
+    return SESSION.render(frame_of(asset, environment, camera, **more))
+
+
+def look(asset: Path, environment: Path | np.ndarray, camera: dict[str, Any], **more: Any) -> dict[str, np.ndarray]:
+    """The same, as a viewport's first picture."""
+    return SESSION.view("bench", frame_of(asset, environment, camera, **more))
+
+
+def frame_of(
     asset: Path,
-    environment: Path,
+    environment: Path | np.ndarray,
     camera: dict[str, Any],
     *,
     rays: int,
@@ -32,16 +42,16 @@ def relight(
     vertices: np.ndarray | None = None,
     passes: tuple[str, ...] = ("Combined",),
     **settings: Any,
-) -> dict[str, np.ndarray]:
-    """Passes of one object under one HDRI; `settings` are fields of RenderSettings."""
+) -> Frame:
+    """One object under one HDRI; `settings` are fields of RenderSettings."""
     cosine, ggx, light = split_rays(rays)
+    radiance = read_environment(environment).radiance if isinstance(environment, Path) else environment
     key = SESSION.load_asset(asset)
-    frame = Frame(
+    return Frame(
         number=1,
         camera=pinhole(camera),
         objects=[ObjectState("subject", key, vertices=vertices)],
-        world=World(environment=read_environment(environment).radiance, strength=strength),
+        world=World(environment=radiance, strength=strength),
         settings=RenderSettings(cosine=cosine, ggx=ggx, environment=light, film_transparent=True, **settings),
         passes=passes,
     )
-    return SESSION.render(frame)
