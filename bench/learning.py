@@ -66,7 +66,7 @@ def learning(path: Path, size: int, steps: int, surfels: int, missing: str) -> s
         f"Surfels learned from {VIEWS * 3 // 4} pictures of {size}x{size} that our renderer made of the {path.stem}, "
         f"{steps} steps, at most {surfels} surfels, the whole schedule: half size first, surfels cut, mirrors, shape. "
         f"PSNR and SSIM are of the {VIEWS // 4} views left out; what differs grows out of last bits. Held to: 0.1 dB "
-        "between devices; 15 minutes on a data-centre card for 30000 steps at 800x800 (`--learn-size 800 --steps 30000`, "
-        "the paper's).\n\n"
+        "between devices; 15 minutes on a data-centre card for the paper's 30000 steps at 800x800 (`--learn-size 800 "
+        "--steps 30000`).\n\n"
     )
     return head + table(["Where", "Steps a second", "Surfels", "PSNR", "SSIM"], rows)
