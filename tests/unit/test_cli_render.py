@@ -95,7 +95,8 @@ def test_blur_is_rendered_skipped_and_made_again(render, tmp_path):
     """The shutter is open over half a frame in which the tile moves, and the lens is wide."""
 
     def rendered(scene: str, word: str, *more: str) -> dict[str, np.ndarray]:
-        code, lines, errors = render("--passes", "Coverage", "--primary", "mesh", *more, scene=scene, frames="2")
+        options = "--passes", "Coverage", "--primary", "mesh", "--filter-width", "0", *more
+        code, lines, errors = render(*options, scene=scene, frames="2")
         assert code == 0 and any(line.startswith(word) for line in lines), (lines, errors)
         assert not any(line.startswith("Note") for line in lines)
         return read_frame(tmp_path / "0002.exr")[0]
