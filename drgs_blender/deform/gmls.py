@@ -196,17 +196,32 @@ def carry(weights: Weights, x: Array, gradients: Array) -> tuple[Array, Array, i
         Points where blending would have turned matter inside out or spanned a tear; the nearest neighbour alone
         carries those, stretched no more than the neighbours have moved apart.
     """
-    n = len(weights.source)
     x = np.ascontiguousarray(x)
-    points, out = np.empty((n, 3), x.dtype), np.empty((n, 3, 3), np.float32)
-    turned = np.zeros(n, np.bool_)
+    rows, centre = pack(x, gradients)
+    points, out, turned = blank(weights, x.dtype)
+    weight = weights.weight.reshape(-1)
+    _carry(weights.source, weight, weights.offset, weights.reach, rows.reshape(-1), centre, points, out, turned)
+    return points, out, int(np.count_nonzero(turned))
+
+
+def blank(weights: Weights, kind: np.dtype) -> tuple[Array, Array, Array]:
+    """Memory for what `carry` returns, and for whether each point is `turned`."""
+    n = len(weights.source)
+    return np.empty((n, 3), kind), np.empty((n, 3, 3), np.float32), np.zeros(n, np.bool_)
+
+
+def pack(x: Array, gradients: Array) -> tuple[Array, Array]:
+    """Sources as they are read.
+
+    Returns
+    -------
+    rows : (s, 16) float32, a cache line each: the columns of its gradient and its place, each with a free one
+    centre : (3,) float64 from which places are
+    """
     centre = _centre(x)
-    # Sixteen numbers a source, one cache line: the columns of its gradient and its place, each with a free one.
     rows = aligned(LANES * len(x), np.float32)
     _pack(x, np.ascontiguousarray(gradients, np.float32).reshape(-1, 3, 3), centre, rows)
-    weight = weights.weight.reshape(-1)
-    _carry(weights.source, weight, weights.offset, weights.reach, rows, centre, points, out, turned)
-    return points, out, int(np.count_nonzero(turned))
+    return rows.reshape(-1, LANES), centre
 
 
 @njit
@@ -251,6 +266,37 @@ def _columns(a):  # type: ignore[no-untyped-def]
     return a[0], a[4], a[8], a[1], a[5], a[9], a[2], a[6], a[10]
 
 
+@njit
+def settled(f, p, g, offset, apart, reach):  # type: ignore[no-untyped-def]
+    """A point as the blend has it, or where matter is torn or inside out as its nearest neighbour has it.
+
+    Parameters
+    ----------
+    f, p : the blended gradient, row by row, and place, from the nearest neighbour
+    g, offset : gradient of the nearest neighbour, and the point from it at rest
+    apart, reach : from it to the farthest neighbour now, squared, and at rest
+
+    Returns
+    -------
+    f, p, turned : those to take, and whether they are the nearest neighbour's
+    """
+    zero, one = np.float32(0.0), np.float32(1.0)
+    own, blended = _squares(g), _squares(f)
+    grown, believed = np.sqrt(apart) / max(reach, np.float32(1e-30)), np.sqrt(own / np.float32(3.0))
+    most = np.sqrt(max(own, blended) / np.float32(3.0))
+    torn = reach > zero and max(grown, most / max(grown, np.float32(1e-30))) > np.float32(_TORN)
+    turned = torn or (not (_determinant(f) > zero) and _determinant(g) > zero)
+    if turned:
+        keep = min(one, max(grown, one) / believed) if torn and believed > zero else one
+        f = (
+            keep * g[0], keep * g[1], keep * g[2], keep * g[3], keep * g[4], keep * g[5], keep * g[6],
+            keep * g[7], keep * g[8],
+        )  # fmt: skip
+        x, y, z = offset
+        p = f[0] * x + f[1] * y + f[2] * z, f[3] * x + f[4] * y + f[5] * z, f[6] * x + f[7] * y + f[8] * z
+    return f, p, turned
+
+
 @njit(parallel=True)
 def _carry(source, weight, offset, reach, rows, centre, points, out, turned):  # type: ignore[no-untyped-def]
     zero, one = np.float32(0.0), np.float32(1.0)
@@ -273,22 +319,10 @@ def _carry(source, weight, offset, reach, rows, centre, points, out, turned):  #
             w += 4
         px, py, pz, _ = fold(place)
         f, g = _columns(lanes(gradient)), _columns(lanes(load(rows, first)))
-        own, blended = _squares(g), _squares(f)
-        grown, believed = np.sqrt(apart) / max(reach[i], np.float32(1e-30)), np.sqrt(own / np.float32(3.0))
-        most = np.sqrt(max(own, blended) / np.float32(3.0))
-        torn = reach[i] > zero and max(grown, most / max(grown, np.float32(1e-30))) > np.float32(_TORN)
-        if torn or (not (_determinant(f) > zero) and _determinant(g) > zero):
-            turned[i] = True
-            keep = min(one, max(grown, one) / believed) if torn and believed > zero else one
-            f = (
-                keep * g[0], keep * g[1], keep * g[2], keep * g[3], keep * g[4], keep * g[5], keep * g[6],
-                keep * g[7], keep * g[8],
-            )  # fmt: skip
-            qx, qy, qz = offset[i, 0], offset[i, 1], offset[i, 2]
-            px = f[0] * qx + f[1] * qy + f[2] * qz
-            py = f[3] * qx + f[4] * qy + f[5] * qz
-            pz = f[6] * qx + f[7] * qy + f[8] * qz
+        q = offset[i, 0], offset[i, 1], offset[i, 2]
+        f, p, turned[i] = settled(f, (px, py, pz), g, q, apart, reach[i])
         out[i, 0, 0], out[i, 0, 1], out[i, 0, 2] = f[0], f[1], f[2]
         out[i, 1, 0], out[i, 1, 1], out[i, 1, 2] = f[3], f[4], f[5]
         out[i, 2, 0], out[i, 2, 1], out[i, 2, 2] = f[6], f[7], f[8]
+        px, py, pz = p
         points[i, 0], points[i, 1], points[i, 2] = centre[0] + (ox + px), centre[1] + (oy + py), centre[2] + (oz + pz)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
+from ..device.kernels import Launcher
 from .blocks import Arrangement, Domain, arrange
 from .colliders import MovingCollider
 from .contact import CONTACTS, bound, collide
@@ -105,9 +106,11 @@ class Grid(ABC):
     Attributes
     ----------
     most : steps that it takes at once, at most
+    launcher : of the device that it works on, if that is not this processor
     """
 
     most = 1
+    launcher: Launcher | None = None
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene

@@ -11,9 +11,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ..asset.model import Mesh
+from ..deform.device.gmls import Carrier
 from ..deform.gmls import Weights, bind_points, carry
 from ..deform.sources import MeshSource
-from ..errors import AssetError, UsageError
+from ..errors import AssetError, DeviceError, UsageError
 from ..formats.registry import read_mesh
 from ..matter import matter_of
 from ..particle_cache import ParticleFrame
@@ -61,7 +62,7 @@ class Job:
     grain: float
     _spacing: float
     _vertices: Array
-    _weights: Weights | None
+    _carried: _Carried | None
     _pins: _PinMotion | None
 
     def rest(self) -> ParticleFrame:
@@ -80,13 +81,7 @@ class Job:
 
     def _surface(self) -> Array:
         """Vertices of the mesh as matter carries them, world."""
-        solver = self.solver
-        if self._weights is None:
-            return solver.riders
-        vertices, _, turned = carry(self._weights, solver.points, solver.gradients)
-        if turned:
-            log.debug("frame %d: %d vertices where matter would be inside out", solver.frame, turned)
-        return vertices
+        return self.solver.riders if self._carried is None else self._carried.vertices(self.solver)
 
     def _to_object(self, points: Array, gradients: Array, vertices: Array) -> ParticleFrame:
         matrix = np.asarray(self.settings.matrix_world)
@@ -100,6 +95,33 @@ class Job:
     def pin_targets(self, frame: int) -> Array | None:
         """Where pinned points are `frame` frames after the start, world; None where they stay."""
         return None if self._pins is None else self._pins.at(frame)
+
+
+class _Carried:
+    """A mesh that matter carries: on the solver's device, or here once that has failed."""
+
+    def __init__(self, weights: Weights) -> None:
+        self._weights = weights
+        self._carrier: Carrier | None = None
+        self._failed = False
+
+    def vertices(self, solver: Stepper) -> Array:
+        """(n, 3) float64, world."""
+        vertices, _, turned = self._carry(solver)
+        if turned:
+            log.debug("frame %d: %d vertices where matter would be inside out", solver.frame, turned)
+        return vertices
+
+    def _carry(self, solver: Stepper) -> tuple[Array, Array, int]:
+        given, launcher = (solver.points, solver.gradients), solver.launcher
+        if launcher is not None and not self._failed:
+            try:
+                self._carrier = self._carrier or Carrier(self._weights, launcher)
+                return self._carrier.carry(*given)
+            except DeviceError as error:
+                log.warning("%s The mesh is carried on the CPU from frame %d on", error, solver.first + solver.frame)
+                self._carrier, self._failed = None, True
+        return carry(self._weights, *given)
 
 
 class _PinMotion:
@@ -178,9 +200,9 @@ def prepare(mesh: Mesh, settings: Settings, name: str = "mesh") -> Job:
     body = Body(
         points, filling.volume, matter_of(materials, which), vertices if rides else np.empty((0, 3)), pinned, velocity
     )
-    weights = None
+    carried = None
     if not rides:
-        weights = bind_points(vertices, points, space=filling.space, parts=filling.part)
+        carried = _Carried(bind_points(vertices, points, space=filling.space, parts=filling.part))
     colliders = _colliders(settings)
     solver = _solver(settings, body, spacing, vertices, colliders)
     solver.first = settings.first
@@ -192,7 +214,7 @@ def prepare(mesh: Mesh, settings: Settings, name: str = "mesh") -> Job:
     digest, moves = digest_of(mesh, settings, colliders, moved), moves_of(settings, colliders, moved)
     tear = max(m.gap for m in materials) * spacing / abs(float(np.linalg.det(matrix[:3, :3]))) ** (1 / 3)
     grain = min(m.grain for m in materials)
-    return Job(settings, filling, solver, digest, moves, tear, grain, spacing, vertices, weights, motion)
+    return Job(settings, filling, solver, digest, moves, tear, grain, spacing, vertices, carried, motion)
 
 
 def _has(names: Sequence[str]) -> str:

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, fields
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ..device.kernels import Launcher
 from ..device.warp import DEVICES, name_of
 from ..errors import Cancelled, DeviceError, UsageError
 from ..matter import FLUID, SNOW, Matter
@@ -115,7 +116,6 @@ class Solver(Stepper):
         if device not in DEVICES:
             raise UsageError(f"device {device!r}", "is unknown", f"Choose from {', '.join(DEVICES)}")
         if device != "cpu":
-            from ..device.kernels import Launcher
             from .device.grid import DeviceGrid
 
             try:
@@ -144,6 +144,10 @@ class Solver(Stepper):
             raise UsageError("simulation", "has no particles", "Fill the mesh first")
         self._check_inside(self.state.x)
         check_apart(self.body.points, self.domain.spacing, self.colliders, self.planes)
+
+    @property
+    def launcher(self) -> Launcher | None:
+        return self.grid.launcher
 
     @property
     def gradients(self) -> Array:

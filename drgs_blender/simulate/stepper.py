@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from ..device.kernels import Launcher
 from ..errors import UsageError
 from .colliders import MovingCollider
 
@@ -26,6 +27,8 @@ class Stepper(ABC):
         Time steps taken in all.
     rate : float
         Time steps a second, at least.
+    launcher : Launcher or None
+        Of the device that computes frames, if that is not this processor.
     colliders, planes
         What matter cannot enter, the latter as rows of `contact.plane_rows`.
     """
@@ -36,6 +39,10 @@ class Stepper(ABC):
     rate: float
     colliders: list[MovingCollider]
     planes: Array
+
+    @property
+    def launcher(self) -> Launcher | None:
+        return None
 
     @property
     @abstractmethod

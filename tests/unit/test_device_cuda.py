@@ -5,18 +5,21 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 pytest.importorskip("warp", reason="warp-lang is not installed")
 
 import test_device_camera_hits
 import test_device_deform
+import test_device_gmls
 import test_device_integrate
 import test_device_mpm
 import test_device_raster
 import warp
 from test_device_denoise import nothing, shots
 
+from drgs_blender.deform.device import gmls
 from drgs_blender.deform.device import mesh_driven as deformation
 from drgs_blender.deform.device.mesh_driven import Deformer
 from drgs_blender.device.kernels import Launcher
@@ -82,7 +85,9 @@ def test_learnings_kernels_compile_for_a_card(tmp_path: Path) -> None:
 def test_particles_kernels_compile_for_a_card(tmp_path: Path, case: str) -> None:
     launcher = Launcher("cpu")
     test_device_mpm.test_a_step_is_the_processors_to_the_last_digits(launcher, case)
+    test_device_gmls.test_a_device_carries_points_as_the_processor_does(launcher, "torn", 16, np.float64)
     works = cells.NUMBER, cells.LIST, cells.INDEX, cells.HOUSE, steps.PREPARE, steps.SOLVE, steps.MOVE, steps.TICK
+    works += (gmls.CARRY,)
     assert made(works, launcher, tmp_path) == set(works)
 
 

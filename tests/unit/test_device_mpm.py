@@ -286,7 +286,7 @@ def failing(launcher: Launcher, monkeypatch: pytest.MonkeyPatch, after: int) -> 
     def broken(grid: DeviceGrid, *arguments: Any) -> list[float]:
         calls.append(1)
         if len(calls) > after:
-            with grid._launcher.failures("simulating"):
+            with grid.launcher.failures("simulating"):
                 raise RuntimeError("CUDA error 700: an illegal memory access was encountered\nlog")
         return step(grid, *arguments)
 

@@ -62,10 +62,11 @@ class DeviceGrid(Grid):
     """
 
     most = _STEPS
+    launcher: Launcher
 
     def __init__(self, scene: Scene, launcher: Launcher) -> None:
         super().__init__(scene)
-        self._launcher = launcher
+        self.launcher = launcher
         self._state: dict[str, Any] = {}
         self._blocks = 0
         self._launches: list[Callable[[], None]] = []
@@ -73,7 +74,7 @@ class DeviceGrid(Grid):
 
     def enter(self, state: State, frame: int, seconds: float, pin_velocity: Array) -> None:
         self._frame, self._seconds = frame, seconds
-        with self._launcher.failures("copying particles"):
+        with self.launcher.failures("copying particles"):
             if not self._state:
                 self._make_room(state)
             for f in fields(state):
@@ -83,7 +84,7 @@ class DeviceGrid(Grid):
 
     def _make_room(self, state: State) -> None:
         """Arrays that are as large in every frame."""
-        scene, there, zeros = self._scene, self._launcher.array, self._launcher.zeros
+        scene, there, zeros = self._scene, self.launcher.array, self.launcher.zeros
         n, pins, k = len(state.x), scene.pins, len(scene.colliders)
         pin = np.full(n, -1, np.int32)
         pin[pins] = np.arange(len(pins))
@@ -106,12 +107,12 @@ class DeviceGrid(Grid):
         self._state = {f.name: zeros(a.shape, a.dtype.name) for f in fields(state) for a in [getattr(state, f.name)]}
         domain = scene.domain
         place = self._state["x"], tuple(domain.origin.tolist()), 1.0 / domain.spacing, *domain.blocks
-        self._number = self._launcher.recorded(NUMBER, n, place, (self._keys, self._order, self._found))
-        self._list = self._launcher.recorded(LIST, n, (n, self._keys), (self._found,))
+        self._number = self.launcher.recorded(NUMBER, n, place, (self._keys, self._order, self._found))
+        self._list = self.launcher.recorded(LIST, n, (n, self._keys), (self._found,))
 
     def sort(self) -> bool:
         domain, found, n = self._scene.domain, self._found, len(self._order) // 2
-        with self._launcher.failures("sorting particles"):
+        with self.launcher.failures("sorting particles"):
             found[:BLOCKS].zero_()
             self._number()
             bits = int(np.prod(domain.blocks, dtype=np.int64)) * 64
@@ -133,7 +134,7 @@ class DeviceGrid(Grid):
 
     def _take_blocks(self, count: int) -> None:
         """Memory for so many active blocks, and the launches that work on it."""
-        zeros, recorded, n = self._launcher.zeros, self._launcher.recorded, len(self._order) // 2
+        zeros, recorded, n = self.launcher.zeros, self.launcher.recorded, len(self._order) // 2
         self._launches, self._blocks = [], count
         self._active, self._neighbour = zeros((count, 3), "int32"), zeros((count, 27), "int32")
         self._first, self._numbers = zeros((count, STARTS), "int32"), zeros((count,), "int64")
@@ -144,7 +145,7 @@ class DeviceGrid(Grid):
 
     def _recorded(self) -> list[Callable[[], None]]:
         """The launches of a step, which are the same for all steps."""
-        scene, s, there, launcher = self._scene, self._state, self._there, self._launcher
+        scene, s, there, launcher = self._scene, self._state, self._there, self.launcher
         n = len(s["x"])
         grid = tuple(scene.domain.origin.tolist()), scene.domain.spacing
         clock, times = there["clock"], there["times"]
@@ -185,7 +186,7 @@ class DeviceGrid(Grid):
         for column, value in ((MOST_DRIFT, limits.drift), (MOST_SPEED, limits.speed), (OUTSIDE, limits.outside)):
             plan["clock"][column] = value
         forces = scene.forces
-        with self._launcher.failures("simulating"):
+        with self.launcher.failures("simulating"):
             for s, (done, dt) in enumerate(times):
                 shares = 1 - np.exp(-dt * forces.drag), np.exp(-dt * forces.damping)
                 plan["times"][s] = dt, *shares, *(dt * g for g in forces.gravity)
@@ -205,7 +206,7 @@ class DeviceGrid(Grid):
 
     def _place_colliders(self, s: int, part: float) -> None:
         """Where the colliders are in step s, at `part` of the frame."""
-        plan, array = self._plan, self._launcher.array
+        plan, array = self._plan, self.launcher.array
         for c, moving in enumerate(self._scene.colliders):
             if s and moving.speed == 0.0:
                 plan["turns"][s, c], plan["vectors"][s, c] = plan["turns"][s - 1, c], plan["vectors"][s - 1, c]
@@ -228,5 +229,5 @@ class DeviceGrid(Grid):
                 plan["vectors"][s, c, row] = vector
 
     def state(self) -> State:
-        with self._launcher.failures("copying particles"):
+        with self.launcher.failures("copying particles"):
             return State(**{name: np.array(array.numpy()) for name, array in self._state.items()})
