@@ -78,7 +78,8 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
     )
     device: EnumProperty(
         name="Device",
-        description="What traces the light and bakes matter. Without a card the processor does all, and says so",
+        description="What traces the light, bakes matter and learns from photographs. Without a card the processor "
+        "does all, and says so",
         items=[
             ("CPU", "CPU", "The processor"),
             ("CUDA", "GPU (CUDA)", "An NVIDIA card; Set Up Engine fetches what it needs"),

@@ -112,7 +112,10 @@ def split(text: str) -> tuple[int, int, int]:
 
 def at_least_zero(text: str) -> float:
     """A finite number that is not negative."""
-    value = float(text)
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
     if not 0.0 <= value < float("inf"):
         raise argparse.ArgumentTypeError(f"{text} is not a number of at least 0")
     return value

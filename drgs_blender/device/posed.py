@@ -74,9 +74,9 @@ def with_fields(posed: PosedSurfels, fields: dict[str, Array]) -> PosedSurfels:
 
 def joined(launcher: Launcher, parts: Sequence[PosedSurfels], here: Callable[[], PosedSurfels]) -> PosedThere:
     """The surfels of some parts as one, on a device; `here` joins them on this processor."""
-    wp, found = warp(), [arrays_of(part, launcher) for part in parts]
+    wp = warp()
     with launcher.failures("joining surfels"):
-        there = {}
+        there, found = {}, [arrays_of(part, launcher) for part in parts]
         for name in FIELDS:
             given = [arrays[name] for arrays in found]
             rows = sum(map(len, given))

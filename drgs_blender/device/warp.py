@@ -31,7 +31,7 @@ DEVICES = {"cpu": "this processor", "cuda": "the first NVIDIA card"}
 #: Called with 1 when kernels begin to be made ready, which nothing interrupts, and with -1 when they are.
 watchers: list[Callable[[int], None]] = []
 #: Versions that the translation is made for; `pyproject.toml` has the same.
-VERSION = "1.19."
+VERSION = "1.19."  # also for what its ``and``, ``or`` and ``if`` leave out: they read no more than Python's do
 _INSTALL = "Install it: pip install 'warp-lang>=1.19,<1.20', or Set Up Engine with Graphics Card"
 
 
@@ -52,11 +52,12 @@ def warp() -> Any:
     if not version.startswith(VERSION):
         raise DeviceError("device cuda", f"warp-lang has version {version}, not {VERSION}x", _INSTALL)
     folder = cache_folder() / "warp"
-    wp.config.log_level = wp.LOG_WARNING  # else it greets on stdout, which is read by programs
+    wp.config.log_level = wp.LOG_ERROR  # else it greets on stdout, which is read by programs, and misses drivers aloud
     # Not the folder itself: Warp would take the sources there for what an older Warp has left, and warn.
     wp.config.kernel_cache_dir = str(folder / "kernels")
     try:
         wp.init()
+        wp.config.log_level = wp.LOG_WARNING
         os.utime(folder)  # see `jit.current_cache`
     except Exception as error:
         raise DeviceError("device cuda", f"Warp does not start ({error})", "Use the CPU") from error

@@ -200,7 +200,8 @@ class _Work:
         file = self.file(phase)
         key = "" if file is None else self.key(phase)
         if file is not None and (state := checkpoint.load(file, key)) is not None:
-            training.restore(state)
+            known = state
+            training.attempt(lambda: training.restore(known), whole=False)
             log.info("%s: going on at step %d", phase, training.iteration)
         saved = shown = told = time.monotonic()
         while not training.finished:

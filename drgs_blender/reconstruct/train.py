@@ -126,7 +126,8 @@ class Training:
 
     def _take_on(self, by: Processor) -> None:
         """Have `by` do the steps, from the first one."""
-        self.by, self.gaussians = by, self._begun.on(by)
+        self.by = by  # before anything that may fail there
+        self.gaussians = self._begun.on(by)
         self.optimiser = Adam(self.gaussians.parameters, by.descend)
         light = self.gaussians.light
         self.light = Adam({} if light is None else {"light": light}, by.descend)
@@ -158,7 +159,10 @@ class Training:
 
     def _keep(self) -> None:
         """Remember a state that the device cannot take along when it fails."""
-        self._kept = {name: np.array(value) for name, value in self.arrays().items()}
+        self._remember(self.arrays())
+
+    def _remember(self, state: dict[str, Array]) -> None:
+        self._kept = {name: np.array(value) for name, value in state.items()}
         self._kept_at = time.monotonic()
 
     @property
@@ -184,6 +188,8 @@ class Training:
         self.seconds += time.monotonic() - started
 
     def _learn(self) -> None:
+        # Also when done again, after a device has left it half-done.
+        self.optimiser.steps = self.light.steps = self.iteration
         schedule, part = self.schedule, self.part
         target = self._next()
         rays = pixel_rays(target.camera, self.by.place)
@@ -286,6 +292,7 @@ class Training:
         self.tally = Tally(there("travel"), there("views"))
         self.iteration, self.optimiser.steps, self.start, self.rounds, self.light.steps = map(int, state["counts"])
         self.error, self.seconds = (float(x) for x in state["numbers"])
+        self._remember(state)
 
 
 def enough(views: list[Target]) -> int:

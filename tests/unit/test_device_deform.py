@@ -19,6 +19,7 @@ from drgs_blender.deform.mesh_driven import MeshDriven
 from drgs_blender.device.kernels import Launcher
 from drgs_blender.device.posed import FIELDS, PosedThere, arrays_of, joined, with_fields
 from drgs_blender.device.warp import is_there
+from drgs_blender.errors import DeviceError
 
 MIRRORED = matrix(np.diag([-1.5, 0.5, 1.0]) @ [[0.8, 0.6, 0], [-0.6, 0.8, 0], [0, 0, 1]], (3.0, -2.0, 1.0))
 
@@ -119,3 +120,16 @@ def test_surfels_of_several_objects_lie_on_the_device_as_one(deformer: Deformer)
         expected = np.concatenate([getattr(part, field) for part in parts])
         np.testing.assert_allclose(whole.on(deformer.launcher)[field], expected, 1e-5, 1e-6, err_msg=field)
     np.testing.assert_array_equal(second.roughness, shades["roughness"])
+
+
+def test_no_memory_to_join_surfels_in_is_the_devices_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Which the processor's work then follows."""
+    launcher, driver = Launcher("cpu"), driven()
+    parts = [driver.pose(driver.mesh.vertices) for _ in range(2)]
+
+    def full(*_: Any, **__: Any) -> None:
+        raise RuntimeError("Failed to allocate 1000000 bytes")
+
+    monkeypatch.setattr(launcher, "array", full)
+    with pytest.raises(DeviceError, match=r"joining surfels .*Failed to allocate"):
+        joined(launcher, parts, lambda: parts[0])

@@ -22,6 +22,7 @@ from drgs_blender.reconstruct.capture import Capture  # noqa: E402
 from drgs_blender.reconstruct.device import devices, kernels, look, losses  # noqa: E402
 from drgs_blender.reconstruct.device import raster as device_raster  # noqa: E402
 from drgs_blender.reconstruct.device.on_device import DESCEND, OnDevice  # noqa: E402
+from drgs_blender.reconstruct.gaussians import Gaussians  # noqa: E402
 from drgs_blender.reconstruct.hull import Region, find_region  # noqa: E402
 from drgs_blender.reconstruct.job import Settings, reconstruct  # noqa: E402
 from drgs_blender.reconstruct.photometric import Photograph  # noqa: E402
@@ -221,7 +222,7 @@ def test_a_step_that_fails_half_done_is_done_again(
     training = learned(capture, region, there, 10)
     fail_at(DESCEND, there, RuntimeError("CUDA error"), monkeypatch)
     training.step()
-    assert training.iteration == 11
+    assert training.iteration == training.optimiser.steps == training.light.steps == 11
     assert training.by is HERE
 
 
@@ -251,6 +252,38 @@ def test_a_device_whose_memory_is_lost_goes_back_to_the_last_state_kept(
     assert training.by is HERE
     assert training.iteration == here.iteration == 8
     assert alike(here, training) == 0
+
+
+def test_a_run_taken_up_on_a_device_goes_back_to_where_it_was_taken_up(
+    capture: Capture, region: Region, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun = learned(capture, region, HERE, 5)
+    training = Training(capture, region, SCHEDULE, by=OnDevice("cpu"))
+    training.restore(begun.arrays())
+    with monkeypatch.context() as patch:
+        patch.setattr(training.by, "rasterise", broken)
+        patch.setattr(training, "_state", broken)
+        training.step()
+    begun.step()
+    assert training.by is HERE
+    assert training.iteration == 6
+    assert alike(begun, training) == 0
+
+
+def test_a_device_that_fails_before_the_first_step_learns_nothing(
+    capture: Capture, region: Region, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As one does whose memory was lost in an earlier phase."""
+    on = Gaussians.on
+
+    def broken_there(self: Gaussians, by: Processor) -> Gaussians:
+        return on(self, by) if by is HERE else broken()
+
+    monkeypatch.setattr(Gaussians, "on", broken_there)
+    training = Training(capture, region, SCHEDULE, by=OnDevice("cpu"))
+    assert training.by is HERE
+    assert "illegal memory" in training.failed
+    training.step()
 
 
 def test_surfels_half_cut_are_of_no_use(capture: Capture, region: Region, monkeypatch: pytest.MonkeyPatch) -> None:

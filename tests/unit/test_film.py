@@ -24,7 +24,7 @@ def camera(**more: object) -> Camera:
 def strip(view: Camera, settings: RenderSettings, rows: tuple[int, int], alpha: np.ndarray, seed: int = 0) -> GBuffer:
     """A G-buffer with random contents and the given coverage (rows, width, aa)."""
     rng = np.random.default_rng(seed)
-    buffer, _ = compact(alpha.astype(np.float32), camera_parameters(view, settings, 1), view.window[0], rows[0])
+    buffer = compact(alpha.astype(np.float32), camera_parameters(view, settings, 1), view.window[0], rows[0])
     points, n = buffer.points, len(buffer.points)
     normal = rng.normal(size=(n, 3)) * 0.3 + (0, 0, 1)
     points.normal[:] = normal / np.linalg.norm(normal, axis=1, keepdims=True)

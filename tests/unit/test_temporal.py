@@ -181,7 +181,7 @@ def test_samples_make_up_a_pixels_motion_as_they_make_up_its_position() -> None:
     alpha = np.zeros((H, W, 4), np.float32)
     alpha[7, 9] = 1.0
     p = parameters()
-    buffer, _ = compact(alpha, p, 0, 0)
+    buffer = compact(alpha, p, 0, 0)
     buffer.position[:] = 0
     buffer.depth[:] = [1.0, 1.001, 2.0, 0.5]
     buffer.points.weight[:] = [0.25, 0.75, 1.0, 1.0]

@@ -36,11 +36,18 @@ class HitsThere(MeshHits):
     Attributes
     ----------
     there : all arrays, on the device
-    here : makes the same on this processor
+    anew : traces them on this processor
     """
 
     there: tuple[Any, ...]
-    here: Callable[[], MeshHits]
+    anew: Callable[[], MeshHits]
+
+    def here(self) -> MeshHits:
+        """The same in this processor's memory; traced anew where they are lost with the device."""
+        try:
+            return MeshHits(*(array.numpy() for array in self.there))
+        except Exception:  # whatever Warp raises for a device that is no more
+            return self.anew()
 
 
 def trace(

@@ -165,7 +165,9 @@ def shade_hits(
             _, _, _, dx, dy, dz = sample_ray(p, pixel[n], sample[n])
             scale = -1.0 / np.sqrt(dx * dx + dy * dy + dz * dz)
             vx, vy, vz = scale * dx, scale * dy, scale * dz
-            face, place, u, v = hit_face[y, x, k], hit_place[y, x, k], where[y, x, k, 0], where[y, x, k, 1]
+            place, u, v = hit_place[y, x, k], where[y, x, k, 0], where[y, x, k, 1]
+            # Points that a device found and has lost are traced anew, where a ray along an edge may meet nothing.
+            face = max(hit_face[y, x, k], np.int32(0))
             nx, ny, nz, gx, gy, gz, r, g, b, rough, metal, er, eg, eb, who = surface_at(
                 face, place, u, v, where[y, x, k, 2], where[y, x, k, 3], where[y, x, k, 4],
                 np.float32(-vx), np.float32(-vy), np.float32(-vz), geometry,

@@ -53,7 +53,7 @@ class GBuffer:
             self.points.flags |= np.where(object_flags[self.object_index] & CATCHER_OBJECT, CATCHER, 0).astype(np.uint8)
 
 
-def compact(alpha: Array, parameters: Array, x0: int, y0: int, second: Array | None = None) -> tuple[GBuffer, Array]:
+def compact(alpha: Array, parameters: Array, x0: int, y0: int, second: Array | None = None) -> GBuffer:
     """Make room for the samples with positive `alpha`, with pixel, sample, weight and flags filled in.
 
     Parameters
@@ -62,17 +62,8 @@ def compact(alpha: Array, parameters: Array, x0: int, y0: int, second: Array | N
     parameters : `camera.camera_parameters`
     x0, y0 : full-picture pixel of ``alpha[0, 0]``
     second : (rows, width, aa) float32 of a second layer, or None: its points follow those of their samples
-
-    Returns
-    -------
-    the G-buffer, and (rows + 1,) int64: the first point of each row
     """
-    start = np.zeros(len(alpha) + 1, np.int64)
-    counts = np.count_nonzero(alpha, axis=(1, 2))
-    if second is not None:
-        counts = counts + np.count_nonzero(second, axis=(1, 2))
-    np.cumsum(counts, out=start[1:])
-    n = int(start[-1])
+    n = np.count_nonzero(alpha) + (0 if second is None else np.count_nonzero(second))
     pixel, sample, owner, face, place = np.empty((5, n), np.int32)
     weight, roughness, metallic, depth = np.empty((4, n), np.float32)
     origin, normal, geometric, view, albedo, position = (np.empty((n, 3), np.float32) for _ in range(6))
@@ -82,7 +73,7 @@ def compact(alpha: Array, parameters: Array, x0: int, y0: int, second: Array | N
     points = ShadingPoints(pixel, sample, weight, origin, normal, geometric, view, albedo, roughness, metallic, flags)
     emission = np.zeros((n, 3), np.float32)
     tied = face, place, np.empty((n, 2), np.float32)
-    return GBuffer((y0, y0 + len(alpha)), points, position, depth, owner, emission, *tied, alpha), start
+    return GBuffer((y0, y0 + len(alpha)), points, position, depth, owner, emission, *tied, alpha)
 
 
 @njit

@@ -39,7 +39,7 @@ def primary_mesh(
     x0, _, x1, _ = camera.window
     hits = trace(scene, parameters, x0, y0, (y1 - y0, x1 - x0, int(parameters[AA])), CAMERA)
     layers = lone(hits, scene)
-    buffer, _ = compact(layers.first, parameters, x0, y0)
+    buffer = compact(layers.first, parameters, x0, y0)
     buffer.alpha = layers.opaque
     shade(scene, hits, parameters, x0, buffer, 0)
     buffer.mark_catchers(scene.object_flags)

@@ -89,7 +89,7 @@ def primary_surfels(
     """
     samples = rasterise(splats, y0, y1)
     layers = combine(samples, scene, splats.parameters, camera.window[0], y0, trace)
-    buffer, _ = compact(layers.first, splats.parameters, camera.window[0], y0, layers.second)
+    buffer = compact(layers.first, splats.parameters, camera.window[0], y0, layers.second)
     buffer.alpha = layers.opaque
     points = buffer.points
     (tie or tie_to_mesh)(
