@@ -52,12 +52,11 @@ def warp() -> Any:
     if not version.startswith(VERSION):
         raise DeviceError("device cuda", f"warp-lang has version {version}, not {VERSION}x", _INSTALL)
     folder = cache_folder() / "warp"
-    wp.config.log_level = wp.LOG_ERROR  # else it greets on stdout, which is read by programs, and misses drivers aloud
+    wp.config.log_level = wp.LOG_WARNING  # else it greets on stdout, which is read by programs
     # Not the folder itself: Warp would take the sources there for what an older Warp has left, and warn.
     wp.config.kernel_cache_dir = str(folder / "kernels")
     try:
         wp.init()
-        wp.config.log_level = wp.LOG_WARNING
         os.utime(folder)  # see `jit.current_cache`
     except Exception as error:
         raise DeviceError("device cuda", f"Warp does not start ({error})", "Use the CPU") from error
