@@ -45,7 +45,8 @@ def frame_of(
 ) -> Frame:
     """One object under one HDRI; `settings` are fields of RenderSettings."""
     cosine, ggx, light = split_rays(rays)
-    radiance = read_environment(environment).radiance if isinstance(environment, Path) else environment
+    given = isinstance(environment, np.ndarray)
+    radiance = environment if given else read_environment(environment).radiance
     key = SESSION.load_asset(asset)
     return Frame(
         number=1,
