@@ -64,6 +64,12 @@ def list_pairs(lane: Any, lanes: Any, room: Any, box: Any, first: Any, tiles_x: 
                 pair += 1
 
 
+def pixel_of(number: Any, tiles_x: Any) -> Any:
+    """Tile, column and row of a lane's pixel: those of a tile follow each other."""
+    tile, within = number // (TILE * TILE), number % (TILE * TILE)
+    return tile, tile % tiles_x * TILE + within % TILE, tile // tiles_x * TILE + within // TILE
+
+
 def inside(box: Any, i: Any, x: Any, y: Any) -> Any:
     """Whether a pixel may see surfel i."""
     return x >= box[i, 0] and x < box[i, 2] and y >= box[i, 1] and y < box[i, 3]
@@ -89,8 +95,7 @@ def blend_pixels(
     height, width, channels = maps.shape[0], maps.shape[1], values.shape[1]
     half, stop = F(0.5), F(MIN_TRANSMITTANCE)
     for number in range(lane, (len(start) - 1) * TILE * TILE, lanes):
-        tile, within = number // (TILE * TILE), number % (TILE * TILE)
-        x, y = tile % tiles_x * TILE + within % TILE, tile // tiles_x * TILE + within // TILE
+        tile, x, y = pixel_of(number, tiles_x)
         if x >= width or y >= height:
             continue
         for c in range(channels):
@@ -134,8 +139,7 @@ def pull_pixels(
     height, width, channels = maps.shape[0], maps.shape[1], values.shape[1]
     stop, most = F(MIN_TRANSMITTANCE), F(MAX_ALPHA)
     for number in range(lane, (len(start) - 1) * TILE * TILE, lanes):
-        tile, within = number // (TILE * TILE), number % (TILE * TILE)
-        x, y = tile % tiles_x * TILE + within % TILE, tile // tiles_x * TILE + within // TILE
+        tile, x, y = pixel_of(number, tiles_x)
         if x >= width or y >= height:
             continue
         alpha, mean, square = ONE - maps[y, x, T], maps[y, x, Z], maps[y, x, ZZ]

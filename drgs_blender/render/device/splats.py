@@ -15,6 +15,7 @@ import numpy as np
 from ...asset.model import PosedSurfels
 from ...device.kernels import Launcher, Work
 from ...device.posed import arrays_of
+from ...device.search import first_of
 from ...device.warp import warp
 from ...frame import Camera
 from ..surfels.splats import (
@@ -72,14 +73,7 @@ def find_starts(lane: Any, lanes: Any, room: Any, keys: Any, count: Any, first: 
     """How many of `count` sorted keys are less than `first`, `first` + 1, ..."""
     (start,) = out
     for t in range(lane, len(start), lanes):
-        low, high = np.int64(0), np.int64(count)
-        while low < high:
-            middle = (low + high) // 2
-            if np.int64(keys[middle]) < first + t:
-                low = middle + 1
-            else:
-                high = middle
-        start[t] = low
+        start[t] = first_of(keys, count, first + t)
 
 
 def gather_splats(lane: Any, lanes: Any, room: Any, order: Any, found: Any, shown: Any, owner: Any, out: Any) -> None:

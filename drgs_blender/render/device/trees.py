@@ -113,6 +113,7 @@ class Trees:
         self.rows = launcher.array(ordered, copy=True)
         self.trees = [Tree(launcher, ordered[first:last]) for first, last in pairwise(self._starts)]
         self._faces: tuple[Array, Any] | None = None
+        self._own: Any = None  # rows of all faces where they stand by themselves, once they are asked for
 
     def of(self, layout: object, rows: Array, masks: Array) -> bool:
         """Whether they are of these triangles."""
@@ -124,7 +125,7 @@ class Trees:
         the next time; None where nothing stands in places."""
         launcher = self._launcher
         if self._faces is None or self._faces[0] is not scene.faces:
-            self._faces = scene.faces, launcher.array(scene.faces)
+            self._faces, self._own = (scene.faces, launcher.array(scene.faces)), None
         given = self.moving = launcher.array(scene.vertices), self._faces[1], launcher.array(scene.places)
         for tree in self.trees:
             tree.follow(scene, given)
@@ -133,9 +134,11 @@ class Trees:
         if not len(scene.places):
             return None
         m = len(scene.faces)
-        own = np.stack([np.arange(m), np.full(m, -1)], axis=1).astype(np.int32)
+        if self._own is None:
+            own = np.stack([np.arange(m), np.full(m, -1)], axis=1).astype(np.int32)
+            self._own = launcher.array(own, copy=True)
         self._corners = launcher.zeros((3 * m, 3))
-        launcher.launch(PLACE, m, (*given, own), (self._corners,))
+        launcher.launch(PLACE, m, (*given, self._own), (self._corners,))
         return self._corners
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ...device.kernels import Work
+from ...device.search import first_of
 from ...device.translate import Native
 from ..blocks import block_of
 
@@ -58,18 +59,6 @@ def list_blocks(lane: Any, lanes: Any, room: Any, n: Any, keys: Any, out: Any) -
             first = keys[p] >> 6 != keys[p - 1] >> 6
         if first:
             found[BLOCKS + add_to(found, OCCUPIED, 1)] = keys[p] >> 6
-
-
-def first_of(keys: Any, count: Any, key: Any) -> Any:
-    """How many of the `count` first keys, sorted, are lower."""
-    low, high = np.int64(0), np.int64(count)
-    while low < high:
-        middle = (low + high) // 2
-        if keys[middle] < key:
-            low = middle + 1
-        else:
-            high = middle
-    return low
 
 
 def index_blocks(lane: Any, lanes: Any, room: Any, n: Any, keys: Any, numbers: Any, sizes: Any, out: Any) -> None:
