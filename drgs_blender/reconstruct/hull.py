@@ -7,11 +7,11 @@ Surfels that start on it need not be found by gradients.
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import binary_erosion, gaussian_filter, label, uniform_filter
+from scipy.ndimage import binary_dilation, binary_erosion, gaussian_filter, label, maximum_filter, uniform_filter
 
 from ..arrays import Array
 from ..errors import AssetError, UsageError
@@ -29,6 +29,8 @@ DISSENT = 0.03
 WITNESSES = 0.2
 #: Cells along the longest side of the hull's box.
 CELLS = 96
+#: Parts of the object thinner than a cell begin so many cells from the parts that are not.
+AWAY = 2
 
 
 @dataclass(slots=True)
@@ -42,6 +44,7 @@ class Region:
     low, high : (3,) float64 corners of the object's box
     points, normals : (n, 3) float32 on the first surface, unit normals outwards
     spacing : distance between those points, metres
+    solid : (m, 3) float32 centres of the cells of side `spacing` that are inside; none where there are no masks
     """
 
     centre: Array
@@ -51,6 +54,7 @@ class Region:
     points: Array
     normals: Array
     spacing: float
+    solid: Array = field(default_factory=lambda: np.zeros((0, 3), np.float32))
 
 
 def silhouettes(capture: Capture) -> list[Array] | None:
@@ -122,7 +126,9 @@ def find_region(capture: Capture) -> Region:
     for cells in (64, CELLS):
         origin, spacing = low, float((high - low).max()) / cells
         shape = np.ceil((high - low) / spacing).astype(int) + 1
-        inside = _main_parts(_carve(origin, spacing, shape, views, masks))
+        inside = _carve(origin, spacing, shape, views, masks)
+        near = _carve(origin, spacing, shape, views, _widened(masks, views, centre, spacing))
+        inside = _main_parts(inside | (near & ~binary_dilation(inside, iterations=AWAY)))
         if not inside.any():
             raise AssetError(
                 str(capture.source),
@@ -133,8 +139,20 @@ def find_region(capture: Capture) -> Region:
         low, high = origin + (corners.min(0) - 1.5) * spacing, origin + (corners.max(0) + 1.5) * spacing
     points, normals = _surface(inside, origin, spacing)
     middle = 0.5 * (low + high)
+    solid = (np.argwhere(inside) * spacing + origin).astype(np.float32)
     log.info("visual hull: %d cells, %d surface points, box %s", int(inside.sum()), len(points), high - low)
-    return Region(middle, 0.5 * float(np.linalg.norm(high - low)), low, high, points, normals, spacing)
+    return Region(middle, 0.5 * float(np.linalg.norm(high - low)), low, high, points, normals, spacing, solid)
+
+
+def _widened(masks: list[Array], views: list[View], centre: Array, spacing: float) -> list[Array]:
+    """Masks grown by half a cell: with them no cell is carved that something thinner passes through."""
+    grown = []
+    for mask, view in zip(masks, views, strict=True):
+        camera = view.camera
+        away = np.linalg.norm(np.asarray(camera.matrix_world)[:3, 3] - centre)
+        pixels = round(0.5 * spacing * max(camera.fx, camera.fy) / max(away, 1e-9))
+        grown.append(maximum_filter(mask, 2 * pixels + 1))
+    return grown
 
 
 def _main_parts(inside: Array) -> Array:

@@ -204,11 +204,13 @@ class _Work:
             training.attempt(lambda: training.restore(known), whole=False)
             log.info("%s: going on at step %d", phase, training.iteration)
         saved = shown = told = time.monotonic()
+        reached = 0.0
         while not training.finished:
             training.step()
             now = time.monotonic()
             stop = self.cancelled()
-            if file is not None and (stop or training.finished or now - saved > SAVE_EVERY):
+            due = stop or training.finished or now - saved > SAVE_EVERY
+            if file is not None and due and not training.trying:
                 checkpoint.save(file, training.arrays(), key)
                 saved = time.monotonic()
             if stop:
@@ -216,8 +218,10 @@ class _Work:
             if now - told > 1 or training.finished:
                 draw = now - shown > SHOW_EVERY or training.finished
                 picture = training.attempt(lambda: preview(training.gaussians, self.capture)) if draw else None
-                part = begin + (end - begin) * training.part
-                self.tell(Progress(phase, part, len(training.gaussians), training.psnr, picture))
+                reached = max(reached, training.part)  # the second start of a trial begins anew
+                self.tell(
+                    Progress(phase, begin + (end - begin) * reached, len(training.gaussians), training.psnr, picture)
+                )
                 told, shown = now, now if draw else shown
         return training.attempt(lambda: training.gaussians.on(HERE))
 

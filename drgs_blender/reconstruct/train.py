@@ -8,6 +8,7 @@ begun to form. The first part runs at half size, where a step costs a quarter.
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -25,9 +26,10 @@ from .attributes import TINT
 from .capture import Capture
 from .density import densify
 from .gaussians import Gaussians, Look
-from .hull import Region, colours_of
+from .hull import Region
 from .processor import HERE, Processor
 from .raster import Tally
+from .starts import enough, inside_hull, on_hull
 from .targets import Target, background_of, pixel_rays, targets
 
 log = logging.getLogger(__name__)
@@ -70,8 +72,9 @@ class Schedule:
         )
 
 
-#: Most surfels for each pixel of a view that shows the object.
-PER_PIXEL = 1.5
+#: Part of the schedule that both starts of `starts` are tried for, by views of which each so many is kept aside;
+#: decibels there that surfels inside the hull must bring. At least so many views leave some to keep aside.
+TRIAL, ASIDE, WORTH, MANY = 0.2, 8, 1.0, 16
 #: Part of the weight of `Schedule.consistency` that matte pixels have, and what the tint of mirrors adds to it.
 MATTE, MIRRORED = 0.2, 5.0
 #: Learning rates at the start, and what is left of them at the end; of centres a part of the object's radius.
@@ -91,12 +94,13 @@ class Training:
     capture : its training views are learned from
     region : where the object is
     schedule : how
-    gaussians : to go on with; None starts on the region's first surface
+    gaussians : to go on with; None tries both of `starts`
     seconds : where the steps would take longer, the schedule runs by the clock
     by : who does the steps; what it fails at, and all that follows, is done here
 
     Attributes
     ----------
+    trying : two starts are being tried; what `arrays` returns then is of one of them alone
     failed : why another one than this processor is of no use any more, in words
     """
 
@@ -114,7 +118,14 @@ class Training:
         self.schedule = schedule = replace(schedule, surfels=min(schedule.surfels, enough(self.targets[0])))
         self._behind = background_of(capture)
         self._pixels = sum(view.camera.width * view.camera.height for views in self.targets for view in views)
-        self._begun = _first(capture, region, schedule) if gaussians is None else gaussians
+        self._rival: Gaussians | None = None
+        self._before: tuple[float, dict[str, Array]] | None = None  # error and state of the first start
+        if gaussians is None:
+            gaussians = on_hull(capture, region, schedule.surfels, schedule.bands, schedule.seed)
+            if len(capture.training) >= MANY:
+                self._rival = inside_hull(gaussians, capture, region, schedule.bands, schedule.seed)
+        self.trying = self._rival is not None
+        self._begun = gaussians
         self.start = len(self._begun)
         self.iteration, self.seconds, self.rounds = 0, 0.0, 0
         self.error = 0.0  # running mean of the squared error
@@ -153,7 +164,7 @@ class Training:
             with suppress(DeviceError, RuntimeError):
                 state = self._state() if whole else state
             self._take_on(HERE)
-            self.restore(state)
+            self._restore(state)
             log.warning("%s Learned on the CPU from step %d on", self.failed, self.iteration)
         return work()
 
@@ -183,6 +194,7 @@ class Training:
             self.attempt(self._learn)
         self.iteration += 1
         self._maybe_densify()
+        self._maybe_decide()
         if self.by is not HERE and time.monotonic() > self._kept_at + KEEP_EVERY:
             self._keep()
         self.seconds += time.monotonic() - started
@@ -215,6 +227,8 @@ class Training:
         """The view of this step: all in turn, in an order drawn anew each time."""
         scale = 1 if self.part < self.schedule.coarse else 0
         views = self._views[scale]
+        if self.trying:
+            views = [view for k, view in enumerate(views) if not _aside(k)]
         turn, place = divmod(self.iteration, len(views))
         return self.by.bring(views[np.random.default_rng([self.schedule.seed, turn]).permutation(len(views))[place]])
 
@@ -261,6 +275,37 @@ class Training:
         self.tally = Tally.of(len(self.gaussians), self.by.place)
         log.debug("step %d: %d surfels, %s", self.iteration, len(self.gaussians), report)
 
+    def _maybe_decide(self) -> None:
+        """At the end of a trial: the other start's, or on with the better one."""
+        if not self.trying or self.part < TRIAL:
+            return
+        error = self.attempt(self._error_aside)
+        if self._before is None:
+            assert self._rival is not None
+            self._before, self._begun = (error, self.arrays()), self._rival
+            self.start, self.iteration, self.seconds, self.rounds, self.error = len(self._begun), 0, 0.0, 0, 0.0
+            self.attempt(lambda: self._take_on(self.by), whole=False)
+            if self.by is not HERE:
+                self._keep()
+            return
+        gain, spent = 10 * math.log10(max(self._before[0], 1e-10) / max(error, 1e-10)), self.seconds
+        log.info("surfels inside the hull: %+.2f dB in views kept aside", gain)
+        _, state = self._before
+        self.trying, self._rival, self._before = False, None, None
+        if gain < WORTH:
+            self.attempt(lambda: self._restore(state))
+        self.seconds = spent + float(state["numbers"][1])
+
+    def _error_aside(self) -> float:
+        """Mean squared error of the views that are kept aside, in half size."""
+        errors = []
+        for view in (view for k, view in enumerate(self._views[1]) if _aside(k)):
+            target = self.by.bring(view)
+            with torch.no_grad():
+                look = self.gaussians.look(target.camera, self.background)
+            errors.append(float((look.colour.clamp(0, 1) - target.colour).square().mean()))
+        return float(np.mean(errors))
+
     def arrays(self) -> dict[str, Array]:
         """All that `restore` needs to go on, with any processor; with the same one bit for bit."""
         return self.attempt(self._state)
@@ -281,7 +326,11 @@ class Training:
         return state
 
     def restore(self, state: dict[str, Array]) -> None:
-        """Go on from what `arrays` returned."""
+        """Go on from what `arrays` returned, with no trial of starts."""
+        self.trying, self._rival, self._before = False, None, None
+        self._restore(state)
+
+    def _restore(self, state: dict[str, Array]) -> None:
         there = lambda name: torch.tensor(state[name], device=self.by.place)  # noqa: E731
         part = lambda name: {k.removeprefix(name): there(k) for k in state if k.startswith(name)}  # noqa: E731
         if self.gaussians.light is not None:
@@ -295,10 +344,9 @@ class Training:
         self._remember(state)
 
 
-def enough(views: list[Target]) -> int:
-    """As many surfels as pictures of this size have use for: with more, the photographs are learned by heart."""
-    shown = [v.camera.width * v.camera.height if v.mask is None else float(v.mask.sum()) for v in views]
-    return max(int(PER_PIXEL * np.mean(shown)), 1)
+def _aside(view: int) -> bool:
+    """Whether a trial keeps this view for its end."""
+    return view % ASIDE == ASIDE // 2
 
 
 def _importance(features: Tensor) -> Tensor:
@@ -319,16 +367,3 @@ def _one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(threads)
-
-
-def _first(capture: Capture, region: Region, schedule: Schedule) -> Gaussians:
-    """Surfels on the first surface, no more than half of the schedule's."""
-    points, normals, most = region.points, region.normals, max(schedule.surfels // 2, 1)
-    spacing = region.spacing
-    if len(points) > most:
-        kept = np.sort(np.random.default_rng(schedule.seed).choice(len(points), most, replace=False))
-        spacing *= (len(points) / most) ** 0.5
-        points, normals = points[kept], normals[kept]
-    return Gaussians.on_surface(
-        points, normals, colours_of(points, normals, capture.training), 0.6 * spacing, schedule.bands
-    )

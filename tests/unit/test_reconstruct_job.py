@@ -97,12 +97,13 @@ def test_surfels_on_the_mesh_lie_where_their_binding_says(capture, settings):
     assert asset.provenance["report"]["psnr"] > 24
 
 
-def test_a_run_that_was_stopped_goes_on_bit_for_bit(capture, tmp_path):
+@pytest.mark.parametrize("stop", [5, 11, 25], ids=["in the first start's trial", "in the second's", "after it"])
+def test_a_run_that_was_stopped_goes_on_bit_for_bit(capture, tmp_path, stop):
     short = Settings(schedule=replace(QUICK, iterations=40, surfels=1500), mesh_resolution=32, materials=False)
     whole = reconstruct(capture, short)
     steps = iter(range(1000))
     with pytest.raises(Cancelled):
-        reconstruct(capture, short, cancelled=lambda: next(steps) == 17, folder=tmp_path)
+        reconstruct(capture, short, cancelled=lambda: next(steps) == stop, folder=tmp_path)
     resumed = reconstruct(capture, short, folder=tmp_path)
     for name in ("centre", "scale", "rotation", "opacity", "sh"):
         assert np.array_equal(getattr(whole.surfels, name), getattr(resumed.surfels, name)), name
