@@ -1,4 +1,4 @@
-"""Surfels that learning begins with: in a hollow that no outline shows, on sheets thinner than a cell, on what is full."""
+"""Surfels that learning begins with: in a hollow that no outline shows, on sheets thinner than a cell."""
 
 from __future__ import annotations
 
