@@ -174,8 +174,8 @@ def surfels(options: argparse.Namespace, part: str = "surfels") -> None:
     ]
     body = (
         "PSNR over whole pictures of the views left out: the mean of the pictures', as published tables give it, and, "
-        "pooled, of the mean squared error, which the worst views decide; normals (mean angle, degrees), depth (median, "
-        "metres) and silhouettes (intersection over union) of the mesh against the true one.\n\n"
+        "pooled, of the mean squared error, which the worst views decide; normals (mean angle, degrees), depth "
+        "(median, metres) and silhouettes (intersection over union) of the mesh against the true one.\n\n"
     )
     cells = [(name, *(shown(r.get(key, "-")) for key in names)) for name, r in rows.items()]
     write_section(f"reconstruct-{part}", title, body + table(head, cells))
