@@ -20,7 +20,7 @@ log = logging.getLogger(__name__)
 
 
 def fingerprint(capture: Capture, **settings: Any) -> str:
-    """Digest of what a state depends on: the photographs, their cameras, and settings that JSON can hold."""
+    """Digest of what a state depends on: the photographs, their masks and cameras, and settings that JSON can hold."""
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode())
     for view in capture.views:
         camera = view.camera
@@ -28,6 +28,8 @@ def fingerprint(capture: Capture, **settings: Any) -> str:
         digest.update(np.asarray(camera.matrix_world, np.float64).tobytes())
         digest.update(np.array([camera.fx, camera.fy, camera.cx, camera.cy]).tobytes())
         digest.update(np.ascontiguousarray(view.colour[::7, ::7]).tobytes())
+        if view.mask is not None:
+            digest.update(np.packbits(view.mask > 0.5).tobytes())
     return digest.hexdigest()
 
 

@@ -209,8 +209,7 @@ class _Work:
             training.step()
             now = time.monotonic()
             stop = self.cancelled()
-            due = stop or training.finished or now - saved > SAVE_EVERY
-            if file is not None and due and not training.trying:
+            if file is not None and (stop or training.finished or now - saved > SAVE_EVERY):
                 checkpoint.save(file, training.arrays(), key)
                 saved = time.monotonic()
             if stop:

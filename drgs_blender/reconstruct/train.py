@@ -100,7 +100,7 @@ class Training:
 
     Attributes
     ----------
-    trying : two starts are being tried; what `arrays` returns then is of one of them alone
+    trying : two starts are being tried
     failed : why another one than this processor is of no use any more, in words
     """
 
@@ -119,17 +119,21 @@ class Training:
         self._behind = background_of(capture)
         self._pixels = sum(view.camera.width * view.camera.height for views in self.targets for view in views)
         self._rival: Gaussians | None = None
-        self._before: tuple[float, dict[str, Array]] | None = None  # error and state of the first start
+        self._before: dict[str, Array] | None = None  # state of the first start, and its error in views kept "aside"
         if gaussians is None:
             gaussians = on_hull(capture, region, schedule.surfels, schedule.bands, schedule.seed)
             if len(capture.training) >= MANY:
                 self._rival = inside_hull(gaussians, capture, region, schedule.bands, schedule.seed)
         self.trying = self._rival is not None
+        self.failed = ""
+        self._begin(gaussians, by)
+
+    def _begin(self, gaussians: Gaussians, by: Processor) -> None:
+        """Learn these from the first step on."""
         self._begun = gaussians
-        self.start = len(self._begun)
+        self.start = len(gaussians)
         self.iteration, self.seconds, self.rounds = 0, 0.0, 0
         self.error = 0.0  # running mean of the squared error
-        self.failed = ""
         self._take_on(HERE)
         if by is not HERE:
             self._keep()
@@ -170,7 +174,7 @@ class Training:
 
     def _keep(self) -> None:
         """Remember a state that the device cannot take along when it fails."""
-        self._remember(self.arrays())
+        self._remember(self.attempt(self._state))
 
     def _remember(self, state: dict[str, Array]) -> None:
         self._kept = {name: np.array(value) for name, value in state.items()}
@@ -185,7 +189,7 @@ class Training:
     @property
     def finished(self) -> bool:
         """Nothing is left to do."""
-        return self.part >= 1
+        return self.part >= 1 and not self.trying
 
     def step(self) -> None:
         """One view."""
@@ -277,24 +281,23 @@ class Training:
 
     def _maybe_decide(self) -> None:
         """At the end of a trial: the other start's, or on with the better one."""
-        if not self.trying or self.part < TRIAL:
+        # No more steps than the first had: compiling falls to it, and by the clock that would be counted against it.
+        even = self._before is not None and self.iteration >= self._before["counts"][0]
+        if not self.trying or (self.part < TRIAL and not even):
             return
         error = self.attempt(self._error_aside)
         if self._before is None:
             assert self._rival is not None
-            self._before, self._begun = (error, self.arrays()), self._rival
-            self.start, self.iteration, self.seconds, self.rounds, self.error = len(self._begun), 0, 0.0, 0, 0.0
-            self.attempt(lambda: self._take_on(self.by), whole=False)
-            if self.by is not HERE:
-                self._keep()
+            self._before = self.attempt(self._state) | {"aside": np.array([error])}
+            self._begin(self._rival, self.by)
             return
-        gain, spent = 10 * math.log10(max(self._before[0], 1e-10) / max(error, 1e-10)), self.seconds
+        state, spent = self._before, self.seconds + float(self._before["numbers"][1])
+        gain = 10 * math.log10(max(float(state["aside"][0]), 1e-10) / max(error, 1e-10))
         log.info("surfels inside the hull: %+.2f dB in views kept aside", gain)
-        _, state = self._before
         self.trying, self._rival, self._before = False, None, None
-        if gain < WORTH:
-            self.attempt(lambda: self._restore(state))
-        self.seconds = spent + float(state["numbers"][1])
+        if not gain >= WORTH:  # nor what is no number
+            self.attempt(lambda: self._restore(state), whole=False)
+        self.seconds = spent
 
     def _error_aside(self) -> float:
         """Mean squared error of the views that are kept aside, in half size."""
@@ -308,7 +311,10 @@ class Training:
 
     def arrays(self) -> dict[str, Array]:
         """All that `restore` needs to go on, with any processor; with the same one bit for bit."""
-        return self.attempt(self._state)
+        state = self.attempt(self._state)
+        if self.trying:
+            state |= {"trying": np.ones(1, np.int64)} | {f"before.{k}": v for k, v in (self._before or {}).items()}
+        return state
 
     def _state(self) -> dict[str, Array]:
         tensors = {"travel": self.tally.travel, "views": self.tally.views}
@@ -326,8 +332,10 @@ class Training:
         return state
 
     def restore(self, state: dict[str, Array]) -> None:
-        """Go on from what `arrays` returned, with no trial of starts."""
-        self.trying, self._rival, self._before = False, None, None
+        """Go on from what `arrays` returned."""
+        self.trying = self.trying and "trying" in state
+        before = {k.removeprefix("before."): v for k, v in state.items() if k.startswith("before.")}
+        self._rival, self._before = self._rival if self.trying else None, before if self.trying and before else None
         self._restore(state)
 
     def _restore(self, state: dict[str, Array]) -> None:

@@ -286,6 +286,28 @@ def test_a_device_that_fails_before_the_first_step_learns_nothing(
     training.step()
 
 
+def test_a_device_that_fails_between_two_starts_loses_neither(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second begins with its first step, not with the first one's last."""
+    capture = balls(count=24, size=40)
+    training = Training(capture, find_region(capture), SCHEDULE, by=OnDevice("cpu"))
+    rival, on = training._rival, Gaussians.on
+    assert rival is not None
+    while training.iteration < 11:
+        training.step()
+
+    def broken_there(self: Gaussians, by: Processor) -> Gaussians:
+        return on(self, by) if by is HERE else broken()
+
+    monkeypatch.setattr(Gaussians, "on", broken_there)
+    training.step()
+    assert training.failed and training.by is HERE
+    assert training.trying and training.iteration == training.rounds == 0
+    assert len(training.gaussians) == training.start == len(rival)
+    while training.trying:
+        training.step()
+    assert training.iteration == 12
+
+
 def test_surfels_half_cut_are_of_no_use(capture: Capture, region: Region, monkeypatch: pytest.MonkeyPatch) -> None:
     training, here = kept(capture, region)
 

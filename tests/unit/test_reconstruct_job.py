@@ -19,6 +19,7 @@ from drgs_blender.colour import linear_to_srgb  # noqa: E402
 from drgs_blender.errors import AssetError, Cancelled, UsageError  # noqa: E402
 from drgs_blender.geometry import VertexNormals  # noqa: E402
 from drgs_blender.reconstruct.capture import Capture  # noqa: E402
+from drgs_blender.reconstruct.checkpoint import fingerprint  # noqa: E402
 from drgs_blender.reconstruct.decouple.settings import Settings as Decoupling  # noqa: E402
 from drgs_blender.reconstruct.hull import find_region  # noqa: E402
 from drgs_blender.reconstruct.job import Settings, reconstruct  # noqa: E402
@@ -98,13 +99,15 @@ def test_surfels_on_the_mesh_lie_where_their_binding_says(capture, settings):
 
 
 @pytest.mark.parametrize("stop", [5, 11, 25], ids=["in the first start's trial", "in the second's", "after it"])
-def test_a_run_that_was_stopped_goes_on_bit_for_bit(capture, tmp_path, stop):
+def test_a_run_that_was_stopped_goes_on_bit_for_bit(capture, tmp_path, stop, caplog):
     short = Settings(schedule=replace(QUICK, iterations=40, surfels=1500), mesh_resolution=32, materials=False)
     whole = reconstruct(capture, short)
     steps = iter(range(1000))
     with pytest.raises(Cancelled):
         reconstruct(capture, short, cancelled=lambda: next(steps) == stop, folder=tmp_path)
-    resumed = reconstruct(capture, short, folder=tmp_path)
+    with caplog.at_level("INFO"):
+        resumed = reconstruct(capture, short, folder=tmp_path)
+    assert f"surfels: going on at step {(stop + 1) % 8 if stop < 16 else stop - 7}" in caplog.text
     for name in ("centre", "scale", "rotation", "opacity", "sh"):
         assert np.array_equal(getattr(whole.surfels, name), getattr(resumed.surfels, name)), name
     assert np.array_equal(whole.mesh.vertices, resumed.mesh.vertices)
@@ -143,6 +146,14 @@ def test_a_damaged_or_foreign_checkpoint_is_not_used(capture, tmp_path, caplog):
     caplog.clear()
     reconstruct(capture, replace(short, schedule=replace(short.schedule, seed=1)), folder=tmp_path)
     assert "other photographs or settings" in caplog.text
+
+
+def test_a_run_with_masks_drawn_anew_is_another(capture):
+    before = fingerprint(capture)
+    other = replace(capture, views=[replace(view, mask=view.mask.copy()) for view in capture.views])
+    assert fingerprint(other) == before
+    other.views[4].mask[20, 25] = 1 - other.views[4].mask[20, 25].round()
+    assert fingerprint(other) != before
 
 
 def test_progress_tells_phases_and_shows_pictures(capture):

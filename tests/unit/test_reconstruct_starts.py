@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from capture_cases import balls, camera  # noqa: E402
 
 from drgs_blender.reconstruct import train  # noqa: E402
 from drgs_blender.reconstruct.capture import Capture, View  # noqa: E402
-from drgs_blender.reconstruct.hull import find_region  # noqa: E402
+from drgs_blender.reconstruct.hull import _widened, find_region  # noqa: E402
 from drgs_blender.reconstruct.train import Schedule, Training  # noqa: E402
 
 #: A ball out of which another one took a bite: centres and radii. The rim of the bite is 0.31 above its ground.
@@ -105,6 +106,37 @@ def test_the_start_that_loses_leaves_no_trace(monkeypatch):
     assert tried.iteration == alone.iteration
 
 
+def test_a_start_that_predicts_nothing_is_not_taken(monkeypatch):
+    capture = balls(24, 40)
+    training = Training(capture, find_region(capture), replace(QUICK, iterations=10, surfels=500))
+    on_hull, errors = training.start, iter([0.1, float("nan")])
+    monkeypatch.setattr(training, "_error_aside", lambda: next(errors))
+    while training.trying:
+        training.step()
+    assert training.start == on_hull and training.iteration == 2
+
+
+def test_the_clock_does_not_favour_the_start_that_came_second(monkeypatch):
+    """What the first step of all takes, compiling, leaves the first start few steps within its time."""
+    capture, clock, tried = balls(24, 40), [0.0], []
+    monkeypatch.setattr(train, "time", SimpleNamespace(monotonic=lambda: clock[0]))
+    training = Training(capture, find_region(capture), replace(QUICK, surfels=500), seconds=50.0)
+    learn, error_aside = training._learn, training._error_aside
+
+    def slowly():
+        clock[0] += 1.0 if clock[0] else 100.0
+        learn()
+
+    def noted():
+        tried.append(training.iteration)
+        return error_aside()
+
+    training._learn, training._error_aside = slowly, noted
+    while not training.finished:
+        training.step()
+    assert tried == [2, 2] and not training.trying and training.seconds == clock[0]
+
+
 def test_views_kept_aside_are_learned_from_after_the_trial():
     capture = balls(24, 40)
     training = Training(capture, find_region(capture), replace(QUICK, iterations=100, surfels=500))
@@ -143,3 +175,12 @@ def test_sheets_thinner_than_a_cell_are_part_of_the_hull():
     tip = region.points[np.abs(region.points[:, 0]) > 0.7]
     assert len(tip) and tip[:, 0].max() > 0.8 and tip[:, 0].min() < -0.8
     assert np.abs(tip[:, 2]).max() < 2 * region.spacing and np.abs(tip[:, 1]).max() < 0.1 + 2 * region.spacing
+
+
+def test_a_camera_in_the_middle_does_not_widen_masks_beyond_the_picture():
+    capture = photographed(fin, 20)
+    view = capture.training[0]
+    matrix = view.camera.matrix_world.copy()
+    matrix[:3, 3] = 1e-12
+    (mask,) = _widened([view.mask], [replace(view, camera=replace(view.camera, matrix_world=matrix))], np.zeros(3), 0.1)
+    assert mask.shape == view.mask.shape and (mask == view.mask.max()).all()
