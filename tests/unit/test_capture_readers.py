@@ -317,6 +317,25 @@ def test_one_camera_or_one_place_is_no_capture(tmp_path):
     refused(scene.folder, "in one place")
 
 
+@pytest.mark.parametrize("convert", [np.linalg.inv, lambda m: np.linalg.inv(m @ captures.OPENCV)])
+def test_an_object_that_turns_before_one_camera_is_told_by_name(tmp_path, convert):
+    """The matrices of cameras around the origin, all as far, that bring the world to the camera."""
+    scene = captures.make(tmp_path)
+    for matrix in scene.cameras:
+        matrix[:3, 3] = 3 * matrix[:3, 2]
+    captures.write_nerf(scene, convert=convert)
+    refused(tmp_path, "in one place", "--axes opengl-inverse")
+
+
+def test_places_that_single_precision_cannot_tell_apart_are_refused(tmp_path):
+    """As those of surveys, whose origin is on the equator."""
+    scene = captures.make(tmp_path)
+    for matrix in scene.cameras:
+        matrix[:3, 3] += [5e5, 5e6, 0]
+    captures.write_nerf(scene)
+    refused(tmp_path, "digits do not suffice", "origin near the object")
+
+
 def test_damaged_files_are_refused_by_name(tmp_path):
     refused(tmp_path / "nothing", "does not exist")
     refused(tmp_path, "is no capture", "COLMAP")
@@ -340,6 +359,15 @@ def test_damaged_files_are_refused_by_name(tmp_path):
         ({"frames": [good["frames"][0] | {"transform_matrix": [[1, 2], [3, 4]]}]}, "4 rows of 4"),
         ({"frames": [good["frames"][0] | {"transform_matrix": np.diag([1, 1, -1, 1]).tolist()}]}, "mirrors"),
         ({"frames": [good["frames"][0] | {"transform_matrix": np.diag([1, 2, 1, 1]).tolist()}]}, "no rotation"),
+        (
+            {"frames": [good["frames"][0] | {"transform_matrix": [[1, 0, 0, 1e300], [0, 1, 0, 0], [0, 0, 1, 0]]}]},
+            "1e+300",
+        ),
+        (
+            {"frames": [good["frames"][0] | {"file_path": "a" * 5000}]},
+            f"1 of 1 images that are not there: {200 * 'a'}. ",
+        ),
+        ({"test_filenames": 5}, "test_filenames"),
     ):
         path.write_text(json.dumps(good | change))
         refused(scene.folder, word)

@@ -272,3 +272,9 @@ def test_ctrl_c_while_python_imports_has_its_exit_code_and_no_traceback(moment):
         command = [sys.executable, "-c", program, moment, name]
         done = subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=CHECKOUT)
         assert (done.returncode, done.stdout, done.stderr) == (130, last, "drgs: interrupted\n")
+
+
+@pytest.mark.parametrize("minutes", ["abc", "0", "-1", "nan", "inf"])
+def test_minutes_that_are_none_are_refused_in_words(minutes: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["reconstruct", "photographs", "--out", "a.drgs", f"--minutes={minutes}"]) == 64
+    assert f"--minutes: {minutes} is not a time above zero" in capsys.readouterr().err

@@ -93,7 +93,7 @@ def read_capture(
     layout = reader.read(path, light) if reader.lights else reader.read(path)
     photographs = sorted(layout.photographs, key=lambda photograph: _natural(photograph.name))
     matrices = np.stack([AXES[axes](photograph.matrix) for photograph in photographs])
-    check_places(matrices, str(path))
+    check_places(matrices, str(path), axes)
     turn = _turn(layout, matrices, axes, up)
     for photograph, matrix in zip(photographs, matrices):
         photograph.matrix = turn @ matrix

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +26,8 @@ OPENCV_TO_BLENDER = np.diag([1.0, -1.0, -1.0, 1.0])
 PICTURES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG", ".JPEG", ".webp", ".tif", ".tiff", ".bmp")
 #: Bytes of a JSON file; 10,000 frames take about 10 MB.
 LARGEST_JSON = 256 << 20
+#: Cameras farther from the origin than this are a program's slip: what follows from such distances overflows.
+_FARTHEST = 1e15
 
 
 def decode_mask(path: Path) -> Array:
@@ -106,6 +109,8 @@ def rigid(values: Any, subject: str) -> Array:
         matrix = np.empty(0)
     if matrix.shape not in ((4, 4), (3, 4)) or not np.isfinite(matrix).all():
         raise AssetError(subject, "has no camera matrix of 4 rows of 4 finite numbers", "Export the cameras again")
+    if (largest := np.abs(matrix[:3]).max()) > _FARTHEST:
+        raise AssetError(subject, f"has a camera matrix with {largest:.0e} in it", "Export the cameras again")
     matrix = np.vstack([matrix[:3], [0, 0, 0, 1]])
     rotation = matrix[:3, :3]
     size = abs(np.linalg.det(rotation)) ** (1 / 3)
@@ -137,9 +142,10 @@ def image_size(path: Path) -> tuple[int, int]:
 
 def find_picture(stem: Path) -> Path | None:
     """The image file `stem`, with its extension or without; None where there is none."""
-    if stem.suffix and stem.is_file():
+    # Not Path.is_file, which raises where a name is too long.
+    if stem.suffix and os.path.isfile(stem):
         return stem
-    return next((found for end in PICTURES if (found := stem.with_name(stem.name + end)).is_file()), None)
+    return next((found for end in PICTURES if os.path.isfile(found := stem.with_name(stem.name + end))), None)
 
 
 def find_mask(folder: Path, image: Path, relative: str = "") -> Path | None:
@@ -148,12 +154,12 @@ def find_mask(folder: Path, image: Path, relative: str = "") -> Path | None:
         return None
     name = Path(relative or image.name)
     candidates = [folder / name, folder / f"{name}.png", *(folder / name.with_suffix(end) for end in PICTURES)]
-    return next((found for found in candidates if found.is_file()), None)
+    return next((found for found in candidates if os.path.isfile(found)), None)
 
 
 def complain_of_missing(subject: str, missing: list[str], total: int) -> None:
     """Raise AssetError where photographs are absent."""
     if missing:
-        named = ", ".join(missing[:3]) + (", ..." if len(missing) > 3 else "")
+        named = ", ".join(name[:200] for name in missing[:3]) + (", ..." if len(missing) > 3 else "")
         problem = f"names {len(missing)} of {total} images that are not there: {named}"
         raise AssetError(subject, problem, "Put the images back, or take their frames out of the file")

@@ -75,7 +75,9 @@ def _read_file(path: Path, test: bool, prefix: bool) -> tuple[list[Photograph], 
         frames = list(frames.values())
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
         raise AssetError(str(path), "has no list of frames", "Choose a transforms.json of NeRF or nerfstudio")
-    left_out = {str(name) for name in data.get("test_filenames", [])}
+    left_out = data.get("test_filenames", [])
+    if not isinstance(left_out, list):
+        raise AssetError(str(path), "has test_filenames that are no list of names", "Export the capture again")
     photographs: list[Photograph] = []
     missing = []
     for index, frame in enumerate(frames):

@@ -35,6 +35,8 @@ _SEEN, _AGREE = 0.25, 0.9
 #: Part of the silhouettes that is explained: below the first something is wrong, above the second it is right.
 _WRONG, _RIGHT = 0.5, 0.8
 _NOWHERE = 0.2
+#: Least spread of cameras in their distance from the origin: single precision leaves some thousand steps of it.
+_DIGITS = 1e-4
 
 
 def turn_upright(matrices: Array) -> Array:
@@ -62,15 +64,29 @@ def turn_upright(matrices: Array) -> Array:
     return np.stack([x, np.cross(z, x), z])
 
 
-def check_places(matrices: Array, subject: str) -> None:
-    """Raise AssetError where cameras do not see an object from several sides."""
+def check_places(matrices: Array, subject: str, axes: str) -> None:
+    """Raise AssetError where cameras do not see an object from several sides, or too far away to compute with."""
     if len(matrices) < 2:
         raise AssetError(subject, "has one camera", "Shape needs photographs from several sides: take 20 or more")
     centres = matrices[:, :3, 3]
-    spread = np.linalg.norm(centres - centres.mean(axis=0), axis=1).max()
-    if spread < 1e-6 * max(float(np.abs(centres).max()), 1.0):
-        problem = "has all its cameras in one place"
-        raise AssetError(subject, problem, "Walk around the object; turning on the spot shows no shape")
+    spread, away = _spread(matrices), float(np.abs(centres).max())
+    if spread < 1e-6 * min(max(away, 1.0), 1e3):
+        remedy = "Walk around the object; turning on the spot shows no shape"
+        # World-to-camera matrices of cameras that look at the origin from one distance, as renderers place them.
+        if not axes.endswith("inverse") and _spread(np.stack([invert(matrix) for matrix in matrices])) > 1e-3:
+            remedy += ". If the matrices are world to camera, give --axes opengl-inverse or opencv-inverse"
+        raise AssetError(subject, "has all its cameras in one place", remedy)
+    if spread < _DIGITS * away:
+        problem = (
+            f"has its cameras {away:.3g} from the origin and within {spread:.3g} of each other: digits do not suffice"
+        )
+        raise AssetError(subject, problem, "Export the capture with the origin near the object")
+
+
+def _spread(matrices: Array) -> float:
+    """How far cameras are from their mean place, at most."""
+    centres = matrices[:, :3, 3]
+    return float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
 
 
 def check_silhouettes(views: Sequence[View], subject: str, axes: str) -> None:
