@@ -149,8 +149,8 @@ def _widened(masks: list[Array], views: list[View], centre: Array, spacing: floa
     grown = []
     for mask, view in zip(masks, views, strict=True):
         camera = view.camera
-        away = np.linalg.norm(np.asarray(camera.matrix_world)[:3, 3] - centre)
-        pixels = 0.5 * spacing * max(camera.fx, camera.fy) / max(away, 1e-9)
+        away = max(float(np.linalg.norm(np.asarray(camera.matrix_world)[:3, 3] - centre)), 1e-9)
+        pixels = 0.5 * spacing * max(camera.fx, camera.fy) / away
         # No more than the picture has: a camera may stand in the middle.
         grown.append(maximum_filter(mask, 2 * min(round(pixels), max(mask.shape)) + 1))
     return grown

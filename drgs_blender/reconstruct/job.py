@@ -17,7 +17,7 @@ from ..asset.model import MATERIAL_CHANNELS, Asset, Binding, Environment, Mesh, 
 from ..build.transfer import surfels_to_vertices
 from ..deform.binding import bind
 from ..deform.mesh_driven import MeshDriven
-from ..errors import Cancelled
+from ..errors import Cancelled, WriteError
 from . import checkpoint
 from .attached import attach_learned, bound
 from .capture import Capture, View
@@ -179,7 +179,13 @@ class _Work:
         self.capture, self.settings, self.tell, self.cancelled, self.folder = capture, settings, tell, cancelled, folder
         self.by = learner(settings.device)
         if folder is not None:
-            folder.mkdir(parents=True, exist_ok=True)
+            try:
+                folder.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                problem = f"cannot be a folder for what goes on after a stop ({error.strerror or error})"
+                raise WriteError(
+                    str(folder), problem, "Move what is there, or choose another name for the asset"
+                ) from error
 
     def seconds(self, share: float) -> float | None:
         """Time of a phase."""

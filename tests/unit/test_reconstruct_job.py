@@ -16,7 +16,7 @@ from capture_cases import balls, colour_of_balls, distance_to_balls  # noqa: E40
 
 from drgs_blender.asset.container import read_asset, write_asset  # noqa: E402
 from drgs_blender.colour import linear_to_srgb  # noqa: E402
-from drgs_blender.errors import AssetError, Cancelled, UsageError  # noqa: E402
+from drgs_blender.errors import AssetError, Cancelled, UsageError, WriteError  # noqa: E402
 from drgs_blender.geometry import VertexNormals  # noqa: E402
 from drgs_blender.reconstruct.capture import Capture  # noqa: E402
 from drgs_blender.reconstruct.checkpoint import fingerprint  # noqa: E402
@@ -98,8 +98,10 @@ def test_surfels_on_the_mesh_lie_where_their_binding_says(capture, settings):
     assert asset.provenance["report"]["psnr"] > 24
 
 
-@pytest.mark.parametrize("stop", [5, 11, 25], ids=["in the first start's trial", "in the second's", "after it"])
-def test_a_run_that_was_stopped_goes_on_bit_for_bit(capture, tmp_path, stop, caplog):
+@pytest.mark.parametrize(
+    ("stop", "step"), [(5, 6), (11, 4), (25, 18)], ids=["in the first start's trial", "in the second's", "after it"]
+)
+def test_a_run_that_was_stopped_goes_on_bit_for_bit(capture, tmp_path, stop, step, caplog):
     short = Settings(schedule=replace(QUICK, iterations=40, surfels=1500), mesh_resolution=32, materials=False)
     whole = reconstruct(capture, short)
     steps = iter(range(1000))
@@ -107,7 +109,7 @@ def test_a_run_that_was_stopped_goes_on_bit_for_bit(capture, tmp_path, stop, cap
         reconstruct(capture, short, cancelled=lambda: next(steps) == stop, folder=tmp_path)
     with caplog.at_level("INFO"):
         resumed = reconstruct(capture, short, folder=tmp_path)
-    assert f"surfels: going on at step {(stop + 1) % 8 if stop < 16 else stop - 7}" in caplog.text
+    assert f"surfels: going on at step {step}" in caplog.text
     for name in ("centre", "scale", "rotation", "opacity", "sh"):
         assert np.array_equal(getattr(whole.surfels, name), getattr(resumed.surfels, name)), name
     assert np.array_equal(whole.mesh.vertices, resumed.mesh.vertices)
@@ -154,6 +156,13 @@ def test_a_run_with_masks_drawn_anew_is_another(capture):
     assert fingerprint(other) == before
     other.views[4].mask[20, 25] = 1 - other.views[4].mask[20, 25].round()
     assert fingerprint(other) != before
+
+
+def test_a_file_where_checkpoints_should_be_is_told_by_name(capture, tmp_path):
+    (tmp_path / "a.reconstruct").write_text("mine")
+    with pytest.raises(WriteError, match=r"a\.reconstruct"):
+        reconstruct(capture, folder=tmp_path / "a.reconstruct")
+    assert (tmp_path / "a.reconstruct").read_text() == "mine"
 
 
 def test_progress_tells_phases_and_shows_pictures(capture):

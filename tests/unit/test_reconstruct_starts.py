@@ -116,6 +116,17 @@ def test_a_start_that_predicts_nothing_is_not_taken(monkeypatch):
     assert training.start == on_hull and training.iteration == 2
 
 
+def test_starts_are_judged_by_the_views_that_neither_saw():
+    capture = balls(24, 24)
+    training = Training(capture, find_region(capture), replace(QUICK, surfels=200))
+    expected = training._error_aside()
+    half = training._views[1]
+    seen = [k for k in range(len(half)) if k % train.ASIDE != train.ASIDE // 2]
+    for k in seen:
+        half[k] = None
+    assert training._error_aside() == expected and len(half) - len(seen) == 3
+
+
 def test_the_clock_does_not_favour_the_start_that_came_second(monkeypatch):
     """What the first step of all takes, compiling, leaves the first start few steps within its time."""
     capture, clock, tried = balls(24, 40), [0.0], []
