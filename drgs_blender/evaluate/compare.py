@@ -62,13 +62,14 @@ def compare(
     UsageError
         There is nothing to compare with.
     """
-    novel = capture.testing
-    if asset.environment is None or not novel:
-        reason = "no environment of its own" if novel else "no views left out"
+    novel, reason, remedy = capture.testing, "no views left out", "Leave views out with --test-every 8"
+    if novel and asset.environment is None:
+        novel, reason = [], "the asset has no light of its own"
+        remedy = "Reconstruct it with materials, or name a known light with --relit"
+    if not novel:
+        if truth is None:
+            raise UsageError(str(capture.source), f"has nothing to compare with: {reason}", remedy)
         logger.warning("views left out are not rendered: %s", reason)
-        novel = []
-    if not novel and truth is None:
-        raise UsageError(str(capture.source), "has nothing to compare with", "Leave views out with --test-every 8")
     total = len(novel) + (sum(len(item.views) for item in truth.sets) if truth else 0)
     done = 0
 

@@ -87,7 +87,8 @@ def _tensors(path: Path) -> dict[str, Any]:
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # damaged archives raise almost anything
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        # Not torch's own words: they advise to load what may run code.
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else "torch cannot load it"
         raise AssetError(str(path), f"holds no weights ({reason})", "Give a state saved by torch") from error
     if not isinstance(state, dict):
         raise AssetError(str(path), "holds no named weights", "Give a state saved by torch")

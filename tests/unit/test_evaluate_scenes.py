@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import captures
@@ -166,8 +167,10 @@ def test_a_published_set_is_scored_under_the_lights_that_are_named(tmp_path):
     assert report["materials"]["albedo_psnr"] > 60 and "metallic_rmse" not in report["materials"]
     assert any("night" in line for line in table(report))
     json.dumps(report, allow_nan=False)
-    with pytest.raises(UsageError, match="nothing to compare"):
+    with pytest.raises(UsageError, match=r"nothing to compare.* no light of its own.*--relit"):
         compare(asset, capture, None, renderer)
+    with pytest.raises(UsageError, match=r"nothing to compare.* no views left out.*--test-every"):
+        compare(asset, replace(capture, views=capture.training), None, renderer)
 
 
 def test_what_is_there_is_kept_and_what_is_missing_made_again(scenes, command):
