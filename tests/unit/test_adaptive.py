@@ -58,14 +58,14 @@ def test_the_mean_of_all_parts_is_the_whole() -> None:
     assert np.abs(parts[0].components - whole.components).max() > 1e-3  # the parts differ, so they are parts
 
 
-def fake(deviation: np.ndarray, drawn: np.ndarray):
-    """A tracer of grey light 1 whose parts have the given deviation at each pixel; counts what it is asked for."""
+def fake(deviation: np.ndarray, drawn: np.ndarray, value: float = 1.0):
+    """A tracer of grey light whose parts have the given deviation at each pixel; counts what it is asked for."""
 
     def trace(points: ShadingPoints, part: tuple[int, int]) -> Radiance:
         n = len(points)
         drawn[points.pixel] += 1
         light = np.zeros((n, 4, 3), np.float32)
-        light[:, 0] = 1.0
+        light[:, 0] = value
         variance = np.zeros((n, 2), np.float32)
         variance[:, 0] = deviation[points.pixel] ** 2
         return Radiance(light, variance)
@@ -79,6 +79,13 @@ def test_quiet_pixels_stop_and_noisy_ones_go_on() -> None:
     sample_adaptively(row_of_points(20), 128, 8, 0.05, fake(deviation, drawn))
     assert drawn[10] == 8
     assert (np.delete(drawn, 10) == 1).all()
+
+
+def test_black_pixels_stop_and_nothing_is_divided_by_their_light() -> None:
+    drawn = np.zeros(4, int)
+    with np.errstate(all="raise"):
+        sample_adaptively(row_of_points(4), 128, 8, 0.05, fake(np.zeros(4, np.float32), drawn, 0.0))
+    assert (drawn == 1).all()
 
 
 def test_nobody_stops_before_the_sixteenth_sample() -> None:

@@ -97,6 +97,33 @@ def test_edges_stay_sharp(kind: str) -> None:
         assert abs(out[:, side].mean() / truth[:, side, 0, 0].mean() - 1) < 0.03, side
 
 
+@pytest.mark.parametrize(("roughness", "glossy_mixes"), [(0.0, False), (1.0, True)])
+def test_small_bumps_part_light_of_smooth_surfaces_alone(roughness: float, glossy_mixes: bool) -> None:
+    """Columns turned 12 degrees against each other: what reflects as diffusely as that hardly shows it."""
+    odd = (np.arange(W) % 2 == 1)[None, :, None]
+    turn = np.radians(6)
+    normal = np.where(odd, [np.sin(turn), -np.cos(turn), 0], [-np.sin(turn), -np.cos(turn), 0])
+    guides = wall(normal=np.broadcast_to(normal, (H, W, 3)), roughness=np.full((H, W), roughness))
+    components, _ = light_of(np.broadcast_to(np.where(odd[..., 0], 2.0, 1.0), (H, W)), guides)
+    out = denoise(components, np.ones((H, W, 2), np.float32), guides)  # as if all of it were noise
+    for lobe, mixes in ((0, True), (2, glossy_mixes)):
+        before, after = (a[:, 1::2, lobe].mean() / a[:, ::2, lobe].mean() for a in (components, out))
+        assert before == pytest.approx(2.0)
+        assert after < 1.5 if mixes else after > 1.85, lobe
+
+
+def test_light_that_a_dark_colour_does_not_explain_stays_where_it_is() -> None:
+    """A nearly black line with a speck of light in it, as on an edge: divided by its colour it would be a firefly."""
+    albedo = np.full((H, W, 3), 0.5)
+    albedo[:, W // 2] = 1e-4
+    guides = wall(albedo=albedo)
+    components, _ = light_of(np.full((H, W), 1.0), guides)
+    components[:, W // 2, 0] = 0.03
+    out = denoise(components, np.full((H, W, 2), 1.0, np.float32), guides)[:, :, 0]
+    beside = np.abs(np.arange(W) - W // 2) > 0
+    np.testing.assert_allclose(out[:, beside], components[:, beside, 0], rtol=0.3)
+
+
 def test_a_slanted_plane_is_one_surface() -> None:
     """Depth changes by ten pixel widths a pixel there; a test on depth alone would not blur at all."""
     position = wall().position

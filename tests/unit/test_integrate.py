@@ -15,6 +15,7 @@ from drgs_blender.jit import get_num_threads, use_threads
 from drgs_blender.render.lights.lamps import Lamps
 from drgs_blender.render.lights.light import EnvironmentLight
 from drgs_blender.render.points import DIFFUSE_DIRECT, DIFFUSE_INDIRECT, GLOSSY_DIRECT, Radiance, ShadingPoints
+from drgs_blender.render.shade.heads import ALPHA, COUNTS, HEAD, _allot
 from drgs_blender.render.shade.integrate import integrate
 from drgs_blender.render.trace.scene import TraceObject, TraceScene
 
@@ -541,6 +542,18 @@ def test_samples_are_allotted_where_they_tell_most(changes: dict, gain: float) -
         value = luminance(integrate(EMPTY, sky, some, settings(16, 8, 8, split=split, look="principled"), 0))
         spread[split] = value.var()
     assert spread["counts"] > gain * spread["auto"]
+
+
+def test_points_of_a_pixel_agree_on_their_samples() -> None:
+    """Where a texture changes the lobes' shares, few steps of the allotment lie between points of one pixel."""
+    counts = []
+    for share in np.linspace(0.1, 0.8, 141, dtype=np.float32):
+        head = np.zeros((1, HEAD), np.float32)
+        head[0, ALPHA] = 0.2**4
+        _allot.py_func(head, 0, share, (True, *np.float32([64, 32, 32, 1, 0, 1])))
+        counts.append(head[0, COUNTS:])
+    assert (np.sum(counts, axis=1) == 128).all() and (np.round(counts) == counts).all()
+    assert 4 < len(np.unique(counts, axis=0)) < 20
 
 
 def test_no_bit_depends_on_the_neighbours_where_batches_overflow() -> None:

@@ -42,6 +42,18 @@ def test_noise_goes_and_each_component_stays_itself() -> None:
 
 
 @pytest.mark.skipif(not available(), reason="the wheel pyoidn is not installed")
+def test_a_texture_of_single_pixels_stays() -> None:
+    """Guides are free of noise: what they show is texture, however much it looks like noise."""
+    _, _, guides = noisy()
+    rng = np.random.default_rng(2)
+    guides.albedo[:] = rng.uniform(0.05, 0.9, (SIZE, SIZE, 1))
+    truth = (guides.albedo * guides.coverage[..., None])[:, :, None] * np.float32([1, 0, 0, 0])[:, None]
+    light = truth * (1 + 0.3 * rng.normal(size=(SIZE, SIZE, 1, 1))).astype(np.float32)
+    before, after = (np.abs(a - truth).mean() for a in (light, denoise_oidn(light, guides)))
+    assert after < 0.6 * before
+
+
+@pytest.mark.skipif(not available(), reason="the wheel pyoidn is not installed")
 def test_it_gives_the_same_bits_again() -> None:
     _, light, guides = noisy()
     assert (denoise_oidn(light, guides, split=False) == denoise_oidn(light, guides, split=False)).all()

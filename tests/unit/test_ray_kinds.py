@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -54,3 +55,34 @@ def test_keeping_lobes_apart_changes_no_mean(split: str) -> None:
     (together, a), (apart, b) = (light_of([panel(), wall(), *more], sky, [low], 2, split) for more in ([], [buried]))
     assert (np.abs(together - apart) <= 4.5 * np.hypot(a, b)).all()
     assert (np.hypot(a, b) < 0.04 * together).all() and not (a == b).all()
+
+
+def test_sky_behind_what_shadow_rays_alone_meet_is_as_bright_as_in_cycles() -> None:
+    """A matte floor under a roof that diffuse rays pass: what Cycles' weights of one ray and one light sample leave."""
+    roof = panel()
+    roof.matrices = np.diag([1e4, 1e4, 1.0, 1.0])[None]
+    roof.visibility = Visibility(diffuse=False)
+    white = World()
+    (free, _), (roofed, _) = (light_of(meshes, white, [], 0, "auto") for meshes in ([], [roof]))
+    # The mean over cosine-distributed rays of p / (p + 1 / (4 pi)), p being their density.
+    cycles = 0.5 + math.log(5.0) / 8
+    np.testing.assert_allclose(roofed[0] / free[0], cycles, atol=0.12)
+
+
+def indirect(metallic: float, **seen: bool) -> np.ndarray:
+    """Mean indirect light from a wall that a lamp just before it lights, by kind, (2, 3)."""
+    shiny = wall()
+    shiny.materials[0].metallic = metallic
+    low = lamp()
+    low.matrix_world[:3, 3] = 1.4, 0.0, 0.6
+    low.matrix_world[:3, :3] = [[0, 0, -1], [0, 1, 0], [1, 0, 0]]  # it shines along +X
+    return light_of([shiny], DARK, [replace(low, size_x=1.5, **seen)], 1)[0][[1, 3]]
+
+
+def test_lamps_shine_at_further_surfaces_on_the_lobes_that_see_them() -> None:
+    both, hidden, kept = indirect(1.0), indirect(1.0, glossy=False), indirect(1.0, diffuse=False)
+    assert both.min() > 1e-3 and not hidden.any()  # a metal has no diffuse lobe
+    np.testing.assert_allclose(kept, both, rtol=1e-5)
+    both, diffuse, glossy = indirect(0.0), indirect(0.0, glossy=False), indirect(0.0, diffuse=False)
+    np.testing.assert_allclose(diffuse + glossy, both, rtol=1e-4)
+    assert (diffuse > 0.8 * both).all() and (glossy > 0.005 * both).all()
