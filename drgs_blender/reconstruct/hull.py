@@ -128,7 +128,8 @@ def find_region(capture: Capture) -> Region:
         shape = np.ceil((high - low) / spacing).astype(int) + 1
         inside = _carve(origin, spacing, shape, views, masks)
         near = _carve(origin, spacing, shape, views, _widened(masks, views, centre, spacing))
-        inside = _main_parts(inside | (near & ~binary_dilation(inside, iterations=AWAY)))
+        apart = near & ~binary_dilation(inside, iterations=AWAY)
+        inside = _main_parts(inside | near) & (inside | apart)
         if not inside.any():
             raise AssetError(
                 str(capture.source),

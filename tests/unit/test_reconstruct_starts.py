@@ -20,8 +20,6 @@ from drgs_blender.reconstruct.train import Schedule, Training  # noqa: E402
 
 #: A ball out of which another one took a bite: centres and radii. The rim of the bite is 0.31 above its ground.
 BOWL, BITE = (np.zeros(3), 0.9), (np.array([0.0, 0.0, 1.1]), 0.75)
-#: Half the sides of a sheet along the axes.
-FIN = np.array([0.85, 0.1, 0.005])
 QUICK = Schedule(iterations=600, surfels=4000)
 
 
@@ -167,25 +165,32 @@ def test_views_kept_aside_are_learned_from_after_the_trial():
     assert kept and not kept & during and {id(view) for view in full} <= after
 
 
-def fin(view, samples: int = 5) -> tuple[np.ndarray, np.ndarray]:
-    """Colour over black and coverage of a ball that a sheet goes through, a two-hundredth as thick as long."""
+def wired(view, across: float, samples: int = 5) -> tuple[np.ndarray, np.ndarray]:
+    """Colour over black and coverage of a ball and a wire through it, along the first axis, 12 mm thick."""
     step = (np.arange(view.width * samples) + 0.5) / samples
     x, y = np.meshgrid((step - view.cx) / view.fx, -(step - view.cy) / view.fy)
     rays = np.stack([x, y, np.full_like(x, -1.0)], -1) @ view.matrix_world[:3, :3].T
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
     eye = view.matrix_world[:3, 3]
     hit = np.isfinite(crossings(eye, rays, (np.zeros(3), 0.4))[0])
-    faces = np.stack([(-FIN - eye) / rays, (FIN - eye) / rays])
+    half = np.array([0.85, 0.006, 0.006])
+    faces = np.stack([(np.array([0, across, across]) + side * half - eye) / rays for side in (-1, 1)])
     hit |= faces.min(axis=0).max(axis=-1) <= faces.max(axis=0).min(axis=-1)
     alpha = hit.reshape(view.height, samples, view.width, samples).mean(axis=(1, 3)).astype(np.float32)
+    alpha = (alpha > 0.3).astype(np.float32)  # drawn by hand, a little too wide
     return np.repeat(0.5 * alpha[..., None], 3, -1), alpha
 
 
-def test_sheets_thinner_than_a_cell_are_part_of_the_hull():
-    region = find_region(photographed(fin, 20))
-    tip = region.points[np.abs(region.points[:, 0]) > 0.7]
-    assert len(tip) and tip[:, 0].max() > 0.8 and tip[:, 0].min() < -0.8
-    assert np.abs(tip[:, 2]).max() < 2 * region.spacing and np.abs(tip[:, 1]).max() < 0.1 + 2 * region.spacing
+@pytest.mark.parametrize("across", [0.0, 0.004, 0.009, 0.013])
+def test_wires_thinner_than_a_cell_are_part_of_the_hull(across):
+    region = find_region(photographed(lambda view: wired(view, across), 16, 200))
+    assert region.spacing > 0.015
+    along = region.points[np.abs(region.points[:, 0]) > 0.5]
+    assert np.abs(along[:, 1:] - across).max() < 2 * region.spacing
+    # On either side, without a long gap.
+    for side in (-1, 1):
+        places = np.sort(side * along[side * along[:, 0] > 0, 0])
+        assert len(places) and places.max() > 0.8 and np.diff(places, prepend=0.5).max() < 6 * region.spacing
 
 
 def test_a_camera_in_the_middle_does_not_widen_masks_beyond_the_picture():
