@@ -194,7 +194,7 @@ def test_wires_thinner_than_a_cell_are_part_of_the_hull(across):
 
 
 def test_a_camera_in_the_middle_does_not_widen_masks_beyond_the_picture():
-    capture = photographed(fin, 20)
+    capture = photographed(lambda view: wired(view, 0.0), 20)
     view = capture.training[0]
     matrix = view.camera.matrix_world.copy()
     matrix[:3, 3] = 1e-12
