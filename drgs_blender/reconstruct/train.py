@@ -124,7 +124,7 @@ class Training:
             gaussians = on_hull(capture, region, schedule.surfels, schedule.bands, schedule.seed)
             if len(capture.training) >= MANY:
                 self._rival = inside_hull(gaussians, capture, region, schedule.bands, schedule.seed)
-        self.trying = self._rival is not None
+        self.trying, self._tried = self._rival is not None, 0.0  # seconds that a trial took
         self.failed = ""
         self._begin(gaussians, by)
 
@@ -183,8 +183,12 @@ class Training:
     @property
     def part(self) -> float:
         """What is done of the schedule, 0..1."""
-        by_steps = self.iteration / self.schedule.iterations
-        return min(max(by_steps, self.seconds / self.limit if self.limit else 0.0), 1.0)
+        by_steps, by_clock = self.iteration / self.schedule.iterations, 0.0
+        if self.limit:
+            # Both starts together get a trial's share of the time, and what comes after goes on from there.
+            begun, left = (TRIAL, (self.limit - self._tried) / (1 - TRIAL)) if self._tried else (0.0, self.limit)
+            by_clock = begun + (self.seconds - self._tried) / max(left / 2 if self.trying else left, 1e-3)
+        return min(max(by_steps, by_clock), 1.0)
 
     @property
     def finished(self) -> bool:
@@ -297,7 +301,7 @@ class Training:
         self.trying, self._rival, self._before = False, None, None
         if not gain >= WORTH:  # nor what is no number
             self.attempt(lambda: self._restore(state), whole=False)
-        self.seconds = spent
+        self.seconds = self._tried = spent
 
     def _error_aside(self) -> float:
         """Mean squared error of the views that are kept aside, in half size."""
@@ -328,7 +332,7 @@ class Training:
         state["counts"] = np.array(
             [self.iteration, self.optimiser.steps, self.start, self.rounds, self.light.steps], np.int64
         )
-        state["numbers"] = np.array([self.error, self.seconds])
+        state["numbers"] = np.array([self.error, self.seconds, self._tried])
         return state
 
     def restore(self, state: dict[str, Array]) -> None:
@@ -348,7 +352,7 @@ class Training:
         self.optimiser.first, self.optimiser.second = part("first."), part("second.")
         self.tally = Tally(there("travel"), there("views"))
         self.iteration, self.optimiser.steps, self.start, self.rounds, self.light.steps = map(int, state["counts"])
-        self.error, self.seconds = (float(x) for x in state["numbers"])
+        self.error, self.seconds, self._tried = (float(x) for x in state["numbers"])
         self._remember(state)
 
 

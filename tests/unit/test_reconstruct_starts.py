@@ -146,6 +146,27 @@ def test_the_clock_does_not_favour_the_start_that_came_second(monkeypatch):
     assert tried == [2, 2] and not training.trying and training.seconds == clock[0]
 
 
+def test_by_the_clock_a_trial_takes_its_share_and_the_schedule_goes_on_evenly(monkeypatch):
+    capture, clock, parts = balls(24, 40), [0.0], []
+    monkeypatch.setattr(train, "time", SimpleNamespace(monotonic=lambda: clock[0]))
+    training = Training(capture, find_region(capture), replace(QUICK, iterations=6000, surfels=500), seconds=100.0)
+    learn = training._learn
+
+    def in_a_second():
+        clock[0] += 1.0
+        learn()
+
+    training._learn = in_a_second
+    while not training.finished:
+        parts.append((training.trying, training.part))
+        training.step()
+    assert training.seconds == clock[0] == pytest.approx(100, abs=1)
+    assert sum(trying for trying, _ in parts) == pytest.approx(100 * train.TRIAL, abs=2)
+    after = [part for trying, part in parts if not trying]
+    np.testing.assert_allclose(np.diff(after), 0.01, atol=1e-3)
+    assert after[0] == pytest.approx(train.TRIAL, abs=0.02)
+
+
 def test_views_kept_aside_are_learned_from_after_the_trial():
     capture = balls(24, 40)
     training = Training(capture, find_region(capture), replace(QUICK, iterations=100, surfels=500))
