@@ -100,7 +100,6 @@ class Training:
 
     Attributes
     ----------
-    trying : two starts are being tried
     failed : why another one than this processor is of no use any more, in words
     """
 
@@ -124,7 +123,7 @@ class Training:
             gaussians = on_hull(capture, region, schedule.surfels, schedule.bands, schedule.seed)
             if len(capture.training) >= MANY:
                 self._rival = inside_hull(gaussians, capture, region, schedule.bands, schedule.seed)
-        self.trying, self._tried = self._rival is not None, 0.0  # seconds that a trial took
+        self._tried = 0.0  # seconds that a trial took
         self.failed = ""
         self._begin(gaussians, by)
 
@@ -181,6 +180,11 @@ class Training:
         self._kept_at = time.monotonic()
 
     @property
+    def trying(self) -> bool:
+        """Two starts are being tried."""
+        return self._rival is not None
+
+    @property
     def part(self) -> float:
         """What is done of the schedule, 0..1."""
         by_steps, by_clock = self.iteration / self.schedule.iterations, 0.0
@@ -223,7 +227,7 @@ class Training:
         self.optimiser.step(self.gaussians.parameters, self._rates(part))
         if self.gaussians.light is not None:
             self.light.step({"light": self.gaussians.light}, {"light": LIGHT_RATE[0] * LIGHT_RATE[1] ** part})
-        squared = float((look.colour.detach().clamp(0, 1) - target.colour).square().mean())
+        squared = _squared_error(look, target)
         self.error = squared if not self.iteration else 0.98 * self.error + 0.02 * squared
 
     @property
@@ -287,18 +291,17 @@ class Training:
         """At the end of a trial: the other start's, or on with the better one."""
         # No more steps than the first had: compiling falls to it, and by the clock that would be counted against it.
         even = self._before is not None and self.iteration >= self._before["counts"][0]
-        if not self.trying or (self.part < TRIAL and not even):
+        if self._rival is None or (self.part < TRIAL and not even):
             return
         error = self.attempt(self._error_aside)
         if self._before is None:
-            assert self._rival is not None
             self._before = self.attempt(self._state) | {"aside": np.array([error])}
             self._begin(self._rival, self.by)
             return
         state, spent = self._before, self.seconds + float(self._before["numbers"][1])
         gain = 10 * math.log10(max(float(state["aside"][0]), 1e-10) / max(error, 1e-10))
         log.info("surfels inside the hull: %+.2f dB in views kept aside", gain)
-        self.trying, self._rival, self._before = False, None, None
+        self._rival, self._before = None, None
         if not gain >= WORTH:  # nor what is no number
             self.attempt(lambda: self._restore(state), whole=False)
         self.seconds = self._tried = spent
@@ -306,11 +309,9 @@ class Training:
     def _error_aside(self) -> float:
         """Mean squared error of the views that are kept aside, in half size."""
         errors = []
-        for view in (view for k, view in enumerate(self._views[1]) if _aside(k)):
-            target = self.by.bring(view)
+        for target in (self.by.bring(view) for k, view in enumerate(self._views[1]) if _aside(k)):
             with torch.no_grad():
-                look = self.gaussians.look(target.camera, self.background)
-            errors.append(float((look.colour.clamp(0, 1) - target.colour).square().mean()))
+                errors.append(_squared_error(self.gaussians.look(target.camera, self.background), target))
         return float(np.mean(errors))
 
     def arrays(self) -> dict[str, Array]:
@@ -337,9 +338,10 @@ class Training:
 
     def restore(self, state: dict[str, Array]) -> None:
         """Go on from what `arrays` returned."""
-        self.trying = self.trying and "trying" in state
+        if "trying" not in state:
+            self._rival = None
         before = {k.removeprefix("before."): v for k, v in state.items() if k.startswith("before.")}
-        self._rival, self._before = self._rival if self.trying else None, before if self.trying and before else None
+        self._before = before if self.trying and before else None
         self._restore(state)
 
     def _restore(self, state: dict[str, Array]) -> None:
@@ -354,6 +356,11 @@ class Training:
         self.iteration, self.optimiser.steps, self.start, self.rounds, self.light.steps = map(int, state["counts"])
         self.error, self.seconds, self._tried = (float(x) for x in state["numbers"])
         self._remember(state)
+
+
+def _squared_error(look: Look, target: Target) -> float:
+    """Mean over the picture."""
+    return float((look.colour.detach().clamp(0, 1) - target.colour).square().mean())
 
 
 def _aside(view: int) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -33,14 +34,20 @@ def shade(which: int, normal: np.ndarray) -> np.ndarray:
     return np.stack(base, -1) * (0.6 + 0.4 * normal[..., 2:])
 
 
-def trace(view: Camera, samples: int = 3) -> tuple[np.ndarray, np.ndarray]:
-    """Colour over black and coverage of the balls, box-filtered."""
+def rays_of(view: Camera, samples: int) -> tuple[np.ndarray, np.ndarray]:
+    """Unit directions (h * samples, w * samples, 3) of a grid within each pixel, and their lengths at unit depth."""
     step = (np.arange(view.width * samples) + 0.5) / samples
     x, y = np.meshgrid((step - view.cx) / view.fx, -(step - view.cy) / view.fy)
     rays = np.stack([x, y, np.full_like(x, -1.0)], -1) @ view.matrix_world[:3, :3].T
-    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    length = np.linalg.norm(rays, axis=-1)
+    return rays / length[..., None], length
+
+
+def trace(view: Camera, samples: int = 3) -> tuple[np.ndarray, np.ndarray]:
+    """Colour over black and coverage of the balls, box-filtered."""
+    rays, _ = rays_of(view, samples)
     eye = view.matrix_world[:3, 3]
-    nearest, colour = np.full(x.shape, np.inf), np.zeros((*x.shape, 3))
+    nearest, colour = np.full(rays.shape[:2], np.inf), np.zeros(rays.shape)
     for which, (middle, radius) in enumerate(BALLS):
         along = rays @ (middle - eye)
         inside = radius**2 - (np.sum((middle - eye) ** 2) - along**2)
@@ -56,12 +63,19 @@ def trace(view: Camera, samples: int = 3) -> tuple[np.ndarray, np.ndarray]:
 
 def balls(count: int = 24, size: int = 48, test_every: int = 8, masks: bool = True) -> Capture:
     """`count` photographs of the balls before black."""
+    return photographed(trace, count, size, test_every, masks)
+
+
+def photographed(
+    shape: Callable[..., tuple[np.ndarray, ...]], count: int, size: int, test_every: int, masks: bool = True
+) -> Capture:
+    """`count` photographs before black of what `shape(camera)` says: colour, coverage, and what else it knows."""
     views = []
     for k in range(count):
         view = camera(k, count, size)
-        colour, alpha = trace(view)
+        colour, alpha, *_ = shape(view)
         views.append(View(f"{k:03d}", view, colour, alpha if masks else None, k % test_every == 0))
-    return Capture(Path("balls"), views, (0.0, 0.0, 0.0))
+    return Capture(Path(shape.__name__), views, (0.0, 0.0, 0.0))
 
 
 def colour_of_balls(points: np.ndarray) -> np.ndarray:

@@ -238,16 +238,21 @@ def kept(capture: Capture, region: Region) -> tuple[Training, Training]:
     return training, here
 
 
+def step_that_loses_all(training: Training, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One at which the device fails, and nothing can be read from it any more."""
+    with monkeypatch.context() as patch:
+        patch.setattr(training.by, "rasterise", broken)
+        patch.setattr(training, "_state", broken)
+        training.step()
+
+
 def test_a_device_whose_memory_is_lost_goes_back_to_the_last_state_kept(
     capture: Capture, region: Region, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """After some failures of a card nothing can be read from it any more."""
     training, here = kept(capture, region)
     training.step()
-    with monkeypatch.context() as patch:
-        patch.setattr(training.by, "rasterise", broken)
-        patch.setattr(training, "_state", broken)
-        training.step()
+    step_that_loses_all(training, monkeypatch)
     here.step()
     assert training.by is HERE
     assert training.iteration == here.iteration == 8
@@ -260,10 +265,7 @@ def test_a_run_taken_up_on_a_device_goes_back_to_where_it_was_taken_up(
     begun = learned(capture, region, HERE, 5)
     training = Training(capture, region, SCHEDULE, by=OnDevice("cpu"))
     training.restore(begun.arrays())
-    with monkeypatch.context() as patch:
-        patch.setattr(training.by, "rasterise", broken)
-        patch.setattr(training, "_state", broken)
-        training.step()
+    step_that_loses_all(training, monkeypatch)
     begun.step()
     assert training.by is HERE
     assert training.iteration == 6

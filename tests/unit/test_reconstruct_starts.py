@@ -1,9 +1,8 @@
-"""Surfels that learning begins with: in a hollow that no outline shows, on sheets thinner than a cell."""
+"""Surfels that learning begins with: in a hollow that no outline shows, on wires thinner than a cell."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,10 +10,10 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from capture_cases import balls, camera  # noqa: E402
+from capture_cases import balls, photographed, rays_of  # noqa: E402
 
 from drgs_blender.reconstruct import train  # noqa: E402
-from drgs_blender.reconstruct.capture import Capture, View  # noqa: E402
+from drgs_blender.reconstruct.capture import Capture  # noqa: E402
 from drgs_blender.reconstruct.hull import _widened, find_region  # noqa: E402
 from drgs_blender.reconstruct.train import Schedule, Training  # noqa: E402
 
@@ -34,11 +33,7 @@ def crossings(eye: np.ndarray, rays: np.ndarray, ball: tuple[np.ndarray, float])
 
 def bowl(view, samples: int = 3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Colour over black, coverage, and the distance along the axis of view, of a bowl with painted bumps."""
-    step = (np.arange(view.width * samples) + 0.5) / samples
-    x, y = np.meshgrid((step - view.cx) / view.fx, -(step - view.cy) / view.fy)
-    local = np.stack([x, y, np.full_like(x, -1.0)], -1)
-    length = np.linalg.norm(local, axis=-1)
-    eye, rays = view.matrix_world[:3, 3], local @ view.matrix_world[:3, :3].T / length[..., None]
+    eye, (rays, length) = view.matrix_world[:3, 3], rays_of(view, samples)
     enter, leave = crossings(eye, rays, BOWL)
     into, out = crossings(eye, rays, BITE)
     bitten = (into < enter) & (enter < out)
@@ -51,16 +46,6 @@ def bowl(view, samples: int = 3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     alpha = hit.reshape(blocks).mean(axis=(1, 3))
     depth = np.where(hit, t / length, 0).reshape(blocks).mean(axis=(1, 3)) / np.maximum(alpha, 1e-6)
     return colour.reshape(*blocks, 3).mean(axis=(1, 3)).astype(np.float32), alpha.astype(np.float32), depth
-
-
-def photographed(shape, count: int = 40, size: int = 64) -> Capture:
-    """Photographs of `shape` before black, one of ten left out."""
-    views = []
-    for k in range(count):
-        view = camera(k, count, size)
-        colour, alpha, *_ = shape(view)
-        views.append(View(f"{k:03d}", view, colour, alpha, k % 10 == 0))
-    return Capture(Path("bowl"), views, (0.0, 0.0, 0.0))
 
 
 def learned(capture: Capture) -> Training:
@@ -83,7 +68,7 @@ def far_off(training: Training, capture: Capture) -> float:
 
 
 def test_a_hollow_that_no_outline_shows_is_found(monkeypatch, caplog):
-    capture = photographed(bowl)
+    capture = photographed(bowl, 40, 64, 10)
     with caplog.at_level("INFO"):
         both = learned(capture)
     assert "inside the hull: +" in caplog.text and not both.trying
@@ -97,7 +82,8 @@ def test_the_start_that_loses_leaves_no_trace(monkeypatch):
     monkeypatch.setattr(train, "WORTH", 1000.0)
     tried = learned(capture)
     # The winner did not see the views that were kept aside until the trial's end: neither does this one.
-    monkeypatch.setattr(Training, "_maybe_decide", lambda self: setattr(self, "trying", self.part < train.TRIAL))
+    until_then = lambda self: setattr(self, "_rival", self._rival if self.part < train.TRIAL else None)  # noqa: E731
+    monkeypatch.setattr(Training, "_maybe_decide", until_then)
     alone = learned(capture)
     for name, value in tried.gaussians.arrays().items():
         assert np.array_equal(value, alone.gaussians.arrays()[name]), name
@@ -188,11 +174,7 @@ def test_views_kept_aside_are_learned_from_after_the_trial():
 
 def wired(view, across: float, samples: int = 5) -> tuple[np.ndarray, np.ndarray]:
     """Colour over black and coverage of a ball and a wire through it, along the first axis, 12 mm thick."""
-    step = (np.arange(view.width * samples) + 0.5) / samples
-    x, y = np.meshgrid((step - view.cx) / view.fx, -(step - view.cy) / view.fy)
-    rays = np.stack([x, y, np.full_like(x, -1.0)], -1) @ view.matrix_world[:3, :3].T
-    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-    eye = view.matrix_world[:3, 3]
+    eye, (rays, _) = view.matrix_world[:3, 3], rays_of(view, samples)
     hit = np.isfinite(crossings(eye, rays, (np.zeros(3), 0.4))[0])
     half = np.array([0.85, 0.006, 0.006])
     faces = np.stack([(np.array([0, across, across]) + side * half - eye) / rays for side in (-1, 1)])
@@ -204,7 +186,7 @@ def wired(view, across: float, samples: int = 5) -> tuple[np.ndarray, np.ndarray
 
 @pytest.mark.parametrize("across", [0.0, 0.004, 0.009, 0.013])
 def test_wires_thinner_than_a_cell_are_part_of_the_hull(across):
-    region = find_region(photographed(lambda view: wired(view, across), 16, 200))
+    region = find_region(photographed(lambda view: wired(view, across), 16, 200, 10))
     assert region.spacing > 0.015
     along = region.points[np.abs(region.points[:, 0]) > 0.5]
     assert np.abs(along[:, 1:] - across).max() < 2 * region.spacing
@@ -215,7 +197,7 @@ def test_wires_thinner_than_a_cell_are_part_of_the_hull(across):
 
 
 def test_a_camera_in_the_middle_does_not_widen_masks_beyond_the_picture():
-    capture = photographed(lambda view: wired(view, 0.0), 20)
+    capture = photographed(lambda view: wired(view, 0.0), 20, 64, 10)
     view = capture.training[0]
     matrix = view.camera.matrix_world.copy()
     matrix[:3, 3] = 1e-12
