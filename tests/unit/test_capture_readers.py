@@ -307,6 +307,68 @@ def test_black_photographs_are_left_out_and_a_black_capture_is_refused(tmp_path,
     refused(tmp_path, "black images")
 
 
+def test_an_empty_mask_is_named_and_its_photograph_left_out(tmp_path, caplog):
+    captures.write_nerfstudio(captures.make(tmp_path))
+    for k in range(12):
+        Image.new("L", (48, 40)).save(tmp_path / "masks" / f"frame_{k:05d}.png")
+        if k == 3:
+            names = {view.name for view in read_capture(tmp_path).views}
+            assert names == {f"frame_{n:05d}" for n in range(4, 12)}
+            assert "4 of 12 masks are empty" in caplog.text and "frame_00000.png" in caplog.text
+    # All of them: what is done with the capture says so.
+    assert len(read_capture(tmp_path).views) == 12
+
+
+def test_empty_alpha_is_an_empty_mask(tmp_path, caplog):
+    scene = captures.make(tmp_path)
+    captures.write_nerf(scene)
+    pixels = captures.picture(scene.cameras[5])
+    pixels[..., 3] = 0
+    Image.fromarray(pixels).save(tmp_path / "train" / "r_5.png")
+    assert "r_5" not in {view.name for view in read_capture(tmp_path).views}
+    assert "1 of 12 masks" in caplog.text and "r_5.png" in caplog.text
+
+
+def test_few_photographs_without_a_mask_are_left_out_and_most_without_take_the_others(tmp_path, caplog):
+    scene = captures.make(tmp_path)
+    captures.write_nerf(scene)
+    for k, matrix in enumerate(scene.cameras):
+        Image.fromarray(captures.picture(matrix)[..., :3]).save(tmp_path / "train" / f"r_{k}.png")
+        if k == 4:
+            capture = read_capture(tmp_path)
+            assert {view.name for view in capture.views} == {f"r_{n}" for n in range(5, 12)}
+            assert all(view.mask is not None for view in capture.views) and capture.background == (1.0, 1.0, 1.0)
+            assert "5 of 12 photographs have no mask (r_0.png, r_1.png, r_2.png, ...)" in caplog.text
+        if k == 6:
+            caplog.clear()
+            assert len(read_capture(tmp_path).views) == 12
+            assert "7 of 12 photographs" in caplog.text and "masks of the others are not used" in caplog.text
+
+
+def test_test_views_need_no_masks(tmp_path, caplog):
+    captures.write_nerf(captures.make(tmp_path), "train")
+    captures.write_nerf(captures.make(tmp_path, 5), "test")
+    for image in (tmp_path / "test").iterdir():
+        Image.open(image).convert("RGB").save(image)
+    capture = read_capture(tmp_path)
+    assert (len(capture.training), len(capture.testing)) == (12, 5) and not caplog.records
+    assert all(view.mask is not None for view in capture.training)
+
+
+def test_pictures_that_exif_turns_are_used_as_stored_and_named(tmp_path, caplog):
+    captures.write_colmap(captures.make(tmp_path), True)
+    before = read_capture(tmp_path)
+    assert not caplog.records
+    exif = Image.Exif()
+    for name, orientation in (("002.png", 1), ("005.png", 3), ("007.png", 6)):
+        file = tmp_path / "images" / name
+        exif[0x0112] = orientation
+        Image.open(file).save(file, exif=exif)
+    after = read_capture(tmp_path)
+    assert all(np.array_equal(a.colour, b.colour) for a, b in zip(before.views, after.views, strict=True))
+    assert len(caplog.records) == 1 and "2 photographs are marked as turned" in caplog.text and "005.png" in caplog.text
+
+
 def test_one_camera_or_one_place_is_no_capture(tmp_path):
     captures.write_nerf(captures.make(tmp_path / "one", 1))
     refused(tmp_path / "one", "one camera")

@@ -18,6 +18,7 @@ from . import colmap, llff, nero, tensoir, transforms
 from .develop import cut_out, develop, find_background
 from .layout import Layout
 from .lens import Lens
+from .usable import usable
 from .world import AXES, check_places, check_silhouettes, turn_upright
 
 logger = logging.getLogger(__name__)
@@ -76,8 +77,8 @@ def read_capture(
     -------
     Capture
         Lenses straightened, Z up. Pictures with alpha are laid on white. Where there are neither alpha nor masks but
-        every picture has a border of one colour, what differs from it is the mask. Black photographs are left out with
-        a warning.
+        every picture has a border of one colour, what differs from it is the mask. Photographs that cannot be used
+        are left out with a warning, see `usable.usable`.
 
     Raises
     ------
@@ -99,16 +100,7 @@ def read_capture(
         photograph.matrix = turn @ matrix
     _check_memory(layout, resolution, path)
     known: dict[Lens, tuple[Lens, np.ndarray]] = {}
-    developed = [(p.image, develop(p, layout, resolution, known)) for p in photographs]
-    views = [view for _, view in developed if view is not None]
-    if black := [image.name for image, view in developed if view is None]:
-        named = ", ".join(black[:3]) + (", ..." if len(black) > 3 else "")
-        if len(views) < max(2, len(black)):
-            raise AssetError(str(path), f"has {len(black)} black images ({named})", "Export the photographs again")
-        logger.warning("%s: %d black images are left out: %s", path, len(black), named)
-    if all(view.mask is None or view.mask.min() >= 1 for view in views):  # an alpha channel that says nothing
-        for view in views:
-            view.mask = None
+    views = usable([(p, develop(p, layout, resolution, known)) for p in photographs], str(path))
     if all(view.mask is None for view in views) and cut_out(views):
         logger.warning(
             "%s: has no masks; what differs from the colour of the pictures' borders is taken for the object. "

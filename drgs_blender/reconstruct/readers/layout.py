@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
+from PIL import ExifTags, Image
 
 from ...colour import to_unit
 from ...errors import AssetError
@@ -138,6 +138,16 @@ def image_size(path: Path) -> tuple[int, int]:
             return image.size
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise AssetError(str(path), f"is no image that can be read ({error})", "Convert it to PNG or JPEG") from error
+
+
+def turned_by_exif(path: Path) -> bool:
+    """Whether viewers show the image file `path`, which can be read, otherwise than its pixels are stored."""
+    with Image.open(path) as image:
+        try:
+            orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
+        except Exception:  # damaged metadata raise almost anything; the pixels are sound
+            return False
+    return orientation in range(2, 9)
 
 
 def find_picture(stem: Path) -> Path | None:
