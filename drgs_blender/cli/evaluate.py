@@ -92,7 +92,7 @@ def run(args: argparse.Namespace) -> int:
             raise UsageError("--make-scenes", "takes no asset", "Score assets in a second command")
         return make(args)
     if args.asset is None or args.capture is None:
-        raise UsageError("drgs evaluate", "needs an asset and its capture", "See `drgs evaluate --help`")
+        raise UsageError("evaluate", "needs an asset and its capture", "See `drgs evaluate --help`")
     return score(args)
 
 
@@ -134,7 +134,7 @@ def score(args: argparse.Namespace) -> int:
 
     from ..asset.container import digest_asset
     from ..engine.session import Session
-    from ..evaluate.compare import compare, source_name, table
+    from ..evaluate.compare import compare, table
     from ..evaluate.lpips import Lpips
     from ..evaluate.truth import Truth, read_relit, read_truth
     from ..reconstruct.readers import read_capture
@@ -159,7 +159,7 @@ def score(args: argparse.Namespace) -> int:
             lambda part, name: bar(name, part),
             writer(args.pictures) if args.pictures is not None else None,
         )
-    report = {"asset": digest_asset(key), "capture": source_name(args.capture), "rays": settings.rays, **report}
+    report = {"asset": digest_asset(key), "capture": capture.name, "rays": settings.rays, **report}
     print(json.dumps(report, indent=1) if args.json else "\n".join(table(report)))
     return 0
 

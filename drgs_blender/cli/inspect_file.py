@@ -25,6 +25,8 @@ EXAMPLES = """examples:
 
 _ZIP = b"PK\x03\x04"
 _EXR = b"\x76\x2f\x31\x01"
+#: Items of a list that a person is shown.
+_FEW = 16
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -126,16 +128,15 @@ def as_lines(value: Any, depth: int = 0) -> Iterator[str]:
             yield f"{pad}{key}:"
             yield from as_lines(item, depth + 1)
         elif isinstance(item, list):
-            yield f"{pad}{key}: {', '.join(plain(part) for part in item) or 'none'}"
+            more = f", ... ({len(item)} in all)" if len(item) > _FEW else ""
+            yield f"{pad}{key}: {', '.join(plain(part) for part in item[:_FEW]) or 'none'}{more}"
         else:
             yield f"{pad}{key}: {plain(item)}" if named else f"{pad}- {plain(item)}"
 
 
 def is_short(value: Any) -> bool:
-    """Whether a list fits a line: few items, none of them nested or a sentence."""
-    if not isinstance(value, list) or len(value) > 16:
-        return False
-    return not any(isinstance(item, dict | list) or len(str(item)) > 30 for item in value)
+    """Whether the first items of a list fit a line: none is nested or a sentence."""
+    return isinstance(value, list) and not any(isinstance(item, dict | list) or len(str(item)) > 30 for item in value)
 
 
 def plain(value: Any) -> str:

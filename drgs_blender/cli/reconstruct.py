@@ -92,7 +92,7 @@ def run(args: argparse.Namespace) -> int:
         if error.name != "torch":
             raise
         raise DeviceError(
-            "drgs reconstruct", "needs PyTorch", f'Install it: "{sys.executable}" -m pip install "torch>=2.5"'
+            "reconstruct", "needs PyTorch", f'Install it: "{sys.executable}" -m pip install "torch>=2.5"'
         ) from error
     from ..reconstruct.readers import read_capture
     from ..reconstruct.train import Schedule

@@ -83,6 +83,7 @@ def compare(
     report: dict[str, Any] = {"novel": None, "lights": [], "materials": None, "geometry": None, "posed_geometry": None}
     if novel:
         assert asset.environment is not None
+        _warn_of_known(asset, capture)
         radiance = asset.environment.radiance
         pictures = [render(view, radiance, None, "views left out") for view in novel]
         report["novel"] = _novel(novel, pictures, capture.background, lpips, show)
@@ -99,6 +100,27 @@ def compare(
                 if not item.posed:
                     report["materials"] = _materials(item, pictures)
     return _without_nan(report)
+
+
+def _warn_of_known(asset: Asset, capture: Capture) -> None:
+    """Say which views left out the asset was learned from all the same, where it says what it was learned from."""
+    learned = asset.provenance.get("learned_from")
+    if not isinstance(learned, list):
+        return
+    made_of = str(asset.provenance.get("capture"))
+    if made_of.split("/")[0] != capture.name.split("/")[0]:
+        logger.warning(
+            "%s: the asset was learned from %s: which views it knows cannot be told by their names",
+            capture.source, made_of,
+        )  # fmt: skip
+        return
+    novel = capture.testing
+    if known := [view.name for view in novel if view.name in learned]:
+        logger.warning(
+            "%s: the asset was learned from %d of the %d views left out (%s): their figures are too good. Give the "
+            "--test-every that it was reconstructed with, or reconstruct it with this one",
+            capture.source, len(known), len(novel), ", ".join(known[:3]) + (", ..." if len(known) > 3 else ""),
+        )  # fmt: skip
 
 
 def posed_vertices(asset: Asset, truth: Truth) -> Array:
@@ -280,8 +302,3 @@ def _shape(name: str, geometry: dict[str, float]) -> str:
     return (
         f"{name}: normals {normal} degrees off; depth {median} (median), {mean} (mean); silhouettes overlap {overlap}"
     )
-
-
-def source_name(path: Path) -> str:
-    """What a capture is called in a report."""
-    return path.resolve().name if path.is_dir() else f"{path.resolve().parent.name}/{path.name}"

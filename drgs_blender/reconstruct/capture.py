@@ -47,6 +47,12 @@ class Capture:
     points: Array | None = None
 
     @property
+    def name(self) -> str:
+        """What it is called in reports: its folder, and its file where one was chosen."""
+        path = self.source.resolve()
+        return f"{path.parent.name}/{path.name}" if path.is_file() else path.name
+
+    @property
     def training(self) -> list[View]:
         """Views that may be learned from."""
         return [view for view in self.views if not view.test]

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation, binary_erosion, gaussian_filter, label, maximum_filter, uniform_filter
 
 from ..arrays import Array
-from ..errors import AssetError, UsageError
+from ..errors import AssetError
 from ..frame import Camera
 from ..jit import njit, prange
 from .capture import Capture, View
@@ -91,7 +91,7 @@ def aim(cameras: list[Camera]) -> tuple[Array, float]:
     eye, axis = matrices[:, :3, 3], -matrices[:, :3, 2]
     across = np.eye(3) - axis[:, :, None] * axis[:, None, :]
     if np.linalg.cond(across.sum(0)) > 1e6:
-        raise UsageError(
+        raise AssetError(
             "cameras", "all look in one direction: depth cannot be told", "Photograph the object from around it"
         )
     middle = np.linalg.solve(across.sum(0), (across @ eye[:, :, None]).sum(0))[:, 0]
@@ -105,12 +105,12 @@ def find_region(capture: Capture) -> Region:
 
     Raises
     ------
-    UsageError: fewer than three views, or cameras that all look the same way.
-    AssetError: masks that have no point in common: cameras and pictures do not belong together.
+    AssetError: fewer than three views, cameras that all look the same way, or masks that have no point in common:
+        cameras and pictures do not belong together.
     """
     views = capture.training
     if len(views) < 3:
-        raise UsageError(
+        raise AssetError(
             str(capture.source),
             f"has {len(views)} views to learn from",
             "A surface needs three or more, from all around",

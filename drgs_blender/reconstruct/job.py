@@ -117,7 +117,8 @@ def reconstruct(
     Returns
     -------
     Asset
-        In the capture's world space. ``provenance["report"]`` holds counts, "psnr" and "ssim" of the views left out.
+        In the capture's world space. ``provenance["report"]`` holds counts, "psnr" and "ssim" of the views left out;
+        ``provenance["learned_from"]`` the names of the others.
 
     Raises
     ------
@@ -156,8 +157,9 @@ def reconstruct(
             binding = shaded_by(binding, mesh, found.normals)
         _take_materials(surfels, mesh, binding)
         environment, origin = Environment(found.environment), "pulled apart from the light"
-    provenance = {"capture": capture.source.name, "variant": settings.variant, "materials": origin, "report": report}
-    return Asset(surfels, mesh, binding, environment, provenance)
+    learned = [view.name for view in capture.training]
+    provenance = {"capture": capture.name, "learned_from": learned, "variant": settings.variant, "materials": origin}
+    return Asset(surfels, mesh, binding, environment, provenance | {"report": report})
 
 
 def mesh_of(gaussians: Gaussians, capture: Capture, region: Region, resolution: int = 256) -> tuple[Mesh, dict]:

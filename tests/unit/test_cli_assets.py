@@ -12,6 +12,7 @@ from PIL import Image
 from drgs_blender.asset.container import read_asset
 from drgs_blender.cli import doctor
 from drgs_blender.cli.find_blender import find_blender
+from drgs_blender.cli.inspect_file import as_lines
 from drgs_blender.cli.main import main
 from drgs_blender.errors import DeviceError
 from drgs_blender.formats.gltf import read_gltf
@@ -170,6 +171,12 @@ def test_inspect_knows_every_kind(cube, tmp_path, capsys):
     assert described(tmp_path / "paint.png", capsys)["kind"] == "environment"
     assert main(["inspect", str(cube)]) == 0
     assert "faces: 12 x 3 int32" in capsys.readouterr().out
+
+
+def test_inspect_shows_the_first_of_many_names_and_counts_them():
+    names = [f"r_{k}" for k in range(100)]
+    (line,) = as_lines({"learned_from": names})
+    assert line == f"learned_from: {', '.join(names[:16])}, ... (100 in all)"
 
 
 def test_inspect_counts_what_is_not_finite(tmp_path, capsys):

@@ -173,6 +173,28 @@ def test_a_published_set_is_scored_under_the_lights_that_are_named(tmp_path):
         compare(asset, replace(capture, views=capture.training), None, renderer)
 
 
+@pytest.mark.parametrize(
+    ("provenance", "test_every", "words"),
+    [
+        ({"capture": "set", "learned_from": ["r_1", "r_2", "r_3", "r_5", "r_6", "r_7"]}, 4, ""),
+        ({"capture": "set", "learned_from": ["r_1", "r_3", "r_5", "r_7"]}, 4, ""),
+        ({"capture": "set", "learned_from": ["r_1", "r_2", "r_3", "r_5", "r_6", "r_7"]}, 3, "2 of the 3 views"),
+        ({"capture": "set/transforms_train.json", "learned_from": [f"r_{k}" for k in range(8)]}, 4, "2 of the 2 views"),
+        ({"capture": "other", "learned_from": ["r_1"]}, 4, "learned from other"),
+        ({"capture": "set"}, 4, ""),  # of an older version
+    ],
+)
+def test_views_that_the_asset_was_learned_from_are_not_taken_for_left_out(
+    tmp_path, caplog, provenance, test_every, words
+):
+    captures.write_nerf(captures.make(tmp_path / "set", 8))
+    mesh = Mesh(np.zeros((3, 3)), np.zeros((1, 3), np.int32), np.zeros((3, 3)), np.zeros(3), np.zeros(3))
+    asset = Asset(attach_nothing(), mesh, None, Environment(np.ones((4, 8, 3), np.float32)), provenance)
+    blank = {"Combined": np.zeros((captures.HEIGHT, captures.WIDTH, 4), np.float32)}
+    compare(asset, read_capture(tmp_path / "set", test_every=test_every), None, lambda *_: blank)
+    assert words in caplog.text and bool(words) == bool(caplog.records)
+
+
 def test_what_is_there_is_kept_and_what_is_missing_made_again(scenes, command):
     folder = scenes / "spot"
     kept, gone = folder / "test" / "r_001.exr", folder / "posed" / "r_001.png"
@@ -207,5 +229,6 @@ def test_damaged_truth_is_refused(scenes, tmp_path, capsys):
         with pytest.raises(AssetError, match=r"truth\.json"):
             read_truth(folder / "spot")
     assert main(["evaluate"]) == EXIT_USAGE
+    assert capsys.readouterr().err.startswith("drgs: evaluate: needs an asset")
     assert main(["evaluate", "a.drgs", "b", "--make-scenes", "c"]) == EXIT_USAGE
     assert "takes no asset" in capsys.readouterr().err
