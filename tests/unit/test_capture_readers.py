@@ -296,6 +296,21 @@ def test_masks_and_photographs_of_another_shape_are_refused(tmp_path):
     refused(tmp_path, "names the mask")
 
 
+def test_a_picture_of_another_shape_than_the_one_camera_of_a_file_is_refused(tmp_path):
+    scene = captures.make(tmp_path)
+    path = captures.write_nerf(scene)
+    image = tmp_path / "train" / "r_5.png"
+    Image.fromarray(captures.picture(scene.cameras[5], 96, 80)).save(image)  # the same shape, larger
+    assert len(read_capture(tmp_path).views) == 12
+    Image.fromarray(captures.picture(scene.cameras[5])[10:26]).save(image)
+    refused(tmp_path, "r_5.png", "48 x 16 pixels", "48 x 40")
+    data = json.loads(path.read_text())
+    for frame in data["frames"]:  # each says what it was taken with
+        frame["camera_angle_x"] = data["camera_angle_x"]
+    path.write_text(json.dumps(data))
+    assert len(read_capture(tmp_path).views) == 12
+
+
 def test_black_photographs_are_left_out_and_a_black_capture_is_refused(tmp_path, caplog):
     captures.write_nerfstudio(captures.make(tmp_path))
     for k in range(12):

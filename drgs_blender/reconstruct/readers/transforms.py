@@ -7,6 +7,7 @@ and a Z-up world; the others give focal lengths, per file or per frame, and any 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,8 @@ _MODELS = {
     "OPENCV_FISHEYE": ("OPENCV_FISHEYE", ("k1", "k2", "k3", "k4")),
     "FISHEYE": ("OPENCV_FISHEYE", ("k1", "k2", "k3", "k4")),
 }
+#: What a frame says that has a camera of its own.
+_OWN = {"camera_angle_x", "fl_x", "w", "h"}
 #: Files of a folder, in the order in which they are taken; those of one row belong together: (file, left out).
 _FILES = (
     (("transforms_train.json", False), ("transforms_test.json", True)),
@@ -79,7 +82,7 @@ def _read_file(path: Path, test: bool, prefix: bool) -> tuple[list[Photograph], 
     if not isinstance(left_out, list):
         raise AssetError(str(path), "has test_filenames that are no list of names", "Export the capture again")
     photographs: list[Photograph] = []
-    missing = []
+    missing, alike = [], []
     for index, frame in enumerate(frames):
         subject = f"{path}, frame {index}"
         name = frame.get("file_path")
@@ -95,12 +98,29 @@ def _read_file(path: Path, test: bool, prefix: bool) -> tuple[list[Photograph], 
         tidy = Path(name).with_suffix("") if Path(name).suffix in PICTURES else Path(name)
         label = tidy.as_posix().removeprefix("./") if prefix else tidy.name
         photographs.append(Photograph(label, image, matrix, lens, mask, test or name in left_out))
+        if not _OWN & frame.keys():
+            alike.append(photographs[-1])
     complain_of_missing(str(path), missing, len(frames))
+    _check_shapes(alike, path)
     if len({photograph.name for photograph in photographs}) < len(photographs):
         for index, photograph in enumerate(photographs):
             photograph.name = f"{index:04d}-{photograph.name}"
     synthetic = "camera_angle_x" in data and "fl_x" not in data and "fl_x" not in frames[0]
     return photographs, synthetic, bool(left_out)
+
+
+def _check_shapes(photographs: list[Photograph], path: Path) -> None:
+    """Raise AssetError where a picture has another shape than most of those that one camera of the file took."""
+    sizes = Counter((p.lens.width, p.lens.height) for p in photographs)
+    for photograph in photographs:
+        (width, height), _ = sizes.most_common(1)[0]
+        w, h = photograph.lens.width, photograph.lens.height
+        if abs(w / width - h / height) * max(width, height) > 2:
+            problem = (
+                f"is {w} x {h} pixels, most pictures of {path.name}, which has one camera for all, {width} x {height}"
+            )
+            remedy = "Restore it, take its frame out of the file, or give each frame a camera (fl_x, w, h)"
+            raise AssetError(str(photograph.image), problem, remedy)
 
 
 def _mask(path: Path, frame: dict[str, Any], image: Path, name: str) -> Path | None:
