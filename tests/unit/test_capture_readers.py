@@ -251,6 +251,25 @@ def test_silhouettes_of_other_objects_are_refused(tmp_path):
     refused(tmp_path, "no common shape")
 
 
+def test_inverted_masks_are_told(tmp_path):
+    captures.write_nerfstudio(captures.make(tmp_path))
+    for mask in (tmp_path / "masks").iterdir():
+        Image.fromarray(255 - np.asarray(Image.open(mask))).save(mask)
+    refused(tmp_path, "masks that are inverted", "white is the object")
+
+
+def test_holes_in_masks_that_fill_the_picture_are_not_taken_for_inverted(tmp_path):
+    """As of shine that somebody's mask leaves out, each time elsewhere."""
+    captures.write_nerfstudio(captures.make(tmp_path))
+    rng = np.random.default_rng(0)
+    for mask in (tmp_path / "masks").iterdir():
+        pixels = np.full((captures.HEIGHT, captures.WIDTH), 255, np.uint8)
+        x, y = rng.integers(1, 34), rng.integers(1, 26)
+        pixels[y : y + 12, x : x + 12] = 0
+        Image.fromarray(pixels).save(mask)
+    assert len(read_capture(tmp_path).views) == 12
+
+
 def test_close_ups_of_parts_are_not_taken_for_wrong_cameras(tmp_path):
     # Hardly any two pictures show the same part: there is no common shape, and nothing is wrong with the cameras.
     rng = np.random.default_rng(0)

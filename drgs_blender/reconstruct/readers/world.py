@@ -90,7 +90,8 @@ def _spread(matrices: Array) -> float:
 
 
 def check_silhouettes(views: Sequence[View], subject: str, axes: str) -> None:
-    """Raise AssetError where the masks of `views` have no common shape, naming the convention in which they have one.
+    """Raise AssetError where the masks of `views` have no common shape, naming the convention in which they have one;
+    or where they are inverted.
 
     The visual hull of an object covers its silhouettes when the cameras are right, and is empty when they are not.
     """
@@ -103,6 +104,9 @@ def check_silhouettes(views: Sequence[View], subject: str, axes: str) -> None:
         return
     outlines = [shape for shape in shapes if shape is not None]
     matrices = np.stack([view.camera.matrix_world for view in chosen])
+    if _inside_out(matrices, outlines):
+        problem = "has masks that are inverted: they fill the pictures' borders, and what they leave out is one shape"
+        raise AssetError(subject, problem, "Invert the masks: white is the object, black its surroundings")
     score = _explained(matrices, outlines)
     logger.debug("%s: the visual hull explains %.2f of the silhouettes", subject, score)
     if score >= _WRONG:
@@ -125,6 +129,15 @@ def check_silhouettes(views: Sequence[View], subject: str, axes: str) -> None:
         problem = f"has silhouettes with no common shape ({score:.0%} explained): cameras and masks do not fit"
         raise AssetError(subject, problem, "Check that the masks show the object, and calibrate the cameras again")
     logger.warning("%s: cameras and masks fit badly (%.0f %% of the silhouettes explained)", subject, 100 * score)
+
+
+def _inside_out(matrices: Array, outlines: list[_Silhouette]) -> bool:
+    """Whether most masks fill the whole border of their pictures, and what they leave out has one common shape."""
+    holes = [(m, _Silhouette(~shape.inside, shape.focal, shape.centre)) for m, shape in zip(matrices, outlines)]
+    holes = [(matrix, hole) for matrix, hole in holes if hole.whole and hole.inside.any()]
+    if 2 * len(holes) <= len(outlines) or len(holes) < 3:
+        return False
+    return _explained(np.stack([matrix for matrix, _ in holes]), [hole for _, hole in holes]) > _RIGHT
 
 
 def _undo(axes: str, matrix: Array) -> Array:
