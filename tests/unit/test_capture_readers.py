@@ -124,16 +124,20 @@ def test_an_object_before_a_plain_backdrop_needs_no_masks(tmp_path, backdrop, ca
         np.testing.assert_allclose(capture.background, backdrop / 255)
 
 
-def test_real_surroundings_are_not_taken_for_a_backdrop(tmp_path, caplog):
-    scene = captures.make(tmp_path)
+def before_clutter(scene):
+    """The capture of `scene` with surroundings and without masks."""
     path = captures.write_nerf(scene)
     rng = np.random.default_rng(0)
     for k, matrix in enumerate(scene.cameras):
         pixels = captures.picture(matrix)
         behind = rng.integers(0, 255, pixels[..., :3].shape)
         pixels = np.where(pixels[..., 3:] > 0, pixels[..., :3], behind).astype(np.uint8)
-        Image.fromarray(pixels).save(tmp_path / "train" / f"r_{k}.png")
-    capture = read_capture(path)
+        Image.fromarray(pixels).save(scene.folder / "train" / f"r_{k}.png")
+    return path
+
+
+def test_real_surroundings_are_not_taken_for_a_backdrop(tmp_path, caplog):
+    capture = read_capture(before_clutter(captures.make(tmp_path)))
     assert all(view.mask is None for view in capture.views) and "has no masks" not in caplog.text
 
 
@@ -283,6 +287,29 @@ def test_close_ups_of_parts_are_not_taken_for_wrong_cameras(tmp_path):
         Image.fromarray(pixels[..., :3]).save(tmp_path / "images" / f"frame_{k:05d}.png")
         Image.fromarray(pixels[..., 3]).save(tmp_path / "masks" / f"frame_{k:05d}.png")
     assert len(read_capture(tmp_path).views) >= 8
+
+
+def test_groups_of_cameras_that_look_at_different_things_are_refused(tmp_path):
+    scene = captures.make(tmp_path, 16)
+    for matrix in scene.cameras[10:]:
+        matrix[:3, 3] += [60, 20, 0]
+    refused(before_clutter(scene), "two groups of cameras", "10 with r_0", "6 with r_10", "nothing in common")
+
+
+@pytest.mark.parametrize("across", [0.0, 2.0])
+def test_close_ups_and_pictures_from_afar_are_one_capture(tmp_path, across):
+    """Also where hardly two of the close-ups show the same part."""
+    scene = captures.make(tmp_path, 8)
+    rng = np.random.default_rng(0)
+    for k in range(6):
+        target = np.array([0, across * (k - 2.5) / 2.5, 0])
+        scene.cameras.append(captures.look_at(target + rng.normal([40, 0, 1], 0.3), target))
+    path = before_clutter(scene)
+    data = json.loads(path.read_text())
+    for frame in data["frames"][8:]:
+        frame["camera_angle_x"] = 0.02
+    path.write_text(json.dumps(data))
+    assert len(read_capture(path).views) == 14
 
 
 def test_missing_images_are_counted_and_named(tmp_path):

@@ -18,6 +18,7 @@ from . import colmap, llff, nero, tensoir, transforms
 from .develop import cut_out, develop, find_background
 from .layout import Layout
 from .lens import Lens
+from .sight import check_sight
 from .usable import usable
 from .world import AXES, check_places, check_silhouettes, turn_upright
 
@@ -84,7 +85,7 @@ def read_capture(
     ------
     AssetError
         Naming the file: nothing is recognised, images are missing or of another shape than their mask or calibration,
-        fewer than two cameras, cameras whose silhouettes do not meet.
+        fewer than two cameras, cameras whose silhouettes do not meet or that look at different things.
     UsageError
         A parameter out of range, or more pixels than the memory holds.
     """
@@ -110,7 +111,10 @@ def read_capture(
     if not layout.split and test_every is not None:
         for index, view in enumerate(views):
             view.test = index % test_every == 0
-    check_silhouettes([view for view in views if not view.test], str(path), axes)
+    learned = [view for view in views if not view.test]
+    check_silhouettes(learned, str(path), axes)
+    if all(view.mask is None for view in learned):
+        check_sight(learned, str(path))
     points = None if layout.points is None else (layout.points @ turn[:3, :3].T).astype(np.float32)
     return Capture(path, views, find_background(views), points)
 
