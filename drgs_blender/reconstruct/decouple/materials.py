@@ -22,6 +22,7 @@ _CELLS = 8
 _SMOOTHEST = 0.03
 #: Where materials begin.
 _ALBEDO, _ROUGHNESS, _METALLIC, _SPECULAR = 0.4, 0.5, 0.2, 0.1
+_GREY, _WITHIN = np.ones(3), (0.05, 0.9)
 _DIELECTRIC = 0.04
 
 
@@ -57,12 +58,18 @@ class Materials:
     parameters : name -> tensor: "detail" (v, c), "grid0" ... (corners, c). With "metallic" the c = 5 columns are
         albedo, roughness, metallic; with "dielectric" c = 4, without the last; with "specular" c = 7: diffuse colour,
         roughness, specular colour
+
+    Parameters
+    ----------
+    colour : (3,) in the hue of which all begins: what all photographs together show. Light that is learned faster than
+        albedo would take it on, and leave its complement to the albedo
     """
 
-    def __init__(self, mesh: Mesh, parametrisation: str, coarse: int) -> None:
+    def __init__(self, mesh: Mesh, parametrisation: str, coarse: int, colour: Array = _GREY) -> None:
         self.specular, self.metallic = parametrisation == "specular", parametrisation == "metallic"
         more = [_SPECULAR] * 3 if self.specular else [_METALLIC] * self.metallic
-        start = np.array([_ALBEDO] * 3 + [_ROUGHNESS] + more)
+        hue = np.asarray(colour) / max(float(np.mean(colour)), 1e-6)
+        start = np.array([*np.clip(_ALBEDO * hue, *_WITHIN), _ROUGHNESS, *more])
         self._start = torch.from_numpy(np.log(start / (1 - start)).astype(np.float32))
         self._grids = Grids(mesh.vertices, coarse)
         self._count, columns = len(mesh.vertices), len(start)

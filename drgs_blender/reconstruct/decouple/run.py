@@ -153,11 +153,12 @@ class _Job:
         self._normals = torch.from_numpy(VertexNormals(mesh.faces, len(mesh.vertices))(mesh.vertices))
         self._faces = torch.from_numpy(mesh.faces.astype(np.int64))
 
-        # Grey light that shows a surface of albedo .4 as bright as the photographs. Colours begin without any detail:
-        # light is to explain shading before albedo can.
-        level = 2.5 * float(self._pixels.colour.mean())
+        # Grey light that shows a surface of albedo .4 as bright as the photographs, which has their hue. Colours begin
+        # without any detail: light is to explain shading before albedo can.
+        mean = self._pixels.colour.mean(axis=0)
+        level = 2.5 * float(mean.mean())
         self.light = LearnedLight(settings.environment // (4 if settings.coarse_to_fine else 1), level)
-        self.materials = Materials(mesh, settings.parametrisation, settings.coarse)
+        self.materials = Materials(mesh, settings.parametrisation, settings.coarse, mean)
         seen = np.maximum(cache[:, 0] * 0.28209479, 0)
         self._edges = edges_of(mesh.faces)
         self._likeness = _likeness(self._edges, seen)
