@@ -313,8 +313,8 @@ class RenderSettings:
         if self.aa:
             return self.aa
         # Another position costs surfels more than a mesh, and they come filtered.
-        share, most = (8, 16) if self.primary == "surfels" else (2, 64)
-        return min(max(self.rays // share, 4), most, max(self.rays, 1))
+        wanted = min(self.rays // 8, 16) if self.primary == "surfels" else max(min(self.rays // 2, 16), self.rays // 4)
+        return min(max(wanted, 4), 64, max(self.rays, 1))
 
 
 @dataclass(slots=True)
