@@ -8,7 +8,7 @@ from typing import Any
 
 import bpy.utils.previews
 
-_LINE = re.compile(r'DRGS_PROGRESS part=([\d.]+) surfels=(\d+) psnr=(-?[\d.]+) phase="([^"]*)"')
+_LINE = re.compile(r'DRGS_PROGRESS part=([\d.]+) surfels=(\d+) (?:psnr=(-?[\d.]+) )?phase="([^"]*)"')
 
 
 class Reconstruction:
@@ -36,7 +36,7 @@ class Reconstruction:
             part, surfels, psnr, phase = found[-1]
             self.part = float(part)
             self.text = f"{phase[:1].upper()}{phase[1:]}"
-            if float(psnr):
+            if psnr:
                 self.text += f", {float(psnr):.1f} dB"
             elif int(surfels):
                 self.text += f", {int(surfels):,} surfels"

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import os
+import sys
 import threading
 from collections.abc import Iterator
 from typing import Any
@@ -15,7 +17,15 @@ def bar(args: argparse.Namespace, label: str, total: float | None = None, unit: 
 
     wanted = args.progress
     disable = True if args.quiet or wanted is False else (False if wanted else None)
-    return tqdm(total=total, desc=label, unit=unit, disable=disable, leave=False, dynamic_ncols=True, **options)
+    width: dict[str, Any] = {"ncols": 80, "nrows": 24} if _unsized() else {"dynamic_ncols": True}
+    return tqdm(total=total, desc=label, unit=unit, disable=disable, leave=False, **width, **options)
+
+
+def _unsized() -> bool:
+    """Whether stderr is a terminal that does not say how large it is: tqdm would draw nothing there."""
+    with contextlib.suppress(OSError, ValueError, AttributeError):
+        return os.get_terminal_size(sys.stderr.fileno()).columns == 0
+    return False
 
 
 @contextlib.contextmanager

@@ -17,6 +17,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..formats.axes import UP_AXES
+from .frame_lines import say
+from .interrupt import interruptible
 from .output import check_suffix, check_writable, write_and_report
 from .progress import FractionBar
 from .sampling import whole
@@ -84,7 +86,7 @@ def run(args: argparse.Namespace) -> int:
     check_suffix(args.out, (".drgs",))
     check_writable(args.out)
 
-    from ..errors import DeviceError
+    from ..errors import Cancelled, DeviceError
 
     try:
         from ..reconstruct.job import Settings, reconstruct
@@ -109,15 +111,27 @@ def run(args: argparse.Namespace) -> int:
         device=args.device,
     )
     work = args.out.with_name(f"{args.out.stem}.reconstruct")
-    with FractionBar(args, "reconstructing") as bar:
-        teller = _Teller(args, bar)
-        asset = reconstruct(capture, settings, teller, folder=work)
+
+    def note(text: str) -> None:
+        if not args.quiet and any(work.glob("*.state")):
+            say(f"drgs: {text}\n", sys.stderr)
+
+    note(f"an earlier run was stopped: going on with {work}, where it is of these photographs and settings")
+    with interruptible() as cancelled, FractionBar(args, "reconstructing") as bar:
+        try:
+            asset = reconstruct(capture, settings, _Teller(args, bar), cancelled, work)
+        except (Cancelled, KeyboardInterrupt):
+            note("the same command goes on from here")
+            raise
     write_and_report(args.out, asset)
     shutil.rmtree(work, ignore_errors=True)
     report = asset.provenance["report"]
     if "psnr" in report:
         # Not what `drgs evaluate` says, which renders the asset under the light that was found.
         print(f"  colours as photographed, views left out: PSNR {report['psnr']:.2f} dB, SSIM {report['ssim']:.4f}")
+    if "decoupling" in report:
+        shown = report["decoupling"]["psnr"]
+        print(f"  materials in the light that was found, pixels learned from: PSNR {shown:.2f} dB")
     return 0
 
 
@@ -125,17 +139,20 @@ class _Teller:
     """Shows progress: a bar, lines on stdout that programs may read, the preview."""
 
     def __init__(self, args: argparse.Namespace, bar: FractionBar) -> None:
-        self._bar, self._quiet, self._next = bar, args.quiet, 0.0
+        self._bar, self._next = bar, 0.0
+        self._lines = not args.quiet and not sys.stdout.isatty()  # they are for programs, and would break the bar
         self._preview = args.out.with_name(f"{args.out.stem}.preview.png")
 
     def __call__(self, progress: Progress) -> None:
-        self._bar(f"{progress.phase}, {progress.surfels} surfels, {progress.psnr:.1f} dB", progress.part)
+        known = progress.psnr is not None
+        surfels = f", {progress.surfels} surfels" if progress.surfels else ""
+        self._bar(f"{progress.phase}{surfels}{f', {progress.psnr:.1f} dB' if known else ''}", progress.part)
         now = time.monotonic()
-        if not self._quiet and now >= self._next:
+        if self._lines and now >= self._next:
             self._next = now + _TELL_EVERY
+            psnr = f"psnr={progress.psnr:.2f} " if known else ""
             print(
-                f"DRGS_PROGRESS part={progress.part:.3f} surfels={progress.surfels} psnr={progress.psnr:.2f} "
-                f'phase="{progress.phase}"',
+                f'DRGS_PROGRESS part={progress.part:.3f} surfels={progress.surfels} {psnr}phase="{progress.phase}"',
                 flush=True,
             )
         if progress.picture is not None:

@@ -28,6 +28,7 @@ from .gaussians import Gaussians
 from .hull import Region, find_region, silhouettes
 from .photometric import Photograph, structural_similarity
 from .processor import HERE
+from .rehearsal import rehearse
 from .relief import follow_normals, shaded_by
 from .silhouette import fill_silhouettes
 from .targets import background_of, composed
@@ -44,6 +45,8 @@ ON_MESH = 0.4
 SHARE, SHARE_ON_MESH = 0.45, 0.15
 #: Part of the minutes for materials and light.
 SHARE_OF_MATERIALS = 0.35
+#: Fewer steps of materials than this tell them badly from the light.
+FEW_STEPS = 300
 #: Phase -> the settings that decide its result.
 DECIDES = {
     "surfels": ("schedule", "minutes"),
@@ -62,7 +65,7 @@ class Settings:
     variant : "p" keeps the free surfels (driven by particles or mesh), "m" makes surfels on the mesh's faces
     schedule : how surfels are learned
     mesh_resolution : most voxels along the mesh's longest side
-    minutes : all stages together; None: the steps of the schedule decide
+    minutes : all stages together, once kernels are compiled; None: the steps of the schedule decide
     materials : pull materials and light apart; else albedo is the photographed colour
     decoupling : how; its ``seconds`` follow from `minutes`. Normals are learned too: a mesh of photographs has errors
     fixed : parameters of surfels on faces that are not learned: "offset", "opacity" (the paper's ablation)
@@ -85,17 +88,17 @@ class Progress:
 
     Attributes
     ----------
-    phase : "surfels", "mesh", "surfels on the mesh", "materials"
+    phase : "compiling kernels" (where minutes are given), "surfels", "mesh", "surfels on the mesh", "materials"
     part : what is done of all, 0..1
     surfels : how many there are
-    psnr : of the latest training views, decibels
+    psnr : of the latest training views, decibels; None: not known
     picture : (h, w, 3) float32, sRGB: a view as it looks now, beside its photograph; None: not drawn this time
     """
 
     phase: str
     part: float
     surfels: int = 0
-    psnr: float = 0.0
+    psnr: float | None = None
     picture: Array | None = None
 
 
@@ -127,6 +130,10 @@ def reconstruct(
     settings = settings or Settings()
     work = _Work(capture, settings, on_progress or (lambda _: None), cancelled or (lambda: False), folder)
     region = find_region(capture)
+    if settings.minutes is not None:
+        log.info("compiling kernels (first run only)")
+        work.tell(Progress("compiling kernels", 0.0))
+        rehearse(settings, silhouettes(capture) is not None, work.by, work.cancelled)
     training = Training(capture, region, settings.schedule, seconds=work.seconds(SHARE), by=work.by)
     free = work.learn("surfels", training, 0.0, 0.5)
     work.tell(Progress("mesh", 0.5, len(free)))
@@ -257,6 +264,12 @@ def _decoupled(work: _Work, mesh: Mesh, surfels: int, report: dict[str, Any]) ->
         work.file("materials"),
         work.by,
     )
+    done, of = found.report["iterations"], work.settings.decoupling.iterations
+    if done < min(FEW_STEPS, of):
+        log.warning(
+            "materials got %d of %d steps in their part of %g minutes, too few to tell them from the light: give more "
+            "minutes, or photographs of a lower resolution", done, of, work.settings.minutes,
+        )  # fmt: skip
     # Without the clock: the same run gives the same bytes.
     report["decoupling"] = {key: value for key, value in found.report.items() if key != "seconds"}
     return found

@@ -231,9 +231,9 @@ class Training:
         self.error = squared if not self.iteration else 0.98 * self.error + 0.02 * squared
 
     @property
-    def psnr(self) -> float:
-        """Of the latest training views, decibels."""
-        return -10 * float(np.log10(max(self.error, 1e-10)))
+    def psnr(self) -> float | None:
+        """Of the latest training views, decibels; None before the first step."""
+        return None if not self.iteration else -10 * float(np.log10(max(self.error, 1e-10)))
 
     def _next(self) -> Target:
         """The view of this step: all in turn, in an order drawn anew each time."""

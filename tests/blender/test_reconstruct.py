@@ -74,7 +74,7 @@ def test_progress_is_what_the_program_says(tmp_path):
     assert state.part == 0 and not state.icon()
     state.follow('DRGS_PROGRESS part=0.1 surfels=9 psnr=20.5 phase="surfels"\nDRGS_PROGRESS part=0.25 surfels=12')
     assert state.part == 0.1 and state.text == "Surfels, 20.5 dB"
-    state.follow('DRGS_PROGRESS part=0.5 surfels=12000 psnr=0.00 phase="mesh"\n')
+    state.follow('DRGS_PROGRESS part=0.5 surfels=12000 phase="mesh"\n')
     assert state.part == 0.5 and state.text == "Mesh, 12,000 surfels"
 
 

@@ -23,7 +23,7 @@ from drgs_blender.reconstruct.checkpoint import fingerprint  # noqa: E402
 from drgs_blender.reconstruct.decouple.settings import Settings as Decoupling  # noqa: E402
 from drgs_blender.reconstruct.hull import find_region  # noqa: E402
 from drgs_blender.reconstruct.job import Settings, reconstruct  # noqa: E402
-from drgs_blender.reconstruct.train import Schedule  # noqa: E402
+from drgs_blender.reconstruct.train import Schedule, Training  # noqa: E402
 
 QUICK = Schedule(iterations=240, surfels=2500)
 
@@ -176,6 +176,8 @@ def test_progress_tells_phases_and_shows_pictures(capture):
     reconstruct(capture, short, told.append)
     assert [p.phase for p in told][:2] == ["surfels", "mesh"]
     assert all(a.part <= b.part for a, b in pairwise(told))
+    assert told[0].psnr > 0 and told[1].psnr is None
+    assert Training(capture, find_region(capture), short.schedule).psnr is None
     picture = told[0].picture
     assert picture.shape == (48, 96, 3) and 0 <= picture.min() <= picture.max() <= 1
 

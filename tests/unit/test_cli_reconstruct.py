@@ -1,0 +1,92 @@
+"""`drgs reconstruct` at a terminal: what it shows, and how it stops."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+pytest.importorskip("torch")
+pytest.importorskip("skimage")
+
+from capture_cases import balls
+
+from drgs_blender.cli.interrupt import interruptible
+from drgs_blender.errors import Cancelled
+
+pytestmark = pytest.mark.skipif(os.name == "nt", reason="signals and terminals of POSIX")
+
+
+@pytest.fixture(scope="module")
+def photographs(tmp_path_factory) -> Path:
+    folder, capture, frames = tmp_path_factory.mktemp("balls"), balls(8, 32), []
+    for view in capture.views:
+        rgba = np.concatenate([view.colour / np.maximum(view.mask[..., None], 1e-6), view.mask[..., None]], -1)
+        Image.fromarray((rgba.clip(0, 1) * 255).astype(np.uint8)).save(folder / f"{view.name}.png")
+        frames.append({"file_path": view.name, "transform_matrix": view.camera.matrix_world.tolist()})
+    angle = 2 * np.arctan(0.5 * 32 / capture.views[0].camera.fx)
+    (folder / "transforms.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
+    return folder
+
+
+def command(photographs: Path, out: Path, *options: str) -> list[str]:
+    program = [sys.executable, "-m", "drgs_blender.cli.main", "reconstruct", str(photographs), "--out", str(out)]
+    return [*program, "--surfels", "400", "--voxels", "24", *options]
+
+
+def test_a_terminal_shows_a_bar_and_no_lines_for_programs(photographs, tmp_path):
+    import pty
+
+    ours, theirs = pty.openpty()  # of no size, as many that programs make
+    words = command(photographs, tmp_path / "a.drgs", "--minutes", "0.1")
+    process = subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=theirs, stderr=theirs)
+    os.close(theirs)
+    said = b""
+    try:
+        while some := os.read(ours, 4096):
+            said += some
+    except OSError:  # Linux's way to say that the other end is closed
+        pass
+    os.close(ours)
+    text = said.decode()
+    assert process.wait(60) == 0 and "DRGS_PROGRESS" not in text
+    assert "compiling kernels:   0%|" in text and re.search(r"materials, \d+ surfels, [\d.]+ dB:", text)
+    assert "materials got" in text and "materials in the light that was found, pixels learned from: PSNR" in text
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)], ids=["SIGINT", "SIGTERM"])
+def test_a_run_that_is_stopped_early_goes_on(photographs, tmp_path, number, code):
+    words = command(photographs, tmp_path / "a.drgs", "--iterations", "1000000", "-v")
+    said = []
+    for _ in range(2):
+        with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+            line = process.stdout.readline()
+            process.send_signal(number)
+            said.append(process.communicate(timeout=60)[1])
+            assert line.startswith("DRGS_PROGRESS") and process.returncode == code
+        assert "the same command goes on from here" in said[-1]
+    assert "going on" not in said[0]
+    assert "an earlier run was stopped" in said[1] and "surfels: going on at step" in said[1]
+
+
+def test_a_signal_is_not_lost_in_a_callback_from_c_and_a_second_one_ends_at_once():
+    before = signal.getsignal(signal.SIGINT)
+    interrupt = ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(signal.SIGINT))
+    with pytest.raises(KeyboardInterrupt), interruptible() as cancelled:
+        assert not cancelled()
+        interrupt()
+        assert cancelled()
+        signal.raise_signal(signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is before
+    with pytest.raises(SystemExit, match="143"), interruptible() as cancelled:
+        signal.raise_signal(signal.SIGTERM)
+        raise Cancelled

@@ -1,0 +1,78 @@
+"""Before the clock of a reconstruction runs, its kernels are ready."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("torch")
+pytest.importorskip("skimage")
+
+from capture_cases import balls
+
+from drgs_blender.reconstruct.decouple.settings import Settings as Decoupling
+from drgs_blender.reconstruct.job import Settings, reconstruct
+from drgs_blender.reconstruct.train import Schedule
+
+#: A process of its own, where nothing is compiled yet: prints the steps by which a kernel was made or loaded.
+STEPS = """
+import gc, sys
+from numba.core.dispatcher import Dispatcher
+sys.path.insert(0, sys.argv[1])
+from capture_cases import balls
+from drgs_blender.reconstruct import job
+from drgs_blender.reconstruct.decouple import run
+from drgs_blender.reconstruct.decouple.settings import Settings as Decoupling
+from drgs_blender.reconstruct.train import Schedule, Training
+
+variant, masked = sys.argv[2], sys.argv[3] == "masks"
+watching, rehearse = False, job.rehearse
+
+def kernels():
+    return sum(len(found.overloads) for found in gc.get_objects() if isinstance(found, Dispatcher))
+
+def watched(step):
+    def watch(self):
+        before = kernels()
+        step(self)
+        if watching and kernels() > before:
+            print(type(self).__name__, self.iteration)
+    return watch
+
+def then_watch(*arguments):
+    global watching
+    rehearse(*arguments)
+    watching = True
+
+Training.step, run._Job.step, job.rehearse = watched(Training.step), watched(run._Job.step), then_watch
+capture = balls(18, 24, masks=masked)
+if not masked:
+    capture.background = None
+quick = Decoupling(iterations=8, pixels=64, normals=True)
+schedule = Schedule(iterations=30, surfels=400)
+job.reconstruct(capture, job.Settings(variant, schedule, mesh_resolution=16, minutes=100.0, decoupling=quick))
+print("watched:", watching)
+"""
+
+
+@pytest.mark.parametrize(("variant", "masks"), [("m", "masks"), ("p", "none")])
+def test_no_step_that_is_timed_compiles(variant, masks):
+    command = [sys.executable, "-c", STEPS, str(Path(__file__).parent), variant, masks]
+    said = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
+    assert said.stdout == "watched: True\n", said.stdout + said.stderr
+
+
+@pytest.mark.parametrize("minutes", [None, 0.01], ids=["by steps", "by the clock"])
+def test_too_little_time_for_materials_is_said(minutes, monkeypatch, caplog):
+    rehearsed, told = [], []
+    monkeypatch.setattr("drgs_blender.reconstruct.job.rehearse", lambda *_: rehearsed.append(1))
+    quick = Decoupling(iterations=4 if minutes is None else 10**6, pixels=64, normals=True)
+    settings = Settings(schedule=Schedule(iterations=10, surfels=400), mesh_resolution=16, decoupling=quick)
+    reconstruct(balls(8, 24), replace(settings, minutes=minutes), told.append)
+    assert bool(rehearsed) == (told[0].phase == "compiling kernels") == (minutes is not None)
+    assert ("materials got" in caplog.text) == (minutes is not None)
+    assert minutes is None or "give more minutes" in caplog.text
