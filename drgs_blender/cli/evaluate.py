@@ -81,8 +81,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     scenes.add_argument("--meshes", type=Path, metavar="DIR", help="folder of the example meshes")
     scenes.add_argument("--blender", metavar="PATH", help="Blender, or a Python that has bpy")
-    sampling.add_arguments(parser, defaults=True, output=False)
-    parser.set_defaults(rays=128, film_transparent=True)  # sampling.override looks for both
+    sampling.add_arguments(parser, defaults=True, output=False, rays=128)
+    parser.set_defaults(film_transparent=True)  # sampling.override looks for it
 
 
 def run(args: argparse.Namespace) -> int:

@@ -47,11 +47,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="p",
         help="p keeps free surfels, for particles and for meshes (default); m hangs them on the mesh's faces",
     )
-    parser.add_argument("--resolution", type=whole(8, 1 << 16), metavar="N", help="pixels of the longer side, at most")
+    parser.add_argument(
+        "--resolution", type=whole(8, 1 << 16), metavar="N", help="pixels of the longer side; default: all"
+    )
     parser.add_argument("--iterations", type=whole(1, 10**7), metavar="N", help="steps of the surfels; default 3000")
     parser.add_argument("--surfels", type=whole(10, 5_000_000), metavar="N", help="at most; default 16000")
     parser.add_argument("--voxels", type=whole(16, 1024), metavar="N", help="of the mesh's longest side; default 256")
-    parser.add_argument("--minutes", type=_minutes, metavar="M", help="all stages together, about")
+    parser.add_argument(
+        "--minutes", type=_minutes, metavar="M", help="all stages together, about, once kernels are compiled"
+    )
     parser.add_argument(
         "--test-every", type=whole(2, 10**6), metavar="K", help="leave out every K-th view, and measure on those"
     )
@@ -67,7 +71,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="cpu",
         help="what learns; without a card the processor does. Default cpu",
     )
-    parser.add_argument("--axes", default="opengl", metavar="NAME", help="what the cameras' matrices are taken for")
+    parser.add_argument(
+        "--axes",
+        default="opengl",
+        metavar="NAME",
+        help="what the cameras' matrices are taken for: opengl (default: the convention of the layout), opencv, "
+        "opengl-inverse, opencv-inverse",
+    )
     parser.add_argument("--up", choices=tuple(UP_AXES), help="up axis of the capture's world; default: found")
 
 

@@ -15,16 +15,19 @@ from ..passes import BY_NAME, PASSES, TEMPORAL
 MOST_PIXEL_PASSES = 1 << 28
 
 
-def add_arguments(parser: argparse.ArgumentParser, *, defaults: bool, output: bool = True) -> None:
+def add_arguments(
+    parser: argparse.ArgumentParser, *, defaults: bool, output: bool = True, rays: int = RenderSettings().rays
+) -> None:
     """Add the sampling options; without `defaults` an absent option stays None and the scene decides.
 
-    Without `output`, what is written is not the user's to choose: film and passes have no options.
+    `rays` is the default of that option. Without `output`, what is written is not the user's to choose: film and passes
+    have no options.
     """
     settings, hints = RenderSettings(), get_type_hints(RenderSettings)
     group = parser.add_argument_group("solution" if defaults else "solution (default: what the scene says)")
 
     def add(flag: str, field: str, about: str, **options: Any) -> None:
-        default = settings.rays if field == "rays" else getattr(settings, field)
+        default = rays if field == "rays" else getattr(settings, field)
         about += f"; default {default}" if defaults else ""
         group.add_argument(flag, dest=field, default=default if defaults else None, help=about, **options)
 

@@ -19,7 +19,7 @@ from drgs_blender.cli import main as command_line
 from drgs_blender.cli import sampling
 from drgs_blender.cli.find_blender import CHECKOUT, find_blender
 from drgs_blender.cli.frame_lines import FrameLines
-from drgs_blender.cli.main import COMMANDS, main
+from drgs_blender.cli.main import COMMANDS, build_parser, main
 from drgs_blender.cli.output import check_writable, write_preview
 from drgs_blender.frame import RenderSettings
 from drgs_blender.passes import BY_NAME
@@ -31,6 +31,23 @@ def test_help_shows_examples(command, capsys):
     text = capsys.readouterr().out
     assert f"examples:\n  drgs {command.name}" in text
     assert "DRGS_EXIT" not in text.splitlines()[-1]
+
+
+def test_help_tells_the_default_that_counts(capsys):
+    assert main(["evaluate", "--help"]) == 0
+    said = re.search(r"--rays RAYS.*?default\s+(\d+)", capsys.readouterr().out, re.DOTALL)
+    given = build_parser().parse_args(["evaluate"])
+    assert int(said[1]) == given.rays == 128
+    assert sampling.override(RenderSettings(), given).rays == 128
+
+
+def test_help_names_the_conventions_of_cameras(capsys):
+    from drgs_blender.reconstruct.readers.world import AXES
+
+    assert main(["reconstruct", "--help"]) == 0
+    text = capsys.readouterr().out
+    said = text[text.rindex("--axes") : text.rindex("--up")]
+    assert set(re.findall(r"open\w+(?:-\w+)?", "".join(said.split()).replace(",", " "))) == set(AXES)
 
 
 def test_every_exit_code_has_a_class():
