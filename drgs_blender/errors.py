@@ -5,6 +5,8 @@ The ``exit_code`` of a class is what ``drgs`` returns to the shell or the farm w
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 EXIT_OK = 0
 EXIT_USAGE = 64
 EXIT_BAD_ASSET = 65
@@ -99,3 +101,8 @@ class Cancelled(Exception):
 ERROR_CLASSES: dict[str, type[DrgsError]] = {
     c.__name__: c for c in (DrgsError, UsageError, AssetError, DeviceError, WriteError, EngineError, VersionError)
 }
+
+
+def first_of(names: Sequence[str]) -> str:
+    """The first of many names, for a message."""
+    return ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")

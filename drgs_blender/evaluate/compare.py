@@ -11,7 +11,7 @@ import numpy as np
 from ..asset import Asset
 from ..deform.gmls import bind_points, carry
 from ..deform.sources import MeshSource
-from ..errors import UsageError
+from ..errors import UsageError, first_of
 from ..frame import Camera
 from ..reconstruct.capture import Capture, View
 from .flip import flip
@@ -118,7 +118,7 @@ def _warn_of_known(asset: Asset, capture: Capture) -> None:
         logger.warning(
             "%s: the asset was learned from %d of the %d views left out (%s): their figures are too good. Give the "
             "--test-every that it was reconstructed with, or reconstruct it with this one",
-            capture.source, len(known), len(novel), ", ".join(known[:3]) + (", ..." if len(known) > 3 else ""),
+            capture.source, len(known), len(novel), first_of(known),
         )  # fmt: skip
 
 

@@ -57,13 +57,18 @@ class Region:
     solid: Array = field(default_factory=lambda: np.zeros((0, 3), np.float32))
 
 
+def have_silhouettes(capture: Capture) -> bool:
+    """Whether there are `silhouettes`."""
+    return capture.background is not None or all(view.mask is not None for view in capture.training)
+
+
 def silhouettes(capture: Capture) -> list[Array] | None:
     """Masks of the training views, (h, w) float32 each: drawn, or told from a background of one colour; or None."""
     views = capture.training
+    if not have_silhouettes(capture):
+        return None
     if all(view.mask is not None for view in views):
         return [np.ascontiguousarray(view.mask, np.float32) for view in views]
-    if capture.background is None:
-        return None
     return [_told_from(np.asarray(capture.background, np.float32), view.colour) for view in views]
 
 

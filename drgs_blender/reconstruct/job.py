@@ -25,7 +25,7 @@ from .decouple.run import Decoupled, decouple
 from .decouple.settings import Settings as Decoupling
 from .device.devices import learner
 from .gaussians import Gaussians
-from .hull import Region, find_region, silhouettes
+from .hull import Region, find_region, have_silhouettes, silhouettes
 from .photometric import Photograph, structural_similarity
 from .processor import HERE
 from .rehearsal import rehearse
@@ -133,7 +133,7 @@ def reconstruct(
     if settings.minutes is not None:
         log.info("compiling kernels (first run only)")
         work.tell(Progress("compiling kernels", 0.0))
-        rehearse(settings, silhouettes(capture) is not None, work.by, work.cancelled)
+        rehearse(settings, have_silhouettes(capture), work.by, work.cancelled)
     training = Training(capture, region, settings.schedule, seconds=work.seconds(SHARE), by=work.by)
     free = work.learn("surfels", training, 0.0, 0.5)
     work.tell(Progress("mesh", 0.5, len(free)))

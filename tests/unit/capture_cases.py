@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from drgs_blender.frame import Camera
 from drgs_blender.reconstruct.capture import Capture, View
@@ -76,6 +78,18 @@ def photographed(
         colour, alpha, *_ = shape(view)
         views.append(View(f"{k:03d}", view, colour, alpha if masks else None, k % test_every == 0))
     return Capture(Path(shape.__name__), views, (0.0, 0.0, 0.0))
+
+
+def write(capture: Capture, folder: Path) -> None:
+    """Write a capture with masks as NeRF-synthetic files."""
+    frames = []
+    for view in capture.views:
+        rgba = np.concatenate([view.colour / np.maximum(view.mask[..., None], 1e-6), view.mask[..., None]], -1)
+        Image.fromarray((rgba.clip(0, 1) * 255).astype(np.uint8)).save(folder / f"{view.name}.png")
+        frames.append({"file_path": view.name, "transform_matrix": view.camera.matrix_world.tolist()})
+    camera = capture.views[0].camera
+    angle = 2 * np.arctan(0.5 * camera.width / camera.fx)
+    (folder / "transforms.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
 
 
 def colour_of_balls(points: np.ndarray) -> np.ndarray:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import json
 import os
 import re
 import signal
@@ -11,14 +10,12 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
-from PIL import Image
 
 pytest.importorskip("torch")
 pytest.importorskip("skimage")
 
-from capture_cases import balls
+from capture_cases import balls, write
 
 from drgs_blender.cli.interrupt import interruptible
 from drgs_blender.errors import Cancelled
@@ -28,13 +25,8 @@ pytestmark = pytest.mark.skipif(os.name == "nt", reason="signals and terminals o
 
 @pytest.fixture(scope="module")
 def photographs(tmp_path_factory) -> Path:
-    folder, capture, frames = tmp_path_factory.mktemp("balls"), balls(8, 32), []
-    for view in capture.views:
-        rgba = np.concatenate([view.colour / np.maximum(view.mask[..., None], 1e-6), view.mask[..., None]], -1)
-        Image.fromarray((rgba.clip(0, 1) * 255).astype(np.uint8)).save(folder / f"{view.name}.png")
-        frames.append({"file_path": view.name, "transform_matrix": view.camera.matrix_world.tolist()})
-    angle = 2 * np.arctan(0.5 * 32 / capture.views[0].camera.fx)
-    (folder / "transforms.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
+    folder = tmp_path_factory.mktemp("balls")
+    write(balls(8, 32), folder)
     return folder
 
 

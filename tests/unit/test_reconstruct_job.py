@@ -12,7 +12,7 @@ import pytest
 torch = pytest.importorskip("torch")
 pytest.importorskip("skimage")
 
-from capture_cases import balls, colour_of_balls, distance_to_balls  # noqa: E402
+from capture_cases import balls, colour_of_balls, distance_to_balls, write  # noqa: E402
 
 from drgs_blender.asset.container import read_asset, write_asset  # noqa: E402
 from drgs_blender.colour import linear_to_srgb  # noqa: E402
@@ -232,19 +232,11 @@ def test_what_cannot_be_reconstructed_is_refused_by_name(case):
 
 def test_the_command_writes_an_asset_and_its_preview(tmp_path, capsys, monkeypatch):
     """Without a card too, though one was asked for."""
-    import json
-
     from PIL import Image
 
     from drgs_blender.cli.main import main
 
-    capture, frames = balls(10, 32), []
-    for view in capture.views:
-        rgba = np.concatenate([view.colour / np.maximum(view.mask[..., None], 1e-6), view.mask[..., None]], -1)
-        Image.fromarray((rgba.clip(0, 1) * 255).astype(np.uint8)).save(tmp_path / f"{view.name}.png")
-        frames.append({"file_path": view.name, "transform_matrix": view.camera.matrix_world.tolist()})
-    angle = 2 * np.arctan(0.5 * 32 / capture.views[0].camera.fx)
-    (tmp_path / "transforms.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
+    write(balls(10, 32), tmp_path)
     out = tmp_path / "made" / "balls.drgs"
     options = ["--iterations", "30", "--surfels", "800", "--voxels", "32", "--test-every", "5", "--no-materials"]
     monkeypatch.setattr("drgs_blender.device.warp.cuda_devices", list)

@@ -13,7 +13,7 @@ import numpy as np
 from PIL import ExifTags, Image
 
 from ...colour import to_unit
-from ...errors import AssetError
+from ...errors import AssetError, first_of
 from ...formats.images import load_image
 from .lens import Lens
 
@@ -170,6 +170,6 @@ def find_mask(folder: Path, image: Path, relative: str = "") -> Path | None:
 def complain_of_missing(subject: str, missing: list[str], total: int) -> None:
     """Raise AssetError where photographs are absent."""
     if missing:
-        named = ", ".join(name[:200] for name in missing[:3]) + (", ..." if len(missing) > 3 else "")
+        named = first_of([name[:200] for name in missing])
         problem = f"names {len(missing)} of {total} images that are not there: {named}"
         raise AssetError(subject, problem, "Put the images back, or take their frames out of the file")

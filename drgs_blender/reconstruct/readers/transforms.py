@@ -112,8 +112,10 @@ def _read_file(path: Path, test: bool, prefix: bool) -> tuple[list[Photograph], 
 def _check_shapes(photographs: list[Photograph], path: Path) -> None:
     """Raise AssetError where a picture has another shape than most of those that one camera of the file took."""
     sizes = Counter((p.lens.width, p.lens.height) for p in photographs)
+    if not sizes:
+        return
+    (width, height), _ = sizes.most_common(1)[0]
     for photograph in photographs:
-        (width, height), _ = sizes.most_common(1)[0]
         w, h = photograph.lens.width, photograph.lens.height
         if abs(w / width - h / height) * max(width, height) > 2:
             problem = (

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Sequence
 from pathlib import Path
 
-from ...errors import AssetError
+from ...errors import AssetError, first_of
 from ..capture import View
 from .layout import Photograph, turned_by_exif
 
@@ -47,17 +47,19 @@ def usable(developed: Sequence[tuple[Photograph, View | None]], subject: str) ->
     return [view for _, view in pairs]
 
 
-def named(files: Sequence[Path]) -> str:
+def _named(files: Sequence[Path]) -> str:
     """The first names of a list of files."""
-    return ", ".join(file.name for file in files[:3]) + (", ..." if len(files) > 3 else "")
+    return first_of([file.name for file in files])
 
 
 def _without_black(developed: Sequence[tuple[Photograph, View | None]], subject: str) -> list[Pair]:
     pairs = [(photograph, view) for photograph, view in developed if view is not None]
     if black := [photograph.image for photograph, view in developed if view is None]:
         if len(pairs) < max(2, len(black)):
-            raise AssetError(subject, f"has {len(black)} black images ({named(black)})", "Export the photographs again")
-        logger.warning("%s: %d black images are left out: %s", subject, len(black), named(black))
+            raise AssetError(
+                subject, f"has {len(black)} black images ({_named(black)})", "Export the photographs again"
+            )
+        logger.warning("%s: %d black images are left out: %s", subject, len(black), _named(black))
     return pairs
 
 
@@ -70,7 +72,7 @@ def _unmasked(pairs: list[Pair], test: bool, subject: str) -> list[Pair]:
     fewer = 2 * len(without) < len(group)
     logger.warning(
         "%s: %d of %d photographs have no mask (%s): %s",
-        subject, len(without), len(group), named([photograph.image for photograph, _ in without]),
+        subject, len(without), len(group), _named([photograph.image for photograph, _ in without]),
         "left out. Draw their masks to use them" if fewer else "the masks of the others are not used. Draw all or none",
     )  # fmt: skip
     if fewer:
@@ -89,6 +91,6 @@ def _empty(pairs: list[Pair], subject: str) -> list[Pair]:
     files = [photograph.mask or photograph.image for photograph, _ in empty]
     logger.warning(
         "%s: %d of %d masks are empty, and their photographs left out: %s. Draw these masks again, or take the "
-        "photographs out", subject, len(empty), len(masked), named(files),
+        "photographs out", subject, len(empty), len(masked), _named(files),
     )  # fmt: skip
     return empty
