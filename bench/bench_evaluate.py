@@ -21,19 +21,19 @@ from drgs_blender.engine.session import Session
 from drgs_blender.evaluate.compare import compare
 from drgs_blender.evaluate.scenes import Plan, make_scenes
 from drgs_blender.evaluate.subjects import OBJECTS
-from drgs_blender.evaluate.truth import read_truth, true_asset
+from drgs_blender.evaluate.truth import Truth, read_truth, true_asset
 from drgs_blender.frame import RenderSettings, split_rays
 from drgs_blender.reconstruct.readers import read_capture
 
 
-def score(path: Path, folder: Path, primary: str, rays: int) -> dict:
-    """The report of an asset of a scene."""
+def score(path: Path, folder: Path, primary: str, rays: int, truth: Truth | None = None) -> dict:
+    """The report of an asset of a scene, against all that is known of it or `truth`."""
     session = Session()
     key = session.load_asset(path)
     cosine, ggx, environment = split_rays(rays)
     settings = RenderSettings(cosine=cosine, ggx=ggx, environment=environment, bounces=3, primary=primary)  # type: ignore[arg-type]
     return compare(
-        session.asset(key), read_capture(folder), read_truth(folder), session_renderer(session, key, settings)
+        session.asset(key), read_capture(folder), truth or read_truth(folder), session_renderer(session, key, settings)
     )
 
 
