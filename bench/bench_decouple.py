@@ -42,6 +42,7 @@ VARIANTS: dict[str, dict[str, dict[str, Any]]] = {
         "as it is": {},
         "loss that noise pulls (log, L1)": {"unbiased": False},
         "weighed by the photographs": {"by_shown": False},
+        "pixels beside clipped ones count whole": {"beside_clipped": 1.0},
         "cosine samples alone (no MIS)": {"cosine": 32, "ggx": 0, "light": 0},
         "four times the rays on a quarter of the pixels": {"pixels": 512, "cosine": 64, "ggx": 32, "light": 32},
     },

@@ -23,7 +23,7 @@ from drgs_blender.reconstruct.decouple.gather import Gatherer, Points  # noqa: E
 from drgs_blender.reconstruct.decouple.light import LearnedLight, colour_cast  # noqa: E402
 from drgs_blender.reconstruct.decouple.losses import dullness, log_loss, unbiased_loss  # noqa: E402
 from drgs_blender.reconstruct.decouple.materials import Materials, from_specular  # noqa: E402
-from drgs_blender.reconstruct.decouple.pixels import Pixels, foreground_pixels  # noqa: E402
+from drgs_blender.reconstruct.decouple.pixels import foreground_pixels  # noqa: E402
 from drgs_blender.reconstruct.decouple.run import Decoupled, decouple  # noqa: E402
 from drgs_blender.reconstruct.decouple.settings import Settings  # noqa: E402
 from drgs_blender.render.lights.light import EnvironmentLight  # noqa: E402
@@ -239,6 +239,39 @@ def test_clipped_photographs_set_no_upper_bound():
     assert float(log_loss(torch.full((4, 3), 0.5), white)) > 0
 
 
+def test_pixels_beside_clipped_ones_are_known_by_channel_and_count_less(ball, capture):
+    """Two pixels around; not the clipped ones themselves, other channels, nor what is clipped in the backdrop."""
+    view = capture.views[0]
+    height, width = view.colour.shape[:2]
+    colour = np.full((height, width, 3), 0.5, np.float32)
+    middle = tuple(np.round(np.argwhere(view.mask > 0.99).mean(0)).astype(int))
+    colour[(*middle, 0)] = 1.0
+    colour[np.asarray(view.mask) == 0] = 1.0
+    tree = TriangleBVH()
+    tree.build(ball.vertices, ball.faces)
+    pixels = foreground_pixels([replace(view, colour=colour)], ball, tree, 10**6)
+    assert int((pixels.colour[:, 0] > 0.9).sum()) == 1
+    assert pixels.beside_clipped.sum(axis=0).tolist() == [12, 0, 0]  # the disc of radius 2, without its middle
+    assert not pixels.beside_clipped[pixels.colour[:, 0] > 0.9].any()
+
+    photographed = torch.full((2, 3), 0.2)
+    shown = torch.full((2, 2, 3), 0.5, requires_grad=True)
+    weights = torch.tensor([[1.0, 1.0, 1.0], [0.5, 1.0, 1.0]])
+    for by_shown in (False, True):
+        (slope,) = torch.autograd.grad(unbiased_loss(shown, photographed, by_shown, weights), shown)
+        assert slope[1, :, 0] == pytest.approx(slope[0, :, 0] / 2) and torch.equal(slope[1, :, 1:], slope[0, :, 1:])
+
+
+@pytest.mark.parametrize(("exposure", "alike"), [(0.5, True), (2.0, False)])
+def test_only_photographs_that_are_clipped_learn_otherwise_beside_it(ball, capture, exposure, alike):
+    views = [replace(view, colour=np.clip(view.colour * np.float32(exposure), 0, 1)) for view in capture.views]
+    found = [
+        decouple(replace(capture, views=views), ball, replace(SMALL, beside_clipped=weight)).albedo
+        for weight in (1.0, 0.5)
+    ]
+    assert np.array_equal(*found) == alike
+
+
 def test_metals_are_pulled_to_be_bright_keep_their_hue_and_paint_is_let_alone():
     albedo = torch.tensor([[0.4, 0.3, 0.1], [0.95, 0.7, 0.4], [1.0, 1.0, 1.0], [0.4, 0.3, 0.1]], requires_grad=True)
     loss = dullness(albedo, torch.tensor([1.0, 1.0, 1.0, 0.4]))
@@ -409,10 +442,7 @@ def test_cache_shows_what_was_photographed(ball, capture):
     tree = TriangleBVH()
     tree.build(ball.vertices, ball.faces)
     pixels = foreground_pixels(capture.views, ball, tree, 10**6)
-    constant = Pixels(
-        pixels.view, pixels.face, pixels.corners, pixels.origin, pixels.flat, pixels.towards,
-        np.full((len(pixels), 3), 0.3, np.float32),
-    )  # fmt: skip
+    constant = replace(pixels, colour=np.full((len(pixels), 3), 0.3, np.float32))
     harmonics, weight = radiance_cache(constant, ball)
     assert harmonics[:, 0] * 0.28209479 == pytest.approx(0.3, abs=0.02)  # those that no photograph shows as well
     assert (weight == 0).any()

@@ -37,7 +37,7 @@ def dullness(albedo: Tensor, metallic: Tensor) -> Tensor:
     return (share * (albedo - known * (_POLISHED / brightest)) ** 2).sum(1).mean()
 
 
-def unbiased_loss(shown: Tensor, photographed: Tensor, by_shown: bool = False) -> Tensor:
+def unbiased_loss(shown: Tensor, photographed: Tensor, by_shown: bool = False, weights: Tensor | None = None) -> Tensor:
     """Weighted squared error of two independent estimates (n, 2, 3) of each pixel.
 
     The product of both differences has the squared error of their mean value for expectation, without their variance,
@@ -48,6 +48,7 @@ def unbiased_loss(shown: Tensor, photographed: Tensor, by_shown: bool = False) -
     by_shown : weigh by what is shown, not by what was photographed. Where the mesh is a little off, one place mirrors
         what the photographs show beside it, bright or dark; weights that are least for bright photographs make a mean
         of these that is too dark
+    weights : (n, 3) how much each value counts; None: all the same
     """
     difference = shown - photographed[:, None]
     if by_shown:
@@ -58,5 +59,7 @@ def unbiased_loss(shown: Tensor, photographed: Tensor, by_shown: bool = False) -
     else:
         weighed = difference / (photographed[:, None] + _KNEE) ** _EXPONENT
         product = weighed[:, 0] * weighed[:, 1]
+    if weights is not None:
+        product = product * weights
     above = (photographed >= CLIPPED) & (difference.detach().mean(1) > 0)
     return torch.where(above, torch.zeros_like(product), product).mean()

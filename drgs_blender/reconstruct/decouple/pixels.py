@@ -6,7 +6,7 @@ import logging
 from dataclasses import dataclass, fields
 
 import numpy as np
-from scipy.ndimage import binary_erosion
+from scipy.ndimage import binary_dilation, binary_erosion
 
 from ...asset.model import Mesh
 from ...colour import srgb_to_linear
@@ -14,6 +14,7 @@ from ...errors import UsageError
 from ...render.reference.raster import camera_rays, pixel_centres
 from ...render.trace.tree import TriangleBVH
 from ..capture import View
+from .losses import CLIPPED
 
 Array = np.ndarray
 log = logging.getLogger(__name__)
@@ -22,6 +23,8 @@ log = logging.getLogger(__name__)
 _INSIDE = 0.99
 #: Least cosine between the surface and the viewer: nearer to the outline a pixel mixes too much.
 _GRAZING = 0.1
+#: Pixels around clipped ones that may well mirror the same, as far as normals are known.
+_BESIDE = 2
 
 
 @dataclass(slots=True)
@@ -36,6 +39,7 @@ class Pixels:
     flat : (n, 3) float32 unit: normal of the face
     towards : (n, 3) float32 unit: to the viewer
     colour : (n, 3) float32 linear Rec.709 as photographed
+    beside_clipped : (n, 3) bool: not clipped, but a pixel of the object `_BESIDE` away or nearer is, in this channel
     """
 
     view: Array
@@ -45,6 +49,7 @@ class Pixels:
     flat: Array
     towards: Array
     colour: Array
+    beside_clipped: Array
 
     def __len__(self) -> int:
         return len(self.view)
@@ -110,7 +115,7 @@ def _of_view(index: int, view: View, mesh: Mesh, tree: TriangleBVH) -> Pixels:
     flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-30)
     towards = -direction / np.linalg.norm(direction, axis=1, keepdims=True)
-    colour = srgb_to_linear(view.colour.reshape(-1, 3)[row])
+    colour = srgb_to_linear(view.colour)
     part = Pixels(
         np.full(len(row), index, np.int32),
         face,
@@ -118,8 +123,16 @@ def _of_view(index: int, view: View, mesh: Mesh, tree: TriangleBVH) -> Pixels:
         origin + t[:, None] * direction,
         flat,
         towards,
-        colour,
+        colour.reshape(-1, 3)[row],
+        _beside(seen[..., None] & (colour >= CLIPPED))[row],
     )
     # A face seen from behind is an error of the mesh, or of its orientation: nothing can be learned there.
-    usable = ((flat * towards).sum(1) > _GRAZING) & np.isfinite(colour).all(1)
+    usable = ((flat * towards).sum(1) > _GRAZING) & np.isfinite(part.colour).all(1)
     return part.select(np.flatnonzero(usable))
+
+
+def _beside(clipped: Array) -> Array:
+    """Which pixels and channels (h w, 3) are near to those that are `clipped` (h, w, 3), and not clipped themselves."""
+    steps = np.arange(-_BESIDE, _BESIDE + 1)
+    disc = (steps[:, None] ** 2 + steps**2 <= _BESIDE**2)[..., None]
+    return (binary_dilation(clipped, disc) & ~clipped).reshape(-1, 3)

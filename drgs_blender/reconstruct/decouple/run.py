@@ -251,7 +251,12 @@ class _Job:
             shown = shown * torch.exp(exposure - exposure.mean())[torch.from_numpy(pixels.view).long()][:, None, None]
         photographed = torch.from_numpy(pixels.colour)
         by_shown = s.by_shown and self.part >= _BY_SHOWN
-        loss = unbiased_loss(shown, photographed, by_shown) if s.unbiased else log_loss(shown.mean(1), photographed)
+        if s.unbiased:
+            beside = torch.from_numpy(pixels.beside_clipped)
+            weights = torch.where(beside, s.beside_clipped, 1.0) if by_shown else None
+            loss = unbiased_loss(shown, photographed, by_shown, weights)
+        else:
+            loss = log_loss(shown.mean(1), photographed)
         self._note(float(loss.detach()), shown.detach().mean(1), photographed)
 
         pair = columns.index_select(0, end_place.flatten()).view(len(edge), 2, -1)

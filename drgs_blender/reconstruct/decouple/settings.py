@@ -34,6 +34,9 @@ class Settings:
     unbiased : compare two independent estimates of each pixel, so that their noise is not learned from
     by_shown : weigh differences by what is shown, once that is near the photographs; else by the photographs, which
         finds polished metal and the light in it too dark where the mesh is a little off
+    beside_clipped : weight, in a channel, of pixels beside clipped ones, once differences are weighed by what is shown.
+        Where normals are a little off, they are found to mirror bright light that is not theirs, and speak against it;
+        what is clipped cannot speak for it
     parametrisation : "metallic" learns albedo and metallic; "specular" diffuse and specular colour, turned into the
         former at the end; "dielectric" albedo alone, metallic is 0
     normals : also learn an offset of each vertex normal, held by `normal_smoothness`
@@ -63,6 +66,7 @@ class Settings:
     polish: float = 0.05
     unbiased: bool = True
     by_shown: bool = True
+    beside_clipped: float = 0.5
     parametrisation: Literal["metallic", "specular", "dielectric"] = "metallic"
     normals: bool = False
     normal_smoothness: float = 0.3
