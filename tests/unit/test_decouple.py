@@ -272,6 +272,17 @@ def test_only_photographs_that_are_clipped_learn_otherwise_beside_it(ball, captu
     assert np.array_equal(*found) == alike
 
 
+def test_pixels_beside_clipped_ones_count_whole_as_long_as_photographs_weigh(ball, capture, monkeypatch):
+    """Half from the first step on gained less: light that is not yet known needs them."""
+    monkeypatch.setattr("drgs_blender.reconstruct.decouple.run._BY_SHOWN", 2.0)
+    views = [replace(view, colour=np.clip(view.colour * np.float32(2), 0, 1)) for view in capture.views]
+    found = [
+        decouple(replace(capture, views=views), ball, replace(SMALL, beside_clipped=weight)).albedo
+        for weight in (1.0, 0.5)
+    ]
+    assert np.array_equal(*found)
+
+
 def test_metals_are_pulled_to_be_bright_keep_their_hue_and_paint_is_let_alone():
     albedo = torch.tensor([[0.4, 0.3, 0.1], [0.95, 0.7, 0.4], [1.0, 1.0, 1.0], [0.4, 0.3, 0.1]], requires_grad=True)
     loss = dullness(albedo, torch.tensor([1.0, 1.0, 1.0, 0.4]))
