@@ -17,6 +17,8 @@ Array = np.ndarray
 
 #: Layers of AlexNet in torchvision's numbering: (number, stride, padding, pooled before).
 _LAYERS = ((0, 4, 2, False), (3, 1, 2, True), (6, 1, 1, True), (8, 1, 1, False), (10, 1, 1, False))
+#: Pixels of a side below which nothing is left for the last layers.
+_LEAST = 31
 _SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 
 
@@ -50,9 +52,11 @@ class Lpips:
             ) from error
 
     def __call__(self, picture: Array, reference: Array) -> float:
-        """Distance of two (h, w, 3) sRGB-encoded pictures in [0, 1], of 64 pixels a side or more."""
+        """Distance of two (h, w, 3) sRGB-encoded pictures in [0, 1]; NaN where a side has fewer than 31 pixels."""
         import torch
 
+        if min(picture.shape[:2]) < _LEAST:
+            return float("nan")
         with torch.no_grad():
             a, b = self._features(picture), self._features(reference)
             total = 0.0

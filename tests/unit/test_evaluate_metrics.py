@@ -194,6 +194,7 @@ def test_lpips_with_given_weights(tmp_path):
     lpips = Lpips(tmp_path / "alexnet.pth", tmp_path / "alex.pth")
     assert lpips(a, b) == pytest.approx(wanted, rel=1e-4) and wanted > 0.01
     assert lpips(a, a) == 0
+    assert lpips(a[:31], b[:31]) > 0 and np.isnan(lpips(a[:, :30], b[:, :30]))  # too small for the last layers
     with pytest.raises(AssetError, match="AlexNet"):
         Lpips(tmp_path / "alex.pth", tmp_path / "alexnet.pth")
     (tmp_path / "bad.pth").write_bytes(b"no weights")
