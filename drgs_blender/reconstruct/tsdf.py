@@ -21,6 +21,7 @@ from ..frame import Camera
 from ..jit import njit, prange
 from .gaussians import Gaussians
 from .hull import Region, world_to_pixel
+from .memory import check_fits
 from .targets import pixel_rays
 
 log = logging.getLogger(__name__)
@@ -31,6 +32,10 @@ BAND = 3.0
 TOGETHER = 32
 #: Least side of a voxel, pixels.
 PIXELS = 1.0
+#: Voxels around the region.
+_AROUND = 5
+#: Bytes a voxel takes on the way: sum and weight, the field, smoothed, widened, and what marching cubes make of it.
+_BYTES_A_VOXEL = 24
 #: Deviation of the smoothing of the field, voxels: below it is the noise of the depth maps.
 SMOOTH = 0.8
 
@@ -53,6 +58,7 @@ def fuse(gaussians: Gaussians, cameras: list[Camera], region: Region, resolution
     Raises
     ------
     AssetError: no surface was found.
+    UsageError: more voxels than the memory holds.
     """
     try:
         from skimage.measure import marching_cubes
@@ -61,8 +67,11 @@ def fuse(gaussians: Gaussians, cameras: list[Camera], region: Region, resolution
     side = float((region.high - region.low).max())
     pixel = [float(np.linalg.norm(np.asarray(c.matrix_world)[:3, 3] - region.centre)) / c.fx for c in cameras]
     voxel = max(side / resolution, PIXELS * float(np.quantile(pixel, 0.25)))
-    low, high = region.low - 5 * voxel, region.high + 5 * voxel
+    low, high = region.low - _AROUND * voxel, region.high + _AROUND * voxel
     shape = tuple(int(n) for n in np.ceil((high - low) / voxel).astype(int) + 1)
+    around = 2 * _AROUND + 2
+    needed = _BYTES_A_VOXEL * float(np.prod(shape))
+    check_fits(needed, "the mesh", "voxels", "--voxels", max(shape) - around, 3, around)
     total, weight = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
     for begin in range(0, len(cameras), TOGETHER):
         batch = cameras[begin : begin + TOGETHER]

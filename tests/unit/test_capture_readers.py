@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+from dataclasses import replace
 
 import captures
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 from PIL import Image
 
 from drgs_blender.errors import AssetError, UsageError
-from drgs_blender.reconstruct.readers import read_capture
+from drgs_blender.reconstruct.readers import BYTES_A_PIXEL, read_capture
 from drgs_blender.reconstruct.readers.lens import MODELS, Lens, distort, lens_of, resample, undistorted
 from drgs_blender.reconstruct.readers.world import turn_upright
 
@@ -524,6 +525,20 @@ def test_more_pixels_than_memory_are_refused_before_they_are_read(tmp_path):
     path.write_text(json.dumps(data))
     refused(tmp_path, "memory", "--resolution", error=UsageError)
     assert len(read_capture(tmp_path, resolution=24).views) == 12
+
+
+def test_the_memory_counted_for_a_pixel_is_what_learning_keeps_of_it(tmp_path, monkeypatch):
+    """Masks before real surroundings take most: colour, mask, the colour cut out, and all in half size."""
+    targets = pytest.importorskip("drgs_blender.reconstruct.targets")
+    monkeypatch.setattr(targets, "KEPT", 0)  # blurred copies are kept of few pixels alone
+    captures.write_nerfstudio(captures.make(tmp_path))
+    capture = replace(read_capture(tmp_path), background=None)
+    held = {}
+    for target in [target for views in targets.targets(capture) for target in views]:
+        held |= {array.ctypes.data: array.nbytes for array in (target.photograph.colour, target.mask.numpy())}
+    for view in capture.views:
+        held |= {array.ctypes.data: array.nbytes for array in (view.colour, view.mask)}
+    assert sum(held.values()) == BYTES_A_PIXEL * captures.WIDTH * captures.HEIGHT * len(capture.views)
 
 
 def test_real_captures(shared_data):

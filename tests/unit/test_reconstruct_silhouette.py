@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from capture_cases import balls, camera
 from shapes import sphere_mesh
 
 from drgs_blender.asset.model import Mesh
+from drgs_blender.errors import UsageError
 from drgs_blender.frame import Camera
 from drgs_blender.reconstruct import tsdf
 from drgs_blender.reconstruct.hull import Region, silhouettes
@@ -69,6 +71,24 @@ def test_exact_depth_maps_make_an_exact_mesh(cameras, monkeypatch):
     assert -0.3 < off(mesh.vertices).mean() < 0  # what the smoothing takes
     filled = off(fill_silhouettes(mesh, cameras, [mask_of(view) for view in cameras]))
     assert abs(filled.mean()) < 0.03 and np.abs(filled).max() < 0.2
+
+
+def test_more_voxels_than_memory_are_refused_with_how_many_fit(cameras, monkeypatch):
+    def begun(*_):
+        raise LookupError
+
+    monkeypatch.setattr("drgs_blender.reconstruct.memory.memory", lambda: 2.0**25)
+    monkeypatch.setattr(tsdf, "surface_maps", begun)
+    sharp = [replace(view, fx=9 * view.fx) for view in cameras]
+    low = np.full(3, -RADIUS)
+    region = Region(np.zeros(3), 2 * RADIUS, low, -low, np.zeros((0, 3)), np.zeros((0, 3)), PIXEL)
+    with pytest.raises(UsageError, match=r"GiB of voxels.*--voxels") as refused:
+        tsdf.fuse(None, sharp, region, 1024)  # type: ignore[arg-type]
+    fitting = int(re.search(r"--voxels (\d+) or less", str(refused.value))[1])  # type: ignore[index]
+    with pytest.raises(LookupError):
+        tsdf.fuse(None, sharp, region, fitting)  # type: ignore[arg-type]
+    with pytest.raises(UsageError):
+        tsdf.fuse(None, sharp, region, fitting + 2)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("pixels", [-1.2, 0.8])

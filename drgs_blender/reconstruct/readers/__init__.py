@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ import numpy as np
 from ...errors import AssetError, UsageError
 from ...formats.axes import UP_AXES
 from ..capture import Capture
+from ..memory import check_fits
 from . import colmap, llff, nero, tensoir, transforms
 from .develop import cut_out, develop, find_background
 from .layout import Layout
@@ -49,8 +49,8 @@ LAYOUTS = (
     Reader("COLMAP", colmap.sniff, colmap.read, "sparse/0 with cameras and images, text or binary, beside images"),
     Reader("LLFF", llff.sniff, llff.read, "poses_bounds.npy beside images"),
 )
-#: Bytes that are kept of every pixel (colour, mask) and taken on the way (a photograph while it is developed).
-_BYTES_A_PIXEL = 16
+#: Bytes that are kept of every pixel: colour, mask, the colour without its surroundings, and all in half size.
+BYTES_A_PIXEL = 32
 
 
 def read_capture(
@@ -158,16 +158,11 @@ def _turn(layout: Layout, matrices: np.ndarray, axes: str, up: str | None) -> np
 
 def _check_memory(layout: Layout, resolution: int | None, path: Path) -> None:
     """Raise UsageError where the pixels of all views would not fit in half of the memory."""
-    if not hasattr(os, "sysconf"):
-        return
     pixels = 0.0
     for photograph in layout.photographs:
         width, height = photograph.lens.width, photograph.lens.height
         factor = 1.0 if resolution is None else min(1.0, resolution / max(width, height))
         pixels += width * height * factor**2
-    needed, memory = pixels * _BYTES_A_PIXEL, os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    if needed > memory / 2:
-        largest = max(max(p.lens.width, p.lens.height) for p in layout.photographs)
-        fitting = int((resolution or largest) * (memory / 2 / needed) ** 0.5)
-        problem = f"is {needed / 2**30:.0f} GiB of pixels, this machine has {memory / 2**30:.0f} GiB of memory"
-        raise UsageError(str(path), problem, f"Give --resolution {fitting} or less")
+    largest = max(max(p.lens.width, p.lens.height) for p in layout.photographs)
+    value = min(resolution or largest, largest)
+    check_fits(pixels * BYTES_A_PIXEL, str(path), "pixels", "--resolution", value, 2)
