@@ -51,6 +51,18 @@ class DRGS_OT_reconstruct(ProgramOperator, bpy.types.Operator):
         default=0,
         min=0,
     )
+    axes: EnumProperty(
+        name="Cameras",
+        description="What the cameras' matrices are taken for; a message names it (--axes) where another one fits",
+        items=(
+            ("opengl", "As the Layout", "The convention of the files' layout"),
+            ("opencv", "OpenCV", "Camera to world, Y down, Z forward"),
+            ("opengl-inverse", "OpenGL, Inverse", "World to camera, Y up, Z backward"),
+            ("opencv-inverse", "OpenCV, Inverse", "World to camera, Y down, Z forward"),
+        ),
+        default="opengl",
+        options={"SKIP_SAVE"},
+    )
     use_environment: BoolProperty(
         name="Set World", description="Light the scene with the light of the photographs", default=False
     )
@@ -89,7 +101,7 @@ class DRGS_OT_reconstruct(ProgramOperator, bpy.types.Operator):
         out = Path(bpy.path.abspath(self.out or f"//{bpy.path.clean_name(folder.name)}"))
         out = assets.chosen(out.absolute().with_suffix(".drgs"), bool(self.out))
         arguments = ["reconstruct", str(capture), "--out", str(out), "--minutes", f"{self.minutes:g}"]
-        arguments += ["--variant", self.variant, "--device", context.scene.drgs.device.lower()]
+        arguments += ["--variant", self.variant, "--axes", self.axes, "--device", context.scene.drgs.device.lower()]
         if self.resolution:
             # Eight is the least that the program takes.
             arguments += ["--resolution", str(max(self.resolution, 8))]

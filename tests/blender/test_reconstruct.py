@@ -87,6 +87,19 @@ def test_what_is_no_capture_is_said(scene, tmp_path):
     assert reconstruction.job is None
 
 
+def test_the_convention_that_a_message_names_can_be_chosen(scene, photographs):
+    """Matrices of OpenCV: refused with the name of the choice, which is one of the operator's and then serves."""
+    file = photographs / "transforms.json"
+    capture = json.loads(file.read_text())
+    for frame in capture["frames"]:
+        frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ np.diag([1, -1, -1, 1])).tolist()
+    file.write_text(json.dumps(capture))
+    with pytest.raises(RuntimeError, match="--axes opencv"):
+        bpy.ops.drgs.reconstruct(filepath=str(photographs), minutes=0.1, use_materials=False)
+    done = bpy.ops.drgs.reconstruct(filepath=str(photographs), minutes=0.1, use_materials=False, axes="opencv")
+    assert done == {"FINISHED"} and bpy.context.active_object.drgs.is_drgs
+
+
 class Window(SimpleNamespace):
     """A window manager and a workspace that remember what was asked of them."""
 
@@ -114,7 +127,8 @@ def test_it_works_beside_the_window_until_cancelled(scene, photographs, tmp_path
     own = {name: value for name, value in vars(cls).items() if not name.startswith(("__", "bl_"))}
     stand_in = type("StandIn", (program.ProgramOperator,), own)()
     values = {"filepath": str(photographs), "out": "", "minutes": 5.0, "resolution": 0, "variant": "p"}
-    for name, value in (values | {"use_materials": True, "test_every": 0, "use_environment": False}).items():
+    values |= {"use_materials": True, "test_every": 0, "axes": "opengl", "use_environment": False}
+    for name, value in values.items():
         setattr(stand_in, name, value)
     scene.drgs.device = "CUDA"
     assert stand_in.run(context) == {"RUNNING_MODAL"}
