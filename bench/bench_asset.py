@@ -30,7 +30,7 @@ Array = np.ndarray
 FOLDER = OUT / "assets"
 COLUMNS = (
     "Object", "Primary", "Views left out: frame / foreground", "Relit scaled: frame / foreground",
-    "Ceiling: true materials",
+    "Relit with the true materials",
     "Relit and deformed scaled: frame / foreground", "Normals deg", "Silhouettes", "Albedo scaled",
     "Roughness / metallic RMSE",
 )  # fmt: skip
@@ -50,8 +50,11 @@ def pair(rows: list[dict[str, Any]]) -> str:
     return f"{mean(rows, 'scaled', 'full'):.2f} / {mean(rows, 'scaled', 'foreground'):.2f}"
 
 
-def ceiling(asset: Asset, folder: Path, primary: str, rays: int) -> str:
-    """What the asset's own shape leaves possible: relit with the true materials of the nearest vertices."""
+def with_true_materials(asset: Asset, folder: Path, primary: str, rays: int) -> str:
+    """What errors of shape alone cost: relit with the true materials of the nearest vertices.
+
+    No bound: materials that were learned on this shape may make up for some of it.
+    """
     truth = read_truth(folder)
     assert truth is not None
     true = true_asset(folder).mesh
@@ -67,20 +70,20 @@ def ceiling(asset: Asset, folder: Path, primary: str, rays: int) -> str:
         mesh=with_truth(asset.mesh, asset.mesh.vertices),
         environment=None,
     )
-    path = FOLDER / f"{folder.name}-ceiling.drgs"
+    path = FOLDER / f"{folder.name}-true-materials.drgs"
     write_asset(path, known)
     others = [item for item in truth.sets if not item.posed and item.light != truth.training_light]
     return pair(under_other_lights(score(path, folder, primary, rays, replace(truth, sets=others)), False))
 
 
-def row(report: dict[str, Any], ceiling: str) -> list[str]:
+def row(report: dict[str, Any], true_materials: str) -> list[str]:
     """Cells of a report, and what stands beside it."""
     novel, geometry, materials = report["novel"], report["geometry"], report["materials"]
     lit = [under_other_lights(report, posed) for posed in (False, True)]
     return [
         f"{novel['psnr']:.2f} / {novel['psnr_foreground']:.2f}",
         pair(lit[0]),
-        ceiling,
+        true_materials,
         pair(lit[1]),
         f"{geometry['normal_degrees']:.2f}",
         f"{geometry['silhouette_iou']:.4f}",
@@ -106,16 +109,16 @@ def main() -> None:
             write_asset(path, reconstruct(capture, settings_of(options)))
         asset = read_asset(path)
         for primary in ("surfels", "mesh"):
-            bound = ceiling(asset, options.scenes / name, primary, options.rays)
-            found = row(score(path, options.scenes / name, primary, options.rays), bound)
+            other = with_true_materials(asset, options.scenes / name, primary, options.rays)
+            found = row(score(path, options.scenes / name, primary, options.rays), other)
             rows = keep(FOLDER / "rows.json", f"{name}|{primary}", found)
             print(name, primary, *found, flush=True)
     side = max(capture.views[0].colour.shape[:2])
     bound = f"{options.minutes:g} minutes" if options.minutes else "{} and {} steps".format(*options.steps)
     body = (
         f"{bound}, {len(capture.training)} photographs of {side} pixels by Cycles; PSNR in dB over the frame on white, "
-        f"and of the foreground; scaled by one factor a channel; means over the other lights. Ceiling: "
-        f"relit as before, but with the true materials on the asset's own shape.\n\n"
+        f"and of the foreground; scaled by one factor a channel; means over the other lights. With "
+        f"the true materials: on the asset's own shape; no bound: learned ones may make up for its errors.\n\n"
     )
     cells = [(*key.split("|"), *cells) for key, cells in rows.items()]
     write_section("asset", "Photographs to assets", body + table(COLUMNS, cells))
