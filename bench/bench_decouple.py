@@ -33,7 +33,7 @@ SIZE, TRAIN, TEST, SAMPLES = 128, 40, 8, 32
 #: The paper's BRDF and losses: L1 of noisy estimates, white light, neither grids nor smoothness of materials.
 PAPER: dict[str, Any] = {
     "look": "paper", "unbiased": False, "white": 0.003, "coarse": 0, "smoothness": 0.0, "coarse_to_fine": False,
-    "polish": 0.0,
+    "polish": 0.0, "plain_metals": 0.0,
 }  # fmt: skip
 
 #: Part -> row -> what differs from the settings that the rows share.
@@ -64,6 +64,7 @@ VARIANTS: dict[str, dict[str, dict[str, Any]]] = {
     "priors": {
         "metallic pulled to 0 or 1": {"bimodal": 0.01},
         "metals of any brightness": {"polish": 0.0},
+        "metals smoothed like paint": {"plain_metals": 0.0},
         "learned exposure of each photograph": {"exposure": True},
         "learned normals": {"normals": True},
     },

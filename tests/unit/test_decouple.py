@@ -21,7 +21,7 @@ from drgs_blender.reconstruct.capture import Capture, View  # noqa: E402
 from drgs_blender.reconstruct.decouple.cache import radiance_cache  # noqa: E402
 from drgs_blender.reconstruct.decouple.gather import Gatherer, Points  # noqa: E402
 from drgs_blender.reconstruct.decouple.light import LearnedLight, colour_cast  # noqa: E402
-from drgs_blender.reconstruct.decouple.losses import dullness, log_loss, unbiased_loss  # noqa: E402
+from drgs_blender.reconstruct.decouple.losses import blotches, dullness, log_loss, unbiased_loss  # noqa: E402
 from drgs_blender.reconstruct.decouple.materials import Materials, from_specular  # noqa: E402
 from drgs_blender.reconstruct.decouple.pixels import foreground_pixels  # noqa: E402
 from drgs_blender.reconstruct.decouple.run import Decoupled, decouple  # noqa: E402
@@ -237,6 +237,25 @@ def test_clipped_photographs_set_no_upper_bound():
     assert float(log_loss(torch.full((4, 3), 3.0), white)) == 0
     assert float(unbiased_loss(torch.full((4, 2, 3), 3.0), white)) == 0
     assert float(log_loss(torch.full((4, 3), 0.5), white)) > 0
+
+
+def test_albedo_along_edges_of_metal_is_evened_out_but_for_its_patterns_and_paint():
+    ends = torch.tensor([[0.6, 0.5, 0.3], [0.9, 0.5, 0.3]]).repeat(4, 1, 1).requires_grad_(True)
+    metallic = torch.tensor([[1.0, 1.0], [0.0, 0.0], [1.0, 0.0], [1.0, 1.0]])
+    alike = torch.tensor([1.0, 1.0, 1.0, 0.0])  # the last edge crosses a line that the photographs show
+    loss = blotches((ends[:, 0] - ends[:, 1]).abs(), metallic, alike[:, None])
+    (slope,) = torch.autograd.grad(loss, ends)
+    assert slope[0, 0, 0] < 0 < slope[0, 1, 0]
+    assert float(slope[1:].abs().max()) == 0
+    metallic.requires_grad_(True)  # not by being less of a metal
+    assert not blotches((ends[:, 0] - ends[:, 1]).abs().detach(), metallic, alike[:, None]).requires_grad
+
+
+@pytest.mark.parametrize(("parametrisation", "alike"), [("metallic", False), ("dielectric", True)])
+def test_only_what_may_be_metal_is_smoothed_as_metals(ball, capture, parametrisation, alike):
+    settings = replace(SMALL, parametrisation=parametrisation, polish=0.0)
+    found = [decouple(capture, ball, replace(settings, plain_metals=weight)).albedo for weight in (0.0, 5.0)]
+    assert np.array_equal(*found) == alike
 
 
 def test_pixels_beside_clipped_ones_are_known_by_channel_and_count_less(ball, capture):

@@ -33,8 +33,26 @@ def dullness(albedo: Tensor, metallic: Tensor) -> Tensor:
     """
     known = albedo.detach()
     brightest = known.max(1, keepdim=True).values.clamp(min=1e-3)
-    share = metallic.detach()[:, None] ** _SURELY
-    return (share * (albedo - known * (_POLISHED / brightest)) ** 2).sum(1).mean()
+    return (_surely_metal(metallic)[:, None] * (albedo - known * (_POLISHED / brightest)) ** 2).sum(1).mean()
+
+
+def blotches(differences: Tensor, metallic: Tensor, likeness: Tensor) -> Tensor:
+    """How uneven metal is: mean over edges, summed over channels.
+
+    The albedo of metal takes in what its normals are off, from vertex to vertex, as no diffuse light evens them out.
+
+    Parameters
+    ----------
+    differences : (e, 3) of albedo along edges, absolute
+    metallic : (e, 2) of their ends
+    likeness : (e, 1) how alike the photographs show these
+    """
+    return (likeness * _surely_metal(metallic.min(1, keepdim=True).values) * differences).mean(0).sum()
+
+
+def _surely_metal(metallic: Tensor) -> Tensor:
+    """How far surfaces are metal beyond doubt, 0..1, without a derivative."""
+    return metallic.detach() ** _SURELY
 
 
 def unbiased_loss(shown: Tensor, photographed: Tensor, by_shown: bool = False, weights: Tensor | None = None) -> Tensor:

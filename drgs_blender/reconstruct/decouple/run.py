@@ -28,7 +28,7 @@ from .blend import blend
 from .cache import edges_of, filled, radiance_cache
 from .gather import Points
 from .light import LearnedLight, colour_cast
-from .losses import dullness, log_loss, unbiased_loss
+from .losses import blotches, dullness, log_loss, unbiased_loss
 from .materials import Materials
 from .pixels import Pixels, foreground_pixels
 from .settings import Settings
@@ -43,8 +43,8 @@ _AIM, _REPORT, _SAVE = 25, 25, 20.0
 _GROWS, _NORMALS, _LAST_RATE = (0.2, 0.45), 0.4, 0.05
 #: Where weights by what is shown begin: before, they let light that is much too bright stay so.
 _BY_SHOWN = 0.3
-#: From here on metals are told from paint well enough to say how bright they are.
-_POLISH = 0.2
+#: From here on metals are told from paint well enough to say how bright and how plain they are.
+_METALS = 0.2
 #: How much smoother than albedo roughness and metallic are (of diffuse and specular colour: diffuse, roughness, rest).
 _SMOOTH = (1.0, 1.0, 1.0, 2.0, 10.0, 10.0, 10.0)
 #: Edges that are smoothed a step; how much photographed chroma may differ along one that is.
@@ -264,9 +264,12 @@ class _Job:
         likeness = torch.from_numpy(self._likeness[edge])[:, None]
         weights = torch.tensor(_SMOOTH[: columns.shape[1]])
         loss = loss + s.smoothness * ((likeness * differences).mean(0) * weights).sum()
+        known = self.materials.metallic and self.part >= _METALS
+        if s.plain_metals > 0 and known:
+            loss = loss + s.plain_metals * s.smoothness * blotches(differences[:, :3], pair[:, :, 4], likeness)
         if s.bimodal > 0 and self.materials.metallic:
             loss = loss + s.bimodal * (here[:, 4] * (1 - here[:, 4])).mean()
-        if s.polish > 0 and self.materials.metallic and self.part >= _POLISH:
+        if s.polish > 0 and known:
             loss = loss + s.polish * dullness(here[:, :3], here[:, 4])
         if s.white > 0:
             loss = loss + s.white * colour_cast(radiance)

@@ -31,6 +31,8 @@ class Settings:
     white : weight that pulls the environment towards grey
     bimodal : weight that pulls metallic to 0 or 1
     polish : weight that pulls the colours of metals towards as bright as polished metals are
+    plain_metals : how much more than other albedo that of metals is smoothed, in parts of `smoothness`: there, errors
+        of normals leave blotches
     unbiased : compare two independent estimates of each pixel, so that their noise is not learned from
     by_shown : weigh differences by what is shown, once that is near the photographs; else by the photographs, which
         finds polished metal and the light in it too dark where the mesh is a little off
@@ -64,6 +66,7 @@ class Settings:
     white: float = 0.0003
     bimodal: float = 0.0
     polish: float = 0.05
+    plain_metals: float = 5.0
     unbiased: bool = True
     by_shown: bool = True
     beside_clipped: float = 0.5
