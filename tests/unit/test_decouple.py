@@ -13,7 +13,7 @@ torch = pytest.importorskip("torch")
 
 from drgs_blender.asset import Mesh  # noqa: E402
 from drgs_blender.asset.model import PosedSurfels  # noqa: E402
-from drgs_blender.colour import linear_to_srgb  # noqa: E402
+from drgs_blender.colour import linear_to_srgb, srgb_to_linear  # noqa: E402
 from drgs_blender.errors import Cancelled, UsageError  # noqa: E402
 from drgs_blender.frame import Camera, Frame, ObjectState, RenderSettings, World  # noqa: E402
 from drgs_blender.geometry import VertexNormals  # noqa: E402
@@ -421,6 +421,61 @@ def test_the_hue_of_all_photographs_is_that_of_the_object_not_of_the_light(ball)
     assert red / blue == pytest.approx(1.0, abs=0.25)
     red, _, blue = np.median(found.albedo, axis=0)
     assert red / blue > 3
+
+
+def _cast(found: Decoupled) -> float:
+    image = found.environment
+    return float(np.abs(image - image.mean(-1, keepdims=True)).mean() / image.mean())
+
+
+def _steps(found: Decoupled) -> float:
+    image = np.log(found.environment)
+    return float(((image - np.roll(image, 1, 1)) ** 2).mean())
+
+
+def _unevenness(found: Decoupled) -> float:
+    return float(found.roughness.std())
+
+
+def _between(found: Decoupled) -> float:
+    return float((found.metallic * (1 - found.metallic)).mean())
+
+
+@pytest.mark.parametrize(
+    ("weight", "value", "measure"),
+    [
+        ("white", 0.3, _cast),
+        ("light_smoothness", 0.3, _steps),
+        ("smoothness", 1.0, _unevenness),
+        ("bimodal", 1.0, _between),
+    ],
+)
+def test_each_weight_makes_less_of_what_it_weighs(ball, capture, weight, value, measure):
+    settings = replace(SMALL, iterations=40)
+    without, with_it = (measure(decouple(capture, ball, replace(settings, **{weight: w}))) for w in (0.0, value))
+    assert with_it < 0.8 * without, (with_it, without)
+
+
+def test_exposures_of_photographs_are_found_again(ball, capture):
+    """Every other one a quarter of a stop darker."""
+    views = [
+        replace(view, colour=linear_to_srgb(srgb_to_linear(view.colour) * np.float32(2 ** (-0.25 * (k % 2)))))
+        for k, view in enumerate(capture.views)
+    ]
+    settings = Settings(iterations=150, pixels=512, environment=16, seed=3, exposure=True)
+    found = np.array(decouple(replace(capture, views=views), ball, settings).report["exposures"])
+    assert np.median(found[0::2]) / np.median(found[1::2]) == pytest.approx(2**0.25, rel=0.04)
+
+
+def test_grids_and_a_coarse_light_carry_what_many_pixels_agree_on(ball, capture):
+    """With as many steps, what is learned on grids is nearer to the photographs; light begins with few rows."""
+    psnr = [decouple(capture, ball, replace(SMALL, iterations=40, coarse=n)).report["psnr"] for n in (0, 2)]
+    assert psnr[1] > psnr[0] + 1
+    rows = [
+        len(decouple(capture, ball, replace(SMALL, iterations=40, environment=32, coarse_to_fine=way)).environment)
+        for way in (True, False)
+    ]
+    assert rows == [32, 32]
 
 
 def test_without_shadows_a_room_around_all_does_not_stand_before_the_light(ball, capture):
