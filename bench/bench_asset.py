@@ -14,20 +14,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from bench_evaluate import mean, of_truth, score, under_other_lights
+from decouple_score import with_materials_of
 from report import OUT, keep, table, write_section
-from scipy.spatial import cKDTree
 
 from drgs_blender.asset.container import write_asset
-from drgs_blender.asset.model import MATERIAL_CHANNELS, Asset, Mesh, Surfels
+from drgs_blender.asset.model import Asset
 from drgs_blender.evaluate.truth import read_truth, true_asset
 from drgs_blender.reconstruct.capture import Capture
 from drgs_blender.reconstruct.job import Progress, Settings, reconstruct
 from drgs_blender.reconstruct.readers import read_capture
 from drgs_blender.reconstruct.train import Schedule
-
-Array = np.ndarray
 
 FOLDER = OUT / "assets"
 COLUMNS = (
@@ -58,13 +55,8 @@ def with_true_materials(asset: Asset, folder: Path) -> Path:
     No bound: materials that were learned on this shape may make up for some of it.
     """
     true = true_asset(folder).mesh
-    tree = cKDTree(true.vertices)
-
-    def with_truth(part: Surfels | Mesh, points: Array) -> Surfels | Mesh:
-        nearest = tree.query(points)[1]
-        return replace(part, **{name: getattr(true, name)[nearest] for name in MATERIAL_CHANNELS})
-
-    surfels, mesh = with_truth(asset.surfels, asset.surfels.centre), with_truth(asset.mesh, asset.mesh.vertices)
+    surfels = with_materials_of(true, asset.surfels, asset.surfels.centre)
+    mesh = with_materials_of(true, asset.mesh, asset.mesh.vertices)
     path = FOLDER / f"{folder.name}-true-materials.drgs"
     write_asset(path, replace(asset, surfels=surfels, mesh=mesh, environment=None))
     return path

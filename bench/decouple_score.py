@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from drgs_blender.asset import Mesh
-from drgs_blender.asset.model import PosedSurfels
+from drgs_blender.asset.model import MATERIAL_CHANNELS, PosedSurfels, Surfels
 from drgs_blender.evaluate.metrics import material_scores, relight_scores
 from drgs_blender.evaluate.truth import TruthSet, read_truth
 from drgs_blender.frame import Camera, Frame, ObjectState, RenderSettings, World
@@ -19,6 +21,7 @@ from drgs_blender.render.pipeline import render
 from drgs_blender.render.trace.scene import TraceObject, TraceScene
 
 Array = np.ndarray
+Part = TypeVar("Part", Mesh, Surfels)
 
 COLUMNS = ("CPU-s", "Relit raw", "Relit scaled", "Albedo scaled", "Roughness RMSE", "Metallic RMSE")
 
@@ -43,6 +46,12 @@ class Scene:
             mesh = Mesh(*(arrays[name] for name in ("vertices", "faces", "albedo", "roughness", "metallic")))
         training = next(item for item in rest if item.light == truth.training_light)
         return cls(read_capture(folder), mesh, training, [item for item in rest if item.light != truth.training_light])
+
+
+def with_materials_of(true: Mesh, part: Part, points: Array) -> Part:
+    """A mesh or surfels, at `points` (n, 3), with the materials of the nearest vertices of `true`."""
+    nearest = cKDTree(true.vertices).query(points)[1]
+    return replace(part, **{name: getattr(true, name)[nearest] for name in MATERIAL_CHANNELS})
 
 
 def passes_of(
