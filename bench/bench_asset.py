@@ -20,7 +20,7 @@ from report import OUT, keep, table, write_section
 
 from drgs_blender.asset.container import write_asset
 from drgs_blender.asset.model import Asset
-from drgs_blender.evaluate.truth import read_truth, true_asset
+from drgs_blender.evaluate.truth import Truth, read_truth, true_asset
 from drgs_blender.reconstruct.capture import Capture
 from drgs_blender.reconstruct.job import Progress, Settings, reconstruct
 from drgs_blender.reconstruct.readers import read_capture
@@ -62,12 +62,12 @@ def with_true_materials(asset: Asset, folder: Path) -> Path:
     return path
 
 
-def relit(path: Path, folder: Path, primary: str, rays: int) -> str:
-    """An asset at rest under the lights that were not photographed."""
+def others_at_rest(folder: Path) -> Truth:
+    """What is known of a scene at rest under the lights that were not photographed."""
     truth = read_truth(folder)
     assert truth is not None
-    others = [item for item in truth.sets if not item.posed and item.light != truth.training_light]
-    return pair(under_other_lights(score(path, folder, primary, rays, replace(truth, sets=others)), False))
+    sets = [item for item in truth.sets if not item.posed and item.light != truth.training_light]
+    return replace(truth, sets=sets)
 
 
 def learned(capture: Capture, settings: Settings) -> tuple[Asset, float]:
@@ -113,9 +113,9 @@ def main() -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         asset, seconds = learned(capture, settings_of(options))
         write_asset(path, asset)
-        references = (with_true_materials(asset, folder), of_truth(folder))
+        others, references = others_at_rest(folder), (with_true_materials(asset, folder), of_truth(folder))
         for primary in ("surfels", "mesh"):
-            beside = [relit(other, folder, primary, options.rays) for other in references]
+            beside = [pair(score(one, folder, primary, options.rays, others)["lights"]) for one in references]
             found = row(score(path, folder, primary, options.rays), beside, seconds)
             rows = keep(FOLDER / "rows.json", f"{name}|{primary}", found)
             print(name, primary, *found, flush=True)

@@ -253,8 +253,8 @@ class _Job:
         by_shown = s.by_shown and self.part >= _BY_SHOWN
         if s.unbiased:
             beside = torch.from_numpy(pixels.beside_clipped)
-            weights = torch.where(beside, s.beside_clipped, 1.0) if by_shown else None
-            loss = unbiased_loss(shown, photographed, by_shown, weights)
+            counts = torch.where(beside, s.beside_clipped, 1.0) if by_shown else None
+            loss = unbiased_loss(shown, photographed, by_shown, counts)
         else:
             loss = log_loss(shown.mean(1), photographed)
         self._note(float(loss.detach()), shown.detach().mean(1), photographed)
@@ -264,12 +264,12 @@ class _Job:
         likeness = torch.from_numpy(self._likeness[edge])[:, None]
         weights = torch.tensor(_SMOOTH[: columns.shape[1]])
         loss = loss + s.smoothness * ((likeness * differences).mean(0) * weights).sum()
-        known = self.materials.metallic and self.part >= _METALS
-        if s.plain_metals > 0 and known:
+        told = self.materials.metallic and self.part >= _METALS
+        if s.plain_metals > 0 and told:
             loss = loss + s.plain_metals * s.smoothness * blotches(differences[:, :3], pair[:, :, 4], likeness)
         if s.bimodal > 0 and self.materials.metallic:
             loss = loss + s.bimodal * (here[:, 4] * (1 - here[:, 4])).mean()
-        if s.polish > 0 and known:
+        if s.polish > 0 and told:
             loss = loss + s.polish * dullness(here[:, :3], here[:, 4])
         if s.white > 0:
             loss = loss + s.white * colour_cast(radiance)
