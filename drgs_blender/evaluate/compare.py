@@ -182,9 +182,7 @@ def _novel(
         "views": len(views),
         "coverage": float(np.mean([m.mean() for m in inside])),
         "psnr": mean_psnr(ours, true),
-        "psnr_foreground": float(
-            np.mean([mean_psnr([a], [b], m[None]) for a, b, m in zip(ours, true, inside) if m.any()])
-        ),
+        "psnr_foreground": mean_psnr(ours, true, inside),
         **_looks(ours, true, lpips),
     }
 
@@ -260,9 +258,9 @@ def table(report: dict[str, Any]) -> list[str]:
     novel = report["novel"]
     if novel:
         lines.append(
-            f"views left out ({novel['views']}, {novel['coverage']:.0%} foreground): PSNR {novel['psnr']:.2f} dB, "
-            f"foreground {novel['psnr_foreground']:.2f} dB, SSIM {_number(novel['ssim'])}, "
-            f"FLIP {_number(novel['flip'])}, LPIPS {_number(novel['lpips'])}"
+            f"views left out ({novel['views']}, {novel['coverage']:.0%} foreground): "
+            f"PSNR {_number(novel['psnr'], 2)} dB, foreground {_number(novel['psnr_foreground'], 2)} dB, "
+            f"SSIM {_number(novel['ssim'])}, FLIP {_number(novel['flip'])}, LPIPS {_number(novel['lpips'])}"
         )
     if geometry := report["geometry"]:
         lines.append(_shape("shape", geometry))
@@ -271,9 +269,9 @@ def table(report: dict[str, Any]) -> list[str]:
     if materials := report["materials"]:
         scale = ", ".join(f"{factor:.2f}" for factor in materials["albedo_scale"])
         lines.append(
-            f"materials: albedo PSNR {materials['albedo_psnr']:.2f} dB, {materials['albedo_psnr_scaled']:.2f} dB "
-            f"scaled (by {scale}); RMSE of roughness {_number(materials.get('roughness_rmse'))}, "
-            f"of metallic {_number(materials.get('metallic_rmse'))}"
+            f"materials: albedo PSNR {_number(materials['albedo_psnr'], 2)} dB, "
+            f"{_number(materials['albedo_psnr_scaled'], 2)} dB scaled (by {scale}); RMSE of roughness "
+            f"{_number(materials.get('roughness_rmse'))}, of metallic {_number(materials.get('metallic_rmse'))}"
         )
     if report["lights"]:
         lines += ["", "PSNR in dB        |  foreground     |  all, on white         |"]
@@ -281,17 +279,18 @@ def table(report: dict[str, Any]) -> list[str]:
         for row in report["lights"]:
             raw, scaled = row["raw"], row["scaled"]
             name = row["light"] + (" posed" if row["posed"] else "") + ("*" if row["training_light"] else "")
+            figures = [raw["foreground"], scaled["foreground"], raw["full"], scaled["full"], row["published"]]
+            a, b, c, d, e = (f"{_number(figure, 2):>6}" for figure in figures)
             lines.append(
-                f"{name:<18}| {raw['foreground']:6.2f} {scaled['foreground']:6.2f}   | {raw['full']:6.2f} "
-                f"{scaled['full']:6.2f} {row['published']:6.2f}  | {_number(row['ssim'])}  {_number(row['flip'])}  "
+                f"{name:<18}| {a} {b}   | {c} {d} {e}  | {_number(row['ssim'])}  {_number(row['flip'])}  "
                 f"{_number(row['lpips'])}"
             )
         lines.append("* the light of the training views. SSIM, FLIP and LPIPS are of the scaled pictures on white.")
     return lines
 
 
-def _number(value: float | None) -> str:
-    return "not computed" if value is None else f"{value:.4f}"
+def _number(value: float | None, places: int = 4) -> str:
+    return "not computed" if value is None else f"{value:.{places}f}"
 
 
 def _shape(name: str, geometry: dict[str, float]) -> str:

@@ -28,10 +28,17 @@ def psnr(picture: Array, reference: Array, mask: Array | None = None) -> float:
     ----------
     picture, reference : (h, w, c) or (n, h, w, c), in any one encoding; several are one set of pixels
     mask : (h, w) or (n, h, w) bool, pixels that count
+
+    Returns
+    -------
+    float
+        At most `MOST_PSNR`; NaN where no pixel counts, or one is NaN.
     """
     squared = (np.asarray(picture, np.float64) - reference) ** 2
-    error = squared.mean() if mask is None else squared[mask].mean() if mask.any() else 0.0
-    return float(min(MOST_PSNR, -10 * np.log10(max(error, 1e-30))))
+    if mask is not None:
+        squared = squared[mask]
+    error = squared.mean() if squared.size else np.nan
+    return float(np.minimum(MOST_PSNR, -10 * np.log10(np.maximum(error, 1e-30))))  # unlike Python's, these keep NaN
 
 
 def ssim(picture: Array, reference: Array) -> float:
@@ -89,13 +96,15 @@ def material_scores(found: dict[str, Array], true: dict[str, Array], mask: Array
     Returns
     -------
     dict
-        Albedo PSNR of linear values, raw and with one factor a channel for all views (also given); RMSE of the others.
+        Albedo PSNR of linear values, raw and with one factor a channel for all views (also given); RMSE of the others;
+        NaN where the mask is empty.
     """
     a, b = found["albedo"][mask], true["albedo"][mask]
     scale = fit_scale(a, b)
 
     def rmse(name: str) -> float:
-        return float(np.sqrt(np.mean((found[name][mask].astype(np.float64) - true[name][mask]) ** 2)))
+        squared = (found[name][mask].astype(np.float64) - true[name][mask]) ** 2
+        return float(np.sqrt(squared.mean())) if squared.size else float("nan")
 
     return {
         "albedo_psnr": psnr(a, b),
@@ -158,12 +167,15 @@ def on_white(linear: Array, alpha: Array) -> Array:
 
 
 def mean_psnr(
-    pictures: Sequence[Array] | Array, references: Sequence[Array] | Array, masks: Array | None = None
+    pictures: Sequence[Array] | Array,
+    references: Sequence[Array] | Array,
+    masks: Sequence[Array] | Array | None = None,
 ) -> float:
-    """Mean of the PSNR of each picture."""
+    """Mean of the PSNR of each picture; with masks, of those where one has pixels, NaN where none has."""
     if masks is None:
         return float(np.mean([psnr(a, b) for a, b in zip(pictures, references)]))
-    return float(np.mean([psnr(a, b, m) for a, b, m in zip(pictures, references, masks) if m.any()]))
+    found = [psnr(a, b, m) for a, b, m in zip(pictures, references, masks) if m.any()]
+    return float(np.mean(found)) if found else float("nan")
 
 
 def _both(pictures: Array, references: Array, inside: Array) -> dict[str, float]:

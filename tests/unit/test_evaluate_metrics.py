@@ -28,6 +28,18 @@ def test_psnr_is_of_all_channels_at_once():
     assert metrics.mean_psnr([a, a], [b, a]) == pytest.approx((metrics.psnr(a, b) + metrics.MOST_PSNR) / 2)
 
 
+def test_pictures_that_are_no_numbers_and_no_pixels_are_not_taken_for_equal():
+    """As those of an object that is nowhere near the true one; the best figure of all was theirs."""
+    a, none = np.ones((2, 4, 4, 3)), np.zeros((2, 4, 4), bool)
+    assert math.isnan(metrics.psnr(a * np.nan, a)) and math.isnan(metrics.psnr(a, a, none))
+    assert math.isnan(metrics.mean_psnr(a, a, none)) and math.isnan(metrics.mean_psnr([a[0] * np.nan, a[0]], a))
+    materials = {"albedo": a, "roughness": a[..., 0]}
+    scores = metrics.material_scores(materials, materials, none)
+    assert all(math.isnan(scores[name]) for name in ("albedo_psnr", "albedo_psnr_scaled", "roughness_rmse"))
+    scores = metrics.relight_scores(a, a[..., 0], a, 0 * a[..., 0])
+    assert math.isnan(scores["raw"]["foreground"]) and scores["raw"]["full"] == metrics.MOST_PSNR
+
+
 def test_ssim_is_that_of_the_paper():
     # A direct sum over the 11 x 11 Gaussian window of Wang et al., away from the border.
     rng = np.random.default_rng(1)

@@ -167,6 +167,9 @@ def test_a_published_set_is_scored_under_the_lights_that_are_named(tmp_path):
     assert report["materials"]["albedo_psnr"] > 60 and "metallic_rmse" not in report["materials"]
     assert any("night" in line for line in table(report))
     json.dumps(report, allow_nan=False)
+    nowhere = compare(asset, capture, Truth([relit]), lambda *about: {k: 0 * v for k, v in renderer(*about).items()})
+    assert nowhere["materials"]["albedo_psnr"] is None and nowhere["geometry"]["silhouette_iou"] == 0
+    assert any("albedo PSNR not computed" in line for line in table(nowhere))
     with pytest.raises(UsageError, match=r"nothing to compare.* no light of its own.*--relit"):
         compare(asset, capture, None, renderer)
     with pytest.raises(UsageError, match=r"nothing to compare.* no views left out.*--test-every"):
