@@ -8,9 +8,9 @@ A.preview.png, shows a view as it is now and its photograph.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import logging
 import math
-import shutil
 import sys
 import time
 from pathlib import Path
@@ -133,8 +133,10 @@ def run(args: argparse.Namespace) -> int:
         except (Cancelled, KeyboardInterrupt):
             note("the same command goes on from here")
             raise
+        finally:
+            _remove_if_empty(work)  # where there is nothing to go on from
     write_and_report(args.out, asset)
-    shutil.rmtree(work, ignore_errors=True)
+    _clear(work)
     report = asset.provenance["report"]
     if "psnr" in report:
         # Not what `drgs evaluate` says, which renders the asset under the light that was found.
@@ -143,6 +145,20 @@ def run(args: argparse.Namespace) -> int:
         shown = report["decoupling"]["psnr"]
         print(f"  materials in the light that was found, pixels learned from: PSNR {shown:.2f} dB")
     return 0
+
+
+def _clear(folder: Path) -> None:
+    """Remove what a run kept to go on from, and nothing else: a folder of this name may have been there before."""
+    for pattern in ("*.state", ".*.state.*.tmp"):  # the latter of runs that were killed
+        for file in folder.glob(pattern):
+            with contextlib.suppress(OSError):
+                file.unlink()
+    _remove_if_empty(folder)
+
+
+def _remove_if_empty(folder: Path) -> None:
+    with contextlib.suppress(OSError):
+        folder.rmdir()
 
 
 class _Teller:

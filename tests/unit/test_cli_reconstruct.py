@@ -5,12 +5,15 @@ from __future__ import annotations
 import ctypes
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
 
 pytest.importorskip("torch")
 pytest.importorskip("skimage")
@@ -18,6 +21,7 @@ pytest.importorskip("skimage")
 from capture_cases import balls, write
 
 from drgs_blender.cli.interrupt import interruptible
+from drgs_blender.cli.main import main
 from drgs_blender.errors import Cancelled
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="signals and terminals of POSIX")
@@ -68,6 +72,20 @@ def test_a_run_that_is_stopped_early_goes_on(photographs, tmp_path, number, code
         assert "the same command goes on from here" in said[-1]
     assert "going on" not in said[0]
     assert "an earlier run was stopped" in said[1] and "surfels: going on at step" in said[1]
+
+
+def test_what_lies_where_the_run_keeps_its_own_stays(photographs, tmp_path, capsys):
+    """As photographs in a folder that is named like the one beside the asset; a run that failed leaves nothing."""
+    mine = tmp_path / "a.reconstruct"
+    shutil.copytree(photographs, mine)
+    before = {file.name for file in mine.iterdir()}
+    options = ["--surfels", "400", "--voxels", "24", "--iterations", "4", "--no-materials"]
+    assert main(["reconstruct", str(mine), "--out", str(tmp_path / "a.drgs"), *options]) == 0
+    assert {file.name for file in mine.iterdir()} == before
+    for picture in mine.glob("*.png"):
+        Image.fromarray(np.zeros((32, 32, 4), np.uint8)).save(picture)
+    assert main(["reconstruct", str(mine), "--out", str(tmp_path / "b.drgs"), *options]) == 65
+    assert "b.reconstruct" not in {file.name for file in tmp_path.iterdir()}
 
 
 def test_a_signal_is_not_lost_in_a_callback_from_c_and_a_second_one_ends_at_once():
