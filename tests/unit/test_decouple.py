@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -509,6 +510,25 @@ def test_an_interrupted_run_ends_where_an_undisturbed_one_does(ball, capture, tm
         assert np.array_equal(a, b)
     other = decouple(capture, ball, replace(settings, seed=1))
     assert not np.array_equal(other.albedo, whole.albedo)
+
+
+def test_a_run_whose_time_was_up_when_it_was_stopped_still_knows_how_good_it_is(ball, capture, tmp_path, monkeypatch):
+    clock, tick = [0.0], [1.0]
+
+    def monotonic() -> float:
+        clock[0] += tick[0]
+        return clock[0]
+
+    monkeypatch.setattr("drgs_blender.reconstruct.decouple.run.time", SimpleNamespace(monotonic=monotonic))
+    settings, path = replace(SMALL, iterations=1000, seconds=100.0), tmp_path / "materials.state"
+    asked = []
+    with pytest.raises(Cancelled):
+        decouple(capture, ball, settings, cancelled=lambda: asked.append(0) or len(asked) > 5, checkpoint=path)
+    tick[0] = 100.0
+    report = decouple(capture, ball, settings, checkpoint=path).report
+    assert report["iterations"] == 5 and 5 < report["psnr"] < 60
+    report = decouple(capture, ball, settings).report
+    assert report["iterations"] == 1 and 5 < report["psnr"] < 60
 
 
 def test_a_damaged_or_foreign_checkpoint_is_not_used(ball, capture, tmp_path, caplog):

@@ -169,8 +169,7 @@ class _Job:
             self._parameters["exposure"] = torch.zeros(len(capture.training))
         self._adam = Adam(self._learned())
         self._views = len(capture.training)
-        self.iteration, self.loss, self.psnr = 0, float("nan"), float("nan")
-        self._error = float("nan")
+        self.iteration, self.loss, self._error = 0, float("nan"), float("nan")
         self._aimed = np.ones((2, 4, 3), np.float32)
         self._spent, self._began, self._saved = 0.0, time.monotonic(), time.monotonic()
         self._key = states.fingerprint(capture, mesh=_digest(mesh), **asdict(settings))
@@ -187,9 +186,14 @@ class _Job:
         done = self.iteration / self._settings.iterations
         return max(done, self._elapsed / self._settings.seconds) if self._settings.seconds > 0 else done
 
+    @property
+    def psnr(self) -> float:
+        """Of the pixels of the last steps, dB in sRGB; NaN before the first."""
+        return float(-10 * np.log10(np.maximum(self._error, 1e-12)))
+
     def going(self) -> bool:
-        """Whether there are steps left."""
-        return self.part < 1
+        """Whether there are steps left; the first one is taken however short the time, or nothing would be known."""
+        return self.iteration == 0 or self.part < 1
 
     def step(self) -> None:
         """One step of the optimiser."""
@@ -288,7 +292,6 @@ class _Job:
         first = not self._error >= 0
         self.loss = loss if first else 0.95 * self.loss + 0.05 * loss
         self._error = error if first else 0.95 * self._error + 0.05 * error
-        self.psnr = float(-10 * np.log10(max(self._error, 1e-12)))
 
     def result(self) -> Decoupled:
         """What has been learned so far."""
