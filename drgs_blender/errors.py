@@ -15,6 +15,9 @@ EXIT_INTERNAL = 70
 EXIT_CANNOT_WRITE = 73
 EXIT_RETRY = 75
 EXIT_VERSION = 78
+#: As shells count: 128 and the number of the signal, SIGINT's and SIGTERM's.
+EXIT_INTERRUPTED = 130
+EXIT_TERMINATED = 143
 
 #: Exit code -> word in the last line of ``drgs render`` and ``drgs denoise``, which farms parse.
 EXIT_CLASSES = {
@@ -26,8 +29,8 @@ EXIT_CLASSES = {
     EXIT_CANNOT_WRITE: "cannot-write",
     EXIT_RETRY: "retry",
     EXIT_VERSION: "version",
-    130: "interrupted",
-    143: "terminated",
+    EXIT_INTERRUPTED: "interrupted",
+    EXIT_TERMINATED: "terminated",
 }
 
 

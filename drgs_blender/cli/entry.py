@@ -12,8 +12,9 @@ def main() -> int:
 
         return run()
     except KeyboardInterrupt:
+        from ..errors import EXIT_INTERRUPTED
         from .frame_lines import say, say_end
 
         say("drgs: interrupted\n", sys.stderr)
-        say_end(sys.argv[1:], 130)
-        return 130
+        say_end(sys.argv[1:], EXIT_INTERRUPTED)
+        return EXIT_INTERRUPTED

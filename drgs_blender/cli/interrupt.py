@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable, Iterator
 from types import FrameType
 
-from ..errors import Cancelled
+from ..errors import EXIT_TERMINATED, Cancelled
 
 
 @contextlib.contextmanager
@@ -45,5 +45,5 @@ def interruptible() -> Iterator[Callable[[], bool]]:
 
 def _end(number: int) -> None:
     if number == signal.SIGTERM:
-        sys.exit(143)
+        sys.exit(EXIT_TERMINATED)
     raise KeyboardInterrupt

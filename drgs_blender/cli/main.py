@@ -130,7 +130,7 @@ def run_command(arguments: Sequence[str], run: Callable[[argparse.Namespace], in
         args.progress = getattr(args, "progress", None)
         args.words = list(arguments)
         set_up_logging(verbose, args.quiet)
-        previous = signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+        previous = signal.signal(signal.SIGTERM, lambda *_: sys.exit(errors.EXIT_TERMINATED))
         try:
             return (run or args.run)(args)
         finally:
@@ -140,7 +140,7 @@ def run_command(arguments: Sequence[str], run: Callable[[argparse.Namespace], in
         return error.exit_code
     except (KeyboardInterrupt, errors.Cancelled):
         say("drgs: interrupted\n", sys.stderr)
-        return 130
+        return errors.EXIT_INTERRUPTED
     except BrokenPipeError:
         sys.stdout = None  # the reader left; nothing may be flushed at exit
         return 141

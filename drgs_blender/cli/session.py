@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..asset.archive import replace_file
-from ..errors import EngineError, UsageError
+from ..errors import EXIT_INTERRUPTED, EXIT_TERMINATED, EngineError, UsageError
 from . import sampling
 from .session_link import POLL_SECONDS, Lock, end, is_running, own_folder
 
@@ -88,7 +88,7 @@ def serve(folder: Path, idle: int) -> int:
     """Render what is asked for, until the session ends."""
     from .machine import Machine
 
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(EXIT_TERMINATED))
     with Machine(keep=True) as machine:
         machine.engine().start()
         life = _Life(folder, idle, _take_over(folder))
@@ -99,7 +99,7 @@ def serve(folder: Path, idle: int) -> int:
                     code = _answer(folder, about, machine)
                 replace_file(folder / f"{about['name']}.code", [str(code).encode()])
                 request.unlink(missing_ok=True)
-                if code in (130, 143):  # it was asked to end while it worked
+                if code in (EXIT_INTERRUPTED, EXIT_TERMINATED):  # it was asked to end while it worked
                     return 0
             time.sleep(POLL_SECONDS)
 
