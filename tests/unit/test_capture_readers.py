@@ -325,6 +325,14 @@ def test_missing_images_are_counted_and_named(tmp_path):
     captures.write_llff(scene)
     (scene.folder / "images" / "005.png").unlink()
     refused(scene.folder, "12 cameras", "images: 11")
+    scene = captures.make(tmp_path / "nero")
+    captures.write_nero(scene)
+    (scene.folder / "7.png").unlink()
+    refused(scene.folder, "1 of 12 images", "7.png")
+    scene = captures.make(tmp_path / "tensoir")
+    captures.write_tensoir(scene)
+    (scene.folder / "train_005" / "rgba_sunset.png").unlink()
+    refused(scene.folder, "1 of 12 images", "train_005/rgba_sunset.png")
 
 
 def test_masks_and_photographs_of_another_shape_are_refused(tmp_path):
