@@ -33,7 +33,7 @@ from .relief import follow_normals, shaded_by
 from .silhouette import fill_silhouettes
 from .targets import background_of, composed
 from .train import Schedule, Training
-from .tsdf import fuse
+from .tsdf import fuse, grid
 
 log = logging.getLogger(__name__)
 
@@ -130,6 +130,7 @@ def reconstruct(
     settings = settings or Settings()
     work = _Work(capture, settings, on_progress or (lambda _: None), cancelled or (lambda: False), folder)
     region = find_region(capture)
+    grid([view.camera for view in capture.training], region, settings.mesh_resolution)  # before minutes of learning
     if settings.minutes is not None:
         log.info("compiling kernels (first run only)")
         work.tell(Progress("compiling kernels", 0.0))

@@ -64,14 +64,7 @@ def fuse(gaussians: Gaussians, cameras: list[Camera], region: Region, resolution
         from skimage.measure import marching_cubes
     except ImportError as error:
         raise DeviceError("a mesh", "needs scikit-image", "Install it: pip install scikit-image") from error
-    side = float((region.high - region.low).max())
-    pixel = [float(np.linalg.norm(np.asarray(c.matrix_world)[:3, 3] - region.centre)) / c.fx for c in cameras]
-    voxel = max(side / resolution, PIXELS * float(np.quantile(pixel, 0.25)))
-    low, high = region.low - _AROUND * voxel, region.high + _AROUND * voxel
-    shape = tuple(int(n) for n in np.ceil((high - low) / voxel).astype(int) + 1)
-    around = 2 * _AROUND + 2
-    needed = _BYTES_A_VOXEL * float(np.prod(shape))
-    check_fits(needed, "the mesh", "voxels", "--voxels", max(shape) - around, 3, around)
+    low, voxel, shape = grid(cameras, region, resolution)
     total, weight = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
     for begin in range(0, len(cameras), TOGETHER):
         batch = cameras[begin : begin + TOGETHER]
@@ -91,6 +84,24 @@ def fuse(gaussians: Gaussians, cameras: list[Camera], region: Region, resolution
     report = {"voxel": voxel, "components_dropped": dropped, "volume": volume, "vertices": n, "faces": len(faces)}
     log.info("mesh: %s", report)
     return Mesh(vertices, faces, np.full((n, 3), 0.5), np.full(n, 0.5), np.zeros(n)), report
+
+
+def grid(cameras: list[Camera], region: Region, resolution: int = 256) -> tuple[Array, float, tuple[int, ...]]:
+    """First corner (3,) and side of the voxels of `fuse`, metres, and how many there are along each axis.
+
+    Raises
+    ------
+    UsageError: more than the memory holds.
+    """
+    side = float((region.high - region.low).max())
+    pixel = [float(np.linalg.norm(np.asarray(c.matrix_world)[:3, 3] - region.centre)) / c.fx for c in cameras]
+    voxel = max(side / resolution, PIXELS * float(np.quantile(pixel, 0.25)))
+    low, high = region.low - _AROUND * voxel, region.high + _AROUND * voxel
+    shape = tuple(int(n) for n in np.ceil((high - low) / voxel).astype(int) + 1)
+    around = 2 * _AROUND + 2
+    needed = _BYTES_A_VOXEL * float(np.prod(shape))
+    check_fits(needed, "the mesh", "voxels", "--voxels", max(shape) - around, 3, around)
+    return low, voxel, shape
 
 
 def surface_maps(gaussians: Gaussians, camera: Camera) -> tuple[Array, Array]:

@@ -16,7 +16,7 @@ from capture_cases import balls, colour_of_balls, distance_to_balls, write  # no
 
 from drgs_blender.asset.container import read_asset, write_asset  # noqa: E402
 from drgs_blender.colour import linear_to_srgb  # noqa: E402
-from drgs_blender.errors import AssetError, Cancelled, WriteError  # noqa: E402
+from drgs_blender.errors import AssetError, Cancelled, UsageError, WriteError  # noqa: E402
 from drgs_blender.geometry import VertexNormals  # noqa: E402
 from drgs_blender.reconstruct.capture import Capture  # noqa: E402
 from drgs_blender.reconstruct.checkpoint import fingerprint  # noqa: E402
@@ -228,6 +228,14 @@ def test_what_cannot_be_reconstructed_is_refused_by_name(case):
         text = "black"
     with pytest.raises(AssetError, match=text):
         reconstruct(capture, Settings(schedule=Schedule(iterations=2)))
+
+
+def test_more_voxels_than_memory_are_refused_before_anything_is_learned(capture, monkeypatch):
+    monkeypatch.setattr("drgs_blender.reconstruct.memory.memory", lambda: 1024.0)
+    told = []
+    with pytest.raises(UsageError, match="--voxels"):
+        reconstruct(capture, Settings(schedule=Schedule(iterations=2), materials=False), told.append)
+    assert not told
 
 
 def test_the_command_writes_an_asset_and_its_preview(tmp_path, capsys, monkeypatch):
