@@ -1,4 +1,4 @@
-"""The names of files that are read and written, for file dialogs and drag and drop; `formats` knows what is in them."""
+"""The names of files that are read and written, and of cameras in them; `formats` knows what is in files."""
 
 from __future__ import annotations
 
@@ -69,6 +69,14 @@ WRITTEN: dict[str, WriteType] = {
     "glTF mesh": WriteType((".glb",), "mesh", "y", True),
     "USD mesh": WriteType((".usdz",), "mesh", "z", True),
     "OpenEXR": WriteType((".exr",), "environment", "z", True),
+}
+
+#: What the matrices in files of cameras may be, and their axes; `reconstruct.readers` turns them.
+CAMERAS: dict[str, str] = {
+    "opengl": "camera to world, y up, z backward",
+    "opencv": "camera to world, y down, z forward",
+    "opengl-inverse": "world to camera, y up, z backward",
+    "opencv-inverse": "world to camera, y down, z forward",
 }
 
 

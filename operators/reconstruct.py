@@ -9,9 +9,22 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, St
 
 from ..addon import assets, engine_link, reconstruction
 from ..drgs_blender.errors import UsageError
+from ..drgs_blender.filetypes import CAMERAS
 from .base import DrgsOperator
 from .import_asset import import_assets
 from .program import ProgramOperator
+
+
+def _title(cameras: str) -> str:
+    """As "OpenCV, Inverse"."""
+    return cameras.replace("opencv", "OpenCV").replace("opengl", "OpenGL").replace("-inverse", ", Inverse")
+
+
+#: Choices of what the cameras' matrices are.
+_CAMERAS = (
+    ("opengl", "As the Layout", "The convention of the files' layout"),
+    *((name, _title(name), meaning.capitalize()) for name, meaning in CAMERAS.items() if name != "opengl"),
+)
 
 
 class DRGS_OT_reconstruct(ProgramOperator, bpy.types.Operator):
@@ -54,12 +67,7 @@ class DRGS_OT_reconstruct(ProgramOperator, bpy.types.Operator):
     axes: EnumProperty(
         name="Cameras",
         description="What the cameras' matrices are taken for; a message names it (--axes) where another one fits",
-        items=(
-            ("opengl", "As the Layout", "The convention of the files' layout"),
-            ("opencv", "OpenCV", "Camera to world, Y down, Z forward"),
-            ("opengl-inverse", "OpenGL, Inverse", "World to camera, Y up, Z backward"),
-            ("opencv-inverse", "OpenCV, Inverse", "World to camera, Y down, Z forward"),
-        ),
+        items=_CAMERAS,
         default="opengl",
         options={"SKIP_SAVE"},
     )

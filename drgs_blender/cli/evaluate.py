@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import UsageError
+from ..filetypes import CAMERAS
 from ..formats.axes import UP_AXES
 from ..frame import Camera, Frame, ObjectState, RenderSettings, Visibility, World
 from . import sampling
@@ -49,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--resolution", type=sampling.whole(8, 65536), metavar="N", help="longer side of the views left out"
     )
-    parser.add_argument("--axes", default="opengl", help="as given to drgs reconstruct")
+    parser.add_argument("--axes", choices=tuple(CAMERAS), default="opengl", help="as given to drgs reconstruct")
     parser.add_argument("--up", choices=tuple(UP_AXES), help="as given to drgs reconstruct")
     parser.add_argument(
         "--lpips",

@@ -16,6 +16,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..filetypes import CAMERAS
 from ..formats.axes import UP_AXES
 from .frame_lines import say
 from .interrupt import interruptible
@@ -73,10 +74,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--axes",
+        choices=tuple(CAMERAS),
         default="opengl",
-        metavar="NAME",
-        help="what the cameras' matrices are taken for: opengl (default: the convention of the layout), opencv, "
-        "opengl-inverse, opencv-inverse",
+        help="what the cameras' matrices are taken for; default opengl: the convention of the layout",
     )
     parser.add_argument("--up", choices=tuple(UP_AXES), help="up axis of the capture's world; default: found")
 

@@ -89,6 +89,10 @@ def test_what_is_no_capture_is_said(scene, tmp_path):
 
 def test_the_convention_that_a_message_names_can_be_chosen(scene, photographs):
     """Matrices of OpenCV: refused with the name of the choice, which is one of the operator's and then serves."""
+    choices = bpy.ops.drgs.reconstruct.get_rna_type().properties["axes"].enum_items
+    titles = {"opengl": "As the Layout", "opencv": "OpenCV", "opengl-inverse": "OpenGL, Inverse"}
+    assert {item.identifier: item.name for item in choices} == titles | {"opencv-inverse": "OpenCV, Inverse"}
+    assert choices["opencv"].description == "Camera to world, y down, z forward"
     file = photographs / "transforms.json"
     capture = json.loads(file.read_text())
     for frame in capture["frames"]:

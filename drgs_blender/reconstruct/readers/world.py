@@ -9,24 +9,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...errors import AssetError
+from ...filetypes import CAMERAS
 from ..capture import View
 from .layout import OPENCV_TO_BLENDER, invert
 
 Array = np.ndarray
 logger = logging.getLogger(__name__)
 
-#: Name -> what brings the matrices of a file to camera-to-world with Blender's axes.
+#: Name, of `CAMERAS` -> what brings the matrices of a file to camera-to-world with Blender's axes.
 AXES = {
     "opengl": lambda matrix: matrix,
     "opencv": lambda matrix: matrix @ OPENCV_TO_BLENDER,
     "opengl-inverse": invert,
     "opencv-inverse": lambda matrix: invert(matrix) @ OPENCV_TO_BLENDER,
-}
-_MEANING = {
-    "opengl": "camera to world, y up, z backward",
-    "opencv": "camera to world, y down, z forward",
-    "opengl-inverse": "world to camera, y up, z backward",
-    "opencv-inverse": "world to camera, y down, z forward",
 }
 #: Views, cells and pixels along a side of the test of silhouettes.
 _VIEWS, _CELLS, _SIDE = 16, 36, 40
@@ -122,7 +117,7 @@ def check_silhouettes(views: Sequence[View], subject: str, axes: str) -> None:
     if scores[best] > _RIGHT:
         problem = (
             f"has cameras whose silhouettes do not meet ({score:.0%} explained; {scores[best]:.0%} if the matrices are "
-            f"{_MEANING[best]})"
+            f"{CAMERAS[best]})"
         )
         raise AssetError(subject, problem, f"Give --axes {best}")
     if score < _NOWHERE and np.mean([shape.whole for shape in outlines]) > 0.5:
