@@ -58,7 +58,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--minutes", type=_minutes, metavar="M", help="all stages together, about, once kernels are compiled"
     )
     parser.add_argument(
-        "--test-every", type=whole(2, 10**6), metavar="K", help="leave out every K-th view, and measure on those"
+        "--test-every",
+        type=whole(2, 10**6),
+        metavar="K",
+        help="leave out every K-th view, and measure on those; if the capture does not say which",
     )
     parser.add_argument(
         "--materials",

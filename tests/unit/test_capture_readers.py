@@ -50,15 +50,24 @@ def test_every_layout_gives_the_cameras_and_pixels_it_was_written_from(tmp_path,
     assert all(np.allclose(view.colour[view.mask == 0], capture.background) for view in capture.views)
 
 
-def test_a_set_made_for_learning_and_one_for_testing(tmp_path):
+def test_a_set_made_for_learning_and_one_for_testing(tmp_path, caplog):
     scene = captures.make(tmp_path)
     captures.write_nerf(scene, "train")
     captures.write_nerf(captures.make(tmp_path, 5), "test")
     capture = read_capture(tmp_path, test_every=2)  # the files' own split counts
+    assert "says itself which views are left out" in caplog.text
     assert (len(capture.training), len(capture.testing)) == (12, 5)
     assert {view.name for view in capture.testing} == {f"test/r_{k}" for k in range(5)}
     alone = read_capture(tmp_path / "transforms_train.json", test_every=4)
     assert [view.name for view in alone.testing] == ["r_0", "r_4", "r_8"]  # r_10 comes after r_9
+    assert len(caplog.records) == 1
+
+
+def test_a_split_that_leaves_nothing_out_is_none(tmp_path):
+    captures.write_tensoir(captures.make(tmp_path))
+    for k, folder in enumerate(sorted(tmp_path.glob("test_*"))):
+        folder.rename(tmp_path / f"train_{4 * k:03d}")
+    assert [view.name for view in read_capture(tmp_path, test_every=6).testing] == ["train_000", "train_006"]
 
 
 def test_sparse_points_turn_with_the_cameras(tmp_path):

@@ -108,9 +108,12 @@ def read_capture(
             "Draw masks if it has parts of that colour",
             path,
         )
-    if not layout.split and test_every is not None:
-        for index, view in enumerate(views):
-            view.test = index % test_every == 0
+    if test_every is not None:
+        if len({view.test for view in views}) > 1:
+            logger.warning("%s: says itself which views are left out; every %d-th is not", path, test_every)
+        else:
+            for index, view in enumerate(views):
+                view.test = index % test_every == 0
     learned = [view for view in views if not view.test]
     check_silhouettes(learned, str(path), axes)
     if all(view.mask is None for view in learned):

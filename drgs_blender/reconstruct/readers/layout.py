@@ -68,14 +68,12 @@ class Layout:
     ----------
     photographs : at least one
     upright : the world is known to be Z up; else "up" is found from the cameras
-    split : `Photograph.test` says which are left out
     points : (n, 3) float64 sparse points in the capture's world, or None
     decode_mask : reads a mask file to (h, w) float32 in 0..1
     """
 
     photographs: list[Photograph]
     upright: bool
-    split: bool = False
     points: Array | None = None
     decode_mask: Callable[[Path], Array] = decode_mask
 

@@ -73,7 +73,7 @@ def read(path: Path) -> Layout:
         depth = path / f"{k}-depth.png"
         mask = depth if depth.is_file() else None
         photographs.append(Photograph(f"{k:03d}", path / f"{k}.png", matrix, lens, mask, k % _TEST_EVERY == 0))
-    return Layout(photographs, upright=True, split=True, decode_mask=_nearer_than_background)
+    return Layout(photographs, upright=True, decode_mask=_nearer_than_background)
 
 
 def _camera(path: Path) -> tuple[Array, Array]:

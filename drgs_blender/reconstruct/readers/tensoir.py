@@ -48,7 +48,7 @@ def read(path: Path, light: str | None = None) -> Layout:
         lens = Lens(width, height, focal, focal, width / 2, height / 2)
         test = folder.name.startswith("test")
         photographs.append(Photograph(folder.name, folder / chosen, rigid(matrix, str(file)), lens, None, test))
-    return Layout(photographs, upright=True, split=True)
+    return Layout(photographs, upright=True)
 
 
 def _is_view(folder: Path) -> bool:

@@ -58,20 +58,20 @@ def sniff(path: Path) -> bool:
 def read(path: Path) -> Layout:
     """Read a folder, or one file. Raises AssetError."""
     if path.is_file():
-        photographs, synthetic, split = _read_file(path, False, prefix=False)
-        return Layout(photographs, upright=synthetic, split=split)
+        photographs, synthetic = _read_file(path, False, prefix=False)
+        return Layout(photographs, upright=synthetic)
     row = next(row for row in _FILES if any((path / name).is_file() for name, _ in row))
-    photographs, synthetic, split = [], True, False
+    photographs, synthetic = [], True
     present = [(path / name, test) for name, test in row if (path / name).is_file()]
     for file, test in present:
-        found, of_blender, named = _read_file(file, test, prefix=len(present) > 1)
+        found, of_blender = _read_file(file, test, prefix=len(present) > 1)
         photographs += found
-        synthetic, split = synthetic and of_blender, split or named
-    return Layout(photographs, upright=synthetic, split=split or len(present) > 1)
+        synthetic = synthetic and of_blender
+    return Layout(photographs, upright=synthetic)
 
 
-def _read_file(path: Path, test: bool, prefix: bool) -> tuple[list[Photograph], bool, bool]:
-    """(photographs, whether the file is NeRF-synthetic's, whether it says which are left out)."""
+def _read_file(path: Path, test: bool, prefix: bool) -> tuple[list[Photograph], bool]:
+    """(photographs, whether the file is NeRF-synthetic's)."""
     data = read_json(path)
     frames = data.get("frames")
     if isinstance(frames, dict):
@@ -106,7 +106,7 @@ def _read_file(path: Path, test: bool, prefix: bool) -> tuple[list[Photograph], 
         for index, photograph in enumerate(photographs):
             photograph.name = f"{index:04d}-{photograph.name}"
     synthetic = "camera_angle_x" in data and "fl_x" not in data and "fl_x" not in frames[0]
-    return photographs, synthetic, bool(left_out)
+    return photographs, synthetic
 
 
 def _check_shapes(photographs: list[Photograph], path: Path) -> None:
