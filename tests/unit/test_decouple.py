@@ -252,11 +252,18 @@ def test_albedo_along_edges_of_metal_is_evened_out_but_for_its_patterns_and_pain
     assert not blotches((ends[:, 0] - ends[:, 1]).abs().detach(), metallic, alike[:, None]).requires_grad
 
 
-@pytest.mark.parametrize(("parametrisation", "alike"), [("metallic", False), ("dielectric", True)])
-def test_only_what_may_be_metal_is_smoothed_as_metals(ball, capture, parametrisation, alike):
-    settings = replace(SMALL, parametrisation=parametrisation, polish=0.0)
-    found = [decouple(capture, ball, replace(settings, plain_metals=weight)).albedo for weight in (0.0, 5.0)]
-    assert np.array_equal(*found) == alike
+@pytest.mark.parametrize("weight", ["plain_metals", "polish"])
+def test_what_is_said_of_metals_begins_late_and_counts_for_nothing_else(ball, capture, weight, monkeypatch):
+    def alike(**other: str) -> bool:
+        settings = replace(SMALL, plain_metals=0.0, polish=0.0, **other)
+        return np.array_equal(
+            *(decouple(capture, ball, replace(settings, **{weight: value})).albedo for value in (0.0, 5.0))
+        )
+
+    assert not alike()
+    assert alike(parametrisation="dielectric")
+    monkeypatch.setattr("drgs_blender.reconstruct.decouple.run._METALS", 2.0)
+    assert alike()
 
 
 def test_pixels_beside_clipped_ones_are_known_by_channel_and_count_less(ball, capture):
