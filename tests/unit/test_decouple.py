@@ -569,6 +569,21 @@ def test_normals_are_the_meshs_where_none_are_learned(ball, capture):
     assert found.normals == pytest.approx(VertexNormals(ball.faces, len(ball.vertices))(ball.vertices), abs=1e-6)
 
 
+def test_normals_are_turned_towards_the_true_ones_once_light_is_known(ball, capture, monkeypatch):
+    """A ball with bumps that the photographed one has not."""
+    bumps = 1 + 0.1 * np.sin(3 * ball.vertices).prod(axis=1, keepdims=True)
+    wrong = replace(ball, vertices=(ball.vertices * bumps).astype(np.float32))
+    smooth = VertexNormals(wrong.faces, len(wrong.vertices))(wrong.vertices)
+    settings = replace(SMALL, iterations=150, pixels=512, environment=16, coarse=3, normals=True)
+
+    def off(normals: np.ndarray) -> float:
+        return float(np.median(np.degrees(np.arccos(np.clip((normals * ball.vertices).sum(axis=1), -1, 1)))))
+
+    assert off(decouple(capture, wrong, settings).normals) < 0.97 * off(smooth)
+    monkeypatch.setattr("drgs_blender.reconstruct.decouple.run._NORMALS", 2.0)
+    assert decouple(capture, wrong, replace(settings, iterations=3)).normals == pytest.approx(smooth, abs=1e-6)
+
+
 def test_bad_input_is_named(ball, capture):
     for wrong in ({"iterations": 0}, {"cosine": 3}, {"environment": 24}, {"smoothness": -1.0}, {"look": "flat"}):
         with pytest.raises(UsageError, match=next(iter(wrong))):
