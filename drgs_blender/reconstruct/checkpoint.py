@@ -14,20 +14,21 @@ from ..arrays import Array
 from ..asset.archive import replace_file
 from ..asset.tensors import decode, encode
 from ..errors import AssetError
+from ..version import __version__
 from .capture import Capture
 
 log = logging.getLogger(__name__)
 
 
 def fingerprint(capture: Capture, **settings: Any) -> str:
-    """Digest of what a state depends on: the photographs, their masks and cameras, and settings that JSON can hold."""
-    digest = hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode())
+    """Digest of what a state depends on: photographs, masks, cameras, settings that JSON can hold, and this version."""
+    digest = hashlib.sha256(__version__.encode() + json.dumps(settings, sort_keys=True, default=str).encode())
     for view in capture.views:
         camera = view.camera
         digest.update(f"{view.name} {view.test} {camera.width} {camera.height}".encode())
         digest.update(np.asarray(camera.matrix_world, np.float64).tobytes())
         digest.update(np.array([camera.fx, camera.fy, camera.cx, camera.cy]).tobytes())
-        digest.update(np.ascontiguousarray(view.colour[::7, ::7]).tobytes())
+        digest.update(np.ascontiguousarray(view.colour).tobytes())
         if view.mask is not None:
             digest.update(np.packbits(view.mask > 0.5).tobytes())
     return digest.hexdigest()
@@ -50,6 +51,6 @@ def load(path: Path, key: str) -> dict[str, Array] | None:
         log.warning("%s cannot be used (%s); starting anew", path, error)
         return None
     if found != key:
-        log.warning("%s belongs to other photographs or settings; starting anew", path)
+        log.warning("%s belongs to other photographs or settings, or another drgs; starting anew", path)
         return None
     return arrays

@@ -351,7 +351,9 @@ def test_growing_light_keeps_what_it_was():
     wave = light.log[5, :, 0] - light.log[5, :, 0].mean()
     assert wave.numpy() == pytest.approx(0.2 * torch.cos(fine).numpy(), abs=0.01)
     assert float(colour_cast(light.radiance())) == pytest.approx(0, abs=1e-6)
-    assert float(colour_cast(light.radiance() * torch.tensor([1.0, 0.5, 0.2]))) > 0.1
+    coloured = light.radiance() * torch.tensor([1.0, 0.5, 0.2])
+    assert float(colour_cast(coloured)) > 0.1
+    assert float(colour_cast(100 * coloured)) == pytest.approx(float(colour_cast(coloured)))
 
 
 # A small capture: a ball with a painted and a metal half.
@@ -461,6 +463,15 @@ def test_each_weight_makes_less_of_what_it_weighs(ball, capture, weight, value, 
     settings = replace(SMALL, iterations=40)
     without, with_it = (measure(decouple(capture, ball, replace(settings, **{weight: w}))) for w in (0.0, value))
     assert with_it < 0.8 * without, (with_it, without)
+
+
+def test_metallic_is_smoothed_more_than_other_materials(ball, capture, monkeypatch):
+    def spread() -> float:
+        return float(decouple(capture, ball, replace(SMALL, iterations=40, smoothness=0.05)).metallic.std())
+
+    more = spread()
+    monkeypatch.setattr("drgs_blender.reconstruct.decouple.run._SMOOTH", (1.0,) * 7)
+    assert more < 0.8 * spread()
 
 
 def test_exposures_of_photographs_are_found_again(ball, capture):

@@ -81,11 +81,19 @@ def test_the_capture_is_one_that_any_reader_takes(scenes):
     assert all(0.02 < view.mask.mean() < 0.6 for view in capture.views)
 
 
+def keys_of(report: object) -> set[str]:
+    """Of all dictionaries within."""
+    inner = report.values() if isinstance(report, dict) else report if isinstance(report, list) else ()
+    return set(report if isinstance(report, dict) else ()).union(*map(keys_of, inner))
+
+
 def test_the_true_object_scores_as_true(scenes, tmp_path, capsys):
     write_asset(tmp_path / "true.drgs", true_asset(scenes / "spot", density=20.0))
     arguments = ["evaluate", str(tmp_path / "true.drgs"), str(scenes / "spot"), "--primary", "mesh", "--rays", "64"]
     assert main([*arguments, "--json", "--pictures", str(tmp_path / "pictures")]) == 0
     report = json.loads(capsys.readouterr().out)
+    page = (ROOT / "docs" / "command-line.md").read_text(encoding="utf-8")
+    assert {key for key in keys_of(report) if f"`{key}`" not in page} == set()
     assert report["novel"]["psnr"] > 27 and report["novel"]["lpips"] is None
     for pose in ("geometry", "posed_geometry"):
         assert report[pose]["normal_degrees"] < 3 and report[pose]["depth_median"] < 2e-3

@@ -155,12 +155,18 @@ def test_a_damaged_or_foreign_checkpoint_is_not_used(capture, tmp_path, caplog):
     assert "other photographs or settings" in caplog.text
 
 
-def test_a_run_with_masks_drawn_anew_is_another(capture):
+def test_a_run_with_masks_drawn_anew_a_retouched_pixel_or_another_program_is_another(capture, monkeypatch):
     before = fingerprint(capture)
+    retouched = replace(capture, views=[replace(view, colour=view.colour.copy()) for view in capture.views])
+    assert fingerprint(retouched) == before
+    retouched.views[4].colour[20, 25] *= 0.9
+    assert fingerprint(retouched) != before
     other = replace(capture, views=[replace(view, mask=view.mask.copy()) for view in capture.views])
     assert fingerprint(other) == before
     other.views[4].mask[20, 25] = 1 - other.views[4].mask[20, 25].round()
     assert fingerprint(other) != before
+    monkeypatch.setattr("drgs_blender.reconstruct.checkpoint.__version__", "0.0.9")
+    assert fingerprint(capture) != before
 
 
 def test_a_file_where_checkpoints_should_be_is_told_by_name(capture, tmp_path):
