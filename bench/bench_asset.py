@@ -1,6 +1,6 @@
 """Photographs to assets, all stages: views left out, relit, relit and deformed, materials and shape against the truth.
 
-python bench/bench_asset.py --scenes scenes [--objects spot fern] [--minutes 7 | --steps 3000 2500] [--rays 128]
+python bench/bench_asset.py --scenes scenes [--objects spot fern] [--minutes 7 | --steps 3000 2500] [--variant m]
 
 Scenes are those of `drgs evaluate --make-scenes scenes`. Rows are kept, so that objects may be measured one by one. An
 object of 256 pixels takes its minutes and three more for the pictures that score it.
@@ -38,9 +38,9 @@ COLUMNS = (
 def settings_of(options: argparse.Namespace) -> Settings:
     """What the options ask for; steps where they bound the run, so that a busy machine gives the same figures."""
     if options.minutes:
-        return Settings(minutes=options.minutes)
+        return Settings(minutes=options.minutes, variant=options.variant)
     learning, decoupling = options.steps
-    base = Settings(schedule=Schedule(iterations=learning))
+    base = Settings(schedule=Schedule(iterations=learning), variant=options.variant)
     return replace(base, decoupling=replace(base.decoupling, iterations=decoupling))
 
 
@@ -105,6 +105,7 @@ def main() -> None:
     parser.add_argument("--objects", nargs="+", default=["spot"])
     parser.add_argument("--minutes", type=float, help="of all stages; else the steps decide")
     parser.add_argument("--steps", type=int, nargs=2, default=(3000, 2500), help="of surfels, of materials and light")
+    parser.add_argument("--variant", choices=("p", "m"), default="p", help="m: surfels on the mesh")
     parser.add_argument("--rays", type=int, default=128)
     options = parser.parse_args()
     for name in options.objects:
@@ -117,7 +118,8 @@ def main() -> None:
         for primary in ("surfels", "mesh"):
             beside = [pair(score(one, folder, primary, options.rays, others)["lights"]) for one in references]
             found = row(score(path, folder, primary, options.rays), beside, seconds)
-            rows = keep(FOLDER / "rows.json", f"{name}|{primary}", found)
+            seen = f"{primary} (M)" if options.variant == "m" and primary == "surfels" else primary
+            rows = keep(FOLDER / "rows.json", f"{name}|{seen}", found)
             print(name, primary, *found, flush=True)
     side = max(capture.views[0].colour.shape[:2])
     bound = f"{options.minutes:g} minutes" if options.minutes else "{} and {} steps".format(*options.steps)

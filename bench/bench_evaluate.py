@@ -1,6 +1,7 @@
 """Scenes with known truth: what Cycles needs for a view, what the true object scores, the ceiling of reconstructions.
 
 python bench/bench_evaluate.py [--size 128] [--test 8] [--samples 64] [--rays 256] [--objects spot fern]
+python bench/bench_evaluate.py --scenes scenes [--rays 128] [--objects spot fern]
 
 The true mesh, materials and lights are rendered by our renderer and compared with Cycles' pictures, once with the mesh
 as what the camera sees, once with surfels that were made from it.
@@ -9,6 +10,7 @@ as what the camera sees, once with surfels that were made from it.
 from __future__ import annotations
 
 import argparse
+import json
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +26,12 @@ from drgs_blender.evaluate.subjects import OBJECTS
 from drgs_blender.evaluate.truth import Truth, read_truth, true_asset
 from drgs_blender.frame import RenderSettings, split_rays
 from drgs_blender.reconstruct.readers import read_capture
+
+COLUMNS = (
+    "Object", "Camera sees", "Foreground", "Views left out: frame / foreground", "Relit, foreground: raw / scaled",
+    "Relit, frame: scaled / published way", "Relit and deformed, foreground: raw / scaled", "FLIP relit",
+    "Normals deg", "Albedo", "Roughness / metallic RMSE",
+)  # fmt: skip
 
 
 def score(path: Path, folder: Path, primary: str, rays: int, truth: Truth | None = None) -> dict:
@@ -54,24 +62,32 @@ def mean(rows: list[dict], kind: str, region: str) -> float:
     return float(np.mean([row[kind][region] for row in rows]))
 
 
+def made(args: argparse.Namespace) -> tuple[Path, Plan, str]:
+    """Where the scenes of the options are, how they were made, and what a view cost, in words."""
+    if args.scenes:
+        return args.scenes, Plan(**json.loads((args.scenes / "plan.json").read_text())), ""
+    plan = Plan(tuple(args.objects), args.size, 2, args.test, args.samples)
+    out = OUT / f"scenes-{args.size}-{args.test}-{args.samples}"
+    command = find_blender().command(ROOT / "drgs_blender" / "evaluate" / "scene_job.py")
+    before, rendered = processor_seconds(children=True), len(list(out.glob("*/*/*.png")))
+    make_scenes(out, plan, command, ROOT / "examples")
+    views = len(list(out.glob("*/*/*.png"))) - rendered
+    spent = processor_seconds(children=True) - before
+    return out, plan, f" ({spent / views:.2f} processor seconds a view)" if views else ""
+
+
 def main() -> None:
-    parser = argparse.ArgumentParser()
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", type=Path, help="that are there already; else they are made")
     parser.add_argument("--size", type=int, default=128)
     parser.add_argument("--test", type=int, default=8)
     parser.add_argument("--samples", type=int, default=64)
     parser.add_argument("--rays", type=int, default=256)
     parser.add_argument("--objects", nargs="+", default=list(OBJECTS))
     args = parser.parse_args()
-    plan = Plan(tuple(args.objects), args.size, 2, args.test, args.samples)
-    out = OUT / f"scenes-{args.size}-{args.test}-{args.samples}"
-    command = find_blender().command(ROOT / "drgs_blender" / "evaluate" / "scene_job.py")
-    before, rendered = processor_seconds(children=True), len(list(out.glob("*/*/*.png")))
-    folders = make_scenes(out, plan, command, ROOT / "examples")
-    made = len(list(out.glob("*/*/*.png"))) - rendered
-    spent = processor_seconds(children=True) - before
-    cost = f"{spent / made:.2f} processor seconds a view" if made else "views were there already"
+    scenes, plan, cost = made(args)
     rows = []
-    for folder in folders:
+    for folder in (scenes / name for name in args.objects):
         for primary in ("mesh", "surfels"):
             report = score(of_truth(folder), folder, primary, args.rays)
             rest, posed = under_other_lights(report, False), under_other_lights(report, True)
@@ -92,26 +108,13 @@ def main() -> None:
                 )
             )
             print(*rows[-1], flush=True)
-    columns = (
-        *(
-            "Object",
-            "Camera sees",
-            "Foreground",
-            "Views left out: frame / foreground",
-            "Relit, foreground: raw / scaled",
-        ),
-        *("Relit, frame: scaled / published way", "Relit and deformed, foreground: raw / scaled", "FLIP relit"),
-        *("Normals, degrees", "Albedo", "Roughness / metallic RMSE"),
+    about = (
+        "The true mesh, materials and light against Cycles' pictures of them: the ceiling of every reconstruction of "
+        f"these scenes. {plan.size} x {plan.size} pixels, {plan.test} test views, {len(plan.lights) - 1} other lights, "
+        f"{plan.samples} samples and denoiser of Cycles{cost}, {args.rays} rays of ours without a denoiser. PSNR in dB "
+        'on white; "published way" fits a scale an image to 8-bit values, white background included.\n\n'
     )
-    text = f"""
-The true mesh, materials and light against Cycles' pictures of them: the ceiling of every reconstruction of these
-scenes. {args.size} x {args.size} pixels, {args.test} test views, 3 other lights, {args.samples} samples and denoiser
-of Cycles ({cost}), {args.rays} rays of ours without a denoiser. PSNR in dB on white; "published way" fits a scale an
-image to 8-bit values, white background included.
-
-{table(columns, rows)}
-"""
-    write_section("evaluate", "Scenes with known truth: the ceiling", text)
+    write_section("evaluate", "Scenes with known truth: the ceiling", about + table(COLUMNS, rows))
 
 
 if __name__ == "__main__":

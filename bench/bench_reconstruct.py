@@ -160,7 +160,7 @@ def surfels(options: argparse.Namespace, part: str = "surfels") -> None:
         row |= against_truth(training.gaussians, training, capture, options.capture)
     row |= {"views": len(capture.training), "size": capture.views[0].camera.width}
     row["limit"] = f"{options.minutes:g} min" if options.minutes else f"{schedule.iterations} steps"
-    rows = keep(ROWS / f"{part}.json", options.capture.name, row)
+    rows = keep(ROWS / f"{part}.json", f"{options.capture.name}|{row['size']}|{row['limit']}", row)
     names = (
         "size", "views", "limit", "wall", "cpu", "steps", "surfels", "psnr", "psnr_pooled", "ssim", "normal", "depth",
         "overlap",
@@ -177,7 +177,7 @@ def surfels(options: argparse.Namespace, part: str = "surfels") -> None:
         "pooled, of the mean squared error, which the worst views decide; normals (mean angle, degrees), depth "
         "(median, metres) and silhouettes (intersection over union) of the mesh against the true one.\n\n"
     )
-    cells = [(name, *(shown(r.get(key, "-")) for key in names)) for name, r in rows.items()]
+    cells = [(key.split("|")[0], *(shown(r.get(name, "-")) for name in names)) for key, r in rows.items()]
     write_section(f"reconstruct-{part}", title, body + table(head, cells))
 
 

@@ -74,7 +74,7 @@ class Schedule:
 
 #: Part of the schedule that both starts of `starts` are tried for, by views of which each so many is kept aside;
 #: decibels there that surfels inside the hull must bring. At least so many views leave some to keep aside.
-TRIAL, ASIDE, WORTH, MANY = 0.2, 8, 1.0, 16
+TRIAL, ASIDE, WORTH, MANY = 0.2, 8, 0.75, 16
 #: Part of the weight of `Schedule.consistency` that matte pixels have, and what the tint of mirrors adds to it.
 MATTE, MIRRORED = 0.2, 5.0
 #: Learning rates at the start, and what is left of them at the end; of centres a part of the object's radius.
