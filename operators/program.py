@@ -6,6 +6,7 @@ import contextlib
 import os
 import shutil
 import subprocess
+import sys
 import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -19,6 +20,8 @@ from ..drgs_blender.errors import AssetError, EngineError, UsageError
 from .base import DrgsOperator
 
 _INTERVAL = 0.25
+#: Seconds between two lines in the terminal of a Blender without a window.
+_TELL_EVERY = 10.0
 
 
 class ProgramOperator(DrgsOperator):
@@ -35,8 +38,12 @@ class ProgramOperator(DrgsOperator):
         """What follows the work; returns what execute returns."""
         return {"FINISHED"}
 
+    def state(self, said: str) -> str:
+        """How far the work is, of all that the program has said; asked now and then."""
+        return ""
+
     def follow(self, context: bpy.types.Context, said: str) -> None:
-        """Told now and then while the program works: all that it has said."""
+        """Told now and then while the program works beside a window: all that it has said."""
 
     def stopped(self, event: bpy.types.Event) -> bool:
         """Whether the work is to end before its time."""
@@ -82,7 +89,7 @@ class ProgramOperator(DrgsOperator):
         try:
             self._spawn(arguments)
             if bpy.app.background or context.window is None:
-                self._process.wait()
+                self._wait()
                 return self._finish(context)
         except BaseException:
             self.clear()
@@ -137,6 +144,18 @@ class ProgramOperator(DrgsOperator):
         finally:
             os.close(handle)
 
+    def _wait(self) -> None:
+        """Wait for the program, where no status bar shows how far it is: standard output does."""
+        told = ""
+        while True:
+            try:
+                self._process.wait(_TELL_EVERY)
+                return
+            except subprocess.TimeoutExpired:
+                state = self.state(self._said())
+            if state != told:
+                _print(told := state)
+
     def _said(self, last: bool = False) -> str:
         """What the program has said; when it has ended, for the last time."""
         said = self._log.read_text(encoding="utf-8", errors="replace")
@@ -156,6 +175,8 @@ class ProgramOperator(DrgsOperator):
                 raise AssetError(self._subject, f"{self._failure}: {reason.rstrip('.')}", "")
             for line in lines:
                 messages.note("INFO", line)
+                if bpy.app.background:
+                    _print(line)
             if missing := self._expected.missing():
                 problem = f"{self._failure}: {written.complaint(self._program, missing)}"
                 raise EngineError(self._subject, problem, written.REMEDY)
@@ -168,3 +189,9 @@ class ProgramOperator(DrgsOperator):
             context.window_manager.event_timer_remove(self._timer)
             context.workspace.status_text_set(None)
             self._timer = None
+
+
+def _print(text: str) -> None:
+    """A line for the terminal of a Blender without a window."""
+    sys.stdout.write(f"{text}\n")
+    sys.stdout.flush()

@@ -124,10 +124,13 @@ class DRGS_OT_reconstruct(ProgramOperator, bpy.types.Operator):
     def stopped(self, event: bpy.types.Event) -> bool:
         return reconstruction.job.cancelled  # Esc may be meant for anything else in so many minutes
 
-    def follow(self, context: bpy.types.Context, said: str) -> None:
+    def state(self, said: str) -> str:
         job = reconstruction.job
         job.follow(said)
-        context.workspace.status_text_set(f"{self._subject}: {job.text}, {job.part:.0%}. Cancel is in the sidebar")
+        return f"{self._subject}: {job.text}, {job.part:.0%}"
+
+    def follow(self, context: bpy.types.Context, said: str) -> None:
+        context.workspace.status_text_set(f"{self.state(said)}. Cancel is in the sidebar")
         _redraw(context)
 
     def done(self, context: bpy.types.Context) -> set[str]:

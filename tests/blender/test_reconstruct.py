@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from itertools import pairwise
 from types import SimpleNamespace
 
 import bpy
@@ -66,6 +67,16 @@ def test_photographs_become_an_object(scene, photographs, tmp_path):
     assert state.icon() == state.icon()
     (preview,) = reconstruction._previews.values()
     assert preview.image_size[0] == 2 * preview.image_size[1]
+
+
+def test_without_a_window_the_terminal_shows_how_far_it_is(scene, photographs, monkeypatch, capsys):
+    monkeypatch.setattr(part("operators.program"), "_TELL_EVERY", 0.2)
+    assert bpy.ops.drgs.reconstruct(filepath=str(photographs), minutes=0.1, use_materials=False) == {"FINISHED"}
+    said = capsys.readouterr().out
+    lines = [line for line in said.splitlines() if line.startswith('Capture "Sphere": ')]
+    assert len(lines) > 1 and any("Surfels, " in line for line in lines)
+    assert all(line != following for line, following in pairwise(lines))
+    assert "surfels on" in said.split(lines[-1])[1] and "DRGS_" not in said
 
 
 def test_progress_is_what_the_program_says(tmp_path):
