@@ -43,7 +43,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("asset", type=Path, nargs="?", metavar="A.drgs", help="asset")
     parser.add_argument("capture", type=Path, nargs="?", metavar="CAPTURE", help="folder or file of the photographs")
     parser.add_argument("--json", action="store_true", help="write the figures as JSON")
-    parser.add_argument("--pictures", type=Path, metavar="DIR", help="write ours beside the true ones")
+    parser.add_argument(
+        "--pictures", type=Path, metavar="DIR", help="write ours, the true ones and their difference, side by side"
+    )
     parser.add_argument(
         "--test-every", type=sampling.whole(2, 10**6), metavar="N", help="views left out, if the capture does not say"
     )
@@ -72,11 +74,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     scenes = parser.add_argument_group("scenes with known truth")
     scenes.add_argument("--make-scenes", type=Path, metavar="OUT", help="render them; goes on where it was stopped")
     scenes.add_argument("--small", action="store_true", help="one object, small and few views, in two minutes")
-    scenes.add_argument("--objects", nargs="+", metavar="NAME", help="which objects")
-    scenes.add_argument("--size", type=sampling.whole(16, 4096), help="pixels of a side")
-    scenes.add_argument("--train", type=sampling.whole(2, 10000), metavar="N", help="training views")
-    scenes.add_argument("--test", type=sampling.whole(2, 10000), metavar="N", help="views left out")
-    scenes.add_argument("--samples", type=sampling.whole(1, 65536), help="of Cycles, a pixel, before denoising")
+    scenes.add_argument(
+        "--objects", nargs="+", metavar="NAME", help="which of spot, cat, robot, helmet, fern; default all"
+    )
+    scenes.add_argument("--size", type=sampling.whole(16, 4096), metavar="N", help="pixels of a side; default 256")
+    scenes.add_argument("--train", type=sampling.whole(2, 10000), metavar="N", help="training views; default 120")
+    scenes.add_argument("--test", type=sampling.whole(2, 10000), metavar="N", help="views left out; default 16")
+    scenes.add_argument(
+        "--samples",
+        type=sampling.whole(1, 65536),
+        metavar="N",
+        help="of Cycles, a pixel, before denoising; default 64",
+    )
     scenes.add_argument(
         "--lights", nargs="+", metavar="NAME", help="Blender's studio lights or files; the first is for training"
     )

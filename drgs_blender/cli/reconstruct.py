@@ -1,7 +1,7 @@
 """Make an asset from calibrated photographs: surfels, a closed mesh, materials and light.
 
-CAPTURE is a folder or file of NeRF-synthetic, nerfstudio, COLMAP, LLFF, NeRO GlossySynthetic or TensoIR. A run that
-was stopped goes on when the same command is given again. While it works, a picture beside the output,
+CAPTURE is a folder or file of NeRF-synthetic, NGP, nerfstudio, COLMAP, LLFF, NeRO GlossySynthetic or TensoIR. A run
+that was stopped goes on when the same command is given again. While surfels are learned, a picture beside the output,
 A.preview.png, shows a view as it is now and its photograph.
 """
 
@@ -52,7 +52,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--resolution", type=whole(8, 1 << 16), metavar="N", help="pixels of the longer side; default: all"
     )
     parser.add_argument("--iterations", type=whole(1, 10**7), metavar="N", help="steps of the surfels; default 3000")
-    parser.add_argument("--surfels", type=whole(10, 5_000_000), metavar="N", help="at most; default 16000")
+    parser.add_argument(
+        "--surfels",
+        type=whole(10, 5_000_000),
+        metavar="N",
+        help="at most, before --variant m makes its own; default 16000",
+    )
     parser.add_argument("--voxels", type=whole(16, 1024), metavar="N", help="of the mesh's longest side; default 256")
     parser.add_argument(
         "--minutes", type=_minutes, metavar="M", help="all stages together, about, once kernels are compiled"

@@ -294,9 +294,8 @@ def _number(value: float | None, places: int = 4) -> str:
 
 
 def _shape(name: str, geometry: dict[str, float]) -> str:
-    normal, median, mean, overlap = (
-        _number(geometry[key]) for key in ("normal_degrees", "depth_median", "depth_mean", "silhouette_iou")
-    )
+    normal = _number(geometry["normal_degrees"], 1)
+    median, mean, overlap = (_number(geometry[key]) for key in ("depth_median", "depth_mean", "silhouette_iou"))
     return (
         f"{name}: normals {normal} degrees off; depth {median} (median), {mean} (mean); silhouettes overlap {overlap}"
     )

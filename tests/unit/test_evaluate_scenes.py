@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import sys
 from dataclasses import replace
@@ -174,6 +175,7 @@ def test_a_published_set_is_scored_under_the_lights_that_are_named(tmp_path):
     assert report["geometry"]["depth_mean"] is None and report["geometry"]["silhouette_iou"] == 1
     assert report["materials"]["albedo_psnr"] > 60 and "metallic_rmse" not in report["materials"]
     assert any("night" in line for line in table(report))
+    assert any(re.match(r"shape: normals \d\.\d degrees off; ", line) for line in table(report))
     json.dumps(report, allow_nan=False)
     nowhere = compare(asset, capture, Truth([relit]), lambda *about: {k: 0 * v for k, v in renderer(*about).items()})
     assert nowhere["materials"]["albedo_psnr"] is None and nowhere["geometry"]["silhouette_iou"] == 0
