@@ -115,10 +115,10 @@ def main() -> None:
         asset, seconds = learned(capture, settings_of(options))
         write_asset(path, asset)
         others, references = others_at_rest(folder), (with_true_materials(asset, folder), of_truth(folder))
-        for primary in ("surfels", "mesh"):
+        for primary in ("surfels",) if options.variant == "m" else ("surfels", "mesh"):  # the mesh is one
             beside = [pair(score(one, folder, primary, options.rays, others)["lights"]) for one in references]
             found = row(score(path, folder, primary, options.rays), beside, seconds)
-            seen = f"{primary} (M)" if options.variant == "m" and primary == "surfels" else primary
+            seen = "surfels (M)" if options.variant == "m" else primary
             rows = keep(FOLDER / "rows.json", f"{name}|{seen}", found)
             print(name, primary, *found, flush=True)
     side = max(capture.views[0].colour.shape[:2])
