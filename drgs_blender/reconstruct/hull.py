@@ -131,10 +131,10 @@ def find_region(capture: Capture) -> Region:
     for cells in (64, CELLS):
         origin, spacing = low, float((high - low).max()) / cells
         shape = np.ceil((high - low) / spacing).astype(int) + 1
-        inside = _carve(origin, spacing, shape, views, masks)
-        near = _carve(origin, spacing, shape, views, _widened(masks, views, centre, spacing))
+        inside, seen = _carve(origin, spacing, shape, views, masks)
+        near, _ = _carve(origin, spacing, shape, views, _widened(masks, views, centre, spacing))
         apart = near & ~binary_dilation(inside, iterations=AWAY)
-        inside = _main_parts(inside | near) & (inside | apart)
+        inside = _main_parts(inside | near, seen) & (inside | apart)
         if not inside.any():
             raise AssetError(
                 str(capture.source),
@@ -162,12 +162,18 @@ def _widened(masks: list[Array], views: list[View], centre: Array, spacing: floa
     return grown
 
 
-def _main_parts(inside: Array) -> Array:
-    """The solid without parts smaller than a hundredth of the largest."""
+def _main_parts(inside: Array, seen: Array) -> Array:
+    """The solid without parts smaller than a hundredth of the largest; than a tenth, where half as many views see them.
+
+    Such are at the edge of the pictures: what no view that has them shows as background, because few have them.
+    """
     parts, count = label(inside)
-    sizes = np.bincount(parts.reshape(-1), minlength=count + 1)
+    flat = parts.reshape(-1)
+    sizes = np.bincount(flat, minlength=count + 1)
+    witnesses = np.bincount(flat, seen.reshape(-1), count + 1) / np.maximum(sizes, 1)
     sizes[0] = 0
-    return (sizes >= max(0.01 * sizes.max(), 1))[parts]
+    doubtful = witnesses < 0.5 * witnesses[sizes.argmax()]
+    return (sizes >= np.where(doubtful, 0.1, 0.01) * sizes.max())[parts] & inside
 
 
 def _surface(inside: Array, origin: Array, spacing: float) -> tuple[Array, Array]:
@@ -216,12 +222,17 @@ def _without_masks(capture: Capture, views: list[View]) -> Region:
     )  # fmt: skip
 
 
-def _carve(low: Array, spacing: float, shape: Array, views: list[View], masks: list[Array]) -> Array:
-    """(shape) bool: points of a grid that enough views see, and no more than `DISSENT` of those call background."""
+def _carve(low: Array, spacing: float, shape: Array, views: list[View], masks: list[Array]) -> tuple[Array, Array]:
+    """Points of a grid that enough views see, no more than `DISSENT` of which call them background; how many see each.
+
+    Returns
+    -------
+    (shape) bool, (shape) int32
+    """
     seen, background = np.zeros(tuple(shape), np.int32), np.zeros(tuple(shape), np.int32)
     for view, mask in zip(views, masks, strict=True):
         _count(low, spacing, world_to_pixel(view.camera), mask, seen, background)
-    return (seen >= max(3, int(WITNESSES * len(views)))) & (background <= DISSENT * seen)
+    return (seen >= max(3, int(WITNESSES * len(views)))) & (background <= DISSENT * seen), seen
 
 
 def world_to_pixel(camera: Camera) -> Array:

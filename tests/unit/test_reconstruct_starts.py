@@ -203,3 +203,12 @@ def test_a_camera_in_the_middle_does_not_widen_masks_beyond_the_picture():
     matrix[:3, 3] = 1e-12
     (mask,) = _widened([view.mask], [replace(view, camera=replace(view.camera, matrix_world=matrix))], np.zeros(3), 0.1)
     assert mask.shape == view.mask.shape and (mask == view.mask.max()).all()
+
+
+def test_what_few_views_have_at_the_edge_of_their_pictures_is_no_part_of_the_object():
+    """Photographs from above alone: below the bowl and beside it few show background, as few look there."""
+    capture = photographed(bowl, 24, 48, 100)
+    capture.views = [view for view in capture.views if view.camera.matrix_world[2, 3] > 0]
+    region = find_region(replace(capture, views=[replace(view, test=False) for view in capture.views]))
+    assert np.abs([region.low, region.high]).max() < 1.05
+    assert np.linalg.norm(region.points, axis=1).max() < 1.1 * BOWL[1]
