@@ -477,6 +477,13 @@ def test_places_that_single_precision_cannot_tell_apart_are_refused(tmp_path):
     refused(tmp_path, "digits do not suffice", "origin near the object")
 
 
+def test_a_folder_of_captures_is_told_from_one(tmp_path):
+    for name in ("b", "a"):
+        (tmp_path / name).mkdir()
+        captures.write_nerf(captures.make(tmp_path / name))
+    refused(tmp_path, "holds some", f"{tmp_path / 'a'}, {tmp_path / 'b'}. Give one")
+
+
 def test_damaged_files_are_refused_by_name(tmp_path):
     refused(tmp_path / "nothing", "does not exist")
     refused(tmp_path, "is no capture", "COLMAP")

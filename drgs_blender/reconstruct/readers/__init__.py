@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import AssetError, UsageError
+from ...errors import AssetError, UsageError, first_of
 from ...formats.axes import UP_AXES
 from ..capture import Capture
 from ..memory import check_fits
@@ -130,6 +130,9 @@ def find_layout(path: Path) -> Reader:
     for reader in LAYOUTS:
         if reader.sniff(path):
             return reader
+    inner = sorted(path.iterdir()) if path.is_dir() else []
+    if captures := [str(one) for one in inner if one.is_dir() and any(reader.sniff(one) for reader in LAYOUTS)]:
+        raise AssetError(str(path), f"is no capture, but holds some: {first_of(captures)}", "Give one of them")
     raise AssetError(str(path), "is no capture", understood)
 
 
