@@ -486,6 +486,7 @@ def test_a_folder_of_captures_is_told_from_one(tmp_path):
 
 def test_damaged_files_are_refused_by_name(tmp_path):
     refused(tmp_path / "nothing", "does not exist")
+    refused(tmp_path / ("a" * 300), "cannot be read: File name too long")
     refused(tmp_path, "is no capture", "COLMAP")
     file = tmp_path / "transforms.json"
     for text, word in (

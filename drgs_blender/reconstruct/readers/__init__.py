@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -125,15 +126,23 @@ def read_capture(
 def find_layout(path: Path) -> Reader:
     """The layout of the capture at `path`. Raises AssetError, listing what is understood."""
     understood = "Understood: " + "; ".join(f"{reader.name} ({reader.about})" for reader in LAYOUTS)
-    if not path.exists():
-        raise AssetError(str(path), "does not exist", "Check the path")
-    for reader in LAYOUTS:
-        if reader.sniff(path):
+    try:
+        if not path.exists():
+            raise AssetError(str(path), "does not exist", "Check the path")
+        if reader := _known(path):
             return reader
-    inner = sorted(path.iterdir()) if path.is_dir() else []
-    if captures := [str(one) for one in inner if one.is_dir() and any(reader.sniff(one) for reader in LAYOUTS)]:
+        inner = sorted(path.iterdir()) if path.is_dir() else []
+        captures = [str(one) for one in inner if os.access(one, os.R_OK | os.X_OK) and one.is_dir() and _known(one)]
+    except OSError as error:
+        raise AssetError(str(path), f"cannot be read: {error.strerror or error}", "Check its permissions") from error
+    if captures:
         raise AssetError(str(path), f"is no capture, but holds some: {first_of(captures)}", "Give one of them")
     raise AssetError(str(path), "is no capture", understood)
+
+
+def _known(path: Path) -> Reader | None:
+    """The first layout that `path` has."""
+    return next((reader for reader in LAYOUTS if reader.sniff(path)), None)
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
