@@ -73,7 +73,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     scenes = parser.add_argument_group("scenes with known truth")
     scenes.add_argument("--make-scenes", type=Path, metavar="OUT", help="render them; goes on where it was stopped")
-    scenes.add_argument("--small", action="store_true", help="one object, small and few views, in two minutes")
+    scenes.add_argument("--small", action="store_true", help="one object, small and few views, in a minute")
     scenes.add_argument(
         "--objects", nargs="+", metavar="NAME", help="which of spot, cat, robot, helmet, fern; default all"
     )
