@@ -1,9 +1,10 @@
 """Photographs to assets, all stages: views left out, relit, relit and deformed, materials and shape against the truth.
 
 python bench/bench_asset.py --scenes scenes [--objects spot fern] [--minutes 7 | --steps 3000 2500] [--variant m]
+python bench/bench_asset.py --scenes scenes --objects spot fern --sheet
 
-Scenes are those of `drgs evaluate --make-scenes scenes`. Rows are kept, so that objects may be measured one by one. An
-object of 256 pixels takes its minutes and three more for the pictures that score it.
+Scenes are those of `drgs evaluate --make-scenes scenes`. Rows are kept, so that objects may be measured one by one, and
+assets, of which --sheet draws some. An object of 256 pixels takes its minutes and three more for what scores it.
 """
 
 from __future__ import annotations
@@ -14,9 +15,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from bench_evaluate import mean, of_truth, score, under_other_lights
 from decouple_score import with_materials_of
-from report import OUT, keep, table, write_section
+from PIL import Image
+from report import OUT, ROOT, keep, table, write_section
 
 from drgs_blender.asset.container import write_asset
 from drgs_blender.asset.model import Asset
@@ -27,6 +30,9 @@ from drgs_blender.reconstruct.readers import read_capture
 from drgs_blender.reconstruct.train import Schedule
 
 FOLDER = OUT / "assets"
+FIGURE = ROOT / "docs" / "images" / "assets.png"
+#: What the sheet shows.
+LIGHT, VIEW = "city", 1
 COLUMNS = (
     "Object", "Primary", "Views left out: frame / foreground", "Relit scaled: frame / foreground",
     "Relit with the true materials", "Relit, the true asset",
@@ -99,6 +105,26 @@ def row(report: dict[str, Any], beside: list[str], seconds: float) -> list[str]:
     ]
 
 
+def sheet(objects: list[str], scenes: Path, rays: int) -> None:
+    """Of each asset one view: as photographed; under another light, the true one and ours; the same bent."""
+    rows = []
+    for name in objects:
+        truth = read_truth(scenes / name)
+        assert truth is not None
+        shown: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+
+        def show(name: str, _: int, ours: np.ndarray, true: np.ndarray, shown: dict = shown) -> None:
+            shown[name] = (true, ours)
+
+        sets = [replace(item, views=item.views[VIEW:][:1], maps=item.maps[VIEW:][:1]) for item in truth.sets]
+        wanted = [item for item in sets if item.name in ("test", f"relit-{LIGHT}", f"posed-{LIGHT}")]
+        score(FOLDER / f"{name}.drgs", scenes / name, "surfels", rays, replace(truth, sets=wanted), show)
+        row = (shown["test"][0], *shown[f"relit-{LIGHT}"], *shown[f"posed-{LIGHT}"])
+        rows.append(np.concatenate(row, axis=1))
+    pixels = np.concatenate(rows).clip(0, 1)
+    Image.fromarray((255 * pixels + 0.5).astype(np.uint8)).save(FIGURE, optimize=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", type=Path, required=True)
@@ -107,7 +133,10 @@ def main() -> None:
     parser.add_argument("--steps", type=int, nargs=2, default=(3000, 2500), help="of surfels, of materials and light")
     parser.add_argument("--variant", choices=("p", "m"), default="p", help="m: surfels on the mesh")
     parser.add_argument("--rays", type=int, default=128)
+    parser.add_argument("--sheet", action="store_true", help="draw the assets that are there")
     options = parser.parse_args()
+    if options.sheet:
+        return sheet(options.objects, options.scenes, options.rays)
     for name in options.objects:
         capture = read_capture(options.scenes / name)
         folder, path = options.scenes / name, FOLDER / f"{name}.drgs"
@@ -127,6 +156,7 @@ def main() -> None:
         f"{bound}, {len(capture.training)} photographs of {side} pixels by Cycles; PSNR in dB over the frame on white, "
         f"and of the foreground; scaled by one factor a channel; means over the other lights. With the true materials: "
         f"on the own shape; no bound, as learned ones may make up for its errors. The true asset: the ceiling.\n\n"
+        f"![One view of each: as photographed; under another light, Cycles and ours; bent](images/{FIGURE.name})\n\n"
     )
     cells = [(*key.split("|"), *cells) for key, cells in sorted(rows.items())]
     write_section("asset", "Photographs to assets", body + table(COLUMNS, cells))

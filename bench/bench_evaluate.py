@@ -20,7 +20,7 @@ from drgs_blender.asset.container import write_asset
 from drgs_blender.cli.evaluate import session_renderer
 from drgs_blender.cli.find_blender import find_blender
 from drgs_blender.engine.session import Session
-from drgs_blender.evaluate.compare import compare
+from drgs_blender.evaluate.compare import Show, compare
 from drgs_blender.evaluate.scenes import Plan, make_scenes
 from drgs_blender.evaluate.subjects import OBJECTS
 from drgs_blender.evaluate.truth import Truth, read_truth, true_asset
@@ -34,15 +34,16 @@ COLUMNS = (
 )  # fmt: skip
 
 
-def score(path: Path, folder: Path, primary: str, rays: int, truth: Truth | None = None) -> dict:
+def score(
+    path: Path, folder: Path, primary: str, rays: int, truth: Truth | None = None, show: Show | None = None
+) -> dict:
     """The report of an asset of a scene, against all that is known of it or `truth`."""
     session = Session()
     key = session.load_asset(path)
     cosine, ggx, environment = split_rays(rays)
     settings = RenderSettings(cosine=cosine, ggx=ggx, environment=environment, bounces=3, primary=primary)  # type: ignore[arg-type]
-    return compare(
-        session.asset(key), read_capture(folder), truth or read_truth(folder), session_renderer(session, key, settings)
-    )
+    renderer = session_renderer(session, key, settings)
+    return compare(session.asset(key), read_capture(folder), truth or read_truth(folder), renderer, show=show)
 
 
 def of_truth(folder: Path) -> Path:
