@@ -383,7 +383,31 @@ def test_black_photographs_are_left_out_and_a_black_capture_is_refused(tmp_path,
             assert "frame_00002.png" in caplog.text
         if k >= 2:
             Image.new("RGB", (48, 40)).save(tmp_path / "images" / f"frame_{k:05d}.png")
-    refused(tmp_path, "black images")
+    refused(tmp_path, "images that are black")
+
+
+def test_photographs_of_one_colour_are_left_out(tmp_path, caplog):
+    """Burned out, or masked whole by an alpha channel that nobody drew."""
+    captures.write_nerf(captures.make(tmp_path))
+    for k in range(3):
+        Image.new("RGBA", (48, 40), (255, 255, 255, 255)).save(tmp_path / "train" / f"r_{k}.png")
+    assert {view.name for view in read_capture(tmp_path).views}.isdisjoint({"r_0", "r_1", "r_2"})
+    assert "3 images are black or of one colour and left out: r_0.png, r_1.png" in caplog.text
+
+
+@pytest.mark.parametrize("size", [(1, 1), (48, 1), (3, 40)])
+def test_pictures_of_hardly_a_pixel_are_refused(tmp_path, size):
+    captures.write_nerf(captures.make(tmp_path))
+    for file in (tmp_path / "train").iterdir():
+        Image.effect_noise(size, 100).convert("RGBA").save(file)
+    refused(tmp_path, "r_0.png", f"{size[0]} x {size[1]} pixels", "larger photographs")
+
+
+def test_a_resolution_that_leaves_hardly_a_pixel_of_a_narrow_picture_is_refused(tmp_path):
+    captures.write_nerf(captures.make(tmp_path))
+    for file in (tmp_path / "train").iterdir():
+        Image.effect_noise((12, 100), 100).convert("RGBA").save(file)
+    refused(tmp_path, "r_0.png", "1 x 8 pixels", "larger --resolution", resolution=8)
 
 
 def test_an_empty_mask_is_named_and_its_photograph_left_out(tmp_path, caplog):
@@ -475,6 +499,42 @@ def test_places_that_single_precision_cannot_tell_apart_are_refused(tmp_path):
         matrix[:3, 3] += [5e5, 5e6, 0]
     captures.write_nerf(scene)
     refused(tmp_path, "digits do not suffice", "origin near the object")
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1e6])
+def test_captures_too_small_or_large_for_any_camera_are_refused(tmp_path, scale):
+    """Cameras show nothing nearer than a millimetre or farther than a thousand kilometres."""
+    scene = captures.make(tmp_path)
+    for matrix in scene.cameras:
+        matrix[:3, 3] *= scale
+    captures.write_nerf(scene)
+    refused(tmp_path, "of each other", "another unit")
+
+
+@pytest.mark.parametrize("wrong", [1, 5])
+def test_few_cameras_of_another_convention_are_named(tmp_path, caplog, wrong):
+    scene = captures.make(tmp_path)
+    captures.write_nerf(scene)
+    read_capture(tmp_path)
+    assert not caplog.records
+    path = tmp_path / "transforms_train.json"
+    data = json.loads(path.read_text())
+    for frame in data["frames"][3 : 3 + wrong]:
+        frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ captures.OPENCV).tolist()
+    path.write_text(json.dumps(data))
+    read_capture(tmp_path)
+    assert f"{wrong} of 12 photographs show the object where the others do not have it: r_3" in caplog.text
+
+
+def test_an_object_of_few_pixels_in_some_pictures_is_no_fault_of_the_cameras(tmp_path, caplog):
+    scene = captures.make(tmp_path)
+    captures.write_nerf(scene)
+    for k in range(4):  # as large as on a photograph from afar, and there it is
+        small = np.zeros((400, 480, 4), np.uint8)
+        small[198:202, 238:242] = (200, 100, 50, 255)
+        Image.fromarray(small).save(tmp_path / "train" / f"r_{k}.png")
+    read_capture(tmp_path)
+    assert "nan" not in caplog.text and "fit badly" not in caplog.text
 
 
 def test_a_folder_of_captures_is_told_from_one(tmp_path):

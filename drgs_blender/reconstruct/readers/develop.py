@@ -21,8 +21,10 @@ logger = logging.getLogger(__name__)
 
 #: What pictures with alpha are laid on, sRGB; the published figures are measured on white.
 WHITE = (1.0, 1.0, 1.0)
-#: Pixels darker than this everywhere are no photograph.
-_BLACK = 0.02
+#: Pixels darker than this everywhere, or that differ no more than this, are no photograph.
+_BLACK, _ALIKE = 0.02, 0.002
+#: Pixels of the shorter side of the least picture that shows anything, also at half size.
+_LEAST = 4
 #: How much the surroundings may vary, and how much of the pixels must be surroundings, to be called one colour.
 _PLAIN, _ENOUGH = 0.01, 0.05
 #: Without masks: width of the border that shows the backdrop, in parts of the picture; part of it that must have one
@@ -33,7 +35,7 @@ _BORDER, _MOST, _NEAR, _SPECK = 0.02, 0.7, 0.06, 0.002
 def develop(
     photograph: Photograph, layout: Layout, resolution: int | None, known: dict[Lens, tuple[Lens, Array]]
 ) -> View | None:
-    """Read one photograph; None where it is black.
+    """Read one photograph; None where it is black or of one colour all over.
 
     Parameters
     ----------
@@ -43,7 +45,7 @@ def develop(
     Raises
     ------
     AssetError
-        The file cannot be decoded; photograph, mask and calibration have different shapes.
+        The file cannot be decoded; photograph, mask and calibration have different shapes; too few pixels.
     """
     subject = str(photograph.image)
     pixels = to_unit(load_image(photograph.image))
@@ -67,9 +69,14 @@ def develop(
         width, height = max(1, round(width * factor)), max(1, round(height * factor))
         layers = shrink(layers, width, height)
         lens = lens.scaled(width, height)
+    if min(width, height) < _LEAST:
+        remedy = "Use larger photographs" if resolution is None else "Use larger ones, or a larger --resolution"
+        raise AssetError(subject, f"has {width} x {height} pixels to learn from, which show nothing", remedy)
     colour = layers[..., :3]
     mask = np.clip(layers[..., 3], 0, 1) if mask is not None else None
     if colour.max(initial=0.0) < _BLACK and (mask is None or mask.any()):
+        return None
+    if (mask is None or mask.min() >= 1) and np.ptp(colour, axis=(0, 1)).max() < _ALIKE:
         return None
     if premultiplied:
         assert mask is not None

@@ -12,6 +12,7 @@ from .layout import Photograph, turned_by_exif
 
 logger = logging.getLogger(__name__)
 
+_BLANK = "black or of one colour"
 #: A photograph and what became of it.
 Pair = tuple[Photograph, View]
 
@@ -19,8 +20,9 @@ Pair = tuple[Photograph, View]
 def usable(developed: Sequence[tuple[Photograph, View | None]], subject: str) -> list[View]:
     """The views of a capture that say something of the object, in their order; warnings name the files of the others.
 
-    Left out are black photographs, those without a mask where most have one, and those whose mask is empty. Where
-    most have no mask, the others lose theirs. Views to learn from and views to test are counted apart.
+    Left out are photographs that are black or of one colour, those without a mask where most have one, and those whose
+    mask is empty. Where most have no mask, the others lose theirs. Views to learn from and views to test are counted
+    apart.
 
     Parameters
     ----------
@@ -30,9 +32,9 @@ def usable(developed: Sequence[tuple[Photograph, View | None]], subject: str) ->
     Raises
     ------
     AssetError
-        Most photographs are black.
+        Most photographs are black or of one colour.
     """
-    pairs = _without_black(developed, subject)
+    pairs = _without_blank(developed, subject)
     if all(view.mask is None or view.mask.min() >= 1 for _, view in pairs):  # an alpha channel that says nothing
         for _, view in pairs:
             view.mask = None
@@ -52,14 +54,14 @@ def _named(files: Sequence[Path]) -> str:
     return first_of([file.name for file in files])
 
 
-def _without_black(developed: Sequence[tuple[Photograph, View | None]], subject: str) -> list[Pair]:
+def _without_blank(developed: Sequence[tuple[Photograph, View | None]], subject: str) -> list[Pair]:
     pairs = [(photograph, view) for photograph, view in developed if view is not None]
-    if black := [photograph.image for photograph, view in developed if view is None]:
-        if len(pairs) < max(2, len(black)):
+    if blank := [photograph.image for photograph, view in developed if view is None]:
+        if len(pairs) < max(2, len(blank)):
             raise AssetError(
-                subject, f"has {len(black)} black images ({_named(black)})", "Export the photographs again"
+                subject, f"has {len(blank)} images that are {_BLANK} ({_named(blank)})", "Export the photographs again"
             )
-        logger.warning("%s: %d black images are left out: %s", subject, len(black), _named(black))
+        logger.warning("%s: %d images are %s and left out: %s", subject, len(blank), _BLANK, _named(blank))
     return pairs
 
 

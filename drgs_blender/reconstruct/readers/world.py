@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...errors import AssetError
+from ...errors import AssetError, first_of
 from ...filetypes import CAMERAS
 from ..capture import View
 from .layout import OPENCV_TO_BLENDER, invert
@@ -30,8 +30,12 @@ _SEEN, _AGREE = 0.25, 0.9
 #: Part of the silhouettes that is explained: below the first something is wrong, above the second it is right.
 _WRONG, _RIGHT = 0.5, 0.8
 _NOWHERE = 0.2
+#: Part of one silhouette below which its camera is wrong, where those of the others are right.
+_STRANGE = 0.05
 #: Least spread of cameras in their distance from the origin: single precision leaves some thousand steps of it.
 _DIGITS = 1e-4
+#: Least and greatest spread of cameras, metres: a `Camera` shows nothing nearer or farther than its clip distances.
+_SMALL, _LARGE = 2e-3, 5e5
 
 
 def turn_upright(matrices: Array) -> Array:
@@ -60,7 +64,7 @@ def turn_upright(matrices: Array) -> Array:
 
 
 def check_places(matrices: Array, subject: str, axes: str) -> None:
-    """Raise AssetError where cameras do not see an object from several sides, or too far away to compute with."""
+    """Raise AssetError where cameras do not see an object from several sides, or too near or far to compute with."""
     if len(matrices) < 2:
         raise AssetError(subject, "has one camera", "Shape needs photographs from several sides: take 20 or more")
     centres = matrices[:, :3, 3]
@@ -76,6 +80,9 @@ def check_places(matrices: Array, subject: str, axes: str) -> None:
             f"has its cameras {away:.3g} from the origin and within {spread:.3g} of each other: digits do not suffice"
         )
         raise AssetError(subject, problem, "Export the capture with the origin near the object")
+    if not _SMALL <= spread <= _LARGE:
+        problem = f"has its cameras within {spread:.3g} m of each other; {_SMALL:g} to {_LARGE:g} can be learned from"
+        raise AssetError(subject, problem, "Export it in another unit, in which the object is about a metre large")
 
 
 def _spread(matrices: Array) -> float:
@@ -97,14 +104,18 @@ def check_silhouettes(views: Sequence[View], subject: str, axes: str) -> None:
     shapes = [_Silhouette.of(view) for view in chosen]
     if any(shape is None for shape in shapes):
         return
-    outlines = [shape for shape in shapes if shape is not None]
-    matrices = np.stack([view.camera.matrix_world for view in chosen])
+    kept = [(view, shape) for view, shape in zip(chosen, shapes) if shape is not None and shape.inside.any()]
+    if len(kept) < 3:
+        return
+    outlines = [shape for _, shape in kept]
+    matrices = np.stack([view.camera.matrix_world for view, _ in kept])
     if _inside_out(matrices, outlines):
         problem = "has masks that are inverted: they fill the pictures' borders, and what they leave out is one shape"
         raise AssetError(subject, problem, "Invert the masks: white is the object, black its surroundings")
     score = _explained(matrices, outlines)
     logger.debug("%s: the visual hull explains %.2f of the silhouettes", subject, score)
     if score >= _WRONG:
+        _warn_of_strangers(masked, *_hull(matrices, outlines), subject)
         return
     # The matrices of the file, as every other convention would have them.
     raw = np.stack([_undo(axes, matrix) for matrix in matrices])
@@ -133,6 +144,24 @@ def _inside_out(matrices: Array, outlines: list[_Silhouette]) -> bool:
     if 2 * len(holes) <= len(outlines) or len(holes) < 3:
         return False
     return _explained(np.stack([matrix for matrix, _ in holes]), [hole for _, hole in holes]) > _RIGHT
+
+
+def _warn_of_strangers(views: Sequence[View], hull: Array, cell: float, subject: str) -> None:
+    """Name the views that have an object whole in their picture, elsewhere than the `hull` of most others."""
+    shapes = [(view, _Silhouette.of(view)) for view in views]
+    strangers = [
+        view.name
+        for view, shape in shapes
+        if shape is not None
+        and shape.inside.any()
+        and shape.whole
+        and _covered(hull, cell, view.camera.matrix_world, shape) < _STRANGE
+    ]
+    if strangers:
+        logger.warning(
+            "%s: %d of %d photographs show the object where the others do not have it: %s. Check their cameras (their "
+            "axes too), or take them out", subject, len(strangers), len(views), first_of(strangers),
+        )  # fmt: skip
 
 
 def _undo(axes: str, matrix: Array) -> Array:
@@ -171,6 +200,12 @@ class _Silhouette:
 
 def _explained(matrices: Array, outlines: list[_Silhouette]) -> float:
     """Mean part of the silhouettes that their visual hull covers."""
+    hull, cell = _hull(matrices, outlines)
+    return float(np.mean([_covered(hull, cell, m, shape) for m, shape in zip(matrices, outlines)]))
+
+
+def _hull(matrices: Array, outlines: list[_Silhouette]) -> tuple[Array, float]:
+    """Centres (n, 3) of the cells of the visual hull, and their side; n may be 0."""
     centre = _meeting_point(matrices)
     distance = np.linalg.norm(matrices[:, :3, 3] - centre, axis=1)
     widest = max(max(shape.inside.shape) / min(shape.focal) for shape in outlines)
@@ -181,10 +216,10 @@ def _explained(matrices: Array, outlines: list[_Silhouette]) -> float:
         cells = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3) * size + low
         hull = cells[_agreed(cells, matrices, outlines)]
         if len(hull) == 0:
-            return 0.0
+            return hull, 0.0
         cell = np.max(size) / _CELLS
         low, size = hull.min(axis=0) - cell, np.ptp(hull, axis=0) + 2 * cell
-    return float(np.mean([_covered(hull, cell, m, shape) for m, shape in zip(matrices, outlines)]))
+    return hull, float(cell)
 
 
 def _meeting_point(matrices: Array) -> Array:
