@@ -7,6 +7,7 @@ Surfels that start on it need not be found by gradients.
 from __future__ import annotations
 
 import logging
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -134,7 +135,8 @@ def find_region(capture: Capture) -> Region:
         inside, seen = _carve(origin, spacing, shape, views, masks)
         near, _ = _carve(origin, spacing, shape, views, _widened(masks, views, centre, spacing))
         apart = near & ~binary_dilation(inside, iterations=AWAY)
-        inside = _main_parts(inside | near, seen) & (inside | apart)
+        main = _main_parts(inside | near)
+        inside = (main if cells < CELLS else _without_phantoms(main, seen, origin, spacing, views)) & (inside | apart)
         if not inside.any():
             raise AssetError(
                 str(capture.source),
@@ -162,18 +164,62 @@ def _widened(masks: list[Array], views: list[View], centre: Array, spacing: floa
     return grown
 
 
-def _main_parts(inside: Array, seen: Array) -> Array:
-    """The solid without parts smaller than a hundredth of the largest; than a tenth, where half as many views see them.
+def _main_parts(inside: Array) -> Array:
+    """The solid without parts smaller than a hundredth of the largest."""
+    parts, sizes = _sized(inside)
+    return (sizes >= max(0.01 * sizes.max(), 1))[parts]
 
-    Such are at the edge of the pictures: what no view that has them shows as background, because few have them.
-    """
+
+def _sized(inside: Array) -> tuple[Array, Array]:
+    """Number of the part that each cell is of, 0 outside, and cells of each."""
     parts, count = label(inside)
-    flat = parts.reshape(-1)
-    sizes = np.bincount(flat, minlength=count + 1)
-    witnesses = np.bincount(flat, seen.reshape(-1), count + 1) / np.maximum(sizes, 1)
+    sizes = np.bincount(parts.reshape(-1), minlength=count + 1)
     sizes[0] = 0
-    doubtful = witnesses < 0.5 * witnesses[sizes.argmax()]
-    return (sizes >= np.where(doubtful, 0.1, 0.01) * sizes.max())[parts] & inside
+    return parts, sizes
+
+
+def _without_phantoms(inside: Array, seen: Array, origin: Array, spacing: float, views: list[View]) -> Array:
+    """The solid without small parts at the edge of the pictures, where few of them can show background.
+
+    Those are smaller than a tenth of the largest, fewer than half as many views have them, and nothing that these show
+    is missing without them.
+    """
+    parts, sizes = _sized(inside)
+    witnesses = np.bincount(parts.reshape(-1), seen.reshape(-1), len(sizes)) / np.maximum(sizes, 1)
+    doubtful = (sizes > 0) & (sizes < 0.1 * sizes.max()) & (witnesses < 0.5 * witnesses[sizes.argmax()])
+    kept = (sizes > 0) & ~doubtful
+    places = lambda which: np.argwhere(which) * spacing + origin  # noqa: E731
+    rest = places(kept[parts])
+    for part in np.flatnonzero(doubtful):
+        kept[part] = _shows_alone(places(parts == part), rest, spacing, views)
+    if left_out := int((sizes > 0).sum() - kept.sum()):
+        log.info("left out %d parts of the hull that few views have in their picture", left_out)
+    return kept[parts]
+
+
+def _shows_alone(part: Array, rest: Array, spacing: float, views: list[View]) -> bool:
+    """Whether some view has most of the points `part` (n, 3) where none of `rest` (m, 3) is, to a cell of `spacing`."""
+    for view in views:
+        x, y, has, _ = _pixels(part, view.camera)
+        if has.any():
+            u, v, shown, depth = _pixels(rest, view.camera)
+            covered = np.zeros((view.camera.height, view.camera.width), bool)
+            covered[v[shown], u[shown]] = True
+            middle = float(np.median(depth[shown])) if shown.any() else np.inf
+            cell = math.ceil(spacing * max(view.camera.fx, view.camera.fy) / middle)
+            covered = maximum_filter(covered, 2 * min(cell, max(covered.shape)) + 1)
+            if covered[y[has], x[has]].mean() < 0.5:
+                return True
+    return False
+
+
+def _pixels(points: Array, camera: Camera) -> tuple[Array, Array, Array, Array]:
+    """Columns and rows of points (n, 3) in the picture, 0 of those outside; which are inside; their depth."""
+    matrix = world_to_pixel(camera)
+    position = points @ matrix[:, :3].T + matrix[:, 3]
+    x, y = (np.floor(position[:, k] / np.maximum(position[:, 2], 1e-9)) for k in (0, 1))
+    inside = (position[:, 2] > 0) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
+    return np.where(inside, x, 0).astype(int), np.where(inside, y, 0).astype(int), inside, position[:, 2]
 
 
 def _surface(inside: Array, origin: Array, spacing: float) -> tuple[Array, Array]:
@@ -181,17 +227,16 @@ def _surface(inside: Array, origin: Array, spacing: float) -> tuple[Array, Array
     padded = np.pad(inside, 3)
     smooth = gaussian_filter(padded.astype(np.float32), 1.5)
     slope = np.stack(np.gradient(smooth), -1)
-    core = padded.copy()
-    for axis in range(3):
-        core &= np.roll(padded, 1, axis) & np.roll(padded, -1, axis)
-    border = padded & ~core
+    beside = np.stack([[np.roll(padded, step, axis) for step in (1, -1)] for axis in range(3)])
+    border = padded & ~beside.all(axis=(0, 1))
     steep = slope[border]
     length = np.linalg.norm(steep, axis=1)
-    solid = length > 1e-3
-    at, steep, length = np.argwhere(border)[solid], steep[solid], length[solid]
-    normals = -steep / length[:, None]
-    offset = np.clip((smooth[border][solid] - 0.5) / length, -1, 1)
-    points = (at - 3 + offset[:, None] * normals) * spacing + origin
+    # Wires and leaves as thin as a cell are alike on both sides: across them, where they are.
+    thin = length <= 1e-3
+    across = np.eye(3, dtype=np.float32)[(~beside.any(axis=1))[:, border].argmax(axis=0)]
+    normals = np.where(thin[:, None], across, -steep / np.maximum(length, 1e-3)[:, None])
+    offset = np.where(thin, 0, np.clip((smooth[border] - 0.5) / np.maximum(length, 1e-3), -1, 1))
+    points = (np.argwhere(border) - 3 + offset[:, None] * normals) * spacing + origin
     return points.astype(np.float32), normals.astype(np.float32)
 
 
@@ -249,12 +294,8 @@ def colours_of(points: Array, normals: Array, views: list[View]) -> Array:
         eye = np.asarray(view.camera.matrix_world)[:3, 3]
         towards = eye - points
         facing = np.einsum("nc,nc->n", towards, normals) / np.maximum(np.linalg.norm(towards, axis=1), 1e-9)
-        matrix = world_to_pixel(view.camera)
-        position = points @ matrix[:, :3].T + matrix[:, 3]
-        x, y = (np.floor(position[:, k] / np.maximum(position[:, 2], 1e-9)).astype(int) for k in (0, 1))
-        inside = (position[:, 2] > 0) & (x >= 0) & (y >= 0) & (x < view.camera.width) & (y < view.camera.height)
+        x, y, inside, _ = _pixels(points, view.camera)
         w = np.where(inside, np.maximum(facing, 0) ** 2, 0)
-        x, y = np.where(inside, x, 0), np.where(inside, y, 0)
         total += w[:, None] * view.colour[y, x]
         weight += w
     return np.where(weight[:, None] > 1e-3, total / np.maximum(weight, 1e-3)[:, None], 0.5).astype(np.float32)

@@ -14,7 +14,7 @@ from capture_cases import balls, photographed, rays_of  # noqa: E402
 
 from drgs_blender.reconstruct import train  # noqa: E402
 from drgs_blender.reconstruct.capture import Capture  # noqa: E402
-from drgs_blender.reconstruct.hull import _widened, find_region  # noqa: E402
+from drgs_blender.reconstruct.hull import _surface, _widened, find_region  # noqa: E402
 from drgs_blender.reconstruct.train import Schedule, Training  # noqa: E402
 
 #: A ball out of which another one took a bite: centres and radii. The rim of the bite is 0.31 above its ground.
@@ -194,6 +194,15 @@ def test_wires_thinner_than_a_cell_are_part_of_the_hull(across):
     for side in (-1, 1):
         places = np.sort(side * along[side * along[:, 0] > 0, 0])
         assert len(places) and places.max() > 0.8 and np.diff(places, prepend=0.5).max() < 6 * region.spacing
+
+
+def test_what_is_a_cell_thin_has_a_surface_where_it_is():
+    """Alike on both sides, it has no slope."""
+    inside = np.zeros((20, 9, 9), bool)
+    inside[3:17, 4, 4] = True
+    points, normals = _surface(inside, np.zeros(3), 0.1)
+    assert np.allclose(np.sort(points[4:-4, 0]), 0.1 * np.arange(7, 13)) and np.allclose(points[4:-4, 1:], 0.4)
+    assert np.allclose(normals[4:-4, 0], 0) and np.allclose(np.linalg.norm(normals, axis=1), 1)
 
 
 def test_a_camera_in_the_middle_does_not_widen_masks_beyond_the_picture():
