@@ -12,7 +12,7 @@ from pathlib import Path
 from urllib.parse import unquote
 
 from ...drgs_blender.engine.child import clean_environment
-from ...drgs_blender.errors import EXIT_CANNOT_WRITE, AssetError, EngineError, UsageError, WriteError
+from ...drgs_blender.errors import EXIT_CANNOT_WRITE, EXIT_TERMINATED, AssetError, EngineError, UsageError, WriteError
 from .. import engine_link
 from . import capture
 
@@ -46,6 +46,7 @@ def ending() -> bool:
     for entry in list(_ending):
         process, until = entry
         if process.poll() is not None:
+            process.stdin.close()
             _ending.remove(entry)
         elif time.monotonic() > until:
             process.kill()
@@ -111,12 +112,16 @@ class Program:
 
     def end(self, save: bool = True) -> None:
         """End it if it runs; while it saves what it needs to go on, `ending` is true. Without, it is killed."""
+        if any(process is self._process for process, _ in _ending):
+            return
         if self.alive:
             (self._process.terminate if save else self._process.kill)()
             try:
                 self._process.wait(_WAIT)
             except subprocess.TimeoutExpired:
+                # Its input stays open: to close it would be to ask a second time, in the middle of what it saves.
                 _ending.append((self._process, time.monotonic() + _PATIENCE))
+                return
         self._process.stdin.close()
 
     def result(self, subject: str, held: str = "") -> list[str]:
@@ -138,7 +143,7 @@ class Program:
         if code == 0:
             return [f"{subject}: {self._in_words(line.removeprefix(_SAYS))}" for line in lines]
         said = next((line for line in reversed(lines) if line.startswith(_SAYS)), "")
-        if said:
+        if said and code != EXIT_TERMINATED:
             raise AssetError(subject, self._in_words(said.removeprefix(_SAYS)).rstrip("."), held)
         if code == EXIT_CANNOT_WRITE:  # nor could its log
             remedy = "Free some space or choose another folder, and bake again"

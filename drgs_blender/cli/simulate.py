@@ -18,6 +18,7 @@ import numpy as np
 from ..errors import UsageError
 from ..particle_cache import ParticleCache
 from ..sequence import frame_path
+from .interrupt import interruptible
 from .output import check_suffix, check_writable
 from .progress import FractionBar, clock
 from .sampling import whole
@@ -126,12 +127,12 @@ def run(args: argparse.Namespace) -> int:
         logger.warning("%d vertices are on walls too thin to fill; they follow what is near", report["bare_vertices"])
     cache = ParticleCache(args.out)
     count = settings.last - settings.first + 1
-    with FractionBar(args, "simulating") as bar:
+    with FractionBar(args, "simulating") as bar, interruptible() as stopped:
 
         def progress(frame: int, part: float) -> None:
             bar(f"frame {frame}", (frame - settings.first - 1 + part) / max(count - 1, 1))
 
-        done = bake(job, cache, overwrite=args.overwrite, progress=progress)
+        done = bake(job, cache, overwrite=args.overwrite, cancelled=stopped, progress=progress)
     print(f"{args.out}: frames {settings.first} to {settings.last}, {done} of them computed now")
     _write_others(args, cache, asset.mesh.faces, settings)
     return 0

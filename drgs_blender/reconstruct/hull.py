@@ -233,7 +233,8 @@ def _surface(inside: Array, origin: Array, spacing: float) -> tuple[Array, Array
     length = np.linalg.norm(steep, axis=1)
     # Wires and leaves as thin as a cell are alike on both sides: across them, where they are.
     thin = length <= 1e-3
-    across = np.eye(3, dtype=np.float32)[(~beside.any(axis=1))[:, border].argmax(axis=0)]
+    lone = np.logical_or(beside[:, 0], beside[:, 1])[:, border].argmin(axis=0)  # an axis along which nothing is beside
+    across = np.eye(3, dtype=np.float32)[lone]
     normals = np.where(thin[:, None], across, -steep / np.maximum(length, 1e-3)[:, None])
     offset = np.where(thin, 0, np.clip((smooth[border] - 0.5) / np.maximum(length, 1e-3), -1, 1))
     points = (np.argwhere(border) - 3 + offset[:, None] * normals) * spacing + origin

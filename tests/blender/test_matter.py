@@ -110,6 +110,7 @@ def test_a_bake_is_stopped_at_once_and_goes_on(body, scene):
     bake.close()
     assert min(took) < 0.5
     assert 3 <= done < wanted
+    assert cache_of(body).read_state()[0] >= done, "what it needs to go on is saved"
     np.testing.assert_array_equal(vertices(body, 3), cache_of(body).read(3).vertices)
     assert np.abs(vertices(body, 3) - vertices(body, 1)).max() > 0.1, "it spins"
     found = work.cached(body, scene)
