@@ -116,8 +116,11 @@ def sheet(objects: list[str], scenes: Path, rays: int) -> None:
         def show(name: str, _: int, ours: np.ndarray, true: np.ndarray, shown: dict = shown) -> None:
             shown[name] = (true, ours)
 
-        sets = [replace(item, views=item.views[VIEW:][:1], maps=item.maps[VIEW:][:1]) for item in truth.sets]
-        wanted = [item for item in sets if item.name in ("test", f"relit-{LIGHT}", f"posed-{LIGHT}")]
+        wanted = [
+            replace(item, views=[item.views[VIEW]], maps=item.maps[VIEW : VIEW + 1])
+            for item in truth.sets
+            if item.name in ("test", f"relit-{LIGHT}", f"posed-{LIGHT}")
+        ]
         score(FOLDER / f"{name}.drgs", scenes / name, "surfels", rays, replace(truth, sets=wanted), show)
         row = (shown["test"][0], *shown[f"relit-{LIGHT}"], *shown[f"posed-{LIGHT}"])
         rows.append(np.concatenate(row, axis=1))

@@ -135,8 +135,10 @@ def find_region(capture: Capture) -> Region:
         inside, seen = _carve(origin, spacing, shape, views, masks)
         near, _ = _carve(origin, spacing, shape, views, _widened(masks, views, centre, spacing))
         apart = near & ~binary_dilation(inside, iterations=AWAY)
-        main = _main_parts(inside | near)
-        inside = (main if cells < CELLS else _without_phantoms(main, seen, origin, spacing, views)) & (inside | apart)
+        parts, sizes = _main_parts(inside | near)
+        if cells == CELLS:
+            sizes[_phantoms(parts, sizes, seen, origin, spacing, views)] = 0
+        inside = (sizes > 0)[parts] & (inside | apart)
         if not inside.any():
             raise AssetError(
                 str(capture.source),
@@ -164,53 +166,39 @@ def _widened(masks: list[Array], views: list[View], centre: Array, spacing: floa
     return grown
 
 
-def _main_parts(inside: Array) -> Array:
-    """The solid without parts smaller than a hundredth of the largest."""
-    parts, sizes = _sized(inside)
-    return (sizes >= max(0.01 * sizes.max(), 1))[parts]
-
-
-def _sized(inside: Array) -> tuple[Array, Array]:
-    """Number of the part that each cell is of, 0 outside, and cells of each."""
+def _main_parts(inside: Array) -> tuple[Array, Array]:
+    """Number of the part that each cell of the solid is of, 0 outside; cells of each, 0 of those under a hundredth."""
     parts, count = label(inside)
     sizes = np.bincount(parts.reshape(-1), minlength=count + 1)
     sizes[0] = 0
-    return parts, sizes
+    return parts, np.where(sizes >= 0.01 * sizes.max(), sizes, 0)
 
 
-def _without_phantoms(inside: Array, seen: Array, origin: Array, spacing: float, views: list[View]) -> Array:
-    """The solid without small parts at the edge of the pictures, where few of them can show background.
+def _phantoms(parts: Array, sizes: Array, seen: Array, origin: Array, spacing: float, views: list[View]) -> list[int]:
+    """Numbers of small parts at the edge of the pictures, where few of them can show background.
 
     Those are smaller than a tenth of the largest, fewer than half as many views have them, and nothing that these show
     is missing without them.
     """
-    parts, sizes = _sized(inside)
     witnesses = np.bincount(parts.reshape(-1), seen.reshape(-1), len(sizes)) / np.maximum(sizes, 1)
     doubtful = (sizes > 0) & (sizes < 0.1 * sizes.max()) & (witnesses < 0.5 * witnesses[sizes.argmax()])
-    kept = (sizes > 0) & ~doubtful
     places = lambda which: np.argwhere(which) * spacing + origin  # noqa: E731
-    rest = places(kept[parts])
-    for part in np.flatnonzero(doubtful):
-        kept[part] = _shows_alone(places(parts == part), rest, spacing, views)
-    if left_out := int((sizes > 0).sum() - kept.sum()):
-        log.info("left out %d parts of the hull that few views have in their picture", left_out)
-    return kept[parts]
-
-
-def _shows_alone(part: Array, rest: Array, spacing: float, views: list[View]) -> bool:
-    """Whether some view has most of the points `part` (n, 3) where none of `rest` (m, 3) is, to a cell of `spacing`."""
-    for view in views:
-        x, y, has, _ = _pixels(part, view.camera)
-        if has.any():
-            u, v, shown, depth = _pixels(rest, view.camera)
-            covered = np.zeros((view.camera.height, view.camera.width), bool)
-            covered[v[shown], u[shown]] = True
-            middle = float(np.median(depth[shown])) if shown.any() else np.inf
-            cell = math.ceil(spacing * max(view.camera.fx, view.camera.fy) / middle)
-            covered = maximum_filter(covered, 2 * min(cell, max(covered.shape)) + 1)
-            if covered[y[has], x[has]].mean() < 0.5:
-                return True
-    return False
+    left = {int(part): places(parts == part) for part in np.flatnonzero(doubtful)}
+    rest = places(((sizes > 0) & ~doubtful)[parts])
+    for view in views if left else ():
+        u, v, shown, depth = _pixels(rest, view.camera)
+        covered = np.zeros((view.camera.height, view.camera.width), bool)
+        covered[v[shown], u[shown]] = True
+        middle = float(np.median(depth[shown])) if shown.any() else np.inf
+        cell = math.ceil(spacing * max(view.camera.fx, view.camera.fy) / middle)
+        covered = maximum_filter(covered, 2 * min(cell, max(covered.shape)) + 1)
+        for part, points in list(left.items()):
+            x, y, has, _ = _pixels(points, view.camera)
+            if has.any() and covered[y[has], x[has]].mean() < 0.5:
+                del left[part]  # most of it is where nothing else is
+    if left:
+        log.info("left out %d parts of the hull that few views have in their picture", len(left))
+    return list(left)
 
 
 def _pixels(points: Array, camera: Camera) -> tuple[Array, Array, Array, Array]:
@@ -230,14 +218,15 @@ def _surface(inside: Array, origin: Array, spacing: float) -> tuple[Array, Array
     beside = np.stack([[np.roll(padded, step, axis) for step in (1, -1)] for axis in range(3)])
     border = padded & ~beside.all(axis=(0, 1))
     steep = slope[border]
-    length = np.linalg.norm(steep, axis=1)
+    length = np.linalg.norm(steep, axis=1)[:, None]
     # Wires and leaves as thin as a cell are alike on both sides: across them, where they are.
     thin = length <= 1e-3
     lone = np.logical_or(beside[:, 0], beside[:, 1])[:, border].argmin(axis=0)  # an axis along which nothing is beside
     across = np.eye(3, dtype=np.float32)[lone]
-    normals = np.where(thin[:, None], across, -steep / np.maximum(length, 1e-3)[:, None])
-    offset = np.where(thin, 0, np.clip((smooth[border] - 0.5) / np.maximum(length, 1e-3), -1, 1))
-    points = (np.argwhere(border) - 3 + offset[:, None] * normals) * spacing + origin
+    length = np.maximum(length, 1e-3)
+    normals = np.where(thin, across, -steep / length)
+    offset = np.where(thin, 0, np.clip((smooth[border][:, None] - 0.5) / length, -1, 1))
+    points = (np.argwhere(border) - 3 + offset * normals) * spacing + origin
     return points.astype(np.float32), normals.astype(np.float32)
 
 

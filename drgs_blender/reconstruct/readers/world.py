@@ -112,10 +112,11 @@ def check_silhouettes(views: Sequence[View], subject: str, axes: str) -> None:
     if _inside_out(matrices, outlines):
         problem = "has masks that are inverted: they fill the pictures' borders, and what they leave out is one shape"
         raise AssetError(subject, problem, "Invert the masks: white is the object, black its surroundings")
-    score = _explained(matrices, outlines)
+    hull = _hull(matrices, outlines)
+    score = _covers(hull, matrices, outlines)
     logger.debug("%s: the visual hull explains %.2f of the silhouettes", subject, score)
     if score >= _WRONG:
-        _warn_of_strangers(masked, *_hull(matrices, outlines), subject)
+        _warn_of_strangers(masked, *hull, subject)
         return
     # The matrices of the file, as every other convention would have them.
     raw = np.stack([_undo(axes, matrix) for matrix in matrices])
@@ -200,8 +201,12 @@ class _Silhouette:
 
 def _explained(matrices: Array, outlines: list[_Silhouette]) -> float:
     """Mean part of the silhouettes that their visual hull covers."""
-    hull, cell = _hull(matrices, outlines)
-    return float(np.mean([_covered(hull, cell, m, shape) for m, shape in zip(matrices, outlines)]))
+    return _covers(_hull(matrices, outlines), matrices, outlines)
+
+
+def _covers(hull: tuple[Array, float], matrices: Array, outlines: list[_Silhouette]) -> float:
+    """Mean part of the silhouettes that a hull covers."""
+    return float(np.mean([_covered(*hull, m, shape) for m, shape in zip(matrices, outlines)]))
 
 
 def _hull(matrices: Array, outlines: list[_Silhouette]) -> tuple[Array, float]:
