@@ -15,7 +15,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation, binary_erosion, gaussian_filter, label, maximum_filter, uniform_filter
 
 from ..arrays import Array
-from ..errors import AssetError
+from ..errors import AssetError, first_of
 from ..frame import Camera
 from ..jit import njit, prange
 from .capture import Capture, View
@@ -30,6 +30,8 @@ DISSENT = 0.03
 WITNESSES = 0.2
 #: Cells along the longest side of the hull's box.
 CELLS = 96
+#: Part of a mask that small parts of the object must have for themselves to be missed where they are left out.
+SHOWN = 0.01
 #: Parts of the object thinner than a cell begin so many cells from the parts that are not.
 AWAY = 2
 
@@ -128,6 +130,7 @@ def find_region(capture: Capture) -> Region:
         raise AssetError(str(capture.source), "shows no object in any mask", "Check masks and background")
     centre, radius = aim([view.camera for view in views])
     low, high = centre - 1.5 * radius, centre + 1.5 * radius
+    missed: list[str] = []
     # Coarse first, to find the box; cells of the second time are as fine as the object allows.
     for cells in (64, CELLS):
         origin, spacing = low, float((high - low).max()) / cells
@@ -138,15 +141,22 @@ def find_region(capture: Capture) -> Region:
         parts, sizes = _main_parts(inside | near)
         if cells == CELLS:
             sizes[_phantoms(parts, sizes, seen, origin, spacing, views)] = 0
-        inside = (sizes > 0)[parts] & (inside | apart)
+        whole = inside | apart
+        inside = (sizes > 0)[parts] & whole
         if not inside.any():
             raise AssetError(
                 str(capture.source),
                 "has masks that no common point projects into: cameras and pictures do not agree",
                 "Check the convention of the cameras' axes and their order",
             )
+        missed = missed or _missed(whole & ~inside, inside, origin, spacing, views, masks)
         corners = np.argwhere(inside)
         low, high = origin + (corners.min(0) - 1.5) * spacing, origin + (corners.max(0) + 1.5) * spacing
+    if len(missed) >= 3:
+        log.warning(
+            "%s: a small part apart from the rest is left out, which %d photographs show (%s): photograph it alone, or "
+            "leave it out of the masks", capture.source, len(missed), first_of(missed),
+        )  # fmt: skip
     points, normals = _surface(inside, origin, spacing)
     middle = 0.5 * (low + high)
     solid = (np.argwhere(inside) * spacing + origin).astype(np.float32)
@@ -186,12 +196,7 @@ def _phantoms(parts: Array, sizes: Array, seen: Array, origin: Array, spacing: f
     left = {int(part): places(parts == part) for part in np.flatnonzero(doubtful)}
     rest = places(((sizes > 0) & ~doubtful)[parts])
     for view in views if left else ():
-        u, v, shown, depth = _pixels(rest, view.camera)
-        covered = np.zeros((view.camera.height, view.camera.width), bool)
-        covered[v[shown], u[shown]] = True
-        middle = float(np.median(depth[shown])) if shown.any() else np.inf
-        cell = math.ceil(spacing * max(view.camera.fx, view.camera.fy) / middle)
-        covered = maximum_filter(covered, 2 * min(cell, max(covered.shape)) + 1)
+        covered = _drawn(rest, spacing, view.camera)
         for part, points in list(left.items()):
             x, y, has, _ = _pixels(points, view.camera)
             if has.any() and covered[y[has], x[has]].mean() < 0.5:
@@ -199,6 +204,32 @@ def _phantoms(parts: Array, sizes: Array, seen: Array, origin: Array, spacing: f
     if left:
         log.info("left out %d parts of the hull that few views have in their picture", len(left))
     return list(left)
+
+
+def _missed(
+    dropped: Array, kept: Array, origin: Array, spacing: float, views: list[View], masks: list[Array]
+) -> list[str]:
+    """Names of the views with more than `SHOWN` of their mask where the `dropped` cells are, and none `kept`."""
+    if not dropped.any():
+        return []
+    names = []
+    lost, rest = (np.argwhere(cells) * spacing + origin for cells in (dropped, kept))
+    for view, mask in zip(views, masks, strict=True):
+        object_ = mask > 0.5
+        alone = object_ & _drawn(lost, spacing, view.camera) & ~_drawn(rest, spacing, view.camera)
+        if alone.sum() > SHOWN * max(object_.sum(), 1):
+            names.append(view.name)
+    return names
+
+
+def _drawn(points: Array, spacing: float, camera: Camera) -> Array:
+    """(h, w) bool: where cells of side `spacing` are in the picture, generously."""
+    x, y, shown, depth = _pixels(points, camera)
+    covered = np.zeros((camera.height, camera.width), bool)
+    covered[y[shown], x[shown]] = True
+    middle = float(np.median(depth[shown])) if shown.any() else np.inf
+    cell = math.ceil(spacing * max(camera.fx, camera.fy) / middle)
+    return maximum_filter(covered, 2 * min(cell, max(covered.shape)) + 1)
 
 
 def _pixels(points: Array, camera: Camera) -> tuple[Array, Array, Array, Array]:

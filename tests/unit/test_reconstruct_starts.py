@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,8 +13,9 @@ torch = pytest.importorskip("torch")
 
 from capture_cases import balls, photographed, rays_of  # noqa: E402
 
+from drgs_blender.frame import Camera  # noqa: E402
 from drgs_blender.reconstruct import train  # noqa: E402
-from drgs_blender.reconstruct.capture import Capture  # noqa: E402
+from drgs_blender.reconstruct.capture import Capture, View  # noqa: E402
 from drgs_blender.reconstruct.hull import _surface, _widened, find_region  # noqa: E402
 from drgs_blender.reconstruct.train import Schedule, Training  # noqa: E402
 
@@ -221,3 +223,30 @@ def test_what_few_views_have_at_the_edge_of_their_pictures_is_no_part_of_the_obj
     region = find_region(replace(capture, views=[replace(view, test=False) for view in capture.views]))
     assert np.abs([region.low, region.high]).max() < 1.05
     assert np.linalg.norm(region.points, axis=1).max() < 1.1 * BOWL[1]
+
+
+@pytest.mark.parametrize(
+    ("away", "radius", "large"), [(1.1, 0.1, False), (2.4, 0.1, False), (2.4, 0.25, True), (1.1, 0.3, True)]
+)
+def test_a_part_that_photographs_show_is_kept_or_said_to_be_left_out(away, radius, large, caplog):
+    """A ball beside a larger one, in all pictures or in few: too small, and large enough."""
+    balls_ = ((np.zeros(3), 0.6), (np.array([away, 0.0, 0.0]), radius))
+    views = []
+    for k, angle in enumerate(np.arange(16) * 2 * np.pi / 16):
+        back = np.array([4 * np.cos(angle), 4 * np.sin(angle), 1.0 + k % 2])
+        distance = np.linalg.norm(back)
+        back = back / distance
+        right = np.cross([0.0, 0, 1], back)
+        right /= np.linalg.norm(right)
+        matrix = np.eye(4)
+        matrix[:3] = np.column_stack([right, np.cross(back, right), back, distance * back])
+        camera = Camera(matrix, 64, 64, 80.0, 80.0, 32.0, 32.0)
+        rays, _ = rays_of(camera, 1)
+        eyes = [matrix[:3, 3] - middle for middle, _ in balls_]
+        hits = [(rays @ eye) ** 2 > eye @ eye - size**2 for eye, (_, size) in zip(eyes, balls_, strict=True)]
+        mask = np.logical_or(*hits).astype(np.float32)
+        views.append(View(f"{k:03d}", camera, np.repeat(1 - mask[..., None], 3, -1), mask))
+    region = find_region(Capture(Path("pair"), views, (1.0, 1.0, 1.0)))
+    kept = (np.linalg.norm(region.solid - balls_[1][0], axis=1) < radius).any()
+    assert kept == large
+    assert ("is left out, which" in caplog.text) != kept
