@@ -18,6 +18,7 @@ from ..build.transfer import surfels_to_vertices
 from ..deform.binding import bind
 from ..deform.mesh_driven import MeshDriven
 from ..errors import Cancelled, WriteError
+from ..geometry import VertexNormals
 from . import checkpoint
 from .attached import attach_learned, bound
 from .capture import Capture, View
@@ -29,9 +30,10 @@ from .hull import Region, find_region, have_silhouettes, silhouettes
 from .photometric import Photograph, structural_similarity
 from .processor import HERE
 from .rehearsal import rehearse
-from .relief import follow_normals, shaded_by
+from .relief import follow_normals, shaded_by, shaded_by_own
 from .silhouette import fill_silhouettes
 from .targets import background_of, composed
+from .thin import is_thin, normals_of
 from .train import Schedule, Training
 from .tsdf import fuse, grid
 
@@ -147,8 +149,11 @@ def reconstruct(
     report |= judge(final, capture)
     visible = final.opacities().detach().numpy() >= UNSEEN
     surfels = _kept(final, visible)
-    found = _decoupled(work, mesh, len(surfels), report) if settings.materials else None
-    if found is not None:
+    found, thin, smooth = None, False, VertexNormals(mesh.faces, len(mesh.vertices))(mesh.vertices)
+    if settings.materials:
+        # Surfels on the mesh have its normals.
+        thin = report["thin"] = settings.variant == "p" and is_thin(final, mesh, capture.training)
+        found = _decoupled(work, mesh, final, thin, report)
         mesh = replace(mesh, albedo=found.albedo, roughness=found.roughness, metallic=found.metallic)
         if settings.decoupling.normals:
             mesh.vertices = follow_normals(mesh, found.normals)
@@ -161,7 +166,9 @@ def reconstruct(
     if found is None:
         report["vertices_without_surfels"] = surfels_to_vertices(mesh, surfels, binding)
     else:
-        if settings.decoupling.normals:
+        if thin:
+            binding = shaded_by_own(binding, mesh, surfels, found.normals - smooth)
+        elif settings.decoupling.normals:
             binding = shaded_by(binding, mesh, found.normals)
         _take_materials(surfels, mesh, binding)
         environment, origin = Environment(found.environment), "pulled apart from the light"
@@ -254,16 +261,17 @@ def _on_mesh(
     return final, bound(binding, final)  # type: ignore[arg-type]
 
 
-def _decoupled(work: _Work, mesh: Mesh, surfels: int, report: dict[str, Any]) -> Decoupled:
+def _decoupled(work: _Work, mesh: Mesh, surfels: Gaussians, thin: bool, report: dict[str, Any]) -> Decoupled:
     """Materials, normals and light."""
     found = decouple(
         work.capture,
         mesh,
         replace(work.settings.decoupling, seconds=work.seconds(SHARE_OF_MATERIALS) or 0.0),
-        lambda at: work.tell(Progress("materials", 0.7 + 0.3 * at.part, surfels, at.psnr)),
+        lambda at: work.tell(Progress("materials", 0.7 + 0.3 * at.part, len(surfels), at.psnr)),
         work.cancelled,
         work.file("materials"),
         work.by,
+        normals_of(surfels) if thin else None,
     )
     done, of = found.report["iterations"], work.settings.decoupling.iterations
     if done < min(FEW_STEPS, of):

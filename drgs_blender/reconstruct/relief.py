@@ -14,10 +14,10 @@ from scipy.sparse import coo_matrix, diags
 from scipy.sparse.linalg import cg
 
 from ..arrays import Array
-from ..asset.model import Binding, Mesh
+from ..asset.model import Binding, Mesh, Surfels
 from ..deform.binding import clamp_weights
 from ..deform.faces import Faces, dot, shading_frames
-from ..geometry import VertexNormals, unit
+from ..geometry import VertexNormals, rotation_matrices, unit
 from .decouple.cache import edges_of
 
 #: Weight of the positions against the slopes of edges.
@@ -78,7 +78,25 @@ def _within(vertices: Array, old: Array, before: Faces, faces: Array, reach: flo
 
 def shaded_by(binding: Binding, mesh: Mesh, normals: Array) -> Binding:
     """`binding` with shading normals that are blended of the unit `normals` (v, 3) of the mesh's vertices."""
+    return _shaded(binding, mesh, Faces.of(mesh.vertices, mesh.faces), _blended(binding, mesh, normals))
+
+
+def shaded_by_own(binding: Binding, mesh: Mesh, surfels: Surfels, turns: Array) -> Binding:
+    """`binding` with the surfels' own normals, on the side of their faces, to which `turns` (v, 3) of the mesh's
+    vertices are added."""
+    faces = Faces.of(mesh.vertices, mesh.faces)
+    own = rotation_matrices(surfels.rotation.astype(np.float64))[..., 2]
+    own = np.where(dot(own, faces.normal[binding.face])[:, None] < 0, -own, own)
+    return _shaded(binding, mesh, faces, own + _blended(binding, mesh, turns))
+
+
+def _blended(binding: Binding, mesh: Mesh, values: Array) -> Array:
+    """(n, 3) where surfels hang of `values` (v, 3) of the vertices."""
+    return np.einsum("nk,nkc->nc", clamp_weights(binding.barycentric), values[mesh.faces[binding.face]])
+
+
+def _shaded(binding: Binding, mesh: Mesh, faces: Faces, normals: Array) -> Binding:
+    """`binding` with `normals` (n, 3) of the surfels, object space, of any length."""
     weights = clamp_weights(binding.barycentric)
-    frames = shading_frames(Faces.of(mesh.vertices, mesh.faces), mesh.faces, mesh.vertices, binding.face, weights)
-    blended = unit(np.einsum("nk,nkc->nc", weights, normals[mesh.faces[binding.face]]))
-    return replace(binding, normal=np.einsum("nij,ni->nj", frames, blended))
+    frames = shading_frames(faces, mesh.faces, mesh.vertices, binding.face, weights)
+    return replace(binding, normal=np.einsum("nij,ni->nj", frames, unit(normals)))

@@ -32,6 +32,7 @@ from drgs_blender.render.pipeline import render  # noqa: E402
 from drgs_blender.render.points import ShadingPoints  # noqa: E402
 from drgs_blender.render.reference.integrate import EmptyTracer, SurfacePoints, integrate_quadrature  # noqa: E402
 from drgs_blender.render.reference.light import Light  # noqa: E402
+from drgs_blender.render.reference.raster import camera_rays, pixel_centres  # noqa: E402
 from drgs_blender.render.shade.integrate import integrate as kernel_integrate  # noqa: E402
 from drgs_blender.render.trace.scene import TraceObject, TraceScene  # noqa: E402
 from drgs_blender.render.trace.tree import TriangleBVH  # noqa: E402
@@ -593,6 +594,27 @@ def test_normals_are_turned_towards_the_true_ones_once_light_is_known(ball, capt
     assert off(decouple(capture, wrong, settings).normals) < 0.97 * off(smooth)
     monkeypatch.setattr("drgs_blender.reconstruct.decouple.run._NORMALS", 2.0)
     assert decouple(capture, wrong, replace(settings, iterations=3)).normals == pytest.approx(smooth, abs=1e-6)
+
+
+def test_normals_that_others_tell_stand_in_for_those_of_a_poor_mesh(ball, capture):
+    """A ball with bumps that the photographed one has not; who tells knows the ball. Nonsense is not believed."""
+    bumps = 1 + 0.1 * np.sin(6 * ball.vertices).prod(axis=1, keepdims=True)
+    wrong = replace(ball, vertices=(ball.vertices * bumps).astype(np.float32))
+    settings = replace(SMALL, iterations=100, pixels=512, environment=16, coarse=3)
+
+    def of_ball(view: View) -> np.ndarray:
+        origin, rays = (a.numpy() for a in camera_rays(view.camera, pixel_centres(view.camera)))
+        rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+        along = -(origin * rays).sum(1)
+        depth = along - np.sqrt(np.maximum(1 - (origin**2).sum(1) + along**2, 0))
+        return (3 * (origin + depth[:, None] * rays)).reshape(*view.colour.shape)
+
+    without = decouple(capture, wrong, settings)
+    told = decouple(capture, wrong, settings, normals=of_ball)
+    assert told.report["psnr"] > without.report["psnr"] + 0.3
+    assert np.array_equal(told.normals, without.normals)  # of the mesh
+    nonsense = decouple(capture, wrong, settings, normals=lambda view: -of_ball(view))
+    assert all(np.array_equal(a, b) for a, b in zip(arrays(nonsense), arrays(without), strict=True))
 
 
 def test_bad_input_is_named(ball, capture):

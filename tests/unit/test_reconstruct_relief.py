@@ -9,8 +9,8 @@ from shapes import sphere_mesh
 from drgs_blender.asset.model import Mesh
 from drgs_blender.deform.attach import attach
 from drgs_blender.deform.mesh_driven import MeshDriven
-from drgs_blender.geometry import VertexNormals, unit
-from drgs_blender.reconstruct.relief import follow_normals, shaded_by
+from drgs_blender.geometry import VertexNormals, rotation_matrices, unit
+from drgs_blender.reconstruct.relief import follow_normals, shaded_by, shaded_by_own
 
 
 @pytest.fixture
@@ -75,3 +75,19 @@ def test_surfels_are_shaded_by_the_normals_in_every_pose(rough):
     turn = np.array([[0, -1.0, 0], [1, 0, 0], [0, 0, 1]])
     posed = driven.pose((mesh.vertices @ turn.T).astype(np.float32))
     assert angles(posed.normal, wanted @ turn.T).max() < 0.1
+
+
+def test_surfels_keep_their_own_normals_on_the_side_of_their_faces(rough):
+    mesh, _, _ = rough
+    surfels, binding, _ = attach(mesh, None, density=20)
+    spun = np.random.default_rng(2).normal(size=surfels.rotation.shape)
+    surfels.rotation = (spun / np.linalg.norm(spun, axis=1, keepdims=True)).astype(np.float32)
+    own = rotation_matrices(surfels.rotation.astype(np.float64))[..., 2]
+    turns = np.tile((0.0, 0.0, 0.4), (len(mesh.vertices), 1))
+    outwards = np.einsum("nc,nc->n", own, unit(surfels.centre.astype(np.float64)))
+    clear = np.abs(outwards) > 0.3  # the faces are a little rough
+    wanted = unit(own * np.sign(outwards)[:, None] + turns[0])
+    for rotate in (np.eye(3), np.array([[0, -1.0, 0], [1, 0, 0], [0, 0, 1]])):
+        driven = MeshDriven(mesh, surfels, shaded_by_own(binding, mesh, surfels, turns))
+        posed = driven.pose((mesh.vertices @ rotate.T).astype(np.float32))
+        assert angles(posed.normal, wanted @ rotate.T)[clear].max() < 0.1

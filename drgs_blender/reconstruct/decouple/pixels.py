@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -11,6 +12,7 @@ from scipy.ndimage import binary_dilation, binary_erosion
 from ...asset.model import Mesh
 from ...colour import srgb_to_linear
 from ...errors import UsageError
+from ...geometry import unit
 from ...render.reference.raster import camera_rays, pixel_centres
 from ...render.trace.tree import TriangleBVH
 from ..capture import View
@@ -18,6 +20,9 @@ from .losses import CLIPPED
 
 Array = np.ndarray
 log = logging.getLogger(__name__)
+
+#: Normals (h, w, 3) of a view's pixels, world space, of any length, facing the viewer.
+Normals = Callable[[View], Array]
 
 #: A mask counts as the object from here on.
 _INSIDE = 0.99
@@ -40,6 +45,7 @@ class Pixels:
     towards : (n, 3) float32 unit: to the viewer
     colour : (n, 3) float32 linear Rec.709 as photographed
     beside_clipped : (n, 3) bool: not clipped, but a pixel of the object `_BESIDE` away or nearer is, in this channel
+    shown : (n, 3) float32 unit, or 0: normal by something that knows better than the mesh, facing the viewer
     """
 
     view: Array
@@ -50,6 +56,7 @@ class Pixels:
     towards: Array
     colour: Array
     beside_clipped: Array
+    shown: Array
 
     def __len__(self) -> int:
         return len(self.view)
@@ -59,13 +66,16 @@ class Pixels:
         return Pixels(**{f.name: np.ascontiguousarray(getattr(self, f.name)[index]) for f in fields(self)})
 
 
-def foreground_pixels(views: list[View], mesh: Mesh, tree: TriangleBVH, most: int, seed: int = 0) -> Pixels:
+def foreground_pixels(
+    views: list[View], mesh: Mesh, tree: TriangleBVH, most: int, seed: int = 0, normals: Normals | None = None
+) -> Pixels:
     """What the pixels of `views` see of the mesh, a pixel away from its outline and the mask's.
 
     Parameters
     ----------
     tree : of the mesh's triangles
     most : keep this many, evenly chosen
+    normals : what else than the mesh tells them; see `Pixels.shown`
 
     Raises
     ------
@@ -76,7 +86,7 @@ def foreground_pixels(views: list[View], mesh: Mesh, tree: TriangleBVH, most: in
     share = max(1, most // max(1, len(views)))
     parts, empty = [], []
     for index, view in enumerate(views):
-        part = _of_view(index, view, mesh, tree)
+        part = pixels_of(index, view, mesh, tree, normals)
         if not len(part):
             empty.append(view.name)
         elif len(part) > share:
@@ -94,7 +104,8 @@ def foreground_pixels(views: list[View], mesh: Mesh, tree: TriangleBVH, most: in
     return pixels
 
 
-def _of_view(index: int, view: View, mesh: Mesh, tree: TriangleBVH) -> Pixels:
+def pixels_of(index: int, view: View, mesh: Mesh, tree: TriangleBVH, normals: Normals | None = None) -> Pixels:
+    """Those of one view, the `index`-th; see `foreground_pixels`."""
     height, width = view.colour.shape[:2]
     x0, y0, x1, y1 = view.camera.window
     if (height, width) != (y1 - y0, x1 - x0):
@@ -116,6 +127,7 @@ def _of_view(index: int, view: View, mesh: Mesh, tree: TriangleBVH) -> Pixels:
     flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-30)
     towards = -direction / np.linalg.norm(direction, axis=1, keepdims=True)
     colour = srgb_to_linear(view.colour)
+    told = None if normals is None else np.asarray(normals(view), np.float32)
     part = Pixels(
         np.full(len(row), index, np.int32),
         face,
@@ -125,6 +137,7 @@ def _of_view(index: int, view: View, mesh: Mesh, tree: TriangleBVH) -> Pixels:
         towards,
         colour.reshape(-1, 3)[row],
         _beside(seen[..., None] & (colour >= CLIPPED))[row],
+        np.zeros_like(flat) if told is None else unit(told.reshape(-1, 3)[row], (0, 0, 0)),
     )
     # A face seen from behind is an error of the mesh, or of its orientation: nothing can be learned there.
     usable = ((flat * towards).sum(1) > _GRAZING) & np.isfinite(part.colour).all(1)

@@ -18,6 +18,7 @@ from ...asset.model import Mesh
 from ...colour import linear_to_srgb
 from ...errors import AssetError, Cancelled, UsageError
 from ...geometry import VertexNormals
+from ...render.primary.primary_surfels import ALIKE
 from ...render.reference.brdf import MIN_ALPHA, dot, normalise
 from ...render.trace.tree import TriangleBVH
 from .. import checkpoint as states
@@ -30,7 +31,7 @@ from .gather import Points
 from .light import LearnedLight, colour_cast
 from .losses import blotches, dullness, log_loss, unbiased_loss
 from .materials import Materials
-from .pixels import Pixels, foreground_pixels
+from .pixels import Normals, Pixels, foreground_pixels
 from .settings import Settings
 
 Array = np.ndarray
@@ -92,6 +93,7 @@ def decouple(
     cancelled: Callable[[], bool] | None = None,
     checkpoint: Path | None = None,
     by: Processor = HERE,
+    normals: Normals | None = None,
 ) -> Decoupled:
     """Learn materials and light of an object from photographs and its geometry.
 
@@ -104,6 +106,8 @@ def decouple(
     cancelled : asked every step; then a checkpoint is left behind and Cancelled raised
     checkpoint : file to go on from when it lies there and fits, written every few seconds, removed at the end
     by : who follows rays; the rest is done here
+    normals : what else than the mesh tells the normals behind pixels. They count where they are within 60 degrees of
+        the face, as for surfels that are rendered; what is learned of normals is added to them
 
     Raises
     ------
@@ -120,7 +124,7 @@ def decouple(
         raise UsageError(str(capture.source), "has no training view", "Leave fewer views out for the test")
     if len(capture.training) < 4:
         log.warning("only %d views: light and materials can hardly be told apart", len(capture.training))
-    job = _Job(capture, mesh, settings, checkpoint, by)
+    job = _Job(capture, mesh, settings, checkpoint, by, normals)
     while job.going():
         if cancelled is not None and cancelled():
             job.save()
@@ -138,12 +142,14 @@ class _Job:
     """A run: what is learned, and everything a step needs."""
 
     def __init__(
-        self, capture: Capture, mesh: Mesh, settings: Settings, checkpoint: Path | None, by: Processor
-    ) -> None:
+        self, capture: Capture, mesh: Mesh, settings: Settings, checkpoint: Path | None, by: Processor,
+        normals: Normals | None,
+    ) -> None:  # fmt: skip
         self._mesh, self._settings, self._checkpoint = mesh, settings, checkpoint
         tree = TriangleBVH()
         tree.build(mesh.vertices, mesh.faces)
-        self._pixels = foreground_pixels(capture.training, mesh, tree, settings.most_pixels, settings.seed)
+        self._pixels = foreground_pixels(capture.training, mesh, tree, settings.most_pixels, settings.seed, normals)
+        self._told = normals is not None
         cache, self._weight = radiance_cache(self._pixels, mesh)
         counts = (settings.cosine, settings.ggx, settings.light)
         if not settings.shadows:
@@ -244,6 +250,8 @@ class _Job:
         if offsets is not None:
             smooth = smooth + offsets
         normal = normalise(blend(smooth, corner_place, shares))
+        if self._told:
+            normal = self._as_shown(pixels, normal, None if offsets is None else blend(offsets, corner_place, shares))
         roughness = self.materials.roughness(here)
         alpha2 = (roughness**2).clamp(min=MIN_ALPHA) ** 2
         radiance = self.light.radiance()
@@ -284,6 +292,13 @@ class _Job:
             loss = loss + s.normal_smoothness * (((turned[:, 0] - turned[:, 1]) ** 2).sum(1).mean())
             loss = loss + 0.02 * s.normal_smoothness * (offsets**2).sum(1).mean()
         return loss
+
+    @staticmethod
+    def _as_shown(pixels: Pixels, normal: Tensor, offsets: Tensor | None) -> Tensor:
+        """Normals (n, 3) told by others than the mesh, with what is learned; its `normal` where they are far off."""
+        shown = torch.from_numpy(pixels.shown)
+        believed = dot(shown, torch.from_numpy(pixels.flat))[:, None] >= ALIKE
+        return torch.where(believed, shown if offsets is None else normalise(shown + offsets), normal)
 
     def _note(self, loss: float, shown: Tensor, photographed: Tensor) -> None:
         """Running means of the loss and of the squared error in sRGB."""

@@ -1,0 +1,82 @@
+"""Things thinner than the mesh can be, told from others, and how their surfels are shaded."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from shapes import sphere_mesh
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("skimage")
+
+from capture_cases import balls  # noqa: E402
+
+from drgs_blender.asset.model import Mesh  # noqa: E402
+from drgs_blender.geometry import rotation_matrices, unit  # noqa: E402
+from drgs_blender.reconstruct import job  # noqa: E402
+from drgs_blender.reconstruct.decouple.settings import Settings as Decoupling  # noqa: E402
+from drgs_blender.reconstruct.gaussians import Gaussians  # noqa: E402
+from drgs_blender.reconstruct.job import Settings, reconstruct  # noqa: E402
+from drgs_blender.reconstruct.thin import is_thin, normals_of  # noqa: E402
+from drgs_blender.reconstruct.train import Schedule  # noqa: E402
+
+COLOUR, RIBS = 0.5, 12
+
+
+def plain(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
+    n = len(vertices)
+    return Mesh(vertices, faces, np.full((n, 3), COLOUR), np.full(n, 0.5), np.zeros(n))
+
+
+def surfels_on(points: np.ndarray, normals: np.ndarray) -> Gaussians:
+    surfels = Gaussians.on_surface(points, normals, np.full(points.shape, COLOUR), 0.05)
+    opaque = surfels.parameters["opacity"].detach() + 5  # nothing shines through
+    return surfels.like(surfels.parameters | {"opacity": opaque})
+
+
+def ribbed() -> Mesh:
+    """What marching cubes make of leaves side by side: a sheet with ribs, its faces up, slopes to 60 degrees."""
+    n = 16 * RIBS
+    x, y = np.meshgrid(*[np.linspace(-0.8, 0.8, n)] * 2, indexing="ij")
+    waves = 2 * np.pi * RIBS / 1.6
+    vertices = np.stack([x, y, 1.8 / waves * np.sin(waves * x)], -1).reshape(-1, 3)
+    corner = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).reshape(-1)
+    faces = [np.stack([corner, corner + a, corner + b], -1) for a, b in ((n, n + 1), (n + 1, 1))]
+    return plain(vertices, np.concatenate(faces))
+
+
+@pytest.fixture(scope="module")
+def views():
+    return [replace(view, mask=None) for view in balls(size=96).views]
+
+
+def test_leaves_are_thin_and_a_ball_is_not(views):
+    from_above = [view for view in views if view.camera.matrix_world[2, 3] > 2]
+    sheet = np.stack([*np.meshgrid(*[np.linspace(-0.9, 0.9, 90)] * 2), np.zeros((90, 90))], -1).reshape(-1, 3)
+    assert is_thin(surfels_on(sheet, np.tile((0.0, 0.0, 1.0), (len(sheet), 1))), ribbed(), from_above)
+    vertices, faces = sphere_mesh(4)
+    assert not is_thin(surfels_on(vertices, unit(vertices.astype(np.float64))), plain(vertices, faces), views)
+
+
+def test_what_surfels_show_faces_the_viewer(views):
+    """Whichever way they were turned."""
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (300, 3)) * (1, 1, 0)
+    for side in (1.0, -1.0):
+        shown = normals_of(surfels_on(points, np.tile((0.0, 0.0, side), (300, 1))))(views[0])
+        height = views[0].camera.matrix_world[2, 3]
+        assert (np.sign(shown[np.abs(shown[..., 2]) > 0.1][:, 2]) == np.sign(height)).all()
+
+
+@pytest.mark.parametrize("thin", [True, False])
+def test_surfels_of_thin_things_are_shaded_by_their_own_normals(thin, monkeypatch):
+    monkeypatch.setattr(job, "is_thin", lambda *_: thin)
+    quick = Decoupling(iterations=5, pixels=64, cosine=2, ggx=2, light=2, environment=8, normals=True)
+    settings = Settings(schedule=Schedule(iterations=60, surfels=1500), mesh_resolution=32, decoupling=quick)
+    asset = reconstruct(balls(), settings)
+    assert asset.provenance["report"]["thin"] is thin
+    own = rotation_matrices(asset.surfels.rotation.astype(np.float64))[..., 2]
+    driven = job.MeshDriven(asset.mesh, asset.surfels, asset.binding).pose(asset.mesh.vertices)
+    cosine = np.abs((own * driven.normal).sum(axis=1))
+    assert (np.quantile(cosine, 0.02) > 0.999) == thin
