@@ -48,6 +48,14 @@ def scenes(command, tmp_path_factory) -> Path:
     return out
 
 
+def test_help_says_what_scenes_are_made(capsys):
+    assert main(["evaluate", "--help"]) == 0
+    said, plan = " ".join(capsys.readouterr().out.split()), Plan()
+    assert f"which of {', '.join(OBJECTS)}; default all" in said and plan.objects == OBJECTS
+    for option, value in (("size", plan.size), ("train", plan.train), ("test", plan.test), ("samples", plan.samples)):
+        assert re.search(rf"--{option} N [^-]*; default {value}\b", said), option
+
+
 def test_cameras_stand_level_around_the_object_and_test_views_are_others():
     train, test = cameras(40, -25, 80, 0.0), cameras(8, 0, 60, 1.0)
     for matrix in train + test:
