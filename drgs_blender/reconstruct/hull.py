@@ -66,8 +66,21 @@ def have_silhouettes(capture: Capture) -> bool:
 
 
 def silhouettes(capture: Capture) -> list[Array] | None:
-    """Masks of the training views, (h, w) float32 each: drawn, or told from a background of one colour; or None."""
+    """Masks of the training views, (h, w) float32 each: drawn, or told from a background of one colour; or None.
+
+    Raises
+    ------
+    AssetError: a mask of another size than its picture.
+    """
     views = capture.training
+    for view in views:
+        if view.mask is not None and view.mask.shape != view.colour.shape[:2]:
+            raise AssetError(
+                view.name,
+                f"has a mask of {view.mask.shape[1]} x {view.mask.shape[0]} pixels for a picture of "
+                f"{view.colour.shape[1]} x {view.colour.shape[0]}",
+                "Give a mask of the picture's size",
+            )
     if not have_silhouettes(capture):
         return None
     if all(view.mask is not None for view in views):
@@ -114,7 +127,7 @@ def find_region(capture: Capture) -> Region:
     Raises
     ------
     AssetError: fewer than three views, cameras that all look the same way, or masks that have no point in common:
-        cameras and pictures do not belong together.
+        cameras and pictures do not belong together; a mask of another size than its picture.
     """
     views = capture.training
     if len(views) < 3:

@@ -65,17 +65,9 @@ def targets(capture: Capture) -> list[list[Target]]:
 
     Raises
     ------
-    AssetError: a mask of another size than its picture, or pictures that are all black.
+    AssetError: pictures that are all black; masks, see `silhouettes`.
     """
     views = capture.training
-    for view in views:
-        if view.mask is not None and view.mask.shape != view.colour.shape[:2]:
-            raise AssetError(
-                view.name,
-                f"has a mask of {view.mask.shape[1]} x {view.mask.shape[0]} pixels for a picture of "
-                f"{view.colour.shape[1]} x {view.colour.shape[0]}",
-                "Give a mask of the picture's size",
-            )
     if max(float(view.colour.max()) for view in views) < 2 / 255:
         raise AssetError(str(capture.source), "has black pictures alone", "Check the exposure and the files")
     drawn = silhouettes(capture)
