@@ -143,7 +143,7 @@ def find_region(capture: Capture) -> Region:
         raise AssetError(str(capture.source), "shows no object in any mask", "Check masks and background")
     centre, radius = aim([view.camera for view in views])
     low, high = centre - 1.5 * radius, centre + 1.5 * radius
-    missed: list[str] = []
+    missed: set[str] = set()
     # Coarse first, to find the box; cells of the second time are as fine as the object allows.
     for cells in (64, CELLS):
         origin, spacing = low, float((high - low).max()) / cells
@@ -162,13 +162,13 @@ def find_region(capture: Capture) -> Region:
                 "has masks that no common point projects into: cameras and pictures do not agree",
                 "Check the convention of the cameras' axes and their order",
             )
-        missed = missed or _missed(whole & ~inside, inside, origin, spacing, views, masks)
+        missed |= _missed(whole & ~inside, inside, origin, spacing, views, masks)
         corners = np.argwhere(inside)
         low, high = origin + (corners.min(0) - 1.5) * spacing, origin + (corners.max(0) + 1.5) * spacing
     if len(missed) >= 3:
         log.warning(
             "%s: a small part apart from the rest is left out, which %d photographs show (%s): photograph it alone, or "
-            "leave it out of the masks", capture.source, len(missed), first_of(missed),
+            "leave it out of the masks", capture.source, len(missed), first_of(sorted(missed)),
         )  # fmt: skip
     points, normals = _surface(inside, origin, spacing)
     middle = 0.5 * (low + high)
@@ -221,17 +221,17 @@ def _phantoms(parts: Array, sizes: Array, seen: Array, origin: Array, spacing: f
 
 def _missed(
     dropped: Array, kept: Array, origin: Array, spacing: float, views: list[View], masks: list[Array]
-) -> list[str]:
+) -> set[str]:
     """Names of the views with more than `SHOWN` of their mask where the `dropped` cells are, and none `kept`."""
     if not dropped.any():
-        return []
-    names = []
+        return set()
+    names = set()
     lost, rest = (np.argwhere(cells) * spacing + origin for cells in (dropped, kept))
     for view, mask in zip(views, masks, strict=True):
         object_ = mask > 0.5
         alone = object_ & _drawn(lost, spacing, view.camera) & ~_drawn(rest, spacing, view.camera)
         if alone.sum() > SHOWN * max(object_.sum(), 1):
-            names.append(view.name)
+            names.add(view.name)
     return names
 
 

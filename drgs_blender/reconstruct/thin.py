@@ -33,7 +33,7 @@ def normals_of(gaussians: Gaussians) -> Normals:
 
     def shown(view: View) -> Array:
         with torch.no_grad():
-            return gaussians.look(view.camera, torch.zeros(3), 0).normal.numpy(force=True)
+            return gaussians.look(view.camera, torch.zeros(3), 0, mirrors=False).normal.numpy(force=True)
 
     return shown
 

@@ -613,8 +613,25 @@ def test_normals_that_others_tell_stand_in_for_those_of_a_poor_mesh(ball, captur
     told = decouple(capture, wrong, settings, normals=of_ball)
     assert told.report["psnr"] > without.report["psnr"] + 0.3
     assert np.array_equal(told.normals, without.normals)  # of the mesh
-    nonsense = decouple(capture, wrong, settings, normals=lambda view: -of_ball(view))
-    assert all(np.array_equal(a, b) for a, b in zip(arrays(nonsense), arrays(without), strict=True))
+    turned = replace(settings, iterations=30, normals=True)
+    plain = arrays(decouple(capture, wrong, turned))
+    for factor in (-1.0, 0.0):
+        nonsense = arrays(decouple(capture, wrong, turned, normals=lambda view, factor=factor: factor * of_ball(view)))
+        assert all(np.array_equal(a, b) for a, b in zip(nonsense, plain, strict=True)), factor
+    learned = decouple(capture, wrong, turned, normals=of_ball)
+    assert np.abs(learned.normals - told.normals).max() > 1e-3  # what is learned is added to them
+
+
+def test_a_checkpoint_of_other_normals_is_not_gone_on_from(ball, capture, tmp_path, caplog):
+    steps = iter(range(9))
+    with pytest.raises(Cancelled):
+        decouple(capture, ball, SMALL, cancelled=lambda: next(steps) == 5, checkpoint=tmp_path / "a.state")
+    up = np.float32([0, 0, 1])
+    with caplog.at_level("INFO"):
+        decouple(
+            capture, ball, SMALL, checkpoint=tmp_path / "a.state", normals=lambda view: np.zeros_like(view.colour) + up
+        )
+    assert "going on" not in caplog.text
 
 
 def test_bad_input_is_named(ball, capture):

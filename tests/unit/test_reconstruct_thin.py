@@ -71,11 +71,15 @@ def test_what_surfels_show_faces_the_viewer(views):
 
 @pytest.mark.parametrize("thin", [True, False])
 def test_surfels_of_thin_things_are_shaded_by_their_own_normals(thin, monkeypatch):
+    told = []
+    learn = job.decouple
     monkeypatch.setattr(job, "is_thin", lambda *_: thin)
+    monkeypatch.setattr(job, "decouple", lambda *given: told.append(given[-1]) or learn(*given))
     quick = Decoupling(iterations=5, pixels=64, cosine=2, ggx=2, light=2, environment=8, normals=True)
     settings = Settings(schedule=Schedule(iterations=60, surfels=1500), mesh_resolution=32, decoupling=quick)
     asset = reconstruct(balls(), settings)
     assert asset.provenance["report"]["thin"] is thin
+    assert [normals is not None for normals in told] == [thin]  # learned with them, too
     own = rotation_matrices(asset.surfels.rotation.astype(np.float64))[..., 2]
     driven = job.MeshDriven(asset.mesh, asset.surfels, asset.binding).pose(asset.mesh.vertices)
     cosine = np.abs((own * driven.normal).sum(axis=1))

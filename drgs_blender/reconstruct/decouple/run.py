@@ -178,7 +178,8 @@ class _Job:
         self.iteration, self.loss, self._error = 0, float("nan"), float("nan")
         self._aimed = np.ones((2, 4, 3), np.float32)
         self._spent, self._began, self._saved = 0.0, time.monotonic(), time.monotonic()
-        self._key = states.fingerprint(capture, mesh=_digest(mesh), **asdict(settings))
+        shape = _digest(mesh.vertices, mesh.faces, self._pixels.shown)
+        self._key = states.fingerprint(capture, mesh=shape, **asdict(settings))
         if checkpoint is not None and (state := states.load(checkpoint, self._key)) is not None:
             self._restore(state)
 
@@ -296,9 +297,11 @@ class _Job:
     @staticmethod
     def _as_shown(pixels: Pixels, normal: Tensor, offsets: Tensor | None) -> Tensor:
         """Normals (n, 3) told by others than the mesh, with what is learned; its `normal` where they are far off."""
-        shown = torch.from_numpy(pixels.shown)
-        believed = dot(shown, torch.from_numpy(pixels.flat))[:, None] >= ALIKE
-        return torch.where(believed, shown if offsets is None else normalise(shown + offsets), normal)
+        shown, flat = torch.from_numpy(pixels.shown), torch.from_numpy(pixels.flat)
+        believed = dot(shown, flat)[:, None] >= ALIKE
+        # The face's where they are not: nothing has no direction, and its derivative would spoil that of its vertices.
+        own = torch.where(believed, shown, flat)
+        return torch.where(believed, own if offsets is None else normalise(own + offsets), normal)
 
     def _note(self, loss: float, shown: Tensor, photographed: Tensor) -> None:
         """Running means of the loss and of the squared error in sRGB."""
@@ -365,8 +368,8 @@ class _Job:
         log.info("materials: going on at step %d", self.iteration)
 
 
-def _digest(mesh: Mesh) -> str:
-    return hashlib.sha256(mesh.vertices.tobytes() + mesh.faces.tobytes()).hexdigest()
+def _digest(*arrays: Array) -> str:
+    return hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()
 
 
 def _likeness(edges: Array, colours: Array) -> Array:
