@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from drgs_blender.asset.model import PosedSurfels
+from drgs_blender.asset.model import Mesh, PosedSurfels
 from drgs_blender.frame import Camera
 from drgs_blender.render.trace.scene import TraceObject, TraceScene
 
@@ -21,6 +21,12 @@ def sphere_mesh(levels: int = 4) -> tuple[np.ndarray, np.ndarray]:
 
     mesh = trimesh.creation.icosphere(levels)
     return np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.int32)
+
+
+def plain_mesh(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
+    """Grey, neither rough nor smooth, no metal."""
+    n = len(vertices)
+    return Mesh(vertices, faces, np.full((n, 3), 0.5), np.full(n, 0.5), np.zeros(n))
 
 
 def scene_of(*meshes: tuple[np.ndarray, np.ndarray], albedo: float = 0.5) -> TraceScene:

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import trimesh
+from shapes import plain_mesh
 
 torch = pytest.importorskip("torch")
 
@@ -55,11 +56,6 @@ def gatherer(mesh: Mesh, samples: int, normals: bool = False, cache: np.ndarray 
     tree = TriangleBVH()
     tree.build(mesh.vertices, mesh.faces)
     return Gatherer(mesh, tree, cache, (samples // 2, samples // 4, samples // 4), normals)
-
-
-def plain_mesh(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
-    n = len(vertices)
-    return Mesh(vertices, faces, np.full((n, 3), 0.5), np.full(n, 0.5), np.zeros(n))
 
 
 def floor_points(count: int = len(ROUGHNESS)) -> tuple[Mesh, Points, np.ndarray]:

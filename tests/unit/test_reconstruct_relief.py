@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from shapes import sphere_mesh
+from shapes import plain_mesh, sphere_mesh
 
-from drgs_blender.asset.model import Mesh
 from drgs_blender.deform.attach import attach
 from drgs_blender.deform.mesh_driven import MeshDriven
 from drgs_blender.geometry import VertexNormals, rotation_matrices, unit
@@ -20,12 +19,7 @@ def rough():
     true = unit(vertices.astype(np.float64))
     edge = np.linalg.norm(vertices[faces[:, 0]] - vertices[faces[:, 1]], axis=1).mean()
     noise = 0.5 * edge * np.sin(15 * true).prod(axis=1, keepdims=True)
-    return plain(true * (1 + noise), faces), true, edge
-
-
-def plain(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
-    n = len(vertices)
-    return Mesh(vertices, faces, np.full((n, 3), 0.5), np.full(n, 0.5), np.zeros(n))
+    return plain_mesh(true * (1 + noise), faces), true, edge
 
 
 def angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -48,7 +42,7 @@ def test_vertices_follow_the_normals(rough):
 def test_the_position_holds_where_normals_say_nothing_new(rough):
     """Normals of a sphere of another size are the same: nothing may drift."""
     mesh, true, _ = rough
-    big = plain(1.3 * true, mesh.faces)
+    big = plain_mesh(1.3 * true, mesh.faces)
     np.testing.assert_allclose(follow_normals(big, true.astype(np.float32)), big.vertices, atol=1e-3)
 
 

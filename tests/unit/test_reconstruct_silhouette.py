@@ -12,9 +12,8 @@ pytest.importorskip("torch")
 pytest.importorskip("skimage")
 
 from capture_cases import balls, camera
-from shapes import sphere_mesh
+from shapes import plain_mesh, sphere_mesh
 
-from drgs_blender.asset.model import Mesh
 from drgs_blender.errors import UsageError
 from drgs_blender.frame import Camera
 from drgs_blender.reconstruct import tsdf
@@ -50,11 +49,6 @@ def mask_of(view: Camera, **ball: object) -> np.ndarray:
     )  # fmt: skip
     depth, _ = hit(fine, **ball)  # type: ignore[arg-type]
     return np.isfinite(depth).reshape(view.height, k, view.width, k).mean(axis=(1, 3)).astype(np.float32)
-
-
-def plain(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
-    n = len(vertices)
-    return Mesh(vertices.astype(np.float32), faces, np.full((n, 3), 0.5), np.full(n, 0.5), np.zeros(n))
 
 
 def off(vertices: np.ndarray) -> np.ndarray:
@@ -94,7 +88,7 @@ def test_more_voxels_than_memory_are_refused_with_how_many_fit(cameras, monkeypa
 @pytest.mark.parametrize("pixels", [-1.2, 0.8])
 def test_outlines_become_those_of_the_masks(cameras, pixels):
     vertices, faces = sphere_mesh(5)
-    mesh = plain((RADIUS + pixels * PIXEL) * vertices, faces)
+    mesh = plain_mesh((RADIUS + pixels * PIXEL) * vertices, faces)
     moved = off(fill_silhouettes(mesh, cameras, [mask_of(view) for view in cameras]))
     assert abs(moved.mean()) < 0.03 and np.abs(moved).max() < 0.06
 
@@ -102,7 +96,7 @@ def test_outlines_become_those_of_the_masks(cameras, pixels):
 def test_a_dent_that_outlines_show_is_filled_where_it_is(cameras):
     vertices, faces = sphere_mesh(5)
     deep = np.exp(-8 * ((vertices - (1, 0, 0)) ** 2).sum(1))  # towards +X, about half a radius wide
-    mesh = plain((RADIUS - PIXEL * deep[:, None]) * vertices, faces)
+    mesh = plain_mesh((RADIUS - PIXEL * deep[:, None]) * vertices, faces)
     moved = off(fill_silhouettes(mesh, cameras, [mask_of(view) for view in cameras]))
     assert np.abs(moved[deep > 0.5]).mean() < 0.35 * deep[deep > 0.5].mean()
     assert np.abs(moved[deep < 0.01]).mean() < 0.03
@@ -112,14 +106,14 @@ def test_parts_that_the_mesh_lacks_do_not_inflate_the_rest(cameras):
     vertices, faces = sphere_mesh(5)
     beside = {"radius": 0.12, "middle": (0.0, 0.0, 0.88)}
     masks = [np.maximum(mask_of(view), mask_of(view, **beside)) for view in cameras]
-    moved = off(fill_silhouettes(plain(RADIUS * vertices, faces), cameras, masks))
+    moved = off(fill_silhouettes(plain_mesh(RADIUS * vertices, faces), cameras, masks))
     far = vertices[:, 2] < 0.3
     assert np.abs(moved[far]).max() < 0.06 and moved.max() <= FARTHEST + 0.01
 
 
 def test_a_mesh_that_no_camera_sees_stays(cameras):
     vertices, faces = sphere_mesh(2)
-    mesh = plain(0.1 * vertices + (0, 0, 50), faces)
+    mesh = plain_mesh(0.1 * vertices + (0, 0, 50), faces)
     empty = [np.zeros((SIZE, SIZE), np.float32)] * len(cameras)
     assert np.array_equal(fill_silhouettes(mesh, cameras, empty), mesh.vertices)
 

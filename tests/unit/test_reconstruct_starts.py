@@ -12,6 +12,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from capture_cases import balls, photographed, rays_of  # noqa: E402
+from captures import ring  # noqa: E402
 
 from drgs_blender.frame import Camera  # noqa: E402
 from drgs_blender.reconstruct import train  # noqa: E402
@@ -232,14 +233,7 @@ def test_a_part_that_photographs_show_is_kept_or_said_to_be_left_out(away, radiu
     """A ball beside a larger one, in all pictures or in few: too small, and large enough."""
     balls_ = ((np.zeros(3), 0.6), (np.array([away, 0.0, 0.0]), radius))
     views = []
-    for k, angle in enumerate(np.arange(16) * 2 * np.pi / 16):
-        back = np.array([4 * np.cos(angle), 4 * np.sin(angle), 1.0 + k % 2])
-        distance = np.linalg.norm(back)
-        back = back / distance
-        right = np.cross([0.0, 0, 1], back)
-        right /= np.linalg.norm(right)
-        matrix = np.eye(4)
-        matrix[:3] = np.column_stack([right, np.cross(back, right), back, distance * back])
+    for k, matrix in enumerate(ring(16)):
         camera = Camera(matrix, 64, 64, 80.0, 80.0, 32.0, 32.0)
         rays, _ = rays_of(camera, 1)
         eyes = [matrix[:3, 3] - middle for middle, _ in balls_]

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from shapes import sphere_mesh
+from shapes import plain_mesh, sphere_mesh
 
 torch = pytest.importorskip("torch")
 pytest.importorskip("skimage")
@@ -22,16 +22,11 @@ from drgs_blender.reconstruct.job import Settings, reconstruct  # noqa: E402
 from drgs_blender.reconstruct.thin import is_thin, normals_of  # noqa: E402
 from drgs_blender.reconstruct.train import Schedule  # noqa: E402
 
-COLOUR, RIBS = 0.5, 12
-
-
-def plain(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
-    n = len(vertices)
-    return Mesh(vertices, faces, np.full((n, 3), COLOUR), np.full(n, 0.5), np.zeros(n))
+RIBS = 12
 
 
 def surfels_on(points: np.ndarray, normals: np.ndarray) -> Gaussians:
-    surfels = Gaussians.on_surface(points, normals, np.full(points.shape, COLOUR), 0.05)
+    surfels = Gaussians.on_surface(points, normals, np.full(points.shape, 0.5), 0.05)
     opaque = surfels.parameters["opacity"].detach() + 5  # nothing shines through
     return surfels.like(surfels.parameters | {"opacity": opaque})
 
@@ -44,7 +39,7 @@ def ribbed() -> Mesh:
     vertices = np.stack([x, y, 1.8 / waves * np.sin(waves * x)], -1).reshape(-1, 3)
     corner = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).reshape(-1)
     faces = [np.stack([corner, corner + a, corner + b], -1) for a, b in ((n, n + 1), (n + 1, 1))]
-    return plain(vertices, np.concatenate(faces))
+    return plain_mesh(vertices, np.concatenate(faces))
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +52,7 @@ def test_leaves_are_thin_and_a_ball_is_not(views):
     sheet = np.stack([*np.meshgrid(*[np.linspace(-0.9, 0.9, 90)] * 2), np.zeros((90, 90))], -1).reshape(-1, 3)
     assert is_thin(surfels_on(sheet, np.tile((0.0, 0.0, 1.0), (len(sheet), 1))), ribbed(), from_above)
     vertices, faces = sphere_mesh(4)
-    assert not is_thin(surfels_on(vertices, unit(vertices.astype(np.float64))), plain(vertices, faces), views)
+    assert not is_thin(surfels_on(vertices, unit(vertices.astype(np.float64))), plain_mesh(vertices, faces), views)
 
 
 def test_what_surfels_show_faces_the_viewer(views):
