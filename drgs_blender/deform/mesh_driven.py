@@ -3,7 +3,8 @@
 A face and its unit normal span space, so the deformation gradient of a face is F = [e1' e2' n'] [e1 e2 n]^-1 and the
 scaled tangents become T' = F T. With C = [e1 e2 n]^-1 T precomputed, a frame costs three vertices, one normal and a
 3x3 by 3x2 product a surfel. Rotations are never blended: F comes from the face, and the shading normal from smooth
-vertex normals.
+vertex normals. A surfel larger than its face has a second F, of three vertices as far apart as it is large, and takes
+the one that stretches it less: neither a single face that is carried badly nor a gap within its reach smears it.
 """
 
 from __future__ import annotations
@@ -17,9 +18,10 @@ import numpy as np
 
 from ..asset.model import MATERIAL_CHANNELS, Binding, Mesh, PosedSurfels, Surfels
 from ..errors import AssetError
-from ..geometry import VertexNormals, rotation_matrices
+from ..geometry import VertexNormals, rotation_matrices, unit
 from ..jit import njit, prange
 from .faces import Faces
+from .spans import spans
 
 Array = np.ndarray
 log = logging.getLogger(__name__)
@@ -66,7 +68,7 @@ class MeshDriven:
         Surfels of the last pose whose face had a vertex that was not finite; they are transparent.
     rest : tuple of arrays
         What `pose_surfels` reads of the binding: face, weights, offset in metres, the faces' mean edge where they have
-        no area (else 0), normal, and the tangents in the frame of edges and normal.
+        no area (else 0), normal, the tangents in the frame of edges and normal, `spans.spans` and the same in theirs.
     """
 
     def __init__(self, mesh: Mesh, surfels: Surfels, binding: Binding) -> None:
@@ -80,7 +82,7 @@ class MeshDriven:
             )
         self.mesh, self.surfels, self.binding = mesh, surfels, binding
         self.normals = VertexNormals(mesh.faces, len(mesh.vertices))
-        faces = Faces.of(mesh.vertices, mesh.faces)
+        faces, normals = Faces.of(mesh.vertices, mesh.faces), self.normals(mesh.vertices)
         self.degenerate_faces = int(faces.degenerate.sum())
         self.lost = 0
         face, corners = binding.face, faces.corners
@@ -91,12 +93,16 @@ class MeshDriven:
         basis = np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], faces.normal], -1)
         if self.degenerate_faces:
             log.warning("mesh: %d faces have no area at rest", self.degenerate_faces)
-            smooth = self.normals(mesh.vertices).astype(np.float64)[mesh.faces].mean(axis=1)
+            smooth = normals.astype(np.float64)[mesh.faces].mean(axis=1)
             for f in np.flatnonzero(faces.degenerate):
                 frame = _tangent_frame(*basis[f, :, 0].tolist(), *basis[f, :, 1].tolist(), *smooth[f].tolist())
                 basis[f] = np.reshape(frame, (3, 3)).T
         coordinates = np.ascontiguousarray(np.linalg.inv(basis)[face] @ tangents, dtype=np.float32)
-        self.rest = binding.face, binding.barycentric, offset, rest_edge, binding.normal, coordinates
+        span = spans(mesh.vertices, mesh.faces, normals, faces, face, binding.barycentric, surfels.scale.max(axis=1))
+        self.rest = (
+            binding.face, binding.barycentric, offset, rest_edge, binding.normal, coordinates,
+            span, _in_spans(mesh.vertices, span, tangents),
+        )  # fmt: skip
 
     def pose(
         self,
@@ -192,6 +198,47 @@ class MeshDriven:
         return result.reshape(own.shape)
 
 
+def _in_spans(vertices: Array, span: Array, tangents: Array) -> Array:
+    """(n, 3, 2) float32 `tangents` in the frames of edges and normal of triangles; 0 where there is none."""
+    found = np.zeros(tangents.shape, np.float32)
+    there = span[:, 0] >= 0
+    corners = vertices[span[there]].astype(np.float64)
+    u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    basis = np.stack([u, v, unit(np.cross(u, v))], -1)
+    found[there] = np.linalg.inv(basis) @ tangents[there]
+    return found
+
+
+@njit
+def _raised(linear: Any, nx: float, ny: float, nz: float) -> tuple[float, float, float]:
+    """What stands off a surface with unit normal n goes through matrix_world: A normalise(A^T n), A its linear part."""
+    ox = linear[0, 0] * nx + linear[1, 0] * ny + linear[2, 0] * nz
+    oy = linear[0, 1] * nx + linear[1, 1] * ny + linear[2, 1] * nz
+    oz = linear[0, 2] * nx + linear[1, 2] * ny + linear[2, 2] * nz
+    length = math.sqrt(ox * ox + oy * oy + oz * oz)
+    length = 1.0 / length if length > 1e-300 else 0.0
+    ox, oy, oz = ox * length, oy * length, oz * length
+    return (
+        linear[0, 0] * ox + linear[0, 1] * oy + linear[0, 2] * oz,
+        linear[1, 0] * ox + linear[1, 1] * oy + linear[1, 2] * oz,
+        linear[2, 0] * ox + linear[2, 1] * oy + linear[2, 2] * oz,
+    )
+
+
+@njit
+def _tangents(
+    ux: float, uy: float, uz: float, vx: float, vy: float, vz: float, hx: float, hy: float, hz: float,
+    coordinates: Any, i: Any,
+) -> tuple[float, float, float, float, float, float]:  # fmt: skip
+    """Both tangents of a surfel whose `coordinates` are in the frame of u, v and h."""
+    p, q, r = coordinates[i, 0, 0], coordinates[i, 1, 0], coordinates[i, 2, 0]
+    a, b, c = coordinates[i, 0, 1], coordinates[i, 1, 1], coordinates[i, 2, 1]
+    return (
+        ux * p + vx * q + hx * r, uy * p + vy * q + hy * r, uz * p + vz * q + hz * r,
+        ux * a + vx * b + hx * c, uy * a + vy * b + hy * c, uz * a + vz * b + hz * c,
+    )  # fmt: skip
+
+
 @njit
 def _tangent_frame(
     ax: float, ay: float, az: float, bx: float, by: float, bz: float, sx: float, sy: float, sz: float
@@ -243,7 +290,7 @@ def pose_surfels(
     out : centre, tangent_u, tangent_v, normal, opacity; the last is written where a vertex is not finite
     """
     vertices, faces, normals = mesh
-    face, weights, offset, rest_edge, local_normal, coordinates = rest
+    face, weights, offset, rest_edge, local_normal, coordinates, span, in_span = rest
     centre, tangent_u, tangent_v, normal, opacity = out
     for block in range(lane, (len(face) + _BLOCK - 1) // _BLOCK, lanes):
         for i in range(block * _BLOCK, min((block + 1) * _BLOCK, len(face))):
@@ -282,17 +329,7 @@ def pose_surfels(
                 sx, sy, sz = nx, ny, nz
             tx, ty, tz, bx, by, bz, sx, sy, sz = _tangent_frame(ux, uy, uz, vx, vy, vz, sx, sy, sz)
 
-            # What stands off the surface goes through matrix_world: A normalise(A^T n), A its linear part.
-            ox = linear[0, 0] * nx + linear[1, 0] * ny + linear[2, 0] * nz
-            oy = linear[0, 1] * nx + linear[1, 1] * ny + linear[2, 1] * nz
-            oz = linear[0, 2] * nx + linear[1, 2] * ny + linear[2, 2] * nz
-            length = math.sqrt(ox * ox + oy * oy + oz * oz)
-            length = 1.0 / length if length > 1e-300 else 0.0
-            ox, oy, oz = ox * length, oy * length, oz * length
-            hx = linear[0, 0] * ox + linear[0, 1] * oy + linear[0, 2] * oz
-            hy = linear[1, 0] * ox + linear[1, 1] * oy + linear[1, 2] * oz
-            hz = linear[2, 0] * ox + linear[2, 1] * oy + linear[2, 2] * oz
-
+            hx, hy, hz = _raised(linear, nx, ny, nz)
             d = np.float64(offset[i])
             centre[i, 0] = ax + wb * ux + wc * vx + d * hx
             centre[i, 1] = ay + wb * uy + wc * vy + d * hy
@@ -305,14 +342,24 @@ def pose_surfels(
                 ux, uy, uz = grow * tx, grow * ty, grow * tz
                 vx, vy, vz = side * grow * bx, side * grow * by, side * grow * bz
                 hx, hy, hz = grow * sx, grow * sy, grow * sz
-            p, q, r = coordinates[i, 0, 0], coordinates[i, 1, 0], coordinates[i, 2, 0]
-            tangent_u[i, 0] = ux * p + vx * q + hx * r
-            tangent_u[i, 1] = uy * p + vy * q + hy * r
-            tangent_u[i, 2] = uz * p + vz * q + hz * r
-            p, q, r = coordinates[i, 0, 1], coordinates[i, 1, 1], coordinates[i, 2, 1]
-            tangent_v[i, 0] = ux * p + vx * q + hx * r
-            tangent_v[i, 1] = uy * p + vy * q + hy * r
-            tangent_v[i, 2] = uz * p + vz * q + hz * r
+            fx, fy, fz, gx, gy, gz = _tangents(ux, uy, uz, vx, vy, vz, hx, hy, hz, coordinates, i)
+            if span[i, 0] >= 0:
+                ia, ib, ic = span[i, 0], span[i, 1], span[i, 2]
+                ax, ay, az = np.float64(vertices[ia, 0]), np.float64(vertices[ia, 1]), np.float64(vertices[ia, 2])
+                ux, uy, uz = vertices[ib, 0] - ax, vertices[ib, 1] - ay, vertices[ib, 2] - az
+                vx, vy, vz = vertices[ic, 0] - ax, vertices[ic, 1] - ay, vertices[ic, 2] - az
+                nx, ny, nz = side * (uy * vz - uz * vy), side * (uz * vx - ux * vz), side * (ux * vy - uy * vx)
+                length = math.sqrt(nx * nx + ny * ny + nz * nz)
+                if length > 1e-10 * (ux * ux + uy * uy + uz * uz + vx * vx + vy * vy + vz * vz):
+                    hx, hy, hz = _raised(linear, nx / length, ny / length, nz / length)
+                    px, py, pz, qx, qy, qz = _tangents(ux, uy, uz, vx, vy, vz, hx, hy, hz, in_span, i)
+                    own = fx * fx + fy * fy + fz * fz + gx * gx + gy * gy + gz * gz
+                    if (
+                        px * px + py * py + pz * pz + qx * qx + qy * qy + qz * qz < own
+                    ):  # a comparison: false if not finite
+                        fx, fy, fz, gx, gy, gz = px, py, pz, qx, qy, qz
+            tangent_u[i, 0], tangent_u[i, 1], tangent_u[i, 2] = fx, fy, fz
+            tangent_v[i, 0], tangent_v[i, 1], tangent_v[i, 2] = gx, gy, gz
 
             lx, ly, lz = np.float64(local_normal[i, 0]), side * local_normal[i, 1], np.float64(local_normal[i, 2])
             nx = tx * lx + bx * ly + sx * lz

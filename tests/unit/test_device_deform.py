@@ -29,6 +29,7 @@ def driven(collapsed: bool = False) -> MeshDriven:
     if collapsed:  # some faces have no area at rest
         mesh.vertices[mesh.faces[:40, 1]] = mesh.vertices[mesh.faces[:40, 0]]
     surfels = shell_surfels(mesh)
+    surfels.scale[::2] *= 8  # larger than their faces
     return MeshDriven(mesh, surfels, bind(mesh, surfels)[0])
 
 
