@@ -109,16 +109,18 @@ def row(report: dict[str, Any], beside: list[str], seconds: float) -> list[str]:
 
 
 def deformed_anew(objects: list[str], scenes: Path, rays: int) -> None:
-    """Write how the surfels of kept assets look deformed into the table, without learning them again."""
-    text = DOCUMENT.read_text(encoding="utf-8")
+    """Score how the surfels of kept assets look deformed, without learning them again; the rest of their rows stays."""
+    before, section = DOCUMENT.read_text(encoding="utf-8").split("<!-- begin asset -->")
     for name in objects:
-        found = score(FOLDER / f"{name}.drgs", scenes / name, "surfels", rays, under_others(scenes / name, posed=True))
-        line = next(line for line in text.splitlines() if line.startswith(f"| {name} | surfels |"))
-        cells = line.split(" | ")
-        cells[COLUMNS.index(DEFORMED)] = pair(found["lights"])
-        text = text.replace(line, " | ".join(cells))
-        print(" | ".join(cells), flush=True)
-    DOCUMENT.write_text(text, encoding="utf-8")
+        truth = under_others(scenes / name, posed=True)
+        found = score(FOLDER / f"{name}.drgs", scenes / name, "surfels", rays, truth)["lights"]
+        line = next(line for line in section.splitlines() if line.startswith(f"| {name} | surfels |"))
+        cells = line.strip("| ").split(" | ")
+        cells[COLUMNS.index(DEFORMED)] = pair(found)
+        section = section.replace(line, f"| {' | '.join(cells)} |")
+        keep(FOLDER / "rows.json", f"{name}|surfels", cells[2:])
+        print(*cells, flush=True)
+    DOCUMENT.write_text(f"{before}<!-- begin asset -->{section}", encoding="utf-8")
 
 
 def sheet(objects: list[str], scenes: Path, rays: int) -> None:
