@@ -21,11 +21,11 @@ from report import table, write_section
 from subjects import asset_path
 
 from drgs_blender.asset.container import read_asset
+from drgs_blender.compute.jit import use_threads
 from drgs_blender.device.warp import cuda_devices, warp
 from drgs_blender.errors import DeviceError
 from drgs_blender.formats.registry import read_environment
 from drgs_blender.frame import RenderSettings, World
-from drgs_blender.jit import use_threads
 from drgs_blender.render.camera import camera_parameters
 from drgs_blender.render.device.on_device import OnDevice
 from drgs_blender.render.lights.light import EnvironmentLight

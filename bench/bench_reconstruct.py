@@ -24,9 +24,9 @@ from embreex import rtcore_scene
 from embreex.mesh_construction import TriangleMesh
 from report import OUT, keep, processor_seconds, table, write_section
 
+from drgs_blender.compute.jit import get_num_threads
 from drgs_blender.frame import Camera
 from drgs_blender.geometry import VertexNormals
-from drgs_blender.jit import get_num_threads
 from drgs_blender.reconstruct.attached import attach_learned
 from drgs_blender.reconstruct.capture import Capture
 from drgs_blender.reconstruct.gaussians import Gaussians

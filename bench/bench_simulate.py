@@ -23,9 +23,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "unit"
 from matter_cases import lattice, solver_of
 
 from drgs_blender.asset.model import Mesh
+from drgs_blender.compute.jit import get_num_threads, set_num_threads
 from drgs_blender.deform.gmls import bind_points, carry
 from drgs_blender.deform.source_driven import _update
-from drgs_blender.jit import get_num_threads, set_num_threads
 from drgs_blender.particle_cache import ParticleCache
 from drgs_blender.simulate.blocks import arrange
 from drgs_blender.simulate.fill import fill

@@ -17,10 +17,10 @@ from report import table
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "unit"))
 from matter_cases import lattice, solver_of
 
+from drgs_blender.compute.jit import use_threads
 from drgs_blender.device.kernels import Launcher
 from drgs_blender.device.warp import cuda_devices
 from drgs_blender.errors import DeviceError
-from drgs_blender.jit import use_threads
 from drgs_blender.simulate.contact import Plane
 from drgs_blender.simulate.device.grid import DeviceGrid
 from drgs_blender.simulate.solver import Solver

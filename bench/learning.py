@@ -11,8 +11,8 @@ from report import table
 
 from drgs_blender.asset.container import read_asset
 from drgs_blender.colour import linear_to_srgb
+from drgs_blender.compute.jit import use_threads
 from drgs_blender.errors import DeviceError
-from drgs_blender.jit import use_threads
 from drgs_blender.reconstruct.capture import Capture, View
 from drgs_blender.reconstruct.device.devices import learner
 from drgs_blender.reconstruct.device.on_device import OnDevice

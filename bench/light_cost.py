@@ -23,9 +23,9 @@ from report import OUT, table
 
 from drgs_blender.asset import Asset, Binding, Mesh, Surfels
 from drgs_blender.asset.container import read_asset, write_asset
+from drgs_blender.compute.jit import njit, prange, source_digest, use_threads
 from drgs_blender.engine.session import Session
 from drgs_blender.frame import Frame
-from drgs_blender.jit import njit, prange, source_digest, use_threads
 from drgs_blender.passes import PASSES
 from drgs_blender.render.camera import camera_parameters
 from drgs_blender.render.lights.light import EnvironmentLight

@@ -11,9 +11,9 @@ from report import OUT, ROOT
 from drgs_blender.asset import Asset, Mesh
 from drgs_blender.asset.container import read_asset, write_asset
 from drgs_blender.build.make import make_asset, read_mesh_file
+from drgs_blender.compute.jit import source_digest
 from drgs_blender.formats.files import Image, MaterialFile
 from drgs_blender.formats.images import load_image
-from drgs_blender.jit import source_digest
 
 SOURCES = {
     "spot": ("spot/spot_triangulated.obj", {"up": "y"}),

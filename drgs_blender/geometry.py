@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from .compute.jit import njit, prange
 from .errors import AssetError
-from .jit import njit, prange
 
 Array = np.ndarray
 

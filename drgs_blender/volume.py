@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .jit import njit, prange
+from .compute.jit import njit, prange
 
 Array = np.ndarray
 

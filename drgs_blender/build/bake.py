@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from ..compute.jit import njit
 from ..errors import UsageError
 from ..geometry import VertexNormals
-from ..jit import njit
 from ..render.points import ShadingPoints
 from ..render.trace.scene import TraceObject
 from .relit import points_along

@@ -88,14 +88,14 @@ def python(args: argparse.Namespace) -> str:
 
 def numba(args: argparse.Namespace) -> str:
     """Numba and its threads."""
-    from ..jit import numba
+    from ..compute.jit import numba
 
     return f"{numba.__version__}, {numba.config.NUMBA_NUM_THREADS} threads, layer {numba.config.THREADING_LAYER}"
 
 
 def cache(args: argparse.Namespace) -> str:
     """Whether compiled kernels can be kept."""
-    from ..jit import cache_folder
+    from ..compute.jit import cache_folder
 
     folder = cache_folder()
     try:

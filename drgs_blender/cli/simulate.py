@@ -101,7 +101,7 @@ def run(args: argparse.Namespace) -> int:
     check_writable(args.out / "cache.json")
 
     from ..asset.container import read_asset
-    from ..jit import use_threads
+    from ..compute.jit import use_threads
     from ..simulate.bake import bake
     from ..simulate.job import prepare
 

@@ -20,9 +20,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ..compute.jit import njit, prange
+from ..compute.simd import LANES, aligned, fold, lanes, load, quads, repeat, spread
 from ..errors import UsageError
-from ..jit import njit, prange
-from ..simd import LANES, aligned, fold, lanes, load, quads, repeat, spread
 from ..volume import Volume, crosses_gap
 
 Array = np.ndarray

@@ -17,9 +17,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..asset.model import MATERIAL_CHANNELS, Binding, Mesh, PosedSurfels, Surfels
+from ..compute.jit import njit, prange
 from ..errors import AssetError
 from ..geometry import VertexNormals, rotation_matrices, unit
-from ..jit import njit, prange
 from .faces import Faces
 from .spans import spans
 

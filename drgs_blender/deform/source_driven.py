@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from ..asset.model import Asset, PosedSurfels
+from ..compute.jit import njit, prange
 from ..errors import AssetError
-from ..jit import njit, prange
 from ..volume import Volume
 from .gmls import bind_points, carry
 from .mesh_driven import MeshDriven

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..compute.jit import njit
 from ..geometry import corner_table
-from ..jit import njit
 from .faces import Faces
 
 Array = np.ndarray

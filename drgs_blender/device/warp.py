@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from ..asset.archive import replace_file
+from ..compute.jit import cache_folder
 from ..errors import DeviceError, WriteError
-from ..jit import cache_folder
 from .typed import Array as ArrayType
 from .typed import Known, Struct, Type, type_of
 

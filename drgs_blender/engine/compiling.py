@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from .. import jit  # noqa: F401  (sets Numba up before it is imported)
+from ..compute import jit  # noqa: F401  (sets Numba up before it is imported)
 from ..device import warp
 
 from numba.core import event  # isort: skip

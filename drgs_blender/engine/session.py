@@ -14,9 +14,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..asset.model import Asset, PosedSurfels
+from ..compute.jit import use_threads
 from ..errors import Cancelled, UsageError
 from ..frame import Frame, Light, ObjectState, RenderSettings
-from ..jit import use_threads
 from ..render.device.devices import Devices
 from ..render.pipeline import Progress, render
 from ..render.processor import HERE, Processor

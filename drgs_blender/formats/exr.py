@@ -9,8 +9,8 @@ import numpy as np
 
 from ..asset import Environment
 from ..asset.archive import replace_by
+from ..compute.jit import get_num_threads
 from ..errors import AssetError
-from ..jit import get_num_threads
 
 Array = np.ndarray
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from ..compute.jit import njit
 from ..errors import AssetError
-from ..jit import njit
 
 Array = np.ndarray
 

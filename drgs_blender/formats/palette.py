@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..jit import njit
+from ..compute.jit import njit
 
 Array = np.ndarray
 

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from ..compute.jit import njit
 from ..errors import AssetError
-from ..jit import njit
 
 Array = np.ndarray
 

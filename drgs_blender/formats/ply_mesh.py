@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from ..colour import srgb_to_linear, to_unit
+from ..compute.jit import njit
 from ..errors import AssetError
-from ..jit import njit
 from .files import MeshFile
 from .gaussian_ply import stack
 from .ply import Rows, read_ply

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ..arrays import Array
-from ..jit import njit, prange
+from ..compute.jit import njit, prange
 
 _BETA1, _BETA2, _EPSILON = 0.9, 0.99, 1e-15
 #: Rows that a thread takes at a time, and numbers below which waking threads takes longer than the step.

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from ..arrays import Array
+from ..compute.jit import njit, prange
 from ..formats.harmonics import basis
-from ..jit import njit, prange
 
 #: Columns of a surfel's features: colour, normal that faces the viewer; then, where something mirrors, tint and blur.
 COLOUR, NORMAL, TINT, BLUR = 0, 3, 6, 9

@@ -15,9 +15,9 @@ import numpy as np
 from scipy.ndimage import binary_dilation, binary_erosion, gaussian_filter, label, maximum_filter, uniform_filter
 
 from ..arrays import Array
+from ..compute.jit import njit, prange
 from ..errors import AssetError, first_of
 from ..frame import Camera
-from ..jit import njit, prange
 from .capture import Capture, View
 
 log = logging.getLogger(__name__)

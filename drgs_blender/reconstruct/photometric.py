@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from ..arrays import Array
-from ..jit import njit, prange
+from ..compute.jit import njit, prange
 
 #: Part of dissimilarity (1 - SSIM) in the loss; the rest is L1.
 DISSIMILARITY = 0.2

@@ -24,9 +24,9 @@ import torch
 from torch import Tensor
 
 from ..arrays import Array
+from ..compute.jit import get_num_threads, njit, prange
 from ..errors import UsageError
 from ..frame import Camera, RenderSettings
-from ..jit import get_num_threads, njit, prange
 from ..render.camera import CLIP_END, CLIP_START, camera_parameters
 from ..render.surfels.raster import MAX_ALPHA, gaussian
 from ..render.surfels.splats import TILE, depth_order, list_by_tile

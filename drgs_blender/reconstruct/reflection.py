@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ..arrays import Array
-from ..jit import njit, prange
+from ..compute.jit import njit, prange
 from .attributes import BLUR, NORMAL, TINT
 
 #: Texels along an edge of the cube's faces, of the sharpest level.

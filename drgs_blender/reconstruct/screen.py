@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ..jit import njit, prange
+from ..compute.jit import njit, prange
 from ..render.camera import CLIP_END, CLIP_START, CX, CY, FX, FY, POSITION
 from ..render.surfels.splats import MIN_ALPHA, span, to_camera
 

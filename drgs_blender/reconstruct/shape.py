@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ..arrays import Array
-from ..jit import njit, prange
+from ..compute.jit import njit, prange
 
 #: Mean depths are those of pixels covered at least so much, and normals are compared where they are covered more.
 THIN, COVERED = np.float32(1e-3), np.float32(0.5)

@@ -16,9 +16,9 @@ from scipy.ndimage import gaussian_filter
 from ..arrays import Array
 from ..asset.model import Mesh
 from ..build.proxy import main_parts
+from ..compute.jit import njit, prange
 from ..errors import AssetError, DeviceError
 from ..frame import Camera
-from ..jit import njit, prange
 from .gaussians import Gaussians
 from .hull import Region, world_to_pixel
 from .memory import check_fits

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from ..compute.jit import njit
 from ..errors import UsageError
 from ..frame import Camera, RenderSettings
-from ..jit import njit
 from .sampling import GOLDEN, mix
 
 Array = np.ndarray

@@ -12,9 +12,9 @@ from collections.abc import Callable
 import numpy as np
 
 from ..asset.model import PosedSurfels
+from ..compute.jit import use_threads
 from ..errors import Cancelled, UsageError
 from ..frame import Frame
-from ..jit import use_threads
 from ..mattes import KINDS
 from ..passes import BY_NAME
 from .camera import camera_parameters

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from ..asset.model import PosedSurfels
+from ..compute.jit import njit, use_threads
 from ..errors import Cancelled
 from ..frame import Camera, Frame, RenderSettings
-from ..jit import njit, use_threads
 from .camera import camera_parameters
 from .lights.lamps import Lamps
 from .lights.light import EnvironmentLight

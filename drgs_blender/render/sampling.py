@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from ..colour import LUMINANCE
-from ..jit import inlined
+from ..compute.jit import inlined
 
 Array = np.ndarray
 

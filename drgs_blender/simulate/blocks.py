@@ -12,7 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from ..jit import get_num_threads, njit, prange
+from ..compute.jit import get_num_threads, njit, prange
 
 Array = np.ndarray
 

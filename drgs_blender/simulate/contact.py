@@ -8,8 +8,8 @@ from typing import Literal
 
 import numpy as np
 
+from ..compute.jit import njit, prange
 from ..errors import UsageError
-from ..jit import njit, prange
 
 Array = np.ndarray
 

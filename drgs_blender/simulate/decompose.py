@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from ..jit import njit
+from ..compute.jit import njit
 
 
 @njit(inline="always")

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
+from ..compute.jit import njit
 from ..errors import AssetError, DeviceError, UsageError
-from ..jit import njit
 from ..volume import Volume
 
 Array = np.ndarray

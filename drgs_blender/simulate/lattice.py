@@ -17,8 +17,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from ..compute.jit import njit, prange
 from ..errors import Cancelled, UsageError
-from ..jit import njit, prange
 from .colliders import Collider, MovingCollider, check_apart
 from .contact import CONTACTS, Plane, plane_rows, surface_near
 from .fields import FieldRows, blow

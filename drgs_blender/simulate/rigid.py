@@ -13,8 +13,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ..compute.jit import njit
 from ..errors import Cancelled
-from ..jit import njit
 from .colliders import Collider, MovingCollider, check_apart, rigid_motion
 from .contact import CONTACTS, Plane, plane_rows
 from .fields import FieldRows, blow

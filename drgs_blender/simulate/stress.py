@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from ..jit import njit
+from ..compute.jit import njit
 from ..matter import COROTATED, ELASTIC, FIRST, FLUID, LAMBDA, MOST_HARDENING, MU, PLASTIC, SAND, SECOND, THIRD
 from .decompose import svd3
 

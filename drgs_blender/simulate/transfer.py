@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..jit import njit, prange
+from ..compute.jit import njit, prange
+from ..compute.simd import fold, load, quads, repeat, spread, store
 from ..matter import ELASTIC, LAMBDA, MU
-from ..simd import fold, load, quads, repeat, spread, store
 from .stress import neo_hookean, respond
 
 Array = np.ndarray

@@ -148,7 +148,7 @@ def test_unfinished_frames_of_killed_writers_go(drgs, folder, tmp_path):
 
 #: A kernel that says whether it was compiled.
 KERNEL = """
-from drgs_blender.jit import njit
+from drgs_blender.compute.jit import njit
 @njit
 def double(x):
     return 2 * x

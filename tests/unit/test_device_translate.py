@@ -11,12 +11,12 @@ import pytest
 
 pytest.importorskip("warp", reason="warp-lang is not installed")
 
+from drgs_blender.compute.jit import njit
 from drgs_blender.device.kernels import Launcher, Work
 from drgs_blender.device.translate import Native, Translation
 from drgs_blender.device.typed import Array, Struct, TranslationError
 from drgs_blender.device.warp import load_module, warp
 from drgs_blender.frame import World
-from drgs_blender.jit import njit
 from drgs_blender.render import sampling
 from drgs_blender.render.device.natives import NATIVES
 from drgs_blender.render.lights import light

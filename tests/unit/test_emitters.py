@@ -11,8 +11,8 @@ from test_integrate import points, settings
 from test_lamps import irradiance, light
 from test_surface import matrix, mesh_state
 
+from drgs_blender.compute.jit import njit
 from drgs_blender.frame import Image, Material, MeshState, Texture, Visibility, World
-from drgs_blender.jit import njit
 from drgs_blender.render.lights.emitters import MOST, Emitters
 from drgs_blender.render.lights.lamps import Lamps, emission_along
 from drgs_blender.render.lights.light import EnvironmentLight

@@ -9,9 +9,9 @@ import pytest
 import trimesh
 
 from drgs_blender.colour import LUMINANCE
+from drgs_blender.compute.jit import get_num_threads, use_threads
 from drgs_blender.errors import UsageError
 from drgs_blender.frame import Light, RenderSettings, World
-from drgs_blender.jit import get_num_threads, use_threads
 from drgs_blender.render.lights.lamps import Lamps
 from drgs_blender.render.lights.light import EnvironmentLight
 from drgs_blender.render.points import DIFFUSE_DIRECT, DIFFUSE_INDIRECT, GLOSSY_DIRECT, Radiance, ShadingPoints

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from drgs_blender.colour import LUMINANCE
+from drgs_blender.compute.jit import get_num_threads, set_num_threads
 from drgs_blender.errors import UsageError
 from drgs_blender.frame import World
-from drgs_blender.jit import get_num_threads, set_num_threads
 from drgs_blender.render.lights.light import EnvironmentLight
 
 

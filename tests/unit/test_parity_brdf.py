@@ -9,8 +9,8 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from drgs_blender.compute.jit import njit  # noqa: E402
 from drgs_blender.frame import World  # noqa: E402
-from drgs_blender.jit import njit  # noqa: E402
 from drgs_blender.render import sampling as kernel_sampling  # noqa: E402
 from drgs_blender.render.lights.light import EnvironmentLight  # noqa: E402
 from drgs_blender.render.reference import brdf, sampling  # noqa: E402

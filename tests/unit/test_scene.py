@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from drgs_blender.compute.jit import get_num_threads, use_threads
 from drgs_blender.errors import AssetError, UsageError
-from drgs_blender.jit import get_num_threads, use_threads
 from drgs_blender.render.trace.scene import ALBEDO, METALLIC, NORMAL, ROUGHNESS, TraceObject, TraceScene
 
 

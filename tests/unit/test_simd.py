@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from drgs_blender.jit import njit
-from drgs_blender.simd import fold, load, quads, repeat, spread, store
+from drgs_blender.compute.jit import njit
+from drgs_blender.compute.simd import fold, load, quads, repeat, spread, store
 
 
 @njit

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from matter_cases import cantilever, lattice, solver_of, timoshenko
 
+from drgs_blender.compute.jit import get_num_threads, set_num_threads
 from drgs_blender.errors import Cancelled, UsageError
-from drgs_blender.jit import get_num_threads, set_num_threads
 from drgs_blender.simulate.colliders import Collider
 from drgs_blender.simulate.contact import Plane
 from drgs_blender.simulate.lattice import Lattice

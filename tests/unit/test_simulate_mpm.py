@@ -11,8 +11,8 @@ from plain_mpm import PlainMpm
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from drgs_blender.compute.jit import get_num_threads, set_num_threads
 from drgs_blender.errors import Cancelled, UsageError
-from drgs_blender.jit import get_num_threads, set_num_threads
 from drgs_blender.simulate.colliders import Collider
 from drgs_blender.simulate.contact import Plane
 

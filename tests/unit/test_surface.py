@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import trimesh
 
+from drgs_blender.compute.jit import njit
 from drgs_blender.errors import AssetError, UsageError
 from drgs_blender.frame import Image, Material, MeshState, Texture, Visibility
-from drgs_blender.jit import njit
 from drgs_blender.render.trace import masks
 from drgs_blender.render.trace.scene import TraceObject, TraceScene
 from drgs_blender.render.trace.surface import nearest, position_at, shadowed, surface_at

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from drgs_blender.compute.jit import get_num_threads, use_threads
 from drgs_blender.frame import Camera, RenderSettings
-from drgs_blender.jit import get_num_threads, use_threads
 from drgs_blender.render.camera import camera_parameters, camera_ray
 from drgs_blender.render.picture.denoise import prepare
 from drgs_blender.render.picture.motion import Instant, Motion, MotionFilm, previous_positions, project

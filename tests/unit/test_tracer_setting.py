@@ -12,6 +12,7 @@ from shapes import sphere_mesh, sphere_surfels
 
 from drgs_blender.asset.container import write_asset
 from drgs_blender.asset.model import Asset, Mesh, PosedSurfels, Surfels
+from drgs_blender.compute.jit import njit
 from drgs_blender.deform.attach import attach
 from drgs_blender.deform.matrix_driven import pose_by_matrix
 from drgs_blender.deform.mesh_driven import MeshDriven
@@ -28,7 +29,6 @@ from drgs_blender.frame import (
     Visibility,
     World,
 )
-from drgs_blender.jit import njit
 from drgs_blender.render.sampling import F, U, mix
 from drgs_blender.render.shade import rays
 from drgs_blender.render.shade import wave as w

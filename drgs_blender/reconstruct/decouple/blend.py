@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...jit import njit
+from ...compute.jit import njit
 
 
 @njit

@@ -23,8 +23,8 @@ import torch
 from torch import Tensor
 
 from ...asset.model import Mesh
+from ...compute.jit import njit, prange
 from ...frame import World
-from ...jit import njit, prange
 from ...render.lights.facing import block_of, facing_row, in_cells_order
 from ...render.lights.light import (
     EnvironmentLight,

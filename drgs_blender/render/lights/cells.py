@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from ...colour import LUMINANCE
-from ...jit import njit, prange
+from ...compute.jit import njit, prange
 
 Array = np.ndarray
 

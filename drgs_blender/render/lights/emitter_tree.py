@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...jit import njit
+from ...compute.jit import njit
 from ..memory import load_double, load_float
 from ..sampling import HALF, ZERO, F
 from .triangles import AREA, BACK, BITS, CLOSED, CORNER, EDGE, LUMINANCE, NORMAL, SIDE, triangle_weight

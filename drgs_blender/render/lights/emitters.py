@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...colour import LUMINANCE as WEIGHTS
-from ...jit import njit
+from ...compute.jit import njit
 from ..memory import Place, address, load_float, load_int32, load_int64
 from ..sampling import ONE, ZERO, F, unit
 from ..trace.scene import Glowing, TraceScene

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...jit import njit, prange
+from ...compute.jit import njit, prange
 from ..memory import load_float, load_int32, load_uint32
 from .cells import Cells
 

@@ -12,8 +12,8 @@ import math
 import numpy as np
 
 from ...colour import LUMINANCE
+from ...compute.jit import njit
 from ...frame import Light
-from ...jit import njit
 from ..sampling import HALF, ONE, PI, TWO, ZERO, F, basis, sincos_turns, unit
 from .light import BRIGHTEST
 

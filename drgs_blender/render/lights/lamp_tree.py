@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...jit import njit
+from ...compute.jit import njit
 from ..sampling import HALF, ONE, ZERO, F
 from .lamp_shapes import AXIS, BARE_SUN, BOUND, FLUX, INTENSITY, KIND, PLACE, REACH_COS, RECTANGLE, SUN
 

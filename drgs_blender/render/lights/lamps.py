@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...compute.jit import njit
 from ...frame import Light
-from ...jit import njit
 from ..sampling import ONE, ZERO, F, U
 from ..trace.surface import emitted
 from .emitters import Emitters, emitter_bits, emitter_pdf, emitter_row, emitters_luminance, sample_emitter

@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ...asset.model import as_float
+from ...compute.jit import njit, prange
 from ...errors import UsageError
 from ...frame import World
-from ...jit import njit, prange
 from ..memory import Place, address, load_float, load_int32, load_uint32
 from ..sampling import fast_acos, fast_atan2_turns, sincos_turns, unit
 from .cells import Cells

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from ...jit import njit
+from ...compute.jit import njit
 from ..memory import load_float
 from ..sampling import ONE, TWO, ZERO, F, fast_atan2_turns
 

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from ...compute.jit import njit, prange
 from ...frame import Frame
-from ...jit import njit, prange
 from ...mattes import DRGS_MATERIAL, KINDS, identities
 from ..points import CATCHER
 from ..primary.gbuffer import GBuffer

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from ...colour import LUMINANCE as REC709
-from ...jit import njit
+from ...compute.jit import njit
 from .rows import over_rows
 from .signal import (
     CERTAINTY,

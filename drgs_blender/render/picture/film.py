@@ -21,8 +21,8 @@ from typing import Any
 
 import numpy as np
 
+from ...compute.jit import njit, prange
 from ...frame import Camera, RenderSettings
-from ...jit import njit, prange
 from ..camera import FX, FY, ORTHOGRAPHIC, WIDTH, sample_ray
 from ..lights.light import EnvironmentLight, map_at, sky_radiance
 from ..points import CATCHER, Radiance

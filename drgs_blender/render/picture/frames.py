@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 import OpenEXR
 
+from ...compute.jit import get_num_threads
 from ...errors import AssetError, UsageError, WriteError
-from ...jit import get_num_threads
 from ...mattes import METADATA
 from ...passes import BY_NAME
 

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...jit import njit, prange
+from ...compute.jit import njit, prange
 from ..camera import CX, CY, FX, FY, ORTHOGRAPHIC, POSITION, WIDTH
 from ..points import CATCHER
 from ..primary.gbuffer import GBuffer

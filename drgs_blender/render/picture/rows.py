@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from typing import Any
 
-from ...jit import get_num_threads
+from ...compute.jit import get_num_threads
 
 #: Runs of rows a thread, so that those who are done early have something to take; fewest rows of a run, because handing
 #: one over costs as much as some of them.

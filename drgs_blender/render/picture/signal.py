@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ...jit import njit, prange
+from ...compute.jit import njit, prange
 from ..sampling import ONE, ZERO, F, luminance
 
 Array = np.ndarray

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from ...jit import njit
+from ...compute.jit import njit
 from ..sampling import ONE, ZERO, F
 from .denoise import prepare, smooth
 from .motion import Instant, Motion

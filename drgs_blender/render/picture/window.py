@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ...jit import njit
+from ...compute.jit import njit
 from .denoise import prepare, smooth
 from .rows import over_rows
 from .signal import LIGHT, LUMINANCE, PAD, SOURCE, SURFACE, VARIANCE, Signal, modulate

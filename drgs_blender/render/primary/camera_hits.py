@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ...jit import get_num_threads, njit, prange
+from ...compute.jit import get_num_threads, njit, prange
 from ..camera import CLIP_END, CLIP_START, WIDTH, sample_ray
 from ..trace.scene import TraceScene
 from ..trace.surface import nearest, position_at, surface_at

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ...jit import njit
+from ...compute.jit import njit
 from ..camera import AA, WIDTH
 from ..points import CATCHER, SECOND, ShadingPoints
 from ..trace.masks import CATCHER as CATCHER_OBJECT

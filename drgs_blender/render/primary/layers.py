@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ...jit import njit, prange
+from ...compute.jit import njit, prange
 from ..surfels.raster import SurfelSamples
 from ..trace.masks import CATCHER, HOLDOUT, ORDINARY
 from ..trace.scene import TraceScene

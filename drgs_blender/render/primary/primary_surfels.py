@@ -28,8 +28,8 @@ from typing import Any
 
 import numpy as np
 
+from ...compute.jit import get_num_threads, njit, prange
 from ...frame import Camera
-from ...jit import get_num_threads, njit, prange
 from ..camera import WIDTH, sample_ray
 from ..points import SECOND
 from ..surfels.raster import SurfelSamples, rasterise

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ...jit import njit, prange
+from ...compute.jit import njit, prange
 from ..camera import CLIP_END, CLIP_START, WIDTH, sample_ray
 from ..lights.lamp_shapes import CAMERA
 from ..lights.lamps import Lamps, lamps_along, suns_along

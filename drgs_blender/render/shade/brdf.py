@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 
-from ...jit import inlined, njit
+from ...compute.jit import inlined, njit
 from ..sampling import HALF, INVERSE_PI, ONE, PI, TWO, ZERO, F, sincos_turns
 
 Array = np.ndarray

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ...jit import njit
+from ...compute.jit import njit
 from ..lights.facing import facing_row
 from ..sampling import ONE, TWO, ZERO, F, U
 from . import brdf

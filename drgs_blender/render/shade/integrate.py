@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from ...colour import LUMINANCE
+from ...compute.jit import get_num_threads, njit, prange
 from ...errors import UsageError
 from ...frame import RenderSettings
-from ...jit import get_num_threads, njit, prange
 from .. import sampling
 from ..lights.lamps import Lamps
 from ..lights.light import EnvironmentLight

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ...jit import njit
+from ...compute.jit import njit
 from ..lights.facing import facing_row
 from ..lights.lamp_shapes import DIFFUSE, GLOSSY
 from ..lights.lamps import emission_along, lamps_along

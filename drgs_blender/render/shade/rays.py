@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...jit import njit, overload
+from ...compute.jit import njit, overload
 from ..lights.lamp_shapes import DIFFUSE, GLOSSY
 from ..lights.lamp_shapes import SHADOW as SHADOWED
 from ..lights.lamps import lamp_flags

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ...jit import njit
+from ...compute.jit import njit
 from ..sampling import ONE, ZERO, F
 
 Array = np.ndarray

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ...jit import njit
+from ...compute.jit import njit
 from ..lights.lamp_shapes import DIFFUSE, GLOSSY
 from ..lights.lamps import emission_along, lamps_along
 from ..lights.light import sky_radiance

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ...jit import inlined, njit
+from ...compute.jit import inlined, njit
 from .. import sampling
 from ..lights.facing import block_of, in_cells_order
 from ..lights.lamps import sample_lamp

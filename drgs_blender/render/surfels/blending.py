@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ...jit import njit
+from ...compute.jit import njit
 from .splats import ALBEDO, METALLIC, NORMAL, ROUGHNESS, SIZE
 
 #: Samples that vector code works on at a time; a tile's side and the room for contributions are multiples of it.

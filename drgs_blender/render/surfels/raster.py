@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from ...jit import get_num_threads, njit, prange
+from ...compute.jit import get_num_threads, njit, prange
 from ..camera import AA, CLIP_END, CLIP_START, FX, FY, ORTHOGRAPHIC, WIDTH, lattice, pixel_shift
 from .blending import GAP, LANES, MANY, MIN_TRANSMITTANCE, mean, merge_sort, prune, rank_sort, weigh, widen
 from .splats import (

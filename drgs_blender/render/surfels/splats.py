@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from ...asset.model import PosedSurfels
+from ...compute.jit import njit, prange
 from ...frame import Camera
-from ...jit import njit, prange
 from ..camera import AA, CLIP_END, CLIP_START, CX, CY, FX, FY, LEAN, ORTHOGRAPHIC, POSITION, filter_reach
 
 Array = np.ndarray

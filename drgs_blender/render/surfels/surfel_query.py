@@ -13,7 +13,7 @@ when it is opaque.
 
 from __future__ import annotations
 
-from ...jit import njit  # first of all: it sets Numba up before anything imports Numba
+from ...compute.jit import njit  # first of all: it sets Numba up before anything imports Numba
 
 # isort: split
 import functools

@@ -6,7 +6,7 @@ run-time integers, so compiled code can be cached on disk and still finds the li
 
 from __future__ import annotations
 
-from ... import jit  # first of all: it sets Numba up before anything imports Numba  # noqa: F401
+from ...compute import jit  # first of all: it sets Numba up before anything imports Numba  # noqa: F401
 
 # isort: split
 import ctypes

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from ...asset.model import as_float
+from ...compute.jit import njit, prange
 from ...errors import UsageError
 from ...frame import MeshState, Visibility
 from ...geometry import VertexNormals
-from ...jit import njit, prange
 from .instances import Places, flattens, normal_matrices
 from .masks import group_mask
 

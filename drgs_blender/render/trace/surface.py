@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...jit import njit
+from ...compute.jit import njit
 from ..memory import load_float, load_int32, load_int64
 from ..sampling import ONE, ZERO, F
 from .embree import blocked, trace

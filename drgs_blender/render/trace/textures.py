@@ -22,9 +22,9 @@ import numpy as np
 
 from ...arrays import frozen
 from ...colour import LUMINANCE, srgb_to_linear, to_unit
+from ...compute.jit import njit
 from ...errors import UsageError
 from ...frame import Image, Material, Texture
-from ...jit import njit
 from ..memory import Place, address, load_float, load_int32, load_int64, load_uint32
 from ..sampling import HALF, ONE, TWO, ZERO, F, luminance
 

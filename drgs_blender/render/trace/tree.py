@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from ...compute.jit import njit, prange
+from ...compute.simd import aligned
 from ...errors import DeviceError, UsageError
-from ...jit import njit, prange
-from ...simd import aligned
 from . import embree
 from .embree import blocked, trace
 

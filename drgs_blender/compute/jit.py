@@ -45,7 +45,7 @@ def source_digest() -> str:
     Numba notices that a kernel's own file changed, but not the files of the functions that it calls: kernels of
     different sources must not share a cache.
     """
-    package, digest = Path(__file__).parent, hashlib.sha256()
+    package, digest = Path(__file__).parent.parent, hashlib.sha256()
     for path in sorted(package.rglob("*.py")):
         if path.relative_to(package).parts[0] not in WITHOUT_KERNELS:
             digest.update(path.read_bytes())

@@ -1,0 +1,1 @@
+"""Compiled code: Numba set up once, its cache, wide numbers."""
