@@ -20,17 +20,19 @@ from .folders import wanted_folder
 
 os.environ.setdefault("NUMBA_THREADING_LAYER", "workqueue")
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-# Where Numba keeps kernels itself, see `kernel_compiler.TESTED`.
-os.environ.setdefault("NUMBA_CACHE_DIR", str(wanted_folder() / "numba"))
-targets.settle()
 
-import numba  # noqa: E402
-from numba import get_num_threads, prange, set_num_threads  # noqa: E402
-from numba.core.ccallback import CFunc  # noqa: E402
-from numba.extending import overload as _overload  # noqa: E402
+import numba
+from numba import get_num_threads, prange, set_num_threads
+from numba.core.ccallback import CFunc
+from numba.extending import overload as _overload
 
-from . import kernel_compiler  # noqa: E402
-from .kernel_cache import KernelCache  # noqa: E402
+if "NUMBA_CACHE_DIR" not in os.environ:  # where Numba keeps kernels itself, see `kernel_compiler.TESTED`
+    numba.config.CACHE_DIR = str(wanted_folder() / "numba")
+if "NUMBA_CPU_NAME" not in os.environ:
+    targets.settle(numba.config)
+
+from . import kernel_compiler
+from .kernel_cache import KernelCache
 
 log = logging.getLogger(__name__)
 _OWN_CACHE = kernel_compiler.is_tested() and not numba.config.DISABLE_JIT

@@ -121,7 +121,7 @@ class _Reader:
 
     def one(self) -> Any:
         if self.tokens[self.at] == "(":
-            return types.BaseTuple.from_types(tuple(self.group()))  # type: ignore[attr-defined]
+            return types.BaseTuple.from_types(tuple(self.group()))
         word = self.take()
         if word == "array":
             self.take("(")
@@ -131,7 +131,7 @@ class _Reader:
             module, _, name = word.partition(":")
             found = _lookup(module, name)
             if self.at < len(self.tokens) and self.tokens[self.at] == "(":
-                return types.BaseTuple.from_types(tuple(self.group()), found)  # type: ignore[attr-defined]
+                return types.BaseTuple.from_types(tuple(self.group()), found)
             return types.Dispatcher(found)
         return _scalar(word)
 

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import functools
 import logging
-import os
 import zipfile
 from pathlib import Path
+
+import numba
 
 log = logging.getLogger(__name__)
 FOLDER = Path(__file__).with_name("kernels")
@@ -35,7 +36,7 @@ def read(name: str) -> bytes | None:
 
 @functools.cache
 def _archive() -> zipfile.ZipFile | None:
-    path = FOLDER / f"{os.environ.get('NUMBA_CPU_NAME', 'native')}.zip"
+    path = FOLDER / f"{numba.config.CPU_NAME or 'native'}.zip"
     try:
         return zipfile.ZipFile(path)
     except FileNotFoundError:

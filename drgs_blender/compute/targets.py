@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import platform
+from typing import Any
 
 #: Target -> what the processor must have, in LLVM's words.  x86-64 psABI levels 3 and 4.
 _V3 = ("avx", "avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe", "xsave")
@@ -38,11 +39,8 @@ def choose() -> str:
     return NATIVE
 
 
-def settle() -> None:
-    """Tell Numba the target; before it is imported. Its own settings, where there are any, go first."""
-    if "NUMBA_CPU_NAME" in os.environ:
-        return
+def settle(config: Any) -> None:
+    """Set the target of this process in Numba's configuration, before anything is compiled."""
     target = choose()
     if target != NATIVE:
-        os.environ["NUMBA_CPU_NAME"] = target
-        os.environ.setdefault("NUMBA_CPU_FEATURES", _FEATURES.get(target, ""))
+        config.CPU_NAME, config.CPU_FEATURES = target, _FEATURES.get(target, "")
