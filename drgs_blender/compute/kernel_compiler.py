@@ -51,7 +51,7 @@ class _Flags(compiler.Flags):
 
     def __eq__(self, other: object) -> bool:
         if type(other) is type(self):
-            return self._values == other._values  # type: ignore[attr-defined]
+            return self._values == other._values
         return super().__eq__(other)
 
 
