@@ -103,6 +103,7 @@ def test_progress_is_told_on_the_calling_thread_and_grows(client, make_frame):
     assert len({phase for _, phase, _ in told}) >= 2
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize("delay", [0.0, 0.3, 1.0])
 def test_cancel_is_quick_and_the_engine_goes_on(client, make_frame, expected, delay):
     client.render(make_frame())
@@ -121,6 +122,7 @@ def test_cancel_is_quick_and_the_engine_goes_on(client, make_frame, expected, de
     assert client.pid == pid
 
 
+@pytest.mark.alone
 @posix
 def test_engine_that_does_not_obey_is_ended(client, make_frame, expected):
     client.render(make_frame())

@@ -117,6 +117,7 @@ def test_every_lit_cell_of_a_large_map_has_its_density(size: tuple[int, int], sk
     assert (np.diff(light.cells.runs[:, 0].astype(np.int64)) >= 1).all() and light.cells.runs[-1, 0] == 2**32 - 1
 
 
+@pytest.mark.alone
 def test_any_number_of_threads_makes_the_same_cells() -> None:
     world = World(environment=np.random.default_rng(0).random((96, 192, 3)).astype(np.float32) ** 4)
     before = get_num_threads()

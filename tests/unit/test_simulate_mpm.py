@@ -409,6 +409,7 @@ def test_turning_everything_turns_the_result():
     assert np.abs(results[0] - results[1]).max() < 1e-5
 
 
+@pytest.mark.alone
 def test_any_number_of_threads_gives_the_same_bits():
     threads = get_num_threads()
     results = []
