@@ -6,6 +6,7 @@ import math
 
 import bpy
 import numpy as np
+import pytest
 from mathutils import Vector
 from scenes import mesh_object, new_world, read_exr
 
@@ -67,6 +68,7 @@ def furnish(scene, ball) -> None:
     lamp(scene, "SPOT", 1, (0.3, -1.5, 0.4), shadow_soft_size=0.1).visible_camera = True
 
 
+@pytest.mark.slow
 def test_a_whole_scene_agrees_with_cycles(ball, scene):
     """Means of blocks of pixels; what differs is told from noise as bench/judge.py does."""
     furnish(scene, ball)

@@ -181,6 +181,7 @@ def test_surfels_become_an_asset_and_an_object(scene, tmp_path):
     assert (tmp_path / "toy.drgs").read_bytes() == before
 
 
+@pytest.mark.slow
 def test_a_file_that_is_imported_again_is_another_object(scene, tmp_path):
     """What the first is made of stays, and what another .blend may be made of."""
     splats = few_splats(tmp_path / "toy.ply")

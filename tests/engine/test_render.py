@@ -137,6 +137,7 @@ def test_engine_that_does_not_obey_is_ended(client, make_frame, expected):
     assert client.pid != pid
 
 
+@pytest.mark.slow
 @posix
 def test_killed_engine_is_replaced_and_the_picture_is_the_same(client, make_frame, expected):
     for _ in range(3):
@@ -154,6 +155,7 @@ def test_engine_killed_again_and_again_is_an_error(client, make_frame, expected)
     assert_same_bits(client.render(make_frame(0.2)), expected)
 
 
+@pytest.mark.slow
 @posix
 @pytest.mark.parametrize("restarts", [0, 1] * (5 if os.environ.get("DRGS_FAULTS") == "whole" else 1))
 def test_stopped_engine_meets_the_deadline(make_client, make_frame, asset_path, expected, restarts):
@@ -293,6 +295,7 @@ def test_engine_outlives_the_thread_that_started_it(make_client, make_frame, ass
     assert client.pid == pid
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
 def test_engines_that_come_and_go_leave_no_thread_and_no_file_behind(client, make_frame):
     def held():

@@ -70,6 +70,7 @@ def far_off(training: Training, capture: Capture) -> float:
     return float(np.median(np.abs(seen - depth)[into]))
 
 
+@pytest.mark.slow
 def test_a_hollow_that_no_outline_shows_is_found(monkeypatch, caplog):
     capture = photographed(bowl, 40, 64, 10)
     with caplog.at_level("INFO"):
@@ -80,6 +81,7 @@ def test_a_hollow_that_no_outline_shows_is_found(monkeypatch, caplog):
     assert far_off(both, capture) < 0.5 * far_off(alone, capture)
 
 
+@pytest.mark.slow
 def test_the_start_that_loses_leaves_no_trace(monkeypatch):
     capture = balls(24, 40)
     monkeypatch.setattr(train, "WORTH", 1000.0)
