@@ -24,7 +24,7 @@ from pathlib import Path
 import pytest
 from _pytest.runner import runtestprotocol
 
-SECONDS = 3.0
+SECONDS = float(os.environ.get("DRGS_TEST_SECONDS", "3"))
 WAITING = 2.0
 SHARED_SECONDS = 10.0
 

@@ -10,6 +10,8 @@ import pytest
 from mathutils import Vector
 from scenes import mesh_object, new_world, read_exr
 
+pytestmark = pytest.mark.blender_api
+
 SIZE, BLOCK, SEEDS = 40, 8, 4
 CUBE = [(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
 SIDES = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]

@@ -10,6 +10,8 @@ import pytest
 from mathutils import Matrix
 from scenes import asset_of, mesh_object, part, select, sphere
 
+pytestmark = pytest.mark.blender_api
+
 
 def columns() -> dict[str, np.ndarray]:
     """Splats on a sphere, as a PLY names them, with harmonics of degree 1."""

@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from scenes import ROOT, asset_of, part, read_exr, select, sphere, write_ball
 
+pytestmark = pytest.mark.blender_api
+
 
 def channel(mesh, name):
     return part("addon.mesh_arrays").read_channel(mesh, name)

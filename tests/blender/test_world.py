@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from scenes import new_world, part, read_exr, write_exr
 
+pytestmark = pytest.mark.blender_api
+
 
 @pytest.fixture
 def sky(tmp_path):
