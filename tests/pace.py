@@ -25,7 +25,7 @@ import pytest
 from _pytest.runner import runtestprotocol
 
 SECONDS = float(os.environ.get("DRGS_TEST_SECONDS", "3"))
-WAITING = 2.0
+WAITING = 4.0
 SHARED_SECONDS = 10.0
 
 

@@ -51,6 +51,7 @@ def problems(names: list[str], count: int, folder: Path, seconds: int = 5) -> li
         assert len(found) < 20, found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("group", GROUPS, ids=lambda group: group[0] if len(group) == 1 else f"{len(group)} kinds")
 def test_damaged_files_do_no_harm(group: list[str], tmp_path: Path) -> None:
     found = problems(group, COUNT, tmp_path)

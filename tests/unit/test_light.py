@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import pytest
 
@@ -31,6 +33,7 @@ def picture(kind: str) -> np.ndarray | None:
 KINDS = ["constant", "random", "sun", "pole"]
 
 
+@functools.lru_cache(maxsize=1)
 def sphere_grid(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
     """Directions (n, 3) on a lat-long grid and the solid angle (n,) of each; multiples of 16 and 32 keep to cells."""
     theta = np.pi * (np.arange(rows) + 0.5) / rows

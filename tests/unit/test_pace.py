@@ -25,6 +25,7 @@ def work(seconds):
 def outcome(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[dict, str]]:
     """Function that runs tests with limits of 50 ms and 100 ms; returns the counts and what was printed."""
     monkeypatch.setattr(pace, "SECONDS", 0.05)
+    monkeypatch.setattr(pace, "WAITING", 2.0)
     monkeypatch.setattr(pace, "SHARED_SECONDS", 0.1)
     monkeypatch.setattr(os, "getloadavg", lambda: (0.0, 0.0, 0.0), raising=False)
     pytester.makeconftest("from pace import *")

@@ -189,6 +189,7 @@ def wired(view, across: float, samples: int = 5) -> tuple[np.ndarray, np.ndarray
     return np.repeat(0.5 * alpha[..., None], 3, -1), alpha
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("across", [0.0, 0.004, 0.009, 0.013])
 def test_wires_thinner_than_a_cell_are_part_of_the_hull(across):
     region = find_region(photographed(lambda view: wired(view, across), 16, 200, 10))
