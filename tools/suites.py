@@ -144,10 +144,12 @@ def parse(words: Sequence[str], names: Iterable[str], root: Path) -> tuple[list[
     return suites, files, list(words[first:])
 
 
-def belongs(file: str, suite: Suite) -> bool:
-    """Whether a file, a folder or a test is one of a suite, or holds all of it."""
+def of_suite(file: str, suite: Suite) -> list[str]:
+    """What of a file, a folder or a test is a suite's: itself, those folders of the suite that it holds, or nothing."""
     path = file.split("::")[0].rstrip("/")
-    return any(f"{path}/".startswith(f"{folder}/") or f"{folder}/".startswith(f"{path}/") for folder in suite.folders)
+    if any(f"{path}/".startswith(f"{folder}/") for folder in suite.folders):
+        return [file]
+    return [folder for folder in suite.folders if folder.startswith(f"{path}/")]
 
 
 # Jobs
@@ -189,6 +191,10 @@ class Job:
     alone: bool = False
     may_be_empty: bool = False
 
+    def meaning(self, code: int) -> int:
+        """Exit code of a command, 0 if it is as good as that."""
+        return 0 if code == NO_TESTS and self.may_be_empty else code
+
 
 KERNELS = "kernels"
 
@@ -216,27 +222,29 @@ def workers() -> int:
 
 
 def suite_jobs(name: str, suite: Suite, plan: Plan, python: Path, root: Path, folder: Path, after: str) -> list[Job]:
-    """One suite's jobs: the tests that run beside others and those that need the machine for themselves."""
-    files = [file for file in plan.files if belongs(file, suite)] or list(suite.folders)
+    """One suite's jobs: the tests that run beside others and those that need the machine for themselves.
+
+    A choice of tests is one job, as it is to be quick, with all threads.
+    """
+    files = [each for file in plan.files for each in of_suite(file, suite)] or list(suite.folders)
     part = "all" if name in plan.whole_suites or any("::" in file for file in files) else plan.part
     whole = WHOLE_TIMES if os.environ.get("DRGS_FAULTS") == "whole" else 1
     made = []
-    for lane in ("shared", "alone"):
-        among = files if lane == "shared" else lonely(files, root)
+    for lane in ("all",) if plan.selects else ("shared", "alone"):
+        among = lonely(files, root) if lane == "alone" else files
         if not among:
             continue
-        own = name if lane == "shared" else f"{name}-alone"
+        own = f"{name}-alone" if lane == "alone" else name
         report = folder / f"{own}.xml"
         command = [str(python), "-m", "pytest", "-q", f"--part={part}", f"--lane={lane}", f"--junitxml={report}"]
         command += ["-o", f"cache_dir=.pytest_cache/{own}", "-o", f"faulthandler_timeout={STUCK_SECONDS}"]
         environment = {}
         if lane == "shared" and suite.spread:
+            command += ["-n", str(workers()), "--dist", "loadfile"]
             if part == "fast":
                 # arrays of these tests are small: threads would wait for each other, and for the other processes
                 environment = {"NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-            if not plan.selects:
-                command += ["-n", str(workers()), "--dist", "loadfile"]
-        title = suite.title if lane == "shared" else f"{suite.title}, alone"
+        title = f"{suite.title}, alone" if lane == "alone" else suite.title
         commands, log, seconds = (
             [[*command, *plan.options, *among]],
             folder / f"{own}.log",
@@ -291,7 +299,7 @@ def jobs(
         after = kernels.title
     named = [name for name in plan.suites if name != LINT]
     if plan.files:
-        named = [name for name in named if any(belongs(file, suites[name]) for file in plan.files)]
+        named = [name for name in named if any(of_suite(file, suites[name]) for file in plan.files)]
     for name in named:
         made += suite_jobs(name, suites[name], plan, python_of[name](), root, folder, after)
     return sorted(made, key=lambda job: job.alone)
@@ -353,7 +361,7 @@ class Runner:
         for command in job.commands:
             process = self._start(job, command, None)
             try:
-                codes.append(process.wait(job.seconds))
+                codes.append(job.meaning(process.wait(job.seconds)))
             except subprocess.TimeoutExpired:
                 print(f"{job.title}: ended after {job.seconds:.0f} s", flush=True)
                 end(process)
@@ -438,7 +446,7 @@ class _Running:
             self.late, code = True, 124
         if code is None:
             return False
-        self.codes.append(code)
+        self.codes.append(self.job.meaning(code))
         if len(self.codes) < len(self.job.commands):
             self._next()
             return False
@@ -550,9 +558,7 @@ def run(
         if job.report is not None:
             tests = report.add(job.report)
             left += left_out(job.report)
-            if job.may_be_empty:
-                codes = [0 if code == NO_TESTS else code for code in codes]
-            elif not tests:
+            if not tests and not job.may_be_empty:
                 wrong.append(job.title)
         wrong += [job.title] * (any(codes) and job.title not in wrong)
     return summed_up(plan, report, wrong, left, time.monotonic() - began, earlier, build)

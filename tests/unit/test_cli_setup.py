@@ -124,5 +124,7 @@ def test_words_choose_suites_files_and_tests(dev, plans, tmp_path):
     assert [*chosen] == [f"Blender {dev.BLENDER}"] and "--part=fast" in next(iter(chosen.values()))
     chosen = commands(dev, plans("test", "tests/unit/test_light.py::test_it"), tmp_path)
     assert "--part=all" in chosen["engine"], "a test that is named is run, slow or not"
+    chosen = commands(dev, plans("test", "tests"), tmp_path)
+    assert chosen["engine"].endswith(" tests/unit tests/engine") and chosen["farm"].endswith(" tests/farm")
     assert dev.main(["test", "enigne"]) == 1
     assert dev.main(["test", "-x", "tests/unit/test_light.py"]) == 1
