@@ -199,6 +199,7 @@ def test_a_python_that_is_none_is_named(tmp_path):
     assert running.done and "no-python" in str(running.error)
 
 
+@pytest.mark.slow
 def test_an_index_that_does_not_answer_is_told_from_a_package_that_is_not_there(tmp_path, monkeypatch):
     """What pip says last is the same for both."""
     monkeypatch.setenv("PIP_RETRIES", "1")

@@ -207,6 +207,7 @@ def test_y_up_files_are_turned_and_vertex_materials_win():
     assert asset.binding is not None and asset.provenance["report"]["surfels"]["surfels"] == len(asset.surfels)
 
 
+@pytest.mark.slow
 def test_textured_cat_keeps_its_picture(shared_data):
     asset = make_asset(shared_data / "meshes/pbr/egyptian_cat.glb", max_triangles=20_000)
     report = asset.provenance["report"]
