@@ -20,7 +20,7 @@ from ..particle_cache import ParticleCache
 from ..sequence import frame_path
 from .interrupt import interruptible
 from .output import check_suffix, check_writable
-from .progress import FractionBar, clock
+from .progress import FractionBar, clock, prepare_engine
 from .sampling import whole
 
 if TYPE_CHECKING:
@@ -108,6 +108,7 @@ def run(args: argparse.Namespace) -> int:
     settings = _settings(args)
     use_threads(args.threads)
     asset = read_asset(args.asset)
+    prepare_engine(args, "simulate")
     with clock(args, "filling"):
         job = prepare(asset.mesh, settings, str(args.asset))
     report = job.filling.report
