@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .compute.jit import njit, prange
+from .compute.jit import njit, plain, prange
 from .errors import AssetError
 
 Array = np.ndarray
@@ -34,7 +34,7 @@ def corner_table(faces: Array, n_vertices: int) -> tuple[Array, Array]:
     start = np.zeros(n_vertices + 1, np.int32)
     np.cumsum(np.bincount(flat, minlength=n_vertices), out=start[1:])
     corner = np.empty(len(flat), np.int32)
-    _sort_corners(flat, start[:-1].copy(), corner)
+    _sort_corners(plain(flat), start[:-1].copy(), corner)
     return start, corner
 
 
@@ -86,7 +86,7 @@ class VertexNormals:
         vertices : (n, 3) float32
         faces : (m, 3) int32: those of this object, of which some may be collapsed to a point
         """
-        empty = _weigh(vertices, faces, self.place, self._weighted)
+        empty = _weigh(plain(vertices), plain(faces), self.place, self._weighted)
         _sum(self._weighted, self.start, normals)
         return int(empty)
 

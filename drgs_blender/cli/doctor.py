@@ -11,7 +11,6 @@ import json
 import os
 import platform
 import sys
-import tempfile
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -95,17 +94,12 @@ def numba(args: argparse.Namespace) -> str:
 
 def cache(args: argparse.Namespace) -> str:
     """Whether compiled kernels can be kept."""
-    from ..compute.jit import cache_folder
+    from ..compute.folders import cache_folder, wanted_folder
 
-    folder = cache_folder()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        remedy = "Set DRGS_CACHE_DIR to a folder that can be written; without one kernels compile at every start"
-        raise DeviceError(f"kernel cache {folder}", error.strerror or str(error), remedy) from error
-    return str(folder)
+    if trouble := cache_folder().trouble:
+        remedy = "Set DRGS_CACHE_DIR to a folder that is yours and can be written"
+        raise DeviceError("kernel cache", trouble, remedy)
+    return str(wanted_folder())
 
 
 def embree(args: argparse.Namespace) -> str:

@@ -85,7 +85,10 @@ def _import(args: argparse.Namespace) -> int:
         raise UsageError("--exposure", "belongs to --remove-light", "Give both")
 
     from ..build.importer import import_asset
+    from ..compute.prepare import prepare_kernels
 
+    with FractionBar(args, "importing") as bar:
+        prepare_kernels(("import",), bar)
     given = {name: value for name in ("resolution", "max_triangles") if (value := getattr(args, name)) is not None}
     with clock(args, "importing"):
         asset = import_asset(

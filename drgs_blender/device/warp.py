@@ -12,13 +12,14 @@ import importlib.util
 import os
 import sys
 from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 
 from ..asset.archive import replace_file
-from ..compute.jit import cache_folder
+from ..compute.folders import cache_folder
 from ..errors import DeviceError, WriteError
 from .typed import Array as ArrayType
 from .typed import Known, Struct, Type, type_of
@@ -33,6 +34,14 @@ watchers: list[Callable[[int], None]] = []
 #: Versions that the translation is made for; `pyproject.toml` has the same.
 VERSION = "1.19."  # also for what its ``and``, ``or`` and ``if`` leave out: they read no more than Python's do
 _INSTALL = "Install it: pip install 'warp-lang>=1.19,<1.20', or Set Up Engine with Graphics Card"
+
+
+def _folder() -> Path:
+    """Warp's part of the folder of compiled kernels."""
+    folder = cache_folder()
+    if folder.path is None:
+        raise DeviceError("device cuda", folder.trouble, "Set DRGS_CACHE_DIR to a folder that can be written")
+    return folder.path / "warp"
 
 
 @functools.cache
@@ -51,13 +60,13 @@ def warp() -> Any:
     version = str(getattr(wp, "__version__", "unknown"))
     if not version.startswith(VERSION):
         raise DeviceError("device cuda", f"warp-lang has version {version}, not {VERSION}x", _INSTALL)
-    folder = cache_folder() / "warp"
+    folder = _folder()
     wp.config.log_level = wp.LOG_WARNING  # else it greets on stdout, which is read by programs
     # Not the folder itself: Warp would take the sources there for what an older Warp has left, and warn.
     wp.config.kernel_cache_dir = str(folder / "kernels")
     try:
         wp.init()
-        os.utime(folder)  # see `jit.current_cache`
+        os.utime(folder)  # it is in use, see `compute.folders`
     except Exception as error:
         raise DeviceError("device cuda", f"Warp does not start ({error})", "Use the CPU") from error
     return wp
@@ -145,7 +154,7 @@ def load_module(source: str) -> ModuleType:
     name = f"drgs_{hashlib.sha256(source.encode()).hexdigest()[:16]}"
     if name not in sys.modules:
         warp()
-        path = cache_folder() / "warp" / f"{name}.py"
+        path = _folder() / f"{name}.py"
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
             replace_file(path, [source.encode()])  # at once: other processes may be reading it

@@ -15,6 +15,7 @@ import numpy as np
 
 from ..asset.model import Asset, PosedSurfels
 from ..compute.jit import use_threads
+from ..compute.prepare import prepare_kernels
 from ..errors import Cancelled, UsageError
 from ..frame import Frame, Light, ObjectState, RenderSettings
 from ..render.device.devices import Devices
@@ -83,6 +84,7 @@ class Session:
         self._pace = Pace()
         self._views_begun = 0
         self._devices = Devices()
+        self._compiled: set[str] = set()
 
     def load_asset(self, path: str | os.PathLike[str]) -> str:
         """Map the asset file at `path`; return its key. See `Stage.load_asset`."""
@@ -108,6 +110,7 @@ class Session:
             A setting cannot be used.
         Cancelled
         """
+        self._compile(frame, (), progress, cancelled)
         lap, processor = _Laps(cancelled), self._devices.processor(frame.settings.device)
         ready = self._prepare(frame, lap, progress, processor)
         tell = None if progress is None else lambda part, phase: progress(phase, part)
@@ -127,6 +130,7 @@ class Session:
         AssetError, UsageError
             As `render`.
         """
+        self._compile(frame, (), progress, None)
         ready = self._prepare(frame, _Laps(None), progress)
         placed = [
             Placed(item.state, item.loaded.asset, item.traced, item.posed)
@@ -149,6 +153,7 @@ class Session:
             As `render`.
         """
         self._views.pop(name, None)
+        self._compile(frame, ("viewport",), progress, cancelled)
         lap, processor = _Laps(cancelled), self._devices.processor(frame.settings.device)
         by_mesh = self._stage.detailed(frame)
         rough = replace(frame, settings=replace(frame.settings, primary="mesh")) if by_mesh else frame
@@ -219,6 +224,15 @@ class Session:
             self._histories.keep(frame, sequence, scene)
         return Passes(pictures, [], statistics)
 
+    def _compile(
+        self, frame: Frame, jobs: tuple[str, ...], progress: OnProgress | None, cancelled: IsCancelled | None
+    ) -> None:
+        """Have the kernels compiled that a frame and some jobs besides need."""
+        wanted = {*jobs, *jobs_of(frame)} - self._compiled
+        if wanted:
+            prepare_kernels(wanted, progress, cancelled)
+            self._compiled |= wanted
+
     def _prepare(self, frame: Frame, lap: _Laps, progress: OnProgress | None, processor: Processor = HERE) -> Ready:
         """Bring scene and light up to date with the frame."""
         _check(frame)
@@ -241,6 +255,22 @@ class Session:
             "triangles": float(len(self._stage.scene.faces)),
             "surfels": float(len(posed)),
         }
+
+
+def jobs_of(frame: Frame) -> set[str]:
+    """What a frame needs compiled, in the words of `compute.manifest`."""
+    settings, jobs = frame.settings, {"frame"}
+    if settings.primary == "mesh":
+        jobs.add("mesh")
+    if settings.tracer == "surfels":
+        jobs.add("surfel rays")
+    if settings.denoise == "svgf":
+        jobs.add("denoise")
+    if frame.lights or frame.meshes:
+        jobs.add("lights")
+    if frame.previous is not None or frame.next is not None:
+        jobs.add("motion")
+    return jobs
 
 
 def _unheeded(settings: RenderSettings) -> list[str]:

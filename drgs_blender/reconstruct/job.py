@@ -15,6 +15,7 @@ import torch
 from ..arrays import Array
 from ..asset.model import MATERIAL_CHANNELS, Asset, Binding, Environment, Mesh, Surfels
 from ..build.transfer import surfels_to_vertices
+from ..compute.prepare import PHASE, prepare_kernels
 from ..deform.binding import bind
 from ..deform.mesh_driven import MeshDriven
 from ..errors import Cancelled, WriteError
@@ -90,7 +91,7 @@ class Progress:
 
     Attributes
     ----------
-    phase : "compiling kernels" (where minutes are given), "surfels", "mesh", "surfels on the mesh", "materials"
+    phase : "Preparing the engine (first time only)", "surfels", "mesh", "surfels on the mesh", "materials"
     part : what is done of all, 0..1
     surfels : how many there are
     psnr : of the latest training views, decibels; None: not known
@@ -133,9 +134,9 @@ def reconstruct(
     work = _Work(capture, settings, on_progress or (lambda _: None), cancelled or (lambda: False), folder)
     region = find_region(capture)
     grid([view.camera for view in capture.training], region, settings.mesh_resolution)  # before minutes of learning
+    prepare_kernels(("reconstruct",), lambda phase, _: work.tell(Progress(phase, 0.0)), work.cancelled)
     if settings.minutes is not None:
-        log.info("compiling kernels (first run only)")
-        work.tell(Progress("compiling kernels", 0.0))
+        work.tell(Progress(PHASE, 0.0))
         rehearse(settings, have_silhouettes(capture), work.by, work.cancelled)
     training = Training(capture, region, settings.schedule, seconds=work.seconds(SHARE), by=work.by)
     free = work.learn("surfels", training, 0.0, 0.5)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...asset.model import as_float
-from ...compute.jit import njit, prange
+from ...compute.jit import njit, plain, prange
 from ...errors import UsageError
 from ...frame import World
 from ..memory import Place, address, load_float, load_int32, load_uint32
@@ -119,10 +119,10 @@ class EnvironmentLight:
         found = np.zeros((len(image), 3))
         with np.errstate(over="ignore"):
             tinted = tint.astype(np.float32)
-        _clean(image, tinted, False, self.texels, found)
+        _clean(plain(image), tinted, False, self.texels, found)
         bad, dark, bright = found.sum(axis=0)
         if bad and dark > -_RINGING * bright:
-            _clean(image, tinted, True, self.texels, found)
+            _clean(plain(image), tinted, True, self.texels, found)
             bad = 0
         self.bad_texels = int(bad)
         self.rotation = np.ascontiguousarray(rotation, np.float32)

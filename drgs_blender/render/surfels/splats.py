@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from ...asset.model import PosedSurfels
-from ...compute.jit import njit, prange
+from ...compute.jit import njit, plain, prange
 from ...frame import Camera
 from ..camera import AA, CLIP_END, CLIP_START, CX, CY, FX, FY, LEAN, ORTHOGRAPHIC, POSITION, filter_reach
 
@@ -85,9 +85,9 @@ def prepare(posed: PosedSurfels, camera: Camera, parameters: Array) -> Splats:
     box = np.empty((n, 4), np.int32)
     nearest = np.empty(n, np.float32)
     _project(*(getattr(posed, name) for name in PLACED), parameters, camera.window, screen, box, nearest)
-    order = depth_order(screen[:, ZC], box)
+    order = depth_order(np.ascontiguousarray(screen[:, ZC]), box)
     surface = np.empty((len(order), SURFACE), np.float32)
-    _gather_surface(order, tuple(getattr(posed, name) for name in SHOWN), surface)
+    _gather_surface(order, tuple(plain(getattr(posed, name)) for name in SHOWN), surface)
     box = box[order]
     tiles_x = (x1 - 1) // TILE - x0 // TILE + 1
     tiles_y = (y1 - 1) // TILE - y0 // TILE + 1

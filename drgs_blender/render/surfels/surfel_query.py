@@ -13,14 +13,13 @@ when it is opaque.
 
 from __future__ import annotations
 
-from ...compute.jit import njit  # first of all: it sets Numba up before anything imports Numba
+from ...compute.jit import cfunc, njit  # first of all: it sets Numba up before anything imports Numba
 
 # isort: split
 import functools
 import math
 from typing import Any
 
-import numba
 import numpy as np
 from llvmlite import ir
 from numba import types
@@ -277,5 +276,5 @@ def _bound(call):  # type: ignore[no-untyped-def]
 @functools.cache
 def callbacks() -> tuple[Any, Any, Any]:
     """Compile (or load from the cache) what Embree calls: bounds, intersect, occluded."""
-    make = numba.cfunc(types.void(types.int64), cache=True, error_model="numpy")
+    make = cfunc(types.void(types.int64))
     return make(_bound.py_func), make(_gather.py_func), make(_shade.py_func)

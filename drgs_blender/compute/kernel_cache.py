@@ -1,0 +1,224 @@
+"""Compiled kernels on disk: one file each, checked before it is used.
+
+A file's name says everything on which the machine code depends: the function and its argument types, the import
+closure of its module (`closure`), the target processor, and the versions of Python, Numba and LLVM. Its content
+starts with its own digest: a damaged file is compiled anew. Numba's public hook, a cache locator, chooses only the
+folder; Numba then reads what it finds unchecked, and two processes that compile at once lose entries of its index.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import hashlib
+import inspect
+import json
+import logging
+import os
+import pickle
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import llvmlite
+import numba
+from numba.core import sigutils, types
+from numba.core.caching import NullCache
+from numba.core.compiler import CompileResult
+from numba.core.serialize import dumps
+
+from . import closure, shipped
+from .folders import cache_folder, write_atomically
+from .kernel_compiler import KernelCompiler, LoadedLibrary, is_nested
+
+log = logging.getLogger(__name__)
+_MAGIC = b"drgs kernel 1\n"
+_DIGEST = 32
+ENDING = ".kernel"
+
+
+class DamagedError(Exception):
+    """What a file holds is not what was written."""
+
+
+class KernelCache(NullCache):
+    """The compiled forms of one function.
+
+    Parameters
+    ----------
+    function : callable
+        The Python function.
+    kind : str
+        Forms of one function that are compiled in another way have another kind.
+    """
+
+    def __init__(self, function: Any, kind: str = "kernel") -> None:
+        self.function, self.kind = function, kind
+
+    @property
+    def cache_path(self) -> str | None:
+        """Folder of the files."""
+        folder = cache_folder().path
+        return str(folder / self._folder()) if folder else None
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """The compiled form for `sig`, None if there is none (that can be used)."""
+        if is_nested():
+            return None  # machine code cannot be linked into the caller
+        target_context.refresh()
+        self._record(sig, 0.0)
+        name = self.file_name(sig, target_context.codegen())
+        if name is None:
+            return None
+        for data in self._found(name):
+            try:
+                return _rebuild(target_context, _checked(data))
+            except Exception as error:  # of what is damaged, unpickling makes anything
+                log.warning("compiled kernel %s is damaged (%s: %s): compiling it", name, type(error).__name__, error)
+        return None
+
+    def save_overload(self, sig: Any, cres: Any) -> None:
+        """Keep a compiled form; that it cannot be written costs time at the next start, and is told there."""
+        if cres.entry_point is None or cres.library.has_dynamic_globals or any(not x.can_cache for x in cres.lifted):
+            return
+        self._record(sig, KernelCompiler.seconds)
+        folder, name = cache_folder(), self.file_name(sig, cres.codegen)
+        if name is None or folder.path is None:
+            return
+        path = folder.path / self._folder() / name
+        try:
+            path.parent.mkdir(exist_ok=True, mode=0o700)
+            write_atomically(path, pack(_reduce(cres)))
+        except OSError as error:
+            folder.failed(path, error)
+
+    def is_there(self, sig: Any, codegen: Any) -> bool:
+        """Whether the compiled form for `sig` need not be compiled."""
+        name = self.file_name(sig, codegen)
+        if name is None:
+            return True  # it would not be kept
+        folder = cache_folder().path
+        return shipped.has(name) or (folder is not None and (folder / self._folder() / name).is_file())
+
+    def file_name(self, sig: Any, codegen: Any) -> str | None:
+        """Name of the file for `sig`; None for types that have no name of their own, of which none is kept."""
+        arguments = describe(sigutils.normalize_signature(sig)[0])
+        if arguments is None:
+            return None
+        cells = self.function.__closure__ or ()
+        facts = (
+            *(self.kind, self.function.__module__, self.function.__qualname__, arguments, self._closure),
+            hashlib.sha256(self.function.__code__.co_code).hexdigest(),
+            hashlib.sha256(dumps(tuple(cell.cell_contents for cell in cells))).hexdigest() if cells else "",
+            *(*codegen.magic_tuple(), numba.__version__, llvmlite.__version__, sys.implementation.cache_tag),
+        )
+        digest = hashlib.sha256("\0".join(map(str, facts)).encode()).hexdigest()
+        return f"{self.function.__qualname__.replace('<locals>.', '')}-{digest[:24]}{ENDING}"
+
+    def _record(self, sig: Any, seconds: float) -> None:
+        """For ``tools/kernels.py``: append what is called, and how long it took to compile, to a file."""
+        if path := os.environ.get("DRGS_RECORD_KERNELS"):
+            arguments = describe(sigutils.normalize_signature(sig)[0])
+            row = [self.function.__module__, self.function.__qualname__, arguments, round(seconds, 2)]
+            with open(path, "a", encoding="utf-8") as file:
+                file.write(json.dumps(row) + "\n")
+
+    def _found(self, name: str) -> Iterator[bytes]:
+        if (data := shipped.read(name)) is not None:
+            yield data
+        folder = cache_folder().path
+        if folder is not None:
+            path = folder / self._folder() / name
+            try:
+                data = path.read_bytes()
+                with contextlib.suppress(OSError):
+                    os.utime(path.parent)
+            except FileNotFoundError:
+                return
+            except OSError as error:
+                log.info("%s: %s", path, error)
+                return
+            yield data
+
+    @functools.cached_property
+    def _closure(self) -> str:
+        return closure.digest(Path(inspect.getfile(self.function)).resolve())
+
+    def _folder(self) -> str:
+        return f"{self.function.__module__.rpartition('.')[2]}-{self._closure}"
+
+
+def pack(content: bytes) -> bytes:
+    """The bytes of a file."""
+    return _MAGIC + hashlib.sha256(content).digest() + content
+
+
+def _checked(data: bytes) -> bytes:
+    """The content of a file.
+
+    Raises
+    ------
+    DamagedError
+    """
+    start = len(_MAGIC) + _DIGEST
+    content = data[start:]
+    if data[: len(_MAGIC)] != _MAGIC or hashlib.sha256(content).digest() != data[len(_MAGIC) : start]:
+        raise DamagedError("its digest is another")
+    return content
+
+
+def describe(arguments: tuple[Any, ...]) -> str | None:
+    """Argument types as text, the same in every process; None if one has an address for a name."""
+    text = ", ".join(map(_described, arguments))
+    return None if re.search(r"\bat 0x[0-9a-f]+", text) else text
+
+
+def _described(kind: Any) -> str:
+    if isinstance(kind, types.Dispatcher):
+        function = kind.dispatcher.py_func
+        return f"{function.__module__}:{function.__qualname__}"
+    if isinstance(kind, types.BaseTuple):  # type: ignore[attr-defined]
+        inner = ", ".join(map(_described, kind.types))
+        owner = getattr(kind, "instance_class", None)
+        return f"{owner.__module__}:{owner.__qualname__}({inner})" if owner else f"({inner})"
+    if isinstance(kind, types.Array):
+        return f"array({kind.dtype}, {kind.ndim}, {kind.layout}, {kind.mutable}, {kind.aligned})"
+    return str(kind)
+
+
+def _reduce(cres: Any) -> bytes:
+    """A compile result as bytes: as Numba's own, without the LLVM code, which is for callers in compiled code."""
+    library, descriptor = cres.library, cres.fndesc
+    descriptor.typemap = descriptor.calltypes = None  # not wanted any more, and some cannot be pickled
+    module = library._final_module
+    symbols = [value.name for values in (module.functions, module.global_variables) for value in values
+               if not value.is_declaration]  # fmt: skip
+    code = library.name, library._get_compiled_object(), symbols
+    environments = tuple(cres._find_referenced_environments())
+    return dumps((code, descriptor, cres.environment, cres.signature, cres.objectmode, cres.reload_init, environments))
+
+
+def _rebuild(target_context: Any, content: bytes) -> Any:
+    (name, machine_code, symbols), descriptor, environment, signature, objectmode, reload_init, environments = (
+        pickle.loads(content)
+    )
+    for function in reload_init:
+        function()
+    codegen = target_context.codegen()
+    library = LoadedLibrary(codegen, name)
+    library.enable_object_caching()
+    library._set_compiled_object(machine_code)
+    library._finalize_final_module()
+    codegen._engine._defined_symbols.update(symbols)
+    entry = target_context.get_executable(library, descriptor, environment)
+    for other in environments:
+        codegen.set_env(other.env_name, other)
+    fields = dict.fromkeys(CompileResult._fields) | {
+        "target_context": target_context, "typing_context": target_context.typing_context, "library": library,
+        "environment": environment, "entry_point": entry, "fndesc": descriptor, "type_annotation": "",
+        "signature": signature, "objectmode": objectmode, "lifted": (), "reload_init": reload_init,
+        "referenced_envs": environments,
+    }  # fmt: skip
+    return CompileResult(**fields)

@@ -1,0 +1,178 @@
+"""How Numba compiles kernels here: functions that only kernels call are compiled once, as a part of their kernels.
+
+Numba makes of each compiled function a library of its own, with machine code and a wrapper for Python, even of one
+that no Python code calls; and it optimises its code again in all that call it. Both are left out here for functions
+met while another one is compiled: they become LLVM code to be linked into their callers, which are optimised whole.
+That halves the time of compiling and leaves the arithmetic as it is.
+
+Only documented hooks are used to get in (``pipeline_class``), and subclasses; what they rely on is not promised by
+Numba, so the versions it was tried with are listed, and with others Numba compiles and keeps kernels in its own way.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import time
+import types as python_types
+from collections.abc import Iterator
+from typing import Any
+
+import numba
+from numba.core import codegen, compiler, errors, sigutils
+
+#: Versions of Numba for which this was tested.
+TESTED = ("0.61", "0.62", "0.63", "0.64", "0.65", "0.66", "0.67", "0.68")
+
+
+def is_tested() -> bool:
+    """Whether this version of Numba is one of `TESTED`."""
+    return ".".join(numba.__version__.split(".")[:2]) in TESTED
+
+
+class _State:
+    """Whether a kernel is being compiled. Numba's compiler lock guards it."""
+
+    compiling = False
+
+
+def is_nested() -> bool:
+    """Whether a kernel is being compiled right now, so that another function is compiled for its sake."""
+    return _State.compiling
+
+
+class EntryLibrary(codegen.JITCodeLibrary):
+    """Code that Python calls."""
+
+    def _optimize_functions(self, ll_module: Any) -> None:
+        ll_module.data_layout = self._codegen._data_layout
+        passes, builder = self._codegen._function_pass_manager()  # once: Numba makes them for each declaration, too
+        for function in ll_module.functions:
+            if not function.is_declaration:
+                passes.run(function, builder)
+
+
+class InnerLibrary(EntryLibrary):
+    """Code that is only linked into other libraries: not optimised by itself, never made machine code of."""
+
+    def _optimize_final_module(self) -> None:
+        pass
+
+    def _finalize_final_module(self) -> None:
+        self._finalize_dynamic_globals()
+        self._finalized = True
+
+    def get_pointer_to_function(self, name: str) -> int:
+        """None: nothing calls it but compiled code."""
+        self._ensure_finalized()
+        return 0
+
+
+class LoadedLibrary(EntryLibrary):
+    """Machine code that was compiled before; there is nothing to link into others."""
+
+
+class KernelCompiler(compiler.Compiler):
+    """Numba's compiler, which knows whether Python called what it compiles or another function did.
+
+    Attributes
+    ----------
+    seconds : float
+        Processor time of the last function that Python called.
+    """
+
+    seconds = 0.0
+
+    def __init__(self, typingctx: Any, targetctx: Any, library: Any, args: Any, return_type: Any, flags: Any,
+                 locals: Any) -> None:  # fmt: skip
+        kind = EntryLibrary
+        flags.no_cfunc_wrapper = True
+        if is_nested():
+            kind = InnerLibrary
+            flags.no_compile = flags.no_cpython_wrapper = True
+        super().__init__(typingctx, targetctx, library, args, return_type, flags, locals)
+        self._kind = kind
+
+    def compile_extra(self, func: Any) -> Any:
+        """Compile `func`; the garbage collector waits, which would visit all of the compiler's objects."""
+        if self.state.library is None:
+            library = self._kind(self.state.targetctx.codegen(), func.__qualname__)
+            library.enable_object_caching()
+            self.state.library = library
+        if is_nested():
+            return super().compile_extra(func)
+        collects, begun = gc.isenabled(), time.process_time()
+        gc.disable()
+        _State.compiling = True
+        try:
+            with _inner_libraries(self.state.targetctx.codegen()):
+                return super().compile_extra(func)
+        finally:
+            _State.compiling = False
+            KernelCompiler.seconds = time.process_time() - begun
+            if collects:
+                gc.enable()
+
+
+@contextlib.contextmanager
+def _inner_libraries(code_generator: Any) -> Iterator[None]:
+    """Whatever Numba compiles meanwhile is for the kernel alone: bodies of parallel loops, its own functions."""
+    set_env = code_generator.set_env
+
+    def set_existing(name: str, environment: Any) -> None:
+        if code_generator._engine.is_symbol_defined(name):
+            set_env(name, environment)
+
+    code_generator._library_class, code_generator.set_env = InnerLibrary, set_existing
+    try:
+        yield
+    finally:
+        del code_generator._library_class, code_generator.set_env
+
+
+def _compile(dispatcher: Any, sig: Any) -> Any:
+    """``Dispatcher.compile``: what was compiled for other kernels is compiled anew when Python calls it."""
+    arguments = tuple(sigutils.normalize_signature(sig)[0])
+    known = dispatcher.overloads.get(arguments)
+    if known is not None and not fits(known.library):
+        del dispatcher.overloads[arguments]
+        known = None
+    if not is_nested():
+        return type(dispatcher).compile(dispatcher, sig)
+    if known is None:  # the same without Numba's timers, of which each would hear of each call of LLVM in each other
+        known = _compile_inner(dispatcher, sig)
+    return known.entry_point
+
+
+def _compile_inner(dispatcher: Any, sig: Any) -> Any:
+    arguments, return_type = sigutils.normalize_signature(sig)
+    with dispatcher._compiling_counter:
+        try:
+            result = dispatcher._compiler.compile(arguments, return_type)
+        except errors.ForceLiteralArg as error:
+            raise error.bind_fold_arguments(
+                lambda args, kws: dispatcher._compiler.fold_argument_types(args, kws)[1]
+            ) from None
+    dispatcher.add_overload(result)
+    return dispatcher.overloads[tuple(result.signature.args)]
+
+
+def fits(library: Any) -> bool:
+    """Whether a library can be used now: to link it, its LLVM code must be there; to call it, its machine code."""
+    return not isinstance(library, LoadedLibrary if is_nested() else InnerLibrary)
+
+
+def _add_overload(dispatcher: Any, cres: Any) -> None:
+    """``Dispatcher.add_overload``: what has no machine code is known to the compiler, not to Python."""
+    if not isinstance(cres.library, InnerLibrary):
+        type(dispatcher).add_overload(dispatcher, cres)
+        return
+    cres = cres._replace(entry_point=object())  # the name under which callers find it
+    dispatcher.targetctx.insert_user_function(cres.entry_point, cres.fndesc, [cres.library])
+    dispatcher.overloads[tuple(cres.signature.args)] = cres
+
+
+def adopt(dispatcher: Any) -> None:
+    """Have a dispatcher made with `KernelCompiler` tell the two kinds of code apart."""
+    dispatcher.compile = python_types.MethodType(_compile, dispatcher)
+    dispatcher.add_overload = python_types.MethodType(_add_overload, dispatcher)

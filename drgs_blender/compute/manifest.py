@@ -1,0 +1,143 @@
+"""The kernels that each kind of job needs, so that they can be compiled before they are called.
+
+`kernels.json` beside this file is written by ``tools/kernels.py`` from what jobs really call. A kernel that it does
+not name is compiled when it is first called; one that it names and that is gone is passed over.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import json
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from numba import types
+
+PATH = Path(__file__).with_name("kernels.json")
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """A compiled form of a function.
+
+    Attributes
+    ----------
+    module, name : str
+        Where the function is.
+    arguments : str
+        Its argument types, as `kernel_cache.describe` writes them.
+    seconds : float
+        Time of compiling it, measured once; only the order among kernels counts.
+    """
+
+    module: str
+    name: str
+    arguments: str
+    seconds: float
+
+
+@functools.cache
+def jobs() -> dict[str, tuple[Kernel, ...]]:
+    """Job -> its kernels."""
+    data = json.loads(PATH.read_text(encoding="utf-8"))
+    kernels = [Kernel(*row) for row in data["kernels"]]
+    return {job: tuple(kernels[i] for i in rows) for job, rows in data["jobs"].items()}
+
+
+def needed(names: Iterable[str]) -> list[Kernel]:
+    """The kernels of some jobs, each once, those first that take longest; unknown jobs have none."""
+    table = jobs()
+    return sorted({kernel for name in names for kernel in table.get(name, ())}, key=lambda k: (-k.seconds, k.name))
+
+
+def dispatcher(kernel: Kernel) -> Any:
+    """The compiled function of a kernel.
+
+    Raises
+    ------
+    LookupError
+        When there is no such function any more.
+    """
+    return _lookup(kernel.module, kernel.name)
+
+
+def signature(kernel: Kernel) -> tuple[Any, ...]:
+    """Argument types of a kernel.
+
+    Raises
+    ------
+    LookupError
+        When there is no such type any more.
+    """
+    return _Reader(kernel.arguments).all()
+
+
+def _lookup(module: str, name: str) -> Any:
+    try:
+        found: Any = importlib.import_module(module)
+        for part in name.split("."):
+            found = getattr(found, part)
+    except (ImportError, AttributeError) as error:
+        raise LookupError(f"{module}:{name}: {error}") from error
+    return found
+
+
+class _Reader:
+    """Reads what `kernel_cache.describe` wrote."""
+
+    def __init__(self, text: str) -> None:
+        self.tokens = re.findall(r"[A-Za-z_][\w.]*(?::[\w.]+)?(?:\[\w+\])?|-?[\d.]+|[(),]", text)
+        self.at = 0
+        if "".join(self.tokens) != text.replace(" ", ""):
+            raise LookupError(f"cannot be read: {text}")
+
+    def all(self) -> tuple[Any, ...]:
+        found = []
+        while self.at < len(self.tokens):
+            found.append(self.one())
+            if self.at < len(self.tokens):
+                self.take(",")
+        return tuple(found)
+
+    def take(self, wanted: str = "") -> str:
+        if self.at == len(self.tokens) or (wanted and self.tokens[self.at] != wanted):
+            raise LookupError(f"{wanted or 'more'} expected in {''.join(self.tokens)}")
+        self.at += 1
+        return self.tokens[self.at - 1]
+
+    def group(self) -> list[Any]:
+        self.take("(")
+        found = []
+        while self.tokens[self.at] != ")":
+            found.append(self.one())
+            if self.tokens[self.at] == ",":
+                self.take()
+        self.take(")")
+        return found
+
+    def one(self) -> Any:
+        if self.tokens[self.at] == "(":
+            return types.BaseTuple.from_types(tuple(self.group()))
+        word = self.take()
+        if word == "array":
+            self.take("(")
+            dtype, _, dimensions, _, layout, _, mutable, _, aligned, _ = (self.take() for _ in range(10))
+            return types.Array(_scalar(dtype), int(dimensions), layout, mutable == "False", aligned=aligned == "True")
+        if ":" in word:
+            module, _, name = word.partition(":")
+            found = _lookup(module, name)
+            if self.at < len(self.tokens) and self.tokens[self.at] == "(":
+                return types.BaseTuple.from_types(tuple(self.group()), found)
+            return types.Dispatcher(found)
+        return _scalar(word)
+
+
+def _scalar(name: str) -> Any:
+    found = {"bool": types.boolean, "none": types.none}.get(name) or getattr(types, name, None)
+    if not isinstance(found, types.Type):
+        raise LookupError(f"type {name}")
+    return found

@@ -1,0 +1,37 @@
+"""A process that compiles the kernels it is told into the cache: a line of JSON each, answered by ``done``.
+
+It ends with its standard input, so with the process that started it.
+"""
+
+from __future__ import annotations
+
+import gc
+import json
+import logging
+import os
+import sys
+
+from . import jit, manifest  # noqa: F401  (jit sets Numba up)
+from .manifest import Kernel
+
+log = logging.getLogger(__name__)
+
+
+def main() -> None:
+    """Compile until the input ends."""
+    answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)  # what anything else prints is no answer
+    gc.disable()  # nothing of the compiler's lasts long enough to be worth the search
+    for line in sys.stdin:
+        module, name, arguments = json.loads(line)
+        kernel = Kernel(module, name, arguments, 0.0)
+        try:
+            manifest.dispatcher(kernel).compile(manifest.signature(kernel))
+        except Exception as error:  # of a list that does not fit any more; the first call says what is wrong
+            log.warning("kernel %s is not compiled ahead: %s: %s", name, type(error).__name__, error)
+        answers.write("done\n")
+        answers.flush()
+
+
+if __name__ == "__main__":
+    main()

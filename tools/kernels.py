@@ -1,0 +1,199 @@
+"""Write `drgs_blender/compute/kernels.json`: the kernels that each kind of job calls, found by doing the jobs.
+
+    .venv/bin/python tools/kernels.py
+
+To be run after a kernel that Python calls has got other arguments; a test says so. Takes some minutes: everything is
+compiled anew, in an empty cache, by one process at a time, to measure how long each kernel takes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+EXAMPLES = ROOT / "examples"
+MANIFEST = ROOT / "drgs_blender" / "compute" / "kernels.json"
+
+
+def commands(folder: Path) -> Iterator[tuple[str, list[object]]]:
+    """(job, command) of everything that is done; the same job may have several commands."""
+    drgs = [sys.executable, "-m", "drgs_blender.cli.main"]
+    asset, light = folder / "spot.drgs", EXAMPLES / "front.json"
+    own = [sys.executable, Path(__file__).resolve(), "--do"]
+    yield "make", [*own, "environment", folder]
+    yield "make", [*drgs, "make", EXAMPLES / "spot/spot_triangulated.obj", "--out", asset]
+    yield "make", [*drgs, "make", EXAMPLES / "robot/RobotExpressive.glb", "--out", folder / "robot.drgs"]
+    yield "import", [*drgs, "import", EXAMPLES / "playbot/playbot.ply", "--up=-y", "--out", folder / "playbot.drgs"]
+    relight = [*drgs, "relight", asset, "--camera", folder / "camera.json", "--env", folder / "light.exr",
+               "--rays", "4", "--out", folder / "frame.exr"]  # fmt: skip
+    assert light.is_file()
+    yield "frame", relight
+    yield "frame", [*own, "frame", folder]
+    yield "mesh", [*relight, "--primary", "mesh"]
+    yield "lights", [*own, "lights", folder]
+    yield "denoise", [*relight, "--denoise", "svgf"]
+    yield "denoise", [*own, "denoise", folder]
+    yield "motion", [*own, "motion", folder]
+    yield "viewport", [*own, "viewport", folder]
+    yield "surfel rays", [*relight, "--tracer", "surfels"]
+    for solver in ("mpm", "xpbd", "rigid"):
+        yield "simulate", [*drgs, "simulate", asset, "--solver", solver, "--resolution", "12", "--frames", "3",
+                           "--floor", "-1", "--out", folder / f"bake-{solver}"]  # fmt: skip
+    yield "simulate", [*relight[:-2], "--cache", folder / "bake-mpm", "--frames", "2", "--out", folder / "baked.exr"]
+    for variant in ("p", "m"):
+        yield "reconstruct", [*own, f"reconstruct-{variant}", folder]
+
+
+def make_environment(folder: Path) -> None:
+    """A small sky with a sun, and the camera file."""
+    import numpy as np
+
+    from drgs_blender.formats.exr import write_exr_picture
+
+    sky = np.full((32, 64, 3), 0.5, np.float32)
+    sky[6, 20] = 200.0
+    write_exr_picture(folder / "light.exr", sky)
+    camera = {"matrix_world": [[1, 0, 0, 0], [0, 0, -1, -3], [0, 1, 0, 0], [0, 0, 0, 1]], "width": 48, "height": 48}
+    (folder / "camera.json").write_text(json.dumps(camera | {"fov_x": 40}))
+
+
+def engine(folder: Path, what: str) -> None:
+    """Frames as Blender sends them: to an engine process, arrays in shared memory."""
+    from dataclasses import replace
+
+    import numpy as np
+
+    from drgs_blender.asset.container import read_asset
+    from drgs_blender.engine.client import EngineClient, locate_engine
+    from drgs_blender.frame import (
+        Camera,
+        Frame,
+        Light,
+        MeshState,
+        Moment,
+        ObjectState,
+        Pose,
+        RenderSettings,
+        World,
+    )  # fmt: skip
+
+    matrix = np.array([[1, 0, 0, 0], [0, 0, -1, -3], [0, 1, 0, 0], [0, 0, 0, 1]], float)
+    camera = Camera(matrix, 48, 48, 60.0, 60.0, 24.0, 24.0)
+    mesh = read_asset(folder / "spot.drgs").mesh
+    world = World(np.full((32, 64, 3), 0.5, np.float32))
+    settings = RenderSettings(cosine=2, ggx=1, environment=1, aa=1)
+    with EngineClient(locate_engine()) as client:
+        key = client.load_asset(str(folder / "spot.drgs"))
+        body = ObjectState("cow", key, vertices=np.array(mesh.vertices, np.float32))
+        frame = Frame(1, camera, [body], world, settings)
+        if what == "frame":
+            client.render(frame)
+            client.render(replace(frame, objects=[ObjectState("cow", key)], settings=replace(settings, aa=4)))
+        elif what == "lights":
+            place = np.eye(4)
+            place[:3, 3] = 0, -1, 2
+            lights = [Light(kind, kind, place) for kind in ("point", "sun", "spot", "area")]  # type: ignore[arg-type]
+            floor = MeshState(
+                "floor", np.array([[-2, -2, -1], [2, -2, -1], [2, 2, -1], [-2, 2, -1]], np.float32),
+                np.array([[0, 1, 2], [0, 2, 3]], np.int32), np.eye(4)[None], np.zeros(1, np.int32),
+            )  # fmt: skip
+            client.render(replace(frame, lights=lights, meshes=[floor]))
+            client.render(replace(frame, lights=lights, meshes=[floor], settings=replace(settings, primary="mesh")))
+        elif what == "denoise":
+            frame = replace(frame, settings=replace(settings, denoise="svgf"), history="shot")
+            client.render(frame)
+            client.render(replace(frame, number=2))
+        elif what == "motion":
+            moment = Moment(camera, [Pose("cow", matrix[None].copy(), body.vertices)])
+            client.render(replace(frame, previous=moment, next=moment, passes=("Combined", "Vector")))
+        elif what == "viewport":
+            for denoise in ("none", "svgf"):
+                seen = replace(frame, settings=replace(settings, denoise=denoise))  # type: ignore[arg-type]
+                client.view("view", seen)
+                client.view("view", seen, go_on=True)
+
+
+def reconstruct(variant: str) -> None:
+    """The trial run that every reconstruction with a time budget begins with."""
+    from drgs_blender.reconstruct.job import Settings
+    from drgs_blender.reconstruct.processor import HERE
+    from drgs_blender.reconstruct.rehearsal import rehearse
+
+    for masked in (True, False):
+        rehearse(Settings(variant=variant), masked, HERE, lambda: False)  # type: ignore[arg-type]
+
+
+def do(what: str, folder: Path) -> None:
+    """One of the commands of `commands` that no command of ``drgs`` does."""
+    if what == "environment":
+        make_environment(folder)
+    elif what.startswith("reconstruct-"):
+        reconstruct(what[-1])
+    else:
+        engine(folder, what)
+
+
+def record(folder: Path, only: set[str]) -> dict[str, dict[tuple[str, str, str], float]]:
+    """Do the jobs; job -> kernel -> seconds of compiling."""
+    found: dict[str, dict[tuple[str, str, str], float]] = {}
+    seconds: dict[tuple[str, str, str], float] = {}
+    failed: list[str] = []
+    for number, (job, command) in enumerate(commands(folder)):
+        if only and job not in only and "environment" not in command and "make" not in command:
+            continue
+        print(job, *(str(part).replace(str(folder), "") for part in command[1:]), flush=True)
+        path = folder / f"kernels-{number}.jsonl"
+        environment = os.environ | {
+            "DRGS_RECORD_KERNELS": str(path), "DRGS_CACHE_DIR": str(folder / "cache"), "DRGS_PREPARE": "0",
+            "DRGS_ENGINE": sys.executable,
+        }  # fmt: skip
+        code = subprocess.run(list(map(str, command)), timeout=1800, env=environment, cwd=ROOT).returncode
+        if code:
+            failed.append(job)
+        for line in path.read_text().splitlines() if path.exists() else ():
+            *kernel, took = json.loads(line)
+            key = tuple(kernel)
+            seconds[key] = max(seconds.get(key, 0.0), took)
+            if kernel[2] is None:
+                print(f"  not kept, its types have no name: {kernel[0]}:{kernel[1]}")
+            else:
+                found.setdefault(job, {})[key] = 0.0
+    if failed:
+        print(f"incomplete, these jobs failed: {', '.join(failed)}", file=sys.stderr)
+    return {job: {key: seconds[key] for key in keys} for job, keys in found.items()}
+
+
+def write(found: dict[str, dict[tuple[str, str, str], float]], path: Path) -> None:
+    """The manifest: kernels in alphabetical order, one line each, and for each job their numbers."""
+    kernels = sorted({key for keys in found.values() for key in keys})
+    seconds = {key: took for keys in found.values() for key, took in keys.items()}
+    rows = ",\n".join("  " + json.dumps([*key, seconds[key]]) for key in kernels)
+    jobs = ",\n".join(f"  {json.dumps(job)}: {sorted(map(kernels.index, keys))}" for job, keys in sorted(found.items()))
+    path.write_text(f'{{"kernels": [\n{rows}\n],\n"jobs": {{\n{jobs}\n}}}}\n', encoding="utf-8")
+
+
+def main() -> int:
+    """The command line; the return value is the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, default=MANIFEST)
+    parser.add_argument("--only", nargs="*", default=[], metavar="JOB", help="these jobs alone, to look at")
+    parser.add_argument("--do", nargs=2, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.do:
+        do(options.do[0], Path(options.do[1]))
+        return 0
+    with tempfile.TemporaryDirectory() as folder:
+        write(record(Path(folder), set(options.only)), options.out)
+    print(options.out)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
