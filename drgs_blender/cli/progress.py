@@ -104,14 +104,14 @@ class FractionBar:
 
 
 def prepare_engine(args: argparse.Namespace, *jobs: str) -> None:
-    """Have the kernels of `jobs` compiled, see `compute.prepare.prepare`; with a bar or lines, as `FractionBar`.
+    """Have the kernels of `jobs` compiled, see `compute.prepare.prepare_kernels`; with a bar or lines, as `FractionBar`.
 
     Raises
     ------
     Cancelled
         Ctrl+C came.
     """
-    from ..compute.prepare import prepare
+    from ..compute.prepare import prepare_kernels
 
     with FractionBar(args, "preparing", programs=True) as show, interruptible() as stopped:
-        prepare(jobs, show, stopped)
+        prepare_kernels(jobs, show, stopped)

@@ -102,7 +102,6 @@ def run(args: argparse.Namespace) -> int:
 
     from ..asset.container import read_asset
     from ..compute.jit import use_threads
-    from ..compute.prepare import prepare_kernels
     from ..simulate.bake import bake
     from ..simulate.job import prepare
 
@@ -130,7 +129,6 @@ def run(args: argparse.Namespace) -> int:
     cache = ParticleCache(args.out)
     count = settings.last - settings.first + 1
     with FractionBar(args, "simulating") as bar, interruptible() as stopped:
-        prepare_kernels(("simulate",), bar, stopped)
 
         def progress(frame: int, part: float) -> None:
             bar(f"frame {frame}", (frame - settings.first - 1 + part) / max(count - 1, 1))
