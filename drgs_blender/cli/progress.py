@@ -104,7 +104,7 @@ class FractionBar:
 
 
 def prepare_engine(args: argparse.Namespace, *jobs: str) -> None:
-    """Have the kernels of `jobs` compiled, see `compute.prepare.prepare_kernels`; with a bar or lines, as `FractionBar`.
+    """Have the kernels of `jobs` compiled, see `compute.prepare`, and show it by a bar or lines, as `FractionBar`.
 
     Raises
     ------
