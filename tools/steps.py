@@ -25,6 +25,8 @@ from typing import IO
 _LINES = 12
 #: Seconds between two looks at the clock, and before time left is estimated.
 _TICK, _EARLY = 0.5, 3.0
+#: Part of a step that is taken for done when it should be.
+_NEARLY = 0.9
 #: Seconds that a command has to end what it started.
 _GRACE = 5.0
 _COUNT = re.compile(r"(\d+) of (\d+)")
@@ -63,6 +65,7 @@ class Step:
     process: subprocess.Popen[bytes] | None = None
     said: str = ""
     part: float = 0.0
+    began: float = 0.0
     tail: deque[str] = field(default_factory=lambda: deque(maxlen=_LINES))
     thread: threading.Thread | None = None
     taken: str = ""  # digest of `of` at its start
@@ -178,7 +181,7 @@ class _Run:
             _stamp_file(step.makes).unlink(missing_ok=True)
         step.before()
         self._write(step, "$ " + " ".join(command))
-        step.said = step.text
+        step.said, step.began = step.text, time.monotonic()
         try:
             step.process = subprocess.Popen(
                 command,
@@ -239,13 +242,21 @@ class _Run:
 
     def _left(self) -> str:
         """The time that is left, at the pace so far; at first, that of the machine where `seconds` were measured."""
-        whole = sum(self._weights.values())
-        done = sum(self._weights[s.name] * (1.0 if s.name in self._done else min(s.part, 1.0)) for s in self._steps)
-        spent = time.monotonic() - self._began
+        now, whole = time.monotonic(), sum(self._weights.values())
+        done = sum(self._weights[step.name] * self._part(step, now) for step in self._steps)
+        spent = now - self._began
         if spent < _EARLY or not whole:
             return ""
         pace = max(spent / done, 0.2) if done > 0.1 * whole else 1.0
         return f"about {clock(pace * (whole - done))} left"
+
+    def _part(self, step: Step, now: float) -> float:
+        """The part of a step that is done, by what it counts or by the clock."""
+        if step.name in self._done:
+            return 1.0
+        if step.process is None:
+            return 0.0
+        return max(min(step.part, 1.0), min((now - step.began) / max(step.seconds, 0.1), _NEARLY))
 
     def _end(self) -> None:
         """End what still runs, with all that it started."""
