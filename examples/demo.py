@@ -25,8 +25,6 @@ import environments  # noqa: E402
 from steps import Step, StepFailed, run_steps  # noqa: E402
 
 EXAMPLES = ROOT / "examples"
-#: What the frames need compiled, and what the assets do, which then need not do it themselves.
-JOBS = ("frame", "denoise", "import")
 
 
 def steps(out: Path, frames: str) -> list[Step]:
@@ -56,12 +54,12 @@ def steps(out: Path, frames: str) -> list[Step]:
     of_scene = (*assets.values(), extension, EXAMPLES / "demo_scene.py", EXAMPLES / "robot")
     blenders = () if os.environ.get("DRGS_BLENDER") else (environments.FOR_BLENDER,)
     return [
-        environments.kernels(*JOBS, seconds=40.0),
+        # First those of an asset, which is then made, and the scene with it, while the others are compiled.
+        environments.kernels("kernels", "import", seconds=12.0),
+        environments.kernels("more kernels", "frame", "denoise", seconds=32.0, after="kernels"),
         asset("robot", EXAMPLES / "robot/RobotExpressive.glb", 2.0),
         asset("helmet", EXAMPLES / "helmet/FlightHelmet.gltf", 8.0),
-        asset(
-            "playbot", EXAMPLES / "playbot/playbot.ply", 10.0, "--up=-y", command="import", after=environments.KERNELS
-        ),
+        asset("playbot", EXAMPLES / "playbot/playbot.ply", 10.0, "--up=-y", command="import", after="kernels"),
         Step("extension", "Building the extension", building, 0.5, (environments.FOR_ENGINE,)),
         Step("scene", "Setting the scene", setting, 4.0, (*assets, "extension", *blenders), scene, of_scene),
         Step(
@@ -69,7 +67,7 @@ def steps(out: Path, frames: str) -> list[Step]:
             "Starting Blender",
             [*drgs, "render", scene, "--frames", frames, "--out", pattern, "--denoise", "svgf", "--overwrite"],
             4.0 + 1.3 * count,
-            ("scene", environments.KERNELS),
+            ("scene", "more kernels"),
             count=rendered,
             before=partial(shutil.rmtree, out / "frames", ignore_errors=True),
         ),

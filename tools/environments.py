@@ -12,7 +12,7 @@ ROOT = Path(__file__).resolve().parent.parent
 ENGINE = ROOT / ".venv"
 BLENDER = ROOT / ".venv-blender"
 #: Names of the steps.
-FOR_ENGINE, FOR_BLENDER, KERNELS = "engine", "blender", "kernels"
+FOR_ENGINE, FOR_BLENDER = "engine", "blender"
 
 
 def python_of(folder: Path) -> Path:
@@ -41,7 +41,7 @@ def environments(seconds: tuple[float, float] = (90.0, 30.0)) -> list[Step]:
     return found
 
 
-def kernels(*jobs: str, seconds: float) -> Step:
-    """What the engine compiles for `jobs`, as soon as its environment stands."""
+def kernels(name: str, *jobs: str, seconds: float, after: str = FOR_ENGINE) -> Step:
+    """What the engine compiles for `jobs`, as soon as its environment stands, or `after` another step."""
     command = [python_of(ENGINE), "-m", "drgs_blender.compute.prepare", *jobs]
-    return Step(KERNELS, "Looking for kernels", command, seconds, (FOR_ENGINE,), count=counted)
+    return Step(name, "Starting the engine", command, seconds, (after,), count=counted)
