@@ -46,7 +46,7 @@ def commands(folder: Path) -> Iterator[tuple[str, list[object]]]:
     for solver in ("mpm", "xpbd", "rigid"):
         yield "simulate", [*drgs, "simulate", asset, "--solver", solver, "--resolution", "12", "--frames", "3",
                            "--floor", "-1", "--out", folder / f"bake-{solver}"]  # fmt: skip
-    yield "simulate", [*relight[:-2], "--cache", folder / "bake-mpm", "--frames", "2", "--out", folder / "baked.exr"]
+    yield "frame", [*relight[:-2], "--cache", folder / "bake-mpm", "--frames", "2", "--out", folder / "baked.exr"]
     for variant in ("p", "m"):
         yield "reconstruct", [*own, f"reconstruct-{variant}", folder]
 
