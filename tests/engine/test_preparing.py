@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import sys
 import time
 
 import pytest
+from processes import all_gone, children
 
 from drgs_blender.errors import Cancelled
 from drgs_blender.phases import PREPARING, STARTING, is_counted, is_preparing
@@ -87,3 +89,20 @@ def test_counted_kernels_are_no_reason_to_kill_the_engine(make_client, make_fram
     assert time.monotonic() - began < 0.5
     client.render(make_frame())
     assert client.pid == pid
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
+def test_who_compiles_ends_with_a_killed_engine(make_client, make_frame, asset_path, tmp_path):
+    """In the middle of a kernel, which takes seconds; Blender may have been closed."""
+    before = f"import os; os.environ |= {{'DRGS_CACHE_DIR': {str(tmp_path)!r}, 'DRGS_PREPARE': '1'}}"
+    client = make_client(before)
+    client.load_asset(str(asset_path))
+    workers: list[int] = []
+
+    def tell(phase: str, part: float) -> None:
+        if is_counted(phase):
+            workers[:] = children(client.pid)
+
+    with pytest.raises(Cancelled):
+        client.render(make_frame(), tell, lambda: len(workers) > 0 and (client._child.kill() or True))
+    assert all_gone(workers, 5.0)
