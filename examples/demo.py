@@ -137,6 +137,10 @@ def main(arguments: Sequence[str] | None = None, before: Sequence[Step] = ()) ->
     parser.add_argument("--frames", default="1-24")
     parser.add_argument("--sheet", action="store_true", help="only the contact sheet, of the frames that are there")
     options = parser.parse_args(arguments)
+    try:
+        _count(options.frames)
+    except ValueError:
+        parser.error(f"--frames {options.frames} is no range like 1-24, 1-24x2 or 7")
     if options.sheet:
         publish(sorted((options.out / "frames").glob("*.exr")), options.out)
         return 0

@@ -25,8 +25,8 @@ from typing import IO
 _LINES = 12
 #: Seconds between two looks at the clock, and before time left is estimated.
 _TICK, _EARLY = 0.5, 3.0
-#: Part of a step that is taken for done when it should be.
-_NEARLY = 0.9
+#: Part of a step from which on what it counts tells its speed; part that is done, at most, of one that is late.
+_TELLING, _NEARLY = 0.15, 0.9
 #: Seconds that a command has to end what it started.
 _GRACE = 5.0
 _COUNT = re.compile(r"(\d+) of (\d+)")
@@ -66,6 +66,7 @@ class Step:
     said: str = ""
     part: float = 0.0
     began: float = 0.0
+    took: float = 0.0
     tail: deque[str] = field(default_factory=lambda: deque(maxlen=_LINES))
     thread: threading.Thread | None = None
     taken: str = ""  # digest of `of` at its start
@@ -140,7 +141,6 @@ class _Run:
         self._environment, self._kept, self._line = os.environ | environment, kept, line
         self._lock = threading.Lock()
         self._done: set[str] = set()
-        self._weights = {step.name: step.seconds for step in steps}
         self._changed = threading.Event()
         self._began = time.monotonic()
 
@@ -175,7 +175,6 @@ class _Run:
             step.taken = digest(step.of, command)
             if step.makes.is_file() and _stamp(step.makes) == step.taken:
                 self._write(step, f"{step.makes} is up to date")
-                self._weights[step.name] = 0.0
                 self._done.add(step.name)
                 return False
             _stamp_file(step.makes).unlink(missing_ok=True)
@@ -233,6 +232,7 @@ class _Run:
                 )
             if step.makes is not None:
                 _stamp_file(step.makes).write_text(json.dumps({"of": step.taken}), encoding="utf-8")
+            step.took = time.monotonic() - step.began
             self._done.add(step.name)
 
     def _show(self) -> None:
@@ -241,22 +241,36 @@ class _Run:
         self._line.show(text, self._left())
 
     def _left(self) -> str:
-        """The time that is left, at the pace so far; at first, that of the machine where `seconds` were measured."""
-        now, whole = time.monotonic(), sum(self._weights.values())
-        done = sum(self._weights[step.name] * self._part(step, now) for step in self._steps)
-        spent = now - self._began
-        if spent < _EARLY or not whole:
+        """The time until the last step, of those that wait for each other, is done."""
+        now = time.monotonic()
+        if now - self._began < _EARLY:
             return ""
-        pace = max(spent / done, 0.2) if done > 0.1 * whole else 1.0
-        return f"about {clock(pace * (whole - done))} left"
+        pace = self._pace()
+        known: dict[str, float] = {}
 
-    def _part(self, step: Step, now: float) -> float:
-        """The part of a step that is done, by what it counts or by the clock."""
+        def until_end(step: Step) -> float:
+            if step.name not in known:
+                later = (until_end(other) for other in self._steps if step.name in other.after)
+                known[step.name] = self._remains(step, pace, now) + max(later, default=0.0)
+            return known[step.name]
+
+        return f"about {clock(max(map(until_end, self._steps)))} left"
+
+    def _pace(self) -> float:
+        """How many times as long as they should steps have taken."""
+        ended = [step for step in self._steps if step.took and step.seconds >= 1.0]
+        return sum(step.took for step in ended) / sum(step.seconds for step in ended) if ended else 1.0
+
+    def _remains(self, step: Step, pace: float, now: float) -> float:
+        """Seconds that a step still takes, by what it counts or by the clock."""
         if step.name in self._done:
-            return 1.0
-        if step.process is None:
             return 0.0
-        return max(min(step.part, 1.0), min((now - step.began) / max(step.seconds, 0.1), _NEARLY))
+        if step.process is None:
+            return pace * step.seconds
+        spent = now - step.began
+        if step.part > _TELLING:
+            return spent * max(1.0 - step.part, 0.0) / step.part
+        return max(pace * step.seconds - spent, (1.0 - _NEARLY) * spent)
 
     def _end(self) -> None:
         """End what still runs, with all that it started."""

@@ -140,3 +140,14 @@ run_steps([Step("a", "a", [sys.executable, "-c", {sleeper!r}], 1.0)], Path("log"
 
 def test_time_left_is_said_roughly():
     assert [clock(seconds) for seconds in (1, 12, 44, 95, 300)] == ["5 s", "10 s", "45 s", "2 min", "5 min"]
+
+
+def test_time_left_is_that_of_the_longest_row_of_steps(run):
+    """Of steps side by side only the longer one counts, and what those before took tells the pace."""
+    nothing = "import time; time.sleep(4)"
+    steps = [Step(name, name, [sys.executable, "-c", nothing], 2.0) for name in ("a", "b")]
+    steps += [Step("c", "c", [sys.executable, "-c", nothing], 20.0, after=("a",))]
+    steps += [Step("d", "d", [sys.executable, "-c", ""], 20.0, after=("c",))]
+    said, _ = run(*steps)
+    left = re.search(r"2 of 4 done\. c; about (\d+) s left", said)
+    assert left and 70 <= int(left[1]) <= 85  # twice as slow as they should be
