@@ -93,8 +93,13 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
         return sub
 
     env = command("env", run_env, "make or refresh the environments (instant when nothing changed)")
+    env.add_argument("--engine", action="store_true", help="only the engine's environment")
     env.add_argument(
-        "--blender", metavar="VERSION", help=f"only Blender's environment of this version, e.g. {BLENDER_FLOOR}"
+        "--blender",
+        nargs="?",
+        const=BLENDER,
+        metavar="VERSION",
+        help=f"only Blender's environment, of this version, e.g. {BLENDER_FLOOR}; default {BLENDER}",
     )
     command("system", run_system, "print the system packages that Blender needs and that are missing (Linux)")
     names = ", ".join(SUITES)
@@ -132,6 +137,11 @@ def python_of(folder: Path) -> Path:
 
 def ensure_engine() -> Path:
     """Make ``.venv`` when needed and return its interpreter."""
+    return ensure(*about_engine(), "import drgs_blender")
+
+
+def about_engine() -> tuple[Path, dict[str, object], list[list[str]]]:
+    """Folder of the engine's environment, what is wanted in it, what pip installs."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     torch = shlex.split(os.environ.get("DRGS_TORCH", TORCH))
     wanted = {
@@ -140,13 +150,26 @@ def ensure_engine() -> Path:
         "optional": project["optional-dependencies"],
         "scripts": project["scripts"],
     }
-    return ensure(ROOT / ".venv", wanted, [torch, ["-e", f"{ROOT}[reconstruct,oidn,gpu,dev]"]], "import drgs_blender")
+    return ROOT / ".venv", wanted, [torch, ["-e", f"{ROOT}[reconstruct,oidn,gpu,dev]"]]
 
 
 def ensure_blender(version: str = BLENDER) -> Path:
     """Make the environment with Blender `version` as a module when needed and return its interpreter."""
+    return ensure(*about_blender(version), "import bpy", python311())
+
+
+def about_blender(version: str) -> tuple[Path, dict[str, object], list[list[str]]]:
+    """The same for Blender's."""
     packages = [f"bpy=={version}", "pytest>=8"]
-    return ensure(blender_folder(version), {"packages": packages}, [packages], "import bpy", python311())
+    return blender_folder(version), {"packages": packages}, [packages]
+
+
+def is_made(folder: Path, wanted: dict[str, object]) -> bool:
+    """Whether an environment is there, as it is wanted."""
+    stamp = folder / "drgs-stamp.json"
+    if not (python_of(folder).exists() and stamp.exists()):
+        return False
+    return stamp.read_text(encoding="utf-8") == json.dumps(wanted, indent=1, sort_keys=True)
 
 
 def ensure(
@@ -158,7 +181,7 @@ def ensure(
     """
     interpreter, stamp = python_of(folder), folder / "drgs-stamp.json"
     text = json.dumps(wanted, indent=1, sort_keys=True)
-    if interpreter.exists() and stamp.exists() and stamp.read_text(encoding="utf-8") == text:
+    if is_made(folder, wanted):
         return interpreter
     started = time.monotonic()
     print(f"Preparing {folder.name} ...", flush=True)
@@ -225,10 +248,26 @@ def import_trouble(folder: Path, message: str) -> str:
 
 def run_env(args: argparse.Namespace) -> int:
     """Make the environments that are missing or out of date."""
-    pythons = [ensure_blender(args.blender)] if args.blender else [ensure_engine(), ensure_blender()]
-    for python in pythons:
-        print(python)
+    if args.engine:
+        print(ensure_engine())
+    elif args.blender:
+        print(ensure_blender(args.blender))
+    else:
+        both()
+        print(python_of(ROOT / ".venv"), python_of(blender_folder(BLENDER)), sep="\n")
     return 0
+
+
+def both() -> None:
+    """Make both environments, at the same time; return at once where they are there."""
+    from environments import environments
+    from steps import StepFailed, run_steps
+
+    if not all(is_made(*about) for about in (about_engine()[:2], about_blender(BLENDER)[:2])):
+        try:
+            run_steps(environments(), ROOT / "build" / "environments.txt", ROOT, {})
+        except StepFailed as failure:
+            raise Failure(str(failure)) from failure
 
 
 def run_system(args: argparse.Namespace) -> int:
@@ -318,8 +357,12 @@ def no_window() -> str:
 
 
 def run_demo(args: argparse.Namespace) -> int:
-    """Render the demo with both environments."""
-    return with_both("examples/demo.py", args.rest)
+    """Render the demo, and make both environments meanwhile."""
+    sys.path.insert(0, str(ROOT / "examples"))
+    import demo
+    from environments import environments
+
+    return demo.main(args.rest, environments())
 
 
 def run_demo_simulation(args: argparse.Namespace) -> int:
@@ -339,9 +382,9 @@ def run_extension(args: argparse.Namespace) -> int:
 
 def with_both(program: str, rest: Sequence[str]) -> int:
     """Run a program of the project in the engine's environment, which is told where Blender's is."""
-    engine = ensure_engine()
-    os.environ.setdefault("DRGS_BLENDER", str(ensure_blender()))
-    return run([engine, ROOT / program, *rest])
+    both()
+    os.environ.setdefault("DRGS_BLENDER", str(python_of(blender_folder(BLENDER))))
+    return run([python_of(ROOT / ".venv"), ROOT / program, *rest])
 
 
 def run_clean(args: argparse.Namespace) -> int:
