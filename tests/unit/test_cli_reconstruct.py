@@ -23,6 +23,7 @@ from capture_cases import balls, write
 from drgs_blender.cli.interrupt import interruptible
 from drgs_blender.cli.main import main
 from drgs_blender.errors import Cancelled
+from drgs_blender.phases import PREPARING
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="signals and terminals of POSIX")
 
@@ -56,7 +57,8 @@ def test_a_terminal_shows_a_bar_and_no_lines_for_programs(photographs, tmp_path)
     os.close(ours)
     text = said.decode()
     assert process.wait(60) == 0 and "DRGS_PROGRESS" not in text
-    assert "compiling kernels:   0%|" in text and re.search(r"materials, \d+ surfels, [\d.]+ dB:", text)
+    assert re.search(re.escape(PREPARING) + r"(, \d+ of \d+)?: +\d+%\|", text)
+    assert re.search(r"materials, \d+ surfels, [\d.]+ dB:", text)
     assert "materials got" in text and "materials in the light that was found, pixels learned from: PSNR" in text
 
 

@@ -8,6 +8,8 @@ from collections.abc import Callable
 import pace
 import pytest
 
+import drgs_blender.compute.jit  # noqa: F401  # else Numba comes with a test's test, is forgotten after it and breaks
+
 pytest_plugins = ["pytester"]
 
 HEAD = """
