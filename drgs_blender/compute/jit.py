@@ -28,8 +28,7 @@ from numba.extending import overload as _overload
 
 if "NUMBA_CACHE_DIR" not in os.environ:  # where Numba keeps kernels itself, see `kernel_compiler.TESTED`
     numba.config.CACHE_DIR = str(wanted_folder() / "numba")
-if "NUMBA_CPU_NAME" not in os.environ:
-    targets.settle(numba.config)
+targets.settle(numba.config)
 
 from . import kernel_compiler
 from .kernel_cache import KernelCache
