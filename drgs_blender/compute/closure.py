@@ -86,7 +86,7 @@ def _parse(source: bytes, path: Path) -> tuple[str, list[str]]:
         elif isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef, ast.Module)):
             first = node.body[0] if node.body else None
             if isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant):
-                first.value.value = ...
+                node.body[:1] = [] if len(node.body) > 1 else [ast.Pass()]
     imported.discard(path)
     return hashlib.sha256(ast.dump(tree).encode()).hexdigest(), sorted(_name(file) for file in imported)
 
@@ -100,7 +100,8 @@ class _Index:
     @functools.cached_property
     def path(self) -> Path | None:
         folder = cache_folder().path
-        return folder and folder / f"sources-{sys.version_info[0]}.{sys.version_info[1]}.json"
+        version = hashlib.sha256(sys.version.encode() + Path(__file__).read_bytes()).hexdigest()[:_DIGITS]
+        return folder and folder / f"sources-{version}.json"
 
     @functools.cached_property
     def rows(self) -> dict[str, tuple[str, list[str]]]:

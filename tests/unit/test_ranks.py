@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from drgs_blender.compute import closure
+
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "drgs_blender"
 #: What the extension may use of the engine's package.
@@ -70,18 +72,18 @@ def test_lower_ranks_never_import_higher_ones():
     assert not wrong, "\n".join(wrong)
 
 
-def test_kernels_do_not_depend_on_the_folders_without_any():
+def test_kernels_do_not_depend_on_the_folders_above_them():
     """Their compiled forms are kept when those folders change."""
-    (line,) = [t for t in (PACKAGE / "compute" / "jit.py").read_text().splitlines() if t.startswith("WITHOUT_KERNELS")]
-    apart = set(re.findall(r'"(\w+)"', line))
-    assert apart
-    for path in sources(PACKAGE):
-        kernels = "njit" in path.read_text(encoding="utf-8")
-        if top_level(path) in apart:
-            assert not kernels, f"{path} has kernels"
-        elif kernels:
-            used = {module.split(".")[1] for _, module, _ in imports(path, ROOT) if module.startswith("drgs_blender.")}
-            assert not used & apart, f"{path} uses {used & apart}"
+    above = {name for name, rank in RANKS.items() if rank >= RANKS["engine"]} - {"reconstruct"}
+    kernels = [path for path in sources(PACKAGE) if re.search("^@njit", path.read_text(encoding="utf-8"), re.M)]
+    assert kernels
+    wrong = [
+        f"{path.relative_to(PACKAGE)} needs {other.relative_to(PACKAGE)}"
+        for path in kernels
+        for other in closure.closure(path)
+        if top_level(other) in above
+    ]
+    assert not wrong, "\n".join(wrong)
 
 
 def test_folders_of_the_renderer_use_those_on_their_left():

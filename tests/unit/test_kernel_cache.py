@@ -1,0 +1,280 @@
+"""Compiled kernels on disk: what is damaged, foreign or of another version is compiled anew; nothing stops work."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import disks
+import numba
+import numpy as np
+import pytest
+from numba.core import event
+
+from drgs_blender.compute import folders, kernel_cache, manifest
+from drgs_blender.compute.jit import njit, plain, prange
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def _inner(x):
+    return x * 2.0
+
+
+inner = njit(_inner)
+
+
+def _outer(x):
+    return inner(x) + 1.0
+
+
+def _sum(values):
+    total = 0.0
+    for i in prange(len(values)):
+        total += inner(values[i])
+    return total
+
+
+class Count(event.Listener):
+    """Compilations that Python asked for while it is registered."""
+
+    def __init__(self) -> None:
+        self.names: list[str] = []
+
+    def on_start(self, event):
+        self.names.append(event.data["dispatcher"].py_func.__name__)
+
+    def on_end(self, event):
+        pass
+
+
+@pytest.fixture
+def compiled():
+    """The names of functions that were compiled."""
+    count = Count()
+    event.register("numba:compile", count)
+    yield count.names
+    event.unregister("numba:compile", count)
+
+
+@pytest.fixture
+def use_folder(monkeypatch):
+    """Have this process keep kernels in another folder."""
+
+    def use(folder: Path) -> folders.CacheFolder:
+        monkeypatch.setenv("DRGS_CACHE_DIR", str(folder))
+        folders.cache_folder.cache_clear()
+        return folders.cache_folder()
+
+    yield use
+    folders.cache_folder.cache_clear()
+
+
+@pytest.fixture
+def folder(tmp_path, use_folder):
+    """An empty folder of kernels."""
+    return Path(use_folder(tmp_path / "kernels").path)
+
+
+def kernels(folder: Path) -> list[Path]:
+    return sorted(folder.rglob(f"*{kernel_cache.ENDING}"))
+
+
+def test_what_was_compiled_is_found_by_the_next_process(folder, compiled):
+    assert njit(_outer)(3.0) == 7.0
+    assert compiled == ["_outer"] and len(kernels(folder)) == 1
+    assert njit(_outer)(4.0) == 9.0
+    assert compiled == ["_outer"]
+
+
+def test_only_what_python_calls_is_kept(folder):
+    assert njit(_sum, parallel=True)(np.arange(5.0)) == 20.0
+    assert [path.name.partition("-")[0] for path in kernels(folder)] == ["_sum"]
+
+
+def test_functions_of_kernels_can_be_called_from_python_before_and_after(folder, compiled):
+    helper = njit(_inner)
+    namespace = {"helper": helper}
+    exec("def first(x): return helper(x) + 1.0\ndef second(x): return helper(x) - 1.0", namespace)
+    first, second = (njit(namespace[name], cache=False) for name in ("first", "second"))
+    assert first(2.0) == 5.0
+    assert helper(2.0) == 4.0  # compiled a second time, as code that Python calls
+    assert second(2.0) == 3.0
+    assert helper(3.0) == 6.0
+    assert compiled == ["first", "_inner", "second"]
+
+
+def test_functions_out_of_the_cache_can_be_parts_of_kernels(folder):
+    njit(_inner)(1.0)
+    helper = njit(_inner)
+    assert helper(2.0) == 4.0
+    namespace = {"helper": helper}
+    exec("def kernel(x): return helper(x) + 1.0", namespace)
+    assert njit(namespace["kernel"], cache=False)(2.0) == 5.0
+    assert helper(3.0) == 6.0
+
+
+DAMAGES = {
+    "empty": lambda data: b"",
+    "cut": lambda data: data[: len(data) // 2],
+    "longer": lambda data: data + b"\0",
+    "one bit": lambda data: data[:-100] + bytes([data[-100] ^ 1]) + data[-99:],
+    "no magic": lambda data: b"x" + data[1:],
+    "other bytes": lambda data: os.urandom(len(data)),
+    "a pickle": lambda data: kernel_cache.pack(b"cos\nsystem\n(S'touch owned'\ntR."),
+    "a pickle of its own": lambda data: b"cos\nsystem\n(S'touch owned'\ntR.",
+}
+
+
+@pytest.mark.parametrize("damage", sorted(set(DAMAGES) - {"a pickle"}))
+def test_damaged_files_are_compiled_anew_and_mended(folder, compiled, damage, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    njit(_outer)(3.0)
+    (path,) = kernels(folder)
+    whole = path.read_bytes()
+    path.write_bytes(DAMAGES[damage](whole))
+    assert njit(_outer)(3.0) == 7.0
+    assert compiled == ["_outer", "_outer"]
+    assert not (tmp_path / "owned").exists()
+    assert njit(_outer)(3.0) == 7.0
+    assert compiled == ["_outer", "_outer"]  # the file is whole again
+
+
+def test_kernels_of_another_numba_are_left_alone(folder, compiled, monkeypatch):
+    njit(_outer)(3.0)
+    monkeypatch.setattr(numba, "__version__", "0.99.0")
+    assert njit(_outer)(3.0) == 7.0
+    assert compiled == ["_outer", "_outer"] and len(kernels(folder)) == 2
+    monkeypatch.undo()
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid"), reason="owners are a thing of POSIX")
+@pytest.mark.parametrize("foreign", ["others may write", "another user"])
+def test_a_folder_of_others_is_not_trusted(tmp_path, use_folder, compiled, foreign):
+    mine = use_folder(tmp_path / "kernels").path
+    njit(_outer)(3.0)
+    if foreign == "another user":
+        if os.geteuid() != 0:
+            pytest.skip("only root can give a folder away")
+        os.chown(mine, 12345, 12345)
+    else:
+        mine.chmod(0o777)
+    again = use_folder(mine)
+    assert again.path != mine and str(mine) in again.trouble
+    assert njit(_outer)(3.0) == 7.0
+    assert compiled == ["_outer", "_outer"]
+
+
+def test_without_a_folder_kernels_are_kept_as_long_as_the_process_lives(tmp_path, use_folder, compiled):
+    (tmp_path / "file").write_text("")
+    folder = use_folder(tmp_path / "file" / "kernels")
+    assert str(tmp_path / "file") in folder.trouble and folder.path.is_dir()
+    assert njit(_outer)(3.0) == 7.0 and njit(_outer)(3.0) == 7.0
+    assert compiled == ["_outer"]
+
+
+def test_a_full_disk_is_named_and_the_kernel_runs(tmp_path, use_folder, compiled):
+    disk = tmp_path / "disk"
+    if not disks.mount(disk, "size=64k"):
+        pytest.skip("no disk can be mounted: not root, or not Linux")
+    try:
+        folder = use_folder(disk / "kernels")
+        assert not folder.trouble
+        (disk / "ballast").write_bytes(b"\0" * (48 << 10))
+        assert njit(_sum, parallel=True)(np.arange(5.0)) == 20.0
+        assert "space" in folder.trouble and str(disk) in folder.trouble
+        assert not list(disk.rglob("*.tmp")) and not kernels(disk)
+        assert njit(_sum, parallel=True)(np.arange(6.0)) == 30.0
+        assert compiled == ["_sum", "_sum"]
+    finally:
+        disks.unmount(disk)
+
+
+@pytest.mark.parametrize("years", [-30, 30])
+def test_a_clock_that_jumped_harms_nothing(folder, compiled, use_folder, years):
+    njit(_outer)(3.0)
+    then = time.time() + years * 365 * 24 * 3600
+    for path in (*kernels(folder), *folder.iterdir(), folder):
+        os.utime(path, (then, then))
+    use_folder(folder)
+    assert njit(_outer)(3.0) == 7.0
+    assert compiled == ["_outer"] * (2 if years < 0 else 1)  # what seems unused for years is removed
+
+
+def test_what_is_used_is_not_removed(folder, compiled, use_folder):
+    njit(_outer)(3.0)
+    long_ago = time.time() - 29 * 24 * 3600
+    os.utime(kernels(folder)[0].parent, (long_ago, long_ago))
+    njit(_outer)(3.0)  # marks it
+    assert time.time() - kernels(folder)[0].parent.stat().st_mtime < 3600
+
+
+_PROGRAM = """
+import numpy as np
+from drgs_blender.geometry import VertexNormals
+print(VertexNormals(np.array([[0, 1, 2]], np.int32), 3)(np.eye(3, dtype=np.float32)).tolist())
+"""
+
+
+def start(cache: Path) -> subprocess.Popen:
+    environment = os.environ | {"DRGS_CACHE_DIR": str(cache), "PYTHONPATH": str(ROOT)}
+    return subprocess.Popen([sys.executable, "-c", _PROGRAM], env=environment, stdout=subprocess.PIPE, text=True)
+
+
+@pytest.mark.slow
+def test_two_processes_may_compile_at_once(tmp_path):
+    answers = [process.communicate(timeout=300)[0] for process in [start(tmp_path), start(tmp_path)]]
+    assert answers[0] == answers[1] != ""
+    kept = kernels(tmp_path)
+    assert len(kept) == 3 and not list(tmp_path.rglob("*.tmp"))
+    assert start(tmp_path).communicate(timeout=300)[0] == answers[0]
+    assert kernels(tmp_path) == kept
+
+
+@pytest.mark.slow
+def test_what_was_killed_goes_on_where_it_was(tmp_path):
+    environment = os.environ | {"DRGS_CACHE_DIR": str(tmp_path), "DRGS_PREPARE": "1"}
+    command = [sys.executable, "-m", "drgs_blender.compute.prepare", "import"]
+    first = subprocess.Popen(command, env=environment, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 300
+    while not kernels(tmp_path) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    first.kill()
+    first.wait()
+    known = manifest.needed(["import"])
+    kept = kernels(tmp_path)
+    assert 0 < len(kept) < len(known)
+    before = {path: path.stat().st_mtime_ns for path in kept}
+    time.sleep(0.5)  # its workers end with it
+    said = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True, timeout=300, check=True)
+    assert said.stdout.splitlines()[-1] == "The engine is ready"
+    assert len(kernels(tmp_path)) == len(known)
+    assert all(path.stat().st_mtime_ns == stamp for path, stamp in before.items())
+    again = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True, timeout=300, check=True)
+    assert again.stdout.splitlines() == ["The engine is ready"]
+
+
+def test_every_kernel_of_the_list_exists_and_its_types_can_be_read():
+    for kernel in manifest.needed(manifest.jobs()):
+        assert manifest.dispatcher(kernel).py_func.__qualname__ == kernel.name
+        assert kernel_cache.describe(manifest.signature(kernel)) == kernel.arguments
+
+
+@pytest.mark.parametrize(
+    "text", ["array(float32, 2", "nonsense", "drgs_blender.nothing:Tracer(int64)", "(int64", "int64 int64"]
+)
+def test_a_list_that_does_not_fit_is_passed_over(text):
+    with pytest.raises(LookupError):
+        manifest.signature(manifest.Kernel("drgs_blender.geometry", "_sum", text, 0.0))
+
+
+def test_arrays_that_are_read_only_share_a_kernel_with_others(folder, compiled):
+    values = np.arange(4.0)
+    values.flags.writeable = False
+    assert np.shares_memory(plain(values), values) and plain(values).tolist() == values.tolist()
+    kernel = njit(_sum, parallel=True)
+    assert kernel(plain(values)) == kernel(np.arange(4.0)) == 12.0
+    assert compiled == ["_sum"]
