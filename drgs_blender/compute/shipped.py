@@ -12,12 +12,11 @@ import logging
 import sys
 import zipfile
 import zlib
-from pathlib import Path
 
-from . import targets
+from . import closure, targets
 
 log = logging.getLogger(__name__)
-FOLDER = Path(__file__).with_name("kernels")
+FOLDER = closure.SHIPPED
 #: What a damaged archive, or one of another program, raises.
 _DAMAGE = (OSError, ValueError, EOFError, NotImplementedError, RuntimeError, zipfile.BadZipFile, zlib.error)
 

@@ -66,6 +66,11 @@ def machine_name() -> str:
     return _MACHINES.get(own, own)
 
 
+def here() -> list[Target]:
+    """The targets of this machine's architecture and system, whether or not its processor has them."""
+    return _of(machine_name(), platform.system())
+
+
 def usable(machine: str, system: str, has: Mapping[str, bool]) -> list[Target]:
     """The targets that a processor can run, the best first.
 
