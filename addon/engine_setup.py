@@ -86,6 +86,16 @@ def digest(source: Path = SOURCE) -> str:
     return found.hexdigest()
 
 
+@functools.cache
+def pinned(source: Path = SOURCE) -> tuple[str, ...]:
+    """The very versions of Numba and LLVM for which the release brings compiled kernels, as pip knows them."""
+    try:
+        versions = json.loads((source / PACKAGE / "compute" / "kernels" / "versions.json").read_text(encoding="utf-8"))
+        return tuple(f"{name}=={versions[name]}" for name in ("numba", "llvmlite"))
+    except (OSError, ValueError, KeyError, TypeError):
+        return ()
+
+
 def interpreter(folder: Path) -> Path:
     """Where the Python of the environment `folder` is, or will be."""
     return folder / ("Scripts/python.exe" if _WINDOWS else "bin/python")
@@ -133,7 +143,7 @@ def _read_stamp(folder: Path) -> dict[str, object]:
 
 @dataclass(slots=True)
 class Step:
-    """One command, and what is done when it has succeeded."""
+    """One command, and what is done when it has succeeded; the engine works without what is not `needed`."""
 
     text: str
     command: list[str]
@@ -141,6 +151,7 @@ class Step:
     then: Callable[[], None] = lambda: None
     download: float = 0.0  # bytes that it fetches, about
     before: Callable[[], None] = lambda: None
+    needed: bool = True
 
 
 class EngineSetup:
@@ -212,11 +223,12 @@ class EngineSetup:
             return False
         step = self._steps.pop(0)
         self._close()
-        if code:
+        if code and step.needed:
             self._fail(f"{step.text} failed: {self._reason(code)[:300]}")
             return True
         try:
-            step.then()
+            if not code:
+                step.then()
         except OSError as error:
             self._fail(f"{step.text} failed: {error}")
             return True
@@ -264,6 +276,11 @@ class EngineSetup:
                 Step("Preparing pip", [*pip, "pip>=24.1"], 0.05),
                 fetch("Installing packages", ENGINE),
             ]
+        if (pins := list(pinned(self.source))) and (afresh or _read_stamp(self.folder).get("pinned") != pins):
+            # First, so that the packages find them there; what pip cannot get leaves kernels to be compiled.
+            exact = [*pip, "--only-binary=:all:", "--progress-bar=raw", *pins]
+            keep = lambda: self._stamp(pinned=pins)  # noqa: E731
+            steps.insert(max(len(steps) - 1, 0), Step("Installing Numba", exact, 0.1, keep, needed=False))
         doctor = [str(own), *_FLAGS, "-m", f"{PACKAGE}.cli.main", "doctor"]
         ready = lambda: self._stamp(sources=digest(self.source))  # noqa: E731
         steps.append(Step("Trying the engine", doctor, 0.1, ready, before=self._copy))

@@ -8,6 +8,7 @@ them.
 from __future__ import annotations
 
 import functools
+import json
 import logging
 import sys
 import zipfile
@@ -41,6 +42,18 @@ def read(name: str) -> bytes | None:
     except _DAMAGE as error:
         log.warning("%s: %s is damaged (%s): compiling it", archive.filename, name, error)
         return None
+
+
+def versions() -> dict[str, str]:
+    """Package -> version for which the release's kernels were made; nothing where it brings none."""
+    try:
+        facts = json.loads((FOLDER / "versions.json").read_text(encoding="utf-8"))
+        return {name: str(facts[name]) for name in ("numba", "llvmlite")}
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        log.warning("%s: versions.json is damaged (%s)", FOLDER, error)
+        return {}
 
 
 @functools.cache
