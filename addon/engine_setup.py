@@ -25,6 +25,7 @@ from typing import IO, NamedTuple
 from ..drgs_blender.engine.child import clean_environment
 from ..drgs_blender.engine.locate import VARIABLE
 from ..drgs_blender.errors import DeviceError
+from ..drgs_blender.phases import PREPARING
 
 log = logging.getLogger("drgs")
 
@@ -55,6 +56,9 @@ RECONSTRUCT = Group("reconstruct", 200e6, 900e6)
 GPU = Group("gpu", 150e6, 400e6)
 CUDA_BYTES = 3e9
 
+#: What is said of kernels that are not there.
+_LATER = "What is missing is compiled when it is first used"
+
 _STAMP = "drgs-engine.json"
 #: Apart from the user's own Python settings; lines arrive as they are written, in UTF-8.
 _FLAGS = ("-I", "-u", "-X", "utf8")
@@ -64,6 +68,8 @@ _FETCHED = 0.75
 _REASON = re.compile(r"error|^missing|not created|no module", re.IGNORECASE)
 #: Words of pip where an index does not answer; what it says last is that there is no such package.
 _UNREACHED = re.compile(r"^Could not fetch URL (\S+?):? .*?\((?:Caused by )?(\w+)|after connection broken by '(\w+)")
+#: How many kernels are compiled, of how many.
+_COUNT = re.compile(re.escape(PREPARING) + r", (\d+) of (\d+)")
 #: Name and size of a package that pip begins with.
 _PACKAGE = re.compile(r"(?:Downloading|Using cached|Processing) (?:\S*/)?([A-Za-z0-9_.]+?)-\d\S*( \([\d.]+ \wB\))?")
 _WINDOWS = os.name == "nt"
@@ -173,6 +179,7 @@ class EngineSetup:
     fetched : bytes of packages that came so far, of the step under way
     log_file : beside the folder; what the commands wrote
     error : why it ended, or None
+    remark : what the engine, which is ready, does without, and why; or ""
     done : whether nothing more will happen
     """
 
@@ -189,6 +196,7 @@ class EngineSetup:
         self.log_file = folder.with_name(f"{folder.name}-setup.log")
         self.text, self.fraction, self.fetched = "Starting", 0.0, 0.0
         self.error: DeviceError | None = None
+        self.remark = ""
         self.done = False
         self._share = 0.0  # of the whole, of the step under way
         self._began = 0.0
@@ -209,8 +217,7 @@ class EngineSetup:
         except OSError as error:
             raise DeviceError(str(folder), f"cannot be made ({error})", "Check its permissions") from error
         self._steps = self._plan(python, afresh, missing, index)
-        self.fraction = 0.0 if missing else 0.9  # a trial alone is the end of a set-up
-        self._whole = sum(s.weight for s in self._steps) / (1 - self.fraction)
+        self._whole = sum(s.weight for s in self._steps)
         self._next()
 
     def poll(self) -> bool:
@@ -223,18 +230,26 @@ class EngineSetup:
             return False
         step = self._steps.pop(0)
         self._close()
-        if code and step.needed:
-            self._fail(f"{step.text} failed: {self._reason(code)[:300]}")
-            return True
         try:
-            if not code:
-                step.then()
+            if code:
+                raise OSError(self._reason(code)[:300])
+            step.then()
         except OSError as error:
-            self._fail(f"{step.text} failed: {error}")
-            return True
+            if not self._forgiven(step, error):
+                return True
         self.fraction = self._began + self._share
         self._next()
         return self.done
+
+    def _forgiven(self, step: Step, error: OSError) -> bool:
+        """Whether the set-up goes on without what a step was for; else it has failed."""
+        problem = f"{step.text} failed: {error}"
+        if step.needed:
+            self._fail(problem)
+        else:
+            self.remark = f"{problem.rstrip('. ')}. {_LATER}. {self.log_file} has the details"
+            log.warning("%s", self.remark)
+        return not step.needed
 
     def _reason(self, code: int) -> str:
         """Why a command failed, in its own words, as far as they can be told from the others."""
@@ -254,10 +269,12 @@ class EngineSetup:
                 os.killpg(self._process.pid, signal.SIGKILL)
             self._process.wait()
         self._close()
+        if self._steps and self._steps[0].text == PREPARING:
+            self.remark = _LATER
         self.done, self.text = True, "Cancelled"
 
     def _plan(self, python: Path, afresh: bool, missing: list[Group], index: str) -> list[Step]:
-        """What is left to do. Extras come last: without them the engine renders."""
+        """What is left to do. Extras and their kernels come last: without them the engine renders."""
         own = interpreter(self.folder)
         pip = [str(own), *_FLAGS, "-m", "pip", "install", "--no-input", "--disable-pip-version-check"]
         pip += ["--extra-index-url", index] if index else []
@@ -276,7 +293,9 @@ class EngineSetup:
                 Step("Preparing pip", [*pip, "pip>=24.1"], 0.05),
                 fetch("Installing packages", ENGINE),
             ]
-        if (pins := list(pinned(self.source))) and (afresh or _read_stamp(self.folder).get("pinned") != pins):
+        if (pins := list(pinned(self.source))) and (
+            ENGINE in missing or _read_stamp(self.folder).get("pinned") != pins
+        ):
             # First, so that the packages find them there; what pip cannot get leaves kernels to be compiled.
             exact = [*pip, "--only-binary=:all:", "--progress-bar=raw", *pins]
             keep = lambda: self._stamp(pinned=pins)  # noqa: E731
@@ -286,7 +305,8 @@ class EngineSetup:
         steps.append(Step("Trying the engine", doctor, 0.1, ready, before=self._copy))
         names = {RECONSTRUCT: "PyTorch", GPU: "NVIDIA Warp"}
         steps += [fetch(f"Installing {names[group]}", group) for group in missing if group in names]
-        return steps
+        kernels = [str(own), *_FLAGS, "-m", f"{PACKAGE}.compute.prepare", "--all"]
+        return [*steps, Step(PREPARING, kernels, 0.3, needed=False)]
 
     def _next(self) -> None:
         """Start the next command, or end."""
@@ -314,7 +334,9 @@ class EngineSetup:
                     creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
                 )
         except OSError as error:
-            self._fail(f"{step.text} failed: {error}")
+            if self._forgiven(step, error):
+                self._steps.pop(0)
+                self._next()
 
     def _copy(self) -> None:
         """Put the engine's sources into the environment; the old ones go only when the new ones are there."""
@@ -354,7 +376,10 @@ class EngineSetup:
 
     def _follow(self, line: str) -> None:
         """What a line of pip says about how far it is."""
-        if package := _PACKAGE.match(line):
+        if count := _COUNT.match(line):
+            done = min(int(count[1]) / max(int(count[2]), 1), 1.0)
+            self.text, self.fraction = line, max(self.fraction, self._began + done * self._share)
+        elif package := _PACKAGE.match(line):
             self.fetched, self._package_bytes = self.fetched + self._package_bytes, 0.0
             self._package = package[1]
             self.text = f"Fetching {package[1]}{package[2] or ''}"

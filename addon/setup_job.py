@@ -39,11 +39,14 @@ def start(python: Path, afresh: bool = False, extras: Sequence[Group] = (), inde
 
 
 def cancel() -> None:
-    """End the set-up under way; what was fetched stays."""
+    """End the set-up under way; what was fetched stays, and an engine that works is used."""
     if running():
         job.cancel()
         _forget_timer()
-        messages.note("INFO", "Set-up of the engine cancelled; Set Up Engine goes on with it")
+        if job.remark:
+            _ready()
+        else:
+            messages.note("INFO", "Set-up of the engine cancelled; Set Up Engine goes on with it")
 
 
 def follow() -> float | None:
@@ -54,13 +57,20 @@ def follow() -> float | None:
         if job.error is not None:
             messages.note("ERROR", str(job.error))
         else:
-            preferences.write("engine_python", "")  # the new one shall be used
-            messages.note("INFO", f"The engine is set up in {job.folder}")
+            _ready()
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
             if area.type in ("VIEW_3D", "PREFERENCES"):
                 area.tag_redraw()
     return None if job.done else INTERVAL
+
+
+def _ready() -> None:
+    """The new engine shall be used."""
+    preferences.write("engine_python", "")
+    messages.note("INFO", f"The engine is set up in {job.folder}")
+    if job.remark:
+        messages.note("INFO", job.remark)
 
 
 def _forget_timer() -> None:

@@ -1,77 +1,156 @@
 """The main job, end to end: make and import assets, rig them in Blender, relight and render 24 frames.
 
+    python3.11 tools/dev.py demo [--out out/demo] [--frames 1-24]      # or make demo, which makes the environments too
     .venv/bin/python examples/demo.py [--out out/demo] [--frames 1-24]
 
-Writes the assets, the .blend, an EXR a frame, a contact sheet (PNG) and an animated picture (WebP).
+Writes the assets, the .blend, an EXR a frame, a contact sheet (PNG) and an animated picture (WebP). Steps that do not
+wait for each other run side by side; of a demo before, assets and scene are taken where nothing changed that they are
+made of. Frames are always rendered anew.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
-import subprocess
+import shutil
 import sys
-import time
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
-import numpy as np
-from PIL import Image
-
-from drgs_blender.colour import linear_to_srgb
-from drgs_blender.render.picture.frames import read_frame
-
 ROOT = Path(__file__).resolve().parent.parent
-BIN = "Scripts" if sys.platform == "win32" else "bin"
-EXE = ".exe" if sys.platform == "win32" else ""
+sys.path.insert(0, str(ROOT / "tools"))
+
+import environments  # noqa: E402
+from steps import Step, StepFailed, run_steps  # noqa: E402
+
+EXAMPLES = ROOT / "examples"
 
 
-def run(*command: object) -> None:
-    print("$", *command, flush=True)
-    subprocess.run([str(c) for c in command], check=True, timeout=900)
+def steps(out: Path, frames: str) -> list[Step]:
+    """All that follows the environments; seconds are those of two processors."""
+    engine, blender = environments.python_of(environments.ENGINE), environments.blender()
+    drgs = [engine, "-m", "drgs_blender.cli.main"]
+    package = ROOT / "drgs_blender"
+    assets = {name: out / f"{name}.drgs" for name in ("robot", "helmet", "playbot")}
+    extension, scene = out / "extension.zip", out / "demo.blend"
+    started = [environments.FOR_ENGINE]
+
+    def asset(name: str, source: Path, seconds: float, *options: str, command: str = "make", after: str = "") -> Step:
+        words = [*drgs, command, source, *options, "--out", assets[name]]
+        before = (*started, *([after] if after else []))
+        return Step(name, f"Making {name}.drgs", words, seconds, before, assets[name], (source.parent, package))
+
+    def rendered(line: str) -> tuple[str, float] | None:
+        nonlocal done
+        done += line.startswith("Saved: ")
+        return (f"Rendering, {done} of {count} frames", done / count) if line.startswith("Saved: ") else None
+
+    done, count = 0, _count(frames)
+    building = [environments.python_of(environments.ENGINE), ROOT / "tools/extension.py", "--out", extension]
+    pattern = out / "frames" / "####.exr"
+    # The last of a list of what Blender needs: the .blend remembers where the assets are.
+    setting = [blender, "-P", EXAMPLES / "demo_scene.py", extension, out, scene]
+    of_scene = (*assets.values(), extension, EXAMPLES / "demo_scene.py", EXAMPLES / "robot")
+    blenders = () if os.environ.get("DRGS_BLENDER") else (environments.FOR_BLENDER,)
+    return [
+        # First those of an asset, which is then made, and the scene with it, while the others are compiled.
+        environments.kernels("kernels", "import", seconds=12.0),
+        environments.kernels("more kernels", "frame", "denoise", seconds=32.0, after="kernels"),
+        asset("robot", EXAMPLES / "robot/RobotExpressive.glb", 2.0),
+        asset("helmet", EXAMPLES / "helmet/FlightHelmet.gltf", 8.0),
+        asset("playbot", EXAMPLES / "playbot/playbot.ply", 10.0, "--up=-y", command="import", after="kernels"),
+        Step("extension", "Building the extension", building, 0.5, (environments.FOR_ENGINE,)),
+        Step("scene", "Setting the scene", setting, 4.0, (*assets, "extension", *blenders), scene, of_scene),
+        Step(
+            "frames",
+            "Starting Blender",
+            [*drgs, "render", scene, "--frames", frames, "--out", pattern, "--denoise", "svgf", "--overwrite"],
+            4.0 + 1.3 * count,
+            ("scene", "more kernels"),
+            count=rendered,
+            before=partial(shutil.rmtree, out / "frames", ignore_errors=True),
+        ),
+        Step("sheet", "Making the contact sheet", [engine, __file__, "--out", out, "--sheet"], 2.0, ("frames",)),
+    ]
 
 
-def to_picture(linear: np.ndarray) -> Image.Image:
-    """Linear Rec.709 -> 8-bit sRGB."""
-    return Image.fromarray((linear_to_srgb(np.clip(linear[..., :3], 0, 1)) * 255 + 0.5).astype(np.uint8))
+def _count(frames: str) -> int:
+    """How many frames a range like 1-24x2,30 has."""
+    found: set[int] = set()
+    for part in frames.split(","):
+        span, _, stride = part.partition("x")
+        first, _, last = span.partition("-")
+        found.update(range(int(first), int(last or first) + 1, int(stride or 1)))
+    return max(len(found), 1)
+
+
+def run(out: Path, frames: str, before: Sequence[Step] = ()) -> None:
+    """Run the demo after the steps `before`, and say where the pictures are.
+
+    Raises
+    ------
+    StepFailed
+    """
+    out = out.resolve()
+    settings = {
+        "BLENDER_USER_RESOURCES": str(out / "blender"),
+        "DRGS_ENGINE": str(environments.python_of(environments.ENGINE)),
+        "DRGS_BLENDER": str(environments.blender()),
+        "PYTHONUNBUFFERED": "1",
+    }
+    first = list(before) or [Step(environments.FOR_ENGINE, "", [sys.executable, "-c", ""], 0.1)]
+    if not before and not os.environ.get("DRGS_BLENDER"):
+        first.append(Step(environments.FOR_BLENDER, "", [sys.executable, "-c", ""], 0.1))
+    seconds = run_steps([*first, *steps(out, frames)], out / "log.txt", ROOT, settings)
+    print(f"Done in {seconds:.0f} s. Look at {out / 'contact-sheet.png'} and {out / 'animation.webp'}")
 
 
 def publish(frames: list[Path], out: Path, fps: int = 24) -> None:
-    pictures = [to_picture(read_frame(path)[0]["Combined"]) for path in frames]
+    """The contact sheet and the animated picture."""
+    import numpy as np
+    from PIL import Image
+
+    from drgs_blender.colour import linear_to_srgb
+    from drgs_blender.render.picture.frames import read_frame
+
+    def picture(path: Path) -> Image.Image:
+        linear = np.clip(read_frame(path)[0]["Combined"][..., :3], 0, 1)  # Rec.709 -> 8-bit sRGB
+        return Image.fromarray((linear_to_srgb(linear) * 255 + 0.5).astype(np.uint8))
+
+    pictures = list(map(picture, frames))
     chosen = pictures[:: max(1, len(pictures) // 8)][:8]
     width, height = chosen[0].size
     sheet = Image.new("RGB", (width * 4, height * ((len(chosen) + 3) // 4)))
-    for i, picture in enumerate(chosen):
-        sheet.paste(picture, (i % 4 * width, i // 4 * height))
+    for i, one in enumerate(chosen):
+        sheet.paste(one, (i % 4 * width, i // 4 * height))
     sheet.save(out / "contact-sheet.png")
     pictures[0].save(
         out / "animation.webp", save_all=True, append_images=pictures[1:], duration=1000 // fps, loop=0, quality=90
     )
 
 
-def main() -> int:
+def main(arguments: Sequence[str] | None = None, before: Sequence[Step] = ()) -> int:
+    """The command line; `before` are steps of whoever calls."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=ROOT / "out" / "demo")
     parser.add_argument("--frames", default="1-24")
-    options = parser.parse_args()
-    begin = time.perf_counter()
-    out = options.out.resolve()
-    out.mkdir(parents=True, exist_ok=True)
-    drgs = [sys.executable, "-m", "drgs_blender.cli.main"]
-    examples = ROOT / "examples"
-    run(*drgs, "make", examples / "robot/RobotExpressive.glb", "--out", out / "robot.drgs")
-    run(*drgs, "make", examples / "helmet/FlightHelmet.gltf", "--out", out / "helmet.drgs")
-    run(*drgs, "import", examples / "playbot/playbot.ply", "--up=-y", "--out", out / "playbot.drgs")
-    run(sys.executable, ROOT / "tools/extension.py", "--out", out / "extension.zip")
-    blender = os.environ.get("DRGS_BLENDER", ROOT / ".venv-blender" / BIN / f"python{EXE}")
-    environment = os.environ | {"BLENDER_USER_RESOURCES": str(out / "blender"), "DRGS_ENGINE": sys.executable}
-    os.environ.update(environment)
-    run(blender, "-P", examples / "demo_scene.py", out / "extension.zip", out, out / "demo.blend")
-    run(*drgs, "render", out / "demo.blend", "--frames", options.frames, "--out", out / "frames/####.exr",
-        "--denoise", "svgf")  # fmt: skip
-    publish(sorted((out / "frames").glob("*.exr")), out)
-    print(
-        f"Done in {time.perf_counter() - begin:.0f} s. Look at {out / 'contact-sheet.png'} and {out / 'animation.webp'}"
-    )
+    parser.add_argument("--sheet", action="store_true", help="only the contact sheet, of the frames that are there")
+    options = parser.parse_args(arguments)
+    try:
+        _count(options.frames)
+    except ValueError:
+        parser.error(f"--frames {options.frames} is no range like 1-24, 1-24x2 or 7")
+    if options.sheet:
+        publish(sorted((options.out / "frames").glob("*.exr")), options.out)
+        return 0
+    try:
+        run(options.out, options.frames, before)
+    except StepFailed as failure:
+        print(f"demo: {failure}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return 130
     return 0
 
 

@@ -9,6 +9,13 @@ from pathlib import Path
 
 import pytest
 from disks import mount, unmount
+from pace import (  # noqa: F401  # hooks
+    pytest_addoption,
+    pytest_collection_modifyitems,
+    pytest_fixture_setup,
+    pytest_runtest_call,
+    pytest_runtest_protocol,
+)
 
 # Started in the background, tests inherit that Ctrl+C is ignored, and programs that they start would, too.
 signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -16,15 +16,17 @@ import os
 import re
 import shlex
 import shutil
-import signal
 import subprocess
 import sys
 import time
 import tomllib
 import venv
-import xml.etree.ElementTree as xml
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+import suites
+from suites import Failure
 
 ROOT = Path(__file__).resolve().parent.parent
 #: Exactly this torch, so that pip never goes looking for a larger build; DRGS_TORCH replaces it (pip arguments).
@@ -51,19 +53,19 @@ APT_PACKAGES = {
     "libgomp.so.1": "libgomp1",
     "libxkbcommon.so.0": "libxkbcommon0",
 }
-SUITES = ("lint", "engine", "farm", "blender", "floor")
-#: Among the others where there is a Blender with a window, see tests/ui.
-WINDOW = "window"
-LTS = "lts"
-TEST_SECONDS = 2400
-#: An artist's work at an artist's pace takes as many times as long.
-WINDOW_TIMES = 3
-#: The slow faults, of which `DRGS_FAULTS=whole` runs all, take as many times as long.
-WHOLE_TIMES = 15
-
-
-class Failure(Exception):
-    """A step that cannot go on; the message is for the user."""
+#: The suite of the oldest Blender, which `make check` runs, and that of the LTS, which runs when asked for.
+FLOOR, LTS = "floor", "lts"
+SUITES = {
+    suites.LINT: suites.Suite("lint", ()),
+    "engine": suites.Suite("engine", ("tests/unit", "tests/engine"), spread=True),
+    "farm": suites.Suite("farm", ("tests/farm",)),
+    "blender": suites.Suite(f"Blender {BLENDER}", ("tests/blender",)),
+    FLOOR: suites.Suite(f"Blender {BLENDER_FLOOR}", ("tests/blender",)),
+    LTS: suites.Suite(f"Blender {BLENDER_LTS}", ("tests/blender",)),
+    suites.WINDOW: suites.Suite("a window", ("tests/ui",), times=suites.WINDOW_TIMES),
+}
+#: What `make test` runs, in this order: the one that spreads over processes takes what the others leave.
+FAST = (suites.LINT, "blender", "farm", "engine")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -91,18 +93,25 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
         return sub
 
     env = command("env", run_env, "make or refresh the environments (instant when nothing changed)")
+    env.add_argument("--engine", action="store_true", help="only the engine's environment")
     env.add_argument(
-        "--blender", metavar="VERSION", help=f"only Blender's environment of this version, e.g. {BLENDER_FLOOR}"
+        "--blender",
+        nargs="?",
+        const=BLENDER,
+        metavar="VERSION",
+        help=f"only Blender's environment, of this version, e.g. {BLENDER_FLOOR}; default {BLENDER}",
     )
     command("system", run_system, "print the system packages that Blender needs and that are missing (Linux)")
-    test = command("test", run_test, "format, types and every test suite; exit code 0 only when all pass")
-    names = ", ".join((*SUITES, WINDOW, LTS))
-    test.add_argument("suites", nargs="*", metavar="SUITE", help=f"any of {names}; all but {LTS} by default")
+    names = ", ".join(SUITES)
+    about = f"words: suites ({names}), files of tests, then options of pytest, e.g. -k material"
+    test = command("test", run_test, f"the fast tests, for every commit; {about}")
+    check = command("check", run_check, f"every test; {about}")
+    check.add_argument("--rest", dest="others", action="store_true", help="only what `test` leaves out")
     demo = command("demo", run_demo, "render the demo through Blender; further arguments go to examples/demo.py")
     matter = command("demo-simulation", run_demo_simulation, "bake and render matter; see examples/demo_simulation.py")
     extension = command("extension", run_extension, "build the extension's zip; arguments go to tools/extension.py")
     bench = command("bench", run_bench, "measure; further arguments go to bench/run.py")
-    for sub in (demo, matter, extension, bench):
+    for sub in (test, check, demo, matter, extension, bench):
         sub.set_defaults(passes_on=True)
     clean = command("clean", run_clean, "remove build products and caches")
     clean.add_argument("--all", action="store_true", help="also the environments")
@@ -128,6 +137,11 @@ def python_of(folder: Path) -> Path:
 
 def ensure_engine() -> Path:
     """Make ``.venv`` when needed and return its interpreter."""
+    return ensure(*about_engine(), "import drgs_blender")
+
+
+def about_engine() -> tuple[Path, dict[str, object], list[list[str]]]:
+    """Folder of the engine's environment, what is wanted in it, what pip installs."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     torch = shlex.split(os.environ.get("DRGS_TORCH", TORCH))
     wanted = {
@@ -136,13 +150,26 @@ def ensure_engine() -> Path:
         "optional": project["optional-dependencies"],
         "scripts": project["scripts"],
     }
-    return ensure(ROOT / ".venv", wanted, [torch, ["-e", f"{ROOT}[reconstruct,oidn,gpu,dev]"]], "import drgs_blender")
+    return ROOT / ".venv", wanted, [torch, ["-e", f"{ROOT}[reconstruct,oidn,gpu,dev]"]]
 
 
 def ensure_blender(version: str = BLENDER) -> Path:
     """Make the environment with Blender `version` as a module when needed and return its interpreter."""
+    return ensure(*about_blender(version), "import bpy", python311())
+
+
+def about_blender(version: str) -> tuple[Path, dict[str, object], list[list[str]]]:
+    """The same for Blender's."""
     packages = [f"bpy=={version}", "pytest>=8"]
-    return ensure(blender_folder(version), {"packages": packages}, [packages], "import bpy", python311())
+    return blender_folder(version), {"packages": packages}, [packages]
+
+
+def is_made(folder: Path, wanted: dict[str, object]) -> bool:
+    """Whether an environment is there, as it is wanted."""
+    stamp = folder / "drgs-stamp.json"
+    if not (python_of(folder).exists() and stamp.exists()):
+        return False
+    return stamp.read_text(encoding="utf-8") == json.dumps(wanted, indent=1, sort_keys=True)
 
 
 def ensure(
@@ -154,7 +181,7 @@ def ensure(
     """
     interpreter, stamp = python_of(folder), folder / "drgs-stamp.json"
     text = json.dumps(wanted, indent=1, sort_keys=True)
-    if interpreter.exists() and stamp.exists() and stamp.read_text(encoding="utf-8") == text:
+    if is_made(folder, wanted):
         return interpreter
     started = time.monotonic()
     print(f"Preparing {folder.name} ...", flush=True)
@@ -221,10 +248,26 @@ def import_trouble(folder: Path, message: str) -> str:
 
 def run_env(args: argparse.Namespace) -> int:
     """Make the environments that are missing or out of date."""
-    pythons = [ensure_blender(args.blender)] if args.blender else [ensure_engine(), ensure_blender()]
-    for python in pythons:
-        print(python)
+    if args.engine:
+        print(ensure_engine())
+    elif args.blender:
+        print(ensure_blender(args.blender))
+    else:
+        both()
+        print(python_of(ROOT / ".venv"), python_of(blender_folder(BLENDER)), sep="\n")
     return 0
+
+
+def both() -> None:
+    """Make both environments, at the same time; return at once where they are there."""
+    from environments import environments
+    from steps import StepFailed, run_steps
+
+    if not all(is_made(*about) for about in (about_engine()[:2], about_blender(BLENDER)[:2])):
+        try:
+            run_steps(environments(), ROOT / "build" / "environments.txt", ROOT, {})
+        except StepFailed as failure:
+            raise Failure(str(failure)) from failure
 
 
 def run_system(args: argparse.Namespace) -> int:
@@ -247,31 +290,36 @@ def loads(library: str) -> bool:
 
 
 def run_test(args: argparse.Namespace) -> int:
-    """Run the chosen suites one after another and sum up what they report."""
-    suites = args.suites or [*SUITES, *own_window()]
-    if unknown := sorted(set(suites) - {*SUITES, WINDOW, LTS}):
-        raise Failure(f"unknown suite {', '.join(unknown)}; there are {', '.join((*SUITES, WINDOW, LTS))}")
-    engine = ensure_engine()
-    if {"farm", "blender"} & set(suites):
-        ensure_blender()  # the engine's suite runs `drgs render` through it where it is there
-    tally = Tally()
-    if "lint" in suites:
-        for tool in (["ruff", "check", "."], ["ruff", "format", "--check", "."], ["mypy"]):
-            tally.check(" ".join(tool), [engine, "-m", *tool])
-    if "engine" in suites:
+    """Run the fast tests, or those that the words choose."""
+    return run_suites(args, "fast", list(FAST))
+
+
+def run_check(args: argparse.Namespace) -> int:
+    """Run everything, or what the words choose of it."""
+    every = [*(name for name in FAST if name != suites.LINT or not args.others), FLOOR]
+    return run_suites(args, "slow" if args.others else "all", every)
+
+
+def run_suites(args: argparse.Namespace, part: str, names: list[str]) -> int:
+    """Run suites side by side: those that the words name, else `names`."""
+    named, files, options = suites.parse(args.rest, SUITES, ROOT)
+    if files or options:
+        names = [name for name in names if name != suites.LINT]
+        names += [suites.WINDOW] * any(file.startswith("tests/ui") for file in files)
+    elif part != "fast" and not named:
+        names += own_window()
+    plan = suites.Plan(part, named or names, [FLOOR, LTS, suites.WINDOW], bool(named), files, options)
+    engine = ensure_engine()  # every suite starts engines
+    if {"engine", "farm"} & set(plan.suites):
+        ensure_blender()  # they run `drgs render` through it
+    if "engine" in plan.suites:
         ensure_node()
-        tally.pytest("engine", engine, "tests/unit", "tests/engine")
-    if "farm" in suites:
-        tally.pytest("farm", engine, "tests/farm")
-    if "blender" in suites:
-        tally.pytest(f"Blender {BLENDER}", ensure_blender(), "tests/blender")
-    if "floor" in suites:
-        tally.pytest(f"Blender {BLENDER_FLOOR}", ensure_blender(BLENDER_FLOOR), "tests/blender")
-    if LTS in suites:
-        tally.pytest(f"Blender {BLENDER_LTS}", ensure_blender(BLENDER_LTS), "tests/blender")
-    if WINDOW in suites:
-        tally.pytest("a window", engine, "tests/ui", times=WINDOW_TIMES)
-    return tally.finish()
+    pythons = {name: ensure_engine for name in SUITES} | {
+        "blender": ensure_blender,
+        FLOOR: lambda: ensure_blender(BLENDER_FLOOR),
+        LTS: lambda: ensure_blender(BLENDER_LTS),
+    }
+    return suites.run(plan, SUITES, pythons, ROOT, os.environ | {"DRGS_ENGINE": str(engine)})
 
 
 def own_window() -> list[str]:
@@ -280,8 +328,8 @@ def own_window() -> list[str]:
     if not reason and not os.environ.get("DRGS_UI_BLENDER") and not shutil.which("Xvfb"):
         reason = "Xvfb is not installed, and the screen is yours: ask for it by name"
     if reason:
-        print(f"== tests: a window: skipped, {reason}", flush=True)
-    return [] if reason else [WINDOW]
+        print(f"== a window: skipped, {reason}", flush=True)
+    return [] if reason else [suites.WINDOW]
 
 
 def no_window() -> str:
@@ -305,52 +353,16 @@ def no_window() -> str:
     return ""
 
 
-class Tally:
-    """Counts over all suites; a suite that collects no test, dies or runs too long counts as a failure."""
-
-    def __init__(self) -> None:
-        self.passed = self.failed = self.skipped = 0
-        self.wrong: list[str] = []
-
-    def check(self, title: str, command: Sequence[str | Path]) -> None:
-        """Run a tool that only passes or fails."""
-        print(f"== {title}", flush=True)
-        if run(command, timeout=TEST_SECONDS):
-            self.wrong.append(title)
-
-    def pytest(self, title: str, python: Path, *folders: str, times: int = 1) -> None:
-        """Run pytest on `folders` and add its counts."""
-        print(f"== tests: {title}", flush=True)
-        report = ROOT / "build" / f"tests-{re.sub(r'[^a-z0-9.]+', '-', title.lower())}.xml"
-        report.parent.mkdir(exist_ok=True)
-        report.unlink(missing_ok=True)
-        seconds = times * TEST_SECONDS * (WHOLE_TIMES if os.environ.get("DRGS_FAULTS") == "whole" else 1)
-        code = run([python, "-m", "pytest", "-q", f"--junitxml={report}", *folders], timeout=seconds)
-        counts = {"tests": 0, "failures": 0, "errors": 0, "skipped": 0}
-        if report.exists():
-            for suite in xml.parse(report).getroot().iter("testsuite"):
-                counts = {key: value + int(suite.get(key, 0)) for key, value in counts.items()}
-        failed = counts["failures"] + counts["errors"]
-        self.failed += failed
-        self.skipped += counts["skipped"]
-        self.passed += counts["tests"] - failed - counts["skipped"]
-        if code or not counts["tests"]:
-            self.wrong.append(title)
-
-    def finish(self) -> int:
-        """Print the summary line; 0 when everything passed."""
-        if self.wrong:
-            print(f"not passed: {', '.join(self.wrong)}")
-        print(f"{self.passed} passed, {self.failed} failed, {self.skipped} skipped", flush=True)
-        return 1 if self.wrong or self.failed else 0
-
-
 # Programs of the project
 
 
 def run_demo(args: argparse.Namespace) -> int:
-    """Render the demo with both environments."""
-    return with_both("examples/demo.py", args.rest)
+    """Render the demo, and make both environments meanwhile."""
+    sys.path.insert(0, str(ROOT / "examples"))
+    import demo
+    from environments import environments
+
+    return demo.main(args.rest, environments())
 
 
 def run_demo_simulation(args: argparse.Namespace) -> int:
@@ -370,9 +382,9 @@ def run_extension(args: argparse.Namespace) -> int:
 
 def with_both(program: str, rest: Sequence[str]) -> int:
     """Run a program of the project in the engine's environment, which is told where Blender's is."""
-    engine = ensure_engine()
-    os.environ.setdefault("DRGS_BLENDER", str(ensure_blender()))
-    return run([engine, ROOT / program, *rest])
+    both()
+    os.environ.setdefault("DRGS_BLENDER", str(python_of(blender_folder(BLENDER))))
+    return run([python_of(ROOT / ".venv"), ROOT / program, *rest])
 
 
 def run_clean(args: argparse.Namespace) -> int:
@@ -385,23 +397,15 @@ def run_clean(args: argparse.Namespace) -> int:
     return 0
 
 
-def run(command: Sequence[str | Path], timeout: float | None = None) -> int:
-    """Run a command with DRGS_ENGINE set; on timeout or interrupt end it with all its children; its exit code."""
+def run(command: Sequence[str | Path]) -> int:
+    """Run a command with DRGS_ENGINE set; on an interrupt end it with all its children; its exit code."""
     environment = os.environ | {"DRGS_ENGINE": str(python_of(ROOT / ".venv"))}
     own_group = os.name != "nt"
     process = subprocess.Popen([str(part) for part in command], cwd=ROOT, env=environment, start_new_session=own_group)
     try:
-        return process.wait(timeout)
-    except subprocess.TimeoutExpired:
-        print(f"ended after {timeout:.0f} s: {command[0]}", file=sys.stderr)
-        return 124
+        return process.wait()
     finally:
-        if process.poll() is None:
-            if own_group:
-                os.killpg(process.pid, signal.SIGKILL)
-            else:
-                subprocess.run(["taskkill", "/F", "/T", "/PID", str(process.pid)], capture_output=True)
-            process.wait()
+        suites.end(process, patience=0.0)
 
 
 if __name__ == "__main__":

@@ -35,6 +35,8 @@ sys.exit(main())
 #: How a line of the program's log begins.
 _SAYS = "drgs: "
 _COUNTS = re.compile(r"(\d+) particles.*at least (\d+) time steps")
+#: A line while kernels are compiled.
+_PREPARING = re.compile(r'DRGS_PROGRESS part=([\d.]+) phase="([^"]*)"')
 
 
 #: Programs that were asked to end and have not yet, with the time until which they may take.
@@ -109,6 +111,15 @@ class Program:
                 found = _COUNTS.search(self._said.read_text(encoding="utf-8", errors="replace"))
                 self._counts = (int(found[1]), int(found[2])) if found else None
         return self._counts
+
+    @property
+    def preparation(self) -> tuple[float, str]:
+        """The part that is done of what comes before the body is filled, and words for it; (0, "") before any."""
+        with suppress(OSError):
+            found = _PREPARING.findall(self._said.read_text(encoding="utf-8", errors="replace"))
+            if found:
+                return float(found[-1][0]), found[-1][1]
+        return 0.0, ""
 
     def end(self, save: bool = True) -> None:
         """End it if it runs; while it saves what it needs to go on, `ending` is true. Without, it is killed."""

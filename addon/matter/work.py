@@ -138,7 +138,10 @@ class Work:
         if self._program is None:
             return 0.0, f"Reading the scene {self._captured:.0%}"
         counts = self._program.counts
-        return 0.0, "Preparing (longer the first time)" if counts is None else f"{counts[0]:,} particles"
+        if counts is not None:
+            return 0.0, f"{counts[0]:,} particles"
+        part, text = self._program.preparation
+        return (part, text) if part < 1.0 and text else (0.0, "Filling the body")
 
     def _take(self, seconds: float) -> bool:
         """Take in what is new, for about `seconds`; whether there was anything."""

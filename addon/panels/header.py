@@ -1,4 +1,4 @@
-"""The newest warning or error in the header of 3D viewports, for those who have the sidebar closed."""
+"""The header of 3D viewports: the newest warning or error, and what is awaited, where the sidebar is closed."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import textwrap
 import bpy
 
 from .. import messages
+from ..viewport import views
 from .sidebar import ICONS
 
 #: Letters that a header has room for; a click shows the rest.
@@ -14,7 +15,12 @@ LETTERS = 40
 
 
 def draw(header: bpy.types.Header, context: bpy.types.Context) -> None:
-    """Show it until the messages are cleared."""
+    """Show the message until they are cleared, and what is awaited where Blender writes nothing over the picture."""
+    scene = context.scene
+    if scene.drgs.overlay == "LIT" and not views.is_rendered(context.space_data, scene):
+        phase, part = views.preparation()
+        if phase:
+            header.layout.label(text=f"{phase}  {part:.0%}", icon="TIME")
     newest = next((m for m in reversed(list(messages.history)) if m.level != "INFO"), None)
     if newest is not None:
         text = textwrap.shorten(newest.text, LETTERS, placeholder="...")

@@ -11,6 +11,7 @@ from ...drgs_blender.matter import MATERIALS
 from .. import assets
 from ..matter import points, work
 from ..matter.properties import DrgsMatterRegion, DrgsMatterSettings, numbers_of
+from .tour import bar_text
 
 
 class _Physics:
@@ -106,8 +107,9 @@ def _draw_bake(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
         return
     now = work.of(obj)
     if now is not None:
-        row = layout.row(align=True)
         part, text = now.progress()
+        text = bar_text(layout, context, text, part, percent=False)
+        row = layout.row(align=True)
         row.progress(factor=part, text=text)
         row.operator("drgs.cancel_matter", text="", icon="CANCEL")
         return
@@ -117,7 +119,8 @@ def _draw_bake(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
         row.operator("drgs.cancel_matter", text="", icon="CANCEL")
         for other in work.running.values():
             part, text = other.progress()
-            layout.progress(factor=part, text=f"{other.subject}: {text}")
+            text = bar_text(layout, context, f"{other.subject}: {text}", part, percent=False)
+            layout.progress(factor=part, text=text)
         return
     try:
         found = work.cached(obj, context.scene)

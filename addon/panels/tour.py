@@ -7,6 +7,7 @@ import textwrap
 import bpy
 
 from .. import engine_link, engine_setup, lighting, reconstruction, setup_job, tour
+from ..viewport import views
 
 #: Pixels of a letter, about, at a scale of 1.
 LETTER = 7.5
@@ -15,20 +16,39 @@ POPOVER = 400
 
 
 def wrapped(layout: bpy.types.UILayout, context: bpy.types.Context, text: str, icon: str = "NONE") -> None:
-    """A text in as many lines as the region needs; what pops up from a header has a width of its own."""
+    """A text in as many lines as the region needs."""
+    column = layout.column(align=True)
+    for i, line in enumerate(textwrap.wrap(text, _letters(context), break_on_hyphens=False)):
+        column.label(text=line, icon="BLANK1" if i and icon != "NONE" else icon)
+
+
+def _letters(context: bpy.types.Context) -> int:
+    """Letters that fit into a line of the region; what pops up from a header has a width of its own."""
     region, scale = context.region, context.preferences.system.ui_scale or 1
     width = POPOVER * scale if region and region.type == "HEADER" else region.width if region else 240
-    letters = max(24, int(width / (LETTER * scale)) - 4)
-    column = layout.column(align=True)
-    for i, line in enumerate(textwrap.wrap(text, letters, break_on_hyphens=False)):
-        column.label(text=line, icon="BLANK1" if i and icon != "NONE" else icon)
+    return max(24, int(width / (LETTER * scale)) - 4)
+
+
+def bar_text(
+    layout: bpy.types.UILayout, context: bpy.types.Context, text: str, part: float, percent: bool = True
+) -> str:
+    """What a progress bar says: `text`, followed by a number where `percent` asks for it.
+
+    Where the region is too narrow, the text is written above the bar, which says the number alone.
+    """
+    number = f"{part:.0%}"
+    said = f"{text}  {number}" if percent else text
+    if len(said) <= _letters(context):
+        return said
+    wrapped(layout, context, text)
+    return number
 
 
 def draw_engine(layout: bpy.types.UILayout, context: bpy.types.Context, always: bool = False) -> None:
     """Set-up of the engine: its buttons where there is none (or `always`), or how far it is."""
     if setup_job.running():
         job = setup_job.job
-        layout.progress(text=f"{job.text}  {job.fraction:.0%}", factor=job.fraction)
+        layout.progress(text=bar_text(layout, context, job.text, job.fraction), factor=job.fraction)
         layout.operator("drgs.engine_setup_cancel", icon="CANCEL")
         return
     if not engine_link.problem() and not always:
@@ -55,7 +75,7 @@ def _import(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
         return
     if icon := job.icon():
         layout.template_icon(icon, scale=8.0)
-    layout.progress(text=f"{job.text}  {job.part:.0%}", factor=job.part)
+    layout.progress(text=bar_text(layout, context, job.text, job.part), factor=job.part)
     layout.operator("drgs.reconstruct_cancel", icon="CANCEL")
 
 
@@ -89,6 +109,9 @@ def _light(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
 
 def _view(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     layout.operator("drgs.show_rendered", icon="SHADING_RENDERED")
+    phase, part = views.preparation()
+    if phase:
+        layout.progress(text=bar_text(layout, context, phase, part), factor=part)
     layout.row().prop(context.scene.drgs, "overlay", expand=True)
 
 

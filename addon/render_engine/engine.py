@@ -14,6 +14,7 @@ from ...drgs_blender.engine.blur import averaged, share, sharp
 from ...drgs_blender.engine.protocol import Passes
 from ...drgs_blender.errors import EXIT_INTERNAL, Cancelled, DrgsError
 from ...drgs_blender.frame import Frame
+from ...drgs_blender.phases import is_preparing
 from .. import engine_link, farm, messages
 from ..export import export_frame
 from ..export.instances import uncancelled
@@ -146,6 +147,9 @@ class DrgsRenderEngine(bpy.types.RenderEngine):
         done = 0
 
         def tell(phase: str, fraction: float) -> None:
+            if is_preparing(phase):
+                self._progress(phase, fraction)
+                return
             self._progress(f"Blur {done}/{len(steps)}: {phase}", min(1.0, (done + fraction) / (len(steps) + 1)))
 
         def parts() -> Iterator[Passes]:

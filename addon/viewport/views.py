@@ -17,6 +17,7 @@ import bpy
 
 from ...drgs_blender.errors import DrgsError
 from ...drgs_blender.frame import Camera, Frame
+from ...drgs_blender.phases import STARTING, is_counted, is_preparing
 from .. import engine_link, messages, preferences
 from ..export.camera import check_lens
 from ..export.view import view_camera
@@ -157,13 +158,22 @@ def show(name: str) -> None:
 def tell(name: str) -> tuple[str, str]:
     """What to say of a viewport: (what is being done, an error or "")."""
     shown = _shown.get(name)
-    phase, error = worker.state(name)
+    error = worker.state(name)[1]
     if shown is None or error:
         return "", error
-    if shown.picture is None:
-        return phase or "Starting the engine", ""
+    phase, part = worker.progress(name)
+    if is_counted(phase):
+        return f"{phase}  {part:.0%}", ""
+    if shown.picture is None or is_preparing(phase):
+        return phase or STARTING, ""
     rays = shown.picture.request.frame.settings.rays
-    return phase if phase == "Preparing kernels" else f"Ray {round(shown.picture.fraction * rays)}/{rays}", ""
+    return f"Ray {round(shown.picture.fraction * rays)}/{rays}", ""
+
+
+def preparation() -> tuple[str, float]:
+    """What is said while kernels are compiled for a viewport, and the part that is done; ("", 0) otherwise."""
+    found = (worker.progress(name) for name in worker.names())
+    return next((each for each in found if is_preparing(each[0])), ("", 0.0))
 
 
 def forget() -> None:

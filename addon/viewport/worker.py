@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from ...drgs_blender.engine.client import EngineClient, Passes
 from ...drgs_blender.errors import Cancelled, DrgsError
 from ...drgs_blender.frame import Frame
+from ...drgs_blender.phases import is_counted
 
 log = logging.getLogger("drgs")
 
@@ -54,6 +55,7 @@ class _View:
     picture: Picture | None = None
     error: str = ""
     phase: str = ""
+    part: float = 0.0
 
 
 class Worker:
@@ -106,6 +108,11 @@ class Worker:
         view = self._views.get(name)
         return ("", "") if view is None else (view.phase, view.error)
 
+    def progress(self, name: str) -> tuple[str, float]:
+        """What is being done for the next picture of a viewport, and the part of it that is done."""
+        view = self._views.get(name)
+        return ("", 0.0) if view is None else (view.phase, view.part)
+
     def busy(self) -> bool:
         """Whether there is something to do."""
         with self._changed:
@@ -149,12 +156,12 @@ class Worker:
                 request, first, asked = view.request, not view.begun, view.asked
                 view.begun = True
             try:
-                self._load(request)
+                self._load(view, request)
                 passes = request.client.view(
                     view.name,
                     request.frame,
                     not first,
-                    lambda phase, part, view=view: self._tell(view, phase),
+                    lambda phase, part, view=view: self._tell(view, phase, part),
                     self._stop_begin(view) if first else self._stop_refining(view, request),
                 )
             except Cancelled:
@@ -171,7 +178,7 @@ class Worker:
             now = time.perf_counter()
             fraction = passes.statistics.get("view.fraction", 1.0)
             with self._changed:
-                view.picture, view.phase = Picture(request, passes, fraction, now - asked), ""
+                view.picture, view.phase, view.part = Picture(request, passes, fraction, now - asked), "", 0.0
                 if view.request is request:
                     view.fraction = fraction
             self.news += 1
@@ -197,7 +204,7 @@ class Worker:
 
         return stop
 
-    def _load(self, request: Request) -> None:
+    def _load(self, view: _View, request: Request) -> None:
         """Have the engine map the assets that it has not, or not as they are now."""
         client, loaded = self._loaded
         if client is not request.client:
@@ -205,13 +212,16 @@ class Worker:
             self._loaded = request.client, loaded
         for path, stamp in request.assets:
             if loaded.get(path) != stamp:
-                request.client.load_asset(path, cancelled=lambda: self._ending or self._held > 0)
+                request.client.load_asset(
+                    path, lambda phase, part: self._tell(view, phase, part), lambda: self._ending or self._held > 0
+                )
                 loaded[path] = stamp
 
-    def _tell(self, view: _View, phase: str) -> None:
-        if phase != view.phase:
-            view.phase = phase
-            self.news += 1
+    def _tell(self, view: _View, phase: str, part: float) -> None:
+        """Take a phase in; there is news where the viewport says something else, see `views.tell`."""
+        changed = phase != view.phase or (is_counted(phase) and f"{part:.0%}" != f"{view.part:.0%}")
+        view.phase, view.part = phase, part
+        self.news += changed
 
     def _fail(self, view: _View, request: Request, text: str) -> None:
         with self._changed:

@@ -17,7 +17,7 @@ from ..formats.files import MeshFile, plain_name
 from ..formats.gltf_nodes import Pose
 from ..formats.mesh import check_extent
 from .texture import CHANNELS, Materials
-from .topology import Net, close_marks, edge_lengths, edges, subdivide, weld
+from .topology import Net, close_marks, edge_lengths, edges, subdivide, survivors, weld
 
 Array = np.ndarray
 log = logging.getLogger(__name__)
@@ -183,9 +183,21 @@ def _net(file: MeshFile, name: str, report: dict[str, Any]) -> Net:
 
 def bake(net: Net, materials: Materials) -> Array:
     """Values (n, CHANNELS) float32 of the vertices: the mean over their corners of the textures around them."""
-    size = _corner_size(net.uvs)
-    material = np.repeat(net.tags[:, 0], 3)
-    corner = materials.sample(material, net.uvs.reshape(-1, 2), FOOTPRINT * size.reshape(-1, 2))
+    return _at_vertices(net, _at_corners(net, materials, np.arange(len(net.faces))))
+
+
+def _at_corners(net: Net, materials: Materials, some: Array) -> Array:
+    """Values (s, 3, CHANNELS) of the textures around the corners of the faces `some`."""
+    uvs = net.uvs[some]
+    size = _corner_size(uvs)
+    material = np.repeat(net.tags[some, 0], 3)
+    found = materials.sample(material, uvs.reshape(-1, 2), FOOTPRINT * size.reshape(-1, 2))
+    return found.reshape(len(some), 3, CHANNELS)
+
+
+def _at_vertices(net: Net, corners: Array) -> Array:
+    """Values (n, CHANNELS) float32 of the vertices, from those of all corners."""
+    corner = corners.reshape(-1, CHANNELS)
     flat = net.faces.reshape(-1)
     count = np.maximum(np.bincount(flat, minlength=len(net.vertices)), 1)
     values = np.stack([np.bincount(flat, corner[:, c], len(net.vertices)) / count for c in range(CHANNELS)], -1)
@@ -209,12 +221,12 @@ def refine(net: Net, materials: Materials, tolerance: float, max_triangles: int)
     net, rounds, unresolved : the divided mesh, rounds done, edges still above the tolerance
     """
     finest = FINEST * float(np.linalg.norm(np.ptp(net.vertices, axis=0)))
-    unresolved = 0
+    unresolved, looked = 0, _Looked(net, materials)
     for done in range(ROUNDS + 1):
         edge, count = edges(net)
         lengths = edge_lengths(net)
         error = np.zeros(count)
-        np.maximum.at(error, edge.reshape(-1), _edge_errors(net, materials).reshape(-1))
+        np.maximum.at(error, edge.reshape(-1), looked.errors.reshape(-1))
         length = np.zeros(count)
         np.maximum.at(length, edge.reshape(-1), lengths.reshape(-1))
         wanted = (error > tolerance) & (length > 2 * finest)
@@ -224,8 +236,40 @@ def refine(net: Net, materials: Materials, tolerance: float, max_triangles: int)
         marked = _within_budget(edge, lengths, np.where(wanted, error * length, 0), max_triangles)
         if not marked.any():
             return net, done, unresolved
+        kept = survivors(net, edge, marked)
         net = subdivide(net, edge, marked)
+        looked = _Looked(net, materials, looked, kept)
     return net, ROUNDS, unresolved
+
+
+class _Looked:
+    """How well a net follows its textures; of what a division left as it was, nothing is looked up again.
+
+    Parameters
+    ----------
+    before, kept : of the net that was divided, and `survivors` of the division
+
+    Attributes
+    ----------
+    errors : (m, 3), see `_edge_errors`
+    """
+
+    def __init__(
+        self, net: Net, materials: Materials, before: _Looked | None = None, kept: Array | None = None
+    ) -> None:
+        if before is None or kept is None:
+            kept = np.full(len(net.faces), -1)
+        new = np.flatnonzero(kept < 0)
+        self._corners = np.empty((len(kept), 3, CHANNELS), np.float32)
+        self.errors = np.zeros(net.faces.shape)
+        if before is not None:
+            old = np.flatnonzero(kept >= 0)
+            self._corners[old], self.errors[old] = before._corners[kept[old]], before.errors[kept[old]]
+        self._corners[new] = _at_corners(net, materials, new)
+        moved = np.zeros(len(net.vertices), bool)  # their values are others than before
+        moved[net.faces[new]] = True
+        again = np.flatnonzero(moved[net.faces].any(axis=1))
+        self.errors[again] = _edge_errors(net, materials, _at_vertices(net, self._corners), again)
 
 
 def _within_budget(edge: Array, lengths: Array, priority: Array, max_triangles: int) -> Array:
@@ -242,16 +286,22 @@ def _within_budget(edge: Array, lengths: Array, priority: Array, max_triangles: 
     return np.zeros(len(priority), bool)
 
 
-def _edge_errors(net: Net, materials: Materials) -> Array:
-    """Largest difference (m, 3) between textures and interpolated vertex values along each edge of each face.
+def _edge_errors(net: Net, materials: Materials, values: Array, some_faces: Array) -> Array:
+    """Largest difference (s, 3) between textures and interpolated vertex values along each edge of each face.
 
     The middle of a face counts for its longest edge. Edges about as long as a texel have none.
+
+    Parameters
+    ----------
+    values : of all vertices, see `bake`
+    some_faces : (s,) the faces that are meant
     """
-    result = np.zeros(net.faces.shape)
-    rows = np.flatnonzero(materials.textured[net.tags[:, 0]])
+    result = np.zeros((len(some_faces), 3))
+    places = np.flatnonzero(materials.textured[net.tags[some_faces, 0]])
+    rows = some_faces[places]
     if not len(rows):
         return result
-    net_values = _perceived(bake(net, materials))
+    net_values = _perceived(values)
     faces, uvs, material = net.faces[rows], net.uvs[rows], net.tags[rows, 0]
     extent = np.abs(np.roll(uvs, -1, axis=1) - uvs)
     coarse = extent.max(axis=-1) > 1.5 * materials.texel_size()[material][:, None]
@@ -274,11 +324,11 @@ def _edge_errors(net: Net, materials: Materials) -> Array:
             weights = np.zeros(3)
             weights[k], weights[(k + 1) % 3] = 1 - t, t
             found = error(weights, some, LOOK * extent[some, k])
-            result[rows[some], k] = np.maximum(result[rows[some], k], found)
+            result[places[some], k] = np.maximum(result[places[some], k], found)
     some = np.flatnonzero(coarse.any(axis=1))
     longest = edge_lengths(net)[rows[some]].argmax(axis=1)
     centre = error(np.full(3, 1 / 3), some, LOOK * extent[some].mean(axis=1))
-    result[rows[some], longest] = np.maximum(result[rows[some], longest], centre)
+    result[places[some], longest] = np.maximum(result[places[some], longest], centre)
     return result
 
 

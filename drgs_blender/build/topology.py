@@ -103,12 +103,20 @@ def close_marks(edge: Array, lengths: Array, marked: Array) -> Array:
     It keeps triangles from degenerating however often they are divided.
     """
     longest = np.take_along_axis(edge, lengths.argmax(axis=1)[:, None], 1)[:, 0]
+    first, second, third = np.ascontiguousarray(edge.T)
     marked = marked.copy()
     while True:
         before = marked.sum()
-        marked[longest[marked[edge].any(axis=1)]] = True
+        marked[longest[marked[first] | marked[second] | marked[third]]] = True
         if marked.sum() == before:
             return marked
+
+
+def survivors(net: Net, edge: Array, marked: Array) -> Array:
+    """For each face of `subdivide`'s net the face of this one that it is, corner for corner; -1 where it is new."""
+    parts = marked[edge].sum(axis=1)
+    same = (parts == 0) & (edge_lengths(net).argmax(axis=1) == 0)  # the others begin at another corner
+    return np.repeat(np.where(same, np.arange(len(parts)), -1), parts + 1)
 
 
 def subdivide(net: Net, edge: Array, marked: Array) -> Net:

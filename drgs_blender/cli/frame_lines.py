@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from typing import IO
 
 from ..errors import EXIT_CLASSES
+from ..phases import is_preparing
 
 HEARTBEAT_SECONDS = 30.0
 #: Between two progress lines of one frame.
@@ -74,7 +75,8 @@ class FrameLines:
 
     def progress(self, frame: int, phase: str, fraction: float) -> None:
         """Where the picture stands; most calls print nothing."""
-        self._doing = f"Fra:{frame} | {phase.capitalize()} | Sample {int(100 * min(max(fraction, 0), 1))}/100"
+        fraction = 0.0 if is_preparing(phase) else min(max(fraction, 0.0), 1.0)  # nothing of the picture is done
+        self._doing = f"Fra:{frame} | {phase.capitalize()} | Sample {int(100 * fraction)}/100"
         if time.monotonic() - self._last >= self._interval:
             self._say(self._doing)
             self._tell_openjd(fraction, f"frame {frame}, {phase}")

@@ -13,7 +13,7 @@ from ..formats.axes import UP_AXES
 from ..sequence import frame_path
 from .frame_range import frames_wanted
 from .output import check_suffix, check_writable, write_and_report
-from .progress import FractionBar, clock
+from .progress import FractionBar, clock, prepare_engine
 from .relight import positive
 from .sampling import whole
 
@@ -85,10 +85,8 @@ def _import(args: argparse.Namespace) -> int:
         raise UsageError("--exposure", "belongs to --remove-light", "Give both")
 
     from ..build.importer import import_asset
-    from ..compute.prepare import prepare_kernels
 
-    with FractionBar(args, "importing") as bar:
-        prepare_kernels(("import",), bar)
+    prepare_engine(args, "import")
     given = {name: value for name in ("resolution", "max_triangles") if (value := getattr(args, name)) is not None}
     with clock(args, "importing"):
         asset = import_asset(

@@ -13,6 +13,7 @@ from ..engine import blur
 from ..engine.protocol import Passes
 from ..errors import Cancelled, EngineError
 from ..frame import Frame, RenderSettings
+from ..phases import is_preparing
 from . import frame_store
 from .blender_process import Evaluated
 
@@ -56,13 +57,24 @@ class Picture:
     def render(
         self, engine: EngineClient, assets: Mapping[str, Path], on_progress: OnProgress, timeout: float
     ) -> tuple[Passes, str]:
-        """The passes and their `settings_hash`; EngineError when that takes longer than `timeout` seconds."""
-        latest, count = time.monotonic() + timeout, max(self._shot.count, 1)
+        """The passes and their `settings_hash`; EngineError when that takes longer than `timeout` seconds.
+
+        The time in which kernels are compiled, once on a machine, does not count.
+        """
+        told, prepared = time.monotonic(), False
+        latest, count = told + timeout, max(self._shot.count, 1)
         hashes: list[str] = []
 
         def tell(phase: str, fraction: float) -> None:
-            done = min(len(hashes) - 1, count - 1)
-            on_progress(f"blur {done}/{count}: {phase}" if count > 1 else phase, (done + fraction) / count)
+            nonlocal told, prepared, latest
+            now = time.monotonic()
+            if is_preparing(phase):
+                latest += now - told if prepared else 0.0
+                on_progress(phase, fraction)
+            else:
+                done = min(len(hashes) - 1, count - 1)
+                on_progress(f"blur {done}/{count}: {phase}" if count > 1 else phase, (done + fraction) / count)
+            told, prepared = now, is_preparing(phase)
 
         def rendered() -> Iterator[Passes]:
             for part in self._parts():

@@ -7,8 +7,16 @@ import contextlib
 import os
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from typing import Any
+
+from ..phases import is_counted, is_preparing
+from .frame_lines import say
+from .interrupt import interruptible
+
+#: Between two lines while kernels are compiled: for programs, and for people without a terminal.
+PROGRAM_SECONDS, PEOPLE_SECONDS = 0.5, 5.0
 
 
 def bar(args: argparse.Namespace, label: str, total: float | None = None, unit: str = "it", **options: Any) -> Any:
@@ -48,20 +56,62 @@ def clock(args: argparse.Namespace, label: str) -> Iterator[None]:
 
 
 class FractionBar:
-    """A bar for work that reports the fraction done; used as a context manager and called as (phase, fraction)."""
+    """A bar for work that reports the fraction done; used as a context manager and called as (phase, fraction).
 
-    def __init__(self, args: argparse.Namespace, label: str) -> None:
+    Parameters
+    ----------
+    programs : while kernels are compiled, lines on stdout for a program that reads them, where that is no terminal
+    """
+
+    def __init__(self, args: argparse.Namespace, label: str, programs: bool = False) -> None:
         layout = "{desc}{percentage:3.0f}%|{bar}| {elapsed}<{remaining}"
         self._bar = bar(args, label, total=1.0, bar_format=layout)
+        self._counted = False
+        self._for_programs = programs and not args.quiet and not sys.stdout.isatty()
+        self._for_people = self._bar.disable and not args.quiet and args.progress is None
+        self._next = 0.0
 
     def __enter__(self) -> FractionBar:
         return self
 
     def __exit__(self, *_: object) -> None:
         self._bar.close()
+        if self._for_programs and self._next:
+            say('DRGS_PROGRESS part=1.000 phase="Ready"\n', sys.stdout)
 
     def __call__(self, phase: str, fraction: float) -> None:
         """Show what is being done and the part of it that is done, in [0, 1]."""
+        if is_counted(phase) != self._counted:  # it has a bar of its own
+            self._counted = is_counted(phase)
+            self._bar.reset()
         if phase:
             self._bar.set_description(phase, refresh=False)
         self._bar.update(max(0.0, min(1.0, fraction) - self._bar.n))
+        if is_preparing(phase):
+            self._say(phase, fraction)
+
+    def _say(self, phase: str, fraction: float) -> None:
+        """Nothing else is heard for minutes where there is no bar."""
+        now = time.monotonic()
+        if now < self._next:
+            return
+        if self._for_programs:
+            self._next = now + PROGRAM_SECONDS
+            say(f'DRGS_PROGRESS part={fraction:.3f} phase="{phase}"\n', sys.stdout)
+        elif self._for_people:
+            self._next = now + PEOPLE_SECONDS
+            say(f"drgs: {phase}\n", sys.stderr)
+
+
+def prepare_engine(args: argparse.Namespace, *jobs: str) -> None:
+    """Have the kernels of `jobs` compiled, see `compute.prepare`, and show it by a bar or lines, as `FractionBar`.
+
+    Raises
+    ------
+    Cancelled
+        Ctrl+C came.
+    """
+    from ..compute.prepare import prepare_kernels
+
+    with FractionBar(args, "preparing", programs=True) as show, interruptible() as stopped:
+        prepare_kernels(jobs, show, stopped)

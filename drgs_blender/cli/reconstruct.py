@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 
 from ..filetypes import CAMERAS
 from ..formats.axes import UP_AXES
+from ..phases import is_preparing
 from .frame_lines import say
 from .interrupt import interruptible
 from .output import check_suffix, check_writable, write_and_report
@@ -180,7 +181,8 @@ class _Teller:
     def __call__(self, progress: Progress) -> None:
         known = progress.psnr is not None
         surfels = f", {progress.surfels} surfels" if progress.surfels else ""
-        self._bar(f"{progress.phase}{surfels}{f', {progress.psnr:.1f} dB' if known else ''}", progress.part)
+        about = "" if is_preparing(progress.phase) else f"{surfels}{f', {progress.psnr:.1f} dB' if known else ''}"
+        self._bar(f"{progress.phase}{about}", progress.part)
         now = time.monotonic()
         if self._lines and now >= self._next:
             self._next = now + _TELL_EVERY

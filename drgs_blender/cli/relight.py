@@ -26,6 +26,7 @@ from ..sequence import frame_path
 from . import sampling
 from .camera_file import read_camera
 from .frame_range import check_template, parse_frames
+from .interrupt import interruptible
 from .output import check_suffix, check_writable, write_preview
 from .progress import FractionBar
 
@@ -101,8 +102,8 @@ def run(args: argparse.Namespace) -> int:
             passes=args.passes,
         )
         started = time.perf_counter()
-        with FractionBar(args, "rendering") as progress:
-            picture = session.render(frame, progress)
+        with FractionBar(args, "rendering") as progress, interruptible() as stopped:
+            picture = session.render(frame, progress, stopped)
         for warning in picture.warnings:
             logger.warning("%s", warning)
         logger.info("frame %d rendered in %.2f s", number, time.perf_counter() - started)

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import AssetError, EngineError, UsageError
+from ..phases import is_preparing
 from ..sequence import frame_path
 from . import sampling, session_link
 from .find_blender import find_blender
@@ -135,7 +136,11 @@ def render(args: argparse.Namespace, machine: Machine) -> int:
                 lines.skipped(path)
             else:
                 lines.begin(number)
-                tell = partial(lines.progress, number)
+
+                def tell(phase: str, fraction: float, number: int = number) -> None:
+                    lines.progress(number, phase, fraction)
+                    progress.set_description(phase if is_preparing(phase) else "frames")
+
                 try:
                     passes, settings = picture.render(engine, machine.assets, tell, args.timeout)
                 except AssetError:

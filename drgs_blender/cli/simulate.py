@@ -20,7 +20,7 @@ from ..particle_cache import ParticleCache
 from ..sequence import frame_path
 from .interrupt import interruptible
 from .output import check_suffix, check_writable
-from .progress import FractionBar, clock
+from .progress import FractionBar, clock, prepare_engine
 from .sampling import whole
 
 if TYPE_CHECKING:
@@ -102,13 +102,13 @@ def run(args: argparse.Namespace) -> int:
 
     from ..asset.container import read_asset
     from ..compute.jit import use_threads
-    from ..compute.prepare import prepare_kernels
     from ..simulate.bake import bake
     from ..simulate.job import prepare
 
     settings = _settings(args)
     use_threads(args.threads)
     asset = read_asset(args.asset)
+    prepare_engine(args, "simulate")
     with clock(args, "filling"):
         job = prepare(asset.mesh, settings, str(args.asset))
     report = job.filling.report
@@ -129,7 +129,6 @@ def run(args: argparse.Namespace) -> int:
     cache = ParticleCache(args.out)
     count = settings.last - settings.first + 1
     with FractionBar(args, "simulating") as bar, interruptible() as stopped:
-        prepare_kernels(("simulate",), bar, stopped)
 
         def progress(frame: int, part: float) -> None:
             bar(f"frame {frame}", (frame - settings.first - 1 + part) / max(count - 1, 1))

@@ -46,6 +46,20 @@ def is_nested() -> bool:
     return _State.compiling
 
 
+class _Flags(compiler.Flags):
+    """Numba's flags, compared by what was set: they are part of the key of each look-up among overloads."""
+
+    __slots__ = ()
+
+    def __hash__(self) -> int:
+        return len(self._values)
+
+    def __eq__(self, other: object) -> bool:
+        if type(other) is type(self):
+            return self._values == other._values
+        return super().__eq__(other)
+
+
 class EntryLibrary(codegen.JITCodeLibrary):
     """Code that Python calls."""
 
@@ -101,7 +115,7 @@ class KernelCompiler(compiler.Compiler):
 
     def __init__(self, typingctx: Any, targetctx: Any, library: Any, args: Any, return_type: Any, flags: Any,
                  locals: Any) -> None:  # fmt: skip
-        kind = EntryLibrary
+        kind, flags = EntryLibrary, _Flags(flags)
         flags.no_cfunc_wrapper = True
         if is_nested():
             kind = InnerLibrary

@@ -19,13 +19,14 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from ..errors import Cancelled
+from ..phases import PREPARING
 from . import manifest, shipped
 from .folders import cache_folder
 from .manifest import Kernel
 
 log = logging.getLogger(__name__)
 #: The one text for it, in Blender and on the command line.
-PHASE = "Preparing the engine (first time only)"
+PHASE = PREPARING
 _POLL = 0.1
 _TELL = 0.4
 

@@ -1,6 +1,6 @@
 """A process that compiles the kernels it is told into the cache: a line of JSON each, answered by ``done``.
 
-It ends with its standard input, so with the process that started it.
+It ends with its standard input, so with the process that started it, also in the middle of a kernel.
 """
 
 from __future__ import annotations
@@ -9,7 +9,9 @@ import gc
 import json
 import logging
 import os
+import queue
 import sys
+import threading
 
 from . import jit, manifest  # noqa: F401  (jit sets Numba up)
 from .manifest import Kernel
@@ -22,8 +24,16 @@ def main() -> None:
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # what anything else prints is no answer
     gc.disable()  # nothing of the compiler's lasts long enough to be worth the search
-    for line in sys.stdin:
-        module, name, arguments = json.loads(line)
+    lines: queue.SimpleQueue[str] = queue.SimpleQueue()
+
+    def listen() -> None:
+        for line in sys.stdin:
+            lines.put(line)
+        os._exit(0)
+
+    threading.Thread(target=listen, daemon=True).start()
+    while True:
+        module, name, arguments = json.loads(lines.get())
         kernel = Kernel(module, name, arguments, 0.0)
         try:
             manifest.dispatcher(kernel).compile(manifest.signature(kernel))

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from ..phases import STARTING
 from . import protocol
 from .protocol import Link, ProtocolError
 from .shared import Region
@@ -50,6 +51,7 @@ class Child:
         wakes whoever waits
     heard : grows with every byte that arrives
     steps, preparing : the last `protocol.Alive`
+    told : phase and fraction of the last `protocol.Progress` that was taken out of `inbox`
     idle : set while no request is unanswered
     greeted : whether hands were shaken
     warm : whether it has finished a picture: everything is imported, kernels are loaded
@@ -61,6 +63,7 @@ class Child:
         self.heard = 0
         self.steps = 0
         self.preparing = False
+        self.told = (STARTING, 0.0)
         self.greeted = False
         self.warm = False
         self.idle = threading.Event()

@@ -38,7 +38,6 @@ T = TypeVar("T")
 
 _POLL = 0.04
 _CANCEL_WAIT = 0.3
-_PREPARING = "Preparing kernels"
 
 
 class EngineClient:
@@ -393,7 +392,7 @@ class EngineClient:
             item = child.inbox.get(timeout=_POLL)
         except queue.Empty:
             if child.preparing and on_progress is not None:
-                on_progress(_PREPARING, 0.0)
+                on_progress(*child.told)
             return None
         if item is None:  # see `wake`
             return None
@@ -402,8 +401,9 @@ class EngineClient:
         if isinstance(item, Exception):
             raise Lost(str(item) or type(item).__name__) from item
         if isinstance(item[0], protocol.Progress):
+            child.told = item[0].phase, item[0].fraction
             if on_progress is not None:
-                on_progress(item[0].phase, item[0].fraction)
+                on_progress(*child.told)
             return None
         if isinstance(item[0], protocol.Failed) and item[0].id == 0:
             raise Lost(f"refused a message: {item[0].problem}")

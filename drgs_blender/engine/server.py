@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import EXIT_INTERNAL, EXIT_OK, EXIT_VERSION, Cancelled, DeviceError, DrgsError
+from ..phases import PREPARING, STARTING, is_counted
 from ..version import __version__
 from . import protocol
 from .codec import CodecError, decode_frame
@@ -54,6 +55,7 @@ class Server:
         self._current = 0
         self._steps = 0
         self._preparing = 0
+        self._fraction = 0.0
         self._reported = ("", 0.0)
 
     # --- threads beside the main one -------------------------------------------------------------------------------
@@ -82,7 +84,7 @@ class Server:
         """Say regularly that the engine is there and whether it advances."""
         while True:
             time.sleep(ALIVE_SECONDS)
-            self._answer(protocol.Alive(self._steps, self._preparing > 0))
+            self._answer(protocol.Alive(self._steps, self._prepares))
 
     # --- the main thread -------------------------------------------------------------------------------------------
 
@@ -90,7 +92,7 @@ class Server:
         """Answer requests, one after the other, for ever."""
         for target in (self.listen, self.show_life):
             threading.Thread(target=target, name=f"drgs-{target.__name__}", daemon=True).start()
-        self._note_preparing(1)
+        self._note_preparing(1, STARTING)
         try:
             self._open_session()
         except Exception:
@@ -98,7 +100,7 @@ class Server:
         self._note_preparing(-1)
         while True:
             message, arrays = self._requests.get()
-            self._current = message.id
+            self._current, self._fraction, self._reported = message.id, 0.0, ("", 0.0)
             self._steps += 1
             try:
                 self._handle(message, arrays)
@@ -167,20 +169,26 @@ class Server:
     def _progress(self, phase: str, fraction: float) -> None:
         """Tell the client where the request stands, not more often than it can use."""
         self._steps += 1
+        self._fraction = min(1.0, max(0.0, float(fraction)))
         now = time.monotonic()
         last_phase, last_time = self._reported
         if phase != last_phase or now - last_time >= PROGRESS_SECONDS:
             self._reported = phase, now
-            self._answer(protocol.Progress(self._current, phase, min(1.0, max(0.0, float(fraction)))))
+            self._answer(protocol.Progress(self._current, phase, self._fraction))
 
-    def _note_preparing(self, change: int) -> None:
+    @property
+    def _prepares(self) -> bool:
+        """Whether it is no fault that a request takes long: imports, kernels that are compiled here or elsewhere."""
+        return self._preparing > 0 or is_counted(self._reported[0])
+
+    def _note_preparing(self, change: int, phase: str = PREPARING) -> None:
         """Count what cannot be interrupted: imports, kernels that are being compiled."""
         self._steps += 1
         self._preparing += change
         if change > 0:
-            self._progress("Preparing kernels", 0.0)
+            self._progress(phase, self._fraction)
         if self._preparing <= 1:
-            self._answer(protocol.Alive(self._steps, self._preparing > 0))
+            self._answer(protocol.Alive(self._steps, self._prepares))
 
     def _fail(self, request: int, error: str, subject: str, problem: str, remedy: str) -> None:
         self._answer(protocol.Failed(request, error, subject, problem, remedy))

@@ -134,7 +134,7 @@ def reconstruct(
     work = _Work(capture, settings, on_progress or (lambda _: None), cancelled or (lambda: False), folder)
     region = find_region(capture)
     grid([view.camera for view in capture.training], region, settings.mesh_resolution)  # before minutes of learning
-    prepare_kernels(("reconstruct",), lambda phase, _: work.tell(Progress(phase, 0.0)), work.cancelled)
+    prepare_kernels(("reconstruct",), lambda phase, part: work.tell(Progress(phase, part)), work.cancelled)
     if settings.minutes is not None:
         work.tell(Progress(PHASE, 0.0))
         rehearse(settings, have_silhouettes(capture), work.by, work.cancelled)

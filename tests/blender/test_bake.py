@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from scenes import new_world, part, read_exr, select, write_ball
 
+pytestmark = pytest.mark.blender_api
+
 
 @pytest.fixture
 def lit(ball, scene):
@@ -32,6 +34,7 @@ def colours(obj, name: str) -> np.ndarray:
     return values.reshape(-1, 4)
 
 
+@pytest.mark.slow
 def test_a_frame_and_an_animation_go_to_attributes_of_all_objects(lit, scene, tmp_path):
     bpy.ops.import_scene.drgs(filepath=str(write_ball(tmp_path / "two.drgs")))
     second = bpy.context.active_object

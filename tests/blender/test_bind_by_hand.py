@@ -8,6 +8,8 @@ import pytest
 from mathutils import Matrix
 from scenes import armature_object, asset_of, mesh_object, part, select, sphere, write_ball
 
+pytestmark = pytest.mark.blender_api
+
 
 def world_vertices(obj) -> np.ndarray:
     """Evaluated vertices in world space."""

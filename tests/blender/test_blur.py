@@ -8,6 +8,8 @@ import pytest
 from scenes import mesh_object, new_world, part, read_exr
 from test_composed import CUBE, SIDES, painted
 
+pytestmark = pytest.mark.blender_api
+
 WIDTH, HEIGHT = 64, 48
 blur = part("drgs_blender.engine.blur")
 

@@ -11,6 +11,8 @@ from bpy_extras.object_utils import world_to_camera_view
 from mathutils import Matrix, Vector
 from scenes import mesh_object, part, read_exr
 
+pytestmark = pytest.mark.blender_api
+
 
 def project(camera, points: np.ndarray) -> np.ndarray:
     """(n, 2) pixel positions of world points by the formula in frame.Camera."""

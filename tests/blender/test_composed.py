@@ -6,8 +6,11 @@ import math
 
 import bpy
 import numpy as np
+import pytest
 from mathutils import Vector
 from scenes import mesh_object, new_world, read_exr
+
+pytestmark = pytest.mark.blender_api
 
 SIZE, BLOCK, SEEDS = 40, 8, 4
 CUBE = [(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
@@ -67,6 +70,7 @@ def furnish(scene, ball) -> None:
     lamp(scene, "SPOT", 1, (0.3, -1.5, 0.4), shadow_soft_size=0.1).visible_camera = True
 
 
+@pytest.mark.slow
 def test_a_whole_scene_agrees_with_cycles(ball, scene):
     """Means of blocks of pixels; what differs is told from noise as bench/judge.py does."""
     furnish(scene, ball)

@@ -8,6 +8,8 @@ import pytest
 from scenes import mesh_object, new_world, part, read_exr
 from test_composed import CUBE, SIDES, lamp, painted
 
+pytestmark = pytest.mark.blender_api
+
 WIDTH, HEIGHT, BLOCK = 64, 48, 8
 
 

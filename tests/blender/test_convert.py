@@ -10,6 +10,8 @@ import pytest
 from mathutils import Matrix
 from scenes import asset_of, mesh_object, part, select, sphere
 
+pytestmark = pytest.mark.blender_api
+
 
 def columns() -> dict[str, np.ndarray]:
     """Splats on a sphere, as a PLY names them, with harmonics of degree 1."""
@@ -105,6 +107,7 @@ def test_values_are_found_in_attributes_of_every_type(scene):
     assert layout(SimpleNamespace(name="new", bl_rna=SimpleNamespace(properties=data))) == ("vector", 4)
 
 
+@pytest.mark.slow
 def test_objects_become_splats_of_blenders_own_and_come_back(ball, scene, tmp_path):
     """The numbers that a PLY of the same scene has, in the world; converted again, the same splats."""
     attributes = part("addon.splat_attributes")

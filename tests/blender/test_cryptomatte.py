@@ -13,6 +13,8 @@ from scenes import mesh_object, new_world
 from test_composed import CUBE, SIDES, painted
 from test_motion import layers_of
 
+pytestmark = pytest.mark.blender_api
+
 #: Run by the engine's Python, which has OpenEXR: texts of a file's header.
 HEADER = """
 import json, sys, OpenEXR

@@ -8,6 +8,8 @@ import pytest
 from mathutils import Matrix
 from scenes import part
 
+pytestmark = pytest.mark.blender_api
+
 SIZE = 24
 
 

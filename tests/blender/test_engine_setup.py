@@ -20,6 +20,16 @@ requirements = setup.requirements
 errors = part("drgs_blender.errors")
 
 DOCTOR = "import {0}\nprint('DR-GS can render here.')\n"
+#: Compiles nothing, and says what `drgs_blender.compute.prepare` says.
+PREPARE = """
+import sys, time
+assert sys.argv[1:] == ["--all"], sys.argv
+for i in range(4):
+    print(f"{TEXT}, {i} of 4", flush=True)
+    time.sleep(0.1)
+print("The engine is ready", flush=True)
+"""
+PREPARING = part("drgs_blender.phases").PREPARING
 
 
 def wheel(folder: Path, name: str) -> str:
@@ -35,8 +45,11 @@ def wheel(folder: Path, name: str) -> str:
 
 def engine_source(folder: Path, requirement: str, program: str) -> Path:
     """Sources of an engine with one requirement, whose `drgs doctor` is `program`."""
-    cli = folder / "drgs_blender" / "cli"
+    cli, compute = folder / "drgs_blender" / "cli", folder / "drgs_blender" / "compute"
     cli.mkdir(parents=True)
+    compute.mkdir()
+    (compute / "__init__.py").write_text("")
+    (compute / "prepare.py").write_text(f"TEXT = {PREPARING!r}\n{PREPARE}")
     extra = wheel(folder, "tinytorch")
     (folder / "pyproject.toml").write_text(
         f'[project]\nname = "small"\ndependencies = ["{requirement}"]\n'
@@ -47,14 +60,16 @@ def engine_source(folder: Path, requirement: str, program: str) -> Path:
     return folder
 
 
-def until_done(running, seconds: float = 120) -> list[float]:
-    """Poll to the end; the fractions that were seen. No poll may take long."""
+def until_done(running, seconds: float = 120, texts: list[str] | None = None) -> list[float]:
+    """Poll to the end; the fractions that were seen, and in `texts` what was said. No poll may take long."""
     fractions, end = [], time.monotonic() + seconds
     while True:
         begin = time.thread_time()
         done = running.poll()
         assert time.thread_time() - begin < 0.5
         fractions.append(running.fraction)
+        if texts is not None and running.text not in texts:
+            texts.append(running.text)
         if done:
             if running.error is not None and "Preparing pip" in str(running.error):
                 pytest.skip("no package index can be reached")
@@ -137,7 +152,7 @@ def test_another_version_of_the_engine_needs_no_network(made):
     setup.digest.cache_clear()
     assert setup.state(folder, source) == "old"
     again = setup.EngineSetup(folder, Path("/no/python/is/needed"), source)
-    assert again.fraction > 0.8
+    assert [step.text for step in again._steps] == ["Trying the engine", PREPARING]
     until_done(again)
     assert again.error is None and setup.state(folder, source) == "ready"
     assert list(folder.rglob("new.py")) and not list(folder.rglob("drgs_blender.old"))
@@ -183,6 +198,58 @@ def test_an_engine_without_reconstruction_renders_and_says_so(made, monkeypatch)
         stamp.write_text(before)
 
 
+@pytest.fixture
+def prepare(made):
+    """Function that gives the small engine another program for its kernels, until the test has ended."""
+    program = made[1] / "drgs_blender" / "compute" / "prepare.py"
+    before = program.read_text()
+
+    def write(text: str) -> None:
+        program.write_text(text)
+        setup.digest.cache_clear()
+
+    yield write
+    write(before)
+
+
+def test_kernels_come_last_and_are_counted(made):
+    folder, source = made
+    running, texts = setup.EngineSetup(folder, Path("/no/python/is/needed"), source), []
+    fractions = until_done(running, texts=texts)
+    assert running.error is None and not running.remark
+    counted = [text for text in texts if text.startswith(f"{PREPARING}, ")]
+    assert counted == [f"{PREPARING}, {i} of 4" for i in range(4)] and texts[-1] == "Ready"
+    assert fractions == sorted(fractions) and len(set(fractions)) > 4
+
+
+def test_kernels_that_cannot_be_compiled_are_named_and_the_engine_works(made, prepare):
+    folder, source = made
+    prepare("raise SystemExit('error: the compiler is tired')")
+    running = setup.EngineSetup(folder, Path("/no/python/is/needed"), source)
+    assert until_done(running)[-1] == 1
+    assert running.error is None and running.text == "Ready" and setup.state(folder, source) == "ready"
+    assert running.remark.startswith(f"{PREPARING} failed: error: the compiler is tired. ")
+    assert "setup.log" in running.remark
+
+
+def test_cancelled_among_its_kernels_the_engine_works(made, prepare, monkeypatch):
+    folder, source = made
+    prepare(f"import time\nprint('{PREPARING}, 1 of 2', flush=True)\ntime.sleep(600)")
+    running = setup.EngineSetup(folder, Path("/no/python/is/needed"), source)
+    end = time.monotonic() + 60
+    while not running.text.endswith("1 of 2"):
+        assert not running.poll() and time.monotonic() < end, running.text
+        time.sleep(0.02)
+    assert setup.state(folder, source) == "ready"
+    process, begin = running._process, time.monotonic()
+    monkeypatch.setattr(job, "job", running)
+    assert bpy.ops.drgs.engine_setup_cancel() == {"FINISHED"}
+    assert time.monotonic() - begin < 2 and process.poll() is not None and running.done and running.error is None
+    assert setup.state(folder, source) == "ready"
+    said = [m.text for m in part("addon.messages").history]
+    assert said[-2:] == [f"The engine is set up in {folder}", "What is missing is compiled when it is first used"]
+
+
 def test_an_engine_that_does_not_work_is_not_ready(made):
     folder, source = made
     program = source / "drgs_blender" / "cli" / "main.py"
@@ -221,6 +288,7 @@ def test_a_python_that_is_none_is_named(tmp_path):
     assert running.done and "no-python" in str(running.error)
 
 
+@pytest.mark.slow
 def test_an_index_that_does_not_answer_is_told_from_a_package_that_is_not_there(tmp_path, monkeypatch):
     """What pip says last is the same for both."""
     monkeypatch.setenv("PIP_RETRIES", "1")

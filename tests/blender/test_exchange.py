@@ -10,6 +10,8 @@ import pytest
 from mathutils import Matrix
 from scenes import part, read_exr, write_exr
 
+pytestmark = pytest.mark.blender_api
+
 
 def imported(operator, path: Path) -> list:
     """What an importer of Blender adds to the scene."""

@@ -11,6 +11,8 @@ import pytest
 from mathutils import Matrix
 from scenes import armature_object, mesh_object, part, sphere
 
+pytestmark = pytest.mark.blender_api
+
 errors = part("drgs_blender.errors")
 
 

@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from scenes import ROOT, asset_of, part, read_exr, select, sphere, write_ball
 
+pytestmark = pytest.mark.blender_api
+
 
 def channel(mesh, name):
     return part("addon.mesh_arrays").read_channel(mesh, name)
@@ -181,6 +183,7 @@ def test_surfels_become_an_asset_and_an_object(scene, tmp_path):
     assert (tmp_path / "toy.drgs").read_bytes() == before
 
 
+@pytest.mark.slow
 def test_a_file_that_is_imported_again_is_another_object(scene, tmp_path):
     """What the first is made of stays, and what another .blend may be made of."""
     splats = few_splats(tmp_path / "toy.ply")

@@ -15,6 +15,8 @@ import pytest
 from bl_ui.utils import PresetPanel
 from scenes import PACKAGE, ROOT, part
 
+pytestmark = pytest.mark.blender_api
+
 
 def test_extension_is_enabled_from_the_zip():
     assert PACKAGE in bpy.context.preferences.addons

@@ -8,6 +8,8 @@ import pytest
 from mathutils import Matrix
 from scenes import part
 
+pytestmark = pytest.mark.blender_api
+
 
 def lamp(scene, kind: str, name: str = "Lamp", **values) -> bpy.types.Object:
     """A light object in the scene, its data set to `values`."""

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from scenes import mesh_object, part, select, sphere, write_ball
 
+pytestmark = pytest.mark.blender_api
+
 CHANNELS = ("albedo", "roughness", "metallic")
 
 

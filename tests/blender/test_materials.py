@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from scenes import mesh_object, part, read_exr, sphere
 
+pytestmark = pytest.mark.blender_api
+
 
 def material(name: str = "Material") -> tuple[bpy.types.NodeTree, bpy.types.Node]:
     """A material; returns its tree and Principled BSDF."""

@@ -85,6 +85,7 @@ def test_frames_are_played_in_any_order_by_any_blender(body, scene, captured, tm
     np.testing.assert_array_equal(np.load(moved / "found.npy"), baked[4])
 
 
+@pytest.mark.slow
 def test_a_bake_is_stopped_at_once_and_goes_on(body, scene):
     matter = body.drgs.matter
     wanted = matter.frame_end = 500_000

@@ -65,6 +65,7 @@ def test_a_disk_that_is_full_before_anything_is_computed_is_no_end_of_blender(bo
     assert whole(cache_of(body)) == [1, 2, 3]
 
 
+@pytest.mark.slow
 def test_a_program_that_is_killed_leaves_its_frames_and_the_next_goes_on(body, scene):
     matter = body.drgs.matter
     matter.frame_end, matter.gravity, matter.spin = 500_000, 0.0, (0, 0, 3)

@@ -11,6 +11,7 @@ from matter_scenes import FRAMES, PATIENCE, cache_of, work, world
 from scenes import part, select
 
 
+@pytest.mark.slow
 def test_all_selected_objects_are_baked_one_after_another(body, scene, tmp_path):
     """One that cannot be is named, and does not keep the others from it."""
     first, second, third, plain = body, body.copy(), body.copy(), body.copy()
@@ -50,6 +51,7 @@ class Window(SimpleNamespace):
         super().__init__(scene=scene, window=object(), window_manager=manager, workspace=workspace)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", ["all", "without the second", "escape", "a loaded file"])
 def test_a_bake_that_waits_says_so_and_can_be_cancelled(body, scene, monkeypatch, ending):
     """The operator's own steps, on a window that stands in for Blender's: there is none in the background."""

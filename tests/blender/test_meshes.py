@@ -8,6 +8,8 @@ import pytest
 from mathutils import Matrix
 from scenes import mesh_object, part, sphere
 
+pytestmark = pytest.mark.blender_api
+
 CUBE = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float32)
 QUADS = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
 

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from scenes import armature_object, mesh_object, part, sphere
 
+pytestmark = pytest.mark.blender_api
+
 #: Turns the layers of an EXR file into arrays, in the engine's interpreter, which has OpenEXR.
 READ = """
 import sys

@@ -11,6 +11,8 @@ import bpy
 import pytest
 from scenes import PACKAGE, armature_object, mesh_object, new_world, part, select
 
+pytestmark = pytest.mark.blender_api
+
 FUNCTIONS = bpy.types.UILayout.bl_rna.functions
 PROPERTIES = bpy.types.UILayout.bl_rna.properties
 

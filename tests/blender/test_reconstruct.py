@@ -51,6 +51,7 @@ def photographs(tmp_path):
     return folder
 
 
+@pytest.mark.slow
 def test_photographs_become_an_object(scene, photographs, tmp_path):
     assert bpy.ops.drgs.reconstruct(filepath=str(photographs), minutes=0.1, use_environment=True) == {"FINISHED"}
     obj = bpy.context.active_object
@@ -69,6 +70,7 @@ def test_photographs_become_an_object(scene, photographs, tmp_path):
     assert preview.image_size[0] == 2 * preview.image_size[1]
 
 
+@pytest.mark.slow
 def test_without_a_window_the_terminal_shows_how_far_it_is(scene, photographs, monkeypatch, capsys):
     monkeypatch.setattr(part("operators.program"), "_TELL_EVERY", 0.2)
     assert bpy.ops.drgs.reconstruct(filepath=str(photographs), minutes=0.1, use_materials=False) == {"FINISHED"}
@@ -98,6 +100,7 @@ def test_what_is_no_capture_is_said(scene, tmp_path):
     assert reconstruction.job is None
 
 
+@pytest.mark.slow
 def test_the_convention_that_a_message_names_can_be_chosen(scene, photographs):
     """Matrices of OpenCV: refused with the name of the choice, which is one of the operator's and then serves."""
     choices = bpy.ops.drgs.reconstruct.get_rna_type().properties["axes"].enum_items

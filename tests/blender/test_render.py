@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 from scenes import PACKAGE, ROOT, new_world, part, read_exr
 
+pytestmark = pytest.mark.blender_api
+
 link = part("addon.engine_link")
 errors = part("drgs_blender.errors")
 

@@ -11,6 +11,8 @@ import pytest
 from mathutils import Euler, Matrix
 from scenes import armature_object, part, select, write_exr
 
+pytestmark = pytest.mark.blender_api
+
 
 @pytest.fixture
 def light(tmp_path) -> Path:

@@ -12,6 +12,8 @@ import pytest
 from mathutils import Matrix, Vector
 from scenes import mesh_object, new_world, part, read_exr
 
+pytestmark = pytest.mark.blender_api
+
 PLANE = [(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)]
 
 

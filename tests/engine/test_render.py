@@ -103,6 +103,7 @@ def test_progress_is_told_on_the_calling_thread_and_grows(client, make_frame):
     assert len({phase for _, phase, _ in told}) >= 2
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize("delay", [0.0, 0.3, 1.0])
 def test_cancel_is_quick_and_the_engine_goes_on(client, make_frame, expected, delay):
     client.render(make_frame())
@@ -121,6 +122,7 @@ def test_cancel_is_quick_and_the_engine_goes_on(client, make_frame, expected, de
     assert client.pid == pid
 
 
+@pytest.mark.alone
 @posix
 def test_engine_that_does_not_obey_is_ended(client, make_frame, expected):
     client.render(make_frame())
@@ -135,6 +137,7 @@ def test_engine_that_does_not_obey_is_ended(client, make_frame, expected):
     assert client.pid != pid
 
 
+@pytest.mark.slow
 @posix
 def test_killed_engine_is_replaced_and_the_picture_is_the_same(client, make_frame, expected):
     for _ in range(3):
@@ -152,6 +155,7 @@ def test_engine_killed_again_and_again_is_an_error(client, make_frame, expected)
     assert_same_bits(client.render(make_frame(0.2)), expected)
 
 
+@pytest.mark.slow
 @posix
 @pytest.mark.parametrize("restarts", [0, 1] * (5 if os.environ.get("DRGS_FAULTS") == "whole" else 1))
 def test_stopped_engine_meets_the_deadline(make_client, make_frame, asset_path, expected, restarts):
@@ -291,6 +295,7 @@ def test_engine_outlives_the_thread_that_started_it(make_client, make_frame, ass
     assert client.pid == pid
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
 def test_engines_that_come_and_go_leave_no_thread_and_no_file_behind(client, make_frame):
     def held():

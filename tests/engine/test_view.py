@@ -265,6 +265,7 @@ def test_new_engine_begins_the_view_again(client, make_frame):
     assert client.view("A", frame, go_on=True).statistics["view.fraction"] > 0.0
 
 
+@pytest.mark.alone
 def test_newer_frame_interrupts_within_tens_of_milliseconds(client, make_frame):
     """From the moment something newer is there until the engine is free, with `wake`; median of some."""
     endless = make_frame(size=(400, 300), rays=4096)

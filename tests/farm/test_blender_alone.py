@@ -250,6 +250,7 @@ picture(4, "after.exr")
 """
 
 
+@pytest.mark.slow
 @linux
 def test_extension_may_be_switched_off_while_it_renders(folder, tmp_path):
     out = tmp_path / "out"

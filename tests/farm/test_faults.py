@@ -31,6 +31,7 @@ def start(folder: Path, out: Path, frames: str, *options: str, scratch: Path | N
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
 
 
+@pytest.mark.slow
 def test_full_disk_gives_no_frame_and_the_frame_once_there_is_room(drgs, folder, small_disk):
     disk = small_disk("size=16k")
     (disk / "filler").write_bytes(bytes(16 << 10))
@@ -120,6 +121,7 @@ def test_asset_that_is_copied_over_in_place_gives_the_job_back(folder, tmp_path)
     assert not list((tmp_path / "out").iterdir())
 
 
+@pytest.mark.slow
 def test_memory_that_does_not_do_gives_the_frame_back(drgs, folder, tmp_path):
     job = ("render", folder / "large.blend", "--frames", "1", "--rays", "4", "--passes", "all")
     code, lines, error = drgs(*job, "--memory-mb", 256, "--out", tmp_path / "####.exr")
@@ -129,6 +131,7 @@ def test_memory_that_does_not_do_gives_the_frame_back(drgs, folder, tmp_path):
     assert code == 0, error
 
 
+@pytest.mark.slow
 def test_unfinished_frames_of_killed_writers_go(drgs, folder, tmp_path):
     """Those of the same job that nobody adds to; other files stay, and those of a node whose clock is ahead."""
     names = [".a_0007.exr.x1.tmp", ".a_0001.exr.x2.tmp", ".b_0001.exr.x3.tmp", "notes.tmp", ".a_0002.exr.x4.tmp"]
@@ -156,6 +159,7 @@ print(double(21), *double.stats.cache_hits.values())
 """
 
 
+@pytest.mark.slow
 def test_kernels_are_compiled_where_they_cannot_be_kept_or_read(small_disk, tmp_path):
     """A full disk; and files that a node left empty or cut off when it lost its power."""
     program = tmp_path / "kernel.py"
@@ -205,6 +209,7 @@ def test_killed_blender_gives_the_job_back_and_takes_the_engine_along(folder, tm
     assert not list(scratch.iterdir()) and set(os.listdir("/dev/shm")) <= shared
 
 
+@pytest.mark.slow
 def test_two_jobs_on_one_folder_do_not_disturb_each_other(drgs, folder, tmp_path):
     alone, both = tmp_path / "alone", tmp_path / "both"
     assert drgs("render", folder / "shot.blend", "--frames", "1-3", "--out", alone / "####.exr", "--rays", 4)[0] == 0

@@ -21,6 +21,7 @@ pytest.importorskip("openjd.cli")
 OPENJD = [str(Path(sys.executable).with_name("openjd"))]
 
 
+@pytest.mark.slow
 def test_bundle_renders_and_denoises_what_one_machine_does(drgs, folder, tmp_path):
     studio, node = tmp_path / "studio", tmp_path / "node"
     studio.mkdir()
@@ -62,6 +63,7 @@ for word; do case $word in --frames=*) echo "$1 ${{word#*=}}" >>{log}; sleep 0.5
 """
 
 
+@pytest.mark.slow
 def test_schedulers_adapt_chunks_and_every_frame_is_made_once(drgs, tmp_path):
     (tmp_path / "a.blend").touch()
     program, log = tmp_path / "drgs.sh", tmp_path / "log"

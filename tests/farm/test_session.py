@@ -87,6 +87,7 @@ def test_chunks_share_blender_and_engine_and_have_the_same_bits(drgs, folder, wa
     assert all_gone(used, 5) and sorted(p.name for p in warm.iterdir() if "-" in p.name or p.suffix) == []
 
 
+@pytest.mark.slow
 def test_what_fails_has_its_code_and_the_session_goes_on(folder, warm, tmp_path, small_disk):
     scene, out = folder / "relative.blend", tmp_path / "out"
     code, lines, errors = told(folder / "blind.blend", out, warm, "1")
@@ -99,6 +100,7 @@ def test_what_fails_has_its_code_and_the_session_goes_on(folder, warm, tmp_path,
     assert told(scene, out, warm, "1")[0] == 0
 
 
+@pytest.mark.slow
 def test_scene_saved_anew_is_opened_anew(folder, warm, tmp_path):
     scene = tmp_path / "scene.blend"
     (tmp_path / "tile.drgs").write_bytes((folder / "tile.drgs").read_bytes())
@@ -110,6 +112,7 @@ def test_scene_saved_anew_is_opened_anew(folder, warm, tmp_path):
     assert shapes == [(24, 32, 4), (480, 640, 4)]
 
 
+@pytest.mark.slow
 def test_dead_blender_or_engine_costs_nothing_afterwards(folder, warm, tmp_path):
     scene = folder / "relative.blend"
     assert told(scene, tmp_path / "out", warm, "1")[0] == 0
@@ -118,6 +121,7 @@ def test_dead_blender_or_engine_costs_nothing_afterwards(folder, warm, tmp_path)
     assert told(scene, tmp_path / "out", warm, "2-3")[0] == 0
 
 
+@pytest.mark.slow
 def test_dead_session_gives_the_chunk_back_and_the_next_one_renders_by_itself(folder, warm, tmp_path):
     scene, out = folder / "relative.blend", tmp_path / "out"
     process = long_chunk(folder, out, warm)
@@ -130,6 +134,7 @@ def test_dead_session_gives_the_chunk_back_and_the_next_one_renders_by_itself(fo
     assert told(scene, out, warm, "1")[0] == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
 def test_task_that_is_ended_takes_its_frame_along(folder, warm, tmp_path, how):
     process = long_chunk(folder, tmp_path / "out", warm)
@@ -148,6 +153,7 @@ def test_task_that_is_ended_takes_its_frame_along(folder, warm, tmp_path, how):
     assert not list((tmp_path / "out").iterdir())
 
 
+@pytest.mark.slow
 def test_session_that_hangs_is_ended_and_the_chunk_given_back(folder, warm, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(session_link, "SILENT_SECONDS", 3.0)
     assert told(folder / "relative.blend", tmp_path / "out", warm, "1")[0] == 0
@@ -160,6 +166,7 @@ def test_session_that_hangs_is_ended_and_the_chunk_given_back(folder, warm, tmp_
     assert all_gone(all_of_it, 5) and not session_link.is_running(warm)
 
 
+@pytest.mark.slow
 def test_request_that_is_lost_is_given_back(folder, warm, tmp_path):
     process = long_chunk(folder, tmp_path / "out", warm)
     assert process.stdout.readline().startswith("Fra:1")
@@ -169,6 +176,7 @@ def test_request_that_is_lost_is_given_back(folder, warm, tmp_path):
     assert process.returncode == 75 and "Try again" in errors
 
 
+@pytest.mark.slow
 def test_frames_are_denoised_by_the_warm_process(drgs, folder, warm, tmp_path, monkeypatch):
     noisy, here, there = (tmp_path / name / "####.exr" for name in ("noisy", "here", "there"))
     options = ("--rays", 4, "--denoise", "none", "--passes", "temporal")
@@ -183,6 +191,7 @@ def test_frames_are_denoised_by_the_warm_process(drgs, folder, warm, tmp_path, m
     assert all(path.read_bytes() == (there.parent / path.name).read_bytes() for path in here.parent.iterdir())
 
 
+@pytest.mark.slow
 def test_session_ends_without_its_folder_its_farm_or_work(tmp_path):
     start = [*PROGRAM.split(), "session", "start"]
     places = [tmp_path / name for name in ("folder", "farm", "work")]

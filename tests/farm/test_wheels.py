@@ -51,6 +51,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_the_wheel_holds_the_whole_package_and_works_without_a_checkout(source, tmp_path):
     wheels = tmp_path / "wheels"
     pip("wheel", source, "--no-deps", "--wheel-dir", wheels)

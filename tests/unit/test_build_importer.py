@@ -106,6 +106,7 @@ def test_proxy_closes_an_open_capture_instead_of_carving_its_inside():
     assert solid.volume == pytest.approx(4 / 3 * np.pi - cap, rel=0.08)
 
 
+@pytest.mark.slow
 def test_import_without_a_mesh_builds_and_binds_one(shared_data):
     asset = import_asset(shared_data / "splats/playbot_lod3_2scale_sh2.ply", resolution=64)
     solid = trimesh.Trimesh(asset.mesh.vertices, asset.mesh.faces, process=False)

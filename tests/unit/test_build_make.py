@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from drgs_blender.build.make import make_asset, mesh_with_materials
+from drgs_blender.build.make import _Looked, _net, make_asset, mesh_with_materials
 from drgs_blender.build.texture import Materials, Pyramid
-from drgs_blender.build.topology import Net, close_marks, edge_lengths, edges, subdivide, weld
+from drgs_blender.build.topology import Net, close_marks, edge_lengths, edges, subdivide, survivors, weld
 from drgs_blender.errors import AssetError
 from drgs_blender.formats.files import Image, MaterialFile, MeshFile
 
@@ -146,6 +146,29 @@ def test_subdivision_stays_watertight_and_shapely(seed):
     assert mesh.face_angles.min() > 0.45 * smallest
 
 
+def test_what_a_division_leaves_is_known_and_looked_up_once():
+    """Errors of a divided net are to the bit those of one that was never seen before."""
+    rng = np.random.default_rng(3)
+    pixels = rng.random((64, 64, 3)).astype(np.float32)
+    file = plane(6, Image(pixels, srgb=False), vertex_roughness=np.linspace(0, 1, 49).astype(np.float32))
+    materials = Materials(file.materials)
+    net = _net(file, "plane", {"notes": []})
+    looked, known = _Looked(net, materials), 0
+    for _ in range(5):
+        edge, count = edges(net)
+        marked = close_marks(edge, edge_lengths(net), rng.random(count) < 0.03)
+        kept, before = survivors(net, edge, marked), net
+        net = subdivide(net, edge, marked)
+        rows = np.flatnonzero(kept >= 0)
+        known += len(rows)
+        assert len(kept) == len(net.faces) and len(rows) < len(kept)
+        for name in ("faces", "uvs", "tags"):
+            np.testing.assert_array_equal(getattr(net, name)[rows], getattr(before, name)[kept[rows]])
+        looked = _Looked(net, materials, looked, kept)
+        np.testing.assert_array_equal(looked.errors, _Looked(net, materials).errors)
+    assert known and looked.errors.max() > 0.1
+
+
 def test_no_crack_opens_between_vertices_that_share_a_place():
     cube = trimesh.creation.box()
     vertices, faces = cube.vertices[cube.faces].reshape(-1, 3), np.arange(36).reshape(-1, 3)
@@ -207,6 +230,7 @@ def test_y_up_files_are_turned_and_vertex_materials_win():
     assert asset.binding is not None and asset.provenance["report"]["surfels"]["surfels"] == len(asset.surfels)
 
 
+@pytest.mark.slow
 def test_textured_cat_keeps_its_picture(shared_data):
     asset = make_asset(shared_data / "meshes/pbr/egyptian_cat.glb", max_triangles=20_000)
     report = asset.provenance["report"]

@@ -626,6 +626,7 @@ def test_the_memory_counted_for_a_pixel_is_what_learning_keeps_of_it(tmp_path, m
     assert sum(held.values()) == BYTES_A_PIXEL * captures.WIDTH * captures.HEIGHT * len(capture.views)
 
 
+@pytest.mark.slow
 def test_real_captures(shared_data):
     head = read_capture(shared_data / "multiview" / "ethiopianHead_1000", resolution=64, test_every=8)
     assert (len(head.training), len(head.testing)) == (57, 9)

@@ -92,6 +92,7 @@ def files(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
 
 
+@pytest.mark.slow
 def test_chunks_give_the_same_files(denoise, tmp_path):
     """One run, runs of one, of three and of four, downwards, with other threads: not a byte differs."""
     code, lines, _ = denoise(f"1-{FRAMES}")

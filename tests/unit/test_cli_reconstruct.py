@@ -39,6 +39,7 @@ def command(photographs: Path, out: Path, *options: str) -> list[str]:
     return [*program, "--surfels", "400", "--voxels", "24", *options]
 
 
+@pytest.mark.slow
 def test_a_terminal_shows_a_bar_and_no_lines_for_programs(photographs, tmp_path):
     import pty
 
@@ -59,6 +60,7 @@ def test_a_terminal_shows_a_bar_and_no_lines_for_programs(photographs, tmp_path)
     assert "materials got" in text and "materials in the light that was found, pixels learned from: PSNR" in text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)], ids=["SIGINT", "SIGTERM"])
 def test_a_run_that_is_stopped_early_goes_on(photographs, tmp_path, number, code):
     words = command(photographs, tmp_path / "a.drgs", "--iterations", "1000000", "-v")

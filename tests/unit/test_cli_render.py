@@ -51,6 +51,7 @@ def column(path: Path) -> float:
     return float(coverage.sum(axis=0) @ (np.arange(coverage.shape[1]) + 0.5) / coverage.sum())
 
 
+@pytest.mark.slow
 def test_renders_evaluated_frames_and_resumes(render, tmp_path):
     options = ("--passes", "Coverage,Depth", "--primary", "mesh")
     code, lines, _ = render(*options)
@@ -80,6 +81,7 @@ def test_renders_evaluated_frames_and_resumes(render, tmp_path):
     assert column(paths[2]) > column(paths[1]) > column(paths[0])
 
 
+@pytest.mark.slow
 def test_other_settings_are_rendered_again(render, tmp_path):
     path = tmp_path / "0002.exr"
     render(frames="2")
@@ -91,6 +93,7 @@ def test_other_settings_are_rendered_again(render, tmp_path):
     assert np.array_equal(read_frame(path)[0]["Combined"], after)
 
 
+@pytest.mark.slow
 def test_blur_is_rendered_skipped_and_made_again(render, tmp_path):
     """The shutter is open over half a frame in which the tile moves, and the lens is wide."""
 
@@ -151,6 +154,7 @@ def test_job_that_is_killed_leaves_no_folder(folder, tmp_path):
     assert not list(scratch.glob("drgs-*"))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="there are no such signals there")
 def test_blender_that_stops_answering_is_ended(folder, monkeypatch):
     monkeypatch.setattr(blender_process, "SILENT_SECONDS", 7.0)
@@ -223,6 +227,7 @@ def engines_of(process: subprocess.Popen) -> list[int]:
     return [pid for pid, command in children(process.pid).items() if "drgs_blender.engine" in command]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="finds the engine in /proc")
 @pytest.mark.parametrize(("deaths", "code"), [(1, 0), (2, 0), (3, 75)])
 def test_engine_killed_in_the_middle_of_a_frame_costs_no_pixel(render, folder, tmp_path, deaths, code):
@@ -254,6 +259,7 @@ def test_engine_killed_in_the_middle_of_a_frame_costs_no_pixel(render, folder, t
         assert np.array_equal(calm, shaken)
 
 
+@pytest.mark.slow
 def test_a_frame_that_takes_too_long_is_given_back(render, tmp_path):
     options = ("--rays", "65536", "--noise-threshold", "0", "--timeout", "4")
     code, lines, errors = render(*options, scene="large.blend", frames="1")

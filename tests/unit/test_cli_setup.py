@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import shutil
 import stat
 import sys
 from pathlib import Path
@@ -16,6 +17,7 @@ ROOT = Path(__file__).resolve().parents[2]
 @pytest.fixture
 def dev(monkeypatch, tmp_path):
     """The script as a module, working in a folder of its own."""
+    monkeypatch.syspath_prepend(str(ROOT / "tools"))
     spec = importlib.util.spec_from_file_location("drgs_dev", ROOT / "tools" / "dev.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -23,10 +25,11 @@ def dev(monkeypatch, tmp_path):
     return module
 
 
-def test_script_needs_the_standard_library_alone(dev):
-    source = (ROOT / "tools" / "dev.py").read_text()
+@pytest.mark.parametrize("name", ["dev.py", "suites.py"])
+def test_scripts_need_the_standard_library_alone(name):
+    source = (ROOT / "tools" / name).read_text()
     imported = {line.split()[1].split(".")[0] for line in source.splitlines() if line.startswith(("import ", "from "))}
-    assert imported <= {*sys.stdlib_module_names, "__future__"}
+    assert imported <= {*sys.stdlib_module_names, "__future__", "suites"}
 
 
 def test_missing_library_is_named_with_its_package(dev, tmp_path):
@@ -63,48 +66,65 @@ def fake_environment(dev, folder: Path, calls: list, broken: str = "never") -> N
     python.chmod(python.stat().st_mode | stat.S_IXUSR)
 
 
-def suite(dev, tmp_path: Path, text: str):
-    """Tally after one folder of tests."""
-    (tmp_path / "tests").mkdir()
-    (tmp_path / "tests" / "test_it.py").write_text(text)
-    tally = dev.Tally()
-    tally.pytest("it", Path(sys.executable), "tests")
-    return tally
-
-
-def test_every_folder_of_tests_is_run(dev, monkeypatch):
-    """Those that need a window where there is one, or when they are asked for."""
-    run = []
+@pytest.fixture
+def plans(dev, monkeypatch):
+    """Function that runs a command of the script; returns the plan that it made."""
+    made = []
     monkeypatch.setattr(dev, "no_window", lambda: "there is none")
-    monkeypatch.setattr(dev, "ensure_engine", lambda: None)
-    monkeypatch.setattr(dev, "ensure_blender", lambda version="": None)
-    monkeypatch.setattr(dev.Tally, "check", lambda *_: None)
-    monkeypatch.setattr(dev.Tally, "pytest", lambda self, title, python, *folders, **_: run.extend(folders))
-    assert dev.main(["test"]) == 0
+    monkeypatch.setattr(dev, "ensure_engine", lambda: Path("python"))
+    monkeypatch.setattr(dev, "ensure_blender", lambda version="": Path("python"))
+    monkeypatch.setattr(dev, "ensure_node", lambda: None)
+    monkeypatch.setattr(dev.suites, "run", lambda plan, *_: made.append(plan) or 0)
+    shutil.copytree(ROOT / "tests", dev.ROOT / "tests", ignore=shutil.ignore_patterns("__pycache__"))
+
+    def plan(*words):
+        assert dev.main(words) == 0
+        return made.pop()
+
+    return plan
+
+
+def commands(dev, plan, tmp_path):
+    """Suite -> what its jobs run, with the files to collect last."""
+    python = {name: lambda: Path("python") for name in dev.SUITES}
+    jobs = dev.suites.jobs(plan, dev.SUITES, python, dev.ROOT, tmp_path / "reports")
+    return {job.title: " ".join(command) for job in jobs for command in job.commands}
+
+
+def test_every_folder_of_tests_is_run(dev, plans, tmp_path):
+    """Those that need a window where there is one, or when they are asked for."""
     there = {f"tests/{path.parent.name}" for path in (ROOT / "tests").glob("*/test_*.py")}
-    assert set(run) == there - {"tests/ui"} and "tests/farm" in run
-    dev.main(["test", "window"])
-    assert set(run) == there
+    for word in ("test", "check"):
+        run = " ".join(commands(dev, plans(word), tmp_path).values())
+        assert {folder for folder in there if folder in run} == there - {"tests/ui"}
+    assert "tests/ui" in commands(dev, plans("check", "window"), tmp_path)["a window"]
 
 
-def test_counts_are_summed(dev, tmp_path, capfd):
-    text = "import pytest\ndef test_a(): pass\ndef test_b(): assert 0\n@pytest.mark.skip\ndef test_c(): pass\n"
-    assert suite(dev, tmp_path, text).finish() == 1
-    assert capfd.readouterr().out.splitlines()[-1] == "1 passed, 1 failed, 1 skipped"
+def test_what_test_leaves_is_all_that_the_rest_of_check_runs(dev, plans, tmp_path):
+    """Nothing twice, nothing never: the parts of each suite, and Blender's floor as a whole."""
+    fast, rest, whole = (commands(dev, plans(*words), tmp_path) for words in (["test"], ["check", "--rest"], ["check"]))
+    assert fast.keys() | rest.keys() == whole.keys() and fast.keys() & rest.keys() == fast.keys() - {"lint"}
+    for title in fast.keys() - {"lint"}:
+        assert "--part=fast" in fast[title] and "--part=slow" in rest[title]
+    assert {title for title in rest if "--part=all" in rest[title]} == {f"Blender {dev.BLENDER_FLOOR}"} | {
+        f"Blender {dev.BLENDER_FLOOR}, alone"
+    } & set(rest)
+    assert all("--part=all" in command for title, command in whole.items() if title != "lint")
+    for title in ("engine", "farm", f"Blender {dev.BLENDER}"):
+        assert "--lane=shared" in whole[title]
+    assert "--lane=alone" in whole["engine, alone"]
 
 
-def test_a_suite_without_tests_has_not_passed(dev, tmp_path):
-    assert suite(dev, tmp_path, "x = 1\n").finish() == 1
-
-
-def test_a_suite_that_passes_passes(dev, tmp_path):
-    assert suite(dev, tmp_path, "def test_a(): pass\n").finish() == 0
-
-
-def test_a_suite_that_hangs_is_ended_with_its_children(dev, tmp_path, monkeypatch):
-    monkeypatch.setattr(dev, "TEST_SECONDS", 2)
-    text = (
-        "import subprocess, sys\ndef test_a(): subprocess.run([sys.executable, '-c', 'import time; time.sleep(60)'])\n"
-    )
-    tally = suite(dev, tmp_path, text)
-    assert tally.wrong == ["it"] and tally.finish() == 1
+def test_words_choose_suites_files_and_tests(dev, plans, tmp_path):
+    assert plans("test", "engine", "farm").suites == ["engine", "farm"]
+    plan = plans("test", "engine", "-k", "farm or window", "-x")
+    assert plan.suites == ["engine"] and plan.options == ["-k", "farm or window", "-x"]
+    assert plans("test", "-k", "lint").suites == ["blender", "farm", "engine"]
+    chosen = commands(dev, plans("test", "tests/blender/test_panels.py"), tmp_path)
+    assert [*chosen] == [f"Blender {dev.BLENDER}"] and "--part=fast" in next(iter(chosen.values()))
+    chosen = commands(dev, plans("test", "tests/unit/test_light.py::test_it"), tmp_path)
+    assert "--part=all" in chosen["engine"], "a test that is named is run, slow or not"
+    chosen = commands(dev, plans("test", "tests"), tmp_path)
+    assert chosen["engine"].endswith(" tests/unit tests/engine") and chosen["farm"].endswith(" tests/farm")
+    assert dev.main(["test", "enigne"]) == 1
+    assert dev.main(["test", "-x", "tests/unit/test_light.py"]) == 1

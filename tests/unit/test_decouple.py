@@ -408,6 +408,7 @@ def arrays(found: Decoupled) -> list[np.ndarray]:
     return [found.albedo, found.roughness, found.metallic, found.environment, found.normals]
 
 
+@pytest.mark.slow
 def test_materials_and_light_are_found_again(ball, capture):
     found = decouple(capture, ball, Settings(iterations=250, pixels=512, environment=16, smoothness=0.002, seed=3))
     scale = (found.albedo * ball.albedo).sum(0) / (found.albedo**2).sum(0)
@@ -592,6 +593,7 @@ def test_normals_are_turned_towards_the_true_ones_once_light_is_known(ball, capt
     assert decouple(capture, wrong, replace(settings, iterations=3)).normals == pytest.approx(smooth, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_normals_that_others_tell_stand_in_for_those_of_a_poor_mesh(ball, capture):
     """A ball with bumps that the photographed one has not; who tells knows the ball. Nonsense is not believed."""
     bumps = 1 + 0.1 * np.sin(6 * ball.vertices).prod(axis=1, keepdims=True)

@@ -43,6 +43,7 @@ def made(works: tuple[object, ...], launcher: Launcher, folder: Path) -> set[obj
     return found
 
 
+@pytest.mark.slow
 def test_pictures_kernels_compile_for_a_card(tmp_path: Path) -> None:
     device = OnDevice("cpu")
     asset = test_device_deform.driven()
@@ -63,6 +64,7 @@ def test_pictures_kernels_compile_for_a_card(tmp_path: Path) -> None:
     assert not device.failed
 
 
+@pytest.mark.slow
 def test_learnings_kernels_compile_for_a_card(tmp_path: Path) -> None:
     pytest.importorskip("torch")
     import test_device_gather
@@ -81,6 +83,7 @@ def test_learnings_kernels_compile_for_a_card(tmp_path: Path) -> None:
     assert made(tuple(works), device.launcher, tmp_path) == works
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ["all", "vortex"])
 def test_particles_kernels_compile_for_a_card(tmp_path: Path, case: str) -> None:
     launcher = Launcher("cpu")

@@ -369,6 +369,7 @@ def test_nothing_of_this_process_meets_what_is_on_a_device(
     assert set(asked) >= {kernels.SUM_PIXELS, losses.ROWS, DESCEND}
 
 
+@pytest.mark.slow
 def test_an_asset_is_learned_on_the_device_asked_for(
     capture: Capture, there: OnDevice, monkeypatch: pytest.MonkeyPatch
 ) -> None:

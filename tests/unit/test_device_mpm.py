@@ -209,6 +209,7 @@ def test_momentum_is_kept_on_a_device(launcher: Launcher) -> None:
         assert np.abs(a - b).max() < 1e-5 * size
 
 
+@pytest.mark.slow
 def test_a_frame_has_the_same_bits_twice_and_goes_on_from_its_state(launcher: Launcher) -> None:
     once, twice, later = (on(CASES["all"](), launcher) for _ in range(3))
     once.advance(FRAME, pins_of(once))

@@ -83,6 +83,7 @@ def test_objects_lie_in_the_unit_sphere_and_span_matte_to_mirror(name):
     assert name in OBJECTS
 
 
+@pytest.mark.slow
 def test_the_capture_is_one_that_any_reader_takes(scenes):
     capture = read_capture(scenes / "spot")
     assert (len(capture.training), len(capture.testing)) == (3, 2)
@@ -96,6 +97,7 @@ def keys_of(report: object) -> set[str]:
     return set(report if isinstance(report, dict) else ()).union(*map(keys_of, inner))
 
 
+@pytest.mark.slow
 def test_the_true_object_scores_as_true(scenes, tmp_path, capsys):
     write_asset(tmp_path / "true.drgs", true_asset(scenes / "spot", density=20.0))
     arguments = ["evaluate", str(tmp_path / "true.drgs"), str(scenes / "spot"), "--primary", "mesh", "--rays", "64"]
@@ -120,6 +122,7 @@ def test_the_true_object_scores_as_true(scenes, tmp_path, capsys):
     assert "city posed" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_the_pose_is_carried_to_another_mesh_of_the_same_shape(scenes):
     truth = read_truth(scenes / "spot")
     assert np.linalg.norm(truth.posed - truth.rest, axis=1).max() > 0.1
@@ -216,6 +219,7 @@ def test_views_that_the_asset_was_learned_from_are_not_taken_for_left_out(
     assert words in caplog.text and bool(words) == bool(caplog.records)
 
 
+@pytest.mark.slow
 def test_what_is_there_is_kept_and_what_is_missing_made_again(scenes, command):
     folder = scenes / "spot"
     kept, gone = folder / "test" / "r_001.exr", folder / "posed" / "r_001.png"
@@ -228,6 +232,7 @@ def test_what_is_there_is_kept_and_what_is_missing_made_again(scenes, command):
     assert not list(folder.glob("raw-*")) and not list(folder.glob("part-*"))
 
 
+@pytest.mark.slow
 def test_other_settings_need_another_folder(scenes, command):
     with pytest.raises(UsageError, match="other settings"):
         make_scenes(scenes, Plan(("spot",), 64), command, ROOT / "examples")
@@ -240,6 +245,7 @@ def test_a_blender_that_fails_is_reported(tmp_path):
         make_scenes(tmp_path / "b", PLAN, [sys.executable, "-c", "raise SystemExit('nothing like this')"], ROOT)
 
 
+@pytest.mark.slow
 def test_damaged_truth_is_refused(scenes, tmp_path, capsys):
     folder = tmp_path / "scenes"
     shutil.copytree(scenes, folder)

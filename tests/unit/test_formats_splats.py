@@ -567,6 +567,7 @@ def test_usd_without_its_package_says_what_to_install(tmp_path: Path, monkeypatc
         write_usd_splats(tmp_path / "b.usda", random_splats(3))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="there are no such limits there")
 @pytest.mark.parametrize(
     ("body", "patience", "reason"),

@@ -51,12 +51,14 @@ def problems(names: list[str], count: int, folder: Path, seconds: int = 5) -> li
         assert len(found) < 20, found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("group", GROUPS, ids=lambda group: group[0] if len(group) == 1 else f"{len(group)} kinds")
 def test_damaged_files_do_no_harm(group: list[str], tmp_path: Path) -> None:
     found = problems(group, COUNT, tmp_path)
     assert not found, f"{len(found)} in {tmp_path}: {found[:5]}"
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(WHOLE, reason="among the others then")
 def test_damaged_files_that_are_read_apart_do_no_harm(tmp_path: Path) -> None:
     found = problems(list(SLOW), COUNT // 5, tmp_path)
@@ -92,6 +94,7 @@ def test_bombs_cost_a_second_and_little_memory_at_most(tmp_path: Path) -> None:
     assert not found, found
 
 
+@pytest.mark.slow
 def test_a_reader_that_fails_is_noticed(tmp_path: Path) -> None:
     """Crash, hang, appetite and credulity of a reader, each as the program reports it."""
     bad = {

@@ -338,6 +338,7 @@ def busy() -> tuple[TraceScene, EnvironmentLight, ShadingPoints, RenderSettings]
     return scene, light, seen, settings(7, 4, 4, bounces=5, aa=4)
 
 
+@pytest.mark.alone
 def test_strips_threads_and_order_change_no_bit(busy: tuple) -> None:
     scene, light, seen, how = busy
     whole = integrate(scene, light, seen, how, 5)

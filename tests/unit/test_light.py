@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import pytest
 
@@ -31,6 +33,7 @@ def picture(kind: str) -> np.ndarray | None:
 KINDS = ["constant", "random", "sun", "pole"]
 
 
+@functools.lru_cache(maxsize=1)
 def sphere_grid(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
     """Directions (n, 3) on a lat-long grid and the solid angle (n,) of each; multiples of 16 and 32 keep to cells."""
     theta = np.pi * (np.arange(rows) + 0.5) / rows
@@ -117,6 +120,7 @@ def test_every_lit_cell_of_a_large_map_has_its_density(size: tuple[int, int], sk
     assert (np.diff(light.cells.runs[:, 0].astype(np.int64)) >= 1).all() and light.cells.runs[-1, 0] == 2**32 - 1
 
 
+@pytest.mark.alone
 def test_any_number_of_threads_makes_the_same_cells() -> None:
     world = World(environment=np.random.default_rng(0).random((96, 192, 3)).astype(np.float32) ** 4)
     before = get_num_threads()

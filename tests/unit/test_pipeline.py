@@ -48,6 +48,7 @@ def test_strips_and_batches_do_not_change_a_bit(
             assert np.array_equal(again[name], whole[name]), (height, name)
 
 
+@pytest.mark.alone
 def test_threads_do_not_change_a_bit(ball: tuple[TraceScene, PosedSurfels, EnvironmentLight]) -> None:
     scene, posed, light = ball
     one = pipeline.render(scene, light, posed, frame(look_along_y(40), denoise="svgf", threads=1))

@@ -90,6 +90,7 @@ def test_asset_is_whole(asset, tmp_path):
     assert np.median(error) < 0.04
 
 
+@pytest.mark.slow
 def test_surfels_on_the_mesh_lie_where_their_binding_says(capture, settings):
     asset = reconstruct(capture, replace(settings, variant="m", schedule=replace(QUICK, iterations=150)))
     corners = asset.mesh.vertices[asset.mesh.faces[asset.binding.face]].astype(np.float64)

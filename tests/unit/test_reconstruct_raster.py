@@ -132,6 +132,7 @@ def hold_each_map_against_brute_force(rasterise):
             assert (given[name].grad.double() - truth).norm() <= 1e-4 * truth.norm() + 1e-9, (k, name)
 
 
+@pytest.mark.alone
 def test_same_bits_with_any_number_of_threads_and_again():
     view, results = camera(100, 70), []
     threads = get_num_threads()

@@ -59,6 +59,7 @@ print("watched:", watching)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("variant", "masks"), [("m", "masks"), ("p", "none")])
 def test_no_step_that_is_timed_compiles(variant, masks):
     command = [sys.executable, "-c", STEPS, str(Path(__file__).parent), variant, masks]

@@ -70,6 +70,7 @@ def far_off(training: Training, capture: Capture) -> float:
     return float(np.median(np.abs(seen - depth)[into]))
 
 
+@pytest.mark.slow
 def test_a_hollow_that_no_outline_shows_is_found(monkeypatch, caplog):
     capture = photographed(bowl, 40, 64, 10)
     with caplog.at_level("INFO"):
@@ -80,6 +81,7 @@ def test_a_hollow_that_no_outline_shows_is_found(monkeypatch, caplog):
     assert far_off(both, capture) < 0.5 * far_off(alone, capture)
 
 
+@pytest.mark.slow
 def test_the_start_that_loses_leaves_no_trace(monkeypatch):
     capture = balls(24, 40)
     monkeypatch.setattr(train, "WORTH", 1000.0)
@@ -187,6 +189,7 @@ def wired(view, across: float, samples: int = 5) -> tuple[np.ndarray, np.ndarray
     return np.repeat(0.5 * alpha[..., None], 3, -1), alpha
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("across", [0.0, 0.004, 0.009, 0.013])
 def test_wires_thinner_than_a_cell_are_part_of_the_hull(across):
     region = find_region(photographed(lambda view: wired(view, across), 16, 200, 10))

@@ -54,6 +54,7 @@ def test_smooth_normals_are_angle_weighted() -> None:
     assert np.isfinite(scene.shading).all()
 
 
+@pytest.mark.alone
 def test_normals_do_not_depend_on_threads(sphere: TraceObject) -> None:
     before, results = get_num_threads(), []
     try:

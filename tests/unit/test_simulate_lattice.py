@@ -126,6 +126,7 @@ def test_pins_hold_and_lead():
     assert (quick.points - points)[~pinned, 2].mean() == pytest.approx(0.12, abs=0.08)
 
 
+@pytest.mark.alone
 def test_threads_restoring_and_cancelling_change_no_bit():
     threads = get_num_threads()
     planes = [Plane((0, 0, -0.1), (0, 0, 1))]

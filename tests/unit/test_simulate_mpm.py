@@ -97,6 +97,7 @@ def tip_of(solver) -> np.ndarray:
     return x > x.max() - solver.domain.spacing
 
 
+@pytest.mark.slow
 def test_cantilever_droops_as_timoshenko_says():
     solver = cantilever(4, length=0.75, gravity=(0, 0, -0.1), damping=14.0)
     rest, tip = solver.points.copy(), tip_of(solver)
@@ -105,6 +106,7 @@ def test_cantilever_droops_as_timoshenko_says():
     assert (rest - solver.points)[tip, 2].mean() == pytest.approx(timoshenko(100.0, length=0.75), rel=0.03)
 
 
+@pytest.mark.slow
 def test_softer_beams_droop_more():
     droops = []
     for young in (1e5, 4e5, 1.6e6):
@@ -116,6 +118,7 @@ def test_softer_beams_droop_more():
     assert droops[0] > 1.1 * droops[1] > 1.21 * droops[2] > 0.05  # the softest hangs down already
 
 
+@pytest.mark.slow
 def test_strain_slower_than_the_digits_of_one_is_not_lost():
     """A bar pulled by 2e-8 of its length a step, which single precision cannot add to 1."""
     points = lattice((0.4, 0.1, 0.1), 0.025)
@@ -373,6 +376,7 @@ def test_a_bar_of_metal_bears_its_weight_or_is_upset_until_it_does(strength, pla
     assert (solver.state.memory.max() > 0) == (plastic > 0)
 
 
+@pytest.mark.slow
 def test_an_animal_of_metal_stands_and_a_fall_from_its_own_height_dents_it():
     h = 1.7 / 17
     body = np.add(lattice((0.9, 0.4, 0.9), h / 2), [0, 0, 0.8])
@@ -409,6 +413,7 @@ def test_turning_everything_turns_the_result():
     assert np.abs(results[0] - results[1]).max() < 1e-5
 
 
+@pytest.mark.alone
 def test_any_number_of_threads_gives_the_same_bits():
     threads = get_num_threads()
     results = []

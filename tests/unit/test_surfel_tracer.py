@@ -283,6 +283,7 @@ print(through[0], through[1], sum(surfel_tracer._shadow.stats.cache_hits.values(
 """
 
 
+@pytest.mark.slow
 def test_kernels_and_callbacks_come_out_of_the_cache_in_another_process(tmp_path: Path) -> None:
     """Addresses differ from process to process; cached code must not have kept one."""
     here = Path(__file__).resolve()

@@ -308,6 +308,7 @@ def test_a_picture_of_another_size_is_no_history() -> None:
     assert (found == fresh).all()
 
 
+@pytest.mark.alone
 def test_results_do_not_depend_on_threads() -> None:
     shots = [shot(wall(1.7 * k), 2.0, 0.3, k, moved(wall(1.7 * k), 1.7)) for k in range(5)]
     results = []

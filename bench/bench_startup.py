@@ -1,0 +1,130 @@
+"""From nothing to a picture: kernels compiled and shipped, the engine, the demo.
+
+    python bench/bench_startup.py [--repeats N] [--demo] [--tests]
+
+Cold is an empty cache folder. ``--demo`` runs ``make demo`` with one, the environments standing; ``--tests`` runs
+``make test`` with one. Both take the figures of a last run where they are not asked for.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from bench_engine import first_frame, plane_asset
+from report import OUT, ROOT, table, write_section
+
+KEPT = OUT / "startup.json"
+#: What -> (hold, stretch), seconds.
+GOALS = {
+    "all kernels, cold": (60, 35),
+    "kernels of one relit frame, cold": (25, 12),
+    "`drgs relight`, start to picture, cold": (25, 12),
+    "`drgs relight`, start to picture, kernels shipped": (3, 1),
+    "`drgs relight`, start to picture, warm": ("", ""),
+    "engine process to first pixel, warm": (0.8, 0.4),
+    "`make demo` after the environments, cold": (75, 45),
+    "`make test`, cold": (480, 300),
+}
+
+
+def run(command: list[object], **environment: object) -> float:
+    """Seconds that a command takes; it must succeed."""
+    begun = time.perf_counter()
+    merged = os.environ | {name: str(value) for name, value in environment.items()}
+    done = subprocess.run(list(map(str, command)), env=merged, cwd=ROOT, capture_output=True, text=True)
+    if done.returncode:
+        raise SystemExit(f"{' '.join(map(str, command))} failed:\n{done.stdout[-2000:]}{done.stderr[-2000:]}")
+    return time.perf_counter() - begun
+
+
+def relight(folder: Path) -> list[object]:
+    """One relit frame of a cow of 100,000 surfels, 256 x 256, under an HDRI."""
+    camera = {"matrix_world": [[1, 0, 0, 0], [0, 0, -1, -3], [0, 1, 0, 0], [0, 0, 0, 1]], "width": 256, "height": 256}
+    (folder / "camera.json").write_text(json.dumps(camera | {"fov_x": 40}))
+    drgs = [sys.executable, "-m", "drgs_blender.cli.main"]
+    if not (folder / "spot.drgs").exists():
+        run([*drgs, "make", ROOT / "examples/spot/spot_triangulated.obj", "--out", folder / "spot.drgs"])
+        kernels = [sys.executable, ROOT / "tools/kernels.py", "--do", "environment", folder]
+        run(kernels)
+    return [*drgs, "relight", folder / "spot.drgs", "--camera", folder / "camera.json", "--env", folder / "light.exr",
+            "--out", folder / "frame.exr"]  # fmt: skip
+
+
+def cold(command: list[object], folder: Path, repeats: int) -> float:
+    """Median seconds of a command with an empty cache folder, shipped kernels left out."""
+    seconds = []
+    for _ in range(repeats):
+        cache = folder / "cache"
+        shutil.rmtree(cache, ignore_errors=True)
+        seconds.append(run(command, DRGS_CACHE_DIR=cache, DRGS_SHIPPED="0"))
+    return statistics.median(seconds)
+
+
+def measure(folder: Path, repeats: int) -> dict[str, float]:
+    """The figures of the kernels and of the engine."""
+    prepare = [sys.executable, "-m", "drgs_blender.compute.prepare"]
+    picture = relight(folder)
+    rows = {
+        "all kernels, cold": cold([*prepare, "--all"], folder, repeats),
+        "kernels of one relit frame, cold": cold([*prepare, "frame"], folder, repeats),
+        "`drgs relight`, start to picture, cold": cold(picture, folder, repeats),
+    }
+    warm = [run(picture, DRGS_CACHE_DIR=folder / "cache", DRGS_SHIPPED="0") for _ in range(repeats + 2)]
+    rows["`drgs relight`, start to picture, warm"] = statistics.median(warm)
+    shipped = folder / "shipped"
+    if (ROOT / "drgs_blender/compute/kernels").is_dir():
+        rows["`drgs relight`, start to picture, kernels shipped"] = statistics.median(
+            _shipped(picture, shipped) for _ in range(repeats + 2)
+        )
+    plane_asset(folder / "sheet.drgs")
+    first_frame(folder / "sheet.drgs")
+    starts = [first_frame(folder / "sheet.drgs")["start_to_first_frame_s"] for _ in range(7)]
+    rows["engine process to first pixel, warm"] = statistics.median(starts)
+    return rows
+
+
+def _shipped(picture: list[object], cache: Path) -> float:
+    shutil.rmtree(cache, ignore_errors=True)
+    return run(picture, DRGS_CACHE_DIR=cache)
+
+
+def whole(command: str, folder: Path) -> float:
+    """Seconds of a command of tools/dev.py with an empty cache folder."""
+    shutil.rmtree(folder / "cache", ignore_errors=True)
+    shutil.rmtree(ROOT / "out" / "demo", ignore_errors=True)
+    return run([sys.executable, ROOT / "tools/dev.py", command], DRGS_CACHE_DIR=folder / "cache")
+
+
+def main() -> None:
+    """Measure and write the section."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--demo", action="store_true", help="measure `make demo` as well")
+    parser.add_argument("--tests", action="store_true", help="measure `make test` as well")
+    options = parser.parse_args()
+    rows = json.loads(KEPT.read_text()) if KEPT.exists() else {}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        rows |= measure(folder, options.repeats)
+        if options.demo:
+            rows["`make demo` after the environments, cold"] = whole("demo", folder)
+        if options.tests:
+            rows["`make test`, cold"] = whole("test", folder)
+    KEPT.parent.mkdir(parents=True, exist_ok=True)
+    KEPT.write_text(json.dumps(rows))
+    shown = [[what, float(rows[what]), *goals] for what, goals in GOALS.items() if what in rows]
+    text = "Cold: an empty cache folder. Whole processes, their start included; medians.\n\n"
+    write_section("startup", "Starting", text + table(("What", "Seconds", "Hold", "Stretch"), shown))
+
+
+if __name__ == "__main__":
+    main()

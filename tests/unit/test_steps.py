@@ -1,0 +1,153 @@
+"""Commands side by side: what waits for what, what is made again, what is said of them and of a failure."""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from processes import all_gone
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT / "tools"))
+
+from steps import Line, Step, StepFailed, clock, counted, run_steps  # noqa: E402
+
+
+def step(name: str, program: str, **options) -> Step:
+    return Step(name, f"doing {name}", [sys.executable, "-c", program], 1.0, **options)
+
+
+@pytest.fixture
+def run(tmp_path):
+    """Function that runs steps; returns what was said, and the log."""
+
+    def together(*steps: Step) -> tuple[str, str]:
+        stream = io.StringIO()
+        run_steps(steps, tmp_path / "log.txt", tmp_path, {"DRGS_STEP": "here"}, stream)
+        return stream.getvalue(), (tmp_path / "log.txt").read_text()
+
+    return together
+
+
+def test_steps_run_side_by_side_and_after_what_they_wait_for(run, tmp_path):
+    """Two wait for each other's files, and a third for both."""
+    meet = "import os, time\nopen('{0}', 'w').close()\nend = time.monotonic() + 30\n"
+    meet += "while not os.path.exists('{1}'): time.sleep(0.01); assert time.monotonic() < end\n"
+    last = "import os; assert os.path.exists('a') and os.path.exists('b'); print(os.environ['DRGS_STEP'])"
+    said, log = run(
+        step("last", last, after=("a", "b")), step("a", meet.format("a", "b")), step("b", meet.format("b", "a"))
+    )
+    lines = said.splitlines()
+    assert lines[0] == "0 of 3 done. doing a, doing b" and lines[-1].startswith("2 of 3 done. doing last")
+    assert re.search(r"^ *[\d.]+ last: here$", log, re.M)
+
+
+def test_what_a_command_counts_is_said_once_for_each_change(run):
+    program = "import time\nfor i in (1, 1, 2): print(f'Baking bread, {i} of 2', flush=True); time.sleep(0.3)"
+    said, _ = run(step("bread", program, count=counted))
+    assert [line.split(" done. ")[1] for line in said.splitlines()] == [
+        "doing bread",
+        "Baking bread, 1 of 2",
+        "Baking bread, 2 of 2",
+    ]
+
+
+def test_on_a_terminal_one_line_is_rewritten():
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    stream = Terminal()
+    line = Line(stream)
+    line.show("a long text", "about 20 s left")
+    line.show("short", "")
+    line.show("x" * 500, "about 10 s left")
+    line.clear()
+    first, second, third, empty = stream.getvalue().removeprefix("\r").rstrip("\r").split("\r")
+    assert "\n" not in stream.getvalue()
+    assert first == "a long text; about 20 s left" and second == "short".ljust(len(first))
+    assert third.endswith("...; about 10 s left") and not empty.strip()
+
+
+def test_a_failure_ends_the_others_and_names_command_words_and_log(run, tmp_path):
+    pid = tmp_path / "pid"
+    sleeper = f"import os, time\nopen({str(pid)!r}, 'w').write(str(os.getpid()))\ntime.sleep(600)"
+    broken = f"import os, time\nwhile not os.path.exists({str(pid)!r}): time.sleep(0.01)\n"
+    broken += "for i in range(40): print('word', i)\nraise SystemExit('no flour')"
+    began = time.monotonic()
+    with pytest.raises(StepFailed) as caught:
+        run(step("sleep", sleeper), step("bread", broken), step("never", "", after=("bread",)))
+    text = str(caught.value)
+    assert text.startswith("doing bread failed (1): ") and "    no flour\n" in text and "word 39" in text
+    assert "word 20" not in text and text.endswith(f"All of it: {tmp_path / 'log.txt'}")
+    assert "word 20" in (tmp_path / "log.txt").read_text()
+    assert time.monotonic() - began < 30
+    assert all_gone([int(pid.read_text())], 5.0)
+
+
+def test_a_command_that_is_not_there_is_named(run):
+    with pytest.raises(StepFailed, match="/nowhere/oven cannot be started"):
+        run(Step("bread", "baking", ["/nowhere/oven"], 1.0))
+
+
+def test_what_is_up_to_date_is_not_made_again(run, tmp_path):
+    flour, bread = tmp_path / "flour", tmp_path / "bread"
+    flour.write_text("white")
+    baking = f"open({str(bread)!r}, 'a').write('|')"
+
+    def bake(program: str = baking) -> str:
+        run(step("bread", program, makes=bread, of=(flour,)), step("eat", "", after=("bread",)))
+        return bread.read_text()
+
+    assert bake() == bake() == "|"
+    flour.write_text("brown")
+    assert bake() == "||"
+    assert bake(baking + " # another oven") == "|||"
+    bread.unlink()
+    assert bake() == "|"
+    flour.write_text("rye")
+    with pytest.raises(StepFailed):  # what fails half way is no bread
+        bake(f"open({str(bread)!r}, 'a').write('half'); raise SystemExit(1)")
+    assert bake() == "|half|"
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals")
+def test_ctrl_c_ends_everything(tmp_path):
+    pid = tmp_path / "pid"
+    sleeper = f"import os, time; open({str(pid)!r}, 'w').write(str(os.getpid())); time.sleep(600)"
+    program = f"""
+import sys; sys.path.insert(0, {str(ROOT / "tools")!r})
+from pathlib import Path
+from steps import Step, run_steps
+run_steps([Step("a", "a", [sys.executable, "-c", {sleeper!r}], 1.0)], Path("log"), Path("."), {{}})
+"""
+    process = subprocess.Popen([sys.executable, "-c", program], cwd=tmp_path, stderr=subprocess.DEVNULL)
+    end = time.monotonic() + 30
+    while not (pid.exists() and pid.read_text()):
+        assert time.monotonic() < end
+        time.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    assert process.wait(20) != 0
+    assert all_gone([int(pid.read_text())], 5.0)
+
+
+def test_time_left_is_said_roughly():
+    assert [clock(seconds) for seconds in (1, 12, 44, 95, 300)] == ["5 s", "10 s", "45 s", "2 min", "5 min"]
+
+
+def test_time_left_is_that_of_the_longest_row_of_steps(run):
+    """Of steps side by side only the longer one counts, and what those before took tells the pace."""
+    nothing = "import time; time.sleep(4)"
+    steps = [Step(name, name, [sys.executable, "-c", nothing], 2.0) for name in ("a", "b")]
+    steps += [Step("c", "c", [sys.executable, "-c", nothing], 20.0, after=("a",))]
+    steps += [Step("d", "d", [sys.executable, "-c", ""], 20.0, after=("c",))]
+    said, _ = run(*steps)
+    left = re.search(r"2 of 4 done\. c; about (\d+) s left", said)
+    assert left and 70 <= int(left[1]) <= 85  # twice as slow as they should be

@@ -1,0 +1,47 @@
+"""The environments as steps that run side by side, and the kernels of the engine's. Standard library only."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+from steps import Step, counted
+
+ROOT = Path(__file__).resolve().parent.parent
+ENGINE = ROOT / ".venv"
+BLENDER = ROOT / ".venv-blender"
+#: Names of the steps.
+FOR_ENGINE, FOR_BLENDER = "engine", "blender"
+
+
+def python_of(folder: Path) -> Path:
+    """The interpreter of an environment."""
+    return folder / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
+
+
+def blender() -> Path:
+    """What DRGS_BLENDER names, otherwise the environment with Blender as a module."""
+    return Path(os.environ.get("DRGS_BLENDER") or python_of(BLENDER))
+
+
+def environments(seconds: tuple[float, float] = (90.0, 30.0)) -> list[Step]:
+    """The engine's environment and Blender's, each a moment's work where it is there.
+
+    Parameters
+    ----------
+    seconds : that they take
+    """
+    command = [sys.executable, ROOT / "tools" / "dev.py", "env"]
+    engine_there, blender_there = python_of(ENGINE).is_file(), python_of(BLENDER).is_file()
+    found = [Step(FOR_ENGINE, "Making .venv", [*command, "--engine"], 1.0 if engine_there else seconds[0])]
+    if not os.environ.get("DRGS_BLENDER"):
+        after = 1.0 if blender_there else seconds[1]
+        found.append(Step(FOR_BLENDER, "Making .venv-blender", [*command, "--blender"], after))
+    return found
+
+
+def kernels(name: str, *jobs: str, seconds: float, after: str = FOR_ENGINE) -> Step:
+    """What the engine compiles for `jobs`, as soon as its environment stands, or `after` another step."""
+    command = [python_of(ENGINE), "-m", "drgs_blender.compute.prepare", *jobs]
+    return Step(name, "Starting the engine", command, seconds, (after,), count=counted)
