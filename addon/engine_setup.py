@@ -92,6 +92,16 @@ def digest(source: Path = SOURCE) -> str:
     return found.hexdigest()
 
 
+@functools.cache
+def pinned(source: Path = SOURCE) -> tuple[str, ...]:
+    """The very versions of Numba and LLVM for which the release brings compiled kernels, as pip knows them."""
+    try:
+        versions = json.loads((source / PACKAGE / "compute" / "kernels" / "versions.json").read_text(encoding="utf-8"))
+        return tuple(f"{name}=={versions[name]}" for name in ("numba", "llvmlite"))
+    except (OSError, ValueError, KeyError, TypeError):
+        return ()
+
+
 def interpreter(folder: Path) -> Path:
     """Where the Python of the environment `folder` is, or will be."""
     return folder / ("Scripts/python.exe" if _WINDOWS else "bin/python")
@@ -259,7 +269,7 @@ class EngineSetup:
                 os.killpg(self._process.pid, signal.SIGKILL)
             self._process.wait()
         self._close()
-        if self._steps and not self._steps[0].needed:
+        if self._steps and self._steps[0].text == PREPARING:
             self.remark = _LATER
         self.done, self.text = True, "Cancelled"
 
@@ -283,6 +293,13 @@ class EngineSetup:
                 Step("Preparing pip", [*pip, "pip>=24.1"], 0.05),
                 fetch("Installing packages", ENGINE),
             ]
+        if (pins := list(pinned(self.source))) and (
+            ENGINE in missing or _read_stamp(self.folder).get("pinned") != pins
+        ):
+            # First, so that the packages find them there; what pip cannot get leaves kernels to be compiled.
+            exact = [*pip, "--only-binary=:all:", "--progress-bar=raw", *pins]
+            keep = lambda: self._stamp(pinned=pins)  # noqa: E731
+            steps.insert(max(len(steps) - 1, 0), Step("Installing Numba", exact, 0.1, keep, needed=False))
         doctor = [str(own), *_FLAGS, "-m", f"{PACKAGE}.cli.main", "doctor"]
         ready = lambda: self._stamp(sources=digest(self.source))  # noqa: E731
         steps.append(Step("Trying the engine", doctor, 0.1, ready, before=self._copy))

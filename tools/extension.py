@@ -2,7 +2,7 @@
 
 With it goes ``dist/index.json``: the folder, on any web server, is a repository for Preferences > Get Extensions.
 
-    python tools/extension.py [--out dist/drgs-0.1.0.zip]
+    python tools/extension.py [--out dist/drgs-0.1.0.zip] [--kernels]
 
 Pure standard library; the archive is the same bytes for the same sources.
 """
@@ -20,6 +20,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from kernel_archive import sources_digest
+
 ROOT = Path(__file__).resolve().parent.parent
 #: What the zip holds, relative to the root. Of folders, only the files with these endings.
 CONTENTS = (
@@ -33,6 +35,8 @@ CONTENTS = (
     "drgs_blender",
 )
 SUFFIXES = {".py", ".typed", ".md", ".toml", ".json", ".js"}
+#: What ``tools/kernels.py build`` makes; a source checkout has none.
+KERNELS = Path("drgs_blender/compute/kernels")
 REQUIRED = {
     "schema_version": str,
     "id": str,
@@ -99,8 +103,25 @@ def faults(manifest: dict[str, Any], version: str) -> list[str]:
     return found
 
 
+def kernels(root: Path = ROOT) -> list[Path]:
+    """The archives of compiled kernels and what belongs to them, sorted, relative to `root`.
+
+    Raises
+    ------
+    ValueError
+        When there are none, or they were made from other sources.
+    """
+    try:
+        made_from = json.loads((root / KERNELS / "versions.json").read_text(encoding="utf-8"))["sources"]
+    except (OSError, ValueError, KeyError):
+        raise ValueError(f"{KERNELS} holds no kernels: run tools/kernels.py build") from None
+    if made_from != sources_digest(root / "drgs_blender"):
+        raise ValueError(f"{KERNELS} was made from other sources: run tools/kernels.py build")
+    return [path.relative_to(root) for path in sorted((root / KERNELS).iterdir()) if path.suffix in {".zip", ".json"}]
+
+
 def members(root: Path = ROOT) -> Iterator[Path]:
-    """The files of the extension, sorted, relative to `root`."""
+    """The files of the extension without compiled kernels, sorted, relative to `root`."""
     for name in CONTENTS:
         path = root / name
         if path.is_file():
@@ -109,20 +130,21 @@ def members(root: Path = ROOT) -> Iterator[Path]:
             for file in sorted(path.rglob("*")):
                 inside = file.relative_to(root)
                 hidden = any(part.startswith(".") or part == "__pycache__" for part in inside.parts)
-                if file.is_file() and file.suffix in SUFFIXES and not hidden:
+                if file.is_file() and file.suffix in SUFFIXES and not hidden and inside.parent != KERNELS:
                     yield inside
 
 
-def build(out: Path | None = None, root: Path = ROOT) -> Path:
+def build(out: Path | None = None, root: Path = ROOT, with_kernels: bool = False) -> Path:
     """Check the manifest and write the zip atomically; returns its path. Raises ValueError naming every fault."""
     manifest = tomllib.loads((root / "blender_manifest.toml").read_text(encoding="utf-8"))
     if wrong := faults(manifest, project_version(root)):
         raise ValueError("blender_manifest.toml: " + "; ".join(wrong))
     out = out or root / "dist" / f"{manifest['id']}-{manifest['version']}.zip"
+    names = [*members(root), *(kernels(root) if with_kernels else ())]
     out.parent.mkdir(parents=True, exist_ok=True)
     partial = out.with_name(out.name + ".part")
     with zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name in members(root):
+        for name in names:
             entry = zipfile.ZipInfo(name.as_posix(), date_time=(2025, 1, 1, 0, 0, 0))
             entry.external_attr = 0o644 << 16
             entry.compress_type = zipfile.ZIP_DEFLATED
@@ -154,9 +176,11 @@ def main() -> int:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, help="the zip to write (default: dist/drgs-VERSION.zip)")
+    parser.add_argument("--kernels", action="store_true", help="with the compiled kernels of tools/kernels.py build")
+    options = parser.parse_args()
     try:
-        out = parser.parse_args().out
-        archive = build(out)
+        out = options.out
+        archive = build(out, with_kernels=options.kernels)
         print(archive)
         if out is None:  # another folder may have an index of its own
             print(write_index(archive))

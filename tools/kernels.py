@@ -1,9 +1,13 @@
-"""Write `drgs_blender/compute/kernels.json`: the kernels that each kind of job calls, found by doing the jobs.
+"""The list of kernels that jobs call, and their compiled forms for a release.
 
-    .venv/bin/python tools/kernels.py
+    .venv/bin/python tools/kernels.py record
+    .venv/bin/python tools/kernels.py build [--target NAME ...] [--python INTERPRETER ...] [--out FOLDER]
 
+`record` writes `drgs_blender/compute/kernels.json`: the kernels that each kind of job calls, found by doing the jobs.
 To be run after a kernel that Python calls has got other arguments; a test says so. Takes some minutes: everything is
 compiled anew, in an empty cache, by one process at a time, to measure how long each kernel takes.
+
+`build` compiles all of the list for fixed targets into `drgs_blender/compute/kernels` (docs/kernels.md).
 """
 
 from __future__ import annotations
@@ -17,6 +21,8 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+import kernel_archive
+
 ROOT = Path(__file__).resolve().parent.parent
 EXAMPLES = ROOT / "examples"
 MANIFEST = ROOT / "drgs_blender" / "compute" / "kernels.json"
@@ -26,7 +32,7 @@ def commands(folder: Path) -> Iterator[tuple[str, list[object]]]:
     """(job, command) of everything that is done; the same job may have several commands."""
     drgs = [sys.executable, "-m", "drgs_blender.cli.main"]
     asset, light = folder / "spot.drgs", EXAMPLES / "front.json"
-    own = [sys.executable, Path(__file__).resolve(), "--do"]
+    own = [sys.executable, Path(__file__).resolve(), "record", "--do"]
     yield "make", [*own, "environment", folder]
     yield "make", [*drgs, "make", EXAMPLES / "spot/spot_triangulated.obj", "--out", asset]
     yield "make", [*drgs, "make", EXAMPLES / "robot/RobotExpressive.glb", "--out", folder / "robot.drgs"]
@@ -179,13 +185,8 @@ def write(found: dict[str, dict[tuple[str, str, str], float]], path: Path) -> No
     path.write_text(f'{{"kernels": [\n{rows}\n],\n"jobs": {{\n{jobs}\n}}}}\n', encoding="utf-8")
 
 
-def main() -> int:
-    """The command line; the return value is the exit code."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, default=MANIFEST)
-    parser.add_argument("--only", nargs="*", default=[], metavar="JOB", help="these jobs alone, to look at")
-    parser.add_argument("--do", nargs=2, help=argparse.SUPPRESS)
-    options = parser.parse_args()
+def run_record(options: argparse.Namespace) -> int:
+    """Write the list."""
     if options.do:
         do(options.do[0], Path(options.do[1]))
         return 0
@@ -193,6 +194,36 @@ def main() -> int:
         write(record(Path(folder), set(options.only)), options.out)
     print(options.out)
     return 0
+
+
+def run_build(options: argparse.Namespace) -> int:
+    """Write archives of compiled kernels."""
+    for path in kernel_archive.build(options.target, options.python, options.out, options.only):
+        print(f"{path}, {path.stat().st_size / 1e6:.1f} MB")
+    return 0
+
+
+def main() -> int:
+    """The command line; the return value is the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    verbs = parser.add_subparsers(required=True, metavar="VERB")
+    verb = verbs.add_parser("record", help="write the list of kernels")
+    verb.set_defaults(run=run_record)
+    verb.add_argument("--out", type=Path, default=MANIFEST)
+    verb.add_argument("--only", nargs="*", default=[], metavar="JOB", help="these jobs alone, to look at")
+    verb.add_argument("--do", nargs=2, help=argparse.SUPPRESS)
+    verb = verbs.add_parser("build", help="compile the list for a release")
+    verb.set_defaults(run=run_build)
+    verb.add_argument("--target", nargs="+", default=[], metavar="NAME", help="all of this machine's architecture")
+    verb.add_argument("--python", nargs="+", default=[sys.executable], help="interpreters with the engine's packages")
+    verb.add_argument("--out", type=Path, default=kernel_archive.FOLDER, help="folder of the archives")
+    verb.add_argument("--only", nargs="+", default=[], metavar="JOB", help="the kernels of these jobs alone")
+    options = parser.parse_args()
+    try:
+        return int(options.run(options))
+    except kernel_archive.BuildError as error:
+        print(f"kernels.py: {error}", file=sys.stderr)
+        return 1
 
 
 if __name__ == "__main__":

@@ -102,6 +102,22 @@ def cache(args: argparse.Namespace) -> str:
     return str(wanted_folder())
 
 
+def kernels(args: argparse.Namespace) -> str:
+    """The processor for which kernels are compiled, and how many are."""
+    from ..compute import prepare, shipped, targets
+    from ..compute.jit import numba
+
+    wanted, own = shipped.versions(), {"numba": numba.__version__, "llvmlite": importlib.metadata.version("llvmlite")}
+    stock = prepare.stock()
+    missing = f", {stock.missing} are compiled when needed" if stock.missing else ""
+    said = f"{targets.current()}, {stock.shipped + stock.kept} ready ({stock.shipped} shipped){missing}"
+    if wanted and wanted != own:
+        other = " and ".join(f"{name} {version}" for name, version in wanted.items())
+        remedy = f"To use those of the release: pip install {' '.join(f'{n}=={v}' for n, v in wanted.items())}"
+        raise DeviceError("kernels", f"{said}; those of the release were made with {other}", remedy)
+    return said
+
+
 def embree(args: argparse.Namespace) -> str:
     """Embree, loaded as the renderer loads it."""
     from ..render.trace.embree import library
@@ -184,6 +200,7 @@ CHECKS: tuple[tuple[str, bool, Callable[[argparse.Namespace], str]], ...] = (
     ("Python", True, python),
     ("Numba", True, numba),
     ("kernel cache", False, cache),
+    ("kernels", False, kernels),
     ("Embree", True, embree),
     ("OpenEXR", True, openexr),
     ("engine", True, engine),

@@ -18,6 +18,8 @@ from .folders import cache_folder, write_atomically
 
 #: The folder `drgs_blender` and the name under which its modules import each other.
 PACKAGE = Path(__file__).resolve().parent.parent
+#: What a release brings, see `shipped`.
+SHIPPED = Path(__file__).with_name("kernels")
 _DIGITS = 16
 
 
@@ -91,6 +93,12 @@ def _parse(source: bytes, path: Path) -> tuple[str, list[str]]:
     return hashlib.sha256(ast.dump(tree).encode()).hexdigest(), sorted(_name(file) for file in imported)
 
 
+def shipped_index() -> str:
+    """File name of the index that a release brings for this Python: what other patches of it parse is the same."""
+    own = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()[:_DIGITS]
+    return f"sources-{sys.implementation.cache_tag}-{own}.json"
+
+
 class _Index:
     """What `_parse` found, by the digest of the bytes it read, kept in the cache folder: parsing takes a second."""
 
@@ -105,11 +113,12 @@ class _Index:
 
     @functools.cached_property
     def rows(self) -> dict[str, tuple[str, list[str]]]:
-        with contextlib.suppress(OSError, ValueError, TypeError):
-            if self.path:
-                rows = json.loads(self.path.read_bytes())
-                return {str(key): (str(facts), [str(n) for n in names]) for key, (facts, names) in rows.items()}
-        return {}
+        found: dict[str, tuple[str, list[str]]] = {}
+        for path in (SHIPPED / shipped_index(), self.path):
+            with contextlib.suppress(OSError, ValueError, TypeError, AttributeError):
+                rows = json.loads(path.read_bytes()) if path else {}
+                found |= {str(key): (str(facts), [str(n) for n in names]) for key, (facts, names) in rows.items()}
+        return found
 
     def add(self, key: str, facts: str, imported: list[str]) -> None:
         self.rows[key] = facts, imported

@@ -28,13 +28,12 @@ from numba.extending import overload as _overload
 
 if "NUMBA_CACHE_DIR" not in os.environ:  # where Numba keeps kernels itself, see `kernel_compiler.TESTED`
     numba.config.CACHE_DIR = str(wanted_folder() / "numba")
-if "NUMBA_CPU_NAME" not in os.environ:
-    targets.settle(numba.config)
 
 from . import kernel_compiler
 from .kernel_cache import KernelCache
 
 log = logging.getLogger(__name__)
+targets.settle(numba.config)
 _OWN_CACHE = kernel_compiler.is_tested() and not numba.config.DISABLE_JIT
 if not _OWN_CACHE:
     log.warning("Numba %s was not tested: kernels take longer to compile", numba.__version__)

@@ -108,11 +108,13 @@ class KernelCache(NullCache):
         if arguments is None:
             return None
         cells = self.function.__closure__ or ()
+        triple, *target = codegen.magic_tuple()
         facts = (
             *(self.kind, self.function.__module__, self.function.__qualname__, arguments, self._closure),
             hashlib.sha256(self.function.__code__.co_code).hexdigest(),
             hashlib.sha256(dumps(tuple(cell.cell_contents for cell in cells))).hexdigest() if cells else "",
-            *(*codegen.magic_tuple(), numba.__version__, llvmlite.__version__, sys.implementation.cache_tag),
+            re.sub(r"(darwin|macosx?)[\d.]+", r"\1", triple),  # each update of macOS has another, with the same code
+            *(*target, numba.__version__, llvmlite.__version__, sys.implementation.cache_tag),
         )
         digest = hashlib.sha256("\0".join(map(str, facts)).encode()).hexdigest()
         return f"{self.function.__qualname__.replace('<locals>.', '')}-{digest[:24]}{ENDING}"

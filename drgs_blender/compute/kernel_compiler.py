@@ -19,6 +19,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import numba
+from llvmlite import binding
 from numba.core import codegen, compiler, errors, sigutils
 
 #: Versions of Numba for which this was tested.
@@ -28,6 +29,10 @@ TESTED = ("0.61", "0.62", "0.63", "0.64", "0.65", "0.66", "0.67", "0.68")
 def is_tested() -> bool:
     """Whether this version of Numba is one of `TESTED`."""
     return ".".join(numba.__version__.split(".")[:2]) in TESTED
+
+
+#: How functions come that are linked in: the same one may be found in several libraries.
+_SHARED = binding.Linkage.linkonce_odr, binding.Linkage.weak_any, binding.Linkage.weak_odr
 
 
 class _State:
@@ -64,6 +69,17 @@ class EntryLibrary(codegen.JITCodeLibrary):
         for function in ll_module.functions:
             if not function.is_declaration:
                 passes.run(function, builder)
+
+    def _optimize_final_module(self) -> None:
+        """Optimise; what was linked in is this library's alone.
+
+        Numba has it seen by all code of the process, under names that count compiled functions or hold an address:
+        kernels that were compiled in other processes may bring another function of the same name.
+        """
+        for function in self._final_module.functions:
+            if not function.is_declaration and function.linkage in _SHARED:
+                function.linkage = "private"
+        super()._optimize_final_module()
 
 
 class InnerLibrary(EntryLibrary):

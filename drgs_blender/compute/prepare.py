@@ -16,10 +16,11 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 
 from ..errors import Cancelled
 from ..phases import PREPARING
-from . import manifest
+from . import manifest, shipped
 from .folders import cache_folder
 from .manifest import Kernel
 
@@ -83,6 +84,41 @@ def lacking(kernels: Iterable[Kernel]) -> list[Kernel]:
         except (LookupError, AttributeError) as error:
             log.info("kernel %s: %s", kernel.name, error)
     return missing
+
+
+@dataclass(frozen=True)
+class Stock:
+    """How many kernels of all jobs are where.
+
+    Attributes
+    ----------
+    shipped : int
+        Come with the release.
+    kept : int
+        Were compiled here.
+    missing : int
+        Are compiled when they are needed.
+    """
+
+    shipped: int
+    kept: int
+    missing: int
+
+
+def stock() -> Stock:
+    """Where the kernels of all jobs are; those of packages that are not installed do not count."""
+    from .jit import numba
+
+    codegen = numba.core.registry.cpu_target.target_context.codegen()
+    kernels, brought = manifest.needed(manifest.jobs()), 0
+    missing = len(lacking(kernels))
+    known = 0
+    for kernel in kernels:
+        with contextlib.suppress(LookupError, AttributeError):
+            name = manifest.dispatcher(kernel)._cache.file_name(manifest.signature(kernel), codegen)
+            known += 1
+            brought += name is not None and shipped.has(name)
+    return Stock(brought, known - brought - missing, missing)
 
 
 class _Pool:

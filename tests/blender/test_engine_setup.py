@@ -123,6 +123,28 @@ def made(tmp_path_factory) -> tuple[Path, Path]:
     return folder, source
 
 
+@pytest.mark.parametrize("there", [True, False])
+def test_the_versions_of_shipped_kernels_are_asked_for_first_and_not_insisted_on(tmp_path, monkeypatch, there):
+    source = engine_source(tmp_path / "source", wheel(tmp_path, "tinydep"), DOCTOR.format("tinydep"))
+    kernels = source / "drgs_blender" / "compute" / "kernels"
+    kernels.mkdir(parents=True)
+    wheel(tmp_path, "numba"), wheel(tmp_path, "llvmlite")
+    version = "1.0" if there else "0.0.0.1"
+    (kernels / "versions.json").write_text(json.dumps({"numba": version, "llvmlite": "1.0", "pythons": []}))
+    monkeypatch.setenv("PIP_FIND_LINKS", str(tmp_path))
+    folder = tmp_path / "engine"
+    running = setup.EngineSetup(folder, Path(sys.executable), source)
+    titles = [step.text for step in running._steps]
+    assert titles.index("Installing Numba") == titles.index("Installing packages") - 1
+    fractions = until_done(running)
+    assert running.error is None and fractions == sorted(fractions) and fractions[-1] == 1
+    assert setup.state(folder, source) == "ready"
+    assert bool(list(running._packages().glob("numba-1.0.dist-info"))) == there
+    again = setup.EngineSetup(folder, Path("/no/python/is/needed"), source)
+    assert ("Installing Numba" in [step.text for step in again._steps]) != there
+    again.cancel()
+
+
 def test_another_version_of_the_engine_needs_no_network(made):
     folder, source = made
     assert setup.state(folder, source) == "ready" and not setup.needs_network(folder, source)
