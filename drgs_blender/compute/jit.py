@@ -70,7 +70,9 @@ def cfunc(signature: Any) -> Any:
     """``numba.cfunc`` with the options of `njit`: what C code calls back."""
 
     def make(function: Any) -> Any:
-        made: Any = CFunc(function, (tuple(signature.args), signature.return_type), {}, {"error_model": "numpy"})
+        compiler = {"pipeline_class": kernel_compiler.KernelCompiler} if _OWN_CACHE else {}
+        wanted = tuple(signature.args), signature.return_type
+        made: Any = CFunc(function, wanted, {}, {"error_model": "numpy"}, **compiler)
         if _OWN_CACHE:
             made._cache = KernelCache(function, "callback")
         else:

@@ -81,8 +81,9 @@ class KernelCache(NullCache):
 
     def save_overload(self, sig: Any, cres: Any) -> None:
         """Keep a compiled form; that it cannot be written costs time at the next start, and is told there."""
-        if cres.entry_point is None or cres.library.has_dynamic_globals or any(not x.can_cache for x in cres.lifted):
+        if cres.library.has_dynamic_globals or any(not x.can_cache for x in cres.lifted):
             return
+        cres.library._ensure_finalized()  # a callback's is not yet
         self._record(sig, KernelCompiler.seconds)
         folder, name = cache_folder(), self.file_name(sig, cres.codegen)
         if name is None or folder.path is None:

@@ -110,10 +110,11 @@ class KernelCompiler(compiler.Compiler):
     def __init__(self, typingctx: Any, targetctx: Any, library: Any, args: Any, return_type: Any, flags: Any,
                  locals: Any) -> None:  # fmt: skip
         kind, flags = EntryLibrary, _Flags(flags)
-        flags.no_cfunc_wrapper = True
         if is_nested():
             kind = InnerLibrary
             flags.no_compile = flags.no_cpython_wrapper = True
+        if is_nested() or not flags.no_cpython_wrapper:  # else C calls it
+            flags.no_cfunc_wrapper = True
         super().__init__(typingctx, targetctx, library, args, return_type, flags, locals)
         self._kind = kind
 

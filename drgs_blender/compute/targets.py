@@ -49,7 +49,7 @@ _V3 = ("sse4.2", "popcnt", "avx", "avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt",
 _V4 = (*_V3, "avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl")
 #: The best first.
 TARGETS = (
-    # LLVM's x86-64-v4 would split sixteen lanes in two halves of 256 bits.
+    # LLVM's x86-64-v4 has loops use half of each register; its Zen 4 has not.
     Target("x86-64-v4", "x86_64", _V4, "x86-64-v4", "-prefer-256-bit"),
     Target("x86-64-v3", "x86_64", _V3, "x86-64-v3"),
     Target("apple-m1", "arm64", (), "apple-m1", systems=("Darwin",)),

@@ -119,6 +119,20 @@ def test_functions_out_of_the_cache_can_be_parts_of_kernels(folder):
     assert helper(3.0) == 6.0
 
 
+@pytest.mark.parametrize("met_before", [False, True])
+def test_functions_out_of_the_cache_can_be_parts_of_callbacks(folder, monkeypatch, met_before):
+    """As functions of surfels along rays are: kernels of the list, and parts of what Embree calls."""
+    njit(_inner)(1.0)
+    monkeypatch.setitem(globals(), "inner", njit(_inner))
+    if met_before:
+        assert inner(2.0) == 4.0
+    for _ in range(2):  # compiled, and out of the cache
+        called = cfunc(numba.float64(numba.float64))(_outer)
+        assert called.ctypes(2.0) == 5.0
+    assert called.cache_hits == 1
+    assert inner(3.0) == 6.0
+
+
 DAMAGES = {
     "empty": lambda data: b"",
     "cut": lambda data: data[: len(data) // 2],
