@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 import sys
@@ -201,7 +202,9 @@ def test_a_full_disk_is_named_and_the_kernel_runs(tmp_path, use_folder, compiled
     try:
         folder = use_folder(disk / "kernels")
         assert not folder.trouble
-        (disk / "ballast").write_bytes(b"\0" * (48 << 10))
+        with contextlib.suppress(OSError), (disk / "ballast").open("wb", buffering=0) as ballast:
+            while ballast.write(b"\0" * 1024) == 1024:
+                pass
         assert njit(_sum, parallel=True)(np.arange(5.0)) == 20.0
         assert "space" in folder.trouble and str(disk) in folder.trouble
         assert not list(disk.rglob("*.tmp")) and not kernels(disk)
