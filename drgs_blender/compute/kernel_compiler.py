@@ -20,7 +20,7 @@ from typing import Any
 
 import numba
 from llvmlite import binding
-from numba.core import codegen, compiler, errors, sigutils
+from numba.core import codegen, compiler, errors, sigutils, targetconfig
 
 #: Versions of Numba for which this was tested.
 TESTED = ("0.61", "0.62", "0.63", "0.64", "0.65", "0.66", "0.67", "0.68")
@@ -35,15 +35,9 @@ def is_tested() -> bool:
 _SHARED = binding.Linkage.linkonce_odr, binding.Linkage.weak_any, binding.Linkage.weak_odr
 
 
-class _State:
-    """Whether a kernel is being compiled. Numba's compiler lock guards it."""
-
-    compiling = False
-
-
 def is_nested() -> bool:
-    """Whether a kernel is being compiled right now, so that another function is compiled for its sake."""
-    return _State.compiling
+    """Whether Numba is compiling something right now, so that another function is compiled for its sake."""
+    return targetconfig.ConfigStack.top_or_none() is not None
 
 
 class _Flags(compiler.Flags):
@@ -134,12 +128,10 @@ class KernelCompiler(compiler.Compiler):
             return super().compile_extra(func)
         collects, begun = gc.isenabled(), time.process_time()
         gc.disable()
-        _State.compiling = True
         try:
             with _inner_libraries(self.state.targetctx.codegen()):
                 return super().compile_extra(func)
         finally:
-            _State.compiling = False
             KernelCompiler.seconds = time.process_time() - begun
             if collects:
                 gc.enable()
