@@ -157,6 +157,7 @@ def settle(config: Any) -> None:
     config : module
         ``numba.config``.
     """
+    config.reload_config()  # else Numba does when it compiles, if variables have changed, and forgets what is set here
     if config.CPU_NAME is None and config.CPU_FEATURES is None and (target := choose()) is not None:
         config.CPU_NAME, config.CPU_FEATURES = target.cpu, target.features
 

@@ -75,9 +75,11 @@ def test_llvm_knows_the_targets_of_this_machine():
         assert known == (cpu != "no-such-one"), done.stderr
 
 
-def test_numba_compiles_for_the_target_and_children_decide_for_themselves():
+@pytest.mark.parametrize("first", ["", "import numba; "])
+def test_numba_compiles_for_the_target_and_children_decide_for_themselves(first):
     program = (
-        "import os; from drgs_blender.compute import jit, targets\n"
+        f"{first}import os; from drgs_blender.compute import jit, targets\n"
+        "jit.njit(lambda x: x + 1, cache=False)(1)\n"
         "tuple_ = jit.numba.core.registry.cpu_target.target_context.codegen().magic_tuple()\n"
         "print(targets.current(), *tuple_[1:], 'NUMBA_CPU_NAME' in os.environ)\n"
     )
