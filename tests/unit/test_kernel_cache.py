@@ -99,7 +99,7 @@ def test_only_what_python_calls_is_kept(folder):
 
 def test_functions_of_kernels_can_be_called_from_python_before_and_after(folder, compiled):
     helper = njit(_inner)
-    namespace = {"helper": helper}
+    namespace = {"helper": helper, "__name__": __name__}
     exec("def first(x): return helper(x) + 1.0\ndef second(x): return helper(x) - 1.0", namespace)
     first, second = (njit(namespace[name], cache=False) for name in ("first", "second"))
     assert first(2.0) == 5.0
@@ -113,7 +113,7 @@ def test_functions_out_of_the_cache_can_be_parts_of_kernels(folder):
     njit(_inner)(1.0)
     helper = njit(_inner)
     assert helper(2.0) == 4.0
-    namespace = {"helper": helper}
+    namespace = {"helper": helper, "__name__": __name__}
     exec("def kernel(x): return helper(x) + 1.0", namespace)
     assert njit(namespace["kernel"], cache=False)(2.0) == 5.0
     assert helper(3.0) == 6.0
@@ -199,7 +199,7 @@ def test_a_full_disk_is_named_and_the_kernel_runs(tmp_path, use_folder, compiled
     try:
         folder = use_folder(disk / "kernels")
         assert not folder.trouble
-        (disk / "ballast").write_bytes(b"\0" * (48 << 10))
+        (disk / "ballast").write_bytes(b"\0" * (60 << 10))
         assert njit(_sum, parallel=True)(np.arange(5.0)) == 20.0
         assert "space" in folder.trouble and str(disk) in folder.trouble
         assert not list(disk.rglob("*.tmp")) and not kernels(disk)
