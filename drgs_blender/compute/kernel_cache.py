@@ -122,7 +122,7 @@ class KernelCache(NullCache):
 
     def _record(self, sig: Any, seconds: float) -> None:
         """For ``tools/kernels.py``: append what is called, and how long it took to compile, to a file."""
-        if path := os.environ.get("DRGS_RECORD_KERNELS"):
+        if self.kind == "kernel" and (path := os.environ.get("DRGS_RECORD_KERNELS")):
             arguments = describe(sigutils.normalize_signature(sig)[0])
             row = [self.function.__module__, self.function.__qualname__, arguments, round(seconds, 2)]
             with open(path, "a", encoding="utf-8") as file:
