@@ -1,7 +1,7 @@
 """The processors for which kernels are compiled: few fixed ones, so that machines of different make agree.
 
-A kernel is not compiled for the processor at hand but for the best of these that it has. So the nodes of a farm draw
-the same frame bit for bit, and a release can bring kernels that are compiled already (docs/kernels.md).
+A kernel is not compiled for the processor at hand but for the best of these that it has. So the nodes of a farm run
+the same code, and a release can bring kernels that are compiled already (docs/kernels.md).
 """
 
 from __future__ import annotations
