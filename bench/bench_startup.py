@@ -53,7 +53,7 @@ def relight(folder: Path) -> list[object]:
     drgs = [sys.executable, "-m", "drgs_blender.cli.main"]
     if not (folder / "spot.drgs").exists():
         run([*drgs, "make", ROOT / "examples/spot/spot_triangulated.obj", "--out", folder / "spot.drgs"])
-        kernels = [sys.executable, ROOT / "tools/kernels.py", "--do", "environment", folder]
+        kernels = [sys.executable, ROOT / "tools/kernels.py", "record", "--do", "environment", folder]
         run(kernels)
     return [*drgs, "relight", folder / "spot.drgs", "--camera", folder / "camera.json", "--env", folder / "light.exr",
             "--out", folder / "frame.exr"]  # fmt: skip
