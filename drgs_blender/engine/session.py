@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..asset.model import Asset, PosedSurfels
+from ..compute.folders import cache_folder
 from ..compute.jit import use_threads
 from ..compute.prepare import prepare_kernels
 from ..errors import Cancelled, UsageError
@@ -246,7 +247,8 @@ class Session:
         return self._stage.scene, light, posed, lamps, self._stage.tree
 
     def _warnings(self, settings: RenderSettings) -> list[str]:
-        return self._stage.warnings() + self._devices.warnings(settings)
+        trouble = cache_folder().trouble
+        return self._stage.warnings() + self._devices.warnings(settings) + ([trouble] if trouble else [])
 
     def _statistics(self, frame: Frame, posed: PosedSurfels, lap: _Laps) -> dict[str, float]:
         return lap.seconds | {

@@ -106,3 +106,17 @@ def test_who_compiles_ends_with_a_killed_engine(make_client, make_frame, asset_p
     with pytest.raises(Cancelled):
         client.render(make_frame(), tell, lambda: len(workers) > 0 and (client._child.kill() or True))
     assert all_gone(workers, 5.0)
+
+
+@pytest.mark.slow
+def test_a_folder_that_cannot_keep_kernels_is_named_with_each_picture(make_client, make_frame, asset_path, tmp_path):
+    """Otherwise nobody would know why every start takes so long; the picture is the same."""
+    (tmp_path / "file").write_text("")
+    client = make_client(f"import os; os.environ |= {{'DRGS_CACHE_DIR': {str(tmp_path / 'file' / 'kernels')!r}}}")
+    engines = make_client(), client
+    for engine in engines:
+        engine.load_asset(str(asset_path))
+    usual, found = (engine.render(make_frame()) for engine in engines)
+    assert not any("compiled kernels" in warning for warning in usual.warnings)
+    assert any(str(tmp_path) in warning and "cannot be kept" in warning for warning in found.warnings)
+    assert (found["Combined"] == usual["Combined"]).all()

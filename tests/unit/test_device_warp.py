@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from drgs_blender.compute.folders import cache_folder
 from drgs_blender.device.kernels import Launcher, Work
 from drgs_blender.device.warp import VERSION, load_module, warp
 from drgs_blender.errors import Cancelled, DeviceError
@@ -51,6 +52,7 @@ def test_warp_prints_nothing_where_programs_read(tmp_path: Path) -> None:
     pytest.importorskip("warp", reason="warp-lang is not installed")
     code = """
 import numpy as np
+from drgs_blender.compute.folders import cache_folder
 from drgs_blender.device.kernels import Launcher, Work
 def double(lane, lanes, room, x, out):
     for i in range(lane, len(x), lanes):
@@ -80,21 +82,26 @@ def _nothing(lane, lanes, room, x, out):  # type: ignore[no-untyped-def]
     pass
 
 
-def test_a_folder_of_kernels_that_cannot_be_written_is_the_devices_failure(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+@pytest.fixture
+def folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Path]:
+    """An empty folder of kernels, in use."""
+    monkeypatch.setenv("DRGS_CACHE_DIR", str(tmp_path))
+    cache_folder.cache_clear()
+    yield tmp_path
+    cache_folder.cache_clear()
+
+
+def test_a_folder_of_kernels_that_cannot_be_written_is_the_devices_failure(folder: Path) -> None:
     pytest.importorskip("warp", reason="warp-lang is not installed")
     launcher = Launcher("cpu")
-    (tmp_path / "file").write_bytes(b"")
-    monkeypatch.setenv("DRGS_CACHE_DIR", str(tmp_path / "file"))
+    (folder / "warp").write_bytes(b"")
     with pytest.raises(DeviceError, match="nothing"):
         launcher.launch(Work(_nothing, (), {}), 1, [np.ones(7, np.int8)], [np.zeros(1)])
 
 
-def test_a_module_that_does_not_load_is_not_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_module_that_does_not_load_is_not_kept(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("drgs_blender.device.warp.warp", lambda: None)
-    monkeypatch.setenv("DRGS_CACHE_DIR", str(tmp_path))
     for _ in range(2):
         with pytest.raises(ZeroDivisionError):
             load_module("1 / 0")
-    assert [path.suffix for path in (tmp_path / "warp").iterdir() if path.is_file()] == [".py"]
+    assert [path.suffix for path in (folder / "warp").iterdir() if path.is_file()] == [".py"]
