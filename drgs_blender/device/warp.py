@@ -66,6 +66,7 @@ def warp() -> Any:
     wp.config.kernel_cache_dir = str(folder / "kernels")
     try:
         wp.init()
+        folder.mkdir(parents=True, exist_ok=True)
         os.utime(folder)  # it is in use, see `compute.folders`
     except Exception as error:
         raise DeviceError("device cuda", f"Warp does not start ({error})", "Use the CPU") from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -94,6 +95,7 @@ def folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Path]:
 def test_a_folder_of_kernels_that_cannot_be_written_is_the_devices_failure(folder: Path) -> None:
     pytest.importorskip("warp", reason="warp-lang is not installed")
     launcher = Launcher("cpu")
+    shutil.rmtree(folder / "warp", ignore_errors=True)
     (folder / "warp").write_bytes(b"")
     with pytest.raises(DeviceError, match="nothing"):
         launcher.launch(Work(_nothing, (), {}), 1, [np.ones(7, np.int8)], [np.zeros(1)])
