@@ -41,6 +41,7 @@ def commands(folder: Path) -> Iterator[tuple[str, list[object]]]:
                "--rays", "4", "--out", folder / "frame.exr"]  # fmt: skip
     assert light.is_file()
     yield "frame", relight
+    yield "frame", [*relight[:8], folder / "light.hdr", *relight[9:]]
     yield "frame", [*own, "frame", folder]
     yield "mesh", [*relight, "--primary", "mesh"]
     yield "lights", [*own, "lights", folder]
@@ -52,13 +53,15 @@ def commands(folder: Path) -> Iterator[tuple[str, list[object]]]:
     for solver in ("mpm", "xpbd", "rigid"):
         yield "simulate", [*drgs, "simulate", asset, "--solver", solver, "--resolution", "12", "--frames", "3",
                            "--floor", "-1", "--out", folder / f"bake-{solver}"]  # fmt: skip
+        yield "simulate", [*drgs, "simulate", asset, "--solver", solver, "--settings", folder / "settings.json",
+                           "--out", folder / f"bake-{solver}-all"]  # fmt: skip
     yield "frame", [*relight[:-2], "--cache", folder / "bake-mpm", "--frames", "2", "--out", folder / "baked.exr"]
     for variant in ("p", "m"):
         yield "reconstruct", [*own, f"reconstruct-{variant}", folder]
 
 
 def make_environment(folder: Path) -> None:
-    """A small sky with a sun, and the camera file."""
+    """A small sky with a sun in two formats, the camera file, and settings of a simulation with all that may act."""
     import numpy as np
 
     from drgs_blender.formats.exr import write_exr_picture
@@ -66,6 +69,15 @@ def make_environment(folder: Path) -> None:
     sky = np.full((32, 64, 3), 0.5, np.float32)
     sky[6, 20] = 200.0
     write_exr_picture(folder / "light.exr", sky)
+    # Radiance's format, each row's channels one after the other, in runs of up to 128 bytes that differ
+    channels = b"".join(bytes([64]) + bytes([128 + 8 * i] * 64) for i in range(4))
+    header = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 32 +X 64\n"
+    (folder / "light.hdr").write_bytes(header + 32 * (bytes([2, 2, 0, 64]) + channels))
+    (folder / "ground.obj").write_text("v -2 -2 -1\nv 2 -2 -1\nv 0 2 -1\nf 1 2 3\n")
+    pins, fields = [{"box": [[-1, -1, -1], [1, 1, -0.5]]}], [{"kind": "wind", "strength": 2.0, "flow": 1.0}]
+    ground = {"mesh": str(folder / "ground.obj")}
+    settings = {"resolution": 12, "last": 3, "colliders": [ground], "pins": pins, "fields": fields}
+    (folder / "settings.json").write_text(json.dumps(settings))
     camera = {"matrix_world": [[1, 0, 0, 0], [0, 0, -1, -3], [0, 1, 0, 0], [0, 0, 0, 1]], "width": 48, "height": 48}
     (folder / "camera.json").write_text(json.dumps(camera | {"fov_x": 40}))
 
@@ -82,6 +94,7 @@ def engine(folder: Path, what: str) -> None:
         Camera,
         Frame,
         Light,
+        Material,
         MeshState,
         Moment,
         ObjectState,
@@ -95,20 +108,22 @@ def engine(folder: Path, what: str) -> None:
     mesh = read_asset(folder / "spot.drgs").mesh
     world = World(np.full((32, 64, 3), 0.5, np.float32))
     settings = RenderSettings(cosine=2, ggx=1, environment=1, aa=1)
+    mattes = "Combined", "CryptoObject00", "CryptoMaterial00"
     with EngineClient(locate_engine()) as client:
         key = client.load_asset(str(folder / "spot.drgs"))
         body = ObjectState("cow", key, vertices=np.array(mesh.vertices, np.float32))
         frame = Frame(1, camera, [body], world, settings)
         if what == "frame":
-            client.render(frame)
+            client.render(replace(frame, passes=mattes))
             client.render(replace(frame, objects=[ObjectState("cow", key)], settings=replace(settings, aa=4)))
         elif what == "lights":
             place = np.eye(4)
             place[:3, 3] = 0, -1, 2
             lights = [Light(kind, kind, place) for kind in ("point", "sun", "spot", "area")]  # type: ignore[arg-type]
+            glowing = Material("glowing", emission=(1.0, 1.0, 1.0))
             floor = MeshState(
                 "floor", np.array([[-2, -2, -1], [2, -2, -1], [2, 2, -1], [-2, 2, -1]], np.float32),
-                np.array([[0, 1, 2], [0, 2, 3]], np.int32), np.eye(4)[None], np.zeros(1, np.int32),
+                np.array([[0, 1, 2], [0, 2, 3]], np.int32), np.eye(4)[None], np.zeros(1, np.int32), materials=[glowing],
             )  # fmt: skip
             client.render(replace(frame, lights=lights, meshes=[floor]))
             client.render(replace(frame, lights=lights, meshes=[floor], settings=replace(settings, primary="mesh")))

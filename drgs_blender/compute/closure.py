@@ -20,6 +20,10 @@ from .folders import cache_folder, write_atomically
 PACKAGE = Path(__file__).resolve().parent.parent
 #: What a release brings, see `shipped`.
 SHIPPED = Path(__file__).with_name("kernels")
+#: What kernels' modules import and machine code does not depend on, or only through the target's name.
+NEUTRAL = frozenset(f"drgs_blender/{name}.py" for name in (
+    "compute/closure", "compute/folders", "compute/shipped", "compute/targets", "errors", "version",
+))  # fmt: skip
 _DIGITS = 16
 
 
@@ -46,16 +50,17 @@ def digest(path: Path) -> str:
 
 @functools.cache
 def closure(path: Path) -> frozenset[Path]:
-    """Source files of `path` and of everything of the package that it imports, directly or not."""
+    """Source files of `path` and of everything of the package that it imports, directly or not, but `NEUTRAL` ones."""
     seen, pending = {path}, [path]
     while pending:
         for other in _facts(pending.pop())[1]:
-            if other not in seen:
+            if other not in seen and _name(other) not in NEUTRAL:
                 seen.add(other)
                 pending.append(other)
     return frozenset(seen)
 
 
+@functools.cache
 def _name(path: Path) -> str:
     """The same on every machine: below the package, or the bare name."""
     return path.relative_to(PACKAGE.parent).as_posix() if path.is_relative_to(PACKAGE) else path.name

@@ -24,9 +24,11 @@ from typing import Any
 
 import llvmlite
 import numba
+from llvmlite import binding
 from numba.core import sigutils, types
 from numba.core.caching import NullCache
 from numba.core.compiler import CompileResult
+from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
 
 from . import closure, shipped
@@ -34,7 +36,7 @@ from .folders import cache_folder, write_atomically
 from .kernel_compiler import KernelCompiler, LoadedLibrary, is_nested
 
 log = logging.getLogger(__name__)
-_MAGIC = b"drgs kernel 1\n"
+_MAGIC = b"drgs kernel 2\n"
 _DIGEST = 32
 ENDING = ".kernel"
 
@@ -56,6 +58,7 @@ class KernelCache(NullCache):
 
     def __init__(self, function: Any, kind: str = "kernel") -> None:
         self.function, self.kind = function, kind
+        self._names: dict[tuple[Any, ...], str | None] = {}
 
     @property
     def cache_path(self) -> str | None:
@@ -67,7 +70,6 @@ class KernelCache(NullCache):
         """The compiled form for `sig`, None if there is none (that can be used)."""
         if is_nested():
             return None  # machine code cannot be linked into the caller
-        target_context.refresh()
         self._record(sig, 0.0)
         name = self.file_name(sig, target_context.codegen())
         if name is None:
@@ -105,6 +107,12 @@ class KernelCache(NullCache):
 
     def file_name(self, sig: Any, codegen: Any) -> str | None:
         """Name of the file for `sig`; None for types that have no name of their own, of which none is kept."""
+        key = sig, codegen.magic_tuple()
+        if key not in self._names:
+            self._names[key] = self._make_name(sig, codegen)
+        return self._names[key]
+
+    def _make_name(self, sig: Any, codegen: Any) -> str | None:
         arguments = describe(sigutils.normalize_signature(sig)[0])
         if arguments is None:
             return None
@@ -196,20 +204,33 @@ def _reduce(cres: Any) -> bytes:
     library, descriptor = cres.library, cres.fndesc
     descriptor.typemap = descriptor.calltypes = None  # not wanted any more, and some cannot be pickled
     module = library._final_module
-    symbols = [value.name for values in (module.functions, module.global_variables) for value in values
-               if not value.is_declaration]  # fmt: skip
-    code = library.name, library._get_compiled_object(), symbols
+    values = [*module.functions, *module.global_variables]
+    symbols = [value.name for value in values if not value.is_declaration]
+    needed = [value.name for value in values if value.is_declaration and not value.name.startswith("llvm.")]
+    code = library.name, library._get_compiled_object(), symbols, needed
     environments = tuple(cres._find_referenced_environments())
     return dumps((code, descriptor, cres.environment, cres.signature, cres.objectmode, cres.reload_init, environments))
 
 
+def _provide(symbols: list[str], target_context: Any) -> None:
+    """Have the functions of Numba there that machine code calls.
+
+    Its registries of all that it can compile, with SciPy's linear algebra, take a third of a second to load: they are
+    left to the first kernel that is compiled, or that calls what only they bring.
+    """
+    rtsys.initialize(target_context)
+    known = target_context.codegen()._engine._defined_symbols
+    if any(name not in known and binding.address_of_symbol(name) is None for name in symbols):
+        target_context.refresh()
+
+
 def _rebuild(target_context: Any, content: bytes) -> Any:
-    (name, machine_code, symbols), descriptor, environment, signature, objectmode, reload_init, environments = (
-        pickle.loads(content)
-    )
+    code, descriptor, environment, signature, objectmode, reload_init, environments = pickle.loads(content)
+    name, machine_code, symbols, needed = code
     for function in reload_init:
         function()
     codegen = target_context.codegen()
+    _provide(needed, target_context)
     library = LoadedLibrary(codegen, name)
     library.enable_object_caching()
     library._set_compiled_object(machine_code)

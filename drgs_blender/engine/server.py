@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import faulthandler
+import gc
 import logging
 import os
 import queue
@@ -93,10 +94,13 @@ class Server:
         for target in (self.listen, self.show_life):
             threading.Thread(target=target, name=f"drgs-{target.__name__}", daemon=True).start()
         self._note_preparing(1, STARTING)
+        gc.disable()  # modules stay: to look for garbage among them takes a tenth of the time of loading them
         try:
             self._open_session()
         except Exception:
             logger.exception("the engine is incomplete")  # the first request will meet it again and be told
+        gc.freeze()
+        gc.enable()
         self._note_preparing(-1)
         while True:
             message, arrays = self._requests.get()
@@ -153,6 +157,7 @@ class Server:
     def _open_session(self) -> Any:
         if self.session is None:
             try:
+                from ..render.shade.brdf import layer_table
                 from . import compiling
                 from .session import Session
             except ImportError as error:
@@ -160,6 +165,7 @@ class Server:
                 raise DeviceError(sys.executable, f"lacks a part of the engine ({error})", remedy) from error
             compiling.watch(self._note_preparing)
             self.session = Session()
+            threading.Thread(target=layer_table, name="drgs-table", daemon=True).start()  # while the first asset loads
         return self.session
 
     def _cancelled(self) -> bool:

@@ -71,6 +71,7 @@ def with_uvs(obj):
     layer.uv.foreach_set("vector", (corners / 2 + 0.5).astype(np.float32).ravel())
 
 
+@pytest.mark.slow
 def test_an_image_shows_what_was_baked_last(lit, scene, tmp_path):
     """Whatever it was before: other pixels, another size, another colour space, packed."""
     with_uvs(lit)
@@ -130,6 +131,7 @@ def test_nothing_is_baked_over_a_material_or_of_what_is_not_rendered(lit):
     assert "relit" not in lit.data.attributes
 
 
+@pytest.mark.slow
 def test_a_mesh_that_is_edited_during_a_bake_is_told(lit, monkeypatch):
     program = part("operators.program").ProgramOperator
     finish = program._finish

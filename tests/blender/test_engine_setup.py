@@ -123,6 +123,7 @@ def made(tmp_path_factory) -> tuple[Path, Path]:
     return folder, source
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("there", [True, False])
 def test_the_versions_of_shipped_kernels_are_asked_for_first_and_not_insisted_on(tmp_path, monkeypatch, there):
     source = engine_source(tmp_path / "source", wheel(tmp_path, "tinydep"), DOCTOR.format("tinydep"))
@@ -145,6 +146,7 @@ def test_the_versions_of_shipped_kernels_are_asked_for_first_and_not_insisted_on
     again.cancel()
 
 
+@pytest.mark.slow
 def test_another_version_of_the_engine_needs_no_network(made):
     folder, source = made
     assert setup.state(folder, source) == "ready" and not setup.needs_network(folder, source)

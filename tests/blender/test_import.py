@@ -219,6 +219,7 @@ def test_a_file_that_a_program_is_writing_is_not_written_by_another(scene, tmp_p
     assert assets.unused(target) == target and assets.unused(pattern, [1, 2]) == pattern
 
 
+@pytest.mark.slow
 def test_names_that_no_file_can_have_are_told(ball, tmp_path):
     """Of some, the system says more than that there is no such file."""
     name = str(tmp_path / ("n" * 300))

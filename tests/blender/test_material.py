@@ -83,6 +83,7 @@ def test_a_mesh_that_is_not_the_assets_is_not_restored(ball):
         bpy.ops.drgs.restore_material()
 
 
+@pytest.mark.slow
 def test_a_report_tells_of_engine_scene_and_messages(ball, tmp_path):
     part("addon.messages").note("WARNING", "something about the light")
     path = tmp_path / "report.txt"

@@ -140,6 +140,7 @@ def test_a_bake_is_stopped_at_once_and_goes_on(body, scene):
     np.testing.assert_allclose(vertices(body, 3), sphere()[0], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_pins_regions_and_colliders_take_part(body, scene):
     """Pinned at the top and carried aside by its own keys, while a table rises from below."""
     matter = body.drgs.matter
@@ -184,6 +185,7 @@ def test_pins_regions_and_colliders_take_part(body, scene):
     np.testing.assert_allclose(vertices(body, 3)[height == 1], [[0, 0, 1]], atol=0.02, err_msg="it follows its object")
 
 
+@pytest.mark.slow
 def test_force_fields_of_the_scene_act_on_it(body, scene):
     """A wind that turns up carries it along, a vortex of another collection does not, and a magnet is named."""
     matter = body.drgs.matter
@@ -216,6 +218,7 @@ def test_force_fields_of_the_scene_act_on_it(body, scene):
     assert any(made["MAGNET"].name in text and "(Magnet) plays no part" in text for text in said)
 
 
+@pytest.mark.slow
 def test_faults_name_the_object_and_the_remedy(body, scene, tmp_path):
     matter = body.drgs.matter
 
@@ -310,6 +313,7 @@ def test_a_material_fills_its_numbers_in(body, scene, name):
     assert describe.describe(body, scene)["material"] == {"name": name, "density": 777}
 
 
+@pytest.mark.slow
 def test_matter_is_baked_on_the_device_of_the_scene(body, scene):
     """What has no form for a card is not asked of it, and another device is no other simulation."""
     body.drgs.matter.frame_end = 3

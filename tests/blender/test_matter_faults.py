@@ -23,6 +23,7 @@ def whole(cache) -> list[int]:
     return frames
 
 
+@pytest.mark.slow
 def test_a_full_disk_ends_a_bake_with_a_word_and_what_was_done_stays(body, scene, small_disk):
     matter, disk = body.drgs.matter, small_disk("size=1024k")
     matter.folder, matter.frame_end, matter.gravity = str(disk / "cache"), 500, 0.0

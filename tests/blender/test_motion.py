@@ -83,6 +83,7 @@ def layers_of(scene, engine, tmp_path):
     return dict(np.load(arrays))
 
 
+@pytest.mark.slow
 def test_vectors_are_those_of_cycles(moving, tmp_path):
     """An armature, a scale, instances and the camera move; frame 3 of 4, so that both neighbours differ."""
     cycles = moving.cycles

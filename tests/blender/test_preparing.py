@@ -55,6 +55,7 @@ def wait(condition, seconds=120.0):
         time.sleep(0.005)
 
 
+@pytest.mark.slow
 def test_f12_counts_them_and_is_left_at_once(cold, shown, monkeypatch):
     pressed: list[float] = []
 
@@ -91,6 +92,7 @@ def test_the_bar_of_f12_moves_with_them(scene, shown, captured, monkeypatch):
     assert shown[:3] == [(f"{phases.PREPARING}, {i} of 3", i / 3) for i in range(1, 4)]
 
 
+@pytest.mark.slow
 def test_a_viewport_says_it_with_its_part_and_can_be_closed(cold, monkeypatch):
     worker = part("addon.viewport.worker").Worker()
     monkeypatch.setattr(views, "worker", worker)
@@ -144,6 +146,7 @@ def test_a_bake_says_it(body, tmp_path, monkeypatch):
         bake.close()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="environments have no links there")
 def test_the_set_up_counts_them_and_cancelled_there_the_engine_answers(tmp_path, monkeypatch):
     """The true engine, in an environment that finds its packages in that of the tests."""

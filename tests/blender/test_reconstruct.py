@@ -91,6 +91,7 @@ def test_progress_is_what_the_program_says(tmp_path):
     assert state.part == 0.5 and state.text == "Mesh, 12,000 surfels"
 
 
+@pytest.mark.slow
 def test_what_is_no_capture_is_said(scene, tmp_path):
     with pytest.raises(RuntimeError, match="is not there"):
         bpy.ops.drgs.reconstruct(filepath=str(tmp_path / "none"))

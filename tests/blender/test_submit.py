@@ -51,6 +51,7 @@ def test_a_job_is_written_and_its_command_shown(settings, tmp_path, manager, fil
     assert bpy.ops.drgs.copy_submit() == {"FINISHED"}
 
 
+@pytest.mark.slow
 def test_what_a_node_would_miss_is_told(settings, tmp_path):
     settings.use_check, settings.shared = True, str(tmp_path / "assets")
     with pytest.raises(RuntimeError, match="a node would miss"):

@@ -263,7 +263,7 @@ def test_every_operator_that_changes_the_scene_can_be_undone():
 INHERITED = {"filepath", "name", "remove_name", "remove_active"}
 
 
-@pytest.mark.parametrize("loaded", [False, True])
+@pytest.mark.parametrize("loaded", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_every_operator_answers_without_what_it_needs(scene, ball_file, loaded):
     """With no object, or one that is not selected: refused in words, never by a failure of the program."""
     if loaded:

@@ -39,6 +39,7 @@ except MemoryError:
     assert result.stdout == "refused\n", result.stderr
 
 
+@pytest.mark.slow
 @linux
 def test_frame_that_does_not_fit_can_be_given_back_and_a_smaller_one_still_works(
     make_client, make_frame, asset_path, monkeypatch

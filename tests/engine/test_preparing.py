@@ -31,6 +31,7 @@ Session.render = render
 """
 
 
+@pytest.mark.slow
 def test_a_kernel_that_is_compiled_is_told_and_can_be_left_at_once(make_client, make_frame, asset_path, tmp_path):
     """The engine has no kernels, and is in the middle of one when it is asked to stop."""
     client = make_client(f"import os; os.environ['DRGS_CACHE_DIR'] = {str(tmp_path)!r}")
@@ -69,6 +70,7 @@ def test_counted_kernels_reach_the_client_with_their_fraction(make_client, make_
     assert {phase for phase, _ in told[:first]} <= {STARTING, "Deforming"}
 
 
+@pytest.mark.slow
 def test_counted_kernels_are_no_reason_to_kill_the_engine(make_client, make_frame, asset_path, monkeypatch):
     """They take longer than an engine may that was asked to stop, and are heard of all the time."""
     client = make_client(COUNTED.format(steps=12))
@@ -91,6 +93,7 @@ def test_counted_kernels_are_no_reason_to_kill_the_engine(make_client, make_fram
     assert client.pid == pid
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
 def test_who_compiles_ends_with_a_killed_engine(make_client, make_frame, asset_path, tmp_path):
     """In the middle of a kernel, which takes seconds; Blender may have been closed."""

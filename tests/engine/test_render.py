@@ -148,6 +148,7 @@ def test_killed_engine_is_replaced_and_the_picture_is_the_same(client, make_fram
     assert_same_bits(client.render(make_frame(0.2)), expected)
 
 
+@pytest.mark.slow
 @posix
 def test_engine_killed_again_and_again_is_an_error(client, make_frame, expected):
     with pytest.raises(EngineError, match="killed by signal 9"):
@@ -173,6 +174,7 @@ def test_stopped_engine_meets_the_deadline(make_client, make_frame, asset_path, 
     assert_same_bits(client.render(make_frame(0.2)), expected)
 
 
+@pytest.mark.slow
 @posix
 def test_asset_that_is_cut_off_in_place_is_an_error_until_it_is_whole(make_client, make_frame, asset_path, tmp_path):
     """The system ends an engine that looks at mapped bytes which are not there any more."""

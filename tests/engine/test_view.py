@@ -256,6 +256,7 @@ def test_process_gives_the_pictures_of_the_library(client, make_frame, session):
     close(passes, session.render(frame))
 
 
+@pytest.mark.slow
 @posix
 def test_new_engine_begins_the_view_again(client, make_frame):
     frame = make_frame(0.2)

@@ -74,6 +74,7 @@ def animate(
     return subprocess.CompletedProcess(process.args, process.returncode, said, errors)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", ["relative.blend", "blurred.blend"])
 def test_animation_rendered_by_blender_has_the_same_bits(drgs, folder, tmp_path, scene):
     own, blender = tmp_path / "drgs", tmp_path / "blender"
@@ -117,6 +118,7 @@ def engines_of(process: subprocess.Popen[str]) -> list[int]:
     return [pid for pid, line in children(process.pid).items() if "drgs_blender.engine" in line]
 
 
+@pytest.mark.slow
 @linux
 @pytest.mark.parametrize(("deaths", "code"), [(2, 0), (3, 75)])
 def test_two_engines_may_die_of_a_frame(folder, tmp_path, deaths, code):
@@ -144,6 +146,7 @@ def test_two_engines_may_die_of_a_frame(folder, tmp_path, deaths, code):
         assert np.array_equal(calm, shaken)
 
 
+@pytest.mark.slow
 @linux
 @pytest.mark.parametrize("attempt", range(20 if WHOLE else 1))
 def test_killed_blender_takes_its_engine_along(folder, tmp_path, attempt):
@@ -205,6 +208,7 @@ for k in range({count}):
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("body", "few", "many"), [(UNDO, 12, 200), (RELOAD, 5, 50)], ids=["undo", "reload"])
 def test_a_picture_is_the_same_after_all_that_was_taken_back(folder, tmp_path, body, few, many):
     out = tmp_path / "out"

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import subprocess
 
+import pytest
+
 from drgs_blender.cli.find_blender import find_blender
 from drgs_blender.engine import protocol
 
@@ -60,6 +62,7 @@ def test_brushes_of_blender_are_no_files_of_the_scene(drgs, folder, tmp_path):
     assert (code, len(lines)) == (0, 1) and "0 files" in lines[0], (lines, error)
 
 
+@pytest.mark.slow
 def test_simulated_frames_are_files_of_the_scene(drgs, folder, tmp_path):
     scene, script = tmp_path / "matter.blend", tmp_path / "make.py"
     script.write_text(f"""

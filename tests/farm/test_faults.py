@@ -51,6 +51,7 @@ def test_folder_that_cannot_be_written_is_found_before_anything_is_rendered(drgs
     assert (code, lines) == (73, ["DRGS_EXIT class=cannot-write"]) and "ead-only" in error
 
 
+@pytest.mark.slow
 def test_denoised_frames_meet_full_and_sealed_disks_as_rendered_ones_do(drgs, folder, small_disk, tmp_path):
     noisy = tmp_path / "noisy" / "####.exr"
     options = ("--rays", 4, "--denoise", "none", "--passes", "temporal")
@@ -69,6 +70,7 @@ def test_denoised_frames_meet_full_and_sealed_disks_as_rendered_ones_do(drgs, fo
     assert code == 0 and sum(line.startswith("Saved") for line in lines) == 2
 
 
+@pytest.mark.slow
 @linux
 def test_log_on_a_full_disk_costs_neither_frame_nor_code(folder, tmp_path):
     """Logs lie on the disk of the frames as a rule; when it has room again the job goes on."""
@@ -91,6 +93,7 @@ def test_full_disk_of_temporary_files_is_said_and_can_be_tried_again(folder, sma
     assert [path.name for path in disk.iterdir()] == ["filler"]
 
 
+@pytest.mark.slow
 def test_frames_of_an_asset_that_changes_meanwhile_are_not_kept(folder, tmp_path):
     """They would be of the old content and bear the hash of the new one."""
     for name in ("relative.blend", "tile.drgs"):
@@ -106,6 +109,7 @@ def test_frames_of_an_asset_that_changes_meanwhile_are_not_kept(folder, tmp_path
     assert not list((tmp_path / "out").iterdir())
 
 
+@pytest.mark.slow
 def test_asset_that_is_copied_over_in_place_gives_the_job_back(folder, tmp_path):
     """As `cp` and `scp` do it: first the file is cut off, while the engine has it mapped."""
     for name in ("relative.blend", "tile.drgs"):
@@ -186,6 +190,7 @@ def test_kernels_are_compiled_where_they_cannot_be_kept_or_read(small_disk, tmp_
     assert result == "42" and str(disk) in told and "space" in told
 
 
+@pytest.mark.slow
 @linux
 @pytest.mark.parametrize("attempt", range(20 if WHOLE else 1))
 def test_killed_blender_gives_the_job_back_and_takes_the_engine_along(folder, tmp_path, attempt):

@@ -68,6 +68,7 @@ def soon(condition: Callable[[], bool], seconds: float = 20.0) -> bool:
     return condition()
 
 
+@pytest.mark.slow
 def test_chunks_share_blender_and_engine_and_have_the_same_bits(drgs, folder, warm, tmp_path):
     scene, out, alone = folder / "relative.blend", tmp_path / "out", tmp_path / "alone"
     code, lines, errors = told(scene, out, warm, "3,-2", "--openjd")

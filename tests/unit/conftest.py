@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
@@ -25,3 +26,25 @@ def device(_device: OnDevice) -> Iterator[OnDevice]:
     _device.failed = ""
     yield _device
     assert not _device.failed, _device.failed
+
+
+@pytest.fixture
+def compiled() -> Iterator[list[str]]:
+    """The names of functions that were compiled for Python, but Numba's own: those whichever test comes first needs."""
+    from numba.core import event
+
+    names: list[str] = []
+
+    class Count(event.Listener):
+        def on_start(self, event: event.Event) -> None:
+            function = event.data["dispatcher"].py_func
+            if "numba" not in Path(function.__code__.co_filename).parts:
+                names.append(function.__name__)
+
+        def on_end(self, event: event.Event) -> None:
+            pass
+
+    count = Count()
+    event.register("numba:compile", count)
+    yield names
+    event.unregister("numba:compile", count)

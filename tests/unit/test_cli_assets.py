@@ -137,6 +137,7 @@ def test_import_without_a_mesh_and_a_picture_of_it(tmp_path, capsys):
     assert pixels[8, 8, 3] > 240 and 100 < pixels[8, 8, 0] < 255 and pixels[0, 0, 3] == 0
 
 
+@pytest.mark.slow
 def test_scale_is_of_all_lengths(cube, tmp_path):
     for command in (["make", str(cube)], ["import", str(splats(tmp_path / "s.ply")), "--mesh", str(cube)]):
         sizes = []

@@ -113,6 +113,7 @@ def test_blur_is_rendered_skipped_and_made_again(render, tmp_path):
     assert not np.array_equal(rendered("blurred.blend", "Saved", "--seed", "3")["Combined"], blurred["Combined"])
 
 
+@pytest.mark.slow
 def test_a_frame_does_not_depend_on_its_chunk(render, tmp_path):
     render(frames="1-3")
     together = read_frame(tmp_path / "0003.exr")[0]["Combined"]
@@ -132,6 +133,7 @@ def test_negative_frames_are_evaluated_where_they_are(render, tmp_path):
     assert column(tmp_path / "0002.exr") > 16.5
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="finds Blender in /proc")
 def test_job_that_is_killed_leaves_no_folder(folder, tmp_path):
     scratch = tmp_path / "scratch"
@@ -167,6 +169,7 @@ def test_blender_that_stops_answering_is_ended(folder, monkeypatch):
             next(frames)
 
 
+@pytest.mark.slow
 def test_scripts_in_the_file_run_only_when_allowed(render):
     assert render(scene="script.blend", frames="1")[0] == 0
     code, lines, errors = render("--enable-scripts", scene="script.blend", frames="2")
@@ -174,6 +177,7 @@ def test_scripts_in_the_file_run_only_when_allowed(render):
     assert "exit code 9" in errors[-1]
 
 
+@pytest.mark.slow
 def test_scene_faults_have_their_exit_code(render, folder, tmp_path):
     faults = {"blind": "has no camera", "layerless": "has no view layer that is rendered", "empty": "render region"}
     for name, fault in faults.items():
@@ -191,6 +195,7 @@ def test_scene_faults_have_their_exit_code(render, folder, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="SIGTERM ends a process at once there")
 @pytest.mark.parametrize(("how", "code", "word"), [("SIGTERM", 143, "terminated"), ("SIGINT", 130, "interrupted")])
 def test_termination_leaves_nothing_behind(folder, tmp_path, how, code, word):
@@ -274,6 +279,7 @@ def test_what_computes_nowhere_is_refused_before_anything_starts(render):
     assert (code, lines) == (64, ["DRGS_EXIT class=usage"]) and "abacus" in errors[-1]
 
 
+@pytest.mark.slow
 def test_nothing_is_left_in_the_temporary_folder(render, tmp_path_factory, monkeypatch):
     scratch = tmp_path_factory.mktemp("scratch")
     monkeypatch.setattr(tempfile, "tempdir", str(scratch))
@@ -282,6 +288,7 @@ def test_nothing_is_left_in_the_temporary_folder(render, tmp_path_factory, monke
     assert not list(scratch.iterdir())
 
 
+@pytest.mark.slow
 def test_frames_with_the_passes_for_it_are_denoised_over_time(render, tmp_path, capsys):
     """The cameras that neighbours name are the same, so the tile is followed; motion is what Blender's keys say."""
     assert render("--passes", "temporal,Vector", "--denoise", "none")[0] == 0

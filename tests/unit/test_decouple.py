@@ -472,6 +472,7 @@ def test_metallic_is_smoothed_more_than_other_materials(ball, capture, monkeypat
     assert more < 0.8 * spread()
 
 
+@pytest.mark.slow
 def test_exposures_of_photographs_are_found_again(ball, capture):
     """Every other one a quarter of a stop darker."""
     views = [
@@ -578,6 +579,7 @@ def test_normals_are_the_meshs_where_none_are_learned(ball, capture):
     assert found.normals == pytest.approx(VertexNormals(ball.faces, len(ball.vertices))(ball.vertices), abs=1e-6)
 
 
+@pytest.mark.slow
 def test_normals_are_turned_towards_the_true_ones_once_light_is_known(ball, capture, monkeypatch):
     """A ball with bumps that the photographed one has not."""
     bumps = 1 + 0.1 * np.sin(3 * ball.vertices).prod(axis=1, keepdims=True)

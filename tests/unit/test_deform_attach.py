@@ -40,6 +40,7 @@ def coverage(mesh: Mesh, surfels, binding, size: int = 512) -> np.ndarray:
     return rasterise(prepare(posed, camera, camera_parameters(camera, settings, 0)), 0, size).alpha.mean(axis=-1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "source",
     [trimesh.creation.icosphere(2), trimesh.creation.icosphere(4), trimesh.creation.cylinder(1.0, 2.0, sections=64)],

@@ -200,6 +200,7 @@ def asset_of(vertices: np.ndarray, faces: np.ndarray) -> Asset:
     return Asset(surfels, mesh, binding)
 
 
+@pytest.mark.slow
 def test_surfels_and_mesh_follow_particles_exactly_under_affine_motion():
     vertices, faces = box_mesh((-0.5, -0.4, -0.3), (0.5, 0.4, 0.3))
     asset = asset_of(vertices, faces)

@@ -241,6 +241,7 @@ def exposed(monkeypatch: pytest.MonkeyPatch, rays: int, seed: int) -> Film:
     return films[0]
 
 
+@pytest.mark.slow
 def test_gain_at_32_rays_against_the_converged_picture(monkeypatch: pytest.MonkeyPatch) -> None:
     truth = exposed(monkeypatch, 2048, seed=5).components.sum(2)
     film = exposed(monkeypatch, 32, seed=1)

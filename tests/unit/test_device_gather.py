@@ -63,6 +63,7 @@ def gathered(found: Gatherer) -> list[Any]:
     return [sums.detach(), *(value.grad for value in given)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", [{}, {"shadows": False}, {"indirect": False}])
 def test_what_arrives_and_its_derivatives(there: OnDevice, settings: dict[str, bool]) -> None:
     device = gatherer(there, **settings)

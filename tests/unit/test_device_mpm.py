@@ -320,6 +320,7 @@ def card(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("drgs_blender.simulate.solver.name_of", lambda device: "cpu")
 
 
+@pytest.mark.slow
 def test_a_bake_goes_on_with_the_same_bits_on_its_device(card: None, tmp_path: Path) -> None:
     whole, parts = ParticleCache(tmp_path / "whole"), ParticleCache(tmp_path / "parts")
     job = job_of(device="cuda")

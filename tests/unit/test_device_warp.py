@@ -49,6 +49,7 @@ def test_the_version_is_that_of_the_packages() -> None:
     assert f'"warp-lang>={VERSION[:-1]},' in text
 
 
+@pytest.mark.slow
 def test_warp_prints_nothing_where_programs_read(tmp_path: Path) -> None:
     pytest.importorskip("warp", reason="warp-lang is not installed")
     code = """

@@ -145,6 +145,7 @@ print(t[0], face[0], u[0], v[0], sum(tree._intersect.stats.cache_hits.values()))
 """
 
 
+@pytest.mark.slow
 def test_kernels_come_out_of_the_cache_in_another_process(tmp_path: Path) -> None:
     """Addresses differ from process to process; cached code must not have kept one."""
     root = Path(__file__).resolve().parents[2]

@@ -149,6 +149,7 @@ def test_splat_transform_reads_what_we_write(tmp_path: Path, suffix: str) -> Non
     same_shapes(theirs, ours, 1e-4)
 
 
+@pytest.mark.slow
 @needs("@playcanvas/splat-transform")
 @pytest.mark.parametrize(
     ("name", "layout", "sign"),

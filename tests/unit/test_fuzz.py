@@ -65,11 +65,13 @@ def test_damaged_files_that_are_read_apart_do_no_harm(tmp_path: Path) -> None:
     assert not found, f"{len(found)} in {tmp_path}: {found[:5]}"
 
 
+@pytest.mark.slow
 def test_published_collections_of_broken_files_do_no_harm(shared_data: Path, tmp_path: Path) -> None:
     found = problems([str(shared_data / "malformed")], 0, tmp_path)
     assert not found, found
 
 
+@pytest.mark.slow
 def test_bombs_cost_a_second_and_little_memory_at_most(tmp_path: Path) -> None:
     """Small files that would unpack to a quarter of a gigabyte, wherever a format lets itself be unpacked."""
     bombs = tmp_path / "bombs"

@@ -13,7 +13,6 @@ import disks
 import numba
 import numpy as np
 import pytest
-from numba.core import event
 
 from drgs_blender.compute import folders, kernel_cache, manifest
 from drgs_blender.compute.jit import cfunc, njit, plain, prange
@@ -37,32 +36,6 @@ def _sum(values):
     for i in prange(len(values)):
         total += inner(values[i])
     return total
-
-
-class Count(event.Listener):
-    """Functions that were compiled for Python while it is registered, not those of Numba itself."""
-
-    def __init__(self) -> None:
-        self.names: list[str] = []
-
-    def on_start(self, event):
-        function = event.data["dispatcher"].py_func
-        if (
-            "numba" not in Path(function.__code__.co_filename).parts
-        ):  # its own are compiled once in a process, by whichever test comes first
-            self.names.append(function.__name__)
-
-    def on_end(self, event):
-        pass
-
-
-@pytest.fixture
-def compiled():
-    """The names of functions that were compiled."""
-    count = Count()
-    event.register("numba:compile", count)
-    yield count.names
-    event.unregister("numba:compile", count)
 
 
 @pytest.fixture
@@ -98,6 +71,36 @@ def test_what_was_compiled_is_found_by_the_next_process(folder, compiled):
 def test_only_what_python_calls_is_kept(folder):
     assert njit(_sum, parallel=True)(np.arange(5.0)) == 20.0
     assert [path.name.partition("-")[0] for path in kernels(folder)] == ["_sum"]
+
+
+_LOADED = """
+import sys
+from drgs_blender.compute.jit import njit
+@njit
+def double(x): return 2 * x
+@njit
+def scramble(text): return hash(text)
+print(double(4), scramble("drgs") == hash("drgs"), "numba.np.linalg" in sys.modules)
+"""
+
+
+def test_numba_s_compiler_is_loaded_only_for_what_is_compiled(tmp_path):
+    """It takes a third of a second."""
+    program, said = tmp_path / "program.py", []
+    program.write_text(_LOADED)
+    environment = os.environ | {"DRGS_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": str(ROOT)}
+    for _ in range(2):
+        done = subprocess.run([sys.executable, program], env=environment, capture_output=True, text=True, check=True)
+        said.append(done.stdout.split())
+    assert said == [["8", "True", "True"], ["8", "True", "False"]]
+
+
+@pytest.mark.parametrize(("symbol", "times"), [("NRT_decref", 0), ("malloc", 0), ("function_of_nobody", 1)])
+def test_what_a_kernel_calls_and_is_not_there_is_loaded_with_the_compiler(monkeypatch, symbol, times):
+    target, calls = numba.core.registry.cpu_target.target_context, []
+    monkeypatch.setattr(target, "refresh", lambda: calls.append(1))
+    kernel_cache._provide([symbol], target)
+    assert len(calls) == times
 
 
 def test_functions_of_kernels_can_be_called_from_python_before_and_after(folder, compiled):

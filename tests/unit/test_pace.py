@@ -29,6 +29,7 @@ def outcome(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> Calla
     monkeypatch.setattr(pace, "SECONDS", 0.05)
     monkeypatch.setattr(pace, "WAITING", 2.0)
     monkeypatch.setattr(pace, "SHARED_SECONDS", 0.1)
+    monkeypatch.setattr(pace, "slowness", lambda: 1.0)
     monkeypatch.setattr(os, "getloadavg", lambda: (0.0, 0.0, 0.0), raising=False)
     pytester.makeconftest("from pace import *")
     pytester.makeini("[pytest]\nmarkers = slow\n alone\naddopts = --strict-markers -p no:cacheprovider -p no:xdist")
@@ -55,6 +56,24 @@ def test_a_test_that_waits_for_long_fails_too_but_not_on_a_busy_machine(outcome,
     assert outcome(text, "--part=fast")[0] == {"failed": 1}
     monkeypatch.setattr(os, "getloadavg", lambda: (2.0 * os.cpu_count(), 0.0, 0.0), raising=False)
     assert outcome(text, "--part=fast")[0] == {"passed": 1}
+
+
+def test_programs_that_a_test_runs_count(outcome, monkeypatch) -> None:
+    """As they would for whoever waits for the tests; and a slow processor has more time for all."""
+    text = "import subprocess, sys\ndef test_it(): subprocess.run([sys.executable, '-c', {!r}])\n".format(
+        "import time\nwhile time.process_time() < 0.3: pass"
+    )
+    assert outcome(text, "--part=fast")[0] == {"failed": 1}
+    monkeypatch.setattr(pace, "slowness", lambda: 20.0)
+    assert outcome(text, "--part=fast")[0] == {"passed": 1}
+
+
+def test_slowness_is_that_of_the_loop(monkeypatch) -> None:
+    for seconds, slowness in ((0.5 * pace.LOOP_SECONDS, 1.0), (3 * pace.LOOP_SECONDS, 3.0)):
+        pace.slowness.cache_clear()
+        monkeypatch.setattr(pace, "loop", lambda seconds=seconds: seconds)
+        assert pace.slowness() == pytest.approx(slowness)
+    pace.slowness.cache_clear()
 
 
 def test_set_up_counts_and_may_take_longer_where_it_is_shared(outcome) -> None:

@@ -48,6 +48,7 @@ def digests(**environment: str) -> dict[str, str]:
     return dict(line.split() for line in done.stdout.splitlines())
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="processors of the x86 family")
 def test_older_instructions_give_the_same_bits() -> None:
     """Numpy and its BLAS choose their code by the processor; the kernels are strict, see docs/farm/nodes.md."""

@@ -147,6 +147,7 @@ def plane_of_surfels(y: float, half: float, spacing: float, sigma: float, **valu
     return surfels(np.stack([x, np.full_like(x, y), z], -1), [sigma, 0, 0], [0, 0, sigma], **values)
 
 
+@pytest.mark.slow
 def test_a_front_edge_does_not_bleed_into_the_back_surface() -> None:
     camera = look_along_y(64, 64, distance=4)
     front = plane_of_surfels(-1.0, 0.5, 0.05, 0.04, albedo=(1, 0, 0), roughness=0.1, object_index=1)
@@ -186,6 +187,7 @@ def test_intersecting_surfels_are_ordered_where_the_ray_meets_them() -> None:
     assert red[12:18].min() > 0.5 > red[22:28].max()
 
 
+@pytest.mark.slow
 def test_fog_of_any_depth_is_blended_in_exact_order() -> None:
     """A thousand faint tilted sheets on every ray, listed by centre in an order that differs on both sides of it."""
     rng = np.random.default_rng(9)

@@ -104,6 +104,7 @@ def test_surfels_on_the_mesh_lie_where_their_binding_says(capture, settings):
     assert asset.provenance["report"]["psnr"] > 24
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stop", "step"), [(5, 6), (11, 4), (25, 18)], ids=["in the first start's trial", "in the second's", "after it"]
 )
@@ -121,6 +122,7 @@ def test_a_run_that_was_stopped_goes_on_bit_for_bit(capture, tmp_path, stop, ste
     assert np.array_equal(whole.mesh.vertices, resumed.mesh.vertices)
 
 
+@pytest.mark.slow
 def test_materials_and_light_come_with_the_asset(capture, tmp_path):
     quick = Decoupling(iterations=30, pixels=256, cosine=4, ggx=4, light=4, environment=8, normals=True)
     short = Settings(schedule=replace(QUICK, iterations=60, surfels=1500), mesh_resolution=32, decoupling=quick)

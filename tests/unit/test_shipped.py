@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numba
 import pytest
-from numba.core import event
 
 from drgs_blender.cli import doctor
 from drgs_blender.compute import folders, kernel_cache, prepare, shipped, targets
@@ -28,28 +27,6 @@ import kernel_archive  # noqa: E402
 
 def _twice(x):
     return 2.0 * x + 1.0
-
-
-class Count(event.Listener):
-    """Compilations that Python asked for while it is registered."""
-
-    def __init__(self) -> None:
-        self.names: list[str] = []
-
-    def on_start(self, event):
-        self.names.append(event.data["dispatcher"].py_func.__name__)
-
-    def on_end(self, event):
-        pass
-
-
-@pytest.fixture
-def compiled():
-    """The names of functions that were compiled."""
-    count = Count()
-    event.register("numba:compile", count)
-    yield count.names
-    event.unregister("numba:compile", count)
 
 
 @pytest.fixture

@@ -112,6 +112,7 @@ def asset_file(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_kill_9_leaves_a_cache_that_loads_and_goes_on_with_the_same_bits(tmp_path, whole):
     asset, folder = asset_file(tmp_path), tmp_path / "bake"
     (tmp_path / "s.json").write_text(json.dumps(DROP | {"last": 1_000_000}))

@@ -74,6 +74,7 @@ def test_it_is_as_stiff_as_it_should_be():
         assert mean[1, 1] == pytest.approx(1 - poisson * (mean[0, 0] - 1), abs=0.004)
 
 
+@pytest.mark.slow
 def test_stiffer_beams_droop_less_and_about_as_much_as_they_should():
     droops = {}
     for young in (1e5, 4e5, 1.6e6):

@@ -36,6 +36,7 @@ def spinning_jelly(h: float = 0.1) -> object:
     return solver_of(points, h, young=2e4, velocity=turning, low=points.min(axis=0) - 1, high=points.max(axis=0) + 1)
 
 
+@pytest.mark.slow
 def test_momenta_are_kept_over_3000_steps():
     solver = spinning_jelly()
     linear, angular = momenta(solver)
@@ -67,6 +68,7 @@ def test_energy_only_falls_and_slowly():
     assert now > 0.93 * start
 
 
+@pytest.mark.slow
 def test_another_solver_goes_the_same_way():
     """1500 steps of one and the same state, against plain numpy in double precision."""
     h = 0.1
@@ -133,6 +135,7 @@ def test_strain_slower_than_the_digits_of_one_is_not_lost():
     assert (solver.gradients[middle, 0, 0] - 1).mean() == pytest.approx(strain, rel=0.02)
 
 
+@pytest.mark.slow
 def test_cantilever_swings_at_its_first_frequency():
     """Against Euler and Bernoulli, whose beam is a little too stiff."""
     solver = cantilever(4, length=0.75, gravity=(0, 0, -0.1))

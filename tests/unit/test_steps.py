@@ -142,6 +142,7 @@ def test_time_left_is_said_roughly():
     assert [clock(seconds) for seconds in (1, 12, 44, 95, 300)] == ["5 s", "10 s", "45 s", "2 min", "5 min"]
 
 
+@pytest.mark.slow
 def test_time_left_is_that_of_the_longest_row_of_steps(run):
     """Of steps side by side only the longer one counts, and what those before took tells the pace."""
     nothing = "import time; time.sleep(4)"
