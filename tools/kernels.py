@@ -41,12 +41,13 @@ def commands(folder: Path) -> Iterator[tuple[str, list[object]]]:
                "--rays", "4", "--out", folder / "frame.exr"]  # fmt: skip
     assert light.is_file()
     yield "frame", relight
-    yield "frame", [*relight[:8], folder / "light.hdr", *relight[9:]]
+    yield "hdr", [*relight[:8], folder / "light.hdr", *relight[9:]]
     yield "frame", [*own, "frame", folder]
     yield "mesh", [*relight, "--primary", "mesh"]
     yield "lights", [*own, "lights", folder]
     yield "denoise", [*relight, "--denoise", "svgf"]
     yield "denoise", [*own, "denoise", folder]
+    yield "mattes", [*own, "mattes", folder]
     yield "motion", [*own, "motion", folder]
     yield "viewport", [*own, "viewport", folder]
     yield "surfel rays", [*relight, "--tracer", "surfels"]
@@ -108,14 +109,15 @@ def engine(folder: Path, what: str) -> None:
     mesh = read_asset(folder / "spot.drgs").mesh
     world = World(np.full((32, 64, 3), 0.5, np.float32))
     settings = RenderSettings(cosine=2, ggx=1, environment=1, aa=1)
-    mattes = "Combined", "CryptoObject00", "CryptoMaterial00"
     with EngineClient(locate_engine()) as client:
         key = client.load_asset(str(folder / "spot.drgs"))
         body = ObjectState("cow", key, vertices=np.array(mesh.vertices, np.float32))
         frame = Frame(1, camera, [body], world, settings)
         if what == "frame":
-            client.render(replace(frame, passes=mattes))
+            client.render(frame)
             client.render(replace(frame, objects=[ObjectState("cow", key)], settings=replace(settings, aa=4)))
+        elif what == "mattes":
+            client.render(replace(frame, passes=("Combined", "CryptoObject00", "CryptoMaterial00")))
         elif what == "lights":
             place = np.eye(4)
             place[:3, 3] = 0, -1, 2

@@ -272,6 +272,8 @@ def jobs_of(frame: Frame) -> set[str]:
         jobs.add("lights")
     if frame.previous is not None or frame.next is not None:
         jobs.add("motion")
+    if any(name.startswith("Crypto") for name in frame.passes):
+        jobs.add("mattes")
     return jobs
 
 

@@ -167,7 +167,7 @@ def test_a_ray_meets_the_blend_of_all_surfels_or_the_mesh_behind(backed: bool) -
     directions = rng.normal(size=(80, 3)) * 0.1 - [0, 0, 1]
     directions = (directions / np.linalg.norm(directions, axis=1, keepdims=True)).astype(np.float32)
     out = np.zeros((80, 400, 16), np.float32)
-    _meet_all(rays.mixed_tracer(scene.tracer, tracer_of(bvh)), origins, directions, out.shape[1], out)
+    _meet_all(rays.MixedTracer(*scene.tracer, *tracer_of(bvh)), origins, directions, out.shape[1], out)
     stop = (0.2 - origins[:, 2]) / directions[:, 2] if backed else np.full(80, np.inf)
     share = []
     for n in range(80):

@@ -109,9 +109,10 @@ NATIVES: dict[Any, Any] = {
         _NEAREST, "nearest", _HIT, (MeshTracer,), (memory.load_float, memory.load_int32, memory.load_int64)
     ),
     surface.shadowed.py_func: Native(_SHADOWED, "shadowed", "bool", (MeshTracer,), (memory.load_int64,)),
-    # Rays meet meshes alone: `rays` has a function of each kind for them.
-    **{
-        getattr(rays, name): getattr(rays, f"_{name}")
-        for name in ("passed", "meet", "put_hit", "surface_of", "put_start")
-    },
+    # Rays meet meshes alone.
+    rays.passed.py_func: rays.passed_meshes.py_func,
+    rays.meet.py_func: rays.meet_meshes.py_func,
+    rays.put_hit.py_func: rays.put_hit_meshes.py_func,
+    rays.surface_of.py_func: rays.surface_of_meshes.py_func,
+    rays.put_start.py_func: rays.put_start_meshes.py_func,
 }

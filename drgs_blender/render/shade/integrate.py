@@ -28,7 +28,7 @@ from . import brdf
 from . import wave as w
 from .heads import ALPHA, COUNTS, HEAD, put_sample, write_heads
 from .paths import FOUND, trace_paths
-from .rays import mixed_tracer
+from .rays import meshes_alone
 from .spread import variances
 from .strategies import BATCH, KIND, KINDS, deliver, finish, trace_batch
 
@@ -48,7 +48,7 @@ class Kernel:
 
     def tables(self, scene: TraceScene, light: EnvironmentLight, lamps: Lamps) -> tuple[Any, Any, Any, Any]:
         """(tracer, geometry, sky, lamps) as `shade` takes them; until the scene's next update."""
-        return scene.tracer, scene.geometry, light.sky, lamps.tables
+        return meshes_alone(scene.tracer), scene.geometry, light.sky, lamps.tables
 
     def shade(self, *arguments: Any) -> None:
         """Shade all points; see `shade_points`."""
@@ -108,8 +108,10 @@ def integrate(
     sky_part, lamp_part = share * (not light.black), (1.0 - share) * (lamps.count > 0)
     kernel = kernel or Kernel()
     tracer, geometry, sky, lamp_tables = kernel.tables(scene, light, lamps)
+    if surfels is not None:
+        tracer = tracer._replace(**tracer_of(surfels)._asdict())
     tables = (
-        tracer if surfels is None else mixed_tracer(tracer, tracer_of(surfels)),
+        tracer,
         geometry,
         F(scene.extent if surfels is None else max(scene.extent, surfels.extent)),
         sky,

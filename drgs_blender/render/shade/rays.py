@@ -1,27 +1,25 @@
-"""Rays of the integrator, compiled for what they are cast at: meshes alone, or meshes and the surfels of DR-GS objects.
+"""Rays of the integrator: what they meet of meshes and, where there are any to meet, of the surfels of DR-GS objects.
 
-Every function here takes a tracer first, and its type decides at compile time: with a `Tracer` there is no trace of
-surfels in the kernels. With a `MixedTracer` a shadow ray brings what surfels let through, and a ray that looks for a
-surface meets the surfels in front of the nearest mesh as one blended surface, see `surfels.surfel_tracer`. What they
-let through reaches the sky; where a mesh lies behind them, chance decides which of the two the ray meets.
+With surfels a shadow ray brings what these let through, and a ray that looks for a surface meets the surfels in front
+of the nearest mesh as one blended surface, see `surfels.surfel_tracer`. What they let through reaches the sky; where a
+mesh lies behind them, chance decides which of the two the ray meets. Functions that end in ``_meshes`` are for meshes
+alone; a device has no others.
 """
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...compute.jit import njit, overload
+from ...compute.jit import njit
 from ..lights.lamp_shapes import DIFFUSE, GLOSSY
 from ..lights.lamp_shapes import SHADOW as SHADOWED
 from ..lights.lamps import lamp_flags
 from ..lights.triangles import ABSENT
 from ..sampling import ONE, ZERO, F, U, mix, unit
 from ..surfels.raster import GAP
-from ..surfels.surfel_tracer import SurfelTracer, trace_surfels, transmittance
+from ..surfels.surfel_tracer import trace_surfels, transmittance
 from ..trace import masks
 from ..trace.surface import Tracer, nearest, shadowed, surface_at
 from . import wave as w
@@ -31,7 +29,7 @@ _GAP, _SURFELS = F(GAP), U(0xFFFFFFFF)
 
 
 class MixedTracer(NamedTuple):
-    """`Tracer` of the meshes and `SurfelTracer` of the surfels, in one; see there."""
+    """`Tracer` of the meshes and `SurfelTracer` of the surfels, see there; without surfels the latter's fields are 0."""
 
     intersect: int
     occluded: int
@@ -45,30 +43,13 @@ class MixedTracer(NamedTuple):
     surfel_object: int
 
 
-def mixed_tracer(meshes: Tracer, surfels: SurfelTracer) -> MixedTracer:
-    """Both tracers in one."""
-    return MixedTracer(*meshes, *surfels)
+def meshes_alone(meshes: Tracer) -> MixedTracer:
+    """A tracer of no surfels."""
+    return MixedTracer(*meshes, 0, 0, 0, 0, 0)
 
 
-def _or(meshes: Callable[..., Any]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Make of a function for `MixedTracer` one for compiled code that is `meshes` for any other tracer."""
-
-    def decorate(mixed: Callable[..., Any]) -> Callable[..., Any]:
-        def choose(tracer: Any, *rest: Any) -> Callable[..., Any]:
-            return mixed if tracer.instance_class is MixedTracer else meshes
-
-        def name(tracer: Any, *rest: Any) -> Any:
-            raise TypeError("for compiled code alone")
-
-        choose.__signature__ = inspect.signature(meshes)  # type: ignore[attr-defined]
-        name.__name__, name.__doc__ = mixed.__name__, mixed.__doc__
-        overload(name)(choose)
-        return name
-
-    return decorate
-
-
-def _passed(tracer, s, ints, slot, far, mask):  # type: ignore[no-untyped-def]
+@njit
+def passed_meshes(tracer, s, ints, slot, far, mask):  # type: ignore[no-untyped-def]
     i, _ = w.at(slot)
     hidden = shadowed(
         tracer, s[i + w.OX], s[i + w.OY], s[i + w.OZ], s[i + w.LX], s[i + w.LY], s[i + w.LZ], ZERO, far, mask
@@ -76,26 +57,29 @@ def _passed(tracer, s, ints, slot, far, mask):  # type: ignore[no-untyped-def]
     return ZERO if hidden else ONE
 
 
-@_or(_passed)
+@njit
 def passed(tracer, s, ints, slot, far, mask):  # type: ignore[no-untyped-def]
     """Share of light that reaches a slot's position from its direction, from no farther than `far`."""
     i, c = w.at(slot)
     ox, oy, oz, lx, ly, lz = s[i + w.OX], s[i + w.OY], s[i + w.OZ], s[i + w.LX], s[i + w.LY], s[i + w.LZ]
     if shadowed(tracer, ox, oy, oz, lx, ly, lz, ZERO, far, mask):
         return ZERO
+    if tracer.surfel_scene == 0:
+        return ONE
     return transmittance(
         tracer, ox, oy, oz, lx, ly, lz, ZERO, far, mask, np.int32(ints[c + w.OWN]),
         s[i + w.GX], s[i + w.GY], s[i + w.GZ], s[i + w.SIZE],
     )  # fmt: skip
 
 
-def _meet(tracer, s, ints, slot, mask):  # type: ignore[no-untyped-def]
+@njit
+def meet_meshes(tracer, s, ints, slot, mask):  # type: ignore[no-untyped-def]
     i, _ = w.at(slot)
     hit = nearest(tracer, s[i + w.OX], s[i + w.OY], s[i + w.OZ], s[i + w.LX], s[i + w.LY], s[i + w.LZ], ZERO, FAR, mask)
     return (ONE if hit[1] < 0 else ZERO), hit[0], hit
 
 
-@_or(_meet)
+@njit
 def meet(tracer, s, ints, slot, mask):  # type: ignore[no-untyped-def]
     """Follow a slot's ray: ``(through, reach, hit)``.
 
@@ -105,6 +89,10 @@ def meet(tracer, s, ints, slot, mask):  # type: ignore[no-untyped-def]
     i, c = w.at(slot)
     ox, oy, oz, lx, ly, lz = s[i + w.OX], s[i + w.OY], s[i + w.OZ], s[i + w.LX], s[i + w.LY], s[i + w.LZ]
     t, face, place, u, v, gx, gy, gz = nearest(tracer, ox, oy, oz, lx, ly, lz, ZERO, FAR, mask)
+    none = np.int32(-1)
+    blank = (ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, none)
+    if tracer.surfel_scene == 0:
+        return (ONE if face < 0 else ZERO), t, (t, face, place, u, v, gx, gy, gz, *blank)
     key = ints[c + w.KEY]
     through, depth, nx, ny, nz, px, py, pz, r, g, b, roughness, metallic, size, owner, reach = trace_surfels(
         tracer, ox, oy, oz, lx, ly, lz, ZERO, t, mask, np.int32(ints[c + w.OWN]),
@@ -112,11 +100,8 @@ def meet(tracer, s, ints, slot, mask):  # type: ignore[no-untyped-def]
     )  # fmt: skip
     if face >= 0:
         if owner < 0 or unit(mix(U(key + U(0x85157AF5)))) < through:
-            none = np.int32(-1)
-            blank = (ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, none)
             return ZERO, reach, (t, face, place, u, v, gx, gy, gz, *blank)
         through = ZERO
-    none = np.int32(-1)
     blended = (nx, ny, nz, r, g, b, roughness, metallic, size, owner)
     return through, reach, (depth, none, none, ZERO, ZERO, px, py, pz, *blended)
 
@@ -133,14 +118,17 @@ def _put_face(s, ints, slot, px, py, pz, dx, dy, dz, hit, key, owner):  # type: 
     ints[c + w.KEY], ints[c + w.OWNER] = key, U(owner)
 
 
-def _put_hit(tracer, s, ints, slot, px, py, pz, dx, dy, dz, hit, key, owner):  # type: ignore[no-untyped-def]
+@njit
+def put_hit_meshes(tracer, s, ints, slot, px, py, pz, dx, dy, dz, hit, key, owner):  # type: ignore[no-untyped-def]
     _put_face(s, ints, slot, px, py, pz, dx, dy, dz, hit, key, owner)
 
 
-@_or(_put_hit)
+@njit
 def put_hit(tracer, s, ints, slot, px, py, pz, dx, dy, dz, hit, key, owner):  # type: ignore[no-untyped-def]
     """Put what a ray from p along d met (a hit of `meet`) into a slot, as `surface_of` reads it."""
     _put_face(s, ints, slot, px, py, pz, dx, dy, dz, hit, key, owner)
+    if tracer.surfel_scene == 0:
+        return
     i, c = w.at(slot)
     s[i + w.NX], s[i + w.NY], s[i + w.NZ] = hit[8], hit[9], hit[10]
     s[i + w.AR], s[i + w.AG], s[i + w.AB] = hit[11], hit[12], hit[13]
@@ -157,11 +145,12 @@ def _face_of(s, ints, slot, geometry):  # type: ignore[no-untyped-def]
     )[:14]  # fmt: skip
 
 
-def _surface_of(tracer, s, ints, slot, geometry):  # type: ignore[no-untyped-def]
+@njit
+def surface_of_meshes(tracer, s, ints, slot, geometry):  # type: ignore[no-untyped-def]
     return _face_of(s, ints, slot, geometry)
 
 
-@_or(_surface_of)
+@njit
 def surface_of(tracer, s, ints, slot, geometry):  # type: ignore[no-untyped-def]
     """What `surface_at` says of the hit in a slot, save for its object."""
     i, c = w.at(slot)
@@ -173,13 +162,16 @@ def surface_of(tracer, s, ints, slot, geometry):  # type: ignore[no-untyped-def]
     )  # fmt: skip
 
 
-def _put_start(tracer, s, ints, slot, own, size, point):  # type: ignore[no-untyped-def]
+@njit
+def put_start_meshes(tracer, s, ints, slot, own, size, point):  # type: ignore[no-untyped-def]
     pass
 
 
-@_or(_put_start)
+@njit
 def put_start(tracer, s, ints, slot, own, size, point):  # type: ignore[no-untyped-def]
     """Put into a slot which surfels are the `point`-th shading point's own; see ``ShadingPoints``."""
+    if tracer.surfel_scene == 0:
+        return
     i, c = w.at(slot)
     s[i + w.SIZE] = size[point]
     ints[c + w.OWN] = U(own[point])
