@@ -29,7 +29,7 @@ _GAP, _SURFELS = F(GAP), U(0xFFFFFFFF)
 
 
 class MixedTracer(NamedTuple):
-    """`Tracer` of the meshes and `SurfelTracer` of the surfels, see there; without surfels the latter's fields are 0."""
+    """`Tracer` of the meshes and `SurfelTracer` of the surfels, see there; without surfels the latter's are 0."""
 
     intersect: int
     occluded: int
