@@ -141,4 +141,6 @@ def test_real_kernels_outlive_changes_elsewhere_and_no_others(tmp_path):
     append("geometry.py", "\nX = 1\n")
     assert compiled() > 0
     append("errors.py", "\nX = 1\n")
+    assert compiled() == 0
+    append("compute/jit.py", "\nX = 1\n")
     assert compiled() > 0
