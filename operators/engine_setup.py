@@ -16,6 +16,7 @@ from ..addon import engine_link, engine_setup, preferences, setup_job
 from ..drgs_blender.engine.locate import VARIABLE, locate_engine
 from ..drgs_blender.errors import UsageError
 from .base import DrgsOperator
+from .program import say
 
 
 class DRGS_OT_engine_setup(DrgsOperator, bpy.types.Operator):
@@ -131,7 +132,11 @@ class DRGS_OT_engine_setup(DrgsOperator, bpy.types.Operator):
         if os.environ.get(VARIABLE):
             self.warn(f"The variable {VARIABLE} names another engine, which is used as long as it is set")
         if bpy.app.background:
+            said = ""
             while setup_job.follow() is not None:
+                if job.text != said:
+                    said = job.text
+                    say(f"Set Up Engine: {said}")
                 time.sleep(setup_job.INTERVAL)
             if job.error is not None:
                 raise job.error

@@ -154,7 +154,7 @@ class ProgramOperator(DrgsOperator):
             except subprocess.TimeoutExpired:
                 state = self.state(self._said())
             if state != told:
-                _print(told := state)
+                say(told := state)
 
     def _said(self, last: bool = False) -> str:
         """What the program has said; when it has ended, for the last time."""
@@ -176,7 +176,7 @@ class ProgramOperator(DrgsOperator):
             for line in lines:
                 messages.note("INFO", line)
                 if bpy.app.background:
-                    _print(line)
+                    say(line)
             if missing := self._expected.missing():
                 problem = f"{self._failure}: {written.complaint(self._program, missing)}"
                 raise EngineError(self._subject, problem, written.REMEDY)
@@ -191,7 +191,7 @@ class ProgramOperator(DrgsOperator):
             self._timer = None
 
 
-def _print(text: str) -> None:
+def say(text: str) -> None:
     """A line for the terminal of a Blender without a window."""
     sys.stdout.write(f"{text}\n")
     sys.stdout.flush()

@@ -209,7 +209,9 @@ def ensure_node() -> None:
     if npm is None or (stamp.exists() and stamp.read_text(encoding="utf-8") == text):
         return
     folder.mkdir(exist_ok=True)
-    command = [npm, "install", "--prefix", folder, "--no-save", "--no-audit", "--no-fund", "--loglevel=error"]
+    print("Fetching the programs of npm that tests compare with (once) ...", flush=True)
+    quiet = ["--no-audit", "--no-fund", "--no-update-notifier", "--no-progress", "--loglevel=error"]
+    command = [npm, "install", "--prefix", folder, "--no-save", *quiet]
     if subprocess.run([*command, *NODE_PACKAGES], cwd=folder).returncode:
         print("npm could not fetch what some tests compare with: they are skipped", flush=True)
         return

@@ -98,8 +98,7 @@ def build(targets: Sequence[str], pythons: Sequence[str], out: Path = FOLDER, jo
                 folder = Path(temporary) / name / tag
                 told = {"NUMBA_CPU_NAME": known[name].cpu, "NUMBA_CPU_FEATURES": known[name].features}
                 _compile(python, copy, folder, told, jobs)
-                rows = json.loads(next(folder.glob("sources-*.json")).read_bytes())
-                sources[index] = json.dumps(rows, sort_keys=True).encode()
+                sources[index] = next(folder.glob("sources-*.json")).read_bytes()
             made.append((shipped.archive_name(name), _pack(Path(temporary) / name)))
         digest = sources_digest(copy / PACKAGE.name)
     facts = {"pythons": sorted(tag for tag, _ in asked.values()), **versions, "sources": digest}

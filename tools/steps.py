@@ -296,11 +296,15 @@ def clock(seconds: float) -> str:
     return f"{max(5, 5 * round(seconds / 5))} s"
 
 
+#: Folders of what is made of sources.
+_PRODUCTS = {"__pycache__", "kernels"}
+
+
 def digest(files: Iterable[Path], command: Sequence[str]) -> str:
     """What changes when one of `files`, of all files in those that are folders, or the command does."""
     found = hashlib.sha256("\0".join(command).encode())
     for top in files:
-        for path in sorted(p for p in top.rglob("*") if "__pycache__" not in p.parts) if top.is_dir() else [top]:
+        for path in sorted(p for p in top.rglob("*") if not _PRODUCTS.intersection(p.parts)) if top.is_dir() else [top]:
             if path.is_file():
                 found.update(f"{path}\0".encode())
                 found.update(path.read_bytes())

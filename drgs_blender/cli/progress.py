@@ -87,6 +87,7 @@ class FractionBar:
         if phase:
             self._bar.set_description(phase, refresh=False)
         self._bar.update(max(0.0, min(1.0, fraction) - self._bar.n))
+        self._bar.refresh()  # the clock goes on where nothing else does
         if is_preparing(phase):
             self._say(phase, fraction)
 

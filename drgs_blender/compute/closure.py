@@ -48,6 +48,29 @@ def digest(path: Path) -> str:
     return total.hexdigest()[:_DIGITS]
 
 
+_noted: dict[Path, tuple[int, int] | None] = {}
+
+
+def note(path: Path) -> None:
+    """Remember a source file as it is when its module is imported."""
+    if path not in _noted:
+        _noted[path] = _stamp(path)
+
+
+@functools.cache
+def changed(path: Path) -> bool:
+    """Whether sources of a module's kernels were changed after they were imported: its digest is then another's."""
+    return any(file in _noted and _noted[file] != _stamp(file) for file in closure(path))
+
+
+def _stamp(path: Path) -> tuple[int, int] | None:
+    try:
+        facts = path.stat()
+    except OSError:
+        return None
+    return facts.st_mtime_ns, facts.st_size
+
+
 @functools.cache
 def closure(path: Path) -> frozenset[Path]:
     """Source files of `path` and of everything of the package that it imports, directly or not, but `NEUTRAL` ones."""
@@ -70,32 +93,32 @@ def _name(path: Path) -> str:
 def _facts(path: Path) -> tuple[str, tuple[Path, ...]]:
     """Digest of a source file without comments and docstrings, and the package's files that it imports."""
     source = path.read_bytes()
-    key = hashlib.sha256(source).hexdigest()
+    key = hashlib.sha256(_name(path).encode() + b"\0" + source).hexdigest()
     if key not in _index.rows:
         _index.add(key, *_parse(source, path))
     facts, imported = _index.rows[key]
-    return facts, tuple(PACKAGE.parent / name for name in imported)
+    found = {file for name in imported for file in _files(tuple(name.split(".")))} - {path}
+    return facts, tuple(sorted(found))
 
 
 def _parse(source: bytes, path: Path) -> tuple[str, list[str]]:
+    """The digest, and the dotted names that are imported from the package."""
     tree = ast.parse(source)
-    imported: set[Path] = set()
+    imported: set[str] = set()
     package = path.parent.relative_to(PACKAGE.parent).parts if path.is_relative_to(PACKAGE) else ()
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            for alias in node.names:
-                imported.update(_files(tuple(alias.name.split("."))))
+            imported.update(alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             base = package[: len(package) - node.level + 1] if node.level else ()
             stem = (*base, *(node.module.split(".") if node.module else ()))
-            for alias in node.names:
-                imported.update(_files((*stem, alias.name)))
+            imported.update(".".join((*stem, alias.name)) for alias in node.names)
         elif isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef, ast.Module)):
             first = node.body[0] if node.body else None
             if isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant):
                 node.body[:1] = [] if len(node.body) > 1 else [ast.Pass()]
-    imported.discard(path)
-    return hashlib.sha256(ast.dump(tree).encode()).hexdigest(), sorted(_name(file) for file in imported)
+    digest = hashlib.sha256(ast.dump(tree).encode()).hexdigest()
+    return digest, sorted(name for name in imported if name.split(".")[0] == PACKAGE.name)
 
 
 def shipped_index() -> str:
@@ -120,8 +143,8 @@ class _Index:
     def rows(self) -> dict[str, tuple[str, list[str]]]:
         found: dict[str, tuple[str, list[str]]] = {}
         for path in (SHIPPED / shipped_index(), self.path):
-            with contextlib.suppress(OSError, ValueError, TypeError, AttributeError):
-                rows = json.loads(path.read_bytes()) if path else {}
+            with contextlib.suppress(OSError, ValueError, TypeError, AttributeError, RecursionError):
+                rows = unpacked(path.read_bytes()) if path else {}
                 found |= {str(key): (str(facts), [str(n) for n in names]) for key, (facts, names) in rows.items()}
         return found
 
@@ -133,16 +156,38 @@ class _Index:
         if self.added and self.path:
             self.added = False
             with contextlib.suppress(OSError):
-                write_atomically(self.path, json.dumps(self.rows).encode())
+                write_atomically(self.path, packed(self.rows))
+
+
+def packed(rows: dict[str, tuple[str, list[str]]]) -> bytes:
+    """The bytes of an index, the digest of the others first."""
+    text = json.dumps(rows, sort_keys=True).encode()
+    return hashlib.sha256(text).hexdigest().encode() + b"\n" + text
+
+
+def unpacked(data: bytes) -> dict[str, tuple[str, list[str]]]:
+    """What `packed` packed.
+
+    Raises
+    ------
+    ValueError
+        When it is damaged.
+    """
+    digest, _, text = data.partition(b"\n")
+    if hashlib.sha256(text).hexdigest().encode() != digest:
+        raise ValueError("its digest is another")
+    rows: dict[str, tuple[str, list[str]]] = json.loads(text)
+    return rows
 
 
 _index = _Index()
 
 
-def _files(name: tuple[str, ...]) -> list[Path]:
+@functools.cache
+def _files(name: tuple[str, ...]) -> tuple[Path, ...]:
     """Files that run when a dotted name is imported from the package: its module and the packages above it."""
-    if not name or name[0] != PACKAGE.name:
-        return []
+    if name[0] != PACKAGE.name:
+        return ()
     found, folder = [], PACKAGE
     for part in name[1:]:
         found.append(folder / "__init__.py")
@@ -154,4 +199,4 @@ def _files(name: tuple[str, ...]) -> list[Path]:
             break
     else:
         found.append(folder / "__init__.py")
-    return [path for path in found if path.is_file()]
+    return tuple(path for path in found if path.is_file())

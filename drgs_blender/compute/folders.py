@@ -6,6 +6,7 @@ import atexit
 import functools
 import logging
 import os
+import re
 import shutil
 import stat
 import sys
@@ -16,6 +17,10 @@ from pathlib import Path
 
 log = logging.getLogger(__name__)
 _MONTH = 30 * 24 * 3600.0
+#: Names of what is put into the folder; nothing else in it is ever removed.
+_OURS = re.compile(r"\w+-[0-9a-f]{16}|sources-[0-9a-f]{16}\.json|\..+\.[0-9a-f]{12}\.tmp")
+#: Of temporary folders, with the process that made it.
+_TEMPORARY = "drgs-kernels-"
 
 
 class CacheFolder:
@@ -25,8 +30,8 @@ class CacheFolder:
 
     Parameters
     ----------
-    wanted : Path
-        Made when it does not exist.
+    wanted : Path or None
+        Made when it does not exist; None where there is no place for it.
 
     Attributes
     ----------
@@ -36,12 +41,14 @@ class CacheFolder:
         Why compiled kernels are not kept for the next start, for the user; "" when they are.
     """
 
-    def __init__(self, wanted: Path) -> None:
+    def __init__(self, wanted: Path | None) -> None:
         self.trouble = ""
         self.path: Path | None = wanted
-        problem = _problem(wanted)
-        if problem:
+        if wanted is None:
+            self.trouble = "compiled kernels cannot be kept, there is no home folder: name a folder in DRGS_CACHE_DIR"
+        elif problem := _problem(wanted):
             self.trouble = f"compiled kernels cannot be kept in {wanted} ({problem}): every start compiles them anew"
+        if self.trouble:
             log.warning("%s", self.trouble)
             self.path = _temporary()
 
@@ -53,22 +60,32 @@ class CacheFolder:
 
 
 def wanted_folder() -> Path:
-    """``DRGS_CACHE_DIR``, else the system's user cache folder + ``drgs/kernels``."""
+    """``DRGS_CACHE_DIR``, else the system's user cache folder + ``drgs/kernels``; absolute.
+
+    Raises
+    ------
+    RuntimeError
+        When the user has no home folder.
+    """
     if override := os.environ.get("DRGS_CACHE_DIR"):
-        return Path(override)
+        return Path(override).expanduser().absolute()
     if sys.platform == "win32":
-        base = Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData/Local"))
+        base = Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData/Local")
     elif sys.platform == "darwin":
         base = Path.home() / "Library/Caches"
     else:
-        base = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
+        named = Path(os.environ.get("XDG_CACHE_HOME", ""))
+        base = named if named.is_absolute() else Path.home() / ".cache"
     return base / "drgs" / "kernels"
 
 
 @functools.cache
 def cache_folder() -> CacheFolder:
     """The folder of this process, found at the first call."""
-    folder = CacheFolder(wanted_folder())
+    try:
+        folder = CacheFolder(wanted_folder())
+    except RuntimeError:
+        folder = CacheFolder(None)
     if folder.path and not folder.trouble:
         _prune(folder.path)
     return folder
@@ -109,20 +126,57 @@ def _problem(folder: Path) -> str:
 
 def _temporary() -> Path | None:
     """A folder that ends with this process: its child processes still share what they compile."""
+    _sweep()
     try:
-        folder = Path(tempfile.mkdtemp(prefix="drgs-kernels-"))
+        folder = Path(tempfile.mkdtemp(prefix=f"{_TEMPORARY}{os.getpid()}-"))
     except OSError:
         return None
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     return folder
 
 
+def leave_temporary() -> None:
+    """Remove the temporary folder, if there is one: for a process that ends without Python's own end."""
+    if cache_folder.cache_info().currsize and (path := cache_folder().path) and path.name.startswith(_TEMPORARY):
+        shutil.rmtree(path, ignore_errors=True)
+
+
+def _sweep() -> None:
+    """Remove temporary folders of this user's processes that were killed."""
+    if not hasattr(os, "geteuid"):
+        return
+    for folder in Path(tempfile.gettempdir()).glob(f"{_TEMPORARY}*-*"):
+        try:
+            process = int(folder.name.removeprefix(_TEMPORARY).partition("-")[0])
+            if folder.lstat().st_uid == os.geteuid() and not folder.is_symlink():
+                os.kill(process, 0)
+        except ProcessLookupError:
+            shutil.rmtree(folder, ignore_errors=True)
+        except (OSError, ValueError):
+            continue
+
+
 def _prune(folder: Path) -> None:
     """Remove what was not used for a month; a clock that jumped back makes nothing old."""
     now = time.time()
     try:
-        for other in folder.iterdir():
-            if now - other.stat().st_mtime > _MONTH:
-                shutil.rmtree(other, ignore_errors=True) if other.is_dir() else other.unlink(missing_ok=True)
+        found = [*folder.iterdir(), *folder.glob("*/.*.tmp")]
     except OSError as error:
         log.info("old kernels in %s: %s", folder, error)
+        return
+    for path in found:
+        try:
+            if _OURS.fullmatch(path.name) and now - path.lstat().st_mtime > _MONTH:
+                _remove(path)
+        except OSError as error:
+            log.info("old kernels in %s: %s", path, error)
+
+
+def _remove(path: Path) -> None:
+    """Remove a file of ours, or a folder with what is ours in it."""
+    if path.is_symlink() or not path.is_dir():
+        path.unlink(missing_ok=True)
+        return
+    for kernel in (*path.glob("*.kernel"), *path.glob(".*.tmp")):
+        kernel.unlink(missing_ok=True)
+    path.rmdir()  # an error where it holds anything else

@@ -9,6 +9,7 @@ parallel kernel may run at a time in a process (workqueue is not re-entrant).
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 from typing import Any
@@ -27,7 +28,8 @@ from numba.core.ccallback import CFunc
 from numba.extending import overload as _overload
 
 if "NUMBA_CACHE_DIR" not in os.environ:  # where Numba keeps kernels itself, see `kernel_compiler.TESTED`
-    numba.config.CACHE_DIR = str(wanted_folder() / "numba")
+    with contextlib.suppress(RuntimeError):  # there is no home folder
+        numba.config.CACHE_DIR = str(wanted_folder() / "numba")
 
 from . import kernel_compiler
 from .kernel_cache import KernelCache
@@ -35,7 +37,7 @@ from .kernel_cache import KernelCache
 log = logging.getLogger(__name__)
 targets.settle(numba.config)
 _OWN_CACHE = kernel_compiler.is_tested() and not numba.config.DISABLE_JIT
-if not _OWN_CACHE:
+if not kernel_compiler.is_tested():
     log.warning("Numba %s was not tested: kernels take longer to compile", numba.__version__)
 
 
@@ -52,7 +54,7 @@ def njit(function: Any = None, *, cache: bool = True, **options: Any) -> Any:
     dispatcher = numba.njit(function, pipeline_class=kernel_compiler.KernelCompiler, **options)
     kernel_compiler.adopt(dispatcher)
     if cache:
-        dispatcher._cache = KernelCache(function)
+        dispatcher._cache = KernelCache(function, options=options)
     return dispatcher
 
 

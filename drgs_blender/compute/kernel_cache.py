@@ -20,10 +20,12 @@ import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import CodeType
 from typing import Any
 
 import llvmlite
 import numba
+import numpy as np
 from llvmlite import binding
 from numba.core import sigutils, types
 from numba.core.caching import NullCache
@@ -41,6 +43,10 @@ _DIGEST = 32
 ENDING = ".kernel"
 
 
+#: Settings of Numba that change machine code.
+_CONFIG = ("OPT", "BOUNDSCHECK", "DEBUGINFO_DEFAULT", "LOOP_VECTORIZE", "SLP_VECTORIZE", "USING_SVML")
+
+
 class DamagedError(Exception):
     """What a file holds is not what was written."""
 
@@ -54,11 +60,18 @@ class KernelCache(NullCache):
         The Python function.
     kind : str
         Forms of one function that are compiled in another way have another kind.
+    options : dict, optional
+        Those of Numba's decorator.
     """
 
-    def __init__(self, function: Any, kind: str = "kernel") -> None:
-        self.function, self.kind = function, kind
+    def __init__(self, function: Any, kind: str = "kernel", options: dict[str, Any] | None = None) -> None:
+        self.function, self.kind, self.options = function, kind, options or {}
         self._names: dict[tuple[Any, ...], str | None] = {}
+        closure.note(self._source)
+
+    @functools.cached_property
+    def _source(self) -> Path:
+        return Path(inspect.getfile(self.function)).resolve()
 
     @property
     def cache_path(self) -> str | None:
@@ -114,16 +127,18 @@ class KernelCache(NullCache):
 
     def _make_name(self, sig: Any, codegen: Any) -> str | None:
         arguments = describe(sigutils.normalize_signature(sig)[0])
-        if arguments is None:
+        if arguments is None or closure.changed(self._source):
             return None
         cells = self.function.__closure__ or ()
         triple, *target = codegen.magic_tuple()
         facts = (
             *(self.kind, self.function.__module__, self.function.__qualname__, arguments, self._closure),
-            hashlib.sha256(self.function.__code__.co_code).hexdigest(),
+            sorted((name, repr(value)) for name, value in self.options.items()),
+            *_code_facts(self.function),
             hashlib.sha256(dumps(tuple(cell.cell_contents for cell in cells))).hexdigest() if cells else "",
             re.sub(r"(darwin|macosx?)[\d.]+", r"\1", triple),  # each update of macOS has another, with the same code
-            *(*target, numba.__version__, llvmlite.__version__, sys.implementation.cache_tag),
+            *(*target, numba.__version__, llvmlite.__version__, np.__version__, sys.implementation.cache_tag),
+            [(name, getattr(numba.config, name)) for name in _CONFIG],
         )
         digest = hashlib.sha256("\0".join(map(str, facts)).encode()).hexdigest()
         return f"{self.function.__qualname__.replace('<locals>.', '')}-{digest[:24]}{ENDING}"
@@ -155,10 +170,31 @@ class KernelCache(NullCache):
 
     @functools.cached_property
     def _closure(self) -> str:
-        return closure.digest(Path(inspect.getfile(self.function)).resolve())
+        return closure.digest(self._source)
 
     def _folder(self) -> str:
         return f"{self.function.__module__.rpartition('.')[2]}-{self._closure}"
+
+
+def _code_facts(function: Any) -> tuple[str, str]:
+    """What a function does, as its byte code says, and the numbers that it takes from its module."""
+    names: set[str] = set()
+
+    def facts(code: CodeType, doc: str | None = None) -> list[Any]:
+        names.update(code.co_names)
+        constants = [facts(c) if isinstance(c, CodeType) else _constant(c) for c in code.co_consts if c != doc]
+        return [code.co_code.hex(), code.co_names, constants]
+
+    said = json.dumps(facts(function.__code__, function.__doc__))
+    values = {name: function.__globals__[name] for name in sorted(names) if name in function.__globals__}
+    numbers = [
+        (name, repr(value)) for name, value in values.items() if isinstance(value, (bool, int, float, np.generic))
+    ]
+    return hashlib.sha256(said.encode()).hexdigest(), str(numbers)
+
+
+def _constant(value: Any) -> str:
+    return repr(sorted(map(repr, value)) if isinstance(value, frozenset) else value)
 
 
 def pack(content: bytes) -> bytes:
@@ -220,8 +256,14 @@ def _provide(symbols: list[str], target_context: Any) -> None:
     """
     rtsys.initialize(target_context)
     known = target_context.codegen()._engine._defined_symbols
-    if any(name not in known and binding.address_of_symbol(name) is None for name in symbols):
+
+    def missing() -> list[str]:
+        return [name for name in symbols if name not in known and binding.address_of_symbol(name) is None]
+
+    if missing():
         target_context.refresh()
+        if absent := missing():
+            raise DamagedError(f"nothing has {', '.join(absent)}")  # to run it would end the process
 
 
 def _rebuild(target_context: Any, content: bytes) -> Any:

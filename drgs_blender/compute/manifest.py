@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import importlib
 import json
+import logging
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -16,7 +17,9 @@ from pathlib import Path
 from typing import Any
 
 from numba import types
+from numba.core.errors import NumbaError
 
+log = logging.getLogger(__name__)
 PATH = Path(__file__).with_name("kernels.json")
 
 
@@ -42,10 +45,14 @@ class Kernel:
 
 @functools.cache
 def jobs() -> dict[str, tuple[Kernel, ...]]:
-    """Job -> its kernels."""
-    data = json.loads(PATH.read_text(encoding="utf-8"))
-    kernels = [Kernel(*row) for row in data["kernels"]]
-    return {job: tuple(kernels[i] for i in rows) for job, rows in data["jobs"].items()}
+    """Job -> its kernels; none where the list is damaged, so that each kernel is compiled when it is first called."""
+    try:
+        data = json.loads(PATH.read_text(encoding="utf-8"))
+        kernels = [Kernel(str(a), str(b), str(c), float(seconds)) for a, b, c, seconds in data["kernels"]]
+        return {str(job): tuple(kernels[i] for i in rows) for job, rows in data["jobs"].items()}
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+        log.warning("%s is damaged (%s): kernels are compiled when they are called. Install DR-GS again", PATH, error)
+        return {}
 
 
 def needed(names: Iterable[str]) -> list[Kernel]:
@@ -73,7 +80,10 @@ def signature(kernel: Kernel) -> tuple[Any, ...]:
     LookupError
         When there is no such type any more.
     """
-    return _Reader(kernel.arguments).all()
+    try:
+        return _Reader(kernel.arguments).all()
+    except (ValueError, TypeError, AttributeError, NumbaError) as error:
+        raise LookupError(f"{kernel.arguments}: {error}") from error
 
 
 def _lookup(module: str, name: str) -> Any:
@@ -81,7 +91,7 @@ def _lookup(module: str, name: str) -> Any:
         found: Any = importlib.import_module(module)
         for part in name.split("."):
             found = getattr(found, part)
-    except (ImportError, AttributeError) as error:
+    except (ImportError, AttributeError, ValueError, TypeError) as error:
         raise LookupError(f"{module}:{name}: {error}") from error
     return found
 

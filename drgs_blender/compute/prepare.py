@@ -17,10 +17,11 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from pathlib import Path
 
-from ..errors import Cancelled
+from ..errors import EXIT_CANNOT_WRITE, EXIT_INTERRUPTED, Cancelled, DrgsError
 from ..phases import PREPARING
-from . import manifest, shipped
+from . import closure, manifest, shipped
 from .folders import cache_folder
 from .manifest import Kernel
 
@@ -29,6 +30,8 @@ log = logging.getLogger(__name__)
 PHASE = PREPARING
 _POLL = 0.1
 _TELL = 0.4
+#: Of memory, which a process that compiles takes.
+_BYTES = 700 << 20
 
 Progress = Callable[[str, float], None]
 
@@ -54,7 +57,14 @@ def prepare_kernels(
     ------
     Cancelled
     """
-    if os.environ.get("DRGS_PREPARE") == "0" or cache_folder().path is None:
+    if os.environ.get("DRGS_PREPARE") != "0":
+        _compile(jobs, progress, cancelled)
+
+
+def _compile(
+    jobs: Iterable[str], progress: Progress | None = None, cancelled: Callable[[], bool] | None = None
+) -> None:
+    if cache_folder().path is None:
         return
     missing = lacking(manifest.needed(jobs))
     if not missing:
@@ -121,6 +131,24 @@ def stock() -> Stock:
     return Stock(brought, known - brought - missing, missing)
 
 
+def processes() -> int:
+    """How many kernels may be compiled at once: one per processor that this process may use, and as memory allows."""
+    allowed = os.cpu_count() or 1
+    with contextlib.suppress(AttributeError, OSError):  # not every system has it
+        allowed = len(os.sched_getaffinity(0))
+    with contextlib.suppress(OSError, ValueError):  # Linux: a limit of a container counts
+        quota, period = Path("/sys/fs/cgroup/cpu.max").read_text().split()
+        allowed = min(allowed, max(1, int(quota) // int(period)))
+    with contextlib.suppress(OSError, ValueError, StopIteration):
+        lines = Path("/proc/meminfo").read_text().splitlines()
+        free = int(next(line for line in lines if line.startswith("MemAvailable")).split()[1]) << 10
+        with contextlib.suppress(OSError, ValueError):
+            most = int(Path("/sys/fs/cgroup/memory.max").read_text())
+            free = min(free, most - int(Path("/sys/fs/cgroup/memory.current").read_text()))
+        allowed = min(allowed, max(1, free // _BYTES))
+    return allowed
+
+
 class _Pool:
     """Worker processes, each compiling one kernel at a time; the longest first.
 
@@ -137,10 +165,16 @@ class _Pool:
         self._all = sum(kernel.seconds for kernel in kernels)
         self.done, self.fraction = 0, 0.0
         self._answers: queue.SimpleQueue[tuple[_Worker, bool]] = queue.SimpleQueue()
-        count = min(len(kernels), os.cpu_count() or 1)
-        self._workers = [_Worker(self._answers) for _ in range(count)]
-        for worker in self._workers:
-            self._give(worker)
+        self._workers: list[_Worker] = []
+        try:
+            for _ in range(min(len(kernels), processes())):
+                self._workers.append(_Worker(self._answers))
+                self._give(self._workers[-1])
+        except OSError as error:  # no more processes may be started
+            log.warning("kernels are compiled by %d processes: %s", len(self._workers), error)
+        except BaseException:
+            self.close()
+            raise
 
     def is_working(self) -> bool:
         """Whether a worker still has something to do."""
@@ -153,7 +187,7 @@ class _Pool:
         except queue.Empty:
             return
         if worker.kernel is not None:
-            self.done += 1
+            self.done += lives
             self.fraction = min(1.0, self.fraction + worker.kernel.seconds / (self._all or 1.0))
             worker.kernel = None
         if lives:
@@ -179,7 +213,11 @@ class _Worker:
         environment = os.environ | {"NUMBA_NUM_THREADS": "1"}
         if folder := cache_folder().path:
             environment["DRGS_CACHE_DIR"] = str(folder)
-        command = [sys.executable, "-m", "drgs_blender.compute.worker"]
+        # the package of this very process, whatever lies in the working folder
+        flag = "-I" if sys.flags.isolated else "-P"
+        paths = [str(closure.PACKAGE.parent), *filter(None, [environment.get("PYTHONPATH")])]
+        environment["PYTHONPATH"] = os.pathsep.join(paths)
+        command = [sys.executable, flag, "-m", "drgs_blender.compute.worker"]
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, encoding="utf-8"
         )
@@ -220,6 +258,7 @@ def main(argv: list[str] | None = None) -> int:
     if not options.jobs and not options.all:
         parser.error("name jobs, or --all")
     told: list[str] = []
+    jobs = list(manifest.jobs()) if options.all else options.jobs
 
     def show(phase: str, fraction: float) -> None:
         if told[-1:] != [phase]:
@@ -227,11 +266,19 @@ def main(argv: list[str] | None = None) -> int:
             print(phase, flush=True)
 
     try:
-        prepare_kernels(manifest.jobs() if options.all else options.jobs, show)
+        if cache_folder().trouble:  # which was logged
+            return EXIT_CANNOT_WRITE
+        _compile(jobs, show)
+        missing = lacking(manifest.needed(jobs))
     except KeyboardInterrupt:
-        return 130
-    if trouble := cache_folder().trouble:
-        print(trouble, file=sys.stderr)
+        return EXIT_INTERRUPTED
+    except DrgsError as error:
+        print(f"prepare: {error}", file=sys.stderr)
+        return error.exit_code
+    if missing:
+        names = ", ".join(sorted({kernel.name for kernel in missing}))
+        print(f"{len(missing)} kernels are not compiled, which are when they are called: {names}", file=sys.stderr)
+        return EXIT_CANNOT_WRITE if cache_folder().trouble else 1
     print("The engine is ready", flush=True)
     return 0
 

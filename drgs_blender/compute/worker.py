@@ -10,11 +10,14 @@ import json
 import logging
 import os
 import queue
+import signal
 import sys
 import threading
 
-from . import jit, manifest  # noqa: F401  (jit sets Numba up)
-from .manifest import Kernel
+signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl+C in the terminal is for the program that waits
+
+from . import jit, manifest  # noqa: E402, F401  (jit sets Numba up)
+from .manifest import Kernel  # noqa: E402
 
 log = logging.getLogger(__name__)
 

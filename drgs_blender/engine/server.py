@@ -215,6 +215,8 @@ def _refuse(link: Link, problem: str) -> None:
 
 
 def _leave(code: int) -> None:
+    if "drgs_blender.compute.folders" in sys.modules:
+        sys.modules["drgs_blender.compute.folders"].leave_temporary()
     logging.shutdown()
     os._exit(code)
 

@@ -39,7 +39,7 @@ def package(tmp_path, monkeypatch):
 
 
 def forget() -> None:
-    for function in (closure.digest, closure.closure, closure._facts, closure._name):
+    for function in (closure.digest, closure.closure, closure.changed, closure._facts, closure._files):
         function.cache_clear()
 
 
@@ -93,6 +93,34 @@ def test_what_code_does_not_depend_on_is_no_part_of_the_closure(package):
     (package / "reader.py").write_text("B = 5\n")
     assert key(package) == before
     assert all((ROOT / name).is_file() for name in closure.NEUTRAL)
+
+
+def test_a_module_that_becomes_a_package_is_found(package):
+    """Its importer is the same, and so may the row of an index be that an earlier version wrote."""
+    key(package)
+    (package / "constants").mkdir()
+    (package / "constants.py").rename(package / "constants/__init__.py")
+    before = key(package)
+    (package / "constants/__init__.py").write_text("A = 2\n")
+    assert key(package) != before
+
+
+def test_the_same_bytes_in_two_folders_import_their_own_neighbours(package):
+    for name in "ab":
+        (package / name).mkdir()
+        (package / name / "kernel.py").write_text("from .constants import A\n")
+        (package / name / "constants.py").write_text("A = 1\n")
+    forget()
+    assert package / "b/constants.py" in closure.closure(package / "b/kernel.py")
+    assert package / "a/constants.py" not in closure.closure(package / "b/kernel.py")
+
+
+@pytest.mark.parametrize("damage", [b"", b"x", b"[" * 100_000, b"0" * 64 + b"\n{}"])
+def test_a_damaged_index_is_parsed_anew(damage):
+    rows = {"k": ("facts", ["drgs_blender.core"])}
+    assert closure.unpacked(closure.packed(rows)) == {"k": ["facts", ["drgs_blender.core"]]}
+    with pytest.raises((ValueError, RecursionError)):
+        closure.unpacked(damage)
 
 
 def test_the_same_sources_elsewhere_have_the_same_key(package, tmp_path, monkeypatch):

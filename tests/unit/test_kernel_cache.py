@@ -73,6 +73,99 @@ def test_only_what_python_calls_is_kept(folder):
     assert [path.name.partition("-")[0] for path in kernels(folder)] == ["_sum"]
 
 
+def _make(factor: float):
+    def scaled(x):
+        return factor * x
+
+    return scaled
+
+
+def _plus_one(x):
+    return x + 1.0
+
+
+def _plus_two(x):
+    return x + 2.0
+
+
+_plus_two.__qualname__ = _plus_one.__qualname__
+
+
+def _name(function=_inner, kind="kernel", options=None, target=("x86_64-linux", "x86-64-v3", "+avx2"), types="float64"):
+    class Codegen:
+        magic_tuple = staticmethod(lambda: target)
+
+    cache = kernel_cache.KernelCache(function, kind, options)
+    return cache.file_name((getattr(numba.types, types),), Codegen())
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"kind": "callback"},
+        {"options": {"error_model": "python"}},
+        {"target": ("aarch64-linux", "x86-64-v3", "+avx2")},
+        {"target": ("x86_64-linux", "x86-64-v4", "+avx2")},
+        {"target": ("x86_64-linux", "x86-64-v3", "+avx512f")},
+        {"types": "float32"},
+        {"function": _outer},
+    ],
+)
+def test_what_code_depends_on_is_in_its_name(folder, changed):
+    assert _name() == _name()
+    assert _name(**changed) != _name()
+
+
+def test_what_functions_of_one_name_do_is_in_their_names(folder):
+    assert _name(_plus_one) != _name(_plus_two)
+    assert _name(_make(2.0)) == _name(_make(2.0)) != _name(_make(3.0))
+
+
+@pytest.mark.parametrize("where", ["closure", "numpy", "python", "numba", "llvmlite", "settings", "global"])
+def test_what_surrounds_code_is_in_its_name(folder, monkeypatch, where):
+    before = _name(_uses_global)
+    if where == "closure":
+        monkeypatch.setattr(kernel_cache.closure, "digest", lambda path: "0" * 16)
+    elif where == "python":
+        monkeypatch.setattr(sys.implementation, "cache_tag", "cpython-399")
+    elif where == "settings":
+        monkeypatch.setattr(numba.config, "BOUNDSCHECK", 1)
+    elif where == "global":
+        monkeypatch.setitem(globals(), "_FACTOR", 3.0)
+    else:
+        module = {"numpy": np, "numba": numba, "llvmlite": kernel_cache.llvmlite}[where]
+        monkeypatch.setattr(module, "__version__", "99.0")
+    assert _name(_uses_global) != before
+
+
+_FACTOR = 2.0
+
+
+def _uses_global(x):
+    return _FACTOR * x
+
+
+def test_a_source_that_changed_after_its_import_is_not_kept(tmp_path):
+    """What runs is the code of before, what the name would say is that of now."""
+    program, source = tmp_path / "program.py", tmp_path / "changing.py"
+    text = "from drgs_blender.compute.jit import njit\nK = 1.0\n@njit\ndef f(x): return x + K\n"
+    program.write_text(
+        "import changing, pathlib, sys\n"
+        "if sys.argv[1:]: pathlib.Path('changing.py').write_text(sys.argv[1])\nprint(changing.f(1.0))\n"
+    )
+    source.write_text(text)
+    environment = os.environ | {
+        "DRGS_CACHE_DIR": str(tmp_path / "cache"),
+        "PYTHONPATH": f"{ROOT}{os.pathsep}{tmp_path}",
+    }
+    said = []
+    for arguments in ([text.replace("1.0", "1000.0")], []):
+        command = [sys.executable, program, *arguments]
+        done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=True)
+        said.append(done.stdout.strip())
+    assert said == ["2.0", "1001.0"]
+
+
 _LOADED = """
 import sys
 from drgs_blender.compute.jit import njit
@@ -99,7 +192,8 @@ def test_numba_s_compiler_is_loaded_only_for_what_is_compiled(tmp_path):
 def test_what_a_kernel_calls_and_is_not_there_is_loaded_with_the_compiler(monkeypatch, symbol, times):
     target, calls = numba.core.registry.cpu_target.target_context, []
     monkeypatch.setattr(target, "refresh", lambda: calls.append(1))
-    kernel_cache._provide([symbol], target)
+    with pytest.raises(kernel_cache.DamagedError, match=symbol) if times else contextlib.nullcontext():
+        kernel_cache._provide([symbol], target)
     assert len(calls) == times
 
 
@@ -316,3 +410,78 @@ def test_callbacks_can_call_functions_that_were_kept(folder):
         assert inner(3.0) == 6.0
     finally:
         inner = before
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "{}",
+        "[]",
+        '{"kernels": [["m", "f"]], "jobs": {"j": [0]}}',
+        '{"kernels": [["m", "f", "int64", 1.0]], "jobs": {"j": [5]}}',
+        "[" * 100_000,
+    ],
+)
+def test_a_damaged_list_leaves_all_to_the_first_call(tmp_path, monkeypatch, caplog, text):
+    path = tmp_path / "kernels.json"
+    path.write_text(text)
+    monkeypatch.setattr(manifest, "PATH", path)
+    manifest.jobs.cache_clear()
+    assert manifest.jobs() == {}
+    manifest.jobs.cache_clear()
+    assert "Install DR-GS again" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "arguments", ["array(float32, x, C, True, True)", "array(float32, 1, Q, True, True)", "os:path(int64)"]
+)
+def test_types_that_are_none_are_passed_over(arguments):
+    with pytest.raises(LookupError):
+        manifest.signature(manifest.Kernel("m", "f", arguments, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("variable", "value", "code"), [("DRGS_CPU_TARGET", "nonsense", 64), ("DRGS_CPU_TARGET", "apple-m1", 69)]
+)
+def test_preparing_says_what_is_wrong(tmp_path, variable, value, code):
+    environment = os.environ | {variable: value, "DRGS_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-m", "drgs_blender.compute.prepare", "import"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert done.returncode == code
+    assert value in done.stderr and "Traceback" not in done.stderr and "ready" not in done.stdout
+
+
+def test_an_engine_is_not_called_ready_whose_kernels_cannot_be_kept(tmp_path):
+    (tmp_path / "file").write_text("")
+    environment = os.environ | {"DRGS_CACHE_DIR": str(tmp_path / "file"), "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-m", "drgs_blender.compute.prepare", "import"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert done.returncode == 73
+    assert str(tmp_path / "file") in done.stderr and "ready" not in done.stdout
+
+
+def test_workers_compile_the_package_of_the_process_that_started_them(tmp_path):
+    """Whatever lies in the working folder, as a checkout does where Blender was started from one."""
+    package = tmp_path / "drgs_blender" / "compute"
+    package.mkdir(parents=True)
+    for path in (package.parent / "__init__.py", package / "__init__.py"):
+        path.write_text("")
+    (package / "worker.py").write_text("print('done')\n" * 100)
+    environment = os.environ | {"DRGS_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": str(ROOT), "DRGS_SHIPPED": "0"}
+    code = f"import sys\nsys.path[0] = {str(ROOT)!r}\nimport drgs_blender.compute.folders\n"
+    code += "from drgs_blender.compute import prepare, manifest\n"
+    code += "manifest.needed = lambda jobs: [k for k in manifest.jobs()['denoise'] if k.name == 'mix']\n"
+    code += "raise SystemExit(prepare.main(['denoise']))\n"
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert len(kernels(tmp_path / "cache")) == 1
+
+
+def test_no_more_workers_than_processors_and_memory_allow(monkeypatch):
+    from drgs_blender.compute import prepare
+
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0, 1, 2}, raising=False)
+    assert 1 <= prepare.processes() <= 3
+    monkeypatch.setattr(prepare, "_BYTES", 1 << 60)
+    assert prepare.processes() == 1 or sys.platform != "linux"
