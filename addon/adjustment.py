@@ -9,7 +9,7 @@ import bpy
 import numpy as np
 from bpy.props import BoolProperty, FloatProperty, FloatVectorProperty, StringProperty
 
-from ..drgs_blender.frame import Adjustment
+from ..drgs_blender.core.frame import Adjustment
 from . import mesh_arrays
 from .limits import Limited
 
@@ -39,7 +39,7 @@ def _number(label: str, about: str, **limits: float) -> FloatProperty:
 
 
 class DrgsAdjustment(bpy.types.PropertyGroup):
-    """Changes on top of the material attributes of an object; see drgs_blender.frame.Adjustment."""
+    """Changes on top of the material attributes of an object; see drgs_blender.core.frame.Adjustment."""
 
     use: BoolProperty(
         name="Adjustments",

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import bpy
 
-from ..drgs_blender.asset import Asset
-from ..drgs_blender.asset.container import read_asset
-from ..drgs_blender.errors import AssetError, UsageError
-from ..drgs_blender.sequence import frame_path
+from ..drgs_blender.core.asset import Asset
+from ..drgs_blender.core.asset.container import read_asset
+from ..drgs_blender.core.errors import AssetError, UsageError
+from ..drgs_blender.core.frame_sequences import frame_path
 from .preferences import ROOT
 
 #: (path, mtime_ns, size) -> asset, arrays memory-mapped. A changed file gets a new key; `forget` empties it.

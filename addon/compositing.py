@@ -12,7 +12,7 @@ from collections.abc import Iterator
 
 import bpy
 
-from ..drgs_blender.errors import UsageError
+from ..drgs_blender.core.errors import UsageError
 from . import assets
 
 #: Label of the nodes that are made here, and engine of the second scene.

@@ -13,10 +13,10 @@ from pathlib import Path
 
 import bpy
 
-from ..drgs_blender.engine.client import EngineClient, Passes, locate_engine
-from ..drgs_blender.engine.locate import VARIABLE
-from ..drgs_blender.errors import DeviceError
-from ..drgs_blender.frame import Frame
+from ..drgs_blender.core.errors import DeviceError
+from ..drgs_blender.core.frame import Frame
+from ..drgs_blender.ipc.client import EngineClient, Passes, locate_engine
+from ..drgs_blender.ipc.locate import VARIABLE
 from . import engine_setup, messages, preferences
 
 SET_UP = f"Press Set Up Engine in sidebar > DR-GS, or name an environment in the preferences or in {VARIABLE}"

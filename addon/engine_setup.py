@@ -22,10 +22,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, NamedTuple
 
-from ..drgs_blender.engine.child import clean_environment
-from ..drgs_blender.engine.locate import VARIABLE
-from ..drgs_blender.errors import DeviceError
-from ..drgs_blender.phases import PREPARING
+from ..drgs_blender.core.errors import DeviceError
+from ..drgs_blender.core.phases import PREPARING
+from ..drgs_blender.ipc.child_process import clean_environment
+from ..drgs_blender.ipc.locate import VARIABLE
 
 log = logging.getLogger("drgs")
 

@@ -12,8 +12,8 @@ from pathlib import Path
 import bpy
 import imbuf
 
-from ..drgs_blender.errors import EXIT_CANNOT_WRITE, EXIT_CLASSES
-from ..drgs_blender.wholeness import is_whole
+from ..drgs_blender.core.errors import EXIT_CANNOT_WRITE, EXIT_CLASSES
+from ..drgs_blender.core.file_integrity import is_whole
 from . import engine_link, messages
 
 #: Environment variable with which a failure ends a Blender that has no window.

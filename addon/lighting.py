@@ -7,7 +7,7 @@ from pathlib import Path
 
 import bpy
 
-from ..drgs_blender.errors import AssetError, UsageError
+from ..drgs_blender.core.errors import AssetError, UsageError
 
 #: Label of the nodes that are made here, by which they are found again.
 LABEL = "DR-GS Light"

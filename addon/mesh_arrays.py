@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 import numpy as np
 
-from ..drgs_blender.asset import MATERIAL_CHANNELS, Mesh
+from ..drgs_blender.core.asset import MATERIAL_CHANNELS, Mesh
 
 Array = np.ndarray
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-from ..drgs_blender.passes import PASSES, TEMPORAL, Pass
+from ..drgs_blender.core.passes import PASSES, TEMPORAL, Pass
 from .properties import switch_of
 
 #: Names that Blender 5.0 spelled out; compositor nodes and its EXR files know only these.

@@ -8,8 +8,8 @@ from collections.abc import Callable
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, PointerProperty, StringProperty
 
-from ..drgs_blender.frame import RenderSettings, split_rays
-from ..drgs_blender.passes import PASSES, Pass
+from ..drgs_blender.core.frame import RenderSettings, split_rays
+from ..drgs_blender.core.passes import PASSES, Pass
 from .adjustment import DrgsAdjustment
 from .limits import Limited
 from .matter.properties import DrgsMatterSettings
@@ -31,7 +31,7 @@ def _switch_overlay(settings: DrgsSceneSettings, context: bpy.types.Context) -> 
 
 
 class DrgsSceneSettings(bpy.types.PropertyGroup):
-    """How DR-GS solves a frame; see drgs_blender.frame.RenderSettings."""
+    """How DR-GS solves a frame; see drgs_blender.core.frame.RenderSettings."""
 
     rays: IntProperty(
         name="Rays",

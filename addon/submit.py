@@ -12,8 +12,8 @@ from pathlib import Path
 import bpy
 from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
 
-from ..drgs_blender.engine.child import clean_environment
-from ..drgs_blender.errors import DeviceError, UsageError
+from ..drgs_blender.core.errors import DeviceError, UsageError
+from ..drgs_blender.ipc.child_process import clean_environment
 from . import engine_link, messages, written
 
 INTERVAL = 0.2

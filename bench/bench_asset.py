@@ -23,13 +23,13 @@ from decouple_score import with_materials_of
 from PIL import Image
 from report import DOCUMENT, OUT, ROOT, keep, table, write_section
 
-from drgs_blender.asset.container import write_asset
-from drgs_blender.asset.model import Asset
+from drgs_blender.core.asset.container import write_asset
+from drgs_blender.core.asset.model import Asset
 from drgs_blender.evaluate.truth import Truth, read_truth, true_asset
-from drgs_blender.reconstruct.capture import Capture
-from drgs_blender.reconstruct.job import Progress, Settings, reconstruct
+from drgs_blender.reconstruct.capture.capture import Capture
+from drgs_blender.reconstruct.optim.train import Schedule
+from drgs_blender.reconstruct.pipeline import Progress, Settings, reconstruct
 from drgs_blender.reconstruct.readers import read_capture
-from drgs_blender.reconstruct.train import Schedule
 
 FOLDER = OUT / "assets"
 FIGURE = ROOT / "docs" / "images" / "assets.png"

@@ -17,17 +17,17 @@ import numpy as np
 from bench_evaluate import mean, under_other_lights
 from report import OUT, keep, table, write_section
 
-from drgs_blender.asset import Environment
-from drgs_blender.asset.container import write_asset
 from drgs_blender.cli.evaluate import session_renderer
+from drgs_blender.core.asset import Environment
+from drgs_blender.core.asset.container import write_asset
+from drgs_blender.core.frame import Camera, RenderSettings, Visibility, split_rays
 from drgs_blender.engine.session import Session
 from drgs_blender.evaluate.compare import Renderer, compare
 from drgs_blender.evaluate.truth import read_truth
-from drgs_blender.frame import Camera, RenderSettings, Visibility, split_rays
-from drgs_blender.reconstruct.decouple.settings import Settings as Decoupling
-from drgs_blender.reconstruct.job import Settings, reconstruct
+from drgs_blender.reconstruct.inverse_rendering.settings import Settings as Decoupling
+from drgs_blender.reconstruct.optim.train import Schedule
+from drgs_blender.reconstruct.pipeline import Settings, reconstruct
 from drgs_blender.reconstruct.readers import read_capture
-from drgs_blender.reconstruct.train import Schedule
 
 Array = np.ndarray
 

@@ -20,10 +20,10 @@ import numpy as np
 from decouple_score import COLUMNS, Scene, score, with_materials_of
 from report import OUT, ROOT, keep, processor_seconds, table, write_section
 
-from drgs_blender.asset import Mesh
-from drgs_blender.colour import srgb_to_linear
-from drgs_blender.reconstruct.decouple.run import Decoupled, decouple
-from drgs_blender.reconstruct.decouple.settings import Settings
+from drgs_blender.core.asset import Mesh
+from drgs_blender.core.color import srgb_to_linear
+from drgs_blender.reconstruct.inverse_rendering.run import Decoupled, decouple
+from drgs_blender.reconstruct.inverse_rendering.settings import Settings
 
 FOLDER = OUT / "decouple"
 SIZE, TRAIN, TEST, SAMPLES = 128, 40, 8, 32
@@ -125,10 +125,10 @@ def long_run(scene: Scene, iterations: int) -> dict[str, list[float]]:
 
 def own_meshes(scene: Scene) -> tuple[Mesh, Mesh]:
     """The mesh of stage (i) as it is fused, and with the outlines of the masks."""
-    from drgs_blender.reconstruct.hull import find_region, silhouettes
-    from drgs_blender.reconstruct.silhouette import fill_silhouettes
-    from drgs_blender.reconstruct.train import Schedule, Training
-    from drgs_blender.reconstruct.tsdf import fuse
+    from drgs_blender.reconstruct.meshing.silhouette_fit import fill_silhouettes
+    from drgs_blender.reconstruct.meshing.tsdf import fuse
+    from drgs_blender.reconstruct.meshing.visual_hull import find_region, silhouettes
+    from drgs_blender.reconstruct.optim.train import Schedule, Training
 
     path = FOLDER / "own-meshes.npz"
     if not path.exists():
@@ -147,7 +147,7 @@ def own_meshes(scene: Scene) -> tuple[Mesh, Mesh]:
 
 def own_mesh(scene: Scene, iterations: int) -> dict[str, list[float]]:
     """On the mesh of stage (i): what its outlines and learned normals are worth, and the paper's way on it."""
-    from drgs_blender.reconstruct.relief import follow_normals
+    from drgs_blender.reconstruct.meshing.normal_integration import follow_normals
 
     fused, mesh = own_meshes(scene)
     base = Settings(iterations=iterations)

@@ -14,12 +14,12 @@ import trimesh
 from report import table, write_section
 from scipy.spatial.transform import Rotation
 
-from drgs_blender.asset.model import Mesh, Surfels
+from drgs_blender.core.asset.model import Mesh, Surfels
 from drgs_blender.deform.attach import attach
 from drgs_blender.deform.binding import bind
 from drgs_blender.deform.mesh_driven import MeshDriven
 from drgs_blender.deform.surfel_update import paper_update, surfel_update
-from drgs_blender.geometry import VertexNormals, quaternions
+from drgs_blender.geometry.normals import VertexNormals, quaternions
 
 FACES, SURFELS = 100_000, 300_000
 

@@ -20,19 +20,19 @@ from ours import pinhole
 from report import table, write_section
 from subjects import asset_path
 
-from drgs_blender.asset.container import read_asset
 from drgs_blender.compute.jit import use_threads
-from drgs_blender.device.warp import cuda_devices, warp
-from drgs_blender.errors import DeviceError
+from drgs_blender.compute.warp.runtime import cuda_devices, warp
+from drgs_blender.core.asset.container import read_asset
+from drgs_blender.core.errors import DeviceError
+from drgs_blender.core.frame import RenderSettings, World
 from drgs_blender.formats.registry import read_environment
-from drgs_blender.frame import RenderSettings, World
+from drgs_blender.render.backend import HERE, Processor
 from drgs_blender.render.camera import camera_parameters
-from drgs_blender.render.device.on_device import OnDevice
-from drgs_blender.render.lights.light import EnvironmentLight
+from drgs_blender.render.gbuffer.mesh import primary_mesh
+from drgs_blender.render.gpu.warp_backend import OnDevice
+from drgs_blender.render.lights.environment import EnvironmentLight
 from drgs_blender.render.points import Radiance
-from drgs_blender.render.primary.primary_mesh import primary_mesh
-from drgs_blender.render.processor import HERE, Processor
-from drgs_blender.render.trace.scene import TraceObject, TraceScene
+from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene
 
 #: Rows, and the processor for each; a card stands in its row whether there is one or not.
 ROWS = ("Numba, Embree, all threads", "Numba, Embree, 1 thread", "Warp on the processor, 1 thread", "Warp on CUDA")

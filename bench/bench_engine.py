@@ -19,14 +19,14 @@ from pathlib import Path
 import numpy as np
 from report import table, write_section
 
-from drgs_blender.asset.container import write_asset
-from drgs_blender.asset.model import Asset, Mesh
+from drgs_blender.core.asset.container import write_asset
+from drgs_blender.core.asset.model import Asset, Mesh
+from drgs_blender.core.frame import Camera, Frame, ObjectState, RenderSettings, World
 from drgs_blender.deform.attach import attach
-from drgs_blender.engine import protocol
-from drgs_blender.engine.client import EngineClient, locate_engine
-from drgs_blender.engine.protocol import Link
-from drgs_blender.engine.shared import Region
-from drgs_blender.frame import Camera, Frame, ObjectState, RenderSettings, World
+from drgs_blender.ipc import protocol
+from drgs_blender.ipc.client import EngineClient, locate_engine
+from drgs_blender.ipc.protocol import Link
+from drgs_blender.ipc.shared_memory import Region
 
 
 def plane_asset(path: Path, cells: int = 100) -> None:

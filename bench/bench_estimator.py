@@ -10,12 +10,12 @@ import numpy as np
 from judge import environments
 from report import table, write_section
 
+from drgs_blender.core.frame import RenderSettings, World
 from drgs_blender.formats.registry import read_environment
-from drgs_blender.frame import RenderSettings, World
-from drgs_blender.render.lights.light import EnvironmentLight
+from drgs_blender.render.integrator.integrate import integrate
+from drgs_blender.render.lights.environment import EnvironmentLight
 from drgs_blender.render.points import ShadingPoints
-from drgs_blender.render.shade.integrate import integrate
-from drgs_blender.render.trace.scene import TraceScene
+from drgs_blender.render.scene.trace_scene import TraceScene
 
 EMPTY = TraceScene()
 

@@ -16,15 +16,15 @@ from pathlib import Path
 import numpy as np
 from report import OUT, ROOT, processor_seconds, table, write_section
 
-from drgs_blender.asset.container import write_asset
 from drgs_blender.cli.evaluate import session_renderer
 from drgs_blender.cli.find_blender import find_blender
+from drgs_blender.core.asset.container import write_asset
+from drgs_blender.core.frame import RenderSettings, split_rays
 from drgs_blender.engine.session import Session
 from drgs_blender.evaluate.compare import Show, compare
 from drgs_blender.evaluate.scenes import Plan, make_scenes
 from drgs_blender.evaluate.subjects import OBJECTS
 from drgs_blender.evaluate.truth import Truth, read_truth, true_asset
-from drgs_blender.frame import RenderSettings, split_rays
 from drgs_blender.reconstruct.readers import read_capture
 
 COLUMNS = (

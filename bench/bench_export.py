@@ -20,8 +20,8 @@ import numpy as np
 from judge import blender_python
 from report import ROOT, table, write_section
 
-from drgs_blender.asset import Asset, Binding, Mesh, Surfels
-from drgs_blender.asset.container import write_asset
+from drgs_blender.core.asset import Asset, Binding, Mesh, Surfels
+from drgs_blender.core.asset.container import write_asset
 
 SURFELS = 1000
 

@@ -28,10 +28,10 @@ from bench_engine import plane_asset
 from farm_tools import MARK, PROGRAM, drgs, leftovers, marked
 from report import table, write_section
 
-from drgs_blender.asset.container import read_asset
-from drgs_blender.engine.client import EngineClient, engine_command
-from drgs_blender.errors import DeviceError, EngineError
-from drgs_blender.frame import Camera, Frame, ObjectState, RenderSettings, World
+from drgs_blender.core.asset.container import read_asset
+from drgs_blender.core.errors import DeviceError, EngineError
+from drgs_blender.core.frame import Camera, Frame, ObjectState, RenderSettings, World
+from drgs_blender.ipc.client import EngineClient, engine_command
 
 sys.path.append(str(Path(__file__).resolve().parent.parent / "tests" / "unit"))
 from blend_files import make_blend_files

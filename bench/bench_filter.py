@@ -14,8 +14,8 @@ from report import OUT, table, write_section
 from scipy.ndimage import binary_dilation
 from subjects import spread_asset
 
-from drgs_blender.asset import Asset, Mesh
-from drgs_blender.asset.container import write_asset
+from drgs_blender.core.asset import Asset, Mesh
+from drgs_blender.core.asset.container import write_asset
 from drgs_blender.deform.attach import attach
 
 #: Cycles' default.

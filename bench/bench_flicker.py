@@ -17,14 +17,14 @@ from ours import SESSION, pinhole
 from report import table, write_section
 from subjects import asset_path
 
-from drgs_blender.asset.container import read_asset
 from drgs_blender.cli import frame_store
 from drgs_blender.cli.main import main as drgs
+from drgs_blender.core.asset.container import read_asset
+from drgs_blender.core.frame import Frame, Moment, ObjectState, RenderSettings, World, split_rays
+from drgs_blender.core.passes import TEMPORAL
 from drgs_blender.formats.registry import read_environment
-from drgs_blender.frame import Frame, Moment, ObjectState, RenderSettings, World, split_rays
-from drgs_blender.passes import TEMPORAL
-from drgs_blender.render.picture.frames import read_frame
-from drgs_blender.render.picture.oidn import available
+from drgs_blender.render.denoise.oidn import available
+from drgs_blender.render.film.frame_files import read_frame
 
 Array = np.ndarray
 

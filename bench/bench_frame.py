@@ -14,7 +14,7 @@ from ours import relight
 from report import OUT, table, write_section
 from subjects import asset_path
 
-from drgs_blender.asset.container import read_asset
+from drgs_blender.core.asset.container import read_asset
 
 
 def main() -> None:

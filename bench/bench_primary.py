@@ -13,7 +13,7 @@ from ours import relight
 from report import OUT, table, write_section
 from subjects import SOURCES, asset_path
 
-from drgs_blender.asset.container import read_asset
+from drgs_blender.core.asset.container import read_asset
 
 
 def main() -> None:

@@ -25,16 +25,16 @@ from embreex.mesh_construction import TriangleMesh
 from report import OUT, keep, processor_seconds, table, write_section
 
 from drgs_blender.compute.jit import get_num_threads
-from drgs_blender.frame import Camera
-from drgs_blender.geometry import VertexNormals
-from drgs_blender.reconstruct.attached import attach_learned
-from drgs_blender.reconstruct.capture import Capture
-from drgs_blender.reconstruct.gaussians import Gaussians
-from drgs_blender.reconstruct.hull import find_region
-from drgs_blender.reconstruct.job import ON_MESH, judge, mesh_of
-from drgs_blender.reconstruct.raster import rasterise
+from drgs_blender.core.frame import Camera
+from drgs_blender.geometry.normals import VertexNormals
+from drgs_blender.reconstruct.capture.capture import Capture
+from drgs_blender.reconstruct.meshing.visual_hull import find_region
+from drgs_blender.reconstruct.model.attached import attach_learned
+from drgs_blender.reconstruct.model.gaussians import Gaussians
+from drgs_blender.reconstruct.model.raster import rasterise
+from drgs_blender.reconstruct.optim.train import Schedule, Training
+from drgs_blender.reconstruct.pipeline import ON_MESH, judge, mesh_of
 from drgs_blender.reconstruct.readers import read_capture
-from drgs_blender.reconstruct.train import Schedule, Training
 
 ROWS = OUT / "reconstruct"
 #: Ablations of stage (i): name -> change of the schedule.

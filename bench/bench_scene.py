@@ -14,9 +14,9 @@ import numpy as np
 import trimesh
 from report import table, write_section
 
-from drgs_blender.asset import Asset, Binding, Mesh, Surfels
-from drgs_blender.asset.container import read_asset, write_asset
-from drgs_blender.render.trace.scene import TraceObject, TraceScene
+from drgs_blender.core.asset import Asset, Binding, Mesh, Surfels
+from drgs_blender.core.asset.container import read_asset, write_asset
+from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene
 
 
 def median_ms(work: Callable[[], object], runs: int) -> float:

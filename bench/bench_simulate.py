@@ -22,16 +22,16 @@ from simulate_motion import motion
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "unit"))
 from matter_cases import lattice, solver_of
 
-from drgs_blender.asset.model import Mesh
 from drgs_blender.compute.jit import get_num_threads, set_num_threads
+from drgs_blender.core.asset.model import Mesh
+from drgs_blender.core.particle_cache import ParticleCache
 from drgs_blender.deform.gmls import bind_points, carry
 from drgs_blender.deform.source_driven import _update
-from drgs_blender.particle_cache import ParticleCache
-from drgs_blender.simulate.blocks import arrange
-from drgs_blender.simulate.fill import fill
-from drgs_blender.simulate.job import PER_CELL, prepare
-from drgs_blender.simulate.settings import parse_settings
-from drgs_blender.simulate.solver import Solver
+from drgs_blender.simulation.blocks import arrange
+from drgs_blender.simulation.fill import fill
+from drgs_blender.simulation.job import PER_CELL, prepare
+from drgs_blender.simulation.settings import parse_settings
+from drgs_blender.simulation.solver import Solver
 
 HERE = Path(__file__).resolve().parent
 FRAME = 1 / 24

@@ -19,14 +19,14 @@ from ours import pinhole
 from report import OUT, table, write_section
 from scipy.ndimage import binary_erosion
 
-from drgs_blender.asset import Asset, Mesh, Surfels
-from drgs_blender.asset.container import write_asset
 from drgs_blender.build.proxy import mesh_from_surfels
+from drgs_blender.core.asset import Asset, Mesh, Surfels
+from drgs_blender.core.asset.container import write_asset
+from drgs_blender.core.frame import Frame, Material, MeshState, ObjectState, RenderSettings, World, split_rays
 from drgs_blender.deform.attach import attach
 from drgs_blender.deform.binding import bind
 from drgs_blender.engine.session import Session
 from drgs_blender.formats.registry import read_environment
-from drgs_blender.frame import Frame, Material, MeshState, ObjectState, RenderSettings, World, split_rays
 
 Array = np.ndarray
 STRENGTH, BOUNCES, AA = 0.35, 3, 16

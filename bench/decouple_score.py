@@ -9,16 +9,16 @@ from typing import TypeVar
 import numpy as np
 from scipy.spatial import cKDTree
 
-from drgs_blender.asset import Mesh
-from drgs_blender.asset.model import MATERIAL_CHANNELS, PosedSurfels, Surfels
+from drgs_blender.core.asset import Mesh
+from drgs_blender.core.asset.model import MATERIAL_CHANNELS, PosedSurfels, Surfels
+from drgs_blender.core.frame import Camera, Frame, ObjectState, RenderSettings, World
 from drgs_blender.evaluate.metrics import material_scores, relight_scores
 from drgs_blender.evaluate.truth import TruthSet, read_truth
-from drgs_blender.frame import Camera, Frame, ObjectState, RenderSettings, World
-from drgs_blender.reconstruct.capture import Capture
+from drgs_blender.reconstruct.capture.capture import Capture
 from drgs_blender.reconstruct.readers import read_capture
-from drgs_blender.render.lights.light import EnvironmentLight
+from drgs_blender.render.lights.environment import EnvironmentLight
 from drgs_blender.render.pipeline import render
-from drgs_blender.render.trace.scene import TraceObject, TraceScene
+from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene
 
 Array = np.ndarray
 Part = TypeVar("Part", Mesh, Surfels)

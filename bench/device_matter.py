@@ -18,12 +18,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "unit"
 from matter_cases import lattice, solver_of
 
 from drgs_blender.compute.jit import use_threads
-from drgs_blender.device.kernels import Launcher
-from drgs_blender.device.warp import cuda_devices
-from drgs_blender.errors import DeviceError
-from drgs_blender.simulate.contact import Plane
-from drgs_blender.simulate.device.grid import DeviceGrid
-from drgs_blender.simulate.solver import Solver
+from drgs_blender.compute.warp.kernels import Launcher
+from drgs_blender.compute.warp.runtime import cuda_devices
+from drgs_blender.core.errors import DeviceError
+from drgs_blender.simulation.contact import Plane
+from drgs_blender.simulation.gpu.grid import DeviceGrid
+from drgs_blender.simulation.solver import Solver
 
 NOT_MEASURED = "not measured: no card"
 FRAME = 1 / 24

@@ -14,7 +14,7 @@ from report import ROOT
 sys.path.append(str(ROOT / "tests"))
 from processes import marked
 
-from drgs_blender.render.picture.frames import read_frame
+from drgs_blender.render.film.frame_files import read_frame
 
 #: In the environment of all that is started here, and of nothing else.
 MARK = f"DRGS_MEASURED={os.getpid()}"

@@ -6,7 +6,7 @@ import numpy as np
 from judge import to_srgb
 from scipy.ndimage import map_coordinates
 
-from drgs_blender.colour import LUMINANCE
+from drgs_blender.core.color import LUMINANCE
 
 Array = np.ndarray
 

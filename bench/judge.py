@@ -14,7 +14,7 @@ import numpy as np
 from report import OUT, ROOT
 from scipy.ndimage import binary_erosion
 
-from drgs_blender.colour import linear_to_srgb
+from drgs_blender.core.color import linear_to_srgb
 
 Array = np.ndarray
 

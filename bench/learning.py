@@ -9,17 +9,17 @@ import ours
 from judge import environments, frame_camera
 from report import table
 
-from drgs_blender.asset.container import read_asset
-from drgs_blender.colour import linear_to_srgb
 from drgs_blender.compute.jit import use_threads
-from drgs_blender.errors import DeviceError
-from drgs_blender.reconstruct.capture import Capture, View
-from drgs_blender.reconstruct.device.devices import learner
-from drgs_blender.reconstruct.device.on_device import OnDevice
-from drgs_blender.reconstruct.hull import find_region
-from drgs_blender.reconstruct.job import judge
-from drgs_blender.reconstruct.processor import HERE, Processor
-from drgs_blender.reconstruct.train import Schedule, Training
+from drgs_blender.core.asset.container import read_asset
+from drgs_blender.core.color import linear_to_srgb
+from drgs_blender.core.errors import DeviceError
+from drgs_blender.reconstruct.backend import HERE, Processor
+from drgs_blender.reconstruct.capture.capture import Capture, View
+from drgs_blender.reconstruct.gpu.devices import learner
+from drgs_blender.reconstruct.gpu.on_device import OnDevice
+from drgs_blender.reconstruct.meshing.visual_hull import find_region
+from drgs_blender.reconstruct.optim.train import Schedule, Training
+from drgs_blender.reconstruct.pipeline import judge
 
 #: Views around the object, every fourth left out; steps of a run that is not timed, which compiles.
 VIEWS, FIRST = 24, 20

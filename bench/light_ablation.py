@@ -12,9 +12,18 @@ from ours import SESSION, pinhole
 from report import ROOT, table
 from subjects import asset_path
 
-from drgs_blender.colour import LUMINANCE
+from drgs_blender.core.color import LUMINANCE
+from drgs_blender.core.frame import (
+    Frame,
+    Material,
+    MeshState,
+    ObjectState,
+    RenderSettings,
+    Visibility,
+    World,
+    split_rays,
+)
 from drgs_blender.formats.registry import read_environment
-from drgs_blender.frame import Frame, Material, MeshState, ObjectState, RenderSettings, Visibility, World, split_rays
 
 Array = np.ndarray
 

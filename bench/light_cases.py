@@ -15,11 +15,11 @@ from ours import pinhole
 from report import OUT
 from subjects import asset_path, spread_materials
 
-from drgs_blender.asset import Asset, Mesh
-from drgs_blender.asset.container import read_asset, write_asset
+from drgs_blender.core.asset import Asset, Mesh
+from drgs_blender.core.asset.container import read_asset, write_asset
+from drgs_blender.core.frame import Frame, ObjectState, RenderSettings, World, split_rays
 from drgs_blender.engine.session import Session
 from drgs_blender.formats.registry import read_environment
-from drgs_blender.frame import Frame, ObjectState, RenderSettings, World, split_rays
 
 Array = np.ndarray
 

@@ -21,18 +21,18 @@ import trimesh
 from light_cases import CASES, Case
 from report import OUT, table
 
-from drgs_blender.asset import Asset, Binding, Mesh, Surfels
-from drgs_blender.asset.container import read_asset, write_asset
 from drgs_blender.compute.jit import njit, prange, source_digest, use_threads
+from drgs_blender.core.asset import Asset, Binding, Mesh, Surfels
+from drgs_blender.core.asset.container import read_asset, write_asset
+from drgs_blender.core.frame import Frame
+from drgs_blender.core.passes import PASSES
 from drgs_blender.engine.session import Session
-from drgs_blender.frame import Frame
-from drgs_blender.passes import PASSES
 from drgs_blender.render.camera import camera_parameters
-from drgs_blender.render.lights.light import EnvironmentLight
+from drgs_blender.render.gbuffer.mesh import primary_mesh
+from drgs_blender.render.integrator.integrate import integrate
+from drgs_blender.render.lights.environment import EnvironmentLight
 from drgs_blender.render.points import ShadingPoints
-from drgs_blender.render.primary.primary_mesh import primary_mesh
-from drgs_blender.render.shade.integrate import integrate
-from drgs_blender.render.trace.scene import TraceObject, TraceScene
+from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene
 
 Array = np.ndarray
 RAYS, RUNS = 32, 3

@@ -14,10 +14,10 @@ from light_cases import BOUNCES, Case, Reference
 from report import OUT, ROOT, table
 from subjects import spread_materials
 
-from drgs_blender.asset import Asset, Mesh
-from drgs_blender.asset.container import read_asset, write_asset
 from drgs_blender.build.make import make_asset
 from drgs_blender.compute.jit import source_digest
+from drgs_blender.core.asset import Asset, Mesh
+from drgs_blender.core.asset.container import read_asset, write_asset
 
 FIGURE = ROOT / "docs" / "images" / "efficiency.png"
 MESH = Path("data/meshes/odedstein/armadillo/armadillo.obj")

@@ -20,7 +20,7 @@ from light_cases import BOUNCES, FOLDER, REFERENCE_AA, Case, Plan, Reference, ch
 from noise import EPSILON, relative_mse, time_ratios
 from report import ROOT, table
 
-from drgs_blender.render.picture.oidn import available as oidn_available
+from drgs_blender.render.denoise.oidn import available as oidn_available
 
 #: Part of the pixels left out of the trimmed relative error.
 TRIM = 0.001

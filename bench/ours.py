@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from drgs_blender.core.frame import Camera, Frame, ObjectState, RenderSettings, World, split_rays
 from drgs_blender.engine.session import Session
 from drgs_blender.formats.registry import read_environment
-from drgs_blender.frame import Camera, Frame, ObjectState, RenderSettings, World, split_rays
 
 #: One session for a whole program, so that kernels and assets are loaded once.
 SESSION = Session()

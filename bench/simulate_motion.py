@@ -14,8 +14,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "unit"
 from matter_cases import cantilever, energy, lattice, momenta, solver_of, timoshenko
 
 from drgs_blender.deform.gmls import bind_points, carry
-from drgs_blender.simulate.contact import Plane
-from drgs_blender.simulate.fill import fill
+from drgs_blender.simulation.contact import Plane
+from drgs_blender.simulation.fill import fill
 
 FRAME = 1 / 24
 Rows = list[list[object]]

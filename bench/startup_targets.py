@@ -37,9 +37,9 @@ def tasks(asset: Path) -> dict[str, Callable[[], np.ndarray]]:
 
     from matter_cases import lattice, solver_of
 
-    from drgs_blender.asset.container import read_asset
+    from drgs_blender.core.asset.container import read_asset
+    from drgs_blender.core.frame import Camera, Frame, ObjectState, RenderSettings, World
     from drgs_blender.engine.session import Session
-    from drgs_blender.frame import Camera, Frame, ObjectState, RenderSettings, World
 
     session = Session()
     key = session.load_asset(str(asset))

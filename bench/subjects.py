@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from report import OUT, ROOT
 
-from drgs_blender.asset import Asset, Mesh
-from drgs_blender.asset.container import read_asset, write_asset
 from drgs_blender.build.make import make_asset, read_mesh_file
 from drgs_blender.compute.jit import source_digest
+from drgs_blender.core.asset import Asset, Mesh
+from drgs_blender.core.asset.container import read_asset, write_asset
 from drgs_blender.formats.files import Image, MaterialFile
 from drgs_blender.formats.images import load_image
 

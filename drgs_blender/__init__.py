@@ -4,6 +4,6 @@ This package is the engine and its library; it never imports ``bpy``. Importing 
 numba and Embree are imported only by the modules that compute with them.
 """
 
-from .version import __version__
+from .core.version import __version__
 
 __all__ = ["__version__"]

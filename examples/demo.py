@@ -111,8 +111,8 @@ def publish(frames: list[Path], out: Path, fps: int = 24) -> None:
     import numpy as np
     from PIL import Image
 
-    from drgs_blender.colour import linear_to_srgb
-    from drgs_blender.render.picture.frames import read_frame
+    from drgs_blender.core.color import linear_to_srgb
+    from drgs_blender.render.film.frame_files import read_frame
 
     def picture(path: Path) -> Image.Image:
         linear = np.clip(read_frame(path)[0]["Combined"][..., :3], 0, 1)  # Rec.709 -> 8-bit sRGB

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from demo import BIN, EXE, ROOT, publish, run
 
-from drgs_blender.particle_cache import ParticleCache
+from drgs_blender.core.particle_cache import ParticleCache
 
 
 def textured_cow(out: Path) -> Path:

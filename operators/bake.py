@@ -15,9 +15,9 @@ from ..addon.export import export_frame
 from ..addon.export.camera import NO_CAMERA
 from ..addon.export.fit import check_fit
 from ..addon.export.frame import WORKING_SPACE
-from ..drgs_blender.engine.frame_file import SUFFIX, write_frame_file
-from ..drgs_blender.errors import UsageError
-from ..drgs_blender.sequence import frame_path
+from ..drgs_blender.core.errors import UsageError
+from ..drgs_blender.core.frame_sequences import frame_path
+from ..drgs_blender.ipc.frame_file import SUFFIX, write_frame_file
 from . import targets
 from .program import ProgramOperator
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import bpy
 
 from ..addon import messages
-from ..drgs_blender.errors import DrgsError, UsageError, WriteError
+from ..drgs_blender.core.errors import DrgsError, UsageError, WriteError
 
 
 class DrgsOperator:

@@ -11,7 +11,7 @@ import numpy as np
 from mathutils.bvhtree import BVHTree
 
 from ..addon import assets, mesh_arrays
-from ..drgs_blender.errors import UsageError
+from ..drgs_blender.core.errors import UsageError
 from . import targets
 from .base import DrgsOperator
 from .shape_keys import transfer_shape_keys

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 import numpy as np
 
-from ..drgs_blender.errors import UsageError
+from ..drgs_blender.core.errors import UsageError
 from . import targets
 from .base import DrgsOperator
 from .bind import rest_pose

@@ -8,7 +8,7 @@ import numpy as np
 from bpy.props import IntProperty
 
 from ..addon import assets, cage_nodes, mesh_arrays
-from ..drgs_blender.errors import UsageError
+from ..drgs_blender.core.errors import UsageError
 from . import targets
 from .base import DrgsOperator
 

@@ -7,7 +7,7 @@ import numpy as np
 from bpy.props import IntVectorProperty
 
 from ..addon import assets
-from ..drgs_blender.errors import UsageError
+from ..drgs_blender.core.errors import UsageError
 from . import targets
 from .base import DrgsOperator
 

@@ -6,7 +6,7 @@ import bpy
 from bpy.props import BoolProperty, EnumProperty
 
 from ..addon import assets, compositing
-from ..drgs_blender.errors import UsageError
+from ..drgs_blender.core.errors import UsageError
 from .base import DrgsOperator
 
 

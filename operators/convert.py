@@ -8,7 +8,7 @@ import bpy
 from bpy.props import BoolProperty, StringProperty
 
 from ..addon import assets, splat_attributes
-from ..drgs_blender.errors import UsageError
+from ..drgs_blender.core.errors import UsageError
 from .import_asset import import_assets
 from .program import ProgramOperator
 

@@ -13,8 +13,8 @@ import bpy
 from bpy.props import BoolProperty, StringProperty
 
 from ..addon import engine_link, engine_setup, preferences, setup_job
-from ..drgs_blender.engine.locate import VARIABLE, locate_engine
-from ..drgs_blender.errors import UsageError
+from ..drgs_blender.core.errors import UsageError
+from ..drgs_blender.ipc.locate import VARIABLE, locate_engine
 from .base import DrgsOperator
 from .program import say
 

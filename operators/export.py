@@ -7,9 +7,9 @@ from pathlib import Path
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
 
-from ..drgs_blender.errors import UsageError
-from ..drgs_blender.filetypes import WRITTEN
-from ..drgs_blender.sequence import frame_path
+from ..drgs_blender.core.errors import UsageError
+from ..drgs_blender.core.file_types import WRITTEN
+from ..drgs_blender.core.frame_sequences import frame_path
 from .import_parts import UP_ITEMS
 from .scene_frames import NUMBER, SceneFrames, draw_colour
 

@@ -9,8 +9,8 @@ import numpy as np
 from bpy.props import BoolProperty, CollectionProperty, StringProperty
 
 from ..addon import assets, mesh_arrays
-from ..drgs_blender.asset import Asset, Environment
-from ..drgs_blender.asset.container import read_asset
+from ..drgs_blender.core.asset import Asset, Environment
+from ..drgs_blender.core.asset.container import read_asset
 from .base import DrgsOperator, DropTarget
 from .mark_assets import mark
 

@@ -8,9 +8,9 @@ import bpy
 from bpy.props import BoolProperty, CollectionProperty, EnumProperty, FloatProperty, StringProperty
 
 from ..addon import assets
-from ..drgs_blender.errors import UsageError
-from ..drgs_blender.filetypes import READ, extensions
-from ..drgs_blender.sequence import frame_path, frames_of, template_of
+from ..drgs_blender.core.errors import UsageError
+from ..drgs_blender.core.file_types import READ, extensions
+from ..drgs_blender.core.frame_sequences import frame_path, frames_of, template_of
 from . import sequences
 from .base import DropTarget
 from .import_asset import import_assets

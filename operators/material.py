@@ -10,8 +10,8 @@ import numpy as np
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, StringProperty
 
 from ..addon import assets, mesh_arrays
-from ..drgs_blender.asset import MATERIAL_CHANNELS
-from ..drgs_blender.errors import AssetError, UsageError
+from ..drgs_blender.core.asset import MATERIAL_CHANNELS
+from ..drgs_blender.core.errors import AssetError, UsageError
 from . import targets
 from .base import DrgsOperator
 from .bind import nearest, source_of

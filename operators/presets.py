@@ -9,7 +9,7 @@ from bl_operators.presets import AddPresetBase
 from bpy.props import StringProperty
 
 from ..addon import presets
-from ..drgs_blender.errors import UsageError
+from ..drgs_blender.core.errors import UsageError
 from .base import DrgsOperator
 
 

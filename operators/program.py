@@ -15,8 +15,8 @@ import bpy
 
 from ..addon import assets, engine_link, messages, written
 from ..addon.matter.program import MAIN
-from ..drgs_blender.engine.child import clean_environment
-from ..drgs_blender.errors import AssetError, EngineError, UsageError
+from ..drgs_blender.core.errors import AssetError, EngineError, UsageError
+from ..drgs_blender.ipc.child_process import clean_environment
 from .base import DrgsOperator
 
 _INTERVAL = 0.25

@@ -8,8 +8,8 @@ import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
 
 from ..addon import assets, engine_link, reconstruction
-from ..drgs_blender.errors import UsageError
-from ..drgs_blender.filetypes import CAMERAS
+from ..drgs_blender.core.errors import UsageError
+from ..drgs_blender.core.file_types import CAMERAS
 from .base import DrgsOperator
 from .import_asset import import_assets
 from .program import ProgramOperator

@@ -11,9 +11,9 @@ import bpy
 from bpy.props import StringProperty
 
 from ..addon import assets, engine_link, messages
-from ..drgs_blender.engine.child import clean_environment
-from ..drgs_blender.errors import DrgsError, UsageError, WriteError
-from ..drgs_blender.version import __version__
+from ..drgs_blender.core.errors import DrgsError, UsageError, WriteError
+from ..drgs_blender.core.version import __version__
+from ..drgs_blender.ipc.child_process import clean_environment
 from . import targets
 from .base import DrgsOperator
 

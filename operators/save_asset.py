@@ -11,10 +11,10 @@ from bpy.props import BoolProperty, StringProperty
 
 from ..addon import assets, mesh_arrays, messages
 from ..addon.export.objects import look_of
-from ..drgs_blender.adjust import edited_asset
-from ..drgs_blender.asset import MATERIAL_CHANNELS
-from ..drgs_blender.asset.container import write_asset
-from ..drgs_blender.errors import UsageError
+from ..drgs_blender.core.asset import MATERIAL_CHANNELS
+from ..drgs_blender.core.asset.container import write_asset
+from ..drgs_blender.core.errors import UsageError
+from ..drgs_blender.core.material_adjustments import edited_asset
 from . import targets
 from .base import DrgsOperator
 

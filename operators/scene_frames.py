@@ -12,11 +12,11 @@ from bpy.props import BoolProperty, EnumProperty, IntProperty
 from ..addon import assets, messages
 from ..addon.export import export_frame
 from ..addon.export.camera import NO_CAMERA
-from ..drgs_blender.engine.frame_file import SUFFIX, write_frame_file
-from ..drgs_blender.errors import UsageError
-from ..drgs_blender.filetypes import Held
-from ..drgs_blender.frame import Frame
-from ..drgs_blender.sequence import frame_path
+from ..drgs_blender.core.errors import UsageError
+from ..drgs_blender.core.file_types import Held
+from ..drgs_blender.core.frame import Frame
+from ..drgs_blender.core.frame_sequences import frame_path
+from ..drgs_blender.ipc.frame_file import SUFFIX, write_frame_file
 from .program import ProgramOperator
 
 #: Stands for the number of a frame in the names of files.

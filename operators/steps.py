@@ -7,7 +7,7 @@ from mathutils import Matrix, Vector
 
 from ..addon import assets
 from ..addon.tour import poser_of, target
-from ..drgs_blender.errors import UsageError
+from ..drgs_blender.core.errors import UsageError
 from . import targets
 from .base import DrgsOperator
 

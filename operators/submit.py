@@ -7,7 +7,7 @@ from pathlib import Path
 import bpy
 
 from ..addon import submit
-from ..drgs_blender.errors import UsageError
+from ..drgs_blender.core.errors import UsageError
 from .base import DrgsOperator
 
 

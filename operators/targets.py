@@ -8,7 +8,7 @@ import bpy
 import numpy as np
 
 from ..addon import assets, mesh_arrays
-from ..drgs_blender.errors import UsageError
+from ..drgs_blender.core.errors import UsageError
 
 Array = np.ndarray
 

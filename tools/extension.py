@@ -65,8 +65,8 @@ PERMISSIONS = {"files", "network", "clipboard", "camera", "microphone"}
 
 
 def project_version(root: Path = ROOT) -> str:
-    """The version written in drgs_blender/version.py, read without importing it."""
-    text = (root / "drgs_blender" / "version.py").read_text(encoding="utf-8")
+    """The version written in drgs_blender/core/version.py, read without importing it."""
+    text = (root / "drgs_blender" / "core" / "version.py").read_text(encoding="utf-8")
     return re.search(r'__version__ = "([^"]+)"', text)[1]
 
 
@@ -80,7 +80,7 @@ def faults(manifest: dict[str, Any], version: str) -> list[str]:
     if found:
         return found
     if manifest["version"] != version:
-        found.append(f"version is {manifest['version']} but drgs_blender/version.py says {version}")
+        found.append(f"version is {manifest['version']} but drgs_blender/core/version.py says {version}")
     if not manifest["id"].isidentifier():
         found.append(f"id {manifest['id']!r} is not a Python identifier")
     if len(manifest["tagline"]) > 64 or not manifest["tagline"][-1:].isalnum():

@@ -89,9 +89,8 @@ def engine(folder: Path, what: str) -> None:
 
     import numpy as np
 
-    from drgs_blender.asset.container import read_asset
-    from drgs_blender.engine.client import EngineClient, locate_engine
-    from drgs_blender.frame import (
+    from drgs_blender.core.asset.container import read_asset
+    from drgs_blender.core.frame import (
         Camera,
         Frame,
         Light,
@@ -103,6 +102,7 @@ def engine(folder: Path, what: str) -> None:
         RenderSettings,
         World,
     )  # fmt: skip
+    from drgs_blender.ipc.client import EngineClient, locate_engine
 
     matrix = np.array([[1, 0, 0, 0], [0, 0, -1, -3], [0, 1, 0, 0], [0, 0, 0, 1]], float)
     camera = Camera(matrix, 48, 48, 60.0, 60.0, 24.0, 24.0)
@@ -145,9 +145,9 @@ def engine(folder: Path, what: str) -> None:
 
 def reconstruct(variant: str) -> None:
     """The trial run that every reconstruction with a time budget begins with."""
-    from drgs_blender.reconstruct.job import Settings
-    from drgs_blender.reconstruct.processor import HERE
-    from drgs_blender.reconstruct.rehearsal import rehearse
+    from drgs_blender.reconstruct.backend import HERE
+    from drgs_blender.reconstruct.jit_warmup import rehearse
+    from drgs_blender.reconstruct.pipeline import Settings
 
     for masked in (True, False):
         rehearse(Settings(variant=variant), masked, HERE, lambda: False)  # type: ignore[arg-type]

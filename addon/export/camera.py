@@ -6,8 +6,8 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
-from ...drgs_blender.errors import UsageError
-from ...drgs_blender.frame import Camera
+from ...drgs_blender.core.errors import UsageError
+from ...drgs_blender.core.frame import Camera
 
 #: For frames whose camera has no part in what is made of them.
 NO_CAMERA = Camera(np.eye(4), 1, 1, 1.0, 1.0, 0.5, 0.5)

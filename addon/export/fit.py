@@ -7,8 +7,8 @@ from collections.abc import Callable
 import bpy
 import numpy as np
 
-from ...drgs_blender.asset import Mesh
-from ...drgs_blender.errors import AssetError
+from ...drgs_blender.core.asset import Mesh
+from ...drgs_blender.core.errors import AssetError
 from .. import mesh_arrays
 
 Array = np.ndarray

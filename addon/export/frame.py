@@ -8,8 +8,8 @@ from pathlib import Path
 
 import bpy
 
-from ...drgs_blender.errors import UsageError
-from ...drgs_blender.frame import Camera, Frame
+from ...drgs_blender.core.errors import UsageError
+from ...drgs_blender.core.frame import Camera, Frame
 from .. import assets, compositing, preferences
 from ..limits import Limited
 from ..passes import enabled

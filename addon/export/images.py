@@ -10,8 +10,8 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ...drgs_blender.colour import linear_to_srgb, srgb_to_linear
-from ...drgs_blender.frame import Image
+from ...drgs_blender.core.color import linear_to_srgb, srgb_to_linear
+from ...drgs_blender.core.frame import Image
 
 Array = np.ndarray
 Warn = Callable[[str], None]

@@ -9,8 +9,8 @@ from typing import TypeVar
 import bpy
 import numpy as np
 
-from ...drgs_blender.errors import Cancelled
-from ...drgs_blender.frame import Visibility
+from ...drgs_blender.core.errors import Cancelled
+from ...drgs_blender.core.frame import Visibility
 
 T = TypeVar("T")
 Warn = Callable[[str], None]

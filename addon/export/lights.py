@@ -7,7 +7,7 @@ from collections.abc import Callable
 import bpy
 import numpy as np
 
-from ...drgs_blender.frame import Light
+from ...drgs_blender.core.frame import Light
 from .instances import Visible
 from .nodes import Paint, Walker, once, plain
 from .sockets import Place, surface_of

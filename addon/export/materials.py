@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import bpy
 import numpy as np
 
-from ...drgs_blender.frame import Image, Material, Texture
+from ...drgs_blender.core.frame import Image, Material, Texture
 from . import images
 from .node_math import reflectance
 from .nodes import Paint, Walker, constant, euler, once, plain, vector_rotate

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import bpy
 import numpy as np
 
-from ...drgs_blender.frame import Image, Material, MeshState
+from ...drgs_blender.core.frame import Image, Material, MeshState
 from .. import mesh_arrays
 from .instances import Key, Visible
 from .materials import DEFAULT, Look, Materials

@@ -7,8 +7,8 @@ from collections.abc import Callable
 import bpy
 import numpy as np
 
-from ...drgs_blender.arrays import same_bits
-from ...drgs_blender.frame import Frame, Moment, Pose
+from ...drgs_blender.core.arrays import same_bits
+from ...drgs_blender.core.frame import Frame, Moment, Pose
 from .. import mesh_arrays
 from .camera import export_camera, picture_of
 from .instances import Key, uncancelled, visible

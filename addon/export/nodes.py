@@ -16,7 +16,7 @@ import bpy
 import numpy as np
 from mathutils import Euler, Matrix
 
-from ...drgs_blender.colour import LUMINANCE as REC709
+from ...drgs_blender.core.color import LUMINANCE as REC709
 from .node_math import BLENDS, OPERATIONS, blackbody, by_row, divide, hsl, hsv, hue_saturation, in_system
 from .sockets import Place
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from ...drgs_blender.asset import MATERIAL_CHANNELS, Asset
-from ...drgs_blender.frame import Adjustment, ObjectState
+from ...drgs_blender.core.asset import MATERIAL_CHANNELS, Asset
+from ...drgs_blender.core.frame import Adjustment, ObjectState
 from .. import assets, mesh_arrays
 from ..matter import playback
 from .fit import check_fit, check_modifiers

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import bpy
 import numpy as np
 
-from ...drgs_blender.colour import srgb_to_linear
-from ...drgs_blender.frame import Image, Texture
+from ...drgs_blender.core.color import srgb_to_linear
+from ...drgs_blender.core.frame import Image, Texture
 from . import images
 from .nodes import LUMINANCE
 

@@ -6,8 +6,8 @@ import bpy
 import numpy as np
 from mathutils import Matrix, Vector
 
-from ...drgs_blender.errors import UsageError
-from ...drgs_blender.frame import Camera
+from ...drgs_blender.core.errors import UsageError
+from ...drgs_blender.core.frame import Camera
 from .camera import export_camera, picture_of, resolution
 
 #: Part of the picture's side by which two cameras differ that are the same but for rounding.

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import bpy
 import numpy as np
 
-from ...drgs_blender.errors import UsageError
-from ...drgs_blender.frame import World
+from ...drgs_blender.core.errors import UsageError
+from ...drgs_blender.core.frame import World
 from .images import linear_pixels
 from .nodes import Paint, Walker, euler, once, plain, vector_rotate
 from .sockets import Place, surface_of

@@ -17,10 +17,10 @@ from urllib.parse import quote
 import bpy
 import numpy as np
 
-from ...drgs_blender.asset import Asset, Binding, Mesh, Surfels
-from ...drgs_blender.asset.archive import replace_file
-from ...drgs_blender.asset.container import write_asset
-from ...drgs_blender.errors import UsageError, WriteError
+from ...drgs_blender.core.asset import Asset, Binding, Mesh, Surfels
+from ...drgs_blender.core.asset.archive import replace_file
+from ...drgs_blender.core.asset.container import write_asset
+from ...drgs_blender.core.errors import UsageError, WriteError
 from .. import assets, mesh_arrays, messages
 from ..export.fit import check_fit, check_modifiers
 from . import playback

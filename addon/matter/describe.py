@@ -11,8 +11,8 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ...drgs_blender.errors import UsageError
-from ...drgs_blender.matter import MATERIALS
+from ...drgs_blender.core.errors import UsageError
+from ...drgs_blender.core.sim_materials import MATERIALS
 from .properties import ANGLES, DrgsMatterSettings, numbers_of
 
 #: Where to look for the settings, in messages.

@@ -20,9 +20,9 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from ...drgs_blender.asset.archive import replace_file
-from ...drgs_blender.errors import AssetError, DrgsError, UsageError, WriteError
-from ...drgs_blender.particle_cache import HEADER, Header, ParticleCache
+from ...drgs_blender.core.asset.archive import replace_file
+from ...drgs_blender.core.errors import AssetError, DrgsError, UsageError, WriteError
+from ...drgs_blender.core.particle_cache import HEADER, Header, ParticleCache
 
 Array = np.ndarray
 log = logging.getLogger(__name__)

@@ -11,8 +11,15 @@ from contextlib import suppress
 from pathlib import Path
 from urllib.parse import unquote
 
-from ...drgs_blender.engine.child import clean_environment
-from ...drgs_blender.errors import EXIT_CANNOT_WRITE, EXIT_TERMINATED, AssetError, EngineError, UsageError, WriteError
+from ...drgs_blender.core.errors import (
+    EXIT_CANNOT_WRITE,
+    EXIT_TERMINATED,
+    AssetError,
+    EngineError,
+    UsageError,
+    WriteError,
+)
+from ...drgs_blender.ipc.child_process import clean_environment
 from .. import engine_link
 from . import capture
 

@@ -16,7 +16,7 @@ from bpy.props import (
     StringProperty,
 )
 
-from ...drgs_blender.matter import MATERIALS
+from ...drgs_blender.core.sim_materials import MATERIALS
 
 #: Numbers of every material, and those that some kinds of matter have besides.
 BASIC = ("young", "poisson", "density")

@@ -18,9 +18,9 @@ from typing import NoReturn
 import bpy
 import numpy as np
 
-from ...drgs_blender.errors import DrgsError, EngineError, UsageError
-from ...drgs_blender.matter import MATERIALS
-from ...drgs_blender.particle_cache import ParticleCache
+from ...drgs_blender.core.errors import DrgsError, EngineError, UsageError
+from ...drgs_blender.core.particle_cache import ParticleCache
+from ...drgs_blender.core.sim_materials import MATERIALS
 from .. import assets, messages, written
 from ..export.memory import uid
 from . import capture, playback, points

@@ -6,8 +6,8 @@ import os
 
 import bpy
 
-from ...drgs_blender.errors import DrgsError
-from ...drgs_blender.matter import MATERIALS
+from ...drgs_blender.core.errors import DrgsError
+from ...drgs_blender.core.sim_materials import MATERIALS
 from .. import assets
 from ..matter import points, work
 from ..matter.properties import DrgsMatterRegion, DrgsMatterSettings, numbers_of

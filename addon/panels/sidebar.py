@@ -7,7 +7,7 @@ import time
 
 import bpy
 
-from ...drgs_blender.version import __version__
+from ...drgs_blender.core.version import __version__
 from .. import assets, engine_link, messages, preferences
 from .object_data import draw_asset
 from .tour import POPOVER, wrapped

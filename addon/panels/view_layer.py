@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-from ...drgs_blender.passes import PASSES
+from ...drgs_blender.core.passes import PASSES
 from ..passes import label
 from ..properties import switch_of
 

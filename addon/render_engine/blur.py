@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import bpy
 import numpy as np
 
-from ...drgs_blender.engine import blur
-from ...drgs_blender.frame import Frame
+from ...drgs_blender.core.frame import Frame
+from ...drgs_blender.ipc import blur
 from ..limits import Limited
 
 Warn = Callable[[str], None]

@@ -9,12 +9,12 @@ from collections.abc import Callable, Iterator
 import bpy
 import numpy as np
 
-from ...drgs_blender import mattes
-from ...drgs_blender.engine.blur import averaged, share, sharp
-from ...drgs_blender.engine.protocol import Passes
-from ...drgs_blender.errors import EXIT_INTERNAL, Cancelled, DrgsError
-from ...drgs_blender.frame import Frame
-from ...drgs_blender.phases import is_preparing
+from ...drgs_blender.core import cryptomatte
+from ...drgs_blender.core.errors import EXIT_INTERNAL, Cancelled, DrgsError
+from ...drgs_blender.core.frame import Frame
+from ...drgs_blender.core.phases import is_preparing
+from ...drgs_blender.ipc.blur import averaged, share, sharp
+from ...drgs_blender.ipc.protocol import Passes
 from .. import engine_link, farm, messages
 from ..export import export_frame
 from ..export.instances import uncancelled
@@ -188,7 +188,7 @@ class DrgsRenderEngine(bpy.types.RenderEngine):
             stopped = False
         finally:
             self.end_result(result, cancel=stopped)
-        for key, text in mattes.metadata(frame, f"{view_layer.name}.").items():
+        for key, text in cryptomatte.metadata(frame, f"{view_layer.name}.").items():
             self.get_result().stamp_data_add_field(key, text)
 
 

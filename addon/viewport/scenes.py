@@ -9,9 +9,9 @@ from pathlib import Path
 
 import bpy
 
-from ...drgs_blender.engine.snapshots import renewed
-from ...drgs_blender.errors import DrgsError
-from ...drgs_blender.frame import Frame
+from ...drgs_blender.core.errors import DrgsError
+from ...drgs_blender.core.frame import Frame
+from ...drgs_blender.ipc.change_detection import renewed
 from .. import messages
 from ..export import export_frame
 from ..export.camera import NO_CAMERA

@@ -7,9 +7,9 @@ import gpu
 import numpy as np
 from mathutils import Matrix
 
-from ...drgs_blender.adjust import edited_asset
-from ...drgs_blender.asset import Asset
-from ...drgs_blender.errors import DrgsError
+from ...drgs_blender.core.asset import Asset
+from ...drgs_blender.core.errors import DrgsError
+from ...drgs_blender.core.material_adjustments import edited_asset
 from .. import assets, mesh_arrays
 from ..export.memory import Memory, uid
 from ..export.objects import look_of

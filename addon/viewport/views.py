@@ -15,9 +15,9 @@ from typing import Any
 
 import bpy
 
-from ...drgs_blender.errors import DrgsError
-from ...drgs_blender.frame import Camera, Frame
-from ...drgs_blender.phases import STARTING, is_counted, is_preparing
+from ...drgs_blender.core.errors import DrgsError
+from ...drgs_blender.core.frame import Camera, Frame
+from ...drgs_blender.core.phases import STARTING, is_counted, is_preparing
 from .. import engine_link, messages, preferences
 from ..export.camera import check_lens
 from ..export.view import view_camera

@@ -13,10 +13,10 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from ...drgs_blender.engine.client import EngineClient, Passes
-from ...drgs_blender.errors import Cancelled, DrgsError
-from ...drgs_blender.frame import Frame
-from ...drgs_blender.phases import is_counted
+from ...drgs_blender.core.errors import Cancelled, DrgsError
+from ...drgs_blender.core.frame import Frame
+from ...drgs_blender.core.phases import is_counted
+from ...drgs_blender.ipc.client import EngineClient, Passes
 
 log = logging.getLogger("drgs")
 

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from ..compute.jit import njit
-from ..errors import UsageError
-from ..geometry import VertexNormals
+from ..core.errors import UsageError
+from ..geometry.normals import VertexNormals
 from ..render.points import ShadingPoints
-from ..render.trace.scene import TraceObject
+from ..render.scene.trace_scene import TraceObject
 from .relit import points_along
 
 Array = np.ndarray

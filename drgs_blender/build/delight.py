@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from ..asset.model import Array, Asset, Surfels
-from ..colour import LUMINANCE, srgb_to_linear
-from ..errors import UsageError
+from ..core.asset.model import Array, Asset, Surfels
+from ..core.color import LUMINANCE, srgb_to_linear
+from ..core.errors import UsageError
+from ..core.frame import RenderSettings, World
 from ..formats.harmonics import basis, whole_bands
-from ..frame import RenderSettings, World
-from ..render.lights.light import EnvironmentLight
-from ..render.trace.scene import TraceObject, TraceScene
+from ..render.lights.environment import EnvironmentLight
+from ..render.scene.trace_scene import TraceObject, TraceScene
 from .importer import CAPTURED
 from .relit import Progress, light_components, points_on_mesh
 from .transfer import surfels_to_vertices

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..asset.model import Asset, PosedSurfels, Surfels
+from ..core.asset.model import Asset, PosedSurfels, Surfels
+from ..core.errors import UsageError
 from ..deform.mesh_driven import MeshDriven
-from ..errors import UsageError
 from ..formats.harmonics import rotate_harmonics, whole_bands
-from ..geometry import rotation_matrices
+from ..geometry.normals import rotation_matrices
 
 Array = np.ndarray
 

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from ..asset.model import Asset, Mesh, Surfels
+from ..core.asset.model import Asset, Mesh, Surfels
+from ..core.errors import AssetError
 from ..deform.binding import bind, project
-from ..deform.faces import Faces
-from ..errors import AssetError
+from ..deform.face_frames import Faces
 from ..formats.axes import scaled_surfels, surfels_to_z_up
 from ..formats.files import MaterialsFile, MeshFile, SurfelFile, plain_name
 from ..formats.gaussian_ply import LAYOUTS

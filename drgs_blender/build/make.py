@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from ..asset.model import Asset, Environment, Mesh, Surfels
+from ..core.asset.model import Asset, Environment, Mesh, Surfels
+from ..core.errors import AssetError
 from ..deform.attach import attach
-from ..deform.faces import Faces
-from ..errors import AssetError
+from ..deform.face_frames import Faces
 from ..formats.axes import mesh_to_z_up
 from ..formats.files import MeshFile, plain_name
 from ..formats.gltf_nodes import Pose

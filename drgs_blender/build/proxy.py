@@ -16,13 +16,13 @@ from scipy.ndimage import gaussian_filter
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from ..asset.model import Mesh, PosedSurfels, Surfels
 from ..compute.jit import njit, prange
-from ..errors import AssetError, DeviceError
+from ..core.asset.model import Mesh, PosedSurfels, Surfels
+from ..core.errors import AssetError, DeviceError
+from ..core.frame import Camera, RenderSettings
 from ..formats.axes import scaled_surfels
 from ..formats.mesh import check_extent
-from ..frame import Camera, RenderSettings
-from ..geometry import rotation_matrices
+from ..geometry.normals import rotation_matrices
 from ..render.camera import camera_parameters
 from ..render.surfels.raster import rasterise
 from ..render.surfels.splats import prepare

@@ -7,16 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..asset.model import Asset, Binding, Surfels
-from ..errors import UsageError
-from ..frame import RenderSettings, World
-from ..geometry import rotation_matrices
-from ..render.lights.lamps import Lamps
-from ..render.lights.light import EnvironmentLight
+from ..core.asset.model import Asset, Binding, Surfels
+from ..core.errors import UsageError
+from ..core.frame import RenderSettings, World
+from ..geometry.normals import rotation_matrices
+from ..render.integrator.integrate import integrate
+from ..render.lights.environment import EnvironmentLight
+from ..render.lights.lights import Lamps
 from ..render.points import ShadingPoints
-from ..render.shade.integrate import integrate
+from ..render.scene.trace_scene import TraceObject, TraceScene
 from ..render.surfels.surfel_bvh import SurfelBVH
-from ..render.trace.scene import TraceObject, TraceScene
 
 Array = np.ndarray
 Progress = Callable[[str, float], None]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..colour import srgb_to_linear, to_unit
+from ..core.color import srgb_to_linear, to_unit
 from ..formats.files import Image, MaterialFile
 
 Array = np.ndarray

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..asset.model import Binding, Mesh, Surfels
+from ..core.asset.model import Binding, Mesh, Surfels
 from ..deform.binding import clamp_weights
-from ..deform.faces import Faces, dot
-from ..geometry import VertexNormals, rotation_matrices
+from ..deform.face_frames import Faces, dot
+from ..geometry.normals import VertexNormals, rotation_matrices
 
 Array = np.ndarray
 

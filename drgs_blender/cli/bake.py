@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..asset.archive import replace_file
-from ..errors import UsageError
-from ..sequence import frame_path
+from ..core.asset.archive import replace_file
+from ..core.errors import UsageError
+from ..core.frame_sequences import frame_path
 from .frame_range import check_template, parse_frames
 from .output import check_suffix, check_writable
 from .placed_frame import surface_frame

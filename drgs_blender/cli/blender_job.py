@@ -39,9 +39,9 @@ def main() -> None:
 def do(job: dict[str, Any], reader: io.FileIO, writer: io.FileIO) -> None:
     """Greet the parent and render the frames of `job`; what goes wrong is sent to the parent."""
     package = enable_extension(job["repository"])
-    protocol = importlib.import_module(f"{package}.drgs_blender.engine.protocol")
-    errors = importlib.import_module(f"{package}.drgs_blender.errors")
-    version = importlib.import_module(f"{package}.drgs_blender.version").__version__
+    protocol = importlib.import_module(f"{package}.drgs_blender.ipc.protocol")
+    errors = importlib.import_module(f"{package}.drgs_blender.core.errors")
+    version = importlib.import_module(f"{package}.drgs_blender.core.version").__version__
     link = protocol.Link(reader, writer)
     link.send(protocol.Hello(protocol.PROTOCOL, version, os.getpid()))
     threading.Thread(target=say_alive, args=(link, protocol), daemon=True).start()
@@ -115,12 +115,12 @@ class Exporter:
 
     def __init__(self, link: Any, package: str, passes: list[str] | None) -> None:
         self.link, self.passes = link, tuple(passes) if passes else None
-        self.protocol = importlib.import_module(f"{package}.drgs_blender.engine.protocol")
-        self.errors = importlib.import_module(f"{package}.drgs_blender.errors")
+        self.protocol = importlib.import_module(f"{package}.drgs_blender.ipc.protocol")
+        self.errors = importlib.import_module(f"{package}.drgs_blender.core.errors")
         self.export_frame = importlib.import_module(f"{package}.addon.export").export_frame
         self.blur = importlib.import_module(f"{package}.addon.render_engine.blur")
-        self.encode_frame = importlib.import_module(f"{package}.drgs_blender.engine.codec").encode_frame
-        self.sent = importlib.import_module(f"{package}.drgs_blender.engine.slots").SentSlots()
+        self.encode_frame = importlib.import_module(f"{package}.drgs_blender.ipc.codec").encode_frame
+        self.sent = importlib.import_module(f"{package}.drgs_blender.ipc.slots").SentSlots()
         self.keys: dict[Path, str] = {}
         self.requests = 0
         self.error: Exception | None = None

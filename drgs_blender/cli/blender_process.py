@@ -20,13 +20,13 @@ from typing import Any
 
 import numpy as np
 
-from ..engine import protocol
-from ..engine.codec import decode_frame
-from ..engine.protocol import Link, ProtocolError
-from ..engine.slots import HeldSlots
-from ..errors import ERROR_CLASSES, DeviceError, DrgsError, EngineError, VersionError, WriteError
-from ..frame import Frame
-from ..version import __version__
+from ..core.errors import ERROR_CLASSES, DeviceError, DrgsError, EngineError, VersionError, WriteError
+from ..core.frame import Frame
+from ..core.version import __version__
+from ..ipc import protocol
+from ..ipc.codec import decode_frame
+from ..ipc.protocol import Link, ProtocolError
+from ..ipc.slots import HeldSlots
 from .blender_job import READY
 from .find_blender import Blender, extension_source
 

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import UsageError
-from ..frame import Camera
+from ..core.errors import UsageError
+from ..core.frame import Camera
 
 _KEYS = {"matrix_world", "width", "height", "fov_x", "fx", "fy", "cx", "cy", "orthographic", "clip_start", "clip_end"}
 LARGEST_SIDE = 65536

@@ -9,10 +9,10 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from ..errors import UsageError
-from ..filetypes import Held
+from ..core.errors import UsageError
+from ..core.file_types import Held
+from ..core.frame_sequences import frame_path
 from ..formats.axes import UP_AXES
-from ..sequence import frame_path
 from .frame_range import frames_wanted
 from .output import check_writable
 from .progress import clock

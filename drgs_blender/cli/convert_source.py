@@ -8,11 +8,11 @@ from typing import Protocol
 
 import numpy as np
 
-from ..asset import Asset, Environment, Mesh, Surfels
-from ..errors import UsageError
-from ..filetypes import Held
+from ..core.asset import Asset, Environment, Mesh, Surfels
+from ..core.errors import UsageError
+from ..core.file_types import Held
+from ..core.frame import RenderSettings, World, split_rays
 from ..formats.splats import Splats, join_splats, splats_of
-from ..frame import RenderSettings, World, split_rays
 from .placed_frame import surface_frame
 from .progress import FractionBar
 from .relight import read_environment, read_vertices, rotation_z
@@ -53,16 +53,16 @@ class Source(Protocol):
 
 def open_source(args: argparse.Namespace) -> Source:
     """Read ``args.input``. Raises AssetError, or UsageError for options that do not go with it."""
-    from ..engine.frame_file import SUFFIX
     from ..formats.axes import surfels_to_z_up
     from ..formats.files import EnvironmentFile, MeshFile, SurfelFile
     from ..formats.registry import read
+    from ..ipc.frame_file import SUFFIX
 
     suffix = args.input.suffix.lower()
     if suffix in (".drgs", SUFFIX) and args.from_up not in (None, "z"):
         raise UsageError("--from-up", "is given for what is always Z up", "Leave it out")
     if suffix == ".drgs":
-        from ..asset.container import read_asset
+        from ..core.asset.container import read_asset
 
         return AssetSource(args, read_asset(args.input))
     if args.vertices:

@@ -21,11 +21,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..errors import AssetError, EngineError, UsageError
-from ..mattes import METADATA
-from ..passes import BY_NAME
-from ..sequence import frame_path
-from ..version import __version__
+from ..core.cryptomatte import METADATA
+from ..core.errors import AssetError, EngineError, UsageError
+from ..core.frame_sequences import frame_path
+from ..core.passes import BY_NAME
+from ..core.version import __version__
 from . import sampling, session_link
 from .frame_lines import FrameLines
 from .frame_range import check_template, parse_frames
@@ -33,7 +33,7 @@ from .output import check_suffix, check_writable
 from .progress import bar
 
 if TYPE_CHECKING:
-    from ..render.picture.shots import NoisyFrame
+    from ..render.denoise.inputs import NoisyFrame
 
 EXAMPLES = """examples:
   drgs denoise 'noisy/####.exr' --frames 1-24 --out 'clean/####.exr'
@@ -125,7 +125,7 @@ def denoise(args: argparse.Namespace) -> int:
 
 def _held(noisy: NoisyFrame) -> tuple[str, ...]:
     """Passes of a noisy frame that a denoised one has as well: all that are not for this step alone."""
-    from ..render.picture.film import COMPONENTS
+    from ..render.film.film import COMPONENTS
 
     return tuple(name for name in BY_NAME if name in noisy.passes or name in COMPONENTS)
 
@@ -155,15 +155,15 @@ class _Source:
 
     def settings(self, number: int, passes: tuple[str, ...] | None) -> str:
         """SHA-256 over all that decides what the denoised frame is."""
-        from ..render.picture.frames import read_checksum
+        from ..render.film.frame_files import read_checksum
 
         sums = [None if k is None else read_checksum(frame_path(self._template, k)) for k in self._window(number)]
         return hashlib.sha256(json.dumps([__version__, passes, sums]).encode()).hexdigest()
 
     def frame(self, number: int) -> NoisyFrame:
         """A noisy frame, read when first needed, and when its file is another one."""
-        from ..render.picture.frames import read_checksum
-        from ..render.picture.shots import read_noisy
+        from ..render.denoise.inputs import read_noisy
+        from ..render.film.frame_files import read_checksum
 
         path = frame_path(self._template, number)
         checksum = read_checksum(path)
@@ -176,9 +176,9 @@ class _Source:
 
     def denoise(self, number: int, passes: tuple[str, ...] | None) -> tuple[NoisyFrame, dict[str, np.ndarray], bool]:
         """The noisy frame, its denoised passes, and whether a neighbour has the very same noise."""
-        from ..render.picture.film import COMPONENTS
-        from ..render.picture.temporal import Shot
-        from ..render.picture.window import window
+        from ..render.denoise.svgf_temporal import Shot
+        from ..render.denoise.svgf_window import window
+        from ..render.film.film import COMPONENTS
 
         around = self._window(number)
         for old in [k for k in self._held if k not in around]:

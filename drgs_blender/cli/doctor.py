@@ -15,8 +15,8 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from ..errors import EXIT_NO_DEVICE, EXIT_OK, DeviceError, DrgsError
-from ..version import __version__
+from ..core.errors import EXIT_NO_DEVICE, EXIT_OK, DeviceError, DrgsError
+from ..core.version import __version__
 
 EXAMPLES = """examples:
   drgs doctor
@@ -120,7 +120,7 @@ def kernels(args: argparse.Namespace) -> str:
 
 def embree(args: argparse.Namespace) -> str:
     """Embree, loaded as the renderer loads it."""
-    from ..render.trace.embree import library
+    from ..render.scene.embree import library
 
     return f"embreex {importlib.metadata.version('embreex')}, {Path(library()._name).name}"
 
@@ -138,7 +138,7 @@ def openexr(args: argparse.Namespace) -> str:
 
 def engine(args: argparse.Namespace) -> str:
     """Start an engine process as the extension does, and shake hands."""
-    from ..engine.client import EngineClient, engine_command, locate_engine
+    from ..ipc.client import EngineClient, engine_command, locate_engine
 
     command = locate_engine() if os.environ.get("DRGS_ENGINE") else engine_command(sys.executable)
     with EngineClient(command) as client:
@@ -191,7 +191,7 @@ def variables(args: argparse.Namespace) -> str:
 #: name, essential?, test
 def card(args: argparse.Namespace) -> str:
     """The graphics card that `--device cuda` uses."""
-    from ..render.device.devices import card
+    from ..render.gpu.select_backend import card
 
     return card()
 

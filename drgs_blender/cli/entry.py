@@ -12,7 +12,7 @@ def main() -> int:
 
         return run()
     except KeyboardInterrupt:
-        from ..errors import EXIT_INTERRUPTED
+        from ..core.errors import EXIT_INTERRUPTED
         from .frame_lines import say, say_end
 
         say("drgs: interrupted\n", sys.stderr)

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import UsageError
-from ..filetypes import CAMERAS
+from ..core.errors import UsageError
+from ..core.file_types import CAMERAS
+from ..core.frame import Camera, Frame, ObjectState, RenderSettings, Visibility, World
 from ..formats.axes import UP_AXES
-from ..frame import Camera, Frame, ObjectState, RenderSettings, Visibility, World
 from . import sampling
 from .output import check_writable
 from .progress import FractionBar
@@ -142,7 +142,7 @@ def score(args: argparse.Namespace) -> int:
     if args.pictures is not None:
         check_writable(args.pictures / "novel-000.png")
 
-    from ..asset.container import digest_asset
+    from ..core.asset.container import digest_asset
     from ..engine.session import Session
     from ..evaluate.compare import compare, table
     from ..evaluate.lpips import Lpips

@@ -9,7 +9,7 @@ import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..errors import DeviceError, UsageError
+from ..core.errors import DeviceError, UsageError
 
 #: The folder that holds this package: the extension's source when it is a checkout.
 CHECKOUT = Path(__file__).resolve().parents[2]

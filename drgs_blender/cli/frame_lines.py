@@ -8,8 +8,8 @@ import time
 from collections.abc import Sequence
 from typing import IO
 
-from ..errors import EXIT_CLASSES
-from ..phases import is_preparing
+from ..core.errors import EXIT_CLASSES
+from ..core.phases import is_preparing
 
 HEARTBEAT_SECONDS = 30.0
 #: Between two progress lines of one frame.

@@ -7,8 +7,8 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from ..errors import UsageError
-from ..sequence import frames_of
+from ..core.errors import UsageError
+from ..core.frame_sequences import frames_of
 
 _TERM = re.compile(r"(?P<first>-?\d{1,20})(?:(?:-|\.\.)(?P<last>-?\d{1,20})(?:[x:](?P<step>-?\d{1,20}))?)?")
 #: Far beyond any shot; a mistyped range must not fill the memory.

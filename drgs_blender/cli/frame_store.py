@@ -17,15 +17,15 @@ from pathlib import Path
 
 import numpy as np
 
-from .. import mattes
-from ..asset.container import digest_asset
-from ..engine.codec import encode_frame
-from ..errors import AssetError
-from ..frame import Frame
-from ..passes import BY_NAME
-from ..render.picture.frames import read_frame, write_frame
-from ..render.picture.shots import describe
-from ..version import __version__
+from ..core import cryptomatte
+from ..core.asset.container import digest_asset
+from ..core.errors import AssetError
+from ..core.frame import Frame
+from ..core.passes import BY_NAME
+from ..core.version import __version__
+from ..ipc.codec import encode_frame
+from ..render.denoise.inputs import describe
+from ..render.film.frame_files import read_frame, write_frame
 
 logger = logging.getLogger(__name__)
 
@@ -121,4 +121,4 @@ def quiet_descriptors() -> Iterator[None]:
 def save(path: Path, pictures: Mapping[str, np.ndarray], frame: Frame, number: int, settings: str) -> None:
     """Write a frame; WriteError when it cannot be written and read back."""
     metadata = {SETTINGS: settings, "frame": str(number), "seed": str(frame.settings.seed)}
-    write_frame(path, dict(pictures), metadata | describe(frame) | mattes.metadata(frame))
+    write_frame(path, dict(pictures), metadata | describe(frame) | cryptomatte.metadata(frame))

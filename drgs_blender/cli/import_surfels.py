@@ -8,9 +8,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ..errors import UsageError
+from ..core.errors import UsageError
+from ..core.frame_sequences import frame_path
 from ..formats.axes import UP_AXES
-from ..sequence import frame_path
 from .frame_range import frames_wanted
 from .output import check_suffix, check_writable, write_and_report
 from .progress import FractionBar, clock, prepare_engine

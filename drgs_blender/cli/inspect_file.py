@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import AssetError
+from ..core.errors import AssetError
 
 EXAMPLES = """examples:
   drgs inspect helmet.drgs
@@ -58,7 +58,7 @@ def inspect_file(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise AssetError(str(path), f"cannot be read ({error.strerror})", "Check the path") from error
     if magic == _ZIP and path.suffix.lower() == ".drgs":
-        from ..asset.container import inspect_asset
+        from ..core.asset.container import inspect_asset
 
         return {"kind": "asset", **inspect_asset(path)}
     if magic == _EXR and (frame := inspect_frame(path)):
@@ -71,7 +71,7 @@ def inspect_file(path: Path) -> dict[str, Any]:
 
 def inspect_frame(path: Path) -> dict[str, Any] | None:
     """Describe a frame written by DR-GS; None when the EXR was written by another program."""
-    from ..render.picture.frames import read_frame
+    from ..render.film.frame_files import read_frame
 
     try:
         pictures, metadata = read_frame(path)

@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable, Iterator
 from types import FrameType
 
-from ..errors import EXIT_TERMINATED, Cancelled
+from ..core.errors import EXIT_TERMINATED, Cancelled
 
 
 @contextlib.contextmanager

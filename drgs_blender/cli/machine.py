@@ -10,10 +10,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from ..asset.container import digest_asset
-from ..engine.client import EngineClient, engine_command
-from ..engine.limits import OPTION
-from ..errors import AssetError, EngineError
+from ..core.asset.container import digest_asset
+from ..core.errors import AssetError, EngineError
+from ..engine.memory_limit import OPTION
+from ..ipc.client import EngineClient, engine_command
 from .blender_process import BlenderProcess, Evaluated
 from .find_blender import Blender
 

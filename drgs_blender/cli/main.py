@@ -1,6 +1,6 @@
 """The `drgs` command: one table of commands, shared options, exit codes.
 
-Exit codes are those of `drgs_blender.errors` (0 done, 64 usage, 65 bad asset, 69 something missing, 70 internal,
+Exit codes are those of `drgs_blender.core.errors` (0 done, 64 usage, 65 bad asset, 69 something missing, 70 internal,
 73 cannot write, 75 may work when repeated, 78 version mismatch), 130 and 143 when interrupted or terminated.
 """
 
@@ -18,8 +18,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NoReturn
 
-from .. import errors
-from ..version import __version__
+from ..core import errors
+from ..core.version import __version__
 from .frame_lines import say, say_end
 
 logger = logging.getLogger(__name__)

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ..asset import Asset
-from ..errors import UsageError, WriteError
+from ..core.asset import Asset
+from ..core.errors import UsageError, WriteError
 
 
 def check_suffix(path: Path, suffixes: tuple[str, ...]) -> None:
@@ -44,7 +44,7 @@ def check_writable(path: Path) -> None:
 
 def write_and_report(path: Path, asset: Asset) -> None:
     """Write an asset and say on stdout what it holds, and what its maker noted."""
-    from ..asset.container import write_asset
+    from ..core.asset.container import write_asset
 
     write_asset(path, asset)
     print(f"{path}: {len(asset.surfels)} surfels on {len(asset.mesh.faces)} triangles")
@@ -72,7 +72,7 @@ def write_preview(path: Path, combined: np.ndarray) -> None:
     combined : (h, w, 4) float32, linear Rec.709, premultiplied alpha; written as 8-bit sRGB, straight alpha, clipped
         to [0, 1]. Nothing else is done to it: view transforms belong to Blender.
     """
-    from ..colour import linear_to_srgb
+    from ..core.color import linear_to_srgb
     from ..formats.images import write_png
 
     alpha = np.clip(np.nan_to_num(combined[..., 3:4]), 0, 1)

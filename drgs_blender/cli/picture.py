@@ -9,16 +9,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..engine import blur
-from ..engine.protocol import Passes
-from ..errors import Cancelled, EngineError
-from ..frame import Frame, RenderSettings
-from ..phases import is_preparing
+from ..core.errors import Cancelled, EngineError
+from ..core.frame import Frame, RenderSettings
+from ..core.phases import is_preparing
+from ..ipc import blur
+from ..ipc.protocol import Passes
 from . import frame_store
 from .blender_process import Evaluated
 
 if TYPE_CHECKING:
-    from ..engine.client import EngineClient, OnProgress
+    from ..ipc.client import EngineClient, OnProgress
 
 
 class Picture:

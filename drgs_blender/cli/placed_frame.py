@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..frame import Frame, split_rays
+from ..core.frame import Frame, split_rays
 
 if TYPE_CHECKING:
     from ..engine.session import Session
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 def surface_frame(path: Path, rays: int, session: Session) -> Frame:
     """Frame whose surfaces get `rays` samples of light a point; `session` has its assets, for ``session.place``."""
-    from ..engine.frame_file import read_frame_file
+    from ..ipc.frame_file import read_frame_file
 
     frame = read_frame_file(path)
     cosine, ggx, environment = split_rays(rays)

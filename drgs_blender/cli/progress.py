@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterator
 from typing import Any
 
-from ..phases import is_counted, is_preparing
+from ..core.phases import is_counted, is_preparing
 from .frame_lines import say
 from .interrupt import interruptible
 

@@ -16,9 +16,9 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..filetypes import CAMERAS
+from ..core.file_types import CAMERAS
+from ..core.phases import is_preparing
 from ..formats.axes import UP_AXES
-from ..phases import is_preparing
 from .frame_lines import say
 from .interrupt import interruptible
 from .output import check_suffix, check_writable, write_and_report
@@ -26,7 +26,7 @@ from .progress import FractionBar
 from .sampling import whole
 
 if TYPE_CHECKING:
-    from ..reconstruct.job import Progress
+    from ..reconstruct.pipeline import Progress
 
 logger = logging.getLogger(__name__)
 
@@ -105,18 +105,18 @@ def run(args: argparse.Namespace) -> int:
     check_suffix(args.out, (".drgs",))
     check_writable(args.out)
 
-    from ..errors import Cancelled, DeviceError
+    from ..core.errors import Cancelled, DeviceError
 
     try:
-        from ..reconstruct.job import Settings, reconstruct
+        from ..reconstruct.pipeline import Settings, reconstruct
     except ImportError as error:
         if error.name != "torch":
             raise
         raise DeviceError(
             "reconstruct", "needs PyTorch", f'Install it: "{sys.executable}" -m pip install "torch>=2.5"'
         ) from error
+    from ..reconstruct.optim.train import Schedule
     from ..reconstruct.readers import read_capture
-    from ..reconstruct.train import Schedule
 
     capture = read_capture(args.capture, args.resolution, args.test_every, args.axes, args.up)
     logger.info("%d views to learn from, %d left out", len(capture.training), len(capture.testing))

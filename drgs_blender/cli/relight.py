@@ -17,12 +17,12 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from .. import mattes
-from ..asset import Asset
-from ..errors import UsageError
-from ..frame import Frame, ObjectState, RenderSettings, World
-from ..particle_cache import ParticleCache
-from ..sequence import frame_path
+from ..core import cryptomatte
+from ..core.asset import Asset
+from ..core.errors import UsageError
+from ..core.frame import Frame, ObjectState, RenderSettings, World
+from ..core.frame_sequences import frame_path
+from ..core.particle_cache import ParticleCache
 from . import sampling
 from .camera_file import read_camera
 from .frame_range import check_template, parse_frames
@@ -111,11 +111,11 @@ def run(args: argparse.Namespace) -> int:
         if path.suffix.lower() == ".png":
             write_preview(path, picture["Combined"])
         else:
-            from ..asset.container import digest_asset
-            from ..render.picture.frames import write_frame
+            from ..core.asset.container import digest_asset
+            from ..render.film.frame_files import write_frame
 
             about = {"asset": digest_asset(key), "seed": str(settings.seed)}
-            write_frame(path, picture, about | mattes.metadata(frame))
+            write_frame(path, picture, about | cryptomatte.metadata(frame))
     return 0
 
 

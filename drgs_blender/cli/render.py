@@ -20,9 +20,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..errors import AssetError, EngineError, UsageError
-from ..phases import is_preparing
-from ..sequence import frame_path
+from ..core.errors import AssetError, EngineError, UsageError
+from ..core.frame_sequences import frame_path
+from ..core.phases import is_preparing
 from . import sampling, session_link
 from .find_blender import find_blender
 from .frame_lines import FrameLines

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, get_args, get_type_hints
 
-from ..errors import UsageError
-from ..frame import Camera, RenderSettings, split_rays
-from ..passes import BY_NAME, PASSES, TEMPORAL
+from ..core.errors import UsageError
+from ..core.frame import Camera, RenderSettings, split_rays
+from ..core.passes import BY_NAME, PASSES, TEMPORAL
 
 #: Pixels times passes of one picture; 16k x 16k with one pass.
 MOST_PIXEL_PASSES = 1 << 28

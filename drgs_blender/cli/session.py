@@ -22,8 +22,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..asset.archive import replace_file
-from ..errors import EXIT_INTERRUPTED, EXIT_TERMINATED, EngineError, UsageError
+from ..core.asset.archive import replace_file
+from ..core.errors import EXIT_INTERRUPTED, EXIT_TERMINATED, EngineError, UsageError
 from . import sampling
 from .session_link import POLL_SECONDS, Lock, end, is_running, own_folder
 

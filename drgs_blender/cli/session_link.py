@@ -26,8 +26,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import IO
 
-from ..asset.archive import replace_file
-from ..errors import EngineError, UsageError, WriteError
+from ..core.asset.archive import replace_file
+from ..core.errors import EngineError, UsageError, WriteError
 from .frame_lines import HEARTBEAT_SECONDS, say
 
 logger = logging.getLogger(__name__)

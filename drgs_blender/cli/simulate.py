@@ -15,16 +15,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import UsageError
-from ..particle_cache import ParticleCache
-from ..sequence import frame_path
+from ..core.errors import UsageError
+from ..core.frame_sequences import frame_path
+from ..core.particle_cache import ParticleCache
 from .interrupt import interruptible
 from .output import check_suffix, check_writable
 from .progress import FractionBar, clock, prepare_engine
 from .sampling import whole
 
 if TYPE_CHECKING:
-    from ..simulate.settings import Settings
+    from ..simulation.settings import Settings
 
 logger = logging.getLogger(__name__)
 
@@ -100,10 +100,10 @@ def run(args: argparse.Namespace) -> int:
         check_writable(frame_path(args.vertices, 1))
     check_writable(args.out / "cache.json")
 
-    from ..asset.container import read_asset
     from ..compute.jit import use_threads
-    from ..simulate.bake import bake
-    from ..simulate.job import prepare
+    from ..core.asset.container import read_asset
+    from ..simulation.bake import bake
+    from ..simulation.job import prepare
 
     settings = _settings(args)
     use_threads(args.threads)
@@ -141,7 +141,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _settings(args: argparse.Namespace) -> Settings:
     """Settings of the file with those of the options."""
-    from ..simulate.settings import parse_settings
+    from ..simulation.settings import parse_settings
 
     data: dict[str, Any] = {}
     folder = Path()
@@ -174,7 +174,7 @@ def _settings(args: argparse.Namespace) -> Settings:
 
 def _write_others(args: argparse.Namespace, cache: ParticleCache, faces: np.ndarray, settings: Settings) -> None:
     """Poses as arrays and a file for other programs, from the cache."""
-    from ..asset.archive import replace_file
+    from ..core.asset.archive import replace_file
     from ..formats.point_cache import write_point_cache
     from ..formats.usd_points import SUFFIXES, write_usd_points
 

@@ -13,7 +13,7 @@ import logging
 import shlex
 from pathlib import Path
 
-from ..errors import AssetError, UsageError
+from ..core.errors import AssetError, UsageError
 from . import sampling
 from .farm import flamenco, openjd, slurm
 from .farm.job import Job

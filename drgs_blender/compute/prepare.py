@@ -19,8 +19,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..errors import EXIT_CANNOT_WRITE, EXIT_INTERRUPTED, Cancelled, DrgsError
-from ..phases import PREPARING
+from ..core.errors import EXIT_CANNOT_WRITE, EXIT_INTERRUPTED, Cancelled, DrgsError
+from ..core.phases import PREPARING
 from . import closure, manifest, shipped
 from .folders import cache_folder
 from .manifest import Kernel

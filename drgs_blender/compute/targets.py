@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from ..errors import DeviceError, UsageError
+from ..core.errors import DeviceError, UsageError
 
 VARIABLE = "DRGS_CPU_TARGET"
 

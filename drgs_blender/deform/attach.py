@@ -15,11 +15,11 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.spatial import cKDTree
 
-from ..asset.model import Binding, Mesh, Surfels
-from ..errors import AssetError
-from ..geometry import quaternions, unit
+from ..core.asset.model import Binding, Mesh, Surfels
+from ..core.errors import AssetError
+from ..geometry.normals import quaternions, unit
 from .binding import project
-from .faces import Faces
+from .face_frames import Faces
 
 Array = np.ndarray
 log = logging.getLogger(__name__)

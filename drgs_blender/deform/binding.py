@@ -12,10 +12,10 @@ import igl
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..asset.model import Binding, Mesh, Surfels
-from ..errors import AssetError
-from ..geometry import rotation_matrices
-from .faces import Faces, dot, shading_frames
+from ..core.asset.model import Binding, Mesh, Surfels
+from ..core.errors import AssetError
+from ..geometry.normals import rotation_matrices
+from .face_frames import Faces, dot, shading_frames
 
 Array = np.ndarray
 log = logging.getLogger(__name__)

@@ -22,8 +22,8 @@ from scipy.spatial import cKDTree
 
 from ..compute.jit import njit, prange
 from ..compute.simd import LANES, aligned, fold, lanes, load, quads, repeat, spread
-from ..errors import UsageError
-from ..volume import Volume, crosses_gap
+from ..core.errors import UsageError
+from ..geometry.occupancy import Volume, crosses_gap
 
 Array = np.ndarray
 log = logging.getLogger(__name__)

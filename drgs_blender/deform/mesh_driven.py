@@ -16,12 +16,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..asset.model import MATERIAL_CHANNELS, Binding, Mesh, PosedSurfels, Surfels
 from ..compute.jit import njit, prange
-from ..errors import AssetError
-from ..geometry import VertexNormals, rotation_matrices, unit
-from .faces import Faces
-from .spans import spans
+from ..core.asset.model import MATERIAL_CHANNELS, Binding, Mesh, PosedSurfels, Surfels
+from ..core.errors import AssetError
+from ..geometry.normals import VertexNormals, rotation_matrices, unit
+from .face_frames import Faces
+from .wide_support import spans
 
 Array = np.ndarray
 log = logging.getLogger(__name__)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..asset.model import Asset, PosedSurfels
 from ..compute.jit import njit, prange
-from ..errors import AssetError
-from ..volume import Volume
+from ..core.asset.model import Asset, PosedSurfels
+from ..core.errors import AssetError
+from ..geometry.occupancy import Volume
 from .gmls import bind_points, carry
 from .mesh_driven import MeshDriven
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..errors import AssetError
-from ..geometry import VertexNormals
+from ..core.errors import AssetError
+from ..geometry.normals import VertexNormals
 
 Array = np.ndarray
 

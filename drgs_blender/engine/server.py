@@ -20,15 +20,15 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import EXIT_INTERNAL, EXIT_OK, EXIT_VERSION, Cancelled, DeviceError, DrgsError
-from ..phases import PREPARING, STARTING, is_counted
-from ..version import __version__
-from . import protocol
-from .codec import CodecError, decode_frame
-from .limits import limit_memory, memory_wanted
-from .protocol import PROTOCOL, Link, ProtocolError
-from .shared import Region
-from .slots import HeldSlots
+from ..core.errors import EXIT_INTERNAL, EXIT_OK, EXIT_VERSION, Cancelled, DeviceError, DrgsError
+from ..core.phases import PREPARING, STARTING, is_counted
+from ..core.version import __version__
+from ..ipc import protocol
+from ..ipc.codec import CodecError, decode_frame
+from ..ipc.protocol import PROTOCOL, Link, ProtocolError
+from ..ipc.shared_memory import Region
+from ..ipc.slots import HeldSlots
+from .memory_limit import limit_memory, memory_wanted
 
 logger = logging.getLogger(__name__)
 
@@ -157,13 +157,13 @@ class Server:
     def _open_session(self) -> Any:
         if self.session is None:
             try:
-                from ..render.shade.brdf import layer_table
-                from . import compiling
+                from ..render.integrator.brdf import layer_table
+                from . import jit_events
                 from .session import Session
             except ImportError as error:
                 remedy = "Install DR-GS again in this environment"
                 raise DeviceError(sys.executable, f"lacks a part of the engine ({error})", remedy) from error
-            compiling.watch(self._note_preparing)
+            jit_events.watch(self._note_preparing)
             self.session = Session()
             threading.Thread(target=layer_table, name="drgs-table", daemon=True).start()  # while the first asset loads
         return self.session

@@ -13,22 +13,22 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..asset.model import Asset, PosedSurfels
 from ..compute.folders import cache_folder
 from ..compute.jit import use_threads
 from ..compute.prepare import prepare_kernels
-from ..errors import Cancelled, UsageError
-from ..frame import Frame, Light, ObjectState, RenderSettings
-from ..render.device.devices import Devices
+from ..core.asset.model import Asset, PosedSurfels
+from ..core.errors import Cancelled, UsageError
+from ..core.frame import Frame, Light, ObjectState, RenderSettings
+from ..ipc.change_detection import renewed
+from ..ipc.protocol import Passes
+from ..render.backend import HERE, Processor
+from ..render.gpu.select_backend import Devices
+from ..render.integrator.adaptive import part_count
 from ..render.pipeline import Progress, render
-from ..render.processor import HERE, Processor
-from ..render.shade.adaptive import part_count
-from ..render.trace.scene import TraceObject
-from .histories import Histories
-from .protocol import Passes
-from .snapshots import renewed
-from .stage import Stage
-from .view import Pace, Ready, View
+from ..render.scene.trace_scene import TraceObject
+from .denoise_history import Histories
+from .progressive_view import Pace, Ready, View
+from .scene_cache import Stage
 
 logger = logging.getLogger(__name__)
 

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from ..asset import Asset
+from ..core.asset import Asset
+from ..core.errors import UsageError, first_of
+from ..core.frame import Camera
 from ..deform.gmls import bind_points, carry
 from ..deform.sources import MeshSource
-from ..errors import UsageError, first_of
-from ..frame import Camera
-from ..reconstruct.capture import Capture, View
+from ..reconstruct.capture.capture import Capture, View
 from .flip import flip
 from .metrics import depth_error, material_scores, mean_psnr, normal_error, on_white, relight_scores, ssim
 from .truth import Truth, TruthSet

@@ -10,7 +10,7 @@ import math
 import numpy as np
 from scipy.ndimage import correlate1d
 
-from ..colour import srgb_to_linear
+from ..core.color import srgb_to_linear
 
 Array = np.ndarray
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import AssetError, DeviceError
+from ..core.errors import AssetError, DeviceError
 
 Array = np.ndarray
 

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..colour import linear_to_srgb
+from ..core.color import linear_to_srgb
 
 Array = np.ndarray
 

@@ -20,14 +20,14 @@ from typing import Any
 
 import numpy as np
 
-from ..asset import Environment
-from ..asset.archive import replace_file
-from ..colour import LUMINANCE, linear_to_srgb
-from ..errors import AssetError, DeviceError, EngineError, UsageError
+from ..core.asset import Environment
+from ..core.asset.archive import replace_file
+from ..core.color import LUMINANCE, linear_to_srgb
+from ..core.errors import AssetError, DeviceError, EngineError, UsageError
 from ..formats.exr import write_exr_environment
 from ..formats.images import write_png
 from ..formats.registry import read_environment
-from ..render.picture.frames import write_frame
+from ..render.film.frame_files import write_frame
 from .subjects import OBJECTS, make_subject
 
 Array = np.ndarray

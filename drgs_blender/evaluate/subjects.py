@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from ..build.make import mesh_with_materials, read_mesh_file
-from ..errors import UsageError
+from ..core.errors import UsageError
 from ..formats.files import Image, MaterialFile
 from ..formats.images import load_image
 

@@ -11,17 +11,17 @@ from typing import Any
 
 import numpy as np
 
-from ..asset import Asset, Mesh
-from ..colour import to_unit
+from ..core.asset import Asset, Mesh
+from ..core.color import to_unit
+from ..core.errors import AssetError
 from ..deform.attach import attach
-from ..errors import AssetError
 from ..formats.images import load_image
 from ..formats.registry import read_environment
-from ..reconstruct.capture import View
+from ..reconstruct.capture.capture import View
 from ..reconstruct.readers import read_capture
 from ..reconstruct.readers.develop import shrink
 from ..reconstruct.readers.layout import read_json
-from ..render.picture.frames import read_frame
+from ..render.film.frame_files import read_frame
 
 Array = np.ndarray
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from PIL import Image as Pillow
 
-from ..asset import Mesh
-from ..colour import linear_to_srgb
-from ..errors import AssetError, UsageError
+from ..core.asset import Mesh
+from ..core.color import linear_to_srgb
+from ..core.errors import AssetError, UsageError
 from .mesh import check_extent
 
 Array = np.ndarray

@@ -9,8 +9,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..asset import Surfels
-from ..errors import UsageError
+from ..core.asset import Surfels
+from ..core.errors import UsageError
 from .files import MeshFile
 from .harmonics import rotate_harmonics, whole_bands
 

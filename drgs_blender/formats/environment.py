@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..asset import Environment
-from ..colour import srgb_to_linear, to_unit
+from ..core.asset import Environment
+from ..core.color import srgb_to_linear, to_unit
 from .exr import read_exr
 from .files import EnvironmentFile
 from .hdr import read_hdr

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from ..asset import Environment
-from ..asset.archive import replace_by
 from ..compute.jit import get_num_threads
-from ..errors import AssetError
+from ..core.asset import Environment
+from ..core.asset.archive import replace_by
+from ..core.errors import AssetError
 
 Array = np.ndarray
 

@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from ..asset import Environment, Surfels
+from ..core.asset import Environment, Surfels
 
 Array = np.ndarray
 

@@ -14,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ..asset import Surfels
-from ..colour import srgb_to_linear
-from ..errors import AssetError
+from ..core.asset import Surfels
+from ..core.color import srgb_to_linear
+from ..core.errors import AssetError
 from .axes import FARTHEST, multiply_quaternions
 from .files import SurfelFile
 from .ply import Header, Rows, read_ply

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from ..asset.archive import replace_file
-from ..errors import UsageError
-from ..version import __version__
+from ..core.asset.archive import replace_file
+from ..core.errors import UsageError
+from ..core.version import __version__
 
 Array = np.ndarray
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import AssetError
+from ..core.errors import AssetError
 from .axes import vectors_to_z_up
 from .files import Image, MaterialFile, MeshFile
 from .gltf_document import Document

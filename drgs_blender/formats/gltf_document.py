@@ -16,7 +16,7 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from ..errors import AssetError
+from ..core.errors import AssetError
 
 Array = np.ndarray
 

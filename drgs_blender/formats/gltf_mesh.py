@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from ..asset import Mesh
-from ..geometry import VertexNormals
+from ..core.asset import Mesh
+from ..geometry.normals import VertexNormals
 from .atlas import Plain, mesh_material
 from .files import plain_name
 from .glb import Glb

@@ -15,8 +15,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..errors import AssetError
-from ..geometry import rotation_matrices
+from ..core.errors import AssetError
+from ..geometry.normals import rotation_matrices
 from .gltf_document import Document
 
 Array = np.ndarray

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ..colour import srgb_to_linear
-from ..errors import AssetError, UsageError
+from ..core.color import srgb_to_linear
+from ..core.errors import AssetError, UsageError
 from .files import SurfelFile, plain_name
 from .gaussian_ply import SH_C0
 from .glb import Glb

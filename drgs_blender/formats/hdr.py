@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ..compute.jit import njit
-from ..errors import AssetError
+from ..core.errors import AssetError
 
 Array = np.ndarray
 

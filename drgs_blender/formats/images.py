@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image as Pillow
 
-from ..asset.archive import replace_file
-from ..errors import AssetError
+from ..core.asset.archive import replace_file
+from ..core.errors import AssetError
 
 Array = np.ndarray
 

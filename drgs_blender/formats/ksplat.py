@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import AssetError
+from ..core.errors import AssetError
 from .files import SurfelFile
 from .packed_splats import dc_of, decode_arrays, log_scale
 

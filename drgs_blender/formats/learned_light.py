@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from ..asset import Environment
-from ..colour import srgb_to_linear
-from ..errors import AssetError, DeviceError
+from ..core.asset import Environment
+from ..core.color import srgb_to_linear
+from ..core.errors import AssetError, DeviceError
 from .files import EnvironmentFile
 from .latlong import directions, nvdiffrec_cube, sample_cube
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..colour import srgb_to_linear
-from ..errors import AssetError
+from ..core.color import srgb_to_linear
+from ..core.errors import AssetError
 from .files import MaterialsFile
 
 Array = np.ndarray

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..errors import AssetError, UsageError
+from ..core.errors import AssetError, UsageError
 from .files import MeshFile
 
 Array = np.ndarray

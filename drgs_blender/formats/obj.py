@@ -7,8 +7,8 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from ..colour import srgb_to_linear
-from ..errors import AssetError
+from ..core.color import srgb_to_linear
+from ..core.errors import AssetError
 from .files import Image, MaterialFile, MeshFile
 from .images import load_image
 

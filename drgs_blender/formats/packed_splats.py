@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import AssetError
+from ..core.errors import AssetError
 from .files import SurfelFile
 from .gaussian_ply import SH_C0, decode_splats
 from .ply import Element, Header, Property, Rows, read_ply

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ..compute.jit import njit
-from ..errors import AssetError
+from ..core.errors import AssetError
 
 Array = np.ndarray
 

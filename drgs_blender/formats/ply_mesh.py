@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ..colour import srgb_to_linear, to_unit
 from ..compute.jit import njit
-from ..errors import AssetError
+from ..core.color import srgb_to_linear, to_unit
+from ..core.errors import AssetError
 from .files import MeshFile
 from .gaussian_ply import stack
 from .ply import Rows, read_ply

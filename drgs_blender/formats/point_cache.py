@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..asset.archive import replace_file
-from ..errors import UsageError
+from ..core.asset.archive import replace_file
+from ..core.errors import UsageError
 
 Array = np.ndarray
 

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ..asset import Environment
-from ..errors import AssetError
-from ..filetypes import READ, Kind
+from ..core.asset import Environment
+from ..core.errors import AssetError
+from ..core.file_types import READ, Kind
 from .environment import read_exr_environment, read_hdr_environment, read_picture_environment
 from .files import EnvironmentFile, MaterialsFile, MeshFile, SurfelFile
 from .gaussian_ply import LAYOUTS, is_gaussian, read_gaussian_ply

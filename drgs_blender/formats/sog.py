@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import AssetError
+from ..core.errors import AssetError
 from .files import SurfelFile
 from .gaussian_ply import sigmoid
 from .gltf_document import is_name

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from PIL import Image as Pillow
 
-from ..asset.archive import replace_file
-from ..errors import UsageError
-from ..version import __version__
+from ..core.asset.archive import replace_file
+from ..core.errors import UsageError
+from ..core.version import __version__
 from .palette import codebook, palette
 from .quaternions import to_smallest_three
 from .splats import Splats, writable

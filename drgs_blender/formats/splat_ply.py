@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..asset.archive import replace_file
+from ..core.asset.archive import replace_file
 from .splats import Splats, writable
 
 Array = np.ndarray

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..colour import linear_to_srgb
+from ..core.color import linear_to_srgb
 from .axes import FARTHEST
 from .files import SurfelFile
 from .gaussian_ply import SH_C0

@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..asset import Surfels
-from ..colour import linear_to_srgb
-from ..errors import AssetError
+from ..core.asset import Surfels
+from ..core.color import linear_to_srgb
+from ..core.errors import AssetError
 from .axes import FARTHEST, from_z_up, multiply_quaternions, scaled_lengths, vectors_from_z_up
 from .gaussian_ply import SH_C0
 from .harmonics import rotate_harmonics, whole_bands

@@ -13,8 +13,8 @@ from types import ModuleType
 
 import numpy as np
 
-from ..asset.archive import replace_file
-from ..errors import AssetError, DeviceError
+from ..core.asset.archive import replace_file
+from ..core.errors import AssetError, DeviceError
 from .files import SurfelFile
 from .packed_splats import decode_arrays
 from .quaternions import from_smallest_three, to_smallest_three

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import AssetError
+from ..core.errors import AssetError
 
 _MAGIC = b"PXR-USDC"
 _SHORTEST = 88

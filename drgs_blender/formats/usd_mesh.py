@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ..asset import Mesh
-from ..asset.archive import replace_file
-from ..geometry import VertexNormals
-from ..version import __version__
+from ..core.asset import Mesh
+from ..core.asset.archive import replace_file
+from ..core.version import __version__
+from ..geometry.normals import VertexNormals
 from .atlas import Plain, Textured, mesh_material
 
 Array = np.ndarray

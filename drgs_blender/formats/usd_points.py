@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ..asset.archive import replace_by
-from ..errors import DeviceError, WriteError
-from ..particle_cache import ParticleFrame
+from ..core.asset.archive import replace_by
+from ..core.errors import DeviceError, WriteError
+from ..core.particle_cache import ParticleFrame
 
 Array = np.ndarray
 

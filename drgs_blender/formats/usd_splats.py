@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from ..asset.archive import replace_by
-from ..asset.tensors import decode
-from ..errors import AssetError, DeviceError, WriteError
+from ..core.asset.archive import replace_by
+from ..core.asset.tensors import decode
+from ..core.errors import AssetError, DeviceError, WriteError
 from . import usd_stage
 from .axes import UP_AXES
 from .files import SurfelFile

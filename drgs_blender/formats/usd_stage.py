@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from ..asset.archive import first_reason
-from ..asset.tensors import encode
-from ..errors import AssetError
+from ..core.asset.archive import first_reason
+from ..core.asset.tensors import encode
+from ..core.errors import AssetError
 
 Array = np.ndarray
 

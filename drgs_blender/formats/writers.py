@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..errors import UsageError
-from ..filetypes import WRITTEN, Held
+from ..core.errors import UsageError
+from ..core.file_types import WRITTEN, Held
 from .exr import write_exr_environment
 from .gltf_mesh import write_gltf_mesh
 from .gltf_splats import write_gltf_splats

@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import Array
-from ..asset.archive import replace_file
-from ..asset.tensors import decode, encode
-from ..errors import AssetError
-from ..version import __version__
-from .capture import Capture
+from ..core.arrays import Array
+from ..core.asset.archive import replace_file
+from ..core.asset.tensors import decode, encode
+from ..core.errors import AssetError
+from ..core.version import __version__
+from .capture.capture import Capture
 
 log = logging.getLogger(__name__)
 

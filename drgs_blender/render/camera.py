@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from ..compute.jit import njit
-from ..errors import UsageError
-from ..frame import Camera, RenderSettings
+from ..core.errors import UsageError
+from ..core.frame import Camera, RenderSettings
 from .sampling import GOLDEN, mix
 
 Array = np.ndarray

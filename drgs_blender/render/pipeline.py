@@ -11,30 +11,30 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..asset.model import PosedSurfels
 from ..compute.jit import use_threads
-from ..errors import Cancelled, UsageError
-from ..frame import Frame
-from ..mattes import KINDS
-from ..passes import BY_NAME
+from ..core.asset.model import PosedSurfels
+from ..core.cryptomatte import KINDS
+from ..core.errors import Cancelled, UsageError
+from ..core.frame import Frame
+from ..core.passes import BY_NAME
+from .backend import HERE, Processor
 from .camera import camera_parameters
-from .lights.lamps import Lamps
-from .lights.light import EnvironmentLight
-from .picture.cryptomatte import CryptoFilm
-from .picture.film import COMPONENTS, Film
-from .picture.motion import Instant, MotionFilm, vector_pass
-from .picture.oidn import denoise_oidn, require
-from .picture.temporal import History, Shot
+from .denoise.oidn import denoise_oidn, require
+from .denoise.svgf_temporal import History, Shot
+from .film.cryptomatte import CryptoFilm
+from .film.film import COMPONENTS, Film
+from .film.motion_vectors import Instant, MotionFilm, vector_pass
+from .gbuffer.gbuffer import GBuffer
+from .gbuffer.mesh import primary_mesh
+from .gbuffer.surfels import primary_surfels, snap_windows
+from .gbuffer.visible_lights import seen_lamps
+from .integrator.adaptive import part_count, sample_adaptively
+from .lights.environment import EnvironmentLight
+from .lights.lights import Lamps
 from .points import Radiance, ShadingPoints
-from .primary.gbuffer import GBuffer
-from .primary.primary_mesh import primary_mesh
-from .primary.primary_surfels import primary_surfels, snap_windows
-from .primary.seen_lamps import seen_lamps
-from .processor import HERE, Processor
-from .shade.adaptive import part_count, sample_adaptively
+from .scene.trace_scene import TraceScene
 from .surfels.splats import Splats
 from .surfels.surfel_bvh import SurfelBVH
-from .trace.scene import TraceScene
 
 Array = np.ndarray
 Progress = Callable[[float, str], None]

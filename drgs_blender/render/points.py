@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, fields
 
 import numpy as np
 
-from ..asset.model import as_float
+from ..core.asset.model import as_float
 
 Array = np.ndarray
 

@@ -14,23 +14,23 @@ from typing import Any
 
 import numpy as np
 
-from ..asset.model import PosedSurfels
 from ..compute.jit import njit, use_threads
-from ..errors import Cancelled
-from ..frame import Camera, Frame, RenderSettings
+from ..core.asset.model import PosedSurfels
+from ..core.errors import Cancelled
+from ..core.frame import Camera, Frame, RenderSettings
+from .backend import HERE, Processor
 from .camera import camera_parameters
-from .lights.lamps import Lamps
-from .lights.light import EnvironmentLight
-from .picture.film import Film
+from .film.film import Film
+from .gbuffer.gbuffer import GBuffer
+from .gbuffer.visible_lights import seen_lamps
+from .integrator.adaptive import Sampling, part_count
+from .integrator.variance import variances
+from .lights.environment import EnvironmentLight
+from .lights.lights import Lamps
 from .pipeline import Batches, Primary, check_frame, denoised, strip_height
 from .points import Radiance, ShadingPoints
-from .primary.gbuffer import GBuffer
-from .primary.seen_lamps import seen_lamps
-from .processor import HERE, Processor
-from .shade.adaptive import Sampling, part_count
-from .shade.spread import variances
+from .scene.trace_scene import TraceScene
 from .surfels.surfel_bvh import SurfelBVH
-from .trace.scene import TraceScene
 
 Array = np.ndarray
 

@@ -12,8 +12,8 @@ import math
 
 import numpy as np
 
-from ..colour import LUMINANCE
 from ..compute.jit import inlined
+from ..core.color import LUMINANCE
 
 Array = np.ndarray
 

@@ -107,8 +107,8 @@ def export():
 def captured(monkeypatch):
     """F12 without the engine: list of the frames that it was asked for; the pictures are grey."""
     frames: list = []
-    link, protocol = part("addon.engine_link"), part("drgs_blender.engine.protocol")
-    table = part("drgs_blender.passes").BY_NAME
+    link, protocol = part("addon.engine_link"), part("drgs_blender.ipc.protocol")
+    table = part("drgs_blender.core.passes").BY_NAME
 
     def render(frame, on_progress=None, cancelled=None):
         frames.append(frame)

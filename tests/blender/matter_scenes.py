@@ -10,7 +10,7 @@ import numpy as np
 from scenes import mesh_object, part
 
 work, describe, capture = (part(f"addon.matter.{name}") for name in ("work", "describe", "capture"))
-particle_cache = part("drgs_blender.particle_cache")
+particle_cache = part("drgs_blender.core.particle_cache")
 FRAMES = 6
 #: Seconds after which something hangs, also where kernels are compiled and the machine has other work.
 PATIENCE = 1800

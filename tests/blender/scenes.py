@@ -39,7 +39,7 @@ def sphere(rings: int = 8, segments: int = 12) -> tuple[np.ndarray, np.ndarray]:
 
 def asset_of(vertices: np.ndarray, faces: np.ndarray, environment: np.ndarray | None = None):
     """An asset with one flat surfel on every face and materials that vary over the mesh."""
-    model = part("drgs_blender.asset")
+    model = part("drgs_blender.core.asset")
     n, m = len(vertices), len(faces)
     unit = np.linspace(0, 1, n, dtype=np.float32)
     mesh = model.Mesh(
@@ -73,7 +73,7 @@ def asset_of(vertices: np.ndarray, faces: np.ndarray, environment: np.ndarray | 
 def write_ball(path: Path, environment: np.ndarray | None = None) -> Path:
     """Write the sphere as an asset."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    part("drgs_blender.asset.container").write_asset(path, asset_of(*sphere(), environment))
+    part("drgs_blender.core.asset.container").write_asset(path, asset_of(*sphere(), environment))
     return path
 
 

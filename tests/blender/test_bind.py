@@ -113,7 +113,7 @@ def test_finer_target_follows_the_coarse_source_between_its_vertices(scene, rig,
     i = (np.arange(8)[:, None] * 9 + np.arange(8)).ravel()
     faces = np.concatenate((np.stack((i, i + 1, i + 10), 1), np.stack((i, i + 10, i + 9), 1))).astype(np.int32)
     path = tmp_path / "plane.drgs"
-    part("drgs_blender.asset.container").write_asset(path, asset_of(fine, faces))
+    part("drgs_blender.core.asset.container").write_asset(path, asset_of(fine, faces))
     bpy.ops.import_scene.drgs(filepath=str(path))
     target = bpy.context.active_object
     bind(target, source)
@@ -138,7 +138,7 @@ def test_parts_parented_to_bones_move_with_their_bone(scene, rig, tmp_path):
     joined = np.vstack((upper, lower))
     path = tmp_path / "pair.drgs"
     asset = asset_of(joined, np.vstack((faces, faces + len(upper))).astype(np.int32))
-    part("drgs_blender.asset.container").write_asset(path, asset)
+    part("drgs_blender.core.asset.container").write_asset(path, asset)
     bpy.ops.import_scene.drgs(filepath=str(path))
     target = bpy.context.active_object
     bind(target, *sources)
@@ -250,7 +250,7 @@ def test_real_character_follows_its_skeleton(scene, tmp_path):
     rig.data.pose_position = "POSE"
     path = tmp_path / "robot.drgs"
     asset = asset_of(np.vstack(vertices), np.array(faces, np.int32))
-    part("drgs_blender.asset.container").write_asset(path, asset)
+    part("drgs_blender.core.asset.container").write_asset(path, asset)
     bpy.ops.import_scene.drgs(filepath=str(path))
     target = bpy.context.active_object
     bind(target, *sources)

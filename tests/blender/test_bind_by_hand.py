@@ -57,7 +57,7 @@ def test_torn_parts_that_heat_does_not_reach_follow_the_nearest_bone(scene, tmp_
     vertices, faces = sphere()
     loose = vertices[faces].reshape(-1, 3), np.arange(3 * len(faces), dtype=np.int32).reshape(-1, 3)
     path = tmp_path / "torn.drgs"
-    part("drgs_blender.asset.container").write_asset(path, asset_of(*loose))
+    part("drgs_blender.core.asset.container").write_asset(path, asset_of(*loose))
     bpy.ops.import_scene.drgs(filepath=str(path))
     torn = bpy.context.active_object
     rest = world_vertices(torn)

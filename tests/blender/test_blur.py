@@ -11,7 +11,7 @@ from test_composed import CUBE, SIDES, painted
 pytestmark = pytest.mark.blender_api
 
 WIDTH, HEIGHT = 64, 48
-blur = part("drgs_blender.engine.blur")
+blur = part("drgs_blender.ipc.blur")
 
 
 @pytest.fixture

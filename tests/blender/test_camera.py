@@ -118,14 +118,14 @@ def test_every_pixel_of_a_cycles_picture_of_positions_projects_to_itself(scene, 
 
 def test_panoramic_camera_is_refused_with_a_remedy(scene):
     scene.camera.data.type = "PANO"
-    with pytest.raises(part("drgs_blender.errors").UsageError, match=r'"Camera".*Perspective or Orthographic'):
+    with pytest.raises(part("drgs_blender.core.errors").UsageError, match=r'"Camera".*Perspective or Orthographic'):
         exported(scene)
 
 
 def test_empty_region_is_refused(scene):
     scene.render.use_border = True
     scene.render.border_min_x = scene.render.border_max_x = 0.5
-    with pytest.raises(part("drgs_blender.errors").UsageError, match="Render Region"):
+    with pytest.raises(part("drgs_blender.core.errors").UsageError, match="Render Region"):
         exported(scene)
 
 
@@ -136,7 +136,9 @@ def test_object_that_is_no_camera_is_named(scene, export, kind):
     scene.collection.objects.link(empty)
     scene.camera = mesh if kind == "MESH" else empty
     name = scene.camera.name
-    with pytest.raises(part("drgs_blender.errors").UsageError, match=rf'"{name}".*{kind.capitalize()}.*Scene > Camera'):
+    with pytest.raises(
+        part("drgs_blender.core.errors").UsageError, match=rf'"{name}".*{kind.capitalize()}.*Scene > Camera'
+    ):
         export()
 
 
@@ -144,12 +146,14 @@ def test_orthographic_scale_of_zero_is_refused(scene, export):
     scene.camera.data.type, scene.camera.data.ortho_scale = "ORTHO", 0
     if scene.camera.data.ortho_scale > 0:
         pytest.skip("this Blender does not allow it")
-    with pytest.raises(part("drgs_blender.errors").UsageError, match=r'"Camera".*Orthographic Scale of 0'):
+    with pytest.raises(part("drgs_blender.core.errors").UsageError, match=r'"Camera".*Orthographic Scale of 0'):
         export()
 
 
 @pytest.mark.parametrize("scale", [(0, 0, 0), (1, 0, 1), (float("nan"), 1, 1), (float("inf"), 1, 1)])
 def test_camera_without_a_direction_is_named(scene, export, scale):
     scene.camera.scale = scale
-    with pytest.raises(part("drgs_blender.errors").UsageError, match=r'Camera "Camera".*scale of 0 or.*not finite'):
+    with pytest.raises(
+        part("drgs_blender.core.errors").UsageError, match=r'Camera "Camera".*scale of 0 or.*not finite'
+    ):
         export()

@@ -96,7 +96,7 @@ def test_strips_are_the_whole_picture(with_gpu, size, rows):
 def test_a_redraw_uploads_a_strip_and_the_picture_changes_when_all_are_there(with_gpu, monkeypatch):
     """What arrives is finished even when newer pictures wait; then the newest is next."""
     views, request = part("addon.viewport.views"), object()
-    Picture, Passes = part("addon.viewport.worker").Picture, part("drgs_blender.engine.protocol").Passes
+    Picture, Passes = part("addon.viewport.worker").Picture, part("drgs_blender.ipc.protocol").Passes
     monkeypatch.setattr(views, "STRIP_PIXELS", 10 * SIZE)
 
     def picture(value):

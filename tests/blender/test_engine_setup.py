@@ -17,7 +17,7 @@ from scenes import PACKAGE, part
 setup = part("addon.engine_setup")
 job = part("addon.setup_job")
 requirements = setup.requirements
-errors = part("drgs_blender.errors")
+errors = part("drgs_blender.core.errors")
 
 DOCTOR = "import {0}\nprint('DR-GS can render here.')\n"
 #: Compiles nothing, and says what `drgs_blender.compute.prepare` says.
@@ -29,7 +29,7 @@ for i in range(4):
     time.sleep(0.1)
 print("The engine is ready", flush=True)
 """
-PREPARING = part("drgs_blender.phases").PREPARING
+PREPARING = part("drgs_blender.core.phases").PREPARING
 
 
 def wheel(folder: Path, name: str) -> str:

@@ -33,7 +33,7 @@ def attribute(obj, name: str) -> np.ndarray:
 
 def centres(path: Path) -> np.ndarray:
     """Where the splats of an asset are."""
-    return np.array(part("drgs_blender.asset.container").read_asset(path).surfels.centre)
+    return np.array(part("drgs_blender.core.asset.container").read_asset(path).surfels.centre)
 
 
 def test_splats_stand_in_the_file_as_in_the_scene(ball, ball_file, scene, tmp_path):
@@ -77,7 +77,7 @@ def test_splats_in_gltf_are_coloured_points_to_who_knows_no_splats(ball, ball_fi
     out = tmp_path / "ball.glb"
     assert bpy.ops.drgs.export(filepath=str(out), format="glTF splats", colour="albedo") == {"FINISHED"}
     found = imported(bpy.ops.import_scene.gltf, out)
-    wanted = part("drgs_blender.asset.container").read_asset(ball_file).surfels
+    wanted = part("drgs_blender.core.asset.container").read_asset(ball_file).surfels
     np.testing.assert_allclose(world_points(found), wanted.centre + np.float32((1, -2, 3)), atol=1e-5)
     if bpy.app.version < (5, 0):
         return  # the importer of 4.2 leaves out the colours of vertices without faces
@@ -175,7 +175,7 @@ def test_the_dialogs_show_what_goes_with_the_format(ball, scene):
         assert wanted <= set(shown) and not unwanted & set(shown)
         stand_in.filepath = "/tmp/a.ply"
         operator.check(stand_in, bpy.context)
-        ends = part("drgs_blender.filetypes").WRITTEN[format_].extensions
+        ends = part("drgs_blender.core.file_types").WRITTEN[format_].extensions
         assert Path(stand_in.filepath).suffix in ends
 
 

@@ -13,7 +13,7 @@ from scenes import armature_object, mesh_object, part, sphere
 
 pytestmark = pytest.mark.blender_api
 
-errors = part("drgs_blender.errors")
+errors = part("drgs_blender.core.errors")
 
 
 def test_object_is_described_with_world_matrix_and_vertices(ball, export):
@@ -51,7 +51,7 @@ def test_what_the_picture_will_lack_is_said(ball, scene, export):
 
 
 def test_visibility_of_objects_is_blenders(ball, scene, export):
-    assert export()[0].objects[0].visibility == part("drgs_blender.frame").Visibility()
+    assert export()[0].objects[0].visibility == part("drgs_blender.core.frame").Visibility()
     ball.visible_camera = ball.visible_glossy = ball.visible_shadow = False
     ball.is_holdout = ball.is_shadow_catcher = True
     rays = export()[0].objects[0].visibility
@@ -278,7 +278,7 @@ def test_missing_asset_is_named(ball, ball_file, export):
 
 def test_replaced_asset_file_is_read_again(ball, ball_file, export):
     export()
-    container = part("drgs_blender.asset.container")
+    container = part("drgs_blender.core.asset.container")
     asset = container.read_asset(ball_file)
     asset.mesh.roughness = np.zeros_like(asset.mesh.roughness)
     container.write_asset(ball_file, asset)
@@ -315,8 +315,8 @@ def test_settings_and_passes_reach_the_frame(ball, scene, captured):
 
 def test_settings_offer_what_the_engine_knows():
     """The menus of the panel and the choices of the frame description are the same."""
-    hints = typing.get_type_hints(part("drgs_blender.frame").RenderSettings)
-    defaults = part("drgs_blender.frame").RenderSettings()
+    hints = typing.get_type_hints(part("drgs_blender.core.frame").RenderSettings)
+    defaults = part("drgs_blender.core.frame").RenderSettings()
     properties = part("addon.properties").DrgsSceneSettings.bl_rna.properties
     for name in ("primary", "tracer", "denoise", "look"):
         assert {i.identifier for i in properties[name].enum_items} == set(typing.get_args(hints[name])), name

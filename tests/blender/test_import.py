@@ -19,7 +19,7 @@ def channel(mesh, name):
 
 
 def test_mesh_is_the_assets_in_order_with_its_materials(ball, ball_file):
-    asset = part("drgs_blender.asset.container").read_asset(ball_file)
+    asset = part("drgs_blender.core.asset.container").read_asset(ball_file)
     arrays = part("addon.mesh_arrays")
     np.testing.assert_array_equal(arrays.read_vertices(ball.data), asset.mesh.vertices)
     np.testing.assert_array_equal(arrays.read_triangles(ball.data), asset.mesh.faces)
@@ -39,7 +39,7 @@ def test_path_is_relative_and_known_to_blenders_path_tools(ball, ball_file, tmp_
     moved = tmp_path / "elsewhere"
     moved.mkdir()
     shutil.move(ball_file, moved / "ball.drgs")
-    with pytest.raises(part("drgs_blender.errors").AssetError, match=r'"ball".*Find Missing Files'):
+    with pytest.raises(part("drgs_blender.core.errors").AssetError, match=r'"ball".*Find Missing Files'):
         part("addon.assets").file_of(ball)
     bpy.ops.file.find_missing_files(directory=str(moved))
     assert part("addon.assets").file_of(ball) == moved / "ball.drgs"
@@ -47,8 +47,10 @@ def test_path_is_relative_and_known_to_blenders_path_tools(ball, ball_file, tmp_
 
 def test_asset_without_a_mesh_is_rendered_by_its_surfels(scene, tmp_path):
     """The object has no vertices; it moves with its matrix."""
-    model, path = part("drgs_blender.asset"), tmp_path / "leaves.drgs"
-    part("drgs_blender.asset.container").write_asset(path, model.Asset(asset_of(*sphere()).surfels, model.Mesh.empty()))
+    model, path = part("drgs_blender.core.asset"), tmp_path / "leaves.drgs"
+    part("drgs_blender.core.asset.container").write_asset(
+        path, model.Asset(asset_of(*sphere()).surfels, model.Mesh.empty())
+    )
     bpy.ops.import_scene.drgs(filepath=str(path))
     leaves = bpy.context.active_object
     assert leaves.drgs.is_drgs and not len(leaves.data.vertices)
@@ -213,7 +215,7 @@ def test_a_file_that_a_program_is_writing_is_not_written_by_another(scene, tmp_p
     assets.announce([target, tmp_path / "dance_02.drgs"])
     assert assets.unused(target) == tmp_path / "toy.001.drgs"
     assert assets.unused(pattern, [1, 2]) == tmp_path / "dance.001_##.drgs" and assets.unused(pattern, [1]) == pattern
-    with pytest.raises(part("drgs_blender.errors").UsageError, match=r"toy\.drgs: is being written already"):
+    with pytest.raises(part("drgs_blender.core.errors").UsageError, match=r"toy\.drgs: is being written already"):
         assets.check_unused(target)
     assets.renounce([target, tmp_path / "dance_02.drgs"])
     assert assets.unused(target) == target and assets.unused(pattern, [1, 2]) == pattern

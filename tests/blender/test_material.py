@@ -263,12 +263,12 @@ def test_a_saved_asset_looks_as_the_edited_object(ball, export, tmp_path, ball_f
     adjustment(ball).tint, adjustment(ball).roughness_offset = (0.5, 1, 1), 0.1
     ball.location.x, ball.rotation_euler.z = 2, 1
     state, asset = export()[0].objects[0], part("addon.assets").load(ball_file)
-    expected = part("drgs_blender.adjust").edited_asset(
+    expected = part("drgs_blender.core.material_adjustments").edited_asset(
         asset, {name: getattr(state, name) for name in CHANNELS}, state.adjustment
     )
     path = tmp_path / "edited"
     assert bpy.ops.drgs.save_asset(filepath=str(path)) == {"FINISHED"}
-    saved = part("drgs_blender.asset.container").read_asset(path.with_suffix(".drgs"))
+    saved = part("drgs_blender.core.asset.container").read_asset(path.with_suffix(".drgs"))
     for name in CHANNELS:
         np.testing.assert_allclose(getattr(saved.mesh, name), getattr(expected.mesh, name), atol=1e-6)
         np.testing.assert_allclose(getattr(saved.surfels, name), getattr(expected.surfels, name), atol=1e-6)

@@ -698,7 +698,7 @@ def test_unchanged_images_are_not_read_again(scene, export, tmp_path):
     swatch(bpy.data.materials["Material"])
     first = export()[0].images[0].pixels
     assert export()[0].images[0].pixels is first
-    assert part("drgs_blender.arrays").frozen(first)
+    assert part("drgs_blender.core.arrays").frozen(first)
     loaded.pixels.foreach_set(np.tile(np.float32((0.5, 0.5, 0.5, 1)), 64))
     again = export()[0].images[0].pixels
     assert again is not first and np.unique(again[..., :3]).tolist() == [128]

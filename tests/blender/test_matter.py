@@ -120,7 +120,7 @@ def test_a_bake_is_stopped_at_once_and_goes_on(body, scene):
     again = work.Bake(body, scene)
     begin_of(again, found.frames + 1)
     again._program._process.stdin.close()
-    with pytest.raises(part("drgs_blender.errors").EngineError, match=r"Bake again: it goes on\. The first"):
+    with pytest.raises(part("drgs_blender.core.errors").EngineError, match=r"Bake again: it goes on\. The first"):
         while not again.step():
             time.sleep(0.01)
     again.close()

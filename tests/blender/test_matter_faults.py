@@ -11,7 +11,7 @@ import pytest
 from matter_scenes import begin_of, cache_of, computed_last, vertices, work
 from scenes import mesh_object, part, sphere
 
-errors = part("drgs_blender.errors")
+errors = part("drgs_blender.core.errors")
 
 
 def whole(cache) -> list[int]:

@@ -39,12 +39,12 @@ def test_mesh_is_described_in_object_space(scene, export):
     assert state.pass_indices.tolist() == [3]
     assert state.uvs is None and state.material_index is None
     assert [m.name for m in state.materials] == ["Default"]
-    assert state.visibility == part("drgs_blender.frame").Visibility()
+    assert state.visibility == part("drgs_blender.core.frame").Visibility()
 
 
 def test_arrays_can_be_kept_by_the_client(scene, export):
     """Frozen arrays of their own are compared by identity and never copied."""
-    frozen = part("drgs_blender.arrays").frozen
+    frozen = part("drgs_blender.core.arrays").frozen
     for faces in (QUADS, [q[:3] for q in QUADS]):  # triangulated, and triangles already
         obj = mesh_object("Shape", CUBE, faces)
         obj.data.uv_layers.new()

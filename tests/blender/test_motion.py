@@ -124,7 +124,7 @@ def test_only_passes_of_motion_cost_an_evaluation(moving, captured):
 
 def test_a_frame_is_the_same_whatever_was_rendered_before(moving, captured):
     """What the engine is told of frames 3 and 2 when they are rendered alone, and within an animation."""
-    encode = part("drgs_blender.engine.codec").encode_frame
+    encode = part("drgs_blender.ipc.codec").encode_frame
     for number in (3, 2):
         moving.frame_set(number)
         bpy.ops.render.render()
@@ -175,6 +175,6 @@ def test_one_switch_adds_what_temporal_denoising_needs(moving, captured):
     moving.drgs.use_temporal, moving.drgs.denoise = True, "svgf"
     moving.view_layers[0].use_pass_vector = False
     bpy.ops.render.render()
-    assert set(captured[0].passes) >= set(part("drgs_blender.passes").TEMPORAL)
+    assert set(captured[0].passes) >= set(part("drgs_blender.core.passes").TEMPORAL)
     assert captured[0].settings.denoise == "none"
     assert captured[0].previous is not None

@@ -17,7 +17,7 @@ import bpy
 import pytest
 from scenes import new_world, part
 
-phases = part("drgs_blender.phases")
+phases = part("drgs_blender.core.phases")
 link, engine, views = part("addon.engine_link"), part("addon.render_engine.engine"), part("addon.viewport.views")
 COUNTED = re.compile(re.escape(phases.PREPARING) + r", \d+ of \d+")
 #: A shared machine proves no more than that.
@@ -170,8 +170,8 @@ def test_the_set_up_counts_them_and_cancelled_there_the_engine_answers(tmp_path,
         for _ in range(100):  # killed, and a moment away from its end
             os.killpg(group, 0)
             time.sleep(0.05)
-    locate = part("drgs_blender.engine.locate").locate_engine
-    with part("drgs_blender.engine.client").EngineClient(locate(setup.interpreter(folder))) as client:
+    locate = part("drgs_blender.ipc.locate").locate_engine
+    with part("drgs_blender.ipc.client").EngineClient(locate(setup.interpreter(folder))) as client:
         client.start()
         assert client.pid
 

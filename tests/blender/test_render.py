@@ -16,13 +16,13 @@ from scenes import PACKAGE, ROOT, new_world, part, read_exr
 pytestmark = pytest.mark.blender_api
 
 link = part("addon.engine_link")
-errors = part("drgs_blender.errors")
+errors = part("drgs_blender.core.errors")
 
 #: Renders a frame description in the engine's own interpreter, without process boundary or Blender.
 SESSION = """
 import json, sys
 import numpy as np
-from drgs_blender.engine.codec import decode_frame
+from drgs_blender.ipc.codec import decode_frame
 from drgs_blender.engine.session import Session
 folder = sys.argv[1]
 session = Session()
@@ -79,7 +79,7 @@ def test_f12_writes_exactly_the_pixels_of_a_session(ball, scene, tmp_path, captu
     (frame,) = captured
     monkeypatch.undo()
     picture = render(scene)
-    description, arrays = part("drgs_blender.engine.codec").encode_frame(frame)
+    description, arrays = part("drgs_blender.ipc.codec").encode_frame(frame)
     (tmp_path / "frame.json").write_text(json.dumps(description))
     np.savez(tmp_path / "arrays.npz", **arrays)
     subprocess.run([os.environ["DRGS_ENGINE"], "-c", SESSION, str(tmp_path)], check=True, timeout=300, cwd=ROOT)
@@ -117,7 +117,7 @@ def test_border_renders_the_same_pixels_as_the_whole(ball, scene):
 def test_passes_of_the_table_reach_the_compositor(ball, scene, captured):
     """Every pass that can be switched on arrives in the render result under Blender's name."""
     layer = scene.view_layers[0]
-    table, names = part("drgs_blender.passes").PASSES, part("addon.passes")
+    table, names = part("drgs_blender.core.passes").PASSES, part("addon.passes")
     switch = part("addon.properties").switch_of
     for p in table:
         setattr(*((layer, p.blender) if p.blender else (layer.drgs, switch(p))), True)
@@ -142,7 +142,7 @@ def test_only_blenders_own_names_are_used_for_its_passes():
     """A compositor made for Cycles finds the same sockets."""
     scene = bpy.context.scene
     layer = scene.view_layers[0]
-    table = [p for p in part("drgs_blender.passes").PASSES if p.blender]
+    table = [p for p in part("drgs_blender.core.passes").PASSES if p.blender]
     for p in table:
         setattr(layer, p.blender, True)
     import importlib

@@ -219,7 +219,7 @@ def test_dropped_files_go_where_they_belong(tmp_path):
     (tmp_path / "a.glb").write_bytes(b'glTF{"asset":{}}')
     for name in ("cloud.glb", "cloud.gltf"):
         (tmp_path / name).write_bytes(b'glTF{"extensionsUsed":["KHR_gaussian_splatting"]}')
-    filetypes = part("drgs_blender.filetypes")
+    filetypes = part("drgs_blender.core.file_types")
     for end in filetypes.extensions("surfels"):  # what only splats have
         if end not in filetypes.extensions("mesh"):
             kinds[f"b{end}"] = "surfels"
@@ -229,7 +229,7 @@ def test_dropped_files_go_where_they_belong(tmp_path):
 def test_every_kind_of_file_can_be_dropped(scene):
     handlers = [c for m in part("operators").MODULES for c in m.CLASSES if issubclass(c, bpy.types.FileHandler)]
     caught = {end for handler in handlers for end in handler.bl_file_extensions.split(";")}
-    wanted = set(part("drgs_blender.filetypes").extensions("surfels", "mesh")) - {".json"}
+    wanted = set(part("drgs_blender.core.file_types").extensions("surfels", "mesh")) - {".json"}
     assert wanted | {".drgs", ".hdr", ".exr"} == caught
     for handler in handlers:
         assert not handler.poll_drop(bpy.context)  # there is no window here

@@ -352,7 +352,7 @@ def worker():
 def request(scene, x=0.0, size=(64, 48), rays=None):
     """What a viewport `x` to the side would ask for."""
     module, frame = part("addon.viewport.worker"), exported()
-    model = part("drgs_blender.frame")
+    model = part("drgs_blender.core.frame")
     matrix = np.array(scene.camera.matrix_world)
     matrix[0, 3] += x
     camera = model.Camera(matrix, *size, size[0], size[0], size[0] / 2, size[1] / 2)

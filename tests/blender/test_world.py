@@ -211,7 +211,7 @@ def test_light_that_is_no_number_is_refused_by_the_name_of_its_world(scene, expo
     _, background = new_world(scene)
     bad = float("nan")
     background.inputs[socket].default_value = bad if socket == "Strength" else (bad, 0, 0, 1)
-    with pytest.raises(part("drgs_blender.errors").UsageError, match=r'^World "World": .*not finite'):
+    with pytest.raises(part("drgs_blender.core.errors").UsageError, match=r'^World "World": .*not finite'):
         export()
 
 

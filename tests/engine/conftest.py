@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drgs_blender.asset.container import write_asset
-from drgs_blender.asset.model import Asset, Mesh
+from drgs_blender.core.asset.container import write_asset
+from drgs_blender.core.asset.model import Asset, Mesh
+from drgs_blender.core.frame import Camera, Frame, ObjectState, RenderSettings, World
 from drgs_blender.deform.attach import attach
-from drgs_blender.engine.client import EngineClient
 from drgs_blender.engine.session import Session
-from drgs_blender.frame import Camera, Frame, ObjectState, RenderSettings, World
+from drgs_blender.ipc.client import EngineClient
 
 ROOT = Path(__file__).resolve().parents[2]
 

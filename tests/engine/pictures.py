@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from drgs_blender.core.frame import Image, Material, MeshState, Texture
 from drgs_blender.engine.session import Session
-from drgs_blender.frame import Image, Material, MeshState, Texture
 
 
 def fresh(asset_path, frame):

@@ -9,16 +9,16 @@ import pytest
 
 pytest.importorskip("warp", reason="warp-lang is not installed")
 
+from drgs_blender.core.frame import Adjustment, ObjectState
 from drgs_blender.deform.mesh_driven import MeshDriven
-from drgs_blender.engine import compiling
+from drgs_blender.engine import jit_events
 from drgs_blender.engine.session import Session
-from drgs_blender.frame import Adjustment, ObjectState
 
 
 @pytest.fixture
 def warp_session(monkeypatch, asset_path):
     """A session for which Warp's processor is the card: the same code, without the card."""
-    monkeypatch.setattr("drgs_blender.render.device.devices.name_of", lambda device: "cpu")
+    monkeypatch.setattr("drgs_blender.render.gpu.select_backend.name_of", lambda device: "cpu")
     session = Session()
     session.load_asset(asset_path)
     return session
@@ -79,7 +79,7 @@ def test_viewports_grow_on_a_device(session, warp_session, make_frame):
 
 
 def test_without_a_card_a_frame_is_rendered_here_with_a_warning(session, make_frame, monkeypatch):
-    monkeypatch.setattr("drgs_blender.device.warp.cuda_devices", list)
+    monkeypatch.setattr("drgs_blender.compute.warp.runtime.cuda_devices", list)
     expected = session.render(make_frame())
     found = session.render(make_frame(device="cuda"))
     assert any("no NVIDIA card" in warning and "CPU" in warning for warning in found.warnings)
@@ -89,7 +89,7 @@ def test_without_a_card_a_frame_is_rendered_here_with_a_warning(session, make_fr
 def test_whoever_waits_is_told_that_kernels_are_made(warp_session, make_frame):
     """They take a minute, and an engine that says nothing for so long is taken for dead."""
     changes = []
-    compiling.watch(changes.append)
+    jit_events.watch(changes.append)
     warp_session.render(make_frame(device="cuda"))
     assert changes.count(1) == changes.count(-1) > 1 and changes[0] == 1
     changes.clear()

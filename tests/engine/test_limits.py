@@ -8,8 +8,8 @@ import sys
 import numpy as np
 import pytest
 
-from drgs_blender.engine.limits import memory_wanted
-from drgs_blender.errors import EXIT_RETRY, EngineError
+from drgs_blender.core.errors import EXIT_RETRY, EngineError
+from drgs_blender.engine.memory_limit import memory_wanted
 
 linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Linux alone has such a limit")
 
@@ -27,7 +27,7 @@ def test_option_wins_over_the_variable(monkeypatch):
 def test_allocations_beyond_the_limit_fail_and_others_do_not():
     program = """
 import numpy as np
-from drgs_blender.engine.limits import limit_memory
+from drgs_blender.engine.memory_limit import limit_memory
 assert limit_memory(400)
 np.ones(100 << 17)
 try:

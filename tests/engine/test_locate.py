@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from drgs_blender.engine import locate
-from drgs_blender.engine.locate import VARIABLE, locate_engine
-from drgs_blender.errors import DeviceError
+from drgs_blender.core.errors import DeviceError
+from drgs_blender.ipc import locate
+from drgs_blender.ipc.locate import VARIABLE, locate_engine
 
 
 @pytest.fixture

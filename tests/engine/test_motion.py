@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from pictures import assert_same_bits, fresh, with_meshes
 
-from drgs_blender.errors import Cancelled, UsageError
-from drgs_blender.frame import Moment, Pose
+from drgs_blender.core.errors import Cancelled, UsageError
+from drgs_blender.core.frame import Moment, Pose
 from drgs_blender.render.camera import camera_parameters
-from drgs_blender.render.picture.motion import project
+from drgs_blender.render.film.motion_vectors import project
 
 PASSES = ("Combined", "Vector", "Previous Position", "Position", "Coverage", "IndexOB", "Depth")
 

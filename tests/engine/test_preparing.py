@@ -8,14 +8,14 @@ import time
 import pytest
 from processes import all_gone, children
 
-from drgs_blender.errors import Cancelled
-from drgs_blender.phases import PREPARING, STARTING, is_counted, is_preparing
+from drgs_blender.core.errors import Cancelled
+from drgs_blender.core.phases import PREPARING, STARTING, is_counted, is_preparing
 
 #: An engine that counts kernels before its pictures, as if they were compiled elsewhere.
 COUNTED = f"""
 import time
 from drgs_blender.engine.session import Session
-from drgs_blender.errors import Cancelled
+from drgs_blender.core.errors import Cancelled
 original = Session.render
 
 def render(self, frame, progress=None, cancelled=None):

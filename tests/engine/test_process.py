@@ -12,12 +12,7 @@ import time
 import pytest
 from processes import all_gone, gone, open_files
 
-from drgs_blender.engine import protocol
-from drgs_blender.engine.child import clean_environment
-from drgs_blender.engine.client import EngineClient
-from drgs_blender.engine.codec import encode_frame
-from drgs_blender.engine.protocol import Link
-from drgs_blender.errors import (
+from drgs_blender.core.errors import (
     EXIT_INTERNAL,
     EXIT_RETRY,
     EXIT_VERSION,
@@ -26,7 +21,12 @@ from drgs_blender.errors import (
     EngineError,
     VersionError,
 )
-from drgs_blender.version import __version__
+from drgs_blender.core.version import __version__
+from drgs_blender.ipc import protocol
+from drgs_blender.ipc.child_process import clean_environment
+from drgs_blender.ipc.client import EngineClient
+from drgs_blender.ipc.codec import encode_frame
+from drgs_blender.ipc.protocol import Link
 
 from .conftest import ROOT, engine_program
 
@@ -62,7 +62,7 @@ def test_starts_quickly_and_ends_when_closed(make_client):
 
 
 def test_other_version_is_refused_at_once_and_both_are_named(make_client):
-    client = make_client("import drgs_blender.version as v; v.__version__ = '9.8.7'")
+    client = make_client("import drgs_blender.core.version as v; v.__version__ = '9.8.7'")
     start = time.monotonic()
     with pytest.raises(VersionError) as caught:
         client.start()
@@ -73,7 +73,7 @@ def test_other_version_is_refused_at_once_and_both_are_named(make_client):
 
 
 def test_other_protocol_is_refused(make_client):
-    client = make_client("import drgs_blender.engine.protocol as p; p.PROTOCOL = 99")
+    client = make_client("import drgs_blender.ipc.protocol as p; p.PROTOCOL = 99")
     with pytest.raises(VersionError, match="protocol 99"):
         client.start()
 
@@ -219,8 +219,8 @@ def test_engine_ends_with_its_killed_client_and_leaves_nothing(tmp_path, make_fr
     program = f"""
 import sys; sys.path.insert(0, {str(ROOT)!r})
 import json, numpy as np
-from drgs_blender.engine.client import EngineClient
-from drgs_blender.frame import *
+from drgs_blender.ipc.client import EngineClient
+from drgs_blender.core.frame import *
 client = EngineClient({engine_program()!r})
 key = client.load_asset({str(asset_path)!r})
 camera = Camera(np.eye(4), 400, 300, 400, 400, 200, 150)

@@ -10,12 +10,12 @@ import random
 import numpy as np
 import pytest
 
-from drgs_blender.engine import protocol
-from drgs_blender.engine.codec import CodecError, decode_frame, encode_frame
-from drgs_blender.engine.protocol import MAGIC, PREFIX, Link, ProtocolError
-from drgs_blender.engine.shared import Region
-from drgs_blender.engine.slots import HeldSlots, SentSlots
-from drgs_blender.frame import Camera, Frame, ObjectState, RenderSettings, World
+from drgs_blender.core.frame import Camera, Frame, ObjectState, RenderSettings, World
+from drgs_blender.ipc import protocol
+from drgs_blender.ipc.codec import CodecError, decode_frame, encode_frame
+from drgs_blender.ipc.protocol import MAGIC, PREFIX, Link, ProtocolError
+from drgs_blender.ipc.shared_memory import Region
+from drgs_blender.ipc.slots import HeldSlots, SentSlots
 
 
 def full_frame() -> Frame:

@@ -12,8 +12,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from drgs_blender.core.errors import AssetError, Cancelled, EngineError, UsageError
 from drgs_blender.engine.session import Session
-from drgs_blender.errors import AssetError, Cancelled, EngineError, UsageError
 
 posix = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 ENDLESS = {"size": (400, 300), "rays": 4096}

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from pictures import assert_same_bits, fresh, with_meshes
 
-from drgs_blender.asset.container import read_asset, write_asset
-from drgs_blender.asset.model import Asset, Mesh, Surfels
-from drgs_blender.engine.objects import traced_object
-from drgs_blender.engine.snapshots import renewed
-from drgs_blender.errors import AssetError, Cancelled, UsageError
-from drgs_blender.frame import Adjustment, Light, Material, MeshState, ObjectState, Visibility, World
+from drgs_blender.core.asset.container import read_asset, write_asset
+from drgs_blender.core.asset.model import Asset, Mesh, Surfels
+from drgs_blender.core.errors import AssetError, Cancelled, UsageError
+from drgs_blender.core.frame import Adjustment, Light, Material, MeshState, ObjectState, Visibility, World
+from drgs_blender.engine.scene_objects import traced_object
+from drgs_blender.ipc.change_detection import renewed
 
 
 def turned(degrees):

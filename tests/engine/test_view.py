@@ -11,10 +11,10 @@ import time
 import numpy as np
 import pytest
 
+from drgs_blender.core.errors import Cancelled
+from drgs_blender.core.frame import Light, ObjectState, Visibility
+from drgs_blender.engine.progressive_view import FIRST_SECONDS, Pace
 from drgs_blender.engine.session import Session
-from drgs_blender.engine.view import FIRST_SECONDS, Pace
-from drgs_blender.errors import Cancelled
-from drgs_blender.frame import Light, ObjectState, Visibility
 from drgs_blender.render import progressive
 from drgs_blender.render.progressive import coarse, parts_of, thinned
 
@@ -87,7 +87,7 @@ def test_last_picture_is_the_final_one(session, make_frame, settings):
 )
 def test_noise_threshold_stops_where_the_final_frame_does(session, make_frame, settings, monkeypatch):
     """To the last bit: a pixel that stopped elsewhere would differ visibly. It ends as soon as nobody needs more."""
-    monkeypatch.setattr("drgs_blender.engine.view.STEP_SECONDS", 0.0)
+    monkeypatch.setattr("drgs_blender.engine.progressive_view.STEP_SECONDS", 0.0)
     frame = lit(make_frame(0.2, noise_threshold=0.05, **settings))
     final = session.render(frame)
     found = pictures(session, frame)
@@ -109,7 +109,7 @@ def test_region_is_the_final_one_too(session, make_frame):
 
 def test_every_picture_is_as_bright_as_the_last(session, make_frame, monkeypatch):
     """Sub-pixel samples that have no light yet borrow it, so that no picture is darker, nor its edges."""
-    monkeypatch.setattr("drgs_blender.engine.view.STEP_SECONDS", 0.0)
+    monkeypatch.setattr("drgs_blender.engine.progressive_view.STEP_SECONDS", 0.0)
     found = pictures(session, make_frame(0.2, rays=64, aa=4))
     assert len(found) > 10
     mean = [p["Combined"].mean(axis=(0, 1)) for p in found]
@@ -119,7 +119,7 @@ def test_every_picture_is_as_bright_as_the_last(session, make_frame, monkeypatch
 
 
 def test_samples_kept_or_found_again_are_the_same(session, make_frame, monkeypatch):
-    monkeypatch.setattr("drgs_blender.engine.view.STEP_SECONDS", 0.0)
+    monkeypatch.setattr("drgs_blender.engine.progressive_view.STEP_SECONDS", 0.0)
     frame = lit(make_frame(0.2, rays=4))
     kept = pictures(session, frame)
     monkeypatch.setattr(progressive, "KEPT_BYTES", 0)
@@ -203,7 +203,7 @@ def test_coarse_pictures_are_like_the_last(session, make_frame, monkeypatch):
         return np.abs(first - final.reshape(144 // size, size, 192 // size, size, 4).mean(axis=(1, 3))).mean()
 
     of_mesh = {size: error(size) for size in (2, 4)}
-    monkeypatch.setattr("drgs_blender.engine.stage._SURFELS_A_VERTEX", 0)
+    monkeypatch.setattr("drgs_blender.engine.scene_cache._SURFELS_A_VERTEX", 0)
     of_surfels = {size: error(size) for size in (2, 4)}
     assert max(of_mesh.values()) < 0.1
     assert max(of_surfels.values()) < 0.1
@@ -294,7 +294,7 @@ def test_newer_frame_interrupts_within_tens_of_milliseconds(client, make_frame):
 
 
 def test_cancelled_step_leaves_the_view_as_it_was(session, make_frame, monkeypatch):
-    monkeypatch.setattr("drgs_blender.engine.view.STEP_SECONDS", 0.0)
+    monkeypatch.setattr("drgs_blender.engine.progressive_view.STEP_SECONDS", 0.0)
     frame = make_frame(0.2, rays=16)
     session.view("A", frame)
     before = session.refine("A").statistics["view.fraction"]

@@ -13,7 +13,7 @@ from blend_files import make_blend_files
 
 from drgs_blender.cli.find_blender import CHECKOUT
 from drgs_blender.cli.main import main
-from drgs_blender.render.picture.frames import read_frame
+from drgs_blender.render.film.frame_files import read_frame
 
 #: How a node of a test starts ``drgs``: this checkout, whatever else is installed.
 PROGRAM = ("" if os.name == "nt" else f"env PYTHONPATH={CHECKOUT} ") + f"{sys.executable} -m drgs_blender.cli.main"

@@ -17,7 +17,7 @@ import pytest
 from processes import all_gone, children
 
 from drgs_blender.cli.find_blender import CHECKOUT, find_blender
-from drgs_blender.render.picture.frames import read_frame
+from drgs_blender.render.film.frame_files import read_frame
 
 from .conftest import WHOLE
 

@@ -7,7 +7,7 @@ import subprocess
 import pytest
 
 from drgs_blender.cli.find_blender import find_blender
-from drgs_blender.engine import protocol
+from drgs_blender.ipc import protocol
 
 
 def check(drgs, folder, name, *options):

@@ -15,8 +15,8 @@ from pathlib import Path
 import pytest
 from processes import all_gone, children, listening
 
-from drgs_blender.asset.container import read_asset, write_asset
 from drgs_blender.cli.find_blender import CHECKOUT
+from drgs_blender.core.asset.container import read_asset, write_asset
 
 from .conftest import PROGRAM, WHOLE, same_pixels
 

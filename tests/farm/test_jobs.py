@@ -17,7 +17,7 @@ from drgs_blender.cli.farm import flamenco
 from drgs_blender.cli.farm.job import Job
 from drgs_blender.cli.frame_lines import FrameLines
 from drgs_blender.cli.frame_range import cut_frames, parse_frames, write_frames
-from drgs_blender.errors import UsageError
+from drgs_blender.core.errors import UsageError
 
 node = pytest.mark.skipif(not shutil.which("node"), reason="node runs the job type")
 

@@ -14,8 +14,8 @@ import pytest
 from processes import all_gone, children, listening
 
 from drgs_blender.cli import denoise, session, session_link
-from drgs_blender.errors import EngineError
-from drgs_blender.render.picture.frames import read_frame
+from drgs_blender.core.errors import EngineError
+from drgs_blender.render.film.frame_files import read_frame
 
 from .conftest import PROGRAM, same_pixels
 

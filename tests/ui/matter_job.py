@@ -19,7 +19,7 @@ PANEL = ("PROPERTIES", "WINDOW")
 
 def frames() -> list[int]:
     """How many frames there are of each object."""
-    cache, folder = part("drgs_blender.particle_cache").ParticleCache, part("addon.matter.describe").folder_of
+    cache, folder = part("drgs_blender.core.particle_cache").ParticleCache, part("addon.matter.describe").folder_of
     return [len(cache(folder(obj)).frames()) for obj in matter()]
 
 

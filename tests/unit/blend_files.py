@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drgs_blender.asset.container import write_asset
-from drgs_blender.asset.model import Asset, Mesh
 from drgs_blender.cli.find_blender import CHECKOUT, find_blender
+from drgs_blender.core.asset.container import write_asset
+from drgs_blender.core.asset.model import Asset, Mesh
+from drgs_blender.core.errors import DeviceError
 from drgs_blender.deform.attach import attach
-from drgs_blender.errors import DeviceError
 
 BUILD = """
 import importlib, os, runpy, sys, tempfile

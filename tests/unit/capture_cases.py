@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from drgs_blender.frame import Camera
-from drgs_blender.reconstruct.capture import Capture, View
+from drgs_blender.core.frame import Camera
+from drgs_blender.reconstruct.capture.capture import Capture, View
 
 #: Two balls that touch: centres and radii. Their crease is no silhouette from any side.
 BALLS = ((np.array([-0.35, 0.0, 0.1]), 0.5), (np.array([0.4, 0.1, -0.05]), 0.4))

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from drgs_blender.asset.model import PosedSurfels
+from drgs_blender.core.asset.model import PosedSurfels
 from drgs_blender.render.surfels.surfel_tracer import SurfelHits
 
 Array = np.ndarray

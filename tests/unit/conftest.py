@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 import pytest
 
 if TYPE_CHECKING:
-    from drgs_blender.render.device.on_device import OnDevice
+    from drgs_blender.render.gpu.warp_backend import OnDevice
 
 
 @pytest.fixture(scope="session")
 def _device() -> OnDevice:
     pytest.importorskip("warp", reason="warp-lang is not installed")
-    from drgs_blender.render.device.on_device import OnDevice
+    from drgs_blender.render.gpu.warp_backend import OnDevice
 
     return OnDevice("cpu")
 

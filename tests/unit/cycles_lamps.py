@@ -2,9 +2,9 @@
 
     .venv-blender/bin/python tests/unit/cycles_lamps.py JOB.json
 
-The job lists lights by the fields of drgs_blender.frame.Light. With ``look`` = [origin, direction], the result is the
-radiance of the light seen from there; without it, the irradiance at the origin on a plane that faces +Z, from a white
-diffuse plane under an orthographic camera. One RGB triple a light goes into JOB.result.json.
+The job lists lights by the fields of drgs_blender.core.frame.Light. With ``look`` = [origin, direction], the result is
+the radiance of the light seen from there; without it, the irradiance at the origin on a plane that faces +Z, from a
+white diffuse plane under an orthographic camera. One RGB triple per light goes into JOB.result.json.
 """
 
 from __future__ import annotations

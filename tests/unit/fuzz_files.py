@@ -33,13 +33,13 @@ from test_container import DATA_MEMBERS, make_asset, rewrite
 from test_formats_environment import encode_hdr, rgbe_pixels
 from test_formats_splats import ksplat
 
-from drgs_blender.asset import Environment, Mesh
-from drgs_blender.asset.archive import read_archive
-from drgs_blender.asset.container import MANIFEST, check_asset, read_asset, write_asset
-from drgs_blender.errors import DrgsError
+from drgs_blender.core.asset import Environment, Mesh
+from drgs_blender.core.asset.archive import read_archive
+from drgs_blender.core.asset.container import MANIFEST, check_asset, read_asset, write_asset
+from drgs_blender.core.errors import DrgsError
 from drgs_blender.formats.registry import read
 from drgs_blender.formats.writers import WRITERS
-from drgs_blender.render.picture.frames import read_frame, write_frame
+from drgs_blender.render.film.frame_files import read_frame, write_frame
 
 Parts = Mapping[str, bytes]
 

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from drgs_blender.matter import make_material, matter_of
-from drgs_blender.simulate.blocks import Domain
-from drgs_blender.simulate.solver import Body, Forces, Solver
+from drgs_blender.core.sim_materials import make_material, matter_of
+from drgs_blender.simulation.blocks import Domain
+from drgs_blender.simulation.solver import Body, Forces, Solver
 
 
 def lattice(size: tuple[float, float, float], spacing: float) -> np.ndarray:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from drgs_blender.asset.model import Mesh, PosedSurfels
-from drgs_blender.frame import Camera
-from drgs_blender.render.trace.scene import TraceObject, TraceScene
+from drgs_blender.core.asset.model import Mesh, PosedSurfels
+from drgs_blender.core.frame import Camera
+from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene
 
 
 def look_along_y(size: int = 48, distance: float = 4.0, focal: float = 70.0, **more: object) -> Camera:

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from drgs_blender.errors import AssetError
+from drgs_blender.core.errors import AssetError
 from drgs_blender.formats.registry import read_surfels
 from drgs_blender.formats.splats import Splats
-from drgs_blender.geometry import rotation_matrices
+from drgs_blender.geometry.normals import rotation_matrices
 
 
 def random_splats(n: int = 300, coefficients: int = 16, seed: int = 1) -> Splats:

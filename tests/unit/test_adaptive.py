@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drgs_blender.frame import RenderSettings, World
-from drgs_blender.render.lights.light import EnvironmentLight
+from drgs_blender.core.frame import RenderSettings, World
+from drgs_blender.render.integrator.adaptive import part_count, sample_adaptively
+from drgs_blender.render.integrator.integrate import integrate
+from drgs_blender.render.lights.environment import EnvironmentLight
 from drgs_blender.render.points import Radiance, ShadingPoints
-from drgs_blender.render.shade.adaptive import part_count, sample_adaptively
-from drgs_blender.render.shade.integrate import integrate
-from drgs_blender.render.trace.scene import TraceScene
+from drgs_blender.render.scene.trace_scene import TraceScene
 
 WIDTH = 40
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from shapes import sphere_mesh
 
-from drgs_blender.adjust import adjusted, edited_asset
-from drgs_blender.asset.model import Asset, Binding, Mesh, Surfels
+from drgs_blender.core.asset.model import Asset, Binding, Mesh, Surfels
+from drgs_blender.core.frame import Adjustment
+from drgs_blender.core.material_adjustments import adjusted, edited_asset
 from drgs_blender.deform.mesh_driven import MeshDriven
-from drgs_blender.frame import Adjustment
 
 
 @pytest.fixture

@@ -10,10 +10,10 @@ from test_cli_convert_frame import FACES, SQUARE, frame_of, plate
 
 from drgs_blender.build.bake import MARGIN, picture, texel_points
 from drgs_blender.cli.main import main
-from drgs_blender.engine.frame_file import write_frame_file
+from drgs_blender.core.frame import ObjectState, World
 from drgs_blender.formats.exr import read_exr
-from drgs_blender.frame import ObjectState, World
-from drgs_blender.render.trace.scene import TraceObject
+from drgs_blender.ipc.frame_file import write_frame_file
+from drgs_blender.render.scene.trace_scene import TraceObject
 
 #: The square in the left half of the image.
 UVS = (np.array([[0, 0], [0.5, 0], [0.5, 1], [0, 1]], np.float32))[FACES]

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drgs_blender.frame import RenderSettings
+from drgs_blender.core.frame import RenderSettings
 from drgs_blender.render import pipeline
+from drgs_blender.render.backend import Processor
 from drgs_blender.render.points import Radiance, ShadingPoints
-from drgs_blender.render.processor import Processor
 
 
 class Timed(Processor):

@@ -7,12 +7,12 @@ import pytest
 from test_integrate import points, settings
 from test_lamps import light
 
-from drgs_blender.frame import Image, Material, Texture, World
-from drgs_blender.render.lights.lamps import Lamps
-from drgs_blender.render.lights.light import EnvironmentLight
-from drgs_blender.render.shade.integrate import integrate
-from drgs_blender.render.trace.scene import TraceScene
-from drgs_blender.render.trace.textures import MaterialTable
+from drgs_blender.core.frame import Image, Material, Texture, World
+from drgs_blender.render.integrator.integrate import integrate
+from drgs_blender.render.lights.environment import EnvironmentLight
+from drgs_blender.render.lights.lights import Lamps
+from drgs_blender.render.scene.textures import MaterialTable
+from drgs_blender.render.scene.trace_scene import TraceScene
 
 BASES = (0.3, 0.6, 1.0, 1.6, 3.0)
 #: A Principled plane (GGX) seen from straight above, under a sun of strength 1 that is tilted by 0.3, in Cycles: by

@@ -7,19 +7,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drgs_blender.asset import Asset, Environment, Mesh, Surfels
-from drgs_blender.asset.container import read_asset
 from drgs_blender.build.delight import captured_along, remove_light
 from drgs_blender.build.relit import relit_colours
 from drgs_blender.cli.main import main
-from drgs_blender.colour import linear_to_srgb, srgb_to_linear
+from drgs_blender.core.asset import Asset, Environment, Mesh, Surfels
+from drgs_blender.core.asset.container import read_asset
+from drgs_blender.core.color import linear_to_srgb, srgb_to_linear
+from drgs_blender.core.errors import UsageError
+from drgs_blender.core.frame import RenderSettings, World
 from drgs_blender.deform.binding import bind
-from drgs_blender.errors import UsageError
 from drgs_blender.formats.exr import write_exr_environment
 from drgs_blender.formats.gaussian_ply import SH_C0
 from drgs_blender.formats.splat_ply import write_splat_ply
 from drgs_blender.formats.splats import splats_of
-from drgs_blender.frame import RenderSettings, World
 
 #: Floor (+Z) and wall (facing -X, at x = 1), n x n squares each.
 N = 12

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 import trimesh
 
-from drgs_blender.asset.model import Mesh, Surfels
 from drgs_blender.build.importer import import_asset
 from drgs_blender.build.proxy import mesh_from_surfels
 from drgs_blender.build.transfer import surfels_to_vertices, vertices_to_surfels
+from drgs_blender.core.asset.model import Mesh, Surfels
+from drgs_blender.core.errors import AssetError
 from drgs_blender.deform.attach import attach
 from drgs_blender.deform.binding import bind
 from drgs_blender.deform.mesh_driven import MeshDriven
-from drgs_blender.errors import AssetError
 from drgs_blender.formats.files import MaterialsFile, MeshFile, SurfelFile
-from drgs_blender.geometry import quaternions, rotation_matrices
+from drgs_blender.geometry.normals import quaternions, rotation_matrices
 
 
 def sphere_capture(n: int = 6000, seed: int = 0, keep=lambda p: np.ones(len(p), bool)) -> Surfels:

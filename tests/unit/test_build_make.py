@@ -9,7 +9,7 @@ import trimesh
 from drgs_blender.build.make import _Looked, _net, make_asset, mesh_with_materials
 from drgs_blender.build.texture import Materials, Pyramid
 from drgs_blender.build.topology import Net, close_marks, edge_lengths, edges, subdivide, survivors, weld
-from drgs_blender.errors import AssetError
+from drgs_blender.core.errors import AssetError
 from drgs_blender.formats.files import Image, MaterialFile, MeshFile
 
 

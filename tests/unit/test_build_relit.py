@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drgs_blender.asset import Asset, Mesh, Surfels
 from drgs_blender.build.relit import relit_colours
+from drgs_blender.core.asset import Asset, Mesh, Surfels
+from drgs_blender.core.errors import UsageError
+from drgs_blender.core.frame import RenderSettings, World
 from drgs_blender.deform.binding import bind
-from drgs_blender.errors import UsageError
-from drgs_blender.frame import RenderSettings, World
-from drgs_blender.render.lights.light import EnvironmentLight
+from drgs_blender.render.lights.environment import EnvironmentLight
 
 SETTINGS = RenderSettings(cosine=128, ggx=64, environment=64, aa=1, bounces=0, look="paper")
 

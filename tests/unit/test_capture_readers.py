@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from drgs_blender.errors import AssetError, UsageError
+from drgs_blender.core.errors import AssetError, UsageError
 from drgs_blender.reconstruct.readers import BYTES_A_PIXEL, read_capture
 from drgs_blender.reconstruct.readers.lens import MODELS, Lens, distort, lens_of, resample, undistorted
-from drgs_blender.reconstruct.readers.world import turn_upright
+from drgs_blender.reconstruct.readers.world_frame import turn_upright
 
 WRITERS = {
     "nerf": lambda scene: captures.write_nerf(scene),
@@ -614,7 +614,7 @@ def test_more_pixels_than_memory_are_refused_before_they_are_read(tmp_path):
 
 def test_the_memory_counted_for_a_pixel_is_what_learning_keeps_of_it(tmp_path, monkeypatch):
     """Masks before real surroundings take most: colour, mask, the colour cut out, and all in half size."""
-    targets = pytest.importorskip("drgs_blender.reconstruct.targets")
+    targets = pytest.importorskip("drgs_blender.reconstruct.capture.training_views")
     monkeypatch.setattr(targets, "KEPT", 0)  # blurred copies are kept of few pixels alone
     captures.write_nerfstudio(captures.make(tmp_path))
     capture = replace(read_capture(tmp_path), background=None)

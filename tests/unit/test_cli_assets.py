@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from drgs_blender.asset.container import read_asset
 from drgs_blender.cli import doctor
 from drgs_blender.cli.find_blender import find_blender
 from drgs_blender.cli.inspect_file import as_lines
 from drgs_blender.cli.main import main
-from drgs_blender.errors import DeviceError
+from drgs_blender.core.asset.container import read_asset
+from drgs_blender.core.errors import DeviceError
 from drgs_blender.formats.gltf import read_gltf
-from drgs_blender.render.picture.frames import write_frame
+from drgs_blender.render.film.frame_files import write_frame
 
 #: Unit cube, each face on the whole texture.
 CUBE = """mtllib cube.mtl

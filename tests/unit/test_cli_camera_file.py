@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from drgs_blender.cli.camera_file import read_camera
-from drgs_blender.errors import UsageError
+from drgs_blender.core.errors import UsageError
 
 GOOD = {"matrix_world": np.eye(4).tolist(), "width": 640, "height": 480, "fov_x": 90}
 

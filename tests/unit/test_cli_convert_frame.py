@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from splat_files import covariance, random_splats
 
-from drgs_blender.asset import Asset, Mesh, Surfels
-from drgs_blender.asset.container import write_asset
 from drgs_blender.cli.main import main
+from drgs_blender.core.asset import Asset, Mesh, Surfels
+from drgs_blender.core.asset.container import write_asset
+from drgs_blender.core.errors import AssetError, VersionError
+from drgs_blender.core.frame import Camera, Frame, Light, MeshState, ObjectState, RenderSettings, Visibility, World
 from drgs_blender.deform.binding import bind
-from drgs_blender.engine.frame_file import read_frame_file, write_frame_file
-from drgs_blender.errors import AssetError, VersionError
 from drgs_blender.formats.harmonics import rotate_harmonics
 from drgs_blender.formats.registry import read_environment, read_mesh, read_surfels
-from drgs_blender.frame import Camera, Frame, Light, MeshState, ObjectState, RenderSettings, Visibility, World
+from drgs_blender.ipc.frame_file import read_frame_file, write_frame_file
 
 SQUARE = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
 FACES = np.array([[0, 1, 2], [0, 2, 3]], np.int32)

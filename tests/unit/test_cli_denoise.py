@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 from shapes import sphere_mesh
 
-from drgs_blender.asset.container import write_asset
-from drgs_blender.asset.model import Asset, Mesh
 from drgs_blender.cli import frame_store
 from drgs_blender.cli.frame_lines import FrameLines
 from drgs_blender.cli.main import main
+from drgs_blender.core.asset.container import write_asset
+from drgs_blender.core.asset.model import Asset, Mesh
+from drgs_blender.core.frame import Camera, Frame, Moment, ObjectState, Pose, RenderSettings, World
+from drgs_blender.core.passes import TEMPORAL
 from drgs_blender.deform.attach import attach
 from drgs_blender.engine.session import Session
-from drgs_blender.frame import Camera, Frame, Moment, ObjectState, Pose, RenderSettings, World
-from drgs_blender.passes import TEMPORAL
-from drgs_blender.render.picture.frames import read_frame, write_frame
+from drgs_blender.render.film.frame_files import read_frame, write_frame
 
 FRAMES = 8
 #: From this frame on, another camera looks.
@@ -124,8 +124,8 @@ def test_neighbours_take_noise_away(denoise, rendered, tmp_path):
 
 def test_one_frame_alone_is_what_the_engine_denoises_alone(denoise, rendered, tmp_path):
     """What is on disk is all that the denoiser works on."""
-    from drgs_blender.render.picture.denoise import denoise as spatial
-    from drgs_blender.render.picture.shots import read_noisy
+    from drgs_blender.render.denoise.inputs import read_noisy
+    from drgs_blender.render.denoise.svgf_spatial import denoise as spatial
 
     denoise("4", "--window", "1")
     found, metadata = read_frame(tmp_path / "out" / "0004.exr")
@@ -236,7 +236,7 @@ def test_the_same_noise_in_every_frame_is_told(denoise, rendered, tmp_path):
 
 def test_frames_keep_the_cameras_to_the_bit(rendered):
     """The vectors that are made from a file are those of the engine."""
-    from drgs_blender.render.picture.shots import describe, read_noisy
+    from drgs_blender.render.denoise.inputs import describe, read_noisy
 
     noisy = read_noisy(rendered / "noisy" / "0003.exr")
     assert noisy.follows(read_noisy(rendered / "noisy" / "0002.exr"))

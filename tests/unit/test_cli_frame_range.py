@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from drgs_blender.cli.frame_range import MOST_FRAMES, check_template, parse_frames
-from drgs_blender.errors import UsageError
-from drgs_blender.sequence import frame_path
+from drgs_blender.core.errors import UsageError
+from drgs_blender.core.frame_sequences import frame_path
 
 
 @pytest.mark.parametrize(

@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 from test_container import make_asset
 
-from drgs_blender.asset.container import digest_asset, write_asset
-from drgs_blender.asset.model import Asset, Mesh
 from drgs_blender.cli import frame_store
 from drgs_blender.cli.blender_process import Evaluated
 from drgs_blender.cli.machine import Machine
 from drgs_blender.cli.main import build_parser
 from drgs_blender.cli.render import claim, layer_path, render
+from drgs_blender.core.asset.container import digest_asset, write_asset
+from drgs_blender.core.asset.model import Asset, Mesh
+from drgs_blender.core.errors import AssetError, EngineError, UsageError
+from drgs_blender.core.frame import Camera, Frame, ObjectState, RenderSettings, World
 from drgs_blender.deform.attach import attach
-from drgs_blender.errors import AssetError, EngineError, UsageError
-from drgs_blender.frame import Camera, Frame, ObjectState, RenderSettings, World
 
 
 def scene() -> Frame:

@@ -14,15 +14,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from drgs_blender import errors
 from drgs_blender.cli import main as command_line
 from drgs_blender.cli import sampling
 from drgs_blender.cli.find_blender import CHECKOUT, find_blender
 from drgs_blender.cli.frame_lines import FrameLines
 from drgs_blender.cli.main import COMMANDS, build_parser, main
 from drgs_blender.cli.output import check_writable, write_preview
-from drgs_blender.frame import RenderSettings
-from drgs_blender.passes import BY_NAME
+from drgs_blender.core import errors
+from drgs_blender.core.frame import RenderSettings
+from drgs_blender.core.passes import BY_NAME
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda c: c.name)
@@ -44,7 +44,7 @@ def test_help_tells_the_default_that_counts(capsys):
 
 @pytest.mark.parametrize("command", ["reconstruct", "evaluate"])
 def test_the_conventions_of_cameras_that_can_be_chosen_are_those_that_are_known(command, capsys):
-    from drgs_blender.reconstruct.readers.world import AXES
+    from drgs_blender.reconstruct.readers.world_frame import AXES
 
     assert main([command, "--help"]) == 0
     text = capsys.readouterr().out
@@ -278,7 +278,7 @@ sys.exit({function}())
     [
         "drgs_blender.cli.main",
         "argparse",
-        "drgs_blender.errors",
+        "drgs_blender.core.errors",
         "drgs_blender.cli.frame_lines",
         "drgs_blender.cli.sampling",
         "drgs_blender.cli.find_blender",

@@ -17,9 +17,9 @@ from drgs_blender.cli import picture as pictures
 from drgs_blender.cli import progress
 from drgs_blender.cli.frame_lines import FrameLines
 from drgs_blender.cli.progress import FractionBar
-from drgs_blender.engine.protocol import Passes
-from drgs_blender.errors import Cancelled, EngineError
-from drgs_blender.phases import PREPARING, is_counted, is_preparing
+from drgs_blender.core.errors import Cancelled, EngineError
+from drgs_blender.core.phases import PREPARING, is_counted, is_preparing
+from drgs_blender.ipc.protocol import Passes
 
 COUNTED = [(f"{PREPARING}, {i} of 4", i / 4) for i in range(1, 5)]
 

@@ -22,8 +22,8 @@ from capture_cases import balls, write
 
 from drgs_blender.cli.interrupt import interruptible
 from drgs_blender.cli.main import main
-from drgs_blender.errors import Cancelled
-from drgs_blender.phases import PREPARING
+from drgs_blender.core.errors import Cancelled
+from drgs_blender.core.phases import PREPARING
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="signals and terminals of POSIX")
 

@@ -12,13 +12,13 @@ import OpenEXR
 import pytest
 from PIL import Image
 
-from drgs_blender.asset.container import read_asset, write_asset
-from drgs_blender.asset.model import Asset, Environment, Mesh
 from drgs_blender.cli.main import main
+from drgs_blender.core.asset.container import read_asset, write_asset
+from drgs_blender.core.asset.model import Asset, Environment, Mesh
+from drgs_blender.core.particle_cache import Header, ParticleCache, ParticleFrame
+from drgs_blender.core.passes import BY_NAME
 from drgs_blender.deform.attach import attach
-from drgs_blender.particle_cache import Header, ParticleCache, ParticleFrame
-from drgs_blender.passes import BY_NAME
-from drgs_blender.render.picture.frames import read_frame
+from drgs_blender.render.film.frame_files import read_frame
 
 # Stands at -Y and looks along +Y; the picture's right is +X.
 FRONT = {"matrix_world": [[1, 0, 0, 0], [0, 0, -1, -6], [0, 1, 0, 0], [0, 0, 0, 1]], "width": 40, "height": 30}

@@ -86,10 +86,11 @@ def test_a_change_outside_or_of_comments_keeps_the_cache(package, name, text):
 
 def test_what_code_does_not_depend_on_is_no_part_of_the_closure(package):
     """As the version, so that an update compiles nothing anew whose sources are the same."""
-    (package / "version.py").write_text("from .reader import B\n")
-    (package / "constants.py").write_text("from .version import B\nA = 1\n")
+    (package / "core").mkdir()
+    (package / "core/version.py").write_text("from ..reader import B\n")
+    (package / "constants.py").write_text("from .core.version import B\nA = 1\n")
     before = key(package)
-    (package / "version.py").write_text("B = 4\n")
+    (package / "core/version.py").write_text("B = 4\n")
     (package / "reader.py").write_text("B = 5\n")
     assert key(package) == before
     assert all((ROOT / name).is_file() for name in closure.NEUTRAL)
@@ -140,7 +141,7 @@ class Count(event.Listener):
     def on_start(self, event): Count.total += 1
     def on_end(self, event): pass
 event.register("numba:compile", Count())
-from drgs_blender.geometry import corner_table
+from drgs_blender.geometry.normals import corner_table
 corner_table(np.array([[0, 1, 2]], np.int32), 3)
 print(Count.total)
 """
@@ -163,12 +164,12 @@ def test_real_kernels_outlive_changes_elsewhere_and_no_others(tmp_path):
     assert compiled() > 0
     assert compiled() == 0
     append("formats/obj.py", "\nX = 1\n")
-    append("reconstruct/job.py", "\nX = 1\n")
-    append("geometry.py", "\n# a comment\n")
+    append("reconstruct/pipeline.py", "\nX = 1\n")
+    append("geometry/normals.py", "\n# a comment\n")
     assert compiled() == 0
-    append("geometry.py", "\nX = 1\n")
+    append("geometry/normals.py", "\nX = 1\n")
     assert compiled() > 0
-    append("errors.py", "\nX = 1\n")
+    append("core/errors.py", "\nX = 1\n")
     assert compiled() == 0
     append("compute/jit.py", "\nX = 1\n")
     assert compiled() > 0

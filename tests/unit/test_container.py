@@ -13,11 +13,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drgs_blender.asset import Asset, Binding, Environment, Mesh, Surfels
-from drgs_blender.asset.archive import read_archive, write_archive
-from drgs_blender.asset.container import MANIFEST, check_asset, digest_asset, inspect_asset, read_asset, write_asset
-from drgs_blender.asset.tensors import decode, encode
-from drgs_blender.errors import AssetError, VersionError, WriteError
+from drgs_blender.core.asset import Asset, Binding, Environment, Mesh, Surfels
+from drgs_blender.core.asset.archive import read_archive, write_archive
+from drgs_blender.core.asset.container import (
+    MANIFEST,
+    check_asset,
+    digest_asset,
+    inspect_asset,
+    read_asset,
+    write_asset,
+)
+from drgs_blender.core.asset.tensors import decode, encode
+from drgs_blender.core.errors import AssetError, VersionError, WriteError
 
 DATA_MEMBERS = ("surfels.safetensors", "mesh.safetensors", "binding.safetensors", "environment.safetensors")
 
@@ -446,7 +453,7 @@ def test_needs_numpy_only() -> None:
     """The extension imports the container in Blender's Python: nothing but numpy and the standard library."""
     import subprocess
 
-    code = "import sys, drgs_blender.asset.container; print(sorted({m.split('.')[0] for m in sys.modules}))"
+    code = "import sys, drgs_blender.core.asset.container; print(sorted({m.split('.')[0] for m in sys.modules}))"
     root = Path(__file__).resolve().parents[2]
     done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, timeout=60)
     heavy = {"numba", "scipy", "torch", "trimesh", "PIL", "OpenEXR", "safetensors", "bpy"}

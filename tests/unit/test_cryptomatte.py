@@ -9,13 +9,13 @@ import OpenEXR
 import pytest
 from shapes import look_along_y, sphere_mesh
 
-from drgs_blender.asset.model import PosedSurfels
-from drgs_blender.frame import Frame, Material, MeshState, ObjectState, RenderSettings, World
-from drgs_blender.mattes import identities, metadata, name_hash
-from drgs_blender.render.lights.light import EnvironmentLight
-from drgs_blender.render.picture.frames import read_frame, write_frame
+from drgs_blender.core.asset.model import PosedSurfels
+from drgs_blender.core.cryptomatte import identities, metadata, name_hash
+from drgs_blender.core.frame import Frame, Material, MeshState, ObjectState, RenderSettings, World
+from drgs_blender.render.film.frame_files import read_frame, write_frame
+from drgs_blender.render.lights.environment import EnvironmentLight
 from drgs_blender.render.pipeline import render
-from drgs_blender.render.trace.scene import TraceObject, TraceScene
+from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene
 
 
 def test_hash_is_murmur3_with_usable_exponents():

@@ -13,30 +13,30 @@ from shapes import plain_mesh
 
 torch = pytest.importorskip("torch")
 
-from drgs_blender.asset import Mesh  # noqa: E402
-from drgs_blender.asset.model import PosedSurfels  # noqa: E402
-from drgs_blender.colour import linear_to_srgb, srgb_to_linear  # noqa: E402
-from drgs_blender.errors import Cancelled, UsageError  # noqa: E402
-from drgs_blender.frame import Camera, Frame, ObjectState, RenderSettings, World  # noqa: E402
-from drgs_blender.geometry import VertexNormals  # noqa: E402
-from drgs_blender.reconstruct.capture import Capture, View  # noqa: E402
-from drgs_blender.reconstruct.decouple.cache import radiance_cache  # noqa: E402
-from drgs_blender.reconstruct.decouple.gather import Gatherer, Points  # noqa: E402
-from drgs_blender.reconstruct.decouple.light import LearnedLight, colour_cast  # noqa: E402
-from drgs_blender.reconstruct.decouple.losses import blotches, dullness, log_loss, unbiased_loss  # noqa: E402
-from drgs_blender.reconstruct.decouple.materials import Materials, from_specular  # noqa: E402
-from drgs_blender.reconstruct.decouple.pixels import foreground_pixels  # noqa: E402
-from drgs_blender.reconstruct.decouple.run import Decoupled, decouple  # noqa: E402
-from drgs_blender.reconstruct.decouple.settings import Settings  # noqa: E402
-from drgs_blender.render.lights.light import EnvironmentLight  # noqa: E402
+from drgs_blender.core.asset import Mesh  # noqa: E402
+from drgs_blender.core.asset.model import PosedSurfels  # noqa: E402
+from drgs_blender.core.color import linear_to_srgb, srgb_to_linear  # noqa: E402
+from drgs_blender.core.errors import Cancelled, UsageError  # noqa: E402
+from drgs_blender.core.frame import Camera, Frame, ObjectState, RenderSettings, World  # noqa: E402
+from drgs_blender.geometry.normals import VertexNormals  # noqa: E402
+from drgs_blender.reconstruct.capture.capture import Capture, View  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering.environment import LearnedLight, colour_cast  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering.estimator import Gatherer, Points  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering.losses import blotches, dullness, log_loss, unbiased_loss  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering.materials import Materials, from_specular  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering.pixels import foreground_pixels  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering.radiance_cache import radiance_cache  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering.run import Decoupled, decouple  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering.settings import Settings  # noqa: E402
+from drgs_blender.render.integrator.integrate import integrate as kernel_integrate  # noqa: E402
+from drgs_blender.render.lights.environment import EnvironmentLight  # noqa: E402
 from drgs_blender.render.pipeline import render  # noqa: E402
 from drgs_blender.render.points import ShadingPoints  # noqa: E402
 from drgs_blender.render.reference.integrate import EmptyTracer, SurfacePoints, integrate_quadrature  # noqa: E402
 from drgs_blender.render.reference.light import Light  # noqa: E402
 from drgs_blender.render.reference.raster import camera_rays, pixel_centres  # noqa: E402
-from drgs_blender.render.shade.integrate import integrate as kernel_integrate  # noqa: E402
-from drgs_blender.render.trace.scene import TraceObject, TraceScene  # noqa: E402
-from drgs_blender.render.trace.tree import TriangleBVH  # noqa: E402
+from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene  # noqa: E402
+from drgs_blender.render.scene.triangle_bvh import TriangleBVH  # noqa: E402
 
 torch.set_num_threads(1)
 
@@ -259,7 +259,7 @@ def test_what_is_said_of_metals_begins_late_and_counts_for_nothing_else(ball, ca
 
     assert not alike()
     assert alike(parametrisation="dielectric")
-    monkeypatch.setattr("drgs_blender.reconstruct.decouple.run._METALS", 2.0)
+    monkeypatch.setattr("drgs_blender.reconstruct.inverse_rendering.run._METALS", 2.0)
     assert alike()
 
 
@@ -303,7 +303,7 @@ def test_only_photographs_that_are_clipped_learn_otherwise_beside_it(ball, captu
 
 def test_pixels_beside_clipped_ones_count_whole_as_long_as_photographs_weigh(ball, capture, monkeypatch):
     """Half from the first step on gained less: light that is not yet known needs them."""
-    monkeypatch.setattr("drgs_blender.reconstruct.decouple.run._BY_SHOWN", 2.0)
+    monkeypatch.setattr("drgs_blender.reconstruct.inverse_rendering.run._BY_SHOWN", 2.0)
     assert alike_whole_and_half(ball, capture, 2.0)
 
 
@@ -468,7 +468,7 @@ def test_metallic_is_smoothed_more_than_other_materials(ball, capture, monkeypat
         return float(decouple(capture, ball, replace(SMALL, iterations=40, smoothness=0.05)).metallic.std())
 
     more = spread()
-    monkeypatch.setattr("drgs_blender.reconstruct.decouple.run._SMOOTH", (1.0,) * 7)
+    monkeypatch.setattr("drgs_blender.reconstruct.inverse_rendering.run._SMOOTH", (1.0,) * 7)
     assert more < 0.8 * spread()
 
 
@@ -536,7 +536,7 @@ def test_a_run_whose_time_was_up_when_it_was_stopped_still_knows_how_good_it_is(
         clock[0] += tick[0]
         return clock[0]
 
-    monkeypatch.setattr("drgs_blender.reconstruct.decouple.run.time", SimpleNamespace(monotonic=monotonic))
+    monkeypatch.setattr("drgs_blender.reconstruct.inverse_rendering.run.time", SimpleNamespace(monotonic=monotonic))
     settings, path = replace(SMALL, iterations=1000, seconds=100.0), tmp_path / "materials.state"
     asked = []
     with pytest.raises(Cancelled):
@@ -591,7 +591,7 @@ def test_normals_are_turned_towards_the_true_ones_once_light_is_known(ball, capt
         return float(np.median(np.degrees(np.arccos(np.clip((normals * ball.vertices).sum(axis=1), -1, 1)))))
 
     assert off(decouple(capture, wrong, settings).normals) < 0.97 * off(smooth)
-    monkeypatch.setattr("drgs_blender.reconstruct.decouple.run._NORMALS", 2.0)
+    monkeypatch.setattr("drgs_blender.reconstruct.inverse_rendering.run._NORMALS", 2.0)
     assert decouple(capture, wrong, replace(settings, iterations=3)).normals == pytest.approx(smooth, abs=1e-6)
 
 

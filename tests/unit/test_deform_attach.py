@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from drgs_blender.asset.model import Mesh, Surfels
+from drgs_blender.core.asset.model import Mesh, Surfels
+from drgs_blender.core.frame import Camera, RenderSettings
 from drgs_blender.deform.attach import UNSEEN, attach, sharp_edges
-from drgs_blender.deform.faces import Faces
+from drgs_blender.deform.face_frames import Faces
 from drgs_blender.deform.mesh_driven import MeshDriven
-from drgs_blender.frame import Camera, RenderSettings
-from drgs_blender.geometry import rotation_matrices
+from drgs_blender.geometry.normals import rotation_matrices
 from drgs_blender.render.camera import camera_parameters
 from drgs_blender.render.surfels.raster import rasterise
 from drgs_blender.render.surfels.splats import prepare

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from drgs_blender.geometry import VertexNormals, corner_table
+from drgs_blender.geometry.normals import VertexNormals, corner_table
 
 
 def test_cube_corners_point_along_the_diagonal_however_it_is_triangulated():

@@ -7,16 +7,16 @@ import pytest
 from matter_cases import lattice, solver_of
 from scipy.spatial.transform import Rotation
 
-from drgs_blender.asset.model import Asset, Mesh
+from drgs_blender.core.asset.model import Asset, Mesh
+from drgs_blender.core.errors import AssetError, UsageError
 from drgs_blender.deform.attach import attach
+from drgs_blender.deform.fracture import torn_faces
 from drgs_blender.deform.gmls import bind_points, carry
 from drgs_blender.deform.mesh_driven import MeshDriven
 from drgs_blender.deform.source_driven import SourceDriven
 from drgs_blender.deform.sources import MeshSource, PointSource
-from drgs_blender.deform.tears import torn_faces
-from drgs_blender.errors import AssetError, UsageError
-from drgs_blender.simulate.contact import Plane
-from drgs_blender.simulate.fill import fill
+from drgs_blender.simulation.contact import Plane
+from drgs_blender.simulation.fill import fill
 
 CENTRE = np.array([5.0, -3.0, 2.0])
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from drgs_blender.asset.model import PosedSurfels
-from drgs_blender.deform.grains import grainy
+from drgs_blender.core.asset.model import PosedSurfels
+from drgs_blender.deform.granular import grainy
 
 N = 4000
 SCALE = np.random.default_rng(1).uniform(0.01, 0.03, (N, 2)).astype(np.float32)

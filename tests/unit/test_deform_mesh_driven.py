@@ -7,12 +7,12 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from drgs_blender.asset.model import Binding, Mesh, Surfels
+from drgs_blender.core.asset.model import Binding, Mesh, Surfels
+from drgs_blender.core.errors import AssetError
 from drgs_blender.deform.attach import attach
 from drgs_blender.deform.binding import bind
 from drgs_blender.deform.mesh_driven import MeshDriven
-from drgs_blender.errors import AssetError
-from drgs_blender.geometry import quaternions, rotation_matrices
+from drgs_blender.geometry.normals import quaternions, rotation_matrices
 
 
 def as_mesh(source: trimesh.Trimesh, seed: int = 0) -> Mesh:

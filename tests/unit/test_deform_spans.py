@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from test_deform_mesh_driven import matrix, posed_by
 
-from drgs_blender.asset.model import Mesh, Surfels
+from drgs_blender.core.asset.model import Mesh, Surfels
 from drgs_blender.deform.binding import bind
 from drgs_blender.deform.mesh_driven import MeshDriven
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from drgs_blender.deform.surfel_update import paper_update, surfel_update
-from drgs_blender.geometry import quaternions, rotation_matrices
+from drgs_blender.geometry.normals import quaternions, rotation_matrices
 
 IDENTITY = np.eye(3)[None]
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drgs_blender.frame import Camera, Frame, ObjectState, RenderSettings, World, split_rays
+from drgs_blender.core.frame import Camera, Frame, ObjectState, RenderSettings, World, split_rays
 from drgs_blender.render import pipeline
-from drgs_blender.render.lights.light import EnvironmentLight
-from drgs_blender.render.picture.denoise import denoise
-from drgs_blender.render.picture.film import Film
-from drgs_blender.render.picture.signal import Guides
-from drgs_blender.render.trace.scene import TraceObject, TraceScene
+from drgs_blender.render.denoise.svgf_spatial import denoise
+from drgs_blender.render.film.film import Film
+from drgs_blender.render.film.guides import Guides
+from drgs_blender.render.lights.environment import EnvironmentLight
+from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene
 
 H, W = 40, 56
 

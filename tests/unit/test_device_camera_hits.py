@@ -13,15 +13,15 @@ from shapes import scene_of, sphere_mesh, sphere_surfels
 from test_device_integrate import among_meshes, ball, floor, placed, psnr
 from test_raster import look_along_y
 
-from drgs_blender.frame import Camera, RenderSettings, Visibility
+from drgs_blender.core.frame import Camera, RenderSettings, Visibility
+from drgs_blender.render.backend import HERE, Processor
 from drgs_blender.render.camera import AA, camera_parameters
-from drgs_blender.render.device.on_device import OnDevice
-from drgs_blender.render.primary.gbuffer import GBuffer
-from drgs_blender.render.primary.primary_mesh import primary_mesh
-from drgs_blender.render.primary.primary_surfels import primary_surfels, snap_windows
-from drgs_blender.render.processor import HERE, Processor
-from drgs_blender.render.trace.masks import CAMERA
-from drgs_blender.render.trace.scene import TraceScene
+from drgs_blender.render.gbuffer.gbuffer import GBuffer
+from drgs_blender.render.gbuffer.mesh import primary_mesh
+from drgs_blender.render.gbuffer.surfels import primary_surfels, snap_windows
+from drgs_blender.render.gpu.warp_backend import OnDevice
+from drgs_blender.render.scene.ray_masks import CAMERA
+from drgs_blender.render.scene.trace_scene import TraceScene
 
 
 def looking_down(**more: float) -> Camera:

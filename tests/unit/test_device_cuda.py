@@ -19,13 +19,13 @@ import test_device_raster
 import warp
 from test_device_denoise import nothing, shots
 
-from drgs_blender.deform.device import gmls
-from drgs_blender.deform.device import mesh_driven as deformation
-from drgs_blender.deform.device.mesh_driven import Deformer
-from drgs_blender.device.kernels import Launcher
-from drgs_blender.render.device import attach, camera_hits, denoise, integrate, raster, splats, trees
-from drgs_blender.render.device.on_device import OnDevice
-from drgs_blender.simulate.device import cells, steps
+from drgs_blender.compute.warp.kernels import Launcher
+from drgs_blender.deform.gpu import gmls
+from drgs_blender.deform.gpu import mesh_driven as deformation
+from drgs_blender.deform.gpu.mesh_driven import Deformer
+from drgs_blender.render.gpu import attach, bvhs, camera_hits, denoise, integrate, raster, splats
+from drgs_blender.render.gpu.warp_backend import OnDevice
+from drgs_blender.simulation.gpu import cells, steps
 
 #: A100 and later.
 ARCHITECTURE = 80
@@ -58,7 +58,7 @@ def test_pictures_kernels_compile_for_a_card(tmp_path: Path) -> None:
         _, history = device.denoise_next(shot, history, True, False, nothing)
     works = raster.BLEND, attach.ATTACH, *denoise.WORKS
     works += deformation.WEIGH, deformation.SUM, deformation.POSE
-    works += trees.PLACE, camera_hits.TRACE, camera_hits.SHADE
+    works += bvhs.PLACE, camera_hits.TRACE, camera_hits.SHADE
     works += splats.PROJECT, splats.KEY, splats.FIND, splats.GATHER, splats.LIST
     assert made(works, device.launcher, tmp_path) == set(works)
     assert not device.failed
@@ -71,7 +71,7 @@ def test_learnings_kernels_compile_for_a_card(tmp_path: Path) -> None:
     import test_device_learning
     import test_device_surfels
 
-    from drgs_blender.reconstruct.device import gather, kernels, losses, on_device
+    from drgs_blender.reconstruct.gpu import gather, kernels, losses, on_device
 
     device = on_device.OnDevice("cpu")
     test_device_surfels.test_every_map_has_a_gradient_of_its_own(device.launcher)

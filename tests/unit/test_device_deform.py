@@ -12,14 +12,14 @@ pytest.importorskip("warp", reason="warp-lang is not installed")
 
 from test_deform_mesh_driven import blob, matrix, shell_surfels
 
-from drgs_blender.asset.model import Mesh
+from drgs_blender.compute.warp.kernels import Launcher
+from drgs_blender.compute.warp.posed_surfels import FIELDS, PosedThere, arrays_of, joined, with_fields
+from drgs_blender.compute.warp.runtime import is_there
+from drgs_blender.core.asset.model import Mesh
+from drgs_blender.core.errors import DeviceError
 from drgs_blender.deform.binding import bind
-from drgs_blender.deform.device.mesh_driven import Deformer
+from drgs_blender.deform.gpu.mesh_driven import Deformer
 from drgs_blender.deform.mesh_driven import MeshDriven
-from drgs_blender.device.kernels import Launcher
-from drgs_blender.device.posed import FIELDS, PosedThere, arrays_of, joined, with_fields
-from drgs_blender.device.warp import is_there
-from drgs_blender.errors import DeviceError
 
 MIRRORED = matrix(np.diag([-1.5, 0.5, 1.0]) @ [[0.8, 0.6, 0], [-0.6, 0.8, 0], [0, 0, 1]], (3.0, -2.0, 1.0))
 

@@ -9,14 +9,14 @@ pytest.importorskip("warp", reason="warp-lang is not installed")
 
 from test_denoise import H, W, light_of, wall
 
-from drgs_blender.errors import Cancelled, DeviceError
-from drgs_blender.render.device.denoise import DeviceSignal
-from drgs_blender.render.device.on_device import OnDevice
-from drgs_blender.render.picture.denoise import denoise
-from drgs_blender.render.picture.motion import Motion
-from drgs_blender.render.picture.signal import Signal
-from drgs_blender.render.picture.temporal import Shot, denoise_next
-from drgs_blender.render.processor import HERE
+from drgs_blender.core.errors import Cancelled, DeviceError
+from drgs_blender.render.backend import HERE
+from drgs_blender.render.denoise.demodulation import Signal
+from drgs_blender.render.denoise.svgf_spatial import denoise
+from drgs_blender.render.denoise.svgf_temporal import Shot, denoise_next
+from drgs_blender.render.film.motion_vectors import Motion
+from drgs_blender.render.gpu.denoise import DeviceSignal
+from drgs_blender.render.gpu.warp_backend import OnDevice
 
 
 def picture() -> tuple:

@@ -14,15 +14,15 @@ from capture_cases import BALLS, balls  # noqa: E402
 from shapes import sphere_mesh  # noqa: E402
 from test_decouple import sky  # noqa: E402
 
-from drgs_blender.asset.model import Mesh  # noqa: E402
-from drgs_blender.errors import DeviceError  # noqa: E402
-from drgs_blender.reconstruct.decouple.gather import Gatherer, Points  # noqa: E402
-from drgs_blender.reconstruct.decouple.run import decouple  # noqa: E402
-from drgs_blender.reconstruct.decouple.settings import Settings  # noqa: E402
-from drgs_blender.reconstruct.device.gather import GATHER  # noqa: E402
-from drgs_blender.reconstruct.device.on_device import OnDevice  # noqa: E402
-from drgs_blender.reconstruct.processor import HERE, Processor  # noqa: E402
-from drgs_blender.render.trace.tree import TriangleBVH  # noqa: E402
+from drgs_blender.core.asset.model import Mesh  # noqa: E402
+from drgs_blender.core.errors import DeviceError  # noqa: E402
+from drgs_blender.reconstruct.backend import HERE, Processor  # noqa: E402
+from drgs_blender.reconstruct.gpu.gather import GATHER  # noqa: E402
+from drgs_blender.reconstruct.gpu.on_device import OnDevice  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering.estimator import Gatherer, Points  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering.run import decouple  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering.settings import Settings  # noqa: E402
+from drgs_blender.render.scene.triangle_bvh import TriangleBVH  # noqa: E402
 
 POINTS = 300
 

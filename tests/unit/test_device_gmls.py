@@ -14,12 +14,12 @@ from scipy.spatial.transform import Rotation
 from test_deform_gmls import CENTRE, cloud
 from test_simulate_bake import job_of
 
-from drgs_blender.deform.device.gmls import Carrier
+from drgs_blender.compute.warp.kernels import Launcher
+from drgs_blender.core.particle_cache import ParticleCache
 from drgs_blender.deform.gmls import bind_points, carry
-from drgs_blender.device.kernels import Launcher
-from drgs_blender.particle_cache import ParticleCache
-from drgs_blender.simulate.bake import bake
-from drgs_blender.simulate.device.grid import DeviceGrid
+from drgs_blender.deform.gpu.gmls import Carrier
+from drgs_blender.simulation.bake import bake
+from drgs_blender.simulation.gpu.grid import DeviceGrid
 
 EPS = float(np.finfo(np.float32).eps)
 SOURCES, POINTS = cloud(2000, 0), cloud(700, 2)
@@ -114,7 +114,7 @@ def test_of_a_frame_only_the_sources_go_to_the_device(launcher: Launcher, monkey
 @pytest.fixture
 def card(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Warp's processor is the card; the number of points of each call of `Carrier.carry`."""
-    monkeypatch.setattr("drgs_blender.simulate.solver.name_of", lambda device: "cpu")
+    monkeypatch.setattr("drgs_blender.simulation.solver.name_of", lambda device: "cpu")
     inner, calls = Carrier.carry, []
 
     def carried(carrier: Carrier, *given: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:

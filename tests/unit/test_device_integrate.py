@@ -11,16 +11,16 @@ import trimesh
 
 pytest.importorskip("warp", reason="warp-lang is not installed")
 
-from drgs_blender.frame import Image, Light, Material, MeshState, RenderSettings, Texture, Visibility, World
-from drgs_blender.render.device.devices import Devices
-from drgs_blender.render.device.on_device import OnDevice
-from drgs_blender.render.lights.emitters import Emitters
-from drgs_blender.render.lights.lamps import Lamps
-from drgs_blender.render.lights.light import EnvironmentLight
+from drgs_blender.core.frame import Image, Light, Material, MeshState, RenderSettings, Texture, Visibility, World
+from drgs_blender.render.backend import HERE
+from drgs_blender.render.gpu.select_backend import Devices
+from drgs_blender.render.gpu.warp_backend import OnDevice
+from drgs_blender.render.integrator.integrate import integrate
+from drgs_blender.render.lights.environment import EnvironmentLight
+from drgs_blender.render.lights.lights import Lamps
+from drgs_blender.render.lights.mesh_lights import Emitters
 from drgs_blender.render.points import CATCHER, Radiance, ShadingPoints
-from drgs_blender.render.processor import HERE
-from drgs_blender.render.shade.integrate import integrate
-from drgs_blender.render.trace.scene import TraceObject, TraceScene
+from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene
 
 BALL = trimesh.creation.icosphere(subdivisions=3)
 SETTINGS = RenderSettings(5, 5, 6, bounces=3, aa=2)
@@ -231,7 +231,7 @@ def test_an_empty_scene_and_hopeless_points_are_survived(device: OnDevice) -> No
 
 
 def test_without_a_card_the_processor_does_all_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("drgs_blender.device.warp.cuda_devices", list)
+    monkeypatch.setattr("drgs_blender.compute.warp.runtime.cuda_devices", list)
     devices, settings = Devices(), replace(SETTINGS, device="cuda")
     assert devices.processor("cuda") is HERE
     (warning,) = devices.warnings(settings)

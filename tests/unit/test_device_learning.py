@@ -15,21 +15,21 @@ pytest.importorskip("warp", reason="warp-lang is not installed")
 from capture_cases import balls  # noqa: E402
 from test_reconstruct_attributes import EYE, surfels  # noqa: E402
 
-from drgs_blender.device.kernels import Work  # noqa: E402
-from drgs_blender.device.warp import parts_of  # noqa: E402
-from drgs_blender.errors import DeviceError  # noqa: E402
-from drgs_blender.reconstruct.capture import Capture  # noqa: E402
-from drgs_blender.reconstruct.device import devices, kernels, look, losses  # noqa: E402
-from drgs_blender.reconstruct.device import raster as device_raster  # noqa: E402
-from drgs_blender.reconstruct.device.on_device import DESCEND, OnDevice  # noqa: E402
-from drgs_blender.reconstruct.gaussians import Gaussians  # noqa: E402
-from drgs_blender.reconstruct.hull import Region, find_region  # noqa: E402
-from drgs_blender.reconstruct.job import Settings, reconstruct  # noqa: E402
-from drgs_blender.reconstruct.photometric import Photograph  # noqa: E402
-from drgs_blender.reconstruct.processor import HERE, Processor  # noqa: E402
-from drgs_blender.reconstruct.reflection import BARE, pyramid  # noqa: E402
-from drgs_blender.reconstruct.targets import Target  # noqa: E402
-from drgs_blender.reconstruct.train import Schedule, Training  # noqa: E402
+from drgs_blender.compute.warp.kernels import Work  # noqa: E402
+from drgs_blender.compute.warp.runtime import parts_of  # noqa: E402
+from drgs_blender.core.errors import DeviceError  # noqa: E402
+from drgs_blender.reconstruct.backend import HERE, Processor  # noqa: E402
+from drgs_blender.reconstruct.capture.capture import Capture  # noqa: E402
+from drgs_blender.reconstruct.capture.training_views import Target  # noqa: E402
+from drgs_blender.reconstruct.gpu import devices, kernels, look, losses  # noqa: E402
+from drgs_blender.reconstruct.gpu import raster as device_raster  # noqa: E402
+from drgs_blender.reconstruct.gpu.on_device import DESCEND, OnDevice  # noqa: E402
+from drgs_blender.reconstruct.losses.photometric import Photograph  # noqa: E402
+from drgs_blender.reconstruct.meshing.visual_hull import Region, find_region  # noqa: E402
+from drgs_blender.reconstruct.model.gaussians import Gaussians  # noqa: E402
+from drgs_blender.reconstruct.model.reflection_probe import BARE, pyramid  # noqa: E402
+from drgs_blender.reconstruct.optim.train import Schedule, Training  # noqa: E402
+from drgs_blender.reconstruct.pipeline import Settings, reconstruct  # noqa: E402
 
 HEIGHT, WIDTH = 23, 31
 

@@ -17,18 +17,18 @@ pytest.importorskip("warp", reason="warp-lang is not installed")
 from test_simulate_bake import asset_file, content, job_of
 
 from drgs_blender.cli.main import main
-from drgs_blender.device.kernels import Launcher
-from drgs_blender.errors import Cancelled, UsageError
-from drgs_blender.matter import FLUID, MU
-from drgs_blender.particle_cache import ParticleCache
-from drgs_blender.simulate.bake import bake
-from drgs_blender.simulate.colliders import Collider
-from drgs_blender.simulate.contact import Plane
-from drgs_blender.simulate.device.grid import DeviceGrid
-from drgs_blender.simulate.fields import ForceField
-from drgs_blender.simulate.grid import Forces, HostGrid
-from drgs_blender.simulate.settings import parse_settings
-from drgs_blender.simulate.solver import Solver
+from drgs_blender.compute.warp.kernels import Launcher
+from drgs_blender.core.errors import Cancelled, UsageError
+from drgs_blender.core.particle_cache import ParticleCache
+from drgs_blender.core.sim_materials import FLUID, MU
+from drgs_blender.simulation.bake import bake
+from drgs_blender.simulation.colliders import Collider
+from drgs_blender.simulation.contact import Plane
+from drgs_blender.simulation.fields import ForceField
+from drgs_blender.simulation.gpu.grid import DeviceGrid
+from drgs_blender.simulation.grid import Forces, HostGrid
+from drgs_blender.simulation.settings import parse_settings
+from drgs_blender.simulation.solver import Solver
 
 EPS = float(np.finfo(np.float32).eps)
 H = 0.05
@@ -317,7 +317,7 @@ def test_a_device_that_fails_within_a_frame_loses_nothing(
 @pytest.fixture
 def card(monkeypatch: pytest.MonkeyPatch) -> None:
     """Warp's processor is the card."""
-    monkeypatch.setattr("drgs_blender.simulate.solver.name_of", lambda device: "cpu")
+    monkeypatch.setattr("drgs_blender.simulation.solver.name_of", lambda device: "cpu")
 
 
 @pytest.mark.slow
@@ -355,7 +355,7 @@ def test_a_bake_whose_device_fails_is_whole(
 def test_without_a_card_the_processor_does_all_and_says_so(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    monkeypatch.setattr("drgs_blender.device.warp.cuda_devices", list)
+    monkeypatch.setattr("drgs_blender.compute.warp.runtime.cuda_devices", list)
     found, expected = tmp_path / "found", tmp_path / "expected"
     asset = str(asset_file(tmp_path))
     options = ["--resolution", "8", "--frames", "3", "--floor", "0", "--young", "2e4"]

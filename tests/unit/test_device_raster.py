@@ -10,12 +10,12 @@ pytest.importorskip("warp", reason="warp-lang is not installed")
 from shapes import scene_of, sphere_mesh, sphere_surfels
 from test_raster import join, look_along_y, plane_of_surfels, random_surfels
 
-from drgs_blender.frame import MeshState, RenderSettings
+from drgs_blender.core.frame import MeshState, RenderSettings
+from drgs_blender.render.backend import HERE
 from drgs_blender.render.camera import camera_parameters
-from drgs_blender.render.device import raster as device_raster
-from drgs_blender.render.device.on_device import OnDevice
-from drgs_blender.render.primary.primary_surfels import primary_surfels, snap_windows
-from drgs_blender.render.processor import HERE
+from drgs_blender.render.gbuffer.surfels import primary_surfels, snap_windows
+from drgs_blender.render.gpu import raster as device_raster
+from drgs_blender.render.gpu.warp_backend import OnDevice
 from drgs_blender.render.surfels.raster import SurfelSamples, rasterise
 from drgs_blender.render.surfels.splats import prepare
 

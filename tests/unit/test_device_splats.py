@@ -12,10 +12,10 @@ pytest.importorskip("warp", reason="warp-lang is not installed")
 from test_device_raster import SCENES
 from test_raster import join, look_along_y, plane_of_surfels, random_surfels, surfels
 
-from drgs_blender.asset.model import PosedSurfels
-from drgs_blender.frame import Camera, RenderSettings
+from drgs_blender.core.asset.model import PosedSurfels
+from drgs_blender.core.frame import Camera, RenderSettings
 from drgs_blender.render.camera import camera_parameters
-from drgs_blender.render.device.on_device import OnDevice
+from drgs_blender.render.gpu.warp_backend import OnDevice
 from drgs_blender.render.surfels.raster import rasterise
 from drgs_blender.render.surfels.splats import Splats, prepare
 

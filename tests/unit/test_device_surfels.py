@@ -19,11 +19,11 @@ from test_reconstruct_raster import (  # noqa: E402
     surfels,
 )
 
-from drgs_blender.errors import DeviceError  # noqa: E402
-from drgs_blender.reconstruct import raster as here  # noqa: E402
-from drgs_blender.reconstruct.device import raster as there  # noqa: E402
-from drgs_blender.reconstruct.device.launch import TensorLauncher  # noqa: E402
-from drgs_blender.reconstruct.raster import Tally  # noqa: E402
+from drgs_blender.core.errors import DeviceError  # noqa: E402
+from drgs_blender.reconstruct.gpu import raster as there  # noqa: E402
+from drgs_blender.reconstruct.gpu.launch import TensorLauncher  # noqa: E402
+from drgs_blender.reconstruct.model import raster as here  # noqa: E402
+from drgs_blender.reconstruct.model.raster import Tally  # noqa: E402
 
 
 @pytest.fixture(scope="module")

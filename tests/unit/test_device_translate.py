@@ -12,15 +12,15 @@ import pytest
 pytest.importorskip("warp", reason="warp-lang is not installed")
 
 from drgs_blender.compute.jit import njit
-from drgs_blender.device.kernels import Launcher, Work
-from drgs_blender.device.translate import Native, Translation
-from drgs_blender.device.typed import Array, Struct, TranslationError
-from drgs_blender.device.warp import load_module, warp
-from drgs_blender.frame import World
+from drgs_blender.compute.warp.kernels import Launcher, Work
+from drgs_blender.compute.warp.runtime import load_module, warp
+from drgs_blender.compute.warp.translate import Native, Translation
+from drgs_blender.compute.warp.types import Array, Struct, TranslationError
+from drgs_blender.core.frame import World
 from drgs_blender.render import sampling
-from drgs_blender.render.device.natives import NATIVES
-from drgs_blender.render.lights import light
-from drgs_blender.render.shade import brdf
+from drgs_blender.render.gpu.natives import NATIVES
+from drgs_blender.render.integrator import brdf
+from drgs_blender.render.lights import environment
 
 F, U = np.float32, np.uint32
 ONE = F(1.0)
@@ -116,10 +116,10 @@ def test_the_renderers_arithmetic_is_the_same_to_the_last_bit(name: str) -> None
 
 def test_the_sky_is_looked_up_to_the_last_bit() -> None:
     image = np.random.default_rng(0).random((40, 80, 3)).astype(np.float32) ** 6
-    sky = light.EnvironmentLight(World(environment=image))
+    sky = environment.EnvironmentLight(World(environment=image))
     u, v = floats(3000, (0, 1), (0, 1))
     rows = np.random.default_rng(3).integers(0, 576, 3000)
-    for function, columns in ((light.sky_radiance, [u, v]), (light.sky_density, [u, v, rows])):
+    for function, columns in ((environment.sky_radiance, [u, v]), (environment.sky_density, [u, v, rows])):
         np.testing.assert_array_equal(on_device(function, columns, (sky.sky,)), here(function, columns, (sky.sky,)))
 
 

@@ -11,14 +11,14 @@ pytest.importorskip("warp", reason="warp-lang is not installed")
 
 from test_device_integrate import ball, floor, placed
 
-from drgs_blender.device.kernels import Work
-from drgs_blender.frame import Visibility
-from drgs_blender.render.device.mirror import Mirror
-from drgs_blender.render.device.natives import NATIVES
-from drgs_blender.render.device.on_device import OnDevice
-from drgs_blender.render.trace.masks import DIFFUSE
-from drgs_blender.render.trace.scene import TraceObject, TraceScene
-from drgs_blender.render.trace.surface import nearest
+from drgs_blender.compute.warp.kernels import Work
+from drgs_blender.core.frame import Visibility
+from drgs_blender.render.gpu.natives import NATIVES
+from drgs_blender.render.gpu.scene_mirror import Mirror
+from drgs_blender.render.gpu.warp_backend import OnDevice
+from drgs_blender.render.scene.interaction import nearest
+from drgs_blender.render.scene.ray_masks import DIFFUSE
+from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene
 
 
 def cast(lane, lanes, room, tracer, origin, direction, mask, out):  # type: ignore[no-untyped-def]

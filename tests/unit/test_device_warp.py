@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 
 from drgs_blender.compute.folders import cache_folder
-from drgs_blender.device.kernels import Launcher, Work
-from drgs_blender.device.warp import VERSION, load_module, warp
-from drgs_blender.errors import Cancelled, DeviceError
-from drgs_blender.frame import RenderSettings
-from drgs_blender.render.device.devices import Devices
-from drgs_blender.render.processor import HERE
+from drgs_blender.compute.warp.kernels import Launcher, Work
+from drgs_blender.compute.warp.runtime import VERSION, load_module, warp
+from drgs_blender.core.errors import Cancelled, DeviceError
+from drgs_blender.core.frame import RenderSettings
+from drgs_blender.render.backend import HERE
+from drgs_blender.render.gpu.select_backend import Devices
 
 CUDA = RenderSettings(device="cuda")
 
@@ -55,7 +55,7 @@ def test_warp_prints_nothing_where_programs_read(tmp_path: Path) -> None:
     code = """
 import numpy as np
 from drgs_blender.compute.folders import cache_folder
-from drgs_blender.device.kernels import Launcher, Work
+from drgs_blender.compute.warp.kernels import Launcher, Work
 def double(lane, lanes, room, x, out):
     for i in range(lane, len(x), lanes):
         out[0][i] = x[i] + x[i]
@@ -103,7 +103,7 @@ def test_a_folder_of_kernels_that_cannot_be_written_is_the_devices_failure(folde
 
 
 def test_a_module_that_does_not_load_is_not_kept(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("drgs_blender.device.warp.warp", lambda: None)
+    monkeypatch.setattr("drgs_blender.compute.warp.runtime.warp", lambda: None)
     for _ in range(2):
         with pytest.raises(ZeroDivisionError):
             load_module("1 / 0")

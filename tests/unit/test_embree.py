@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from drgs_blender.errors import DeviceError, UsageError
-from drgs_blender.render.trace import embree
-from drgs_blender.render.trace.tree import ALL, Group, TriangleBVH
+from drgs_blender.core.errors import DeviceError, UsageError
+from drgs_blender.render.scene import embree
+from drgs_blender.render.scene.triangle_bvh import ALL, Group, TriangleBVH
 
 
 def rays(count: int, seed: int = 0, spread: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
@@ -137,7 +137,7 @@ ROUNDING = 4 * float(np.finfo(np.float32).eps)
 
 _PROGRAM = """
 import numpy as np
-from drgs_blender.render.trace import tree
+from drgs_blender.render.scene import triangle_bvh as tree
 bvh = tree.TriangleBVH()
 bvh.build([[0, 0, 1], [1, 0, 1], [0, 1, 1]], [[0, 1, 2]])
 t, face, u, v = bvh.intersect([[0.25, 0.25, 0]], [[0, 0, 1]])

@@ -12,16 +12,16 @@ from test_lamps import irradiance, light
 from test_surface import matrix, mesh_state
 
 from drgs_blender.compute.jit import njit
-from drgs_blender.frame import Image, Material, MeshState, Texture, Visibility, World
-from drgs_blender.render.lights.emitters import MOST, Emitters
-from drgs_blender.render.lights.lamps import Lamps, emission_along
-from drgs_blender.render.lights.light import EnvironmentLight
+from drgs_blender.core.frame import Image, Material, MeshState, Texture, Visibility, World
+from drgs_blender.render.integrator.integrate import integrate
+from drgs_blender.render.lights.environment import EnvironmentLight
+from drgs_blender.render.lights.lights import Lamps, emission_along
+from drgs_blender.render.lights.mesh_lights import MOST, Emitters
 from drgs_blender.render.points import CATCHER
 from drgs_blender.render.sampling import F, sobol
-from drgs_blender.render.shade.integrate import integrate
-from drgs_blender.render.trace import masks
-from drgs_blender.render.trace.scene import TraceScene
-from drgs_blender.render.trace.surface import nearest
+from drgs_blender.render.scene import ray_masks
+from drgs_blender.render.scene.interaction import nearest
+from drgs_blender.render.scene.trace_scene import TraceScene
 
 GLOW = Material("glow", (0.0, 0.0, 0.0), 1.0, 1.0, (3.0, 2.0, 1.0))
 SQUARE = np.float32([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
@@ -71,7 +71,7 @@ def bulb(*places: np.ndarray, inwards: bool = False) -> MeshState:
 def _look(origins, directions, tracer, geometry, table, pick, emitters, out):  # type: ignore[no-untyped-def]
     for i in range(len(origins)):
         o, d = (origins[i, 0], origins[i, 1], origins[i, 2]), (directions[i, 0], directions[i, 1], directions[i, 2])
-        hit = nearest(tracer, *o, *d, F(0.0), F(np.inf), np.int32(masks.DIFFUSE))
+        hit = nearest(tracer, *o, *d, F(0.0), F(np.inf), np.int32(ray_masks.DIFFUSE))
         out[i, 0], out[i, 1], out[i, 2], out[i, 3], _ = emission_along(*o, *d, hit, geometry, table, pick, emitters)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pickle
 
-from drgs_blender.errors import ERROR_CLASSES, AssetError, UsageError
+from drgs_blender.core.errors import ERROR_CLASSES, AssetError, UsageError
 
 
 def test_what_is_wrong_with_a_file_comes_with_a_remedy_always():

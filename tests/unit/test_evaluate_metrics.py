@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from drgs_blender.colour import linear_to_srgb
-from drgs_blender.errors import AssetError
+from drgs_blender.core.color import linear_to_srgb
+from drgs_blender.core.errors import AssetError
 from drgs_blender.evaluate import metrics
 from drgs_blender.evaluate.flip import flip, flip_map
 from drgs_blender.evaluate.lpips import Lpips

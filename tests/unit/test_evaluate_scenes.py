@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from drgs_blender.asset import Asset, Environment, Mesh
-from drgs_blender.asset.container import write_asset
 from drgs_blender.cli.main import main
-from drgs_blender.colour import srgb_to_linear
-from drgs_blender.errors import EXIT_USAGE, AssetError, DeviceError, EngineError, UsageError
+from drgs_blender.core.asset import Asset, Environment, Mesh
+from drgs_blender.core.asset.container import write_asset
+from drgs_blender.core.color import srgb_to_linear
+from drgs_blender.core.errors import EXIT_USAGE, AssetError, DeviceError, EngineError, UsageError
 from drgs_blender.evaluate.compare import compare, posed_vertices, table
 from drgs_blender.evaluate.scenes import Plan, cameras, make_scenes
 from drgs_blender.evaluate.subjects import OBJECTS, make_subject
@@ -141,7 +141,7 @@ def test_the_pose_is_carried_to_another_mesh_of_the_same_shape(scenes):
 
 
 def attach_nothing():
-    from drgs_blender.asset import Surfels
+    from drgs_blender.core.asset import Surfels
 
     one = np.zeros(1, np.float32)
     return Surfels(np.zeros((1, 3)), np.ones((1, 2)), np.array([[1.0, 0, 0, 0]]), one, np.zeros((1, 3)), one, one)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drgs_blender.frame import Camera, RenderSettings, World
-from drgs_blender.passes import BY_NAME
+from drgs_blender.core.frame import Camera, RenderSettings, World
+from drgs_blender.core.passes import BY_NAME
 from drgs_blender.render.camera import camera_parameters, sample_ray
-from drgs_blender.render.lights.light import EnvironmentLight
-from drgs_blender.render.picture.film import EMPTY_DEPTH, Film
+from drgs_blender.render.film.film import EMPTY_DEPTH, Film
+from drgs_blender.render.gbuffer.gbuffer import GBuffer, compact
+from drgs_blender.render.lights.environment import EnvironmentLight
 from drgs_blender.render.points import Radiance
-from drgs_blender.render.primary.gbuffer import GBuffer, compact
 
 ALL = tuple(name for name in BY_NAME if not name.startswith("Crypto"))  # these have a film of their own
 AA = 4

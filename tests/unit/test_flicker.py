@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drgs_blender.colour import linear_to_srgb
+from drgs_blender.core.color import linear_to_srgb
 
 N, H, W = 6, 20, 40
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image as Pillow
 
-from drgs_blender.colour import linear_to_srgb, srgb_to_linear
-from drgs_blender.errors import AssetError
+from drgs_blender.core.color import linear_to_srgb, srgb_to_linear
+from drgs_blender.core.errors import AssetError
 from drgs_blender.formats.latlong import directions, nvdiffrec_cube, sample_cube
 from drgs_blender.formats.registry import read, read_environment, read_materials
 

@@ -13,13 +13,13 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from splat_files import covariance, old_spz, random_splats, refusals
 
-from drgs_blender.asset import Asset, Environment, Mesh, Surfels
-from drgs_blender.asset.container import write_asset
 from drgs_blender.build.export import posed_surfels
 from drgs_blender.build.importer import import_asset
 from drgs_blender.cli.main import main
+from drgs_blender.core.asset import Asset, Environment, Mesh, Surfels
+from drgs_blender.core.asset.container import write_asset
+from drgs_blender.core.errors import AssetError
 from drgs_blender.deform.binding import bind
-from drgs_blender.errors import AssetError
 from drgs_blender.formats.axes import UP_AXES, surfels_to_z_up, vectors_to_z_up
 from drgs_blender.formats.gltf_splats import write_gltf_splats
 from drgs_blender.formats.harmonics import basis, rotate_harmonics
@@ -28,7 +28,7 @@ from drgs_blender.formats.sog_writer import write_sog
 from drgs_blender.formats.splat_ply import write_splat_ply
 from drgs_blender.formats.splats import Splats, splats_from_z_up, splats_of
 from drgs_blender.formats.spz import write_spz
-from drgs_blender.geometry import rotation_matrices
+from drgs_blender.geometry.normals import rotation_matrices
 
 WRITERS = {".ply": write_splat_ply, ".spz": write_spz, ".glb": write_gltf_splats}
 

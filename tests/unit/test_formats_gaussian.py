@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drgs_blender.asset import Surfels
-from drgs_blender.colour import linear_to_srgb, srgb_to_linear
-from drgs_blender.errors import AssetError
+from drgs_blender.core.asset import Surfels
+from drgs_blender.core.color import linear_to_srgb, srgb_to_linear
+from drgs_blender.core.errors import AssetError
 from drgs_blender.formats.axes import UP_AXES, surfels_to_z_up
 from drgs_blender.formats.gaussian_ply import SH_C0
 from drgs_blender.formats.gltf_nodes import rotation_matrix

@@ -9,9 +9,9 @@ import pytest
 import trimesh
 from shapes import sphere_mesh
 
-from drgs_blender.asset import Mesh
 from drgs_blender.build.texture import Materials
-from drgs_blender.errors import UsageError
+from drgs_blender.core.asset import Mesh
+from drgs_blender.core.errors import UsageError
 from drgs_blender.formats.atlas import bake_atlas
 from drgs_blender.formats.axes import vectors_from_z_up
 from drgs_blender.formats.gltf_mesh import write_gltf_mesh

@@ -18,10 +18,10 @@ import pytest
 from fuzz_files import obj, square
 from splat_files import random_splats
 
-from drgs_blender.asset.archive import read_archive, replace_by, replace_file
 from drgs_blender.build.proxy import mesh_from_surfels
 from drgs_blender.cli.main import main
-from drgs_blender.errors import AssetError, WriteError
+from drgs_blender.core.asset.archive import read_archive, replace_by, replace_file
+from drgs_blender.core.errors import AssetError, WriteError
 from drgs_blender.formats import gltf_document, usd_stage
 from drgs_blender.formats.axes import scaled_surfels
 from drgs_blender.formats.glb import Glb
@@ -369,8 +369,8 @@ sys.path.insert(0, {str(Path(__file__).parent)!r})
 import numpy as np
 from pathlib import Path
 from splat_files import random_splats
-from drgs_blender.asset import Environment
-from drgs_blender.errors import WriteError
+from drgs_blender.core.asset import Environment
+from drgs_blender.core.errors import WriteError
 from drgs_blender.formats.writers import WRITERS
 writer = next(w for w in WRITERS if {suffix!r} in w.extensions)
 given = {given}

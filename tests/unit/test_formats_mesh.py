@@ -15,8 +15,8 @@ import pytest
 from PIL import Image as Pillow
 from scipy.spatial import cKDTree
 
-from drgs_blender.colour import srgb_to_linear
-from drgs_blender.errors import AssetError
+from drgs_blender.core.color import srgb_to_linear
+from drgs_blender.core.errors import AssetError
 from drgs_blender.formats.axes import vectors_to_z_up
 from drgs_blender.formats.gltf import read_gltf, uv_transform
 from drgs_blender.formats.registry import read_mesh

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from shapes import sphere_mesh
 from splat_files import covariance, random_splats
 
-from drgs_blender.asset import Mesh
+from drgs_blender.core.asset import Mesh
 from drgs_blender.formats.axes import multiply_quaternions, vectors_from_z_up
 from drgs_blender.formats.gltf_mesh import write_gltf_mesh
 from drgs_blender.formats.gltf_splats import EXTENSION, write_gltf_splats

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from splat_files import covariance, random_splats
 
-from drgs_blender.errors import UsageError
+from drgs_blender.core.errors import UsageError
 from drgs_blender.formats.palette import codebook, palette
 from drgs_blender.formats.registry import find_format, read_surfels
 from drgs_blender.formats.sog_writer import write_sog

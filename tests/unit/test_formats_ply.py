@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drgs_blender.colour import srgb_to_linear
-from drgs_blender.errors import AssetError
+from drgs_blender.core.color import srgb_to_linear
+from drgs_blender.core.errors import AssetError
 from drgs_blender.formats.ply import TYPES, parse_header, read_ply
 from drgs_blender.formats.ply_mesh import read_ply_mesh
 from drgs_blender.formats.registry import read

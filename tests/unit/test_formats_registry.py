@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drgs_blender.errors import AssetError
+from drgs_blender.core.errors import AssetError
 from drgs_blender.formats.files import EnvironmentFile, MeshFile, SurfelFile
 from drgs_blender.formats.registry import FORMATS, document, find_format, read, read_surfels
 

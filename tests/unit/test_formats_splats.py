@@ -19,9 +19,9 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from splat_files import covariance, damaged, random_splats, refusals
 
-from drgs_blender.asset import Surfels
-from drgs_blender.colour import linear_to_srgb, srgb_to_linear
-from drgs_blender.errors import AssetError, DeviceError
+from drgs_blender.core.asset import Surfels
+from drgs_blender.core.color import linear_to_srgb, srgb_to_linear
+from drgs_blender.core.errors import AssetError, DeviceError
 from drgs_blender.formats.axes import surfels_to_z_up
 from drgs_blender.formats.files import MeshFile
 from drgs_blender.formats.glb import Glb

@@ -12,9 +12,9 @@ import pytest
 from PIL import Image
 from shapes import sphere_mesh
 
-from drgs_blender.asset import Mesh
-from drgs_blender.colour import srgb_to_linear
-from drgs_blender.errors import UsageError
+from drgs_blender.core.asset import Mesh
+from drgs_blender.core.color import srgb_to_linear
+from drgs_blender.core.errors import UsageError
 from drgs_blender.formats.usd_mesh import write_usd_mesh
 
 

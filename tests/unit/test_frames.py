@@ -13,10 +13,10 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from drgs_blender.errors import AssetError, UsageError, WriteError
-from drgs_blender.passes import BY_NAME, PASSES
-from drgs_blender.render.picture import frames
-from drgs_blender.render.picture.frames import read_frame, write_frame
+from drgs_blender.core.errors import AssetError, UsageError, WriteError
+from drgs_blender.core.passes import BY_NAME, PASSES
+from drgs_blender.render.film import frame_files
+from drgs_blender.render.film.frame_files import read_frame, write_frame
 
 ROOT = Path(__file__).resolve().parents[2]
 BLENDER_PYTHON = ROOT / ".venv-blender" / "bin" / "python"
@@ -99,7 +99,7 @@ def test_a_failure_leaves_the_old_frame_and_nothing_else(tmp_path: Path, monkeyp
     def truncate(temporary: Path, *_: object) -> None:
         raise OSError("channel R reads back differently")
 
-    monkeypatch.setattr(frames, "_verify", truncate)
+    monkeypatch.setattr(frame_files, "_verify", truncate)
     with pytest.raises(WriteError) as caught:
         write_frame(path, some_passes((5, 5), ("Combined",)), {"run": "2"})
     assert caught.value.exit_code == 73

@@ -9,12 +9,12 @@ import pytest
 from test_integrate import points, settings
 from test_surface import mesh_state
 
-from drgs_blender.frame import Light, Material, MeshState, World
-from drgs_blender.render.lights.emitters import Emitters
-from drgs_blender.render.lights.lamps import Lamps
-from drgs_blender.render.lights.light import EnvironmentLight
-from drgs_blender.render.shade.integrate import integrate
-from drgs_blender.render.trace.scene import TraceScene
+from drgs_blender.core.frame import Light, Material, MeshState, World
+from drgs_blender.render.integrator.integrate import integrate
+from drgs_blender.render.lights.environment import EnvironmentLight
+from drgs_blender.render.lights.lights import Lamps
+from drgs_blender.render.lights.mesh_lights import Emitters
+from drgs_blender.render.scene.trace_scene import TraceScene
 
 FACES = np.int32([[0, 1, 2], [0, 2, 3]])
 RADIANCE = (2.0, 1.0, 0.5)

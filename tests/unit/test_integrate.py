@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 import trimesh
 
-from drgs_blender.colour import LUMINANCE
 from drgs_blender.compute.jit import get_num_threads, use_threads
-from drgs_blender.errors import UsageError
-from drgs_blender.frame import Light, RenderSettings, World
-from drgs_blender.render.lights.lamps import Lamps
-from drgs_blender.render.lights.light import EnvironmentLight
+from drgs_blender.core.color import LUMINANCE
+from drgs_blender.core.errors import UsageError
+from drgs_blender.core.frame import Light, RenderSettings, World
+from drgs_blender.render.integrator.integrate import integrate
+from drgs_blender.render.integrator.sample_allocation import ALPHA, COUNTS, HEAD, _allot
+from drgs_blender.render.lights.environment import EnvironmentLight
+from drgs_blender.render.lights.lights import Lamps
 from drgs_blender.render.points import DIFFUSE_DIRECT, DIFFUSE_INDIRECT, GLOSSY_DIRECT, Radiance, ShadingPoints
-from drgs_blender.render.shade.heads import ALPHA, COUNTS, HEAD, _allot
-from drgs_blender.render.shade.integrate import integrate
-from drgs_blender.render.trace.scene import TraceObject, TraceScene
+from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene
 
 WHITE = EnvironmentLight(World())
 

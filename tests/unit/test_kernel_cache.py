@@ -332,7 +332,7 @@ def test_what_is_used_is_not_removed(folder, compiled, use_folder):
 
 _PROGRAM = """
 import numpy as np
-from drgs_blender.geometry import VertexNormals
+from drgs_blender.geometry.normals import VertexNormals
 print(VertexNormals(np.array([[0, 1, 2]], np.int32), 3)(np.eye(3, dtype=np.float32)).tolist())
 """
 
@@ -386,7 +386,7 @@ def test_every_kernel_of_the_list_exists_and_its_types_can_be_read():
 )
 def test_a_list_that_does_not_fit_is_passed_over(text):
     with pytest.raises(LookupError):
-        manifest.signature(manifest.Kernel("drgs_blender.geometry", "_sum", text, 0.0))
+        manifest.signature(manifest.Kernel("drgs_blender.geometry.normals", "_sum", text, 0.0))
 
 
 def test_arrays_that_are_read_only_share_a_kernel_with_others(folder, compiled):

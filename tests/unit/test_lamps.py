@@ -7,10 +7,10 @@ import math
 import numpy as np
 import pytest
 
-from drgs_blender.frame import Light
-from drgs_blender.render.lights.lamp_shapes import CAMERA, DIFFUSE, GLOSSY, INTENSITY, PLACE, RADIANCE, SHADOW
-from drgs_blender.render.lights.lamp_tree import SECOND, lamps_weight, pick_lamp, pick_probability
-from drgs_blender.render.lights.lamps import Lamps, lamp_flags
+from drgs_blender.core.frame import Light
+from drgs_blender.render.lights.light_shapes import CAMERA, DIFFUSE, GLOSSY, INTENSITY, PLACE, RADIANCE, SHADOW
+from drgs_blender.render.lights.light_tree import SECOND, lamps_weight, pick_lamp, pick_probability
+from drgs_blender.render.lights.lights import Lamps, lamp_flags
 from drgs_blender.render.sampling import F, sobol
 
 NUMBERS = sobol(1 << 14)

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from test_lamps import light
 
-from drgs_blender.frame import Light
-from drgs_blender.render.lights.lamp_shapes import CAMERA, DIFFUSE, GLOSSY, SHADOW
-from drgs_blender.render.lights.lamps import Lamps, lamp_flags
+from drgs_blender.core.frame import Light
+from drgs_blender.render.lights.light_shapes import CAMERA, DIFFUSE, GLOSSY, SHADOW
+from drgs_blender.render.lights.lights import Lamps, lamp_flags
 from drgs_blender.render.sampling import sobol
 
 ROOT = Path(__file__).resolve().parents[2]

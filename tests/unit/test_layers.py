@@ -9,19 +9,19 @@ import pytest
 from shapes import look_along_y, sphere_mesh, sphere_surfels
 from test_surface import matrix, mesh_state
 
-from drgs_blender.asset.model import PosedSurfels
-from drgs_blender.frame import Camera, Frame, Material, ObjectState, RenderSettings, Visibility, World
-from drgs_blender.passes import BY_NAME
+from drgs_blender.core.asset.model import PosedSurfels
+from drgs_blender.core.frame import Camera, Frame, Material, ObjectState, RenderSettings, Visibility, World
+from drgs_blender.core.passes import BY_NAME
 from drgs_blender.render import pipeline
 from drgs_blender.render.camera import camera_parameters
-from drgs_blender.render.lights.light import EnvironmentLight
-from drgs_blender.render.picture.film import Film
+from drgs_blender.render.film.film import Film
+from drgs_blender.render.gbuffer.gbuffer import GBuffer
+from drgs_blender.render.gbuffer.mesh import primary_mesh
+from drgs_blender.render.gbuffer.surfels import primary_surfels, snap_windows
+from drgs_blender.render.lights.environment import EnvironmentLight
 from drgs_blender.render.points import CATCHER, SECOND, Radiance
-from drgs_blender.render.primary.gbuffer import GBuffer
-from drgs_blender.render.primary.primary_mesh import primary_mesh
-from drgs_blender.render.primary.primary_surfels import primary_surfels, snap_windows
+from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene
 from drgs_blender.render.surfels.splats import prepare
-from drgs_blender.render.trace.scene import TraceObject, TraceScene
 
 AA = 2
 SIZE = 24

@@ -7,11 +7,11 @@ import functools
 import numpy as np
 import pytest
 
-from drgs_blender.colour import LUMINANCE
 from drgs_blender.compute.jit import get_num_threads, set_num_threads
-from drgs_blender.errors import UsageError
-from drgs_blender.frame import World
-from drgs_blender.render.lights.light import EnvironmentLight
+from drgs_blender.core.color import LUMINANCE
+from drgs_blender.core.errors import UsageError
+from drgs_blender.core.frame import World
+from drgs_blender.render.lights.environment import EnvironmentLight
 
 
 def picture(kind: str) -> np.ndarray | None:

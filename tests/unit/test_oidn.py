@@ -7,9 +7,9 @@ import sys
 import numpy as np
 import pytest
 
-from drgs_blender.errors import DeviceError
-from drgs_blender.render.picture.oidn import available, denoise_oidn
-from drgs_blender.render.picture.signal import Guides
+from drgs_blender.core.errors import DeviceError
+from drgs_blender.render.denoise.oidn import available, denoise_oidn
+from drgs_blender.render.film.guides import Guides
 
 SIZE = 64
 
@@ -68,7 +68,7 @@ def test_absence_is_an_error_with_a_remedy(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_the_pipeline_says_so_before_it_renders(monkeypatch: pytest.MonkeyPatch) -> None:
-    from drgs_blender.frame import Camera, Frame, RenderSettings
+    from drgs_blender.core.frame import Camera, Frame, RenderSettings
     from drgs_blender.render.pipeline import render
 
     monkeypatch.setitem(sys.modules, "pyoidn", None)

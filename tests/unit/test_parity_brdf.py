@@ -10,12 +10,12 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from drgs_blender.compute.jit import njit  # noqa: E402
-from drgs_blender.frame import World  # noqa: E402
+from drgs_blender.core.frame import World  # noqa: E402
 from drgs_blender.render import sampling as kernel_sampling  # noqa: E402
-from drgs_blender.render.lights.light import EnvironmentLight  # noqa: E402
+from drgs_blender.render.integrator import brdf as kernel  # noqa: E402
+from drgs_blender.render.lights.environment import EnvironmentLight  # noqa: E402
 from drgs_blender.render.reference import brdf, sampling  # noqa: E402
 from drgs_blender.render.reference.light import Light  # noqa: E402
-from drgs_blender.render.shade import brdf as kernel  # noqa: E402
 
 torch.set_num_threads(1)
 F64 = torch.float64

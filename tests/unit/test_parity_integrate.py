@@ -12,8 +12,9 @@ from scipy import stats
 torch = pytest.importorskip("torch")
 trimesh = pytest.importorskip("trimesh")
 
-from drgs_blender.frame import RenderSettings, World  # noqa: E402
-from drgs_blender.render.lights.light import EnvironmentLight  # noqa: E402
+from drgs_blender.core.frame import RenderSettings, World  # noqa: E402
+from drgs_blender.render.integrator.integrate import integrate as kernel_integrate  # noqa: E402
+from drgs_blender.render.lights.environment import EnvironmentLight  # noqa: E402
 from drgs_blender.render.points import ShadingPoints  # noqa: E402
 from drgs_blender.render.reference.integrate import (  # noqa: E402
     Counts,
@@ -23,8 +24,7 @@ from drgs_blender.render.reference.integrate import (  # noqa: E402
     tracer_from_arrays,
 )
 from drgs_blender.render.reference.light import Light  # noqa: E402
-from drgs_blender.render.shade.integrate import integrate as kernel_integrate  # noqa: E402
-from drgs_blender.render.trace.scene import TraceObject, TraceScene  # noqa: E402
+from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene  # noqa: E402
 
 torch.set_num_threads(1)
 F64 = torch.float64

@@ -10,10 +10,10 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from drgs_blender.asset.model import PosedSurfels  # noqa: E402
-from drgs_blender.engine.blur import through  # noqa: E402
-from drgs_blender.errors import UsageError  # noqa: E402
-from drgs_blender.frame import Camera, RenderSettings  # noqa: E402
+from drgs_blender.core.asset.model import PosedSurfels  # noqa: E402
+from drgs_blender.core.errors import UsageError  # noqa: E402
+from drgs_blender.core.frame import Camera, RenderSettings  # noqa: E402
+from drgs_blender.ipc.blur import through  # noqa: E402
 from drgs_blender.render.camera import camera_parameters, camera_ray, check_camera, lattice, pixel_shift  # noqa: E402
 from drgs_blender.render.reference import raster as reference  # noqa: E402
 from drgs_blender.render.surfels import raster as kernel  # noqa: E402

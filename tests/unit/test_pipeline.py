@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from shapes import look_along_y, scene_of, sphere_mesh, sphere_surfels
 
-from drgs_blender.asset.model import PosedSurfels
-from drgs_blender.errors import Cancelled, UsageError
-from drgs_blender.frame import Camera, Frame, ObjectState, RenderSettings, World
-from drgs_blender.passes import BY_NAME
+from drgs_blender.core.asset.model import PosedSurfels
+from drgs_blender.core.errors import Cancelled, UsageError
+from drgs_blender.core.frame import Camera, Frame, ObjectState, RenderSettings, World
+from drgs_blender.core.passes import BY_NAME
 from drgs_blender.render import pipeline
-from drgs_blender.render.lights.light import EnvironmentLight
-from drgs_blender.render.trace.scene import TraceScene
+from drgs_blender.render.lights.environment import EnvironmentLight
+from drgs_blender.render.scene.trace_scene import TraceScene
 
 ALL = tuple(BY_NAME)
 

@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 from shapes import look_along_y, scene_of, sphere_mesh, sphere_surfels
 
-from drgs_blender.asset.model import PosedSurfels
-from drgs_blender.frame import Camera, RenderSettings, World
+from drgs_blender.core.asset.model import PosedSurfels
+from drgs_blender.core.frame import Camera, RenderSettings, World
 from drgs_blender.render.camera import camera_parameters
-from drgs_blender.render.lights.light import EnvironmentLight
+from drgs_blender.render.gbuffer.gbuffer import GBuffer
+from drgs_blender.render.gbuffer.mesh import primary_mesh
+from drgs_blender.render.gbuffer.surfels import primary_surfels, snap_windows
+from drgs_blender.render.integrator.integrate import integrate
+from drgs_blender.render.lights.environment import EnvironmentLight
 from drgs_blender.render.points import ShadingPoints
-from drgs_blender.render.primary.gbuffer import GBuffer
-from drgs_blender.render.primary.primary_mesh import primary_mesh
-from drgs_blender.render.primary.primary_surfels import primary_surfels, snap_windows
-from drgs_blender.render.shade.integrate import integrate
+from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene
 from drgs_blender.render.surfels.splats import prepare
-from drgs_blender.render.trace.scene import TraceObject, TraceScene
 
 SETTINGS = RenderSettings(aa=2, bounces=0, cosine=32, ggx=16, environment=16, look="paper")
 

@@ -17,12 +17,12 @@ ROOT = Path(__file__).resolve().parents[2]
 PROGRAM = """
 import hashlib
 import numpy as np
-from drgs_blender.colour import srgb_to_linear
-from drgs_blender.engine.objects import world_vertices
-from drgs_blender.frame import Light, World
-from drgs_blender.render.lights.lamps import Lamps
-from drgs_blender.render.lights.light import EnvironmentLight
-from drgs_blender.render.shade.brdf import layer_table
+from drgs_blender.core.color import srgb_to_linear
+from drgs_blender.engine.scene_objects import world_vertices
+from drgs_blender.core.frame import Light, World
+from drgs_blender.render.lights.lights import Lamps
+from drgs_blender.render.lights.environment import EnvironmentLight
+from drgs_blender.render.integrator.brdf import layer_table
 
 rng = np.random.default_rng(0)
 turns = np.tile(np.eye(4), (90, 1, 1))

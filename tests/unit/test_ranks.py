@@ -15,10 +15,7 @@ from drgs_blender.compute import closure
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "drgs_blender"
 #: What the extension may use of the engine's package.
-LIGHT_MODULES = tuple(
-    f"engine.{name}"
-    for name in ("protocol", "client", "codec", "slots", "shared", "child", "locate", "snapshots", "frame_file", "blur")
-)
+LIGHT = ("core", "ipc")
 
 
 def rank_table() -> dict[str, int]:
@@ -66,7 +63,7 @@ def test_lower_ranks_never_import_higher_ones():
             if parts[0] != "drgs_blender" or len(parts) < 2 or parts[1] not in RANKS:
                 continue
             other = RANKS[parts[1]]
-            sideways = other == rank and rank >= 2 and parts[1] != own
+            sideways = other == rank and parts[1] != own and own != "__init__"
             if other > rank or sideways:
                 wrong.append(f"{path.relative_to(ROOT)}:{line} (rank {rank}) imports {module} (rank {other})")
     assert not wrong, "\n".join(wrong)
@@ -116,13 +113,11 @@ def test_the_engine_never_imports_blender():
 
 
 def light_sources() -> list[Path]:
-    """Files that run in Blender's Python: rank 0 and the light modules of the engine."""
-    files = [path for path in sources(PACKAGE) if RANKS.get(top_level(path), 0) == 0]
-    files += [PACKAGE / (module.replace(".", "/") + ".py") for module in LIGHT_MODULES]
-    return [path for path in files if path.exists()]
+    """Files that run in Blender's Python."""
+    return [PACKAGE / "__init__.py", *(path for name in LIGHT for path in sources(PACKAGE / name))]
 
 
-def test_rank_zero_needs_numpy_alone():
+def test_what_the_extension_uses_needs_numpy_alone():
     allowed = {"numpy", "drgs_blender", *sys.stdlib_module_names}
     wrong = [
         f"{path.relative_to(ROOT)}:{line} imports {module}"
@@ -133,7 +128,7 @@ def test_rank_zero_needs_numpy_alone():
     assert not wrong, "\n".join(wrong)
 
 
-def test_rank_zero_imports_are_relative():
+def test_what_the_extension_uses_imports_relatively():
     """Inside Blender the package is called bl_ext.<repository>.<id>.drgs_blender."""
     wrong = [
         f"{path.relative_to(ROOT)}:{line} imports {module}"
@@ -146,7 +141,6 @@ def test_rank_zero_imports_are_relative():
 
 @pytest.mark.parametrize("folder", ["addon", "operators"])
 def test_extension_uses_only_the_light_part_by_relative_import(folder):
-    light = tuple(name for name, rank in RANKS.items() if rank == 0)
     wrong = []
     for path in sources(ROOT / folder):
         for line, module, level in imports(path, ROOT):
@@ -156,7 +150,7 @@ def test_extension_uses_only_the_light_part_by_relative_import(folder):
                 if level == 0:
                     wrong.append(f"{where} absolutely")
                 inside = ".".join(parts[1:])
-                is_light = inside in ("", "__version__") or parts[1] in light or inside.startswith(LIGHT_MODULES)
+                is_light = inside in ("", "__version__") or parts[1] in LIGHT
                 if parts[0] == "drgs_blender" and not is_light:
                     wrong.append(f"{where}, which needs more than numpy")
             elif parts[0] in ("numba", "torch", "embreex", "OpenEXR", "scipy", "trimesh", "igl", "PIL", "tqdm"):

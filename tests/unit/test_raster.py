@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drgs_blender.asset.model import PosedSurfels
-from drgs_blender.errors import UsageError
-from drgs_blender.frame import Camera, RenderSettings
+from drgs_blender.core.asset.model import PosedSurfels
+from drgs_blender.core.errors import UsageError
+from drgs_blender.core.frame import Camera, RenderSettings
 from drgs_blender.render.camera import camera_parameters, lattice, pixel_shift
 from drgs_blender.render.surfels import raster
 from drgs_blender.render.surfels import splats as screen

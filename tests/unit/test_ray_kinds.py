@@ -10,11 +10,11 @@ import pytest
 from test_glow import lamp, panel, wall
 from test_integrate import points, settings, sun_picture
 
-from drgs_blender.frame import Light, MeshState, Visibility, World
-from drgs_blender.render.lights.lamps import Lamps
-from drgs_blender.render.lights.light import EnvironmentLight
-from drgs_blender.render.shade.integrate import integrate
-from drgs_blender.render.trace.scene import TraceScene
+from drgs_blender.core.frame import Light, MeshState, Visibility, World
+from drgs_blender.render.integrator.integrate import integrate
+from drgs_blender.render.lights.environment import EnvironmentLight
+from drgs_blender.render.lights.lights import Lamps
+from drgs_blender.render.scene.trace_scene import TraceScene
 
 DARK = World(strength=0.0)
 

@@ -8,7 +8,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from drgs_blender.formats.harmonics import basis  # noqa: E402
-from drgs_blender.reconstruct.attributes import attributes, frames  # noqa: E402
+from drgs_blender.reconstruct.model.attributes import attributes, frames  # noqa: E402
 
 EYE = np.array([0.3, -4.0, 1.0])
 

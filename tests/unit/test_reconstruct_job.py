@@ -14,16 +14,16 @@ pytest.importorskip("skimage")
 
 from capture_cases import balls, colour_of_balls, distance_to_balls, write  # noqa: E402
 
-from drgs_blender.asset.container import read_asset, write_asset  # noqa: E402
-from drgs_blender.colour import linear_to_srgb  # noqa: E402
-from drgs_blender.errors import AssetError, Cancelled, UsageError, WriteError  # noqa: E402
-from drgs_blender.geometry import VertexNormals  # noqa: E402
-from drgs_blender.reconstruct.capture import Capture  # noqa: E402
+from drgs_blender.core.asset.container import read_asset, write_asset  # noqa: E402
+from drgs_blender.core.color import linear_to_srgb  # noqa: E402
+from drgs_blender.core.errors import AssetError, Cancelled, UsageError, WriteError  # noqa: E402
+from drgs_blender.geometry.normals import VertexNormals  # noqa: E402
+from drgs_blender.reconstruct.capture.capture import Capture  # noqa: E402
 from drgs_blender.reconstruct.checkpoint import fingerprint  # noqa: E402
-from drgs_blender.reconstruct.decouple.settings import Settings as Decoupling  # noqa: E402
-from drgs_blender.reconstruct.hull import find_region  # noqa: E402
-from drgs_blender.reconstruct.job import Settings, reconstruct  # noqa: E402
-from drgs_blender.reconstruct.train import Schedule, Training  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering.settings import Settings as Decoupling  # noqa: E402
+from drgs_blender.reconstruct.meshing.visual_hull import find_region  # noqa: E402
+from drgs_blender.reconstruct.optim.train import Schedule, Training  # noqa: E402
+from drgs_blender.reconstruct.pipeline import Settings, reconstruct  # noqa: E402
 
 QUICK = Schedule(iterations=240, surfels=2500)
 
@@ -240,7 +240,7 @@ def test_what_cannot_be_reconstructed_is_refused_by_name(case):
 
 
 def test_more_voxels_than_memory_are_refused_before_anything_is_learned(capture, monkeypatch):
-    monkeypatch.setattr("drgs_blender.reconstruct.memory.memory", lambda: 1024.0)
+    monkeypatch.setattr("drgs_blender.reconstruct.memory_budget.memory", lambda: 1024.0)
     told = []
     with pytest.raises(UsageError, match="--voxels"):
         reconstruct(capture, Settings(schedule=Schedule(iterations=2), materials=False), told.append)
@@ -256,7 +256,7 @@ def test_the_command_writes_an_asset_and_its_preview(tmp_path, capsys, monkeypat
     write(balls(10, 32), tmp_path)
     out = tmp_path / "made" / "balls.drgs"
     options = ["--iterations", "30", "--surfels", "800", "--voxels", "32", "--test-every", "5", "--no-materials"]
-    monkeypatch.setattr("drgs_blender.device.warp.cuda_devices", list)
+    monkeypatch.setattr("drgs_blender.compute.warp.runtime.cuda_devices", list)
     code = main(["reconstruct", str(tmp_path), "--out", str(out), *options, "--device", "cuda"])
     said, warned = capsys.readouterr()
     assert "device cuda" in warned and "Learned on the CPU" in warned

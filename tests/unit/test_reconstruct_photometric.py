@@ -7,8 +7,8 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from drgs_blender.reconstruct.adam import Adam  # noqa: E402
-from drgs_blender.reconstruct.photometric import Photograph, difference, structural_similarity  # noqa: E402
+from drgs_blender.reconstruct.losses.photometric import Photograph, difference, structural_similarity  # noqa: E402
+from drgs_blender.reconstruct.optim.adam import Adam  # noqa: E402
 
 
 def window() -> torch.Tensor:

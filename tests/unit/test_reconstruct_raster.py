@@ -7,12 +7,12 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from drgs_blender.asset.model import PosedSurfels  # noqa: E402
 from drgs_blender.compute.jit import get_num_threads, set_num_threads  # noqa: E402
-from drgs_blender.errors import UsageError  # noqa: E402
-from drgs_blender.frame import Camera, RenderSettings  # noqa: E402
-from drgs_blender.reconstruct.raster import Tally, rasterise  # noqa: E402
-from drgs_blender.reconstruct.screen import LOW_PASS  # noqa: E402
+from drgs_blender.core.asset.model import PosedSurfels  # noqa: E402
+from drgs_blender.core.errors import UsageError  # noqa: E402
+from drgs_blender.core.frame import Camera, RenderSettings  # noqa: E402
+from drgs_blender.reconstruct.model.projection import LOW_PASS  # noqa: E402
+from drgs_blender.reconstruct.model.raster import Tally, rasterise  # noqa: E402
 from drgs_blender.render.camera import camera_parameters  # noqa: E402
 from drgs_blender.render.reference import raster as reference  # noqa: E402
 from drgs_blender.render.surfels import raster as renderer  # noqa: E402

@@ -7,7 +7,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from drgs_blender.reconstruct.reflection import BARE, LEVELS, dark_cube, mirrored, pyramid  # noqa: E402
+from drgs_blender.reconstruct.model.reflection_probe import BARE, LEVELS, dark_cube, mirrored, pyramid  # noqa: E402
 
 
 def reflected(normal, rays, blur, texels, tint=1.0, alpha=1.0):

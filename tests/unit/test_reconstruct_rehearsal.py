@@ -14,10 +14,10 @@ pytest.importorskip("skimage")
 
 from capture_cases import balls
 
-from drgs_blender.phases import PREPARING
-from drgs_blender.reconstruct.decouple.settings import Settings as Decoupling
-from drgs_blender.reconstruct.job import Settings, reconstruct
-from drgs_blender.reconstruct.train import Schedule
+from drgs_blender.core.phases import PREPARING
+from drgs_blender.reconstruct.inverse_rendering.settings import Settings as Decoupling
+from drgs_blender.reconstruct.optim.train import Schedule
+from drgs_blender.reconstruct.pipeline import Settings, reconstruct
 
 #: A process of its own, where nothing is compiled yet: prints the steps by which a kernel was made or loaded.
 STEPS = """
@@ -26,9 +26,9 @@ from numba.core.dispatcher import Dispatcher
 sys.path.insert(0, sys.argv[1])
 from capture_cases import balls
 from drgs_blender.reconstruct import job
-from drgs_blender.reconstruct.decouple import run
-from drgs_blender.reconstruct.decouple.settings import Settings as Decoupling
-from drgs_blender.reconstruct.train import Schedule, Training
+from drgs_blender.reconstruct.inverse_rendering import run
+from drgs_blender.reconstruct.inverse_rendering.settings import Settings as Decoupling
+from drgs_blender.reconstruct.optim.train import Schedule, Training
 
 variant, masked = sys.argv[2], sys.argv[3] == "masks"
 watching, rehearse = False, job.rehearse
@@ -71,7 +71,7 @@ def test_no_step_that_is_timed_compiles(variant, masks):
 @pytest.mark.parametrize("minutes", [None, 0.01], ids=["by steps", "by the clock"])
 def test_too_little_time_for_materials_is_said(minutes, monkeypatch, caplog):
     rehearsed, told = [], []
-    monkeypatch.setattr("drgs_blender.reconstruct.job.rehearse", lambda *_: rehearsed.append(1))
+    monkeypatch.setattr("drgs_blender.reconstruct.pipeline.rehearse", lambda *_: rehearsed.append(1))
     quick = Decoupling(iterations=4 if minutes is None else 10**6, pixels=64, normals=True)
     settings = Settings(schedule=Schedule(iterations=10, surfels=400), mesh_resolution=16, decoupling=quick)
     reconstruct(balls(8, 24), replace(settings, minutes=minutes), told.append)

@@ -8,8 +8,8 @@ from shapes import plain_mesh, sphere_mesh
 
 from drgs_blender.deform.attach import attach
 from drgs_blender.deform.mesh_driven import MeshDriven
-from drgs_blender.geometry import VertexNormals, rotation_matrices, unit
-from drgs_blender.reconstruct.relief import follow_normals, shaded_by, shaded_by_own
+from drgs_blender.geometry.normals import VertexNormals, rotation_matrices, unit
+from drgs_blender.reconstruct.meshing.normal_integration import follow_normals, shaded_by, shaded_by_own
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from drgs_blender.reconstruct.shape import shape_loss  # noqa: E402
+from drgs_blender.reconstruct.losses.shape import shape_loss  # noqa: E402
 
 HEIGHT, WIDTH = 14, 17
 

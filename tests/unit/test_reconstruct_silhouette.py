@@ -14,12 +14,12 @@ pytest.importorskip("skimage")
 from capture_cases import balls, camera
 from shapes import plain_mesh, sphere_mesh
 
-from drgs_blender.errors import UsageError
-from drgs_blender.frame import Camera
-from drgs_blender.reconstruct import tsdf
-from drgs_blender.reconstruct.hull import Region, silhouettes
-from drgs_blender.reconstruct.silhouette import FARTHEST, fill_silhouettes
-from drgs_blender.reconstruct.targets import pixel_rays
+from drgs_blender.core.errors import UsageError
+from drgs_blender.core.frame import Camera
+from drgs_blender.reconstruct.capture.training_views import pixel_rays
+from drgs_blender.reconstruct.meshing import tsdf
+from drgs_blender.reconstruct.meshing.silhouette_fit import FARTHEST, fill_silhouettes
+from drgs_blender.reconstruct.meshing.visual_hull import Region, silhouettes
 
 SIZE, RADIUS = 96, 0.7
 PIXEL = 4.0 / camera(0, 1, SIZE).fx
@@ -71,7 +71,7 @@ def test_more_voxels_than_memory_are_refused_with_how_many_fit(cameras, monkeypa
     def begun(*_):
         raise LookupError
 
-    monkeypatch.setattr("drgs_blender.reconstruct.memory.memory", lambda: 2.0**25)
+    monkeypatch.setattr("drgs_blender.reconstruct.memory_budget.memory", lambda: 2.0**25)
     monkeypatch.setattr(tsdf, "surface_maps", begun)
     sharp = [replace(view, fx=9 * view.fx) for view in cameras]
     low = np.full(3, -RADIUS)

@@ -14,11 +14,11 @@ torch = pytest.importorskip("torch")
 from capture_cases import balls, photographed, rays_of  # noqa: E402
 from captures import ring  # noqa: E402
 
-from drgs_blender.frame import Camera  # noqa: E402
-from drgs_blender.reconstruct import train  # noqa: E402
-from drgs_blender.reconstruct.capture import Capture, View  # noqa: E402
-from drgs_blender.reconstruct.hull import _surface, _widened, find_region  # noqa: E402
-from drgs_blender.reconstruct.train import Schedule, Training  # noqa: E402
+from drgs_blender.core.frame import Camera  # noqa: E402
+from drgs_blender.reconstruct.capture.capture import Capture, View  # noqa: E402
+from drgs_blender.reconstruct.meshing.visual_hull import _surface, _widened, find_region  # noqa: E402
+from drgs_blender.reconstruct.optim import train  # noqa: E402
+from drgs_blender.reconstruct.optim.train import Schedule, Training  # noqa: E402
 
 #: A ball out of which another one took a bite: centres and radii. The rim of the bite is 0.31 above its ground.
 BOWL, BITE = (np.zeros(3), 0.9), (np.array([0.0, 0.0, 1.1]), 0.75)

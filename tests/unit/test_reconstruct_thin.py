@@ -13,14 +13,14 @@ pytest.importorskip("skimage")
 
 from capture_cases import balls  # noqa: E402
 
-from drgs_blender.asset.model import Mesh  # noqa: E402
-from drgs_blender.geometry import rotation_matrices, unit  # noqa: E402
-from drgs_blender.reconstruct import job  # noqa: E402
-from drgs_blender.reconstruct.decouple.settings import Settings as Decoupling  # noqa: E402
-from drgs_blender.reconstruct.gaussians import Gaussians  # noqa: E402
-from drgs_blender.reconstruct.job import Settings, reconstruct  # noqa: E402
-from drgs_blender.reconstruct.thin import is_thin, normals_of  # noqa: E402
-from drgs_blender.reconstruct.train import Schedule  # noqa: E402
+from drgs_blender.core.asset.model import Mesh  # noqa: E402
+from drgs_blender.geometry.normals import rotation_matrices, unit  # noqa: E402
+from drgs_blender.reconstruct import pipeline  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering.settings import Settings as Decoupling  # noqa: E402
+from drgs_blender.reconstruct.model.gaussians import Gaussians  # noqa: E402
+from drgs_blender.reconstruct.model.thin_structures import is_thin, normals_of  # noqa: E402
+from drgs_blender.reconstruct.optim.train import Schedule  # noqa: E402
+from drgs_blender.reconstruct.pipeline import Settings, reconstruct  # noqa: E402
 
 RIBS = 12
 
@@ -67,15 +67,15 @@ def test_what_surfels_show_faces_the_viewer(views):
 @pytest.mark.parametrize("thin", [True, False])
 def test_surfels_of_thin_things_are_shaded_by_their_own_normals(thin, monkeypatch):
     told = []
-    learn = job.decouple
-    monkeypatch.setattr(job, "is_thin", lambda *_: thin)
-    monkeypatch.setattr(job, "decouple", lambda *given: told.append(given[-1]) or learn(*given))
+    learn = pipeline.decouple
+    monkeypatch.setattr(pipeline, "is_thin", lambda *_: thin)
+    monkeypatch.setattr(pipeline, "decouple", lambda *given: told.append(given[-1]) or learn(*given))
     quick = Decoupling(iterations=5, pixels=64, cosine=2, ggx=2, light=2, environment=8, normals=True)
     settings = Settings(schedule=Schedule(iterations=60, surfels=1500), mesh_resolution=32, decoupling=quick)
     asset = reconstruct(balls(), settings)
     assert asset.provenance["report"]["thin"] is thin
     assert [normals is not None for normals in told] == [thin]  # learned with them, too
     own = rotation_matrices(asset.surfels.rotation.astype(np.float64))[..., 2]
-    driven = job.MeshDriven(asset.mesh, asset.surfels, asset.binding).pose(asset.mesh.vertices)
+    driven = pipeline.MeshDriven(asset.mesh, asset.surfels, asset.binding).pose(asset.mesh.vertices)
     cosine = np.abs((own * driven.normal).sum(axis=1))
     assert (np.quantile(cosine, 0.02) > 0.999) == thin

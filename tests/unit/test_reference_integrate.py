@@ -9,7 +9,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from drgs_blender.frame import World  # noqa: E402
+from drgs_blender.core.frame import World  # noqa: E402
 from drgs_blender.render.reference import brdf  # noqa: E402
 from drgs_blender.render.reference.integrate import (  # noqa: E402
     Counts,

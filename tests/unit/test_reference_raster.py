@@ -9,7 +9,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from drgs_blender.frame import Camera  # noqa: E402
+from drgs_blender.core.frame import Camera  # noqa: E402
 from drgs_blender.render.reference.brdf import normalise  # noqa: E402
 from drgs_blender.render.reference.raster import (  # noqa: E402
     MIN_ALPHA,

@@ -10,7 +10,7 @@ from scipy import stats
 
 torch = pytest.importorskip("torch")
 
-from drgs_blender.frame import World  # noqa: E402
+from drgs_blender.core.frame import World  # noqa: E402
 from drgs_blender.render.reference import brdf, sampling  # noqa: E402
 from drgs_blender.render.reference.light import Light, directions_of  # noqa: E402
 

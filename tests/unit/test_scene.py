@@ -9,8 +9,8 @@ import pytest
 import trimesh
 
 from drgs_blender.compute.jit import get_num_threads, use_threads
-from drgs_blender.errors import AssetError, UsageError
-from drgs_blender.render.trace.scene import ALBEDO, METALLIC, NORMAL, ROUGHNESS, TraceObject, TraceScene
+from drgs_blender.core.errors import AssetError, UsageError
+from drgs_blender.render.scene.trace_scene import ALBEDO, METALLIC, NORMAL, ROUGHNESS, TraceObject, TraceScene
 
 
 def trace_object(vertices: np.ndarray, faces: np.ndarray, name: str = "thing", **changes: object) -> TraceObject:

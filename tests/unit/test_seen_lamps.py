@@ -11,11 +11,11 @@ from shapes import look_along_y
 from test_layers import FACES, SIZE, SQUARE, veil, wall
 from test_surface import matrix, mesh_state
 
-from drgs_blender.frame import Frame, Light, Material, RenderSettings, Visibility, World
-from drgs_blender.render.lights.lamps import Lamps
-from drgs_blender.render.lights.light import EnvironmentLight
+from drgs_blender.core.frame import Frame, Light, Material, RenderSettings, Visibility, World
+from drgs_blender.render.lights.environment import EnvironmentLight
+from drgs_blender.render.lights.lights import Lamps
 from drgs_blender.render.pipeline import render
-from drgs_blender.render.trace.scene import TraceScene
+from drgs_blender.render.scene.trace_scene import TraceScene
 
 BLACK = Material("black", (0.0, 0.0, 0.0), 1.0)
 #: Radiance of `panel`: power times colour over pi times its area.

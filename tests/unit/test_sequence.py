@@ -8,10 +8,10 @@ import pytest
 from splat_files import random_splats
 
 from drgs_blender.cli.main import main
-from drgs_blender.errors import UsageError
+from drgs_blender.core.errors import UsageError
+from drgs_blender.core.frame_sequences import frame_path, frames_of, template_of
 from drgs_blender.formats.registry import read_surfels
 from drgs_blender.formats.splat_ply import write_splat_ply
-from drgs_blender.sequence import frame_path, frames_of, template_of
 
 
 def test_numbered_files_are_told_from_others(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ import pytest
 from drgs_blender.cli import doctor
 from drgs_blender.compute import folders, kernel_cache, prepare, shipped, targets
 from drgs_blender.compute.jit import njit
-from drgs_blender.errors import DeviceError
+from drgs_blender.core.errors import DeviceError
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.append(str(ROOT / "tools"))
@@ -173,7 +173,8 @@ def test_the_zip_brings_only_kernels_made_from_its_own_sources(tmp_path):
         if (ROOT / name).is_file():
             shutil.copy(ROOT / name, tmp_path / name)
     (tmp_path / "drgs_blender" / "compute" / "kernels").mkdir(parents=True)
-    shutil.copy(ROOT / "drgs_blender" / "version.py", tmp_path / "drgs_blender")
+    (tmp_path / "drgs_blender" / "core").mkdir()
+    shutil.copy(ROOT / "drgs_blender" / "core" / "version.py", tmp_path / "drgs_blender" / "core")
     folder = tmp_path / extension.KERNELS
     with pytest.raises(ValueError, match="holds no kernels"):
         extension.build(tmp_path / "a.zip", tmp_path, with_kernels=True)
@@ -207,9 +208,9 @@ _FRAME = """
 import hashlib, sys
 import numpy as np
 from numba.core import event
-from drgs_blender.asset.container import read_asset
+from drgs_blender.core.asset.container import read_asset
 from drgs_blender.engine.session import Session
-from drgs_blender.frame import Camera, Frame, ObjectState, RenderSettings, World
+from drgs_blender.core.frame import Camera, Frame, ObjectState, RenderSettings, World
 
 class Count(event.Listener):
     names = []

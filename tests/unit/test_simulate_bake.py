@@ -16,17 +16,17 @@ import numpy as np
 import pytest
 import trimesh
 
-from drgs_blender import particle_cache
-from drgs_blender.asset.container import write_asset
-from drgs_blender.asset.model import Asset, Mesh
 from drgs_blender.cli.main import main
+from drgs_blender.core import particle_cache
+from drgs_blender.core.asset.container import write_asset
+from drgs_blender.core.asset.model import Asset, Mesh
+from drgs_blender.core.errors import AssetError, Cancelled, UsageError, WriteError
+from drgs_blender.core.particle_cache import ParticleCache
 from drgs_blender.deform.attach import attach
-from drgs_blender.errors import AssetError, Cancelled, UsageError, WriteError
 from drgs_blender.formats.usd_points import write_usd_points
-from drgs_blender.particle_cache import ParticleCache
-from drgs_blender.simulate.bake import bake
-from drgs_blender.simulate.job import prepare
-from drgs_blender.simulate.settings import parse_settings
+from drgs_blender.simulation.bake import bake
+from drgs_blender.simulation.job import prepare
+from drgs_blender.simulation.settings import parse_settings
 
 DROP = {"resolution": 8, "floor": 0.0, "material": {"name": "jelly", "young": 2e4}, "last": 6}
 

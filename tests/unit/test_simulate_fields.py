@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from matter_cases import lattice, solver_of
 
-from drgs_blender.errors import UsageError
-from drgs_blender.simulate.fields import FieldRows, ForceField, noise, push_of
-from drgs_blender.simulate.lattice import Lattice
-from drgs_blender.simulate.settings import parse_settings
-from drgs_blender.simulate.solver import Forces
+from drgs_blender.core.errors import UsageError
+from drgs_blender.simulation.fields import FieldRows, ForceField, noise, push_of
+from drgs_blender.simulation.settings import parse_settings
+from drgs_blender.simulation.solver import Forces
+from drgs_blender.simulation.xpbd import Lattice
 
 
 def still(kind, *, place=(0, 0, 0), axis=(0, 0, 1), strength=1.0, flow=0.0, **more):

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from drgs_blender.errors import AssetError, UsageError
-from drgs_blender.simulate.fill import fill
+from drgs_blender.core.errors import AssetError, UsageError
+from drgs_blender.simulation.fill import fill
 
 
 def ball(levels: int = 4) -> trimesh.Trimesh:

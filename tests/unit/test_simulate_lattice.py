@@ -7,11 +7,11 @@ import pytest
 from matter_cases import cantilever, lattice, solver_of, timoshenko
 
 from drgs_blender.compute.jit import get_num_threads, set_num_threads
-from drgs_blender.errors import Cancelled, UsageError
-from drgs_blender.simulate.colliders import Collider
-from drgs_blender.simulate.contact import Plane
-from drgs_blender.simulate.lattice import Lattice
-from drgs_blender.simulate.solver import Forces
+from drgs_blender.core.errors import Cancelled, UsageError
+from drgs_blender.simulation.colliders import Collider
+from drgs_blender.simulation.contact import Plane
+from drgs_blender.simulation.solver import Forces
+from drgs_blender.simulation.xpbd import Lattice
 
 FRAME = 1 / 24
 

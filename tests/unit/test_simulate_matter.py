@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drgs_blender.errors import UsageError
-from drgs_blender.matter import MATERIALS, MODELS, make_material
-from drgs_blender.simulate.decompose import svd3
-from drgs_blender.simulate.settings import parse_settings
-from drgs_blender.simulate.stress import respond
+from drgs_blender.core.errors import UsageError
+from drgs_blender.core.sim_materials import MATERIALS, MODELS, make_material
+from drgs_blender.simulation.constitutive import respond
+from drgs_blender.simulation.decompose import svd3
+from drgs_blender.simulation.settings import parse_settings
 
 SOLID = [name for name, m in MATERIALS.items() if m.model != "fluid"]
 

@@ -12,9 +12,9 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from drgs_blender.compute.jit import get_num_threads, set_num_threads
-from drgs_blender.errors import Cancelled, UsageError
-from drgs_blender.simulate.colliders import Collider
-from drgs_blender.simulate.contact import Plane
+from drgs_blender.core.errors import Cancelled, UsageError
+from drgs_blender.simulation.colliders import Collider
+from drgs_blender.simulation.contact import Plane
 
 FRAME = 1 / 24
 
@@ -452,9 +452,9 @@ def test_riders_are_not_lost_when_sand_falls_apart():
 
 
 def test_riders_move_with_the_matter():
-    from drgs_blender.matter import make_material, matter_of
-    from drgs_blender.simulate.blocks import Domain
-    from drgs_blender.simulate.solver import Body, Forces, Solver
+    from drgs_blender.core.sim_materials import make_material, matter_of
+    from drgs_blender.simulation.blocks import Domain
+    from drgs_blender.simulation.solver import Body, Forces, Solver
 
     h = 0.1
     points = lattice((0.5, 0.5, 0.5), h / 2)

@@ -8,12 +8,12 @@ import trimesh
 from matter_cases import lattice, solver_of
 from scipy.spatial.transform import Rotation
 
-from drgs_blender.errors import Cancelled, UsageError
-from drgs_blender.simulate.colliders import Collider
-from drgs_blender.simulate.contact import Plane
-from drgs_blender.simulate.fields import ForceField
-from drgs_blender.simulate.rigid import Rigid
-from drgs_blender.simulate.solver import Forces
+from drgs_blender.core.errors import Cancelled, UsageError
+from drgs_blender.simulation.colliders import Collider
+from drgs_blender.simulation.contact import Plane
+from drgs_blender.simulation.fields import ForceField
+from drgs_blender.simulation.rigid import Rigid
+from drgs_blender.simulation.solver import Forces
 
 FRAME = 1 / 24
 GRAVITY = (0.0, 0.0, -9.81)

@@ -7,9 +7,9 @@ import pytest
 import trimesh
 from matter_cases import lattice
 
-from drgs_blender.errors import UsageError
-from drgs_blender.simulate.colliders import Collider, MovingCollider, check_apart
-from drgs_blender.simulate.contact import Plane, plane_rows
+from drgs_blender.core.errors import UsageError
+from drgs_blender.simulation.colliders import Collider, MovingCollider, check_apart
+from drgs_blender.simulation.contact import Plane, plane_rows
 
 CELL = 0.1
 

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 from test_integrate import EMPTY, WHITE, points
 
-from drgs_blender.frame import RenderSettings
+from drgs_blender.core.frame import RenderSettings
+from drgs_blender.render.integrator.adaptive import part_count, sample_adaptively
+from drgs_blender.render.integrator.integrate import integrate
+from drgs_blender.render.integrator.variance import variances
 from drgs_blender.render.points import Radiance, ShadingPoints
-from drgs_blender.render.shade.adaptive import part_count, sample_adaptively
-from drgs_blender.render.shade.integrate import integrate
-from drgs_blender.render.shade.spread import variances
 
 
 def pixels(count: int, aa: int) -> ShadingPoints:

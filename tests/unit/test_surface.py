@@ -9,11 +9,11 @@ import pytest
 import trimesh
 
 from drgs_blender.compute.jit import njit
-from drgs_blender.errors import AssetError, UsageError
-from drgs_blender.frame import Image, Material, MeshState, Texture, Visibility
-from drgs_blender.render.trace import masks
-from drgs_blender.render.trace.scene import TraceObject, TraceScene
-from drgs_blender.render.trace.surface import nearest, position_at, shadowed, surface_at
+from drgs_blender.core.errors import AssetError, UsageError
+from drgs_blender.core.frame import Image, Material, MeshState, Texture, Visibility
+from drgs_blender.render.scene import ray_masks
+from drgs_blender.render.scene.interaction import nearest, position_at, shadowed, surface_at
+from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene
 
 F = np.float32
 
@@ -219,7 +219,7 @@ def test_what_moves_is_followed_as_if_it_were_new() -> None:
         fresh.update(objects, meshes, [PICTURE])
         assert scene.extent == fresh.extent
         np.testing.assert_array_equal(scene.pass_index, fresh.pass_index)
-        for mask in (-1, masks.GLOSSY, masks.ORDINARY, masks.SURFELS):
+        for mask in (-1, ray_masks.GLOSSY, ray_masks.ORDINARY, ray_masks.SURFELS):
             for a, b in zip(meet(scene, origins, directions, mask), meet(fresh, origins, directions, mask)):
                 assert (
                     np.abs(np.nan_to_num(a) - np.nan_to_num(b)).reshape(len(a), -1).max(axis=1) < 1e-4
@@ -243,15 +243,16 @@ def test_visibility_decides_what_rays_meet() -> None:
     scene = TraceScene()
     scene.update(objects, meshes)
     expected = {
-        masks.CAMERA: (2.0, 1), masks.DIFFUSE: (1.0, 0), masks.GLOSSY: (0.7, 5), masks.SHADOW: (0.5, 2),
-        masks.SURFELS: (1.0, 0), masks.ORDINARY: (3.0, 4), masks.DIFFUSE << masks.WITHOUT: (2.0, 1),
-        masks.GLOSSY << masks.WITHOUT: (np.inf, -1), masks.SHADOW << masks.WITHOUT: (2.0, 1), -1: (0.5, 2),
+        ray_masks.CAMERA: (2.0, 1), ray_masks.DIFFUSE: (1.0, 0), ray_masks.GLOSSY: (0.7, 5), ray_masks.SHADOW: (0.5, 2),
+        ray_masks.SURFELS: (1.0, 0), ray_masks.ORDINARY: (3.0, 4), ray_masks.DIFFUSE << ray_masks.WITHOUT: (2.0, 1),
+        ray_masks.GLOSSY << ray_masks.WITHOUT: (np.inf, -1), ray_masks.SHADOW << ray_masks.WITHOUT: (2.0, 1),
+        -1: (0.5, 2),
     }  # fmt: skip
     for mask, (distance, owner) in expected.items():
         t, numbers, _ = meet(scene, [[0.1, 0.2, 0]], [[0, 0, 1]], mask)
         assert t[0] == pytest.approx(distance, rel=1e-6), mask
         assert (numbers[0, 2], numbers[0, 3]) == (owner, owner >= 0), mask
-    np.testing.assert_array_equal(scene.object_flags, [0, masks.CATCHER, 0, 0, masks.HOLDOUT, 0, 0])
+    np.testing.assert_array_equal(scene.object_flags, [0, ray_masks.CATCHER, 0, 0, ray_masks.HOLDOUT, 0, 0])
     assert scene.any_ordinary
 
 

@@ -13,8 +13,8 @@ import pytest
 from clouds import blend_all, cloud, join, rays, select
 from shapes import sphere_surfels
 
-from drgs_blender.asset.model import PosedSurfels
-from drgs_blender.errors import UsageError
+from drgs_blender.core.asset.model import PosedSurfels
+from drgs_blender.core.errors import UsageError
 from drgs_blender.render.surfels.surfel_bvh import SurfelBVH
 from drgs_blender.render.surfels.surfel_query import CAPACITY
 from drgs_blender.render.surfels.surfel_tracer import Starts, SurfelHits, trace, transmittance_many

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from drgs_blender.compute import targets
-from drgs_blender.errors import DeviceError, UsageError
+from drgs_blender.core.errors import DeviceError, UsageError
 
 ROOT = Path(__file__).resolve().parents[2]
 V4, V3 = (next(t for t in targets.TARGETS if t.name == name) for name in ("x86-64-v4", "x86-64-v3"))

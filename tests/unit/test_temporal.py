@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 
 from drgs_blender.compute.jit import get_num_threads, use_threads
-from drgs_blender.frame import Camera, RenderSettings
+from drgs_blender.core.frame import Camera, RenderSettings
 from drgs_blender.render.camera import camera_parameters, camera_ray
-from drgs_blender.render.picture.denoise import prepare
-from drgs_blender.render.picture.motion import Instant, Motion, MotionFilm, previous_positions, project
-from drgs_blender.render.picture.signal import LIGHT, PAD, Guides, Signal
-from drgs_blender.render.picture.temporal import Shot, denoise_next
-from drgs_blender.render.picture.window import window
+from drgs_blender.render.denoise.demodulation import LIGHT, PAD, Signal
+from drgs_blender.render.denoise.svgf_spatial import prepare
+from drgs_blender.render.denoise.svgf_temporal import Shot, denoise_next
+from drgs_blender.render.denoise.svgf_window import window
+from drgs_blender.render.film.guides import Guides
+from drgs_blender.render.film.motion_vectors import Instant, Motion, MotionFilm, previous_positions, project
 
 H, W = 48, 64
 PITCH = 1e-3  # metres a pixel
@@ -175,8 +176,8 @@ def test_vectors_lead_to_the_place_in_the_picture_before() -> None:
 
 def test_samples_make_up_a_pixels_motion_as_they_make_up_its_position() -> None:
     """Two samples near, one far behind, one of a shadow catcher in front: the near ones count, by weight."""
+    from drgs_blender.render.gbuffer.gbuffer import compact
     from drgs_blender.render.points import CATCHER
-    from drgs_blender.render.primary.gbuffer import compact
 
     alpha = np.zeros((H, W, 4), np.float32)
     alpha[7, 9] = 1.0

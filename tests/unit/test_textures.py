@@ -8,10 +8,10 @@ import weakref
 import numpy as np
 import pytest
 
-from drgs_blender.colour import srgb_to_linear
-from drgs_blender.errors import UsageError
-from drgs_blender.frame import Image, Material, Texture
-from drgs_blender.render.trace.textures import MaterialTable
+from drgs_blender.core.color import srgb_to_linear
+from drgs_blender.core.errors import UsageError
+from drgs_blender.core.frame import Image, Material, Texture
+from drgs_blender.render.scene.textures import MaterialTable
 
 RNG = np.random.default_rng(7)
 BYTES = RNG.integers(0, 256, (5, 7, 4), dtype=np.uint8)

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from PIL import Image as Picture
 
+from drgs_blender.core.frame import Image, Material, Texture
 from drgs_blender.formats.exr import read_exr
-from drgs_blender.frame import Image, Material, Texture
-from drgs_blender.render.trace.textures import MaterialTable
+from drgs_blender.render.scene.textures import MaterialTable
 
 ROOT = Path(__file__).resolve().parents[2]
 BINARY = "Scripts/python.exe" if sys.platform == "win32" else "bin/python"

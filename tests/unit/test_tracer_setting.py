@@ -10,15 +10,11 @@ import pytest
 from clouds import blend_all, cloud
 from shapes import sphere_mesh, sphere_surfels
 
-from drgs_blender.asset.container import write_asset
-from drgs_blender.asset.model import Asset, Mesh, PosedSurfels, Surfels
 from drgs_blender.compute.jit import njit
-from drgs_blender.deform.attach import attach
-from drgs_blender.deform.matrix_driven import pose_by_matrix
-from drgs_blender.deform.mesh_driven import MeshDriven
-from drgs_blender.engine.session import Session
-from drgs_blender.errors import AssetError
-from drgs_blender.frame import (
+from drgs_blender.core.asset.container import write_asset
+from drgs_blender.core.asset.model import Asset, Mesh, PosedSurfels, Surfels
+from drgs_blender.core.errors import AssetError
+from drgs_blender.core.frame import (
     Camera,
     Frame,
     Light,
@@ -29,12 +25,16 @@ from drgs_blender.frame import (
     Visibility,
     World,
 )
+from drgs_blender.deform.attach import attach
+from drgs_blender.deform.mesh_driven import MeshDriven
+from drgs_blender.deform.rigid import pose_by_matrix
+from drgs_blender.engine.session import Session
+from drgs_blender.render.integrator import intersect
+from drgs_blender.render.integrator import wavefront as w
 from drgs_blender.render.sampling import F, U, mix
-from drgs_blender.render.shade import rays
-from drgs_blender.render.shade import wave as w
+from drgs_blender.render.scene.trace_scene import TraceScene
 from drgs_blender.render.surfels.surfel_bvh import SurfelBVH
 from drgs_blender.render.surfels.surfel_tracer import tracer_of
-from drgs_blender.render.trace.scene import TraceScene
 
 Array = np.ndarray
 DARK = World(colour=(0.0, 0.0, 0.0))
@@ -148,7 +148,7 @@ def _meet_all(tracer, origins, directions, count, out):  # type: ignore[no-untyp
             s[i + w.OX], s[i + w.OY], s[i + w.OZ] = origins[n, 0], origins[n, 1], origins[n, 2]
             s[i + w.LX], s[i + w.LY], s[i + w.LZ] = directions[n, 0], directions[n, 1], directions[n, 2]
             ints[c + w.KEY], ints[c + w.OWN] = mix(U(mix(U(n)) + U(k))), U(0xFFFFFFFF)
-            through, _, hit = rays.meet(tracer, s, ints, 3, np.int32(-1))
+            through, _, hit = intersect.meet(tracer, s, ints, 3, np.int32(-1))
             out[n, k, 0], out[n, k, 1], out[n, k, 2], out[n, k, 3] = through, hit[0], F(hit[1]), F(hit[17])
             values = hit[5:17]
             for j in range(12):
@@ -167,7 +167,7 @@ def test_a_ray_meets_the_blend_of_all_surfels_or_the_mesh_behind(backed: bool) -
     directions = rng.normal(size=(80, 3)) * 0.1 - [0, 0, 1]
     directions = (directions / np.linalg.norm(directions, axis=1, keepdims=True)).astype(np.float32)
     out = np.zeros((80, 400, 16), np.float32)
-    _meet_all(rays.MixedTracer(*scene.tracer, *tracer_of(bvh)), origins, directions, out.shape[1], out)
+    _meet_all(intersect.MixedTracer(*scene.tracer, *tracer_of(bvh)), origins, directions, out.shape[1], out)
     stop = (0.2 - origins[:, 2]) / directions[:, 2] if backed else np.full(80, np.inf)
     share = []
     for n in range(80):

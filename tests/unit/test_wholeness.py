@@ -10,7 +10,7 @@ import OpenEXR
 import pytest
 from PIL import Image
 
-from drgs_blender.wholeness import is_whole
+from drgs_blender.core.file_integrity import is_whole
 
 COMPRESSIONS = ("NO", "RLE", "ZIPS", "ZIP", "PIZ", "PXR24", "B44", "B44A", "DWAA", "DWAB")
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from ...errors import AssetError, DrgsError
+from ...core.errors import AssetError, DrgsError
 from ..blender_process import BlenderProcess
 from ..find_blender import Blender
 

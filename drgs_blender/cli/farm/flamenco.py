@@ -7,8 +7,8 @@ import shlex
 import sys
 from pathlib import Path
 
-from ...asset.archive import replace_file
-from ...errors import UsageError
+from ...core.asset.archive import replace_file
+from ...core.errors import UsageError
 from .job import Job
 
 #: The job type, as the Manager calls it: the script's name without its suffix, dashes for underscores.

@@ -8,8 +8,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from ...asset.archive import replace_file
-from ...errors import UsageError
+from ...core.asset.archive import replace_file
+from ...core.errors import UsageError
 from ..frame_range import write_frames
 from .job import Job
 

@@ -6,8 +6,8 @@ import re
 import shlex
 from pathlib import Path
 
-from ...asset.archive import replace_file
-from ...errors import EXIT_CANNOT_WRITE, EXIT_RETRY, UsageError
+from ...core.asset.archive import replace_file
+from ...core.errors import EXIT_CANNOT_WRITE, EXIT_RETRY, UsageError
 from .job import Job
 
 #: How often a chunk is queued again that ended with code 75 (an engine died), or 73 (a disk was full) after a pause.

@@ -11,17 +11,17 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import AssetError, UsageError, first_of
+from ...core.errors import AssetError, UsageError, first_of
 from ...formats.axes import UP_AXES
-from ..capture import Capture
-from ..memory import check_fits
+from ..capture.capture import Capture
+from ..memory_budget import check_fits
 from . import colmap, llff, nero, tensoir, transforms
+from .camera_overlap import check_sight
 from .develop import cut_out, develop, find_background
 from .layout import Layout
 from .lens import Lens
-from .sight import check_sight
-from .usable import usable
-from .world import AXES, check_places, check_silhouettes, turn_upright
+from .usable_photographs import usable
+from .world_frame import AXES, check_places, check_silhouettes, turn_upright
 
 logger = logging.getLogger(__name__)
 

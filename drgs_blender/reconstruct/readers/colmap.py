@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import AssetError
+from ...core.errors import AssetError
 from .layout import OPENCV_TO_BLENDER, Layout, Photograph, complain_of_missing, find_mask, invert, rigid
 from .lens import MODELS, Lens, lens_of
 

@@ -8,11 +8,11 @@ import numpy as np
 from PIL import Image
 from scipy.ndimage import binary_erosion, binary_fill_holes, label
 
-from ...colour import to_unit
-from ...errors import AssetError
+from ...core.color import to_unit
+from ...core.errors import AssetError
+from ...core.frame import Camera
 from ...formats.images import load_image
-from ...frame import Camera
-from ..capture import View
+from ..capture.capture import View
 from .layout import Layout, Photograph
 from .lens import Lens, resample, undistorted
 

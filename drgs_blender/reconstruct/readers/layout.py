@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from PIL import ExifTags, Image
 
-from ...colour import to_unit
-from ...errors import AssetError, first_of
+from ...core.color import to_unit
+from ...core.errors import AssetError, first_of
 from ...formats.images import load_image
 from .lens import Lens
 

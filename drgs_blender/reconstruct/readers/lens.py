@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from ...errors import AssetError
+from ...core.errors import AssetError
 
 Array = np.ndarray
 #: (x, y, coefficients) -> (x, y) as distorted

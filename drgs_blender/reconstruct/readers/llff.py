@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import AssetError
+from ...core.errors import AssetError
 from .layout import PICTURES, Layout, Photograph, find_mask, rigid
 from .lens import Lens
 

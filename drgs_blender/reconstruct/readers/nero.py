@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import AssetError
+from ...core.errors import AssetError
 from ...formats.axes import UP_AXES
 from ...formats.images import load_image
 from .layout import OPENCV_TO_BLENDER, Layout, Photograph, complain_of_missing, image_size, invert, rigid

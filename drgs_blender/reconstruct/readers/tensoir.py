@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import AssetError
+from ...core.errors import AssetError
 from .layout import Layout, Photograph, complain_of_missing, read_json, rigid
 from .lens import Lens
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import AssetError
+from ...core.errors import AssetError
 from .layout import (
     PICTURES,
     Layout,

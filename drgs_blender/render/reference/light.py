@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...colour import LUMINANCE
-from ...frame import World
+from ...core.color import LUMINANCE
+from ...core.frame import World
 
 
 def directions_of(u: Tensor, v: Tensor) -> Tensor:

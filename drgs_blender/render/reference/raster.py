@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...asset.model import PosedSurfels
-from ...frame import Camera
+from ...core.asset.model import PosedSurfels
+from ...core.frame import Camera
 from .brdf import dot, normalise
 
 #: Variance of the screen-space filter, square pixels.

@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from ...asset.model import PosedSurfels
 from ...compute.jit import njit, plain, prange
-from ...frame import Camera
+from ...core.asset.model import PosedSurfels
+from ...core.frame import Camera
 from ..camera import AA, CLIP_END, CLIP_START, CX, CY, FX, FY, LEAN, ORTHOGRAPHIC, POSITION, filter_reach
 
 Array = np.ndarray

@@ -7,11 +7,11 @@ import math
 
 import numpy as np
 
-from ...asset.model import PosedSurfels
 from ...compute.jit import njit
-from ...errors import DeviceError, UsageError
-from ..trace.embree import QUALITY_LOW, QUALITY_REFIT, SCENE_DYNAMIC, address, device, library
-from ..trace.tree import aligned, box_of, looseness, neighbours
+from ...core.asset.model import PosedSurfels
+from ...core.errors import DeviceError, UsageError
+from ..scene.embree import QUALITY_LOW, QUALITY_REFIT, SCENE_DYNAMIC, address, device, library
+from ..scene.triangle_bvh import aligned, box_of, looseness, neighbours
 from .surfel_query import CUT, MASK, MIN_ALPHA, OBJECT, OPACITY, RECORD, TANGENT_U, TANGENT_V, WIDTH, callbacks
 
 Array = np.ndarray

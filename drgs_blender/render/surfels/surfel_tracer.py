@@ -22,9 +22,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...asset.model import as_float
 from ...compute.jit import get_num_threads, njit, prange
-from ...errors import UsageError
+from ...core.asset.model import as_float
+from ...core.errors import UsageError
 from ..memory import address, load_float, load_int32
 from ..sampling import ONE, ZERO, F
 from .raster import GAP

@@ -1,0 +1,1 @@
+"""Scalar code of Numba kernels translated for NVIDIA Warp, and its launch."""

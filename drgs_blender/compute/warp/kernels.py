@@ -1,0 +1,209 @@
+"""Kernels of translated functions: made when they are first needed, launched with arrays of this process or a device's.
+
+What is launched is a function ``f(lane, lanes, room, *arguments, out)`` that does every `lanes`-th piece of some work
+from the `lane`-th on, with scratch memory of its own, and writes to the arrays `out`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...core.errors import Cancelled, DeviceError
+from .runtime import is_there, load_module, parts_of, preparing, type_for, warp
+from .translate import Constants, Translation
+from .types import Array as ArrayType
+from .types import Type, given, spelled
+
+Array = np.ndarray
+
+#: Lanes at most.
+LANES = 1 << 17
+
+
+class Room(NamedTuple):
+    """An array of scratch memory for one lane: type of its elements, and its shape."""
+
+    element: str
+    shape: tuple[int, ...]
+
+
+#: Scratch memory of a function: nested tuples of `Room`.
+Rooms = Any
+
+
+class Work:
+    """A function that can be launched.
+
+    Parameters
+    ----------
+    function : see this module's head
+    rooms : of what it takes as `room`
+    natives, constants : see `Translation`
+    """
+
+    def __init__(
+        self,
+        function: Callable[..., Any],
+        rooms: Rooms,
+        natives: Mapping[Any, Any],
+        constants: Constants = lambda module, name, value: value,
+    ) -> None:
+        self.function, self.rooms = function, rooms
+        self._natives, self._constants = natives, constants
+
+    def module(self, types: tuple[Type, ...], fused: bool) -> ModuleType:
+        """Module whose ``run`` is the kernel for arguments of these types."""
+        translation = Translation(self._natives, self._constants, fused)
+        kinds = _types(self.rooms)
+        made = translation.function(self.function, ["int64", "int64", kinds, *types])
+        rooms = [f"r{i}" for i in range(len(given(kinds)))]
+        names = [f"a{i}" for i in range(len(given(types)))]
+        parameters = ["lanes: wp.int64"]
+        parameters += [f"{n}: {ArrayType(k.element, k.axes + 1)}" for n, k in zip(rooms, given(kinds))]
+        parameters += [f"{n}: {spelled(k)}" for n, k in zip(names, given(types))]
+        arguments = ["wp.int64(t)", "lanes", *(f"{n}[t]" for n in rooms), *names]
+        translation.add(
+            f"@wp.kernel\ndef run({', '.join(parameters)}):\n    t = wp.tid()\n    {made.name}({', '.join(arguments)})"
+        )
+        return load_module(translation.source)
+
+
+class Launcher:
+    """Launches work on one device.
+
+    Parameters
+    ----------
+    device : Warp's name of it: "cuda:0", "cpu"
+
+    Attributes
+    ----------
+    apart : whether it has memory of its own, as a card has
+    """
+
+    def __init__(self, device: str) -> None:
+        self.device = warp().get_device(device)
+        self.apart = bool(self.device.is_cuda)
+        self._rooms: dict[Work, list[Any]] = {}
+        self._modules: dict[tuple[Work, tuple[Type, ...]], ModuleType] = {}
+
+    def array(self, array: Array, copy: bool | None = None) -> Any:
+        """A Warp array of an array's content; on the processor it is the same memory unless told otherwise."""
+        wp = warp()
+        copy = self.apart if copy is None else copy
+        array = np.ascontiguousarray(array)
+        return wp.array(array, dtype=getattr(wp, array.dtype.name), device=self.device, copy=copy)
+
+    def zeros(self, shape: tuple[int, ...], element: str = "float32") -> Any:
+        """An array on the device."""
+        return warp().zeros(shape, dtype=getattr(warp(), element), device=self.device)
+
+    def launch(self, work: Work, pieces: int, arguments: Sequence[Any], out: Sequence[Any]) -> None:
+        """Do `pieces` of work.
+
+        Parameters
+        ----------
+        arguments : numbers, arrays here or on the device, named tuples of numbers, and tuples of all these
+        out : arrays that are written to, or tuples of them: those of this process as a whole, those on the device where
+            the work does
+
+        Raises
+        ------
+        DeviceError
+            When the device fails, for one of the reasons that a device has.
+        """
+        with self.failures(work.function.__name__.replace("_", " ")):
+            arrays = list(parts_of(tuple(out)))
+            found = [a if is_there(a) else self.zeros(a.shape, a.dtype.name) for a in arrays]
+            self._launch(work, pieces, arguments, tuple(out), found)
+            for array, result in zip(arrays, found):
+                if array is not result:
+                    array[...] = result.numpy()
+
+    def recorded(self, work: Work, pieces: int, arguments: Sequence[Any], out: Sequence[Any]) -> Callable[[], None]:
+        """The same launch, not done now but whenever it is called, at little cost; all its arrays are the device's.
+
+        Raises
+        ------
+        DeviceError
+            As `launch`; what it does later belongs into `failures`.
+        """
+        with self.failures(work.function.__name__.replace("_", " ")):
+            made = self._launch(work, pieces, arguments, tuple(out), list(parts_of(tuple(out))), record_cmd=True)
+            kept = arguments, out, self._rooms.get(work)
+
+            def again(kept: Any = kept) -> None:
+                made.launch()
+
+            return again
+
+    def _launch(
+        self, work: Work, pieces: int, arguments: Sequence[Any], out: tuple[Any, ...], found: list[Any], **how: bool
+    ) -> Any:
+        module = self._ready(work, tuple(type_for(a) for a in (*arguments, out)))
+        lanes = min(pieces, LANES)
+        inputs = [self._argument(module, part) for part in parts_of(tuple(arguments))]
+        given = [lanes, *self._room(work, lanes), *inputs, *found]
+        return warp().launch(module.run, lanes, given, device=self.device, **how)
+
+    def _ready(self, work: Work, types: tuple[Type, ...]) -> ModuleType:
+        """The module for arguments of these types, compiled."""
+        if (work, types) not in self._modules:
+            with preparing():
+                module = work.module(types, self.device.is_cuda)
+                warp().load_module(module, self.device)
+            self._modules[work, types] = module
+        return self._modules[work, types]
+
+    @contextlib.contextmanager
+    def failures(self, work: str) -> Iterator[None]:
+        """Name what the device could not do, whatever Warp raises for it: a compiler that fails is an Exception."""
+        try:
+            yield
+        except (Cancelled, DeviceError):
+            raise
+        except Exception as error:
+            said = (str(error).strip() or type(error).__name__).splitlines()[0]
+            problem = f"{self.device.name} failed at {work} ({said})"
+            raise DeviceError("device cuda", problem, "Use fewer objects or the CPU") from error
+
+    def _argument(self, module: ModuleType, value: Any) -> Any:
+        if isinstance(value, np.ndarray):
+            return self.array(value)
+        if isinstance(value, tuple):
+            struct = getattr(module, type(value).__name__)()
+            for name, part in zip(value._fields, value):  # type: ignore[attr-defined]
+                setattr(struct, name, part)
+            return struct
+        return value.item() if isinstance(value, np.generic) else value
+
+    def _room(self, work: Work, lanes: int) -> list[Any]:
+        """Scratch memory; neighbouring lanes find theirs next to each other on a card."""
+        known = self._rooms.get(work)
+        if known and known[0].shape[0] >= lanes:
+            return known
+        wp = warp()
+        made = []
+        for room in _flat(work.rooms):
+            dtype, axes = getattr(wp, room.element), len(room.shape)
+            if self.apart:
+                turned = wp.zeros((*room.shape, lanes), dtype=dtype, device=self.device)
+                made.append(turned.transpose((axes, *range(axes))))
+            else:
+                made.append(wp.zeros((lanes, *room.shape), dtype=dtype, device=self.device))
+        self._rooms[work] = made
+        return made
+
+
+def _flat(rooms: Rooms) -> list[Room]:
+    return [rooms] if isinstance(rooms, Room) else [room for inner in rooms for room in _flat(inner)]
+
+
+def _types(rooms: Rooms) -> Type:
+    if isinstance(rooms, Room):
+        return ArrayType(rooms.element, len(rooms.shape))
+    return tuple(_types(inner) for inner in rooms)

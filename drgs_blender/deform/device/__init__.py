@@ -1,1 +1,0 @@
-"""Deformation on a graphics card; on the processor, by the same translation, for tests."""

@@ -1,0 +1,75 @@
+"""The frame of reference of a face at rest: what attaching, binding and driving must agree on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..geometry.normals import VertexNormals, unit
+
+Array = np.ndarray
+
+#: A face is degenerate when twice its area is below this part of its squared longest edge: single precision no longer
+#: says where it faces.
+DEGENERATE = 1e-6
+
+
+def dot(a: Array, b: Array) -> Array:
+    """Row-wise dot products of (n, c) arrays."""
+    return np.einsum("nc,nc->n", a, b)
+
+
+@dataclass(slots=True)
+class Faces:
+    """Triangles at rest, float64.
+
+    Attributes
+    ----------
+    corners : (m, 3, 3) vertex positions
+    normal : (m, 3) unit normals; (0, 0, 1) where degenerate
+    area : (m,)
+    mean_edge : (m,) mean edge length: the unit of Binding.offset
+    degenerate : (m,) bool: no area, or not finite
+    """
+
+    corners: Array
+    normal: Array
+    area: Array
+    mean_edge: Array
+    degenerate: Array
+
+    @classmethod
+    def of(cls, vertices: Array, faces: Array) -> Faces:
+        """Measure the faces (m, 3) of `vertices` (n, 3)."""
+        corners = np.asarray(vertices, np.float64)[faces]
+        edges = np.roll(corners, -1, axis=1) - corners
+        lengths = np.linalg.norm(edges, axis=-1)
+        cross = np.cross(edges[:, 0], -edges[:, 2])
+        twice_area = np.linalg.norm(cross, axis=-1)
+        degenerate = ~(twice_area > DEGENERATE * lengths.max(axis=1, initial=0.0) ** 2)
+        cross[degenerate] = (0, 0, 1)
+        return cls(corners, unit(cross), 0.5 * twice_area, np.nan_to_num(lengths.mean(axis=1)), degenerate)
+
+
+def shading_frames(faces: Faces, indices: Array, vertices: Array, face: Array, barycentric: Array) -> Array:
+    """Frames (n, 3, 3) with columns (t, b, s) at points of faces, as Binding.normal defines them.
+
+    Parameters
+    ----------
+    faces, indices, vertices : the mesh: measured faces, (m, 3) vertex indices, (k, 3) positions
+    face, barycentric : (n,), (n, 3): the points
+    """
+    normals = VertexNormals(indices, len(vertices))(vertices).astype(np.float64)
+    s = unit(np.einsum("nk,nkc->nc", barycentric, normals[indices[face]]))
+    t = np.zeros_like(s)
+    missing = np.ones(len(s), bool)
+    corners = faces.corners[face]
+    axis = np.eye(3)[np.argmin(np.abs(s), axis=-1)]  # never parallel to s
+    for direction in (corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], axis):
+        flat = direction - s * dot(direction, s)[:, None]
+        length = np.linalg.norm(flat, axis=-1)
+        use = missing & (length > 1e-6 * np.linalg.norm(direction, axis=-1))
+        t[use] = flat[use] / length[use, None]
+        missing &= ~use
+    return np.stack([t, np.cross(s, t), s], -1)

@@ -1,0 +1,144 @@
+"""Surfels that follow their mesh on a device, where they stay: `deform.mesh_driven` from the same source.
+
+The functions here are translated and never run as they stand.
+"""
+
+from __future__ import annotations
+
+import weakref
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...compute.warp.kernels import Launcher, Work
+from ...compute.warp.posed_surfels import PosedThere
+from ...compute.warp.runtime import warp
+from ...core.asset.model import MATERIAL_CHANNELS, PosedSurfels
+from ...geometry.normals import face_normal, vertex_normal
+from .. import mesh_driven
+from ..mesh_driven import MeshDriven, Posing
+
+Array = np.ndarray
+
+#: Coordinates below this, metres, hide no surfel.
+_USABLE = 1e28
+
+
+def weigh_corners(lane: Any, lanes: Any, room: Any, vertices: Any, faces: Any, place: Any, out: Any) -> None:
+    """`geometry._weigh`, one face after the other."""
+    (weighted,) = out
+    for f in range(lane, len(faces), lanes):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        x, y, z = vertices[a, 0], vertices[a, 1], vertices[a, 2]
+        nx, ny, nz, first, second, third = face_normal(
+            vertices[b, 0] - x, vertices[b, 1] - y, vertices[b, 2] - z,
+            vertices[c, 0] - x, vertices[c, 1] - y, vertices[c, 2] - z,
+        )  # fmt: skip
+        for k in range(3):
+            p = place[3 * f + k]
+            w = first if k == 0 else (second if k == 1 else third)
+            weighted[p, 0], weighted[p, 1], weighted[p, 2] = w * nx, w * ny, w * nz
+
+
+def sum_corners(lane: Any, lanes: Any, room: Any, weighted: Any, start: Any, side: Any, out: Any) -> None:
+    """`geometry._sum`; `side` -1 turns the normals round."""
+    (normals,) = out
+    for v in range(lane, len(normals), lanes):
+        x, y, z = vertex_normal(weighted, start[v], start[v + 1])
+        normals[v, 0], normals[v, 1], normals[v, 2] = side * x, side * y, side * z
+
+
+def _constants(module: ModuleType, name: str, value: Any) -> Any:
+    """One surfel a block."""
+    return 1 if module is mesh_driven and name == "_BLOCK" else value
+
+
+WEIGH = Work(weigh_corners, (), {})
+SUM = Work(sum_corners, (), {})
+POSE = Work(mesh_driven.pose_surfels, (), {}, _constants)
+
+
+class _Tables(NamedTuple):
+    """What of a mesh and its surfels is the same in every frame: `MeshDriven.rest`, `VertexNormals`, own channels."""
+
+    rest: tuple[Any, ...]
+    faces: Any
+    start: Any
+    place: Any
+    channels: dict[str, Any]
+
+
+class Deformer:
+    """Poses surfels on a device, and keeps there what does not change from frame to frame.
+
+    Parameters
+    ----------
+    launcher : of the device
+    """
+
+    def __init__(self, launcher: Launcher) -> None:
+        self.launcher = launcher
+        self._known: weakref.WeakKeyDictionary[MeshDriven, _Tables] = weakref.WeakKeyDictionary()
+
+    def pose(
+        self, driven: MeshDriven, vertices_world: Array, corner_normals_world: Array | None = None,
+        materials: Any = None, *, matrix_world: Array | None = None, object_index: int = 0, torn: Array | None = None,
+    ) -> PosedSurfels:  # fmt: skip
+        """`MeshDriven.pose` on the device, but for meshes with vertices that are not finite: these hide surfels.
+
+        Raises
+        ------
+        AssetError: as there.
+        DeviceError: the device fails.
+        """
+        given = vertices_world, corner_normals_world, materials
+
+        def here() -> PosedSurfels:
+            return driven.pose(*given, matrix_world=matrix_world, object_index=object_index, torn=torn)
+
+        posing = driven.posing(*given, matrix_world, torn)
+        if not np.abs(posing.vertices).max(initial=0.0) < _USABLE:
+            return here()
+        driven.lost = 0
+        n, launcher, tables = len(driven.surfels), self.launcher, self._tables(driven)
+        with launcher.failures("copying a mesh"):
+            vertices = launcher.array(posing.vertices)
+            opacity = self._own(tables, driven, "opacity", posing.opacity)
+            opacity = opacity if posing.opacity is driven.surfels.opacity else launcher.array(opacity, copy=True)
+            owner = warp().full(n, object_index, dtype=warp().int32, device=launcher.device)
+            made = [launcher.zeros((n, 3)) for _ in range(4)]
+        normals = self._smooth(tables, driven, posing, vertices) if posing.normals is None else posing.normals
+        mesh = vertices, tables.faces, normals
+        arguments = mesh, posing.normals is not None, posing.linear, posing.side, tables.rest
+        launcher.launch(POSE, n, arguments, (*made, opacity))
+        names = "centre", "tangent_u", "tangent_v", "normal"
+        channels = {name: self._own(tables, driven, name, posing.channels[name]) for name in MATERIAL_CHANNELS}
+        there = dict(zip(names, made)) | channels | {"opacity": opacity, "object_index": owner}
+        return PosedThere(there, here, posing.channels)
+
+    def _smooth(self, tables: _Tables, driven: MeshDriven, posing: Posing, vertices: Any) -> Any:
+        """(n, 3) normals of the vertices."""
+        launcher = self.launcher
+        with launcher.failures("copying a mesh"):
+            own = posing.bent is driven.normals.faces
+            faces = tables.faces if own else launcher.array(posing.bent)
+            weighted, normals = launcher.zeros((3 * len(faces), 3)), launcher.zeros(vertices.shape)
+        launcher.launch(WEIGH, len(faces), (vertices, faces, tables.place), (weighted,))
+        launcher.launch(SUM, len(normals), (weighted, tables.start, np.float32(posing.side)), (normals,))
+        return normals
+
+    def _tables(self, driven: MeshDriven) -> _Tables:
+        known = self._known.get(driven)
+        if known is None:
+            copy, smoother = self.launcher.array, driven.normals
+            with self.launcher.failures("copying a binding"):
+                own = {name: copy(getattr(driven.surfels, name)) for name in ("opacity", *MATERIAL_CHANNELS)}
+                rest = tuple(map(copy, driven.rest))
+                known = _Tables(rest, copy(driven.mesh.faces), copy(smoother.start), copy(smoother.place), own)
+            self._known[driven] = known
+        return known
+
+    def _own(self, tables: _Tables, driven: MeshDriven, name: str, array: Array) -> Any:
+        """The device's copy of an array of the surfels, or the array where it is another one."""
+        return tables.channels[name] if array is getattr(driven.surfels, name) else array

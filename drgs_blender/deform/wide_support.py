@@ -1,0 +1,108 @@
+"""Three vertices that span what a surfel covers, where it is larger than the face it hangs on."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..compute.jit import njit
+from ..geometry.normals import corner_table
+from .face_frames import Faces
+
+Array = np.ndarray
+
+#: Most vertices that are looked at for one surfel.
+_MOST = 2048
+#: Cosine to the face from which on a vertex is of the same side of the object.
+_SAME_SIDE = 0.3
+#: Part of an equilateral triangle's area, over the same longest edge, that a span has at least.
+_BROAD = 0.3
+
+
+def spans(
+    vertices: Array, indices: Array, normals: Array, faces: Faces, face: Array, weights: Array, reach: Array
+) -> Array:
+    """Vertices about `reach` away from where surfels hang, a third of a turn apart.
+
+    The surface is walked from the face on, so that they are of the same sheet: not of the other side of a wall, nor of
+    what only comes near.
+
+    Parameters
+    ----------
+    vertices, indices, normals : (k, 3), (m, 3) int32, (k, 3) smooth normals: the mesh at rest
+    faces : those of the mesh, measured
+    face, weights : (n,), (n, 3): where the surfels hang
+    reach : (n,) metres; those that are no larger than the mean edge of their face need no span
+
+    Returns
+    -------
+    (n, 3) int32
+        -1 where the own face is to be taken, also for want of a broad triangle larger than that.
+    """
+    wanted = np.flatnonzero((reach > faces.mean_edge[face]) & ~faces.degenerate[face])
+    found = np.full((len(face), 3), -1, np.int32)
+    if len(wanted):
+        own = face[wanted]
+        corners = faces.corners[own]
+        inside = np.maximum(weights[wanted], 0)
+        foot = np.einsum("nk,nkc->nc", inside / inside.sum(axis=1, keepdims=True), corners)
+        along = corners[:, 1] - corners[:, 0]
+        along /= np.linalg.norm(along, axis=1, keepdims=True)
+        across = np.cross(faces.normal[own], along)
+        start, corner = corner_table(indices, len(vertices))
+        found[wanted] = _walk(
+            vertices.astype(np.float64), indices, normals, start, corner, faces.normal, own, foot, along, across,
+            reach[wanted].astype(np.float64),
+        )  # fmt: skip
+        triangle = vertices[found[wanted]].astype(np.float64)
+        edges = np.roll(triangle, -1, axis=1) - triangle
+        area = 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+        longest = (edges**2).sum(axis=2).max(axis=1)
+        broad = (area > faces.area[own]) & (area > _BROAD * np.sqrt(3) / 4 * longest)
+        found[wanted[~broad]] = -1
+    return found
+
+
+@njit
+def _walk(  # type: ignore[no-untyped-def]
+    vertices, indices, normals, start, corner, face_normals, face, foot, along, across, reach
+):
+    """For each surfel the vertices nearest to three places around its foot."""
+    found = np.empty((len(face), 3), np.int32)
+    seen = np.full(len(vertices), -1, np.int32)
+    queue = np.empty(_MOST, np.int32)
+    best = np.empty(3)
+    for i in range(len(face)):
+        f, r = face[i], reach[i]
+        best[:] = np.inf
+        first, last = 0, 0
+        for k in range(3):
+            found[i, k] = queue[last] = indices[f, k]
+            seen[queue[last]] = i
+            last += 1
+        while first < last:
+            v = queue[first]
+            first += 1
+            a = b = 0.0
+            for c in range(3):
+                a += (vertices[v, c] - foot[i, c]) * along[i, c]
+                b += (vertices[v, c] - foot[i, c]) * across[i, c]
+            for k in range(3):
+                angle = 2 * np.pi / 3 * k
+                gap = (a - r * np.cos(angle)) ** 2 + (b - r * np.sin(angle)) ** 2
+                if gap < best[k]:
+                    best[k] = gap
+                    found[i, k] = v
+            for at in range(start[v], start[v + 1]):
+                for k in range(3):
+                    w = indices[corner[at] // 3, k]
+                    if seen[w] == i or last == _MOST:
+                        continue
+                    seen[w] = i
+                    square = turned = 0.0
+                    for c in range(3):
+                        square += (vertices[w, c] - foot[i, c]) ** 2
+                        turned += normals[w, c] * face_normals[f, c]
+                    if square < (1.5 * r) ** 2 and turned > _SAME_SIDE:
+                        queue[last] = w
+                        last += 1
+    return found

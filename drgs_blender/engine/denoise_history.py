@@ -1,0 +1,87 @@
+"""What the session remembers of the sequences of pictures that follow a user, by their names."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from ..core.arrays import same_bits
+from ..core.frame import Frame
+from ..ipc.change_detection import renewed
+from ..render.camera import camera_parameters
+from ..render.denoise.svgf_temporal import History
+from ..render.film.film import COMPONENTS
+from ..render.film.motion_vectors import Instant
+from ..render.scene.trace_scene import TraceScene
+
+#: Names of which the session keeps the history.
+KEPT = 4
+
+
+@dataclass(slots=True)
+class Sequence:
+    """One sequence.
+
+    Attributes
+    ----------
+    history : for the next picture; its instant holds the scene's own arrays where nothing moved, which saves looking
+    past : the instant of the last picture
+    fit : what must stay for the history to be of use: layout of the scene, window, primary surface, split of light
+    situation : all that decides what a picture shows; the same objects (``is``) as long as nothing changed
+    pictures : how many have gone into the history
+    """
+
+    history: History = field(default_factory=History)
+    past: Instant | None = None
+    fit: tuple[Any, ...] = ()
+    situation: tuple[Any, ...] = (None, None)
+    pictures: int = 0
+
+
+class Histories:
+    """The last sequences that were continued."""
+
+    def __init__(self) -> None:
+        self._known: dict[str, Sequence] = {}
+
+    def continued(self, frame: Frame, scene: TraceScene, scenery: tuple[Any, ...]) -> Sequence:
+        """The sequence that `frame` continues, with what of it is of use.
+
+        Parameters
+        ----------
+        scene : brought up to date for the frame
+        scenery : objects, meshes, images, world and lights of the frame, unchanged ones as the same objects
+        """
+        settings, camera = frame.settings, frame.camera
+        old = self._known.get(frame.history, Sequence())
+        # How many samples are drawn, and which, is a matter of noise.
+        lasting = replace(
+            settings, seed=0, threads=0, device="cpu", cosine=0, ggx=0, environment=0, noise_threshold=0.0
+        )
+        situation = renewed(camera, old.situation[0]), renewed(lasting, old.situation[1]), *scenery
+        split = any(name in frame.passes for name in COMPONENTS)
+        fit = scene.layout, scene.places.shape, camera.window, camera.width, camera.height, settings.primary, split
+        if fit != old.fit or old.past is None:
+            return Sequence(fit=fit, situation=situation)
+        still = len(situation) == len(old.situation) and all(a is b for a, b in zip(situation, old.situation))
+        instant = Instant(
+            scene.vertices if still or same_bits(old.past.vertices, scene.vertices) else old.past.vertices,
+            scene.places if still or same_bits(old.past.places, scene.places) else old.past.places,
+            old.past.parameters,
+        )
+        return Sequence(History(old.history.signal, instant, still), old.past, fit, situation, old.pictures)
+
+    def keep(self, frame: Frame, sequence: Sequence, scene: TraceScene) -> None:
+        """Remember `sequence` after its picture `frame` was made."""
+        before, past = sequence.history.instant, sequence.past
+        sequence.past = Instant(
+            past.vertices if past and before and before.vertices is scene.vertices else scene.vertices.copy(),
+            past.places if past and before and before.places is scene.places else scene.places.copy(),
+            camera_parameters(frame.camera, frame.settings, frame.number),
+        )
+        sequence.history.instant = None  # the scene's arrays are for this picture only
+        sequence.pictures += 1
+        self._known.pop(frame.history, None)
+        self._known[frame.history] = sequence
+        while len(self._known) > KEPT:
+            del self._known[next(iter(self._known))]

@@ -1,0 +1,290 @@
+"""The scene of the last frame: assets, posed objects, light. What did not change from frame to frame is kept."""
+
+from __future__ import annotations
+
+import functools
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from ..compute.warp.posed_surfels import PosedThere, joined
+from ..core.asset.container import read_asset
+from ..core.asset.model import Asset, PosedSurfels, Surfels
+from ..core.errors import AssetError, UsageError
+from ..core.frame import Frame, Image, Light, MeshState, Moment, ObjectState, RenderSettings, World
+from ..deform.gpu.mesh_driven import Deformer
+from ..deform.mesh_driven import MeshDriven
+from ..ipc.change_detection import renewed
+from ..render.backend import HERE, Processor
+from ..render.camera import camera_parameters
+from ..render.film.motion_vectors import Instant
+from ..render.lights.environment import EnvironmentLight
+from ..render.lights.lights import Lamps
+from ..render.lights.mesh_lights import Emitters
+from ..render.scene.ray_masks import group_mask
+from ..render.scene.trace_scene import TraceObject, TraceScene
+from ..render.surfels.surfel_bvh import SurfelBVH
+from .scene_objects import join, material_faults, moved_vertices, posed_surfels, traced_object
+
+#: Surfels a vertex up to which a mesh is taken for as detailed as a coarse picture.
+_SURFELS_A_VERTEX = 16
+
+
+@dataclass(slots=True)
+class _Loaded:
+    """An asset, the state of the file it is mapped from, and its deformation once it was needed."""
+
+    asset: Asset
+    stamp: tuple[int, int, int]
+    driven: MeshDriven | None = None
+
+    def surfels_of(self, state: ObjectState) -> MeshDriven | Surfels:
+        """The deformation of the asset's surfels, made when an object first needs it; the surfels without a mesh."""
+        if not len(self.asset.mesh.faces):
+            return self.asset.surfels
+        if self.driven is None:
+            asset = self.asset
+            if asset.binding is None:
+                problem = f"the surfels of {state.asset} are not bound to its mesh"
+                raise AssetError(f"object {state.name}", problem, "Bind them, or choose the mesh as primary surface")
+            self.driven = MeshDriven(asset.mesh, asset.surfels, asset.binding)
+        return self.driven
+
+
+@dataclass(slots=True)
+class Standing:
+    """An object as it was in the last frame, and what was made of it."""
+
+    state: ObjectState
+    loaded: _Loaded
+    traced: TraceObject
+    posed: PosedSurfels | None = None
+    lost: int = 0
+    faults: list[str] = field(default_factory=list)
+
+
+class Stage:
+    """Brings scene and light up to date with a frame.
+
+    Attributes
+    ----------
+    objects, meshes, images : of the last frame
+    scene : what rays meet
+    tree : surfels that rays meet; None when they meet the mesh
+    world, light, lamps : of the last frame
+    """
+
+    def __init__(self) -> None:
+        self._assets: dict[str, _Loaded] = {}
+        self.objects: list[Standing] = []
+        self.meshes: list[MeshState] = []
+        self.images: list[Image] = []
+        self.scene = TraceScene()
+        self.tree: SurfelBVH | None = None
+        self._in_tree: list[Standing] = []
+        self._current = True
+        self.world: World | None = None
+        self.light: EnvironmentLight | None = None
+        self.lamps = Lamps([])
+        self._emitters = Emitters()
+        self._deformer: Deformer | None = None
+
+    @property
+    def scenery(self) -> tuple[object, ...]:
+        """All but the lamps that a picture of the last frame depends on."""
+        return *(item.state for item in self.objects), self.meshes, self.images, self.world
+
+    def load_asset(self, path: str | os.PathLike[str]) -> str:
+        """Map the asset file at `path` unless it is mapped and unchanged; return its key.
+
+        The key is the resolved path: a file that was written again keeps its key and is used from the next call on.
+
+        Raises
+        ------
+        AssetError, VersionError
+            Naming the file.
+        """
+        key = os.path.realpath(path)
+        try:
+            status = os.stat(key)
+        except OSError as error:
+            reason = error.strerror or str(error)
+            raise AssetError(key, f"cannot be opened ({reason})", "Check that the file is where it was") from error
+        stamp = status.st_ino, status.st_mtime_ns, status.st_size
+        known = self._assets.get(key)
+        if known is None or known.stamp != stamp:
+            self._assets[key] = _Loaded(read_asset(key), stamp)
+        return key
+
+    def asset(self, key: str) -> Asset:
+        """The loaded asset of `key`."""
+        return self._assets[key].asset
+
+    def detailed(self, frame: Frame) -> bool:
+        """Whether the meshes of all objects are detailed enough to stand for their surfels in coarse pictures."""
+        if frame.settings.tracer != "mesh":
+            return False
+        assets = [self._assets[state.asset].asset for state in frame.objects if state.asset in self._assets]
+        return all(len(a.surfels) <= _SURFELS_A_VERTEX * len(a.mesh.vertices) for a in assets)
+
+    def kept(self, frame: Frame) -> Frame:
+        """The frame as it is now, whatever becomes of its arrays; those of the scene are kept already."""
+        states = [item.state for item in self.objects]
+        world = frame.world if self.world is None else self.world
+        return renewed(replace(frame, objects=states, meshes=self.meshes, images=self.images, world=world), None)
+
+    def pose(self, frame: Frame, processor: Processor = HERE) -> PosedSurfels:
+        """Bring the trace scene up to date; return the surfels of all objects, posed where they will be needed."""
+        seen, met = frame.settings.primary == "surfels", frame.settings.tracer == "surfels"
+        objects = []
+        for index, state in enumerate(frame.objects):
+            loaded = self._assets.get(state.asset)
+            if loaded is None:
+                raise AssetError(
+                    f"object {state.name}",
+                    f"its asset {state.asset} is not loaded",
+                    "Link the object to its file again",
+                )
+            _check_surface(state, loaded.asset, frame.settings)
+            known = self.objects[index] if index < len(self.objects) else None
+            kept = renewed(state, None if known is None else known.state)
+            if known is not None and known.loaded is loaded and known.state is kept and known.traced.seen_only == met:
+                item = known
+            else:
+                item = Standing(kept, loaded, traced_object(kept, loaded.asset, met), faults=material_faults(kept))
+            if (seen or met) and item.posed is None:
+                given = item.state, index, loaded.surfels_of(item.state), item.traced
+                item.posed, item.lost = posed_surfels(*given, self._poser(processor))
+            objects.append(item)
+        meshes, images = renewed(frame.meshes, self.meshes), renewed(frame.images, self.images)
+        same = len(objects) == len(self.objects) and all(a is b for a, b in zip(objects, self.objects))
+        if not (self._current and same and meshes is self.meshes and images is self.images):
+            self._current = False  # an update that fails half way leaves nothing to be taken for current
+            self.scene.update([item.traced for item in objects], meshes, images)
+            self._current = True
+        self.objects, self.meshes, self.images = objects, meshes, images
+        used = {state.asset for state in frame.objects}
+        for key, loaded in self._assets.items():
+            if key not in used:
+                loaded.driven = None
+        self._plant(objects if met else None)
+        shown = [item for item in objects if item.state.visibility.camera] if seen else []
+        return self._joined([item.posed for item in shown if item.posed is not None], processor)
+
+    def _poser(self, processor: Processor) -> Callable[..., PosedSurfels]:
+        """Who poses surfels: `MeshDriven.pose`, or a device as long as it can."""
+        launcher = processor.launcher
+        if launcher is None:
+            return MeshDriven.pose
+        if self._deformer is None or self._deformer.launcher is not launcher:
+            self._deformer = Deformer(launcher)
+        there = self._deformer.pose
+
+        def pose(*given: Any, **options: Any) -> PosedSurfels:
+            return processor.tried(lambda: there(*given, **options), lambda: MeshDriven.pose(*given, **options))
+
+        return pose
+
+    def _joined(self, parts: list[PosedSurfels], processor: Processor) -> PosedSurfels:
+        """The surfels of all objects as one, on a device if it has posed any."""
+        here, launcher = functools.partial(join, parts), processor.launcher
+        if launcher is None or len(parts) < 2 or not any(isinstance(part, PosedThere) for part in parts):
+            return here()
+        return processor.tried(lambda: joined(launcher, parts, here), here)
+
+    def _plant(self, objects: list[Standing] | None) -> None:
+        """Bring the tree of surfels up to date; None when light does not meet surfels."""
+        if objects is None:
+            self.tree, self._in_tree = None, []
+            return
+        same = len(objects) == len(self._in_tree) and all(a is b for a, b in zip(objects, self._in_tree))
+        if self.tree is not None and same:
+            return
+        self.tree, tree = None, self.tree or SurfelBVH()  # as above
+        masks = [group_mask(item.state.visibility, True) for item in objects]
+        tree.update(join([item.posed for item in objects if item.posed is not None]), np.array(masks, np.int32))
+        self.tree, self._in_tree = tree, objects
+
+    def instant(self, frame: Frame, moment: Moment | None) -> Instant | None:
+        """The scene at another time; None when no pass asks for it."""
+        if moment is None or not {"Vector", "Previous Position"}.intersection(frame.passes):
+            return None
+        for what, poses, shapes in (
+            ("objects", moment.objects, frame.objects),
+            ("meshes", moment.meshes, frame.meshes),
+        ):
+            if len(poses) != len(shapes):
+                raise UsageError(
+                    f"motion of {what}", f"is of {len(poses)}, the frame has {len(shapes)}", "Give one each"
+                )
+        moved = [
+            None if pose is None else moved_vertices(item.state, item.loaded.asset, pose)
+            for pose, item in zip(moment.objects, self.objects)
+        ]
+        vertices, places = self.scene.at(moved, moment.meshes)
+        return Instant(vertices, places, camera_parameters(moment.camera, frame.settings, frame.number))
+
+    def warnings(self) -> list[str]:
+        """What the user should know about the meshes of the last frame."""
+        found = []
+        if not self.objects and not self.meshes:
+            found.append("the frame has no DR-GS object; the picture shows the world alone")
+        lost = [item.lost for item in self.objects] + [0] * len(self.meshes)
+        for hidden, fault in zip(lost, self.scene.faults, strict=True):
+            if fault.bad_vertices:
+                surfels = f" and {hidden} surfels" if hidden else ""
+                found.append(
+                    f"{fault.name}: {fault.bad_vertices} vertices are not finite or too far away; "
+                    f"{fault.bad_faces} faces{surfels} are left out"
+                )
+            if fault.empty_faces:
+                found.append(f"{fault.name}: {fault.empty_faces} faces have no area; light passes through them")
+            if fault.bad_places:
+                found.append(
+                    f"{fault.name}: {fault.bad_places} instances are flat, not finite or too far away; left out"
+                )
+        for item in self.objects:
+            found += item.faults
+        found += self.scene.materials.warnings
+        found += self.lamps.warnings
+        if self.light is not None and self.light.bad_texels:
+            found.append(
+                f"world: {self.light.bad_texels} pixels of the environment are negative, infinite or no number, and "
+                "give no light; where that shows, repair the image"
+            )
+        return found
+
+    def light_of(self, world: World) -> EnvironmentLight:
+        """The light of `world`, made again only when something about it changed; a rotation costs nothing."""
+        known, kept = self.world, renewed(world, self.world)
+        if self.light is None or known is None:
+            self.light = EnvironmentLight(kept)
+        elif kept is not known:
+            if all(getattr(kept, name) is getattr(known, name) for name in ("environment", "colour", "strength")):
+                self.light.rotation = np.ascontiguousarray(kept.rotation, np.float32)
+            else:
+                self.light = EnvironmentLight(kept)
+        self.world = kept
+        return self.light
+
+    def lamps_of(self, lights: list[Light]) -> Lamps:
+        """Blender's lights and surfaces that emit, and what they send to the middle of the scene."""
+        self._emitters = Emitters(self.scene, self._emitters)
+        boxes = [self.scene.bvh.bounds()] if len(self.scene.faces) or self.tree is None else []
+        boxes += [self.tree.bounds()] if self.tree is not None else []
+        low, high = np.min([box[0] for box in boxes], axis=0), np.max([box[1] for box in boxes], axis=0)
+        self.lamps = Lamps(lights, 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low)), self._emitters)
+        return self.lamps
+
+
+def _check_surface(state: ObjectState, asset: Asset, settings: RenderSettings) -> None:
+    """Refuse an asset of which nothing would be seen, or that light would not meet."""
+    subject, bare = f"object {state.name}", settings.primary == "mesh" or settings.tracer == "mesh"
+    if bare and not len(asset.mesh.faces):
+        remedy = "Choose surfels as primary surface and as tracer, or import a file whose mesh has faces"
+        raise AssetError(subject, f"the mesh of {state.asset} has no faces", remedy)
+    if "surfels" in (settings.primary, settings.tracer) and not len(asset.surfels):
+        raise AssetError(subject, f"{state.asset} has no surfels", "Choose the mesh as primary surface and as tracer")

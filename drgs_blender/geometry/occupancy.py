@@ -1,0 +1,73 @@
+"""Filled space as cells, and whether a straight way through it leaves it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..compute.jit import njit, prange
+
+Array = np.ndarray
+
+
+@dataclass(frozen=True, slots=True)
+class Volume:
+    """Cells of space that matter fills.
+
+    Attributes
+    ----------
+    origin : (3,) float64, metres: lowest corner of cell (0, 0, 0)
+    spacing : metres, side of a cell
+    part : (nx, ny, nz) int32, number of the connected part a cell belongs to, -1 outside
+    """
+
+    origin: Array
+    spacing: float
+    part: Array
+
+    def centres(self) -> Array:
+        """(n, 3) float64 centres of the filled cells, in the order of ``part[part >= 0]``."""
+        return self.origin + (np.argwhere(self.part >= 0) + 0.5) * self.spacing
+
+
+@njit(parallel=True)
+def _crossings(points, starts, chosen, part, origin, spacing, reach, out):  # type: ignore[no-untyped-def]
+    nx, ny, nz = part.shape
+    for i in prange(len(points)):
+        for m in range(chosen.shape[1]):
+            k = chosen[i, m]
+            dx, dy, dz = points[i, 0] - starts[k, 0], points[i, 1] - starts[k, 1], points[i, 2] - starts[k, 2]
+            length = np.sqrt(dx * dx + dy * dy + dz * dz) / spacing
+            steps = int(2.0 * (length - reach)) + 1 if length > reach else 0
+            empty = False
+            for s in range(steps):
+                t = 0.5 * (s + 1) / length
+                a = int(np.floor((starts[k, 0] + t * dx - origin[0]) / spacing))
+                b = int(np.floor((starts[k, 1] + t * dy - origin[1]) / spacing))
+                c = int(np.floor((starts[k, 2] + t * dz - origin[2]) / spacing))
+                if not (0 <= a < nx and 0 <= b < ny and 0 <= c < nz) or part[a, b, c] < 0:
+                    empty = True
+            out[i, m] = empty
+
+
+def crosses_gap(volume: Volume, points: Array, sources: Array, chosen: Array, reach: float = 1.5) -> Array:
+    """Whether the straight way from a source to a point leaves the filled space.
+
+    Parameters
+    ----------
+    points : (n, 3) float64, metres
+    sources : (k, 3) float64, points in filled cells
+    chosen : (n, m) int, sources to look at from each point
+    reach : cells before the point that may be empty: a surface lies just outside of what fills it
+
+    Returns
+    -------
+    (n, m) bool
+    """
+    out = np.empty(chosen.shape, np.bool_)
+    _crossings(
+        np.ascontiguousarray(points, np.float64), np.ascontiguousarray(sources, np.float64),
+        np.ascontiguousarray(chosen, np.int64), volume.part, volume.origin, volume.spacing, reach, out,
+    )  # fmt: skip
+    return out

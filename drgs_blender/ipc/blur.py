@@ -1,0 +1,81 @@
+"""One blurred picture of many: what each shows of it, and their mean. Where they are seen from, Blender's side says."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+
+from ..core.frame import Camera, Frame, RenderSettings
+from ..core.passes import BY_NAME
+from .messages import Passes
+
+Array = np.ndarray
+
+#: Passes that are not blurred: what they say of a surface has no mean.
+SHARP = frozenset(
+    name for name, p in BY_NAME.items() if (p.kind != "COLOR" or p.exact or name == "Albedo") and name != "Variance"
+)
+
+
+def through(camera: Camera, lens: tuple[float, float], distance: float) -> Camera:
+    """`camera` from another place of its lens, metres to the right and up; what is at `distance` stays in its pixel."""
+    x, y = lens
+    pose = np.array(camera.matrix_world)
+    aside = x * pose[:3, 0] + y * pose[:3, 1]
+    pose[:3, 3] += aside
+    if camera.orthographic:
+        pose[:3, 2] += aside / distance
+        return replace(camera, matrix_world=pose)
+    cx, cy = camera.cx + camera.fx * x / distance, camera.cy - camera.fy * y / distance
+    return replace(camera, matrix_world=pose, cx=cx, cy=cy)
+
+
+def sharp(frame: Frame) -> Frame | None:
+    """The picture with those passes of a blurred one that stay sharp; None where none is wanted."""
+    names = tuple(name for name in frame.passes if name in SHARP)
+    if not names:
+        return None
+    cheap = replace(frame.settings, cosine=1, ggx=1, environment=1, bounces=0, denoise="none", noise_threshold=0.0)
+    return replace(frame, passes=names, settings=cheap)
+
+
+def share(frame: Frame, count: int, index: int) -> Frame:
+    """One of the `count` pictures that are averaged, of a frame at its time and place on the lens."""
+    names = tuple(name for name in frame.passes if name not in SHARP)
+    return replace(frame, passes=names, settings=shared(frame.settings, count, index), previous=None, next=None)
+
+
+def shared(settings: RenderSettings, count: int, index: int) -> RenderSettings:
+    """The settings of one of `count` pictures: its part of the samples, with noise of its own."""
+    return replace(
+        settings,
+        cosine=-(-settings.cosine // count),
+        ggx=-(-settings.ggx // count),
+        environment=-(-settings.environment // count),
+        aa=-(-settings.aa // count),
+        noise_threshold=0.0,
+        seed=(settings.seed + 0x9E3779B1 * index) % 2**31,
+    )
+
+
+def averaged(parts: Iterable[Passes], count: int) -> Passes:
+    """One picture of the sharp passes and `count` that are averaged; seconds and samples are added up."""
+    sums: dict[str, Array] = {}
+    kept: dict[str, Array] = {}
+    statistics: dict[str, float] = {}
+    warnings: list[str] = []
+    for part in parts:
+        for name, values in part.items():
+            if name in SHARP:
+                kept[name] = values
+            else:
+                sums[name] = values.astype(np.float64) if name not in sums else sums[name] + values
+        warnings += [text for text in part.warnings if text not in warnings]
+        for name, value in part.statistics.items():
+            added = name.startswith("seconds.") or name == "samples"
+            statistics[name] = statistics.get(name, 0.0) + value if added else value
+    # The pictures' noise is independent.
+    means = {name: total / (count**2 if name == "Variance" else count) for name, total in sums.items()}
+    return Passes(kept | {name: mean.astype(np.float32) for name, mean in means.items()}, warnings, statistics)

@@ -1,0 +1,38 @@
+"""Telling what changed from frame to frame."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, TypeVar
+
+import numpy as np
+
+from ..core.arrays import keep, same_bits
+
+T = TypeVar("T")
+
+
+def renewed(value: T, known: Any) -> T:
+    """`known` itself when it equals `value`, else a copy of `value` that nobody can change.
+
+    Arrays are compared bit by bit. Wherever a part of `value` (a field, an item) equals that of `known`, the copy holds
+    the latter: whoever looks at it sees by identity what changed.
+    """
+    made: Any
+    if isinstance(value, np.ndarray):
+        made = known if isinstance(known, np.ndarray) and same_bits(value, known) else keep(value)
+        return made
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        before = known if type(known) is type(value) else None
+        names = [f.name for f in dataclasses.fields(value)]
+        made = {name: renewed(getattr(value, name), getattr(before, name, None)) for name in names}
+        if before is not None and all(made[name] is getattr(before, name) for name in names):
+            return before
+        return type(value)(**made)
+    if isinstance(value, (list, tuple)):
+        old = known if type(known) is type(value) else ()
+        made = [renewed(item, old[i] if i < len(old) else None) for i, item in enumerate(value)]
+        if len(old) == len(made) and type(known) is type(value) and all(a is b for a, b in zip(made, old)):
+            return known
+        return type(value)(made)
+    return known if type(known) is type(value) and known == value else value

@@ -1,0 +1,97 @@
+"""A frame on disk, for programs that do not talk to Blender; numpy and the standard library only.
+
+A safetensors file: the arrays by slot, and the rest of the frame as JSON. Large arrays lie beside it, named by what
+they hold, so that the frames of a sequence share what does not change.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..core.asset.archive import replace_file
+from ..core.asset.tensors import decode, encode, parse_json
+from ..core.errors import AssetError, VersionError
+from ..core.frame import Frame
+from ..core.version import __version__
+from .codec import CodecError, decode_frame, encode_frame
+
+Array = np.ndarray
+
+#: Ending of such files.
+SUFFIX = ".drgsframe"
+_DESCRIPTION = "description"
+#: Arrays of as many bytes have a file of their own.
+_LARGE = 1 << 16
+_REMEDY = "Export the frame again"
+
+
+def write_frame_file(path: Path, frame: Frame) -> None:
+    """Write `frame`, whose objects name the files of their assets. Raises WriteError."""
+    data, arrays = encode_frame(frame)
+    apart = {slot: _write_apart(path.parent, array) for slot, array in arrays.items() if array.nbytes >= _LARGE}
+    text = json.dumps({"version": __version__, "frame": data, "apart": apart}, allow_nan=False)
+    inside = {slot: array for slot, array in arrays.items() if slot not in apart}
+    replace_file(path, encode({_DESCRIPTION: np.frombuffer(text.encode(), np.uint8)} | inside))
+
+
+def read_frame_file(path: Path) -> Frame:
+    """The frame that `write_frame_file` wrote.
+
+    Raises
+    ------
+    AssetError
+        The file cannot be read, or is damaged.
+    VersionError
+        Another version of the program wrote it.
+    """
+    subject = str(path)
+    try:
+        if path.exists() and not path.is_file():
+            raise AssetError(subject, "is not a regular file", _REMEDY)
+        arrays = decode(np.fromfile(path, np.uint8), subject)
+    except OSError as error:
+        raise AssetError(subject, f"cannot be read ({error.strerror or error})", "Check the path") from error
+    text = arrays.pop(_DESCRIPTION, None)
+    if text is None:
+        raise AssetError(subject, "is no frame", _REMEDY)
+    content = parse_json(text.tobytes(), subject)
+    if content.get("version") != __version__:
+        raise VersionError(subject, f"is of version {content.get('version')}, this is {__version__}", "Export it again")
+    arrays |= _read_apart(path, content.get("apart"))
+    try:
+        return decode_frame(content.get("frame"), arrays)
+    except CodecError as error:
+        raise AssetError(subject, f"is no frame ({error})", _REMEDY) from error
+
+
+def _write_apart(folder: Path, array: Array) -> str:
+    """Write an array to a file that its content names, unless that is there; return the name."""
+    data = io.BytesIO()
+    np.save(data, array, allow_pickle=False)
+    name = f"{hashlib.blake2b(data.getbuffer(), digest_size=16).hexdigest()}.npy"
+    if not (folder / name).exists():
+        replace_file(folder / name, [data.getbuffer()])
+    return name
+
+
+def _read_apart(path: Path, names: Any) -> dict[str, Array]:
+    """The arrays that lie beside a frame file, by slot."""
+    subject = str(path)
+    if not isinstance(names, dict):
+        raise AssetError(subject, "is no frame", _REMEDY)
+    arrays = {}
+    for slot, name in names.items():
+        beside = path.parent / str(name)
+        if Path(str(name)).name != name or not beside.is_file():
+            raise AssetError(subject, f"needs {str(name)[:60]!r}, which does not lie beside it", _REMEDY)
+        try:
+            arrays[slot] = np.load(beside, allow_pickle=False)
+        except (OSError, ValueError, EOFError, SyntaxError, MemoryError) as error:
+            raise AssetError(str(beside), f"cannot be read ({error})", _REMEDY) from error
+    return arrays

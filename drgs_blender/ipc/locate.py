@@ -1,0 +1,71 @@
+"""Where the engine's interpreter is. Never downloads, never guesses in the user's PATH."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from ..core.errors import DeviceError
+
+#: Environment variable that names the engine: farms start Blender with factory settings.
+VARIABLE = "DRGS_ENGINE"
+
+
+def _interpreter_in(folder: Path) -> Path | None:
+    """The Python of the environment `folder`, or beside a program in `folder`."""
+    for candidate in ("bin/python3", "bin/python", "Scripts/python.exe", "python.exe", "python3", "python"):
+        if (folder / candidate).is_file():
+            return folder / candidate
+    return None
+
+
+def _interpreter(place: Path) -> Path | None:
+    """The Python that `place` means: an interpreter, a ``drgs`` program, or the folder of an environment."""
+    if place.is_dir():
+        return _interpreter_in(place)
+    if not place.is_file():
+        return None
+    if place.stem.lower() == "drgs":
+        return _interpreter_in(place.parent) or _interpreter_in(place.resolve().parent)
+    return place if os.access(place, os.X_OK) else None
+
+
+def engine_command(interpreter: str | os.PathLike[str]) -> list[str]:
+    """Command that runs the engine on `interpreter`, which has DR-GS installed; nothing of this process leaks in."""
+    return [os.fspath(interpreter), "-I", "-m", "drgs_blender.engine"]
+
+
+def locate_engine(preference: str | os.PathLike[str] | None = None) -> list[str]:
+    """Find the engine; return the command for `EngineClient`.
+
+    Looked at in this order: the environment variable ``DRGS_ENGINE``, `preference`, and ``.venv`` beside the package
+    when it runs from a source checkout. The first two may name an interpreter, a ``drgs`` program or the folder of an
+    environment; one that is set but leads nowhere is an error, never skipped.
+
+    Raises
+    ------
+    DeviceError
+        Naming every place looked at.
+    """
+    looked: list[str] = []
+    for origin, value in ((f"environment variable {VARIABLE}", os.environ.get(VARIABLE)), ("preference", preference)):
+        if not value:
+            looked.append(f"{origin} is not set")
+            continue
+        place = Path(value).expanduser()
+        if found := _interpreter(place):
+            return engine_command(found)
+        what = "has no Python in it" if place.is_dir() else "is not an interpreter" if place.exists() else "is absent"
+        remedy = "Set it to the folder of an environment with DR-GS installed, or to its python or drgs program"
+        raise DeviceError(f"engine ({origin})", f"{place} {what}", remedy)
+    checkout = Path(__file__).resolve().parents[2]
+    if (checkout / "pyproject.toml").is_file():
+        if found := _interpreter(checkout / ".venv"):
+            return engine_command(found)
+        looked.append(f"{checkout / '.venv'} has no Python in it")
+    raise DeviceError(
+        "engine",
+        f"not found: {'; '.join(looked)}",
+        f"Create an environment with `python -m venv` and `pip install .` in a checkout of DR-GS, then name its "
+        f"folder in the add-on preferences or in {VARIABLE}",
+    )

@@ -1,0 +1,347 @@
+"""How extension and engine send each other `messages`: their form, and the link that carries it (docs/protocol.md).
+
+A message is a fixed prefix, a JSON header of limited size, and arrays: in the pipe behind the header, or in a shared
+region. Everything is checked against limits before memory is taken for it; nothing received is ever executed.
+Needs numpy and the standard library only: Blender's Python uses this module as it is.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from ..core.version import __version__
+from .codec import CodecError, decode, encode
+from .messages import (
+    MESSAGES,
+    Alive,
+    Cancel,
+    Failed,
+    Hello,
+    LoadAsset,
+    Loaded,
+    Need,
+    Passes,
+    Progress,
+    Refine,
+    Render,
+    Result,
+    Shutdown,
+    Stopped,
+    View,
+    Welcome,
+)
+from .shared_memory import Region
+
+__all__ = [  # the messages are part of it
+    "ALIGNMENT",
+    "DTYPES",
+    "MAGIC",
+    "MAX_ARRAYS",
+    "MAX_BULK",
+    "MAX_DIMENSIONS",
+    "MAX_HEADER",
+    "MESSAGES",
+    "PREFIX",
+    "PROTOCOL",
+    "Alive",
+    "Cancel",
+    "Failed",
+    "Hello",
+    "Link",
+    "LoadAsset",
+    "Loaded",
+    "Need",
+    "Passes",
+    "Placed",
+    "Progress",
+    "ProtocolError",
+    "RawIO",
+    "Refine",
+    "Render",
+    "Result",
+    "Shutdown",
+    "Stopped",
+    "View",
+    "Welcome",
+    "__version__",
+    "pack",
+    "same_version",
+    "sendable",
+    "unpack",
+]
+
+Array = np.ndarray
+
+#: Raised with every change of the messages. Two sides work together only when it and the version are the same.
+PROTOCOL = 7
+
+MAGIC = b"DRGS"
+PREFIX = struct.Struct("<4sIQ")  # magic, bytes of the header, bytes of arrays behind it in the pipe
+
+MAX_HEADER = 8 << 20
+MAX_ARRAYS = 1 << 14
+MAX_DIMENSIONS = 4
+MAX_BULK = 16 << 30
+ALIGNMENT = 64
+DTYPES = {d: np.dtype(d) for d in ("<f4", "<f8", "<i4", "<i8", "|u1")}
+
+
+class ProtocolError(ValueError):
+    """What was received is not a message of this protocol."""
+
+
+class RawIO(Protocol):
+    """The part of an unbuffered binary file that a link uses."""
+
+    def readinto(self, buffer: memoryview, /) -> int | None: ...
+    def write(self, data: memoryview | bytes, /) -> int | None: ...
+
+
+# --- headers ------------------------------------------------------------------------------------------------------
+
+
+def _aligned(size: int) -> int:
+    return -(-size // ALIGNMENT) * ALIGNMENT
+
+
+def _no_constant(text: str) -> float:
+    raise ProtocolError(f"the header holds the number {text}")
+
+
+def _no_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) != len(pairs):
+        raise ProtocolError("the header holds a name twice")
+    return found
+
+
+def sendable(array: Array) -> Array:
+    """`array` C-contiguous, little-endian and of a dtype that may be sent, copied only where needed."""
+    array = np.ascontiguousarray(array).reshape(np.shape(array))
+    dtype = array.dtype.newbyteorder("<")
+    if dtype.str not in DTYPES:
+        raise CodecError(f"an array of {array.dtype} cannot be sent, only {', '.join(DTYPES)}")
+    return array.astype(dtype, copy=False)
+
+
+def pack(message: Any, arrays: dict[str, Array], where: str) -> tuple[bytes, int]:
+    """Header of `message` with `arrays` (all `sendable`); return (header bytes, bytes of the arrays)."""
+    table = []
+    offset = 0
+    for name, array in arrays.items():
+        table.append([name, array.dtype.str, list(array.shape), offset])
+        offset = _aligned(offset + array.nbytes)
+    header = {
+        "type": type(message).__name__,
+        "body": encode(type(message), message, "", {}),
+        "where": where if offset else "inline",
+        "arrays": table,
+    }
+    text = json.dumps(header, allow_nan=False, separators=(",", ":")).encode("ascii")
+    if len(text) > MAX_HEADER:
+        raise CodecError(f"the header has {len(text)} bytes, at most {MAX_HEADER} are allowed")
+    return text, offset
+
+
+@dataclass(slots=True)
+class Placed:
+    """One array of a message: where its bytes lie in the bulk."""
+
+    name: str
+    dtype: np.dtype
+    shape: tuple[int, ...]
+    offset: int
+    size: int
+
+
+def unpack(header: bytes) -> tuple[Any, str, list[Placed], int]:
+    """Check a header; return (message, "inline" or "shared", its arrays, bytes of the bulk).
+
+    Raises
+    ------
+    ProtocolError
+        Whatever is wrong with it; no other error is raised.
+    """
+    try:
+        data = json.loads(header, parse_constant=_no_constant, object_pairs_hook=_no_duplicates)
+    except (ValueError, RecursionError) as error:
+        raise ProtocolError(f"the header cannot be read ({error})") from error
+    if not isinstance(data, dict) or set(data) != {"type", "body", "where", "arrays"}:
+        raise ProtocolError("the header does not have the parts of a message")
+    kind = data["type"]
+    if not isinstance(kind, str) or kind not in MESSAGES:
+        raise ProtocolError(f"unknown message {str(kind)[:100]!r}")
+    if data["where"] not in ("inline", "shared"):
+        raise ProtocolError("the arrays are neither inline nor shared")
+    if not isinstance(data["arrays"], list) or len(data["arrays"]) > MAX_ARRAYS:
+        raise ProtocolError(f"the arrays are not a list of at most {MAX_ARRAYS}")
+    try:
+        message = decode(MESSAGES[kind], data["body"], "", {})
+    except CodecError as error:
+        raise ProtocolError(f"{kind}: {error}") from error
+    placed: list[Placed] = []
+    offset = 0
+    for entry in data["arrays"]:
+        item = _place(entry, offset)
+        placed.append(item)
+        offset = _aligned(item.offset + item.size)
+        if offset > MAX_BULK:
+            raise ProtocolError(f"the arrays have more than {MAX_BULK} bytes")
+    if len({item.name for item in placed}) != len(placed):
+        raise ProtocolError("two arrays have the same name")
+    return message, data["where"], placed, offset
+
+
+def _place(entry: Any, offset: int) -> Placed:
+    """Check one row of the array table; arrays lie one behind the other, each on a multiple of `ALIGNMENT`."""
+    if not isinstance(entry, list) or len(entry) != 4:
+        raise ProtocolError("an array is not described by name, dtype, shape and offset")
+    name, dtype, shape, start = entry
+    if not isinstance(name, str) or not isinstance(dtype, str) or dtype not in DTYPES:
+        raise ProtocolError(f"array {str(name)[:100]!r} has dtype {str(dtype)[:20]!r}, allowed: {', '.join(DTYPES)}")
+    if not isinstance(shape, list) or len(shape) > MAX_DIMENSIONS:
+        raise ProtocolError(f"array {name[:100]!r} has more than {MAX_DIMENSIONS} dimensions")
+    if any(type(n) is not int or not 0 <= n <= MAX_BULK for n in shape):
+        raise ProtocolError(f"array {name[:100]!r} has an impossible shape")
+    size = math.prod(shape) * DTYPES[dtype].itemsize
+    if type(start) is not int or start != offset or size > MAX_BULK:
+        raise ProtocolError(f"array {name[:100]!r} does not lie where it must")
+    return Placed(name, DTYPES[dtype], tuple(shape), start, size)
+
+
+# --- the link -----------------------------------------------------------------------------------------------------
+
+
+class Link:
+    """Both ends of the two pipes, and the shared regions where there are any.
+
+    One thread may receive; any thread may send. A message with arrays may be sent only when the other side has
+    answered the previous one that had any: the shared region holds one message at a time.
+
+    Parameters
+    ----------
+    reader, writer : unbuffered binary files
+    incoming, outgoing : shared regions, or None: arrays travel in the pipe
+    heard : called whenever bytes arrive
+    """
+
+    def __init__(self, reader: RawIO, writer: RawIO, heard: Callable[[], None] | None = None) -> None:
+        self._reader, self._writer, self._heard = reader, writer, heard
+        self._sending = threading.Lock()
+        self.incoming: Region | None = None
+        self.outgoing: Region | None = None
+        self.bulk_sent = 0
+        self.bulk_received = 0
+
+    def send(self, message: Any, arrays: dict[str, Array] | None = None) -> None:
+        """Write one message.
+
+        Raises
+        ------
+        OSError
+            When the other side is gone.
+        CodecError
+            When the message cannot be expressed.
+        """
+        ready = {name: sendable(array) for name, array in (arrays or {}).items()}
+        with self._sending:
+            size = sum(_aligned(array.nbytes) for array in ready.values())
+            region = self.outgoing.writable(size) if self.outgoing is not None and size else None
+            header, _ = pack(message, ready, "inline" if region is None else "shared")
+            self.bulk_sent += size
+            offset = 0
+            if region is not None:
+                for array in ready.values():
+                    target = np.frombuffer(region, array.dtype, array.size, offset)
+                    target[:] = array.reshape(-1)
+                    offset = _aligned(offset + array.nbytes)
+                size = 0
+            self._write(PREFIX.pack(MAGIC, len(header), size) + header)
+            if size:
+                for array in ready.values():
+                    self._write(memoryview(array.reshape(-1).view(np.uint8)))
+                    self._write(bytes(_aligned(array.nbytes) - array.nbytes))
+
+    def receive(self) -> tuple[Any, dict[str, Array]] | None:
+        """Wait for one message; return (message, its arrays, each a new array), or None at the end of the pipe.
+
+        Raises
+        ------
+        ProtocolError
+            When what arrives is not a message. The link cannot be used any more.
+        """
+        prefix = bytearray(PREFIX.size)
+        if not self._read(memoryview(prefix), may_end=True):
+            return None
+        magic, header_size, inline_size = PREFIX.unpack(prefix)
+        if magic != MAGIC:
+            raise ProtocolError(f"expected the start of a message, found {bytes(prefix[:4])!r}")
+        if not 2 <= header_size <= MAX_HEADER:
+            raise ProtocolError(f"a header of {header_size} bytes is announced, at most {MAX_HEADER} are allowed")
+        header = bytearray(header_size)
+        self._read(memoryview(header))
+        message, where, placed, size = unpack(bytes(header))
+        if inline_size != (size if where == "inline" else 0):
+            raise ProtocolError(f"{inline_size} bytes of arrays are announced, the header describes {size}")
+        self.bulk_received += size
+        if where == "shared":
+            return message, self._copy_shared(placed, size)
+        arrays: dict[str, Array] = {}
+        padding = bytearray(ALIGNMENT)
+        for item in placed:
+            arrays[item.name] = array = self._allocate(item)
+            self._read(memoryview(array.reshape(-1).view(np.uint8)))
+            self._read(memoryview(padding)[: _aligned(item.size) - item.size])
+        return message, arrays
+
+    def _copy_shared(self, placed: list[Placed], size: int) -> dict[str, Array]:
+        if self.incoming is None:
+            raise ProtocolError("arrays are announced in a shared region, but there is none")
+        try:
+            region = self.incoming.readable(size)
+        except (ValueError, OSError) as error:
+            raise ProtocolError(str(error)) from error
+        arrays: dict[str, Array] = {}
+        for item in placed:
+            source = np.frombuffer(region, item.dtype, math.prod(item.shape), item.offset)
+            arrays[item.name] = array = self._allocate(item)
+            array.reshape(-1)[:] = source
+        return arrays
+
+    @staticmethod
+    def _allocate(item: Placed) -> Array:
+        try:
+            return np.empty(item.shape, item.dtype)
+        except (MemoryError, ValueError) as error:
+            raise ProtocolError(f"no memory for array {item.name[:100]!r} of {item.size} bytes") from error
+
+    def _write(self, data: memoryview | bytes) -> None:
+        view = memoryview(data)
+        while len(view):
+            view = view[self._writer.write(view) or 0 :]
+
+    def _read(self, view: memoryview, may_end: bool = False) -> bool:
+        wanted = len(view)
+        while len(view):
+            count = self._reader.readinto(view)
+            if not count:
+                if may_end and len(view) == wanted:
+                    return False
+                raise ProtocolError("the pipe ended in the middle of a message")
+            view = view[count:]
+            if self._heard is not None:
+                self._heard()
+        return True
+
+
+def same_version(greeting: Hello | Welcome) -> bool:
+    """Whether the other side speaks the same protocol and is the same version of DR-GS."""
+    return greeting.protocol == PROTOCOL and greeting.version == __version__

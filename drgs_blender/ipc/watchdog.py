@@ -1,0 +1,40 @@
+"""When an engine that does not answer is given up."""
+
+from __future__ import annotations
+
+import time
+
+from ..core.errors import EngineError
+from .child_process import Child
+
+
+class Lost(Exception):
+    """The engine died, fell silent or spoke nonsense; a new one may do better."""
+
+
+class Watch:
+    """Counts how long the engine has been silent, and how long its main thread has stood still.
+
+    Time is counted in small steps, so that a pause of this process (a debugger, a suspended machine) is not taken
+    for one of the engine.
+    """
+
+    def __init__(self, child: Child, silence: float, stall: float) -> None:
+        self._child, self._silence, self._stall = child, silence, stall
+        self._last = time.monotonic()
+        self._seen = (child.heard, child.steps)
+        self._quiet = self._still = 0.0
+
+    def check(self) -> None:
+        now = time.monotonic()
+        passed, self._last = min(now - self._last, 0.5), now
+        heard, steps = self._seen
+        self._quiet = 0.0 if self._child.heard != heard else self._quiet + passed
+        self._still = 0.0 if self._child.steps != steps else self._still + passed
+        self._seen = (self._child.heard, self._child.steps)
+        if self._quiet > self._silence:
+            raise Lost(f"did not answer for {self._silence:g} s")
+        if self._still > self._stall:
+            raise EngineError(
+                "engine", f"made no progress for {self._stall:g} s", "Try fewer samples or a smaller scene"
+            )

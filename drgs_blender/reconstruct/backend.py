@@ -1,0 +1,82 @@
+"""Who does the work of a step of learning: this processor; `reconstruct.device` has another for a card.
+
+What surfels show, how far that is from a photograph, and the way down: every step goes through one of these, and so do
+previews. Tensors are the processor's own: `Processor.place` says where.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..core.arrays import Array
+from ..core.asset.model import Mesh
+from ..core.frame import Camera
+from ..render.scene.triangle_bvh import TriangleBVH
+from .capture.training_views import Target
+from .inverse_rendering.estimator import Gatherer
+from .losses.photometric import difference
+from .losses.shape import shape_loss
+from .model.attributes import attributes
+from .model.raster import Maps, Tally, rasterise
+from .model.reflection_probe import mirrored
+from .optim.adam import descend
+
+
+class Processor:
+    """This processor, by all threads: numpy's arrays and compiled code behind torch's tensors.
+
+    Attributes
+    ----------
+    place : where its tensors are
+    """
+
+    place = torch.device("cpu")
+
+    def bring(self, target: Target) -> Target:
+        """What a view is compared with, where this can read it."""
+        return target
+
+    def attributes(
+        self, parameters: dict[str, Tensor], centre: Tensor, eye: Array, bands: int, mirrors: bool
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """`attributes.attributes`."""
+        return attributes(parameters, centre, eye, bands, mirrors)
+
+    def rasterise(
+        self, centre: Tensor, tangent_u: Tensor, tangent_v: Tensor, opacity: Tensor, features: Tensor, camera: Camera,
+        tally: Tally | None = None,
+    ) -> Maps:  # fmt: skip
+        """`raster.rasterise`."""
+        return rasterise(centre, tangent_u, tangent_v, opacity, features, camera, tally)
+
+    def mirrored(self, features: Tensor, alpha: Tensor, rays: Tensor, texels: Tensor) -> Tensor:
+        """`reflection.mirrored`."""
+        return mirrored(features, alpha, rays.numpy(), texels)
+
+    def difference(self, picture: Tensor, photograph: Any) -> Tensor:
+        """`photometric.difference`; the photograph of what `bring` returned."""
+        return difference(picture, photograph)
+
+    def shape_loss(
+        self, alpha: Tensor, depth: Tensor, distortion: Tensor, normal: Tensor, mask: Tensor | None, rays: Tensor,
+        counts: Tensor, weights: tuple[float, float, float],
+    ) -> Tensor:  # fmt: skip
+        """`shape.shape_loss`."""
+        known = None if mask is None else mask.numpy()
+        return shape_loss(alpha, depth, distortion, normal, known, rays.numpy(), counts.numpy(), weights)
+
+    def descend(self, value: Tensor, gradient: Tensor, first: Tensor, second: Tensor, rate: Array) -> None:
+        """`adam.descend`."""
+        descend(value, gradient, first, second, rate)
+
+    def gatherer(
+        self, mesh: Mesh, tree: TriangleBVH, cache: Array | None, counts: tuple[int, int, int], normals: bool
+    ) -> Gatherer:
+        """`decouple.gather.Gatherer`."""
+        return Gatherer(mesh, tree, cache, counts, normals)
+
+
+HERE = Processor()

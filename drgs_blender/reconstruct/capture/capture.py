@@ -1,0 +1,63 @@
+"""What a capture is: calibrated photographs of one object."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from ...core.arrays import Array
+from ...core.frame import Camera
+
+
+@dataclass(slots=True)
+class View:
+    """One photograph.
+
+    Attributes
+    ----------
+    name : as in the capture, unique
+    camera : pinhole (lens distortion is taken out when a capture is read); Z up world, Blender's camera convention
+    colour : (height, width, 3) float32, sRGB-encoded in 0..1 as photographed, top row first
+    mask : (height, width) float32 in 0..1, how much of the pixel is the object; None where nobody drew one
+    test : left out of training
+    """
+
+    name: str
+    camera: Camera
+    colour: Array
+    mask: Array | None = None
+    test: bool = False
+
+
+@dataclass(slots=True)
+class Capture:
+    """Photographs of one object.
+
+    Attributes
+    ----------
+    source : what was read
+    views : in the order of their names
+    background : sRGB of what `colour` shows outside of the mask where that is one colour; None: the real surroundings
+    points : (n, 3) float32 sparse points on what was photographed (structure from motion), or None
+    """
+
+    source: Path
+    views: list[View]
+    background: tuple[float, float, float] | None = None
+    points: Array | None = None
+
+    @property
+    def name(self) -> str:
+        """What it is called in reports: its folder, and its file where one was chosen."""
+        path = self.source.resolve()
+        return f"{path.parent.name}/{path.name}" if path.is_file() else path.name
+
+    @property
+    def training(self) -> list[View]:
+        """Views that may be learned from."""
+        return [view for view in self.views if not view.test]
+
+    @property
+    def testing(self) -> list[View]:
+        """Views left out."""
+        return [view for view in self.views if view.test]

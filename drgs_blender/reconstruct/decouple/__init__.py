@@ -1,1 +1,0 @@
-"""Stage (ii): albedo, roughness, metallic and the light around an object, from photographs and its geometry."""

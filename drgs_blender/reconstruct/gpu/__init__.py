@@ -1,0 +1,1 @@
+"""Learning on a graphics card: torch tensors and Warp kernels."""

@@ -1,0 +1,263 @@
+"""Kernels of the differentiable rasteriser on a device, one lane a surfel, a pixel or a surfel in a tile.
+
+The functions here are translated and never run as they stand; what they call is the processor's. Forwards, a lane
+walks the list of its pixel's tile. Backwards, a first kernel walks it again and leaves, in a rectangle of each
+surfel's own, what its pixels let through before it and how they want its strength to change; a second one takes a
+surfel in one tile and sums over these pixels, row by row: no two lanes ever write to one number, and every sum has
+one order. The results are the same bits each time.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ...compute.warp.kernels import Room, Work
+from ...render.sampling import ONE, ZERO, F
+from ...render.surfels.raster import MAX_ALPHA, gaussian
+from ...render.surfels.splats import TILE
+from ..model.projection import (
+    CUT,
+    DIM,
+    I0,
+    IX,
+    IY,
+    OPACITY,
+    RX,
+    RY,
+    UX,
+    UY,
+    VX,
+    VY,
+    project_surfel,
+    project_surfel_backward,
+)
+from ..model.raster import BEFORE, MIN_TRANSMITTANCE, TRAVEL, slopes, strength
+
+#: Columns of a pixel's maps: transmittance, sums of weighted depth and of its square, distortion, median, features.
+T, Z, ZZ, DISTORTION, MEDIAN, FEATURES = 0, 1, 2, 3, 4, 5
+#: Columns of a pixel's gradients: of alpha, depth, median, distortion, features.
+G_ALPHA, G_DEPTH, G_MEDIAN, G_DISTORTION, G_FEATURES = 0, 1, 2, 3, 4
+#: Features at most.
+CHANNELS = 16
+
+
+def project_rows(
+    lane: Any, lanes: Any, room: Any, centre: Any, tangent_u: Any, tangent_v: Any, opacity: Any, p: Any, width: Any,
+    height: Any, out: Any,
+) -> None:  # fmt: skip
+    """`screen.project`."""
+    record, depth, box = out
+    for i in range(lane, len(centre), lanes):
+        project_surfel(i, centre, tangent_u, tangent_v, opacity, p, width, height, record, depth, box)
+
+
+def list_pairs(lane: Any, lanes: Any, room: Any, box: Any, first: Any, tiles_x: Any, out: Any) -> None:
+    """Tile and surfel of every pair of both, surfel by surfel, row by row of tiles."""
+    tile, surfel = out
+    for i in range(lane, len(box), lanes):
+        pair = first[i]
+        for ty in range(box[i, 1] // TILE, (box[i, 3] - 1) // TILE + 1):
+            for tx in range(box[i, 0] // TILE, (box[i, 2] - 1) // TILE + 1):
+                tile[pair], surfel[pair] = np.int32(ty * tiles_x + tx), np.int32(i)
+                pair += 1
+
+
+def pixel_of(number: Any, tiles_x: Any) -> Any:
+    """Tile, column and row of a lane's pixel: those of a tile follow each other."""
+    tile, within = number // (TILE * TILE), number % (TILE * TILE)
+    return tile, tile % tiles_x * TILE + within % TILE, tile // tiles_x * TILE + within // TILE
+
+
+def inside(box: Any, i: Any, x: Any, y: Any) -> Any:
+    """Whether a pixel may see surfel i."""
+    return x >= box[i, 0] and x < box[i, 2] and y >= box[i, 1] and y < box[i, 3]
+
+
+def meet(record: Any, i: Any, x: Any, y: Any, near: Any, far: Any) -> Any:
+    """Place of a pixel from surfel i's centre, and what `raster.strength` says of it."""
+    ex, ey = F(x) + F(0.5) - record[i, RX], F(y) + F(0.5) - record[i, RY]
+    q, z, exact, su, sv = strength(
+        ex, ey, record[i, UX], record[i, UY], record[i, VX], record[i, VY], record[i, I0], record[i, IX],
+        record[i, IY], ONE / record[i, I0], record[i, DIM], near, far,
+    )  # fmt: skip
+    return ex, ey, q, z, exact, su, sv
+
+
+def blend_pixels(
+    lane: Any, lanes: Any, room: Any, record: Any, values: Any, box: Any, start: Any, listed: Any, near: Any, far: Any,
+    tiles_x: Any, out: Any,
+) -> None:  # fmt: skip
+    """The maps of all pixels, as `raster._blend` sums them; neighbouring lanes are of one tile."""
+    (maps,) = out
+    (sums,) = room
+    height, width, channels = maps.shape[0], maps.shape[1], values.shape[1]
+    half, stop = F(0.5), F(MIN_TRANSMITTANCE)
+    for number in range(lane, (len(start) - 1) * TILE * TILE, lanes):
+        tile, x, y = pixel_of(number, tiles_x)
+        if x >= width or y >= height:
+            continue
+        for c in range(channels):
+            sums[c] = ZERO
+        t, depth, square, distortion, median = ONE, ZERO, ZERO, ZERO, ZERO
+        entry, last = start[tile], start[tile + 1]
+        while entry < last and t >= stop:
+            i = np.int64(listed[entry])
+            entry += 1
+            if inside(box, i, x, y):
+                _, _, q, z, _, _, _ = meet(record, i, x, y, near, far)
+                if q < record[i, CUT]:
+                    w = t * min(record[i, OPACITY] * gaussian(q), F(MAX_ALPHA))
+                    after = t - w
+                    distortion += w * (z * z * (ONE - t) + square - (z + z) * depth)
+                    depth += w * z
+                    square += w * z * z
+                    if t > half and after <= half:
+                        median = z
+                    for c in range(channels):
+                        sums[c] += w * values[i, c]
+                    t = after
+        maps[y, x, T], maps[y, x, Z], maps[y, x, ZZ] = t, depth, square
+        maps[y, x, DISTORTION], maps[y, x, MEDIAN] = distortion, median
+        for c in range(channels):
+            maps[y, x, FEATURES + c] = sums[c]
+
+
+def pull_pixels(
+    lane: Any, lanes: Any, room: Any, record: Any, values: Any, box: Any, start: Any, listed: Any, first: Any,
+    near: Any, far: Any, tiles_x: Any, maps: Any, incoming: Any, out: Any,
+) -> None:  # fmt: skip
+    """Transmittance before each surfel, and gradient of its strength, by pixels of the surfels' rectangles.
+
+    Parameters
+    ----------
+    first : (m,) first row of each surfel's rectangle in what is written
+    incoming : (h, w, G_FEATURES + channels)
+    """
+    (pulls,) = out
+    height, width, channels = maps.shape[0], maps.shape[1], values.shape[1]
+    stop, most = F(MIN_TRANSMITTANCE), F(MAX_ALPHA)
+    for number in range(lane, (len(start) - 1) * TILE * TILE, lanes):
+        tile, x, y = pixel_of(number, tiles_x)
+        if x >= width or y >= height:
+            continue
+        alpha, mean, square = ONE - maps[y, x, T], maps[y, x, Z], maps[y, x, ZZ]
+        g_alpha, g_depth, g_distortion = incoming[y, x, G_ALPHA], incoming[y, x, G_DEPTH], incoming[y, x, G_DISTORTION]
+        # Twice: the distortion is quadratic in the weights.
+        total = g_alpha * alpha + g_depth * mean + F(2.0) * g_distortion * maps[y, x, DISTORTION]
+        for c in range(channels):
+            total += incoming[y, x, G_FEATURES + c] * maps[y, x, FEATURES + c]
+        t, run = ONE, ZERO
+        entry, last = start[tile], start[tile + 1]
+        while entry < last and t >= stop:
+            i = np.int64(listed[entry])
+            entry += 1
+            if inside(box, i, x, y):
+                _, _, q, z, _, _, _ = meet(record, i, x, y, near, far)
+                if q < record[i, CUT]:
+                    strong = record[i, OPACITY] * gaussian(q)
+                    a = min(strong, most)
+                    w = t * a
+                    g = g_alpha
+                    for c in range(channels):
+                        g += values[i, c] * incoming[y, x, G_FEATURES + c]
+                    g = g + g_depth * z + g_distortion * (z * z * alpha + square - (z + z) * mean)
+                    run += w * g
+                    pull = t * g - (total - run) / (ONE - a)
+                    at = first[i] + np.int64(y - box[i, 1]) * np.int64(box[i, 2] - box[i, 0]) + np.int64(x - box[i, 0])
+                    pulls[at, 0], pulls[at, 1] = t, pull if strong < most else ZERO
+                    t = t - w
+
+
+def sum_pixels(
+    lane: Any, lanes: Any, room: Any, record: Any, box: Any, listed: Any, tiles: Any, pairs: Any, first: Any,
+    near: Any, far: Any, tiles_x: Any, maps: Any, incoming: Any, pulls: Any, out: Any,
+) -> None:  # fmt: skip
+    """Gradients of each surfel's record and features from its pixels in one tile.
+
+    Parameters
+    ----------
+    listed, tiles, pairs : (k,) surfel, tile and number of each pair, in the order of tiles
+    pulls : what `pull_pixels` wrote
+    """
+    (slots,) = out
+    half, width, height = F(0.5), maps.shape[1], maps.shape[0]
+    channels = incoming.shape[2] - G_FEATURES
+    for entry in range(lane, len(listed), lanes):
+        i, tile, pair = np.int64(listed[entry]), np.int64(tiles[entry]), pairs[entry]
+        left, top = tile % tiles_x * TILE, tile // tiles_x * TILE
+        x0, x1 = max(left, np.int64(box[i, 0])), min(min(left + TILE, np.int64(box[i, 2])), width)
+        y0, y1 = max(top, np.int64(box[i, 1])), min(min(top + TILE, np.int64(box[i, 3])), height)
+        across = np.int64(box[i, 2] - box[i, 0])
+        ux, uy, vx, vy = record[i, UX], record[i, UY], record[i, VX], record[i, VY]
+        ix, iy, opacity = record[i, IX], record[i, IY], record[i, OPACITY]
+        to_x, to_y, to_ux, to_uy, to_vx, to_vy = ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
+        to_i, to_ix, to_iy, to_opacity, travel = ZERO, ZERO, ZERO, ZERO, ZERO
+        for y in range(y0, y1):
+            for x in range(x0, x1):
+                at = first[i] + (y - np.int64(box[i, 1])) * across + x - np.int64(box[i, 0])
+                t, pull = pulls[at, 0], pulls[at, 1]
+                if t > ZERO:
+                    ex, ey, q, z, exact, su, sv = meet(record, i, x, y, near, far)
+                    kernel = gaussian(q)
+                    alpha = min(opacity * kernel, F(MAX_ALPHA))
+                    w = t * alpha
+                    g_distortion = incoming[y, x, G_DISTORTION]
+                    g_z = w * (
+                        incoming[y, x, G_DEPTH]
+                        + (g_distortion + g_distortion) * (z * (ONE - maps[y, x, T]) - maps[y, x, Z])
+                    )
+                    if t > half and t - w <= half:
+                        g_z += incoming[y, x, G_MEDIAN]
+                    g_ex, g_ey, g_su, g_sv, g_i, slope = slopes(
+                        pull, g_z, alpha, ex, ey, z, exact, su, sv, ux, uy, vx, vy, ix, iy
+                    )
+                    to_x -= g_ex
+                    to_y -= g_ey
+                    to_ux += g_su * ex
+                    to_uy += g_su * ey
+                    to_vx += g_sv * ex
+                    to_vy += g_sv * ey
+                    to_i += g_i
+                    to_ix += slope * ex
+                    to_iy += slope * ey
+                    to_opacity += pull * kernel
+                    travel += abs(g_ex) + abs(g_ey)
+                    for c in range(channels):
+                        slots[pair, BEFORE + c] += w * incoming[y, x, G_FEATURES + c]
+        slots[pair, RX], slots[pair, RY] = to_x, to_y
+        slots[pair, UX], slots[pair, UY], slots[pair, VX], slots[pair, VY] = to_ux, to_uy, to_vx, to_vy
+        slots[pair, I0], slots[pair, IX], slots[pair, IY] = to_i, to_ix, to_iy
+        slots[pair, OPACITY], slots[pair, TRAVEL] = to_opacity, travel
+
+
+def sum_tiles(lane: Any, lanes: Any, room: Any, slots: Any, first: Any, out: Any) -> None:
+    """Add up the slots of each surfel, `first` (m + 1,) to the next one's, in the order of tiles; a lane a number."""
+    (total,) = out
+    columns = total.shape[1]
+    for number in range(lane, total.shape[0] * columns, lanes):
+        i, c = number // columns, number % columns
+        found = ZERO
+        for pair in range(first[i], first[i + 1]):
+            found += slots[pair, c]
+        total[i, c] = found
+
+
+def project_rows_backward(
+    lane: Any, lanes: Any, room: Any, centre: Any, tangent_u: Any, tangent_v: Any, p: Any, index: Any, gradient: Any,
+    out: Any,
+) -> None:  # fmt: skip
+    """`screen.project_backward`."""
+    g_centre, g_u, g_v = out
+    for k in range(lane, len(index), lanes):
+        project_surfel_backward(k, centre, tangent_u, tangent_v, p, index, gradient, g_centre, g_u, g_v)
+
+
+PROJECT = Work(project_rows, (), {})
+LIST = Work(list_pairs, (), {})
+BLEND = Work(blend_pixels, (Room("float32", (CHANNELS,)),), {})
+PULL = Work(pull_pixels, (), {})
+SUM_PIXELS = Work(sum_pixels, (), {})
+SUM_TILES = Work(sum_tiles, (), {})
+PROJECT_BACKWARD = Work(project_rows_backward, (), {})

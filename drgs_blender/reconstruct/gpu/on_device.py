@@ -1,0 +1,84 @@
+"""A processor for learning that is a device of Warp and of torch."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ...compute.warp.kernels import Work
+from ...core.arrays import Array
+from ...core.asset.model import Mesh
+from ...core.frame import Camera
+from ...render.scene.triangle_bvh import TriangleBVH
+from ..backend import Processor
+from ..capture.training_views import Target
+from ..model.raster import Maps, Tally
+from ..optim.adam import some_rows
+from . import look, losses
+from .gather import DeviceGatherer
+from .launch import TensorLauncher
+from .raster import rasterise
+
+
+def descend_rows(lane: Any, lanes: Any, room: Any, gradient: Any, rate: Any, out: Any) -> None:
+    """`adam.descend`."""
+    value, first, second = out
+    for i in range(lane, len(value), lanes):
+        some_rows(value, gradient, first, second, rate, i, i + 1)
+
+
+DESCEND = Work(descend_rows, (), {})
+
+
+class OnDevice(Processor):
+    """A device of Warp, on which torch has its tensors.
+
+    Parameters
+    ----------
+    device : Warp's name of it: "cuda:0", "cpu"
+
+    What fails there is a DeviceError of Warp's work, a RuntimeError of torch's.
+    """
+
+    def __init__(self, device: str) -> None:
+        self.launcher = TensorLauncher(device)
+        self.place = self.launcher.place
+
+    def bring(self, target: Target) -> Target:
+        mask = None if target.mask is None else target.mask.to(self.place)
+        return replace(target, photograph=target.colour.to(self.place), mask=mask)
+
+    def attributes(
+        self, parameters: dict[str, Tensor], centre: Tensor, eye: Array, bands: int, mirrors: bool
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        return look.attributes(parameters, centre, eye, bands, mirrors)
+
+    def rasterise(
+        self, centre: Tensor, tangent_u: Tensor, tangent_v: Tensor, opacity: Tensor, features: Tensor, camera: Camera,
+        tally: Tally | None = None,
+    ) -> Maps:  # fmt: skip
+        return rasterise(self.launcher, centre, tangent_u, tangent_v, opacity, features, camera, tally)
+
+    def mirrored(self, features: Tensor, alpha: Tensor, rays: Tensor, texels: Tensor) -> Tensor:
+        return look.mirrored(features, alpha, rays, texels)
+
+    def difference(self, picture: Tensor, photograph: Tensor) -> Tensor:
+        return losses.difference(self.launcher, picture, photograph)
+
+    def shape_loss(
+        self, alpha: Tensor, depth: Tensor, distortion: Tensor, normal: Tensor, mask: Tensor | None, rays: Tensor,
+        counts: Tensor, weights: tuple[float, float, float],
+    ) -> Tensor:  # fmt: skip
+        return losses.shape_loss(alpha, depth, distortion, normal, mask, rays, counts, weights)
+
+    def descend(self, value: Tensor, gradient: Tensor, first: Tensor, second: Tensor, rate: Array) -> None:
+        there = torch.from_numpy(rate).to(self.place)
+        self.launcher.launch(DESCEND, len(value), (gradient, there), (value, first, second))
+
+    def gatherer(
+        self, mesh: Mesh, tree: TriangleBVH, cache: Array | None, counts: tuple[int, int, int], normals: bool
+    ) -> DeviceGatherer:
+        return DeviceGatherer(self.launcher, mesh, tree, cache, counts, normals)

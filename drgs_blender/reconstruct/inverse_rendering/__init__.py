@@ -1,0 +1,1 @@
+"""Stage (ii): albedo, roughness, metallic and environment from photographs and geometry."""

@@ -1,0 +1,401 @@
+"""The rendering equation at pixels, with its derivatives: what arrives, before the surface's colours weigh it.
+
+Of the BRDF only roughness and normal are inside the integral; albedo and metallic multiply four sums that every pixel
+has, each of radiance L over the drawn directions, with the weight w of the balance heuristic:
+
+    D  = sum w L cos / pi                 what a white Lambert surface reflects
+    S  = sum w L lobe (1 - f),   f = (1 - v.h)^5, lobe = D G / (4 n.v), of GGX with height-correlated Smith
+    P  = sum w L lobe f                   so that S F0 + P has Schlick's Fresnel
+    E  = sum w L lobe fresnel             the exact dielectric of IOR 1.5
+
+Directions and weights carry no derivative ("detached" sampling); radiance, roughness and normal do. Directions that
+miss the object meet the environment, a table of texels; those that hit it the radiance cache.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...compute.jit import njit, prange
+from ...core.asset.model import Mesh
+from ...core.frame import World
+from ...render.integrator.brdf import fresnel_dielectric, ggx, sample_vndf, vndf_terms
+from ...render.lights.environment import (
+    EnvironmentLight,
+    cell_at,
+    cell_end,
+    direction_in_cell,
+    first_cell,
+    map_at,
+    sky_density,
+)
+from ...render.lights.product_sampling import block_of, facing_row, in_cells_order
+from ...render.sampling import (
+    GOLDEN,
+    INVERSE_PI,
+    ONE,
+    ZERO,
+    F,
+    U,
+    basis,
+    cosine_hemisphere,
+    mix,
+    point_set,
+    scrambled,
+    unit,
+)
+from ...render.scene.embree import trace
+from ...render.scene.triangle_bvh import TriangleBVH
+
+Array = np.ndarray
+
+#: Sums of a pixel: D, S, P, E of the module's text.
+SUMS = 4
+#: Part of the scene's size by which rays start above the surface: more than facets stand off the smooth shape.
+_LIFT = 5e-4
+_BLOCK = 16
+#: Parts in which texel gradients are summed: a fixed number, so that threads do not change the result.
+_PARTS = 8
+_NONE = np.int32(-1)
+
+
+class Samples(NamedTuple):
+    """What `scatter` needs of each drawn direction; (n, s, ...), s over both halves.
+
+    Attributes
+    ----------
+    texel : (n, s, 4) int32: what a direction that misses the object reads, the first -1 for any other
+    share : (n, s, 4) float32: of these texels
+    weight : (n, s, 4) float32: of the radiance in D, S, P, E
+    """
+
+    texel: Array
+    share: Array
+    weight: Array
+
+
+@dataclass(slots=True)
+class Points:
+    """Pixels of one step: origin, flat, towards (n, 3) float32 as in `Pixels`, key (n,) uint32 of random numbers."""
+
+    origin: Array
+    flat: Array
+    towards: Array
+    key: Array
+
+
+@njit
+def _lobe(nl, nv, nh, sin2, a2):  # type: ignore[no-untyped-def]
+    """D G / (4 nl nv), D, and derivatives of the logarithm of the former by a2, nl, nv and nh (on the unit sphere)."""
+    value, d = ggx(nl, nv, nh * nh, sin2, a2)
+    k = a2 * nh * nh + sin2
+    rest = ONE - a2
+    sv, sl = math.sqrt(a2 + rest * nv * nv), math.sqrt(a2 + rest * nl * nl)
+    smith = nl * sv + nv * sl
+    half = F(0.5)
+    by_a2 = ONE / a2 - F(2.0) * nh * nh / k - half * (nl * (ONE - nv * nv) / sv + nv * (ONE - nl * nl) / sl) / smith
+    by_nl = -(sv + nv * nl * rest / sl) / smith
+    by_nv = -(sl + nl * nv * rest / sv) / smith
+    by_nh = F(4.0) * nh * rest / k
+    return value, d, by_a2, by_nl, by_nv, by_nh
+
+
+@njit
+def _bilinear(u, v, height, width):  # type: ignore[no-untyped-def]
+    """Four texels and their shares at lat-long coordinates, wrapped in u and clamped in v."""
+    x, y = u * F(width) - F(0.5), v * F(height) - F(0.5)
+    y = min(max(y, ZERO), F(height - 1))
+    c0, r0 = np.int32(x + ONE) - np.int32(1), np.int32(y)
+    a, b = x - F(c0), y - F(r0)
+    c1 = c0 + np.int32(1) if c0 + 1 < width else np.int32(0)
+    c0 = np.int32(width - 1) if c0 < 0 else c0
+    r1 = min(r0 + np.int32(1), np.int32(height - 1))
+    i = (r0 * width + c0, r0 * width + c1, r1 * width + c0, r1 * width + c1)
+    return i, ((ONE - a) * (ONE - b), a * (ONE - b), (ONE - a) * b, a * b)
+
+
+@njit
+def _cached(cache, a, b, c, u, v, dx, dy, dz, k):  # type: ignore[no-untyped-def]
+    """Channel k of the radiance that leaves a face's point in a direction; never negative."""
+    y0, band = F(0.28209479177387814), F(0.4886025119029199)
+    total = ZERO
+    for corner in range(3):
+        vertex = a if corner == 0 else (b if corner == 1 else c)
+        share = ONE - u - v if corner == 0 else (u if corner == 1 else v)
+        of = y0 * cache[vertex, 0, k] + band * (
+            dz * cache[vertex, 2, k] - dy * cache[vertex, 1, k] - dx * cache[vertex, 3, k]
+        )
+        total += share * max(of, ZERO)
+    return total
+
+
+@njit
+def _direction(strategy, n0, n1, n2, normal, view, alpha, bound, frame, row, sky):  # type: ignore[no-untyped-def]
+    """Direction of a strategy (0 cosine, 1 GGX, 2 light) from three random uint32."""
+    nx, ny, nz = normal
+    tx, ty, tz, bx, by, bz = frame
+    if strategy == 2:
+        number, _ = in_cells_order(row, block_of(row, n0, sky), n0, n1, sky)
+        place = first_cell(number, sky)
+        while number > cell_end(place, sky):
+            place += 1
+        _, column, upper, lower, _ = cell_at(place, sky)
+        dx, dy, dz, _, _ = direction_in_cell(column, upper, lower, n1, n2, sky)
+        return dx, dy, dz
+    if strategy == 0:
+        x, y, z = cosine_hemisphere(unit(n0), unit(n1))
+    else:
+        vx, vy, vz = view
+        ix, iy, iz = tx * vx + ty * vy + tz * vz, bx * vx + by * vy + bz * vz, nx * vx + ny * vy + nz * vz
+        x, y, z = sample_vndf(unit(n0), unit(n1), ix, iy, iz, alpha, bound)
+    return x * tx + y * bx + z * nx, x * ty + y * by + z * ny, x * tz + y * bz + z * nz
+
+
+@njit
+def _texels(radiance, t, p, k):  # type: ignore[no-untyped-def]
+    """Channel k of four texels by their shares."""
+    first = p[0] * radiance[t[0], k] + p[1] * radiance[t[1], k]
+    return first + p[2] * radiance[t[2], k] + p[3] * radiance[t[3], k]
+
+
+@njit
+def gather_point(i, points, normals, a2s, counts, sequence, scene, faces, cache, radiance, shape, sky, seen, out):  # type: ignore[no-untyped-def]
+    """All samples of one pixel; see `gather` for what is written."""
+    origin, flat, towards, key = points
+    sums, by_a2, by_normal, texel, share, weights = out
+    learn_normals = by_normal.shape[0] > 0
+    nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
+    gx, gy, gz = flat[i, 0], flat[i, 1], flat[i, 2]
+    vx, vy, vz = towards[i, 0], towards[i, 1], towards[i, 2]
+    ox, oy, oz = origin[i, 0] + shape[2] * gx, origin[i, 1] + shape[2] * gy, origin[i, 2] + shape[2] * gz
+    nv = nx * vx + ny * vy + nz * vz
+    a2 = a2s[i]
+    alpha = F(math.sqrt(a2))
+    bound, norm = vndf_terms(max(nv, F(1e-4)), a2)
+    frame = basis(nx, ny, nz)
+    row = facing_row(nx, ny, nz, sky)
+    place = 0
+    for half in range(2):
+        for strategy in range(3):
+            own = mix(U(mix(key[i]) + U(U(3 * half + strategy + 1) * GOLDEN)))
+            for j in range(counts[strategy] // 2):
+                s = place
+                place += 1
+                texel[i, s, 0] = _NONE
+                if strategy == 1 and not nv > ZERO:
+                    continue
+                n0 = scrambled(sequence[j, 0], mix(U(own + U(1))))
+                n1 = scrambled(sequence[j, 1], mix(U(own + U(2))))
+                n2 = scrambled(sequence[j, 2], mix(U(own + U(3))))
+                dx, dy, dz = _direction(strategy, n0, n1, n2, (nx, ny, nz), (vx, vy, vz), alpha, bound, frame, row, sky)
+                nl = nx * dx + ny * dy + nz * dz
+                if not (nl > F(1e-6) and gx * dx + gy * dy + gz * dz > ZERO):
+                    continue
+                hx, hy, hz = vx + dx, vy + dy, vz + dz
+                scale = ONE / math.sqrt(max(hx * hx + hy * hy + hz * hz, F(1e-20)))
+                hx, hy, hz = hx * scale, hy * scale, hz * scale
+                nh, vh = nx * hx + ny * hy + nz * hz, min(max(vx * hx + vy * hy + vz * hz, ZERO), ONE)
+                cx, cy, cz = ny * hz - nz * hy, nz * hx - nx * hz, nx * hy - ny * hx
+                value, density, l_a2, l_nl, l_nv, l_nh = ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
+                if nv > ZERO:
+                    value, density, l_a2, l_nl, l_nv, l_nh = _lobe(nl, nv, nh, cx * cx + cy * cy + cz * cz, a2)
+                u, v = map_at(dx, dy, dz, sky)
+                total = F(counts[0]) * nl * INVERSE_PI + F(counts[1]) * density * norm
+                if counts[2] > 0:
+                    total += F(counts[2]) * sky_density(u, v, row, sky)
+                if not total > F(1e-12):
+                    continue
+                w = ONE / total
+                lobe = w * value * nl
+                x = ONE - vh
+                f = x * x
+                f = f * f * x
+                w0, w1, w2, w3 = w * nl * INVERSE_PI, lobe * (ONE - f), lobe * f, lobe * fresnel_dielectric(vh)
+                _, group, face, _, hu, hv, _, _, _ = trace(
+                    scene[0], scene[1], ox, oy, oz, dx, dy, dz, ZERO, F(np.inf), _NONE
+                )
+                if group >= 0:
+                    if not seen:
+                        continue
+                    a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
+                    red = _cached(cache, a, b, c, hu, hv, -dx, -dy, -dz, 0)
+                    green = _cached(cache, a, b, c, hu, hv, -dx, -dy, -dz, 1)
+                    blue = _cached(cache, a, b, c, hu, hv, -dx, -dy, -dz, 2)
+                else:
+                    four, parts = _bilinear(u, v, shape[0], shape[1])
+                    red, green, blue = (
+                        _texels(radiance, four, parts, 0),
+                        _texels(radiance, four, parts, 1),
+                        _texels(radiance, four, parts, 2),
+                    )
+                    texel[i, s, 0], texel[i, s, 1], texel[i, s, 2], texel[i, s, 3] = four
+                    share[i, s, 0], share[i, s, 1], share[i, s, 2], share[i, s, 3] = parts
+                    weights[i, s, 0], weights[i, s, 1], weights[i, s, 2], weights[i, s, 3] = w0, w1, w2, w3
+                for k in range(3):
+                    light = red if k == 0 else (green if k == 1 else blue)
+                    sums[i, half, 0, k] += w0 * light
+                    sums[i, half, 1, k] += w1 * light
+                    sums[i, half, 2, k] += w2 * light
+                    sums[i, half, 3, k] += w3 * light
+                    by_a2[i, half, 1, k] += l_a2 * w1 * light
+                    by_a2[i, half, 2, k] += l_a2 * w2 * light
+                    by_a2[i, half, 3, k] += l_a2 * w3 * light
+                if learn_normals:
+                    along = l_nl + ONE / nl
+                    for axis in range(3):
+                        l = dx if axis == 0 else (dy if axis == 1 else dz)
+                        h = hx if axis == 0 else (hy if axis == 1 else hz)
+                        e = vx if axis == 0 else (vy if axis == 1 else vz)
+                        slope = along * l + l_nv * e + l_nh * h
+                        for k in range(3):
+                            light = red if k == 0 else (green if k == 1 else blue)
+                            by_normal[i, half, 0, 3 * k + axis] += w0 / nl * l * light
+                            by_normal[i, half, 1, 3 * k + axis] += w1 * slope * light
+                            by_normal[i, half, 2, 3 * k + axis] += w2 * slope * light
+                            by_normal[i, half, 3, 3 * k + axis] += w3 * slope * light
+
+
+@njit(parallel=True)
+def _gather(points, normals, a2s, counts, sequence, scene, faces, cache, radiance, shape, sky, seen, out):  # type: ignore[no-untyped-def]
+    n = len(a2s)
+    for block in prange((n + _BLOCK - 1) // _BLOCK):
+        for i in range(block * _BLOCK, min(n, (block + 1) * _BLOCK)):
+            gather_point(
+                i, points, normals, a2s, counts, sequence, scene, faces, cache, radiance, shape, sky, seen, out
+            )
+
+
+@njit(parallel=True)
+def _scatter(texel, share, weight, gradient, parts):  # type: ignore[no-untyped-def]
+    """Sum what each texel's radiance is worth to the loss, in parts of pixels."""
+    n, samples = texel.shape[:2]
+    for part in prange(len(parts)):
+        for i in range(part * n // len(parts), (part + 1) * n // len(parts)):
+            for s in range(samples):
+                if texel[i, s, 0] < 0:
+                    continue
+                half = 2 * s // samples
+                for k in range(3):
+                    value = ZERO
+                    for q in range(4):
+                        value += weight[i, s, q] * gradient[i, half, q, k]
+                    for q in range(4):
+                        parts[part, texel[i, s, q], k] += share[i, s, q] * value
+
+
+class Gatherer:
+    """Draws directions at pixels of a mesh and sums what arrives along them.
+
+    Parameters
+    ----------
+    mesh : what rays meet
+    tree : of its triangles, or of nothing where nothing is in the way
+    cache : (v, 4, 3) float32, see `cache.radiance_cache`; None: what hits the mesh is black
+    counts : even numbers of cosine, GGX and light samples a pixel
+    normals : whether derivatives by the normals are wanted
+    """
+
+    def __init__(
+        self, mesh: Mesh, tree: TriangleBVH, cache: Array | None, counts: tuple[int, int, int], normals: bool = False
+    ) -> None:
+        self._faces, self._tree, self._normals = mesh.faces, tree, normals
+        self._counts = np.array(counts, np.int64)
+        self._seen = cache is not None
+        self._cache = np.zeros((1, 4, 3), np.float32) if cache is None else np.ascontiguousarray(cache, np.float32)
+        low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+        self._lift = F(_LIFT * float(np.linalg.norm(high - low)))
+        self._sequence = point_set(max(counts) + 1)
+        self._light: EnvironmentLight | None = None
+
+    def aim(self, radiance: Array) -> None:
+        """Draw light samples in proportion to (h, w, 3) `radiance` from now on."""
+        self._light = EnvironmentLight(World(environment=np.ascontiguousarray(radiance, np.float32)))
+
+    def __call__(self, points: Points, normal: Tensor, alpha2: Tensor, radiance: Tensor) -> Tensor:
+        """The sums of `points`.
+
+        Parameters
+        ----------
+        normal : (n, 3) unit shading normals
+        alpha2 : (n,) square of GGX's alpha
+        radiance : (h, w, 3) lat-long, of the size given to `aim`
+
+        Returns
+        -------
+        (n, 2, 4, 3) : D, S, P, E from either half of the samples, each an estimate of its own
+        """
+        return _Gather.apply(normal, alpha2, radiance, self, points)
+
+    def run(self, points: Points, normal: Array, alpha2: Array, radiance: Array) -> tuple[Array, Array, Array, Samples]:
+        """Sums, their derivatives by alpha2 and by the normal (n, 2, 4, 3[, 3]), and the samples."""
+        if self._light is None:
+            self.aim(radiance)
+        assert self._light is not None
+        n, s = len(alpha2), int(self._counts.sum())
+        sums, by_a2 = np.zeros((2, n, 2, SUMS, 3), np.float32)
+        by_normal = np.zeros((n if self._normals else 0, 2, SUMS, 9), np.float32)
+        samples = Samples(
+            np.empty((n, s, 4), np.int32), np.empty((n, s, 4), np.float32), np.empty((n, s, 4), np.float32)
+        )
+        height, width = radiance.shape[:2]
+        self._gather(
+            (points.origin, points.flat, points.towards, points.key),
+            np.ascontiguousarray(normal),
+            np.ascontiguousarray(alpha2),
+            np.ascontiguousarray(radiance).reshape(-1, 3),
+            (np.int32(height), np.int32(width), self._lift),
+            self._light,
+            (sums, by_a2, by_normal, *samples),
+        )
+        # Weights are of all samples together: either half alone has half of the sum.
+        sums *= 2
+        by_a2 *= 2
+        by_normal *= 2
+        return sums, by_a2, by_normal.reshape(*by_normal.shape[:3], 3, 3), samples
+
+    def _gather(
+        self, points: tuple[Array, ...], normal: Array, alpha2: Array, radiance: Array, shape: tuple[Any, ...],
+        light: EnvironmentLight, out: tuple[Array, ...],
+    ) -> None:  # fmt: skip
+        """`gather_point` of all points."""
+        scene = self._tree.intersect_address, self._tree.scene
+        _gather(
+            points, normal, alpha2, self._counts, self._sequence, scene, self._faces, self._cache, radiance, shape,
+            light.sky, self._seen, out,
+        )  # fmt: skip
+
+
+class _Gather(torch.autograd.Function):
+    """`Gatherer.run` with its derivatives."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, normal: Tensor, alpha2: Tensor, radiance: Tensor, gatherer: Gatherer, points: Points
+    ) -> Tensor:
+        sums, by_a2, by_normal, samples = gatherer.run(
+            points, normal.detach().numpy(), alpha2.detach().numpy(), radiance.detach().numpy()
+        )
+        ctx.kept = by_a2, by_normal, samples, tuple(radiance.shape)
+        return torch.from_numpy(sums)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        by_a2, by_normal, samples, shape = ctx.kept
+        gradient = gradients[0]
+        for_alpha2 = (gradient * torch.from_numpy(by_a2)).sum((1, 2, 3))
+        for_normal = None
+        if len(by_normal):
+            for_normal = (gradient.unsqueeze(-1) * torch.from_numpy(by_normal)).sum((1, 2, 3))
+        for_radiance = None
+        if ctx.needs_input_grad[2]:
+            parts = np.zeros((_PARTS, shape[0] * shape[1], 3), np.float32)
+            # The factor two of either half, as in `Gatherer.run`.
+            _scatter(*samples, np.ascontiguousarray((2 * gradient).numpy()), parts)
+            for_radiance = torch.from_numpy(parts.sum(axis=0).reshape(shape))
+        return for_normal, for_alpha2, for_radiance, None, None

@@ -1,0 +1,84 @@
+"""Light that the object itself sends: what the photographs show of each vertex, as a function of direction.
+
+That is the paper's radiance of the surfels during training. It does not depend on materials that are still unknown.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.sparse import coo_matrix, csr_matrix
+
+from ...core.asset.model import Mesh
+from ...formats.harmonics import basis
+from .pixels import Pixels
+
+Array = np.ndarray
+
+#: Degree of the spherical harmonics, and how strongly all but their mean are held back.
+DEGREE, _RIDGE = 1, 0.5
+#: Pixels taken in at once.
+_BLOCK = 1 << 17
+
+
+def edges_of(faces: Array) -> Array:
+    """(e, 2) int64 undirected edges of (m, 3) faces, each once, lower vertex first."""
+    pairs = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64), axis=1)
+    return np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0)
+
+
+def adjacency(faces: Array, count: int) -> csr_matrix:
+    """(count, count) ones where an edge connects two vertices."""
+    edges = edges_of(faces)
+    both = np.concatenate([edges, edges[:, ::-1]])
+    return coo_matrix((np.ones(len(both), np.float32), (both[:, 0], both[:, 1])), shape=(count, count)).tocsr()
+
+
+def radiance_cache(pixels: Pixels, mesh: Mesh) -> tuple[Array, Array]:
+    """Outgoing radiance of each vertex by least squares over the pixels around it.
+
+    Returns
+    -------
+    harmonics : (v, 4, 3) float32, linear Rec.709: coefficients of ``formats.harmonics.basis``; vertices that no
+        photograph shows take the mean of their neighbours, in turn
+    weight : (v,) float32, how many pixels show a vertex
+    """
+    count, terms = len(mesh.vertices), (DEGREE + 1) ** 2
+    upper = [(i, j) for i in range(terms) for j in range(i, terms)]
+    total = np.zeros((count, len(upper) + 3 * terms + 1))
+    for first in range(0, len(pixels), _BLOCK):
+        part = slice(first, first + _BLOCK)
+        y = basis(pixels.towards[part], DEGREE)
+        products = [y[:, i] * y[:, j] for i, j in upper]
+        values = (y[:, :, None] * pixels.colour[part, None, :]).reshape(len(y), -1)
+        corner = mesh.faces[pixels.face[part]].reshape(-1)
+        row = np.repeat(np.arange(len(y)), 3)
+        spread = coo_matrix((pixels.corners[part].reshape(-1), (corner, row)), shape=(count, len(y))).tocsr()
+        total += spread @ np.column_stack([*products, values, np.ones(len(y))])
+    matrix = np.zeros((count, terms, terms))
+    for column, (i, j) in enumerate(upper):
+        matrix[:, i, j] = matrix[:, j, i] = total[:, column]
+    target = total[:, len(upper) : -1].reshape(count, terms, 3)
+    weight = total[:, -1]
+    # A vertex that few pixels show has little more than a mean.
+    held = np.diag([1e-9] + [_RIDGE] * (terms - 1)) / (4 * np.pi)
+    harmonics = np.linalg.solve(matrix + held * (1 + 0.2 * weight[:, None, None]), target)
+    harmonics[weight < 1e-3] = 0
+    harmonics = filled(harmonics.reshape(count, -1), weight > 1e-3, mesh).reshape(count, terms, 3)
+    return harmonics, weight.astype(np.float32)
+
+
+def filled(values: Array, known: Array, mesh: Mesh, rounds: int = 200) -> Array:
+    """`values` (v, c) with the unknown rows filled from their neighbours, outwards from the known ones; float32."""
+    near = adjacency(mesh.faces, len(values))
+    values = np.where(known[:, None], values, 0.0)
+    filled = known.copy()
+    for _ in range(rounds):
+        count = near @ filled.astype(np.float64)
+        new = ~filled & (count > 0)
+        if not new.any():
+            break
+        values[new] = (near @ values)[new] / count[new, None]
+        filled |= new
+    if not filled.all() and known.any():
+        values[~filled] = values[known].mean(axis=0)
+    return values.astype(np.float32)

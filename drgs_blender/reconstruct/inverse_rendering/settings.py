@@ -1,0 +1,104 @@
+"""How the light and the materials of an object are pulled apart."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Literal
+
+from ...core.errors import UsageError
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Settings of `decouple`.
+
+    Attributes
+    ----------
+    iterations : steps of the optimiser
+    seconds : stop after so much time of the wall clock, the schedule squeezed to fit; 0 is no limit
+    pixels : drawn in each step, over all training views
+    cosine, ggx, light : directions that each strategy draws at a pixel, even numbers
+    look : BRDF, "principled" (Blender's) or "paper"
+    indirect : light that other parts of the object send is what the photographs show of them; else it is black
+    shadows : other parts of the object stand before the environment; without, every point sees all of it, as in the
+        split-sum shading of other methods
+    environment : rows of the learned lat-long light at the end, a power of two
+    coarse_to_fine : begin with a quarter of the rows and double them on a schedule
+    rate, light_rate : first step sizes of materials and light (Adam), in logits and log radiance
+    coarse : also learn materials on this many nested grids of cells, which carry what many pixels agree on quickly
+    smoothness : weight of the differences of materials along edges, less where the photographs differ
+    light_smoothness : weight of the differences of log radiance between neighbours in the environment
+    white : weight that pulls the environment towards grey
+    bimodal : weight that pulls metallic to 0 or 1
+    polish : weight that pulls the colours of metals towards as bright as polished metals are
+    plain_metals : how much more than other albedo that of metals is smoothed, in parts of `smoothness`: there, errors
+        of normals leave blotches
+    unbiased : compare two independent estimates of each pixel, so that their noise is not learned from
+    by_shown : weigh differences by what is shown, once that is near the photographs; else by the photographs, which
+        finds polished metal and the light in it too dark where the mesh is a little off
+    beside_clipped : weight, in a channel, of pixels beside clipped ones, once differences are weighed by what is shown.
+        Where normals are a little off, they are found to mirror bright light that is not theirs, and speak against it;
+        what is clipped cannot speak for it
+    parametrisation : "metallic" learns albedo and metallic; "specular" diffuse and specular colour, turned into the
+        former at the end; "dielectric" albedo alone, metallic is 0
+    normals : also learn an offset of each vertex normal, held by `normal_smoothness`
+    exposure : also learn the brightness of every photograph
+    most_pixels : foreground pixels kept in memory, evenly over all views
+    seed : of all random numbers
+    """
+
+    iterations: int = 2500
+    seconds: float = 0.0
+    pixels: int = 2048
+    cosine: int = 16
+    ggx: int = 8
+    light: int = 8
+    look: Literal["principled", "paper"] = "principled"
+    indirect: bool = True
+    shadows: bool = True
+    environment: int = 64
+    coarse_to_fine: bool = True
+    rate: float = 0.04
+    light_rate: float = 0.4
+    coarse: int = 3
+    smoothness: float = 0.01
+    light_smoothness: float = 0.001
+    white: float = 0.0003
+    bimodal: float = 0.0
+    polish: float = 0.05
+    plain_metals: float = 5.0
+    unbiased: bool = True
+    by_shown: bool = True
+    beside_clipped: float = 0.5
+    parametrisation: Literal["metallic", "specular", "dielectric"] = "metallic"
+    normals: bool = False
+    normal_smoothness: float = 0.3
+    exposure: bool = False
+    most_pixels: int = 2_000_000
+    seed: int = 0
+
+    def check(self) -> None:
+        """Raise UsageError on what cannot be used."""
+        counts = (self.cosine, self.ggx, self.light)
+        rows = self.environment
+        wrong = {
+            "iterations": self.iterations < 1,
+            "pixels": self.pixels < 1,
+            "most_pixels": self.most_pixels < 1,
+            "cosine, ggx, light": min(counts) < 0 or sum(counts) == 0 or any(c % 2 for c in counts),
+            "environment": not 8 <= rows <= 1024 or rows & (rows - 1) != 0,
+            "look": self.look not in ("principled", "paper"),
+            "parametrisation": self.parametrisation not in ("metallic", "specular", "dielectric"),
+            "coarse": not 0 <= self.coarse <= 8,
+        }
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, float) and not 0.0 <= value < float("inf"):
+                wrong[field.name] = True
+        bad = [name for name, is_wrong in wrong.items() if is_wrong]
+        if bad:
+            raise UsageError(
+                "decoupling settings",
+                f"{', '.join(bad)} cannot be used",
+                "Numbers are positive, samples even, rows of the environment a power of two from 8 to 1024",
+            )

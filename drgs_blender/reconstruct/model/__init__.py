@@ -1,0 +1,1 @@
+"""The surfels that are learned, and the differentiable rasteriser that shows them."""

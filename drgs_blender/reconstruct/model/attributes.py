@@ -1,0 +1,173 @@
+"""From what is learned of surfels to what the rasteriser blends, forwards and backwards, in one pass over the surfels.
+
+Quaternions give frames, logarithms sizes, logits what lies in 0..1, harmonics the colour seen from the view; plain
+tensor operations would cost as much as blending the pixels. The tests hold this against such.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...compute.jit import njit, prange
+from ...core.arrays import Array
+from ...formats.harmonics import basis
+
+#: Columns of a surfel's features: colour, normal that faces the viewer; then, where something mirrors, tint and blur.
+COLOUR, NORMAL, TINT, BLUR = 0, 3, 6, 9
+#: Bands of harmonics -> coefficients.
+COEFFICIENTS = {0: 1, 1: 4, 2: 9, 3: 16}
+#: The parameters that this reads, in the order of the kernels.
+_NAMES = ("scale", "rotation", "opacity", "sh", "tint", "blur")
+
+
+def attributes(
+    parameters: dict[str, Tensor], centre: Tensor, eye: Array, bands: int, mirrors: bool
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """What a view from `eye` (3,) blends; differentiable in the parameters of `gaussians.Gaussians`.
+
+    The dependence of direction and facing on the centre is not differentiated.
+
+    Parameters
+    ----------
+    centre : (n, 3) world
+    bands : of harmonics; those beyond are left out
+    mirrors : tint and blur are features
+
+    Returns
+    -------
+    tangents u and v (n, 3) scaled by the standard deviations, opacity (n,), features (n, 6 or 10), all float32
+    """
+    return _Attributes.apply(centre.detach().numpy(), eye, bands, mirrors, *(parameters[name] for name in _NAMES))
+
+
+def frames(scale: Array, rotation: Array) -> tuple[Array, Array, Array]:
+    """Tangents of `rotation` (n, 4) wxyz scaled by exp of `scale` (n, 2), and the normal; any length; (n, 3) each."""
+    u, v, normal = (np.empty((len(scale), 3), np.float32) for _ in range(3))
+    _frames(scale, rotation, u, v, normal)
+    return u, v, normal
+
+
+class _Attributes(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, centre: Array, eye: Array, bands: int, mirrors: bool, *parameters: Tensor
+    ) -> tuple[Tensor, ...]:
+        raw = [np.ascontiguousarray(p.detach().numpy(), np.float32) for p in parameters]
+        n = len(centre)
+        away = centre - np.asarray(eye, np.float32)
+        away /= np.maximum(np.sqrt(np.einsum("nk,nk->n", away, away)), 1e-12)[:, None]
+        degree = min(bands, int(raw[3].shape[1] ** 0.5) - 1)
+        values = basis(away, degree).astype(np.float32)
+        u, v, normal = frames(raw[0], raw[1])
+        alpha, features = np.empty(n, np.float32), np.empty((n, BLUR + 1 if mirrors else TINT), np.float32)
+        _blended(normal, away, values, *raw[2:], alpha, features)
+        ctx.save = (raw, values, u, v, normal, alpha, features)
+        return tuple(torch.from_numpy(a) for a in (u, v, alpha, features))
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Any, ...]:
+        raw, values, u, v, normal, alpha, features = ctx.save
+        incoming = [
+            np.zeros_like(a) if g is None else np.ascontiguousarray(g.numpy(), np.float32)
+            for g, a in zip(gradients, (u, v, alpha, features), strict=True)
+        ]
+        to = [np.zeros_like(a) for a in raw]
+        _backward(raw[1], values, u, v, normal, alpha, features, *incoming, *to)
+        return None, None, None, None, *(torch.from_numpy(g) for g in to)
+
+
+@njit
+def _logistic(x: Any) -> Any:
+    return np.float32(1.0) / (np.float32(1.0) + np.exp(-x))
+
+
+@njit(parallel=True)
+def _frames(scale: Any, rotation: Any, u: Any, v: Any, normal: Any) -> None:
+    one, two = np.float32(1.0), np.float32(2.0)
+    for i in prange(len(scale)):
+        w, x, y, z = rotation[i, 0], rotation[i, 1], rotation[i, 2], rotation[i, 3]
+        r = one / max(np.sqrt(w * w + x * x + y * y + z * z), np.float32(1e-12))
+        w, x, y, z = w * r, x * r, y * r, z * r
+        a, b = np.exp(scale[i, 0]), np.exp(scale[i, 1])
+        u[i, 0], u[i, 1], u[i, 2] = (
+            a * (one - two * (y * y + z * z)),
+            a * two * (x * y + w * z),
+            a * two * (x * z - w * y),
+        )
+        v[i, 0], v[i, 1], v[i, 2] = (
+            b * two * (x * y - w * z),
+            b * (one - two * (x * x + z * z)),
+            b * two * (y * z + w * x),
+        )
+        normal[i, 0], normal[i, 1] = two * (x * z + w * y), two * (y * z - w * x)
+        normal[i, 2] = one - two * (x * x + y * y)
+
+
+@njit(parallel=True)
+def _blended(
+    normal: Any, away: Any, values: Any, opacity: Any, sh: Any, tint: Any, blur: Any, alpha: Any, features: Any
+) -> None:
+    """Opacity and features."""
+    for i in prange(len(alpha)):
+        alpha[i] = _logistic(opacity[i])
+        facing = np.float32(0.0)
+        for c in range(3):
+            facing += away[i, c] * normal[i, c]
+        for c in range(3):
+            colour = np.float32(0.5)
+            for k in range(values.shape[1]):
+                colour += values[i, k] * sh[i, k, c]
+            features[i, COLOUR + c] = max(colour, np.float32(0.0))
+            features[i, NORMAL + c] = -normal[i, c] if facing > 0 else normal[i, c]
+        if features.shape[1] > TINT:
+            for c in range(3):
+                features[i, TINT + c] = _logistic(tint[i, c])
+            features[i, BLUR] = _logistic(blur[i])
+
+
+@njit(parallel=True)
+def _backward(
+    rotation: Any, values: Any, u: Any, v: Any, normal: Any, alpha: Any, features: Any, g_u: Any, g_v: Any,
+    g_alpha: Any, g_features: Any, to_scale: Any, to_rotation: Any, to_opacity: Any, to_sh: Any, to_tint: Any,
+    to_blur: Any,
+) -> None:  # fmt: skip
+    """Gradients of the raw parameters, into arrays of zeros."""
+    one, two = np.float32(1.0), np.float32(2.0)
+    for i in prange(len(alpha)):
+        to_opacity[i] = g_alpha[i] * alpha[i] * (one - alpha[i])
+        for c in range(3):
+            if features[i, COLOUR + c] > 0:
+                for k in range(values.shape[1]):
+                    to_sh[i, k, c] = values[i, k] * g_features[i, COLOUR + c]
+        if features.shape[1] > TINT:
+            for c in range(3):
+                f = features[i, TINT + c]
+                to_tint[i, c] = g_features[i, TINT + c] * f * (one - f)
+            f = features[i, BLUR]
+            to_blur[i] = g_features[i, BLUR] * f * (one - f)
+        a0, a1, a2 = g_u[i, 0], g_u[i, 1], g_u[i, 2]
+        b0, b1, b2 = g_v[i, 0], g_v[i, 1], g_v[i, 2]
+        to_scale[i, 0] = a0 * u[i, 0] + a1 * u[i, 1] + a2 * u[i, 2]
+        to_scale[i, 1] = b0 * v[i, 0] + b1 * v[i, 1] + b2 * v[i, 2]
+        # By the unscaled tangents, whose lengths are the deviations, and by the normal as it is without the view.
+        a = np.sqrt(u[i, 0] * u[i, 0] + u[i, 1] * u[i, 1] + u[i, 2] * u[i, 2])
+        b = np.sqrt(v[i, 0] * v[i, 0] + v[i, 1] * v[i, 1] + v[i, 2] * v[i, 2])
+        side = np.float32(0.0)
+        for c in range(3):
+            side += features[i, NORMAL + c] * normal[i, c]
+        a0, a1, a2, b0, b1, b2 = a * a0, a * a1, a * a2, b * b0, b * b1, b * b2
+        n0, n1, n2 = side * g_features[i, NORMAL], side * g_features[i, NORMAL + 1], side * g_features[i, NORMAL + 2]
+        w, x, y, z = rotation[i, 0], rotation[i, 1], rotation[i, 2], rotation[i, 3]
+        r = one / max(np.sqrt(w * w + x * x + y * y + z * z), np.float32(1e-12))
+        w, x, y, z = w * r, x * r, y * r, z * r
+        dw = two * (a1 * z - a2 * y - b0 * z + b2 * x + n0 * y - n1 * x)
+        dx = two * (a1 * y + a2 * z + b0 * y - two * b1 * x + b2 * w + n0 * z - n1 * w - two * n2 * x)
+        dy = two * (a1 * x - two * a0 * y - a2 * w + b0 * x + b2 * z + n0 * w + n1 * z - two * n2 * y)
+        dz = two * (a1 * w - two * a0 * z + a2 * x - b0 * w - two * b1 * z + b2 * y + n0 * x + n1 * y)
+        along = dw * w + dx * x + dy * y + dz * z
+        to_rotation[i, 0], to_rotation[i, 1] = r * (dw - along * w), r * (dx - along * x)
+        to_rotation[i, 2], to_rotation[i, 3] = r * (dy - along * y), r * (dz - along * z)

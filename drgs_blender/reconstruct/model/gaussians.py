@@ -1,0 +1,159 @@
+"""The surfels that are learned: raw parameters, what they mean, how they split and vanish."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...core.arrays import Array
+from ...core.asset.model import Surfels
+from ...core.color import srgb_to_linear
+from ...core.frame import Camera
+from ...geometry.normals import quaternions
+from ..backend import HERE, Processor
+from ..capture.training_views import pixel_rays
+from .attributes import COEFFICIENTS, COLOUR, NORMAL, frames
+from .raster import Maps, Tally
+from .reflection_probe import dark_cube, pyramid
+
+#: Value of the constant harmonic.
+SH0 = 0.28209479177387814
+#: Logit of the tint of surfels that nothing is known of.
+MATT = -3.0
+
+
+@dataclass(slots=True)
+class Look:
+    """One view of the surfels.
+
+    Attributes
+    ----------
+    colour : (h, w, 3) over the background, sRGB-encoded
+    normal : (h, w, 3) sum of weighted normals that face the viewer, world space
+    maps : alpha, depth, median, distortion
+    """
+
+    colour: Tensor
+    normal: Tensor
+    maps: Maps
+
+
+class Gaussians:
+    """Surfels as learned: every attribute a float32 tensor of `parameters`, free of bounds.
+
+    ``centre`` (n, 3) world; ``scale`` (n, 2) logarithms; ``rotation`` (n, 4) quaternions wxyz of any length;
+    ``opacity`` (n,) logits; ``sh`` (n, k, 3) harmonics of the colour less one half, as in 3D Gaussian splatting;
+    ``tint`` (n, 3) and ``blur`` (n,) logits of how much of the `light` around is mirrored, and how blurred.
+
+    Parameters
+    ----------
+    light : the cube of `reflection`; None: nothing is mirrored
+    by : who shows them, where all their tensors are
+    """
+
+    def __init__(self, parameters: dict[str, Tensor], light: Tensor | None = None, by: Processor = HERE) -> None:
+        self.parameters, self.light, self.by = parameters, light, by
+        if light is not None:
+            light.requires_grad_(True)
+        for value in parameters.values():
+            value.requires_grad_(True)
+
+    @classmethod
+    def on_surface(cls, points: Array, normals: Array, colours: Array, size: float, degree: int = 2) -> Gaussians:
+        """Discs of standard deviation `size` at `points` (n, 3) with `normals` (n, 3) and sRGB `colours` (n, 3)."""
+        n = len(points)
+        helper = np.where(np.abs(normals[:, 2:]) < 0.9, (0.0, 0, 1), (1.0, 0, 0))
+        u = np.cross(helper, normals)
+        u /= np.linalg.norm(u, axis=1, keepdims=True)
+        sh = np.zeros((n, COEFFICIENTS[degree], 3))
+        sh[:, 0] = (colours - 0.5) / SH0
+        values = {
+            "centre": points,
+            "scale": np.full((n, 2), math.log(size)),
+            "rotation": quaternions(np.stack([u, np.cross(normals, u), normals], -1)),
+            "opacity": np.full(n, math.log(0.5 / 0.5)),
+            "sh": sh,
+            "tint": np.full((n, 3), MATT),
+            "blur": np.zeros(n),
+        }
+        return cls({k: torch.tensor(v, dtype=torch.float32) for k, v in values.items()}, dark_cube())
+
+    def __len__(self) -> int:
+        return len(self.parameters["opacity"])
+
+    def frames(self) -> tuple[Array, Array, Array]:
+        """Scaled tangents and the normal, (n, 3) each; not differentiated."""
+        return frames(*(self.parameters[name].numpy(force=True) for name in ("scale", "rotation")))
+
+    def centres(self) -> Tensor:
+        """(n, 3) world positions."""
+        return self.parameters["centre"]
+
+    def opacities(self) -> Tensor:
+        """(n,) in 0..1."""
+        return torch.sigmoid(self.parameters["opacity"])
+
+    def look(
+        self,
+        camera: Camera,
+        background: Tensor,
+        bands: int = 3,
+        tally: Tally | None = None,
+        rays: Tensor | None = None,
+        mirrors: bool = True,
+    ) -> Look:
+        """Render a view over `background` (3,); `rays` are `targets.pixel_rays` where they are at hand."""
+        mirrors = mirrors and self.light is not None
+        centre, eye = self.centres(), np.asarray(camera.matrix_world)[:3, 3]
+        u, v, opacity, features = self.by.attributes(self.parameters, centre, eye, bands, mirrors)
+        maps = self.by.rasterise(centre, u, v, opacity, features, camera, tally)
+        colour = maps.features[..., COLOUR : COLOUR + 3] + (1 - maps.alpha)[..., None] * background
+        if mirrors:
+            assert self.light is not None
+            rays = pixel_rays(camera, self.by.place) if rays is None else rays
+            colour = colour + self.by.mirrored(maps.features, maps.alpha, rays, pyramid(self.light))
+        return Look(colour, maps.features[..., NORMAL : NORMAL + 3], maps)
+
+    def take(self, rows: Array) -> Gaussians:
+        """The surfels `rows`, in this order, as a set of their own."""
+        index = torch.from_numpy(np.asarray(rows, np.int64)).to(self.by.place)
+        return self.like({k: v.detach()[index].clone() for k, v in self.parameters.items()})
+
+    def like(self, parameters: dict[str, Tensor]) -> Gaussians:
+        """Surfels of the same kind with other parameters."""
+        return Gaussians(parameters, self.light, self.by)
+
+    def on(self, by: Processor) -> Gaussians:
+        """The same surfels where another processor has its tensors."""
+        return Gaussians(*self._there(by), by)
+
+    def _there(self, by: Processor) -> tuple[dict[str, Tensor], Tensor | None]:
+        """Parameters and light at a processor's place."""
+        light = None if self.light is None else self.light.detach().to(by.place)
+        return {k: v.detach().to(by.place) for k, v in self.parameters.items()}, light
+
+    def arrays(self) -> dict[str, Array]:
+        """The raw parameters."""
+        return {k: v.numpy(force=True) for k, v in self.parameters.items()}
+
+    def surfels(self) -> Surfels:
+        """What an asset holds. The albedo is the mean colour as photographed, light included, decoded."""
+        with torch.no_grad():
+            raw = self.arrays()
+            u, v, normal = self.frames()
+            scale = np.exp(raw["scale"])
+            frame = np.stack([u / scale[:, :1], v / scale[:, 1:], normal], -1)
+            n = len(self)
+            sh = raw["sh"].copy()
+            if self.light is not None:
+                # Harmonics know no mirrors: the mean of what is mirrored.
+                sh[:, 0] += torch.sigmoid(self.parameters["tint"]).numpy() * self.light.exp().mean().item() / SH0
+            albedo = srgb_to_linear(np.clip(0.5 + SH0 * sh[:, 0], 0, 1))
+            return Surfels(
+                self.centres().numpy().copy(), scale, quaternions(frame.astype(np.float64)),
+                self.opacities().numpy(), albedo, np.full(n, 0.5), np.zeros(n), sh,
+            )  # fmt: skip

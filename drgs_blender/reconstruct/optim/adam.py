@@ -1,0 +1,100 @@
+"""Adam (Kingma and Ba 2015) in place over arrays whose rows come and go."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...compute.jit import njit, prange
+from ...core.arrays import Array
+
+_BETA1, _BETA2, _EPSILON = 0.9, 0.99, 1e-15
+#: Rows that a thread takes at a time, and numbers below which waking threads takes longer than the step.
+_BLOCK, _FEW = 1024, 200_000
+
+
+def descend(value: Tensor, gradient: Tensor, first: Tensor, second: Tensor, rate: Array) -> None:
+    """One step of rows (n, k) in place, with their moments; `rate` (k,) float32 by columns."""
+    rows = [t.detach().numpy() for t in (value, gradient, first, second)]
+    step = _step if value.numel() < _FEW else _step_by_all
+    step(*rows, rate)
+
+
+class Adam:
+    """The optimiser of named parameters.
+
+    Parameters
+    ----------
+    parameters : name -> float32 tensor whose first axis counts rows
+    descend : what does a step, where the tensors are
+
+    Attributes
+    ----------
+    first, second : moments by name, tensors like the parameters
+    """
+
+    def __init__(self, parameters: dict[str, Tensor], descend: Callable[..., None] = descend) -> None:
+        self.first = {k: torch.zeros_like(v, requires_grad=False) for k, v in parameters.items()}
+        self.second = {k: torch.zeros_like(v, requires_grad=False) for k, v in parameters.items()}
+        self.steps, self._descend = 0, descend
+
+    def step(self, parameters: dict[str, Tensor], rates: dict[str, float | Array]) -> None:
+        """One step for each parameter that has a gradient.
+
+        Parameters
+        ----------
+        parameters : as they were given at first; changed in place, gradients removed
+        rates : learning rate by name, or one for each column (c,) of the rows seen as (n, c)
+        """
+        self.steps += 1
+        correction = (1 - _BETA2**self.steps) ** 0.5 / (1 - _BETA1**self.steps)
+        for name, value in parameters.items():
+            if value.grad is None:
+                continue
+            width = max(value.numel() // max(len(value), 1), 1)
+            rate = np.broadcast_to(np.asarray(rates[name], np.float32), (width,))
+            tensors = value.detach(), value.grad.contiguous(), self.first[name], self.second[name]
+            rows = [t.reshape(-1, width) for t in tensors]
+            self._descend(*rows, np.ascontiguousarray(rate * np.float32(correction)))
+            value.grad = None
+
+    def take(self, rows: Array) -> None:
+        """Keep the moments of `rows` in this order; those of -1 begin anew."""
+        for moments in (self.first, self.second):
+            for name, value in moments.items():
+                index = torch.from_numpy(rows).to(value.device)
+                kept = value[index]
+                kept[index < 0] = 0
+                moments[name] = kept
+
+
+@njit
+def some_rows(value: Any, gradient: Any, first: Any, second: Any, rate: Any, begin: Any, end: Any) -> None:
+    """The rows from `begin` to `end`. No branch: vector code."""
+    b1, b2, epsilon = np.float32(_BETA1), np.float32(_BETA2), np.float32(_EPSILON)
+    one = np.float32(1.0)
+    for i in range(begin, end):
+        for k in range(value.shape[1]):
+            g = gradient[i, k]
+            m, v = b1 * first[i, k] + (one - b1) * g, b2 * second[i, k] + (one - b2) * g * g
+            # Else a surfel seen from within itself: its other views know better.
+            known = abs(g) < np.float32(np.inf)
+            first[i, k] = m if known else first[i, k]
+            second[i, k] = v if known else second[i, k]
+            after = value[i, k] - rate[k] * m / (np.sqrt(v) + epsilon)
+            value[i, k] = after if known else value[i, k]
+
+
+@njit
+def _step(value: Any, gradient: Any, first: Any, second: Any, rate: Any) -> None:
+    some_rows(value, gradient, first, second, rate, 0, len(value))
+
+
+@njit(parallel=True)
+def _step_by_all(value: Any, gradient: Any, first: Any, second: Any, rate: Any) -> None:
+    for block in prange((len(value) + _BLOCK - 1) // _BLOCK):
+        some_rows(value, gradient, first, second, rate, block * _BLOCK, min((block + 1) * _BLOCK, len(value)))

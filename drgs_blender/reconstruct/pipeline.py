@@ -1,0 +1,335 @@
+"""Photographs to an asset: surfels, mesh, surfels on the mesh or bound to it, materials and light."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+
+from ..build.transfer import surfels_to_vertices
+from ..compute.prepare import PHASE, prepare_kernels
+from ..core.arrays import Array
+from ..core.asset.model import MATERIAL_CHANNELS, Asset, Binding, Environment, Mesh, Surfels
+from ..core.errors import Cancelled, WriteError
+from ..deform.binding import bind
+from ..deform.mesh_driven import MeshDriven
+from ..geometry.normals import VertexNormals
+from . import checkpoint
+from .backend import HERE
+from .capture.capture import Capture, View
+from .capture.training_views import background_of, composed
+from .gpu.devices import learner
+from .inverse_rendering.run import Decoupled, decouple
+from .inverse_rendering.settings import Settings as Decoupling
+from .jit_warmup import rehearse
+from .losses.photometric import Photograph, structural_similarity
+from .meshing.normal_integration import follow_normals, shaded_by, shaded_by_own
+from .meshing.silhouette_fit import fill_silhouettes
+from .meshing.tsdf import fuse, grid
+from .meshing.visual_hull import Region, find_region, have_silhouettes, silhouettes
+from .model.attached import attach_learned, bound
+from .model.gaussians import Gaussians
+from .model.thin_structures import is_thin, normals_of
+from .optim.train import Schedule, Training
+
+log = logging.getLogger(__name__)
+
+#: Seconds between two checkpoints, and two previews.
+SAVE_EVERY, SHOW_EVERY = 20.0, 5.0
+#: Steps on the mesh, as a part of those before.
+ON_MESH = 0.4
+#: Parts of the minutes that the surfels get, and their second round on the mesh.
+SHARE, SHARE_ON_MESH = 0.45, 0.15
+#: Part of the minutes for materials and light.
+SHARE_OF_MATERIALS = 0.35
+#: Fewer steps of materials than this tell them badly from the light.
+FEW_STEPS = 300
+#: Phase -> the settings that decide its result.
+DECIDES = {
+    "surfels": ("schedule", "minutes"),
+    "surfels on the mesh": ("schedule", "minutes", "mesh_resolution", "fixed"),
+}
+#: Fainter surfels do not come into the asset.
+UNSEEN = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What is made of a capture.
+
+    Attributes
+    ----------
+    variant : "p" keeps the free surfels (driven by particles or mesh), "m" makes surfels on the mesh's faces
+    schedule : how surfels are learned
+    mesh_resolution : most voxels along the mesh's longest side
+    minutes : all stages together, once kernels are compiled; None: the steps of the schedule decide
+    materials : pull materials and light apart; else albedo is the photographed colour
+    decoupling : how; its ``seconds`` follow from `minutes`. Normals are learned too: a mesh of photographs has errors
+    fixed : parameters of surfels on faces that are not learned: "offset", "opacity" (the paper's ablation)
+    device : "cpu", or "cuda" to learn on the first NVIDIA card; without one this processor does
+    """
+
+    variant: Literal["p", "m"] = "p"
+    schedule: Schedule = field(default_factory=Schedule)
+    mesh_resolution: int = 256
+    minutes: float | None = None
+    materials: bool = True
+    decoupling: Decoupling = field(default_factory=lambda: Decoupling(normals=True))
+    fixed: tuple[str, ...] = ()
+    device: Literal["cpu", "cuda"] = "cpu"
+
+
+@dataclass(slots=True)
+class Progress:
+    """Where a reconstruction stands.
+
+    Attributes
+    ----------
+    phase : "Preparing the engine (first time only)", "surfels", "mesh", "surfels on the mesh", "materials"
+    part : what is done of all, 0..1
+    surfels : how many there are
+    psnr : of the latest training views, decibels; None: not known
+    picture : (h, w, 3) float32, sRGB: a view as it looks now, beside its photograph; None: not drawn this time
+    """
+
+    phase: str
+    part: float
+    surfels: int = 0
+    psnr: float | None = None
+    picture: Array | None = None
+
+
+def reconstruct(
+    capture: Capture,
+    settings: Settings | None = None,
+    on_progress: Callable[[Progress], None] | None = None,
+    cancelled: Callable[[], bool] | None = None,
+    folder: Path | None = None,
+) -> Asset:
+    """Make an asset from photographs.
+
+    Parameters
+    ----------
+    on_progress : called about every second, with a picture every few seconds
+    cancelled : asked between steps; a checkpoint is left and Cancelled raised
+    folder : of checkpoints; a run that was stopped goes on from there, bit for bit unless `minutes` are given
+
+    Returns
+    -------
+    Asset
+        In the capture's world space. ``provenance["report"]`` holds counts, "psnr" and "ssim" of the views left out;
+        ``provenance["learned_from"]`` the names of the others.
+
+    Raises
+    ------
+    UsageError, AssetError: what cannot be reconstructed, see `hull.find_region`, `targets.targets` and `tsdf.fuse`.
+    """
+    settings = settings or Settings()
+    work = _Work(capture, settings, on_progress or (lambda _: None), cancelled or (lambda: False), folder)
+    region = find_region(capture)
+    grid([view.camera for view in capture.training], region, settings.mesh_resolution)  # before minutes of learning
+    prepare_kernels(("reconstruct",), lambda phase, part: work.tell(Progress(phase, part)), work.cancelled)
+    if settings.minutes is not None:
+        work.tell(Progress(PHASE, 0.0))
+        rehearse(settings, have_silhouettes(capture), work.by, work.cancelled)
+    training = Training(capture, region, settings.schedule, seconds=work.seconds(SHARE), by=work.by)
+    free = work.learn("surfels", training, 0.0, 0.5)
+    work.tell(Progress("mesh", 0.5, len(free)))
+    report: dict[str, Any] = {"views": len(capture.training), "left_out": len(capture.testing)}
+    mesh, report["mesh"] = mesh_of(free, capture, region, settings.mesh_resolution)
+    final: Gaussians = free
+    binding: Binding | None = None
+    if settings.variant == "m":
+        final, binding = _on_mesh(work, mesh, free, region, report)
+    report |= judge(final, capture)
+    visible = final.opacities().detach().numpy() >= UNSEEN
+    surfels = _kept(final, visible)
+    found, thin, smooth = None, False, VertexNormals(mesh.faces, len(mesh.vertices))(mesh.vertices)
+    if settings.materials:
+        # Surfels on the mesh have its normals.
+        thin = report["thin"] = settings.variant == "p" and is_thin(final, mesh, capture.training)
+        found = _decoupled(work, mesh, final, thin, report)
+        mesh = replace(mesh, albedo=found.albedo, roughness=found.roughness, metallic=found.metallic)
+        if settings.decoupling.normals:
+            mesh.vertices = follow_normals(mesh, found.normals)
+    if binding is None:
+        binding, report["binding"] = bind(mesh, surfels)
+    else:
+        binding = _rows(binding, visible)
+        surfels.centre = MeshDriven(mesh, surfels, binding).pose(mesh.vertices).centre
+    environment, origin = None, "photographed colour, light included"
+    if found is None:
+        report["vertices_without_surfels"] = surfels_to_vertices(mesh, surfels, binding)
+    else:
+        if thin:
+            binding = shaded_by_own(binding, mesh, surfels, found.normals - smooth)
+        elif settings.decoupling.normals:
+            binding = shaded_by(binding, mesh, found.normals)
+        _take_materials(surfels, mesh, binding)
+        environment, origin = Environment(found.environment), "pulled apart from the light"
+    learned = [view.name for view in capture.training]
+    provenance = {"capture": capture.name, "learned_from": learned, "variant": settings.variant, "materials": origin}
+    return Asset(surfels, mesh, binding, environment, provenance | {"report": report})
+
+
+def mesh_of(gaussians: Gaussians, capture: Capture, region: Region, resolution: int = 256) -> tuple[Mesh, dict]:
+    """The surface of surfels as the training views see it, with the outlines of their masks; see `tsdf.fuse`."""
+    cameras = [view.camera for view in capture.training]
+    mesh, report = fuse(gaussians, cameras, region, resolution)
+    if (masks := silhouettes(capture)) is not None:
+        mesh.vertices = fill_silhouettes(mesh, cameras, masks)
+    return mesh, report
+
+
+class _Work:
+    """What all phases of a run share."""
+
+    def __init__(
+        self, capture: Capture, settings: Settings, tell: Callable[[Progress], None], cancelled: Callable[[], bool],
+        folder: Path | None,
+    ) -> None:  # fmt: skip
+        self.capture, self.settings, self.tell, self.cancelled, self.folder = capture, settings, tell, cancelled, folder
+        self.by = learner(settings.device)
+        if folder is not None:
+            try:
+                folder.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                problem = f"cannot be a folder for what goes on after a stop ({error.strerror or error})"
+                raise WriteError(
+                    str(folder), problem, "Move what is there, or choose another name for the asset"
+                ) from error
+
+    def seconds(self, share: float) -> float | None:
+        """Time of a phase."""
+        return None if self.settings.minutes is None else 60 * share * self.settings.minutes
+
+    def file(self, phase: str) -> Path | None:
+        """Checkpoint of a phase."""
+        return None if self.folder is None else self.folder / f"{phase.replace(' ', '-')}.state"
+
+    def key(self, phase: str) -> str:
+        """Which run a checkpoint of a phase is of: its photographs, and the settings that decide its result."""
+        settings = asdict(self.settings)
+        return checkpoint.fingerprint(self.capture, **{name: settings[name] for name in DECIDES[phase]})
+
+    def learn(self, phase: str, training: Training, begin: float, end: float) -> Gaussians:
+        """Run a training to its end, from its checkpoint if there is one: that of a run with other settings of later
+        phases serves as well."""
+        file = self.file(phase)
+        key = "" if file is None else self.key(phase)
+        if file is not None and (state := checkpoint.load(file, key)) is not None:
+            known = state
+            training.attempt(lambda: training.restore(known), whole=False)
+            log.info("%s: going on at step %d", phase, training.iteration)
+        saved = shown = told = time.monotonic()
+        reached = 0.0
+        while not training.finished:
+            training.step()
+            now = time.monotonic()
+            stop = self.cancelled()
+            if file is not None and (stop or training.finished or now - saved > SAVE_EVERY):
+                checkpoint.save(file, training.arrays(), key)
+                saved = time.monotonic()
+            if stop:
+                raise Cancelled
+            if now - told > 1 or training.finished:
+                draw = now - shown > SHOW_EVERY or training.finished
+                picture = training.attempt(lambda: preview(training.gaussians, self.capture)) if draw else None
+                reached = max(reached, training.part)  # the second start of a trial begins anew
+                self.tell(
+                    Progress(phase, begin + (end - begin) * reached, len(training.gaussians), training.psnr, picture)
+                )
+                told, shown = now, now if draw else shown
+        return training.attempt(lambda: training.gaussians.on(HERE))
+
+
+def _on_mesh(
+    work: _Work, mesh: Mesh, free: Gaussians, region: Region, report: dict[str, Any]
+) -> tuple[Gaussians, Binding]:
+    """Algorithm 1, and what it leaves to learn."""
+    settings = work.settings
+    attached, binding, report["attach"] = attach_learned(mesh, free, settings.fixed)
+    training = Training(
+        work.capture, region, settings.schedule.on_mesh(ON_MESH), attached, work.seconds(SHARE_ON_MESH), work.by
+    )
+    final = work.learn("surfels on the mesh", training, 0.55, 0.7)
+    return final, bound(binding, final)  # type: ignore[arg-type]
+
+
+def _decoupled(work: _Work, mesh: Mesh, surfels: Gaussians, thin: bool, report: dict[str, Any]) -> Decoupled:
+    """Materials, normals and light."""
+    found = decouple(
+        work.capture,
+        mesh,
+        replace(work.settings.decoupling, seconds=work.seconds(SHARE_OF_MATERIALS) or 0.0),
+        lambda at: work.tell(Progress("materials", 0.7 + 0.3 * at.part, len(surfels), at.psnr)),
+        work.cancelled,
+        work.file("materials"),
+        work.by,
+        normals_of(surfels) if thin else None,
+    )
+    done, of = found.report["iterations"], work.settings.decoupling.iterations
+    if done < min(FEW_STEPS, of):
+        log.warning(
+            "materials got %d of %d steps in their part of %g minutes, too few to tell them from the light: give more "
+            "minutes, or photographs of a lower resolution", done, of, work.settings.minutes,
+        )  # fmt: skip
+    # Without the clock: the same run gives the same bytes.
+    report["decoupling"] = {key: value for key, value in found.report.items() if key != "seconds"}
+    return found
+
+
+def _take_materials(surfels: Surfels, mesh: Mesh, binding: Binding) -> None:
+    """Give surfels the materials of the mesh where they hang on it, in place."""
+    corners, share = mesh.faces[binding.face], binding.barycentric
+    for name in MATERIAL_CHANNELS:
+        blended = np.einsum("nk,nk...->n...", share, getattr(mesh, name)[corners])
+        setattr(surfels, name, np.clip(blended, 0, 1).astype(np.float32))
+
+
+def _kept(gaussians: Gaussians, visible: Array) -> Surfels:
+    """Surfels that can be seen."""
+    surfels = gaussians.surfels()
+    rows = {name: getattr(surfels, name)[visible] for name in Surfels.__dataclass_fields__ if name != "extras"}
+    return Surfels(**rows)
+
+
+def _rows(binding: Binding, keep: Array) -> Binding:
+    return Binding(*(getattr(binding, name)[keep] for name in Binding.__dataclass_fields__))
+
+
+def _drawn(gaussians: Gaussians, view: View, capture: Capture) -> Array:
+    """(h, w, 3) sRGB in 0..1."""
+    with torch.no_grad():
+        background = torch.tensor(background_of(capture), dtype=torch.float32, device=gaussians.by.place)
+        look = gaussians.look(view.camera, background)
+    return np.clip(look.colour.numpy(force=True), 0, 1)
+
+
+def preview(gaussians: Gaussians, capture: Capture) -> Array:
+    """A view, left out if there is one, beside its photograph: (h, 2 w, 3) sRGB."""
+    view = (capture.testing or capture.training)[0]
+    return np.concatenate([_drawn(gaussians, view, capture), composed(view, capture)], axis=1)
+
+
+def judge(gaussians: Gaussians, capture: Capture) -> dict[str, float]:
+    """The views left out, whole pictures: "psnr", the mean of that of each as in published tables and in `drgs
+    evaluate`; "psnr_pooled", of the mean squared error over all; "ssim"."""
+    if not capture.testing:
+        return {}
+    errors, similar = [], []
+    for view in capture.testing:
+        drawn, truth = _drawn(gaussians, view, capture), composed(view, capture)
+        errors.append(max(float(np.square(drawn - truth).mean()), 1e-10))
+        similar.append(structural_similarity(drawn, Photograph.of(truth)))
+    return {
+        "psnr": float(np.mean(-10 * np.log10(errors))),
+        "psnr_pooled": -10 * float(np.log10(np.mean(errors))),
+        "ssim": float(np.mean(similar)),
+    }

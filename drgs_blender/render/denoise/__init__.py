@@ -1,0 +1,1 @@
+"""Denoisers: SVGF in space and over time, OIDN."""

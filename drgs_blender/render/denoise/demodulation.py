@@ -1,0 +1,186 @@
+"""Light as SVGF filters it: divided by surface colour and coverage, in planes, beside what guides the filters.
+
+Pictures are planar here, (rows, planes, columns), with `PAD` empty columns on either side: kernels work on runs of
+`TILE` pixels, plane by plane, with scratch arrays whose strides the compiler knows, so that all of it is SIMD.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ...compute.jit import njit, prange
+from ..film.guides import Guides
+from ..sampling import ONE, ZERO, F, luminance
+
+Array = np.ndarray
+
+#: Surface colours below this are not divided out, they would amplify noise.
+COLOUR_FLOOR = 0.02
+DIELECTRIC_F0 = 0.04
+
+LEVELS = 5
+#: Pixels a kernel works on at once; empty columns left and right of a picture (twice the last level's step).
+TILE, PAD = 128, 2 << (LEVELS - 1)
+#: Planes of a guide. ``SURFACE`` is the object's index, NaN where nothing is covered; ``SOURCE`` the same, NaN also
+#: where the light is no number. ``WIDTH`` is the inverse width of a pixel.
+POSITION, NORMAL, ROUGHNESS, SOURCE, SURFACE, WIDTH, GUIDES = 0, 3, 6, 7, 8, 9, 10
+#: Planes of a signal, two lobes each: luminance, its variance, the inverse of the difference that counts; the light.
+LUMINANCE, VARIANCE, CERTAINTY, LIGHT = 0, 2, 4, 6
+
+
+@dataclass(slots=True)
+class Signal:
+    """Demodulated light of a picture and what guides its filters.
+
+    Attributes
+    ----------
+    guide : (h, GUIDES, w + 2 PAD) float32
+    light : (h, LIGHT + 6 parts, w + 2 PAD) float32; after ``LIGHT``: diffuse direct, (indirect,) glossy direct,
+        (indirect), three colours each, divided by surface colour and coverage
+    spans : (h, 2) int32: first and last + 1 column of each row that is covered, `PAD` not counted
+    """
+
+    guide: Array
+    light: Array
+    spans: Array
+
+    def here(self) -> Signal | None:
+        """The same in this process's memory; None where it is lost with the device that had it."""
+        return self
+
+
+def demodulate(components: Array, variance: Array, guides: Guides, split: bool = True) -> Signal:
+    """Divide light by surface colour and coverage; parameters as of `denoise.denoise`."""
+    h, w = guides.coverage.shape
+    guide = np.zeros((h, GUIDES, w + 2 * PAD), np.float32)
+    light = np.zeros((h, planes_of(split), w + 2 * PAD), np.float32)
+    spans = np.zeros((h, 2), np.int32)
+    _demodulate(components, variance, guides.arrays, guide, light, spans)
+    return Signal(guide, light, spans)
+
+
+def planes_of(split: bool) -> int:
+    """How many planes a signal has."""
+    return LIGHT + (12 if split else 6)
+
+
+def modulate(signal: Signal, guides: Guides) -> Array:
+    """(h, w, 4, 3) float32: light multiplied by surface colour and coverage again."""
+    out = np.zeros((*guides.coverage.shape, 4, 3), np.float32)
+    _modulate(signal.light, signal.spans, guides.arrays, out)
+    return out
+
+
+@njit(inline="always")
+def _colour(lobe: Any, albedo: Any, metallic: Any, y: Any, x: Any) -> Any:
+    """Surface colour of a lobe's light, at least COLOUR_FLOOR: diffuse a (1 - m), glossy Fresnel's F0."""
+    m = metallic[y, x]
+    k = ONE - m
+    if lobe == 0:
+        base, share = ZERO, k
+    else:
+        base, share = F(DIELECTRIC_F0) * k, m
+    floor = F(COLOUR_FLOOR)
+    red, green, blue = base + share * albedo[y, x, 0], base + share * albedo[y, x, 1], base + share * albedo[y, x, 2]
+    return max(red, floor), max(green, floor), max(blue, floor)
+
+
+@njit(inline="always")
+def _channel(k: Any, red: Any, green: Any, blue: Any) -> Any:
+    return red if k == 0 else green if k == 1 else blue
+
+
+@njit(inline="always")
+def demodulate_pixel(y: Any, x: Any, components: Any, variance: Any, surface: Any, guide: Any, light: Any) -> None:
+    """Fill the planes of a covered pixel, which are 0, and NaN in `SOURCE` and `SURFACE`; `surface` as of `Guides`."""
+    coverage, position, normal, albedo, roughness, metallic, index, footprint = surface
+    parts = (light.shape[1] - LIGHT) // 6
+    usable = F(1e30)
+    cover, c = coverage[y, x], x + PAD
+    for k in range(3):
+        guide[y, POSITION + k, c], guide[y, NORMAL + k, c] = position[y, x, k], normal[y, x, k]
+    guide[y, ROUGHNESS, c] = roughness[y, x]
+    guide[y, WIDTH, c] = ONE / footprint[y, x]
+    guide[y, SURFACE, c] = index[y, x]
+    valid = True
+    for lobe in range(2):
+        red, green, blue = _colour(lobe, albedo, metallic, y, x)
+        shade = cover * luminance(red, green, blue)
+        base = LIGHT + 3 * parts * lobe
+        for k in range(3):
+            scale = ONE / (cover * _channel(k, red, green, blue))
+            direct, indirect = components[y, x, 2 * lobe, k], components[y, x, 2 * lobe + 1, k]
+            if not (abs(direct) < usable and abs(indirect) < usable):
+                valid = False
+            if parts == 2:
+                light[y, base + k, c], light[y, base + 3 + k, c] = direct * scale, indirect * scale
+            else:
+                light[y, base + k, c] = (direct + indirect) * scale
+        spread = variance[y, x, lobe] / (shade * shade)
+        if not spread < usable:
+            valid = False
+        light[y, VARIANCE + lobe, c] = max(spread, ZERO)
+    if valid:
+        guide[y, SOURCE, c] = index[y, x]
+        for lobe in range(2):
+            light[y, LUMINANCE + lobe, c] = _lobe_luminance(light, y, c, lobe, parts)
+    else:
+        for k in range(light.shape[1]):
+            light[y, k, c] = ZERO
+
+
+@njit(inline="always")
+def _lobe_luminance(light: Any, y: Any, c: Any, lobe: Any, parts: Any) -> Any:
+    total = ZERO
+    for part in range(parts):
+        k = LIGHT + 3 * (parts * lobe + part)
+        total += luminance(light[y, k, c], light[y, k + 1, c], light[y, k + 2, c])
+    return total
+
+
+@njit(parallel=True)
+def _demodulate(components: Any, variance: Any, surface: Any, guide: Any, light: Any, spans: Any) -> None:
+    coverage = surface[0]
+    h, w = coverage.shape
+    for y in prange(h):
+        guide[y, SOURCE] = F(np.nan)
+        guide[y, SURFACE] = F(np.nan)
+        for x in range(w):
+            if coverage[y, x] > ZERO:
+                demodulate_pixel(y, x, components, variance, surface, guide, light)
+        find_span(y, coverage, spans)
+
+
+@njit(inline="always")
+def find_span(y: Any, coverage: Any, spans: Any) -> None:
+    """Which columns of a row are covered."""
+    first, last = coverage.shape[1], 0
+    for x in range(coverage.shape[1]):
+        if coverage[y, x] > ZERO:
+            first, last = min(first, x), x + 1
+    spans[y, 0], spans[y, 1] = first, max(last, first)
+
+
+@njit(inline="always")
+def modulate_pixel(y: Any, x: Any, light: Any, surface: Any, out: Any) -> None:
+    """Multiply a covered pixel's light by surface colour and coverage again."""
+    coverage, _, _, albedo, _, metallic, _, _ = surface
+    parts = (light.shape[1] - LIGHT) // 6
+    for lobe in range(2):
+        red, green, blue = _colour(lobe, albedo, metallic, y, x)
+        for part in range(parts):
+            for k in range(3):
+                value = light[y, LIGHT + 3 * (parts * lobe + part) + k, x + PAD]
+                out[y, x, 2 * lobe + part, k] = value * _channel(k, red, green, blue) * coverage[y, x]
+
+
+@njit(parallel=True)
+def _modulate(light: Any, spans: Any, surface: Any, out: Any) -> None:
+    coverage = surface[0]
+    for y in prange(len(spans)):
+        for x in range(spans[y, 0], spans[y, 1]):
+            if coverage[y, x] > ZERO:
+                modulate_pixel(y, x, light, surface, out)

@@ -1,0 +1,122 @@
+"""Noisy frames on disk as the denoiser over time wants them.
+
+A frame file says in its metadata through which camera it was seen (``camera``), and through which its surfaces were one
+frame earlier (``previous``). Where the latter is not the camera of the file before, there is a cut, and nothing leads
+from one to the other.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ...core.errors import AssetError
+from ...core.frame import Camera, Frame, RenderSettings
+from ...core.passes import TEMPORAL
+from ..camera import camera_parameters
+from ..film.film import COMPONENTS, add_light, footprints
+from ..film.frame_files import read_frame
+from ..film.guides import Guides
+from ..film.motion_vectors import Motion, motion
+from .svgf_temporal import Shot
+
+Array = np.ndarray
+
+#: How far the numbers of two cameras may lie apart (metres, radians, pixels) that are the same one evaluated twice.
+SAME_CAMERA = 1e-4
+_HOW = "Render it with `drgs render --denoise none --passes temporal`, or with For Temporal Denoising switched on"
+
+
+@dataclass(slots=True)
+class NoisyFrame:
+    """A frame file.
+
+    Attributes
+    ----------
+    shot : its light and what tells its surfaces apart; its motion leads one frame back
+    passes : by name, those of the light excepted
+    metadata : of the file
+    camera, previous : parameters of the cameras of this frame and of one frame earlier
+    window : (width, height, x0, y0, x1, y1) of the full picture and of the part rendered
+    """
+
+    shot: Shot
+    passes: dict[str, Array]
+    metadata: dict[str, str]
+    camera: Array
+    previous: Array
+    window: tuple[int, ...]
+
+    def follows(self, other: NoisyFrame) -> bool:
+        """Whether this frame's motion leads to `other`; not across a cut."""
+        return self.window == other.window and np.allclose(self.previous, other.camera, rtol=1e-6, atol=SAME_CAMERA)
+
+    def beauty(self, light: Array) -> Array:
+        """Combined with (h, w, 4, 3) other `light`."""
+        return add_light(light, self.passes["Env"], self.passes["Emit"], self.passes["Combined"][..., 3])
+
+
+def describe(frame: Frame) -> dict[str, str]:
+    """What a frame file says of how it was seen, for its metadata."""
+    said = {"camera": _camera_text(frame.camera), "denoise": frame.settings.denoise, "noise": str(frame.number)}
+    if frame.previous is not None:
+        said["previous"] = _camera_text(frame.previous.camera)
+    return said
+
+
+def read_noisy(path: str | Path) -> NoisyFrame:
+    """Read a frame for the denoiser.
+
+    Raises
+    ------
+    AssetError: it cannot be read, lacks passes (which are named), or its light is denoised already.
+    """
+    passes, metadata = read_frame(path)
+    missing = [name for name in TEMPORAL if name not in passes]
+    if missing:
+        raise AssetError(str(path), f"lacks the passes {', '.join(missing)}", _HOW)
+    if metadata.get("denoise", "none") != "none":
+        raise AssetError(str(path), f"is denoised already ({metadata['denoise']})", _HOW)
+    try:
+        now, window = _parameters(metadata["camera"])
+        before, _ = _parameters(metadata["previous"]) if "previous" in metadata else (now, window)
+    except (KeyError, ValueError, TypeError) as error:
+        raise AssetError(str(path), "does not say through which camera it was seen", _HOW) from error
+    position, coverage = passes["Position"], _one(passes, "Coverage")
+    guides = Guides(
+        coverage,
+        position,
+        passes["Normal"],
+        passes["Albedo"],
+        _one(passes, "Roughness"),
+        _one(passes, "Metallic"),
+        _one(passes, "IndexOB"),
+        footprints(_one(passes, "Depth"), now),
+    )
+    components = np.stack([passes.pop(name) for name in COMPONENTS], axis=2)
+    moved: Motion = motion(position, passes.pop("Previous Position"), coverage, now, before)
+    return NoisyFrame(Shot(components, passes.pop("Variance"), guides, moved), passes, metadata, now, before, window)
+
+
+def _one(passes: dict[str, Array], name: str) -> Array:
+    return np.ascontiguousarray(passes[name][..., 0])
+
+
+def _camera_text(camera: Camera) -> str:
+    numbers = [*np.asarray(camera.matrix_world, np.float64)[:3].ravel(), camera.fx, camera.fy, camera.cx, camera.cy]
+    size = [camera.width, camera.height, *camera.window]
+    return json.dumps([[float(x) for x in numbers], bool(camera.orthographic), [int(x) for x in size]])
+
+
+def _parameters(text: str) -> tuple[Array, tuple[int, ...]]:
+    """`camera.camera_parameters` (what sampling adds to them left at its defaults), and the window."""
+    numbers, orthographic, size = json.loads(text)
+    matrix = np.eye(4)
+    matrix[:3] = np.reshape(np.array(numbers[:12], np.float64), (3, 4))
+    width, height, x0, y0, x1, y1 = size
+    fx, fy, cx, cy = numbers[12:]
+    camera = Camera(matrix, width, height, fx, fy, cx, cy, orthographic, region=(x0, y0, x1, y1))
+    return camera_parameters(camera, RenderSettings(), 0), tuple(size)

@@ -1,0 +1,298 @@
+"""Spatial SVGF: an edge-stopping a-trous filter on demodulated light, guided by the light's variance.
+
+Schied et al., "Spatiotemporal Variance-Guided Filtering" (2017); its temporal half is in `temporal`. Diffuse and glossy
+light are filtered apart, each divided by the colour of its surface first and multiplied again afterwards, so that
+texture is not blurred. Changes and their reasons:
+
+- Light is divided by coverage too, and pixels without coverage take no part: silhouettes do not bleed.
+- Depth is compared as distance from the tangent plane, in pixel widths: exact on slanted planes, no depth gradient that
+  breaks at edges.
+- Fireflies are clamped first, to mean + `FIREFLY` deviations of their neighbours, only where the pixel's own variance
+  does not vouch for them.
+- Rough surfaces reflect smoothly: the power on the normals' cosine falls from 128 to 32 with roughness; 32 for diffuse.
+- Differences of luminance are compared with the larger deviation of both pixels, so that either takes as much from the
+  other as it gives. With the pixel's own, as in the paper, dark pixels (whose estimated variance is small with their
+  light) shut out the bright ones that these would average with: a tenth of the light went in glossy scenes.
+- Direct and indirect light share one set of weights, so their sum stays the sum to the last bit.
+- Edges are stopped by (1 - x / 8)^8 where the paper has exp(-x): much the same, but exactly zero from x = 8 on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from ...compute.jit import njit
+from ...core.color import LUMINANCE as REC709
+from ..film.row_threads import over_rows
+from .demodulation import (
+    CERTAINTY,
+    LEVELS,
+    LIGHT,
+    LUMINANCE,
+    NORMAL,
+    PAD,
+    POSITION,
+    ROUGHNESS,
+    SOURCE,
+    SURFACE,
+    TILE,
+    VARIANCE,
+    WIDTH,
+    Guides,
+    Signal,
+    demodulate,
+    modulate,
+)
+
+Array = np.ndarray
+
+#: Luminance differences that count, in deviations of the estimate: at the first level, and their ratio from level to
+#: level. The further apart pixels are, the more alike they must be.
+SIGMA_LUMINANCE, SIGMA_DECAY = 2.4, 0.8
+#: Distances from the tangent plane that count, in pixel widths per pixel of distance on the screen.
+SIGMA_PLANE = 1.0
+SIGMA_ROUGHNESS = 0.1
+NORMAL_POWER, ROUGH_NORMAL_POWER = 128.0, 32.0
+FIREFLY = 3.0
+
+
+def denoise(
+    components: Array, variance: Array, guides: Guides, split: bool = True, check: Callable[[], None] = lambda: None
+) -> Array:  # fmt: skip
+    """Filter the light of a picture.
+
+    Parameters
+    ----------
+    components : (h, w, 4, 3) float32 premultiplied light, see `points.Radiance`; non-finite values are replaced
+    variance : (h, w, 2) float32 of the luminance of the diffuse and the glossy sum
+    split : keep direct and indirect light apart; else their sum is returned as direct light and indirect is 0 (faster)
+    check : called between levels; may raise to stop
+
+    Returns
+    -------
+    (h, w, 4, 3) float32
+    """
+    signal = prepare(components, variance, guides, split)
+    check()
+    return modulate(smooth(signal, check), guides)
+
+
+def prepare(components: Array, variance: Array, guides: Guides, split: bool = True) -> Signal:
+    """Light to be filtered: demodulated, its fireflies clamped; parameters as of `denoise`."""
+    signal = demodulate(components, variance, guides, split)
+    clamped = np.zeros_like(signal.light)
+    over_rows(_clamp_fireflies, len(clamped), signal.guide, signal.spans, signal.light, clamped)
+    return Signal(signal.guide, clamped, signal.spans)
+
+
+def smooth(signal: Signal, check: Callable[[], None] = lambda: None) -> Signal:
+    """All levels of the a-trous filter."""
+    light, out, other = signal.light, np.zeros_like(signal.light), np.zeros_like(signal.light)
+    for level in range(LEVELS):
+        check()
+        over_rows(_weigh, len(light), sigma_of(level), signal.guide, signal.spans, light)
+        over_rows(_a_trous, len(light), 1 << level, signal.guide, signal.spans, light, out)
+        light, out, other = out, other, out
+    return Signal(signal.guide, light, signal.spans)
+
+
+def sigma_of(level: int) -> np.float32:
+    """`SIGMA_LUMINANCE` of a level."""
+    return np.float32(SIGMA_LUMINANCE * SIGMA_DECAY**level)
+
+
+@njit
+def _clamp_fireflies(y0: Any, y1: Any, guide: Any, spans: Any, light: Any, out: Any) -> None:
+    """Scale down outliers among 5 x 5 neighbours of the same object; pixels that hold no number stay as they are."""
+    h, planes = light.shape[:2]
+    zero, one = np.float32(0.0), np.float32(1.0)
+    near = np.empty((3, TILE + 4), np.float32)
+    own = np.empty((5, TILE), np.float32)
+    sums = np.empty((5, TILE), np.float32)
+    for y in range(y0, y1):
+        for x0 in range(spans[y, 0] + PAD, spans[y, 1] + PAD, TILE):
+            n = min(TILE, spans[y, 1] + PAD - x0)
+            for i in range(n):
+                own[0, i] = guide[y, SURFACE, x0 + i]
+                for k in range(5):
+                    sums[k, i] = zero
+            for k in range(4):
+                for i in range(n):
+                    own[1 + k, i] = light[y, k, x0 + i]
+            for yy in range(max(y - 2, 0), min(y + 3, h)):
+                for i in range(n + 4):
+                    near[0, i] = guide[yy, SOURCE, x0 - 2 + i]
+                for k in range(2):
+                    for i in range(n + 4):
+                        near[1 + k, i] = light[yy, k, x0 - 2 + i]
+                for dx in range(5):
+                    if yy == y and dx == 2:
+                        continue
+                    off = np.uint64(dx)
+                    for i in range(np.uint64(n)):
+                        j = i + off
+                        same = one if near[0, j] == own[0, i] else zero
+                        d, g = same * near[1, j], same * near[2, j]
+                        sums[0, i] += same
+                        sums[1, i] += d
+                        sums[2, i] += d * near[1, j]
+                        sums[3, i] += g
+                        sums[4, i] += g * near[2, j]
+            for lobe in range(2):
+                for i in range(n):
+                    inverse = one / max(sums[0, i], one)
+                    mean = sums[1 + 2 * lobe, i] * inverse
+                    deviation = np.sqrt(max(sums[2 + 2 * lobe, i] * inverse - mean * mean, zero))
+                    limit = mean + np.float32(FIREFLY) * deviation
+                    value, spread = own[1 + lobe, i], own[3 + lobe, i]
+                    doubtful = spread > (value - mean) * (value - mean) * np.float32(0.0625)
+                    scale = limit / value if sums[0, i] >= np.float32(4.0) and value > limit and doubtful else one
+                    sums[1 + 2 * lobe, i] = scale
+                for i in range(n):
+                    scale = sums[1 + 2 * lobe, i]
+                    out[y, LUMINANCE + lobe, x0 + i] = own[1 + lobe, i] * scale
+                    out[y, VARIANCE + lobe, x0 + i] = own[3 + lobe, i] * scale * scale
+                width = (planes - LIGHT) // 2
+                for k in range(LIGHT + lobe * width, LIGHT + (lobe + 1) * width):
+                    for i in range(n):
+                        out[y, k, x0 + i] = light[y, k, x0 + i] * sums[1 + 2 * lobe, i]
+
+
+@njit(inline="always")
+def stop(x: Any) -> Any:
+    """(1 - x / 8)^8 for x in [0, 8], beyond it 0."""
+    u = max(np.float32(1.0) - np.float32(0.125) * x, np.float32(0.0))
+    u *= u
+    u *= u
+    return u * u
+
+
+@njit
+def _weigh(y0: Any, y1: Any, sigma: Any, guide: Any, spans: Any, light: Any) -> None:
+    """Inverse deviations of luminance that edges are compared with, from the variance of 3 x 3 pixels (Gaussian)."""
+    h = len(light)
+    zero, one, tiny = np.float32(0.0), np.float32(1.0), np.float32(1e-8)
+    near = np.empty((3, TILE + 2), np.float32)
+    sums = np.empty((3, TILE), np.float32)
+    for y in range(y0, y1):
+        for x0 in range(spans[y, 0] + PAD, spans[y, 1] + PAD, TILE):
+            n = min(TILE, spans[y, 1] + PAD - x0)
+            for i in range(n):
+                sums[0, i] = sums[1, i] = sums[2, i] = zero
+            for yy in range(max(y - 1, 0), min(y + 2, h)):
+                for i in range(n + 2):
+                    near[0, i] = guide[yy, SOURCE, x0 - 1 + i]
+                    near[1, i] = light[yy, VARIANCE, x0 - 1 + i]
+                    near[2, i] = light[yy, VARIANCE + 1, x0 - 1 + i]
+                for dx in range(3):
+                    tap = np.float32((2 - abs(yy - y)) * (2 - abs(dx - 1)))
+                    off = np.uint64(dx)
+                    for i in range(np.uint64(n)):
+                        share = tap if near[0, i + off] == near[0, i + off] else zero
+                        sums[0, i] += share
+                        sums[1, i] += share * near[1, i + off]
+                        sums[2, i] += share * near[2, i + off]
+            for k in range(2):
+                for i in range(n):
+                    inverse = one / max(sums[0, i], one)
+                    deviation = sigma * np.sqrt(sums[1 + k, i] * inverse) + tiny
+                    # A pixel that holds no number has nothing to compare with.
+                    source = guide[y, SOURCE, x0 + i]
+                    light[y, CERTAINTY + k, x0 + i] = one / deviation if source == source else zero
+
+
+@njit
+def _a_trous(y0: Any, y1: Any, step: Any, guide: Any, spans: Any, light: Any, out: Any) -> None:
+    """One level: 5 x 5 B-spline taps `step` pixels apart."""
+    h, planes = light.shape[:2]
+    taps = (np.float32(0.0625), np.float32(0.25), np.float32(0.375), np.float32(0.25), np.float32(0.0625))
+    zero, one = np.float32(0.0), np.float32(1.0)
+    diffuse_power = np.float32(ROUGH_NORMAL_POWER)
+    power_slope = np.float32(ROUGH_NORMAL_POWER - NORMAL_POWER)
+    lobe_planes = (planes - LIGHT) // 2
+    first_glossy = LIGHT + lobe_planes
+    # What is read at a tap (guide, then signal), at the pixel itself, and what is summed.
+    near = np.empty((SURFACE + LIGHT + 12, TILE + 2 * PAD), np.float32)
+    own = np.empty((SURFACE + 7, TILE), np.float32)
+    weight = np.empty((2, TILE), np.float32)
+    sums = np.empty((2 + LIGHT + 12, TILE), np.float32)
+    for y in range(y0, y1):
+        for x0 in range(spans[y, 0] + PAD, spans[y, 1] + PAD, TILE):
+            n = min(TILE, spans[y, 1] + PAD - x0)
+            for k in range(SURFACE + 2):
+                for i in range(n):
+                    own[k, i] = guide[y, k, x0 + i]
+            for k in range(2):
+                for i in range(n):
+                    own[SURFACE + 2 + k, i] = light[y, LUMINANCE + k, x0 + i]
+                    own[SURFACE + 4 + k, i] = light[y, CERTAINTY + k, x0 + i]
+            for i in range(n):
+                own[SURFACE + 6, i] = np.float32(NORMAL_POWER) + power_slope * own[ROUGHNESS, i]
+            for k in range(2 + planes):
+                for i in range(n):
+                    sums[k, i] = zero
+            for dy in range(5):
+                yy = y + (dy - 2) * step
+                if yy < 0 or yy >= h or spans[yy, 0] >= spans[yy, 1]:
+                    continue
+                start, reach = x0 - 2 * step, n + 4 * step
+                for k in range(SURFACE):
+                    for i in range(reach):
+                        near[k, i] = guide[yy, k, start + i]
+                for k in range(planes):
+                    for i in range(reach):
+                        near[SURFACE + k, i] = light[yy, k, start + i]
+                for dx in range(5):
+                    kernel = taps[dy] * taps[dx]
+                    off = np.uint64(dx * step)
+                    far = one / (np.float32(SIGMA_PLANE) * np.float32(max(1, step * max(abs(dy - 2), abs(dx - 2)))))
+                    for i in range(np.uint64(n)):
+                        j = i + off
+                        nx, ny, nz = own[NORMAL, i], own[NORMAL + 1, i], own[NORMAL + 2, i]
+                        plane = abs(
+                            nx * (near[POSITION, j] - own[POSITION, i])
+                            + ny * (near[POSITION + 1, j] - own[POSITION + 1, i])
+                            + nz * (near[POSITION + 2, j] - own[POSITION + 2, i])
+                        )
+                        turn = one - (nx * near[NORMAL, j] + ny * near[NORMAL + 1, j] + nz * near[NORMAL + 2, j])
+                        common = plane * own[WIDTH, i] * far
+                        rough = abs(near[ROUGHNESS, j] - own[ROUGHNESS, i]) * np.float32(1.0 / SIGMA_ROUGHNESS)
+                        sure_d = min(near[SURFACE + CERTAINTY, j], own[SURFACE + 4, i])
+                        sure_g = min(near[SURFACE + CERTAINTY + 1, j], own[SURFACE + 5, i])
+                        far_d = abs(near[SURFACE + LUMINANCE, j] - own[SURFACE + 2, i]) * sure_d
+                        far_g = abs(near[SURFACE + LUMINANCE + 1, j] - own[SURFACE + 3, i]) * sure_g
+                        same = kernel if near[SOURCE, j] == own[SURFACE, i] else zero
+                        weight[0, i] = same * stop(common + diffuse_power * turn + far_d)
+                        weight[1, i] = same * stop(common + own[SURFACE + 6, i] * turn + rough + far_g)
+                    for lobe in range(2):
+                        for i in range(np.uint64(n)):
+                            w = weight[lobe, i]
+                            sums[lobe, i] += w
+                            sums[2 + VARIANCE + lobe, i] += w * w * near[SURFACE + VARIANCE + lobe, i + off]
+                        for k in range(LIGHT + lobe * lobe_planes, LIGHT + (lobe + 1) * lobe_planes):
+                            for i in range(np.uint64(n)):
+                                sums[2 + k, i] += weight[lobe, i] * near[SURFACE + k, i + off]
+            for lobe in range(2):
+                for i in range(n):
+                    sums[lobe, i] = one / max(sums[lobe, i], np.float32(1e-20))
+                    sums[2 + LUMINANCE + lobe, i] = zero
+                    out[y, VARIANCE + lobe, x0 + i] = sums[2 + VARIANCE + lobe, i] * sums[lobe, i] * sums[lobe, i]
+            for k in range(LIGHT, planes):
+                lobe = 1 if k >= first_glossy else 0
+                share = share_of((k - LIGHT) % 3)
+                for i in range(n):
+                    value = sums[2 + k, i] * sums[lobe, i]
+                    sums[2 + LUMINANCE + lobe, i] += share * value
+                    out[y, k, x0 + i] = value
+            for lobe in range(2):
+                for i in range(n):
+                    out[y, LUMINANCE + lobe, x0 + i] = sums[2 + LUMINANCE + lobe, i]
+
+
+@njit(inline="always")
+def share_of(k: Any) -> Any:
+    """Share of colour channel `k` in luminance."""
+    return np.float32(REC709[0]) if k == 0 else np.float32(REC709[1]) if k == 1 else np.float32(REC709[2])

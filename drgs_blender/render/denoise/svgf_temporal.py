@@ -1,0 +1,286 @@
+"""Light of neighbouring frames, brought to this frame's surfaces: SVGF's temporal half, and a window for final frames.
+
+Pictures are compared on demodulated light, so texture moves with its surface and never ghosts. Every pixel looks up
+where its surface was (`motion`); of the four pixels around that place those count that show the same object, lie on the
+tangent plane there and are turned alike. Where none does, a surface has just come into view and starts anew.
+
+This half is recursive, for a picture that follows the user; `window` has another for final frames. The present's weight
+is not a count of frames but Kalman's gain: with v the variance of this frame and h that of the past, both known from
+the integrator, the best mixture takes (h + b) / (h + b + v) of this frame, b being the square by which the past is
+wrong. As long as the light stands still, b = 0 and this is 1 / N in frame N. b is measured as what the difference of
+both, averaged over the neighbourhood, has beyond its own noise. Changes that hide in the noise are bounded by a least
+weight of the present.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ...compute.jit import njit
+from ..film.motion_vectors import Instant, Motion
+from ..film.row_threads import over_rows
+from ..sampling import ONE, ZERO, F
+from .demodulation import (
+    LIGHT,
+    LUMINANCE,
+    NORMAL,
+    PAD,
+    POSITION,
+    SOURCE,
+    SURFACE,
+    TILE,
+    VARIANCE,
+    WIDTH,
+    Guides,
+    Signal,
+    modulate,
+)
+from .svgf_spatial import prepare, smooth
+
+Array = np.ndarray
+
+#: Least weight of the present where anything moves, diffuse and glossy, since small changes hide in the noise. Glossy
+#: reflections do not even move with the surface.
+LEAST_GAIN = (0.2, 0.6)
+#: Distance from the tangent plane, in pixel widths, up to which a pixel of another frame shows the same surface.
+SAME_PLANE = 2.0
+#: Cosine of the angle by which its normal may differ; surfaces turn between frames.
+SAME_NORMAL = 0.7
+#: Taps of the neighbourhood in which change is looked for: (2 R + 1)^2, `SPACING` pixels apart.
+RADIUS, SPACING = 2, 2
+#: Planes of what `find_change` returns, two lobes each: mean variance now and before, square of the change.
+NOW, PAST, BIAS, CHANGES = 0, 2, 4, 6
+
+
+@dataclass(slots=True)
+class Shot:
+    """One noisy picture as a frame file holds it; see `denoise.denoise` for the arrays.
+
+    ``motion`` leads to the frame before; None where there is none.
+    """
+
+    components: Array
+    variance: Array
+    guides: Guides
+    motion: Motion | None = None
+
+
+@dataclass(slots=True)
+class History:
+    """What the pictures of a sequence leave for the next one.
+
+    Attributes
+    ----------
+    signal : what `denoise_next` returned for the last picture; None before the first
+    instant : the scene as it was in that picture
+    still : nothing has changed since then, save the noise
+    """
+
+    signal: Signal | None = None
+    instant: Instant | None = None
+    still: bool = False
+
+
+def denoise_next(
+    shot: Shot,
+    history: Signal | None,
+    split: bool = True,
+    still: bool = False,
+    check: Callable[[], None] = lambda: None,
+) -> tuple[Array, Signal]:
+    """Denoise a picture with the help of those before it.
+
+    Parameters
+    ----------
+    history : what this function returned for the frame before; None starts anew
+    still : nothing in the scene has changed since then (camera, objects, light), only the noise: pictures are then
+        gathered without end, with equal weights
+    split, check : see `denoise.denoise`; a history made with another `split` or size is not used
+
+    Returns
+    -------
+    (h, w, 4, 3) float32 light, and the history for the next frame
+    """
+    signal = prepare(shot.components, shot.variance, shot.guides, split)
+    check()
+    past = None if history is None else history.here()
+    if past is not None and shot.motion is not None and past.light.shape == signal.light.shape:
+        signal = accumulate(past, signal, shot.motion, still)
+    return modulate(smooth(signal, check), shot.guides), signal
+
+
+def least_gain(still: bool) -> Array:
+    """(2,) float32 least weight of the present."""
+    return np.zeros(2, np.float32) if still else np.array(LEAST_GAIN, np.float32)
+
+
+def accumulate(history: Signal, signal: Signal, motion: Motion, still: bool = False) -> Signal:
+    """Mix what earlier frames saw of the same surfaces into a frame's light; see `denoise_next`."""
+    past, source = warp(history, signal, motion.vector, motion.previous)
+    change = find_change(signal, past, source)
+    if still:
+        change[:, BIAS : BIAS + 2] = 0.0
+    least = least_gain(still)
+    guide, light = signal.guide.copy(), np.zeros_like(signal.light)
+    over_rows(_mix, len(light), least, signal.spans, signal.light, past, source, change, guide, light)
+    return Signal(guide, light, signal.spans)
+
+
+def warp(other: Signal, signal: Signal, vector: Array, expected: Array) -> tuple[Array, Array]:
+    """Light of another picture on the surfaces of `signal`, and its ``SOURCE`` (h, w + 2 PAD), NaN where it has none.
+
+    Parameters
+    ----------
+    vector, expected : see `_neighbours`
+    """
+    light = np.zeros_like(signal.light)
+    source = np.full((len(light), light.shape[2]), np.nan, np.float32)
+    over_rows(
+        _look_up, len(light), signal.guide, signal.spans, vector, expected, other.guide, other.light, light, source
+    )
+    return light, source
+
+
+def find_change(signal: Signal, past: Array, source: Array) -> Array:
+    """How two pictures differ beyond their noise, (h, CHANGES, w + 2 PAD) float32."""
+    out = np.zeros((len(past), CHANGES, past.shape[2]), np.float32)
+    over_rows(_compare, len(past), signal.guide, signal.spans, signal.light, past, source, out)
+    return out
+
+
+@njit
+def _look_up(
+    y0: Any, y1: Any, guide: Any, spans: Any, vector: Any, expected: Any, other: Any, other_light: Any, out: Any,
+    source: Any,
+) -> None:  # fmt: skip
+    for y in range(y0, y1):
+        for x in range(spans[y, 0], spans[y, 1]):
+            look_up_pixel(y, x, guide, vector, expected, other, other_light, out, source)
+
+
+@njit
+def look_up_pixel(
+    y: Any, x: Any, guide: Any, vector: Any, expected: Any, other: Any, other_light: Any, out: Any, source: Any
+) -> None:  # fmt: skip
+    """Bilinear interpolation over those of four pixels that show the same surface."""
+    h, planes = out.shape[0], out.shape[1]
+    w = out.shape[2] - 2 * PAD
+    c = x + PAD
+    surface = guide[y, SURFACE, c]
+    px, py = F(x) + vector[y, x, 0], F(y) + vector[y, x, 1]
+    # A comparison that NaN fails too.
+    if not (px > -ONE and py > -ONE and px < F(w) and py < F(h)) or surface != surface:
+        return
+    left, top = math.floor(px), math.floor(py)
+    fx, fy = px - F(left), py - F(top)
+    total = ZERO
+    for j in range(2):
+        for i in range(2):
+            share = (fx if i else ONE - fx) * (fy if j else ONE - fy)
+            yy, cc = top + j, left + i + PAD
+            if share <= F(1e-3) or yy < 0 or yy >= h:
+                continue
+            if other[yy, SOURCE, cc] != surface:
+                continue
+            nx, ny, nz = other[yy, NORMAL, cc], other[yy, NORMAL + 1, cc], other[yy, NORMAL + 2, cc]
+            away = (
+                nx * (expected[y, x, 0] - other[yy, POSITION, cc])
+                + ny * (expected[y, x, 1] - other[yy, POSITION + 1, cc])
+                + nz * (expected[y, x, 2] - other[yy, POSITION + 2, cc])
+            )
+            alike = nx * guide[y, NORMAL, c] + ny * guide[y, NORMAL + 1, c] + nz * guide[y, NORMAL + 2, c]
+            if not (abs(away) * other[yy, WIDTH, cc] < F(SAME_PLANE)) or alike < SAME_NORMAL:
+                continue
+            total += share
+            for k in range(planes):
+                out[y, k, c] += share * other_light[yy, k, cc]
+    if total > ZERO:
+        source[y, c] = surface
+        inverse = ONE / total
+        for k in range(planes):
+            out[y, k, c] *= inverse
+
+
+@njit
+def _compare(y0: Any, y1: Any, guide: Any, spans: Any, light: Any, past: Any, source: Any, out: Any) -> None:
+    """Mean variance of the present and of the past, and square of what differs, around every pixel."""
+    h = len(light)
+    zero, one = np.float32(0.0), np.float32(1.0)
+    near = np.empty((7, TILE + 2 * PAD), np.float32)
+    sums = np.empty((7, TILE), np.float32)
+    surface = np.empty(TILE, np.float32)
+    for y in range(y0, y1):
+        for x0 in range(spans[y, 0] + PAD, spans[y, 1] + PAD, TILE):
+            n = min(TILE, spans[y, 1] + PAD - x0)
+            for i in range(n):
+                surface[i] = guide[y, SURFACE, x0 + i]
+                for k in range(7):
+                    sums[k, i] = zero
+            start, reach = x0 - RADIUS * SPACING, n + 2 * RADIUS * SPACING
+            for dy in range(-RADIUS, RADIUS + 1):
+                yy = y + dy * SPACING
+                if yy < 0 or yy >= h:
+                    continue
+                for i in range(reach):
+                    same = guide[yy, SOURCE, start + i] == source[yy, start + i]
+                    near[0, i] = guide[yy, SOURCE, start + i] if same else np.float32(np.nan)
+                for lobe in range(2):
+                    for i in range(reach):
+                        a = start + i
+                        near[1 + 3 * lobe, i] = light[yy, LUMINANCE + lobe, a] - past[yy, LUMINANCE + lobe, a]
+                        near[2 + 3 * lobe, i] = light[yy, VARIANCE + lobe, a]
+                        near[3 + 3 * lobe, i] = past[yy, VARIANCE + lobe, a]
+                for dx in range(2 * RADIUS + 1):
+                    off = np.uint64(dx * SPACING)
+                    for i in range(np.uint64(n)):
+                        same = one if near[0, i + off] == surface[i] else zero
+                        sums[0, i] += same
+                        for k in range(1, 7):
+                            sums[k, i] += same * near[k, i + off]
+            for lobe in range(2):
+                for i in range(n):
+                    inverse = one / max(sums[0, i], one)
+                    difference = sums[1 + 3 * lobe, i] * inverse
+                    now, before = sums[2 + 3 * lobe, i] * inverse, sums[3 + 3 * lobe, i] * inverse
+                    out[y, NOW + lobe, x0 + i], out[y, PAST + lobe, x0 + i] = now, before
+                    out[y, BIAS + lobe, x0 + i] = max(difference * difference - (now + before) * inverse, zero)
+
+
+@njit
+def _mix(
+    y0: Any, y1: Any, least: Any, spans: Any, light: Any, past: Any, source: Any, change: Any, guide: Any, out: Any
+) -> None:  # fmt: skip
+    for y in range(y0, y1):
+        for c in range(spans[y, 0] + PAD, spans[y, 1] + PAD):
+            mix_pixel(y, c, least, light, past, source, change, guide, out)
+
+
+@njit
+def mix_pixel(
+    y: Any, c: Any, least: Any, light: Any, past: Any, source: Any, change: Any, guide: Any, out: Any
+) -> None:  # fmt: skip
+    """Kalman's update; a pixel that holds no number takes over the past."""
+    width = (light.shape[1] - LIGHT) // 2
+    known, usable = source[y, c] == source[y, c], guide[y, SOURCE, c] == guide[y, SOURCE, c]
+    if known and not usable:
+        guide[y, SOURCE, c] = guide[y, SURFACE, c]
+    for lobe in range(2):
+        gain = ONE
+        if known and usable:
+            error = change[y, PAST + lobe, c] + change[y, BIAS + lobe, c]
+            whole = error + change[y, NOW + lobe, c]
+            gain = max(error / whole, least[lobe]) if whole > ZERO else ONE
+        elif known:
+            gain = ZERO
+        rest = ONE - gain
+        k = VARIANCE + lobe
+        out[y, k, c] = rest * rest * past[y, k, c] + gain * gain * light[y, k, c]
+        k = LUMINANCE + lobe
+        out[y, k, c] = rest * past[y, k, c] + gain * light[y, k, c]
+        for k in range(LIGHT + lobe * width, LIGHT + (lobe + 1) * width):
+            out[y, k, c] = rest * past[y, k, c] + gain * light[y, k, c]

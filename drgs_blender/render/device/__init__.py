@@ -1,1 +1,0 @@
-"""The renderer's kernels on a graphics card; on the processor, by the same translation, for tests."""

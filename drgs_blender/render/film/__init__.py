@@ -1,0 +1,1 @@
+"""Film, passes and frame files."""

@@ -1,0 +1,84 @@
+"""Cryptomatte: which objects and materials a pixel shows, and how much of each (Friedman and Jones 2015).
+
+A pixel holds the numbers of the names (`mattes`) and the coverages of what it shows, most first, two in every RGBA
+pass.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ...compute.jit import njit, prange
+from ...core.cryptomatte import DRGS_MATERIAL, KINDS, identities
+from ...core.frame import Frame
+from ..gbuffer.gbuffer import GBuffer
+from ..points import CATCHER
+from ..scene.trace_scene import TraceScene
+
+Array = np.ndarray
+
+#: Passes of each kind.
+PASSES = 3
+#: Things that are told apart in one pixel before the least are left out.
+_SLOTS = 24
+
+
+class CryptoFilm:
+    """Identities and coverages of the camera's window, of one kind of thing."""
+
+    def __init__(self, kind: str, scene: TraceScene, frame: Frame) -> None:
+        x0, y0, x1, y1 = frame.camera.window
+        self._kind, self._scene, self._origin, self._width = kind, scene, (x0, y0), frame.camera.width
+        objects = [item.name for item in frame.objects] + [mesh.name for mesh in frame.meshes]
+        self._identities = identities(objects if kind == "object" else [*scene.material_names, DRGS_MATERIAL])
+        self.pixels = np.zeros((y1 - y0, x1 - x0, 2 * PASSES, 2), np.float32)
+
+    def add(self, buffer: GBuffer) -> None:
+        """Take the samples of a strip."""
+        y0, y1 = buffer.rows
+        x0, top = self._origin
+        start = np.searchsorted(buffer.points.pixel, np.arange(y0, y1 + 1, dtype=np.int64) * self._width)
+        scene = self._scene
+        owner = scene.source[buffer.object_index] if self._kind == "object" else scene.material_of(buffer.face)
+        points = buffer.points
+        rows = self.pixels[y0 - top : y1 - top]
+        _rank(start, x0, self._width, points.pixel, points.weight, points.flags, self._identities[owner], rows)
+
+    def passes(self) -> dict[str, Array]:
+        """Name -> (h, w, 4) float32."""
+        height, width = self.pixels.shape[:2]
+        both = self.pixels.reshape(height, width, PASSES, 4)
+        return {f"{KINDS[self._kind]}{i:02}": np.ascontiguousarray(both[:, :, i]) for i in range(PASSES)}
+
+
+@njit(parallel=True)
+def _rank(start: Any, x0: Any, width: Any, pixel: Any, weight: Any, flags: Any, identity: Any, out: Any) -> None:
+    """Add up the weights of each identity in a pixel, and keep the largest."""
+    for y in prange(len(start) - 1):
+        known, share = np.empty(_SLOTS, np.float32), np.empty(_SLOTS, np.float32)
+        first = start[y]
+        while first < start[y + 1]:
+            last, count = first, 0
+            while last < start[y + 1] and pixel[last] == pixel[first]:
+                if not flags[last] & CATCHER:
+                    slot = 0
+                    while slot < count and known[slot] != identity[last]:
+                        slot += 1
+                    if slot < _SLOTS:
+                        if slot == count:
+                            known[slot], share[slot] = identity[last], np.float32(0.0)
+                            count += 1
+                        share[slot] += weight[last]
+                last += 1
+            x = pixel[first] % width - x0
+            for rank in range(min(count, out.shape[2])):
+                best = rank
+                for slot in range(rank + 1, count):
+                    if share[slot] > share[best]:
+                        best = slot
+                known[rank], known[best] = known[best], known[rank]
+                share[rank], share[best] = share[best], share[rank]
+                out[y, x, rank, 0], out[y, x, rank, 1] = known[rank], share[rank]
+            first = last

@@ -1,0 +1,338 @@
+"""From shading points and their light to the pixels of all passes.
+
+A pixel is the plain mean of its ``aa`` sub-pixel samples (box filter of one pixel), premultiplied by coverage. Passes
+that describe the surface are not premultiplied, so that the object has no dark rim in them:
+
+- Depth, Position: mean of the samples on the surface nearest to the camera (those within `SAME_SURFACE` pixel widths
+  of the nearest one), so that no value lies between two surfaces; 1e10 and 0 where the pixel is empty;
+- Normal, Albedo, Roughness, Metallic: mean of all covered samples by weight;
+- IndexOB: of the nearest sample.
+
+Combined is DiffDir + DiffInd + GlossDir + GlossInd + Env + Emit, added in this order, to the last bit.
+
+A holdout leaves black, and alpha 0 where the film is transparent. A shadow catcher is seen by its shadow alone, a black
+veil as dense as the part of its light that the rest of the scene takes from it: 1 - (light in the scene) / (light among
+catchers alone), both summed over the pixel first, so that the quotient is not one of noise.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ...compute.jit import njit, prange
+from ...core.frame import Camera, RenderSettings
+from ..camera import FX, FY, ORTHOGRAPHIC, WIDTH, sample_ray
+from ..gbuffer.gbuffer import GBuffer
+from ..lights.environment import EnvironmentLight, map_at, sky_radiance
+from ..points import CATCHER, Radiance
+from ..sampling import luminance
+from .guides import Guides
+
+Array = np.ndarray
+
+EMPTY_DEPTH = 1e10
+#: Samples of one pixel within this many pixel widths of depth are of one surface (a slope of 83 degrees).
+SAME_SURFACE = 8.0
+
+
+COMPONENTS = ("DiffDir", "DiffInd", "GlossDir", "GlossInd")
+
+
+class Film:
+    """The picture while it is made, of the camera's window.
+
+    Attributes
+    ----------
+    components : (h, w, 4, 3) float32, in the order of `points.Radiance.components`, premultiplied
+    variance : (h, w, 2) float32 of the luminance of the premultiplied diffuse and glossy sums
+    environment : (h, w, 3) float32 light straight from the world, as if catchers had no shadow
+    emission : (h, w, 3) float32 light that seen surfaces emit
+    coverage : (h, w) float32
+    catcher : (h, w, 3) float32 sums by weight over the points of catchers: one, luminance, unshadowed luminance
+    veiled : (h, w, 3) float32 the part of ``environment`` that is seen through catchers
+    depth, position, normal, albedo, roughness, metallic, index : (h, w) or (h, w, 3) float32
+    """
+
+    def __init__(self, camera: Camera, settings: RenderSettings, parameters: Array) -> None:
+        x0, y0, x1, y1 = camera.window
+        size = (y1 - y0, x1 - x0)
+        self.transparent = settings.film_transparent
+        self.origin = (x0, y0)
+        self.parameters = parameters
+        self.components = np.zeros((*size, 4, 3), np.float32)
+        self.variance = np.zeros((*size, 2), np.float32)
+        self.environment = np.zeros((*size, 3), np.float32)
+        self.emission, self.catcher, self.veiled = (np.zeros((*size, 3), np.float32) for _ in range(3))
+        self.coverage, self.roughness, self.metallic, self.index = (np.zeros(size, np.float32) for _ in range(4))
+        self.depth = np.full(size, EMPTY_DEPTH, np.float32)
+        self.position, self.normal, self.albedo = (np.zeros((*size, 3), np.float32) for _ in range(3))
+
+    def add(self, buffer: GBuffer, radiance: Radiance, pass_index: Array, light: EnvironmentLight) -> None:
+        """Take the strip `buffer` with the light of its points.
+
+        Parameters
+        ----------
+        pass_index : (objects,) int32
+        light : what is seen behind, unless the film is transparent
+        """
+        x0, top = self.origin
+        y0, y1 = buffer.rows
+        rows = slice(y0 - top, y1 - top)
+        points = buffer.points
+        width = int(self.parameters[WIDTH])
+        start = np.searchsorted(points.pixel, np.arange(y0, y1 + 1, dtype=np.int64) * width)
+        _develop(
+            start,
+            x0,
+            self.parameters,
+            points.pixel,
+            points.weight,
+            points.normal,
+            points.albedo,
+            points.roughness,
+            points.metallic,
+            buffer.position,
+            buffer.depth,
+            buffer.object_index,
+            buffer.emission,
+            points.flags,
+            pass_index,
+            radiance.components,
+            radiance.variance,
+            np.zeros(len(points), np.float32) if radiance.unshadowed is None else radiance.unshadowed,
+            self.components[rows],
+            self.variance[rows],
+            self.coverage[rows],
+            self.depth[rows],
+            self.position[rows],
+            self.normal[rows],
+            self.albedo[rows],
+            self.roughness[rows],
+            self.metallic[rows],
+            self.index[rows],
+            self.emission[rows],
+            self.catcher[rows],
+        )
+        if not self.transparent and not light.black:
+            _background(self.parameters, x0, y0, buffer.alpha, light.sky, self.environment[rows])
+            caught = np.flatnonzero(points.flags & CATCHER)
+            if len(caught):
+                _behind(
+                    self.parameters, x0, y0, points.pixel[caught], points.sample[caught], points.weight[caught],
+                    light.sky, self.veiled[rows],
+                )  # fmt: skip
+
+    def guides(self) -> Guides:
+        """What the denoiser tells surfaces apart by."""
+        return Guides(
+            self.coverage,
+            self.position,
+            self.normal,
+            self.albedo,
+            self.roughness,
+            self.metallic,
+            self.index,
+            footprints(self.depth, self.parameters),
+        )
+
+    def passes(
+        self,
+        names: tuple[str, ...],
+        components: Array | None = None,
+        vector: Array | None = None,
+        previous: Array | None = None,
+    ) -> dict[str, Array]:
+        """Passes by name, (h, w, channels) float32.
+
+        Parameters
+        ----------
+        components : (h, w, 4, 3) denoised light; that of the film when None
+        vector, previous : the passes of motion; nothing moves when None
+        """
+        light = self.components if components is None else components
+        made = {name: np.ascontiguousarray(light[:, :, i]) for i, name in enumerate(COMPONENTS)}
+        shadow = self._shadow()
+        made["Env"] = self.environment - self.veiled * shadow[..., None] if shadow.any() else self.environment
+        made["Emit"] = self.emission
+        made |= {"Position": self.position, "Normal": self.normal, "Albedo": self.albedo, "Variance": self.variance}
+        made["Vector"] = np.zeros((*self.coverage.shape, 4), np.float32) if vector is None else vector
+        made["Previous Position"] = self.position if previous is None else previous
+        scalars = {
+            "Depth": self.depth,
+            "Roughness": self.roughness,
+            "Metallic": self.metallic,
+            "Coverage": self.coverage,
+            "IndexOB": self.index,
+        }
+        made |= {name: values[..., None] for name, values in scalars.items()}
+        if "Combined" in names:
+            made["Combined"] = self._beauty(light, made["Env"], shadow)
+        if "Noisy Image" in names:
+            made["Noisy Image"] = self._beauty(self.components, made["Env"], shadow)
+        return {name: made[name] for name in names}
+
+    def _shadow(self) -> Array:
+        """(h, w) float32 in [0, 1]: how dense the shadows on catchers are."""
+        _, light, unshadowed = np.moveaxis(self.catcher, 2, 0)
+        return np.where(unshadowed > 0, np.clip(1 - light / np.where(unshadowed > 0, unshadowed, 1), 0, 1), 0)
+
+    def _beauty(self, light: Array, environment: Array, shadow: Array) -> Array:
+        opaque = self.coverage + self.catcher[:, :, 0] * shadow if self.transparent else np.float32(1.0)
+        return add_light(light, environment, self.emission, opaque)
+
+
+def footprints(depth: Array, parameters: Array) -> Array:
+    """(h, w) float32 metres: width of a pixel at `depth` (h, w) before the camera of `parameters`."""
+    per_metre = np.float32(1.0 / min(parameters[FX], parameters[FY]))
+    return np.full_like(depth, per_metre) if parameters[ORTHOGRAPHIC] != 0.0 else depth * per_metre
+
+
+def add_light(light: Array, environment: Array, emission: Array, opaque: Array | np.float32) -> Array:
+    """(h, w, 4) float32 Combined of (h, w, 4, 3) light, what is behind it and what surfaces emit."""
+    out = np.empty((*light.shape[:2], 4), np.float32)
+    out[..., :3] = light[:, :, 0] + light[:, :, 1] + light[:, :, 2] + light[:, :, 3] + environment + emission
+    out[..., 3] = opaque
+    return out
+
+
+@njit(parallel=True)
+def _develop(
+    start: Any,
+    x0: Any,
+    p: Any,
+    pixel: Any,
+    weight: Any,
+    normal: Any,
+    albedo: Any,
+    roughness: Any,
+    metallic: Any,
+    position: Any,
+    depth: Any,
+    owner: Any,
+    emission: Any,
+    flags: Any,
+    pass_index: Any,
+    light: Any,
+    light_variance: Any,
+    unshadowed: Any,
+    components: Any,
+    variance: Any,
+    coverage: Any,
+    out_depth: Any,
+    out_position: Any,
+    out_normal: Any,
+    out_albedo: Any,
+    out_roughness: Any,
+    out_metallic: Any,
+    out_index: Any,
+    out_emission: Any,
+    out_catcher: Any,
+) -> None:
+    """Sum the points of each pixel; they are neighbours in the arrays."""
+    width = np.int64(p[WIDTH])
+    per_depth = np.float32(0.0 if p[ORTHOGRAPHIC] != 0.0 else SAME_SURFACE / min(p[FX], p[FY]))
+    fixed = np.float32(SAME_SURFACE / min(p[FX], p[FY]) if p[ORTHOGRAPHIC] != 0.0 else 0.0)
+    zero = np.float32(0.0)
+    for y in prange(len(start) - 1):
+        first = start[y]
+        while first < start[y + 1]:
+            last = first + 1
+            while last < start[y + 1] and pixel[last] == pixel[first]:
+                last += 1
+            x = pixel[first] % width - x0
+            nearest = -1
+            for i in range(first, last):
+                if flags[i] & CATCHER:
+                    shine = zero
+                    for c in range(4):
+                        shine += luminance(light[i, c, 0], light[i, c, 1], light[i, c, 2])
+                    out_catcher[y, x, 0] += weight[i]
+                    out_catcher[y, x, 1] += weight[i] * shine
+                    out_catcher[y, x, 2] += weight[i] * unshadowed[i]
+                elif nearest < 0 or depth[i] < depth[nearest]:
+                    nearest = i
+            if nearest < 0:
+                first = last
+                continue
+            limit = depth[nearest] * (np.float32(1.0) + per_depth) + fixed
+            total = surface = mean_depth = rough = metal = zero
+            px = py = pz = nx = ny = nz = r = g = b = zero
+            for i in range(first, last):
+                if flags[i] & CATCHER:
+                    continue
+                w = weight[i]
+                total += w
+                for k in range(3):
+                    out_emission[y, x, k] += w * emission[i, k]
+                for c in range(4):
+                    for k in range(3):
+                        components[y, x, c, k] += w * light[i, c, k]
+                variance[y, x, 0] += w * w * light_variance[i, 0]
+                variance[y, x, 1] += w * w * light_variance[i, 1]
+                nx, ny, nz = nx + w * normal[i, 0], ny + w * normal[i, 1], nz + w * normal[i, 2]
+                r, g, b = r + w * albedo[i, 0], g + w * albedo[i, 1], b + w * albedo[i, 2]
+                rough, metal = rough + w * roughness[i], metal + w * metallic[i]
+                if depth[i] <= limit:
+                    surface += w
+                    # Differences to the nearest sample, lest float32 lose small ones far from the origin.
+                    mean_depth += w * (depth[i] - depth[nearest])
+                    px += w * (position[i, 0] - position[nearest, 0])
+                    py += w * (position[i, 1] - position[nearest, 1])
+                    pz += w * (position[i, 2] - position[nearest, 2])
+            coverage[y, x] = min(total, np.float32(1.0))
+            out_depth[y, x] = depth[nearest] + mean_depth / surface
+            out_position[y, x, 0] = position[nearest, 0] + px / surface
+            out_position[y, x, 1] = position[nearest, 1] + py / surface
+            out_position[y, x, 2] = position[nearest, 2] + pz / surface
+            length = np.sqrt(nx * nx + ny * ny + nz * nz)
+            if length > np.float32(1e-6) * total:
+                nx, ny, nz = nx / length, ny / length, nz / length
+            else:
+                nx, ny, nz = normal[nearest, 0], normal[nearest, 1], normal[nearest, 2]
+            out_normal[y, x, 0], out_normal[y, x, 1], out_normal[y, x, 2] = nx, ny, nz
+            inverse = np.float32(1.0) / total
+            out_albedo[y, x, 0], out_albedo[y, x, 1], out_albedo[y, x, 2] = r * inverse, g * inverse, b * inverse
+            out_roughness[y, x], out_metallic[y, x] = rough * inverse, metal * inverse
+            out_index[y, x] = np.float32(pass_index[owner[nearest]])
+            first = last
+
+
+@njit
+def _world(p: Any, pixel: Any, sample: Any, sky: Any) -> Any:
+    """The world's radiance along the ray of a sub-pixel sample."""
+    _, _, _, dx, dy, dz = sample_ray(p, pixel, sample)
+    scale = 1.0 / np.sqrt(dx * dx + dy * dy + dz * dz)
+    u, v = map_at(np.float32(dx * scale), np.float32(dy * scale), np.float32(dz * scale), sky)
+    return sky_radiance(u, v, sky)
+
+
+@njit(parallel=True)
+def _background(p: Any, x0: Any, y0: Any, alpha: Any, sky: Any, out: Any) -> None:
+    """Add the world's radiance along every sub-pixel ray, weighted by what the surfaces leave uncovered."""
+    width = np.int64(p[WIDTH])
+    rows, columns, aa = alpha.shape
+    share = np.float32(1.0 / aa)
+    for y in prange(rows):
+        for x in range(columns):
+            red = green = blue = np.float32(0.0)
+            for k in range(aa):
+                left = (np.float32(1.0) - alpha[y, x, k]) * share
+                if left <= np.float32(0.0):
+                    continue
+                r, g, b = _world(p, (y0 + y) * width + x0 + x, k, sky)
+                red, green, blue = red + left * r, green + left * g, blue + left * b
+            out[y, x, 0], out[y, x, 1], out[y, x, 2] = red, green, blue
+
+
+@njit
+def _behind(p: Any, x0: Any, y0: Any, pixel: Any, sample: Any, weight: Any, sky: Any, out: Any) -> None:
+    """Add the world's radiance behind some points, by weight."""
+    width = np.int64(p[WIDTH])
+    for i in range(len(pixel)):
+        y, x = pixel[i] // width - y0, pixel[i] % width - x0
+        r, g, b = _world(p, pixel[i], sample[i], sky)
+        out[y, x, 0] += weight[i] * r
+        out[y, x, 1] += weight[i] * g
+        out[y, x, 2] += weight[i] * b

@@ -1,0 +1,31 @@
+"""What tells surfaces apart for a denoiser."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+Array = np.ndarray
+
+
+@dataclass(slots=True)
+class Guides:
+    """What tells surfaces apart, (h, w) or (h, w, 3) float32; see `film.Film`.
+
+    ``footprint`` (h, w) is the width of a pixel at the surface, metres.
+    """
+
+    coverage: Array
+    position: Array
+    normal: Array
+    albedo: Array
+    roughness: Array
+    metallic: Array
+    index: Array
+    footprint: Array
+
+    @property
+    def arrays(self) -> tuple[Array, ...]:
+        """All of them, in this order."""
+        return tuple(getattr(self, f.name) for f in fields(self))

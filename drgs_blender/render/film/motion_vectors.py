@@ -1,0 +1,250 @@
+"""Where every visible surface point is at another time: on its mesh, in the world, in the picture.
+
+A point is tied to the mesh by a face and barycentric coordinates. What stands off the mesh (a surfel is not quite on
+it) keeps its coordinates in the basis of the face's two edges and unit normal, as surfels do when they are posed, so
+that a seen point moves exactly as its surfel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...compute.jit import njit, prange
+from ..camera import CX, CY, FX, FY, ORTHOGRAPHIC, POSITION, WIDTH
+from ..gbuffer.gbuffer import GBuffer
+from ..points import CATCHER
+from ..scene.interaction import position_at
+from ..scene.trace_scene import TraceScene
+from .film import SAME_SURFACE
+
+Array = np.ndarray
+
+
+class Instant(NamedTuple):
+    """The shapes of a scene and its camera at one time.
+
+    Attributes
+    ----------
+    vertices, places : laid out as those of `trace.scene.TraceScene`
+    parameters : `camera.camera_parameters`
+    """
+
+    vertices: Array
+    places: Array
+    parameters: Array
+
+
+@dataclass(slots=True)
+class Motion:
+    """Where the surfaces of a picture are at another time, mostly one frame earlier.
+
+    Attributes
+    ----------
+    vector : (h, w, 2) float32 pixels, x to the right and y down: what must be added to a pixel's position to find its
+        surface in the other frame; NaN where that is unknown (nothing covered, or it is behind the camera)
+    previous : (h, w, 3) float32 metres, world space: where the surface at ``Position`` is then
+    """
+
+    vector: Array
+    previous: Array
+
+
+def previous_positions(
+    faces: Array, now: Instant, then: Instant, face: Array, place: Array, barycentric: Array, position: Array
+) -> Array:
+    """World positions of surface points at another time.
+
+    Parameters
+    ----------
+    faces : (m, 3) int32
+    face : (n,) int32, the face each point is tied to; negative for points that are tied to nothing and do not move
+    place : (n,) int32, the row of ``places`` that the face stands in; negative for a face in world space
+    barycentric : (n, 2) float32 weights of the face's second and third corner, as Embree gives them
+    position : (n, 3) float32 where the points are now
+
+    Returns
+    -------
+    (n, 3) float32
+    """
+    out = np.empty((len(face), 3), np.float32)
+    _previous(
+        faces, now.vertices, now.places, then.vertices, then.places, face, place, barycentric, position, out
+    )  # fmt: skip
+    return out
+
+
+class MotionFilm:
+    """Gathers the motion of a picture's samples strip by strip, as `film.Film` does their light.
+
+    Parameters
+    ----------
+    shape : (h, w) of the camera's window
+    origin : (x0, y0) of it
+    now, then : this time and the other one
+    """
+
+    def __init__(self, shape: tuple[int, int], origin: tuple[int, int], now: Instant, then: Instant) -> None:
+        self.origin, self.now, self.then = origin, now, then
+        self.displacement = np.zeros((*shape, 3), np.float32)
+
+    def add(self, buffer: GBuffer, scene: TraceScene) -> None:
+        """Take the samples of the strip `buffer`."""
+        position = buffer.position
+        if self.then.vertices is not self.now.vertices or self.then.places is not self.now.places:
+            tied = buffer.face, buffer.place, buffer.barycentric
+            self.displace(buffer, previous_positions(scene.faces, self.now, self.then, *tied, position))
+
+    def displace(self, buffer: GBuffer, previous: Array) -> None:
+        """Take samples that are at `previous` (n, 3) at the other time."""
+        x0, top = self.origin
+        y0, y1 = buffer.rows
+        points, parameters = buffer.points, self.now.parameters
+        start = np.searchsorted(points.pixel, np.arange(y0, y1 + 1, dtype=np.int64) * int(parameters[WIDTH]))
+        _displace(
+            start, x0, parameters, points.pixel, points.weight, points.flags, buffer.face, buffer.depth,
+            buffer.position, previous, self.displacement[y0 - top : y1 - top],
+        )  # fmt: skip
+
+    def motion(self, position: Array, coverage: Array) -> Motion:
+        """Motion of the picture whose passes are `position` and `coverage`."""
+        return motion(position, position + self.displacement, coverage, self.now.parameters, self.then.parameters)
+
+
+def motion(position: Array, previous: Array, coverage: Array, now: Array, then: Array) -> Motion:
+    """Motion of surfaces seen at `position` (h, w, 3) that are at `previous` at the other time; `now` and `then` are
+    the parameters of the cameras."""
+    vector = np.full((*coverage.shape, 2), np.nan, np.float32)
+    _vectors(now, then, position, previous, coverage, vector)
+    return Motion(vector, previous)
+
+
+def vector_pass(before: Motion | None, after: Motion | None, shape: tuple[int, int]) -> Array:
+    """(h, w, 4) float32: motion as Blender's Vector pass has it, zero where it is unknown.
+
+    As Cycles writes it, in pixels, x to the right and y up: the place in the previous frame less that in this one, and
+    the place in this frame less that in the next one.
+    """
+    out = np.zeros((*shape, 4), np.float32)
+    for known, first, side in ((before, 0, 1.0), (after, 2, -1.0)):
+        if known is not None:
+            out[..., first : first + 2] = np.nan_to_num(known.vector * np.array([side, -side], np.float32), nan=0.0)
+    return out
+
+
+@njit(inline="always")
+def project(p: Any, x: Any, y: Any, z: Any) -> Any:
+    """Pixel position and depth of a world-space point through the camera of parameters `p`; inverse of `camera_ray`."""
+    x, y, z = x - p[POSITION], y - p[POSITION + 1], z - p[POSITION + 2]
+    depth = -(p[2] * x + p[5] * y + p[8] * z)
+    right = p[0] * x + p[3] * y + p[6] * z
+    up = p[1] * x + p[4] * y + p[7] * z
+    scale = 1.0 if p[ORTHOGRAPHIC] != 0.0 else 1.0 / depth
+    return p[CX] + p[FX] * right * scale, p[CY] - p[FY] * up * scale, depth
+
+
+@njit(inline="always")
+def _basis(v: Any, faces: Any, f: Any) -> Any:
+    """First corner, two edges, unit normal (0 for a face without area) of face `f`, float64."""
+    a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+    x, y, z = np.float64(v[a, 0]), np.float64(v[a, 1]), np.float64(v[a, 2])
+    ux, uy, uz = v[b, 0] - x, v[b, 1] - y, v[b, 2] - z
+    wx, wy, wz = v[c, 0] - x, v[c, 1] - y, v[c, 2] - z
+    nx, ny, nz = uy * wz - uz * wy, uz * wx - ux * wz, ux * wy - uy * wx
+    length = np.sqrt(nx * nx + ny * ny + nz * nz)
+    inverse = 1.0 / length if length > 0.0 else 0.0
+    return x, y, z, ux, uy, uz, wx, wy, wz, nx * inverse, ny * inverse, nz * inverse, length
+
+
+@njit(parallel=True)
+def _previous(
+    faces: Any, vertices: Any, places: Any, before: Any, places_before: Any, face: Any, place: Any, barycentric: Any,
+    position: Any, out: Any,
+) -> None:  # fmt: skip
+    for i in prange(len(face)):
+        f, stand = face[i], place[i]
+        if f < 0:
+            out[i, 0], out[i, 1], out[i, 2] = position[i, 0], position[i, 1], position[i, 2]
+            continue
+        if stand >= 0:
+            x, y, z = position_at(f, stand, barycentric[i, 0], barycentric[i, 1], vertices, faces, places)
+            u, v, w = position_at(f, stand, barycentric[i, 0], barycentric[i, 1], before, faces, places_before)
+            out[i, 0], out[i, 1], out[i, 2] = (
+                position[i, 0] + (u - x),
+                position[i, 1] + (v - y),
+                position[i, 2] + (w - z),
+            )
+            continue
+        b, c = np.float64(barycentric[i, 0]), np.float64(barycentric[i, 1])
+        x, y, z, ux, uy, uz, wx, wy, wz, nx, ny, nz, size = _basis(vertices, faces, f)
+        # What is left of the position beside the mesh point, in the face's basis.
+        dx = position[i, 0] - (x + b * ux + c * wx)
+        dy = position[i, 1] - (y + b * uy + c * wy)
+        dz = position[i, 2] - (z + b * uz + c * wz)
+        x, y, z, pux, puy, puz, pwx, pwy, pwz, pnx, pny, pnz, _ = _basis(before, faces, f)
+        off = nx * dx + ny * dy + nz * dz
+        if size > 0.0:
+            # Along the edges: dual basis w x n / size and n x u / size.
+            b += ((wy * nz - wz * ny) * dx + (wz * nx - wx * nz) * dy + (wx * ny - wy * nx) * dz) / size
+            c += ((ny * uz - nz * uy) * dx + (nz * ux - nx * uz) * dy + (nx * uy - ny * ux) * dz) / size
+            dx, dy, dz = off * pnx, off * pny, off * pnz
+        out[i, 0] = x + b * pux + c * pwx + dx
+        out[i, 1] = y + b * puy + c * pwy + dy
+        out[i, 2] = z + b * puz + c * pwz + dz
+
+
+@njit(parallel=True)
+def _displace(
+    start: Any, x0: Any, p: Any, pixel: Any, weight: Any, flags: Any, face: Any, depth: Any, position: Any,
+    previous: Any, out: Any,
+) -> None:  # fmt: skip
+    """Mean displacement of the samples on the surface nearest to the camera, the same that make up Position.
+
+    Samples that are tied to no face follow the others.
+    """
+    width = np.int64(p[WIDTH])
+    flat = p[ORTHOGRAPHIC] != 0.0
+    slope = SAME_SURFACE / min(p[FX], p[FY])
+    per_depth, fixed = np.float32(0.0 if flat else slope), np.float32(slope if flat else 0.0)
+    for y in prange(len(start) - 1):
+        first = start[y]
+        while first < start[y + 1]:
+            last = first
+            nearest = np.float32(np.inf)
+            while last < start[y + 1] and pixel[last] == pixel[first]:
+                if not flags[last] & CATCHER:
+                    nearest = min(nearest, depth[last])
+                last += 1
+            limit = nearest * (np.float32(1.0) + per_depth) + fixed
+            total = dx = dy = dz = np.float32(0.0)
+            for i in range(first, last):
+                if depth[i] <= limit and face[i] >= 0 and not flags[i] & CATCHER:
+                    w = weight[i]
+                    total += w
+                    dx += w * (previous[i, 0] - position[i, 0])
+                    dy += w * (previous[i, 1] - position[i, 1])
+                    dz += w * (previous[i, 2] - position[i, 2])
+            if total > np.float32(0.0):
+                x = pixel[first] % width - x0
+                out[y, x, 0], out[y, x, 1], out[y, x, 2] = dx / total, dy / total, dz / total
+            first = last
+
+
+@njit(parallel=True)
+def _vectors(now: Any, before: Any, position: Any, previous: Any, coverage: Any, vector: Any) -> None:
+    """Difference of the two projections, zero to the last bit where nothing moved."""
+    h, w = coverage.shape
+    for y in prange(h):
+        for x in range(w):
+            if not coverage[y, x] > np.float32(0.0):
+                continue
+            ax, ay, _ = project(
+                now, np.float64(position[y, x, 0]), np.float64(position[y, x, 1]), np.float64(position[y, x, 2])
+            )
+            bx, by, depth = project(
+                before, np.float64(previous[y, x, 0]), np.float64(previous[y, x, 1]), np.float64(previous[y, x, 2])
+            )
+            if depth > 0.0 or before[ORTHOGRAPHIC] != 0.0:
+                vector[y, x, 0], vector[y, x, 1] = np.float32(bx - ax), np.float32(by - ay)

@@ -1,0 +1,1 @@
+"""What the camera sees: the G-buffer, from surfels and from meshes."""

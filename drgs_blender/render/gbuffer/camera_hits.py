@@ -1,0 +1,189 @@
+"""Camera rays against meshes: what they meet first, and points to be lit there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ...compute.jit import get_num_threads, njit, prange
+from ..camera import CLIP_END, CLIP_START, WIDTH, sample_ray
+from ..scene.interaction import nearest, position_at, surface_at
+from ..scene.trace_scene import TraceScene
+from .gbuffer import GBuffer, face_viewer
+
+Array = np.ndarray
+
+#: Samples or points of a block.
+_BLOCK = 256
+
+
+@dataclass(slots=True)
+class MeshHits:
+    """What camera rays through the sub-pixel samples of some rows meet first.
+
+    Attributes
+    ----------
+    depth : (rows, width, aa) float32, metres along the view axis
+    owner : (rows, width, aa) int32, object, or -1 where nothing is met; the other arrays are undefined there
+    face, place : (rows, width, aa) int32
+    where : (rows, width, aa, 5) float32: the hit's u and v, and its geometric normal as `surface_at` wants it
+    """
+
+    depth: Array
+    owner: Array
+    face: Array
+    place: Array
+    where: Array
+
+    @property
+    def arrays(self) -> tuple[Array, ...]:
+        """All of them."""
+        return self.depth, self.owner, self.face, self.place, self.where
+
+
+def trace_camera(scene: TraceScene, parameters: Array, x0: int, y0: int, shape: tuple[int, ...], mask: int) -> MeshHits:
+    """Closest hits of the camera's rays with what `mask` lets them meet.
+
+    Parameters
+    ----------
+    parameters : `camera.camera_parameters`
+    x0, y0 : full-picture pixel of the first sample
+    shape : (rows, width, aa)
+    """
+    owner, face, place = (np.empty(shape, np.int32) for _ in range(3))
+    hits = MeshHits(np.empty(shape, np.float32), owner, face, place, np.empty((*shape, 5), np.float32))
+    if not mask:
+        hits.owner[:] = -1
+        return hits
+    owners = scene.face_object, scene.place_object
+    _trace(scene.tracer, (parameters, x0, y0), np.int32(mask), owners, hits.arrays, 8 * get_num_threads())
+    return hits
+
+
+def shade_mesh(scene: TraceScene, hits: MeshHits, parameters: Array, x0: int, buffer: GBuffer, layer: int) -> None:
+    """Fill the points of `buffer` that have the flags `layer` from `hits`."""
+    moving = scene.vertices, scene.faces, scene.places
+    view_of = parameters, x0, buffer.rows[0]
+    keys, out = arrays_of(buffer)
+    _shade(scene.geometry, moving, view_of, layer, hits.arrays, keys, *out, 8 * get_num_threads())
+
+
+def arrays_of(buffer: GBuffer) -> tuple[tuple[Array, ...], tuple[tuple[Array, ...], ...]]:
+    """Pixel, sample and flags of its points, and in three groups the arrays that `shade_hits` fills."""
+    points = buffer.points
+    frames = points.origin, points.normal, points.geometric_normal, points.view
+    materials = points.albedo, points.roughness, points.metallic
+    seen = buffer.position, buffer.depth, buffer.object_index, buffer.emission
+    tied = buffer.face, buffer.place, buffer.barycentric
+    return (points.pixel, points.sample, points.flags), (frames, materials, (*seen, *tied))
+
+
+@njit(parallel=True)
+def _trace(tracer: Any, view_of: Any, mask: Any, owners: Any, out: Any, lanes: Any) -> None:
+    for lane in prange(lanes):
+        trace_samples(np.int64(lane), lanes, None, tracer, view_of, mask, owners, out)
+
+
+@njit(parallel=True)
+def _shade(geometry: Any, moving: Any, view_of: Any, layer: Any, hits: Any, keys: Any, frames: Any, materials: Any,
+           seen: Any, lanes: Any) -> None:  # fmt: skip
+    for lane in prange(lanes):
+        out = frames, materials, seen
+        shade_hits(np.int64(lane), lanes, None, geometry, moving, view_of, layer, hits, keys, out)
+
+
+@njit
+def trace_samples(
+    lane: Any, lanes: Any, room: Any, tracer: Any, view_of: Any, mask: Any, owners: Any, out: Any
+) -> None:
+    """Closest hits of every so-manyth (`lanes`) block of sub-pixel samples, from the `lane`-th on.
+
+    Parameters
+    ----------
+    room : not used
+    view_of : `camera.camera_parameters`, column and row of the first sample
+    owners : object of each face and of each place
+    out : `MeshHits.arrays`
+    """
+    p, x0, y0 = view_of
+    face_object, place_object = owners
+    depth, owner, face, place, where = out
+    width = np.int64(p[WIDTH])
+    rows, columns, aa = depth.shape
+    near, far = np.float32(p[CLIP_START]), np.float32(p[CLIP_END])
+    count = rows * columns * aa
+    for block in range(lane, (count + _BLOCK - 1) // _BLOCK, lanes):
+        for n in range(block * _BLOCK, min((block + 1) * _BLOCK, count)):
+            x, y, k = n // aa % columns, n // (aa * columns), n % aa
+            ox, oy, oz, dx, dy, dz = sample_ray(p, (y0 + y) * width + x0 + x, k)
+            t, f, i, u, v, gx, gy, gz = nearest(
+                tracer, np.float32(ox), np.float32(oy), np.float32(oz),
+                np.float32(dx), np.float32(dy), np.float32(dz), near, far, mask,
+            )  # fmt: skip
+            depth[y, x, k], face[y, x, k], place[y, x, k] = t, f, i
+            where[y, x, k, 0], where[y, x, k, 1] = u, v
+            where[y, x, k, 2], where[y, x, k, 3], where[y, x, k, 4] = gx, gy, gz
+            owner[y, x, k] = -1
+            if f >= 0 and i >= 0:
+                owner[y, x, k] = place_object[i]
+            elif f >= 0:
+                owner[y, x, k] = face_object[f]
+
+
+@njit
+def shade_hits(
+    lane: Any, lanes: Any, room: Any, geometry: Any, moving: Any, view_of: Any, layer: Any, hits: Any, keys: Any,
+    out: Any,
+) -> None:  # fmt: skip
+    """Fill every so-manyth (`lanes`) block of points from their hits, from the `lane`-th on.
+
+    Parameters
+    ----------
+    room : not used
+    geometry, moving : the scene's, and its vertices, faces and places
+    view_of : as of `trace_samples`
+    layer : flags that points must have
+    hits : `MeshHits.arrays`
+    keys, out : `arrays_of`
+    """
+    vertices, faces, places = moving
+    p, x0, y0 = view_of
+    hit_depth, _, hit_face, hit_place, where = hits
+    pixel, sample, flags = keys
+    frames, materials, seen = out
+    origin, normal, geometric, view = frames
+    albedo, roughness, metallic = materials
+    position, depth, owner, emission, out_face, out_place, barycentric = seen
+    width = np.int64(p[WIDTH])
+    for block in range(lane, (len(pixel) + _BLOCK - 1) // _BLOCK, lanes):
+        for n in range(block * _BLOCK, min((block + 1) * _BLOCK, len(pixel))):
+            if flags[n] & layer != layer:
+                continue
+            y, x, k = pixel[n] // width - y0, pixel[n] % width - x0, sample[n]
+            _, _, _, dx, dy, dz = sample_ray(p, pixel[n], sample[n])
+            scale = -1.0 / np.sqrt(dx * dx + dy * dy + dz * dz)
+            vx, vy, vz = scale * dx, scale * dy, scale * dz
+            place, u, v = hit_place[y, x, k], where[y, x, k, 0], where[y, x, k, 1]
+            # Points that a device found and has lost are traced anew, where a ray along an edge may meet nothing.
+            face = max(hit_face[y, x, k], np.int32(0))
+            nx, ny, nz, gx, gy, gz, r, g, b, rough, metal, er, eg, eb, who = surface_at(
+                face, place, u, v, where[y, x, k, 2], where[y, x, k, 3], where[y, x, k, 4],
+                np.float32(-vx), np.float32(-vy), np.float32(-vz), geometry,
+            )  # fmt: skip
+            sx, sy, sz = face_viewer(
+                np.float64(nx), np.float64(ny), np.float64(nz), np.float64(gx), np.float64(gy), np.float64(gz),
+                vx, vy, vz,
+            )  # fmt: skip
+            px, py, pz = position_at(face, place, u, v, vertices, faces, places)
+            origin[n, 0], origin[n, 1], origin[n, 2] = px, py, pz
+            position[n, 0], position[n, 1], position[n, 2] = px, py, pz
+            normal[n, 0], normal[n, 1], normal[n, 2] = sx, sy, sz
+            geometric[n, 0], geometric[n, 1], geometric[n, 2] = gx, gy, gz
+            view[n, 0], view[n, 1], view[n, 2] = vx, vy, vz
+            albedo[n, 0], albedo[n, 1], albedo[n, 2] = r, g, b
+            roughness[n], metallic[n] = rough, metal
+            depth[n], owner[n] = hit_depth[y, x, k], who
+            emission[n, 0], emission[n, 1], emission[n, 2] = er, eg, eb
+            out_face[n], out_place[n], barycentric[n, 0], barycentric[n, 1] = face, place, u, v

@@ -1,0 +1,119 @@
+"""What the camera sees of a strip of rows, before light: the result of both primary stages."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ...compute.jit import njit
+from ..camera import AA, WIDTH
+from ..points import CATCHER, SECOND, ShadingPoints
+from ..scene.ray_masks import CATCHER as CATCHER_OBJECT
+
+Array = np.ndarray
+
+#: Least cosine between a shading normal and the direction to the viewer.
+LEAST_FACING = 0.02
+
+
+@dataclass(slots=True)
+class GBuffer:
+    """Covered sub-pixel samples of the rows ``y0 .. y1`` of the camera's window, ordered by pixel, then sample.
+
+    Attributes
+    ----------
+    rows : (y0, y1) in the full picture, half-open
+    points : ShadingPoints, n of them, what the integrator eats
+    position : (n, 3) float32, world space: the seen surface point (``points.origin`` lies on the traced mesh)
+    depth : (n,) float32, metres along the view axis
+    object_index : (n,) int32, as numbered by `scene.TraceScene`
+    emission : (n, 3) float32 radiance that the surface itself sends to the camera
+    face, place : (n,) int32: what the point is tied to, as `surface.nearest` numbers it; face -1 for a surfel off all
+        meshes
+    barycentric : (n, 2) float32 weights of the face's second and third corner
+    alpha : (rows, width, aa) float32: what of each sub-pixel sample hides the background; shadow catchers do not
+    """
+
+    rows: tuple[int, int]
+    points: ShadingPoints
+    position: Array
+    depth: Array
+    object_index: Array
+    emission: Array
+    face: Array
+    place: Array
+    barycentric: Array
+    alpha: Array
+
+    def mark_catchers(self, object_flags: Array) -> None:
+        """Flag the points of shadow catchers."""
+        if (object_flags & CATCHER_OBJECT).any():
+            self.points.flags |= np.where(object_flags[self.object_index] & CATCHER_OBJECT, CATCHER, 0).astype(np.uint8)
+
+
+def compact(alpha: Array, parameters: Array, x0: int, y0: int, second: Array | None = None) -> GBuffer:
+    """Make room for the samples with positive `alpha`, with pixel, sample, weight and flags filled in.
+
+    Parameters
+    ----------
+    alpha : (rows, width, aa) float32
+    parameters : `camera.camera_parameters`
+    x0, y0 : full-picture pixel of ``alpha[0, 0]``
+    second : (rows, width, aa) float32 of a second layer, or None: its points follow those of their samples
+    """
+    n = np.count_nonzero(alpha) + (0 if second is None else np.count_nonzero(second))
+    pixel, sample, owner, face, place = np.empty((5, n), np.int32)
+    weight, roughness, metallic, depth = np.empty((4, n), np.float32)
+    origin, normal, geometric, view, albedo, position = (np.empty((n, 3), np.float32) for _ in range(6))
+    flags = np.zeros(n, np.uint8)
+    none = np.empty((0, 0, 0), np.float32)
+    _number(alpha, none if second is None else second, parameters, x0, y0, pixel, sample, weight, flags)
+    points = ShadingPoints(pixel, sample, weight, origin, normal, geometric, view, albedo, roughness, metallic, flags)
+    emission = np.zeros((n, 3), np.float32)
+    tied = face, place, np.empty((n, 2), np.float32)
+    return GBuffer((y0, y0 + len(alpha)), points, position, depth, owner, emission, *tied, alpha)
+
+
+@njit
+def _number(
+    alpha: Any, second: Any, p: Any, x0: Any, y0: Any, pixel: Any, sample: Any, weight: Any, flags: Any
+) -> None:
+    """List the covered samples in order."""
+    width = np.int64(p[WIDTH])
+    share = np.float32(1.0 / p[AA])
+    rows, columns, aa = alpha.shape
+    layers = 2 if len(second) == rows else 1
+    n = 0
+    for y in range(rows):
+        for x in range(columns):
+            for k in range(aa):
+                for layer in range(layers):
+                    a = second[y, x, k] if layer else alpha[y, x, k]
+                    if a > np.float32(0.0):
+                        pixel[n] = (y0 + y) * width + x0 + x
+                        sample[n] = k
+                        weight[n] = a * share
+                        flags[n] = SECOND if layer else 0
+                        n += 1
+
+
+@njit(inline="always")
+def face_viewer(nx: Any, ny: Any, nz: Any, gx: Any, gy: Any, gz: Any, vx: Any, vy: Any, vz: Any) -> Any:
+    """Shading normal on the side of the geometric normal g, which faces the viewer at v, and visible from there.
+
+    A smooth normal that looks away from the viewer near a silhouette is bent until it is just visible.
+    """
+    if nx * gx + ny * gy + nz * gz < 0.0:
+        nx, ny, nz = -nx, -ny, -nz
+    facing = nx * vx + ny * vy + nz * vz
+    if facing < LEAST_FACING:
+        lift = LEAST_FACING - facing
+        nx, ny, nz = nx + lift * vx, ny + lift * vy, nz + lift * vz
+        length = np.sqrt(nx * nx + ny * ny + nz * nz)
+        if length < 1e-6:
+            return gx, gy, gz
+        k = 1.0 / length
+        nx, ny, nz = nx * k, ny * k, nz * k
+    return nx, ny, nz

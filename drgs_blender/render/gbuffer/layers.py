@@ -1,0 +1,128 @@
+"""What of each sub-pixel sample is surfels, an ordinary mesh, a hole or background.
+
+Surfels are blended on their own; the nearest ordinary mesh on the camera's ray then hides them, or fills what they
+leave free behind them. A holdout hides what lies behind it and is not seen itself; a shadow catcher is a surface that
+hides nothing by itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ...compute.jit import njit, prange
+from ..scene.ray_masks import CATCHER, HOLDOUT, ORDINARY
+from ..scene.trace_scene import TraceScene
+from ..surfels.raster import SurfelSamples
+from .camera_hits import MeshHits, trace_camera
+
+Array = np.ndarray
+
+#: Surfels that leave less of a mesh behind them free than this (a contribution they would skip themselves) hide it.
+_LEAST = np.float32(1.0 / 255.0)
+
+
+@dataclass(slots=True)
+class Layers:
+    """Weights of the two points of each sub-pixel sample, all (rows, width, aa) float32.
+
+    Attributes
+    ----------
+    first : surfels
+    second : ordinary meshes, or None when there are none
+    opaque : what hides the background, holdouts included
+    hits : of ordinary meshes, or None when there are none
+    """
+
+    first: Array
+    second: Array | None
+    opaque: Array
+    hits: MeshHits | None
+
+
+def combine(
+    samples: SurfelSamples,
+    scene: TraceScene,
+    parameters: Array,
+    x0: int,
+    y0: int,
+    trace: Callable[..., MeshHits] = trace_camera,
+) -> Layers:
+    """Combine blended surfels with the ordinary meshes that the camera sees.
+
+    Parameters
+    ----------
+    parameters : `camera.camera_parameters`
+    x0, y0 : full-picture pixel of the first sample
+    trace : who casts the camera's rays
+    """
+    special = bool((scene.object_flags & (HOLDOUT | CATCHER)).any())
+    if not scene.any_ordinary and not special:
+        return Layers(samples.alpha, None, samples.alpha, None)
+    hits = trace(scene, parameters, x0, y0, samples.alpha.shape, ORDINARY if scene.any_ordinary else 0)
+    first, second, opaque = (np.empty_like(samples.alpha) for _ in range(3))
+    _combine(
+        samples.alpha,
+        samples.depth,
+        samples.object_index,
+        hits.depth,
+        hits.owner,
+        scene.object_flags,
+        first,
+        second,
+        opaque,
+    )
+    return Layers(first, second, opaque, hits)
+
+
+def lone(hits: MeshHits, scene: TraceScene) -> Layers:
+    """Layers of meshes alone."""
+    nothing = np.zeros(hits.depth.shape, np.float32)
+    first, second, opaque = (np.empty_like(nothing) for _ in range(3))
+    none = np.zeros(hits.depth.shape, np.int32)
+    _combine(nothing, nothing, none, hits.depth, hits.owner, scene.object_flags, first, second, opaque)
+    return Layers(second, None, opaque, hits)
+
+
+@njit(parallel=True)
+def _combine(
+    alpha: Any,
+    depth: Any,
+    owner: Any,
+    mesh_depth: Any,
+    mesh_owner: Any,
+    object_flags: Any,
+    first: Any,
+    second: Any,
+    opaque: Any,
+) -> None:
+    zero, one = np.float32(0.0), np.float32(1.0)
+    rows, columns, aa = alpha.shape
+    for y in prange(rows):
+        for x in range(columns):
+            for k in range(aa):
+                a = alpha[y, x, k]
+                m = mesh_owner[y, x, k]
+                if a > zero and m >= 0:
+                    if mesh_depth[y, x, k] < depth[y, x, k]:
+                        a = zero
+                    elif one - a < _LEAST:
+                        a, m = one, -1
+                b = one - a if m >= 0 else zero
+                hidden = a + b
+                if a > zero:
+                    flags = object_flags[owner[y, x, k]]
+                    if flags & HOLDOUT:
+                        a = zero
+                    elif flags & CATCHER:
+                        hidden -= a
+                if b > zero:
+                    flags = object_flags[m]
+                    if flags & HOLDOUT:
+                        b = zero
+                    elif flags & CATCHER:
+                        hidden -= b
+                first[y, x, k], second[y, x, k], opaque[y, x, k] = a, b, hidden

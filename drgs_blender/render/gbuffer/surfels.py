@@ -1,0 +1,298 @@
+"""From blended surfels to shading points whose secondary rays are safe.
+
+Rays that light a surfel meet the mesh, and the mesh is not where the surfels are: a ray that starts at a surfel below
+the mesh is blocked by its own surface, one that starts above misses contact shadows. Every point is therefore moved to
+the mesh point that belongs to it:
+
+1. along the camera ray, within a window of depths around the surfel: the first face that is turned as the surfel is,
+   and to the viewer, unless the surfel is clearly seen from behind;
+2. else the first face along it that is turned to the viewer: the surfel overhangs a fold, and what is seen beyond the
+   fold is lit as the face there, with that face's normal;
+3. else (the surfel overhangs the mesh's silhouette) within the window along its normal, inwards, then outwards;
+4. else the nearest face along the camera ray within the window, whichever way it is turned;
+5. else (no mesh near) the point stays where it is, lifted by the window along its normal.
+
+Where light meets the surfels themselves, points stay where they are, and say which surfels are their own.
+
+A surfel's normal that is turned away from its face by more than 60 degrees would lose most of the light between both;
+the face's own is used then.
+
+The window is `WINDOW_SCALES` standard deviations of the surfels or `WINDOW_EDGES` mean edge lengths of the object's
+mesh, whichever is larger. The seen position and depth stay those of the surfels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from ...compute.jit import get_num_threads, njit, prange
+from ...core.frame import Camera
+from ..camera import WIDTH, sample_ray
+from ..points import SECOND
+from ..scene.interaction import nearest
+from ..scene.ray_masks import SURFELS
+from ..scene.trace_scene import TraceScene
+from ..surfels.raster import SurfelSamples, rasterise
+from ..surfels.splats import SIZE, Splats
+from .camera_hits import MeshHits, shade_mesh, trace_camera
+from .gbuffer import GBuffer, compact, face_viewer
+from .layers import combine
+
+Array = np.ndarray
+
+WINDOW_SCALES = 4.0
+WINDOW_EDGES = 2.0
+#: A surfel off the mesh's silhouette counts as seen from behind only when this cosine says so clearly.
+RIM = 0.3
+#: Cosine between a surfel's normal and a face's from which they are turned alike.
+ALIKE = 0.5
+
+#: Points of a block.
+_BLOCK = 256
+
+# How a surfel's mesh point was found.
+NOWHERE, ALONG_VIEW, ALONG_NORMAL, ANY_SIDE, FACING = 0, 1, 2, 3, 4
+
+
+def snap_windows(scene: TraceScene, object_count: int) -> Array:
+    """(max(object_count, 1),) float32 metres: `WINDOW_EDGES` times the mean edge length of each object's mesh."""
+    total, count = np.zeros((2, max(object_count, 1)))
+    _edge_lengths(scene.vertices, scene.faces, scene.face_object, total, count)
+    return (WINDOW_EDGES * total / np.maximum(count, 1)).astype(np.float32)
+
+
+def primary_surfels(
+    splats: Splats,
+    scene: TraceScene,
+    windows: Array,
+    camera: Camera,
+    y0: int,
+    y1: int,
+    tied: bool = True,
+    rasterise: Callable[[Splats, int, int], SurfelSamples] = rasterise,
+    tie: Callable[..., None] | None = None,
+    trace: Callable[..., MeshHits] = trace_camera,
+    shade: Callable[..., None] = shade_mesh,
+) -> GBuffer:
+    """Blend the surfels of the rows ``y0 .. y1`` (full-picture pixels) and tie them to the mesh.
+
+    Parameters
+    ----------
+    splats : `prepare` of this frame
+    windows : `snap_windows` of this frame
+    tied : False: rays meet surfels, and nothing is tied
+    rasterise, tie : who blends the surfels, and who ties their points; None: this processor
+    trace, shade : as of `primary_mesh`, for ordinary meshes next to the surfels
+    """
+    samples = rasterise(splats, y0, y1)
+    layers = combine(samples, scene, splats.parameters, camera.window[0], y0, trace)
+    buffer = compact(layers.first, splats.parameters, camera.window[0], y0, layers.second)
+    buffer.alpha = layers.opaque
+    points = buffer.points
+    (tie or tie_to_mesh)(
+        scene,
+        (tied, scene.vertex_faces > 0),
+        (splats.parameters, windows, camera.window[0], y0),
+        (samples.depth, samples.surface, samples.object_index),
+        (points.pixel, points.sample, points.flags),
+        (points.origin, points.normal, points.geometric_normal, points.view),
+        (points.albedo, points.roughness, points.metallic),
+        (buffer.position, buffer.depth, buffer.object_index, buffer.face, buffer.place, buffer.barycentric),
+    )
+    if not tied:
+        row, column = np.divmod(points.pixel, splats.parameters[WIDTH].astype(np.int64))
+        points.own = np.where(points.flags & SECOND, -1, buffer.object_index).astype(np.int32)
+        points.size = samples.surface[row - y0, column - camera.window[0], points.sample, SIZE]
+    if layers.hits is not None:
+        shade(scene, layers.hits, splats.parameters, camera.window[0], buffer, SECOND)
+    buffer.mark_catchers(scene.object_flags)
+    return buffer
+
+
+@njit
+def _edge_lengths(vertices: Any, faces: Any, face_object: Any, total: Any, count: Any) -> None:
+    """Sum and number of edge lengths an object, from at most about 100,000 evenly chosen faces."""
+    step = max(1, len(faces) // 100_000)
+    for f in range(0, len(faces), step):
+        owner = face_object[f]
+        for k in range(3):
+            a, b = faces[f, k], faces[f, (k + 1) % 3]
+            x = vertices[b, 0] - vertices[a, 0]
+            y = vertices[b, 1] - vertices[a, 1]
+            z = vertices[b, 2] - vertices[a, 2]
+            if owner < len(total):
+                total[owner] += np.sqrt(x * x + y * y + z * z)
+                count[owner] += 1
+
+
+@njit(inline="always")
+def _shoot(tracer: Any, x: Any, y: Any, z: Any, dx: Any, dy: Any, dz: Any, reach: Any) -> Any:
+    """Closest hit on the segment from (x, y, z) along (dx, dy, dz): its parameter, unit face normal, face and u, v.
+
+    The face is -1 when nothing is hit.
+
+    Short segments that start near the surface keep float32 exact where a ray from a distant camera would not.
+    """
+    t, face, _, u, v, gx, gy, gz = nearest(
+        tracer, np.float32(x), np.float32(y), np.float32(z), np.float32(dx), np.float32(dy), np.float32(dz),
+        np.float32(0.0), np.float32(reach), np.int32(SURFELS),
+    )  # fmt: skip
+    length = np.sqrt(np.float64(gx) * gx + np.float64(gy) * gy + np.float64(gz) * gz)
+    if face < 0 or length == 0.0:
+        return np.float64(0.0), 0.0, 0.0, 0.0, np.int32(-1), u, v
+    return np.float64(t), gx / length, gy / length, gz / length, face, u, v
+
+
+@njit(inline="always")
+def _find(
+    tracer: Any,
+    x: Any,
+    y: Any,
+    z: Any,
+    nx: Any,
+    ny: Any,
+    nz: Any,
+    vx: Any,
+    vy: Any,
+    vz: Any,
+    ahead: Any,
+    window: Any,
+) -> Any:
+    """Mesh point of the surfel point (x, y, z) with normal n, seen from v: how it was found, point, face normal, and
+    the face with u and v (-1: none)."""
+    how = NOWHERE
+    face, a, b = np.int32(-1), np.float32(0.0), np.float32(0.0)
+    hx, hy, hz, gx, gy, gz = x, y, z, nx, ny, nz
+    turned = nx * vx + ny * vy + nz * vz < -RIM
+    left = ahead + window
+    sx, sy, sz = x + ahead * vx, y + ahead * vy, z + ahead * vz
+    for _ in range(3):
+        t, fx, fy, fz, hit, u, v = _shoot(tracer, sx, sy, sz, -vx, -vy, -vz, left)
+        if hit < 0:
+            break
+        sx, sy, sz = sx - t * vx, sy - t * vy, sz - t * vz
+        facing = fx * vx + fy * vy + fz * vz > 0.0
+        agrees = fx * nx + fy * ny + fz * nz > ALIKE and (facing or turned)
+        if agrees or how == NOWHERE or (facing and how == ANY_SIDE):
+            how = ALONG_VIEW if agrees else FACING if facing else ANY_SIDE
+            hx, hy, hz, gx, gy, gz = sx, sy, sz, fx, fy, fz
+            face, a, b = hit, u, v
+        past = 1e-3 * window
+        left -= t + past
+        if agrees or left <= 0.0:
+            break
+        sx, sy, sz = sx - past * vx, sy - past * vy, sz - past * vz
+    if how != ALONG_VIEW and how != FACING:
+        for turn in range(2):
+            side = 2.0 * turn - 1.0
+            t, fx, fy, fz, hit, u, v = _shoot(tracer, x, y, z, side * nx, side * ny, side * nz, window)
+            if hit >= 0 and fx * nx + fy * ny + fz * nz > ALIKE:
+                t *= side
+                return ALONG_NORMAL, x + t * nx, y + t * ny, z + t * nz, fx, fy, fz, hit, u, v
+    return how, hx, hy, hz, gx, gy, gz, face, a, b
+
+
+@njit
+def attach_points(
+    lane: Any, lanes: Any, room: Any, tracer: Any, rules: Any, view_of: Any, samples: Any, keys: Any, out: Any
+) -> None:
+    """Fill every so-manyth (`lanes`) block of shading points, from the `lane`-th on; see the module's head.
+
+    Parameters
+    ----------
+    room : not used
+    rules, view_of, samples, keys, out : as of `tie_to_mesh`; the last is its three groups of arrays to be filled
+    """
+    tied, any_mesh = rules
+    p, windows, x0, y0 = view_of
+    sample_depth, surface, sample_object = samples
+    pixel, sample, flags = keys
+    frames, materials, seen = out
+    origin, normal, geometric, view = frames
+    albedo, roughness, metallic = materials
+    position, depth, owner, tied_face, tied_place, barycentric = seen
+    width = np.int64(p[WIDTH])
+    for block in range(lane, (len(pixel) + _BLOCK - 1) // _BLOCK, lanes):
+        for n in range(block * _BLOCK, min((block + 1) * _BLOCK, len(pixel))):
+            if flags[n] & SECOND:
+                continue
+            row, column, k = pixel[n] // width - y0, pixel[n] % width - x0, sample[n]
+            s = np.float64(sample_depth[row, column, k])
+            who = sample_object[row, column, k]
+            ox, oy, oz, dx, dy, dz = sample_ray(p, pixel[n], sample[n])
+            x, y, z = ox + s * dx, oy + s * dy, oz + s * dz
+            slope = np.sqrt(dx * dx + dy * dy + dz * dz)
+            vx, vy, vz = -dx / slope, -dy / slope, -dz / slope
+            nx, ny, nz = (
+                np.float64(surface[row, column, k, 0]),
+                np.float64(surface[row, column, k, 1]),
+                np.float64(surface[row, column, k, 2]),
+            )
+            if nx * nx + ny * ny + nz * nz < 0.5:
+                nx, ny, nz = vx, vy, vz
+            window = np.float64(WINDOW_SCALES) * surface[row, column, k, 8]
+            if who < len(windows):
+                window = max(window, np.float64(windows[who]))
+            # The window starts in front of the surfel, yet not behind the camera.
+            ahead = min(window, 0.999 * s * slope)
+            how = NOWHERE
+            hx, hy, hz, gx, gy, gz = x, y, z, nx, ny, nz
+            face, u, v = np.int32(-1), np.float32(0.0), np.float32(0.0)
+            if any_mesh:
+                how, hx, hy, hz, gx, gy, gz, face, u, v = _find(
+                    tracer, x, y, z, nx, ny, nz, vx, vy, vz, ahead, window
+                )  # fmt: skip
+            if not tied:  # the face says how the point moves, nothing else
+                how, hx, hy, hz, gx, gy, gz = NOWHERE, x, y, z, nx, ny, nz
+            # A face met by the camera ray shows which side is seen; else the surfel tells, save at its rim.
+            if how in (ALONG_VIEW, ANY_SIDE, FACING):
+                behind = gx * vx + gy * vy + gz * vz < 0.0
+            else:
+                # Without a mesh it may be a leaf, of which the back is as good as the front.
+                closed = who < len(windows) and windows[who] > 0.0
+                behind = nx * vx + ny * vy + nz * vz < (-RIM if closed else 0.0)
+            if behind:
+                gx, gy, gz = -gx, -gy, -gz
+            gx, gy, gz = face_viewer(gx, gy, gz, gx, gy, gz, vx, vy, vz)
+            nx, ny, nz = face_viewer(nx, ny, nz, gx, gy, gz, vx, vy, vz)
+            if nx * gx + ny * gy + nz * gz < ALIKE:
+                nx, ny, nz = gx, gy, gz
+            if tied and how == NOWHERE:
+                hx, hy, hz = x + window * gx, y + window * gy, z + window * gz
+            origin[n, 0], origin[n, 1], origin[n, 2] = hx, hy, hz
+            normal[n, 0], normal[n, 1], normal[n, 2] = nx, ny, nz
+            geometric[n, 0], geometric[n, 1], geometric[n, 2] = gx, gy, gz
+            view[n, 0], view[n, 1], view[n, 2] = vx, vy, vz
+            albedo[n, 0], albedo[n, 1], albedo[n, 2] = (
+                surface[row, column, k, 3],
+                surface[row, column, k, 4],
+                surface[row, column, k, 5],
+            )
+            roughness[n], metallic[n] = surface[row, column, k, 6], surface[row, column, k, 7]
+            position[n, 0], position[n, 1], position[n, 2] = x, y, z
+            depth[n], owner[n] = s, who
+            tied_face[n], tied_place[n], barycentric[n, 0], barycentric[n, 1] = face, -1, u, v
+
+
+@njit(parallel=True)
+def _attach(tracer: Any, rules: Any, view_of: Any, samples: Any, keys: Any, frames: Any, materials: Any, seen: Any,
+            lanes: Any) -> None:  # fmt: skip
+    for lane in prange(lanes):
+        attach_points(np.int64(lane), lanes, None, tracer, rules, view_of, samples, keys, (frames, materials, seen))
+
+
+def tie_to_mesh(scene: TraceScene, *arguments: Any) -> None:
+    """Tie shading points to the mesh.
+
+    Parameters
+    ----------
+    scene
+    arguments : tuples: whether points are tied at all, and whether there is a mesh; parameters of the camera, windows,
+        and the first column and row of the samples; depth, surface and object of these; pixel, sample and flags of the
+        points; and the arrays to be filled: origin, normal, geometric normal and view; albedo, roughness and metallic;
+        position, depth, object, face, place and barycentric coordinates
+    """
+    _attach(scene.tracer, *arguments, 8 * get_num_threads())

@@ -1,0 +1,87 @@
+"""Lamps that the camera sees.
+
+Blender's lights are seen only where their ray visibility says so, and between the camera's clip distances (suns: at
+any). They hide nothing: a ray gathers the light of each lamp it meets before a surface, and goes on. Where a sub-pixel
+sample has several surfaces, or a surface that is not opaque, each part of it sees the lamps before its own depth. Lamps
+in front of a holdout are hidden by it.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ...compute.jit import njit, prange
+from ..camera import CLIP_END, CLIP_START, WIDTH, sample_ray
+from ..lights.light_shapes import CAMERA
+from ..lights.lights import Lamps, lamps_along, suns_along
+from ..points import CATCHER
+from ..sampling import ONE, ZERO, F
+from .gbuffer import GBuffer
+
+Array = np.ndarray
+
+_FAR = F(np.inf)
+
+
+def seen_lamps(lamps: Lamps, parameters: Array, x0: int, buffer: GBuffer) -> Array:
+    """Radiance of lamps straight to the camera, mean over each pixel's samples.
+
+    Parameters
+    ----------
+    parameters : `camera.camera_parameters`
+    x0 : first column of the camera's window
+
+    Returns
+    -------
+    (rows, width, 3) float32 linear Rec.709, of the buffer's rows
+    """
+    points = buffer.points
+    y0, y1 = buffer.rows
+    width = int(parameters[WIDTH])
+    start = np.searchsorted(points.pixel, np.arange(y0, y1 + 1, dtype=np.int64) * width)
+    out = np.zeros((*buffer.alpha.shape[:2], 3), np.float32)
+    _look(
+        parameters, x0, y0, start, buffer.alpha, points.pixel, points.sample, points.weight, points.flags, buffer.depth,
+        lamps.tables, out,
+    )  # fmt: skip
+    return out
+
+
+@njit(parallel=True)
+def _look(
+    p: Any, x0: Any, y0: Any, start: Any, alpha: Any, pixel: Any, sample: Any, weight: Any, flags: Any, depth: Any,
+    lamps: Any, out: Any,
+) -> None:  # fmt: skip
+    width, near = np.int64(p[WIDTH]), p[CLIP_START]
+    rows, columns, aa = alpha.shape
+    for y in prange(rows):
+        n = start[y]
+        for x in range(columns):
+            place = (y0 + y) * width + x0 + x
+            for k in range(aa):
+                first = n
+                while n < start[y + 1] and pixel[n] == place and sample[n] == k:
+                    n += 1
+                ox, oy, oz, dx, dy, dz = sample_ray(p, place, k)
+                length = np.sqrt(dx * dx + dy * dy + dz * dz)
+                # As in Cycles, rays start at the clip distance: soft lamps face that place.
+                origin = F(ox + near * dx), F(oy + near * dy), F(oz + near * dz)
+                direction = F(dx / length), F(dy / length), F(dz / length)
+                end = F((p[CLIP_END] - near) * length)
+                r, g, b = lamps_along(*origin, *direction, end, ONE, ZERO, CAMERA, *lamps)
+                s, t, u = suns_along(*origin, *direction, _FAR, ONE, ZERO, CAMERA, *lamps)
+                r, g, b = r + s, g + t, b + u
+                if not r + g + b > ZERO:
+                    continue
+                free = (ONE - alpha[y, x, k]) / F(aa)
+                red, green, blue = free * r, free * g, free * b
+                for i in range(first, n):
+                    if flags[i] & CATCHER:
+                        continue
+                    r, g, b = lamps_along(*origin, *direction, F((depth[i] - near) * length), ONE, ZERO, CAMERA, *lamps)
+                    red, green, blue = red + weight[i] * r, green + weight[i] * g, blue + weight[i] * b
+                out[y, x, 0] += red
+                out[y, x, 1] += green
+                out[y, x, 2] += blue

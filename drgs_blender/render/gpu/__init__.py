@@ -1,0 +1,1 @@
+"""The renderer's kernels on a graphics card, by Warp; on its CPU device for tests."""

@@ -1,0 +1,29 @@
+"""Shading points tied to the mesh on a device: `primary.primary_surfels` with Warp's rays, from the same source."""
+
+from __future__ import annotations
+
+from types import ModuleType
+from typing import Any
+
+from ...compute.warp.kernels import Launcher, Work
+from ..gbuffer import surfels
+from ..scene.trace_scene import TraceScene
+from .natives import NATIVES
+from .scene_mirror import Mirror
+
+
+def _constants(module: ModuleType, name: str, value: Any) -> Any:
+    """One point a block."""
+    return 1 if module is surfels and name == "_BLOCK" else value
+
+
+ATTACH = Work(surfels.attach_points, (), NATIVES, _constants)
+
+
+def tie(launcher: Launcher, mirror: Mirror, scene: TraceScene, *arguments: Any) -> None:
+    """`primary_surfels.tie_to_mesh` on a device."""
+    *inwards, frames, materials, seen = arguments
+    with launcher.failures("copying the scene"):
+        tracer = mirror.tracer(scene)
+    groups = frames, materials, seen
+    launcher.launch(ATTACH, len(frames[0]), (tracer, *inwards), groups)

@@ -1,0 +1,88 @@
+"""What the camera sees of meshes, on a device: `primary.camera_hits` with Warp's rays, from the same source."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from ...compute.warp.kernels import Launcher, Work
+from ..gbuffer import camera_hits
+from ..gbuffer.camera_hits import MeshHits, arrays_of
+from ..gbuffer.gbuffer import GBuffer
+from ..scene.trace_scene import TraceScene
+from .natives import NATIVES
+from .scene_mirror import Mirror
+
+Array = np.ndarray
+
+
+def _constants(module: ModuleType, name: str, value: Any) -> Any:
+    """One sample or point a block."""
+    return 1 if module is camera_hits and name == "_BLOCK" else value
+
+
+TRACE = Work(camera_hits.trace_samples, (), NATIVES, _constants)
+SHADE = Work(camera_hits.shade_hits, (), NATIVES, _constants)
+
+
+@dataclass(slots=True)
+class HitsThere(MeshHits):
+    """`MeshHits` of which depth and owner have come back from a device; faces, places and where stay there.
+
+    Attributes
+    ----------
+    there : all arrays, on the device
+    anew : traces them on this processor
+    """
+
+    there: tuple[Any, ...]
+    anew: Callable[[], MeshHits]
+
+    def here(self) -> MeshHits:
+        """The same in this processor's memory; traced anew where they are lost with the device."""
+        try:
+            return MeshHits(*(array.numpy() for array in self.there))
+        except Exception:  # whatever Warp raises for a device that is no more
+            return self.anew()
+
+
+def trace(
+    launcher: Launcher, mirror: Mirror, here: Callable[[], MeshHits], scene: TraceScene, parameters: Array, x0: int,
+    y0: int, shape: tuple[int, ...], mask: int,
+) -> MeshHits:  # fmt: skip
+    """`primary.camera_hits.trace_camera` on a device; `here` does it on this processor."""
+    if not mask:
+        return here()
+    with launcher.failures("copying the scene"):
+        tracer, owners, zeros = mirror.tracer(scene), mirror.owners(scene), launcher.zeros
+        depth, where = zeros(shape), zeros((*shape, 5))
+        owner, face, place = (zeros(shape, "int32") for _ in range(3))
+    there = depth, owner, face, place, where
+    arguments = tracer, (parameters, x0, y0), np.int32(mask), owners
+    launcher.launch(TRACE, int(np.prod(shape)), arguments, there)
+    with launcher.failures("tracing the camera's rays"):
+        return HitsThere(depth.numpy(), owner.numpy(), face, place, where, there, here)
+
+
+def shade(
+    launcher: Launcher, mirror: Mirror, scene: TraceScene, hits: HitsThere, parameters: Array, x0: int,
+    buffer: GBuffer, layer: int,
+) -> None:  # fmt: skip
+    """`primary.camera_hits.shade_mesh` on a device."""
+    keys, out = arrays_of(buffer)
+    chosen = np.flatnonzero(keys[2] & layer == layer)
+    if not len(chosen):
+        return
+    with launcher.failures("copying the scene"):
+        geometry, moving = mirror.geometry(scene), mirror.moving(scene)
+    # Those alone: what is written to comes back as a whole.
+    found = tuple(tuple(np.empty((len(chosen), *array.shape[1:]), array.dtype) for array in group) for group in out)
+    arguments = geometry, moving, (parameters, x0, buffer.rows[0]), layer, hits.there
+    launcher.launch(SHADE, len(chosen), (*arguments, tuple(key[chosen] for key in keys)), found)
+    for group, values in zip(out, found):
+        for array, value in zip(group, values):
+            array[chosen] = value

@@ -1,0 +1,55 @@
+"""The integrator on a device: `shade.integrate` with Warp's rays, one lane a point, from the same source."""
+
+from __future__ import annotations
+
+from types import ModuleType
+from typing import Any
+
+from ...compute.warp.kernels import Launcher, Room, Work
+from ..integrator import direct, indirect, integrate, sample_allocation, wavefront
+from ..lights.environment import EnvironmentLight
+from ..lights.lights import Lamps
+from ..scene.trace_scene import TraceScene
+from .natives import NATIVES
+from .scene_mirror import Mirror
+
+
+def _constants(module: ModuleType, name: str, value: Any) -> Any:
+    """One ray a batch, one point a block, one lane a packet: a thread needs no more."""
+    if name in ("BATCH", "_BLOCK") and module in (integrate, direct):
+        return 1
+    if module is wavefront and type(value) is int and name.strip("_").isupper():
+        return value // wavefront.LANES
+    return value
+
+
+_BATCH = (
+    Room("float32", (wavefront._FLOATS // wavefront.LANES,)),
+    Room("uint32", (wavefront._INTS // wavefront.LANES,)),
+)
+#: As `integrate._room` makes it, for batches and blocks of one.
+_ROOMS = (
+    _BATCH,
+    _BATCH,
+    Room("float32", (1, indirect.FOUND)),
+    Room("float32", (1, direct.KINDS * direct.KIND)),
+    Room("float32", (1, sample_allocation.HEAD)),
+    Room("uint32", (1,)),
+    Room("int64", (1,)),
+)
+SHADE = Work(integrate.shade_points, _ROOMS, NATIVES, _constants)
+
+
+class DeviceKernel(integrate.Kernel):
+    """`shade.integrate.Kernel` on a device."""
+
+    def __init__(self, launcher: Launcher, mirror: Mirror) -> None:
+        self._launcher, self._mirror = launcher, mirror
+
+    def tables(self, scene: TraceScene, light: EnvironmentLight, lamps: Lamps) -> tuple[Any, Any, Any, Any]:
+        with self._launcher.failures("copying the scene"):
+            return self._mirror.tables(scene, light, lamps)
+
+    def shade(self, *arguments: Any) -> None:
+        *inwards, out = arguments
+        self._launcher.launch(SHADE, len(out[0]), inwards, out)

@@ -1,0 +1,227 @@
+"""Surfels blended on a device, one lane a sample, exactly as `surfels.raster` blends them.
+
+The functions here are translated and never run as they stand. A lane gathers the nearest contributions of its sample in
+a list that is kept in order, and blends them; while more were met than the list holds, and light still passes, it
+gathers those behind the last.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ...compute.warp.kernels import Launcher, Room, Work
+from ..camera import AA, CLIP_END, CLIP_START, FX, FY, ORTHOGRAPHIC, WIDTH, lattice, pixel_shift
+from ..sampling import ONE, ZERO, F
+from ..surfels.blending import GAP, MIN_TRANSMITTANCE
+from ..surfels.raster import MAX_ALPHA, SurfelSamples, gaussian
+from ..surfels.splats import (
+    ALBEDO,
+    CUT,
+    DIM,
+    LOW,
+    METALLIC,
+    NORMAL,
+    OPACITY,
+    ROUGHNESS,
+    RX,
+    RY,
+    SIZE,
+    TILE,
+    ZC,
+    A,
+    B,
+    D,
+    N,
+    Splats,
+)
+
+#: Contributions that a lane gathers at once.
+MOST = 64
+#: Sums over a cluster of contributions: weight, and times that depth, normal, albedo, roughness, metallic and size; the
+#: weight of its heaviest one. Row 0 is the cluster at hand, row 1 the heaviest so far.
+_WEIGHT, _DEPTH, _NORMAL, _COLOUR, _ROUGHNESS, _METALLIC, _SIZE, _HEAVIEST, _SUMS = 0, 1, 2, 5, 8, 9, 10, 11, 12
+
+
+def meet(screen: Any, i: Any, opacity: Any, near: Any, far: Any, x: Any, y: Any) -> Any:
+    """Strength (0 where it has no part) and depth of splat i at a place on the screen, as `raster._meet` has it."""
+    big = F(1e30)
+    ex, ey = x - screen[i, RX], y - screen[i, RY]
+    inverse = ONE / (screen[i, N] + screen[i, N + 1] * ex + screen[i, N + 2] * ey)
+    u = (screen[i, A] + screen[i, A + 1] * ex + screen[i, A + 2] * ey) * inverse
+    v = (screen[i, B] + screen[i, B + 1] * ex + screen[i, B + 2] * ey) * inverse
+    z = (screen[i, D] + screen[i, D + 1] * ex + screen[i, D + 2] * ey) * inverse
+    exact = u * u + v * v if z > near and z < far else big
+    filtered = screen[i, LOW] * (ex * ex + ey * ey) + screen[i, DIM]
+    q = exact if exact <= filtered else filtered
+    depth = z if exact <= filtered else screen[i, ZC]
+    if not (q < screen[i, CUT] and depth > near and depth < far):
+        return ZERO, depth
+    return min(opacity * gaussian(q), F(MAX_ALPHA)), depth
+
+
+def insert(lists_z: Any, lists_a: Any, lists_i: Any, n: Any, z: Any, alpha: Any, splat: Any) -> None:
+    """Put a contribution behind those of n that are not farther; if the list is full, its last one goes."""
+    k = min(n, MOST - 1)
+    while k > 0 and lists_z[k - 1] > z:
+        lists_z[k], lists_a[k], lists_i[k] = lists_z[k - 1], lists_a[k - 1], lists_i[k - 1]
+        k = k - 1
+    lists_z[k], lists_a[k], lists_i[k] = z, alpha, np.int32(splat)
+
+
+def settle(sums: Any, owner: Any) -> None:
+    """The cluster at hand has ended: keep it if it is the heaviest, and begin another."""
+    if sums[0, _WEIGHT] > sums[1, _WEIGHT]:
+        owner[1] = owner[0]
+        for c in range(_SUMS):
+            sums[1, c] = sums[0, c]
+    for c in range(_SUMS):
+        sums[0, c] = ZERO
+
+
+def add(sums: Any, owner: Any, surface: Any, i: Any, z: Any, w: Any) -> None:
+    """Take a contribution of weight w into the cluster at hand, as `blending.weigh` and `blending.mean` do."""
+    nx, ny, nz = surface[i, NORMAL], surface[i, NORMAL + 1], surface[i, NORMAL + 2]
+    # Both sides of a thin sheet may lie in one cluster: normals agree with the nearest one.
+    along = sums[0, _NORMAL] * nx + sums[0, _NORMAL + 1] * ny + sums[0, _NORMAL + 2] * nz
+    signed = -w if along < ZERO else w
+    sums[0, _WEIGHT] += w
+    sums[0, _DEPTH] += w * z
+    sums[0, _NORMAL] += signed * nx
+    sums[0, _NORMAL + 1] += signed * ny
+    sums[0, _NORMAL + 2] += signed * nz
+    for c in range(3):
+        sums[0, _COLOUR + c] += w * surface[i, ALBEDO + c]
+    sums[0, _ROUGHNESS] += w * surface[i, ROUGHNESS]
+    sums[0, _METALLIC] += w * surface[i, METALLIC]
+    sums[0, _SIZE] += w * surface[i, SIZE]
+    if w > sums[0, _HEAVIEST]:
+        sums[0, _HEAVIEST], owner[0] = w, np.int32(i)
+
+
+def gather(
+    lists_z: Any, lists_a: Any, lists_i: Any, screen: Any, surface: Any, box: Any, nearest: Any, tile_list: Any,
+    first: Any, last: Any, x: Any, y: Any, px: Any, py: Any, near: Any, far: Any, t: Any, after: Any, after_splat: Any,
+) -> Any:  # fmt: skip
+    """List the nearest contributions beyond a depth (and splat); how many there are, those left out included."""
+    stop = F(MIN_TRANSMITTANCE)
+    n, left, farthest = 0, t, F(-1e30)
+    for entry in range(first, last):
+        i = np.int64(tile_list[entry])
+        if x < box[i, 0] or x >= box[i, 2] or y < box[i, 1] or y >= box[i, 3]:
+            continue
+        if left < stop and nearest[i] >= farthest:
+            continue
+        alpha, z = meet(screen, i, surface[i, OPACITY], near, far, px, py)
+        if not alpha > ZERO or (left < stop and not z < farthest):
+            continue
+        if z < after or (z == after and i <= after_splat):
+            continue
+        if n < MOST or z < lists_z[MOST - 1]:
+            insert(lists_z, lists_a, lists_i, n, z, alpha, i)
+        n += 1
+        left = left * (ONE - alpha)
+        farthest = max(farthest, z)
+    return n
+
+
+def blend_samples(
+    lane: Any, lanes: Any, room: Any, screen: Any, surface: Any, box: Any, nearest: Any, objects: Any,
+    tile_start: Any, tile_list: Any, p: Any, x0: Any, x1: Any, tile_y0: Any, y0: Any, y1: Any, aa: Any, out: Any,
+) -> None:  # fmt: skip
+    """Blend the samples of the rows y0 .. y1, as `raster._blend` does."""
+    lists_z, lists_a, lists_i, sums, owner = room
+    out_alpha, out_depth, out_surface, out_object = out
+    tile_x0 = x0 // TILE
+    tiles_x = (x1 - 1) // TILE - tile_x0 + 1
+    columns = x1 - x0
+    width = np.int64(p[WIDTH])
+    near, far = F(p[CLIP_START]), F(p[CLIP_END])
+    slope = F(1.0 / min(p[FX], p[FY]))
+    pixel = ZERO if p[ORTHOGRAPHIC] != 0.0 else slope
+    pixel_base = slope if p[ORTHOGRAPHIC] != 0.0 else ZERO
+    stop = F(MIN_TRANSMITTANCE)
+    for sample in range(lane, (y1 - y0) * columns * aa, lanes):
+        number = sample % aa
+        column, row = sample // aa % columns, sample // (aa * columns)
+        x, y = x0 + column, y0 + row
+        tile = (y // TILE - tile_y0) * tiles_x + x // TILE - tile_x0
+        shift_x, shift_y = pixel_shift(p, y * width + x)
+        jx, jy = lattice(shift_x, shift_y, number, p)
+        for c in range(_SUMS):
+            sums[0, c], sums[1, c] = ZERO, ZERO
+        t, before, before_size = ONE, ZERO, F(1e30)
+        after, after_splat = F(-1e30), np.int64(-1)
+        more: Any = True
+        while more:
+            n = gather(
+                lists_z, lists_a, lists_i, screen, surface, box, nearest, tile_list, tile_start[tile],
+                tile_start[tile + 1], x, y, F(x + jx), F(y + jy), near, far, t, after, after_splat,
+            )  # fmt: skip
+            k = 0
+            while k < min(n, MOST) and t >= stop:
+                z, alpha, i = lists_z[k], lists_a[k], np.int64(lists_i[k])
+                share = t * alpha
+                t = t * (ONE - alpha)
+                size = max(surface[i, SIZE], pixel_base + pixel * z)
+                if z - before > F(0.5 * GAP) * (size + before_size):
+                    settle(sums, owner)
+                add(sums, owner, surface, i, z, share)
+                before, before_size, after, after_splat = z, size, z, i
+                k += 1
+            more = n > MOST and t >= stop
+        settle(sums, owner)
+        total = sums[1, _WEIGHT]
+        if not total > ZERO:
+            continue
+        g = ONE / total
+        nx, ny, nz = sums[1, _NORMAL], sums[1, _NORMAL + 1], sums[1, _NORMAL + 2]
+        length = F(math.sqrt(nx * nx + ny * ny + nz * nz))
+        f = ONE / length if length > F(1e-6) * total else ZERO
+        out_alpha[row, column, number], out_depth[row, column, number] = ONE - t, sums[1, _DEPTH] * g
+        for c in range(3):
+            out_surface[row, column, number, c] = f * sums[1, _NORMAL + c]
+        for c in range(6):
+            out_surface[row, column, number, 3 + c] = sums[1, _COLOUR + c] * g
+        out_object[row, column, number] = objects[owner[1]]
+
+
+_ROOMS = (
+    Room("float32", (MOST,)),
+    Room("float32", (MOST,)),
+    Room("int32", (MOST,)),
+    Room("float32", (2, _SUMS)),
+    Room("int32", (2,)),
+)
+BLEND = Work(blend_samples, _ROOMS, {})
+
+
+@dataclass(slots=True)
+class SamplesThere(SurfelSamples):
+    """`SurfelSamples` that have come back from a device.
+
+    Attributes
+    ----------
+    there : depth, surface and object index, where they still are
+    """
+
+    there: tuple[Any, Any, Any]
+
+
+def rasterise(launcher: Launcher, splats: Splats, y0: int, y1: int) -> SamplesThere:
+    """`surfels.raster.rasterise` on a device; where ``alpha`` is 0 the other arrays are undefined."""
+    x0, top, x1, _ = splats.window
+    aa = int(splats.parameters[AA])
+    shape = y1 - y0, x1 - x0, aa
+    with launcher.failures("blending surfels"):
+        alpha, depth, surface = (launcher.zeros(size) for size in (shape, shape, (*shape, 9)))
+        owner = launcher.zeros(shape, "int32")
+    arrays = splats.screen, splats.surface, splats.box, splats.nearest, splats.object_index
+    arguments = *arrays, splats.tile_start, splats.tile_list, splats.parameters, x0, x1, top // TILE, y0, y1, aa
+    launcher.launch(BLEND, int(np.prod(shape)), arguments, (alpha, depth, surface, owner))
+    with launcher.failures("blending surfels"):
+        there = depth, surface, owner
+        return SamplesThere(alpha.numpy(), depth.numpy(), surface.numpy(), owner.numpy(), there)

@@ -1,0 +1,114 @@
+"""What a device knows of a scene: copies of the arrays behind every address, and Warp's trees."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from ...compute.warp.kernels import Launcher
+from ..lights.environment import EnvironmentLight, Sky
+from ..lights.lights import Lamps
+from ..memory import Place, address
+from ..scene.interaction import Geometry
+from ..scene.ray_masks import CAMERA, DIFFUSE, GLOSSY, ORDINARY, SHADOW, SURFELS, WITHOUT
+from ..scene.trace_scene import TraceScene
+from .bvhs import Trees
+from .natives import MeshTracer
+
+Array = np.ndarray
+
+_KINDS = DIFFUSE | GLOSSY | SHADOW
+#: Rays that are cast here.
+_RAYS = CAMERA | ORDINARY | _KINDS | _KINDS << WITHOUT | SURFELS
+
+
+class Mirror:
+    """Keeps what a device needs of the scene, the light and the lamps of one frame after another.
+
+    Parameters
+    ----------
+    launcher : of the device
+    """
+
+    def __init__(self, launcher: Launcher) -> None:
+        self._launcher = launcher
+        #: Of every table: what it was made of, the table, and the arrays that it refers to.
+        self._known: dict[str, tuple[tuple[Any, ...], Any, list[Any]]] = {}
+        self._trees: Trees | None = None
+
+    def tables(self, scene: TraceScene, light: EnvironmentLight, lamps: Lamps) -> tuple[Any, Any, Any, Any]:
+        """(tracer, geometry, sky, lamps) with the device's addresses; until what they are of changes."""
+        state = scene, scene.version
+        lights = self._table(
+            "lamps", (lamps, *state), lambda place: (*lamps.tables[:2], lamps.emitters.address_at(place))
+        )
+        return self.tracer(scene), self.geometry(scene), self.sky(light), lights
+
+    def sky(self, light: EnvironmentLight) -> Sky:
+        """The environment; until it is another one."""
+        # Its pictures are large, and stay; only how they are turned may have changed.
+        sky: Sky = self._table("sky", (light,), light.sky_at)
+        return sky._replace(**{name: value for name, value in light.sky._asdict().items() if len(name) == 2})
+
+    def geometry(self, scene: TraceScene) -> Geometry:
+        """What lies behind the faces; until the scene's next update."""
+        found: Geometry = self._table("geometry", (scene, scene.version), scene.geometry_at)
+        return found
+
+    def owners(self, scene: TraceScene) -> tuple[Any, Any]:
+        """Objects of the scene's faces and places, as arrays; until its next update."""
+        copy = self._launcher.array
+        found: tuple[Any, Any] = self._table(
+            "owners", (scene, scene.version), lambda place: (copy(scene.face_object), copy(scene.place_object))
+        )
+        return found
+
+    def moving(self, scene: TraceScene) -> tuple[Any, Any, Any]:
+        """The scene's vertices, faces and places; until its next update."""
+        self.tracer(scene)
+        assert self._trees is not None
+        return self._trees.moving
+
+    def tracer(self, scene: TraceScene) -> MeshTracer:
+        """How rays meet the scene; until its next update."""
+        found: MeshTracer = self._table("tracer", (scene, scene.version), lambda place: self._tracer(scene, place))
+        return found
+
+    def _table(self, name: str, made_of: tuple[Any, ...], make: Callable[[Place], Any]) -> Any:
+        """A table made anew where what it is made of is not the same as before."""
+        known = self._known.pop(name, None)
+        if known is None or any(a is not b for a, b in zip(known[0], made_of)):
+            del known  # gives the memory back before more is taken
+            kept: list[Any] = []
+            known = made_of, make(lambda array: self._place(array, kept)), kept
+        self._known[name] = known
+        return known[1]
+
+    def _place(self, array: Array, kept: list[Any]) -> int:
+        """Where the device finds a copy of an array."""
+        if not self._launcher.apart:
+            kept.append(array)
+            return address(array)
+        if not array.size:
+            return 0
+        copy = self._launcher.array(array.reshape(-1))  # as its own elements: Warp counts up to 2^31
+        kept.append(copy)
+        return int(copy.ptr)
+
+    def _tracer(self, scene: TraceScene, place: Place) -> MeshTracer:
+        rows, masks = scene.standing()
+        if not len(rows):
+            self._trees = None
+            return MeshTracer(0, 0, 0, 0)
+        # What stands in places may have come or gone, and what sees it changed, without another layout.
+        rays = masks & _RAYS
+        if self._trees is None or not self._trees.of(scene.layout, rows, rays):
+            self._trees = None  # gives the memory back before more is taken
+            self._trees = Trees(self._launcher, scene.layout, rows, rays)
+        trees, placed = self._trees, len(scene.places) > 0
+        corners = trees.follow(scene)
+        plain = len(trees.trees) == 1 and not placed
+        faces = 0 if plain else int(trees.rows.ptr)
+        return MeshTracer(place(trees.table), len(trees.trees), faces, int(corners.ptr) if placed else 0)

@@ -1,0 +1,163 @@
+"""Surfels projected, sorted and listed by tile on a device, where they stay: what `surfels.splats.prepare` makes, from
+the same source.
+
+The functions here are translated and never run as they stand.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ...compute.warp.kernels import Launcher, Work
+from ...compute.warp.posed_surfels import arrays_of
+from ...compute.warp.runtime import warp
+from ...compute.warp.search import first_of
+from ...core.asset.model import PosedSurfels
+from ...core.frame import Camera
+from ..surfels.splats import (
+    PLACED,
+    RECORD,
+    SHOWN,
+    SURFACE,
+    TILE,
+    ZC,
+    Splats,
+    depth_key,
+    pack_surface,
+    project_surfel,
+    tiles_of,
+)
+
+Array = np.ndarray
+
+#: Key of what is not seen: behind that of every depth.
+_CULLED = 0xFFFFFFFF
+#: Places in tiles that Warp's sort, which counts twice as many by 31 bits, can hold.
+_MOST = (1 << 30) - 1
+
+
+@dataclass(slots=True)
+class SplatsThere(Splats):
+    """`Splats` whose arrays are a device's, but for ``parameters``.
+
+    Attributes
+    ----------
+    here : the same on the processor, made when that is asked for
+    """
+
+    here: Callable[[], Splats]
+
+
+def project_surfels(lane: Any, lanes: Any, room: Any, placed: Any, p: Any, window: Any, out: Any) -> None:
+    """`splats._project`, and the depths of the centres."""
+    centre, tangent_u, tangent_v, opacity = placed
+    screen, box, nearest, depth = out
+    for i in range(lane, len(centre), lanes):
+        project_surfel(i, centre, tangent_u, tangent_v, opacity, p, window, screen, box, nearest)
+        depth[i] = screen[i, ZC]
+
+
+def key_depths(lane: Any, lanes: Any, room: Any, bits: Any, box: Any, out: Any) -> None:
+    """What surfels are sorted by: those that are culled go last."""
+    keys, order = out
+    for i in range(lane, len(box), lanes):
+        keys[i] = depth_key(bits[i]) if box[i, 2] > box[i, 0] else np.uint32(_CULLED)
+        order[i] = np.int32(i)
+
+
+def find_starts(lane: Any, lanes: Any, room: Any, keys: Any, count: Any, first: Any, out: Any) -> None:
+    """How many of `count` sorted keys are less than `first`, `first` + 1, ..."""
+    (start,) = out
+    for t in range(lane, len(start), lanes):
+        start[t] = first_of(keys, count, first + t)
+
+
+def gather_splats(lane: Any, lanes: Any, room: Any, order: Any, found: Any, shown: Any, owner: Any, out: Any) -> None:
+    """Records of surfels in order of depth, and the number of tiles of each."""
+    screen, box, nearest = found
+    out_screen, out_surface, out_box, out_nearest, out_owner, tiles = out
+    for k in range(lane, len(out_box), lanes):
+        i = np.int64(order[k])
+        for c in range(RECORD):
+            out_screen[k, c] = screen[i, c]
+        for c in range(4):
+            out_box[k, c] = box[i, c]
+        out_nearest[k], out_owner[k] = nearest[i], owner[i]
+        pack_surface(i, k, shown, out_surface)
+        x0, y0, x1, y1 = tiles_of(box, i)
+        tiles[k] = (x1 - x0) * (y1 - y0)
+
+
+def list_tiles(lane: Any, lanes: Any, room: Any, box: Any, ends: Any, grid: Any, out: Any) -> None:
+    """Every splat's tiles, splat by splat; `ends` are those of their rows."""
+    first_x, first_y, columns = grid
+    keys, splat = out
+    for k in range(lane, len(box), lanes):
+        x0, y0, x1, y1 = tiles_of(box, k)
+        row = ends[k] - (x1 - x0) * (y1 - y0)
+        for y in range(y0 - first_y, y1 - first_y):
+            for x in range(x0 - first_x, x1 - first_x):
+                keys[row], splat[row] = np.uint32(y * columns + x), np.int32(k)
+                row += 1
+
+
+PROJECT = Work(project_surfels, (), {})
+KEY = Work(key_depths, (), {})
+FIND = Work(find_starts, (), {})
+GATHER = Work(gather_splats, (), {})
+LIST = Work(list_tiles, (), {})
+
+
+def prepare(
+    launcher: Launcher, posed: PosedSurfels, camera: Camera, parameters: Array, here: Callable[[], Splats]
+) -> Splats:
+    """`surfels.splats.prepare` on a device; where no surfel is seen, there is nothing that could stay there.
+
+    Parameters
+    ----------
+    here : makes the same on the processor
+    """
+    n, zeros = len(posed), launcher.zeros
+    with launcher.failures("copying surfels"):
+        given = arrays_of(posed, launcher)
+        found = zeros((n, RECORD)), zeros((n, 4), "int32"), zeros((n,))
+        depth, keys, order = zeros((n,)), zeros((2 * n,), "uint32"), zeros((2 * n,), "int32")
+    placed, shown = (tuple(given[name] for name in names) for names in (PLACED, SHOWN))
+    launcher.launch(PROJECT, n, (placed, parameters, tuple(map(int, camera.window))), (*found, depth))
+    launcher.launch(KEY, n, (depth.view(warp().uint32), found[1]), (keys, order))
+    m = np.zeros(1, np.int64)
+    with launcher.failures("sorting surfels"):
+        warp().utils.radix_sort_pairs(keys, order, n)
+    launcher.launch(FIND, 1, (keys, n, _CULLED), (m,))
+    seen = int(m[0])
+    if not seen:
+        return here()
+    with launcher.failures("sorting surfels"):
+        made = zeros((seen, RECORD)), zeros((seen, SURFACE)), zeros((seen, 4), "int32"), zeros((seen,))
+        owner, tiles = zeros((seen,), "int32"), zeros((seen,), "int64")
+    launcher.launch(GATHER, seen, (order, found, shown, given["object_index"]), (*made, owner, tiles))
+    lists = _listed(launcher, made[2], tiles, camera.window)
+    return SplatsThere(*made, owner, *lists, camera.window, parameters, here)
+
+
+def _listed(launcher: Launcher, box: Any, tiles: Any, window: tuple[int, int, int, int]) -> tuple[Any, Any]:
+    """(tile_start, tile_list) of `Splats` from the boxes and how many tiles each lies in."""
+    x0, y0, x1, y1 = (window[0] // TILE, window[1] // TILE, (window[2] - 1) // TILE + 1, (window[3] - 1) // TILE + 1)
+    columns, rows = x1 - x0, y1 - y0
+    zeros, m = launcher.zeros, len(box)
+    with launcher.failures("listing surfels"):
+        start = zeros((columns * rows + 1,), "int64")
+        warp().utils.array_scan(tiles, tiles)
+        total = int(tiles[m - 1 :].numpy()[0])
+        if total > _MOST:
+            raise MemoryError(f"{total} places in tiles")
+        keys, splat = zeros((2 * total,), "uint32"), zeros((2 * total,), "int32")
+    launcher.launch(LIST, m, (box, tiles, (x0, y0, columns)), (keys, splat))
+    with launcher.failures("listing surfels"):
+        warp().utils.radix_sort_pairs(keys, splat, total, 0, (columns * rows).bit_length())
+    launcher.launch(FIND, columns * rows + 1, (keys, total, 0), (start,))
+    return start, splat[:total]

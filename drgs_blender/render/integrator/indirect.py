@@ -1,0 +1,196 @@
+"""Indirect light: what comes back along rays that hit a surface, as paths traced on in batches.
+
+At every vertex of a path one environment sample, one lamp sample and one BRDF sample, combined by the balance
+heuristic; from the fourth vertex on, Russian roulette.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ...compute.jit import njit
+from ..lights.environment import map_at, sky_density, sky_radiance
+from ..lights.light_shapes import DIFFUSE, GLOSSY
+from ..lights.lights import emission_along, lamps_along
+from ..lights.product_sampling import facing_row
+from ..sampling import GOLDEN, ONE, ZERO, F, U, mix, unit
+from ..scene import ray_masks
+from . import brdf
+from . import wavefront as w
+from .intersect import FAR, lamp_light, meet, passed, put_hit, surface_of
+
+Array = np.ndarray
+
+#: Ray offset from the surface: relative to the point's own and to the scene's largest coordinate.
+_OFFSET_POINT, _OFFSET_SCENE = F(1e-5), F(2e-6)
+#: Russian roulette starts after this many bounces.
+_SURE_BOUNCES = 3
+#: Columns of `found`: indirect light, then the caller's.
+INDIRECT, CARRIED = 0, 3
+FOUND = 10
+
+
+@njit
+def lifted(px: Any, py: Any, pz: Any, gx: Any, gy: Any, gz: Any, extent: Any) -> Any:
+    """Lift a ray's start off the surface by more than rounding can push it below."""
+    lift = _OFFSET_POINT * max(abs(px), max(abs(py), abs(pz))) + _OFFSET_SCENE * extent
+    return px + lift * gx, py + lift * gy, pz + lift * gz
+
+
+@njit
+def _surfaces(s: Any, ints: Any, count: Any, scene: Any, look: Any, table: Any, sky: Any) -> None:
+    """Normals and materials where the rays hit. What the surfaces emit was taken where the rays left (`_onwards`)."""
+    tracer, geometry, extent = scene
+    for slot in range(count):
+        a, c = w.at(slot)
+        vx, vy, vz = s[a + w.VX], s[a + w.VY], s[a + w.VZ]
+        nx, ny, nz, gx, gy, gz, r, g, b, roughness, metallic, _, _, _ = surface_of(tracer, s, ints, slot, geometry)
+        mx, my, mz = brdf.glossy_normal(nx, ny, nz, gx, gy, gz, vx, vy, vz)
+        s[a + w.NX], s[a + w.NY], s[a + w.NZ] = nx, ny, nz
+        s[a + w.MX], s[a + w.MY], s[a + w.MZ] = mx, my, mz
+        s[a + w.GX], s[a + w.GY], s[a + w.GZ] = gx, gy, gz
+        ints[c + w.ROW] = U(facing_row(nx, ny, nz, sky))
+        s[a + w.OX], s[a + w.OY], s[a + w.OZ] = lifted(s[a + w.OX], s[a + w.OY], s[a + w.OZ], gx, gy, gz, extent)
+        s[a + w.AR], s[a + w.AG], s[a + w.AB] = r, g, b
+        s[a + w.METALLIC], s[a + w.A2] = metallic, brdf.alpha_squared(roughness)
+        s[a + w.KD] = brdf.diffuse_weight(roughness, metallic, mx * vx + my * vy + mz * vz, look, table)
+
+
+@njit
+def _towards_sky(s: Any, ints: Any, count: Any, sky: Any, tracer: Any, shift: Any, found: Any) -> None:
+    """The environment samples that `light_directions` drew and `carry` weighed."""
+    for slot in range(count):
+        i, c = w.at(slot)
+        if not s[i + w.LIVE] > ZERO:
+            continue
+        red, green, blue = sky_radiance(s[i + w.MU], s[i + w.MV], sky)
+        weight = ONE / s[i + w.PE]
+        red, green, blue = red * s[i + w.QR] * weight, green * s[i + w.QG] * weight, blue * s[i + w.QB] * weight
+        if red + green + blue > ZERO:
+            through = passed(tracer, s, ints, slot, FAR, np.int32(ray_masks.SHADOW << shift))
+            owner = np.int64(ints[c + w.OWNER])
+            found[owner, INDIRECT] += red * through
+            found[owner, INDIRECT + 1] += green * through
+            found[owner, INDIRECT + 2] += blue * through
+
+
+@njit
+def _towards_lamps(s: Any, ints: Any, count: Any, lamps: Any, tracer: Any, shift: Any, found: Any) -> None:
+    """The lamp samples that `lamp_directions` drew."""
+    for slot in range(count):
+        i, c = w.at(slot)
+        others = s[i + w.SHARE] * s[i + w.PC] + (ONE - s[i + w.SHARE]) * s[i + w.PG]
+        dr, dg, db, gr, gg, gb = lamp_light(
+            s, ints, slot, others, others, ONE, lamps, tracer, np.int32(ray_masks.SHADOW << shift)
+        )
+        if dr + dg + db + gr + gg + gb > ZERO:
+            owner = np.int64(ints[c + w.OWNER])
+            found[owner, INDIRECT] += s[i + w.TR] * (s[i + w.QR] * dr + s[i + w.SR] * gr)
+            found[owner, INDIRECT + 1] += s[i + w.TG] * (s[i + w.QG] * dg + s[i + w.SG] * gg)
+            found[owner, INDIRECT + 2] += s[i + w.TB] * (s[i + w.QB] * db + s[i + w.SB] * gb)
+
+
+@njit
+def _onwards(
+    s: Any, ints: Any, count: Any, bounce: Any, last: Any, sky: Any, lamps: Any, any_lamps: Any, glows: Any,
+    scene: Any, shift: Any, found: Any,
+) -> Any:  # fmt: skip
+    """The BRDF samples; return how many paths go on, in slots 0, 1, ..."""
+    tracer, geometry, _ = scene
+    going = 0
+    for slot in range(count):
+        i, c = w.at(slot)
+        if not s[i + w.LIVE] > ZERO:
+            continue
+        position = (s[i + w.OX], s[i + w.OY], s[i + w.OZ])
+        direction = (s[i + w.LX], s[i + w.LY], s[i + w.LZ])
+        diffuse = ints[c + w.CELL] == U(1)
+        mask = np.int32((ray_masks.DIFFUSE if diffuse else ray_masks.GLOSSY) << shift)
+        ends = last and not any_lamps and not glows
+        if ends:
+            through = passed(tracer, s, ints, slot, FAR, mask)
+        else:
+            through, reach, hit = meet(tracer, s, ints, slot, mask)
+        owner = np.int64(ints[c + w.OWNER])
+        fr, fg, fb = s[i + w.QR], s[i + w.QG], s[i + w.QB]
+        if any_lamps:
+            seen_by = DIFFUSE if diffuse else GLOSSY
+            red, green, blue = lamps_along(*position, *direction, reach, s[i + w.PG], ONE, seen_by, *lamps)
+            found[owner, INDIRECT] += fr * red
+            found[owner, INDIRECT + 1] += fg * green
+            found[owner, INDIRECT + 2] += fb * blue
+        if glows:
+            red, green, blue, own, glossy = emission_along(*position, *direction, hit, geometry, *lamps)
+            weight = ONE / (s[i + w.PG] + (own if diffuse else glossy))
+            found[owner, INDIRECT] += fr * red * weight
+            found[owner, INDIRECT + 1] += fg * green * weight
+            found[owner, INDIRECT + 2] += fb * blue * weight
+        if through > ZERO:
+            u, v = map_at(*direction, sky)
+            red, green, blue = sky_radiance(u, v, sky)
+            weight = through / (s[i + w.PG] + sky_density(u, v, ints[c + w.ROW], sky))
+            found[owner, INDIRECT] += fr * red * weight
+            found[owner, INDIRECT + 1] += fg * green * weight
+            found[owner, INDIRECT + 2] += fb * blue * weight
+        if through < ONE and not last:
+            weight = (ONE - through) / s[i + w.PG]
+            fr, fg, fb = fr * weight, fg * weight, fb * weight
+            key = ints[c + w.KEY]
+            if bounce + 1 >= _SURE_BOUNCES:
+                survive = min(ONE, max(fr, max(fg, fb)))
+                if not unit(mix(U(key + U(0x165667B1)))) < survive:
+                    continue
+                fr, fg, fb = fr / survive, fg / survive, fb / survive
+            # The slots before this one are done with.
+            put_hit(tracer, s, ints, going, *position, *direction, hit, key, owner)
+            i, _ = w.at(going)
+            s[i + w.TR], s[i + w.TG], s[i + w.TB] = fr, fg, fb
+            going += 1
+    return going
+
+
+@njit
+def trace_paths(
+    s: Any, ints: Any, count: Any, scene: Any, lights: Any, look: Any, table: Any, bounces: Any, shift: Any, found: Any
+) -> None:  # fmt: skip
+    """Follow `count` paths that `put_hit` began in slots 0, 1, ...; their light goes to rows OWNER of `found`.
+
+    Parameters
+    ----------
+    scene : (Tracer or MixedTracer, Geometry, extent)
+    lights : (Sky, whether it shines, tables of lamps, whether there are any: one of them is sampled at every vertex)
+    bounces : vertices of a path, and whether there are surfaces that emit, which are looked for beyond the last too
+    shift : 0, or ``masks.WITHOUT``
+    found : (capacity, FOUND) float32; INDIRECT is written
+    """
+    tracer, _, _ = scene
+    sky, sky_shines, lamps, any_lamps = lights
+    vertices, glows = bounces
+    for slot in range(count):
+        i, c = w.at(slot)
+        s[i + w.TR], s[i + w.TG], s[i + w.TB] = ONE, ONE, ONE
+        owner = np.int64(ints[c + w.OWNER])
+        for k in range(CARRIED):
+            found[owner, k] = ZERO
+    for bounce in range(vertices):
+        _surfaces(s, ints, count, scene, look, table, sky)
+        w.lobe_shares(s, count, look)
+        if sky_shines:
+            w.fresh_numbers(ints, count, GOLDEN)
+            w.light_directions(s, ints, count, sky)
+            w.evaluate(s, count, look)
+            w.carry(s, count, ONE)
+            _towards_sky(s, ints, count, sky, tracer, shift, found)
+        if any_lamps:
+            w.fresh_numbers(ints, count, U(0x2C1B3C6D))
+            w.lamp_directions(s, ints, count, lamps)
+            w.evaluate(s, count, look)
+            _towards_lamps(s, ints, count, lamps, tracer, shift, found)
+        w.fresh_numbers(ints, count, U(0x7FEB352D))
+        w.brdf_directions(s, ints, count)
+        w.evaluate(s, count, look)
+        w.carry(s, count, ZERO)
+        last = bounce + 1 == vertices
+        count = _onwards(s, ints, count, bounce, last, sky, lamps, any_lamps, glows, scene, shift, found)

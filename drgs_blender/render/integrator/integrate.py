@@ -1,0 +1,274 @@
+"""Light at the visible points: multi-strategy direct light with ray-traced visibility, then paths traced on.
+
+See docs/rendering.md for the estimator. Everything here runs in blocks of points, in parallel, each block in batches of
+rays (`wave`); a point's result depends on nothing but the point, the scene, the light, the settings, the seed and the
+frame number.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ...compute.jit import get_num_threads, njit, prange
+from ...core.color import LUMINANCE
+from ...core.errors import UsageError
+from ...core.frame import RenderSettings
+from .. import sampling
+from ..lights.environment import EnvironmentLight
+from ..lights.lights import Lamps
+from ..points import CATCHER, SECOND, Radiance, ShadingPoints
+from ..sampling import GOLDEN, ONE, ZERO, F, U, mix, unit
+from ..scene import ray_masks
+from ..scene.trace_scene import TraceScene
+from ..surfels.surfel_bvh import SurfelBVH
+from ..surfels.surfel_tracer import tracer_of
+from . import brdf
+from . import wavefront as w
+from .direct import BATCH, KIND, KINDS, deliver, finish, trace_batch
+from .indirect import FOUND, trace_paths
+from .intersect import meshes_alone
+from .sample_allocation import ALPHA, COUNTS, HEAD, put_sample, write_heads
+from .variance import variances
+
+Array = np.ndarray
+
+#: Part of the samples that go to the light at most where rays of different kinds meet different objects: there the
+#: picture follows from how strategies are weighed (docs/rendering.md), and this comes closest to Cycles.
+_APART = F(0.25)
+#: Points of a block.
+_BLOCK = 64
+#: Least share of the light samples that go to sky or lamps when both shine.
+_LEAST_SHARE = 0.1
+
+
+class Kernel:
+    """What shades points, and where it finds the scene: all threads here; `render.gpu` has the same for a card."""
+
+    def tables(self, scene: TraceScene, light: EnvironmentLight, lamps: Lamps) -> tuple[Any, Any, Any, Any]:
+        """(tracer, geometry, sky, lamps) as `shade` takes them; until the scene's next update."""
+        return meshes_alone(scene.tracer), scene.geometry, light.sky, lamps.tables
+
+    def shade(self, *arguments: Any) -> None:
+        """Shade all points; see `shade_points`."""
+        _kernel(*arguments, 8 * get_num_threads())
+
+
+def integrate(
+    scene: TraceScene,
+    light: EnvironmentLight,
+    points: ShadingPoints,
+    settings: RenderSettings,
+    frame_number: int,
+    lamps: Lamps | None = None,
+    part: tuple[int, int] = (0, 1),
+    *,
+    surfels: SurfelBVH | None = None,
+    kernel: Kernel | None = None,
+) -> Radiance:
+    """Light that leaves `points` towards the camera.
+
+    Parameters
+    ----------
+    scene, light, lamps : what rays meet, what they see when they meet nothing, and what shines in between
+    points : visible points, world space
+    settings : ``cosine``, ``ggx`` and ``environment`` samples a pixel and their ``split``, divided among its
+        ``positions``; ``bounces``, ``look``, ``seed``, ``clamp_indirect``
+    frame_number : int, part of the seed
+    part : (i, n): only the i-th of n equal parts of each sub-sample's samples; the mean over all parts is the whole
+    surfels : what rays meet of DR-GS objects next to the scene's meshes; then `points` say which surfels are their own
+    kernel : None: that of this processor
+
+    Returns
+    -------
+    Radiance
+        Linear Rec.709, never NaN or Inf. A point with a coordinate that is not finite stays black.
+
+    Raises
+    ------
+    UsageError
+        When settings are out of range.
+    """
+    counts = (settings.cosine, settings.ggx, settings.environment)
+    if min(counts) < 0 or settings.bounces < 0 or settings.aa < 0:
+        raise UsageError("render settings", "samples, bounces or aa are negative", "Use counts of zero or more")
+    if not (0.0 <= settings.clamp_indirect < np.inf and 0.0 <= settings.noise_threshold < np.inf):
+        raise UsageError("render settings", "the clamp or the threshold is no number of at least 0", "Use 0 for none")
+    if settings.look not in brdf.LOOKS:
+        raise UsageError("render settings", f"look {settings.look!r} is unknown", "Use principled or paper")
+    n = len(points)
+    out = Radiance.dark(n)
+    lamps = lamps or _NO_LAMPS
+    glows = scene.materials.glows
+    if n == 0 or sum(counts) == 0 or (light.black and not lamps.count and not glows):
+        return out
+    share = sky_share(light, lamps)
+    # Where neither shines, nothing is drawn by its light, though surfaces may emit some.
+    sky_part, lamp_part = share * (not light.black), (1.0 - share) * (lamps.count > 0)
+    kernel = kernel or Kernel()
+    tracer, geometry, sky, lamp_tables = kernel.tables(scene, light, lamps)
+    if surfels is not None:
+        tracer = tracer._replace(**tracer_of(surfels)._asdict())
+    tables = (
+        tracer,
+        geometry,
+        F(scene.extent if surfels is None else max(scene.extent, surfels.extent)),
+        sky,
+        (not light.black, lamps.count > 0),
+        lamp_tables,
+        brdf.layer_table(),
+        sampling.point_set(sum(counts) + 1),
+    )
+    rules = (
+        (settings.split == "auto", *map(F, counts), F(sky_part), F(lamp_part), _APART if scene.rays_differ else ONE),
+        settings.positions,
+        part,
+        (settings.bounces, glows),
+        brdf.LOOKS[settings.look],
+        U(mixed(settings.seed, frame_number)),
+        F(settings.clamp_indirect * settings.positions * part[1] / sum(counts)),
+        (lamps.rays_differ, scene.rays_differ and (settings.split == "auto" or min(counts[:2]) > 0)),
+    )
+
+    def run(some: ShadingPoints, shift: int, found: Radiance) -> None:
+        kernel.shade(
+            (some.pixel, some.sample, some.flags),
+            (some.origin, some.normal, some.geometric_normal, some.view),
+            (some.albedo, some.roughness, some.metallic, some.own, some.size),
+            *tables,
+            *rules,
+            shift,
+            (found.components, found.moments),
+        )
+
+    run(points, 0, out)
+    out.variance = variances(points.pixel, out.moments)
+    caught = np.flatnonzero(points.flags & CATCHER)
+    if len(caught):
+        alone = Radiance.dark(len(caught))
+        run(points[caught], ray_masks.WITHOUT, alone)
+        out.unshadowed = np.zeros(n, np.float32)
+        # Not a matrix product: BLAS rounds a row by how many rows there are.
+        out.unshadowed[caught] = (alone.total * np.array(LUMINANCE, np.float32)).sum(axis=1)
+    return out
+
+
+def sky_share(light: EnvironmentLight, lamps: Lamps) -> float:
+    """Part of the light samples that go to the environment; the others go to lamps."""
+    if not lamps.count:
+        return 1.0
+    if light.black:
+        return 0.0
+    share = light.power / (light.power + lamps.power) if lamps.power > 0.0 else 1.0
+    return float(min(max(share, _LEAST_SHARE), 1.0 - _LEAST_SHARE))
+
+
+_NO_LAMPS = Lamps([])
+
+
+def mixed(seed: int, frame_number: int) -> int:
+    """One 32-bit key of the job's seed and the frame's number."""
+    value = (seed * 0x9E3779B97F4A7C15 + (frame_number + 1) * 0xD1B54A32D192ED03) & (2**64 - 1)
+    value ^= value >> 32
+    value = value * 0xD6E8FEB86659FD93 & (2**64 - 1)
+    return value >> 32
+
+
+@njit
+def shade_points(
+    lane: Any, lanes: Any, room: Any, keys: Any, frames: Any, surfaces: Any, tracer: Any, geometry: Any, extent: Any,
+    sky: Any, sky_rules: Any, lamps: Any, table: Any, sequence: Any, split: Any, aa: Any, part: Any, bounces: Any,
+    look: Any, seed: Any, limit: Any, differ: Any, shift: Any, out: Any,
+) -> None:  # fmt: skip
+    """Shade every so-manyth (`lanes`) block of points, from the `lane`-th on.
+
+    Parameters
+    ----------
+    room : scratch memory, see `_room`
+    keys, frames, surfaces : arrays of the points
+    out : components and moments of their `Radiance`
+    """
+    pixel, sample, flags = keys
+    components, moments = out
+    n = len(pixel)
+    blocks = (n + _BLOCK - 1) // _BLOCK
+    scene, lights = (tracer, geometry, extent), (sky, sky_rules[0], lamps, sky_rules[1])
+    rays, paths, found, sums, head, row, total = room
+    s, ints = rays
+    # Samples of a sub-sample's part lie next to each other among those of the pixel.
+    rate = ONE / F(aa * part[1])
+    for block in range(lane, blocks, lanes):
+        start = block * _BLOCK
+        end = min(n, start + _BLOCK)
+        sums[:] = ZERO
+        total[:] = 0
+        write_heads(start, end, frames, surfaces, extent, sky, look, table, split, head, row)
+        begun = np.int64(0)
+        for strategy in range(4):
+            count = np.int64(0)
+            for i in range(start, end):
+                h = i - start
+                if head[h, ALPHA] < ZERO or head[h, COUNTS + strategy] == ZERO:
+                    continue
+                own = U(seed ^ mix(U(pixel[i])))
+                if flags[i] & SECOND:
+                    own = U(own ^ U(0x5BD1E995))
+                key = mix(U(mix(own) + U(U(strategy + 1) * GOLDEN)))
+                step = head[h, COUNTS + strategy] * rate
+                dither = unit(mix(U(key + U(4))))
+                # Each position begins with another part, lest a part have samples at all positions of a pixel or none.
+                turn = np.int64((np.uint64(U(U(sample[i]) * GOLDEN)) * np.uint64(part[1])) >> np.uint64(32))
+                place = F(sample[i] * part[1] + (part[0] + turn) % part[1])
+                first, past = np.int64(place * step + dither), np.int64((place + ONE) * step + dither)
+                for j in range(first, past):
+                    if count == BATCH:
+                        begun = trace_batch(
+                            strategy, count, rays, paths, begun, found, scene, lights, table, bounces, look, limit,
+                            differ, shift, sums,
+                        )  # fmt: skip
+                        count = np.int64(0)
+                    total[h] += 1
+                    put_sample(tracer, s, ints, count, i, h, frames, surfaces, head, rate)
+                    _, c = w.at(count)
+                    ints[c + w.KEY] = mix(U(key ^ U(U(j + 1) * U(0x85EBCA6B))))
+                    ints[c + w.CELL], ints[c + w.ROW] = key, row[h]
+                    ints[c + w.N0], ints[c + w.N1], ints[c + w.N2] = sequence[j, 0], sequence[j, 1], sequence[j, 2]
+                    count += 1
+            if count > 0:
+                begun = trace_batch(
+                    strategy, count, rays, paths, begun, found, scene, lights, table, bounces, look, limit, differ,
+                    shift, sums,
+                )  # fmt: skip
+        trace_paths(paths[0], paths[1], begun, scene, lights, look, table, bounces, shift, found)
+        deliver(begun, found, limit, sums)
+        for i in range(start, end):
+            finish(sums, i - start, total[i - start], components, moments, i)
+
+
+@njit
+def _room() -> Any:
+    """Scratch memory of `shade_points`."""
+    return (
+        w.batch(BATCH),
+        w.batch(BATCH),
+        np.zeros((BATCH, FOUND), np.float32),
+        np.empty((_BLOCK, KINDS * KIND), np.float32),
+        np.zeros((_BLOCK, HEAD), np.float32),
+        np.zeros(_BLOCK, np.uint32),
+        np.empty(_BLOCK, np.int64),
+    )
+
+
+@njit(parallel=True)
+def _kernel(
+    keys: Any, frames: Any, surfaces: Any, tracer: Any, geometry: Any, extent: Any, sky: Any, sky_rules: Any,
+    lamps: Any, table: Any, sequence: Any, split: Any, aa: Any, part: Any, bounces: Any, look: Any, seed: Any,
+    limit: Any, differ: Any, shift: Any, out: Any, lanes: Any,
+) -> None:  # fmt: skip
+    # Threads get neighbouring lanes, lanes get every so-manyth block: no thread is left with all the costly ones.
+    for lane in prange(lanes):
+        shade_points(
+            np.int64(lane), lanes, _room(), keys, frames, surfaces, tracer, geometry, extent, sky, sky_rules, lamps,
+            table, sequence, split, aa, part, bounces, look, seed, limit, differ, shift, out,
+        )  # fmt: skip

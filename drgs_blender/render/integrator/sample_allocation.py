@@ -1,0 +1,115 @@
+"""What all samples of a shading point share: start of its rays, lobes, and how many samples each strategy draws."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from ...compute.jit import njit
+from ..lights.product_sampling import facing_row
+from ..sampling import ONE, TWO, ZERO, F, U
+from . import brdf
+from . import wavefront as w
+from .indirect import lifted
+from .intersect import put_start
+
+#: Strategies in the order of ``RenderSettings``' counts; the samples of the last are divided between sky and lamps.
+COSINE, GGX, SKY, LAMPS = range(4)
+#: Columns of a head: start of the rays, alpha squared, diffuse weight, normal m, samples of each strategy.
+ALPHA, WEIGHT, NORMAL, COUNTS = 3, 4, 5, 8
+HEAD = 12
+#: Part of the samples that go to the light where the surface is all diffuse, and for a specular lobe; less where that
+#: is narrow: the part is `_LIGHT_GLOSSY` from this alpha on.
+_LIGHT_DIFFUSE, _LIGHT_GLOSSY, _WIDE = F(0.75), F(0.5), F(0.03)
+
+
+@njit
+def _rounded(x: Any) -> Any:
+    return F(np.int32(x + F(0.5)))
+
+
+@njit
+def _allot(head: Any, h: Any, share: Any, split: Any) -> None:
+    """Samples a pixel of each strategy at the h-th point; `share` is the diffuse lobe's part of what it reflects.
+
+    Whole numbers in coarse steps: points of one pixel mostly agree, and then their samples add up to these numbers.
+    """
+    auto, cosine, ggx, light, sky, lamps, most = split
+    if auto:
+        total = cosine + ggx + light
+        alpha = F(math.sqrt(head[h, ALPHA]))
+        glossy = _LIGHT_GLOSSY * min(ONE, max(F(0.05), alpha / _WIDE))
+        light = total * min(most, share * _LIGHT_DIFFUSE + (ONE - share) * glossy) if sky + lamps > ZERO else ZERO
+        ggx = (total - light) * (ONE - share)
+        if total >= F(3.0):
+            # Each lobe keeps a ray: what its own rays alone find (`apart`) must not be lost.
+            step = max(ONE, F(np.int32(total / F(8.0))))
+            light = step * _rounded(light / step)
+            if lamps > ZERO:
+                # Lamps without size, or that nothing shadows, are found by their own samples alone.
+                light = max(light, TWO if sky > ZERO else ONE)
+            light = min(light, total - TWO)
+            half = max(ONE, F(np.int32(step / TWO)))
+            ggx = half * _rounded((total - light) * (ONE - share) / half)
+            ggx = min(max(ggx, ONE), total - light - ONE) if share < ONE else ZERO
+            ggx = ggx if share > ZERO else total - light
+        cosine = total - light - ggx
+    if sky > ZERO and lamps > ZERO and light >= TWO:
+        sky = min(max(_rounded(light * sky), ONE), light - ONE) / light
+        lamps = ONE - sky
+    head[h, COUNTS + COSINE], head[h, COUNTS + GGX] = cosine, ggx
+    head[h, COUNTS + SKY], head[h, COUNTS + LAMPS] = light * sky, light * lamps
+
+
+@njit
+def write_heads(
+    first: Any, last: Any, frames: Any, surfaces: Any, extent: Any, sky: Any, look: Any, table: Any, split: Any,
+    head: Any, row: Any,
+) -> None:  # fmt: skip
+    """What all samples of a point share, see `HEAD`, and its row in the light's tables.
+
+    Alpha squared is -1 where the point is unusable.
+    """
+    origin, normal, flat, view = frames
+    albedo, roughness, metallic, _, _ = surfaces
+    for i in range(first, last):
+        h = i - first
+        check = roughness[i] + metallic[i]
+        for k in range(3):
+            check += origin[i, k] + normal[i, k] + flat[i, k] + view[i, k] + albedo[i, k]
+        if not abs(check) < F(1e18):
+            head[h, ALPHA] = -ONE
+            continue
+        gx, gy, gz, vx, vy, vz = flat[i, 0], flat[i, 1], flat[i, 2], view[i, 0], view[i, 1], view[i, 2]
+        head[h, 0], head[h, 1], head[h, 2] = lifted(origin[i, 0], origin[i, 1], origin[i, 2], gx, gy, gz, extent)
+        mx, my, mz = brdf.glossy_normal(normal[i, 0], normal[i, 1], normal[i, 2], gx, gy, gz, vx, vy, vz)
+        mv = mx * vx + my * vy + mz * vz
+        weight = brdf.diffuse_weight(roughness[i], metallic[i], mv, look, table)
+        head[h, ALPHA], head[h, WEIGHT] = brdf.alpha_squared(roughness[i]), weight
+        head[h, NORMAL], head[h, NORMAL + 1], head[h, NORMAL + 2] = mx, my, mz
+        r, g, b = albedo[i, 0], albedo[i, 1], albedo[i, 2]
+        row[h] = U(facing_row(normal[i, 0], normal[i, 1], normal[i, 2], sky))
+        _allot(head, h, w.diffuse_share(mv, r, g, b, weight, metallic[i], look), split)
+
+
+@njit
+def put_sample(
+    tracer: Any, s: Any, ints: Any, slot: Any, i: Any, h: Any, frames: Any, surfaces: Any, head: Any, rate: Any
+) -> None:
+    """Copy point i, the h-th of its block, into a slot; `rate` is its part of a pixel's samples."""
+    _, normal, flat, view = frames
+    albedo, _, metallic, own, size = surfaces
+    a, c = w.at(slot)
+    s[a + w.OX], s[a + w.OY], s[a + w.OZ] = head[h, 0], head[h, 1], head[h, 2]
+    s[a + w.NX], s[a + w.NY], s[a + w.NZ] = normal[i, 0], normal[i, 1], normal[i, 2]
+    s[a + w.MX], s[a + w.MY], s[a + w.MZ] = head[h, NORMAL], head[h, NORMAL + 1], head[h, NORMAL + 2]
+    s[a + w.GX], s[a + w.GY], s[a + w.GZ] = flat[i, 0], flat[i, 1], flat[i, 2]
+    s[a + w.VX], s[a + w.VY], s[a + w.VZ] = view[i, 0], view[i, 1], view[i, 2]
+    s[a + w.AR], s[a + w.AG], s[a + w.AB] = albedo[i, 0], albedo[i, 1], albedo[i, 2]
+    s[a + w.METALLIC], s[a + w.A2], s[a + w.KD] = metallic[i], head[h, ALPHA], head[h, WEIGHT]
+    s[a + w.WC], s[a + w.WG] = head[h, COUNTS + COSINE] * rate, head[h, COUNTS + GGX] * rate
+    s[a + w.WE], s[a + w.WL] = head[h, COUNTS + SKY] * rate, head[h, COUNTS + LAMPS] * rate
+    ints[c + w.OWNER] = U(h)
+    put_start(tracer, s, ints, slot, own, size, i)

@@ -1,0 +1,340 @@
+"""Batches of rays, stage by stage: arithmetic that vectorises, apart from what waits for memory or for Embree.
+
+A batch is two flat arrays, one of float32 and one of uint32, made of packets of `LANES` slots: field f of a slot lies
+f * LANES behind its field 0 (`at`). Loops over the lanes of a packet have constant length, no call and no branch that
+matters, so that LLVM turns them into vector code; table lookups stand in loops of their own, where the processor
+overlaps their cache misses.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from ...compute.jit import inlined, njit
+from .. import sampling
+from ..lights.environment import cell_at, cell_end, direction_in_cell, first_cell, map_at, sky_density, sky_touch
+from ..lights.lights import sample_lamp
+from ..lights.product_sampling import block_of, in_cells_order
+from ..sampling import INVERSE_PI, ONE, TWO, ZERO, F, U, luminance, mix, scrambled, unit
+from . import brdf
+
+Array = np.ndarray
+
+LANES = 16
+
+# float32 fields, in units of LANES. Position and frame of the surface that a ray leaves (N shading normal, M normal of
+# the specular lobe, G geometric normal, V towards the viewer) ...
+OX, OY, OZ, NX, NY, NZ, MX, MY, MZ, GX, GY, GZ, VX, VY, VZ = (LANES * i for i in range(15))
+# ... its albedo, metallic, alpha squared, weight of the diffuse lobe
+AR, AG, AB, METALLIC, A2, KD = (LANES * i for i in range(15, 21))
+# the ray's direction, whether there is one (1 or 0), BRDF times cosine (diffuse, specular), density of cosine and GGX
+LX, LY, LZ, LIVE, QR, QG, QB, SR, SG, SB, PC, PG = (LANES * i for i in range(21, 33))
+# where the direction meets the map of the environment, and the density of light sampling
+MU, MV, PE = (LANES * i for i in range(33, 36))
+# of paths: throughput, part of the diffuse lobe in sampling; of lamp samples: radiance (distance in MU, density in MV)
+TR, TG, TB, SHARE, ER, EG, EB = (LANES * i for i in range(36, 43))
+# of a point's samples: how many each strategy draws there; where rays meet surfels: size of those that they start on
+WC, WG, WE, WL, SIZE = (LANES * i for i in range(43, 48))
+_FLOATS = 48 * LANES
+# uint32 fields: three random numbers, the key of more, the owner (a point, or a path), a place in a table, the row of
+# the normal in the light's tables, the object of the surfels that the ray starts on (or -1)
+N0, N1, N2, KEY, OWNER, CELL, ROW, OWN = (LANES * i for i in range(8))
+_INTS = 8 * LANES
+
+_TINY = F(1e-30)
+
+
+@njit
+def batch(capacity: Any) -> Any:
+    """(float32, uint32) arrays with room for `capacity` slots."""
+    packets = (capacity + LANES - 1) // LANES
+    return np.zeros(packets * _FLOATS, np.float32), np.zeros(packets * _INTS, np.uint32)
+
+
+@inlined
+def at(slot: Any) -> Any:
+    """Places of a slot's field 0 in the two arrays."""
+    packet, lane = slot // LANES, slot % LANES
+    return packet * _FLOATS + lane, packet * _INTS + lane
+
+
+@inlined
+def packets(count: Any) -> Any:
+    """Packets that hold `count` slots."""
+    return (count + LANES - 1) // LANES
+
+
+@njit
+def scramble(ints: Any, count: Any) -> None:
+    """Turn N0 to N2, a Sobol' point with reversed bits, into random numbers; CELL is the key of the point set."""
+    for p in range(packets(count)):
+        c = p * _INTS
+        for i in range(c, c + LANES):
+            key = ints[i + CELL]
+            ints[i + N0] = scrambled(ints[i + N0], mix(U(key + U(1))))
+            ints[i + N1] = scrambled(ints[i + N1], mix(U(key + U(2))))
+            ints[i + N2] = scrambled(ints[i + N2], mix(U(key + U(3))))
+
+
+@inlined
+def _cosine_direction(s: Any, i: Any, u: Any, v: Any) -> Any:
+    """World direction in proportion to the cosine."""
+    nx, ny, nz = s[i + NX], s[i + NY], s[i + NZ]
+    bx, by, bz, cx, cy, cz = sampling.basis(nx, ny, nz)
+    x, y, z = sampling.cosine_hemisphere(u, v)
+    return x * bx + y * cx + z * nx, x * by + y * cy + z * ny, x * bz + y * cz + z * nz
+
+
+@inlined
+def _ggx_direction(s: Any, i: Any, u: Any, v: Any) -> Any:
+    """World direction by visible normals."""
+    mx, my, mz, vx, vy, vz = s[i + MX], s[i + MY], s[i + MZ], s[i + VX], s[i + VY], s[i + VZ]
+    bx, by, bz, cx, cy, cz = sampling.basis(mx, my, mz)
+    up = max(mx * vx + my * vy + mz * vz, F(1e-6))
+    a2 = s[i + A2]
+    bound, _ = brdf.vndf_terms(up, a2)
+    ix, iy = bx * vx + by * vy + bz * vz, cx * vx + cy * vy + cz * vz
+    x, y, z = brdf.sample_vndf(u, v, ix, iy, up, math.sqrt(a2), bound)
+    return x * bx + y * cx + z * mx, x * by + y * cy + z * my, x * bz + y * cz + z * mz
+
+
+@njit
+def cosine_directions(s: Any, ints: Any, count: Any) -> None:
+    """Directions in proportion to the cosine."""
+    for p in range(packets(count)):
+        b, c = p * _FLOATS, p * _INTS
+        for k in range(LANES):
+            i = b + k
+            x, y, z = _cosine_direction(s, i, unit(ints[c + k + N0]), unit(ints[c + k + N1]))
+            s[i + LX], s[i + LY], s[i + LZ] = x, y, z
+
+
+@njit
+def ggx_directions(s: Any, ints: Any, count: Any) -> None:
+    """Directions by visible normals."""
+    for p in range(packets(count)):
+        b, c = p * _FLOATS, p * _INTS
+        for k in range(LANES):
+            i = b + k
+            x, y, z = _ggx_direction(s, i, unit(ints[c + k + N0]), unit(ints[c + k + N1]))
+            s[i + LX], s[i + LY], s[i + LZ] = x, y, z
+
+
+@njit
+def brdf_directions(s: Any, ints: Any, count: Any) -> None:
+    """Directions from the mixture of both lobes; CELL tells which (1 diffuse, 0 specular)."""
+    for p in range(packets(count)):
+        b, c = p * _FLOATS, p * _INTS
+        for k in range(LANES):
+            i = b + k
+            u, v = unit(ints[c + k + N0]), unit(ints[c + k + N1])
+            x0, y0, z0 = _cosine_direction(s, i, u, v)
+            x1, y1, z1 = _ggx_direction(s, i, u, v)
+            diffuse = unit(ints[c + k + N2]) < s[i + SHARE]
+            s[i + LX] = x0 if diffuse else x1
+            s[i + LY] = y0 if diffuse else y1
+            s[i + LZ] = z0 if diffuse else z1
+            ints[c + k + CELL] = U(1) if diffuse else U(0)
+
+
+@njit
+def light_directions(s: Any, ints: Any, count: Any, sky: Any) -> None:
+    """Directions towards the environment in proportion to its light on the surface, with MU, MV and PE."""
+    for slot in range(count):
+        _, c = at(slot)
+        ints[c + CELL] = U(block_of(ints[c + ROW], ints[c + N2], sky))
+    for slot in range(count):
+        i, c = at(slot)
+        block = np.int64(ints[c + CELL])
+        ints[c + N2], s[i + ER] = in_cells_order(ints[c + ROW], block, ints[c + N2], mix(ints[c + N2]), sky)
+    # One loop a table, without a branch that waits for the table: the cache misses of many slots overlap.
+    for slot in range(count):
+        _, c = at(slot)
+        ints[c + CELL] = U(first_cell(ints[c + N2], sky))
+    for slot in range(count):
+        i, c = at(slot)
+        s[i + PE] = F(cell_end(ints[c + CELL], sky))
+    for slot in range(count):
+        _, c = at(slot)
+        place = ints[c + CELL]
+        while ints[c + N2] > cell_end(place, sky):
+            place = U(place + U(1))
+        ints[c + CELL] = place
+    for slot in range(count):
+        i, c = at(slot)
+        _, column, s[i + MV], s[i + LZ], density = cell_at(ints[c + CELL], sky)
+        s[i + MU], s[i + PE] = F(column), density * s[i + ER]
+    for p in range(packets(count)):
+        b, c = p * _FLOATS, p * _INTS
+        for k in range(LANES):
+            i = b + k
+            s[i + LX], s[i + LY], s[i + LZ], s[i + MU], s[i + MV] = direction_in_cell(
+                s[i + MU], s[i + MV], s[i + LZ], ints[c + k + N0], ints[c + k + N1], sky
+            )
+
+
+@njit
+def lamp_directions(s: Any, ints: Any, count: Any, lamps: Any) -> None:
+    """Directions towards lamps, with ER, EG, EB, distance, density (see ``sample_lamp``) and the lamp in CELL."""
+    for slot in range(count):
+        i, c = at(slot)
+        lx, ly, lz, distance, r, g, b, density, lamp = sample_lamp(
+            ints[c + N2], ints[c + N0], ints[c + N1], s[i + OX], s[i + OY], s[i + OZ], *lamps
+        )
+        s[i + LX], s[i + LY], s[i + LZ], s[i + MU], s[i + MV] = lx, ly, lz, distance, density
+        s[i + ER], s[i + EG], s[i + EB] = r, g, b
+        ints[c + CELL] = U(max(lamp, 0))
+
+
+@njit
+def look_up(s: Any, ints: Any, count: Any, sky: Any) -> None:
+    """MU, MV and PE of directions that were not drawn from the environment."""
+    for p in range(packets(count)):
+        for i in range(p * _FLOATS, p * _FLOATS + LANES):
+            s[i + MU], s[i + MV] = map_at(s[i + LX], s[i + LY], s[i + LZ], sky)
+    for slot in range(count):
+        i, c = at(slot)
+        if s[i + LIVE] > ZERO:
+            s[i + PE] = sky_density(s[i + MU], s[i + MV], ints[c + ROW], sky)
+
+
+@njit
+def warm(s: Any, count: Any, sky: Any) -> None:
+    """Fetch what `sky_radiance` will read, all at once, long before it waits for it."""
+    for slot in range(count):
+        i, _ = at(slot)
+        if s[i + LIVE] > ZERO:
+            s[i + ER] = sky_touch(s[i + MU], s[i + MV], sky)
+
+
+@njit
+def evaluate(s: Any, count: Any, look: Any) -> None:
+    """BRDF of both lobes times cosine, densities of cosine and GGX sampling, and LIVE: whether any light can pass."""
+    for p in range(packets(count)):
+        for i in range(p * _FLOATS, p * _FLOATS + LANES):
+            lx, ly, lz = s[i + LX], s[i + LY], s[i + LZ]
+            mx, my, mz, vx, vy, vz = s[i + MX], s[i + MY], s[i + MZ], s[i + VX], s[i + VY], s[i + VZ]
+            nl = max(s[i + NX] * lx + s[i + NY] * ly + s[i + NZ] * lz, ZERO)
+            ml = max(mx * lx + my * ly + mz * lz, ZERO)
+            mv = mx * vx + my * vy + mz * vz
+            # Cosine and sine of the half vector, and of half the angle between the directions.
+            vl = vx * lx + vy * ly + vz * lz
+            inverse = ONE / max(TWO + TWO * vl, _TINY)
+            hx, hy, hz = vx + lx, vy + ly, vz + lz
+            cx, cy, cz = my * hz - mz * hy, mz * hx - mx * hz, mx * hy - my * hx
+            mh2, sin2 = (ml + mv) * (ml + mv) * inverse, (cx * cx + cy * cy + cz * cz) * inverse
+            a2 = s[i + A2]
+            _, norm = brdf.vndf_terms(max(mv, ZERO), a2)
+            qr, qg, qb, sr, sg, sb, pg = brdf.evaluate(
+                ml, mv, vl, mh2, sin2, s[i + AR], s[i + AG], s[i + AB], s[i + KD], s[i + METALLIC], a2, norm, look
+            )
+            s[i + QR], s[i + QG], s[i + QB] = qr * nl, qg * nl, qb * nl
+            above = ml > ZERO
+            s[i + SR] = sr * ml if above else ZERO
+            s[i + SG] = sg * ml if above else ZERO
+            s[i + SB] = sb * ml if above else ZERO
+            s[i + PC], s[i + PG] = nl * INVERSE_PI, pg if above else ZERO
+            out = min(s[i + GX] * lx + s[i + GY] * ly + s[i + GZ] * lz, max(nl, ml))
+            s[i + LIVE] = ONE if out > ZERO else ZERO
+
+
+@inlined
+def _factor(s: Any, i: Any, cosine: Any, ggx: Any) -> Any:
+    """One over the density of all strategies together for the slot at i."""
+    brdf_density = cosine * s[i + WC] * s[i + PC] + ggx * s[i + WG] * s[i + PG]
+    return ONE / max(brdf_density + s[i + WE] * s[i + PE], _TINY)
+
+
+@inlined
+def _scale(s: Any, i: Any, k: Any) -> None:
+    """Multiply both lobes of the slot at i."""
+    s[i + QR], s[i + QG], s[i + QB] = s[i + QR] * k, s[i + QG] * k, s[i + QB] * k
+    s[i + SR], s[i + SG], s[i + SB] = s[i + SR] * k, s[i + SG] * k, s[i + SB] * k
+
+
+@inlined
+def weigh_one(s: Any, i: Any, cosine: Any, ggx: Any) -> None:
+    """`weigh` for the slot at i."""
+    _scale(s, i, _factor(s, i, cosine, ggx))
+
+
+@njit
+def weigh(s: Any, count: Any, cosine: Any, ggx: Any) -> None:
+    """Divide by the density of all strategies together; the arguments (1 or 0) say whether these two take part."""
+    for p in range(packets(count)):
+        # Two loops, for LLVM vectorises none with so many places that are read and written.
+        for i in range(p * _FLOATS, p * _FLOATS + LANES):
+            s[i + ER] = _factor(s, i, cosine, ggx)
+        for i in range(p * _FLOATS, p * _FLOATS + LANES):
+            _scale(s, i, s[i + ER])
+
+
+@njit
+def weigh_apart(s: Any, count: Any) -> None:
+    """`weigh` where cosine sampling is of the diffuse lobe alone, GGX sampling of the specular one alone."""
+    for p in range(packets(count)):
+        for i in range(p * _FLOATS, p * _FLOATS + LANES):
+            light = s[i + WE] * s[i + PE]
+            k = ONE / max(s[i + WC] * s[i + PC] + light, _TINY)
+            s[i + QR], s[i + QG], s[i + QB] = s[i + QR] * k, s[i + QG] * k, s[i + QB] * k
+            k = ONE / max(s[i + WG] * s[i + PG] + light, _TINY)
+            s[i + SR], s[i + SG], s[i + SB] = s[i + SR] * k, s[i + SG] * k, s[i + SB] * k
+
+
+@njit
+def drop(s: Any, count: Any, lobe: Any) -> None:
+    """Take the lobe whose fields begin at `lobe` (QR or SR) out of the BRDF."""
+    for p in range(packets(count)):
+        for i in range(p * _FLOATS + lobe, p * _FLOATS + lobe + 3 * LANES):
+            s[i] = ZERO
+
+
+@inlined
+def diffuse_share(mv: Any, r: Any, g: Any, b: Any, kd: Any, metallic: Any, look: Any) -> Any:
+    """How often the diffuse lobe is sampled, from what both reflect towards the viewer."""
+    fr, fg, fb = brdf.fresnel(max(mv, ZERO), r, g, b, metallic, look)
+    diffuse = kd * luminance(r, g, b)
+    share = min(max(diffuse / max(diffuse + luminance(fr, fg, fb), _TINY), F(0.1)), F(0.8))
+    share = share if mv > ZERO else ONE
+    return share if kd > ZERO else ZERO
+
+
+@njit
+def lobe_shares(s: Any, count: Any, look: Any) -> None:
+    """SHARE: how often the diffuse lobe is sampled."""
+    for p in range(packets(count)):
+        for i in range(p * _FLOATS, p * _FLOATS + LANES):
+            mv = s[i + MX] * s[i + VX] + s[i + MY] * s[i + VY] + s[i + MZ] * s[i + VZ]
+            s[i + SHARE] = diffuse_share(mv, s[i + AR], s[i + AG], s[i + AB], s[i + KD], s[i + METALLIC], look)
+
+
+@njit
+def carry(s: Any, count: Any, light: Any) -> None:
+    """Put throughput times both lobes into QR, QG, QB, and what a path's samples are divided by into PG and PE.
+
+    PG becomes the density of the mixture of lobes, PE the same plus `light` times the density of light sampling.
+    """
+    for p in range(packets(count)):
+        for i in range(p * _FLOATS, p * _FLOATS + LANES):
+            s[i + QR] = s[i + TR] * (s[i + QR] + s[i + SR])
+            s[i + QG] = s[i + TG] * (s[i + QG] + s[i + SG])
+            s[i + QB] = s[i + TB] * (s[i + QB] + s[i + SB])
+            density = max(s[i + SHARE] * s[i + PC] + (ONE - s[i + SHARE]) * s[i + PG], _TINY)
+            s[i + PG] = density
+            s[i + PE] = density + light * s[i + PE]
+
+
+@njit
+def fresh_numbers(ints: Any, count: Any, step: Any) -> None:
+    """Move on to the next key and hash three random numbers from it."""
+    for p in range(packets(count)):
+        c = p * _INTS
+        for i in range(c, c + LANES):
+            key = U(ints[i + KEY] + step)
+            ints[i + KEY] = key
+            ints[i + N0] = mix(key)
+            ints[i + N1] = mix(U(key + U(0x68E31DA4)))
+            ints[i + N2] = mix(U(key + U(0xB5297A4D)))

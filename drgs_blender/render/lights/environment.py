@@ -1,0 +1,325 @@
+"""The environment light: radiance from a direction, and directions in proportion to radiance.
+
+A texel's directions are drawn uniformly over its solid angle (uniform in azimuth and in z), so its density is one
+constant, finite at the poles. Its probability is the luminance, averaged over the texel as the bilinear lookup sees it,
+times the solid angle: wherever a lookup can be positive, so is the density.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from ...compute.jit import njit, plain, prange
+from ...core.asset.model import as_float
+from ...core.errors import UsageError
+from ...core.frame import World
+from ..memory import Place, address, load_float, load_int32, load_uint32
+from ..sampling import fast_acos, fast_atan2_turns, sincos_turns, unit
+from .environment_cdf import Cells
+from .product_sampling import Facing, block_of, facing_ratio, facing_row, in_cells_order
+
+Array = np.ndarray
+
+#: Radiance above this is cut: its square is still a float32.
+BRIGHTEST = np.float32(1e15)
+
+#: A constant world as a picture: fine enough to be sampled as a surface faces it.
+_CONSTANT = (16, 32, 3)
+#: Negative light, as a part of all light, up to which it is the ringing of a picture's filter.
+_RINGING = 1e-5
+
+
+@njit(parallel=True)
+def _clean(image, tint, rings, texels, found):  # type: ignore[no-untyped-def]
+    """Write the tinted picture: black where a texel is no light, but for its negative part if the picture `rings`.
+
+    Writes for each row how many texels are no light, and how much of them is negative and positive.
+    """
+    zero = np.float32(0.0)
+    for row in prange(len(image)):
+        bad, dark, bright = 0, 0.0, 0.0
+        for column in range(image.shape[1]):
+            r, g, b = image[row, column, 0] * tint[0], image[row, column, 1] * tint[1], image[row, column, 2] * tint[2]
+            if not (abs(r) < np.inf and abs(g) < np.inf and abs(b) < np.inf):
+                bad += 1
+                dark = -np.inf
+                continue
+            dark += min(r, zero) + min(g, zero) + min(b, zero)
+            bright += max(r, zero) + max(g, zero) + max(b, zero)
+            if min(r, g, b) >= zero or rings:
+                texels[row, column, 0] = min(max(r, zero), BRIGHTEST)
+                texels[row, column, 1] = min(max(g, zero), BRIGHTEST)
+                texels[row, column, 2] = min(max(b, zero), BRIGHTEST)
+            else:
+                bad += 1
+        found[row, 0], found[row, 1], found[row, 2] = bad, dark, bright
+
+
+class Sky(NamedTuple):
+    """An `EnvironmentLight` for compiled code: addresses of its arrays, their sizes, and its rotation row by row."""
+
+    texels: int
+    height: int
+    width: int
+    cells: int
+    guide: int
+    guide_size: int
+    row_z: int
+    step: int
+    columns: int
+    starts: int
+    slices: int
+    ratio: int
+    first: int
+    block: int
+    blocks: int
+    block_columns: int
+    shift: int
+    xx: np.float32
+    xy: np.float32
+    xz: np.float32
+    yx: np.float32
+    yy: np.float32
+    yz: np.float32
+    zx: np.float32
+    zy: np.float32
+    zz: np.float32
+
+
+class EnvironmentLight:
+    """A `World` made ready for lookups and sampling by compiled code.
+
+    Attributes
+    ----------
+    texels : (h, w, 4) float32: lat-long radiance times colour and strength, linear Rec.709, and in the last place the
+        density of the sampling cell that the texel lies in: one cache line serves both
+    cells : the cells in which it is sampled
+    row_z : (rows + 1,) float32: z at the upper edge of each row of cells, from 1 to -1
+    facing : the cells weighed by the cosine at a surface
+    rotation : (3, 3) float32: world direction to environment direction
+    bad_texels : int: NaN, infinite or negative texels, taken as black; not those of filters that ring, whose negative
+        values are 0
+    """
+
+    def __init__(self, world: World) -> None:
+        if world.environment is None:
+            image = np.ones(_CONSTANT, np.float32)
+        else:
+            image = as_float(world.environment, (-1, -1, 3), "environment")
+            if image.size == 0:
+                raise UsageError("environment", "has no pixels", "Choose another picture or a colour")
+        rotation = np.asarray(world.rotation, np.float64).reshape(3, 3)
+        tint = np.asarray(world.colour, np.float64) * float(world.strength)
+        if not (np.isfinite(rotation).all() and np.isfinite(tint).all()):
+            raise UsageError("world", "has a colour, strength or rotation that is not finite", "Check its settings")
+        self.texels = np.zeros((*image.shape[:2], 4), np.float32)
+        found = np.zeros((len(image), 3))
+        with np.errstate(over="ignore"):
+            tinted = tint.astype(np.float32)
+        _clean(plain(image), tinted, False, self.texels, found)
+        bad, dark, bright = found.sum(axis=0)
+        if bad and dark > -_RINGING * bright:
+            _clean(plain(image), tinted, True, self.texels, found)
+            bad = 0
+        self.bad_texels = int(bad)
+        self.rotation = np.ascontiguousarray(rotation, np.float32)
+        self.cells = Cells(self.texels)
+        self.row_z = self.cells.edges.astype(np.float32)
+        self.facing = Facing(self.cells)
+
+    @property
+    def black(self) -> bool:
+        """No light at all."""
+        return not self.cells.power > 0.0
+
+    @property
+    def sky(self) -> Sky:
+        """What compiled code reads; valid while this light lives and its rotation is not replaced."""
+        return self.sky_at(address)
+
+    def sky_at(self, place: Place) -> Sky:
+        """`sky` of arrays that lie elsewhere."""
+        height, width = self.texels.shape[:2]
+        cells, facing = self.cells, self.facing
+        return Sky(
+            place(self.texels),
+            height,
+            width,
+            place(cells.runs),
+            place(cells.guide),
+            len(cells.guide),
+            place(self.row_z),
+            cells.step,
+            width // cells.step,
+            place(facing.starts),
+            place(facing.slices),
+            place(facing.ratio),
+            place(facing.first),
+            place(cells.block),
+            len(facing.first),
+            cells.block.shape[1],
+            cells.shift,
+            *self.rotation.ravel(),
+        )
+
+    @property
+    def power(self) -> float:
+        """Luminance integrated over all directions."""
+        return self.cells.power
+
+    def lookup(self, directions: Array) -> Array:
+        """(n, 3) radiance from (n, 3) unit world directions."""
+        return _lookup_many(np.ascontiguousarray(directions, np.float32), self.sky)
+
+    def pdf(self, directions: Array, normal: Array | None = None) -> Array:
+        """(n,) density per solid angle with which ``sample`` draws (n, 3) unit world directions."""
+        directions = np.ascontiguousarray(directions, np.float32)
+        return _pdf_many(directions, self._rows(normal, len(directions)), self.sky)
+
+    def sample(self, numbers: Array, normal: Array | None = None) -> tuple[Array, Array]:
+        """World directions (n, 3) and densities (n,) from (n, 3) uint32 random numbers.
+
+        `normal`, unit world vectors (3,) or (n, 3), is that of the surface which is to be lit; None is of no surface.
+        """
+        return _sample_many(np.ascontiguousarray(numbers, np.uint32), self._rows(normal, len(numbers)), self.sky)
+
+    def _rows(self, normal: Array | None, count: int) -> Array:
+        if normal is None:
+            return np.full(count, len(self.facing.ratio) - 1, np.int32)
+        return _rows_many(np.broadcast_to(np.asarray(normal, np.float32), (count, 3)), self.sky)
+
+
+@njit
+def map_at(dx, dy, dz, sky):  # type: ignore[no-untyped-def]
+    """Lat-long coordinates (u, v) in [0, 1] of a world direction; row 0 at +Z, +X at u = 1/2."""
+    x = sky.xx * dx + sky.xy * dy + sky.xz * dz
+    y = sky.yx * dx + sky.yy * dy + sky.yz * dz
+    z = sky.zx * dx + sky.zy * dy + sky.zz * dz
+    return np.float32(0.5) - fast_atan2_turns(y, x), fast_acos(z) * np.float32(1.0 / math.pi)
+
+
+@njit
+def sky_density(u, v, facing, sky):  # type: ignore[no-untyped-def]
+    """Density per solid angle at (u, v) of light sampling at a surface whose `facing_row` is `facing`."""
+    row = min(np.int64(sky.height - 1), np.int64(v * np.float32(sky.height)))
+    column = min(np.int64(sky.width - 1), np.int64(u * np.float32(sky.width)))
+    density = load_float(sky.texels, 4 * (row * sky.width + column) + 3)
+    if sky.step > 1:
+        row, column = row // sky.step, column // sky.step
+    return density * facing_ratio(facing, row, column, sky)
+
+
+@njit
+def sky_radiance(u, v, sky):  # type: ignore[no-untyped-def]
+    """Bilinear lookup, wrapped in u and clamped in v."""
+    h, w = sky.height, sky.width
+    x, y = u * np.float32(w) - np.float32(0.5), v * np.float32(h) - np.float32(0.5)
+    y = min(max(y, np.float32(0.0)), np.float32(h - 1))
+    c0, r0 = np.int64(x + np.float32(1.0)) - 1, np.int64(y)
+    a, b = x - np.float32(c0), y - np.float32(r0)
+    c1 = c0 + 1 if c0 + 1 < w else 0
+    c0 = w - 1 if c0 < 0 else c0
+    r1 = min(r0 + 1, h - 1)
+    one = np.float32(1.0)
+    p00, p01, p10, p11 = (one - a) * (one - b), a * (one - b), (one - a) * b, a * b
+    i00, i01, i10, i11 = 4 * (r0 * w + c0), 4 * (r0 * w + c1), 4 * (r1 * w + c0), 4 * (r1 * w + c1)
+    t = sky.texels
+    red = p00 * load_float(t, i00) + p01 * load_float(t, i01) + p10 * load_float(t, i10) + p11 * load_float(t, i11)
+    i00, i01, i10, i11 = i00 + 1, i01 + 1, i10 + 1, i11 + 1
+    green = p00 * load_float(t, i00) + p01 * load_float(t, i01) + p10 * load_float(t, i10) + p11 * load_float(t, i11)
+    i00, i01, i10, i11 = i00 + 1, i01 + 1, i10 + 1, i11 + 1
+    blue = p00 * load_float(t, i00) + p01 * load_float(t, i01) + p10 * load_float(t, i10) + p11 * load_float(t, i11)
+    return red, green, blue
+
+
+@njit
+def sky_touch(u, v, sky):  # type: ignore[no-untyped-def]
+    """Some value from both rows of texels that `sky_radiance` will read there: brings them into the cache."""
+    h, w = sky.height, sky.width
+    y = min(max(v * np.float32(h) - np.float32(0.5), np.float32(0.0)), np.float32(h - 1))
+    column, row = min(np.int64(u * np.float32(w)), w - 1), np.int64(y)
+    upper, lower = 4 * (row * w + column), 4 * (min(row + 1, h - 1) * w + column)
+    return load_float(sky.texels, upper) + load_float(sky.texels, lower)
+
+
+@njit
+def first_cell(n, sky):  # type: ignore[no-untyped-def]
+    """Place in the sampling cells where the search for the random number n (uint32) starts."""
+    return load_int32(sky.guide, np.int64((np.uint64(n) * np.uint64(sky.guide_size)) >> np.uint64(32)))
+
+
+@njit
+def cell_end(place, sky):  # type: ignore[no-untyped-def]
+    """Last random number (uint32) that falls on the cell at a place."""
+    return load_uint32(sky.cells, 2 * np.int64(place))
+
+
+@njit
+def cell_at(place, sky):  # type: ignore[no-untyped-def]
+    """(row, column) of the cell at a place, upper and lower z of its row, density per solid angle."""
+    cell = np.int64(load_uint32(sky.cells, 2 * np.int64(place) + 1))
+    row, column = cell // sky.columns, cell % sky.columns
+    density = load_float(sky.texels, 4 * (row * sky.step * sky.width + column * sky.step) + 3)
+    return row, column, load_float(sky.row_z, row), load_float(sky.row_z, row + 1), density
+
+
+@njit
+def direction_in_cell(column, upper, lower, n0, n1, sky):  # type: ignore[no-untyped-def]
+    """World direction within a cell, from two uint32, and its lat-long coordinates (u, v)."""
+    u = (np.float32(column) + unit(n0)) / np.float32(sky.columns)
+    z = upper + unit(n1) * (lower - upper)
+    s, c = sincos_turns(np.float32(0.5) - u)
+    ring = math.sqrt(max(np.float32(0.0), np.float32(1.0) - z * z))
+    x, y = ring * c, ring * s
+    dx = sky.xx * x + sky.yx * y + sky.zx * z
+    dy = sky.xy * x + sky.yy * y + sky.zy * z
+    dz = sky.xz * x + sky.yz * y + sky.zz * z
+    return dx, dy, dz, u, fast_acos(z) * np.float32(1.0 / math.pi)
+
+
+@njit
+def _lookup_many(directions, sky):  # type: ignore[no-untyped-def]
+    out = np.empty((len(directions), 3), np.float32)
+    for i in range(len(directions)):
+        u, v = map_at(directions[i, 0], directions[i, 1], directions[i, 2], sky)
+        out[i, 0], out[i, 1], out[i, 2] = sky_radiance(u, v, sky)
+    return out
+
+
+@njit
+def _rows_many(normals, sky):  # type: ignore[no-untyped-def]
+    out = np.empty(len(normals), np.int32)
+    for i in range(len(normals)):
+        out[i] = facing_row(normals[i, 0], normals[i, 1], normals[i, 2], sky)
+    return out
+
+
+@njit
+def _pdf_many(directions, facing, sky):  # type: ignore[no-untyped-def]
+    out = np.empty(len(directions), np.float32)
+    for i in range(len(directions)):
+        u, v = map_at(directions[i, 0], directions[i, 1], directions[i, 2], sky)
+        out[i] = sky_density(u, v, facing[i], sky)
+    return out
+
+
+@njit
+def _sample_many(numbers, facing, sky):  # type: ignore[no-untyped-def]
+    n = len(numbers)
+    directions, pdf = np.empty((n, 3), np.float32), np.empty(n, np.float32)
+    for i in range(n):
+        number, ratio = in_cells_order(
+            facing[i], block_of(facing[i], numbers[i, 0], sky), numbers[i, 0], numbers[i, 1], sky
+        )
+        place = first_cell(number, sky)
+        while number > cell_end(place, sky):
+            place += 1
+        _, column, upper, lower, pdf[i] = cell_at(place, sky)
+        pdf[i] *= ratio
+        directions[i, 0], directions[i, 1], directions[i, 2], _, _ = direction_in_cell(
+            column, upper, lower, numbers[i, 1], numbers[i, 2], sky
+        )
+    return directions, pdf

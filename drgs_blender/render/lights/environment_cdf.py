@@ -1,0 +1,216 @@
+"""The cells in which an environment is sampled: the power of each, and which random numbers fall on it.
+
+Cells follow each other in Morton order, so that equal strata of a random number are compact regions of equal power.
+That order goes through square blocks one after another, which is how the work is divided among threads: results do
+not depend on their number.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ...compute.jit import njit, prange
+from ...core.color import LUMINANCE
+
+Array = np.ndarray
+
+#: Cells at most; larger pictures are averaged down for sampling (never for the lookup).
+_MOST_CELLS = 1 << 22
+#: Blocks at most, and parts along a side of a block of which the power is known.
+_MOST_BLOCKS, _PARTS = 512, 4
+#: Texel rows that one thread filters at a time.
+_STRIP = 32
+
+
+class Cells:
+    """Cells of a lat-long picture.
+
+    Attributes
+    ----------
+    step : int: texels along a side of a cell
+    edges : (rows + 1,) z at the upper edge of each row of cells, from 1 to -1
+    runs : (k, 2) uint32: last random number that falls on a cell, and the cell; the lit cells in Morton order
+    guide : (2^b,) int32: where to start looking in `runs`, for equal slices of the random numbers
+    density : (rows, columns) float32: probability per solid angle; 0 everywhere when black
+    power : float: luminance integrated over all directions
+    shift : int: cells along a side of a block are 2^shift
+    block : (height, width) int32: the block at a coarse place of the map
+    first : (n,) uint32: first random number of each block that has light
+    parts : (p, n) float64: power of the parts of each block, row by row; all of them together 1
+    corners : (n, 2) int32: row and column of each block's first cell
+
+    Parameters
+    ----------
+    texels : (h, w, 4) float32: finite linear Rec.709 radiance; the density of its cell is written to the last place
+    """
+
+    def __init__(self, texels: Array) -> None:
+        h, w = texels.shape[:2]
+        self.step = _step(h, w)
+        rows, columns = h // self.step, w // self.step
+        self.edges = np.cos(np.pi * np.arange(rows + 1) / rows)
+        self.edges[0], self.edges[-1] = 1.0, -1.0
+        solid = -np.diff(self.edges) * (2.0 * math.pi / columns)
+        weights = np.zeros((rows, columns))
+        red, green, blue = (float(weight) for weight in LUMINANCE)
+        _weigh(texels, red, green, blue, solid, self.step, weights)
+
+        self.shift = 0
+        while -(-rows >> self.shift) * -(-columns >> self.shift) > _MOST_BLOCKS:
+            self.shift += 1
+        height, width = -(-rows >> self.shift), -(-columns >> self.shift)
+        places = _morton_order(height, width)
+        corners = (np.stack(np.divmod(places, width), axis=1) << self.shift).astype(np.int32)
+        side = 1 << self.shift
+        inner = np.stack(np.divmod(_morton_order(side, side), side), axis=1).astype(np.int32)
+        coarse = max(0, self.shift - _PARTS.bit_length() + 1)
+        parts = np.zeros((1 << 2 * (self.shift - coarse), len(places)))
+        lit = np.zeros(len(places), np.int64)
+        _sum_blocks(weights, corners, inner, coarse, self.shift - coarse, lit, parts)
+        self.power = float(parts.sum())
+        if not self.power > 0.0:  # black: all alike, but for the density
+            weights[:] = 1.0
+            _sum_blocks(weights, corners, inner, coarse, self.shift - coarse, lit, parts)
+
+        with_light = lit > 0
+        self.corners, lit = corners[with_light], lit[with_light]
+        self.parts = parts[:, with_light] / parts.sum()
+        self.block = np.zeros((height, width), np.int32)
+        self.block.ravel()[places[with_light]] = np.arange(len(lit))
+        # Every cell gets one random number, and its share of the others.
+        reached = np.append(0.0, np.cumsum(self.parts.sum(axis=0)))
+        reached[-1] = 1.0
+        before = np.append(0, np.cumsum(lit))
+        spare = 2**32 - int(before[-1])
+        starts = np.floor(reached * spare).astype(np.int64) + before
+        self.first = starts[:-1].astype(np.uint32)
+        self.runs = np.empty((int(before[-1]), 2), np.uint32)
+        self.guide = np.zeros(1 << (rows * columns - 1).bit_length(), np.int32)
+        self.density = np.zeros((rows, columns), np.float32)
+        unit = 2.0**-32 if self.power > 0.0 else 0.0
+        dealt = before, reached, starts, spare, self.runs, self.guide
+        _deal(weights, 1.0 / parts.sum(), self.corners, inner, *dealt, unit / solid, self.step, self.density, texels)
+
+    def part_directions(self) -> Array:
+        """(3, p, n) float32 unit directions towards the middles of `parts`, in the environment's frame."""
+        rows, columns = len(self.edges) - 1, self.density.shape[1]
+        along = math.isqrt(len(self.parts))
+        side = (1 << self.shift) // along
+        row, column = np.stack(np.divmod(np.arange(len(self.parts)), along))[:, :, None] * side
+        top, left = np.minimum(self.corners[:, 0] + row, rows), np.minimum(self.corners[:, 1] + column, columns)
+        z = 0.5 * (self.edges[top] + self.edges[np.minimum(top + side, rows)])
+        turn = 0.5 - 0.5 * (left + np.minimum(left + side, columns)) / columns
+        ring = np.sqrt(np.maximum(0, 1 - z * z))
+        return np.stack([ring * np.cos(2 * np.pi * turn), ring * np.sin(2 * np.pi * turn), z]).astype(np.float32)
+
+
+def _step(h: int, w: int) -> int:
+    """Texels along a side of a cell: few enough cells, in whole numbers of texels; 1 where that cannot be."""
+    for step in range(1, min(h, w) + 1):
+        if (h // step) * (w // step) <= _MOST_CELLS and h % step == 0 and w % step == 0:
+            return step
+    return 1
+
+
+@njit
+def _morton_order(rows, columns):  # type: ignore[no-untyped-def]
+    """Cells of a grid in the order of their interleaved index bits: neighbours in the grid stay near each other."""
+    order = np.empty(rows * columns, np.int64)
+    side = 1
+    while side < max(rows, columns):
+        side *= 2
+    found = 0
+    for code in range(side * side):
+        row, column = np.uint32(code >> 1), np.uint32(code)
+        row, column = row & np.uint32(0x55555555), column & np.uint32(0x55555555)
+        row, column = (row | row >> np.uint32(1)), (column | column >> np.uint32(1))
+        row, column = row & np.uint32(0x33333333), column & np.uint32(0x33333333)
+        row, column = (row | row >> np.uint32(2)), (column | column >> np.uint32(2))
+        row, column = row & np.uint32(0x0F0F0F0F), column & np.uint32(0x0F0F0F0F)
+        row, column = (row | row >> np.uint32(4)), (column | column >> np.uint32(4))
+        row, column = row & np.uint32(0x00FF00FF), column & np.uint32(0x00FF00FF)
+        row, column = (
+            (row | row >> np.uint32(8)) & np.uint32(0xFFFF),
+            (column | column >> np.uint32(8)) & np.uint32(0xFFFF),
+        )
+        if row < rows and column < columns:
+            order[found] = np.int64(row) * columns + np.int64(column)
+            found += 1
+    return order
+
+
+@njit
+def _luminance(texels, row, red, green, blue, out):  # type: ignore[no-untyped-def]
+    for c in range(len(out)):
+        out[c] = red * texels[row, c, 0] + green * texels[row, c, 1] + blue * texels[row, c, 2]
+
+
+@njit(parallel=True)
+def _weigh(texels, red, green, blue, solid, step, weights):  # type: ignore[no-untyped-def]
+    """Add to each cell its solid angle times the mean luminance, as the bilinear lookup has it, over its texels.
+
+    The mean over a texel of the bilinear interpolant is three quarters of itself and an eighth of either neighbour,
+    along both axes; columns wrap, rows clamp.
+    """
+    h, w = texels.shape[:2]
+    strip = (_STRIP + step - 1) // step * step
+    for s in prange((h + strip - 1) // strip):
+        upper, here, lower, mixed = np.empty(w), np.empty(w), np.empty(w), np.empty(w)
+        top, end = s * strip, min(h, (s + 1) * strip)
+        _luminance(texels, max(top - 1, 0), red, green, blue, upper)
+        _luminance(texels, top, red, green, blue, here)
+        for row in range(top, end):
+            _luminance(texels, min(row + 1, h - 1), red, green, blue, lower)
+            for c in range(w):
+                mixed[c] = 0.75 * here[c] + 0.125 * (upper[c] + lower[c])
+            scale = solid[row // step] / (step * step)
+            for cell, c in enumerate(range(0, w, step)):
+                total = 0.0
+                for k in range(c, min(c + step, w)):
+                    before, after = mixed[k - 1 if k else w - 1], mixed[k + 1 if k + 1 < w else 0]
+                    total += 0.75 * mixed[k] + 0.125 * (before + after)
+                weights[row // step, cell] += total * scale
+            for c in range(w):
+                upper[c], here[c] = here[c], lower[c]
+
+
+@njit(parallel=True)
+def _sum_blocks(weights, corners, inner, coarse, bits, lit, parts):  # type: ignore[no-untyped-def]
+    """Count the lit cells of each block and sum the power of its parts, which are 2^coarse cells wide."""
+    rows, columns = weights.shape
+    for b in prange(len(corners)):
+        lit[b] = 0
+        parts[:, b] = 0.0
+        for k in range(len(inner)):
+            row, column = corners[b, 0] + inner[k, 0], corners[b, 1] + inner[k, 1]
+            if row < rows and column < columns and weights[row, column] > 0.0:
+                lit[b] += 1
+                parts[((inner[k, 0] >> coarse) << bits) + (inner[k, 1] >> coarse), b] += weights[row, column]
+
+
+@njit(parallel=True)
+def _deal(  # type: ignore[no-untyped-def]
+    weights, scale, corners, inner, before, reached, starts, spare, runs, guide, per_number, step, density, texels
+):
+    """Divide the random numbers of each block among its lit cells; write their densities."""
+    rows, columns = weights.shape
+    width = (np.int64(1) << 32) // len(guide)
+    for b in prange(len(corners)):
+        i, start, sum_ = before[b], starts[b], reached[b]
+        for k in range(len(inner)):
+            row, column = corners[b, 0] + inner[k, 0], corners[b, 1] + inner[k, 1]
+            if row < rows and column < columns and weights[row, column] > 0.0:
+                sum_ = min(sum_ + weights[row, column] * scale, reached[b + 1])
+                i += 1
+                end = starts[b + 1] if i == before[b + 1] else np.int64(sum_ * spare) + i
+                runs[i - 1, 0] = np.uint32(end - 1)
+                runs[i - 1, 1] = np.uint32(row * columns + column)
+                for slice_ in range((start + width - 1) // width, (end - 1) // width + 1):
+                    guide[slice_] = i - 1
+                density[row, column] = (end - start) * per_number[row]
+                for y in range(row * step, (row + 1) * step):
+                    for x in range(column * step, (column + 1) * step):
+                        texels[y, x, 3] = density[row, column]
+                start = end

@@ -1,0 +1,373 @@
+"""What shines next to the sky, Blender's lights and surfaces that emit: directions towards them, those that rays meet.
+
+``lamp_tree`` says which lamp to sample from a point, ``lamp_shapes`` what one lamp is; ``emitters`` are the surfaces.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...compute.jit import njit
+from ...core.frame import Light
+from ..sampling import ONE, ZERO, F, U
+from ..scene.interaction import emitted
+from .light_shapes import (
+    BARE_SUN,
+    BOUND,
+    CAMERA,
+    DIFFUSE,
+    FLAGS,
+    GLOSSY,
+    INTENSITY,
+    KIND,
+    PLACE,
+    RADIANCE,
+    SHADOW,
+    WIDTH,
+    lamp_density,
+    lamp_direction,
+    lamp_emission,
+    lamp_hit,
+    lamp_row,
+)
+from .light_tree import (
+    COUNT,
+    END,
+    FIRST,
+    NEXT,
+    PAST,
+    SECOND,
+    SUNS,
+    box_hit,
+    build,
+    is_sun,
+    lamps_weight,
+    pick_lamp,
+    pick_probability,
+)
+from .mesh_lights import Emitters, emitter_bits, emitter_pdf, emitter_row, emitters_luminance, sample_emitter
+
+Array = np.ndarray
+
+
+class Lamps:
+    """Lights made ready for compiled code.
+
+    Parameters
+    ----------
+    lights : Blender's lights of one frame
+    centre, radius : a sphere around what they shine on, world space; only for `power`
+    emitters : surfaces that emit light; those that are not among them are found by chance alone
+
+    Attributes
+    ----------
+    table : (k, WIDTH) float32: one lamp a row, in the order of the tree, suns last; k >= 1 (a black one when there is
+        none)
+    pick : (m, 16) float32: the tree, see the columns above
+    order : (count,) int: which of `lights` each row is
+    count : int: lamps that shine, and triangles
+    power : estimated luminance that arrives at the sphere from all directions together (cd / m^2 sr), as the integral
+        of an environment over all directions is
+    rays_differ : bool: there is one that diffuse rays see and glossy ones do not, or the other way
+    seen : bool: there is a lamp that the camera sees
+    warnings : list of str: lights that are left out, and why
+    """
+
+    def __init__(
+        self,
+        lights: list[Light],
+        centre: Array | None = None,
+        radius: float = 1.0,
+        emitters: Emitters | None = None,
+    ) -> None:
+        self.emitters = emitters or _NO_EMITTERS
+        rows: list[Array] = []
+        kept: list[int] = []
+        self.warnings: list[str] = []
+        for i, light in enumerate(lights):
+            row = lamp_row(light)
+            if isinstance(row, str):
+                self.warnings.append(f"light {light.name!r} is left out: {row}")
+            else:
+                rows.append(row)
+                kept.append(i)
+        self.warnings += self.emitters.warnings
+        self.count = len(rows) + self.emitters.count
+        table = np.array(rows, np.float32).reshape(-1, WIDTH)
+        order, self.pick = build(table)
+        self.table = table[order] if rows else np.zeros((1, WIDTH), np.float32)
+        self.order = np.array(kept, np.int64)[order]
+        middle = np.zeros(3) if centre is None else np.asarray(centre, np.float64)
+        self.power = self._power(middle, radius) + self.emitters.power(middle, radius)
+        flags = self.table[:, FLAGS].astype(int)
+        self.rays_differ = bool(((flags >> 1 ^ flags >> 2) & 1).any()) or self.emitters.rays_differ
+        self.seen = bool((flags & CAMERA).any())
+
+    @property
+    def tables(self) -> tuple[Array, Array, int]:
+        """What compiled code takes as `lamps`; until the next update of the emitters' scene."""
+        return self.table, self.pick, self.emitters.address
+
+    def sample(self, numbers: Array, points: Array) -> tuple[Array, Array, Array, Array, Array]:
+        """``sample_lamp`` for (n, 3) uint32 and (n, 3) or (3,) points.
+
+        Returns
+        -------
+        (directions (n, 3), distances (n,), radiance (n, 3), densities (n,), rows (n,))
+        """
+        numbers = np.ascontiguousarray(numbers, np.uint32)
+        out, rows = _sample_many(numbers, _rows(points, numbers), *self.tables)
+        return out[:, :3], out[:, 3], out[:, 4:7], out[:, 7], rows
+
+    def pdf(self, rows: Array, points: Array, directions: Array) -> Array:
+        """(n,) ``pdf_lamp`` of table rows (n,) for (n, 3) unit directions at (n, 3) or (3,) points."""
+        directions = np.ascontiguousarray(directions, np.float32)
+        rows = np.ascontiguousarray(np.broadcast_to(rows, len(directions)), np.int64)
+        return _pdf_many(rows, _rows(points, directions), directions, *self.tables)
+
+    def along(
+        self,
+        origins: Array,
+        directions: Array,
+        others: Array | float = 1.0,
+        share: float = 0.0,
+        seen_by: int = DIFFUSE,
+        tmax: float = np.inf,
+    ) -> Array:
+        """(n, 3) ``lamps_along`` for (n, 3) unit directions from (n, 3) or (3,) origins."""
+        directions = np.ascontiguousarray(directions, np.float32)
+        others = np.ascontiguousarray(np.broadcast_to(np.asarray(others, np.float32), len(directions)))
+        return _along_many(_rows(origins, directions), directions, F(tmax), others, F(share), seen_by, *self.tables)
+
+    def _power(self, centre: Array, radius: float) -> float:
+        table = self.table.astype(np.float64)
+        square = np.sum((table[:, PLACE : PLACE + 3] - centre) ** 2, axis=1)
+        square = np.maximum(np.maximum(square, table[:, BOUND] ** 2), max(float(radius), 1e-9) ** 2)
+        return float(np.sum(table[:, INTENSITY] / np.where(is_sun(table), 1.0, square)))
+
+
+def _rows(values: Array, like: Array) -> Array:
+    """float32 rows, one broadcast to as many as `like` has."""
+    values = np.asarray(values, np.float32)
+    return np.ascontiguousarray(np.broadcast_to(values, (len(like), 3)))
+
+
+_NO_EMITTERS = Emitters()
+
+
+@njit
+def _emitters_share(px, py, pz, table, pick, emitters):  # type: ignore[no-untyped-def]
+    """How often surfaces are sampled from a point, rather than lamps; float64."""
+    if emitters == 0:
+        return 0.0
+    if pick[0, END] == ZERO:
+        return 1.0
+    own = emitters_luminance(px, py, pz, emitters)
+    both = own + np.float64(lamps_weight(px, py, pz, table, pick))
+    return own / both if both > 0.0 else 0.0
+
+
+@njit
+def sample_lamp(n0, n1, n2, px, py, pz, table, pick, emitters):  # type: ignore[no-untyped-def]
+    """A direction from a point towards one of the lamps or surfaces, from three uint32.
+
+    Returns
+    -------
+    (lx, ly, lz, distance, r, g, b, pdf, index)
+        World direction of unit length, distance to the lamp (infinite for suns), radiance, density per solid angle
+        times the probability of the pick, row of the table or, behind those, of the emitters. A negative density
+        marks a lamp that no other strategy finds (without size, or one that nothing shadows): what it adds is
+        f cos rgb / |pdf| without a further weight.
+        (..., 0, 0, 0, 0, -1 or the lamp) when the lamp sends nothing here.
+    """
+    share = _emitters_share(px, py, pz, table, pick, emitters)
+    if share > 0.0:
+        rest = np.float64(n0) * (1.0 / 4294967296.0)
+        if rest < share:
+            lx, ly, lz, t, r, g, b, pdf, i = sample_emitter(rest / share, n1, n2, px, py, pz, emitters)
+            return lx, ly, lz, t, r, g, b, pdf * F(share), i + len(table) if i >= 0 else i
+        n0 = U(np.int64(min((rest - share) / (1.0 - share), 1.0) * 4294967295.0))
+    i, probability = pick_lamp(n0, px, py, pz, table, pick)
+    probability *= F(1.0 - share)
+    if i < 0:
+        return ZERO, ZERO, ONE, ZERO, ZERO, ZERO, ZERO, ZERO, np.int64(-1)
+    lx, ly, lz, t = lamp_direction(i, n1, n2, px, py, pz, table)
+    if not t >= ZERO:
+        return ZERO, ZERO, ONE, ZERO, ZERO, ZERO, ZERO, ZERO, i
+    bare = table[i, KIND] <= F(BARE_SUN)
+    if bare:
+        pdf = -probability
+    else:
+        pdf = probability * lamp_density(i, px, py, pz, lx, ly, lz, t, table)
+        if not np.int64(table[i, FLAGS]) & SHADOW:
+            pdf = -pdf
+    part = lamp_emission(i, lx, ly, lz, table)
+    if bare and table[i, KIND] != F(BARE_SUN):
+        part /= t * t
+    r, g, b = part * table[i, RADIANCE], part * table[i, RADIANCE + 1], part * table[i, RADIANCE + 2]
+    if not (r + g + b < F(np.inf) and abs(pdf) > ZERO and abs(pdf) < F(np.inf)):
+        return lx, ly, lz, t, ZERO, ZERO, ZERO, ZERO, i
+    return lx, ly, lz, t, r, g, b, pdf, i
+
+
+@njit
+def lamp_flags(index, table, emitters):  # type: ignore[no-untyped-def]
+    """Bits CAMERA, DIFFUSE, GLOSSY (rays that see it), SHADOW (things block it) and ABSENT of what was sampled."""
+    if index >= len(table):
+        return emitter_bits(index - len(table), emitters)
+    return np.int64(table[index, FLAGS])
+
+
+@njit
+def pdf_lamp(index, px, py, pz, lx, ly, lz, table, pick, emitters):  # type: ignore[no-untyped-def]
+    """Density per solid angle, pick included, with which ``sample_lamp`` draws this unit direction by this lamp.
+
+    0 where the lamp sends nothing from there: the density of samples whose radiance is not 0. 0 for lamps without size.
+    """
+    t = lamp_hit(index, px, py, pz, lx, ly, lz, table)
+    if not (t >= ZERO and lamp_emission(index, lx, ly, lz, table) > ZERO):
+        return ZERO
+    density = lamp_density(index, px, py, pz, lx, ly, lz, t, table)
+    if not density > ZERO:
+        return ZERO
+    return density * _probability(index, px, py, pz, table, pick, emitters)
+
+
+@njit
+def _probability(index, px, py, pz, table, pick, emitters):  # type: ignore[no-untyped-def]
+    """With which a lamp is picked."""
+    share = F(1.0 - _emitters_share(px, py, pz, table, pick, emitters))
+    return share * pick_probability(index, px, py, pz, table, pick)
+
+
+@njit
+def emission_along(ox, oy, oz, dx, dy, dz, hit, geometry, table, pick, emitters):  # type: ignore[no-untyped-def]
+    """What the surface that a ray meets emits, and how it is found by ``sample_lamp``.
+
+    Parameters
+    ----------
+    ox .. dz : origin and unit direction, world space
+    hit : what ``trace.surface.nearest`` returned
+    geometry : the scene's
+
+    Returns
+    -------
+    (r, g, b, diffuse, glossy)
+        Radiance, 0 without a hit; density per solid angle, pick included, with which ``sample_lamp`` draws this
+        direction by this surface, for either lobe.
+    """
+    if hit[1] < 0:
+        return ZERO, ZERO, ZERO, ZERO, ZERO
+    r, g, b = emitted(hit[1], hit[3], hit[4], geometry)
+    if not r + g + b > ZERO:
+        return ZERO, ZERO, ZERO, ZERO, ZERO
+    i = emitter_row(hit[1], hit[2], emitters)
+    if i < 0:
+        return r, g, b, ZERO, ZERO
+    pdf = emitter_pdf(i, ox, oy, oz, dx, dy, dz, hit[0], emitters)
+    pdf *= F(_emitters_share(ox, oy, oz, table, pick, emitters))
+    flags = lamp_flags(len(table) + i, table, emitters)
+    return r, g, b, pdf if flags & DIFFUSE else ZERO, pdf if flags & GLOSSY else ZERO
+
+
+@njit
+def _add_lamp(i, ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, pick, emitters):  # type: ignore[no-untyped-def]
+    flags = np.int64(table[i, FLAGS])
+    # What nothing shadows is left to ``sample_lamp``: only the camera looks at it along rays.
+    if not flags & seen_by or not (flags & SHADOW or seen_by & CAMERA):
+        return ZERO, ZERO, ZERO
+    t = lamp_hit(i, ox, oy, oz, dx, dy, dz, table)
+    if not (t >= ZERO and (t < tmax or t == tmax == F(np.inf))):
+        return ZERO, ZERO, ZERO
+    weight = lamp_emission(i, dx, dy, dz, table)
+    if not weight > ZERO:
+        return ZERO, ZERO, ZERO
+    if share > ZERO:
+        density = lamp_density(i, ox, oy, oz, dx, dy, dz, t, table)
+        weight /= others + share * density * _probability(i, ox, oy, oz, table, pick, emitters)
+    else:
+        weight /= others
+    return weight * table[i, RADIANCE], weight * table[i, RADIANCE + 1], weight * table[i, RADIANCE + 2]
+
+
+@njit
+def lamps_along(ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, pick, emitters):  # type: ignore[no-untyped-def]
+    """Sum over the lamps with size that a ray meets of L / (others + share * pick * density).
+
+    Parameters
+    ----------
+    ox .. dz : origin and unit direction, world space; tmax : distance of the surface behind, infinite when none
+    others : sum over all other strategies of count times density in this direction; must be positive
+    share : number of lamp samples that the balance heuristic reckons with; 0 leaves them out
+    seen_by : CAMERA, DIFFUSE or GLOSSY: lamps that such rays do not see are left out
+
+    Returns
+    -------
+    (r, g, b)
+    """
+    red, green, blue = ZERO, ZERO, ZERO
+    node, count = np.int64(1), np.int64(pick[0, COUNT])
+    while node < count:
+        if not box_hit(node, ox, oy, oz, dx, dy, dz, tmax, pick):
+            node = np.int64(pick[node, NEXT])
+            continue
+        if pick[node, SECOND] == ZERO:
+            for i in range(np.int64(pick[node, FIRST]), np.int64(pick[node, PAST])):
+                r, g, b = _add_lamp(i, ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, pick, emitters)
+                red, green, blue = red + r, green + g, blue + b
+        node += 1
+    r, g, b = suns_along(ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, pick, emitters)
+    return red + r, green + g, blue + b
+
+
+@njit
+def suns_along(ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, pick, emitters):  # type: ignore[no-untyped-def]
+    """`lamps_along` of suns alone."""
+    red, green, blue = ZERO, ZERO, ZERO
+    for i in range(np.int64(pick[0, SUNS]), np.int64(pick[0, END])):
+        r, g, b = _add_lamp(i, ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, pick, emitters)
+        red, green, blue = red + r, green + g, blue + b
+    return red, green, blue
+
+
+@njit
+def _sample_many(numbers, points, table, pick, emitters):  # type: ignore[no-untyped-def]
+    out, rows = np.empty((len(numbers), 8), np.float32), np.empty(len(numbers), np.int64)
+    for j in range(len(numbers)):
+        lx, ly, lz, t, r, g, b, pdf, i = sample_lamp(
+            numbers[j, 0],
+            numbers[j, 1],
+            numbers[j, 2],
+            points[j, 0],
+            points[j, 1],
+            points[j, 2],
+            table,
+            pick,
+            emitters,
+        )
+        out[j, 0], out[j, 1], out[j, 2], out[j, 3] = lx, ly, lz, t
+        out[j, 4], out[j, 5], out[j, 6], out[j, 7] = r, g, b, pdf
+        rows[j] = i
+    return out, rows
+
+
+@njit
+def _pdf_many(rows, points, directions, table, pick, emitters):  # type: ignore[no-untyped-def]
+    out = np.empty(len(points), np.float32)
+    for j in range(len(points)):
+        out[j] = pdf_lamp(
+            rows[j], points[j, 0], points[j, 1], points[j, 2], directions[j, 0], directions[j, 1], directions[j, 2],
+            table, pick, emitters,
+        )  # fmt: skip
+    return out
+
+
+@njit
+def _along_many(origins, directions, tmax, others, share, seen_by, table, pick, emitters):  # type: ignore[no-untyped-def]
+    out = np.empty((len(origins), 3), np.float32)
+    for j in range(len(origins)):
+        out[j, 0], out[j, 1], out[j, 2] = lamps_along(
+            origins[j, 0], origins[j, 1], origins[j, 2], directions[j, 0], directions[j, 1], directions[j, 2],
+            tmax, others[j], share, seen_by, table, pick, emitters,
+        )  # fmt: skip
+    return out

@@ -1,0 +1,324 @@
+"""Surfaces that emit light as lights that are sampled: all their triangles, one of which is picked by `emitter_tree`.
+
+What a triangle is estimated to send takes the mean of its texture; what it sends is looked up exactly.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...compute.jit import njit
+from ...core.color import LUMINANCE as WEIGHTS
+from ..memory import Place, address, load_float, load_int32, load_int64
+from ..sampling import ONE, ZERO, F, unit
+from ..scene.interaction import Geometry, emitted
+from ..scene.trace_scene import Glowing, TraceScene
+from .light_shapes import DIFFUSE, GLOSSY, SHADOW
+from .mesh_light_tree import Tree, build, emitter_probability, emitters_weight, morton_order, pick_emitter
+from .triangle_light import (
+    ABSENT,
+    AREA,
+    BITS,
+    CLOSED,
+    CORNER,
+    EDGE,
+    LONGEST,
+    LUMINANCE,
+    NORMAL,
+    SIDE,
+    WIDTH,
+    triangle_density,
+    triangle_direction,
+)
+
+Array = np.ndarray
+
+#: Triangles that are sampled; meshes with the most are left to chance first.
+MOST = 1 << 20
+#: Triangles that have less than this part of the power are left to chance, and those with less area (square metres).
+_FAINTEST, _SMALLEST = 1e-9, 1e-18
+#: Barycentric places at which a triangle's texture is looked up.
+_PLACES = np.array([[4, 4, 4], [8, 2, 2], [2, 8, 2], [2, 2, 8]], np.float32) / 12
+
+
+class EmitterTables(NamedTuple):
+    """Emitters for compiled code; valid as long as they live and the scene is not updated. All are int64.
+
+    Attributes
+    ----------
+    tree : see `emitter_tree`
+    faces : address of (n,) int32, the scene's face of each row
+    slot : address of (m - vertex_faces,) int32, of each face, or -1; counted within the mesh where it stands in places
+    first : address of (places,) int32, what to add for each place
+    row : address of (slots,) int32, or -1
+    geometry : the scene's
+    """
+
+    tree: Tree
+    faces: int
+    slot: int
+    first: int
+    row: int
+    geometry: Geometry
+
+
+class Emitters:
+    """The emitting triangles of a scene.
+
+    Parameters
+    ----------
+    scene : None: there are none
+    previous : of the frame before; what has not changed is taken over
+
+    Attributes
+    ----------
+    count : triangles that are sampled
+    rays_differ : there is one that diffuse rays see and glossy ones do not, or the other way
+    warnings : list of str
+    """
+
+    def __init__(self, scene: TraceScene | None = None, previous: Emitters | None = None) -> None:
+        self._scene = scene
+        glowing = scene.glowing if scene is not None else []
+        self._known: list[Any] = [scene and scene.materials]
+        for glow in glowing:
+            self._known += [glow.mesh, int(glow.faces[0]), None if glow.places is None else glow.places.start]
+        if previous is not None and _same(self._known, previous._known):
+            self._take(previous)
+            return
+        self.warnings: list[str] = []
+        self.rows, self.faces = np.zeros((1, WIDTH), np.float32), np.zeros(1, np.int32)
+        self.slot, self.first, self.row = (np.full(1, -1, np.int32) for _ in range(3))
+        self.count, self.scale, self.rays_differ = 0, 0.0, False
+        self._shut: list[tuple[Array, bool]] = []  # faces of meshes, whether they are closed
+        if scene is not None and glowing:
+            self._gather(scene, glowing, previous._shut if previous is not None else [])
+        self.nodes, self.sums = build(self.rows[: self.count], self.scale)
+
+    def _take(self, other: Emitters) -> None:
+        names = (
+            "warnings",
+            "rows",
+            "faces",
+            "slot",
+            "first",
+            "row",
+            "count",
+            "scale",
+            "rays_differ",
+            "nodes",
+            "sums",
+            "_shut",
+        )
+        for name in names:
+            setattr(self, name, getattr(other, name))
+
+    @property
+    def address(self) -> int:
+        """What compiled code takes, 0 where there is none; until the next update of the scene."""
+        return self.address_at(address)
+
+    def address_at(self, place: Place) -> int:
+        """`address` of arrays that lie elsewhere."""
+        if self._scene is None or not self.count:
+            return 0
+        where = [place(array) for array in (self.rows, self.nodes, self.sums)] + [self.count, len(self.nodes) // 2]
+        where += [place(array) for array in (self.faces, self.slot, self.first, self.row)]
+        self._tables = np.array([*where, *self._scene.geometry_at(place)], np.int64)
+        return place(self._tables)
+
+    def power(self, centre: Array, radius: float) -> float:
+        """Luminance that arrives at a sphere from all directions together, as `Lamps.power`."""
+        if not self.count:
+            return 0.0
+        rows = self.rows.astype(np.float64)
+        middle = rows[:, CORNER : CORNER + 3] + (rows[:, EDGE : EDGE + 3] + rows[:, SIDE : SIDE + 3]) / 3.0
+        square = np.maximum(((middle - centre) ** 2).sum(axis=1), max(float(radius), 1e-9) ** 2)
+        return float((rows[:, LUMINANCE] * rows[:, AREA] / square).sum() * self.scale)
+
+    def _gather(self, scene: TraceScene, glowing: list[Glowing], known: list[tuple[Array, bool]]) -> None:
+        """Fill all arrays."""
+        sizes = [len(glow.faces) * (1 if glow.places is None else len(glow.places)) for glow in glowing]
+        slots = 0
+        kept: list[tuple[Glowing, int, int]] = []
+        self.slot = np.full(len(scene.faces) - scene.vertex_faces, -1, np.int32)
+        self.first = np.zeros(max(len(scene.places), 1), np.int32)
+        for index in np.argsort(sizes, kind="stable"):
+            glow, size = glowing[index], sizes[index]
+            if slots + size > MOST:
+                self.warnings.append(
+                    f"{glow.mesh.name}: {size} emitting faces are too many to be sampled; rays find them by chance"
+                )
+                continue
+            kept.append((glow, slots, size))
+            slots += size
+        rows, faces = np.zeros((slots, WIDTH), np.float32), np.zeros(slots, np.int32)
+        here = np.eye(3, 4, dtype=np.float32)[None]
+        for glow, start, size in kept:
+            own = np.arange(len(glow.faces), dtype=np.int32)
+            self.slot[glow.faces - scene.vertex_faces] = own + (start if glow.places is None else 0)
+            matrices = here
+            if glow.places is not None:
+                self.first[glow.places.start : glow.places.stop] = start + len(own) * np.arange(len(glow.places))
+                matrices = scene.places[glow.places.start : glow.places.stop]
+            part = slice(start, start + size)
+            v = glow.mesh.visibility
+            bits = DIFFUSE * v.diffuse | GLOSSY * v.glossy | SHADOW | ABSENT * (not v.shadow_catcher)
+            self.rays_differ |= v.diffuse != v.glossy
+            faces[part] = np.tile(glow.faces, len(matrices))
+            shut = next((entry for entry in known if entry[0] is glow.mesh.faces), None)
+            shut = shut or (glow.mesh.faces, _is_closed(glow.mesh.faces))
+            self._shut.append(shut)
+            bits |= CLOSED * shut[1]
+            # Normals look outwards where the surface is closed; a mirrored place turns the order of the corners.
+            inwards = shut[1] and _volume(scene.vertices, scene.faces[glow.shape]) < 0.0
+            turned = (np.linalg.det(matrices[:, :, :3]) < 0.0) != inwards
+            luminance = _luminance(glow, scene)
+            _fill(glow.faces, scene.vertices, scene.faces, matrices, luminance, F(bits), turned, rows[part])
+        self._order(rows, faces)
+
+    def _order(self, rows: Array, faces: Array) -> None:
+        """Keep the rows that count, in the order of the tree."""
+        # Products of what the tree handles stay within float32's range.
+        power = rows[:, LUMINANCE].astype(np.float64) * rows[:, AREA]
+        kept = np.flatnonzero((rows[:, AREA] > _SMALLEST) & (power > _FAINTEST * power.sum()))
+        self.row, self.count = np.full(max(len(rows), 1), -1, np.int32), len(kept)
+        if not self.count:
+            return
+        kept = kept[morton_order(rows[kept])]
+        self.rows, self.faces = np.ascontiguousarray(rows[kept]), np.ascontiguousarray(faces[kept])
+        self.row[kept] = np.arange(self.count, dtype=np.int32)
+        self.scale = float(self.rows[:, LUMINANCE].max())
+        self.rows[:, LUMINANCE] /= self.scale
+
+
+def _same(a: list[Any], b: list[Any]) -> bool:
+    return len(a) == len(b) and all(x is y or (isinstance(x, int) and x == y) for x, y in zip(a, b))
+
+
+def _luminance(glow: Glowing, scene: TraceScene) -> Array:
+    """(k,) float32 estimates of the mean luminance of each face: half of it its own, half its material's."""
+    table, weights = scene.materials, np.array(WEIGHTS)
+    out = np.zeros(len(glow.faces), np.float32)
+    for material in np.unique(glow.material):
+        own = glow.material == material
+        mean = float(table.mean_emission(material) @ weights)
+        out[own] = mean
+        if table.arrays[1][material, 3] >= 0 and glow.uvs is not None:
+            uv = np.einsum("pc,fcd->fpd", _PLACES, glow.uvs[own]).reshape(-1, 2)
+            found = table.lookup(np.full(len(uv), material, np.int32), uv)[:, 5:] @ weights
+            out[own] = 0.5 * (mean + found.reshape(-1, len(_PLACES)).mean(axis=1))
+    return out
+
+
+@njit
+def _tables(emitters):  # type: ignore[no-untyped-def]
+    """EmitterTables, from where they stand."""
+    e = emitters
+    tree = Tree(load_int64(e, 0), load_int64(e, 1), load_int64(e, 2), load_int64(e, 3), load_int64(e, 4))
+    geometry = Geometry(
+        load_int64(e, 9), load_int64(e, 10), load_int64(e, 11), load_int64(e, 12), load_int64(e, 13),
+        load_int64(e, 14), load_int64(e, 15), load_int64(e, 16), load_int64(e, 17), load_int64(e, 18),
+    )  # fmt: skip
+    return EmitterTables(tree, load_int64(e, 5), load_int64(e, 6), load_int64(e, 7), load_int64(e, 8), geometry)
+
+
+def _is_closed(faces: Array) -> bool:
+    """Whether each edge of (m, 3) faces belongs to two of them that are turned alike."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
+    one, two = np.sort(edges[:, 0] << 32 | edges[:, 1]), np.sort(edges[:, 1] << 32 | edges[:, 0])
+    return len(one) > 0 and bool((one[1:] != one[:-1]).all() and np.array_equal(one, two))
+
+
+@njit
+def _volume(vertices, faces):  # type: ignore[no-untyped-def]
+    """That a closed surface encloses, negative where its normals look inwards."""
+    volume = 0.0
+    o = vertices[faces[0, 0]].astype(np.float64)
+    for f in range(len(faces)):
+        a, b, c = vertices[faces[f, 0]] - o, vertices[faces[f, 1]] - o, vertices[faces[f, 2]] - o
+        volume += a[0] * (b[1] * c[2] - b[2] * c[1])
+        volume += a[1] * (b[2] * c[0] - b[0] * c[2]) + a[2] * (b[0] * c[1] - b[1] * c[0])
+    return volume
+
+
+@njit
+def _fill(own, vertices, faces, matrices, luminance, bits, turned, rows):  # type: ignore[no-untyped-def]
+    """Rows of faces in (k, 3, 4) places; (k,) `turned` tells that the normals look the other way."""
+    corners, edges = np.empty((3, 3)), np.empty((2, 3))
+    for j in range(len(own) * len(matrices)):
+        m, face = matrices[j // len(own)], own[j % len(own)]
+        for c in range(3):
+            x, y, z = vertices[faces[face, c], 0], vertices[faces[face, c], 1], vertices[faces[face, c], 2]
+            for k in range(3):
+                corners[c, k] = (
+                    np.float64(m[k, 0]) * x + np.float64(m[k, 1]) * y + np.float64(m[k, 2]) * z + np.float64(m[k, 3])
+                )
+        e, f, g = 0.0, 0.0, 0.0
+        for k in range(3):
+            edges[0, k], edges[1, k] = corners[1, k] - corners[0, k], corners[2, k] - corners[0, k]
+            rows[j, CORNER + k], rows[j, EDGE + k], rows[j, SIDE + k] = corners[0, k], edges[0, k], edges[1, k]
+            e, f, g = e + edges[0, k] ** 2, f + edges[1, k] ** 2, g + (edges[1, k] - edges[0, k]) ** 2
+        nx = edges[0, 1] * edges[1, 2] - edges[0, 2] * edges[1, 1]
+        ny = edges[0, 2] * edges[1, 0] - edges[0, 0] * edges[1, 2]
+        nz = edges[0, 0] * edges[1, 1] - edges[0, 1] * edges[1, 0]
+        length = np.sqrt(nx * nx + ny * ny + nz * nz)
+        if length > 0.0:
+            scale = (-1.0 if turned[j // len(own)] else 1.0) / length
+            rows[j, NORMAL], rows[j, NORMAL + 1], rows[j, NORMAL + 2] = nx * scale, ny * scale, nz * scale
+        rows[j, AREA], rows[j, LONGEST] = 0.5 * length, max(e, max(f, g))
+        rows[j, LUMINANCE], rows[j, BITS] = luminance[j % len(own)], bits
+
+
+@njit
+def sample_emitter(rest, n1, n2, px, py, pz, emitters):  # type: ignore[no-untyped-def]
+    """`lamps.sample_lamp` among emitting triangles: `rest` in [0, 1), float64, picks, two uint32 choose the place."""
+    tables = _tables(emitters)
+    i, probability = pick_emitter(rest, px, py, pz, tables.tree)
+    if i < 0:
+        return ZERO, ZERO, ONE, ZERO, ZERO, ZERO, ZERO, ZERO, np.int64(-1)
+    lx, ly, lz, t, u, v, density = triangle_direction(i, unit(n1), unit(n2), px, py, pz, tables.tree.rows)
+    pdf = F(probability * density)
+    if not (t > ZERO and pdf > ZERO and pdf < F(np.inf)):
+        return ZERO, ZERO, ONE, ZERO, ZERO, ZERO, ZERO, ZERO, i
+    r, g, b = emitted(load_int32(tables.faces, i), u, v, tables.geometry)
+    return lx, ly, lz, t, r, g, b, pdf, i
+
+
+@njit
+def emitter_row(face, place, emitters):  # type: ignore[no-untyped-def]
+    """Row of the triangle that a ray hit, -1 when it is not sampled."""
+    if emitters == 0:
+        return np.int64(-1)
+    tables = _tables(emitters)
+    own = np.int64(face) - tables.geometry.vertex_faces
+    if own < 0:
+        return np.int64(-1)
+    slot = np.int64(load_int32(tables.slot, own))
+    if slot < 0:
+        return slot
+    if place >= 0:
+        slot += load_int32(tables.first, np.int64(place))
+    return np.int64(load_int32(tables.row, slot))
+
+
+@njit
+def emitter_bits(i, emitters):  # type: ignore[no-untyped-def]
+    """Bits of a row, see `triangles`."""
+    return np.int64(load_float(_tables(emitters).tree.rows, WIDTH * i + BITS))
+
+
+@njit
+def emitter_pdf(i, px, py, pz, lx, ly, lz, t, emitters):  # type: ignore[no-untyped-def]
+    """Density per solid angle, pick included, of `sample_emitter` in the direction that meets row `i` at t."""
+    tree = _tables(emitters).tree
+    density = triangle_density(i, px, py, pz, lx, ly, lz, t, tree.rows)
+    return F(density * emitter_probability(i, px, py, pz, tree))
+
+
+@njit
+def emitters_luminance(px, py, pz, emitters):  # type: ignore[no-untyped-def]
+    """Estimated luminance that arrives at a point from all that is sampled, unshadowed; float64."""
+    return emitters_weight(px, py, pz, _tables(emitters).tree)

@@ -1,1 +1,0 @@
-"""From light to pixels: film, denoising, frames on disk."""

@@ -1,1 +1,0 @@
-"""What the camera sees, before light."""

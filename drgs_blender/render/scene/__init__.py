@@ -1,0 +1,1 @@
+"""What rays meet: triangles in one BVH, instances, materials, textures."""

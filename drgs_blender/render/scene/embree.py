@@ -1,0 +1,199 @@
+"""Ray casting with Embree, callable from compiled kernels.
+
+Embree is the shared library inside the embreex wheel. Kernels call it through plain function addresses that arrive as
+run-time integers, so compiled code can be cached on disk and still finds the library wherever it is loaded next time.
+"""
+
+from __future__ import annotations
+
+from ...compute import jit  # first of all: it sets Numba up before anything imports Numba  # noqa: F401
+
+# isort: split
+import ctypes
+import functools
+from pathlib import Path
+from typing import Any
+
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+from ...core.errors import DeviceError
+
+_REMEDY = "Reinstall the engine's environment with embreex 4.4 or later"
+
+# Constants of Embree 4's C interface (include/embree4/rtcore_*.h).
+_VERSION_PROPERTY, _RAY_MASK_PROPERTY = 0, 64
+GEOMETRY_TRIANGLE, GEOMETRY_INSTANCE_ARRAY = 0, 122
+BUFFER_INDEX, BUFFER_VERTEX, BUFFER_TRANSFORM = 0, 1, 23
+FORMAT_UINT3, FORMAT_FLOAT3, FORMAT_FLOAT3X4_ROW_MAJOR = 0x5003, 0x9003, 0x9134
+QUALITY_LOW, QUALITY_REFIT = 0, 3
+SCENE_DYNAMIC = 1
+
+
+def _library_path() -> Path:
+    import embreex.rtcore  # its own loader finds Embree's dependencies (TBB) first
+
+    package = Path(embreex.rtcore.__file__).parent
+    for folder, pattern in (
+        (package.parent / "embreex.libs", "libembree4-*.so.4"),
+        (package.parent / "embreex.libs", "embree4*.dll"),
+        (package / ".dylibs", "libembree4*.dylib"),
+    ):
+        if found := sorted(folder.glob(pattern)):
+            return found[0]
+    raise DeviceError("Embree", f"no Embree library lies beside {package}", _REMEDY)
+
+
+@functools.cache
+def library() -> ctypes.CDLL:
+    """Load Embree once.
+
+    Raises
+    ------
+    DeviceError
+        When embreex is missing or holds no library.
+    """
+    try:
+        lib = ctypes.CDLL(str(_library_path()))
+    except (ImportError, OSError) as error:
+        raise DeviceError("Embree", f"cannot be loaded ({error})", _REMEDY) from error
+    pointer, unsigned, size = ctypes.c_void_p, ctypes.c_uint, ctypes.c_size_t
+    for name, result, arguments in (
+        ("rtcNewDevice", pointer, [ctypes.c_char_p]),
+        ("rtcReleaseDevice", None, [pointer]),
+        ("rtcGetDeviceError", ctypes.c_int, [pointer]),
+        ("rtcGetDeviceProperty", ctypes.c_ssize_t, [pointer, ctypes.c_int]),
+        ("rtcNewScene", pointer, [pointer]),
+        ("rtcReleaseScene", None, [pointer]),
+        ("rtcSetSceneFlags", None, [pointer, ctypes.c_int]),
+        ("rtcSetSceneBuildQuality", None, [pointer, ctypes.c_int]),
+        ("rtcCommitScene", None, [pointer]),
+        ("rtcGetSceneBounds", None, [pointer, pointer]),
+        ("rtcNewGeometry", pointer, [pointer, ctypes.c_int]),
+        ("rtcReleaseGeometry", None, [pointer]),
+        ("rtcSetGeometryBuildQuality", None, [pointer, ctypes.c_int]),
+        ("rtcSetSharedGeometryBuffer", None, [pointer, ctypes.c_int, unsigned, ctypes.c_int, pointer] + [size] * 3),
+        ("rtcUpdateGeometryBuffer", None, [pointer, ctypes.c_int, unsigned]),
+        ("rtcSetGeometryMask", None, [pointer, unsigned]),
+        ("rtcSetGeometryInstancedScene", None, [pointer, pointer]),
+        ("rtcCommitGeometry", None, [pointer]),
+        ("rtcAttachGeometryByID", None, [pointer, pointer, unsigned]),
+        ("rtcDetachGeometry", None, [pointer, unsigned]),
+        ("rtcIntersect1", None, [pointer] * 3),
+        ("rtcOccluded1", None, [pointer] * 3),
+    ):
+        function = getattr(lib, name)
+        function.restype, function.argtypes = result, arguments
+    return lib
+
+
+@functools.cache
+def device() -> int:
+    """The one Embree device of this process, which all scenes share and nobody releases.
+
+    Raises
+    ------
+    DeviceError
+        When Embree refuses to start, has another version than 4.4 or a later 4.x, or was built without ray masks.
+    """
+    lib = library()
+    made = lib.rtcNewDevice(None)
+    if not made:
+        raise DeviceError("Embree", f"refuses to start (error {lib.rtcGetDeviceError(None)})", _REMEDY)
+    version = lib.rtcGetDeviceProperty(made, _VERSION_PROPERTY)
+    if not 40400 <= version < 50000:
+        raise DeviceError("Embree", f"has version {version / 10000:.4f}, expected 4.4", _REMEDY)
+    if not lib.rtcGetDeviceProperty(made, _RAY_MASK_PROPERTY):
+        raise DeviceError("Embree", "was built without ray masks", _REMEDY)
+    return int(made)
+
+
+def address(function: Any) -> int:
+    """Where a function of `library` lies in this process."""
+    return ctypes.cast(function, ctypes.c_void_p).value or 0
+
+
+# RTCRayHit as 24 words: org 0-2, tnear 3, dir 4-6, time 7, tfar 8, mask 9, id 10, flags 11,
+# Ng 12-14, u 15, v 16, primID 17, geomID 18, instID 19, instPrimID 20 (new in 4.4), padding to 16 bytes.
+# Embree writes instPrimID on every hit: in a shorter structure it overwrites whatever lies behind on the stack.
+_WORDS = 24
+_TFAR, _MASK, _NORMAL, _U, _V = 8, 9, 12, 15, 16
+_PRIMITIVE, _GEOMETRY, _INSTANCE, _INSTANCE_PRIMITIVE = 17, 18, 19, 20
+
+
+def _emit_call(builder: Any, arguments: Any, words: int) -> Any:
+    """Emit: fill a ray on the stack, call Embree at the given address; returns a loader of words by type."""
+    word, single, pointer = ir.IntType(32), ir.FloatType(), ir.IntType(8).as_pointer()
+    address, scene, *ray = arguments
+    memory = cgutils.alloca_once(builder, ir.ArrayType(word, words))
+    memory.align = 64
+
+    def slot(index: int, kind: Any) -> Any:
+        place = builder.gep(memory, [ir.Constant(word, 0), ir.Constant(word, index)])
+        return builder.bitcast(place, kind.as_pointer())
+
+    ox, oy, oz, dx, dy, dz, tnear, tfar, mask = ray
+    for index, value in enumerate((ox, oy, oz, tnear, dx, dy, dz, ir.Constant(single, 0.0), tfar)):
+        builder.store(value, slot(index, single))
+    builder.store(mask, slot(_MASK, word))
+    for index in (10, 11):
+        builder.store(ir.Constant(word, 0), slot(index, word))
+    for index in (_PRIMITIVE, _GEOMETRY, _INSTANCE):
+        if index < words:
+            builder.store(ir.Constant(word, -1), slot(index, word))
+    kind = ir.FunctionType(ir.VoidType(), [pointer, pointer, pointer]).as_pointer()
+    builder.call(
+        builder.inttoptr(address, kind),
+        [builder.inttoptr(scene, pointer), builder.bitcast(memory, pointer), ir.Constant(pointer, None)],
+    )
+    return lambda index, kind: builder.load(slot(index, kind))
+
+
+_ARGUMENTS = (types.int64, types.int64) + (types.float32,) * 8 + (types.int32,)
+_TRACED = types.Tuple((types.float32,) + (types.int32,) * 3 + (types.float32,) * 5)
+
+
+@intrinsic
+def trace(typing: Any, address: Any, scene: Any, ox: Any, oy: Any, oz: Any, dx: Any, dy: Any, dz: Any,
+          tnear: Any, tfar: Any, mask: Any) -> Any:  # fmt: skip
+    """Closest hit of one ray, for compiled code: ``(t, group, primitive, instance, u, v, gx, gy, gz)``.
+
+    `address` is ``TriangleBVH.intersect_address`` and `scene` ``TriangleBVH.scene``, both int64; `mask` is an int32:
+    the ray meets groups that have one of its bits. ``group`` is -1 when nothing is hit (then t is `tfar`);
+    ``primitive`` counts from the group's first face; ``instance`` counts the group's places, -1 for a group that
+    stands in the world as it is. The hit is (1 - u - v) v0 + u v1 + v v2; (gx, gy, gz) is the geometric normal
+    (v1 - v0) x (v2 - v0), **not** of unit length, before the instance's matrix.
+    """
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        load = _emit_call(builder, arguments, _WORDS)
+        word, single = ir.IntType(32), ir.FloatType()
+        none = ir.Constant(word, -1)
+        owner = load(_INSTANCE, word)
+        instanced = builder.icmp_signed("!=", owner, none)
+        group = builder.select(instanced, owner, load(_GEOMETRY, word))
+        # Embree leaves the place unwritten for hits without instance.
+        place = builder.select(instanced, load(_INSTANCE_PRIMITIVE, word), none)
+        values = [load(_TFAR, single), group, load(_PRIMITIVE, word), place]
+        values += [load(i, single) for i in (_U, _V, _NORMAL, _NORMAL + 1, _NORMAL + 2)]
+        return context.make_tuple(builder, signature.return_type, values)
+
+    return _TRACED(*_ARGUMENTS), codegen
+
+
+@intrinsic
+def blocked(typing: Any, address: Any, scene: Any, ox: Any, oy: Any, oz: Any, dx: Any, dy: Any, dz: Any,
+            tnear: Any, tfar: Any, mask: Any) -> Any:  # fmt: skip
+    """Return whether anything that has a bit of `mask` (int32) lies on the ray; see `trace`.
+
+    `address` is ``TriangleBVH.occluded_address``.
+    """
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        load = _emit_call(builder, arguments, 12)
+        # Embree sets tfar to -inf when the ray is blocked.
+        return builder.fcmp_ordered("<", load(_TFAR, ir.FloatType()), ir.Constant(ir.FloatType(), 0.0))
+
+    return types.boolean(*_ARGUMENTS), codegen

@@ -1,0 +1,37 @@
+"""Which rays meet what: the bits of a group's mask and of a ray's."""
+
+from __future__ import annotations
+
+from ...core.frame import Visibility
+
+#: Kinds of rays. DIFFUSE and GLOSSY are indirect rays from such a scattering, SHADOW those towards light.
+CAMERA, DIFFUSE, GLOSSY, SHADOW = 1, 2, 4, 8
+#: Every DR-GS mesh, whatever sees it: what surfels are tied to.
+SURFELS = 16
+#: What the camera sees of ordinary meshes, next to surfels.
+ORDINARY = 32
+#: ``kind << WITHOUT``: rays of that kind in a world of shadow catchers alone, without what throws shadows on them.
+WITHOUT = 8
+
+#: Bits of ``TraceScene.object_flags``.
+HOLDOUT, CATCHER = 1, 2
+
+
+def group_mask(visibility: Visibility, surfels: bool, seen_only: bool = False) -> int:
+    """Mask of what has this visibility; `surfels` tells DR-GS meshes from ordinary ones.
+
+    Of a DR-GS mesh that is `seen_only`, light does not meet the triangles.
+    """
+    v = visibility
+    kinds = DIFFUSE * v.diffuse | GLOSSY * v.glossy | SHADOW * v.shadow
+    mask = CAMERA * v.camera | kinds
+    if v.shadow_catcher:
+        mask |= kinds << WITHOUT
+    if surfels:
+        return (mask & CAMERA if seen_only else mask) | SURFELS
+    return mask | ORDINARY * v.camera
+
+
+def object_flags(visibility: Visibility) -> int:
+    """HOLDOUT and CATCHER."""
+    return HOLDOUT * visibility.holdout | CATCHER * visibility.shadow_catcher

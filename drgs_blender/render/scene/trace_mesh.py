@@ -1,0 +1,365 @@
+"""One object's place in the traced scene: how its vertices, normals and materials get there.
+
+Nothing that stays the same is done again. An array of an object is taken for unchanged when it is the same array as in
+the last update; nobody may write into it meanwhile.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ...compute.jit import njit, prange
+from ...core.asset.model import as_float
+from ...core.errors import UsageError
+from ...core.frame import MeshState, Visibility
+from ...geometry.normals import VertexNormals
+from .instances import Places, flattens, normal_matrices
+from .ray_masks import group_mask
+
+Array = np.ndarray
+
+#: Columns of ``TraceScene.shading``.
+NORMAL, ALBEDO, ROUGHNESS, METALLIC, SHADING_WIDTH = slice(0, 3), slice(3, 6), 6, 7, 8
+
+#: Coordinates beyond this (metres) are as unusable as NaN: their products overflow.
+FARTHEST = 1e15
+_BLOCK = 4096
+
+
+@dataclass(slots=True)
+class TraceObject:
+    """One DR-GS object as rays see it.
+
+    Attributes
+    ----------
+    name : used in messages
+    vertices : (n, 3) float32, metres, world space
+    faces : (m, 3) int32
+    albedo, roughness, metallic : per vertex (n, 3), (n,), (n,) in [0, 1]; linear Rec.709
+    corner_normals : (m, 3, 3) float32, world space, or None: smooth angle-weighted vertex normals
+    pass_index : Blender's object index pass
+    visibility : which rays meet it
+    seen_only : whether only the camera meets its triangles, light its surfels
+    torn : (m,) bool, faces that no ray meets, or None
+    """
+
+    name: str
+    vertices: Array
+    faces: Array
+    albedo: Array
+    roughness: Array
+    metallic: Array
+    corner_normals: Array | None = None
+    pass_index: int = 0
+    visibility: Visibility = field(default_factory=Visibility)
+    seen_only: bool = False
+    torn: Array | None = None
+
+
+@dataclass(slots=True)
+class Part:
+    """One object or mesh in the scene's arrays.
+
+    Attributes
+    ----------
+    source : its index among the objects, then meshes, of the update
+    item : what was last taken in; None before the first time
+    faces : (m, 3) int32, of its own vertices
+    vertex, face, row : its rows among vertices, faces, and ``shading`` (objects) or ``normals`` (meshes)
+    mask : of its group
+    smooth : whether normals are made from the faces
+    instanced : whether its vertices are in object space
+    dead : (m,) bool, faces that touch an unusable vertex or are torn, or None
+    reach : metres, the largest coordinate of its vertices
+    bad_vertices, bad_faces : that are unusable, or touch one that is
+    empty_faces, flat_faces : without area as a shape, and where its matrix puts it
+    """
+
+    source: int
+    name: str
+    faces: Array
+    vertex: slice
+    face: slice
+    row: slice
+    mask: int
+    smooth: bool
+    instanced: bool = False
+    item: TraceObject | MeshState | None = None
+    dead: Array | None = None
+    reach: float = 0.0
+    bad_vertices: int = 0
+    bad_faces: int = 0
+    empty_faces: int = 0
+    flat_faces: int = 0
+    smoother: VertexNormals | None = None
+    own_normals: Array | None = None  # of meshes, object space
+
+    def fits(self, item: TraceObject | MeshState, places: Places | None) -> bool:
+        """Whether `item` can take the part's place without a new layout."""
+        return (
+            self.smooth == (item.corner_normals is None)
+            and self.instanced == (places is not None and places.instanced)
+            and self.mask == mask_of(item)
+            and self.vertex.stop - self.vertex.start == len(item.vertices)
+            and (self.faces is item.faces or np.array_equal(self.faces, item.faces))
+        )
+
+    @property
+    def traced_faces(self) -> Array:
+        """Its faces with the dead ones collapsed to one point, where no ray meets them."""
+        if self.dead is None:
+            return self.faces
+        faces = self.faces.copy()
+        faces[self.dead] = 0
+        return faces
+
+    def take_vertices(
+        self, vertices: Array, matrix: Array | None, target: Array, torn: Array | None = None
+    ) -> tuple[bool, bool]:
+        """Bring (n, 3) `vertices`, moved by a (3, 4) matrix, to `target`; returns (anything moved, other dead faces).
+
+        Unusable vertices are put at the origin.
+        """
+        if matrix is None:
+            bad, moved, self.reach = _copy_vertices(vertices, target)
+        else:
+            bad, moved, self.reach = _move_vertices(vertices, matrix, target)
+        self.bad_vertices, self.bad_faces = int(bad), 0
+        before, dead = self.dead, torn
+        if bad:
+            with np.errstate(invalid="ignore", over="ignore"):
+                world = vertices if matrix is None else vertices @ matrix[:, :3].T + matrix[:, 3]
+                unusable = ~(np.abs(world) < FARTHEST).all(axis=1)
+            dead = unusable[self.faces].any(axis=1)
+            self.bad_faces = int(dead.sum())
+            dead = dead if torn is None else dead | torn
+        self.dead = dead
+        same = before is dead or (before is not None and dead is not None and np.array_equal(before, dead))
+        return bool(moved), not same
+
+    def count_empty(self, vertices: Array) -> int:
+        """Living faces without area."""
+        a, b, c = np.moveaxis(vertices[self.faces], 1, 0)
+        empty = ~((np.cross(b - a, c - a) ** 2).sum(axis=1) > 0)
+        return int((empty if self.dead is None else empty & ~self.dead).sum())
+
+    def smooth_normals(self, vertices: Array, out: Array) -> None:
+        """Normals of `vertices` from the living faces, into (n, 3) `out`."""
+        if self.smoother is None:
+            self.smoother = VertexNormals(self.faces, len(vertices))
+        empty = self.smoother.into(vertices, self.traced_faces, out)
+        self.empty_faces = empty - (0 if self.dead is None else int(self.dead.sum()))
+
+    def given_normals(self, normals: Array, vertices: Array, out: Array) -> None:
+        """Unit normals from those given, one a corner, into (3 m, 3) `out`; a face's own where they are unusable."""
+        given = as_float(normals, (len(self.faces), 3, 3), f"corner normals of {self.name}")
+        empty = _given_normals(given, vertices, self.traced_faces, out)
+        self.empty_faces = int(empty) - (0 if self.dead is None else int(self.dead.sum()))
+
+
+def mask_of(item: TraceObject | MeshState) -> int:
+    """Group mask of an object or a mesh."""
+    if isinstance(item, TraceObject):
+        return group_mask(item.visibility, True, item.seen_only)
+    return group_mask(item.visibility, False)
+
+
+def own_faces(item: TraceObject | MeshState) -> Array:
+    """(m, 3) int32 faces of `item`; UsageError when they refer to vertices that do not exist."""
+    faces = np.ascontiguousarray(item.faces, np.int32).reshape(-1, 3)
+    n = len(item.vertices)
+    if len(faces) and (faces.min() < 0 or faces.max() >= n):
+        raise UsageError(item.name, f"faces refer to vertices outside 0..{n - 1}", "Check the mesh's indices")
+    return faces
+
+
+def take_object(part: Part, item: TraceObject, vertices: Array, shading: Array) -> tuple[bool, bool]:
+    """Bring an object up to date in the scene's `vertices` and `shading`; what `Part.take_vertices` returns."""
+    before = part.item if isinstance(part.item, TraceObject) else None
+    moved, died = False, False
+    own, rows = vertices[part.vertex], shading[part.row]
+    if before is None or before.vertices is not item.vertices or before.torn is not item.torn:
+        given = as_float(item.vertices, (-1, 3), f"vertices of {item.name}")
+        moved, died = part.take_vertices(given, None, own, item.torn)
+    if before is None or moved or died or before.corner_normals is not item.corner_normals:
+        if item.corner_normals is None:
+            part.smooth_normals(own, rows[:, NORMAL])
+        else:
+            part.given_normals(item.corner_normals, own, rows[:, NORMAL])
+    names = ("albedo", "roughness", "metallic")
+    if before is None or any(getattr(before, name) is not getattr(item, name) for name in names):
+        n = len(own)
+        of_rows = np.arange(n, dtype=np.int32) if part.smooth else part.faces.ravel()
+        albedo = as_float(item.albedo, (n, 3), f"albedo of {item.name}")
+        roughness = as_float(item.roughness, (n,), f"roughness of {item.name}")
+        metallic = as_float(item.metallic, (n,), f"metallic of {item.name}")
+        _materials(of_rows, albedo, roughness, metallic, rows)
+    part.item = item
+    return moved, died
+
+
+def take_mesh(part: Part, item: MeshState, places: Places, vertices: Array, normals: Array) -> tuple[bool, bool]:
+    """Bring a mesh up to date in the scene's `vertices` and `normals`; what `Part.take_vertices` returns."""
+    before = part.item if isinstance(part.item, MeshState) else None
+    own, rows = vertices[part.vertex], normals[part.row]
+    given = as_float(item.vertices, (-1, 3), f"vertices of {item.name}")
+    matrix = None if part.instanced else places.matrices[0]
+    moved, died = False, False
+    other_shape = before is None or before.vertices is not item.vertices
+    if other_shape or not part.instanced:
+        moved, died = part.take_vertices(given, matrix, own)
+    if other_shape or died or before is None or before.corner_normals is not item.corner_normals:
+        if part.own_normals is None:
+            part.own_normals = rows if part.instanced else np.empty_like(rows)
+        # In object space, as Blender makes them: a stretched shape has the normals of the shape, stretched.
+        if item.corner_normals is None:
+            part.smooth_normals(given, part.own_normals)
+        else:
+            part.given_normals(item.corner_normals, given, part.own_normals)
+    if matrix is not None:
+        _turn_normals(part.own_normals, normal_matrices(places.matrices[:1])[0], rows)
+        part.flat_faces = part.count_empty(own) if flattens(matrix) else 0
+    part.item = item
+    return moved, died
+
+
+def place_vertices(vertices: Array | None, matrix: Array | None, target: Array) -> None:
+    """Bring (n, 3) `vertices`, moved by a (3, 4) matrix, to `target`; what is unusable or None leaves it as it is."""
+    if vertices is None or np.shape(vertices) != target.shape:
+        return
+    moved = np.empty_like(target)
+    given = np.ascontiguousarray(vertices, np.float32)
+    bad, _, _ = _copy_vertices(given, moved) if matrix is None else _move_vertices(given, matrix, moved)
+    if bad:
+        with np.errstate(invalid="ignore", over="ignore"):
+            world = given if matrix is None else given @ matrix[:, :3].T + matrix[:, 3]
+            usable = (np.abs(world) < FARTHEST).all(axis=1)
+        target[usable] = moved[usable]
+    else:
+        target[:] = moved
+
+
+@njit
+def _usable(x: Any, y: Any, z: Any) -> Any:
+    """The vertex and its largest coordinate, or the origin for an unusable one; how many of these (0 or 1)."""
+    size = max(abs(x), max(abs(y), abs(z)))
+    # A NaN may hide in the maximum, yet not in the sum.
+    if size < FARTHEST and abs(x + y + z) < 4 * FARTHEST:
+        return x, y, z, size, 0
+    zero = np.float32(0.0)
+    return zero, zero, zero, zero, 1
+
+
+@njit(parallel=True)
+def _copy_vertices(source: Any, target: Any) -> Any:
+    """Copy usable vertices, put the others at the origin: how many those are, how many moved, largest coordinate."""
+    bad = moved = 0
+    reach = np.float32(0.0)
+    n = len(source)
+    for block in prange((n + _BLOCK - 1) // _BLOCK):
+        lost = changed = 0
+        far = np.float32(0.0)
+        for i in range(block * _BLOCK, min(n, (block + 1) * _BLOCK)):
+            x, y, z = source[i, 0], source[i, 1], source[i, 2]
+            x, y, z, size, unusable = _usable(x, y, z)
+            lost += unusable
+            if x != target[i, 0] or y != target[i, 1] or z != target[i, 2]:
+                target[i, 0], target[i, 1], target[i, 2] = x, y, z
+                changed += 1
+            far = max(far, size)
+        bad += lost
+        moved += changed
+        reach = max(reach, far)
+    return bad, moved, reach
+
+
+@njit(parallel=True)
+def _move_vertices(source: Any, matrix: Any, target: Any) -> Any:
+    """As `_copy_vertices`, moved by a (3, 4) float64 matrix."""
+    bad = moved = 0
+    reach = np.float32(0.0)
+    m00, m01, m02, m03 = matrix[0, 0], matrix[0, 1], matrix[0, 2], matrix[0, 3]
+    m10, m11, m12, m13 = matrix[1, 0], matrix[1, 1], matrix[1, 2], matrix[1, 3]
+    m20, m21, m22, m23 = matrix[2, 0], matrix[2, 1], matrix[2, 2], matrix[2, 3]
+    n = len(source)
+    for block in prange((n + _BLOCK - 1) // _BLOCK):
+        lost = changed = 0
+        far = np.float32(0.0)
+        for i in range(block * _BLOCK, min(n, (block + 1) * _BLOCK)):
+            a, b, c = source[i, 0], source[i, 1], source[i, 2]
+            x = np.float32(m00 * a + m01 * b + m02 * c + m03)
+            y = np.float32(m10 * a + m11 * b + m12 * c + m13)
+            z = np.float32(m20 * a + m21 * b + m22 * c + m23)
+            x, y, z, size, unusable = _usable(x, y, z)
+            lost += unusable
+            if x != target[i, 0] or y != target[i, 1] or z != target[i, 2]:
+                target[i, 0], target[i, 1], target[i, 2] = x, y, z
+                changed += 1
+            far = max(far, size)
+        bad += lost
+        moved += changed
+        reach = max(reach, far)
+    return bad, moved, reach
+
+
+@njit(parallel=True)
+def _given_normals(normals: Any, vertices: Any, faces: Any, out: Any) -> Any:
+    """Fill (3 m, 3) `out` with the (m, 3, 3) normals made unit; count the faces without area."""
+    empty = 0
+    for f in prange(len(faces)):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        ux, uy, uz = vertices[b, 0] - vertices[a, 0], vertices[b, 1] - vertices[a, 1], vertices[b, 2] - vertices[a, 2]
+        vx, vy, vz = vertices[c, 0] - vertices[a, 0], vertices[c, 1] - vertices[a, 1], vertices[c, 2] - vertices[a, 2]
+        gx, gy, gz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+        area = np.sqrt(gx * gx + gy * gy + gz * gz)
+        if area > np.float32(0.0):
+            gx, gy, gz = gx / area, gy / area, gz / area
+        else:
+            empty += 1
+            gx, gy, gz = np.float32(0.0), np.float32(0.0), np.float32(1.0)
+        for k in range(3):
+            x, y, z = normals[f, k, 0], normals[f, k, 1], normals[f, k, 2]
+            length = np.sqrt(x * x + y * y + z * z)
+            if length > 1e-12 and length < FARTHEST:
+                scale = np.float32(1.0) / length
+                x, y, z = x * scale, y * scale, z * scale
+            else:
+                x, y, z = gx, gy, gz
+            out[3 * f + k, 0], out[3 * f + k, 1], out[3 * f + k, 2] = x, y, z
+    return empty
+
+
+@njit(parallel=True)
+def _turn_normals(normals: Any, matrix: Any, out: Any) -> None:
+    """Unit normals through a (3, 3) matrix of normals; (0, 0, 1) where they have no direction."""
+    for i in prange(len(normals)):
+        x, y, z = normals[i, 0], normals[i, 1], normals[i, 2]
+        a = matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z
+        b = matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z
+        c = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z
+        length = np.sqrt(a * a + b * b + c * c)
+        if length > np.float32(1e-15):
+            scale = np.float32(1.0) / length
+            a, b, c = a * scale, b * scale, c * scale
+        else:
+            a, b, c = np.float32(0.0), np.float32(0.0), np.float32(1.0)
+        out[i, 0], out[i, 1], out[i, 2] = a, b, c
+
+
+@njit(parallel=True)
+def _materials(vertex: Any, albedo: Any, roughness: Any, metallic: Any, rows: Any) -> None:
+    """Copy the material of vertex[i] to shading row i, within [0, 1]; NaN becomes 0."""
+    for i in prange(len(vertex)):
+        v = vertex[i]
+        for k in range(3):
+            rows[i, 3 + k] = min(np.float32(1.0), max(np.float32(0.0), albedo[v, k]))
+            if not rows[i, 3 + k] >= 0.0:
+                rows[i, 3 + k] = 0.0
+        rows[i, 6] = min(np.float32(1.0), max(np.float32(0.0), roughness[v]))
+        rows[i, 7] = min(np.float32(1.0), max(np.float32(0.0), metallic[v]))
+        for k in (6, 7):
+            if not rows[i, k] >= 0.0:
+                rows[i, k] = 0.0

@@ -1,0 +1,460 @@
+"""Everything rays can meet in one frame: DR-GS objects and ordinary meshes, with one tree.
+
+DR-GS objects and meshes in one place are triangles in world space; a mesh in several places keeps its vertices in
+object space and a tree of its own, and stands in the scene as instances.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from typing import Any
+
+import numpy as np
+
+from ...core.asset.model import as_float
+from ...core.errors import UsageError
+from ...core.frame import Image, MeshState, Pose
+from ..memory import Place, address
+from ..sampling import F
+from .instances import Places, normal_matrices, other_matrices, usable_places
+from .interaction import Geometry, Tracer
+from .ray_masks import object_flags
+from .textures import MaterialTable
+from .trace_mesh import (
+    ALBEDO,
+    METALLIC,
+    NORMAL,
+    ROUGHNESS,
+    SHADING_WIDTH,
+    Part,
+    TraceObject,
+    mask_of,
+    own_faces,
+    place_vertices,
+    take_mesh,
+    take_object,
+)
+from .triangle_bvh import Group, TriangleBVH
+
+Array = np.ndarray
+
+__all__ = ["ALBEDO", "METALLIC", "NORMAL", "ROUGHNESS", "ObjectFaults", "TraceObject", "TraceScene"]
+
+
+@dataclass(slots=True)
+class ObjectFaults:
+    """What was wrong with one object in the last update; such faces and places are invisible to rays."""
+
+    name: str
+    bad_vertices: int  # NaN, infinite or absurdly far
+    bad_faces: int  # touch a bad vertex
+    empty_faces: int  # have no area
+    bad_places: int = 0  # matrices that are not finite, or flatten one of several places
+
+
+@dataclass(slots=True)
+class Glowing:
+    """A mesh with materials that emit light.
+
+    Attributes
+    ----------
+    mesh : as given
+    shape : all faces of the mesh, among the scene's
+    faces : (k,) int64, those that emit
+    material : (k,) int32, of ``TraceScene.materials``
+    uvs : (k, 3, 2) float32, or None
+    places : rows of ``TraceScene.places``, or None where the faces are in world space
+    """
+
+    mesh: MeshState
+    shape: slice
+    faces: Array
+    material: Array
+    uvs: Array | None
+    places: range | None
+
+
+class TraceScene:
+    """All objects and meshes of a frame.
+
+    Objects are numbered: DR-GS objects as given, then meshes as given, then the places of meshes that stand in
+    several, in the order of the meshes.
+
+    Attributes
+    ----------
+    bvh : TriangleBVH over everything
+    layout : another object whenever vertices and faces are numbered anew
+    version : another object after every update
+    vertices : (n, 3) float32, faces : (m, 3) int32: as traced (``bvh``'s own arrays), world space save for meshes in
+        several places; a face with a bad vertex is collapsed to one point
+    face_object : (m,) int32: object of each face (of a mesh in several places: the mesh)
+    shading_faces : (m, 3) int32: rows of ``shading`` (DR-GS objects) or of ``normals`` at the corners of each face
+    shading : (k, 8) float32: unit shading normal (3), albedo (3), roughness, metallic
+    normals : (r, 3) float32: of meshes; object space where these stand in several places
+    vertex_faces : how many faces are of DR-GS objects; those come first
+    places : (p, 3, 4) float32 object-to-world matrices of meshes in several places
+    place_object : (p,) int32: object of each place
+    rays_differ : whether there is an object that diffuse rays meet and glossy ones do not, or the other way
+    pass_index, object_flags : (objects,) int32: Blender's object index pass; bits HOLDOUT and CATCHER
+    source : (objects,) int64: which of the frame's objects, or behind them which of its meshes, each is
+    any_ordinary : whether the camera may see an ordinary mesh
+    materials : MaterialTable of the meshes
+    extent : float, metres: the largest absolute coordinate, the scale of rounding errors
+    faults : what was wrong, one entry an object, then one a mesh
+    """
+
+    def __init__(self) -> None:
+        self.bvh = TriangleBVH()
+        self.layout = self.version = object()
+        self.shading_faces: Array = np.empty((0, 3), np.int32)
+        self.shading: Array = np.empty((0, SHADING_WIDTH), np.float32)
+        self.normals: Array = np.empty((0, 3), np.float32)
+        self.face_object: Array = np.empty(0, np.int32)
+        self.vertex_faces = 0
+        self.places: Array = np.empty((0, 3, 4), np.float32)
+        self.pass_index: Array = np.empty(0, np.int32)
+        self.source: Array = np.empty(0, np.int64)
+        self.object_flags: Array = np.empty(0, np.int32)
+        self.rays_differ = False
+        self.any_ordinary = False
+        self.materials = MaterialTable([], [])
+        self._material_tables: Array = np.array(self.materials.addresses, np.int64)
+        self.extent = 0.0
+        self.faults: list[ObjectFaults] = []
+        self._parts: list[Part] = []
+        self._known: list[tuple[MeshState, Places]] = []
+        self._given: list[Any] = []  # lists of materials, images
+        self._first_material: list[int] = []
+        self._groups: list[list[int]] = []  # parts of each group
+        self._vertex_count = 0
+        self._place_normal: Array = np.empty((0, 3, 3), np.float32)
+        self.place_object: Array = np.empty(0, np.int32)
+        self._first_place: Array = np.zeros(1, np.int32)
+        self._material: Array = np.empty(0, np.int32)
+        self._uvs: Array = np.empty((0, 3, 2), np.float32)
+
+    @property
+    def vertices(self) -> Array:
+        """(n, 3) float32 vertices, metres."""
+        return self.bvh.vertices
+
+    @property
+    def faces(self) -> Array:
+        """(m, 3) int32 faces of everything, as traced."""
+        return self.bvh.faces
+
+    @property
+    def tracer(self) -> Tracer:
+        """How compiled code casts rays into the scene; until the next update."""
+        bvh = self.bvh
+        tables = address(bvh.first_face), address(self._first_place)
+        return Tracer(bvh.intersect_address, bvh.occluded_address, bvh.scene, *tables)
+
+    @property
+    def geometry(self) -> Geometry:
+        """What compiled code finds behind a hit; until the next update."""
+        return self.geometry_at(address)
+
+    def geometry_at(self, place: Place) -> Geometry:
+        """`geometry` of arrays that lie elsewhere."""
+        tables = self._material_tables if place is address else np.array(self.materials.addresses_at(place), np.int64)
+        return Geometry(
+            place(self.shading_faces),
+            place(self.shading),
+            place(self.normals),
+            place(self.face_object),
+            self.vertex_faces,
+            place(self._material),
+            place(self._uvs) if len(self._uvs) else 0,
+            place(self._place_normal),
+            place(self.place_object),
+            place(tables),
+        )
+
+    def standing(self) -> tuple[Array, Array]:
+        """Every triangle of the scene where it stands: (k, 2) int32 face and place (or -1), and its (k,) int32 mask."""
+        rows, masks = [np.empty((0, 2), np.int32)], [np.empty(0, np.int32)]
+        for group, members in enumerate(self._groups):
+            for part in (self._parts[i] for i in members):
+                faces, where = np.arange(part.face.start, part.face.stop, dtype=np.int32), self._places_of(group, part)
+                places = np.array([-1] if where is None else where, np.int32)
+                rows.append(np.stack([np.tile(faces, len(places)), np.repeat(places, len(faces))], axis=1))
+                masks.append(np.full(len(rows[-1]), part.mask, np.int32))
+        return np.concatenate(rows), np.concatenate(masks)
+
+    @property
+    def glowing(self) -> list[Glowing]:
+        """What emits light, in the order of the scene's faces."""
+        found: list[Glowing] = []
+        if not self.materials.glows:
+            return found
+        glows = np.any(self.materials.arrays[0][:, 5:] > 0.0, axis=1)
+        for group, members in enumerate(self._groups):
+            for part in (self._parts[i] for i in members):
+                if not isinstance(part.item, MeshState):
+                    continue
+                rows = slice(part.face.start - self.vertex_faces, part.face.stop - self.vertex_faces)
+                own = np.flatnonzero(glows[self._material[rows]]) + rows.start
+                if not len(own):
+                    continue
+                where = self._places_of(group, part)
+                uvs = self._uvs[own] if len(self._uvs) else None
+                found.append(Glowing(part.item, part.face, own + self.vertex_faces, self._material[own], uvs, where))
+        return found
+
+    def _places_of(self, group: int, part: Part) -> range | None:
+        """Rows of `places` in which a part of a group stands; None where it is in world space."""
+        if not part.instanced:
+            return None
+        first, objects = int(self._first_place[group]), len(self.faults) - len(self._known)
+        return range(first, first + len(self._known[part.source - objects][1].matrices))
+
+    def update(
+        self, objects: Sequence[TraceObject], meshes: Sequence[MeshState] = (), images: Sequence[Image] = ()
+    ) -> None:
+        """Take the objects of a new frame: refit what moved, rebuild when faces or visibility changed.
+
+        An object that is the same (``is``) as in the last update is unchanged; so is an array of one that is not.
+
+        Raises
+        ------
+        UsageError, AssetError
+            When an object's arrays do not fit together; names the object.
+        """
+        items: list[TraceObject | MeshState] = [*objects, *meshes]
+        # An update that fails half way leaves nothing to be taken for current.
+        (parts, self._parts), (known, self._known) = (self._parts, []), (self._known, [])
+        kept = [k[1] if k[0] is mesh else None for k, mesh in zip(known, meshes)]
+        kept += [None] * (len(meshes) - len(kept))
+        stands = [old or usable_places(mesh) for old, mesh in zip(kept, meshes)]
+        places: list[Places | None] = [*([None] * len(objects)), *stands]
+        order = _order(items, places)
+        same = [p.source for p in parts] == order and all(p.fits(items[p.source], places[p.source]) for p in parts)
+        if not same:
+            parts = self._lay_out(items, places, order)
+        before = [part.item for part in parts]
+        vertices = self.bvh.vertices if same else np.zeros((self._vertex_count, 3), np.float32)
+        moved, elsewhere, died = set(), set(), not same
+        for index, part in enumerate(parts):
+            item, where = items[part.source], places[part.source]
+            if part.item is item:
+                continue
+            if isinstance(item, TraceObject):
+                change = take_object(part, item, vertices, self.shading)
+            else:
+                assert where is not None
+                change = take_mesh(part, item, where, vertices, self.normals)
+                elsewhere |= {index} if where.instanced else set()
+            moved |= {index} if change[0] else set()
+            died |= change[1]
+        if not same or elsewhere or len(known) != len(meshes):
+            self._place(stands, len(items))
+        self._number(objects, meshes, stands)
+        self._take_materials(parts, before, meshes, images, len(objects))
+        self._commit(parts, vertices, places, moved, elsewhere, died)
+        self.version = object()
+        self.faults = [ObjectFaults(item.name, 0, 0, 0, p.bad if p else 0) for item, p in zip(items, places)]
+        for part in parts:
+            fault = self.faults[part.source]
+            fault.bad_vertices, fault.empty_faces = part.bad_vertices, max(part.empty_faces, part.flat_faces)
+            fault.bad_faces = part.bad_faces
+        self._parts, self._known = parts, list(zip(meshes, stands))
+
+    def at(self, objects: Sequence[Array | None], meshes: Sequence[Pose | None]) -> tuple[Array, Array]:
+        """`vertices` and `places` as they would be with everything at another time, for motion.
+
+        Parameters
+        ----------
+        objects : (n, 3) world-space vertices of every DR-GS object of the last update, or None: as now
+        meshes : of every mesh, or None; vertices or matrices of another number than now are ignored, unusable ones too
+        """
+        vertices, places = self.vertices.copy(), self.places.copy()
+        first = np.cumsum([0, *(len(p.matrices) if p.instanced else 0 for _, p in self._known)])
+        for part in self._parts:
+            own = vertices[part.vertex]
+            if isinstance(part.item, TraceObject):
+                place_vertices(objects[part.source], None, own)
+                continue
+            index = part.source - len(objects)
+            pose, (mesh, now) = meshes[index], self._known[index]
+            if pose is None:
+                continue
+            given = mesh.vertices if pose.vertices is None else pose.vertices
+            moved = other_matrices(pose.matrices, now)
+            if now.instanced:
+                places[first[index] : first[index + 1]] = moved
+            place_vertices(given, None if now.instanced else moved[0], own)
+        return vertices, places
+
+    def close(self) -> None:
+        """Give the tree's memory back."""
+        self.bvh.close()
+
+    def _lay_out(
+        self, items: Sequence[TraceObject | MeshState], places: Sequence[Places | None], order: list[int]
+    ) -> list[Part]:
+        """Give everything its place in the scene's arrays; all that depends on topology alone."""
+        parts = []
+        faces, owners = [np.empty((0, 3), np.int32)], [np.empty(0, np.int32)]
+        vertex = face = self.vertex_faces = 0
+        rows = {True: 0, False: 0}
+        for source in order:
+            item, where = items[source], places[source]
+            own, n = own_faces(item), len(item.vertices)
+            m, smooth, surfels = len(own), item.corner_normals is None, isinstance(item, TraceObject)
+            row = rows[surfels]
+            # Corners with normals of their own get a row each.
+            corner = own if smooth else np.arange(3 * m, dtype=np.int32).reshape(m, 3)
+            faces.append(corner + np.int32(row))
+            owners.append(np.full(m, source, np.int32))
+            rows[surfels] += n if smooth else 3 * m
+            spans = slice(vertex, vertex + n), slice(face, face + m), slice(row, rows[surfels])
+            instanced = where is not None and where.instanced
+            parts.append(Part(source, item.name, own, *spans, mask_of(item), smooth, instanced))
+            vertex, face = vertex + n, face + m
+            self.vertex_faces += m if surfels else 0
+        self._vertex_count, self.layout = vertex, object()
+        self.shading_faces, self.face_object = np.concatenate(faces), np.concatenate(owners)
+        self.shading = np.zeros((rows[True], SHADING_WIDTH), np.float32)
+        self.normals = np.zeros((rows[False], 3), np.float32)
+        self._material = np.zeros(face - self.vertex_faces, np.int32)
+        self._uvs = np.empty((0, 3, 2), np.float32)
+        # A part in places is a group of its own; others of one mask share one.
+        alike = groupby(range(len(parts)), lambda i: (parts[i].mask, i if parts[i].instanced else -1))
+        self._groups = [list(members) for _, members in alike]
+        return parts
+
+    def _place(self, where: Sequence[Places], first: int) -> None:
+        """List the places of meshes in several; their objects are numbered from `first`."""
+        matrices = np.concatenate([np.empty((0, 3, 4)), *(p.matrices for p in where if p.instanced)])
+        self.places = np.ascontiguousarray(matrices, np.float32)
+        self._place_normal = normal_matrices(matrices)
+        self.place_object = np.arange(first, first + len(matrices), dtype=np.int32)
+
+    def _number(self, objects: Sequence[TraceObject], meshes: Sequence[MeshState], where: Sequence[Places]) -> None:
+        """Pass index and flags of all objects and places; see the class."""
+        index = [np.array([o.pass_index for o in objects], np.int32)]
+        index.append(np.array([p.pass_index[0] if len(p.pass_index) else 0 for p in where], np.int32))
+        index += [p.pass_index for p in where if p.instanced]
+        self.pass_index = np.concatenate(index)
+        seen = [o.visibility for o in objects] + [mesh.visibility for mesh in meshes]
+        self.rays_differ = any(v.diffuse != v.glossy for v in seen)
+        flags = np.array([object_flags(visibility) for visibility in seen], np.int32)
+        counts = [0] * len(objects) + [len(p.matrices) if p.instanced else 0 for p in where]
+        self.source = np.concatenate([np.arange(len(seen)), np.repeat(np.arange(len(seen)), counts)])
+        self.object_flags = flags[self.source]
+        self.any_ordinary = any(mesh.visibility.camera and len(p.matrices) > 0 for mesh, p in zip(meshes, where))
+
+    @property
+    def material_names(self) -> list[str]:
+        """Names of the materials of all meshes, in the order of ``materials``."""
+        given = self._given[: max(len(self._first_material) - 1, 0)]
+        return [material.name for materials in given for material in materials]
+
+    def material_of(self, face: Array) -> Array:
+        """(n,) int64 place of materials of faces in ``material_names``; one behind the last for DR-GS objects."""
+        own, none = face - self.vertex_faces, len(self.material_names)
+        found = np.full(len(face), none, np.int64)
+        meshes = own >= 0
+        found[meshes] = self._material[own[meshes]]
+        return found
+
+    def _take_materials(
+        self,
+        parts: Sequence[Part],
+        before: Sequence[TraceObject | MeshState | None],
+        meshes: Sequence[MeshState],
+        images: Sequence[Image],
+        count: int,
+    ) -> None:
+        """Bring materials and texture coordinates of meshes up to date."""
+        given: list[Any] = [mesh.materials for mesh in meshes]
+        first = [int(n) for n in np.cumsum([0, *(len(own) for own in given)])]
+        given += images
+        if first != self._first_material or [id(g) for g in given] != [id(g) for g in self._given]:
+            self.materials = MaterialTable([m for mesh in meshes for m in mesh.materials], list(images), self.materials)
+            self._material_tables = np.array(self.materials.addresses, np.int64)
+            self._given = given
+        if any(mesh.uvs is not None for mesh in meshes) and not len(self._uvs):
+            self._uvs = np.zeros((len(self._material), 3, 2), np.float32)
+            before = [None] * len(before)
+        for part, old in zip(parts, before):
+            mesh = part.item
+            if not isinstance(mesh, MeshState):
+                continue
+            rows = slice(part.face.start - self.vertex_faces, part.face.stop - self.vertex_faces)
+            if old is not mesh or first != self._first_material:
+                self._material[rows] = first[part.source - count] + _material_index(mesh, len(part.faces))
+            if mesh.uvs is None and len(self._uvs):
+                self._uvs[rows] = 0.0
+            elif mesh.uvs is not None and (not isinstance(old, MeshState) or old.uvs is not mesh.uvs):
+                self._uvs[rows] = as_float(mesh.uvs, (len(part.faces), 3, 2), f"texture coordinates of {mesh.name}")
+        self._first_material = first
+
+    def _commit(
+        self,
+        parts: Sequence[Part],
+        vertices: Array,
+        places: Sequence[Places | None],
+        moved: set[int],
+        elsewhere: set[int],
+        other_faces: bool,
+    ) -> None:
+        """Bring the tree up to date: parts whose vertices `moved`, shapes that stand `elsewhere`."""
+        first_place, count = [], 0
+        matrices: dict[int, Array] = {}
+        for index, members in enumerate(self._groups):
+            where = places[parts[members[0]].source]
+            first_place.append(count)
+            if parts[members[0]].instanced and where is not None:
+                matrices[index] = self.places[count : count + len(where.matrices)]
+                count += len(where.matrices)
+        self._first_place = np.array(first_place or [0], np.int32)
+        if other_faces:
+            faces = [part.traced_faces + np.int32(part.vertex.start) for part in parts]
+            groups = [
+                Group(parts[m[0]].face.start, parts[m[-1]].face.stop, parts[m[0]].mask, matrices.get(i))
+                for i, m in enumerate(self._groups)
+            ]
+            self.bvh.build(vertices, np.concatenate([np.empty((0, 3), np.int32), *faces]), groups)
+        else:
+            changed = [i for i, members in enumerate(self._groups) if moved.intersection(members)]
+            placed = {i: m for i, m in matrices.items() if elsewhere.intersection(self._groups[i])}
+            self.bvh.refit(None, changed, placed)
+        reach = [part.reach for part in parts if not part.instanced]
+        for index, m in matrices.items():
+            part = parts[self._groups[index][0]]
+            reach.append(float((np.abs(m[:, :, :3]).sum(axis=2) * part.reach + np.abs(m[:, :, 3])).max(initial=0.0)))
+        self.extent = float(F(max(reach, default=0.0)))
+
+
+def _order(items: Sequence[TraceObject | MeshState], places: Sequence[Places | None]) -> list[int]:
+    """Indices of what is traced, in the order of the scene's arrays: objects, meshes in one place, in several.
+
+    Neighbours of one mask share a group, so each kind is sorted by mask; meshes stay in order of places.
+    """
+
+    def kind(source: int) -> tuple[int, int]:
+        where = places[source]
+        if where is None:
+            return 0, mask_of(items[source])
+        return (2, 0) if where.instanced else (1, mask_of(items[source]))
+
+    here = [i for i, where in enumerate(places) if (len(items[i].faces) if where is None else len(where.matrices))]
+    return sorted(here, key=kind)
+
+
+def _material_index(mesh: MeshState, count: int) -> Array | int:
+    """Material of each face, within the mesh's materials."""
+    if not mesh.materials:
+        raise UsageError(f"object {mesh.name}", "has no material", "Give it at least one")
+    if mesh.material_index is None:
+        return 0
+    index = np.asarray(mesh.material_index)
+    if index.shape != (count,):
+        raise UsageError(
+            f"object {mesh.name}", f"{len(index)} material indices for {count} faces", "Give one index a face"
+        )
+    return np.clip(index, 0, len(mesh.materials) - 1)

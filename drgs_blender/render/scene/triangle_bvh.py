@@ -1,0 +1,364 @@
+"""The tree that rays go through: triangles that move, in the world as they are or standing in many places."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ...compute.jit import njit, prange
+from ...compute.simd import aligned
+from ...core.errors import DeviceError, UsageError
+from . import embree
+from .embree import blocked, trace
+
+Array = np.ndarray
+
+#: A mask that every ray meets, and that meets every group.
+ALL = -1
+
+#: Rebuild when the boxes of neighbouring triangles have grown this much against the whole scene's box.
+DEGRADED = 2.0
+_RUN = 32  # neighbouring triangles in one box of that measure
+_RUNS = 1024  # boxes looked at
+
+
+@dataclass(slots=True)
+class Group:
+    """A run of faces that rays meet or pass together.
+
+    Attributes
+    ----------
+    first, last : the faces, half-open
+    mask : int32 bits; a ray meets the group when it has one of them
+    places : None when the vertices are in world space; else (k, 3, 4) float32 object-to-world matrices, invertible:
+        the group's faces stand in k places and share one tree
+    """
+
+    first: int
+    last: int
+    mask: int = ALL
+    places: Array | None = None
+
+
+@njit(parallel=True)
+def _intersect(address, scene, first, origins, directions, tnear, tfar, mask, t, face, instance, u, v):  # type: ignore[no-untyped-def]
+    n, block = len(origins), 512
+    for b in prange((n + block - 1) // block):
+        for i in range(b * block, min(n, (b + 1) * block)):
+            t[i], group, primitive, instance[i], u[i], v[i], _, _, _ = trace(
+                address, scene, origins[i, 0], origins[i, 1], origins[i, 2],
+                directions[i, 0], directions[i, 1], directions[i, 2], tnear, tfar, mask,
+            )  # fmt: skip
+            face[i] = first[group] + primitive if group >= 0 else np.int32(-1)
+
+
+@njit(parallel=True)
+def _occluded(address, scene, origins, directions, tnear, tfar, mask, out):  # type: ignore[no-untyped-def]
+    n, block = len(origins), 512
+    for b in prange((n + block - 1) // block):
+        for i in range(b * block, min(n, (b + 1) * block)):
+            out[i] = blocked(
+                address, scene, origins[i, 0], origins[i, 1], origins[i, 2],
+                directions[i, 0], directions[i, 1], directions[i, 2], tnear, tfar, mask,
+            )  # fmt: skip
+
+
+@njit(parallel=True)
+def looseness(vertices, faces, runs):  # type: ignore[no-untyped-def]
+    """Summed box surface of runs of once neighbouring triangles, relative to the box of them all."""
+    boxes = np.empty((len(runs), 6), np.float32)
+    for g in prange(len(runs)):
+        x0 = y0 = z0 = np.float32(np.inf)
+        x1 = y1 = z1 = np.float32(-np.inf)
+        for k in range(runs.shape[1]):
+            for c in range(3):
+                v = faces[runs[g, k], c]
+                x, y, z = vertices[v, 0], vertices[v, 1], vertices[v, 2]
+                x0, y0, z0 = min(x0, x), min(y0, y), min(z0, z)
+                x1, y1, z1 = max(x1, x), max(y1, y), max(z1, z)
+        boxes[g, 0], boxes[g, 1], boxes[g, 2], boxes[g, 3], boxes[g, 4], boxes[g, 5] = x0, y0, z0, x1, y1, z1
+    total = 0.0
+    lowest, highest = np.full(3, np.inf), np.full(3, -np.inf)
+    for g in range(len(runs)):
+        x, y, z = boxes[g, 3] - boxes[g, 0], boxes[g, 4] - boxes[g, 1], boxes[g, 5] - boxes[g, 2]
+        total += x * y + y * z + z * x
+        for a in range(3):
+            lowest[a], highest[a] = min(lowest[a], boxes[g, a]), max(highest[a], boxes[g, 3 + a])
+    x, y, z = highest[0] - lowest[0], highest[1] - lowest[1], highest[2] - lowest[2]
+    whole = x * y + y * z + z * x
+    return total / whole if whole > 0.0 else 0.0
+
+
+@njit(parallel=True)
+def _centres(vertices, faces, out):  # type: ignore[no-untyped-def]
+    for i in prange(len(faces)):
+        a, b, c = faces[i, 0], faces[i, 1], faces[i, 2]
+        for k in range(3):
+            out[i, k] = (vertices[a, k] + vertices[b, k] + vertices[c, k]) * np.float32(1 / 3)
+
+
+@njit
+def _spread(x):  # type: ignore[no-untyped-def]
+    """The lowest ten bits of a number with two free ones after each."""
+    for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
+        x = (x | x << shift) & mask
+    return x
+
+
+@njit(parallel=True)
+def _keys(centre, low, scale, out):  # type: ignore[no-untyped-def]
+    """Morton code of each centre and, below it, its index: no two are alike."""
+    for i in prange(len(centre)):
+        x = _spread(np.int64((centre[i, 0] - low[0]) * scale[0]))
+        y = _spread(np.int64((centre[i, 1] - low[1]) * scale[1]))
+        z = _spread(np.int64((centre[i, 2] - low[2]) * scale[2]))
+        out[i] = np.uint64((x | y << 1 | z << 2) << 32 | i)
+
+
+def neighbours(vertices: Array, faces: Array) -> Array:
+    """(g, 32) int32: runs of faces along a Morton curve through the centroids, evenly chosen."""
+    m = len(faces)
+    if m < 4 * _RUN:
+        return np.empty((0, _RUN), np.int32)
+    centre = np.empty((m, 3), np.float32)
+    _centres(vertices, faces, centre)
+    low, high = (np.array([f(x) for x in centre.T]) for f in (np.min, np.max))  # along an axis is 20 times slower
+    key = np.empty(m, np.uint64)
+    _keys(centre, low, np.float32(1023) / np.maximum(high - low, np.float32(1e-30)), key)
+    key.sort()
+    order = key.astype(np.uint32).view(np.int32)
+    runs = order[: m // _RUN * _RUN].reshape(-1, _RUN)
+    return np.ascontiguousarray(runs[:: max(1, math.ceil(len(runs) / _RUNS))])
+
+
+class _Part:
+    """What Embree holds of one group: its triangles and, when it stands in places, those."""
+
+    def __init__(self, top: int, index: int, group: Group, vertices: Array, faces: Array) -> None:
+        self._lib, self._device = embree.library(), embree.device()
+        self._top, self._index, self._mask = top, index, group.mask & 0xFFFFFFFF
+        self._vertices, self._faces, self._first = vertices, faces[group.first : group.last], group.first
+        self._triangles: int | None = None
+        self._instances: int | None = None
+        self._shape: int | None = None
+        if group.places is not None:
+            self._shape = new_scene()
+        self.build()
+        if group.places is not None:
+            self._instances = self._lib.rtcNewGeometry(self._device, embree.GEOMETRY_INSTANCE_ARRAY)
+            self._lib.rtcSetGeometryInstancedScene(self._instances, self._shape)
+            self._lib.rtcSetGeometryMask(self._instances, self._mask)
+            self._lib.rtcAttachGeometryByID(top, self._instances, index)
+            self.place(group.places)
+
+    def build(self) -> None:
+        """Build the triangles' own tree from scratch."""
+        lib = self._lib
+        scene, index = (self._top, self._index) if self._shape is None else (self._shape, 0)
+        if self._triangles is not None:
+            lib.rtcDetachGeometry(scene, index)
+            lib.rtcReleaseGeometry(self._triangles)
+        self._triangles = lib.rtcNewGeometry(self._device, embree.GEOMETRY_TRIANGLE)
+        for kind, form, array in (
+            (embree.BUFFER_VERTEX, embree.FORMAT_FLOAT3, self._vertices),
+            (embree.BUFFER_INDEX, embree.FORMAT_UINT3, self._faces),
+        ):
+            lib.rtcSetSharedGeometryBuffer(self._triangles, kind, 0, form, array.ctypes.data, 0, 12, len(array))
+        lib.rtcSetGeometryBuildQuality(self._triangles, embree.QUALITY_REFIT)
+        lib.rtcSetGeometryMask(self._triangles, self._mask)
+        lib.rtcAttachGeometryByID(scene, self._triangles, index)
+        self._commit()
+        self._runs = neighbours(self._vertices, self._faces)
+        self._looseness = looseness(self._vertices, self._faces, self._runs)
+
+    def refit(self) -> bool:
+        """Follow moved vertices; True when the tree was worn out and built anew instead."""
+        worn = len(self._runs) > 0 and (looseness(self._vertices, self._faces, self._runs) > DEGRADED * self._looseness)
+        if worn:
+            self.build()
+        else:
+            self._lib.rtcUpdateGeometryBuffer(self._triangles, embree.BUFFER_VERTEX, 0)
+            self._commit()
+        return worn
+
+    def place(self, places: Array) -> None:
+        """Let the group stand in (k, 3, 4) `places`, copied."""
+        self._places = aligned(12 * len(places), np.float32).reshape(-1, 3, 4)
+        self._places[:] = places
+        self._lib.rtcSetSharedGeometryBuffer(
+            self._instances, embree.BUFFER_TRANSFORM, 0, embree.FORMAT_FLOAT3X4_ROW_MAJOR,
+            self._places.ctypes.data, 0, 48, len(places),
+        )  # fmt: skip
+        self._lib.rtcCommitGeometry(self._instances)
+
+    def _commit(self) -> None:
+        self._lib.rtcCommitGeometry(self._triangles)
+        if self._shape is not None:
+            self._lib.rtcCommitScene(self._shape)
+        if self._instances is not None:
+            self._lib.rtcCommitGeometry(self._instances)  # its boxes follow the shape's
+
+    def release(self) -> None:
+        """Give what Embree holds back; the top scene must have been released before."""
+        for geometry in (self._instances, self._triangles):
+            if geometry is not None:
+                self._lib.rtcReleaseGeometry(geometry)
+        if self._shape is not None:
+            self._lib.rtcReleaseScene(self._shape)
+
+
+def new_scene() -> int:
+    """An empty Embree scene whose geometries are refitted.
+
+    Only a dynamic scene of low quality keeps one tree a geometry, and only such a tree is refitted; any other scene
+    silently builds anew at each commit. The geometry's own tree is of full quality either way.
+    """
+    lib = embree.library()
+    scene = lib.rtcNewScene(embree.device())
+    lib.rtcSetSceneFlags(scene, embree.SCENE_DYNAMIC)
+    lib.rtcSetSceneBuildQuality(scene, embree.QUALITY_LOW)
+    return int(scene)
+
+
+def box_of(scene: int) -> tuple[Array, Array]:
+    """Lowest and highest corner of the box around a committed scene, (3,) float32 each; zeros when it is empty."""
+    box = np.zeros(8, np.float32)
+    if scene:
+        embree.library().rtcGetSceneBounds(scene, box.ctypes.data)
+    low, high = box[:3].copy(), box[4:7].copy()
+    return (low, high) if (low <= high).all() else (np.zeros(3, np.float32), np.zeros(3, np.float32))
+
+
+class TriangleBVH:
+    """Triangles ready for ray casting, whose vertices may move.
+
+    Attributes
+    ----------
+    vertices : (n, 3) float32, metres, the coordinates Embree reads; write into them and call ``refit()``
+    faces : (m, 3) int32
+    first_face : (groups,) int32: the first face of each group, what turns a traced primitive into a face
+    intersect_address, occluded_address, scene : int: what ``trace`` and ``blocked`` take in compiled code
+    rebuilds : how often a group's tree was built from scratch
+    """
+
+    def __init__(self) -> None:
+        self._lib = embree.library()
+        self.intersect_address = embree.address(self._lib.rtcIntersect1)
+        self.occluded_address = embree.address(self._lib.rtcOccluded1)
+        self.scene: int = 0
+        self.vertices: Array = np.empty((0, 3), np.float32)
+        self.faces: Array = np.empty((0, 3), np.int32)
+        self.first_face: Array = np.zeros(1, np.int32)
+        self.rebuilds = 0
+        self._parts: list[_Part] = []
+        self.build(self.vertices, self.faces)
+
+    def build(self, vertices: Array, faces: Array, groups: Sequence[Group] | None = None) -> None:
+        """Build the trees anew from (n, 3) vertices and (m, 3) faces, both copied.
+
+        Parameters
+        ----------
+        groups : runs of `faces`; by default one of them all, which every ray meets
+
+        Raises
+        ------
+        UsageError
+            When a face refers to a vertex that does not exist.
+        DeviceError
+            When Embree fails (out of memory).
+        """
+        n, m = len(vertices), len(faces)
+        if m and (np.min(faces) < 0 or np.max(faces) >= n):
+            raise UsageError("mesh", f"faces refer to vertices outside 0..{n - 1}", "Check the mesh's indices")
+        self._release()
+        self.vertices = aligned(3 * n, np.float32).reshape(n, 3)
+        self.faces = aligned(3 * m, np.int32).reshape(m, 3)
+        self.vertices[:] = vertices
+        self.faces[:] = faces
+        groups = [Group(0, m)] if groups is None else groups
+        self.first_face = np.array([g.first for g in groups] or [0], np.int32)
+        self.scene = new_scene()
+        for index, group in enumerate(groups):
+            self._parts.append(_Part(self.scene, index, group, self.vertices, self.faces))
+        self._commit()
+        self.rebuilds += len(groups)
+
+    def refit(
+        self,
+        vertices: Array | None = None,
+        moved: Collection[int] | None = None,
+        places: Mapping[int, Array] | None = None,
+    ) -> None:
+        """Follow moved vertices; rebuild the tree of a group that is worn out.
+
+        Parameters
+        ----------
+        vertices : (n, 3), or None: those already written into ``self.vertices``
+        moved : the groups whose vertices moved, or None: all
+        places : group -> new (k, 3, 4) matrices, for groups that were built with places
+        """
+        if vertices is not None:
+            self.vertices[:] = vertices
+        for index in range(len(self._parts)) if moved is None else sorted(moved):
+            self.rebuilds += self._parts[index].refit()
+        for index, matrices in (places or {}).items():
+            self._parts[index].place(matrices)
+        self._commit()
+
+    def _commit(self) -> None:
+        self._lib.rtcCommitScene(self.scene)
+        if error := self._lib.rtcGetDeviceError(embree.device()):
+            raise DeviceError(
+                "Embree", f"failed with error {error} on {len(self.faces)} triangles", "Use a smaller mesh"
+            )
+
+    def intersect(
+        self, origins: Array, directions: Array, tnear: float = 0.0, tfar: float = math.inf, mask: int = ALL
+    ) -> tuple[Array, Array, Array, Array]:
+        """Closest hits of many rays: t (n,), face (n,) int32 or -1, u (n,), v (n,); t in units of the direction."""
+        t, face, _, u, v = self.hits(origins, directions, tnear, tfar, mask)
+        return t, face, u, v
+
+    def hits(
+        self, origins: Array, directions: Array, tnear: float = 0.0, tfar: float = math.inf, mask: int = ALL
+    ) -> tuple[Array, Array, Array, Array, Array]:
+        """As `intersect`, with the place of the face's group between face and u: (n,) int32 or -1."""
+        origins, directions = (np.ascontiguousarray(a, np.float32) for a in (origins, directions))
+        t, u, v = np.empty((3, len(origins)), np.float32)
+        face, instance = np.empty((2, len(origins)), np.int32)
+        arguments: tuple[Any, ...] = self.intersect_address, self.scene, self.first_face, origins, directions
+        _intersect(*arguments, tnear, tfar, np.int32(mask), t, face, instance, u, v)
+        return t, face, instance, u, v
+
+    def occluded_many(
+        self, origins: Array, directions: Array, tnear: float = 0.0, tfar: float = math.inf, mask: int = ALL
+    ) -> Array:
+        """(n,) bool: whether anything lies on each ray."""
+        origins, directions = (np.ascontiguousarray(a, np.float32) for a in (origins, directions))
+        out = np.empty(len(origins), np.bool_)
+        _occluded(self.occluded_address, self.scene, origins, directions, tnear, tfar, np.int32(mask), out)
+        return out
+
+    def _release(self) -> None:
+        if self.scene:
+            self._lib.rtcReleaseScene(self.scene)
+            self.scene = 0
+        for part in self._parts:
+            part.release()
+        self._parts = []
+
+    def bounds(self) -> tuple[Array, Array]:
+        """Lowest and highest corner of the box around everything, (3,) float32 each; zeros when there is nothing."""
+        return box_of(self.scene)
+
+    def close(self) -> None:
+        """Give the trees' memory back; the object cannot be used afterwards."""
+        self._release()
+
+    def __del__(self) -> None:
+        if getattr(self, "scene", 0):
+            self.close()

@@ -1,1 +1,0 @@
-"""Light at the visible points: BRDF, sampling, paths."""

@@ -1,1 +1,0 @@
-"""What rays meet: triangles, instances, materials, in one tree."""

@@ -1,0 +1,1 @@
+"""Simulated matter: particles that fill a mesh, their motion, frames on disk."""

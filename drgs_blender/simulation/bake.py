@@ -1,0 +1,117 @@
+"""Frames of a job into a cache; what is there already stays."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+
+from ..core.errors import UsageError
+from ..core.particle_cache import Header, ParticleCache
+from .digest import same_until
+from .job import Job
+
+log = logging.getLogger(__name__)
+
+#: Seconds of computing that an interruption may cost.
+_KEEP_EVERY = 5.0
+
+
+def bake(
+    job: Job,
+    cache: ParticleCache,
+    *,
+    overwrite: bool = False,
+    cancelled: Callable[[], bool] | None = None,
+    progress: Callable[[int, float], None] | None = None,
+) -> int:
+    """Simulate the frames of a job that are not in the cache.
+
+    A bake that was stopped in any way goes on where it was, with the same bits as if it had not been.
+
+    Parameters
+    ----------
+    job : at its beginning
+    overwrite : frames of other settings are removed; otherwise they are an error
+    cancelled : asked before every time step
+    progress : told the frame that is computed and which part of it is done
+
+    Returns
+    -------
+    int
+        Frames computed.
+
+    Raises
+    ------
+    UsageError
+        The cache holds another simulation, or this one ran into trouble: frames up to there stay.
+    Cancelled, WriteError
+        What was done stays.
+    """
+    settings, solver = job.settings, job.solver
+    rest = job.rest()
+    header = Header(
+        job.digest, len(rest.points), len(rest.vertices), settings.first, settings.fps, asdict(settings),
+        tear=job.tear, grain=job.grain, moves=job.moves,
+    )  # fmt: skip
+    start = _resume(job, cache, header, overwrite)
+    if start is None:
+        cache.create(header, rest)
+        cache.write(settings.first, rest)
+        start = settings.first
+    done, kept, kept_at = 0, start, time.monotonic()
+    frame = start
+    try:
+        for frame in range(start + 1, settings.last + 1):
+            told = None if progress is None else (lambda part, f=frame: progress(f, part))
+            solver.advance(1 / settings.fps, job.pin_targets(frame - settings.first), cancelled, told)
+            _check_own(cache, job)
+            cache.write(frame, job.now())
+            done += 1
+            if time.monotonic() - kept_at > _KEEP_EVERY:
+                cache.write_state(frame, solver.arrays())
+                kept, kept_at = frame, time.monotonic()
+    finally:
+        now = settings.first + solver.frame
+        if now > kept and cache.path(now).exists() and _owned(cache, job):
+            cache.write_state(now, solver.arrays())
+    return done
+
+
+def _owned(cache: ParticleCache, job: Job) -> bool:
+    header = cache.header()
+    return header is not None and (header.digest, header.moves) == (job.digest, job.moves)
+
+
+def _check_own(cache: ParticleCache, job: Job) -> None:
+    """Frames of two simulations must never lie in one folder."""
+    if not _owned(cache, job):
+        raise UsageError(
+            str(cache.folder), "was given to another simulation, or emptied, meanwhile", "Bake again, one at a time"
+        )
+
+
+def _resume(job: Job, cache: ParticleCache, header: Header, overwrite: bool) -> int | None:
+    """The last frame of this simulation in the cache, with the solver put there; None to begin anew."""
+    found, first = cache.header(), job.settings.first
+    if found is None:
+        return None
+    state = cache.read_state()
+    frame, arrays = state or (first, {})
+    needed = min(frame, job.settings.last) - first
+    if found.digest != job.digest or not same_until(needed, found.moves, job.moves):
+        if not overwrite:
+            raise UsageError(
+                str(cache.folder), "holds another simulation", "Choose another folder, or overwrite it (--overwrite)"
+            )
+        return None
+    if state is None:
+        return None
+    whole = set(range(first, frame + 1)) <= set(cache.frames())
+    if not whole or not job.solver.restore(frame - first, arrays):
+        log.info("%s: does not hold all that is needed to go on; begins again", cache.folder)
+        return None
+    if frame < job.settings.last and found.moves != job.moves:
+        cache.extend(header, frame)
+    return frame

@@ -1,0 +1,75 @@
+"""What frames depend on, as digests: a frame is the same where both of a simulation are.
+
+One is of the settings and of all at rest. What moves has one for each frame, of its motion until then, so that a longer
+bake goes on from a shorter one.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+
+import numpy as np
+
+from ..core.asset.model import Mesh
+from ..core.version import __version__
+from .colliders import Collider
+from .settings import Settings
+
+Array = np.ndarray
+
+
+def digest_of(mesh: Mesh, settings: Settings, colliders: Sequence[Collider], motion: Array | None) -> str:
+    """Digest of the settings and of what they name, in the first frame.
+
+    Parameters
+    ----------
+    colliders : those of the settings
+    motion : (k, n, 3) vertices of the mesh, that pins follow; None where they stay
+    """
+    described = asdict(settings)
+    for key in ("last", "colliders", "motion", "device"):
+        del described[key]
+    for field in described["fields"]:
+        field["frames"] = field["frames"][:1]
+    # What moves is computed otherwise than what stands, also while it stands still.
+    described["contacts"] = [(c.contact, c.friction, c.thickness, len(c.vertices) > 1) for c in colliders]
+    described["moved"] = motion is not None
+    parts = [*settings.pins, *(region for region, _ in settings.regions)]
+    groups = sorted({part.group for part in parts if part.group is not None})
+    digest = hashlib.sha256(json.dumps([__version__, described, groups], sort_keys=True).encode())
+    arrays = [mesh.vertices, mesh.faces, *(mesh.groups[name] for name in groups)]
+    arrays += [a for c in colliders for a in (c.vertices[0], c.faces)]
+    arrays += [] if motion is None else [motion[0]]
+    for array in arrays:
+        digest.update(f"{array.dtype.str} {array.shape}".encode())
+        digest.update(_bytes(array))
+    return digest.hexdigest()
+
+
+def moves_of(settings: Settings, colliders: Sequence[Collider], motion: Array | None) -> list[str]:
+    """For each frame, a digest of how all that moves has moved until then; it moves no more after the last one."""
+    tracks = {f"collider {i}": c.vertices for i, c in enumerate(colliders)}
+    tracks |= {f"field {i}": np.array(field.frames, np.float64) for i, field in enumerate(settings.fields)}
+    tracks |= {} if motion is None else {"pins": motion}
+    digest, found = hashlib.sha256(), []
+    for frame in range(max(map(len, tracks.values()), default=0)):
+        for name, rows in tracks.items():
+            if 0 < frame < len(rows) and not np.array_equal(rows[frame], rows[frame - 1]):
+                digest.update(f"{frame} {name}".encode())
+                digest.update(_bytes(rows[frame]))
+        found.append(digest.hexdigest()[:16])
+    while len(found) > 1 and found[-1] == found[-2]:
+        found.pop()
+    return found
+
+
+def same_until(frame: int, one: Sequence[str], other: Sequence[str]) -> bool:
+    """Whether two `moves_of` are of the same motion until `frame`, counted from 0."""
+    return one[: frame + 1][-1:] == other[: frame + 1][-1:]
+
+
+def _bytes(array: Array) -> Array:
+    return np.ascontiguousarray(array).reshape(-1).view(np.uint8)

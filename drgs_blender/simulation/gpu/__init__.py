@@ -1,0 +1,1 @@
+"""The grid of the particle solver on a graphics card."""

@@ -1,0 +1,102 @@
+"""Which particles are in which cells, on a device: functions that are translated and never run as they stand.
+
+A particle's key is the number of its block and of its cell in it. Sorted by that, equals in their own order, particles
+of a cell, and of the cells of a block that follow each other along z, stand together.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ...compute.warp.kernels import Work
+from ...compute.warp.search import first_of
+from ...compute.warp.translate import Native
+from ..blocks import block_of
+
+#: Where cells of a block begin: 64, and where the last one ends.
+STARTS = 65
+#: What `found` holds: how many particles are outside, how many blocks have particles, and then their numbers.
+LOST, OCCUPIED, BLOCKS = range(3)
+
+
+def add_to(counts: Any, at: Any, by: Any) -> Any:
+    """Add to an element of an array; what it was before."""
+    raise NotImplementedError
+
+
+_ADD = """
+@wp.func
+def add_to(counts: wp.array(dtype=wp.int64), at: wp.int64, by: wp.int64):
+    return wp.atomic_add(counts, wp.int32(at), by)
+"""
+_NATIVES = {add_to: Native(_ADD, "add_to", "int64")}
+
+
+def number_particles(
+    lane: Any, lanes: Any, room: Any, x: Any, origin: Any, scale: Any, bx: Any, by: Any, bz: Any, out: Any
+) -> None:
+    """Key of each particle, and its own number beside it; counts those outside or not finite."""
+    keys, order, found = out
+    for p in range(lane, len(x), lanes):
+        gx, gy, gz = (x[p, 0] - origin[0]) * scale, (x[p, 1] - origin[1]) * scale, (x[p, 2] - origin[2]) * scale
+        block, cell = block_of(gx, gy, gz, bx, by, bz), 0
+        if block >= 0:
+            cell = ((int(gx - 0.5) & 3) * 4 + (int(gy - 0.5) & 3)) * 4 + (int(gz - 0.5) & 3)
+        else:
+            add_to(found, LOST, 1)
+        keys[p] = block * 64 + cell
+        order[p] = np.int32(p)
+
+
+def list_blocks(lane: Any, lanes: Any, room: Any, n: Any, keys: Any, out: Any) -> None:
+    """Blocks with particles, once each, in any order."""
+    (found,) = out
+    for p in range(lane, n, lanes):
+        first = True
+        if p > 0:
+            first = keys[p] >> 6 != keys[p - 1] >> 6
+        if first:
+            found[BLOCKS + add_to(found, OCCUPIED, 1)] = keys[p] >> 6
+
+
+def index_blocks(lane: Any, lanes: Any, room: Any, n: Any, keys: Any, numbers: Any, sizes: Any, out: Any) -> None:
+    """Tables of the active blocks: their places, those around them, and where particles of their cells begin."""
+    active, neighbour, first = out
+    by, bz = sizes[1], sizes[2]
+    for task in range(lane, sizes[0] * (27 + STARTS), lanes):
+        s, e = task // (27 + STARTS), task % (27 + STARTS)
+        number = numbers[s]
+        if e < 27:
+            other = number + ((e // 9 - 1) * by + e // 3 % 3 - 1) * bz + e % 3 - 1
+            at = first_of(numbers, sizes[0], other)
+            known = False
+            if at < sizes[0]:
+                known = numbers[at] == other
+            neighbour[s, e] = np.int32(at) if known else np.int32(-1)
+        else:
+            first[s, e - 27] = np.int32(first_of(keys, n, number * 64 + (e - 27)))
+        if e == 0:
+            active[s, 0], active[s, 1], active[s, 2] = number // (by * bz), number // bz % by, number % bz
+
+
+def house_particles(lane: Any, lanes: Any, room: Any, n: Any, keys: Any, numbers: Any, sizes: Any, out: Any) -> None:
+    """Which active block each particle is in, sorted."""
+    (home,) = out
+    for p in range(lane, n, lanes):
+        home[p] = np.int32(first_of(numbers, sizes[0], keys[p] >> 6))
+
+
+NUMBER = Work(number_particles, (), _NATIVES)
+LIST = Work(list_blocks, (), _NATIVES)
+INDEX = Work(index_blocks, (), {})
+HOUSE = Work(house_particles, (), {})
+
+
+def around(occupied: np.ndarray, blocks: tuple[int, int, int]) -> np.ndarray:
+    """Numbers of all blocks that touch some, which are not at the border of the domain; sorted."""
+    _, by, bz = blocks
+    steps = np.arange(-1, 2)
+    near = ((steps[:, None, None] * by + steps[:, None]) * bz + steps).ravel()
+    return np.unique(occupied[:, None] + near)

@@ -1,0 +1,309 @@
+"""One step of MLS-MPM: particles to grid, the grid's own step, grid to particles.
+
+After Hu et al. 2018 (moving least squares MPM) with APIC (Jiang et al. 2015) and quadratic B-splines. A block's nodes
+are gathered in a scratch of 8^3 nodes from cell -1 to 6 of the block, which lets particles drift by a cell.
+Single precision stalls slow motion and slow strain: positions are double, and deformation gradients are kept less 1.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..compute.jit import njit, prange
+from ..compute.simd import fold, load, quads, repeat, spread, store
+from ..core.sim_materials import ELASTIC, LAMBDA, MU
+from .constitutive import neo_hookean, respond
+
+Array = np.ndarray
+
+_ZERO, _HALF, _ONE, _ONE_HALF = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(1.5)
+
+#: 8^3 nodes of momentum (or velocity) and mass, and one more, as rows are loaded four nodes at a time.
+_SCRATCH = 2048 + 4
+
+#: Share of a node's matter that is pinned from which on the node is. On a flat border between pinned and free matter
+#: the last node held is then, over all positions of the grid, on average on the border itself.
+PINNED = np.float32(0.2)
+
+#: Share of the matter of the fullest node around below which a node says nothing about how a rider moves: the few
+#: grains at its rim, pushed by all others, are no surface.
+BARE = np.float32(0.1)
+
+
+@njit(inline="always")
+def weights_of(f):  # type: ignore[no-untyped-def]
+    """Quadratic B-spline weights of three nodes, `f` from the first one in spacings; they sum to 1 as rounded."""
+    a, c = _ONE_HALF - f, f - _HALF
+    first, last = _HALF * a * a, _HALF * c * c
+    return first, (_ONE - first) - last, last
+
+
+@njit(inline="always")
+def cell_of(x, p, origin, scale):  # type: ignore[no-untyped-def]
+    """The first of the three nodes around a particle along each axis, and how far after it the particle is."""
+    gx, gy, gz = (x[p, 0] - origin[0]) * scale, (x[p, 1] - origin[1]) * scale, (x[p, 2] - origin[2]) * scale
+    i, j, k = int(gx - 0.5), int(gy - 0.5), int(gz - 0.5)
+    return i, j, k, np.float32(gx - i), np.float32(gy - j), np.float32(gz - k)
+
+
+@njit(inline="always")
+def node_of(neighbour, b, i, j, k):  # type: ignore[no-untyped-def]
+    """Where node (i, j, k) of block b's scratch is: slot and number in the grid, and offset in the scratch."""
+    e = (((i + 3) >> 2) * 3 + ((j + 3) >> 2)) * 3 + ((k + 3) >> 2)
+    n = (((i + 3) & 3) * 4 + ((j + 3) & 3)) * 4 + ((k + 3) & 3)
+    return neighbour[b, e], n, ((i * 8 + j) * 8 + k) * 4
+
+
+@njit(inline="always")
+def _steps():  # type: ignore[no-untyped-def]
+    """How many spacings each node of a row is from its first."""
+    return quads(_ZERO, _ONE, np.float32(2.0), np.float32(3.0))
+
+
+@njit(inline="always")
+def _carried(scratch, base, wx, wy, wz):  # type: ignore[no-untyped-def]
+    """Velocity that matter gives to a rider, and the weight of the nodes it comes from: 0 where there is no matter."""
+    heaviest = _ZERO
+    for ii in range(3):
+        for jj in range(3):
+            for kk in range(3):
+                heaviest = max(heaviest, scratch[base + ii * 256 + jj * 32 + 4 * kk + 3])
+    x = y = z = weight = _ZERO
+    for ii in range(3):
+        for jj in range(3):
+            for kk in range(3):
+                n = base + ii * 256 + jj * 32 + 4 * kk
+                if scratch[n + 3] > BARE * heaviest:
+                    w = wx[ii] * wy[jj] * wz[kk]
+                    x, y, z, weight = x + w * scratch[n], y + w * scratch[n + 1], z + w * scratch[n + 2], weight + w
+    if weight > _ZERO:
+        x, y, z = x / weight, y / weight, z / weight
+    return x, y, z, weight
+
+
+@njit(inline="always")
+def stretch(f, p, step, g0, g1, g2, g3, g4, g5, g6, g7, g8):  # type: ignore[no-untyped-def]
+    """F = (1 + step grad v) F, in place, where `f` holds F - 1."""
+    h0, h4, h8 = f[p, 0], f[p, 4], f[p, 8]
+    f0, f1, f2, f3, f4, f5, f6, f7, f8 = _ONE + h0, f[p, 1], f[p, 2], f[p, 3], _ONE + h4, f[p, 5], f[p, 6], f[p, 7], _ONE + h8  # noqa: E501  # fmt: skip
+    f[p, 0] = h0 + step * (g0 * f0 + g1 * f3 + g2 * f6)
+    f[p, 1] = f1 + step * (g0 * f1 + g1 * f4 + g2 * f7)
+    f[p, 2] = f2 + step * (g0 * f2 + g1 * f5 + g2 * f8)
+    f[p, 3] = f3 + step * (g3 * f0 + g4 * f3 + g5 * f6)
+    f[p, 4] = h4 + step * (g3 * f1 + g4 * f4 + g5 * f7)
+    f[p, 5] = f5 + step * (g3 * f2 + g4 * f5 + g5 * f8)
+    f[p, 6] = f6 + step * (g6 * f0 + g7 * f3 + g8 * f6)
+    f[p, 7] = f7 + step * (g6 * f1 + g7 * f4 + g8 * f7)
+    f[p, 8] = h8 + step * (g6 * f2 + g7 * f5 + g8 * f8)
+
+
+@njit(inline="always")
+def momentum_of(p, v, affine, tau, m, q, h, fx, fy, fz):  # type: ignore[no-untyped-def]
+    """Momentum that particle p gives to the first node around it, and by how much more the next ones along x, y and z
+    get of it, row by row: m v + (m C - factor V tau) d, with d from the particle to the node and q = -factor V."""
+    a00, a01, a02 = (m * affine[p, 0] + q * tau[p, 0]) * h, (m * affine[p, 1] + q * tau[p, 3]) * h, (m * affine[p, 2] + q * tau[p, 4]) * h  # noqa: E501  # fmt: skip
+    a10, a11, a12 = (m * affine[p, 3] + q * tau[p, 3]) * h, (m * affine[p, 4] + q * tau[p, 1]) * h, (m * affine[p, 5] + q * tau[p, 5]) * h  # noqa: E501  # fmt: skip
+    a20, a21, a22 = (m * affine[p, 6] + q * tau[p, 4]) * h, (m * affine[p, 7] + q * tau[p, 5]) * h, (m * affine[p, 8] + q * tau[p, 2]) * h  # noqa: E501  # fmt: skip
+    mx = m * v[p, 0] - a00 * fx - a01 * fy - a02 * fz
+    my = m * v[p, 1] - a10 * fx - a11 * fy - a12 * fz
+    mz = m * v[p, 2] - a20 * fx - a21 * fy - a22 * fz
+    return mx, my, mz, a00, a01, a02, a10, a11, a12, a20, a21, a22
+
+
+@njit(inline="always")
+def pushed(x, y, z, gx, gy, gz, slow, pull, wx, wy, wz):  # type: ignore[no-untyped-def]
+    """A velocity after a step of what acts on all matter alike."""
+    # All forces alike, so that damping does not change where matter comes to rest.
+    x, y, z = slow * (x + gx), slow * (y + gy), slow * (z + gz)
+    return x + pull * (wx - x), y + pull * (wy - y), z + pull * (wz - z)
+
+
+@njit(parallel=True)
+def scatter(  # type: ignore[no-untyped-def]
+    x, v, affine, tau, mass, volume, origin, spacing, dt, block, shares, start, neighbour, nodes
+):  # fmt: skip
+    """Particles to grid.
+
+    Parameters
+    ----------
+    x (n, 3) float64; v (n, 3), affine (n, 9), tau (n, 6), mass (n,), volume (n,) float32
+        In the order of the arrangement; volume is that at rest.
+    nodes : (a, 64, 4) float32
+        Written: momentum and mass of the nodes of active blocks.
+    """
+    scale = 1.0 / spacing
+    h = np.float32(spacing)
+    factor = np.float32(4.0 * dt * scale * scale)
+    for s in prange(len(nodes)):
+        nodes[s] = np.float32(0.0)
+    for colour in range(8):
+        for t in prange(shares.shape[1] - 1):
+            for b in range(shares[colour, t], shares[colour, t + 1]):
+                scratch = np.zeros(_SCRATCH, np.float32)
+                cx, cy, cz = 4 * block[b, 0] - 1, 4 * block[b, 1] - 1, 4 * block[b, 2] - 1
+                for p in range(start[b], start[b + 1]):
+                    m = mass[p]
+                    if m == np.float32(0.0):
+                        continue
+                    i, j, k, fx, fy, fz = cell_of(x, p, origin, scale)
+                    wx, wy, wz = weights_of(fx), weights_of(fy), weights_of(fz)
+                    q = -factor * volume[p]
+                    mx, my, mz, a00, a01, a02, a10, a11, a12, a20, a21, a22 = momentum_of(
+                        p, v, affine, tau, m, q, h, fx, fy, fz
+                    )
+                    base = (((i - cx) * 8 + (j - cy)) * 8 + (k - cz)) * 4
+                    # A row of nodes along z at once; the fourth has no weight.
+                    along = quads(wz[0], wz[1], wz[2], _ZERO)
+                    here = along * (repeat(mx, my, mz, m) + _steps() * repeat(a02, a12, a22, _ZERO))
+                    per_x, per_y = along * repeat(a00, a10, a20, _ZERO), along * repeat(a01, a11, a21, _ZERO)
+                    for ii in range(3):
+                        line = here + np.float32(ii) * per_x
+                        for jj in range(3):
+                            at = base + ii * 256 + jj * 32
+                            row = (wx[ii] * wy[jj]) * (line + np.float32(jj) * per_y)
+                            store(scratch, at, load(scratch, at) + row)
+                for i in range(8):
+                    for j in range(8):
+                        for k in range(8):
+                            s, n, o = node_of(neighbour, b, i, j, k)
+                            nodes[s, n, 0] += scratch[o]
+                            nodes[s, n, 1] += scratch[o + 1]
+                            nodes[s, n, 2] += scratch[o + 2]
+                            nodes[s, n, 3] += scratch[o + 3]
+
+
+@njit(parallel=True)
+def advance_nodes(nodes, least, dt, force, wind, drag, damping):  # type: ignore[no-untyped-def]
+    """Momentum to velocity, in place, and what acts on all matter alike.
+
+    Parameters
+    ----------
+    least : kg, below which a node is empty: momentum over a mass near underflow is noise
+    force : (3,) m/s^2, acceleration
+    wind : (3,) m/s, towards which `drag` (1/s) pulls
+    damping : 1/s
+    """
+    pull, slow = np.float32(1.0 - np.exp(-dt * drag)), np.float32(np.exp(-dt * damping))
+    gx, gy, gz = np.float32(dt * force[0]), np.float32(dt * force[1]), np.float32(dt * force[2])
+    wx, wy, wz = np.float32(wind[0]), np.float32(wind[1]), np.float32(wind[2])
+    for s in prange(len(nodes)):
+        for n in range(64):
+            m = nodes[s, n, 3]
+            if m < least:
+                nodes[s, n] = np.float32(0.0)
+            else:
+                r = _ONE / m
+                x, y, z = nodes[s, n, 0] * r, nodes[s, n, 1] * r, nodes[s, n, 2] * r
+                nodes[s, n, 0], nodes[s, n, 1], nodes[s, n, 2] = pushed(x, y, z, gx, gy, gz, slow, pull, wx, wy, wz)
+
+
+@njit(parallel=True)
+def gather(  # type: ignore[no-untyped-def]
+    x, v, affine, elastic, total, tau, memory, model, parameters, mass, solid, origin, spacing, dt,
+    block, shares, start, neighbour, nodes, fastest,
+):  # fmt: skip
+    """Grid to particles: move them, deform them, and find their stress for the next step.
+
+    Parameters
+    ----------
+    elastic, total : (n, 9) float32
+        Deformation gradients; `total` has no rows where the two are the same for every particle. Matter that is not
+        `solid` keeps the total it has.
+    fastest : (b,) float32
+        Written: the highest speed in each block, m/s; infinite where a particle is not finite.
+    """
+    scale = 1.0 / spacing
+    to_gradient = np.float32(4.0 * scale)
+    step = np.float32(dt)
+    apart = len(total) > 0
+    for t in prange(shares.shape[1] - 1):
+        for b in range(shares[8, t], shares[8, t + 1]):
+            scratch = np.zeros(_SCRATCH, np.float32)
+            for i in range(8):
+                for j in range(8):
+                    for k in range(8):
+                        s, n, o = node_of(neighbour, b, i, j, k)
+                        scratch[o] = nodes[s, n, 0]
+                        scratch[o + 1] = nodes[s, n, 1]
+                        scratch[o + 2] = nodes[s, n, 2]
+                        scratch[o + 3] = nodes[s, n, 3]
+            cx, cy, cz = 4 * block[b, 0] - 1, 4 * block[b, 1] - 1, 4 * block[b, 2] - 1
+            top = np.float32(0.0)
+            for p in range(start[b], start[b + 1]):
+                i, j, k, fx, fy, fz = cell_of(x, p, origin, scale)
+                wx, wy, wz = weights_of(fx), weights_of(fy), weights_of(fz)
+                base = (((i - cx) * 8 + (j - cy)) * 8 + (k - cz)) * 4
+                blend = per_x = per_y = spread(_ZERO)
+                for ii in range(3):
+                    for jj in range(3):
+                        row = (wx[ii] * wy[jj]) * load(scratch, base + ii * 256 + jj * 32)
+                        blend = blend + row
+                        per_x = per_x + (np.float32(ii) - fx) * row
+                        per_y = per_y + (np.float32(jj) - fy) * row
+                along = quads(wz[0], wz[1], wz[2], _ZERO)
+                blend = along * blend
+                vx, vy, vz, _ = fold(blend)
+                if mass[p] == _ZERO:
+                    # Riders may be where some nodes have no matter: what there is counts fully; F follows no riders.
+                    vx, vy, vz, weight = _carried(scratch, base, wx, wy, wz)
+                    if weight <= _ZERO:
+                        vx, vy, vz = v[p, 0], v[p, 1], v[p, 2]
+                v[p, 0], v[p, 1], v[p, 2] = vx, vy, vz
+                x[p, 0] += dt * vx
+                x[p, 1] += dt * vy
+                x[p, 2] += dt * vz
+                speed = vx * vx + vy * vy + vz * vz
+                top = top if speed <= top or top != top else speed  # NaN stays
+                if mass[p] == _ZERO:
+                    continue
+                b0, b3, b6, _ = fold(along * per_x)
+                b1, b4, b7, _ = fold(along * per_y)
+                b2, b5, b8, _ = fold((_steps() - spread(fz)) * blend)
+                g0, g1, g2 = to_gradient * b0, to_gradient * b1, to_gradient * b2
+                g3, g4, g5 = to_gradient * b3, to_gradient * b4, to_gradient * b5
+                g6, g7, g8 = to_gradient * b6, to_gradient * b7, to_gradient * b8
+                affine[p, 0], affine[p, 1], affine[p, 2] = g0, g1, g2
+                affine[p, 3], affine[p, 4], affine[p, 5] = g3, g4, g5
+                affine[p, 6], affine[p, 7], affine[p, 8] = g6, g7, g8
+                stretch(elastic, p, step, g0, g1, g2, g3, g4, g5, g6, g7, g8)
+                if apart and solid[p]:
+                    stretch(total, p, step, g0, g1, g2, g3, g4, g5, g6, g7, g8)
+                if model[p] == ELASTIC:
+                    neo_hookean(elastic, p, parameters[p, MU], parameters[p, LAMBDA], tau)
+                else:
+                    respond(p, model, parameters, elastic, tau, memory, affine, dt)
+            fastest[b] = np.sqrt(top)
+
+
+@njit
+def hold_pins(x, pinned, pin_velocity, mass, origin, spacing, slot, nodes, held):  # type: ignore[no-untyped-def]
+    """Nodes with pinned matter move as the pins do.
+
+    Parameters
+    ----------
+    pinned : (k,) int64, particles held
+    pin_velocity : (k, 3) float32, m/s
+    held : (a, 64, 4) float32, zero before and after: pinned momentum and mass
+    """
+    scale = 1.0 / spacing
+    for turn in range(2):
+        for q in range(len(pinned)):
+            p = pinned[q]
+            i, j, k, fx, fy, fz = cell_of(x, p, origin, scale)
+            wx, wy, wz = weights_of(fx), weights_of(fy), weights_of(fz)
+            for ii in range(3):
+                for jj in range(3):
+                    for kk in range(3):
+                        s = slot[(i + ii) >> 2, (j + jj) >> 2, (k + kk) >> 2]
+                        n = (((i + ii) & 3) * 4 + ((j + jj) & 3)) * 4 + ((k + kk) & 3)
+                        if turn == 0:
+                            w = wx[ii] * wy[jj] * wz[kk] * mass[p]
+                            held[s, n, 3] += w
+                            for c in range(3):
+                                held[s, n, c] += w * pin_velocity[q, c]
+                        else:
+                            m = held[s, n, 3]
+                            if m > PINNED * nodes[s, n, 3]:
+                                for c in range(3):
+                                    nodes[s, n, c] = held[s, n, c] / m
+                            held[s, n] = np.float32(0.0)
