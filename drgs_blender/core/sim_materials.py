@@ -1,4 +1,4 @@
-"""The one table of materials, and what compiled code knows of each particle's.
+"""The table of simulation materials, and the columns of each particle that compiled code reads.
 
 A row names one of a few constitutive models and its numbers in SI units; artists' presets are rows too.
 """

@@ -1,4 +1,4 @@
-"""Where matter has come apart under a mesh whose faces still join the pieces."""
+"""Fracture: faces that still join pieces of matter that have come apart, and are left out."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Surfels of matter that runs: where their surface is stretched they show grains, not a skin that is pulled."""
+"""Granular surfels: where a granular surface is stretched, its surfels shrink to grains instead of a stretched skin."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Three vertices that span what a surfel covers, where it is larger than the face it hangs on."""
+"""Wide support: the three vertices that a surfel follows which is larger than the face it is bound to."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Filled space as cells, and whether a straight way through it leaves it."""
+"""Voxel occupancy of a solid, with a line-of-sight test."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A few steps on next to nothing: after them the kernels of a reconstruction are compiled, and its clocks are fair."""
+"""Warm-up: a few steps on a tiny scene, so that JIT compilation does not count against the time budget."""
 
 from __future__ import annotations
 

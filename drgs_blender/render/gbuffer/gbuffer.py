@@ -1,4 +1,4 @@
-"""What the camera sees of a strip of rows, before light: the result of both primary stages."""
+"""The G-buffer of a strip of rows: what the camera sees before it is lit; the result of surfels and meshes alike."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
-"""Lamps that the camera sees.
+"""Lights that the camera sees.
 
 Blender's lights are seen only where their ray visibility says so, and between the camera's clip distances (suns: at
-any). They hide nothing: a ray gathers the light of each lamp it meets before a surface, and goes on. Where a sub-pixel
-sample has several surfaces, or a surface that is not opaque, each part of it sees the lamps before its own depth. Lamps
-in front of a holdout are hidden by it.
+any). They hide nothing: a ray gathers the light of each light it meets before a surface, and goes on. Where a sub-pixel
+sample has several surfaces, or a surface that is not opaque, each part of it sees the lights before its own depth.
+Lights in front of a holdout are hidden by it.
 """
 
 from __future__ import annotations

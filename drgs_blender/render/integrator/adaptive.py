@@ -1,4 +1,4 @@
-"""Samples where the noise is: the samples of a picture in parts, each part only where the last ones were not enough."""
+"""Adaptive sampling: a frame in parts of equal sample counts; a pixel goes on while its error is too large."""
 
 from __future__ import annotations
 

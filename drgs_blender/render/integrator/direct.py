@@ -1,4 +1,4 @@
-"""Samples of one strategy, a batch at a time: draw, weigh, trace, and add what they see to the sums of their points."""
+"""Direct light: samples of one strategy in batches (draw, evaluate, pdfs, trace), joined by MIS (balance heuristic)."""
 
 from __future__ import annotations
 

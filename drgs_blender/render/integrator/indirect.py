@@ -1,7 +1,8 @@
-"""Indirect light: what comes back along rays that hit a surface, as paths traced on in batches.
+"""Indirect light: paths continued in batches from the hits of direct samples.
 
-At every vertex of a path one environment sample, one lamp sample and one BRDF sample, combined by the balance
-heuristic; from the fourth vertex on, Russian roulette.
+Every path vertex takes next-event estimation of environment and lights, one sample each, and one BRDF sample, combined
+by multiple importance sampling (balance heuristic). The throughput is the path's weight so far; from the fourth vertex on,
+Russian roulette ends paths by it.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Light at the visible points: multi-strategy direct light with ray-traced visibility, then paths traced on.
+"""The integrator: direct light by multiple importance sampling, then indirect light by path tracing.
 
 See docs/rendering.md for the estimator. Everything here runs in blocks of points, in parallel, each block in batches of
-rays (`wave`); a point's result depends on nothing but the point, the scene, the light, the settings, the seed and the
-frame number.
+rays (`wavefront`); a point's result depends on nothing but the point, the scene, the light, the settings, the seed and
+the frame number.
 """
 
 from __future__ import annotations

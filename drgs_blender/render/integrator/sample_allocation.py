@@ -1,4 +1,4 @@
-"""What all samples of a shading point share: start of its rays, lobes, and how many samples each strategy draws."""
+"""State of a shading point that all its samples share: ray origin, lobes, and samples allocated to each strategy."""
 
 from __future__ import annotations
 

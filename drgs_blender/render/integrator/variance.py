@@ -1,4 +1,4 @@
-"""Variance of light from the spread of its samples, over the points of a pixel where each has few."""
+"""Sample variance of the radiance: of a point, or of all points of its pixel where each has few samples."""
 
 from __future__ import annotations
 

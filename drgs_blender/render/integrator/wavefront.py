@@ -1,4 +1,4 @@
-"""Batches of rays, stage by stage: arithmetic that vectorises, apart from what waits for memory or for Embree.
+"""Wavefront batches of rays, stage by stage: arithmetic that vectorises, apart from what waits for memory or Embree.
 
 A batch is two flat arrays, one of float32 and one of uint32, made of packets of `LANES` slots: field f of a slot lies
 f * LANES behind its field 0 (`at`). Loops over the lanes of a packet have constant length, no call and no branch that

@@ -1,4 +1,4 @@
-"""The cells in which an environment is sampled: the power of each, and which random numbers fall on it.
+"""The CDF of the environment: the power of each sampling cell, and the random numbers that are inverted to it.
 
 Cells follow each other in Morton order, so that equal strata of a random number are compact regions of equal power.
 That order goes through square blocks one after another, which is how the work is divided among threads: results do

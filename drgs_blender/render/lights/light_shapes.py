@@ -1,7 +1,7 @@
-"""One lamp: from Blender's panel to radiance as Cycles has it, and sampling and meeting its shape.
+"""The shape of one of Blender's lights: from its panel to radiance as in Cycles, sampling, pdf and intersection.
 
-A lamp is a row of a float32 table. What it sends towards a point is written per solid angle at that point, so a lamp
-is a set of directions, a radiance for each, and a density with which `lamp_direction` draws them. The conversions were
+A light is a row of a float32 table. What it sends towards a point is written per solid angle at that point, so a light
+is a set of directions, a radiance for each, and a pdf with which `lamp_direction` draws them. The conversions were
 measured in Cycles of Blender 5.0.1 (see docs/rendering.md).
 """
 

@@ -1,8 +1,8 @@
-"""Which lamp to sample from a point: a tree of lamps, weighed by what each may send there.
+"""The light tree: which light to sample from a point, weighed by what each may send there.
 
-Up to `_LEAF` lamps are weighed one by one; more stand in a tree, and the pick walks down it by the estimates of its
-branches (Conty Estevez and Kulla 2018). The probability of a pick can be had for any lamp and point, and the same tree
-finds the lamps that a ray meets. Suns, which are nowhere, stand outside the tree.
+Up to `_LEAF` lights are weighed one by one; more stand in a tree, and the pick walks down it by the estimates of its
+branches (Conty Estevez and Kulla 2018). The probability of a pick can be had for any light and point, and the same tree
+finds the lights that a ray meets. Suns, which are nowhere, stand outside the tree.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""What shines next to the sky, Blender's lights and surfaces that emit: directions towards them, those that rays meet.
+"""All lights but the environment, Blender's and meshes': directions towards them, pdfs, those that rays meet.
 
-``lamp_tree`` says which lamp to sample from a point, ``lamp_shapes`` what one lamp is; ``emitters`` are the surfaces.
+`light_tree` picks the light to sample from a point, `light_shapes` is one light, `mesh_lights` are emitting surfaces.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Which emitting triangle to sample from a point: a tree over triangles in Morton order.
+"""The light tree over emitting triangles, in Morton order.
 
 The tree is complete and binary, node i has children 2 i and 2 i + 1, and its leaves hold equal runs of the rows: it is
 made again in linear time when triangles move. A branch is weighed as by Conty Estevez and Kulla (2018): power over

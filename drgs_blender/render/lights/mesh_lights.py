@@ -1,4 +1,4 @@
-"""Surfaces that emit light as lights that are sampled: all their triangles, one of which is picked by `emitter_tree`.
+"""Mesh lights: surfaces that emit, sampled by triangles, one of which is picked by `mesh_light_tree`.
 
 What a triangle is estimated to send takes the mean of its texture; what it sends is looked up exactly.
 """

@@ -1,9 +1,9 @@
-"""Light of the environment as a surface faces it: the sampling cells in blocks, weighed again for every normal.
+"""Product sampling: the environment times the cosine, tabulated for some hundred normals.
 
-For some hundred normals a table holds the power of each block of cells times the mean cosine towards it (product
-sampling, Clarberg et al. 2005), mixed with the power alone, so that whatever shines can be drawn. Surfaces use the
-table of the nearest normal; its density is exact whatever their own is. Blocks are runs of the cells' Morton order: a
-random number is first moved to the block's run, then inverted as without the tables.
+For each of them a table holds the power of each block of cells times the mean cosine towards it (Clarberg et al. 2005),
+mixed with the power alone, so that whatever shines can be drawn. Surfaces use the table of the nearest normal; its pdf
+is exact whatever their own normal is. Blocks are runs of the cells' Morton order: a random number is first moved to the
+block's run, then inverted as without the tables.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""One emitting triangle: directions towards it, and with which density they are drawn.
+"""One emitting triangle: directions towards it, and the pdf with which they are drawn.
 
 A triangle that is large in the sky is sampled by solid angle (Arvo 1995), in double, as it cancels; others by area.
 Compiled code takes the address of the rows, see `memory`.
