@@ -85,7 +85,7 @@ class Picture:
             passes = blur.averaged(rendered(), count) if self._shot.count else next(rendered())
         except Cancelled as end:
             problem, remedy = f"took longer than {timeout:g} s", "Raise --timeout, or use fewer rays"
-            raise EngineError(f"frame {self.frame.number}", problem, remedy) from end
+            raise EngineError(f"frame {self._shot.number}", problem, remedy) from end
         return passes, _joined(hashes)
 
 

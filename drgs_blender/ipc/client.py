@@ -425,7 +425,7 @@ def _encoded(frame: Frame) -> tuple[dict[str, Any], dict[str, Array]]:
         description, arrays = encode_frame(frame)
         return description, {slot: sendable(array) for slot, array in arrays.items()}
     except CodecError as error:
-        raise UsageError(f"frame {frame.number}", str(error), "Correct the setting or object it names") from error
+        raise UsageError("frame", str(error), "Correct the setting or object it names") from error
 
 
 def _as_error(failure: protocol.Failed) -> DrgsError:
