@@ -11,7 +11,6 @@ from __future__ import annotations
 import contextlib
 import functools
 import hashlib
-import inspect
 import json
 import logging
 import os
@@ -67,11 +66,8 @@ class KernelCache(NullCache):
     def __init__(self, function: Any, kind: str = "kernel", options: dict[str, Any] | None = None) -> None:
         self.function, self.kind, self.options = function, kind, options or {}
         self._names: dict[tuple[Any, ...], str | None] = {}
+        self._source = _source(function.__code__.co_filename)
         closure.note(self._source)
-
-    @functools.cached_property
-    def _source(self) -> Path:
-        return Path(inspect.getfile(self.function)).resolve()
 
     @property
     def cache_path(self) -> str | None:
@@ -195,6 +191,11 @@ def _code_facts(function: Any) -> tuple[str, str]:
 
 def _constant(value: Any) -> str:
     return repr(sorted(map(repr, value)) if isinstance(value, frozenset) else value)
+
+
+@functools.cache
+def _source(name: str) -> Path:
+    return Path(name).resolve()
 
 
 def pack(content: bytes) -> bytes:
