@@ -6,7 +6,7 @@ Nothing of Blender is imported before `register`, so this folder can be collecte
 
 def register() -> None:
     """Called by Blender when the extension is enabled."""
-    from .. import addon, operators
+    from . import addon, operators
 
     addon.register()
     try:
@@ -18,7 +18,7 @@ def register() -> None:
 
 def unregister() -> None:
     """Called by Blender when the extension is disabled, and at exit."""
-    from .. import addon, operators
+    from . import addon, operators
 
     operators.unregister()
     addon.unregister()

@@ -105,7 +105,7 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--asset", type=Path, help="asset to render; default: a sheet of 20,000 triangles")
     args = parser.parse_args()
-    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # else each start compiles all of Python's sources: users' have been
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # else each start compiles all sources: users have them compiled
     links = {"shared memory": link(True), "pipes alone": link(False)}
     with tempfile.TemporaryDirectory() as folder:
         path = args.asset or Path(folder) / "sheet.drgs"

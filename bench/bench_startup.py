@@ -126,7 +126,7 @@ def main() -> None:
     parser.add_argument("--tests", action="store_true", help="measure `make test` as well")
     parser.add_argument("--ci", action="store_true", help="measure `.ci/run` of a clean clone as well")
     options = parser.parse_args()
-    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # else each start compiles all of Python's sources: users' have been
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # else each start compiles all sources: users have them compiled
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         found = measure(folder, options.repeats)
