@@ -68,7 +68,8 @@ class MeshDriven:
         Surfels of the last pose whose face had a vertex that was not finite; they are transparent.
     rest : tuple of arrays
         What `pose_surfels` reads of the binding: face, weights, offset in metres, the faces' mean edge where they have
-        no area (else 0), normal, the tangents in the frame of edges and normal, `spans.spans` and the same in theirs.
+        no area (else 0), normal, the tangents in the frame of edges and normal, `wide_support.spans` and the same in
+        theirs.
     """
 
     def __init__(self, mesh: Mesh, surfels: Surfels, binding: Binding) -> None:

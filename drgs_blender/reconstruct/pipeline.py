@@ -128,7 +128,8 @@ def reconstruct(
 
     Raises
     ------
-    UsageError, AssetError: what cannot be reconstructed, see `hull.find_region`, `targets.targets` and `tsdf.fuse`.
+    UsageError, AssetError: what cannot be reconstructed, see `visual_hull.find_region`, `training_views.targets` and
+        `tsdf.fuse`.
     """
     settings = settings or Settings()
     work = _Work(capture, settings, on_progress or (lambda _: None), cancelled or (lambda: False), folder)

@@ -86,7 +86,7 @@ class Radiance:
         surface colour included; their sum is the point's radiance. Not yet multiplied by ``ShadingPoints.weight``
     variance : (n, 2) float32: estimated variance of the luminance of the diffuse and of the glossy sum
     unshadowed : (n,) float32 or None: for points flagged CATCHER the luminance that would leave them if rays met
-        shadow catchers alone (masks shifted by `masks.WITHOUT`); not read elsewhere
+        shadow catchers alone (masks shifted by `ray_masks.WITHOUT`); not read elsewhere
     moments : (n, 5) float32, what ``variance`` is made of (`shade.spread`): number of samples, then sum and sum of
         squares of their luminance, diffuse and glossy; may be empty
     """

@@ -41,7 +41,7 @@ class State:
     elastic : (n, 9) float32, elastic deformation gradient less 1
     total : (n, 9) float32, deformation gradient since the start less 1; no rows where no matter is plastic
     tau : (n, 6) float32, Kirchhoff stress, Pa: xx, yy, zz, xy, xz, yz
-    memory : (n,) float32, see `stress.respond`
+    memory : (n,) float32, see `constitutive.respond`
     """
 
     x: Array

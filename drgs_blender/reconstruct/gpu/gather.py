@@ -1,4 +1,4 @@
-"""The rendering equation at pixels on a device, one lane a pixel: `decouple.gather` with Warp's rays."""
+"""The rendering equation at pixels on a device, one lane a pixel: `inverse_rendering.estimator` with Warp's rays."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ def project_rows(
     lane: Any, lanes: Any, room: Any, centre: Any, tangent_u: Any, tangent_v: Any, opacity: Any, p: Any, width: Any,
     height: Any, out: Any,
 ) -> None:  # fmt: skip
-    """`screen.project`."""
+    """`projection.project`."""
     record, depth, box = out
     for i in range(lane, len(centre), lanes):
         project_surfel(i, centre, tangent_u, tangent_v, opacity, p, width, height, record, depth, box)
@@ -248,7 +248,7 @@ def project_rows_backward(
     lane: Any, lanes: Any, room: Any, centre: Any, tangent_u: Any, tangent_v: Any, p: Any, index: Any, gradient: Any,
     out: Any,
 ) -> None:  # fmt: skip
-    """`screen.project_backward`."""
+    """`projection.project_backward`."""
     g_centre, g_u, g_v = out
     for k in range(lane, len(index), lanes):
         project_surfel_backward(k, centre, tangent_u, tangent_v, p, index, gradient, g_centre, g_u, g_v)

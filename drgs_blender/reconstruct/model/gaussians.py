@@ -106,7 +106,7 @@ class Gaussians:
         rays: Tensor | None = None,
         mirrors: bool = True,
     ) -> Look:
-        """Render a view over `background` (3,); `rays` are `targets.pixel_rays` where they are at hand."""
+        """Render a view over `background` (3,); `rays` are `training_views.pixel_rays` where they are at hand."""
         mirrors = mirrors and self.light is not None
         centre, eye = self.centres(), np.asarray(camera.matrix_world)[:3, 3]
         u, v, opacity, features = self.by.attributes(self.parameters, centre, eye, bands, mirrors)

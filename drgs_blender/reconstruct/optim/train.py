@@ -72,7 +72,7 @@ class Schedule:
         )
 
 
-#: Part of the schedule that both starts of `starts` are tried for, by views of which each so many is kept aside;
+#: Part of the schedule that both starts of `initialisation` are tried for, by views of which every n-th is kept aside;
 #: decibels there that surfels inside the hull must bring. At least so many views leave some to keep aside.
 TRIAL, ASIDE, WORTH, MANY = 0.2, 8, 0.75, 16
 #: Part of the weight of `Schedule.consistency` that matte pixels have, and what the tint of mirrors adds to it.
@@ -94,7 +94,7 @@ class Training:
     capture : its training views are learned from
     region : where the object is
     schedule : how
-    gaussians : to go on with; None tries both of `starts`
+    gaussians : to go on with; None tries both of `initialisation`
     seconds : where the steps would take longer, the schedule runs by the clock
     by : who does the steps; what it fails at, and all that follows, is done here
 

@@ -53,7 +53,7 @@ class Signal:
 
 
 def demodulate(components: Array, variance: Array, guides: Guides, split: bool = True) -> Signal:
-    """Divide light by surface colour and coverage; parameters as of `denoise.denoise`."""
+    """Divide light by surface colour and coverage; parameters as of `svgf_spatial.denoise`."""
     h, w = guides.coverage.shape
     guide = np.zeros((h, GUIDES, w + 2 * PAD), np.float32)
     light = np.zeros((h, planes_of(split), w + 2 * PAD), np.float32)

@@ -1,4 +1,4 @@
-"""Intel's Open Image Denoise as an alternative to `denoise`, where the wheel `pyoidn` is installed.
+"""Intel's Open Image Denoise as an alternative to `svgf_spatial`, where the wheel `pyoidn` is installed.
 
 A trained network: smoother than SVGF on single pictures, but it takes seconds to load, knows nothing of neighbouring
 frames, and is no part of this package.

@@ -1,8 +1,8 @@
 """Spatial SVGF: an edge-stopping a-trous filter on demodulated light, guided by the light's variance.
 
-Schied et al., "Spatiotemporal Variance-Guided Filtering" (2017); its temporal half is in `temporal`. Diffuse and glossy
-light are filtered apart, each divided by the colour of its surface first and multiplied again afterwards, so that
-texture is not blurred. Changes and their reasons:
+Schied et al., "Spatiotemporal Variance-Guided Filtering" (2017); its temporal half is in `svgf_temporal`. Diffuse and
+glossy light are filtered apart, each divided by the colour of its surface first and multiplied again afterwards, so
+that texture is not blurred. Changes and their reasons:
 
 - Light is divided by coverage too, and pixels without coverage take no part: silhouettes do not bleed.
 - Depth is compared as distance from the tangent plane, in pixel widths: exact on slanted planes, no depth gradient that

@@ -4,9 +4,9 @@ Pictures are compared on demodulated light, so texture moves with its surface an
 where its surface was (`motion`); of the four pixels around that place those count that show the same object, lie on the
 tangent plane there and are turned alike. Where none does, a surface has just come into view and starts anew.
 
-This half is recursive, for a picture that follows the user; `window` has another for final frames. The present's weight
-is not a count of frames but Kalman's gain: with v the variance of this frame and h that of the past, both known from
-the integrator, the best mixture takes (h + b) / (h + b + v) of this frame, b being the square by which the past is
+This half is recursive, for a picture that follows the user; `svgf_window` has another for final frames. The present's
+weight is not a count of frames but Kalman's gain: with v the variance of this frame and h that of the past, both known
+from the integrator, the best mixture takes (h + b) / (h + b + v) of this frame, b being the square by which the past is
 wrong. As long as the light stands still, b = 0 and this is 1 / N in frame N. b is measured as what the difference of
 both, averaged over the neighbourhood, has beyond its own noise. Changes that hide in the noise are bounded by a least
 weight of the present.
@@ -59,7 +59,7 @@ NOW, PAST, BIAS, CHANGES = 0, 2, 4, 6
 
 @dataclass(slots=True)
 class Shot:
-    """One noisy picture as a frame file holds it; see `denoise.denoise` for the arrays.
+    """One noisy picture as a frame file holds it; see `svgf_spatial.denoise` for the arrays.
 
     ``motion`` leads to the frame before; None where there is none.
     """
@@ -100,7 +100,7 @@ def denoise_next(
     history : what this function returned for the frame before; None starts anew
     still : nothing in the scene has changed since then (camera, objects, light), only the noise: pictures are then
         gathered without end, with equal weights
-    split, check : see `denoise.denoise`; a history made with another `split` or size is not used
+    split, check : see `svgf_spatial.denoise`; a history made with another `split` or size is not used
 
     Returns
     -------

@@ -1,6 +1,6 @@
 """SVGF for final frames: the light of a window of frames that looks ahead as far as back.
 
-The mean over the frames k - 2 .. k + 2, weighted by v / (v + b), see `temporal`: a steady change cancels, and what
+The mean over the frames k - 2 .. k + 2, weighted by v / (v + b), see `svgf_temporal`: a steady change cancels, and what
 comes of it depends on these frames alone, so that it does not matter in which runs and on which machines they are made.
 """
 
@@ -33,7 +33,7 @@ def window(shots: Sequence[Shot | None], split: bool = True, check: Callable[[],
     Parameters
     ----------
     shots : frames k - 2 .. k + 2, of one size; None where the sequence has ended. Nothing else enters the result.
-    split, check : see `denoise.denoise`
+    split, check : see `svgf_spatial.denoise`
 
     Returns
     -------

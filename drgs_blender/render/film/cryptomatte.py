@@ -1,7 +1,7 @@
 """Cryptomatte: which objects and materials a pixel shows, and how much of each (Friedman and Jones 2015).
 
-A pixel holds the numbers of the names (`mattes`) and the coverages of what it shows, most first, two in every RGBA
-pass.
+A pixel holds the numbers of the names (`core.cryptomatte`) and the coverages of what it shows, most first, two in every
+RGBA pass.
 """
 
 from __future__ import annotations

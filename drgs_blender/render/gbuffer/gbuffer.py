@@ -30,8 +30,8 @@ class GBuffer:
     depth : (n,) float32, metres along the view axis
     object_index : (n,) int32, as numbered by `scene.TraceScene`
     emission : (n, 3) float32 radiance that the surface itself sends to the camera
-    face, place : (n,) int32: what the point is tied to, as `surface.nearest` numbers it; face -1 for a surfel off all
-        meshes
+    face, place : (n,) int32: what the point is tied to, as `interaction.nearest` numbers it; face -1 for a surfel off
+        all meshes
     barycentric : (n, 2) float32 weights of the face's second and third corner
     alpha : (rows, width, aa) float32: what of each sub-pixel sample hides the background; shadow catchers do not
     """

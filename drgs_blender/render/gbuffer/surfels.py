@@ -85,7 +85,7 @@ def primary_surfels(
     windows : `snap_windows` of this frame
     tied : False: rays meet surfels, and nothing is tied
     rasterise, tie : who blends the surfels, and who ties their points; None: this processor
-    trace, shade : as of `primary_mesh`, for ordinary meshes next to the surfels
+    trace, shade : as of `mesh`, for ordinary meshes next to the surfels
     """
     samples = rasterise(splats, y0, y1)
     layers = combine(samples, scene, splats.parameters, camera.window[0], y0, trace)

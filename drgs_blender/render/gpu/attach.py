@@ -21,7 +21,7 @@ ATTACH = Work(surfels.attach_points, (), NATIVES, _constants)
 
 
 def tie(launcher: Launcher, mirror: Mirror, scene: TraceScene, *arguments: Any) -> None:
-    """`primary_surfels.tie_to_mesh` on a device."""
+    """`surfels.tie_to_mesh` on a device."""
     *inwards, frames, materials, seen = arguments
     with launcher.failures("copying the scene"):
         tracer = mirror.tracer(scene)

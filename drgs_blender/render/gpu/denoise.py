@@ -64,7 +64,7 @@ _PLANES = planes_of(True)
 
 
 def span_rows(lane: Any, lanes: Any, room: Any, coverage: Any, out: Any) -> None:
-    """`signal.find_span`."""
+    """`demodulation.find_span`."""
     (spans,) = out
     for y in range(lane, coverage.shape[0], lanes):
         find_span(y, coverage, spans)
@@ -73,7 +73,7 @@ def span_rows(lane: Any, lanes: Any, room: Any, coverage: Any, out: Any) -> None
 def demodulate_pixels(
     lane: Any, lanes: Any, room: Any, components: Any, variance: Any, surface: Any, out: Any
 ) -> None:  # fmt: skip
-    """`signal._demodulate`."""
+    """`demodulation._demodulate`."""
     guide, light = out
     coverage = surface[0]
     h, w = coverage.shape[0], coverage.shape[1]
@@ -89,7 +89,7 @@ def demodulate_pixels(
 
 
 def clamp_pixels(lane: Any, lanes: Any, room: Any, guide: Any, spans: Any, light: Any, out: Any) -> None:
-    """`denoise._clamp_fireflies`."""
+    """`svgf_spatial._clamp_fireflies`."""
     (clamped,) = out
     h, w, planes = guide.shape[0], guide.shape[2] - 2 * PAD, light.shape[1]
     width = (planes - LIGHT) // 2
@@ -129,7 +129,7 @@ def look_up_pixels(
     lane: Any, lanes: Any, room: Any, guide: Any, spans: Any, vector: Any, expected: Any, other: Any, other_light: Any,
     out: Any,
 ) -> None:  # fmt: skip
-    """`temporal._look_up`."""
+    """`svgf_temporal._look_up`."""
     past, source = out
     h, w = guide.shape[0], guide.shape[2] - 2 * PAD
     for column in range(lane, h * (w + 2 * PAD), lanes):
@@ -143,7 +143,7 @@ def look_up_pixels(
 def compare_pixels(
     lane: Any, lanes: Any, room: Any, still: Any, guide: Any, spans: Any, light: Any, past: Any, source: Any, out: Any
 ) -> None:  # fmt: skip
-    """`temporal._compare`."""
+    """`svgf_temporal._compare`."""
     (change,) = out
     (sums,) = room
     h, w = guide.shape[0], guide.shape[2] - 2 * PAD
@@ -180,7 +180,7 @@ def compare_pixels(
 def mix_pixels(
     lane: Any, lanes: Any, room: Any, least: Any, spans: Any, light: Any, past: Any, source: Any, change: Any, out: Any
 ) -> None:  # fmt: skip
-    """`temporal._mix`."""
+    """`svgf_temporal._mix`."""
     guide, mixed = out
     h, w = guide.shape[0], guide.shape[2] - 2 * PAD
     for pixel in range(lane, h * w, lanes):
@@ -190,7 +190,7 @@ def mix_pixels(
 
 
 def weigh_pixels(lane: Any, lanes: Any, room: Any, sigma: Any, guide: Any, spans: Any, out: Any) -> None:
-    """`denoise._weigh`."""
+    """`svgf_spatial._weigh`."""
     (light,) = out
     h, w = guide.shape[0], guide.shape[2] - 2 * PAD
     for pixel in range(lane, h * w, lanes):
@@ -219,7 +219,7 @@ def tap(k: Any) -> Any:
 
 
 def a_trous_pixels(lane: Any, lanes: Any, room: Any, step: Any, guide: Any, spans: Any, light: Any, out: Any) -> None:
-    """`denoise._a_trous`."""
+    """`svgf_spatial._a_trous`."""
     (filtered,) = out
     (sums,) = room
     h, w, planes = guide.shape[0], guide.shape[2] - 2 * PAD, light.shape[1]
@@ -278,7 +278,7 @@ def a_trous_pixels(lane: Any, lanes: Any, room: Any, step: Any, guide: Any, span
 
 
 def modulate_pixels(lane: Any, lanes: Any, room: Any, light: Any, surface: Any, out: Any) -> None:
-    """`signal._modulate`."""
+    """`demodulation._modulate`."""
     (picture,) = out
     coverage = surface[0]
     h, w = coverage.shape[0], coverage.shape[1]
@@ -339,7 +339,7 @@ def _prepare(launcher: Launcher, shot: Shot, surface: tuple[Any, ...], split: bo
 
 
 def _accumulate(launcher: Launcher, history: Signal, signal: DeviceSignal, shot: Shot, still: bool) -> None:
-    """`picture.temporal.accumulate`; changes `signal`."""
+    """`svgf_temporal.accumulate`; changes `signal`."""
     assert shot.motion is not None
     h, planes, padded = signal.light.shape
     pixels = h * (padded - 2 * PAD)

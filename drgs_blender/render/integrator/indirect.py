@@ -163,7 +163,7 @@ def trace_paths(
     scene : (Tracer or MixedTracer, Geometry, extent)
     lights : (Sky, whether it shines, tables of lamps, whether there are any: one of them is sampled at every vertex)
     bounces : vertices of a path, and whether there are surfaces that emit, which are looked for beyond the last too
-    shift : 0, or ``masks.WITHOUT``
+    shift : 0, or ``ray_masks.WITHOUT``
     found : (capacity, FOUND) float32; INDIRECT is written
     """
     tracer, _, _ = scene

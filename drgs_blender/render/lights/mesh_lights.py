@@ -48,7 +48,7 @@ class EmitterTables(NamedTuple):
 
     Attributes
     ----------
-    tree : see `emitter_tree`
+    tree : see `mesh_light_tree`
     faces : address of (n,) int32, the scene's face of each row
     slot : address of (m - vertex_faces,) int32, of each face, or -1; counted within the mesh where it stands in places
     first : address of (places,) int32, what to add for each place
@@ -274,7 +274,7 @@ def _fill(own, vertices, faces, matrices, luminance, bits, turned, rows):  # typ
 
 @njit
 def sample_emitter(rest, n1, n2, px, py, pz, emitters):  # type: ignore[no-untyped-def]
-    """`lamps.sample_lamp` among emitting triangles: `rest` in [0, 1), float64, picks, two uint32 choose the place."""
+    """`lights.sample_lamp` among emitting triangles: `rest` in [0, 1), float64, picks, two uint32 choose the place."""
     tables = _tables(emitters)
     i, probability = pick_emitter(rest, px, py, pz, tables.tree)
     if i < 0:

@@ -15,7 +15,7 @@ from ..memory import load_float
 from ..sampling import ONE, TWO, ZERO, F, fast_atan2_turns
 
 #: Columns of a row: corner, two edges that leave it, area, square of the longest edge, unit normal, mean luminance of
-#: the emitted radiance, bits (``lamp_shapes``' and `ABSENT`).
+#: the emitted radiance, bits (``light_shapes``' and `ABSENT`).
 CORNER, EDGE, SIDE, AREA, LONGEST, NORMAL, LUMINANCE, BITS = 0, 3, 6, 9, 10, 11, 14, 15
 WIDTH = 16
 #: Bits: does not shine in a world of shadow catchers alone; is of a closed surface, whose outside its normal is.

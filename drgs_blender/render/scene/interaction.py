@@ -26,7 +26,7 @@ class Tracer(NamedTuple):
 
     Attributes
     ----------
-    intersect, occluded, scene : addresses, see `tree.TriangleBVH`
+    intersect, occluded, scene : addresses, see `triangle_bvh.TriangleBVH`
     first_face : address of (groups,) int32, the first face of each group
     first_place : address of (groups,) int32, the first row of each group's places in ``Geometry.place_*``
     """
@@ -72,7 +72,7 @@ def nearest(tracer, ox, oy, oz, dx, dy, dz, tnear, tfar, mask):  # type: ignore[
     """Closest hit of one ray: ``(t, face, place, u, v, gx, gy, gz)``, all float32 or int32.
 
     ``face`` is -1 when nothing is hit (t is then `tfar`), ``place`` -1 outside shapes in places. The hit is
-    (1 - u - v) v0 + u v1 + v v2; g is for `surface_at`. `mask` (int32) tells what the ray meets, see `masks`.
+    (1 - u - v) v0 + u v1 + v v2; g is for `surface_at`. `mask` (int32) tells what the ray meets, see `ray_masks`.
     """
     t, group, face, place, u, v, gx, gy, gz = trace(
         tracer.intersect, tracer.scene, ox, oy, oz, dx, dy, dz, tnear, tfar, mask

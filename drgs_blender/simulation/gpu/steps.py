@@ -237,7 +237,7 @@ def solve_nodes(
 
 
 def carried(nodes: Any, neighbour: Any, b: Any, i: Any, j: Any, k: Any, wx: Any, wy: Any, wz: Any) -> Any:
-    """Velocity that matter gives to a rider, and the weight of the nodes it comes from, as `transfer._carried`."""
+    """Velocity that matter gives to a rider, and the weight of the nodes it comes from, as `p2g_g2p._carried`."""
     heaviest = ZERO
     for e in range(27):
         s, n, _ = node_of(neighbour, b, i + e // 9, j + e // 3 % 3, k + e % 3)
@@ -259,7 +259,7 @@ def move_particles(
     model: Any, parameters: Any, solid: Any, pin: Any, pin_velocity: Any, n: Any, origin: Any, spacing: Any, clock: Any,
     times: Any, apart: Any, pinned: Any, out: Any,
 ) -> None:  # fmt: skip
-    """Grid to particles: move them, deform them, and find their stress, as `transfer.gather`."""
+    """Grid to particles: move them, deform them, and find their stress, as `p2g_g2p.gather`."""
     x, v, affine, elastic, total, tau, memory, fastest = out
     if clock[STOPPED] != 0.0:
         return
