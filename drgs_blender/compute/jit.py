@@ -95,10 +95,12 @@ class _Memory:
 
 
 def plain(array: np.ndarray) -> np.ndarray:
-    """`array` as a kernel that only reads it takes it: the same memory, not marked as read only.
+    """`array` as a kernel that only reads it takes it: contiguous, not marked as read only; the same memory if it can.
 
-    Numba compiles a kernel anew for arrays that are marked, which those of files and messages are.
+    Numba compiles a kernel anew for each order of axes and for arrays that are marked, as those of files and messages
+    are.
     """
+    array = np.ascontiguousarray(array)
     return array if array.flags.writeable else np.asarray(_Memory(array))
 
 

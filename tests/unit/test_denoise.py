@@ -7,6 +7,7 @@ import pytest
 
 from drgs_blender.core.frame import Camera, Frame, ObjectState, RenderSettings, World, split_rays
 from drgs_blender.render import pipeline
+from drgs_blender.render.denoise.demodulation import demodulate
 from drgs_blender.render.denoise.svgf_spatial import denoise
 from drgs_blender.render.film.film import Film
 from drgs_blender.render.film.guides import Guides
@@ -252,3 +253,17 @@ def test_gain_at_32_rays_against_the_converged_picture(monkeypatch: pytest.Monke
 
     gain = psnr(denoise(film.components, film.variance, film.guides())) - psnr(film.components)
     assert gain > 2.0, gain
+
+
+def test_the_order_of_axes_compiles_nothing_anew(compiled):
+    """A kernel of Numba's takes seconds for each order of the axes of what it is given."""
+    for turned in (False, True):
+        shape = (8, 9, 3)
+        values = np.random.default_rng(3).random(shape).astype(np.float32)
+        if turned:
+            values = np.asfortranarray(values)
+        flat = np.ascontiguousarray(values[..., 0])
+        guides = Guides(flat, values, values, values, flat, flat, flat, flat)
+        compiled.clear()
+        demodulate(np.ones((8, 9, 4, 3), np.float32), np.ones((8, 9, 2), np.float32), guides)
+    assert "_demodulate" not in compiled

@@ -25,7 +25,7 @@ import gc, sys
 from numba.core.dispatcher import Dispatcher
 sys.path.insert(0, sys.argv[1])
 from capture_cases import balls
-from drgs_blender.reconstruct import job
+from drgs_blender.reconstruct import pipeline as job
 from drgs_blender.reconstruct.inverse_rendering import run
 from drgs_blender.reconstruct.inverse_rendering.settings import Settings as Decoupling
 from drgs_blender.reconstruct.optim.train import Schedule, Training

@@ -6,6 +6,8 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
+from ...compute.jit import plain
+
 Array = np.ndarray
 
 
@@ -27,5 +29,5 @@ class Guides:
 
     @property
     def arrays(self) -> tuple[Array, ...]:
-        """All of them, in this order."""
-        return tuple(getattr(self, f.name) for f in fields(self))
+        """All of them, in this order, as kernels take them."""
+        return tuple(plain(getattr(self, f.name)) for f in fields(self))

@@ -84,7 +84,7 @@ def prepare(posed: PosedSurfels, camera: Camera, parameters: Array) -> Splats:
     screen = np.empty((n, RECORD), np.float32)
     box = np.empty((n, 4), np.int32)
     nearest = np.empty(n, np.float32)
-    _project(*(getattr(posed, name) for name in PLACED), parameters, camera.window, screen, box, nearest)
+    _project(*(plain(getattr(posed, name)) for name in PLACED), parameters, camera.window, screen, box, nearest)
     order = depth_order(np.ascontiguousarray(screen[:, ZC]), box)
     surface = np.empty((len(order), SURFACE), np.float32)
     _gather_surface(order, tuple(plain(getattr(posed, name)) for name in SHOWN), surface)
