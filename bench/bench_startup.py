@@ -105,10 +105,18 @@ def _shipped(picture: list[object], cache: Path) -> float:
 
 
 def whole(command: str, folder: Path) -> float:
-    """Seconds of a command of tools/dev.py with an empty cache folder."""
+    """Seconds of a command of tools/dev.py with an empty cache folder, the kernels of a release put aside."""
     shutil.rmtree(folder / "cache", ignore_errors=True)
     shutil.rmtree(ROOT / "out" / "demo", ignore_errors=True)
-    return run([sys.executable, ROOT / "tools/dev.py", command], DRGS_CACHE_DIR=folder / "cache", DRGS_SHIPPED="0")
+    kernels, aside = ROOT / "drgs_blender/compute/kernels", ROOT / "build/kernels-aside"
+    aside.parent.mkdir(exist_ok=True)
+    if kernels.is_dir():
+        kernels.replace(aside)
+    try:
+        return run([sys.executable, ROOT / "tools/dev.py", command], DRGS_CACHE_DIR=folder / "cache")
+    finally:
+        if aside.is_dir():
+            aside.replace(kernels)
 
 
 def clone(folder: Path) -> float:
@@ -122,24 +130,29 @@ def main() -> None:
     """Measure and write the section."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--no-kernels", action="store_true", help="only what the other options ask for")
     parser.add_argument("--demo", action="store_true", help="measure `make demo` as well")
     parser.add_argument("--tests", action="store_true", help="measure `make test` as well")
     parser.add_argument("--ci", action="store_true", help="measure `.ci/run` of a clean clone as well")
     options = parser.parse_args()
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # else each start compiles all sources: users have them compiled
+    rows: dict[str, list[object]] = json.loads(KEPT.read_text()) if KEPT.exists() else {}
+
+    def keep(found: dict[str, float]) -> None:
+        rows.update({what: [seconds, time.strftime("%Y-%m-%d")] for what, seconds in found.items()})
+        KEPT.parent.mkdir(parents=True, exist_ok=True)
+        KEPT.write_text(json.dumps(rows))
+
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        found = measure(folder, options.repeats)
+        if not options.no_kernels:
+            keep(measure(folder, options.repeats))
         if options.demo:
-            found["`make demo` after the environments, cold"] = whole("demo", folder)
+            keep({"`make demo` after the environments, cold": whole("demo", folder)})
         if options.tests:
-            found["`make test`, cold"] = whole("test", folder)
+            keep({"`make test`, cold": whole("test", folder)})
         if options.ci:
-            found["`.ci/run`, environments and cache cold"] = clone(folder)
-    rows: dict[str, list[object]] = json.loads(KEPT.read_text()) if KEPT.exists() else {}
-    rows |= {what: [seconds, time.strftime("%Y-%m-%d")] for what, seconds in found.items()}
-    KEPT.parent.mkdir(parents=True, exist_ok=True)
-    KEPT.write_text(json.dumps(rows))
+            keep({"`.ci/run`, environments and cache cold": clone(folder)})
     shown = [[what, *rows.get(what, ["not measured", ""]), *goals] for what, goals in GOALS.items()]
     text = (
         "Cold: an empty cache folder, without kernels of a release. Whole processes, their start included; medians of "

@@ -4,7 +4,7 @@
 
 - what counts is the processor time of the test, of the programs that it started and waited for, and of set-up that no
   other test shares, less that of compiling kernels. A busy machine and an empty cache of kernels change little of it,
-  and on a slow processor the limit is larger, by a loop that is timed once;
+  and where the processor is slow just then the limit is larger, by a loop that is timed;
 - a test that only waits uses no processor: it may take `WAITING` times as long by the clock, and longer in proportion
   to how many programs want each processor;
 - a test that is over a limit runs a second time at once, and the smaller figures count: what it or its programs
@@ -14,8 +14,8 @@
 
 from __future__ import annotations
 
-import functools
 import os
+import statistics
 import sys
 import threading
 import time
@@ -101,10 +101,9 @@ def loop() -> float:
     return time.process_time() - begun
 
 
-@functools.cache
 def slowness() -> float:
-    """How many times slower this processor is than the one the limits are meant for; 1 for a faster one."""
-    return max(1.0, min(loop() for _ in range(5)) / LOOP_SECONDS)
+    """How many times slower this processor is right now than the one the limits are meant for; 1 for a faster one."""
+    return max(1.0, statistics.median(loop() for _ in range(7)) / LOOP_SECONDS)
 
 
 @dataclass
@@ -129,17 +128,19 @@ class Cost:
         """What is wrong with the test, "" if nothing."""
         # what waits for others waits longer where many want the processor
         crowd = max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1)) if hasattr(os, "getloadavg") else 2.0
-        if self.busy > SECONDS * slowness():
-            return f"took {self.busy:.1f} s of the processor, more than {SECONDS * slowness():.1f}"
-        if self.wall > SECONDS * slowness() * WAITING * crowd:
-            return f"took {self.wall:.1f} s, more than {SECONDS * slowness() * WAITING * crowd:.0f}"
+        if self.busy <= SECONDS and self.wall <= SECONDS * WAITING * crowd:
+            return ""
+        limit = SECONDS * slowness()
+        if self.busy > limit:
+            return f"took {self.busy:.1f} s of the processor, more than {limit:.1f}"
+        if self.wall > limit * WAITING * crowd:
+            return f"took {self.wall:.1f} s, more than {limit * WAITING * crowd:.0f}"
         return ""
 
     def shared_fault(self) -> str:
         """What is wrong with set-up that it shares with others, "" if nothing."""
         for name, seconds in self.shared.items():
-            limit = SHARED_SECONDS * slowness()
-            if seconds > limit:
+            if seconds > SHARED_SECONDS and seconds > (limit := SHARED_SECONDS * slowness()):
                 return f"needs {name}, whose set-up took {seconds:.1f} s of the processor, more than {limit:.1f}"
         return ""
 

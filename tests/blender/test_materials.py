@@ -495,6 +495,7 @@ def test_nodes_that_share_a_source_are_worked_out_once(scene, export):
     assert frame.meshes[0].materials[0].roughness == pytest.approx(0.5)
 
 
+@pytest.mark.slow
 def test_very_long_rows_of_nodes_are_cut_off_and_named(scene, export):
     tree, principled = material()
     value, shader = add(tree, "Value"), principled.outputs[0]

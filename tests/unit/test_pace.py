@@ -70,10 +70,8 @@ def test_programs_that_a_test_runs_count(outcome, monkeypatch) -> None:
 
 def test_slowness_is_that_of_the_loop(monkeypatch) -> None:
     for seconds, slowness in ((0.5 * pace.LOOP_SECONDS, 1.0), (3 * pace.LOOP_SECONDS, 3.0)):
-        pace.slowness.cache_clear()
         monkeypatch.setattr(pace, "loop", lambda seconds=seconds: seconds)
         assert pace.slowness() == pytest.approx(slowness)
-    pace.slowness.cache_clear()
 
 
 def test_set_up_counts_and_may_take_longer_where_it_is_shared(outcome) -> None:

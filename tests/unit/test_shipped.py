@@ -33,6 +33,8 @@ def _twice(x):
 def release(tmp_path, monkeypatch, compiled):
     """The archive of a release that brings one kernel, and a cache folder that lacks it."""
 
+    monkeypatch.delenv("DRGS_SHIPPED", raising=False)
+
     def use(cache: Path) -> None:
         monkeypatch.setenv("DRGS_CACHE_DIR", str(cache))
         for known in (folders.cache_folder, shipped._archive, shipped._names):
@@ -236,13 +238,14 @@ print(digest.hexdigest(), len(Count.names))
 """
 
 
-def frame(asset: Path, target: str, cache: Path, source: Path = ROOT) -> tuple[str, int]:
-    """Digest of a frame's passes, and how many kernels were compiled for it."""
+def frame(asset: Path, target: str, cache: Path, source: Path | None = None) -> tuple[str, int]:
+    """Digest of a frame's passes, and how many kernels were compiled for it; with the kernels of `source`, or none."""
     environment = {name: value for name, value in os.environ.items() if not name.startswith(("DRGS_", "NUMBA_"))}
-    environment |= {"DRGS_CPU_TARGET": target, "DRGS_CACHE_DIR": str(cache), "PYTHONPATH": str(source)}
+    environment |= {"DRGS_CPU_TARGET": target, "DRGS_CACHE_DIR": str(cache), "PYTHONPATH": str(source or ROOT)}
+    environment |= {} if source else {"DRGS_SHIPPED": "0"}
     done = subprocess.run(
         [sys.executable, "-c", _FRAME, asset],
-        env=environment, cwd=source, capture_output=True, text=True, timeout=900,
+        env=environment, cwd=source or ROOT, capture_output=True, text=True, timeout=900,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     digest, count = done.stdout.split()
