@@ -15,14 +15,16 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from ..core.errors import EXIT_CANNOT_WRITE, EXIT_INTERRUPTED, Cancelled, DrgsError
 from ..core.phases import PREPARING
 from . import closure, manifest, shipped
 from .folders import cache_folder
+from .kernel_cache import KernelCache
 from .manifest import Kernel
 
 log = logging.getLogger(__name__)
@@ -82,18 +84,26 @@ def _compile(
 
 def lacking(kernels: Iterable[Kernel]) -> list[Kernel]:
     """Those of some kernels that are not compiled yet and can be compiled ahead."""
+    codegen = _codegen()
+    return [kernel for kernel, cache, signature in _known(kernels) if not cache.is_there(signature, codegen)]
+
+
+def _codegen() -> Any:
     from .jit import numba
 
-    codegen = numba.core.registry.cpu_target.target_context.codegen()
-    missing = []
+    return numba.core.registry.cpu_target.target_context.codegen()
+
+
+def _known(kernels: Iterable[Kernel]) -> Iterator[tuple[Kernel, KernelCache, tuple[Any, ...]]]:
+    """Kernels that exist, with their caches and argument types; not those of packages that are not installed."""
     for kernel in kernels:
         try:
-            cache = manifest.dispatcher(kernel)._cache
-            if not cache.is_there(manifest.signature(kernel), codegen):
-                missing.append(kernel)
+            cache, signature = manifest.dispatcher(kernel)._cache, manifest.signature(kernel)
         except (LookupError, AttributeError) as error:
             log.info("kernel %s: %s", kernel.name, error)
-    return missing
+            continue
+        if isinstance(cache, KernelCache):  # else Numba keeps it in its own way
+            yield kernel, cache, signature
 
 
 @dataclass(frozen=True)
@@ -117,18 +127,17 @@ class Stock:
 
 def stock() -> Stock:
     """Where the kernels of all jobs are; those of packages that are not installed do not count."""
-    from .jit import numba
-
-    codegen = numba.core.registry.cpu_target.target_context.codegen()
-    kernels, brought = manifest.needed(manifest.jobs()), 0
-    missing = len(lacking(kernels))
-    known = 0
-    for kernel in kernels:
-        with contextlib.suppress(LookupError, AttributeError):
-            name = manifest.dispatcher(kernel)._cache.file_name(manifest.signature(kernel), codegen)
-            known += 1
-            brought += name is not None and shipped.has(name)
-    return Stock(brought, known - brought - missing, missing)
+    codegen = _codegen()
+    brought = kept = missing = 0
+    for _, cache, signature in _known(manifest.needed(manifest.jobs())):
+        name = cache.file_name(signature, codegen)
+        if name is not None and shipped.has(name):
+            brought += 1
+        elif cache.is_there(signature, codegen):
+            kept += 1
+        else:
+            missing += 1
+    return Stock(brought, kept, missing)
 
 
 def processes() -> int:

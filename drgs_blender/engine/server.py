@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from ..compute.folders import leave_temporary
 from ..core.errors import EXIT_INTERNAL, EXIT_OK, EXIT_VERSION, Cancelled, DeviceError, DrgsError
 from ..core.phases import PREPARING, STARTING, is_counted
 from ..core.version import __version__
@@ -215,8 +216,7 @@ def _refuse(link: Link, problem: str) -> None:
 
 
 def _leave(code: int) -> None:
-    if "drgs_blender.compute.folders" in sys.modules:
-        sys.modules["drgs_blender.compute.folders"].leave_temporary()
+    leave_temporary()
     logging.shutdown()
     os._exit(code)
 

@@ -39,7 +39,7 @@ def package(tmp_path, monkeypatch):
 
 
 def forget() -> None:
-    for function in (closure.digest, closure.closure, closure.changed, closure._facts, closure._files):
+    for function in (closure.digest, closure.closure, closure.changed, closure._facts, closure._files, closure._name):
         function.cache_clear()
 
 

@@ -32,7 +32,6 @@ def _twice(x):
 @pytest.fixture
 def release(tmp_path, monkeypatch, compiled):
     """The archive of a release that brings one kernel, and a cache folder that lacks it."""
-
     monkeypatch.delenv("DRGS_SHIPPED", raising=False)
 
     def use(cache: Path) -> None:
