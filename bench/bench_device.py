@@ -100,7 +100,7 @@ def main() -> None:
     shades = mesh.albedo, mesh.roughness, mesh.metallic
     scene.update([TraceObject(options.asset, mesh.vertices, mesh.faces, *shades)])
     camera = pinhole(frame_camera(mesh.vertices, options.size, azimuth=-60, fill=0.66))
-    settings = RenderSettings(16, 8, 8, bounces=1, primary="mesh", aa=4)
+    settings = RenderSettings(samples=32, bounces=1, primary="mesh", aa=4)
     points = primary_mesh(scene, camera, camera_parameters(camera, settings, 1), 0, options.size).points
     light = EnvironmentLight(World(environment=read_environment(environments() / "city.exr").radiance))
 

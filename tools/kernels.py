@@ -108,7 +108,7 @@ def engine(folder: Path, what: str) -> None:
     camera = Camera(matrix, 48, 48, 60.0, 60.0, 24.0, 24.0)
     mesh = read_asset(folder / "spot.drgs").mesh
     world = World(np.full((32, 64, 3), 0.5, np.float32))
-    settings = RenderSettings(cosine=2, ggx=1, environment=1, aa=1)
+    settings = RenderSettings(samples=4, aa=1)
     with EngineClient(locate_engine()) as client:
         key = client.load_asset(str(folder / "spot.drgs"))
         body = ObjectState("cow", key, vertices=np.array(mesh.vertices, np.float32))

@@ -30,7 +30,7 @@ _DARK = 0.05
 _BRIGHT, _BRIGHTEST = 0.9, 0.8
 #: Rounds: the light that other parts of the object reflect depends on their albedo.
 _ROUNDS = 2
-_SAMPLES = RenderSettings(cosine=96, ggx=48, environment=48, aa=1, bounces=1, look="principled")
+_SAMPLES = RenderSettings(samples=192, aa=1, bounces=1, look="principled")
 
 
 def remove_light(

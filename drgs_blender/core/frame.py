@@ -271,50 +271,68 @@ class World:
 class RenderSettings:
     """How a frame is solved.
 
-    ``cosine``, ``ggx``, ``environment`` are samples a pixel of each strategy, their sum is "rays"; with ``split``
-    "auto" the sum alone counts, and each point divides it by its material. ``aa`` is the number of sub-pixel positions
-    among which samples are divided; 0 chooses it by their number (`positions`). ``bounces`` counts indirect bounces.
-    ``look`` is "principled" (Blender's Principled BSDF, GGX) or "paper" (the paper's BRDF). ``threads`` 0 is all cores.
-    ``noise_threshold`` above 0 stops sampling a pixel once its estimated error (as Cycles defines it) is below it; the
-    samples above are then the most a pixel gets. ``clamp_indirect`` above 0 limits the brightness of a single indirect
-    sample, which loses energy. ``primary`` is what the camera sees of DR-GS objects; ``tracer`` is what light meets of
-    them: their meshes, or the surfels themselves, blended along each ray (slower; for thin things without a good mesh).
-    ``filter_width`` is that of the pixel filter as Cycles counts it, half of Blackman and Harris's window; 0 is a box
-    of one pixel.
-    ``device`` "cuda" has a graphics card do what it can, see docs/gpu.md; without one it is as "cpu", with a warning.
+    Attributes
+    ----------
+    samples : int
+        Per pixel, over all strategies; each point divides them by its material.
+    strategy_samples : tuple of int, optional
+        Samples per pixel drawn by the cosine, by GGX and by the environment and lights, instead of ``samples``. The
+        paper has (16, 8, 8).
+    bounces : int
+        Indirect bounces.
+    subpixel_samples : int
+        Places in a pixel among which its samples are divided; 0 chooses by their number (`subpixel_count`).
+    camera_sees, rays_see : {"surfels", "mesh"}
+        What the camera sees of DR-GS objects, and what shadow and indirect rays meet of them: their meshes, or the
+        surfels, blended along each ray (slower; for thin things without a good mesh).
+    denoise : {"none", "svgf", "oidn"}
+    shading_model : {"principled", "paper"}
+        Blender's Principled BSDF, or the paper's BRDF.
+    film_transparent : bool
+    seed : int
+    threads : int
+        0 is all cores.
+    noise_threshold : float
+        Above 0, sampling of a pixel stops once its estimated error (as Cycles defines it) is below; the samples above
+        are then the most that a pixel gets.
+    clamp_indirect : float
+        Above 0, the limit of a single indirect sample, which loses energy.
+    device : {"cpu", "cuda"}
+        "cuda" has a graphics card do what it can, see docs/gpu.md; without one it is as "cpu", with a warning.
+    filter_width : float
+        Of the pixel filter in pixels as Cycles counts it, half of Blackman and Harris's window; 0 is a box of one pixel.
     """
 
-    cosine: int = 16
-    ggx: int = 8
-    environment: int = 8
+    samples: int = 32
+    strategy_samples: tuple[int, int, int] | None = None
     bounces: int = 1
-    aa: int = 0
-    primary: Literal["surfels", "mesh"] = "surfels"
-    tracer: Literal["mesh", "surfels"] = "mesh"
+    subpixel_samples: int = 0
+    camera_sees: Literal["surfels", "mesh"] = "surfels"
+    rays_see: Literal["mesh", "surfels"] = "mesh"
     denoise: Literal["none", "svgf", "oidn"] = "none"
-    look: Literal["principled", "paper"] = "principled"
+    shading_model: Literal["principled", "paper"] = "principled"
     film_transparent: bool = False
     seed: int = 0
     threads: int = 0
     noise_threshold: float = 0.0
     clamp_indirect: float = 0.0
-    split: Literal["auto", "counts"] = "auto"
     device: Literal["cpu", "cuda"] = "cpu"
     filter_width: float = 0.0
 
     @property
-    def rays(self) -> int:
-        """Samples a pixel over all strategies."""
-        return self.cosine + self.ggx + self.environment
+    def sample_count(self) -> int:
+        """Samples per pixel: ``samples``, or the sum of ``strategy_samples``."""
+        return self.samples if self.strategy_samples is None else sum(self.strategy_samples)
 
     @property
-    def positions(self) -> int:
-        """Sub-pixel positions: ``aa``, or as many as let edges and textures keep up with the noise."""
-        if self.aa:
-            return self.aa
-        # Another position costs surfels more than a mesh, and they come filtered.
-        wanted = min(self.rays // 8, 16) if self.primary == "surfels" else max(min(self.rays // 2, 16), self.rays // 4)
-        return min(max(wanted, 4), 64, max(self.rays, 1))
+    def subpixel_count(self) -> int:
+        """Places per pixel: ``subpixel_samples``, or as many as let edges and textures keep up with the noise."""
+        if self.subpixel_samples:
+            return self.subpixel_samples
+        # Another place costs surfels more than a mesh, and they come filtered.
+        count = self.sample_count
+        wanted = min(count // 8, 16) if self.camera_sees == "surfels" else max(min(count // 2, 16), count // 4)
+        return min(max(wanted, 4), 64, max(count, 1))
 
 
 @dataclass(slots=True)
@@ -368,9 +386,3 @@ class Frame:
     previous: Moment | None = None
     next: Moment | None = None
     history: str = ""
-
-
-def split_rays(rays: int) -> tuple[int, int, int]:
-    """Divide `rays` as the paper does: half cosine, a quarter GGX, a quarter light; each at least 1."""
-    ggx = environment = max(1, rays // 4)
-    return max(1, rays - ggx - environment), ggx, environment

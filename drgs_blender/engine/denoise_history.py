@@ -56,8 +56,7 @@ class Histories:
         old = self._known.get(frame.history, Sequence())
         # How many samples are drawn, and which, is a matter of noise.
         lasting = replace(
-            settings, seed=0, threads=0, device="cpu", cosine=0, ggx=0, environment=0, noise_threshold=0.0
-        )
+            settings, seed=0, threads=0, device="cpu", samples=0, noise_threshold=0.0)
         situation = renewed(camera, old.situation[0]), renewed(lasting, old.situation[1]), *scenery
         split = any(name in frame.passes for name in COMPONENTS)
         fit = scene.layout, scene.places.shape, camera.window, camera.width, camera.height, settings.primary, split

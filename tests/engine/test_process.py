@@ -225,7 +225,7 @@ client = EngineClient({engine_program()!r})
 key = client.load_asset({str(asset_path)!r})
 camera = Camera(np.eye(4), 400, 300, 400, 400, 200, 150)
 camera.matrix_world[2, 3] = 4
-frame = Frame(1, camera, [ObjectState("Ball", key)], settings=RenderSettings(cosine=4096, ggx=4096, environment=4096))
+frame = Frame(1, camera, [ObjectState("Ball", key)], settings=RenderSettings(samples=12288))
 client.render(frame, lambda phase, part: print(client.pid, phase, flush=True))
 """
     environment = os.environ | {"TMPDIR": str(tmp_path)}

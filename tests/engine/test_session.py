@@ -377,16 +377,16 @@ def test_statistics_and_stages(session, make_frame):
 
 def test_a_threshold_that_cannot_be_followed_is_named(session, make_frame):
     frame = make_frame()
-    frame.settings = replace(frame.settings, noise_threshold=0.1, cosine=3, ggx=2, environment=2, aa=4)
+    frame.settings = replace(frame.settings, noise_threshold=0.1, samples=7, aa=4)
     assert any("noise threshold" in text and "3 + 2 + 2" in text for text in session.render(frame).warnings)
-    frame.settings = replace(frame.settings, cosine=16, ggx=8, environment=8)
+    frame.settings = replace(frame.settings, samples=32)
     assert not any("noise threshold" in text for text in session.render(frame).warnings)
 
 
 def test_regions_and_history_do_not_show_in_adaptive_frames(session, make_frame, asset_path):
     """Whether a pixel goes on is its own affair: a region is a crop, with a lamp in the scene too."""
     frame = make_frame(0.2)
-    frame.settings = replace(frame.settings, noise_threshold=0.2, cosine=32, ggx=16, environment=16, aa=2)
+    frame.settings = replace(frame.settings, noise_threshold=0.2, samples=64, aa=2)
     place = np.eye(4)
     place[:3, 3] = (0.5, -1.0, 3.0)
     frame.lights = [Light("Panel", "area", place, power=60.0, size_x=0.5)]

@@ -50,7 +50,7 @@ def test_the_samples_are_divided_into_equal_parts(changes: dict, expected: int) 
 def test_the_mean_of_all_parts_is_the_whole() -> None:
     """A part draws the very samples that the whole draws, so that nothing is lost by stopping late."""
     points, light, scene = row_of_points(12, aa=2), lively_light(), TraceScene()
-    settings = RenderSettings(16, 8, 8, bounces=0, aa=2)
+    settings = RenderSettings(samples=32, bounces=0, aa=2)
     whole = integrate(scene, light, points, settings, 5)
     parts = [integrate(scene, light, points, settings, 5, part=(i, 4)) for i in range(4)]
     mean = np.mean([p.components for p in parts], axis=0)
@@ -108,8 +108,8 @@ def test_a_pixel_stops_as_soon_as_its_error_is_small_enough() -> None:
 
 def test_a_lower_threshold_gives_a_smaller_error() -> None:
     points, light, scene = row_of_points(WIDTH), lively_light(), TraceScene()
-    settings = RenderSettings(256, 128, 128, bounces=0, aa=1)
-    truth = integrate(scene, light, points, replace(settings, cosine=8192, ggx=4096, environment=4096), 1).total
+    settings = RenderSettings(samples=512, bounces=0, aa=1)
+    truth = integrate(scene, light, points, replace(settings, samples=16384), 1).total
     errors, samples = [], []
     for threshold in (0.4, 0.02):
         asked = 0

@@ -23,8 +23,8 @@ from drgs_blender.formats.splats import splats_of
 
 #: Floor (+Z) and wall (facing -X, at x = 1), n x n squares each.
 N = 12
-FORWARD = RenderSettings(cosine=512, ggx=128, environment=256, aa=1, bounces=1, look="principled", seed=99)
-FEW = RenderSettings(cosine=96, ggx=32, environment=64, aa=1, bounces=1, look="principled")
+FORWARD = RenderSettings(samples=896, aa=1, bounces=1, look="principled", seed=99)
+FEW = RenderSettings(samples=192, aa=1, bounces=1, look="principled")
 
 
 def sky() -> np.ndarray:

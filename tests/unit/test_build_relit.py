@@ -12,7 +12,7 @@ from drgs_blender.core.frame import RenderSettings, World
 from drgs_blender.deform.binding import bind
 from drgs_blender.render.lights.environment import EnvironmentLight
 
-SETTINGS = RenderSettings(cosine=128, ggx=64, environment=64, aa=1, bounces=0, look="paper")
+SETTINGS = RenderSettings(samples=256, aa=1, bounces=0, look="paper")
 
 
 def plate(albedo: float = 0.6, flip: bool = False) -> Asset:

@@ -187,7 +187,7 @@ def test_defaults_are_those_of_the_settings():
 
 
 def test_only_given_options_override_the_scene():
-    scene = RenderSettings(cosine=1, ggx=2, environment=3, bounces=4, aa=5, look="paper", film_transparent=True, seed=9)
+    scene = RenderSettings(samples=6, bounces=4, aa=5, look="paper", film_transparent=True, seed=9)
     assert sampling.override(scene, options([], False)) == scene
     changed = sampling.override(scene, options(["--rays", "64", "--no-transparent"], False))
     assert (changed.cosine, changed.ggx, changed.environment) == (32, 16, 16)

@@ -175,7 +175,7 @@ def test_shading_matches_the_renderer_where_the_mesh_shadows_itself():
         number, zero, np.ones(24, np.float32), origin, up, up, view, albedo, roughness.astype(np.float32),
         metallic.astype(np.float32), np.zeros(24, np.uint8), zero - 1, np.zeros(24, np.float32),
     )  # fmt: skip
-    settings = RenderSettings(cosine=2048, ggx=1024, environment=1024, bounces=0, aa=1)
+    settings = RenderSettings(samples=4096, bounces=0, aa=1)
     theirs = kernel_integrate(scene, EnvironmentLight(World(image)), points, settings, 1).components.sum(1)
     # Next to the contact, rays that start a little higher see a little less.
     assert ours.numpy() == pytest.approx(theirs, rel=0.03, abs=0.006)
@@ -391,7 +391,7 @@ def photographed(ball: Mesh) -> Capture:
     world = World(image.astype(np.float32))
     light, none, column = EnvironmentLight(world), np.empty((0, 3), np.float32), np.empty(0, np.float32)
     posed = PosedSurfels(none, none, none, none, column, none, column, column, np.empty(0, np.int32))
-    settings = RenderSettings(cosine=64, ggx=32, environment=32, bounces=0, primary="mesh", aa=4, film_transparent=True)
+    settings = RenderSettings(samples=128, bounces=0, primary="mesh", aa=4, film_transparent=True)
     views = []
     for k in range(14):
         camera = camera_at(2.4 * k, -0.6 + 0.12 * k, 32)

@@ -23,7 +23,7 @@ from drgs_blender.render.points import CATCHER, Radiance, ShadingPoints
 from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene
 
 BALL = trimesh.creation.icosphere(subdivisions=3)
-SETTINGS = RenderSettings(5, 5, 6, bounces=3, aa=2)
+SETTINGS = RenderSettings(samples=16, bounces=3, aa=2)
 DARK = EnvironmentLight(World(colour=(0.0, 0.0, 0.0)))
 
 
@@ -193,7 +193,7 @@ def test_a_device_finds_the_light_that_the_processor_finds(device: OnDevice, nam
 
 @pytest.mark.parametrize("settings", [
     replace(SETTINGS, split="counts", bounces=0), replace(SETTINGS, bounces=8, clamp_indirect=0.5),
-    replace(SETTINGS, cosine=0, ggx=0, environment=8, split="counts"),
+    replace(SETTINGS, strategy_samples=(0, 0, 8)),
 ])  # fmt: skip
 def test_settings_mean_the_same_on_a_device(device: OnDevice, settings: RenderSettings) -> None:
     here, there = both(device, under_lamps(), settings, (1, 2))

@@ -115,10 +115,10 @@ def judge(found: np.ndarray, truth: np.ndarray, error: np.ndarray) -> None:
 
 
 COMBINATIONS = {
-    "cosine alone": RenderSettings(cosine=8, ggx=0, environment=0, aa=1, split="counts"),
-    "environment alone": RenderSettings(cosine=0, ggx=0, environment=8, aa=1, split="counts"),
-    "all": RenderSettings(cosine=8, ggx=4, environment=4, aa=1, split="counts"),
-    "counts that the sub-samples do not divide": RenderSettings(5, 3, 6, aa=AA, split="counts"),
+    "cosine alone": RenderSettings(strategy_samples=(8, 0, 0), aa=1),
+    "environment alone": RenderSettings(strategy_samples=(0, 0, 8), aa=1),
+    "all": RenderSettings(strategy_samples=(8, 4, 4), aa=1),
+    "counts that the sub-samples do not divide": RenderSettings(strategy_samples=(5, 3, 6), aa=AA),
     "allotted by the material": RenderSettings(aa=1),
     "allotted by the material, to sub-samples": RenderSettings(cosine=7, aa=AA),
 }
@@ -147,7 +147,7 @@ def test_indirect_light(bounces: int, look: str):
     counts = Counts(*((5000, 2500, 2500) if bounces == 1 else (1600, 800, 800)))
     samples = integrate(tracer, light, _lifted(points), counts, bounces, look, generator, samples=True)
     reference, noise = samples.sum(1).numpy(), (samples.var(1) * samples.shape[1]).sqrt().numpy()
-    found, error = kernel_means(points, RenderSettings(8, 4, 4, bounces, aa=1, look=look), 4000)
+    found, error = kernel_means(points, RenderSettings(samples=16, bounces=bounces, aa=1, look=look), 4000)
     assert (reference[:, 1] > 0).any()
     judge(found, reference, np.hypot(error, noise))
 

@@ -20,7 +20,7 @@ from drgs_blender.render.points import ShadingPoints
 from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene
 from drgs_blender.render.surfels.splats import prepare
 
-SETTINGS = RenderSettings(aa=2, bounces=0, cosine=32, ggx=16, environment=16, look="paper")
+SETTINGS = RenderSettings(aa=2, bounces=0, samples=64, look="paper")
 
 
 def surfel_buffer(posed: PosedSurfels, scene: TraceScene, camera: Camera, settings: RenderSettings) -> GBuffer:

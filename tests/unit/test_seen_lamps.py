@@ -116,7 +116,7 @@ def test_the_window_and_a_distant_sun() -> None:
     scene = TraceScene()
     scene.update([], [half])
     frame = Frame(
-        1, look_along_y(SIZE), [], settings=RenderSettings(1, 0, 1, 0, aa=4, primary="mesh"), passes=("Emit",)
+        1, look_along_y(SIZE), [], settings=RenderSettings(samples=2, bounces=0, aa=4, primary="mesh"), passes=("Emit",)
     )
     whole = render(scene, EnvironmentLight(World(strength=0.0)), None, frame, lamps=Lamps([sun]))["Emit"]  # type: ignore[arg-type]
     radiance = 3.0 / (math.pi * math.sin(0.1) ** 2)

@@ -48,7 +48,7 @@ def test_points_of_a_pixel_may_be_integrated_in_different_calls() -> None:
 
 def test_even_light_is_finished_early_at_many_positions() -> None:
     """512 rays at 64 positions come in 32 parts of a quarter of a sample a position."""
-    settings = RenderSettings(256, 128, 128, bounces=0, primary="mesh", noise_threshold=0.2)
+    settings = RenderSettings(samples=512, bounces=0, primary="mesh", noise_threshold=0.2)
     parts, some, asked = part_count(settings), pixels(20, settings.positions), 0
 
     def trace(chosen: ShadingPoints, part: tuple[int, int]) -> Radiance:

@@ -38,7 +38,7 @@ from drgs_blender.render.surfels.surfel_tracer import tracer_of
 
 Array = np.ndarray
 DARK = World(colour=(0.0, 0.0, 0.0))
-SETTINGS = RenderSettings(cosine=1, ggx=1, environment=1, bounces=0, aa=1, tracer="surfels")
+SETTINGS = RenderSettings(samples=3, bounces=0, aa=1, tracer="surfels")
 SHEARED = np.array([[1.2, 0.5, 0.0, 0.1], [0.0, -0.8, 0.3, 0.0], [0.2, 0.0, 1.0, 0.2], [0, 0, 0, 1.0]])
 
 
@@ -204,7 +204,7 @@ def test_a_ball_looks_the_same_by_its_mesh_and_by_its_surfels(tmp_path: Path) ->
     world = World(np.broadcast_to(rows, (8, 16, 3)).astype(np.float32) ** -2)
     place = np.eye(4)
     place[2, 3] = 1.05
-    how = RenderSettings(cosine=128, ggx=64, environment=64, bounces=1, aa=4)
+    how = RenderSettings(samples=256, bounces=1, aa=4)
     frame = Frame(
         1, from_above(32, scale=10.0), [ObjectState("Ball", key, place)], world, how,
         meshes=[quad("Ground", 0.0, roughness=0.2)],
@@ -247,7 +247,7 @@ def test_masks_tell_which_rays_meet_surfels(tmp_path: Path) -> None:
     place = np.eye(4)
     place[2, 3] = 2.0
     ground = quad("Ground", 0.0)
-    how = replace(SETTINGS, cosine=256, ggx=128, environment=128, film_transparent=True)
+    how = replace(SETTINGS, samples=512, film_transparent=True)
     frame = Frame(1, from_above(24, scale=6.0), [ObjectState("Ball", key, place)], World(), how, meshes=[ground])
 
     def render(**seen: bool) -> Array:
