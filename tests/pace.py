@@ -1,7 +1,8 @@
 """Hooks of pytest: which part of the tests runs, and the limit that keeps the fast part fast.
 
-``--part=fast`` leaves out the tests marked ``slow`` and holds the others to `SECONDS`. A test that takes longer is named
-at the end of the run; one that takes `FAILS` times as long fails. A limit that failed at once would fail by chance:
+``--part=fast`` leaves out the tests marked ``slow`` and holds the others to `SECONDS`. A test that takes longer is
+named at the end of the run; one that takes `FAILS` times as long fails. A limit that failed at once would fail by
+chance:
 
 - what counts is the processor time of the test, of the programs that it started and waited for, and of set-up that no
   other test shares, less that of compiling kernels. A busy machine and an empty cache of kernels change little of it,

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..compute.jit import njit, prange
+from ..compute.jit import njit, plain, prange
 from ..core.asset.model import MATERIAL_CHANNELS, Binding, Mesh, PosedSurfels, Surfels
 from ..core.errors import AssetError
 from ..geometry.normals import VertexNormals, rotation_matrices, unit
@@ -100,10 +100,8 @@ class MeshDriven:
                 basis[f] = np.reshape(frame, (3, 3)).T
         coordinates = np.ascontiguousarray(np.linalg.inv(basis)[face] @ tangents, dtype=np.float32)
         span = spans(mesh.vertices, mesh.faces, normals, faces, face, binding.barycentric, surfels.scale.max(axis=1))
-        self.rest = (
-            binding.face, binding.barycentric, offset, rest_edge, binding.normal, coordinates,
-            span, _in_spans(mesh.vertices, span, tangents),
-        )  # fmt: skip
+        rest = (binding.face, binding.barycentric, offset, rest_edge, binding.normal, coordinates)
+        self.rest = tuple(map(plain, (*rest, span, _in_spans(mesh.vertices, span, tangents))))
 
     def pose(
         self,
@@ -146,8 +144,8 @@ class MeshDriven:
         opacity = posing.opacity.copy()
         centre, tangent_u, tangent_v, normal = (np.empty((n, 3), np.float32) for _ in range(4))
         _pose(
-            (posing.vertices, self.mesh.faces, normals), by_corner, posing.linear, posing.side, self.rest,
-            (centre, tangent_u, tangent_v, normal, opacity),
+            (plain(posing.vertices), plain(self.mesh.faces), plain(normals)), by_corner, posing.linear, posing.side,
+            self.rest, (centre, tangent_u, tangent_v, normal, opacity),
         )  # fmt: skip
         self.lost = int(np.count_nonzero(opacity != posing.opacity))
         if self.lost:
@@ -194,8 +192,9 @@ class MeshDriven:
             return own
         result = own.reshape(len(own), -1).copy()
         _repaint(
-            self.mesh.faces, self.binding.face, self.binding.barycentric, changed, edited.reshape(len(rest), -1), result
-        )
+            plain(self.mesh.faces), plain(self.binding.face), plain(self.binding.barycentric), changed,
+            plain(edited.reshape(len(rest), -1)), result,
+        )  # fmt: skip
         return result.reshape(own.shape)
 
 

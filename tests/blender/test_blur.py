@@ -64,6 +64,7 @@ def test_motion_blur_is_that_of_cycles(white, ball, position):
     assert np.abs(ours - theirs).mean() < 0.02 and ((ours > 0.05) & (ours < 0.95)).mean() > 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", [{}, {"aperture_blades": 5, "aperture_rotation": 0.4}, {"aperture_ratio": 2.0}])
 @pytest.mark.parametrize("kind", ["PERSP", "ORTHO"])
 def test_depth_of_field_is_that_of_cycles(white, ball, kind, shape):

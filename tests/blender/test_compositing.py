@@ -46,6 +46,7 @@ def blocks(image: np.ndarray) -> np.ndarray:
     return image.reshape(HEIGHT // BLOCK, BLOCK, WIDTH // BLOCK, BLOCK, 4).mean(axis=(1, 3))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [{}, {"shadows": "HOLDOUT"}, {"compare": True}])
 def test_the_composite_is_the_picture_of_one_engine(shared_scene, options):
     """In front, behind, on the floor: shadows and edges are where Cycles alone has them."""

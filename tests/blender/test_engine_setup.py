@@ -160,6 +160,7 @@ def test_another_version_of_the_engine_needs_no_network(made):
     assert list(folder.rglob("new.py")) and not list(folder.rglob("drgs_blender.old"))
 
 
+@pytest.mark.slow
 def test_reconstruction_is_added_to_an_engine_that_is_ready(made):
     folder, source = made
     assert setup.needs_network(folder, source, setup.RECONSTRUCT) and not list(folder.rglob("tinytorch.py"))

@@ -400,6 +400,7 @@ def test_it_is_busy_until_there_is_a_picture_of_what_was_asked_last(scene, ball,
             assert busy or shown
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("threshold", [0.0, 0.03])
 @pytest.mark.parametrize("border", [False, True])
 def test_f12_is_the_last_picture_of_the_camera_view(scene, ball, worker, threshold, border):

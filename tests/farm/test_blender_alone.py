@@ -87,6 +87,7 @@ def test_animation_rendered_by_blender_has_the_same_bits(drgs, folder, tmp_path,
         assert np.array_equal(written_by_blender(blender / name), read_frame(own / name)[0]["Combined"])
 
 
+@pytest.mark.slow
 def test_failures_end_a_blender_on_a_farm_with_their_code(folder, tmp_path):
     scene = shutil.copy(folder / "relative.blend", tmp_path)  # without its asset
     result = animate(scene, tmp_path / "out", tmp_path, DRGS_FARM="1")
@@ -104,6 +105,7 @@ def test_frame_that_blender_writes_on_a_full_disk_does_not_stay(folder, tmp_path
     assert [path.name for path in disk.iterdir()] == ["filler"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pages", [1, 4, 16])
 def test_frame_that_finds_room_for_a_part_of_it_does_not_stay(folder, tmp_path, small_disk, pages):
     disk = small_disk(f"size={4 * pages + 4}k")

@@ -34,6 +34,7 @@ def test_scene_that_takes_everything_along_is_fine(drgs, folder, tmp_path):
     assert [line.rsplit(": ", 1)[1] for line in missing] == ["is not in a shared folder"] * 2
 
 
+@pytest.mark.slow
 def test_scene_that_cannot_be_rendered_is_refused_as_by_a_node(drgs, folder, monkeypatch):
     code, lines, error = check(drgs, folder, "blind.blend")
     assert code == 64 and "has no camera" in error and "has no camera" in "".join(lines)

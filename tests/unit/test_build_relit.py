@@ -10,6 +10,7 @@ from drgs_blender.core.asset import Asset, Mesh, Surfels
 from drgs_blender.core.errors import UsageError
 from drgs_blender.core.frame import RenderSettings, World
 from drgs_blender.deform.binding import bind
+from drgs_blender.deform.mesh_driven import MeshDriven
 from drgs_blender.render.lights.environment import EnvironmentLight
 
 SETTINGS = RenderSettings(samples=256, aa=1, bounces=0, look="paper")
@@ -66,3 +67,23 @@ def test_without_a_mesh_there_is_nothing_to_light() -> None:
     asset = Asset(plate().surfels, Mesh.empty())
     with pytest.raises(UsageError, match="mesh"):
         relit_colours(asset, asset.surfels, asset.mesh.vertices, World(), SETTINGS)
+
+
+def test_arrays_that_are_read_only_as_those_of_files_compile_nothing_anew(compiled) -> None:
+    """The integrator's kernel takes half a minute for each kind of array that it is given."""
+    for frozen in (False, True):
+        asset = plate()
+        vertices = asset.mesh.vertices.copy()
+        for array in [
+            vertices,
+            *(getattr(part, n) for part in (asset.mesh, asset.surfels, asset.binding) for n in part.__slots__),
+        ]:
+            if isinstance(array, np.ndarray):
+                array.setflags(write=not frozen)
+        compiled.clear()
+        posed = MeshDriven(asset.mesh, asset.surfels, asset.binding).pose(
+            vertices, materials={"albedo": asset.mesh.albedo / 2}
+        )
+        assert np.isfinite(posed.centre).all()
+        relit_colours(asset, asset.surfels, vertices, World(lit_half()), SETTINGS)
+    assert not compiled

@@ -82,6 +82,7 @@ def alike(here: GBuffer, there: GBuffer, camera: Camera) -> None:
         assert far.mean() < 0.002, name  # a ray along an edge meets the other face
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("view", VIEWS)
 @pytest.mark.parametrize("name", SCENES)
 def test_the_camera_sees_the_same_meshes(device: OnDevice, name: str, view: str) -> None:

@@ -59,6 +59,7 @@ def deformer() -> Deformer:
     return Deformer(Launcher("cpu"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("collapsed", [False, True])
 @pytest.mark.parametrize("name", POSES)
 def test_a_device_poses_surfels_as_the_processor_does(deformer: Deformer, name: str, collapsed: bool) -> None:

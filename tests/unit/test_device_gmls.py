@@ -53,6 +53,7 @@ def inside_out() -> tuple[np.ndarray, np.ndarray]:
 MOTIONS: dict[str, Callable[[], tuple[np.ndarray, np.ndarray]]] = {"bent": bent, "torn": torn, "inside out": inside_out}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
 @pytest.mark.parametrize("neighbours", [1, 16])
 @pytest.mark.parametrize("name", MOTIONS)

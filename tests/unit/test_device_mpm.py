@@ -136,6 +136,7 @@ def pins_of(solver: Solver) -> np.ndarray | None:
     return solver.state.x[solver._pins] + [0.001, 0, 0.0005] if len(solver._pins) else None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_a_step_is_the_processors_to_the_last_digits(launcher: Launcher, case: str) -> None:
     here, there = pair(case, launcher)

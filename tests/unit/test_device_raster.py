@@ -69,6 +69,7 @@ def test_fog_of_any_depth_is_blended_in_exact_order(device: OnDevice) -> None:
     np.testing.assert_allclose(there.surface[seen], here.surface[seen], atol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("offset", [-0.02, 0.1])
 @pytest.mark.parametrize("tied", [True, False])
 def test_points_are_tied_to_the_mesh_as_the_processor_ties_them(device: OnDevice, offset: float, tied: bool) -> None:

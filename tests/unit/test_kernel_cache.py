@@ -177,6 +177,7 @@ print(double(4), scramble("drgs") == hash("drgs"), "numba.np.linalg" in sys.modu
 """
 
 
+@pytest.mark.slow
 def test_numba_s_compiler_is_loaded_only_for_what_is_compiled(tmp_path):
     """It takes a third of a second."""
     program, said = tmp_path / "program.py", []

@@ -250,12 +250,10 @@ def test_pick_probabilities(count):
     for point in rng.uniform((-10, -10, 0), (10, 10, 4), (4, 3)).astype(np.float32):
         each = np.array([pick_probability(i, *point, lamps.table, lamps.pick) for i in range(lamps.count)])
         numbers = (np.arange(1 << 14, dtype=np.uint32) << np.uint32(18)) + np.uint32(1 << 17)
-        picked = np.zeros(lamps.count + 1)
-        for n in numbers:
-            i, probability = pick_lamp(n, *point, lamps.table, lamps.pick)
-            picked[i] += 1
-            if i >= 0:
-                assert probability == pytest.approx(each[i], rel=1e-4)
+        found = np.array([pick_lamp(n, *point, lamps.table, lamps.pick) for n in numbers])
+        index, probability = found[:, 0].astype(int), found[:, 1]
+        np.testing.assert_allclose(probability[index >= 0], each[index[index >= 0]], rtol=1e-4)
+        picked = np.bincount(index % (lamps.count + 1), minlength=lamps.count + 1)
         # Equally spaced numbers: each lamp gets its share to within one number a boundary.
         np.testing.assert_allclose(picked[:-1] / len(numbers), each, atol=2 / len(numbers))
         assert picked[-1] / len(numbers) == pytest.approx(1 - each.sum(), abs=1e-3)

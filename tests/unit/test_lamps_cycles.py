@@ -113,6 +113,7 @@ def cycles(tmp_path_factory) -> dict[str, np.ndarray]:
     return dict(zip(jobs, np.array(results), strict=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LIT)
 def test_irradiance(cycles, name):
     lamps = Lamps([LIT[name]])

@@ -59,6 +59,7 @@ SCENES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("orthographic", [False, True], ids=["perspective", "orthographic"])
 @pytest.mark.parametrize("scene", SCENES)
 def test_g_buffer(scene: str, orthographic: bool):

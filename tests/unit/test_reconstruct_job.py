@@ -59,6 +59,7 @@ def test_hull_holds_the_object_and_touches_it(capture):
     assert (region.low < (-0.85, -0.5, -0.45)).all() and (region.high > (0.8, 0.5, 0.6)).all()
 
 
+@pytest.mark.slow
 def test_mesh_is_closed_faces_outwards_and_lies_on_the_surface(asset, capture):
     mesh = asset.mesh
     assert closed(mesh.faces)

@@ -66,6 +66,7 @@ def z_scores(samples: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
     return (samples.sum(1) - truth)[error > 0] / error[error > 0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("look", brdf.LOOKS)
 @pytest.mark.parametrize("counts", [(30000, 0, 0), (0, 30000, 0), (0, 0, 30000), (10000, 5000, 5000)])
 def test_each_strategy_and_all_together_find_the_truth(counts: tuple[int, int, int], look: str):

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ...compute.jit import get_num_threads, njit, prange
+from ...compute.jit import get_num_threads, njit, plain, prange
 from ...core.color import LUMINANCE
 from ...core.errors import UsageError
 from ...core.frame import RenderSettings
@@ -133,9 +133,9 @@ def integrate(
 
     def run(some: ShadingPoints, shift: int, found: Radiance) -> None:
         kernel.shade(
-            (some.pixel, some.sample, some.flags),
-            (some.origin, some.normal, some.geometric_normal, some.view),
-            (some.albedo, some.roughness, some.metallic, some.own, some.size),
+            (plain(some.pixel), plain(some.sample), plain(some.flags)),
+            (plain(some.origin), plain(some.normal), plain(some.geometric_normal), plain(some.view)),
+            (plain(some.albedo), plain(some.roughness), plain(some.metallic), plain(some.own), plain(some.size)),
             *tables,
             *rules,
             shift,

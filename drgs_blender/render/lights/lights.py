@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...compute.jit import njit
+from ...compute.jit import njit, plain
 from ...core.frame import Light
 from ..sampling import ONE, ZERO, F, U
 from ..scene.interaction import emitted
@@ -122,7 +122,7 @@ class Lamps:
     def pdf(self, rows: Array, points: Array, directions: Array) -> Array:
         """(n,) ``pdf_lamp`` of table rows (n,) for (n, 3) unit directions at (n, 3) or (3,) points."""
         directions = np.ascontiguousarray(directions, np.float32)
-        rows = np.ascontiguousarray(np.broadcast_to(rows, len(directions)), np.int64)
+        rows = plain(np.broadcast_to(np.asarray(rows, np.int64), len(directions)))
         return _pdf_many(rows, _rows(points, directions), directions, *self.tables)
 
     def along(
@@ -136,7 +136,7 @@ class Lamps:
     ) -> Array:
         """(n, 3) ``lamps_along`` for (n, 3) unit directions from (n, 3) or (3,) origins."""
         directions = np.ascontiguousarray(directions, np.float32)
-        others = np.ascontiguousarray(np.broadcast_to(np.asarray(others, np.float32), len(directions)))
+        others = plain(np.broadcast_to(np.asarray(others, np.float32), len(directions)))
         return _along_many(_rows(origins, directions), directions, F(tmax), others, F(share), seen_by, *self.tables)
 
     def _power(self, centre: Array, radius: float) -> float:
@@ -149,7 +149,7 @@ class Lamps:
 def _rows(values: Array, like: Array) -> Array:
     """float32 rows, one broadcast to as many as `like` has."""
     values = np.asarray(values, np.float32)
-    return np.ascontiguousarray(np.broadcast_to(values, (len(like), 3)))
+    return plain(np.broadcast_to(values, (len(like), 3)))
 
 
 _NO_EMITTERS = Emitters()

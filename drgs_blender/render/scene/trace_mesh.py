@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ...compute.jit import njit, prange
+from ...compute.jit import njit, plain, prange
 from ...core.asset.model import as_float
 from ...core.errors import UsageError
 from ...core.frame import MeshState, Visibility
@@ -124,9 +124,9 @@ class Part:
         Unusable vertices are put at the origin.
         """
         if matrix is None:
-            bad, moved, self.reach = _copy_vertices(vertices, target)
+            bad, moved, self.reach = _copy_vertices(plain(vertices), target)
         else:
-            bad, moved, self.reach = _move_vertices(vertices, matrix, target)
+            bad, moved, self.reach = _move_vertices(plain(vertices), matrix, target)
         self.bad_vertices, self.bad_faces = int(bad), 0
         before, dead = self.dead, torn
         if bad:
@@ -156,7 +156,7 @@ class Part:
     def given_normals(self, normals: Array, vertices: Array, out: Array) -> None:
         """Unit normals from those given, one a corner, into (3 m, 3) `out`; a face's own where they are unusable."""
         given = as_float(normals, (len(self.faces), 3, 3), f"corner normals of {self.name}")
-        empty = _given_normals(given, vertices, self.traced_faces, out)
+        empty = _given_normals(plain(given), vertices, self.traced_faces, out)
         self.empty_faces = int(empty) - (0 if self.dead is None else int(self.dead.sum()))
 
 
@@ -196,7 +196,7 @@ def take_object(part: Part, item: TraceObject, vertices: Array, shading: Array) 
         albedo = as_float(item.albedo, (n, 3), f"albedo of {item.name}")
         roughness = as_float(item.roughness, (n,), f"roughness of {item.name}")
         metallic = as_float(item.metallic, (n,), f"metallic of {item.name}")
-        _materials(of_rows, albedo, roughness, metallic, rows)
+        _materials(of_rows, plain(albedo), plain(roughness), plain(metallic), rows)
     part.item = item
     return moved, died
 
@@ -231,7 +231,7 @@ def place_vertices(vertices: Array | None, matrix: Array | None, target: Array) 
     if vertices is None or np.shape(vertices) != target.shape:
         return
     moved = np.empty_like(target)
-    given = np.ascontiguousarray(vertices, np.float32)
+    given = plain(np.asarray(vertices, np.float32))
     bad, _, _ = _copy_vertices(given, moved) if matrix is None else _move_vertices(given, matrix, moved)
     if bad:
         with np.errstate(invalid="ignore", over="ignore"):

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from ...compute.jit import njit
+from ...compute.jit import njit, plain
 from ...core.asset.model import PosedSurfels
 from ...core.errors import DeviceError, UsageError
 from ..scene.embree import QUALITY_LOW, QUALITY_REFIT, SCENE_DYNAMIC, address, device, library
@@ -149,9 +149,9 @@ class SurfelBVH:
         self.objects = np.ascontiguousarray(posed.object_index, np.int32)
         self.bad = int(
             _record(
-                posed.centre, posed.tangent_u, posed.tangent_v, posed.opacity, self.objects,
-                np.ascontiguousarray(masks, np.int32), posed.normal, posed.albedo, posed.roughness, posed.metallic,
-                words, boxes, self.surface,
+                plain(posed.centre), plain(posed.tangent_u), plain(posed.tangent_v), plain(posed.opacity),
+                plain(self.objects), plain(np.asarray(masks, np.int32)), plain(posed.normal), plain(posed.albedo),
+                plain(posed.roughness), plain(posed.metallic), words, boxes, self.surface,
             )
         )  # fmt: skip
         self._words = words
