@@ -26,7 +26,7 @@ EMPTY = 1e9
 
 def partner_of(scene: bpy.types.Scene) -> bpy.types.Scene | None:
     """The scene that DR-GS renders for `scene`, None where it has none."""
-    return next((s for s in bpy.data.scenes if s.drgs.over is scene and s is not scene), None)
+    return next((s for s in bpy.data.scenes if s.drgs.background_scene is scene and s is not scene), None)
 
 
 def set_up(scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer, others: str, compare: bool) -> bpy.types.Scene:
@@ -49,7 +49,7 @@ def set_up(scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer, others: str,
     partner.name = f"{scene.name} DR-GS"
     if old is not None:
         _copy(old.drgs, partner.drgs)
-    partner.drgs.over = scene
+    partner.drgs.background_scene = scene
     render = partner.render
     render.engine, render.film_transparent, render.use_compositing, render.use_sequencer = ENGINE, True, False, False
     if bpy.app.version >= (5, 0, 0):
@@ -103,7 +103,7 @@ def clear(scene: bpy.types.Scene) -> bool:
 
 def differences(partner: bpy.types.Scene) -> list[str]:
     """What of the scene below has changed since the partner was made, and is not shared by both."""
-    below = partner.drgs.over
+    below = partner.drgs.background_scene
     kinds = (
         (_drgs(below), [o for c in partner.collection.children if c.name.startswith(RENDERED) for o in c.objects]),
         (below.collection.objects, partner.collection.objects),
@@ -157,7 +157,7 @@ def _gather(scene: bpy.types.Scene) -> bpy.types.Collection:
 def _copy(source: bpy.types.PropertyGroup, target: bpy.types.PropertyGroup) -> None:
     """Set all values of `target` to those of `source`."""
     for prop in source.bl_rna.properties:
-        if not prop.is_readonly and prop.identifier not in ("rna_type", "name", "overlay", "over"):
+        if not prop.is_readonly and prop.identifier not in ("rna_type", "name", "overlay", "background_scene"):
             setattr(target, prop.identifier, getattr(source, prop.identifier))
 
 

@@ -32,7 +32,7 @@ def blender_name(render_pass: Pass) -> str:
 def enabled(scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer) -> list[Pass]:
     """The passes switched on in a view layer of a scene; Combined always, as Blender always has it."""
     extra = view_layer.drgs
-    needed = TEMPORAL if scene.drgs.use_temporal else ()
+    needed = TEMPORAL if scene.drgs.use_denoising_data else ()
     return [
         p
         for p in PASSES

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, PointerProperty, StringProperty
 
-from ..drgs_blender.core.frame import RenderSettings, split_rays
+from ..drgs_blender.core.frame import RenderSettings
 from ..drgs_blender.core.passes import PASSES, Pass
 from .adjustment import DrgsAdjustment
 from .limits import Limited
@@ -18,7 +18,7 @@ from .submit import DrgsSubmitSettings
 _DENOISERS = {
     "none": ("None", "Keep the noise"),
     "svgf": ("SVGF", "Variance-guided filter that keeps edges and material detail"),
-    "oidn": ("OpenImageDenoise", "Intel's learned filter; smoothest with few rays"),
+    "oidn": ("OpenImageDenoise", "Intel's learned filter; smoothest with few samples"),
 }
 #: The denoisers that the engine knows, for the menu.
 DENOISE_ITEMS = [(n, *_DENOISERS[n]) for n in typing.get_args(typing.get_type_hints(RenderSettings)["denoise"])]
@@ -33,36 +33,37 @@ def _switch_overlay(settings: DrgsSceneSettings, context: bpy.types.Context) -> 
 class DrgsSceneSettings(bpy.types.PropertyGroup):
     """How DR-GS solves a frame; see drgs_blender.core.frame.RenderSettings."""
 
-    rays: IntProperty(
-        name="Rays",
-        description="Light samples a pixel, divided by the material: towards light, and along what is reflected",
-        min=3,
+    samples: IntProperty(
+        name="Samples",
+        description="Light samples per pixel. Each surface divides them by its material: towards "
+        "lights, and along what it reflects",
+        min=1,
         soft_max=1024,
         max=65536,
         default=32,
     )
-    use_custom_split: BoolProperty(
-        name="Custom Split", description="Choose the number of rays of each sampling strategy", default=False
+    use_strategy_samples: BoolProperty(
+        name="Samples per Strategy", description="Choose the number of samples of each strategy", default=False
     )
-    cosine: IntProperty(
+    cosine_samples: IntProperty(
         name="Cosine",
-        description="Rays a pixel drawn by the cosine of the angle",
+        description="Samples per pixel drawn by the cosine of the angle",
         min=1,
         soft_max=512,
         max=65536,
         default=16,
     )
-    ggx: IntProperty(
+    ggx_samples: IntProperty(
         name="GGX",
-        description="Rays a pixel drawn by the shape of the highlight",
+        description="Samples per pixel drawn by the shape of the highlight",
         min=1,
         soft_max=256,
         max=65536,
         default=8,
     )
-    environment: IntProperty(
-        name="Environment",
-        description="Rays a pixel drawn towards bright light",
+    environment_samples: IntProperty(
+        name="Lights",
+        description="Samples per pixel drawn towards the world and lights, the brighter the more",
         min=1,
         soft_max=256,
         max=65536,
@@ -88,7 +89,7 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
     )
     use_noise_threshold: BoolProperty(
         name="Noise Threshold",
-        description="Stop sampling a pixel once its noise is below the threshold; Rays are then the most it gets",
+        description="Stop sampling a pixel once its noise is below the threshold; Samples are then the most it gets",
         default=False,
     )
     noise_threshold: FloatProperty(
@@ -109,9 +110,10 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
         default=0.0,
         precision=1,
     )
-    aa: IntProperty(
-        name="Anti-aliasing",
-        description="Positions inside a pixel among which its rays are divided; 0 chooses by their number",
+    subpixel_samples: IntProperty(
+        name="Sub-Pixel Samples",
+        description="Places in a pixel among which its samples are divided: edges and textures get smoother. 0 chooses "
+        "by the number of samples",
         min=0,
         soft_max=64,
         max=1024,
@@ -128,18 +130,18 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
         step=10,
         precision=2,
     )
-    primary: EnumProperty(
-        name="Primary",
-        description="What the camera sees",
+    camera_sees: EnumProperty(
+        name="Camera Sees",
+        description="What of DR-GS objects is in the picture",
         items=(
             ("surfels", "Surfels", "The captured Gaussians, with their soft edges and fine detail"),
             ("mesh", "Mesh", "The triangle mesh that carries them"),
         ),
         default="surfels",
     )
-    tracer: EnumProperty(
-        name="Tracer",
-        description="What shadows, reflections and passed-on light meet of DR-GS objects",
+    rays_see: EnumProperty(
+        name="Rays See",
+        description="What shadow rays, reflections and indirect light meet of DR-GS objects",
         items=(
             ("mesh", "Mesh", "The triangle mesh that carries the surfels; fast"),
             (
@@ -156,8 +158,8 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
         items=DENOISE_ITEMS,
         default="none",
     )
-    use_temporal: BoolProperty(
-        name="For Temporal Denoising",
+    use_denoising_data: BoolProperty(
+        name="Store Denoising Data",
         description="Keep the noise and write every pass that the command `drgs denoise` needs to take it out of the "
         "finished frames, each with the help of its neighbours",
         default=False,
@@ -165,14 +167,14 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
     blur_steps: IntProperty(
         name="Blur Steps",
         description="Pictures at other times and other places of the lens whose mean has motion blur and depth of "
-        "field; the rays are divided among them, at least three for each",
+        "field; the samples are divided among them",
         min=2,
         soft_max=64,
         max=1024,
         default=16,
     )
     use_viewport_denoise: BoolProperty(
-        name="Denoise First Pictures",
+        name="Denoise Preview",
         description="Take the noise out of the coarse pictures that the viewport shows while something moves, with the "
         "help of those before",
         default=True,
@@ -189,24 +191,32 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
         options=set(),
         update=_switch_overlay,
     )
-    over: PointerProperty(
+    background_scene: PointerProperty(
         type=bpy.types.Scene,
-        name="Over",
+        name="Background Scene",
         description="The scene of another engine over whose picture this one is laid, and whose resolution and render "
         "region it has",
     )
-    look: EnumProperty(
-        name="Look",
-        description="Reflection model",
+    shading_model: EnumProperty(
+        name="Shading Model",
+        description="How surfaces reflect light",
         items=(
             ("principled", "Principled", "As Blender's Principled BSDF with GGX"),
-            ("paper", "Paper", "Cook-Torrance as the material was reconstructed with"),
+            ("paper", "As Captured", "The BRDF of the paper, with which materials may have been reconstructed"),
         ),
         default="principled",
     )
-    seed: IntProperty(name="Seed", description="Another number gives other noise", default=0, min=0)
+    seed: IntProperty(
+        name="Seed",
+        description="Of the random numbers: pictures with different seeds have independent noise and can be averaged",
+        default=0,
+        min=0,
+    )
     use_animated_seed: BoolProperty(
-        name="Animated Seed", description="Other noise in every frame", default=True, options=set()
+        name="Animated Seed",
+        description="Change the noise from frame to frame, as Cycles' Animated Seed",
+        default=True,
+        options=set(),
     )
     submit: PointerProperty(type=DrgsSubmitSettings, name="Farm")
 
@@ -215,24 +225,21 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
     ) -> RenderSettings:
         """The engine's settings; `warn` is told of those that cannot be."""
         own = Limited(self, f'Scene "{self.id_data.name}"', warn)
-        split = (own.cosine, own.ggx, own.environment) if own.use_custom_split else split_rays(own.rays)
-        cosine, ggx, environment = split
+        strategies = own.cosine_samples, own.ggx_samples, own.environment_samples
         return RenderSettings(
-            cosine=cosine,
-            ggx=ggx,
-            environment=environment,
+            samples=own.samples,
+            strategy_samples=strategies if own.use_strategy_samples else None,
             bounces=own.bounces,
-            aa=own.aa,
-            primary=own.primary,
+            subpixel_samples=own.subpixel_samples,
+            camera_sees=own.camera_sees,
             tracer=own.tracer,
-            denoise="none" if own.use_temporal else own.denoise,
-            look=own.look,
+            denoise="none" if own.use_denoising_data else own.denoise,
+            look=own.shading_model,
             film_transparent=film_transparent,
             seed=own.seed,
             threads=threads,
             noise_threshold=own.noise_threshold if own.use_noise_threshold else 0.0,
             clamp_indirect=own.clamp_indirect,
-            split="counts" if own.use_custom_split else "auto",
             device=own.device.lower(),
             filter_width=own.filter_width,
         )

@@ -108,12 +108,12 @@ def row(report: dict[str, Any], beside: list[str], seconds: float) -> list[str]:
     ]
 
 
-def deformed_anew(objects: list[str], scenes: Path, rays: int) -> None:
+def deformed_anew(objects: list[str], scenes: Path, samples: int) -> None:
     """Score how the surfels of kept assets look deformed, without learning them again; the rest of their rows stays."""
     before, section = DOCUMENT.read_text(encoding="utf-8").split("<!-- begin asset -->")
     for name in objects:
         truth = under_others(scenes / name, posed=True)
-        found = score(FOLDER / f"{name}.drgs", scenes / name, "surfels", rays, truth)["lights"]
+        found = score(FOLDER / f"{name}.drgs", scenes / name, "surfels", samples, truth)["lights"]
         line = next(line for line in section.splitlines() if line.startswith(f"| {name} | surfels |"))
         cells = line.strip("| ").split(" | ")
         cells[COLUMNS.index(DEFORMED)] = pair(found)
@@ -123,7 +123,7 @@ def deformed_anew(objects: list[str], scenes: Path, rays: int) -> None:
     DOCUMENT.write_text(f"{before}<!-- begin asset -->{section}", encoding="utf-8")
 
 
-def sheet(objects: list[str], scenes: Path, rays: int) -> None:
+def sheet(objects: list[str], scenes: Path, samples: int) -> None:
     """Of each asset one view: as photographed; under another light, the true one and ours; the same bent."""
     rows = []
     for name in objects:
@@ -139,7 +139,7 @@ def sheet(objects: list[str], scenes: Path, rays: int) -> None:
             for item in truth.sets
             if item.name in ("test", f"relit-{LIGHT}", f"posed-{LIGHT}")
         ]
-        score(FOLDER / f"{name}.drgs", scenes / name, "surfels", rays, replace(truth, sets=wanted), show)
+        score(FOLDER / f"{name}.drgs", scenes / name, "surfels", samples, replace(truth, sets=wanted), show)
         row = (shown["test"][0], *shown[f"relit-{LIGHT}"], *shown[f"posed-{LIGHT}"])
         rows.append(np.concatenate(row, axis=1))
     pixels = np.concatenate(rows).clip(0, 1)
@@ -153,14 +153,14 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, help="of all stages; else the steps decide")
     parser.add_argument("--steps", type=int, nargs=2, default=(3000, 2500), help="of surfels, of materials and light")
     parser.add_argument("--variant", choices=("p", "m"), default="p", help="m: surfels on the mesh")
-    parser.add_argument("--rays", type=int, default=128)
+    parser.add_argument("--samples", type=int, default=128)
     parser.add_argument("--deformed", action="store_true", help="score the assets that are there, deformed, anew")
     parser.add_argument("--sheet", action="store_true", help="draw the assets that are there")
     options = parser.parse_args()
     if options.sheet:
-        return sheet(options.objects, options.scenes, options.rays)
+        return sheet(options.objects, options.scenes, options.samples)
     if options.deformed:
-        return deformed_anew(options.objects, options.scenes, options.rays)
+        return deformed_anew(options.objects, options.scenes, options.samples)
     for name in options.objects:
         capture = read_capture(options.scenes / name)
         folder, path = options.scenes / name, FOLDER / f"{name}.drgs"
@@ -168,12 +168,12 @@ def main() -> None:
         asset, seconds = learned(capture, settings_of(options))
         write_asset(path, asset)
         others, references = under_others(folder), (with_true_materials(asset, folder), of_truth(folder))
-        for primary in ("surfels",) if options.variant == "m" else ("surfels", "mesh"):  # the mesh is one
-            beside = [pair(score(one, folder, primary, options.rays, others)["lights"]) for one in references]
-            found = row(score(path, folder, primary, options.rays), beside, seconds)
-            seen = "surfels (M)" if options.variant == "m" else primary
+        for camera_sees in ("surfels",) if options.variant == "m" else ("surfels", "mesh"):  # the mesh is one
+            beside = [pair(score(one, folder, camera_sees, options.samples, others)["lights"]) for one in references]
+            found = row(score(path, folder, camera_sees, options.samples), beside, seconds)
+            seen = "surfels (M)" if options.variant == "m" else camera_sees
             rows = keep(FOLDER / "rows.json", f"{name}|{seen}", found)
-            print(name, primary, *found, flush=True)
+            print(name, camera_sees, *found, flush=True)
     side = max(capture.views[0].colour.shape[:2])
     bound = f"{options.minutes:g} minutes" if options.minutes else "{} and {} steps".format(*options.steps)
     body = (

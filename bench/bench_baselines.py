@@ -1,6 +1,6 @@
 """What other methods leave out, and what it costs under other lights and in other poses.
 
-python bench/bench_baselines.py --scenes scenes [--objects spot] [--steps 3000 1000] [--rays 128]
+python bench/bench_baselines.py --scenes scenes [--objects spot] [--steps 3000 1000] [--samples 128]
 
 Scenes are those of `drgs evaluate --make-scenes scenes`. All rows of an object share its photographs, surfels and mesh;
 what is left out, is left out of learning and of rendering. Rows are kept; a row takes about two minutes at 128 pixels.
@@ -20,7 +20,7 @@ from report import OUT, keep, table, write_section
 from drgs_blender.cli.evaluate import session_renderer
 from drgs_blender.core.asset import Environment
 from drgs_blender.core.asset.container import write_asset
-from drgs_blender.core.frame import Camera, RenderSettings, Visibility, split_rays
+from drgs_blender.core.frame import Camera, RenderSettings, Visibility
 from drgs_blender.engine.session import Session
 from drgs_blender.evaluate.compare import Renderer, compare
 from drgs_blender.evaluate.truth import read_truth
@@ -56,7 +56,7 @@ class Method:
 METHODS = {
     "DR-GS": Method(),
     "no metallic, the paper's lobe (as IRGS)": Method(
-        {"parametrisation": "dielectric", "look": "paper"}, {"bounces": 3, "look": "paper"}
+        {"parametrisation": "dielectric", "shading_model": "paper"}, {"bounces": 3, "shading_model": "paper"}
     ),
     "no shadows, no inter-reflection (as split-sum shading: Ref-Gaussian)": Method(
         {"shadows": False, "indirect": False}, {"bounces": 0}, Visibility(diffuse=False, glossy=False, shadow=False)
@@ -65,9 +65,9 @@ METHODS = {
 }
 
 
-def renderer(session: Session, key: str, method: Method, rays: int) -> Renderer:
+def renderer(session: Session, key: str, method: Method, samples: int) -> Renderer:
     """Renders as `method` does."""
-    lit = session_renderer(session, key, RenderSettings(*split_rays(rays), **method.rendering), method.visibility)
+    lit = session_renderer(session, key, RenderSettings(samples, **method.rendering), method.visibility)
 
     def photographed(camera: Camera, radiance: Array, vertices: Array | None) -> dict[str, Array]:
         passes = lit(camera, radiance, vertices)
@@ -91,7 +91,7 @@ def row(folder: Path, name: str, options: argparse.Namespace) -> list[str]:
     path = FOLDER / f"{folder.name}.drgs"
     write_asset(path, asset)
     session = Session()
-    draw = renderer(session, session.load_asset(path), method, options.rays)
+    draw = renderer(session, session.load_asset(path), method, options.samples)
     report = compare(asset, capture, read_truth(folder), draw)
     (day,) = (entry for entry in report["lights"] if entry["posed"] and entry["training_light"])
     relit = [mean(under_other_lights(report, posed), "scaled", "foreground") for posed in (False, True)]
@@ -104,7 +104,7 @@ def main() -> None:
     parser.add_argument("--objects", nargs="+", default=["spot"])
     parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(METHODS))
     parser.add_argument("--steps", type=int, nargs=2, default=(3000, 1000), help="of surfels, of materials and light")
-    parser.add_argument("--rays", type=int, default=128)
+    parser.add_argument("--samples", type=int, default=128)
     options = parser.parse_args()
     for name in options.objects:
         for method in options.methods:

@@ -1,6 +1,6 @@
 """Whole scenes against Cycles: .blend files with DR-GS objects, meshes, instances and lights, rendered by both engines.
 
-python bench/bench_composed.py [--size 192] [--seeds 3] [--samples 1024] [--rays 2048] [--scenes NAME ...]
+python bench/bench_composed.py [--size 192] [--seeds 3] [--spp 1024] [--samples 2048] [--scenes NAME ...]
 
 Both pictures come out of Blender, ours through the extension, from one file (`composed_job.py`).
 """
@@ -38,7 +38,7 @@ def render(name: str, options: argparse.Namespace, folder: Path) -> tuple[np.nda
     """(ours, theirs): (k, h, w, 4) pictures of k seeds. Those of Cycles are kept for as long as the job is the same."""
     drgs, npz = spread_asset("spot")
     wanted = []
-    for engine, samples in (("CYCLES", options.samples), ("DRGS", options.rays)):
+    for engine, samples in (("CYCLES", options.spp), ("DRGS", options.samples)):
         for seed in range(options.seeds):
             out = OUT / f"composed-{name}-{engine.lower()}-{seed}.npy"
             note = out.with_suffix(".job.json")
@@ -74,8 +74,8 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--size", type=int, default=192)
     parser.add_argument("--seeds", type=int, default=3, help="independent pictures of either program, at least 2")
-    parser.add_argument("--samples", type=int, default=1024, help="of Cycles, a pixel and picture")
-    parser.add_argument("--rays", type=int, default=2048, help="of ours, a pixel and picture")
+    parser.add_argument("--spp", type=int, default=1024, help="of Cycles, a pixel and picture")
+    parser.add_argument("--samples", type=int, default=2048, help="of ours, a pixel and picture")
     parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=list(SCENES))
     options = parser.parse_args()
     if options.seeds < 2:
@@ -124,9 +124,10 @@ def report(options: argparse.Namespace, rows: list[tuple[str, ...]]) -> str:
     )
     return (
         f"Foreground PSNR in sRGB (mask eroded by 2 px), {options.size}x{options.size}, of .blend files rendered by "
-        f"Cycles of bpy 5.0.1 (Principled, GGX) and through the extension, primary mesh, aa 16, {BOUNCES} bounces in "
-        f"both. Each picture is the mean of {options.seeds} with independent random numbers, of {options.samples} spp "
-        f"and {options.rays} rays. Cycles' shadow terminator offsets and clamps are off. *No noise* and *Cycles "
+        f"Cycles of bpy 5.0.1 (Principled, GGX) and through the extension, primary mesh, 16 sub-pixel samples, "
+        f"{BOUNCES} bounces in "
+        f"both. Each picture is the mean of {options.seeds} with independent random numbers, of {options.spp} spp "
+        f"and {options.samples} samples. Cycles' shadow terminator offsets and clamps are off. *No noise* and *Cycles "
         "itself* as in the section on parity.\n\n" + table(columns, rows) + "\n\n"
         "In the last two scenes sky and lamps stand next to objects that only some rays meet, where a picture depends "
         "on how strategies are weighed (docs/rendering.md)."

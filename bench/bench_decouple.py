@@ -30,7 +30,8 @@ SIZE, TRAIN, TEST, SAMPLES = 128, 40, 8, 32
 
 #: The paper's BRDF and losses: L1 of noisy estimates, white light, neither grids nor smoothness of materials.
 PAPER: dict[str, Any] = {
-    "look": "paper", "unbiased": False, "white": 0.003, "coarse": 0, "smoothness": 0.0, "coarse_to_fine": False,
+    "shading_model": "paper", "unbiased": False, "white": 0.003, "coarse": 0, "smoothness": 0.0, "coarse_to_fine":
+    False,
     "polish": 0.0, "plain_metals": 0.0,
 }  # fmt: skip
 
@@ -57,7 +58,7 @@ VARIANTS: dict[str, dict[str, dict[str, Any]]] = {
         "learned half as fast": {"rate": 0.02},
         "without smoothness": {"smoothness": 0.0},
         "specular-glossiness": {"parametrisation": "specular"},
-        "the paper's BRDF": {"look": "paper"},
+        "the paper's BRDF": {"shading_model": "paper"},
     },
     "priors": {
         "metallic pulled to 0 or 1": {"bimodal": 0.01},

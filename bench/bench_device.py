@@ -64,7 +64,7 @@ def frames(options: argparse.Namespace, cards: list[str]) -> str:
             continue
         ours.SESSION._devices._known["cuda"] = processor
         seconds = []
-        common = {"rays": 32, "aa": 4, "denoise": "svgf", "device": "cuda", "threads": threads}
+        common = {"samples": 32, "subpixel_samples": 4, "denoise": "svgf", "device": "cuda", "threads": threads}
         for k in range(options.runs, -1, -1):  # the last is at rest
             began = time.perf_counter()
             moved = (vertices * (1 + 1e-3 * k)).astype(np.float32)
@@ -100,7 +100,7 @@ def main() -> None:
     shades = mesh.albedo, mesh.roughness, mesh.metallic
     scene.update([TraceObject(options.asset, mesh.vertices, mesh.faces, *shades)])
     camera = pinhole(frame_camera(mesh.vertices, options.size, azimuth=-60, fill=0.66))
-    settings = RenderSettings(samples=32, bounces=1, primary="mesh", aa=4)
+    settings = RenderSettings(samples=32, bounces=1, camera_sees="mesh", subpixel_samples=4)
     points = primary_mesh(scene, camera, camera_parameters(camera, settings, 1), 0, options.size).points
     light = EnvironmentLight(World(environment=read_environment(environments() / "city.exr").radiance))
 
@@ -137,7 +137,8 @@ def main() -> None:
         rows.append([name, *times, likeness, f"{100 * alike:.1f} %"])
     body = (
         f"Light of {len(points)} points ({options.size}x{options.size}, 4 positions a pixel, 82k triangles, city HDRI, "
-        f"{settings.rays} rays, one bounce), the same samples and seeds everywhere; medians of {options.runs} runs, "
+        f"{settings.samples} samples, one bounce), the same samples and seeds everywhere; medians of {options.runs} "
+        f"runs, "
         "copies to and from the device included. Held to: 60 dB between devices. Warp runs one thread on a processor: "
         "its row there tells that the code is right, not how fast a card is.\n\n"
         + table(["Where", "First time", "Seconds", "Speed", "PSNR of the light", "Points alike to the last bit"], rows)

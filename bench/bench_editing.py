@@ -1,6 +1,6 @@
 """Edited materials: the paper's picture of them, made by the extension's own buttons, and what each edit changed.
 
-python bench/bench_editing.py [--size 256] [--rays 512]
+python bench/bench_editing.py [--size 256] [--samples 512]
 
 Blender edits and renders (`editing_job.py`); the passes of the materials are compared here.
 """
@@ -64,7 +64,7 @@ def render(options: argparse.Namespace, folder: Path) -> None:
     archive = folder / "extension.zip"
     subprocess.run([sys.executable, str(ROOT / "tools" / "extension.py"), "--out", str(archive)], check=True)
     job = {
-        "zip": str(archive), "out": str(folder), "size": options.size, "rays": options.rays,
+        "zip": str(archive), "out": str(folder), "size": options.size, "samples": options.samples,
         "assets": {"helmet": str(asset_path("helmet")), "spot": str(textured_spot())},
         "lights": [str(environments() / f"{name}.exr") for name in LIGHTS],
     }  # fmt: skip
@@ -75,9 +75,9 @@ def render(options: argparse.Namespace, folder: Path) -> None:
     subprocess.run(command, check=True, timeout=3000, env=environment)
 
 
-def load(folder: Path, name: str, primary: str) -> dict[str, Layers]:
+def load(folder: Path, name: str, camera_sees: str) -> dict[str, Layers]:
     """Step -> layers of a subject's pictures of one primary surface."""
-    end = f"-{primary}"
+    end = f"-{camera_sees}"
     files = folder.glob(f"{name}-*{end}.exr")
     return {f.stem.removeprefix(f"{name}-").removesuffix(end): read_layers(f) for f in files}
 
@@ -172,7 +172,7 @@ def draw(pictures: dict[str, dict[str, Layers]]) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--size", type=int, default=256)
-    parser.add_argument("--rays", type=int, default=512)
+    parser.add_argument("--samples", type=int, default=512)
     options = parser.parse_args()
     OUT.mkdir(parents=True, exist_ok=True)
     pictures: dict[str, dict[str, Layers]] = {}
@@ -196,7 +196,9 @@ def report(options: argparse.Namespace, rows: list[list[object]], same: list[lis
     """The text of the section."""
     columns = ("Subject", "Made by", "Part", *CHANNELS, "Rest: pixels that changed")
     return (
-        f"{options.size}x{options.size}, {options.rays} rays, surfels as primary surface, aa 16, 2 bounces, under "
+        f"{options.size}x{options.size}, {options.samples} samples, surfels as primary surface, 16 sub-pixel "
+        f"samples, 2 "
+        f"bounces, under "
         f"{LIGHTS[0]}.exr, posed under {LIGHTS[1]}.exr. Every edit was made in Blender by the operators and settings "
         "of the sidebar (`bench/editing_job.py`), after *Restore Captured Material*. The helmet's parts are attributes "
         "that `drgs make` keeps of its source, spot's are vertex groups.\n\n"

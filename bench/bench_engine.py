@@ -48,7 +48,7 @@ def first_frame(path: Path) -> dict[str, float]:
     camera = Camera(np.eye(4), 400, 400, 440.0, 440.0, 200.0, 200.0)
     camera.matrix_world[2, 3] = 2.5
     world = World(np.random.default_rng(0).uniform(0, 1, (256, 512, 3)).astype(np.float32))
-    settings = RenderSettings(samples=4, aa=1)
+    settings = RenderSettings(samples=4, subpixel_samples=1)
     start = time.perf_counter()
     with EngineClient(locate_engine()) as client:
         client.start()
@@ -60,7 +60,7 @@ def first_frame(path: Path) -> dict[str, float]:
         first = time.perf_counter()
         later = []
         for number in range(2, 7):
-            frame.number = number
+            frame.noise_index = number
             again = time.perf_counter()
             engine = client.render(frame).statistics["seconds.total"]
             later.append(time.perf_counter() - again - engine)

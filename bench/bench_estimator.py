@@ -33,7 +33,7 @@ def points(n: int, mu: float, albedo: float, roughness: float, metallic: float) 
 
 def solve(light: EnvironmentLight, seen: ShadingPoints, counts: tuple[int, int, int], look: str) -> np.ndarray:
     """(n,) mean radiance of each point."""
-    settings = RenderSettings(*counts, split="counts", aa=1, bounces=0, look=look)  # type: ignore[arg-type]
+    settings = RenderSettings(strategy_samples=counts, subpixel_samples=1, bounces=0, shading_model=look)  # type: ignore[arg-type]
     return integrate(EMPTY, light, seen, settings, 0).total.mean(axis=1)
 
 
@@ -91,7 +91,7 @@ def main() -> None:
     body += (
         "metals is the single-scattering GGX lobe's; the paper's look adds its to a full Lambert base, and gains.\n\n"
     )
-    body += table(["look", "metallic", "roughness .05", ".3", ".6", "1"], furnace())
+    body += table(["shading_model", "metallic", "roughness .05", ".3", ".6", "1"], furnace())
     body += "\n\nDirectional albedo of a white metal at cosine 0.9: the look *paper* against the form that IRGS\n"
     body += "published, whose denominator is at least 1e-6, and the same without that clamp (bench/irgs.py):\n\n"
     body += table(["roughness", "paper", "IRGS", "IRGS without the clamp"], published())

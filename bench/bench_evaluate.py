@@ -1,7 +1,7 @@
 """Scenes with known truth: what Cycles needs for a view, what the true object scores, the ceiling of reconstructions.
 
-python bench/bench_evaluate.py [--size 128] [--test 8] [--samples 64] [--rays 256] [--objects spot fern]
-python bench/bench_evaluate.py --scenes scenes [--rays 128] [--objects spot fern]
+python bench/bench_evaluate.py [--size 128] [--test 8] [--spp 64] [--samples 256] [--objects spot fern]
+python bench/bench_evaluate.py --scenes scenes [--samples 128] [--objects spot fern]
 
 The true mesh, materials and lights are rendered by our renderer and compared with Cycles' pictures, once with the mesh
 as what the camera sees, once with surfels that were made from it.
@@ -19,7 +19,7 @@ from report import OUT, ROOT, processor_seconds, table, write_section
 from drgs_blender.cli.evaluate import session_renderer
 from drgs_blender.cli.find_blender import find_blender
 from drgs_blender.core.asset.container import write_asset
-from drgs_blender.core.frame import RenderSettings, split_rays
+from drgs_blender.core.frame import RenderSettings
 from drgs_blender.engine.session import Session
 from drgs_blender.evaluate.compare import Show, compare
 from drgs_blender.evaluate.scenes import Plan, make_scenes
@@ -35,13 +35,12 @@ COLUMNS = (
 
 
 def score(
-    path: Path, folder: Path, primary: str, rays: int, truth: Truth | None = None, show: Show | None = None
+    path: Path, folder: Path, camera_sees: str, samples: int, truth: Truth | None = None, show: Show | None = None
 ) -> dict:
     """The report of an asset of a scene, against all that is known of it or `truth`."""
     session = Session()
     key = session.load_asset(path)
-    cosine, ggx, environment = split_rays(rays)
-    settings = RenderSettings(cosine=cosine, ggx=ggx, environment=environment, bounces=3, primary=primary)  # type: ignore[arg-type]
+    settings = RenderSettings(samples=samples, bounces=3, camera_sees=camera_sees)  # type: ignore[arg-type]
     renderer = session_renderer(session, key, settings)
     return compare(session.asset(key), read_capture(folder), truth or read_truth(folder), renderer, show=show)
 
@@ -67,8 +66,8 @@ def made(args: argparse.Namespace) -> tuple[Path, Plan, str]:
     """Where the scenes of the options are, how they were made, and what a view cost, in words."""
     if args.scenes:
         return args.scenes, Plan(**json.loads((args.scenes / "plan.json").read_text())), ""
-    plan = Plan(tuple(args.objects), args.size, 2, args.test, args.samples)
-    out = OUT / f"scenes-{args.size}-{args.test}-{args.samples}"
+    plan = Plan(tuple(args.objects), args.size, 2, args.test, args.spp)
+    out = OUT / f"scenes-{args.size}-{args.test}-{args.spp}"
     command = find_blender().command(ROOT / "drgs_blender" / "evaluate" / "scene_job.py")
     before, rendered = processor_seconds(children=True), len(list(out.glob("*/*/*.png")))
     make_scenes(out, plan, command, ROOT / "examples")
@@ -82,21 +81,21 @@ def main() -> None:
     parser.add_argument("--scenes", type=Path, help="that are there already; else they are made")
     parser.add_argument("--size", type=int, default=128)
     parser.add_argument("--test", type=int, default=8)
-    parser.add_argument("--samples", type=int, default=64)
-    parser.add_argument("--rays", type=int, default=256)
+    parser.add_argument("--spp", type=int, default=64)
+    parser.add_argument("--samples", type=int, default=256)
     parser.add_argument("--objects", nargs="+", default=list(OBJECTS))
     args = parser.parse_args()
     scenes, plan, cost = made(args)
     rows = []
     for folder in (scenes / name for name in args.objects):
-        for primary in ("mesh", "surfels"):
-            report = score(of_truth(folder), folder, primary, args.rays)
+        for camera_sees in ("mesh", "surfels"):
+            report = score(of_truth(folder), folder, camera_sees, args.samples)
             rest, posed = under_other_lights(report, False), under_other_lights(report, True)
             materials, geometry = report["materials"], report["geometry"]
             rows.append(
                 (
                     folder.name,
-                    primary,
+                    camera_sees,
                     f"{100 * rest[0]['coverage']:.0f} %",
                     f"{report['novel']['psnr']:.1f} / {report['novel']['psnr_foreground']:.1f}",
                     f"{mean(rest, 'raw', 'foreground'):.1f} / {mean(rest, 'scaled', 'foreground'):.1f}",
@@ -112,7 +111,8 @@ def main() -> None:
     about = (
         "The true mesh, materials and light against Cycles' pictures of them: the ceiling of every reconstruction of "
         f"these scenes. {plan.size} x {plan.size} pixels, {plan.test} test views, {len(plan.lights) - 1} other lights, "
-        f"{plan.samples} samples and denoiser of Cycles{cost}, {args.rays} rays of ours without a denoiser. PSNR in dB "
+        f"{plan.samples} samples and denoiser of Cycles{cost}, {args.samples} samples of ours without a denoiser. PSNR "
+        f"in dB "
         'on white; "published way" fits a scale an image to 8-bit values, white background included.\n\n'
     )
     write_section("evaluate", "Scenes with known truth: the ceiling", about + table(COLUMNS, rows))

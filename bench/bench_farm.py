@@ -44,17 +44,17 @@ def sheet(folder: Path) -> tuple[Path, np.ndarray]:
     return path, np.array(read_asset(path).mesh.vertices)
 
 
-def picture(key: str, vertices: np.ndarray, number: int, size: int, rays: int) -> Frame:
+def picture(key: str, vertices: np.ndarray, number: int, size: int, samples: int) -> Frame:
     """A frame in which the sheet is bent by its number."""
     camera = Camera(np.eye(4), size, size, 1.1 * size, 1.1 * size, size / 2, size / 2)
     camera.matrix_world[2, 3] = 2.5
     moved = vertices + np.float32([0, 0, 0.05]) * np.sin(0.1 * number + vertices[:, :1])
     world = World(np.random.default_rng(0).uniform(0, 1, (32, 64, 3)).astype(np.float32))
-    settings = RenderSettings(cosine=rays, ggx=rays, environment=rays, aa=1)
+    settings = RenderSettings(samples=3 * samples, subpixel_samples=1)
     return Frame(number, camera, [ObjectState("sheet", key, vertices=moved.astype(np.float32))], world, settings)
 
 
-def kills(scene: Path, folder: Path, count: int, rays: int) -> str:
+def kills(scene: Path, folder: Path, count: int, samples: int) -> str:
     """An engine killed in the middle of each of `count` frames."""
     path, vertices = sheet(folder)
     seen, same = [], 0
@@ -88,7 +88,7 @@ def kills(scene: Path, folder: Path, count: int, rays: int) -> str:
     return "SIGKILL 0.2 to 0.4 s into a frame, one engine after the other.\n\n" + table(["", ""], rows)
 
 
-def left(scene: Path, folder: Path, count: int, rays: int) -> str:
+def left(scene: Path, folder: Path, count: int, samples: int) -> str:
     """What remains on the machine of jobs that were ended in every way."""
     rows = []
     for what in ("engine killed", "Blender killed", "drgs killed", "drgs terminated", "session killed", "disk full"):
@@ -107,7 +107,7 @@ def _disturbed(what: str, scene: Path, scratch: Path, out: Path) -> int:
     environment = os.environ | {"TMPDIR": str(scratch)}
     place = scratch.with_name(f"{scratch.name}-session")
     command = [*PROGRAM.split(), "render", str(scene), "--frames", "1-3", "--out", str(out / "####.exr")]
-    command += ["--rays", "16384"]
+    command += ["--samples", "16384"]
     if what == "session killed":
         subprocess.run([*PROGRAM.split(), "session", "start", str(place)], env=environment, check=True)
         command += ["--session", str(place)]
@@ -139,16 +139,16 @@ def _disturbed(what: str, scene: Path, scratch: Path, out: Path) -> int:
     return job.returncode
 
 
-def overhead(scene: Path, folder: Path, count: int, rays: int) -> str:
+def overhead(scene: Path, folder: Path, count: int, samples: int) -> str:
     """Seconds of a chunk beyond its frames: cold, in a session, and as a task of OpenJD."""
     place = folder / "session"
     drgs("session", "start", str(place))
     try:
-        cold = [_chunk(scene, folder / "cold", k, rays) for k in range(3)]
-        warm = [_chunk(scene, folder / "warm", k, rays, "--session", str(place)) for k in range(count)]
+        cold = [_chunk(scene, folder / "cold", k, samples) for k in range(3)]
+        warm = [_chunk(scene, folder / "warm", k, samples, "--session", str(place)) for k in range(count)]
     finally:
         drgs("session", "stop", str(place))
-    tasks, second = _tasks(scene, folder / "openjd", count, rays)
+    tasks, second = _tasks(scene, folder / "openjd", count, samples)
     rows = [
         ["drgs render, a process for each chunk", statistics.median(cold), max(cold)],
         ["drgs render --session, first chunk (Blender opens the scene)", warm[0], warm[0]],
@@ -164,11 +164,11 @@ def overhead(scene: Path, folder: Path, count: int, rays: int) -> str:
     )
 
 
-def _tasks(scene: Path, out: Path, count: int, rays: int) -> tuple[list[float], list[float]]:
+def _tasks(scene: Path, out: Path, count: int, samples: int) -> tuple[list[float], list[float]]:
     """Seconds of every task of both steps of a session of OpenJD beyond those of its frames."""
     command = drgs(
         "submit", "openjd", str(scene), "--no-check", "--to", str(out / "job"), "--drgs", PROGRAM, "--frames",
-        f"1-{2 * count}", "--chunk", "2", f"--options=--rays {rays}", "--out", str(out / "####.exr"),
+        f"1-{2 * count}", "--chunk", "2", f"--options=--samples {samples}", "--out", str(out / "####.exr"),
         "--denoised", str(out / "clean" / "####.exr"),
     ).stdout.splitlines()[-1]  # fmt: skip
     words = [str(farm_slurm.OPENJD), *shlex.split(command)[1:]]
@@ -189,16 +189,18 @@ def _of_frames(text: str) -> float:
     return sum(map(float, re.findall(r" Time: 00:(\d\d\.\d\d)", text)))
 
 
-def _chunk(scene: Path, out: Path, number: int, rays: int, *options: str) -> float:
+def _chunk(scene: Path, out: Path, number: int, samples: int, *options: str) -> float:
     """Seconds of two frames beyond those of the frames themselves."""
     frames = f"{2 * number + 1}-{2 * number + 2}"
     started = time.monotonic()
-    done = drgs("render", str(scene), "--frames", frames, "--out", str(out / "####.exr"), "--rays", str(rays), *options)
+    done = drgs(
+        "render", str(scene), "--frames", frames, "--out", str(out / "####.exr"), "--samples", str(samples), *options
+    )
     whole = time.monotonic() - started
     return whole - _of_frames(done.stdout)
 
 
-def scaling(scene: Path, folder: Path, count: int, rays: int) -> str:
+def scaling(scene: Path, folder: Path, count: int, samples: int) -> str:
     """Frames an hour of one worker on one core, and of two on a core each."""
     cores = sorted(os.sched_getaffinity(0))[:2]
     if len(cores) < 2:
@@ -210,7 +212,7 @@ def scaling(scene: Path, folder: Path, count: int, rays: int) -> str:
     try:
         _work(both, scene, folder / "warm-up", 2, 64)  # Blender opens the scene, kernels are loaded
         times = {
-            len(places): [_work(places, scene, folder / f"{len(places)}-{k}", count, rays) for k in range(3)]
+            len(places): [_work(places, scene, folder / f"{len(places)}-{k}", count, samples) for k in range(3)]
             for places in (one, both)
         }
     finally:
@@ -219,7 +221,8 @@ def scaling(scene: Path, folder: Path, count: int, rays: int) -> str:
     hours = {workers: 3600 * workers * count / statistics.median(times[workers]) for workers in times}
     rows = [[workers, hours[workers], hours[workers] / hours[1]] for workers in hours]
     return (
-        f"{count} frames of 32 x 24 pixels with {rays} rays for each worker, a session on one core with one thread; "
+        f"{count} frames of 32 x 24 pixels with {samples} samples for each worker, a session on one core with one "
+        f"thread; "
         "medians of three runs.\n\n" + table(["workers", "frames an hour", "of one"], rows)
     )
 
@@ -229,13 +232,13 @@ def pinned(core: int) -> list[str]:
     return ["taskset", "-c", str(core), *PROGRAM.split()]
 
 
-def _work(places: dict[int, Path], scene: Path, out: Path, count: int, rays: int) -> float:
+def _work(places: dict[int, Path], scene: Path, out: Path, count: int, samples: int) -> float:
     """Seconds in which every worker, a session on a core, renders `count` frames."""
     started = time.monotonic()
     jobs = [
         subprocess.Popen(
             [*pinned(core), "render", str(scene), "--frames", f"{k * count + 1}-{(k + 1) * count}", "--overwrite",
-             "--out", str(out / "####.exr"), "--rays", str(rays), "--threads", "1", "--session", str(place)],
+             "--out", str(out / "####.exr"), "--samples", str(samples), "--threads", "1", "--session", str(place)],
             stdout=subprocess.DEVNULL,
         )
         for k, (core, place) in enumerate(places.items())
@@ -245,7 +248,7 @@ def _work(places: dict[int, Path], scene: Path, out: Path, count: int, rays: int
     return time.monotonic() - started
 
 
-def soak(scene: Path, folder: Path, count: int, rays: int) -> str:
+def soak(scene: Path, folder: Path, count: int, samples: int) -> str:
     """Memory and time of an engine that renders `count` frames of a bending object."""
     path, vertices = sheet(folder)
     memory, seconds = [], []
@@ -280,7 +283,7 @@ PROCESSORS = {
 }
 
 
-def processors(scene: Path, folder: Path, count: int, rays: int) -> str:
+def processors(scene: Path, folder: Path, count: int, samples: int) -> str:
     """The same frames with kernels compiled for this processor and for older ones."""
     path, vertices = sheet(folder)
     made: dict[str, np.ndarray] = {}
@@ -290,7 +293,7 @@ def processors(scene: Path, folder: Path, count: int, rays: int) -> str:
         try:
             with EngineClient(engine_command(sys.executable)) as client:
                 key = client.load_asset(str(path))
-                frames = [picture(key, vertices, number, 96, rays) for number in range(1, count + 1)]
+                frames = [picture(key, vertices, number, 96, samples) for number in range(1, count + 1)]
                 made[what] = np.array([client.render(frame)["Combined"] for frame in frames])
         except DeviceError as error:  # it has no such instructions
             print(error)
@@ -304,7 +307,8 @@ def processors(scene: Path, folder: Path, count: int, rays: int) -> str:
         relative = apart / np.maximum(np.abs(ours), 1e-3)
         rows.append([what, f"{(apart.max(axis=-1) > 0).mean():.2%}", float(relative.max()), float(apart.max())])
     return (
-        f"{count} frames of 96 x 96 pixels, {3 * rays} rays, by engines whose kernels were compiled for fixed targets "
+        f"{count} frames of 96 x 96 pixels, {3 * samples} samples, by engines whose kernels were compiled for fixed "
+        f"targets "
         "and older processors, against this processor's own; Embree takes the best that there is.\n\n"
     ) + table(["kernels for", "pixels that differ", "largest relative difference", "largest difference"], rows)
 
@@ -332,9 +336,9 @@ def main() -> None:
         (folder / "scene").mkdir()
         make_blend_files(folder / "scene")
         for part in options.part:
-            title, run, count, rays = PARTS[part]
+            title, run, count, samples = PARTS[part]
             (folder / part).mkdir()
-            body = run(folder / "scene/relative.blend", folder / part, options.count or count, rays)
+            body = run(folder / "scene/relative.blend", folder / part, options.count or count, samples)
             write_section(f"farm-{part}", title, body)
 
 

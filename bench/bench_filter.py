@@ -1,6 +1,6 @@
 """Silhouettes and textures against Cycles with its own pixel filter, from surfels and from meshes.
 
-python bench/bench_filter.py [--size 256] [--rays 1024]
+python bench/bench_filter.py [--size 256] [--samples 1024]
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ ROWS = (
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--size", type=int, default=256)
-    parser.add_argument("--samples", type=int, default=1024, help="of Cycles")
-    parser.add_argument("--rays", type=int, default=1024, help="of ours")
+    parser.add_argument("--spp", type=int, default=1024, help="of Cycles")
+    parser.add_argument("--samples", type=int, default=1024, help="of ours")
     options = parser.parse_args()
     jobs = {}
     for mesh, light in CASES:
@@ -45,7 +45,7 @@ def main() -> None:
         write_asset(drgs, Asset(surfels, shape, binding, None, {"source": mesh}))
         jobs[mesh] = drgs, {
             "mesh": str(npz), "environment": str(environments() / f"{light}.exr"), "camera": camera, "strength": 0.35,
-            "samples": options.samples, "bounces": 1, "terminator_offset": 0.0, "filter_width": WIDTH,
+            "samples": options.spp, "bounces": 1, "terminator_offset": 0.0, "filter_width": WIDTH,
             "out": str(OUT / f"filter-{mesh}.npy"),
         }  # fmt: skip
     cycles_pictures([job for _, job in jobs.values()], "filter")
@@ -54,18 +54,19 @@ def main() -> None:
         theirs = np.load(job["out"])
         cover = theirs[..., 3]
         edge, near = (cover > 0) & (cover < 1), binary_dilation(cover > 0)
-        for primary, width, aa in ROWS:
+        for camera_sees, width, subpixels in ROWS:
             found = relight(
-                drgs, job["environment"], job["camera"], rays=options.rays, primary=primary, aa=aa, bounces=1,
+                drgs, job["environment"], job["camera"], samples=options.samples, camera_sees=camera_sees,
+                subpixel_samples=subpixels, bounces=1,
                 strength=job["strength"], filter_width=width,
             )["Combined"]  # fmt: skip
-            np.save(OUT / f"filter-{mesh}-{primary}-{width}-{aa}.npy", found)
+            np.save(OUT / f"filter-{mesh}-{camera_sees}-{width}-{subpixels}.npy", found)
             off = float(np.sqrt(np.mean((found[..., 3] - cover)[edge] ** 2)))
             name = f"Blackman-Harris {width:g}" if width else "box 1"
             likeness = (f"{psnr(found, theirs, where):.2f}" for where in (near, edge))
-            rows.append((mesh, primary, name, aa, *likeness, f"{off:.4f}"))
+            rows.append((mesh, camera_sees, name, subpixels, *likeness, f"{off:.4f}"))
     body = (
-        f"{options.size}x{options.size}, {options.rays} rays, against Cycles with {options.samples} samples and its "
+        f"{options.size}x{options.size}, {options.samples} samples, against Cycles with {options.spp} samples and its "
         f"default filter, Blackman-Harris {WIDTH:g}; the same mesh, materials, light, one bounce. PSNR in sRGB over "
         "all that is covered, edges included, and over the partly covered pixels alone; alpha: RMSE over the latter. "
         "Surfels stand a part of a pixel off the mesh.\n\n"

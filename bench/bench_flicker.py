@@ -1,6 +1,6 @@
 """Does a sequence under a light that turns flicker? Noisy, denoised one by one, over time, and in a window.
 
-python bench/bench_flicker.py [--frames 8] [--size 256] [--rays 32] [--reference 1024] [--step 1]
+python bench/bench_flicker.py [--frames 8] [--size 256] [--samples 32] [--reference 1024] [--step 1]
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from subjects import asset_path
 from drgs_blender.cli import frame_store
 from drgs_blender.cli.main import main as drgs
 from drgs_blender.core.asset.container import read_asset
-from drgs_blender.core.frame import Frame, Moment, ObjectState, RenderSettings, World, split_rays
+from drgs_blender.core.frame import Frame, Moment, ObjectState, RenderSettings, World
 from drgs_blender.core.passes import TEMPORAL
 from drgs_blender.formats.registry import read_environment
 from drgs_blender.render.denoise.oidn import available
@@ -35,7 +35,7 @@ def frames(options: argparse.Namespace, environment: str) -> list[Frame]:
     key = SESSION.load_asset(path)
     radiance = read_environment(environments() / f"{environment}.exr").radiance
     camera = pinhole(frame_camera(read_asset(path).mesh.vertices, options.size, azimuth=-60, fill=0.66))
-    settings = RenderSettings(*split_rays(options.rays), film_transparent=True, aa=4)
+    settings = RenderSettings(options.samples, film_transparent=True, subpixel_samples=4)
     out = []
     for number in range(options.frames):
         a = np.radians(options.step * number)
@@ -62,15 +62,15 @@ def in_windows(sequence: list[Frame]) -> tuple[list[Array], list[Array], list[Ar
         pictures, coverage = [], []
         for frame in sequence:
             passes = SESSION.render(replace(frame, passes=TEMPORAL))
-            path = Path(noisy.replace("####", f"{frame.number:04d}"))
-            frame_store.save(path, passes, frame, frame.number, "")
+            path = Path(noisy.replace("####", f"{frame.noise_index:04d}"))
+            frame_store.save(path, passes, frame, frame.noise_index, "")
             pictures.append(passes["Combined"][..., :3])
             coverage.append(passes["Coverage"][..., 0])
         numbers = f"0-{len(sequence) - 1}"
         code = drgs(["denoise", noisy, "--frames", numbers, "--out", clean, "--passes", "Combined"])
         if code:
             raise SystemExit(code)
-        found = [read_frame(clean.replace("####", f"{f.number:04d}"))[0]["Combined"][..., :3] for f in sequence]
+        found = [read_frame(clean.replace("####", f"{f.noise_index:04d}"))[0]["Combined"][..., :3] for f in sequence]
     return pictures, found, coverage
 
 
@@ -78,7 +78,7 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--frames", type=int, default=8)
     parser.add_argument("--size", type=int, default=256)
-    parser.add_argument("--rays", type=int, default=32)
+    parser.add_argument("--samples", type=int, default=32)
     parser.add_argument("--reference", type=int, default=1024)
     parser.add_argument("--step", type=float, default=1.0, help="degrees a frame")
     options = parser.parse_args()
@@ -86,8 +86,7 @@ def main() -> None:
     for environment in ("city", "studio"):
         sequence = frames(options, environment)
         noisy, windows, coverage = in_windows(sequence)
-        cosine, ggx, light = split_rays(options.reference)
-        truth = np.stack(rendered(sequence, cosine=cosine, ggx=ggx, environment=light))
+        truth = np.stack(rendered(sequence, samples=options.reference))
         mask = np.stack([foreground(c, 1) for c in coverage])
         rest = flicker(truth, mask)
         ways: dict[str, list[Array]] = {
@@ -103,7 +102,7 @@ def main() -> None:
             later = [psnr(a, b, m) for a, b, m in zip(shown[2:], truth[2:], mask[2:])]
             rows.append((environment, name, f"{1e3 * (flicker(shown, mask) - rest):.2f}", f"{np.mean(later):.2f}"))
     body = (
-        f"cat, {options.size}x{options.size}, {options.rays} rays, {options.frames} frames, the world turns "
+        f"cat, {options.size}x{options.size}, {options.samples} samples, {options.frames} frames, the world turns "
         f"{options.step:g} degree(s) a frame. Flicker: mean absolute second difference in time of sRGB luminance, less "
         f"that of {options.reference} rays, in thousandths. PSNR: against {options.reference} rays, foreground, sRGB, "
         "from the third frame on.\n\n" + table(("World", "Denoiser", "Flicker", "PSNR, dB"), rows)

@@ -37,10 +37,10 @@ def main() -> None:
     }  # fmt: skip
     rows, medians = [], {}
     variants = {
-        "surfels, aa 4": {"primary": "surfels", "aa": 4},
-        "surfels, aa 1": {"primary": "surfels", "aa": 1},
-        "mesh, aa 4": {"primary": "mesh", "aa": 4},
-        "surfels, aa 4, SVGF": {"primary": "surfels", "aa": 4, "denoise": "svgf"},
+        "surfels, 4 sub-pixel samples": {"camera_sees": "surfels", "subpixel_samples": 4},
+        "surfels, 1 sub-pixel samples": {"camera_sees": "surfels", "subpixel_samples": 1},
+        "mesh, 4 sub-pixel samples": {"camera_sees": "mesh", "subpixel_samples": 4},
+        "surfels, 4 sub-pixel samples, SVGF": {"camera_sees": "surfels", "subpixel_samples": 4, "denoise": "svgf"},
     }
     coverage = 0.0
     for name, settings in variants.items():
@@ -49,7 +49,7 @@ def main() -> None:
             # Everything moves a little in every frame, so that nothing is left out of the time.
             moved = mesh.vertices * np.float32(1 + 1e-4 * run)
             begin = time.perf_counter()
-            picture = relight(path, environment, camera, rays=32, vertices=moved, bounces=1, seed=run, **settings)
+            picture = relight(path, environment, camera, samples=32, vertices=moved, bounces=1, seed=run, **settings)
             picture = picture["Combined"]
             walls.append(time.perf_counter() - begin)
         coverage = float((picture[..., 3] > 0.5).mean())

@@ -34,8 +34,10 @@ def main() -> None:
     parser.add_argument("--cases", nargs="+", choices=[c.name for c in CASES], default=[c.name for c in CASES])
     parser.add_argument("--size", type=int, default=200, help="of the pictures that are compared")
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--aa", type=int, default=0, help="sub-pixel positions of ours, 0 as the settings choose")
-    parser.add_argument("--rays", type=int, nargs="+", default=(8, 32, 128, 256), help="of ours")
+    parser.add_argument(
+        "--subpixel-samples", type=int, default=0, help="sub-pixel positions of ours, 0 as the settings choose"
+    )
+    parser.add_argument("--samples", type=int, nargs="+", default=(8, 32, 128, 256), help="of ours")
     parser.add_argument("--spp", type=int, nargs="+", default=(2, 8, 32, 128), help="of Cycles and Mitsuba")
     parser.add_argument("--denoised-spp", type=int, nargs="+", default=(1, 4, 16), help="of Cycles with OIDN")
     parser.add_argument("--reference-rays", type=int, default=2048)

@@ -1,6 +1,6 @@
 """Engine against Cycles: the same mesh, vertex materials, HDRI and camera, both converged.
 
-python bench/bench_parity.py [--size 256] [--seeds 4] [--samples 1024] [--rays 4096]
+python bench/bench_parity.py [--size 256] [--seeds 4] [--spp 1024] [--samples 4096]
 
 Every picture is rendered `seeds` times by either program with independent random numbers. Their means are compared as
 they are, and what differs between the programs is told from the noise of both, see `judge.systematic_error`: a sun
@@ -69,7 +69,7 @@ def pictures(options: argparse.Namespace, mesh: str, light: str, bent: bool) -> 
     jobs = [
         {
             "mesh": str(npz), "environment": str(environments() / f"{light}.exr"), "camera": camera,
-            "samples": options.samples, "bounces": BOUNCES, "deform": bent, "strength": STRENGTH, "seed": seed,
+            "samples": options.spp, "bounces": BOUNCES, "deform": bent, "strength": STRENGTH, "seed": seed,
             # Not physics: it lights what the mesh itself shadows, and both programs are to solve the same scene.
             "terminator_offset": 0.0,
             "out": f"{stem}-{seed}.npy", "vertices_out": f"{stem}-vertices.npy",
@@ -83,8 +83,8 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--size", type=int, default=256)
     parser.add_argument("--seeds", type=int, default=4, help="independent pictures of either program, at least 2")
-    parser.add_argument("--samples", type=int, default=1024, help="of Cycles, a pixel and picture")
-    parser.add_argument("--rays", type=int, default=4096, help="of ours, a pixel and picture")
+    parser.add_argument("--spp", type=int, default=1024, help="of Cycles, a pixel and picture")
+    parser.add_argument("--samples", type=int, default=4096, help="of ours, a pixel and picture")
     parser.add_argument("--meshes", nargs="+", default=MESHES)
     parser.add_argument("--lights", nargs="+", default=LIGHTS)
     options = parser.parse_args()
@@ -99,7 +99,8 @@ def main() -> None:
         vertices = np.load(jobs[0]["vertices_out"])
         ours = np.stack([
             relight(
-                drgs, job["environment"], job["camera"], rays=options.rays, vertices=vertices, primary="mesh", aa=16,
+                drgs, job["environment"], job["camera"], samples=options.samples, vertices=vertices,
+                camera_sees="mesh", subpixel_samples=16,
                 bounces=BOUNCES, strength=STRENGTH, seed=job["seed"],
             )["Combined"]
             for job in jobs
@@ -139,8 +140,9 @@ def report(options: argparse.Namespace, scores: dict[tuple[str, str], dict[bool,
     share = np.mean([s.noise * 10 ** (s.plain / 10) for s in both])
     return (
         f"Foreground PSNR in sRGB (mask eroded by 2 px), {options.size}x{options.size}, Cycles of bpy 5.0.1 "
-        f"(Principled, GGX) against `--primary mesh --aa 16`, {BOUNCES} bounces in both. Each picture is the mean of "
-        f"{options.seeds} with independent random numbers, of {options.samples} spp and {options.rays} rays; "
+        f"(Principled, GGX) against `--camera-sees mesh --subpixel-samples 16`, {BOUNCES} bounces in both. Each "
+        f"picture is the mean of "
+        f"{options.seeds} with independent random numbers, of {options.spp} spp and {options.samples} samples; "
         f"{np.mean([s.clipped for s in both]):.1%} of the pixels are clipped to white. Bent: two-bone armature and a "
         "shape key, evaluated by Blender. Cycles' shadow terminator offset is off in both poses.\n\n"
         + table(columns, rows)

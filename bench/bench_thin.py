@@ -22,7 +22,7 @@ from scipy.ndimage import binary_erosion
 from drgs_blender.build.proxy import mesh_from_surfels
 from drgs_blender.core.asset import Asset, Mesh, Surfels
 from drgs_blender.core.asset.container import write_asset
-from drgs_blender.core.frame import Frame, Material, MeshState, ObjectState, RenderSettings, World, split_rays
+from drgs_blender.core.frame import Frame, Material, MeshState, ObjectState, RenderSettings, World
 from drgs_blender.deform.attach import attach
 from drgs_blender.deform.binding import bind
 from drgs_blender.engine.session import Session
@@ -119,11 +119,10 @@ def render(
 ) -> tuple[Array, Array, float]:
     """Our pictures with two seeds, where the subject is, processor seconds of the second."""
     write_asset(path, asset)
-    cosine, ggx, light = split_rays(options.rays)
     session = Session()
     key = session.load_asset(path)
     world = World(read_environment(environments() / "city.exr").radiance, strength=STRENGTH)
-    how = RenderSettings(cosine, ggx, light, bounces=BOUNCES, aa=AA, film_transparent=True, **settings)
+    how = RenderSettings(options.samples, bounces=BOUNCES, subpixel_samples=AA, film_transparent=True, **settings)
     subject = ObjectState("subject", key, pass_index=1)
     frame = Frame(1, pinhole(camera), [subject], world, how, ("Combined", "IndexOB"), [ground()])
     pictures = []
@@ -139,7 +138,7 @@ def render(
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--size", type=int, default=240)
-    parser.add_argument("--rays", type=int, default=256)
+    parser.add_argument("--samples", type=int, default=256)
     parser.add_argument("--spp", type=int, default=256)
     parser.add_argument("--subjects", nargs="+", choices=SUBJECTS, default=list(SUBJECTS))
     options = parser.parse_args()
@@ -169,7 +168,9 @@ def main() -> None:
         binding, _ = bind(fused, surfels)
         making = time.process_time() - began
         found = {
-            "surfels": render(Asset(surfels, Mesh.empty()), folder / f"{name}.drgs", camera, options, tracer="surfels"),
+            "surfels": render(
+                Asset(surfels, Mesh.empty()), folder / f"{name}.drgs", camera, options, rays_see="surfels"
+            ),
             "TSDF": render(Asset(surfels, fused, binding), folder / f"{name}-tsdf.drgs", camera, options),
         }
         save(folder / f"{name}.png", [theirs.mean(0), *(ours.mean(0) for ours, _, _ in found.values())])
@@ -181,9 +182,11 @@ def main() -> None:
                  f"{making:.0f}" if tracer == "TSDF" else "-")
             )  # fmt: skip
     body = (
-        f"{options.size}x{options.size}, city.exr, {BOUNCES} indirect bounces, {options.rays} rays, aa {AA}, against "
-        f"Cycles on the sheets themselves with {options.spp} spp. *surfels*: no mesh, `--tracer surfels`. *TSDF*: "
-        f"`--tracer mesh` with the mesh fused from the surfels at {RESOLUTION} voxels. PSNR in sRGB without the noise "
+        f"{options.size}x{options.size}, city.exr, {BOUNCES} indirect bounces, {options.samples} samples, {AA} "
+        f"sub-pixel samples, against "
+        f"Cycles on the sheets themselves with {options.spp} spp. *surfels*: no mesh, `--rays-see surfels`. *TSDF*: "
+        f"`--rays-see mesh` with the mesh fused from the surfels at {RESOLUTION} voxels. PSNR in sRGB without the "
+        f"noise "
         "of either, inside the subject and on the ground around it; processor seconds of a frame, and of making and "
         "binding that mesh.\n\n"
         + table(("Subject", "Surfels", "Light meets", "Subject dB", "Ground dB", "CPU s", "Mesh CPU s"), rows)

@@ -235,7 +235,12 @@ def build(job: dict) -> bpy.types.Scene:
     cycles.caustics_reflective = cycles.caustics_refractive = True
     cycles.light_sampling_threshold = 0.0
     settings = scene.drgs
-    settings.aa, settings.primary, settings.bounces, settings.denoise = 16, "mesh", job["bounces"], "none"
+    settings.subpixel_samples, settings.camera_sees, settings.bounces, settings.denoise = (
+        16,
+        "mesh",
+        job["bounces"],
+        "none",
+    )
     bpy.ops.wm.save_as_mainfile(filepath=job["blend"])
     return scene
 
@@ -243,7 +248,7 @@ def build(job: dict) -> bpy.types.Scene:
 def picture(scene: bpy.types.Scene, engine: str, seed: int, samples: int, path: Path) -> None:
     scene.render.engine = engine
     scene.cycles.seed, scene.cycles.samples = seed, samples
-    scene.drgs.seed, scene.drgs.rays = seed, samples
+    scene.drgs.seed, scene.drgs.samples = seed, samples
     scene.render.filepath = str(path.with_suffix(".exr"))
     bpy.ops.render.render(write_still=True)
     image = bpy.data.images.load(scene.render.filepath)

@@ -55,23 +55,26 @@ def with_materials_of(true: Mesh, part: Part, points: Array) -> Part:
 
 
 def passes_of(
-    mesh: Mesh, cameras: list[Camera], radiance: Array, rays: int, passes: tuple[str, ...]
+    mesh: Mesh, cameras: list[Camera], radiance: Array, samples: int, passes: tuple[str, ...]
 ) -> list[dict[str, Array]]:
     """Passes of a mesh in a light, one dictionary a camera; one bounce."""
     scene, world = TraceScene(), World(environment=radiance)
     scene.update([TraceObject("subject", mesh.vertices, mesh.faces, mesh.albedo, mesh.roughness, mesh.metallic)])
     rows, column = np.empty((0, 3), np.float32), np.empty(0, np.float32)
     posed = PosedSurfels(rows, rows, rows, rows, column, rows, column, column, np.empty(0, np.int32))
-    quarter = max(1, rays // 4)
     settings = RenderSettings(
-        cosine=2 * quarter, ggx=quarter, environment=quarter, bounces=1, primary="mesh", aa=9, film_transparent=True
+        samples=max(4, samples),
+        bounces=1,
+        camera_sees="mesh",
+        subpixel_samples=9,
+        film_transparent=True,
     )
     light = EnvironmentLight(world)
     frames = [Frame(1, camera, [ObjectState("subject", "")], world, settings, passes) for camera in cameras]
     return [render(scene, light, posed, frame) for frame in frames]
 
 
-def score(scene: Scene, mesh: Mesh, rays: int = 64, step: int = 2) -> tuple[float, float, float, float, float]:
+def score(scene: Scene, mesh: Mesh, samples: int = 64, step: int = 2) -> tuple[float, float, float, float, float]:
     """Relit raw and scaled (foreground, dB, means over the other lights), albedo scaled (dB), roughness, metallic.
 
     Parameters
@@ -92,7 +95,7 @@ def score(scene: Scene, mesh: Mesh, rays: int = 64, step: int = 2) -> tuple[floa
     raw, scaled = [], []
     for item in scene.relit:
         views = item.views[::step]
-        pictures = passes_of(mesh, [view.camera for view in views], item.radiance, rays, ("Combined",))
+        pictures = passes_of(mesh, [view.camera for view in views], item.radiance, samples, ("Combined",))
         linear = np.stack([picture["Combined"] for picture in pictures])
         alpha = np.clip(linear[..., 3], 0, 1)
         straight = linear[..., :3] / np.maximum(alpha, 1e-6)[..., None] * (alpha > 0)[..., None]

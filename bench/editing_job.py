@@ -172,9 +172,13 @@ def main(path: str) -> None:
         scene, how, out = prepare(job), SUBJECTS[name], Path(job["out"])
 
         def picture(step: str, scene: bpy.types.Scene = scene, stem: Path = out / name) -> None:
-            for primary, rays, aa in (("surfels", job["rays"], 16), ("mesh", 16, 1)):
-                scene.drgs.primary, scene.drgs.rays, scene.drgs.aa = primary, rays, aa
-                scene.render.filepath = f"{stem}-{step}-{primary}.exr"
+            for camera_sees, samples, subpixels in (("surfels", job["rays"], 16), ("mesh", 16, 1)):
+                scene.drgs.camera_sees, scene.drgs.samples, scene.drgs.subpixel_samples = (
+                    camera_sees,
+                    samples,
+                    subpixels,
+                )
+                scene.render.filepath = f"{stem}-{step}-{camera_sees}.exr"
                 bpy.ops.render.render(write_still=True)
 
         obj = subject(asset, how.turn)

@@ -46,7 +46,7 @@ def build(asset: str) -> bpy.types.Scene:
     camera.location.z = 3
     scene.collection.objects.link(camera)
     scene.camera = camera
-    scene.drgs.rays = 3
+    scene.drgs.samples = 3
     return scene
 
 

@@ -79,11 +79,11 @@ def fill(disk: Path, trio: Trio, to: Path) -> float:
     return time.monotonic() - started
 
 
-def faults(scene: Path, folder: Path, count: int, rays: int) -> str:
+def faults(scene: Path, folder: Path, count: int, samples: int) -> str:
     """`count` frames while a node, an engine and a disk fail; compared with one machine that nothing disturbs."""
     before = leftovers()
     to, disk = folder / "job", folder / "disk"
-    options = ("--frames", f"1-{count}", "--chunk", "10", f"--options=--rays {rays}")
+    options = ("--frames", f"1-{count}", "--chunk", "10", f"--options=--samples {samples}")
     with small_disk(disk, 64), cluster() as trio:
         submit(trio, scene, to, *options, "--out", str(disk / "####.exr"))
         node = lambda name: f"SLURMD_NODENAME={name}"  # noqa: E731
@@ -99,7 +99,9 @@ def faults(scene: Path, folder: Path, count: int, rays: int) -> str:
         seconds = time.monotonic() - started
         lines = saved(to)
         alone = folder / "alone"
-        drgs("render", str(scene), "--frames", f"1-{count}", "--out", str(alone / "####.exr"), "--rays", str(rays))
+        drgs(
+            "render", str(scene), "--frames", f"1-{count}", "--out", str(alone / "####.exr"), "--samples", str(samples)
+        )
         differ = frames_differ(alone, disk, count)
         odd = [p.name for p in disk.iterdir() if p.suffix != ".exr" or p.name.startswith(".")]
     rows = [
@@ -112,19 +114,20 @@ def faults(scene: Path, folder: Path, count: int, rays: int) -> str:
         ["seconds", seconds],
     ]
     return (
-        f"{count} frames of 32 x 24 pixels with {rays} rays in chunks of 10, an array of Slurm on three nodes of one "
+        f"{count} frames of 32 x 24 pixels with {samples} samples in chunks of 10, an array of Slurm on three nodes of "
+        f"one "
         "core each. While they were rendered one node was ended with all it ran, an engine was killed, and the disk of "
         "the frames was filled until a chunk ended with code 73.\n\n" + table(["", ""], rows)
     )
 
 
-def chunks(scene: Path, folder: Path, count: int, rays: int) -> str:
+def chunks(scene: Path, folder: Path, count: int, samples: int) -> str:
     """The same frames, denoised over time, in chunks of several sizes on three nodes: the same files?"""
     seconds: dict[str, float] = {}
     with cluster() as trio:
         for size in ("1", "4", "10", "adaptive"):
             started = time.monotonic()
-            (_sessions if size == "adaptive" else _slurm)(trio, scene, folder / size, count, rays, size)
+            (_sessions if size == "adaptive" else _slurm)(trio, scene, folder / size, count, samples, size)
             seconds[size] = time.monotonic() - started
     rows = []
     for size in seconds:
@@ -136,7 +139,8 @@ def chunks(scene: Path, folder: Path, count: int, rays: int) -> str:
         raise SystemExit(f"not every node took part: {steps}")
     nodes = [[node, *("; ".join(map(write_frames, made[node])) for made in steps.values())] for node in NODES]
     return (
-        f"{count} frames of 32 x 24 pixels with {rays} rays, rendered and then denoised over a window of five frames, "
+        f"{count} frames of 32 x 24 pixels with {samples} samples, rendered and then denoised over a window of five "
+        f"frames, "
         "on three nodes of Slurm; adaptive are arrays of sessions of OpenJD, each with a third of the frames, which "
         "choose the size of their chunks by their time. Files are compared byte for byte with those of chunks of 10."
         "\n\n"
@@ -146,19 +150,19 @@ def chunks(scene: Path, folder: Path, count: int, rays: int) -> str:
     )
 
 
-def _slurm(trio: Trio, scene: Path, folder: Path, count: int, rays: int, size: str) -> None:
+def _slurm(trio: Trio, scene: Path, folder: Path, count: int, samples: int, size: str) -> None:
     submit(
-        trio, scene, folder / "job", "--frames", f"1-{count}", "--chunk", size, f"--options=--rays {rays}",
+        trio, scene, folder / "job", "--frames", f"1-{count}", "--chunk", size, f"--options=--samples {samples}",
         "--out", str(folder / "noisy/####.exr"), "--denoised", str(folder / "clean/####.exr"),
     )  # fmt: skip
     trio.until_done(900)
 
 
-def _sessions(trio: Trio, scene: Path, folder: Path, count: int, rays: int, size: str) -> None:
+def _sessions(trio: Trio, scene: Path, folder: Path, count: int, samples: int, size: str) -> None:
     """A session of OpenJD on every node, each with a part of the frames, and then with denoising it."""
     command = drgs(
         "submit", "openjd", str(scene), "--no-check", "--to", str(folder / "job"), "--drgs", PROGRAM,
-        "--frames", f"1-{count}", "--chunk", "2", "--chunk-seconds", "5", f"--options=--rays {rays}",
+        "--frames", f"1-{count}", "--chunk", "2", "--chunk-seconds", "5", f"--options=--samples {samples}",
         "--out", str(folder / "noisy/####.exr"), "--denoised", str(folder / "clean/####.exr"),
     ).stdout.splitlines()[-1]  # fmt: skip
     parts = [write_frames(part) for part in cut_frames(list(range(1, count + 1)), -(-count // len(NODES)))]

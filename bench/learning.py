@@ -30,7 +30,9 @@ def photographs(path: Path, size: int) -> Capture:
     vertices, views = read_asset(path).mesh.vertices, []
     for k in range(VIEWS):
         described = frame_camera(vertices, size, azimuth=360 * k / VIEWS)
-        found = ours.relight(path, environments() / "city.exr", described, rays=32, aa=4, denoise="svgf")["Combined"]
+        found = ours.relight(
+            path, environments() / "city.exr", described, samples=32, subpixel_samples=4, denoise="svgf"
+        )["Combined"]
         camera, colour, mask = ours.pinhole(described), linear_to_srgb(found[..., :3].clip(0, 1)), found[..., 3]
         views.append(View(f"{k:02d}", camera, colour.astype("float32"), mask.clip(0, 1), k % 4 == 0))
     return Capture(path, views, (0.0, 0.0, 0.0))

@@ -21,7 +21,6 @@ from drgs_blender.core.frame import (
     RenderSettings,
     Visibility,
     World,
-    split_rays,
 )
 from drgs_blender.formats.registry import read_environment
 
@@ -80,7 +79,7 @@ def frame_of(
     matrix = look_at(np.array([0.6, -3.6, 1.3]), np.array([0.0, 0.0, 0.5]))
     camera = pinhole({"matrix_world": matrix.tolist(), "width": size, "height": size, "fov_x": angle})
     world = World(read_environment(environments() / f"{light}.exr").radiance, strength=0.6)
-    settings = RenderSettings(*split_rays(options.ablation_rays), bounces=BOUNCES, primary="mesh")
+    settings = RenderSettings(options.ablation_rays, bounces=BOUNCES, camera_sees="mesh")
     return Frame(1, camera, objects, world, settings, ("Combined", "Coverage"), meshes)
 
 

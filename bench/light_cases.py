@@ -17,7 +17,7 @@ from subjects import asset_path, spread_materials
 
 from drgs_blender.core.asset import Asset, Mesh
 from drgs_blender.core.asset.container import read_asset, write_asset
-from drgs_blender.core.frame import Frame, ObjectState, RenderSettings, World, split_rays
+from drgs_blender.core.frame import Frame, ObjectState, RenderSettings, World
 from drgs_blender.engine.session import Session
 from drgs_blender.formats.registry import read_environment
 
@@ -84,29 +84,29 @@ class Case:
             "out": str(out),
         } | more  # fmt: skip
 
-    def frame(self, key: str, size: int, rays: int, seed: int = 0, **settings: Any) -> Frame:
+    def frame(self, key: str, size: int, samples: int, seed: int = 0, **settings: Any) -> Frame:
         """A frame of ours; reads the environment's file."""
         chosen: dict[str, Any] = {
-            "primary": "mesh",
+            "camera_sees": "mesh",
             "bounces": BOUNCES,
             "film_transparent": True,
             "threads": 2,
+            "samples": samples,
         }
-        chosen |= dict(zip(("cosine", "ggx", "environment"), split_rays(rays)))
         return Frame(
-            number=1,
+            noise_index=1,
             camera=pinhole(self.camera(size)),
             objects=[ObjectState(self.name, key)],
             world=World(environment=read_environment(self.environment).radiance, strength=STRENGTH),
             settings=RenderSettings(**(chosen | {"seed": seed} | settings)),
         )
 
-    def picture(self, size: int, rays: int, seed: int = 0, **settings: Any) -> tuple[Array, float]:
+    def picture(self, size: int, samples: int, seed: int = 0, **settings: Any) -> tuple[Array, float]:
         """Our picture and its seconds, from arrays and the map's file to pixels, in a session that knows the asset."""
         session = Session()
         key = session.load_asset(self.files[0])
         begin = time.perf_counter()
-        picture = session.render(self.frame(key, size, rays, seed, **settings))["Combined"]
+        picture = session.render(self.frame(key, size, samples, seed, **settings))["Combined"]
         return picture, time.perf_counter() - begin
 
 
@@ -129,13 +129,13 @@ class Plan:
 
     size: int
     seeds: int
-    aa: int
+    subpixel_samples: int
     reference_rays: int
     reference_spp: int
 
     @classmethod
     def of(cls, options: argparse.Namespace) -> Plan:
-        return cls(options.size, options.seeds, options.aa, options.reference_rays, options.reference_spp)
+        return cls(options.size, options.seeds, options.subpixel_samples, options.reference_rays, options.reference_spp)
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,4 +154,4 @@ class Reference:
 @cache
 def our_reference(case: Case, plan: Plan) -> Reference:
     """Our converged picture; its seed is none that is measured."""
-    return Reference.of(case.picture(plan.size, plan.reference_rays, 1000, aa=REFERENCE_AA)[0])
+    return Reference.of(case.picture(plan.size, plan.reference_rays, 1000, subpixel_samples=REFERENCE_AA)[0])

@@ -37,7 +37,7 @@ from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene
 Array = np.ndarray
 RAYS, RUNS = 32, 3
 #: The paper's counts, so that the floor can trace the same rays.
-FIXED = {"aa": 4, "split": "counts"}
+FIXED = {"subpixel_samples": 4, "strategy_samples": (16, 8, 8)}
 #: What a plain loop must gain by a second thread for the machine to count as free.
 FREE = 1.8
 #: The subject of all but the memory test.
@@ -68,14 +68,14 @@ class Stage:
         frame = case.frame("", size, RAYS, **FIXED)
         scene = TraceScene()
         scene.update([TraceObject("subject", mesh.vertices, mesh.faces, mesh.albedo, mesh.roughness, mesh.metallic)])
-        parameters = camera_parameters(frame.camera, frame.settings, frame.number)
+        parameters = camera_parameters(frame.camera, frame.settings, frame.noise_index)
         points = primary_mesh(scene, frame.camera, parameters, 0, size).points
         return cls(frame, scene, EnvironmentLight(frame.world), points)
 
     def seconds(self) -> float:
         """Of the integrator alone."""
         return median_seconds(
-            lambda: integrate(self.scene, self.light, self.points, self.frame.settings, self.frame.number)
+            lambda: integrate(self.scene, self.light, self.points, self.frame.settings, self.frame.noise_index)
         )
 
 
@@ -157,7 +157,11 @@ def floor(size: int) -> list[list[object]]:
     traced, count = floor_seconds(stage)
     beyond = f"beyond it {2e9 * (whole - traced) / count:.0f} ns of a processor a ray"
     return [
-        [f"frame, {RAYS} rays, aa {FIXED['aa']}", f"{whole:.2f} s", f"{whole / traced:.2f} times the floor; {beyond}"],
+        [
+            f"frame, {RAYS} rays, {FIXED['subpixel_samples']} sub-pixel samples",
+            f"{whole:.2f} s",
+            f"{whole / traced:.2f} times the floor; {beyond}",
+        ],
         [f"floor: the same {count / 1e6:.1f} million rays", f"{traced:.2f} s", f"{count / traced / 1e6:.1f} million/s"],
     ]
 
@@ -169,16 +173,19 @@ def rays_of(stage: Stage, rng: np.random.Generator) -> tuple[list[tuple[Array, A
     (it leaves out directions below the surface, so do we).
     """
     settings, scene, points = stage.frame.settings, stage.scene, stage.points
+    by_cosine, by_ggx, by_light = settings.strategy_samples
     camera = camera_rays(stage.frame, rng)
     origins, directions = [], []
     lift = 1e-5 * np.abs(points.origin).max(axis=1) + 2e-6 * scene.extent
     start = (points.origin + lift[:, None] * points.geometric_normal).astype(np.float32)
     for count, draw in (
-        (settings.cosine, lambda i: cosine(points.normal[i], rng)),
-        (settings.ggx, lambda i: ggx(points.normal[i], points.view[i], points.roughness[i], rng)),
-        (settings.environment, lambda i: stage.light.sample(whole(len(i), rng), points.normal[i])[0]),
+        (by_cosine, lambda i: cosine(points.normal[i], rng)),
+        (by_ggx, lambda i: ggx(points.normal[i], points.view[i], points.roughness[i], rng)),
+        (by_light, lambda i: stage.light.sample(whole(len(i), rng), points.normal[i])[0]),
     ):
-        of = np.repeat(np.arange(len(points)), np.floor(count / settings.aa + rng.random(len(points))).astype(int))
+        of = np.repeat(
+            np.arange(len(points)), np.floor(count / settings.subpixel_samples + rng.random(len(points))).astype(int)
+        )
         towards = draw(of)
         good = above(towards, points.normal[of]) & above(towards, points.geometric_normal[of])
         origins.append(start[of[good]])
@@ -209,7 +216,7 @@ def whole(count: int, rng: np.random.Generator) -> Array:
 def camera_rays(frame: Frame, rng: np.random.Generator) -> tuple[Array, Array]:
     """One ray a sub-pixel position, in the order of the picture."""
     camera = frame.camera
-    y, x, _ = np.indices((camera.height, camera.width, frame.settings.aa), np.float32).reshape(3, -1)
+    y, x, _ = np.indices((camera.height, camera.width, frame.settings.subpixel_samples), np.float32).reshape(3, -1)
     x += rng.random(len(x), np.float32)
     y += rng.random(len(y), np.float32)
     local = np.stack([(x - camera.cx) / camera.fx, -(y - camera.cy) / camera.fy, -np.ones_like(x)], axis=1)
@@ -303,7 +310,7 @@ def large_frame(path: Path, width: int, height: int) -> dict[str, float]:
     """Render the ball so that it fills the picture's height; largest memory of this process so far."""
     session = Session()
     key = session.load_asset(path)
-    frame = CASE.frame(key, height, RAYS, **FIXED, primary="surfels", denoise="svgf")
+    frame = CASE.frame(key, height, RAYS, **FIXED, camera_sees="surfels", denoise="svgf")
     camera = frame.camera
     distance = 1.2 / np.sin(np.arctan(height / 2 / camera.fy))
     camera.matrix_world = np.array([[1, 0, 0, 0], [0, 0, -1, -distance], [0, 1, 0, 0], [0, 0, 0, 1]], float)
@@ -333,8 +340,9 @@ def cost(options: argparse.Namespace) -> str:
         rows.append(["memory", "not measured", str(error).strip().splitlines()[-1]])
     settings = CASE.frame("", 8, RAYS, **FIXED).settings
     return (
-        f"{CASE.mesh}, {size}x{size}, {RAYS} rays ({settings.cosine} cosine, {settings.ggx} GGX, "
-        f"{settings.environment} environment), {settings.bounces} indirect bounce, aa {settings.aa}, mesh as primary "
+        f"{CASE.mesh}, {size}x{size}, {RAYS} rays (cosine, GGX and environment "
+        f"{settings.strategy_samples}), {settings.bounces} indirect bounce, "
+        f"{settings.subpixel_samples} sub-pixel samples, mesh as primary "
         f"surface, 2 threads unless said; medians of {RUNS}. The floor traces as many rays of the same kinds (camera, "
         "first hits, shadow rays of the bounce) in batches, single rays, no packets. Memory: peak of a process of its "
         "own, surfels as primary surface.\n\n" + table(("What", "Measured", ""), rows)

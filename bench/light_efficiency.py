@@ -30,7 +30,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "full": {},
     "no denoiser": {"denoise": "none"},
     "no MIS (cosine samples alone)": {"cosine_only": True},
-    "no mesh (light meets surfels)": {"tracer": "surfels"},
+    "no mesh (light meets surfels)": {"rays_see": "surfels"},
 }
 
 
@@ -70,27 +70,29 @@ class Curve:
     """One line of the figure."""
 
     name: str
-    rays: list[int]
+    samples: list[int]
     decibels: list[float]
     seconds: list[float]
 
 
-def settings_of(change: dict[str, Any], rays: int) -> dict[str, Any]:
+def settings_of(change: dict[str, Any], samples: int) -> dict[str, Any]:
     """Fields of RenderSettings of a variant."""
-    chosen = {"primary": "surfels", "aa": AA, "denoise": "svgf"} | change
+    chosen = {"camera_sees": "surfels", "subpixel_samples": AA, "denoise": "svgf"} | change
     if chosen.pop("cosine_only", False):
-        chosen |= {"cosine": rays, "ggx": 0, "environment": 0, "split": "counts"}
+        chosen |= {"strategy_samples": (samples, 0, 0)}
     return chosen
 
 
-def converged(case: Case, size: int, rays: int, tracer: str) -> Reference:
-    """Mean of pictures with different seeds and the aa that is measured, of `rays` in all.
+def converged(case: Case, size: int, samples: int, rays_see: str) -> Reference:
+    """Mean of pictures with different seeds and the subpixels that is measured, of `rays` in all.
 
     One picture of more sub-pixel positions would be another picture: the low-pass of surfels follows their number.
     """
-    count = max(1, rays // PART)
+    count = max(1, samples // PART)
     pictures = [
-        case.picture(size, rays // count, 1000 + seed, primary="surfels", aa=AA, tracer=tracer)[0]
+        case.picture(
+            size, samples // count, 1000 + seed, camera_sees="surfels", subpixel_samples=AA, rays_see=rays_see
+        )[0]
         for seed in range(count)
     ]
     return Reference.of(np.mean(pictures, axis=0), alpha=0.99)
@@ -100,14 +102,14 @@ def measure(case: Case, options: argparse.Namespace) -> list[Curve]:
     curves = []
     references: dict[str, Reference] = {}
     for name, change in VARIANTS.items():
-        tracer = change.get("tracer", "mesh")
-        if tracer not in references:
-            references[tracer] = converged(case, options.size, options.reference_rays, tracer)
-        reference = references[tracer]
+        rays_see = change.get("rays_see", "mesh")
+        if rays_see not in references:
+            references[rays_see] = converged(case, options.size, options.reference_rays, rays_see)
+        reference = references[rays_see]
         curve = Curve(name, list(options.efficiency_rays), [], [])
         case.picture(options.size, 4, **settings_of(change, 4))  # kernels
-        for rays in curve.rays:
-            picture, seconds = case.picture(options.size, rays, **settings_of(change, rays))
+        for samples in curve.samples:
+            picture, seconds = case.picture(options.size, samples, **settings_of(change, samples))
             curve.decibels.append(psnr(picture, reference.picture, reference.mask))
             curve.seconds.append(seconds)
         curves.append(curve)
@@ -123,8 +125,8 @@ def draw(curves: list[Curve]) -> None:
 
     figure, (left, right) = pyplot.subplots(1, 2, figsize=(9, 3.6), constrained_layout=True)
     for curve in curves:
-        left.plot(curve.rays, curve.decibels, marker="o", markersize=3, label=curve.name)
-        right.plot(curve.rays, curve.seconds, marker="o", markersize=3, label=curve.name)
+        left.plot(curve.samples, curve.decibels, marker="o", markersize=3, label=curve.name)
+        right.plot(curve.samples, curve.seconds, marker="o", markersize=3, label=curve.name)
     right.set_yscale("log")
     for axes, what in ((left, "PSNR, dB"), (right, "seconds a frame")):
         axes.set_xscale("log", base=2)
@@ -148,8 +150,9 @@ def efficiency(options: argparse.Namespace) -> str:
     mesh = read_asset(case.files[0]).mesh
     text = (
         f"Armadillo, {len(mesh.faces):,} triangles, spread materials, {case.light}.exr, {options.size}x{options.size}, "
-        f"{BOUNCES} indirect bounce, surfels as primary surface, aa {AA}, SVGF unless said, one picture a point; PSNR "
-        f"over the subject against {options.reference_rays} rays (mean over seeds, same aa and tracer) without "
+        f"{BOUNCES} indirect bounce, surfels as primary surface, {AA} sub-pixel samples, SVGF unless said, one "
+        f"picture a point; PSNR "
+        f"over the subject against {options.reference_rays} rays (mean over seeds, same subpixels and tracer) without "
         "denoiser. Seconds: whole frame, everything built anew. Without MIS, all samples at the visible point are of "
         "the cosine; further hits are as always.\n\n"
         f"![PSNR and time over samples](images/{FIGURE.name})\n\n"
@@ -157,13 +160,15 @@ def efficiency(options: argparse.Namespace) -> str:
     columns = ("Samples", *(f"{c.name}: dB / s" for c in curves))
     rows = [
         (
-            rays,
+            samples,
             *(
-                f"{c.decibels[c.rays.index(rays)]:.1f} / {c.seconds[c.rays.index(rays)]:.2f}" if rays in c.rays else "-"
+                f"{c.decibels[c.samples.index(samples)]:.1f} / {c.seconds[c.samples.index(samples)]:.2f}"
+                if samples in c.samples
+                else "-"
                 for c in curves
             ),
         )
-        for rays in options.efficiency_rays
+        for samples in options.efficiency_rays
     ]
     text += table(columns, rows)
     return text

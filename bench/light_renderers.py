@@ -92,7 +92,7 @@ def judged(count: int, pictures: Sequence[tuple[np.ndarray, float]], reference: 
 @cache
 def ours(case: Case, plan: Plan, counts: tuple[int, ...], denoise: str = "none") -> Measured:
     """Our pictures at every number of rays."""
-    settings: dict[str, Any] = {"denoise": denoise, "aa": plan.aa}
+    settings: dict[str, Any] = {"denoise": denoise, "subpixel_samples": plan.subpixel_samples}
     case.picture(plan.size, 8, **settings)  # kernels and pages of files
     reference = our_reference(case, plan)
     setup = [case.picture(TINY, 4)[1] for _ in range(plan.seeds)]
@@ -217,8 +217,10 @@ def subjects_text(options: argparse.Namespace) -> str:
     cases = "; ".join(f"{c.name}: {c.mesh}, {c.materials}, {c.light}" for c in chosen(options))
     return (
         f"{options.size}x{options.size}, {BOUNCES} indirect bounce, 2 threads, {options.seeds} seeds. Subjects: "
-        f"{cases}. Ours: mesh as primary surface, aa {options.aa or 'by the rays'}, {_list(options.rays)} rays. "
-        f"Each program against its own converged picture (ours {options.reference_rays} rays, aa {REFERENCE_AA}; "
+        f"{cases}. Ours: mesh as primary surface, {options.subpixel_samples or 'by the rays'} sub-pixel samples, "
+        f"{_list(options.samples)} samples. "
+        f"Each program against its own converged picture (ours {options.reference_rays} rays, {REFERENCE_AA} "
+        f"sub-pixel samples; "
         f"theirs {options.reference_spp} spp), PSNR in sRGB over the subject (mask eroded by 2 px). Seconds from "
         "arrays in memory to pixels: scene, environment map and acceleration structure are made anew each time, "
         "program and kernels were loaded before. *Sampling alone*: less the setup, the time of a picture of "
@@ -229,20 +231,20 @@ def subjects_text(options: argparse.Namespace) -> str:
 
 def equal_psnr(options: argparse.Namespace) -> str:
     """Plain pictures against Cycles."""
-    plan, rays, spp = Plan.of(options), tuple(options.rays), tuple(options.spp)
-    rows = [(case, ours(case, plan, rays), cycles(case, plan, spp)) for case in chosen(options)]
+    plan, samples, spp = Plan.of(options), tuple(options.samples), tuple(options.spp)
+    rows = [(case, ours(case, plan, samples), cycles(case, plan, spp)) for case in chosen(options)]
     about = f"{subjects_text(options)} Cycles of bpy 5.0.1 on the processor, {_list(spp)} spp, no denoiser."
     return f"{about}\n\n{comparison(rows, options.levels, 'Cycles')}"
 
 
 def against_mitsuba(options: argparse.Namespace) -> str:
     """Plain pictures against Mitsuba."""
-    plan, rays, spp = Plan.of(options), tuple(options.rays), tuple(options.spp)
+    plan, samples, spp = Plan.of(options), tuple(options.samples), tuple(options.spp)
     rows, about = [], {}
     try:
         for case in chosen(options):
             found, about = mitsuba(case, plan, spp)
-            rows.append((case, ours(case, plan, rays), found))
+            rows.append((case, ours(case, plan, samples), found))
     except Unavailable as reason:
         return f"Not measured: {reason}."
     return (
@@ -254,14 +256,14 @@ def against_mitsuba(options: argparse.Namespace) -> str:
 
 def denoised(options: argparse.Namespace) -> str:
     """Ours with SVGF and OIDN against Cycles with OIDN."""
-    plan, rays, spp = Plan.of(options), tuple(options.rays), tuple(options.denoised_spp)
+    plan, samples, spp = Plan.of(options), tuple(options.samples), tuple(options.denoised_spp)
     filters = ["svgf", *(["oidn"] if oidn_available() else [])]
     about = f"{subjects_text(options)} Cycles + OIDN (albedo and normals, accurate prefilter), {_list(spp)} spp."
     if "oidn" not in filters:
         about += " Ours + OIDN: not measured, pyoidn is not installed."
     parts = [about]
     for name in filters:
-        rows = [(case, ours(case, plan, rays, name), cycles(case, plan, spp, True)) for case in chosen(options)]
+        rows = [(case, ours(case, plan, samples, name), cycles(case, plan, spp, True)) for case in chosen(options)]
         parts.append(f"### Ours + {name.upper()}\n\n{comparison(rows, options.denoised_levels, 'Cycles + OIDN')}")
     return "\n\n".join(parts)
 
@@ -270,9 +272,9 @@ def relative_error(options: argparse.Namespace) -> str:
     """Errors at as many rays as Cycles has samples."""
     plan, rows = Plan.of(options), []
     # The whole series where it has the number: part equal-psnr measured it.
-    rays, spp = (tuple(s) if EQUAL in s else (EQUAL,) for s in (options.rays, options.spp))
+    samples, spp = (tuple(s) if EQUAL in s else (EQUAL,) for s in (options.samples, options.spp))
     for case in chosen(options):
-        a, b = ours(case, plan, rays).at(EQUAL), cycles(case, plan, spp).at(EQUAL)
+        a, b = ours(case, plan, samples).at(EQUAL), cycles(case, plan, spp).at(EQUAL)
         rows.append((
             case.name, *(f"{x:.4f}" for x in (a.untrimmed, b.untrimmed, a.trimmed, b.trimmed)),
             f"{a.decibels:.1f}", f"{b.decibels:.1f}", f"{a.seconds:.2f}", f"{b.seconds:.2f}",

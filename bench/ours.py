@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from drgs_blender.core.frame import Camera, Frame, ObjectState, RenderSettings, World, split_rays
+from drgs_blender.core.frame import Camera, Frame, ObjectState, RenderSettings, World
 from drgs_blender.engine.session import Session
 from drgs_blender.formats.registry import read_environment
 
@@ -37,22 +37,21 @@ def frame_of(
     environment: Path | np.ndarray,
     camera: dict[str, Any],
     *,
-    rays: int,
+    samples: int,
     strength: float = 1.0,
     vertices: np.ndarray | None = None,
     passes: tuple[str, ...] = ("Combined",),
     **settings: Any,
 ) -> Frame:
     """One object under one HDRI; `settings` are fields of RenderSettings."""
-    cosine, ggx, light = split_rays(rays)
     given = isinstance(environment, np.ndarray)
     radiance = environment if given else read_environment(environment).radiance
     key = SESSION.load_asset(asset)
     return Frame(
-        number=1,
+        noise_index=1,
         camera=pinhole(camera),
         objects=[ObjectState("subject", key, vertices=vertices)],
         world=World(environment=radiance, strength=strength),
-        settings=RenderSettings(cosine=cosine, ggx=ggx, environment=light, film_transparent=True, **settings),
+        settings=RenderSettings(samples=samples, film_transparent=True, **settings),
         passes=passes,
     )

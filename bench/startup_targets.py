@@ -47,7 +47,7 @@ def tasks(asset: Path) -> dict[str, Callable[[], np.ndarray]]:
     camera = Camera(np.eye(4), SIZE, SIZE, 1.1 * SIZE, 1.1 * SIZE, SIZE / 2, SIZE / 2)
     camera.matrix_world[2, 3] = 2.5
     world = World(np.random.default_rng(0).uniform(0, 1, (64, 128, 3)).astype(np.float32))
-    settings = RenderSettings(samples=12, aa=1)
+    settings = RenderSettings(samples=12, subpixel_samples=1)
     frame = Frame(1, camera, [ObjectState("sheet", key, vertices=vertices)], world, settings)
 
     def render(**changes: object) -> Callable[[], np.ndarray]:
@@ -63,9 +63,9 @@ def tasks(asset: Path) -> dict[str, Callable[[], np.ndarray]]:
         return np.array(solver.points)
 
     return {
-        "mesh": render(primary="mesh"),
+        "mesh": render(camera_sees="mesh"),
         "surfels": render(),
-        "surfel rays": render(tracer="surfels"),
+        "surfel rays": render(rays_see="surfels"),
         "denoised": render(denoise="svgf"),
         "simulated": simulate,
     }

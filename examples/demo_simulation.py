@@ -61,7 +61,7 @@ def main() -> int:
     for shot in ("droop", "fall"):
         frames = out / shot
         run(*drgs, "render", out / f"{shot}.blend", "--frames", options.frames, "--out", frames / "####.exr",
-            "--rays", "16", "--denoise", "svgf")  # fmt: skip
+            "--samples", "16", "--denoise", "svgf")  # fmt: skip
         publish(sorted(frames.glob("*.exr")), frames, fps=8)
         print(f"Look at {frames / 'contact-sheet.png'} and {frames / 'animation.webp'}")
     print(f"Done in {time.perf_counter() - begin:.0f} s")

@@ -56,7 +56,7 @@ class DRGS_OT_bake_light(ProgramOperator, targets.ObjectMode, bpy.types.Operator
         ),
         default="all",
     )
-    rays: IntProperty(name="Rays", description="Samples of light a vertex or texel", default=256, min=3, max=65536)
+    samples: IntProperty(name="Samples", description="Samples of light per vertex or texel", default=256, min=3, max=65536)
     use_animation: BoolProperty(name="Animation", description="All frames of the scene's range", default=False)
 
     _names: tuple[str, ...] = ()
@@ -71,7 +71,7 @@ class DRGS_OT_bake_light(ProgramOperator, targets.ObjectMode, bpy.types.Operator
         layout.prop(self, "target", expand=True)
         for name in ("name",) if self.target == "ATTRIBUTE" else ("directory", "size"):
             layout.prop(self, name)
-        for name in ("light", "rays", "use_animation"):
+        for name in ("light", "samples", "use_animation"):
             layout.prop(self, name)
 
     def run(self, context: bpy.types.Context) -> set[str]:
@@ -86,7 +86,7 @@ class DRGS_OT_bake_light(ProgramOperator, targets.ObjectMode, bpy.types.Operator
         self._check_places(objects)
         with self.folder("drgs-bake-") as folder:
             scenes = str(folder / f"{_NUMBER}{SUFFIX}")
-            arguments = ["bake", scenes, "--rays", str(self.rays), "--light", self.light]
+            arguments = ["bake", scenes, "--samples", str(self.samples), "--light", self.light]
             arguments += ["--size", str(self.size), f"--frames={','.join(map(str, self._frames))}"]
             for number in self._visited(context):
                 frame = export_frame(context.evaluated_depsgraph_get(), str, messages.Warnings(), camera=NO_CAMERA)

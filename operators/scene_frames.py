@@ -39,7 +39,7 @@ class SceneFrames(ProgramOperator):
         ),
         default="captured",
     )
-    rays: IntProperty(name="Rays", description="Samples a splat of the scene's light", default=256, min=1, max=65536)
+    samples: IntProperty(name="Samples", description="Samples per splat of the scene's light", default=256, min=1, max=65536)
 
     def describe(
         self, context: bpy.types.Context, target: Path, kind: Held, frames: Iterable[int] | None = None
@@ -54,7 +54,7 @@ class SceneFrames(ProgramOperator):
         numbers = self._write_all(context, template, kind, frames)
         arguments = ["convert", template, str(target), "--as", kind, f"--frames={','.join(map(str, numbers))}"]
         if kind == "splats":
-            arguments += ["--colour", self.colour, "--rays", str(self.rays)]
+            arguments += ["--colour", self.colour, "--samples", str(self.samples)]
         return arguments
 
     def _write_all(
@@ -97,7 +97,7 @@ def draw_colour(layout: bpy.types.UILayout, operator: bpy.types.Operator) -> Non
     """What splats show."""
     layout.prop(operator, "colour")
     if operator.colour == "relit":
-        layout.prop(operator, "rays")
+        layout.prop(operator, "samples")
 
 
 def _hide(frame: Frame, chosen: set[str]) -> None:

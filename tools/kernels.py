@@ -38,19 +38,19 @@ def commands(folder: Path) -> Iterator[tuple[str, list[object]]]:
     yield "make", [*drgs, "make", EXAMPLES / "robot/RobotExpressive.glb", "--out", folder / "robot.drgs"]
     yield "import", [*drgs, "import", EXAMPLES / "playbot/playbot.ply", "--up=-y", "--out", folder / "playbot.drgs"]
     relight = [*drgs, "relight", asset, "--camera", folder / "camera.json", "--env", folder / "light.exr",
-               "--rays", "4", "--out", folder / "frame.exr"]  # fmt: skip
+               "--samples", "4", "--out", folder / "frame.exr"]  # fmt: skip
     assert light.is_file()
     yield "frame", relight
     yield "hdr", [*relight[:8], folder / "light.hdr", *relight[9:]]
     yield "frame", [*own, "frame", folder]
-    yield "mesh", [*relight, "--primary", "mesh"]
+    yield "mesh", [*relight, "--camera-sees", "mesh"]
     yield "lights", [*own, "lights", folder]
     yield "denoise", [*relight, "--denoise", "svgf"]
     yield "denoise", [*own, "denoise", folder]
     yield "mattes", [*own, "mattes", folder]
     yield "motion", [*own, "motion", folder]
     yield "viewport", [*own, "viewport", folder]
-    yield "surfel rays", [*relight, "--tracer", "surfels"]
+    yield "surfel rays", [*relight, "--rays-see", "surfels"]
     for solver in ("mpm", "xpbd", "rigid"):
         yield "simulate", [*drgs, "simulate", asset, "--solver", solver, "--resolution", "12", "--frames", "3",
                            "--floor", "-1", "--out", folder / f"bake-{solver}"]  # fmt: skip
@@ -108,14 +108,16 @@ def engine(folder: Path, what: str) -> None:
     camera = Camera(matrix, 48, 48, 60.0, 60.0, 24.0, 24.0)
     mesh = read_asset(folder / "spot.drgs").mesh
     world = World(np.full((32, 64, 3), 0.5, np.float32))
-    settings = RenderSettings(samples=4, aa=1)
+    settings = RenderSettings(samples=4, subpixel_samples=1)
     with EngineClient(locate_engine()) as client:
         key = client.load_asset(str(folder / "spot.drgs"))
         body = ObjectState("cow", key, vertices=np.array(mesh.vertices, np.float32))
         frame = Frame(1, camera, [body], world, settings)
         if what == "frame":
             client.render(frame)
-            client.render(replace(frame, objects=[ObjectState("cow", key)], settings=replace(settings, aa=4)))
+            client.render(
+                replace(frame, objects=[ObjectState("cow", key)], settings=replace(settings, subpixel_samples=4))
+            )
         elif what == "mattes":
             client.render(replace(frame, passes=("Combined", "CryptoObject00", "CryptoMaterial00")))
         elif what == "lights":
@@ -128,11 +130,11 @@ def engine(folder: Path, what: str) -> None:
                 np.array([[0, 1, 2], [0, 2, 3]], np.int32), np.eye(4)[None], np.zeros(1, np.int32), materials=[glowing],
             )  # fmt: skip
             client.render(replace(frame, lights=lights, meshes=[floor]))
-            client.render(replace(frame, lights=lights, meshes=[floor], settings=replace(settings, primary="mesh")))
+            client.render(replace(frame, lights=lights, meshes=[floor], settings=replace(settings, camera_sees="mesh")))
         elif what == "denoise":
             frame = replace(frame, settings=replace(settings, denoise="svgf"), history="shot")
             client.render(frame)
-            client.render(replace(frame, number=2))
+            client.render(replace(frame, noise_index=2))
         elif what == "motion":
             moment = Moment(camera, [Pose("cow", matrix[None].copy(), body.vertices)])
             client.render(replace(frame, previous=moment, next=moment, passes=("Combined", "Vector")))

@@ -23,7 +23,7 @@ def resolution(render: bpy.types.RenderSettings) -> tuple[int, int]:
 
 def picture_of(scene: bpy.types.Scene) -> bpy.types.RenderSettings:
     """Settings that say how large a scene's picture is: those of the scene over which it is laid, or its own."""
-    return (scene.drgs.over or scene).render
+    return (scene.drgs.background_scene or scene).render
 
 
 def border(render: bpy.types.RenderSettings, width: int, height: int) -> tuple[int, int, int, int] | None:

@@ -96,7 +96,7 @@ def export_frame(
         warn(f'View layer "{layer.name}": its Material Override is of meshes; DR-GS objects keep their own materials')
     settings = scene.drgs
     frame = Frame(
-        number=scene.frame_current if settings.use_animated_seed else 0,
+        noise_index=scene.frame_current if settings.use_animated_seed else 0,
         camera=camera,
         objects=objects.states,
         world=memory.recall(("world", uid(world)), (), lambda: export_world(world, warn)),
@@ -137,7 +137,8 @@ def _check_features(scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer, war
     space = getattr(getattr(bpy.data, "colorspace", None), "working_space", WORKING_SPACE)
     if space != WORKING_SPACE:
         warn(f"The file works in {space}; DR-GS renders {WORKING_SPACE}, so colours will differ")
-    if scene.drgs.over is not None and (changed := compositing.differences(scene)):
-        warn(f'Scene "{scene.drgs.over.name}" has another {", ".join(changed)} now: press Set Up Compositing again')
+    if scene.drgs.background_scene is not None and (changed := compositing.differences(scene)):
+        below = f'Scene "{scene.drgs.background_scene.name}"'
+        warn(f"{below} has another {', '.join(changed)} now: press Set Up Compositing again")
     if view_layer.use_pass_cryptomatte_asset:
         warn(f'Cryptomatte of assets of view layer "{view_layer.name}" is not rendered by DR-GS')

@@ -34,7 +34,7 @@ class DRGS_PT_compositing(bpy.types.Panel):
         if changed := compositing.differences(partner):
             wrapped(layout, context, f"Not in the DR-GS scene yet: {', '.join(changed)}", "ERROR")
         settings = partner.drgs
-        for name in ("rays", "denoise", "bounces", "primary", "tracer"):
+        for name in ("samples", "denoise", "bounces", "camera_sees", "rays_see"):
             layout.prop(settings, name)
         layout.prop(partner.view_layers[0].drgs, "others")
 

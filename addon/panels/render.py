@@ -39,23 +39,23 @@ class DRGS_PT_sampling(_RenderPanel, bpy.types.Panel):
         layout.use_property_decorate = False
         settings = context.scene.drgs
         layout.prop(settings, "device")
-        layout.prop(settings, "use_custom_split")
+        layout.prop(settings, "use_strategy_samples")
         column = layout.column(align=True)
-        if settings.use_custom_split:
-            for name in ("cosine", "ggx", "environment"):
+        if settings.use_strategy_samples:
+            for name in ("cosine_samples", "ggx_samples", "environment_samples"):
                 column.prop(settings, name)
         else:
-            column.prop(settings, "rays")
+            column.prop(settings, "samples")
         row = layout.row(heading="Noise Threshold")
         row.prop(settings, "use_noise_threshold", text="")
         value = row.row()
         value.active = settings.use_noise_threshold
         value.prop(settings, "noise_threshold", text="")
-        layout.prop(settings, "aa")
+        layout.prop(settings, "subpixel_samples")
         row = layout.row()
-        row.active = not settings.use_temporal
+        row.active = not settings.use_denoising_data
         row.prop(settings, "denoise")
-        layout.prop(settings, "use_temporal")
+        layout.prop(settings, "use_denoising_data")
         row = layout.row(align=True)
         row.prop(settings, "seed")
         row.prop(settings, "use_animated_seed", text="", icon="TIME")
@@ -72,7 +72,7 @@ class DRGS_PT_light(_RenderPanel, bpy.types.Panel):
         layout.use_property_split = True
         layout.use_property_decorate = False
         settings = context.scene.drgs
-        for name in ("bounces", "clamp_indirect", "look", "primary", "tracer"):
+        for name in ("bounces", "clamp_indirect", "shading_model", "camera_sees", "rays_see"):
             layout.prop(settings, name)
 
 

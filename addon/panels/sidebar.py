@@ -56,8 +56,8 @@ class DRGS_PT_engine(_SidebarPanel, bpy.types.Panel):
         layout.label(text=f"Processor, {threads} threads", icon="BLANK1")
         last = engine_link.statistics
         if last:
-            seconds, rays = last.get("seconds.total", 0.0), last.get("samples", 0.0) / 1e6
-            wrapped(layout, context, f"Last picture: {seconds:.1f} s, {rays:.1f} million rays", "BLANK1")
+            seconds, samples = last.get("seconds.total", 0.0), last.get("samples", 0.0) / 1e6
+            wrapped(layout, context, f"Last picture: {seconds:.1f} s, {samples:.1f} million samples", "BLANK1")
         row = layout.row(align=True)
         row.operator("drgs.engine_test")
         row.operator("drgs.engine_stop", text="Stop")

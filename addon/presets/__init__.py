@@ -10,16 +10,16 @@ import bpy
 FOLDER = "drgs/render"
 #: What a preset sets, of `settings = bpy.context.scene.drgs`.
 VALUES = (
-    "rays",
-    "use_custom_split",
-    "cosine",
-    "ggx",
-    "environment",
+    "samples",
+    "use_strategy_samples",
+    "cosine_samples",
+    "ggx_samples",
+    "environment_samples",
     "bounces",
     "use_noise_threshold",
     "noise_threshold",
     "clamp_indirect",
-    "aa",
+    "subpixel_samples",
     "denoise",
 )
 _ROOT = str(Path(__file__).parent)

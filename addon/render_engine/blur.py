@@ -96,7 +96,7 @@ def pictures(
     export: Callable[[], Frame],
     frame_set: Callable[[int, float], None],
 ) -> Iterator[Frame]:
-    """The frame `sharp` at each time and place on the lens, as yet with all of its passes and rays.
+    """The frame `sharp` at each time and place on the lens, as yet with all of its passes and samples.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ def pictures(
                 frame = export()
             camera = depsgraph.scene_eval.camera.evaluated_get(depsgraph)
             seen = blur.through(frame.camera, step.lens, focus_distance(camera, depsgraph))
-            yield replace(frame, number=sharp.number, camera=seen, previous=None, next=None)
+            yield replace(frame, noise_index=sharp.noise_index, camera=seen, previous=None, next=None)
     finally:
         if moves:
             frame_set(*own)

@@ -194,11 +194,11 @@ class DrgsRenderEngine(bpy.types.RenderEngine):
 
 def summary(frame: Frame, statistics: dict[str, float]) -> str:
     """What a picture was made of, for the line above it."""
-    parts = [f"{frame.settings.rays} rays"]
+    parts = [f"{frame.settings.sample_count} samples"]
     parts += [f"{int(statistics[name]):,} {name}" for name in ("surfels", "triangles") if statistics.get(name)]
     seconds = statistics.get("seconds.total")
     if seconds:
         parts.append(
-            f"{seconds:.2f} s in the engine, {statistics.get('samples', 0) / 1e6 / seconds:.1f} million rays/s"
+            f"{seconds:.2f} s in the engine, {statistics.get('samples', 0) / 1e6 / seconds:.1f} million samples/s"
         )
     return " | ".join(parts)

@@ -166,8 +166,8 @@ def tell(name: str) -> tuple[str, str]:
         return f"{phase}  {part:.0%}", ""
     if shown.picture is None or is_preparing(phase):
         return phase or STARTING, ""
-    rays = shown.picture.request.frame.settings.rays
-    return f"Ray {round(shown.picture.fraction * rays)}/{rays}", ""
+    samples = shown.picture.request.frame.settings.sample_count
+    return f"Sample {round(shown.picture.fraction * samples)}/{samples}", ""
 
 
 def preparation() -> tuple[str, float]:

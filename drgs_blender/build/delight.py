@@ -30,7 +30,7 @@ _DARK = 0.05
 _BRIGHT, _BRIGHTEST = 0.9, 0.8
 #: Rounds: the light that other parts of the object reflect depends on their albedo.
 _ROUNDS = 2
-_SAMPLES = RenderSettings(samples=192, aa=1, bounces=1, look="principled")
+_SAMPLES = RenderSettings(samples=192, subpixel_samples=1, bounces=1, shading_model="principled")
 
 
 def remove_light(

@@ -166,7 +166,9 @@ def _camera(direction: Array, low: Array, high: Array, voxel: float) -> Camera:
 
 def _look(posed: PosedSurfels, camera: Camera, direction: Array) -> tuple[Array, Array, Array, Array]:
     """Coverage, depth, cosine between surface and view, and red albedo (size, size) of a view."""
-    samples = rasterise(prepare(posed, camera, camera_parameters(camera, RenderSettings(aa=1), 0)), 0, camera.height)
+    samples = rasterise(
+        prepare(posed, camera, camera_parameters(camera, RenderSettings(subpixel_samples=1), 0)), 0, camera.height
+    )
     alpha, surface = samples.alpha[..., 0], samples.surface[..., 0, :]
     surface = np.where(alpha[..., None] > 0, surface, 0)
     cosine = np.abs(surface[..., :3] @ direction.astype(np.float32))

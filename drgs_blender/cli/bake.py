@@ -34,7 +34,7 @@ Target = tuple[str, Path, Path | None]
 EXAMPLES = """examples:
   drgs bake shot.drgsframe --object Robot robot.npy
   drgs bake shot.drgsframe --object Robot robot.exr robot_uvs.npy --size 2048 --light diffuse
-  drgs bake 'shot_####.drgsframe' --frames 1-24 --object Robot 'robot_####.npy' --rays 512
+  drgs bake 'shot_####.drgsframe' --frames 1-24 --object Robot 'robot_####.npy' --samples 512
 """
 
 
@@ -52,7 +52,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--light", choices=("all", "diffuse"), default="all",
         help="all light, highlights as seen along the normal, or what looks the same from everywhere; default all",
     )  # fmt: skip
-    parser.add_argument("--rays", type=whole(3, 65536), default=256, metavar="N", help="samples a point; default 256")
+    parser.add_argument(
+        "--samples", type=whole(3, 65536), default=256, metavar="N", help="samples a point; default 256"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -96,7 +98,7 @@ def _bake(
     from ..build.relit import light_components, own_surfels
     from ..formats.exr import write_exr_picture
 
-    frame = surface_frame(path, args.rays, session)
+    frame = surface_frame(path, args.samples, session)
     (scene, light, _, lamps, tree), placed = session.place(frame)
     index = {item.state.name: i for i, item in enumerate(placed)}
     for k, (name, out, uvs) in enumerate(targets):

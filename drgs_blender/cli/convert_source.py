@@ -11,7 +11,7 @@ import numpy as np
 from ..core.asset import Asset, Environment, Mesh, Surfels
 from ..core.errors import UsageError
 from ..core.file_types import Held
-from ..core.frame import RenderSettings, World, split_rays
+from ..core.frame import RenderSettings, World
 from ..formats.splats import Splats, join_splats, splats_of
 from .placed_frame import surface_frame
 from .progress import FractionBar
@@ -130,8 +130,7 @@ class AssetSource:
 
         args.asset = args.input  # as `drgs relight` names it in messages
         world = World(read_environment(args, asset), rotation_z(args.env_rotation), strength=args.env_strength)
-        cosine, ggx, environment = split_rays(args.rays)
-        settings = RenderSettings(cosine=cosine, ggx=ggx, environment=environment, aa=1)
+        settings = RenderSettings(samples=args.samples, subpixel_samples=1)
         with FractionBar(args, "lighting") as progress:
             colour = relit_colours(asset, surfels, self._vertices, world, settings, progress)
         return splats_of(surfels, colour), _SHOWN["relit"]
@@ -146,7 +145,7 @@ class FrameSource:
         if args.env:
             raise UsageError("--env", "is given for a frame, which has its own light", "Leave it out")
         self._args, session = args, Session()
-        self._frame = surface_frame(args.input, args.rays, session)
+        self._frame = surface_frame(args.input, args.samples, session)
         self.notes: list[str] = []
         (self._scene, self._light, _, self._lamps, self._tree), self._objects = session.place(self._frame)
         self._seen = [i for i, item in enumerate(self._objects) if item.state.visibility.camera]

@@ -81,7 +81,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     scenes.add_argument("--train", type=sampling.whole(2, 10000), metavar="N", help="training views; default 120")
     scenes.add_argument("--test", type=sampling.whole(2, 10000), metavar="N", help="views left out; default 16")
     scenes.add_argument(
-        "--samples",
+        "--spp",
         type=sampling.whole(1, 65536),
         metavar="N",
         help="of Cycles, a pixel, before denoising; default 64",
@@ -91,7 +91,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     scenes.add_argument("--meshes", type=Path, metavar="DIR", help="folder of the example meshes")
     scenes.add_argument("--blender", metavar="PATH", help="Blender, or a Python that has bpy")
-    sampling.add_arguments(parser, defaults=True, output=False, rays=128)
+    sampling.add_arguments(parser, defaults=True, output=False, samples=128)
     parser.set_defaults(film_transparent=True)  # sampling.override looks for it
 
 
@@ -169,7 +169,7 @@ def score(args: argparse.Namespace) -> int:
             lambda part, name: bar(name, part),
             writer(args.pictures) if args.pictures is not None else None,
         )
-    report = {"asset": digest_asset(key), "capture": capture.name, "rays": settings.rays, **report}
+    report = {"asset": digest_asset(key), "capture": capture.name, "samples": settings.samples, **report}
     print(json.dumps(report, indent=1) if args.json else "\n".join(table(report)))
     return 0
 
@@ -185,7 +185,7 @@ def session_renderer(
     def render(camera: Camera, radiance: np.ndarray, vertices: np.ndarray | None) -> dict[str, np.ndarray]:
         state = ObjectState(Path(key).stem, key, vertices=vertices, visibility=visibility or Visibility())
         world = World(radiance)
-        frame = Frame(number=1, camera=camera, objects=[state], world=world, settings=settings, passes=PASSES)
+        frame = Frame(noise_index=1, camera=camera, objects=[state], world=world, settings=settings, passes=PASSES)
         return dict(session.render(frame))
 
     return render

@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     mesh = parser.add_mutually_exclusive_group()
     mesh.add_argument("--mesh", type=Path, help="their mesh; default: one is built around them")
     mesh.add_argument(
-        "--no-mesh", action="store_true", help="surfels alone, for --tracer surfels: foliage, hair, anything thin"
+        "--no-mesh", action="store_true", help="surfels alone, for --rays-see surfels: foliage, hair, anything thin"
     )
     parser.add_argument("--scale", type=positive, default=1.0, metavar="S", help="factor on all lengths")
     parser.add_argument("--env", type=Path, help="environment of the capture, kept in the asset")

@@ -84,7 +84,7 @@ class Picture:
         try:
             passes = blur.averaged(rendered(), count) if self._shot.count else next(rendered())
         except Cancelled as end:
-            problem, remedy = f"took longer than {timeout:g} s", "Raise --timeout, or use fewer rays"
+            problem, remedy = f"took longer than {timeout:g} s", "Raise --timeout, or use fewer samples"
             raise EngineError(f"frame {self._shot.number}", problem, remedy) from end
         return passes, _joined(hashes)
 

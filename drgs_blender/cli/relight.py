@@ -34,7 +34,7 @@ logger = logging.getLogger(__name__)
 
 EXAMPLES = """examples:
   drgs relight helmet.drgs --env studio.hdr --camera front.json --out helmet.exr
-  drgs relight helmet.drgs --env city.exr --env-rotation 90 --camera front.json --rays 128 --denoise svgf \\
+  drgs relight helmet.drgs --env city.exr --env-rotation 90 --camera front.json --samples 128 --denoise svgf \\
       --passes all --transparent --out helmet.exr
   drgs relight robot.drgs --env city.exr --camera front.json --vertices pose.npy --out pose.png
   drgs relight cat.drgs --env city.exr --camera front.json --cache bake --frames 1-48 --out 'cat/####.exr'
@@ -94,7 +94,7 @@ def run(args: argparse.Namespace) -> int:
     world = World(read_environment(args, session.asset(key)), rotation_z(args.env_rotation), strength=args.env_strength)
     for number, vertices in poses:
         frame = Frame(
-            number=number,
+            noise_index=number,
             camera=camera,
             objects=[ObjectState(name=args.asset.stem, asset=key, vertices=vertices(), tear=tear, grain=grain)],
             world=world,

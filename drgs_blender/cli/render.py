@@ -38,7 +38,7 @@ logger = logging.getLogger(__name__)
 
 EXAMPLES = """examples:
   drgs render shot.blend --frames 1-24 --out 'frames/####.exr'
-  drgs render shot.blend --frames 1-24x2,30 --out 'frames/####.exr' --rays 128 --denoise svgf --passes all
+  drgs render shot.blend --frames 1-24x2,30 --out 'frames/####.exr' --samples 128 --denoise svgf --passes all
   drgs render shot.blend --frames 7 --out still.exr --blender /opt/blender/blender
 """
 

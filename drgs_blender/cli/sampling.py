@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any, get_args, get_type_hints
 
 from ..core.errors import UsageError
-from ..core.frame import Camera, RenderSettings, split_rays
+from ..core.frame import Camera, RenderSettings
 from ..core.passes import BY_NAME, PASSES, TEMPORAL
 
 #: Pixels times passes of one picture; 16k x 16k with one pass.
@@ -16,30 +16,31 @@ MOST_PIXEL_PASSES = 1 << 28
 
 
 def add_arguments(
-    parser: argparse.ArgumentParser, *, defaults: bool, output: bool = True, rays: int = RenderSettings().rays
+    parser: argparse.ArgumentParser, *, defaults: bool, output: bool = True, samples: int = RenderSettings().samples
 ) -> None:
     """Add the sampling options; without `defaults` an absent option stays None and the scene decides.
 
-    `rays` is the default of that option. Without `output`, what is written is not the user's to choose: film and passes
+    `samples` is the default of that option. Without `output`, what is written is not the user's to choose: film and
+    passes
     have no options.
     """
     settings, hints = RenderSettings(), get_type_hints(RenderSettings)
     group = parser.add_argument_group("solution" if defaults else "solution (default: what the scene says)")
 
     def add(flag: str, field: str, about: str, **options: Any) -> None:
-        default = rays if field == "rays" else getattr(settings, field)
+        default = samples if field == "samples" else getattr(settings, field)
         about += f"; default {default}" if defaults else ""
         group.add_argument(flag, dest=field, default=default if defaults else None, help=about, **options)
 
     def choices(field: str) -> tuple[str, ...]:
         return get_args(hints[field])
 
-    add("--rays", "rays", "rays a pixel, divided among light and lobes by the material", type=whole(1, 65536))
+    add("--samples", "samples", "per pixel, divided among lights and lobes by the material", type=whole(1, 65536))
     group.add_argument(
-        "--split",
-        type=split,
+        "--strategy-samples",
+        type=strategies,
         metavar="C,G,L",
-        help="rays a pixel by cosine, by GGX and towards light, instead of --rays (the paper has 16,8,8)",
+        help="samples per pixel by cosine, by GGX and towards lights, instead of --samples (the paper has 16,8,8)",
     )
     add("--bounces", "bounces", "indirect bounces", type=whole(0, 64))
     add(
@@ -55,9 +56,9 @@ def add_arguments(
         type=at_least_zero,
     )
     add(
-        "--aa",
-        "aa",
-        "sub-pixel positions among which the rays are divided, 0 for as many as suit them",
+        "--subpixel-samples",
+        "subpixel_samples",
+        "places in a pixel among which its samples are divided, 0 for as many as suit them",
         type=whole(0, 1024),
     )
     add(
@@ -66,10 +67,15 @@ def add_arguments(
         "pixels that the filter is wide (Blackman-Harris, Cycles has 1.5); 0 for a box of one pixel",
         type=at_least_zero,
     )
-    add("--primary", "primary", "what the camera sees: surfels or the mesh", choices=choices("primary"))
-    add("--tracer", "tracer", "what light meets of DR-GS objects: the mesh or the surfels", choices=choices("tracer"))
+    add("--camera-sees", "camera_sees", "what the camera sees: surfels or the mesh", choices=choices("camera_sees"))
+    add(
+        "--rays-see",
+        "rays_see",
+        "what shadow and indirect rays meet of DR-GS objects: the mesh or the surfels",
+        choices=choices("rays_see"),
+    )
     add("--denoise", "denoise", "denoiser", choices=choices("denoise"))
-    add("--look", "look", "material model", choices=choices("look"))
+    add("--shading-model", "shading_model", "reflection model", choices=choices("shading_model"))
     add("--seed", "seed", "seed of the noise", type=whole(0, 2**31 - 1))
     add("--device", "device", "what traces light; without a card the processor does", choices=choices("device"))
     add("--threads", "threads", "threads, 0 for all cores", type=whole(0, 1024))
@@ -105,11 +111,11 @@ def whole(low: int, high: int) -> Any:
     return parse
 
 
-def split(text: str) -> tuple[int, int, int]:
+def strategies(text: str) -> tuple[int, int, int]:
     """``16,8,8`` -> counts of the three strategies."""
     counts = [int(word) for word in text.split(",")]
     if len(counts) != 3 or min(counts) < 0 or not 1 <= sum(counts) <= 65536:
-        raise argparse.ArgumentTypeError(f"{text} is not three numbers of rays, such as 16,8,8")
+        raise argparse.ArgumentTypeError(f"{text} is not three numbers of samples, such as 16,8,8")
     return counts[0], counts[1], counts[2]
 
 
@@ -153,14 +159,22 @@ def check_size(camera: Camera, passes: Sequence[str]) -> None:
 
 def override(settings: RenderSettings, args: argparse.Namespace) -> RenderSettings:
     """`settings` with every option that was given."""
-    numbers = ("bounces", "noise_threshold", "clamp_indirect", "aa", "filter_width", "seed", "threads")
-    names = (*numbers, "primary", "tracer", "denoise", "look", "device", "film_transparent")
+    numbers = (
+        "samples",
+        "bounces",
+        "noise_threshold",
+        "clamp_indirect",
+        "subpixel_samples",
+        "filter_width",
+        "seed",
+        "threads",
+    )
+    names = (*numbers, "camera_sees", "rays_see", "denoise", "shading_model", "device", "film_transparent")
     given = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
-    counts = args.split or (args.rays and split_rays(args.rays))
-    if counts:
-        given |= dict(zip(("cosine", "ggx", "environment"), counts, strict=True))
-        given["split"] = "counts" if args.split else "auto"
+    if args.strategy_samples or args.samples is not None:
+        given["strategy_samples"] = args.strategy_samples
     result = replace(settings, **given)
-    if result.positions > result.rays:
-        raise UsageError("--aa", f"{result.aa} is more than the {result.rays} rays of a pixel", "Use more rays or less")
+    if result.subpixel_count > result.sample_count:
+        problem = f"{result.subpixel_count} is more than the {result.sample_count} samples of a pixel"
+        raise UsageError("--subpixel-samples", problem, "Use more samples, or fewer of these")
     return result

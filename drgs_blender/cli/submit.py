@@ -25,7 +25,7 @@ logger = logging.getLogger(__name__)
 
 EXAMPLES = """examples:
   drgs submit check shot.blend --frames 1-240 --out '//frames/####.exr' --shared /projects
-  drgs submit openjd shot.blend --frames 1-240 --out '//frames/####.exr' --to job --options='--rays 128'
+  drgs submit openjd shot.blend --frames 1-240 --out '//frames/####.exr' --to job --options='--samples 128'
   drgs submit slurm shot.blend --frames 1-240 --chunk 8 --out '//frames/####.exr' --to job --sbatch=--cpus-per-task=8
   drgs submit flamenco shot.blend --frames 1-240 --out '//noisy/####.exr' --denoised '//clean/####.exr' --to job
 """
@@ -44,7 +44,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--chunk", type=sampling.whole(1, 1_000_000), default=5, metavar="N", help="frames a task; 5")
     parser.add_argument("--name", help="name of the job; default: the scene's")
     parser.add_argument("--drgs", default="drgs", metavar="COMMAND", help="how a node starts drgs; default drgs")
-    parser.add_argument("--options", default="", metavar="'...'", help="options of drgs render: --options='--rays 64'")
+    parser.add_argument(
+        "--options", default="", metavar="'...'", help="options of drgs render: --options='--samples 64'"
+    )
     group = parser.add_argument_group("check")
     group.add_argument("--no-check", action="store_true", help="submit without looking at the scene")
     group.add_argument(

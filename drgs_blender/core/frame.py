@@ -300,7 +300,8 @@ class RenderSettings:
     device : {"cpu", "cuda"}
         "cuda" has a graphics card do what it can, see docs/gpu.md; without one it is as "cpu", with a warning.
     filter_width : float
-        Of the pixel filter in pixels as Cycles counts it, half of Blackman and Harris's window; 0 is a box of one pixel.
+        Of the pixel filter in pixels as Cycles counts it, half of Blackman and Harris's window; 0 is a box of one
+        pixel.
     """
 
     samples: int = 32
@@ -369,12 +370,14 @@ class Frame:
 
     Attributes
     ----------
+    noise_index : int
+        Part of the seed of all random numbers. It is the scene's frame number only while *Animated Seed* is on.
     previous, next : one frame earlier and later, for the passes of motion; None: nothing moves
     history : name of the sequence of pictures that this one continues. With the denoiser SVGF, what the engine rendered
         before under this name is mixed in; "" stands alone, as every final frame must
     """
 
-    number: int
+    noise_index: int
     camera: Camera
     objects: list[ObjectState]
     world: World = field(default_factory=World)

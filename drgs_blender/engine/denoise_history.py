@@ -56,10 +56,11 @@ class Histories:
         old = self._known.get(frame.history, Sequence())
         # How many samples are drawn, and which, is a matter of noise.
         lasting = replace(
-            settings, seed=0, threads=0, device="cpu", samples=0, noise_threshold=0.0)
+            settings, seed=0, threads=0, device="cpu", samples=0, strategy_samples=None, noise_threshold=0.0
+        )
         situation = renewed(camera, old.situation[0]), renewed(lasting, old.situation[1]), *scenery
         split = any(name in frame.passes for name in COMPONENTS)
-        fit = scene.layout, scene.places.shape, camera.window, camera.width, camera.height, settings.primary, split
+        fit = scene.layout, scene.places.shape, camera.window, camera.width, camera.height, settings.camera_sees, split
         if fit != old.fit or old.past is None:
             return Sequence(fit=fit, situation=situation)
         still = len(situation) == len(old.situation) and all(a is b for a, b in zip(situation, old.situation))
@@ -76,7 +77,7 @@ class Histories:
         sequence.past = Instant(
             past.vertices if past and before and before.vertices is scene.vertices else scene.vertices.copy(),
             past.places if past and before and before.places is scene.places else scene.places.copy(),
-            camera_parameters(frame.camera, frame.settings, frame.number),
+            camera_parameters(frame.camera, frame.settings, frame.noise_index),
         )
         sequence.history.instant = None  # the scene's arrays are for this picture only
         sequence.pictures += 1

@@ -113,7 +113,7 @@ class View:
     def _coarse(self, ready: Ready, draw: Draw, size: int) -> Passes:
         frame = coarse(self.frame, size, self._by_mesh)
         if frame.history:
-            frame.number += self._number
+            frame.noise_index += self._number
         projected = 0.0
 
         def watch(part: float, phase: str) -> None:

@@ -125,7 +125,7 @@ class Stage:
 
     def detailed(self, frame: Frame) -> bool:
         """Whether the meshes of all objects are detailed enough to stand for their surfels in coarse pictures."""
-        if frame.settings.tracer != "mesh":
+        if frame.settings.rays_see != "mesh":
             return False
         assets = [self._assets[state.asset].asset for state in frame.objects if state.asset in self._assets]
         return all(len(a.surfels) <= _SURFELS_A_VERTEX * len(a.mesh.vertices) for a in assets)
@@ -138,7 +138,7 @@ class Stage:
 
     def pose(self, frame: Frame, processor: Processor = HERE) -> PosedSurfels:
         """Bring the trace scene up to date; return the surfels of all objects, posed where they will be needed."""
-        seen, met = frame.settings.primary == "surfels", frame.settings.tracer == "surfels"
+        seen, met = frame.settings.camera_sees == "surfels", frame.settings.rays_see == "surfels"
         objects = []
         for index, state in enumerate(frame.objects):
             loaded = self._assets.get(state.asset)
@@ -225,7 +225,7 @@ class Stage:
             for pose, item in zip(moment.objects, self.objects)
         ]
         vertices, places = self.scene.at(moved, moment.meshes)
-        return Instant(vertices, places, camera_parameters(moment.camera, frame.settings, frame.number))
+        return Instant(vertices, places, camera_parameters(moment.camera, frame.settings, frame.noise_index))
 
     def warnings(self) -> list[str]:
         """What the user should know about the meshes of the last frame."""
@@ -282,9 +282,9 @@ class Stage:
 
 def _check_surface(state: ObjectState, asset: Asset, settings: RenderSettings) -> None:
     """Refuse an asset of which nothing would be seen, or that light would not meet."""
-    subject, bare = f"object {state.name}", settings.primary == "mesh" or settings.tracer == "mesh"
+    subject, bare = f"object {state.name}", settings.camera_sees == "mesh" or settings.rays_see == "mesh"
     if bare and not len(asset.mesh.faces):
         remedy = "Choose surfels as primary surface and as tracer, or import a file whose mesh has faces"
         raise AssetError(subject, f"the mesh of {state.asset} has no faces", remedy)
-    if "surfels" in (settings.primary, settings.tracer) and not len(asset.surfels):
+    if "surfels" in (settings.camera_sees, settings.rays_see) and not len(asset.surfels):
         raise AssetError(subject, f"{state.asset} has no surfels", "Choose the mesh as primary surface and as tracer")

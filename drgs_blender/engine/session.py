@@ -119,7 +119,7 @@ class Session:
         lap("render")
         x0, y0, x1, y1 = frame.camera.window
         passes.statistics |= self._statistics(frame, ready[2], lap)
-        passes.statistics["samples"] = float((x1 - x0) * (y1 - y0) * frame.settings.rays)
+        passes.statistics["samples"] = float((x1 - x0) * (y1 - y0) * frame.settings.sample_count)
         passes.warnings = self._warnings(frame.settings) + _unheeded(frame.settings)
         return passes
 
@@ -157,7 +157,7 @@ class Session:
         self._compile(frame, ("viewport",), progress, cancelled)
         lap, processor = _Laps(cancelled), self._devices.processor(frame.settings.device)
         by_mesh = self._stage.detailed(frame)
-        rough = replace(frame, settings=replace(frame.settings, primary="mesh")) if by_mesh else frame
+        rough = replace(frame, settings=replace(frame.settings, camera_sees="mesh")) if by_mesh else frame
         ready = self._prepare(rough, lap, progress, processor)
         view = View(self._stage.kept(frame), self._pace, self._views_begun, by_mesh, processor)
         self._views_begun += 1
@@ -262,9 +262,9 @@ class Session:
 def jobs_of(frame: Frame) -> set[str]:
     """What a frame needs compiled, in the words of `compute.manifest`."""
     settings, jobs = frame.settings, {"frame"}
-    if settings.primary == "mesh":
+    if settings.camera_sees == "mesh":
         jobs.add("mesh")
-    if settings.tracer == "surfels":
+    if settings.rays_see == "surfels":
         jobs.add("surfel rays")
     if settings.denoise == "svgf":
         jobs.add("denoise")
@@ -281,8 +281,9 @@ def _unheeded(settings: RenderSettings) -> list[str]:
     """Settings that cannot be followed together with the others."""
     if settings.noise_threshold > 0.0 and part_count(settings) == 1:
         return [
-            f"noise threshold: {settings.cosine} + {settings.ggx} + {settings.environment} rays cannot be drawn in "
-            "parts, so all are traced; use more rays, or counts with a common power of two"
+            f"noise threshold: {settings.strategy_samples or settings.samples} samples cannot be drawn in parts, so "
+            f"all "
+            "are traced; use more samples, or samples per strategy with a common power of two"
         ]
     return []
 

@@ -37,7 +37,7 @@ def sharp(frame: Frame) -> Frame | None:
     names = tuple(name for name in frame.passes if name in SHARP)
     if not names:
         return None
-    cheap = replace(frame.settings, samples=3, bounces=0, denoise="none", noise_threshold=0.0)
+    cheap = replace(frame.settings, samples=3, strategy_samples=None, bounces=0, denoise="none", noise_threshold=0.0)
     return replace(frame, passes=names, settings=cheap)
 
 
@@ -49,13 +49,15 @@ def share(frame: Frame, count: int, index: int) -> Frame:
 
 def shared(settings: RenderSettings, count: int, index: int) -> RenderSettings:
     """The settings of one of `count` pictures: its part of the samples, with noise of its own."""
+    given = settings.strategy_samples
     return replace(
-        settings, cosine=-(-settings.cosine // count),
-        ggx=-(-settings.ggx // count),
-        environment=-(-settings.environment // count),
-        aa=-(-settings.aa // count),
+        settings,
+        samples=-(-settings.samples // count),
+        strategy_samples=given and (-(-given[0] // count), -(-given[1] // count), -(-given[2] // count)),
+        subpixel_samples=-(-settings.subpixel_samples // count),
         noise_threshold=0.0,
-        seed=(settings.seed + 0x9E3779B1 * index) % 2**31,)
+        seed=(settings.seed + 0x9E3779B1 * index) % 2**31,
+    )
 
 
 def averaged(parts: Iterable[Passes], count: int) -> Passes:

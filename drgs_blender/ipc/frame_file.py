@@ -25,6 +25,8 @@ Array = np.ndarray
 
 #: Ending of such files.
 SUFFIX = ".drgsframe"
+#: Of the description; counts up when its fields change. `_UPGRADES` reads the formats before.
+FORMAT = 2
 _DESCRIPTION = "description"
 #: Arrays of as many bytes have a file of their own.
 _LARGE = 1 << 16
@@ -35,7 +37,7 @@ def write_frame_file(path: Path, frame: Frame) -> None:
     """Write `frame`, whose objects name the files of their assets. Raises WriteError."""
     data, arrays = encode_frame(frame)
     apart = {slot: _write_apart(path.parent, array) for slot, array in arrays.items() if array.nbytes >= _LARGE}
-    text = json.dumps({"version": __version__, "frame": data, "apart": apart}, allow_nan=False)
+    text = json.dumps({"format": FORMAT, "version": __version__, "frame": data, "apart": apart}, allow_nan=False)
     inside = {slot: array for slot, array in arrays.items() if slot not in apart}
     replace_file(path, encode({_DESCRIPTION: np.frombuffer(text.encode(), np.uint8)} | inside))
 
@@ -48,7 +50,7 @@ def read_frame_file(path: Path) -> Frame:
     AssetError
         The file cannot be read, or is damaged.
     VersionError
-        Another version of the program wrote it.
+        A later version of the program wrote it.
     """
     subject = str(path)
     try:
@@ -61,13 +63,39 @@ def read_frame_file(path: Path) -> Frame:
     if text is None:
         raise AssetError(subject, "is no frame", _REMEDY)
     content = parse_json(text.tobytes(), subject)
-    if content.get("version") != __version__:
-        raise VersionError(subject, f"is of version {content.get('version')}, this is {__version__}", "Export it again")
+    kind = content.get("format", 1)
+    if kind not in range(1, FORMAT + 1):
+        problem = f"has format {str(kind)[:20]} (of DR-GS {str(content.get('version'))[:20]}); this is {__version__}"
+        raise VersionError(subject, problem, "Use a later DR-GS, or export the frame again with this one")
     arrays |= _read_apart(path, content.get("apart"))
+    frame: Any = content.get("frame")
     try:
-        return decode_frame(content.get("frame"), arrays)
+        for upgrade in _UPGRADES[kind - 1 :]:
+            frame = upgrade(frame)
+    except (TypeError, KeyError, AttributeError) as error:
+        raise AssetError(subject, f"is no frame ({type(error).__name__}: {error})", _REMEDY) from error
+    try:
+        return decode_frame(frame, arrays)
     except CodecError as error:
         raise AssetError(subject, f"is no frame ({error})", _REMEDY) from error
+
+
+def _named_samples(frame: dict[str, Any]) -> dict[str, Any]:
+    """Format 1 to 2: samples are one number, and settings have the names that artists see."""
+    frame = dict(frame)
+    frame["noise_index"] = frame.pop("number")
+    settings = frame["settings"] = dict(frame["settings"])
+    counts = [settings.pop(name) for name in ("cosine", "ggx", "environment")]
+    settings["strategy_samples"] = counts if settings.pop("split") == "counts" else None
+    settings["samples"] = sum(counts)
+    names = {"aa": "subpixel_samples", "primary": "camera_sees", "tracer": "rays_see", "look": "shading_model"}
+    for old, new in names.items():
+        settings[new] = settings.pop(old)
+    return frame
+
+
+#: From each format to the next, the oldest first.
+_UPGRADES = (_named_samples,)
 
 
 def _write_apart(folder: Path, array: Array) -> str:

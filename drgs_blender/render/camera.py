@@ -22,7 +22,7 @@ from .sampling import GOLDEN, mix
 Array = np.ndarray
 
 #: Offsets into the array of `camera_parameters`.
-POSITION, FX, FY, CX, CY, ORTHOGRAPHIC, CLIP_START, CLIP_END, WIDTH, SEED, AA, LEAN, FILTER, PARAMETERS = (
+POSITION, FX, FY, CX, CY, ORTHOGRAPHIC, CLIP_START, CLIP_END, WIDTH, SEED, SUBPIXELS, LEAN, FILTER, PARAMETERS = (
     *(9, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21, 22, 24, 25),
 )
 _GOLDEN_RATIO = 0.6180339887498949
@@ -70,7 +70,7 @@ def lean(camera: Camera) -> Array:
     return matrix[:3, :2].T @ matrix[:3, 2] if camera.orthographic else np.zeros(2)
 
 
-def camera_parameters(camera: Camera, settings: RenderSettings, frame_number: int) -> Array:
+def camera_parameters(camera: Camera, settings: RenderSettings, noise_index: int) -> Array:
     """Flatten the camera, sub-pixel count and seed for kernels.
 
     Returns
@@ -79,11 +79,14 @@ def camera_parameters(camera: Camera, settings: RenderSettings, frame_number: in
 
     Raises
     ------
-    UsageError: the camera cannot take a picture, ``settings.aa`` is negative, or there is no such pixel filter.
+    UsageError: the camera cannot take a picture, ``settings.subpixel_samples`` is negative, or there is no such pixel
+    filter.
     """
     check_camera(camera)
-    if settings.aa < 0:
-        raise UsageError("sub-pixel samples", f"are {settings.aa}", "Choose some, or 0 for as many as suit the rays")
+    if settings.subpixel_samples < 0:
+        raise UsageError(
+            "sub-pixel samples", f"are {settings.subpixel_samples}", "Choose some, or 0 for as many as suit the rays"
+        )
     if not 0 <= settings.filter_width <= WIDEST:
         raise UsageError(
             "pixel filter", f"is {settings.filter_width:g} pixels wide", f"Choose 0 (a box) to {WIDEST:g}, such as 1.5"
@@ -95,8 +98,8 @@ def camera_parameters(camera: Camera, settings: RenderSettings, frame_number: in
     out[FX], out[FY], out[CX], out[CY] = camera.fx, camera.fy, camera.cx, camera.cy
     out[ORTHOGRAPHIC] = camera.orthographic
     out[CLIP_START], out[CLIP_END], out[WIDTH] = camera.clip_start, camera.clip_end, camera.width
-    out[SEED] = mix(np.uint32(settings.seed & 0xFFFFFFFF) ^ mix(np.uint32(frame_number & 0xFFFFFFFF)))
-    out[AA] = settings.positions
+    out[SEED] = mix(np.uint32(settings.seed & 0xFFFFFFFF) ^ mix(np.uint32(noise_index & 0xFFFFFFFF)))
+    out[SUBPIXELS] = settings.subpixel_count
     out[LEAN : LEAN + 2] = lean(camera)
     out[FILTER] = settings.filter_width
     return out
@@ -113,7 +116,7 @@ def pixel_shift(parameters: Any, pixel: Any) -> Any:
 @njit(inline="always")
 def lattice(shift_x: Any, shift_y: Any, sample: Any, parameters: Any) -> Any:
     """Position of a pixel's sub-pixel sample: in [0, 1) inside the pixel, or `filter_reach` beyond it."""
-    x = shift_x + sample / parameters[AA]
+    x = shift_x + sample / parameters[SUBPIXELS]
     y = shift_y + sample * _GOLDEN_RATIO
     x, y = x - math.floor(x), y - math.floor(y)
     width = parameters[FILTER]

@@ -66,11 +66,11 @@ def render(
     ----------
     scene : what rays meet, updated for this frame; its objects in the order of ``frame.objects``
     light : the frame's world
-    posed : surfels of all objects, world space; not used when ``frame.settings.primary`` is "mesh"
+    posed : surfels of all objects, world space; not used when ``frame.settings.camera_sees`` is "mesh"
     progress : called with the part done in [0, 1] and the name of the phase
     cancelled : asked several times a second
     lamps : the frame's lights
-    tree : the surfels that light meets, when ``frame.settings.tracer`` is "surfels"
+    tree : the surfels that light meets, when ``frame.settings.rays_see`` is "surfels"
     previous, following : the scene one frame earlier and later; None: nothing moves
     history : what earlier pictures leave to the denoiser SVGF; brought up to date when the picture is done
     processor : who does the work
@@ -87,7 +87,7 @@ def render(
     settings, camera = frame.settings, frame.camera
     check_frame(frame)
     use_threads(settings.threads)
-    parameters = camera_parameters(camera, settings, frame.number)
+    parameters = camera_parameters(camera, settings, frame.noise_index)
 
     def check() -> None:
         if cancelled is not None and cancelled():
@@ -99,7 +99,7 @@ def render(
             progress(part, phase)
 
     tell(0.0, "Projecting")
-    primary = Primary(scene, posed, frame, parameters, tree, processor)
+    camera_sees = Primary(scene, posed, frame, parameters, tree, processor)
     film = Film(camera, settings, parameters)
     mattes = [
         CryptoFilm(kind, scene, frame)
@@ -117,11 +117,11 @@ def render(
     ]
     end = 1.0 if settings.denoise == "none" else 0.9
     batches = Batches(scene, light, lamps, tree, frame, check, processor)
-    height = strip_height(right - left, settings.positions)
+    height = strip_height(right - left, settings.subpixel_count)
     for y0 in range(top, bottom, height):
         tell(end * (y0 - top) / (bottom - top), "Rendering")
         y1 = min(y0 + height, bottom)
-        buffer = primary.rows(y0, y1)
+        buffer = camera_sees.rows(y0, y1)
         check()
         radiance = batches.light(buffer)
         film.add(buffer, radiance, scene.pass_index, light)
@@ -179,7 +179,7 @@ class Primary:
         self._scene, self._camera, self._parameters = scene, frame.camera, parameters
         self._tree, self._objects, self._processor = tree, len(frame.objects), processor
         self._splats: Splats | None = None
-        if frame.settings.primary == "surfels":
+        if frame.settings.camera_sees == "surfels":
             self._splats = processor.prepare(posed, frame.camera, parameters)
             self._windows = snap_windows(scene, len(frame.objects))
 
@@ -195,9 +195,9 @@ class Primary:
         return primary_surfels(*given, by.rasterise, by.tie, by.trace, by.shade)
 
 
-def strip_height(width: int, aa: int) -> int:
+def strip_height(width: int, subpixels: int) -> int:
     """Rows of a strip that fit in `STRIP_BYTES`."""
-    return max(1, STRIP_BYTES // (SAMPLE_BYTES * width * aa))
+    return max(1, STRIP_BYTES // (SAMPLE_BYTES * width * subpixels))
 
 
 def _own_surfels(buffer: GBuffer, tree: SurfelBVH, objects: int) -> None:
@@ -217,14 +217,14 @@ class Batches:
         self._scene, self._light, self._lamps, self._frame, self._check = scene, light, lamps, frame, check
         self._tree, self._processor = tree, processor
         self._parts = part_count(frame.settings)
-        self._size = max(FEWEST_POINTS, FIRST_SAMPLES * self._parts // max(1, frame.settings.rays))
+        self._size = max(FEWEST_POINTS, FIRST_SAMPLES * self._parts // max(1, frame.settings.sample_count))
 
     def light(self, buffer: GBuffer) -> Radiance:
         """Light of all points of `buffer`."""
         if self._parts == 1:
             return self.trace(buffer.points, (0, 1))
         threshold = self._frame.settings.noise_threshold
-        return sample_adaptively(buffer.points, self._frame.settings.rays, self._parts, threshold, self.trace)
+        return sample_adaptively(buffer.points, self._frame.settings.sample_count, self._parts, threshold, self.trace)
 
     def trace(self, points: ShadingPoints, part: tuple[int, int]) -> Radiance:
         """Light of `points`, ordered by pixel, from one part of their samples, see `integrate`."""
@@ -240,7 +240,7 @@ class Batches:
                 self._light,
                 points[first:last],
                 self._frame.settings,
-                self._frame.number,
+                self._frame.noise_index,
                 self._lamps,
                 part,
                 surfels=self._tree,
@@ -264,10 +264,10 @@ def check_frame(frame: Frame) -> None:
     for name in frame.passes:
         if name not in BY_NAME:
             raise UsageError(f"pass {name!r}", "does not exist", f"Choose from {', '.join(BY_NAME)}")
-    if settings.primary not in ("surfels", "mesh"):
-        raise UsageError("primary visibility", f"is {settings.primary!r}", "Choose surfels or mesh")
-    if settings.tracer not in ("mesh", "surfels"):
-        raise UsageError("tracer", f"is {settings.tracer!r}", "Choose mesh or surfels")
+    if settings.camera_sees not in ("surfels", "mesh"):
+        raise UsageError("primary visibility", f"is {settings.camera_sees!r}", "Choose surfels or mesh")
+    if settings.rays_see not in ("mesh", "surfels"):
+        raise UsageError("rays_see", f"is {settings.rays_see!r}", "Choose mesh or surfels")
     if settings.denoise not in ("none", "svgf", "oidn"):
         raise UsageError("denoiser", f"is {settings.denoise!r}", "Choose none, svgf or oidn")
     if settings.denoise == "oidn":

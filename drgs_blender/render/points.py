@@ -30,8 +30,9 @@ class ShadingPoints:
     Attributes
     ----------
     pixel : (n,) int32: y * camera.width + x in the full picture; seeds the random numbers
-    sample : (n,) int32: sub-pixel sample, 0 .. aa - 1; a pair (pixel, sample) may occur twice, once flagged SECOND
-    weight : (n,) float32: alpha / aa, what the point contributes to its pixel
+    sample : (n,) int32: sub-pixel sample, 0 .. subpixels - 1; a pair (pixel, sample) may occur twice, once flagged
+        SECOND
+    weight : (n,) float32: alpha / subpixels, what the point contributes to its pixel
     origin : (n, 3) float32 metres: on the traced mesh, where secondary rays start
     normal : (n, 3) float32 unit: shading normal, faces the viewer
     geometric_normal : (n, 3) float32 unit: of the traced mesh at ``origin``, faces the viewer

@@ -50,10 +50,10 @@ def parts_of(settings: RenderSettings) -> list[tuple[int, tuple[int, int]]]:
     """
     n = part_count(settings)
     if n > 1:
-        return [(sample, (i, n)) for i in range(n) for sample in range(settings.positions)]
-    n = settings.rays // (settings.positions * _FEWEST)
+        return [(sample, (i, n)) for i in range(n) for sample in range(settings.subpixel_count)]
+    n = settings.sample_count // (settings.subpixel_count * _FEWEST)
     n = 1 if settings.denoise == "svgf" or n < 1 else min(1 << n.bit_length() - 1, _MOST_PARTS)
-    return [(sample, (i, n)) for i in range(n) for sample in range(settings.positions)]
+    return [(sample, (i, n)) for i in range(n) for sample in range(settings.subpixel_count)]
 
 
 def coarse(frame: Frame, size: int, by_mesh: bool = False) -> Frame:
@@ -79,10 +79,11 @@ def coarse(frame: Frame, size: int, by_mesh: bool = False) -> Frame:
         clip_start=camera.clip_start,
         clip_end=camera.clip_end,
     )
-    few = {name: min(1, getattr(frame.settings, name)) for name in ("cosine", "ggx", "environment")}
-    settings = replace(frame.settings, aa=1, noise_threshold=0.0, **few)
+    samples, by_strategy = min(3, frame.settings.samples), frame.settings.strategy_samples
+    few = by_strategy and (min(1, by_strategy[0]), min(1, by_strategy[1]), min(1, by_strategy[2]))
+    settings = replace(frame.settings, samples=samples, strategy_samples=few, subpixel_samples=1, noise_threshold=0.0)
     if by_mesh:
-        settings.primary = "mesh"
+        settings.camera_sees = "mesh"
     if settings.denoise != "none" or frame.history:
         settings.denoise = "svgf"
     return replace(frame, camera=view, settings=settings, previous=None, next=None)
@@ -113,7 +114,7 @@ class _Strip:
 
     def begin(self, points: int, settings: RenderSettings, parts: int) -> None:
         """Make room for the light of so many points."""
-        self.light = Sampling(points, settings.rays, parts, settings.noise_threshold)
+        self.light = Sampling(points, settings.sample_count, parts, settings.noise_threshold)
         self.moments, self.latest = np.zeros((points, 5), np.float32), np.zeros((points, 5), np.float32)
 
     def add(self, chosen: Array, found: Radiance) -> None:
@@ -163,9 +164,9 @@ class Progressive:
         self._parts = parts_of(frame.settings)
         self._adaptive = part_count(frame.settings) > 1
         self._next = 0
-        self._parameters = camera_parameters(frame.camera, frame.settings, frame.number)
+        self._parameters = camera_parameters(frame.camera, frame.settings, frame.noise_index)
         _, top, _, bottom = frame.camera.window
-        height = strip_height(frame.camera.window[2] - frame.camera.window[0], frame.settings.positions)
+        height = strip_height(frame.camera.window[2] - frame.camera.window[0], frame.settings.subpixel_count)
         self._strips = [_Strip((y, min(y + height, bottom))) for y in range(top, bottom, height)]
         self._primary: Primary | None = None
         self._left = KEPT_BYTES
@@ -212,7 +213,7 @@ class Progressive:
 
     def _draw(self, batches: Batches, check: Callable[[], None]) -> None:
         sample, part = self._parts[self._next]
-        last = sample == self.frame.settings.positions - 1
+        last = sample == self.frame.settings.subpixel_count - 1
         found = []
         for strip in self._strips:
             if strip.light is not None and not len(strip.light.going):

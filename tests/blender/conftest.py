@@ -58,8 +58,13 @@ def scene(tmp_path):
     scene.collection.objects.link(camera)
     scene.camera = camera
     settings = scene.drgs
-    settings.use_custom_split, settings.cosine, settings.ggx, settings.environment = True, 2, 1, 1
-    settings.aa = 1
+    settings.use_strategy_samples, settings.cosine_samples, settings.ggx_samples, settings.environment_samples = (
+        True,
+        2,
+        1,
+        1,
+    )
+    settings.subpixel_samples = 1
     image = scene.render.image_settings
     image.file_format, image.color_depth = "OPEN_EXR", "32"
     scene.render.filepath = str(tmp_path / "out.exr")

@@ -22,7 +22,7 @@ def lit(ball, scene):
         values = np.tile(np.float32(value), (len(ball.data.vertices), 1)).ravel()
         ball.data.attributes[name].data.foreach_set("color" if name == "albedo" else "value", values)
     ball.data.update_tag()
-    scene.drgs.look, scene.drgs.bounces = "paper", 0
+    scene.drgs.shading_model, scene.drgs.bounces = "paper", 0
     scene.frame_start, scene.frame_end = 1, 2
     scene.frame_set(1)
     return ball
@@ -40,11 +40,11 @@ def test_a_frame_and_an_animation_go_to_attributes_of_all_objects(lit, scene, tm
     second = bpy.context.active_object
     second.location.x = 50
     select(second, lit)
-    assert bpy.ops.drgs.bake_light(light="diffuse", rays=1024) == {"FINISHED"}
+    assert bpy.ops.drgs.bake_light(light="diffuse", samples=1024) == {"FINISHED"}
     np.testing.assert_allclose(colours(lit, "relit"), np.tile([0.5, 0.25, 0.1, 1], (86, 1)), rtol=0.03)
     assert np.ptp(colours(second, "relit")[:, 0]) > 0.2  # its colours vary over the mesh
     select(lit)
-    assert bpy.ops.drgs.bake_light(light="diffuse", rays=1024, use_animation=True) == {"FINISHED"}
+    assert bpy.ops.drgs.bake_light(light="diffuse", samples=1024, use_animation=True) == {"FINISHED"}
     for number in (1, 2):
         np.testing.assert_allclose(colours(lit, f"relit.{number:04}")[:, 0], 0.5 * number, rtol=0.03)
     assert scene.frame_current == 1 and "relit.0001" not in second.data.attributes
@@ -108,7 +108,7 @@ def test_one_object_does_not_get_the_light_of_another(lit, scene, tmp_path):
     with_uvs(lit)
     with_uvs(second)
     select(lit, second)
-    bpy.ops.drgs.bake_light(target="IMAGE", directory=str(tmp_path), size=16, rays=3)
+    bpy.ops.drgs.bake_light(target="IMAGE", directory=str(tmp_path), size=16, samples=3)
     assert sorted(path.name for path in tmp_path.glob("*.exr")) == ["Tör_0001.exr", "Tür_0001.exr"]
 
 
@@ -144,7 +144,7 @@ def test_a_mesh_that_is_edited_during_a_bake_is_told(lit, monkeypatch):
 
     monkeypatch.setattr(program, "_finish", edited)
     count = len(lit.data.vertices)
-    assert bpy.ops.drgs.bake_light(rays=3) == {"FINISHED"} and "relit" in lit.data.attributes
+    assert bpy.ops.drgs.bake_light(samples=3) == {"FINISHED"} and "relit" in lit.data.attributes
     count, messages = 0, part("addon.messages")
-    bpy.ops.drgs.bake_light(rays=3, name="second")
+    bpy.ops.drgs.bake_light(samples=3, name="second")
     assert 'Object "ball" has other vertices' in messages.history[-1].text and "second" not in lit.data.attributes

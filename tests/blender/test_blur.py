@@ -20,8 +20,8 @@ def white(ball, scene):
     new_world(scene)[1].inputs["Color"].default_value = (1, 1, 1, 1)
     scene.render.film_transparent = True
     settings = scene.drgs
-    settings.use_custom_split, settings.rays, settings.aa, settings.bounces = False, 48, 0, 0
-    settings.primary, settings.blur_steps = "mesh", 16
+    settings.use_strategy_samples, settings.samples, settings.subpixel_samples, settings.bounces = False, 48, 0, 0
+    settings.camera_sees, settings.blur_steps = "mesh", 16
     cycles = scene.cycles
     cycles.device, cycles.samples, cycles.use_adaptive_sampling, cycles.use_denoising = "CPU", 512, False, False
     cycles.pixel_filter_type, cycles.filter_width, cycles.max_bounces = "BOX", 1.0, 0
@@ -79,7 +79,7 @@ def test_depth_of_field_is_that_of_cycles(white, ball, kind, shape):
     dof.use_dof, dof.focus_object, dof.aperture_fstop = True, ball, {"PERSP": 0.1, "ORTHO": 1.5}[kind]
     for name, value in shape.items():
         setattr(dof, name, value)
-    white.drgs.blur_steps, white.drgs.rays = 128, 3
+    white.drgs.blur_steps, white.drgs.samples = 128, 3
     ours, theirs = alpha(white), alpha(white, "CYCLES")
     np.testing.assert_allclose(ours.sum(), theirs.sum(), rtol=0.02)
     right = slice(36, None)
@@ -108,12 +108,12 @@ def test_what_is_in_focus_stays_where_it_is(white, kind):
 def test_rays_are_divided_and_surface_passes_stay_sharp(white, captured, ball):
     white.render.engine = "DRGS"
     white.view_layers[0].use_pass_z = True
-    white.drgs.rays, white.drgs.blur_steps = 64, 8
+    white.drgs.samples, white.drgs.blur_steps = 64, 8
     white.camera.data.dof.use_dof = True
     bpy.ops.render.render()
     sharp, *pictures = captured
     assert sharp.passes == ("Depth",) and len(pictures) == 8
-    assert all(p.passes == ("Combined",) and p.settings.rays == 8 for p in pictures)
+    assert all(p.passes == ("Combined",) and p.settings.sample_count == 8 for p in pictures)
     assert len({p.settings.seed for p in pictures}) == 8
     assert np.array_equal(sharp.camera.matrix_world, np.array(white.camera.matrix_world))
     history = part("addon.messages").history
@@ -130,5 +130,5 @@ def test_the_line_above_the_picture_says_what_it_is_made_of(white, captured):
     bpy.ops.render.render()
     engine = part("addon.render_engine.engine")
     text = engine.summary(captured[0], {"surfels": 1234.0, "seconds.total": 2.0, "samples": 6e6})
-    assert text == "48 rays | 1,234 surfels | 2.00 s in the engine, 3.0 million rays/s"
-    assert engine.summary(captured[0], {}) == "48 rays"
+    assert text == "48 samples | 1,234 surfels | 2.00 s in the engine, 3.0 million samples/s"
+    assert engine.summary(captured[0], {}) == "48 samples"

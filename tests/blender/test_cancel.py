@@ -74,11 +74,11 @@ def test_tracing_and_denoising(lit, escape, phase, monkeypatch):
         return original(frame, tell, stopped)
 
     monkeypatch.setattr(link, "render", watched)
-    rays = {"cosine": 500} if phase == "Rendering" else {"cosine": 1}
+    samples = {"cosine_samples": 500} if phase == "Rendering" else {"cosine_samples": 1}
     size = 1024 if phase == "Rendering" else 768
-    check(lit, escape, resolution_x=size, resolution_y=size, denoise="svgf", **rays)
+    check(lit, escape, resolution_x=size, resolution_y=size, denoise="svgf", **samples)
     monkeypatch.setattr(link, "render", original)
-    lit.drgs.cosine, lit.drgs.denoise = 2, "none"
+    lit.drgs.cosine_samples, lit.drgs.denoise = 2, "none"
     np.testing.assert_array_equal(rendered(lit), before)
 
 

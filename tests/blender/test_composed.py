@@ -87,7 +87,12 @@ def test_a_whole_scene_agrees_with_cycles(ball, scene):
     cycles.max_bounces = cycles.diffuse_bounces = cycles.glossy_bounces = settings.bounces = 2
     cycles.sample_clamp_direct = cycles.sample_clamp_indirect = cycles.blur_glossy = cycles.light_sampling_threshold = 0
     cycles.caustics_reflective = True
-    settings.use_custom_split, settings.rays, settings.aa, settings.primary = False, 512, 16, "mesh"
+    settings.use_strategy_samples, settings.samples, settings.subpixel_samples, settings.camera_sees = (
+        False,
+        512,
+        16,
+        "mesh",
+    )
     pictures = {}
     for engine in ("CYCLES", "DRGS"):
         render.engine = engine

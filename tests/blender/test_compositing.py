@@ -32,8 +32,8 @@ def shared_scene(ball, scene):
     cycles.device, cycles.samples, cycles.use_adaptive_sampling, cycles.use_denoising = "CPU", 128, False, False
     cycles.pixel_filter_type, cycles.filter_width, cycles.max_bounces = "BOX", 1.0, 0
     settings = scene.drgs
-    settings.use_custom_split, settings.rays, settings.aa, settings.bounces = False, 128, 16, 0
-    settings.primary = "mesh"
+    settings.use_strategy_samples, settings.samples, settings.subpixel_samples, settings.bounces = False, 128, 16, 0
+    settings.camera_sees = "mesh"
     return scene
 
 
@@ -94,20 +94,20 @@ def test_settings_of_the_second_scene_survive_and_what_it_lacks_is_named(shared_
     bpy.ops.drgs.set_up_compositing()
     compositing = part("addon.compositing")
     partner = compositing.partner_of(scene)
-    partner.drgs.rays = 77
+    partner.drgs.samples = 77
     scene.render.resolution_x, scene.render.use_border, scene.render.border_max_x = 40, True, 0.5
     mesh_object("New", CUBE, SIDES)
     second = ball.copy()
     scene.collection.objects.link(second)
     bpy.ops.render.render()
     (frame,) = captured
-    assert (frame.camera.width, frame.camera.region) == (40, (0, 0, 20, HEIGHT)) and frame.settings.rays == 77
+    assert (frame.camera.width, frame.camera.region) == (40, (0, 0, 20, HEIGHT)) and frame.settings.sample_count == 77
     assert all(m.visibility.shadow_catcher for m in frame.meshes) and len(frame.objects) == 1
     last = part("addon.messages").history[-1]
     assert '"New"' in last.text and f'"{second.name}"' in last.text and "again" in last.text
     bpy.ops.drgs.set_up_compositing()
     partner = compositing.partner_of(scene)
-    assert partner.drgs.rays == 77 and not compositing.differences(partner)
+    assert partner.drgs.samples == 77 and not compositing.differences(partner)
     bpy.ops.render.render()
     assert len(captured[1].objects) == 2 and len(captured[1].meshes) == 4
 

@@ -69,7 +69,7 @@ def test_mattes_are_those_of_cycles(ball, scene, tmp_path, of):
     cube = painted(mesh_object("A cube with a long näme", CUBE, SIDES), (0.5, 0.5, 0.5))
     cube.scale, cube.location = (0.4, 0.4, 0.4), (1.0, -1, 0.2)
     setattr(scene.view_layers[0], f"use_pass_cryptomatte_{of.lower()}", True)
-    scene.drgs.primary, scene.drgs.aa = "mesh", 16
+    scene.drgs.camera_sees, scene.drgs.subpixel_samples = "mesh", 16
     cycles = scene.cycles
     cycles.device, cycles.samples, cycles.use_denoising, cycles.pixel_filter_type = "CPU", 16, False, "BOX"
     found = {}

@@ -132,7 +132,7 @@ def test_the_light_of_the_scene_is_in_the_colours(ball, scene, tmp_path):
     scene.collection.objects.link(sun)
     scene.drgs.bounces = 0
     out = tmp_path / "lit.ply"
-    assert bpy.ops.drgs.export(filepath=str(out), format="3DGS PLY", colour="relit", rays=32) == {"FINISHED"}
+    assert bpy.ops.drgs.export(filepath=str(out), format="3DGS PLY", colour="relit", samples=32) == {"FINISHED"}
     (cloud,) = imported(bpy.ops.wm.ply_import, out)
     green = 0.5 + 0.28209479 * attribute(cloud, "f_dc_1")
     height = world_points([cloud])[:, 2]

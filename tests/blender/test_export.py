@@ -293,24 +293,35 @@ def test_no_camera_is_an_error_with_a_remedy(scene, export):
 
 def test_settings_and_passes_reach_the_frame(ball, scene, captured):
     settings, layer = scene.drgs, scene.view_layers[0]
-    settings.use_custom_split, settings.rays = False, 64
-    settings.bounces, settings.aa, settings.look, settings.denoise, settings.seed = 3, 8, "paper", "svgf", 5
-    settings.primary, settings.tracer, scene.render.film_transparent = "mesh", "surfels", True
+    settings.use_strategy_samples, settings.samples = False, 64
+    settings.bounces, settings.subpixel_samples, settings.shading_model, settings.denoise, settings.seed = (
+        3,
+        8,
+        "paper",
+        "svgf",
+        5,
+    )
+    settings.camera_sees, settings.rays_see, scene.render.film_transparent = "mesh", "surfels", True
     settings.noise_threshold, settings.clamp_indirect = 0.02, 10
     layer.use_pass_z = layer.use_pass_object_index = layer.drgs.use_pass_albedo = layer.drgs.use_pass_noisy_image = True
     scene.frame_set(12)
     bpy.ops.render.render()
     frame = captured[0]
     s = frame.settings
-    assert (s.cosine, s.ggx, s.environment, s.bounces, s.aa, s.seed) == (32, 16, 16, 3, 8, 5)
-    assert (s.look, s.denoise, s.primary, s.tracer, s.film_transparent) == ("paper", "svgf", "mesh", "surfels", True)
-    assert s.split == "auto"
+    assert (s.samples, s.strategy_samples, s.bounces, s.subpixel_samples, s.seed) == (64, None, 3, 8, 5)
+    assert (s.shading_model, s.denoise, s.camera_sees, s.rays_see, s.film_transparent) == (
+        "paper",
+        "svgf",
+        "mesh",
+        "surfels",
+        True,
+    )
     assert (s.noise_threshold, s.clamp_indirect) == (0, 10), "the threshold is off"
     assert frame.passes == ("Combined", "Depth", "Albedo", "IndexOB", "Noisy Image")
-    assert frame.number == 12
+    assert frame.noise_index == 12
     settings.use_animated_seed, settings.use_noise_threshold = False, True
     bpy.ops.render.render()
-    assert captured[1].number == 0 and captured[1].settings.noise_threshold == pytest.approx(0.02)
+    assert captured[1].noise_index == 0 and captured[1].settings.noise_threshold == pytest.approx(0.02)
 
 
 def test_settings_offer_what_the_engine_knows():
@@ -318,7 +329,7 @@ def test_settings_offer_what_the_engine_knows():
     hints = typing.get_type_hints(part("drgs_blender.core.frame").RenderSettings)
     defaults = part("drgs_blender.core.frame").RenderSettings()
     properties = part("addon.properties").DrgsSceneSettings.bl_rna.properties
-    for name in ("primary", "tracer", "denoise", "look"):
+    for name in ("camera_sees", "rays_see", "denoise", "shading_model"):
         assert {i.identifier for i in properties[name].enum_items} == set(typing.get_args(hints[name])), name
         assert properties[name].default == getattr(defaults, name)
 
@@ -331,17 +342,23 @@ def stored(group):
 def test_settings_of_another_version_become_sound_and_are_named(ball, scene, export):
     """A number out of its limits, no number, an entry that this version does not know, another type."""
     blur = part("addon.render_engine.blur")
-    kept = {"rays": 2**31 - 1, "primary": 7, "bounces": -3, "clamp_indirect": float("nan"), "look": "another"}
+    kept = {
+        "rays": 2**31 - 1,
+        "camera_sees": 7,
+        "bounces": -3,
+        "clamp_indirect": float("nan"),
+        "shading_model": "another",
+    }
     for name, value in (kept | {"blur_steps": 2**31 - 1}).items():
         stored(scene.drgs)[name] = value
     stored(scene.view_layers[0].drgs)["others"] = 9
     ball.drgs.adjustment.use = True
     stored(ball.drgs.adjustment)["roughness_gain"] = float("nan")
-    scene.render.use_motion_blur, scene.drgs.use_custom_split = True, False
+    scene.render.use_motion_blur, scene.drgs.use_strategy_samples = True, False
     frame, warnings = export()
     settings = frame.settings
-    assert (settings.rays, settings.bounces, settings.clamp_indirect) == (65536, 0, 0)
-    assert (settings.primary, settings.look) == ("surfels", "principled")
+    assert (settings.samples, settings.bounces, settings.clamp_indirect) == (65536, 0, 0)
+    assert (settings.camera_sees, settings.shading_model) == ("surfels", "principled")
     assert frame.objects[0].adjustment.roughness[0] == 1 and not frame.objects[0].visibility.holdout
     assert len(blur.steps(scene, scene.camera, warnings.append)) == 1024
     named = {w.split(" is ")[0] for w in warnings}

@@ -55,7 +55,7 @@ def test_asset_without_a_mesh_is_rendered_by_its_surfels(scene, tmp_path):
     leaves = bpy.context.active_object
     assert leaves.drgs.is_drgs and not len(leaves.data.vertices)
     leaves.location.x = 1.0
-    scene.drgs.tracer, scene.render.film_transparent = "surfels", True
+    scene.drgs.rays_see, scene.render.film_transparent = "surfels", True
     bpy.ops.render.render(write_still=True)
     alpha = read_exr(scene.render.filepath, 64, 48)[..., 3]
     assert alpha[24, 46] > 0.9 and not alpha[:, :20].any()
@@ -287,7 +287,7 @@ def test_matter_of_a_linked_object_stays_as_it_is(scene, ball, tmp_path):
 
 
 def test_a_preset_that_cannot_be_used_is_named(scene, monkeypatch, tmp_path):
-    (tmp_path / "Broken.py").write_text("import bpy\nbpy.context.scene.drgs.rays = 'many'\n")
+    (tmp_path / "Broken.py").write_text("import bpy\nbpy.context.scene.drgs.samples = 'many'\n")
     monkeypatch.setattr(bpy.utils, "preset_paths", lambda folder: [str(tmp_path)])
     with pytest.raises(RuntimeError, match=r"Broken.py: cannot be used \(TypeError.*Remove it"):
         bpy.ops.drgs.render_preset(filepath=str(tmp_path / "Broken.py"))

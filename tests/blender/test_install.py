@@ -186,4 +186,4 @@ def test_disable_and_enable_again(scene):
     assert not hasattr(bpy.types.Scene, "drgs")
     assert not [h for h in bpy.app.handlers.load_post if h.__module__.startswith(PACKAGE)]
     bpy.ops.preferences.addon_enable(module=PACKAGE)
-    assert scene.drgs.rays == 32
+    assert scene.drgs.samples == 32

@@ -91,8 +91,8 @@ def test_vectors_are_those_of_cycles(moving, tmp_path):
     cycles.use_adaptive_sampling = cycles.use_denoising = False
     theirs = layers_of(moving, "CYCLES", tmp_path)
     settings = moving.drgs
-    settings.primary, settings.aa, settings.filter_width = "mesh", 64, 0
-    settings.cosine, settings.ggx, settings.environment = 32, 16, 16
+    settings.camera_sees, settings.subpixel_samples, settings.filter_width = "mesh", 64, 0
+    settings.cosine_samples, settings.ggx_samples, settings.environment_samples = 32, 16, 16
     ours = layers_of(moving, "DRGS", tmp_path)
     index = next(name for name in ours if name in ("IndexOB", "Object Index"))
     alike = ours[index] == theirs[index]
@@ -104,7 +104,7 @@ def test_vectors_are_those_of_cycles(moving, tmp_path):
     difference = np.abs(ours["Vector"] - theirs["Vector"])[inside]
     assert np.median(difference) < 0.001 and difference.max() < 0.01
     assert np.abs(theirs["Vector"][inside]).max() > 3
-    settings.primary = "surfels"
+    settings.camera_sees = "surfels"
     seen = layers_of(moving, "DRGS", tmp_path)
     # The few large surfels of this ball stand off its faces, which turn; other meshes are as before.
     off = np.abs(seen["Vector"] - theirs["Vector"])
@@ -148,7 +148,7 @@ def test_the_scene_is_at_its_frame_afterwards(moving, captured):
     moving.frame_set(3)
     bpy.ops.render.render()
     assert moving.frame_current == 3
-    assert captured[0].number == 3
+    assert captured[0].noise_index == 3
 
 
 def test_what_comes_and_goes_stands_still(moving, captured):
@@ -172,7 +172,7 @@ def test_what_comes_and_goes_stands_still(moving, captured):
 
 
 def test_one_switch_adds_what_temporal_denoising_needs(moving, captured):
-    moving.drgs.use_temporal, moving.drgs.denoise = True, "svgf"
+    moving.drgs.use_denoising_data, moving.drgs.denoise = True, "svgf"
     moving.view_layers[0].use_pass_vector = False
     bpy.ops.render.render()
     assert set(captured[0].passes) >= set(part("drgs_blender.core.passes").TEMPORAL)

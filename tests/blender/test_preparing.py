@@ -117,13 +117,13 @@ def test_a_viewport_says_it_with_its_part_and_can_be_closed(cold, monkeypatch):
 
 def test_a_picture_that_is_refined_says_it_too(scene, monkeypatch):
     """Kernels that are not counted have no part of their own."""
-    frame = SimpleNamespace(settings=SimpleNamespace(rays=8))
+    frame = SimpleNamespace(settings=SimpleNamespace(samples=8))
     picture = SimpleNamespace(request=SimpleNamespace(frame=frame), fraction=0.5)
     phase = [("Rendering", 0.5)]
     worker = SimpleNamespace(state=lambda name: ("", ""), progress=lambda name: phase[0], names=lambda: ["a"])
     monkeypatch.setattr(views, "worker", worker)
     monkeypatch.setattr(views, "_shown", {"a": views.Shown(picture=picture)})
-    assert views.tell("a") == ("Ray 4/8", "") and views.preparation() == ("", 0.0)
+    assert views.tell("a") == ("Sample 4/8", "") and views.preparation() == ("", 0.0)
     phase[0] = phases.PREPARING, 0.3
     assert views.tell("a") == (phases.PREPARING, "")
     phase[0] = f"{phases.PREPARING}, 3 of 12", 0.25

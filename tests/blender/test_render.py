@@ -263,7 +263,7 @@ def test_cancel_ends_a_long_render_within_half_a_second(ball, scene, monkeypatch
     light(scene)
     render(scene)
     scene.render.resolution_x = scene.render.resolution_y = 2048
-    scene.drgs.cosine = scene.drgs.environment = 500
+    scene.drgs.cosine_samples = scene.drgs.environment_samples = 500
     pressed: list[float] = []
     original = link.render
 
@@ -284,5 +284,5 @@ def test_cancel_ends_a_long_render_within_half_a_second(ball, scene, monkeypatch
     assert pressed and time.perf_counter() - pressed[0] < 0.5
     monkeypatch.undo()
     scene.render.resolution_x, scene.render.resolution_y = 64, 48
-    scene.drgs.cosine, scene.drgs.environment = 2, 1
+    scene.drgs.cosine_samples, scene.drgs.environment_samples = 2, 1
     assert render(scene)[24, 32, 3] > 0.99

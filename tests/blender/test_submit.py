@@ -35,7 +35,7 @@ def write() -> set[str]:
     [("openjd", "template.json", "openjd run "), ("slurm", "render.sbatch", "sh "), ("flamenco", "job.json", "curl ")],
 )
 def test_a_job_is_written_and_its_command_shown(settings, tmp_path, manager, file, starts):
-    settings.manager, settings.chunk, settings.options = manager, 2, "--rays 16"
+    settings.manager, settings.chunk, settings.options = manager, 2, "--samples 16"
     settings.use_denoise, settings.denoised = True, "//clean/####.exr"
     settings.sbatch, settings.retries = "--partition=farm --mem=8G", 7
     assert write() == {"FINISHED"}

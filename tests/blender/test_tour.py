@@ -164,9 +164,9 @@ def test_the_tour_says_what_comes_next_from_nothing_to_the_picture(scene, ball_f
 def test_presets_set_what_they_say_and_are_refused_elsewhere(scene, name, tmp_path):
     presets = part("addon.presets")
     path = next(f for p in bpy.utils.preset_paths(presets.FOLDER) for f in Path(p).iterdir() if f.stem == name)
-    scene.drgs.rays, scene.drgs.bounces = 7, 0
+    scene.drgs.samples, scene.drgs.bounces = 7, 0
     assert bpy.ops.drgs.render_preset(filepath=str(path), menu_idname="DRGS_PT_presets") == {"FINISHED"}
-    assert scene.drgs.rays in (16, 64, 1024) and scene.drgs.bounces > 0 and not scene.drgs.use_custom_split
+    assert scene.drgs.samples in (16, 64, 1024) and scene.drgs.bounces > 0 and not scene.drgs.use_strategy_samples
     stray = tmp_path / f"{name}.py"
     stray.write_bytes(path.read_bytes())
     with pytest.raises(RuntimeError, match="is no render preset"):
@@ -175,19 +175,19 @@ def test_presets_set_what_they_say_and_are_refused_elsewhere(scene, name, tmp_pa
 
 def test_own_settings_are_kept_as_a_preset(scene):
     presets = part("addon.presets")
-    scene.drgs.use_custom_split, scene.drgs.rays, scene.drgs.clamp_indirect = False, 123, 4.5
+    scene.drgs.use_strategy_samples, scene.drgs.samples, scene.drgs.clamp_indirect = False, 123, 4.5
     bpy.ops.drgs.render_preset_add(name="My Look")
-    scene.drgs.rays, scene.drgs.clamp_indirect = 5, 0
+    scene.drgs.samples, scene.drgs.clamp_indirect = 5, 0
     path = next(f for p in bpy.utils.preset_paths(presets.FOLDER) for f in Path(p).iterdir() if f.stem == "My_Look")
     bpy.ops.drgs.render_preset(filepath=str(path))
-    assert scene.drgs.rays == 123 and scene.drgs.clamp_indirect == 4.5
+    assert scene.drgs.samples == 123 and scene.drgs.clamp_indirect == 4.5
     path.unlink()
 
 
 def test_settings_follow_keyframes_and_drivers(ball, scene, export):
-    scene.drgs.use_custom_split = False
-    for number, rays in ((1, 8), (11, 108)):
-        scene.drgs.rays = rays
+    scene.drgs.use_strategy_samples = False
+    for number, samples in ((1, 8), (11, 108)):
+        scene.drgs.samples = samples
         scene.drgs.keyframe_insert("rays", frame=number)
     driver = scene.driver_add("drgs.clamp_indirect").driver
     variable = driver.variables.new()
@@ -198,7 +198,7 @@ def test_settings_follow_keyframes_and_drivers(ball, scene, export):
     for number in (1, 6, 11):
         scene.frame_set(number)
         settings = export()[0].settings
-        seen.append(settings.cosine + settings.ggx + settings.environment)
+        seen.append(settings.cosine_samples + settings.ggx_samples + settings.environment_samples)
         assert settings.clamp_indirect == pytest.approx(3)
     assert seen[0] == 8 and seen[2] == 108 and 8 < seen[1] < 108
 

@@ -356,7 +356,11 @@ def request(scene, x=0.0, size=(64, 48), rays=None):
     matrix = np.array(scene.camera.matrix_world)
     matrix[0, 3] += x
     camera = model.Camera(matrix, *size, size[0], size[0], size[0] / 2, size[1] / 2)
-    settings = frame.frame.settings if rays is None else dataclasses.replace(frame.frame.settings, cosine=rays)
+    settings = (
+        frame.frame.settings
+        if rays is None
+        else dataclasses.replace(frame.frame.settings, samples=rays, strategy_samples=None)
+    )
     found = dataclasses.replace(frame.frame, camera=camera, passes=("Combined",), settings=settings)
     return module.Request(found, part("addon.engine_link").client(), frame.assets)
 
@@ -407,7 +411,7 @@ def test_f12_is_the_last_picture_of_the_camera_view(scene, ball, worker, thresho
     """Through the camera, in a region as large as the picture, with the same seed: rays and pixels are the same."""
     new_world(scene)
     settings, render = scene.drgs, scene.render
-    settings.use_custom_split, settings.rays, settings.aa, settings.seed = False, 64, 4, 7
+    settings.use_strategy_samples, settings.samples, settings.subpixel_samples, settings.seed = False, 64, 4, 7
     settings.use_noise_threshold, settings.noise_threshold = threshold > 0, max(threshold, 1e-3)
     render.use_border = render.use_crop_to_border = border
     render.border_min_x, render.border_max_x, render.border_min_y, render.border_max_y = 0.26, 0.77, 0.11, 0.83
@@ -435,7 +439,7 @@ def test_newest_request_wins_and_first_pictures_are_shown_meanwhile(scene, ball,
     wait(lambda: done(worker, "a", last))
     seen = set()
     for i in range(60):
-        worker.submit("a", last := request(scene, 0.01 * i, rays=512))
+        worker.submit("a", last := request(scene, 0.01 * i, samples=512))
         end = time.monotonic() + 0.02
         while time.monotonic() < end:
             seen.add(id(worker.picture("a").request))
@@ -446,7 +450,7 @@ def test_newest_request_wins_and_first_pictures_are_shown_meanwhile(scene, ball,
 
 
 def test_final_render_has_the_engine_to_itself(scene, ball, worker):
-    worker.submit("a", what := request(scene, rays=4096, size=(400, 300)))
+    worker.submit("a", what := request(scene, samples=4096, size=(400, 300)))
     wait(lambda: worker.picture("a") is not None)
     worker.hold()
     link = part("addon.engine_link")

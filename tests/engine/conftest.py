@@ -63,19 +63,23 @@ def asset_path(tmp_path_factory: pytest.TempPathFactory, mesh: Mesh) -> Path:
 
 @pytest.fixture(scope="session")
 def make_frame(asset_path: Path, mesh: Mesh) -> Callable[..., Frame]:
-    """Function that makes a frame: bent by `bend`, of `size` pixels, with `rays` samples of each strategy."""
+    """Function that makes a frame: bent by `bend`, of `size` pixels, with three times `samples` samples."""
     environment = np.random.default_rng(7).uniform(0, 2, (16, 32, 3)).astype(np.float32)
 
-    def make(bend: float = 0.0, size: tuple[int, int] = (48, 36), rays: int = 2, **settings: object) -> Frame:
+    def make(bend: float = 0.0, size: tuple[int, int] = (48, 36), samples: int = 2, **settings: object) -> Frame:
         width, height = size
         matrix = np.eye(4)
         matrix[:3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]  # looks along +Y
         matrix[1, 3] = -4.0
-        sampling = {"cosine": rays, "ggx": rays, "environment": rays, "aa": 2, "film_transparent": True}
+        sampling = {
+            "samples": 3 * samples,
+            "subpixel_samples": 2,
+            "film_transparent": True,
+        }
         vertices = mesh.vertices.copy()
         vertices[:, 0] += np.float32(bend) * vertices[:, 2] ** 2
         return Frame(
-            number=3,
+            noise_index=3,
             camera=Camera(matrix, width, height, 1.3 * width, 1.3 * width, width / 2, height / 2),
             objects=[ObjectState("Ball", str(asset_path.resolve()), vertices=vertices)],
             world=World(environment.copy()),

@@ -29,10 +29,10 @@ def psnr(a, b):
     return -10 * np.log10(max(error, 1e-20))
 
 
-@pytest.mark.parametrize("changes", [{}, {"denoise": "svgf"}, {"primary": "mesh", "noise_threshold": 0.05}])
+@pytest.mark.parametrize("changes", [{}, {"denoise": "svgf"}, {"camera_sees": "mesh", "noise_threshold": 0.05}])
 def test_the_picture_is_the_processors(session, warp_session, make_frame, changes):
     passes = ("Combined", "DiffDir", "GlossInd")
-    frames = [replace(make_frame(rays=4, bounces=2, device=d, **changes), passes=passes) for d in ("cpu", "cuda")]
+    frames = [replace(make_frame(samples=4, bounces=2, device=d, **changes), passes=passes) for d in ("cpu", "cuda")]
     here, there = session.render(frames[0]), warp_session.render(frames[1])
     assert there.warnings == here.warnings
     for name in passes:
@@ -46,7 +46,7 @@ def test_surfels_stay_on_a_device_from_deformation_to_picture(session, warp_sess
     for case in ("bent", "two", "torn", "tinted", "grainy", "again"):
         pictures, counts = [], []
         for which, device in ((session, "cpu"), (warp_session, "cuda")):
-            frame = make_frame(0.3, device=device, rays=1)
+            frame = make_frame(0.3, device=device, samples=1)
             (item,) = frame.objects
             if case != "bent":
                 other = ObjectState("Second", item.asset, np.diag([-0.5, 0.5, 0.5, 1.0]))
@@ -71,7 +71,7 @@ def test_surfels_stay_on_a_device_from_deformation_to_picture(session, warp_sess
 def test_viewports_grow_on_a_device(session, warp_session, make_frame):
     last = []
     for which, device in ((session, "cpu"), (warp_session, "cuda")):
-        passes = which.view("v", make_frame(rays=4, device=device))
+        passes = which.view("v", make_frame(samples=4, device=device))
         while passes.statistics["view.fraction"] < 1.0:
             passes = which.refine("v")
         last.append(passes["Combined"])

@@ -47,7 +47,7 @@ def test_frame_that_does_not_fit_can_be_given_back_and_a_smaller_one_still_works
     monkeypatch.setenv("DRGS_MEMORY_MB", "900")
     client = make_client()
     client.load_asset(str(asset_path))
-    large = make_frame(size=(9000, 9000), rays=1)
+    large = make_frame(size=(9000, 9000), samples=1)
     with pytest.raises(EngineError, match=r"memory|killed|exited") as caught:
         client.render(large)
     assert caught.value.exit_code == EXIT_RETRY

@@ -72,10 +72,10 @@ def of_one_surface(pictures):
     return (index >= 0) & np.all(alike, axis=0)
 
 
-@pytest.mark.parametrize("primary", ["surfels", "mesh"])
-def test_everything_moves_as_its_shape_and_the_camera(session, make_frame, primary):
+@pytest.mark.parametrize("camera_sees", ["surfels", "mesh"])
+def test_everything_moves_as_its_shape_and_the_camera(session, make_frame, camera_sees):
     """DR-GS objects, meshes and instances; Blender's signs: previous less present, present less next, y up."""
-    frame, maps = moving_frame(make_frame, primary=primary)
+    frame, maps = moving_frame(make_frame, camera_sees=camera_sees)
     pictures = session.render(frame)
     seen = of_one_surface(pictures)
     assert set(np.unique(pictures["IndexOB"][seen])) == {1, 5, 6, 7}
@@ -93,7 +93,7 @@ def test_everything_moves_as_its_shape_and_the_camera(session, make_frame, prima
 
 def test_vertices_of_another_time_carry_the_surface(session, make_frame):
     """An affine map of the vertices, of the object and of a mesh that stands in several places."""
-    frame, _ = moving_frame(make_frame, primary="mesh")
+    frame, _ = moving_frame(make_frame, camera_sees="mesh")
     shear = np.float32([[1.0, 0.1, 0], [0, 0.9, 0.05], [0.08, 0, 1.1]])
     for state, pose in ((frame.objects[0], frame.previous.objects[0]), (frame.meshes[1], frame.previous.meshes[1])):
         pose.vertices = state.vertices @ shear.T
@@ -157,14 +157,14 @@ def noise(pictures, truth):
 
 
 def still_frame(make_frame, number, history="view", **settings):
-    frame = make_frame(0.1, rays=1, denoise="svgf", film_transparent=True, **settings)
-    frame.passes, frame.number, frame.history = ("Combined",), number, history
+    frame = make_frame(0.1, samples=1, denoise="svgf", film_transparent=True, **settings)
+    frame.passes, frame.noise_index, frame.history = ("Combined",), number, history
     return frame
 
 
 @pytest.fixture(scope="module")
 def truth(make_frame, asset_path):
-    return fresh(asset_path, make_frame(0.1, rays=256))
+    return fresh(asset_path, make_frame(0.1, samples=256))
 
 
 def test_a_picture_that_stands_still_gets_cleaner(session, make_frame, asset_path, truth):
@@ -185,7 +185,7 @@ def test_light_follows_what_moves(session, make_frame, asset_path):
             frame.camera.matrix_world[0, 3] = 0.02 * k
             picture = session.render(frame)
             if k >= 4:
-                clean = replace(frame, settings=make_frame(rays=128).settings, history="")
+                clean = replace(frame, settings=make_frame(samples=128).settings, history="")
                 results[history] += noise(picture, session.render(clean))
     assert results["view"] < 0.9 * results[""]
 

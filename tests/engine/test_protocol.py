@@ -81,10 +81,10 @@ def test_frame_survives_the_way_through_json():
 
 def test_numpy_scalars_are_sent_as_numbers():
     frame = full_frame()
-    frame.number, frame.camera.fx, frame.camera.orthographic = np.int64(9), np.float32(2.5), np.bool_(True)  # type: ignore
+    frame.noise_index, frame.camera.fx, frame.camera.orthographic = np.int64(9), np.float32(2.5), np.bool_(True)  # type: ignore
     data, arrays = encode_frame(frame)
     back = decode_frame(json.loads(json.dumps(data)), arrays)
-    assert (back.number, back.camera.fx, back.camera.orthographic) == (9, 2.5, True)
+    assert (back.noise_index, back.camera.fx, back.camera.orthographic) == (9, 2.5, True)
 
 
 def test_objects_of_one_name_get_slots_of_their_own():

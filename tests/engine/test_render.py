@@ -16,7 +16,7 @@ from drgs_blender.core.errors import AssetError, Cancelled, EngineError, UsageEr
 from drgs_blender.engine.session import Session
 
 posix = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
-ENDLESS = {"size": (400, 300), "rays": 4096}
+ENDLESS = {"size": (400, 300), "samples": 4096}
 
 
 @pytest.fixture(scope="module")

@@ -33,7 +33,7 @@ def test_history_does_not_show(session, make_frame, asset_path):
     two.objects.append(second)
     swapped = make_frame(0.1)
     swapped.objects = [second, two.objects[0]]
-    mesh = make_frame(0.2, primary="mesh")
+    mesh = make_frame(0.2, camera_sees="mesh")
     constant = make_frame(0.2)
     constant.world = World(colour=(0.2, 0.4, 0.8))
     painted = make_frame()
@@ -198,7 +198,7 @@ def test_mirrored_object_is_lit_from_outside(session, make_frame, mesh):
 @pytest.mark.parametrize("surface", ["mesh", "surfels"])
 def test_a_torn_body_leaves_its_gap_free(session, make_frame, surface):
     """The upper half is carried off: with `tear`, neither camera nor rays meet the faces that join the halves."""
-    frame = make_frame(size=(40, 60), rays=1, primary=surface, tracer=surface)
+    frame = make_frame(size=(40, 60), samples=1, camera_sees=surface, rays_see=surface)
     whole = frame.objects[0].vertices
 
     def alpha(lifted, tear):
@@ -239,7 +239,7 @@ def test_unfit_objects_are_named_with_both_counts(session, make_frame):
 
 
 def test_unusable_settings_are_refused(session, make_frame):
-    for name, value in (("cosine", -1), ("bounces", -2)):
+    for name, value in (("samples", -1), ("bounces", -2)):
         frame = make_frame()
         setattr(frame.settings, name, value)
         with pytest.raises(UsageError, match="negative"):
@@ -250,10 +250,10 @@ def test_unusable_settings_are_refused(session, make_frame):
         session.render(frame)
 
 
-@pytest.mark.parametrize("primary", ["surfels", "mesh"])
-def test_materials_out_of_range_are_as_at_its_end_on_surfels_and_mesh_alike(session, make_frame, mesh, primary):
+@pytest.mark.parametrize("camera_sees", ["surfels", "mesh"])
+def test_materials_out_of_range_are_as_at_its_end_on_surfels_and_mesh_alike(session, make_frame, mesh, camera_sees):
     def picture(**materials):
-        frame = make_frame(primary=primary)
+        frame = make_frame(camera_sees=camera_sees)
         frame.passes = ("Combined", "Albedo", "Roughness", "Metallic", "DiffDir")
         for name, value in materials.items():
             setattr(frame.objects[0], name, np.full_like(getattr(mesh, name), value))
@@ -275,7 +275,7 @@ def test_environment_that_is_not_only_turned_is_refused(session, make_frame):
 
 
 def test_vertices_of_a_huge_object_are_not_called_infinite_alone(session, make_frame, caplog):
-    frame = make_frame(primary="mesh")
+    frame = make_frame(camera_sees="mesh")
     frame.objects[0].matrix_world[:3, :3] *= 1e20
     (text,) = session.render(frame).warnings
     assert text.startswith("Ball: ") and "not finite or too far away" in text
@@ -298,7 +298,7 @@ def test_asset_of_which_nothing_would_be_seen_is_refused(tmp_path, session, make
     frame.objects[0].asset = session.load_asset(path)
     with pytest.raises(AssetError, match=f"Ball.*{problem}"):
         session.render(frame)
-    frame.settings.primary = "mesh"
+    frame.settings.camera_sees = "mesh"
     if part == "surfels":
         assert session.render(frame)["Combined"][..., 3].max() > 0.9
     else:
@@ -358,7 +358,7 @@ def test_unbound_surfels_need_binding_or_the_mesh(tmp_path, session, make_frame,
     frame.objects[0].asset = session.load_asset(path)
     with pytest.raises(AssetError, match=r"Ball.*not bound"):
         session.render(frame)
-    frame.settings.primary = "mesh"
+    frame.settings.camera_sees = "mesh"
     assert session.render(frame)["Combined"][..., 3].max() > 0.9
 
 
@@ -368,7 +368,7 @@ def test_cancelled_between_stages(session, make_frame):
 
 
 def test_statistics_and_stages(session, make_frame):
-    passes = session.render(make_frame(primary="surfels"))
+    passes = session.render(make_frame(camera_sees="surfels"))
     stages = ("seconds.deform", "seconds.light", "seconds.render", "seconds.total")
     assert all(passes.statistics[name] >= 0 for name in stages)
     assert passes.statistics["surfels"] == len(session.asset(make_frame().objects[0].asset).surfels)
@@ -377,7 +377,7 @@ def test_statistics_and_stages(session, make_frame):
 
 def test_a_threshold_that_cannot_be_followed_is_named(session, make_frame):
     frame = make_frame()
-    frame.settings = replace(frame.settings, noise_threshold=0.1, samples=7, aa=4)
+    frame.settings = replace(frame.settings, noise_threshold=0.1, samples=7, subpixel_samples=4)
     assert any("noise threshold" in text and "3 + 2 + 2" in text for text in session.render(frame).warnings)
     frame.settings = replace(frame.settings, samples=32)
     assert not any("noise threshold" in text for text in session.render(frame).warnings)
@@ -386,7 +386,7 @@ def test_a_threshold_that_cannot_be_followed_is_named(session, make_frame):
 def test_regions_and_history_do_not_show_in_adaptive_frames(session, make_frame, asset_path):
     """Whether a pixel goes on is its own affair: a region is a crop, with a lamp in the scene too."""
     frame = make_frame(0.2)
-    frame.settings = replace(frame.settings, noise_threshold=0.2, samples=64, aa=2)
+    frame.settings = replace(frame.settings, noise_threshold=0.2, samples=64, subpixel_samples=2)
     place = np.eye(4)
     place[:3, 3] = (0.5, -1.0, 3.0)
     frame.lights = [Light("Panel", "area", place, power=60.0, size_x=0.5)]
@@ -397,11 +397,11 @@ def test_regions_and_history_do_not_show_in_adaptive_frames(session, make_frame,
     np.testing.assert_array_equal(fresh(asset_path, frame)["Combined"], whole[y0:y1, x0:x1])
 
 
-@pytest.mark.parametrize("primary", ["surfels", "mesh"])
-def test_an_adjustment_changes_what_is_seen_and_keeps_its_detail(session, make_frame, primary):
+@pytest.mark.parametrize("camera_sees", ["surfels", "mesh"])
+def test_an_adjustment_changes_what_is_seen_and_keeps_its_detail(session, make_frame, camera_sees):
     """A tint is a factor on every pixel's albedo, whatever stands between vertices; a mask leaves a half alone."""
     names = ("Combined", "Albedo", "Roughness", "Coverage", "Position")
-    frame = replace(make_frame(primary=primary), passes=names)
+    frame = replace(make_frame(camera_sees=camera_sees), passes=names)
     before = session.render(frame)
     frame.objects[0].adjustment = Adjustment(tint=(0.5, 1.0, 0.25), roughness=(0.5, 0.1, 0.0, 1.0))
     after = session.render(frame)
@@ -415,7 +415,7 @@ def test_an_adjustment_changes_what_is_seen_and_keeps_its_detail(session, make_f
     asset = session.asset(frame.objects[0].asset)
     frame.objects[0].adjustment.mask = (asset.mesh.vertices[:, 2] > 0).astype(np.float32)
     masked, height = session.render(frame), before["Position"][..., 2]
-    far = 0.35 if primary == "mesh" else 0.75  # surfels are as wide as faces, and soft
+    far = 0.35 if camera_sees == "mesh" else 0.75  # surfels are as wide as faces, and soft
     low, high = covered & (height < -far), covered & (height > far)
     assert low.any() and high.any()
     np.testing.assert_allclose(masked["Albedo"][low], before["Albedo"][low], atol=1e-6)

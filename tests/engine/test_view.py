@@ -7,6 +7,7 @@ import signal
 import sys
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -60,10 +61,10 @@ def lit(frame):
     "settings",
     [
         {},
-        {"primary": "mesh", "bounces": 2},
-        {"rays": 12, "aa": 3},
-        {"rays": 3, "aa": 2},  # not divisible: one part a sub-pixel sample
-        {"denoise": "svgf", "rays": 4},
+        {"camera_sees": "mesh", "bounces": 2},
+        {"samples": 12, "subpixel_samples": 3},
+        {"samples": 3, "subpixel_samples": 2},  # not divisible: one part a sub-pixel sample
+        {"denoise": "svgf", "samples": 4},
         {"film_transparent": False},
     ],
 )
@@ -79,10 +80,10 @@ def test_last_picture_is_the_final_one(session, make_frame, settings):
 @pytest.mark.parametrize(
     "settings",
     [
-        {"rays": 64, "aa": 4},
-        {"rays": 128, "aa": 2, "denoise": "svgf"},
-        {"rays": 32, "aa": 3, "split": "counts"},
-        {"rays": 64, "primary": "mesh"},
+        {"samples": 64, "subpixel_samples": 4},
+        {"samples": 128, "subpixel_samples": 2, "denoise": "svgf"},
+        {"samples": 32, "subpixel_samples": 3, "strategy_samples": (32, 32, 32)},
+        {"samples": 64, "camera_sees": "mesh"},
     ],
 )
 def test_noise_threshold_stops_where_the_final_frame_does(session, make_frame, settings, monkeypatch):
@@ -110,7 +111,7 @@ def test_region_is_the_final_one_too(session, make_frame):
 def test_every_picture_is_as_bright_as_the_last(session, make_frame, monkeypatch):
     """Sub-pixel samples that have no light yet borrow it, so that no picture is darker, nor its edges."""
     monkeypatch.setattr("drgs_blender.engine.progressive_view.STEP_SECONDS", 0.0)
-    found = pictures(session, make_frame(0.2, rays=64, aa=4))
+    found = pictures(session, make_frame(0.2, samples=64, subpixel_samples=4))
     assert len(found) > 10
     mean = [p["Combined"].mean(axis=(0, 1)) for p in found]
     np.testing.assert_allclose(mean[0], mean[-1], rtol=0.15)  # surfels are never smaller than a sample
@@ -120,7 +121,7 @@ def test_every_picture_is_as_bright_as_the_last(session, make_frame, monkeypatch
 
 def test_samples_kept_or_found_again_are_the_same(session, make_frame, monkeypatch):
     monkeypatch.setattr("drgs_blender.engine.progressive_view.STEP_SECONDS", 0.0)
-    frame = lit(make_frame(0.2, rays=4))
+    frame = lit(make_frame(0.2, samples=4))
     kept = pictures(session, frame)
     monkeypatch.setattr(progressive, "KEPT_BYTES", 0)
     monkeypatch.setattr("drgs_blender.render.pipeline.STRIP_BYTES", 1 << 17)  # some rows a strip
@@ -193,7 +194,7 @@ def test_thin_surfels_cover_as_much(session, make_frame):
 
 def test_coarse_pictures_are_like_the_last(session, make_frame, monkeypatch):
     """Whatever the size of their pixels: of the detailed mesh, and of the surfels where the mesh is not."""
-    frame = make_frame(0.2, size=(192, 144), rays=16)
+    frame = make_frame(0.2, size=(192, 144), samples=16)
     final = session.render(frame)["Combined"]
 
     def error(size):
@@ -211,14 +212,14 @@ def test_coarse_pictures_are_like_the_last(session, make_frame, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("counts", "aa", "steps"), [((16, 8, 8), 4, 8), ((2, 1, 1), 4, 4), ((6, 6, 6), 3, 3), ((512, 0, 0), 1, 32)]
+    ("counts", "subpixels", "steps"),
+    [((16, 8, 8), 4, 8), ((2, 1, 1), 4, 4), ((6, 6, 6), 3, 3), ((512, 0, 0), 1, 32)],
 )
-def test_parts_draw_every_sample_once(make_frame, counts, aa, steps):
-    settings = make_frame().settings
-    settings.cosine, settings.ggx, settings.environment, settings.aa = *counts, aa
+def test_parts_draw_every_sample_once(make_frame, counts, subpixels, steps):
+    settings = replace(make_frame().settings, strategy_samples=counts, subpixel_samples=subpixels)
     parts = parts_of(settings)
     assert len(parts) == len(set(parts)) == steps
-    assert {sample for sample, _ in parts} == set(range(aa))
+    assert {sample for sample, _ in parts} == set(range(subpixels))
 
 
 @pytest.mark.parametrize(("fixed", "each"), [(0.15, 1e-7), (0.01, 2e-6), (0.05, 2e-5), (0.3, 1e-8)])
@@ -269,7 +270,7 @@ def test_new_engine_begins_the_view_again(client, make_frame):
 @pytest.mark.alone
 def test_newer_frame_interrupts_within_tens_of_milliseconds(client, make_frame):
     """From the moment something newer is there until the engine is free, with `wake`; median of some."""
-    endless = make_frame(size=(400, 300), rays=4096)
+    endless = make_frame(size=(400, 300), samples=4096)
     client.view("A", endless)
     client.view("A", endless, go_on=True)
     stop, waits = threading.Event(), []
@@ -295,7 +296,7 @@ def test_newer_frame_interrupts_within_tens_of_milliseconds(client, make_frame):
 
 def test_cancelled_step_leaves_the_view_as_it_was(session, make_frame, monkeypatch):
     monkeypatch.setattr("drgs_blender.engine.progressive_view.STEP_SECONDS", 0.0)
-    frame = make_frame(0.2, rays=16)
+    frame = make_frame(0.2, samples=16)
     session.view("A", frame)
     before = session.refine("A").statistics["view.fraction"]
     for asked in range(1, 30):

@@ -44,7 +44,7 @@ ANIMATION = """
 scene = opened()
 scene.frame_start, scene.frame_end, scene.frame_step = 1, 3, 2
 scene.render.filepath = {out!r} + "/####"
-scene.drgs.rays = {rays}
+scene.drgs.samples = {rays}
 bpy.ops.render.render(animation=True)
 """
 END = """
@@ -63,10 +63,10 @@ def begin(scene: Path, tmp_path: Path, body: str, **environment: str) -> subproc
 
 
 def animate(
-    scene: Path, out: Path, tmp_path: Path, rays: int = 4, **environment: str
+    scene: Path, out: Path, tmp_path: Path, samples: int = 4, **environment: str
 ) -> subprocess.CompletedProcess[str]:
     """Frames 1 and 3 of `scene`, rendered and written by Blender."""
-    process = begin(scene, tmp_path, ANIMATION.format(out=str(out), rays=rays), **environment)
+    process = begin(scene, tmp_path, ANIMATION.format(out=str(out), samples=samples), **environment)
     try:
         said, errors = process.communicate(timeout=400)  # the first may compile kernels
     finally:
@@ -125,8 +125,8 @@ def engines_of(process: subprocess.Popen[str]) -> list[int]:
 @pytest.mark.parametrize(("deaths", "code"), [(2, 0), (3, 75)])
 def test_two_engines_may_die_of_a_frame(folder, tmp_path, deaths, code):
     """As under `drgs render`: the third death gives the frame back."""
-    scene, rays = folder / "relative.blend", 8192
-    body = ANIMATION.format(out=str(tmp_path / "shaken"), rays=rays).replace("= 1, 3, 2", "= 1, 1, 1")
+    scene, samples = folder / "relative.blend", 8192
+    body = ANIMATION.format(out=str(tmp_path / "shaken"), samples=samples).replace("= 1, 3, 2", "= 1, 1, 1")
     process = begin(scene, tmp_path, body, DRGS_FARM="1")
     killed: set[int] = set()
     try:
@@ -143,7 +143,7 @@ def test_two_engines_may_die_of_a_frame(folder, tmp_path, deaths, code):
     if code:
         assert said.splitlines()[-1] == "DRGS_EXIT class=retry" and not (tmp_path / "shaken").exists()
     else:
-        assert animate(scene, tmp_path / "calm", tmp_path, rays).returncode == 0
+        assert animate(scene, tmp_path / "calm", tmp_path, samples).returncode == 0
         calm, shaken = (written_by_blender(tmp_path / name / "0001.exr") for name in ("calm", "shaken"))
         assert np.array_equal(calm, shaken)
 
@@ -153,7 +153,7 @@ def test_two_engines_may_die_of_a_frame(folder, tmp_path, deaths, code):
 @pytest.mark.parametrize("attempt", range(20 if WHOLE else 1))
 def test_killed_blender_takes_its_engine_along(folder, tmp_path, attempt):
     shared = set(os.listdir("/dev/shm"))
-    process = begin(folder / "large.blend", tmp_path, ANIMATION.format(out=str(tmp_path / "out"), rays=65536))
+    process = begin(folder / "large.blend", tmp_path, ANIMATION.format(out=str(tmp_path / "out"), samples=65536))
     try:
         while not (found := engines_of(process)):
             assert process.poll() is None
@@ -229,7 +229,7 @@ import addon_utils, importlib, threading, time
 out, count = {out!r}, {count}
 def picture(rays, name=""):
     scene = opened()
-    scene.drgs.rays = rays
+    scene.drgs.samples = rays
     scene.render.filepath = out + "/" + name
     try:
         bpy.ops.render.render(write_still=bool(name))

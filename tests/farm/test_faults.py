@@ -35,7 +35,7 @@ def start(folder: Path, out: Path, frames: str, *options: str, scratch: Path | N
 def test_full_disk_gives_no_frame_and_the_frame_once_there_is_room(drgs, folder, small_disk):
     disk = small_disk("size=16k")
     (disk / "filler").write_bytes(bytes(16 << 10))
-    job = ("render", folder / "shot.blend", "--frames", "1-2", "--out", disk / "####.exr", "--rays", 4)
+    job = ("render", folder / "shot.blend", "--frames", "1-2", "--out", disk / "####.exr", "--samples", 4)
     code, lines, error = drgs(*job)
     assert (code, lines[-1]) == (73, "DRGS_EXIT class=cannot-write")
     assert "0001.exr" in error and not any(line.startswith("Saved") for line in lines)
@@ -54,7 +54,7 @@ def test_folder_that_cannot_be_written_is_found_before_anything_is_rendered(drgs
 @pytest.mark.slow
 def test_denoised_frames_meet_full_and_sealed_disks_as_rendered_ones_do(drgs, folder, small_disk, tmp_path):
     noisy = tmp_path / "noisy" / "####.exr"
-    options = ("--rays", 4, "--denoise", "none", "--passes", "temporal")
+    options = ("--samples", 4, "--denoise", "none", "--passes", "temporal")
     assert drgs("render", folder / "shot.blend", "--frames", "1-2", "--out", noisy, *options)[0] == 0
     disk = small_disk("size=16k")
     job = ("denoise", noisy, "--frames", "1-2", "--out", disk / "####.exr")
@@ -75,7 +75,7 @@ def test_denoised_frames_meet_full_and_sealed_disks_as_rendered_ones_do(drgs, fo
 def test_log_on_a_full_disk_costs_neither_frame_nor_code(folder, tmp_path):
     """Logs lie on the disk of the frames as a rule; when it has room again the job goes on."""
     for scene, code in (("shot.blend", 0), ("blind.blend", 64)):
-        command = [*PROGRAM.split(), "render", str(folder / scene), "--frames", "1-2", "--rays", "4"]
+        command = [*PROGRAM.split(), "render", str(folder / scene), "--frames", "1-2", "--samples", "4"]
         command += ["--out", str(tmp_path / "####.exr")]
         with open("/dev/full", "w") as full:
             done = subprocess.run(command, stdout=full, stderr=full, timeout=120)
@@ -100,7 +100,7 @@ def test_frames_of_an_asset_that_changes_meanwhile_are_not_kept(folder, tmp_path
         shutil.copy(folder / name, tmp_path)
     (tmp_path / "relative.blend").rename(tmp_path / "shot.blend")
     asset = read_asset(tmp_path / "tile.drgs")
-    process = start(tmp_path, tmp_path / "out", "1-9", "--rays", "65536")
+    process = start(tmp_path, tmp_path / "out", "1-9", "--samples", "65536")
     while not process.stdout.readline().startswith("Fra:1 "):
         assert process.poll() is None
     write_asset(tmp_path / "tile.drgs", replace(asset, mesh=replace(asset.mesh, albedo=0.5 * asset.mesh.albedo)))
@@ -115,7 +115,7 @@ def test_asset_that_is_copied_over_in_place_gives_the_job_back(folder, tmp_path)
     for name in ("relative.blend", "tile.drgs"):
         shutil.copy(folder / name, tmp_path)
     (tmp_path / "relative.blend").rename(tmp_path / "shot.blend")
-    process = start(tmp_path, tmp_path / "out", "1-9", "--rays", "65536")
+    process = start(tmp_path, tmp_path / "out", "1-9", "--samples", "65536")
     while not process.stdout.readline().startswith("Fra:1 "):
         assert process.poll() is None
     os.truncate(tmp_path / "tile.drgs", 100)
@@ -127,7 +127,7 @@ def test_asset_that_is_copied_over_in_place_gives_the_job_back(folder, tmp_path)
 
 @pytest.mark.slow
 def test_memory_that_does_not_do_gives_the_frame_back(drgs, folder, tmp_path):
-    job = ("render", folder / "large.blend", "--frames", "1", "--rays", "4", "--passes", "all")
+    job = ("render", folder / "large.blend", "--frames", "1", "--samples", "4", "--passes", "all")
     code, lines, error = drgs(*job, "--memory-mb", 256, "--out", tmp_path / "####.exr")
     assert (code, lines[-1]) == (75, "DRGS_EXIT class=retry"), error
     assert not list(tmp_path.iterdir())
@@ -145,7 +145,7 @@ def test_unfinished_frames_of_killed_writers_go(drgs, folder, tmp_path):
         os.utime(tmp_path / name, (0, 0))
     ahead = (4e9, 4e9)
     os.utime(tmp_path / names[4], ahead)
-    job = ("render", folder / "shot.blend", "--frames", "1", "--out", tmp_path / "a_####.exr", "--rays", 4)
+    job = ("render", folder / "shot.blend", "--frames", "1", "--out", tmp_path / "a_####.exr", "--samples", 4)
     assert drgs(*job)[0] == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*names[1:], "a_0001.exr"])
     for when in ((0, 0), ahead):  # what was made before what is nobody's business
@@ -197,7 +197,7 @@ def test_killed_blender_gives_the_job_back_and_takes_the_engine_along(folder, tm
     shared = set(os.listdir("/dev/shm"))
     scratch = tmp_path / "scratch"
     scratch.mkdir()
-    process = start(folder, tmp_path / "out", "1-9", "--rays", "65536", scratch=scratch)
+    process = start(folder, tmp_path / "out", "1-9", "--samples", "65536", scratch=scratch)
     try:
         while not process.stdout.readline().startswith("Fra:1 "):
             assert process.poll() is None
@@ -219,8 +219,8 @@ def test_killed_blender_gives_the_job_back_and_takes_the_engine_along(folder, tm
 @pytest.mark.slow
 def test_two_jobs_on_one_folder_do_not_disturb_each_other(drgs, folder, tmp_path):
     alone, both = tmp_path / "alone", tmp_path / "both"
-    assert drgs("render", folder / "shot.blend", "--frames", "1-3", "--out", alone / "####.exr", "--rays", 4)[0] == 0
-    jobs = [start(folder, both, "1-3", "--rays", "4") for _ in range(2)]
+    assert drgs("render", folder / "shot.blend", "--frames", "1-3", "--out", alone / "####.exr", "--samples", 4)[0] == 0
+    jobs = [start(folder, both, "1-3", "--samples", "4") for _ in range(2)]
     results = [job.communicate(timeout=120) for job in jobs]
     assert [job.returncode for job in jobs] == [0, 0], results
     assert sorted(path.name for path in both.iterdir()) == ["0001.exr", "0002.exr", "0003.exr"]
@@ -232,7 +232,7 @@ def test_two_jobs_on_one_folder_do_not_disturb_each_other(drgs, folder, tmp_path
 def test_fifty_engines_killed_in_the_middle_of_frames_cost_no_pixel(drgs, folder, tmp_path):
     """Killed at moments that are spread over the frame; each is noticed, and the frame made by the next engine."""
     calm, shaken = tmp_path / "calm", tmp_path / "shaken"
-    rays = ("--rays", "65536")  # longer than the longest delay
+    rays = ("--samples", "65536")  # longer than the longest delay
     assert drgs("render", folder / "shot.blend", "--frames", "1-50", "--out", calm / "####.exr", *rays)[0] == 0
     process = start(folder, shaken, "1-50", *rays)
     killed: set[str] = set()  # in which frames; a frame that is made again may say so twice

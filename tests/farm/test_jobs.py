@@ -87,7 +87,7 @@ def manager(**given: object) -> object:
 def make_job(**changes: object) -> Job:
     given = {
         "name": "shot", "scene": Path("/p/shot.blend"), "frames": [1, 2, 3, 4, 5], "out": "/p/f/####.exr",
-        "clean": None, "chunk": 2, "options": ("--rays", "8"), "program": ("drgs",),
+        "clean": None, "chunk": 2, "options": ("--samples", "8"), "program": ("drgs",),
     }  # fmt: skip
     return Job(**given | changes)
 
@@ -106,10 +106,10 @@ def test_frames_survive_being_written(n=300):
 @pytest.mark.parametrize(
     "options",
     [
-        ["--options=--rays many"],
+        ["--options=--samples many"],
         ["--options=--frames 7"],
         ["--options=--out x.exr"],
-        ["--options='--rays"],
+        ["--options='--samples"],
         ["--frames", "1..0"],
         ["--denoised", "f/####.exr"],
     ],

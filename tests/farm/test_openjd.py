@@ -27,7 +27,7 @@ def test_bundle_renders_and_denoises_what_one_machine_does(drgs, folder, tmp_pat
     studio.mkdir()
     for name in ("relative.blend", "tile.drgs"):
         shutil.copy(folder / name, studio)
-    scene, rays = studio / "relative.blend", "--rays 4"
+    scene, rays = studio / "relative.blend", "--samples 4"
     code, lines, error = drgs(
         "submit", "openjd", scene, "--frames", "1-3", "--chunk", 2, "--out", "//noisy/####.exr", "--no-check",
         "--denoised", "//clean/####.exr", "--to", tmp_path / "job", "--drgs", PROGRAM, f"--options={rays}",

@@ -45,12 +45,12 @@ def chunk(scene: Path, out: Path, place: Path, frames: str, *options: str) -> su
 
 def long_chunk(folder: Path, out: Path, place: Path) -> subprocess.Popen[str]:
     """A task of one frame that lasts longer than any test looks at it."""
-    return chunk(folder / "large.blend", out, place, "1", "--rays", "65536")
+    return chunk(folder / "large.blend", out, place, "1", "--samples", "65536")
 
 
 def told(scene: Path, out: Path, place: Path, frames: str, *options: str) -> tuple[int, list[str], str]:
     """(exit code, lines, errors) of a task."""
-    process = chunk(scene, out, place, frames, "--rays", "4", *options)
+    process = chunk(scene, out, place, frames, "--samples", "4", *options)
     text, errors = process.communicate(timeout=400)  # the first may compile kernels
     return process.returncode, text.splitlines(), errors
 
@@ -81,7 +81,7 @@ def test_chunks_share_blender_and_engine_and_have_the_same_bits(drgs, folder, wa
     code, lines, _ = told(scene, out, warm, "2-3")
     assert code == 0 and sum(line.startswith("skipping") for line in lines) == 2
     assert family(server(warm)) == used
-    assert drgs("render", scene, "--frames=-2,1-3", "--out", alone / "####.exr", "--rays", 4)[0] == 0
+    assert drgs("render", scene, "--frames=-2,1-3", "--out", alone / "####.exr", "--samples", 4)[0] == 0
     assert sorted(p.name for p in out.iterdir()) == ["-0002.exr", "0001.exr", "0002.exr", "0003.exr"]
     assert all(same_pixels(path, alone / path.name) for path in out.iterdir())
     session_link.end(warm)
@@ -180,7 +180,7 @@ def test_request_that_is_lost_is_given_back(folder, warm, tmp_path):
 @pytest.mark.slow
 def test_frames_are_denoised_by_the_warm_process(drgs, folder, warm, tmp_path, monkeypatch):
     noisy, here, there = (tmp_path / name / "####.exr" for name in ("noisy", "here", "there"))
-    options = ("--rays", 4, "--denoise", "none", "--passes", "temporal")
+    options = ("--samples", 4, "--denoise", "none", "--passes", "temporal")
     assert drgs("render", folder / "relative.blend", "--frames", "1-3", "--out", noisy, *options)[0] == 0
     job = ("denoise", noisy, "--frames", "1-3", "--openjd", "--out")
     with monkeypatch.context() as patch:

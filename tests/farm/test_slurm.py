@@ -57,10 +57,10 @@ def test_chunk_that_ends_with_75_is_queued_again_and_the_second_step_waits(drgs,
     shaky = tmp_path / "drgs.sh"
     shaky.write_text(SHAKY.format(mark=tmp_path / "mark", program=PROGRAM))
     shaky.chmod(0o755)
-    rays = ("--rays", "4", "--denoise", "none", "--passes", "temporal")
+    rays = ("--samples", "4", "--denoise", "none", "--passes", "temporal")
     job = submit(
         drgs, trio, scene, "--frames", "1-3", "--chunk", 2, "--out", "//noisy/####.exr", "--drgs", shaky,
-        "--denoised", "//clean/####.exr", "--options=--rays 4",
+        "--denoised", "//clean/####.exr", "--options=--samples 4",
     )  # fmt: skip
     trio.until_done(150)
     told = logs(job, "render")
@@ -111,7 +111,7 @@ def test_sessions_of_openjd_in_an_array_render_and_denoise_what_one_machine_does
     job = tmp_path / "job"
     code, lines, error = drgs(
         "submit", "openjd", scene, "--frames", "1-5", "--chunk", 1, "--chunk-seconds", 5, "--out", "//noisy/####.exr",
-        "--denoised", "//clean/####.exr", "--no-check", "--to", job, "--drgs", PROGRAM, "--options=--rays 4",
+        "--denoised", "//clean/####.exr", "--no-check", "--to", job, "--drgs", PROGRAM, "--options=--samples 4",
     )  # fmt: skip
     assert code == 0, error
     trio.submit_sessions(job, Path(sys.executable).with_name("openjd"), lines[-1], ["1-2", "3-4", "5"])
@@ -122,7 +122,7 @@ def test_sessions_of_openjd_in_an_array_render_and_denoise_what_one_machine_does
         assert [text.count("Entering Environment: WarmEngine") for text in told] == [1, 1, 1]
     alone = tmp_path / "alone"
     noisy, clean = alone / "noisy" / "####.exr", alone / "clean" / "####.exr"
-    rays = ("--rays", 4, "--denoise", "none", "--passes", "temporal")
+    rays = ("--samples", 4, "--denoise", "none", "--passes", "temporal")
     assert drgs("render", scene, "--frames", "1-5", "--out", noisy, *rays)[0] == 0
     assert drgs("denoise", noisy, "--frames", "1-5", "--out", clean)[0] == 0
     for path in (*noisy.parent.iterdir(), *clean.parent.iterdir()):
@@ -131,7 +131,7 @@ def test_sessions_of_openjd_in_an_array_render_and_denoise_what_one_machine_does
 
 @pytest.mark.skipif(not WHOLE, reason="slow; DRGS_FAULTS=whole runs it")
 def test_frames_of_a_node_that_is_lost_are_made_by_another(drgs, trio, scene, tmp_path):
-    rays = ("--rays", "2048")
+    rays = ("--samples", "2048")
     job = submit(
         drgs, trio, scene, "--frames", "1-12", "--chunk", 3, "--out", "//f/####.exr", "--drgs", PROGRAM,
         f"--options={' '.join(rays)}",

@@ -91,7 +91,7 @@ def test_a_node_without_a_network_renders_what_the_checkout_does(source, folder,
     run(blender.program, "-c", INSTALL.format(archive=str(archive)), env=environment)
     program = shutil.which("drgs", path=str(place / SCRIPTS))
     assert "installed there" in run(program, "doctor", "--node", cwd=tmp_path, env=environment)
-    words = ("render", folder / "relative.blend", "--frames", "2", "--rays", 4, "--out")
+    words = ("render", folder / "relative.blend", "--frames", "2", "--samples", 4, "--out")
     run(program, *words, tmp_path / "node/####.exr", cwd=tmp_path, env=environment)
     run(*PROGRAM.split(), *words, tmp_path / "here/####.exr")
     assert same_pixels(tmp_path / "node/0002.exr", tmp_path / "here/0002.exr")

@@ -17,13 +17,13 @@ from drgs_blender.render.scene.trace_scene import TraceScene
 WIDTH = 40
 
 
-def row_of_points(count: int, aa: int = 1) -> ShadingPoints:
-    """Points of one row of pixels on a matte plane, `aa` to a pixel."""
-    n = count * aa
+def row_of_points(count: int, subpixels: int = 1) -> ShadingPoints:
+    """Points of one row of pixels on a matte plane, `subpixels` to a pixel."""
+    n = count * subpixels
     up, view = np.tile(np.float32([0, 0, 1]), (n, 1)), np.tile(np.float32([0.6, 0, 0.8]), (n, 1))
-    pixel, sample = np.repeat(np.arange(count), aa), np.tile(np.arange(aa), count)
+    pixel, sample = np.repeat(np.arange(count), subpixels), np.tile(np.arange(subpixels), count)
     return ShadingPoints(
-        pixel, sample, np.full(n, 1 / aa), np.zeros((n, 3)), up, up, view, np.full((n, 3), 0.7), np.full(n, 0.4),
+        pixel, sample, np.full(n, 1 / subpixels), np.zeros((n, 3)), up, up, view, np.full((n, 3), 0.7), np.full(n, 0.4),
         np.zeros(n),
     )  # fmt: skip
 
@@ -37,10 +37,10 @@ def lively_light() -> EnvironmentLight:
     [
         ({}, 1),  # no threshold
         ({"noise_threshold": 0.1}, 2),  # parts of 16 rays
-        ({"noise_threshold": 0.1, "cosine": 3}, 1),
-        ({"noise_threshold": 0.1, "split": "counts"}, 8),
-        ({"noise_threshold": 0.1, "cosine": 3, "split": "counts"}, 1),  # no common divisor
-        ({"noise_threshold": 0.1, "cosine": 4096, "ggx": 2048, "environment": 2048}, 32),
+        ({"noise_threshold": 0.1, "samples": 19}, 1),
+        ({"noise_threshold": 0.1, "strategy_samples": (16, 8, 8)}, 8),
+        ({"noise_threshold": 0.1, "strategy_samples": (3, 8, 8)}, 1),  # no common divisor
+        ({"noise_threshold": 0.1, "samples": 8192}, 32),
     ],
 )
 def test_the_samples_are_divided_into_equal_parts(changes: dict, expected: int) -> None:
@@ -49,8 +49,8 @@ def test_the_samples_are_divided_into_equal_parts(changes: dict, expected: int) 
 
 def test_the_mean_of_all_parts_is_the_whole() -> None:
     """A part draws the very samples that the whole draws, so that nothing is lost by stopping late."""
-    points, light, scene = row_of_points(12, aa=2), lively_light(), TraceScene()
-    settings = RenderSettings(samples=32, bounces=0, aa=2)
+    points, light, scene = row_of_points(12, subpixel_samples=2), lively_light(), TraceScene()
+    settings = RenderSettings(samples=32, bounces=0, subpixel_samples=2)
     whole = integrate(scene, light, points, settings, 5)
     parts = [integrate(scene, light, points, settings, 5, part=(i, 4)) for i in range(4)]
     mean = np.mean([p.components for p in parts], axis=0)
@@ -108,7 +108,7 @@ def test_a_pixel_stops_as_soon_as_its_error_is_small_enough() -> None:
 
 def test_a_lower_threshold_gives_a_smaller_error() -> None:
     points, light, scene = row_of_points(WIDTH), lively_light(), TraceScene()
-    settings = RenderSettings(samples=512, bounces=0, aa=1)
+    settings = RenderSettings(samples=512, bounces=0, subpixel_samples=1)
     truth = integrate(scene, light, points, replace(settings, samples=16384), 1).total
     errors, samples = [], []
     for threshold in (0.4, 0.02):
@@ -119,7 +119,7 @@ def test_a_lower_threshold_gives_a_smaller_error() -> None:
             asked += len(some)
             return integrate(scene, light, some, settings, 0, part=part)
 
-        found = sample_adaptively(points, settings.rays, 32, threshold, trace)
+        found = sample_adaptively(points, settings.sample_count, 32, threshold, trace)
         errors.append(float(np.sqrt(np.mean((found.total - truth) ** 2))))
         samples.append(asked)
     assert samples[1] > 2 * samples[0]

@@ -57,7 +57,7 @@ def test_an_object_is_baked_as_it_is_lit(tmp_path: Path, mirrored: bool) -> None
     arguments = ["bake", str(tmp_path / "f_####.drgsframe"), "--frames", "1-2", "--light", "diffuse", "--size", "32"]
     arguments += ["--object", "Plate", str(tmp_path / "v_####.npy")]
     arguments += ["--object", "Plate", str(tmp_path / "t_####.exr"), str(tmp_path / "uvs.npy")]
-    assert main([*arguments, "--rays", "64"]) == 0
+    assert main([*arguments, "--samples", "64"]) == 0
     first, second = (np.load(tmp_path / f"v_{n:04}.npy") for n in (1, 2))
     np.testing.assert_allclose(first[:, 0], [0.2, 0.2, 0.6, 0.6], rtol=0.03)
     np.testing.assert_allclose(second, 2 * first, rtol=0.03)

@@ -41,7 +41,7 @@ def test_no_launch_takes_long_whatever_points_cost(seconds: float, monkeypatch: 
     )  # fmt: skip
     slow = Timed(seconds, 30 * seconds, n // 2)
     monkeypatch.setattr(pipeline, "time", SimpleNamespace(perf_counter=lambda: slow.clock))
-    frame: Any = SimpleNamespace(settings=RenderSettings(samples=16), number=0)
+    frame: Any = SimpleNamespace(settings=RenderSettings(samples=16), noise_index=0)
     nothing: Any = None
     pipeline.Batches(nothing, nothing, None, None, frame, lambda: None, slow).trace(points, (0, 1))
     assert sum(slow.sizes) == n and max(slow.took) < 1.0

@@ -28,7 +28,7 @@ CYCLES = {
 @pytest.mark.parametrize("metallic, roughness", list(CYCLES))
 def test_diffuse_light_grows_with_the_base_colour_and_that_of_metals_ends_at_white(metallic, roughness):
     lamps = Lamps([light("sun", 0, 0, 0, tilt=0.3, power=1.0)])
-    sky, how = EnvironmentLight(World(strength=0.0)), settings(0, 0, 1, look="principled")
+    sky, how = EnvironmentLight(World(strength=0.0)), settings(0, 0, 1, shading_model="principled")
     found = [
         integrate(
             TraceScene(), sky, points(1, mu=1.0, albedo=a, roughness=roughness, metallic=metallic), how, 0, lamps

@@ -23,8 +23,8 @@ from drgs_blender.formats.splats import splats_of
 
 #: Floor (+Z) and wall (facing -X, at x = 1), n x n squares each.
 N = 12
-FORWARD = RenderSettings(samples=896, aa=1, bounces=1, look="principled", seed=99)
-FEW = RenderSettings(samples=192, aa=1, bounces=1, look="principled")
+FORWARD = RenderSettings(samples=896, subpixel_samples=1, bounces=1, shading_model="principled", seed=99)
+FEW = RenderSettings(samples=192, subpixel_samples=1, bounces=1, shading_model="principled")
 
 
 def sky() -> np.ndarray:

@@ -13,7 +13,7 @@ from drgs_blender.deform.binding import bind
 from drgs_blender.deform.mesh_driven import MeshDriven
 from drgs_blender.render.lights.environment import EnvironmentLight
 
-SETTINGS = RenderSettings(samples=256, aa=1, bounces=0, look="paper")
+SETTINGS = RenderSettings(samples=256, subpixel_samples=1, bounces=0, shading_model="paper")
 
 
 def plate(albedo: float = 0.6, flip: bool = False) -> Asset:

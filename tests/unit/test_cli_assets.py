@@ -130,9 +130,9 @@ def test_import_without_a_mesh_and_a_picture_of_it(tmp_path, capsys):
     assert report["counts"]["faces"] == 0 and report["counts"]["surfels"] == 400 and not report["bound"]
     camera = {"matrix_world": [[1, 0, 0, 0], [0, 0, -1, -4], [0, 1, 0, 0], [0, 0, 0, 1]], "fov_x": 40}
     (tmp_path / "c.json").write_text(json.dumps(camera | {"width": 16, "height": 16}))
-    picture = ["relight", str(out), "--camera", str(tmp_path / "c.json"), "--rays", "16", "--out", str(png)]
+    picture = ["relight", str(out), "--camera", str(tmp_path / "c.json"), "--samples", "16", "--out", str(png)]
     assert main(picture) != 0 and not png.exists()
-    assert main([*picture, "--tracer", "surfels", "--transparent"]) == 0
+    assert main([*picture, "--rays-see", "surfels", "--transparent"]) == 0
     pixels = np.asarray(Image.open(png))
     assert pixels[8, 8, 3] > 240 and 100 < pixels[8, 8, 0] < 255 and pixels[0, 0, 3] == 0
 

@@ -16,6 +16,7 @@ from drgs_blender.core.frame import Camera, Frame, Light, MeshState, ObjectState
 from drgs_blender.deform.binding import bind
 from drgs_blender.formats.harmonics import rotate_harmonics
 from drgs_blender.formats.registry import read_environment, read_mesh, read_surfels
+from drgs_blender.ipc import frame_file
 from drgs_blender.ipc.frame_file import read_frame_file, write_frame_file
 
 SQUARE = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
@@ -39,7 +40,7 @@ def plate(path: Path, albedo: float = 0.5, meshless: bool = False) -> Path:
 
 def frame_of(objects: list[ObjectState], **more: object) -> Frame:
     camera = Camera(np.eye(4), 8, 8, 8.0, 8.0, 4.0, 4.0)
-    settings = RenderSettings(bounces=0, look="paper")
+    settings = RenderSettings(bounces=0, shading_model="paper")
     return Frame(1, camera, objects, settings=more.pop("settings", settings), **more)  # type: ignore[arg-type]
 
 
@@ -53,6 +54,32 @@ def test_frame_files_keep_the_frame(tmp_path: Path) -> None:
     np.testing.assert_array_equal(back.objects[0].vertices, SQUARE)
     assert back.objects[0].asset == "//ball.drgs" and back.lights[0].power == 3 and back.settings == frame.settings
     np.testing.assert_array_equal(back.world.environment, frame.world.environment)
+
+
+KEPT = Path(__file__).parent / "kept"
+
+
+def test_frame_files_of_format_1_open(tmp_path: Path) -> None:
+    """Kept from before samples were one number and settings had the names of the panels."""
+    frame = read_frame_file(KEPT / "frame-1.drgsframe")
+    expected = RenderSettings(
+        samples=40, subpixel_samples=4, camera_sees="mesh", rays_see="surfels", shading_model="paper", denoise="svgf",
+        seed=3, noise_threshold=0.02,
+    )  # fmt: skip
+    assert frame.settings == expected and frame.noise_index == 7 and frame.history == "shot"
+    assert (frame.objects[0].adjustment.hue, frame.lights[0].power, frame.images[0].encoding) == (0.1, 20.0, "srgb")
+    strategies = read_frame_file(KEPT / "frame-1-strategies.drgsframe").settings
+    assert (strategies.strategy_samples, strategies.sample_count) == ((16, 8, 4), 28)
+    write_frame_file(tmp_path / "again.drgsframe", frame)
+    assert read_frame_file(tmp_path / "again.drgsframe").settings == expected
+
+
+def test_frame_files_of_a_later_format_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(frame_file, "FORMAT", 3)
+    write_frame_file(tmp_path / "a.drgsframe", frame_of([]))
+    monkeypatch.undo()
+    with pytest.raises(VersionError, match=r"has format 3.*Use a later DR-GS"):
+        read_frame_file(tmp_path / "a.drgsframe")
 
 
 def test_damaged_frame_files_are_refused(tmp_path: Path) -> None:
@@ -101,18 +128,18 @@ def test_objects_stand_where_their_matrices_put_them(tmp_path: Path) -> None:
     np.testing.assert_allclose(mesh.vertices.min(axis=0), [-2, -2, -6], atol=1e-5)
 
 
-@pytest.mark.parametrize("tracer", ["mesh", "surfels"])
-def test_the_light_of_the_scene_is_baked_with_its_lamps_and_shadows(tmp_path: Path, tracer: str) -> None:
+@pytest.mark.parametrize("rays_see", ["mesh", "surfels"])
+def test_the_light_of_the_scene_is_baked_with_its_lamps_and_shadows(tmp_path: Path, rays_see: str) -> None:
     """A sun from above of 1 W/m2 on a plate of albedo a leaves a / pi; half of it lies in the shadow of a mesh."""
-    asset = str(plate(tmp_path / "plate.drgs", 0.8, meshless=tracer == "surfels"))
-    settings = RenderSettings(bounces=0, look="paper", tracer=tracer)  # type: ignore[arg-type]
+    asset = str(plate(tmp_path / "plate.drgs", 0.8, meshless=rays_see == "surfels"))
+    settings = RenderSettings(bounces=0, shading_model="paper", rays_see=rays_see)  # type: ignore[arg-type]
     sun = Light("sun", "sun", np.eye(4), power=np.pi * 0.5)
     lid = MeshState("lid", SQUARE * [1, 2, 1] + np.float32([1, 0, 0.5]), FACES, np.eye(4)[None], np.zeros(1, np.int32))
     black = World(None, colour=(0.0, 0.0, 0.0))
     for name, meshes in (("open", []), ("half", [lid])):
         frame = frame_of([ObjectState("a", asset)], world=black, lights=[sun], meshes=meshes, settings=settings)
         write_frame_file(tmp_path / f"{name}.drgsframe", frame)
-        options = ["--as", "splats", "--colour", "relit", "--rays", "64"]
+        options = ["--as", "splats", "--colour", "relit", "--samples", "64"]
         assert main(["convert", str(tmp_path / f"{name}.drgsframe"), str(tmp_path / f"{name}.ply"), *options]) == 0
     surfels = [read_surfels(tmp_path / f"{name}.ply").surfels for name in ("open", "half")]
     lit = surfels[0].albedo.mean()

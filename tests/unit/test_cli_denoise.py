@@ -54,7 +54,7 @@ def rendered(tmp_path_factory: pytest.TempPathFactory):
     key = session.load_asset(folder / "ball.drgs")
     light = np.random.default_rng(7).uniform(0, 2, (16, 32, 3)).astype(np.float32)
 
-    def write(name: str, rays: int, frames: range) -> None:
+    def write(name: str, samples: int, frames: range) -> None:
         (folder / name).mkdir()
         for number in frames:
             side = 0.0 if number < CUT else 0.5
@@ -63,7 +63,7 @@ def rendered(tmp_path_factory: pytest.TempPathFactory):
                 seen(number, side),
                 [ObjectState("ball", key, placed(number))],
                 World(light),
-                RenderSettings(rays, rays, rays, aa=3, film_transparent=True),
+                RenderSettings(3 * samples, subpixel_samples=3, film_transparent=True),
                 TEMPORAL,
                 previous=Moment(seen(number - 1, side), [Pose("ball", placed(number - 1)[None])]),
             )

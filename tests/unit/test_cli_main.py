@@ -36,7 +36,7 @@ def test_help_shows_examples(command, capsys):
 def test_help_tells_the_default_that_counts(capsys):
     assert main(["evaluate", "--help"]) == 0
     text = capsys.readouterr().out
-    said = re.search(r"default\s+(\d+)", text[text.rindex("--rays RAYS") :])
+    said = re.search(r"default\s+(\d+)", text[text.rindex("--samples RAYS") :])
     given = build_parser().parse_args(["evaluate"])
     assert int(said[1]) == given.rays == 128
     assert sampling.override(RenderSettings(), given).rays == 128
@@ -65,8 +65,8 @@ def test_every_exit_code_has_a_class():
         [],
         ["nonsense"],
         ["relight"],
-        ["relight", "a.drgs", "--camera", "c.json", "--out", "o.exr", "--rays", "0"],
-        ["relight", "a.drgs", "--camera", "c.json", "--out", "o.exr", "--rays", "many"],
+        ["relight", "a.drgs", "--camera", "c.json", "--out", "o.exr", "--samples", "0"],
+        ["relight", "a.drgs", "--camera", "c.json", "--out", "o.exr", "--samples", "many"],
         ["relight", "a.drgs", "--camera", "c.json", "--out", "o.exr", "--passes", "Combined,Beauty"],
         ["relight", "a.drgs", "--camera", "c.json", "--out", "o.exr", "--env-strength", "nan"],
         ["relight", "a.drgs", "--camera", "no.json", "--out", "o.exr"],
@@ -187,16 +187,18 @@ def test_defaults_are_those_of_the_settings():
 
 
 def test_only_given_options_override_the_scene():
-    scene = RenderSettings(samples=6, bounces=4, aa=5, look="paper", film_transparent=True, seed=9)
+    scene = RenderSettings(
+        samples=6, bounces=4, subpixel_samples=5, shading_model="paper", film_transparent=True, seed=9
+    )
     assert sampling.override(scene, options([], False)) == scene
-    changed = sampling.override(scene, options(["--rays", "64", "--no-transparent"], False))
-    assert (changed.cosine, changed.ggx, changed.environment) == (32, 16, 16)
+    changed = sampling.override(scene, options(["--samples", "64", "--no-transparent"], False))
+    assert (changed.samples, changed.strategy_samples) == (64, None)
     assert (changed.film_transparent, changed.look, changed.seed, changed.bounces) == (False, "paper", 9, 4)
 
 
 def test_more_positions_than_rays_is_refused():
-    with pytest.raises(errors.UsageError, match="--aa"):
-        sampling.override(RenderSettings(), options(["--rays", "4", "--aa", "8"], True))
+    with pytest.raises(errors.UsageError, match="--subpixel-samples"):
+        sampling.override(RenderSettings(), options(["--samples", "4", "--subpixel-samples", "8"], True))
 
 
 def test_pass_names():

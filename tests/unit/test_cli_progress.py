@@ -98,7 +98,7 @@ class Engine:
 
 def test_kernels_do_not_count_as_time_of_a_frame(monkeypatch):
     monkeypatch.setattr(pictures.frame_store, "settings_hash", lambda frame, assets: "")
-    frame = SimpleNamespace(number=0)  # of the noise, as Animated Seed is off: it is not the one that is rendered
+    frame = SimpleNamespace(noise_index=0)  # of the noise, as Animated Seed is off: it is not the one that is rendered
     shot = pictures.Picture.__new__(pictures.Picture)
     shot._shot, shot.frame = SimpleNamespace(count=0, number=7), frame
     told = []

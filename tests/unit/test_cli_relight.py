@@ -60,7 +60,7 @@ def relight(folder: Path, tmp_path: Path):
     def relight(*options: str, asset: str = "lit.drgs") -> tuple[dict[str, np.ndarray], dict[str, str]]:
         out = tmp_path / "o.exr"
         arguments = ["relight", str(folder / asset), "--camera", str(folder / "front.json"), "--out", str(out)]
-        assert main([*arguments, "--rays", "16", *options]) == 0
+        assert main([*arguments, "--samples", "16", *options]) == 0
         return read_frame(out)
 
     return relight
@@ -100,7 +100,7 @@ def test_all_passes_are_written_with_their_channels(relight):
 
 
 def test_transparent_film_has_the_silhouette_as_alpha(relight):
-    alpha = relight("--transparent", "--primary", "mesh")[0]["Combined"][..., 3]
+    alpha = relight("--transparent", "--camera-sees", "mesh")[0]["Combined"][..., 3]
     opaque = relight()[0]["Combined"][..., 3]
     assert (opaque == 1).all()
     assert alpha[0, 0] == 0 and alpha[15, 20] == pytest.approx(1, abs=1e-3)
@@ -133,11 +133,11 @@ def test_a_simulation_poses_the_asset_frame_by_frame(relight, folder, tmp_path, 
     moved = rest * np.float32(0.8) + np.float32([0.2, 0, 0.1])
     cache.write(2, ParticleFrame(still.points, still.gradients, moved))
     np.save(tmp_path / "v.npy", moved)
-    expected, _ = relight("--vertices", str(tmp_path / "v.npy"), "--aa", "1")
-    one, _ = relight("--cache", str(cache.folder), "--frames", "2", "--aa", "1")
+    expected, _ = relight("--vertices", str(tmp_path / "v.npy"), "--subpixel-samples", "1")
+    one, _ = relight("--cache", str(cache.folder), "--frames", "2", "--subpixel-samples", "1")
     alpha = expected["Combined"][..., 3]
     assert np.abs(one["Combined"][..., 3] - alpha).max() < 0.3 and one["Combined"].shape == expected["Combined"].shape
-    common = ["relight", str(folder / "lit.drgs"), "--camera", str(folder / "front.json"), "--rays", "4"]
+    common = ["relight", str(folder / "lit.drgs"), "--camera", str(folder / "front.json"), "--samples", "4"]
     common += ["--cache", str(cache.folder)]
     assert main([*common, "--out", str(tmp_path / "all/##.exr")]) == 0
     sums = [read_frame(tmp_path / f"all/{k:02d}.exr")[0]["Combined"][..., :3].sum() for k in (1, 2)]
@@ -151,7 +151,7 @@ def test_a_simulation_poses_the_asset_frame_by_frame(relight, folder, tmp_path, 
 
 def test_mesh_and_surfels_show_the_same_object(relight):
     surfels, mesh = (
-        relight("--primary", p, "--passes", "Depth")[0]["Depth"][12:18, 17:23] for p in ("surfels", "mesh")
+        relight("--camera-sees", p, "--passes", "Depth")[0]["Depth"][12:18, 17:23] for p in ("surfels", "mesh")
     )
     np.testing.assert_allclose(surfels, mesh, atol=0.02)
 
@@ -159,7 +159,7 @@ def test_mesh_and_surfels_show_the_same_object(relight):
 def test_png_preview(folder, tmp_path):
     out = tmp_path / "o.png"
     arguments = ["relight", str(folder / "lit.drgs"), "--camera", str(folder / "front.json"), "--out", str(out)]
-    assert main([*arguments, "--rays", "4", "--transparent", "--primary", "mesh"]) == 0
+    assert main([*arguments, "--samples", "4", "--transparent", "--camera-sees", "mesh"]) == 0
     with Image.open(out) as picture:
         assert (picture.size, picture.mode) == ((40, 30), "RGBA")
         assert picture.getpixel((0, 0)) == (0, 0, 0, 0) and picture.getpixel((20, 15))[3] == 255
@@ -197,14 +197,14 @@ def damage_vertices(folder: Path) -> None:
 )
 def test_what_the_reader_of_the_light_noted_is_said(relight, tmp_path, capsys, make, said):
     write_exr(tmp_path / "e.exr", make().astype(np.float32))
-    relight("--env", str(tmp_path / "e.exr"), "--primary", "mesh")
+    relight("--env", str(tmp_path / "e.exr"), "--camera-sees", "mesh")
     said_of_it = capsys.readouterr().err
     assert "e.exr" in said_of_it and said in said_of_it
 
 
 def test_display_referred_light_is_said(relight, tmp_path, capsys):
     Image.new("RGB", (8, 4), "white").save(tmp_path / "e.png")
-    relight("--env", str(tmp_path / "e.png"), "--primary", "mesh")
+    relight("--env", str(tmp_path / "e.png"), "--camera-sees", "mesh")
     assert "display-referred" in capsys.readouterr().err
 
 
@@ -264,7 +264,7 @@ def test_relights_with_torch_blocked(folder, tmp_path):
     )
     out = tmp_path / "o.exr"
     arguments = ["relight", str(folder / "lit.drgs"), "--camera", str(folder / "front.json"), "--out", str(out)]
-    command = [sys.executable, "-c", program, *arguments, "--rays", "4", "--denoise", "svgf"]
+    command = [sys.executable, "-c", program, *arguments, "--samples", "4", "--denoise", "svgf"]
     result = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert result.returncode == 0, result.stderr
     assert np.isfinite(read_frame(out)[0]["Combined"]).all()

@@ -53,7 +53,7 @@ def column(path: Path) -> float:
 
 @pytest.mark.slow
 def test_renders_evaluated_frames_and_resumes(render, tmp_path):
-    options = ("--passes", "Coverage,Depth", "--primary", "mesh")
+    options = ("--passes", "Coverage,Depth", "--camera-sees", "mesh")
     code, lines, _ = render(*options)
     assert code == 0 and lines[-1] == "DRGS_EXIT class=ok"
     paths = [tmp_path / f"000{n}.exr" for n in (1, 2, 3)]
@@ -98,7 +98,7 @@ def test_blur_is_rendered_skipped_and_made_again(render, tmp_path):
     """The shutter is open over half a frame in which the tile moves, and the lens is wide."""
 
     def rendered(scene: str, word: str, *more: str) -> dict[str, np.ndarray]:
-        options = "--passes", "Coverage", "--primary", "mesh", "--filter-width", "0", *more
+        options = "--passes", "Coverage", "--camera-sees", "mesh", "--filter-width", "0", *more
         code, lines, errors = render(*options, scene=scene, frames="2")
         assert code == 0 and any(line.startswith(word) for line in lines), (lines, errors)
         assert not any(line.startswith("Note") for line in lines)
@@ -127,7 +127,7 @@ def test_every_view_layer_gets_a_file(render, tmp_path):
 
 
 def test_negative_frames_are_evaluated_where_they_are(render, tmp_path):
-    assert render("--passes", "Coverage", "--primary", "mesh", frames="-2,2,3")[0] == 0
+    assert render("--passes", "Coverage", "--camera-sees", "mesh", frames="-2,2,3")[0] == 0
     assert [p.name for p in sorted(tmp_path.iterdir())] == ["-0002.exr", "0002.exr", "0003.exr"]
     assert column(tmp_path / "-0002.exr") == pytest.approx(16, abs=0.05)
     assert column(tmp_path / "0002.exr") > 16.5
@@ -140,7 +140,7 @@ def test_job_that_is_killed_leaves_no_folder(folder, tmp_path):
     scratch.mkdir()
     process = subprocess.Popen(
         [sys.executable, "-m", "drgs_blender.cli.main", "render", str(folder / "shot.blend"), "--frames", "1-9",
-         "--out", str(tmp_path / "####.exr"), "--rays", "65536"],
+         "--out", str(tmp_path / "####.exr"), "--samples", "65536"],
         stdout=subprocess.PIPE, text=True, env=os.environ | {"TMPDIR": str(scratch)},
     )  # fmt: skip
     try:
@@ -203,7 +203,7 @@ def test_termination_leaves_nothing_behind(folder, tmp_path, how, code, word):
     scratch = tmp_path / "scratch"
     scratch.mkdir()
     command = [sys.executable, "-m", "drgs_blender.cli.main", "render", str(folder / "shot.blend"), "--frames", "1-9"]
-    command += ["--out", str(tmp_path / "####.exr"), "--rays", "65536"]
+    command += ["--out", str(tmp_path / "####.exr"), "--samples", "65536"]
     environment = os.environ | {"TMPDIR": str(scratch)}
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment, start_new_session=True)
     try:
@@ -237,10 +237,10 @@ def engines_of(process: subprocess.Popen) -> list[int]:
 @pytest.mark.parametrize(("deaths", "code"), [(1, 0), (2, 0), (3, 75)])
 def test_engine_killed_in_the_middle_of_a_frame_costs_no_pixel(render, folder, tmp_path, deaths, code):
     """Two engines may die of one frame; the third death gives the frame back to the farm."""
-    assert render("--rays", "2048", frames="1")[0] == 0
+    assert render("--samples", "2048", frames="1")[0] == 0
     (tmp_path / "0001.exr").rename(tmp_path / "calm.exr")
     command = [sys.executable, "-m", "drgs_blender.cli.main", "render", str(folder / "shot.blend"), "--frames", "1"]
-    command += ["--out", str(tmp_path / "####.exr"), "--rays", "2048"]
+    command += ["--out", str(tmp_path / "####.exr"), "--samples", "2048"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     killed: set[int] = set()
     try:
@@ -266,7 +266,7 @@ def test_engine_killed_in_the_middle_of_a_frame_costs_no_pixel(render, folder, t
 
 @pytest.mark.slow
 def test_a_frame_that_takes_too_long_is_given_back(render, tmp_path):
-    options = ("--rays", "65536", "--noise-threshold", "0", "--timeout", "4")
+    options = ("--samples", "65536", "--noise-threshold", "0", "--timeout", "4")
     code, lines, errors = render(*options, scene="large.blend", frames="1")
     assert (code, lines[-1]) == (75, "DRGS_EXIT class=retry") and "took longer than 4 s" in errors[-1]
     code, lines, errors = render("--enable-scripts", "--timeout", "6", scene="slow.blend", frames="1")

@@ -62,7 +62,7 @@ def passes():
     near = TraceObject("Ball", (vertices * 0.4 + [0.8, 0, 0]).astype(np.float32), faces, grey, one, one * 0)
     scene.update([near], [mesh], [])
     names = tuple(f"Crypto{of}{i:02}" for of in ("Object", "Material") for i in range(3))
-    settings = RenderSettings(samples=3, bounces=0, aa=16, primary="mesh", film_transparent=True)
+    settings = RenderSettings(samples=3, bounces=0, subpixel_samples=16, camera_sees="mesh", film_transparent=True)
     frame = Frame(
         1, look_along_y(), [ObjectState("Ball", "")], settings=settings, meshes=[mesh], passes=("Coverage", *names)
     )

@@ -79,7 +79,7 @@ def quadrature(
     return integrate_quadrature(EmptyTracer(), light, points, 128, look).sum(1)
 
 
-@pytest.mark.parametrize("look", ["principled", "paper"])
+@pytest.mark.parametrize("shading_model", ["principled", "paper"])
 def test_radiance_and_its_derivatives_match_the_reference(look):
     """Value, and derivatives by roughness, normal and light, against a quadrature that torch differentiates."""
     mesh, points, up = floor_points()
@@ -175,7 +175,7 @@ def test_shading_matches_the_renderer_where_the_mesh_shadows_itself():
         number, zero, np.ones(24, np.float32), origin, up, up, view, albedo, roughness.astype(np.float32),
         metallic.astype(np.float32), np.zeros(24, np.uint8), zero - 1, np.zeros(24, np.float32),
     )  # fmt: skip
-    settings = RenderSettings(samples=4096, bounces=0, aa=1)
+    settings = RenderSettings(samples=4096, bounces=0, subpixel_samples=1)
     theirs = kernel_integrate(scene, EnvironmentLight(World(image)), points, settings, 1).components.sum(1)
     # Next to the contact, rays that start a little higher see a little less.
     assert ours.numpy() == pytest.approx(theirs, rel=0.03, abs=0.006)
@@ -326,7 +326,7 @@ def test_specular_colours_and_back():
     assert metal == pytest.approx(metallic, abs=2e-3) and found == pytest.approx(albedo, abs=2e-3)
 
 
-@pytest.mark.parametrize("look", ["principled", "paper"])
+@pytest.mark.parametrize("shading_model", ["principled", "paper"])
 def test_dielectrics_are_surfaces_without_metal(look):
     mesh, points, up = floor_points()
     sums = torch.rand(len(up), 2, 4, 3, generator=torch.Generator().manual_seed(2))
@@ -391,7 +391,7 @@ def photographed(ball: Mesh) -> Capture:
     world = World(image.astype(np.float32))
     light, none, column = EnvironmentLight(world), np.empty((0, 3), np.float32), np.empty(0, np.float32)
     posed = PosedSurfels(none, none, none, none, column, none, column, column, np.empty(0, np.int32))
-    settings = RenderSettings(samples=128, bounces=0, primary="mesh", aa=4, film_transparent=True)
+    settings = RenderSettings(samples=128, bounces=0, camera_sees="mesh", subpixel_samples=4, film_transparent=True)
     views = []
     for k in range(14):
         camera = camera_at(2.4 * k, -0.6 + 0.12 * k, 32)
@@ -635,7 +635,13 @@ def test_a_checkpoint_of_other_normals_is_not_gone_on_from(ball, capture, tmp_pa
 
 
 def test_bad_input_is_named(ball, capture):
-    for wrong in ({"iterations": 0}, {"cosine": 3}, {"environment": 24}, {"smoothness": -1.0}, {"look": "flat"}):
+    for wrong in (
+        {"iterations": 0},
+        {"cosine": 3},
+        {"environment": 24},
+        {"smoothness": -1.0},
+        {"shading_model": "flat"},
+    ):
         with pytest.raises(UsageError, match=next(iter(wrong))):
             decouple(capture, ball, replace(SMALL, **wrong))
     with pytest.raises(UsageError, match="no training view"):

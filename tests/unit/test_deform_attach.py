@@ -36,7 +36,7 @@ def coverage(mesh: Mesh, surfels, binding, size: int = 512) -> np.ndarray:
     matrix[:3, 3] = (5, 0, 0)
     camera = Camera(matrix, size, size, size / 3, size / 3, size / 2, size / 2, orthographic=True)
     posed = MeshDriven(mesh, surfels, binding).pose(mesh.vertices)
-    settings = RenderSettings(aa=4)
+    settings = RenderSettings(subpixel_samples=4)
     return rasterise(prepare(posed, camera, camera_parameters(camera, settings, 0)), 0, size).alpha.mean(axis=-1)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drgs_blender.core.frame import Camera, Frame, ObjectState, RenderSettings, World, split_rays
+from drgs_blender.core.frame import Camera, Frame, ObjectState, RenderSettings, World
 from drgs_blender.render import pipeline
 from drgs_blender.render.denoise.demodulation import demodulate
 from drgs_blender.render.denoise.svgf_spatial import denoise
@@ -231,12 +231,13 @@ def exposed(monkeypatch: pytest.MonkeyPatch, rays: int, seed: int) -> Film:
             films.append(self)
 
     monkeypatch.setattr(pipeline, "Film", Kept)
-    cosine, ggx, environment = split_rays(rays)
     frame = Frame(
         1,
         Camera(matrix, 96, 80, 110.0, 110.0, 48.0, 40.0),
         [ObjectState("ball", "a"), ObjectState("floor", "a")],
-        settings=RenderSettings(cosine, ggx, environment, 1, aa=4, primary="mesh", seed=seed, split="counts"),
+        settings=RenderSettings(
+            strategy_samples=(rays // 2, rays // 4, rays // 4), subpixel_samples=4, camera_sees="mesh", seed=seed
+        ),
     )
     pipeline.render(scene(), EnvironmentLight(World(environment=sky)), None, frame)  # type: ignore[arg-type]
     return films[0]

@@ -56,7 +56,7 @@ SCENES = {"among meshes": among_meshes, "unseen": unseen}
 
 
 def seen(by: Processor, scene: TraceScene, camera: Camera, rows: tuple[int, int] = (0, 48)) -> GBuffer:
-    parameters = camera_parameters(camera, RenderSettings(aa=3, seed=5), 2)
+    parameters = camera_parameters(camera, RenderSettings(subpixel_samples=3, seed=5), 2)
     return primary_mesh(scene, camera, parameters, *rows, by.trace, by.shade)
 
 
@@ -106,7 +106,7 @@ def test_meshes_behind_surfels_leave_the_surfels_as_they_are(device: OnDevice) -
     """Only the points of meshes are filled."""
     scene, camera = scene_of(sphere_mesh(3)), look_along_y(48, 40)
     scene.update([scene._parts[0].item], [floor(placed(0, 0, -0.4), name="ground")])
-    parameters, windows = camera_parameters(camera, RenderSettings(aa=2), 1), snap_windows(scene, 1)
+    parameters, windows = camera_parameters(camera, RenderSettings(subpixel_samples=2), 1), snap_windows(scene, 1)
     posed = sphere_surfels(1.05)
     here, there = (
         primary_surfels(
@@ -127,7 +127,7 @@ def test_meshes_behind_surfels_leave_the_surfels_as_they_are(device: OnDevice) -
 def test_a_card_that_fails_between_hits_and_points_leaves_them_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     device, scene, camera = OnDevice("cpu"), among_meshes()[0], VIEWS["perspective"]
     expected = seen(HERE, scene, camera)
-    parameters = camera_parameters(camera, RenderSettings(aa=3, seed=5), 2)
+    parameters = camera_parameters(camera, RenderSettings(subpixel_samples=3, seed=5), 2)
     trace = device.trace
 
     def broken(*arguments: object) -> None:
@@ -152,7 +152,7 @@ def test_a_card_that_fails_between_hits_and_points_leaves_them_whole(monkeypatch
 def test_points_whose_hits_are_lost_and_not_found_again_are_on_some_face(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where a device met the edge of a face, the processor's ray may go past."""
     device, scene, camera = OnDevice("cpu"), among_meshes()[0], VIEWS["perspective"]
-    parameters = camera_parameters(camera, RenderSettings(aa=3, seed=5), 2)
+    parameters = camera_parameters(camera, RenderSettings(subpixel_samples=3, seed=5), 2)
 
     def lost(*arguments: object) -> object:
         hits = device.trace(*arguments)  # type: ignore[arg-type]

@@ -23,7 +23,7 @@ from drgs_blender.render.points import CATCHER, Radiance, ShadingPoints
 from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene
 
 BALL = trimesh.creation.icosphere(subdivisions=3)
-SETTINGS = RenderSettings(samples=16, bounces=3, aa=2)
+SETTINGS = RenderSettings(samples=16, bounces=3, subpixel_samples=2)
 DARK = EnvironmentLight(World(colour=(0.0, 0.0, 0.0)))
 
 
@@ -175,11 +175,11 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
     return float(-10 * np.log10(max(error, 1e-20)))
 
 
-@pytest.mark.parametrize("look", ["paper", "principled"])
+@pytest.mark.parametrize("shading_model", ["paper", "principled"])
 @pytest.mark.parametrize("name", SCENES)
 def test_a_device_finds_the_light_that_the_processor_finds(device: OnDevice, name: str, look: str) -> None:
     scene = SCENES[name]()
-    here, there = both(device, scene, replace(SETTINGS, look=look))
+    here, there = both(device, scene, replace(SETTINGS, shading_model=look))
     assert here.total.max() > 0.1
     assert psnr(here.total, there.total) > 60.0
     # Nearly all samples agree to rounding; a ray along an edge may meet the other face.
@@ -192,7 +192,7 @@ def test_a_device_finds_the_light_that_the_processor_finds(device: OnDevice, nam
 
 
 @pytest.mark.parametrize("settings", [
-    replace(SETTINGS, split="counts", bounces=0), replace(SETTINGS, bounces=8, clamp_indirect=0.5),
+    replace(SETTINGS, strategy_samples=(5, 5, 6), bounces=0), replace(SETTINGS, bounces=8, clamp_indirect=0.5),
     replace(SETTINGS, strategy_samples=(0, 0, 8)),
 ])  # fmt: skip
 def test_settings_mean_the_same_on_a_device(device: OnDevice, settings: RenderSettings) -> None:
@@ -261,7 +261,7 @@ def test_a_device_that_fails_is_left_alone_and_its_work_done_here(device: OnDevi
 def test_surfels_as_tracer_are_left_to_the_processor(device: OnDevice) -> None:
     devices = Devices()
     devices._known["cuda"] = device
-    (warning,) = devices.warnings(replace(SETTINGS, device="cuda", tracer="surfels"))
+    (warning,) = devices.warnings(replace(SETTINGS, device="cuda", rays_see="surfels"))
     assert "surfels" in warning
 
 

@@ -32,7 +32,7 @@ def both(
 ) -> tuple[SurfelSamples, SurfelSamples]:
     posed, view = SCENES[name]
     camera = look_along_y(40, 30, **view)
-    given = posed, camera, camera_parameters(camera, RenderSettings(aa=3, seed=5, filter_width=width), 2)
+    given = posed, camera, camera_parameters(camera, RenderSettings(subpixel_samples=3, seed=5, filter_width=width), 2)
     return rasterise(prepare(*given), *rows), device.rasterise(device.prepare(*given), *rows)
 
 
@@ -59,7 +59,7 @@ def test_fog_of_any_depth_is_blended_in_exact_order(device: OnDevice) -> None:
     """More contributions a sample than a list holds: the list is filled again."""
     fog = join(*(plane_of_surfels(0.05 * i, 0.3, 0.05, 0.05, opacity=0.012) for i in range(16)))
     camera = look_along_y(12, 12, focal=30.0)
-    splats = prepare(fog, camera, camera_parameters(camera, RenderSettings(aa=1), 0))
+    splats = prepare(fog, camera, camera_parameters(camera, RenderSettings(subpixel_samples=1), 0))
     here, there = rasterise(splats, 0, 12), device.rasterise(splats, 0, 12)
     assert 0.5 < here.alpha.max() < 0.999
     assert len(splats.tile_list) / len(splats.tile_start) > 10 * device_raster.MOST
@@ -79,7 +79,7 @@ def test_points_are_tied_to_the_mesh_as_the_processor_ties_them(device: OnDevice
     kept = scene_of(sphere_mesh(3))._parts[0].item
     ordinary = MeshState("wall", wall, np.int32([[0, 1, 2], [0, 2, 3]]), np.eye(4)[None], np.zeros(1, np.int32))
     scene.update([kept], [ordinary])
-    parameters = camera_parameters(camera, RenderSettings(aa=2), 1)
+    parameters = camera_parameters(camera, RenderSettings(subpixel_samples=2), 1)
     posed, windows = sphere_surfels(1 + offset), snap_windows(scene, 1)
     here, there = (
         primary_surfels(
@@ -104,7 +104,7 @@ def test_blended_samples_are_not_copied_to_a_card_again(monkeypatch: pytest.Monk
     monkeypatch.setattr(
         device.launcher, "array", lambda array, *more, **how: copied.append(array) or copy(array, *more, **how)
     )
-    parameters, windows = camera_parameters(camera, RenderSettings(aa=2), 1), snap_windows(scene, 1)
+    parameters, windows = camera_parameters(camera, RenderSettings(subpixel_samples=2), 1), snap_windows(scene, 1)
     splats = device.prepare(sphere_surfels(1.0), camera, parameters)
     given, samples = (scene, windows, camera, 0, 40, True), []
 

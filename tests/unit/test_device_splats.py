@@ -23,7 +23,7 @@ CAMERA = look_along_y(75, 50)
 
 
 def both(device: OnDevice, posed: PosedSurfels, camera: Camera = CAMERA) -> tuple[Splats, Splats]:
-    parameters = camera_parameters(camera, RenderSettings(aa=3, seed=5), 2)
+    parameters = camera_parameters(camera, RenderSettings(subpixel_samples=3, seed=5), 2)
     return tuple(by(posed, camera, parameters) for by in (prepare, device.prepare))  # type: ignore[return-value]
 
 

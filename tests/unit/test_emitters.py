@@ -99,7 +99,7 @@ def light_of(
     """Mean light of a point by kind, (4, 3), and its standard error."""
     scene = scene_of(*meshes, images=images)
     seen = points(count, **({"albedo": 0.8, "roughness": 0.4, "origin": (0.3, 0.1, 0.0)} | changes))  # type: ignore[arg-type]
-    how = settings(*counts, bounces=bounces, look="principled")
+    how = settings(*counts, bounces=bounces, shading_model="principled")
     lamps = Lamps(list(lights), np.zeros(3), 3.0, Emitters(scene) if sampled else None)
     found = integrate(scene, EnvironmentLight(World(strength=strength)), seen, how, 0, lamps).components.astype(float)
     return found.mean(0), found.std(0) / math.sqrt(count)

@@ -100,7 +100,15 @@ def keys_of(report: object) -> set[str]:
 @pytest.mark.slow
 def test_the_true_object_scores_as_true(scenes, tmp_path, capsys):
     write_asset(tmp_path / "true.drgs", true_asset(scenes / "spot", density=20.0))
-    arguments = ["evaluate", str(tmp_path / "true.drgs"), str(scenes / "spot"), "--primary", "mesh", "--rays", "64"]
+    arguments = [
+        "evaluate",
+        str(tmp_path / "true.drgs"),
+        str(scenes / "spot"),
+        "--camera-sees",
+        "mesh",
+        "--samples",
+        "64",
+    ]
     assert main([*arguments, "--json", "--pictures", str(tmp_path / "pictures")]) == 0
     report = json.loads(capsys.readouterr().out)
     page = (ROOT / "docs" / "command-line.md").read_text(encoding="utf-8")

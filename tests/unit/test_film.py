@@ -22,7 +22,7 @@ def camera(**more: object) -> Camera:
 
 
 def strip(view: Camera, settings: RenderSettings, rows: tuple[int, int], alpha: np.ndarray, seed: int = 0) -> GBuffer:
-    """A G-buffer with random contents and the given coverage (rows, width, aa)."""
+    """A G-buffer with random contents and the given coverage (rows, width, subpixels)."""
     rng = np.random.default_rng(seed)
     buffer = compact(alpha.astype(np.float32), camera_parameters(view, settings, 1), view.window[0], rows[0])
     points, n = buffer.points, len(buffer.points)
@@ -44,7 +44,7 @@ def expose(
     alpha: np.ndarray, transparent: bool, world: World | None = None, view: Camera | None = None
 ) -> tuple[Film, GBuffer, Radiance]:
     view = view or camera()
-    settings = RenderSettings(aa=AA, film_transparent=transparent)
+    settings = RenderSettings(subpixel_samples=AA, film_transparent=transparent)
     film = Film(view, settings, camera_parameters(view, settings, 1))
     buffer = strip(view, settings, (view.window[1], view.window[3]), alpha)
     light = random_light(len(buffer.points))
@@ -111,7 +111,7 @@ def test_surface_passes_have_no_dark_rim_and_no_holes() -> None:
 
 
 def test_depth_and_index_at_an_edge_are_of_the_nearest_surface() -> None:
-    view, settings = camera(), RenderSettings(aa=AA, film_transparent=True)
+    view, settings = camera(), RenderSettings(subpixel_samples=AA, film_transparent=True)
     film = Film(view, settings, camera_parameters(view, settings, 1))
     alpha = np.ones((10, 12, AA))
     buffer = strip(view, settings, (0, 10), alpha)
@@ -131,7 +131,7 @@ def test_background_is_the_mean_over_the_sub_pixel_rays() -> None:
     alpha = some_coverage()[:6, :6]
     film, _, _ = expose(alpha, False, world, view)
     light = EnvironmentLight(world)
-    parameters = camera_parameters(view, RenderSettings(aa=AA), 1)
+    parameters = camera_parameters(view, RenderSettings(subpixel_samples=AA), 1)
     expected = np.zeros((6, 6, 3))
     for y, x, k in np.ndindex(6, 6, AA):
         direction = np.array(sample_ray(parameters, (2 + y) * 12 + 3 + x, k))[3:]

@@ -356,7 +356,7 @@ def test_convert_bakes_the_light_of_an_environment(tmp_path: Path) -> None:
     asset.surfels.roughness[:] = 1
     asset.environment = Environment(np.full((8, 16, 3), 0.5))
     write_asset(tmp_path / "a.drgs", asset)
-    options = ["--colour", "relit", "--rays", "64"]
+    options = ["--colour", "relit", "--samples", "64"]
     assert main(["convert", str(tmp_path / "a.drgs"), str(tmp_path / "b.ply"), *options]) == 0
     seen = read_surfels(tmp_path / "b.ply").surfels
     assert seen.sh is not None and seen.sh.shape[1] == 1

@@ -49,7 +49,7 @@ def total(meshes: list[MeshState], lights: list[Light], bounces: int, strength: 
     scene.update([], meshes)
     seen = points(4000, albedo=0.8, roughness=0.4, origin=(0.3, 0.1, 0.0))
     light = EnvironmentLight(World(strength=strength))
-    how = settings(16, 8, 8, bounces=bounces, look="principled")
+    how = settings(16, 8, 8, bounces=bounces, shading_model="principled")
     lamps = Lamps(lights, emitters=Emitters(scene))
     found = integrate(scene, light, seen, how, 0, lamps).components.astype(float)
     return found.mean(0), found.std(0) / math.sqrt(len(found))

@@ -22,8 +22,13 @@ from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene
 WHITE = EnvironmentLight(World())
 
 
-def settings(cosine: int = 0, ggx: int = 0, environment: int = 0, **changes: object) -> RenderSettings:
-    return replace(RenderSettings(cosine, ggx, environment, split="counts", bounces=0, aa=1, look="paper"), **changes)  # type: ignore[arg-type]
+def settings(
+    cosine: int = 0, ggx: int = 0, environment: int = 0, *, auto: bool = False, **changes: object
+) -> RenderSettings:
+    """As many samples of each strategy, or (`auto`) as many in all."""
+    counts = None if auto else (cosine, ggx, environment)
+    plain = RenderSettings(cosine + ggx + environment, counts, 0, subpixel_samples=1, shading_model="paper")
+    return replace(plain, **changes)  # type: ignore[arg-type]
 
 
 def points(
@@ -84,10 +89,10 @@ def test_white_furnace_of_the_diffuse_lobe_is_exact() -> None:
     np.testing.assert_array_equal(result.components[:, DIFFUSE_INDIRECT], 0.0)
 
 
-@pytest.mark.parametrize("look", ["paper", "principled"])
+@pytest.mark.parametrize("shading_model", ["paper", "principled"])
 def test_metals_have_no_diffuse_light_to_the_rounding_of_interpolation(look: str) -> None:
     for metallic in np.nextafter(np.float32(1), np.float32([0, 1, 2])):
-        result = integrate(EMPTY, WHITE, points(20, metallic=metallic), settings(8, 8, 8, look=look), 0)
+        result = integrate(EMPTY, WHITE, points(20, metallic=metallic), settings(8, 8, 8, shading_model=look), 0)
         assert not result.components[:, :2].any() and result.components[:, 2].min() > 0
 
 
@@ -121,14 +126,14 @@ def directional_albedo(mu: float, roughness: float, metallic: float, look: str) 
     return float((fresnel * g * vh / (mu * cos)).sum() / (2000 * 720))
 
 
-@pytest.mark.parametrize("look", ["paper", "principled"])
+@pytest.mark.parametrize("shading_model", ["paper", "principled"])
 @pytest.mark.parametrize("roughness", [0.05, 0.3, 1.0])
 @pytest.mark.parametrize(("mu", "metallic"), [(0.9, 1.0), (0.3, 1.0), (0.3, 0.0), (0.7, 0.4)])
 def test_the_glossy_lobe_reflects_its_directional_albedo(
     look: str, roughness: float, mu: float, metallic: float
 ) -> None:
     seen = points(400, mu=mu, roughness=roughness, metallic=metallic)
-    found = integrate(EMPTY, WHITE, seen, settings(ggx=64, look=look), 0).components[:, 2].mean(axis=1)
+    found = integrate(EMPTY, WHITE, seen, settings(ggx=64, shading_model=look), 0).components[:, 2].mean(axis=1)
     expected = directional_albedo(mu, roughness, metallic, look)
     assert expected <= 1.0001
     assert found.mean() == pytest.approx(expected, abs=4 * float(found.std()) / 20 + 1e-3)
@@ -148,17 +153,19 @@ CYCLES = {
 def test_the_layer_takes_what_it_takes_in_cycles(roughness: float) -> None:
     for mu, taken in zip((0.2053, 0.4994, 0.9), CYCLES[roughness], strict=True):
         seen = points(50, mu=mu, roughness=roughness)
-        found = integrate(EMPTY, WHITE, seen, settings(cosine=16, look="principled"), 0).components[:, DIFFUSE_DIRECT]
+        found = integrate(EMPTY, WHITE, seen, settings(cosine=16, shading_model="principled"), 0).components[
+            :, DIFFUSE_DIRECT
+        ]
         np.testing.assert_allclose(1 - found, taken, atol=8e-4)
 
 
-@pytest.mark.parametrize("look", ["paper", "principled"])
+@pytest.mark.parametrize("shading_model", ["paper", "principled"])
 def test_nothing_reflects_more_than_it_receives(look: str) -> None:
     for mu in (0.15, 0.5, 0.95):
         for roughness in (0.05, 0.4, 0.9):
             for metallic in (0.0, 1.0):
                 seen = points(200, mu=mu, roughness=roughness, metallic=metallic)
-                total = integrate(EMPTY, WHITE, seen, settings(16, 32, 0, look=look), 0).total.mean()
+                total = integrate(EMPTY, WHITE, seen, settings(16, 32, 0, shading_model=look), 0).total.mean()
                 limit = (
                     1.01 if look == "principled" or metallic == 1 else 1 + directional_albedo(mu, roughness, 0, look)
                 )
@@ -175,7 +182,7 @@ def agreement(scene: TraceScene, light: EnvironmentLight, seen: ShadingPoints, a
     return np.abs(first.mean(axis=0) - second.mean(axis=0)) / (error + 1e-6)
 
 
-@pytest.mark.parametrize("look", ["paper", "principled"])
+@pytest.mark.parametrize("shading_model", ["paper", "principled"])
 @pytest.mark.parametrize(
     "alone", [{"cosine": 64}, {"ggx": 64}, {"environment": 64}], ids=["cosine", "ggx", "environment"]
 )
@@ -184,8 +191,8 @@ def test_each_strategy_alone_agrees_with_all_together(alone: dict, look: str) ->
     scene = scene_of((ball.vertices * 0.8 + [1.0, 0.4, 1.0], ball.faces), metallic=0.3)
     light = EnvironmentLight(World(environment=sun_picture()))
     seen = points(3000, albedo=0.7, roughness=0.55, metallic=0.4)
-    together = settings(32, 16, 16, bounces=2, look=look)
-    found = agreement(scene, light, seen, settings(**alone, bounces=2, look=look), together)
+    together = settings(32, 16, 16, bounces=2, shading_model=look)
+    found = agreement(scene, light, seen, settings(**alone, bounces=2, shading_model=look), together)
     # Samples of the environment are shadow rays: they bring no light of surfaces.
     direct = [DIFFUSE_DIRECT, GLOSSY_DIRECT]
     assert (found[direct if "environment" in alone else slice(None)] < 4.5).all()
@@ -201,15 +208,21 @@ def test_a_shiny_surface_sees_the_sun_by_any_strategy() -> None:
 
 @pytest.mark.parametrize("counts", [(6, 0, 0), (1, 0, 0), (7, 3, 5), (16, 8, 8)])
 def test_sub_samples_share_the_pixels_samples(counts: tuple[int, int, int]) -> None:
-    aa, pixels = 4, 200
-    seen = points(aa * pixels, mu=0.99, metallic=0.0)
-    seen = replace(seen, pixel=np.repeat(np.arange(pixels), aa), sample=np.tile(np.arange(aa), pixels))
+    subpixels, pixels = 4, 200
+    seen = points(subpixels * pixels, mu=0.99, metallic=0.0)
+    seen = replace(seen, pixel=np.repeat(np.arange(pixels), subpixels), sample=np.tile(np.arange(subpixels), pixels))
     # Where the light is constant, each cosine sample of a diffuse surface gives exactly the same.
-    found = integrate(EMPTY, WHITE, seen, settings(counts[0], aa=aa), 0).components[:, DIFFUSE_DIRECT, 0]
-    np.testing.assert_allclose(found.reshape(pixels, aa).mean(axis=1), 1.0, atol=1e-4)
-    assert found.reshape(pixels, aa).mean(axis=0) == pytest.approx(np.ones(aa), abs=0.45)
+    found = integrate(EMPTY, WHITE, seen, settings(counts[0], subpixel_samples=subpixels), 0).components[
+        :, DIFFUSE_DIRECT, 0
+    ]
+    np.testing.assert_allclose(found.reshape(pixels, subpixels).mean(axis=1), 1.0, atol=1e-4)
+    assert found.reshape(pixels, subpixels).mean(axis=0) == pytest.approx(np.ones(subpixels), abs=0.45)
     light = EnvironmentLight(World(environment=sun_picture()))
-    split = luminance(integrate(EMPTY, light, seen, settings(*counts, aa=aa), 0)).reshape(pixels, aa).mean(axis=1)
+    split = (
+        luminance(integrate(EMPTY, light, seen, settings(*counts, subpixel_samples=subpixels), 0))
+        .reshape(pixels, subpixels)
+        .mean(axis=1)
+    )
     whole = luminance(integrate(EMPTY, light, points(pixels, mu=0.99), settings(64, 16, 64), 0))
     assert split.mean() == pytest.approx(whole.mean(), abs=4 * float(split.std()) / np.sqrt(pixels) + 0.01)
 
@@ -251,12 +264,12 @@ def test_many_bounces_lie_between_the_series_and_the_furnace(bounces: int) -> No
     assert series[0] - error < diffuse.mean() < series[1] + error
 
 
-@pytest.mark.parametrize("look", ["paper", "principled"])
+@pytest.mark.parametrize("shading_model", ["paper", "principled"])
 def test_a_furnace_of_mirrors_keeps_its_light(look: str) -> None:
     """White metal of low roughness loses next to nothing: under a white sky everything looks white, at any bounce."""
     scene = scene_of(corner(), albedo=1.0, roughness=0.1, metallic=1.0)
     seen = points(3000, origin=(3, 0, 0), albedo=1.0, roughness=0.1, metallic=1.0)
-    total = luminance(integrate(scene, WHITE, seen, settings(0, 16, 8, bounces=8, look=look), 0))
+    total = luminance(integrate(scene, WHITE, seen, settings(0, 16, 8, bounces=8, shading_model=look), 0))
     assert total.mean() == pytest.approx(1.0, abs=0.01)
 
 
@@ -335,7 +348,7 @@ def busy() -> tuple[TraceScene, EnvironmentLight, ShadingPoints, RenderSettings]
     light = EnvironmentLight(World(environment=sun_picture()))
     seen = points(3000, albedo=0.7, metallic=0.4)
     seen = replace(seen, pixel=np.arange(3000) // 4, sample=np.arange(3000) % 4)
-    return scene, light, seen, settings(7, 4, 4, bounces=5, aa=4)
+    return scene, light, seen, settings(7, 4, 4, bounces=5, subpixel_samples=4)
 
 
 @pytest.mark.alone
@@ -401,7 +414,7 @@ def test_no_fault_of_the_input_reaches_a_pixel() -> None:
     seen.normal[30], seen.geometric_normal[31], seen.view[32] = 0.0, 0.0, 0.0
     seen.view[33] = [0, 0, -1]
     for look in ("paper", "principled"):
-        result = integrate(scene, light, seen, settings(8, 8, 8, bounces=4, look=look), 0)
+        result = integrate(scene, light, seen, settings(8, 8, 8, bounces=4, shading_model=look), 0)
         assert np.isfinite(result.components).all() and (result.components >= 0).all()
         assert np.isfinite(result.variance).all() and (result.variance >= 0).all()
         assert not result.components[:21].reshape(7, 3, -1)[:, :2].any()
@@ -415,7 +428,9 @@ def test_nothing_to_do_is_done() -> None:
     assert integrate(EMPTY, WHITE, points(0), settings(4), 0).components.shape == (0, 4, 3)
 
 
-@pytest.mark.parametrize("wrong", [{"cosine": -1}, {"bounces": -1}, {"aa": -1}, {"look": "toon"}])
+@pytest.mark.parametrize(
+    "wrong", [{"cosine": -1}, {"bounces": -1}, {"subpixel_samples": -1}, {"shading_model": "toon"}]
+)
 def test_settings_that_make_no_sense_are_refused(wrong: dict) -> None:
     with pytest.raises(UsageError, match="render settings"):
         integrate(EMPTY, WHITE, points(1), replace(settings(4), **wrong), 0)
@@ -450,9 +465,9 @@ def test_every_strategy_finds_the_same_lamp(strategies: dict) -> None:
     assert values.std() / 20 < 0.02 * expected
 
 
-@pytest.mark.parametrize("split", ["counts", "auto"])
-def test_sky_and_lamps_share_the_light_samples_without_bias(split: str) -> None:
-    sky, counts = EnvironmentLight(World(sun_picture())), settings(cosine=16, ggx=16, environment=64, split=split)
+@pytest.mark.parametrize("auto", [False, True])
+def test_sky_and_lamps_share_the_light_samples_without_bias(auto: bool) -> None:
+    sky, counts = EnvironmentLight(World(sun_picture())), settings(cosine=16, ggx=16, environment=64, auto=auto)
     some = points(3000, albedo=0.7, roughness=0.3)
     together, alone, lamps = (
         luminance(integrate(EMPTY, light, some, counts, 8, lamp))
@@ -486,10 +501,10 @@ def test_mirrors_reflect_lamps_that_only_lamp_samples_find(changes: dict, rays: 
     matrix[:3, 1] = np.cross(mirrored, matrix[:3, 0])
     lamps = Lamps([replace(Light("lamp", "area", matrix, power=30.0), **changes)], radius=1.0)  # type: ignore[arg-type]
     found = {}
-    for split, counts in (("counts", (16, 8, 64)), ("auto", rays)):
-        value = luminance(integrate(EMPTY, DARK, some, settings(*counts, split=split), 0, lamps)).astype(float)
-        found[split] = value.mean(), value.std() / 20
-    (whole, a), (allotted, b) = found["counts"], found["auto"]
+    for auto, counts in ((False, (16, 8, 64)), (True, rays)):
+        value = luminance(integrate(EMPTY, DARK, some, settings(*counts, auto=auto), 0, lamps)).astype(float)
+        found[auto] = value.mean(), value.std() / 20
+    (whole, a), (allotted, b) = found[False], found[True]
     assert whole > 1.0 and abs(allotted - whole) < 4.5 * np.hypot(a, b) + 1e-3 * whole
 
 
@@ -518,7 +533,7 @@ def test_the_clamp_is_the_same_in_parts() -> None:
     """A part of a position's samples is less than one sample, of which each weighs the more."""
     box = trimesh.creation.box((4, 4, 4))
     inside = scene_of((np.asarray(box.vertices), np.asarray(box.faces)[:10]), albedo=0.9)
-    counts = settings(cosine=16, environment=16, bounces=2, aa=16, clamp_indirect=0.05)
+    counts = settings(cosine=16, environment=16, bounces=2, subpixel_samples=16, clamp_indirect=0.05)
     some = replace(points(320), pixel=np.arange(320) // 16, sample=np.arange(320) % 16)
     sky = EnvironmentLight(World(sun_picture()))
     whole = integrate(inside, sky, some, counts, 0).components
@@ -539,10 +554,10 @@ def test_samples_are_allotted_where_they_tell_most(changes: dict, gain: float) -
     """The spread of pixels under a sky with a bright spot, next to that with the paper's 16 + 8 + 8."""
     sky, some = EnvironmentLight(World(sun_picture())), points(1000, albedo=0.7, **changes)
     spread = {}
-    for split in ("counts", "auto"):
-        value = luminance(integrate(EMPTY, sky, some, settings(16, 8, 8, split=split, look="principled"), 0))
-        spread[split] = value.var()
-    assert spread["counts"] > gain * spread["auto"]
+    for auto in (False, True):
+        value = luminance(integrate(EMPTY, sky, some, settings(16, 8, 8, auto=auto, shading_model="principled"), 0))
+        spread[auto] = value.var()
+    assert spread[False] > gain * spread[True]
 
 
 def test_points_of_a_pixel_agree_on_their_samples() -> None:
@@ -570,14 +585,14 @@ def test_no_bit_depends_on_the_neighbours_where_batches_overflow() -> None:
         np.testing.assert_array_equal(cut.variance, whole.variance[first:last])
 
 
-@pytest.mark.parametrize("aa", [1, 4, 16, 32])
-def test_the_variance_of_a_pixel_does_not_depend_on_its_positions(aa: int) -> None:
+@pytest.mark.parametrize("subpixel_samples", [1, 4, 16, 32])
+def test_the_variance_of_a_pixel_does_not_depend_on_its_positions(subpixels: int) -> None:
     """Points of few samples, of one at last, are estimated together with those of their pixel."""
     pixels = 400
     sky = EnvironmentLight(World(np.random.default_rng(3).random((8, 16, 3)).astype(np.float32) ** 4))
-    seen = points(aa * pixels, mu=0.8, metallic=0.0)
-    seen = replace(seen, pixel=np.repeat(np.arange(pixels), aa), sample=np.tile(np.arange(aa), pixels))
-    found = integrate(EMPTY, sky, seen, RenderSettings(bounces=0, aa=aa), 0)
-    light = (found.components.sum(axis=1) @ LUMINANCE).reshape(pixels, aa).mean(axis=1)
-    estimated = found.variance.sum(axis=1).reshape(pixels, aa).sum(axis=1).mean() / aa**2
+    seen = points(subpixels * pixels, mu=0.8, metallic=0.0)
+    seen = replace(seen, pixel=np.repeat(np.arange(pixels), subpixels), sample=np.tile(np.arange(subpixels), pixels))
+    found = integrate(EMPTY, sky, seen, RenderSettings(bounces=0, subpixel_samples=subpixels), 0)
+    light = (found.components.sum(axis=1) @ LUMINANCE).reshape(pixels, subpixels).mean(axis=1)
+    estimated = found.variance.sum(axis=1).reshape(pixels, subpixels).sum(axis=1).mean() / subpixels**2
     assert 1.0 < estimated / light.var() < 4.0

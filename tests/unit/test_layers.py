@@ -27,7 +27,7 @@ AA = 2
 SIZE = 24
 SQUARE = np.float32([[-1, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]])
 FACES = np.int32([[0, 1, 2], [0, 2, 3]])
-SETTINGS = RenderSettings(aa=AA)
+SETTINGS = RenderSettings(subpixel_samples=AA)
 GLOW = Material("glow", (0.2, 0.4, 0.6), 0.3, 0.0, emission=(1.0, 2.0, 3.0))
 
 
@@ -107,8 +107,8 @@ def test_a_mesh_between_the_balls_halves() -> None:
     np.testing.assert_allclose(np.bincount(buffer.points.pixel, buffer.points.weight), 1, atol=1e-5)
 
 
-@pytest.mark.parametrize("primary", ["surfels", "mesh"])
-def test_the_whole_picture_does_not_depend_on_strips(primary: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("camera_sees", ["surfels", "mesh"])
+def test_the_whole_picture_does_not_depend_on_strips(camera_sees: str, monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(0)
     light = EnvironmentLight(World(environment=rng.random((8, 16, 3)).astype(np.float32)))
     vertices, faces = sphere_mesh(3)
@@ -121,7 +121,7 @@ def test_the_whole_picture_does_not_depend_on_strips(primary: str, monkeypatch: 
     hole = mesh_state(SQUARE * 0.3, FACES, matrix((0.9, -1.5, 0.9)), visibility=Visibility(holdout=True))
     meshes = [small, wall(2.0), hole]
     scene.update([thing], meshes)
-    settings = RenderSettings(aa=AA, samples=8, primary=primary, threads=1)  # type: ignore[arg-type]
+    settings = RenderSettings(subpixel_samples=AA, samples=8, camera_sees=camera_sees, threads=1)  # type: ignore[arg-type]
     states = [ObjectState("ball", "key")]
     camera = look_along_y(SIZE, focal=20.0)
     frame = Frame(3, camera, states, settings=settings, passes=tuple(BY_NAME), meshes=meshes)
@@ -131,7 +131,7 @@ def test_the_whole_picture_does_not_depend_on_strips(primary: str, monkeypatch: 
     np.testing.assert_allclose(whole["Emit"][0, 0], (1, 2, 3), rtol=1e-5)
     assert 0 in whole["Coverage"] and 1 in whole["Coverage"]
     for height in (1, 7):
-        monkeypatch.setattr(pipeline, "strip_height", lambda width, aa, h=height: h)
+        monkeypatch.setattr(pipeline, "strip_height", lambda width, subpixels, h=height: h)
         again = pipeline.render(scene, light, posed, frame)
         for name in BY_NAME:
             np.testing.assert_array_equal(again[name], whole[name], err_msg=name)

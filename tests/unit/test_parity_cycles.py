@@ -78,7 +78,9 @@ def test_kernel_agrees_with_cycles():
     strip = ShadingPoints(np.arange(n * pixels), np.zeros(n * pixels), np.ones(n * pixels), **rows)
     scene = TraceScene()
     scene.update([])
-    found = kernel_integrate(scene, EnvironmentLight(sky()), strip, RenderSettings(samples=32, bounces=0, aa=1), 1)
+    found = kernel_integrate(
+        scene, EnvironmentLight(sky()), strip, RenderSettings(samples=32, bounces=0, subpixel_samples=1), 1
+    )
     scene.close()
     found = found.components[:, [0, 2]].reshape(pixels, n, 2, 3).astype(float)
     error = found.std(0) / math.sqrt(pixels)

@@ -84,21 +84,21 @@ def visible_points(enclosed: bool = False) -> SurfacePoints:
 
 
 def kernel_means(points: SurfacePoints, settings: RenderSettings, pixels: int) -> tuple[np.ndarray, np.ndarray]:
-    """Mean (n, 4, 3) over `pixels` pixels of `settings.aa` sub-samples, and its standard error."""
+    """Mean (n, 4, 3) over `pixels` pixels of `settings.subpixel_samples` sub-samples, and its standard error."""
     arrays = sphere_over_plane()
     scene = TraceScene()
     scene.update([TraceObject("sphere and plane", **arrays)])
-    n, aa = len(points), settings.aa
-    pixel = np.repeat(np.arange(n * pixels), aa)  # a pixel shows one point, n points take turns
-    sample = np.tile(np.arange(aa), n * pixels)
+    n, subpixels = len(points), settings.subpixel_samples
+    pixel = np.repeat(np.arange(n * pixels), subpixels)  # a pixel shows one point, n points take turns
+    sample = np.tile(np.arange(subpixels), n * pixels)
     rows = {
         name: np.ascontiguousarray(getattr(points, name).numpy().astype(np.float32)[pixel % n])
         for name in ("origin", "normal", "geometric_normal", "view", "albedo", "roughness", "metallic")
     }
-    strip = ShadingPoints(pixel, sample, np.full(len(pixel), 1 / aa, np.float32), **rows)
+    strip = ShadingPoints(pixel, sample, np.full(len(pixel), 1 / subpixels, np.float32), **rows)
     found = kernel_integrate(scene, EnvironmentLight(world()), strip, settings, 3).components.astype(float)
     scene.close()
-    a_pixel = found.reshape(pixels, n, aa, 4, 3).mean(2)
+    a_pixel = found.reshape(pixels, n, subpixels, 4, 3).mean(2)
     return a_pixel.mean(0), a_pixel.std(0) / math.sqrt(pixels)
 
 
@@ -115,30 +115,30 @@ def judge(found: np.ndarray, truth: np.ndarray, error: np.ndarray) -> None:
 
 
 COMBINATIONS = {
-    "cosine alone": RenderSettings(strategy_samples=(8, 0, 0), aa=1),
-    "environment alone": RenderSettings(strategy_samples=(0, 0, 8), aa=1),
-    "all": RenderSettings(strategy_samples=(8, 4, 4), aa=1),
-    "counts that the sub-samples do not divide": RenderSettings(strategy_samples=(5, 3, 6), aa=AA),
-    "allotted by the material": RenderSettings(aa=1),
-    "allotted by the material, to sub-samples": RenderSettings(cosine=7, aa=AA),
+    "cosine alone": RenderSettings(strategy_samples=(8, 0, 0), subpixel_samples=1),
+    "environment alone": RenderSettings(strategy_samples=(0, 0, 8), subpixel_samples=1),
+    "all": RenderSettings(strategy_samples=(8, 4, 4), subpixel_samples=1),
+    "counts that the sub-samples do not divide": RenderSettings(strategy_samples=(5, 3, 6), subpixel_samples=AA),
+    "allotted by the material": RenderSettings(subpixel_samples=1),
+    "allotted by the material, to sub-samples": RenderSettings(samples=23, subpixel_samples=AA),
 }
 
 
-@pytest.mark.parametrize("look", ["principled", "paper"])
+@pytest.mark.parametrize("shading_model", ["principled", "paper"])
 @pytest.mark.parametrize("name", COMBINATIONS)
 def test_direct_light(name: str, look: str):
     """Against quadrature, which has no noise: its own error is below 0.2 % of the light."""
     points = visible_points()
     arrays = sphere_over_plane()
     truth = integrate_quadrature(tracer_from_arrays(**arrays), Light.from_world(world()), _lifted(points), 96, look)
-    settings = replace(COMBINATIONS[name], look=look, bounces=0)
+    settings = replace(COMBINATIONS[name], shading_model=look, bounces=0)
     found, error = kernel_means(points, settings, 4000)
     assert (found[:, 1] == 0).all() and (found[:, 3] == 0).all()
     truth = truth.numpy()
     judge(found, truth, np.where(truth > 0, np.hypot(error, 4e-3 * truth), error))
 
 
-@pytest.mark.parametrize("look", ["principled", "paper"])
+@pytest.mark.parametrize("shading_model", ["principled", "paper"])
 @pytest.mark.parametrize("bounces", [1, 3])
 def test_indirect_light(bounces: int, look: str):
     points = visible_points(enclosed=True)
@@ -147,7 +147,9 @@ def test_indirect_light(bounces: int, look: str):
     counts = Counts(*((5000, 2500, 2500) if bounces == 1 else (1600, 800, 800)))
     samples = integrate(tracer, light, _lifted(points), counts, bounces, look, generator, samples=True)
     reference, noise = samples.sum(1).numpy(), (samples.var(1) * samples.shape[1]).sqrt().numpy()
-    found, error = kernel_means(points, RenderSettings(samples=16, bounces=bounces, aa=1, look=look), 4000)
+    found, error = kernel_means(
+        points, RenderSettings(samples=16, bounces=bounces, subpixel_samples=1, shading_model=look), 4000
+    )
     assert (reference[:, 1] > 0).any()
     judge(found, reference, np.hypot(error, noise))
 

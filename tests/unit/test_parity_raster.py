@@ -64,7 +64,7 @@ SCENES = {
 @pytest.mark.parametrize("scene", SCENES)
 def test_g_buffer(scene: str, orthographic: bool):
     posed, view = SCENES[scene](), camera(orthographic)
-    parameters = camera_parameters(view, RenderSettings(aa=AA, seed=5), 7)
+    parameters = camera_parameters(view, RenderSettings(subpixel_samples=AA, seed=5), 7)
     found = kernel.rasterise(prepare(posed, view, parameters), 0, view.height)
 
     position = np.empty((view.height, view.width, AA, 2))

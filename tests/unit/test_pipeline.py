@@ -20,7 +20,7 @@ ALL = tuple(BY_NAME)
 
 
 def frame(camera: Camera, passes: tuple[str, ...] = ALL, objects: int = 1, **settings: object) -> Frame:
-    defaults: dict[str, object] = {"aa": 2, "cosine": 4, "ggx": 2, "environment": 2}
+    defaults: dict[str, object] = {"subpixel_samples": 2, "samples": 8}
     states = [ObjectState(f"object {i}", "key") for i in range(objects)]
     return Frame(3, camera, states, settings=RenderSettings(**(defaults | settings)), passes=passes)  # type: ignore[arg-type]
 
@@ -32,15 +32,15 @@ def ball() -> tuple[TraceScene, PosedSurfels, EnvironmentLight]:
     return scene_of(sphere_mesh(3)), sphere_surfels(1.0, 3000), EnvironmentLight(world)
 
 
-@pytest.mark.parametrize("primary", ["surfels", "mesh"])
+@pytest.mark.parametrize("camera_sees", ["surfels", "mesh"])
 def test_strips_and_batches_do_not_change_a_bit(
-    ball: tuple[TraceScene, PosedSurfels, EnvironmentLight], monkeypatch: pytest.MonkeyPatch, primary: str
+    ball: tuple[TraceScene, PosedSurfels, EnvironmentLight], monkeypatch: pytest.MonkeyPatch, camera_sees: str
 ) -> None:
     scene, posed, light = ball
-    this = frame(look_along_y(52), primary=primary, denoise="svgf", threads=1)
+    this = frame(look_along_y(52), camera_sees=camera_sees, denoise="svgf", threads=1)
     whole = pipeline.render(scene, light, posed, this)
     for height, batch in ((1, 400), (7, 3333), (52, 10**7)):
-        monkeypatch.setattr(pipeline, "strip_height", lambda width, aa, h=height: h)
+        monkeypatch.setattr(pipeline, "strip_height", lambda width, subpixels, h=height: h)
         monkeypatch.setattr(pipeline, "FIRST_SAMPLES", batch)
         monkeypatch.setattr(pipeline, "BATCH_SECONDS", 1e-9)  # batches shrink as fast as they can
         again = pipeline.render(scene, light, posed, this)
@@ -67,10 +67,10 @@ def test_a_region_is_a_crop(ball: tuple[TraceScene, PosedSurfels, EnvironmentLig
 
 def test_surfels_and_mesh_of_one_ball_look_alike(ball: tuple[TraceScene, PosedSurfels, EnvironmentLight]) -> None:
     scene, _, light = ball
-    settings = {"cosine": 64, "ggx": 32, "environment": 32, "film_transparent": True}
+    settings = {"samples": 128, "film_transparent": True}
     camera = look_along_y(48)
-    a = pipeline.render(scene, light, sphere_surfels(1.0, 30000), frame(camera, primary="surfels", **settings))
-    b = pipeline.render(scene, light, sphere_surfels(1.0, 10), frame(camera, primary="mesh", **settings))
+    a = pipeline.render(scene, light, sphere_surfels(1.0, 30000), frame(camera, camera_sees="surfels", **settings))
+    b = pipeline.render(scene, light, sphere_surfels(1.0, 10), frame(camera, camera_sees="mesh", **settings))
     inside = b["Coverage"][..., 0] == 1
     inside[1:-1, 1:-1] &= inside[2:, 1:-1] & inside[:-2, 1:-1] & inside[1:-1, 2:] & inside[1:-1, :-2]
     difference = np.abs(a["Combined"] - b["Combined"])[inside]
@@ -80,15 +80,15 @@ def test_surfels_and_mesh_of_one_ball_look_alike(ball: tuple[TraceScene, PosedSu
     assert np.abs(a["Depth"] - b["Depth"])[facing].max() < 0.06
 
 
-@pytest.mark.parametrize("primary", ["surfels", "mesh"])
+@pytest.mark.parametrize("camera_sees", ["surfels", "mesh"])
 @pytest.mark.parametrize("denoise", ["none", "svgf"])
-def test_an_empty_scene_is_the_world(primary: str, denoise: str) -> None:
+def test_an_empty_scene_is_the_world(camera_sees: str, denoise: str) -> None:
     nothing = PosedSurfels(
         *(np.empty((0, 3), np.float32) for _ in range(4)), np.empty(0, np.float32), np.empty((0, 3), np.float32),
         *(np.empty(0, np.float32) for _ in range(2)), np.empty(0, np.int32),
     )  # fmt: skip
     light = EnvironmentLight(World(colour=(0.25, 0.5, 1.0)))
-    this = frame(look_along_y(8), objects=0, primary=primary, denoise=denoise)
+    this = frame(look_along_y(8), objects=0, camera_sees=camera_sees, denoise=denoise)
     passes = pipeline.render(scene_of(), light, nothing, this)
     assert np.allclose(passes["Combined"], (0.25, 0.5, 1.0, 1.0))
     assert (passes["Depth"] == 1e10).all() and (passes["Coverage"] == 0).all()
@@ -131,7 +131,7 @@ def test_progress_rises_to_one(ball: tuple[TraceScene, PosedSurfels, Environment
 def test_cancel_is_seen_soon(ball: tuple[TraceScene, PosedSurfels, EnvironmentLight]) -> None:
     """The time between two questions stays short even when a whole strip would take many seconds."""
     scene, posed, light = ball
-    this = frame(look_along_y(200, focal=300.0), aa=4, cosine=4096, ggx=2048, environment=2048)
+    this = frame(look_along_y(200, focal=300.0), subpixel_samples=4, samples=8192)
     pipeline.render(scene, light, posed, frame(look_along_y(16)))  # compile
     asked: list[float] = [time.process_time()]
 
@@ -155,8 +155,8 @@ def test_cancel_at_once(ball: tuple[TraceScene, PosedSurfels, EnvironmentLight])
 @pytest.mark.parametrize(
     ("settings", "passes", "message"),
     [
-        ({"aa": -1}, ALL, "sub-pixel"),
-        ({"primary": "voxels"}, ALL, "voxels"),
+        ({"subpixel_samples": -1}, ALL, "sub-pixel"),
+        ({"camera_sees": "voxels"}, ALL, "voxels"),
         ({"denoise": "blur"}, ALL, "oidn"),
         ({}, ("Combined", "Shadow"), "Shadow"),
     ],

@@ -20,7 +20,7 @@ from drgs_blender.render.points import ShadingPoints
 from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene
 from drgs_blender.render.surfels.splats import prepare
 
-SETTINGS = RenderSettings(aa=2, bounces=0, samples=64, look="paper")
+SETTINGS = RenderSettings(subpixel_samples=2, bounces=0, samples=64, shading_model="paper")
 
 
 def surfel_buffer(posed: PosedSurfels, scene: TraceScene, camera: Camera, settings: RenderSettings) -> GBuffer:
@@ -31,19 +31,21 @@ def surfel_buffer(posed: PosedSurfels, scene: TraceScene, camera: Camera, settin
 
 def white_light(scene: TraceScene, points: ShadingPoints) -> np.ndarray:
     """(n,) direct light of a uniform white world, nearly without noise."""
-    return integrate(scene, EnvironmentLight(World()), points, replace(SETTINGS, split="counts"), 1).total[:, 1]
+    return integrate(
+        scene, EnvironmentLight(World()), points, replace(SETTINGS, strategy_samples=(32, 16, 16)), 1
+    ).total[:, 1]
 
 
-def check_contract(buffer: GBuffer, aa: int) -> None:
+def check_contract(buffer: GBuffer, subpixels: int) -> None:
     points = buffer.points
     for name in ("normal", "geometric_normal", "view"):
         assert np.allclose(np.linalg.norm(getattr(points, name), axis=1), 1, atol=1e-5), name
     assert ((points.normal * points.view).sum(1) > 0).all()
     assert ((points.geometric_normal * points.view).sum(1) > 0).all()
-    order = points.pixel.astype(np.int64) * aa + points.sample
+    order = points.pixel.astype(np.int64) * subpixels + points.sample
     assert (np.diff(order) > 0).all()
     covered = buffer.alpha[buffer.alpha > 0]
-    assert np.allclose(points.weight, covered / aa)
+    assert np.allclose(points.weight, covered / subpixels)
 
 
 @pytest.mark.parametrize("offset", [-0.1, -0.02, -0.004, 0.0, 0.004, 0.02, 0.1])
@@ -163,7 +165,7 @@ def test_an_edge_is_as_soft_as_the_pixel_filter(width: float) -> None:
     plane = np.array([[-9, 0, -9], [edge, 0, -9], [edge, 0, 9], [-9, 0, 9]], np.float32)
     scene = scene_of((plane, np.array([[0, 1, 2], [0, 2, 3]], np.int32)))
     camera = look_along_y(24, focal=4.0, orthographic=True)
-    settings = RenderSettings(aa=64, primary="mesh", filter_width=width)
+    settings = RenderSettings(subpixel_samples=64, camera_sees="mesh", filter_width=width)
     buffer = primary_mesh(scene, camera, camera_parameters(camera, settings, 1), 0, 24)
     coverage = np.bincount(buffer.points.pixel, buffer.points.weight, 24 * 24).reshape(24, 24).mean(0)
     a, k = np.array([0.48829, 0.14128, 0.01168]), 2 * np.pi * np.arange(1, 4)
@@ -203,7 +205,7 @@ def test_overhang_of_a_fold_is_lit_as_the_face_beyond() -> None:
     pose[:3, :3] = np.stack([right, np.cross(back, right), back], axis=1)
     pose[:3, 3] = eye
     camera = Camera(pose, 40, 40, 120.0, 120.0, 20.0, 20.0)
-    settings = RenderSettings(aa=4)
+    settings = RenderSettings(subpixel_samples=4)
     parameters = camera_parameters(camera, settings, 0)
     scene = TraceScene()
     one = np.ones(len(vertices), np.float32)

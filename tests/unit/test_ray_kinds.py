@@ -20,31 +20,31 @@ DARK = World(strength=0.0)
 
 
 def light_of(
-    meshes: list[MeshState], world: World, lights: list[Light], bounces: int, split: str = "counts"
+    meshes: list[MeshState], world: World, lights: list[Light], bounces: int, auto: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
     """Mean over pixels by kind of light, (4, 3), and its standard error."""
     scene = TraceScene()
     scene.update([], meshes)
     seen = points(6000, albedo=0.7, roughness=0.5, metallic=0.4, origin=(0.3, 0.1, 0.0))
-    how = settings(8, 8, 8, bounces=bounces, look="principled", split=split)
+    how = settings(8, 8, 8, bounces=bounces, shading_model="principled", auto=auto)
     found = integrate(scene, EnvironmentLight(world), seen, how, 0, Lamps(lights)).components.astype(float)
     return found.mean(0), found.std(0) / math.sqrt(len(found))
 
 
-@pytest.mark.parametrize("split", ["counts", "auto"])
+@pytest.mark.parametrize("auto", [False, True])
 @pytest.mark.parametrize(("hidden", "black", "kept"), [("diffuse", [0, 1], [2, 3]), ("glossy", [2, 3], [0, 1])])
-def test_a_lobe_meets_what_its_own_rays_meet(hidden: str, black: list[int], kept: list[int], split: str) -> None:
+def test_a_lobe_meets_what_its_own_rays_meet(hidden: str, black: list[int], kept: list[int], auto: bool) -> None:
     """A glowing panel is all there is; hidden to one kind of rays it leaves that lobe black."""
     glow = panel()
-    whole, a = light_of([glow], DARK, [], 0, split)
+    whole, a = light_of([glow], DARK, [], 0, auto)
     glow.visibility = Visibility(**{hidden: False})
-    part, b = light_of([glow], DARK, [], 0, split)
+    part, b = light_of([glow], DARK, [], 0, auto)
     assert whole[[0, 2]].min() > 0.01 and not part[black].any()
     assert (np.abs(part - whole)[kept] <= 4.5 * np.hypot(a, b)[kept]).all()
 
 
-@pytest.mark.parametrize("split", ["counts", "auto"])
-def test_keeping_lobes_apart_changes_no_mean(split: str) -> None:
+@pytest.mark.parametrize("auto", [False, True])
+def test_keeping_lobes_apart_changes_no_mean(auto: bool) -> None:
     """A thing under the floor that nothing sees decides how samples are weighed, not what light there is."""
     buried = wall()
     buried.matrices, buried.visibility = np.diag([0.2, 0.2, 0.2, 1.0])[None], Visibility(glossy=False)
@@ -52,7 +52,7 @@ def test_keeping_lobes_apart_changes_no_mean(split: str) -> None:
     low = lamp()
     low.matrix_world[2, 3] = 0.6
     sky = World(sun_picture() * np.float32(0.05))
-    (together, a), (apart, b) = (light_of([panel(), wall(), *more], sky, [low], 2, split) for more in ([], [buried]))
+    (together, a), (apart, b) = (light_of([panel(), wall(), *more], sky, [low], 2, auto) for more in ([], [buried]))
     assert (np.abs(together - apart) <= 4.5 * np.hypot(a, b)).all()
     assert (np.hypot(a, b) < 0.04 * together).all() and not (a == b).all()
 
@@ -63,7 +63,7 @@ def test_sky_behind_what_shadow_rays_alone_meet_is_as_bright_as_in_cycles() -> N
     roof.matrices = np.diag([1e4, 1e4, 1.0, 1.0])[None]
     roof.visibility = Visibility(diffuse=False)
     white = World()
-    (free, _), (roofed, _) = (light_of(meshes, white, [], 0, "auto") for meshes in ([], [roof]))
+    (free, _), (roofed, _) = (light_of(meshes, white, [], 0, True) for meshes in ([], [roof]))
     # The mean over cosine-distributed rays of p / (p + 1 / (4 pi)), p being their density.
     cycles = 0.5 + math.log(5.0) / 8
     np.testing.assert_allclose(roofed[0] / free[0], cycles, atol=0.12)

@@ -162,7 +162,7 @@ def test_agrees_with_the_renderer_where_surfels_do_not_intersect():
         centre, u, v, np.tile(turn[:, 2], (n, 1)), opacity, np.zeros((n, 3), np.float32), np.zeros(n, np.float32),
         np.zeros(n, np.float32), np.zeros(n, np.int32),
     )  # fmt: skip
-    parameters = camera_parameters(view, RenderSettings(aa=1), 0)
+    parameters = camera_parameters(view, RenderSettings(subpixel_samples=1), 0)
     splats = prepare(posed, view, parameters)
     # The renderer's samples are shifted inside their pixels; ours stand in the middle: compare the means over rows.
     theirs = renderer.rasterise(splats, 0, view.height).alpha[..., 0]

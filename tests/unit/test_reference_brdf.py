@@ -81,7 +81,7 @@ def test_a_narrow_lobe_keeps_its_energy():
     assert mirror_albedo(0.8, 0.05) == pytest.approx(1.0, abs=1e-3)
 
 
-@pytest.mark.parametrize("look", brdf.LOOKS)
+@pytest.mark.parametrize("shading_model", brdf.SHADING_MODELS)
 @pytest.mark.parametrize("cosine", [1.0, 0.5, 0.2])
 def test_white_furnace(look: str, cosine: float):
     view, white = view_at(cosine), torch.ones(3, dtype=F64)
@@ -136,7 +136,7 @@ def test_the_paper_brdf_is_reciprocal():
         torch.testing.assert_close(there, back, rtol=1e-9, atol=0)
 
 
-@pytest.mark.parametrize("look", brdf.LOOKS)
+@pytest.mark.parametrize("shading_model", brdf.SHADING_MODELS)
 def test_below_the_surface_is_black_and_without_nan(look: str):
     view, light = random_unit((200,), 4).requires_grad_(), random_unit((200,), 5).requires_grad_()
     roughness = torch.full((200,), 0.3, dtype=F64, requires_grad=True)
@@ -151,7 +151,7 @@ def test_below_the_surface_is_black_and_without_nan(look: str):
     assert all(torch.isfinite(x.grad).all() for x in (view, light, roughness))
 
 
-@pytest.mark.parametrize("look", brdf.LOOKS)
+@pytest.mark.parametrize("shading_model", brdf.SHADING_MODELS)
 def test_gradients(look: str):
     def unit_parts(normal, view, light, albedo, roughness, metallic):
         normal, view, light = (brdf.normalise(x) for x in (normal, view, light))

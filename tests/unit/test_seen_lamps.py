@@ -37,12 +37,10 @@ def picture(
     scene = TraceScene()
     scene.update(list(objects), meshes)
     values = {
-        "aa": 4,
-        "cosine": 1,
-        "ggx": 0,
-        "environment": 1,
+        "subpixel_samples": 4,
+        "samples": 2,
         "bounces": 0,
-        "primary": "mesh" if posed is None else "surfels",
+        "camera_sees": "mesh" if posed is None else "surfels",
     }
     camera = look_along_y(SIZE, clip_start=clip[0], clip_end=clip[1])
     frame = Frame(1, camera, [], settings=RenderSettings(**(values | settings)), passes=("Combined", "Emit"))
@@ -50,7 +48,7 @@ def picture(
 
 
 def test_a_lamp_covers_what_it_should_with_its_radiance_and_no_alpha() -> None:
-    seen = picture([panel(0.0)], [], film_transparent=True, aa=16)
+    seen = picture([panel(0.0)], [], film_transparent=True, subpixel_samples=16)
     middle = seen["Emit"][SIZE // 2 - 3 : SIZE // 2 + 3, SIZE // 2 - 7 : SIZE // 2 + 7]
     np.testing.assert_allclose(middle, np.broadcast_to(SHINE, middle.shape), rtol=1e-5)
     # 70 pixels a radian at 4 metres.
@@ -116,7 +114,11 @@ def test_the_window_and_a_distant_sun() -> None:
     scene = TraceScene()
     scene.update([], [half])
     frame = Frame(
-        1, look_along_y(SIZE), [], settings=RenderSettings(samples=2, bounces=0, aa=4, primary="mesh"), passes=("Emit",)
+        1,
+        look_along_y(SIZE),
+        [],
+        settings=RenderSettings(samples=2, bounces=0, subpixel_samples=4, camera_sees="mesh"),
+        passes=("Emit",),
     )
     whole = render(scene, EnvironmentLight(World(strength=0.0)), None, frame, lamps=Lamps([sun]))["Emit"]  # type: ignore[arg-type]
     radiance = 3.0 / (math.pi * math.sin(0.1) ** 2)

@@ -226,7 +226,7 @@ key = session.load_asset(sys.argv[1])
 vertices = np.array(read_asset(sys.argv[1]).mesh.vertices, np.float32)
 camera = Camera(np.array([[1, 0, 0, 0], [0, 0, -1, -3], [0, 1, 0, 0], [0, 0, 0, 1]], float), 24, 24, 30.0, 30.0, 12, 12)
 world = World(np.random.default_rng(0).uniform(0, 1, (32, 64, 3)).astype(np.float32))
-settings = RenderSettings(samples=6, aa=1, primary="mesh")
+settings = RenderSettings(samples=6, subpixel_samples=1, camera_sees="mesh")
 frame = Frame(1, camera, [ObjectState("cow", key, vertices=vertices)], world, settings)
 passes = session.render(frame, lambda phase, part: None, lambda: False)
 assert passes["Combined"][..., :3].std() > 0.01

@@ -14,10 +14,10 @@ from drgs_blender.render.integrator.variance import variances
 from drgs_blender.render.points import Radiance, ShadingPoints
 
 
-def pixels(count: int, aa: int) -> ShadingPoints:
-    """`count` pixels of one matte plane, of `aa` positions each."""
-    some = points(count * aa, albedo=0.7, roughness=0.4, weight=np.full(count * aa, 1 / aa))
-    return replace(some, pixel=np.repeat(np.arange(count), aa), sample=np.tile(np.arange(aa), count))
+def pixels(count: int, subpixels: int) -> ShadingPoints:
+    """`count` pixels of one matte plane, of `subpixels` positions each."""
+    some = points(count * subpixels, albedo=0.7, roughness=0.4, weight=np.full(count * subpixels, 1 / subpixels))
+    return replace(some, pixel=np.repeat(np.arange(count), subpixels), sample=np.tile(np.arange(subpixels), count))
 
 
 def moments_of(samples: list[list[float]]) -> np.ndarray:
@@ -38,7 +38,7 @@ def test_few_samples_are_those_of_the_pixel_and_many_a_points_own() -> None:
 
 
 def test_points_of_a_pixel_may_be_integrated_in_different_calls() -> None:
-    some, settings = pixels(30, 16), RenderSettings(aa=16, bounces=0)
+    some, settings = pixels(30, 16), RenderSettings(subpixel_samples=16, bounces=0)
     whole = integrate(EMPTY, WHITE, some, settings, 0)
     calls = [integrate(EMPTY, WHITE, some[rows], settings, 0) for rows in (slice(0, 101), slice(101, None))]
     together = variances(some.pixel, np.concatenate([found.moments for found in calls]))
@@ -48,16 +48,16 @@ def test_points_of_a_pixel_may_be_integrated_in_different_calls() -> None:
 
 def test_even_light_is_finished_early_at_many_positions() -> None:
     """512 rays at 64 positions come in 32 parts of a quarter of a sample a position."""
-    settings = RenderSettings(samples=512, bounces=0, primary="mesh", noise_threshold=0.2)
-    parts, some, asked = part_count(settings), pixels(20, settings.positions), 0
+    settings = RenderSettings(samples=512, bounces=0, camera_sees="mesh", noise_threshold=0.2)
+    parts, some, asked = part_count(settings), pixels(20, settings.subpixel_count), 0
 
     def trace(chosen: ShadingPoints, part: tuple[int, int]) -> Radiance:
         nonlocal asked
         asked += len(chosen)
         return integrate(EMPTY, WHITE, chosen, settings, 0, part=part)
 
-    found = sample_adaptively(some, settings.rays, parts, settings.noise_threshold, trace)
-    assert (settings.positions, parts) == (64, 32)
+    found = sample_adaptively(some, settings.sample_count, parts, settings.noise_threshold, trace)
+    assert (settings.subpixel_count, parts) == (64, 32)
     assert asked < 0.25 * parts * len(some)
     mean = found.total.reshape(20, 64, 3).mean(axis=1)
     np.testing.assert_allclose(mean, np.broadcast_to(mean.mean(axis=0), mean.shape), rtol=0.3)

@@ -38,7 +38,7 @@ from drgs_blender.render.surfels.surfel_tracer import tracer_of
 
 Array = np.ndarray
 DARK = World(colour=(0.0, 0.0, 0.0))
-SETTINGS = RenderSettings(samples=3, bounces=0, aa=1, tracer="surfels")
+SETTINGS = RenderSettings(samples=3, bounces=0, subpixel_samples=1, rays_see="surfels")
 SHEARED = np.array([[1.2, 0.5, 0.0, 0.1], [0.0, -0.8, 0.3, 0.0], [0.2, 0.0, 1.0, 0.2], [0, 0, 0, 1.0]])
 
 
@@ -110,7 +110,7 @@ def test_the_sky_is_seen_through_surfels_by_every_strategy(tmp_path: Path) -> No
     way = (way / np.linalg.norm(way, axis=1, keepdims=True)).astype(np.float32)
     camera = from_above(2, scale=1e4)
     for counts in ((1024, 0, 0), (0, 0, 1024)):
-        how = replace(SETTINGS, cosine=counts[0], ggx=counts[1], environment=counts[2], look="paper")
+        how = replace(SETTINGS, strategy_samples=counts, shading_model="paper")
         frame = Frame(1, camera, unseen, World(), how, meshes=[quad("Ground", 0.0, roughness=1.0, metallic=0.0)])
         lit = session.render(frame)["Combined"][..., 0].mean()
         frame.objects = []
@@ -128,7 +128,7 @@ def test_lamps_among_surfels_look_the_same_to_both_strategies(tmp_path: Path) ->
     lamp = Light("Panel", "area", matrix, power=50.0, shape="square", size_x=1.5)
     found = []
     for counts in ((0, 0, 2048), (8192, 0, 0)):
-        how = replace(SETTINGS, cosine=counts[0], ggx=counts[1], environment=counts[2], look="paper")
+        how = replace(SETTINGS, strategy_samples=counts, shading_model="paper")
         frame = Frame(
             1, from_above(2, scale=1e4), [ObjectState("Cloud", key, matrix, visibility=Visibility(camera=False))],
             DARK, how, meshes=[quad("Ground", 0.0, roughness=1.0)], lights=[lamp],
@@ -204,21 +204,21 @@ def test_a_ball_looks_the_same_by_its_mesh_and_by_its_surfels(tmp_path: Path) ->
     world = World(np.broadcast_to(rows, (8, 16, 3)).astype(np.float32) ** -2)
     place = np.eye(4)
     place[2, 3] = 1.05
-    how = RenderSettings(samples=256, bounces=1, aa=4)
+    how = RenderSettings(samples=256, bounces=1, subpixel_samples=4)
     frame = Frame(
         1, from_above(32, scale=10.0), [ObjectState("Ball", key, place)], world, how,
         meshes=[quad("Ground", 0.0, roughness=0.2)],
     )  # fmt: skip
     pictures = {}
-    for primary in ("mesh", "surfels"):
+    for camera_sees in ("mesh", "surfels"):
         for tracer in ("mesh", "surfels"):
-            frame.settings = replace(how, primary=primary, tracer=tracer)  # type: ignore[arg-type]
-            pictures[primary, tracer] = session.render(frame)["Combined"][..., :3]
-    for primary in ("mesh", "surfels"):
-        a, b = pictures[primary, "mesh"], pictures[primary, "surfels"]
+            frame.settings = replace(how, camera_sees=camera_sees, rays_see=tracer)  # type: ignore[arg-type]
+            pictures[camera_sees, tracer] = session.render(frame)["Combined"][..., :3]
+    for camera_sees in ("mesh", "surfels"):
+        a, b = pictures[camera_sees, "mesh"], pictures[camera_sees, "surfels"]
         assert np.abs(a.mean(axis=(0, 1)) / b.mean(axis=(0, 1)) - 1).max() < 0.02
         assert np.sqrt(np.mean((a - b) ** 2)) < 0.04 * a.mean()
-    frame.settings = replace(how, tracer="mesh")
+    frame.settings = replace(how, rays_see="mesh")
     np.testing.assert_array_equal(session.render(frame)["Combined"][..., :3], pictures["surfels", "mesh"])
 
 
@@ -229,7 +229,7 @@ def test_surfels_without_a_mesh_need_the_surfel_tracer(tmp_path: Path) -> None:
     picture = session.render(frame)["Combined"]
     assert np.isfinite(picture).all() and picture[6:10, 6:10, 3].min() > 0.8
     assert 0.02 < picture[6:10, 6:10, :3].mean() < 1.0
-    for change in ({"tracer": "mesh"}, {"primary": "mesh"}):
+    for change in ({"rays_see": "mesh"}, {"camera_sees": "mesh"}):
         frame.settings = replace(SETTINGS, **change)
         with pytest.raises(AssetError, match=r"Leaves.*no faces.*Choose surfels"):
             session.render(frame)

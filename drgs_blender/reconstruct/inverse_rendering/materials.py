@@ -84,16 +84,16 @@ class Materials:
             value = value + blend(self.parameters[f"grid{level}"], index[vertices], share[vertices])
         return torch.sigmoid(value)
 
-    def reflect(self, columns: Tensor, sums: Tensor, nv: Tensor, look: str) -> Tensor:
+    def reflect(self, columns: Tensor, sums: Tensor, nv: Tensor, shading_model: str) -> Tensor:
         """Radiance (n, 2, 3) of surfaces with `columns` (n, c), whose `sums` (n, 2, 4, 3) see gather.py."""
         colour, roughness = columns[:, None, :3], self.roughness(columns)
         white, mirror, edge, dielectric = sums.unbind(2)
-        if look == "principled":
+        if shading_model == "principled":
             white = white * (1 - layer_albedo(nv, roughness))[:, None, None]
         if self.specular:
             return colour * white + columns[:, None, 4:7] * mirror + edge
         metal = columns[:, None, 4:5] if self.metallic else torch.zeros(())
-        if look == "paper":
+        if shading_model == "paper":
             f0 = _DIELECTRIC * (1 - metal) + colour * metal
             return (1 - metal) * colour * white + f0 * mirror + edge
         return (1 - metal) * (colour * white + dielectric) + metal * (colour * mirror + edge)

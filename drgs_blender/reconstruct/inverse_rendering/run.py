@@ -258,7 +258,7 @@ class _Job:
         radiance = self.light.radiance()
         sums = self._gatherer(Points(pixels.origin, pixels.flat, pixels.towards, key), normal, alpha2, radiance)
         nv = dot(normal, torch.from_numpy(pixels.towards)).clamp(1e-3, 1)
-        shown = self.materials.reflect(here, sums, nv, s.look)
+        shown = self.materials.reflect(here, sums, nv, s.shading_model)
         if s.exposure:
             exposure = self._parameters["exposure"]
             shown = shown * torch.exp(exposure - exposure.mean())[torch.from_numpy(pixels.view).long()][:, None, None]

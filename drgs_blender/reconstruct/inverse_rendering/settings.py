@@ -53,7 +53,7 @@ class Settings:
     cosine: int = 16
     ggx: int = 8
     light: int = 8
-    look: Literal["principled", "paper"] = "principled"
+    shading_model: Literal["principled", "paper"] = "principled"
     indirect: bool = True
     shadows: bool = True
     environment: int = 64
@@ -87,7 +87,7 @@ class Settings:
             "most_pixels": self.most_pixels < 1,
             "cosine, ggx, light": min(counts) < 0 or sum(counts) == 0 or any(c % 2 for c in counts),
             "environment": not 8 <= rows <= 1024 or rows & (rows - 1) != 0,
-            "look": self.look not in ("principled", "paper"),
+            "shading_model": self.shading_model not in ("principled", "paper"),
             "parametrisation": self.parametrisation not in ("metallic", "specular", "dielectric"),
             "coarse": not 0 <= self.coarse <= 8,
         }

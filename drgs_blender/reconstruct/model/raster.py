@@ -126,7 +126,7 @@ def view_of(camera: Camera) -> tuple[Array, tuple[int, int]]:
     """`camera_parameters` of a camera that photographs, and the picture's width and height; see `rasterise`."""
     if camera.orthographic:
         raise UsageError("camera", "is orthographic", "Photographs to learn from are perspective")
-    return camera_parameters(camera, RenderSettings(aa=1), 0), (camera.width, camera.height)
+    return camera_parameters(camera, RenderSettings(subpixel_samples=1), 0), (camera.width, camera.height)
 
 
 class _Rasterise(torch.autograd.Function):

@@ -61,7 +61,7 @@ class NoisyFrame:
 
 def describe(frame: Frame) -> dict[str, str]:
     """What a frame file says of how it was seen, for its metadata."""
-    said = {"camera": _camera_text(frame.camera), "denoise": frame.settings.denoise, "noise": str(frame.number)}
+    said = {"camera": _camera_text(frame.camera), "denoise": frame.settings.denoise, "noise": str(frame.noise_index)}
     if frame.previous is not None:
         said["previous"] = _camera_text(frame.previous.camera)
     return said

@@ -1,6 +1,7 @@
 """From shading points and their light to the pixels of all passes.
 
-A pixel is the plain mean of its ``aa`` sub-pixel samples (box filter of one pixel), premultiplied by coverage. Passes
+A pixel is the plain mean of its ``subpixels`` sub-pixel samples (box filter of one pixel), premultiplied by coverage.
+Passes
 that describe the surface are not premultiplied, so that the object has no dark rim in them:
 
 - Depth, Position: mean of the samples on the surface nearest to the camera (those within `SAME_SURFACE` pixel widths
@@ -312,12 +313,12 @@ def _world(p: Any, pixel: Any, sample: Any, sky: Any) -> Any:
 def _background(p: Any, x0: Any, y0: Any, alpha: Any, sky: Any, out: Any) -> None:
     """Add the world's radiance along every sub-pixel ray, weighted by what the surfaces leave uncovered."""
     width = np.int64(p[WIDTH])
-    rows, columns, aa = alpha.shape
-    share = np.float32(1.0 / aa)
+    rows, columns, subpixels = alpha.shape
+    share = np.float32(1.0 / subpixels)
     for y in prange(rows):
         for x in range(columns):
             red = green = blue = np.float32(0.0)
-            for k in range(aa):
+            for k in range(subpixels):
                 left = (np.float32(1.0) - alpha[y, x, k]) * share
                 if left <= np.float32(0.0):
                     continue

@@ -25,10 +25,10 @@ class MeshHits:
 
     Attributes
     ----------
-    depth : (rows, width, aa) float32, metres along the view axis
-    owner : (rows, width, aa) int32, object, or -1 where nothing is met; the other arrays are undefined there
-    face, place : (rows, width, aa) int32
-    where : (rows, width, aa, 5) float32: the hit's u and v, and its geometric normal as `surface_at` wants it
+    depth : (rows, width, subpixels) float32, metres along the view axis
+    owner : (rows, width, subpixels) int32, object, or -1 where nothing is met; the other arrays are undefined there
+    face, place : (rows, width, subpixels) int32
+    where : (rows, width, subpixels, 5) float32: the hit's u and v, and its geometric normal as `surface_at` wants it
     """
 
     depth: Array
@@ -50,7 +50,7 @@ def trace_camera(scene: TraceScene, parameters: Array, x0: int, y0: int, shape: 
     ----------
     parameters : `camera.camera_parameters`
     x0, y0 : full-picture pixel of the first sample
-    shape : (rows, width, aa)
+    shape : (rows, width, subpixels)
     """
     owner, face, place = (np.empty(shape, np.int32) for _ in range(3))
     hits = MeshHits(np.empty(shape, np.float32), owner, face, place, np.empty((*shape, 5), np.float32))
@@ -111,12 +111,12 @@ def trace_samples(
     face_object, place_object = owners
     depth, owner, face, place, where = out
     width = np.int64(p[WIDTH])
-    rows, columns, aa = depth.shape
+    rows, columns, subpixels = depth.shape
     near, far = np.float32(p[CLIP_START]), np.float32(p[CLIP_END])
-    count = rows * columns * aa
+    count = rows * columns * subpixels
     for block in range(lane, (count + _BLOCK - 1) // _BLOCK, lanes):
         for n in range(block * _BLOCK, min((block + 1) * _BLOCK, count)):
-            x, y, k = n // aa % columns, n // (aa * columns), n % aa
+            x, y, k = n // subpixels % columns, n // (subpixels * columns), n % subpixels
             ox, oy, oz, dx, dy, dz = sample_ray(p, (y0 + y) * width + x0 + x, k)
             t, f, i, u, v, gx, gy, gz = nearest(
                 tracer, np.float32(ox), np.float32(oy), np.float32(oz),

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...compute.jit import njit
-from ..camera import AA, WIDTH
+from ..camera import SUBPIXELS, WIDTH
 from ..points import CATCHER, SECOND, ShadingPoints
 from ..scene.ray_masks import CATCHER as CATCHER_OBJECT
 
@@ -33,7 +33,7 @@ class GBuffer:
     face, place : (n,) int32: what the point is tied to, as `interaction.nearest` numbers it; face -1 for a surfel off
         all meshes
     barycentric : (n, 2) float32 weights of the face's second and third corner
-    alpha : (rows, width, aa) float32: what of each sub-pixel sample hides the background; shadow catchers do not
+    alpha : (rows, width, subpixels) float32: what of each sub-pixel sample hides the background; shadow catchers do not
     """
 
     rows: tuple[int, int]
@@ -58,10 +58,10 @@ def compact(alpha: Array, parameters: Array, x0: int, y0: int, second: Array | N
 
     Parameters
     ----------
-    alpha : (rows, width, aa) float32
+    alpha : (rows, width, subpixels) float32
     parameters : `camera.camera_parameters`
     x0, y0 : full-picture pixel of ``alpha[0, 0]``
-    second : (rows, width, aa) float32 of a second layer, or None: its points follow those of their samples
+    second : (rows, width, subpixels) float32 of a second layer, or None: its points follow those of their samples
     """
     n = np.count_nonzero(alpha) + (0 if second is None else np.count_nonzero(second))
     pixel, sample, owner, face, place = np.empty((5, n), np.int32)
@@ -82,13 +82,13 @@ def _number(
 ) -> None:
     """List the covered samples in order."""
     width = np.int64(p[WIDTH])
-    share = np.float32(1.0 / p[AA])
-    rows, columns, aa = alpha.shape
+    share = np.float32(1.0 / p[SUBPIXELS])
+    rows, columns, subpixels = alpha.shape
     layers = 2 if len(second) == rows else 1
     n = 0
     for y in range(rows):
         for x in range(columns):
-            for k in range(aa):
+            for k in range(subpixels):
                 for layer in range(layers):
                     a = second[y, x, k] if layer else alpha[y, x, k]
                     if a > np.float32(0.0):

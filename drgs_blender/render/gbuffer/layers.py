@@ -27,7 +27,7 @@ _LEAST = np.float32(1.0 / 255.0)
 
 @dataclass(slots=True)
 class Layers:
-    """Weights of the two points of each sub-pixel sample, all (rows, width, aa) float32.
+    """Weights of the two points of each sub-pixel sample, all (rows, width, subpixels) float32.
 
     Attributes
     ----------
@@ -100,10 +100,10 @@ def _combine(
     opaque: Any,
 ) -> None:
     zero, one = np.float32(0.0), np.float32(1.0)
-    rows, columns, aa = alpha.shape
+    rows, columns, subpixels = alpha.shape
     for y in prange(rows):
         for x in range(columns):
-            for k in range(aa):
+            for k in range(subpixels):
                 a = alpha[y, x, k]
                 m = mesh_owner[y, x, k]
                 if a > zero and m >= 0:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from ...core.frame import Camera
-from ..camera import AA
+from ..camera import SUBPIXELS
 from ..scene.ray_masks import CAMERA
 from ..scene.trace_scene import TraceScene
 from .camera_hits import MeshHits, shade_mesh, trace_camera
@@ -37,7 +37,7 @@ def primary_mesh(
     trace, shade : who casts the rays, and who finds what they have met
     """
     x0, _, x1, _ = camera.window
-    hits = trace(scene, parameters, x0, y0, (y1 - y0, x1 - x0, int(parameters[AA])), CAMERA)
+    hits = trace(scene, parameters, x0, y0, (y1 - y0, x1 - x0, int(parameters[SUBPIXELS])), CAMERA)
     layers = lone(hits, scene)
     buffer = compact(layers.first, parameters, x0, y0)
     buffer.alpha = layers.opaque

@@ -55,12 +55,12 @@ def _look(
     lamps: Any, out: Any,
 ) -> None:  # fmt: skip
     width, near = np.int64(p[WIDTH]), p[CLIP_START]
-    rows, columns, aa = alpha.shape
+    rows, columns, subpixels = alpha.shape
     for y in prange(rows):
         n = start[y]
         for x in range(columns):
             place = (y0 + y) * width + x0 + x
-            for k in range(aa):
+            for k in range(subpixels):
                 first = n
                 while n < start[y + 1] and pixel[n] == place and sample[n] == k:
                     n += 1
@@ -75,7 +75,7 @@ def _look(
                 r, g, b = r + s, g + t, b + u
                 if not r + g + b > ZERO:
                     continue
-                free = (ONE - alpha[y, x, k]) / F(aa)
+                free = (ONE - alpha[y, x, k]) / F(subpixels)
                 red, green, blue = free * r, free * g, free * b
                 for i in range(first, n):
                     if flags[i] & CATCHER:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ...compute.warp.kernels import Launcher, Room, Work
-from ..camera import AA, CLIP_END, CLIP_START, FX, FY, ORTHOGRAPHIC, WIDTH, lattice, pixel_shift
+from ..camera import CLIP_END, CLIP_START, FX, FY, ORTHOGRAPHIC, SUBPIXELS, WIDTH, lattice, pixel_shift
 from ..sampling import ONE, ZERO, F
 from ..surfels.blending import GAP, MIN_TRANSMITTANCE
 from ..surfels.raster import MAX_ALPHA, SurfelSamples, gaussian
@@ -130,7 +130,7 @@ def gather(
 
 def blend_samples(
     lane: Any, lanes: Any, room: Any, screen: Any, surface: Any, box: Any, nearest: Any, objects: Any,
-    tile_start: Any, tile_list: Any, p: Any, x0: Any, x1: Any, tile_y0: Any, y0: Any, y1: Any, aa: Any, out: Any,
+    tile_start: Any, tile_list: Any, p: Any, x0: Any, x1: Any, tile_y0: Any, y0: Any, y1: Any, subpixels: Any, out: Any,
 ) -> None:  # fmt: skip
     """Blend the samples of the rows y0 .. y1, as `raster._blend` does."""
     lists_z, lists_a, lists_i, sums, owner = room
@@ -144,9 +144,9 @@ def blend_samples(
     pixel = ZERO if p[ORTHOGRAPHIC] != 0.0 else slope
     pixel_base = slope if p[ORTHOGRAPHIC] != 0.0 else ZERO
     stop = F(MIN_TRANSMITTANCE)
-    for sample in range(lane, (y1 - y0) * columns * aa, lanes):
-        number = sample % aa
-        column, row = sample // aa % columns, sample // (aa * columns)
+    for sample in range(lane, (y1 - y0) * columns * subpixels, lanes):
+        number = sample % subpixels
+        column, row = sample // subpixels % columns, sample // (subpixels * columns)
         x, y = x0 + column, y0 + row
         tile = (y // TILE - tile_y0) * tiles_x + x // TILE - tile_x0
         shift_x, shift_y = pixel_shift(p, y * width + x)
@@ -214,13 +214,13 @@ class SamplesThere(SurfelSamples):
 def rasterise(launcher: Launcher, splats: Splats, y0: int, y1: int) -> SamplesThere:
     """`surfels.raster.rasterise` on a device; where ``alpha`` is 0 the other arrays are undefined."""
     x0, top, x1, _ = splats.window
-    aa = int(splats.parameters[AA])
-    shape = y1 - y0, x1 - x0, aa
+    subpixels = int(splats.parameters[SUBPIXELS])
+    shape = y1 - y0, x1 - x0, subpixels
     with launcher.failures("blending surfels"):
         alpha, depth, surface = (launcher.zeros(size) for size in (shape, shape, (*shape, 9)))
         owner = launcher.zeros(shape, "int32")
     arrays = splats.screen, splats.surface, splats.box, splats.nearest, splats.object_index
-    arguments = *arrays, splats.tile_start, splats.tile_list, splats.parameters, x0, x1, top // TILE, y0, y1, aa
+    arguments = *arrays, splats.tile_start, splats.tile_list, splats.parameters, x0, x1, top // TILE, y0, y1, subpixels
     launcher.launch(BLEND, int(np.prod(shape)), arguments, (alpha, depth, surface, owner))
     with launcher.failures("blending surfels"):
         there = depth, surface, owner

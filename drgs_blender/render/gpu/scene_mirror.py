@@ -73,7 +73,7 @@ class Mirror:
 
     def tracer(self, scene: TraceScene) -> MeshTracer:
         """How rays meet the scene; until its next update."""
-        found: MeshTracer = self._table("tracer", (scene, scene.version), lambda place: self._tracer(scene, place))
+        found: MeshTracer = self._table("rays_see", (scene, scene.version), lambda place: self._tracer(scene, place))
         return found
 
     def _table(self, name: str, made_of: tuple[Any, ...], make: Callable[[Place], Any]) -> Any:

@@ -41,7 +41,7 @@ class Devices:
         why = self._missing.get(device) or processor.failed
         if why:
             return [f"{why} Rendered on the CPU"]
-        if processor is not HERE and settings.tracer == "surfels":
+        if processor is not HERE and settings.rays_see == "surfels":
             return ["tracer surfels: not on a graphics card; rendered on the CPU"]
         return []
 

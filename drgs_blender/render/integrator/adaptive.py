@@ -27,10 +27,10 @@ def part_count(settings: RenderSettings) -> int:
     """In how many equal parts the samples can be drawn; 1 when nothing is gained by it."""
     if settings.noise_threshold <= 0.0:
         return 1
-    if settings.split == "auto":
-        return min(1 << max(settings.rays // _FEWEST, 1).bit_length() - 1, _MOST_PARTS)
+    if settings.strategy_samples is None:
+        return min(1 << max(settings.samples // _FEWEST, 1).bit_length() - 1, _MOST_PARTS)
     # Parts do not differ where every count is a multiple of their number.
-    common = math.gcd(settings.cosine, settings.ggx, settings.environment)
+    common = math.gcd(*settings.strategy_samples)
     return max(1, min(common & -common, _MOST_PARTS))
 
 

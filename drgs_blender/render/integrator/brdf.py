@@ -20,7 +20,7 @@ from ..sampling import HALF, INVERSE_PI, ONE, PI, TWO, ZERO, F, sincos_turns
 Array = np.ndarray
 
 PAPER, PRINCIPLED = 0, 1
-LOOKS = {"paper": PAPER, "principled": PRINCIPLED}
+SHADING_MODELS = {"paper": PAPER, "principled": PRINCIPLED}
 
 _IOR = 1.5
 _F0 = F(0.04)
@@ -59,23 +59,23 @@ def layer_albedo(roughness, nv, table):  # type: ignore[no-untyped-def]
 
 
 @njit
-def diffuse_weight(roughness, metallic, nv, look, table):  # type: ignore[no-untyped-def]
+def diffuse_weight(roughness, metallic, nv, shading_model, table):  # type: ignore[no-untyped-def]
     """What multiplies albedo / pi in the diffuse lobe."""
     # Metals interpolated over a triangle are 1 to rounding, above or below: none has a diffuse lobe.
     rest = ONE - metallic if metallic < _METAL else ZERO
-    if look == PAPER:
+    if shading_model == PAPER:
         return rest
     return rest * (ONE - layer_albedo(roughness, nv, table))
 
 
 @inlined
-def fresnel(vh, r, g, b, metallic, look):  # type: ignore[no-untyped-def]
+def fresnel(vh, r, g, b, metallic, shading_model):  # type: ignore[no-untyped-def]
     """Reflectance (RGB) of the specular lobes at half-vector cosine vh; metals end at white, as in Cycles."""
     r, g, b = min(r, ONE), min(g, ONE), min(b, ONE)
     x = max(ZERO, ONE - vh)
     s = x * x
     s = s * s * x
-    if look == PAPER:
+    if shading_model == PAPER:
         dielectric = (ONE - metallic) * _F0
         r, g, b = dielectric + metallic * r, dielectric + metallic * g, dielectric + metallic * b
         return r + (ONE - r) * s, g + (ONE - g) * s, b + (ONE - b) * s
@@ -150,7 +150,7 @@ def sample_vndf(u, v, ix, iy, iz, alpha, bound):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def evaluate(nl, nv, vl, nh2, sin2, r, g, b, kd, metallic, a2, norm, look):  # type: ignore[no-untyped-def]
+def evaluate(nl, nv, vl, nh2, sin2, r, g, b, kd, metallic, a2, norm, shading_model):  # type: ignore[no-untyped-def]
     """Diffuse and specular (RGB each) BRDF values and the density of ``sample_vndf``; all without the cosine.
 
     nl > 0; where nv <= 0 the specular lobe is black, as in Cycles. Without branches, so that loops over it vectorise.
@@ -158,7 +158,7 @@ def evaluate(nl, nv, vl, nh2, sin2, r, g, b, kd, metallic, a2, norm, look):  # t
     k = kd * INVERSE_PI
     value, d = ggx(nl, nv, nh2, sin2, a2)
     value, d = value if nv > ZERO else ZERO, d if nv > ZERO else ZERO
-    fr, fg, fb = fresnel(math.sqrt(max(ZERO, HALF + HALF * vl)), r, g, b, metallic, look)
+    fr, fg, fb = fresnel(math.sqrt(max(ZERO, HALF + HALF * vl)), r, g, b, metallic, shading_model)
     return k * r, k * g, k * b, value * fr, value * fg, value * fb, d * norm
 
 

@@ -99,11 +99,11 @@ def _see_lamps(
 
 @njit
 def _trace_lamps(
-    count: Any, s: Any, ints: Any, scene: Any, lamps: Any, look: Any, apart: Any, shift: Any, sums: Any
+    count: Any, s: Any, ints: Any, scene: Any, lamps: Any, shading_model: Any, apart: Any, shift: Any, sums: Any
 ) -> None:
     """Lamp samples: draw, trace, add."""
     w.lamp_directions(s, ints, count, lamps)
-    w.evaluate(s, count, look)
+    w.evaluate(s, count, shading_model)
     mask = np.int32(ray_masks.SHADOW << shift)
     for slot in range(count):
         i, _ = w.at(slot)
@@ -129,11 +129,11 @@ def _see_sky(count: Any, s: Any, ints: Any, sky: Any, sums: Any) -> None:
 
 @njit
 def _trace_sky(
-    count: Any, s: Any, ints: Any, tracer: Any, sky: Any, look: Any, apart: Any, shift: Any, sums: Any
+    count: Any, s: Any, ints: Any, tracer: Any, sky: Any, shading_model: Any, apart: Any, shift: Any, sums: Any
 ) -> None:
     """Samples of the environment: draw, weigh, trace, add."""
     w.light_directions(s, ints, count, sky)
-    w.evaluate(s, count, look)
+    w.evaluate(s, count, shading_model)
     if apart:
         w.weigh_apart(s, count)
     else:
@@ -150,7 +150,7 @@ def _trace_sky(
 @njit
 def trace_batch(
     strategy: Any, count: Any, rays: Any, paths: Any, begun: Any, found: Any, scene: Any, lights: Any, table: Any,
-    bounces: Any, look: Any, limit: Any, differ: Any, shift: Any, sums: Any,
+    bounces: Any, shading_model: Any, limit: Any, differ: Any, shift: Any, sums: Any,
 ) -> Any:  # fmt: skip
     """Samples of one strategy: draw, weigh, trace, and add what they see; return the number of paths under way."""
     s, ints = rays
@@ -160,10 +160,10 @@ def trace_batch(
     lamps_differ, apart = differ
     w.scramble(ints, count)
     if any_lamps and strategy == LAMPS:
-        _trace_lamps(count, s, ints, scene, lamps, look, apart, shift, sums)
+        _trace_lamps(count, s, ints, scene, lamps, shading_model, apart, shift, sums)
         return begun
     if strategy == SKY:
-        _trace_sky(count, s, ints, tracer, sky, look, apart, shift, sums)
+        _trace_sky(count, s, ints, tracer, sky, shading_model, apart, shift, sums)
         return begun
     if strategy == COSINE:
         w.cosine_directions(s, ints, count)
@@ -171,7 +171,7 @@ def trace_batch(
     else:
         w.ggx_directions(s, ints, count)
         mask = np.int32(ray_masks.GLOSSY << shift)
-    w.evaluate(s, count, look)
+    w.evaluate(s, count, shading_model)
     w.look_up(s, ints, count, sky)
     cosine = ggx = ONE
     if apart and strategy == COSINE:
@@ -202,7 +202,7 @@ def trace_batch(
         others = cosine * s[i + w.WC] * s[i + w.PC] + ggx * s[i + w.WG] * s[i + w.PG]
         rest = (ONE - through) * (ONE + s[i + w.WE] * s[i + w.PE] / max(others, F(1e-30)))
         if begun == BATCH:
-            trace_paths(p, path_ints, begun, scene, lights, look, table, bounces, shift, found)
+            trace_paths(p, path_ints, begun, scene, lights, shading_model, table, bounces, shift, found)
             deliver(begun, found, limit, sums)
             begun = np.int64(0)
         put_hit(tracer, p, path_ints, begun, *position, *direction, hit, ints[c + w.KEY], begun)

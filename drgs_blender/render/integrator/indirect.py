@@ -41,7 +41,7 @@ def lifted(px: Any, py: Any, pz: Any, gx: Any, gy: Any, gz: Any, extent: Any) ->
 
 
 @njit
-def _surfaces(s: Any, ints: Any, count: Any, scene: Any, look: Any, table: Any, sky: Any) -> None:
+def _surfaces(s: Any, ints: Any, count: Any, scene: Any, shading_model: Any, table: Any, sky: Any) -> None:
     """Normals and materials where the rays hit. What the surfaces emit was taken where the rays left (`_onwards`)."""
     tracer, geometry, extent = scene
     for slot in range(count):
@@ -56,7 +56,7 @@ def _surfaces(s: Any, ints: Any, count: Any, scene: Any, look: Any, table: Any, 
         s[a + w.OX], s[a + w.OY], s[a + w.OZ] = lifted(s[a + w.OX], s[a + w.OY], s[a + w.OZ], gx, gy, gz, extent)
         s[a + w.AR], s[a + w.AG], s[a + w.AB] = r, g, b
         s[a + w.METALLIC], s[a + w.A2] = metallic, brdf.alpha_squared(roughness)
-        s[a + w.KD] = brdf.diffuse_weight(roughness, metallic, mx * vx + my * vy + mz * vz, look, table)
+        s[a + w.KD] = brdf.diffuse_weight(roughness, metallic, mx * vx + my * vy + mz * vz, shading_model, table)
 
 
 @njit
@@ -154,7 +154,8 @@ def _onwards(
 
 @njit
 def trace_paths(
-    s: Any, ints: Any, count: Any, scene: Any, lights: Any, look: Any, table: Any, bounces: Any, shift: Any, found: Any
+    s: Any, ints: Any, count: Any, scene: Any, lights: Any, shading_model: Any, table: Any, bounces: Any, shift: Any,
+    found: Any
 ) -> None:  # fmt: skip
     """Follow `count` paths that `put_hit` began in slots 0, 1, ...; their light goes to rows OWNER of `found`.
 
@@ -176,22 +177,22 @@ def trace_paths(
         for k in range(CARRIED):
             found[owner, k] = ZERO
     for bounce in range(vertices):
-        _surfaces(s, ints, count, scene, look, table, sky)
-        w.lobe_shares(s, count, look)
+        _surfaces(s, ints, count, scene, shading_model, table, sky)
+        w.lobe_shares(s, count, shading_model)
         if sky_shines:
             w.fresh_numbers(ints, count, GOLDEN)
             w.light_directions(s, ints, count, sky)
-            w.evaluate(s, count, look)
+            w.evaluate(s, count, shading_model)
             w.carry(s, count, ONE)
             _towards_sky(s, ints, count, sky, tracer, shift, found)
         if any_lamps:
             w.fresh_numbers(ints, count, U(0x2C1B3C6D))
             w.lamp_directions(s, ints, count, lamps)
-            w.evaluate(s, count, look)
+            w.evaluate(s, count, shading_model)
             _towards_lamps(s, ints, count, lamps, tracer, shift, found)
         w.fresh_numbers(ints, count, U(0x7FEB352D))
         w.brdf_directions(s, ints, count)
-        w.evaluate(s, count, look)
+        w.evaluate(s, count, shading_model)
         w.carry(s, count, ZERO)
         last = bounce + 1 == vertices
         count = _onwards(s, ints, count, bounce, last, sky, lamps, any_lamps, glows, scene, shift, found)

@@ -60,7 +60,7 @@ def integrate(
     light: EnvironmentLight,
     points: ShadingPoints,
     settings: RenderSettings,
-    frame_number: int,
+    noise_index: int,
     lamps: Lamps | None = None,
     part: tuple[int, int] = (0, 1),
     *,
@@ -73,9 +73,9 @@ def integrate(
     ----------
     scene, light, lamps : what rays meet, what they see when they meet nothing, and what shines in between
     points : visible points, world space
-    settings : ``cosine``, ``ggx`` and ``environment`` samples a pixel and their ``split``, divided among its
-        ``positions``; ``bounces``, ``look``, ``seed``, ``clamp_indirect``
-    frame_number : int, part of the seed
+    settings : RenderSettings
+        Samples per pixel, divided among its ``subpixel_count`` places; bounces, shading model, seed, clamp.
+    noise_index : int, part of the seed
     part : (i, n): only the i-th of n equal parts of each sub-sample's samples; the mean over all parts is the whole
     surfels : what rays meet of DR-GS objects next to the scene's meshes; then `points` say which surfels are their own
     kernel : None: that of this processor
@@ -90,13 +90,15 @@ def integrate(
     UsageError
         When settings are out of range.
     """
-    counts = (settings.cosine, settings.ggx, settings.environment)
-    if min(counts) < 0 or settings.bounces < 0 or settings.aa < 0:
-        raise UsageError("render settings", "samples, bounces or aa are negative", "Use counts of zero or more")
+    auto = settings.strategy_samples is None
+    counts = (settings.samples, 0, 0) if settings.strategy_samples is None else settings.strategy_samples
+    if min(counts) < 0 or settings.bounces < 0 or settings.subpixel_samples < 0:
+        problem = "samples, bounces or sub-pixel samples are negative"
+        raise UsageError("render settings", problem, "Use counts of zero or more")
     if not (0.0 <= settings.clamp_indirect < np.inf and 0.0 <= settings.noise_threshold < np.inf):
         raise UsageError("render settings", "the clamp or the threshold is no number of at least 0", "Use 0 for none")
-    if settings.look not in brdf.LOOKS:
-        raise UsageError("render settings", f"look {settings.look!r} is unknown", "Use principled or paper")
+    if settings.shading_model not in brdf.SHADING_MODELS:
+        raise UsageError("render settings", f"look {settings.shading_model!r} is unknown", "Use principled or paper")
     n = len(points)
     out = Radiance.dark(n)
     lamps = lamps or _NO_LAMPS
@@ -121,14 +123,14 @@ def integrate(
         sampling.point_set(sum(counts) + 1),
     )
     rules = (
-        (settings.split == "auto", *map(F, counts), F(sky_part), F(lamp_part), _APART if scene.rays_differ else ONE),
-        settings.positions,
+        (auto, *map(F, counts), F(sky_part), F(lamp_part), _APART if scene.rays_differ else ONE),
+        settings.subpixel_count,
         part,
         (settings.bounces, glows),
-        brdf.LOOKS[settings.look],
-        U(mixed(settings.seed, frame_number)),
-        F(settings.clamp_indirect * settings.positions * part[1] / sum(counts)),
-        (lamps.rays_differ, scene.rays_differ and (settings.split == "auto" or min(counts[:2]) > 0)),
+        brdf.SHADING_MODELS[settings.shading_model],
+        U(mixed(settings.seed, noise_index)),
+        F(settings.clamp_indirect * settings.subpixel_count * part[1] / sum(counts)),
+        (lamps.rays_differ, scene.rays_differ and (auto or min(counts[:2]) > 0)),
     )
 
     def run(some: ShadingPoints, shift: int, found: Radiance) -> None:
@@ -167,9 +169,9 @@ def sky_share(light: EnvironmentLight, lamps: Lamps) -> float:
 _NO_LAMPS = Lamps([])
 
 
-def mixed(seed: int, frame_number: int) -> int:
+def mixed(seed: int, noise_index: int) -> int:
     """One 32-bit key of the job's seed and the frame's number."""
-    value = (seed * 0x9E3779B97F4A7C15 + (frame_number + 1) * 0xD1B54A32D192ED03) & (2**64 - 1)
+    value = (seed * 0x9E3779B97F4A7C15 + (noise_index + 1) * 0xD1B54A32D192ED03) & (2**64 - 1)
     value ^= value >> 32
     value = value * 0xD6E8FEB86659FD93 & (2**64 - 1)
     return value >> 32
@@ -178,8 +180,9 @@ def mixed(seed: int, frame_number: int) -> int:
 @njit
 def shade_points(
     lane: Any, lanes: Any, room: Any, keys: Any, frames: Any, surfaces: Any, tracer: Any, geometry: Any, extent: Any,
-    sky: Any, sky_rules: Any, lamps: Any, table: Any, sequence: Any, split: Any, aa: Any, part: Any, bounces: Any,
-    look: Any, seed: Any, limit: Any, differ: Any, shift: Any, out: Any,
+    sky: Any, sky_rules: Any, lamps: Any, table: Any, sequence: Any, split: Any, subpixels: Any, part: Any,
+    bounces: Any,
+    shading_model: Any, seed: Any, limit: Any, differ: Any, shift: Any, out: Any,
 ) -> None:  # fmt: skip
     """Shade every so-manyth (`lanes`) block of points, from the `lane`-th on.
 
@@ -197,13 +200,13 @@ def shade_points(
     rays, paths, found, sums, head, row, total = room
     s, ints = rays
     # Samples of a sub-sample's part lie next to each other among those of the pixel.
-    rate = ONE / F(aa * part[1])
+    rate = ONE / F(subpixels * part[1])
     for block in range(lane, blocks, lanes):
         start = block * _BLOCK
         end = min(n, start + _BLOCK)
         sums[:] = ZERO
         total[:] = 0
-        write_heads(start, end, frames, surfaces, extent, sky, look, table, split, head, row)
+        write_heads(start, end, frames, surfaces, extent, sky, shading_model, table, split, head, row)
         begun = np.int64(0)
         for strategy in range(4):
             count = np.int64(0)
@@ -224,7 +227,8 @@ def shade_points(
                 for j in range(first, past):
                     if count == BATCH:
                         begun = trace_batch(
-                            strategy, count, rays, paths, begun, found, scene, lights, table, bounces, look, limit,
+                            strategy, count, rays, paths, begun, found, scene, lights, table, bounces, shading_model,
+                            limit,
                             differ, shift, sums,
                         )  # fmt: skip
                         count = np.int64(0)
@@ -237,10 +241,11 @@ def shade_points(
                     count += 1
             if count > 0:
                 begun = trace_batch(
-                    strategy, count, rays, paths, begun, found, scene, lights, table, bounces, look, limit, differ,
+                    strategy, count, rays, paths, begun, found, scene, lights, table, bounces, shading_model, limit,
+                    differ,
                     shift, sums,
                 )  # fmt: skip
-        trace_paths(paths[0], paths[1], begun, scene, lights, look, table, bounces, shift, found)
+        trace_paths(paths[0], paths[1], begun, scene, lights, shading_model, table, bounces, shift, found)
         deliver(begun, found, limit, sums)
         for i in range(start, end):
             finish(sums, i - start, total[i - start], components, moments, i)
@@ -263,12 +268,13 @@ def _room() -> Any:
 @njit(parallel=True)
 def _kernel(
     keys: Any, frames: Any, surfaces: Any, tracer: Any, geometry: Any, extent: Any, sky: Any, sky_rules: Any,
-    lamps: Any, table: Any, sequence: Any, split: Any, aa: Any, part: Any, bounces: Any, look: Any, seed: Any,
+    lamps: Any, table: Any, sequence: Any, split: Any, subpixels: Any, part: Any, bounces: Any, shading_model: Any,
+    seed: Any,
     limit: Any, differ: Any, shift: Any, out: Any, lanes: Any,
 ) -> None:  # fmt: skip
     # Threads get neighbouring lanes, lanes get every so-manyth block: no thread is left with all the costly ones.
     for lane in prange(lanes):
         shade_points(
             np.int64(lane), lanes, _room(), keys, frames, surfaces, tracer, geometry, extent, sky, sky_rules, lamps,
-            table, sequence, split, aa, part, bounces, look, seed, limit, differ, shift, out,
+            table, sequence, split, subpixels, part, bounces, shading_model, seed, limit, differ, shift, out,
         )  # fmt: skip

@@ -65,7 +65,8 @@ def _allot(head: Any, h: Any, share: Any, split: Any) -> None:
 
 @njit
 def write_heads(
-    first: Any, last: Any, frames: Any, surfaces: Any, extent: Any, sky: Any, look: Any, table: Any, split: Any,
+    first: Any, last: Any, frames: Any, surfaces: Any, extent: Any, sky: Any, shading_model: Any, table: Any,
+    split: Any,
     head: Any, row: Any,
 ) -> None:  # fmt: skip
     """What all samples of a point share, see `HEAD`, and its row in the light's tables.
@@ -86,12 +87,12 @@ def write_heads(
         head[h, 0], head[h, 1], head[h, 2] = lifted(origin[i, 0], origin[i, 1], origin[i, 2], gx, gy, gz, extent)
         mx, my, mz = brdf.glossy_normal(normal[i, 0], normal[i, 1], normal[i, 2], gx, gy, gz, vx, vy, vz)
         mv = mx * vx + my * vy + mz * vz
-        weight = brdf.diffuse_weight(roughness[i], metallic[i], mv, look, table)
+        weight = brdf.diffuse_weight(roughness[i], metallic[i], mv, shading_model, table)
         head[h, ALPHA], head[h, WEIGHT] = brdf.alpha_squared(roughness[i]), weight
         head[h, NORMAL], head[h, NORMAL + 1], head[h, NORMAL + 2] = mx, my, mz
         r, g, b = albedo[i, 0], albedo[i, 1], albedo[i, 2]
         row[h] = U(facing_row(normal[i, 0], normal[i, 1], normal[i, 2], sky))
-        _allot(head, h, w.diffuse_share(mv, r, g, b, weight, metallic[i], look), split)
+        _allot(head, h, w.diffuse_share(mv, r, g, b, weight, metallic[i], shading_model), split)
 
 
 @njit

@@ -211,7 +211,7 @@ def warm(s: Any, count: Any, sky: Any) -> None:
 
 
 @njit
-def evaluate(s: Any, count: Any, look: Any) -> None:
+def evaluate(s: Any, count: Any, shading_model: Any) -> None:
     """BRDF of both lobes times cosine, densities of cosine and GGX sampling, and LIVE: whether any light can pass."""
     for p in range(packets(count)):
         for i in range(p * _FLOATS, p * _FLOATS + LANES):
@@ -229,7 +229,19 @@ def evaluate(s: Any, count: Any, look: Any) -> None:
             a2 = s[i + A2]
             _, norm = brdf.vndf_terms(max(mv, ZERO), a2)
             qr, qg, qb, sr, sg, sb, pg = brdf.evaluate(
-                ml, mv, vl, mh2, sin2, s[i + AR], s[i + AG], s[i + AB], s[i + KD], s[i + METALLIC], a2, norm, look
+                ml,
+                mv,
+                vl,
+                mh2,
+                sin2,
+                s[i + AR],
+                s[i + AG],
+                s[i + AB],
+                s[i + KD],
+                s[i + METALLIC],
+                a2,
+                norm,
+                shading_model,
             )
             s[i + QR], s[i + QG], s[i + QB] = qr * nl, qg * nl, qb * nl
             above = ml > ZERO
@@ -293,9 +305,9 @@ def drop(s: Any, count: Any, lobe: Any) -> None:
 
 
 @inlined
-def diffuse_share(mv: Any, r: Any, g: Any, b: Any, kd: Any, metallic: Any, look: Any) -> Any:
+def diffuse_share(mv: Any, r: Any, g: Any, b: Any, kd: Any, metallic: Any, shading_model: Any) -> Any:
     """How often the diffuse lobe is sampled, from what both reflect towards the viewer."""
-    fr, fg, fb = brdf.fresnel(max(mv, ZERO), r, g, b, metallic, look)
+    fr, fg, fb = brdf.fresnel(max(mv, ZERO), r, g, b, metallic, shading_model)
     diffuse = kd * luminance(r, g, b)
     share = min(max(diffuse / max(diffuse + luminance(fr, fg, fb), _TINY), F(0.1)), F(0.8))
     share = share if mv > ZERO else ONE
@@ -303,12 +315,12 @@ def diffuse_share(mv: Any, r: Any, g: Any, b: Any, kd: Any, metallic: Any, look:
 
 
 @njit
-def lobe_shares(s: Any, count: Any, look: Any) -> None:
+def lobe_shares(s: Any, count: Any, shading_model: Any) -> None:
     """SHARE: how often the diffuse lobe is sampled."""
     for p in range(packets(count)):
         for i in range(p * _FLOATS, p * _FLOATS + LANES):
             mv = s[i + MX] * s[i + VX] + s[i + MY] * s[i + VY] + s[i + MZ] * s[i + VZ]
-            s[i + SHARE] = diffuse_share(mv, s[i + AR], s[i + AG], s[i + AB], s[i + KD], s[i + METALLIC], look)
+            s[i + SHARE] = diffuse_share(mv, s[i + AR], s[i + AG], s[i + AB], s[i + KD], s[i + METALLIC], shading_model)
 
 
 @njit

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-LOOKS = ("principled", "paper")
+SHADING_MODELS = ("principled", "paper")
 MIN_ALPHA = 1e-3
 IOR = 1.5
 #: Reflectance of the dielectric at normal incidence.
@@ -136,7 +136,7 @@ def evaluate(
     albedo: Tensor,
     roughness: Tensor,
     metallic: Tensor,
-    look: str = "principled",
+    shading_model: str = "principled",
 ) -> tuple[Tensor, Tensor]:
     """BRDF times the cosine of the light, diffuse and glossy part.
 
@@ -151,15 +151,15 @@ def evaluate(
     diffuse, glossy : (..., 3); zero where the light is below the surface, glossy also where the view is (an
         interpolated normal may turn away from the viewer at a silhouette; diffuse light does not ask for the view)
     """
-    if look not in LOOKS:
-        raise ValueError(f"look {look!r} is not one of {LOOKS}")
+    if shading_model not in SHADING_MODELS:
+        raise ValueError(f"look {shading_model!r} is not one of {SHADING_MODELS}")
     normal, view, light = torch.broadcast_tensors(normal, view, light)
     lit = (dot(normal, light) > 0).unsqueeze(-1)
     seen = lit & (dot(normal, view) > 0).unsqueeze(-1)
     # Directions below the surface are replaced by the normal, so that neither value nor gradient is ever NaN.
     cos_light = dot(normal, torch.where(lit, light, normal))
     base = ((1 - metallic) / math.pi * cos_light).unsqueeze(-1) * albedo
-    if look == "principled":
+    if shading_model == "principled":
         base = base * (1 - layer_albedo(dot(normal, view), roughness)).unsqueeze(-1)
 
     view, light = torch.where(seen, view, normal), torch.where(seen, light, normal)
@@ -169,7 +169,7 @@ def evaluate(
     alpha = alpha_of(roughness)
     facets = ggx_distribution(normal, half, alpha) * smith_visibility(cos_view, cos_light, alpha) * cos_light
     metal = metallic.unsqueeze(-1)
-    if look == "paper":
+    if shading_model == "paper":
         fresnel = fresnel_schlick(cos_half, 0.04 * (1 - metal) + albedo * metal)
     else:
         dielectric = fresnel_dielectric(cos_half).unsqueeze(-1)

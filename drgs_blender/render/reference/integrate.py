@@ -191,7 +191,7 @@ def integrate(
     points: SurfacePoints,
     counts: Counts = Counts(),
     bounces: int = 1,
-    look: str = "principled",
+    shading_model: str = "principled",
     generator: torch.Generator | None = None,
     samples: bool = False,
 ) -> Tensor:
@@ -212,14 +212,19 @@ def integrate(
     directions, weight = draw(points, light, counts, generator)
 
     def follow(met: SurfacePoints) -> Tensor:
-        return integrate(tracer, light, met, SECONDARY, bounces - 1, look, generator).sum(1)
+        return integrate(tracer, light, met, SECONDARY, bounces - 1, shading_model, generator).sum(1)
 
-    result = _gather(tracer, light, points, directions, weight, look, follow if bounces > 0 else None)
+    result = _gather(tracer, light, points, directions, weight, shading_model, follow if bounces > 0 else None)
     return result if samples else result.sum(1)
 
 
 def integrate_quadrature(
-    tracer: Tracer, light: Light, points: SurfacePoints, rows: int = 256, look: str = "principled", bounces: int = 0
+    tracer: Tracer,
+    light: Light,
+    points: SurfacePoints,
+    rows: int = 256,
+    shading_model: str = "principled",
+    bounces: int = 0,
 ) -> Tensor:
     """`integrate` without chance: the midpoint rule on a lat-long grid of `rows` x 2 `rows` cells of the sphere.
 
@@ -235,7 +240,7 @@ def integrate_quadrature(
     solid_angle = ((edges[:-1] - edges[1:]) * math.pi / rows).repeat_interleave(2 * rows)
 
     def follow(met: SurfacePoints) -> Tensor:
-        return integrate_quadrature(tracer, light, met, max(rows // 8, 8), look, bounces - 1).sum(1)
+        return integrate_quadrature(tracer, light, met, max(rows // 8, 8), shading_model, bounces - 1).sum(1)
 
     parts = [torch.zeros(0, 4, 3, dtype=dtype, device=device)]
     block = max(1, _CELLS_AT_ONCE // len(grid))
@@ -244,7 +249,9 @@ def integrate_quadrature(
         above = (some.normal @ grid.T > 0) & (some.geometric_normal @ grid.T > 0)
         weight = torch.where(above, solid_angle, torch.zeros_like(solid_angle))
         directions = grid.expand(len(some), -1, 3)
-        parts.append(_gather(tracer, light, some, directions, weight, look, follow if bounces > 0 else None).sum(1))
+        parts.append(
+            _gather(tracer, light, some, directions, weight, shading_model, follow if bounces > 0 else None).sum(1)
+        )
     return torch.cat(parts)
 
 
@@ -254,7 +261,7 @@ def _gather(
     points: SurfacePoints,
     directions: Tensor,
     weight: Tensor,
-    look: str,
+    shading_model: str,
     follow: Callable[[SurfacePoints], Tensor] | None,
 ) -> Tensor:
     """What arrives along `directions` (n, s, 3), reflected and weighted: (n, s, 4, 3)."""
@@ -266,7 +273,7 @@ def _gather(
         points.albedo[:, None],
         points.roughness[:, None],
         points.metallic[:, None],
-        look,
+        shading_model,
     )
     reflected = torch.stack([diffuse, glossy], 2) * weight[..., None, None]
     # Only what can carry light is traced.

@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from ...compute.jit import get_num_threads, njit, prange
-from ..camera import AA, CLIP_END, CLIP_START, FX, FY, ORTHOGRAPHIC, WIDTH, lattice, pixel_shift
+from ..camera import CLIP_END, CLIP_START, FX, FY, ORTHOGRAPHIC, SUBPIXELS, WIDTH, lattice, pixel_shift
 from .blending import GAP, LANES, MANY, MIN_TRANSMITTANCE, mean, merge_sort, prune, rank_sort, weigh, widen
 from .splats import (
     CUT,
@@ -70,11 +70,12 @@ class SurfelSamples:
 
     Attributes
     ----------
-    alpha : (rows, width, aa) float32 coverage, 1 - transmittance
-    depth : (rows, width, aa) float32, metres along the view axis
-    surface : (rows, width, aa, 9) float32: world normal (unit, on the surfels' own side, which may face away from the
+    alpha : (rows, width, subpixels) float32 coverage, 1 - transmittance
+    depth : (rows, width, subpixels) float32, metres along the view axis
+    surface : (rows, width, subpixels, 9) float32: world normal (unit, on the surfels' own side, which may face away
+        from the
         viewer; 0 where they cancel), albedo, roughness, metallic, and the mean standard deviation in metres
-    object_index : (rows, width, aa) int32
+    object_index : (rows, width, subpixels) int32
     """
 
     alpha: Array
@@ -86,8 +87,8 @@ class SurfelSamples:
 def rasterise(splats: Splats, y0: int, y1: int) -> SurfelSamples:
     """Blend the splats for the rows ``y0 .. y1`` (full-picture pixels, inside the window)."""
     x0, top, x1, _ = splats.window
-    aa = int(splats.parameters[AA])
-    shape = (y1 - y0, x1 - x0, aa)
+    subpixels = int(splats.parameters[SUBPIXELS])
+    shape = (y1 - y0, x1 - x0, subpixels)
     samples = SurfelSamples(
         np.zeros(shape, np.float32),
         np.empty(shape, np.float32),
@@ -109,7 +110,7 @@ def rasterise(splats: Splats, y0: int, y1: int) -> SurfelSamples:
             top // TILE,
             y0,
             y1,
-            aa,
+            subpixels,
             4 * get_num_threads(),
             samples.alpha,
             samples.depth,
@@ -181,7 +182,7 @@ def _meet(screen: Any, i: Any, opacity: Any, near: Any, far: Any, state: Any, fi
 @njit
 def _collect(
     tile_list: Any, begin: Any, end: Any, screen: Any, surface: Any, box: Any, nearest: Any,
-    left: Any, top: Any, right: Any, bottom: Any, tile_left: Any, tile_top: Any, aa: Any,
+    left: Any, top: Any, right: Any, bottom: Any, tile_left: Any, tile_top: Any, subpixels: Any,
     records: Any, surfaces: Any, spans: Any,
 ) -> None:  # fmt: skip
     """Bring together what blending reads of a tile's splats; spans are samples of the tile's rows, and rows."""
@@ -192,7 +193,10 @@ def _collect(
         for c in range(SURFACE):
             surfaces[e, c] = surface[i, c]
         records[e, _STRENGTH], records[e, _NEAREST] = surface[i, OPACITY], nearest[i]
-        spans[e, 0], spans[e, 2] = (max(box[i, 0], left) - tile_left) * aa, (min(box[i, 2], right) - tile_left) * aa
+        spans[e, 0], spans[e, 2] = (
+            (max(box[i, 0], left) - tile_left) * subpixels,
+            (min(box[i, 2], right) - tile_left) * subpixels,
+        )
         spans[e, 1], spans[e, 3] = max(box[i, 1], top) - tile_top, min(box[i, 3], bottom) - tile_top
 
 
@@ -233,17 +237,19 @@ def _limit(state: Any) -> Any:
 
 
 @njit
-def _place(p: Any, width: Any, y: Any, tile_left: Any, left: Any, right: Any, first: Any, aa: Any, state: Any) -> None:
+def _place(
+    p: Any, width: Any, y: Any, tile_left: Any, left: Any, right: Any, first: Any, subpixels: Any, state: Any
+) -> None:
     """Start a block: positions of its samples, nothing gathered. Those outside the window count as opaque."""
     zero = np.float32(0.0)
     for lane in range(LANES):
         k = np.uintp(lane)
-        x = tile_left + (first + lane) // aa
+        x = tile_left + (first + lane) // subpixels
         state[_X + k] = state[_Y + k] = state[_LEFT + k] = zero
         state[_FARTHEST + k] = np.float32(-1e30)
         if left <= x < right:
             shift_x, shift_y = pixel_shift(p, y * width + x)
-            jx, jy = lattice(shift_x, shift_y, (first + lane) % aa, p)
+            jx, jy = lattice(shift_x, shift_y, (first + lane) % subpixels, p)
             state[_X + k], state[_Y + k], state[_LEFT + k] = x + jx, y + jy, np.float32(1.0)
 
 
@@ -286,7 +292,7 @@ def _gather(
 @njit
 def _finish(
     surfaces: Any, lists_z: Any, lists_a: Any, lists_i: Any, room: Any, count: Any, rank: Any, order: Any,
-    weights: Any, pixel_base: Any, pixel: Any, aa: Any, y: Any, x: Any, first: Any,
+    weights: Any, pixel_base: Any, pixel: Any, subpixels: Any, y: Any, x: Any, first: Any,
     owner: Any, out_alpha: Any, out_depth: Any, out_surface: Any,
 ) -> None:  # fmt: skip
     """Resolve the samples of a block and write them; ``owner`` gets each one's heaviest splat. x: of the tile."""
@@ -299,7 +305,7 @@ def _finish(
             merge_sort(lists_z, base, n, order)
         else:
             rank_sort(lists_z, base, n, rank, order)
-        column, k = x + (first + lane) // aa, (first + lane) % aa
+        column, k = x + (first + lane) // subpixels, (first + lane) % subpixels
         t, total, depth, owner[lane], begin, end = weigh(
             surfaces, lists_z, lists_a, lists_i, base, n, order, weights, pixel_base, pixel
         )
@@ -324,7 +330,7 @@ def _blend(
     tile_y0: Any,
     y0: Any,
     y1: Any,
-    aa: Any,
+    subpixels: Any,
     workers: Any,
     out_alpha: Any,
     out_depth: Any,
@@ -342,7 +348,7 @@ def _blend(
     # A pixel at depth z is pixel_base + pixel * z metres wide.
     pixel = np.float32(0.0 if ortho else 1.0 / min(p[FX], p[FY]))
     pixel_base = np.float32(1.0 / min(p[FX], p[FY]) if ortho else 0.0)
-    blocks_row = TILE * aa // LANES
+    blocks_row = TILE * subpixels // LANES
     for worker in prange(workers):
         state = np.empty(_BLOCK, np.float32)
         count = np.empty(LANES, np.int32)
@@ -366,7 +372,7 @@ def _blend(
                 spans = np.empty((2 * n, 4), np.int32)
             _collect(
                 tile_list, listed, listed + n, screen, surface, box, nearest, left, top, right, bottom,
-                tx * TILE, ty * TILE, aa, records, surfaces, spans,
+                tx * TILE, ty * TILE, subpixels, records, surfaces, spans,
             )  # fmt: skip
             _count(spans, n, blocks_row, start)
             if start[-1] > len(binned):
@@ -378,7 +384,7 @@ def _blend(
                     continue
                 y = ty * TILE + block // blocks_row
                 first = block % blocks_row * LANES  # of the samples of the tile's row
-                _place(p, width, y, tx * TILE, left, right, first, aa, state)
+                _place(p, width, y, tx * TILE, left, right, first, subpixels, state)
                 count[:] = 0
                 while True:
                     begin = _gather(
@@ -401,11 +407,12 @@ def _blend(
                         room *= 2
                         order, weights = np.empty(room, np.int32), np.empty(room, np.float32)
                 _finish(
-                    surfaces, lists_z, lists_a, lists_i, room, count, rank, order, weights, pixel_base, pixel, aa,
+                    surfaces, lists_z, lists_a, lists_i, room, count, rank, order, weights, pixel_base, pixel,
+                    subpixels,
                     y - y0, tx * TILE - x0, first, owner, out_alpha, out_depth, out_surface,
                 )  # fmt: skip
                 for lane in range(LANES):
                     if count[lane] > 0:
-                        out_object[y - y0, tx * TILE - x0 + (first + lane) // aa, (first + lane) % aa] = objects[
-                            tile_list[listed + owner[lane]]
-                        ]
+                        out_object[y - y0, tx * TILE - x0 + (first + lane) // subpixels, (first + lane) % subpixels] = (
+                            objects[tile_list[listed + owner[lane]]]
+                        )

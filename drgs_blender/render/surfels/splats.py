@@ -18,7 +18,7 @@ import numpy as np
 from ...compute.jit import njit, plain, prange
 from ...core.asset.model import PosedSurfels
 from ...core.frame import Camera
-from ..camera import AA, CLIP_END, CLIP_START, CX, CY, FX, FY, LEAN, ORTHOGRAPHIC, POSITION, filter_reach
+from ..camera import CLIP_END, CLIP_START, CX, CY, FX, FY, LEAN, ORTHOGRAPHIC, POSITION, SUBPIXELS, filter_reach
 
 Array = np.ndarray
 
@@ -190,7 +190,7 @@ def project_surfel(
     for column in range(RECORD):
         screen[i, column] = 0.0
     screen[i, RX], screen[i, RY], screen[i, ZC], screen[i, CUT] = rx, ry, c[2], cut
-    screen[i, LOW] = 2.0 * p[AA] if in_front else 1e30
+    screen[i, LOW] = 2.0 * p[SUBPIXELS] if in_front else 1e30
     if length <= 0.0:
         screen[i, A], screen[i, N], screen[i, D] = 1e15, 1.0, c[2]  # a point: only the low-pass sees it
     elif ortho:
@@ -216,7 +216,7 @@ def project_surfel(
             screen[i, B] = k * (c[0] * a[1] - c[1] * a[0])
             screen[i, N] = k * nz
     # Screen bounds.
-    low = np.sqrt(0.5 * cut / p[AA])
+    low = np.sqrt(0.5 * cut / p[SUBPIXELS])
     if ortho:
         lo_x, hi_x = span(fx, rx, 1.0, a[0], b[0], 0.0, 0.0, cut)
         lo_y, hi_y = span(fy, ry, 1.0, a[1], b[1], 0.0, 0.0, cut)
