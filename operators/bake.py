@@ -56,7 +56,9 @@ class DRGS_OT_bake_light(ProgramOperator, targets.ObjectMode, bpy.types.Operator
         ),
         default="all",
     )
-    samples: IntProperty(name="Samples", description="Samples of light per vertex or texel", default=256, min=3, max=65536)
+    samples: IntProperty(
+        name="Samples", description="Samples of light per vertex or texel", default=256, min=3, max=65536
+    )
     use_animation: BoolProperty(name="Animation", description="All frames of the scene's range", default=False)
 
     _names: tuple[str, ...] = ()

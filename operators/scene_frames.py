@@ -39,7 +39,9 @@ class SceneFrames(ProgramOperator):
         ),
         default="captured",
     )
-    samples: IntProperty(name="Samples", description="Samples per splat of the scene's light", default=256, min=1, max=65536)
+    samples: IntProperty(
+        name="Samples", description="Samples per splat of the scene's light", default=256, min=1, max=65536
+    )
 
     def describe(
         self, context: bpy.types.Context, target: Path, kind: Held, frames: Iterable[int] | None = None

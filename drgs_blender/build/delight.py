@@ -99,7 +99,7 @@ def captured_along(surfels: Surfels, directions: Array) -> Array:
 
 
 def _light(
-    asset: Asset, light: EnvironmentLight, settings: RenderSettings, progress: Progress | None
+    asset: Asset, environment: EnvironmentLight, settings: RenderSettings, progress: Progress | None
 ) -> tuple[Array, Array, Array]:
     """Diffuse light of albedo 1, glossy light, and captured colour, (n, 3) each, of every surfel along its normal."""
     mesh, surfels = asset.mesh, asset.surfels
@@ -112,7 +112,7 @@ def _light(
     scene = TraceScene()
     scene.update([TraceObject("asset", mesh.vertices, mesh.faces, mesh.albedo, mesh.roughness, mesh.metallic)])
     try:
-        components = light_components(scene, light, points, settings, progress=progress).astype(np.float64)
+        components = light_components(scene, environment, points, settings, progress=progress).astype(np.float64)
     finally:
         scene.close()
     return components[:, :2].sum(axis=1), components[:, 2:].sum(axis=1), captured_along(surfels, points.normal)

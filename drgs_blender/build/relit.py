@@ -13,7 +13,7 @@ from ..core.frame import RenderSettings, World
 from ..geometry.normals import rotation_matrices
 from ..render.integrator.integrate import integrate
 from ..render.lights.environment import EnvironmentLight
-from ..render.lights.lights import Lamps
+from ..render.lights.lights import Lights
 from ..render.points import ShadingPoints
 from ..render.scene.trace_scene import TraceObject, TraceScene
 from ..render.surfels.surfel_bvh import SurfelBVH
@@ -67,23 +67,23 @@ def relit_colours(
 
 def lit_colours(
     scene: TraceScene,
-    light: EnvironmentLight,
+    environment: EnvironmentLight,
     points: ShadingPoints,
     settings: RenderSettings,
-    lamps: Lamps | None = None,
+    lights: Lights | None = None,
     tree: SurfelBVH | None = None,
     progress: Progress | None = None,
 ) -> Array:
     """Light that leaves `points`, (n, 3) float32 linear Rec.709; what is given is as for `integrate`."""
-    return light_components(scene, light, points, settings, lamps, tree, progress).sum(axis=1)
+    return light_components(scene, environment, points, settings, lights, tree, progress).sum(axis=1)
 
 
 def light_components(
     scene: TraceScene,
-    light: EnvironmentLight,
+    environment: EnvironmentLight,
     points: ShadingPoints,
     settings: RenderSettings,
-    lamps: Lamps | None = None,
+    lights: Lights | None = None,
     tree: SurfelBVH | None = None,
     progress: Progress | None = None,
 ) -> Array:
@@ -94,7 +94,7 @@ def light_components(
         if progress is not None:
             progress("Lighting", start / n)
         rows = slice(start, start + _BLOCK)
-        components[rows] = integrate(scene, light, points[rows], settings, 0, lamps, surfels=tree).components
+        components[rows] = integrate(scene, environment, points[rows], settings, 0, lights, surfels=tree).components
     if progress is not None:
         progress("Done", 1.0)
     return components

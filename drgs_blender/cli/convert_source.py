@@ -147,7 +147,7 @@ class FrameSource:
         self._args, session = args, Session()
         self._frame = surface_frame(args.input, args.samples, session)
         self.notes: list[str] = []
-        (self._scene, self._light, _, self._lamps, self._tree), self._objects = session.place(self._frame)
+        (self._scene, self._light, _, self._lights, self._tree), self._objects = session.place(self._frame)
         self._seen = [i for i, item in enumerate(self._objects) if item.state.visibility.camera]
         self._session = session  # keeps the scene
         faces = any(len(self._objects[i].mesh.faces) for i in self._seen)
@@ -208,7 +208,7 @@ class FrameSource:
             points = points_on_mesh(surfels, item.mesh.vertices, faces, binding, mirrored=mirrored)
             points = points if tree is None else own_surfels(points, index, size)
         settings = self._frame.settings
-        colour = lit_colours(self._scene, self._light, points, settings, self._lamps, tree, progress)
+        colour = lit_colours(self._scene, self._light, points, settings, self._lights, tree, progress)
         return splats_of(surfels, colour)
 
 

@@ -12,7 +12,7 @@ from ..core.frame import Frame
 from ..ipc.protocol import Passes
 from ..render.backend import HERE, Processor
 from ..render.lights.environment import EnvironmentLight
-from ..render.lights.lights import Lamps
+from ..render.lights.lights import Lights
 from ..render.pipeline import Progress
 from ..render.progressive import Progressive, coarse, thinned
 from ..render.scene.trace_scene import TraceScene
@@ -20,7 +20,7 @@ from ..render.surfels.surfel_bvh import SurfelBVH
 
 IsCancelled = Callable[[], bool]
 #: What a frame was made into.
-Ready = tuple[TraceScene, EnvironmentLight, PosedSurfels, Lamps, SurfelBVH | None]
+Ready = tuple[TraceScene, EnvironmentLight, PosedSurfels, Lights, SurfelBVH | None]
 #: Makes a whole picture of a frame, telling its progress.
 Draw = Callable[[Frame, Ready, Progress], Passes]
 
@@ -121,8 +121,8 @@ class View:
             if phase == "Rendering" and not projected:
                 projected = time.perf_counter()
 
-        scene, light, posed, lamps, tree = ready
+        scene, environment, posed, lights, tree = ready
         pixels = frame.camera.width * frame.camera.height
-        passes = draw(frame, (scene, light, thinned(posed, pixels), lamps, tree), watch)
+        passes = draw(frame, (scene, environment, thinned(posed, pixels), lights, tree), watch)
         self._pace.note(pixels, time.perf_counter() - projected)
         return passes

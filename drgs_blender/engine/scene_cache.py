@@ -22,7 +22,7 @@ from ..render.backend import HERE, Processor
 from ..render.camera import camera_parameters
 from ..render.film.motion_vectors import Instant
 from ..render.lights.environment import EnvironmentLight
-from ..render.lights.lights import Lamps
+from ..render.lights.lights import Lights
 from ..render.lights.mesh_lights import Emitters
 from ..render.scene.ray_masks import group_mask
 from ..render.scene.trace_scene import TraceObject, TraceScene
@@ -74,7 +74,7 @@ class Stage:
     objects, meshes, images : of the last frame
     scene : what rays meet
     tree : surfels that rays meet; None when they meet the mesh
-    world, light, lamps : of the last frame
+    world, environment, lights : of the last frame
     """
 
     def __init__(self) -> None:
@@ -87,14 +87,14 @@ class Stage:
         self._in_tree: list[Standing] = []
         self._current = True
         self.world: World | None = None
-        self.light: EnvironmentLight | None = None
-        self.lamps = Lamps([])
+        self.environment: EnvironmentLight | None = None
+        self.environments = Lights([])
         self._emitters = Emitters()
         self._deformer: Deformer | None = None
 
     @property
     def scenery(self) -> tuple[object, ...]:
-        """All but the lamps that a picture of the last frame depends on."""
+        """All but the lights that a picture of the last frame depends on."""
         return *(item.state for item in self.objects), self.meshes, self.images, self.world
 
     def load_asset(self, path: str | os.PathLike[str]) -> str:
@@ -249,35 +249,36 @@ class Stage:
         for item in self.objects:
             found += item.faults
         found += self.scene.materials.warnings
-        found += self.lamps.warnings
-        if self.light is not None and self.light.bad_texels:
+        found += self.environments.warnings
+        if self.environment is not None and self.environment.bad_texels:
             found.append(
-                f"world: {self.light.bad_texels} pixels of the environment are negative, infinite or no number, and "
+                f"world: {self.environment.bad_texels} pixels of the environment are negative, infinite or no "
+                f"number, and "
                 "give no light; where that shows, repair the image"
             )
         return found
 
-    def light_of(self, world: World) -> EnvironmentLight:
+    def environment_of(self, world: World) -> EnvironmentLight:
         """The light of `world`, made again only when something about it changed; a rotation costs nothing."""
         known, kept = self.world, renewed(world, self.world)
-        if self.light is None or known is None:
-            self.light = EnvironmentLight(kept)
+        if self.environment is None or known is None:
+            self.environment = EnvironmentLight(kept)
         elif kept is not known:
             if all(getattr(kept, name) is getattr(known, name) for name in ("environment", "colour", "strength")):
-                self.light.rotation = np.ascontiguousarray(kept.rotation, np.float32)
+                self.environment.rotation = np.ascontiguousarray(kept.rotation, np.float32)
             else:
-                self.light = EnvironmentLight(kept)
+                self.environment = EnvironmentLight(kept)
         self.world = kept
-        return self.light
+        return self.environment
 
-    def lamps_of(self, lights: list[Light]) -> Lamps:
+    def lights_of(self, lights: list[Light]) -> Lights:
         """Blender's lights and surfaces that emit, and what they send to the middle of the scene."""
         self._emitters = Emitters(self.scene, self._emitters)
         boxes = [self.scene.bvh.bounds()] if len(self.scene.faces) or self.tree is None else []
         boxes += [self.tree.bounds()] if self.tree is not None else []
         low, high = np.min([box[0] for box in boxes], axis=0), np.max([box[1] for box in boxes], axis=0)
-        self.lamps = Lamps(lights, 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low)), self._emitters)
-        return self.lamps
+        self.environments = Lights(lights, 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low)), self._emitters)
+        return self.environments
 
 
 def _check_surface(state: ObjectState, asset: Asset, settings: RenderSettings) -> None:

@@ -200,7 +200,7 @@ class Session:
         self, frame: Frame, ready: Ready, tell: Progress | None, cancelled: IsCancelled | None, processor: Processor
     ) -> Passes:
         """The frame's picture as a whole, part of a sequence where it names one."""
-        scene, light, posed, lamps, tree = ready
+        scene, environment, posed, lights, tree = ready
         sequence, statistics = None, {}
         if frame.history and frame.settings.denoise == "svgf":
             self._lights = renewed(frame.lights, self._lights)
@@ -209,12 +209,12 @@ class Session:
             statistics["history"] = float(sequence.pictures)
         pictures = render(
             scene,
-            light,
+            environment,
             posed,
             frame,
             tell,
             cancelled,
-            lamps,
+            lights,
             tree,
             self._stage.instant(frame, frame.previous),
             self._stage.instant(frame, frame.next),
@@ -242,9 +242,9 @@ class Session:
             progress("Deforming", 0.0)
         posed = self._stage.pose(frame, processor)
         lap("deform")
-        light, lamps = self._stage.light_of(frame.world), self._stage.lamps_of(frame.lights)
+        environment, lights = self._stage.environment_of(frame.world), self._stage.lights_of(frame.lights)
         lap("light")
-        return self._stage.scene, light, posed, lamps, self._stage.tree
+        return self._stage.scene, environment, posed, lights, self._stage.tree
 
     def _warnings(self, settings: RenderSettings) -> list[str]:
         trouble = cache_folder().trouble

@@ -27,10 +27,10 @@ from .film.motion_vectors import Instant, MotionFilm, vector_pass
 from .gbuffer.gbuffer import GBuffer
 from .gbuffer.mesh import primary_mesh
 from .gbuffer.surfels import primary_surfels, snap_windows
-from .gbuffer.visible_lights import seen_lamps
+from .gbuffer.visible_lights import visible_lights
 from .integrator.adaptive import part_count, sample_adaptively
 from .lights.environment import EnvironmentLight
-from .lights.lights import Lamps
+from .lights.lights import Lights
 from .points import Radiance, ShadingPoints
 from .scene.trace_scene import TraceScene
 from .surfels.splats import Splats
@@ -48,12 +48,12 @@ BATCH_SECONDS, FIRST_SAMPLES, FEWEST_POINTS = 0.03, 1 << 17, 16
 
 def render(
     scene: TraceScene,
-    light: EnvironmentLight,
+    environment: EnvironmentLight,
     posed: PosedSurfels,
     frame: Frame,
     progress: Progress | None = None,
     cancelled: Callable[[], bool] | None = None,
-    lamps: Lamps | None = None,
+    lights: Lights | None = None,
     tree: SurfelBVH | None = None,
     previous: Instant | None = None,
     following: Instant | None = None,
@@ -69,7 +69,7 @@ def render(
     posed : surfels of all objects, world space; not used when ``frame.settings.camera_sees`` is "mesh"
     progress : called with the part done in [0, 1] and the name of the phase
     cancelled : asked several times a second
-    lamps : the frame's lights
+    lights : the frame's lights
     tree : the surfels that light meets, when ``frame.settings.rays_see`` is "surfels"
     previous, following : the scene one frame earlier and later; None: nothing moves
     history : what earlier pictures leave to the denoiser SVGF; brought up to date when the picture is done
@@ -116,7 +116,7 @@ def render(
         for then in (previous, following, past)
     ]
     end = 1.0 if settings.denoise == "none" else 0.9
-    batches = Batches(scene, light, lamps, tree, frame, check, processor)
+    batches = Batches(scene, environment, lights, tree, frame, check, processor)
     height = strip_height(right - left, settings.subpixel_count)
     for y0 in range(top, bottom, height):
         tell(end * (y0 - top) / (bottom - top), "Rendering")
@@ -124,11 +124,11 @@ def render(
         buffer = camera_sees.rows(y0, y1)
         check()
         radiance = batches.light(buffer)
-        film.add(buffer, radiance, scene.pass_index, light)
+        film.add(buffer, radiance, scene.pass_index, environment)
         for matte in mattes:
             matte.add(buffer)
-        if lamps is not None and lamps.seen:
-            film.emission[y0 - top : y1 - top] += seen_lamps(lamps, parameters, left, buffer)
+        if lights is not None and lights.seen:
+            film.emission[y0 - top : y1 - top] += visible_lights(lights, parameters, left, buffer)
         for motion in moving:
             if motion is not None:
                 motion.add(buffer, scene)
@@ -211,10 +211,11 @@ class Batches:
     """Integrates points in batches as long as `BATCH_SECONDS`, learning how many points these are."""
 
     def __init__(
-        self, scene: TraceScene, light: EnvironmentLight, lamps: Lamps | None, tree: SurfelBVH | None, frame: Frame,
+        self, scene: TraceScene, environment: EnvironmentLight, lights: Lights | None, tree: SurfelBVH | None, frame:
+        Frame,
         check: Check, processor: Processor = HERE,
     ) -> None:  # fmt: skip
-        self._scene, self._light, self._lamps, self._frame, self._check = scene, light, lamps, frame, check
+        self._scene, self._light, self._lights, self._frame, self._check = scene, environment, lights, frame, check
         self._tree, self._processor = tree, processor
         self._parts = part_count(frame.settings)
         self._size = max(FEWEST_POINTS, FIRST_SAMPLES * self._parts // max(1, frame.settings.sample_count))
@@ -241,7 +242,7 @@ class Batches:
                 points[first:last],
                 self._frame.settings,
                 self._frame.noise_index,
-                self._lamps,
+                self._lights,
                 part,
                 surfels=self._tree,
             )

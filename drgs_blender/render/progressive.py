@@ -22,11 +22,11 @@ from .backend import HERE, Processor
 from .camera import camera_parameters
 from .film.film import Film
 from .gbuffer.gbuffer import GBuffer
-from .gbuffer.visible_lights import seen_lamps
+from .gbuffer.visible_lights import visible_lights
 from .integrator.adaptive import Sampling, part_count
 from .integrator.variance import variances
 from .lights.environment import EnvironmentLight
-from .lights.lights import Lamps
+from .lights.lights import Lights
 from .pipeline import Batches, Primary, check_frame, denoised, strip_height
 from .points import Radiance, ShadingPoints
 from .scene.trace_scene import TraceScene
@@ -179,9 +179,9 @@ class Progressive:
     def advance(
         self,
         scene: TraceScene,
-        light: EnvironmentLight,
+        environment: EnvironmentLight,
         posed: PosedSurfels,
-        lamps: Lamps | None,
+        lights: Lights | None,
         tree: SurfelBVH | None,
         seconds: float = 0.0,
         cancelled: Callable[[], bool] | None = None,
@@ -203,13 +203,13 @@ class Progressive:
         check()
         if self._primary is None:
             self._primary = Primary(scene, posed, self.frame, self._parameters, tree, self._processor)
-        batches = Batches(scene, light, lamps, tree, self.frame, check, self._processor)
+        batches = Batches(scene, environment, lights, tree, self.frame, check, self._processor)
         began = time.perf_counter()
         while self._next < len(self._parts):
             self._draw(batches, check)
             if time.perf_counter() - began >= seconds:
                 break
-        return self._develop(scene, light, lamps, check)
+        return self._develop(scene, environment, lights, check)
 
     def _draw(self, batches: Batches, check: Callable[[], None]) -> None:
         sample, part = self._parts[self._next]
@@ -245,7 +245,7 @@ class Progressive:
         return buffer
 
     def _develop(
-        self, scene: TraceScene, light: EnvironmentLight, lamps: Lamps | None, check: Callable[[], None]
+        self, scene: TraceScene, environment: EnvironmentLight, lights: Lights | None, check: Callable[[], None]
     ) -> dict[str, Array]:
         camera = self.frame.camera
         film = Film(camera, self.frame.settings, self._parameters)
@@ -253,10 +253,10 @@ class Progressive:
             buffer = self._samples(strip)
             check()
             exact = self._adaptive and self.fraction == 1.0
-            film.add(buffer, strip.radiance(buffer.points, exact), scene.pass_index, light)
-            if lamps is not None and lamps.seen:
+            film.add(buffer, strip.radiance(buffer.points, exact), scene.pass_index, environment)
+            if lights is not None and lights.seen:
                 rows = slice(strip.rows[0] - camera.window[1], strip.rows[1] - camera.window[1])
-                film.emission[rows] += seen_lamps(lamps, self._parameters, camera.window[0], buffer)
+                film.emission[rows] += visible_lights(lights, self._parameters, camera.window[0], buffer)
         return film.passes(self.frame.passes, denoised(film, self.frame, check, self._processor))
 
 

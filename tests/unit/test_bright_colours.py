@@ -10,7 +10,7 @@ from test_lamps import light
 from drgs_blender.core.frame import Image, Material, Texture, World
 from drgs_blender.render.integrator.integrate import integrate
 from drgs_blender.render.lights.environment import EnvironmentLight
-from drgs_blender.render.lights.lights import Lamps
+from drgs_blender.render.lights.lights import Lights
 from drgs_blender.render.scene.textures import MaterialTable
 from drgs_blender.render.scene.trace_scene import TraceScene
 
@@ -27,7 +27,7 @@ CYCLES = {
 
 @pytest.mark.parametrize("metallic, roughness", list(CYCLES))
 def test_diffuse_light_grows_with_the_base_colour_and_that_of_metals_ends_at_white(metallic, roughness):
-    lamps = Lamps([light("sun", 0, 0, 0, tilt=0.3, power=1.0)])
+    lamps = Lights([light("sun", 0, 0, 0, tilt=0.3, power=1.0)])
     sky, how = EnvironmentLight(World(strength=0.0)), settings(0, 0, 1, shading_model="principled")
     found = [
         integrate(

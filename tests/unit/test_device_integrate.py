@@ -17,7 +17,7 @@ from drgs_blender.render.gpu.select_backend import Devices
 from drgs_blender.render.gpu.warp_backend import OnDevice
 from drgs_blender.render.integrator.integrate import integrate
 from drgs_blender.render.lights.environment import EnvironmentLight
-from drgs_blender.render.lights.lights import Lamps
+from drgs_blender.render.lights.lights import Lights
 from drgs_blender.render.lights.mesh_lights import Emitters
 from drgs_blender.render.points import CATCHER, Radiance, ShadingPoints
 from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene
@@ -71,7 +71,7 @@ def placed(x: float, y: float, z: float, scale: float = 1.0) -> np.ndarray:
     return matrix
 
 
-def lamps() -> Lamps:
+def lamps() -> Lights:
     """Every kind that shines in another way, more than one leaf of the tree."""
     down = placed(0.5, 0.4, 3.0)
     side = placed(2.5, -1.0, 2.0) @ np.array([[0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1.0]])
@@ -85,7 +85,7 @@ def lamps() -> Lamps:
         Light("sun", "sun", side, power=1.5, angle=0.05),
         Light("laser", "sun", down, power=0.4),
     ]
-    return Lamps(kinds, np.array([0, 0, 1.2]), 1.0)
+    return Lights(kinds, np.array([0, 0, 1.2]), 1.0)
 
 
 def under_sky() -> tuple:
@@ -133,7 +133,7 @@ def among_meshes() -> tuple:
     ]
     scene = TraceScene()
     scene.update([ball((1.6, 0.6, 1.9), 0.6)], meshes, images)
-    return scene, sky(), Lamps([], np.array([0, 0, 1.2]), 1.0, Emitters(scene)), seen()
+    return scene, sky(), Lights([], np.array([0, 0, 1.2]), 1.0, Emitters(scene)), seen()
 
 
 def hidden() -> tuple:

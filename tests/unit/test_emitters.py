@@ -15,7 +15,7 @@ from drgs_blender.compute.jit import njit
 from drgs_blender.core.frame import Image, Material, MeshState, Texture, Visibility, World
 from drgs_blender.render.integrator.integrate import integrate
 from drgs_blender.render.lights.environment import EnvironmentLight
-from drgs_blender.render.lights.lights import Lamps, emission_along
+from drgs_blender.render.lights.lights import Lights, emission_along
 from drgs_blender.render.lights.mesh_lights import MOST, Emitters
 from drgs_blender.render.points import CATCHER
 from drgs_blender.render.sampling import F, sobol
@@ -75,7 +75,7 @@ def _look(origins, directions, tracer, geometry, table, pick, emitters, out):  #
         out[i, 0], out[i, 1], out[i, 2], out[i, 3], _ = emission_along(*o, *d, hit, geometry, table, pick, emitters)
 
 
-def along(scene: TraceScene, lamps: Lamps, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+def along(scene: TraceScene, lamps: Lights, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """(n, 4): what rays meet, and the density with which it is drawn from the same place."""
     out = np.empty((len(directions), 4), np.float32)
     directions = np.ascontiguousarray(directions, np.float32)
@@ -100,7 +100,7 @@ def light_of(
     scene = scene_of(*meshes, images=images)
     seen = points(count, **({"albedo": 0.8, "roughness": 0.4, "origin": (0.3, 0.1, 0.0)} | changes))  # type: ignore[arg-type]
     how = settings(*counts, bounces=bounces, shading_model="principled")
-    lamps = Lamps(list(lights), np.zeros(3), 3.0, Emitters(scene) if sampled else None)
+    lamps = Lights(list(lights), np.zeros(3), 3.0, Emitters(scene) if sampled else None)
     found = integrate(scene, EnvironmentLight(World(strength=strength)), seen, how, 0, lamps).components.astype(float)
     return found.mean(0), found.std(0) / math.sqrt(count)
 
@@ -132,7 +132,7 @@ def test_irradiance_is_lambert_s_formula(height: float, turn: float) -> None:
     )
     corners[:, 2] += height + 0.9 * abs(s)
     scene = scene_of(mesh_state(corners, np.int32([[0, 1, 2]]), materials=[GLOW]))
-    lamps = Lamps([], emitters=Emitters(scene))
+    lamps = Lights([], emitters=Emitters(scene))
     assert lamps.count == 1
     assert irradiance(lamps, numbers=sobol(1 << 13)) == pytest.approx(2.0 * polygon_irradiance(corners), rel=3e-3)
 
@@ -141,7 +141,7 @@ def test_irradiance_is_lambert_s_formula(height: float, turn: float) -> None:
 def test_what_is_drawn_and_what_is_found_have_one_density(count: int) -> None:
     """So the weights of both strategies sum to one: p / (p + q) and q / (p + q), with the same p and q."""
     scene = scene_of(soup(count, size=min(0.2, 2.0 / math.sqrt(count))))
-    lamps = Lamps([light("point", 0, 1, 2, radius=0.2, power=30)], emitters=Emitters(scene))
+    lamps = Lights([light("point", 0, 1, 2, radius=0.2, power=30)], emitters=Emitters(scene))
     rng = np.random.default_rng(1)
     numbers = rng.integers(0, 1 << 32, (4000, 3), np.uint32)
     origins = np.float32(rng.uniform((-1, -1, -0.2), (1, 1, 0.2), (4000, 3)))
@@ -167,7 +167,7 @@ def test_densities_over_all_directions_sum_to_one(count: int) -> None:
     corners = np.full((count, 3, 3), 0.4)
     corners[..., :2] = (at[:, None] + rng.random((count, 3, 2)) / side) * 2 - 1
     scene = scene_of(mesh_state(corners.reshape(-1, 3), np.arange(3 * count).reshape(-1, 3), materials=[GLOW]))
-    lamps = Lamps([], emitters=Emitters(scene))
+    lamps = Lights([], emitters=Emitters(scene))
     u, v = (rng.random((2, 400, 400)) + np.stack(np.meshgrid(*[np.arange(400)] * 2))).reshape(2, -1) / 400
     r = np.sqrt(1 - v * v)
     upwards = np.stack([r * np.cos(2 * math.pi * u), r * np.sin(2 * math.pi * u), v], -1)
@@ -251,7 +251,7 @@ def test_a_catcher_s_own_world_has_no_light_of_other_surfaces() -> None:
     scene = scene_of(panel(place((0.2, 0.3, 0.8), 0.3)))
     seen = points(500, albedo=0.8, flags=np.full(500, CATCHER, np.int32))
     how = settings(16, 8, 8)
-    lamps = Lamps([], emitters=Emitters(scene))
+    lamps = Lights([], emitters=Emitters(scene))
     found = integrate(scene, EnvironmentLight(World(strength=0.0)), seen, how, 0, lamps)
     assert found.components.max() > 0 and found.unshadowed is not None and found.unshadowed.max() == 0
 
@@ -287,7 +287,7 @@ def test_samples_of_closed_surfaces_go_to_the_side_that_is_seen() -> None:
         (faces[1:], place((0, 0, 1))),
     ):
         scene = scene_of(mesh_state(vertices, np.ascontiguousarray(own), where, where, materials=[GLOW]))
-        directions, distance, _, _, _ = Lamps([], emitters=Emitters(scene)).sample(numbers, np.zeros(3))
+        directions, distance, _, _, _ = Lights([], emitters=Emitters(scene)).sample(numbers, np.zeros(3))
         first, _, _, _ = scene.bvh.intersect(np.zeros_like(directions), directions)
         seen.append((np.abs(first - distance) < 1e-4 * distance).mean())
     assert min(seen[:3]) > 0.85 and np.ptp(seen[:3]) < 0.02 and seen[3] < 0.6

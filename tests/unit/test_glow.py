@@ -12,7 +12,7 @@ from test_surface import mesh_state
 from drgs_blender.core.frame import Light, Material, MeshState, World
 from drgs_blender.render.integrator.integrate import integrate
 from drgs_blender.render.lights.environment import EnvironmentLight
-from drgs_blender.render.lights.lights import Lamps
+from drgs_blender.render.lights.lights import Lights
 from drgs_blender.render.lights.mesh_lights import Emitters
 from drgs_blender.render.scene.trace_scene import TraceScene
 
@@ -50,7 +50,7 @@ def total(meshes: list[MeshState], lights: list[Light], bounces: int, strength: 
     seen = points(4000, albedo=0.8, roughness=0.4, origin=(0.3, 0.1, 0.0))
     light = EnvironmentLight(World(strength=strength))
     how = settings(16, 8, 8, bounces=bounces, shading_model="principled")
-    lamps = Lamps(lights, emitters=Emitters(scene))
+    lamps = Lights(lights, emitters=Emitters(scene))
     found = integrate(scene, light, seen, how, 0, lamps).components.astype(float)
     return found.mean(0), found.std(0) / math.sqrt(len(found))
 

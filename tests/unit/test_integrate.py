@@ -15,7 +15,7 @@ from drgs_blender.core.frame import Light, RenderSettings, World
 from drgs_blender.render.integrator.integrate import integrate
 from drgs_blender.render.integrator.sample_allocation import ALPHA, COUNTS, HEAD, _allot
 from drgs_blender.render.lights.environment import EnvironmentLight
-from drgs_blender.render.lights.lights import Lamps
+from drgs_blender.render.lights.lights import Lights
 from drgs_blender.render.points import DIFFUSE_DIRECT, DIFFUSE_INDIRECT, GLOSSY_DIRECT, Radiance, ShadingPoints
 from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene
 
@@ -439,11 +439,11 @@ def test_settings_that_make_no_sense_are_refused(wrong: dict) -> None:
 # --- lamps ---------------------------------------------------------------------------------------------------------
 
 
-def area_lamp(**changes: object) -> Lamps:
+def area_lamp(**changes: object) -> Lights:
     """A square of one metre, two metres above the origin, shining down."""
     matrix = np.eye(4)
     matrix[:3, 3] = (0.3, 0.2, 2.0)
-    return Lamps([replace(Light("panel", "area", matrix, power=30.0), **changes)], radius=1.0)  # type: ignore[arg-type]
+    return Lights([replace(Light("panel", "area", matrix, power=30.0), **changes)], radius=1.0)  # type: ignore[arg-type]
 
 
 DARK = EnvironmentLight(World(colour=(0.0, 0.0, 0.0)))
@@ -499,7 +499,7 @@ def test_mirrors_reflect_lamps_that_only_lamp_samples_find(changes: dict, rays: 
     matrix[:3, 2], matrix[:3, 3] = mirrored, 2 * mirrored  # it shines along its own -Z
     matrix[:3, 0] = np.cross([0, 1, 0], mirrored) / np.linalg.norm(np.cross([0, 1, 0], mirrored))
     matrix[:3, 1] = np.cross(mirrored, matrix[:3, 0])
-    lamps = Lamps([replace(Light("lamp", "area", matrix, power=30.0), **changes)], radius=1.0)  # type: ignore[arg-type]
+    lamps = Lights([replace(Light("lamp", "area", matrix, power=30.0), **changes)], radius=1.0)  # type: ignore[arg-type]
     found = {}
     for auto, counts in ((False, (16, 8, 64)), (True, rays)):
         value = luminance(integrate(EMPTY, DARK, some, settings(*counts, auto=auto), 0, lamps)).astype(float)

@@ -9,8 +9,8 @@ import pytest
 
 from drgs_blender.core.frame import Light
 from drgs_blender.render.lights.light_shapes import CAMERA, DIFFUSE, GLOSSY, INTENSITY, PLACE, RADIANCE, SHADOW
-from drgs_blender.render.lights.light_tree import SECOND, lamps_weight, pick_lamp, pick_probability
-from drgs_blender.render.lights.lights import Lamps, lamp_flags
+from drgs_blender.render.lights.light_tree import SECOND, lights_weight, pick_light, pick_probability
+from drgs_blender.render.lights.lights import Lights, light_flags
 from drgs_blender.render.sampling import F, sobol
 
 NUMBERS = sobol(1 << 14)
@@ -61,7 +61,7 @@ def uniform_directions(count: int, seed: int = 1) -> np.ndarray:
     return np.stack([r * np.cos(a), r * np.sin(a), z], axis=1).astype(np.float32)
 
 
-def irradiance(lamps: Lamps, point=(0, 0, 0), normal=(0, 0, 1), numbers: np.ndarray = NUMBERS) -> float:
+def irradiance(lamps: Lights, point=(0, 0, 0), normal=(0, 0, 1), numbers: np.ndarray = NUMBERS) -> float:
     """On a surface that faces `normal`, from the lamp samples."""
     directions, _, radiance, density, _ = lamps.sample(numbers, point)
     hit = density != 0
@@ -70,7 +70,7 @@ def irradiance(lamps: Lamps, point=(0, 0, 0), normal=(0, 0, 1), numbers: np.ndar
 
 
 def test_point_light_is_power_over_squared_distance():
-    lamps = Lamps([light("point", 0, 3, 4, power=20, colour=(1, 0.5, 0))])
+    lamps = Lights([light("point", 0, 3, 4, power=20, colour=(1, 0.5, 0))])
     directions, distance, radiance, density, _ = lamps.sample(NUMBERS[:1], (0, 0, 0))
     np.testing.assert_allclose(directions, [[0, 0.6, 0.8]], rtol=1e-6)
     assert distance[0] == pytest.approx(5)
@@ -82,9 +82,9 @@ def test_soft_point_is_a_disk_that_faces_the_surface():
     radius, distance = 0.5, 2.0
     radiance = 10 / (4 * math.pi * math.pi * radius**2)
     expected = math.pi * radiance * radius**2 / (radius**2 + distance**2)
-    assert irradiance(Lamps([light("point", 0, 0, 2, radius=radius)])) == pytest.approx(expected, rel=1e-4)
+    assert irradiance(Lights([light("point", 0, 0, 2, radius=radius)])) == pytest.approx(expected, rel=1e-4)
     # Far away it is a point.
-    assert irradiance(Lamps([light("point", 0, 0, 200, radius=radius)])) == pytest.approx(
+    assert irradiance(Lights([light("point", 0, 0, 200, radius=radius)])) == pytest.approx(
         10 / (4 * math.pi * 200**2), rel=1e-4
     )
 
@@ -92,26 +92,26 @@ def test_soft_point_is_a_disk_that_faces_the_surface():
 def test_sphere_above_the_horizon():
     """A sphere of uniform radiance gives pi L (r / d)^2 cos, at any distance, and pi L to whoever is inside."""
     for x, z in ((0, 2), (1.0, 1.0), (0, 0.501)):
-        lamps = Lamps([light("point", x, 0, z, radius=0.5, soft_falloff=False)])
+        lamps = Lights([light("point", x, 0, z, radius=0.5, soft_falloff=False)])
         d2 = x * x + z * z
         assert irradiance(lamps) == pytest.approx(10 / (4 * math.pi * d2) * z / math.sqrt(d2), rel=3e-4)
-    inside = Lamps([light("point", 0.1, 0, 0.2, radius=0.5, soft_falloff=False)])
+    inside = Lights([light("point", 0.1, 0, 0.2, radius=0.5, soft_falloff=False)])
     assert irradiance(inside) == pytest.approx(10 / (4 * math.pi * 0.25), rel=3e-4)
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.009, 0.6, math.pi])
 def test_sun_gives_its_strength(angle):
-    lamps = Lamps([light("sun", 5, 5, -7, tilt=0.0, angle=angle, power=3)])
+    lamps = Lights([light("sun", 5, 5, -7, tilt=0.0, angle=angle, power=3)])
     assert irradiance(lamps) == pytest.approx(3, rel=3e-4)
     if angle < 1:
-        tilted = Lamps([light("sun", 0, 0, 0, tilt=0.9, angle=angle, power=3)])
+        tilted = Lights([light("sun", 0, 0, 0, tilt=0.9, angle=angle, power=3)])
         assert irradiance(tilted) == pytest.approx(3 * math.cos(0.9), rel=3e-4)
 
 
 def test_disk_on_its_axis():
     """pi L sin^2 of the half angle under which it is seen."""
     for height in (0.1, 1.0, 7.0):
-        lamps = Lamps([light("area", 0, 0, height, shape="disk", size_x=1.0)])
+        lamps = Lights([light("area", 0, 0, height, shape="disk", size_x=1.0)])
         radiance = 10 / (math.pi * math.pi * 0.25)
         expected = math.pi * radiance * 0.25 / (0.25 + height**2)
         found = irradiance(lamps, numbers=sobol(1 << 17))
@@ -124,7 +124,7 @@ def test_rectangle_over_its_corner(height):
     a, b = 0.6 / height, 1.4 / height
     p, q = math.sqrt(1 + a * a), math.sqrt(1 + b * b)
     factor = (a / p * math.atan(b / p) + b / q * math.atan(a / q)) / (2 * math.pi)
-    lamps = Lamps([light("area", 0.3, 0.7, height, shape="rectangle", size_x=0.6, size_y=1.4)])
+    lamps = Lights([light("area", 0.3, 0.7, height, shape="rectangle", size_x=0.6, size_y=1.4)])
     assert irradiance(lamps) == pytest.approx(factor * 10 / (0.6 * 1.4), rel=3e-4)
 
 
@@ -132,7 +132,7 @@ def test_power_does_not_depend_on_spread_and_size():
     """All of an area's power passes a large plane beneath it, whatever its spread."""
     numbers = np.random.default_rng(0).integers(0, 2**32, (200 * 200, 3), dtype=np.uint32)
     for spread in (0.0, 0.08, 0.5, 1.5):
-        lamps = Lamps([light("area", 0, 0, 1.5, size_x=0.5, spread=spread)])
+        lamps = Lights([light("area", 0, 0, 1.5, size_x=0.5, spread=spread)])
         width = 0.51 + 2 * 1.5 * math.tan(spread / 2)
         x, y = np.meshgrid(*[((np.arange(200) + 0.5) / 200 - 0.5) * width] * 2)
         directions, _, radiance, density, _ = lamps.sample(numbers, np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3))
@@ -148,15 +148,15 @@ def test_without_normalize_radiance_stays():
         {"kind": "spot", "radius": 2.0},
     ):
         settings = dict(settings)
-        lamps = Lamps([light(settings.pop("kind"), 0, 0, 1, normalize=False, power=2, **settings)])
+        lamps = Lights([light(settings.pop("kind"), 0, 0, 1, normalize=False, power=2, **settings)])
         assert lamps.along((0, 0, 0), [[0, 0, 1]])[0, 0] == pytest.approx(2 / math.pi)
-    assert Lamps([light("sun", 0, 0, 1, normalize=False, power=2, angle=0.3)]).along((0, 0, 0), [[0, 0, 1]])[0, 0] == 2
+    assert Lights([light("sun", 0, 0, 1, normalize=False, power=2, angle=0.3)]).along((0, 0, 0), [[0, 0, 1]])[0, 0] == 2
 
 
 @pytest.mark.parametrize("name", LARGE)
 def test_density_integrates_to_one(name):
     """Over all directions; where samples may miss (cone of a spot or spread), to the share of those that count."""
-    lamps = Lamps([LARGE[name]])
+    lamps = Lights([LARGE[name]])
     directions = uniform_directions(1 << 20)
     density = lamps.pdf(0, (0, 0, 0), directions).astype(float)
     drawn = (lamps.sample(NUMBERS, (0, 0, 0))[2][:, 0] > 0).mean()
@@ -167,7 +167,7 @@ def test_density_integrates_to_one(name):
 
 @pytest.mark.parametrize("name", LARGE)
 def test_samples_lie_where_their_density_says(name):
-    lamps = Lamps([LARGE[name]])
+    lamps = Lights([LARGE[name]])
     directions, distance, radiance, density, rows = lamps.sample(NUMBERS, (0, 0, 0))
     hit = (density > 0) & (radiance[:, 0] > 0)
     np.testing.assert_allclose(np.linalg.norm(directions[hit], axis=1), 1, rtol=2e-6)
@@ -182,7 +182,7 @@ def test_samples_lie_where_their_density_says(name):
 
 @pytest.mark.parametrize("name", LARGE)
 def test_both_strategies_and_their_combination_agree(name):
-    lamps = Lamps([LARGE[name]])
+    lamps = Lights([LARGE[name]])
     weigh = lambda d: np.maximum(d @ (0.3, 0.5, 0.4), 0)  # noqa: E731
     directions, _, radiance, density, _ = lamps.sample(NUMBERS, (0, 0, 0))
     hit = density > 0
@@ -204,7 +204,7 @@ def test_both_strategies_and_their_combination_agree(name):
 
 def test_weights_of_one_direction_sum_to_one():
     for lamp in LARGE.values():
-        lamps = Lamps([lamp, light("sun", 0, 0, 0, tilt=3.0, angle=0.2), light("point", 9, 9, 9)])
+        lamps = Lights([lamp, light("sun", 0, 0, 0, tilt=3.0, angle=0.2), light("point", 9, 9, 9)])
         directions, _, radiance, density, rows = lamps.sample(NUMBERS[:512], (0, 0, 0))
         density = np.where(rows == 0, density, 0)
         for others, share in ((0.3, 1.0), (4.0, 0.25)):
@@ -243,30 +243,30 @@ def crowd(count: int, seed: int = 0) -> list[Light]:
 
 @pytest.mark.parametrize("count", [0, 1, 32, 33, 300])
 def test_pick_probabilities(count):
-    lamps = Lamps(crowd(count))
+    lamps = Lights(crowd(count))
     assert lamps.count == count + 3
     assert (lamps.pick[1:, SECOND] > 0).any() == (count > 32)
     rng = np.random.default_rng(1)
     for point in rng.uniform((-10, -10, 0), (10, 10, 4), (4, 3)).astype(np.float32):
         each = np.array([pick_probability(i, *point, lamps.table, lamps.pick) for i in range(lamps.count)])
         numbers = (np.arange(1 << 14, dtype=np.uint32) << np.uint32(18)) + np.uint32(1 << 17)
-        found = np.array([pick_lamp(n, *point, lamps.table, lamps.pick) for n in numbers])
+        found = np.array([pick_light(n, *point, lamps.table, lamps.pick) for n in numbers])
         index, probability = found[:, 0].astype(int), found[:, 1]
         np.testing.assert_allclose(probability[index >= 0], each[index[index >= 0]], rtol=1e-4)
         picked = np.bincount(index % (lamps.count + 1), minlength=lamps.count + 1)
         # Equally spaced numbers: each lamp gets its share to within one number a boundary.
         np.testing.assert_allclose(picked[:-1] / len(numbers), each, atol=2 / len(numbers))
         assert picked[-1] / len(numbers) == pytest.approx(1 - each.sum(), abs=1e-3)
-        assert lamps_weight(*point, lamps.table, lamps.pick) > 0
+        assert lights_weight(*point, lamps.table, lamps.pick) > 0
 
 
 def test_every_lamp_that_shines_on_a_point_can_be_picked():
     lights = crowd(300)
-    lamps = Lamps(lights)
+    lamps = Lights(lights)
     points = np.random.default_rng(2).uniform((-10, -10, 0), (10, 10, 4), (40, 3)).astype(np.float32)
     shining = 0
     for row, own in enumerate(lamps.order):
-        alone = Lamps([lights[own]])
+        alone = Lights([lights[own]])
         for point in points:
             lit = (alone.sample(NUMBERS[:16], point)[2] > 0).any()
             shining += lit
@@ -277,7 +277,7 @@ def test_every_lamp_that_shines_on_a_point_can_be_picked():
 def test_crowd_is_the_sum_of_its_lamps():
     """By samples through the tree, and by the lamps alone, all over a hall; with less spread than by power."""
     lights = crowd(300)
-    lamps = Lamps(lights)
+    lamps = Lights(lights)
     numbers, spread, spread_by_power = sobol(1 << 15), 0.0, 0.0
     by_power = lamps.table[:, INTENSITY] / lamps.table[:, INTENSITY].sum()
     points = np.random.default_rng(3).uniform((-10, -10, 0), (10, 10, 1), (6, 3)).astype(np.float32)
@@ -286,7 +286,7 @@ def test_crowd_is_the_sum_of_its_lamps():
         hit = density != 0
         terms = np.zeros(len(numbers))
         terms[hit] = radiance[hit, 1] * np.maximum(directions[hit, 2], 0) / np.abs(density[hit])
-        each = np.array([irradiance(Lamps([lights[i]]), point, numbers=NUMBERS[:1024]) for i in lamps.order])
+        each = np.array([irradiance(Lights([lights[i]]), point, numbers=NUMBERS[:1024]) for i in lamps.order])
         assert terms.mean() == pytest.approx(each.sum(), rel=0.02)
         spread += terms.std() / each.sum()
         spread_by_power += math.sqrt((each**2 / by_power).sum() / each.sum() ** 2 - 1)
@@ -295,7 +295,7 @@ def test_crowd_is_the_sum_of_its_lamps():
 
 def test_rays_through_the_tree_meet_what_each_lamp_says():
     lights = [one for one in crowd(300) if one.kind != "spot"]
-    lamps = Lamps(lights)
+    lamps = Lights(lights)
     rng = np.random.default_rng(4)
     origins = rng.uniform((-10, -10, 0), (10, 10, 4), (3000, 3)).astype(np.float32)
     aims = lamps.table[rng.integers(0, lamps.count - 3, 3000), PLACE : PLACE + 3] + rng.normal(0, 0.1, (3000, 3))
@@ -304,7 +304,7 @@ def test_rays_through_the_tree_meet_what_each_lamp_says():
     directions[:300] = np.eye(3)[np.arange(300) % 3]
     for tmax, seen_by in ((np.inf, DIFFUSE), (6.0, GLOSSY)):
         found = lamps.along(origins, directions, tmax=tmax, seen_by=seen_by)
-        expected = sum(Lamps([one]).along(origins, directions, tmax=tmax, seen_by=seen_by) for one in lights)
+        expected = sum(Lights([one]).along(origins, directions, tmax=tmax, seen_by=seen_by) for one in lights)
         np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
         assert (found > 0).any(axis=1).mean() > 0.05
     some = np.stack([lamps.pdf(i, origins, directions) for i in range(0, lamps.count, 7)])
@@ -312,49 +312,49 @@ def test_rays_through_the_tree_meet_what_each_lamp_says():
 
 
 def test_a_thousand_lamps():
-    lamps = Lamps(crowd(1000))
+    lamps = Lights(crowd(1000))
     directions, _, radiance, density, rows = lamps.sample(NUMBERS, (1.0, 2.0, 0.5))
     assert len(np.unique(rows)) > 100
     assert np.isfinite(directions).all() and np.isfinite(radiance).all() and np.isfinite(density).all()
 
 
 def test_many_lamps_in_one_place():
-    lamps = Lamps([light("point", 1, 1, 1) for _ in range(100)])
+    lamps = Lights([light("point", 1, 1, 1) for _ in range(100)])
     assert irradiance(lamps, (1, 1, 0)) == pytest.approx(100 * 10 / (4 * math.pi), rel=1e-3)
 
 
 def test_rays_see_only_what_they_may():
     flags = [{"camera": True}, {"diffuse": False}, {"glossy": False}]
-    lamps = Lamps([light("area", 0, 0, 1, colour=tuple(np.eye(3)[i]), **flag) for i, flag in enumerate(flags)])
+    lamps = Lights([light("area", 0, 0, 1, colour=tuple(np.eye(3)[i]), **flag) for i, flag in enumerate(flags)])
     up = [[0.0, 0.0, 1.0]]
     for seen_by, expected in ((CAMERA, (1, 0, 0)), (DIFFUSE, (1, 0, 1)), (GLOSSY, (1, 1, 0))):
         np.testing.assert_array_equal(lamps.along((0, 0, 0), up, seen_by=seen_by)[0] > 0, np.array(expected) > 0)
-    assert lamps.rays_differ and not Lamps([light("sun", 0, 0, 0)]).rays_differ
-    found = [lamp_flags(i, *lamps.tables[::2]) & ~SHADOW for i in range(3)]
+    assert lamps.rays_differ and not Lights([light("sun", 0, 0, 0)]).rays_differ
+    found = [light_flags(i, *lamps.tables[::2]) & ~SHADOW for i in range(3)]
     assert found == [CAMERA | DIFFUSE | GLOSSY, GLOSSY, DIFFUSE]
 
 
 def test_surfaces_in_front_hide_lamps():
-    lamps = Lamps([light("area", 0, 0, 2), light("sun", 0, 0, 0, angle=0.5)])
+    lamps = Lights([light("area", 0, 0, 2), light("sun", 0, 0, 0, angle=0.5)])
     up = [[0.0, 0.0, 1.0]]
     both, near, none = (lamps.along((0, 0, 0), up, tmax=tmax)[0, 0] for tmax in (np.inf, 3.0, 1.0))
     assert both > near > none == 0
 
 
 def test_lamp_without_shadow_is_left_to_its_own_samples():
-    lamps = Lamps([light("area", 0, 0, 2, cast_shadow=False, camera=True)])
+    lamps = Lights([light("area", 0, 0, 2, cast_shadow=False, camera=True)])
     up = [[0.0, 0.0, 1.0]]
     assert lamps.along((0, 0, 0), up, seen_by=DIFFUSE)[0, 0] == 0
     assert lamps.along((0, 0, 0), up, seen_by=CAMERA)[0, 0] > 0
     assert (lamps.sample(NUMBERS[:64], (0, 0, 0))[3] < 0).all()
-    assert irradiance(lamps) == pytest.approx(irradiance(Lamps([light("area", 0, 0, 2)])), rel=1e-6)
+    assert irradiance(lamps) == pytest.approx(irradiance(Lights([light("area", 0, 0, 2)])), rel=1e-6)
 
 
 def test_nothing_is_ever_infinite():
     """At, in, on, behind and far from every lamp; what is behind an area gets nothing."""
     lamps = [*LARGE.values(), light("point", 0, 0, 0), light("spot", 0, 0, 0), light("area", 0, 0, 0, size_x=1e-5)]
     for lamp in lamps:
-        one = Lamps([lamp])
+        one = Lights([lamp])
         assert not one.warnings
         place = np.asarray(lamp.matrix_world)[:3, 3]
         back = np.asarray(lamp.matrix_world)[:3, 2]
@@ -388,40 +388,40 @@ def test_useless_lights_are_named_and_left_out():
     }
     lights = [Light(name, "area", **{"matrix_world": placed(0, 0, 1)} | settings) for name, settings in useless.items()]
     lights.insert(4, light("point", 0, 0, 2))
-    lamps = Lamps(lights)
+    lamps = Lights(lights)
     assert len(lamps.warnings) == len(useless)
     for name, warning in zip(useless, lamps.warnings, strict=True):
         assert repr(name) in warning
     assert lamps.count == 1 and lamps.order.tolist() == [4]
     assert irradiance(lamps) == pytest.approx(10 / (4 * math.pi * 4), rel=1e-5)
-    assert "scale" in Lamps([light("spot", 0, 0, 1, scale=(0, 1, 1))]).warnings[0]
-    assert "scale" in Lamps([light("sun", 0, 0, 1, scale=(1, 1, 0))]).warnings[0]
-    assert "closed" in Lamps([light("spot", 0, 0, 1, spot_size=0.0)]).warnings[0]
+    assert "scale" in Lights([light("spot", 0, 0, 1, scale=(0, 1, 1))]).warnings[0]
+    assert "scale" in Lights([light("sun", 0, 0, 1, scale=(1, 1, 0))]).warnings[0]
+    assert "closed" in Lights([light("spot", 0, 0, 1, spot_size=0.0)]).warnings[0]
     # A point has no axes: its scale does not matter.
-    assert not Lamps([light("point", 0, 0, 1, scale=(0, 0, 0))]).warnings
+    assert not Lights([light("point", 0, 0, 1, scale=(0, 0, 0))]).warnings
 
 
 def test_no_lamps_are_black():
-    lamps = Lamps([])
+    lamps = Lights([])
     assert lamps.count == 0 and lamps.power == 0 and len(lamps.table) == 1
     _, _, radiance, density, rows = lamps.sample(NUMBERS[:16], (0, 0, 0))
     assert not radiance.any() and not density.any() and (rows == -1).all()
     assert not lamps.along((0, 0, 0), uniform_directions(64)).any()
-    assert lamps_weight(F(0), F(0), F(0), lamps.table, lamps.pick) == 0
+    assert lights_weight(F(0), F(0), F(0), lamps.table, lamps.pick) == 0
 
 
 def test_power_is_comparable_with_an_environment():
     """Luminance from all directions: irradiance of a sun, intensity over squared distance of a lamp."""
-    assert Lamps([light("sun", 0, 0, 0, power=3, angle=0.1)]).power == pytest.approx(3)
-    far = Lamps([light("point", 0, 0, 10, power=20)], centre=np.array([0, 0, 2.0]), radius=1.0)
+    assert Lights([light("sun", 0, 0, 0, power=3, angle=0.1)]).power == pytest.approx(3)
+    far = Lights([light("point", 0, 0, 10, power=20)], centre=np.array([0, 0, 2.0]), radius=1.0)
     assert far.power == pytest.approx(20 / (4 * math.pi * 64))
-    near = Lamps([light("point", 0, 0, 0, power=20)], centre=np.zeros(3), radius=2.0)
+    near = Lights([light("point", 0, 0, 0, power=20)], centre=np.zeros(3), radius=2.0)
     assert near.power == pytest.approx(20 / (4 * math.pi * 4))
 
 
 def test_rows_keep_their_light():
     lights = crowd(40)
-    lamps = Lamps(lights)
+    lamps = Lights(lights)
     for row, own in enumerate(lamps.order):
         if lights[own].kind != "sun":
             np.testing.assert_allclose(lamps.table[row, PLACE : PLACE + 3], lights[own].matrix_world[:3, 3], rtol=1e-6)

@@ -16,7 +16,7 @@ from test_lamps import light
 
 from drgs_blender.core.frame import Light
 from drgs_blender.render.lights.light_shapes import CAMERA, DIFFUSE, GLOSSY, SHADOW
-from drgs_blender.render.lights.lights import Lamps, lamp_flags
+from drgs_blender.render.lights.lights import Lights, light_flags
 from drgs_blender.render.sampling import sobol
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -116,7 +116,7 @@ def cycles(tmp_path_factory) -> dict[str, np.ndarray]:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", LIT)
 def test_irradiance(cycles, name):
-    lamps = Lamps([LIT[name]])
+    lamps = Lights([LIT[name]])
     directions, _, radiance, density, _ = lamps.sample(sobol(1 << 17), (0, 0, 0))
     hit = density != 0
     terms = radiance[hit] * (np.maximum(directions[hit, 2], 0) / np.abs(density[hit]))[:, None].astype(float)
@@ -128,7 +128,7 @@ def test_irradiance(cycles, name):
 def test_radiance_along_a_ray(cycles, name):
     lamp, origin, direction = SEEN[name]
     unit = np.array([direction]) / np.linalg.norm(direction)
-    found = Lamps([dataclasses.replace(lamp, camera=True)]).along(origin, unit, seen_by=CAMERA)[0]
+    found = Lights([dataclasses.replace(lamp, camera=True)]).along(origin, unit, seen_by=CAMERA)[0]
     expected = cycles[f"seen {name}"]
     np.testing.assert_allclose(found, expected, rtol=1e-3)
     hidden = ("beside", "corner", "turned", "behind", "outside")
@@ -140,8 +140,8 @@ def test_who_sees_a_light(cycles):
     assert cycles["no camera"].max() == 0
     assert cycles["no diffuse"].max() == 0 < cycles["no glossy"].max()
     assert cycles["no glossy, glossy"].max() == 0 < cycles["no diffuse, glossy"].max()
-    lamps = Lamps([light("area", 0, 0, 1, diffuse=False)])
-    assert lamp_flags(0, *lamps.tables[::2]) == GLOSSY | SHADOW
+    lamps = Lights([light("area", 0, 0, 1, diffuse=False)])
+    assert light_flags(0, *lamps.tables[::2]) == GLOSSY | SHADOW
     assert not lamps.along((0, 0, 0), [[0, 0, 1]], seen_by=DIFFUSE).any()
     assert not lamps.along((0, 0, 0), [[0, 0, 1]], seen_by=CAMERA).any()
     assert lamps.along((0, 0, 0), [[0, 0, 1]], seen_by=GLOSSY).all()

@@ -13,7 +13,7 @@ from test_integrate import points, settings, sun_picture
 from drgs_blender.core.frame import Light, MeshState, Visibility, World
 from drgs_blender.render.integrator.integrate import integrate
 from drgs_blender.render.lights.environment import EnvironmentLight
-from drgs_blender.render.lights.lights import Lamps
+from drgs_blender.render.lights.lights import Lights
 from drgs_blender.render.scene.trace_scene import TraceScene
 
 DARK = World(strength=0.0)
@@ -27,7 +27,7 @@ def light_of(
     scene.update([], meshes)
     seen = points(6000, albedo=0.7, roughness=0.5, metallic=0.4, origin=(0.3, 0.1, 0.0))
     how = settings(8, 8, 8, bounces=bounces, shading_model="principled", auto=auto)
-    found = integrate(scene, EnvironmentLight(world), seen, how, 0, Lamps(lights)).components.astype(float)
+    found = integrate(scene, EnvironmentLight(world), seen, how, 0, Lights(lights)).components.astype(float)
     return found.mean(0), found.std(0) / math.sqrt(len(found))
 
 

@@ -52,11 +52,11 @@ _HIT = ("float32", "int32", "int32", "int32", "float32", "float32", "float32", "
 
 def gather_points(
     lane: Any, lanes: Any, room: Any, points: Any, normals: Any, a2s: Any, counts: Any, sequence: Any, scene: Any,
-    faces: Any, cache: Any, radiance: Any, shape: Any, sky: Any, seen: Any, out: Any,
+    faces: Any, cache: Any, radiance: Any, shape: Any, envmap: Any, seen: Any, out: Any,
 ) -> None:  # fmt: skip
     """`decouple.gather._gather`."""
     for i in range(lane, len(a2s), lanes):
-        gather_point(i, points, normals, a2s, counts, sequence, scene, faces, cache, radiance, shape, sky, seen, out)
+        gather_point(i, points, normals, a2s, counts, sequence, scene, faces, cache, radiance, shape, envmap, seen, out)
 
 
 GATHER = Work(gather_points, (), NATIVES | {trace: Native(_TRACE, "trace_mesh", _HIT)})
@@ -81,20 +81,23 @@ class DeviceGatherer(Gatherer):
 
     def _gather(
         self, points: tuple[Array, ...], normal: Array, alpha2: Array, radiance: Array, shape: tuple[Any, ...],
-        light: EnvironmentLight, out: tuple[Array, ...],
+        environment: EnvironmentLight, out: tuple[Array, ...],
     ) -> None:  # fmt: skip
         if not self.failed:
             try:
                 with self._launcher.failures("copying the mesh"):
                     counts, sequence, faces, cache = self._kept()
-                    scene, sky = (0, 0 if self._mesh is None else int(self._mesh.id)), self._mirror.sky(light)
-                arguments = points, normal, alpha2, counts, sequence, scene, faces, cache, radiance, shape, sky
+                    scene, envmap = (
+                        (0, 0 if self._mesh is None else int(self._mesh.id)),
+                        self._mirror.envmap(environment),
+                    )
+                arguments = points, normal, alpha2, counts, sequence, scene, faces, cache, radiance, shape, envmap
                 self._launcher.launch(GATHER, len(alpha2), (*arguments, self._seen), out)
                 return
             except DeviceError as error:
                 self.failed = str(error)
                 log.warning("%s Materials are learned on the CPU from here on", self.failed)
-        super()._gather(points, normal, alpha2, radiance, shape, light, out)
+        super()._gather(points, normal, alpha2, radiance, shape, environment, out)
 
     def _kept(self) -> tuple[Any, ...]:
         """What stays on the device: the mesh that rays meet, and tables."""

@@ -31,9 +31,9 @@ from ...render.lights.environment import (
     cell_at,
     cell_end,
     direction_in_cell,
+    envmap_pdf,
     first_cell,
     map_at,
-    sky_density,
 )
 from ...render.lights.product_sampling import block_of, facing_row, in_cells_order
 from ...render.sampling import (
@@ -136,17 +136,17 @@ def _cached(cache, a, b, c, u, v, dx, dy, dz, k):  # type: ignore[no-untyped-def
 
 
 @njit
-def _direction(strategy, n0, n1, n2, normal, view, alpha, bound, frame, row, sky):  # type: ignore[no-untyped-def]
+def _direction(strategy, n0, n1, n2, normal, view, alpha, bound, frame, row, envmap):  # type: ignore[no-untyped-def]
     """Direction of a strategy (0 cosine, 1 GGX, 2 light) from three random uint32."""
     nx, ny, nz = normal
     tx, ty, tz, bx, by, bz = frame
     if strategy == 2:
-        number, _ = in_cells_order(row, block_of(row, n0, sky), n0, n1, sky)
-        place = first_cell(number, sky)
-        while number > cell_end(place, sky):
+        number, _ = in_cells_order(row, block_of(row, n0, envmap), n0, n1, envmap)
+        place = first_cell(number, envmap)
+        while number > cell_end(place, envmap):
             place += 1
-        _, column, upper, lower, _ = cell_at(place, sky)
-        dx, dy, dz, _, _ = direction_in_cell(column, upper, lower, n1, n2, sky)
+        _, column, upper, lower, _ = cell_at(place, envmap)
+        dx, dy, dz, _, _ = direction_in_cell(column, upper, lower, n1, n2, envmap)
         return dx, dy, dz
     if strategy == 0:
         x, y, z = cosine_hemisphere(unit(n0), unit(n1))
@@ -165,7 +165,7 @@ def _texels(radiance, t, p, k):  # type: ignore[no-untyped-def]
 
 
 @njit
-def gather_point(i, points, normals, a2s, counts, sequence, scene, faces, cache, radiance, shape, sky, seen, out):  # type: ignore[no-untyped-def]
+def gather_point(i, points, normals, a2s, counts, sequence, scene, faces, cache, radiance, shape, envmap, seen, out):  # type: ignore[no-untyped-def]
     """All samples of one pixel; see `gather` for what is written."""
     origin, flat, towards, key = points
     sums, by_a2, by_normal, texel, share, weights = out
@@ -179,7 +179,7 @@ def gather_point(i, points, normals, a2s, counts, sequence, scene, faces, cache,
     alpha = F(math.sqrt(a2))
     bound, norm = vndf_terms(max(nv, F(1e-4)), a2)
     frame = basis(nx, ny, nz)
-    row = facing_row(nx, ny, nz, sky)
+    row = facing_row(nx, ny, nz, envmap)
     place = 0
     for half in range(2):
         for strategy in range(3):
@@ -193,7 +193,9 @@ def gather_point(i, points, normals, a2s, counts, sequence, scene, faces, cache,
                 n0 = scrambled(sequence[j, 0], mix(U(own + U(1))))
                 n1 = scrambled(sequence[j, 1], mix(U(own + U(2))))
                 n2 = scrambled(sequence[j, 2], mix(U(own + U(3))))
-                dx, dy, dz = _direction(strategy, n0, n1, n2, (nx, ny, nz), (vx, vy, vz), alpha, bound, frame, row, sky)
+                dx, dy, dz = _direction(
+                    strategy, n0, n1, n2, (nx, ny, nz), (vx, vy, vz), alpha, bound, frame, row, envmap
+                )
                 nl = nx * dx + ny * dy + nz * dz
                 if not (nl > F(1e-6) and gx * dx + gy * dy + gz * dz > ZERO):
                     continue
@@ -205,10 +207,10 @@ def gather_point(i, points, normals, a2s, counts, sequence, scene, faces, cache,
                 value, density, l_a2, l_nl, l_nv, l_nh = ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
                 if nv > ZERO:
                     value, density, l_a2, l_nl, l_nv, l_nh = _lobe(nl, nv, nh, cx * cx + cy * cy + cz * cz, a2)
-                u, v = map_at(dx, dy, dz, sky)
+                u, v = map_at(dx, dy, dz, envmap)
                 total = F(counts[0]) * nl * INVERSE_PI + F(counts[1]) * density * norm
                 if counts[2] > 0:
-                    total += F(counts[2]) * sky_density(u, v, row, sky)
+                    total += F(counts[2]) * envmap_pdf(u, v, row, envmap)
                 if not total > F(1e-12):
                     continue
                 w = ONE / total
@@ -262,12 +264,12 @@ def gather_point(i, points, normals, a2s, counts, sequence, scene, faces, cache,
 
 
 @njit(parallel=True)
-def _gather(points, normals, a2s, counts, sequence, scene, faces, cache, radiance, shape, sky, seen, out):  # type: ignore[no-untyped-def]
+def _gather(points, normals, a2s, counts, sequence, scene, faces, cache, radiance, shape, envmap, seen, out):  # type: ignore[no-untyped-def]
     n = len(a2s)
     for block in prange((n + _BLOCK - 1) // _BLOCK):
         for i in range(block * _BLOCK, min(n, (block + 1) * _BLOCK)):
             gather_point(
-                i, points, normals, a2s, counts, sequence, scene, faces, cache, radiance, shape, sky, seen, out
+                i, points, normals, a2s, counts, sequence, scene, faces, cache, radiance, shape, envmap, seen, out
             )
 
 
@@ -361,13 +363,13 @@ class Gatherer:
 
     def _gather(
         self, points: tuple[Array, ...], normal: Array, alpha2: Array, radiance: Array, shape: tuple[Any, ...],
-        light: EnvironmentLight, out: tuple[Array, ...],
+        environment: EnvironmentLight, out: tuple[Array, ...],
     ) -> None:  # fmt: skip
         """`gather_point` of all points."""
         scene = self._tree.intersect_address, self._tree.scene
         _gather(
             points, normal, alpha2, self._counts, self._sequence, scene, self._faces, self._cache, radiance, shape,
-            light.sky, self._seen, out,
+            environment.envmap, self._seen, out,
         )  # fmt: skip
 
 

@@ -26,7 +26,7 @@ from ...compute.jit import njit, prange
 from ...core.frame import Camera, RenderSettings
 from ..camera import FX, FY, ORTHOGRAPHIC, WIDTH, sample_ray
 from ..gbuffer.gbuffer import GBuffer
-from ..lights.environment import EnvironmentLight, map_at, sky_radiance
+from ..lights.environment import EnvironmentLight, envmap_radiance, map_at
 from ..points import CATCHER, Radiance
 from ..sampling import luminance
 from .guides import Guides
@@ -70,7 +70,7 @@ class Film:
         self.depth = np.full(size, EMPTY_DEPTH, np.float32)
         self.position, self.normal, self.albedo = (np.zeros((*size, 3), np.float32) for _ in range(3))
 
-    def add(self, buffer: GBuffer, radiance: Radiance, pass_index: Array, light: EnvironmentLight) -> None:
+    def add(self, buffer: GBuffer, radiance: Radiance, pass_index: Array, environment: EnvironmentLight) -> None:
         """Take the strip `buffer` with the light of its points.
 
         Parameters
@@ -116,13 +116,13 @@ class Film:
             self.emission[rows],
             self.catcher[rows],
         )
-        if not self.transparent and not light.black:
-            _background(self.parameters, x0, y0, buffer.alpha, light.sky, self.environment[rows])
+        if not self.transparent and not environment.black:
+            _background(self.parameters, x0, y0, buffer.alpha, environment.envmap, self.environment[rows])
             caught = np.flatnonzero(points.flags & CATCHER)
             if len(caught):
                 _behind(
                     self.parameters, x0, y0, points.pixel[caught], points.sample[caught], points.weight[caught],
-                    light.sky, self.veiled[rows],
+                    environment.envmap, self.veiled[rows],
                 )  # fmt: skip
 
     def guides(self) -> Guides:
@@ -301,16 +301,16 @@ def _develop(
 
 
 @njit
-def _world(p: Any, pixel: Any, sample: Any, sky: Any) -> Any:
+def _world(p: Any, pixel: Any, sample: Any, envmap: Any) -> Any:
     """The world's radiance along the ray of a sub-pixel sample."""
     _, _, _, dx, dy, dz = sample_ray(p, pixel, sample)
     scale = 1.0 / np.sqrt(dx * dx + dy * dy + dz * dz)
-    u, v = map_at(np.float32(dx * scale), np.float32(dy * scale), np.float32(dz * scale), sky)
-    return sky_radiance(u, v, sky)
+    u, v = map_at(np.float32(dx * scale), np.float32(dy * scale), np.float32(dz * scale), envmap)
+    return envmap_radiance(u, v, envmap)
 
 
 @njit(parallel=True)
-def _background(p: Any, x0: Any, y0: Any, alpha: Any, sky: Any, out: Any) -> None:
+def _background(p: Any, x0: Any, y0: Any, alpha: Any, envmap: Any, out: Any) -> None:
     """Add the world's radiance along every sub-pixel ray, weighted by what the surfaces leave uncovered."""
     width = np.int64(p[WIDTH])
     rows, columns, subpixels = alpha.shape
@@ -322,18 +322,18 @@ def _background(p: Any, x0: Any, y0: Any, alpha: Any, sky: Any, out: Any) -> Non
                 left = (np.float32(1.0) - alpha[y, x, k]) * share
                 if left <= np.float32(0.0):
                     continue
-                r, g, b = _world(p, (y0 + y) * width + x0 + x, k, sky)
+                r, g, b = _world(p, (y0 + y) * width + x0 + x, k, envmap)
                 red, green, blue = red + left * r, green + left * g, blue + left * b
             out[y, x, 0], out[y, x, 1], out[y, x, 2] = red, green, blue
 
 
 @njit
-def _behind(p: Any, x0: Any, y0: Any, pixel: Any, sample: Any, weight: Any, sky: Any, out: Any) -> None:
+def _behind(p: Any, x0: Any, y0: Any, pixel: Any, sample: Any, weight: Any, envmap: Any, out: Any) -> None:
     """Add the world's radiance behind some points, by weight."""
     width = np.int64(p[WIDTH])
     for i in range(len(pixel)):
         y, x = pixel[i] // width - y0, pixel[i] % width - x0
-        r, g, b = _world(p, pixel[i], sample[i], sky)
+        r, g, b = _world(p, pixel[i], sample[i], envmap)
         out[y, x, 0] += weight[i] * r
         out[y, x, 1] += weight[i] * g
         out[y, x, 2] += weight[i] * b

@@ -15,7 +15,7 @@ import numpy as np
 from ...compute.jit import njit, prange
 from ..camera import CLIP_END, CLIP_START, WIDTH, sample_ray
 from ..lights.light_shapes import CAMERA
-from ..lights.lights import Lamps, lamps_along, suns_along
+from ..lights.lights import Lights, lights_along, suns_along
 from ..points import CATCHER
 from ..sampling import ONE, ZERO, F
 from .gbuffer import GBuffer
@@ -25,8 +25,8 @@ Array = np.ndarray
 _FAR = F(np.inf)
 
 
-def seen_lamps(lamps: Lamps, parameters: Array, x0: int, buffer: GBuffer) -> Array:
-    """Radiance of lamps straight to the camera, mean over each pixel's samples.
+def visible_lights(lights: Lights, parameters: Array, x0: int, buffer: GBuffer) -> Array:
+    """Radiance of lights straight to the camera, mean over each pixel's samples.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ def seen_lamps(lamps: Lamps, parameters: Array, x0: int, buffer: GBuffer) -> Arr
     out = np.zeros((*buffer.alpha.shape[:2], 3), np.float32)
     _look(
         parameters, x0, y0, start, buffer.alpha, points.pixel, points.sample, points.weight, points.flags, buffer.depth,
-        lamps.tables, out,
+        lights.tables, out,
     )  # fmt: skip
     return out
 
@@ -52,7 +52,7 @@ def seen_lamps(lamps: Lamps, parameters: Array, x0: int, buffer: GBuffer) -> Arr
 @njit(parallel=True)
 def _look(
     p: Any, x0: Any, y0: Any, start: Any, alpha: Any, pixel: Any, sample: Any, weight: Any, flags: Any, depth: Any,
-    lamps: Any, out: Any,
+    lights: Any, out: Any,
 ) -> None:  # fmt: skip
     width, near = np.int64(p[WIDTH]), p[CLIP_START]
     rows, columns, subpixels = alpha.shape
@@ -66,12 +66,12 @@ def _look(
                     n += 1
                 ox, oy, oz, dx, dy, dz = sample_ray(p, place, k)
                 length = np.sqrt(dx * dx + dy * dy + dz * dz)
-                # As in Cycles, rays start at the clip distance: soft lamps face that place.
+                # As in Cycles, rays start at the clip distance: soft lights face that place.
                 origin = F(ox + near * dx), F(oy + near * dy), F(oz + near * dz)
                 direction = F(dx / length), F(dy / length), F(dz / length)
                 end = F((p[CLIP_END] - near) * length)
-                r, g, b = lamps_along(*origin, *direction, end, ONE, ZERO, CAMERA, *lamps)
-                s, t, u = suns_along(*origin, *direction, _FAR, ONE, ZERO, CAMERA, *lamps)
+                r, g, b = lights_along(*origin, *direction, end, ONE, ZERO, CAMERA, *lights)
+                s, t, u = suns_along(*origin, *direction, _FAR, ONE, ZERO, CAMERA, *lights)
                 r, g, b = r + s, g + t, b + u
                 if not r + g + b > ZERO:
                     continue
@@ -80,7 +80,9 @@ def _look(
                 for i in range(first, n):
                     if flags[i] & CATCHER:
                         continue
-                    r, g, b = lamps_along(*origin, *direction, F((depth[i] - near) * length), ONE, ZERO, CAMERA, *lamps)
+                    r, g, b = lights_along(
+                        *origin, *direction, F((depth[i] - near) * length), ONE, ZERO, CAMERA, *lights
+                    )
                     red, green, blue = red + weight[i] * r, green + weight[i] * g, blue + weight[i] * b
                 out[y, x, 0] += red
                 out[y, x, 1] += green

@@ -8,7 +8,7 @@ from typing import Any
 from ...compute.warp.kernels import Launcher, Room, Work
 from ..integrator import direct, indirect, integrate, sample_allocation, wavefront
 from ..lights.environment import EnvironmentLight
-from ..lights.lights import Lamps
+from ..lights.lights import Lights
 from ..scene.trace_scene import TraceScene
 from .natives import NATIVES
 from .scene_mirror import Mirror
@@ -46,9 +46,9 @@ class DeviceKernel(integrate.Kernel):
     def __init__(self, launcher: Launcher, mirror: Mirror) -> None:
         self._launcher, self._mirror = launcher, mirror
 
-    def tables(self, scene: TraceScene, light: EnvironmentLight, lamps: Lamps) -> tuple[Any, Any, Any, Any]:
+    def tables(self, scene: TraceScene, environment: EnvironmentLight, lights: Lights) -> tuple[Any, Any, Any, Any]:
         with self._launcher.failures("copying the scene"):
-            return self._mirror.tables(scene, light, lamps)
+            return self._mirror.tables(scene, environment, lights)
 
     def shade(self, *arguments: Any) -> None:
         *inwards, out = arguments

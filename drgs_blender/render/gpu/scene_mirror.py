@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from ...compute.warp.kernels import Launcher
-from ..lights.environment import EnvironmentLight, Sky
-from ..lights.lights import Lamps
+from ..lights.environment import ROTATION, EnvironmentLight, EnvMap
+from ..lights.lights import Lights
 from ..memory import Place, address
 from ..scene.interaction import Geometry
 from ..scene.ray_masks import CAMERA, DIFFUSE, GLOSSY, ORDINARY, SHADOW, SURFELS, WITHOUT
@@ -25,7 +25,7 @@ _RAYS = CAMERA | ORDINARY | _KINDS | _KINDS << WITHOUT | SURFELS
 
 
 class Mirror:
-    """Keeps what a device needs of the scene, the light and the lamps of one frame after another.
+    """Keeps what a device needs of the scene, the environment and the lights of one frame after another.
 
     Parameters
     ----------
@@ -38,19 +38,19 @@ class Mirror:
         self._known: dict[str, tuple[tuple[Any, ...], Any, list[Any]]] = {}
         self._trees: Trees | None = None
 
-    def tables(self, scene: TraceScene, light: EnvironmentLight, lamps: Lamps) -> tuple[Any, Any, Any, Any]:
-        """(tracer, geometry, sky, lamps) with the device's addresses; until what they are of changes."""
+    def tables(self, scene: TraceScene, environment: EnvironmentLight, lights: Lights) -> tuple[Any, Any, Any, Any]:
+        """(tracer, geometry, environment, lights) with the device's addresses; until what they are of changes."""
         state = scene, scene.version
-        lights = self._table(
-            "lamps", (lamps, *state), lambda place: (*lamps.tables[:2], lamps.emitters.address_at(place))
+        of_lights = self._table(
+            "lights", (lights, *state), lambda place: (*lights.tables[:2], lights.emitters.address_at(place))
         )
-        return self.tracer(scene), self.geometry(scene), self.sky(light), lights
+        return self.tracer(scene), self.geometry(scene), self.envmap(environment), of_lights
 
-    def sky(self, light: EnvironmentLight) -> Sky:
+    def envmap(self, environment: EnvironmentLight) -> EnvMap:
         """The environment; until it is another one."""
         # Its pictures are large, and stay; only how they are turned may have changed.
-        sky: Sky = self._table("sky", (light,), light.sky_at)
-        return sky._replace(**{name: value for name, value in light.sky._asdict().items() if len(name) == 2})
+        envmap: EnvMap = self._table("environment", (environment,), environment.envmap_at)
+        return envmap._replace(**{name: getattr(environment.envmap, name) for name in ROTATION})
 
     def geometry(self, scene: TraceScene) -> Geometry:
         """What lies behind the faces; until the scene's next update."""

@@ -7,20 +7,20 @@ from typing import Any
 import numpy as np
 
 from ...compute.jit import njit
-from ..lights.environment import sky_radiance
+from ..lights.environment import envmap_radiance
 from ..lights.light_shapes import DIFFUSE, GLOSSY
-from ..lights.lights import emission_along, lamps_along
+from ..lights.lights import emission_along, lights_along
 from ..sampling import ONE, ZERO, F, luminance
 from ..scene import ray_masks
 from . import wavefront as w
 from .indirect import CARRIED, INDIRECT, trace_paths
-from .intersect import FAR, lamp_light, meet, passed, put_hit
-from .sample_allocation import COSINE, GGX, LAMPS, SKY
+from .intersect import FAR, light_radiance, meet, passed, put_hit
+from .sample_allocation import COSINE, ENVIRONMENT, GGX, LIGHTS
 
 #: Rays of a batch: few enough for the second cache, enough to fill vectors.
 BATCH = 512
-#: Columns of a block's sums, once each for light of the sky and lamp samples, indirect light, that of lamps and of
-#: surfaces that rays met: diffuse and glossy light, then sum and sum of squares of the luminance of each.
+#: Columns of a block's sums, once each for what samples of environment and lights find, indirect light, and light of
+#: lights and surfaces that rays met: diffuse and glossy light, then sum and sum of squares of the luminance of each.
 KINDS, KIND, MOMENTS = 3, 10, 6
 
 
@@ -74,22 +74,22 @@ def deliver(count: Any, found: Any, limit: Any, sums: Any) -> None:
 
 
 @njit
-def _see_lamps(
-    slot: Any, s: Any, ints: Any, reach: Any, hit: Any, cosine: Any, ggx: Any, lamps: Any, differ: Any, glows: Any,
+def _see_lights(
+    slot: Any, s: Any, ints: Any, reach: Any, hit: Any, cosine: Any, ggx: Any, lights: Any, differ: Any, glows: Any,
     geometry: Any, sums: Any,
 ) -> None:  # fmt: skip
-    """What lamps between a point and what its ray hit shine, and what that emits; the BRDF is not yet weighed."""
+    """What lights between a point and what its ray hit shine, and what that emits; the BRDF is not yet weighed."""
     i, _ = w.at(slot)
     position, direction = (s[i + w.OX], s[i + w.OY], s[i + w.OZ]), (s[i + w.LX], s[i + w.LY], s[i + w.LZ])
     others, share = cosine * s[i + w.WC] * s[i + w.PC] + ggx * s[i + w.WG] * s[i + w.PG], s[i + w.WL]
     if not others > ZERO:
         return
-    dr, dg, db = lamps_along(*position, *direction, reach, others, share, DIFFUSE, *lamps)
+    dr, dg, db = lights_along(*position, *direction, reach, others, share, DIFFUSE, *lights)
     gr, gg, gb = dr, dg, db
     if differ:
-        gr, gg, gb = lamps_along(*position, *direction, reach, others, share, GLOSSY, *lamps)
+        gr, gg, gb = lights_along(*position, *direction, reach, others, share, GLOSSY, *lights)
     if glows:
-        r, g, b, density, glossy = emission_along(*position, *direction, hit, geometry, *lamps)
+        r, g, b, density, glossy = emission_along(*position, *direction, hit, geometry, *lights)
         weight, glossy = ONE / (others + share * density), ONE / (others + share * glossy)
         dr, dg, db = dr + weight * r, dg + weight * g, db + weight * b
         gr, gg, gb = gr + glossy * r, gg + glossy * g, gb + glossy * b
@@ -98,11 +98,11 @@ def _see_lamps(
 
 
 @njit
-def _trace_lamps(
-    count: Any, s: Any, ints: Any, scene: Any, lamps: Any, shading_model: Any, apart: Any, shift: Any, sums: Any
+def _trace_lights(
+    count: Any, s: Any, ints: Any, scene: Any, lights: Any, shading_model: Any, apart: Any, shift: Any, sums: Any
 ) -> None:
-    """Lamp samples: draw, trace, add."""
-    w.lamp_directions(s, ints, count, lamps)
+    """Light samples: draw, trace, add."""
+    w.light_directions(s, ints, count, lights)
     w.evaluate(s, count, shading_model)
     mask = np.int32(ray_masks.SHADOW << shift)
     for slot in range(count):
@@ -110,60 +110,62 @@ def _trace_lamps(
         others, glossy_others = s[i + w.WC] * s[i + w.PC], s[i + w.WG] * s[i + w.PG]
         if not apart:
             others = glossy_others = others + glossy_others
-        dr, dg, db, gr, gg, gb = lamp_light(s, ints, slot, others, glossy_others, s[i + w.WL], lamps, scene[0], mask)
+        dr, dg, db, gr, gg, gb = light_radiance(
+            s, ints, slot, others, glossy_others, s[i + w.WL], lights, scene[0], mask
+        )
         if dr + dg + db + gr + gg + gb > ZERO:
             _reflect(sums, s, ints, slot, 0, dr, dg, db, gr, gg, gb)
 
 
 @njit
-def _see_sky(count: Any, s: Any, ints: Any, sky: Any, sums: Any) -> None:
+def _see_envmap(count: Any, s: Any, ints: Any, envmap: Any, sums: Any) -> None:
     """Add what the environment sends along the slots' rays; LIVE is the share that gets through."""
     for slot in range(count):
         i, _ = w.at(slot)
         through = s[i + w.LIVE]
         if through > ZERO:
-            r, g, b = sky_radiance(s[i + w.MU], s[i + w.MV], sky)
+            r, g, b = envmap_radiance(s[i + w.MU], s[i + w.MV], envmap)
             r, g, b = r * through, g * through, b * through
             _reflect(sums, s, ints, slot, 0, r, g, b, r, g, b)
 
 
 @njit
-def _trace_sky(
-    count: Any, s: Any, ints: Any, tracer: Any, sky: Any, shading_model: Any, apart: Any, shift: Any, sums: Any
+def _trace_envmap(
+    count: Any, s: Any, ints: Any, tracer: Any, envmap: Any, shading_model: Any, apart: Any, shift: Any, sums: Any
 ) -> None:
     """Samples of the environment: draw, weigh, trace, add."""
-    w.light_directions(s, ints, count, sky)
+    w.environment_directions(s, ints, count, envmap)
     w.evaluate(s, count, shading_model)
     if apart:
         w.weigh_apart(s, count)
     else:
         w.weigh(s, count, ONE, ONE)
-    w.warm(s, count, sky)
+    w.warm(s, count, envmap)
     mask = np.int32(ray_masks.SHADOW << shift)
     for slot in range(count):
         i, _ = w.at(slot)
         if s[i + w.LIVE] > ZERO:
             s[i + w.LIVE] = passed(tracer, s, ints, slot, FAR, mask)
-    _see_sky(count, s, ints, sky, sums)
+    _see_envmap(count, s, ints, envmap, sums)
 
 
 @njit
 def trace_batch(
-    strategy: Any, count: Any, rays: Any, paths: Any, begun: Any, found: Any, scene: Any, lights: Any, table: Any,
+    strategy: Any, count: Any, rays: Any, paths: Any, begun: Any, found: Any, scene: Any, illumination: Any, table: Any,
     bounces: Any, shading_model: Any, limit: Any, differ: Any, shift: Any, sums: Any,
 ) -> Any:  # fmt: skip
     """Samples of one strategy: draw, weigh, trace, and add what they see; return the number of paths under way."""
     s, ints = rays
     p, path_ints = paths
     tracer = scene[0]
-    sky, sky_shines, lamps, any_lamps = lights
-    lamps_differ, apart = differ
+    envmap, envmap_shines, lights, any_lights = illumination
+    lights_differ, apart = differ
     w.scramble(ints, count)
-    if any_lamps and strategy == LAMPS:
-        _trace_lamps(count, s, ints, scene, lamps, shading_model, apart, shift, sums)
+    if any_lights and strategy == LIGHTS:
+        _trace_lights(count, s, ints, scene, lights, shading_model, apart, shift, sums)
         return begun
-    if strategy == SKY:
-        _trace_sky(count, s, ints, tracer, sky, shading_model, apart, shift, sums)
+    if strategy == ENVIRONMENT:
+        _trace_envmap(count, s, ints, tracer, envmap, shading_model, apart, shift, sums)
         return begun
     if strategy == COSINE:
         w.cosine_directions(s, ints, count)
@@ -172,7 +174,7 @@ def trace_batch(
         w.ggx_directions(s, ints, count)
         mask = np.int32(ray_masks.GLOSSY << shift)
     w.evaluate(s, count, shading_model)
-    w.look_up(s, ints, count, sky)
+    w.look_up(s, ints, count, envmap)
     cosine = ggx = ONE
     if apart and strategy == COSINE:
         ggx = ZERO
@@ -180,20 +182,20 @@ def trace_batch(
     if apart and strategy == GGX:
         cosine = ZERO
         w.drop(s, count, w.QR)
-    see_lamps = any_lamps or bounces[1]
-    # Lamps are seen before the BRDF is weighed, for they have densities of their own: such rays are traced first.
-    if not see_lamps:
+    see_lights = any_lights or bounces[1]
+    # Lights are seen before the BRDF is weighed, for they have densities of their own: such rays are traced first.
+    if not see_lights:
         w.weigh(s, count, cosine, ggx)
-    if sky_shines:
-        w.warm(s, count, sky)
+    if envmap_shines:
+        w.warm(s, count, envmap)
     for slot in range(count):
         i, c = w.at(slot)
         if not s[i + w.LIVE] > ZERO:
             continue
         position, direction = (s[i + w.OX], s[i + w.OY], s[i + w.OZ]), (s[i + w.LX], s[i + w.LY], s[i + w.LZ])
         through, reach, hit = meet(tracer, s, ints, slot, mask)
-        if see_lamps:
-            _see_lamps(slot, s, ints, reach, hit, cosine, ggx, lamps, lamps_differ, bounces[1], scene[1], sums)
+        if see_lights:
+            _see_lights(slot, s, ints, reach, hit, cosine, ggx, lights, lights_differ, bounces[1], scene[1], sums)
             w.weigh_one(s, i, cosine, ggx)
         s[i + w.LIVE] = through
         if through == ONE or bounces[0] == 0:
@@ -202,7 +204,7 @@ def trace_batch(
         others = cosine * s[i + w.WC] * s[i + w.PC] + ggx * s[i + w.WG] * s[i + w.PG]
         rest = (ONE - through) * (ONE + s[i + w.WE] * s[i + w.PE] / max(others, F(1e-30)))
         if begun == BATCH:
-            trace_paths(p, path_ints, begun, scene, lights, shading_model, table, bounces, shift, found)
+            trace_paths(p, path_ints, begun, scene, illumination, shading_model, table, bounces, shift, found)
             deliver(begun, found, limit, sums)
             begun = np.int64(0)
         put_hit(tracer, p, path_ints, begun, *position, *direction, hit, ints[c + w.KEY], begun)
@@ -214,8 +216,8 @@ def trace_batch(
         )  # fmt: skip
         found[begun, CARRIED + 6] = F(ints[c + w.OWNER])
         begun += 1
-    if sky_shines:
-        _see_sky(count, s, ints, sky, sums)
+    if envmap_shines:
+        _see_envmap(count, s, ints, envmap, sums)
     return begun
 
 

@@ -12,15 +12,15 @@ from typing import Any
 import numpy as np
 
 from ...compute.jit import njit
-from ..lights.environment import map_at, sky_density, sky_radiance
+from ..lights.environment import envmap_pdf, envmap_radiance, map_at
 from ..lights.light_shapes import DIFFUSE, GLOSSY
-from ..lights.lights import emission_along, lamps_along
+from ..lights.lights import emission_along, lights_along
 from ..lights.product_sampling import facing_row
 from ..sampling import GOLDEN, ONE, ZERO, F, U, mix, unit
 from ..scene import ray_masks
 from . import brdf
 from . import wavefront as w
-from .intersect import FAR, lamp_light, meet, passed, put_hit, surface_of
+from .intersect import FAR, light_radiance, meet, passed, put_hit, surface_of
 
 Array = np.ndarray
 
@@ -41,7 +41,7 @@ def lifted(px: Any, py: Any, pz: Any, gx: Any, gy: Any, gz: Any, extent: Any) ->
 
 
 @njit
-def _surfaces(s: Any, ints: Any, count: Any, scene: Any, shading_model: Any, table: Any, sky: Any) -> None:
+def _surfaces(s: Any, ints: Any, count: Any, scene: Any, shading_model: Any, table: Any, envmap: Any) -> None:
     """Normals and materials where the rays hit. What the surfaces emit was taken where the rays left (`_onwards`)."""
     tracer, geometry, extent = scene
     for slot in range(count):
@@ -52,7 +52,7 @@ def _surfaces(s: Any, ints: Any, count: Any, scene: Any, shading_model: Any, tab
         s[a + w.NX], s[a + w.NY], s[a + w.NZ] = nx, ny, nz
         s[a + w.MX], s[a + w.MY], s[a + w.MZ] = mx, my, mz
         s[a + w.GX], s[a + w.GY], s[a + w.GZ] = gx, gy, gz
-        ints[c + w.ROW] = U(facing_row(nx, ny, nz, sky))
+        ints[c + w.ROW] = U(facing_row(nx, ny, nz, envmap))
         s[a + w.OX], s[a + w.OY], s[a + w.OZ] = lifted(s[a + w.OX], s[a + w.OY], s[a + w.OZ], gx, gy, gz, extent)
         s[a + w.AR], s[a + w.AG], s[a + w.AB] = r, g, b
         s[a + w.METALLIC], s[a + w.A2] = metallic, brdf.alpha_squared(roughness)
@@ -60,13 +60,13 @@ def _surfaces(s: Any, ints: Any, count: Any, scene: Any, shading_model: Any, tab
 
 
 @njit
-def _towards_sky(s: Any, ints: Any, count: Any, sky: Any, tracer: Any, shift: Any, found: Any) -> None:
-    """The environment samples that `light_directions` drew and `carry` weighed."""
+def _towards_envmap(s: Any, ints: Any, count: Any, envmap: Any, tracer: Any, shift: Any, found: Any) -> None:
+    """The environment samples that `environment_directions` drew and `carry` weighed."""
     for slot in range(count):
         i, c = w.at(slot)
         if not s[i + w.LIVE] > ZERO:
             continue
-        red, green, blue = sky_radiance(s[i + w.MU], s[i + w.MV], sky)
+        red, green, blue = envmap_radiance(s[i + w.MU], s[i + w.MV], envmap)
         weight = ONE / s[i + w.PE]
         red, green, blue = red * s[i + w.QR] * weight, green * s[i + w.QG] * weight, blue * s[i + w.QB] * weight
         if red + green + blue > ZERO:
@@ -78,13 +78,13 @@ def _towards_sky(s: Any, ints: Any, count: Any, sky: Any, tracer: Any, shift: An
 
 
 @njit
-def _towards_lamps(s: Any, ints: Any, count: Any, lamps: Any, tracer: Any, shift: Any, found: Any) -> None:
-    """The lamp samples that `lamp_directions` drew."""
+def _towards_lights(s: Any, ints: Any, count: Any, lights: Any, tracer: Any, shift: Any, found: Any) -> None:
+    """The light samples that `light_directions` drew."""
     for slot in range(count):
         i, c = w.at(slot)
         others = s[i + w.SHARE] * s[i + w.PC] + (ONE - s[i + w.SHARE]) * s[i + w.PG]
-        dr, dg, db, gr, gg, gb = lamp_light(
-            s, ints, slot, others, others, ONE, lamps, tracer, np.int32(ray_masks.SHADOW << shift)
+        dr, dg, db, gr, gg, gb = light_radiance(
+            s, ints, slot, others, others, ONE, lights, tracer, np.int32(ray_masks.SHADOW << shift)
         )
         if dr + dg + db + gr + gg + gb > ZERO:
             owner = np.int64(ints[c + w.OWNER])
@@ -95,7 +95,7 @@ def _towards_lamps(s: Any, ints: Any, count: Any, lamps: Any, tracer: Any, shift
 
 @njit
 def _onwards(
-    s: Any, ints: Any, count: Any, bounce: Any, last: Any, sky: Any, lamps: Any, any_lamps: Any, glows: Any,
+    s: Any, ints: Any, count: Any, bounce: Any, last: Any, envmap: Any, lights: Any, any_lights: Any, glows: Any,
     scene: Any, shift: Any, found: Any,
 ) -> Any:  # fmt: skip
     """The BRDF samples; return how many paths go on, in slots 0, 1, ..."""
@@ -109,29 +109,29 @@ def _onwards(
         direction = (s[i + w.LX], s[i + w.LY], s[i + w.LZ])
         diffuse = ints[c + w.CELL] == U(1)
         mask = np.int32((ray_masks.DIFFUSE if diffuse else ray_masks.GLOSSY) << shift)
-        ends = last and not any_lamps and not glows
+        ends = last and not any_lights and not glows
         if ends:
             through = passed(tracer, s, ints, slot, FAR, mask)
         else:
             through, reach, hit = meet(tracer, s, ints, slot, mask)
         owner = np.int64(ints[c + w.OWNER])
         fr, fg, fb = s[i + w.QR], s[i + w.QG], s[i + w.QB]
-        if any_lamps:
+        if any_lights:
             seen_by = DIFFUSE if diffuse else GLOSSY
-            red, green, blue = lamps_along(*position, *direction, reach, s[i + w.PG], ONE, seen_by, *lamps)
+            red, green, blue = lights_along(*position, *direction, reach, s[i + w.PG], ONE, seen_by, *lights)
             found[owner, INDIRECT] += fr * red
             found[owner, INDIRECT + 1] += fg * green
             found[owner, INDIRECT + 2] += fb * blue
         if glows:
-            red, green, blue, own, glossy = emission_along(*position, *direction, hit, geometry, *lamps)
+            red, green, blue, own, glossy = emission_along(*position, *direction, hit, geometry, *lights)
             weight = ONE / (s[i + w.PG] + (own if diffuse else glossy))
             found[owner, INDIRECT] += fr * red * weight
             found[owner, INDIRECT + 1] += fg * green * weight
             found[owner, INDIRECT + 2] += fb * blue * weight
         if through > ZERO:
-            u, v = map_at(*direction, sky)
-            red, green, blue = sky_radiance(u, v, sky)
-            weight = through / (s[i + w.PG] + sky_density(u, v, ints[c + w.ROW], sky))
+            u, v = map_at(*direction, envmap)
+            red, green, blue = envmap_radiance(u, v, envmap)
+            weight = through / (s[i + w.PG] + envmap_pdf(u, v, ints[c + w.ROW], envmap))
             found[owner, INDIRECT] += fr * red * weight
             found[owner, INDIRECT + 1] += fg * green * weight
             found[owner, INDIRECT + 2] += fb * blue * weight
@@ -154,7 +154,8 @@ def _onwards(
 
 @njit
 def trace_paths(
-    s: Any, ints: Any, count: Any, scene: Any, lights: Any, shading_model: Any, table: Any, bounces: Any, shift: Any,
+    s: Any, ints: Any, count: Any, scene: Any, illumination: Any, shading_model: Any, table: Any, bounces: Any,
+    shift: Any,
     found: Any
 ) -> None:  # fmt: skip
     """Follow `count` paths that `put_hit` began in slots 0, 1, ...; their light goes to rows OWNER of `found`.
@@ -162,13 +163,14 @@ def trace_paths(
     Parameters
     ----------
     scene : (Tracer or MixedTracer, Geometry, extent)
-    lights : (Sky, whether it shines, tables of lamps, whether there are any: one of them is sampled at every vertex)
+    illumination : (EnvMap, whether it shines, tables of lights, whether there are any: one of them is sampled at every
+        vertex)
     bounces : vertices of a path, and whether there are surfaces that emit, which are looked for beyond the last too
     shift : 0, or ``ray_masks.WITHOUT``
     found : (capacity, FOUND) float32; INDIRECT is written
     """
     tracer, _, _ = scene
-    sky, sky_shines, lamps, any_lamps = lights
+    envmap, envmap_shines, lights, any_lights = illumination
     vertices, glows = bounces
     for slot in range(count):
         i, c = w.at(slot)
@@ -177,22 +179,22 @@ def trace_paths(
         for k in range(CARRIED):
             found[owner, k] = ZERO
     for bounce in range(vertices):
-        _surfaces(s, ints, count, scene, shading_model, table, sky)
+        _surfaces(s, ints, count, scene, shading_model, table, envmap)
         w.lobe_shares(s, count, shading_model)
-        if sky_shines:
+        if envmap_shines:
             w.fresh_numbers(ints, count, GOLDEN)
-            w.light_directions(s, ints, count, sky)
+            w.environment_directions(s, ints, count, envmap)
             w.evaluate(s, count, shading_model)
             w.carry(s, count, ONE)
-            _towards_sky(s, ints, count, sky, tracer, shift, found)
-        if any_lamps:
+            _towards_envmap(s, ints, count, envmap, tracer, shift, found)
+        if any_lights:
             w.fresh_numbers(ints, count, U(0x2C1B3C6D))
-            w.lamp_directions(s, ints, count, lamps)
+            w.light_directions(s, ints, count, lights)
             w.evaluate(s, count, shading_model)
-            _towards_lamps(s, ints, count, lamps, tracer, shift, found)
+            _towards_lights(s, ints, count, lights, tracer, shift, found)
         w.fresh_numbers(ints, count, U(0x7FEB352D))
         w.brdf_directions(s, ints, count)
         w.evaluate(s, count, shading_model)
         w.carry(s, count, ZERO)
         last = bounce + 1 == vertices
-        count = _onwards(s, ints, count, bounce, last, sky, lamps, any_lamps, glows, scene, shift, found)
+        count = _onwards(s, ints, count, bounce, last, envmap, lights, any_lights, glows, scene, shift, found)

@@ -17,7 +17,7 @@ from ...core.errors import UsageError
 from ...core.frame import RenderSettings
 from .. import sampling
 from ..lights.environment import EnvironmentLight
-from ..lights.lights import Lamps
+from ..lights.lights import Lights
 from ..points import CATCHER, SECOND, Radiance, ShadingPoints
 from ..sampling import GOLDEN, ONE, ZERO, F, U, mix, unit
 from ..scene import ray_masks
@@ -39,16 +39,16 @@ Array = np.ndarray
 _APART = F(0.25)
 #: Points of a block.
 _BLOCK = 64
-#: Least share of the light samples that go to sky or lamps when both shine.
+#: Least share of the light samples that go to environment or lights when both shine.
 _LEAST_SHARE = 0.1
 
 
 class Kernel:
     """What shades points, and where it finds the scene: all threads here; `render.gpu` has the same for a card."""
 
-    def tables(self, scene: TraceScene, light: EnvironmentLight, lamps: Lamps) -> tuple[Any, Any, Any, Any]:
-        """(tracer, geometry, sky, lamps) as `shade` takes them; until the scene's next update."""
-        return meshes_alone(scene.tracer), scene.geometry, light.sky, lamps.tables
+    def tables(self, scene: TraceScene, environment: EnvironmentLight, lights: Lights) -> tuple[Any, Any, Any, Any]:
+        """(tracer, geometry, environment, lights) as `shade` takes them; until the scene's next update."""
+        return meshes_alone(scene.tracer), scene.geometry, environment.envmap, lights.tables
 
     def shade(self, *arguments: Any) -> None:
         """Shade all points; see `shade_points`."""
@@ -57,11 +57,11 @@ class Kernel:
 
 def integrate(
     scene: TraceScene,
-    light: EnvironmentLight,
+    environment: EnvironmentLight,
     points: ShadingPoints,
     settings: RenderSettings,
     noise_index: int,
-    lamps: Lamps | None = None,
+    lights: Lights | None = None,
     part: tuple[int, int] = (0, 1),
     *,
     surfels: SurfelBVH | None = None,
@@ -71,7 +71,7 @@ def integrate(
 
     Parameters
     ----------
-    scene, light, lamps : what rays meet, what they see when they meet nothing, and what shines in between
+    scene, light, lights : what rays meet, what they see when they meet nothing, and what shines in between
     points : visible points, world space
     settings : RenderSettings
         Samples per pixel, divided among its ``subpixel_count`` places; bounces, shading model, seed, clamp.
@@ -101,36 +101,36 @@ def integrate(
         raise UsageError("render settings", f"look {settings.shading_model!r} is unknown", "Use principled or paper")
     n = len(points)
     out = Radiance.dark(n)
-    lamps = lamps or _NO_LAMPS
+    lights = lights or _NO_LIGHTS
     glows = scene.materials.glows
-    if n == 0 or sum(counts) == 0 or (light.black and not lamps.count and not glows):
+    if n == 0 or sum(counts) == 0 or (environment.black and not lights.count and not glows):
         return out
-    share = sky_share(light, lamps)
+    share = environment_share(environment, lights)
     # Where neither shines, nothing is drawn by its light, though surfaces may emit some.
-    sky_part, lamp_part = share * (not light.black), (1.0 - share) * (lamps.count > 0)
+    environment_part, lights_part = share * (not environment.black), (1.0 - share) * (lights.count > 0)
     kernel = kernel or Kernel()
-    tracer, geometry, sky, lamp_tables = kernel.tables(scene, light, lamps)
+    tracer, geometry, envmap, light_tables = kernel.tables(scene, environment, lights)
     if surfels is not None:
         tracer = tracer._replace(**tracer_of(surfels)._asdict())
     tables = (
         tracer,
         geometry,
         F(scene.extent if surfels is None else max(scene.extent, surfels.extent)),
-        sky,
-        (not light.black, lamps.count > 0),
-        lamp_tables,
+        envmap,
+        (not environment.black, lights.count > 0),
+        light_tables,
         brdf.layer_table(),
         sampling.point_set(sum(counts) + 1),
     )
     rules = (
-        (auto, *map(F, counts), F(sky_part), F(lamp_part), _APART if scene.rays_differ else ONE),
+        (auto, *map(F, counts), F(environment_part), F(lights_part), _APART if scene.rays_differ else ONE),
         settings.subpixel_count,
         part,
         (settings.bounces, glows),
         brdf.SHADING_MODELS[settings.shading_model],
         U(mixed(settings.seed, noise_index)),
         F(settings.clamp_indirect * settings.subpixel_count * part[1] / sum(counts)),
-        (lamps.rays_differ, scene.rays_differ and (auto or min(counts[:2]) > 0)),
+        (lights.rays_differ, scene.rays_differ and (auto or min(counts[:2]) > 0)),
     )
 
     def run(some: ShadingPoints, shift: int, found: Radiance) -> None:
@@ -156,17 +156,17 @@ def integrate(
     return out
 
 
-def sky_share(light: EnvironmentLight, lamps: Lamps) -> float:
-    """Part of the light samples that go to the environment; the others go to lamps."""
-    if not lamps.count:
+def environment_share(environment: EnvironmentLight, lights: Lights) -> float:
+    """Part of the light samples that go to the environment; the others go to lights."""
+    if not lights.count:
         return 1.0
-    if light.black:
+    if environment.black:
         return 0.0
-    share = light.power / (light.power + lamps.power) if lamps.power > 0.0 else 1.0
+    share = environment.power / (environment.power + lights.power) if lights.power > 0.0 else 1.0
     return float(min(max(share, _LEAST_SHARE), 1.0 - _LEAST_SHARE))
 
 
-_NO_LAMPS = Lamps([])
+_NO_LIGHTS = Lights([])
 
 
 def mixed(seed: int, noise_index: int) -> int:
@@ -180,7 +180,7 @@ def mixed(seed: int, noise_index: int) -> int:
 @njit
 def shade_points(
     lane: Any, lanes: Any, room: Any, keys: Any, frames: Any, surfaces: Any, tracer: Any, geometry: Any, extent: Any,
-    sky: Any, sky_rules: Any, lamps: Any, table: Any, sequence: Any, split: Any, subpixels: Any, part: Any,
+    envmap: Any, lit_by: Any, lights: Any, table: Any, sequence: Any, split: Any, subpixels: Any, part: Any,
     bounces: Any,
     shading_model: Any, seed: Any, limit: Any, differ: Any, shift: Any, out: Any,
 ) -> None:  # fmt: skip
@@ -196,7 +196,7 @@ def shade_points(
     components, moments = out
     n = len(pixel)
     blocks = (n + _BLOCK - 1) // _BLOCK
-    scene, lights = (tracer, geometry, extent), (sky, sky_rules[0], lamps, sky_rules[1])
+    scene, illumination = (tracer, geometry, extent), (envmap, lit_by[0], lights, lit_by[1])
     rays, paths, found, sums, head, row, total = room
     s, ints = rays
     # Samples of a sub-sample's part lie next to each other among those of the pixel.
@@ -206,7 +206,7 @@ def shade_points(
         end = min(n, start + _BLOCK)
         sums[:] = ZERO
         total[:] = 0
-        write_heads(start, end, frames, surfaces, extent, sky, shading_model, table, split, head, row)
+        write_heads(start, end, frames, surfaces, extent, envmap, shading_model, table, split, head, row)
         begun = np.int64(0)
         for strategy in range(4):
             count = np.int64(0)
@@ -227,7 +227,8 @@ def shade_points(
                 for j in range(first, past):
                     if count == BATCH:
                         begun = trace_batch(
-                            strategy, count, rays, paths, begun, found, scene, lights, table, bounces, shading_model,
+                            strategy, count, rays, paths, begun, found, scene, illumination, table, bounces,
+                            shading_model,
                             limit,
                             differ, shift, sums,
                         )  # fmt: skip
@@ -241,11 +242,12 @@ def shade_points(
                     count += 1
             if count > 0:
                 begun = trace_batch(
-                    strategy, count, rays, paths, begun, found, scene, lights, table, bounces, shading_model, limit,
+                    strategy, count, rays, paths, begun, found, scene, illumination, table, bounces, shading_model,
+                    limit,
                     differ,
                     shift, sums,
                 )  # fmt: skip
-        trace_paths(paths[0], paths[1], begun, scene, lights, shading_model, table, bounces, shift, found)
+        trace_paths(paths[0], paths[1], begun, scene, illumination, shading_model, table, bounces, shift, found)
         deliver(begun, found, limit, sums)
         for i in range(start, end):
             finish(sums, i - start, total[i - start], components, moments, i)
@@ -267,14 +269,14 @@ def _room() -> Any:
 
 @njit(parallel=True)
 def _kernel(
-    keys: Any, frames: Any, surfaces: Any, tracer: Any, geometry: Any, extent: Any, sky: Any, sky_rules: Any,
-    lamps: Any, table: Any, sequence: Any, split: Any, subpixels: Any, part: Any, bounces: Any, shading_model: Any,
+    keys: Any, frames: Any, surfaces: Any, tracer: Any, geometry: Any, extent: Any, envmap: Any, lit_by: Any,
+    lights: Any, table: Any, sequence: Any, split: Any, subpixels: Any, part: Any, bounces: Any, shading_model: Any,
     seed: Any,
     limit: Any, differ: Any, shift: Any, out: Any, lanes: Any,
 ) -> None:  # fmt: skip
     # Threads get neighbouring lanes, lanes get every so-manyth block: no thread is left with all the costly ones.
     for lane in prange(lanes):
         shade_points(
-            np.int64(lane), lanes, _room(), keys, frames, surfaces, tracer, geometry, extent, sky, sky_rules, lamps,
+            np.int64(lane), lanes, _room(), keys, frames, surfaces, tracer, geometry, extent, envmap, lit_by, lights,
             table, sequence, split, subpixels, part, bounces, shading_model, seed, limit, differ, shift, out,
         )  # fmt: skip

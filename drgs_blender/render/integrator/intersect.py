@@ -1,7 +1,8 @@
 """Rays of the integrator: what they meet of meshes and, where there are any to meet, of the surfels of DR-GS objects.
 
 With surfels a shadow ray brings what these let through, and a ray that looks for a surface meets the surfels in front
-of the nearest mesh as one blended surface, see `surfels.surfel_tracer`. What they let through reaches the sky; where a
+of the nearest mesh as one blended surface, see `surfels.surfel_tracer`. What they let through reaches the
+environment; where a
 mesh lies behind them, chance decides which of the two the ray meets. Functions that end in ``_meshes`` are for meshes
 alone; a device has no others.
 """
@@ -15,7 +16,7 @@ import numpy as np
 from ...compute.jit import njit
 from ..lights.light_shapes import DIFFUSE, GLOSSY
 from ..lights.light_shapes import SHADOW as SHADOWED
-from ..lights.lights import lamp_flags
+from ..lights.lights import light_flags
 from ..lights.triangle_light import ABSENT
 from ..sampling import ONE, ZERO, F, U, mix, unit
 from ..scene import ray_masks
@@ -83,7 +84,7 @@ def meet_meshes(tracer, s, ints, slot, mask):  # type: ignore[no-untyped-def]
 def meet(tracer, s, ints, slot, mask):  # type: ignore[no-untyped-def]
     """Follow a slot's ray: ``(through, reach, hit)``.
 
-    ``through`` is the share of light that comes from beyond everything: 1 where nothing is met, 0 behind a mesh. Lamps
+    ``through`` is the share of light that comes from beyond everything: 1 where nothing is met, 0 behind a mesh. Lights
     nearer than ``reach`` are seen. ``hit`` is for `put_hit`, and not to be used where ``through`` is 1.
     """
     i, c = w.at(slot)
@@ -178,20 +179,20 @@ def put_start(tracer, s, ints, slot, own, size, point):  # type: ignore[no-untyp
 
 
 @njit
-def lamp_light(
-    s: Any, ints: Any, slot: Any, others: Any, glossy_others: Any, share: Any, lamps: Any, tracer: Any, mask: Any
+def light_radiance(
+    s: Any, ints: Any, slot: Any, others: Any, glossy_others: Any, share: Any, lights: Any, tracer: Any, mask: Any
 ) -> Any:  # fmt: skip
-    """What a lamp sample brings: radiance over density for the diffuse and for the glossy lobe, 0 when in shadow.
+    """What a light sample brings: radiance over density for the diffuse and for the glossy lobe, 0 when in shadow.
 
     `others` and `share` are the balance heuristic's densities of other strategies, for the diffuse and for the glossy
-    lobe, and number of lamp samples.
+    lobe, and number of light samples.
     """
     i, c = w.at(slot)
     density = s[i + w.MV]
     r, g, b = s[i + w.ER], s[i + w.EG], s[i + w.EB]
     if not (s[i + w.LIVE] > ZERO and r + g + b > ZERO and density != ZERO):
         return ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
-    flags = lamp_flags(np.int64(ints[c + w.CELL]), lamps[0], lamps[2])
+    flags = light_flags(np.int64(ints[c + w.CELL]), lights[0], lights[2])
     if flags & ABSENT and mask >> ray_masks.WITHOUT:
         return ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
     bright = ONE

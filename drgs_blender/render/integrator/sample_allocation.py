@@ -15,8 +15,9 @@ from . import wavefront as w
 from .indirect import lifted
 from .intersect import put_start
 
-#: Strategies in the order of ``RenderSettings``' counts; the samples of the last are divided between sky and lamps.
-COSINE, GGX, SKY, LAMPS = range(4)
+#: Strategies in the order of ``RenderSettings``' counts; the samples of the last are divided between environment and
+# lights.
+COSINE, GGX, ENVIRONMENT, LIGHTS = range(4)
 #: Columns of a head: start of the rays, alpha squared, diffuse weight, normal m, samples of each strategy.
 ALPHA, WEIGHT, NORMAL, COUNTS = 3, 4, 5, 8
 HEAD = 12
@@ -36,36 +37,36 @@ def _allot(head: Any, h: Any, share: Any, split: Any) -> None:
 
     Whole numbers in coarse steps: points of one pixel mostly agree, and then their samples add up to these numbers.
     """
-    auto, cosine, ggx, light, sky, lamps, most = split
+    auto, cosine, ggx, light, envmap, lights, most = split
     if auto:
         total = cosine + ggx + light
         alpha = F(math.sqrt(head[h, ALPHA]))
         glossy = _LIGHT_GLOSSY * min(ONE, max(F(0.05), alpha / _WIDE))
-        light = total * min(most, share * _LIGHT_DIFFUSE + (ONE - share) * glossy) if sky + lamps > ZERO else ZERO
+        light = total * min(most, share * _LIGHT_DIFFUSE + (ONE - share) * glossy) if envmap + lights > ZERO else ZERO
         ggx = (total - light) * (ONE - share)
         if total >= F(3.0):
             # Each lobe keeps a ray: what its own rays alone find (`apart`) must not be lost.
             step = max(ONE, F(np.int32(total / F(8.0))))
             light = step * _rounded(light / step)
-            if lamps > ZERO:
-                # Lamps without size, or that nothing shadows, are found by their own samples alone.
-                light = max(light, TWO if sky > ZERO else ONE)
+            if lights > ZERO:
+                # Lights without size, or that nothing shadows, are found by their own samples alone.
+                light = max(light, TWO if envmap > ZERO else ONE)
             light = min(light, total - TWO)
             half = max(ONE, F(np.int32(step / TWO)))
             ggx = half * _rounded((total - light) * (ONE - share) / half)
             ggx = min(max(ggx, ONE), total - light - ONE) if share < ONE else ZERO
             ggx = ggx if share > ZERO else total - light
         cosine = total - light - ggx
-    if sky > ZERO and lamps > ZERO and light >= TWO:
-        sky = min(max(_rounded(light * sky), ONE), light - ONE) / light
-        lamps = ONE - sky
+    if envmap > ZERO and lights > ZERO and light >= TWO:
+        envmap = min(max(_rounded(light * envmap), ONE), light - ONE) / light
+        lights = ONE - envmap
     head[h, COUNTS + COSINE], head[h, COUNTS + GGX] = cosine, ggx
-    head[h, COUNTS + SKY], head[h, COUNTS + LAMPS] = light * sky, light * lamps
+    head[h, COUNTS + ENVIRONMENT], head[h, COUNTS + LIGHTS] = light * envmap, light * lights
 
 
 @njit
 def write_heads(
-    first: Any, last: Any, frames: Any, surfaces: Any, extent: Any, sky: Any, shading_model: Any, table: Any,
+    first: Any, last: Any, frames: Any, surfaces: Any, extent: Any, envmap: Any, shading_model: Any, table: Any,
     split: Any,
     head: Any, row: Any,
 ) -> None:  # fmt: skip
@@ -91,7 +92,7 @@ def write_heads(
         head[h, ALPHA], head[h, WEIGHT] = brdf.alpha_squared(roughness[i]), weight
         head[h, NORMAL], head[h, NORMAL + 1], head[h, NORMAL + 2] = mx, my, mz
         r, g, b = albedo[i, 0], albedo[i, 1], albedo[i, 2]
-        row[h] = U(facing_row(normal[i, 0], normal[i, 1], normal[i, 2], sky))
+        row[h] = U(facing_row(normal[i, 0], normal[i, 1], normal[i, 2], envmap))
         _allot(head, h, w.diffuse_share(mv, r, g, b, weight, metallic[i], shading_model), split)
 
 
@@ -111,6 +112,6 @@ def put_sample(
     s[a + w.AR], s[a + w.AG], s[a + w.AB] = albedo[i, 0], albedo[i, 1], albedo[i, 2]
     s[a + w.METALLIC], s[a + w.A2], s[a + w.KD] = metallic[i], head[h, ALPHA], head[h, WEIGHT]
     s[a + w.WC], s[a + w.WG] = head[h, COUNTS + COSINE] * rate, head[h, COUNTS + GGX] * rate
-    s[a + w.WE], s[a + w.WL] = head[h, COUNTS + SKY] * rate, head[h, COUNTS + LAMPS] * rate
+    s[a + w.WE], s[a + w.WL] = head[h, COUNTS + ENVIRONMENT] * rate, head[h, COUNTS + LIGHTS] * rate
     ints[c + w.OWNER] = U(h)
     put_start(tracer, s, ints, slot, own, size, i)

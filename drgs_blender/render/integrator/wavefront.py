@@ -15,8 +15,8 @@ import numpy as np
 
 from ...compute.jit import inlined, njit
 from .. import sampling
-from ..lights.environment import cell_at, cell_end, direction_in_cell, first_cell, map_at, sky_density, sky_touch
-from ..lights.lights import sample_lamp
+from ..lights.environment import cell_at, cell_end, direction_in_cell, envmap_pdf, envmap_touch, first_cell, map_at
+from ..lights.lights import sample_light
 from ..lights.product_sampling import block_of, in_cells_order
 from ..sampling import INVERSE_PI, ONE, TWO, ZERO, F, U, luminance, mix, scrambled, unit
 from . import brdf
@@ -34,7 +34,7 @@ AR, AG, AB, METALLIC, A2, KD = (LANES * i for i in range(15, 21))
 LX, LY, LZ, LIVE, QR, QG, QB, SR, SG, SB, PC, PG = (LANES * i for i in range(21, 33))
 # where the direction meets the map of the environment, and the density of light sampling
 MU, MV, PE = (LANES * i for i in range(33, 36))
-# of paths: throughput, part of the diffuse lobe in sampling; of lamp samples: radiance (distance in MU, density in MV)
+# of paths: throughput, part of the diffuse lobe in sampling; of light samples: radiance (distance in MU, density in MV)
 TR, TG, TB, SHARE, ER, EG, EB = (LANES * i for i in range(36, 43))
 # of a point's samples: how many each strategy draws there; where rays meet surfels: size of those that they start on
 WC, WG, WE, WL, SIZE = (LANES * i for i in range(43, 48))
@@ -141,73 +141,73 @@ def brdf_directions(s: Any, ints: Any, count: Any) -> None:
 
 
 @njit
-def light_directions(s: Any, ints: Any, count: Any, sky: Any) -> None:
+def environment_directions(s: Any, ints: Any, count: Any, envmap: Any) -> None:
     """Directions towards the environment in proportion to its light on the surface, with MU, MV and PE."""
     for slot in range(count):
         _, c = at(slot)
-        ints[c + CELL] = U(block_of(ints[c + ROW], ints[c + N2], sky))
+        ints[c + CELL] = U(block_of(ints[c + ROW], ints[c + N2], envmap))
     for slot in range(count):
         i, c = at(slot)
         block = np.int64(ints[c + CELL])
-        ints[c + N2], s[i + ER] = in_cells_order(ints[c + ROW], block, ints[c + N2], mix(ints[c + N2]), sky)
+        ints[c + N2], s[i + ER] = in_cells_order(ints[c + ROW], block, ints[c + N2], mix(ints[c + N2]), envmap)
     # One loop a table, without a branch that waits for the table: the cache misses of many slots overlap.
     for slot in range(count):
         _, c = at(slot)
-        ints[c + CELL] = U(first_cell(ints[c + N2], sky))
+        ints[c + CELL] = U(first_cell(ints[c + N2], envmap))
     for slot in range(count):
         i, c = at(slot)
-        s[i + PE] = F(cell_end(ints[c + CELL], sky))
+        s[i + PE] = F(cell_end(ints[c + CELL], envmap))
     for slot in range(count):
         _, c = at(slot)
         place = ints[c + CELL]
-        while ints[c + N2] > cell_end(place, sky):
+        while ints[c + N2] > cell_end(place, envmap):
             place = U(place + U(1))
         ints[c + CELL] = place
     for slot in range(count):
         i, c = at(slot)
-        _, column, s[i + MV], s[i + LZ], density = cell_at(ints[c + CELL], sky)
+        _, column, s[i + MV], s[i + LZ], density = cell_at(ints[c + CELL], envmap)
         s[i + MU], s[i + PE] = F(column), density * s[i + ER]
     for p in range(packets(count)):
         b, c = p * _FLOATS, p * _INTS
         for k in range(LANES):
             i = b + k
             s[i + LX], s[i + LY], s[i + LZ], s[i + MU], s[i + MV] = direction_in_cell(
-                s[i + MU], s[i + MV], s[i + LZ], ints[c + k + N0], ints[c + k + N1], sky
+                s[i + MU], s[i + MV], s[i + LZ], ints[c + k + N0], ints[c + k + N1], envmap
             )
 
 
 @njit
-def lamp_directions(s: Any, ints: Any, count: Any, lamps: Any) -> None:
-    """Directions towards lamps, with ER, EG, EB, distance, density (see ``sample_lamp``) and the lamp in CELL."""
+def light_directions(s: Any, ints: Any, count: Any, lights: Any) -> None:
+    """Directions towards lights, with ER, EG, EB, distance, density (see ``sample_light``) and the light in CELL."""
     for slot in range(count):
         i, c = at(slot)
-        lx, ly, lz, distance, r, g, b, density, lamp = sample_lamp(
-            ints[c + N2], ints[c + N0], ints[c + N1], s[i + OX], s[i + OY], s[i + OZ], *lamps
+        lx, ly, lz, distance, r, g, b, density, light = sample_light(
+            ints[c + N2], ints[c + N0], ints[c + N1], s[i + OX], s[i + OY], s[i + OZ], *lights
         )
         s[i + LX], s[i + LY], s[i + LZ], s[i + MU], s[i + MV] = lx, ly, lz, distance, density
         s[i + ER], s[i + EG], s[i + EB] = r, g, b
-        ints[c + CELL] = U(max(lamp, 0))
+        ints[c + CELL] = U(max(light, 0))
 
 
 @njit
-def look_up(s: Any, ints: Any, count: Any, sky: Any) -> None:
+def look_up(s: Any, ints: Any, count: Any, envmap: Any) -> None:
     """MU, MV and PE of directions that were not drawn from the environment."""
     for p in range(packets(count)):
         for i in range(p * _FLOATS, p * _FLOATS + LANES):
-            s[i + MU], s[i + MV] = map_at(s[i + LX], s[i + LY], s[i + LZ], sky)
+            s[i + MU], s[i + MV] = map_at(s[i + LX], s[i + LY], s[i + LZ], envmap)
     for slot in range(count):
         i, c = at(slot)
         if s[i + LIVE] > ZERO:
-            s[i + PE] = sky_density(s[i + MU], s[i + MV], ints[c + ROW], sky)
+            s[i + PE] = envmap_pdf(s[i + MU], s[i + MV], ints[c + ROW], envmap)
 
 
 @njit
-def warm(s: Any, count: Any, sky: Any) -> None:
-    """Fetch what `sky_radiance` will read, all at once, long before it waits for it."""
+def warm(s: Any, count: Any, envmap: Any) -> None:
+    """Fetch what `envmap_radiance` will read, all at once, long before it waits for it."""
     for slot in range(count):
         i, _ = at(slot)
         if s[i + LIVE] > ZERO:
-            s[i + ER] = sky_touch(s[i + MU], s[i + MV], sky)
+            s[i + ER] = envmap_touch(s[i + MU], s[i + MV], envmap)
 
 
 @njit

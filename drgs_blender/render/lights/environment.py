@@ -58,7 +58,7 @@ def _clean(image, tint, rings, texels, found):  # type: ignore[no-untyped-def]
         found[row, 0], found[row, 1], found[row, 2] = bad, dark, bright
 
 
-class Sky(NamedTuple):
+class EnvMap(NamedTuple):
     """An `EnvironmentLight` for compiled code: addresses of its arrays, their sizes, and its rotation row by row."""
 
     texels: int
@@ -87,6 +87,10 @@ class Sky(NamedTuple):
     zx: np.float32
     zy: np.float32
     zz: np.float32
+
+
+#: The fields of an `EnvMap` that are its rotation: they may change while its arrays stay where they are.
+ROTATION = ("xx", "xy", "xz", "yx", "yy", "yz", "zx", "zy", "zz")
 
 
 class EnvironmentLight:
@@ -136,15 +140,15 @@ class EnvironmentLight:
         return not self.cells.power > 0.0
 
     @property
-    def sky(self) -> Sky:
+    def envmap(self) -> EnvMap:
         """What compiled code reads; valid while this light lives and its rotation is not replaced."""
-        return self.sky_at(address)
+        return self.envmap_at(address)
 
-    def sky_at(self, place: Place) -> Sky:
-        """`sky` of arrays that lie elsewhere."""
+    def envmap_at(self, place: Place) -> EnvMap:
+        """`environment` of arrays that lie elsewhere."""
         height, width = self.texels.shape[:2]
         cells, facing = self.cells, self.facing
-        return Sky(
+        return EnvMap(
             place(self.texels),
             height,
             width,
@@ -172,50 +176,50 @@ class EnvironmentLight:
 
     def lookup(self, directions: Array) -> Array:
         """(n, 3) radiance from (n, 3) unit world directions."""
-        return _lookup_many(np.ascontiguousarray(directions, np.float32), self.sky)
+        return _lookup_many(np.ascontiguousarray(directions, np.float32), self.envmap)
 
     def pdf(self, directions: Array, normal: Array | None = None) -> Array:
         """(n,) density per solid angle with which ``sample`` draws (n, 3) unit world directions."""
         directions = np.ascontiguousarray(directions, np.float32)
-        return _pdf_many(directions, self._rows(normal, len(directions)), self.sky)
+        return _pdf_many(directions, self._rows(normal, len(directions)), self.envmap)
 
     def sample(self, numbers: Array, normal: Array | None = None) -> tuple[Array, Array]:
         """World directions (n, 3) and densities (n,) from (n, 3) uint32 random numbers.
 
         `normal`, unit world vectors (3,) or (n, 3), is that of the surface which is to be lit; None is of no surface.
         """
-        return _sample_many(np.ascontiguousarray(numbers, np.uint32), self._rows(normal, len(numbers)), self.sky)
+        return _sample_many(np.ascontiguousarray(numbers, np.uint32), self._rows(normal, len(numbers)), self.envmap)
 
     def _rows(self, normal: Array | None, count: int) -> Array:
         if normal is None:
             return np.full(count, len(self.facing.ratio) - 1, np.int32)
-        return _rows_many(np.broadcast_to(np.asarray(normal, np.float32), (count, 3)), self.sky)
+        return _rows_many(np.broadcast_to(np.asarray(normal, np.float32), (count, 3)), self.envmap)
 
 
 @njit
-def map_at(dx, dy, dz, sky):  # type: ignore[no-untyped-def]
+def map_at(dx, dy, dz, envmap):  # type: ignore[no-untyped-def]
     """Lat-long coordinates (u, v) in [0, 1] of a world direction; row 0 at +Z, +X at u = 1/2."""
-    x = sky.xx * dx + sky.xy * dy + sky.xz * dz
-    y = sky.yx * dx + sky.yy * dy + sky.yz * dz
-    z = sky.zx * dx + sky.zy * dy + sky.zz * dz
+    x = envmap.xx * dx + envmap.xy * dy + envmap.xz * dz
+    y = envmap.yx * dx + envmap.yy * dy + envmap.yz * dz
+    z = envmap.zx * dx + envmap.zy * dy + envmap.zz * dz
     return np.float32(0.5) - fast_atan2_turns(y, x), fast_acos(z) * np.float32(1.0 / math.pi)
 
 
 @njit
-def sky_density(u, v, facing, sky):  # type: ignore[no-untyped-def]
+def envmap_pdf(u, v, facing, envmap):  # type: ignore[no-untyped-def]
     """Density per solid angle at (u, v) of light sampling at a surface whose `facing_row` is `facing`."""
-    row = min(np.int64(sky.height - 1), np.int64(v * np.float32(sky.height)))
-    column = min(np.int64(sky.width - 1), np.int64(u * np.float32(sky.width)))
-    density = load_float(sky.texels, 4 * (row * sky.width + column) + 3)
-    if sky.step > 1:
-        row, column = row // sky.step, column // sky.step
-    return density * facing_ratio(facing, row, column, sky)
+    row = min(np.int64(envmap.height - 1), np.int64(v * np.float32(envmap.height)))
+    column = min(np.int64(envmap.width - 1), np.int64(u * np.float32(envmap.width)))
+    density = load_float(envmap.texels, 4 * (row * envmap.width + column) + 3)
+    if envmap.step > 1:
+        row, column = row // envmap.step, column // envmap.step
+    return density * facing_ratio(facing, row, column, envmap)
 
 
 @njit
-def sky_radiance(u, v, sky):  # type: ignore[no-untyped-def]
+def envmap_radiance(u, v, envmap):  # type: ignore[no-untyped-def]
     """Bilinear lookup, wrapped in u and clamped in v."""
-    h, w = sky.height, sky.width
+    h, w = envmap.height, envmap.width
     x, y = u * np.float32(w) - np.float32(0.5), v * np.float32(h) - np.float32(0.5)
     y = min(max(y, np.float32(0.0)), np.float32(h - 1))
     c0, r0 = np.int64(x + np.float32(1.0)) - 1, np.int64(y)
@@ -226,7 +230,7 @@ def sky_radiance(u, v, sky):  # type: ignore[no-untyped-def]
     one = np.float32(1.0)
     p00, p01, p10, p11 = (one - a) * (one - b), a * (one - b), (one - a) * b, a * b
     i00, i01, i10, i11 = 4 * (r0 * w + c0), 4 * (r0 * w + c1), 4 * (r1 * w + c0), 4 * (r1 * w + c1)
-    t = sky.texels
+    t = envmap.texels
     red = p00 * load_float(t, i00) + p01 * load_float(t, i01) + p10 * load_float(t, i10) + p11 * load_float(t, i11)
     i00, i01, i10, i11 = i00 + 1, i01 + 1, i10 + 1, i11 + 1
     green = p00 * load_float(t, i00) + p01 * load_float(t, i01) + p10 * load_float(t, i10) + p11 * load_float(t, i11)
@@ -236,90 +240,90 @@ def sky_radiance(u, v, sky):  # type: ignore[no-untyped-def]
 
 
 @njit
-def sky_touch(u, v, sky):  # type: ignore[no-untyped-def]
-    """Some value from both rows of texels that `sky_radiance` will read there: brings them into the cache."""
-    h, w = sky.height, sky.width
+def envmap_touch(u, v, envmap):  # type: ignore[no-untyped-def]
+    """Some value from both rows of texels that `envmap_radiance` will read there: brings them into the cache."""
+    h, w = envmap.height, envmap.width
     y = min(max(v * np.float32(h) - np.float32(0.5), np.float32(0.0)), np.float32(h - 1))
     column, row = min(np.int64(u * np.float32(w)), w - 1), np.int64(y)
     upper, lower = 4 * (row * w + column), 4 * (min(row + 1, h - 1) * w + column)
-    return load_float(sky.texels, upper) + load_float(sky.texels, lower)
+    return load_float(envmap.texels, upper) + load_float(envmap.texels, lower)
 
 
 @njit
-def first_cell(n, sky):  # type: ignore[no-untyped-def]
+def first_cell(n, envmap):  # type: ignore[no-untyped-def]
     """Place in the sampling cells where the search for the random number n (uint32) starts."""
-    return load_int32(sky.guide, np.int64((np.uint64(n) * np.uint64(sky.guide_size)) >> np.uint64(32)))
+    return load_int32(envmap.guide, np.int64((np.uint64(n) * np.uint64(envmap.guide_size)) >> np.uint64(32)))
 
 
 @njit
-def cell_end(place, sky):  # type: ignore[no-untyped-def]
+def cell_end(place, envmap):  # type: ignore[no-untyped-def]
     """Last random number (uint32) that falls on the cell at a place."""
-    return load_uint32(sky.cells, 2 * np.int64(place))
+    return load_uint32(envmap.cells, 2 * np.int64(place))
 
 
 @njit
-def cell_at(place, sky):  # type: ignore[no-untyped-def]
+def cell_at(place, envmap):  # type: ignore[no-untyped-def]
     """(row, column) of the cell at a place, upper and lower z of its row, density per solid angle."""
-    cell = np.int64(load_uint32(sky.cells, 2 * np.int64(place) + 1))
-    row, column = cell // sky.columns, cell % sky.columns
-    density = load_float(sky.texels, 4 * (row * sky.step * sky.width + column * sky.step) + 3)
-    return row, column, load_float(sky.row_z, row), load_float(sky.row_z, row + 1), density
+    cell = np.int64(load_uint32(envmap.cells, 2 * np.int64(place) + 1))
+    row, column = cell // envmap.columns, cell % envmap.columns
+    density = load_float(envmap.texels, 4 * (row * envmap.step * envmap.width + column * envmap.step) + 3)
+    return row, column, load_float(envmap.row_z, row), load_float(envmap.row_z, row + 1), density
 
 
 @njit
-def direction_in_cell(column, upper, lower, n0, n1, sky):  # type: ignore[no-untyped-def]
+def direction_in_cell(column, upper, lower, n0, n1, envmap):  # type: ignore[no-untyped-def]
     """World direction within a cell, from two uint32, and its lat-long coordinates (u, v)."""
-    u = (np.float32(column) + unit(n0)) / np.float32(sky.columns)
+    u = (np.float32(column) + unit(n0)) / np.float32(envmap.columns)
     z = upper + unit(n1) * (lower - upper)
     s, c = sincos_turns(np.float32(0.5) - u)
     ring = math.sqrt(max(np.float32(0.0), np.float32(1.0) - z * z))
     x, y = ring * c, ring * s
-    dx = sky.xx * x + sky.yx * y + sky.zx * z
-    dy = sky.xy * x + sky.yy * y + sky.zy * z
-    dz = sky.xz * x + sky.yz * y + sky.zz * z
+    dx = envmap.xx * x + envmap.yx * y + envmap.zx * z
+    dy = envmap.xy * x + envmap.yy * y + envmap.zy * z
+    dz = envmap.xz * x + envmap.yz * y + envmap.zz * z
     return dx, dy, dz, u, fast_acos(z) * np.float32(1.0 / math.pi)
 
 
 @njit
-def _lookup_many(directions, sky):  # type: ignore[no-untyped-def]
+def _lookup_many(directions, envmap):  # type: ignore[no-untyped-def]
     out = np.empty((len(directions), 3), np.float32)
     for i in range(len(directions)):
-        u, v = map_at(directions[i, 0], directions[i, 1], directions[i, 2], sky)
-        out[i, 0], out[i, 1], out[i, 2] = sky_radiance(u, v, sky)
+        u, v = map_at(directions[i, 0], directions[i, 1], directions[i, 2], envmap)
+        out[i, 0], out[i, 1], out[i, 2] = envmap_radiance(u, v, envmap)
     return out
 
 
 @njit
-def _rows_many(normals, sky):  # type: ignore[no-untyped-def]
+def _rows_many(normals, envmap):  # type: ignore[no-untyped-def]
     out = np.empty(len(normals), np.int32)
     for i in range(len(normals)):
-        out[i] = facing_row(normals[i, 0], normals[i, 1], normals[i, 2], sky)
+        out[i] = facing_row(normals[i, 0], normals[i, 1], normals[i, 2], envmap)
     return out
 
 
 @njit
-def _pdf_many(directions, facing, sky):  # type: ignore[no-untyped-def]
+def _pdf_many(directions, facing, envmap):  # type: ignore[no-untyped-def]
     out = np.empty(len(directions), np.float32)
     for i in range(len(directions)):
-        u, v = map_at(directions[i, 0], directions[i, 1], directions[i, 2], sky)
-        out[i] = sky_density(u, v, facing[i], sky)
+        u, v = map_at(directions[i, 0], directions[i, 1], directions[i, 2], envmap)
+        out[i] = envmap_pdf(u, v, facing[i], envmap)
     return out
 
 
 @njit
-def _sample_many(numbers, facing, sky):  # type: ignore[no-untyped-def]
+def _sample_many(numbers, facing, envmap):  # type: ignore[no-untyped-def]
     n = len(numbers)
     directions, pdf = np.empty((n, 3), np.float32), np.empty(n, np.float32)
     for i in range(n):
         number, ratio = in_cells_order(
-            facing[i], block_of(facing[i], numbers[i, 0], sky), numbers[i, 0], numbers[i, 1], sky
+            facing[i], block_of(facing[i], numbers[i, 0], envmap), numbers[i, 0], numbers[i, 1], envmap
         )
-        place = first_cell(number, sky)
-        while number > cell_end(place, sky):
+        place = first_cell(number, envmap)
+        while number > cell_end(place, envmap):
             place += 1
-        _, column, upper, lower, pdf[i] = cell_at(place, sky)
+        _, column, upper, lower, pdf[i] = cell_at(place, envmap)
         pdf[i] *= ratio
         directions[i, 0], directions[i, 1], directions[i, 2], _, _ = direction_in_cell(
-            column, upper, lower, numbers[i, 1], numbers[i, 2], sky
+            column, upper, lower, numbers[i, 1], numbers[i, 2], envmap
         )
     return directions, pdf

@@ -1,7 +1,7 @@
 """The shape of one of Blender's lights: from its panel to radiance as in Cycles, sampling, pdf and intersection.
 
 A light is a row of a float32 table. What it sends towards a point is written per solid angle at that point, so a light
-is a set of directions, a radiance for each, and a pdf with which `lamp_direction` draws them. The conversions were
+is a set of directions, a radiance for each, and a pdf with which `light_direction` draws them. The conversions were
 measured in Cycles of Blender 5.0.1 (see docs/rendering.md).
 """
 
@@ -20,7 +20,7 @@ from .environment import BRIGHTEST
 Array = np.ndarray
 
 #: Columns of the table. PLACE is the position, or of suns the direction towards them; AXIS is the direction in which
-#: the lamp shines; U and V are an area's unit axes, of spots axes scaled so that their cone is round.
+#: the light shines; U and V are an area's unit axes, of spots axes scaled so that their cone is round.
 KIND, PLACE, RADIUS, RADIANCE, AXIS, U_AXIS, V_AXIS, HALF_U, HALF_V = 0, 1, 4, 5, 8, 11, 14, 17, 18
 #: tan(spread / 2) and the factor that keeps the power, 0 without spread; cosine of a spot's cone and 1 / its soft part.
 SPREAD_TAN, SPREAD_SCALE, CONE_COS, CONE_SCALE = 19, 20, 21, 22
@@ -32,7 +32,7 @@ WIDTH = 28
 #: Kinds. A soft point is a disk that faces whoever looks; the two bare ones are met by no ray.
 BARE_POINT, BARE_SUN, SOFT_POINT, SPHERE, SUN, RECTANGLE, ELLIPSE = range(7)
 
-#: Bits of FLAGS: rays that see the lamp, and whether things block it.
+#: Bits of FLAGS: rays that see the light, and whether things block it.
 CAMERA, DIFFUSE, GLOSSY, SHADOW = 1, 2, 4, 8
 
 #: Smaller radii (metres, radians) are points; Cycles' parallel area light (spread 0) gets this spread, in radians.
@@ -43,7 +43,7 @@ _TINY = F(1e-30)
 _NEAR = F(100.0)
 
 
-def lamp_row(light: Light) -> Array | str:
+def light_row(light: Light) -> Array | str:
     """(WIDTH,) float32 row of a light, or in words why it gives no light."""
     matrix = np.asarray(light.matrix_world, np.float64).reshape(4, 4)
     colour = np.maximum(np.asarray(light.colour, np.float64), 0.0) * float(light.power)
@@ -151,8 +151,8 @@ def _area(row: Array, light: Light, columns: Array, lengths: Array) -> float | N
 
 
 @njit
-def lamp_emission(i, lx, ly, lz, table):  # type: ignore[no-untyped-def]
-    """Share of its radiance that lamp `i` sends against the unit direction (lx, ly, lz), which points at it."""
+def light_emission(i, lx, ly, lz, table):  # type: ignore[no-untyped-def]
+    """Share of its radiance that light `i` sends against the unit direction (lx, ly, lz), which points at it."""
     if table[i, CONE_COS] > -ONE:
         w = -(lx * table[i, AXIS] + ly * table[i, AXIS + 1] + lz * table[i, AXIS + 2])
         u = lx * table[i, U_AXIS] + ly * table[i, U_AXIS + 1] + lz * table[i, U_AXIS + 2]
@@ -171,8 +171,8 @@ def lamp_emission(i, lx, ly, lz, table):  # type: ignore[no-untyped-def]
 
 
 @njit
-def lamp_hit(i, ox, oy, oz, dx, dy, dz, table):  # type: ignore[no-untyped-def]
-    """Distance at which a ray of unit direction meets lamp `i`, -1 when it does not. Suns are at infinity."""
+def light_hit(i, ox, oy, oz, dx, dy, dz, table):  # type: ignore[no-untyped-def]
+    """Distance at which a ray of unit direction meets light `i`, -1 when it does not. Suns are at infinity."""
     kind = np.int32(table[i, KIND])
     if kind <= BARE_SUN:
         return -ONE
@@ -218,9 +218,9 @@ def _cone_width(square, r2):  # type: ignore[no-untyped-def]
 
 @njit
 def _window(i, px, py, pz, table):  # type: ignore[no-untyped-def]
-    """Part of an area lamp's rectangle that is sampled from a point: (u0, u1, v0, v1, height, round, lit).
+    """Part of an area light's rectangle that is sampled from a point: (u0, u1, v0, v1, height, round, lit).
 
-    Relative to the point's foot on the lamp's plane; with spread, no more than its cone can reach. When `round`, the
+    Relative to the point's foot on the light's plane; with spread, no more than its cone can reach. When `round`, the
     whole ellipse is sampled instead.
     """
     x, y, z = px - table[i, PLACE], py - table[i, PLACE + 1], pz - table[i, PLACE + 2]
@@ -271,8 +271,8 @@ def _spherical_rectangle(a, b, u0, u1, v0, v1, height):  # type: ignore[no-untyp
 
 
 @njit
-def lamp_density(i, px, py, pz, lx, ly, lz, t, table):  # type: ignore[no-untyped-def]
-    """Density per solid angle with which `lamp_direction` draws a direction that meets lamp `i` at distance `t`."""
+def light_pdf(i, px, py, pz, lx, ly, lz, t, table):  # type: ignore[no-untyped-def]
+    """Density per solid angle with which `light_direction` draws a direction that meets light `i` at distance `t`."""
     kind = np.int32(table[i, KIND])
     if kind <= BARE_SUN:
         return ZERO
@@ -289,7 +289,7 @@ def lamp_density(i, px, py, pz, lx, ly, lz, t, table):  # type: ignore[no-untype
             return F(1.0 / max(solid, 1e-30))
         else:
             area = (u1 - u0) * (v1 - v0)
-        # The cosine at the lamp is height / t.
+        # The cosine at the light is height / t.
         return t * t * t / (height * area)
     x, y, z = table[i, PLACE] - px, table[i, PLACE + 1] - py, table[i, PLACE + 2] - pz
     square = x * x + y * y + z * z
@@ -313,8 +313,8 @@ def _about(x, y, z, width, a, b):  # type: ignore[no-untyped-def]
 
 
 @njit
-def lamp_direction(i, n1, n2, px, py, pz, table):  # type: ignore[no-untyped-def]
-    """A unit direction towards lamp `i` and the distance, from two uint32; distance -1 when it sends nothing here."""
+def light_direction(i, n1, n2, px, py, pz, table):  # type: ignore[no-untyped-def]
+    """A unit direction towards light `i` and the distance, from two uint32; distance -1 when it sends nothing here."""
     kind = np.int32(table[i, KIND])
     a, b = unit(n1), unit(n2)
     x, y, z = table[i, PLACE], table[i, PLACE + 1], table[i, PLACE + 2]
@@ -356,7 +356,7 @@ def lamp_direction(i, n1, n2, px, py, pz, table):  # type: ignore[no-untyped-def
         w = ONE - TWO * a
         r = math.sqrt(max(ZERO, ONE - w * w))
         lx, ly, lz = r * c, r * s, w
-        return lx, ly, lz, max(ZERO, lamp_hit(i, px, py, pz, lx, ly, lz, table))
+        return lx, ly, lz, max(ZERO, light_hit(i, px, py, pz, lx, ly, lz, table))
     if not d > F(1e-15):
         return ZERO, ZERO, ONE, -ONE
     x, y, z = x / d, y / d, z / d

@@ -15,9 +15,9 @@ from .light_shapes import AXIS, BARE_SUN, BOUND, FLUX, INTENSITY, KIND, PLACE, R
 
 Array = np.ndarray
 
-#: Lamps in a leaf at most.
+#: Lights in a leaf at most.
 _LEAF = 32
-#: Columns of a node: its box, the axis and cosine of a cone around all directions its lamps send into, their mean
+#: Columns of a node: its box, the axis and cosine of a cone around all directions its lights send into, their mean
 #: intensity over that cone, the rows of the table it holds, its second child (0: a leaf) and the node after all below.
 _LOW, _HIGH, _CONE, _REACH, _POWER, FIRST, PAST, SECOND, NEXT = 0, 3, 6, 9, 10, 11, 12, 13, 14
 _NODE_WIDTH = 16
@@ -46,11 +46,11 @@ def build(table: Array) -> tuple[Array, Array]:
         nodes.append(node)
         own = order[first:past]
         low, high = (places[own] - bounds[own]).min(axis=0), (places[own] + bounds[own]).max(axis=0)
-        # Boxes must hold their lamps after rounding too.
+        # Boxes must hold their lights after rounding too.
         pad = 1e-6 * np.maximum(np.abs(low), np.abs(high)).max() + 1e-12
         node[_LOW : _LOW + 3], node[_HIGH : _HIGH + 3] = low - pad, high + pad
         node[_CONE : _CONE + 3], node[_REACH] = _common_cone(table[own].astype(np.float64))
-        # Mean intensity over the cone: what a lamp of unknown direction sends to a point in it.
+        # Mean intensity over the cone: what a light of unknown direction sends to a point in it.
         cone = 2.0 * np.pi * max(1.0 - node[_REACH], 1e-6)
         node[_POWER], node[FIRST], node[PAST] = table[own, FLUX].sum(dtype=np.float64) / cone, first, past
         if past - first > _LEAF:
@@ -69,7 +69,7 @@ def build(table: Array) -> tuple[Array, Array]:
 
 
 def _common_cone(table: Array) -> tuple[Array, float]:
-    """Axis and cosine of a cone of directions that holds all that these lamps send."""
+    """Axis and cosine of a cone of directions that holds all that these lights send."""
     everywhere = np.zeros(3), -1.0
     if (table[:, REACH_COS] <= -1.0).any():
         return everywhere
@@ -99,8 +99,8 @@ def _reaches(x, y, z, square, bound, ax, ay, az, reach_cos):  # type: ignore[no-
 
 
 @njit
-def _lamp_weight(i, px, py, pz, table):  # type: ignore[no-untyped-def]
-    """Estimate of what lamp `i` sends to a point; 0 only where it sends nothing."""
+def _light_weight(i, px, py, pz, table):  # type: ignore[no-untyped-def]
+    """Estimate of what light `i` sends to a point; 0 only where it sends nothing."""
     x, y, z = px - table[i, PLACE], py - table[i, PLACE + 1], pz - table[i, PLACE + 2]
     square, bound = x * x + y * y + z * z, table[i, BOUND]
     ax, ay, az = table[i, AXIS], table[i, AXIS + 1], table[i, AXIS + 2]
@@ -116,11 +116,11 @@ def _lamp_weight(i, px, py, pz, table):  # type: ignore[no-untyped-def]
 
 @njit
 def _node_weight(node, px, py, pz, table, pick):  # type: ignore[no-untyped-def]
-    """Estimate of what the lamps below a node send to a point; exactly the sum over the lamps of a leaf."""
+    """Estimate of what the lights below a node send to a point; exactly the sum over the lights of a leaf."""
     weight = ZERO
     if pick[node, SECOND] == ZERO:
         for i in range(np.int64(pick[node, FIRST]), np.int64(pick[node, PAST])):
-            weight += _lamp_weight(i, px, py, pz, table)
+            weight += _light_weight(i, px, py, pz, table)
         return weight
     x = px - HALF * (pick[node, _LOW] + pick[node, _HIGH])
     y = py - HALF * (pick[node, _LOW + 1] + pick[node, _HIGH + 1])
@@ -140,8 +140,8 @@ def _node_weight(node, px, py, pz, table, pick):  # type: ignore[no-untyped-def]
 
 
 @njit
-def lamps_weight(px, py, pz, table, pick):  # type: ignore[no-untyped-def]
-    """Estimated luminance that arrives at a point from all lamps, unshadowed; 0 only where nothing arrives."""
+def lights_weight(px, py, pz, table, pick):  # type: ignore[no-untyped-def]
+    """Estimated luminance that arrives at a point from all lights, unshadowed; 0 only where nothing arrives."""
     weight = pick[0, _SUN_POWER]
     if pick[0, SUNS] > ZERO:
         weight += _node_weight(np.int64(1), px, py, pz, table, pick)
@@ -149,8 +149,8 @@ def lamps_weight(px, py, pz, table, pick):  # type: ignore[no-untyped-def]
 
 
 @njit
-def pick_lamp(n0, px, py, pz, table, pick):  # type: ignore[no-untyped-def]
-    """(index, probability) of the lamp that a uint32 picks for a point; (-1, 0) when it falls on none."""
+def pick_light(n0, px, py, pz, table, pick):  # type: ignore[no-untyped-def]
+    """(index, probability) of the light that a uint32 picks for a point; (-1, 0) when it falls on none."""
     rest = np.float64(n0) * (1.0 / 4294967296.0)
     probability = 1.0
     first, past = np.int64(pick[0, SUNS]), np.int64(pick[0, END])
@@ -182,7 +182,7 @@ def pick_lamp(n0, px, py, pz, table, pick):  # type: ignore[no-untyped-def]
         return np.int64(-1), ZERO
     goal, sum_, chosen, own = rest * total, 0.0, np.int64(-1), 0.0
     for i in range(first, past):
-        weight = np.float64(table[i, INTENSITY] if suns else _lamp_weight(i, px, py, pz, table))
+        weight = np.float64(table[i, INTENSITY] if suns else _light_weight(i, px, py, pz, table))
         if weight > 0.0:
             # The last one that can be picked takes what rounding leaves.
             chosen, own = i, weight
@@ -194,14 +194,14 @@ def pick_lamp(n0, px, py, pz, table, pick):  # type: ignore[no-untyped-def]
 
 @njit
 def pick_probability(i, px, py, pz, table, pick):  # type: ignore[no-untyped-def]
-    """Probability with which `pick_lamp` picks lamp `i` for a point."""
+    """Probability with which `pick_light` picks light `i` for a point."""
     suns = np.float64(pick[0, _SUN_POWER])
     if F(i) >= pick[0, SUNS]:
         here = 0.0
         if pick[0, SUNS] > ZERO:
             here = np.float64(_node_weight(np.int64(1), px, py, pz, table, pick))
         return F(np.float64(table[i, INTENSITY]) / (suns + here))
-    own = np.float64(_lamp_weight(i, px, py, pz, table))
+    own = np.float64(_light_weight(i, px, py, pz, table))
     if not own > 0.0:
         return ZERO
     node = np.int64(1)

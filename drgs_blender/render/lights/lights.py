@@ -24,11 +24,11 @@ from .light_shapes import (
     RADIANCE,
     SHADOW,
     WIDTH,
-    lamp_density,
-    lamp_direction,
-    lamp_emission,
-    lamp_hit,
-    lamp_row,
+    light_direction,
+    light_emission,
+    light_hit,
+    light_pdf,
+    light_row,
 )
 from .light_tree import (
     COUNT,
@@ -41,8 +41,8 @@ from .light_tree import (
     box_hit,
     build,
     is_sun,
-    lamps_weight,
-    pick_lamp,
+    lights_weight,
+    pick_light,
     pick_probability,
 )
 from .mesh_lights import Emitters, emitter_bits, emitter_pdf, emitter_row, emitters_luminance, sample_emitter
@@ -50,7 +50,7 @@ from .mesh_lights import Emitters, emitter_bits, emitter_pdf, emitter_row, emitt
 Array = np.ndarray
 
 
-class Lamps:
+class Lights:
     """Lights made ready for compiled code.
 
     Parameters
@@ -61,15 +61,15 @@ class Lamps:
 
     Attributes
     ----------
-    table : (k, WIDTH) float32: one lamp a row, in the order of the tree, suns last; k >= 1 (a black one when there is
+    table : (k, WIDTH) float32: one light a row, in the order of the tree, suns last; k >= 1 (a black one when there is
         none)
     pick : (m, 16) float32: the tree, see the columns above
     order : (count,) int: which of `lights` each row is
-    count : int: lamps that shine, and triangles
+    count : int: lights that shine, and triangles
     power : estimated luminance that arrives at the sphere from all directions together (cd / m^2 sr), as the integral
         of an environment over all directions is
     rays_differ : bool: there is one that diffuse rays see and glossy ones do not, or the other way
-    seen : bool: there is a lamp that the camera sees
+    seen : bool: there is a light that the camera sees
     warnings : list of str: lights that are left out, and why
     """
 
@@ -85,7 +85,7 @@ class Lamps:
         kept: list[int] = []
         self.warnings: list[str] = []
         for i, light in enumerate(lights):
-            row = lamp_row(light)
+            row = light_row(light)
             if isinstance(row, str):
                 self.warnings.append(f"light {light.name!r} is left out: {row}")
             else:
@@ -105,11 +105,11 @@ class Lamps:
 
     @property
     def tables(self) -> tuple[Array, Array, int]:
-        """What compiled code takes as `lamps`; until the next update of the emitters' scene."""
+        """What compiled code takes as `lights`; until the next update of the emitters' scene."""
         return self.table, self.pick, self.emitters.address
 
     def sample(self, numbers: Array, points: Array) -> tuple[Array, Array, Array, Array, Array]:
-        """``sample_lamp`` for (n, 3) uint32 and (n, 3) or (3,) points.
+        """``sample_light`` for (n, 3) uint32 and (n, 3) or (3,) points.
 
         Returns
         -------
@@ -120,7 +120,7 @@ class Lamps:
         return out[:, :3], out[:, 3], out[:, 4:7], out[:, 7], rows
 
     def pdf(self, rows: Array, points: Array, directions: Array) -> Array:
-        """(n,) ``pdf_lamp`` of table rows (n,) for (n, 3) unit directions at (n, 3) or (3,) points."""
+        """(n,) ``pdf_light`` of table rows (n,) for (n, 3) unit directions at (n, 3) or (3,) points."""
         directions = np.ascontiguousarray(directions, np.float32)
         rows = plain(np.broadcast_to(np.asarray(rows, np.int64), len(directions)))
         return _pdf_many(rows, _rows(points, directions), directions, *self.tables)
@@ -134,7 +134,7 @@ class Lamps:
         seen_by: int = DIFFUSE,
         tmax: float = np.inf,
     ) -> Array:
-        """(n, 3) ``lamps_along`` for (n, 3) unit directions from (n, 3) or (3,) origins."""
+        """(n, 3) ``lights_along`` for (n, 3) unit directions from (n, 3) or (3,) origins."""
         directions = np.ascontiguousarray(directions, np.float32)
         others = plain(np.broadcast_to(np.asarray(others, np.float32), len(directions)))
         return _along_many(_rows(origins, directions), directions, F(tmax), others, F(share), seen_by, *self.tables)
@@ -157,28 +157,28 @@ _NO_EMITTERS = Emitters()
 
 @njit
 def _emitters_share(px, py, pz, table, pick, emitters):  # type: ignore[no-untyped-def]
-    """How often surfaces are sampled from a point, rather than lamps; float64."""
+    """How often surfaces are sampled from a point, rather than lights; float64."""
     if emitters == 0:
         return 0.0
     if pick[0, END] == ZERO:
         return 1.0
     own = emitters_luminance(px, py, pz, emitters)
-    both = own + np.float64(lamps_weight(px, py, pz, table, pick))
+    both = own + np.float64(lights_weight(px, py, pz, table, pick))
     return own / both if both > 0.0 else 0.0
 
 
 @njit
-def sample_lamp(n0, n1, n2, px, py, pz, table, pick, emitters):  # type: ignore[no-untyped-def]
-    """A direction from a point towards one of the lamps or surfaces, from three uint32.
+def sample_light(n0, n1, n2, px, py, pz, table, pick, emitters):  # type: ignore[no-untyped-def]
+    """A direction from a point towards one of the lights or surfaces, from three uint32.
 
     Returns
     -------
     (lx, ly, lz, distance, r, g, b, pdf, index)
-        World direction of unit length, distance to the lamp (infinite for suns), radiance, density per solid angle
+        World direction of unit length, distance to the light (infinite for suns), radiance, density per solid angle
         times the probability of the pick, row of the table or, behind those, of the emitters. A negative density
-        marks a lamp that no other strategy finds (without size, or one that nothing shadows): what it adds is
+        marks a light that no other strategy finds (without size, or one that nothing shadows): what it adds is
         f cos rgb / |pdf| without a further weight.
-        (..., 0, 0, 0, 0, -1 or the lamp) when the lamp sends nothing here.
+        (..., 0, 0, 0, 0, -1 or the light) when the light sends nothing here.
     """
     share = _emitters_share(px, py, pz, table, pick, emitters)
     if share > 0.0:
@@ -187,21 +187,21 @@ def sample_lamp(n0, n1, n2, px, py, pz, table, pick, emitters):  # type: ignore[
             lx, ly, lz, t, r, g, b, pdf, i = sample_emitter(rest / share, n1, n2, px, py, pz, emitters)
             return lx, ly, lz, t, r, g, b, pdf * F(share), i + len(table) if i >= 0 else i
         n0 = U(np.int64(min((rest - share) / (1.0 - share), 1.0) * 4294967295.0))
-    i, probability = pick_lamp(n0, px, py, pz, table, pick)
+    i, probability = pick_light(n0, px, py, pz, table, pick)
     probability *= F(1.0 - share)
     if i < 0:
         return ZERO, ZERO, ONE, ZERO, ZERO, ZERO, ZERO, ZERO, np.int64(-1)
-    lx, ly, lz, t = lamp_direction(i, n1, n2, px, py, pz, table)
+    lx, ly, lz, t = light_direction(i, n1, n2, px, py, pz, table)
     if not t >= ZERO:
         return ZERO, ZERO, ONE, ZERO, ZERO, ZERO, ZERO, ZERO, i
     bare = table[i, KIND] <= F(BARE_SUN)
     if bare:
         pdf = -probability
     else:
-        pdf = probability * lamp_density(i, px, py, pz, lx, ly, lz, t, table)
+        pdf = probability * light_pdf(i, px, py, pz, lx, ly, lz, t, table)
         if not np.int64(table[i, FLAGS]) & SHADOW:
             pdf = -pdf
-    part = lamp_emission(i, lx, ly, lz, table)
+    part = light_emission(i, lx, ly, lz, table)
     if bare and table[i, KIND] != F(BARE_SUN):
         part /= t * t
     r, g, b = part * table[i, RADIANCE], part * table[i, RADIANCE + 1], part * table[i, RADIANCE + 2]
@@ -211,7 +211,7 @@ def sample_lamp(n0, n1, n2, px, py, pz, table, pick, emitters):  # type: ignore[
 
 
 @njit
-def lamp_flags(index, table, emitters):  # type: ignore[no-untyped-def]
+def light_flags(index, table, emitters):  # type: ignore[no-untyped-def]
     """Bits CAMERA, DIFFUSE, GLOSSY (rays that see it), SHADOW (things block it) and ABSENT of what was sampled."""
     if index >= len(table):
         return emitter_bits(index - len(table), emitters)
@@ -219,15 +219,16 @@ def lamp_flags(index, table, emitters):  # type: ignore[no-untyped-def]
 
 
 @njit
-def pdf_lamp(index, px, py, pz, lx, ly, lz, table, pick, emitters):  # type: ignore[no-untyped-def]
-    """Density per solid angle, pick included, with which ``sample_lamp`` draws this unit direction by this lamp.
+def pdf_light(index, px, py, pz, lx, ly, lz, table, pick, emitters):  # type: ignore[no-untyped-def]
+    """Density per solid angle, pick included, with which ``sample_light`` draws this unit direction by this light.
 
-    0 where the lamp sends nothing from there: the density of samples whose radiance is not 0. 0 for lamps without size.
+    0 where the light sends nothing from there: the density of samples whose radiance is not 0. 0 for lights without
+    size.
     """
-    t = lamp_hit(index, px, py, pz, lx, ly, lz, table)
-    if not (t >= ZERO and lamp_emission(index, lx, ly, lz, table) > ZERO):
+    t = light_hit(index, px, py, pz, lx, ly, lz, table)
+    if not (t >= ZERO and light_emission(index, lx, ly, lz, table) > ZERO):
         return ZERO
-    density = lamp_density(index, px, py, pz, lx, ly, lz, t, table)
+    density = light_pdf(index, px, py, pz, lx, ly, lz, t, table)
     if not density > ZERO:
         return ZERO
     return density * _probability(index, px, py, pz, table, pick, emitters)
@@ -235,14 +236,14 @@ def pdf_lamp(index, px, py, pz, lx, ly, lz, table, pick, emitters):  # type: ign
 
 @njit
 def _probability(index, px, py, pz, table, pick, emitters):  # type: ignore[no-untyped-def]
-    """With which a lamp is picked."""
+    """With which a light is picked."""
     share = F(1.0 - _emitters_share(px, py, pz, table, pick, emitters))
     return share * pick_probability(index, px, py, pz, table, pick)
 
 
 @njit
 def emission_along(ox, oy, oz, dx, dy, dz, hit, geometry, table, pick, emitters):  # type: ignore[no-untyped-def]
-    """What the surface that a ray meets emits, and how it is found by ``sample_lamp``.
+    """What the surface that a ray meets emits, and how it is found by ``sample_light``.
 
     Parameters
     ----------
@@ -253,7 +254,7 @@ def emission_along(ox, oy, oz, dx, dy, dz, hit, geometry, table, pick, emitters)
     Returns
     -------
     (r, g, b, diffuse, glossy)
-        Radiance, 0 without a hit; density per solid angle, pick included, with which ``sample_lamp`` draws this
+        Radiance, 0 without a hit; density per solid angle, pick included, with which ``sample_light`` draws this
         direction by this surface, for either lobe.
     """
     if hit[1] < 0:
@@ -266,24 +267,24 @@ def emission_along(ox, oy, oz, dx, dy, dz, hit, geometry, table, pick, emitters)
         return r, g, b, ZERO, ZERO
     pdf = emitter_pdf(i, ox, oy, oz, dx, dy, dz, hit[0], emitters)
     pdf *= F(_emitters_share(ox, oy, oz, table, pick, emitters))
-    flags = lamp_flags(len(table) + i, table, emitters)
+    flags = light_flags(len(table) + i, table, emitters)
     return r, g, b, pdf if flags & DIFFUSE else ZERO, pdf if flags & GLOSSY else ZERO
 
 
 @njit
-def _add_lamp(i, ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, pick, emitters):  # type: ignore[no-untyped-def]
+def _add_light(i, ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, pick, emitters):  # type: ignore[no-untyped-def]
     flags = np.int64(table[i, FLAGS])
-    # What nothing shadows is left to ``sample_lamp``: only the camera looks at it along rays.
+    # What nothing shadows is left to ``sample_light``: only the camera looks at it along rays.
     if not flags & seen_by or not (flags & SHADOW or seen_by & CAMERA):
         return ZERO, ZERO, ZERO
-    t = lamp_hit(i, ox, oy, oz, dx, dy, dz, table)
+    t = light_hit(i, ox, oy, oz, dx, dy, dz, table)
     if not (t >= ZERO and (t < tmax or t == tmax == F(np.inf))):
         return ZERO, ZERO, ZERO
-    weight = lamp_emission(i, dx, dy, dz, table)
+    weight = light_emission(i, dx, dy, dz, table)
     if not weight > ZERO:
         return ZERO, ZERO, ZERO
     if share > ZERO:
-        density = lamp_density(i, ox, oy, oz, dx, dy, dz, t, table)
+        density = light_pdf(i, ox, oy, oz, dx, dy, dz, t, table)
         weight /= others + share * density * _probability(i, ox, oy, oz, table, pick, emitters)
     else:
         weight /= others
@@ -291,15 +292,15 @@ def _add_lamp(i, ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, pi
 
 
 @njit
-def lamps_along(ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, pick, emitters):  # type: ignore[no-untyped-def]
-    """Sum over the lamps with size that a ray meets of L / (others + share * pick * density).
+def lights_along(ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, pick, emitters):  # type: ignore[no-untyped-def]
+    """Sum over the lights with size that a ray meets of L / (others + share * pick * density).
 
     Parameters
     ----------
     ox .. dz : origin and unit direction, world space; tmax : distance of the surface behind, infinite when none
     others : sum over all other strategies of count times density in this direction; must be positive
-    share : number of lamp samples that the balance heuristic reckons with; 0 leaves them out
-    seen_by : CAMERA, DIFFUSE or GLOSSY: lamps that such rays do not see are left out
+    share : number of light samples that the balance heuristic reckons with; 0 leaves them out
+    seen_by : CAMERA, DIFFUSE or GLOSSY: lights that such rays do not see are left out
 
     Returns
     -------
@@ -313,7 +314,7 @@ def lamps_along(ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, pic
             continue
         if pick[node, SECOND] == ZERO:
             for i in range(np.int64(pick[node, FIRST]), np.int64(pick[node, PAST])):
-                r, g, b = _add_lamp(i, ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, pick, emitters)
+                r, g, b = _add_light(i, ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, pick, emitters)
                 red, green, blue = red + r, green + g, blue + b
         node += 1
     r, g, b = suns_along(ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, pick, emitters)
@@ -322,10 +323,10 @@ def lamps_along(ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, pic
 
 @njit
 def suns_along(ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, pick, emitters):  # type: ignore[no-untyped-def]
-    """`lamps_along` of suns alone."""
+    """`lights_along` of suns alone."""
     red, green, blue = ZERO, ZERO, ZERO
     for i in range(np.int64(pick[0, SUNS]), np.int64(pick[0, END])):
-        r, g, b = _add_lamp(i, ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, pick, emitters)
+        r, g, b = _add_light(i, ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, pick, emitters)
         red, green, blue = red + r, green + g, blue + b
     return red, green, blue
 
@@ -334,7 +335,7 @@ def suns_along(ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, pick
 def _sample_many(numbers, points, table, pick, emitters):  # type: ignore[no-untyped-def]
     out, rows = np.empty((len(numbers), 8), np.float32), np.empty(len(numbers), np.int64)
     for j in range(len(numbers)):
-        lx, ly, lz, t, r, g, b, pdf, i = sample_lamp(
+        lx, ly, lz, t, r, g, b, pdf, i = sample_light(
             numbers[j, 0],
             numbers[j, 1],
             numbers[j, 2],
@@ -355,7 +356,7 @@ def _sample_many(numbers, points, table, pick, emitters):  # type: ignore[no-unt
 def _pdf_many(rows, points, directions, table, pick, emitters):  # type: ignore[no-untyped-def]
     out = np.empty(len(points), np.float32)
     for j in range(len(points)):
-        out[j] = pdf_lamp(
+        out[j] = pdf_light(
             rows[j], points[j, 0], points[j, 1], points[j, 2], directions[j, 0], directions[j, 1], directions[j, 2],
             table, pick, emitters,
         )  # fmt: skip
@@ -366,7 +367,7 @@ def _pdf_many(rows, points, directions, table, pick, emitters):  # type: ignore[
 def _along_many(origins, directions, tmax, others, share, seen_by, table, pick, emitters):  # type: ignore[no-untyped-def]
     out = np.empty((len(origins), 3), np.float32)
     for j in range(len(origins)):
-        out[j, 0], out[j, 1], out[j, 2] = lamps_along(
+        out[j, 0], out[j, 1], out[j, 2] = lights_along(
             origins[j, 0], origins[j, 1], origins[j, 2], directions[j, 0], directions[j, 1], directions[j, 2],
             tmax, others[j], share, seen_by, table, pick, emitters,
         )  # fmt: skip

@@ -130,7 +130,7 @@ class Emitters:
         return place(self._tables)
 
     def power(self, centre: Array, radius: float) -> float:
-        """Luminance that arrives at a sphere from all directions together, as `Lamps.power`."""
+        """Luminance that arrives at a sphere from all directions together, as `Lights.power`."""
         if not self.count:
             return 0.0
         rows = self.rows.astype(np.float64)
@@ -274,7 +274,7 @@ def _fill(own, vertices, faces, matrices, luminance, bits, turned, rows):  # typ
 
 @njit
 def sample_emitter(rest, n1, n2, px, py, pz, emitters):  # type: ignore[no-untyped-def]
-    """`lights.sample_lamp` among emitting triangles: `rest` in [0, 1), float64, picks, two uint32 choose the place."""
+    """`lights.sample_light` among emitting triangles: `rest` in [0, 1), float64, picks, two uint32 choose the place."""
     tables = _tables(emitters)
     i, probability = pick_emitter(rest, px, py, pz, tables.tree)
     if i < 0:

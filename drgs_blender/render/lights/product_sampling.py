@@ -34,11 +34,11 @@ def normals() -> Array:
 
 
 @njit
-def facing_row(nx, ny, nz, sky):  # type: ignore[no-untyped-def]
+def facing_row(nx, ny, nz, envmap):  # type: ignore[no-untyped-def]
     """Row of the tables for a unit world normal."""
-    x = sky.xx * nx + sky.xy * ny + sky.xz * nz
-    y = sky.yx * nx + sky.yy * ny + sky.yz * nz
-    z = sky.zx * nx + sky.zy * ny + sky.zz * nz
+    x = envmap.xx * nx + envmap.xy * ny + envmap.xz * nz
+    y = envmap.yx * nx + envmap.yy * ny + envmap.yz * nz
+    z = envmap.zx * nx + envmap.zy * ny + envmap.zz * nz
     one = np.float32(1.0)
     scale = one / max(abs(x) + abs(y) + abs(z), np.float32(1e-20))
     x, y, z = x * scale, y * scale, z * scale
@@ -120,33 +120,33 @@ def _find_slices(starts, blocks, slices):  # type: ignore[no-untyped-def]
 
 
 @njit
-def block_of(row, n, sky):  # type: ignore[no-untyped-def]
+def block_of(row, n, envmap):  # type: ignore[no-untyped-def]
     """Block on which the random number n (uint32) falls in a row of the tables."""
     n = min(np.uint32(n), np.uint32(2**32 - 2))  # the largest number fills the rows up
-    base = np.int64(row) * np.int64(sky.blocks)
-    place = np.int64(load_int32(sky.slices, np.int64(row) * _SLICES + (np.int64(n) >> _SLICE)))
-    while place + 1 < sky.blocks and load_uint32(sky.starts, base + place + 1) <= n:
+    base = np.int64(row) * np.int64(envmap.blocks)
+    place = np.int64(load_int32(envmap.slices, np.int64(row) * _SLICES + (np.int64(n) >> _SLICE)))
+    while place + 1 < envmap.blocks and load_uint32(envmap.starts, base + place + 1) <= n:
         place += 1
     return place
 
 
 @njit
-def in_cells_order(row, block, n, below, sky):  # type: ignore[no-untyped-def]
+def in_cells_order(row, block, n, below, envmap):  # type: ignore[no-untyped-def]
     """Random number n, which fell on a block, among those of the block's cells; and the row's ratio there.
 
     `below` (uint32) stands behind n's last digit: where a block's run grows, all its cells stay reachable.
     """
-    place = np.int64(row) * np.int64(sky.blocks) + block
-    ratio = load_float(sky.ratio, place)
-    into = np.float64(n - load_uint32(sky.starts, place)) + np.float64(below) * 2.0**-32
-    start = np.int64(load_uint32(sky.first, block))
-    end = np.int64(load_uint32(sky.first, block + 1)) if block + 1 < sky.blocks else np.int64(1 << 32)
+    place = np.int64(row) * np.int64(envmap.blocks) + block
+    ratio = load_float(envmap.ratio, place)
+    into = np.float64(n - load_uint32(envmap.starts, place)) + np.float64(below) * 2.0**-32
+    start = np.int64(load_uint32(envmap.first, block))
+    end = np.int64(load_uint32(envmap.first, block + 1)) if block + 1 < envmap.blocks else np.int64(1 << 32)
     end = end if end > start else np.int64(1 << 32)
     return np.uint32(min(start + np.int64(into / np.float64(ratio)), end - 1)), ratio
 
 
 @njit
-def facing_ratio(row, cell_row, cell_column, sky):  # type: ignore[no-untyped-def]
+def facing_ratio(row, cell_row, cell_column, envmap):  # type: ignore[no-untyped-def]
     """Density of light sampling by a row of the tables over that without, in the cell at (row, column)."""
-    place = (np.int64(cell_row) >> sky.shift) * sky.block_columns + (np.int64(cell_column) >> sky.shift)
-    return load_float(sky.ratio, np.int64(row) * np.int64(sky.blocks) + np.int64(load_int32(sky.block, place)))
+    place = (np.int64(cell_row) >> envmap.shift) * envmap.block_columns + (np.int64(cell_column) >> envmap.shift)
+    return load_float(envmap.ratio, np.int64(row) * np.int64(envmap.blocks) + np.int64(load_int32(envmap.block, place)))

@@ -1,6 +1,7 @@
 """One emitting triangle: directions towards it, and the pdf with which they are drawn.
 
-A triangle that is large in the sky is sampled by solid angle (Arvo 1995), in double, as it cancels; others by area.
+A triangle that is seen under a large solid angle is sampled by solid angle (Arvo 1995), in double, as it cancels;
+others by area.
 Compiled code takes the address of the rows, see `memory`.
 """
 
@@ -63,7 +64,7 @@ def _scaled(a, k):  # type: ignore[no-untyped-def]
 def _frame(i, px, py, pz, rows):  # type: ignore[no-untyped-def]
     """First corner and middle of a triangle as seen from a point, edges, squared distance of the middle, if it is near.
 
-    Near is what is large in the sky.
+    Near is what is large in the environment.
     """
     k = WIDTH * np.int64(i)
     corner = _plus(_vector(rows, k + CORNER), (-px, -py, -pz))
