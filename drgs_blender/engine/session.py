@@ -282,8 +282,7 @@ def _unheeded(settings: RenderSettings) -> list[str]:
     if settings.noise_threshold > 0.0 and part_count(settings) == 1:
         return [
             f"noise threshold: {settings.strategy_samples or settings.samples} samples cannot be drawn in parts, so "
-            f"all "
-            "are traced; use more samples, or samples per strategy with a common power of two"
+            "all are traced; use more samples, or samples per strategy with a common power of two"
         ]
     return []
 

@@ -58,7 +58,7 @@ def render(entry: dict, path: Path) -> list[float]:
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
     add_light(entry)
-    look = entry.get("shading_model")
+    look = entry.get("look")
     if look is None:
         add_receiver(entry.get("glossy_roughness"))
         origin, direction = Vector((0, 0, 1e-2)), Vector((0, 0, -1))

@@ -49,7 +49,7 @@ def test_the_samples_are_divided_into_equal_parts(changes: dict, expected: int) 
 
 def test_the_mean_of_all_parts_is_the_whole() -> None:
     """A part draws the very samples that the whole draws, so that nothing is lost by stopping late."""
-    points, light, scene = row_of_points(12, subpixel_samples=2), lively_light(), TraceScene()
+    points, light, scene = row_of_points(12, subpixels=2), lively_light(), TraceScene()
     settings = RenderSettings(samples=32, bounces=0, subpixel_samples=2)
     whole = integrate(scene, light, points, settings, 5)
     parts = [integrate(scene, light, points, settings, 5, part=(i, 4)) for i in range(4)]

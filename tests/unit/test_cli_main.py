@@ -36,10 +36,10 @@ def test_help_shows_examples(command, capsys):
 def test_help_tells_the_default_that_counts(capsys):
     assert main(["evaluate", "--help"]) == 0
     text = capsys.readouterr().out
-    said = re.search(r"default\s+(\d+)", text[text.rindex("--samples RAYS") :])
+    said = re.search(r"default\s+(\d+)", text[text.rindex("--samples SAMPLES") :])
     given = build_parser().parse_args(["evaluate"])
-    assert int(said[1]) == given.rays == 128
-    assert sampling.override(RenderSettings(), given).rays == 128
+    assert int(said[1]) == given.samples == 128
+    assert sampling.override(RenderSettings(), given).samples == 128
 
 
 @pytest.mark.parametrize("command", ["reconstruct", "evaluate"])
@@ -193,7 +193,7 @@ def test_only_given_options_override_the_scene():
     assert sampling.override(scene, options([], False)) == scene
     changed = sampling.override(scene, options(["--samples", "64", "--no-transparent"], False))
     assert (changed.samples, changed.strategy_samples) == (64, None)
-    assert (changed.film_transparent, changed.look, changed.seed, changed.bounces) == (False, "paper", 9, 4)
+    assert (changed.film_transparent, changed.shading_model, changed.seed, changed.bounces) == (False, "paper", 9, 4)
 
 
 def test_more_positions_than_rays_is_refused():

@@ -68,7 +68,7 @@ def floor_points(count: int = len(ROUGHNESS)) -> tuple[Mesh, Points, np.ndarray]
 
 
 def quadrature(
-    image: torch.Tensor, normal: torch.Tensor, view: torch.Tensor, values: torch.Tensor, look: str
+    image: torch.Tensor, normal: torch.Tensor, view: torch.Tensor, values: torch.Tensor, shading_model: str
 ) -> object:
     """Radiance (n, 3) of points in the open, materials (n, 5), without chance."""
     points = SurfacePoints(
@@ -76,11 +76,11 @@ def quadrature(
         values[:, 4],
     )  # fmt: skip
     light = Light(image, torch.eye(3, dtype=torch.float64), torch.ones(3, dtype=torch.float64))
-    return integrate_quadrature(EmptyTracer(), light, points, 128, look).sum(1)
+    return integrate_quadrature(EmptyTracer(), light, points, 128, shading_model).sum(1)
 
 
 @pytest.mark.parametrize("shading_model", ["principled", "paper"])
-def test_radiance_and_its_derivatives_match_the_reference(look):
+def test_radiance_and_its_derivatives_match_the_reference(shading_model):
     """Value, and derivatives by roughness, normal and light, against a quadrature that torch differentiates."""
     mesh, points, up = floor_points()
     image = sky()
@@ -96,7 +96,7 @@ def test_radiance_and_its_derivatives_match_the_reference(look):
     roughness = materials.roughness(columns)
     sums = draw(points, unit, roughness**4, radiance)
     nv = (unit * towards).sum(1)
-    ours = materials.reflect(columns, sums, nv, look)
+    ours = materials.reflect(columns, sums, nv, shading_model)
     assert ours[:, 0].detach().numpy() == pytest.approx(ours[:, 1].detach().numpy(), rel=0.03)  # independent halves
     total = ours.mean(1)
 
@@ -105,7 +105,7 @@ def test_radiance_and_its_derivatives_match_the_reference(look):
     values = columns.detach().double()
     values[:, 3] = roughness.detach().double()
     values.requires_grad_(True)
-    true = quadrature(wide, n64 / n64.norm(dim=1, keepdim=True), towards.double(), values, look)
+    true = quadrature(wide, n64 / n64.norm(dim=1, keepdim=True), towards.double(), values, shading_model)
     assert total.detach().numpy() == pytest.approx(true.detach().numpy(), rel=0.01)
 
     weight = torch.tensor([1.0, 0.5, 2.0])
@@ -327,12 +327,14 @@ def test_specular_colours_and_back():
 
 
 @pytest.mark.parametrize("shading_model", ["principled", "paper"])
-def test_dielectrics_are_surfaces_without_metal(look):
+def test_dielectrics_are_surfaces_without_metal(shading_model):
     mesh, points, up = floor_points()
     sums = torch.rand(len(up), 2, 4, 3, generator=torch.Generator().manual_seed(2))
     columns, nv = torch.tensor([[0.6, 0.4, 0.2, 0.3, 0.0]]).repeat(len(up), 1), torch.from_numpy(points.towards[:, 2])
     metallic, plain = (Materials(mesh, kind, 0) for kind in ("metallic", "dielectric"))
-    assert torch.equal(plain.reflect(columns[:, :4], sums, nv, look), metallic.reflect(columns, sums, nv, look))
+    assert torch.equal(
+        plain.reflect(columns[:, :4], sums, nv, shading_model), metallic.reflect(columns, sums, nv, shading_model)
+    )
     assert not plain.values()[2].any() and metallic.values()[2].all()
 
 

@@ -15,7 +15,7 @@ from test_raster import look_along_y
 
 from drgs_blender.core.frame import Camera, RenderSettings, Visibility
 from drgs_blender.render.backend import HERE, Processor
-from drgs_blender.render.camera import AA, camera_parameters
+from drgs_blender.render.camera import SUBPIXELS, camera_parameters
 from drgs_blender.render.gbuffer.gbuffer import GBuffer
 from drgs_blender.render.gbuffer.mesh import primary_mesh
 from drgs_blender.render.gbuffer.surfels import primary_surfels, snap_windows
@@ -138,7 +138,7 @@ def test_a_card_that_fails_between_hits_and_points_leaves_them_whole(monkeypatch
         monkeypatch.setattr(device.launcher, "_room", broken)
         return hits
 
-    shape = 48, 64, int(parameters[AA])
+    shape = 48, 64, int(parameters[SUBPIXELS])
     assert trace(scene, parameters, 0, 0, shape, 0).owner.max() == -1, "rays that meet nothing"
     assert trace(scene, parameters, 0, 0, shape, CAMERA).owner.max() >= 0
     found = primary_mesh(scene, camera, parameters, 0, 48, once, device.shade)

@@ -177,9 +177,9 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
 
 @pytest.mark.parametrize("shading_model", ["paper", "principled"])
 @pytest.mark.parametrize("name", SCENES)
-def test_a_device_finds_the_light_that_the_processor_finds(device: OnDevice, name: str, look: str) -> None:
+def test_a_device_finds_the_light_that_the_processor_finds(device: OnDevice, name: str, shading_model: str) -> None:
     scene = SCENES[name]()
-    here, there = both(device, scene, replace(SETTINGS, shading_model=look))
+    here, there = both(device, scene, replace(SETTINGS, shading_model=shading_model))
     assert here.total.max() > 0.1
     assert psnr(here.total, there.total) > 60.0
     # Nearly all samples agree to rounding; a ray along an edge may meet the other face.

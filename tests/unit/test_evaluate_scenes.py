@@ -52,7 +52,7 @@ def test_help_says_what_scenes_are_made(capsys):
     assert main(["evaluate", "--help"]) == 0
     said, plan = " ".join(capsys.readouterr().out.split()), Plan()
     assert f"which of {', '.join(OBJECTS)}; default all" in said and plan.objects == OBJECTS
-    for option, value in (("size", plan.size), ("train", plan.train), ("test", plan.test), ("samples", plan.samples)):
+    for option, value in (("size", plan.size), ("train", plan.train), ("test", plan.test), ("spp", plan.samples)):
         assert re.search(rf"--{option} N [^-]*; default {value}\b", said), option
 
 

@@ -90,13 +90,15 @@ def test_white_furnace_of_the_diffuse_lobe_is_exact() -> None:
 
 
 @pytest.mark.parametrize("shading_model", ["paper", "principled"])
-def test_metals_have_no_diffuse_light_to_the_rounding_of_interpolation(look: str) -> None:
+def test_metals_have_no_diffuse_light_to_the_rounding_of_interpolation(shading_model: str) -> None:
     for metallic in np.nextafter(np.float32(1), np.float32([0, 1, 2])):
-        result = integrate(EMPTY, WHITE, points(20, metallic=metallic), settings(8, 8, 8, shading_model=look), 0)
+        result = integrate(
+            EMPTY, WHITE, points(20, metallic=metallic), settings(8, 8, 8, shading_model=shading_model), 0
+        )
         assert not result.components[:, :2].any() and result.components[:, 2].min() > 0
 
 
-def directional_albedo(mu: float, roughness: float, metallic: float, look: str) -> float:
+def directional_albedo(mu: float, roughness: float, metallic: float, shading_model: str) -> float:
     """The glossy lobe's share of reflected light for base colour 1, by quadrature over half vectors in float64."""
     alpha = max(roughness**2, 1e-3)
     view = np.array([np.sqrt(1 - mu * mu), 0, mu])
@@ -115,7 +117,7 @@ def directional_albedo(mu: float, roughness: float, metallic: float, look: str) 
     smith = lambda c: 0.5 * (np.sqrt(1 + alpha**2 * (1 / c**2 - 1)) - 1)  # noqa: E731
     g = 1 / (1 + smith(mu) + smith(nl))
     schlick = (1 - vh) ** 5
-    if look == "paper":
+    if shading_model == "paper":
         f0 = 0.04 * (1 - metallic) + metallic
         fresnel = f0 + (1 - f0) * schlick
     else:
@@ -130,11 +132,13 @@ def directional_albedo(mu: float, roughness: float, metallic: float, look: str) 
 @pytest.mark.parametrize("roughness", [0.05, 0.3, 1.0])
 @pytest.mark.parametrize(("mu", "metallic"), [(0.9, 1.0), (0.3, 1.0), (0.3, 0.0), (0.7, 0.4)])
 def test_the_glossy_lobe_reflects_its_directional_albedo(
-    look: str, roughness: float, mu: float, metallic: float
+    shading_model: str, roughness: float, mu: float, metallic: float
 ) -> None:
     seen = points(400, mu=mu, roughness=roughness, metallic=metallic)
-    found = integrate(EMPTY, WHITE, seen, settings(ggx=64, shading_model=look), 0).components[:, 2].mean(axis=1)
-    expected = directional_albedo(mu, roughness, metallic, look)
+    found = (
+        integrate(EMPTY, WHITE, seen, settings(ggx=64, shading_model=shading_model), 0).components[:, 2].mean(axis=1)
+    )
+    expected = directional_albedo(mu, roughness, metallic, shading_model)
     assert expected <= 1.0001
     assert found.mean() == pytest.approx(expected, abs=4 * float(found.std()) / 20 + 1e-3)
 
@@ -160,14 +164,16 @@ def test_the_layer_takes_what_it_takes_in_cycles(roughness: float) -> None:
 
 
 @pytest.mark.parametrize("shading_model", ["paper", "principled"])
-def test_nothing_reflects_more_than_it_receives(look: str) -> None:
+def test_nothing_reflects_more_than_it_receives(shading_model: str) -> None:
     for mu in (0.15, 0.5, 0.95):
         for roughness in (0.05, 0.4, 0.9):
             for metallic in (0.0, 1.0):
                 seen = points(200, mu=mu, roughness=roughness, metallic=metallic)
-                total = integrate(EMPTY, WHITE, seen, settings(16, 32, 0, shading_model=look), 0).total.mean()
+                total = integrate(EMPTY, WHITE, seen, settings(16, 32, 0, shading_model=shading_model), 0).total.mean()
                 limit = (
-                    1.01 if look == "principled" or metallic == 1 else 1 + directional_albedo(mu, roughness, 0, look)
+                    1.01
+                    if shading_model == "principled" or metallic == 1
+                    else 1 + directional_albedo(mu, roughness, 0, shading_model)
                 )
                 assert total < limit + 0.01
 
@@ -186,13 +192,13 @@ def agreement(scene: TraceScene, light: EnvironmentLight, seen: ShadingPoints, a
 @pytest.mark.parametrize(
     "alone", [{"cosine": 64}, {"ggx": 64}, {"environment": 64}], ids=["cosine", "ggx", "environment"]
 )
-def test_each_strategy_alone_agrees_with_all_together(alone: dict, look: str) -> None:
+def test_each_strategy_alone_agrees_with_all_together(alone: dict, shading_model: str) -> None:
     ball = trimesh.creation.icosphere(subdivisions=3)
     scene = scene_of((ball.vertices * 0.8 + [1.0, 0.4, 1.0], ball.faces), metallic=0.3)
     light = EnvironmentLight(World(environment=sun_picture()))
     seen = points(3000, albedo=0.7, roughness=0.55, metallic=0.4)
-    together = settings(32, 16, 16, bounces=2, shading_model=look)
-    found = agreement(scene, light, seen, settings(**alone, bounces=2, shading_model=look), together)
+    together = settings(32, 16, 16, bounces=2, shading_model=shading_model)
+    found = agreement(scene, light, seen, settings(**alone, bounces=2, shading_model=shading_model), together)
     # Samples of the environment are shadow rays: they bring no light of surfaces.
     direct = [DIFFUSE_DIRECT, GLOSSY_DIRECT]
     assert (found[direct if "environment" in alone else slice(None)] < 4.5).all()
@@ -265,11 +271,11 @@ def test_many_bounces_lie_between_the_series_and_the_furnace(bounces: int) -> No
 
 
 @pytest.mark.parametrize("shading_model", ["paper", "principled"])
-def test_a_furnace_of_mirrors_keeps_its_light(look: str) -> None:
+def test_a_furnace_of_mirrors_keeps_its_light(shading_model: str) -> None:
     """White metal of low roughness loses next to nothing: under a white sky everything looks white, at any bounce."""
     scene = scene_of(corner(), albedo=1.0, roughness=0.1, metallic=1.0)
     seen = points(3000, origin=(3, 0, 0), albedo=1.0, roughness=0.1, metallic=1.0)
-    total = luminance(integrate(scene, WHITE, seen, settings(0, 16, 8, bounces=8, shading_model=look), 0))
+    total = luminance(integrate(scene, WHITE, seen, settings(0, 16, 8, bounces=8, shading_model=shading_model), 0))
     assert total.mean() == pytest.approx(1.0, abs=0.01)
 
 
@@ -413,8 +419,8 @@ def test_no_fault_of_the_input_reaches_a_pixel() -> None:
         getattr(seen, name)[3 * k + 1] = np.inf
     seen.normal[30], seen.geometric_normal[31], seen.view[32] = 0.0, 0.0, 0.0
     seen.view[33] = [0, 0, -1]
-    for look in ("paper", "principled"):
-        result = integrate(scene, light, seen, settings(8, 8, 8, bounces=4, shading_model=look), 0)
+    for shading_model in ("paper", "principled"):
+        result = integrate(scene, light, seen, settings(8, 8, 8, bounces=4, shading_model=shading_model), 0)
         assert np.isfinite(result.components).all() and (result.components >= 0).all()
         assert np.isfinite(result.variance).all() and (result.variance >= 0).all()
         assert not result.components[:21].reshape(7, 3, -1)[:, :2].any()
@@ -585,7 +591,7 @@ def test_no_bit_depends_on_the_neighbours_where_batches_overflow() -> None:
         np.testing.assert_array_equal(cut.variance, whole.variance[first:last])
 
 
-@pytest.mark.parametrize("subpixel_samples", [1, 4, 16, 32])
+@pytest.mark.parametrize("subpixels", [1, 4, 16, 32])
 def test_the_variance_of_a_pixel_does_not_depend_on_its_positions(subpixels: int) -> None:
     """Points of few samples, of one at last, are estimated together with those of their pixel."""
     pixels = 400

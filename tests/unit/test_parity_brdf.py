@@ -23,15 +23,15 @@ COUNT = 4000
 
 
 @njit
-def _evaluate_many(cosines, albedo, roughness, metallic, look, table, out):
+def _evaluate_many(cosines, albedo, roughness, metallic, shading_model, table, out):
     """Rows of `cosines`: n.l, n.v, v.l, (n.h)^2, sin^2 of n and h."""
     for i in range(len(out)):
         nl, nv, vl, nh2, sin2 = cosines[i]
         a2 = kernel.alpha_squared(roughness[i])
-        kd = kernel.diffuse_weight(roughness[i], metallic[i], nv, look, table)
+        kd = kernel.diffuse_weight(roughness[i], metallic[i], nv, shading_model, table)
         _, norm = kernel.vndf_terms(nv, a2)
         r, g, b = albedo[i]
-        values = kernel.evaluate(nl, nv, vl, nh2, sin2, r, g, b, kd, metallic[i], a2, norm, look)
+        values = kernel.evaluate(nl, nv, vl, nh2, sin2, r, g, b, kd, metallic[i], a2, norm, shading_model)
         for k in range(7):
             out[i, k] = values[k]
 
@@ -67,7 +67,7 @@ def situations(seed: int = 0) -> tuple[torch.Tensor, ...]:
     return normal, view, light, uniform(COUNT, 3), roughness, uniform(COUNT)
 
 
-def kernel_values(situation: tuple[torch.Tensor, ...], look: str, table: np.ndarray) -> torch.Tensor:
+def kernel_values(situation: tuple[torch.Tensor, ...], shading_model: str, table: np.ndarray) -> torch.Tensor:
     """(n, 7): diffuse and glossy value times the cosine, density."""
     normal, view, light, albedo, roughness, metallic = situation
     half = brdf.normalise(view + light)
@@ -75,18 +75,18 @@ def kernel_values(situation: tuple[torch.Tensor, ...], look: str, table: np.ndar
     cosines.append((torch.linalg.cross(normal, half) ** 2).sum(-1))
     single = [x.numpy().astype(np.float32) for x in (torch.stack(cosines, -1), albedo, roughness, metallic)]
     out = np.empty((len(normal), 7), np.float32)
-    _evaluate_many(*single, kernel.SHADING_MODELS[look], table.astype(np.float32), out)
+    _evaluate_many(*single, kernel.SHADING_MODELS[shading_model], table.astype(np.float32), out)
     out[:, :6] *= single[0][:, :1]
     return torch.from_numpy(out).double()
 
 
 @pytest.mark.parametrize("shading_model", brdf.SHADING_MODELS)
-def test_brdf_values_and_the_density_of_visible_normals(look: str):
+def test_brdf_values_and_the_density_of_visible_normals(shading_model: str):
     situation = situations()
     normal, view, light, *_, roughness, _ = situation
     table = brdf.F0 + (1 - brdf.F0) * brdf.layer_table()
-    found = kernel_values(situation, look, table)
-    diffuse, glossy = brdf.evaluate(*situation, look)
+    found = kernel_values(situation, shading_model, table)
+    diffuse, glossy = brdf.evaluate(*situation, shading_model)
     density = sampling.pdf_ggx(normal, view, light, brdf.alpha_of(roughness), bounded=True)
     expected = torch.cat([diffuse, glossy, density.unsqueeze(-1)], -1)
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-9)

@@ -126,12 +126,14 @@ COMBINATIONS = {
 
 @pytest.mark.parametrize("shading_model", ["principled", "paper"])
 @pytest.mark.parametrize("name", COMBINATIONS)
-def test_direct_light(name: str, look: str):
+def test_direct_light(name: str, shading_model: str):
     """Against quadrature, which has no noise: its own error is below 0.2 % of the light."""
     points = visible_points()
     arrays = sphere_over_plane()
-    truth = integrate_quadrature(tracer_from_arrays(**arrays), Light.from_world(world()), _lifted(points), 96, look)
-    settings = replace(COMBINATIONS[name], shading_model=look, bounces=0)
+    truth = integrate_quadrature(
+        tracer_from_arrays(**arrays), Light.from_world(world()), _lifted(points), 96, shading_model
+    )
+    settings = replace(COMBINATIONS[name], shading_model=shading_model, bounces=0)
     found, error = kernel_means(points, settings, 4000)
     assert (found[:, 1] == 0).all() and (found[:, 3] == 0).all()
     truth = truth.numpy()
@@ -140,15 +142,15 @@ def test_direct_light(name: str, look: str):
 
 @pytest.mark.parametrize("shading_model", ["principled", "paper"])
 @pytest.mark.parametrize("bounces", [1, 3])
-def test_indirect_light(bounces: int, look: str):
+def test_indirect_light(bounces: int, shading_model: str):
     points = visible_points(enclosed=True)
     tracer, light = tracer_from_arrays(**sphere_over_plane()), Light.from_world(world())
     generator = torch.Generator().manual_seed(21)
     counts = Counts(*((5000, 2500, 2500) if bounces == 1 else (1600, 800, 800)))
-    samples = integrate(tracer, light, _lifted(points), counts, bounces, look, generator, samples=True)
+    samples = integrate(tracer, light, _lifted(points), counts, bounces, shading_model, generator, samples=True)
     reference, noise = samples.sum(1).numpy(), (samples.var(1) * samples.shape[1]).sqrt().numpy()
     found, error = kernel_means(
-        points, RenderSettings(samples=16, bounces=bounces, subpixel_samples=1, shading_model=look), 4000
+        points, RenderSettings(samples=16, bounces=bounces, subpixel_samples=1, shading_model=shading_model), 4000
     )
     assert (reference[:, 1] > 0).any()
     judge(found, reference, np.hypot(error, noise))

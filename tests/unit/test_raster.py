@@ -94,7 +94,7 @@ def test_one_surfel_is_the_gaussian_it_should_be(orthographic: bool, width: floa
     camera = look_along_y(60, 50, distance=4, focal=20.0 if orthographic else 80.0, orthographic=orthographic)
     # Sheared tangents in the plane y = 0, depth 4; 1 m is 20 pixels there.
     u, v = np.array([0.3, 0, 0.1]), np.array([0.1, 0, 0.4])
-    got = render(surfels([[0.1, 0, -0.2]], u, v, opacity=0.8), camera, subpixel_samples=2, filter_width=width)
+    got = render(surfels([[0.1, 0, -0.2]], u, v, opacity=0.8), camera, subpixels=2, filter_width=width)
     at = sample_positions(camera, 2, filter_width=width)
     offset = np.stack([(at[..., 0] - 30) / 20 - 0.1, -(at[..., 1] - 25) / 20 + 0.2], -1)
     uv = offset @ np.linalg.inv(np.array([u[[0, 2]], v[[0, 2]]]))
@@ -106,7 +106,7 @@ def test_one_surfel_is_the_gaussian_it_should_be(orthographic: bool, width: floa
     assert np.allclose(got.surface[got.alpha > 0][:, 8], np.hypot(0.1, 0.4), atol=1e-6)
 
 
-@pytest.mark.parametrize("subpixel_samples", [1, 4, 16])
+@pytest.mark.parametrize("subpixels", [1, 4, 16])
 def test_the_low_pass_follows_the_sampling_rate(subpixels: int) -> None:
     camera = look_along_y(31, 31)
     dot = surfels([[0, 0, 0]], [1e-5, 0, 0], [0, 0, 1e-5], opacity=1.0)
@@ -119,7 +119,7 @@ def test_the_low_pass_follows_the_sampling_rate(subpixels: int) -> None:
         assert abs(got.alpha.mean(-1).sum() - np.pi / subpixels) < 0.3 * np.pi / subpixels
 
 
-@pytest.mark.parametrize("subpixel_samples", [4, 16])
+@pytest.mark.parametrize("subpixels", [4, 16])
 def test_a_ball_is_as_large_as_it_is(subpixels: int) -> None:
     """The many surfels edge-on along its outline do not widen it."""
     camera = look_along_y(40, 40, focal=15.0, orthographic=True)
@@ -141,7 +141,7 @@ def test_a_surfel_fades_as_it_turns_edge_on(tilt: float) -> None:
     got = render(
         surfels([[0, 0, 0]], [0.02 * tilt, 0.02, 0], [0, 0, 1e-4], opacity=0.9),
         look_along_y(41, 41),
-        subpixel_samples=16,
+        subpixels=16,
     )
     peak = 0.9 * tilt / np.hypot(tilt, 1)
     assert (got.alpha == 0).all() if peak < 1 / 255 else 0.3 * peak < got.alpha.max() <= 1.01 * peak
@@ -160,7 +160,7 @@ def test_a_front_edge_does_not_bleed_into_the_back_surface() -> None:
     front = plane_of_surfels(-1.0, 0.5, 0.05, 0.04, albedo=(1, 0, 0), roughness=0.1, object_index=1)
     back = plane_of_surfels(1.0, 3.0, 0.08, 0.06, albedo=(0, 0, 1), roughness=0.9, object_index=2)
     both = join(front, back)
-    got = render(both, camera, subpixel_samples=4)
+    got = render(both, camera, subpixels=4)
     depth, owner = got.depth, got.object_index
     assert (got.alpha > 0.95).all()
     # Every sample lies on one of the surfaces, none between, and everything about it is of that surface.
@@ -169,11 +169,11 @@ def test_a_front_edge_does_not_bleed_into_the_back_surface() -> None:
     assert np.allclose(got.surface[..., 3], owner == 1, atol=1e-5)
     assert np.allclose(got.surface[..., 6], np.where(owner == 1, 0.1, 0.9), atol=1e-4)
     # The blend without clusters has what the clusters prevent.
-    blended = render_without_gaps(both, camera, subpixel_samples=4)
+    blended = render_without_gaps(both, camera, subpixels=4)
     assert ((blended.depth > 3.2) & (blended.depth < 4.8)).sum() > 100
     assert np.array_equal(blended.alpha, got.alpha)
     # The heavier surface wins: the edge lies where the front surface covers half.
-    alone = render(front, camera, subpixel_samples=4).alpha
+    alone = render(front, camera, subpixels=4).alpha
     assert np.array_equal((owner == 1)[np.abs(alone - 0.5) > 0.01], (alone > 0.5)[np.abs(alone - 0.5) > 0.01])
 
 
@@ -190,7 +190,7 @@ def test_intersecting_surfels_are_ordered_where_the_ray_meets_them() -> None:
     camera = look_along_y(40, 40, distance=4, orthographic=True, focal=20)
     rising = surfels([[0, 0.01, 0]], [0.7, 0.7, 0], [0, 0, 1], albedo=(1, 0, 0), opacity=0.99)
     falling = surfels([[0, -0.01, 0]], [0.7, -0.7, 0], [0, 0, 1], albedo=(0, 1, 0), opacity=0.99)
-    red = render_without_gaps(join(rising, falling), camera, subpixel_samples=1).surface[20, :, 0, 3]
+    red = render_without_gaps(join(rising, falling), camera, subpixels=1).surface[20, :, 0, 3]
     assert red[12:18].min() > 0.5 > red[22:28].max()
 
 
@@ -205,7 +205,7 @@ def test_fog_of_any_depth_is_blended_in_exact_order() -> None:
     centre = np.stack([np.zeros(n), middle, np.zeros(n)], -1)
     albedo = np.stack([red, red, red], -1)
     sheets = surfels(centre, u, [0, 0, 1e4], opacity=opacity, albedo=albedo)
-    got = render_without_gaps(sheets, camera, subpixel_samples=2)
+    got = render_without_gaps(sheets, camera, subpixels=2)
     at = sample_positions(camera, 2)
     x = (at[..., 0] - 4) / 4
     depth = 4 + middle + tilt * x[..., None]
@@ -231,7 +231,7 @@ def test_what_full_lists_drop_is_hidden() -> None:
     u = np.stack([np.full(n, 1e4), 1e4 * tilt, np.zeros(n)], -1)
     red = k / n
     sheets = surfels(centre, u, [0, 0, 1e4], opacity=0.1, albedo=np.stack([red, red, red], -1))
-    got = render_without_gaps(sheets, camera, subpixel_samples=1)
+    got = render_without_gaps(sheets, camera, subpixels=1)
     x = (sample_positions(camera, 1)[..., 0] - 4) / 4
     depth = 2 + 0.01 * k + tilt * (x[..., None] + 4)
     order = np.argsort(depth, axis=-1, kind="stable")
@@ -249,7 +249,7 @@ def test_the_order_of_the_input_does_not_matter() -> None:
     posed = random_surfels(300, seed=5)
     turned = PosedSurfels(*(np.ascontiguousarray(getattr(posed, f)[::-1]) for f in FIELDS))
     camera = look_along_y(48, 40)
-    a, b = render(posed, camera, subpixel_samples=2), render(turned, camera, subpixel_samples=2)
+    a, b = render(posed, camera, subpixels=2), render(turned, camera, subpixels=2)
     assert np.array_equal(a.alpha, b.alpha)
     seen = a.alpha > 0
     assert np.array_equal(a.surface[seen], b.surface[seen])
@@ -259,7 +259,7 @@ def test_the_order_of_the_input_does_not_matter() -> None:
 def test_rows_and_regions_are_crops_of_the_picture(width: float) -> None:
     posed = random_surfels(500, seed=6)
     camera = look_along_y(70, 61)
-    whole = render(posed, camera, subpixel_samples=3, filter_width=width)
+    whole = render(posed, camera, subpixels=3, filter_width=width)
     p = camera_parameters(camera, RenderSettings(subpixel_samples=3, seed=3, filter_width=width), 7)
     splats = screen.prepare(posed, camera, p)
     for y0, y1 in ((0, 1), (5, 38), (31, 61), (60, 61)):
@@ -268,7 +268,7 @@ def test_rows_and_regions_are_crops_of_the_picture(width: float) -> None:
         seen = part.alpha > 0
         assert np.array_equal(part.surface[seen], whole.surface[y0:y1][seen])
     camera.region = (13, 7, 50, 41)
-    part = render(posed, camera, subpixel_samples=3, filter_width=width)
+    part = render(posed, camera, subpixels=3, filter_width=width)
     assert np.array_equal(part.alpha, whole.alpha[7:41, 13:50])
     seen = part.alpha > 0
     assert np.array_equal(part.depth[seen], whole.depth[7:41, 13:50][seen])
@@ -324,7 +324,7 @@ def test_cameras_that_cannot_see_are_refused(change: dict[str, object]) -> None:
         camera_parameters(camera, RenderSettings(), 1)
 
 
-@pytest.mark.parametrize("subpixel_samples", [1, 2, 3, 4, 7, 16])
+@pytest.mark.parametrize("subpixels", [1, 2, 3, 4, 7, 16])
 def test_sub_pixel_positions_are_stratified_and_uniform(subpixels: int) -> None:
     camera = look_along_y(48, 48)
     at = sample_positions(camera, subpixels) % 1.0

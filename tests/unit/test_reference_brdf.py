@@ -83,15 +83,15 @@ def test_a_narrow_lobe_keeps_its_energy():
 
 @pytest.mark.parametrize("shading_model", brdf.SHADING_MODELS)
 @pytest.mark.parametrize("cosine", [1.0, 0.5, 0.2])
-def test_white_furnace(look: str, cosine: float):
+def test_white_furnace(shading_model: str, cosine: float):
     view, white = view_at(cosine), torch.ones(3, dtype=F64)
     for roughness in (0.2, 0.5, 1.0):
         light, solid = hemisphere(view, roughness)
         for metallic in (0.0, 0.4, 1.0):
-            parts = brdf.evaluate(UP, view, light, white, scalar(roughness), scalar(metallic), look)
+            parts = brdf.evaluate(UP, view, light, white, scalar(roughness), scalar(metallic), shading_model)
             diffuse, glossy = (float((part[:, 0] * solid).sum()) for part in parts)
             weight = 1 - metallic
-            if look == "principled":
+            if shading_model == "principled":
                 weight *= 1 - float(brdf.layer_albedo(scalar(cosine), scalar(roughness)))
                 assert diffuse + glossy <= 1.0
             assert diffuse == pytest.approx(weight, abs=1e-4)  # error of the midpoint rule: 4e-5
@@ -137,11 +137,11 @@ def test_the_paper_brdf_is_reciprocal():
 
 
 @pytest.mark.parametrize("shading_model", brdf.SHADING_MODELS)
-def test_below_the_surface_is_black_and_without_nan(look: str):
+def test_below_the_surface_is_black_and_without_nan(shading_model: str):
     view, light = random_unit((200,), 4).requires_grad_(), random_unit((200,), 5).requires_grad_()
     roughness = torch.full((200,), 0.3, dtype=F64, requires_grad=True)
     half = torch.full((200,), 0.5, dtype=F64)
-    parts = brdf.evaluate(UP, view, light, torch.full((200, 3), 0.5, dtype=F64), roughness, half, look)
+    parts = brdf.evaluate(UP, view, light, torch.full((200, 3), 0.5, dtype=F64), roughness, half, shading_model)
     value = torch.cat(parts, 1)
     unlit, unseen = light[:, 2] <= 0, view[:, 2] <= 0
     assert unlit.any() and unseen.any() and (~unlit & ~unseen).any()
@@ -152,10 +152,10 @@ def test_below_the_surface_is_black_and_without_nan(look: str):
 
 
 @pytest.mark.parametrize("shading_model", brdf.SHADING_MODELS)
-def test_gradients(look: str):
+def test_gradients(shading_model: str):
     def unit_parts(normal, view, light, albedo, roughness, metallic):
         normal, view, light = (brdf.normalise(x) for x in (normal, view, light))
-        return brdf.evaluate(normal, view, light, albedo, roughness, metallic, look)
+        return brdf.evaluate(normal, view, light, albedo, roughness, metallic, shading_model)
 
     inputs = (
         torch.tensor([[0.1, -0.2, 1.0], [0.0, 0.3, 0.9]], dtype=F64),

@@ -69,13 +69,13 @@ def z_scores(samples: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
 @pytest.mark.slow
 @pytest.mark.parametrize("shading_model", brdf.SHADING_MODELS)
 @pytest.mark.parametrize("counts", [(30000, 0, 0), (0, 30000, 0), (0, 0, 30000), (10000, 5000, 5000)])
-def test_each_strategy_and_all_together_find_the_truth(counts: tuple[int, int, int], look: str):
+def test_each_strategy_and_all_together_find_the_truth(counts: tuple[int, int, int], shading_model: str):
     light, points = random_light(), points_up()
-    truth = integrate_quadrature(EmptyTracer(), light, points, 256, look)
+    truth = integrate_quadrature(EmptyTracer(), light, points, 256, shading_model)
     # Samples of one strategy are equally distributed; those of several are not, which only widens the estimate of
     # the error.
     generator = torch.Generator().manual_seed(5)
-    samples = integrate(EmptyTracer(), light, points, Counts(*counts), 0, look, generator, samples=True)
+    samples = integrate(EmptyTracer(), light, points, Counts(*counts), 0, shading_model, generator, samples=True)
     z = z_scores(samples, truth)
     assert z.abs().max() < 4.0
     assert (z**2).mean() < 2.5
@@ -128,13 +128,13 @@ def test_white_surfaces_in_white_light_vanish():
 
 
 @pytest.mark.parametrize("shading_model", brdf.SHADING_MODELS)
-def test_indirect_light_agrees_with_quadrature(look: str):
+def test_indirect_light_agrees_with_quadrature(shading_model: str):
     light, points = random_light(3, 4), points_up(metallic=(0.0, 0.6, 0.3))
     points.origin = torch.tensor([[0.1, 0.3, 1e-4], [0.5, 0.6, 1e-4], [0.3, 0.2, 1e-4]], dtype=F64)
     wall = quads([(-2, 0, 0), (2, 0, 0), (2, 0, 3), (-2, 0, 3)], albedo=0.7)
-    truth = integrate_quadrature(wall, light, points, 64, look, bounces=1)
+    truth = integrate_quadrature(wall, light, points, 64, shading_model, bounces=1)
     generator = torch.Generator().manual_seed(9)
-    samples = integrate(wall, light, points, Counts(6000, 3000, 3000), 1, look, generator, samples=True)
+    samples = integrate(wall, light, points, Counts(6000, 3000, 3000), 1, shading_model, generator, samples=True)
     assert (truth[:, 1] > 0.01).all()
     # The coarse grid of the second surface leaves 1 % of the truth as its own error.
     error = (samples.var(1) * samples.shape[1]).sqrt()

@@ -83,7 +83,7 @@ def test_a_shadow_is_the_transmittance_of_all_surfels(tmp_path: Path) -> None:
     tilt[:3, :3] = [[0.8, 0, 0.6], [0, 1, 0], [-0.6, 0, 0.8]]  # shines along (-0.6, 0, -0.8)
     frame = Frame(
         1, from_above(), [ObjectState("Cloud", key, matrix, visibility=Visibility(camera=False))], DARK,
-        replace(SETTINGS, environment=4), ("Combined", "Position"), [quad("Ground", 0.0)],
+        replace(SETTINGS, samples=6), ("Combined", "Position"), [quad("Ground", 0.0)],
         [Light("Sun", "sun", tilt, power=3.0)],
     )  # fmt: skip
     passes = session.render(frame)
