@@ -6,10 +6,10 @@ import bpy
 
 from . import (
     bake,
-    bind,
     bind_armature,
     bind_cage,
     bind_lattice,
+    bind_rig,
     compositing,
     convert,
     engine,
@@ -38,7 +38,7 @@ MODULES = (
     convert,
     splats,
     mark_assets,
-    bind,
+    bind_rig,
     bind_armature,
     bind_lattice,
     bind_cage,

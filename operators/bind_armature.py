@@ -8,7 +8,7 @@ import numpy as np
 from ..drgs_blender.core.errors import UsageError
 from . import selection
 from .base import DrgsOperator
-from .bind import rest_pose
+from .bind_rig import rest_pose
 from .vertex_weights import Weights, read_weights, write_weights
 
 Array = np.ndarray
