@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from . import (
+    background_render,
     engine_link,
-    farm,
     handlers,
-    matter,
     panels,
-    preferences,
+    physics,
+    physics_settings,
     presets,
     properties,
     reconstruction,
@@ -20,8 +20,7 @@ from . import (
 
 #: In order of registration; undone in reverse.
 MODULES = (
-    preferences,
-    matter,
+    physics_settings,
     submit,
     properties,
     presets,
@@ -29,7 +28,8 @@ MODULES = (
     setup_job,
     reconstruction,
     handlers,
-    farm,
+    physics,
+    background_render,
     viewport,
     render_engine,
     panels,

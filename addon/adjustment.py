@@ -11,7 +11,7 @@ from bpy.props import BoolProperty, FloatProperty, FloatVectorProperty, StringPr
 
 from ..drgs_blender.core.frame import Adjustment
 from . import mesh_arrays
-from .limits import Limited
+from .property_limits import Limited
 
 Array = np.ndarray
 
@@ -43,7 +43,7 @@ class DrgsAdjustment(bpy.types.PropertyGroup):
 
     use: BoolProperty(
         name="Adjustments",
-        description="Show the object with its adjustments, or as it was before",
+        description="Apply the adjustments; switched off, the object is as it was before them",
         default=True,
         update=_tell,
     )
@@ -71,21 +71,21 @@ class DrgsAdjustment(bpy.types.PropertyGroup):
         "Saturation", "Factor on the albedo's saturation; 0 is grey", min=0.0, soft_max=2.0, default=1.0
     )
     value: _number("Value", "Factor on the albedo's brightness", min=0.0, soft_max=2.0, max=100.0, default=1.0)
-    roughness_gain: _number("Roughness", "Factor on the roughness", min=0.0, soft_max=4.0, default=1.0)
+    roughness_gain: _number("Roughness Factor", "Multiplies the roughness", min=0.0, soft_max=4.0, default=1.0)
     roughness_offset: _number("Offset", "Added to the roughness after the factor", min=-1.0, max=1.0, default=0.0)
-    roughness_low: _number("Lowest", "The roughness becomes no lower than this", min=0.0, max=1.0, default=0.0)
-    roughness_high: _number("Highest", "The roughness becomes no higher than this", min=0.0, max=1.0, default=1.0)
-    metallic_gain: _number("Metallic", "Factor on the metallic channel", min=0.0, soft_max=4.0, default=1.0)
+    roughness_low: _number("Minimum", "The roughness becomes no lower than this", min=0.0, max=1.0, default=0.0)
+    roughness_high: _number("Maximum", "The roughness becomes no higher than this", min=0.0, max=1.0, default=1.0)
+    metallic_gain: _number("Metallic Factor", "Multiplies the metallic channel", min=0.0, soft_max=4.0, default=1.0)
     metallic_offset: _number("Offset", "Added to the metallic channel after the factor", min=-1.0, max=1.0, default=0.0)
-    metallic_low: _number("Lowest", "The metallic channel becomes no lower than this", min=0.0, max=1.0, default=0.0)
-    metallic_high: _number("Highest", "The metallic channel becomes no higher than this", min=0.0, max=1.0, default=1.0)
+    metallic_low: _number("Minimum", "The metallic channel becomes no lower than this", min=0.0, max=1.0, default=0.0)
+    metallic_high: _number("Maximum", "The metallic channel becomes no higher than this", min=0.0, max=1.0, default=1.0)
     mask: StringProperty(
         name="Mask",
-        description="Vertex group or point attribute that says where, and how much of it; empty is everywhere",
+        description="Vertex group or point attribute that limits the adjustments by its values; empty is everywhere",
         search=_masks,
         update=_tell,
     )
-    use_invert: BoolProperty(name="Invert", description="Where the mask is not", default=False, update=_tell)
+    use_invert: BoolProperty(name="Invert", description="Adjust where the mask is 0", default=False, update=_tell)
 
     def values(self) -> tuple[object, ...]:
         """All settings, to be compared; () where they change nothing."""

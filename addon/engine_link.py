@@ -22,6 +22,20 @@ from . import engine_setup, messages, preferences
 SET_UP = f"Press Set Up Engine in sidebar > DR-GS, or name an environment in the preferences or in {VARIABLE}"
 UPDATE = "Press Set Up Engine in sidebar > DR-GS; nothing need be fetched for it"
 
+#: Runs ``drgs`` and ends it together with Blender, however that ends: its standard input is closed then.
+_MAIN = """
+import os, signal, sys, threading
+
+def watch():
+    while os.read(0, 1):
+        pass
+    os.kill(os.getpid(), signal.SIGTERM)
+
+threading.Thread(target=watch, daemon=True).start()
+from drgs_blender.cli.main import main
+sys.exit(main())
+"""
+
 OnProgress = Callable[[str, float], None]
 IsCancelled = Callable[[], bool]
 
@@ -59,6 +73,20 @@ def command_line() -> list[str]:
         return locate_engine()
     except DeviceError as error:
         raise DeviceError("engine", "is not set up", SET_UP) from error
+
+
+def drgs_command() -> list[str]:
+    """Command that runs ``drgs`` in the engine's environment and ends it together with Blender.
+
+    Its standard input must be a pipe that stays open: it ends when that is closed.
+
+    Raises
+    ------
+    DeviceError
+        See `command_line`.
+    """
+    command = command_line()
+    return [*command[: command.index("-m")], "-c", _MAIN]
 
 
 def lacks_reconstruction() -> bool:

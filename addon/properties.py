@@ -10,9 +10,10 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, Po
 
 from ..drgs_blender.core.frame import RenderSettings
 from ..drgs_blender.core.passes import PASSES, Pass
+from . import mesh_display
 from .adjustment import DrgsAdjustment
-from .limits import Limited
-from .matter.properties import DrgsMatterSettings
+from .physics_settings import DrgsPhysicsSettings
+from .property_limits import Limited
 from .submit import DrgsSubmitSettings
 
 _DENOISERS = {
@@ -25,9 +26,7 @@ DENOISE_ITEMS = [(n, *_DENOISERS[n]) for n in typing.get_args(typing.get_type_hi
 
 
 def _switch_overlay(settings: DrgsSceneSettings, context: bpy.types.Context) -> None:
-    from .viewport import overlay
-
-    overlay.switched(settings.id_data)
+    mesh_display.update_display(settings.id_data)
 
 
 class DrgsSceneSettings(bpy.types.PropertyGroup):
@@ -79,8 +78,8 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
     )
     device: EnumProperty(
         name="Device",
-        description="What traces the light, bakes matter and learns from photographs. Without a card the processor "
-        "does all, and says so",
+        description="What traces the light, bakes simulations and learns from photographs. Without a card the "
+        "processor does all, and says so",
         items=[
             ("CPU", "CPU", "The processor"),
             ("CUDA", "GPU (CUDA)", "An NVIDIA card; Set Up Engine fetches what it needs"),
@@ -180,11 +179,11 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
         default=True,
     )
     overlay: EnumProperty(
-        name="DR-GS Objects",
+        name="Viewport Display",
         description="How DR-GS objects are drawn in viewports that another engine or no engine renders",
         items=(
-            ("OFF", "Mesh", "As the mesh that carries them"),
-            ("SURFELS", "Surfels", "As discs with their colour, without light and without the engine"),
+            ("OFF", "Mesh", "As the mesh that carries the splats"),
+            ("SURFELS", "Splats", "As discs with their colour, without light and without the engine"),
             ("LIT", "Lit", "As DR-GS renders them, in front of and behind the scene's other objects"),
         ),
         default="OFF",
@@ -208,13 +207,14 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
     )
     seed: IntProperty(
         name="Seed",
-        description="Of the random numbers: pictures with different seeds have independent noise and can be averaged",
+        description="Start value of the random numbers: the same seed gives the same noise. Compare two to tell noise "
+        "from detail",
         default=0,
         min=0,
     )
     use_animated_seed: BoolProperty(
         name="Animated Seed",
-        description="Change the noise from frame to frame, as Cycles' Animated Seed",
+        description="Another noise pattern in every frame, so that noise does not stick to the picture",
         default=True,
         options=set(),
     )
@@ -260,7 +260,7 @@ class DrgsViewLayerSettings(bpy.types.PropertyGroup):
         name="Other Objects",
         description="What the camera sees of objects that are not DR-GS objects",
         items=(
-            ("SEEN", "Seen", "The objects themselves"),
+            ("SEEN", "Visible", "The objects themselves"),
             (
                 "CATCHER",
                 "Shadow Catchers",
@@ -310,7 +310,7 @@ class DrgsObjectSettings(bpy.types.PropertyGroup):
         default=False,
         update=_tell,
     )
-    matter: PointerProperty(type=DrgsMatterSettings, name="Matter")
+    physics: PointerProperty(type=DrgsPhysicsSettings, name="Physics")
     shown_as: StringProperty(
         name="Display As", description="How the mesh is displayed when it is not drawn as a box", options={"HIDDEN"}
     )

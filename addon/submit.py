@@ -14,7 +14,7 @@ from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
 
 from ..drgs_blender.core.errors import DeviceError, UsageError
 from ..drgs_blender.ipc.child_process import clean_environment
-from . import engine_link, messages, written
+from . import engine_link, messages, output_check
 
 INTERVAL = 0.2
 #: Newer Blenders warn of a leading // where a property does not say that it may have one.
@@ -55,7 +55,9 @@ class DrgsSubmitSettings(bpy.types.PropertyGroup):
         subtype="FILE_PATH",
         options=_RELATIVE,
     )
-    chunk: IntProperty(name="Chunk", description="Frames of one task", min=1, soft_max=100, default=5)
+    chunk: IntProperty(
+        name="Frames per Task", description="Frames that a node renders in one go", min=1, soft_max=100, default=5
+    )
     folder: StringProperty(
         name="Job Folder",
         description="Where the job is written",
@@ -74,17 +76,21 @@ class DrgsSubmitSettings(bpy.types.PropertyGroup):
         subtype="DIR_PATH",
         options=_RELATIVE,
     )
-    program: StringProperty(name="Program", description="How a node starts drgs", default="drgs")
+    program: StringProperty(
+        name="Program", description="Command by which a node of the farm starts drgs", default="drgs"
+    )
     options: StringProperty(
         name="Options", description="Further options of drgs render, such as --threads 8 --memory-mb 6000"
     )
     retries: IntProperty(
-        name="Retries", description="How often a chunk is queued again whose engine died", min=0, soft_max=10, default=3
+        name="Retries", description="How often a task is queued again whose engine died", min=0, soft_max=10, default=3
     )
     sbatch: StringProperty(
-        name="Options of sbatch", description="Divided by blanks, such as --partition=farm --cpus-per-task=8"
+        name="Options of sbatch", description="Separated by spaces, such as --partition=farm --cpus-per-task=8"
     )
-    manager_url: StringProperty(name="Address", description="Of the Flamenco Manager", default="http://localhost:8080")
+    manager_url: StringProperty(
+        name="Address", description="Address of the Flamenco Manager", default="http://localhost:8080"
+    )
 
 
 class Submission:
@@ -112,7 +118,7 @@ class Submission:
         python = engine[: engine.index("-m")]
         words = [*python, "-m", "drgs_blender.cli.main", "--no-progress", "submit", *arguments(scene)]
         self._program = f"drgs submit of {python[0]}"
-        self._expected = written.Expected(
+        self._expected = output_check.ExpectedFiles(
             [Path(bpy.path.abspath(settings.folder)).absolute() / JOB_FILES[settings.manager]]
         )
         options = {"creationflags": subprocess.CREATE_NO_WINDOW} if sys.platform == "win32" else {}
@@ -151,8 +157,8 @@ class Submission:
         missing = self._expected.missing()
         if self._process.returncode == 0 and (missing or len(said) < 2):
             self.text = "No job was written"
-            problem = written.complaint(self._program, missing) if missing else f"{self._program} named no command"
-            self.error = f"{problem}. {written.REMEDY}."
+            problem = output_check.complaint(self._program, missing) if missing else f"{self._program} named no command"
+            self.error = f"{problem}. {output_check.REMEDY}."
         elif self._process.returncode == 0:
             self.text, self.command = said[-2].removesuffix(". Submit with"), said[-1]
         else:

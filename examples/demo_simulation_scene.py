@@ -85,15 +85,15 @@ def paint(obj: bpy.types.Object, colour: Sequence[float] | None = None, **values
 
 
 def bake(obj: bpy.types.Object, material: str, collider: bpy.types.Object | None = None, **numbers: object) -> None:
-    matter = obj.drgs.matter
-    matter.use, matter.material, matter.frame_end = True, material, FRAMES
+    physics = obj.drgs.physics
+    physics.use, physics.material, physics.frame_end = True, material, FRAMES
     for name, value in numbers.items():
-        setattr(matter, name, value)
+        setattr(physics, name, value)
     bpy.context.view_layer.objects.active = obj
     if collider is not None:
-        bpy.ops.drgs.matter_row(rows="colliders")
-        matter.colliders[0].object = collider
-    bpy.ops.drgs.bake_matter()
+        bpy.ops.drgs.physics_row(rows="colliders")
+        physics.colliders[0].object = collider
+    bpy.ops.drgs.bake_physics()
 
 
 def start(blend: Path) -> None:

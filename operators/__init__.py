@@ -6,10 +6,10 @@ import bpy
 
 from . import (
     bake,
-    bind,
     bind_armature,
     bind_cage,
     bind_lattice,
+    bind_rig,
     compositing,
     convert,
     engine,
@@ -20,14 +20,14 @@ from . import (
     light,
     mark_assets,
     material,
-    matter,
+    physics,
     presets,
     reconstruct,
     report,
     save_asset,
     splats,
-    steps,
     submit,
+    workflow,
 )
 
 MODULES = (
@@ -38,12 +38,12 @@ MODULES = (
     convert,
     splats,
     mark_assets,
-    bind,
+    bind_rig,
     bind_armature,
     bind_lattice,
     bind_cage,
-    matter,
-    steps,
+    physics,
+    workflow,
     light,
     material,
     save_asset,
@@ -59,8 +59,8 @@ MODULES = (
 
 def _file_import(menu: bpy.types.Menu, context: bpy.types.Context) -> None:
     menu.layout.operator("import_scene.drgs", text="DR-GS asset (.drgs)")
-    menu.layout.operator("drgs.import_parts", text="DR-GS from surfels and mesh")
-    menu.layout.operator("drgs.reconstruct", text="DR-GS from photographs")
+    menu.layout.operator("drgs.import_parts", text="DR-GS asset from splats and mesh")
+    menu.layout.operator("drgs.reconstruct", text="DR-GS asset from photographs")
 
 
 def _file_export(menu: bpy.types.Menu, context: bpy.types.Context) -> None:

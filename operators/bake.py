@@ -13,18 +13,18 @@ from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
 from ..addon import assets, mesh_arrays, messages
 from ..addon.export import export_frame
 from ..addon.export.camera import NO_CAMERA
-from ..addon.export.fit import check_fit
 from ..addon.export.frame import WORKING_SPACE
+from ..addon.export.topology_check import check_topology
 from ..drgs_blender.core.errors import UsageError
 from ..drgs_blender.core.frame_sequences import frame_path
 from ..drgs_blender.ipc.frame_file import SUFFIX, write_frame_file
-from . import targets
-from .program import ProgramOperator
+from . import selection
+from .engine_command import CommandOperator
 
 _NUMBER = "####"
 
 
-class DRGS_OT_bake_light(ProgramOperator, targets.ObjectMode, bpy.types.Operator):
+class DRGS_OT_bake_light(CommandOperator, selection.ObjectMode, bpy.types.Operator):
     """Bake the light of the scene on the selected DR-GS objects to colour attributes, or to images by their UV maps"""
 
     bl_idname = "drgs.bake_light"
@@ -41,15 +41,19 @@ class DRGS_OT_bake_light(ProgramOperator, targets.ObjectMode, bpy.types.Operator
         default="ATTRIBUTE",
     )
     name: StringProperty(
-        name="Name", description="Of the attribute; the number of a frame of an animation is added", default="relit"
+        name="Name",
+        description="Name of the attribute; the number of a frame of an animation is added",
+        default="relit",
     )
     directory: StringProperty(
         name="Folder", description="Where the images go", subtype="DIR_PATH", default="//", options={"SKIP_SAVE"}
     )
-    size: IntProperty(name="Size", description="Texels along a side of the images", default=1024, min=16, max=16384)
+    size: IntProperty(
+        name="Size", description="Width and height of the images, texels", default=1024, min=16, max=16384
+    )
     light: EnumProperty(
         name="Light",
-        description="What is baked",
+        description="Part of the light that is baked",
         items=(
             ("all", "All", "Diffuse light and highlights, these as seen along the normal"),
             ("diffuse", "Diffuse", "What looks the same from everywhere"),
@@ -77,7 +81,7 @@ class DRGS_OT_bake_light(ProgramOperator, targets.ObjectMode, bpy.types.Operator
             layout.prop(self, name)
 
     def run(self, context: bpy.types.Context) -> set[str]:
-        objects = targets.editable(targets.selected(context), data=True)
+        objects = selection.editable(selection.selected(context), data=True)
         scene = context.scene
         frames = range(scene.frame_start, scene.frame_end + 1, scene.frame_step)
         self._frames = tuple(frames) if self.use_animation else (scene.frame_current,)
@@ -172,7 +176,7 @@ class DRGS_OT_bake_light(ProgramOperator, targets.ObjectMode, bpy.types.Operator
         if not bpy.data.filepath and self.directory.startswith("//"):
             raise UsageError("Folder", f"{self.directory} lies beside the .blend, which is not saved", "Save it first")
         evaluated = obj.evaluated_get(context.evaluated_depsgraph_get())
-        same = check_fit(evaluated, evaluated.data, assets.load(assets.file_of(obj)).mesh, messages.Warnings())
+        same = check_topology(evaluated, evaluated.data, assets.load(assets.file_of(obj)).mesh, messages.Warnings())
         uvs = mesh_arrays.read_uvs(evaluated.data, "")
         if not same or uvs is None:
             raise UsageError(

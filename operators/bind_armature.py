@@ -6,9 +6,9 @@ import bpy
 import numpy as np
 
 from ..drgs_blender.core.errors import UsageError
-from . import targets
+from . import selection
 from .base import DrgsOperator
-from .bind import rest_pose
+from .bind_rig import rest_pose
 from .vertex_weights import Weights, read_weights, write_weights
 
 Array = np.ndarray
@@ -19,7 +19,7 @@ BONES = 4
 FALLOFF = 4
 
 
-class DRGS_OT_bind_to_armature(DrgsOperator, targets.ObjectMode, bpy.types.Operator):
+class DRGS_OT_bind_to_armature(DrgsOperator, selection.ObjectMode, bpy.types.Operator):
     """Let the selected DR-GS objects follow the selected armature with automatic weights"""
 
     bl_idname = "drgs.bind_to_armature"
@@ -35,10 +35,10 @@ class DRGS_OT_bind_to_armature(DrgsOperator, targets.ObjectMode, bpy.types.Opera
         return super().poll(context)
 
     def run(self, context: bpy.types.Context) -> set[str]:
-        armatures = list(targets.of_type(context.selected_objects, "ARMATURE"))
+        armatures = list(selection.of_type(context.selected_objects, "ARMATURE"))
         if len(armatures) != 1:
             raise UsageError("Selection", f"holds {len(armatures)} armatures", "Select one")
-        objects = targets.editable(targets.selected(context), data=True)
+        objects = selection.editable(selection.selected(context), data=True)
         filled = bind_to_armature(context, objects, armatures[0])
         for name, share in filled.items():
             self.warn(
@@ -82,7 +82,7 @@ def bind_to_armature(
             weights = read_weights(obj, index)
             bare = np.flatnonzero(weights.totals(len(obj.data.vertices)) <= 1e-6)
             if len(bare):
-                near = nearby(targets.world_vertices(obj)[bare], segments, bare)
+                near = nearby(selection.world_vertices(obj)[bare], segments, bare)
                 write_weights(obj, Weights.joined(names, [weights, near]))
                 filled[obj.name] = len(bare) / len(obj.data.vertices)
     return filled
@@ -91,11 +91,11 @@ def bind_to_armature(
 def _heat(context: bpy.types.Context, obj: bpy.types.Object, armature: bpy.types.Object) -> None:
     """Blender's own automatic weights; adds the modifier and the parent."""
     before = list(context.selected_objects), context.view_layer.objects.active
-    targets.select_only(context, (obj, armature), armature)
+    selection.select_only(context, (obj, armature), armature)
     try:
         bpy.ops.object.parent_set(type="ARMATURE_AUTO")
     finally:
-        targets.select_only(context, *before)
+        selection.select_only(context, *before)
 
 
 def nearby(points: Array, segments: Array, rows: Array) -> Weights:

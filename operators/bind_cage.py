@@ -9,7 +9,7 @@ from bpy.props import IntProperty
 
 from ..addon import assets, cage_nodes, mesh_arrays
 from ..drgs_blender.core.errors import UsageError
-from . import targets
+from . import selection
 from .base import DrgsOperator
 
 NAME = "DR-GS Cage"
@@ -17,20 +17,18 @@ NAME = "DR-GS Cage"
 VOXELS = 48
 
 
-class DRGS_OT_bind_to_cage(DrgsOperator, targets.ObjectMode, bpy.types.Operator):
+class DRGS_OT_bind_to_cage(DrgsOperator, selection.ObjectMode, bpy.types.Operator):
     """Let a low-poly mesh carry the selected DR-GS objects: the mesh that is selected too, or a new one around them"""
 
     bl_idname = "drgs.bind_to_cage"
     bl_label = "Add Cage"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
 
-    faces: IntProperty(
-        name="Faces", description="About so many triangles has a new cage", min=50, soft_max=5000, default=400
-    )
+    faces: IntProperty(name="Faces", description="Triangles of a new cage, about", min=50, soft_max=5000, default=400)
 
     def run(self, context: bpy.types.Context) -> set[str]:
-        objects = targets.editable(targets.selected(context))
-        cages = list(targets.of_type(context.selected_objects, "MESH"))
+        objects = selection.editable(selection.selected(context))
+        cages = list(selection.of_type(context.selected_objects, "MESH"))
         if len(cages) > 1:
             raise UsageError("Selection", f"holds {len(cages)} other meshes", "Select one cage, or none for a new one")
         cage = cages[0] if cages else new_cage(context, objects, self.faces)
@@ -42,7 +40,7 @@ class DRGS_OT_bind_to_cage(DrgsOperator, targets.ObjectMode, bpy.types.Operator)
             raise
         for name, reason in refused.items():
             self.report({"INFO"}, f'Surface Deform cannot bind "{name}" to "{cage.name}" ({reason}); nodes carry it')
-        targets.select_only(context, [cage], cage)
+        selection.select_only(context, [cage], cage)
         return {"FINISHED"}
 
 
@@ -60,12 +58,12 @@ def bind_to_cage(context: bpy.types.Context, objects: list[bpy.types.Object], ca
         That mesh cannot carry anything, or an object's mesh may not be changed; nothing has been changed then.
     """
     shape = cage.evaluated_get(context.evaluated_depsgraph_get()).data
-    targets.in_world(cage, mesh_arrays.read_vertices(shape))
+    selection.in_world(cage, mesh_arrays.read_vertices(shape))
     if not any(p.area > 0 for p in shape.polygons):
         raise UsageError(f'Cage "{cage.name}"', "has no faces that could carry anything", "Give it faces")
     refused, done = {}, []
     for obj in objects:
-        modifier = targets.add_modifier(obj, "SURFACE_DEFORM", NAME, target=cage)
+        modifier = selection.add_modifier(obj, "SURFACE_DEFORM", NAME, target=cage)
         done.append((obj, modifier))
         context.view_layer.update()
         with context.temp_override(object=obj, active_object=obj, selected_objects=[obj]):
@@ -85,7 +83,7 @@ def bind_to_cage(context: bpy.types.Context, objects: list[bpy.types.Object], ca
             obj.modifiers.remove(modifier)
         raise
     for obj in left:
-        modifier = targets.add_modifier(obj, "NODES", NAME)
+        modifier = selection.add_modifier(obj, "NODES", NAME)
         context.view_layer.update()
         cage_nodes.carry(obj, cage, modifier)
     cage.display_type, cage.hide_render = "WIRE", True
@@ -94,9 +92,9 @@ def bind_to_cage(context: bpy.types.Context, objects: list[bpy.types.Object], ca
 
 def _check_carried(objects: list[bpy.types.Object], cage: bpy.types.Object) -> None:
     """UsageError where nodes cannot carry an object: each vertex of its mesh keeps its place in the cage."""
-    for obj in targets.editable(objects, data=True) if objects else ():
-        targets.check_size(obj)
-        targets.check_size(cage)
+    for obj in selection.editable(objects, data=True) if objects else ():
+        selection.check_size(obj)
+        selection.check_size(cage)
         if obj.data.users > 1:
             raise UsageError(
                 f'Object "{obj.name}"',
@@ -107,7 +105,7 @@ def _check_carried(objects: list[bpy.types.Object], cage: bpy.types.Object) -> N
 
 def new_cage(context: bpy.types.Context, objects: list[bpy.types.Object], faces: int) -> bpy.types.Object:
     """A closed mesh of about `faces` triangles around the undeformed `objects`, in their collection."""
-    vertices = [targets.world_vertices(o) for o in objects]
+    vertices = [selection.world_vertices(o) for o in objects]
     starts = np.cumsum([0, *map(len, vertices)])
     everything = np.concatenate(vertices)
     triangles = np.concatenate([mesh_arrays.loop_triangles(o.data) + start for o, start in zip(objects, starts)])
@@ -121,7 +119,7 @@ def new_cage(context: bpy.types.Context, objects: list[bpy.types.Object], faces:
             ("SOLIDIFY", {"thickness": 2 * size / VOXELS, "offset": 0.0}),
             ("REMESH", {"mode": "VOXEL", "voxel_size": size / VOXELS}),
         ):
-            targets.add_modifier(cage, kind, kind, **values)
+            selection.add_modifier(cage, kind, kind, **values)
         _apply(context, cage)
         count = len(mesh_arrays.loop_triangles(cage.data))
         if not count:
@@ -129,7 +127,7 @@ def new_cage(context: bpy.types.Context, objects: list[bpy.types.Object], faces:
                 "Cage", "nothing is left of the objects at this size", "Make the cage by hand and select it"
             )
         ratio = min(1.0, faces / count)
-        targets.add_modifier(cage, "DECIMATE", "DECIMATE", ratio=ratio, use_collapse_triangulate=True)
+        selection.add_modifier(cage, "DECIMATE", "DECIMATE", ratio=ratio, use_collapse_triangulate=True)
         _apply(context, cage)
         clean(cage.data, 1e-4 * size)
     except UsageError:

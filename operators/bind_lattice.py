@@ -8,14 +8,14 @@ from bpy.props import IntVectorProperty
 
 from ..addon import assets
 from ..drgs_blender.core.errors import UsageError
-from . import targets
+from . import selection
 from .base import DrgsOperator
 
 #: The lattice is larger than what it bends: a point on its border would be bent on one side only.
 MARGIN = 1.05
 
 
-class DRGS_OT_bind_to_lattice(DrgsOperator, targets.ObjectMode, bpy.types.Operator):
+class DRGS_OT_bind_to_lattice(DrgsOperator, selection.ObjectMode, bpy.types.Operator):
     """Let a lattice bend the selected DR-GS objects: the one that is selected too, or a new one around them all"""
 
     bl_idname = "drgs.bind_to_lattice"
@@ -33,14 +33,14 @@ class DRGS_OT_bind_to_lattice(DrgsOperator, targets.ObjectMode, bpy.types.Operat
     )
 
     def run(self, context: bpy.types.Context) -> set[str]:
-        objects = targets.editable(targets.selected(context))
-        lattices = list(targets.of_type(context.selected_objects, "LATTICE"))
+        objects = selection.editable(selection.selected(context))
+        lattices = list(selection.of_type(context.selected_objects, "LATTICE"))
         if len(lattices) > 1:
             raise UsageError("Selection", f"holds {len(lattices)} lattices", "Select one, or none for a new one")
         lattice = lattices[0] if lattices else new_lattice(context, objects, tuple(self.points))
         for obj in objects:
-            targets.add_modifier(obj, "LATTICE", "DR-GS Lattice", object=lattice)
-        targets.select_only(context, [lattice], lattice)
+            selection.add_modifier(obj, "LATTICE", "DR-GS Lattice", object=lattice)
+        selection.select_only(context, [lattice], lattice)
         return {"FINISHED"}
 
 
@@ -48,7 +48,7 @@ def new_lattice(
     context: bpy.types.Context, objects: list[bpy.types.Object], points: tuple[int, int, int]
 ) -> bpy.types.Object:
     """A lattice around the undeformed `objects`, with `points` along each axis, in their collection."""
-    low, high = targets.bounds(objects)
+    low, high = selection.bounds(objects)
     data = bpy.data.lattices.new("DR-GS Lattice")
     data.points_u, data.points_v, data.points_w = points
     data.use_outside = False

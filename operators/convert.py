@@ -9,11 +9,11 @@ from bpy.props import BoolProperty, StringProperty
 
 from ..addon import assets, splat_attributes
 from ..drgs_blender.core.errors import UsageError
+from .engine_command import CommandOperator
 from .import_asset import import_assets
-from .program import ProgramOperator
 
 
-class DRGS_OT_convert(ProgramOperator, bpy.types.Operator):
+class DRGS_OT_convert(CommandOperator, bpy.types.Operator):
     """Make the active object, a cloud of splats or a textured mesh, a DR-GS object at the same place"""
 
     bl_idname = "drgs.convert"
@@ -21,13 +21,13 @@ class DRGS_OT_convert(ProgramOperator, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
 
     out: StringProperty(
-        name="Asset",
+        name="Save As",
         description="The file to write; empty is beside the .blend, numbered where an object is made of that",
         subtype="FILE_PATH",
         options={"SKIP_SAVE"},
     )
     use_mesh: BoolProperty(
-        name="Build Mesh",
+        name="Mesh from Splats",
         description="Build a mesh around splats, so that they can be bent and cast shadows. Else light meets the "
         "splats themselves",
         default=True,

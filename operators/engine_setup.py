@@ -16,7 +16,7 @@ from ..addon import engine_link, engine_setup, preferences, setup_job
 from ..drgs_blender.core.errors import UsageError
 from ..drgs_blender.ipc.locate import VARIABLE, locate_engine
 from .base import DrgsOperator
-from .program import say
+from .engine_command import say
 
 
 class DRGS_OT_engine_setup(DrgsOperator, bpy.types.Operator):
@@ -34,7 +34,7 @@ class DRGS_OT_engine_setup(DrgsOperator, bpy.types.Operator):
     )
 
     afresh: BoolProperty(
-        name="Start Afresh",
+        name="Reinstall",
         description="Take nothing of an earlier set-up: makes the environment and fetches the packages anew",
         default=False,
         options={"SKIP_SAVE"},
@@ -53,7 +53,7 @@ class DRGS_OT_engine_setup(DrgsOperator, bpy.types.Operator):
         options={"SKIP_SAVE"},
     )
     index: StringProperty(
-        name="Extra Index",
+        name="Extra Package Index",
         description="Address of a package index that is asked too. Empty: those that pip is configured with",
         options={"SKIP_SAVE"},
     )

@@ -48,7 +48,7 @@ class DRGS_OT_export(SceneFrames, bpy.types.Operator):
     )
     frame_start: IntProperty(name="Frame Start", description="First frame", default=1)
     frame_end: IntProperty(name="End", description="Last frame", default=250)
-    frame_step: IntProperty(name="Step", description="From frame to frame", default=1, min=1)
+    frame_step: IntProperty(name="Step", description="Frames from one file to the next", default=1, min=1)
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         scene = context.scene

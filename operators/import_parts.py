@@ -13,8 +13,8 @@ from ..drgs_blender.core.file_types import READ, extensions
 from ..drgs_blender.core.frame_sequences import frame_path, frames_of, template_of
 from . import sequences
 from .base import DropTarget
+from .engine_command import CommandOperator
 from .import_asset import import_assets
-from .program import ProgramOperator
 
 #: Bytes in which the header of a PLY or glTF file says what it holds, and what only those of splats hold.
 HEADER = 65536
@@ -26,23 +26,23 @@ SPLATS = {
 #: A name that says too little to be caught by it.
 GENERAL = (".json",)
 UP_ITEMS = (
-    ("auto", "Automatic", "As the formats say"),
-    ("z", "Z", ""),
-    ("y", "Y", ""),
+    ("auto", "Automatic", "As the file's format says"),
+    ("z", "Z", "As in Blender"),
+    ("y", "Y", "Most games and glTF"),
     ("-y", "-Y", "Most photogrammetry"),
-    ("-z", "-Z", ""),
+    ("-z", "-Z", "Upside down"),
 )
 
 
-class DRGS_OT_import_parts(ProgramOperator, bpy.types.Operator):
+class DRGS_OT_import_parts(CommandOperator, bpy.types.Operator):
     """Make a .drgs asset from surfels or splats and their mesh, or from a textured mesh alone, and load it"""
 
     bl_idname = "drgs.import_parts"
-    bl_label = "Import Surfels and Mesh"
+    bl_label = "Make Asset"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
 
     surfels: StringProperty(
-        name="Surfels",
+        name="Splats or Surfels",
         description="PLY, SPZ, SOG, ... with surfels or splats; #### stands for the number of a sequence",
         subtype="FILE_PATH",
     )
@@ -53,7 +53,7 @@ class DRGS_OT_import_parts(ProgramOperator, bpy.types.Operator):
     )
     environment: StringProperty(name="Environment", description="EXR or HDR image of the light", subtype="FILE_PATH")
     out: StringProperty(
-        name="Asset",
+        name="Save As",
         description="The file to write; empty is beside the first file, numbered where an object is made of that",
         subtype="FILE_PATH",
         options={"SKIP_SAVE"},
@@ -61,13 +61,13 @@ class DRGS_OT_import_parts(ProgramOperator, bpy.types.Operator):
     up: EnumProperty(name="Up", description="Axis that points up in the files", items=UP_ITEMS, default="auto")
     scale: FloatProperty(name="Scale", description="Factor on all lengths", default=1.0, min=1e-6, max=1e6)
     use_mesh: BoolProperty(
-        name="Build Mesh",
-        description="Where none is given, build one around the surfels, so that they can be bent and cast shadows. "
-        "Else light meets the surfels themselves: for foliage, hair, anything thin",
+        name="Mesh from Splats",
+        description="Where no mesh is given, build one around the splats, so that they can be bent and cast shadows. "
+        "Else light meets the splats themselves: for foliage, hair, anything thin",
         default=True,
     )
     use_remove_light: BoolProperty(
-        name="Remove Light",
+        name="Estimate Colour without Light",
         description="Estimate the albedo of surfels without materials: their captured colour divided by the light that "
         "the environment sends there, with shadows",
         default=False,
@@ -146,7 +146,9 @@ class DRGS_OT_import_parts(ProgramOperator, bpy.types.Operator):
             arguments += ["--env", light]
         if surfels and self.use_remove_light:
             if not light:
-                raise UsageError("Remove Light", "needs the light of the capture", "Choose its environment")
+                raise UsageError(
+                    "Estimate Colour without Light", "needs the light of the capture", "Choose its environment"
+                )
             arguments.append("--remove-light")
         if self.up != "auto":
             arguments.append(f"--up={self.up}")

@@ -7,7 +7,7 @@ from pathlib import Path
 import bpy
 from bpy.props import FloatProperty, StringProperty
 
-from ..addon.lighting import choose_light, nodes_of
+from ..addon.world_setup import choose_light, nodes_of
 from .base import DrgsOperator, DropTarget
 
 SUFFIXES = (".hdr", ".exr")

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import bpy
 
-from . import targets
+from . import selection
 from .base import DrgsOperator
 
 TAG = "DR-GS"
 
 
-class DRGS_OT_mark_assets(DrgsOperator, targets.ObjectMode, bpy.types.Operator):
+class DRGS_OT_mark_assets(DrgsOperator, selection.ObjectMode, bpy.types.Operator):
     """Offer the selected DR-GS objects in the asset browser, with preview and the tag DR-GS"""
 
     bl_idname = "drgs.mark_assets"
@@ -18,7 +18,7 @@ class DRGS_OT_mark_assets(DrgsOperator, targets.ObjectMode, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
 
     def run(self, context: bpy.types.Context) -> set[str]:
-        mark(targets.editable(targets.selected(context), vertices=False))
+        mark(selection.editable(selection.selected(context), vertices=False))
         return {"FINISHED"}
 
 

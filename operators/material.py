@@ -12,9 +12,9 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, StringProperty
 from ..addon import assets, mesh_arrays
 from ..drgs_blender.core.asset import MATERIAL_CHANNELS
 from ..drgs_blender.core.errors import AssetError, UsageError
-from . import targets
+from . import selection
 from .base import DrgsOperator
-from .bind import nearest, source_of
+from .nearest_surface import nearest, source_of
 
 Array = np.ndarray
 Change = Callable[[Array], Array]
@@ -60,10 +60,10 @@ PRESETS = {
 
 def _masks(operator: DRGS_OT_set_material, context: bpy.types.Context, typed: str) -> Iterable[str]:
     """Names that the mask may have, of all selected objects."""
-    return dict.fromkeys(name for o in targets.selected(context) for name in mesh_arrays.mask_names(o, typed))
+    return dict.fromkeys(name for o in selection.selected(context) for name in mesh_arrays.mask_names(o, typed))
 
 
-class DRGS_OT_set_material(DrgsOperator, targets.ObjectMode, bpy.types.Operator):
+class DRGS_OT_set_material(DrgsOperator, selection.ObjectMode, bpy.types.Operator):
     """Give the selected DR-GS objects, or the parts that a mask says, another material"""
 
     bl_idname = "drgs.set_material"
@@ -72,13 +72,13 @@ class DRGS_OT_set_material(DrgsOperator, targets.ObjectMode, bpy.types.Operator)
 
     preset: EnumProperty(
         name="Material",
-        description="What it becomes",
+        description="Material that the objects take",
         items=[(key, p.label, p.about) for key, p in PRESETS.items()],
         default="GOLD",
     )
     factor: FloatProperty(
         name="Factor",
-        description="How much of it; 0 is as before, 1 is all",
+        description="How much of the material is applied: 0 is nothing, 1 is all",
         subtype="FACTOR",
         min=0.0,
         max=1.0,
@@ -86,14 +86,19 @@ class DRGS_OT_set_material(DrgsOperator, targets.ObjectMode, bpy.types.Operator)
     )
     mask: StringProperty(
         name="Mask",
-        description="Vertex group or point attribute that says where, and how much of it; empty is everywhere",
+        description="Vertex group or point attribute that limits the change by its values; empty is everywhere",
         search=_masks,
         options={"SKIP_SAVE"},
     )
-    use_invert: BoolProperty(name="Invert", description="Where the mask is not", default=False, options={"SKIP_SAVE"})
+    use_invert: BoolProperty(
+        name="Invert",
+        description="Apply it where the mask is 0",
+        default=False,
+        options={"SKIP_SAVE"},
+    )
 
     def run(self, context: bpy.types.Context) -> set[str]:
-        objects = targets.editable(targets.selected(context), data=True)
+        objects = selection.editable(selection.selected(context), data=True)
         weights = [self.weight(obj) for obj in objects]  # all of them first: an error leaves every object as it was
         for obj, weight in zip(objects, weights, strict=True):
             set_material(obj, PRESETS[self.preset], weight)
@@ -121,7 +126,7 @@ class DRGS_OT_set_material(DrgsOperator, targets.ObjectMode, bpy.types.Operator)
         return weight
 
 
-class DRGS_OT_restore_material(DrgsOperator, targets.ObjectMode, bpy.types.Operator):
+class DRGS_OT_restore_material(DrgsOperator, selection.ObjectMode, bpy.types.Operator):
     """Give the selected DR-GS objects back the materials of their assets, without adjustments"""
 
     bl_idname = "drgs.restore_material"
@@ -129,14 +134,14 @@ class DRGS_OT_restore_material(DrgsOperator, targets.ObjectMode, bpy.types.Opera
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
 
     def run(self, context: bpy.types.Context) -> set[str]:
-        for obj in targets.editable(targets.selected(context), data=True):
+        for obj in selection.editable(selection.selected(context), data=True):
             for channel in MATERIAL_CHANNELS:
                 mesh_arrays.write_channel(obj.data, channel, captured(obj, channel))
             obj.drgs.adjustment.reset()
         return {"FINISHED"}
 
 
-class DRGS_OT_copy_material(DrgsOperator, targets.ObjectMode, bpy.types.Operator):
+class DRGS_OT_copy_material(DrgsOperator, selection.ObjectMode, bpy.types.Operator):
     """Copy the material of the active DR-GS object to the other selected ones, from the nearest places, with its
     adjustments"""
 
@@ -145,15 +150,15 @@ class DRGS_OT_copy_material(DrgsOperator, targets.ObjectMode, bpy.types.Operator
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
 
     def run(self, context: bpy.types.Context) -> set[str]:
-        *objects, source = targets.selected(context)
+        *objects, source = selection.selected(context)
         if source is not context.active_object or not objects:
             raise UsageError(
                 "Selection", "holds no two DR-GS objects", "Select those to change, then the one to copy from"
             )
         place = source_of(source)
         values = {channel: present(source, channel) for channel in MATERIAL_CHANNELS}
-        for obj in targets.editable(objects, data=True):
-            match = nearest(targets.world_vertices(obj), [place])
+        for obj in selection.editable(objects, data=True):
+            match = nearest(selection.world_vertices(obj), [place])
             for channel, own in values.items():
                 copied = np.einsum("nc,nc...->n...", match.barycentric, own[match.corners])
                 mesh_arrays.write_channel(obj.data, channel, copied)
@@ -161,7 +166,7 @@ class DRGS_OT_copy_material(DrgsOperator, targets.ObjectMode, bpy.types.Operator
         return {"FINISHED"}
 
 
-class DRGS_OT_reset_adjustments(DrgsOperator, targets.ObjectMode, bpy.types.Operator):
+class DRGS_OT_reset_adjustments(DrgsOperator, selection.ObjectMode, bpy.types.Operator):
     """Take the adjustments of the selected DR-GS objects back; what is painted stays"""
 
     bl_idname = "drgs.reset_adjustments"
@@ -169,12 +174,12 @@ class DRGS_OT_reset_adjustments(DrgsOperator, targets.ObjectMode, bpy.types.Oper
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
 
     def run(self, context: bpy.types.Context) -> set[str]:
-        for obj in targets.editable(targets.selected(context), vertices=False):
+        for obj in selection.editable(selection.selected(context), vertices=False):
             obj.drgs.adjustment.reset()
         return {"FINISHED"}
 
 
-class DRGS_OT_paint(DrgsOperator, targets.ObjectMode, bpy.types.Operator):
+class DRGS_OT_paint(DrgsOperator, selection.ObjectMode, bpy.types.Operator):
     """Paint a material channel of the active DR-GS object, as all paint modes do, with Blender's brushes. Other
     objects stay selected"""
 
@@ -184,7 +189,7 @@ class DRGS_OT_paint(DrgsOperator, targets.ObjectMode, bpy.types.Operator):
 
     channel: EnumProperty(
         name="Channel",
-        description="What is painted",
+        description="Attribute that brushes paint",
         items=(
             ("albedo", "Albedo", "The colour of the surface without light"),
             ("roughness", "Roughness", "Black is a mirror, white is matte"),
@@ -194,7 +199,7 @@ class DRGS_OT_paint(DrgsOperator, targets.ObjectMode, bpy.types.Operator):
     )
 
     def run(self, context: bpy.types.Context) -> set[str]:
-        (obj,) = targets.editable(targets.selected(context)[-1:], data=True)
+        (obj,) = selection.editable(selection.selected(context)[-1:], data=True)
         if not obj.visible_get():
             raise UsageError(f'Object "{obj.name}"', "is hidden", "Show it in the Outliner")
         mesh_arrays.make_paintable(obj.data, self.channel, present(obj, self.channel))

@@ -11,8 +11,8 @@ from ..addon import assets, engine_link, reconstruction
 from ..drgs_blender.core.errors import UsageError
 from ..drgs_blender.core.file_types import CAMERAS
 from .base import DrgsOperator
+from .engine_command import CommandOperator
 from .import_asset import import_assets
-from .program import ProgramOperator
 
 
 def _title(cameras: str) -> str:
@@ -22,12 +22,12 @@ def _title(cameras: str) -> str:
 
 #: Choices of what the cameras' matrices are.
 _CAMERAS = (
-    ("opengl", "As the Layout", "The convention of the files' layout"),
+    ("opengl", "Automatic", "What the layout of the files has by convention: COLMAP, NeRF, nerfstudio"),
     *((name, _title(name), meaning.capitalize()) for name, meaning in CAMERAS.items() if name != "opengl"),
 )
 
 
-class DRGS_OT_reconstruct(ProgramOperator, bpy.types.Operator):
+class DRGS_OT_reconstruct(CommandOperator, bpy.types.Operator):
     """Make a DR-GS object of photographs with known cameras (COLMAP, NeRF, nerfstudio). Blender goes on meanwhile"""
 
     bl_idname = "drgs.reconstruct"
@@ -37,18 +37,20 @@ class DRGS_OT_reconstruct(ProgramOperator, bpy.types.Operator):
     filepath: StringProperty(subtype="FILE_PATH", options={"SKIP_SAVE"})
     filter_folder: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
     out: StringProperty(
-        name="Asset",
+        name="Save As",
         description="The file to write; empty is beside the .blend, numbered where an object is made of that",
         subtype="FILE_PATH",
         options={"SKIP_SAVE"},
     )
-    minutes: FloatProperty(name="Minutes", description="About how long it may take", default=10.0, min=0.1, max=1e4)
+    minutes: FloatProperty(
+        name="Time Limit (min)", description="About how long it may take", default=10.0, min=0.1, max=1e4
+    )
     resolution: IntProperty(
         name="Resolution", description="Longer side of the photographs, reduced; 0 is as they are", default=400, min=0
     )
     variant: EnumProperty(
         name="Surfels",
-        description="What becomes of the surfels",
+        description="Which surfels the asset gets",
         items=(
             ("p", "Free", "Stay where they were learned, bound to the mesh"),
             ("m", "On the Mesh", "New ones hang on the mesh's faces"),
@@ -56,17 +58,18 @@ class DRGS_OT_reconstruct(ProgramOperator, bpy.types.Operator):
         default="p",
     )
     use_materials: BoolProperty(
-        name="Materials", description="Pull materials apart from the light of the photographs", default=True
+        name="Materials", description="Separate the materials from the light of the photographs", default=True
     )
     test_every: IntProperty(
-        name="Test Every",
-        description="Leave out every so-manyth view, and measure on those; 0 leaves out what the capture says",
+        name="Hold Out Every Nth Photo",
+        description="Learn nothing from every nth photograph, and measure the result on those; 0 holds out what the "
+        "capture names for tests",
         default=0,
         min=0,
     )
     axes: EnumProperty(
-        name="Cameras",
-        description="What the cameras' matrices are taken for; a message names it (--axes) where another one fits",
+        name="Camera Convention",
+        description="Axes of the cameras' matrices. Where another one fits better, a message names it (--axes)",
         items=_CAMERAS,
         default="opengl",
         options={"SKIP_SAVE"},
@@ -138,7 +141,7 @@ class DRGS_OT_reconstruct(ProgramOperator, bpy.types.Operator):
         return {"FINISHED"}
 
     def clear(self) -> None:
-        ProgramOperator.clear(self)
+        CommandOperator.clear(self)
         reconstruction.job = None
         _redraw(bpy.context)
 

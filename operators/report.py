@@ -14,7 +14,7 @@ from ..addon import assets, engine_link, messages
 from ..drgs_blender.core.errors import DrgsError, UsageError, WriteError
 from ..drgs_blender.core.version import __version__
 from ..drgs_blender.ipc.child_process import clean_environment
-from . import targets
+from . import selection
 from .base import DrgsOperator
 
 #: Seconds after which the engine's own diagnosis is given up.
@@ -39,7 +39,7 @@ class DRGS_OT_select_named(DrgsOperator, bpy.types.Operator):
         obj = context.view_layer.objects.get(self.name)
         if obj is None:
             raise UsageError(f'Object "{self.name}"', "is not in this view layer", "It may have another name now")
-        targets.select_only(context, [obj], obj)
+        selection.select_only(context, [obj], obj)
         return {"FINISHED"}
 
 

@@ -15,13 +15,13 @@ from ..drgs_blender.core.asset import MATERIAL_CHANNELS
 from ..drgs_blender.core.asset.container import write_asset
 from ..drgs_blender.core.errors import UsageError
 from ..drgs_blender.core.material_adjustments import edited_asset
-from . import targets
+from . import selection
 from .base import DrgsOperator
 
 SUFFIX = ".drgs"
 
 
-class DRGS_OT_save_asset(DrgsOperator, targets.ObjectMode, bpy.types.Operator):
+class DRGS_OT_save_asset(DrgsOperator, selection.ObjectMode, bpy.types.Operator):
     """Write the selected DR-GS objects with their painted and adjusted materials as new .drgs assets"""
 
     bl_idname = "drgs.save_asset"
@@ -37,14 +37,14 @@ class DRGS_OT_save_asset(DrgsOperator, targets.ObjectMode, bpy.types.Operator):
     filter_glob: StringProperty(default="*.drgs", options={"HIDDEN"})
     check_existing: BoolProperty(default=True, options={"HIDDEN"})
     use_saved: BoolProperty(
-        name="Use It",
-        description="Make the objects those of the new files, without adjustments of their own",
+        name="Link Objects to New File",
+        description="The objects use the new files from now on; their adjustments, which are in these, are reset",
         default=False,
     )
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         if not self.filepath:
-            name = bpy.path.clean_name(targets.selected(context)[-1].name)
+            name = bpy.path.clean_name(selection.selected(context)[-1].name)
             self.filepath = os.path.join(os.path.dirname(bpy.data.filepath), f"{name} edited{SUFFIX}")
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
@@ -53,7 +53,7 @@ class DRGS_OT_save_asset(DrgsOperator, targets.ObjectMode, bpy.types.Operator):
         if not self.filepath:
             raise UsageError("Asset", "has no file to go to", "Choose one")
         path = Path(bpy.path.ensure_ext(bpy.path.abspath(self.filepath), SUFFIX))
-        objects = targets.editable(targets.selected(context), vertices=False)
+        objects = selection.editable(selection.selected(context), vertices=False)
         paths = [path] if len(objects) == 1 else [path.with_name(bpy.path.clean_name(o.name) + SUFFIX) for o in objects]
         if len(set(paths)) < len(paths):
             raise UsageError("Objects", "have names that make the same file name", "Rename one")
@@ -64,7 +64,7 @@ class DRGS_OT_save_asset(DrgsOperator, targets.ObjectMode, bpy.types.Operator):
         for obj, target in zip(objects, paths):
             save(obj, target, context.evaluated_depsgraph_get())
         if self.use_saved:
-            for obj, target in zip(targets.editable(objects, vertices=False, data=True), paths):
+            for obj, target in zip(selection.editable(objects, vertices=False, data=True), paths):
                 obj.drgs.asset = assets.anchor(target)
                 obj.drgs.adjustment.reset()
                 mesh = assets.load(target).mesh

@@ -17,13 +17,13 @@ from ..drgs_blender.core.file_types import Held
 from ..drgs_blender.core.frame import Frame
 from ..drgs_blender.core.frame_sequences import frame_path
 from ..drgs_blender.ipc.frame_file import SUFFIX, write_frame_file
-from .program import ProgramOperator
+from .engine_command import CommandOperator
 
 #: Stands for the number of a frame in the names of files.
 NUMBER = "####"
 
 
-class SceneFrames(ProgramOperator):
+class SceneFrames(CommandOperator):
     """Base of operators that make something of DR-GS objects as they are posed, painted and lit in the scene."""
 
     use_selection: BoolProperty(

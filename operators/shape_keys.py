@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import bpy
 import numpy as np
 
-if TYPE_CHECKING:
-    from .bind import Match
+from .nearest_surface import Match
 
 Array = np.ndarray
 

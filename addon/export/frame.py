@@ -11,16 +11,16 @@ import bpy
 from ...drgs_blender.core.errors import UsageError
 from ...drgs_blender.core.frame import Camera, Frame
 from .. import assets, compositing, preferences
-from ..limits import Limited
 from ..passes import enabled
+from ..property_limits import Limited
 from .camera import export_camera, picture_of
+from .export_cache import ExportCache, uid
 from .images import end_export
 from .instances import UNRENDERED, Unrendered, Visible, uncancelled, visible
 from .lights import export_light
 from .materials import Materials
-from .memory import Memory, uid
 from .meshes import Meshes
-from .moments import FrameSet, add_moments
+from .motion_steps import FrameSet, add_moments
 from .objects import DrgsObjects
 from .world import export_world
 
@@ -35,7 +35,7 @@ def export_frame(
     *,
     camera: Camera | None = None,
     frame_set: FrameSet | None = None,
-    memory: Memory | None = None,
+    cache: ExportCache | None = None,
     shown: Callable[[bpy.types.Object], bool] | None = None,
     passes: tuple[str, ...] | None = None,
     cancelled: Callable[[], bool] | None = None,
@@ -48,7 +48,7 @@ def export_frame(
     warn : told of everything that cannot be rendered as the scene has it
     camera : replaces the scene's camera
     frame_set : evaluates the scene at another frame, for passes of motion; without it nothing moves
-    memory : what earlier exports of the same depsgraph made and is still true
+    cache : what earlier exports of the same depsgraph made and is still true
     shown : whether an evaluated object is in the picture; all are when None
     passes : replace those of the view layer
     cancelled : asked before each object
@@ -72,8 +72,8 @@ def export_frame(
     # As in Cycles, a view layer may replace all materials and, in later Blenders, the world.
     world = getattr(layer, "world_override", None) or scene.world
     materials, unrendered, lights = Materials(warn, layer.material_override), Unrendered(), []
-    memory = Memory() if memory is None else memory
-    objects, meshes = DrgsObjects(depsgraph, key_of, warn, memory), Meshes(depsgraph, materials, warn, memory)
+    cache = ExportCache() if cache is None else cache
+    objects, meshes = DrgsObjects(depsgraph, key_of, warn, cache), Meshes(depsgraph, materials, warn, cache)
     others = Limited(depsgraph.view_layer.drgs, f'View layer "{depsgraph.view_layer.name}"', warn).others
     for item in uncancelled(visible(depsgraph), cancelled):
         if shown is not None and not shown(item.object):
@@ -99,14 +99,14 @@ def export_frame(
         noise_index=scene.frame_current if settings.use_animated_seed else 0,
         camera=camera,
         objects=objects.states,
-        world=memory.recall(("world", uid(world)), (), lambda: export_world(world, warn)),
+        world=cache.get(("world", uid(world)), (), lambda: export_world(world, warn)),
         settings=settings.to_settings(scene.render.film_transparent, preferences.read("threads", 0), warn),
         passes=passes or tuple(p.name for p in enabled(scene, depsgraph.view_layer)),
         meshes=meshes.states(),
         lights=lights,
         images=list(materials.images.values()),
     )
-    memory.end()
+    cache.end()
     end_export()
     if frame_set is not None and own_camera:
         add_moments(frame, depsgraph, frame_set, objects.keys, meshes.keys(), cancelled)

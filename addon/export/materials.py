@@ -12,8 +12,8 @@ from ...drgs_blender.core.frame import Image, Material, Texture
 from . import images
 from .node_math import reflectance
 from .nodes import Paint, Walker, constant, euler, once, plain, vector_rotate
-from .pictures import Picture
 from .sockets import Place, surface_of
+from .texture_refs import TextureRef
 
 Warn = Callable[[str], None]
 Array = np.ndarray
@@ -98,7 +98,7 @@ class Materials:
         for name, paint in paints.items():
             picture = paint.texture
             values[name] = _usable(tree, name, paint, getattr(DEFAULT.material, name))
-            if isinstance(picture, Picture):
+            if isinstance(picture, TextureRef):
                 values[f"{name}_texture"] = self._texture(picture)
                 maps.append(picture.uv_map)
         if len(set(maps)) > 1:
@@ -106,7 +106,7 @@ class Materials:
             self._warn(f'Material "{material.name}": of its UV maps ({names}) only the first is used')
         return Look(Material(material.name, **values), maps[0] if maps else None)
 
-    def _texture(self, picture: Picture) -> Texture:
+    def _texture(self, picture: TextureRef) -> Texture:
         exported = picture.export(self._warn)
         self.images[exported.name] = exported
         return picture.texture(exported.name)
@@ -163,13 +163,13 @@ class _Tree(Walker):
 
     # Textures
 
-    def mean(self, texture: Picture) -> Array:
+    def mean(self, texture: TextureRef) -> Array:
         return texture.mean(self._warn)
 
-    def channel(self, texture: Picture, name: str) -> Picture:
+    def channel(self, texture: TextureRef, name: str) -> TextureRef:
         return texture.only(name)
 
-    def curved(self, texture: Picture, function: Callable[[Array], Array]) -> Paint | None:
+    def curved(self, texture: TextureRef, function: Callable[[Array], Array]) -> Paint | None:
         found = texture.curved(function, self._warn)
         return None if found is None else Paint(np.full(3, found[1]), found[0])
 
@@ -187,7 +187,7 @@ class _Tree(Walker):
         matrix, uv_map = self.coordinates(output.input("Vector"))
         return Paint(
             np.ones(3),
-            Picture(
+            TextureRef(
                 image,
                 straight,
                 "a" if output.socket.name == "Alpha" else "rgb",

@@ -11,9 +11,9 @@ import numpy as np
 
 from ...drgs_blender.core.frame import Image, Material, MeshState
 from .. import mesh_arrays
+from .export_cache import ExportCache, uid
 from .instances import Key, Visible
 from .materials import DEFAULT, Look, Materials
-from .memory import Memory, uid
 
 Warn = Callable[[str], None]
 Array = np.ndarray
@@ -55,8 +55,8 @@ class _Arrays:
 class Meshes:
     """Collects the meshes of one export. Those with the same data, materials and visibility are one shape."""
 
-    def __init__(self, depsgraph: bpy.types.Depsgraph, materials: Materials, warn: Warn, memory: Memory) -> None:
-        self._depsgraph, self._materials, self._warn, self._memory = depsgraph, materials, warn, memory
+    def __init__(self, depsgraph: bpy.types.Depsgraph, materials: Materials, warn: Warn, cache: ExportCache) -> None:
+        self._depsgraph, self._materials, self._warn, self._cache = depsgraph, materials, warn, cache
         self._shapes: dict[tuple[object, ...], _Shape] = {}
 
     def add(self, item: Visible) -> None:
@@ -72,8 +72,8 @@ class Meshes:
         if shape is None:
             owners = uid(obj.data), uid(obj)
             stands = (*owners, obj.data.as_pointer(), obj.data.is_editmode)
-            arrays = self._memory.recall(("arrays", *stands), owners, lambda: self._arrays(obj))
-            state, pictures = self._memory.recall(
+            arrays = self._cache.get(("arrays", *stands), owners, lambda: self._arrays(obj))
+            state, pictures = self._cache.get(
                 ("mesh", *stands, obj.name, *key), owners, lambda: self._state(item, slots, arrays)
             )
             self._materials.images |= pictures

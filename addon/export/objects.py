@@ -11,11 +11,10 @@ import numpy as np
 
 from ...drgs_blender.core.asset import MATERIAL_CHANNELS, Asset
 from ...drgs_blender.core.frame import Adjustment, ObjectState
-from .. import assets, mesh_arrays
-from ..matter import playback
-from .fit import check_fit, check_modifiers
+from .. import assets, cache_playback, mesh_arrays
+from .export_cache import ExportCache, uid
 from .instances import Key, Visible
-from .memory import Memory, uid
+from .topology_check import check_modifiers, check_topology
 
 Warn = Callable[[str], None]
 #: Gives the engine's key of the asset at a path.
@@ -25,8 +24,8 @@ KeyOf = Callable[[Path], str]
 class DrgsObjects:
     """Collects the DR-GS objects of one export."""
 
-    def __init__(self, depsgraph: bpy.types.Depsgraph, key_of: KeyOf, warn: Warn, memory: Memory) -> None:
-        self._depsgraph, self._key_of, self._warn, self._memory = depsgraph, key_of, warn, memory
+    def __init__(self, depsgraph: bpy.types.Depsgraph, key_of: KeyOf, warn: Warn, cache: ExportCache) -> None:
+        self._depsgraph, self._key_of, self._warn, self._cache = depsgraph, key_of, warn, cache
         self.states: list[ObjectState] = []
         self.keys: list[Key] = []
 
@@ -41,9 +40,9 @@ class DrgsObjects:
         """
         obj = item.object
         check_modifiers(obj, self._depsgraph)
-        playback.check(obj, self._warn, final=self._depsgraph.mode == "RENDER")
-        look = obj.drgs.show_captured, obj.drgs.adjustment.values(), *playback.look_of(obj).items()
-        shape = self._memory.recall(
+        cache_playback.check(obj, self._warn, final=self._depsgraph.mode == "RENDER")
+        look = obj.drgs.show_captured, obj.drgs.adjustment.values(), *cache_playback.look_of(obj).items()
+        shape = self._cache.get(
             ("object", uid(obj), obj.name, obj.data.as_pointer(), obj.mode, str(assets.file_of(obj)), look),
             (uid(obj), uid(obj.data)),
             lambda: _shape(obj, self._depsgraph, self._key_of, self._warn),
@@ -62,7 +61,7 @@ def _shape(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, key_of: KeyOf,
     editing, captured = obj.mode == "EDIT", obj.drgs.show_captured
     mesh = obj.to_mesh(preserve_all_data_layers=True, depsgraph=depsgraph) if editing else obj.data
     try:
-        same_faces = check_fit(obj, mesh, asset.mesh, warn)
+        same_faces = check_topology(obj, mesh, asset.mesh, warn)
         arrays = {
             "vertices": mesh_arrays.read_vertices(mesh),
             "corner_normals": _corner_normals(obj, mesh, same_faces, warn),
@@ -71,7 +70,7 @@ def _shape(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, key_of: KeyOf,
         for array in arrays.values():
             if array is not None:
                 array.flags.writeable = False  # so that the engine's client need not copy it
-        look = playback.look_of(obj)
+        look = cache_playback.look_of(obj)
         adjustment = None if captured else _adjustment(obj, mesh, warn)
         return ObjectState(name=obj.name, asset=key_of(path), adjustment=adjustment, **arrays, **look)
     finally:
@@ -87,7 +86,7 @@ def look_of(obj: bpy.types.Object, asset: Asset, warn: Warn) -> tuple[dict[str, 
     AssetError
         Its mesh is not the asset's, moved; names the object.
     """
-    check_fit(obj, obj.data, asset.mesh, warn)
+    check_topology(obj, obj.data, asset.mesh, warn)
     painted = {channel: _edited(obj, obj.data, asset, channel, warn) for channel in MATERIAL_CHANNELS}
     return {name: values for name, values in painted.items() if values is not None}, _adjustment(obj, obj.data, warn)
 

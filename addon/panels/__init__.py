@@ -4,17 +4,31 @@ from __future__ import annotations
 
 import bpy
 
-from . import adjustment, compositing, header, matter, object_data, rays, render, sidebar, submit, tour, view_layer
+from . import (
+    adjustment,
+    compositing,
+    header,
+    object_data,
+    physics,
+    preferences,
+    ray_visibility,
+    render,
+    sidebar,
+    submit,
+    view_layer,
+    workflow,
+)
 
 CLASSES = (
+    *preferences.CLASSES,
     *render.CLASSES,
     *submit.CLASSES,
     *view_layer.CLASSES,
     *object_data.CLASSES,
-    *matter.CLASSES,
-    *rays.CLASSES,
+    *physics.CLASSES,
+    *ray_visibility.CLASSES,
     *compositing.CLASSES,
-    *tour.CLASSES,
+    *workflow.CLASSES,
     *sidebar.CLASSES,
     *adjustment.CLASSES,
 )

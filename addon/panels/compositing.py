@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from .. import compositing
-from .tour import wrapped
+from .text_layout import wrapped
 
 
 class DRGS_PT_compositing(bpy.types.Panel):

@@ -10,7 +10,7 @@ import bpy
 from ...drgs_blender.core.version import __version__
 from .. import assets, engine_link, messages, preferences
 from .object_data import draw_asset
-from .tour import POPOVER, wrapped
+from .text_layout import POPOVER, wrapped
 
 ICONS = {"INFO": "INFO", "WARNING": "ERROR", "ERROR": "CANCEL"}
 SHOWN = 8

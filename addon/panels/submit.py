@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from .. import submit
-from .tour import wrapped
+from .text_layout import wrapped
 
 
 class DRGS_PT_submit(bpy.types.Panel):

@@ -15,7 +15,7 @@ import numpy as np
 
 from ...drgs_blender.core.frame import Frame
 from ...drgs_blender.ipc import blur
-from ..limits import Limited
+from ..property_limits import Limited
 
 Warn = Callable[[str], None]
 

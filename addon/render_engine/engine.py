@@ -15,7 +15,7 @@ from ...drgs_blender.core.frame import Frame
 from ...drgs_blender.core.phases import is_preparing
 from ...drgs_blender.ipc.blur import averaged, share, sharp
 from ...drgs_blender.ipc.protocol import Passes
-from .. import engine_link, farm, messages
+from .. import background_render, engine_link, messages
 from ..export import export_frame
 from ..export.instances import uncancelled
 from ..passes import blender_name, enabled
@@ -107,7 +107,7 @@ class DrgsRenderEngine(bpy.types.RenderEngine):
         """Report an error. `error_set` would let Blender write a black picture and go on."""
         messages.note("ERROR", text)
         self.report({"ERROR"}, text)
-        farm.fail(text, code)
+        background_render.fail(text, code)
 
     def _render(self, depsgraph: bpy.types.Depsgraph) -> None:
         warn = messages.Warnings(messages.warned)

@@ -12,19 +12,19 @@ def _changed(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = Non
     """Called after every evaluation of a scene, a new frame's included; for final renders on another thread."""
     if depsgraph is not None and depsgraph.mode == "VIEWPORT":
         scenes.changed(depsgraph)
-        surfels.memory.note(depsgraph)
+        surfels.cache.note(depsgraph)
 
 
 @bpy.app.handlers.persistent
 def _forget(*_: object) -> None:
     views.forget()
-    surfels.memory.clear()
+    surfels.cache.clear()
 
 
 @bpy.app.handlers.persistent
 def _undone(*_: object) -> None:
     scenes.forget()
-    surfels.memory.clear()
+    surfels.cache.clear()
 
 
 #: Name of the handler list -> what is called. After undo, nothing is where it was in memory.

@@ -10,7 +10,7 @@ import gpu
 import numpy as np
 from gpu_extras.batch import batch_for_shader
 
-from . import display
+from .view_transform import HIGH, LOW, SIZE
 
 Array = np.ndarray
 Rect = tuple[float, float, float, float]
@@ -52,8 +52,8 @@ vec3 decoded(vec3 colour)
 _COMPOSITE = f"""{_DECODE}
 vec3 shown(vec3 light)
 {{
-  const float last = {display.SIZE - 1}.0;
-  vec3 place = (log2(max(light, vec3(0.0)) + exp2({display.LOW})) - {display.LOW}) / {display.HIGH - display.LOW};
+  const float last = {SIZE - 1}.0;
+  vec3 place = (log2(max(light, vec3(0.0)) + exp2({LOW})) - {LOW}) / {HIGH - LOW};
   place = clamp(place, 0.0, 1.0) * last;
   ivec3 low = ivec3(min(place, vec3(last - 1.0)));
   vec3 share = place - vec3(low);
@@ -62,7 +62,7 @@ vec3 shown(vec3 light)
     ivec3 step = ivec3(corner & 1, (corner >> 1) & 1, corner >> 2);
     vec3 weight = mix(1.0 - share, share, vec3(step));
     ivec3 cell = low + step;
-    sum += weight.x * weight.y * weight.z * texelFetch(table, ivec2(cell.x, cell.y + {display.SIZE} * cell.z), 0).rgb;
+    sum += weight.x * weight.y * weight.z * texelFetch(table, ivec2(cell.x, cell.y + {SIZE} * cell.z), 0).rgb;
   }}
   return sum;
 }}

@@ -13,20 +13,20 @@ import bpy
 import gpu
 import numpy as np
 
-from .. import assets, messages
+from .. import messages
 from ..export.view import setback
-from . import display, draw, surfels, views
+from . import draw, surfels, view_transform, views
 
 #: Of Blender's tables of display colours, those that were needed: as arrays, and as textures once they were drawn.
-_tables: dict[display.Key, gpu.types.GPUTexture] = {}
-_failed: set[display.Key] = set()
+_tables: dict[view_transform.Key, gpu.types.GPUTexture] = {}
+_failed: set[view_transform.Key] = set()
 _handle: object | None = None
 
 
 def _lit(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> str:
     """Draw the picture of the engine; return an error or ""."""
     scene, name = context.scene, views.name_of(context.region)
-    key = display.key_of(scene)
+    key = view_transform.key_of(scene)
     if key not in _tables:
         if not bpy.app.timers.is_registered(_make_table) and key not in _failed:
             bpy.app.timers.register(_make_table, first_interval=0.0)
@@ -88,30 +88,17 @@ def _draw() -> None:
 def _make_table() -> None:
     """Make the table that the scene of the window needs, outside of any drawing."""
     for window in bpy.context.window_manager.windows:
-        key = display.key_of(window.scene)
+        key = view_transform.key_of(window.scene)
         if window.scene.drgs.overlay != "LIT" or key in _tables or key in _failed:
             continue
         try:
-            _tables[key] = draw.texture(display.table(key))
+            _tables[key] = draw.texture(view_transform.table(key))
         except (RuntimeError, OSError, TypeError) as error:
             _failed.add(key)
             problem = f"The view transform {key[1]} cannot be read ({error}), and Lit needs it"
             messages.note("ERROR", f"{problem}. Choose another in Render > Color Management")
         for area in window.screen.areas:
             area.tag_redraw()
-
-
-def switched(scene: bpy.types.Scene) -> None:
-    """Show the meshes of DR-GS objects as boxes while something is drawn in their place, else as they were."""
-    for obj in scene.objects:
-        if not assets.is_drgs(obj) or obj.library is not None:
-            continue
-        settings = obj.drgs
-        if scene.drgs.overlay != "OFF":
-            if obj.display_type != "BOUNDS":
-                settings.shown_as, obj.display_type = obj.display_type, "BOUNDS"
-        elif settings.shown_as:
-            obj.display_type, settings.shown_as = settings.shown_as, ""
 
 
 def register() -> None:

@@ -15,7 +15,7 @@ from ...drgs_blender.ipc.change_detection import renewed
 from .. import messages
 from ..export import export_frame
 from ..export.camera import NO_CAMERA
-from ..export.memory import Memory
+from ..export.export_cache import ExportCache
 
 #: Scene, view layer, and the local view of a viewport ("" for none).
 Key = tuple[str, str, str]
@@ -39,7 +39,7 @@ class Exported:
 
 @dataclass(slots=True)
 class _Scene:
-    memory: Memory = field(default_factory=Memory)
+    cache: ExportCache = field(default_factory=ExportCache)
     exported: Exported | None = None
     current: bool = False
 
@@ -59,13 +59,13 @@ def exported(
     key = depsgraph.scene.name_full, depsgraph.view_layer.name, local
     scene = _scenes.setdefault(key, _Scene())
     if not scene.current or scene.exported is None:
-        made = _export(depsgraph, scene.memory, shown)
+        made = _export(depsgraph, scene.cache, shown)
         scene.exported, scene.current = renewed(made, scene.exported), True
     return scene.exported
 
 
 def _export(
-    depsgraph: bpy.types.Depsgraph, memory: Memory, shown: Callable[[bpy.types.Object], bool] | None
+    depsgraph: bpy.types.Depsgraph, cache: ExportCache, shown: Callable[[bpy.types.Object], bool] | None
 ) -> Exported:
     assets: dict[str, tuple[int, int]] = {}
 
@@ -73,7 +73,7 @@ def _export(
         return os.path.realpath(path)  # as the engine makes it; it is asked later, by the worker
 
     try:
-        frame = export_frame(depsgraph, key_of, messages.Warnings(), camera=NO_CAMERA, memory=memory, shown=shown)
+        frame = export_frame(depsgraph, key_of, messages.Warnings(), camera=NO_CAMERA, cache=cache, shown=shown)
     except DrgsError as error:
         messages.note("ERROR", str(error))
         return Exported(error=str(error))
@@ -88,7 +88,7 @@ def changed(depsgraph: bpy.types.Depsgraph) -> None:
     names = depsgraph.scene.name_full, depsgraph.view_layer.name
     for key, scene in _scenes.items():
         if key[:2] == names:
-            scene.memory.note(depsgraph)
+            scene.cache.note(depsgraph)
             scene.current = False
 
 

@@ -11,7 +11,7 @@ from ...drgs_blender.core.asset import Asset
 from ...drgs_blender.core.errors import DrgsError
 from ...drgs_blender.core.material_adjustments import edited_asset
 from .. import assets, mesh_arrays
-from ..export.memory import Memory, uid
+from ..export.export_cache import ExportCache, uid
 from ..export.objects import look_of
 from . import draw
 
@@ -19,7 +19,7 @@ Array = np.ndarray
 
 #: Diameter of a disc in standard deviations of its surfel: neighbours just overlap.
 _WIDTH = 2.5
-memory = Memory()
+cache = ExportCache()
 
 
 def places(asset: Asset, vertices: Array) -> Array:
@@ -47,13 +47,13 @@ def show(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
             continue
         look = obj.drgs.show_captured, obj.drgs.adjustment.values()
         key = "object", uid(obj), obj.data.as_pointer(), obj.mode, look
-        batch = memory.recall(key, (uid(obj), uid(obj.data)), lambda obj=obj: _batch(obj))
+        batch = cache.get(key, (uid(obj), uid(obj.data)), lambda obj=obj: _batch(obj))
         if batch is None:
             continue
         matrix: Matrix = instance.matrix_world
         scale = 0.5 * region.height * rv3d.window_matrix[1][1] * matrix.median_scale
         draw.discs(batch, rv3d.perspective_matrix @ matrix, scale, rv3d.is_perspective)
-    memory.end()
+    cache.end()
 
 
 def _batch(obj: bpy.types.Object) -> gpu.types.GPUBatch | None:

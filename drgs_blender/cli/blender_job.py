@@ -206,7 +206,7 @@ def _caches() -> Iterator[tuple[str, str]]:
             if modifier.type == "MESH_CACHE" and modifier.filepath:
                 stored, found = modifier.filepath, bpy.path.abspath(modifier.filepath, library=obj.library)
                 yield stored, found
-                if modifier.name.startswith("DR-GS Matter"):
+                if modifier.name.startswith("DR-GS Physics"):
                     cut = len(os.path.basename(stored.replace("\\", "/")))
                     yield stored[:-cut] + "cache.json", os.path.join(os.path.dirname(found), "cache.json")
 

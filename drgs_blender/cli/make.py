@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--pose",
         choices=("rest", "default"),
         default="rest",
-        help="of a skinned glTF: as Blender's importer rests it, for Bind to Rig (default), or as viewers show it",
+        help="of a skinned glTF: as Blender's importer rests it, for Transfer Rig (default), or as viewers show it",
     )
     parser.add_argument("--scale", type=positive, default=1.0, metavar="S", help="factor on all lengths")
     parser.add_argument("--env", type=Path, help="environment kept in the asset")

@@ -88,11 +88,11 @@ def ball(scene, ball_file):
 @pytest.fixture
 def body(ball):
     """The sphere as matter, coarse and soft, that falls for a few frames."""
-    from matter_scenes import FRAMES  # the extension is not installed before
+    from physics_scenes import FRAMES  # the extension is not installed before
 
-    matter = ball.drgs.matter
-    matter.use = True
-    matter.young, matter.resolution, matter.frame_end = 2e4, 8, FRAMES
+    physics = ball.drgs.physics
+    physics.use = True
+    physics.young, physics.resolution, physics.frame_end = 2e4, 8, FRAMES
     return ball
 
 

@@ -133,7 +133,7 @@ def test_nothing_is_baked_over_a_material_or_of_what_is_not_rendered(lit):
 
 @pytest.mark.slow
 def test_a_mesh_that_is_edited_during_a_bake_is_told(lit, monkeypatch):
-    program = part("operators.program").ProgramOperator
+    program = part("operators.engine_command").CommandOperator
     finish = program._finish
 
     def edited(self, context):

@@ -1,4 +1,4 @@
-"""Bind to Rig: a DR-GS object follows the rig of another mesh exactly as that mesh does."""
+"""Transfer Rig: a DR-GS object follows the rig of another mesh exactly as that mesh does."""
 
 from __future__ import annotations
 

@@ -167,7 +167,7 @@ def test_what_surface_deform_refuses_carries_by_nodes(pair):
     select(cage, *pair)
     assert bpy.ops.drgs.bind_to_cage() == {"FINISHED"}
     assert cage.hide_render and [m.type for o in pair for m in o.modifiers] == ["NODES", "NODES"]
-    assert part("addon.tour").poser_of(pair[0]) == cage
+    assert part("addon.workflow").poser_of(pair[0]) == cage
     for obj, rest in zip(pair, before):
         np.testing.assert_allclose(world_vertices(obj), rest, atol=1e-5)
     turn = Matrix.Translation((0, 2, 1)) @ Matrix.Rotation(1.0, 4, (1, 2, 3)) @ Matrix.Scale(1.5, 4)

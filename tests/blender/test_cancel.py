@@ -98,7 +98,7 @@ def test_export_stops_before_the_next_object(lit, escape, captured, monkeypatch)
                 escape.append(time.perf_counter())
             yield item
 
-    for module in ("frame", "moments"):
+    for module in ("frame", "motion_steps"):
         monkeypatch.setattr(part(f"addon.export.{module}"), "visible", watched)
     for turn in range(TIMES):
         last = 3 + 11 * (turn % 11)  # of three evaluations of 42 objects

@@ -147,7 +147,7 @@ def test_picture_of_a_region_stays_in_it(with_gpu):
 
 def test_composite_is_hidden_by_what_is_nearer(with_gpu):
     """Left half 2 m, right half 6 m away, an object at 4 m: only the left half is seen; empty pixels never are."""
-    draw, display = part("addon.viewport.draw"), part("addon.viewport.display")
+    draw, display = part("addon.viewport.draw"), part("addon.viewport.view_transform")
     near, far, away = 1.0, 100.0, 4.0
     projection = np.diag([1.0, 1.0, -(far + near) / (far - near), 0.0])
     projection[2, 3], projection[3, 2] = -2 * far * near / (far - near), -1.0

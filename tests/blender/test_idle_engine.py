@@ -6,7 +6,7 @@ from pathlib import Path
 
 import bpy
 import pytest
-from matter_scenes import work
+from physics_scenes import bake_job
 from scenes import mesh_object, part, select, sphere
 
 SAYS = r"drgs {} of .*idle ended without an error but has not written {}.*the engine of this extension"
@@ -74,7 +74,7 @@ def test_no_job_is_said_to_be_written(ball, scene, idle, manager):
 
 
 def test_no_bake_and_no_preview_is_said_to_be_done(body, idle):
-    refused(bpy.ops.drgs.bake_matter, "simulate", "frames 1 to 6 in .*drgs_cache")
-    assert not work.running and not body.modifiers
-    refused(bpy.ops.drgs.preview_matter, "simulate", "the particles in")
-    assert not work.running
+    refused(bpy.ops.drgs.bake_physics, "simulate", "frames 1 to 6 in .*drgs_cache")
+    assert not bake_job.running and not body.modifiers
+    refused(bpy.ops.drgs.show_particles, "simulate", "the particles in")
+    assert not bake_job.running

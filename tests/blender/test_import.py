@@ -270,9 +270,9 @@ def test_nothing_is_put_into_a_collection_of_a_library(scene, tmp_path):
     assert len(scene.collection.objects) == 5
 
 
-def test_matter_of_a_linked_object_stays_as_it_is(scene, ball, tmp_path):
+def test_physics_of_a_linked_object_stay_as_it_is(scene, ball, tmp_path):
     """Blender would change it in memory and lose it with the file."""
-    ball.drgs.matter.use = True
+    ball.drgs.physics.use = True
     bpy.data.libraries.write(str(tmp_path / "library.blend"), {ball})
     bpy.data.objects.remove(ball)
     with bpy.data.libraries.load(str(tmp_path / "library.blend"), link=True) as (_, wanted):
@@ -280,10 +280,10 @@ def test_matter_of_a_linked_object_stays_as_it_is(scene, ball, tmp_path):
     linked = bpy.data.objects["ball"]
     scene.collection.objects.link(linked)
     select(linked)
-    for operator in (bpy.ops.drgs.matter_row, bpy.ops.drgs.free_matter):
+    for operator in (bpy.ops.drgs.physics_row, bpy.ops.drgs.free_physics):
         with pytest.raises(RuntimeError, match=r'"ball".*comes from a library.*Make Local'):
             operator()
-    assert not linked.drgs.matter.regions
+    assert not linked.drgs.physics.regions
 
 
 def test_a_preset_that_cannot_be_used_is_named(scene, monkeypatch, tmp_path):

@@ -132,16 +132,16 @@ def test_every_panel_draws_and_every_poll_answers(scene, ball_file, loaded):
     if loaded:
         bpy.ops.import_scene.drgs(filepath=str(ball_file))
         part("addon.messages").note("WARNING", "a rather long message " * 6)
-        matter = bpy.context.object.drgs.matter
-        matter.use = matter.use_floor = True
+        physics = bpy.context.object.drgs.physics
+        physics.use = physics.use_floor = True
         for rows in ("regions", "colliders"):
-            bpy.ops.drgs.matter_row(rows=rows)
+            bpy.ops.drgs.physics_row(rows=rows)
     classes = part("addon.panels").CLASSES
     assert len(classes) >= 8
     drawn = 0
     for cls in classes:
         if getattr(cls, "poll", lambda _: True)(bpy.context):
-            stand_in = type("StandIn", (), {"layout": Layout()})()
+            stand_in = type("StandIn", (), {"layout": Layout(), "bl_rna": cls.bl_rna})()
             if issubclass(cls, PresetPanel):  # Blender draws its list of files
                 assert {Path(f).stem for p in bpy.utils.preset_paths(cls.preset_subdir) for f in Path(p).iterdir()}
             else:
@@ -153,15 +153,13 @@ def test_every_panel_draws_and_every_poll_answers(scene, ball_file, loaded):
             if hasattr(cls, "bl_idname") and "." in cls.bl_idname:
                 group, name = cls.bl_idname.split(".")
                 assert getattr(getattr(bpy.ops, group), name).poll() in (True, False)
-    stand_in = type("StandIn", (), {"layout": Layout(), "bl_rna": part("addon.preferences").DrgsPreferences.bl_rna})()
-    part("addon.preferences").DrgsPreferences.draw(stand_in, bpy.context)
 
 
 @pytest.mark.parametrize("kind", ["POINT", "AREA"])
 def test_panels_of_a_light_draw(scene, kind):
     obj = bpy.data.objects.new("Lamp", bpy.data.lights.new("Lamp", kind))
     context = type("Context", (), {"engine": "DRGS", "object": obj, "light": obj.data})
-    rays = part("addon.panels.rays")
+    rays = part("addon.panels.ray_visibility")
     for cls in rays.CLASSES:
         assert cls.poll(context)
         cls.draw(type("StandIn", (), {"layout": Layout()})(), context)

@@ -191,13 +191,13 @@ def test_before_and_after_is_a_switch_that_loses_nothing(ball, scene, ball_file)
     """What is painted and adjusted goes and comes, in viewports that remember, in discs, and by keyframes."""
     bpy.ops.drgs.set_material(preset="GOLD")
     adjustment(ball).tint = (1, 0.5, 1)
-    export_frame, memory = part("addon.export").export_frame, part("addon.export.memory").Memory()
+    export_frame, cache = part("addon.export").export_frame, part("addon.export.export_cache").ExportCache()
     surfels, asset = part("addon.viewport.surfels"), part("addon.assets").load(ball_file)
 
     def state():
         depsgraph = bpy.context.evaluated_depsgraph_get()
         discs = surfels.colours(ball.evaluated_get(depsgraph), asset)
-        return export_frame(depsgraph, str, lambda text: None, memory=memory).objects[0], discs
+        return export_frame(depsgraph, str, lambda text: None, cache=cache).objects[0], discs
 
     after = state()
     for number, before in ((1, True), (2, False)):
@@ -235,12 +235,12 @@ def test_adjustments_follow_keyframes_and_are_exported_anew_by_viewports(ball, s
     for number, value in ((1, 1.0), (11, 0.0)):
         settings.saturation = value
         ball.keyframe_insert("drgs.adjustment.saturation", frame=number)
-    export_frame, memory = part("addon.export").export_frame, part("addon.export.memory").Memory()
+    export_frame, cache = part("addon.export").export_frame, part("addon.export.export_cache").ExportCache()
     seen = []
     for number in (1, 6, 11):
         scene.frame_set(number)
         depsgraph = bpy.context.evaluated_depsgraph_get()
-        state = export_frame(depsgraph, str, lambda text: None, memory=memory).objects[0]
+        state = export_frame(depsgraph, str, lambda text: None, cache=cache).objects[0]
         seen.append(1.0 if state.adjustment is None else state.adjustment.saturation)
     assert seen == pytest.approx([1, 0.5, 0], abs=1e-6)
 

@@ -137,24 +137,24 @@ def reconstructing(ball_file):
     image.save()
 
 
-def matter(ball_file):
+def physics(ball_file):
     """Two objects of which one waits for the bake of the other."""
     imported(ball_file)
-    bpy.context.active_object.drgs.matter.use = True
+    bpy.context.active_object.drgs.physics.use = True
     other = bpy.context.active_object.copy()
     bpy.context.scene.collection.objects.link(other)
     select(other, bpy.context.active_object)
-    part("addon.matter.work").waiting.add(part("addon.export.memory").uid(bpy.context.active_object))
+    part("addon.physics.bake_job").waiting.add(part("addon.export.export_cache").uid(bpy.context.active_object))
 
 
-STATES = [empty, imported, unselected, damaged, bound, painted, others, elsewhere, reconstructing, matter]
+STATES = [empty, imported, unselected, damaged, bound, painted, others, elsewhere, reconstructing, physics]
 
 
 @pytest.mark.parametrize("state", STATES)
 @pytest.mark.parametrize("engine", [True, False])
 def test_every_panel_and_menu_is_drawn(scene, ball_file, state, engine, monkeypatch):
     monkeypatch.setattr(part("addon.reconstruction"), "job", None)
-    monkeypatch.setattr(part("addon.matter.work"), "waiting", set())
+    monkeypatch.setattr(part("addon.physics.bake_job"), "waiting", set())
     state(ball_file)
     if not engine:
         monkeypatch.setenv("DRGS_ENGINE", "/nowhere")
@@ -170,7 +170,7 @@ def test_every_panel_and_menu_is_drawn(scene, ball_file, state, engine, monkeypa
                 draw(stand_in, bpy.context)
     if bpy.context.mode != "OBJECT":
         bpy.ops.object.mode_set(mode="OBJECT")
-    assert "DRGS_PT_tour" in drawn and len(drawn["DRGS_PT_tour"]) > 10
+    assert "DRGS_PT_workflow" in drawn and len(drawn["DRGS_PT_workflow"]) > 10
     assert all(drawn[name] for name in ("DRGS_PT_messages", "DRGS_PT_engine"))
 
 
@@ -181,10 +181,10 @@ def _own(cls: type) -> dict[str, object]:
 
 
 def test_the_bake_button_says_of_how_many_objects_and_what_is_waited_for(scene, ball_file, monkeypatch):
-    matter(ball_file)
-    work = part("addon.matter.work")
+    physics(ball_file)
+    bake_job = part("addon.physics.bake_job")
     before = SimpleNamespace(subject='Object "A"', progress=lambda: (0.5, "Frame 3 of 6"))
-    monkeypatch.setattr(work, "running", {-1: before})
+    monkeypatch.setattr(bake_job, "running", {-1: before})
     texts = []
 
     class Panel(Layout):
@@ -192,10 +192,10 @@ def test_the_bake_button_says_of_how_many_objects_and_what_is_waited_for(scene, 
             texts.append(named.get("text"))
             return super().check(name, named)
 
-    draw = part("addon.panels.matter")._draw_bake
+    draw = part("addon.panels.physics")._draw_bake
     draw(Panel([]), bpy.context)
     assert texts[1:] == ["Waits for the bakes before it", "", 'Object "A": Frame 3 of 6']
-    work.waiting.clear()
+    bake_job.waiting.clear()
     texts.clear()
     draw(Panel([]), bpy.context)
     assert texts == [None, "Bake 2 Objects"]
@@ -221,3 +221,29 @@ def test_the_newest_problem_is_in_the_header_of_viewports(scene, monkeypatch):
         draw(SimpleNamespace(layout=Header([])), bpy.context)
     assert [icon for _, icon in told] == ["ERROR", "CANCEL", "CANCEL"] and told[1][0] == told[2][0] == "Gone"
     assert told[0][0].startswith("word word") and len(told[0][0]) <= 40
+
+
+GROUPS = (
+    ("addon.properties", "DrgsSceneSettings"),
+    ("addon.properties", "DrgsViewLayerSettings"),
+    ("addon.properties", "DrgsObjectSettings"),
+    ("addon.physics_settings", "DrgsPhysicsSettings"),
+    ("addon.physics_settings", "DrgsPhysicsRegion"),
+    ("addon.physics_settings", "DrgsPhysicsCollider"),
+    ("addon.adjustment", "DrgsAdjustment"),
+    ("addon.submit", "DrgsSubmitSettings"),
+)
+
+
+@pytest.mark.parametrize(("module", "name"), GROUPS)
+def test_labels_fit_beside_their_field_and_say_more_when_pointed_at(module, name):
+    """Blender's panels give a label some 24 letters at their default width; a tooltip that repeats it says nothing."""
+    properties = getattr(part(module), name).bl_rna.properties
+    own = [p for p in properties if p.identifier not in ("rna_type", "name")]
+    own = [p for p in own if not p.identifier.startswith("use_pass_")]  # whose texts are the engine's
+    assert own
+    assert not {p.name for p in own if len(p.name) > 24}
+    silent = {
+        p.identifier for p in own if p.type not in ("POINTER", "COLLECTION") and len(p.description) <= len(p.name)
+    }
+    assert not silent

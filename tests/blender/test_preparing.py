@@ -133,14 +133,14 @@ def test_a_picture_that_is_refined_says_it_too(scene, monkeypatch):
 def test_a_bake_says_it(body, tmp_path, monkeypatch):
     """`drgs simulate` without kernels, as its panel shows it; cancelled before there is a frame."""
     monkeypatch.setenv("DRGS_CACHE_DIR", str(tmp_path / "kernels"))
-    work = part("addon.matter.work")
-    bake = work.Bake(body, bpy.context.scene)
+    bake_job = part("addon.physics.bake_job")
+    bake = bake_job.Bake(body, bpy.context.scene)
     try:
         wait(lambda: bake.step(0.1) or COUNTED.fullmatch(bake.progress()[1]))
         assert 0 <= bake.progress()[0] <= 1
         began = time.monotonic()
         bake.close()
-        wait(lambda: not part("addon.matter.program").ending(), 10)
+        wait(lambda: not part("addon.physics.simulate_process").ending(), 10)
         assert time.monotonic() - began < 2 * SECONDS
     finally:
         bake.close()
@@ -184,5 +184,5 @@ def test_a_narrow_panel_writes_it_above_the_bar(scene):
         said.clear()
         region = SimpleNamespace(type="UI", width=width)
         context = SimpleNamespace(region=region, preferences=SimpleNamespace(system=SimpleNamespace(ui_scale=1.0)))
-        found = part("addon.panels.tour").bar_text(layout, context, text, 0.25)
+        found = part("addon.panels.workflow").bar_text(layout, context, text, 0.25)
         assert (" ".join(said), found) == ((text, "25%") if above else ("", f"{text}  25%"))

@@ -72,7 +72,7 @@ def test_photographs_become_an_object(scene, photographs, tmp_path):
 
 @pytest.mark.slow
 def test_without_a_window_the_terminal_shows_how_far_it_is(scene, photographs, monkeypatch, capsys):
-    monkeypatch.setattr(part("operators.program"), "_TELL_EVERY", 0.2)
+    monkeypatch.setattr(part("operators.engine_command"), "_TELL_EVERY", 0.2)
     assert bpy.ops.drgs.reconstruct(filepath=str(photographs), minutes=0.1, use_materials=False) == {"FINISHED"}
     said = capsys.readouterr().out
     lines = [line for line in said.splitlines() if line.startswith('Capture "Sphere": ')]
@@ -105,7 +105,7 @@ def test_what_is_no_capture_is_said(scene, tmp_path):
 def test_the_convention_that_a_message_names_can_be_chosen(scene, photographs):
     """Matrices of OpenCV: refused with the name of the choice, which is one of the operator's and then serves."""
     choices = bpy.ops.drgs.reconstruct.get_rna_type().properties["axes"].enum_items
-    titles = {"opengl": "As the Layout", "opencv": "OpenCV", "opengl-inverse": "OpenGL, Inverse"}
+    titles = {"opengl": "Automatic", "opencv": "OpenCV", "opengl-inverse": "OpenGL, Inverse"}
     assert {item.identifier: item.name for item in choices} == titles | {"opencv-inverse": "OpenCV, Inverse"}
     assert choices["opencv"].description == "Camera to world, y down, z forward"
     file = photographs / "transforms.json"
@@ -139,12 +139,12 @@ class Window(SimpleNamespace):
 
 def test_it_works_beside_the_window_until_cancelled(scene, photographs, tmp_path, monkeypatch):
     """The operator's own steps, on a window that stands in for Blender's: there is none in the background."""
-    program = part("operators.program")
+    program = part("operators.engine_command")
     monkeypatch.setattr(program, "bpy", SimpleNamespace(app=SimpleNamespace(background=False), types=bpy.types))
     context = Window()
     cls = operator.DRGS_OT_reconstruct
     own = {name: value for name, value in vars(cls).items() if not name.startswith(("__", "bl_"))}
-    stand_in = type("StandIn", (program.ProgramOperator,), own)()
+    stand_in = type("StandIn", (program.CommandOperator,), own)()
     values = {"filepath": str(photographs), "out": "", "minutes": 5.0, "resolution": 0, "variant": "p"}
     values |= {"use_materials": True, "test_every": 0, "axes": "opengl", "use_environment": False}
     for name, value in values.items():

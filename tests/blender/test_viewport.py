@@ -40,8 +40,8 @@ def exported():
 
 def fresh():
     """The same by an export that knows nothing."""
-    scenes, memory = part("addon.viewport.scenes"), part("addon.export.memory")
-    return scenes._export(bpy.context.evaluated_depsgraph_get(), memory.Memory(), None)
+    scenes, caching = part("addon.viewport.scenes"), part("addon.export.export_cache")
+    return scenes._export(bpy.context.evaluated_depsgraph_get(), caching.ExportCache(), None)
 
 
 def bits(value):
@@ -522,7 +522,7 @@ def test_engine_that_dies_is_replaced(scene, ball, worker):
 
 def looked_up(table, colours):
     """What the shader does with the table, for (n, 3) scene-linear colours."""
-    display = part("addon.viewport.display")
+    display = part("addon.viewport.view_transform")
     n = display.SIZE
     place = (np.log2(np.maximum(colours, 0) + 2.0**display.LOW) - display.LOW) / (display.HIGH - display.LOW)
     place = np.clip(place, 0, 1) * (n - 1)
@@ -556,7 +556,7 @@ def displayed(scene, colours, path):
 @pytest.mark.parametrize("transform", ["AgX", "Filmic", "Standard"])
 def test_table_shows_colours_as_blender_does(scene, tmp_path, transform):
     scene.view_settings.view_transform = transform
-    display = part("addon.viewport.display")
+    display = part("addon.viewport.view_transform")
     before = len(bpy.data.scenes), len(bpy.data.images)
     table = display.table(display.key_of(scene))
     assert (len(bpy.data.scenes), len(bpy.data.images)) == before

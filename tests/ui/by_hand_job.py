@@ -193,7 +193,7 @@ def relight_it() -> Iterator[float]:
     yield from hands.write("120")
     yield from settled()
     yield from seen("hand-14-turned")
-    found["turn"] = part("addon.lighting").nodes_of(bpy.context.scene.world)[1].inputs["Rotation"].default_value[2]
+    found["turn"] = part("addon.world_setup").nodes_of(bpy.context.scene.world)[1].inputs["Rotation"].default_value[2]
 
 
 def lay_over() -> Iterator[float]:

@@ -77,9 +77,9 @@ def middle(kind: str = "VIEW_3D", region: str = "WINDOW") -> Place:
 
 def following() -> str:
     """Key of the step that the sidebar marks."""
-    tour = part("addon.tour")
+    workflow = part("addon.workflow")
     with context_of():
-        return tour.next_step(tour.steps(bpy.context)).key
+        return workflow.next_step(workflow.steps(bpy.context)).key
 
 
 # The hands

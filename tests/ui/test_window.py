@@ -1,4 +1,4 @@
-"""The tour in a real window, with the extension installed from its zip.
+"""The workflow in a real window, with the extension installed from its zip.
 
     DRGS_UI_BLENDER="path/to/blender" python -m pytest tests/ui
 

@@ -1,4 +1,4 @@
-"""Runs inside Blender with a window, for test_window.py: goes the tour, notes what it finds, asks for photographs."""
+"""Runs inside Blender with a window, for test_window.py: goes the workflow, notes and photographs it."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def select(obj: bpy.types.Object) -> None:
     bpy.context.view_layer.objects.active = obj
 
 
-def tour() -> Iterator[float]:
+def workflow() -> Iterator[float]:
     """From an empty file to the picture."""
     for obj in list(bpy.data.objects):
         bpy.data.objects.remove(obj)
@@ -114,8 +114,8 @@ def export() -> Iterator[float]:
 
 
 def in_viewport() -> Iterator[float]:
-    """The tour, with the context that a click in the viewport has."""
-    steps = tour()
+    """The workflow, with the context that a click in the viewport has."""
+    steps = workflow()
     while True:
         with context_of():
             try:

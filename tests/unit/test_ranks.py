@@ -20,11 +20,62 @@ LIGHT = ("core", "ipc")
 
 def rank_table() -> dict[str, int]:
     """Package or module directly under drgs_blender -> its rank, read from the architecture page."""
-    rows = re.findall(r"^\| (\d) \| ([^|]+) \|", (ROOT / "docs/architecture.md").read_text(encoding="utf-8"), re.M)
+    page, _, _ = (ROOT / "docs/architecture.md").read_text(encoding="utf-8").partition("## The extension")
+    rows = re.findall(r"^\| (\d) \| ([^|]+) \|", page, re.M)
     return {name: int(rank) for rank, names in rows for name in re.findall(r"`(\w+)`", names)}
 
 
 RANKS = rank_table()
+#: Folders of the extension, the lower one first.
+EXTENSION = ("addon", "operators")
+#: Files of the extension that may import inside functions, and why.
+LATE_IMPORTS = {
+    "__init__.py": "Blender is there only when it registers the extension; pytest and type checkers import it before"
+}
+
+
+def extension_ranks() -> dict[tuple[str, str], tuple[int, int]]:
+    """(folder, module or package in it) -> its rank; those of `operators` are above all of `addon`."""
+    _, _, page = (ROOT / "docs/architecture.md").read_text(encoding="utf-8").partition("## The extension")
+    found: dict[tuple[str, str], tuple[int, int]] = {}
+    for level, folder in enumerate(EXTENSION):
+        _, _, table = page.partition(f"| Rank | In `{folder}/`")
+        rows = re.findall(r"^\| (\d) \| ([^|]+) \|", table.partition("\n\n")[0], re.M)
+        found |= {(folder, name): (level, int(rank)) for rank, names in rows for name in re.findall(r"`(\w+)`", names)}
+    return found
+
+
+def extension_sources() -> list[Path]:
+    return [path for folder in EXTENSION for path in sources(ROOT / folder)]
+
+
+def extension_unit(path: Path) -> tuple[str, str]:
+    """Folder of the extension, and the module or package in it that a file belongs to."""
+    folder, name = path.relative_to(ROOT).parts[:2]
+    return folder, name.removesuffix(".py")
+
+
+def module_name(path: Path) -> str:
+    """As "addon.export.frame"; of a package its own name."""
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+
+
+def cycle(graph: dict[str, set[str]]) -> list[str]:
+    """Names along one circle of a graph, the first of them again at the end; empty without any."""
+    done: set[str] = set()
+
+    def descend(node: str, way: list[str]) -> list[str]:
+        if node in way:
+            return [*way[way.index(node) :], node]
+        if node in done:
+            return []
+        for other in sorted(graph.get(node, ())):
+            if found := descend(other, [*way, node]):
+                return found
+        done.add(node)
+        return []
+
+    return next((found for node in sorted(graph) if (found := descend(node, []))), [])
 
 
 def imports(path: Path, root: Path) -> Iterator[tuple[int, str, int]]:
@@ -156,6 +207,57 @@ def test_extension_uses_only_the_light_part_by_relative_import(folder):
             elif parts[0] in ("numba", "torch", "embreex", "OpenEXR", "scipy", "trimesh", "igl", "PIL", "tqdm"):
                 wrong.append(f"{where}, which Blender does not have")
     assert not wrong, "\n".join(wrong)
+
+
+def test_every_part_of_the_extension_has_a_rank():
+    found = {extension_unit(path) for path in extension_sources()}
+    assert {(folder, name) for folder, name in found if name != "__init__"} == set(extension_ranks())
+
+
+def test_lower_ranks_of_the_extension_never_import_higher_ones():
+    ranks = extension_ranks()
+    wrong = []
+    for path in extension_sources():
+        own = extension_unit(path)
+        if own[1] == "__init__":  # registers all of its folder
+            continue
+        for line, module, _ in imports(path, ROOT):
+            parts = module.split(".")
+            other = (parts[0], parts[1]) if len(parts) > 1 else ("", "")
+            if parts[0] not in EXTENSION or other == own:
+                continue
+            if ranks.get(other, (9, 9)) >= ranks[own]:
+                wrong.append(f"{path.relative_to(ROOT)}:{line} imports {module}")
+    assert not wrong, "\n".join(wrong)
+
+
+def test_imports_of_the_extension_run_in_no_circle():
+    files = {module_name(path): path for path in extension_sources()}
+    graph: dict[str, set[str]] = {}
+    for name, path in files.items():
+        for _, module, _ in imports(path, ROOT):
+            while module and module not in files:
+                module = module.rpartition(".")[0]
+            if module and module != name:
+                graph.setdefault(name, set()).add(module)
+    assert len(graph) > 80
+    assert not cycle(graph), " -> ".join(cycle(graph))
+
+
+def test_a_circle_is_found():
+    assert cycle({"a": {"b", "c"}, "b": {"d"}, "c": {"e"}, "e": {"f"}, "f": {"c"}}) == ["c", "e", "f", "c"]
+    assert cycle({"a": {"b", "c"}, "b": {"c"}}) == []
+
+
+def test_the_extension_imports_inside_functions_only_where_it_must():
+    late = set()
+    for path in (ROOT / "__init__.py", *extension_sources()):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and any(
+                isinstance(part, ast.ImportFrom) and part.level for part in ast.walk(node)
+            ):
+                late.add(path.relative_to(ROOT).as_posix())
+    assert late == set(LATE_IMPORTS)
 
 
 def test_addon_never_imports_operators_except_to_register_them():

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import bpy
 import pytest
-from matter_scenes import FRAMES, PATIENCE, cache_of, work, world
+from physics_scenes import FRAMES, PATIENCE, bake_job, cache_of, world
 from scenes import part, select
 
 
@@ -18,25 +18,25 @@ def test_all_selected_objects_are_baked_one_after_another(body, scene, tmp_path)
     for x, obj in ((4, second), (8, third), (12, plain)):
         scene.collection.objects.link(obj)
         obj.location.x = x
-    plain.drgs.matter.use = False
+    plain.drgs.physics.use = False
     first.name, second.name, third.name = "First", "Second", "Third"
-    second.drgs.matter.pin_group = "Nope"
+    second.drgs.physics.pin_group = "Nope"
     select(plain, third, second, first)
     with pytest.raises(RuntimeError, match='Object "Second": has no vertex group') as told:
-        bpy.ops.drgs.bake_matter()
+        bpy.ops.drgs.bake_physics()
     assert "First" not in str(told.value) and "Third" not in str(told.value)
     assert cache_of(first).frames() == cache_of(third).frames() == list(range(1, FRAMES + 1))
-    assert not cache_of(second).frames() and not plain.modifiers and not work.running and not work.waiting
+    assert not cache_of(second).frames() and not plain.modifiers and not bake_job.running and not bake_job.waiting
     assert world(third, FRAMES)[:, 2].mean() < -0.1 and abs(world(third, FRAMES)[:, 0].mean() - 8) < 0.01
-    second.drgs.matter.pin_group = ""
+    second.drgs.physics.pin_group = ""
     # What an editor is pinned to is meant alone, whatever is selected.
     with bpy.context.temp_override(object=second):
-        assert work.chosen(bpy.context) == [second]
-        assert bpy.ops.drgs.bake_matter() == {"FINISHED"}
+        assert bake_job.chosen(bpy.context) == [second]
+        assert bpy.ops.drgs.bake_physics() == {"FINISHED"}
     assert cache_of(second).frames() == list(range(1, FRAMES + 1))
     scene.frame_set(1)
     select(second, first)
-    assert [obj.name for obj in work.chosen(bpy.context)] == ["Second", "First"]
+    assert [obj.name for obj in bake_job.chosen(bpy.context)] == ["Second", "First"]
 
 
 class Window(SimpleNamespace):
@@ -55,22 +55,22 @@ class Window(SimpleNamespace):
 @pytest.mark.parametrize("ending", ["all", "without the second", "escape", "a loaded file"])
 def test_a_bake_that_waits_says_so_and_can_be_cancelled(body, scene, monkeypatch, ending):
     """The operator's own steps, on a window that stands in for Blender's: there is none in the background."""
-    operators = part("operators.matter")
+    operators = part("operators.physics")
     monkeypatch.setattr(operators, "bpy", SimpleNamespace(app=SimpleNamespace(background=False), types=bpy.types))
     other = body.copy()
     scene.collection.objects.link(other)
     select(body, other)
-    own = {n: v for n, v in vars(operators.DRGS_OT_bake_matter).items() if not n.startswith(("__", "bl_"))}
+    own = {n: v for n, v in vars(operators.DRGS_OT_bake_physics).items() if not n.startswith(("__", "bl_"))}
     told: list[str] = []
-    bake = type("StandIn", (operators._Worker,), own | {"report": lambda self, _, text: told.append(text)})()
+    bake = type("StandIn", (operators._JobOperator,), own | {"report": lambda self, _, text: told.append(text)})()
     context = Window(scene)
     context.object = context.active_object = other
     context.selected_objects = [body, other]
     assert bake.run(context) == {"RUNNING_MODAL"}
-    assert work.of(body) and work.is_waiting(other) and not work.of(other)
-    assert not bpy.ops.drgs.bake_matter.poll() and bpy.ops.drgs.cancel_matter.poll()
+    assert bake_job.of(body) and bake_job.is_waiting(other) and not bake_job.of(other)
+    assert not bpy.ops.drgs.bake_physics.poll() and bpy.ops.drgs.cancel_physics.poll()
     if ending == "without the second":
-        assert bpy.ops.drgs.cancel_matter() == {"FINISHED"} and work.of(body)
+        assert bpy.ops.drgs.cancel_physics() == {"FINISHED"} and bake_job.of(body)
     elif ending == "escape":
         assert bake.modal(context, SimpleNamespace(type="ESC", value="PRESS")) == {"CANCELLED"}
     elif ending == "a loaded file":
@@ -80,7 +80,7 @@ def test_a_bake_that_waits_says_so_and_can_be_cancelled(body, scene, monkeypatch
     while ending in ("all", "without the second") and result <= {"RUNNING_MODAL", "PASS_THROUGH"}:
         assert time.monotonic() < until
         result = bake.modal(context, SimpleNamespace(type="TIMER", value="NOTHING"))
-    assert not work.running and not work.waiting and bpy.ops.drgs.bake_matter.poll()
+    assert not bake_job.running and not bake_job.waiting and bpy.ops.drgs.bake_physics.poll()
     frames = [len(cache_of(obj).frames()) for obj in (body, other)]
     if ending in ("all", "without the second"):
         assert result == {"FINISHED"} and frames == [FRAMES, FRAMES if ending == "all" else 0]
@@ -88,14 +88,14 @@ def test_a_bake_that_waits_says_so_and_can_be_cancelled(body, scene, monkeypatch
 
 
 def test_frames_are_the_scenes_until_the_artist_chooses(ball, scene):
-    matter = ball.drgs.matter
+    physics = ball.drgs.physics
     scene.frame_start, scene.frame_end = 10, 72
-    matter.use = True
-    assert (matter.frame_start, matter.frame_end) == (10, 72)
-    matter.frame_end = 40
+    physics.use = True
+    assert (physics.frame_start, physics.frame_end) == (10, 72)
+    physics.frame_end = 40
     scene.frame_start, scene.frame_end = 1, 250
-    matter.use = False
-    matter.use = True
-    assert (matter.frame_start, matter.frame_end) == (10, 40), "what is chosen, or baked, stays"
+    physics.use = False
+    physics.use = True
+    assert (physics.frame_start, physics.frame_end) == (10, 40), "what is chosen, or baked, stays"
     other = ball.copy()
-    assert (other.drgs.matter.frame_start, other.drgs.matter.frame_end) == (10, 40)
+    assert (other.drgs.physics.frame_start, other.drgs.physics.frame_end) == (10, 40)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import bpy
 
-from . import assets, cage_nodes, engine_link, lighting, setup_job
+from . import assets, cage_nodes, engine_link, setup_job, world_setup
 
 ENGINE = "DRGS"
 #: Modifiers that follow another object, in the order in which an artist thinks of them.
@@ -15,7 +15,7 @@ BENDS = ("ARMATURE", "LATTICE", "SURFACE_DEFORM")
 
 
 class Step(NamedTuple):
-    """One step of the tour.
+    """One step of the workflow.
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ def next_step(found: list[Step]) -> Step | None:
 
 
 def target(context: bpy.types.Context) -> bpy.types.Object | None:
-    """The DR-GS object that the tour speaks of: the active one or what that bends, else the first of the scene."""
+    """The DR-GS object that the workflow is about: the active one or what that bends, else the first of the scene."""
     active = context.object
     if assets.is_drgs(active):
         return active
@@ -71,7 +71,7 @@ def _steps(context: bpy.types.Context) -> Iterator[Step]:
     yield Step("import", "Import", bool(count), True, text)
     yield _bind(obj)
     yield _pose(obj)
-    lit = lighting.shines(scene.world) or any(o.type == "LIGHT" and not o.hide_render for o in scene.objects)
+    lit = world_setup.shines(scene.world) or any(o.type == "LIGHT" and not o.hide_render for o in scene.objects)
     dark = scene.world is None
     text = "Nothing lights the scene" if dark else "Only the plain colour of the World; choose an image, or add lights"
     yield Step("light", "Light", lit, dark, "" if lit else text)

@@ -13,8 +13,7 @@ from pathlib import Path
 
 import bpy
 
-from ..addon import assets, engine_link, messages, written
-from ..addon.matter.program import MAIN
+from ..addon import assets, engine_link, messages, output_check
 from ..drgs_blender.core.errors import AssetError, EngineError, UsageError
 from ..drgs_blender.ipc.child_process import clean_environment
 from .base import DrgsOperator
@@ -24,14 +23,14 @@ _INTERVAL = 0.25
 _TELL_EVERY = 10.0
 
 
-class ProgramOperator(DrgsOperator):
+class CommandOperator(DrgsOperator):
     """Base of operators that give `start` the arguments of ``drgs`` and go on in `done` when it has done its work."""
 
     _process: subprocess.Popen | None = None
     _log: Path | None = None
     _timer: bpy.types.Timer | None = None
     _subject, _failure, _program = "", "", ""
-    _expected = written.Expected()
+    _expected = output_check.ExpectedFiles()
     _folder: Path | None = None
 
     def done(self, context: bpy.types.Context) -> set[str]:
@@ -84,7 +83,7 @@ class ProgramOperator(DrgsOperator):
         files : that it writes
         """
         self._subject, self._failure = subject, failure
-        self._expected = written.Expected(files)
+        self._expected = output_check.ExpectedFiles(files)
         assets.announce(self._expected.paths)
         try:
             self._spawn(arguments)
@@ -125,14 +124,13 @@ class ProgramOperator(DrgsOperator):
             self.clear()
 
     def _spawn(self, arguments: list[str]) -> None:
-        command = engine_link.command_line()
-        python = command[: command.index("-m")]
-        self._program = f"drgs {arguments[0]} of {python[0]}"
+        command = engine_link.drgs_command()
+        self._program = f"drgs {arguments[0]} of {command[0]}"
         handle, name = tempfile.mkstemp(prefix="drgs-", suffix=".log")
         self._log = Path(name)
         try:
             self._process = subprocess.Popen(
-                [*python, "-c", MAIN, "--no-progress", *arguments],
+                [*command, "--no-progress", *arguments],
                 stdin=subprocess.PIPE,
                 stdout=handle,
                 stderr=handle,
@@ -140,7 +138,7 @@ class ProgramOperator(DrgsOperator):
             )
         except OSError as error:
             self._log.unlink()
-            raise UsageError("Engine", f"{python[0]} cannot be started ({error})", "See the preferences") from error
+            raise UsageError("Engine", f"{command[0]} cannot be started ({error})", "See the preferences") from error
         finally:
             os.close(handle)
 
@@ -178,8 +176,8 @@ class ProgramOperator(DrgsOperator):
                 if bpy.app.background:
                     say(line)
             if missing := self._expected.missing():
-                problem = f"{self._failure}: {written.complaint(self._program, missing)}"
-                raise EngineError(self._subject, problem, written.REMEDY)
+                problem = f"{self._failure}: {output_check.complaint(self._program, missing)}"
+                raise EngineError(self._subject, problem, output_check.REMEDY)
             return self.done(context)
         finally:
             self.clear()

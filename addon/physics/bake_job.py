@@ -21,28 +21,28 @@ import numpy as np
 from ...drgs_blender.core.errors import DrgsError, EngineError, UsageError
 from ...drgs_blender.core.particle_cache import ParticleCache
 from ...drgs_blender.core.sim_materials import MATERIALS
-from .. import assets, messages, written
-from ..export.memory import uid
-from . import capture, playback, points
-from .describe import check, describe, folder_of, own_folder, subject_of
-from .program import Program, ending
-from .properties import DrgsMatterSettings
+from .. import assets, cache_playback, messages, output_check
+from ..export.export_cache import uid
+from ..physics_settings import DrgsPhysicsSettings
+from . import particle_display, scene_export
+from .settings_export import check, describe, folder_of, own_folder, subject_of
+from .simulate_process import SimulateProcess, ending
 
 #: Where a capture lies inside the cache.
 INPUT = "drgs_input"
-#: Steps of particles that a core makes in a second at best, by model of matter (bench/bench_simulate.py measures it);
-#: models that need singular values, and the quick look.
+#: Steps of particles that a core makes in a second at best, by material model (bench/bench_simulate.py measures it);
+#: models that need singular values, and the preview (XPBD).
 _RATES, _SLOW, _QUICK = {"elastic": 1.2e7, "fluid": 1e7}, 2.7e6, 1.5e8
 #: Seconds that the start takes, a frame besides, and a particle in it.
 _START, _FRAME, _KEEP = 3.0, 0.02, 5e-7
 
 #: What is being done, by the `uid` of its object.
-running: dict[int, Work] = {}
+running: dict[int, Job] = {}
 #: Objects whose bake begins when those before it have ended, by `uid`.
 waiting: set[int] = set()
 
 
-class Work:
+class Job:
     """Something the engine's program does for an object.
 
     Parameters
@@ -67,21 +67,21 @@ class Work:
     def __init__(self, obj: bpy.types.Object, scene: bpy.types.Scene, inputs: Path, folder: Path, still: bool) -> None:
         self.key, self.subject = uid(obj), subject_of(obj)
         if self.key in running:
-            raise UsageError(self.subject, "is at work already", "Wait until it is done, or cancel it")
+            raise UsageError(self.subject, "is being baked already", "Wait until it is done, or cancel it")
         check(obj)
         self.folder, self.cancelled = folder, False
         self._inputs = inputs
         self._threads = scene.render.threads if scene.render.threads_mode == "FIXED" else 0
-        self._device = scene.drgs.device.lower() if obj.drgs.matter.solver == "mpm" else "cpu"
-        self._capture = capture.capture(obj, scene, inputs, still=still)
+        self._device = scene.drgs.device.lower() if obj.drgs.physics.solver == "mpm" else "cpu"
+        self._capture = scene_export.export_scene(obj, scene, inputs, still=still)
         self._captured = 0.0
-        self._program: Program | None = None
+        self._process: SimulateProcess | None = None
         running[self.key] = self
 
     @property
     def capturing(self) -> bool:
         """Whether the scene is still being read: it must not be edited meanwhile."""
-        return self._program is None
+        return self._process is None
 
     def step(self, seconds: float = float("inf")) -> bool:
         """Go on for about `seconds`; return whether all is done.
@@ -91,7 +91,7 @@ class Work:
         DrgsError
             Whatever went wrong; `close` it then.
         """
-        if self._program is None:
+        if self._process is None:
             until = time.monotonic() + seconds
             for part in self._capture:
                 self._captured = part
@@ -99,12 +99,12 @@ class Work:
                     return False
             if ending():
                 return False
-            self._program = Program(self._inputs, self.folder, self._threads, self._device)
+            self._process = SimulateProcess(self._inputs, self.folder, self._threads, self._device)
             return False
-        alive = self._program.alive
+        alive = self._process.alive
         if self._take(seconds) or alive:
             return False
-        for line in self._program.result(self.subject, self._held()):
+        for line in self._process.result(self.subject, self._held()):
             messages.note("WARNING", line)
         self._finish()
         return True
@@ -112,13 +112,13 @@ class Work:
     def close(self) -> None:
         """End whatever runs. What is done stays."""
         self._capture.close()
-        self.end_program()
+        self.end_process()
         running.pop(self.key, None)
 
-    def end_program(self) -> None:
+    def end_process(self) -> None:
         """End the engine's program if it runs."""
-        if self._program is not None:
-            self._program.end(self._saves)
+        if self._process is not None:
+            self._process.end(self._saves)
 
     def target(self) -> bpy.types.Object:
         """The object; undo makes new ones, so none is kept.
@@ -135,12 +135,12 @@ class Work:
 
     def progress(self) -> tuple[float, str]:
         """The part that is done, and words for it."""
-        if self._program is None:
+        if self._process is None:
             return 0.0, f"Reading the scene {self._captured:.0%}"
-        counts = self._program.counts
+        counts = self._process.counts
         if counts is not None:
             return 0.0, f"{counts[0]:,} particles"
-        part, text = self._program.preparation
+        part, text = self._process.preparation
         return (part, text) if part < 1.0 and text else (0.0, "Filling the body")
 
     def _take(self, seconds: float) -> bool:
@@ -152,16 +152,16 @@ class Work:
         return ""
 
     def _finish(self) -> None:
-        """The program has done its work."""
+        """The program has done its job."""
 
     def _lacks(self, what: str) -> NoReturn:
         """It says so, but has not written that."""
         missing = [Path(f"{what} in {self.folder}")]
         held = f". {self._held()}" if self._held() else ""
-        raise EngineError(self.subject, written.complaint(self._program.name, missing), written.REMEDY + held)
+        raise EngineError(self.subject, output_check.complaint(self._process.name, missing), output_check.REMEDY + held)
 
 
-class Bake(Work):
+class Bake(Job):
     """Frames into the object's cache and its mesh.
 
     Attributes
@@ -173,11 +173,11 @@ class Bake(Work):
     def __init__(self, obj: bpy.types.Object, scene: bpy.types.Scene) -> None:
         folder = own_folder(obj)
         super().__init__(obj, scene, folder / INPUT, folder, still=False)
-        matter = obj.drgs.matter
-        self.first, self.frames, self.count = matter.frame_start, matter.frame_end - matter.frame_start + 1, 0
-        self._playback: playback.Playback | None = None
+        physics = obj.drgs.physics
+        self.first, self.frames, self.count = physics.frame_start, physics.frame_end - physics.frame_start + 1, 0
+        self._playback: cache_playback.Playback | None = None
         self._begun = 0, time.monotonic()
-        points.hide(obj)
+        particle_display.hide(obj)
 
     def progress(self) -> tuple[float, str]:
         """The part that is done, and words for it."""
@@ -192,17 +192,17 @@ class Bake(Work):
     def cancel(self) -> bool:
         """End before its time; whether there are frames to play. Another bake goes on from them."""
         self.close()
-        if self._program is not None and not self.count:
+        if self._process is not None and not self.count:
             with suppress(DrgsError):  # whatever it is, the next bake says it
                 self._take(0.0)
         return self.count > 0
 
     def _take(self, seconds: float) -> bool:
-        if self._program.counts is None:
+        if self._process.counts is None:
             return False  # until then the folder holds what was there before
         if self._playback is None:
-            path = self._inputs / capture.MATRICES
-            self._playback = playback.Playback(self.folder, np.load(path) if path.exists() else None)
+            path = self._inputs / scene_export.MATRICES
+            self._playback = cache_playback.Playback(self.folder, np.load(path) if path.exists() else None)
         before, self.count = self.count, self._playback.follow(seconds)
         if self.count == before:
             return False
@@ -223,12 +223,12 @@ class Bake(Work):
         if not self.count:
             return
         obj = self.target()
-        if renew or playback.modifier_of(obj) is None:
-            playback.attach(obj, self._playback.path, self.first)
+        if renew or cache_playback.modifier_of(obj) is None:
+            cache_playback.attach(obj, self._playback.path, self.first)
         obj.update_tag(refresh={"DATA"})
 
 
-class Preview(Work):
+class Preview(Job):
     """The particles that the object is filled with, as points in viewports.
 
     Attributes
@@ -254,10 +254,10 @@ class Preview(Work):
 
     def _finish(self) -> None:
         cache = ParticleCache(self.folder)
-        if self._program.counts is None or cache.header() is None:
+        if self._process.counts is None or cache.header() is None:
             self._lacks("the particles")
-        self.counts = self._program.counts
-        points.show(self.target(), cache.rest().points, self.counts)
+        self.counts = self._process.counts
+        particle_display.show(self.target(), cache.rest().points, self.counts)
 
 
 @dataclass(frozen=True, slots=True)
@@ -284,17 +284,17 @@ def cached(obj: bpy.types.Object, scene: bpy.types.Scene) -> Cached:
     DrgsError
         The folder cannot be told or read.
     """
-    folder, matter = folder_of(obj), obj.drgs.matter
+    folder, physics = folder_of(obj), obj.drgs.physics
     frames = ParticleCache(folder).frames()
-    known = capture.stored(folder / INPUT)
+    known = scene_export.stored(folder / INPUT)
     changed = False
     # Values that are animated are those of the first frame, so that only there can be told whether they changed.
-    if frames and known is not None and (obj.animation_data is None or scene.frame_current == matter.frame_start):
+    if frames and known is not None and (obj.animation_data is None or scene.frame_current == physics.frame_start):
         now = describe(obj, scene)
         changed = any(known.get(key) != now.get(key) for key in (set(now) | {"floor", "domain"}) - {"last"})
         before = [{k: v for k, v in row.items() if k not in ("mesh", "vertices")} for row in known.get("colliders", [])]
-        changed |= before != capture.contacts(obj)
-    return Cached(len(frames), matter.frame_end - matter.frame_start + 1, changed)
+        changed |= before != scene_export.contacts(obj)
+    return Cached(len(frames), physics.frame_end - physics.frame_start + 1, changed)
 
 
 def free(obj: bpy.types.Object) -> None:
@@ -309,21 +309,21 @@ def free(obj: bpy.types.Object) -> None:
     while ending():
         time.sleep(0.02)
     ParticleCache(folder).clear()
-    capture.clear(folder / INPUT)
-    playback.detach(obj)
+    scene_export.clear(folder / INPUT)
+    cache_playback.detach(obj)
     with suppress(OSError):
-        (folder / playback.FILE).unlink(missing_ok=True)
+        (folder / cache_playback.FILE).unlink(missing_ok=True)
         os.rmdir(folder)
 
 
 def chosen(context: bpy.types.Context) -> list[bpy.types.Object]:
-    """What Bake bakes: the selected objects with matter, the active one last, or the one an editor is pinned to."""
+    """What Bake bakes: the selected objects with physics, the active one last, or the one an editor is pinned to."""
     active = context.active_object
     if context.object != active:
         found = [context.object]
     else:
         found = [*(obj for obj in context.selected_objects if obj != active), active]
-    return [obj for obj in found if assets.is_drgs(obj) and obj.drgs.matter.use]
+    return [obj for obj in found if assets.is_drgs(obj) and obj.drgs.physics.use]
 
 
 def is_waiting(obj: bpy.types.Object | None) -> bool:
@@ -331,7 +331,7 @@ def is_waiting(obj: bpy.types.Object | None) -> bool:
     return obj is not None and uid(obj) in waiting
 
 
-def of(obj: bpy.types.Object | None) -> Work | None:
+def of(obj: bpy.types.Object | None) -> Job | None:
     """What is being done for an object."""
     return None if obj is None else running.get(uid(obj))
 
@@ -341,14 +341,14 @@ def object_of(key: int) -> bpy.types.Object | None:
     return next((obj for obj in bpy.data.objects if obj.session_uid == key), None)
 
 
-def estimate(matter: DrgsMatterSettings, counts: tuple[int, int], cores: int) -> float:
+def estimate(physics: DrgsPhysicsSettings, counts: tuple[int, int], cores: int) -> float:
     """Seconds that a bake takes at least, from particles and time steps a frame."""
     particles, steps = counts
-    rate = max(_RATES.get(MATERIALS[part.material].model, _SLOW) for part in (matter, *matter.regions))
-    if matter.solver != "mpm":
+    rate = max(_RATES.get(MATERIALS[part.material].model, _SLOW) for part in (physics, *physics.regions))
+    if physics.solver != "mpm":
         rate = _QUICK
     frame = _FRAME + _KEEP * particles + particles * steps / (rate * max(1, cores) ** 0.85)
-    return _START + (matter.frame_end - matter.frame_start) * frame
+    return _START + (physics.frame_end - physics.frame_start) * frame
 
 
 def clock(seconds: float) -> str:
@@ -363,14 +363,14 @@ def clock(seconds: float) -> str:
 def end_all() -> None:
     """End everything that runs."""
     waiting.clear()
-    for work in list(running.values()):
-        work.close()
+    for job in list(running.values()):
+        job.close()
 
 
-def _end_programs() -> None:
+def _end_processes() -> None:
     """Blender closes: what it has in memory may be gone already, but the programs must not go on."""
-    for work in running.values():
-        work.end_program()
+    for job in running.values():
+        job.end_process()
 
 
 @bpy.app.handlers.persistent
@@ -381,10 +381,10 @@ def _before_loading(*_: object) -> None:
 
 def register() -> None:
     bpy.app.handlers.load_pre.append(_before_loading)
-    atexit.register(_end_programs)
+    atexit.register(_end_processes)
 
 
 def unregister() -> None:
     bpy.app.handlers.load_pre.remove(_before_loading)
-    atexit.unregister(_end_programs)
+    atexit.unregister(_end_processes)
     end_all()

@@ -35,7 +35,7 @@ def test_a_chosen_light_is_what_the_engine_gets(ball, light, export):
 def test_another_light_keeps_the_nodes_and_their_keyframes(ball, light, tmp_path, scene, export):
     bpy.ops.drgs.choose_light(filepath=str(light))
     world = scene.world
-    texture, mapping, _ = part("addon.lighting").nodes_of(world)
+    texture, mapping, _ = part("addon.world_setup").nodes_of(world)
     for number, angle in ((1, 0.0), (11, 1.0)):
         mapping.inputs["Rotation"].default_value[2] = angle
         mapping.inputs["Rotation"].keyframe_insert("default_value", index=2, frame=number)
@@ -107,7 +107,7 @@ def test_a_new_camera_stands_before_what_the_viewport_looks_at(perspective):
     distance = 7.0 if perspective == "PERSP" else 0.0
     matrix = (Matrix.Translation((1, 2, 3)) @ turned @ Matrix.Translation((0, 0, distance))).inverted()
     view = SimpleNamespace(view_matrix=matrix, view_distance=7.0, view_perspective=perspective)
-    assert np.allclose(part("operators.steps").standing(view).translation, (1, -5, 3), atol=1e-4)
+    assert np.allclose(part("operators.workflow").standing(view).translation, (1, -5, 3), atol=1e-4)
 
 
 def test_show_rendered_makes_drgs_the_engine(ball, scene):
@@ -130,8 +130,8 @@ def test_marked_objects_are_assets_that_survive_saving(ball, tmp_path):
 
 def expected() -> str:
     """Key of the step that comes next."""
-    tour = part("addon.tour")
-    return tour.next_step(tour.steps(bpy.context)).key
+    workflow = part("addon.workflow")
+    return workflow.next_step(workflow.steps(bpy.context)).key
 
 
 def test_the_tour_says_what_comes_next_from_nothing_to_the_picture(scene, ball_file, light, monkeypatch):
@@ -248,7 +248,7 @@ def test_every_operator_that_changes_the_scene_can_be_undone():
     engine |= {"drgs.engine_choose", "drgs.clear_messages", "drgs.render_preset_add"}
     engine |= {"drgs.copy_messages", "drgs.report"}
     engine |= {"drgs.submit", "drgs.submit_cancel", "drgs.copy_submit"}  # files and the clipboard
-    engine |= {"drgs.preview_matter", "drgs.hide_preview", "drgs.cancel_matter"}  # nothing that a file keeps
+    engine |= {"drgs.show_particles", "drgs.hide_particles", "drgs.cancel_physics"}  # nothing that a file keeps
     engine |= {"drgs.reconstruct_cancel"}
     classes = [c for m in part("operators").MODULES for c in m.CLASSES if issubclass(c, bpy.types.Operator)]
     assert {c.bl_idname for c in classes if "UNDO" not in getattr(c, "bl_options", ())} == engine

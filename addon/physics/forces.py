@@ -16,10 +16,10 @@ _SIDES = {"BOTH": "both", "POSITIVE": "above", "NEGATIVE": "below"}
 
 def fields_on(obj: bpy.types.Object, scene: bpy.types.Scene) -> list[bpy.types.Object]:
     """Objects whose fields act on `obj`; says which are of a type that the engine does not know."""
-    matter = obj.drgs.matter
-    if matter.fields == 0:
+    physics = obj.drgs.physics
+    if physics.fields == 0:
         return []
-    among = matter.field_collection.all_objects if matter.field_collection else scene.objects
+    among = physics.field_collection.all_objects if physics.field_collection else scene.objects
     found = []
     for other in among:
         field = other.field
@@ -31,8 +31,8 @@ def fields_on(obj: bpy.types.Object, scene: bpy.types.Scene) -> list[bpy.types.O
             found.append(other)
         else:
             known = ", ".join(name.title() for name in KINDS)
-            text = f'Object "{other.name}": its field ({field.type.title()}) plays no part in matter; {known} do'
-            messages.note("WARNING", text)
+            subject = f'Object "{other.name}": its field ({field.type.title()})'
+            messages.note("WARNING", f"{subject} has no effect in DR-GS Physics; {known} have")
     return found
 
 

@@ -9,7 +9,9 @@ import bpy
 import numpy as np
 from scenes import mesh_object, part
 
-work, describe, capture = (part(f"addon.matter.{name}") for name in ("work", "describe", "capture"))
+bake_job, settings_export, scene_export = (
+    part(f"addon.physics.{name}") for name in ("bake_job", "settings_export", "scene_export")
+)
 particle_cache = part("drgs_blender.core.particle_cache")
 FRAMES = 6
 #: Seconds after which something hangs, also where kernels are compiled and the machine has other work.
@@ -30,7 +32,7 @@ def world(obj, frame):
 
 
 def cache_of(obj):
-    return particle_cache.ParticleCache(describe.folder_of(obj))
+    return particle_cache.ParticleCache(settings_export.folder_of(obj))
 
 
 def begin_of(bake, count):
@@ -44,7 +46,7 @@ def begin_of(bake, count):
 
 def computed_last(obj) -> int:
     """Frames that the last bake did not find in the cache."""
-    said = (describe.folder_of(obj) / work.INPUT / capture.SAID).read_text()
+    said = (settings_export.folder_of(obj) / bake_job.INPUT / scene_export.SAID).read_text()
     return int(re.search(r"(\d+) of them computed now", said)[1])
 
 

@@ -1,4 +1,4 @@
-"""Matter in a window: one click bakes what is selected, one object after another, and Esc stops all of it."""
+"""Physics in a window: one click bakes what is selected, one object after another, and Esc stops all of it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ FRAMES = 5
 
 @pytest.fixture(scope="module")
 def seen(tmp_path_factory: pytest.TempPathFactory) -> window.Seen:
-    return window.run("matter_job.py", tmp_path_factory.mktemp("matter"))
+    return window.run("physics_job.py", tmp_path_factory.mktemp("physics"))
 
 
 def test_nothing_fails(seen):

@@ -9,7 +9,7 @@ from pathlib import Path
 REMEDY = "See that this is the engine of this extension (preferences), or set it up again"
 
 
-class Expected:
+class ExpectedFiles:
     """Files as they are before a program that is to write them begins.
 
     Parameters

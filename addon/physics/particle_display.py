@@ -10,7 +10,7 @@ import numpy as np
 from gpu_extras.batch import batch_for_shader
 
 from .. import messages
-from ..export.memory import uid
+from ..export.export_cache import uid
 
 Array = np.ndarray
 
@@ -69,7 +69,9 @@ def _draw() -> None:
     except Exception as failure:  # else it would be printed with every redraw, and told to nobody
         messages.log.exception("preview failed")
         shown.clear()
-        messages.note("ERROR", f"Preview: cannot be drawn ({type(failure).__name__}: {failure}). Bakes do not need it")
+        messages.note(
+            "ERROR", f"Show Particles: cannot be drawn ({type(failure).__name__}: {failure}). Bakes do not need it"
+        )
 
 
 def _draw_all() -> None:

@@ -1,4 +1,4 @@
-"""Runs inside Blender with a window, for test_matter.py: two objects are baked by one click, then stopped by Esc."""
+"""Runs inside Blender with a window, for test_physics.py: two objects are baked by one click, then stopped by Esc."""
 
 from __future__ import annotations
 
@@ -19,26 +19,27 @@ PANEL = ("PROPERTIES", "WINDOW")
 
 def frames() -> list[int]:
     """How many frames there are of each object."""
-    cache, folder = part("drgs_blender.core.particle_cache").ParticleCache, part("addon.matter.describe").folder_of
-    return [len(cache(folder(obj)).frames()) for obj in matter()]
+    cache = part("drgs_blender.core.particle_cache").ParticleCache
+    folder_of = part("addon.physics.settings_export").folder_of
+    return [len(cache(folder_of(obj)).frames()) for obj in subjects()]
 
 
-def matter() -> list[bpy.types.Object]:
+def subjects() -> list[bpy.types.Object]:
     return sorted((obj for obj in bpy.data.objects if obj.drgs.is_drgs), key=lambda obj: obj.name)
 
 
 def at_work() -> tuple[int, int]:
     """How many bakes run, and how many wait."""
-    work = part("addon.matter.work")
-    return len(work.running), len(work.waiting)
+    bake_job = part("addon.physics.bake_job")
+    return len(bake_job.running), len(bake_job.waiting)
 
 
-def work() -> Iterator[float]:
+def steps() -> Iterator[float]:
     scene = bpy.context.scene
     for obj in list(scene.objects):
         bpy.data.objects.remove(obj)
     scene.frame_start, scene.frame_end = 1, FRAMES
-    bpy.ops.wm.save_as_mainfile(filepath=str(hands.FOLDER / "matter.blend"))
+    bpy.ops.wm.save_as_mainfile(filepath=str(hands.FOLDER / "physics.blend"))
     bpy.ops.import_scene.drgs(filepath=hands.ASSET)
     first = bpy.context.active_object
     second = first.copy()
@@ -46,40 +47,40 @@ def work() -> Iterator[float]:
     second.location.x = 4
     second.select_set(True)
     for obj in (first, second):
-        obj.drgs.matter.use = True
-        obj.drgs.matter.resolution, obj.drgs.matter.young = 12, 2e4
+        obj.drgs.physics.use = True
+        obj.drgs.physics.resolution, obj.drgs.physics.young = 12, 2e4
         # It turns where it is: what falls leaves its domain one day, and then the next bake begins.
-        obj.drgs.matter.gravity, obj.drgs.matter.spin = 0.0, (0, 0, 1)
-    found["range"] = [obj.drgs.matter.frame_end for obj in matter()]
+        obj.drgs.physics.gravity, obj.drgs.physics.spin = 0.0, (0, 0, 1)
+    found["range"] = [obj.drgs.physics.frame_end for obj in subjects()]
     yield 1.0
     _, area, _ = hands.where("PROPERTIES")
     area.spaces.active.context = "PHYSICS"
     with hands.context_of("PROPERTIES"):
         bpy.ops.screen.screen_full_area()
     yield 1.0
-    yield from press("drgs.bake_matter", *PANEL)
+    yield from press("drgs.bake_physics", *PANEL)
     yield from until(lambda: at_work() == (1, 1), "the first bake", 60)
-    yield from photograph("matter-1-baking")
+    yield from photograph("physics-1-baking")
     yield from until(lambda: at_work() == (0, 0), "the end of the bakes")
     found["baked"] = frames()
-    yield from photograph("matter-2-baked")
-    for obj in matter():
-        obj.drgs.matter.frame_end = 100_000
+    yield from photograph("physics-2-baked")
+    for obj in subjects():
+        obj.drgs.physics.frame_end = 100_000
     yield 0.5
-    yield from press("drgs.bake_matter", *PANEL)
+    yield from press("drgs.bake_physics", *PANEL)
     yield from until(lambda: max(frames()) > FRAMES, "the bake that goes on")
-    yield from photograph("matter-3-going-on")
+    yield from photograph("physics-3-going-on")
     yield from key("ESC")
     yield from until(lambda: at_work() == (0, 0), "the end of the bake that goes on", 60)
     found["stopped"] = frames()
-    yield from photograph("matter-4-stopped")
+    yield from photograph("physics-4-stopped")
     with hands.context_of("PROPERTIES"):
         bpy.ops.screen.back_to_previous()
     yield 1.0
     scene.frame_set(FRAMES)
-    yield from photograph("matter-5-played")
-    found["modifiers"] = [[m.type for m in obj.modifiers] for obj in matter()]
+    yield from photograph("physics-5-played")
+    found["modifiers"] = [[m.type for m in obj.modifiers] for obj in subjects()]
     found["messages"] = [m.text for m in part("addon.messages").history]
 
 
-hands.run(work())
+hands.run(steps())

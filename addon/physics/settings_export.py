@@ -13,10 +13,10 @@ import numpy as np
 
 from ...drgs_blender.core.errors import UsageError
 from ...drgs_blender.core.sim_materials import MATERIALS
-from .properties import ANGLES, DrgsMatterSettings, numbers_of
+from ..physics_settings import ANGLES, DrgsPhysicsSettings, numbers_of
 
 #: Where to look for the settings, in messages.
-PANEL = "Physics > DR-GS Matter"
+PANEL = "Physics > DR-GS Physics"
 
 
 def subject_of(obj: bpy.types.Object) -> str:
@@ -44,7 +44,7 @@ def folder_of(obj: bpy.types.Object) -> Path:
 
 def _path_of(obj: bpy.types.Object) -> str:
     """The cache of an object as the artist wrote it, or the one that it has by itself."""
-    return obj.drgs.matter.folder.rstrip("/\\") or f"//drgs_cache/{bpy.path.clean_name(obj.name)}"
+    return obj.drgs.physics.folder.rstrip("/\\") or f"//drgs_cache/{bpy.path.clean_name(obj.name)}"
 
 
 def check(obj: bpy.types.Object) -> None:
@@ -55,15 +55,15 @@ def check(obj: bpy.types.Object) -> None:
     UsageError
         Naming object and remedy.
     """
-    matter = obj.drgs.matter
+    physics = obj.drgs.physics
     if obj.library or (obj.override_library and obj.override_library.is_system_override):
         raise UsageError(subject_of(obj), "is linked from another file", "Make it local, or bake it there")
     if obj.mode == "EDIT":
         raise UsageError(subject_of(obj), "is being edited", "Leave Edit Mode")
-    if matter.frame_end <= matter.frame_start:
+    if physics.frame_end <= physics.frame_start:
         raise UsageError(
             subject_of(obj),
-            f"ends at frame {matter.frame_end}, not after its first, {matter.frame_start}",
+            f"ends at frame {physics.frame_end}, not after its first, {physics.frame_start}",
             f"Change the frames in {PANEL} > Cache",
         )
 
@@ -78,15 +78,15 @@ def own_folder(obj: bpy.types.Object) -> Path:
     """
     own = folder_of(obj)
     for other in bpy.data.objects:
-        if other != obj and _has_matter(other) and _same_place(other, own):
+        if other != obj and _has_physics(other) and _same_place(other, own):
             raise UsageError(
                 subject_of(obj), f'has the same cache as "{other.name}", {own}', f"Choose another in {PANEL} > Cache"
             )
     return own
 
 
-def _has_matter(obj: bpy.types.Object) -> bool:
-    return obj.type == "MESH" and obj.drgs.matter.use and not obj.library and bool(obj.users_scene)
+def _has_physics(obj: bpy.types.Object) -> bool:
+    return obj.type == "MESH" and obj.drgs.physics.use and not obj.library and bool(obj.users_scene)
 
 
 def _same_place(obj: bpy.types.Object, folder: Path) -> bool:
@@ -100,49 +100,49 @@ def describe(obj: bpy.types.Object, scene: bpy.types.Scene) -> dict[str, Any]:
 
     Values are those of the current frame.
     """
-    matter = obj.drgs.matter
-    wind = _numbers(matter.wind)
+    physics = obj.drgs.physics
+    wind = _numbers(physics.wind)
     data: dict[str, Any] = {
-        "material": _material(matter),
-        "regions": [{"group": region.group, "material": _material(region)} for region in matter.regions],
-        "solver": matter.solver,
-        "resolution": matter.resolution,
-        "seed": matter.seed,
-        "gravity": _numbers(matter.gravity * g for g in scene.gravity) if scene.use_gravity else [0.0] * 3,
+        "material": _material(physics),
+        "regions": [{"group": region.group, "material": _material(region)} for region in physics.regions],
+        "solver": physics.solver,
+        "resolution": physics.resolution,
+        "seed": physics.seed,
+        "gravity": _numbers(physics.gravity * g for g in scene.gravity) if scene.use_gravity else [0.0] * 3,
         "wind": wind,
-        "drag": _number(matter.drag) if any(wind) else 0.0,
-        "damping": _number(matter.damping),
-        "velocity": _numbers(matter.velocity),
-        "spin": _numbers(matter.spin),
-        "pins": [{"group": matter.pin_group}] if matter.pin_group else [],
-        "walls": matter.walls,
-        "first": matter.frame_start,
-        "last": matter.frame_end,
+        "drag": _number(physics.drag) if any(wind) else 0.0,
+        "damping": _number(physics.damping),
+        "velocity": _numbers(physics.velocity),
+        "spin": _numbers(physics.spin),
+        "pins": [{"group": physics.pin_group}] if physics.pin_group else [],
+        "walls": physics.walls,
+        "first": physics.frame_start,
+        "last": physics.frame_end,
         "fps": scene.render.fps / _number(scene.render.fps_base),
     }
-    if matter.use_floor:
-        data["floor"] = _number(matter.floor)
-        data["floor_contact"] = matter.floor_contact
-        data["floor_friction"] = _number(matter.floor_friction)
-    if matter.domain is not None:
-        corners = np.array(matter.domain.bound_box, np.float64)
-        matrix = np.array(matter.domain.matrix_world, np.float64)
+    if physics.use_floor:
+        data["floor"] = _number(physics.floor)
+        data["floor_contact"] = physics.floor_contact
+        data["floor_friction"] = _number(physics.floor_friction)
+    if physics.domain is not None:
+        corners = np.array(physics.domain.bound_box, np.float64)
+        matrix = np.array(physics.domain.matrix_world, np.float64)
         world = corners @ matrix[:3, :3].T + matrix[:3, 3]
         low, high = world.min(axis=0), world.max(axis=0)
         if (high - low).min() <= 0:
             raise UsageError(
-                f'Object "{matter.domain.name}"', "has no volume, so it is no domain", "Choose a box, or none"
+                f'Object "{physics.domain.name}"', "has no volume, so it is no domain", "Choose a box, or none"
             )
         data["domain"] = [_numbers(low), _numbers(high)]
     return data
 
 
-def _material(matter: DrgsMatterSettings) -> dict[str, Any]:
+def _material(physics: DrgsPhysicsSettings) -> dict[str, Any]:
     """The row of the table, and the numbers that differ from it."""
-    row = MATERIALS[matter.material]
-    found: dict[str, Any] = {"name": matter.material}
-    for name in numbers_of(matter.material):
-        value = _number(math.degrees(getattr(matter, name)) if name in ANGLES else getattr(matter, name))
+    row = MATERIALS[physics.material]
+    found: dict[str, Any] = {"name": physics.material}
+    for name in numbers_of(physics.material):
+        value = _number(math.degrees(getattr(physics, name)) if name in ANGLES else getattr(physics, name))
         if value != _number(getattr(row, name)):
             found[name] = value
     return found

@@ -1,4 +1,4 @@
-"""Simulate objects: preview their particles, bake, cancel, free. The engine works in a process of its own."""
+"""Simulate objects: show their particles, bake, cancel, delete the bake. The engine works in a process of its own."""
 
 from __future__ import annotations
 
@@ -10,64 +10,67 @@ import bpy
 from bpy.props import EnumProperty, IntProperty
 
 from ..addon import assets, messages
-from ..addon.export.memory import uid
-from ..addon.matter import points, work
-from . import targets
+from ..addon.export.export_cache import uid
+from ..addon.physics import bake_job, particle_display
+from . import selection
 from .base import DrgsOperator
 
 #: Seconds between two looks at what the engine does, and at most spent on one.
 _TICK, _SHARE = 0.1, 0.05
 
 
-NEEDS = "Make a DR-GS object the active one, and switch Matter on"
+NEEDS = "Make a DR-GS object the active one, and enable Physics > DR-GS Physics"
 
 
-def _has_matter(obj: bpy.types.Object | None) -> bool:
-    return assets.is_drgs(obj) and obj.drgs.matter.use
+def _has_physics(obj: bpy.types.Object | None) -> bool:
+    return assets.is_drgs(obj) and obj.drgs.physics.use
 
 
 def _idle(cls: type[bpy.types.Operator], objects: Iterable[bpy.types.Object | None]) -> bool:
-    """Poll of what needs matter for which nothing is being done."""
+    """Poll of what needs objects with physics for which nothing is being done."""
     objects = list(objects)
-    has = bool(objects) and all(map(_has_matter, objects))
+    has = bool(objects) and all(map(_has_physics, objects))
     cls.poll_message_set("Wait for what is being done, or cancel it" if has else NEEDS)
-    return has and not any(work.of(obj) or work.is_waiting(obj) for obj in objects)
+    return has and not any(bake_job.of(obj) or bake_job.is_waiting(obj) for obj in objects)
 
 
-class _Worker(DrgsOperator):
-    """Does a `work.Work` for each of some objects, one after another: step by step beside Blender's window, at once in
-    background mode and without a window. Where one fails, that is told, and the next begins."""
+class _JobOperator(DrgsOperator):
+    """Runs a `bake_job.Job` for each of some objects, one after another.
 
-    _work: work.Work
+    Step by step beside Blender's window, at once in background mode and without a window. Where one fails, that is
+    told, and the next begins.
+    """
+
+    _job: bake_job.Job
     _queue: list[int]
     _succeeded = False
     _timer: bpy.types.Timer | None = None
 
     @classmethod
     def objects(cls, context: bpy.types.Context) -> list[bpy.types.Object]:
-        """Those to work for."""
+        """Those to simulate."""
         return [context.object]
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         return _idle(cls, cls.objects(context))
 
-    def begin(self, obj: bpy.types.Object, scene: bpy.types.Scene) -> work.Work:
-        """The work to do for an object."""
-        raise TypeError(f"{type(self).__name__} has no work")
+    def begin(self, obj: bpy.types.Object, scene: bpy.types.Scene) -> bake_job.Job:
+        """The job for an object."""
+        raise TypeError(f"{type(self).__name__} has no job")
 
     def done(self, context: bpy.types.Context) -> str:
         """What to tell when it is done."""
         return ""
 
     def stopped(self) -> set[str]:
-        """End the work before its time; what the operator returns then."""
-        self._work.close()
+        """End the job before its time; what the operator returns then."""
+        self._job.close()
         return {"CANCELLED"}
 
     def run(self, context: bpy.types.Context) -> set[str]:
         self._queue = list(map(uid, self.objects(context)))
-        work.waiting.update(self._queue)
+        bake_job.waiting.update(self._queue)
         try:
             if not self._next(context):
                 return self._result()
@@ -88,44 +91,44 @@ class _Worker(DrgsOperator):
         return self._result()
 
     def _whole(self, context: bpy.types.Context) -> set[str]:
-        """Do the work under way, and wait for it."""
+        """Run the present job, and wait for it."""
         try:
-            while not self._work.step():
+            while not self._job.step():
                 time.sleep(_SHARE)
             return self._tell(context)
         finally:
-            self._work.close()
+            self._job.close()
 
     def _next(self, context: bpy.types.Context) -> bool:
         """Begin with the next object for which that can be done; whether there is one."""
         while self._queue:
             key = self._queue.pop(0)
-            if key not in work.waiting:  # the artist thought better of it
+            if key not in bake_job.waiting:  # the artist thought better of it
                 continue
-            work.waiting.discard(key)
-            obj = work.object_of(key)
+            bake_job.waiting.discard(key)
+            obj = bake_job.object_of(key)
             if obj is not None and self.guard(partial(self._take_up, obj), context) == {"RUNNING_MODAL"}:
                 return True
         return False
 
     def _take_up(self, obj: bpy.types.Object, context: bpy.types.Context) -> set[str]:
-        self._work = self.begin(obj, context.scene)
+        self._job = self.begin(obj, context.scene)
         return {"RUNNING_MODAL"}
 
     def _result(self) -> set[str]:
         return {"FINISHED"} if self._succeeded else {"CANCELLED"}
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        if self._work.cancelled or (event.type == "ESC" and event.value == "PRESS"):
+        if self._job.cancelled or (event.type == "ESC" and event.value == "PRESS"):
             self._abandon()
             self._release(context)
             return self.stopped()
         if event.type != "TIMER":
-            return {"RUNNING_MODAL"} if self._work.capturing else {"PASS_THROUGH"}
+            return {"RUNNING_MODAL"} if self._job.capturing else {"PASS_THROUGH"}
         try:
             if self.guard(self._part, context) == {"PASS_THROUGH"}:
                 return {"PASS_THROUGH"}
-            self._work.close()
+            self._job.close()
             if self._next(context):
                 return {"PASS_THROUGH"}
         except Exception:
@@ -135,22 +138,22 @@ class _Worker(DrgsOperator):
         return self._result()
 
     def _part(self, context: bpy.types.Context) -> set[str]:
-        """Go on with the work under way for a moment."""
-        if self._work.step(_SHARE):
+        """Go on with the present job for a moment."""
+        if self._job.step(_SHARE):
             return self._tell(context)
-        context.workspace.status_text_set(f"{self._work.subject}: {self._work.progress()[1]}. Esc cancels")
+        context.workspace.status_text_set(f"{self._job.subject}: {self._job.progress()[1]}. Esc cancels")
         _redraw(context, "PROPERTIES")
         return {"PASS_THROUGH"}
 
     def cancel(self, context: bpy.types.Context) -> None:
-        """End the work, and what was to follow; also called when Blender closes or loads a file."""
+        """End the job, and those that were to follow; also called when Blender closes or loads a file."""
         self._abandon()
-        self._work.close()
+        self._job.close()
         self._release(context)
 
     def _abandon(self) -> None:
         """Nothing is to follow."""
-        work.waiting.difference_update(self._queue)
+        bake_job.waiting.difference_update(self._queue)
         self._queue.clear()
 
     def _tell(self, context: bpy.types.Context) -> set[str]:
@@ -168,10 +171,10 @@ class _Worker(DrgsOperator):
         _redraw(context)
 
 
-class DRGS_OT_bake_matter(_Worker, bpy.types.Operator):
+class DRGS_OT_bake_physics(_JobOperator, bpy.types.Operator):
     """Simulate all frames of the selected objects with the engine"""
 
-    bl_idname = "drgs.bake_matter"
+    bl_idname = "drgs.bake_physics"
     bl_label = "Bake"
     bl_description = (
         "Simulate all frames of the selected objects with the engine, one object after another, the active one last. "
@@ -181,78 +184,78 @@ class DRGS_OT_bake_matter(_Worker, bpy.types.Operator):
 
     @classmethod
     def objects(cls, context: bpy.types.Context) -> list[bpy.types.Object]:
-        return work.chosen(context)
+        return bake_job.chosen(context)
 
-    def begin(self, obj: bpy.types.Object, scene: bpy.types.Scene) -> work.Work:
-        return work.Bake(obj, scene)
+    def begin(self, obj: bpy.types.Object, scene: bpy.types.Scene) -> bake_job.Job:
+        return bake_job.Bake(obj, scene)
 
     def stopped(self) -> set[str]:
-        kept = self._work.cancel()
-        text = f"{self._work.subject}: stopped at {self._work.progress()[1].split(',')[0].lower()}; Bake goes on"
+        kept = self._job.cancel()
+        text = f"{self._job.subject}: stopped at {self._job.progress()[1].split(',')[0].lower()}; Bake goes on"
         messages.note("INFO", text)
         self.report({"INFO"}, text)
         return {"FINISHED"} if kept or self._succeeded else {"CANCELLED"}
 
     def done(self, context: bpy.types.Context) -> str:
-        return f"{self._work.subject}: {self._work.frames} frames baked in {self._work.folder}"
+        return f"{self._job.subject}: {self._job.frames} frames baked in {self._job.folder}"
 
 
-class DRGS_OT_preview_matter(_Worker, bpy.types.Operator):
+class DRGS_OT_show_particles(_JobOperator, bpy.types.Operator):
     """Show the particles that fill the active object, and how long a bake takes at least"""
 
-    bl_idname = "drgs.preview_matter"
-    bl_label = "Preview Filling"
+    bl_idname = "drgs.show_particles"
+    bl_label = "Show Particles"
 
-    def begin(self, obj: bpy.types.Object, scene: bpy.types.Scene) -> work.Work:
-        return work.Preview(obj, scene)
+    def begin(self, obj: bpy.types.Object, scene: bpy.types.Scene) -> bake_job.Job:
+        return bake_job.Preview(obj, scene)
 
     def done(self, context: bpy.types.Context) -> str:
-        particles, steps = self._work.counts
-        return f"{self._work.subject}: {particles:,} particles, at least {steps} time steps a frame"
+        particles, steps = self._job.counts
+        return f"{self._job.subject}: {particles:,} particles, at least {steps} time steps a frame"
 
 
-class DRGS_OT_hide_preview(DrgsOperator, bpy.types.Operator):
+class DRGS_OT_hide_particles(DrgsOperator, bpy.types.Operator):
     """Show the particles no more"""
 
-    bl_idname = "drgs.hide_preview"
-    bl_label = "Hide Preview"
+    bl_idname = "drgs.hide_particles"
+    bl_label = "Hide Particles"
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         cls.poll_message_set("The active object shows no particles")
-        return context.object is not None and points.of(context.object) is not None
+        return context.object is not None and particle_display.of(context.object) is not None
 
     def run(self, context: bpy.types.Context) -> set[str]:
-        points.hide(context.object)
+        particle_display.hide(context.object)
         _redraw(context)
         return {"FINISHED"}
 
 
-class DRGS_OT_cancel_matter(DrgsOperator, bpy.types.Operator):
+class DRGS_OT_cancel_physics(DrgsOperator, bpy.types.Operator):
     """Stop what is being done for this object, and what waits for that; Bake goes on later"""
 
-    bl_idname = "drgs.cancel_matter"
+    bl_idname = "drgs.cancel_physics"
     bl_label = "Cancel"
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         cls.poll_message_set("Nothing is being done for the active object")
-        return work.of(context.object) is not None or work.is_waiting(context.object)
+        return bake_job.of(context.object) is not None or bake_job.is_waiting(context.object)
 
     def run(self, context: bpy.types.Context) -> set[str]:
-        if work.is_waiting(context.object):
-            work.waiting.discard(uid(context.object))
+        if bake_job.is_waiting(context.object):
+            bake_job.waiting.discard(uid(context.object))
             return {"FINISHED"}
-        work.of(context.object).cancelled = True  # its own operator ends it
+        bake_job.of(context.object).cancelled = True  # its own operator ends it
         return {"FINISHED"}
 
 
-class DRGS_OT_free_matter(DrgsOperator, bpy.types.Operator):
+class DRGS_OT_free_physics(DrgsOperator, bpy.types.Operator):
     """Remove the active object's baked frames from the disk; it is as it was before. Files cannot be brought back by
     undo"""
 
-    bl_idname = "drgs.free_matter"
-    bl_label = "Free Cache"
+    bl_idname = "drgs.free_physics"
+    bl_label = "Delete Bake"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
 
     @classmethod
@@ -263,15 +266,15 @@ class DRGS_OT_free_matter(DrgsOperator, bpy.types.Operator):
         return context.window_manager.invoke_confirm(self, event)
 
     def run(self, context: bpy.types.Context) -> set[str]:
-        targets.editable([context.object], vertices=False)
-        work.free(context.object)
+        selection.editable([context.object], vertices=False)
+        bake_job.free(context.object)
         return {"FINISHED"}
 
 
-class DRGS_OT_matter_row(DrgsOperator, bpy.types.Operator):
+class DRGS_OT_physics_row(DrgsOperator, bpy.types.Operator):
     """Add or remove a region or a collider"""
 
-    bl_idname = "drgs.matter_row"
+    bl_idname = "drgs.physics_row"
     bl_label = "Add or Remove"
     bl_options = {"REGISTER", "UNDO", "INTERNAL"}  # noqa: RUF012 - read by Blender
 
@@ -283,11 +286,11 @@ class DRGS_OT_matter_row(DrgsOperator, bpy.types.Operator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         cls.poll_message_set(NEEDS)
-        return _has_matter(context.object)
+        return _has_physics(context.object)
 
     def run(self, context: bpy.types.Context) -> set[str]:
-        targets.editable([context.object], vertices=False)
-        rows = getattr(context.object.drgs.matter, self.rows)
+        selection.editable([context.object], vertices=False)
+        rows = getattr(context.object.drgs.physics, self.rows)
         if self.remove < 0:
             rows.add()
         else:
@@ -296,7 +299,7 @@ class DRGS_OT_matter_row(DrgsOperator, bpy.types.Operator):
 
 
 def _redraw(context: bpy.types.Context, *kinds: str) -> None:
-    """Draw editors of these kinds again, by default those that show anything of matter."""
+    """Draw editors of these kinds again, by default those that show anything of simulations."""
     for window in context.window_manager.windows:
         for area in window.screen.areas:
             if area.type in (kinds or ("PROPERTIES", "VIEW_3D")):
@@ -304,10 +307,10 @@ def _redraw(context: bpy.types.Context, *kinds: str) -> None:
 
 
 CLASSES = (
-    DRGS_OT_bake_matter,
-    DRGS_OT_preview_matter,
-    DRGS_OT_hide_preview,
-    DRGS_OT_cancel_matter,
-    DRGS_OT_free_matter,
-    DRGS_OT_matter_row,
+    DRGS_OT_bake_physics,
+    DRGS_OT_show_particles,
+    DRGS_OT_hide_particles,
+    DRGS_OT_cancel_physics,
+    DRGS_OT_free_physics,
+    DRGS_OT_physics_row,
 )

@@ -26,7 +26,7 @@ _PROBES = np.array(((10, 100, 200), (200, 50, 120), (0, 255, 128)))
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
+class TextureRef:
     """An image on a surface; all that frame.Texture says, and the datablock.
 
     Attributes
@@ -65,11 +65,11 @@ class Picture:
             return mean[:3]
         return np.full(3, mean[:3] @ LUMINANCE if self.channel == "luminance" else mean[_CHANNELS[self.channel]])
 
-    def only(self, channel: str) -> Picture:
+    def only(self, channel: str) -> TextureRef:
         """One channel or the luminance; of what is one channel already, itself."""
         return replace(self, channel=channel) if self.channel == "rgb" else self
 
-    def curved(self, function: Callable[[Array], Array], warn: Warn) -> tuple[Picture, float] | None:
+    def curved(self, function: Callable[[Array], Array], warn: Warn) -> tuple[TextureRef, float] | None:
         """The picture with `function` of (n, 3) colours done to its values, and a factor for it to stay below 1.
 
         None where that is no curve: the image is not of bytes, or channels work upon each other.

@@ -21,12 +21,11 @@ from ...drgs_blender.core.asset import Asset, Binding, Mesh, Surfels
 from ...drgs_blender.core.asset.archive import replace_file
 from ...drgs_blender.core.asset.container import write_asset
 from ...drgs_blender.core.errors import UsageError, WriteError
-from .. import assets, mesh_arrays, messages
-from ..export.fit import check_fit, check_modifiers
-from . import playback
-from .describe import PANEL, describe, subject_of
+from .. import assets, cache_playback, mesh_arrays, messages
+from ..export.topology_check import check_modifiers, check_topology
+from ..physics_settings import DrgsPhysicsCollider
 from .forces import describe_field, fields_on, row_of
-from .properties import DrgsMatterCollider
+from .settings_export import PANEL, describe, subject_of
 
 Array = np.ndarray
 
@@ -42,11 +41,13 @@ _FLATTEST = 1e-12
 _KINDS = {"BOOLEAN": bool, "FLOAT": np.float32, "INT": np.int32}
 
 
-def capture(obj: bpy.types.Object, scene: bpy.types.Scene, folder: Path, *, still: bool = False) -> Iterator[float]:
+def export_scene(
+    obj: bpy.types.Object, scene: bpy.types.Scene, folder: Path, *, still: bool = False
+) -> Iterator[float]:
     """Write body, settings and all that moves into `folder`, which is emptied before.
 
-    The scene is evaluated at every frame of the bake if anything in it may matter, and at its own again in the end,
-    also when the generator is closed early.
+    The scene is evaluated at every frame of the bake if anything in it may have an effect, and at its own again in
+    the end, also when the generator is closed early.
 
     Parameters
     ----------
@@ -65,10 +66,10 @@ def capture(obj: bpy.types.Object, scene: bpy.types.Scene, folder: Path, *, stil
     WriteError
         Naming file and reason.
     """
-    matter = obj.drgs.matter
-    frames = range(matter.frame_start, matter.frame_end + 1)
+    physics = obj.drgs.physics
+    frames = range(physics.frame_start, physics.frame_end + 1)
     now = scene.frame_current, scene.frame_subframe
-    with _writing(folder), playback.hidden(obj):
+    with _writing(folder), cache_playback.hidden(obj):
         clear(folder)
         folder.mkdir(parents=True, exist_ok=True)
         try:
@@ -98,7 +99,7 @@ def capture(obj: bpy.types.Object, scene: bpy.types.Scene, folder: Path, *, stil
 
 
 def stored(folder: Path) -> dict[str, Any] | None:
-    """The settings that `capture` wrote last; None without."""
+    """The settings that `export_scene` wrote last; None without."""
     try:
         data = json.loads((folder / SETTINGS).read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -107,7 +108,7 @@ def stored(folder: Path) -> dict[str, Any] | None:
 
 
 def clear(folder: Path) -> None:
-    """Remove what `capture` wrote and the folder, as far as nothing else is in it."""
+    """Remove what `export_scene` wrote and the folder, as far as nothing else is in it."""
     with suppress(OSError):
         for path in folder.iterdir():
             if path.name in (BODY, SETTINGS, MATRICES, MOTION, SAID, LOG) or path.name.startswith(_COLLIDER):
@@ -137,7 +138,7 @@ def _capture_motion(
     """Where colliders, fields, pinned parts and the object itself are in every frame; completes `data`."""
     vertices, matrix = rest
     obstacles, pushing = list(_obstacles(obj)), fields_on(obj, scene)
-    rows = [[row_of(other, obj.drgs.matter.fields, _depsgraph())] for other in pushing]
+    rows = [[row_of(other, obj.drgs.physics.fields, _depsgraph())] for other in pushing]
     motion = _Track(folder / MOTION, vertices, len(frames)) if data["pins"] else None
     matrices, tracks = [matrix], []
     data["colliders"] = []
@@ -157,7 +158,7 @@ def _capture_motion(
                 motion.add(i, now if np.array_equal(placed, matrix) else _moved(now, to_rest @ placed))
             matrices.append(np.array(obj.evaluated_get(_depsgraph()).matrix_world, np.float64))
             for other, pushes in zip(pushing, rows):
-                pushes.append(row_of(other, obj.drgs.matter.fields, _depsgraph()))
+                pushes.append(row_of(other, obj.drgs.physics.fields, _depsgraph()))
             for (other, _), track in zip(obstacles, tracks):
                 local, _, placed = _read(other)
                 if local.shape != track.first.shape:
@@ -182,11 +183,11 @@ def _capture_motion(
 
 
 def contacts(obj: bpy.types.Object) -> list[dict[str, Any]]:
-    """What each collider does to matter, as `capture` writes it."""
+    """How each collider acts, as `export_scene` writes it."""
     return [_contact(settings) for _, settings in _obstacles(obj)]
 
 
-def _contact(settings: DrgsMatterCollider) -> dict[str, Any]:
+def _contact(settings: DrgsPhysicsCollider) -> dict[str, Any]:
     numbers = {name: float(f"{getattr(settings, name):.6g}") for name in ("friction", "thickness")}
     return {"contact": settings.contact} | numbers
 
@@ -243,7 +244,9 @@ def _read(obj: bpy.types.Object, *, fits: bool = False) -> tuple[Array, Array, A
     mesh = evaluated.to_mesh(preserve_all_data_layers=True, depsgraph=depsgraph)
     try:
         if fits:
-            check_fit(evaluated, mesh, assets.load(assets.file_of(obj)).mesh, lambda text: messages.note("INFO", text))
+            check_topology(
+                evaluated, mesh, assets.load(assets.file_of(obj)).mesh, lambda text: messages.note("INFO", text)
+            )
         vertices = mesh_arrays.read_vertices(mesh)
         corners, _ = mesh_arrays.read_loop_triangles(mesh)
         faces = mesh_arrays.read_corner_vertices(mesh)[corners]
@@ -268,10 +271,10 @@ def _may_move(obj: bpy.types.Object) -> bool:
     return False
 
 
-def _obstacles(obj: bpy.types.Object) -> Iterator[tuple[bpy.types.Object, DrgsMatterCollider]]:
+def _obstacles(obj: bpy.types.Object) -> Iterator[tuple[bpy.types.Object, DrgsPhysicsCollider]]:
     """Every collider once, with its settings; a row without anything chosen is none."""
     seen = {obj.name_full}
-    for settings in obj.drgs.matter.colliders:
+    for settings in obj.drgs.physics.colliders:
         chosen = [settings.object] if settings.object else []
         if settings.collection:
             chosen += settings.collection.all_objects

@@ -6,9 +6,9 @@ import bpy
 from mathutils import Matrix, Vector
 
 from ..addon import assets
-from ..addon.tour import poser_of, target
+from ..addon.workflow import poser_of, target
 from ..drgs_blender.core.errors import UsageError
-from . import targets
+from . import selection
 from .base import DrgsOperator
 
 ENGINE = "DRGS"
@@ -43,7 +43,7 @@ class DRGS_OT_pose(DrgsOperator, bpy.types.Operator):
             raise UsageError(
                 f'Object "{poser.name}"', "comes from a library", "Choose Object > Library Override > Make"
             )
-        targets.select_only(context, [poser], poser)
+        selection.select_only(context, [poser], poser)
         bpy.ops.object.mode_set(mode=MODES[poser.type])
         return {"FINISHED"}
 

@@ -1,4 +1,4 @@
-"""The engine's program at work: ``drgs simulate`` in a process of its own, which Blender only watches."""
+"""``drgs simulate`` in a process of its own, which Blender only watches."""
 
 from __future__ import annotations
 
@@ -21,24 +21,11 @@ from ...drgs_blender.core.errors import (
 )
 from ...drgs_blender.ipc.child_process import clean_environment
 from .. import engine_link
-from . import capture
+from . import scene_export
 
 #: Seconds that Blender waits for a program that is ended, and seconds after which that is killed: saving what it needs
 #: to go on takes some.
 _WAIT, _PATIENCE = 0.2, 5.0
-#: Runs ``drgs`` and ends it together with Blender, however that ends: its standard input is closed then.
-MAIN = """
-import os, signal, sys, threading
-
-def watch():
-    while os.read(0, 1):
-        pass
-    os.kill(os.getpid(), signal.SIGTERM)
-
-threading.Thread(target=watch, daemon=True).start()
-from drgs_blender.cli.main import main
-sys.exit(main())
-"""
 #: How a line of the program's log begins.
 _SAYS = "drgs: "
 _COUNTS = re.compile(r"(\d+) particles.*at least (\d+) time steps")
@@ -62,8 +49,8 @@ def ending() -> bool:
     return bool(_ending)
 
 
-class Program:
-    """One run on what `capture` wrote.
+class SimulateProcess:
+    """One run on what `scene_export` wrote.
 
     Parameters
     ----------
@@ -85,17 +72,16 @@ class Program:
     def __init__(self, inputs: Path, folder: Path, threads: int = 0, device: str = "cpu") -> None:
         self._counts: tuple[int, int] | None = None
         self._inputs, self._folder = inputs, folder
-        self._said, self._log = inputs / capture.SAID, inputs / capture.LOG
-        command = engine_link.command_line()
-        python = command[: command.index("-m")]
-        self.name = f"drgs simulate of {python[0]}"
+        self._said, self._log = inputs / scene_export.SAID, inputs / scene_export.LOG
+        command = engine_link.drgs_command()
+        self.name = f"drgs simulate of {command[0]}"
         options = {"creationflags": subprocess.CREATE_NO_WINDOW} if sys.platform == "win32" else {}
-        arguments = [inputs / capture.BODY, "--settings", inputs / capture.SETTINGS, "--out", folder]
+        arguments = [inputs / scene_export.BODY, "--settings", inputs / scene_export.SETTINGS, "--out", folder]
         arguments += ["--overwrite", "--threads", str(threads), "--device", device]
         try:
             with open(self._said, "wb") as said, open(self._log, "wb") as log:
                 self._process = subprocess.Popen(
-                    [*python, "-c", MAIN, "--no-progress", "simulate", *map(str, arguments)],
+                    [*command, "--no-progress", "simulate", *map(str, arguments)],
                     stdin=subprocess.PIPE,
                     stdout=said,
                     stderr=log,
@@ -103,7 +89,7 @@ class Program:
                     **options,
                 )
         except OSError as error:
-            raise UsageError("Engine", f"{python[0]} cannot be started ({error})", "See the preferences") from error
+            raise UsageError("Engine", f"{command[0]} cannot be started ({error})", "See the preferences") from error
 
     @property
     def alive(self) -> bool:
@@ -171,6 +157,6 @@ class Program:
         raise EngineError(subject, f"the engine's program ended ({code}): {last.rstrip('.')}", remedy)
 
     def _in_words(self, line: str) -> str:
-        """A line of the engine's program without the files that `capture` wrote: the artist knows objects."""
-        line = line.replace(f"{self._inputs / capture.BODY}: ", "").replace(f"{self._inputs}{os.sep}", "")
-        return capture.COLLIDER_FILE.sub(lambda found: f'collider "{unquote(found[1])}"', line)
+        """A line of the engine's program without the files that `scene_export` wrote: the artist knows objects."""
+        line = line.replace(f"{self._inputs / scene_export.BODY}: ", "").replace(f"{self._inputs}{os.sep}", "")
+        return scene_export.COLLIDER_FILE.sub(lambda found: f'collider "{unquote(found[1])}"', line)

@@ -16,9 +16,9 @@ from bpy.props import (
     StringProperty,
 )
 
-from ...drgs_blender.core.sim_materials import MATERIALS
+from ..drgs_blender.core.sim_materials import MATERIALS
 
-#: Numbers of every material, and those that some kinds of matter have besides.
+#: Numbers of every material, and those that some models have besides.
 BASIC = ("young", "poisson", "density")
 OF_MODEL = {
     "plastic": ("yield_stress", "hardening", "viscosity"),
@@ -35,19 +35,19 @@ _RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"} if _BLEND_RELATIVE else set()
 
 MATERIAL_ITEMS = [(name, name.title(), row.about[:1].upper() + row.about[1:]) for name, row in MATERIALS.items()]
 CONTACT_ITEMS = (
-    ("separate", "Separate", "Matter slides with friction and may leave the surface"),
-    ("slip", "Slip", "Matter slides without friction and stays on the surface"),
-    ("sticky", "Sticky", "Matter that touches the surface stays where it is on it"),
+    ("separate", "Separate", "The object slides with friction and may leave the surface"),
+    ("slip", "Slip", "The object slides without friction and stays on the surface"),
+    ("sticky", "Sticky", "What touches the surface sticks to it"),
 )
-WALL_ITEMS = (("open", "Open", "Matter that leaves stops the bake with a message"), *CONTACT_ITEMS)
+WALL_ITEMS = (("open", "Open", "Particles that leave the domain stop the bake with a message"), *CONTACT_ITEMS)
 
 
 def numbers_of(material: str) -> tuple[str, ...]:
-    """The numbers that matter for a material of the table."""
+    """The numbers that count for a material of the table."""
     return BASIC + OF_MODEL.get(MATERIALS[material].model, ())
 
 
-def _take_preset(settings: _Matter, context: bpy.types.Context) -> None:
+def _take_preset(settings: _MaterialNumbers, context: bpy.types.Context) -> None:
     """Fill the numbers in when another material is chosen."""
     row = MATERIALS[settings.material]
     for name in BASIC + tuple({n for names in OF_MODEL.values() for n in names}):
@@ -55,15 +55,15 @@ def _take_preset(settings: _Matter, context: bpy.types.Context) -> None:
         setattr(settings, name, math.radians(value) if name in ANGLES else value)
 
 
-def _take_range(settings: DrgsMatterSettings, context: bpy.types.Context) -> None:
-    """Take the scene's frames when matter is switched on for the first time, as Blender's own caches do."""
+def _take_range(settings: DrgsPhysicsSettings, context: bpy.types.Context) -> None:
+    """Take the scene's frames when physics is switched on for the first time, as Blender's own caches do."""
     scene = context.scene
     chosen = settings.is_property_set("frame_start") or settings.is_property_set("frame_end")
     if settings.use and not chosen and scene.frame_end > scene.frame_start:
         settings.frame_start, settings.frame_end = scene.frame_start, scene.frame_end
 
 
-class _Matter:
+class _MaterialNumbers:
     """A material: a row of the engine's table and the numbers of it."""
 
     material: EnumProperty(
@@ -75,8 +75,8 @@ class _Matter:
         options=set(),
     )
     young: FloatProperty(
-        name="Stiffness (Pa)",
-        description="Young's modulus, pascals. A hundred times as stiff takes ten times as long",
+        name="Young's Modulus (Pa)",
+        description="Stiffness, pascals. A hundred times as stiff takes ten times as long",
         min=1.0,
         soft_min=1e3,
         soft_max=1e8,
@@ -95,7 +95,7 @@ class _Matter:
     )
     density: FloatProperty(
         name="Density (kg/m³)",
-        description="Kilograms a cubic metre",
+        description="Kilograms per cubic metre",
         min=0.01,
         max=1e5,
         soft_max=1e4,
@@ -105,7 +105,7 @@ class _Matter:
     )
     yield_stress: FloatProperty(
         name="Yield Stress (Pa)",
-        description="Pascals beyond which it does not spring back",
+        description="Stress beyond which it does not spring back, pascals",
         min=0.0,
         max=1e12,
         soft_max=1e7,
@@ -144,16 +144,16 @@ class _Matter:
         precision=4,
     )
     compression: FloatProperty(
-        name="Crushes At",
-        description="Share by which it is pressed together until it crushes",
+        name="Critical Compression",
+        description="Compression, as a share of the length, beyond which snow is crushed for good",
         min=1e-5,
         max=1.0,
         default=_FIRST.compression,
         precision=4,
     )
     stretch: FloatProperty(
-        name="Tears At",
-        description="Share by which it is pulled apart until it tears",
+        name="Critical Stretch",
+        description="Stretch, as a share of the length, beyond which snow breaks",
         min=1e-5,
         max=1.0,
         default=_FIRST.stretch,
@@ -161,7 +161,7 @@ class _Matter:
     )
 
 
-class DrgsMatterRegion(_Matter, bpy.types.PropertyGroup):
+class DrgsPhysicsRegion(_MaterialNumbers, bpy.types.PropertyGroup):
     """A part of the object that is made of something else."""
 
     group: StringProperty(
@@ -171,25 +171,25 @@ class DrgsMatterRegion(_Matter, bpy.types.PropertyGroup):
     )
 
 
-class DrgsMatterCollider(bpy.types.PropertyGroup):
-    """A mesh, or the meshes of a collection, that matter meets."""
+class DrgsPhysicsCollider(bpy.types.PropertyGroup):
+    """A mesh, or the meshes of a collection, that the object collides with."""
 
     object: PointerProperty(
         type=bpy.types.Object,
         name="Object",
-        description="Mesh that matter collides with, also animated",
+        description="Mesh that the object collides with; it may be animated",
         poll=lambda self, obj: obj.type == "MESH",
     )
     collection: PointerProperty(
         type=bpy.types.Collection, name="Collection", description="All meshes of it are colliders"
     )
-    contact: EnumProperty(name="Contact", description="What the surface does to matter", items=CONTACT_ITEMS)
+    contact: EnumProperty(name="Contact", description="How the object moves along the surface", items=CONTACT_ITEMS)
     friction: FloatProperty(
         name="Friction", description="Coulomb friction: 0 is ice", min=0.0, soft_max=2.0, max=1e6, default=0.5
     )
     thickness: FloatProperty(
         name="Thickness",
-        description="Distance from the surface at which matter is stopped, metres",
+        description="Distance from the surface at which the object is stopped, metres",
         unit="LENGTH",
         soft_min=0.0,
         soft_max=1.0,
@@ -198,37 +198,40 @@ class DrgsMatterCollider(bpy.types.PropertyGroup):
     )
 
 
-class DrgsMatterSettings(_Matter, bpy.types.PropertyGroup):
-    """The matter that fills an object. Animated and driven values count as they are in the first frame."""
+class DrgsPhysicsSettings(_MaterialNumbers, bpy.types.PropertyGroup):
+    """Material, forces, colliders and frames of a simulated object.
+
+    Animated and driven values count as they are in the first frame.
+    """
 
     use: BoolProperty(
-        name="Matter",
-        description="Fill the object with matter and let the engine simulate it; its surface follows",
+        name="Physics",
+        description="Fill the object with particles that the engine simulates; its mesh and splats follow them",
         default=False,
         update=_take_range,
         options=set(),
     )
-    regions: CollectionProperty(type=DrgsMatterRegion, name="Regions")
-    colliders: CollectionProperty(type=DrgsMatterCollider, name="Colliders")
+    regions: CollectionProperty(type=DrgsPhysicsRegion, name="Regions")
+    colliders: CollectionProperty(type=DrgsPhysicsCollider, name="Colliders")
     solver: EnumProperty(
         name="Solver",
-        description="How motion is computed",
+        description="Method by which the motion is computed",
         items=(
-            ("mpm", "Simulation", "Material points on a grid (MLS-MPM): every material"),
-            ("xpbd", "Quick Look", "A lattice that springs back (XPBD): fast, and everything is elastic"),
-            ("rigid", "Rigid", "Nothing bends: it falls, tumbles and comes to rest in one piece"),
+            ("mpm", "MPM", "Material points on a grid (MLS-MPM): every material"),
+            ("xpbd", "Preview (XPBD)", "Position-based dynamics of a lattice: fast, and every material is elastic"),
+            ("rigid", "Rigid Body", "Nothing bends: it falls, tumbles and comes to rest in one piece"),
         ),
         options=set(),
     )
     tear: BoolProperty(
-        name="Show Tears",
-        description="Leave out faces that span a gap where matter has come apart, with their surfels",
+        name="Open Tears",
+        description="Leave out faces that span a gap where the material has come apart, with their splats",
         default=True,
         options=set(),
     )
     grain: BoolProperty(
-        name="Show Grains",
-        description="Surfels of sand are grains where it runs, instead of a skin that is stretched",
+        name="Granular Splats",
+        description="Sand: where it flows, splats are drawn as grains instead of a stretched skin",
         default=True,
         options=set(),
     )
@@ -242,7 +245,12 @@ class DrgsMatterSettings(_Matter, bpy.types.PropertyGroup):
         default=48,
         options=set(),
     )
-    seed: IntProperty(name="Seed", description="Another number gives other disorder to sand and fluids", min=0)
+    seed: IntProperty(
+        name="Seed",
+        description="Random places of the particles of sand and fluids. Another seed gives another variant "
+        "of the motion",
+        min=0,
+    )
     gravity: FloatProperty(
         name="Gravity",
         description="Share of the scene's gravity that acts on it",
@@ -268,11 +276,11 @@ class DrgsMatterSettings(_Matter, bpy.types.PropertyGroup):
         description="Only force fields of this collection act on it",
     )
     wind: FloatVectorProperty(
-        name="Wind", description="Velocity of the air, metres a second, world", subtype="XYZ", unit="VELOCITY"
+        name="Wind", description="Velocity of the air, metres per second, world", subtype="XYZ", unit="VELOCITY"
     )
     drag: FloatProperty(
         name="Drag",
-        description="How the wind takes it along: share of the difference in speed that is lost in a second. Without "
+        description="How the wind takes it along: share of the difference in speed that is lost per second. Without "
         "wind there is none",
         min=0.0,
         max=1e4,
@@ -280,32 +288,33 @@ class DrgsMatterSettings(_Matter, bpy.types.PropertyGroup):
         default=1.0,
     )
     damping: FloatProperty(
-        name="Damping", description="Share of its speed that it loses in a second", min=0.0, max=1e4, soft_max=10.0
+        name="Damping", description="Share of its speed that it loses per second", min=0.0, max=1e4, soft_max=10.0
     )
     velocity: FloatVectorProperty(
-        name="Velocity", description="At the start, metres a second, world", subtype="XYZ", unit="VELOCITY"
+        name="Velocity", description="At the start, metres per second, world", subtype="XYZ", unit="VELOCITY"
     )
     spin: FloatVectorProperty(
         name="Spin",
-        description="At the start, about the object's centre: angle turned in a second about each axis of the world",
+        description="At the start, about the object's centre: angle per second about each axis of the world",
         subtype="XYZ",
         unit="ROTATION",
     )
     pin_group: StringProperty(
-        name="Pinned",
+        name="Pin Group",
         description="Vertex group (weights of 0.5 and more) or point attribute of what is held; it follows the "
         "object's own animation: armature, shape keys, transforms",
     )
     use_floor: BoolProperty(name="Floor", description="A level floor without end", default=False, options=set())
     floor: FloatProperty(name="Height", description="Height of the floor in the world, metres", unit="LENGTH")
-    floor_contact: EnumProperty(name="Contact", description="What the floor does to matter", items=CONTACT_ITEMS)
+    floor_contact: EnumProperty(name="Contact", description="How the object moves along the floor", items=CONTACT_ITEMS)
     floor_friction: FloatProperty(
         name="Friction", description="Coulomb friction of the floor: 0 is ice", min=0.0, soft_max=2.0, default=0.5
     )
     domain: PointerProperty(
         type=bpy.types.Object,
         name="Domain",
-        description="Mesh whose bounding box, in the world, is the space simulated; none is three sizes around",
+        description="Mesh whose bounding box, in the world, is the space simulated. Without one, three times the "
+        "object's size",
         poll=lambda self, obj: obj.type == "MESH",
     )
     walls: EnumProperty(name="Walls", description="What the sides of the domain do", items=WALL_ITEMS)
@@ -326,13 +335,13 @@ class DrgsMatterSettings(_Matter, bpy.types.PropertyGroup):
         options=set(),
     )
     folder: StringProperty(
-        name="Cache",
-        description="Folder of the frames; empty is drgs_cache/OBJECT beside the .blend. One folder an object",
+        name="Cache Folder",
+        description="Folder of the frames; empty is drgs_cache/OBJECT beside the .blend. One folder per object",
         subtype="DIR_PATH",
         options=_RELATIVE,
     )
 
 
-CLASSES = (DrgsMatterRegion, DrgsMatterCollider, DrgsMatterSettings)
+CLASSES = (DrgsPhysicsRegion, DrgsPhysicsCollider, DrgsPhysicsSettings)
 
 register, unregister = bpy.utils.register_classes_factory(CLASSES)

@@ -51,7 +51,7 @@ def check_modifiers(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> No
         return
 
 
-def check_fit(obj: bpy.types.Object, mesh: bpy.types.Mesh, rest: Mesh, warn: Callable[[str], None]) -> bool:
+def check_topology(obj: bpy.types.Object, mesh: bpy.types.Mesh, rest: Mesh, warn: Callable[[str], None]) -> bool:
     """Compare the evaluated `mesh` of `obj` with the asset's mesh.
 
     Faces in another order, and triangles merged to polygons, still join the vertices as the asset does: every edge

@@ -9,9 +9,9 @@ import bpy
 from ...drgs_blender.core.errors import DrgsError
 from ...drgs_blender.core.sim_materials import MATERIALS
 from .. import assets
-from ..matter import points, work
-from ..matter.properties import DrgsMatterRegion, DrgsMatterSettings, numbers_of
-from .tour import bar_text
+from ..physics import bake_job, particle_display
+from ..physics_settings import DrgsPhysicsRegion, DrgsPhysicsSettings, numbers_of
+from .text_layout import bar_text
 
 
 class _Physics:
@@ -25,12 +25,12 @@ class _Physics:
 
 
 class _Part(_Physics):
-    bl_parent_id = "DRGS_PT_matter"
+    bl_parent_id = "DRGS_PT_physics"
     bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012 - read by Blender
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return assets.is_drgs(context.object) and context.object.drgs.matter.use
+        return assets.is_drgs(context.object) and context.object.drgs.physics.use
 
 
 def _column(layout: bpy.types.UILayout) -> bpy.types.UILayout:
@@ -38,14 +38,14 @@ def _column(layout: bpy.types.UILayout) -> bpy.types.UILayout:
     return layout.column()
 
 
-def _draw_material(layout: bpy.types.UILayout, settings: DrgsMatterSettings | DrgsMatterRegion) -> None:
+def _draw_material(layout: bpy.types.UILayout, settings: DrgsPhysicsSettings | DrgsPhysicsRegion) -> None:
     layout.prop(settings, "material")
     for name in numbers_of(settings.material):
         layout.prop(settings, name)
 
 
 def _draw_group(
-    layout: bpy.types.UILayout, settings: DrgsMatterSettings | DrgsMatterRegion, name: str, obj: bpy.types.Object
+    layout: bpy.types.UILayout, settings: DrgsPhysicsSettings | DrgsPhysicsRegion, name: str, obj: bpy.types.Object
 ) -> None:
     """A vertex group, or an attribute where there are no groups."""
     if obj.vertex_groups:
@@ -59,43 +59,43 @@ def _draw_rows(layout: bpy.types.UILayout, rows: str, index: int) -> bpy.types.U
     box = layout.box()
     line = box.row()
     column = line.column()
-    button = line.operator("drgs.matter_row", text="", icon="X", emboss=False)
+    button = line.operator("drgs.physics_row", text="", icon="X", emboss=False)
     button.rows, button.remove = rows, index
     return column
 
 
 def _draw_add(layout: bpy.types.UILayout, rows: str, text: str) -> None:
-    button = layout.operator("drgs.matter_row", text=text, icon="ADD")
+    button = layout.operator("drgs.physics_row", text=text, icon="ADD")
     button.rows, button.remove = rows, -1
 
 
-class DRGS_PT_matter(_Physics, bpy.types.Panel):
-    bl_label = "DR-GS Matter"
+class DRGS_PT_physics(_Physics, bpy.types.Panel):
+    bl_label = "DR-GS Physics"
 
     def draw_header(self, context: bpy.types.Context) -> None:
-        self.layout.prop(context.object.drgs.matter, "use", text="")
+        self.layout.prop(context.object.drgs.physics, "use", text="")
 
     def draw(self, context: bpy.types.Context) -> None:
         obj = context.object
-        matter = obj.drgs.matter
+        physics = obj.drgs.physics
         column = _column(self.layout)
-        column.active = matter.use
-        _draw_material(column, matter)
-        column.prop(matter, "solver")
-        column.prop(matter, "resolution")
-        column.prop(matter, "tear")
-        if MATERIALS[matter.material].grain:
-            column.prop(matter, "grain")
+        column.active = physics.use
+        _draw_material(column, physics)
+        column.prop(physics, "solver")
+        column.prop(physics, "resolution")
+        column.prop(physics, "tear")
+        if MATERIALS[physics.material].grain:
+            column.prop(physics, "grain")
         row = self.layout.row(align=True)
-        row.operator("drgs.preview_matter", icon="POINTCLOUD_DATA")
-        fill = points.of(obj)
+        row.operator("drgs.show_particles", icon="POINTCLOUD_DATA")
+        fill = particle_display.of(obj)
         if fill is not None:
-            row.operator("drgs.hide_preview", text="", icon="X")
+            row.operator("drgs.hide_particles", text="", icon="X")
             render = context.scene.render
             cores = render.threads if render.threads_mode == "FIXED" else os.cpu_count() or 1
-            least = work.clock(work.estimate(matter, fill.counts, cores))
+            least = bake_job.clock(bake_job.estimate(physics, fill.counts, cores))
             column = self.layout.column(align=True)
-            column.label(text=f"{fill.counts[0]:,} particles, {fill.counts[1]} steps a frame")
+            column.label(text=f"{fill.counts[0]:,} particles, {fill.counts[1]} steps per frame")
             column.label(text=f"At least {least} to bake")
         _draw_bake(self.layout, context)
 
@@ -103,82 +103,82 @@ class DRGS_PT_matter(_Physics, bpy.types.Panel):
 def _draw_bake(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     """The button that fits what is baked, or how far it is."""
     obj = context.object
-    if not obj.drgs.matter.use:
+    if not obj.drgs.physics.use:
         return
-    now = work.of(obj)
+    now = bake_job.of(obj)
     if now is not None:
         part, text = now.progress()
         text = bar_text(layout, context, text, part, percent=False)
         row = layout.row(align=True)
         row.progress(factor=part, text=text)
-        row.operator("drgs.cancel_matter", text="", icon="CANCEL")
+        row.operator("drgs.cancel_physics", text="", icon="CANCEL")
         return
-    if work.is_waiting(obj):
+    if bake_job.is_waiting(obj):
         row = layout.row(align=True)
         row.label(text="Waits for the bakes before it", icon="TIME")
-        row.operator("drgs.cancel_matter", text="", icon="CANCEL")
-        for other in work.running.values():
+        row.operator("drgs.cancel_physics", text="", icon="CANCEL")
+        for other in bake_job.running.values():
             part, text = other.progress()
             text = bar_text(layout, context, f"{other.subject}: {text}", part, percent=False)
             layout.progress(factor=part, text=text)
         return
     try:
-        found = work.cached(obj, context.scene)
+        found = bake_job.cached(obj, context.scene)
     except DrgsError as error:
         layout.label(text=str(error), icon="ERROR")
         return
     row = layout.row(align=True)
-    count = len(work.chosen(context))
+    count = len(bake_job.chosen(context))
     more = f" {count} Objects" if count > 1 else ""
     if not found.frames:
-        row.operator("drgs.bake_matter", text=f"Bake{more}", icon="REC")
+        row.operator("drgs.bake_physics", text=f"Bake{more}", icon="REC")
         return
     if found.changed:
-        layout.label(text="Settings have changed: a bake begins anew", icon="INFO")
-        text = "Bake Anew"
+        layout.label(text="Settings have changed since", icon="INFO")
+        text = "Rebake"
     else:
-        text = "Bake Again" if found.frames >= found.wanted else f"Resume ({found.frames} of {found.wanted})"
-    row.operator("drgs.bake_matter", text=f"Bake{more}" if more else text, icon="REC")
-    row.operator("drgs.free_matter", text="", icon="TRASH")
+        text = "Bake" if found.frames >= found.wanted else f"Resume ({found.frames} of {found.wanted})"
+    row.operator("drgs.bake_physics", text=f"Bake{more}" if more else text, icon="REC")
+    row.operator("drgs.free_physics", text="", icon="TRASH")
 
 
-class DRGS_PT_matter_regions(_Part, bpy.types.Panel):
+class DRGS_PT_physics_regions(_Part, bpy.types.Panel):
     bl_label = "Regions"
 
     def draw(self, context: bpy.types.Context) -> None:
         obj = context.object
-        for i, region in enumerate(obj.drgs.matter.regions):
+        for i, region in enumerate(obj.drgs.physics.regions):
             column = _column(_draw_rows(self.layout, "regions", i))
             _draw_group(column, region, "group", obj)
             _draw_material(column, region)
         _draw_add(self.layout, "regions", "Add Region")
 
 
-class DRGS_PT_matter_forces(_Part, bpy.types.Panel):
+class DRGS_PT_physics_forces(_Part, bpy.types.Panel):
     bl_label = "Forces and Pins"
 
     def draw(self, context: bpy.types.Context) -> None:
-        matter = context.object.drgs.matter
+        physics = context.object.drgs.physics
         column = _column(self.layout)
-        _draw_group(column, matter, "pin_group", context.object)
-        column.prop(matter, "gravity")
-        column.prop(matter, "fields")
-        column.prop(matter, "field_collection")
-        column.prop(matter, "wind")
+        _draw_group(column, physics, "pin_group", context.object)
+        column.prop(physics, "gravity")
+        column.prop(physics, "fields")
+        column.prop(physics, "field_collection")
+        column.prop(physics, "wind")
         drag = column.column()
-        drag.active = any(matter.wind)
-        drag.prop(matter, "drag")
-        column.prop(matter, "damping")
-        column.prop(matter, "velocity")
-        column.prop(matter, "spin")
+        drag.active = any(physics.wind)
+        drag.prop(physics, "drag")
+        column.prop(physics, "damping")
+        column.prop(physics, "velocity")
+        column.prop(physics, "spin")
 
 
-class DRGS_PT_matter_colliders(_Part, bpy.types.Panel):
+class DRGS_PT_physics_colliders(_Part, bpy.types.Panel):
     bl_label = "Colliders"
 
     def draw(self, context: bpy.types.Context) -> None:
-        matter = context.object.drgs.matter
-        for i, collider in enumerate(matter.colliders):
+        physics = context.object.drgs.physics
+        for i, collider in enumerate(physics.colliders):
             column = _column(_draw_rows(self.layout, "colliders", i))
             for name in ("object", "collection", "contact"):
                 column.prop(collider, name)
@@ -188,29 +188,29 @@ class DRGS_PT_matter_colliders(_Part, bpy.types.Panel):
             column.prop(collider, "thickness")
         _draw_add(self.layout, "colliders", "Add Collider")
         column = _column(self.layout)
-        column.prop(matter, "use_floor")
-        if matter.use_floor:
-            column.prop(matter, "floor")
-            column.prop(matter, "floor_contact")
+        column.prop(physics, "use_floor")
+        if physics.use_floor:
+            column.prop(physics, "floor")
+            column.prop(physics, "floor_contact")
             friction = column.column()
-            friction.active = matter.floor_contact == "separate"
-            friction.prop(matter, "floor_friction")
+            friction.active = physics.floor_contact == "separate"
+            friction.prop(physics, "floor_friction")
 
 
-class DRGS_PT_matter_cache(_Part, bpy.types.Panel):
-    bl_label = "Space and Cache"
+class DRGS_PT_physics_cache(_Part, bpy.types.Panel):
+    bl_label = "Domain and Cache"
 
     def draw(self, context: bpy.types.Context) -> None:
-        matter = context.object.drgs.matter
+        physics = context.object.drgs.physics
         column = _column(self.layout)
         for name in ("domain", "walls", "frame_start", "frame_end", "folder", "seed"):
-            column.prop(matter, name)
+            column.prop(physics, name)
 
 
 CLASSES = (
-    DRGS_PT_matter,
-    DRGS_PT_matter_regions,
-    DRGS_PT_matter_forces,
-    DRGS_PT_matter_colliders,
-    DRGS_PT_matter_cache,
+    DRGS_PT_physics,
+    DRGS_PT_physics_regions,
+    DRGS_PT_physics_forces,
+    DRGS_PT_physics_colliders,
+    DRGS_PT_physics_cache,
 )

@@ -1,19 +1,18 @@
-"""Bind to Rig: the weights and shape keys of a rigged mesh, carried over to a DR-GS object at the same place."""
+"""Transfer Rig: the weights and shape keys of a rigged mesh, carried over to a DR-GS object at the same place."""
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import bpy
 import numpy as np
-from mathutils.bvhtree import BVHTree
 
-from ..addon import assets, mesh_arrays
+from ..addon import assets
 from ..drgs_blender.core.errors import UsageError
-from . import targets
+from . import selection
 from .base import DrgsOperator
+from .nearest_surface import Match, Source, nearest, source_of
 from .shape_keys import transfer_shape_keys
 from .vertex_weights import Weights, read_weights, write_weights
 
@@ -23,31 +22,11 @@ Array = np.ndarray
 DOUBTFUL, WRONG = 0.02, 0.2
 
 
-@dataclass(slots=True)
-class Source:
-    """One mesh that gives weights: its arrays at rest in world space."""
-
-    object: bpy.types.Object
-    vertices: Array  # (n, 3) float64 world
-    triangles: Array  # (m, 3) int
-    matrix: Array  # (4, 4) object to world
-
-
-@dataclass(slots=True)
-class Match:
-    """For each target vertex: the nearest place on the sources."""
-
-    source: Array  # (n,) index into the sources
-    corners: Array  # (n, 3) vertices of the nearest triangle, in its source
-    barycentric: Array  # (n, 3)
-    distance: Array  # (n,) metres
-
-
 class DRGS_OT_bind_to_rig(DrgsOperator, bpy.types.Operator):
     """Let the selected DR-GS objects follow the rig of the other selected meshes: copy their weights and shape keys"""
 
     bl_idname = "drgs.bind_to_rig"
-    bl_label = "Bind to Rig"
+    bl_label = "Transfer Rig"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
 
     @classmethod
@@ -62,9 +41,9 @@ class DRGS_OT_bind_to_rig(DrgsOperator, bpy.types.Operator):
         sources = [o for o in context.selected_objects if o is not active and o.type == "MESH"]
         objects = [active]
         if not all(map(assets.is_drgs, sources)):  # else one DR-GS object takes the rig of others
-            objects = targets.selected(context)
+            objects = selection.selected(context)
             sources = [o for o in sources if not assets.is_drgs(o)]
-        for target in targets.editable(objects, data=True):
+        for target in selection.editable(objects, data=True):
             distance = bind_to_rig(context, target, sources)
             if distance > DOUBTFUL:
                 self.warn(
@@ -98,12 +77,12 @@ def bind_to_rig(context: bpy.types.Context, target: bpy.types.Object, sources: l
         )
     armature = armature_of(target.name, sources)
     for obj in filter(None, (target, armature)):
-        targets.check_size(obj)
+        selection.check_size(obj)
     with rest_pose(context, armature):
         places = [source_of(o) for o in sources]
         matrix = np.array(target.matrix_world, np.float64)
         armature_matrix = armature.matrix_world.copy() if armature else None
-    match = nearest(targets.world_vertices(target), places)
+    match = nearest(selection.world_vertices(target), places)
     everything = np.concatenate([s.vertices for s in places])
     distance = float(match.distance.mean() / max(np.linalg.norm(np.ptp(everything, axis=0)), 1e-12))
     if distance > WRONG:
@@ -156,56 +135,6 @@ def rest_pose(context: bpy.types.Context, armature: bpy.types.Object | None) -> 
     finally:
         armature.data.pose_position = before
         context.view_layer.update()
-
-
-def source_of(obj: bpy.types.Object) -> Source:
-    """The undeformed mesh of `obj` in the world; UsageError where it has no faces."""
-    mesh = obj.data
-    if mesh.shape_keys:
-        local = np.empty((len(mesh.vertices), 3), np.float32)
-        mesh.shape_keys.reference_key.points.foreach_get("co", local.ravel())
-    else:
-        local = mesh_arrays.read_vertices(mesh)
-    triangles = mesh_arrays.loop_triangles(mesh)
-    if not len(triangles):
-        raise UsageError(f'Object "{obj.name}"', "has no faces", "Deselect it")
-    matrix = np.array(obj.matrix_world, np.float64)
-    return Source(obj, targets.in_world(obj, local), triangles, matrix)
-
-
-def nearest(points: Array, sources: list[Source]) -> Match:
-    """Nearest place on the sources for each point, (n, 3) world."""
-    starts = np.cumsum([0, *(len(s.vertices) for s in sources)])
-    vertices = np.concatenate([s.vertices for s in sources])
-    triangles = np.concatenate([s.triangles + start for s, start in zip(sources, starts)])
-    tree = BVHTree.FromPolygons(vertices.tolist(), triangles.tolist(), all_triangles=True)
-    hits = [tree.find_nearest(p) for p in points.tolist()]
-    found = np.array([h[0] for h in hits], np.float64)
-    corners = triangles[[h[2] for h in hits]]
-    source = np.searchsorted(starts, corners[:, 0], side="right") - 1
-    return Match(
-        source=source,
-        corners=corners - starts[source][:, None],
-        barycentric=barycentric(found, vertices[corners]),
-        distance=np.linalg.norm(found - points, axis=1),
-    )
-
-
-def barycentric(points: Array, triangles: Array) -> Array:
-    """Barycentric coordinates, clamped to the triangle, of (n, 3) points in (n, 3, 3) triangles."""
-    a, b, c = triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
-    p = points - a
-    bb, bc, cc = (np.einsum("ij,ij->i", x, y) for x, y in ((b, b), (b, c), (c, c)))
-    pb, pc = np.einsum("ij,ij->i", p, b), np.einsum("ij,ij->i", p, c)
-    area = bb * cc - bc * bc
-    flat = area <= 1e-12 * np.maximum(bb * cc, 1e-300)
-    area = np.where(flat, 1, area)
-    v, w = (cc * pb - bc * pc) / area, (bb * pc - bc * pb) / area
-    weights = np.clip(np.stack((1 - v - w, v, w), axis=1), 0, 1)
-    weights[weights < 1e-5] = 0  # a vertex that coincides takes exactly its partner's values
-    near = np.linalg.norm(triangles - points[:, None], axis=2).argmin(axis=1)
-    weights[flat] = np.eye(3)[near[flat]]
-    return weights / weights.sum(axis=1, keepdims=True)
 
 
 def _weights(sources: list[Source], match: Match, armature: bpy.types.Object) -> Weights:

@@ -20,14 +20,14 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from ...drgs_blender.core.asset.archive import replace_file
-from ...drgs_blender.core.errors import AssetError, DrgsError, UsageError, WriteError
-from ...drgs_blender.core.particle_cache import HEADER, Header, ParticleCache
+from ..drgs_blender.core.asset.archive import replace_file
+from ..drgs_blender.core.errors import AssetError, DrgsError, UsageError, WriteError
+from ..drgs_blender.core.particle_cache import HEADER, Header, ParticleCache
 
 Array = np.ndarray
 log = logging.getLogger(__name__)
 
-MODIFIER = "DR-GS Matter"
+MODIFIER = "DR-GS Physics"
 FILE = "mesh.pc2"
 _HEAD = struct.Struct("<12s2i2fi")
 _COUNT = struct.Struct("<i")
@@ -151,11 +151,11 @@ def check(obj: bpy.types.Object, warn: Callable[[str], None], *, final: bool) ->
         raise AssetError(
             f'Object "{obj.name}"',
             f"its simulated frames are not there: {path} does not exist",
-            "Bring the folder along with the .blend, bake again, or use Free Cache",
+            "Bring the folder along with the .blend, bake again, or use Delete Bake",
         )
-    matter = obj.drgs.matter
+    physics = obj.drgs.physics
     # While a bake begins anew there is none for a moment; then nobody waits for a final picture.
-    if final and (matter.tear or matter.grain) and not (path.parent / HEADER).exists():
+    if final and (physics.tear or physics.grain) and not (path.parent / HEADER).exists():
         warn(f'"{obj.name}": {path.parent / HEADER} does not exist; its tears and grains are not shown. Bake again')
 
 
@@ -165,13 +165,13 @@ def _path_of(obj: bpy.types.Object, modifier: bpy.types.Modifier) -> Path:
 
 def look_of(obj: bpy.types.Object) -> dict[str, float]:
     """`tear` and `grain` of the played mesh, see `frame.ObjectState`; empty where nothing is played."""
-    modifier, matter = modifier_of(obj), obj.drgs.matter
+    modifier, physics = modifier_of(obj), obj.drgs.physics
     if modifier is None:
         return {}
     with suppress(DrgsError):  # a damaged cache plays all the same; the next bake says it
         header = ParticleCache(_path_of(obj, modifier).parent).header()
         if header is not None:
-            return {"tear": header.tear * matter.tear, "grain": header.grain * matter.grain}
+            return {"tear": header.tear * physics.tear, "grain": header.grain * physics.grain}
     return {}
 
 

@@ -24,14 +24,14 @@ def uid(datablock: bpy.types.ID | None) -> int:
     return 0 if datablock is None else datablock.original.session_uid
 
 
-class Memory:
+class ExportCache:
     """Results by key, each with the datablocks it depends on. An empty one remembers nothing to begin with."""
 
     def __init__(self) -> None:
         self._known: dict[tuple[Hashable, ...], tuple[frozenset[int], Any]] = {}
         self._used: set[tuple[Hashable, ...]] = set()
 
-    def recall(self, key: tuple[Hashable, ...], owners: Iterable[int], make: Callable[[], T]) -> T:
+    def get(self, key: tuple[Hashable, ...], owners: Iterable[int], make: Callable[[], T]) -> T:
         """The result known under `key`, else that of `make`.
 
         Parameters

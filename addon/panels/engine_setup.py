@@ -1,0 +1,27 @@
+"""How far the set-up of the engine is, or the buttons that begin it."""
+
+from __future__ import annotations
+
+import bpy
+
+from .. import engine_link, engine_setup, setup_job
+from .text_layout import bar_text, wrapped
+
+
+def draw_engine(layout: bpy.types.UILayout, context: bpy.types.Context, always: bool = False) -> None:
+    """Set-up of the engine: its buttons where there is none (or `always`), or how far it is."""
+    if setup_job.running():
+        job = setup_job.job
+        layout.progress(text=bar_text(layout, context, job.text, job.fraction), factor=job.fraction)
+        layout.operator("drgs.engine_setup_cancel", icon="CANCEL")
+        return
+    if not engine_link.problem() and not always:
+        return
+    if setup_job.job is not None and setup_job.job.error is not None:
+        wrapped(layout, context, str(setup_job.job.error), "ERROR")
+    if engine_setup.needs_network(engine_link.own_folder()) and not bpy.app.online_access:
+        wrapped(layout, context, "The set-up fetches Python packages; Blender is offline", "INTERNET_OFFLINE")
+        layout.prop(context.preferences.system, "use_online_access")
+    column = layout.column(align=True)
+    column.operator("drgs.engine_setup", icon="IMPORT")
+    column.operator("drgs.engine_choose", icon="FILE_FOLDER")
