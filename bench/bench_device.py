@@ -26,10 +26,10 @@ from drgs_blender.core.asset.container import read_asset
 from drgs_blender.core.errors import DeviceError
 from drgs_blender.core.frame import RenderSettings, World
 from drgs_blender.formats.registry import read_environment
-from drgs_blender.render.backend import HERE, Processor
+from drgs_blender.render.backend import CPU, RenderBackend
 from drgs_blender.render.camera import camera_parameters
 from drgs_blender.render.gbuffer.mesh import primary_mesh
-from drgs_blender.render.gpu.warp_backend import OnDevice
+from drgs_blender.render.gpu.warp_backend import WarpRenderBackend
 from drgs_blender.render.lights.environment import EnvironmentLight
 from drgs_blender.render.points import Radiance
 from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene
@@ -55,9 +55,9 @@ def frames(options: argparse.Namespace, cards: list[str]) -> str:
     sky = read_environment(environments() / "city.exr").radiance
     rows, reference = [], np.empty(0)
     for name, processor, threads in (
-        (ROWS[0], HERE, 0),
-        ("the same, surfels, light and filter by Warp on the processor", OnDevice("cpu"), 0),
-        ("the same, by Warp on CUDA", OnDevice(cards[0]) if cards else None, 0),
+        (ROWS[0], CPU, 0),
+        ("the same, surfels, light and filter by Warp on the processor", WarpRenderBackend("cpu"), 0),
+        ("the same, by Warp on CUDA", WarpRenderBackend(cards[0]) if cards else None, 0),
     ):
         if processor is None:
             rows.append([name, *[NOT_MEASURED] * 4])
@@ -104,7 +104,7 @@ def main() -> None:
     points = primary_mesh(scene, camera, camera_parameters(camera, settings, 1), 0, options.size).points
     light = EnvironmentLight(World(environment=read_environment(environments() / "city.exr").radiance))
 
-    def run(processor: Processor, threads: int) -> tuple[Radiance, float, float]:
+    def run(processor: RenderBackend, threads: int) -> tuple[Radiance, float, float]:
         """The light, seconds of the first time, and the median of the others."""
         use_threads(threads)
         seconds = []
@@ -119,10 +119,10 @@ def main() -> None:
 
     cards = cuda_devices()
     made: dict[str, tuple[Radiance, float, float] | None] = {
-        ROWS[0]: run(HERE, 0),
-        ROWS[1]: run(HERE, 1),
-        ROWS[2]: run(OnDevice("cpu"), 1),
-        ROWS[3]: run(OnDevice(cards[0]), 0) if cards else None,
+        ROWS[0]: run(CPU, 0),
+        ROWS[1]: run(CPU, 1),
+        ROWS[2]: run(WarpRenderBackend("cpu"), 1),
+        ROWS[3]: run(WarpRenderBackend(cards[0]), 0) if cards else None,
     }
     reference, _, whole = made[ROWS[0]] or (Radiance.dark(0), 0.0, 1.0)
     rows = []

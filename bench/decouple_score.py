@@ -18,6 +18,7 @@ from drgs_blender.reconstruct.capture.capture import Capture
 from drgs_blender.reconstruct.readers import read_capture
 from drgs_blender.render.lights.environment import EnvironmentLight
 from drgs_blender.render.pipeline import render
+from drgs_blender.render.prepared_scene import PreparedScene
 from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene
 
 Array = np.ndarray
@@ -71,7 +72,7 @@ def passes_of(
     )
     light = EnvironmentLight(world)
     frames = [Frame(1, camera, [ObjectState("subject", "")], world, settings, passes) for camera in cameras]
-    return [render(scene, light, posed, frame) for frame in frames]
+    return [render(PreparedScene(scene, light, posed), frame) for frame in frames]
 
 
 def score(scene: Scene, mesh: Mesh, samples: int = 64, step: int = 2) -> tuple[float, float, float, float, float]:

@@ -99,7 +99,8 @@ def _bake(
     from ..formats.exr import write_exr_picture
 
     frame = surface_frame(path, args.samples, session)
-    (scene, light, _, lights, tree), placed = session.place(frame)
+    prepared, placed = session.place(frame)
+    tree = prepared.surfel_bvh
     index = {item.state.name: i for i, item in enumerate(placed)}
     for k, (name, out, uvs) in enumerate(targets):
         if name not in index:
@@ -116,7 +117,9 @@ def _bake(
             points, texel = texel_points(item.mesh, _uvs_of(uvs, item), args.size)
         if tree is not None:
             points = own_surfels(points, index[name], float(tree.sizes(len(placed))[index[name]]))
-        components = light_components(scene, light, points, frame.settings, lights, tree)
+        components = light_components(
+            prepared.scene, prepared.environment, points, frame.settings, prepared.lights, tree
+        )
         tell((k + 1) / len(targets))
         colours = components[:, : 4 if args.light == "all" else 2].sum(axis=1)
         if texel is None:

@@ -147,7 +147,7 @@ class FrameSource:
         self._args, session = args, Session()
         self._frame = surface_frame(args.input, args.samples, session)
         self.notes: list[str] = []
-        (self._scene, self._light, _, self._lights, self._tree), self._objects = session.place(self._frame)
+        self._prepared, self._objects = session.place(self._frame)
         self._seen = [i for i, item in enumerate(self._objects) if item.state.visibility.camera]
         self._session = session  # keeps the scene
         faces = any(len(self._objects[i].mesh.faces) for i in self._seen)
@@ -160,7 +160,7 @@ class FrameSource:
 
         picture = self._frame.world.environment
         look = directions(_PLAIN if picture is None else len(picture))
-        radiance = self._light.lookup(look.reshape(-1, 3).astype(np.float32)).reshape(look.shape)
+        radiance = self._prepared.environment.lookup(look.reshape(-1, 3).astype(np.float32)).reshape(look.shape)
         return Environment(radiance)
 
     def mesh(self) -> Mesh:
@@ -198,7 +198,7 @@ class FrameSource:
     def _lit(self, index: int, progress: FractionBar) -> Splats:
         from ..build.relit import lit_colours, own_surfels, points_of_surfels, points_on_mesh
 
-        item, surfels, tree = self._objects[index], self._surfels(index), self._tree
+        item, surfels, tree = self._objects[index], self._surfels(index), self._prepared.surfel_bvh
         size = 0.0 if tree is None else float(tree.sizes(len(self._objects))[index])
         if item.asset.binding is None:
             points = points_of_surfels(surfels, index, size)
@@ -208,7 +208,9 @@ class FrameSource:
             points = points_on_mesh(surfels, item.mesh.vertices, faces, binding, mirrored=mirrored)
             points = points if tree is None else own_surfels(points, index, size)
         settings = self._frame.settings
-        colour = lit_colours(self._scene, self._light, points, settings, self._lights, tree, progress)
+        colour = lit_colours(
+            self._prepared.scene, self._prepared.environment, points, settings, self._prepared.lights, tree, progress
+        )
         return splats_of(surfels, colour)
 
 

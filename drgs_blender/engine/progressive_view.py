@@ -4,25 +4,20 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
-from ..core.asset.model import PosedSurfels
 from ..core.frame import Frame
 from ..ipc.protocol import Passes
-from ..render.backend import HERE, Processor
-from ..render.lights.environment import EnvironmentLight
-from ..render.lights.lights import Lights
+from ..render.backend import CPU, RenderBackend
 from ..render.pipeline import Progress
+from ..render.prepared_scene import PreparedScene
 from ..render.progressive import Progressive, coarse, thinned
-from ..render.scene.trace_scene import TraceScene
-from ..render.surfels.surfel_bvh import SurfelBVH
 
 IsCancelled = Callable[[], bool]
-#: What a frame was made into.
-Ready = tuple[TraceScene, EnvironmentLight, PosedSurfels, Lights, SurfelBVH | None]
 #: Makes a whole picture of a frame, telling its progress.
-Draw = Callable[[Frame, Ready, Progress], Passes]
+Draw = Callable[[Frame, PreparedScene, Progress], Passes]
 
 #: Seconds that the pixels of a first picture may take (projecting the surfels comes on top, whatever its size).
 FIRST_SECONDS = 0.045
@@ -79,9 +74,9 @@ class View:
     processor : as given
     """
 
-    def __init__(self, frame: Frame, pace: Pace, number: int, by_mesh: bool, processor: Processor = HERE) -> None:
+    def __init__(self, frame: Frame, pace: Pace, number: int, by_mesh: bool, backend: RenderBackend = CPU) -> None:
         self.frame, self._pace, self._number, self._by_mesh = frame, pace, number, by_mesh
-        self.processor = processor
+        self.backend = backend
         self.pixel = 1
         self._picture: Progressive | None = None
 
@@ -90,27 +85,27 @@ class View:
         """Part of the samples in the last picture, in [0, 1]; 0 for a coarse one."""
         return 0.0 if self._picture is None else self._picture.fraction
 
-    def begin(self, ready: Ready, draw: Draw) -> Passes:
+    def begin(self, prepared: PreparedScene, draw: Draw) -> Passes:
         """The first picture."""
         x0, y0, x1, y1 = self.frame.camera.window
         self.pixel = self._pace.size((x1 - x0) * (y1 - y0))
-        return self._coarse(ready, draw, self.pixel)
+        return self._coarse(prepared, draw, self.pixel)
 
-    def advance(self, ready: Ready, draw: Draw, cancelled: IsCancelled | None) -> Passes:
+    def advance(self, prepared: PreparedScene, draw: Draw, cancelled: IsCancelled | None) -> Passes:
         """The next picture: finer pixels, then more samples."""
         if self._picture is None and self.pixel > 4:
-            passes = self._coarse(ready, draw, self.pixel // 4)
+            passes = self._coarse(prepared, draw, self.pixel // 4)
             self.pixel //= 4
             return passes
         if self._picture is None:
-            picture, seconds = Progressive(self.frame, self.processor), 0.0
+            picture, seconds = Progressive(self.frame, self.backend), 0.0
         else:
             picture, seconds = self._picture, STEP_SECONDS
-        pictures = picture.advance(*ready, seconds, cancelled)
+        pictures = picture.advance(prepared, seconds, cancelled)
         self._picture, self.pixel = picture, 1
         return Passes(pictures, [], {})
 
-    def _coarse(self, ready: Ready, draw: Draw, size: int) -> Passes:
+    def _coarse(self, prepared: PreparedScene, draw: Draw, size: int) -> Passes:
         frame = coarse(self.frame, size, self._by_mesh)
         if frame.history:
             frame.noise_index += self._number
@@ -121,8 +116,7 @@ class View:
             if phase == "Rendering" and not projected:
                 projected = time.perf_counter()
 
-        scene, environment, posed, lights, tree = ready
         pixels = frame.camera.width * frame.camera.height
-        passes = draw(frame, (scene, environment, thinned(posed, pixels), lights, tree), watch)
+        passes = draw(frame, replace(prepared, surfels=thinned(prepared.surfels, pixels)), watch)
         self._pace.note(pixels, time.perf_counter() - projected)
         return passes

@@ -18,7 +18,7 @@ from ..core.frame import Frame, Image, Light, MeshState, Moment, ObjectState, Re
 from ..deform.gpu.mesh_driven import Deformer
 from ..deform.mesh_driven import MeshDriven
 from ..ipc.change_detection import renewed
-from ..render.backend import HERE, Processor
+from ..render.backend import CPU, RenderBackend
 from ..render.camera import camera_parameters
 from ..render.film.motion_vectors import Instant
 from ..render.lights.environment import EnvironmentLight
@@ -136,7 +136,7 @@ class Stage:
         world = frame.world if self.world is None else self.world
         return renewed(replace(frame, objects=states, meshes=self.meshes, images=self.images, world=world), None)
 
-    def pose(self, frame: Frame, processor: Processor = HERE) -> PosedSurfels:
+    def pose(self, frame: Frame, backend: RenderBackend = CPU) -> PosedSurfels:
         """Bring the trace scene up to date; return the surfels of all objects, posed where they will be needed."""
         seen, met = frame.settings.camera_sees == "surfels", frame.settings.rays_see == "surfels"
         objects = []
@@ -157,7 +157,7 @@ class Stage:
                 item = Standing(kept, loaded, traced_object(kept, loaded.asset, met), faults=material_faults(kept))
             if (seen or met) and item.posed is None:
                 given = item.state, index, loaded.surfels_of(item.state), item.traced
-                item.posed, item.lost = posed_surfels(*given, self._poser(processor))
+                item.posed, item.lost = posed_surfels(*given, self._poser(backend))
             objects.append(item)
         meshes, images = renewed(frame.meshes, self.meshes), renewed(frame.images, self.images)
         same = len(objects) == len(self.objects) and all(a is b for a, b in zip(objects, self.objects))
@@ -172,28 +172,30 @@ class Stage:
                 loaded.driven = None
         self._plant(objects if met else None)
         shown = [item for item in objects if item.state.visibility.camera] if seen else []
-        return self._joined([item.posed for item in shown if item.posed is not None], processor)
+        return self._joined([item.posed for item in shown if item.posed is not None], backend)
 
-    def _poser(self, processor: Processor) -> Callable[..., PosedSurfels]:
+    def _poser(self, backend: RenderBackend) -> Callable[..., PosedSurfels]:
         """Who poses surfels: `MeshDriven.pose`, or a device as long as it can."""
-        launcher = processor.launcher
+        launcher = backend.launcher
         if launcher is None:
             return MeshDriven.pose
         if self._deformer is None or self._deformer.launcher is not launcher:
             self._deformer = Deformer(launcher)
-        there = self._deformer.pose
+        on_device = self._deformer.pose
 
         def pose(*given: Any, **options: Any) -> PosedSurfels:
-            return processor.tried(lambda: there(*given, **options), lambda: MeshDriven.pose(*given, **options))
+            return backend.with_fallback(
+                lambda: on_device(*given, **options), lambda: MeshDriven.pose(*given, **options)
+            )
 
         return pose
 
-    def _joined(self, parts: list[PosedSurfels], processor: Processor) -> PosedSurfels:
+    def _joined(self, parts: list[PosedSurfels], backend: RenderBackend) -> PosedSurfels:
         """The surfels of all objects as one, on a device if it has posed any."""
-        here, launcher = functools.partial(join, parts), processor.launcher
+        on_cpu, launcher = functools.partial(join, parts), backend.launcher
         if launcher is None or len(parts) < 2 or not any(isinstance(part, PosedThere) for part in parts):
-            return here()
-        return processor.tried(lambda: joined(launcher, parts, here), here)
+            return on_cpu()
+        return backend.with_fallback(lambda: joined(launcher, parts, on_cpu), on_cpu)
 
     def _plant(self, objects: list[Standing] | None) -> None:
         """Bring the tree of surfels up to date; None when light does not meet surfels."""

@@ -21,13 +21,14 @@ from ..core.errors import Cancelled, UsageError
 from ..core.frame import Frame, Light, ObjectState, RenderSettings
 from ..ipc.change_detection import renewed
 from ..ipc.protocol import Passes
-from ..render.backend import HERE, Processor
-from ..render.gpu.select_backend import Devices
+from ..render.backend import CPU, RenderBackend
+from ..render.gpu.select_backend import Backends
 from ..render.integrator.adaptive import part_count
 from ..render.pipeline import Progress, render
+from ..render.prepared_scene import PreparedScene
 from ..render.scene.trace_scene import TraceObject
 from .denoise_history import Histories
-from .progressive_view import Pace, Ready, View
+from .progressive_view import Pace, View
 from .scene_cache import Stage
 
 logger = logging.getLogger(__name__)
@@ -84,7 +85,7 @@ class Session:
         self._views: dict[str, View] = {}
         self._pace = Pace()
         self._views_begun = 0
-        self._devices = Devices()
+        self._backends = Backends()
         self._compiled: set[str] = set()
 
     def load_asset(self, path: str | os.PathLike[str]) -> str:
@@ -112,18 +113,18 @@ class Session:
         Cancelled
         """
         self._compile(frame, (), progress, cancelled)
-        lap, processor = _Laps(cancelled), self._devices.processor(frame.settings.device)
-        ready = self._prepare(frame, lap, progress, processor)
+        lap, backend = _Laps(cancelled), self._backends.select(frame.settings.device)
+        prepared = self._prepare(frame, lap, progress, backend)
         tell = None if progress is None else lambda part, phase: progress(phase, part)
-        passes = self._draw(frame, ready, tell, cancelled, processor)
+        passes = self._draw(frame, prepared, tell, cancelled, backend)
         lap("render")
         x0, y0, x1, y1 = frame.camera.window
-        passes.statistics |= self._statistics(frame, ready[2], lap)
+        passes.statistics |= self._statistics(frame, prepared.surfels, lap)
         passes.statistics["samples"] = float((x1 - x0) * (y1 - y0) * frame.settings.sample_count)
         passes.warnings = self._warnings(frame.settings) + _unheeded(frame.settings)
         return passes
 
-    def place(self, frame: Frame, progress: OnProgress | None = None) -> tuple[Ready, list[Placed]]:
+    def place(self, frame: Frame, progress: OnProgress | None = None) -> tuple[PreparedScene, list[Placed]]:
         """Scene, light and objects of a frame whose objects are seen as surfels, without its picture.
 
         Raises
@@ -132,13 +133,13 @@ class Session:
             As `render`.
         """
         self._compile(frame, (), progress, None)
-        ready = self._prepare(frame, _Laps(None), progress)
+        prepared = self._prepare(frame, _Laps(None), progress)
         placed = [
             Placed(item.state, item.loaded.asset, item.traced, item.posed)
             for item in self._stage.objects
             if item.posed is not None
         ]
-        return ready, placed
+        return prepared, placed
 
     def view(
         self, name: str, frame: Frame, progress: OnProgress | None = None, cancelled: IsCancelled | None = None
@@ -155,18 +156,20 @@ class Session:
         """
         self._views.pop(name, None)
         self._compile(frame, ("viewport",), progress, cancelled)
-        lap, processor = _Laps(cancelled), self._devices.processor(frame.settings.device)
+        lap, backend = _Laps(cancelled), self._backends.select(frame.settings.device)
         by_mesh = self._stage.detailed(frame)
         rough = replace(frame, settings=replace(frame.settings, camera_sees="mesh")) if by_mesh else frame
-        ready = self._prepare(rough, lap, progress, processor)
-        view = View(self._stage.kept(frame), self._pace, self._views_begun, by_mesh, processor)
+        prepared = self._prepare(rough, lap, progress, backend)
+        view = View(self._stage.kept(frame), self._pace, self._views_begun, by_mesh, backend)
         self._views_begun += 1
-        passes = view.begin(ready, lambda frame, ready, tell: self._draw(frame, ready, tell, cancelled, processor))
+        passes = view.begin(
+            prepared, lambda frame, prepared, tell: self._draw(frame, prepared, tell, cancelled, backend)
+        )
         lap("render")
         self._views[name] = view
         while len(self._views) > _VIEWS:
             del self._views[next(iter(self._views))]
-        return self._seen(view, passes, ready, lap)
+        return self._seen(view, passes, prepared, lap)
 
     def refine(
         self, name: str, progress: OnProgress | None = None, cancelled: IsCancelled | None = None
@@ -182,47 +185,41 @@ class Session:
         if view is None:
             return None
         lap = _Laps(cancelled)
-        processor = view.processor
-        ready = self._prepare(view.frame, lap, progress, processor)  # other views may have changed the scene
+        backend = view.backend
+        prepared = self._prepare(view.frame, lap, progress, backend)  # other views may have changed the scene
         passes = view.advance(
-            ready, lambda frame, ready, tell: self._draw(frame, ready, tell, cancelled, processor), cancelled
+            prepared, lambda frame, prepared, tell: self._draw(frame, prepared, tell, cancelled, backend), cancelled
         )
         lap("render")
-        return self._seen(view, passes, ready, lap)
+        return self._seen(view, passes, prepared, lap)
 
-    def _seen(self, view: View, passes: Passes, ready: Ready, lap: _Laps) -> Passes:
-        passes.statistics |= self._statistics(view.frame, ready[2], lap)
+    def _seen(self, view: View, passes: Passes, prepared: PreparedScene, lap: _Laps) -> Passes:
+        passes.statistics |= self._statistics(view.frame, prepared.surfels, lap)
         passes.statistics |= {"view.fraction": view.fraction, "view.pixel": float(view.pixel)}
         passes.warnings = self._warnings(view.frame.settings)
         return passes
 
     def _draw(
-        self, frame: Frame, ready: Ready, tell: Progress | None, cancelled: IsCancelled | None, processor: Processor
+        self,
+        frame: Frame,
+        prepared: PreparedScene,
+        tell: Progress | None,
+        cancelled: IsCancelled | None,
+        backend: RenderBackend,
     ) -> Passes:
         """The frame's picture as a whole, part of a sequence where it names one."""
-        scene, environment, posed, lights, tree = ready
         sequence, statistics = None, {}
         if frame.history and frame.settings.denoise == "svgf":
             self._lights = renewed(frame.lights, self._lights)
             scenery = *self._stage.scenery, self._lights
-            sequence = self._histories.continued(frame, scene, scenery)
+            sequence = self._histories.continued(frame, prepared.scene, scenery)
             statistics["history"] = float(sequence.pictures)
-        pictures = render(
-            scene,
-            environment,
-            posed,
-            frame,
-            tell,
-            cancelled,
-            lights,
-            tree,
-            self._stage.instant(frame, frame.previous),
-            self._stage.instant(frame, frame.next),
-            None if sequence is None else sequence.history,
-            processor,
-        )
+        instants = {name: self._stage.instant(frame, getattr(frame, name)) for name in ("previous", "next")}
+        prepared = replace(prepared, previous=instants["previous"], following=instants["next"])
+        history = None if sequence is None else sequence.history
+        pictures = render(prepared, frame, tell, cancelled, history=history, backend=backend)
         if sequence is not None:
-            self._histories.keep(frame, sequence, scene)
+            self._histories.keep(frame, sequence, prepared.scene)
         return Passes(pictures, [], statistics)
 
     def _compile(
@@ -234,21 +231,23 @@ class Session:
             prepare_kernels(wanted, progress, cancelled)
             self._compiled |= wanted
 
-    def _prepare(self, frame: Frame, lap: _Laps, progress: OnProgress | None, processor: Processor = HERE) -> Ready:
+    def _prepare(
+        self, frame: Frame, lap: _Laps, progress: OnProgress | None, backend: RenderBackend = CPU
+    ) -> PreparedScene:
         """Bring scene and light up to date with the frame."""
         _check(frame)
         use_threads(frame.settings.threads)
         if progress is not None:
             progress("Deforming", 0.0)
-        posed = self._stage.pose(frame, processor)
+        posed = self._stage.pose(frame, backend)
         lap("deform")
         environment, lights = self._stage.environment_of(frame.world), self._stage.lights_of(frame.lights)
         lap("light")
-        return self._stage.scene, environment, posed, lights, self._stage.tree
+        return PreparedScene(self._stage.scene, environment, posed, lights, self._stage.tree)
 
     def _warnings(self, settings: RenderSettings) -> list[str]:
         trouble = cache_folder().trouble
-        return self._stage.warnings() + self._devices.warnings(settings) + ([trouble] if trouble else [])
+        return self._stage.warnings() + self._backends.warnings(settings) + ([trouble] if trouble else [])
 
     def _statistics(self, frame: Frame, posed: PosedSurfels, lap: _Laps) -> dict[str, float]:
         return lap.seconds | {

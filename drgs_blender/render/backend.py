@@ -28,26 +28,29 @@ Array = np.ndarray
 T = TypeVar("T")
 
 
-class Processor:
-    """This processor, by all threads.
+class RenderBackend:
+    """The kernels of a frame, run on the CPU by all threads; other backends override what they can do.
 
     Attributes
     ----------
-    failed : of another one, why it is of no use to this picture any more, in words; what it was to do is done here
-    failures : how often that happened
-    launcher : of another one, what starts its kernels
+    failed : str
+        Error message of a backend that failed for this frame; its work falls back to the CPU. "" without a failure.
+    failures : int
+        How many frames it failed for.
+    launcher : Launcher, optional
+        Of a device: what launches its kernels.
     """
 
     failed = ""
     failures = 0
     launcher: Launcher | None = None
 
-    def tried(self, there: Callable[[], T], here: Callable[[], T]) -> T:
-        """Work done there, on another processor, or here once that has failed."""
-        return here()
+    def with_fallback(self, on_device: Callable[[], T], on_cpu: Callable[[], T]) -> T:
+        """The result of `on_device`, or that of `on_cpu` where there is no device or it has failed."""
+        return on_cpu()
 
     def integrate(self, *arguments: Any, surfels: SurfelBVH | None = None) -> Radiance:
-        """`shade.integrate.integrate`."""
+        """`integrator.integrate.integrate`."""
         return integrate(*arguments, surfels=surfels)
 
     def prepare(self, posed: PosedSurfels, camera: Camera, parameters: Array) -> Splats:
@@ -57,32 +60,32 @@ class Processor:
     def trace(self, scene: TraceScene, parameters: Array, x0: int, y0: int, shape: tuple[int, ...], mask: int) -> (
         MeshHits
     ):  # fmt: skip
-        """`primary.camera_hits.trace_camera`."""
+        """`gbuffer.camera_hits.trace_camera`."""
         return trace_camera(scene, parameters, x0, y0, shape, mask)
 
     def shade(self, scene: TraceScene, hits: MeshHits, parameters: Array, x0: int, buffer: GBuffer, layer: int) -> None:
-        """`primary.camera_hits.shade_mesh`; of what this processor has traced."""
+        """`gbuffer.camera_hits.shade_mesh`, of what this backend has traced."""
         shade_mesh(scene, hits, parameters, x0, buffer, layer)
 
     def rasterise(self, splats: Splats, y0: int, y1: int) -> SurfelSamples:
-        """`surfels.raster.rasterise`; of what this processor has prepared."""
+        """`surfels.raster.rasterise`; of what this backend has prepared."""
         return rasterise(splats, y0, y1)
 
     def tie(self, scene: TraceScene, *arguments: Any) -> None:
-        """`primary.primary_surfels.tie_to_mesh`."""
+        """`gbuffer.surfels.tie_to_mesh`."""
         tie_to_mesh(scene, *arguments)
 
     def denoise(
         self, components: Array, variance: Array, guides: Guides, split: bool, check: Callable[[], None]
     ) -> Array:  # fmt: skip
-        """`picture.denoise.denoise`."""
+        """`denoise.svgf_spatial.denoise`."""
         return denoise(components, variance, guides, split, check)
 
     def denoise_next(
         self, shot: Shot, history: Signal | None, split: bool, still: bool, check: Callable[[], None]
     ) -> tuple[Array, Signal]:
-        """`picture.temporal.denoise_next`."""
+        """`denoise.svgf_temporal.denoise_next`."""
         return denoise_next(shot, history, split, still, check)
 
 
-HERE = Processor()
+CPU = RenderBackend()

@@ -12,12 +12,11 @@ from collections.abc import Callable
 import numpy as np
 
 from ..compute.jit import use_threads
-from ..core.asset.model import PosedSurfels
 from ..core.cryptomatte import KINDS
 from ..core.errors import Cancelled, UsageError
 from ..core.frame import Frame
 from ..core.passes import BY_NAME
-from .backend import HERE, Processor
+from .backend import CPU, RenderBackend
 from .camera import camera_parameters
 from .denoise.oidn import denoise_oidn, require
 from .denoise.svgf_temporal import History, Shot
@@ -29,10 +28,8 @@ from .gbuffer.mesh import primary_mesh
 from .gbuffer.surfels import primary_surfels, snap_windows
 from .gbuffer.visible_lights import visible_lights
 from .integrator.adaptive import part_count, sample_adaptively
-from .lights.environment import EnvironmentLight
-from .lights.lights import Lights
 from .points import Radiance, ShadingPoints
-from .scene.trace_scene import TraceScene
+from .prepared_scene import PreparedScene
 from .surfels.splats import Splats
 from .surfels.surfel_bvh import SurfelBVH
 
@@ -47,37 +44,35 @@ BATCH_SECONDS, FIRST_SAMPLES, FEWEST_POINTS = 0.03, 1 << 17, 16
 
 
 def render(
-    scene: TraceScene,
-    environment: EnvironmentLight,
-    posed: PosedSurfels,
+    prepared: PreparedScene,
     frame: Frame,
     progress: Progress | None = None,
     cancelled: Callable[[], bool] | None = None,
-    lights: Lights | None = None,
-    tree: SurfelBVH | None = None,
-    previous: Instant | None = None,
-    following: Instant | None = None,
+    *,
     history: History | None = None,
-    processor: Processor = HERE,
+    backend: RenderBackend = CPU,
 ) -> dict[str, Array]:
     """Render the passes of a frame.
 
     Parameters
     ----------
-    scene : what rays meet, updated for this frame; its objects in the order of ``frame.objects``
-    light : the frame's world
-    posed : surfels of all objects, world space; not used when ``frame.settings.camera_sees`` is "mesh"
-    progress : called with the part done in [0, 1] and the name of the phase
-    cancelled : asked several times a second
-    lights : the frame's lights
-    tree : the surfels that light meets, when ``frame.settings.rays_see`` is "surfels"
-    previous, following : the scene one frame earlier and later; None: nothing moves
-    history : what earlier pictures leave to the denoiser SVGF; brought up to date when the picture is done
-    processor : who does the work
+    prepared : PreparedScene
+        The frame's shapes and lights.
+    frame : Frame
+        Camera, settings and passes.
+    progress : callable, optional
+        Called with the part done in [0, 1] and the name of the phase.
+    cancelled : callable, optional
+        Called several times per second; True ends the rendering.
+    history : History, optional
+        What earlier frames leave to the denoiser SVGF; brought up to date when the frame is done.
+    backend : RenderBackend
+        Where the kernels run.
 
     Returns
     -------
-    pass name -> (h, w, channels) float32 of the camera's window, row 0 at the top; those of ``frame.passes``
+    dict of str to (h, w, channels) float32 array
+        The passes of ``frame.passes``, of the camera's window, row 0 at the top.
 
     Raises
     ------
@@ -99,7 +94,8 @@ def render(
             progress(part, phase)
 
     tell(0.0, "Projecting")
-    camera_sees = Primary(scene, posed, frame, parameters, tree, processor)
+    scene, lights = prepared.scene, prepared.lights
+    visible = VisibleSurfaces(prepared, frame, parameters, backend)
     film = Film(camera, settings, parameters)
     mattes = [
         CryptoFilm(kind, scene, frame)
@@ -113,18 +109,18 @@ def render(
     past = None if history is None else history.instant
     moving = [
         None if then is None else MotionFilm((bottom - top, right - left), (left, top), now, then)
-        for then in (previous, following, past)
+        for then in (prepared.previous, prepared.following, past)
     ]
     end = 1.0 if settings.denoise == "none" else 0.9
-    batches = Batches(scene, environment, lights, tree, frame, check, processor)
+    batches = Batches(prepared, frame, check, backend)
     height = strip_height(right - left, settings.subpixel_count)
     for y0 in range(top, bottom, height):
         tell(end * (y0 - top) / (bottom - top), "Rendering")
         y1 = min(y0 + height, bottom)
-        buffer = camera_sees.rows(y0, y1)
+        buffer = visible.rows(y0, y1)
         check()
         radiance = batches.light(buffer)
-        film.add(buffer, radiance, scene.pass_index, environment)
+        film.add(buffer, radiance, scene.pass_index, prepared.environment)
         for matte in mattes:
             matte.add(buffer)
         if lights is not None and lights.seen:
@@ -137,10 +133,10 @@ def render(
     if settings.denoise != "none":
         tell(end, "Denoising")
     if history is None:
-        components = denoised(film, frame, check, processor)
+        components = denoised(film, frame, check, backend)
     else:
         shot = Shot(film.components, film.variance, film.guides(), motions[2])
-        components, signal = processor.denoise_next(shot, history.signal, split_light(frame), history.still, check)
+        components, signal = backend.denoise_next(shot, history.signal, split_light(frame), history.still, check)
     tell(1.0, "Done")
     if history is not None:
         history.signal = signal
@@ -155,12 +151,12 @@ def render(
     return {name: made[name] for name in frame.passes}
 
 
-def denoised(film: Film, frame: Frame, check: Check, processor: Processor = HERE) -> Array | None:
+def denoised(film: Film, frame: Frame, check: Check, backend: RenderBackend = CPU) -> Array | None:
     """(h, w, 4, 3) light of the film without noise, by the denoiser of the frame; None without one."""
     if frame.settings.denoise == "oidn":
         return denoise_oidn(film.components, film.guides(), split_light(frame), check)
     if frame.settings.denoise == "svgf":
-        return processor.denoise(film.components, film.variance, film.guides(), split_light(frame), check)
+        return backend.denoise(film.components, film.variance, film.guides(), split_light(frame), check)
     return None
 
 
@@ -169,30 +165,27 @@ def split_light(frame: Frame) -> bool:
     return any(name in frame.passes for name in COMPONENTS)
 
 
-class Primary:
-    """What the camera sees of a frame, strip by strip."""
+class VisibleSurfaces:
+    """The G-buffer of a frame, strip by strip."""
 
-    def __init__(
-        self, scene: TraceScene, posed: PosedSurfels, frame: Frame, parameters: Array, tree: SurfelBVH | None,
-        processor: Processor = HERE,
-    ) -> None:  # fmt: skip
-        self._scene, self._camera, self._parameters = scene, frame.camera, parameters
-        self._tree, self._objects, self._processor = tree, len(frame.objects), processor
+    def __init__(self, prepared: PreparedScene, frame: Frame, parameters: Array, backend: RenderBackend = CPU) -> None:
+        self._scene, self._camera, self._parameters = prepared.scene, frame.camera, parameters
+        self._tree, self._objects, self._backend = prepared.surfel_bvh, len(frame.objects), backend
         self._splats: Splats | None = None
         if frame.settings.camera_sees == "surfels":
-            self._splats = processor.prepare(posed, frame.camera, parameters)
-            self._windows = snap_windows(scene, len(frame.objects))
+            self._splats = backend.prepare(prepared.surfels, frame.camera, parameters)
+            self._windows = snap_windows(prepared.scene, len(frame.objects))
 
     def rows(self, y0: int, y1: int) -> GBuffer:
         """The samples of the rows ``y0 .. y1`` of the full picture."""
-        by = self._processor
+        backend = self._backend
         if self._splats is None:
-            buffer = primary_mesh(self._scene, self._camera, self._parameters, y0, y1, by.trace, by.shade)
+            buffer = primary_mesh(self._scene, self._camera, self._parameters, y0, y1, backend.trace, backend.shade)
             if self._tree is not None:
                 _own_surfels(buffer, self._tree, self._objects)
             return buffer
         given = self._splats, self._scene, self._windows, self._camera, y0, y1, self._tree is None
-        return primary_surfels(*given, by.rasterise, by.tie, by.trace, by.shade)
+        return primary_surfels(*given, backend.rasterise, backend.tie, backend.trace, backend.shade)
 
 
 def strip_height(width: int, subpixels: int) -> int:
@@ -210,13 +203,8 @@ def _own_surfels(buffer: GBuffer, tree: SurfelBVH, objects: int) -> None:
 class Batches:
     """Integrates points in batches as long as `BATCH_SECONDS`, learning how many points these are."""
 
-    def __init__(
-        self, scene: TraceScene, environment: EnvironmentLight, lights: Lights | None, tree: SurfelBVH | None, frame:
-        Frame,
-        check: Check, processor: Processor = HERE,
-    ) -> None:  # fmt: skip
-        self._scene, self._light, self._lights, self._frame, self._check = scene, environment, lights, frame, check
-        self._tree, self._processor = tree, processor
+    def __init__(self, prepared: PreparedScene, frame: Frame, check: Check, backend: RenderBackend = CPU) -> None:
+        self._prepared, self._frame, self._check, self._backend = prepared, frame, check, backend
         self._parts = part_count(frame.settings)
         self._size = max(FEWEST_POINTS, FIRST_SAMPLES * self._parts // max(1, frame.settings.sample_count))
 
@@ -230,21 +218,21 @@ class Batches:
     def trace(self, points: ShadingPoints, part: tuple[int, int]) -> Radiance:
         """Light of `points`, ordered by pixel, from one part of their samples, see `integrate`."""
         n = len(points)
-        out = Radiance.dark(n)
+        out, prepared = Radiance.dark(n), self._prepared
         first = 0
         while first < n:
             # A pixel's points stay together: their variance is estimated together.
             last = int(np.searchsorted(points.pixel, points.pixel[min(first + self._size, n) - 1], side="right"))
             began = time.perf_counter()
-            found = self._processor.integrate(
-                self._scene,
-                self._light,
+            found = self._backend.integrate(
+                prepared.scene,
+                prepared.environment,
                 points[first:last],
                 self._frame.settings,
                 self._frame.noise_index,
-                self._lights,
+                prepared.lights,
                 part,
-                surfels=self._tree,
+                surfels=prepared.surfel_bvh,
             )
             out.components[first:last], out.variance[first:last] = found.components, found.variance
             out.moments[first:last] = found.moments

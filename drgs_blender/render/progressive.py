@@ -18,19 +18,16 @@ from ..compute.jit import njit, use_threads
 from ..core.asset.model import PosedSurfels
 from ..core.errors import Cancelled
 from ..core.frame import Camera, Frame, RenderSettings
-from .backend import HERE, Processor
+from .backend import CPU, RenderBackend
 from .camera import camera_parameters
 from .film.film import Film
 from .gbuffer.gbuffer import GBuffer
 from .gbuffer.visible_lights import visible_lights
 from .integrator.adaptive import Sampling, part_count
 from .integrator.variance import variances
-from .lights.environment import EnvironmentLight
-from .lights.lights import Lights
-from .pipeline import Batches, Primary, check_frame, denoised, strip_height
+from .pipeline import Batches, VisibleSurfaces, check_frame, denoised, strip_height
 from .points import Radiance, ShadingPoints
-from .scene.trace_scene import TraceScene
-from .surfels.surfel_bvh import SurfelBVH
+from .prepared_scene import PreparedScene
 
 Array = np.ndarray
 
@@ -158,9 +155,9 @@ class Progressive:
     frame, processor : as of `pipeline.render`
     """
 
-    def __init__(self, frame: Frame, processor: Processor = HERE) -> None:
+    def __init__(self, frame: Frame, backend: RenderBackend = CPU) -> None:
         check_frame(frame)
-        self.frame, self._processor = frame, processor
+        self.frame, self._backend = frame, backend
         self._parts = parts_of(frame.settings)
         self._adaptive = part_count(frame.settings) > 1
         self._next = 0
@@ -168,7 +165,7 @@ class Progressive:
         _, top, _, bottom = frame.camera.window
         height = strip_height(frame.camera.window[2] - frame.camera.window[0], frame.settings.subpixel_count)
         self._strips = [_Strip((y, min(y + height, bottom))) for y in range(top, bottom, height)]
-        self._primary: Primary | None = None
+        self._visible: VisibleSurfaces | None = None
         self._left = KEPT_BYTES
 
     @property
@@ -178,11 +175,7 @@ class Progressive:
 
     def advance(
         self,
-        scene: TraceScene,
-        environment: EnvironmentLight,
-        posed: PosedSurfels,
-        lights: Lights | None,
-        tree: SurfelBVH | None,
+        prepared: PreparedScene,
         seconds: float = 0.0,
         cancelled: Callable[[], bool] | None = None,
     ) -> dict[str, Array]:
@@ -201,15 +194,15 @@ class Progressive:
 
         use_threads(self.frame.settings.threads)
         check()
-        if self._primary is None:
-            self._primary = Primary(scene, posed, self.frame, self._parameters, tree, self._processor)
-        batches = Batches(scene, environment, lights, tree, self.frame, check, self._processor)
+        if self._visible is None:
+            self._visible = VisibleSurfaces(prepared, self.frame, self._parameters, self._backend)
+        batches = Batches(prepared, self.frame, check, self._backend)
         began = time.perf_counter()
         while self._next < len(self._parts):
             self._draw(batches, check)
             if time.perf_counter() - began >= seconds:
                 break
-        return self._develop(scene, environment, lights, check)
+        return self._develop(prepared, check)
 
     def _draw(self, batches: Batches, check: Callable[[], None]) -> None:
         sample, part = self._parts[self._next]
@@ -235,8 +228,8 @@ class Progressive:
         """The strip's camera samples, kept while there is room."""
         if strip.buffer is not None:
             return strip.buffer
-        assert self._primary is not None
-        buffer = self._primary.rows(*strip.rows)
+        assert self._visible is not None
+        buffer = self._visible.rows(*strip.rows)
         if strip.light is None:
             strip.begin(len(buffer.points), self.frame.settings, self._parts[-1][1][1])
         size = _bytes_of(buffer)
@@ -244,20 +237,18 @@ class Progressive:
             strip.buffer, self._left = buffer, self._left - size
         return buffer
 
-    def _develop(
-        self, scene: TraceScene, environment: EnvironmentLight, lights: Lights | None, check: Callable[[], None]
-    ) -> dict[str, Array]:
-        camera = self.frame.camera
+    def _develop(self, prepared: PreparedScene, check: Callable[[], None]) -> dict[str, Array]:
+        camera, lights = self.frame.camera, prepared.lights
         film = Film(camera, self.frame.settings, self._parameters)
         for strip in self._strips:
             buffer = self._samples(strip)
             check()
             exact = self._adaptive and self.fraction == 1.0
-            film.add(buffer, strip.radiance(buffer.points, exact), scene.pass_index, environment)
+            film.add(buffer, strip.radiance(buffer.points, exact), prepared.scene.pass_index, prepared.environment)
             if lights is not None and lights.seen:
                 rows = slice(strip.rows[0] - camera.window[1], strip.rows[1] - camera.window[1])
                 film.emission[rows] += visible_lights(lights, self._parameters, camera.window[0], buffer)
-        return film.passes(self.frame.passes, denoised(film, self.frame, check, self._processor))
+        return film.passes(self.frame.passes, denoised(film, self.frame, check, self._backend))
 
 
 def _bytes_of(buffer: GBuffer) -> int:

@@ -9,19 +9,19 @@ from typing import TYPE_CHECKING
 import pytest
 
 if TYPE_CHECKING:
-    from drgs_blender.render.gpu.warp_backend import OnDevice
+    from drgs_blender.render.gpu.warp_backend import WarpRenderBackend
 
 
 @pytest.fixture(scope="session")
-def _device() -> OnDevice:
+def _device() -> WarpRenderBackend:
     pytest.importorskip("warp", reason="warp-lang is not installed")
-    from drgs_blender.render.gpu.warp_backend import OnDevice
+    from drgs_blender.render.gpu.warp_backend import WarpRenderBackend
 
-    return OnDevice("cpu")
+    return WarpRenderBackend("cpu")
 
 
 @pytest.fixture
-def device(_device: OnDevice) -> Iterator[OnDevice]:
+def device(_device: WarpRenderBackend) -> Iterator[WarpRenderBackend]:
     """Warp's processor, as a card; what it failed at would be done here, and be like itself."""
     _device.failed = ""
     yield _device

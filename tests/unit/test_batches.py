@@ -10,11 +10,12 @@ import pytest
 
 from drgs_blender.core.frame import RenderSettings
 from drgs_blender.render import pipeline
-from drgs_blender.render.backend import Processor
+from drgs_blender.render.backend import RenderBackend
 from drgs_blender.render.points import Radiance, ShadingPoints
+from drgs_blender.render.prepared_scene import PreparedScene
 
 
-class Timed(Processor):
+class Timed(RenderBackend):
     """A processor that takes so many seconds a point, dearer ones from a point on; notes what each batch took."""
 
     def __init__(self, seconds: float, dear: float, first_dear: int) -> None:
@@ -43,7 +44,7 @@ def test_no_launch_takes_long_whatever_points_cost(seconds: float, monkeypatch: 
     monkeypatch.setattr(pipeline, "time", SimpleNamespace(perf_counter=lambda: slow.clock))
     frame: Any = SimpleNamespace(settings=RenderSettings(samples=16), noise_index=0)
     nothing: Any = None
-    pipeline.Batches(nothing, nothing, None, None, frame, lambda: None, slow).trace(points, (0, 1))
+    pipeline.Batches(PreparedScene(nothing, nothing, nothing), frame, lambda: None, slow).trace(points, (0, 1))
     assert sum(slow.sizes) == n and max(slow.took) < 1.0
     tail = slow.took[-max(1, len(slow.took) // 4) :]
     assert max(tail) < 2 * pipeline.BATCH_SECONDS, "it has learned what the dear ones cost"

@@ -15,6 +15,7 @@ from drgs_blender.core.frame import Frame, Material, MeshState, ObjectState, Ren
 from drgs_blender.render.film.frame_files import read_frame, write_frame
 from drgs_blender.render.lights.environment import EnvironmentLight
 from drgs_blender.render.pipeline import render
+from drgs_blender.render.prepared_scene import PreparedScene
 from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene
 
 
@@ -68,7 +69,7 @@ def passes():
     )
     empty, flat = np.empty((0, 3), np.float32), np.empty(0, np.float32)
     nothing = PosedSurfels(empty, empty, empty, empty, flat, empty, flat, flat, np.empty(0, np.int32))
-    made = render(scene, EnvironmentLight(World()), nothing, frame)
+    made = render(PreparedScene(scene, EnvironmentLight(World()), nothing), frame)
     scene.close()
     return made
 

@@ -32,6 +32,7 @@ from drgs_blender.render.integrator.integrate import integrate as kernel_integra
 from drgs_blender.render.lights.environment import EnvironmentLight  # noqa: E402
 from drgs_blender.render.pipeline import render  # noqa: E402
 from drgs_blender.render.points import ShadingPoints  # noqa: E402
+from drgs_blender.render.prepared_scene import PreparedScene  # noqa: E402
 from drgs_blender.render.reference.integrate import EmptyTracer, SurfacePoints, integrate_quadrature  # noqa: E402
 from drgs_blender.render.reference.light import Light  # noqa: E402
 from drgs_blender.render.reference.raster import camera_rays, pixel_centres  # noqa: E402
@@ -398,7 +399,7 @@ def photographed(ball: Mesh) -> Capture:
     for k in range(14):
         camera = camera_at(2.4 * k, -0.6 + 0.12 * k, 32)
         frame = Frame(1, camera, [ObjectState("ball", "")], world, settings)
-        picture = render(scene, light, posed, frame)["Combined"]
+        picture = render(PreparedScene(scene, light, posed), frame)["Combined"]
         views.append(View(f"{k:02d}", camera, linear_to_srgb(np.clip(picture[..., :3], 0, 1)), picture[..., 3]))
     return Capture(Path("ball"), views, (0.0, 0.0, 0.0))
 

@@ -12,6 +12,7 @@ from drgs_blender.render.denoise.svgf_spatial import denoise
 from drgs_blender.render.film.film import Film
 from drgs_blender.render.film.guides import Guides
 from drgs_blender.render.lights.environment import EnvironmentLight
+from drgs_blender.render.prepared_scene import PreparedScene
 from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene
 
 H, W = 40, 56
@@ -239,7 +240,7 @@ def exposed(monkeypatch: pytest.MonkeyPatch, rays: int, seed: int) -> Film:
             strategy_samples=(rays // 2, rays // 4, rays // 4), subpixel_samples=4, camera_sees="mesh", seed=seed
         ),
     )
-    pipeline.render(scene(), EnvironmentLight(World(environment=sky)), None, frame)  # type: ignore[arg-type]
+    pipeline.render(PreparedScene(scene(), EnvironmentLight(World(environment=sky)), None), frame)  # type: ignore[arg-type]
     return films[0]
 
 

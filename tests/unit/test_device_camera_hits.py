@@ -14,12 +14,12 @@ from test_device_integrate import among_meshes, ball, floor, placed, psnr
 from test_raster import look_along_y
 
 from drgs_blender.core.frame import Camera, RenderSettings, Visibility
-from drgs_blender.render.backend import HERE, Processor
+from drgs_blender.render.backend import CPU, RenderBackend
 from drgs_blender.render.camera import SUBPIXELS, camera_parameters
 from drgs_blender.render.gbuffer.gbuffer import GBuffer
 from drgs_blender.render.gbuffer.mesh import primary_mesh
 from drgs_blender.render.gbuffer.surfels import primary_surfels, snap_windows
-from drgs_blender.render.gpu.warp_backend import OnDevice
+from drgs_blender.render.gpu.warp_backend import WarpRenderBackend
 from drgs_blender.render.scene.ray_masks import CAMERA
 from drgs_blender.render.scene.trace_scene import TraceScene
 
@@ -55,7 +55,7 @@ def unseen() -> tuple:
 SCENES = {"among meshes": among_meshes, "unseen": unseen}
 
 
-def seen(by: Processor, scene: TraceScene, camera: Camera, rows: tuple[int, int] = (0, 48)) -> GBuffer:
+def seen(by: RenderBackend, scene: TraceScene, camera: Camera, rows: tuple[int, int] = (0, 48)) -> GBuffer:
     parameters = camera_parameters(camera, RenderSettings(subpixel_samples=3, seed=5), 2)
     return primary_mesh(scene, camera, parameters, *rows, by.trace, by.shade)
 
@@ -85,13 +85,13 @@ def alike(here: GBuffer, there: GBuffer, camera: Camera) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("view", VIEWS)
 @pytest.mark.parametrize("name", SCENES)
-def test_the_camera_sees_the_same_meshes(device: OnDevice, name: str, view: str) -> None:
+def test_the_camera_sees_the_same_meshes(device: WarpRenderBackend, name: str, view: str) -> None:
     """Textures, emission, places, mirrored ones, what is hidden from the camera."""
     scene, camera = SCENES[name]()[0], VIEWS[view]
-    alike(seen(HERE, scene, camera), seen(device, scene, camera), camera)
+    alike(seen(CPU, scene, camera), seen(device, scene, camera), camera)
 
 
-def test_rows_do_not_depend_on_those_rendered_with_them(device: OnDevice) -> None:
+def test_rows_do_not_depend_on_those_rendered_with_them(device: WarpRenderBackend) -> None:
     scene, camera = among_meshes()[0], VIEWS["perspective"]
     whole, part = seen(device, scene, camera), seen(device, scene, camera, (11, 29))
     width = camera.width
@@ -102,7 +102,7 @@ def test_rows_do_not_depend_on_those_rendered_with_them(device: OnDevice) -> Non
             np.testing.assert_array_equal(values, getattr(whole.points, field.name)[own], field.name)
 
 
-def test_meshes_behind_surfels_leave_the_surfels_as_they_are(device: OnDevice) -> None:
+def test_meshes_behind_surfels_leave_the_surfels_as_they_are(device: WarpRenderBackend) -> None:
     """Only the points of meshes are filled."""
     scene, camera = scene_of(sphere_mesh(3)), look_along_y(48, 40)
     scene.update([scene._parts[0].item], [floor(placed(0, 0, -0.4), name="ground")])
@@ -110,10 +110,10 @@ def test_meshes_behind_surfels_leave_the_surfels_as_they_are(device: OnDevice) -
     posed = sphere_surfels(1.05)
     here, there = (
         primary_surfels(
-            HERE.prepare(posed, camera, parameters), scene, windows, camera, 0, 40, True, HERE.rasterise, HERE.tie,
+            CPU.prepare(posed, camera, parameters), scene, windows, camera, 0, 40, True, CPU.rasterise, CPU.tie,
             by.trace, by.shade,
         )
-        for by in (HERE, device)
+        for by in (CPU, device)
     )  # fmt: skip
     behind = here.points.flags != 0
     assert 0.1 < behind.mean() < 0.9
@@ -125,8 +125,8 @@ def test_meshes_behind_surfels_leave_the_surfels_as_they_are(device: OnDevice) -
 
 
 def test_a_card_that_fails_between_hits_and_points_leaves_them_whole(monkeypatch: pytest.MonkeyPatch) -> None:
-    device, scene, camera = OnDevice("cpu"), among_meshes()[0], VIEWS["perspective"]
-    expected = seen(HERE, scene, camera)
+    device, scene, camera = WarpRenderBackend("cpu"), among_meshes()[0], VIEWS["perspective"]
+    expected = seen(CPU, scene, camera)
     parameters = camera_parameters(camera, RenderSettings(subpixel_samples=3, seed=5), 2)
     trace = device.trace
 
@@ -151,14 +151,14 @@ def test_a_card_that_fails_between_hits_and_points_leaves_them_whole(monkeypatch
 
 def test_points_whose_hits_are_lost_and_not_found_again_are_on_some_face(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where a device met the edge of a face, the processor's ray may go past."""
-    device, scene, camera = OnDevice("cpu"), among_meshes()[0], VIEWS["perspective"]
+    device, scene, camera = WarpRenderBackend("cpu"), among_meshes()[0], VIEWS["perspective"]
     parameters = camera_parameters(camera, RenderSettings(subpixel_samples=3, seed=5), 2)
 
     def lost(*arguments: object) -> object:
         hits = device.trace(*arguments)  # type: ignore[arg-type]
-        anew = HERE.trace(*arguments)  # type: ignore[arg-type]
+        anew = CPU.trace(*arguments)  # type: ignore[arg-type]
         anew.owner[:], anew.face[:], anew.place[:] = -1, -1, -1
-        hits.there, hits.anew = (None,), lambda: anew  # type: ignore[attr-defined]
+        hits.on_device, hits.anew = (None,), lambda: anew  # type: ignore[attr-defined]
         device.failed = "a card that is no more"
         return hits
 

@@ -24,7 +24,7 @@ from drgs_blender.deform.gpu import gmls
 from drgs_blender.deform.gpu import mesh_driven as deformation
 from drgs_blender.deform.gpu.mesh_driven import Deformer
 from drgs_blender.render.gpu import attach, bvhs, camera_hits, denoise, integrate, raster, splats
-from drgs_blender.render.gpu.warp_backend import OnDevice
+from drgs_blender.render.gpu.warp_backend import WarpRenderBackend
 from drgs_blender.simulation.gpu import cells, steps
 
 #: A100 and later.
@@ -45,7 +45,7 @@ def made(works: tuple[object, ...], launcher: Launcher, folder: Path) -> set[obj
 
 @pytest.mark.slow
 def test_pictures_kernels_compile_for_a_card(tmp_path: Path) -> None:
-    device = OnDevice("cpu")
+    device = WarpRenderBackend("cpu")
     asset = test_device_deform.driven()
     deformer = Deformer(device.launcher)
     deformer.pose(asset, asset.mesh.vertices)
@@ -73,7 +73,7 @@ def test_learnings_kernels_compile_for_a_card(tmp_path: Path) -> None:
 
     from drgs_blender.reconstruct.gpu import gather, kernels, losses, on_device
 
-    device = on_device.OnDevice("cpu")
+    device = on_device.WarpRenderBackend("cpu")
     test_device_surfels.test_every_map_has_a_gradient_of_its_own(device.launcher)
     test_device_learning.test_difference_from_a_photograph(device)
     test_device_learning.test_a_step_down(device)
@@ -96,7 +96,7 @@ def test_particles_kernels_compile_for_a_card(tmp_path: Path, case: str) -> None
 
 @pytest.mark.skipif(os.environ.get("DRGS_FAULTS") != "whole", reason="takes minutes; DRGS_FAULTS=whole runs it")
 def test_the_integrator_compiles_for_a_card(tmp_path: Path) -> None:
-    device = OnDevice("cpu")
+    device = WarpRenderBackend("cpu")
     for scene in (test_device_integrate.under_sky(), test_device_integrate.among_meshes()):
         test_device_integrate.both(device, scene, test_device_integrate.SETTINGS)
     assert made((integrate.SHADE,), device.launcher, tmp_path) == {integrate.SHADE}

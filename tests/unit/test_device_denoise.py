@@ -10,13 +10,13 @@ pytest.importorskip("warp", reason="warp-lang is not installed")
 from test_denoise import H, W, light_of, wall
 
 from drgs_blender.core.errors import Cancelled, DeviceError
-from drgs_blender.render.backend import HERE
+from drgs_blender.render.backend import CPU
 from drgs_blender.render.denoise.demodulation import Signal
 from drgs_blender.render.denoise.svgf_spatial import denoise
 from drgs_blender.render.denoise.svgf_temporal import Shot, denoise_next
 from drgs_blender.render.film.motion_vectors import Motion
 from drgs_blender.render.gpu.denoise import DeviceSignal
-from drgs_blender.render.gpu.warp_backend import OnDevice
+from drgs_blender.render.gpu.warp_backend import WarpRenderBackend
 
 
 def picture() -> tuple:
@@ -56,7 +56,7 @@ def shots(count: int) -> list[Shot]:
 
 
 @pytest.mark.parametrize("split", [True, False])
-def test_a_device_filters_as_the_processor_does(device: OnDevice, split: bool) -> None:
+def test_a_device_filters_as_the_processor_does(device: WarpRenderBackend, split: bool) -> None:
     here = denoise(*picture(), split)
     there = device.denoise(*picture(), split, nothing)
     assert np.isfinite(there).all() and np.abs(here - picture()[0])[:3].max() > 0.05
@@ -65,7 +65,9 @@ def test_a_device_filters_as_the_processor_does(device: OnDevice, split: bool) -
 
 @pytest.mark.parametrize("still", [True, False])
 @pytest.mark.parametrize("split", [True, False])
-def test_pictures_are_gathered_over_time_as_the_processor_does(device: OnDevice, split: bool, still: bool) -> None:
+def test_pictures_are_gathered_over_time_as_the_processor_does(
+    device: WarpRenderBackend, split: bool, still: bool
+) -> None:
     here = there = None
     for k, shot in enumerate(shots(3)):
         expected, here = denoise_next(shot, here, split, still)
@@ -79,7 +81,7 @@ def test_pictures_are_gathered_over_time_as_the_processor_does(device: OnDevice,
 
 
 def test_a_sequence_goes_on_where_the_device_fails_and_where_it_is_back(
-    device: OnDevice, monkeypatch: pytest.MonkeyPatch
+    device: WarpRenderBackend, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first, second, third = shots(3)
     expected = None
@@ -95,11 +97,11 @@ def test_a_sequence_goes_on_where_the_device_fails_and_where_it_is_back(
     np.testing.assert_allclose(found, picture, rtol=2e-4, atol=1e-6)
 
 
-def test_a_history_that_is_lost_with_its_device_starts_anew(device: OnDevice) -> None:
+def test_a_history_that_is_lost_with_its_device_starts_anew(device: WarpRenderBackend) -> None:
     first, second, _ = shots(3)
     _, history = device.denoise_next(first, None, True, False, nothing)
     history.guide = None
-    found, _ = HERE.denoise_next(second, history, True, False, nothing)
+    found, _ = CPU.denoise_next(second, history, True, False, nothing)
     np.testing.assert_array_equal(found, denoise(second.components, second.variance, second.guides))
 
 
@@ -108,7 +110,7 @@ def failing(*_: object) -> None:
     raise DeviceError("device cuda", "has no memory left", "Use the CPU")
 
 
-def test_nothing_seen_and_a_caller_who_stops(device: OnDevice) -> None:
+def test_nothing_seen_and_a_caller_who_stops(device: WarpRenderBackend) -> None:
     guides = wall(coverage=np.zeros((H, W)))
     assert not device.denoise(*light_of(np.ones((H, W)), guides), guides, True, nothing).any()
 

@@ -12,9 +12,9 @@ import trimesh
 pytest.importorskip("warp", reason="warp-lang is not installed")
 
 from drgs_blender.core.frame import Image, Light, Material, MeshState, RenderSettings, Texture, Visibility, World
-from drgs_blender.render.backend import HERE
-from drgs_blender.render.gpu.select_backend import Devices
-from drgs_blender.render.gpu.warp_backend import OnDevice
+from drgs_blender.render.backend import CPU
+from drgs_blender.render.gpu.select_backend import Backends
+from drgs_blender.render.gpu.warp_backend import WarpRenderBackend
 from drgs_blender.render.integrator.integrate import integrate
 from drgs_blender.render.lights.environment import EnvironmentLight
 from drgs_blender.render.lights.lights import Lights
@@ -164,7 +164,9 @@ SCENES: dict[str, Callable[[], tuple]] = {
 }
 
 
-def both(device: OnDevice, scene: tuple, settings: RenderSettings, part: tuple[int, int] = (0, 1)) -> list[Radiance]:
+def both(
+    device: WarpRenderBackend, scene: tuple, settings: RenderSettings, part: tuple[int, int] = (0, 1)
+) -> list[Radiance]:
     objects, light, shining, points = scene
     return [by(objects, light, points, settings, 3, shining, part) for by in (integrate, device.integrate)]
 
@@ -177,7 +179,9 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
 
 @pytest.mark.parametrize("shading_model", ["paper", "principled"])
 @pytest.mark.parametrize("name", SCENES)
-def test_a_device_finds_the_light_that_the_processor_finds(device: OnDevice, name: str, shading_model: str) -> None:
+def test_a_device_finds_the_light_that_the_processor_finds(
+    device: WarpRenderBackend, name: str, shading_model: str
+) -> None:
     scene = SCENES[name]()
     here, there = both(device, scene, replace(SETTINGS, shading_model=shading_model))
     assert here.total.max() > 0.1
@@ -195,20 +199,20 @@ def test_a_device_finds_the_light_that_the_processor_finds(device: OnDevice, nam
     replace(SETTINGS, strategy_samples=(5, 5, 6), bounces=0), replace(SETTINGS, bounces=8, clamp_indirect=0.5),
     replace(SETTINGS, strategy_samples=(0, 0, 8)),
 ])  # fmt: skip
-def test_settings_mean_the_same_on_a_device(device: OnDevice, settings: RenderSettings) -> None:
+def test_settings_mean_the_same_on_a_device(device: WarpRenderBackend, settings: RenderSettings) -> None:
     here, there = both(device, under_lamps(), settings, (1, 2))
     assert here.total.max() > 0.1
     assert psnr(here.total, there.total) > 60.0
 
 
-def test_points_give_the_same_bits_in_any_company(device: OnDevice) -> None:
+def test_points_give_the_same_bits_in_any_company(device: WarpRenderBackend) -> None:
     scene, light, shining, points = under_lamps()
     whole = device.integrate(scene, light, points, SETTINGS, 0, shining)
     part = device.integrate(scene, light, points[100:300], SETTINGS, 0, shining)
     np.testing.assert_array_equal(part.components, whole.components[100:300])
 
 
-def test_what_moves_is_followed(device: OnDevice) -> None:
+def test_what_moves_is_followed(device: WarpRenderBackend) -> None:
     """The tree is refitted, places and materials are taken anew."""
     scene, points, light = TraceScene(), seen(), sky()
     for shift, visibility in ((0.0, Visibility()), (0.4, Visibility()), (-0.3, Visibility(shadow=False))):
@@ -218,7 +222,7 @@ def test_what_moves_is_followed(device: OnDevice) -> None:
         assert psnr(here.total, there.total) > 60.0
 
 
-def test_an_empty_scene_and_hopeless_points_are_survived(device: OnDevice) -> None:
+def test_an_empty_scene_and_hopeless_points_are_survived(device: WarpRenderBackend) -> None:
     points = seen(50)
     points.origin[3] = np.nan
     points.normal[4] = np.inf
@@ -232,44 +236,44 @@ def test_an_empty_scene_and_hopeless_points_are_survived(device: OnDevice) -> No
 
 def test_without_a_card_the_processor_does_all_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("drgs_blender.compute.warp.runtime.cuda_devices", list)
-    devices, settings = Devices(), replace(SETTINGS, device="cuda")
-    assert devices.processor("cuda") is HERE
+    devices, settings = Backends(), replace(SETTINGS, device="cuda")
+    assert devices.select("cuda") is CPU
     (warning,) = devices.warnings(settings)
     assert "no NVIDIA card" in warning and warning.endswith("Rendered on the CPU")
     assert devices.warnings(SETTINGS) == []
 
 
-def test_a_device_that_fails_is_left_alone_and_its_work_done_here(device: OnDevice, monkeypatch) -> None:
+def test_a_device_that_fails_is_left_alone_and_its_work_done_here(device: WarpRenderBackend, monkeypatch) -> None:
     scene, light, shining, points = under_lamps()
-    broken = OnDevice("cpu")
+    broken = WarpRenderBackend("cpu")
     monkeypatch.setattr(
         broken.launcher, "_room", lambda *arguments: (_ for _ in ()).throw(RuntimeError("out of memory\nat 0"))
     )
     found = broken.integrate(scene, light, points, SETTINGS, 3, shining)
     np.testing.assert_array_equal(found.components, integrate(scene, light, points, SETTINGS, 3, shining).components)
-    devices = Devices()
+    devices = Backends()
     devices._known["cuda"] = broken
     (warning,) = devices.warnings(replace(SETTINGS, device="cuda"))
     assert "out of memory" in warning and "at 0" not in warning and warning.endswith("Rendered on the CPU")
-    assert devices.processor("cuda") is broken and not broken.failed  # what comes next may fit
+    assert devices.select("cuda") is broken and not broken.failed  # what comes next may fit
     for _ in range(2):
         broken.integrate(scene, light, points, SETTINGS, 3, shining)
-        devices.processor("cuda")
+        devices.select("cuda")
     assert broken.failed and devices.warnings(replace(SETTINGS, device="cuda")) == [warning]
 
 
-def test_surfels_as_tracer_are_left_to_the_processor(device: OnDevice) -> None:
-    devices = Devices()
+def test_surfels_as_tracer_are_left_to_the_processor(device: WarpRenderBackend) -> None:
+    devices = Backends()
     devices._known["cuda"] = device
     (warning,) = devices.warnings(replace(SETTINGS, device="cuda", rays_see="surfels"))
-    assert "surfels" in warning
+    assert "Rays See: Surfels" in warning
 
 
 def test_every_array_is_copied_to_a_card(monkeypatch: pytest.MonkeyPatch) -> None:
     """A card cannot read this memory: here it is spoilt once the copies are made. Its scratch memory is turned."""
     scene, light, shining, points = among_meshes()
     expected = integrate(scene, light, points, SETTINGS, 3, shining)
-    apart = OnDevice("cpu")
+    apart = WarpRenderBackend("cpu")
     apart.launcher.apart = True
     apart.mirror.tables(scene, light, shining)
     spoilt = [

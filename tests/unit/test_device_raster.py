@@ -11,11 +11,11 @@ from shapes import scene_of, sphere_mesh, sphere_surfels
 from test_raster import join, look_along_y, plane_of_surfels, random_surfels
 
 from drgs_blender.core.frame import MeshState, RenderSettings
-from drgs_blender.render.backend import HERE
+from drgs_blender.render.backend import CPU
 from drgs_blender.render.camera import camera_parameters
 from drgs_blender.render.gbuffer.surfels import primary_surfels, snap_windows
 from drgs_blender.render.gpu import raster as device_raster
-from drgs_blender.render.gpu.warp_backend import OnDevice
+from drgs_blender.render.gpu.warp_backend import WarpRenderBackend
 from drgs_blender.render.surfels.raster import SurfelSamples, rasterise
 from drgs_blender.render.surfels.splats import prepare
 
@@ -28,7 +28,7 @@ SCENES = {
 
 
 def both(
-    device: OnDevice, name: str, rows: tuple[int, int] = (0, 30), width: float = 0.0
+    device: WarpRenderBackend, name: str, rows: tuple[int, int] = (0, 30), width: float = 0.0
 ) -> tuple[SurfelSamples, SurfelSamples]:
     posed, view = SCENES[name]
     camera = look_along_y(40, 30, **view)
@@ -38,7 +38,9 @@ def both(
 
 @pytest.mark.parametrize("width", [0.0, 1.5])
 @pytest.mark.parametrize("name", SCENES)
-def test_a_device_finds_the_samples_that_the_processor_finds(device: OnDevice, name: str, width: float) -> None:
+def test_a_device_finds_the_samples_that_the_processor_finds(
+    device: WarpRenderBackend, name: str, width: float
+) -> None:
     here, there = both(device, name, width=width)
     seen = here.alpha > 0
     assert seen.mean() > 0.1
@@ -49,13 +51,13 @@ def test_a_device_finds_the_samples_that_the_processor_finds(device: OnDevice, n
     np.testing.assert_array_equal(there.object_index[seen], here.object_index[seen])
 
 
-def test_rows_do_not_depend_on_those_rendered_with_them(device: OnDevice) -> None:
+def test_rows_do_not_depend_on_those_rendered_with_them(device: WarpRenderBackend) -> None:
     _, whole = both(device, "cloud")
     _, part = both(device, "cloud", (11, 17))
     np.testing.assert_array_equal(part.alpha, whole.alpha[11:17])
 
 
-def test_fog_of_any_depth_is_blended_in_exact_order(device: OnDevice) -> None:
+def test_fog_of_any_depth_is_blended_in_exact_order(device: WarpRenderBackend) -> None:
     """More contributions a sample than a list holds: the list is filled again."""
     fog = join(*(plane_of_surfels(0.05 * i, 0.3, 0.05, 0.05, opacity=0.012) for i in range(16)))
     camera = look_along_y(12, 12, focal=30.0)
@@ -72,7 +74,9 @@ def test_fog_of_any_depth_is_blended_in_exact_order(device: OnDevice) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("offset", [-0.02, 0.1])
 @pytest.mark.parametrize("tied", [True, False])
-def test_points_are_tied_to_the_mesh_as_the_processor_ties_them(device: OnDevice, offset: float, tied: bool) -> None:
+def test_points_are_tied_to_the_mesh_as_the_processor_ties_them(
+    device: WarpRenderBackend, offset: float, tied: bool
+) -> None:
     """A sphere of surfels about its mesh, before an ordinary mesh that they must not be tied to."""
     scene, camera = scene_of(sphere_mesh(3)), look_along_y(48, 40)
     wall = np.float32([[-3, -0.5, -3], [3, -0.5, -3], [3, -0.5, 3], [-3, -0.5, 3]])
@@ -85,7 +89,7 @@ def test_points_are_tied_to_the_mesh_as_the_processor_ties_them(device: OnDevice
         primary_surfels(
             by.prepare(posed, camera, parameters), scene, windows, camera, 0, 40, tied, by.rasterise, by.tie
         )
-        for by in (HERE, device)
+        for by in (CPU, device)
     )
     for name in ("pixel", "sample", "flags", "own"):
         np.testing.assert_array_equal(getattr(there.points, name), getattr(here.points, name))
@@ -99,7 +103,7 @@ def test_points_are_tied_to_the_mesh_as_the_processor_ties_them(device: OnDevice
 
 
 def test_blended_samples_are_not_copied_to_a_card_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    device, scene, camera, copied = OnDevice("cpu"), scene_of(sphere_mesh(2)), look_along_y(48, 40), []
+    device, scene, camera, copied = WarpRenderBackend("cpu"), scene_of(sphere_mesh(2)), look_along_y(48, 40), []
     device.launcher.apart, copy = True, device.launcher.array
     monkeypatch.setattr(
         device.launcher, "array", lambda array, *more, **how: copied.append(array) or copy(array, *more, **how)

@@ -15,14 +15,14 @@ from test_raster import join, look_along_y, plane_of_surfels, random_surfels, su
 from drgs_blender.core.asset.model import PosedSurfels
 from drgs_blender.core.frame import Camera, RenderSettings
 from drgs_blender.render.camera import camera_parameters
-from drgs_blender.render.gpu.warp_backend import OnDevice
+from drgs_blender.render.gpu.warp_backend import WarpRenderBackend
 from drgs_blender.render.surfels.raster import rasterise
 from drgs_blender.render.surfels.splats import Splats, prepare
 
 CAMERA = look_along_y(75, 50)
 
 
-def both(device: OnDevice, posed: PosedSurfels, camera: Camera = CAMERA) -> tuple[Splats, Splats]:
+def both(device: WarpRenderBackend, posed: PosedSurfels, camera: Camera = CAMERA) -> tuple[Splats, Splats]:
     parameters = camera_parameters(camera, RenderSettings(subpixel_samples=3, seed=5), 2)
     return tuple(by(posed, camera, parameters) for by in (prepare, device.prepare))  # type: ignore[return-value]
 
@@ -45,7 +45,7 @@ VIEWS = {
 
 
 @pytest.mark.parametrize("name", VIEWS)
-def test_a_device_makes_the_splats_that_the_processor_makes(device: OnDevice, name: str) -> None:
+def test_a_device_makes_the_splats_that_the_processor_makes(device: WarpRenderBackend, name: str) -> None:
     here, there = both(device, *VIEWS[name])
     assert len(there) == len(here) and (len(here) == 0) == (name == "elsewhere")
     for field in ("box", "object_index", "tile_start", "tile_list"):
@@ -57,7 +57,7 @@ def test_a_device_makes_the_splats_that_the_processor_makes(device: OnDevice, na
 
 
 def test_surfels_are_copied_to_a_card_once_a_frame(monkeypatch: pytest.MonkeyPatch) -> None:
-    posed, device, copied = random_surfels(1500), OnDevice("cpu"), []
+    posed, device, copied = random_surfels(1500), WarpRenderBackend("cpu"), []
     copy = device.launcher.array
     device.launcher.apart = True
     monkeypatch.setattr(device.launcher, "array", lambda array: copied.append(array.nbytes) or copy(array))
@@ -71,7 +71,7 @@ def test_surfels_are_copied_to_a_card_once_a_frame(monkeypatch: pytest.MonkeyPat
 
 
 def test_a_card_that_fails_after_its_splats_are_made_leaves_a_whole_picture(monkeypatch: pytest.MonkeyPatch) -> None:
-    device = OnDevice("cpu")
+    device = WarpRenderBackend("cpu")
     here, there = both(device, random_surfels(1500))
 
     def broken(*arguments: object) -> None:

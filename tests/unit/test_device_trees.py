@@ -15,7 +15,7 @@ from drgs_blender.compute.warp.kernels import Work
 from drgs_blender.core.frame import Visibility
 from drgs_blender.render.gpu.natives import NATIVES
 from drgs_blender.render.gpu.scene_mirror import Mirror
-from drgs_blender.render.gpu.warp_backend import OnDevice
+from drgs_blender.render.gpu.warp_backend import WarpRenderBackend
 from drgs_blender.render.scene.interaction import nearest
 from drgs_blender.render.scene.ray_masks import DIFFUSE
 from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene
@@ -33,7 +33,7 @@ def cast(lane, lanes, room, tracer, origin, direction, mask, out):  # type: igno
 CAST = Work(cast, (), NATIVES)
 
 
-def hits(device: OnDevice, scene: TraceScene, count: int = 4000) -> list[tuple[np.ndarray, ...]]:
+def hits(device: WarpRenderBackend, scene: TraceScene, count: int = 4000) -> list[tuple[np.ndarray, ...]]:
     """(depth, face, place) of random rays by Embree and by the device."""
     rng = np.random.default_rng(3)
     origin = rng.normal(size=(count, 3)).astype(np.float32)
@@ -45,7 +45,7 @@ def hits(device: OnDevice, scene: TraceScene, count: int = 4000) -> list[tuple[n
     return [(t, face, instance), out]
 
 
-def agree(device: OnDevice, scene: TraceScene) -> None:
+def agree(device: WarpRenderBackend, scene: TraceScene) -> None:
     (t, face, instance), found = hits(device, scene)
     assert (face >= 0).mean() > 0.2
     other = (found[1] != face) | ((found[2] >= 0) != (instance >= 0))
@@ -55,8 +55,8 @@ def agree(device: OnDevice, scene: TraceScene) -> None:
 
 
 @pytest.fixture
-def device() -> OnDevice:
-    return OnDevice("cpu")
+def device() -> WarpRenderBackend:
+    return WarpRenderBackend("cpu")
 
 
 def moved(item: TraceObject, by: np.ndarray) -> TraceObject:
@@ -68,7 +68,7 @@ def builds(mirror: Mirror) -> int:
     return sum(tree.builds for tree in mirror._trees.trees)
 
 
-def test_a_tree_is_refitted_until_it_is_worn_out(device: OnDevice) -> None:
+def test_a_tree_is_refitted_until_it_is_worn_out(device: WarpRenderBackend) -> None:
     """What was near goes everywhere: the boxes of the old tree would all be met, and the hits are Embree's still."""
     scene, item = TraceScene(), ball((0.0, 0.0, 0.0), 2.0)
     scene.update([item])
@@ -86,7 +86,7 @@ def test_a_tree_is_refitted_until_it_is_worn_out(device: OnDevice) -> None:
     assert builds(device.mirror) == 2
 
 
-def test_what_stands_in_places_is_followed(device: OnDevice) -> None:
+def test_what_stands_in_places_is_followed(device: WarpRenderBackend) -> None:
     """Places move, come and go; of two kinds of masks only one is worn out; a face dies and lives again."""
     scene, item = TraceScene(), ball((0.0, 0.0, 0.0), 1.0)
     shut, narrow = Visibility(glossy=False), floor().vertices * np.float32([1.0, 0.3, 1.0])
@@ -105,7 +105,7 @@ def test_what_stands_in_places_is_followed(device: OnDevice) -> None:
 
 
 def test_of_a_scene_that_moves_only_vertices_go_to_a_card(monkeypatch: pytest.MonkeyPatch) -> None:
-    device, scene, item, copied = OnDevice("cpu"), TraceScene(), ball((0.0, 0.0, 0.0), 1.0), []
+    device, scene, item, copied = WarpRenderBackend("cpu"), TraceScene(), ball((0.0, 0.0, 0.0), 1.0), []
     device.launcher.apart, copy = True, device.launcher.array
     monkeypatch.setattr(
         device.launcher, "array", lambda array, *more, **how: copied.append(array.nbytes) or copy(array, *more, **how)

@@ -19,8 +19,8 @@ from drgs_blender.compute.warp.kernels import Launcher, Work
 from drgs_blender.compute.warp.runtime import VERSION, load_module, warp
 from drgs_blender.core.errors import Cancelled, DeviceError
 from drgs_blender.core.frame import RenderSettings
-from drgs_blender.render.backend import HERE
-from drgs_blender.render.gpu.select_backend import Devices
+from drgs_blender.render.backend import CPU
+from drgs_blender.render.gpu.select_backend import Backends
 
 CUDA = RenderSettings(device="cuda")
 
@@ -38,8 +38,8 @@ def afresh() -> Iterator[None]:
 ])  # fmt: skip
 def test_warp_that_is_not_the_right_one_is_a_warning(monkeypatch: pytest.MonkeyPatch, module: Any, words: str) -> None:
     monkeypatch.setitem(sys.modules, "warp", module)
-    devices = Devices()
-    assert devices.processor("cuda") is HERE
+    devices = Backends()
+    assert devices.select("cuda") is CPU
     (warning,) = devices.warnings(CUDA)
     assert words in warning and "pip install" in warning and warning.endswith("Rendered on the CPU")
 

@@ -20,6 +20,7 @@ from drgs_blender.render.gbuffer.mesh import primary_mesh
 from drgs_blender.render.gbuffer.surfels import primary_surfels, snap_windows
 from drgs_blender.render.lights.environment import EnvironmentLight
 from drgs_blender.render.points import CATCHER, SECOND, Radiance
+from drgs_blender.render.prepared_scene import PreparedScene
 from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene
 from drgs_blender.render.surfels.splats import prepare
 
@@ -126,13 +127,13 @@ def test_the_whole_picture_does_not_depend_on_strips(camera_sees: str, monkeypat
     camera = look_along_y(SIZE, focal=20.0)
     frame = Frame(3, camera, states, settings=settings, passes=tuple(BY_NAME), meshes=meshes)
     posed = sphere_surfels(1.0, 3000)
-    whole = pipeline.render(scene, light, posed, frame)
+    whole = pipeline.render(PreparedScene(scene, light, posed), frame)
     assert {10, 11, 12} <= set(np.unique(whole["IndexOB"]).astype(int))
     np.testing.assert_allclose(whole["Emit"][0, 0], (1, 2, 3), rtol=1e-5)
     assert 0 in whole["Coverage"] and 1 in whole["Coverage"]
     for height in (1, 7):
         monkeypatch.setattr(pipeline, "strip_height", lambda width, subpixels, h=height: h)
-        again = pipeline.render(scene, light, posed, frame)
+        again = pipeline.render(PreparedScene(scene, light, posed), frame)
         for name in BY_NAME:
             np.testing.assert_array_equal(again[name], whole[name], err_msg=name)
 

@@ -70,12 +70,13 @@ def test_absence_is_an_error_with_a_remedy(monkeypatch: pytest.MonkeyPatch) -> N
 def test_the_pipeline_says_so_before_it_renders(monkeypatch: pytest.MonkeyPatch) -> None:
     from drgs_blender.core.frame import Camera, Frame, RenderSettings
     from drgs_blender.render.pipeline import render
+    from drgs_blender.render.prepared_scene import PreparedScene
 
     monkeypatch.setitem(sys.modules, "pyoidn", None)
     camera = Camera(np.eye(4), 8, 8, 8.0, 8.0, 4.0, 4.0)
     frame = Frame(1, camera, [], settings=RenderSettings(denoise="oidn"))
     with pytest.raises(DeviceError, match="OIDN"):
-        render(None, None, None, frame)  # type: ignore[arg-type]
+        render(PreparedScene(None, None, None), frame)  # type: ignore[arg-type]
 
 
 @pytest.mark.skipif(not available(), reason="the wheel pyoidn is not installed")

@@ -14,6 +14,7 @@ from drgs_blender.core.frame import Camera, Frame, ObjectState, RenderSettings, 
 from drgs_blender.core.passes import BY_NAME
 from drgs_blender.render import pipeline
 from drgs_blender.render.lights.environment import EnvironmentLight
+from drgs_blender.render.prepared_scene import PreparedScene
 from drgs_blender.render.scene.trace_scene import TraceScene
 
 ALL = tuple(BY_NAME)
@@ -38,12 +39,12 @@ def test_strips_and_batches_do_not_change_a_bit(
 ) -> None:
     scene, posed, light = ball
     this = frame(look_along_y(52), camera_sees=camera_sees, denoise="svgf", threads=1)
-    whole = pipeline.render(scene, light, posed, this)
+    whole = pipeline.render(PreparedScene(scene, light, posed), this)
     for height, batch in ((1, 400), (7, 3333), (52, 10**7)):
         monkeypatch.setattr(pipeline, "strip_height", lambda width, subpixels, h=height: h)
         monkeypatch.setattr(pipeline, "FIRST_SAMPLES", batch)
         monkeypatch.setattr(pipeline, "BATCH_SECONDS", 1e-9)  # batches shrink as fast as they can
-        again = pipeline.render(scene, light, posed, this)
+        again = pipeline.render(PreparedScene(scene, light, posed), this)
         for name in ALL:
             assert np.array_equal(again[name], whole[name]), (height, name)
 
@@ -51,15 +52,17 @@ def test_strips_and_batches_do_not_change_a_bit(
 @pytest.mark.alone
 def test_threads_do_not_change_a_bit(ball: tuple[TraceScene, PosedSurfels, EnvironmentLight]) -> None:
     scene, posed, light = ball
-    one = pipeline.render(scene, light, posed, frame(look_along_y(40), denoise="svgf", threads=1))
-    all_of_them = pipeline.render(scene, light, posed, frame(look_along_y(40), denoise="svgf", threads=0))
+    one = pipeline.render(PreparedScene(scene, light, posed), frame(look_along_y(40), denoise="svgf", threads=1))
+    all_of_them = pipeline.render(
+        PreparedScene(scene, light, posed), frame(look_along_y(40), denoise="svgf", threads=0)
+    )
     assert all(np.array_equal(one[n], all_of_them[n]) for n in ALL)
 
 
 def test_a_region_is_a_crop(ball: tuple[TraceScene, PosedSurfels, EnvironmentLight]) -> None:
     scene, posed, light = ball
-    whole = pipeline.render(scene, light, posed, frame(look_along_y(48)))
-    part = pipeline.render(scene, light, posed, frame(look_along_y(48, region=(11, 5, 40, 31))))
+    whole = pipeline.render(PreparedScene(scene, light, posed), frame(look_along_y(48)))
+    part = pipeline.render(PreparedScene(scene, light, posed), frame(look_along_y(48, region=(11, 5, 40, 31))))
     for name in ALL:
         assert part[name].shape[:2] == (26, 29)
         assert np.array_equal(part[name], whole[name][5:31, 11:40]), name
@@ -69,8 +72,12 @@ def test_surfels_and_mesh_of_one_ball_look_alike(ball: tuple[TraceScene, PosedSu
     scene, _, light = ball
     settings = {"samples": 128, "film_transparent": True}
     camera = look_along_y(48)
-    a = pipeline.render(scene, light, sphere_surfels(1.0, 30000), frame(camera, camera_sees="surfels", **settings))
-    b = pipeline.render(scene, light, sphere_surfels(1.0, 10), frame(camera, camera_sees="mesh", **settings))
+    a = pipeline.render(
+        PreparedScene(scene, light, sphere_surfels(1.0, 30000)), frame(camera, camera_sees="surfels", **settings)
+    )
+    b = pipeline.render(
+        PreparedScene(scene, light, sphere_surfels(1.0, 10)), frame(camera, camera_sees="mesh", **settings)
+    )
     inside = b["Coverage"][..., 0] == 1
     inside[1:-1, 1:-1] &= inside[2:, 1:-1] & inside[:-2, 1:-1] & inside[1:-1, 2:] & inside[1:-1, :-2]
     difference = np.abs(a["Combined"] - b["Combined"])[inside]
@@ -89,7 +96,7 @@ def test_an_empty_scene_is_the_world(camera_sees: str, denoise: str) -> None:
     )  # fmt: skip
     light = EnvironmentLight(World(colour=(0.25, 0.5, 1.0)))
     this = frame(look_along_y(8), objects=0, camera_sees=camera_sees, denoise=denoise)
-    passes = pipeline.render(scene_of(), light, nothing, this)
+    passes = pipeline.render(PreparedScene(scene_of(), light, nothing), this)
     assert np.allclose(passes["Combined"], (0.25, 0.5, 1.0, 1.0))
     assert (passes["Depth"] == 1e10).all() and (passes["Coverage"] == 0).all()
 
@@ -97,23 +104,23 @@ def test_an_empty_scene_is_the_world(camera_sees: str, denoise: str) -> None:
 def test_a_black_world_is_black(ball: tuple[TraceScene, PosedSurfels, EnvironmentLight]) -> None:
     scene, posed, _ = ball
     light = EnvironmentLight(World(strength=0.0))
-    passes = pipeline.render(scene, light, posed, frame(look_along_y(16), denoise="svgf"))
+    passes = pipeline.render(PreparedScene(scene, light, posed), frame(look_along_y(16), denoise="svgf"))
     assert (passes["Combined"][..., :3] == 0).all() and (passes["Combined"][..., 3] == 1).all()
 
 
 def test_only_the_passes_asked_for_come_back(ball: tuple[TraceScene, PosedSurfels, EnvironmentLight]) -> None:
     scene, posed, light = ball
-    passes = pipeline.render(scene, light, posed, frame(look_along_y(16), ("Normal", "Combined")))
+    passes = pipeline.render(PreparedScene(scene, light, posed), frame(look_along_y(16), ("Normal", "Combined")))
     assert list(passes) == ["Normal", "Combined"]
 
 
 def test_the_sum_of_denoised_passes_is_combined(ball: tuple[TraceScene, PosedSurfels, EnvironmentLight]) -> None:
     scene, posed, light = ball
-    p = pipeline.render(scene, light, posed, frame(look_along_y(40), denoise="svgf"))
+    p = pipeline.render(PreparedScene(scene, light, posed), frame(look_along_y(40), denoise="svgf"))
     total = p["DiffDir"] + p["DiffInd"] + p["GlossDir"] + p["GlossInd"] + p["Env"]
     assert np.array_equal(p["Combined"][..., :3], total)
     assert np.abs(p["Combined"] - p["Noisy Image"]).mean() > 1e-4
-    fast = pipeline.render(scene, light, posed, frame(look_along_y(40), ("Combined",), denoise="svgf"))
+    fast = pipeline.render(PreparedScene(scene, light, posed), frame(look_along_y(40), ("Combined",), denoise="svgf"))
     assert np.allclose(fast["Combined"], p["Combined"], atol=1e-5)
 
 
@@ -121,7 +128,9 @@ def test_progress_rises_to_one(ball: tuple[TraceScene, PosedSurfels, Environment
     scene, posed, light = ball
     told: list[tuple[float, str]] = []
     pipeline.render(
-        scene, light, posed, frame(look_along_y(32), denoise="svgf"), lambda part, phase: told.append((part, phase))
+        PreparedScene(scene, light, posed),
+        frame(look_along_y(32), denoise="svgf"),
+        lambda part, phase: told.append((part, phase)),
     )
     parts = [part for part, _ in told]
     assert parts == sorted(parts) and parts[0] == 0 and parts[-1] == 1
@@ -132,7 +141,7 @@ def test_cancel_is_seen_soon(ball: tuple[TraceScene, PosedSurfels, EnvironmentLi
     """The time between two questions stays short even when a whole strip would take many seconds."""
     scene, posed, light = ball
     this = frame(look_along_y(200, focal=300.0), subpixel_samples=4, samples=8192)
-    pipeline.render(scene, light, posed, frame(look_along_y(16)))  # compile
+    pipeline.render(PreparedScene(scene, light, posed), frame(look_along_y(16)))  # compile
     asked: list[float] = [time.process_time()]
 
     def cancelled() -> bool:
@@ -140,7 +149,7 @@ def test_cancel_is_seen_soon(ball: tuple[TraceScene, PosedSurfels, EnvironmentLi
         return asked[-1] - asked[0] > 1.0
 
     with pytest.raises(Cancelled):
-        pipeline.render(scene, light, posed, this, cancelled=cancelled)
+        pipeline.render(PreparedScene(scene, light, posed), this, cancelled=cancelled)
     assert len(asked) > 4
     # CPU time of both threads, so that a busy machine does not matter.
     assert max(np.diff(asked)) < 0.8
@@ -149,7 +158,7 @@ def test_cancel_is_seen_soon(ball: tuple[TraceScene, PosedSurfels, EnvironmentLi
 def test_cancel_at_once(ball: tuple[TraceScene, PosedSurfels, EnvironmentLight]) -> None:
     scene, posed, light = ball
     with pytest.raises(Cancelled):
-        pipeline.render(scene, light, posed, frame(look_along_y(16)), cancelled=lambda: True)
+        pipeline.render(PreparedScene(scene, light, posed), frame(look_along_y(16)), cancelled=lambda: True)
 
 
 @pytest.mark.parametrize(
@@ -169,4 +178,4 @@ def test_refusals(
 ) -> None:
     scene, posed, light = ball
     with pytest.raises(UsageError, match=message):
-        pipeline.render(scene, light, posed, frame(look_along_y(8), passes, **settings))
+        pipeline.render(PreparedScene(scene, light, posed), frame(look_along_y(8), passes, **settings))

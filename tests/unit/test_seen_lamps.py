@@ -15,6 +15,7 @@ from drgs_blender.core.frame import Frame, Light, Material, RenderSettings, Visi
 from drgs_blender.render.lights.environment import EnvironmentLight
 from drgs_blender.render.lights.lights import Lights
 from drgs_blender.render.pipeline import render
+from drgs_blender.render.prepared_scene import PreparedScene
 from drgs_blender.render.scene.trace_scene import TraceScene
 
 BLACK = Material("black", (0.0, 0.0, 0.0), 1.0)
@@ -44,7 +45,7 @@ def picture(
     }
     camera = look_along_y(SIZE, clip_start=clip[0], clip_end=clip[1])
     frame = Frame(1, camera, [], settings=RenderSettings(**(values | settings)), passes=("Combined", "Emit"))
-    return render(scene, EnvironmentLight(World(strength=0.0)), posed, frame, lights=Lights(lights))
+    return render(PreparedScene(scene, EnvironmentLight(World(strength=0.0)), posed, Lights(lights)), frame)
 
 
 def test_a_lamp_covers_what_it_should_with_its_radiance_and_no_alpha() -> None:
@@ -120,10 +121,10 @@ def test_the_window_and_a_distant_sun() -> None:
         settings=RenderSettings(samples=2, bounces=0, subpixel_samples=4, camera_sees="mesh"),
         passes=("Emit",),
     )
-    whole = render(scene, EnvironmentLight(World(strength=0.0)), None, frame, lights=Lights([sun]))["Emit"]  # type: ignore[arg-type]
+    whole = render(PreparedScene(scene, EnvironmentLight(World(strength=0.0)), None, Lights([sun])), frame)["Emit"]  # type: ignore[arg-type]
     radiance = 3.0 / (math.pi * math.sin(0.1) ** 2)
     np.testing.assert_allclose(whole[SIZE // 2, SIZE // 2 + 2], radiance, rtol=1e-4)
     assert not whole[:, : SIZE // 2 - 1].any()
     part = replace(frame, camera=replace(frame.camera, region=(8, 6, 20, 15)))
-    window = render(scene, EnvironmentLight(World(strength=0.0)), None, part, lights=Lights([sun]))["Emit"]  # type: ignore[arg-type]
+    window = render(PreparedScene(scene, EnvironmentLight(World(strength=0.0)), None, Lights([sun])), part)["Emit"]  # type: ignore[arg-type]
     np.testing.assert_array_equal(window, whole[6:15, 8:20])

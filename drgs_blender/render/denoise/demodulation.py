@@ -47,7 +47,7 @@ class Signal:
     light: Array
     spans: Array
 
-    def here(self) -> Signal | None:
+    def to_cpu(self) -> Signal | None:
         """The same in this process's memory; None where it is lost with the device that had it."""
         return self
 

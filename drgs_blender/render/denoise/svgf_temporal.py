@@ -108,7 +108,7 @@ def denoise_next(
     """
     signal = prepare(shot.components, shot.variance, shot.guides, split)
     check()
-    past = None if history is None else history.here()
+    past = None if history is None else history.to_cpu()
     if past is not None and shot.motion is not None and past.light.shape == signal.light.shape:
         signal = accumulate(past, signal, shot.motion, still)
     return modulate(smooth(signal, check), shot.guides), signal

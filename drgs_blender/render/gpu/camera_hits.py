@@ -30,7 +30,7 @@ SHADE = Work(camera_hits.shade_hits, (), NATIVES, _constants)
 
 
 @dataclass(slots=True)
-class HitsThere(MeshHits):
+class DeviceHits(MeshHits):
     """`MeshHits` of which depth and owner have come back from a device; faces, places and where stay there.
 
     Attributes
@@ -39,37 +39,37 @@ class HitsThere(MeshHits):
     anew : traces them on this processor
     """
 
-    there: tuple[Any, ...]
+    on_device: tuple[Any, ...]
     anew: Callable[[], MeshHits]
 
-    def here(self) -> MeshHits:
+    def to_cpu(self) -> MeshHits:
         """The same in this processor's memory; traced anew where they are lost with the device."""
         try:
-            return MeshHits(*(array.numpy() for array in self.there))
+            return MeshHits(*(array.numpy() for array in self.on_device))
         except Exception:  # whatever Warp raises for a device that is no more
             return self.anew()
 
 
 def trace(
-    launcher: Launcher, mirror: Mirror, here: Callable[[], MeshHits], scene: TraceScene, parameters: Array, x0: int,
+    launcher: Launcher, mirror: Mirror, on_cpu: Callable[[], MeshHits], scene: TraceScene, parameters: Array, x0: int,
     y0: int, shape: tuple[int, ...], mask: int,
 ) -> MeshHits:  # fmt: skip
     """`primary.camera_hits.trace_camera` on a device; `here` does it on this processor."""
     if not mask:
-        return here()
+        return on_cpu()
     with launcher.failures("copying the scene"):
         tracer, owners, zeros = mirror.tracer(scene), mirror.owners(scene), launcher.zeros
         depth, where = zeros(shape), zeros((*shape, 5))
         owner, face, place = (zeros(shape, "int32") for _ in range(3))
-    there = depth, owner, face, place, where
+    on_device = depth, owner, face, place, where
     arguments = tracer, (parameters, x0, y0), np.int32(mask), owners
-    launcher.launch(TRACE, int(np.prod(shape)), arguments, there)
+    launcher.launch(TRACE, int(np.prod(shape)), arguments, on_device)
     with launcher.failures("tracing the camera's rays"):
-        return HitsThere(depth.numpy(), owner.numpy(), face, place, where, there, here)
+        return DeviceHits(depth.numpy(), owner.numpy(), face, place, where, on_device, on_cpu)
 
 
 def shade(
-    launcher: Launcher, mirror: Mirror, scene: TraceScene, hits: HitsThere, parameters: Array, x0: int,
+    launcher: Launcher, mirror: Mirror, scene: TraceScene, hits: DeviceHits, parameters: Array, x0: int,
     buffer: GBuffer, layer: int,
 ) -> None:  # fmt: skip
     """`primary.camera_hits.shade_mesh` on a device."""
@@ -81,7 +81,7 @@ def shade(
         geometry, moving = mirror.geometry(scene), mirror.moving(scene)
     # Those alone: what is written to comes back as a whole.
     found = tuple(tuple(np.empty((len(chosen), *array.shape[1:]), array.dtype) for array in group) for group in out)
-    arguments = geometry, moving, (parameters, x0, buffer.rows[0]), layer, hits.there
+    arguments = geometry, moving, (parameters, x0, buffer.rows[0]), layer, hits.on_device
     launcher.launch(SHADE, len(chosen), (*arguments, tuple(key[chosen] for key in keys)), found)
     for group, values in zip(out, found):
         for array, value in zip(group, values):

@@ -303,7 +303,7 @@ class DeviceSignal(Signal):
     light: Any
     spans: Any
 
-    def here(self) -> Signal | None:
+    def to_cpu(self) -> Signal | None:
         try:
             return Signal(self.guide.numpy(), self.light.numpy(), self.spans.numpy())
         except Exception:  # whatever Warp raises for a device that is no more

@@ -200,7 +200,7 @@ BLEND = Work(blend_samples, _ROOMS, {})
 
 
 @dataclass(slots=True)
-class SamplesThere(SurfelSamples):
+class DeviceSamples(SurfelSamples):
     """`SurfelSamples` that have come back from a device.
 
     Attributes
@@ -208,10 +208,10 @@ class SamplesThere(SurfelSamples):
     there : depth, surface and object index, where they still are
     """
 
-    there: tuple[Any, Any, Any]
+    on_device: tuple[Any, Any, Any]
 
 
-def rasterise(launcher: Launcher, splats: Splats, y0: int, y1: int) -> SamplesThere:
+def rasterise(launcher: Launcher, splats: Splats, y0: int, y1: int) -> DeviceSamples:
     """`surfels.raster.rasterise` on a device; where ``alpha`` is 0 the other arrays are undefined."""
     x0, top, x1, _ = splats.window
     subpixels = int(splats.parameters[SUBPIXELS])
@@ -223,5 +223,5 @@ def rasterise(launcher: Launcher, splats: Splats, y0: int, y1: int) -> SamplesTh
     arguments = *arrays, splats.tile_start, splats.tile_list, splats.parameters, x0, x1, top // TILE, y0, y1, subpixels
     launcher.launch(BLEND, int(np.prod(shape)), arguments, (alpha, depth, surface, owner))
     with launcher.failures("blending surfels"):
-        there = depth, surface, owner
-        return SamplesThere(alpha.numpy(), depth.numpy(), surface.numpy(), owner.numpy(), there)
+        on_device = depth, surface, owner
+        return DeviceSamples(alpha.numpy(), depth.numpy(), surface.numpy(), owner.numpy(), on_device)

@@ -41,7 +41,7 @@ _MOST = (1 << 30) - 1
 
 
 @dataclass(slots=True)
-class SplatsThere(Splats):
+class DeviceSplats(Splats):
     """`Splats` whose arrays are a device's, but for ``parameters``.
 
     Attributes
@@ -49,7 +49,7 @@ class SplatsThere(Splats):
     here : the same on the processor, made when that is asked for
     """
 
-    here: Callable[[], Splats]
+    on_cpu: Callable[[], Splats]
 
 
 def project_surfels(lane: Any, lanes: Any, room: Any, placed: Any, p: Any, window: Any, out: Any) -> None:
@@ -113,7 +113,7 @@ LIST = Work(list_tiles, (), {})
 
 
 def prepare(
-    launcher: Launcher, posed: PosedSurfels, camera: Camera, parameters: Array, here: Callable[[], Splats]
+    launcher: Launcher, posed: PosedSurfels, camera: Camera, parameters: Array, on_cpu: Callable[[], Splats]
 ) -> Splats:
     """`surfels.splats.prepare` on a device; where no surfel is seen, there is nothing that could stay there.
 
@@ -135,13 +135,13 @@ def prepare(
     launcher.launch(FIND, 1, (keys, n, _CULLED), (m,))
     seen = int(m[0])
     if not seen:
-        return here()
+        return on_cpu()
     with launcher.failures("sorting surfels"):
         made = zeros((seen, RECORD)), zeros((seen, SURFACE)), zeros((seen, 4), "int32"), zeros((seen,))
         owner, tiles = zeros((seen,), "int32"), zeros((seen,), "int64")
     launcher.launch(GATHER, seen, (order, found, shown, given["object_index"]), (*made, owner, tiles))
     lists = _listed(launcher, made[2], tiles, camera.window)
-    return SplatsThere(*made, owner, *lists, camera.window, parameters, here)
+    return DeviceSplats(*made, owner, *lists, camera.window, parameters, on_cpu)
 
 
 def _listed(launcher: Launcher, box: Any, tiles: Any, window: tuple[int, int, int, int]) -> tuple[Any, Any]:

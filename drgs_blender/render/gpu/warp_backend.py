@@ -1,4 +1,4 @@
-"""A processor that is a device of Warp; what it fails at, and all that follows, is done here."""
+"""The Warp backend: kernels on a device; what it fails at, and all that follows in the frame, runs on the CPU."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ...compute.warp.kernels import Launcher
 from ...core.asset.model import PosedSurfels
 from ...core.errors import DeviceError
 from ...core.frame import Camera
-from ..backend import Processor, T
+from ..backend import RenderBackend, T
 from ..denoise.demodulation import Signal
 from ..denoise.svgf_temporal import Shot
 from ..film.guides import Guides
@@ -21,103 +21,106 @@ from ..integrator.integrate import integrate
 from ..points import Radiance
 from ..scene.trace_scene import TraceScene
 from ..surfels.raster import SurfelSamples
-from ..surfels.raster import rasterise as rasterise_here
+from ..surfels.raster import rasterise as rasterise_on_cpu
 from ..surfels.splats import Splats
 from ..surfels.surfel_bvh import SurfelBVH
 from .attach import tie
-from .camera_hits import HitsThere, shade, trace
+from .camera_hits import DeviceHits, shade, trace
 from .denoise import denoise
 from .integrate import DeviceKernel
-from .raster import SamplesThere, rasterise
+from .raster import DeviceSamples, rasterise
 from .scene_mirror import Mirror
-from .splats import SplatsThere, prepare
+from .splats import DeviceSplats, prepare
 
 Array = np.ndarray
 
 
-class OnDevice(Processor):
+class WarpRenderBackend(RenderBackend):
     """A device of Warp.
 
     Parameters
     ----------
-    device : Warp's name of it: "cuda:0", "cpu"
+    device : str
+        Warp's name of it: "cuda:0", "cpu".
     """
 
     def __init__(self, device: str) -> None:
         self.launcher: Launcher = Launcher(device)
         self.mirror = Mirror(self.launcher)
-        self._samples: SamplesThere | None = None
+        self._samples: DeviceSamples | None = None
         self._kernel = DeviceKernel(self.launcher, self.mirror)
 
     def integrate(self, *arguments: Any, surfels: SurfelBVH | None = None) -> Radiance:
-        here = super().integrate
+        on_cpu = super().integrate
         if surfels is not None:
-            return here(*arguments, surfels=surfels)
-        return self.tried(lambda: integrate(*arguments, kernel=self._kernel), lambda: here(*arguments))
+            return on_cpu(*arguments, surfels=surfels)
+        return self.with_fallback(lambda: integrate(*arguments, kernel=self._kernel), lambda: on_cpu(*arguments))
 
     def prepare(self, posed: PosedSurfels, camera: Camera, parameters: Array) -> Splats:
-        here = functools.partial(super().prepare, posed, camera, parameters)
+        on_cpu = functools.partial(super().prepare, posed, camera, parameters)
         if not len(posed):
-            return here()
-        return self.tried(lambda: prepare(self.launcher, posed, camera, parameters, functools.cache(here)), here)
+            return on_cpu()
+        return self.with_fallback(
+            lambda: prepare(self.launcher, posed, camera, parameters, functools.cache(on_cpu)), on_cpu
+        )
 
     def trace(self, scene: TraceScene, *arguments: Any) -> MeshHits:
-        here = functools.partial(super().trace, scene, *arguments)
+        on_cpu = functools.partial(super().trace, scene, *arguments)
         if not len(scene.faces):
-            return here()
-        return self.tried(lambda: trace(self.launcher, self.mirror, here, scene, *arguments), here)
+            return on_cpu()
+        return self.with_fallback(lambda: trace(self.launcher, self.mirror, on_cpu, scene, *arguments), on_cpu)
 
     def shade(self, scene: TraceScene, hits: MeshHits, *arguments: Any) -> None:
-        def here() -> None:
-            shade_mesh(scene, hits.here() if isinstance(hits, HitsThere) else hits, *arguments)
+        def on_cpu() -> None:
+            shade_mesh(scene, hits.to_cpu() if isinstance(hits, DeviceHits) else hits, *arguments)
 
-        if not isinstance(hits, HitsThere):
-            return here()
-        return self.tried(lambda: shade(self.launcher, self.mirror, scene, hits, *arguments), here)
+        if not isinstance(hits, DeviceHits):
+            return on_cpu()
+        return self.with_fallback(lambda: shade(self.launcher, self.mirror, scene, hits, *arguments), on_cpu)
 
     def rasterise(self, splats: Splats, y0: int, y1: int) -> SurfelSamples:
-        def here() -> SurfelSamples:
-            own = splats.here() if isinstance(splats, SplatsThere) else splats
-            return rasterise_here(own, y0, y1)
+        def on_cpu() -> SurfelSamples:
+            own = splats.on_cpu() if isinstance(splats, DeviceSplats) else splats
+            return rasterise_on_cpu(own, y0, y1)
 
         if not len(splats):
-            return here()
+            return on_cpu()
 
-        def there() -> SurfelSamples:
+        def on_device() -> SurfelSamples:
             self._samples = rasterise(self.launcher, splats, y0, y1)
             return self._samples
 
-        return self.tried(there, here)
+        return self.with_fallback(on_device, on_cpu)
 
     def tie(self, scene: TraceScene, *arguments: Any) -> None:
-        here = functools.partial(super().tie, scene, *arguments)
+        on_cpu = functools.partial(super().tie, scene, *arguments)
         rules, view_of, samples, *more = arguments
         latest, self._samples = self._samples, None
         if latest is not None and samples[1] is latest.surface:
-            samples = latest.there  # not to be copied again
-        self.tried(lambda: tie(self.launcher, self.mirror, scene, rules, view_of, samples, *more), here)
+            samples = latest.on_device  # not to be copied again
+        self.with_fallback(lambda: tie(self.launcher, self.mirror, scene, rules, view_of, samples, *more), on_cpu)
 
     def denoise(
         self, components: Array, variance: Array, guides: Guides, split: bool, check: Callable[[], None]
     ) -> Array:  # fmt: skip
-        here, shot = super().denoise, Shot(components, variance, guides)
-        return self.tried(
+        on_cpu, shot = super().denoise, Shot(components, variance, guides)
+        return self.with_fallback(
             lambda: denoise(self.launcher, shot, None, split, False, check)[0],
-            lambda: here(components, variance, guides, split, check),
+            lambda: on_cpu(components, variance, guides, split, check),
         )
 
     def denoise_next(
         self, shot: Shot, history: Signal | None, split: bool, still: bool, check: Callable[[], None]
     ) -> tuple[Array, Signal]:
-        here, given = super().denoise_next, (shot, history, split, still, check)
-        return self.tried(lambda: denoise(self.launcher, *given), lambda: here(*given))
+        on_cpu, given = super().denoise_next, (shot, history, split, still, check)
+        return self.with_fallback(lambda: denoise(self.launcher, *given), lambda: on_cpu(*given))
 
-    def tried(self, there: Callable[[], T], here: Callable[[], T]) -> T:
-        """Work done there, or here once that has failed."""
+    def with_fallback(self, on_device: Callable[[], T], on_cpu: Callable[[], T]) -> T:
+        """The result of `on_device`, or that of `on_cpu` once the device has failed."""
         if not self.failed:
             try:
-                return there()
+                return on_device()
             except DeviceError as error:
                 self.failed = str(error)
                 self.failures += 1
-        return here()
+        return on_cpu()

@@ -1,0 +1,41 @@
+"""What a frame becomes before it is rendered."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ..core.asset.model import PosedSurfels
+from .film.motion_vectors import Instant
+from .lights.environment import EnvironmentLight
+from .lights.lights import Lights
+from .scene.trace_scene import TraceScene
+from .surfels.surfel_bvh import SurfelBVH
+
+
+@dataclass(slots=True)
+class PreparedScene:
+    """A frame's shapes, lights and surfels, brought into world space and ready for rays.
+
+    Attributes
+    ----------
+    scene : TraceScene
+        What rays meet; its objects are in the order of ``frame.objects``.
+    environment : EnvironmentLight
+        The frame's world.
+    surfels : PosedSurfels
+        Those of all objects; not used where ``frame.settings.camera_sees`` is "mesh".
+    lights : Lights, optional
+        All lights but the environment, emitting meshes included.
+    surfel_bvh : SurfelBVH, optional
+        The surfels that light meets, where ``frame.settings.rays_see`` is "surfels".
+    previous, following : Instant, optional
+        The scene one frame earlier and later, for motion vectors; None: nothing moves.
+    """
+
+    scene: TraceScene
+    environment: EnvironmentLight
+    surfels: PosedSurfels
+    lights: Lights | None = None
+    surfel_bvh: SurfelBVH | None = None
+    previous: Instant | None = None
+    following: Instant | None = None
