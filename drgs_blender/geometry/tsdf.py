@@ -201,20 +201,24 @@ def _fuse(
     """
     height, width = depth.shape[1], depth.shape[2]
     for i in prange(total.shape[0]):
+        # A column of voxels along Z at a time: what depends on X and Y alone is found once for each view.
+        value, weights = np.zeros(total.shape[2], depth.dtype), np.zeros(total.shape[2], depth.dtype)
         for j in range(total.shape[1]):
-            for k in range(total.shape[2]):
-                value, weights, views = depth.dtype.type(0), depth.dtype.type(0), 0
-                for m in range(len(depth)):
-                    x = low[0] + i * voxel - origin[m, 0]
-                    y = low[1] + j * voxel - origin[m, 1]
+            value[:], weights[:] = 0, 0
+            for m in range(len(depth)):
+                x, y = low[0] + i * voxel - origin[m, 0], low[1] + j * voxel - origin[m, 1]
+                right, down, ahead = axes[m, 0], axes[m, 1], axes[m, 2]
+                right_xy, down_xy = right[0] * x + right[1] * y, down[0] * x + down[1] * y
+                ahead_xy = ahead[0] * x + ahead[1] * y
+                for k in range(total.shape[2]):
                     z = low[2] + k * voxel - origin[m, 2]
-                    a = axes[m]
-                    away = (a[2, 0] * x + a[2, 1] * y + a[2, 2] * z) * scale[m, 2] + offset[m, 2]
+                    away = (ahead_xy + ahead[2] * z) * scale[m, 2] + offset[m, 2]
                     if away <= 0.0:
                         continue
-                    divisor = away if perspective else 1.0
-                    px = ((a[0, 0] * x + a[0, 1] * y + a[0, 2] * z) * scale[m, 0] + offset[m, 0]) / divisor
-                    py = ((a[1, 0] * x + a[1, 1] * y + a[1, 2] * z) * scale[m, 1] + offset[m, 1]) / divisor
+                    px = (right_xy + right[2] * z) * scale[m, 0] + offset[m, 0]
+                    py = (down_xy + down[2] * z) * scale[m, 1] + offset[m, 1]
+                    if perspective:
+                        px, py = px / away, py / away
                     if px < 0.0 or py < 0.0 or px >= width or py >= height:
                         continue
                     w = cosine[m, int(py), int(px)]
@@ -223,9 +227,9 @@ def _fuse(
                     seen = _sample(depth[m], px, py) if bilinear else depth[m, int(py), int(px)]
                     gap = (seen - depth.dtype.type(away)) / depth.dtype.type(band)
                     if gap > depth.dtype.type(-1):
-                        value += w * min(w * gap, depth.dtype.type(1))
-                        weights += w
-                        views += 1
-                total[i, j, k] += value
-                weight[i, j, k] += weights
-                count[i, j, k] += views
+                        value[k] += w * min(w * gap, depth.dtype.type(1))
+                        weights[k] += w
+                        count[i, j, k] += 1
+            for k in range(total.shape[2]):
+                total[i, j, k] += value[k]
+                weight[i, j, k] += weights[k]
