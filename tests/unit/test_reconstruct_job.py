@@ -241,7 +241,7 @@ def test_what_cannot_be_reconstructed_is_refused_by_name(case):
 
 
 def test_more_voxels_than_memory_are_refused_before_anything_is_learned(capture, monkeypatch):
-    monkeypatch.setattr("drgs_blender.reconstruct.memory_budget.memory", lambda: 1024.0)
+    monkeypatch.setattr("drgs_blender.reconstruct.memory_budget.total_memory", lambda: 1024.0)
     told = []
     with pytest.raises(UsageError, match="--voxels"):
         reconstruct(capture, Settings(schedule=Schedule(iterations=2), materials=False), told.append)
