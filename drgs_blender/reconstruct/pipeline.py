@@ -36,7 +36,8 @@ from .meshing.visual_hull import Region, find_region, have_silhouettes, silhouet
 from .model.attached import attach_learned, bound
 from .model.gaussians import Gaussians
 from .model.thin_structures import is_thin, normals_of
-from .optim.train import Schedule, Training
+from .optim.schedule import Schedule
+from .optim.train import Training
 
 log = logging.getLogger(__name__)
 

@@ -22,7 +22,8 @@ from drgs_blender.reconstruct.capture.capture import Capture  # noqa: E402
 from drgs_blender.reconstruct.checkpoint import fingerprint  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.settings import Settings as Decoupling  # noqa: E402
 from drgs_blender.reconstruct.meshing.visual_hull import find_region  # noqa: E402
-from drgs_blender.reconstruct.optim.train import Schedule, Training  # noqa: E402
+from drgs_blender.reconstruct.optim.schedule import Schedule  # noqa: E402
+from drgs_blender.reconstruct.optim.train import Training  # noqa: E402
 from drgs_blender.reconstruct.pipeline import Settings, reconstruct  # noqa: E402
 
 QUICK = Schedule(iterations=240, surfels=2500)

@@ -16,7 +16,7 @@ from capture_cases import balls
 
 from drgs_blender.core.phases import PREPARING
 from drgs_blender.reconstruct.inverse_rendering.settings import Settings as Decoupling
-from drgs_blender.reconstruct.optim.train import Schedule
+from drgs_blender.reconstruct.optim.schedule import Schedule
 from drgs_blender.reconstruct.pipeline import Settings, reconstruct
 
 #: A process of its own, where nothing is compiled yet: prints the steps by which a kernel was made or loaded.
@@ -28,7 +28,8 @@ from capture_cases import balls
 from drgs_blender.reconstruct import pipeline as job
 from drgs_blender.reconstruct.inverse_rendering import run
 from drgs_blender.reconstruct.inverse_rendering.settings import Settings as Decoupling
-from drgs_blender.reconstruct.optim.train import Schedule, Training
+from drgs_blender.reconstruct.optim.schedule import Schedule
+from drgs_blender.reconstruct.optim.train import Training
 
 variant, masked = sys.argv[2], sys.argv[3] == "masks"
 watching, rehearse = False, job.rehearse
