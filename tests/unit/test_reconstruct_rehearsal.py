@@ -50,7 +50,7 @@ def then_watch(*arguments):
     rehearse(*arguments)
     watching = True
 
-Training.step, run._Job.step, job.rehearse = watched(Training.step), watched(run._Job.step), then_watch
+Training.step, run.Job.step, job.rehearse = watched(Training.step), watched(run.Job.step), then_watch
 capture = balls(18, 24, masks=masked)
 if not masked:
     capture.background = None
