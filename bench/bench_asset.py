@@ -27,7 +27,7 @@ from drgs_blender.core.asset.container import write_asset
 from drgs_blender.core.asset.model import Asset
 from drgs_blender.evaluate.truth import Truth, read_truth, true_asset
 from drgs_blender.reconstruct.capture.capture import Capture
-from drgs_blender.reconstruct.optim.train import Schedule
+from drgs_blender.reconstruct.optim.schedule import Schedule
 from drgs_blender.reconstruct.pipeline import Progress, Settings, reconstruct
 from drgs_blender.reconstruct.readers import read_capture
 

@@ -25,7 +25,7 @@ from drgs_blender.engine.session import Session
 from drgs_blender.evaluate.compare import Renderer, compare
 from drgs_blender.evaluate.truth import read_truth
 from drgs_blender.reconstruct.inverse_rendering.settings import Settings as Decoupling
-from drgs_blender.reconstruct.optim.train import Schedule
+from drgs_blender.reconstruct.optim.schedule import Schedule
 from drgs_blender.reconstruct.pipeline import Settings, reconstruct
 from drgs_blender.reconstruct.readers import read_capture
 

@@ -129,7 +129,8 @@ def own_meshes(scene: Scene) -> tuple[Mesh, Mesh]:
     from drgs_blender.reconstruct.meshing.silhouette_fit import fill_silhouettes
     from drgs_blender.reconstruct.meshing.tsdf import fuse
     from drgs_blender.reconstruct.meshing.visual_hull import find_region, silhouettes
-    from drgs_blender.reconstruct.optim.train import Schedule, Training
+    from drgs_blender.reconstruct.optim.schedule import Schedule
+    from drgs_blender.reconstruct.optim.train import Training
 
     path = FOLDER / "own-meshes.npz"
     if not path.exists():

@@ -32,7 +32,8 @@ from drgs_blender.reconstruct.meshing.visual_hull import find_region
 from drgs_blender.reconstruct.model.attached import attach_learned
 from drgs_blender.reconstruct.model.gaussians import Gaussians
 from drgs_blender.reconstruct.model.raster import rasterise
-from drgs_blender.reconstruct.optim.train import Schedule, Training
+from drgs_blender.reconstruct.optim.schedule import Schedule
+from drgs_blender.reconstruct.optim.train import Training
 from drgs_blender.reconstruct.pipeline import ON_MESH, judge, mesh_of
 from drgs_blender.reconstruct.readers import read_capture
 

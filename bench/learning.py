@@ -18,7 +18,8 @@ from drgs_blender.reconstruct.capture.capture import Capture, View
 from drgs_blender.reconstruct.gpu.devices import learner
 from drgs_blender.reconstruct.gpu.on_device import OnDevice
 from drgs_blender.reconstruct.meshing.visual_hull import find_region
-from drgs_blender.reconstruct.optim.train import Schedule, Training
+from drgs_blender.reconstruct.optim.schedule import Schedule
+from drgs_blender.reconstruct.optim.train import Training
 from drgs_blender.reconstruct.pipeline import judge
 
 #: Views around the object, every fourth left out; steps of a run that is not timed, which compiles.
@@ -47,8 +48,8 @@ def learning(path: Path, size: int, steps: int, surfels: int, missing: str) -> s
         training = Training(capture, region, schedule, by=by)
         while not training.finished:
             training.step()
-        if training.failed:
-            raise DeviceError("device", training.failed, "")
+        if training.fallback.failed:
+            raise DeviceError("device", training.fallback.failed, "")
         return training
 
     def run(by: Processor, threads: int) -> list[str]:
@@ -57,7 +58,7 @@ def learning(path: Path, size: int, steps: int, surfels: int, missing: str) -> s
         training = learned(schedule, by)
         use_threads(0)
         found = judge(training.gaussians.on(HERE), capture)
-        rate = f"{steps / training.seconds:.1f}"
+        rate = f"{steps / training.clock.spent:.1f}"
         return [rate, f"{len(training.gaussians)}", f"{found['psnr']:.2f} dB", f"{found['ssim']:.4f}"]
 
     rows = [["Numba and torch, all threads", *run(HERE, 0)], ["Numba and torch, 1 thread", *run(HERE, 1)]]

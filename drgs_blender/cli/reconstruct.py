@@ -115,7 +115,7 @@ def run(args: argparse.Namespace) -> int:
         raise DeviceError(
             "reconstruct", "needs PyTorch", f'Install it: "{sys.executable}" -m pip install "torch>=2.5"'
         ) from error
-    from ..reconstruct.optim.train import Schedule
+    from ..reconstruct.optim.schedule import Schedule
     from ..reconstruct.readers import read_capture
 
     capture = read_capture(args.capture, args.resolution, args.test_every, args.axes, args.up)

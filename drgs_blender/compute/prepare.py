@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core.errors import EXIT_CANNOT_WRITE, EXIT_INTERRUPTED, Cancelled, DrgsError
+from ..core.memory import available_memory
 from ..core.phases import PREPARING
 from . import closure, manifest, shipped
 from .folders import cache_folder
@@ -148,14 +149,8 @@ def processes() -> int:
     with contextlib.suppress(OSError, ValueError):  # Linux: a limit of a container counts
         quota, period = Path("/sys/fs/cgroup/cpu.max").read_text().split()
         allowed = min(allowed, max(1, int(quota) // int(period)))
-    with contextlib.suppress(OSError, ValueError, StopIteration):
-        lines = Path("/proc/meminfo").read_text().splitlines()
-        free = int(next(line for line in lines if line.startswith("MemAvailable")).split()[1]) << 10
-        with contextlib.suppress(OSError, ValueError):
-            most = int(Path("/sys/fs/cgroup/memory.max").read_text())
-            free = min(free, most - int(Path("/sys/fs/cgroup/memory.current").read_text()))
-        allowed = min(allowed, max(1, free // _BYTES))
-    return allowed
+    most = available_memory() / _BYTES
+    return allowed if most >= allowed else max(1, int(most))
 
 
 class _Pool:

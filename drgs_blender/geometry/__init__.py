@@ -1,1 +1,1 @@
-"""Geometry of triangle meshes: vertex normals, occupancy."""
+"""Geometry of surfaces: vertex normals, occupancy, signed distance fields."""

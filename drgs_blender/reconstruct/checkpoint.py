@@ -5,6 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -54,3 +56,42 @@ def load(path: Path, key: str) -> dict[str, Array] | None:
         log.warning("%s belongs to other photographs or settings, or another drgs; starting anew", path)
         return None
     return arrays
+
+
+class Checkpoint:
+    """The file of a run's state, if one is wanted.
+
+    Parameters
+    ----------
+    path : Path, optional
+        Without it, nothing is written or read.
+    key : str
+        Of `fingerprint`.
+    every : float
+        Seconds between two states.
+    now : callable
+        Seconds since whenever.
+    """
+
+    def __init__(self, path: Path | None, key: str, every: float, now: Callable[[], float] = time.monotonic) -> None:
+        self._path, self._key, self._every, self._now = path, key, every, now
+        self._saved = now()
+
+    def load(self) -> dict[str, Array] | None:
+        """The state that lies there and belongs to this run."""
+        return None if self._path is None else load(self._path, self._key)
+
+    def is_due(self) -> bool:
+        """Whether the last state was written a while ago."""
+        return self._path is not None and self._now() - self._saved > self._every
+
+    def save(self, state: dict[str, Array]) -> None:
+        """Write a state; WriteError names the path."""
+        if self._path is not None:
+            save(self._path, state, self._key)
+            self._saved = self._now()
+
+    def remove(self) -> None:
+        """Delete the file: the run is over."""
+        if self._path is not None:
+            self._path.unlink(missing_ok=True)

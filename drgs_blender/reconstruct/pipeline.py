@@ -36,7 +36,8 @@ from .meshing.visual_hull import Region, find_region, have_silhouettes, silhouet
 from .model.attached import attach_learned, bound
 from .model.gaussians import Gaussians
 from .model.thin_structures import is_thin, normals_of
-from .optim.train import Schedule, Training
+from .optim.schedule import Schedule
+from .optim.train import Training
 
 log = logging.getLogger(__name__)
 
@@ -223,20 +224,19 @@ class _Work:
         """Run a training to its end, from its checkpoint if there is one: that of a run with other settings of later
         phases serves as well."""
         file = self.file(phase)
-        key = "" if file is None else self.key(phase)
-        if file is not None and (state := checkpoint.load(file, key)) is not None:
+        kept = checkpoint.Checkpoint(file, "" if file is None else self.key(phase), SAVE_EVERY)
+        if (state := kept.load()) is not None:
             known = state
             training.attempt(lambda: training.restore(known), whole=False)
             log.info("%s: going on at step %d", phase, training.iteration)
-        saved = shown = told = time.monotonic()
+        shown = told = time.monotonic()
         reached = 0.0
         while not training.finished:
             training.step()
             now = time.monotonic()
             stop = self.cancelled()
-            if file is not None and (stop or training.finished or now - saved > SAVE_EVERY):
-                checkpoint.save(file, training.arrays(), key)
-                saved = time.monotonic()
+            if stop or training.finished or kept.is_due():
+                kept.save(training.arrays())
             if stop:
                 raise Cancelled
             if now - told > 1 or training.finished:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -260,7 +259,7 @@ def test_what_is_said_of_metals_begins_late_and_counts_for_nothing_else(ball, ca
 
     assert not alike()
     assert alike(parametrisation="dielectric")
-    monkeypatch.setattr("drgs_blender.reconstruct.inverse_rendering.run._METALS", 2.0)
+    monkeypatch.setattr("drgs_blender.reconstruct.inverse_rendering.schedule._METALS", 2.0)
     assert alike()
 
 
@@ -304,7 +303,7 @@ def test_only_photographs_that_are_clipped_learn_otherwise_beside_it(ball, captu
 
 def test_pixels_beside_clipped_ones_count_whole_as_long_as_photographs_weigh(ball, capture, monkeypatch):
     """Half from the first step on gained less: light that is not yet known needs them."""
-    monkeypatch.setattr("drgs_blender.reconstruct.inverse_rendering.run._BY_SHOWN", 2.0)
+    monkeypatch.setattr("drgs_blender.reconstruct.inverse_rendering.schedule._BY_SHOWN", 2.0)
     assert alike_whole_and_half(ball, capture, 2.0)
 
 
@@ -471,7 +470,7 @@ def test_metallic_is_smoothed_more_than_other_materials(ball, capture, monkeypat
         return float(decouple(capture, ball, replace(SMALL, iterations=40, smoothness=0.05)).metallic.std())
 
     more = spread()
-    monkeypatch.setattr("drgs_blender.reconstruct.inverse_rendering.run._SMOOTH", (1.0,) * 7)
+    monkeypatch.setattr("drgs_blender.reconstruct.inverse_rendering.regularisers._SMOOTH", (1.0,) * 7)
     assert more < 0.8 * spread()
 
 
@@ -532,22 +531,22 @@ def test_an_interrupted_run_ends_where_an_undisturbed_one_does(ball, capture, tm
     assert not np.array_equal(other.albedo, whole.albedo)
 
 
-def test_a_run_whose_time_was_up_when_it_was_stopped_still_knows_how_good_it_is(ball, capture, tmp_path, monkeypatch):
+def test_a_run_whose_time_was_up_when_it_was_stopped_still_knows_how_good_it_is(ball, capture, tmp_path):
     clock, tick = [0.0], [1.0]
 
-    def monotonic() -> float:
+    def now() -> float:
         clock[0] += tick[0]
         return clock[0]
 
-    monkeypatch.setattr("drgs_blender.reconstruct.inverse_rendering.run.time", SimpleNamespace(monotonic=monotonic))
     settings, path = replace(SMALL, iterations=1000, seconds=100.0), tmp_path / "materials.state"
     asked = []
     with pytest.raises(Cancelled):
-        decouple(capture, ball, settings, cancelled=lambda: asked.append(0) or len(asked) > 5, checkpoint=path)
+        stop = lambda: asked.append(0) or len(asked) > 5  # noqa: E731
+        decouple(capture, ball, settings, cancelled=stop, checkpoint=path, now=now)
     tick[0] = 100.0
-    report = decouple(capture, ball, settings, checkpoint=path).report
+    report = decouple(capture, ball, settings, checkpoint=path, now=now).report
     assert report["iterations"] == 5 and 5 < report["psnr"] < 60
-    report = decouple(capture, ball, settings).report
+    report = decouple(capture, ball, settings, now=now).report
     assert report["iterations"] == 1 and 5 < report["psnr"] < 60
 
 
@@ -594,7 +593,7 @@ def test_normals_are_turned_towards_the_true_ones_once_light_is_known(ball, capt
         return float(np.median(np.degrees(np.arccos(np.clip((normals * ball.vertices).sum(axis=1), -1, 1)))))
 
     assert off(decouple(capture, wrong, settings).normals) < 0.97 * off(smooth)
-    monkeypatch.setattr("drgs_blender.reconstruct.inverse_rendering.run._NORMALS", 2.0)
+    monkeypatch.setattr("drgs_blender.reconstruct.inverse_rendering.schedule._NORMALS", 2.0)
     assert decouple(capture, wrong, replace(settings, iterations=3)).normals == pytest.approx(smooth, abs=1e-6)
 
 

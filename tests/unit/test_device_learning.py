@@ -28,7 +28,8 @@ from drgs_blender.reconstruct.losses.photometric import Photograph  # noqa: E402
 from drgs_blender.reconstruct.meshing.visual_hull import Region, find_region  # noqa: E402
 from drgs_blender.reconstruct.model.gaussians import Gaussians  # noqa: E402
 from drgs_blender.reconstruct.model.reflection_probe import BARE, pyramid  # noqa: E402
-from drgs_blender.reconstruct.optim.train import Schedule, Training  # noqa: E402
+from drgs_blender.reconstruct.optim.schedule import Schedule  # noqa: E402
+from drgs_blender.reconstruct.optim.train import Training  # noqa: E402
 from drgs_blender.reconstruct.pipeline import Settings, reconstruct  # noqa: E402
 
 HEIGHT, WIDTH = 23, 31
@@ -161,10 +162,10 @@ def test_first_steps_are_the_processors(capture: Capture, region: Region, there:
 def test_a_device_learns_as_well_as_the_processor(capture: Capture, region: Region, there: OnDevice) -> None:
     """All of the schedule: surfels cut, mirrors, shape. What begins as last digits grows, but leads no other way."""
     here, other = (learned(capture, region, by, SCHEDULE.iterations) for by in (HERE, there))
-    assert here.rounds == other.rounds == SCHEDULE.rounds
+    assert here.growth.rounds == other.growth.rounds == SCHEDULE.rounds
     assert here.psnr > 20
     assert abs(here.psnr - other.psnr) < 0.1
-    assert not other.failed
+    assert not other.fallback.failed
     assert other.gaussians.by is there
 
 
@@ -197,8 +198,8 @@ def test_a_device_that_fails_is_a_warning_and_the_processor_goes_on(
     (said,) = caplog.messages
     assert str(error) in said and "on the CPU from step 10 on" in said
     assert training.iteration == 20
-    assert training.by is HERE
-    assert training.failed == str(error)
+    assert training.fallback.by is HERE
+    assert training.fallback.failed == str(error)
 
     assert alike(expected, training) == 0
 
@@ -222,8 +223,9 @@ def test_a_step_that_fails_half_done_is_done_again(
     training = learned(capture, region, there, 10)
     fail_at(DESCEND, there, RuntimeError("CUDA error"), monkeypatch)
     training.step()
-    assert training.iteration == training.optimiser.steps == training.light.steps == 11
-    assert training.by is HERE
+    learner = training.learner
+    assert training.iteration == learner.optimiser.steps == learner.light.steps == 11
+    assert training.fallback.by is HERE
 
 
 def broken(*_: Any, **__: Any) -> None:
@@ -233,7 +235,7 @@ def broken(*_: Any, **__: Any) -> None:
 def kept(capture: Capture, region: Region) -> tuple[Training, Training]:
     """A training on a device that has kept its state, and one of this processor with the same."""
     training, here = learned(capture, region, OnDevice("cpu"), 7), Training(capture, region, SCHEDULE)
-    training._keep()
+    training.fallback.keep()
     here.restore(training.arrays())
     return training, here
 
@@ -241,8 +243,8 @@ def kept(capture: Capture, region: Region) -> tuple[Training, Training]:
 def step_that_loses_all(training: Training, monkeypatch: pytest.MonkeyPatch) -> None:
     """One at which the device fails, and nothing can be read from it any more."""
     with monkeypatch.context() as patch:
-        patch.setattr(training.by, "rasterise", broken)
-        patch.setattr(training, "_state", broken)
+        patch.setattr(training.fallback.by, "rasterise", broken)
+        patch.setattr(training.learner, "arrays", broken)
         training.step()
 
 
@@ -254,7 +256,7 @@ def test_a_device_whose_memory_is_lost_goes_back_to_the_last_state_kept(
     training.step()
     step_that_loses_all(training, monkeypatch)
     here.step()
-    assert training.by is HERE
+    assert training.fallback.by is HERE
     assert training.iteration == here.iteration == 8
     assert alike(here, training) == 0
 
@@ -267,7 +269,7 @@ def test_a_run_taken_up_on_a_device_goes_back_to_where_it_was_taken_up(
     training.restore(begun.arrays())
     step_that_loses_all(training, monkeypatch)
     begun.step()
-    assert training.by is HERE
+    assert training.fallback.by is HERE
     assert training.iteration == 6
     assert alike(begun, training) == 0
 
@@ -283,8 +285,8 @@ def test_a_device_that_fails_before_the_first_step_learns_nothing(
 
     monkeypatch.setattr(Gaussians, "on", broken_there)
     training = Training(capture, region, SCHEDULE, by=OnDevice("cpu"))
-    assert training.by is HERE
-    assert "illegal memory" in training.failed
+    assert training.fallback.by is HERE
+    assert "illegal memory" in training.fallback.failed
     training.step()
 
 
@@ -292,7 +294,7 @@ def test_a_device_that_fails_between_two_starts_loses_neither(monkeypatch: pytes
     """The second begins with its first step, not with the first one's last."""
     capture = balls(count=24, size=40)
     training = Training(capture, find_region(capture), SCHEDULE, by=OnDevice("cpu"))
-    rival, on = training._rival, Gaussians.on
+    rival, on = training.trial.rival, Gaussians.on
     assert rival is not None
     while training.iteration < 11:
         training.step()
@@ -302,9 +304,9 @@ def test_a_device_that_fails_between_two_starts_loses_neither(monkeypatch: pytes
 
     monkeypatch.setattr(Gaussians, "on", broken_there)
     training.step()
-    assert training.failed and training.by is HERE
-    assert training.trying and training.iteration == training.rounds == 0
-    assert len(training.gaussians) == training.start == len(rival)
+    assert training.fallback.failed and training.fallback.by is HERE
+    assert training.trying and training.iteration == training.growth.rounds == 0
+    assert len(training.gaussians) == training.growth.start == len(rival)
     while training.trying:
         training.step()
     assert training.iteration == 12
@@ -314,16 +316,16 @@ def test_surfels_half_cut_are_of_no_use(capture: Capture, region: Region, monkey
     training, here = kept(capture, region)
 
     def half(rows: Any) -> None:
-        training.optimiser.first.clear()
+        training.learner.optimiser.first.clear()
         broken()
 
-    monkeypatch.setattr(training.optimiser, "take", half)
-    training.iteration = here.iteration = 40
-    training._maybe_densify()
-    here._maybe_densify()
-    assert training.by is HERE
-    assert len(training.gaussians) > 1.2 * training.start
-    assert training.rounds == here.rounds > 0
+    monkeypatch.setattr(training.learner.optimiser, "take", half)
+    training.learner.iteration = here.learner.iteration = 40
+    training.densify_when_due()
+    here.densify_when_due()
+    assert training.fallback.by is HERE
+    assert len(training.gaussians) > 1.2 * training.growth.start
+    assert training.growth.rounds == here.growth.rounds > 0
     assert alike(here, training) == 0
 
 
@@ -362,9 +364,9 @@ def test_nothing_of_this_process_meets_what_is_on_a_device(
     monkeypatch.setattr(torch, "nonzero", lambda x: torch.zeros(90, x.dim(), dtype=torch.int64, device=x.device))
     monkeypatch.setattr(torch.Tensor, "__float__", lambda _: 0.5)
     training = Training(capture, region, replace(SCHEDULE, mirrors=0.0, shape=0.0))
-    training._take_on(there)
-    training._learn()
-    training.optimiser.take(np.array([0, -1, 2]))
+    training.move(there)
+    training.learner.step(training.views.of_step(0, half=True, but_aside=False), 0.0)
+    training.learner.optimiser.take(np.array([0, -1, 2]))
     training.gaussians.take(np.array([1, 2]))
     assert set(asked) >= {kernels.SUM_PIXELS, losses.ROWS, DESCEND}
 

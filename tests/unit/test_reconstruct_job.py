@@ -22,7 +22,8 @@ from drgs_blender.reconstruct.capture.capture import Capture  # noqa: E402
 from drgs_blender.reconstruct.checkpoint import fingerprint  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.settings import Settings as Decoupling  # noqa: E402
 from drgs_blender.reconstruct.meshing.visual_hull import find_region  # noqa: E402
-from drgs_blender.reconstruct.optim.train import Schedule, Training  # noqa: E402
+from drgs_blender.reconstruct.optim.schedule import Schedule  # noqa: E402
+from drgs_blender.reconstruct.optim.train import Training  # noqa: E402
 from drgs_blender.reconstruct.pipeline import Settings, reconstruct  # noqa: E402
 
 QUICK = Schedule(iterations=240, surfels=2500)
@@ -241,7 +242,7 @@ def test_what_cannot_be_reconstructed_is_refused_by_name(case):
 
 
 def test_more_voxels_than_memory_are_refused_before_anything_is_learned(capture, monkeypatch):
-    monkeypatch.setattr("drgs_blender.reconstruct.memory_budget.memory", lambda: 1024.0)
+    monkeypatch.setattr("drgs_blender.reconstruct.memory_budget.total_memory", lambda: 1024.0)
     told = []
     with pytest.raises(UsageError, match="--voxels"):
         reconstruct(capture, Settings(schedule=Schedule(iterations=2), materials=False), told.append)

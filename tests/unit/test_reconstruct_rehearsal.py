@@ -16,7 +16,7 @@ from capture_cases import balls
 
 from drgs_blender.core.phases import PREPARING
 from drgs_blender.reconstruct.inverse_rendering.settings import Settings as Decoupling
-from drgs_blender.reconstruct.optim.train import Schedule
+from drgs_blender.reconstruct.optim.schedule import Schedule
 from drgs_blender.reconstruct.pipeline import Settings, reconstruct
 
 #: A process of its own, where nothing is compiled yet: prints the steps by which a kernel was made or loaded.
@@ -28,7 +28,8 @@ from capture_cases import balls
 from drgs_blender.reconstruct import pipeline as job
 from drgs_blender.reconstruct.inverse_rendering import run
 from drgs_blender.reconstruct.inverse_rendering.settings import Settings as Decoupling
-from drgs_blender.reconstruct.optim.train import Schedule, Training
+from drgs_blender.reconstruct.optim.schedule import Schedule
+from drgs_blender.reconstruct.optim.train import Training
 
 variant, masked = sys.argv[2], sys.argv[3] == "masks"
 watching, rehearse = False, job.rehearse
@@ -49,7 +50,7 @@ def then_watch(*arguments):
     rehearse(*arguments)
     watching = True
 
-Training.step, run._Job.step, job.rehearse = watched(Training.step), watched(run._Job.step), then_watch
+Training.step, run.Job.step, job.rehearse = watched(Training.step), watched(run.Job.step), then_watch
 capture = balls(18, 24, masks=masked)
 if not masked:
     capture.background = None

@@ -71,7 +71,7 @@ def test_more_voxels_than_memory_are_refused_with_how_many_fit(cameras, monkeypa
     def begun(*_):
         raise LookupError
 
-    monkeypatch.setattr("drgs_blender.reconstruct.memory_budget.memory", lambda: 2.0**25)
+    monkeypatch.setattr("drgs_blender.reconstruct.memory_budget.total_memory", lambda: 2.0**25)
     monkeypatch.setattr(tsdf, "surface_maps", begun)
     sharp = [replace(view, fx=9 * view.fx) for view in cameras]
     low = np.full(3, -RADIUS)

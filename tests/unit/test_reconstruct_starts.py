@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,8 +16,11 @@ from captures import ring  # noqa: E402
 from drgs_blender.core.frame import Camera  # noqa: E402
 from drgs_blender.reconstruct.capture.capture import Capture, View  # noqa: E402
 from drgs_blender.reconstruct.meshing.visual_hull import _surface, _widened, find_region  # noqa: E402
-from drgs_blender.reconstruct.optim import train  # noqa: E402
-from drgs_blender.reconstruct.optim.train import Schedule, Training  # noqa: E402
+from drgs_blender.reconstruct.optim import starts, train  # noqa: E402
+from drgs_blender.reconstruct.optim.learner import Learner  # noqa: E402
+from drgs_blender.reconstruct.optim.schedule import Schedule  # noqa: E402
+from drgs_blender.reconstruct.optim.train import Training  # noqa: E402
+from drgs_blender.reconstruct.optim.views import Views  # noqa: E402
 
 #: A ball out of which another one took a bite: centres and radii. The rim of the bite is 0.31 above its ground.
 BOWL, BITE = (np.zeros(3), 0.9), (np.array([0.0, 0.0, 1.1]), 0.75)
@@ -84,11 +86,10 @@ def test_a_hollow_that_no_outline_shows_is_found(monkeypatch, caplog):
 @pytest.mark.slow
 def test_the_start_that_loses_leaves_no_trace(monkeypatch):
     capture = balls(24, 40)
-    monkeypatch.setattr(train, "WORTH", 1000.0)
+    monkeypatch.setattr(starts, "WORTH", 1000.0)
     tried = learned(capture)
     # The winner did not see the views that were kept aside until the trial's end: neither does this one.
-    until_then = lambda self: setattr(self, "_rival", self._rival if self.part < train.TRIAL else None)  # noqa: E731
-    monkeypatch.setattr(Training, "_maybe_decide", until_then)
+    monkeypatch.setattr(starts.Trial, "is_due", lambda self, part, _: self.end() if part >= starts.TRIAL else None)
     alone = learned(capture)
     for name, value in tried.gaussians.arrays().items():
         assert np.array_equal(value, alone.gaussians.arrays()[name]), name
@@ -98,82 +99,83 @@ def test_the_start_that_loses_leaves_no_trace(monkeypatch):
 def test_a_start_that_predicts_nothing_is_not_taken(monkeypatch):
     capture = balls(24, 40)
     training = Training(capture, find_region(capture), replace(QUICK, iterations=10, surfels=500))
-    on_hull, errors = training.start, iter([0.1, float("nan")])
-    monkeypatch.setattr(training, "_error_aside", lambda: next(errors))
+    on_hull, errors = training.growth.start, iter([0.1, float("nan")])
+    monkeypatch.setattr(Learner, "error_of", lambda *_: next(errors))
     while training.trying:
         training.step()
-    assert training.start == on_hull and training.iteration == 2
+    assert training.growth.start == on_hull and training.iteration == 2
 
 
 def test_starts_are_judged_by_the_views_that_neither_saw():
     capture = balls(24, 24)
     training = Training(capture, find_region(capture), replace(QUICK, surfels=200))
-    expected = training._error_aside()
-    half = training._views[1]
-    seen = [k for k in range(len(half)) if k % train.ASIDE != train.ASIDE // 2]
+    expected = training.learner.error_of(training.views.aside())
+    half = training.views.half
+    seen = [k for k in range(len(half)) if k % starts.ASIDE != starts.ASIDE // 2]
     for k in seen:
         half[k] = None
-    assert training._error_aside() == expected and len(half) - len(seen) == 3
+    assert training.learner.error_of(training.views.aside()) == expected and len(half) - len(seen) == 3
 
 
 def test_the_clock_does_not_favour_the_start_that_came_second(monkeypatch):
     """What the first step of all takes, compiling, leaves the first start few steps within its time."""
     capture, clock, tried = balls(24, 40), [0.0], []
-    monkeypatch.setattr(train, "time", SimpleNamespace(monotonic=lambda: clock[0]))
-    training = Training(capture, find_region(capture), replace(QUICK, surfels=500), seconds=50.0)
-    learn, error_aside = training._learn, training._error_aside
+    step, error_of = Learner.step, Learner.error_of
 
-    def slowly():
+    def slowly(*arguments):
         clock[0] += 1.0 if clock[0] else 100.0
-        learn()
+        step(*arguments)
 
-    def noted():
+    def noted(*arguments):
         tried.append(training.iteration)
-        return error_aside()
+        return error_of(*arguments)
 
-    training._learn, training._error_aside = slowly, noted
+    monkeypatch.setattr(Learner, "step", slowly)
+    monkeypatch.setattr(Learner, "error_of", noted)
+    schedule = replace(QUICK, surfels=500)
+    training = Training(capture, find_region(capture), schedule, seconds=50.0, now=lambda: clock[0])
     while not training.finished:
         training.step()
-    assert tried == [2, 2] and not training.trying and training.seconds == clock[0]
+    assert tried == [2, 2] and not training.trying and training.clock.spent == clock[0]
 
 
 def test_by_the_clock_a_trial_takes_its_share_and_the_schedule_goes_on_evenly(monkeypatch):
     capture, clock, parts = balls(24, 40), [0.0], []
-    monkeypatch.setattr(train, "time", SimpleNamespace(monotonic=lambda: clock[0]))
-    training = Training(capture, find_region(capture), replace(QUICK, iterations=6000, surfels=500), seconds=100.0)
-    learn = training._learn
+    step = Learner.step
 
-    def in_a_second():
+    def in_a_second(*arguments):
         clock[0] += 1.0
-        learn()
+        step(*arguments)
 
-    training._learn = in_a_second
+    monkeypatch.setattr(Learner, "step", in_a_second)
+    schedule = replace(QUICK, iterations=6000, surfels=500)
+    training = Training(capture, find_region(capture), schedule, seconds=100.0, now=lambda: clock[0])
     while not training.finished:
         parts.append((training.trying, training.part))
         training.step()
-    assert training.seconds == clock[0] == pytest.approx(100, abs=1)
-    assert sum(trying for trying, _ in parts) == pytest.approx(100 * train.TRIAL, abs=2)
+    assert training.clock.spent == clock[0] == pytest.approx(100, abs=1)
+    assert sum(trying for trying, _ in parts) == pytest.approx(100 * starts.TRIAL, abs=2)
     after = [part for trying, part in parts if not trying]
     np.testing.assert_allclose(np.diff(after), 0.01, atol=1e-3)
-    assert after[0] == pytest.approx(train.TRIAL, abs=0.02)
+    assert after[0] == pytest.approx(starts.TRIAL, abs=0.02)
 
 
-def test_views_kept_aside_are_learned_from_after_the_trial():
+def test_views_kept_aside_are_learned_from_after_the_trial(monkeypatch):
     capture = balls(24, 40)
     training = Training(capture, find_region(capture), replace(QUICK, iterations=100, surfels=500))
     during, after = set(), set()
-    following = training._next
+    of_step = Views.of_step
 
-    def noted():
-        target = following()
+    def noted(*arguments, **named):
+        target = of_step(*arguments, **named)
         (during if training.trying else after).add(id(target))
         return target
 
-    training._next = noted
+    monkeypatch.setattr(Views, "of_step", noted)
     while not training.finished:
         training.step()
     full, half = training.targets
-    kept = {id(view) for k, view in enumerate(half) if k % train.ASIDE == train.ASIDE // 2}
+    kept = {id(view) for k, view in enumerate(half) if k % starts.ASIDE == starts.ASIDE // 2}
     assert kept and not kept & during and {id(view) for view in full} <= after
 
 

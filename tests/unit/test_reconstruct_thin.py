@@ -19,7 +19,7 @@ from drgs_blender.reconstruct import pipeline  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.settings import Settings as Decoupling  # noqa: E402
 from drgs_blender.reconstruct.model.gaussians import Gaussians  # noqa: E402
 from drgs_blender.reconstruct.model.thin_structures import is_thin, normals_of  # noqa: E402
-from drgs_blender.reconstruct.optim.train import Schedule  # noqa: E402
+from drgs_blender.reconstruct.optim.schedule import Schedule  # noqa: E402
 from drgs_blender.reconstruct.pipeline import Settings, reconstruct  # noqa: E402
 
 RIBS = 12

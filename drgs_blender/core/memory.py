@@ -1,0 +1,63 @@
+"""How much memory this process may use: that of the machine, or of a container (a cgroup of Linux), if that is less."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+_ROOT = Path("/")
+
+
+def total_memory(root: Path = _ROOT) -> float:
+    """Memory of this machine or container.
+
+    Parameters
+    ----------
+    root : Path
+        Folder that holds `sys` and `proc`.
+
+    Returns
+    -------
+    float
+        Bytes; infinite where the system does not say.
+    """
+    total = float("inf")
+    with suppress(AttributeError, OSError, ValueError):  # not every system has it
+        total = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    return min([total, *(float(limit) for limit, _ in _cgroups(root))])
+
+
+def available_memory(root: Path = _ROOT) -> float:
+    """Memory that may be taken now without other programs or this one running out.
+
+    Parameters
+    ----------
+    root : Path
+        Folder that holds `sys` and `proc`.
+
+    Returns
+    -------
+    float
+        Bytes; infinite where the system does not say.
+    """
+    free = float("inf")
+    with suppress(OSError, ValueError, StopIteration, IndexError):
+        lines = (root / "proc/meminfo").read_text().splitlines()
+        free = float(int(next(line for line in lines if line.startswith("MemAvailable")).split()[1]) << 10)
+    return max(min([free, *(float(limit - used) for limit, used in _cgroups(root))]), 0.0)
+
+
+def _cgroups(root: Path) -> Iterator[tuple[int, int]]:
+    """Limit and use, in bytes, of the cgroup (version 2) of this process and of those around it, where limited."""
+    group = Path()
+    with suppress(OSError, StopIteration):
+        lines = (root / "proc/self/cgroup").read_text().splitlines()
+        group = Path(next(line for line in lines if line.startswith("0::")).removeprefix("0::").lstrip("/"))
+    if ".." in group.parts:  # outside of what this process sees of the tree
+        group = Path()
+    for part in (group, *group.parents):
+        folder = root / "sys/fs/cgroup" / part
+        with suppress(OSError, ValueError):  # "max" is no limit
+            yield int((folder / "memory.max").read_text()), int((folder / "memory.current").read_text())

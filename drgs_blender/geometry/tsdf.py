@@ -1,0 +1,235 @@
+"""Depth maps fused into a truncated signed distance field (TSDF), and the closed mesh of its zero level.
+
+Each view tells the voxels along its rays how far before or behind its surface they lie, and that what it sees through
+is free. What too few views see counts as inside, so the mesh is closed there too (Curless and Levoy 1996, "A
+volumetric method for building complex models from range images"; Lorensen and Cline 1987, marching cubes).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from ..compute.jit import njit, prange
+from ..core.asset.model import Mesh
+from ..core.errors import AssetError
+
+Array = np.ndarray
+
+#: Half width of the band around a seen surface, in voxels.
+BAND = 3.0
+#: Components smaller than this part of the largest one's area are dropped.
+CRUMB = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class DepthMaps:
+    """Depth maps of views of one size, and where in them a point is seen.
+
+    With ``q = scale * (axes @ (point - origin)) + offset``, ``q[2]`` is the depth of a point and ``q[:2]`` its
+    position in pixels, in a perspective view multiplied by the depth.
+
+    Attributes
+    ----------
+    depth : (v, h, w) float32 or float64
+        Metres along the axis of view, +inf where nothing is seen. Its precision is that of the fusion's arithmetic.
+    cosine : (v, h, w), of the same dtype
+        Between the surface's normal and the view, 0..1: the weight of a pixel. Below 0.1 a pixel does not count; where
+        nothing is seen, 1 says that space is free.
+    origin : (v, 3) float64
+        Metres, in the frame of the field.
+    axes : (v, 3, 3) float64
+        Rows towards the right and down in the picture and along the view.
+    scale, offset : (v, 3) float64
+    perspective : bool
+        Whether positions are to be divided by the depth; else the views are orthographic.
+    bilinear : bool
+        Whether depth is interpolated between pixels that lie on one surface, and silhouettes are left out; else it is
+        that of the pixel in which a point lies.
+    """
+
+    depth: Array
+    cosine: Array
+    origin: Array
+    axes: Array
+    scale: Array
+    offset: Array
+    perspective: bool
+    bilinear: bool
+
+
+class SignedDistanceField:
+    """Mean truncated signed distance at the voxels of a grid: +1 before a surface, -1 behind it, 0 on it.
+
+    Parameters
+    ----------
+    low : (3,) float64
+        Centre of voxel (0, 0, 0), metres, in the frame of the mesh to be made.
+    voxel : float
+        Distance between the centres of neighbours, metres.
+    shape : tuple of int
+        Voxels along each axis.
+    """
+
+    def __init__(self, low: Array, voxel: float, shape: tuple[int, ...]) -> None:
+        self._low, self._voxel = np.ascontiguousarray(low, np.float64), voxel
+        self._total, self._weight = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+        self._count = np.zeros(shape, np.int32)
+
+    def add(self, maps: DepthMaps) -> None:
+        """Take depth maps in, in the order of their views.
+
+        Sums over the views of one call have the precision of their depth, those over calls are float32.
+        """
+        _fuse(
+            self._total, self._weight, self._count, self._low, self._voxel, maps.depth, maps.cosine, maps.origin,
+            maps.axes, maps.scale, maps.offset, maps.perspective, maps.bilinear, BAND * self._voxel,
+        )  # fmt: skip
+
+    def mesh(self, witnesses: int, smoothing: float, advice: str) -> tuple[Mesh, dict[str, Any]]:
+        """The zero level, as a watertight mesh of the components that matter.
+
+        Parameters
+        ----------
+        witnesses : int
+            Views, one at least, that must see a voxel before it counts as seen; others are inside.
+        smoothing : float
+            Standard deviation of the filter of the field, in voxels.
+        advice : str
+            What to do where no mesh can be made, for the message.
+
+        Returns
+        -------
+        mesh : Mesh
+            In the frame of the grid; counter-clockwise seen from outside, neutral materials.
+        report : dict
+            "voxel" (metres), "components_dropped", "volume" (cubic metres), "vertices", "faces".
+
+        Raises
+        ------
+        AssetError
+            The field has no zero level.
+        """
+        from skimage.measure import marching_cubes  # takes long to import, and most jobs make no mesh
+
+        field = np.full_like(self._total, -1.0)
+        np.divide(self._total, self._weight, out=field, where=self._count >= witnesses)
+        field = np.pad(gaussian_filter(field, smoothing), 1, constant_values=1.0)
+        if not field.min() < 0 < field.max():
+            raise AssetError("surfels", "enclose no volume", advice)
+        vertices, faces, _, _ = marching_cubes(field, 0.0)
+        vertices, faces, dropped, volume = main_parts((vertices - 1) * self._voxel + self._low, faces)
+        n = len(vertices)
+        report = {
+            "voxel": self._voxel, "components_dropped": dropped, "volume": volume, "vertices": n, "faces": len(faces),
+        }  # fmt: skip
+        return Mesh(vertices, faces, np.full((n, 3), 0.5), np.full(n, 0.5), np.zeros(n)), report
+
+
+def main_parts(vertices: Array, faces: Array) -> tuple[Array, Array, int, float]:
+    """Keep the connected components that matter: neither crumbs nor cavities.
+
+    Parameters
+    ----------
+    vertices : (n, 3) float
+        Metres.
+    faces : (f, 3) int
+        All of the same orientation, whichever.
+
+    Returns
+    -------
+    vertices : (m, 3) float
+    faces : (g, 3) int32
+        Counter-clockwise seen from outside.
+    dropped : int
+        Components left out.
+    volume : float
+        Of those kept, cubic metres.
+    """
+    n = len(vertices)
+    links = coo_matrix((np.ones(2 * len(faces)), (faces[:, [0, 1]].reshape(-1), faces[:, [1, 2]].reshape(-1))), (n, n))
+    _, label = connected_components(links, directed=False)
+    corners = vertices[faces]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    of_face = label[faces[:, 0]]
+    area = np.bincount(of_face, 0.5 * np.linalg.norm(cross, axis=1), label.max() + 1)
+    volume = np.bincount(of_face, np.einsum("fc,fc->f", cross, corners[:, 0]) / 6, label.max() + 1)
+    side = np.sign(volume[area.argmax()]) or 1.0
+    keep = (area >= CRUMB * area.max()) & (side * volume > 0)
+    faces = faces[keep[of_face]]
+    if side < 0:
+        faces = faces[:, ::-1]
+    used, faces = np.unique(faces, return_inverse=True)
+    return vertices[used], faces.reshape(-1, 3).astype(np.int32), int((~keep).sum()), float(side * volume[keep].sum())
+
+
+@njit
+def _sample(depth: Any, x: Any, y: Any) -> Any:
+    """Depth at pixel position (x, y): bilinear where its four pixels lie on one surface, else the nearest pixel's.
+
+    NaN on a silhouette, of which a pixel says too little to carve by it.
+    """
+    height, width = depth.shape
+    px, py = int(x), int(y)
+    u, v = x - 0.5, y - 0.5
+    if u < 0.0 or v < 0.0 or u >= width - 1 or v >= height - 1:
+        return depth[py, px]
+    i, j = int(u), int(v)
+    a, b, c, d = depth[j, i], depth[j, i + 1], depth[j + 1, i], depth[j + 1, i + 1]
+    least, most = min(min(a, b), min(c, d)), max(max(a, b), max(c, d))
+    if not most - least < np.float32(0.03) * least:
+        return depth[py, px] if least == most or most < np.inf else depth.dtype.type(np.nan)
+    s, t = depth.dtype.type(u - i), depth.dtype.type(v - j)
+    top, bottom = a + s * (b - a), c + s * (d - c)
+    return top + t * (bottom - top)
+
+
+@njit(parallel=True)
+def _fuse(
+    total: Any, weight: Any, count: Any, low: Any, voxel: Any, depth: Any, cosine: Any, origin: Any, axes: Any,
+    scale: Any, offset: Any, perspective: Any, bilinear: Any, band: Any,
+) -> None:  # fmt: skip
+    """Add views to the sums: +1 before the surface, falling to -1 behind it within the band (metres).
+
+    A pixel counts with the cosine at which it sees the surface: the rim of a silhouette says little. The same cosine
+    turns distance along the view into distance from the surface. Literals of the maps' type keep all in its precision.
+    """
+    height, width = depth.shape[1], depth.shape[2]
+    for i in prange(total.shape[0]):
+        # A column of voxels along Z at a time: what depends on X and Y alone is found once for each view.
+        value, weights = np.zeros(total.shape[2], depth.dtype), np.zeros(total.shape[2], depth.dtype)
+        for j in range(total.shape[1]):
+            value[:], weights[:] = 0, 0
+            for m in range(len(depth)):
+                x, y = low[0] + i * voxel - origin[m, 0], low[1] + j * voxel - origin[m, 1]
+                right, down, ahead = axes[m, 0], axes[m, 1], axes[m, 2]
+                right_xy, down_xy = right[0] * x + right[1] * y, down[0] * x + down[1] * y
+                ahead_xy = ahead[0] * x + ahead[1] * y
+                for k in range(total.shape[2]):
+                    z = low[2] + k * voxel - origin[m, 2]
+                    away = (ahead_xy + ahead[2] * z) * scale[m, 2] + offset[m, 2]
+                    if away <= 0.0:
+                        continue
+                    px = (right_xy + right[2] * z) * scale[m, 0] + offset[m, 0]
+                    py = (down_xy + down[2] * z) * scale[m, 1] + offset[m, 1]
+                    if perspective:
+                        px, py = px / away, py / away
+                    if px < 0.0 or py < 0.0 or px >= width or py >= height:
+                        continue
+                    w = cosine[m, int(py), int(px)]
+                    if w < 0.1:
+                        continue
+                    seen = _sample(depth[m], px, py) if bilinear else depth[m, int(py), int(px)]
+                    gap = (seen - depth.dtype.type(away)) / depth.dtype.type(band)
+                    if gap > depth.dtype.type(-1):
+                        value[k] += w * min(w * gap, depth.dtype.type(1))
+                        weights[k] += w
+                        count[i, j, k] += 1
+            for k in range(total.shape[2]):
+                total[i, j, k] += value[k]
+                weight[i, j, k] += weights[k]

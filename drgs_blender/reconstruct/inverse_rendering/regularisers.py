@@ -1,0 +1,97 @@
+"""What is expected of materials, normals and light, whatever the photographs show."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .environment import LearnedLight, colour_cast
+from .losses import blotches, dullness
+from .radiance_cache import edges_of
+from .settings import Settings
+from .surface import Seen
+
+Array = np.ndarray
+
+#: How much smoother than albedo roughness and metallic are (of diffuse and specular colour: diffuse, roughness, rest).
+_SMOOTH = (1.0, 1.0, 1.0, 2.0, 10.0, 10.0, 10.0)
+#: Edges that are smoothed per step; how much photographed chroma may differ along one that is.
+_EDGES, _CHROMA = 8192, 0.08
+
+
+class Regularisers:
+    """Losses that hold what is learned, and the edges of the mesh along which they do.
+
+    Parameters
+    ----------
+    faces : (f, 3) int32
+    seen : (v, 3) float32
+        Mean colour of the photographs at the vertices.
+    settings : Settings
+    """
+
+    def __init__(self, faces: Array, seen: Array, settings: Settings) -> None:
+        self._settings = settings
+        self._edges = edges_of(faces)
+        self._likeness = _likeness(self._edges, seen)
+
+    def draw(self, generator: np.random.Generator) -> Array:
+        """Numbers of the edges of a step, (e,) int64."""
+        return generator.integers(0, max(len(self._edges), 1), min(_EDGES, len(self._edges)))
+
+    def edges(self, edge: Array) -> Array:
+        """Vertices (e, 2) of edges."""
+        return self._edges[edge]
+
+    def of_materials(self, seen: Seen, edge: Array, has_metallic: bool, knows_metals: bool) -> Tensor:
+        """Smooth where the photographs are alike; metals plain, bright and told from paint.
+
+        Parameters
+        ----------
+        seen : Seen
+        edge : (e,) int
+            Numbers of its edges.
+        has_metallic : bool
+            Metallic is learned.
+        knows_metals : bool
+            It is known well enough to say more of metals.
+        """
+        s = self._settings
+        pair = seen.at_ends(seen.columns)
+        differences = (pair[:, 0] - pair[:, 1]).abs()
+        likeness = torch.from_numpy(self._likeness[edge])[:, None]
+        weights = torch.tensor(_SMOOTH[: seen.columns.shape[1]])
+        loss = s.smoothness * ((likeness * differences).mean(0) * weights).sum()
+        told = has_metallic and knows_metals
+        if s.plain_metals > 0 and told:
+            loss = loss + s.plain_metals * s.smoothness * blotches(differences[:, :3], pair[:, :, 4], likeness)
+        if s.bimodal > 0 and has_metallic:
+            loss = loss + s.bimodal * (seen.here[:, 4] * (1 - seen.here[:, 4])).mean()
+        if s.polish > 0 and told:
+            loss = loss + s.polish * dullness(seen.here[:, :3], seen.here[:, 4])
+        return loss
+
+    def of_light(self, light: LearnedLight, radiance: Tensor) -> Tensor:
+        """Grey and smooth."""
+        s, loss = self._settings, torch.zeros(())
+        if s.white > 0:
+            loss = loss + s.white * colour_cast(radiance)
+        if s.light_smoothness > 0:
+            loss = loss + s.light_smoothness * light.roughness()
+        return loss
+
+    def of_normals(self, seen: Seen) -> Tensor:
+        """Offsets small, and alike along edges."""
+        if seen.offsets is None:
+            return torch.zeros(())
+        turned = seen.at_ends(seen.offsets)
+        loss = self._settings.normal_smoothness * (((turned[:, 0] - turned[:, 1]) ** 2).sum(1).mean())
+        return loss + 0.02 * self._settings.normal_smoothness * (seen.offsets**2).sum(1).mean()
+
+
+def _likeness(edges: Array, colours: Array) -> Array:
+    """How alike the ends of edges (e, 2) are in the photographs (e,): 1 the same chroma, 0 another."""
+    chroma = colours / np.maximum(colours.sum(axis=1, keepdims=True), 1e-4)
+    difference = np.linalg.norm(chroma[edges[:, 0]] - chroma[edges[:, 1]], axis=1)
+    return np.exp(-((difference / _CHROMA) ** 2)).astype(np.float32)

@@ -1,0 +1,113 @@
+"""What is learned of the surface: its materials, and normals on top of those of the mesh."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...core.asset.model import Mesh
+from ...geometry.normals import VertexNormals
+from ...render.gbuffer.surfels import ALIKE
+from ...render.reference.brdf import dot, normalise
+from .blend import blend
+from .materials import Materials
+from .pixels import Pixels
+from .settings import Settings
+
+Array = np.ndarray
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """The surface at the n pixels and e edges of a step, with derivatives by what is learned.
+
+    Attributes
+    ----------
+    here : (n, c) float32
+        Columns of `Materials` at the pixels.
+    normal : (n, 3) float32
+        Unit, world space.
+    columns : (u, c) float32
+        Of `Materials`, of the vertices that pixels and edges use.
+    offsets : (u, 3) float32, optional
+        What is learned of their normals.
+    ends : (e, 2) int64
+        The ends of the edges among those vertices.
+    """
+
+    here: Tensor
+    normal: Tensor
+    columns: Tensor
+    offsets: Tensor | None
+    ends: Tensor
+
+    def at_ends(self, values: Tensor) -> Tensor:
+        """Values (u, k) of the vertices at the ends of the edges, (e, 2, k)."""
+        return values.index_select(0, self.ends.flatten()).view(len(self.ends), 2, -1)
+
+
+class Surface:
+    """Materials and normals of a mesh as something to learn.
+
+    Parameters
+    ----------
+    mesh : Mesh
+    settings : Settings
+    mean : (3,) float
+        Colour of the photographs.
+    told : bool
+        Pixels have normals of their own, that others than the mesh tell.
+
+    Attributes
+    ----------
+    materials : Materials
+    parameters : dict
+        Name to tensor: those of the materials, and "normals" (v, 3) where they are learned.
+    """
+
+    def __init__(self, mesh: Mesh, settings: Settings, mean: Array, told: bool) -> None:
+        self._normals = torch.from_numpy(VertexNormals(mesh.faces, len(mesh.vertices))(mesh.vertices))
+        self._faces = torch.from_numpy(mesh.faces.astype(np.int64))
+        self._told = told
+        self.materials = Materials(mesh, settings.parametrisation, settings.coarse, mean)
+        self.parameters = dict(self.materials.parameters)
+        if settings.normals:
+            self.parameters["normals"] = torch.zeros(len(mesh.vertices), 3)
+
+    def at(self, pixels: Pixels, edges: Array) -> Seen:
+        """The surface at pixels and at edges (e, 2) of vertices."""
+        corner = self._faces[torch.from_numpy(pixels.face)]
+        ends = torch.from_numpy(edges)
+        used, place = torch.unique(torch.cat([corner.flatten(), ends.flatten()]), return_inverse=True)
+        corner_place, end_place = place[: corner.numel()].view(-1, 3), place[corner.numel() :].view(-1, 2)
+        shares = torch.from_numpy(pixels.corners)
+
+        columns = self.materials.at(used)
+        here = blend(columns, corner_place, shares)
+        smooth = self._normals[used]
+        offsets = self.parameters["normals"].index_select(0, used) if "normals" in self.parameters else None
+        if offsets is not None:
+            smooth = smooth + offsets
+        normal = normalise(blend(smooth, corner_place, shares))
+        if self._told:
+            normal = _as_shown(pixels, normal, None if offsets is None else blend(offsets, corner_place, shares))
+        return Seen(here, normal, columns, offsets, end_place)
+
+    def normals(self) -> Array:
+        """(v, 3) float32 unit: smooth vertex normals with what was learned on top."""
+        normals = self._normals
+        if "normals" in self.parameters:
+            normals = normalise(normals + self.parameters["normals"])
+        return normals.numpy().astype(np.float32)
+
+
+def _as_shown(pixels: Pixels, normal: Tensor, offsets: Tensor | None) -> Tensor:
+    """Normals (n, 3) told by others than the mesh, with what is learned; its `normal` where they are far off."""
+    shown, flat = torch.from_numpy(pixels.shown), torch.from_numpy(pixels.flat)
+    believed = dot(shown, flat)[:, None] >= ALIKE
+    # The face's where they are not: nothing has no direction, and its derivative would spoil that of its vertices.
+    own = torch.where(believed, shown, flat)
+    return torch.where(believed, own if offsets is None else normalise(own + offsets), normal)

@@ -1,0 +1,37 @@
+"""When surfels are cut, and how many there may be then."""
+
+from __future__ import annotations
+
+from .schedule import Schedule
+
+
+class Growth:
+    """Rounds of densification, spread evenly over a part of the schedule.
+
+    Parameters
+    ----------
+    schedule : Schedule
+    start : int
+        Surfels at the first step.
+
+    Attributes
+    ----------
+    start : int
+    rounds : int
+        Those that are done.
+    """
+
+    def __init__(self, schedule: Schedule, start: int) -> None:
+        self._schedule, self.start, self.rounds = schedule, start, 0
+
+    def due(self, part: float) -> int:
+        """Rounds that are to be done by this part of the schedule."""
+        return int(self._grown(part) * self._schedule.rounds)
+
+    def budget(self, part: float) -> int:
+        """How many surfels there may be then."""
+        return int(self.start + (self._schedule.surfels - self.start) * self._grown(part))
+
+    def _grown(self, part: float) -> float:
+        begin, end = self._schedule.densify
+        return min(max((part - begin) / (end - begin), 0.0), 1.0)

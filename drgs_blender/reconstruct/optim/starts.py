@@ -1,0 +1,86 @@
+"""The trial of two starts: each is learned for a while, and the better one in views that neither saw goes on."""
+
+from __future__ import annotations
+
+import logging
+import math
+
+import numpy as np
+
+from ...core.arrays import Array
+from ..model.gaussians import Gaussians
+
+log = logging.getLogger(__name__)
+
+#: Part of the schedule that both starts of `initialisation` are tried for, by views of which every n-th is kept aside;
+#: decibels there that surfels inside the hull must bring. At least so many views leave some to keep aside.
+TRIAL, ASIDE, WORTH, MANY = 0.2, 8, 0.75, 16
+
+
+def is_aside(view: int) -> bool:
+    """Whether a trial keeps the view of this number for its end."""
+    return view % ASIDE == ASIDE // 2
+
+
+class Trial:
+    """What a trial knows of the two starts.
+
+    Parameters
+    ----------
+    rival : Gaussians, optional
+        The start that is learned second; without, there is no trial.
+
+    Attributes
+    ----------
+    rival : Gaussians or None
+        None at the end.
+    first : dict or None
+        State of the first start when its turn was over, and its error in views kept "aside"; before that None.
+    """
+
+    def __init__(self, rival: Gaussians | None) -> None:
+        self.rival = rival
+        self.first: dict[str, Array] | None = None
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether two starts are being tried."""
+        return self.rival is not None
+
+    def is_due(self, part: float, iteration: int) -> bool:
+        """Whether the turn of the present start is over, at this part of the schedule and after so many steps."""
+        # No more steps than the first had: compiling falls to it, and by the clock that would be counted against it.
+        even = self.first is not None and iteration >= self.first["counts"][0]
+        return self.goes_on and (part >= TRIAL or bool(even))
+
+    def keep_first(self, state: dict[str, Array], error: float) -> Gaussians:
+        """Keep the state of the first start and its mean squared error; returns the other one."""
+        assert self.rival is not None
+        self.first = state | {"aside": np.array([error])}
+        return self.rival
+
+    def decide(self, error: float) -> dict[str, Array] | None:
+        """End the trial by the second start's mean squared error: the state of the first one where that is better."""
+        first = self.first
+        assert first is not None
+        gain = 10 * math.log10(max(float(first["aside"][0]), 1e-10) / max(error, 1e-10))
+        log.info("surfels inside the hull: %+.2f dB in views kept aside", gain)
+        self.end()
+        return None if gain >= WORTH else first  # nor what is no number
+
+    def end(self) -> None:
+        """Go on with the present start alone."""
+        self.rival = self.first = None
+
+    def arrays(self) -> dict[str, Array]:
+        """What `restore` needs; nothing where no trial goes on."""
+        if not self.goes_on:
+            return {}
+        return {"trying": np.ones(1, np.int64)} | {f"before.{k}": v for k, v in (self.first or {}).items()}
+
+    def restore(self, state: dict[str, Array]) -> None:
+        """Go on from what `arrays` returned, among other arrays."""
+        if "trying" not in state:
+            self.end()
+        first = {k.removeprefix("before."): v for k, v in state.items() if k.startswith("before.")}
+        self.first = first if self.goes_on and first else None

@@ -1,0 +1,57 @@
+"""Memory that a process may use, of a machine and of containers within it."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from drgs_blender.core.memory import available_memory, total_memory
+
+GIB = 1 << 30
+
+
+def system(root: Path, free: int, own: str, groups: dict[str, tuple[str, int]]) -> Path:
+    """Files as Linux shows them: `free` bytes, a process in the group `own`, limit and use by group."""
+    (root / "proc/self").mkdir(parents=True)
+    (root / "proc/meminfo").write_text(f"MemTotal: {1 << 40} kB\nMemFree: 1 kB\nMemAvailable: {free >> 10} kB\n")
+    (root / "proc/self/cgroup").write_text(f"12:cpu:/old\n0::{own}\n")
+    for name, (limit, used) in groups.items():
+        folder = root / "sys/fs/cgroup" / name
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "memory.max").write_text(f"{limit}\n")
+        (folder / "memory.current").write_text(f"{used}\n")
+    return root
+
+
+def test_without_a_limit_what_the_system_says_counts(tmp_path):
+    root = system(tmp_path, 3 * GIB, "/", {})
+    assert available_memory(root) == 3 * GIB
+    assert total_memory(root) == total_memory(tmp_path / "none")
+
+
+@pytest.mark.parametrize("own", ["/", "/slice/job", "/../elsewhere"])
+def test_a_limit_of_the_container_counts(tmp_path, own):
+    root = system(tmp_path, 3 * GIB, own, {"": (str(1 * GIB), GIB // 4), "slice": ("max", GIB)})
+    assert total_memory(root) == GIB and available_memory(root) == GIB - GIB // 4
+
+
+def test_the_least_of_nested_limits_counts(tmp_path):
+    groups = {"": (str(4 * GIB), 0), "slice": (str(2 * GIB), GIB), "slice/job": (str(3 * GIB), 0)}
+    root = system(tmp_path, 8 * GIB, "/slice/job", groups)
+    assert available_memory(root) == GIB and total_memory(root) <= 2 * GIB
+
+
+def test_a_container_over_its_limit_has_nothing_left(tmp_path):
+    assert available_memory(system(tmp_path, GIB, "/", {"": ("1000", 2000)})) == 0
+
+
+def test_a_system_that_does_not_say_sets_no_limit(tmp_path, monkeypatch):
+    monkeypatch.delattr("os.sysconf", raising=False)
+    assert available_memory(tmp_path) == total_memory(tmp_path) == float("inf")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads files of Linux")
+def test_of_this_machine():
+    assert 1 << 20 < available_memory() <= total_memory() < 1 << 50
