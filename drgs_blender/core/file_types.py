@@ -55,7 +55,7 @@ READ: dict[str, ReadType] = {
     "Wavefront OBJ": ReadType((".obj",), "mesh"),
     "Radiance HDR": ReadType((".hdr",), "environment"),
     "OpenEXR": ReadType((".exr",), "environment"),
-    "picture": ReadType((".png", ".jpg", ".jpeg", ".webp"), "environment"),
+    "picture": ReadType((".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff"), "environment"),
     "learned light": ReadType((".map", ".pth"), "environment"),
     "NeRO materials": ReadType((".npy",), "materials"),
 }

@@ -30,6 +30,7 @@ from .ply import HEADER_LIMIT, parse_header
 from .ply_mesh import read_ply_mesh
 from .sog import read_sog, sniff_sog
 from .spz import read_spz, sniff_spz
+from .tiff import MAGIC as TIFF
 from .usd_splats import MESHES, read_usd_splats, sniff_usd
 from .writers import WRITERS
 
@@ -178,9 +179,9 @@ FORMATS: tuple[Format, ...] = (
     ),
     Format(
         "picture",
-        lambda head, path: head.startswith((b"\x89PNG", b"\xff\xd8\xff")) or head[8:12] == b"WEBP",
+        lambda head, path: head.startswith((b"\x89PNG", b"\xff\xd8\xff", *TIFF)) or head[8:12] == b"WEBP",
         read_picture_environment,
-        "display-referred, decoded from sRGB",
+        "PNG, JPEG, WebP, TIFF, 8 or 16 bits: display-referred, decoded from sRGB; TIFF with floats is linear",
     ),
     Format(
         "learned light",

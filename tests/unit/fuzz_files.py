@@ -118,6 +118,7 @@ def kinds() -> dict[str, Callable[[], Kind]]:
     made["a.splat"] = whole("a.splat", splat_records(len(splats)))
     for suffix in ("png", "jpg", "webp"):
         made[f"picture.{suffix}"] = lambda s=suffix: Kind(f"a.{s}", {"file": picture(s)})
+    made["picture.tif"] = whole("a.tif", tiff())
     made["light.map"] = lambda: inside(Kind("a.map", {"file": learned_light()}))
     made["whole light.map"] = lambda: Kind("a.map", {"file": learned_light()})
     for member in (MANIFEST, *DATA_MEMBERS):
@@ -183,6 +184,15 @@ def picture(suffix: str) -> bytes:
     data = io.BytesIO()
     pixels = np.random.default_rng(3).integers(0, 256, (16, 32, 3), np.uint8)
     Image.fromarray(pixels).save(data, "JPEG" if suffix == "jpg" else suffix.upper())
+    return data.getvalue()
+
+
+def tiff() -> bytes:
+    """A small picture of floats."""
+    import tifffile
+
+    data = io.BytesIO()
+    tifffile.imwrite(data, np.random.default_rng(3).random((16, 32, 3), np.float32), compression="zlib")
     return data.getvalue()
 
 
@@ -351,7 +361,7 @@ def attempt(kind: Kind, path: Path, need: int | None = None, honest: object = No
     used = max(peak() - before, apart()[1] - largest)
     if not problem and (taken := apart()[0] - seconds) > SECONDS + 1:  # the system counts whole seconds
         problem = f"took {taken:.1f} s of a process of its own"
-    slack = SLACK_DECODERS if path.suffix in (".usd", ".usdc", ".png", ".jpg", ".webp") else SLACK
+    slack = SLACK_DECODERS if path.suffix in (".usd", ".usdc", ".png", ".jpg", ".webp", ".tif") else SLACK
     if not problem and need is not None and used > 4 * need + slack:
         problem = f"took {used >> 20} MiB, {need >> 20} MiB would be honest"
     return problem
