@@ -21,8 +21,9 @@ def find_flip() -> Callable[[Array, Array], float] | None:
     except ImportError as error:
         logger.warning(
             "FLIP is not computed: the package flip-evaluator cannot be imported (%s). Install it: "
-            'pip install "drgs-blender[evaluate]"', error,
-        )  # fmt: skip
+            "pip install flip-evaluator",
+            error,
+        )
         return None
     return flip
 

@@ -28,6 +28,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+import scene_files
 from splat_files import build_spz, old_spz, random_splats, spz_blocks
 from test_container import DATA_MEMBERS, make_asset, rewrite
 from test_formats_environment import encode_hdr, rgbe_pixels
@@ -115,6 +116,15 @@ def kinds() -> dict[str, Callable[[], Kind]]:
         made[f"{encoding}.ply"] = whole("a.ply", ply(mesh, encoding))
     made["compressed.ply"] = whole("a.ply", compressed_ply())
     made["mesh.obj"] = whole("a.obj", obj(mesh))
+    corners = mesh.vertices.astype(np.float32)[mesh.faces]
+    vertices = mesh.vertices.astype(float)
+    made["binary.stl"] = whole("a.stl", scene_files.binary_stl(corners))
+    made["text.stl"] = whole("a.stl", scene_files.text_stl(corners))
+    made["mesh.off"] = whole("a.off", scene_files.off(vertices, mesh.faces))
+    package = scene_files.threemf(scene_files.model(vertices, mesh.faces))
+    made["mesh.3mf"] = whole("a.3mf", package)
+    made["mesh.3mf inside"] = lambda: inside(Kind("a.3mf", {"file": package}))
+    made["mesh.dae"] = whole("a.dae", scene_files.collada(vertices, mesh.faces.tolist()))
     made["a.splat"] = whole("a.splat", splat_records(len(splats)))
     for suffix in ("png", "jpg", "webp"):
         made[f"picture.{suffix}"] = lambda s=suffix: Kind(f"a.{s}", {"file": picture(s)})

@@ -87,7 +87,7 @@ def test_without_its_package_flip_is_not_computed_and_a_warning_says_what_to_ins
     assert find_flip() is flip
     monkeypatch.setitem(sys.modules, "flip_evaluator", None)
     assert find_flip() is None
-    assert "flip-evaluator cannot be imported" in caplog.text and 'pip install "drgs-blender[evaluate]"' in caplog.text
+    assert "flip-evaluator cannot be imported" in caplog.text and "pip install flip-evaluator" in caplog.text
 
 
 def scene(coverage: float = 0.25, views: int = 3):
