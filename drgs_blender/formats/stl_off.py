@@ -58,8 +58,10 @@ def read_stl(path: Path) -> MeshFile:
     count = _count(data)
     binary = count >= 0 and len(data) == _START + _TRIANGLE * count
     if not binary and (data.lstrip()[:5].lower() != b"solid" or _FACET.search(data) is None):
+        if count == 0 or (data.lstrip()[:5].lower() == b"solid" and b"endsolid" in data[-1000:].lower()):
+            raise AssetError(str(path), "has no triangles", "Choose a file with a surface")
         held = max(len(data) - _START, 0) // _TRIANGLE
-        if count < 1 or held < count:
+        if held < count or count < 0:
             problem = f"says that it has {max(count, 0)} triangles, and has the bytes of {held}"
             raise AssetError(str(path), problem, _DAMAGED)
         notes.append(f"{len(data) - _START - _TRIANGLE * count} bytes behind the last triangle ignored")

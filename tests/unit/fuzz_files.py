@@ -202,7 +202,9 @@ def tiff() -> bytes:
     import tifffile
 
     data = io.BytesIO()
-    tifffile.imwrite(data, np.random.default_rng(3).random((16, 32, 3), np.float32), compression="zlib")
+    tifffile.imwrite(
+        data, np.random.default_rng(3).random((16, 32, 3), np.float32), photometric="rgb", compression="zlib"
+    )
     return data.getvalue()
 
 

@@ -171,6 +171,7 @@ BAD = {
         (GOOD_STL[: len(GOOD_STL) // 2], "triangles, of which 0 are whole"),
         (GOOD_STL.replace(b"vertex", b"vertex x", 1), "is no STL that can be read"),
         (GOOD_STL.replace(b"endfacet\n", b"endfacet\nfacet normal 0 0 0\nendfacet\n", 1), "of which 128 are whole"),
+        (text_stl(SOUP[:0]), "has no triangles"),
         (b"", "is empty"),
     ],
     "a.off": [
