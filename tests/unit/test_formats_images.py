@@ -109,8 +109,9 @@ def test_16_bit_tiff_with_lzw_as_photo_editors_write_it_is_read_to_the_last_bit(
 
 
 def test_planes_of_colour_and_alpha_that_was_multiplied_in() -> None:
-    planes = tiff(np.moveaxis(DEEP[..., :3], 2, 0), planarconfig="separate")
-    np.testing.assert_array_equal(decode_image(planes, "it"), DEEP[..., :3])
+    for options in STORED:
+        planes = tiff(np.moveaxis(DEEP[..., :3], 2, 0), planarconfig="separate", **options)
+        np.testing.assert_array_equal(decode_image(planes, "it"), DEEP[..., :3])
     half = np.dstack([DEEP[..., :3] // 2, np.full((9, 14), 32768, np.uint16)])
     found = decode_image(tiff(half, extrasamples=["assocalpha"]), "it").astype(int)
     assert np.abs(found[..., :3] - DEEP[..., :3]).max() <= 2 and (found[..., 3] == 32768).all()
