@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import logging
 import re
 import struct
 import warnings
@@ -23,7 +22,7 @@ _DAMAGED = "Export the file again, or restore it from a copy"
 #: Bytes of binary STL: the text and the count at its beginning, a triangle.
 _START, _TRIANGLE = 84, 50
 _SOLID = re.compile(rb"^[ \t]*(end)?solid\b[ \t]*([^\n]*)", re.IGNORECASE | re.MULTILINE)
-_FACET = re.compile(rb"^[ \t]*facet\b", re.IGNORECASE | re.MULTILINE)
+_FACET = re.compile(rb"^[ \t]*facet\b[^\n]*", re.IGNORECASE | re.MULTILINE)
 _OFF = re.compile(rb"\s*(?:#[^\n]*\n\s*)*((?:ST)?(C?)(N?)4?n?OFF)\b(?:[ \t]+BINARY\b)?")
 
 
@@ -67,6 +66,7 @@ def read_stl(path: Path) -> MeshFile:
         notes.append(f"{len(data) - _START - _TRIANGLE * count} bytes behind the last triangle ignored")
         data, binary = data[: _START + _TRIANGLE * count], True
     names: list[str] = []
+    wanted = count
     if not binary:
         data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
         named = [found for found in _SOLID.finditer(data) if not found[1]]
@@ -74,6 +74,7 @@ def read_stl(path: Path) -> MeshFile:
         # The library looks for its words in names, too: these get none.
         numbers = iter(range(len(named)))
         data = _SOLID.sub(lambda found: b"endsolid" if found[1] else b"solid %d" % next(numbers), data)
+        data, wanted = _FACET.subn(b"facet", data)  # without normals, which follow from the corners
     corners: list[Array] = []
     parts: list[tuple[str, int, int]] = []
     done = 0
@@ -83,7 +84,6 @@ def read_stl(path: Path) -> MeshFile:
         first, done = done, done + len(mesh.faces)
         if name.isdigit() and int(name) < len(names) and names[int(name)]:
             parts.append((names[int(name)], first, done))
-    wanted = count if binary else len(_FACET.findall(data))
     if done != wanted:
         raise AssetError(str(path), f"has {wanted} triangles, of which {done} are whole", _DAMAGED)
     if binary and (coloured := _coloured(data)):
@@ -117,7 +117,7 @@ def read_off(path: Path) -> MeshFile:
     text = data[match.end() :].decode("latin-1")
     lines = [line for row in text.splitlines() if (line := row.partition("#")[0].strip())]
     counts = lines[0].split()[:2] if lines else []
-    if len(counts) < 2 or not all(count.isdigit() and len(count) < 12 for count in counts):
+    if len(counts) < 2 or not all(count.isdecimal() and len(count) < 12 for count in counts):
         raise AssetError(str(path), "does not say how many vertices and faces it has", _DAMAGED)
     vertices, faces = map(int, counts)
     if len(lines) < 1 + vertices + faces:
@@ -156,8 +156,6 @@ def _load(data: bytes, kind: str, path: Path) -> list[Any]:
     """The meshes that trimesh finds, as they are in the file."""
     import trimesh
 
-    noisy = logging.getLogger("trimesh")  # normals of text that are no numbers, with where it noticed
-    was, noisy.disabled = noisy.disabled, True
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", DeprecationWarning)  # by which older numpy says that text is no number
@@ -167,5 +165,3 @@ def _load(data: bytes, kind: str, path: Path) -> list[Any]:
     except Exception as error:  # what is wrong with damaged files shows wherever the library stumbles over it
         said = (str(error).splitlines() or [type(error).__name__])[0][:200]
         raise AssetError(str(path), f"is no {kind.upper()} that can be read ({said})", _DAMAGED) from error
-    finally:
-        noisy.disabled = was

@@ -182,6 +182,7 @@ BAD = {
         (b"OFF BINARY\n\0\0\0\3", "is OFF that is binary"),
         (b"4OFF\n1 0 0\n0 0 0 0\n", "not of three dimensions"),
         (b"OFF", "does not say how many"),
+        ("OFF ² 1 0\n".encode("latin-1"), "does not say how many"),
     ],
     "a.3mf": [
         (threemf(model(TRIANGLE, np.array([[0, 1, 7]]))), "faces of vertices that are not there"),
