@@ -129,8 +129,11 @@ def read_off(path: Path) -> MeshFile:
         notes.append("colours of faces left out")
     if not meshes:
         return MeshFile(np.zeros((0, 3)), np.zeros((0, 3)), notes=notes)
+    corners = np.asarray(meshes[0].faces)
+    if corners.size and not 0 <= corners.min() <= corners.max() < vertices:
+        raise AssetError(str(path), f"has faces of other vertices than its {vertices}", _DAMAGED)
     with np.errstate(over="ignore"):
-        mesh = MeshFile(np.asarray(meshes[0].vertices).astype(np.float32), np.asarray(meshes[0].faces), notes=notes)
+        mesh = MeshFile(np.asarray(meshes[0].vertices).astype(np.float32), corners, notes=notes)
     if match[2] and len(mesh.vertices) == vertices:
         mesh.vertex_colours = _colours([line.split() for line in lines[1 : 1 + vertices]], 6 if match[3] else 3)
         notes.append("vertex colours left out: not three numbers each" if mesh.vertex_colours is None else
