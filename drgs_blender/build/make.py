@@ -48,7 +48,7 @@ def make_asset(
     pose: Pose = "rest",
     scale: float = 1.0,
 ) -> Asset:
-    """Make an asset from a mesh with textures: glTF, GLB, OBJ, PLY and whatever else `formats` reads.
+    """Make an asset from a mesh with textures: glTF, GLB, OBJ, PLY, DAE and whatever else `formats` reads.
 
     Parameters
     ----------

@@ -29,7 +29,8 @@ class Pyramid:
         pixels = image.pixels[..., None] if image.pixels.ndim == 2 else image.pixels
         pixels = to_unit(np.repeat(pixels[..., :1], 3, axis=2) if pixels.shape[2] < 3 else pixels[..., :3])
         self.image = image
-        self.levels = [np.ascontiguousarray(srgb_to_linear(pixels) if image.srgb else pixels)]
+        encoded = image.srgb and image.pixels.dtype.kind == "u"
+        self.levels = [np.ascontiguousarray(srgb_to_linear(pixels) if encoded else pixels)]
         while max(self.levels[-1].shape[:2]) > 1:
             self.levels.append(_halve(self.levels[-1]))
 

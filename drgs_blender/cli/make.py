@@ -23,7 +23,12 @@ EXAMPLES = """examples:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of ``drgs make``."""
-    parser.add_argument("mesh", type=Path, metavar="MESH", help="mesh with materials (glTF, GLB, OBJ, PLY)")
+    parser.add_argument(
+        "mesh",
+        type=Path,
+        metavar="MESH",
+        help="mesh with materials (glTF, GLB, OBJ, PLY, DAE), or without (STL, OFF, 3MF)",
+    )
     parser.add_argument("--out", type=Path, required=True, metavar="A.drgs", help="asset to write")
     parser.add_argument("--up", choices=tuple(UP_AXES), help="up axis of the file; default: what its format says")
     parser.add_argument(

@@ -14,7 +14,7 @@ from ..core.frame import Camera
 from ..deform.gmls import bind_points, carry
 from ..deform.sources import MeshSource
 from ..reconstruct.capture.capture import Capture, View
-from .flip import flip
+from .flip import find_flip
 from .metrics import depth_error, material_scores, mean_psnr, normal_error, on_white, relight_scores, ssim
 from .truth import Truth, TruthSet
 
@@ -27,6 +27,8 @@ Renderer = Callable[[Camera, Array, Array | None], dict[str, Array]]
 PASSES = ("Combined", "Depth", "Normal", "Albedo", "Roughness", "Metallic", "Coverage")
 #: A perceptual distance of two encoded pictures.
 Distance = Callable[[Array, Array], float]
+#: By name; None where it is not computed.
+Distances = dict[str, Distance | None]
 #: Called with the part done and what is rendered.
 Progress = Callable[[float, str], None]
 #: Where files of pictures go: (name of the set, number of the view, ours and the true one, encoded).
@@ -61,6 +63,7 @@ def compare(
     UsageError
         There is nothing to compare with.
     """
+    distances: Distances = {"flip": find_flip(), "lpips": lpips}
     novel, reason, remedy = capture.testing, "no views left out", "Leave views out with --test-every 8"
     if novel and asset.environment is None:
         novel, reason = [], "the asset has no light of its own"
@@ -85,13 +88,13 @@ def compare(
         _warn_of_known(asset, capture)
         radiance = asset.environment.radiance
         pictures = [render(view, radiance, None, "views left out") for view in novel]
-        report["novel"] = _novel(novel, pictures, capture.background, lpips, show)
+        report["novel"] = _novel(novel, pictures, capture.background, distances, show)
     if truth is not None:
         vertices = posed_vertices(asset, truth) if any(item.posed for item in truth.sets) else None
         for item in truth.sets:
             pose = vertices if item.posed else None
             pictures = [render(view, item.radiance, pose, item.name) for view in item.views]
-            entry = _relit(item, pictures, lpips, show)
+            entry = _relit(item, pictures, distances, show)
             entry["training_light"] = item.light == truth.training_light
             report["lights"].append(entry)
             if item.maps:
@@ -152,20 +155,19 @@ def _white(view: View, background: tuple[float, float, float] | None) -> tuple[A
 
 
 def _looks(
-    ours: Sequence[Array] | Array, true: Sequence[Array] | Array, lpips: Distance | None
+    ours: Sequence[Array] | Array, true: Sequence[Array] | Array, distances: Distances
 ) -> dict[str, float | None]:
     """Means of the measures that look at whole pictures."""
     pairs = list(zip(ours, true))
     return {
-        "ssim": float(np.mean([ssim(a, b) for a, b in pairs])),
-        "flip": float(np.mean([flip(a, b) for a, b in pairs])),
-        "lpips": None if lpips is None else float(np.mean([lpips(a, b) for a, b in pairs])),
+        name: None if of is None else float(np.mean([of(a, b) for a, b in pairs]))
+        for name, of in {"ssim": ssim, **distances}.items()
     }
 
 
 def _novel(
     views: list[View], pictures: list[dict[str, Array]], background: tuple[float, float, float] | None,
-    lpips: Distance | None, show: Show | None,
+    distances: Distances, show: Show | None,
 ) -> dict[str, Any]:  # fmt: skip
     wanted = [_white(view, background) for view in views]
     ours = []
@@ -183,13 +185,11 @@ def _novel(
         "coverage": float(np.mean([m.mean() for m in inside])),
         "psnr": mean_psnr(ours, true),
         "psnr_foreground": mean_psnr(ours, true, inside),
-        **_looks(ours, true, lpips),
+        **_looks(ours, true, distances),
     }
 
 
-def _relit(
-    item: TruthSet, pictures: list[dict[str, Array]], lpips: Distance | None, show: Show | None
-) -> dict[str, Any]:
+def _relit(item: TruthSet, pictures: list[dict[str, Array]], distances: Distances, show: Show | None) -> dict[str, Any]:
     straight = [_straight(picture) for picture in pictures]
     linear, alpha = (np.stack(parts) for parts in zip(*straight))
     wanted = [_white(view, (1.0, 1.0, 1.0)) for view in item.views]
@@ -200,7 +200,7 @@ def _relit(
         if show is not None:
             show(item.name, k, a, b)
     about = {"name": item.name, "light": item.light, "posed": item.posed, "views": len(item.views)}
-    return {**about, **scores, **_looks(ours, true, lpips)}
+    return {**about, **scores, **_looks(ours, true, distances)}
 
 
 def _inside(item: TruthSet) -> Array:

@@ -50,8 +50,10 @@ def read_exr_environment(path: Path) -> EnvironmentFile:
 
 
 def read_picture_environment(path: Path) -> EnvironmentFile:
-    """A PNG, JPEG or other display-referred picture: decoded from sRGB."""
+    """A PNG, JPEG or other display-referred picture: decoded from sRGB. TIFF with floats is linear."""
     pixels = load_image(path)[..., :3]
+    if pixels.dtype.kind == "f":
+        return _finish(pixels, "TIFF", [])
     note = "display-referred picture decoded from sRGB: nothing in it is brighter than 1"
     return _finish(srgb_to_linear(to_unit(pixels)), "picture", [note])
 

@@ -47,7 +47,7 @@ class Image:
     Attributes
     ----------
     pixels : (h, w, c) uint8, uint16 or float32, row 0 at the top; integers are fractions of their maximum
-    srgb : pixels are sRGB-encoded (else linear)
+    srgb : integers are sRGB-encoded (else linear); float32 is linear whatever this says
     uv_transform : (2, 3) float64: texture coordinates = uv_transform @ (u, v, 1), v **up** (Blender's convention)
     wrap : "repeat", "clamp" or "mirror" along u and v
     """

@@ -145,7 +145,7 @@ def _per_corner(values: list[list[float]], which: Array) -> Array | None:
 def _libraries(names: list[str], path: Path, notes: list[str]) -> dict[str, MaterialFile]:
     materials: dict[str, MaterialFile] = {}
     for name in dict.fromkeys(names):
-        file = _beside(path, name)
+        file = beside(path, name)
         if file is None or not file.is_file():
             notes.append(f"material file {name} not found")
         else:
@@ -189,10 +189,10 @@ def _read_mtl(path: Path, notes: list[str]) -> dict[str, MaterialFile]:
 def _image(line: str, path: Path, notes: list[str]) -> Image | None:
     """The image a map statement names (its options come first, the file last)."""
     name = _text(line.split()[-1])
-    file = _beside(path, name)
+    file = beside(path, name)
     if file is None or not file.is_file():
         rest = _text(line.strip().split(None, 1)[1])  # a name with spaces and no options
-        file = _beside(path, rest)
+        file = beside(path, rest)
     if file is None or not file.is_file():
         notes.append(f"texture {name} not found")
         return None
@@ -203,7 +203,7 @@ def _image(line: str, path: Path, notes: list[str]) -> Image | None:
         return None
 
 
-def _beside(path: Path, name: str) -> Path | None:
+def beside(path: Path, name: str) -> Path | None:
     """The file `name` relative to `path`; of an absolute name only the last part is tried."""
     pure = PurePosixPath(name.replace("\\", "/"))
     if not pure.name or "\0" in name:

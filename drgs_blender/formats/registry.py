@@ -28,8 +28,11 @@ from .obj import read_obj
 from .packed_splats import is_compressed, read_compressed_ply, read_splat, sniff_splat
 from .ply import HEADER_LIMIT, parse_header
 from .ply_mesh import read_ply_mesh
+from .scene_mesh import read_scene_mesh, sniff_3mf, sniff_collada
 from .sog import read_sog, sniff_sog
 from .spz import read_spz, sniff_spz
+from .stl_off import read_off, read_stl, sniff_off, sniff_stl
+from .tiff import MAGIC as TIFF
 from .usd_splats import MESHES, read_usd_splats, sniff_usd
 from .writers import WRITERS
 
@@ -169,6 +172,26 @@ FORMATS: tuple[Format, ...] = (
         lambda path: sanitise(read_obj(path)),
         "with MTL (Kd, map_Kd, Ns, Pr, Pm)",
     ),
+    Format(
+        "3MF",
+        sniff_3mf,
+        lambda path: sanitise(read_scene_mesh(path)),
+        "shapes alone, where they are placed; in metres; needs lxml (extra `meshes`)",
+    ),
+    Format(
+        "COLLADA",
+        sniff_collada,
+        lambda path: sanitise(read_scene_mesh(path)),
+        "with base colours, textures, vertex colours; in metres, turned to Z up; no skins; needs lxml and pycollada "
+        "(extra `meshes`)",
+    ),
+    Format("OFF", sniff_off, lambda path: sanitise(read_off(path)), "as text; with vertex colours (COFF)"),
+    Format(
+        "STL",
+        sniff_stl,
+        lambda path: sanitise(read_stl(path)),
+        "binary and text; corners at exactly the same place become one vertex; no colours",
+    ),
     Format("Radiance HDR", _magic(b"#?"), read_hdr_environment, "RGBE and XYZE, old and new runs"),
     Format(
         "OpenEXR",
@@ -178,9 +201,9 @@ FORMATS: tuple[Format, ...] = (
     ),
     Format(
         "picture",
-        lambda head, path: head.startswith((b"\x89PNG", b"\xff\xd8\xff")) or head[8:12] == b"WEBP",
+        lambda head, path: head.startswith((b"\x89PNG", b"\xff\xd8\xff", *TIFF)) or head[8:12] == b"WEBP",
         read_picture_environment,
-        "display-referred, decoded from sRGB",
+        "PNG, JPEG, WebP, TIFF, 8 or 16 bits: display-referred, decoded from sRGB; TIFF with floats is linear",
     ),
     Format(
         "learned light",

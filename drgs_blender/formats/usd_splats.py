@@ -5,36 +5,27 @@ https://openusd.org/release/user_guides/schemas/usdVol/ParticleField3DGaussianSp
 
 from __future__ import annotations
 
-import math
-import signal
-import subprocess
-import sys
-import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..core.asset.archive import replace_by
-from ..core.asset.tensors import decode
-from ..core.errors import AssetError, DeviceError, WriteError
+from ..core.errors import DeviceError, WriteError
 from . import usd_stage
+from .apart import PATIENCE, SECONDS, read_apart
 from .axes import UP_AXES
 from .files import SurfelFile
 from .splat_scene import Piece, join_pieces
 from .splats import Splats, writable
 from .usd_crate import check_crate
-from .usd_stage import DEGREE, FULL, HARMONICS, LACKING, NO_SPLATS, REFUSED, REMEDY, SCHEMA, SPACE, UP
+from .usd_stage import DEGREE, HARMONICS, NO_SPLATS, SCHEMA, SPACE, UP
 
 Array = np.ndarray
 
-#: Processor time and memory for a file: some for the library, and in proportion to its bytes.
-_SECONDS, _PACE = 5.0, 1 << 20
-#: By the clock it may take so many times as long: the machine may be busy, and who waits takes no processor time.
-_PATIENCE = 20
-_MEMORY, _RATIO = 8 << 30, 32
 #: What to do for what is not read.
 MESHES = "For its meshes, import it in Blender and export glTF (.glb), which is read"
+_LACKING = ("needs the package usd-core", "Install it: pip install usd-core")
 _NAMES = (b".usda", b".usdc", b".usd")
 
 
@@ -56,51 +47,13 @@ def read_usd_splats(path: Path) -> SurfelFile:
         usd-core is not installed.
     """
     check_crate(path)
-    arrays = _read_apart(path)
+    arrays = read_apart(path, usd_stage.__name__, "USD", _LACKING, {NO_SPLATS: MESHES}, SECONDS, PATIENCE)
     up = arrays.pop(UP).tobytes().decode(errors="replace")
     pieces = []
     for i in range(sum(name.endswith("/matrix") for name in arrays)):
         of = {name: arrays[f"{i}/{name}"] for name in ("centre", "scale", "rotation", "opacity", "sh")}
         pieces.append(Piece(Splats(**of), arrays[f"{i}/matrix"], bool(arrays[f"{i}/linear"][0])))
     return join_pieces(pieces, path, "USD", up if up in UP_AXES else "y")
-
-
-def _read_apart(path: Path) -> dict[str, Array]:
-    """The arrays of `usd_stage`, from a process that may take time and memory in proportion to the file."""
-    subject, size = str(path), path.stat().st_size
-    try:
-        subject.encode()
-    except UnicodeEncodeError as error:
-        raise AssetError(subject, "has a path that is no text, and USD takes no other", "Rename it") from error
-    seconds = math.ceil(_SECONDS + size / _PACE)
-    slow = AssetError(subject, "keeps USD busy for longer than such a file can take", REMEDY)
-    with tempfile.TemporaryDirectory() as folder:
-        target = Path(folder) / "splats"
-        # The package as it is here, wherever that comes from.
-        code = (
-            f"import sys; sys.path.insert(0, sys.argv[1]); from {usd_stage.__name__} import main; main(*sys.argv[2:])"
-        )
-        given = Path(__file__).resolve().parents[2], path.absolute(), target, _MEMORY + _RATIO * size, seconds
-        command = [sys.executable, "-c", code, *map(str, given)]
-        try:
-            done = subprocess.run(command, capture_output=True, timeout=_PATIENCE * seconds, stdin=subprocess.DEVNULL)
-        except subprocess.TimeoutExpired as error:
-            raise slow from error
-        except OSError as error:
-            raise DeviceError(subject, f"cannot be read: Python does not start ({error})", "See drgs doctor") from error
-        if done.returncode == -getattr(signal, "SIGXCPU", 0):  # Windows has no such signal
-            raise slow
-        if done.returncode == LACKING:
-            raise DeviceError(subject, "needs the package usd-core", "Install it: pip install usd-core")
-        said = (done.stderr.decode(errors="replace").strip().splitlines() or [""])[-1][:300]
-        if done.returncode == FULL:
-            problem = f"cannot hold the splats of {subject} ({said})"
-            raise WriteError(folder, problem, "Free space there, or name another folder by the variable TMPDIR")
-        if done.returncode:
-            known = done.returncode == REFUSED and said
-            remedy = MESHES if said == NO_SPLATS else REMEDY
-            raise AssetError(subject, said if known else "cannot be read: USD crashes on it", remedy)
-        return decode(np.fromfile(target, np.uint8), subject)
 
 
 def write_usd_splats(path: Path, splats: Splats) -> None:
@@ -149,5 +102,5 @@ def _usd(subject: str) -> tuple[Any, Any]:
     try:
         from pxr import Usd, UsdGeom
     except ImportError as error:
-        raise DeviceError(subject, "needs the package usd-core", "Install it: pip install usd-core") from error
+        raise DeviceError(subject, *_LACKING) from error
     return Usd, UsdGeom

@@ -5,14 +5,12 @@ damaged files. `usd_splats` runs it with limits.
 from __future__ import annotations
 
 import os
-import sys
 from typing import Any
 
 import numpy as np
 
-from ..core.asset.archive import first_reason
-from ..core.asset.tensors import encode
 from ..core.errors import AssetError
+from .apart import hand_over, limit
 
 Array = np.ndarray
 
@@ -21,57 +19,24 @@ DEGREE = "radiance:sphericalHarmonicsDegree"
 HARMONICS = "radiance:sphericalHarmonicsCoefficients"
 #: Attribute of UsdColorSpaceAPI, and how the names of linear light with our primaries start.
 SPACE, LINEAR = "colorSpace:name", "lin_rec709"
-#: Codes to leave with: the file is refused (the reason is the last line of stderr), USD is not installed, what was read
-#: cannot be handed over (likewise).
-REFUSED, LACKING, FULL = 65, 69, 73
 #: Splats may be repeated by references until they are so many bytes, some and in proportion to the files.
 _SPLATS, _RATIO = 64 << 20, 32
 #: Name of the text that says which axis is up.
 UP = "up"
-REMEDY = "Export it again, or restore it from a copy"
 _ELSEWHERE = "which is not in this package"
 NO_SPLATS = f"holds no splats ({SCHEMA}), and of USD nothing else is read"
 
 
 def main(source: str, target: str, most_bytes: str, most_seconds: str) -> None:
-    """Write the pieces of the stage `source` to `target`; leave with a code.
+    """Write the pieces of the stage `source` to `target`; leave with a code (see `apart`)."""
+    limit(int(most_bytes), int(most_seconds))
 
-    At most so many bytes of memory (Linux) and seconds of processor time (not on Windows) are taken for it.
-    """
-    _limit(int(most_bytes), int(most_seconds))
-    try:
+    def read(subject: str) -> dict[str, Array]:
         from pxr import Usd, UsdGeom
-    except ImportError:
-        sys.exit(LACKING)
-    try:
-        arrays = read_stage(source, Usd, UsdGeom)
-    except AssetError as error:
-        sys.stderr.write(f"\n{error.problem}\n")
-        sys.exit(REFUSED)
-    except (RuntimeError, TypeError, ValueError, MemoryError, OverflowError) as error:  # what USD's library raises
-        sys.stderr.write(f"\ncannot be read as USD ({first_reason(str(error))})\n")
-        sys.exit(REFUSED)
-    try:
-        with open(target, "wb") as file:
-            file.writelines(encode(arrays))
-    except OSError as error:
-        sys.stderr.write(f"\n{error.strerror or error}\n")
-        sys.exit(FULL)
 
+        return read_stage(subject, Usd, UsdGeom)
 
-def _limit(most_bytes: int, most_seconds: int) -> None:
-    """Let this process fail beyond these limits, and leave no image of its memory where it crashes."""
-    if sys.platform == "win32":
-        return
-    import resource
-
-    limits = {resource.RLIMIT_CPU: most_seconds, resource.RLIMIT_CORE: 0}
-    if sys.platform.startswith("linux"):
-        limits[resource.RLIMIT_AS] = most_bytes
-    for kind, wanted in limits.items():
-        now, most = resource.getrlimit(kind)
-        known = [limit for limit in (now, most) if limit != resource.RLIM_INFINITY]
-        resource.setrlimit(kind, (min([wanted, *known]), most))
+    hand_over(source, target, "USD", read)
 
 
 def read_stage(subject: str, usd: Any, geometry: Any) -> dict[str, Array]:

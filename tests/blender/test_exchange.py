@@ -189,3 +189,17 @@ def test_what_cannot_be_exported_is_refused_in_words(ball, scene, tmp_path):
     with pytest.raises(RuntimeError, match=r"folder\.ply"):
         bpy.ops.drgs.export(filepath=str(tmp_path / "folder.ply"))
     assert sorted(p.name for p in tmp_path.iterdir() if p.suffix == ".ply") == ["folder.ply"]
+
+
+@pytest.mark.parametrize("text", [False, True], ids=["binary", "text"])
+def test_stl_that_blender_writes_becomes_an_object(scene, tmp_path, text):
+    bpy.ops.mesh.primitive_uv_sphere_add(segments=12, ring_count=8, location=(1, 2, 3), rotation=(0.3, 0, 0.5))
+    ball = bpy.context.active_object
+    bpy.context.view_layer.update()
+    path = tmp_path / "ball.stl"
+    assert bpy.ops.wm.stl_export(filepath=str(path), ascii_format=text, export_selected_objects=True) == {"FINISHED"}
+    assert bpy.ops.drgs.import_parts(filepath=str(path)) == {"FINISHED"}
+    points, wanted = world_points([bpy.context.active_object]), world_points([ball])
+    assert len(points) == len(wanted)  # the corners of triangles are joined again
+    apart = np.abs(points[:, None] - wanted[None]).max(axis=2)
+    assert apart.min(axis=1).max() < 1e-5 and apart.min(axis=0).max() < 1e-5

@@ -585,7 +585,7 @@ def test_usd_that_takes_too_long_is_given_up(
     (tmp_path / "a.usda").write_text("#usda 1.0\n")
     (tmp_path / "pxr.py").write_text(body)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    monkeypatch.setattr("drgs_blender.formats.usd_splats._SECONDS", 3.0)
-    monkeypatch.setattr("drgs_blender.formats.usd_splats._PATIENCE", patience)
+    monkeypatch.setattr("drgs_blender.formats.usd_splats.SECONDS", 3.0)
+    monkeypatch.setattr("drgs_blender.formats.usd_splats.PATIENCE", patience)
     with pytest.raises((AssetError, DeviceError), match=reason):
         read_surfels(tmp_path / "a.usda")

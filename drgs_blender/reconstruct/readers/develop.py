@@ -8,7 +8,7 @@ import numpy as np
 from PIL import Image
 from scipy.ndimage import binary_erosion, binary_fill_holes, label
 
-from ...core.color import to_unit
+from ...core.color import linear_to_srgb, to_unit
 from ...core.errors import AssetError
 from ...core.frame import Camera
 from ...formats.images import load_image
@@ -48,7 +48,7 @@ def develop(
         The file cannot be decoded; photograph, mask and calibration have different shapes; too few pixels.
     """
     subject = str(photograph.image)
-    pixels = to_unit(load_image(photograph.image))
+    pixels = _shown(load_image(photograph.image))
     height, width = pixels.shape[:2]
     lens = _fitting(photograph.lens, width, height, subject)
     mask = _mask(photograph, layout, pixels)
@@ -96,6 +96,14 @@ def _fitting(lens: Lens, width: int, height: int, subject: str) -> Lens:
         problem = f"is {width} x {height} pixels, but its camera was calibrated for {lens.width} x {lens.height}"
         raise AssetError(subject, problem, "Use the photographs that were calibrated, or calibrate these")
     return lens.scaled(width, height)
+
+
+def _shown(pixels: Array) -> Array:
+    """(h, w, 3 or 4) float32 in 0..1, sRGB-encoded, of a picture as it is read: floats are linear."""
+    if pixels.dtype.kind == "u":
+        return to_unit(pixels)
+    pixels = np.clip(pixels, 0, 1)
+    return np.concatenate([linear_to_srgb(pixels[..., :3]), pixels[..., 3:]], axis=2)
 
 
 def _mask(photograph: Photograph, layout: Layout, pixels: Array) -> Array | None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import ExifTags, Image
+from PIL import ExifTags, Image, UnidentifiedImageError
 
 from ...core.color import to_unit
 from ...core.errors import AssetError, first_of
@@ -32,7 +32,7 @@ _FARTHEST = 1e15
 
 def decode_mask(path: Path) -> Array:
     """(h, w) float32 in 0..1 of a mask file: alpha where it has one that says something, else brightness."""
-    pixels = to_unit(load_image(path))
+    pixels = np.clip(to_unit(load_image(path)), 0, 1)
     if pixels.shape[2] == 4 and pixels[..., 3].min() < 1:
         return pixels[..., 3]
     return pixels[..., :3].mean(axis=-1)
@@ -129,18 +129,13 @@ def invert(matrix: Array) -> Array:
     return out
 
 
-def image_size(path: Path) -> tuple[int, int]:
-    """(width, height) from the header of an image file. Raises AssetError."""
-    try:
-        with Image.open(path) as image:
-            return image.size
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise AssetError(str(path), f"is no image that can be read ({error})", "Convert it to PNG or JPEG") from error
-
-
 def turned_by_exif(path: Path) -> bool:
     """Whether viewers show the image file `path`, which can be read, otherwise than its pixels are stored."""
-    with Image.open(path) as image:
+    try:
+        image = Image.open(path)
+    except UnidentifiedImageError:  # TIFF with floats, which is turned when it is read
+        return False
+    with image:
         try:
             orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
         except Exception:  # damaged metadata raise almost anything; the pixels are sound

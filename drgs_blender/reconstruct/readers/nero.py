@@ -13,10 +13,11 @@ from typing import Any
 
 import numpy as np
 
+from ...core.color import to_unit
 from ...core.errors import AssetError
 from ...formats.axes import UP_AXES
-from ...formats.images import load_image
-from .layout import OPENCV_TO_BLENDER, Layout, Photograph, complain_of_missing, image_size, invert, rigid
+from ...formats.images import image_size, load_image
+from .layout import OPENCV_TO_BLENDER, Layout, Photograph, complain_of_missing, invert, rigid
 from .lens import Lens
 
 Array = np.ndarray
@@ -95,4 +96,4 @@ def _camera(path: Path) -> tuple[Array, Array]:
 def _nearer_than_background(path: Path) -> Array:
     """(h, w) float32: 1 where a 16-bit depth is that of the object."""
     depth = load_image(path)[..., 0]
-    return (depth.astype(np.float32) / np.iinfo(depth.dtype).max < _BACKGROUND).astype(np.float32)
+    return (to_unit(depth) < _BACKGROUND).astype(np.float32)

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from ...core.errors import AssetError
+from ...formats.images import image_size
 from .layout import (
     PICTURES,
     Layout,
@@ -21,7 +22,6 @@ from .layout import (
     complain_of_missing,
     find_mask,
     find_picture,
-    image_size,
     read_json,
     rigid,
 )

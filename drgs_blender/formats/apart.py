@@ -1,0 +1,137 @@
+"""Files read by a program of its own: libraries that may hang or crash on damaged ones, or take all memory.
+
+The program gets a file to read and one to write arrays to; it leaves with a code, and its last line says why.
+"""
+
+from __future__ import annotations
+
+import math
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from ..core.asset.archive import first_reason
+from ..core.asset.tensors import decode, encode
+from ..core.errors import AssetError, DeviceError, WriteError
+
+Array = np.ndarray
+
+#: Codes to leave with: the file is refused (the reason is the last line of stderr), the library is not installed, what
+#: was read cannot be handed over (likewise).
+REFUSED, LACKING, FULL = 65, 69, 73
+#: Processor time and memory for a file: some for the library, and in proportion to its bytes.
+SECONDS, _PACE = 5.0, 1 << 20
+#: By the clock it may take so many times as long: the machine may be busy, and who waits takes no processor time.
+PATIENCE = 20
+_MEMORY, _RATIO = 8 << 30, 32
+REMEDY = "Export it again, or restore it from a copy"
+
+
+def hand_over(source: str, target: str, kind: str, read: Callable[[str], Mapping[str, Array]]) -> None:
+    """In the program: write what `read` makes of `source` to `target`; leave with a code where that fails.
+
+    Parameters
+    ----------
+    kind : what errors call such files
+    """
+    try:
+        arrays = read(source)
+    except AssetError as error:
+        sys.stderr.write(f"\n{error.problem}\n")
+        sys.exit(REFUSED)
+    except ImportError:
+        sys.exit(LACKING)
+    except Exception as error:  # what libraries raise of damaged files has no common type
+        sys.stderr.write(f"\ncannot be read as {kind} ({first_reason(str(error) or type(error).__name__)})\n")
+        sys.exit(REFUSED)
+    try:
+        with open(target, "wb") as file:
+            file.writelines(encode(arrays))
+    except OSError as error:
+        sys.stderr.write(f"\n{error.strerror or error}\n")
+        sys.exit(FULL)
+
+
+def limit(most_bytes: int, most_seconds: int) -> None:
+    """In the program: let it fail beyond these limits, and leave no image of its memory where it crashes.
+
+    At most so many bytes of memory (Linux) and seconds of processor time (not on Windows).
+    """
+    if sys.platform == "win32":
+        return
+    import resource
+
+    limits = {resource.RLIMIT_CPU: most_seconds, resource.RLIMIT_CORE: 0}
+    if sys.platform.startswith("linux"):
+        limits[resource.RLIMIT_AS] = most_bytes
+    for kind, wanted in limits.items():
+        now, most = resource.getrlimit(kind)
+        known = [limit for limit in (now, most) if limit != resource.RLIM_INFINITY]
+        resource.setrlimit(kind, (min([wanted, *known]), most))
+
+
+def read_apart(
+    path: Path,
+    module: str,
+    kind: str,
+    lacking: tuple[str, str],
+    remedies: Mapping[str, str] | None = None,
+    seconds: float = SECONDS,
+    patience: float = PATIENCE,
+) -> dict[str, Array]:
+    """The arrays that ``module.main`` hands over, from a process that may take time and memory in proportion.
+
+    Parameters
+    ----------
+    module : dotted name; its `main` takes a source, a target and the two limits as text
+    kind : what errors call such files
+    lacking : problem and remedy where its library is not installed
+    remedies : reason for which a file is refused -> what to do, where that is not `REMEDY`
+    seconds, patience : of processor time for a small file; how many times as long by the clock
+
+    Raises
+    ------
+    AssetError
+        The file is damaged, or of a kind that is not read.
+    DeviceError
+        The library is not installed.
+    WriteError
+        There is no room for what is handed over.
+    """
+    subject, size = str(path), path.stat().st_size
+    try:
+        subject.encode()
+    except UnicodeEncodeError as error:
+        raise AssetError(subject, f"has a path that is no text, and {kind} takes no other", "Rename it") from error
+    most = math.ceil(seconds + size / _PACE)
+    slow = AssetError(subject, f"keeps {kind} busy for longer than such a file can take", REMEDY)
+    with tempfile.TemporaryDirectory() as folder:
+        target = Path(folder) / "arrays"
+        # The package as it is here, wherever that comes from.
+        code = f"import sys; sys.path.insert(0, sys.argv[1]); from {module} import main; main(*sys.argv[2:])"
+        given = Path(__file__).resolve().parents[2], path.absolute(), target, _MEMORY + _RATIO * size, most
+        command = [sys.executable, "-c", code, *map(str, given)]
+        try:
+            done = subprocess.run(command, capture_output=True, timeout=patience * most, stdin=subprocess.DEVNULL)
+        except subprocess.TimeoutExpired as error:
+            raise slow from error
+        except OSError as error:
+            raise DeviceError(subject, f"cannot be read: Python does not start ({error})", "See drgs doctor") from error
+        if done.returncode == -getattr(signal, "SIGXCPU", 0):  # Windows has no such signal
+            raise slow
+        if done.returncode == LACKING:
+            raise DeviceError(subject, *lacking)
+        said = (done.stderr.decode(errors="replace").strip().splitlines() or [""])[-1][:300]
+        if done.returncode == FULL:
+            problem = f"cannot hold what is in {subject} ({said})"
+            raise WriteError(folder, problem, "Free space there, or name another folder by the variable TMPDIR")
+        if done.returncode:
+            known = done.returncode == REFUSED and said
+            problem = said if known else f"cannot be read: {kind} crashes on it"
+            raise AssetError(subject, problem, (remedies or {}).get(said, REMEDY))
+        return decode(np.fromfile(target, np.uint8), subject)
