@@ -208,8 +208,10 @@ class DrgsMatterSettings(_Matter, bpy.types.PropertyGroup):
         update=_take_range,
         options=set(),
     )
-    regions: CollectionProperty(type=DrgsMatterRegion, name="Regions")
-    colliders: CollectionProperty(type=DrgsMatterCollider, name="Colliders")
+    regions: CollectionProperty(
+        type=DrgsMatterRegion, name="Regions", description="Parts of the object that are made of something else"
+    )
+    colliders: CollectionProperty(type=DrgsMatterCollider, name="Colliders", description="Meshes that the matter meets")
     solver: EnumProperty(
         name="Solver",
         description="How motion is computed",
