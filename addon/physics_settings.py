@@ -211,8 +211,12 @@ class DrgsPhysicsSettings(_MaterialNumbers, bpy.types.PropertyGroup):
         update=_take_range,
         options=set(),
     )
-    regions: CollectionProperty(type=DrgsPhysicsRegion, name="Regions")
-    colliders: CollectionProperty(type=DrgsPhysicsCollider, name="Colliders")
+    regions: CollectionProperty(
+        type=DrgsPhysicsRegion, name="Regions", description="Parts of the object that are made of something else"
+    )
+    colliders: CollectionProperty(
+        type=DrgsPhysicsCollider, name="Colliders", description="Meshes that the simulated object meets"
+    )
     solver: EnumProperty(
         name="Solver",
         description="Method by which the motion is computed",

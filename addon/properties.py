@@ -218,7 +218,7 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
         default=True,
         options=set(),
     )
-    submit: PointerProperty(type=DrgsSubmitSettings, name="Farm")
+    submit: PointerProperty(type=DrgsSubmitSettings, name="Farm", description="How frames are rendered on a farm")
 
     def to_settings(
         self, film_transparent: bool, threads: int, warn: Callable[[str], None] = lambda text: None
@@ -302,7 +302,9 @@ class DrgsObjectSettings(bpy.types.PropertyGroup):
         set=_set_path,
     )
 
-    adjustment: PointerProperty(type=DrgsAdjustment, name="Adjustments")
+    adjustment: PointerProperty(
+        type=DrgsAdjustment, name="Adjustments", description="Changes on top of the material attributes of the object"
+    )
     show_captured: BoolProperty(
         name="Show as Captured",
         description="Before and after: render the object with the material of its asset, without what is painted, "
@@ -310,7 +312,9 @@ class DrgsObjectSettings(bpy.types.PropertyGroup):
         default=False,
         update=_tell,
     )
-    physics: PointerProperty(type=DrgsPhysicsSettings, name="Physics")
+    physics: PointerProperty(
+        type=DrgsPhysicsSettings, name="Physics", description="The simulation of the object and its material"
+    )
     shown_as: StringProperty(
         name="Display As", description="How the mesh is displayed when it is not drawn as a box", options={"HIDDEN"}
     )

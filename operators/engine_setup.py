@@ -165,7 +165,12 @@ class DRGS_OT_engine_choose(DrgsOperator, bpy.types.Operator):
     bl_idname = "drgs.engine_choose"
     bl_label = "Choose Engine"
 
-    filepath: StringProperty(name="Engine", subtype="FILE_PATH", options={"SKIP_SAVE"})
+    filepath: StringProperty(
+        name="Engine",
+        description="Folder of the environment, or its Python",
+        subtype="FILE_PATH",
+        options={"SKIP_SAVE"},
+    )
     filter_folder: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:

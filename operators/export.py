@@ -27,7 +27,9 @@ class DRGS_OT_export(SceneFrames, bpy.types.Operator):
     bl_label = "Export DR-GS"
     bl_options = {"REGISTER", "UNDO", "PRESET"}  # noqa: RUF012 - read by Blender
 
-    filepath: StringProperty(subtype="FILE_PATH", options={"SKIP_SAVE"})
+    filepath: StringProperty(
+        description="The file to write; its ending chooses the format", subtype="FILE_PATH", options={"SKIP_SAVE"}
+    )
     check_existing: BoolProperty(default=True, options={"HIDDEN"})
     filter_glob: StringProperty(default=_GLOB, options={"HIDDEN"})
     format: EnumProperty(

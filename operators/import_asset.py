@@ -24,7 +24,7 @@ class DRGS_OT_import_asset(DrgsOperator, bpy.types.Operator):
     bl_label = "Import DR-GS"
     bl_options = {"REGISTER", "UNDO", "PRESET"}  # noqa: RUF012 - read by Blender
 
-    filepath: StringProperty(subtype="FILE_PATH", options={"SKIP_SAVE"})
+    filepath: StringProperty(description="The .drgs file to import", subtype="FILE_PATH", options={"SKIP_SAVE"})
     directory: StringProperty(subtype="DIR_PATH", options={"SKIP_SAVE", "HIDDEN"})
     files: CollectionProperty(type=bpy.types.OperatorFileListElement, options={"SKIP_SAVE", "HIDDEN"})
     filter_glob: StringProperty(default="*.drgs", options={"HIDDEN"})

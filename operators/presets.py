@@ -20,7 +20,9 @@ class DRGS_OT_render_preset(DrgsOperator, bpy.types.Operator):
     bl_label = "Render Preset"
     bl_options = {"REGISTER", "UNDO", "INTERNAL"}  # noqa: RUF012 - read by Blender
 
-    filepath: StringProperty(subtype="FILE_PATH", options={"SKIP_SAVE", "HIDDEN"})
+    filepath: StringProperty(
+        description="File of the preset, in a folder of presets", subtype="FILE_PATH", options={"SKIP_SAVE", "HIDDEN"}
+    )
     menu_idname: StringProperty(options={"SKIP_SAVE", "HIDDEN"})
 
     def run(self, context: bpy.types.Context) -> set[str]:

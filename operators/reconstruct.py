@@ -34,7 +34,9 @@ class DRGS_OT_reconstruct(CommandOperator, bpy.types.Operator):
     bl_label = "Reconstruct from Photographs"
     bl_options = {"REGISTER", "UNDO", "PRESET"}  # noqa: RUF012 - read by Blender
 
-    filepath: StringProperty(subtype="FILE_PATH", options={"SKIP_SAVE"})
+    filepath: StringProperty(
+        description="Folder of the photographs and their cameras", subtype="FILE_PATH", options={"SKIP_SAVE"}
+    )
     filter_folder: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
     out: StringProperty(
         name="Save As",

@@ -4,7 +4,8 @@
     python3.11 tools/dev.py test
 
 Standard library only. Two environments are made beside the checkout, because Blender's Python pins an older numpy:
-``.venv`` (the engine) and ``.venv-blender`` (Blender as a module, for tests and batch rendering).
+``.venv`` (the engine) and ``.venv-blender`` (Blender as a module, for tests and batch rendering). `docs` makes a third,
+``.venv-docs``, for the generator of the site.
 """
 
 from __future__ import annotations
@@ -35,6 +36,8 @@ BLENDER = "5.0.1"
 BLENDER_FLOOR = "4.2.23"
 #: The LTS between them, tested when asked for.
 BLENDER_LTS = "4.5.15"
+#: Seconds that Blender may take to say what its operators and properties are.
+REFERENCE_SECONDS = 300
 #: Programs of npm that read our files in the tests and write others for us.
 NODE_PACKAGES = ("@adobe/spz@0.2.2", "@playcanvas/splat-transform@2.7.1", "gltf-validator@2.0.0-dev.3.10")
 #: Shared library that Blender needs -> the Debian package that holds it.
@@ -53,6 +56,8 @@ APT_PACKAGES = {
     "libgomp.so.1": "libgomp1",
     "libxkbcommon.so.0": "libxkbcommon0",
 }
+#: The group of dependencies in pyproject.toml that the site takes.
+DOCS = "docs"
 #: The suite of the oldest Blender, which `make check` runs, and that of the LTS, which runs when asked for.
 FLOOR, LTS = "floor", "lts"
 SUITES = {
@@ -110,6 +115,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     demo = command("demo", run_demo, "render the demo through Blender; further arguments go to examples/demo.py")
     matter = command("demo-simulation", run_demo_simulation, "bake and render matter; see examples/demo_simulation.py")
     extension = command("extension", run_extension, "build the extension's zip; arguments go to tools/extension.py")
+    command("docs", run_docs, "build the site of the documentation in build/docs/html; any warning ends it")
     bench = command("bench", run_bench, "measure; further arguments go to bench/run.py")
     for sub in (test, check, demo, matter, extension, bench):
         sub.set_defaults(passes_on=True)
@@ -147,7 +153,7 @@ def about_engine() -> tuple[Path, dict[str, object], list[list[str]]]:
     wanted = {
         "torch": torch,
         "dependencies": project["dependencies"],
-        "optional": project["optional-dependencies"],
+        "optional": {k: v for k, v in project["optional-dependencies"].items() if k != DOCS},
         "scripts": project["scripts"],
     }
     return ROOT / ".venv", wanted, [torch, ["-e", f"{ROOT}[reconstruct,oidn,gpu,dev]"]]
@@ -200,6 +206,14 @@ def ensure(
     stamp.write_text(text, encoding="utf-8")
     print(f"Preparing {folder.name} took {time.monotonic() - started:.0f} s", flush=True)
     return interpreter
+
+
+def ensure_docs() -> Path:
+    """Make ``.venv-docs`` when needed and return its interpreter."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    packages = project["optional-dependencies"][DOCS]
+    probe = "import furo, griffe, mermaidx, myst_parser, sphinx"
+    return ensure(ROOT / ".venv-docs", {"packages": packages}, [packages], probe)
 
 
 def ensure_node() -> None:
@@ -380,6 +394,19 @@ def run_bench(args: argparse.Namespace) -> int:
 def run_extension(args: argparse.Namespace) -> int:
     """Build the extension."""
     return with_both("tools/extension.py", args.rest)
+
+
+def run_docs(args: argparse.Namespace) -> int:
+    """Build the site: the reference of Blender's side by Blender, all else by the generator."""
+    blender, generator = ensure_blender(), ensure_docs()
+    pages = ROOT / "build" / "docs" / "blender"
+    shutil.rmtree(pages, ignore_errors=True)
+    command = [blender, ROOT / "tools" / "blender_reference.py", "--out", pages]
+    try:
+        code = subprocess.run(command, cwd=ROOT, timeout=REFERENCE_SECONDS).returncode
+    except subprocess.TimeoutExpired as error:
+        raise Failure(f"tools/blender_reference.py did not end within {REFERENCE_SECONDS} s; run it alone") from error
+    return code or run([generator, ROOT / "tools" / "docs.py"])
 
 
 def with_both(program: str, rest: Sequence[str]) -> int:

@@ -1,0 +1,198 @@
+"""Build the site of the documentation into ``build/docs/html``; `make docs` runs it in ``.venv-docs``.
+
+The sources are laid out in ``build/docs/source`` as in the repository, so that links between pages are the same on
+GitHub and in the site. The reference of Blender's side is in ``build/docs/blender``, by tools/blender_reference.py.
+Any warning ends the build.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import shutil
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import api_reference
+from sphinx.cmd.build import main as sphinx
+from sphinx.util.inventory import InventoryFile
+
+ROOT = Path(__file__).resolve().parent.parent
+BUILD = ROOT / "build" / "docs"
+#: Pages in the order of the navigation; README.md is the start page. Every page of docs/ must be here.
+NAVIGATION = {
+    "Start": ("docs/user-guide.md", "docs/command-line.md", "examples/README.md", "docs/glossary.md", "CHANGELOG.md"),
+    "Guides": (
+        *("docs/rendering.md", "docs/simulation.md", "docs/deformation.md", "docs/decoupling.md"),
+        *("docs/gpu.md", "docs/benchmarks.md"),
+    ),
+    "Formats and farm": (
+        *("docs/formats.md", "docs/asset-format.md", "docs/farm/nodes.md", "docs/farm/slurm.md"),
+        *("docs/farm/openjd.md", "docs/farm/flamenco.md"),
+    ),
+    "Internals": ("docs/architecture.md", "docs/kernels.md", "docs/protocol.md", "CONTRIBUTING.md"),
+}
+#: Folders, below the laid out sources, of the two references.
+PYTHON, BLENDER = "reference/python", "reference/blender"
+#: Part of its natural size in which a diagram is shown.
+DIAGRAM_SCALE = 0.7
+
+
+class DocsError(Exception):
+    """The documentation cannot be built; the message says what is wrong where, and what to do."""
+
+
+def lay_out(root: Path, source: Path, blender: Path) -> list[str]:
+    """Lay out the sources of the site.
+
+    Parameters
+    ----------
+    root : Path
+        The repository.
+    source : Path
+        Folder to fill; what it holds is removed.
+    blender : Path
+        Folder with the pages of Blender's side.
+
+    Returns
+    -------
+    list of str
+        Modules of the Python reference.
+
+    Raises
+    ------
+    DocsError
+        A page that the navigation does not name, or no reference of Blender's side.
+    """
+    named = [page for group in NAVIGATION.values() for page in group]
+    guides = {path.relative_to(root).as_posix() for path in (root / "docs").rglob("*.md")}
+    if left_out := sorted(guides - set(named)):
+        raise DocsError(f"{', '.join(left_out)}: not in the navigation. Add to NAVIGATION in tools/docs.py")
+    if not (blender / "index.md").is_file():
+        raise DocsError(f"{blender}: holds no index.md. Run tools/blender_reference.py in Blender's environment first")
+    shutil.rmtree(source, ignore_errors=True)
+    pages = [Page(root, name) for name in ("README.md", *named)]
+    for page in pages:
+        place = source / ("index.md" if page.name == "README.md" else page.name)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        place.write_text(page.text({p.name for p in pages}), encoding="utf-8")
+        for file in page.files:
+            (source / file).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(root / file, source / file)
+    with (source / "index.md").open("a", encoding="utf-8") as index:
+        index.writelines(trees())
+    shutil.copytree(blender, source / BLENDER)
+    return api_reference.write(root, source / PYTHON)
+
+
+def trees() -> Iterator[str]:
+    """The navigation, as the start page holds it."""
+    reference = (f"Operators and properties <{BLENDER}/index>", f"Python modules <{PYTHON}/{api_reference.PACKAGE}>")
+    for title, entries in (NAVIGATION | {"Reference": (*reference, "All names <genindex>")}).items():
+        if title == "Start":
+            entries = ("Overview <self>", *entries)
+        yield "\n".join(["", "```{toctree}", ":hidden:", f":caption: {title}", "", *entries, "```", ""])
+
+
+class Page:
+    """A page of the repository.
+
+    Parameters
+    ----------
+    root : Path
+        The repository.
+    name : str
+        Path of the page inside it.
+
+    Attributes
+    ----------
+    files : list of str
+        What the page shows or links to that is no page, once `linked` was called: to be copied beside it.
+    """
+
+    def __init__(self, root: Path, name: str) -> None:
+        self.root, self.name = root, name
+        self.files: list[str] = []
+
+    def text(self, pages: set[str]) -> str:
+        """The page as the site's generator takes it, which has `pages`: links as they are there, diagrams drawn."""
+        text = self.linked(pages)
+        return re.sub(r"^```mermaid\n(.*?)^```$", self._diagram, text, flags=re.DOTALL | re.MULTILINE)
+
+    def linked(self, pages: set[str]) -> str:
+        """The page with links as they are in the site; DocsError where one leads nowhere."""
+        text = (self.root / self.name).read_text(encoding="utf-8")
+        return re.sub(r"(\]\()([^)\s]+)(\))", lambda found: self._link(found, pages), text)
+
+    def _link(self, found: re.Match[str], pages: set[str]) -> str:
+        """A link as it is in the site: to a page, to a module's reference, or to a file that is copied."""
+        path, mark, anchor = found[2].partition("#")
+        if re.match(r"[a-z]+:", found[2]) or not path:
+            return found[0]
+        here = (self.root / self.name).parent
+        target = (here / path).resolve()
+        if not target.exists() or not target.is_relative_to(self.root):
+            raise DocsError(f"{self.name}: links to {found[2]}, which is not there. Correct the link")
+        inside = target.relative_to(self.root)
+        name = inside.as_posix()
+        up = "../" * (len(Path(self.name).parts) - 1)
+        if name == "README.md":
+            return f"{found[1]}{up}index.md{mark}{anchor}{found[3]}"
+        if name in pages:
+            return found[0]
+        if inside.parts[0] == api_reference.PACKAGE and (target.suffix == ".py" or (target / "__init__.py").is_file()):
+            module = ".".join(inside.with_suffix("").parts).removesuffix(".__init__")
+            return f"{found[1]}{up}{PYTHON}/{module}.md{found[3]}"
+        if target.is_dir():
+            raise DocsError(f"{self.name}: links to the folder {name}, which the site lacks. Link to a file or page")
+        self.files.append(name)
+        return found[0]
+
+    def _diagram(self, found: re.Match[str]) -> str:
+        """A diagram of Mermaid as SVG, which needs no script and no network to be seen."""
+        import mermaidx
+
+        try:
+            svg = mermaidx.render(found[1]).svg()
+        except RuntimeError as error:
+            raise DocsError(f"{self.name}: a Mermaid diagram cannot be drawn ({error}). Correct it") from error
+        width = float(re.search(r'viewBox="[-\d.]+ [-\d.]+ ([\d.]+)', svg)[1]) * DIAGRAM_SCALE
+        svg = svg.replace('width="100%"', f'width="{width:.0f}"', 1).replace("\n", " ")
+        return f'```{{raw}} html\n<div class="diagram">{svg}</div>\n```'
+
+
+def check(modules: list[str], html: Path) -> None:
+    """Raise DocsError where a module is in no page or a page holds what only the network gives."""
+    inventory = InventoryFile.loads((html / "objects.inv").read_bytes(), uri="")
+    there = set(inventory.data["py:module"])
+    if missing := sorted(set(modules) - there):
+        raise DocsError(f"{', '.join(missing)}: in no page of the reference. See tools/api_reference.py")
+    for page in html.rglob("*.html"):
+        fetched = re.findall(r'<(?:script|link|img)[^>]*(?:src|href)="(https?://[^"]+)"', page.read_text("utf-8"))
+        if fetched:
+            raise DocsError(f"{page}: fetches {fetched[0]}, so it needs the network. Bring it with the site")
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Build the site; the return value is the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=BUILD, help="folder of source and html; default build/docs")
+    args = parser.parse_args(argv)
+    source, html = args.out / "source", args.out / "html"
+    try:
+        modules = lay_out(ROOT, source, args.out / "blender")
+        shutil.rmtree(html, ignore_errors=True)
+        options = ["-W", "--keep-going", "-q", "-E", "-j", "auto", "-b", "html", "-d", str(args.out / "doctrees")]
+        if code := sphinx([*options, "-c", str(ROOT / "tools" / "site"), str(source), str(html)]):
+            return code
+        check(modules, html)
+    except DocsError as error:
+        print(f"docs.py: {error}", file=sys.stderr)
+        return 1
+    print(html / "index.html")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
