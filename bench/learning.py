@@ -13,10 +13,10 @@ from drgs_blender.compute.jit import use_threads
 from drgs_blender.core.asset.container import read_asset
 from drgs_blender.core.color import linear_to_srgb
 from drgs_blender.core.errors import DeviceError
-from drgs_blender.reconstruct.backend import HERE, Processor
+from drgs_blender.reconstruct.backend import CPU, LearningBackend
 from drgs_blender.reconstruct.capture.capture import Capture, View
-from drgs_blender.reconstruct.gpu.devices import learner
-from drgs_blender.reconstruct.gpu.on_device import OnDevice
+from drgs_blender.reconstruct.gpu.select_backend import select_backend
+from drgs_blender.reconstruct.gpu.warp_backend import WarpLearningBackend
 from drgs_blender.reconstruct.meshing.visual_hull import find_region
 from drgs_blender.reconstruct.optim.schedule import Schedule
 from drgs_blender.reconstruct.optim.train import Training
@@ -44,7 +44,7 @@ def learning(path: Path, size: int, steps: int, surfels: int, missing: str) -> s
     capture = photographs(path, size)
     region, schedule = find_region(capture), Schedule(iterations=steps, surfels=surfels)
 
-    def learned(schedule: Schedule, by: Processor) -> Training:
+    def learned(schedule: Schedule, by: LearningBackend) -> Training:
         training = Training(capture, region, schedule, by=by)
         while not training.finished:
             training.step()
@@ -52,19 +52,19 @@ def learning(path: Path, size: int, steps: int, surfels: int, missing: str) -> s
             raise DeviceError("device", training.fallback.failed, "")
         return training
 
-    def run(by: Processor, threads: int) -> list[str]:
+    def run(by: LearningBackend, threads: int) -> list[str]:
         use_threads(threads)
         learned(replace(schedule, iterations=FIRST), by)
         training = learned(schedule, by)
         use_threads(0)
-        found = judge(training.gaussians.on(HERE), capture)
+        found = judge(training.gaussians.on(CPU), capture)
         rate = f"{steps / training.clock.spent:.1f}"
         return [rate, f"{len(training.gaussians)}", f"{found['psnr']:.2f} dB", f"{found['ssim']:.4f}"]
 
-    rows = [["Numba and torch, all threads", *run(HERE, 0)], ["Numba and torch, 1 thread", *run(HERE, 1)]]
-    rows.append(["Warp and torch on the processor, 1 thread", *run(OnDevice("cpu"), 1)])
-    card = learner("cuda")
-    rows.append(["Warp and torch on CUDA", *([missing] * 4 if card is HERE else run(card, 0))])
+    rows = [["Numba and torch, all threads", *run(CPU, 0)], ["Numba and torch, 1 thread", *run(CPU, 1)]]
+    rows.append(["Warp and torch on the processor, 1 thread", *run(WarpLearningBackend("cpu"), 1)])
+    card = select_backend("cuda")
+    rows.append(["Warp and torch on CUDA", *([missing] * 4 if card is CPU else run(card, 0))])
     head = (
         f"Surfels learned from {VIEWS * 3 // 4} pictures of {size}x{size} that our renderer made of the {path.stem}, "
         f"{steps} steps, at most {surfels} surfels, the whole schedule: half size first, surfels cut, mirrors, shape. "

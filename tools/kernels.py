@@ -147,12 +147,12 @@ def engine(folder: Path, what: str) -> None:
 
 def reconstruct(variant: str) -> None:
     """The trial run that every reconstruction with a time budget begins with."""
-    from drgs_blender.reconstruct.backend import HERE
+    from drgs_blender.reconstruct.backend import CPU
     from drgs_blender.reconstruct.jit_warmup import rehearse
     from drgs_blender.reconstruct.pipeline import Settings
 
     for masked in (True, False):
-        rehearse(Settings(variant=variant), masked, HERE, lambda: False)  # type: ignore[arg-type]
+        rehearse(Settings(variant=variant), masked, CPU, lambda: False)  # type: ignore[arg-type]
 
 
 def do(what: str, folder: Path) -> None:

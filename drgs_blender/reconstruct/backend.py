@@ -1,7 +1,7 @@
-"""Who does the work of a step of learning: this processor; `reconstruct.device` has another for a card.
+"""The backend that executes the steps of learning on the CPU; `reconstruct.gpu` has another for a card.
 
-What surfels show, how far that is from a photograph, and the way down: every step goes through one of these, and so do
-previews. Tensors are the processor's own: `Processor.place` says where.
+How surfels look, how far that is from a photograph, and the optimiser's step: every iteration goes through a backend,
+and so do previews. Tensors are the backend's own: `LearningBackend.device` says where.
 """
 
 from __future__ import annotations
@@ -25,15 +25,16 @@ from .model.reflection_probe import mirrored
 from .optim.adam import descend
 
 
-class Processor:
-    """This processor, by all threads: numpy's arrays and compiled code behind torch's tensors.
+class LearningBackend:
+    """The CPU, by all threads: numpy's arrays and compiled code behind torch's tensors.
 
     Attributes
     ----------
-    place : where its tensors are
+    device : torch.device
+        Where its tensors are.
     """
 
-    place = torch.device("cpu")
+    device = torch.device("cpu")
 
     def bring(self, target: Target) -> Target:
         """What a view is compared with, where this can read it."""
@@ -79,4 +80,4 @@ class Processor:
         return Gatherer(mesh, tree, cache, counts, normals)
 
 
-HERE = Processor()
+CPU = LearningBackend()

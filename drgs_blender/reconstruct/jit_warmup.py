@@ -12,7 +12,7 @@ import numpy as np
 from ..core.asset.model import Mesh
 from ..core.errors import Cancelled
 from ..core.frame import Camera
-from .backend import Processor
+from .backend import LearningBackend
 from .capture.capture import Capture, View
 from .inverse_rendering.run import decouple
 from .meshing.visual_hull import find_region
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 _SIZE, _AWAY, _STEPS, _STEPS_OF_MATERIALS = 32, 4.0, 24, 4
 
 
-def rehearse(settings: Settings, masked: bool, by: Processor, cancelled: Callable[[], bool]) -> None:
+def rehearse(settings: Settings, masked: bool, backend: LearningBackend, cancelled: Callable[[], bool]) -> None:
     """Take some steps of every phase that `settings` have.
 
     Parameters
@@ -44,14 +44,14 @@ def rehearse(settings: Settings, masked: bool, by: Processor, cancelled: Callabl
         for view in capture.views:
             view.mask = None
     schedule = replace(settings.schedule, iterations=_STEPS)
-    training = Training(capture, region, schedule, by=by)
+    training = Training(capture, region, schedule, backend=backend)
     _all_steps(training, cancelled)
     if settings.variant == "m":
         attached, _, _ = attach_learned(mesh, training.gaussians, settings.fixed)
-        _all_steps(Training(capture, region, schedule.on_mesh(1.0), attached, by=by), cancelled)
+        _all_steps(Training(capture, region, schedule.on_mesh(1.0), attached, backend=backend), cancelled)
     if settings.materials:
         quick = replace(settings.decoupling, iterations=_STEPS_OF_MATERIALS, seconds=0.0, pixels=64)
-        decouple(capture, mesh, quick, None, cancelled, by=by)
+        decouple(capture, mesh, quick, None, cancelled, backend=backend)
 
 
 def _all_steps(training: Training, cancelled: Callable[[], bool]) -> None:

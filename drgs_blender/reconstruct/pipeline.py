@@ -21,10 +21,10 @@ from ..deform.binding import bind
 from ..deform.mesh_driven import MeshDriven
 from ..geometry.normals import VertexNormals
 from . import checkpoint
-from .backend import HERE
+from .backend import CPU
 from .capture.capture import Capture, View
 from .capture.training_views import background_of, composed
-from .gpu.devices import learner
+from .gpu.select_backend import select_backend
 from .inverse_rendering.run import Decoupled, decouple
 from .inverse_rendering.settings import Settings as Decoupling
 from .jit_warmup import rehearse
@@ -139,8 +139,8 @@ def reconstruct(
     prepare_kernels(("reconstruct",), lambda phase, part: work.tell(Progress(phase, part)), work.cancelled)
     if settings.minutes is not None:
         work.tell(Progress(PHASE, 0.0))
-        rehearse(settings, have_silhouettes(capture), work.by, work.cancelled)
-    training = Training(capture, region, settings.schedule, seconds=work.seconds(SHARE), by=work.by)
+        rehearse(settings, have_silhouettes(capture), work.backend, work.cancelled)
+    training = Training(capture, region, settings.schedule, seconds=work.seconds(SHARE), backend=work.backend)
     free = work.learn("surfels", training, 0.0, 0.5)
     work.tell(Progress("mesh", 0.5, len(free)))
     report: dict[str, Any] = {"views": len(capture.training), "left_out": len(capture.testing)}
@@ -197,7 +197,7 @@ class _Work:
         folder: Path | None,
     ) -> None:  # fmt: skip
         self.capture, self.settings, self.tell, self.cancelled, self.folder = capture, settings, tell, cancelled, folder
-        self.by = learner(settings.device)
+        self.backend = select_backend(settings.device)
         if folder is not None:
             try:
                 folder.mkdir(parents=True, exist_ok=True)
@@ -247,7 +247,7 @@ class _Work:
                     Progress(phase, begin + (end - begin) * reached, len(training.gaussians), training.psnr, picture)
                 )
                 told, shown = now, now if draw else shown
-        return training.attempt(lambda: training.gaussians.on(HERE))
+        return training.attempt(lambda: training.gaussians.on(CPU))
 
 
 def _on_mesh(
@@ -257,7 +257,7 @@ def _on_mesh(
     settings = work.settings
     attached, binding, report["attach"] = attach_learned(mesh, free, settings.fixed)
     training = Training(
-        work.capture, region, settings.schedule.on_mesh(ON_MESH), attached, work.seconds(SHARE_ON_MESH), work.by
+        work.capture, region, settings.schedule.on_mesh(ON_MESH), attached, work.seconds(SHARE_ON_MESH), work.backend
     )
     final = work.learn("surfels on the mesh", training, 0.55, 0.7)
     return final, bound(binding, final)  # type: ignore[arg-type]
@@ -272,7 +272,7 @@ def _decoupled(work: _Work, mesh: Mesh, surfels: Gaussians, thin: bool, report: 
         lambda at: work.tell(Progress("materials", 0.7 + 0.3 * at.part, len(surfels), at.psnr)),
         work.cancelled,
         work.file("materials"),
-        work.by,
+        work.backend,
         normals_of(surfels) if thin else None,
     )
     done, of = found.report["iterations"], work.settings.decoupling.iterations
@@ -308,7 +308,7 @@ def _rows(binding: Binding, keep: Array) -> Binding:
 def _drawn(gaussians: Gaussians, view: View, capture: Capture) -> Array:
     """(h, w, 3) sRGB in 0..1."""
     with torch.no_grad():
-        background = torch.tensor(background_of(capture), dtype=torch.float32, device=gaussians.by.place)
+        background = torch.tensor(background_of(capture), dtype=torch.float32, device=gaussians.backend.device)
         look = gaussians.look(view.camera, background)
     return np.clip(look.colour.numpy(force=True), 0, 1)
 

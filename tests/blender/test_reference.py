@@ -51,16 +51,16 @@ def test_every_argument_of_an_operator_is_listed(pages):
 
 def test_every_property_of_every_group_is_listed(pages):
     listed = sections(pages["properties.md"])
-    matter, properties = part("addon.matter.properties"), part("addon.properties")
+    physics, properties = part("addon.physics_settings"), part("addon.properties")
     groups = {
         "scene.drgs": properties.DrgsSceneSettings,
         "scene.drgs.submit": part("addon.submit").DrgsSubmitSettings,
         "view_layer.drgs": properties.DrgsViewLayerSettings,
         "object.drgs": properties.DrgsObjectSettings,
         "object.drgs.adjustment": part("addon.adjustment").DrgsAdjustment,
-        "object.drgs.matter": matter.DrgsMatterSettings,
-        "object.drgs.matter.regions[i]": matter.DrgsMatterRegion,
-        "object.drgs.matter.colliders[i]": matter.DrgsMatterCollider,
+        "object.drgs.physics": physics.DrgsPhysicsSettings,
+        "object.drgs.physics.regions[i]": physics.DrgsPhysicsRegion,
+        "object.drgs.physics.colliders[i]": physics.DrgsPhysicsCollider,
         f'preferences.addons["{PACKAGE}"].preferences': part("addon.preferences").DrgsPreferences,
     }
     assert set(listed) == set(groups)

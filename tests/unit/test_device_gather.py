@@ -16,9 +16,9 @@ from test_decouple import sky  # noqa: E402
 
 from drgs_blender.core.asset.model import Mesh  # noqa: E402
 from drgs_blender.core.errors import DeviceError  # noqa: E402
-from drgs_blender.reconstruct.backend import HERE, Processor  # noqa: E402
+from drgs_blender.reconstruct.backend import CPU, LearningBackend  # noqa: E402
 from drgs_blender.reconstruct.gpu.gather import GATHER  # noqa: E402
-from drgs_blender.reconstruct.gpu.on_device import OnDevice  # noqa: E402
+from drgs_blender.reconstruct.gpu.warp_backend import WarpLearningBackend  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.estimator import Gatherer, Points  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.run import decouple  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.settings import Settings  # noqa: E402
@@ -28,8 +28,8 @@ POINTS = 300
 
 
 @pytest.fixture
-def there() -> OnDevice:
-    return OnDevice("cpu")
+def there() -> WarpLearningBackend:
+    return WarpLearningBackend("cpu")
 
 
 def two_balls(places: Any = (((0, 0, 0), 1), ((2.2, 0, 0), 1))) -> Mesh:
@@ -40,7 +40,7 @@ def two_balls(places: Any = (((0, 0, 0), 1), ((2.2, 0, 0), 1))) -> Mesh:
     return Mesh(vertices, faces, np.full((n, 3), 0.5), np.full(n, 0.5), np.zeros(n))
 
 
-def gatherer(by: Processor, shadows: bool = True, indirect: bool = True, normals: bool = True) -> Gatherer:
+def gatherer(by: LearningBackend, shadows: bool = True, indirect: bool = True, normals: bool = True) -> Gatherer:
     mesh, tree = two_balls(), TriangleBVH()
     tree.build(mesh.vertices, mesh.faces if shadows else mesh.faces[:0])
     cache = np.random.default_rng(2).uniform(0.1, 1, (len(mesh.vertices), 4, 3)).astype(np.float32)
@@ -65,9 +65,9 @@ def gathered(found: Gatherer) -> list[Any]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("settings", [{}, {"shadows": False}, {"indirect": False}])
-def test_what_arrives_and_its_derivatives(there: OnDevice, settings: dict[str, bool]) -> None:
+def test_what_arrives_and_its_derivatives(there: WarpLearningBackend, settings: dict[str, bool]) -> None:
     device = gatherer(there, **settings)
-    here, other = gathered(gatherer(HERE, **settings)), gathered(device)
+    here, other = gathered(gatherer(CPU, **settings)), gathered(device)
     assert not device.failed
     sums, same = here[0], (here[0] - other[0]).abs().amax((1, 2, 3)) <= 1e-4 * here[0].abs().amax((1, 2, 3))
     assert sums.abs().max() > 0
@@ -78,7 +78,7 @@ def test_what_arrives_and_its_derivatives(there: OnDevice, settings: dict[str, b
     assert (other[3] - here[3]).norm() < 1e-3 * here[3].norm()
 
 
-def test_a_device_with_memory_of_its_own(there: OnDevice) -> None:
+def test_a_device_with_memory_of_its_own(there: WarpLearningBackend) -> None:
     expected = gathered(gatherer(there))
     there.launcher.apart = True
     assert all(torch.equal(a, b) for a, b in zip(expected, gathered(gatherer(there)), strict=True))
@@ -86,18 +86,18 @@ def test_a_device_with_memory_of_its_own(there: OnDevice) -> None:
 
 def test_shadows_and_light_from_the_mesh_count() -> None:
     """What the comparisons above would not see if nothing was met."""
-    whole, alone, dark = (gathered(gatherer(HERE, **s))[0] for s in ({}, {"shadows": False}, {"indirect": False}))
+    whole, alone, dark = (gathered(gatherer(CPU, **s))[0] for s in ({}, {"shadows": False}, {"indirect": False}))
     assert (whole - alone).norm() > 0.02 * whole.norm()
     assert (whole - dark).norm() > 0.02 * whole.norm()
 
 
 def test_a_device_that_fails_is_a_warning(
-    there: OnDevice, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    there: WarpLearningBackend, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def fail(*_: Any) -> None:
         raise DeviceError("device cuda", "out of memory")
 
-    device, here = gatherer(there), gathered(gatherer(HERE))
+    device, here = gatherer(there), gathered(gatherer(CPU))
     monkeypatch.setattr(there.launcher, "launch", fail)
     for _ in range(2):
         assert all(torch.equal(a, b) for a, b in zip(gathered(device), here, strict=True))
@@ -106,13 +106,13 @@ def test_a_device_that_fails_is_a_warning(
 
 
 def test_materials_and_light_are_those_that_the_processor_finds(
-    there: OnDevice, monkeypatch: pytest.MonkeyPatch
+    there: WarpLearningBackend, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     capture, mesh, asked = balls(count=8, size=32), two_balls(BALLS), []
     launch = there.launcher.launch
     monkeypatch.setattr(there.launcher, "launch", lambda work, *rest: asked.append(work) or launch(work, *rest))
     settings = Settings(iterations=40, pixels=128, cosine=4, ggx=4, light=4, environment=8, normals=True)
-    here, other = (decouple(capture, mesh, settings, by=by) for by in (HERE, there))
+    here, other = (decouple(capture, mesh, settings, backend=by) for by in (CPU, there))
     assert asked == [GATHER] * 40
     for name in ("albedo", "roughness", "environment"):
         a, b = getattr(here, name), getattr(other, name)

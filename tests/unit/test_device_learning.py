@@ -18,12 +18,12 @@ from test_reconstruct_attributes import EYE, surfels  # noqa: E402
 from drgs_blender.compute.warp.kernels import Work  # noqa: E402
 from drgs_blender.compute.warp.runtime import parts_of  # noqa: E402
 from drgs_blender.core.errors import DeviceError  # noqa: E402
-from drgs_blender.reconstruct.backend import HERE, Processor  # noqa: E402
+from drgs_blender.reconstruct.backend import CPU, LearningBackend  # noqa: E402
 from drgs_blender.reconstruct.capture.capture import Capture  # noqa: E402
 from drgs_blender.reconstruct.capture.training_views import Target  # noqa: E402
 from drgs_blender.reconstruct.gpu import devices, kernels, look, losses  # noqa: E402
 from drgs_blender.reconstruct.gpu import raster as device_raster  # noqa: E402
-from drgs_blender.reconstruct.gpu.on_device import DESCEND, OnDevice  # noqa: E402
+from drgs_blender.reconstruct.gpu.warp_backend import DESCEND, WarpLearningBackend  # noqa: E402
 from drgs_blender.reconstruct.losses.photometric import Photograph  # noqa: E402
 from drgs_blender.reconstruct.meshing.visual_hull import Region, find_region  # noqa: E402
 from drgs_blender.reconstruct.model.gaussians import Gaussians  # noqa: E402
@@ -36,18 +36,18 @@ HEIGHT, WIDTH = 23, 31
 
 
 @pytest.fixture(scope="module")
-def there() -> OnDevice:
-    return OnDevice("cpu")
+def there() -> WarpLearningBackend:
+    return WarpLearningBackend("cpu")
 
 
 def random(*shape: int, seed: int = 0, low: float = 0.0, high: float = 1.0) -> Any:
     return torch.tensor(np.random.default_rng([seed, *shape]).uniform(low, high, shape), dtype=torch.float32)
 
 
-def hold_alike(work: Callable[..., Any], inputs: list[Any], there: OnDevice, close: float = 1e-5) -> None:
+def hold_alike(work: Callable[..., Any], inputs: list[Any], there: WarpLearningBackend, close: float = 1e-5) -> None:
     """`work(processor, *inputs)` has the same values and gradients of all inputs on both processors."""
     results = []
-    for by in (HERE, there):
+    for by in (CPU, there):
         given = [value.clone().requires_grad_() for value in inputs]
         found = work(by, *given)
         found = found if isinstance(found, tuple) else (found,)
@@ -59,7 +59,7 @@ def hold_alike(work: Callable[..., Any], inputs: list[Any], there: OnDevice, clo
 
 
 @pytest.mark.parametrize(("bands", "mirrors"), [(0, True), (2, True), (1, False)])
-def test_attributes(there: OnDevice, bands: int, mirrors: bool) -> None:
+def test_attributes(there: WarpLearningBackend, bands: int, mirrors: bool) -> None:
     raw, centre = surfels()
     names = list(raw)
     hold_alike(
@@ -68,7 +68,7 @@ def test_attributes(there: OnDevice, bands: int, mirrors: bool) -> None:
     )  # fmt: skip
 
 
-def test_what_is_mirrored(there: OnDevice) -> None:
+def test_what_is_mirrored(there: WarpLearningBackend) -> None:
     """Pixels hardly covered among them, and one without a normal."""
     features, alpha = random(HEIGHT, WIDTH, 10, low=-1), random(HEIGHT, WIDTH, seed=1)
     features[..., 6:] = 0.9 * alpha[..., None] * features[..., 6:].abs()
@@ -92,7 +92,7 @@ def test_gradients_of_shared_texels_do_not_depend_on_the_order() -> None:
     torch.testing.assert_close(found[0].double(), exact, rtol=1e-6, atol=1e-6)
 
 
-def test_difference_from_a_photograph(there: OnDevice) -> None:
+def test_difference_from_a_photograph(there: WarpLearningBackend) -> None:
     """Saturated in part, where brighter is as good."""
     colour = random(HEIGHT, WIDTH, 3)
     colour[5:9] = 1.0
@@ -102,7 +102,7 @@ def test_difference_from_a_photograph(there: OnDevice) -> None:
 
 
 @pytest.mark.parametrize("weights", [(0.1, 0.0, 0.0), (0.0, 0.7, 0.0), (0.0, 0.0, 0.25)])
-def test_losses_of_the_shape(there: OnDevice, weights: tuple[float, float, float]) -> None:
+def test_losses_of_the_shape(there: WarpLearningBackend, weights: tuple[float, float, float]) -> None:
     alpha = random(HEIGHT, WIDTH, low=0.2)
     alpha[:4, :5] = 0
     maps = [alpha, alpha * (3 + 0.3 * random(HEIGHT, WIDTH, seed=1)), random(HEIGHT, WIDTH, seed=2)]
@@ -112,10 +112,10 @@ def test_losses_of_the_shape(there: OnDevice, weights: tuple[float, float, float
     hold_alike(work, [*maps, normal], there)
 
 
-def test_a_step_down(there: OnDevice) -> None:
+def test_a_step_down(there: WarpLearningBackend) -> None:
     """To the last bit; gradients that are no numbers change nothing."""
     found = []
-    for by in (HERE, there):
+    for by in (CPU, there):
         value, first, second = random(50, 6), random(50, 6, seed=1), random(50, 6, seed=2)
         gradient = random(50, 6, seed=3, low=-1)
         gradient[3, 2] = float("nan")
@@ -140,8 +140,8 @@ def region(capture: Capture) -> Region:
     return find_region(capture)
 
 
-def learned(capture: Capture, region: Region, by: Processor, steps: int) -> Training:
-    training = Training(capture, region, SCHEDULE, by=by)
+def learned(capture: Capture, region: Region, by: LearningBackend, steps: int) -> Training:
+    training = Training(capture, region, SCHEDULE, backend=by)
     for _ in range(steps):
         training.step()
     return training
@@ -155,22 +155,24 @@ def alike(a: Training, b: Training) -> float:
     return max(float(np.linalg.norm(found[n] - other[n]) / max(np.linalg.norm(found[n]), 1e-9)) for n in names)
 
 
-def test_first_steps_are_the_processors(capture: Capture, region: Region, there: OnDevice) -> None:
-    assert alike(learned(capture, region, HERE, 3), learned(capture, region, there, 3)) < 1e-5
+def test_first_steps_are_the_processors(capture: Capture, region: Region, there: WarpLearningBackend) -> None:
+    assert alike(learned(capture, region, CPU, 3), learned(capture, region, there, 3)) < 1e-5
 
 
-def test_a_device_learns_as_well_as_the_processor(capture: Capture, region: Region, there: OnDevice) -> None:
+def test_a_device_learns_as_well_as_the_processor(capture: Capture, region: Region, there: WarpLearningBackend) -> None:
     """All of the schedule: surfels cut, mirrors, shape. What begins as last digits grows, but leads no other way."""
-    here, other = (learned(capture, region, by, SCHEDULE.iterations) for by in (HERE, there))
+    here, other = (learned(capture, region, by, SCHEDULE.iterations) for by in (CPU, there))
     assert here.growth.rounds == other.growth.rounds == SCHEDULE.rounds
     assert here.psnr > 20
     assert abs(here.psnr - other.psnr) < 0.1
     assert not other.fallback.failed
-    assert other.gaussians.by is there
+    assert other.gaussians.backend is there
 
 
-def test_a_state_of_one_processor_is_of_use_to_the_other(capture: Capture, region: Region, there: OnDevice) -> None:
-    for one, other in ((HERE, there), (there, HERE)):
+def test_a_state_of_one_processor_is_of_use_to_the_other(
+    capture: Capture, region: Region, there: WarpLearningBackend
+) -> None:
+    for one, other in ((CPU, there), (there, CPU)):
         begun = learned(capture, region, one, 20)
         going_on = Training(capture, region, SCHEDULE, by=other)
         going_on.restore(begun.arrays())
@@ -187,7 +189,7 @@ def test_a_device_that_fails_is_a_warning_and_the_processor_goes_on(
     caplog: pytest.LogCaptureFixture,
 ) -> None:  # fmt: skip
     """From where it failed: nothing is lost."""
-    there = OnDevice("cpu")
+    there = WarpLearningBackend("cpu")
     training = learned(capture, region, there, 10)
     expected = Training(capture, region, SCHEDULE)
     expected.restore(training.arrays())
@@ -198,13 +200,13 @@ def test_a_device_that_fails_is_a_warning_and_the_processor_goes_on(
     (said,) = caplog.messages
     assert str(error) in said and "on the CPU from step 10 on" in said
     assert training.iteration == 20
-    assert training.fallback.by is HERE
+    assert training.fallback.backend is CPU
     assert training.fallback.failed == str(error)
 
     assert alike(expected, training) == 0
 
 
-def fail_at(work: Work, there: OnDevice, error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
+def fail_at(work: Work, there: WarpLearningBackend, error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
     """Have the device fail at some work from now on."""
     launch = there.launcher.launch
 
@@ -219,13 +221,13 @@ def fail_at(work: Work, there: OnDevice, error: Exception, monkeypatch: pytest.M
 def test_a_step_that_fails_half_done_is_done_again(
     capture: Capture, region: Region, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    there = OnDevice("cpu")
+    there = WarpLearningBackend("cpu")
     training = learned(capture, region, there, 10)
     fail_at(DESCEND, there, RuntimeError("CUDA error"), monkeypatch)
     training.step()
     learner = training.learner
     assert training.iteration == learner.optimiser.steps == learner.light.steps == 11
-    assert training.fallback.by is HERE
+    assert training.fallback.backend is CPU
 
 
 def broken(*_: Any, **__: Any) -> None:
@@ -234,7 +236,7 @@ def broken(*_: Any, **__: Any) -> None:
 
 def kept(capture: Capture, region: Region) -> tuple[Training, Training]:
     """A training on a device that has kept its state, and one of this processor with the same."""
-    training, here = learned(capture, region, OnDevice("cpu"), 7), Training(capture, region, SCHEDULE)
+    training, here = learned(capture, region, WarpLearningBackend("cpu"), 7), Training(capture, region, SCHEDULE)
     training.fallback.keep()
     here.restore(training.arrays())
     return training, here
@@ -243,7 +245,7 @@ def kept(capture: Capture, region: Region) -> tuple[Training, Training]:
 def step_that_loses_all(training: Training, monkeypatch: pytest.MonkeyPatch) -> None:
     """One at which the device fails, and nothing can be read from it any more."""
     with monkeypatch.context() as patch:
-        patch.setattr(training.fallback.by, "rasterise", broken)
+        patch.setattr(training.fallback.backend, "rasterise", broken)
         patch.setattr(training.learner, "arrays", broken)
         training.step()
 
@@ -256,7 +258,7 @@ def test_a_device_whose_memory_is_lost_goes_back_to_the_last_state_kept(
     training.step()
     step_that_loses_all(training, monkeypatch)
     here.step()
-    assert training.fallback.by is HERE
+    assert training.fallback.backend is CPU
     assert training.iteration == here.iteration == 8
     assert alike(here, training) == 0
 
@@ -264,12 +266,12 @@ def test_a_device_whose_memory_is_lost_goes_back_to_the_last_state_kept(
 def test_a_run_taken_up_on_a_device_goes_back_to_where_it_was_taken_up(
     capture: Capture, region: Region, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    begun = learned(capture, region, HERE, 5)
-    training = Training(capture, region, SCHEDULE, by=OnDevice("cpu"))
+    begun = learned(capture, region, CPU, 5)
+    training = Training(capture, region, SCHEDULE, backend=WarpLearningBackend("cpu"))
     training.restore(begun.arrays())
     step_that_loses_all(training, monkeypatch)
     begun.step()
-    assert training.fallback.by is HERE
+    assert training.fallback.backend is CPU
     assert training.iteration == 6
     assert alike(begun, training) == 0
 
@@ -280,12 +282,12 @@ def test_a_device_that_fails_before_the_first_step_learns_nothing(
     """As one does whose memory was lost in an earlier phase."""
     on = Gaussians.on
 
-    def broken_there(self: Gaussians, by: Processor) -> Gaussians:
-        return on(self, by) if by is HERE else broken()
+    def broken_there(self: Gaussians, by: LearningBackend) -> Gaussians:
+        return on(self, by) if by is CPU else broken()
 
     monkeypatch.setattr(Gaussians, "on", broken_there)
-    training = Training(capture, region, SCHEDULE, by=OnDevice("cpu"))
-    assert training.fallback.by is HERE
+    training = Training(capture, region, SCHEDULE, backend=WarpLearningBackend("cpu"))
+    assert training.fallback.backend is CPU
     assert "illegal memory" in training.fallback.failed
     training.step()
 
@@ -293,18 +295,18 @@ def test_a_device_that_fails_before_the_first_step_learns_nothing(
 def test_a_device_that_fails_between_two_starts_loses_neither(monkeypatch: pytest.MonkeyPatch) -> None:
     """The second begins with its first step, not with the first one's last."""
     capture = balls(count=24, size=40)
-    training = Training(capture, find_region(capture), SCHEDULE, by=OnDevice("cpu"))
+    training = Training(capture, find_region(capture), SCHEDULE, backend=WarpLearningBackend("cpu"))
     rival, on = training.trial.rival, Gaussians.on
     assert rival is not None
     while training.iteration < 11:
         training.step()
 
-    def broken_there(self: Gaussians, by: Processor) -> Gaussians:
-        return on(self, by) if by is HERE else broken()
+    def broken_there(self: Gaussians, by: LearningBackend) -> Gaussians:
+        return on(self, by) if by is CPU else broken()
 
     monkeypatch.setattr(Gaussians, "on", broken_there)
     training.step()
-    assert training.fallback.failed and training.fallback.by is HERE
+    assert training.fallback.failed and training.fallback.backend is CPU
     assert training.trying and training.iteration == training.growth.rounds == 0
     assert len(training.gaussians) == training.growth.start == len(rival)
     while training.trying:
@@ -323,7 +325,7 @@ def test_surfels_half_cut_are_of_no_use(capture: Capture, region: Region, monkey
     training.learner.iteration = here.learner.iteration = 40
     training.densify_when_due()
     here.densify_when_due()
-    assert training.fallback.by is HERE
+    assert training.fallback.backend is CPU
     assert len(training.gaussians) > 1.2 * training.growth.start
     assert training.growth.rounds == here.growth.rounds > 0
     assert alike(here, training) == 0
@@ -336,11 +338,11 @@ def test_without_a_card_the_processor_learns_and_a_warning_says_why(
         raise DeviceError("device cuda", "no NVIDIA card with a driver was found")
 
     monkeypatch.setattr(devices, "name_of", none)
-    assert devices.learner("cuda") is HERE
+    assert devices.learner("cuda") is CPU
     monkeypatch.setattr(devices, "name_of", lambda device: "cuda:0")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert devices.learner("cuda") is HERE
-    assert devices.learner("cpu") is HERE
+    assert devices.learner("cuda") is CPU
+    assert devices.learner("cpu") is CPU
     first, second = caplog.messages
     assert "no NVIDIA card" in first and "PyTorch" in second and "a build of it for CUDA" in second
 
@@ -356,7 +358,7 @@ def test_nothing_of_this_process_meets_what_is_on_a_device(
         assert {tensor.device.type for tensor in tensors} == {"meta"}, work.function.__name__
         asked.append(work)
 
-    there = OnDevice("cpu")
+    there = WarpLearningBackend("cpu")
     there.place = torch.device("meta")
     monkeypatch.setattr(there.launcher, "launch", launch)
     ends = lambda counts: (torch.nn.functional.pad(torch.cumsum(counts, 0), (1, 0)), 1000)  # noqa: E731
@@ -373,14 +375,14 @@ def test_nothing_of_this_process_meets_what_is_on_a_device(
 
 @pytest.mark.slow
 def test_an_asset_is_learned_on_the_device_asked_for(
-    capture: Capture, there: OnDevice, monkeypatch: pytest.MonkeyPatch
+    capture: Capture, there: WarpLearningBackend, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Surfels, mesh, surfels on the mesh: as on this processor, but for what begins as last digits."""
     pytest.importorskip("skimage")
     monkeypatch.setattr(devices, "name_of", lambda device: "cpu")
     used = []
-    rasterise = OnDevice.rasterise
-    monkeypatch.setattr(OnDevice, "rasterise", lambda *a, **k: used.append(1) or rasterise(*a, **k))
+    rasterise = WarpLearningBackend.rasterise
+    monkeypatch.setattr(WarpLearningBackend, "rasterise", lambda *a, **k: used.append(1) or rasterise(*a, **k))
     settings = Settings(variant="m", schedule=SCHEDULE, mesh_resolution=32, materials=False)
     expected, found = (reconstruct(capture, replace(settings, device=device)) for device in ("cpu", "cuda"))
     assert len(used) >= 1.4 * SCHEDULE.iterations

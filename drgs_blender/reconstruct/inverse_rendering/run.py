@@ -20,7 +20,7 @@ from ...core.errors import AssetError, Cancelled, UsageError
 from ...render.reference.brdf import MIN_ALPHA, dot
 from ...render.scene.triangle_bvh import TriangleBVH
 from .. import checkpoint as states
-from ..backend import HERE, Processor
+from ..backend import CPU, LearningBackend
 from ..capture.capture import Capture
 from ..optim.adam import Adam
 from .lighting import Lighting
@@ -80,7 +80,7 @@ def decouple(
     on_progress: Callable[[Progress], None] | None = None,
     cancelled: Callable[[], bool] | None = None,
     checkpoint: Path | None = None,
-    by: Processor = HERE,
+    backend: LearningBackend = CPU,
     normals: Normals | None = None,
     now: Callable[[], float] = time.monotonic,
 ) -> Decoupled:
@@ -94,7 +94,7 @@ def decouple(
     on_progress : called every few steps
     cancelled : asked every step; then a checkpoint is left behind and Cancelled raised
     checkpoint : file to go on from when it lies there and fits, written every few seconds, removed at the end
-    by : who follows rays; the rest is done here
+    backend : who follows rays; the rest is done here
     normals : what else than the mesh tells the normals behind pixels. They count where they are within 60 degrees of
         the face, as for surfels that are rendered; what is learned of normals is added to them
     now : seconds since whenever
@@ -114,7 +114,7 @@ def decouple(
         raise UsageError(str(capture.source), "has no training view", "Leave fewer views out for the test")
     if len(capture.training) < 4:
         log.warning("only %d views: light and materials can hardly be told apart", len(capture.training))
-    job = Job(capture, mesh, settings, checkpoint, by, normals, now)
+    job = Job(capture, mesh, settings, checkpoint, backend, normals, now)
     schedule = job.schedule
     while schedule.going():
         if cancelled is not None and cancelled():
@@ -171,7 +171,7 @@ class Job:
     """
 
     def __init__(
-        self, capture: Capture, mesh: Mesh, settings: Settings, checkpoint: Path | None, by: Processor,
+        self, capture: Capture, mesh: Mesh, settings: Settings, checkpoint: Path | None, backend: LearningBackend,
         normals: Normals | None, now: Callable[[], float],
     ) -> None:  # fmt: skip
         self._mesh, self._settings, self._views = mesh, settings, len(capture.training)
@@ -184,7 +184,7 @@ class Job:
         if not settings.shadows:
             tree = TriangleBVH()
             tree.build(mesh.vertices, mesh.faces[:0])
-        gatherer = by.gatherer(mesh, tree, cache if settings.indirect else None, counts, settings.normals)
+        gatherer = backend.gatherer(mesh, tree, cache if settings.indirect else None, counts, settings.normals)
 
         # Grey light that shows a surface of albedo .4 as bright as the photographs, which has their hue. Colours begin
         # without any detail: light is to explain shading before albedo can.

@@ -17,7 +17,7 @@ from torch import Tensor
 from ...core.asset.model import Binding, Mesh
 from ...deform.attach import attach
 from ...deform.face_frames import Faces
-from ..backend import HERE, Processor
+from ..backend import CPU, LearningBackend
 from .gaussians import Gaussians
 
 #: Surfels are kept this far from 0 and 1 in opacity when they become logits.
@@ -35,9 +35,9 @@ class Attached(Gaussians):
 
     def __init__(
         self, parameters: dict[str, Tensor], base: Tensor, normal: Tensor, edge: Tensor, fixed: tuple[str, ...] = (),
-        light: Tensor | None = None, by: Processor = HERE,
+        light: Tensor | None = None, backend: LearningBackend = CPU,
     ) -> None:  # fmt: skip
-        super().__init__(parameters, light, by)
+        super().__init__(parameters, light, backend)
         self.base, self.normal, self.edge, self.fixed = base, normal, edge, fixed
         for name in fixed:
             parameters[name].requires_grad_(False)
@@ -48,13 +48,13 @@ class Attached(Gaussians):
 
     def like(self, parameters: dict[str, Tensor]) -> Attached:
         """The same faces with other parameters."""
-        return Attached(parameters, self.base, self.normal, self.edge, self.fixed, self.light, self.by)
+        return Attached(parameters, self.base, self.normal, self.edge, self.fixed, self.light, self.backend)
 
-    def on(self, by: Processor) -> Attached:
+    def on(self, backend: LearningBackend) -> Attached:
         """The same surfels where another processor has its tensors."""
-        parameters, light = self._there(by)
-        base, normal, edge = (t.to(by.place) for t in (self.base, self.normal, self.edge))
-        return Attached(parameters, base, normal, edge, self.fixed, light, by)
+        parameters, light = self._there(backend)
+        base, normal, edge = (t.to(backend.device) for t in (self.base, self.normal, self.edge))
+        return Attached(parameters, base, normal, edge, self.fixed, light, backend)
 
 
 def attach_learned(

@@ -14,7 +14,7 @@ from ...core.asset.model import Surfels
 from ...core.color import srgb_to_linear
 from ...core.frame import Camera
 from ...geometry.normals import quaternions
-from ..backend import HERE, Processor
+from ..backend import CPU, LearningBackend
 from ..capture.training_views import pixel_rays
 from .attributes import COEFFICIENTS, COLOUR, NORMAL, frames
 from .raster import Maps, Tally
@@ -52,11 +52,13 @@ class Gaussians:
     Parameters
     ----------
     light : the cube of `reflection`; None: nothing is mirrored
-    by : who shows them, where all their tensors are
+    backend : who shows them, where all their tensors are
     """
 
-    def __init__(self, parameters: dict[str, Tensor], light: Tensor | None = None, by: Processor = HERE) -> None:
-        self.parameters, self.light, self.by = parameters, light, by
+    def __init__(
+        self, parameters: dict[str, Tensor], light: Tensor | None = None, backend: LearningBackend = CPU
+    ) -> None:
+        self.parameters, self.light, self.backend = parameters, light, backend
         if light is not None:
             light.requires_grad_(True)
         for value in parameters.values():
@@ -109,32 +111,32 @@ class Gaussians:
         """Render a view over `background` (3,); `rays` are `training_views.pixel_rays` where they are at hand."""
         mirrors = mirrors and self.light is not None
         centre, eye = self.centres(), np.asarray(camera.matrix_world)[:3, 3]
-        u, v, opacity, features = self.by.attributes(self.parameters, centre, eye, bands, mirrors)
-        maps = self.by.rasterise(centre, u, v, opacity, features, camera, tally)
+        u, v, opacity, features = self.backend.attributes(self.parameters, centre, eye, bands, mirrors)
+        maps = self.backend.rasterise(centre, u, v, opacity, features, camera, tally)
         colour = maps.features[..., COLOUR : COLOUR + 3] + (1 - maps.alpha)[..., None] * background
         if mirrors:
             assert self.light is not None
-            rays = pixel_rays(camera, self.by.place) if rays is None else rays
-            colour = colour + self.by.mirrored(maps.features, maps.alpha, rays, pyramid(self.light))
+            rays = pixel_rays(camera, self.backend.device) if rays is None else rays
+            colour = colour + self.backend.mirrored(maps.features, maps.alpha, rays, pyramid(self.light))
         return Look(colour, maps.features[..., NORMAL : NORMAL + 3], maps)
 
     def take(self, rows: Array) -> Gaussians:
         """The surfels `rows`, in this order, as a set of their own."""
-        index = torch.from_numpy(np.asarray(rows, np.int64)).to(self.by.place)
+        index = torch.from_numpy(np.asarray(rows, np.int64)).to(self.backend.device)
         return self.like({k: v.detach()[index].clone() for k, v in self.parameters.items()})
 
     def like(self, parameters: dict[str, Tensor]) -> Gaussians:
         """Surfels of the same kind with other parameters."""
-        return Gaussians(parameters, self.light, self.by)
+        return Gaussians(parameters, self.light, self.backend)
 
-    def on(self, by: Processor) -> Gaussians:
+    def on(self, backend: LearningBackend) -> Gaussians:
         """The same surfels where another processor has its tensors."""
-        return Gaussians(*self._there(by), by)
+        return Gaussians(*self._there(backend), backend)
 
-    def _there(self, by: Processor) -> tuple[dict[str, Tensor], Tensor | None]:
+    def _there(self, backend: LearningBackend) -> tuple[dict[str, Tensor], Tensor | None]:
         """Parameters and light at a processor's place."""
-        light = None if self.light is None else self.light.detach().to(by.place)
-        return {k: v.detach().to(by.place) for k, v in self.parameters.items()}, light
+        light = None if self.light is None else self.light.detach().to(backend.device)
+        return {k: v.detach().to(backend.device) for k, v in self.parameters.items()}, light
 
     def arrays(self) -> dict[str, Array]:
         """The raw parameters."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from ...core.arrays import Array
 from ...core.errors import DeviceError
-from ..backend import HERE, Processor
+from ..backend import CPU, LearningBackend
 
 log = logging.getLogger(__name__)
 _T = TypeVar("_T")
@@ -28,7 +28,7 @@ class Movable(Protocol):
     def iteration(self) -> int:
         """Steps that are done."""
 
-    def move(self, by: Processor) -> None:
+    def move(self, backend: LearningBackend) -> None:
         """Have `by` do the steps, from the first one."""
 
     def state(self) -> dict[str, Array]:
@@ -49,7 +49,7 @@ class Fallback:
 
     Attributes
     ----------
-    by : Processor
+    backend : LearningBackend
         Who does the steps.
     failed : str
         Why another one than this processor is of no use any more, in words; empty while it is.
@@ -57,16 +57,16 @@ class Fallback:
 
     def __init__(self, learned: Movable, now: Callable[[], float] = time.monotonic) -> None:
         self._learned, self._now = learned, now
-        self.by, self.failed = HERE, ""
+        self.backend, self.failed = CPU, ""
         self._kept: dict[str, Array] = {}
         self._kept_at = 0.0
 
-    def begin(self, by: Processor) -> None:
+    def begin(self, backend: LearningBackend) -> None:
         """Have `by` do the steps from the first one, if it is of use."""
-        self._move(HERE)
-        if by is not HERE:
+        self._move(CPU)
+        if backend is not CPU:
             self.keep()
-            self.attempt(lambda: None if self.failed else self._move(by), whole=False)
+            self.attempt(lambda: None if self.failed else self._move(backend), whole=False)
 
     def attempt(self, work: Callable[[], _T], whole: bool = True) -> _T:
         """Have the processor do some work; where it fails, this one does it, and goes on.
@@ -80,13 +80,13 @@ class Fallback:
         try:
             return work()
         except (DeviceError, RuntimeError) as error:
-            if self.by is HERE:
+            if self.backend is CPU:
                 raise
             self.failed = (str(error).strip() or type(error).__name__).splitlines()[0]
             state = self._kept
             with suppress(DeviceError, RuntimeError):
                 state = self._learned.state() if whole else state
-            self._move(HERE)
+            self._move(CPU)
             self._learned.take_up(state)
             log.warning("%s Learned on the CPU from step %d on", self.failed, self._learned.iteration)
         return work()
@@ -97,7 +97,7 @@ class Fallback:
 
     def keep_if_away(self, every: float = 0.0) -> None:
         """The same, where a device does the work and the last time was `every` seconds ago."""
-        if self.by is not HERE and self._now() >= self._kept_at + every:
+        if self.backend is not CPU and self._now() >= self._kept_at + every:
             self.keep()
 
     def remember(self, state: dict[str, Array]) -> None:
@@ -105,6 +105,6 @@ class Fallback:
         self._kept = {name: np.array(value) for name, value in state.items()}
         self._kept_at = self._now()
 
-    def _move(self, by: Processor) -> None:
-        self.by = by  # before anything that may fail there
-        self._learned.move(by)
+    def _move(self, backend: LearningBackend) -> None:
+        self.backend = backend  # before anything that may fail there
+        self._learned.move(backend)

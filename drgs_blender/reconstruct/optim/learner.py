@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ...core.arrays import Array
-from ..backend import Processor
+from ..backend import LearningBackend
 from ..capture.training_views import Target, pixel_rays
 from ..model.attributes import TINT
 from ..model.densification import densify
@@ -37,7 +37,7 @@ class Learner:
     radius : float
         Of the object, metres.
     background : (3,) float32 tensor, on the processor
-    by : Processor
+    backend : LearningBackend
 
     Attributes
     ----------
@@ -53,14 +53,14 @@ class Learner:
     """
 
     def __init__(
-        self, gaussians: Gaussians, schedule: Schedule, radius: float, background: Tensor, by: Processor
+        self, gaussians: Gaussians, schedule: Schedule, radius: float, background: Tensor, backend: LearningBackend
     ) -> None:
-        self._schedule, self._radius, self._background, self._by = schedule, radius, background, by
-        self.gaussians = gaussians.on(by)
-        self.optimiser = Adam(self.gaussians.parameters, by.descend)
+        self._schedule, self._radius, self._background, self._backend = schedule, radius, background, backend
+        self.gaussians = gaussians.on(backend)
+        self.optimiser = Adam(self.gaussians.parameters, backend.descend)
         light = self.gaussians.light
-        self.light = Adam({} if light is None else {"light": light}, by.descend)
-        self.tally = Tally.of(len(self.gaussians), by.place)
+        self.light = Adam({} if light is None else {"light": light}, backend.descend)
+        self.tally = Tally.of(len(self.gaussians), backend.device)
         self.iteration, self.error = 0, 0.0
 
     def step(self, target: Target, part: float) -> None:
@@ -86,7 +86,7 @@ class Learner:
     def _look(self, target: Target, part: float) -> tuple[Look, Tensor]:
         """The surfels as the view sees them, and its rays."""
         schedule = self._schedule
-        rays = pixel_rays(target.camera, self._by.place)
+        rays = pixel_rays(target.camera, self._backend.device)
         tally = self.tally if part < schedule.densify[1] else None
         mirrors = part >= schedule.mirrors < 1
         bands = min(schedule.bands, int(part * 8))
@@ -107,17 +107,17 @@ class Learner:
             schedule.consistency if shaped else 0.0,
         )
         counts = _importance(maps.features)
-        shape = self._by.shape_loss(
+        shape = self._backend.shape_loss(
             maps.alpha, maps.depth, maps.distortion, look.normal, target.mask, rays, counts, weights
         )
-        return self._by.difference(look.colour, target.photograph) + shape
+        return self._backend.difference(look.colour, target.photograph) + shape
 
     def densify(self, budget: int) -> None:
         """Cut surfels, until there are `budget` at most."""
         self.gaussians, report = densify(
             self.gaussians, self.optimiser, self.tally, budget, 0.5 * self._radius, 1e-3 * self._radius
         )
-        self.tally = Tally.of(len(self.gaussians), self._by.place)
+        self.tally = Tally.of(len(self.gaussians), self._backend.device)
         log.debug("step %d: %d surfels, %s", self.iteration, len(self.gaussians), report)
 
     def error_of(self, views: Iterable[Target]) -> float:
@@ -141,7 +141,7 @@ class Learner:
 
     def restore(self, state: dict[str, Array]) -> None:
         """Take the surfels of another learner, also of another processor, from its `arrays`."""
-        there = lambda name: torch.tensor(state[name], device=self._by.place)  # noqa: E731
+        there = lambda name: torch.tensor(state[name], device=self._backend.device)  # noqa: E731
         part = lambda name: {k.removeprefix(name): there(k) for k in state if k.startswith(name)}  # noqa: E731
         if self.gaussians.light is not None:
             self.gaussians.light = there("light").requires_grad_(True)

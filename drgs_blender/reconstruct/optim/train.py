@@ -15,7 +15,7 @@ from typing import TypeVar
 import numpy as np
 
 from ...core.arrays import Array
-from ..backend import HERE, Processor
+from ..backend import CPU, LearningBackend
 from ..capture.capture import Capture
 from ..capture.training_views import background_of, targets
 from ..meshing.visual_hull import Region
@@ -46,7 +46,7 @@ class Training:
         To go on with; without, both of `initialisation` are tried.
     seconds : float, optional
         Where the steps would take longer, the schedule runs by the clock.
-    by : Processor
+    backend : LearningBackend
         Who does the steps; what it fails at, and all that follows, is done by this processor.
     now : callable
         Seconds since whenever.
@@ -76,7 +76,7 @@ class Training:
         schedule: Schedule,
         gaussians: Gaussians | None = None,
         seconds: float | None = None,
-        by: Processor = HERE,
+        backend: LearningBackend = CPU,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
         self.region, self.targets, self._background = region, targets(capture), background_of(capture)
@@ -87,13 +87,13 @@ class Training:
             if len(capture.training) >= MANY:
                 rival = inside_hull(gaussians, capture, region, schedule.bands, schedule.seed)
         self.clock, self.trial, self.fallback = Clock(seconds, now), Trial(rival), Fallback(self, now)
-        self._begin(gaussians, by)
+        self._begin(gaussians, backend)
 
-    def _begin(self, gaussians: Gaussians, by: Processor) -> None:
+    def _begin(self, gaussians: Gaussians, backend: LearningBackend) -> None:
         """Learn these from the first step on."""
         self._begun, self.growth = gaussians, Growth(self.schedule, len(gaussians))
         self.clock.restart()
-        self.fallback.begin(by)
+        self.fallback.begin(backend)
 
     @property
     def gaussians(self) -> Gaussians:
@@ -160,7 +160,7 @@ class Training:
         error = self.attempt(lambda: self.learner.error_of(self.views.aside()))
         first = self.trial.first
         if first is None:
-            self._begin(self.trial.keep_first(self.attempt(self.state), error), self.fallback.by)
+            self._begin(self.trial.keep_first(self.attempt(self.state), error), self.fallback.backend)
             return
         spent = self.clock.spent + float(first["numbers"][1])
         better = self.trial.decide(error)
@@ -177,10 +177,10 @@ class Training:
         self.trial.restore(state)
         self.take_up(state)
 
-    def move(self, by: Processor) -> None:
+    def move(self, backend: LearningBackend) -> None:
         """Have `by` do the steps, from the first one: see `Fallback`."""
-        self.views = Views(self.targets, self._background, by, self.schedule.seed)
-        self.learner = Learner(self._begun, self.schedule, self.region.radius, self.views.background, by)
+        self.views = Views(self.targets, self._background, backend, self.schedule.seed)
+        self.learner = Learner(self._begun, self.schedule, self.region.radius, self.views.background, backend)
 
     def state(self) -> dict[str, Array]:
         """All of the present start that `take_up` needs."""

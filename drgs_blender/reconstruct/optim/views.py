@@ -7,12 +7,12 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 
-from ..backend import Processor
+from ..backend import LearningBackend
 from ..capture.training_views import Target
 from .starts import is_aside
 
 #: Pixels of all views up to which these stay on a device, 16 bytes each.
-KEPT_THERE = 100_000_000
+KEPT_ON_DEVICE = 100_000_000
 
 
 class Views:
@@ -24,7 +24,7 @@ class Views:
         Training views in full and in half size.
     background : tuple of float
         sRGB colour of `training_views.background_of`.
-    by : Processor
+    backend : LearningBackend
     seed : int
         Of the order of the views.
 
@@ -35,13 +35,13 @@ class Views:
     """
 
     def __init__(
-        self, targets: list[list[Target]], background: tuple[float, float, float], by: Processor, seed: int
+        self, targets: list[list[Target]], background: tuple[float, float, float], backend: LearningBackend, seed: int
     ) -> None:
-        self._by, self._seed = by, seed
-        self.background = torch.tensor(background, dtype=torch.float32, device=by.place)
+        self._backend, self._seed = backend, seed
+        self.background = torch.tensor(background, dtype=torch.float32, device=backend.device)
         pixels = sum(view.camera.width * view.camera.height for views in targets for view in views)
-        few = pixels <= KEPT_THERE
-        self.full, self.half = [[by.bring(view) for view in views] for views in targets] if few else targets
+        few = pixels <= KEPT_ON_DEVICE
+        self.full, self.half = [[backend.bring(view) for view in views] for views in targets] if few else targets
 
     def of_step(self, iteration: int, half: bool, but_aside: bool) -> Target:
         """The view of a step: all in turn, in an order drawn anew each time.
@@ -58,8 +58,8 @@ class Views:
         if but_aside:
             views = [view for k, view in enumerate(views) if not is_aside(k)]
         turn, place = divmod(iteration, len(views))
-        return self._by.bring(views[np.random.default_rng([self._seed, turn]).permutation(len(views))[place]])
+        return self._backend.bring(views[np.random.default_rng([self._seed, turn]).permutation(len(views))[place]])
 
     def aside(self) -> Iterator[Target]:
         """The views that a trial keeps aside, in half size."""
-        return (self._by.bring(view) for k, view in enumerate(self.half) if is_aside(k))
+        return (self._backend.bring(view) for k, view in enumerate(self.half) if is_aside(k))

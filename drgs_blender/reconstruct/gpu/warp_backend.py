@@ -13,7 +13,7 @@ from ...core.arrays import Array
 from ...core.asset.model import Mesh
 from ...core.frame import Camera
 from ...render.scene.triangle_bvh import TriangleBVH
-from ..backend import Processor
+from ..backend import LearningBackend
 from ..capture.training_views import Target
 from ..model.raster import Maps, Tally
 from ..optim.adam import some_rows
@@ -33,7 +33,7 @@ def descend_rows(lane: Any, lanes: Any, room: Any, gradient: Any, rate: Any, out
 DESCEND = Work(descend_rows, (), {})
 
 
-class OnDevice(Processor):
+class WarpLearningBackend(LearningBackend):
     """A device of Warp, on which torch has its tensors.
 
     Parameters
@@ -45,11 +45,11 @@ class OnDevice(Processor):
 
     def __init__(self, device: str) -> None:
         self.launcher = TensorLauncher(device)
-        self.place = self.launcher.place
+        self.device = self.launcher.place
 
     def bring(self, target: Target) -> Target:
-        mask = None if target.mask is None else target.mask.to(self.place)
-        return replace(target, photograph=target.colour.to(self.place), mask=mask)
+        mask = None if target.mask is None else target.mask.to(self.device)
+        return replace(target, photograph=target.colour.to(self.device), mask=mask)
 
     def attributes(
         self, parameters: dict[str, Tensor], centre: Tensor, eye: Array, bands: int, mirrors: bool
@@ -75,7 +75,7 @@ class OnDevice(Processor):
         return losses.shape_loss(alpha, depth, distortion, normal, mask, rays, counts, weights)
 
     def descend(self, value: Tensor, gradient: Tensor, first: Tensor, second: Tensor, rate: Array) -> None:
-        there = torch.from_numpy(rate).to(self.place)
+        there = torch.from_numpy(rate).to(self.device)
         self.launcher.launch(DESCEND, len(value), (gradient, there), (value, first, second))
 
     def gatherer(

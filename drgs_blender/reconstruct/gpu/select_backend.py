@@ -1,4 +1,4 @@
-"""Which processor learns: the one asked for, or this one with a warning that says why."""
+"""The backend that learns: the one that is asked for, or the CPU with a warning that says why."""
 
 from __future__ import annotations
 
@@ -8,23 +8,23 @@ import torch
 
 from ...compute.warp.runtime import name_of
 from ...core.errors import DeviceError
-from ..backend import HERE, Processor
-from .on_device import OnDevice
+from ..backend import CPU, LearningBackend
+from .warp_backend import WarpLearningBackend
 
 log = logging.getLogger(__name__)
 
 
-def learner(device: str) -> Processor:
-    """The processor for a setting, "cpu" or "cuda"; this one, with a warning, where that has none."""
+def select_backend(device: str) -> LearningBackend:
+    """The backend for a setting, "cpu" or "cuda"; the CPU, with a warning, where there is no such device."""
     if device == "cpu":
-        return HERE
+        return CPU
     try:
         name = name_of(device)
         if name.startswith("cuda") and not torch.cuda.is_available():
             raise DeviceError(
                 "device cuda", f"PyTorch {torch.__version__} does not find the card", "Install a build of it for CUDA"
             )
-        return OnDevice(name)
+        return WarpLearningBackend(name)
     except (DeviceError, RuntimeError) as error:
         log.warning("%s Learned on the CPU", error)
-        return HERE
+        return CPU
