@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator
-from itertools import accumulate
+from itertools import accumulate, groupby
 from pathlib import Path
 from typing import Any
 
@@ -227,21 +227,26 @@ class Writer:
 
     def text(self, text: str, scope: Any) -> list[str]:
         """Paragraphs of a docstring as Markdown, line by line; what is indented by four spaces is code."""
-        out, code = [], False
+        lines, code = [], False
         for line in text.strip("\n").split("\n"):
-            blank = not out or not out[-1].strip()
-            code = (line.startswith("    ") and (code or blank)) or (code and not line.strip())
-            out.append(line if code else self.block_start(self.inline(line, scope)))
+            blank = not lines or not lines[-1][1].strip()
+            code = (code or blank) if line.startswith("    ") else code and not line.strip()
+            lines.append((code, line))
+        out: list[str] = []
+        for is_code, run in groupby(lines, key=lambda pair: pair[0]):
+            part = "\n".join(line for _, line in run)  # as one, because a name in backticks may go over two lines
+            found = part if is_code else self.inline(part, scope)
+            out += [line if is_code else self.block_start(line) for line in found.split("\n")]
         return out
 
     @staticmethod
     def block_start(line: str) -> str:
-        """A line that does not begin what Markdown takes for a heading, a comment or a rule."""
-        return re.sub(r"^(\s*)([#%>]|\+{3}|={2,}|-{3,})", r"\1\\\2", line)
+        """A line that begins no heading, comment or rule of Markdown and ends in one colon."""
+        return re.sub(r"^(\s*)([#%>]|\+{3}|={2,}|-{3,})", r"\1\\\2", re.sub(r"::$", ":", line))
 
-    def inline(self, line: str, scope: Any, types: bool = False) -> str:
-        """A line as Markdown; with `types`, names of classes outside of backticks are links, too."""
-        parts = re.split(r"(`+)([^`]+)\1", line)
+    def inline(self, text: str, scope: Any, types: bool = False) -> str:
+        """Text as Markdown; with `types`, names of classes outside of backticks are links, too."""
+        parts = re.split(r"(`+)([^`]+)\1", text)
         out = []
         for index in range(0, len(parts), 3):
             plain = parts[index]

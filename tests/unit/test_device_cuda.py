@@ -71,14 +71,14 @@ def test_learnings_kernels_compile_for_a_card(tmp_path: Path) -> None:
     import test_device_learning
     import test_device_surfels
 
-    from drgs_blender.reconstruct.gpu import gather, kernels, losses, on_device
+    from drgs_blender.reconstruct.gpu import gather, kernels, losses, warp_backend
 
-    device = on_device.WarpRenderBackend("cpu")
+    device = warp_backend.WarpLearningBackend("cpu")
     test_device_surfels.test_every_map_has_a_gradient_of_its_own(device.launcher)
     test_device_learning.test_difference_from_a_photograph(device)
     test_device_learning.test_a_step_down(device)
     test_device_gather.test_what_arrives_and_its_derivatives(device, {})
-    modules = kernels, losses, on_device, gather
+    modules = kernels, losses, warp_backend, gather
     works = {work for module in modules for work in vars(module).values() if isinstance(work, kernels.Work)}
     assert made(tuple(works), device.launcher, tmp_path) == works
 

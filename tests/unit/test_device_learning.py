@@ -21,7 +21,7 @@ from drgs_blender.core.errors import DeviceError  # noqa: E402
 from drgs_blender.reconstruct.backend import CPU, LearningBackend  # noqa: E402
 from drgs_blender.reconstruct.capture.capture import Capture  # noqa: E402
 from drgs_blender.reconstruct.capture.training_views import Target  # noqa: E402
-from drgs_blender.reconstruct.gpu import devices, kernels, look, losses  # noqa: E402
+from drgs_blender.reconstruct.gpu import kernels, look, losses, select_backend  # noqa: E402
 from drgs_blender.reconstruct.gpu import raster as device_raster  # noqa: E402
 from drgs_blender.reconstruct.gpu.warp_backend import DESCEND, WarpLearningBackend  # noqa: E402
 from drgs_blender.reconstruct.losses.photometric import Photograph  # noqa: E402
@@ -174,7 +174,7 @@ def test_a_state_of_one_processor_is_of_use_to_the_other(
 ) -> None:
     for one, other in ((CPU, there), (there, CPU)):
         begun = learned(capture, region, one, 20)
-        going_on = Training(capture, region, SCHEDULE, by=other)
+        going_on = Training(capture, region, SCHEDULE, backend=other)
         going_on.restore(begun.arrays())
         assert going_on.iteration == 20
         assert alike(begun, going_on) == 0
@@ -337,12 +337,12 @@ def test_without_a_card_the_processor_learns_and_a_warning_says_why(
     def none(device: str) -> str:
         raise DeviceError("device cuda", "no NVIDIA card with a driver was found")
 
-    monkeypatch.setattr(devices, "name_of", none)
-    assert devices.learner("cuda") is CPU
-    monkeypatch.setattr(devices, "name_of", lambda device: "cuda:0")
+    monkeypatch.setattr(select_backend, "name_of", none)
+    assert select_backend.select_backend("cuda") is CPU
+    monkeypatch.setattr(select_backend, "name_of", lambda device: "cuda:0")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert devices.learner("cuda") is CPU
-    assert devices.learner("cpu") is CPU
+    assert select_backend.select_backend("cuda") is CPU
+    assert select_backend.select_backend("cpu") is CPU
     first, second = caplog.messages
     assert "no NVIDIA card" in first and "PyTorch" in second and "a build of it for CUDA" in second
 
@@ -359,7 +359,7 @@ def test_nothing_of_this_process_meets_what_is_on_a_device(
         asked.append(work)
 
     there = WarpLearningBackend("cpu")
-    there.place = torch.device("meta")
+    there.device = torch.device("meta")
     monkeypatch.setattr(there.launcher, "launch", launch)
     ends = lambda counts: (torch.nn.functional.pad(torch.cumsum(counts, 0), (1, 0)), 1000)  # noqa: E731
     monkeypatch.setattr(device_raster, "starts", ends)
@@ -379,7 +379,7 @@ def test_an_asset_is_learned_on_the_device_asked_for(
 ) -> None:
     """Surfels, mesh, surfels on the mesh: as on this processor, but for what begins as last digits."""
     pytest.importorskip("skimage")
-    monkeypatch.setattr(devices, "name_of", lambda device: "cpu")
+    monkeypatch.setattr(select_backend, "name_of", lambda device: "cpu")
     used = []
     rasterise = WarpLearningBackend.rasterise
     monkeypatch.setattr(WarpLearningBackend, "rasterise", lambda *a, **k: used.append(1) or rasterise(*a, **k))

@@ -69,7 +69,13 @@ def test_a_package_lists_its_modules(pages: dict[str, str]) -> None:
 def test_a_docstring_is_read_with_types_and_without(tmp_path: Path) -> None:
     text = '''"""Things."""
 class Thing:
-    """One *thing* of a_b_c < d."""
+    """One *thing* of a_b_c < d.
+
+    Of ``the_first
+    the_second``::
+
+        x_1 = `y_1`
+    """
 def make(old, new: int = 3) -> Thing:
     """Make a `Thing`.
 
@@ -92,6 +98,7 @@ def make(old, new: int = 3) -> Thing:
     assert "- **new** : int\\\n  What there will be." in page
     assert "- ValueError\\\n  Nothing fits." in page
     assert r"One *thing* of a\_b\_c \< d." in page
+    assert "Of `the_first\nthe_second`:\n\n    x_1 = `y_1`\n" in page
 
 
 def test_what_begins_with_an_underscore_has_no_place(tmp_path: Path) -> None:

@@ -25,6 +25,8 @@ myst_heading_anchors = 4
 myst_enable_extensions = ["colon_fence"]
 # Blocks of code without a language are commands and formulas, not Python.
 highlight_language = "none"
+# Quotes and dashes stay as they are typed: many are values and options.
+smartquotes = False
 # Names are written in full in the pages; what the reader sees is the last part.
 add_module_names = False
 python_use_unqualified_type_names = True
