@@ -45,7 +45,7 @@ def learning(path: Path, size: int, steps: int, surfels: int, missing: str) -> s
     region, schedule = find_region(capture), Schedule(iterations=steps, surfels=surfels)
 
     def learned(schedule: Schedule, by: LearningBackend) -> Training:
-        training = Training(capture, region, schedule, by=by)
+        training = Training(capture, region, schedule, backend=backend)
         while not training.finished:
             training.step()
         if training.fallback.failed:

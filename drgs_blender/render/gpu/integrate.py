@@ -18,7 +18,7 @@ def _constants(module: ModuleType, name: str, value: Any) -> Any:
     """One ray a batch, one point a block, one lane a packet: a thread needs no more."""
     if name in ("BATCH", "_BLOCK") and module in (integrate, direct):
         return 1
-    if module is wavefront and type(value) is int and name.strip("_").isupper():
+    if module is wavefront and name in wavefront.IN_LANES:
         return value // wavefront.LANES
     return value
 

@@ -43,6 +43,15 @@ _FLOATS = 48 * LANES
 # the normal in the light's tables, the object of the surfels that the ray starts on (or -1)
 N0, N1, N2, KEY, OWNER, CELL, ROW, OWN = (LANES * i for i in range(8))
 _INTS = 8 * LANES
+#: All constants above count in LANES. A device has one lane: there they are divided by it, by this table.
+IN_LANES = (
+    "LANES", "_FLOATS", "_INTS",
+    "OX", "OY", "OZ", "NX", "NY", "NZ", "MX", "MY", "MZ", "GX", "GY", "GZ", "VX", "VY", "VZ",
+    "AR", "AG", "AB", "METALLIC", "A2", "KD",
+    "LX", "LY", "LZ", "LIVE", "QR", "QG", "QB", "SR", "SG", "SB", "PC", "PG",
+    "MU", "MV", "PE", "TR", "TG", "TB", "SHARE", "ER", "EG", "EB", "WC", "WG", "WE", "WL", "SIZE",
+    "N0", "N1", "N2", "KEY", "OWNER", "CELL", "ROW", "OWN",
+)  # fmt: skip
 
 _TINY = F(1e-30)
 
