@@ -19,7 +19,7 @@ from bpy.props import (
 from ..drgs_blender.core.sim_materials import MATERIALS
 
 #: Numbers of every material, and those that some models have besides.
-BASIC = ("young", "poisson", "density")
+BASIC = ("youngs_modulus", "poisson", "density")
 OF_MODEL = {
     "plastic": ("yield_stress", "hardening", "viscosity"),
     "sand": ("friction_angle", "cohesion"),
@@ -74,14 +74,14 @@ class _MaterialNumbers:
         update=_take_preset,
         options=set(),
     )
-    young: FloatProperty(
+    youngs_modulus: FloatProperty(
         name="Young's Modulus (Pa)",
         description="Stiffness, pascals. A hundred times as stiff takes ten times as long",
         min=1.0,
         soft_min=1e3,
         soft_max=1e8,
         max=1e12,
-        default=_FIRST.young,
+        default=_FIRST.youngs_modulus,
         precision=0,
         step=100,
     )

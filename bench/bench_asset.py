@@ -1,6 +1,6 @@
 """Photographs to assets, all stages: views left out, relit, relit and deformed, materials and shape against the truth.
 
-python bench/bench_asset.py --scenes scenes [--objects spot fern] [--minutes 7 | --steps 3000 2500] [--variant m]
+python bench/bench_asset.py --scenes scenes [--objects spot fern] [--time-budget 7 | --steps 3000 2500] [--variant m]
 python bench/bench_asset.py --scenes scenes --objects spot fern --deformed
 python bench/bench_asset.py --scenes scenes --objects spot fern --sheet
 
@@ -46,8 +46,8 @@ COLUMNS = (
 
 def settings_of(options: argparse.Namespace) -> Settings:
     """What the options ask for; steps where they bound the run, so that a busy machine gives the same figures."""
-    if options.minutes:
-        return Settings(minutes=options.minutes, variant=options.variant)
+    if options.time_budget:
+        return Settings(minutes=options.time_budget, variant=options.variant)
     learning, decoupling = options.steps
     base = Settings(schedule=Schedule(iterations=learning), variant=options.variant)
     return replace(base, decoupling=replace(base.decoupling, iterations=decoupling))
@@ -150,7 +150,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", type=Path, required=True)
     parser.add_argument("--objects", nargs="+", default=["spot"])
-    parser.add_argument("--minutes", type=float, help="of all stages; else the steps decide")
+    parser.add_argument("--time-budget", type=float, help="of all stages; else the steps decide")
     parser.add_argument("--steps", type=int, nargs=2, default=(3000, 2500), help="of surfels, of materials and light")
     parser.add_argument("--variant", choices=("p", "m"), default="p", help="m: surfels on the mesh")
     parser.add_argument("--samples", type=int, default=128)
@@ -175,7 +175,7 @@ def main() -> None:
             rows = keep(FOLDER / "rows.json", f"{name}|{seen}", found)
             print(name, camera_sees, *found, flush=True)
     side = max(capture.views[0].colour.shape[:2])
-    bound = f"{options.minutes:g} minutes" if options.minutes else "{} and {} steps".format(*options.steps)
+    bound = f"{options.time_budget:g} minutes" if options.time_budget else "{} and {} steps".format(*options.steps)
     body = (
         f"{bound}, {len(capture.training)} photographs of {side} pixels by Cycles; PSNR in dB over the frame on white, "
         f"and of the foreground; scaled by one factor a channel; means over the other lights. With the true materials: "

@@ -1,8 +1,8 @@
 """Photographs to surfels and mesh: time of the rasteriser, views left out, the mesh against the truth, ablations.
 
 python bench/bench_reconstruct.py --part raster
-python bench/bench_reconstruct.py --part surfels --capture scenes/spot [--minutes 2] [--size 200]
-python bench/bench_reconstruct.py --part photographs --capture lego_400 [--minutes 2] [--size 256]
+python bench/bench_reconstruct.py --part surfels --capture scenes/spot [--time-budget 2] [--size 200]
+python bench/bench_reconstruct.py --part photographs --capture lego_400 [--time-budget 2] [--size 256]
 python bench/bench_reconstruct.py --part ablations --capture scenes/spot [--iterations 800] [--only NAME ...]
 python bench/bench_reconstruct.py --part variants --capture scenes/spot [--iterations 1500]
 
@@ -156,11 +156,11 @@ def surfels(options: argparse.Namespace, part: str = "surfels") -> None:
     capture = read_capture(options.capture, options.size, 8)
     warm(capture)
     schedule = Schedule(iterations=options.iterations or 6000, surfels=options.surfels)
-    training, row = trained(capture, schedule, 60 * options.minutes if options.minutes else None)
+    training, row = trained(capture, schedule, 60 * options.time_budget if options.time_budget else None)
     if (options.capture / "mesh.npz").exists():
         row |= against_truth(training.gaussians, training, capture, options.capture)
     row |= {"views": len(capture.training), "size": capture.views[0].camera.width}
-    row["limit"] = f"{options.minutes:g} min" if options.minutes else f"{schedule.iterations} steps"
+    row["limit"] = f"{options.time_budget:g} min" if options.time_budget else f"{schedule.iterations} steps"
     rows = keep(ROWS / f"{part}.json", f"{options.capture.name}|{row['size']}|{row['limit']}", row)
     names = (
         "size", "views", "limit", "wall", "cpu", "steps", "surfels", "psnr", "psnr_pooled", "ssim", "normal", "depth",
@@ -250,7 +250,7 @@ def main() -> None:
     parser.add_argument("--part", choices=tuple(PARTS), default="raster")
     parser.add_argument("--capture", type=Path)
     parser.add_argument("--size", type=int, default=200)
-    parser.add_argument("--minutes", type=float, default=2.0, help="of stage (i); 0: the steps alone decide")
+    parser.add_argument("--time-budget", type=float, default=2.0, help="of stage (i); 0: the steps alone decide")
     parser.add_argument("--surfels", type=int, default=Schedule().surfels, help="at most")
     parser.add_argument("--iterations", type=int)
     parser.add_argument("--only", nargs="+", choices=tuple(ABLATIONS))

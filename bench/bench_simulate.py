@@ -120,7 +120,7 @@ def against_taichi(options: argparse.Namespace) -> str:
     points = lattice((0.4, 0.3, 0.3), h / 2)
     velocity = np.cross([2.0, -2.0, 4.0], points - points.mean(axis=0)) + 2 * np.sin(9 * points[:, [1, 2, 0]])
     velocity -= velocity.mean(axis=0)
-    solver = solver_of(points, h, young=1e6, velocity=velocity, gravity=(0.1, 0, -0.2))
+    solver = solver_of(points, h, youngs_modulus=1e6, velocity=velocity, gravity=(0.1, 0, -0.2))
     dt, steps = 0.999 * 0.5 * h / float(solver.body.matter.wave_speed.max()), 1500
     _, found = in_taichi(options.taichi, solver, dt, steps, 1, "--double")
     for _ in range(5):
@@ -164,7 +164,7 @@ def jelly(options: argparse.Namespace) -> str:
         for resolution in (12, fine):  # the first one compiles
             settings = {
                 "solver": name,
-                "material": {"name": "jelly", "young": 1e5},
+                "material": {"name": "jelly", "youngs_modulus": 1e5},
                 "floor": 0,
                 "resolution": resolution,
             }

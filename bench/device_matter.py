@@ -35,7 +35,9 @@ def cube(particles: int) -> Solver:
     side = (particles / 8) ** (1 / 3) * H
     points = lattice((side,) * 3, H / 2) + 0.05
     floor = Plane((0, 0, 0), (0, 0, 1))
-    return solver_of(points, H, young=4e5, gravity=(0, 0, -9.81), planes=[floor], low=(-1, -1, -0.5), high=(1.5,) * 3)
+    return solver_of(
+        points, H, youngs_modulus=4e5, gravity=(0, 0, -9.81), planes=[floor], low=(-1, -1, -0.5), high=(1.5,) * 3
+    )
 
 
 def timed(solver: Solver, frames: int) -> tuple[float, float]:

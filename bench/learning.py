@@ -44,7 +44,7 @@ def learning(path: Path, size: int, steps: int, surfels: int, missing: str) -> s
     capture = photographs(path, size)
     region, schedule = find_region(capture), Schedule(iterations=steps, surfels=surfels)
 
-    def learned(schedule: Schedule, by: LearningBackend) -> Training:
+    def learned(schedule: Schedule, backend: LearningBackend) -> Training:
         training = Training(capture, region, schedule, backend=backend)
         while not training.finished:
             training.step()
@@ -52,10 +52,10 @@ def learning(path: Path, size: int, steps: int, surfels: int, missing: str) -> s
             raise DeviceError("device", training.fallback.failed, "")
         return training
 
-    def run(by: LearningBackend, threads: int) -> list[str]:
+    def run(backend: LearningBackend, threads: int) -> list[str]:
         use_threads(threads)
-        learned(replace(schedule, iterations=FIRST), by)
-        training = learned(schedule, by)
+        learned(replace(schedule, iterations=FIRST), backend)
+        training = learned(schedule, backend)
         use_threads(0)
         found = judge(training.gaussians.on(CPU), capture)
         rate = f"{steps / training.clock.spent:.1f}"

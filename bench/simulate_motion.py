@@ -33,7 +33,9 @@ def conservation(options: argparse.Namespace) -> Rows:
 
     points = lattice((0.5, 0.4, 0.3), 0.05)
     turning = np.cross([1.0, -2.0, 4.0], points - points.mean(axis=0)) + 0.3 * np.sin(7 * points[:, [1, 2, 0]])
-    spinning = solver_of(points, 0.1, young=2e4, velocity=turning - turning.mean(axis=0), low=[-1] * 3, high=[1.6] * 3)
+    spinning = solver_of(
+        points, 0.1, youngs_modulus=2e4, velocity=turning - turning.mean(axis=0), low=[-1] * 3, high=[1.6] * 3
+    )
     linear, angular = momenta(spinning)
     size = (spinning.body.volume * 1000 * np.linalg.norm(spinning.state.v, axis=1)).sum()
     while spinning.steps < (300 if options.short else 3000):
@@ -48,7 +50,7 @@ def conservation(options: argparse.Namespace) -> Rows:
     h = 0.0625
     points = lattice((1, 0.5, 0.5), h / 2)
     stretch = 0.5 * np.sin(np.pi * (points[:, 0] - 0.5))
-    solver = solver_of(points, h, young=1e5, velocity=np.stack([stretch, 0 * stretch, 0 * stretch], -1))
+    solver = solver_of(points, h, youngs_modulus=1e5, velocity=np.stack([stretch, 0 * stretch, 0 * stretch], -1))
     begin, step, seen = energy(solver)[0], 0.4 / solver.steps_of(0.4), []
     for _ in range(6):
         solver.advance(0.05)
@@ -61,9 +63,9 @@ def conservation(options: argparse.Namespace) -> Rows:
     return rows
 
 
-def droop(per: int, young: float, gravity: float, frames: int, **more: float) -> float:
+def droop(per: int, youngs_modulus: float, gravity: float, frames: int, **more: float) -> float:
     """Of the tip of a cantilever, metres."""
-    beam = cantilever(per, young=young, gravity=(0, 0, -gravity), **more)
+    beam = cantilever(per, youngs_modulus=youngs_modulus, gravity=(0, 0, -gravity), **more)
     rest = beam.points.copy()
     tip = rest[:, 0] > rest[:, 0].max() - beam.domain.spacing
     for _ in range(frames):
@@ -92,14 +94,17 @@ def beams(options: argparse.Namespace) -> Rows:
     half = (top + 1 + 0.5 * (a - c) / (a - 2 * b + c)) * 0.025
     exact = 3.516 / (2 * np.pi) * np.sqrt(1e6 * 0.125**2 / 12 / 1000) / 0.75**2
     rows.append(["cantilever, first frequency over Euler and Bernoulli's", 0.5 / half / exact, "0.93 to 0.98"])
-    droops = {young: droop(4, young, 2.0, 24 if options.short else 96, damping=6.0) for young in (1e5, 4e5, 1.6e6)}
+    droops = {
+        youngs_modulus: droop(4, youngs_modulus, 2.0, 24 if options.short else 96, damping=6.0)
+        for youngs_modulus in (1e5, 4e5, 1.6e6)
+    }
     values = list(droops.values())
     told = ", ".join(f"{value:.3f}" for value in values)
     ordered = values[0] > values[1] > values[2] > 0
     rows.append(
         ["droop under 2 m/s² for E = 1e5, 4e5, 1.6e6, m", told, f"strictly ordered: {'yes' if ordered else 'no'}"]
     )
-    stiff = droop(4, 1.6e6, 0.2, 24 if options.short else 60, damping=8.0) / timoshenko(200.0, young=1.6e6)
+    stiff = droop(4, 1.6e6, 0.2, 24 if options.short else 60, damping=8.0) / timoshenko(200.0, youngs_modulus=1.6e6)
     rows.append(["stiffest, under 0.2 m/s², over the linear one", stiff, "0.97 to 1.03"])
     return rows
 
@@ -109,9 +114,10 @@ def drops(options: argparse.Namespace) -> Rows:
     rows: Rows = []
     h = 0.1
     points = np.add(lattice((0.6, 0.6, 0.6), h / 2), [0, 0, 0.2])
-    for young in (3e4, 1e5, 5e5):
+    for youngs_modulus in (3e4, 1e5, 5e5):
         solver = solver_of(
-            points, h, young=young, gravity=(0, 0, -9.81), damping=2, planes=[Plane((0, 0, 0), (0, 0, 1))],
+            points, h, youngs_modulus=youngs_modulus, gravity=(0, 0, -9.81), damping=2, planes=[Plane((0, 0, 0), (0,
+                0, 1))],
             low=(-0.8, -0.8, -0.4), high=(1.4, 1.4, 1.4),
         )  # fmt: skip
         lowest = np.inf
@@ -119,9 +125,11 @@ def drops(options: argparse.Namespace) -> Rows:
             solver.advance(FRAME)
             lowest = min(lowest, float(solver.points[:, 2].min()) - h / 4)  # the surface is half a spacing below
         # Its own weight presses this much out of it: a pillar's mean strain times the share that is of volume.
-        pressed = 1000 * 9.81 * 0.3 / young * (1 - 2 * 0.3)
+        pressed = 1000 * 9.81 * 0.3 / youngs_modulus * (1 - 2 * 0.3)
         volume = (np.linalg.det(solver.gradients.astype(float)) * solver.body.volume).sum() / solver.body.volume.sum()
-        rows.append([f"block dropped on the ground, E = {young:g}: penetration, cells", max(0.0, -lowest / h), "0.75"])
+        rows.append(
+            [f"block dropped on the ground, E = {youngs_modulus:g}: penetration, cells", max(0.0, -lowest / h), "0.75"]
+        )
         rows.append(
             ["its volume in the end, with what its weight presses out", float(volume + pressed), "at least 0.96"]
         )
@@ -148,7 +156,7 @@ def followed(options: argparse.Namespace) -> Rows:
     h = 0.05
     points = np.add(lattice((0.6, 0.3, 0.6), h / 2), [0, 0, 0.1])
     floor = [Plane((0, 0, 0), (0, 0, 1))]
-    solver = solver_of(points, h, young=5e4, gravity=(0, 0, -9.81), planes=floor, velocity=(0.5, 0, -1))
+    solver = solver_of(points, h, youngs_modulus=5e4, gravity=(0, 0, -9.81), planes=floor, velocity=(0.5, 0, -1))
     for _ in range(10):
         solver.advance(FRAME)
     out = np.random.default_rng(0).random(len(points)) < 0.05

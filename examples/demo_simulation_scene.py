@@ -110,7 +110,7 @@ def droop(assets: Path) -> None:
     """Two cows, alike but for their stiffness."""
     start(assets / "droop.blend")
     add_ground()
-    for name, x, young in (("soft", -1.35, SOFT), ("firm", 1.35, FIRM)):
+    for name, x, youngs_modulus in (("soft", -1.35, SOFT), ("firm", 1.35, FIRM)):
         cow = import_drgs(assets / "cow.drgs")
         cow.name = name
         stand(cow, 1.8, Vector((x, 0, 0)), math.radians(-60))
@@ -118,7 +118,9 @@ def droop(assets: Path) -> None:
         bpy.context.view_layer.update()
         height = np.array([(cow.matrix_world @ v.co).z for v in cow.data.vertices])
         cow.vertex_groups.new(name="hooves").add(np.flatnonzero(height < 0.12).tolist(), 1.0, "REPLACE")
-        bake(cow, "jelly", young=young, pin_group="hooves", damping=1.5, resolution=32, use_floor=True)
+        bake(
+            cow, "jelly", youngs_modulus=youngs_modulus, pin_group="hooves", damping=1.5, resolution=32, use_floor=True
+        )
     add_turning_world("courtyard.exr")
     add_camera(Vector((0.2, 0, 0.8)), 8.5)
     bpy.ops.wm.save_mainfile()
@@ -136,7 +138,7 @@ def fall(assets: Path) -> None:
         "jelly": {"colour": (0.6, 0.05, 0.08), "roughness": 0.2, "metallic": 0.0},
     }
     for (name, look), x in zip(looks.items(), places):
-        more = {"young": 4e5} if name == "jelly" else {}
+        more = {"youngs_modulus": 4e5} if name == "jelly" else {}
         cat = import_drgs(assets / "cat.drgs")
         cat.name = name
         stand(cat, 2.2, Vector((x, 0, 0.9)), math.radians(-25))

@@ -113,7 +113,7 @@ class DRGS_OT_reconstruct(CommandOperator, bpy.types.Operator):
             )
         out = Path(bpy.path.abspath(self.out or f"//{bpy.path.clean_name(folder.name)}"))
         out = assets.chosen(out.absolute().with_suffix(".drgs"), bool(self.out))
-        arguments = ["reconstruct", str(capture), "--out", str(out), "--minutes", f"{self.minutes:g}"]
+        arguments = ["reconstruct", str(capture), "--out", str(out), "--time-budget", f"{self.minutes:g}"]
         arguments += ["--variant", self.variant, "--axes", self.axes, "--device", context.scene.drgs.device.lower()]
         if self.resolution:
             # Eight is the least that the program takes.

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 EXAMPLES = """examples:
-  drgs reconstruct lego --out lego.drgs --resolution 400 --minutes 10
+  drgs reconstruct lego --out lego.drgs --resolution 400 --time-budget 10
   drgs reconstruct statue/colmap --out statue.drgs --test-every 8 --variant m
 """
 
@@ -61,7 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--voxels", type=whole(16, 1024), metavar="N", help="of the mesh's longest side; default 256")
     parser.add_argument(
-        "--minutes", type=_minutes, metavar="M", help="all stages together, about, once kernels are compiled"
+        "--time-budget", type=_minutes, metavar="M", help="all stages together, about, once kernels are compiled"
     )
     parser.add_argument(
         "--test-every",
@@ -125,7 +125,7 @@ def run(args: argparse.Namespace) -> int:
         variant=args.variant,
         schedule=Schedule(**{name: value for name, value in given.items() if value is not None}),
         mesh_resolution=args.voxels or Settings().mesh_resolution,
-        minutes=args.minutes,
+        minutes=args.time_budget,
         materials=args.materials,
         device=args.device,
     )

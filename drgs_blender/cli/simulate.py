@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 EXAMPLES = """examples:
-  drgs simulate cat.drgs --material jelly --young 1e5 --floor 0 --frames 48 --out bake
+  drgs simulate cat.drgs --material jelly --youngs-modulus 1e5 --floor 0 --frames 48 --out bake
   drgs simulate cat.drgs --settings drop.json --out bake --vertices 'poses/####.npy' --export cat.pc2
   drgs relight cat.drgs --env studio.hdr --camera front.json --cache bake --frames 24 --out 24.png
 """
@@ -37,7 +37,7 @@ EXAMPLES = """examples:
 #: Time steps a frame from which a bake is slower than its settings let expect.
 _MANY_STEPS = 2000
 #: Options that are a number of the material.
-_MATTER = ("young", "poisson", "density")
+_MATTER = ("youngs_modulus", "poisson", "density")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -51,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--material", metavar="NAME", help="jelly, rubber, cloth, metal, clay, foam, sand, snow, water, ..."
     )
-    group.add_argument("--young", type=float, metavar="PA", help="stiffness: Young's modulus")
+    group.add_argument("--youngs-modulus", type=float, metavar="PA", help="stiffness: Young's modulus")
     group.add_argument("--poisson", type=float, metavar="NU", help="Poisson's ratio, below 0.5")
     group.add_argument("--density", type=float, metavar="KG/M3", help="density")
     group.add_argument("--resolution", type=int, metavar="N", help="grid cells along the longest side; default 48")

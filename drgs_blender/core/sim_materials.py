@@ -41,7 +41,7 @@ class Material:
     ----------
     model : "elastic" (neo-Hookean), "corotated" (fixed corotated), "plastic" (Hencky strain, von Mises yield),
         "sand" (Drucker-Prager), "snow" (Stomakhin et al. 2013) or "fluid" (weakly compressible)
-    young, poisson : Pa, and the ratio in [0, 0.5); of a fluid they give the bulk modulus E / (3 (1 - 2 nu))
+    youngs_modulus, poisson : Pa, and the ratio in [0, 0.5); of a fluid they give the bulk modulus E / (3 (1 - 2 nu))
     density : kg / m^3
     yield_stress : Pa, plastic: deviatoric stress at which flow starts
     hardening : plastic: Pa that the yield stress gains per unit of plastic strain (negative softens, down to a tenth);
@@ -55,7 +55,7 @@ class Material:
     name: str
     model: str
     about: str = ""
-    young: float = 1e5
+    youngs_modulus: float = 1e5
     poisson: float = 0.3
     density: float = 1000.0
     yield_stress: float = 0.0
@@ -83,8 +83,8 @@ class Material:
 
     def moduli(self) -> tuple[float, float]:
         """Lame's parameters (lambda, mu), Pa."""
-        mu = self.young / (2 * (1 + self.poisson))
-        return self.young * self.poisson / ((1 + self.poisson) * (1 - 2 * self.poisson)), mu
+        mu = self.youngs_modulus / (2 * (1 + self.poisson))
+        return self.youngs_modulus * self.poisson / ((1 + self.poisson) * (1 - 2 * self.poisson)), mu
 
     def wave_speed(self) -> float:
         """Speed of the fastest elastic wave, m/s."""
@@ -129,7 +129,7 @@ MATERIALS: dict[str, Material] = {row.name: row for row in _ROWS}
 
 #: Setting -> (lowest, highest) value that means anything; the others must only be finite.
 _RANGES = {
-    "young": (1.0, 1e12),
+    "youngs_modulus": (1.0, 1e12),
     "poisson": (0.0, 0.495),
     "density": (1e-2, 1e5),
     "yield_stress": (0.0, 1e12),

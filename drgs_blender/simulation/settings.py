@@ -192,7 +192,7 @@ class _Reader:
         if isinstance(value, str):
             return make_material(value, None, f"{self.subject}, {key}")
         if not isinstance(value, Mapping) or not isinstance(value.get("name"), str):
-            raise self.fail(key, 'a name, or an object such as {"name": "jelly", "young": 1e5}')
+            raise self.fail(key, 'a name, or an object such as {"name": "jelly", "youngs_modulus": 1e5}')
         changes = {k: v for k, v in value.items() if k != "name"}
         return make_material(value["name"], changes, f"{self.subject}, {key}")
 

@@ -92,7 +92,7 @@ def body(ball):
 
     physics = ball.drgs.physics
     physics.use = True
-    physics.young, physics.resolution, physics.frame_end = 2e4, 8, FRAMES
+    physics.youngs_modulus, physics.resolution, physics.frame_end = 2e4, 8, FRAMES
     return ball
 
 

@@ -154,22 +154,22 @@ def test_pins_regions_and_colliders_take_part(body, scene):
     physics.pin_group = "Top"
     bpy.ops.drgs.physics_row(rows="regions")
     physics.regions[0].group, physics.regions[0].material = "stiff", "rubber"
-    physics.regions[0].young = 4e4
+    physics.regions[0].youngs_modulus = 4e4
     table = box_object("Table", (-2, -2, -1.6), (2, 2, -1.1))
     bpy.ops.drgs.physics_row(rows="colliders")
     physics.colliders[0].object = table
-    for frame, x, z, young in ((1, 0.0, 0.0, 2e4), (FRAMES, 0.5, 0.5, 9e4)):
+    for frame, x, z, youngs_modulus in ((1, 0.0, 0.0, 2e4), (FRAMES, 0.5, 0.5, 9e4)):
         for obj, index, value in ((body, 0, x), (table, 2, z)):
             obj.location[index] = value
             obj.keyframe_insert("location", index=index, frame=frame)
-        physics.young = young
-        body.keyframe_insert("drgs.physics.young", frame=frame)
+        physics.youngs_modulus = youngs_modulus
+        body.keyframe_insert("drgs.physics.youngs_modulus", frame=frame)
     scene.frame_set(FRAMES)
-    assert physics.young == 9e4
+    assert physics.youngs_modulus == 9e4
     bpy.ops.drgs.bake_physics()
     data = json.loads((settings_export.folder_of(body) / bake_job.INPUT / scene_export.SETTINGS).read_text())
-    assert data["material"] == {"name": "jelly", "young": 2e4}, "as in the first frame"
-    assert data["regions"] == [{"group": "stiff", "material": {"name": "rubber", "young": 4e4}}]
+    assert data["material"] == {"name": "jelly", "youngs_modulus": 2e4}, "as in the first frame"
+    assert data["regions"] == [{"group": "stiff", "material": {"name": "rubber", "youngs_modulus": 4e4}}]
     assert "motion" in data and "vertices" in data["colliders"][0] and "Table" in data["colliders"][0]["mesh"]
     np.testing.assert_allclose(world(body, 1), sphere()[0], atol=1e-5)
     assert not bake_job.cached(body, scene).changed
@@ -189,7 +189,7 @@ def test_pins_regions_and_colliders_take_part(body, scene):
 def test_force_fields_of_the_scene_act_on_it(body, scene):
     """A wind that turns up carries it along, a vortex of another collection does not, and a magnet is named."""
     physics = body.drgs.physics
-    physics.gravity, physics.fields, physics.resolution, physics.young = 0.0, 0.5, 6, 1e6
+    physics.gravity, physics.fields, physics.resolution, physics.youngs_modulus = 0.0, 0.5, 6, 1e6
     made = {}
     for kind in ("WIND", "VORTEX", "MAGNET"):
         bpy.ops.object.effector_add(type=kind, rotation=(0, np.pi / 2, 0))

@@ -48,7 +48,7 @@ def steps() -> Iterator[float]:
     second.select_set(True)
     for obj in (first, second):
         obj.drgs.physics.use = True
-        obj.drgs.physics.resolution, obj.drgs.physics.young = 12, 2e4
+        obj.drgs.physics.resolution, obj.drgs.physics.youngs_modulus = 12, 2e4
         # It turns where it is: what falls leaves its domain one day, and then the next bake begins.
         obj.drgs.physics.gravity, obj.drgs.physics.spin = 0.0, (0, 0, 1)
     found["range"] = [obj.drgs.physics.frame_end for obj in subjects()]

@@ -52,21 +52,36 @@ def solver_of(
 
 
 def cantilever(
-    per: int, *, length: float = 1.0, height: float = 0.125, young: float = 1e6, offset: float = 0.0, **more: Any
+    per: int,
+    *,
+    length: float = 1.0,
+    height: float = 0.125,
+    youngs_modulus: float = 1e6,
+    offset: float = 0.0,
+    **more: Any,
 ) -> Solver:
     """A beam along x, clamped at x < 0, `per` cells high; the clamp is `offset` cells before a node of the grid."""
     h = height / per
     points = lattice((length + 2 * h, height, height), h / 2) - [2 * h, 0, 0]
     low, high = (-4 * h, -2 * h, -length), (1.2 * length + h, height + 2 * h, height + 0.3 * length)
     domain = Domain.around(np.add(aligned(low, high, h).low, [offset * h, 0, 0]), np.asarray(high), h)
-    return solver_of(points, h, domain=domain, pinned=points[:, 0] < 0, young=young, poisson=0.3, density=1000, **more)
+    return solver_of(
+        points,
+        h,
+        domain=domain,
+        pinned=points[:, 0] < 0,
+        youngs_modulus=youngs_modulus,
+        poisson=0.3,
+        density=1000,
+        **more,
+    )
 
 
-def timoshenko(load: float, *, length: float = 1.0, height: float = 0.125, young: float = 1e6) -> float:
+def timoshenko(load: float, *, length: float = 1.0, height: float = 0.125, youngs_modulus: float = 1e6) -> float:
     """Droop of the tip of a square cantilever under its own weight `load` = density x gravity, metres."""
     weight, area, inertia = load * height**2, height**2, height**4 / 12
-    shear = 10 * 1.3 / (12 + 11 * 0.3) * area * young / 2.6
-    return weight * length**4 / (8 * young * inertia) + weight * length**2 / (2 * shear)
+    shear = 10 * 1.3 / (12 + 11 * 0.3) * area * youngs_modulus / 2.6
+    return weight * length**4 / (8 * youngs_modulus * inertia) + weight * length**2 / (2 * shear)
 
 
 def masses(solver: Solver) -> np.ndarray:

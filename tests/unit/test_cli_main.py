@@ -298,5 +298,5 @@ def test_ctrl_c_while_python_imports_has_its_exit_code_and_no_traceback(moment):
 
 @pytest.mark.parametrize("minutes", ["abc", "0", "-1", "nan", "inf"])
 def test_minutes_that_are_none_are_refused_in_words(minutes: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["reconstruct", "photographs", "--out", "a.drgs", f"--minutes={minutes}"]) == 64
-    assert f"--minutes: {minutes} is not a time above zero" in capsys.readouterr().err
+    assert main(["reconstruct", "photographs", "--out", "a.drgs", f"--time-budget={minutes}"]) == 64
+    assert f"--time-budget: {minutes} is not a time above zero" in capsys.readouterr().err

@@ -45,7 +45,7 @@ def test_a_terminal_shows_a_bar_and_no_lines_for_programs(photographs, tmp_path)
     import pty
 
     ours, theirs = pty.openpty()  # of no size, as many that programs make
-    words = command(photographs, tmp_path / "a.drgs", "--minutes", "0.1")
+    words = command(photographs, tmp_path / "a.drgs", "--time-budget", "0.1")
     process = subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=theirs, stderr=theirs)
     os.close(theirs)
     said = b""

@@ -82,7 +82,7 @@ def test_particles_left_out_of_a_simulation_are_where_the_others_carry_them():
     h = 0.05
     points = np.add(lattice((0.6, 0.3, 0.6), h / 2), [0, 0, 0.1])
     floor = Plane((0, 0, 0), (0, 0, 1))
-    body = solver_of(points, h, young=5e4, gravity=(0, 0, -9.81), planes=[floor], velocity=(0.5, 0, -1))
+    body = solver_of(points, h, youngs_modulus=5e4, gravity=(0, 0, -9.81), planes=[floor], velocity=(0.5, 0, -1))
     for _ in range(10):
         body.advance(1 / 24)
     out = np.random.default_rng(0).random(len(points)) < 0.05

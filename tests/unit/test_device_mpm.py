@@ -170,7 +170,7 @@ def test_a_step_is_the_processors_to_the_last_digits(launcher: Launcher, case: s
 ])  # fmt: skip
 def test_a_frame_in_which_a_body_falls_and_lands(launcher: Launcher, ground: dict[str, Any]) -> None:
     """Hundreds of steps, and particles that cross cells: motion agrees as long as nothing is chaotic."""
-    here, there = (body(along=(0.3, 0, -4.0), young=4e5, **ground) for _ in range(2))
+    here, there = (body(along=(0.3, 0, -4.0), youngs_modulus=4e5, **ground) for _ in range(2))
     rest = here.points.copy()
     on(there, launcher)
     for _ in range(2):
@@ -266,7 +266,7 @@ def test_what_goes_wrong_is_said_as_the_processor_says_it(launcher: Launcher) ->
 
 
 def test_a_caller_may_stop_within_a_frame(launcher: Launcher) -> None:
-    solver = on(body(young=1e6), launcher)
+    solver = on(body(youngs_modulus=1e6), launcher)
     before, asked = solver.state.x.copy(), []
 
     def stop() -> bool:
@@ -299,7 +299,7 @@ def test_a_device_that_fails_within_a_frame_loses_nothing(
     launcher: Launcher, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """That frame and all later ones are the processor's, from the state that the device left."""
-    solver, alike = on(body(young=1e6), launcher), on(body(young=1e6), launcher)
+    solver, alike = on(body(youngs_modulus=1e6), launcher), on(body(youngs_modulus=1e6), launcher)
     for each in (solver, alike):
         each.advance(FRAME)
     failing(launcher, monkeypatch, after=1)
@@ -359,7 +359,7 @@ def test_without_a_card_the_processor_does_all_and_says_so(
     monkeypatch.setattr("drgs_blender.compute.warp.runtime.cuda_devices", list)
     found, expected = tmp_path / "found", tmp_path / "expected"
     asset = str(asset_file(tmp_path))
-    options = ["--resolution", "8", "--frames", "3", "--floor", "0", "--young", "2e4"]
+    options = ["--resolution", "8", "--frames", "3", "--floor", "0", "--youngs-modulus", "2e4"]
     assert main(["simulate", asset, "--out", str(found), "--device", "cuda", *options]) == 0
     said = capsys.readouterr().err
     assert "no NVIDIA card" in said and "Simulated on the CPU" in said

@@ -132,7 +132,7 @@ def test_any_number_of_threads_makes_the_same_cells() -> None:
     many = EnvironmentLight(world)
     for name in ("runs", "guide", "density", "first", "parts"):
         np.testing.assert_array_equal(getattr(one.cells, name), getattr(many.cells, name))
-    np.testing.assert_array_equal(one.facing.starts, many.facing.starts)
+    np.testing.assert_array_equal(one.product.starts, many.product.starts)
 
 
 def test_the_search_of_a_number_starts_at_the_first_cell_of_its_slice() -> None:

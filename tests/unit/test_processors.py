@@ -32,7 +32,7 @@ light, lamps = EnvironmentLight(World(rng.random((64, 128, 3), np.float32))), La
 arrays = {
     "bytes": srgb_to_linear(np.arange(256) / 255), "floats": srgb_to_linear(rng.random(100000)),
     "vertices": world_vertices(rng.random((100000, 3), np.float32), turns[0]), "layer": layer_table(),
-    "edges": light.row_z, "runs": light.cells.runs, "starts": light.facing.starts, "ratio": light.facing.ratio,
+    "edges": light.row_z, "runs": light.cells.runs, "starts": light.product.starts, "ratio": light.product.ratio,
     "lamps": lamps.table, "tree": lamps.pick,
 }
 for name, array in arrays.items():

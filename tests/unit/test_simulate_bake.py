@@ -28,7 +28,7 @@ from drgs_blender.simulation.bake import bake
 from drgs_blender.simulation.job import prepare
 from drgs_blender.simulation.settings import parse_settings
 
-DROP = {"resolution": 8, "floor": 0.0, "material": {"name": "jelly", "young": 2e4}, "last": 6}
+DROP = {"resolution": 8, "floor": 0.0, "material": {"name": "jelly", "youngs_modulus": 2e4}, "last": 6}
 
 
 def block(levels: int = 2) -> Mesh:
@@ -156,7 +156,7 @@ def test_a_cache_that_lost_something_is_baked_anew(tmp_path, whole, damage):
 def test_other_settings_are_not_mixed_in(tmp_path):
     cache = ParticleCache(tmp_path)
     bake(job_of(last=3), cache)
-    stiff = {"material": {"name": "jelly", "young": 4e4}, "last": 2}
+    stiff = {"material": {"name": "jelly", "youngs_modulus": 4e4}, "last": 2}
     with pytest.raises(UsageError, match=r"holds another simulation.*overwrite"):
         bake(job_of(**stiff), cache)
     assert cache.frames() == [1, 2, 3]
@@ -288,7 +288,7 @@ def test_the_surface_lies_on_what_it_falls_on(tmp_path, material):
     ball.apply_translation([0.1, 0, -0.21])
     ball.export(tmp_path / "ball.ply")
     collider = {"mesh": str(tmp_path / "ball.ply"), "friction": 0.0}
-    job = job_of(material={"name": material, "young": 2e4}, colliders=[collider], gravity=[0, 0, -30])
+    job = job_of(material={"name": material, "youngs_modulus": 2e4}, colliders=[collider], gravity=[0, 0, -30])
     sunk, rests = 0.0, 0
     for _ in range(8):
         job.solver.advance(1 / 24)
@@ -303,7 +303,7 @@ def test_the_surface_lies_on_what_it_falls_on(tmp_path, material):
 
 
 def test_vertex_groups_pin_and_differ(tmp_path):
-    regions = [{"group": "left", "material": {"name": "rubber", "young": 3e5, "density": 500}}]
+    regions = [{"group": "left", "material": {"name": "rubber", "youngs_modulus": 3e5, "density": 500}}]
     job = job_of(pins=[{"group": "left"}], regions=regions, floor=None, last=3)
     left = job.filling.points[:, 0] < -0.12
     density = job.solver.body.matter.density
@@ -397,12 +397,24 @@ def test_options_of_the_command_win_over_the_file(tmp_path, capsys):
     (tmp_path / "s.json").write_text(json.dumps(DROP | {"material": "sand"}))
     command = ["simulate", str(asset), "--settings", str(tmp_path / "s.json"), "--out", str(tmp_path / "c")]
     code = main(
-        [*command, "--material", "rubber", "--young", "5e4", "--gravity", "-1,0,-2", "--pin", "left", "--frames", "2"]
+        [
+            *command,
+            "--material",
+            "rubber",
+            "--youngs-modulus",
+            "5e4",
+            "--gravity",
+            "-1,0,-2",
+            "--pin",
+            "left",
+            "--frames",
+            "2",
+        ]
     )
     assert code == 0
     assert "particles (winding number)" in capsys.readouterr().out
     settings = ParticleCache(tmp_path / "c").header().settings
-    assert settings["material"]["name"] == "rubber" and settings["material"]["young"] == 5e4
+    assert settings["material"]["name"] == "rubber" and settings["material"]["youngs_modulus"] == 5e4
     assert settings["gravity"] == [-1, 0, -2] and settings["last"] == 2 and settings["pins"][0]["group"] == "left"
     assert main([*command, "--poisson", "0.6"]) == 64
     assert "poisson: is 0.6" in capsys.readouterr().err

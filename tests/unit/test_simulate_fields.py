@@ -62,7 +62,7 @@ def test_wind_carries_matter_at_its_speed_and_fields_may_move(quick):
 
     def made(*fields):
         forces = Forces(gravity=(0, 0, 0), fields=fields)
-        solver = solver_of(points, 0.1, young=2e5, high=(4, 4, 4), low=(-1, -1, -1))
+        solver = solver_of(points, 0.1, youngs_modulus=2e5, high=(4, 4, 4), low=(-1, -1, -1))
         if quick:
             return Lattice(solver.body, forces, cubes=4)
         return type(solver)(solver.body, solver.domain, forces)

@@ -16,13 +16,13 @@ from drgs_blender.simulation.xpbd import Lattice
 FRAME = 1 / 24
 
 
-def block(material: str = "jelly", young: float = 1e5, **more):
-    return solver_of(lattice((0.4, 0.4, 0.4), 0.05), 0.1, material, young=young, **more).body
+def block(material: str = "jelly", youngs_modulus: float = 1e5, **more):
+    return solver_of(lattice((0.4, 0.4, 0.4), 0.05), 0.1, material, youngs_modulus=youngs_modulus, **more).body
 
 
-@pytest.mark.parametrize("young", [1e4, 1e6, 2e9])
-def test_matter_at_rest_stays(young):
-    body = block(young=young)
+@pytest.mark.parametrize("youngs_modulus", [1e4, 1e6, 2e9])
+def test_matter_at_rest_stays(youngs_modulus):
+    body = block(youngs_modulus=youngs_modulus)
     quick = Lattice(body, Forces(gravity=(0, 0, 0)), cubes=5)
     quick.advance(FRAME)
     assert np.abs(quick.points - body.points).max() < 1e-9
@@ -43,19 +43,21 @@ def test_it_falls_turns_and_keeps_its_momentum():
     assert np.degrees(np.arctan2(gradient[1, 0], gradient[0, 0])) == pytest.approx(np.degrees(3 * t), abs=3)
 
 
-@pytest.mark.parametrize("young", [1e4, 1e6, 2e9])
-def test_no_stiffness_and_no_thin_part_makes_energy(young):
+@pytest.mark.parametrize("youngs_modulus", [1e4, 1e6, 2e9])
+def test_no_stiffness_and_no_thin_part_makes_energy(youngs_modulus):
     """Ribs that fill cubes in part only, shaken: motion may die away, and nothing turns inside out."""
     points = lattice((1.0, 0.6, 0.3), 0.025)
     points = points[(points[:, 2] < 0.1) | (np.abs(points[:, 0] % 0.34 - 0.17) < 0.04)]
     shake = 0.4 * np.sin(9 * points[:, [1, 2, 0]]) + np.cross([0, 2.0, 1.0], points - points.mean(axis=0))
-    quick = Lattice(solver_of(points, 0.05, young=young, velocity=shake).body, Forces(gravity=(0, 0, 0)))
+    quick = Lattice(
+        solver_of(points, 0.05, youngs_modulus=youngs_modulus, velocity=shake).body, Forces(gravity=(0, 0, 0))
+    )
     mass = 1 / quick._inverse_mass[:, None]
     start = (mass * quick.v**2).sum()
     for _ in range(24):
         quick.advance(FRAME)
     assert 0.1 * start < (mass * quick.v**2).sum() < 1.05 * start
-    assert np.linalg.det(quick.gradients.astype(float)).min() > (0.5 if young > 1e5 else 0)
+    assert np.linalg.det(quick.gradients.astype(float)).min() > (0.5 if youngs_modulus > 1e5 else 0)
 
 
 def test_it_is_as_stiff_as_it_should_be():
@@ -63,7 +65,7 @@ def test_it_is_as_stiff_as_it_should_be():
     points = lattice((2.0, 0.4, 0.4), 0.05)
     ends = (points[:, 0] < 0.15) | (points[:, 0] > 1.85)
     for poisson in (0.0, 0.3):
-        body = solver_of(points, 0.1, young=1e5, poisson=poisson, pinned=ends).body
+        body = solver_of(points, 0.1, youngs_modulus=1e5, poisson=poisson, pinned=ends).body
         quick = Lattice(body, Forces(gravity=(0, 0, 0), damping=20.0), cubes=20)
         target = points[ends] * [1.05, 1, 1]
         for _ in range(16):
@@ -77,15 +79,15 @@ def test_it_is_as_stiff_as_it_should_be():
 @pytest.mark.slow
 def test_stiffer_beams_droop_less_and_about_as_much_as_they_should():
     droops = {}
-    for young in (1e5, 4e5, 1.6e6):
-        beam = cantilever(4, young=young)
+    for youngs_modulus in (1e5, 4e5, 1.6e6):
+        beam = cantilever(4, youngs_modulus=youngs_modulus)
         quick = Lattice(beam.body, Forces(gravity=(0, 0, -0.1), damping=4.0), cubes=18)
         tip = beam.body.points[:, 0] > 0.97
         for _ in range(50):
             quick.advance(FRAME)
-        droops[young] = (beam.body.points - quick.points)[tip, 2].mean()
+        droops[youngs_modulus] = (beam.body.points - quick.points)[tip, 2].mean()
     assert droops[1e5] > droops[4e5] > droops[1.6e6] > 0
-    assert 0.4 < droops[1e5] / timoshenko(100.0, young=1e5) < 1.4
+    assert 0.4 < droops[1e5] / timoshenko(100.0, youngs_modulus=1e5) < 1.4
 
 
 @pytest.mark.parametrize("kind", ["plane", "mesh"])

@@ -20,7 +20,7 @@ FRAME = 1 / 24
 
 
 def test_free_fall_is_the_discrete_solution():
-    solver = solver_of(lattice((0.4, 0.4, 0.4), 0.05), 0.1, gravity=(0, 0, -9.81), low=(-1, -1, -3), young=1e5)
+    solver = solver_of(lattice((0.4, 0.4, 0.4), 0.05), 0.1, gravity=(0, 0, -9.81), low=(-1, -1, -3), youngs_modulus=1e5)
     rest = solver.points.copy()
     solver.advance(0.5)
     n = solver.steps
@@ -33,7 +33,9 @@ def spinning_jelly(h: float = 0.1) -> object:
     centre = points.mean(axis=0)
     turning = np.cross([1.0, -2.0, 4.0], points - centre) + 0.3 * np.sin(7 * points[:, [1, 2, 0]])
     turning -= turning.mean(axis=0) - [0.01, 0.02, 0.03]
-    return solver_of(points, h, young=2e4, velocity=turning, low=points.min(axis=0) - 1, high=points.max(axis=0) + 1)
+    return solver_of(
+        points, h, youngs_modulus=2e4, velocity=turning, low=points.min(axis=0) - 1, high=points.max(axis=0) + 1
+    )
 
 
 @pytest.mark.slow
@@ -55,7 +57,9 @@ def test_energy_only_falls_and_slowly():
     h = 0.0625
     points = lattice((1, 0.5, 0.5), h / 2)
     stretch = 0.5 * np.sin(np.pi * (points[:, 0] - 0.5))
-    solver = solver_of(points, h, young=1e5, poisson=0.3, velocity=np.stack([stretch, 0 * stretch, 0 * stretch], -1))
+    solver = solver_of(
+        points, h, youngs_modulus=1e5, poisson=0.3, velocity=np.stack([stretch, 0 * stretch, 0 * stretch], -1)
+    )
     start, step = energy(solver)[0], 0.4 / solver.steps_of(0.4)
     for _ in range(4):
         solver.advance(0.3 / 4)
@@ -75,7 +79,7 @@ def test_another_solver_goes_the_same_way():
     points = lattice((0.3, 0.2, 0.2), h / 2)
     velocity = np.cross([2.0, -2.0, 4.0], points - points.mean(axis=0)) + 2 * np.sin(9 * points[:, [1, 2, 0]])
     solver = solver_of(
-        points, h, young=1e6, velocity=velocity - velocity.mean(axis=0), gravity=(0.1, 0, -0.2),
+        points, h, youngs_modulus=1e6, velocity=velocity - velocity.mean(axis=0), gravity=(0.1, 0, -0.2),
         low=points.min(axis=0) - 0.4, high=points.max(axis=0) + 0.3,
     )  # fmt: skip
     plain = PlainMpm(solver)
@@ -111,8 +115,8 @@ def test_cantilever_droops_as_timoshenko_says():
 @pytest.mark.slow
 def test_softer_beams_droop_more():
     droops = []
-    for young in (1e5, 4e5, 1.6e6):
-        beam = cantilever(4, young=young, gravity=(0, 0, -2.0), damping=6.0)
+    for youngs_modulus in (1e5, 4e5, 1.6e6):
+        beam = cantilever(4, youngs_modulus=youngs_modulus, gravity=(0, 0, -2.0), damping=6.0)
         rest, tip = beam.points.copy(), tip_of(beam)
         for _ in range(24):
             beam.advance(FRAME)
@@ -125,7 +129,7 @@ def test_strain_slower_than_the_digits_of_one_is_not_lost():
     """A bar pulled by 2e-8 of its length a step, which single precision cannot add to 1."""
     points = lattice((0.4, 0.1, 0.1), 0.025)
     held = (points[:, 0] < 0.1) | (points[:, 0] > 0.3)
-    solver = solver_of(points, 0.05, young=1.2e7, damping=20.0, pinned=held)
+    solver = solver_of(points, 0.05, youngs_modulus=1.2e7, damping=20.0, pinned=held)
     pulled = points[held] + [[4e-5, 0, 0]] * (points[held, :1] > 0.3)
     solver.advance(1.0, pulled)
     assert solver.steps > 5000
@@ -158,7 +162,7 @@ def test_a_hanging_bar_stretches_by_half_its_weight():
     solver = solver_of(
         points,
         h,
-        young=1e5,
+        youngs_modulus=1e5,
         poisson=0.0,
         gravity=(0, 0, -0.5),
         damping=20,
@@ -180,8 +184,8 @@ def box(low, high) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("obstacle", ["plane", "mesh", "single face"])
-@pytest.mark.parametrize("young", [3e4, 1e5, 5e5])
-def test_a_dropped_block_neither_sinks_in_nor_shrinks(obstacle, young):
+@pytest.mark.parametrize("youngs_modulus", [3e4, 1e5, 5e5])
+def test_a_dropped_block_neither_sinks_in_nor_shrinks(obstacle, youngs_modulus):
     h = 0.1
     points = np.add(lattice((0.6, 0.6, 0.6), h / 2), [0, 0, 0.2])
     colliders, planes = [], []
@@ -194,7 +198,7 @@ def test_a_dropped_block_neither_sinks_in_nor_shrinks(obstacle, young):
         corners = np.array([[-3, -3, 0], [3, -3, 0], [3, 3, 0], [-3, 3, 0.0]])
         colliders = [Collider("face", np.array([[0, 1, 2], [0, 2, 3]]), corners)]
     solver = solver_of(
-        points, h, young=young, gravity=(0, 0, -9.81), damping=2, colliders=colliders, planes=planes,
+        points, h, youngs_modulus=youngs_modulus, gravity=(0, 0, -9.81), damping=2, colliders=colliders, planes=planes,
         low=(-0.8, -0.8, -0.4), high=(1.4, 1.4, 1.4),
     )  # fmt: skip
     lowest = np.inf
@@ -203,7 +207,7 @@ def test_a_dropped_block_neither_sinks_in_nor_shrinks(obstacle, young):
         lowest = min(lowest, float(solver.points[:, 2].min()))
     assert lowest > -0.75 * h
     volume = (np.linalg.det(solver.gradients.astype(float)) * solver.body.volume).sum()
-    sag = 1000 * 9.81 * 0.3 / young * (1 - 2 * 0.3)  # what its own weight presses out of it
+    sag = 1000 * 9.81 * 0.3 / youngs_modulus * (1 - 2 * 0.3)  # what its own weight presses out of it
     assert volume > (0.96 - sag) * solver.body.volume.sum()
     assert solver.points[:, 2].max() < 0.8 + h
 
@@ -215,7 +219,7 @@ def test_coulomb_friction_on_a_slope(friction):
     points = lattice((0.4, 0.4, 0.2), h / 2)
     gravity = 9.81 * np.array([np.sin(slope), 0, -np.cos(slope)])
     solver = solver_of(
-        points, h, young=1e6, gravity=tuple(gravity), planes=[Plane((0, 0, 0), (0, 0, 1), friction=friction)],
+        points, h, youngs_modulus=1e6, gravity=tuple(gravity), planes=[Plane((0, 0, 0), (0, 0, 1), friction=friction)],
         low=(-0.2, -0.2, -0.2), high=(2.5, 0.6, 0.6),
     )  # fmt: skip
     solver.advance(0.1)  # settles
@@ -235,7 +239,14 @@ def test_a_lift_carries_what_is_on_it_and_a_turntable_turns_it():
     path = np.stack([vertices @ r.T + [0, 0, f * FRAME * 0.5] for f, r in zip(frames, turn)])
     lift = Collider("lift", faces, path, contact="sticky")
     solver = solver_of(
-        points, h, young=2e5, gravity=(0, 0, -9.81), colliders=[lift], low=(-1, -1, -0.6), high=(1, 1, 1.2), damping=1.0
+        points,
+        h,
+        youngs_modulus=2e5,
+        gravity=(0, 0, -9.81),
+        colliders=[lift],
+        low=(-1, -1, -0.6),
+        high=(1, 1, 1.2),
+        damping=1.0,
     )
     for _ in range(12):
         solver.advance(FRAME)
@@ -257,7 +268,7 @@ def test_a_collider_that_deforms_pushes():
     bulge = np.exp(-4 * (u**2 + v**2))
     path = np.stack([np.stack([u, v, bulge * 0.04 * f], -1).reshape(-1, 3) for f in range(11)])
     solver = solver_of(
-        points, h, young=2e5, gravity=(0, 0, -9.81), damping=2, colliders=[Collider("sheet", faces, path)],
+        points, h, youngs_modulus=2e5, gravity=(0, 0, -9.81), damping=2, colliders=[Collider("sheet", faces, path)],
         low=(-1, -1, -0.4), high=(1, 1, 1.2),
     )  # fmt: skip
     for _ in range(10):
@@ -270,7 +281,7 @@ def test_pins_follow_their_targets_and_pull_the_rest():
     h = 0.1
     points = lattice((0.8, 0.3, 0.3), h / 2)
     pinned = points[:, 0] < 0.2
-    solver = solver_of(points, h, young=1e5, damping=5, pinned=pinned, low=(-0.5, -0.5, -0.5), high=(3, 1, 1))
+    solver = solver_of(points, h, youngs_modulus=1e5, damping=5, pinned=pinned, low=(-0.5, -0.5, -0.5), high=(3, 1, 1))
     for k in range(1, 25):
         solver.advance(FRAME, points[pinned] + [0.02 * k, 0, 0])
     assert np.abs(solver.points[pinned] - points[pinned] - [0.48, 0, 0]).max() < 1e-6
@@ -296,7 +307,8 @@ def test_sand_holds_a_slope_below_its_angle_of_friction_only():
     slopes = {}
     for angle in (45.0, 12.0):
         solver = solver_of(
-            points, h, "sand", gravity=(0, 0, -9.81), young=1e5, planes=[Plane((0, 0, 0), (0, 0, 1), friction=1.0)],
+            points, h, "sand", gravity=(0, 0, -9.81), youngs_modulus=1e5, planes=[Plane((0, 0, 0), (0, 0, 1),
+                friction=1.0)],
             low=(-1.5, -1.5, -0.3), high=(1.5, 1.5, 1), friction_angle=angle,
         )  # fmt: skip
         for _ in range(24):
@@ -346,7 +358,7 @@ def test_metal_stays_bent_and_jelly_does_not():
     for name in ("metal", "jelly"):
         solver = solver_of(
             points, h, name, planes=[Plane((0, 0, 0), (0, 0, 1), "separate", 0.0)], colliders=[plate], damping=3.0,
-            young=1e5, **({"yield_stress": 3e3, "hardening": 0.0} if name == "metal" else {}),
+            youngs_modulus=1e5, **({"yield_stress": 3e3, "hardening": 0.0} if name == "metal" else {}),
         )  # fmt: skip
         for _ in range(len(down) - 1):
             solver.advance(FRAME)
@@ -364,7 +376,7 @@ def test_a_bar_of_metal_bears_its_weight_or_is_upset_until_it_does(strength, pla
     """Density x gravity x height is 1e4 Pa; below z the bar flows by (that of what is above - Y) / H."""
     h, weight = 0.125, 1e4
     points = lattice((0.25, 0.25, 1.0), h / 2)
-    numbers = {"young": 1e6, "poisson": 0.0, "density": weight / 9.81, "hardening": 1e5}
+    numbers = {"youngs_modulus": 1e6, "poisson": 0.0, "density": weight / 9.81, "hardening": 1e5}
     solver = solver_of(
         points, h, "metal", gravity=(0, 0, -9.81), damping=150.0, yield_stress=strength * weight,
         planes=[Plane((0, 0, 0), (0, 0, 1), "slip")], **numbers,
@@ -524,7 +536,9 @@ def test_a_collider_faster_than_the_grid_shortens_the_step():
     points = lattice((0.4, 0.4, 0.4), h / 2)
     vertices, faces = box((-0.5, -0.2, -0.2), (-0.2, 0.6, 0.6))
     path = np.stack([vertices, np.add(vertices, [2.0, 0, 0])])  # 20 cells in a frame
-    solver = solver_of(points, h, young=1e3, density=1000, colliders=[Collider("bat", faces, path)], high=(8, 1.5, 1.5))
+    solver = solver_of(
+        points, h, youngs_modulus=1e3, density=1000, colliders=[Collider("bat", faces, path)], high=(8, 1.5, 1.5)
+    )
     solver.advance(FRAME)
     assert solver.steps >= 2.0 / (0.5 * h)
     assert solver.points[:, 0].min() > 1.8 - 1.5 * h  # the bat is before it, it has not passed through

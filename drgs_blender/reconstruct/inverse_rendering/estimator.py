@@ -35,7 +35,7 @@ from ...render.lights.environment import (
     first_cell,
     map_at,
 )
-from ...render.lights.product_sampling import block_of, facing_row, in_cells_order
+from ...render.lights.product_sampling import block_of, in_cells_order, product_row
 from ...render.sampling import (
     GOLDEN,
     INVERSE_PI,
@@ -179,7 +179,7 @@ def gather_point(i, points, normals, a2s, counts, sequence, scene, faces, cache,
     alpha = F(math.sqrt(a2))
     bound, norm = vndf_terms(max(nv, F(1e-4)), a2)
     frame = basis(nx, ny, nz)
-    row = facing_row(nx, ny, nz, envmap)
+    row = product_row(nx, ny, nz, envmap)
     place = 0
     for half in range(2):
         for strategy in range(3):

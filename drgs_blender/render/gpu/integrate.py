@@ -33,7 +33,7 @@ _ROOMS = (
     _BATCH,
     Room("float32", (1, indirect.FOUND)),
     Room("float32", (1, direct.KINDS * direct.KIND)),
-    Room("float32", (1, sample_allocation.HEAD)),
+    Room("float32", (1, sample_allocation.POINT_STATE)),
     Room("uint32", (1,)),
     Room("int64", (1,)),
 )

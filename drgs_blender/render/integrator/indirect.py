@@ -15,7 +15,7 @@ from ...compute.jit import njit
 from ..lights.environment import envmap_pdf, envmap_radiance, map_at
 from ..lights.light_shapes import DIFFUSE, GLOSSY
 from ..lights.lights import emission_along, lights_along
-from ..lights.product_sampling import facing_row
+from ..lights.product_sampling import product_row
 from ..sampling import GOLDEN, ONE, ZERO, F, U, mix, unit
 from ..scene import ray_masks
 from . import brdf
@@ -52,7 +52,7 @@ def _surfaces(s: Any, ints: Any, count: Any, scene: Any, shading_model: Any, tab
         s[a + w.NX], s[a + w.NY], s[a + w.NZ] = nx, ny, nz
         s[a + w.MX], s[a + w.MY], s[a + w.MZ] = mx, my, mz
         s[a + w.GX], s[a + w.GY], s[a + w.GZ] = gx, gy, gz
-        ints[c + w.ROW] = U(facing_row(nx, ny, nz, envmap))
+        ints[c + w.ROW] = U(product_row(nx, ny, nz, envmap))
         s[a + w.OX], s[a + w.OY], s[a + w.OZ] = lifted(s[a + w.OX], s[a + w.OY], s[a + w.OZ], gx, gy, gz, extent)
         s[a + w.AR], s[a + w.AG], s[a + w.AB] = r, g, b
         s[a + w.METALLIC], s[a + w.A2] = metallic, brdf.alpha_squared(roughness)

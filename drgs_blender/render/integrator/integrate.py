@@ -29,7 +29,7 @@ from . import wavefront as w
 from .direct import BATCH, KIND, KINDS, deliver, finish, trace_batch
 from .indirect import FOUND, trace_paths
 from .intersect import meshes_alone
-from .sample_allocation import ALPHA, COUNTS, HEAD, put_sample, write_heads
+from .sample_allocation import ALPHA, COUNTS, POINT_STATE, put_sample, write_point_states
 from .variance import variances
 
 Array = np.ndarray
@@ -197,7 +197,7 @@ def shade_points(
     n = len(pixel)
     blocks = (n + _BLOCK - 1) // _BLOCK
     scene, illumination = (tracer, geometry, extent), (envmap, lit_by[0], lights, lit_by[1])
-    rays, paths, found, sums, head, row, total = room
+    rays, paths, found, sums, state, row, total = room
     s, ints = rays
     # Samples of a sub-sample's part lie next to each other among those of the pixel.
     rate = ONE / F(subpixels * part[1])
@@ -206,19 +206,19 @@ def shade_points(
         end = min(n, start + _BLOCK)
         sums[:] = ZERO
         total[:] = 0
-        write_heads(start, end, frames, surfaces, extent, envmap, shading_model, table, split, head, row)
+        write_point_states(start, end, frames, surfaces, extent, envmap, shading_model, table, split, state, row)
         begun = np.int64(0)
         for strategy in range(4):
             count = np.int64(0)
             for i in range(start, end):
                 h = i - start
-                if head[h, ALPHA] < ZERO or head[h, COUNTS + strategy] == ZERO:
+                if state[h, ALPHA] < ZERO or state[h, COUNTS + strategy] == ZERO:
                     continue
                 own = U(seed ^ mix(U(pixel[i])))
                 if flags[i] & SECOND:
                     own = U(own ^ U(0x5BD1E995))
                 key = mix(U(mix(own) + U(U(strategy + 1) * GOLDEN)))
-                step = head[h, COUNTS + strategy] * rate
+                step = state[h, COUNTS + strategy] * rate
                 dither = unit(mix(U(key + U(4))))
                 # Each position begins with another part, lest a part have samples at all positions of a pixel or none.
                 turn = np.int64((np.uint64(U(U(sample[i]) * GOLDEN)) * np.uint64(part[1])) >> np.uint64(32))
@@ -234,7 +234,7 @@ def shade_points(
                         )  # fmt: skip
                         count = np.int64(0)
                     total[h] += 1
-                    put_sample(tracer, s, ints, count, i, h, frames, surfaces, head, rate)
+                    put_sample(tracer, s, ints, count, i, h, frames, surfaces, state, rate)
                     _, c = w.at(count)
                     ints[c + w.KEY] = mix(U(key ^ U(U(j + 1) * U(0x85EBCA6B))))
                     ints[c + w.CELL], ints[c + w.ROW] = key, row[h]
@@ -261,7 +261,7 @@ def _room() -> Any:
         w.batch(BATCH),
         np.zeros((BATCH, FOUND), np.float32),
         np.empty((_BLOCK, KINDS * KIND), np.float32),
-        np.zeros((_BLOCK, HEAD), np.float32),
+        np.zeros((_BLOCK, POINT_STATE), np.float32),
         np.zeros(_BLOCK, np.uint32),
         np.empty(_BLOCK, np.int64),
     )

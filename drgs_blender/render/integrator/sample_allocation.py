@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...compute.jit import njit
-from ..lights.product_sampling import facing_row
+from ..lights.product_sampling import product_row
 from ..sampling import ONE, TWO, ZERO, F, U
 from . import brdf
 from . import wavefront as w
@@ -18,9 +18,9 @@ from .intersect import put_start
 #: Strategies in the order of ``RenderSettings``' counts; the samples of the last are divided between environment and
 # lights.
 COSINE, GGX, ENVIRONMENT, LIGHTS = range(4)
-#: Columns of a head: start of the rays, alpha squared, diffuse weight, normal m, samples of each strategy.
+#: Columns of a point's state: start of the rays, alpha squared, diffuse weight, normal m, samples of each strategy.
 ALPHA, WEIGHT, NORMAL, COUNTS = 3, 4, 5, 8
-HEAD = 12
+POINT_STATE = 12
 #: Part of the samples that go to the light where the surface is all diffuse, and for a specular lobe; less where that
 #: is narrow: the part is `_LIGHT_GLOSSY` from this alpha on.
 _LIGHT_DIFFUSE, _LIGHT_GLOSSY, _WIDE = F(0.75), F(0.5), F(0.03)
@@ -32,7 +32,7 @@ def _rounded(x: Any) -> Any:
 
 
 @njit
-def _allot(head: Any, h: Any, share: Any, split: Any) -> None:
+def _allocate(state: Any, h: Any, share: Any, split: Any) -> None:
     """Samples a pixel of each strategy at the h-th point; `share` is the diffuse lobe's part of what it reflects.
 
     Whole numbers in coarse steps: points of one pixel mostly agree, and then their samples add up to these numbers.
@@ -40,7 +40,7 @@ def _allot(head: Any, h: Any, share: Any, split: Any) -> None:
     auto, cosine, ggx, light, envmap, lights, most = split
     if auto:
         total = cosine + ggx + light
-        alpha = F(math.sqrt(head[h, ALPHA]))
+        alpha = F(math.sqrt(state[h, ALPHA]))
         glossy = _LIGHT_GLOSSY * min(ONE, max(F(0.05), alpha / _WIDE))
         light = total * min(most, share * _LIGHT_DIFFUSE + (ONE - share) * glossy) if envmap + lights > ZERO else ZERO
         ggx = (total - light) * (ONE - share)
@@ -60,17 +60,17 @@ def _allot(head: Any, h: Any, share: Any, split: Any) -> None:
     if envmap > ZERO and lights > ZERO and light >= TWO:
         envmap = min(max(_rounded(light * envmap), ONE), light - ONE) / light
         lights = ONE - envmap
-    head[h, COUNTS + COSINE], head[h, COUNTS + GGX] = cosine, ggx
-    head[h, COUNTS + ENVIRONMENT], head[h, COUNTS + LIGHTS] = light * envmap, light * lights
+    state[h, COUNTS + COSINE], state[h, COUNTS + GGX] = cosine, ggx
+    state[h, COUNTS + ENVIRONMENT], state[h, COUNTS + LIGHTS] = light * envmap, light * lights
 
 
 @njit
-def write_heads(
+def write_point_states(
     first: Any, last: Any, frames: Any, surfaces: Any, extent: Any, envmap: Any, shading_model: Any, table: Any,
     split: Any,
-    head: Any, row: Any,
+    state: Any, row: Any,
 ) -> None:  # fmt: skip
-    """What all samples of a point share, see `HEAD`, and its row in the light's tables.
+    """What all samples of a point share, see `POINT_STATE`, and its row in the light's tables.
 
     Alpha squared is -1 where the point is unusable.
     """
@@ -82,36 +82,36 @@ def write_heads(
         for k in range(3):
             check += origin[i, k] + normal[i, k] + flat[i, k] + view[i, k] + albedo[i, k]
         if not abs(check) < F(1e18):
-            head[h, ALPHA] = -ONE
+            state[h, ALPHA] = -ONE
             continue
         gx, gy, gz, vx, vy, vz = flat[i, 0], flat[i, 1], flat[i, 2], view[i, 0], view[i, 1], view[i, 2]
-        head[h, 0], head[h, 1], head[h, 2] = lifted(origin[i, 0], origin[i, 1], origin[i, 2], gx, gy, gz, extent)
+        state[h, 0], state[h, 1], state[h, 2] = lifted(origin[i, 0], origin[i, 1], origin[i, 2], gx, gy, gz, extent)
         mx, my, mz = brdf.glossy_normal(normal[i, 0], normal[i, 1], normal[i, 2], gx, gy, gz, vx, vy, vz)
         mv = mx * vx + my * vy + mz * vz
         weight = brdf.diffuse_weight(roughness[i], metallic[i], mv, shading_model, table)
-        head[h, ALPHA], head[h, WEIGHT] = brdf.alpha_squared(roughness[i]), weight
-        head[h, NORMAL], head[h, NORMAL + 1], head[h, NORMAL + 2] = mx, my, mz
+        state[h, ALPHA], state[h, WEIGHT] = brdf.alpha_squared(roughness[i]), weight
+        state[h, NORMAL], state[h, NORMAL + 1], state[h, NORMAL + 2] = mx, my, mz
         r, g, b = albedo[i, 0], albedo[i, 1], albedo[i, 2]
-        row[h] = U(facing_row(normal[i, 0], normal[i, 1], normal[i, 2], envmap))
-        _allot(head, h, w.diffuse_share(mv, r, g, b, weight, metallic[i], shading_model), split)
+        row[h] = U(product_row(normal[i, 0], normal[i, 1], normal[i, 2], envmap))
+        _allocate(state, h, w.diffuse_share(mv, r, g, b, weight, metallic[i], shading_model), split)
 
 
 @njit
 def put_sample(
-    tracer: Any, s: Any, ints: Any, slot: Any, i: Any, h: Any, frames: Any, surfaces: Any, head: Any, rate: Any
+    tracer: Any, s: Any, ints: Any, slot: Any, i: Any, h: Any, frames: Any, surfaces: Any, state: Any, rate: Any
 ) -> None:
     """Copy point i, the h-th of its block, into a slot; `rate` is its part of a pixel's samples."""
     _, normal, flat, view = frames
     albedo, _, metallic, own, size = surfaces
     a, c = w.at(slot)
-    s[a + w.OX], s[a + w.OY], s[a + w.OZ] = head[h, 0], head[h, 1], head[h, 2]
+    s[a + w.OX], s[a + w.OY], s[a + w.OZ] = state[h, 0], state[h, 1], state[h, 2]
     s[a + w.NX], s[a + w.NY], s[a + w.NZ] = normal[i, 0], normal[i, 1], normal[i, 2]
-    s[a + w.MX], s[a + w.MY], s[a + w.MZ] = head[h, NORMAL], head[h, NORMAL + 1], head[h, NORMAL + 2]
+    s[a + w.MX], s[a + w.MY], s[a + w.MZ] = state[h, NORMAL], state[h, NORMAL + 1], state[h, NORMAL + 2]
     s[a + w.GX], s[a + w.GY], s[a + w.GZ] = flat[i, 0], flat[i, 1], flat[i, 2]
     s[a + w.VX], s[a + w.VY], s[a + w.VZ] = view[i, 0], view[i, 1], view[i, 2]
     s[a + w.AR], s[a + w.AG], s[a + w.AB] = albedo[i, 0], albedo[i, 1], albedo[i, 2]
-    s[a + w.METALLIC], s[a + w.A2], s[a + w.KD] = metallic[i], head[h, ALPHA], head[h, WEIGHT]
-    s[a + w.WC], s[a + w.WG] = head[h, COUNTS + COSINE] * rate, head[h, COUNTS + GGX] * rate
-    s[a + w.WE], s[a + w.WL] = head[h, COUNTS + ENVIRONMENT] * rate, head[h, COUNTS + LIGHTS] * rate
+    s[a + w.METALLIC], s[a + w.A2], s[a + w.KD] = metallic[i], state[h, ALPHA], state[h, WEIGHT]
+    s[a + w.WC], s[a + w.WG] = state[h, COUNTS + COSINE] * rate, state[h, COUNTS + GGX] * rate
+    s[a + w.WE], s[a + w.WL] = state[h, COUNTS + ENVIRONMENT] * rate, state[h, COUNTS + LIGHTS] * rate
     ints[c + w.OWNER] = U(h)
     put_start(tracer, s, ints, slot, own, size, i)

@@ -19,7 +19,7 @@ from ...core.frame import World
 from ..memory import Place, address, load_float, load_int32, load_uint32
 from ..sampling import fast_acos, fast_atan2_turns, sincos_turns, unit
 from .environment_cdf import Cells
-from .product_sampling import Facing, block_of, facing_ratio, facing_row, in_cells_order
+from .product_sampling import ProductTables, block_of, in_cells_order, product_ratio, product_row
 
 Array = np.ndarray
 
@@ -132,7 +132,7 @@ class EnvironmentLight:
         self.rotation = np.ascontiguousarray(rotation, np.float32)
         self.cells = Cells(self.texels)
         self.row_z = self.cells.edges.astype(np.float32)
-        self.facing = Facing(self.cells)
+        self.product = ProductTables(self.cells)
 
     @property
     def black(self) -> bool:
@@ -147,7 +147,7 @@ class EnvironmentLight:
     def envmap_at(self, place: Place) -> EnvMap:
         """`environment` of arrays that lie elsewhere."""
         height, width = self.texels.shape[:2]
-        cells, facing = self.cells, self.facing
+        cells, product = self.cells, self.product
         return EnvMap(
             place(self.texels),
             height,
@@ -158,12 +158,12 @@ class EnvironmentLight:
             place(self.row_z),
             cells.step,
             width // cells.step,
-            place(facing.starts),
-            place(facing.slices),
-            place(facing.ratio),
-            place(facing.first),
+            place(product.starts),
+            place(product.slices),
+            place(product.ratio),
+            place(product.first),
             place(cells.block),
-            len(facing.first),
+            len(product.first),
             cells.block.shape[1],
             cells.shift,
             *self.rotation.ravel(),
@@ -192,7 +192,7 @@ class EnvironmentLight:
 
     def _rows(self, normal: Array | None, count: int) -> Array:
         if normal is None:
-            return np.full(count, len(self.facing.ratio) - 1, np.int32)
+            return np.full(count, len(self.product.ratio) - 1, np.int32)
         return _rows_many(np.broadcast_to(np.asarray(normal, np.float32), (count, 3)), self.envmap)
 
 
@@ -206,14 +206,14 @@ def map_at(dx, dy, dz, envmap):  # type: ignore[no-untyped-def]
 
 
 @njit
-def envmap_pdf(u, v, facing, envmap):  # type: ignore[no-untyped-def]
+def envmap_pdf(u, v, product, envmap):  # type: ignore[no-untyped-def]
     """Density per solid angle at (u, v) of light sampling at a surface whose `facing_row` is `facing`."""
     row = min(np.int64(envmap.height - 1), np.int64(v * np.float32(envmap.height)))
     column = min(np.int64(envmap.width - 1), np.int64(u * np.float32(envmap.width)))
     density = load_float(envmap.texels, 4 * (row * envmap.width + column) + 3)
     if envmap.step > 1:
         row, column = row // envmap.step, column // envmap.step
-    return density * facing_ratio(facing, row, column, envmap)
+    return density * product_ratio(product, row, column, envmap)
 
 
 @njit
@@ -297,26 +297,26 @@ def _lookup_many(directions, envmap):  # type: ignore[no-untyped-def]
 def _rows_many(normals, envmap):  # type: ignore[no-untyped-def]
     out = np.empty(len(normals), np.int32)
     for i in range(len(normals)):
-        out[i] = facing_row(normals[i, 0], normals[i, 1], normals[i, 2], envmap)
+        out[i] = product_row(normals[i, 0], normals[i, 1], normals[i, 2], envmap)
     return out
 
 
 @njit
-def _pdf_many(directions, facing, envmap):  # type: ignore[no-untyped-def]
+def _pdf_many(directions, product, envmap):  # type: ignore[no-untyped-def]
     out = np.empty(len(directions), np.float32)
     for i in range(len(directions)):
         u, v = map_at(directions[i, 0], directions[i, 1], directions[i, 2], envmap)
-        out[i] = envmap_pdf(u, v, facing[i], envmap)
+        out[i] = envmap_pdf(u, v, product[i], envmap)
     return out
 
 
 @njit
-def _sample_many(numbers, facing, envmap):  # type: ignore[no-untyped-def]
+def _sample_many(numbers, product, envmap):  # type: ignore[no-untyped-def]
     n = len(numbers)
     directions, pdf = np.empty((n, 3), np.float32), np.empty(n, np.float32)
     for i in range(n):
         number, ratio = in_cells_order(
-            facing[i], block_of(facing[i], numbers[i, 0], envmap), numbers[i, 0], numbers[i, 1], envmap
+            product[i], block_of(product[i], numbers[i, 0], envmap), numbers[i, 0], numbers[i, 1], envmap
         )
         place = first_cell(number, envmap)
         while number > cell_end(place, envmap):

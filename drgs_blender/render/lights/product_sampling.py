@@ -34,7 +34,7 @@ def normals() -> Array:
 
 
 @njit
-def facing_row(nx, ny, nz, envmap):  # type: ignore[no-untyped-def]
+def product_row(nx, ny, nz, envmap):  # type: ignore[no-untyped-def]
     """Row of the tables for a unit world normal."""
     x = envmap.xx * nx + envmap.xy * ny + envmap.xz * nz
     y = envmap.yx * nx + envmap.yy * ny + envmap.yz * nz
@@ -50,7 +50,7 @@ def facing_row(nx, ny, nz, envmap):  # type: ignore[no-untyped-def]
     return row * np.int32(SIDE) + column
 
 
-class Facing:
+class ProductTables:
     """The tables.
 
     Attributes
@@ -146,7 +146,7 @@ def in_cells_order(row, block, n, below, envmap):  # type: ignore[no-untyped-def
 
 
 @njit
-def facing_ratio(row, cell_row, cell_column, envmap):  # type: ignore[no-untyped-def]
+def product_ratio(row, cell_row, cell_column, envmap):  # type: ignore[no-untyped-def]
     """Density of light sampling by a row of the tables over that without, in the cell at (row, column)."""
     place = (np.int64(cell_row) >> envmap.shift) * envmap.block_columns + (np.int64(cell_column) >> envmap.shift)
     return load_float(envmap.ratio, np.int64(row) * np.int64(envmap.blocks) + np.int64(load_int32(envmap.block, place)))
