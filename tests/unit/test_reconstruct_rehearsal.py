@@ -42,7 +42,8 @@ def watched(step):
         before = kernels()
         step(self)
         if watching and kernels() > before:
-            print(type(self).__name__, self.iteration)
+            at = self.learner if isinstance(self, Training) else self.schedule
+            print(type(self).__name__, at.iteration)
     return watch
 
 def then_watch(*arguments):
