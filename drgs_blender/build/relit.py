@@ -37,16 +37,23 @@ def relit_colours(
 
     Parameters
     ----------
-    asset : its mesh is what light meets; object space is the world
-    surfels : the asset's surfels, posed as `vertices` are
-    vertices : (n, 3) float32, the mesh's vertices
-    world : the light
-    settings : samples a surfel, bounces, look, seed
-    progress : called with the name of the phase and the part of it that is done, in [0, 1]
+    asset : Asset
+        Its mesh is what light meets; object space is the world.
+    surfels : Surfels
+        The asset's surfels, posed as `vertices` are.
+    vertices : (n, 3) float32 array
+        The mesh's vertices.
+    world : World
+        The light.
+    settings : RenderSettings
+        Samples per surfel, bounces, look, seed.
+    progress : callable, optional
+        Called with the name of the phase and the part of it that is done, in [0, 1].
 
     Returns
     -------
-    (n, 3) float32, linear Rec.709, scene-referred
+    (n, 3) float32 array
+        Linear Rec.709, scene-referred.
 
     Raises
     ------
@@ -123,8 +130,10 @@ def points_of_surfels(surfels: Surfels, owner: int, size: float) -> ShadingPoint
 
     Parameters
     ----------
-    owner : the object, by its number in the tree of surfels, that does not shade itself nearby
-    size : mean larger standard deviation of its surfels, metres
+    owner : int
+        The object, by its number in the tree of surfels, that does not shade itself nearby.
+    size : float
+        Mean larger standard deviation of its surfels, metres.
     """
     normal = rotation_matrices(surfels.rotation.astype(np.float64))[..., 2]
     return own_surfels(_points(surfels, surfels.centre, normal, normal), owner, size)

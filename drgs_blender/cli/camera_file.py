@@ -23,7 +23,8 @@ def read_camera(path: str | Path) -> Camera:
 
     Parameters
     ----------
-    path : path of a JSON object with the keys
+    path : str or Path
+        A JSON object with the keys
 
         - ``matrix_world``: 4 rows of 4 numbers, camera to world, rigid, Blender's convention (looks down -Z, Y up)
         - ``width``, ``height``: pixels

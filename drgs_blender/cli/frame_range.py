@@ -63,9 +63,11 @@ def frames_wanted(text: str | None, source: Path, output: Path) -> list[int] | N
 
     Parameters
     ----------
-    text : the value of ``--frames``: a range, "" for those that are there, None where it is not given, which means the
-        same for a `source` that is no file but a pattern of files
-    source, output : with a run of ``#`` for the number
+    text : str or None
+        The value of ``--frames``: a range, "" for those that are there, None where it is not given, which means the
+        same for a `source` that is no file but a pattern of files.
+    source, output : Path
+        With a run of ``#`` for the number.
 
     Raises
     ------
@@ -84,7 +86,8 @@ def write_frames(frames: Sequence[int]) -> str:
 
     Parameters
     ----------
-    frames : at least one, none twice
+    frames : sequence of int
+        At least one, none twice.
     """
     terms: list[str] = []
     start = 0

@@ -35,13 +35,16 @@ def project(mesh: Mesh, faces: Faces, points: Array) -> tuple[Array, Array, Arra
 
     Parameters
     ----------
-    points : (n, 3) finite, object space
+    points : (n, 3) array
+        Finite, object space.
 
     Returns
     -------
-    face : (n,) int64
-    barycentric : (n, 3) float64, clamped to the face, sums to 1
-    distance : (n,) float64, metres
+    face : (n,) int64 array
+    barycentric : (n, 3) float64 array
+        Clamped to the face, sums to 1.
+    distance : (n,) float64 array
+        Metres.
     """
     proper = np.flatnonzero(~faces.degenerate)
     if not len(proper):

@@ -26,8 +26,10 @@ def psnr(picture: Array, reference: Array, mask: Array | None = None) -> float:
 
     Parameters
     ----------
-    picture, reference : (h, w, c) or (n, h, w, c), in any one encoding; several are one set of pixels
-    mask : (h, w) or (n, h, w) bool, pixels that count
+    picture, reference : (h, w, c) or (n, h, w, c) array
+        In any one encoding; several are one set of pixels.
+    mask : (h, w) or (n, h, w) bool array, optional
+        Pixels that count.
 
     Returns
     -------
@@ -90,8 +92,9 @@ def material_scores(found: dict[str, Array], true: dict[str, Array], mask: Array
 
     Parameters
     ----------
-    found, true : "albedo" (n, h, w, 3), and "roughness", "metallic" (n, h, w) where `true` has them; albedo is linear
-    mask : (n, h, w) bool
+    found, true : dict of str to array
+        "albedo" (n, h, w, 3), and "roughness", "metallic" (n, h, w) where `true` has them; albedo is linear.
+    mask : (n, h, w) bool array
 
     Returns
     -------
@@ -119,9 +122,14 @@ def relight_scores(linear: Array, alpha: Array, reference: Array, mask: Array) -
 
     Parameters
     ----------
-    linear, alpha : (n, h, w, 3), (n, h, w): our pictures, linear, not premultiplied, and their coverage
-    reference : (n, h, w, 3) sRGB-encoded on white
-    mask : (n, h, w) float coverage of the reference; the foreground is where it is above 0.5
+    linear : (n, h, w, 3) array
+        Our pictures, linear, not premultiplied.
+    alpha : (n, h, w) array
+        Their coverage.
+    reference : (n, h, w, 3) array
+        sRGB-encoded on white.
+    mask : (n, h, w) float array
+        Coverage of the reference; the foreground is where it is above 0.5.
 
     Returns
     -------

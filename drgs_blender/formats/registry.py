@@ -42,11 +42,16 @@ class Format:
 
     Attributes
     ----------
-    name : shown to users; the key of its `filetypes.ReadType`
-    sniff : (first bytes, path) -> whether the file is of this format
-    read : path -> what comes out
-    note : one line for the documentation
-    instead : what to do where something else than `kind` is wanted of such a file
+    name : str
+        Shown to users; the key of its `filetypes.ReadType`.
+    sniff : callable
+        (first bytes, path) -> whether the file is of this format.
+    read : callable
+        path -> what comes out.
+    note : str
+        One line for the documentation.
+    instead : str
+        What to do where something else than `kind` is wanted of such a file.
     """
 
     name: str

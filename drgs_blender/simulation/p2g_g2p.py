@@ -126,9 +126,15 @@ def scatter(  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    x (n, 3) float64; v (n, 3), affine (n, 9), tau (n, 6), mass (n,), volume (n,) float32
-        In the order of the arrangement; volume is that at rest.
-    nodes : (a, 64, 4) float32
+    x : (n, 3) float64 array
+        In the order of the arrangement, as all that is of particles.
+    v : (n, 3) float32 array
+    affine : (n, 9) float32 array
+    tau : (n, 6) float32 array
+    mass : (n,) float32 array
+    volume : (n,) float32 array
+        At rest.
+    nodes : (a, 64, 4) float32 array
         Written: momentum and mass of the nodes of active blocks.
     """
     scale = 1.0 / spacing
@@ -178,10 +184,14 @@ def advance_nodes(nodes, least, dt, force, wind, drag, damping):  # type: ignore
 
     Parameters
     ----------
-    least : kg, below which a node is empty: momentum over a mass near underflow is noise
-    force : (3,) m/s^2, acceleration
-    wind : (3,) m/s, towards which `drag` (1/s) pulls
-    damping : 1/s
+    least : float
+        kg, below which a node is empty: momentum over a mass near underflow is noise.
+    force : (3,) array
+        m/s^2, acceleration.
+    wind : (3,) array
+        m/s, towards which `drag` (1/s) pulls.
+    damping : float
+        1/s.
     """
     pull, slow = np.float32(1.0 - np.exp(-dt * drag)), np.float32(np.exp(-dt * damping))
     gx, gy, gz = np.float32(dt * force[0]), np.float32(dt * force[1]), np.float32(dt * force[2])
@@ -206,10 +216,10 @@ def gather(  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    elastic, total : (n, 9) float32
+    elastic, total : (n, 9) float32 array
         Deformation gradients; `total` has no rows where the two are the same for every particle. Matter that is not
         `solid` keeps the total it has.
-    fastest : (b,) float32
+    fastest : (b,) float32 array
         Written: the highest speed in each block, m/s; infinite where a particle is not finite.
     """
     scale = 1.0 / spacing
@@ -281,9 +291,12 @@ def hold_pins(x, pinned, pin_velocity, mass, origin, spacing, slot, nodes, held)
 
     Parameters
     ----------
-    pinned : (k,) int64, particles held
-    pin_velocity : (k, 3) float32, m/s
-    held : (a, 64, 4) float32, zero before and after: pinned momentum and mass
+    pinned : (k,) int64 array
+        Particles held.
+    pin_velocity : (k, 3) float32 array
+        m/s.
+    held : (a, 64, 4) float32 array
+        Zero before and after: pinned momentum and mass.
     """
     scale = 1.0 / spacing
     for turn in range(2):

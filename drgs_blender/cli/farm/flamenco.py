@@ -22,7 +22,8 @@ def write_job(job: Job, folder: Path, manager: str) -> str:
 
     Parameters
     ----------
-    manager : address of the Flamenco Manager
+    manager : str
+        Address of the Flamenco Manager.
 
     Returns
     -------

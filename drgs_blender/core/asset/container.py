@@ -102,8 +102,9 @@ def read_asset(path: PathLike, verify: bool = True) -> Asset:
 
     Parameters
     ----------
-    verify : also read everything once: SHA-256 of every member, finite values, ranges. Without it only structure,
-        shapes and indices are checked, which is enough never to crash.
+    verify : bool
+        Also read everything once: SHA-256 of every member, finite values, ranges. Without it only structure, shapes and
+        indices are checked, which is enough never to crash.
 
     Raises
     ------

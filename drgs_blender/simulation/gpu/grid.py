@@ -53,7 +53,8 @@ class DeviceGrid(Grid):
 
     Parameters
     ----------
-    launcher : of the device
+    launcher : Launcher
+        Of the device.
 
     Raises
     ------
