@@ -176,5 +176,5 @@ class MaterialsFile:
 
 
 def plain_name(path: str | Path) -> str:
-    """The name of a file as text that every program can show: bytes of it that are no UTF-8 as \\xe9."""
+    r"""The name of a file as text that every program can show: bytes of it that are no UTF-8 as \xe9."""
     return os.fsencode(Path(path).name).decode(errors="backslashreplace")

@@ -260,8 +260,10 @@ class MovingCollider:
         return np.full(len(points), np.inf) if seen is None else seen[:, 0]
 
     def closest(self, points: Array, start: bool = False) -> tuple[Array, Array, Array]:
-        """Signed distances (n,) from the mesh at the end or the `start` of the frame, its closest points, and the way
-        out, (n, 3)."""
+        """Signed distances (n,) from the mesh, its closest points, and the way out, (n, 3).
+
+        The mesh is that at the end of the frame, or at its `start`.
+        """
         import igl
 
         faces, vertices = self.collider.faces, self._before if start else self._after

@@ -99,8 +99,11 @@ def stretch(f, p, step, g0, g1, g2, g3, g4, g5, g6, g7, g8):  # type: ignore[no-
 
 @njit(inline="always")
 def momentum_of(p, v, affine, tau, m, q, h, fx, fy, fz):  # type: ignore[no-untyped-def]
-    """Momentum that particle p gives to the first node around it, and by how much more the next ones along x, y and z
-    get of it, row by row: m v + (m C - factor V tau) d, with d from the particle to the node and q = -factor V."""
+    """Momentum that particle p gives to the first node around it, and its increments to the next nodes.
+
+    They are along x, y and z, row by row: m v + (m C - factor V tau) d, with d from the particle to the node and
+    q = -factor V.
+    """
     a00, a01, a02 = (m * affine[p, 0] + q * tau[p, 0]) * h, (m * affine[p, 1] + q * tau[p, 3]) * h, (m * affine[p, 2] + q * tau[p, 4]) * h  # noqa: E501  # fmt: skip
     a10, a11, a12 = (m * affine[p, 3] + q * tau[p, 3]) * h, (m * affine[p, 4] + q * tau[p, 1]) * h, (m * affine[p, 5] + q * tau[p, 5]) * h  # noqa: E501  # fmt: skip
     a20, a21, a22 = (m * affine[p, 6] + q * tau[p, 4]) * h, (m * affine[p, 7] + q * tau[p, 5]) * h, (m * affine[p, 8] + q * tau[p, 2]) * h  # noqa: E501  # fmt: skip
