@@ -59,6 +59,23 @@ def relit_colours(
     ------
     UsageError
         The asset has no mesh, or the settings are out of range.
+
+    Examples
+    --------
+    A wall of albedo 0.5 reflects half of the light that comes from everywhere:
+
+    >>> from drgs_blender.core.asset.model import Mesh
+    >>> from drgs_blender.deform.attach import attach
+    >>> corners = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
+    >>> mesh = Mesh(corners, [[0, 1, 2], [0, 2, 3]], albedo=[[0.5] * 3] * 4, roughness=[1] * 4, metallic=[0] * 4)
+    >>> surfels, binding, report = attach(mesh, density=1)
+    >>> asset = Asset(surfels, mesh, binding)
+    >>> world = World(colour=(1.0, 0.4, 0.2))
+    >>> relit_colours(asset, surfels, mesh.vertices, world, RenderSettings(samples=1024)).round(1)
+    array([[0.5, 0.2, 0.1],
+           [0.5, 0.2, 0.1],
+           [0.5, 0.2, 0.1],
+           [0.5, 0.2, 0.1]], dtype=float32)
     """
     mesh = asset.mesh
     if asset.binding is None:

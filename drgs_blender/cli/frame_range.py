@@ -35,6 +35,11 @@ def parse_frames(text: str) -> list[int]:
     ------
     UsageError
         Naming the term that cannot be used.
+
+    Examples
+    --------
+    >>> parse_frames("1-9x4, 24-22x-1, 7")
+    [1, 5, 9, 24, 23, 22, 7]
     """
     frames: dict[int, None] = {}
     for term in text.replace(" ", "").split(","):
@@ -88,6 +93,11 @@ def write_frames(frames: Sequence[int]) -> str:
     ----------
     frames : sequence of int
         At least one, none twice.
+
+    Examples
+    --------
+    >>> write_frames([1, 3, 5, 7, 30])
+    '1-7:2,30'
     """
     terms: list[str] = []
     start = 0

@@ -162,6 +162,12 @@ def make_material(name: str, changes: Mapping[str, Any] | None = None, subject: 
     ------
     UsageError
         An unknown name or setting, or a number that means nothing, saying what is possible.
+
+    Examples
+    --------
+    >>> jelly = make_material("jelly", {"density": 900})
+    >>> jelly.model, jelly.density
+    ('elastic', 900.0)
     """
     if name not in MATERIALS:
         raise UsageError(subject, f"there is no material {name!r}", f"There are {', '.join(MATERIALS)}")

@@ -223,6 +223,16 @@ def quaternions(matrices: Array) -> Array:
     """(n, 3, 3) rotation matrices -> (n, 4) unit quaternions wxyz with w >= 0, of the same dtype.
 
     Of the four rows of 4 q q^T the one with the largest diagonal is normalised, which never divides by a small number.
+
+    Examples
+    --------
+    Half a turn about Z, there and back:
+
+    >>> half_turn = rotation_matrices(np.array([[0.0, 0, 0, 1]]))
+    >>> half_turn.diagonal(axis1=1, axis2=2)
+    array([[-1., -1.,  1.]])
+    >>> quaternions(half_turn)
+    array([[0., 0., 0., 1.]])
     """
     m = np.moveaxis(matrices, (-2, -1), (0, 1))
     trace = m[0, 0] + m[1, 1] + m[2, 2]
