@@ -30,6 +30,7 @@ def texel_points(mesh: TraceObject, uvs: Array, size: int) -> tuple[ShadingPoint
 
     Parameters
     ----------
+    mesh : TraceObject
     uvs : (m, 3, 2) array
         Of the corners of the mesh's faces; v = 0 is the bottom edge of the image, which repeats.
     size : int

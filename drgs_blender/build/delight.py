@@ -47,6 +47,8 @@ def remove_light(
         paint.
     settings : RenderSettings
         Samples per surfel.
+    progress : callable, optional
+        Called with the name of the phase and the part of it that is done.
 
     Raises
     ------

@@ -38,6 +38,7 @@ def surfels_of_pose(rest: Surfels, posed: PosedSurfels, *, mirrored: bool = Fals
     ----------
     rest : Surfels
         The same surfels before they were posed.
+    posed : PosedSurfels
     mirrored : bool
         The pose contains a matrix that mirrors.
     """

@@ -261,6 +261,8 @@ class _Looked:
 
     Parameters
     ----------
+    net : Net
+    materials : Materials
     before : _Looked, optional
         Of the net that was divided.
     kept : array, optional
@@ -311,6 +313,8 @@ def _edge_errors(net: Net, materials: Materials, values: Array, some_faces: Arra
 
     Parameters
     ----------
+    net : Net
+    materials : Materials
     values : array
         Of all vertices, see `bake`.
     some_faces : (s,) array

@@ -147,6 +147,7 @@ def points_of_surfels(surfels: Surfels, owner: int, size: float) -> ShadingPoint
 
     Parameters
     ----------
+    surfels : Surfels
     owner : int
         The object, by its number in the tree of surfels, that does not shade itself nearby.
     size : float

@@ -51,6 +51,8 @@ def weld(
         Corners of faces with different keys (materials) are never merged.
     normals : (m, 3, 3) array or None
         Unit corner normals: corners whose normals differ (cosine below `agree`) stay apart; None merges them all.
+    agree : float
+        Cosine.
 
     Returns
     -------

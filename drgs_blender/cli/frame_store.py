@@ -43,6 +43,7 @@ def settings_hash(frame: Frame, assets: Mapping[str, Path]) -> str:
 
     Parameters
     ----------
+    frame : Frame
     assets : mapping of str to Path
         Path of the asset behind each ``ObjectState.asset``.
     """

@@ -26,6 +26,7 @@ class Picture:
 
     Parameters
     ----------
+    shot : Evaluated
     override : callable
         Gives the settings of the command for those of the scene.
 

@@ -60,6 +60,8 @@ class FractionBar:
 
     Parameters
     ----------
+    args : argparse.Namespace
+    label : str
     programs : bool
         While kernels are compiled, lines on stdout for a program that reads them, where that is no terminal.
     """

@@ -53,6 +53,7 @@ def metadata(frame: Frame, layer: str = "") -> dict[str, str]:
 
     Parameters
     ----------
+    frame : Frame
     layer : str
         What stands in the file before the names of passes, with its dot.
     """

@@ -20,6 +20,7 @@ def adjusted(materials: Mapping[str, Array], adjustment: Adjustment, mask: Array
     ----------
     materials : mapping of str to array
         "albedo" (n, 3) linear Rec.709, "roughness" (n,), "metallic" (n,).
+    adjustment : Adjustment
     mask : (n,) array, optional
         In [0, 1] at the same places; replaces ``adjustment.mask``, which is of vertices.
     """

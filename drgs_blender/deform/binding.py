@@ -35,6 +35,8 @@ def project(mesh: Mesh, faces: Faces, points: Array) -> tuple[Array, Array, Arra
 
     Parameters
     ----------
+    mesh : Mesh
+    faces : Faces
     points : (n, 3) array
         Finite, object space.
 

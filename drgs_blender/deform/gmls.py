@@ -197,6 +197,7 @@ def carry(weights: Weights, x: Array, gradients: Array) -> tuple[Array, Array, i
 
     Parameters
     ----------
+    weights : Weights
     x : (s, 3) float32 or float64 array
         Metres: the sources now.
     gradients : (s, 3, 3) float32 array

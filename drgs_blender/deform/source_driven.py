@@ -64,6 +64,8 @@ class SourceDriven:
             The sources now.
         gradients : (s, 3, 3) array
             Their deformation gradients.
+        object_index : int
+            Index into Frame.objects, copied to every surfel.
 
         Returns
         -------

@@ -46,12 +46,15 @@ def compare(
 
     Parameters
     ----------
+    asset : Asset
     capture : Capture
         Its views left out are rendered under the asset's own light, at the size they have there.
     truth : Truth or None
         Sets under known lights, at rest and posed, with maps.
+    renderer : callable
     lpips : callable, optional
         None where it is not computed.
+    progress, show : callable, optional
 
     Returns
     -------

@@ -178,6 +178,7 @@ def two_bones(subject: bpy.types.Object, soft: float) -> bpy.types.PoseBone:
 
     Parameters
     ----------
+    subject : bpy.types.Object
     soft : float
         Part of the height within which the weights go over from one bone to the other.
     """

@@ -99,10 +99,12 @@ def make_scenes(
     ----------
     out : Path
         Folder, made when it is not there.
+    plan : Plan
     command : list of str
         Starts a Blender that runs scene_job.py.
     meshes : Path
         Folder of the example meshes.
+    progress : callable, optional
     threads : int
         Of Cycles; 0 is all.
 
@@ -149,6 +151,7 @@ def cameras(count: int, lowest: float, highest: float, turn: float) -> list[Arra
 
     Parameters
     ----------
+    count : int
     lowest, highest : float
         Degrees of elevation.
     turn : float

@@ -138,6 +138,9 @@ def read_relit(
         Any layout; of one with several lights (TensoIR), the pictures of the light that is named as the file is.
     light : Path
         Lat-long environment, Blender's mapping.
+    resolution : int, optional
+    axes : str
+    up : str, optional
 
     Raises
     ------

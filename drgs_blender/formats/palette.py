@@ -24,6 +24,7 @@ def codebook(values: Array, size: int = 256) -> tuple[Array, Array]:
     ----------
     values : float32 array
         Any shape, finite.
+    size : int
 
     Returns
     -------
@@ -61,6 +62,7 @@ def palette(rows: Array, size: int) -> tuple[Array, Array]:
     ----------
     rows : (n, c) float32 array
         Finite.
+    size : int
 
     Returns
     -------

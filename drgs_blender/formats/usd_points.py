@@ -36,6 +36,7 @@ def write_usd_points(
 
     Parameters
     ----------
+    path : Path
     frames : iterable of ParticleFrame
         In their order, object space.
     faces : (m, 3) int array

@@ -92,6 +92,8 @@ class VertexNormals:
         vertices : (n, 3) float32 array
         faces : (m, 3) int32 array
             Those of this object, of which some may be collapsed to a point.
+        normals : (n, 3) float32 array
+            Written.
         """
         empty = _weigh(plain(vertices), plain(faces), self.place, self._weighted)
         _sum(self._weighted, self.start, normals)

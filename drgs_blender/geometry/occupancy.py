@@ -59,6 +59,7 @@ def crosses_gap(volume: Volume, points: Array, sources: Array, chosen: Array, re
 
     Parameters
     ----------
+    volume : Volume
     points : (n, 3) float64 array
         Metres.
     sources : (k, 3) float64 array

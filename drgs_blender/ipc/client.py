@@ -141,6 +141,7 @@ class EngineClient:
 
         Parameters
         ----------
+        frame : Frame
         on_progress : callable, optional
             Called with the phase and the part done in [0, 1].
         cancelled : callable, optional

@@ -34,6 +34,7 @@ def bake(
     ----------
     job : Job
         At its beginning.
+    cache : ParticleCache
     overwrite : bool
         Frames of other settings are removed; otherwise they are an error.
     cancelled : callable, optional

@@ -154,6 +154,7 @@ def arrange(x: Array, domain: Domain) -> tuple[Arrangement, Array]:
     ----------
     x : (n, 3) float64 array
         Metres.
+    domain : Domain
 
     Returns
     -------

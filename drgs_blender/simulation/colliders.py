@@ -124,8 +124,14 @@ def make_field(
 
     Parameters
     ----------
+    vertices : (n, 3) array
+    faces : (m, 3) array
     closed : bool
         See `is_closed`.
+    spacing : float
+        Metres.
+    low, high : (3,) array
+        Corners of the box that the field covers.
     velocities : (n, 3) array, optional
         Of the vertices, m/s.
     """
@@ -279,6 +285,7 @@ class MovingCollider:
 
         Parameters
         ----------
+        points : (n, 3) array
         distances : (n,) array
             As `distances` has them, infinite also in the middle of what is as thick as a cell.
         """
@@ -317,6 +324,7 @@ def check_apart(points: Array, depth: float, colliders: Sequence[MovingCollider]
         Of the body, world.
     depth : float
         Metres that are no matter.
+    colliders : sequence of MovingCollider
     planes : array
         Rows of `contact.plane_rows`.
 
@@ -356,6 +364,7 @@ def lift_surface(points: Array, spacing: float, colliders: Sequence[MovingCollid
         World, at the end of the frame that the colliders have entered.
     spacing : float
         Of the grid, metres.
+    colliders : sequence of MovingCollider
     planes : array
         Rows of `contact.plane_rows`.
     """

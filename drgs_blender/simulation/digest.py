@@ -26,6 +26,8 @@ def digest_of(mesh: Mesh, settings: Settings, colliders: Sequence[Collider], mot
 
     Parameters
     ----------
+    mesh : Mesh
+    settings : Settings
     colliders : sequence of Collider
         Those of the settings.
     motion : (k, n, 3) array or None

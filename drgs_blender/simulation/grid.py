@@ -143,6 +143,7 @@ class Grid(ABC):
 
         Parameters
         ----------
+        state : State
         frame : int
             Counted from 0.
         seconds : float

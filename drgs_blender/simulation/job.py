@@ -155,6 +155,7 @@ def prepare(mesh: Mesh, settings: Settings, name: str = "mesh") -> Job:
     ----------
     mesh : Mesh
         The asset's, object space.
+    settings : Settings
     name : str
         Of it, in messages.
 

@@ -157,9 +157,12 @@ def entries(node: Definition) -> Iterator[Entry]:
             yield Entry(section, tuple(n.strip(" *") for n in names.split(",") if n), slot, first + i)
 
 
-def parameters(node: ast.FunctionDef | ast.AsyncFunctionDef) -> set[str]:
+def parameters(node: ast.FunctionDef | ast.AsyncFunctionDef, typed: bool = False) -> set[str]:
+    """Names of the parameters, if `typed` of those alone whose annotation says something."""
     a = node.args
     every = [*a.posonlyargs, *a.args, *a.kwonlyargs, *filter(None, (a.vararg, a.kwarg))]
+    if typed:
+        every = [argument for argument in every if argument.annotation and ast.unparse(argument.annotation) != "Any"]
     return {argument.arg for argument in every} - {"self", "cls"}
 
 
@@ -197,13 +200,24 @@ def known_names(node: Definition, section: str) -> set[str] | None:
         return parameters(node)
     if section == "Attributes":
         return set().union(*map(attributes, family(node)))
-    makers = (s for c in family(node) for s in c.body if isinstance(s, ast.FunctionDef) and s.name == "__init__")
-    return next(map(parameters, makers), set()) or set().union(*map(fields, family(node)))
+    return parameters(maker) if (maker := maker_of(node)) else set().union(*map(fields, family(node)))
+
+
+def maker_of(node: Definition) -> ast.FunctionDef | ast.AsyncFunctionDef | None:
+    """The function whose parameters the docstring has: of a class its ``__init__``."""
+    if not isinstance(node, ast.ClassDef):
+        return node
+    inits = (s for c in family(node) for s in c.body if isinstance(s, ast.FunctionDef) and s.name == "__init__")
+    return next(inits, None)
 
 
 def faults(module: ast.Module) -> Iterator[tuple[str, str]]:
-    """("type" or "name", what is wrong in which line) of every entry that is not as it should be."""
+    """("type", "name" or "missing", what is wrong in which line) of every entry that is not as it should be."""
     for node in definitions(module):
+        listed = {name for entry in entries(node) if entry.section == "Parameters" for name in entry.names}
+        maker = maker_of(node) if listed else None
+        if maker and (missing := parameters(maker, typed=True) - listed):
+            yield "missing", f"{node.lineno}: {node.name} has parameters, but not {', '.join(sorted(missing))}"
         for entry in entries(node):
             known = known_names(node, entry.section)
             where = f"{entry.line}: {node.name}: {', '.join(entry.names)}"
@@ -232,6 +246,11 @@ def test_entries_have_types(folder: str) -> None:
 @pytest.mark.parametrize("folder", [name for name in FOLDERS if name not in NOT_YET])
 def test_entries_name_what_exists(folder: str) -> None:
     assert not found_in(folder, "name"), "\n".join(found_in(folder, "name"))
+
+
+@pytest.mark.parametrize("folder", [name for name in FOLDERS if name not in NOT_YET])
+def test_sections_of_parameters_are_whole(folder: str) -> None:
+    assert not found_in(folder, "missing"), "\n".join(found_in(folder, "missing"))
 
 
 @pytest.mark.parametrize("folder", NOT_YET)
@@ -280,7 +299,7 @@ def test_prose_is_no_type(slot: str) -> None:
 
 
 def test_faults_are_found() -> None:
-    text = '''def f(a, b):
+    text = '''def f(a, b, d: int, e: Any):
     """Sum.
 
     Parameters
@@ -296,6 +315,7 @@ def test_faults_are_found() -> None:
     """
 '''
     assert [(kind, text.split(":")[0]) for kind, text in faults(ast.parse(text))] == [
+        ("missing", "1"),
         ("name", "8"),
         ("type", "9"),
         ("type", "13"),

@@ -53,6 +53,8 @@ def check_scene(
     ----------
     scene : Path
         .blend file.
+    frames : sequence of int
+    blender : Blender
     shared : sequence of Path
         Folders that every node sees under the same path; files outside of them are faults when there are any.
     scripts : bool

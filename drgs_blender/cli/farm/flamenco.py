@@ -22,6 +22,8 @@ def write_job(job: Job, folder: Path, manager: str) -> str:
 
     Parameters
     ----------
+    job : Job
+    folder : Path
     manager : str
         Address of the Flamenco Manager.
 

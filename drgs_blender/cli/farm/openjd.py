@@ -24,6 +24,7 @@ def write_bundle(job: Job, folder: Path, seconds: int = 0, files: Iterable[Path]
 
     Parameters
     ----------
+    job : Job
     folder : Path
         Of the bundle.
     seconds : int

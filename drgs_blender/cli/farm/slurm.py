@@ -61,6 +61,7 @@ def write_job(job: Job, folder: Path, retries: int = RETRIES, directives: tuple[
 
     Parameters
     ----------
+    job : Job
     folder : Path
         On a disk that every node sees; the logs go there as well.
     retries : int

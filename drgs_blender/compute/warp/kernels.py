@@ -114,6 +114,8 @@ class Launcher:
 
         Parameters
         ----------
+        work : Work
+        pieces : int
         arguments : sequence
             Numbers, arrays here or on the device, named tuples of numbers, and tuples of all these.
         out : sequence

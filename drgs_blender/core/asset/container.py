@@ -102,6 +102,7 @@ def read_asset(path: PathLike, verify: bool = True) -> Asset:
 
     Parameters
     ----------
+    path : str or path-like
     verify : bool
         Also read everything once: SHA-256 of every member, finite values, ranges. Without it only structure, shapes and
         indices are checked, which is enough never to crash.

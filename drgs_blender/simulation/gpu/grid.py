@@ -53,6 +53,7 @@ class DeviceGrid(Grid):
 
     Parameters
     ----------
+    scene : Scene
     launcher : Launcher
         Of the device.
 
