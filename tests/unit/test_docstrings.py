@@ -39,7 +39,7 @@ WORDS |= {"Path", "path-like", "bytes-like", "callable", "module", "function", "
 WORDS |= {"dict", "list", "tuple", "set", "mapping", "sequence", "iterable", "iterator", "namedtuple"}
 CONTAINERS = "list|tuple|set|sequence|iterable|iterator"
 NUMBER = r"(?:bool|u?int(?:8|16|32|64)?|float(?:16|32|64)?|complex(?:64|128)?)"
-SHAPE = r"\([\w.+* /-]+,(?:[\w.+* /-]+,)*[\w.+* /-]*\)"
+SHAPE = r"\([\w.+*^ /-]+,(?:[\w.+*^ /-]+,)*[\w.+*^ /-]*\)"
 ARRAY = re.compile(
     rf"(?:{SHAPE}(?:(?:, | or ){SHAPE})* )?(?:unit )?(?:{NUMBER}(?:(?:, | or ){NUMBER})* )?(?:array|tensor)s?"
 )
