@@ -26,8 +26,10 @@ class Place(NamedTuple):
         return {s.identifier: Place(s, self.groups) for s in self.node.inputs}
 
     def origin(self) -> Place:
-        """The output that feeds this input, through reroutes, muted nodes and groups; where nothing does, the input
-        whose own value counts."""
+        """The output that feeds this input, through reroutes, muted nodes and groups.
+
+        Where nothing does, the input whose own value counts.
+        """
         own = place = self
         while place.socket.is_linked:
             link = place.socket.links[0]

@@ -30,12 +30,17 @@ def texel_points(mesh: TraceObject, uvs: Array, size: int) -> tuple[ShadingPoint
 
     Parameters
     ----------
-    uvs : (m, 3, 2), of the corners of the mesh's faces; v = 0 is the bottom edge of the image, which repeats
-    size : texels along a side
+    mesh : TraceObject
+    uvs : (m, 3, 2) array
+        Of the corners of the mesh's faces; v = 0 is the bottom edge of the image, which repeats.
+    size : int
+        Texels along a side.
 
     Returns
     -------
-    the points, and the texel of each, (n,) int64 into size * size, row 0 at the top
+    points : ShadingPoints
+    texel : (n,) int64 array
+        The texel of each, into size * size, row 0 at the top.
 
     Raises
     ------

@@ -40,10 +40,15 @@ def remove_light(
 
     Parameters
     ----------
-    asset : with a mesh, an environment and ``surfels.sh``; changed in place, its mesh too
-    exposure : linear captured colour that radiance 1 gives; None chooses it so that the brightest tenth is not brighter
-        than paint
-    settings : samples a surfel
+    asset : Asset
+        With a mesh, an environment and ``surfels.sh``; changed in place, its mesh too.
+    exposure : float, optional
+        Linear captured colour that radiance 1 gives; None chooses it so that the brightest tenth is not brighter than
+        paint.
+    settings : RenderSettings
+        Samples per surfel.
+    progress : callable, optional
+        Called with the name of the phase and the part of it that is done.
 
     Raises
     ------

@@ -36,8 +36,11 @@ def surfels_of_pose(rest: Surfels, posed: PosedSurfels, *, mirrored: bool = Fals
 
     Parameters
     ----------
-    rest : the same surfels before they were posed
-    mirrored : the pose contains a matrix that mirrors
+    rest : Surfels
+        The same surfels before they were posed.
+    posed : PosedSurfels
+    mirrored : bool
+        The pose contains a matrix that mirrors.
     """
     tangents = np.stack([posed.tangent_u, posed.tangent_v], axis=-1).astype(np.float64)
     axes, scale, _ = np.linalg.svd(tangents, full_matrices=True)

@@ -51,16 +51,25 @@ def import_asset(
 
     Parameters
     ----------
-    surfels : path of surfels or splats, or a file already read
-    mesh : path of the mesh they were captured with; None builds a closed one around them
-    environment : path of the light of the capture
-    up : "z", "y", "-z" or "-y", the up axis of surfels and mesh; None is what the formats say,
-        and Z where they say nothing
-    materials : materials of the mesh's vertices kept apart from it (NeRO's folder), or such a file already read
-    resolution : voxels along the longest side of a mesh that is built
-    max_triangles : budget for texture detail of a textured mesh
-    meshless : build no mesh: the surfels follow their object's matrix, and light meets them alone
-    scale : factor on all lengths of surfels and mesh
+    surfels : str, Path or SurfelFile
+        Path of surfels or splats, or a file already read.
+    mesh : str, Path or MeshFile, optional
+        Path of the mesh they were captured with; None builds a closed one around them.
+    environment : str or Path, optional
+        Path of the light of the capture.
+    up : str, optional
+        "z", "y", "-z" or "-y", the up axis of surfels and mesh; None is what the formats say, and Z where they say
+        nothing.
+    materials : str, Path or MaterialsFile, optional
+        Materials of the mesh's vertices kept apart from it (NeRO's folder), or such a file already read.
+    resolution : int
+        Voxels along the longest side of a mesh that is built.
+    max_triangles : int
+        Budget for texture detail of a textured mesh.
+    meshless : bool
+        Build no mesh: the surfels follow their object's matrix, and light meets them alone.
+    scale : float
+        Factor on all lengths of surfels and mesh.
 
     Returns
     -------

@@ -52,15 +52,24 @@ def make_asset(
 
     Parameters
     ----------
-    source : path, or a mesh file already read
-    up : "z", "y", "-z" or "-y", the up axis of the file; None is what its format says, and Z where it says nothing
-    max_triangles : budget of the subdivision that gives texture detail its vertices; a finer mesh is left as it is
-    tolerance : error of interpolated materials at which edges are split
-    density : see `deform.attach.attach`
-    pretrained : surfels whose place and opacity the attached ones take over (Algorithm 1)
-    environment : light kept in the asset
-    pose : of a skinned glTF file, "rest" as Blender's importer rests it or "default" as viewers show the file
-    scale : factor on all lengths
+    source : str, Path or MeshFile
+        Path, or a mesh file already read.
+    up : str, optional
+        "z", "y", "-z" or "-y", the up axis of the file; None is what its format says, and Z where it says nothing.
+    max_triangles : int
+        Budget of the subdivision that gives texture detail its vertices; a finer mesh is left as it is.
+    tolerance : float
+        Error of interpolated materials at which edges are split.
+    density : float
+        See `deform.attach.attach`.
+    pretrained : Surfels, optional
+        Surfels whose place and opacity the attached ones take over (Algorithm 1).
+    environment : Environment, str or Path, optional
+        Light kept in the asset.
+    pose : {"rest", "default"}
+        Of a skinned glTF file, "rest" as Blender's importer rests it or "default" as viewers show the file.
+    scale : float
+        Factor on all lengths.
 
     Returns
     -------
@@ -218,7 +227,12 @@ def refine(net: Net, materials: Materials, tolerance: float, max_triangles: int)
 
     Returns
     -------
-    net, rounds, unresolved : the divided mesh, rounds done, edges still above the tolerance
+    net : Net
+        The divided mesh.
+    rounds : int
+        Rounds done.
+    unresolved : int
+        Edges still above the tolerance.
     """
     finest = FINEST * float(np.linalg.norm(np.ptp(net.vertices, axis=0)))
     unresolved, looked = 0, _Looked(net, materials)
@@ -247,11 +261,17 @@ class _Looked:
 
     Parameters
     ----------
-    before, kept : of the net that was divided, and `survivors` of the division
+    net : Net
+    materials : Materials
+    before : _Looked, optional
+        Of the net that was divided.
+    kept : array, optional
+        `survivors` of the division.
 
     Attributes
     ----------
-    errors : (m, 3), see `_edge_errors`
+    errors : (m, 3) array
+        See `_edge_errors`.
     """
 
     def __init__(
@@ -293,8 +313,12 @@ def _edge_errors(net: Net, materials: Materials, values: Array, some_faces: Arra
 
     Parameters
     ----------
-    values : of all vertices, see `bake`
-    some_faces : (s,) the faces that are meant
+    net : Net
+    materials : Materials
+    values : array
+        Of all vertices, see `bake`.
+    some_faces : (s,) array
+        The faces that are meant.
     """
     result = np.zeros((len(some_faces), 3))
     places = np.flatnonzero(materials.textured[net.tags[some_faces, 0]])

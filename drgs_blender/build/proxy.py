@@ -42,9 +42,12 @@ def mesh_from_surfels(surfels: Surfels, *, resolution: int = 192, views: int = 6
 
     Parameters
     ----------
-    surfels : object space
-    resolution : voxels along the longest side
-    views : orthographic depth maps, spread evenly over the sphere
+    surfels : Surfels
+        Object space.
+    resolution : int
+        Voxels along the longest side.
+    views : int
+        Orthographic depth maps, spread evenly over the sphere.
 
     Returns
     -------

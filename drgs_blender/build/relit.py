@@ -37,21 +37,45 @@ def relit_colours(
 
     Parameters
     ----------
-    asset : its mesh is what light meets; object space is the world
-    surfels : the asset's surfels, posed as `vertices` are
-    vertices : (n, 3) float32, the mesh's vertices
-    world : the light
-    settings : samples a surfel, bounces, look, seed
-    progress : called with the name of the phase and the part of it that is done, in [0, 1]
+    asset : Asset
+        Its mesh is what light meets; object space is the world.
+    surfels : Surfels
+        The asset's surfels, posed as `vertices` are.
+    vertices : (n, 3) float32 array
+        The mesh's vertices.
+    world : World
+        The light.
+    settings : RenderSettings
+        Samples per surfel, bounces, look, seed.
+    progress : callable, optional
+        Called with the name of the phase and the part of it that is done, in [0, 1].
 
     Returns
     -------
-    (n, 3) float32, linear Rec.709, scene-referred
+    (n, 3) float32 array
+        Linear Rec.709, scene-referred.
 
     Raises
     ------
     UsageError
         The asset has no mesh, or the settings are out of range.
+
+    Examples
+    --------
+    A wall of albedo 0.5 reflects half of the light that comes from everywhere:
+
+    >>> from drgs_blender.core.asset.model import Mesh
+    >>> from drgs_blender.deform.attach import attach
+    >>> corners = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
+    >>> mesh = Mesh(corners, [[0, 1, 2], [0, 2, 3]], albedo=[[0.5] * 3] * 4, roughness=[1] * 4, metallic=[0] * 4)
+    >>> surfels, binding, report = attach(mesh, density=1)
+    >>> asset = Asset(surfels, mesh, binding)
+    >>> world = World(colour=(1.0, 0.4, 0.2))
+    >>> relit_colours(asset, surfels, mesh.vertices, world, RenderSettings(samples=1024)).round(1)
+    array([[0.5, 0.2, 0.1],
+           [0.5, 0.2, 0.1],
+           [0.5, 0.2, 0.1],
+           [0.5, 0.2, 0.1]], dtype=float32)
     """
     mesh = asset.mesh
     if asset.binding is None:
@@ -123,8 +147,11 @@ def points_of_surfels(surfels: Surfels, owner: int, size: float) -> ShadingPoint
 
     Parameters
     ----------
-    owner : the object, by its number in the tree of surfels, that does not shade itself nearby
-    size : mean larger standard deviation of its surfels, metres
+    surfels : Surfels
+    owner : int
+        The object, by its number in the tree of surfels, that does not shade itself nearby.
+    size : float
+        Mean larger standard deviation of its surfels, metres.
     """
     normal = rotation_matrices(surfels.rotation.astype(np.float64))[..., 2]
     return own_surfels(_points(surfels, surfels.centre, normal, normal), owner, size)

@@ -18,11 +18,13 @@ class Pyramid:
 
     Parameters
     ----------
-    image : texture of a file
+    image : Image
+        Texture of a file.
 
     Attributes
     ----------
-    levels : (h, w, c) arrays; level 0 is the image, each next one the mean of 2 x 2 pixels
+    levels : list of (h, w, c) array
+        Level 0 is the image, each next one the mean of 2 x 2 pixels.
     """
 
     def __init__(self, image: Image) -> None:
@@ -46,8 +48,10 @@ class Pyramid:
 
         Parameters
         ----------
-        texels : (n, 2) from `texels`
-        footprint : (n,) width of the area to average, in pixels of level 0
+        texels : (n, 2) array
+            From `texels`.
+        footprint : (n,) array
+            Width of the area to average, in pixels of level 0.
         """
         level = np.clip(np.log2(np.maximum(footprint, 1)), 0, len(self.levels) - 1)
         low = np.minimum(level.astype(np.int64), max(len(self.levels) - 2, 0))
@@ -82,8 +86,10 @@ class Materials:
 
     Parameters
     ----------
-    materials : of the file
-    coloured : the vertices have colours: the base colour of faces without a material (-1) is then white
+    materials : list of MaterialFile
+        Of the file.
+    coloured : bool
+        The vertices have colours: the base colour of faces without a material (-1) is then white.
     """
 
     def __init__(self, materials: list[MaterialFile], coloured: bool = False) -> None:
@@ -97,9 +103,12 @@ class Materials:
 
         Parameters
         ----------
-        material : (n,) int, -1 is the default material
-        uvs : (n, 2), v up
-        scale : (n, 2) width of the area to average, in texture coordinates
+        material : (n,) int array
+            -1 is the default material.
+        uvs : (n, 2) array
+            v up.
+        scale : (n, 2) array
+            Width of the area to average, in texture coordinates.
         """
         result = np.empty((len(material), CHANNELS), np.float32)
         for index in np.unique(material):

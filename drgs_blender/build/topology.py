@@ -19,12 +19,14 @@ class Net:
 
     Attributes
     ----------
-    vertices : (n, 3) float64
-    point : (n,) int64
-    values : (n, c) float64 attributes of the vertices, interpolated linearly
-    faces : (m, 3) int64
-    uvs : (m, 3, 2) float64
-    tags : (m, t) int64 labels of the faces, inherited
+    vertices : (n, 3) float64 array
+    point : (n,) int64 array
+    values : (n, c) float64 array
+        Attributes of the vertices, interpolated linearly.
+    faces : (m, 3) int64 array
+    uvs : (m, 3, 2) float64 array
+    tags : (m, t) int64 array
+        Labels of the faces, inherited.
     """
 
     vertices: Array
@@ -42,17 +44,24 @@ def weld(
 
     Parameters
     ----------
-    vertices : (n, 3) finite
-    faces : (m, 3)
-    keys : (m,) int: corners of faces with different keys (materials) are never merged
-    normals : (m, 3, 3) unit corner normals: corners whose normals differ (cosine below `agree`) stay apart; None
-        merges them all
+    vertices : (n, 3) array
+        Finite.
+    faces : (m, 3) array
+    keys : (m,) int array
+        Corners of faces with different keys (materials) are never merged.
+    normals : (m, 3, 3) array or None
+        Unit corner normals: corners whose normals differ (cosine below `agree`) stay apart; None merges them all.
+    agree : float
+        Cosine.
 
     Returns
     -------
-    source : (k,) an original vertex for each new one
-    point : (k,) the place of each new vertex, numbered
-    faces : (m, 3) new faces
+    source : (k,) array
+        An original vertex for each new one.
+    point : (k,) array
+        The place of each new vertex, numbered.
+    faces : (m, 3) array
+        New faces.
     """
     extent = np.ptp(vertices, axis=0).max(initial=0.0)
     grid = np.round((vertices - vertices.min(axis=0)) / max(extent * 2e-7, 1e-30)).astype(np.int64)

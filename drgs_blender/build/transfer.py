@@ -27,7 +27,8 @@ def surfels_to_vertices(mesh: Mesh, surfels: Surfels, binding: Binding) -> int:
 
     Returns
     -------
-    int : vertices that took the nearest surfels
+    int
+        Vertices that took the nearest surfels.
     """
     vertices = mesh.vertices.astype(np.float64)
     k = min(NEAREST, len(surfels))

@@ -43,11 +43,18 @@ class Evaluated:
 
     Attributes
     ----------
-    number, layer : of the frame; its view layer, "" when there is only one
-    frame : its description, without blur
-    warnings : of the export, those of `pictures` too when these have come
-    count : of pictures whose mean is the blurred one; 0 where nothing is blurred
-    pictures : has these described, each with all passes and rays of the frame; may be called again
+    number : int
+        Of the frame.
+    layer : str
+        Its view layer, "" when there is only one.
+    frame : Frame
+        Its description, without blur.
+    warnings : list of str
+        Of the export, those of `pictures` too when these have come.
+    count : int
+        Of pictures whose mean is the blurred one; 0 where nothing is blurred.
+    pictures : callable
+        Has these described, each with all passes and rays of the frame; may be called again.
     """
 
     number: int
@@ -63,12 +70,16 @@ class BlenderProcess:
 
     Parameters
     ----------
-    blender : which Blender
-    job : what it should do, JSON-able: ``scene``, ``frames``, ``scripts``, ``passes``; with ``report`` the attribute
-        of that name has its ``files`` (as stored and as found) and ``notes`` before the first frame comes; with
-        ``keep`` it waits for `more` frames after these
-    key_of : gives the engine's key of the asset at a path
-    timeout : seconds that the evaluation of one frame may take, the first with the loading of the file
+    blender : Blender
+        Which Blender.
+    job : dict
+        What it should do, JSON-able: ``scene``, ``frames``, ``scripts``, ``passes``; with ``report`` the attribute of
+        that name has its ``files`` (as stored and as found) and ``notes`` before the first frame comes; with ``keep``
+        it waits for `more` frames after these.
+    key_of : callable
+        Gives the engine's key of the asset at a path.
+    timeout : float
+        Seconds that the evaluation of one frame may take, the first with the loading of the file.
     """
 
     def __init__(

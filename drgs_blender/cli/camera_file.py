@@ -23,7 +23,8 @@ def read_camera(path: str | Path) -> Camera:
 
     Parameters
     ----------
-    path : path of a JSON object with the keys
+    path : str or Path
+        A JSON object with the keys
 
         - ``matrix_world``: 4 rows of 4 numbers, camera to world, rigid, Blender's convention (looks down -Z, Y up)
         - ``width``, ``height``: pixels
@@ -35,6 +36,17 @@ def read_camera(path: str | Path) -> Camera:
     ------
     UsageError
         Naming the file and the key.
+
+    Examples
+    --------
+    A field of view of 90 degrees is as wide as twice the focal length:
+
+    >>> matrix = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]]
+    >>> text = json.dumps({"matrix_world": matrix, "width": 64, "height": 48, "fov_x": 90})
+    >>> _ = Path("camera.json").write_text(text)
+    >>> camera = read_camera("camera.json")
+    >>> round(camera.fx, 6), round(camera.fy, 6), camera.cx, camera.cy
+    (32.0, 32.0, 32.0, 24.0)
     """
     subject = f"camera {path}"
     path = Path(path)

@@ -34,8 +34,10 @@ class Source(Protocol):
 
     Attributes
     ----------
-    kinds : best first
-    notes : what its reader converted or assumed
+    kinds : tuple of {"splats", "mesh", "environment"}
+        Best first.
+    notes : list of str
+        What its reader converted or assumed.
     """
 
     kinds: tuple[Held, ...]

@@ -35,6 +35,11 @@ def parse_frames(text: str) -> list[int]:
     ------
     UsageError
         Naming the term that cannot be used.
+
+    Examples
+    --------
+    >>> parse_frames("1-9x4, 24-22x-1, 7")
+    [1, 5, 9, 24, 23, 22, 7]
     """
     frames: dict[int, None] = {}
     for term in text.replace(" ", "").split(","):
@@ -63,9 +68,11 @@ def frames_wanted(text: str | None, source: Path, output: Path) -> list[int] | N
 
     Parameters
     ----------
-    text : the value of ``--frames``: a range, "" for those that are there, None where it is not given, which means the
-        same for a `source` that is no file but a pattern of files
-    source, output : with a run of ``#`` for the number
+    text : str or None
+        The value of ``--frames``: a range, "" for those that are there, None where it is not given, which means the
+        same for a `source` that is no file but a pattern of files.
+    source, output : Path
+        With a run of ``#`` for the number.
 
     Raises
     ------
@@ -84,7 +91,13 @@ def write_frames(frames: Sequence[int]) -> str:
 
     Parameters
     ----------
-    frames : at least one, none twice
+    frames : sequence of int
+        At least one, none twice.
+
+    Examples
+    --------
+    >>> write_frames([1, 3, 5, 7, 30])
+    '1-7:2,30'
     """
     terms: list[str] = []
     start = 0

@@ -43,7 +43,9 @@ def settings_hash(frame: Frame, assets: Mapping[str, Path]) -> str:
 
     Parameters
     ----------
-    assets : path of the asset behind each ``ObjectState.asset``
+    frame : Frame
+    assets : mapping of str to Path
+        Path of the asset behind each ``ObjectState.asset``.
     """
     description, arrays = encode_frame(frame)
     for name in ("threads", "device"):
@@ -86,7 +88,8 @@ def remove_abandoned(template: str) -> None:
 
     Parameters
     ----------
-    template : pattern of the frames, with ``#``
+    template : str
+        Pattern of the frames, with ``#``.
     """
     folder, name = Path(template).parent, re.sub("#+", "*", glob.escape(Path(template).name))
     stem, suffix = os.path.splitext(name)

@@ -28,11 +28,13 @@ class Machine:
 
     Parameters
     ----------
-    keep : leave Blender, with its scene, for the next chunk
+    keep : bool
+        Leave Blender, with its scene, for the next chunk.
 
     Attributes
     ----------
-    assets : engine's key -> path of every asset of the open scene
+    assets : dict of str to Path
+        Engine's key -> path of every asset of the open scene.
     """
 
     def __init__(self, keep: bool = False) -> None:

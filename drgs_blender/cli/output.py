@@ -68,9 +68,11 @@ def write_preview(path: Path, combined: np.ndarray) -> None:
 
     Parameters
     ----------
-    path : PNG file
-    combined : (h, w, 4) float32, linear Rec.709, premultiplied alpha; written as 8-bit sRGB, straight alpha, clipped
-        to [0, 1]. Nothing else is done to it: view transforms belong to Blender.
+    path : Path
+        PNG file.
+    combined : (h, w, 4) float32 array
+        Linear Rec.709, premultiplied alpha; written as 8-bit sRGB, straight alpha, clipped to [0, 1]. Nothing else is
+        done to it: view transforms belong to Blender.
     """
     from ..core.color import linear_to_srgb
     from ..formats.images import write_png

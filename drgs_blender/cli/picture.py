@@ -26,11 +26,14 @@ class Picture:
 
     Parameters
     ----------
-    override : gives the settings of the command for those of the scene
+    shot : Evaluated
+    override : callable
+        Gives the settings of the command for those of the scene.
 
     Attributes
     ----------
-    frame : its description, without blur
+    frame : Frame
+        Its description, without blur.
     """
 
     def __init__(self, shot: Evaluated, override: Callable[[RenderSettings], RenderSettings]) -> None:

@@ -13,8 +13,7 @@ if TYPE_CHECKING:
 
 
 def surface_frame(path: Path, samples: int, session: Session) -> Frame:
-    """Frame whose surfaces get `samples` samples of light per point; `session` has its assets, for "
-    "``session.place``."""
+    """Frame whose surfaces get `samples` samples of light per point; ``session.place`` finds its assets."""
     from ..ipc.frame_file import read_frame_file
 
     frame = read_frame_file(path)

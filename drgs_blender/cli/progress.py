@@ -60,7 +60,10 @@ class FractionBar:
 
     Parameters
     ----------
-    programs : while kernels are compiled, lines on stdout for a program that reads them, where that is no terminal
+    args : argparse.Namespace
+    label : str
+    programs : bool
+        While kernels are compiled, lines on stdout for a program that reads them, where that is no terminal.
     """
 
     def __init__(self, args: argparse.Namespace, label: str, programs: bool = False) -> None:

@@ -131,8 +131,10 @@ def at_least_zero(text: str) -> float:
 
 
 def passes(text: str) -> tuple[str, ...]:
-    """``Combined,Depth``, ``temporal`` (what ``drgs denoise`` needs) or ``all`` -> names of the pass table, in its
-    order; Combined is always among them."""
+    """Names of the pass table, in its order, from ``Combined,Depth``, ``temporal`` or ``all``.
+
+    ``temporal`` is what ``drgs denoise`` needs; Combined is always among them.
+    """
     if text == "all":
         return tuple(BY_NAME)
     known = {name.lower(): name for name in BY_NAME}

@@ -1,5 +1,6 @@
-"""Keep Blender, with its scene, and an engine from one chunk of frames to the next: for farms that run many tasks on
-a node one after the other.
+"""Keep Blender, with its scene, and an engine from one chunk of frames to the next.
+
+For farms that run many tasks on a node one after the other.
 
 `start` begins a process in the background, `drgs render --session FOLDER` has it render, `stop` ends it. It ends by
 itself when the folder or the program that started it (Linux) is gone, and when nothing was asked of it for long.

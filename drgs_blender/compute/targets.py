@@ -91,7 +91,10 @@ def decide(asked: str, machine: str, system: str, has: Mapping[str, bool]) -> Ta
     ----------
     asked : str
         Name of a target, "native", or "" for the best one.
-    machine, system, has
+    machine, system : str
+        As for `usable`.
+    has : mapping of str to bool
+        As for `usable`.
         As for `usable`.
 
     Returns

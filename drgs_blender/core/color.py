@@ -11,7 +11,13 @@ LUMINANCE = (0.2126, 0.7152, 0.0722)
 
 
 def srgb_to_linear(encoded: Array) -> Array:
-    """Decode sRGB values; float32, any shape. Values outside [0, 1] follow the curve's extension."""
+    """Decode sRGB values; float32, any shape. Values outside [0, 1] follow the curve's extension.
+
+    Examples
+    --------
+    >>> srgb_to_linear([0, 0.5, 1]).round(3)
+    array([0.   , 0.214, 1.   ], dtype=float32)
+    """
     x = np.asarray(encoded, np.float32)
     # In double: powers in single precision have other last digits on other processors, and so would textures.
     power = ((np.maximum(x, 0.04045).astype(np.float64) + 0.055) / 1.055) ** 2.4

@@ -53,7 +53,9 @@ def metadata(frame: Frame, layer: str = "") -> dict[str, str]:
 
     Parameters
     ----------
-    layer : what stands in the file before the names of passes, with its dot
+    frame : Frame
+    layer : str
+        What stands in the file before the names of passes, with its dot.
     """
     names: dict[str, Iterable[str]] = {
         "object": [*(item.name for item in frame.objects), *(mesh.name for mesh in frame.meshes)],

@@ -15,8 +15,10 @@ class ReadType:
 
     Attributes
     ----------
-    extensions : usual endings; they never decide alone
-    kind : what comes out
+    extensions : tuple of str
+        Usual endings; they never decide alone.
+    kind : {"surfels", "mesh", "environment", "materials"}
+        What comes out.
     """
 
     extensions: tuple[str, ...]
@@ -29,10 +31,14 @@ class WriteType:
 
     Attributes
     ----------
-    extensions : endings that choose it
-    kind : what goes in
-    up : the up axis that the format prescribes, or that is written unless asked otherwise
-    fixed : no other up axis can be asked for
+    extensions : tuple of str
+        Endings that choose it.
+    kind : {"splats", "mesh", "environment"}
+        What goes in.
+    up : {"z", "y"}
+        The up axis that the format prescribes, or that is written unless asked otherwise.
+    fixed : bool
+        No other up axis can be asked for.
     """
 
     extensions: tuple[str, ...]

@@ -24,12 +24,16 @@ class Camera:
 
     Attributes
     ----------
-    matrix_world : (4, 4) float64 camera-to-world, rigid, Blender's convention; of an orthographic camera -Z may lean,
-        its part along the axis still of length 1
-    width, height : full picture in pixels (after resolution %)
-    fx, fy, cx, cy : pixels; fx != fy expresses pixel aspect
-    region : (x0, y0, x1, y1) in pixels, half-open: what is rendered (border); None is everything. Results are always
-        of the region's size.
+    matrix_world : (4, 4) float64 array
+        Camera-to-world, rigid, Blender's convention; of an orthographic camera -Z may lean, its part along the axis
+        still of length 1.
+    width, height : int
+        Full picture in pixels (after resolution %).
+    fx, fy, cx, cy : float
+        Pixels; fx != fy expresses pixel aspect.
+    region : tuple of int, optional
+        (x0, y0, x1, y1) in pixels, half-open: what is rendered (border); None is everything. Results are always of the
+        region's size.
     """
 
     matrix_world: Array
@@ -72,10 +76,16 @@ class Adjustment:
 
     Attributes
     ----------
-    tint : linear Rec.709 factors on the albedo, after hue, saturation and value
-    hue : turns, added to the hue of the albedo; saturation and value are factors (HSV, as Blender's node)
-    roughness, metallic : gain, offset, lowest, highest: new = clip(gain * old + offset, lowest, highest)
-    mask : (n,) float32, how much of it a vertex gets, in [0, 1]; None: all of it everywhere
+    tint : tuple of float
+        Linear Rec.709 factors on the albedo, after hue, saturation and value.
+    hue : float
+        Turns, added to the hue of the albedo (HSV, as Blender's node).
+    saturation, value : float
+        Factors on those of the albedo.
+    roughness, metallic : tuple of float
+        Gain, offset, lowest, highest: new = clip(gain * old + offset, lowest, highest).
+    mask : (n,) float32 array, optional
+        How much of it a vertex gets, in [0, 1]; None: all of it everywhere.
     """
 
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -93,19 +103,32 @@ class ObjectState:
 
     Attributes
     ----------
-    name : object name, used in messages
-    asset : key of a loaded asset (see Session.load_asset)
-    matrix_world : (4, 4) float64 object-to-world; may scale, shear or mirror
-    vertices : (n, 3) float32, **object space**, the evaluated mesh; None is the asset's rest mesh
-    corner_normals : (m, 3, 3) float32 unit, object space, one a face corner, or None for smooth angle-weighted
-        vertex normals computed by the engine
-    albedo, roughness, metallic : per-vertex overrides (n, 3), (n,), (n,); None keeps the asset's
-    pass_index : Blender's object index pass
-    visibility : which rays meet it
-    adjustment : changes to the materials, after the overrides
-    tear : metres, object space: faces with an edge that is longer than in the asset by more than this, and more than
-        three times as long, span a tear and are left out with their surfels; 0: none
-    grain : how much surfels that are stretched are grains instead, see `deform.grains`; 0: not at all
+    name : str
+        Object name, used in messages.
+    asset : str
+        Key of a loaded asset (see Session.load_asset).
+    matrix_world : (4, 4) float64 array
+        Object-to-world; may scale, shear or mirror.
+    vertices : (n, 3) float32 array, optional
+        **Object space**, the evaluated mesh; None is the asset's rest mesh.
+    corner_normals : (m, 3, 3) float32 array, optional
+        Unit, object space, one per face corner, or None for smooth angle-weighted vertex normals computed by the
+        engine.
+    albedo : (n, 3) array, optional
+        Per-vertex overrides; None keeps the asset's.
+    roughness, metallic : (n,) array, optional
+        Per-vertex overrides; None keeps the asset's.
+    pass_index : int
+        Blender's object index pass.
+    visibility : Visibility
+        Which rays meet it.
+    adjustment : Adjustment, optional
+        Changes to the materials, after the overrides.
+    tear : float
+        Metres, object space: faces with an edge that is longer than in the asset by more than this, and more than three
+        times as long, span a tear and are left out with their surfels; 0: none.
+    grain : float
+        How much surfels that are stretched are grains instead, see `deform.grains`; 0: not at all.
     """
 
     name: str
@@ -129,8 +152,10 @@ class Image:
 
     Attributes
     ----------
-    pixels : (h, w, 4) uint8 or float32, row 0 at the top; alpha is straight and last
-    encoding : "srgb" is decoded by the engine (colour channels only), "linear" is linear Rec.709 or no colour at all
+    pixels : (h, w, 4) uint8 or float32 array
+        Row 0 at the top; alpha is straight and last.
+    encoding : {"linear", "srgb"}
+        "srgb" is decoded by the engine (colour channels only), "linear" is linear Rec.709 or no colour at all.
     """
 
     name: str
@@ -144,10 +169,16 @@ class Texture:
 
     Attributes
     ----------
-    image : name of one of ``Frame.images``
-    channel : what of it: "rgb" for colours, one channel or the luminance for numbers
-    transform : (2, 3) float64, maps (u, v, 1) to the image's own (u, v); v = 0 is the image's bottom edge
-    interpolation, extension : as Blender's Image Texture node
+    image : str
+        Name of one of ``Frame.images``.
+    channel : {"rgb", "r", "g", "b", "a", "luminance"}
+        What of it: "rgb" for colours, one channel or the luminance for numbers.
+    transform : (2, 3) float64 array
+        Maps (u, v, 1) to the image's own (u, v); v = 0 is the image's bottom edge.
+    interpolation : {"linear", "closest"}
+        As Blender's Image Texture node.
+    extension : {"repeat", "extend", "clip", "mirror"}
+        As Blender's Image Texture node.
     """
 
     image: str
@@ -163,9 +194,12 @@ class Material:
 
     Attributes
     ----------
-    base_colour : linear Rec.709; above 1, as in Cycles, diffuse light grows and that of metals does not
-    roughness, metallic : [0, 1], with a texture factors that may be larger
-    emission : linear Rec.709 radiance, colour times strength
+    base_colour : tuple of float
+        Linear Rec.709; above 1, as in Cycles, diffuse light grows and that of metals does not.
+    roughness, metallic : float
+        In [0, 1]; with a texture factors that may be larger.
+    emission : tuple of float
+        Linear Rec.709 radiance, colour times strength.
     """
 
     name: str
@@ -185,16 +219,25 @@ class MeshState:
 
     Attributes
     ----------
-    name : object name, used in messages
-    vertices : (n, 3) float32, object space
-    faces : (m, 3) int32
-    matrices : (k, 4, 4) float64 object-to-world, one an instance
-    pass_indices : (k,) int32, Blender's object index pass of each instance
-    corner_normals : (m, 3, 3) float32 unit, object space, or None for smooth angle-weighted vertex normals
-    uvs : (m, 3, 2) float32, one a face corner, or None without textures
-    material_index : (m,) int32 into ``materials``, or None: the first everywhere
-    materials : never empty
-    visibility : of all its instances
+    name : str
+        Object name, used in messages.
+    vertices : (n, 3) float32 array
+        Object space.
+    faces : (m, 3) int32 array
+    matrices : (k, 4, 4) float64 array
+        Object-to-world, one per instance.
+    pass_indices : (k,) int32 array
+        Blender's object index pass of each instance.
+    corner_normals : (m, 3, 3) float32 array, optional
+        Unit, object space, or None for smooth angle-weighted vertex normals.
+    uvs : (m, 3, 2) float32 array, optional
+        One per face corner, or None without textures.
+    material_index : (m,) int32 array, optional
+        Into ``materials``, or None: the first everywhere.
+    materials : list of Material
+        Never empty.
+    visibility : Visibility
+        Of all its instances.
     """
 
     name: str
@@ -215,20 +258,36 @@ class Light:
 
     Attributes
     ----------
-    kind : "point", "sun", "spot" or "area"
-    matrix_world : (4, 4) float64; the light shines along its -Z
-    colour : linear Rec.709
-    power : watts of radiant flux; of a sun watts a square metre at a surface that faces it. Exposure and
-        temperature are already in power and colour
-    radius : metres, of point and spot lights
-    soft_falloff : point and spot lights are disks that face whoever looks (Blender's default), else spheres
-    angle : radians, apparent diameter of a sun
-    spot_size, spot_blend : radians, full cone angle; [0, 1]
-    shape, size_x, size_y : of area lights, metres before ``matrix_world`` scales them
-    spread : radians, of area lights; pi shines everywhere
-    normalize : power is independent of the light's size (Blender 5's switch, on by default)
-    camera, diffuse, glossy : whether such rays see the light
-    cast_shadow : whether objects between light and surface block it
+    kind : {"point", "sun", "spot", "area"}
+    matrix_world : (4, 4) float64 array
+        The light shines along its -Z.
+    colour : tuple of float
+        Linear Rec.709.
+    power : float
+        Watts of radiant flux; of a sun watts per square metre at a surface that faces it. Exposure and temperature are
+        already in power and colour.
+    radius : float
+        Metres, of point and spot lights.
+    soft_falloff : bool
+        Point and spot lights are disks that face whoever looks (Blender's default), else spheres.
+    angle : float
+        Radians, apparent diameter of a sun.
+    spot_size : float
+        Radians, full cone angle.
+    spot_blend : float
+        In [0, 1].
+    shape : {"square", "rectangle", "disk", "ellipse"}
+        Of area lights.
+    size_x, size_y : float
+        Of area lights, metres before ``matrix_world`` scales them.
+    spread : float
+        Radians, of area lights; pi shines everywhere.
+    normalize : bool
+        Power is independent of the light's size (Blender 5's switch, on by default).
+    camera, diffuse, glossy : bool
+        Whether such rays see the light.
+    cast_shadow : bool
+        Whether objects between light and surface block it.
     """
 
     name: str
@@ -342,9 +401,12 @@ class Pose:
 
     Attributes
     ----------
-    name : of the object, used in messages
-    matrices : (k, 4, 4) float64 object-to-world, one an instance; an `ObjectState` has one
-    vertices : (n, 3) float32, object space; None: as in the frame itself
+    name : str
+        Of the object, used in messages.
+    matrices : (k, 4, 4) float64 array
+        Object-to-world, one per instance; an `ObjectState` has one.
+    vertices : (n, 3) float32 array, optional
+        Object space; None: as in the frame itself.
     """
 
     name: str
@@ -372,9 +434,11 @@ class Frame:
     ----------
     noise_index : int
         Part of the seed of all random numbers. It is the scene's frame number only while *Animated Seed* is on.
-    previous, next : one frame earlier and later, for the passes of motion; None: nothing moves
-    history : name of the sequence of pictures that this one continues. With the denoiser SVGF, what the engine rendered
-        before under this name is mixed in; "" stands alone, as every final frame must
+    previous, next : Moment, optional
+        One frame earlier and later, for the passes of motion; None: nothing moves.
+    history : str
+        Name of the sequence of pictures that this one continues. With the denoiser SVGF, what the engine rendered
+        before under this name is mixed in; "" stands alone, as every final frame must.
     """
 
     noise_index: int

@@ -11,7 +11,13 @@ _NUMBER = re.compile(r"\d+")
 
 
 def frame_path(template: str, frame: int) -> Path:
-    """Path of a frame: the last run of ``#`` in the file's name becomes the number, padded with zeros."""
+    """Path of a frame: the last run of ``#`` in the file's name becomes the number, padded with zeros.
+
+    Examples
+    --------
+    >>> frame_path("take_#/cow_####.exr", 12).as_posix()
+    'take_#/cow_0012.exr'
+    """
     folder, name = Path(template).parent, Path(template).name
     runs = list(re.finditer("#+", name))
     if not runs:
@@ -28,6 +34,11 @@ def template_of(paths: list[Path]) -> tuple[str, list[int]]:
     ------
     UsageError
         They differ in more, or lie in several folders.
+
+    Examples
+    --------
+    >>> template_of([Path("cow_0012.ply"), Path("cow_0007.ply")])
+    ('cow_####.ply', [7, 12])
     """
     first = paths[0]
     for found in reversed(list(_NUMBER.finditer(first.name))):

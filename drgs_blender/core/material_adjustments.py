@@ -18,8 +18,11 @@ def adjusted(materials: Mapping[str, Array], adjustment: Adjustment, mask: Array
 
     Parameters
     ----------
-    materials : "albedo" (n, 3) linear Rec.709, "roughness" (n,), "metallic" (n,)
-    mask : (n,) in [0, 1] at the same places; replaces ``adjustment.mask``, which is of vertices
+    materials : mapping of str to array
+        "albedo" (n, 3) linear Rec.709, "roughness" (n,), "metallic" (n,).
+    adjustment : Adjustment
+    mask : (n,) array, optional
+        In [0, 1] at the same places; replaces ``adjustment.mask``, which is of vertices.
     """
     made = {"albedo": recoloured(materials["albedo"], adjustment)}
     for name in ("roughness", "metallic"):

@@ -39,13 +39,20 @@ class Header:
 
     Attributes
     ----------
-    digest : of the settings and the mesh; another one means other frames
-    moves : of what moves in each frame, see `simulate.digest`
-    points, vertices : counts
-    first : frame at which all is at rest
-    fps : frames a second
-    settings : JSON-able, as they were given
-    tear, grain : see `frame.ObjectState`
+    digest : str
+        Of the settings and the mesh; another one means other frames.
+    moves : list of str
+        Of what moves in each frame, see `simulate.digest`.
+    points, vertices : int
+        Counts.
+    first : int
+        Frame at which all is at rest.
+    fps : float
+        Frames per second.
+    settings : dict
+        JSON-able, as they were given.
+    tear, grain : float
+        See `frame.ObjectState`.
     """
 
     digest: str
@@ -66,9 +73,12 @@ class ParticleFrame:
 
     Attributes
     ----------
-    points : (n, 3) float32, metres
-    gradients : (n, 3, 3) float16, deformation gradient of each since rest
-    vertices : (k, 3) float32, metres: the mesh
+    points : (n, 3) float32 array
+        Metres.
+    gradients : (n, 3, 3) float16 array
+        Deformation gradient of each since rest.
+    vertices : (k, 3) float32 array
+        Metres: the mesh.
     """
 
     points: Array
@@ -81,7 +91,8 @@ class ParticleCache:
 
     Parameters
     ----------
-    folder : need not exist before `create`
+    folder : str or path-like
+        Need not exist before `create`.
     """
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:

@@ -11,12 +11,18 @@ class Pass:
 
     Attributes
     ----------
-    name : name in Frame.passes and layer name in EXR files (Blender's own name where Blender has the pass)
-    channels : channel letters, as Blender's ``add_pass`` wants them
-    kind : Blender's pass type ('COLOR', 'VECTOR' or 'VALUE')
-    blender : property of ``ViewLayer`` that switches it on in Blender; "" where DR-GS has its own switch
-    about : tooltip
-    exact : its numbers can be neither averaged nor rounded
+    name : str
+        Name in Frame.passes and layer name in EXR files (Blender's own name where Blender has the pass).
+    channels : str
+        Channel letters, as Blender's ``add_pass`` wants them.
+    kind : str
+        Blender's pass type: "COLOR", "VECTOR" or "VALUE".
+    blender : str
+        Property of ``ViewLayer`` that switches it on in Blender; "" where DR-GS has its own switch.
+    about : str
+        Tooltip.
+    exact : bool
+        Its numbers can be neither averaged nor rounded.
     """
 
     name: str

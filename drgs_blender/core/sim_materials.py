@@ -39,17 +39,30 @@ class Material:
 
     Attributes
     ----------
-    model : "elastic" (neo-Hookean), "corotated" (fixed corotated), "plastic" (Hencky strain, von Mises yield),
-        "sand" (Drucker-Prager), "snow" (Stomakhin et al. 2013) or "fluid" (weakly compressible)
-    youngs_modulus, poisson : Pa, and the ratio in [0, 0.5); of a fluid they give the bulk modulus E / (3 (1 - 2 nu))
-    density : kg / m^3
-    yield_stress : Pa, plastic: deviatoric stress at which flow starts
-    hardening : plastic: Pa that the yield stress gains per unit of plastic strain (negative softens, down to a tenth);
-        snow: the exponent xi
-    viscosity : Pa s, fluid; of plastic flow it delays the return to the yield surface (foam)
-    friction_angle : degrees, sand
-    cohesion : sand: volumetric strain that it bears before it comes apart
-    compression, stretch : snow: elastic strain at which it crushes and tears
+    model : str
+        "elastic" (neo-Hookean), "corotated" (fixed corotated), "plastic" (Hencky strain, von Mises yield), "sand"
+        (Drucker-Prager), "snow" (Stomakhin et al. 2013) or "fluid" (weakly compressible).
+    youngs_modulus : float
+        Pa; of a fluid it gives with `poisson` the bulk modulus E / (3 (1 - 2 nu)).
+    poisson : float
+        Ratio in [0, 0.5).
+    density : float
+        kg / m^3.
+    yield_stress : float
+        Pa, plastic: deviatoric stress at which flow starts.
+    hardening : float
+        Plastic: Pa that the yield stress gains per unit of plastic strain (negative softens, down to a tenth); snow:
+        the exponent xi.
+    viscosity : float
+        Pa s, fluid; of plastic flow it delays the return to the yield surface (foam).
+    friction_angle : float
+        Degrees, sand.
+    cohesion : float
+        Sand: volumetric strain that it bears before it comes apart.
+    compression : float
+        Snow: elastic strain at which it crushes.
+    stretch : float
+        Snow: elastic strain at which it tears.
     """
 
     name: str
@@ -149,6 +162,12 @@ def make_material(name: str, changes: Mapping[str, Any] | None = None, subject: 
     ------
     UsageError
         An unknown name or setting, or a number that means nothing, saying what is possible.
+
+    Examples
+    --------
+    >>> jelly = make_material("jelly", {"density": 900})
+    >>> jelly.model, jelly.density
+    ('elastic', 900.0)
     """
     if name not in MATERIALS:
         raise UsageError(subject, f"there is no material {name!r}", f"There are {', '.join(MATERIALS)}")
@@ -173,12 +192,16 @@ class Matter:
 
     Attributes
     ----------
-    model : (n,) uint8
-    parameters : (n, COLUMNS) float32, see `Material.row`
-    density : (n,) float32, kg / m^3
-    wave_speed : (n,) float32, m/s
-    diffusivity : (n,) float32, m^2 / s, of momentum
-    keeps_shape : (n,) bool
+    model : (n,) uint8 array
+    parameters : (n, COLUMNS) float32 array
+        See `Material.row`.
+    density : (n,) float32 array
+        kg / m^3.
+    wave_speed : (n,) float32 array
+        m/s.
+    diffusivity : (n,) float32 array
+        m^2 / s, of momentum.
+    keeps_shape : (n,) bool array
     """
 
     model: Array

@@ -62,18 +62,25 @@ def attach(
     Parameters
     ----------
     mesh : Mesh
-    pretrained : surfels whose place on the faces and whose opacity are averaged per face, or None
-    tau : a pretrained surfel counts for the face it projects to only if its smallest barycentric coordinate is larger
-    scale : "fitted" matches the second moments of the face, and cuts faces as `density` says; "paper" is the distance
-        to the nearest other face centre in both directions, one surfel a face
-    density : longest edge of a fitted surfel's piece of face, as a part of the mesh's diagonal: diagonal / density
-    spread : factor on fitted standard deviations
-    opacity : where no pretrained surfels are given
+    pretrained : Surfels, optional
+        Surfels whose place on the faces and whose opacity are averaged per face.
+    tau : float
+        A pretrained surfel counts for the face it projects to only if its smallest barycentric coordinate is larger.
+    scale : {"fitted", "paper"}
+        "fitted" matches the second moments of the face, and cuts faces as `density` says; "paper" is the distance to
+        the nearest other face centre in both directions, one surfel per face.
+    density : float
+        Longest edge of a fitted surfel's piece of face, as a part of the mesh's diagonal: diagonal / density.
+    spread : float
+        Factor on fitted standard deviations.
+    opacity : float
+        Where no pretrained surfels are given.
 
     Returns
     -------
-    surfels, binding
+    surfels : Surfels
         Materials are those of the mesh at the surfel's centre; the shading normal is the smooth one.
+    binding : Binding
     report : dict
         "surfels", "faces", "cut_faces", "degenerate_faces" (they get no surfel); with `pretrained` also "pretrained",
         "interior", "on_edges" (projected to an edge or vertex and not used), "faces_with_pretrained",

@@ -26,11 +26,15 @@ class Faces:
 
     Attributes
     ----------
-    corners : (m, 3, 3) vertex positions
-    normal : (m, 3) unit normals; (0, 0, 1) where degenerate
-    area : (m,)
-    mean_edge : (m,) mean edge length: the unit of Binding.offset
-    degenerate : (m,) bool: no area, or not finite
+    corners : (m, 3, 3) array
+        Vertex positions.
+    normal : (m, 3) array
+        Unit normals; (0, 0, 1) where degenerate.
+    area : (m,) array
+    mean_edge : (m,) array
+        Mean edge length: the unit of Binding.offset.
+    degenerate : (m,) bool array
+        No area, or not finite.
     """
 
     corners: Array
@@ -57,8 +61,15 @@ def shading_frames(faces: Faces, indices: Array, vertices: Array, face: Array, b
 
     Parameters
     ----------
-    faces, indices, vertices : the mesh: measured faces, (m, 3) vertex indices, (k, 3) positions
-    face, barycentric : (n,), (n, 3): the points
+    faces : Faces
+        The mesh's, measured.
+    indices : (m, 3) array
+        Vertices of each face.
+    vertices : (k, 3) array
+    face : (n,) array
+        Faces of the points.
+    barycentric : (n, 3) array
+        The points on them.
     """
     normals = VertexNormals(indices, len(vertices))(vertices).astype(np.float64)
     s = unit(np.einsum("nk,nkc->nc", barycentric, normals[indices[face]]))

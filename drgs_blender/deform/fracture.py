@@ -15,13 +15,15 @@ def torn_faces(rest: Array, now: Array, faces: Array, gap: float) -> Array:
 
     Parameters
     ----------
-    rest, now : (n, 3) float, metres, the same space
-    faces : (m, 3) int
-    gap : metres
+    rest, now : (n, 3) float array
+        Metres, the same space.
+    faces : (m, 3) int array
+    gap : float
+        Metres.
 
     Returns
     -------
-    (m,) bool
+    (m,) bool array
         Faces with a vertex that is not finite are not among them.
     """
     torn = np.zeros(len(faces), bool)

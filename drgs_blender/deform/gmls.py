@@ -45,12 +45,18 @@ class Weights:
 
     Attributes
     ----------
-    source : (n, k) int32, neighbours, the first one always of use; N and Q are 0 where fewer than k are of use
-    weight : (n, k, 4) float32, Q in metres, and N
-    offset : (n, 3) float32, from the first neighbour to the point, metres
-    reach : (n,) float32, from the first neighbour to the farthest that is of use, metres
-    separated : number of points that had neighbours across a gap, which are not used
-    stranded : number of points all of whose neighbours were across a gap; the nearest carries them
+    source : (n, k) int32 array
+        Neighbours, the first one always of use; N and Q are 0 where fewer than k are of use.
+    weight : (n, k, 4) float32 array
+        Q in metres, and N.
+    offset : (n, 3) float32 array
+        From the first neighbour to the point, metres.
+    reach : (n,) float32 array
+        From the first neighbour to the farthest that is of use, metres.
+    separated : int
+        Number of points that had neighbours across a gap, which are not used.
+    stranded : int
+        Number of points all of whose neighbours were across a gap; the nearest carries them.
     """
 
     source: Array
@@ -74,12 +80,18 @@ def bind_points(
 
     Parameters
     ----------
-    points : (n, 3) metres
-    sources : (s, 3) metres, at rest
-    neighbours : used at most
-    space : filled space of which the sources are inside; a neighbour counts only if the way to it stays inside
-    parts : (s,) int, number of the connected part of each source; neighbours are all of one part: that of the nearest
-    point_parts : (n,) int, overrides the part; -1 leaves it to the nearest
+    points : (n, 3) array
+        Metres.
+    sources : (s, 3) array
+        Metres, at rest.
+    neighbours : int
+        Used at most.
+    space : Volume, optional
+        Filled space of which the sources are inside; a neighbour counts only if the way to it stays inside.
+    parts : (s,) int array, optional
+        Number of the connected part of each source; neighbours are all of one part: that of the nearest.
+    point_parts : (n,) int array, optional
+        Overrides the part; -1 leaves it to the nearest.
 
     Raises
     ------
@@ -185,13 +197,17 @@ def carry(weights: Weights, x: Array, gradients: Array) -> tuple[Array, Array, i
 
     Parameters
     ----------
-    x : (s, 3) float32 or float64, metres: the sources now
-    gradients : (s, 3, 3) float32: their deformation gradients since they were bound
+    weights : Weights
+    x : (s, 3) float32 or float64 array
+        Metres: the sources now.
+    gradients : (s, 3, 3) float32 array
+        Their deformation gradients since they were bound.
 
     Returns
     -------
-    points : (n, 3) of the type of x
-    gradients : (n, 3, 3) float32
+    points : (n, 3) array
+        Of the type of x.
+    gradients : (n, 3, 3) float32 array
     turned : int
         Points where blending would have turned matter inside out or spanned a tear; the nearest neighbour alone
         carries those, stretched no more than the neighbours have moved apart.
@@ -215,8 +231,10 @@ def pack(x: Array, gradients: Array) -> tuple[Array, Array]:
 
     Returns
     -------
-    rows : (s, 16) float32, a cache line each: the columns of its gradient and its place, each with a free one
-    centre : (3,) float64 from which places are
+    rows : (s, 16) float32 array
+        A cache line each: the columns of its gradient and its place, each with a free one.
+    centre : (3,) float64 array
+        From which places are.
     """
     centre = _centre(x)
     rows = aligned(LANES * len(x), np.float32)
@@ -272,13 +290,25 @@ def settled(f, p, g, offset, apart, reach):  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    f, p : the blended gradient, row by row, and place, from the nearest neighbour
-    g, offset : gradient of the nearest neighbour, and the point from it at rest
-    apart, reach : from it to the farthest neighbour now, squared, and at rest
+    f : tuple of float
+        The blended gradient, row by row.
+    p : tuple of float
+        The blended place, from the nearest neighbour.
+    g : tuple of float
+        Gradient of the nearest neighbour.
+    offset : (3,) array
+        The point from it at rest.
+    apart : float
+        From it to the farthest neighbour now, squared.
+    reach : float
+        The same at rest, not squared.
 
     Returns
     -------
-    f, p, turned : those to take, and whether they are the nearest neighbour's
+    f, p : tuple of float
+        Those to take.
+    turned : bool
+        Whether they are the nearest neighbour's.
     """
     zero, one = np.float32(0.0), np.float32(1.0)
     own, blended = _squares(g), _squares(f)

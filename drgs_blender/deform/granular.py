@@ -25,9 +25,12 @@ def grainy(posed: PosedSurfels, scale: Array, grain: float) -> PosedSurfels:
 
     Parameters
     ----------
-    posed : surfels of one object
-    scale : (n, 2) their scales where nothing is stretched, metres
-    grain : standard deviation of the normals' slopes
+    posed : PosedSurfels
+        Surfels of one object.
+    scale : (n, 2) array
+        Their scales where nothing is stretched, metres.
+    grain : float
+        Standard deviation of the normals' slopes.
     """
     u, v = posed.tangent_u.astype(np.float64), posed.tangent_v.astype(np.float64)
     uu, vv, uv = (np.einsum("nc,nc->n", a, b) for a, b in ((u, u), (v, v), (u, v)))

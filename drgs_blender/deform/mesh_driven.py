@@ -35,12 +35,20 @@ class Posing(NamedTuple):
 
     Attributes
     ----------
-    vertices : (n, 3) float32, world space
-    normals : (3 m, 3) float32 of the corners; None: smooth ones are to be made
-    bent : (m, 3) int32, faces that smooth normals are made from: those that are torn are points
-    linear, side : see `pose_surfels`
-    opacity : of the surfels where all vertices are finite
-    channels : materials of the surfels; the asset's own arrays where nothing was edited
+    vertices : (n, 3) float32 array
+        World space.
+    normals : (3 m, 3) float32 array or None
+        Of the corners; None: smooth ones are to be made.
+    bent : (m, 3) int32 array
+        Faces that smooth normals are made from: those that are torn are points.
+    linear : array
+        See `pose_surfels`.
+    side : float
+        See `pose_surfels`.
+    opacity : array
+        Of the surfels where all vertices are finite.
+    channels : dict of str to array
+        Materials of the surfels; the asset's own arrays where nothing was edited.
     """
 
     vertices: Array
@@ -57,7 +65,12 @@ class MeshDriven:
 
     Parameters
     ----------
-    mesh, surfels, binding : the asset at rest, object space
+    mesh : Mesh
+        At rest, object space.
+    surfels : Surfels
+        At rest, object space.
+    binding : Binding
+        Of the surfels to the mesh.
 
     Attributes
     ----------
@@ -66,7 +79,7 @@ class MeshDriven:
         face's edges, since such a face has no deformation gradient.
     lost : int
         Surfels of the last pose whose face had a vertex that was not finite; they are transparent.
-    rest : tuple of arrays
+    rest : tuple of array
         What `pose_surfels` reads of the binding: face, weights, offset in metres, the faces' mean edge where they have
         no area (else 0), normal, the tangents in the frame of edges and normal, `wide_support.spans` and the same in
         theirs.
@@ -117,16 +130,22 @@ class MeshDriven:
 
         Parameters
         ----------
-        vertices_world : (n, 3) float32, world space: the posed mesh
-        corner_normals_world : (m, 3, 3) float32 unit normals of the face corners, pointing out of the object in the
-            world (as they appear, mirrored or not); None computes smooth angle-weighted ones
-        materials : "albedo" (n, 3), "roughness" (n,), "metallic" (n,) of the vertices in this frame; None or absent
-            keeps the asset's. A surfel keeps its own value as far as its face's vertices are unchanged and takes the
-            new value in proportion to the weights of the changed ones.
-        matrix_world : (4, 4) object-to-world that `vertices_world` contain. Needed where it mirrors or scales: it
-            says which side of a face is out, and scales what stands off the surface. None is rigid.
-        object_index : index into Frame.objects, copied to every surfel
-        torn : (m,) bool, faces that are not there: their surfels are transparent, and they bend no smooth normals
+        vertices_world : (n, 3) float32 array
+            World space: the posed mesh.
+        corner_normals_world : (m, 3, 3) float32 array, optional
+            Unit normals of the face corners, pointing out of the object in the world (as they appear, mirrored or not);
+            None computes smooth angle-weighted ones.
+        materials : mapping of str to (array or None), optional
+            "albedo" (n, 3), "roughness" (n,), "metallic" (n,) of the vertices in this frame; None or absent keeps the
+            asset's. A surfel keeps its own value as far as its face's vertices are unchanged and takes the new value in
+            proportion to the weights of the changed ones.
+        matrix_world : (4, 4) array, optional
+            Object-to-world that `vertices_world` contain. Needed where it mirrors or scales: it says which side of a
+            face is out, and scales what stands off the surface. None is rigid.
+        object_index : int
+            Index into Frame.objects, copied to every surfel.
+        torn : (m,) bool array, optional
+            Faces that are not there: their surfels are transparent, and they bend no smooth normals.
 
         Returns
         -------
@@ -283,11 +302,20 @@ def pose_surfels(
 
     Parameters
     ----------
-    room : not used
-    mesh : posed vertices, faces, normals of the vertices or (`by_corner`) of the corners
-    linear, side : (3, 3) float64 of the object's matrix, and -1 if that mirrors, else 1
-    rest : `MeshDriven.rest`
-    out : centre, tangent_u, tangent_v, normal, opacity; the last is written where a vertex is not finite
+    lane, lanes : int
+    room : object
+        Not used.
+    mesh : tuple of array
+        Posed vertices, faces, normals of the vertices or (`by_corner`) of the corners.
+    by_corner : bool
+    linear : (3, 3) float64 array
+        Of the object's matrix.
+    side : float
+        -1 if that mirrors, else 1.
+    rest : tuple of array
+        `MeshDriven.rest`.
+    out : tuple of array
+        Written: centre, tangent_u, tangent_v, normal; opacity where a vertex is not finite.
     """
     vertices, faces, normals = mesh
     face, weights, offset, rest_edge, local_normal, coordinates, span, in_span = rest

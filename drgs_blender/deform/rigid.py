@@ -17,9 +17,12 @@ def pose_by_matrix(surfels: Surfels, matrix_world: Array, object_index: int = 0)
 
     Parameters
     ----------
-    surfels : object space
-    matrix_world : (4, 4) object-to-world
-    object_index : index into Frame.objects, copied to every surfel
+    surfels : Surfels
+        Object space.
+    matrix_world : (4, 4) array
+        Object-to-world.
+    object_index : int
+        Index into Frame.objects, copied to every surfel.
     """
     matrix = np.asarray(matrix_world, np.float64)
     linear = matrix[:3, :3]

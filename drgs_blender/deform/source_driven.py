@@ -19,9 +19,14 @@ class SourceDriven:
 
     Parameters
     ----------
-    asset : bound surfels and mesh at rest, object space
-    sources : (s, 3) at rest, in the space of the asset
-    space, parts : as of `gmls.bind_points`
+    asset : Asset
+        Bound surfels and mesh at rest, object space.
+    sources : (s, 3) array
+        At rest, in the space of the asset.
+    space : Volume, optional
+        As of `gmls.bind_points`.
+    parts : array, optional
+        As of `gmls.bind_points`.
 
     Attributes
     ----------
@@ -55,7 +60,12 @@ class SourceDriven:
 
         Parameters
         ----------
-        x, gradients : (s, 3), (s, 3, 3): the sources now, and their deformation gradients
+        x : (s, 3) array
+            The sources now.
+        gradients : (s, 3, 3) array
+            Their deformation gradients.
+        object_index : int
+            Index into Frame.objects, copied to every surfel.
 
         Returns
         -------

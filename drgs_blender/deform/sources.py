@@ -22,7 +22,10 @@ class MeshSource:
 
     Parameters
     ----------
-    vertices, faces : (n, 3), (m, 3): at rest
+    vertices : (n, 3) array
+        At rest.
+    faces : (m, 3) array
+        At rest.
     """
 
     def __init__(self, vertices: Array, faces: Array) -> None:
@@ -68,7 +71,8 @@ class PointSource:
 
     Parameters
     ----------
-    points : (n, 3) at rest
+    points : (n, 3) array
+        At rest.
     """
 
     def __init__(self, points: Array) -> None:

@@ -21,17 +21,20 @@ def surfel_update(gradient: Array, rotation: Array, scale: Array) -> tuple[Array
 
     Parameters
     ----------
-    gradient : (n, 3, 3) deformation gradients F; may be singular or mirror
-    rotation : (n, 3, 3) rotations [t_u, t_v, n]
-    scale : (n, 2) standard deviations along t_u and t_v
+    gradient : (n, 3, 3) array
+        Deformation gradients F; may be singular or mirror.
+    rotation : (n, 3, 3) array
+        Rotations [t_u, t_v, n].
+    scale : (n, 2) array
+        Standard deviations along t_u and t_v.
 
     Returns
     -------
-    rotation : (n, 3, 3) of the dtype of the inputs
-        Right-handed; the third column is the normal of the image plane, on the same side of the matter as before:
-        normalised sign(det F) cof(F) n. A tangent is flipped where F mirrors.
-    scale : (n, 2) of the dtype of the inputs
-        0 in a direction that F collapses; never NaN for finite input.
+    rotation : (n, 3, 3) array
+        Of the dtype of the inputs. Right-handed; the third column is the normal of the image plane, on the same side of
+        the matter as before: normalised sign(det F) cof(F) n. A tangent is flipped where F mirrors.
+    scale : (n, 2) array
+        Of the dtype of the inputs. 0 in a direction that F collapses; never NaN for finite input.
     """
     dtype = np.result_type(gradient, rotation, scale)
     tiny = np.finfo(dtype).tiny ** 0.5

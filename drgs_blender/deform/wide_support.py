@@ -28,14 +28,24 @@ def spans(
 
     Parameters
     ----------
-    vertices, indices, normals : (k, 3), (m, 3) int32, (k, 3) smooth normals: the mesh at rest
-    faces : those of the mesh, measured
-    face, weights : (n,), (n, 3): where the surfels hang
-    reach : (n,) metres; those that are no larger than the mean edge of their face need no span
+    vertices : (k, 3) array
+        Of the mesh at rest.
+    indices : (m, 3) int32 array
+        Its faces.
+    normals : (k, 3) array
+        Its smooth normals.
+    faces : Faces
+        Those of the mesh, measured.
+    face : (n,) array
+        Faces on which the surfels hang.
+    weights : (n, 3) array
+        Barycentric coordinates of where they do.
+    reach : (n,) array
+        Metres; those that are no larger than the mean edge of their face need no span.
 
     Returns
     -------
-    (n, 3) int32
+    (n, 3) int32 array
         -1 where the own face is to be taken, also for want of a broad triangle larger than that.
     """
     wanted = np.flatnonzero((reach > faces.mean_edge[face]) & ~faces.degenerate[face])

@@ -111,6 +111,33 @@ class Session:
         UsageError
             A setting cannot be used.
         Cancelled
+
+        Examples
+        --------
+        A square of one metre, seen from two metres above it through a lens that shows two metres:
+
+        >>> import numpy as np
+        >>> from drgs_blender.core.asset.container import write_asset
+        >>> from drgs_blender.core.asset.model import Asset, Mesh
+        >>> from drgs_blender.core.frame import Camera, ObjectState, RenderSettings
+        >>> from drgs_blender.deform.attach import attach
+        >>> corners = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
+        >>> mesh = Mesh(corners, [[0, 1, 2], [0, 2, 3]], albedo=[[0.5] * 3] * 4, roughness=[1] * 4, metallic=[0] * 4)
+        >>> surfels, binding, report = attach(mesh)
+        >>> write_asset("square.drgs", Asset(surfels, mesh, binding))
+        >>> session = Session()
+        >>> matrix = np.eye(4)
+        >>> matrix[:3, 3] = 0.5, 0.5, 2
+        >>> camera = Camera(matrix, width=8, height=8, fx=8, fy=8, cx=4, cy=4)
+        >>> square = ObjectState("Square", asset=session.load_asset("square.drgs"))
+        >>> settings = RenderSettings(samples=4, camera_sees="mesh", film_transparent=True)
+        >>> passes = session.render(Frame(1, camera, [square], settings=settings, passes=("Combined", "Depth")))
+        >>> passes["Combined"].shape, passes["Depth"].shape
+        ((8, 8, 4), (8, 8, 1))
+        >>> passes["Combined"][:, 4, 3]
+        array([0., 0., 1., 1., 1., 1., 0., 0.], dtype=float32)
+        >>> passes["Depth"][4, 4].round(3)
+        array([2.], dtype=float32)
         """
         self._compile(frame, (), progress, cancelled)
         lap, backend = _Laps(cancelled), self._backends.select(frame.settings.device)

@@ -48,9 +48,15 @@ def compare(
 
     Parameters
     ----------
-    capture : its views left out are rendered under the asset's own light, at the size they have there
-    truth : sets under known lights, at rest and posed, with maps
-    lpips : None where it is not computed
+    asset : Asset
+    capture : Capture
+        Its views left out are rendered under the asset's own light, at the size they have there.
+    truth : Truth or None
+        Sets under known lights, at rest and posed, with maps.
+    renderer : callable
+    lpips : callable, optional
+        None where it is not computed.
+    progress, show : callable, optional
 
     Returns
     -------

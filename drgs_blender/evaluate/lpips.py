@@ -27,8 +27,10 @@ class Lpips:
 
     Parameters
     ----------
-    backbone : state of torchvision's AlexNet
-    heads : state of LPIPS's linear layers for it
+    backbone : Path
+        State of torchvision's AlexNet.
+    heads : Path
+        State of LPIPS's linear layers for it.
 
     Raises
     ------

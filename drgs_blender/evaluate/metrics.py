@@ -26,13 +26,23 @@ def psnr(picture: Array, reference: Array, mask: Array | None = None) -> float:
 
     Parameters
     ----------
-    picture, reference : (h, w, c) or (n, h, w, c), in any one encoding; several are one set of pixels
-    mask : (h, w) or (n, h, w) bool, pixels that count
+    picture, reference : (h, w, c) or (n, h, w, c) array
+        In any one encoding; several are one set of pixels.
+    mask : (h, w) or (n, h, w) bool array, optional
+        Pixels that count.
 
     Returns
     -------
     float
         At most `MOST_PSNR`; NaN where no pixel counts, or one is NaN.
+
+    Examples
+    --------
+    An error of a tenth everywhere is 20 dB; a picture compared with itself has the most there is:
+
+    >>> picture, reference = np.full((2, 2, 3), 0.5), np.full((2, 2, 3), 0.6)
+    >>> round(psnr(picture, reference), 3), psnr(picture, picture) == MOST_PSNR
+    (20.0, True)
     """
     squared = (np.asarray(picture, np.float64) - reference) ** 2
     if mask is not None:
@@ -61,13 +71,29 @@ def ssim(picture: Array, reference: Array) -> float:
 
 
 def fit_scale(values: Array, reference: Array) -> Array:
-    """(c,) factors on (n, c) `values` that bring each channel closest to `reference` (least squares)."""
+    """(c,) factors on (n, c) `values` that bring each channel closest to `reference` (least squares).
+
+    Examples
+    --------
+    >>> values = np.array([[0.2, 0.1], [0.4, 0.3]])
+    >>> fit_scale(values, values * [2, 0.5])
+    array([2. , 0.5])
+    """
     values, reference = np.asarray(values, np.float64), np.asarray(reference, np.float64)
     return (values * reference).sum(axis=0) / np.maximum((values**2).sum(axis=0), 1e-12)
 
 
 def normal_error(normals: Array, reference: Array, mask: Array) -> float:
-    """Mean angle in degrees between (h, w, 3) normals, of pixels in `mask` where both have one."""
+    """Mean angle in degrees between (h, w, 3) normals, of pixels in `mask` where both have one.
+
+    Examples
+    --------
+    The second pixel has no normal and does not count:
+
+    >>> normals, reference = np.array([[[0, 0, 1.0], [0, 0, 0]]]), np.array([[[0, 1.0, 0], [0, 0, 1]]])
+    >>> round(normal_error(normals, reference, np.full((1, 2), True)))
+    90
+    """
     lengths = np.linalg.norm(normals, axis=-1) * np.linalg.norm(reference, axis=-1)
     counted = mask & (lengths > 1e-6)
     if not counted.any():
@@ -90,8 +116,9 @@ def material_scores(found: dict[str, Array], true: dict[str, Array], mask: Array
 
     Parameters
     ----------
-    found, true : "albedo" (n, h, w, 3), and "roughness", "metallic" (n, h, w) where `true` has them; albedo is linear
-    mask : (n, h, w) bool
+    found, true : dict of str to array
+        "albedo" (n, h, w, 3), and "roughness", "metallic" (n, h, w) where `true` has them; albedo is linear.
+    mask : (n, h, w) bool array
 
     Returns
     -------
@@ -119,9 +146,14 @@ def relight_scores(linear: Array, alpha: Array, reference: Array, mask: Array) -
 
     Parameters
     ----------
-    linear, alpha : (n, h, w, 3), (n, h, w): our pictures, linear, not premultiplied, and their coverage
-    reference : (n, h, w, 3) sRGB-encoded on white
-    mask : (n, h, w) float coverage of the reference; the foreground is where it is above 0.5
+    linear : (n, h, w, 3) array
+        Our pictures, linear, not premultiplied.
+    alpha : (n, h, w) array
+        Their coverage.
+    reference : (n, h, w, 3) array
+        sRGB-encoded on white.
+    mask : (n, h, w) float array
+        Coverage of the reference; the foreground is where it is above 0.5.
 
     Returns
     -------

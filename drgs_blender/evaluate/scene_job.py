@@ -178,7 +178,9 @@ def two_bones(subject: bpy.types.Object, soft: float) -> bpy.types.PoseBone:
 
     Parameters
     ----------
-    soft : part of the height within which the weights go over from one bone to the other
+    subject : bpy.types.Object
+    soft : float
+        Part of the height within which the weights go over from one bone to the other.
     """
     points = np.array([vertex.co for vertex in subject.data.vertices])
     low, high = points.min(axis=0), points.max(axis=0)

@@ -52,12 +52,18 @@ class Plan:
 
     Attributes
     ----------
-    objects : of `subjects.OBJECTS`
-    size : pixels of a side
-    train, test : views
-    samples : of a pixel, before denoising
-    lights : the first one lights the training views; names of Blender's studio lights, or files
-    bounces : of light
+    objects : tuple of str
+        Of `subjects.OBJECTS`.
+    size : int
+        Pixels of a side.
+    train, test : int
+        Views.
+    samples : int
+        Of a pixel, before denoising.
+    lights : tuple of str
+        The first one lights the training views; names of Blender's studio lights, or files.
+    bounces : int
+        Of light.
     """
 
     objects: tuple[str, ...] = OBJECTS
@@ -91,10 +97,16 @@ def make_scenes(
 
     Parameters
     ----------
-    out : folder, made when it is not there
-    command : starts a Blender that runs scene_job.py
-    meshes : folder of the example meshes
-    threads : of Cycles; 0 is all
+    out : Path
+        Folder, made when it is not there.
+    plan : Plan
+    command : list of str
+        Starts a Blender that runs scene_job.py.
+    meshes : Path
+        Folder of the example meshes.
+    progress : callable, optional
+    threads : int
+        Of Cycles; 0 is all.
 
     Raises
     ------
@@ -139,8 +151,11 @@ def cameras(count: int, lowest: float, highest: float, turn: float) -> list[Arra
 
     Parameters
     ----------
-    lowest, highest : degrees of elevation
-    turn : radians about Z, by which test views differ from training views
+    count : int
+    lowest, highest : float
+        Degrees of elevation.
+    turn : float
+        Radians about Z, by which test views differ from training views.
     """
     low, high = np.sin(np.radians([lowest, highest]))
     matrices = []

@@ -37,8 +37,10 @@ def make_subject(name: str, meshes: Path) -> dict[str, Array]:
 
     Parameters
     ----------
-    name : one of `OBJECTS`
-    meshes : folder of the example meshes
+    name : str
+        One of `OBJECTS`.
+    meshes : Path
+        Folder of the example meshes.
 
     Returns
     -------

@@ -32,13 +32,19 @@ class TruthSet:
 
     Attributes
     ----------
-    name : shown in tables
-    light : its name
-    radiance : (h, w, 3) lat-long, Blender's mapping
-    posed : the object is deformed
-    views : what Cycles saw, in the light's own exposure
-    maps : per view pass name -> (h, w, c): Coverage, and of Albedo, Roughness, Metallic, Normal, Depth what is known;
-        empty where nothing is
+    name : str
+        Shown in tables.
+    light : str
+        Its name.
+    radiance : (h, w, 3) array
+        Lat-long, Blender's mapping.
+    posed : bool
+        The object is deformed.
+    views : list of View
+        What Cycles saw, in the light's own exposure.
+    maps : list of dict of str to (h, w, c) array
+        Passes of each view: Coverage, and of Albedo, Roughness, Metallic, Normal, Depth what is known; empty where
+        nothing is.
     """
 
     name: str
@@ -55,10 +61,14 @@ class Truth:
 
     Attributes
     ----------
-    sets : at least one
-    training_light : name of the light of the training views, "" where it is not known
-    rest, posed, faces : (n, 3) float32 vertices of the true mesh at rest and deformed, (m, 3) int32; None where no set
-        is posed
+    sets : list of TruthSet
+        At least one.
+    training_light : str
+        Name of the light of the training views, "" where it is not known.
+    rest, posed : (n, 3) float32 array, optional
+        Vertices of the true mesh at rest and deformed; None where no set is posed.
+    faces : (m, 3) int32 array, optional
+        Of both.
     """
 
     sets: list[TruthSet]
@@ -124,8 +134,13 @@ def read_relit(
 
     Parameters
     ----------
-    capture : any layout; of one with several lights (TensoIR), the pictures of the light that is named as the file is
-    light : lat-long environment, Blender's mapping
+    capture : Path
+        Any layout; of one with several lights (TensoIR), the pictures of the light that is named as the file is.
+    light : Path
+        Lat-long environment, Blender's mapping.
+    resolution : int, optional
+    axes : str
+    up : str, optional
 
     Raises
     ------

@@ -42,9 +42,12 @@ class Textured:
 
     Attributes
     ----------
-    colour : PNG of the base colour, sRGB
-    surface : PNG whose green is the roughness and whose blue is the metallic (glTF)
-    uvs : (m, 3, 2) float32 of the corners of the triangles, the origin at the upper left (glTF)
+    colour : bytes
+        PNG of the base colour, sRGB.
+    surface : bytes
+        PNG whose green is the roughness and whose blue is the metallic (glTF).
+    uvs : (m, 3, 2) float32 array
+        Of the corners of the triangles, the origin at the upper left (glTF).
     """
 
     colour: bytes
@@ -85,13 +88,17 @@ def bake_atlas(corner_values: Array, subject: str) -> tuple[Array, Array]:
 
     Parameters
     ----------
-    corner_values : (m, 3, c) values at the corners of triangles
-    subject : named in errors
+    corner_values : (m, 3, c) array
+        Values at the corners of triangles.
+    subject : str
+        Named in errors.
 
     Returns
     -------
-    texels : (s, s, c) float32, row 0 at the top; filtered linearly they are the interpolation of the corners' values
-    uvs : (m, 3, 2) float32, the origin at the upper left (glTF)
+    texels : (s, s, c) float32 array
+        Row 0 at the top; filtered linearly they are the interpolation of the corners' values.
+    uvs : (m, 3, 2) float32 array
+        The origin at the upper left (glTF).
     """
     m, _, channels = corner_values.shape
     squares = -(-m // 2)

@@ -36,7 +36,14 @@ _QUATERNIONS = {
 
 
 def vectors_to_z_up(vectors: Array, up: str = "y") -> Array:
-    """Turn (..., 3) positions or directions from `up` (a key of `UP_AXES`) to Z up; same dtype."""
+    """Turn (..., 3) positions or directions from `up` (a key of `UP_AXES`) to Z up; same dtype.
+
+    Examples
+    --------
+    >>> vectors_to_z_up(np.array([[0, 1, 0], [0, 0, 1]]), up="y")
+    array([[ 0,  0,  1],
+           [ 0, -1,  0]])
+    """
     turn = UP_AXES[up]
     source = np.abs(turn).argmax(axis=1)
     sign = turn[np.arange(3), source].astype(vectors.dtype)

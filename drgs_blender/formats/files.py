@@ -23,13 +23,19 @@ class SurfelFile:
 
     Attributes
     ----------
-    surfels : activated values; axes as in the file (see formats.axes). Properties that no layout knows, and known
-        ones that a surfel cannot hold, are in ``surfels.extras``
-    layout : which program writes such files
-    unknown : properties of the file that the layout does not name
-    notes : what was converted, dropped or assumed
-    up : the up axis that the format prescribes (a key of ``axes.UP_AXES``); None where it prescribes none
-    assumed : those of the notes that are of surfels and their materials; whoever wants the splats lost nothing
+    surfels : Surfels
+        Activated values; axes as in the file (see formats.axes). Properties that no layout knows, and known ones that a
+        surfel cannot hold, are in ``surfels.extras``.
+    layout : str
+        Which program writes such files.
+    unknown : list of str
+        Properties of the file that the layout does not name.
+    notes : list of str
+        What was converted, dropped or assumed.
+    up : str, optional
+        The up axis that the format prescribes (a key of ``axes.UP_AXES``); None where it prescribes none.
+    assumed : list of str
+        Those of the notes that are of surfels and their materials; whoever wants the splats lost nothing.
     """
 
     surfels: Surfels
@@ -46,10 +52,14 @@ class Image:
 
     Attributes
     ----------
-    pixels : (h, w, c) uint8, uint16 or float32, row 0 at the top; integers are fractions of their maximum
-    srgb : integers are sRGB-encoded (else linear); float32 is linear whatever this says
-    uv_transform : (2, 3) float64: texture coordinates = uv_transform @ (u, v, 1), v **up** (Blender's convention)
-    wrap : "repeat", "clamp" or "mirror" along u and v
+    pixels : (h, w, c) uint8, uint16 or float32 array
+        Row 0 at the top; integers are fractions of their maximum.
+    srgb : bool
+        Integers are sRGB-encoded (else linear); float32 is linear whatever this says.
+    uv_transform : (2, 3) float64 array
+        Texture coordinates = uv_transform @ (u, v, 1), v **up** (Blender's convention).
+    wrap : tuple of str
+        "repeat", "clamp" or "mirror" along u and v.
     """
 
     pixels: Array
@@ -64,9 +74,12 @@ class MaterialFile:
 
     Attributes
     ----------
-    base_colour : linear Rec.709 factor
-    base_colour_image : RGB(A); multiplies base_colour
-    metallic_roughness_image : G is roughness, B is metallic (glTF); multiplies the factors; never sRGB
+    base_colour : tuple of float
+        Linear Rec.709 factor.
+    base_colour_image : Image, optional
+        RGB(A); multiplies base_colour.
+    metallic_roughness_image : Image, optional
+        G is roughness, B is metallic (glTF); multiplies the factors; never sRGB.
     """
 
     name: str
@@ -83,17 +96,25 @@ class MeshFile:
 
     Attributes
     ----------
-    vertices : (n, 3) float32
-    faces : (m, 3) int32
-    corner_normals : (m, 3, 3) float32 unit, or None
-    corner_uvs : (m, 3, 2) float32, v up (0 is the bottom row of an image), or None
-    face_material : (m,) int32 into `materials`, -1 without one
+    vertices : (n, 3) float32 array
+    faces : (m, 3) int32 array
+    corner_normals : (m, 3, 3) float32 array, optional
+        Unit.
+    corner_uvs : (m, 3, 2) float32 array, optional
+        v up (0 is the bottom row of an image).
+    face_material : (m,) int32 array, optional
+        Into `materials`, -1 without one.
     materials : list of MaterialFile
-    parts : (name, first face, one past the last face) of each named object or primitive
-    vertex_colours : (n, 3) linear factor on the base colour, or None
-    vertex_roughness, vertex_metallic : (n,) in [0, 1], used in place of the material's, or None
-    up_axis : "Z" where positions are known to be Z up (glTF is converted on reading), "unknown" else
-    notes : what was converted, dropped or assumed
+    parts : list of tuple of (str, int, int)
+        (name, first face, one past the last face) of each named object or primitive.
+    vertex_colours : (n, 3) array, optional
+        Linear factor on the base colour.
+    vertex_roughness, vertex_metallic : (n,) array, optional
+        In [0, 1], used in place of the material's.
+    up_axis : {"Z", "unknown"}
+        "Z" where positions are known to be Z up (glTF is converted on reading), "unknown" else.
+    notes : list of str
+        What was converted, dropped or assumed.
     """
 
     vertices: Array
@@ -122,9 +143,12 @@ class EnvironmentFile:
 
     Attributes
     ----------
-    environment : linear radiance
-    layout : which program writes such files
-    notes : what was converted or assumed
+    environment : Environment
+        Linear radiance.
+    layout : str
+        Which program writes such files.
+    notes : list of str
+        What was converted or assumed.
     """
 
     environment: Environment
@@ -138,7 +162,10 @@ class MaterialsFile:
 
     Attributes
     ----------
-    albedo, roughness, metallic : (n, 3), (n,), (n,) float32 in [0, 1], linear
+    albedo : (n, 3) float32 array
+        In [0, 1], linear.
+    roughness, metallic : (n,) float32 array
+        In [0, 1], linear.
     """
 
     albedo: Array
@@ -149,5 +176,5 @@ class MaterialsFile:
 
 
 def plain_name(path: str | Path) -> str:
-    """The name of a file as text that every program can show: bytes of it that are no UTF-8 as \\xe9."""
+    r"""The name of a file as text that every program can show: bytes of it that are no UTF-8 as \xe9."""
     return os.fsencode(Path(path).name).decode(errors="backslashreplace")

@@ -51,12 +51,18 @@ class Layout:
 
     Attributes
     ----------
-    name : who writes it
-    has, lacks : properties that must and must not be there
-    albedo, roughness, metallic : channels, None where the file has none
-    srgb : the albedo is sRGB-encoded after activation
-    known : other properties whose meaning is known, as a regular expression (kept in the extras, not "unknown")
-    note : told to the user
+    name : str
+        Who writes it.
+    has, lacks : tuple of str
+        Properties that must and must not be there.
+    albedo, roughness, metallic : Channel, optional
+        None where the file has none.
+    srgb : bool
+        The albedo is sRGB-encoded after activation.
+    known : str
+        Other properties whose meaning is known, as a regular expression (kept in the extras, not "unknown").
+    note : str
+        Told to the user.
     """
 
     name: str

@@ -26,7 +26,8 @@ class Glb:
 
     Attributes
     ----------
-    json : the document; everything but buffers, views and accessors is the caller's
+    json : dict
+        The document; everything but buffers, views and accessors is the caller's.
     """
 
     def __init__(self) -> None:

@@ -43,7 +43,8 @@ class Document:
 
     Parameters
     ----------
-    path : .gltf or .glb; the content decides
+    path : Path
+        .gltf or .glb; the content decides.
 
     Raises
     ------
@@ -114,7 +115,8 @@ class Document:
 
         Parameters
         ----------
-        kinds : permitted types ("SCALAR", "VEC3", ...)
+        kinds : tuple of str
+            Permitted types ("SCALAR", "VEC3", ...).
         """
         entry = self.item("accessors", index)
         dtype, shape = self._type(entry, kinds)

@@ -35,8 +35,10 @@ class NodeTree:
 
     Parameters
     ----------
-    document : an open glTF file
-    pose : "rest" or "default", see above
+    document : Document
+        An open glTF file.
+    pose : {"rest", "default"}
+        "rest" or "default", see above.
     """
 
     def __init__(self, document: Document, pose: Pose = "rest") -> None:

@@ -56,12 +56,14 @@ def rotate_harmonics(sh: Array, rotation: Array) -> Array:
 
     Parameters
     ----------
-    sh : (n, k, 3) float32, k = 1, 4, 9 or 16
-    rotation : (3, 3), or (n, 3, 3) one a function; orthogonal: it may mirror
+    sh : (n, k, 3) float32 array
+        With k = 1, 4, 9 or 16.
+    rotation : (3, 3) or (n, 3, 3) array
+        One for all functions, or one per function; orthogonal: it may mirror.
 
     Returns
     -------
-    (n, k, 3) float32
+    (n, k, 3) float32 array
         Each band stays within itself. Its matrix comes from the band's values at fixed directions and at the turned
         ones, exact because the directions determine the band.
     """

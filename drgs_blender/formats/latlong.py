@@ -38,9 +38,11 @@ def sample_cube(faces: Array, direction: Array, position: Callable[[int, Array],
 
     Parameters
     ----------
-    faces : (6, n, n, c) in the order +X -X +Y -Y +Z -Z
-    direction : (..., 3)
-    position : (face, directions divided by their largest component) -> (column, row) in pixels on that face
+    faces : (6, n, n, c) array
+        In the order +X -X +Y -Y +Z -Z.
+    direction : (..., 3) array
+    position : callable
+        (face, directions divided by their largest component) -> (column, row) in pixels on that face.
     """
     largest = np.argmax(np.abs(direction), axis=-1)
     major = np.take_along_axis(direction, largest[..., None], axis=-1)[..., 0]

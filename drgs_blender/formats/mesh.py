@@ -36,8 +36,10 @@ def check_extent(vertices: Array, subject: str, scale: float = 1.0) -> None:
 
 
 def sanitise(mesh: MeshFile) -> MeshFile:
-    """Remove faces with vertices that are NaN or infinite, and these vertices; replace other values that are not
-    finite. What was changed is counted in ``notes``. Returns `mesh` itself, changed.
+    """Remove faces with vertices that are NaN or infinite, and these vertices.
+
+    Other values that are not finite are replaced. What was changed is counted in ``notes``. Returns `mesh` itself,
+    changed.
     """
     finite = np.isfinite(mesh.vertices).all(axis=1)
     if not finite.all():

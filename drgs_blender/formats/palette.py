@@ -22,12 +22,16 @@ def codebook(values: Array, size: int = 256) -> tuple[Array, Array]:
 
     Parameters
     ----------
-    values : any shape, float32, finite
+    values : float32 array
+        Any shape, finite.
+    size : int
 
     Returns
     -------
-    book : (size,) float32, ascending
-    index : uint8, shape of `values`
+    book : (size,) float32 array
+        Ascending.
+    index : uint8 array
+        Shape of `values`.
     """
     low, high = (float(f(initial=np.inf * s)) for f, s in ((values.min, 1), (values.max, -1)))
     if not low < high:
@@ -56,12 +60,15 @@ def palette(rows: Array, size: int) -> tuple[Array, Array]:
 
     Parameters
     ----------
-    rows : (n, c) float32, finite
+    rows : (n, c) float32 array
+        Finite.
+    size : int
 
     Returns
     -------
-    entries : (k, c) float32, k <= size
-    index : (n,) int32
+    entries : (k, c) float32 array
+        k <= size.
+    index : (n,) int32 array
     """
     n = len(rows)
     if n <= size:

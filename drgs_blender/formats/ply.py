@@ -77,9 +77,12 @@ class Rows:
 
     Attributes
     ----------
-    element : its header
-    columns : name -> (count,) array of a scalar property, of the declared type; may be a view of the mapped file
-    lists : name -> (values (total,), lengths (count,) int64) of a list property
+    element : Element
+        Its header.
+    columns : dict of str to (count,) array
+        Scalar properties, of the declared type; may be views of the mapped file.
+    lists : dict of str to tuple of ((total,) array, (count,) int64 array)
+        Values and lengths of list properties.
     """
 
     element: Element

@@ -25,10 +25,18 @@ def write_point_cache(path: Path, frames: Iterable[Array], count: int, points: i
 
     Parameters
     ----------
-    path : ends in .pc2 or .mdd, which decides the format
-    frames : `count` arrays (points, 3), metres, object space, Z up; in Mesh Cache leave the axes at Y forward, Z up
-    first : number of the first frame
-    fps : frames a second; times of an MDD are seconds from the first frame
+    path : Path
+        Ends in .pc2 or .mdd, which decides the format.
+    frames : iterable of (points, 3) array
+        As many as `count`, metres, object space, Z up; in Mesh Cache leave the axes at Y forward, Z up.
+    count : int
+        Frames.
+    points : int
+        Of each frame.
+    first : int
+        Number of the first frame.
+    fps : float
+        Frames per second; times of an MDD are seconds from the first frame.
 
     Raises
     ------

@@ -45,11 +45,16 @@ class Format:
 
     Attributes
     ----------
-    name : shown to users; the key of its `filetypes.ReadType`
-    sniff : (first bytes, path) -> whether the file is of this format
-    read : path -> what comes out
-    note : one line for the documentation
-    instead : what to do where something else than `kind` is wanted of such a file
+    name : str
+        Shown to users; the key of its `filetypes.ReadType`.
+    sniff : callable
+        (first bytes, path) -> whether the file is of this format.
+    read : callable
+        path -> what comes out.
+    note : str
+        One line for the documentation.
+    instead : str
+        What to do where something else than `kind` is wanted of such a file.
     """
 
     name: str
@@ -275,9 +280,19 @@ def read_surfels(path: str | Path) -> SurfelFile:
 
 
 def read_mesh(path: str | Path, pose: Pose = "rest") -> MeshFile:
-    """Read a mesh with its materials; ``up_axis`` says whether it is known to be Z up. Raises AssetError.
+    r"""Read a mesh with its materials; ``up_axis`` says whether it is known to be Z up. Raises AssetError.
 
     `pose` is that of skinned glTF: "rest" as Blender's importer rests it, "default" as viewers show the file.
+
+    Examples
+    --------
+    Faces of more than three corners are divided:
+
+    >>> text = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4"
+    >>> _ = Path("square.obj").write_text(text)
+    >>> mesh = read_mesh("square.obj")
+    >>> len(mesh.vertices), len(mesh.faces), mesh.up_axis
+    (4, 2, 'unknown')
     """
     path = Path(path)
     if find_format(path, "mesh").read is _read_gltf:

@@ -28,9 +28,12 @@ class Piece:
 
     Attributes
     ----------
-    splats : in the node's space; nothing in them is checked
-    matrix : (4, 4) node-to-scene
-    linear : the colours are linear, not sRGB-encoded
+    splats : Splats
+        In the node's space; nothing in them is checked.
+    matrix : (4, 4) array
+        Node-to-scene.
+    linear : bool
+        The colours are linear, not sRGB-encoded.
     """
 
     splats: Splats

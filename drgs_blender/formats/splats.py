@@ -30,11 +30,16 @@ class Splats:
 
     Attributes
     ----------
-    centre : (n, 3) float32, metres
-    scale : (n, 3) float32, metres, linear: standard deviations along the rotated X, Y and Z axes
-    rotation : (n, 4) float32 unit quaternion wxyz
-    opacity : (n,) float32 in [0, 1]
-    sh : (n, k, 3) float32 with k = 1, 4, 9 or 16: outgoing colour, display-referred, in the basis and order of 3DGS
+    centre : (n, 3) float32 array
+        Metres.
+    scale : (n, 3) float32 array
+        Metres, linear: standard deviations along the rotated X, Y and Z axes.
+    rotation : (n, 4) float32 array
+        Unit quaternion wxyz.
+    opacity : (n,) float32 array
+        In [0, 1].
+    sh : (n, k, 3) float32 array
+        With k = 1, 4, 9 or 16: outgoing colour, display-referred, in the basis and order of 3DGS.
     """
 
     centre: Array
@@ -52,9 +57,11 @@ def splats_of(surfels: Surfels, colour: Array | None = None) -> Splats:
 
     Parameters
     ----------
-    surfels : any space
-    colour : (n, 3) linear Rec.709 colour to show from all sides; None is the captured colour (``surfels.sh``) where
-        there is one, else the albedo. Linear colour is encoded as sRGB, which is what viewers of splats expect.
+    surfels : Surfels
+        Any space.
+    colour : (n, 3) array, optional
+        Linear Rec.709 colour to show from all sides; None is the captured colour (``surfels.sh``) where there is one,
+        else the albedo. Linear colour is encoded as sRGB, which is what viewers of splats expect.
     """
     if colour is None and surfels.sh is not None:
         sh = whole_bands(surfels.sh)

@@ -36,10 +36,17 @@ def write_usd_points(
 
     Parameters
     ----------
-    frames : in their order, object space
-    faces : (m, 3) int, triangles of the mesh
-    first, fps : number of the first frame, frames a second
-    matrix_world : (4, 4) object to world: the transform of ``/Matter``
+    path : Path
+    frames : iterable of ParticleFrame
+        In their order, object space.
+    faces : (m, 3) int array
+        Triangles of the mesh.
+    first : int
+        Number of the first frame.
+    fps : float
+        Frames per second.
+    matrix_world : sequence of sequence of float
+        (4, 4) object to world: the transform of ``/Matter``.
 
     Raises
     ------

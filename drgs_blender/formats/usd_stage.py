@@ -1,5 +1,6 @@
-"""The splats of a USD stage as plain arrays in a file: a program of its own, since USD's library may hang or crash on
-damaged files. `usd_splats` runs it with limits.
+"""The splats of a USD stage as plain arrays in a file.
+
+A program of its own, since USD's library may hang or crash on damaged files. `usd_splats` runs it with limits.
 """
 
 from __future__ import annotations

@@ -25,10 +25,13 @@ class Writer:
 
     Attributes
     ----------
-    name : shown to users; the key of its `filetypes.WriteType`
-    write : (path, what goes in) -> None, where what goes in is `splats.Splats`, `asset.Mesh` or `asset.Environment`;
-        raises WriteError
-    kept, lost : for the documentation
+    name : str
+        Shown to users; the key of its `filetypes.WriteType`.
+    write : callable
+        (path, what goes in) -> None, where what goes in is `splats.Splats`, `asset.Mesh` or `asset.Environment`; raises
+        WriteError.
+    kept, lost : str
+        For the documentation.
     """
 
     name: str

@@ -20,14 +20,15 @@ def corner_table(faces: Array, n_vertices: int) -> tuple[Array, Array]:
 
     Parameters
     ----------
-    faces : (m, 3) int
-    n_vertices : number of vertices
+    faces : (m, 3) int array
+    n_vertices : int
+        Number of vertices.
 
     Returns
     -------
-    start : (n_vertices + 1,) int32
+    start : (n_vertices + 1,) int32 array
         The corners of vertex v are ``corner[start[v]:start[v + 1]]``, in ascending order.
-    corner : (3 m,) int32
+    corner : (3 m,) int32 array
         Corner index: 3 x face + position in the face.
     """
     flat = np.asarray(faces).reshape(-1)
@@ -53,12 +54,17 @@ class VertexNormals:
 
     Parameters
     ----------
-    faces : (m, 3) int, counter-clockwise seen from outside
-    n_vertices : number of vertices
+    faces : (m, 3) int array
+        Counter-clockwise seen from outside.
+    n_vertices : int
+        Number of vertices.
 
     Attributes
     ----------
-    start, place : (n_vertices + 1,), (3 m,) int32: the rows of each vertex's corners, and the row of each corner
+    start : (n_vertices + 1,) int32 array
+        The rows of each vertex's corners.
+    place : (3 m,) int32 array
+        The row of each corner.
     """
 
     def __init__(self, faces: Array, n_vertices: int) -> None:
@@ -83,8 +89,11 @@ class VertexNormals:
 
         Parameters
         ----------
-        vertices : (n, 3) float32
-        faces : (m, 3) int32: those of this object, of which some may be collapsed to a point
+        vertices : (n, 3) float32 array
+        faces : (m, 3) int32 array
+            Those of this object, of which some may be collapsed to a point.
+        normals : (n, 3) float32 array
+            Written.
         """
         empty = _weigh(plain(vertices), plain(faces), self.place, self._weighted)
         _sum(self._weighted, self.start, normals)
@@ -216,6 +225,16 @@ def quaternions(matrices: Array) -> Array:
     """(n, 3, 3) rotation matrices -> (n, 4) unit quaternions wxyz with w >= 0, of the same dtype.
 
     Of the four rows of 4 q q^T the one with the largest diagonal is normalised, which never divides by a small number.
+
+    Examples
+    --------
+    Half a turn about Z, there and back:
+
+    >>> half_turn = rotation_matrices(np.array([[0.0, 0, 0, 1]]))
+    >>> half_turn.diagonal(axis1=1, axis2=2)
+    array([[-1., -1.,  1.]])
+    >>> quaternions(half_turn)
+    array([[0., 0., 0., 1.]])
     """
     m = np.moveaxis(matrices, (-2, -1), (0, 1))
     trace = m[0, 0] + m[1, 1] + m[2, 2]

@@ -17,9 +17,12 @@ class Volume:
 
     Attributes
     ----------
-    origin : (3,) float64, metres: lowest corner of cell (0, 0, 0)
-    spacing : metres, side of a cell
-    part : (nx, ny, nz) int32, number of the connected part a cell belongs to, -1 outside
+    origin : (3,) float64 array
+        Metres: lowest corner of cell (0, 0, 0).
+    spacing : float
+        Metres, side of a cell.
+    part : (nx, ny, nz) int32 array
+        Number of the connected part a cell belongs to, -1 outside.
     """
 
     origin: Array
@@ -56,14 +59,19 @@ def crosses_gap(volume: Volume, points: Array, sources: Array, chosen: Array, re
 
     Parameters
     ----------
-    points : (n, 3) float64, metres
-    sources : (k, 3) float64, points in filled cells
-    chosen : (n, m) int, sources to look at from each point
-    reach : cells before the point that may be empty: a surface lies just outside of what fills it
+    volume : Volume
+    points : (n, 3) float64 array
+        Metres.
+    sources : (k, 3) float64 array
+        Points in filled cells.
+    chosen : (n, m) int array
+        Sources to look at from each point.
+    reach : float
+        Cells before the point that may be empty: a surface lies just outside of what fills it.
 
     Returns
     -------
-    (n, m) bool
+    (n, m) bool array
     """
     out = np.empty(chosen.shape, np.bool_)
     _crossings(

@@ -47,14 +47,22 @@ class Child:
 
     Attributes
     ----------
-    inbox : (message, arrays) as they arrive; at the end one exception that says why there will be no more. None only
-        wakes whoever waits
-    heard : grows with every byte that arrives
-    steps, preparing : the last `protocol.Alive`
-    told : phase and fraction of the last `protocol.Progress` that was taken out of `inbox`
-    idle : set while no request is unanswered
-    greeted : whether hands were shaken
-    warm : whether it has finished a picture: everything is imported, kernels are loaded
+    inbox : queue.Queue
+        (message, arrays) as they arrive; at the end one exception that says why there will be no more. None only wakes
+        whoever waits.
+    heard : int
+        Grows with every byte that arrives.
+    steps : int
+        Of the last `protocol.Alive`, as `preparing`.
+    preparing : bool
+    told : tuple of (str, float)
+        Phase and fraction of the last `protocol.Progress` that was taken out of `inbox`.
+    idle : threading.Event
+        Set while no request is unanswered.
+    greeted : bool
+        Whether hands were shaken.
+    warm : bool
+        Whether it has finished a picture: everything is imported, kernels are loaded.
     """
 
     def __init__(self, command: list[str], shared: bool) -> None:

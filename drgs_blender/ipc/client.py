@@ -56,12 +56,18 @@ class EngineClient:
 
     Parameters
     ----------
-    command : command line of the engine, see `locate_engine`
-    silence : seconds without a sign of life after which the engine is taken for dead
-    greeting : seconds a new process has to say something; importing Python on a busy machine takes some
-    stall : seconds its main thread may work on one step
-    restarts : how often one request is repeated on a new engine after the old one died
-    shared : exchange arrays through shared memory where the system has it
+    command : list of str
+        Command line of the engine, see `locate_engine`.
+    silence : float
+        Seconds without a sign of life after which the engine is taken for dead.
+    greeting : float
+        Seconds a new process has to say something; importing Python on a busy machine takes some.
+    stall : float
+        Seconds its main thread may work on one step.
+    restarts : int
+        How often one request is repeated on a new engine after the old one died.
+    shared : bool
+        Exchange arrays through shared memory where the system has it.
     """
 
     def __init__(
@@ -135,8 +141,11 @@ class EngineClient:
 
         Parameters
         ----------
-        on_progress : called with the phase and the part done in [0, 1]
-        cancelled : asked often; once it says True, `Cancelled` is raised within half a second
+        frame : Frame
+        on_progress : callable, optional
+            Called with the phase and the part done in [0, 1].
+        cancelled : callable, optional
+            Asked often; once it says True, `Cancelled` is raised within half a second.
 
         Returns
         -------

@@ -157,8 +157,10 @@ class Passes(dict[str, Array]):
 
     Attributes
     ----------
-    warnings : list of str, each naming the object it is about
-    statistics : seconds a stage (``seconds.deform`` ...), counts of triangles, surfels, rays
+    warnings : list of str
+        Each naming the object it is about.
+    statistics : dict of str to float
+        Seconds per stage (``seconds.deform`` ...), counts of triangles, surfels, rays.
     """
 
     def __init__(self, passes: dict[str, Array], warnings: list[str], statistics: dict[str, float]) -> None:

@@ -228,9 +228,15 @@ class Link:
 
     Parameters
     ----------
-    reader, writer : unbuffered binary files
-    incoming, outgoing : shared regions, or None: arrays travel in the pipe
-    heard : called whenever bytes arrive
+    reader, writer : RawIO
+        Unbuffered binary files.
+    heard : callable, optional
+        Called whenever bytes arrive.
+
+    Attributes
+    ----------
+    incoming, outgoing : Region or None
+        Shared memory of arrays; None: they travel in the pipe.
     """
 
     def __init__(self, reader: RawIO, writer: RawIO, heard: Callable[[], None] | None = None) -> None:

@@ -32,10 +32,15 @@ def bake(
 
     Parameters
     ----------
-    job : at its beginning
-    overwrite : frames of other settings are removed; otherwise they are an error
-    cancelled : asked before every time step
-    progress : told the frame that is computed and which part of it is done
+    job : Job
+        At its beginning.
+    cache : ParticleCache
+    overwrite : bool
+        Frames of other settings are removed; otherwise they are an error.
+    cancelled : callable, optional
+        Asked before every time step.
+    progress : callable, optional
+        Told the frame that is computed and which part of it is done.
 
     Returns
     -------

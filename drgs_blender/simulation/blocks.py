@@ -29,9 +29,12 @@ class Domain:
 
     Attributes
     ----------
-    origin : (3,) float64, metres: node (0, 0, 0)
-    spacing : metres between nodes
-    blocks : blocks of 4 cells along x, y and z
+    origin : (3,) float64 array
+        Metres: node (0, 0, 0).
+    spacing : float
+        Metres between nodes.
+    blocks : tuple of int
+        Blocks of 4 cells along x, y and z.
     """
 
     origin: Array
@@ -63,14 +66,20 @@ class Arrangement:
 
     Attributes
     ----------
-    order : (n,) int64, the particles block by block
-    block : (b, 3) int32, blocks with particles, those of one parity together
-    shares : (9, threads + 1) int64, blocks cut into as many parts as there are threads, alike in work: those of each
-        parity, and all
-    start : (b + 1,) int64, where the particles of each block begin
-    neighbour : (b, 27) int32, the slot of each block around, x slowest
-    active : (a, 3) int32, blocks that have memory, by slot
-    slot : (bx, by, bz) int32, slot of each block of the domain, -1 without memory
+    order : (n,) int64 array
+        The particles block by block.
+    block : (b, 3) int32 array
+        Blocks with particles, those of one parity together.
+    shares : (9, threads + 1) int64 array
+        Blocks cut into as many parts as there are threads, alike in work: those of each parity, and all.
+    start : (b + 1,) int64 array
+        Where the particles of each block begin.
+    neighbour : (b, 27) int32 array
+        The slot of each block around, x slowest.
+    active : (a, 3) int32 array
+        Blocks that have memory, by slot.
+    slot : (bx, by, bz) int32 array
+        Slot of each block of the domain, -1 without memory.
     """
 
     order: Array
@@ -143,12 +152,15 @@ def arrange(x: Array, domain: Domain) -> tuple[Arrangement, Array]:
 
     Parameters
     ----------
-    x : (n, 3) float64, metres
+    x : (n, 3) float64 array
+        Metres.
+    domain : Domain
 
     Returns
     -------
-    arrangement
-    lost : (k,) indices of particles outside the domain or not finite; where there are any, the arrangement is void
+    arrangement : Arrangement
+    lost : (k,) array
+        Indices of particles outside the domain or not finite; where there are any, the arrangement is void.
     """
     bx, by, bz = domain.blocks
     number = _blocks_of(x, domain.origin, 1.0 / domain.spacing, bx, by, bz)

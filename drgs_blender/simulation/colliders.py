@@ -40,12 +40,17 @@ class Collider:
 
     Attributes
     ----------
-    name : used in messages
-    faces : (m, 3) int
-    vertices : (n, 3), or (k, n, 3) a frame each from the first one simulated on; the last one stays. World, metres
-    contact : "sticky" holds what touches it, "slip" lets it slide and never leave, "separate" lets it leave
-    friction : Coulomb's coefficient, of "separate"
-    thickness : metres by which the surface is moved outwards
+    name : str
+        Used in messages.
+    faces : (m, 3) int array
+    vertices : (n, 3) or (k, n, 3) array
+        World, metres; of k frames from the first one simulated on, of which the last stays.
+    contact : {"separate", "slip", "sticky"}
+        "sticky" holds what touches it, "slip" lets it slide and never leave, "separate" lets it leave.
+    friction : float
+        Coulomb's coefficient, of "separate".
+    thickness : float
+        Metres by which the surface is moved outwards.
     """
 
     name: str
@@ -84,9 +89,14 @@ class Field:
 
     Attributes
     ----------
-    origin, spacing : (3,) float64 and metres, in the space of the field
-    distance : (nx, ny, nz) float32, metres
-    velocity : (nx, ny, nz, 3) float32, m/s, or with nx = 0 where the surface does not deform
+    origin : (3,) float64 array
+        Metres, in the space of the field.
+    spacing : float
+        Metres.
+    distance : (nx, ny, nz) float32 array
+        Metres.
+    velocity : (nx, ny, nz, 3) float32 array
+        m/s, or with nx = 0 where the surface does not deform.
     """
 
     origin: Array
@@ -114,8 +124,16 @@ def make_field(
 
     Parameters
     ----------
-    closed : see `is_closed`
-    velocities : (n, 3) of the vertices, m/s
+    vertices : (n, 3) array
+    faces : (m, 3) array
+    closed : bool
+        See `is_closed`.
+    spacing : float
+        Metres.
+    low, high : (3,) array
+        Corners of the box that the field covers.
+    velocities : (n, 3) array, optional
+        Of the vertices, m/s.
     """
     import igl
 
@@ -212,9 +230,13 @@ class MovingCollider:
 
         Returns
         -------
-        field : None where nothing can be touched
-        rotation, shift : (3, 3), (3,) from the space of the field to the world
-        linear, spin : m/s of the field's origin-independent centre and rad/s about ``shift``'s centre, see `collide`
+        field : Field or None
+            None where nothing can be touched.
+        rotation : (3, 3) array
+            From the space of the field to the world, as `shift`.
+        shift : (3,) array
+        linear, spin : (3,) array
+            m/s of the field's origin-independent centre and rad/s about ``shift``'s centre, see `collide`.
         """
         if not self._rigid:
             return self._deforming(part)
@@ -244,8 +266,10 @@ class MovingCollider:
         return np.full(len(points), np.inf) if seen is None else seen[:, 0]
 
     def closest(self, points: Array, start: bool = False) -> tuple[Array, Array, Array]:
-        """Signed distances (n,) from the mesh at the end or the `start` of the frame, its closest points, and the way
-        out, (n, 3)."""
+        """Signed distances (n,) from the mesh, its closest points, and the way out, (n, 3).
+
+        The mesh is that at the end of the frame, or at its `start`.
+        """
         import igl
 
         faces, vertices = self.collider.faces, self._before if start else self._after
@@ -261,7 +285,9 @@ class MovingCollider:
 
         Parameters
         ----------
-        distances : (n,) as `distances` has them, infinite also in the middle of what is as thick as a cell
+        points : (n, 3) array
+        distances : (n,) array
+            As `distances` has them, infinite also in the middle of what is as thick as a cell.
         """
         low, high = self._before.min(axis=0) - self.spacing, self._before.max(axis=0) + self.spacing
         far = np.isfinite(distances) & (np.abs(distances) >= self.spacing)
@@ -294,9 +320,13 @@ def check_apart(points: Array, depth: float, colliders: Sequence[MovingCollider]
 
     Parameters
     ----------
-    points : (n, 3) of the body, world
-    depth : metres that are no matter
-    planes : rows of `contact.plane_rows`
+    points : (n, 3) array
+        Of the body, world.
+    depth : float
+        Metres that are no matter.
+    colliders : sequence of MovingCollider
+    planes : array
+        Rows of `contact.plane_rows`.
 
     Raises
     ------
@@ -330,9 +360,13 @@ def lift_surface(points: Array, spacing: float, colliders: Sequence[MovingCollid
 
     Parameters
     ----------
-    points : (n, 3) float64, world, at the end of the frame that the colliders have entered
-    spacing : of the grid, metres
-    planes : rows of `contact.plane_rows`
+    points : (n, 3) float64 array
+        World, at the end of the frame that the colliders have entered.
+    spacing : float
+        Of the grid, metres.
+    colliders : sequence of MovingCollider
+    planes : array
+        Rows of `contact.plane_rows`.
     """
     points = np.array(points)
     clearance = _CLEARANCE * spacing

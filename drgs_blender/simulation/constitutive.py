@@ -79,13 +79,20 @@ def respond(p, model, parameters, f, tau, memories, affine, dt):  # type: ignore
 
     Parameters
     ----------
-    model, parameters : (n,) uint8, (n, k) float32
-    f : (n, 9) float32, elastic deformation gradient less 1, changed in place where matter flows
-    tau : (n, 6) float32, written
-    memories : (n,) float32, changed: what the model remembers: equivalent plastic strain (plastic), volume correction
-        (sand), plastic volume (snow), volume ratio (fluid)
-    affine : (n, 9) float32 velocity gradient, 1/s
-    dt : seconds
+    p : int
+    model : (n,) uint8 array
+    parameters : (n, k) float32 array
+    f : (n, 9) float32 array
+        Elastic deformation gradient less 1, changed in place where matter flows.
+    tau : (n, 6) float32 array
+        Written.
+    memories : (n,) float32 array
+        Changed: what the model remembers: equivalent plastic strain (plastic), volume correction (sand), plastic volume
+        (snow), volume ratio (fluid).
+    affine : (n, 9) float32 array
+        Velocity gradient, 1/s.
+    dt : float
+        Seconds.
     """
     kind = model[p]
     if kind == ELASTIC:

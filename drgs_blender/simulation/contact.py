@@ -43,7 +43,7 @@ def surface_near(  # type: ignore[no-untyped-def]
 
     Returns
     -------
-    tuple of 7 floats
+    tuple of float
         Signed distance (infinite outside of the field), unit normal and velocity of the surface.
     """
     nx, ny, nz = distance.shape
@@ -114,8 +114,14 @@ class Plane:
 
     Attributes
     ----------
-    point, normal : metres and a unit vector, world
-    contact, friction : as those of `Collider`
+    point : tuple of float
+        Metres, world.
+    normal : tuple of float
+        Unit vector, world.
+    contact : {"separate", "slip", "sticky"}
+        As those of `Collider`.
+    friction : float
+        As those of `Collider`.
     """
 
     point: tuple[float, float, float]

@@ -26,9 +26,9 @@ def svd3(f, n):  # type: ignore[no-untyped-def]
 
     Returns
     -------
-    u, sigma, v : tuples of 9, 3 and 9 floats
-        Row-major. V is a rotation; sigma is not sorted and not negative; where A mirrors or is singular, so does U
-        or U has a made-up column.
+    u, sigma, v : tuple of float
+        Nine, three and nine, row-major. V is a rotation; sigma is not sorted and not negative; where A mirrors or is
+        singular, so does U or U has a made-up column.
     """
     a, b, c = 1.0 + float(f[n, 0]), float(f[n, 1]), float(f[n, 2])
     d, e, g = float(f[n, 3]), 1.0 + float(f[n, 4]), float(f[n, 5])

@@ -26,8 +26,12 @@ def digest_of(mesh: Mesh, settings: Settings, colliders: Sequence[Collider], mot
 
     Parameters
     ----------
-    colliders : those of the settings
-    motion : (k, n, 3) vertices of the mesh, that pins follow; None where they stay
+    mesh : Mesh
+    settings : Settings
+    colliders : sequence of Collider
+        Those of the settings.
+    motion : (k, n, 3) array or None
+        Vertices of the mesh, that pins follow; None where they stay.
     """
     described = asdict(settings)
     for key in ("last", "colliders", "motion", "device"):

@@ -33,17 +33,26 @@ class ForceField:
 
     Attributes
     ----------
-    kind : "force" (away from it, towards it if the strength is negative), "wind" (along its axis), "vortex" (around its
-        axis) or "turbulence"
-    frames : rows of eight: place (metres), axis (any length), strength (m/s^2) and flow (1/s), a frame each from the
-        first one simulated on; the last one stays. Flow is how it slows what moves in it: wind blows at strength / flow
-    shape : what distances are measured from: "point", "plane" (across its axis) or "line" (along its axis)
-    falloff : whether distance counts from all around, in a tube or in a cone along the axis
-    side : of the plane across the axis on which it acts
-    power : of the distance beyond `nearest` with which it falls
-    nearest, farthest : metres: full strength up to there, none beyond
-    radial, inner, outer : the same across the tube (metres) or cone (degrees)
-    size : of turbulence, metres
+    kind : str
+        "force" (away from it, towards it if the strength is negative), "wind" (along its axis), "vortex" (around its
+        axis) or "turbulence".
+    frames : tuple of tuple of float
+        Rows of eight: place (metres), axis (any length), strength (m/s^2) and flow (1/s), a frame each from the first
+        one simulated on; the last one stays. Flow is how it slows what moves in it: wind blows at strength / flow.
+    shape : str
+        What distances are measured from: "point", "plane" (across its axis) or "line" (along its axis).
+    falloff : str
+        Whether distance counts from all around, in a tube or in a cone along the axis.
+    side : str
+        Of the plane across the axis on which it acts.
+    power : float
+        Of the distance beyond `nearest` with which it falls.
+    nearest, farthest : float
+        Metres: full strength up to there, none beyond.
+    radial, inner, outer : float
+        The same across the tube (metres) or cone (degrees).
+    size : float
+        Of turbulence, metres.
     """
 
     kind: str
@@ -139,13 +148,17 @@ def push_of(f, x, y, z):  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    f : row of `FieldRows.at`
-    x, y, z : metres, world
+    f : (k,) array
+        A row of `FieldRows.at`.
+    x, y, z : float
+        Metres, world.
 
     Returns
     -------
-    ax, ay, az, flow
-        m/s^2, and 1/s by which it slows what moves there.
+    ax, ay, az : float
+        m/s^2.
+    flow : float
+        1/s, by which it slows what moves there.
     """
     nx, ny, nz = f[_AXIS], f[_AXIS + 1], f[_AXIS + 2]
     rx, ry, rz = x - f[_PLACE], y - f[_PLACE + 1], z - f[_PLACE + 2]  # from its middle

@@ -36,12 +36,17 @@ class Filling:
 
     Attributes
     ----------
-    points : (n, 3) float64, metres, in the frame of the mesh
-    volume : (n,) float32, cubic metres of space that each stands for
-    part : (n,) int32, number of the connected part
-    space : the cells themselves
-    report : "particles", "parts", "dropped_parts", "dropped_cells", "method" ("winding number" or "ray parity"),
-        "bare_vertices": vertices farther than two cells from any particle, whose surroundings are too thin to fill
+    points : (n, 3) float64 array
+        Metres, in the frame of the mesh.
+    volume : (n,) float32 array
+        Cubic metres of space that each stands for.
+    part : (n,) int32 array
+        Number of the connected part.
+    space : Volume
+        The cells themselves.
+    report : dict
+        "particles", "parts", "dropped_parts", "dropped_cells", "method" ("winding number" or "ray parity"),
+        "bare_vertices": vertices farther than two cells from any particle, whose surroundings are too thin to fill.
     """
 
     points: Array
@@ -65,13 +70,20 @@ def fill(
 
     Parameters
     ----------
-    vertices, faces : (n, 3) float, (m, 3) int
-        Metres; need not be closed, free of intersections, or oriented outwards.
-    spacing : metres between particles
-    jitter : random displacement of particles, in cells, up to 1: sand and snow show no rows then
-    seed : of the jitter
-    method : "winding", "parity" or "auto"
-    name : of the mesh, in messages
+    vertices : (n, 3) float array
+        Metres.
+    faces : (m, 3) int array
+        Need not be closed, free of intersections, or oriented outwards.
+    spacing : float
+        Metres between particles.
+    jitter : float
+        Random displacement of particles, in cells, up to 1: sand and snow show no rows then.
+    seed : int
+        Of the jitter.
+    method : str
+        "winding", "parity" or "auto".
+    name : str
+        Of the mesh, in messages.
 
     Raises
     ------

@@ -35,13 +35,20 @@ class State:
 
     Attributes
     ----------
-    x : (n, 3) float64, metres, world
-    v : (n, 3) float32, m/s
-    affine : (n, 9) float32, velocity gradient of APIC, 1/s
-    elastic : (n, 9) float32, elastic deformation gradient less 1
-    total : (n, 9) float32, deformation gradient since the start less 1; no rows where no matter is plastic
-    tau : (n, 6) float32, Kirchhoff stress, Pa: xx, yy, zz, xy, xz, yz
-    memory : (n,) float32, see `constitutive.respond`
+    x : (n, 3) float64 array
+        Metres, world.
+    v : (n, 3) float32 array
+        m/s.
+    affine : (n, 9) float32 array
+        Velocity gradient of APIC, 1/s.
+    elastic : (n, 9) float32 array
+        Elastic deformation gradient less 1.
+    total : (n, 9) float32 array
+        Deformation gradient since the start less 1; no rows where no matter is plastic.
+    tau : (n, 6) float32 array
+        Kirchhoff stress, Pa: xx, yy, zz, xy, xz, yz.
+    memory : (n,) float32 array
+        See `constitutive.respond`.
     """
 
     x: Array
@@ -64,10 +71,20 @@ class Scene:
 
     Attributes
     ----------
-    mass, volume : (n,) float32, kg and cubic metres at rest; no mass: riders
-    model, parameters, solid : (n,) uint8, (n, k) float32, (n,) bool, see `matter`; solid matter keeps its shape
-    pins : (k,) int64, particles that only move as they are told
-    least : kg, below which a node is empty
+    mass : (n,) float32 array
+        kg; none: riders.
+    volume : (n,) float32 array
+        Cubic metres at rest.
+    model : (n,) uint8 array
+        See `matter`.
+    parameters : (n, k) float32 array
+        See `matter`.
+    solid : (n,) bool array
+        Matter that keeps its shape.
+    pins : (k,) int64 array
+        Particles that only move as they are told.
+    least : float
+        kg, below which a node is empty.
     """
 
     domain: Domain
@@ -90,9 +107,12 @@ class Limits:
 
     Attributes
     ----------
-    drift : cells that particles may still move until they must be sorted again
-    speed : m/s, of the fastest, from which on a step must be shorter
-    outside : m/s, of the fastest of what is told how to move
+    drift : float
+        Cells that particles may still move until they must be sorted again.
+    speed : float
+        m/s, of the fastest, from which on a step must be shorter.
+    outside : float
+        m/s, of the fastest of what is told how to move.
     """
 
     drift: float
@@ -105,8 +125,10 @@ class Grid(ABC):
 
     Attributes
     ----------
-    most : steps that it takes at once, at most
-    launcher : of the device that it works on, if that is not this processor
+    most : int
+        Steps that it takes at once, at most.
+    launcher : Launcher, optional
+        Of the device that it works on, if that is not this processor.
     """
 
     most = 1
@@ -121,9 +143,13 @@ class Grid(ABC):
 
         Parameters
         ----------
-        frame : counted from 0
-        seconds : its length
-        pin_velocity : (k, 3) float32, m/s
+        state : State
+        frame : int
+            Counted from 0.
+        seconds : float
+            Its length.
+        pin_velocity : (k, 3) float32 array
+            m/s.
         """
 
     @abstractmethod

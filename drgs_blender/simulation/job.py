@@ -47,10 +47,16 @@ class Job:
     Attributes
     ----------
     settings : Settings
-    filling : particles at rest, world
-    solver : at the beginning
-    digest, moves : what frames depend on, see `digest`
-    tear, grain : see `frame.ObjectState`
+    filling : Filling
+        Particles at rest, world.
+    solver : Stepper
+        At the beginning.
+    digest : str
+        Of what all frames depend on, see `digest`.
+    moves : list of str
+        Of what moves in each frame.
+    tear, grain : float
+        See `frame.ObjectState`.
     """
 
     settings: Settings
@@ -147,8 +153,11 @@ def prepare(mesh: Mesh, settings: Settings, name: str = "mesh") -> Job:
 
     Parameters
     ----------
-    mesh : the asset's, object space
-    name : of it, in messages
+    mesh : Mesh
+        The asset's, object space.
+    settings : Settings
+    name : str
+        Of it, in messages.
 
     Raises
     ------

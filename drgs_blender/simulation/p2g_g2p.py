@@ -99,8 +99,11 @@ def stretch(f, p, step, g0, g1, g2, g3, g4, g5, g6, g7, g8):  # type: ignore[no-
 
 @njit(inline="always")
 def momentum_of(p, v, affine, tau, m, q, h, fx, fy, fz):  # type: ignore[no-untyped-def]
-    """Momentum that particle p gives to the first node around it, and by how much more the next ones along x, y and z
-    get of it, row by row: m v + (m C - factor V tau) d, with d from the particle to the node and q = -factor V."""
+    """Momentum that particle p gives to the first node around it, and its increments to the next nodes.
+
+    They are along x, y and z, row by row: m v + (m C - factor V tau) d, with d from the particle to the node and
+    q = -factor V.
+    """
     a00, a01, a02 = (m * affine[p, 0] + q * tau[p, 0]) * h, (m * affine[p, 1] + q * tau[p, 3]) * h, (m * affine[p, 2] + q * tau[p, 4]) * h  # noqa: E501  # fmt: skip
     a10, a11, a12 = (m * affine[p, 3] + q * tau[p, 3]) * h, (m * affine[p, 4] + q * tau[p, 1]) * h, (m * affine[p, 5] + q * tau[p, 5]) * h  # noqa: E501  # fmt: skip
     a20, a21, a22 = (m * affine[p, 6] + q * tau[p, 4]) * h, (m * affine[p, 7] + q * tau[p, 5]) * h, (m * affine[p, 8] + q * tau[p, 2]) * h  # noqa: E501  # fmt: skip
@@ -126,9 +129,15 @@ def scatter(  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    x (n, 3) float64; v (n, 3), affine (n, 9), tau (n, 6), mass (n,), volume (n,) float32
-        In the order of the arrangement; volume is that at rest.
-    nodes : (a, 64, 4) float32
+    x : (n, 3) float64 array
+        In the order of the arrangement, as all that is of particles.
+    v : (n, 3) float32 array
+    affine : (n, 9) float32 array
+    tau : (n, 6) float32 array
+    mass : (n,) float32 array
+    volume : (n,) float32 array
+        At rest.
+    nodes : (a, 64, 4) float32 array
         Written: momentum and mass of the nodes of active blocks.
     """
     scale = 1.0 / spacing
@@ -178,10 +187,14 @@ def advance_nodes(nodes, least, dt, force, wind, drag, damping):  # type: ignore
 
     Parameters
     ----------
-    least : kg, below which a node is empty: momentum over a mass near underflow is noise
-    force : (3,) m/s^2, acceleration
-    wind : (3,) m/s, towards which `drag` (1/s) pulls
-    damping : 1/s
+    least : float
+        kg, below which a node is empty: momentum over a mass near underflow is noise.
+    force : (3,) array
+        m/s^2, acceleration.
+    wind : (3,) array
+        m/s, towards which `drag` (1/s) pulls.
+    damping : float
+        1/s.
     """
     pull, slow = np.float32(1.0 - np.exp(-dt * drag)), np.float32(np.exp(-dt * damping))
     gx, gy, gz = np.float32(dt * force[0]), np.float32(dt * force[1]), np.float32(dt * force[2])
@@ -206,10 +219,10 @@ def gather(  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    elastic, total : (n, 9) float32
+    elastic, total : (n, 9) float32 array
         Deformation gradients; `total` has no rows where the two are the same for every particle. Matter that is not
         `solid` keeps the total it has.
-    fastest : (b,) float32
+    fastest : (b,) float32 array
         Written: the highest speed in each block, m/s; infinite where a particle is not finite.
     """
     scale = 1.0 / spacing
@@ -281,9 +294,12 @@ def hold_pins(x, pinned, pin_velocity, mass, origin, spacing, slot, nodes, held)
 
     Parameters
     ----------
-    pinned : (k,) int64, particles held
-    pin_velocity : (k, 3) float32, m/s
-    held : (a, 64, 4) float32, zero before and after: pinned momentum and mass
+    pinned : (k,) int64 array
+        Particles held.
+    pin_velocity : (k, 3) float32 array
+        m/s.
+    held : (a, 64, 4) float32 array
+        Zero before and after: pinned momentum and mass.
     """
     scale = 1.0 / spacing
     for turn in range(2):

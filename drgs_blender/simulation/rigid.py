@@ -41,7 +41,14 @@ class Rigid(Stepper):
 
     Parameters
     ----------
-    body, forces, colliders, planes : as of `solver.Solver`
+    body : Body
+        As of `solver.Solver`.
+    forces : Forces, optional
+        As of `solver.Solver`.
+    colliders : sequence of Collider
+        As of `solver.Solver`.
+    planes : sequence of Plane
+        As of `solver.Solver`.
     """
 
     rate = 480.0

@@ -48,21 +48,46 @@ class Settings:
 
     Attributes
     ----------
-    material : of all matter that no region claims
-    regions : parts of other matter; the last one that fits counts
-    resolution : grid cells along the body's longest side; there are two particles a cell and axis
-    solver : "mpm"; "xpbd" for a quick look at what an elastic body does; "rigid" for one that never bends
-    gravity, wind : m/s^2 and m/s; drag (1/s) is how the wind pulls, damping (1/s) slows everything
-    fields : of force
-    velocity, spin : m/s and rad/s about the body's centre, at the start
-    pins : parts that stay where they are, or move as the mesh does in `motion`
-    motion : .npy of (k, n, 3) vertices of the mesh, a frame each, object space
-    floor : height of a floor in the world, metres, or None; with its contact and friction
-    domain : corners of the space that is simulated, world; None is chosen from the body and what is around it
-    walls : what its sides do; "open" makes leaving an error
-    first, last, fps : frames
-    device : what computes them, one of `DEVICES`; frames do not depend on it, but for last digits
-    matrix_world : (4, 4) object to world
+    material : Material
+        Of all matter that no region claims.
+    regions : tuple of tuple of (Region, Material)
+        Parts of other matter; the last one that fits counts.
+    resolution : int
+        Grid cells along the body's longest side; there are two particles a cell and axis.
+    solver : str
+        "mpm"; "xpbd" for a quick look at what an elastic body does; "rigid" for one that never bends.
+    gravity : tuple of float
+        m/s^2.
+    wind : tuple of float
+        m/s.
+    drag : float
+        1/s, how the wind pulls.
+    damping : float
+        1/s, slows everything.
+    fields : tuple of ForceField
+        Of force.
+    velocity : tuple of float
+        m/s, at the start.
+    spin : tuple of float
+        rad/s about the body's centre, at the start.
+    pins : tuple of Region
+        Parts that stay where they are, or move as the mesh does in `motion`.
+    motion : str, optional
+        .npy of (k, n, 3) vertices of the mesh in k frames, object space.
+    floor : float, optional
+        Height of a floor in the world, metres, or None; with its contact and friction.
+    domain : tuple of tuple of float, optional
+        Corners of the space that is simulated, world; None is chosen from the body and what is around it.
+    walls : str
+        What its sides do; "open" makes leaving an error.
+    first, last : int
+        Frames.
+    fps : float
+        Frames per second.
+    device : str
+        What computes them, one of `DEVICES`; frames do not depend on it, but for last digits.
+    matrix_world : tuple of tuple of float
+        (4, 4) object to world.
     """
 
     material: Material = field(default_factory=lambda: make_material("jelly"))

@@ -41,12 +41,18 @@ class Body:
 
     Attributes
     ----------
-    points : (n, 3) float64, metres, world
-    volume : (n,) cubic metres
-    matter : of the points
-    riders : (k, 3) float64, points without mass that move along
-    pinned : (n,) bool, points that only move as they are told
-    velocity : (3,) or (n, 3), m/s, at the start
+    points : (n, 3) float64 array
+        Metres, world.
+    volume : (n,) array
+        Cubic metres.
+    matter : Matter
+        Of the points.
+    riders : (k, 3) float64 array
+        Points without mass that move along.
+    pinned : (n,) bool array, optional
+        Points that only move as they are told.
+    velocity : (3,) or (n, 3) array or sequence of float
+        m/s, at the start.
     """
 
     points: Array
@@ -65,9 +71,16 @@ class Solver(Stepper):
     body : Body
     domain : Domain
         Where particles may be; leaving it is an error.
-    forces, colliders, planes : what acts
-    courant : time step in parts of what elastic waves and viscosity bear; above 1 is unstable
-    device : one of `DEVICES`; what it cannot do is done by this processor, with a warning
+    forces : Forces, optional
+        What acts.
+    colliders : sequence of Collider
+        What acts.
+    planes : sequence of Plane
+        What acts.
+    courant : float
+        Time step in parts of what elastic waves and viscosity bear; above 1 is unstable.
+    device : str
+        One of `DEVICES`; what it cannot do is done by this processor, with a warning.
 
     Attributes
     ----------

@@ -29,7 +29,10 @@ class Stepper(ABC):
         Time steps a second, at least.
     launcher : Launcher or None
         Of the device that computes frames, if that is not this processor.
-    colliders, planes
+    colliders : list of MovingCollider
+        What matter cannot enter.
+    planes : array
+        The same, as rows of `contact.plane_rows`.
         What matter cannot enter, the latter as rows of `contact.plane_rows`.
     """
 
@@ -103,10 +106,14 @@ class Stepper(ABC):
 
         Parameters
         ----------
-        seconds : length of the frame
-        pin_targets : (k, 3) where the pinned points are at its end; None holds them
-        cancelled : asked before each step
-        progress : told which part of the frame is done
+        seconds : float
+            Length of the frame.
+        pin_targets : (k, 3) array, optional
+            Where the pinned points are at its end; None holds them.
+        cancelled : callable, optional
+            Asked before each step.
+        progress : callable, optional
+            Told which part of the frame is done.
 
         Raises
         ------

@@ -52,8 +52,16 @@ class Lattice(Stepper):
 
     Parameters
     ----------
-    body, forces, colliders, planes : as of `solver.Solver`
-    cubes : along the longest side
+    body : Body
+        As of `solver.Solver`.
+    forces : Forces, optional
+        As of `solver.Solver`.
+    colliders : sequence of Collider
+        As of `solver.Solver`.
+    planes : sequence of Plane
+        As of `solver.Solver`.
+    cubes : int
+        Along the longest side.
     """
 
     rate = 720.0  #: each step is one iteration
@@ -259,7 +267,8 @@ def _solve(x, inverse_mass, corners, parity, slopes, terms):  # type: ignore[no-
 
     Parameters
     ----------
-    terms : (cubes, 5, 4) float64: alpha, beta, b and q
+    terms : (cubes, 5, 4) float64 array
+        Alpha, beta, b and q.
     """
     for colour in range(8):
         for q in prange(parity[colour], parity[colour + 1]):

@@ -21,10 +21,14 @@ class Report:
 
     Attributes
     ----------
-    faults : what a node cannot do without
-    notes : what a node will do differently, or only perhaps
-    files : what the scene refers to, that exists
-    error : the first fault that DR-GS itself met
+    faults : list of str
+        What a node cannot do without.
+    notes : list of str
+        What a node will do differently, or only perhaps.
+    files : list of Path
+        What the scene refers to, that exists.
+    error : DrgsError, optional
+        The first fault that DR-GS itself met.
     """
 
     faults: list[str] = field(default_factory=list)
@@ -47,9 +51,14 @@ def check_scene(
 
     Parameters
     ----------
-    scene : .blend file
-    shared : folders that every node sees under the same path; files outside of them are faults when there are any
-    scripts : let the file run its own Python scripts
+    scene : Path
+        .blend file.
+    frames : sequence of int
+    blender : Blender
+    shared : sequence of Path
+        Folders that every node sees under the same path; files outside of them are faults when there are any.
+    scripts : bool
+        Let the file run its own Python scripts.
     """
     report = Report()
     warnings: dict[str, None] = {}

@@ -22,7 +22,10 @@ def write_job(job: Job, folder: Path, manager: str) -> str:
 
     Parameters
     ----------
-    manager : address of the Flamenco Manager
+    job : Job
+    folder : Path
+    manager : str
+        Address of the Flamenco Manager.
 
     Returns
     -------

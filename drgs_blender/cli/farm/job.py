@@ -17,13 +17,22 @@ class Job:
 
     Attributes
     ----------
-    name : for people
-    scene : absolute path of the .blend file
-    frames : in the order in which they shall be made
-    out, clean : absolute patterns with ``#``, of the rendered and of the denoised frames; `clean` may be None
-    chunk : most frames of one task
-    options : further options of ``drgs render``
-    program : how a node starts ``drgs``: a program and perhaps its first arguments
+    name : str
+        For people.
+    scene : Path
+        Absolute path of the .blend file.
+    frames : list of int
+        In the order in which they shall be made.
+    out : str
+        Absolute pattern with ``#``, of the rendered frames.
+    clean : str or None
+        The same of the denoised frames, if there are any.
+    chunk : int
+        Most frames of one task.
+    options : tuple of str
+        Further options of ``drgs render``.
+    program : tuple of str
+        How a node starts ``drgs``: a program and perhaps its first arguments.
     """
 
     name: str

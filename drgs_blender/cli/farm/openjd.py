@@ -24,9 +24,13 @@ def write_bundle(job: Job, folder: Path, seconds: int = 0, files: Iterable[Path]
 
     Parameters
     ----------
-    folder : of the bundle
-    seconds : how long a chunk should take, for schedulers that adapt its size; 0 leaves it at ``job.chunk`` frames
-    files : what the scene needs, for schedulers that copy it to the nodes
+    job : Job
+    folder : Path
+        Of the bundle.
+    seconds : int
+        How long a chunk should take, for schedulers that adapt its size; 0 leaves it at ``job.chunk`` frames.
+    files : iterable of Path
+        What the scene needs, for schedulers that copy it to the nodes.
 
     Returns
     -------

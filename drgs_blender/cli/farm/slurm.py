@@ -61,9 +61,13 @@ def write_job(job: Job, folder: Path, retries: int = RETRIES, directives: tuple[
 
     Parameters
     ----------
-    folder : on a disk that every node sees; the logs go there as well
-    retries : how often a chunk is queued again after exit code 75 or 73
-    directives : further options of sbatch, such as ``--partition=farm``
+    job : Job
+    folder : Path
+        On a disk that every node sees; the logs go there as well.
+    retries : int
+        How often a chunk is queued again after exit code 75 or 73.
+    directives : tuple of str
+        Further options of sbatch, such as ``--partition=farm``.
 
     Returns
     -------

@@ -55,14 +55,20 @@ class Expressions:
 
     Parameters
     ----------
-    translation : of which the function is a part
-    function, tree : the function and its syntax
-    arguments : its parameters by name
+    translation : Translation
+        Of which the function is a part.
+    function : callable
+    tree : ast.FunctionDef
+        Its syntax.
+    arguments : dict of str to Value
+        Its parameters by name.
 
     Attributes
     ----------
-    result : type of what the function returns
-    line : of the function's text, under way; for errors
+    result : object
+        Type of what the function returns.
+    line : int
+        Of the function's text, under way; for errors.
     """
 
     def __init__(

@@ -41,9 +41,14 @@ class Work:
 
     Parameters
     ----------
-    function : see this module's head
-    rooms : of what it takes as `room`
-    natives, constants : see `Translation`
+    function : callable
+        See this module's head.
+    rooms : Room or tuple
+        Of what it takes as `room`.
+    natives : mapping
+        See `Translation`.
+    constants : callable
+        See `Translation`.
     """
 
     def __init__(
@@ -78,11 +83,13 @@ class Launcher:
 
     Parameters
     ----------
-    device : Warp's name of it: "cuda:0", "cpu"
+    device : str
+        Warp's name of it: "cuda:0", "cpu".
 
     Attributes
     ----------
-    apart : whether it has memory of its own, as a card has
+    apart : bool
+        Whether it has memory of its own, as a card has.
     """
 
     def __init__(self, device: str) -> None:
@@ -107,9 +114,13 @@ class Launcher:
 
         Parameters
         ----------
-        arguments : numbers, arrays here or on the device, named tuples of numbers, and tuples of all these
-        out : arrays that are written to, or tuples of them: those of this process as a whole, those on the device where
-            the work does
+        work : Work
+        pieces : int
+        arguments : sequence
+            Numbers, arrays here or on the device, named tuples of numbers, and tuples of all these.
+        out : sequence
+            Arrays that are written to, or tuples of them: those of this process as a whole, those on the device where
+            the work does.
 
         Raises
         ------

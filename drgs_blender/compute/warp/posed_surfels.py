@@ -22,9 +22,12 @@ class PosedThere(PosedSurfels):
 
     Parameters
     ----------
-    there : every field by its name, on the device or, where nobody has needed it there, here
-    here : makes the same on this processor; called when a field is first read that is not among the `known`
-    known : fields that are on this processor, too
+    there : dict
+        Every field by its name, on the device or, where nobody has needed it there, here.
+    here : callable
+        Makes the same on this processor; called when a field is first read that is not among the `known`.
+    known : mapping of str to array, optional
+        Fields that are on this processor, too.
     """
 
     def __init__(

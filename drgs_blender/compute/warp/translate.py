@@ -40,11 +40,16 @@ class Native:
 
     Attributes
     ----------
-    source : text of a Warp function; its name is ``name``
-    name : unlike any other's
-    result : type of what it returns
-    structs : named tuples that it takes
-    uses : functions that natives stand for, which it calls
+    source : str
+        Text of a Warp function; its name is ``name``.
+    name : str
+        Unlike any other's.
+    result : object
+        Type of what it returns.
+    structs : tuple of type
+        Named tuples that it takes.
+    uses : tuple
+        Functions that natives stand for, which it calls.
     """
 
     source: str
@@ -68,9 +73,12 @@ class Translation:
 
     Parameters
     ----------
-    natives : what stands for functions that are not translated: the device's own, or other ones that are
-    constants : may replace integers of modules, see `Constants`
-    fused : whether products and sums may be fused, which rounds otherwise than the processor does
+    natives : mapping
+        What stands for functions that are not translated: the device's own, or other ones that are.
+    constants : callable
+        May replace integers of modules, see `Constants`.
+    fused : bool
+        Whether products and sums may be fused, which rounds otherwise than the processor does.
     """
 
     natives: Mapping[Any, Native | types.FunctionType] = field(default_factory=dict)

@@ -102,8 +102,10 @@ def read_asset(path: PathLike, verify: bool = True) -> Asset:
 
     Parameters
     ----------
-    verify : also read everything once: SHA-256 of every member, finite values, ranges. Without it only structure,
-        shapes and indices are checked, which is enough never to crash.
+    path : str or path-like
+    verify : bool
+        Also read everything once: SHA-256 of every member, finite values, ranges. Without it only structure, shapes and
+        indices are checked, which is enough never to crash.
 
     Raises
     ------
@@ -111,6 +113,21 @@ def read_asset(path: PathLike, verify: bool = True) -> Asset:
         Names file, member and tensor, and what is wrong.
     VersionError
         The file was written by a later version.
+
+    Examples
+    --------
+    >>> from drgs_blender.core.asset.model import Asset, Mesh
+    >>> from drgs_blender.deform.attach import attach
+    >>> corners = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
+    >>> mesh = Mesh(corners, [[0, 1, 2], [0, 2, 3]], albedo=[[0.5] * 3] * 4, roughness=[1] * 4, metallic=[0] * 4)
+    >>> surfels, binding, report = attach(mesh, density=1)
+    >>> write_asset("square.drgs", Asset(surfels, mesh, binding, provenance={"by": "hand"}))
+    >>> asset = read_asset("square.drgs")
+    >>> asset.mesh.faces
+    array([[0, 1, 2],
+           [0, 2, 3]], dtype=int32)
+    >>> asset.binding.face, asset.provenance
+    (array([0, 0, 1, 1], dtype=int32), {'by': 'hand'})
     """
     subject = os.fspath(path)
     members = read_archive(path, check=(MANIFEST,))

@@ -38,13 +38,22 @@ class Surfels:
 
     Attributes
     ----------
-    centre : (n, 3) float32, metres, object space
-    scale : (n, 2) float32, metres: standard deviations along the two tangents (linear, not log)
-    rotation : (n, 4) float32 unit quaternion wxyz; the rotated X and Y axes are the tangents, Z is the normal
-    opacity : (n,) float32 in [0, 1]
-    albedo, roughness, metallic : (n, 3), (n,), (n,) float32 in [0, 1]
-    sh : (n, k, 3) float32 or None: spherical-harmonic outgoing colour as captured (3DGS basis and order)
-    extras : unknown per-surfel properties kept from the file, name -> (n,) or (n, c) float32
+    centre : (n, 3) float32 array
+        Metres, object space.
+    scale : (n, 2) float32 array
+        Metres: standard deviations along the two tangents (linear, not log).
+    rotation : (n, 4) float32 array
+        Unit quaternion wxyz; the rotated X and Y axes are the tangents, Z is the normal.
+    opacity : (n,) float32 array
+        In [0, 1].
+    albedo : (n, 3) float32 array
+        In [0, 1].
+    roughness, metallic : (n,) float32 array
+        In [0, 1].
+    sh : (n, k, 3) float32 array, optional
+        Spherical-harmonic outgoing colour as captured (3DGS basis and order).
+    extras : dict of str to (n,) or (n, c) float32 array
+        Unknown per-surfel properties kept from the file.
     """
 
     centre: Array
@@ -79,10 +88,16 @@ class Mesh:
 
     Attributes
     ----------
-    vertices : (n, 3) float32, metres, object space
-    faces : (m, 3) int32, counter-clockwise seen from outside
-    albedo, roughness, metallic : per vertex (n, 3), (n,), (n,) float32 in [0, 1]
-    groups : named vertex sets kept from the source (one a material or part), name -> (k,) int32 vertex indices
+    vertices : (n, 3) float32 array
+        Metres, object space.
+    faces : (m, 3) int32 array
+        Counter-clockwise seen from outside.
+    albedo : (n, 3) float32 array
+        Per vertex, in [0, 1].
+    roughness, metallic : (n,) float32 array
+        Per vertex, in [0, 1].
+    groups : dict of str to (k,) int32 array
+        Vertices of the named sets kept from the source (one per material or part).
     """
 
     vertices: Array
@@ -117,12 +132,14 @@ class Binding:
 
     Attributes
     ----------
-    face : (n,) int32
-    barycentric : (n, 3) float32, sums to 1
-    offset : (n,) float32, along the unit face normal in units of the rest face's mean edge length
-    normal : (n, 3) float32: shading normal in the orthonormal frame (t, b, s) of the face, where s is the
-        interpolated smooth vertex normal, t the first edge projected off s, b = s x t. Surfels made from the mesh
-        have exactly (0, 0, 1).
+    face : (n,) int32 array
+    barycentric : (n, 3) float32 array
+        Sums to 1.
+    offset : (n,) float32 array
+        Along the unit face normal in units of the rest face's mean edge length.
+    normal : (n, 3) float32 array
+        Shading normal in the orthonormal frame (t, b, s) of the face, where s is the interpolated smooth vertex normal,
+        t the first edge projected off s, b = s x t. Surfels made from the mesh have exactly (0, 0, 1).
     """
 
     face: Array
@@ -172,12 +189,17 @@ class PosedSurfels:
 
     Attributes
     ----------
-    centre : (n, 3) float32, world space
-    tangent_u, tangent_v : (n, 3) float32, world space, **scaled** (F s_u t_u, F s_v t_v); need not be orthogonal:
-        the kernel at q solves q - centre = u tangent_u + v tangent_v and is exp(-(u^2 + v^2) / 2)
-    normal : (n, 3) float32 unit shading normal, world space
-    opacity, albedo, roughness, metallic : as in Surfels, after the frame's material edits
-    object_index : (n,) int32: index into Frame.objects
+    centre : (n, 3) float32 array
+        World space.
+    tangent_u, tangent_v : (n, 3) float32 array
+        World space, **scaled** (F s_u t_u, F s_v t_v); need not be orthogonal: the kernel at q solves q - centre = u
+        tangent_u + v tangent_v and is exp(-(u^2 + v^2) / 2).
+    normal : (n, 3) float32 array
+        Unit shading normal, world space.
+    opacity, albedo, roughness, metallic : array
+        As in Surfels, after the frame's material edits.
+    object_index : (n,) int32 array
+        Index into Frame.objects.
     """
 
     centre: Array

@@ -55,7 +55,8 @@ def encode(tensors: Mapping[str, Array]) -> list[memoryview]:
 
     Parameters
     ----------
-    tensors : name -> array, written in this order, little-endian and C-contiguous
+    tensors : mapping of str to array
+        Written in this order, little-endian and C-contiguous.
     """
     header: dict[str, Any] = {}
     buffers: list[memoryview] = []
@@ -80,8 +81,10 @@ def decode(buffer: Array, subject: str = "tensors") -> dict[str, Array]:
 
     Parameters
     ----------
-    buffer : (n,) uint8, the whole file; the arrays are as writable as it is
-    subject : what errors name
+    buffer : (n,) uint8 array
+        The whole file; the arrays are as writable as it is.
+    subject : str
+        What errors name.
 
     Raises
     ------

@@ -68,8 +68,10 @@ class Carrier:
 
     Parameters
     ----------
-    weights : of `gmls.bind_points`
-    launcher : of the device
+    weights : Weights
+        Of `gmls.bind_points`.
+    launcher : Launcher
+        Of the device.
 
     Raises
     ------

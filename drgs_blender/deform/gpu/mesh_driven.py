@@ -74,7 +74,8 @@ class Deformer:
 
     Parameters
     ----------
-    launcher : of the device
+    launcher : Launcher
+        Of the device.
     """
 
     def __init__(self, launcher: Launcher) -> None:

@@ -53,7 +53,9 @@ class DeviceGrid(Grid):
 
     Parameters
     ----------
-    launcher : of the device
+    scene : Scene
+    launcher : Launcher
+        Of the device.
 
     Raises
     ------
