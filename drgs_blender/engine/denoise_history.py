@@ -24,11 +24,16 @@ class Sequence:
 
     Attributes
     ----------
-    history : for the next picture; its instant holds the scene's own arrays where nothing moved, which saves looking
-    past : the instant of the last picture
-    fit : what must stay for the history to be of use: layout of the scene, window, primary surface, split of light
-    situation : all that decides what a picture shows; the same objects (``is``) as long as nothing changed
-    pictures : how many have gone into the history
+    history : History
+        For the next picture; its instant holds the scene's own arrays where nothing moved, which saves looking.
+    past : Instant, optional
+        The instant of the last picture.
+    fit : tuple
+        What must stay for the history to be of use: layout of the scene, window, primary surface, split of light.
+    situation : tuple
+        All that decides what a picture shows; the same objects (``is``) as long as nothing changed.
+    pictures : int
+        How many have gone into the history.
     """
 
     history: History = field(default_factory=History)
@@ -49,8 +54,11 @@ class Histories:
 
         Parameters
         ----------
-        scene : brought up to date for the frame
-        scenery : objects, meshes, images, world and lights of the frame, unchanged ones as the same objects
+        frame : Frame
+        scene : TraceScene
+            Brought up to date for the frame.
+        scenery : tuple
+            Objects, meshes, images, world and lights of the frame, unchanged ones as the same objects.
         """
         settings, camera = frame.settings, frame.camera
         old = self._known.get(frame.history, Sequence())

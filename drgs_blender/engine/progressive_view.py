@@ -62,16 +62,24 @@ class View:
 
     Parameters
     ----------
-    frame : what it shows; nobody may change it. Where it names a ``history``, coarse pictures are denoised with it
-    pace : for how coarse the first picture is
-    number : another one for every view: in a history, the noise of one picture must differ from that of the next
-    by_mesh : whether coarse pictures show the meshes, which are as detailed as those pictures
-    processor : who does the work
+    frame : Frame
+        What it shows; nobody may change it. Where it names a ``history``, coarse pictures are denoised with it.
+    pace : Pace
+        For how coarse the first picture is.
+    number : int
+        Another one for every view: in a history, the noise of one picture must differ from that of the next.
+    by_mesh : bool
+        Whether coarse pictures show the meshes, which are as detailed as those pictures.
+    backend : RenderBackend
+        Where the kernels run.
+    backend : RenderBackend
 
     Attributes
     ----------
-    pixel : side of the pixels of the last picture, in those of the frame
-    processor : as given
+    pixel : int
+        Side of the pixels of the last picture, in those of the frame.
+    backend : RenderBackend
+        As given.
     """
 
     def __init__(self, frame: Frame, pace: Pace, number: int, by_mesh: bool, backend: RenderBackend = CPU) -> None:

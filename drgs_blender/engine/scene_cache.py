@@ -71,9 +71,16 @@ class Stage:
 
     Attributes
     ----------
-    objects, meshes, images : of the last frame
-    scene : what rays meet
-    tree : surfels that rays meet; None when they meet the mesh
+    objects : list of Standing
+        Of the last frame.
+    meshes : list of MeshState
+        Of the last frame.
+    images : list of Image
+        Of the last frame.
+    scene : TraceScene
+        What rays meet.
+    tree : SurfelBVH or None
+        Surfels that rays meet; None when they meet the mesh.
     world, environment, lights : of the last frame
     """
 

@@ -179,8 +179,13 @@ def posed_surfels(
 
     Parameters
     ----------
-    driven : what poses them; surfels without a mesh follow the object's matrix
-    pose : `MeshDriven.pose`, or another that does the same elsewhere
+    state : ObjectState
+    index : int
+    driven : MeshDriven or Surfels
+        What poses them; surfels without a mesh follow the object's matrix.
+    traced : TraceObject
+    pose : callable
+        `MeshDriven.pose`, or another that does the same elsewhere.
     """
     matrix = np.asarray(state.matrix_world, np.float64)
     if isinstance(driven, Surfels):

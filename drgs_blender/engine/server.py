@@ -45,7 +45,8 @@ class Server:
 
     Parameters
     ----------
-    link : to the client
+    link : Link
+        To the client.
     """
 
     def __init__(self, link: Link) -> None:

@@ -47,9 +47,12 @@ class Placed:
 
     Attributes
     ----------
-    state : what the frame says of it
-    mesh : as rays see it, with the frame's materials
-    surfels : posed; of `asset`, one each
+    state : ObjectState
+        What the frame says of it.
+    mesh : TraceObject
+        As rays see it, with the frame's materials.
+    surfels : PosedSurfels
+        Posed; of `asset`, one each.
     """
 
     state: ObjectState
@@ -101,8 +104,11 @@ class Session:
 
         Parameters
         ----------
-        progress : called with (phase, part of the picture done in [0, 1])
-        cancelled : asked between steps; True raises `Cancelled`
+        frame : Frame
+        progress : callable, optional
+            Called with (phase, part of the picture done in [0, 1]).
+        cancelled : callable, optional
+            Asked between steps; True raises `Cancelled`.
 
         Raises
         ------

@@ -37,7 +37,10 @@ def hand_over(source: str, target: str, kind: str, read: Callable[[str], Mapping
 
     Parameters
     ----------
-    kind : what errors call such files
+    source, target : str
+    kind : str
+        What errors call such files.
+    read : callable
     """
     try:
         arrays = read(source)
@@ -88,11 +91,17 @@ def read_apart(
 
     Parameters
     ----------
-    module : dotted name; its `main` takes a source, a target and the two limits as text
-    kind : what errors call such files
-    lacking : problem and remedy where its library is not installed
-    remedies : reason for which a file is refused -> what to do, where that is not `REMEDY`
-    seconds, patience : of processor time for a small file; how many times as long by the clock
+    path : Path
+    module : str
+        Dotted name; its `main` takes a source, a target and the two limits as text.
+    kind : str
+        What errors call such files.
+    lacking : tuple of str
+        Problem and remedy where its library is not installed.
+    remedies : mapping of str to str, optional
+        Reason for which a file is refused -> what to do, where that is not `REMEDY`.
+    seconds, patience : float
+        Of processor time for a small file; how many times as long by the clock.
 
     Raises
     ------

@@ -12,11 +12,13 @@ def join_equal(*columns: Array) -> tuple[Array, Array]:
 
     Parameters
     ----------
-    columns : (n, k) float32 each
+    columns : (n, k) float32 array
+        Each.
 
     Returns
     -------
-    first, number : (m,) int64 rows to keep, in their order, and (n,) int64 which of them each row is
+    first, number : (m,) int64 array
+        Rows to keep, in their order, and (n,) int64 which of them each row is.
     """
     rows = np.ascontiguousarray(np.concatenate(columns, axis=1, dtype=np.float32) + np.float32(0))
     keys = rows.view(np.dtype((np.void, rows.shape[1] * 4))).reshape(-1)

@@ -36,9 +36,12 @@ def decode_tiff(data: bytes, subject: str, limit: int) -> Array:
 
     Parameters
     ----------
-    data : the file
-    subject : what errors call it
-    limit : pixels at most
+    data : bytes
+        The file.
+    subject : str
+        What errors call it.
+    limit : int
+        Pixels at most.
 
     Returns
     -------

@@ -36,16 +36,16 @@ class DepthMaps:
 
     Attributes
     ----------
-    depth : (v, h, w) float32 or float64
+    depth : (v, h, w) float32 or float64 array
         Metres along the axis of view, +inf where nothing is seen. Its precision is that of the fusion's arithmetic.
-    cosine : (v, h, w), of the same dtype
-        Between the surface's normal and the view, 0..1: the weight of a pixel. Below 0.1 a pixel does not count; where
-        nothing is seen, 1 says that space is free.
-    origin : (v, 3) float64
+    cosine : (v, h, w) array
+        Of the same dtype Between the surface's normal and the view, 0..1: the weight of a pixel. Below 0.1 a pixel does
+        not count; where nothing is seen, 1 says that space is free.
+    origin : (v, 3) float64 array
         Metres, in the frame of the field.
-    axes : (v, 3, 3) float64
+    axes : (v, 3, 3) float64 array
         Rows towards the right and down in the picture and along the view.
-    scale, offset : (v, 3) float64
+    scale, offset : (v, 3) float64 array
     perspective : bool
         Whether positions are to be divided by the depth; else the views are orthographic.
     bilinear : bool
@@ -68,7 +68,7 @@ class SignedDistanceField:
 
     Parameters
     ----------
-    low : (3,) float64
+    low : (3,) float64 array
         Centre of voxel (0, 0, 0), metres, in the frame of the mesh to be made.
     voxel : float
         Distance between the centres of neighbours, metres.
@@ -136,15 +136,15 @@ def main_parts(vertices: Array, faces: Array) -> tuple[Array, Array, int, float]
 
     Parameters
     ----------
-    vertices : (n, 3) float
+    vertices : (n, 3) float array
         Metres.
-    faces : (f, 3) int
+    faces : (f, 3) int array
         All of the same orientation, whichever.
 
     Returns
     -------
-    vertices : (m, 3) float
-    faces : (g, 3) int32
+    vertices : (m, 3) float array
+    faces : (g, 3) int32 array
         Counter-clockwise seen from outside.
     dropped : int
         Components left out.

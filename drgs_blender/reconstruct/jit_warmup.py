@@ -32,7 +32,11 @@ def rehearse(settings: Settings, masked: bool, backend: LearningBackend, cancell
 
     Parameters
     ----------
-    masked : the photographs have masks, or a background that tells as much
+    settings : Settings
+    masked : bool
+        The photographs have masks, or a background that tells as much.
+    backend : LearningBackend
+    cancelled : callable
 
     Raises
     ------

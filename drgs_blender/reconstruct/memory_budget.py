@@ -14,9 +14,15 @@ def check_fits(needed: float, subject: str, of: str, option: str, value: int, po
 
     Parameters
     ----------
-    subject, of : what is too large, and what it consists of, for the message
-    option, value : what decides its size, and how it is set
-    power, margin : the bytes grow with this power of the value and its margin together
+    needed : float
+    subject, of : str
+        What is too large, and what it consists of, for the message.
+    option : str
+        What decides its size, and how it is set.
+    value : int
+        What decides its size, and how it is set.
+    power, margin : int
+        The bytes grow with this power of the value and its margin together.
     """
     if needed > _SHARE * total_memory():
         fitting = int((value + margin) * (_SHARE * total_memory() / needed) ** (1 / power)) - margin

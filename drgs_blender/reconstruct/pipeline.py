@@ -66,14 +66,21 @@ class Settings:
 
     Attributes
     ----------
-    variant : "p" keeps the free surfels (driven by particles or mesh), "m" makes surfels on the mesh's faces
-    schedule : how surfels are learned
-    mesh_resolution : most voxels along the mesh's longest side
-    minutes : all stages together, once kernels are compiled; None: the steps of the schedule decide
-    materials : pull materials and light apart; else albedo is the photographed colour
+    variant : {"p", "m"}
+        "p" keeps the free surfels (driven by particles or mesh), "m" makes surfels on the mesh's faces.
+    schedule : Schedule
+        How surfels are learned.
+    mesh_resolution : int
+        Most voxels along the mesh's longest side.
+    minutes : float, optional
+        All stages together, once kernels are compiled; None: the steps of the schedule decide.
+    materials : bool
+        Pull materials and light apart; else albedo is the photographed colour.
     decoupling : how; its ``seconds`` follow from `minutes`. Normals are learned too: a mesh of photographs has errors
-    fixed : parameters of surfels on faces that are not learned: "offset", "opacity" (the paper's ablation)
-    device : "cpu", or "cuda" to learn on the first NVIDIA card; without one this processor does
+    fixed : tuple of str
+        Parameters of surfels on faces that are not learned: "offset", "opacity" (the paper's ablation).
+    device : {"cpu", "cuda"}
+        "cpu", or "cuda" to learn on the first NVIDIA card; without one this processor does.
     """
 
     variant: Literal["p", "m"] = "p"
@@ -92,11 +99,16 @@ class Progress:
 
     Attributes
     ----------
-    phase : "Preparing the engine (first time only)", "surfels", "mesh", "surfels on the mesh", "materials"
-    part : what is done of all, 0..1
-    surfels : how many there are
-    psnr : of the latest training views, decibels; None: not known
-    picture : (h, w, 3) float32, sRGB: a view as it looks now, beside its photograph; None: not drawn this time
+    phase : str
+        "Preparing the engine (first time only)", "surfels", "mesh", "surfels on the mesh", "materials".
+    part : float
+        What is done of all, 0..1.
+    surfels : int
+        How many there are.
+    psnr : float, optional
+        Of the latest training views, decibels; None: not known.
+    picture : (h, w, 3) float32 array, optional
+        sRGB: a view as it looks now, beside its photograph; None: not drawn this time.
     """
 
     phase: str
@@ -117,9 +129,14 @@ def reconstruct(
 
     Parameters
     ----------
-    on_progress : called about every second, with a picture every few seconds
-    cancelled : asked between steps; a checkpoint is left and Cancelled raised
-    folder : of checkpoints; a run that was stopped goes on from there, bit for bit unless `minutes` are given
+    capture : Capture
+    settings : Settings, optional
+    on_progress : callable, optional
+        Called about every second, with a picture every few seconds.
+    cancelled : callable, optional
+        Asked between steps; a checkpoint is left and Cancelled raised.
+    folder : Path, optional
+        Of checkpoints; a run that was stopped goes on from there, bit for bit unless `minutes` are given.
 
     Returns
     -------

@@ -75,7 +75,8 @@ def camera_parameters(camera: Camera, settings: RenderSettings, noise_index: int
 
     Returns
     -------
-    (PARAMETERS,) float64: the camera-to-world matrix (row-major), then the fields named by this module's offsets.
+    (PARAMETERS,) float64 array
+        The camera-to-world matrix (row-major), then the fields named by this module's offsets.
 
     Raises
     ------

@@ -29,19 +29,31 @@ class ShadingPoints:
 
     Attributes
     ----------
-    pixel : (n,) int32: y * camera.width + x in the full picture; seeds the random numbers
-    sample : (n,) int32: sub-pixel sample, 0 .. subpixels - 1; a pair (pixel, sample) may occur twice, once flagged
-        SECOND
-    weight : (n,) float32: alpha / subpixels, what the point contributes to its pixel
-    origin : (n, 3) float32 metres: on the traced mesh, where secondary rays start
-    normal : (n, 3) float32 unit: shading normal, faces the viewer
-    geometric_normal : (n, 3) float32 unit: of the traced mesh at ``origin``, faces the viewer
-    view : (n, 3) float32 unit: towards the camera
-    albedo, roughness, metallic : (n, 3), (n,), (n,) float32 in [0, 1]; linear Rec.709
-    flags : (n,) uint8: SECOND, CATCHER; 0 when not given
-    own : (n,) int32: object whose surfels the point lies on, so that those near it do not shade it; -1: none. For rays
-        that meet surfels; empty where they meet meshes alone
-    size : (n,) float32 metres: mean larger standard deviation of these surfels; as long as ``own``
+    pixel : (n,) int32 array
+        y * camera.width + x in the full picture; seeds the random numbers.
+    sample : (n,) int32 array
+        Sub-pixel sample, 0 .. subpixels - 1; a pair (pixel, sample) may occur twice, once flagged SECOND.
+    weight : (n,) float32 array
+        Alpha / subpixels, what the point contributes to its pixel.
+    origin : (n, 3) float32 array
+        Metres: on the traced mesh, where secondary rays start.
+    normal : (n, 3) float32 array
+        Unit: shading normal, faces the viewer.
+    geometric_normal : (n, 3) float32 array
+        Unit: of the traced mesh at ``origin``, faces the viewer.
+    view : (n, 3) float32 array
+        Unit: towards the camera.
+    albedo : (n, 3) float32 array
+        In [0, 1]; linear Rec.709.
+    roughness, metallic : (n,) float32 array
+        In [0, 1]; linear Rec.709.
+    flags : (n,) uint8 array
+        SECOND, CATCHER; 0 when not given.
+    own : (n,) int32 array
+        Object whose surfels the point lies on, so that those near it do not shade it; -1: none. For rays that meet
+        surfels; empty where they meet meshes alone.
+    size : (n,) float32 array
+        Metres: mean larger standard deviation of these surfels; as long as ``own``.
     """
 
     pixel: Array
@@ -83,13 +95,17 @@ class Radiance:
 
     Attributes
     ----------
-    components : (n, 4, 3) float32 linear Rec.709: diffuse direct, diffuse indirect, glossy direct, glossy indirect;
-        surface colour included; their sum is the point's radiance. Not yet multiplied by ``ShadingPoints.weight``
-    variance : (n, 2) float32: estimated variance of the luminance of the diffuse and of the glossy sum
-    unshadowed : (n,) float32 or None: for points flagged CATCHER the luminance that would leave them if rays met
-        shadow catchers alone (masks shifted by `ray_masks.WITHOUT`); not read elsewhere
-    moments : (n, 5) float32, what ``variance`` is made of (`shade.spread`): number of samples, then sum and sum of
-        squares of their luminance, diffuse and glossy; may be empty
+    components : (n, 4, 3) float32 array
+        Linear Rec.709: diffuse direct, diffuse indirect, glossy direct, glossy indirect; surface colour included; their
+        sum is the point's radiance. Not yet multiplied by ``ShadingPoints.weight``.
+    variance : (n, 2) float32 array
+        Estimated variance of the luminance of the diffuse and of the glossy sum.
+    unshadowed : (n,) float32 array, optional
+        For points flagged CATCHER the luminance that would leave them if rays met shadow catchers alone (masks shifted
+        by `ray_masks.WITHOUT`); not read elsewhere.
+    moments : (n, 5) float32 array
+        What ``variance`` is made of (`shade.spread`): number of samples, then sum and sum of squares of their
+        luminance, diffuse and glossy; may be empty.
     """
 
     components: Array

@@ -153,6 +153,7 @@ class Progressive:
     Parameters
     ----------
     frame, processor : as of `pipeline.render`
+    backend : RenderBackend
     """
 
     def __init__(self, frame: Frame, backend: RenderBackend = CPU) -> None:

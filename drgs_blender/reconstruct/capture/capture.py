@@ -15,11 +15,16 @@ class View:
 
     Attributes
     ----------
-    name : as in the capture, unique
-    camera : pinhole (lens distortion is taken out when a capture is read); Z up world, Blender's camera convention
-    colour : (height, width, 3) float32, sRGB-encoded in 0..1 as photographed, top row first
-    mask : (height, width) float32 in 0..1, how much of the pixel is the object; None where nobody drew one
-    test : left out of training
+    name : str
+        As in the capture, unique.
+    camera : Camera
+        Pinhole (lens distortion is taken out when a capture is read); Z up world, Blender's camera convention.
+    colour : (height, width, 3) float32 array
+        sRGB-encoded in 0..1 as photographed, top row first.
+    mask : (height, width) float32 array, optional
+        In 0..1, how much of the pixel is the object; None where nobody drew one.
+    test : bool
+        Left out of training.
     """
 
     name: str
@@ -35,10 +40,14 @@ class Capture:
 
     Attributes
     ----------
-    source : what was read
-    views : in the order of their names
-    background : sRGB of what `colour` shows outside of the mask where that is one colour; None: the real surroundings
-    points : (n, 3) float32 sparse points on what was photographed (structure from motion), or None
+    source : Path
+        What was read.
+    views : list of View
+        In the order of their names.
+    background : tuple of float, optional
+        sRGB of what `colour` shows outside of the mask where that is one colour; None: the real surroundings.
+    points : (n, 3) float32 array, optional
+        Sparse points on what was photographed (structure from motion).
     """
 
     source: Path

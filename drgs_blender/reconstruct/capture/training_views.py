@@ -28,9 +28,12 @@ class Target:
 
     Attributes
     ----------
-    camera : of that size
-    photograph : what it should look like; on a device the colour alone, (h, w, 3)
-    mask : (h, w) tensor in 0..1, or None where nothing is known of it
+    camera : Camera
+        Of that size.
+    photograph : Photograph or tensor
+        What it should look like; on a device the colour alone, (h, w, 3).
+    mask : (h, w) tensor or None
+        Tensor in 0..1, or None where nothing is known of it.
     """
 
     camera: Camera

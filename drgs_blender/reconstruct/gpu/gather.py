@@ -67,7 +67,13 @@ class DeviceGatherer(Gatherer):
 
     Parameters
     ----------
-    launcher : of the device
+    launcher : Launcher
+        Of the device.
+    mesh : Mesh
+    tree : TriangleBVH
+    cache : array or None
+    counts : tuple of int
+    normals : bool
     """
 
     def __init__(

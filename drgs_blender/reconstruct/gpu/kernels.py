@@ -132,7 +132,8 @@ def pull_pixels(
 
     Parameters
     ----------
-    first : (m,) first row of each surfel's rectangle in what is written
+    first : (m,) array
+        First row of each surfel's rectangle in what is written.
     incoming : (h, w, G_FEATURES + channels)
     """
     (pulls,) = out
@@ -178,7 +179,8 @@ def sum_pixels(
 
     Parameters
     ----------
-    listed, tiles, pairs : (k,) surfel, tile and number of each pair, in the order of tiles
+    listed, tiles, pairs : (k,) array
+        Surfel, tile and number of each pair, in the order of tiles.
     pulls : what `pull_pixels` wrote
     """
     (slots,) = out

@@ -17,7 +17,8 @@ class TensorLauncher(Launcher):
 
     Parameters
     ----------
-    device : Warp's name of it: "cuda:0", "cpu"
+    device : str
+        Warp's name of it: "cuda:0", "cpu".
 
     Attributes
     ----------

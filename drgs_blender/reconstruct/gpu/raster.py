@@ -118,8 +118,10 @@ class _Pairs:
 
     Attributes
     ----------
-    first : (m + 1,) int64, first pair of each surfel, as they are numbered
-    start : (tiles + 1,) int64, first entry of each tile
+    first : (m + 1,) int64 array
+        First pair of each surfel, as they are numbered.
+    start : (tiles + 1,) int64 array
+        First entry of each tile.
     surfel, tile, number : (k,) int32, int32, int64 of the entries: pairs in the order of tiles, then of surfels
     """
 

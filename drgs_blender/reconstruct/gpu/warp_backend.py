@@ -38,7 +38,8 @@ class WarpLearningBackend(LearningBackend):
 
     Parameters
     ----------
-    device : Warp's name of it: "cuda:0", "cpu"
+    device : str
+        Warp's name of it: "cuda:0", "cpu".
 
     What fails there is a DeviceError of Warp's work, a RuntimeError of torch's.
     """

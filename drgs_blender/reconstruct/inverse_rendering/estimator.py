@@ -70,9 +70,12 @@ class Samples(NamedTuple):
 
     Attributes
     ----------
-    texel : (n, s, 4) int32: what a direction that misses the object reads, the first -1 for any other
-    share : (n, s, 4) float32: of these texels
-    weight : (n, s, 4) float32: of the radiance in D, S, P, E
+    texel : (n, s, 4) int32 array
+        What a direction that misses the object reads, the first -1 for any other.
+    share : (n, s, 4) float32 array
+        Of these texels.
+    weight : (n, s, 4) float32 array
+        Of the radiance in D, S, P, E.
     """
 
     texel: Array
@@ -296,11 +299,16 @@ class Gatherer:
 
     Parameters
     ----------
-    mesh : what rays meet
-    tree : of its triangles, or of nothing where nothing is in the way
-    cache : (v, 4, 3) float32, see `cache.radiance_cache`; None: what hits the mesh is black
-    counts : even numbers of cosine, GGX and light samples a pixel
-    normals : whether derivatives by the normals are wanted
+    mesh : Mesh
+        What rays meet.
+    tree : TriangleBVH
+        Of its triangles, or of nothing where nothing is in the way.
+    cache : (v, 4, 3) float32 array or None
+        See `cache.radiance_cache`; None: what hits the mesh is black.
+    counts : tuple of int
+        Even numbers of cosine, GGX and light samples a pixel.
+    normals : bool
+        Whether derivatives by the normals are wanted.
     """
 
     def __init__(
@@ -324,13 +332,18 @@ class Gatherer:
 
         Parameters
         ----------
-        normal : (n, 3) unit shading normals
-        alpha2 : (n,) square of GGX's alpha
-        radiance : (h, w, 3) lat-long, of the size given to `aim`
+        points : Points
+        normal : (n, 3) tensor
+            Unit shading normals.
+        alpha2 : (n,) tensor
+            Square of GGX's alpha.
+        radiance : (h, w, 3) tensor
+            Lat-long, of the size given to `aim`.
 
         Returns
         -------
-        (n, 2, 4, 3) : D, S, P, E from either half of the samples, each an estimate of its own
+        (n, 2, 4, 3) tensor
+            D, S, P, E from either half of the samples, each an estimate of its own.
         """
         return _Gather.apply(normal, alpha2, radiance, self, points)
 

@@ -26,7 +26,7 @@ class Lighting:
     Attributes
     ----------
     learned : LearnedLight
-    aimed : (h, 2 h, 3) float32
+    aimed : (h, 2 h, 3) float32 array
         The radiance by which directions are drawn.
     """
 

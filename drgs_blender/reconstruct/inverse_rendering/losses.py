@@ -43,9 +43,12 @@ def blotches(differences: Tensor, metallic: Tensor, likeness: Tensor) -> Tensor:
 
     Parameters
     ----------
-    differences : (e, 3) of albedo along edges, absolute
-    metallic : (e, 2) of their ends
-    likeness : (e, 1) how alike the photographs show these
+    differences : (e, 3) tensor
+        Of albedo along edges, absolute.
+    metallic : (e, 2) tensor
+        Of their ends.
+    likeness : (e, 1) tensor
+        How alike the photographs show these.
     """
     return (likeness * _surely_metal(metallic.min(1, keepdim=True).values) * differences).mean(0).sum()
 
@@ -63,10 +66,13 @@ def unbiased_loss(shown: Tensor, photographed: Tensor, by_shown: bool = False, w
 
     Parameters
     ----------
-    by_shown : weigh by what is shown, not by what was photographed. Where the mesh is a little off, one place mirrors
-        what the photographs show beside it, bright or dark; weights that are least for bright photographs make a mean
-        of these that is too dark
-    weights : (n, 3) how much each value counts; None: all the same
+    shown, photographed : tensor
+    by_shown : bool
+        Weigh by what is shown, not by what was photographed. Where the mesh is a little off, one place mirrors what the
+        photographs show beside it, bright or dark; weights that are least for bright photographs make a mean of these
+        that is too dark.
+    weights : (n, 3) tensor, optional
+        How much each value counts; None: all the same.
     """
     difference = shown - photographed[:, None]
     if by_shown:

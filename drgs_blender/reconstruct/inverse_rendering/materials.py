@@ -61,8 +61,12 @@ class Materials:
 
     Parameters
     ----------
-    colour : (3,) in the hue of which all begins: what all photographs together show. Light that is learned faster than
-        albedo would take it on, and leave its complement to the albedo
+    mesh : Mesh
+    parametrisation : str
+    coarse : int
+    colour : (3,) array
+        In the hue of which all begins: what all photographs together show. Light that is learned faster than albedo
+        would take it on, and leave its complement to the albedo.
     """
 
     def __init__(self, mesh: Mesh, parametrisation: str, coarse: int, colour: Array = _GREY) -> None:

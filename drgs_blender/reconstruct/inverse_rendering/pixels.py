@@ -38,14 +38,21 @@ class Pixels:
 
     Attributes
     ----------
-    view : (n,) int32, index among the training views
+    view : (n,) int32 array
+        Index among the training views.
     face : (n,) int32; corners : (n, 3) float32, barycentric
-    origin : (n, 3) float32, world: the point on the mesh
-    flat : (n, 3) float32 unit: normal of the face
-    towards : (n, 3) float32 unit: to the viewer
-    colour : (n, 3) float32 linear Rec.709 as photographed
-    beside_clipped : (n, 3) bool: not clipped, but a pixel of the object `_BESIDE` away or nearer is, in this channel
-    shown : (n, 3) float32 unit, or 0: normal by something that knows better than the mesh, facing the viewer
+    origin : (n, 3) float32 array
+        World: the point on the mesh.
+    flat : (n, 3) float32 array
+        Unit: normal of the face.
+    towards : (n, 3) float32 array
+        Unit: to the viewer.
+    colour : (n, 3) float32 array
+        Linear Rec.709 as photographed.
+    beside_clipped : (n, 3) bool array
+        Not clipped, but a pixel of the object `_BESIDE` away or nearer is, in this channel.
+    shown : (n, 3) float32 array
+        Unit, or 0: normal by something that knows better than the mesh, facing the viewer.
     """
 
     view: Array
@@ -73,9 +80,15 @@ def foreground_pixels(
 
     Parameters
     ----------
-    tree : of the mesh's triangles
-    most : keep this many, evenly chosen
-    normals : what else than the mesh tells them; see `Pixels.shown`
+    views : list of View
+    mesh : Mesh
+    tree : TriangleBVH
+        Of the mesh's triangles.
+    most : int
+        Keep this many, evenly chosen.
+    seed : int
+    normals : callable, optional
+        What else than the mesh tells them; see `Pixels.shown`.
 
     Raises
     ------

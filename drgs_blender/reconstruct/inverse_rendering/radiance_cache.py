@@ -38,9 +38,11 @@ def radiance_cache(pixels: Pixels, mesh: Mesh) -> tuple[Array, Array]:
 
     Returns
     -------
-    harmonics : (v, 4, 3) float32, linear Rec.709: coefficients of ``formats.harmonics.basis``; vertices that no
-        photograph shows take the mean of their neighbours, in turn
-    weight : (v,) float32, how many pixels show a vertex
+    harmonics : (v, 4, 3) float32 array
+        Linear Rec.709: coefficients of ``formats.harmonics.basis``; vertices that no photograph shows take the mean of
+        their neighbours, in turn.
+    weight : (v,) float32 array
+        How many pixels show a vertex.
     """
     count, terms = len(mesh.vertices), (DEGREE + 1) ** 2
     upper = [(i, j) for i in range(terms) for j in range(i, terms)]

@@ -25,8 +25,8 @@ class Regularisers:
 
     Parameters
     ----------
-    faces : (f, 3) int32
-    seen : (v, 3) float32
+    faces : (f, 3) int32 array
+    seen : (v, 3) float32 array
         Mean colour of the photographs at the vertices.
     settings : Settings
     """
@@ -50,7 +50,7 @@ class Regularisers:
         Parameters
         ----------
         seen : Seen
-        edge : (e,) int
+        edge : (e,) int array
             Numbers of its edges.
         has_metallic : bool
             Metallic is learned.

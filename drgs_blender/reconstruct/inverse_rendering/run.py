@@ -46,12 +46,18 @@ class Decoupled:
 
     Attributes
     ----------
-    albedo, roughness, metallic : (v, 3), (v,), (v,) float32 in [0, 1], of the mesh's vertices; linear Rec.709
-    environment : (h, 2 h, 3) float32 radiance in the mapping of `asset.Environment`, Z up. What cannot be seen apart
-        is its scale against that of the albedo
-    normals : (v, 3) float32 unit: smooth vertex normals, with what was learned on top
-    report : JSON-able: "views", "pixels", "iterations", "seconds", "psnr" (of the pixels of the last steps, dB in
-        sRGB), "loss", "unseen_vertices", "exposures" (factors of the views, when learned)
+    albedo : (v, 3) float32 array
+        In [0, 1], of the mesh's vertices; linear Rec.709.
+    roughness, metallic : (v,) float32 array
+        In [0, 1], of the mesh's vertices; linear Rec.709.
+    environment : (h, 2 h, 3) float32 array
+        Radiance in the mapping of `asset.Environment`, Z up. What cannot be seen apart is its scale against that of the
+        albedo.
+    normals : (v, 3) float32 array
+        Unit: smooth vertex normals, with what was learned on top.
+    report : dict
+        JSON-able: "views", "pixels", "iterations", "seconds", "psnr" (of the pixels of the last steps, dB in sRGB),
+        "loss", "unseen_vertices", "exposures" (factors of the views, when learned).
     """
 
     albedo: Array
@@ -90,14 +96,23 @@ def decouple(
 
     Parameters
     ----------
-    mesh : world space, faces counter-clockwise seen from outside; its materials are not used
-    on_progress : called every few steps
-    cancelled : asked every step; then a checkpoint is left behind and Cancelled raised
-    checkpoint : file to go on from when it lies there and fits, written every few seconds, removed at the end
-    backend : who follows rays; the rest is done here
-    normals : what else than the mesh tells the normals behind pixels. They count where they are within 60 degrees of
-        the face, as for surfels that are rendered; what is learned of normals is added to them
-    now : seconds since whenever
+    capture : Capture
+    mesh : Mesh
+        World space, faces counter-clockwise seen from outside; its materials are not used.
+    settings : Settings
+    on_progress : callable, optional
+        Called every few steps.
+    cancelled : callable, optional
+        Asked every step; then a checkpoint is left behind and Cancelled raised.
+    checkpoint : Path, optional
+        File to go on from when it lies there and fits, written every few seconds, removed at the end.
+    backend : LearningBackend
+        Who follows rays; the rest is done here.
+    normals : callable, optional
+        What else than the mesh tells the normals behind pixels. They count where they are within 60 degrees of the
+        face, as for surfels that are rendered; what is learned of normals is added to them.
+    now : callable
+        Seconds since whenever.
 
     Raises
     ------

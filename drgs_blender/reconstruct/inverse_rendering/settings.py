@@ -14,37 +14,61 @@ class Settings:
 
     Attributes
     ----------
-    iterations : steps of the optimiser
-    seconds : stop after so much time of the wall clock, the schedule squeezed to fit; 0 is no limit
-    pixels : drawn in each step, over all training views
-    cosine, ggx, light : directions that each strategy draws at a pixel, even numbers
+    iterations : int
+        Steps of the optimiser.
+    seconds : float
+        Stop after so much time of the wall clock, the schedule squeezed to fit; 0 is no limit.
+    pixels : int
+        Drawn in each step, over all training views.
+    cosine, ggx, light : int
+        Directions that each strategy draws at a pixel, even numbers.
     look : BRDF, "principled" (Blender's) or "paper"
-    indirect : light that other parts of the object send is what the photographs show of them; else it is black
-    shadows : other parts of the object stand before the environment; without, every point sees all of it, as in the
-        split-sum shading of other methods
-    environment : rows of the learned lat-long light at the end, a power of two
-    coarse_to_fine : begin with a quarter of the rows and double them on a schedule
-    rate, light_rate : first step sizes of materials and light (Adam), in logits and log radiance
-    coarse : also learn materials on this many nested grids of cells, which carry what many pixels agree on quickly
-    smoothness : weight of the differences of materials along edges, less where the photographs differ
-    light_smoothness : weight of the differences of log radiance between neighbours in the environment
-    white : weight that pulls the environment towards grey
-    bimodal : weight that pulls metallic to 0 or 1
-    polish : weight that pulls the colours of metals towards as bright as polished metals are
-    plain_metals : how much more than other albedo that of metals is smoothed, in parts of `smoothness`: there, errors
-        of normals leave blotches
-    unbiased : compare two independent estimates of each pixel, so that their noise is not learned from
-    by_shown : weigh differences by what is shown, once that is near the photographs; else by the photographs, which
-        finds polished metal and the light in it too dark where the mesh is a little off
-    beside_clipped : weight, in a channel, of pixels beside clipped ones, once differences are weighed by what is shown.
-        Where normals are a little off, they are found to mirror bright light that is not theirs, and speak against it;
-        what is clipped cannot speak for it
-    parametrisation : "metallic" learns albedo and metallic; "specular" diffuse and specular colour, turned into the
-        former at the end; "dielectric" albedo alone, metallic is 0
-    normals : also learn an offset of each vertex normal, held by `normal_smoothness`
-    exposure : also learn the brightness of every photograph
-    most_pixels : foreground pixels kept in memory, evenly over all views
-    seed : of all random numbers
+    indirect : bool
+        Light that other parts of the object send is what the photographs show of them; else it is black.
+    shadows : bool
+        Other parts of the object stand before the environment; without, every point sees all of it, as in the split-sum
+        shading of other methods.
+    environment : int
+        Rows of the learned lat-long light at the end, a power of two.
+    coarse_to_fine : bool
+        Begin with a quarter of the rows and double them on a schedule.
+    rate, light_rate : float
+        First step sizes of materials and light (Adam), in logits and log radiance.
+    coarse : int
+        Also learn materials on this many nested grids of cells, which carry what many pixels agree on quickly.
+    smoothness : float
+        Weight of the differences of materials along edges, less where the photographs differ.
+    light_smoothness : float
+        Weight of the differences of log radiance between neighbours in the environment.
+    white : float
+        Weight that pulls the environment towards grey.
+    bimodal : float
+        Weight that pulls metallic to 0 or 1.
+    polish : float
+        Weight that pulls the colours of metals towards as bright as polished metals are.
+    plain_metals : float
+        How much more than other albedo that of metals is smoothed, in parts of `smoothness`: there, errors of normals
+        leave blotches.
+    unbiased : bool
+        Compare two independent estimates of each pixel, so that their noise is not learned from.
+    by_shown : bool
+        Weigh differences by what is shown, once that is near the photographs; else by the photographs, which finds
+        polished metal and the light in it too dark where the mesh is a little off.
+    beside_clipped : float
+        Weight, in a channel, of pixels beside clipped ones, once differences are weighed by what is shown. Where
+        normals are a little off, they are found to mirror bright light that is not theirs, and speak against it; what
+        is clipped cannot speak for it.
+    parametrisation : {"metallic", "specular", "dielectric"}
+        "metallic" learns albedo and metallic; "specular" diffuse and specular colour, turned into the former at the
+        end; "dielectric" albedo alone, metallic is 0.
+    normals : bool
+        Also learn an offset of each vertex normal, held by `normal_smoothness`.
+    exposure : bool
+        Also learn the brightness of every photograph.
+    most_pixels : int
+        Foreground pixels kept in memory, evenly over all views.
+    seed : int
+        Of all random numbers.
     """
 
     iterations: int = 2500

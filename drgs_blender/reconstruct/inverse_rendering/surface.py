@@ -26,15 +26,15 @@ class Seen:
 
     Attributes
     ----------
-    here : (n, c) float32
+    here : (n, c) float32 tensor
         Columns of `Materials` at the pixels.
-    normal : (n, 3) float32
+    normal : (n, 3) float32 tensor
         Unit, world space.
-    columns : (u, c) float32
+    columns : (u, c) float32 tensor
         Of `Materials`, of the vertices that pixels and edges use.
-    offsets : (u, 3) float32, optional
-        What is learned of their normals.
-    ends : (e, 2) int64
+    offsets : (u, 3) float32 tensor or None
+        Optional What is learned of their normals.
+    ends : (e, 2) int64 tensor
         The ends of the edges among those vertices.
     """
 
@@ -56,7 +56,7 @@ class Surface:
     ----------
     mesh : Mesh
     settings : Settings
-    mean : (3,) float
+    mean : (3,) float array
         Colour of the photographs.
     told : bool
         Pixels have normals of their own, that others than the mesh tell.

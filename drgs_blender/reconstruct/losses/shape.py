@@ -27,13 +27,19 @@ def shape_loss(
 
     Parameters
     ----------
-    alpha, depth, distortion : (h, w) of `raster.Maps`
-    normal : (h, w, 3) sum of weighted normals that face the viewer
-    mask : (h, w) float32 in 0..1; None where nothing is known of it
-    rays : (h, w, 3) float32, `training_views.pixel_rays`
-    counts : (h, w) float32, how much the agreement of normals counts in each pixel
-    weights : of |alpha - mask|, of the distortion, and of alpha (1 - cosine) between `normal` and that of the mean
-        depth by central differences, where alpha is over one half; alpha itself is not a variable there
+    alpha, depth, distortion : (h, w) tensor
+        Of `raster.Maps`.
+    normal : (h, w, 3) tensor
+        Sum of weighted normals that face the viewer.
+    mask : (h, w) float32 array or None
+        In 0..1; None where nothing is known of it.
+    rays : (h, w, 3) float32 array
+        `training_views.pixel_rays`.
+    counts : (h, w) float32 array
+        How much the agreement of normals counts in each pixel.
+    weights : tuple of float
+        Of |alpha - mask|, of the distortion, and of alpha (1 - cosine) between `normal` and that of the mean depth by
+        central differences, where alpha is over one half; alpha itself is not a variable there.
     """
     return _Shape.apply(alpha, depth, distortion, normal, mask, rays, counts, weights)
 

@@ -35,12 +35,16 @@ def follow_normals(mesh: Mesh, normals: Array, hold: float = HOLD) -> Array:
 
     Parameters
     ----------
-    normals : (v, 3) unit, of the vertices
-    hold : weight of the positions
+    mesh : Mesh
+    normals : (v, 3) array
+        Unit, of the vertices.
+    hold : float
+        Weight of the positions.
 
     Returns
     -------
-    (v, 3) float32; where a face would turn by more than 60 degrees, the vertices stay
+    (v, 3) float32 array
+        Where a face would turn by more than 60 degrees, the vertices stay.
     """
     old, faces = mesh.vertices.astype(np.float64), mesh.faces
     before = Faces.of(old, faces)

@@ -44,12 +44,17 @@ def fill_silhouettes(mesh: Mesh, cameras: list[Camera], masks: list[Array], roun
 
     Parameters
     ----------
-    cameras : perspective
-    masks : (h, w) float32 each, coverage in 0..1
+    mesh : Mesh
+    cameras : list of Camera
+        Perspective.
+    masks : list of array
+        (h, w) float32 each, coverage in 0..1.
+    rounds : int
 
     Returns
     -------
-    (v, 3) float32; those of `mesh` where no outline is seen
+    (v, 3) float32 array
+        Those of `mesh` where no outline is seen.
     """
     matrices = [world_to_pixel(camera) for camera in cameras]
     near = adjacency(mesh.faces, len(mesh.vertices))

@@ -41,8 +41,12 @@ def fuse(
 
     Parameters
     ----------
-    region : its box, slightly widened, is divided
-    resolution : most voxels along the longest side; none is smaller than `PIXELS` of the nearest quarter of views
+    gaussians : Gaussians
+    cameras : list of Camera
+    region : Region
+        Its box, slightly widened, is divided.
+    resolution : int
+        Most voxels along the longest side; none is smaller than `PIXELS` of the nearest quarter of views.
 
     Returns
     -------

@@ -42,12 +42,18 @@ class Region:
 
     Attributes
     ----------
-    centre : (3,) float64, metres
-    radius : of a sphere around the object, metres
-    low, high : (3,) float64 corners of the object's box
-    points, normals : (n, 3) float32 on the first surface, unit normals outwards
-    spacing : distance between those points, metres
-    solid : (m, 3) float32 centres of the cells of side `spacing` that are inside; none where there are no masks
+    centre : (3,) float64 array
+        Metres.
+    radius : float
+        Of a sphere around the object, metres.
+    low, high : (3,) float64 array
+        Corners of the object's box.
+    points, normals : (n, 3) float32 array
+        On the first surface, unit normals outwards.
+    spacing : float
+        Distance between those points, metres.
+    solid : (m, 3) float32 array
+        Centres of the cells of side `spacing` that are inside; none where there are no masks.
     """
 
     centre: Array

@@ -29,8 +29,15 @@ class Attached(Gaussians):
 
     Parameters
     ----------
-    base, normal, edge : (n, 3), (n, 3), (n,) tensors: point on the face, its unit normal, its mean edge, world space
-    fixed : names of parameters that are not learned
+    parameters : dict of str to tensor
+    base, normal : (n, 3) tensor
+        Tensors: point on the face, its unit normal, its mean edge, world space.
+    edge : (n,) tensor
+        Tensors: point on the face, its unit normal, its mean edge, world space.
+    fixed : tuple of str
+        Names of parameters that are not learned.
+    light : tensor, optional
+    backend : LearningBackend
     """
 
     def __init__(
@@ -64,7 +71,10 @@ def attach_learned(
 
     Parameters
     ----------
-    fixed : parameters that stay as they begin: "offset", "opacity"
+    mesh : Mesh
+    pretrained : Gaussians
+    fixed : tuple of str
+        Parameters that stay as they begin: "offset", "opacity".
 
     Returns
     -------

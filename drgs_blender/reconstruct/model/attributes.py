@@ -33,9 +33,14 @@ def attributes(
 
     Parameters
     ----------
-    centre : (n, 3) world
-    bands : of harmonics; those beyond are left out
-    mirrors : tint and blur are features
+    parameters : dict of str to tensor
+    centre : (n, 3) tensor
+        World.
+    eye : array
+    bands : int
+        Of harmonics; those beyond are left out.
+    mirrors : bool
+        Tint and blur are features.
 
     Returns
     -------

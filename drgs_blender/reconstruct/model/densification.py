@@ -30,10 +30,16 @@ def densify(
 
     Parameters
     ----------
-    optimiser : its moments follow the surfels
-    tally : what backward passes noted since the last time
-    largest : surfels with a larger deviation vanish, metres
-    smallest : surfels with a smaller one are not cut, metres
+    gaussians : Gaussians
+    optimiser : Adam
+        Its moments follow the surfels.
+    tally : Tally
+        What backward passes noted since the last time.
+    budget : int
+    largest : float
+        Surfels with a larger deviation vanish, metres.
+    smallest : float
+        Surfels with a smaller one are not cut, metres.
 
     Returns
     -------

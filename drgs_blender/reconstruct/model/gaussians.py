@@ -32,9 +32,12 @@ class Look:
 
     Attributes
     ----------
-    colour : (h, w, 3) over the background, sRGB-encoded
-    normal : (h, w, 3) sum of weighted normals that face the viewer, world space
-    maps : alpha, depth, median, distortion
+    colour : (h, w, 3) tensor
+        Over the background, sRGB-encoded.
+    normal : (h, w, 3) tensor
+        Sum of weighted normals that face the viewer, world space.
+    maps : Maps
+        Alpha, depth, median, distortion.
     """
 
     colour: Tensor
@@ -51,8 +54,11 @@ class Gaussians:
 
     Parameters
     ----------
-    light : the cube of `reflection`; None: nothing is mirrored
-    backend : who shows them, where all their tensors are
+    parameters : dict of str to tensor
+    light : tensor, optional
+        The cube of `reflection`; None: nothing is mirrored.
+    backend : LearningBackend
+        Who shows them, where all their tensors are.
     """
 
     def __init__(

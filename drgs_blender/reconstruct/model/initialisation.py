@@ -50,7 +50,8 @@ def inside_hull(first: Gaussians, capture: Capture, region: Region, bands: int, 
 
     Returns
     -------
-    None where nothing is known of a solid.
+    Gaussians or None
+        None where nothing is known of a solid.
     """
     count = int(INSIDE * len(first))
     if not len(region.solid) or not count:

@@ -158,8 +158,10 @@ def project_backward(
 
     Parameters
     ----------
-    index : (m,) surfel of each row of `gradient` (m, at least PARAMETERS)
-    g_centre, g_u, g_v : (n, 3) float32, world space; rows of surfels that were not seen stay as they are
+    index : (m,) array
+        Surfel of each row of `gradient` (m, at least PARAMETERS).
+    g_centre, g_u, g_v : (n, 3) float32 array
+        World space; rows of surfels that were not seen stay as they are.
     """
     for k in prange(len(index)):
         project_surfel_backward(k, centre, tangent_u, tangent_v, p, index, gradient, g_centre, g_u, g_v)

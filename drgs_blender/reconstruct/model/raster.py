@@ -81,9 +81,11 @@ class Tally:
 
     Attributes
     ----------
-    travel : (n,) float32 += sum over pixels of |dL/dx| + |dL/dy| of the projected centre (Ye et al. 2024, "AbsGS":
-        absolute values, so that pixels that pull in opposite directions do not cancel)
-    views : (n,) int32 += 1 where the surfel was listed in a tile
+    travel : (n,) float32 tensor
+        += sum over pixels of |dL/dx| + |dL/dy| of the projected centre (Ye et al. 2024, "AbsGS": absolute values, so
+        that pixels that pull in opposite directions do not cancel).
+    views : (n,) int32 tensor
+        += 1 where the surfel was listed in a tile.
     """
 
     travel: Tensor
@@ -108,11 +110,15 @@ def rasterise(
 
     Parameters
     ----------
-    centre, tangent_u, tangent_v : (n, 3) float32, world space, tangents scaled by the standard deviations
-    opacity : (n,) float32
-    features : (n, c) float32 of any kind
-    camera : perspective, the whole picture
-    tally : is added to when gradients are computed
+    centre, tangent_u, tangent_v : (n, 3) float32 tensor
+        World space, tangents scaled by the standard deviations.
+    opacity : (n,) float32 tensor
+    features : (n, c) float32 tensor
+        Of any kind.
+    camera : Camera
+        Perspective, the whole picture.
+    tally : Tally, optional
+        Is added to when gradients are computed.
 
     Raises
     ------

@@ -45,10 +45,13 @@ def mirrored(features: Tensor, alpha: Tensor, rays: Array, texels: Tensor) -> Te
 
     Parameters
     ----------
-    features : (h, w, 10) blended, see `attributes`: normals of any length, tint, and blur in 0..1, 0 a perfect mirror
-    alpha : (h, w)
-    rays : (h, w, 3) float32, viewer to surface, of any length
-    texels : `pyramid` of the cube
+    features : (h, w, 10) tensor
+        Blended, see `attributes`: normals of any length, tint, and blur in 0..1, 0 a perfect mirror.
+    alpha : (h, w) tensor
+    rays : (h, w, 3) float32 array
+        Viewer to surface, of any length.
+    texels : tensor
+        `pyramid` of the cube.
     """
     return _Mirrored.apply(features, alpha, rays, texels)
 

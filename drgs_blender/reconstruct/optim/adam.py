@@ -29,8 +29,10 @@ class Adam:
 
     Parameters
     ----------
-    parameters : name -> float32 tensor whose first axis counts rows
-    descend : what does a step, where the tensors are
+    parameters : dict of str to tensor
+        name -> float32 tensor whose first axis counts rows.
+    descend : callable
+        What does a step, where the tensors are.
 
     Attributes
     ----------
@@ -47,8 +49,10 @@ class Adam:
 
         Parameters
         ----------
-        parameters : as they were given at first; changed in place, gradients removed
-        rates : learning rate by name, or one for each column (c,) of the rows seen as (n, c)
+        parameters : dict of str to tensor
+            As they were given at first; changed in place, gradients removed.
+        rates : dict of str to (float or array)
+            Learning rate by name, or one for each column (c,) of the rows seen as (n, c).
         """
         self.steps += 1
         correction = (1 - _BETA2**self.steps) ** 0.5 / (1 - _BETA1**self.steps)

@@ -36,7 +36,8 @@ class Learner:
     schedule : Schedule
     radius : float
         Of the object, metres.
-    background : (3,) float32 tensor, on the processor
+    background : (3,) float32 tensor
+        Tensor, on the processor.
     backend : LearningBackend
 
     Attributes

@@ -21,14 +21,22 @@ class Schedule:
 
     Attributes
     ----------
-    iterations : steps, one view each
-    surfels : how many there are at the end of densification, at most: see `enough`
-    coarse : part of the steps that is done at half size
-    densify : parts of the steps between which surfels are cut; `rounds` times
-    shape : part of the steps after which distortion and normals count
-    mask, distortion, consistency : weights of the losses
-    mirrors : part of the steps after which reflections are learned; 1 never
-    bands : highest band of the colour's harmonics
+    iterations : int
+        Steps, one view each.
+    surfels : int
+        How many there are at the end of densification, at most: see `enough`.
+    coarse : float
+        Part of the steps that is done at half size.
+    densify : tuple of float
+        Parts of the steps between which surfels are cut; `rounds` times.
+    shape : float
+        Part of the steps after which distortion and normals count.
+    mask, distortion, consistency : float
+        Weights of the losses.
+    mirrors : float
+        Part of the steps after which reflections are learned; 1 never.
+    bands : int
+        Highest band of the colour's harmonics.
     """
 
     iterations: int = 3000

@@ -66,14 +66,20 @@ def read_capture(
 
     Parameters
     ----------
-    path : a folder of any layout of `LAYOUTS`, or its transforms.json
-    resolution : pixels of the longer side at most; None keeps the photographs' size
-    test_every : leave out every so many views, from the first in the order of their names; where the capture itself
-        says which views are left out, that counts instead
-    axes : what the matrices of a file are taken for, a key of `AXES`; "opengl" is each layout's own convention
-    up : the world's up axis, a key of `formats.axes.UP_AXES`; None: as the layout prescribes, else found from the
-        cameras, which people hold level
-    light : which pictures to read where a layout has every view under several lights
+    path : str or Path
+        A folder of any layout of `LAYOUTS`, or its transforms.json.
+    resolution : int, optional
+        Pixels of the longer side at most; None keeps the photographs' size.
+    test_every : int, optional
+        Leave out every so many views, from the first in the order of their names; where the capture itself says which
+        views are left out, that counts instead.
+    axes : str
+        What the matrices of a file are taken for, a key of `AXES`; "opengl" is each layout's own convention.
+    up : str, optional
+        The world's up axis, a key of `formats.axes.UP_AXES`; None: as the layout prescribes, else found from the
+        cameras, which people hold level.
+    light : str, optional
+        Which pictures to read where a layout has every view under several lights.
 
     Returns
     -------

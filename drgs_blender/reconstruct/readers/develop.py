@@ -39,8 +39,12 @@ def develop(
 
     Parameters
     ----------
-    resolution : pixels of the longer side at most; None keeps the size
-    known : what `undistorted` says of lenses that distort, filled as they are met
+    photograph : Photograph
+    layout : Layout
+    resolution : int or None
+        Pixels of the longer side at most; None keeps the size.
+    known : dict of Lens to tuple of (Lens, array)
+        What `undistorted` says of lenses that distort, filled as they are met.
 
     Raises
     ------

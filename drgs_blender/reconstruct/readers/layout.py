@@ -44,12 +44,18 @@ class Photograph:
 
     Attributes
     ----------
-    name : unique
-    image : file
-    matrix : (4, 4) float64 camera-to-world, rigid, Blender's camera convention, world of the capture
-    lens : calibrated for a picture that may have another size than `image`, not another shape
-    mask : file, or None
-    test : left out of training by whoever made the capture
+    name : str
+        Unique.
+    image : Path
+        File.
+    matrix : (4, 4) float64 array
+        Camera-to-world, rigid, Blender's camera convention, world of the capture.
+    lens : Lens
+        Calibrated for a picture that may have another size than `image`, not another shape.
+    mask : Path, optional
+        File.
+    test : bool
+        Left out of training by whoever made the capture.
     """
 
     name: str
@@ -66,10 +72,14 @@ class Layout:
 
     Attributes
     ----------
-    photographs : at least one
-    upright : the world is known to be Z up; else "up" is found from the cameras
-    points : (n, 3) float64 sparse points in the capture's world, or None
-    decode_mask : reads a mask file to (h, w) float32 in 0..1
+    photographs : list of Photograph
+        At least one.
+    upright : bool
+        The world is known to be Z up; else "up" is found from the cameras.
+    points : (n, 3) float64 array, optional
+        Sparse points in the capture's world.
+    decode_mask : callable
+        Reads a mask file to (h, w) float32 in 0..1.
     """
 
     photographs: list[Photograph]

@@ -26,10 +26,14 @@ class Lens:
 
     Attributes
     ----------
-    width, height : pixels of the picture that was calibrated
-    fx, fy, cx, cy : pixels; pixel centres are at +0.5
-    model : a key of `MODELS`
-    coefficients : of the model, in COLMAP's order, without focal lengths and principal point
+    width, height : int
+        Pixels of the picture that was calibrated.
+    fx, fy, cx, cy : float
+        Pixels; pixel centres are at +0.5.
+    model : str
+        A key of `MODELS`.
+    coefficients : tuple of float
+        Of the model, in COLMAP's order, without focal lengths and principal point.
     """
 
     width: int
@@ -181,7 +185,8 @@ def undistorted(lens: Lens) -> tuple[Lens, Array]:
     Returns
     -------
     pinhole
-    positions : (2, height, width) float64, (row, column) in pixels of the photograph, pixel centres at integers
+    positions : array
+        (2, height, width) float64, (row, column) in pixels of the photograph, pixel centres at integers.
     """
     zoom = _zoom(lens)
     pinhole = Lens(lens.width, lens.height, lens.fx * zoom, lens.fy * zoom, lens.cx, lens.cy)

@@ -27,7 +27,8 @@ def usable(developed: Sequence[tuple[Photograph, View | None]], subject: str) ->
     Parameters
     ----------
     developed : what `develop` made of each photograph
-    subject : the capture, for messages
+    subject : str
+        The capture, for messages.
 
     Raises
     ------

@@ -37,10 +37,12 @@ class Signal:
 
     Attributes
     ----------
-    guide : (h, GUIDES, w + 2 PAD) float32
-    light : (h, LIGHT + 6 parts, w + 2 PAD) float32; after ``LIGHT``: diffuse direct, (indirect,) glossy direct,
-        (indirect), three colours each, divided by surface colour and coverage
-    spans : (h, 2) int32: first and last + 1 column of each row that is covered, `PAD` not counted
+    guide : (h, GUIDES, w + 2 PAD) float32 array
+    light : (h, LIGHT + 6 parts, w + 2 PAD) float32 array
+        After ``LIGHT``: diffuse direct, (indirect,) glossy direct, (indirect), three colours each, divided by surface
+        colour and coverage.
+    spans : (h, 2) int32 array
+        First and last + 1 column of each row that is covered, `PAD` not counted.
     """
 
     guide: Array

@@ -36,11 +36,16 @@ class NoisyFrame:
 
     Attributes
     ----------
-    shot : its light and what tells its surfaces apart; its motion leads one frame back
-    passes : by name, those of the light excepted
-    metadata : of the file
-    camera, previous : parameters of the cameras of this frame and of one frame earlier
-    window : (width, height, x0, y0, x1, y1) of the full picture and of the part rendered
+    shot : Shot
+        Its light and what tells its surfaces apart; its motion leads one frame back.
+    passes : dict of str to array
+        By name, those of the light excepted.
+    metadata : dict of str to str
+        Of the file.
+    camera, previous : array
+        Parameters of the cameras of this frame and of one frame earlier.
+    window : tuple of int
+        (width, height, x0, y0, x1, y1) of the full picture and of the part rendered.
     """
 
     shot: Shot

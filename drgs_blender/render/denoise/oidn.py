@@ -49,14 +49,19 @@ def denoise_oidn(
 
     Parameters
     ----------
-    components : (h, w, 4, 3) float32 premultiplied light, see `points.Radiance`; non-finite values count as black
-    guides : its coverage, albedo and normals; taken as free of noise
-    split : filter each of the four components; else their sum alone, returned as the first (four times as fast)
-    check : called between runs; may raise to stop
+    components : (h, w, 4, 3) float32 array
+        Premultiplied light, see `points.Radiance`; non-finite values count as black.
+    guides : Guides
+        Its coverage, albedo and normals; taken as free of noise.
+    split : bool
+        Filter each of the four components; else their sum alone, returned as the first (four times as fast).
+    check : callable
+        Called between runs; may raise to stop.
 
     Returns
     -------
-    (h, w, 4, 3) float32; 0 where nothing is covered
+    (h, w, 4, 3) float32 array
+        0 where nothing is covered.
 
     Raises
     ------

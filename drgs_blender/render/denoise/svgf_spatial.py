@@ -66,14 +66,19 @@ def denoise(
 
     Parameters
     ----------
-    components : (h, w, 4, 3) float32 premultiplied light, see `points.Radiance`; non-finite values are replaced
-    variance : (h, w, 2) float32 of the luminance of the diffuse and the glossy sum
-    split : keep direct and indirect light apart; else their sum is returned as direct light and indirect is 0 (faster)
-    check : called between levels; may raise to stop
+    components : (h, w, 4, 3) float32 array
+        Premultiplied light, see `points.Radiance`; non-finite values are replaced.
+    variance : (h, w, 2) float32 array
+        Of the luminance of the diffuse and the glossy sum.
+    guides : Guides
+    split : bool
+        Keep direct and indirect light apart; else their sum is returned as direct light and indirect is 0 (faster).
+    check : callable
+        Called between levels; may raise to stop.
 
     Returns
     -------
-    (h, w, 4, 3) float32
+    (h, w, 4, 3) float32 array
     """
     signal = prepare(components, variance, guides, split)
     check()

@@ -76,9 +76,12 @@ class History:
 
     Attributes
     ----------
-    signal : what `denoise_next` returned for the last picture; None before the first
-    instant : the scene as it was in that picture
-    still : nothing has changed since then, save the noise
+    signal : Signal, optional
+        What `denoise_next` returned for the last picture; None before the first.
+    instant : Instant, optional
+        The scene as it was in that picture.
+    still : bool
+        Nothing has changed since then, save the noise.
     """
 
     signal: Signal | None = None
@@ -97,14 +100,21 @@ def denoise_next(
 
     Parameters
     ----------
-    history : what this function returned for the frame before; None starts anew
-    still : nothing in the scene has changed since then (camera, objects, light), only the noise: pictures are then
-        gathered without end, with equal weights
-    split, check : see `svgf_spatial.denoise`; a history made with another `split` or size is not used
+    shot : Shot
+    history : Signal or None
+        What this function returned for the frame before; None starts anew.
+    still : bool
+        Nothing in the scene has changed since then (camera, objects, light), only the noise: pictures are then gathered
+        without end, with equal weights.
+    split : bool
+        See `svgf_spatial.denoise`; a history made with another `split` or size is not used.
+    check : callable
+        See `svgf_spatial.denoise`; a history made with another `split` or size is not used.
 
     Returns
     -------
-    (h, w, 4, 3) float32 light, and the history for the next frame
+    (h, w, 4, 3) float32 array
+        Light, and the history for the next frame.
     """
     signal = prepare(shot.components, shot.variance, shot.guides, split)
     check()
@@ -136,7 +146,9 @@ def warp(other: Signal, signal: Signal, vector: Array, expected: Array) -> tuple
 
     Parameters
     ----------
-    vector, expected : see `_neighbours`
+    other, signal : Signal
+    vector, expected : array
+        See `_neighbours`.
     """
     light = np.zeros_like(signal.light)
     source = np.full((len(light), light.shape[2]), np.nan, np.float32)

@@ -32,12 +32,16 @@ def window(shots: Sequence[Shot | None], split: bool = True, check: Callable[[],
 
     Parameters
     ----------
-    shots : frames k - 2 .. k + 2, of one size; None where the sequence has ended. Nothing else enters the result.
-    split, check : see `svgf_spatial.denoise`
+    shots : sequence of (Shot or None)
+        Frames k - 2 .. k + 2, of one size; None where the sequence has ended. Nothing else enters the result.
+    split : bool
+        See `svgf_spatial.denoise`.
+    check : callable
+        See `svgf_spatial.denoise`.
 
     Returns
     -------
-    (h, w, 4, 3) float32
+    (h, w, 4, 3) float32 array
 
     Raises
     ------

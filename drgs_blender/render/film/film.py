@@ -46,14 +46,20 @@ class Film:
 
     Attributes
     ----------
-    components : (h, w, 4, 3) float32, in the order of `points.Radiance.components`, premultiplied
-    variance : (h, w, 2) float32 of the luminance of the premultiplied diffuse and glossy sums
-    environment : (h, w, 3) float32 light straight from the world, as if catchers had no shadow
-    emission : (h, w, 3) float32 light that seen surfaces emit
-    coverage : (h, w) float32
-    catcher : (h, w, 3) float32 sums by weight over the points of catchers: one, luminance, unshadowed luminance
-    veiled : (h, w, 3) float32 the part of ``environment`` that is seen through catchers
-    depth, position, normal, albedo, roughness, metallic, index : (h, w) or (h, w, 3) float32
+    components : (h, w, 4, 3) float32 array
+        In the order of `points.Radiance.components`, premultiplied.
+    variance : (h, w, 2) float32 array
+        Of the luminance of the premultiplied diffuse and glossy sums.
+    environment : (h, w, 3) float32 array
+        Light straight from the world, as if catchers had no shadow.
+    emission : (h, w, 3) float32 array
+        Light that seen surfaces emit.
+    coverage : (h, w) float32 array
+    catcher : (h, w, 3) float32 array
+        Sums by weight over the points of catchers: one, luminance, unshadowed luminance.
+    veiled : (h, w, 3) float32 array
+        The part of ``environment`` that is seen through catchers.
+    depth, position, normal, albedo, roughness, metallic, index : (h, w) or (h, w, 3) float32 array
     """
 
     def __init__(self, camera: Camera, settings: RenderSettings, parameters: Array) -> None:
@@ -75,8 +81,11 @@ class Film:
 
         Parameters
         ----------
-        pass_index : (objects,) int32
+        buffer : GBuffer
+        radiance : Radiance
+        pass_index : (objects,) int32 array
         light : what is seen behind, unless the film is transparent
+        environment : EnvironmentLight
         """
         x0, top = self.origin
         y0, y1 = buffer.rows
@@ -149,8 +158,11 @@ class Film:
 
         Parameters
         ----------
-        components : (h, w, 4, 3) denoised light; that of the film when None
-        vector, previous : the passes of motion; nothing moves when None
+        names : tuple of str
+        components : (h, w, 4, 3) array, optional
+            Denoised light; that of the film when None.
+        vector, previous : array, optional
+            The passes of motion; nothing moves when None.
         """
         light = self.components if components is None else components
         made = {name: np.ascontiguousarray(light[:, :, i]) for i, name in enumerate(COMPONENTS)}

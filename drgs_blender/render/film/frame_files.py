@@ -45,10 +45,14 @@ def write_frame(path: str | Path, passes: dict[str, Array], metadata: dict[str, 
 
     Parameters
     ----------
-    path : file to write; its folder must exist
-    passes : pass name (see `passes.PASSES`) -> (h, w, channels) float32, row 0 at the top, linear Rec.709
-    metadata : free text by key, such as the hash of the settings
-    half : colour passes as half floats (values beyond 65504 are clamped)
+    path : str or Path
+        File to write; its folder must exist.
+    passes : dict of str to array
+        Pass name (see `passes.PASSES`) -> (h, w, channels) float32, row 0 at the top, linear Rec.709.
+    metadata : dict of str to str
+        Free text by key, such as the hash of the settings.
+    half : bool
+        Colour passes as half floats (values beyond 65504 are clamped).
 
     Raises
     ------
@@ -88,8 +92,10 @@ def read_frame(path: str | Path) -> tuple[dict[str, Array], dict[str, str]]:
 
     Returns
     -------
-    passes : pass name -> (h, w, channels) float32, row 0 at the top; unknown layers are left out
-    metadata : as given to `write_frame`
+    passes : dict of str to array
+        Pass name -> (h, w, channels) float32, row 0 at the top; unknown layers are left out.
+    metadata : dict of str to str
+        As given to `write_frame`.
 
     Raises
     ------

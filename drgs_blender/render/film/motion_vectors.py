@@ -28,8 +28,10 @@ class Instant(NamedTuple):
 
     Attributes
     ----------
-    vertices, places : laid out as those of `trace.scene.TraceScene`
-    parameters : `camera.camera_parameters`
+    vertices, places : array
+        Laid out as those of `trace.scene.TraceScene`.
+    parameters : array
+        `camera.camera_parameters`.
     """
 
     vertices: Array
@@ -43,9 +45,11 @@ class Motion:
 
     Attributes
     ----------
-    vector : (h, w, 2) float32 pixels, x to the right and y down: what must be added to a pixel's position to find its
-        surface in the other frame; NaN where that is unknown (nothing covered, or it is behind the camera)
-    previous : (h, w, 3) float32 metres, world space: where the surface at ``Position`` is then
+    vector : (h, w, 2) float32 array
+        Pixels, x to the right and y down: what must be added to a pixel's position to find its surface in the other
+        frame; NaN where that is unknown (nothing covered, or it is behind the camera).
+    previous : (h, w, 3) float32 array
+        Metres, world space: where the surface at ``Position`` is then.
     """
 
     vector: Array
@@ -59,15 +63,20 @@ def previous_positions(
 
     Parameters
     ----------
-    faces : (m, 3) int32
-    face : (n,) int32, the face each point is tied to; negative for points that are tied to nothing and do not move
-    place : (n,) int32, the row of ``places`` that the face stands in; negative for a face in world space
-    barycentric : (n, 2) float32 weights of the face's second and third corner, as Embree gives them
-    position : (n, 3) float32 where the points are now
+    faces : (m, 3) int32 array
+    now, then : Instant
+    face : (n,) int32 array
+        The face each point is tied to; negative for points that are tied to nothing and do not move.
+    place : (n,) int32 array
+        The row of ``places`` that the face stands in; negative for a face in world space.
+    barycentric : (n, 2) float32 array
+        Weights of the face's second and third corner, as Embree gives them.
+    position : (n, 3) float32 array
+        Where the points are now.
 
     Returns
     -------
-    (n, 3) float32
+    (n, 3) float32 array
     """
     out = np.empty((len(face), 3), np.float32)
     _previous(
@@ -81,9 +90,12 @@ class MotionFilm:
 
     Parameters
     ----------
-    shape : (h, w) of the camera's window
-    origin : (x0, y0) of it
-    now, then : this time and the other one
+    shape : tuple of int
+        (h, w) of the camera's window.
+    origin : tuple of int
+        (x0, y0) of it.
+    now, then : Instant
+        This time and the other one.
     """
 
     def __init__(self, shape: tuple[int, int], origin: tuple[int, int], now: Instant, then: Instant) -> None:

@@ -25,10 +25,13 @@ class MeshHits:
 
     Attributes
     ----------
-    depth : (rows, width, subpixels) float32, metres along the view axis
-    owner : (rows, width, subpixels) int32, object, or -1 where nothing is met; the other arrays are undefined there
-    face, place : (rows, width, subpixels) int32
-    where : (rows, width, subpixels, 5) float32: the hit's u and v, and its geometric normal as `surface_at` wants it
+    depth : (rows, width, subpixels) float32 array
+        Metres along the view axis.
+    owner : (rows, width, subpixels) int32 array
+        Object, or -1 where nothing is met; the other arrays are undefined there.
+    face, place : (rows, width, subpixels) int32 array
+    where : (rows, width, subpixels, 5) float32 array
+        The hit's u and v, and its geometric normal as `surface_at` wants it.
     """
 
     depth: Array
@@ -48,9 +51,14 @@ def trace_camera(scene: TraceScene, parameters: Array, x0: int, y0: int, shape: 
 
     Parameters
     ----------
-    parameters : `camera.camera_parameters`
-    x0, y0 : full-picture pixel of the first sample
-    shape : (rows, width, subpixels)
+    scene : TraceScene
+    parameters : array
+        `camera.camera_parameters`.
+    x0, y0 : int
+        Full-picture pixel of the first sample.
+    shape : tuple of int
+        (rows, width, subpixels).
+    mask : int
     """
     owner, face, place = (np.empty(shape, np.int32) for _ in range(3))
     hits = MeshHits(np.empty(shape, np.float32), owner, face, place, np.empty((*shape, 5), np.float32))

@@ -24,16 +24,24 @@ class GBuffer:
 
     Attributes
     ----------
-    rows : (y0, y1) in the full picture, half-open
-    points : ShadingPoints, n of them, what the integrator eats
-    position : (n, 3) float32, world space: the seen surface point (``points.origin`` lies on the traced mesh)
-    depth : (n,) float32, metres along the view axis
-    object_index : (n,) int32, as numbered by `scene.TraceScene`
-    emission : (n, 3) float32 radiance that the surface itself sends to the camera
-    face, place : (n,) int32: what the point is tied to, as `interaction.nearest` numbers it; face -1 for a surfel off
-        all meshes
-    barycentric : (n, 2) float32 weights of the face's second and third corner
-    alpha : (rows, width, subpixels) float32: what of each sub-pixel sample hides the background; shadow catchers do not
+    rows : tuple of int
+        (y0, y1) in the full picture, half-open.
+    points : ShadingPoints
+        n of them, what the integrator eats.
+    position : (n, 3) float32 array
+        World space: the seen surface point (``points.origin`` lies on the traced mesh).
+    depth : (n,) float32 array
+        Metres along the view axis.
+    object_index : (n,) int32 array
+        As numbered by `scene.TraceScene`.
+    emission : (n, 3) float32 array
+        Radiance that the surface itself sends to the camera.
+    face, place : (n,) int32 array
+        What the point is tied to, as `interaction.nearest` numbers it; face -1 for a surfel off all meshes.
+    barycentric : (n, 2) float32 array
+        Weights of the face's second and third corner.
+    alpha : (rows, width, subpixels) float32 array
+        What of each sub-pixel sample hides the background; shadow catchers do not.
     """
 
     rows: tuple[int, int]
@@ -58,10 +66,13 @@ def compact(alpha: Array, parameters: Array, x0: int, y0: int, second: Array | N
 
     Parameters
     ----------
-    alpha : (rows, width, subpixels) float32
-    parameters : `camera.camera_parameters`
-    x0, y0 : full-picture pixel of ``alpha[0, 0]``
-    second : (rows, width, subpixels) float32 of a second layer, or None: its points follow those of their samples
+    alpha : (rows, width, subpixels) float32 array
+    parameters : array
+        `camera.camera_parameters`.
+    x0, y0 : int
+        Full-picture pixel of ``alpha[0, 0]``.
+    second : (rows, width, subpixels) float32 array, optional
+        Of a second layer, or None: its points follow those of their samples.
     """
     n = np.count_nonzero(alpha) + (0 if second is None else np.count_nonzero(second))
     pixel, sample, owner, face, place = np.empty((5, n), np.int32)

@@ -31,10 +31,14 @@ class Layers:
 
     Attributes
     ----------
-    first : surfels
-    second : ordinary meshes, or None when there are none
-    opaque : what hides the background, holdouts included
-    hits : of ordinary meshes, or None when there are none
+    first : array
+        Surfels.
+    second : array or None
+        Ordinary meshes, or None when there are none.
+    opaque : array
+        What hides the background, holdouts included.
+    hits : MeshHits or None
+        Of ordinary meshes, or None when there are none.
     """
 
     first: Array
@@ -55,9 +59,14 @@ def combine(
 
     Parameters
     ----------
-    parameters : `camera.camera_parameters`
-    x0, y0 : full-picture pixel of the first sample
-    trace : who casts the camera's rays
+    samples : SurfelSamples
+    scene : TraceScene
+    parameters : array
+        `camera.camera_parameters`.
+    x0, y0 : int
+        Full-picture pixel of the first sample.
+    trace : callable
+        Who casts the camera's rays.
     """
     special = bool((scene.object_flags & (HOLDOUT | CATCHER)).any())
     if not scene.any_ordinary and not special:

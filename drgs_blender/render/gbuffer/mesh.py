@@ -33,8 +33,13 @@ def primary_mesh(
 
     Parameters
     ----------
-    parameters : `camera.camera_parameters`
-    trace, shade : who casts the rays, and who finds what they have met
+    scene : TraceScene
+    camera : Camera
+    parameters : array
+        `camera.camera_parameters`.
+    y0, y1 : int
+    trace, shade : callable
+        Who casts the rays, and who finds what they have met.
     """
     x0, _, x1, _ = camera.window
     hits = trace(scene, parameters, x0, y0, (y1 - y0, x1 - x0, int(parameters[SUBPIXELS])), CAMERA)

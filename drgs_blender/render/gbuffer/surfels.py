@@ -81,11 +81,21 @@ def primary_surfels(
 
     Parameters
     ----------
-    splats : `prepare` of this frame
-    windows : `snap_windows` of this frame
-    tied : False: rays meet surfels, and nothing is tied
-    rasterise, tie : who blends the surfels, and who ties their points; None: this processor
-    trace, shade : as of `mesh`, for ordinary meshes next to the surfels
+    splats : Splats
+        `prepare` of this frame.
+    scene : TraceScene
+    windows : array
+        `snap_windows` of this frame.
+    camera : Camera
+    y0, y1 : int
+    tied : bool
+        False: rays meet surfels, and nothing is tied.
+    rasterise : callable
+        Who blends the surfels, and who ties their points; None: this processor.
+    tie : callable, optional
+        Who blends the surfels, and who ties their points; None: this processor.
+    trace, shade : callable
+        As of `mesh`, for ordinary meshes next to the surfels.
     """
     samples = rasterise(splats, y0, y1)
     layers = combine(samples, scene, splats.parameters, camera.window[0], y0, trace)
@@ -289,7 +299,7 @@ def tie_to_mesh(scene: TraceScene, *arguments: Any) -> None:
 
     Parameters
     ----------
-    scene
+    scene : TraceScene
     arguments : tuples: whether points are tied at all, and whether there is a mesh; parameters of the camera, windows,
         and the first column and row of the samples; depth, surface and object of these; pixel, sample and flags of the
         points; and the arrays to be filled: origin, normal, geometric normal and view; albedo, roughness and metallic;

@@ -30,12 +30,17 @@ def visible_lights(lights: Lights, parameters: Array, x0: int, buffer: GBuffer) 
 
     Parameters
     ----------
-    parameters : `camera.camera_parameters`
-    x0 : first column of the camera's window
+    lights : Lights
+    parameters : array
+        `camera.camera_parameters`.
+    x0 : int
+        First column of the camera's window.
+    buffer : GBuffer
 
     Returns
     -------
-    (rows, width, 3) float32 linear Rec.709, of the buffer's rows
+    (rows, width, 3) float32 array
+        Linear Rec.709, of the buffer's rows.
     """
     points = buffer.points
     y0, y1 = buffer.rows

@@ -44,11 +44,14 @@ class Tree:
 
     Parameters
     ----------
-    rows : (k, 2) int32, the triangles: face, and place or -1
+    launcher : Launcher
+    rows : (k, 2) int32 array
+        The triangles: face, and place or -1.
 
     Attributes
     ----------
-    builds : how often it was built
+    builds : int
+        How often it was built.
     """
 
     def __init__(self, launcher: Launcher, rows: Array) -> None:
@@ -93,13 +96,18 @@ class Trees:
 
     Parameters
     ----------
-    layout : the scene's
-    rows, masks : (k, 2) int32 face and place of all triangles, and what meets each
+    launcher : Launcher
+    layout : object
+        The scene's.
+    rows, masks : (k, 2) int32 array
+        Face and place of all triangles, and what meets each.
 
     Attributes
     ----------
-    rows : (k, 2) int32 on the device, those of each tree together
-    table : (trees, 3) int64, now: each one's id, mask and first of its `rows`
+    rows : (k, 2) int32 array
+        On the device, those of each tree together.
+    table : (trees, 3) int64 array
+        Now: each one's id, mask and first of its `rows`.
     moving : the scene's vertices, faces and places, on the device, now
     trees : as many as there are kinds
     """

@@ -36,7 +36,8 @@ class DeviceHits(MeshHits):
     Attributes
     ----------
     there : all arrays, on the device
-    anew : traces them on this processor
+    anew : callable
+        Traces them on this processor.
     """
 
     on_device: tuple[Any, ...]

@@ -15,11 +15,15 @@ class MeshTracer(NamedTuple):
 
     Attributes
     ----------
-    meshes : address of (kinds, 3) int64: Warp's mesh of triangles in world space, the rays that meet them, and the
-        first of its rows in `faces`
-    kinds : int, of masks
-    faces : address of (k, 2) int32, the scene's face and place of each triangle; 0: they are the scene's faces
-    corners : address of (m, 3, 3) float32, corners of the scene's faces; read where a shape stands in places
+    meshes : int
+        Address of (kinds, 3) int64: Warp's mesh of triangles in world space, the rays that meet them, and the first of
+        its rows in `faces`.
+    kinds : int
+        Of masks.
+    faces : int
+        Address of (k, 2) int32, the scene's face and place of each triangle; 0: they are the scene's faces.
+    corners : int
+        Address of (m, 3, 3) float32, corners of the scene's faces; read where a shape stands in places.
     """
 
     meshes: int

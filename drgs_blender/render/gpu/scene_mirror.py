@@ -29,7 +29,8 @@ class Mirror:
 
     Parameters
     ----------
-    launcher : of the device
+    launcher : Launcher
+        Of the device.
     """
 
     def __init__(self, launcher: Launcher) -> None:

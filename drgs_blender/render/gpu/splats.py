@@ -120,6 +120,11 @@ def prepare(
     Parameters
     ----------
     here : makes the same on the processor
+    launcher : Launcher
+    posed : PosedSurfels
+    camera : Camera
+    parameters : array
+    on_cpu : callable
     """
     n, zeros = len(posed), launcher.zeros
     with launcher.failures("copying surfels"):

@@ -39,9 +39,14 @@ def sample_adaptively(points: ShadingPoints, samples: int, parts: int, threshold
 
     Parameters
     ----------
-    points : ordered by pixel
-    samples : of a pixel, all parts together
-    parts : power of two, see `part_count`
+    points : ShadingPoints
+        Ordered by pixel.
+    samples : int
+        Of a pixel, all parts together.
+    parts : int
+        Power of two, see `part_count`.
+    threshold : float
+    trace : callable
     """
     found = Sampling(len(points), samples, parts, threshold)
     while len(found.going):
@@ -61,12 +66,17 @@ class Sampling:
 
     Parameters
     ----------
-    count, samples, parts, threshold : points, and as of `sample_adaptively`
+    count, samples, parts : int
+        Points, and as of `sample_adaptively`.
+    threshold : float
+        Points, and as of `sample_adaptively`.
 
     Attributes
     ----------
-    going : (m,) indices of the points that need part number ``part``; none when all is done
-    light : (n, 4, 3) sums over the parts drawn, of which there are ``drawn`` (n,)
+    going : (m,) array
+        Indices of the points that need part number ``part``; none when all is done.
+    light : (n, 4, 3) array
+        Sums over the parts drawn, of which there are ``drawn`` (n,).
     """
 
     def __init__(self, count: int, samples: int, parts: int, threshold: float) -> None:
@@ -91,8 +101,10 @@ class Sampling:
 
         Parameters
         ----------
-        pixel, weight : (n,) of all points
-        variance : (m, 2) of the light that it gave those that needed it
+        pixel, weight : (n,) array
+            Of all points.
+        variance : (m, 2) array
+            Of the light that it gave those that needed it.
         """
         self._variance[self.going] += variance
         self.part += 1

@@ -167,7 +167,8 @@ def trace_paths(
         vertex)
     bounces : vertices of a path, and whether there are surfaces that emit, which are looked for beyond the last too
     shift : 0, or ``ray_masks.WITHOUT``
-    found : (capacity, FOUND) float32; INDIRECT is written
+    found : (capacity, FOUND) float32 array
+        INDIRECT is written.
     """
     tracer, _, _ = scene
     envmap, envmap_shines, lights, any_lights = illumination

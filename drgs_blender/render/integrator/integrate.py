@@ -72,13 +72,19 @@ def integrate(
     Parameters
     ----------
     scene, light, lights : what rays meet, what they see when they meet nothing, and what shines in between
-    points : visible points, world space
+    environment : EnvironmentLight
+    points : ShadingPoints
+        Visible points, world space.
     settings : RenderSettings
         Samples per pixel, divided among its ``subpixel_count`` places; bounces, shading model, seed, clamp.
-    noise_index : int, part of the seed
-    part : (i, n): only the i-th of n equal parts of each sub-sample's samples; the mean over all parts is the whole
-    surfels : what rays meet of DR-GS objects next to the scene's meshes; then `points` say which surfels are their own
-    kernel : None: that of this processor
+    noise_index : int
+        Part of the seed.
+    part : tuple of int
+        (i, n): only the i-th of n equal parts of each sub-sample's samples; the mean over all parts is the whole.
+    surfels : SurfelBVH, optional
+        What rays meet of DR-GS objects next to the scene's meshes; then `points` say which surfels are their own.
+    kernel : Kernel, optional
+        None: that of this processor.
 
     Returns
     -------

@@ -23,8 +23,10 @@ def variances(pixel: Array, moments: Array) -> Array:
 
     Parameters
     ----------
-    pixel : (n,) of each point, ordered: only points of one call are taken together
-    moments : (n, 5) float32, see ``Radiance``
+    pixel : (n,) array
+        Of each point, ordered: only points of one call are taken together.
+    moments : (n, 5) float32 array
+        See ``Radiance``.
     """
     out = np.zeros((len(pixel), 2), np.float32)
     _spread(pixel, moments, out)

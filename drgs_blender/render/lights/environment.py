@@ -98,14 +98,18 @@ class EnvironmentLight:
 
     Attributes
     ----------
-    texels : (h, w, 4) float32: lat-long radiance times colour and strength, linear Rec.709, and in the last place the
-        density of the sampling cell that the texel lies in: one cache line serves both
-    cells : the cells in which it is sampled
-    row_z : (rows + 1,) float32: z at the upper edge of each row of cells, from 1 to -1
+    texels : (h, w, 4) float32 array
+        Lat-long radiance times colour and strength, linear Rec.709, and in the last place the density of the sampling
+        cell that the texel lies in: one cache line serves both.
+    cells : Cells
+        The cells in which it is sampled.
+    row_z : (rows + 1,) float32 array
+        z at the upper edge of each row of cells, from 1 to -1.
     facing : the cells weighed by the cosine at a surface
-    rotation : (3, 3) float32: world direction to environment direction
-    bad_texels : int: NaN, infinite or negative texels, taken as black; not those of filters that ring, whose negative
-        values are 0
+    rotation : (3, 3) float32 array
+        World direction to environment direction.
+    bad_texels : int
+        NaN, infinite or negative texels, taken as black; not those of filters that ring, whose negative values are 0.
     """
 
     def __init__(self, world: World) -> None:

@@ -29,21 +29,33 @@ class Cells:
 
     Attributes
     ----------
-    step : int: texels along a side of a cell
-    edges : (rows + 1,) z at the upper edge of each row of cells, from 1 to -1
-    runs : (k, 2) uint32: last random number that falls on a cell, and the cell; the lit cells in Morton order
-    guide : (2^b,) int32: where to start looking in `runs`, for equal slices of the random numbers
-    density : (rows, columns) float32: probability per solid angle; 0 everywhere when black
-    power : float: luminance integrated over all directions
-    shift : int: cells along a side of a block are 2^shift
-    block : (height, width) int32: the block at a coarse place of the map
-    first : (n,) uint32: first random number of each block that has light
-    parts : (p, n) float64: power of the parts of each block, row by row; all of them together 1
-    corners : (n, 2) int32: row and column of each block's first cell
+    step : int
+        Texels along a side of a cell.
+    edges : (rows + 1,) array
+        z at the upper edge of each row of cells, from 1 to -1.
+    runs : (k, 2) uint32 array
+        Last random number that falls on a cell, and the cell; the lit cells in Morton order.
+    guide : (2^b,) int32 array
+        Where to start looking in `runs`, for equal slices of the random numbers.
+    density : (rows, columns) float32 array
+        Probability per solid angle; 0 everywhere when black.
+    power : float
+        Luminance integrated over all directions.
+    shift : int
+        Cells along a side of a block are 2^shift.
+    block : (height, width) int32 array
+        The block at a coarse place of the map.
+    first : (n,) uint32 array
+        First random number of each block that has light.
+    parts : (p, n) float64 array
+        Power of the parts of each block, row by row; all of them together 1.
+    corners : (n, 2) int32 array
+        Row and column of each block's first cell.
 
     Parameters
     ----------
-    texels : (h, w, 4) float32: finite linear Rec.709 radiance; the density of its cell is written to the last place
+    texels : (h, w, 4) float32 array
+        Finite linear Rec.709 radiance; the density of its cell is written to the last place.
     """
 
     def __init__(self, texels: Array) -> None:

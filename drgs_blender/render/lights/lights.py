@@ -55,22 +55,33 @@ class Lights:
 
     Parameters
     ----------
-    lights : Blender's lights of one frame
-    centre, radius : a sphere around what they shine on, world space; only for `power`
-    emitters : surfaces that emit light; those that are not among them are found by chance alone
+    lights : list of Light
+        Blender's lights of one frame.
+    centre : array, optional
+        A sphere around what they shine on, world space; only for `power`.
+    radius : float
+        A sphere around what they shine on, world space; only for `power`.
+    emitters : Emitters, optional
+        Surfaces that emit light; those that are not among them are found by chance alone.
 
     Attributes
     ----------
-    table : (k, WIDTH) float32: one light a row, in the order of the tree, suns last; k >= 1 (a black one when there is
-        none)
-    pick : (m, 16) float32: the tree, see the columns above
-    order : (count,) int: which of `lights` each row is
-    count : int: lights that shine, and triangles
+    table : (k, WIDTH) float32 array
+        One light a row, in the order of the tree, suns last; k >= 1 (a black one when there is none).
+    pick : (m, 16) float32 array
+        The tree, see the columns above.
+    order : (count,) int array
+        Which of `lights` each row is.
+    count : int
+        Lights that shine, and triangles.
     power : estimated luminance that arrives at the sphere from all directions together (cd / m^2 sr), as the integral
         of an environment over all directions is
-    rays_differ : bool: there is one that diffuse rays see and glossy ones do not, or the other way
-    seen : bool: there is a light that the camera sees
-    warnings : list of str: lights that are left out, and why
+    rays_differ : bool
+        There is one that diffuse rays see and glossy ones do not, or the other way.
+    seen : bool
+        There is a light that the camera sees.
+    warnings : list of str
+        Lights that are left out, and why.
     """
 
     def __init__(
@@ -299,7 +310,8 @@ def lights_along(ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, pi
     ----------
     ox .. dz : origin and unit direction, world space; tmax : distance of the surface behind, infinite when none
     others : sum over all other strategies of count times density in this direction; must be positive
-    share : number of light samples that the balance heuristic reckons with; 0 leaves them out
+    share : int
+        Number of light samples that the balance heuristic reckons with; 0 leaves them out.
     seen_by : CAMERA, DIFFUSE or GLOSSY: lights that such rays do not see are left out
 
     Returns

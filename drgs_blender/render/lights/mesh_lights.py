@@ -48,12 +48,18 @@ class EmitterTables(NamedTuple):
 
     Attributes
     ----------
-    tree : see `mesh_light_tree`
-    faces : address of (n,) int32, the scene's face of each row
-    slot : address of (m - vertex_faces,) int32, of each face, or -1; counted within the mesh where it stands in places
-    first : address of (places,) int32, what to add for each place
-    row : address of (slots,) int32, or -1
-    geometry : the scene's
+    tree : Tree
+        See `mesh_light_tree`.
+    faces : int
+        Address of (n,) int32, the scene's face of each row.
+    slot : int
+        Address of (m - vertex_faces,) int32, of each face, or -1; counted within the mesh where it stands in places.
+    first : int
+        Address of (places,) int32, what to add for each place.
+    row : int
+        Address of (slots,) int32, or -1.
+    geometry : Geometry
+        The scene's.
     """
 
     tree: Tree
@@ -69,13 +75,17 @@ class Emitters:
 
     Parameters
     ----------
-    scene : None: there are none
-    previous : of the frame before; what has not changed is taken over
+    scene : TraceScene, optional
+        None: there are none.
+    previous : Emitters, optional
+        Of the frame before; what has not changed is taken over.
 
     Attributes
     ----------
-    count : triangles that are sampled
-    rays_differ : there is one that diffuse rays see and glossy ones do not, or the other way
+    count : int
+        Triangles that are sampled.
+    rays_differ : bool
+        There is one that diffuse rays see and glossy ones do not, or the other way.
     warnings : list of str
     """
 

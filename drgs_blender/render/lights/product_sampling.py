@@ -55,15 +55,20 @@ class ProductTables:
 
     Attributes
     ----------
-    starts : (SIDE^2 + 1, 2^b) uint32: first random number of each block as each normal has it, the last row without
-        regard to a normal; filled up with the largest number
-    slices : (SIDE^2 + 1, _SLICES) int32: block of the first number of each slice of the random numbers
-    ratio : (SIDE^2 + 1, 2^b) float32: density of a block's cells over that without regard to the normal
-    first : (2^b,) uint32: first random number of each block in the cells' own order
+    starts : (SIDE^2 + 1, 2^b) uint32 array
+        First random number of each block as each normal has it, the last row without regard to a normal; filled up with
+        the largest number.
+    slices : (SIDE^2 + 1, _SLICES) int32 array
+        Block of the first number of each slice of the random numbers.
+    ratio : (SIDE^2 + 1, 2^b) float32 array
+        Density of a block's cells over that without regard to the normal.
+    first : (2^b,) uint32 array
+        First random number of each block in the cells' own order.
 
     Parameters
     ----------
-    cells : what the tables weigh again
+    cells : Cells
+        What the tables weigh again.
     """
 
     def __init__(self, cells: Cells) -> None:

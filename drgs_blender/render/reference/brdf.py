@@ -142,14 +142,18 @@ def evaluate(
 
     Parameters
     ----------
-    normal, view, light : (..., 3) unit vectors, broadcastable
+    normal, view, light : (..., 3) tensor
+        Unit vectors, broadcastable.
     albedo : (..., 3); roughness, metallic : (...)
     look : "principled" or "paper"
+    roughness, metallic : tensor
+    shading_model : str
 
     Returns
     -------
-    diffuse, glossy : (..., 3); zero where the light is below the surface, glossy also where the view is (an
-        interpolated normal may turn away from the viewer at a silhouette; diffuse light does not ask for the view)
+    diffuse, glossy : (..., 3) tensor
+        Zero where the light is below the surface, glossy also where the view is (an interpolated normal may turn away
+        from the viewer at a silhouette; diffuse light does not ask for the view).
     """
     if shading_model not in SHADING_MODELS:
         raise ValueError(f"look {shading_model!r} is not one of {SHADING_MODELS}")

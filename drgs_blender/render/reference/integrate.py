@@ -27,10 +27,14 @@ class SurfacePoints:
 
     Attributes
     ----------
-    origin : (n, 3) where rays start, safe from self-shadowing
-    normal, geometric_normal : (n, 3) unit, on the viewer's side
-    view : (n, 3) unit, towards the viewer
-    albedo, roughness, metallic : (n, 3), (n,), (n,)
+    origin : (n, 3) tensor
+        Where rays start, safe from self-shadowing.
+    normal, geometric_normal : (n, 3) tensor
+        Unit, on the viewer's side.
+    view : (n, 3) tensor
+        Unit, towards the viewer.
+    albedo : (n, 3) tensor
+    roughness, metallic : (n,) tensor
     """
 
     origin: Tensor
@@ -75,9 +79,16 @@ class TriangleTracer:
     Parameters
     ----------
     vertices : (n, 3) world space; faces : (m, 3) integers
-    albedo, roughness, metallic : per vertex (n, 3), (n,), (n,); may require gradients
-    corner_normals : (m, 3, 3) unit, or None for flat shading
-    offset : metres by which points are lifted off the surface they lie on
+    faces : tensor
+    albedo : (n, 3) tensor
+        Per vertex; may require gradients.
+    roughness, metallic : (n,) tensor
+        Per vertex; may require gradients.
+    corner_normals : (m, 3, 3) tensor, optional
+        Unit, or None for flat shading.
+    offset : float
+        Metres by which points are lifted off the surface they lie on.
+    chunk : int
     """
 
     def __init__(
@@ -201,12 +212,21 @@ def integrate(
 
     Parameters
     ----------
-    bounces : surfaces between the point and the light source that are followed; 0 is direct light only
-    samples : return what each drawn direction contributes instead of the sum
+    tracer : Tracer
+    light : Light
+    points : SurfacePoints
+    counts : Counts
+    bounces : int
+        Surfaces between the point and the light source that are followed; 0 is direct light only.
+    shading_model : str
+    generator : iterator, optional
+    samples : bool
+        Return what each drawn direction contributes instead of the sum.
 
     Returns
     -------
-    (n, 4, 3): diffuse direct, diffuse indirect, glossy direct, glossy indirect; (n, s, 4, 3) with `samples`
+    (n, 4, 3) tensor
+        Diffuse direct, diffuse indirect, glossy direct, glossy indirect; (n, s, 4, 3) with `samples`.
     """
     generator = generator or torch.Generator(device=points.origin.device).manual_seed(0)
     directions, weight = draw(points, light, counts, generator)

@@ -33,9 +33,12 @@ class Light:
 
     Parameters
     ----------
-    image : (h, w, 3) linear Rec.709 radiance; may require a gradient. None is white
-    rotation : (3, 3) that takes world directions into the image's
-    colour : (3,) factor, strength included
+    image : (h, w, 3) tensor or None
+        Linear Rec.709 radiance; may require a gradient. None is white.
+    rotation : (3, 3) tensor
+        That takes world directions into the image's.
+    colour : (3,) tensor
+        Factor, strength included.
     """
 
     def __init__(self, image: Tensor | None, rotation: Tensor, colour: Tensor) -> None:

@@ -56,11 +56,18 @@ class ReferenceGBuffer:
 
     Attributes
     ----------
-    coverage : (p,) 1 - prod(1 - alpha_i)
-    depth : (p,) metres along the view axis, mean of the contributions by weight
-    position : (p, 3) world: the point of the pixel's ray at that depth
-    normal : (p, 3) unit, world, facing the viewer
-    albedo, roughness, metallic : (p, 3), (p,), (p,): means by weight
+    coverage : (p,) tensor
+        1 - prod(1 - alpha_i).
+    depth : (p,) tensor
+        Metres along the view axis, mean of the contributions by weight.
+    position : (p, 3) tensor
+        World: the point of the pixel's ray at that depth.
+    normal : (p, 3) tensor
+        Unit, world, facing the viewer.
+    albedo : (p, 3) tensor
+        Means by weight.
+    roughness, metallic : (p,) tensor
+        Means by weight.
     """
 
     coverage: Tensor
@@ -135,12 +142,18 @@ def rasterise(
 
     Parameters
     ----------
-    position : (p, 2) pixel positions; the pixel centres of the camera's window by default
-    gap : split the contributions where the depth jumps by more than this many times the mean size of the surfels on
-        both sides (the larger standard deviation, at least a pixel), and describe the heaviest part alone; coverage
-        is that of all. None blends all contributions
-    samples : positions a pixel; the low-pass filter is that much narrower in variance
-    chunk : surfel-pixel pairs held at once
+    splats : Splats
+    camera : Camera
+    position : (p, 2) tensor, optional
+        Pixel positions; the pixel centres of the camera's window by default.
+    gap : float, optional
+        Split the contributions where the depth jumps by more than this many times the mean size of the surfels on both
+        sides (the larger standard deviation, at least a pixel), and describe the heaviest part alone; coverage is that
+        of all. None blends all contributions.
+    samples : int
+        Positions a pixel; the low-pass filter is that much narrower in variance.
+    chunk : int
+        Surfel-pixel pairs held at once.
     """
     if position is None:
         position = pixel_centres(camera, splats.centre.dtype, str(splats.centre.device))

@@ -23,11 +23,15 @@ class Places:
 
     Attributes
     ----------
-    matrices : (k, 3, 4) float64 object-to-world
-    pass_index : (k,) int32
-    kept : (places of the mesh,) bool: which of them these are
-    bad : how many places were left out
-    instanced : whether the shape keeps its own tree and stands in its places; else it goes into the world as it is
+    matrices : (k, 3, 4) float64 array
+        Object-to-world.
+    pass_index : (k,) int32 array
+    kept : (places of the mesh,) bool array
+        Which of them these are.
+    bad : int
+        How many places were left out.
+    instanced : bool
+        Whether the shape keeps its own tree and stands in its places; else it goes into the world as it is.
     """
 
     matrices: Array

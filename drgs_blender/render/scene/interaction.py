@@ -26,9 +26,12 @@ class Tracer(NamedTuple):
 
     Attributes
     ----------
-    intersect, occluded, scene : addresses, see `triangle_bvh.TriangleBVH`
-    first_face : address of (groups,) int32, the first face of each group
-    first_place : address of (groups,) int32, the first row of each group's places in ``Geometry.place_*``
+    intersect, occluded, scene : int
+        Addresses, see `triangle_bvh.TriangleBVH`.
+    first_face : int
+        Address of (groups,) int32, the first face of each group.
+    first_place : int
+        Address of (groups,) int32, the first row of each group's places in ``Geometry.place_*``.
     """
 
     intersect: int
@@ -43,16 +46,26 @@ class Geometry(NamedTuple):
 
     Attributes
     ----------
-    shading_faces : (m, 3) int32, rows of ``shading`` (faces below ``vertex_faces``) or of ``normals`` (the others)
-    shading : (k, 8) float32: unit normal, albedo, roughness, metallic
-    normals : (r, 3) float32 unit; object space for faces of shapes in places
-    face_object : (m,) int32, object of each face; not used for faces of shapes in places
-    vertex_faces : how many faces carry materials at their vertices
-    material : (m - vertex_faces,) int32, rows of ``materials``
-    uvs : (m - vertex_faces, 3, 2) float32, or 0 when no mesh has any
-    place_normal : (p, 3, 3) float32, matrices of normals
-    place_object : (p,) int32
-    materials : (6,) int64, ``textures.MaterialTable.addresses``
+    shading_faces : int
+        (m, 3) int32, rows of ``shading`` (faces below ``vertex_faces``) or of ``normals`` (the others).
+    shading : int
+        (k, 8) float32: unit normal, albedo, roughness, metallic.
+    normals : int
+        (r, 3) float32 unit; object space for faces of shapes in places.
+    face_object : int
+        (m,) int32, object of each face; not used for faces of shapes in places.
+    vertex_faces : int
+        How many faces carry materials at their vertices.
+    material : int
+        (m - vertex_faces,) int32, rows of ``materials``.
+    uvs : int
+        (m - vertex_faces, 3, 2) float32, or 0 when no mesh has any.
+    place_normal : int
+        (p, 3, 3) float32, matrices of normals.
+    place_object : int
+        (p,) int32.
+    materials : int
+        (6,) int64, ``textures.MaterialTable.addresses``.
     """
 
     shading_faces: int
@@ -160,7 +173,8 @@ def surface_at(face, place, u, v, gx, gy, gz, dx, dy, dz, geometry):  # type: ig
     Parameters
     ----------
     face, place, u, v, gx, gy, gz : of the hit; face >= 0
-    dx, dy, dz : float32 direction of the ray
+    dx, dy, dz : float
+        Direction of the ray.
     geometry : Geometry
 
     Returns
@@ -224,7 +238,8 @@ def position_at(face, place, u, v, vertices, faces, places):  # type: ignore[no-
     Parameters
     ----------
     vertices, faces : ``TriangleBVH``'s
-    places : (p, 3, 4) float32, ``TraceScene.places``
+    places : (p, 3, 4) float32 array
+        ``TraceScene.places``.
     """
     w = 1.0 - np.float64(u) - np.float64(v)
     a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]

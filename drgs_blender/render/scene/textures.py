@@ -84,9 +84,12 @@ class MaterialTable:
 
     Parameters
     ----------
-    materials : in the order of the indices that ``material_at`` takes
-    images : what their textures refer to by name; only those in use are looked at
-    previous : table of the frame before: what it made of images whose pixels are the same frozen array is taken over
+    materials : list of Material
+        In the order of the indices that ``material_at`` takes.
+    images : list of Image
+        What their textures refer to by name; only those in use are looked at.
+    previous : MaterialTable, optional
+        Table of the frame before: what it made of images whose pixels are the same frozen array is taken over.
 
     Raises
     ------
@@ -103,8 +106,10 @@ class MaterialTable:
         transforms (t, 6) float32;
         images (i, 4) int64, address, width, height, kind;
         decode (256,) float32, linear value of each sRGB byte
-    glows : whether anything emits light
-    warnings : what was wrong and how it was taken, in words
+    glows : bool
+        Whether anything emits light.
+    warnings : list of str
+        What was wrong and how it was taken, in words.
     """
 
     def __init__(self, materials: list[Material], images: list[Image], previous: MaterialTable | None = None) -> None:
@@ -375,7 +380,8 @@ def material_at(material, u, v, addresses):  # type: ignore[no-untyped-def]
     Parameters
     ----------
     material : integer, index into the materials of the table; not checked
-    u, v : float32, v upwards
+    u, v : float
+        v upwards.
     addresses : ``MaterialTable.addresses``
 
     Returns

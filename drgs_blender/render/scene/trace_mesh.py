@@ -35,15 +35,25 @@ class TraceObject:
 
     Attributes
     ----------
-    name : used in messages
-    vertices : (n, 3) float32, metres, world space
-    faces : (m, 3) int32
-    albedo, roughness, metallic : per vertex (n, 3), (n,), (n,) in [0, 1]; linear Rec.709
-    corner_normals : (m, 3, 3) float32, world space, or None: smooth angle-weighted vertex normals
-    pass_index : Blender's object index pass
-    visibility : which rays meet it
-    seen_only : whether only the camera meets its triangles, light its surfels
-    torn : (m,) bool, faces that no ray meets, or None
+    name : str
+        Used in messages.
+    vertices : (n, 3) float32 array
+        Metres, world space.
+    faces : (m, 3) int32 array
+    albedo : (n, 3) array
+        Per vertex in [0, 1]; linear Rec.709.
+    roughness, metallic : (n,) array
+        Per vertex in [0, 1]; linear Rec.709.
+    corner_normals : (m, 3, 3) float32 array, optional
+        World space, or None: smooth angle-weighted vertex normals.
+    pass_index : int
+        Blender's object index pass.
+    visibility : Visibility
+        Which rays meet it.
+    seen_only : bool
+        Whether only the camera meets its triangles, light its surfels.
+    torn : (m,) bool array, optional
+        Faces that no ray meets.
     """
 
     name: str
@@ -65,17 +75,27 @@ class Part:
 
     Attributes
     ----------
-    source : its index among the objects, then meshes, of the update
-    item : what was last taken in; None before the first time
-    faces : (m, 3) int32, of its own vertices
+    source : int
+        Its index among the objects, then meshes, of the update.
+    item : TraceObject or MeshState, optional
+        What was last taken in; None before the first time.
+    faces : (m, 3) int32 array
+        Of its own vertices.
     vertex, face, row : its rows among vertices, faces, and ``shading`` (objects) or ``normals`` (meshes)
-    mask : of its group
-    smooth : whether normals are made from the faces
-    instanced : whether its vertices are in object space
-    dead : (m,) bool, faces that touch an unusable vertex or are torn, or None
-    reach : metres, the largest coordinate of its vertices
-    bad_vertices, bad_faces : that are unusable, or touch one that is
-    empty_faces, flat_faces : without area as a shape, and where its matrix puts it
+    mask : int
+        Of its group.
+    smooth : bool
+        Whether normals are made from the faces.
+    instanced : bool
+        Whether its vertices are in object space.
+    dead : (m,) bool array, optional
+        Faces that touch an unusable vertex or are torn.
+    reach : float
+        Metres, the largest coordinate of its vertices.
+    bad_vertices, bad_faces : int
+        That are unusable, or touch one that is.
+    empty_faces, flat_faces : int
+        Without area as a shape, and where its matrix puts it.
     """
 
     source: int

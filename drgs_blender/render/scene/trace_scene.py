@@ -60,11 +60,14 @@ class Glowing:
 
     Attributes
     ----------
-    mesh : as given
+    mesh : MeshState
+        As given.
     shape : all faces of the mesh, among the scene's
-    faces : (k,) int64, those that emit
-    material : (k,) int32, of ``TraceScene.materials``
-    uvs : (k, 3, 2) float32, or None
+    faces : (k,) int64 array
+        Those that emit.
+    material : (k,) int32 array
+        Of ``TraceScene.materials``.
+    uvs : (k, 3, 2) float32 array or None
     places : rows of ``TraceScene.places``, or None where the faces are in world space
     """
 
@@ -84,25 +87,40 @@ class TraceScene:
 
     Attributes
     ----------
-    bvh : TriangleBVH over everything
+    bvh : TriangleBVH
+        TriangleBVH over everything.
     layout : another object whenever vertices and faces are numbered anew
     version : another object after every update
     vertices : (n, 3) float32, faces : (m, 3) int32: as traced (``bvh``'s own arrays), world space save for meshes in
         several places; a face with a bad vertex is collapsed to one point
-    face_object : (m,) int32: object of each face (of a mesh in several places: the mesh)
-    shading_faces : (m, 3) int32: rows of ``shading`` (DR-GS objects) or of ``normals`` at the corners of each face
-    shading : (k, 8) float32: unit shading normal (3), albedo (3), roughness, metallic
-    normals : (r, 3) float32: of meshes; object space where these stand in several places
-    vertex_faces : how many faces are of DR-GS objects; those come first
-    places : (p, 3, 4) float32 object-to-world matrices of meshes in several places
-    place_object : (p,) int32: object of each place
-    rays_differ : whether there is an object that diffuse rays meet and glossy ones do not, or the other way
-    pass_index, object_flags : (objects,) int32: Blender's object index pass; bits HOLDOUT and CATCHER
-    source : (objects,) int64: which of the frame's objects, or behind them which of its meshes, each is
-    any_ordinary : whether the camera may see an ordinary mesh
-    materials : MaterialTable of the meshes
-    extent : float, metres: the largest absolute coordinate, the scale of rounding errors
-    faults : what was wrong, one entry an object, then one a mesh
+    face_object : (m,) int32 array
+        Object of each face (of a mesh in several places: the mesh).
+    shading_faces : (m, 3) int32 array
+        Rows of ``shading`` (DR-GS objects) or of ``normals`` at the corners of each face.
+    shading : (k, 8) float32 array
+        Unit shading normal (3), albedo (3), roughness, metallic.
+    normals : (r, 3) float32 array
+        Of meshes; object space where these stand in several places.
+    vertex_faces : int
+        How many faces are of DR-GS objects; those come first.
+    places : (p, 3, 4) float32 array
+        Object-to-world matrices of meshes in several places.
+    place_object : (p,) int32 array
+        Object of each place.
+    rays_differ : bool
+        Whether there is an object that diffuse rays meet and glossy ones do not, or the other way.
+    pass_index, object_flags : (objects,) int32 array
+        Blender's object index pass; bits HOLDOUT and CATCHER.
+    source : (objects,) int64 array
+        Which of the frame's objects, or behind them which of its meshes, each is.
+    any_ordinary : bool
+        Whether the camera may see an ordinary mesh.
+    materials : MaterialTable
+        MaterialTable of the meshes.
+    extent : float
+        Metres: the largest absolute coordinate, the scale of rounding errors.
+    faults : list of ObjectFaults
+        What was wrong, one entry an object, then one a mesh.
     """
 
     def __init__(self) -> None:
@@ -267,8 +285,10 @@ class TraceScene:
 
         Parameters
         ----------
-        objects : (n, 3) world-space vertices of every DR-GS object of the last update, or None: as now
-        meshes : of every mesh, or None; vertices or matrices of another number than now are ignored, unusable ones too
+        objects : sequence of (array or None)
+            (n, 3) world-space vertices of every DR-GS object of the last update, or None: as now.
+        meshes : sequence of (Pose or None)
+            Of every mesh, or None; vertices or matrices of another number than now are ignored, unusable ones too.
         """
         vertices, places = self.vertices.copy(), self.places.copy()
         first = np.cumsum([0, *(len(p.matrices) if p.instanced else 0 for _, p in self._known)])

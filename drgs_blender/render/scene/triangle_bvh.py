@@ -32,10 +32,13 @@ class Group:
 
     Attributes
     ----------
-    first, last : the faces, half-open
-    mask : int32 bits; a ray meets the group when it has one of them
-    places : None when the vertices are in world space; else (k, 3, 4) float32 object-to-world matrices, invertible:
-        the group's faces stand in k places and share one tree
+    first, last : int
+        The faces, half-open.
+    mask : int
+        int32 bits; a ray meets the group when it has one of them.
+    places : array, optional
+        None when the vertices are in world space; else (k, 3, 4) float32 object-to-world matrices, invertible: the
+        group's faces stand in k places and share one tree.
     """
 
     first: int
@@ -238,11 +241,15 @@ class TriangleBVH:
 
     Attributes
     ----------
-    vertices : (n, 3) float32, metres, the coordinates Embree reads; write into them and call ``refit()``
-    faces : (m, 3) int32
-    first_face : (groups,) int32: the first face of each group, what turns a traced primitive into a face
-    intersect_address, occluded_address, scene : int: what ``trace`` and ``blocked`` take in compiled code
-    rebuilds : how often a group's tree was built from scratch
+    vertices : (n, 3) float32 array
+        Metres, the coordinates Embree reads; write into them and call ``refit()``.
+    faces : (m, 3) int32 array
+    first_face : (groups,) int32 array
+        The first face of each group, what turns a traced primitive into a face.
+    intersect_address, occluded_address, scene : int
+        What ``trace`` and ``blocked`` take in compiled code.
+    rebuilds : int
+        How often a group's tree was built from scratch.
     """
 
     def __init__(self) -> None:
@@ -262,7 +269,9 @@ class TriangleBVH:
 
         Parameters
         ----------
-        groups : runs of `faces`; by default one of them all, which every ray meets
+        vertices, faces : array
+        groups : sequence of Group, optional
+            Runs of `faces`; by default one of them all, which every ray meets.
 
         Raises
         ------
@@ -297,9 +306,12 @@ class TriangleBVH:
 
         Parameters
         ----------
-        vertices : (n, 3), or None: those already written into ``self.vertices``
-        moved : the groups whose vertices moved, or None: all
-        places : group -> new (k, 3, 4) matrices, for groups that were built with places
+        vertices : (n, 3) array, optional
+            Or None: those already written into ``self.vertices``.
+        moved : iterable of int, optional
+            The groups whose vertices moved, or None: all.
+        places : mapping of int to array, optional
+            group -> new (k, 3, 4) matrices, for groups that were built with places.
         """
         if vertices is not None:
             self.vertices[:] = vertices

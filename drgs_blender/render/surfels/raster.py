@@ -70,12 +70,14 @@ class SurfelSamples:
 
     Attributes
     ----------
-    alpha : (rows, width, subpixels) float32 coverage, 1 - transmittance
-    depth : (rows, width, subpixels) float32, metres along the view axis
-    surface : (rows, width, subpixels, 9) float32: world normal (unit, on the surfels' own side, which may face away
-        from the
-        viewer; 0 where they cancel), albedo, roughness, metallic, and the mean standard deviation in metres
-    object_index : (rows, width, subpixels) int32
+    alpha : (rows, width, subpixels) float32 array
+        Coverage, 1 - transmittance.
+    depth : (rows, width, subpixels) float32 array
+        Metres along the view axis.
+    surface : (rows, width, subpixels, 9) float32 array
+        World normal (unit, on the surfels' own side, which may face away from the viewer; 0 where they cancel), albedo,
+        roughness, metallic, and the mean standard deviation in metres.
+    object_index : (rows, width, subpixels) int32 array
     """
 
     alpha: Array

@@ -46,14 +46,21 @@ class Splats:
 
     Attributes
     ----------
-    screen : (m, RECORD) float32 coefficients in pixels of the full picture
-    surface : (m, SURFACE) float32 world-space normal, material, size (metres, larger standard deviation), opacity
-    box : (m, 4) int32 pixels (x0, y0, x1, y1), half-open, inside the window; conservative
-    nearest : (m,) float32 least depth of any contribution
-    object_index : (m,) int32
-    tile_start : (tiles + 1,) int64 and tile_list (k,) int32: splats of each tile, in order
-    window : (x0, y0, x1, y1), the camera's
-    parameters : see `camera.camera_parameters`
+    screen : (m, RECORD) float32 array
+        Coefficients in pixels of the full picture.
+    surface : (m, SURFACE) float32 array
+        World-space normal, material, size (metres, larger standard deviation), opacity.
+    box : (m, 4) int32 array
+        Pixels (x0, y0, x1, y1), half-open, inside the window; conservative.
+    nearest : (m,) float32 array
+        Least depth of any contribution.
+    object_index : (m,) int32 array
+    tile_start : array
+        (tiles + 1,) int64 and tile_list (k,) int32: splats of each tile, in order.
+    window : tuple of int
+        (x0, y0, x1, y1), the camera's.
+    parameters : array
+        See `camera.camera_parameters`.
     """
 
     screen: Array
@@ -75,9 +82,12 @@ def prepare(posed: PosedSurfels, camera: Camera, parameters: Array) -> Splats:
 
     Parameters
     ----------
-    posed : surfels in world space; a surfel with a non-finite number is left out
-    camera : gives the window
-    parameters : `camera.camera_parameters`
+    posed : PosedSurfels
+        Surfels in world space; a surfel with a non-finite number is left out.
+    camera : Camera
+        Gives the window.
+    parameters : array
+        `camera.camera_parameters`.
     """
     x0, y0, x1, y1 = camera.window
     n = len(posed)

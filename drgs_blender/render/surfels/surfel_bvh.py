@@ -86,11 +86,16 @@ class SurfelBVH:
 
     Attributes
     ----------
-    intersect_address, occluded_address, scene : int: what `trace_surfels` and `transmittance` take in compiled code
-    surface : (n, SURFACE) float32: what is blended of each surfel, see the columns above
-    objects : (n,) int32: index of each surfel's object
-    rebuilds : how often the tree was built from scratch
-    bad : how many surfels of the last update have a number that is not finite; they are never met
+    intersect_address, occluded_address, scene : int
+        What `trace_surfels` and `transmittance` take in compiled code.
+    surface : (n, SURFACE) float32 array
+        What is blended of each surfel, see the columns above.
+    objects : (n,) int32 array
+        Index of each surfel's object.
+    rebuilds : int
+        How often the tree was built from scratch.
+    bad : int
+        How many surfels of the last update have a number that is not finite; they are never met.
     """
 
     def __init__(self) -> None:
@@ -126,8 +131,10 @@ class SurfelBVH:
 
         Parameters
         ----------
-        posed : surfels in world space
-        masks : (objects,) int32: a ray meets the surfels of an object when the two masks share a bit; None: all do
+        posed : PosedSurfels
+            Surfels in world space.
+        masks : (objects,) int32 array, optional
+            A ray meets the surfels of an object when the two masks share a bit; None: all do.
 
         Raises
         ------

@@ -63,9 +63,12 @@ class SurfelTracer(NamedTuple):
 
     Attributes
     ----------
-    surfel_intersect, surfel_occluded, surfel_scene : addresses, see `SurfelBVH`
-    surface : address of (n, SURFACE) float32, ``SurfelBVH.surface``
-    surfel_object : address of (n,) int32, ``SurfelBVH.objects``
+    surfel_intersect, surfel_occluded, surfel_scene : int
+        Addresses, see `SurfelBVH`.
+    surface : int
+        Address of (n, SURFACE) float32, ``SurfelBVH.surface``.
+    surfel_object : int
+        Address of (n,) int32, ``SurfelBVH.objects``.
     """
 
     surfel_intersect: int
@@ -89,11 +92,15 @@ def transmittance(  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    tracer : SurfelTracer, or anything that has its fields
+    tracer : SurfelTracer
+        Or anything that has its fields.
     ox .. dz : float32 origin and unit direction, world space
-    mask : int32, see ``SurfelBVH.update``; -1 meets all
-    own : int32: object that the ray starts on, or -1; then the rest does not matter
-    gx, gy, gz, size : float32: unit geometric normal (either side) and mean surfel size (metres) where the ray starts
+    mask : int
+        See ``SurfelBVH.update``; -1 meets all.
+    own : int
+        Object that the ray starts on, or -1; then the rest does not matter.
+    gx, gy, gz, size : float
+        Unit geometric normal (either side) and mean surfel size (metres) where the ray starts.
     """
     query = query_memory()
     context = begin_query(query, ox, oy, oz, dx, dy, dz, mask, own, gx, gy, gz, size)
@@ -215,12 +222,19 @@ class SurfelHits:
 
     Attributes
     ----------
-    through : (n,) float32: share of light that passes
-    depth : (n,) float32, in units of the direction
-    normal, geometric_normal : (n, 3) float32 unit, world space
-    albedo, roughness, metallic : (n, 3), (n,), (n,) float32 in [0, 1]; linear Rec.709
-    size : (n,) float32 metres: mean larger standard deviation of the surfels
-    object_index : (n,) int32
+    through : (n,) float32 array
+        Share of light that passes.
+    depth : (n,) float32 array
+        In units of the direction.
+    normal, geometric_normal : (n, 3) float32 array
+        Unit, world space.
+    albedo : (n, 3) float32 array
+        In [0, 1]; linear Rec.709.
+    roughness, metallic : (n,) float32 array
+        In [0, 1]; linear Rec.709.
+    size : (n,) float32 array
+        Metres: mean larger standard deviation of the surfels.
+    object_index : (n,) int32 array
     """
 
     through: Array
@@ -240,9 +254,12 @@ class Starts:
 
     Attributes
     ----------
-    object_index : (n,) int32, -1 for rays that start anywhere else
-    normal : (n, 3) float32 unit geometric normals, either side, world space
-    size : (n,) float32 metres: mean larger standard deviation of the surfels there
+    object_index : (n,) int32 array
+        -1 for rays that start anywhere else.
+    normal : (n, 3) float32 array
+        Unit geometric normals, either side, world space.
+    size : (n,) float32 array
+        Metres: mean larger standard deviation of the surfels there.
     """
 
     object_index: Array
