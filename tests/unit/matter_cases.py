@@ -23,7 +23,7 @@ def aligned(low: Any, high: Any, h: float) -> Domain:
     return Domain.around(low, np.asarray(high, float), h)
 
 
-def solver_of(
+def solver_of(  # noqa: PLR0913 - keywords, of which a test gives few
     points: np.ndarray,
     h: float,
     material: str = "jelly",

@@ -7,7 +7,6 @@ through is free. What no view sees is inside: the mesh is closed where nobody ph
 from __future__ import annotations
 
 import logging
-from typing import Any
 
 import numpy as np
 import torch
@@ -119,7 +118,7 @@ def surface_maps(gaussians: Gaussians, camera: Camera) -> tuple[Array, Array]:
 
 
 @njit
-def _sample(depth: Any, x: Any, y: Any) -> Any:
+def _sample(depth, x, y):  # type: ignore[no-untyped-def]
     """Depth at pixel position (x, y): bilinear where its four pixels lie on one surface, else the nearest pixel's.
 
     NaN on a silhouette, of which a pixel says too little to carve by it.
@@ -140,7 +139,7 @@ def _sample(depth: Any, x: Any, y: Any) -> Any:
 
 
 @njit(parallel=True)
-def _fuse(total: Any, weight: Any, low: Any, voxel: Any, matrices: Any, depth: Any, cosine: Any, band: Any) -> None:
+def _fuse(total, weight, low, voxel, matrices, depth, cosine, band):  # type: ignore[no-untyped-def]
     """Add views to the field: +1 before the surface, falling to -1 behind it within the band.
 
     A pixel counts with the cosine at which it sees the surface; the same cosine turns distance along the ray into
