@@ -16,6 +16,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 import bpy
 import numpy as np
@@ -163,7 +164,7 @@ def _path_of(obj: bpy.types.Object, modifier: bpy.types.Modifier) -> Path:
     return Path(bpy.path.abspath(modifier.filepath, library=obj.library))
 
 
-def look_of(obj: bpy.types.Object) -> dict[str, float]:
+def look_of(obj: bpy.types.Object) -> dict[str, Any]:
     """`tear` and `grain` of the played mesh, see `frame.ObjectState`; empty where nothing is played."""
     modifier, physics = modifier_of(obj), obj.drgs.physics
     if modifier is None:

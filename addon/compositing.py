@@ -193,6 +193,7 @@ def _layer_collections(
 def _lay_over(scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer, partner: bpy.types.Scene, compare: bool) -> None:
     """Put the partner's picture over that of a view layer, before whatever else the nodes do."""
     tree = tree_of(scene, create=True)
+    assert tree is not None, "it was asked for"
     _take_out(tree)
     below = _layers(tree, scene, view_layer)
     above = _new(tree, "CompositorNodeRLayers", below.location.x, below.location.y - 420)

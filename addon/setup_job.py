@@ -40,11 +40,11 @@ def start(python: Path, afresh: bool = False, extras: Sequence[Group] = (), inde
 
 def cancel() -> None:
     """End the set-up under way; what was fetched stays, and an engine that works is used."""
-    if running():
+    if job is not None and not job.done:
         job.cancel()
         _forget_timer()
         if job.remark:
-            _ready()
+            _ready(job)
         else:
             messages.note("INFO", "Set-up of the engine cancelled; Set Up Engine goes on with it")
 
@@ -57,7 +57,7 @@ def follow() -> float | None:
         if job.error is not None:
             messages.note("ERROR", str(job.error))
         else:
-            _ready()
+            _ready(job)
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
             if area.type in ("VIEW_3D", "PREFERENCES"):
@@ -65,7 +65,7 @@ def follow() -> float | None:
     return None if job.done else INTERVAL
 
 
-def _ready() -> None:
+def _ready(job: EngineSetup) -> None:
     """The new engine shall be used."""
     preferences.write("engine_python", "")
     messages.note("INFO", f"The engine is set up in {job.folder}")
@@ -85,6 +85,6 @@ def register() -> None:
 def unregister() -> None:
     global job
     _forget_timer()
-    if running():
+    if job is not None and not job.done:
         job.cancel()
     job = None

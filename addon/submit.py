@@ -8,6 +8,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import IO
 
 import bpy
 from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
@@ -121,11 +122,16 @@ class Submission:
         self._expected = output_check.ExpectedFiles(
             [Path(bpy.path.abspath(settings.folder)).absolute() / JOB_FILES[settings.manager]]
         )
-        options = {"creationflags": subprocess.CREATE_NO_WINDOW} if sys.platform == "win32" else {}
+        no_window = getattr(subprocess, "CREATE_NO_WINDOW", 0)  # Windows alone has it
         self._said, self._log = tempfile.TemporaryFile(), tempfile.TemporaryFile()  # noqa: SIM115 - until it has ended
         try:
             self._process = subprocess.Popen(
-                words, stdin=subprocess.DEVNULL, stdout=self._said, stderr=self._log, env=clean_environment(), **options
+                words,
+                stdin=subprocess.DEVNULL,
+                stdout=self._said,
+                stderr=self._log,
+                env=clean_environment(),
+                creationflags=no_window,
             )
         except OSError as error:
             raise DeviceError(f"engine {python[0]}", f"cannot be started ({error})", engine_link.SET_UP) from error
@@ -167,7 +173,7 @@ class Submission:
         self.done = True
 
     @staticmethod
-    def _read(stream) -> list[str]:
+    def _read(stream: IO[bytes]) -> list[str]:
         stream.seek(0)
         with stream:
             return stream.read().decode("utf-8", "replace").splitlines()
@@ -230,7 +236,7 @@ def start(scene: bpy.types.Scene) -> Submission:
     if bpy.app.background:
         while not job.poll():
             time.sleep(0.02)
-        _tell()
+        _tell(job)
     elif not bpy.app.timers.is_registered(follow):
         bpy.app.timers.register(follow, first_interval=INTERVAL, persistent=True)
     return job
@@ -242,7 +248,7 @@ def follow() -> float | None:
         return None
     ended = job.poll()
     if ended:
-        _tell()
+        _tell(job)
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
             if area.type == "PROPERTIES":
@@ -250,7 +256,7 @@ def follow() -> float | None:
     return None if ended else INTERVAL
 
 
-def _tell() -> None:
+def _tell(job: Submission) -> None:
     for note in job.notes:
         messages.note("WARNING", note)
     messages.note("ERROR" if job.error else "INFO", job.error or job.text)
@@ -264,7 +270,7 @@ def unregister() -> None:
     global job
     if bpy.app.timers.is_registered(follow):
         bpy.app.timers.unregister(follow)
-    if running():
+    if job is not None and not job.done:
         job.cancel()
     job = None
     bpy.utils.unregister_class(DrgsSubmitSettings)

@@ -147,7 +147,7 @@ class DRGS_OT_bake_light(CommandOperator, selection.ObjectMode, bpy.types.Operat
 
     def _attribute(self, index: int) -> str:
         """Pattern of the files with the colours of an object's vertices."""
-        return str(self._folder / f"{_NUMBER}_{index}.npy")
+        return str(self.work_folder / f"{_NUMBER}_{index}.npy")
 
     def _image(self, obj: bpy.types.Object) -> str:
         """Pattern of the images of an object."""
@@ -184,7 +184,7 @@ class DRGS_OT_bake_light(CommandOperator, selection.ObjectMode, bpy.types.Operat
                 "has no UV map" if same else "has other faces than its asset, which UV maps are of",
                 "Unwrap it in Edit Mode, or bake to an attribute",
             )
-        path = self._folder / f"{index}_uvs.npy"
+        path = self.work_folder / f"{index}_uvs.npy"
         np.save(path, uvs.reshape(-1, 3, 2), allow_pickle=False)
         return [self._image(obj), str(path)]
 

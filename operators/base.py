@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import bpy
 
@@ -12,6 +13,12 @@ from ..drgs_blender.core.errors import DrgsError, UsageError, WriteError
 
 class DrgsOperator:
     """Base of operators that do their work in `run` and may raise DrgsError there."""
+
+    # Of Blender's Operator, which subclasses have as a base beside this, and their own.
+    if TYPE_CHECKING:
+        bl_label: str
+        filepath: str
+        report: Callable[[set[str], str], None]
 
     def run(self, context: bpy.types.Context) -> set[str]:
         """The work; returns what execute returns."""

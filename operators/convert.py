@@ -87,12 +87,12 @@ class DRGS_OT_convert(CommandOperator, bpy.types.Operator):
                 raise UsageError(subject, f"has splats of an unknown kind ({error})", "Import their file") from error
             if not len(columns["x"]):
                 raise UsageError(subject, "has no points", "Choose another")
-            path = self._folder / "splats.ply"
+            path = self.work_folder / "splats.ply"
             splat_attributes.write_ply(path, columns)
             return ["import", str(path), "--up", "z", *([] if self.use_mesh else ["--no-mesh"])]
         if obj.type != "MESH" or not len(data.polygons):
             raise UsageError(subject, "has neither faces nor the attributes of splats", "Choose splats or a mesh")
-        path = self._folder / "mesh.glb"
+        path = self.work_folder / "mesh.glb"
         selected, active = context.selected_objects, context.view_layer.objects.active
         for other in selected:
             other.select_set(other is obj)

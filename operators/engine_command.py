@@ -26,7 +26,7 @@ _TELL_EVERY = 10.0
 class CommandOperator(DrgsOperator):
     """Base of operators that give `start` the arguments of ``drgs`` and go on in `done` when it has done its work."""
 
-    _process: subprocess.Popen | None = None
+    _process: subprocess.Popen[bytes] | None = None
     _log: Path | None = None
     _timer: bpy.types.Timer | None = None
     _subject, _failure, _program = "", "", ""
@@ -57,6 +57,18 @@ class CommandOperator(DrgsOperator):
         except BaseException:
             self.clear()
             raise
+
+    @property
+    def work_folder(self) -> Path:
+        """The folder that `folder` has made."""
+        assert self._folder is not None, "only within `folder`"
+        return self._folder
+
+    @property
+    def process(self) -> subprocess.Popen[bytes]:
+        """The program, once it is started."""
+        assert self._process is not None, "only after `start`"
+        return self._process
 
     def clear(self) -> None:
         """Remove what was made for the program alone; called however it ends."""
@@ -104,7 +116,7 @@ class CommandOperator(DrgsOperator):
             return {"CANCELLED"}
         if event.type != "TIMER":
             return {"PASS_THROUGH"}
-        if self._process.poll() is None:
+        if self.process.poll() is None:
             self.follow(context, self._said())
             return {"PASS_THROUGH"}
         self._release(context)
@@ -147,7 +159,7 @@ class CommandOperator(DrgsOperator):
         told = ""
         while True:
             try:
-                self._process.wait(_TELL_EVERY)
+                self.process.wait(_TELL_EVERY)
                 return
             except subprocess.TimeoutExpired:
                 state = self.state(self._said())
@@ -156,9 +168,11 @@ class CommandOperator(DrgsOperator):
 
     def _said(self, last: bool = False) -> str:
         """What the program has said; when it has ended, for the last time."""
+        assert self._log is not None, "only after `start`"
         said = self._log.read_text(encoding="utf-8", errors="replace")
         if last:
-            self._process.stdin.close()
+            assert self.process.stdin is not None, "it was made a pipe"
+            self.process.stdin.close()
             with contextlib.suppress(OSError):  # Windows lets go of it late
                 self._log.unlink()
         return said
@@ -167,9 +181,9 @@ class CommandOperator(DrgsOperator):
         """Tell what the program said, and go on, or say why it could not do its work."""
         lines = [line for line in self._said(last=True).strip().splitlines() if not line.startswith("DRGS_")]
         try:
-            if self._process.returncode:
+            if self.process.returncode:
                 said = [line for line in lines if line.startswith("drgs: ")] or lines
-                reason = said[-1].removeprefix("drgs: ") if said else f"exit code {self._process.returncode}"
+                reason = said[-1].removeprefix("drgs: ") if said else f"exit code {self.process.returncode}"
                 raise AssetError(self._subject, f"{self._failure}: {reason.rstrip('.')}", "")
             for line in lines:
                 messages.note("INFO", line)

@@ -22,7 +22,7 @@ Change = Callable[[Array], Array]
 
 def _all(*value: float) -> Change:
     """The same value for every vertex."""
-    return lambda old: np.broadcast_to(np.float32(value if old.ndim == 2 else value[0]), old.shape)
+    return lambda old: np.broadcast_to(np.array(value if old.ndim == 2 else value[0], np.float32), old.shape)
 
 
 class Preset(NamedTuple):

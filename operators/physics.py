@@ -23,7 +23,7 @@ NEEDS = "Make a DR-GS object the active one, and enable Physics > DR-GS Physics"
 
 
 def _has_physics(obj: bpy.types.Object | None) -> bool:
-    return assets.is_drgs(obj) and obj.drgs.physics.use
+    return obj is not None and assets.is_drgs(obj) and obj.drgs.physics.use
 
 
 def _idle(cls: type[bpy.types.Operator], objects: Iterable[bpy.types.Object | None]) -> bool:
@@ -190,6 +190,7 @@ class DRGS_OT_bake_physics(_JobOperator, bpy.types.Operator):
         return bake_job.Bake(obj, scene)
 
     def stopped(self) -> set[str]:
+        assert isinstance(self._job, bake_job.Bake), self._job
         kept = self._job.cancel()
         text = f"{self._job.subject}: stopped at {self._job.progress()[1].split(',')[0].lower()}; Bake goes on"
         messages.note("INFO", text)
@@ -197,6 +198,7 @@ class DRGS_OT_bake_physics(_JobOperator, bpy.types.Operator):
         return {"FINISHED"} if kept or self._succeeded else {"CANCELLED"}
 
     def done(self, context: bpy.types.Context) -> str:
+        assert isinstance(self._job, bake_job.Bake), self._job
         return f"{self._job.subject}: {self._job.frames} frames baked in {self._job.folder}"
 
 
@@ -210,6 +212,7 @@ class DRGS_OT_show_particles(_JobOperator, bpy.types.Operator):
         return bake_job.Preview(obj, scene)
 
     def done(self, context: bpy.types.Context) -> str:
+        assert isinstance(self._job, bake_job.Preview), self._job
         particles, steps = self._job.counts
         return f"{self._job.subject}: {particles:,} particles, at least {steps} time steps a frame"
 
@@ -246,7 +249,9 @@ class DRGS_OT_cancel_physics(DrgsOperator, bpy.types.Operator):
         if bake_job.is_waiting(context.object):
             bake_job.waiting.discard(uid(context.object))
             return {"FINISHED"}
-        bake_job.of(context.object).cancelled = True  # its own operator ends it
+        job = bake_job.of(context.object)
+        assert job is not None, "poll has looked"
+        job.cancelled = True  # its own operator ends it
         return {"FINISHED"}
 
 

@@ -127,10 +127,10 @@ class DRGS_OT_reconstruct(CommandOperator, bpy.types.Operator):
         return self.start(context, arguments, subject, f"Making {out.name}", "could not be reconstructed", [out])
 
     def stopped(self, event: bpy.types.Event) -> bool:
-        return reconstruction.job.cancelled  # Esc may be meant for anything else in so many minutes
+        return _job().cancelled  # Esc may be meant for anything else in so many minutes
 
     def state(self, said: str) -> str:
-        job = reconstruction.job
+        job = _job()
         job.follow(said)
         return f"{self._subject}: {job.text}, {job.part:.0%}"
 
@@ -139,7 +139,7 @@ class DRGS_OT_reconstruct(CommandOperator, bpy.types.Operator):
         _redraw(context)
 
     def done(self, context: bpy.types.Context) -> set[str]:
-        import_assets(context, [reconstruction.job.out], self.use_environment)
+        import_assets(context, [_job().out], self.use_environment)
         return {"FINISHED"}
 
     def clear(self) -> None:
@@ -160,8 +160,13 @@ class DRGS_OT_reconstruct_cancel(DrgsOperator, bpy.types.Operator):
         return reconstruction.job is not None
 
     def run(self, context: bpy.types.Context) -> set[str]:
-        reconstruction.job.cancelled = True  # its own operator ends it
+        _job().cancelled = True  # its own operator ends it
         return {"FINISHED"}
+
+
+def _job() -> reconstruction.Reconstruction:
+    assert reconstruction.job is not None, "none is under way"
+    return reconstruction.job
 
 
 def _redraw(context: bpy.types.Context) -> None:

@@ -52,7 +52,7 @@ class SceneFrames(CommandOperator):
         """
         if context.mode != "OBJECT":
             bpy.ops.object.mode_set(mode="OBJECT")
-        template = str(self._folder / f"{NUMBER}{SUFFIX}")
+        template = str(self.work_folder / f"{NUMBER}{SUFFIX}")
         numbers = self._write_all(context, template, kind, frames)
         arguments = ["convert", template, str(target), "--as", kind, f"--frames={','.join(map(str, numbers))}"]
         if kind == "splats":

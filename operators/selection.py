@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from typing import TYPE_CHECKING
 
 import bpy
 import numpy as np
@@ -90,6 +91,9 @@ def check_size(obj: bpy.types.Object) -> None:
 
 class ObjectMode:
     """Poll of operators that need Object Mode and a selected DR-GS object."""
+
+    if TYPE_CHECKING:  # of Blender's Operator
+        poll_message_set: Callable[[str], None]
 
     needs = "Select one or several DR-GS objects in Object Mode"
 

@@ -52,6 +52,7 @@ class DRGS_OT_submit_cancel(DrgsOperator, bpy.types.Operator):
         return submit.running()
 
     def run(self, context: bpy.types.Context) -> set[str]:
+        assert submit.job is not None, "poll has looked"
         submit.job.cancel()
         return {"FINISHED"}
 
@@ -70,6 +71,7 @@ class DRGS_OT_copy_submit(DrgsOperator, bpy.types.Operator):
         return True
 
     def run(self, context: bpy.types.Context) -> set[str]:
+        assert submit.job is not None, "poll has looked"
         context.window_manager.clipboard = submit.job.command
         return {"FINISHED"}
 

@@ -32,6 +32,7 @@ class DRGS_OT_pose(DrgsOperator, bpy.types.Operator):
 
     def run(self, context: bpy.types.Context) -> set[str]:
         obj = target(context)
+        assert obj is not None, "poll has looked"
         poser = poser_of(obj)
         if poser is None:
             raise UsageError(

@@ -121,9 +121,10 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
         sub.set_defaults(passes_on=True)
     clean = command("clean", run_clean, "remove build products and caches")
     clean.add_argument("--all", action="store_true", help="also the environments")
-    args, args.rest = parser.parse_known_args(argv)
-    if args.rest and not args.passes_on:
-        parser.error(f"unrecognized arguments: {' '.join(args.rest)}")
+    args, rest = parser.parse_known_args(argv)
+    args.rest = rest
+    if rest and not args.passes_on:
+        parser.error(f"unrecognized arguments: {' '.join(rest)}")
     return args
 
 
@@ -197,7 +198,7 @@ def ensure(
         else:
             subprocess.run([python, "-m", "venv", folder], check=True)
     for step in steps:
-        command = [interpreter, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", *step]
+        command = [str(interpreter), "-m", "pip", "install", "--quiet", "--disable-pip-version-check", *step]
         if subprocess.run(command, cwd=ROOT).returncode:
             raise Failure(f"pip install {' '.join(step)} failed in {folder.name}; its message is above")
     trial = subprocess.run([interpreter, "-c", probe], capture_output=True, text=True, timeout=300, cwd=ROOT)
@@ -225,7 +226,7 @@ def ensure_node() -> None:
     folder.mkdir(exist_ok=True)
     print("Fetching the programs of npm that tests compare with (once) ...", flush=True)
     quiet = ["--no-audit", "--no-fund", "--no-update-notifier", "--no-progress", "--loglevel=error"]
-    command = [npm, "install", "--prefix", folder, "--no-save", *quiet]
+    command = [npm, "install", "--prefix", str(folder), "--no-save", *quiet]
     if subprocess.run([*command, *NODE_PACKAGES], cwd=folder).returncode:
         print("npm could not fetch what some tests compare with: they are skipped", flush=True)
         return
@@ -401,7 +402,7 @@ def run_docs(args: argparse.Namespace) -> int:
     blender, generator = ensure_blender(), ensure_docs()
     pages = ROOT / "build" / "docs" / "blender"
     shutil.rmtree(pages, ignore_errors=True)
-    command = [blender, ROOT / "tools" / "blender_reference.py", "--out", pages]
+    command = [str(blender), str(ROOT / "tools" / "blender_reference.py"), "--out", str(pages)]
     try:
         code = subprocess.run(command, cwd=ROOT, timeout=REFERENCE_SECONDS).returncode
     except subprocess.TimeoutExpired as error:

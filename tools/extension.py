@@ -67,7 +67,10 @@ PERMISSIONS = {"files", "network", "clipboard", "camera", "microphone"}
 def project_version(root: Path = ROOT) -> str:
     """The version written in drgs_blender/core/version.py, read without importing it."""
     text = (root / "drgs_blender" / "core" / "version.py").read_text(encoding="utf-8")
-    return re.search(r'__version__ = "([^"]+)"', text)[1]
+    found = re.search(r'__version__ = "([^"]+)"', text)
+    if found is None:
+        raise ValueError("drgs_blender/core/version.py names no __version__; write one")
+    return found[1]
 
 
 def faults(manifest: dict[str, Any], version: str) -> list[str]:

@@ -101,7 +101,7 @@ def build(targets: Sequence[str], pythons: Sequence[str], out: Path = FOLDER, jo
                 sources[index] = next(folder.glob("sources-*.json")).read_bytes()
             made.append((shipped.archive_name(name), _pack(Path(temporary) / name)))
         digest = sources_digest(copy / PACKAGE.name)
-    facts = {"pythons": sorted(tag for tag, _ in asked.values()), **versions, "sources": digest}
+    facts: dict[str, object] = {"pythons": sorted(tag for tag, _ in asked.values()), **versions, "sources": digest}
     return _write(out, made, sources, facts)
 
 

@@ -123,7 +123,7 @@ def engine(folder: Path, what: str) -> None:
         elif what == "lights":
             place = np.eye(4)
             place[:3, 3] = 0, -1, 2
-            lights = [Light(kind, kind, place) for kind in ("point", "sun", "spot", "area")]  # type: ignore[arg-type]
+            lights = [Light(kind, kind, place) for kind in ("point", "sun", "spot", "area")]
             glowing = Material("glowing", emission=(1.0, 1.0, 1.0))
             floor = MeshState(
                 "floor", np.array([[-2, -2, -1], [2, -2, -1], [2, 2, -1], [-2, 2, -1]], np.float32),
@@ -140,7 +140,7 @@ def engine(folder: Path, what: str) -> None:
             client.render(replace(frame, previous=moment, next=moment, passes=("Combined", "Vector")))
         elif what == "viewport":
             for denoise in ("none", "svgf"):
-                seen = replace(frame, settings=replace(settings, denoise=denoise))  # type: ignore[arg-type]
+                seen = replace(frame, settings=replace(settings, denoise=denoise))
                 client.view("view", seen)
                 client.view("view", seen, go_on=True)
 

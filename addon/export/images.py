@@ -78,6 +78,7 @@ def export_curved(image: bpy.types.Image, straight: bool, source: str, curve: by
     curve : (256, 3) float32 in [0, 1], linear, as bytes
     """
     plain = export_image(image, straight, warn)
+    assert plain is not None, "a curve is made of pixels"
     values = np.frombuffer(curve, np.float32).reshape(256, 3)
     number = bool((np.ptp(values, axis=1) < 1e-6).all()) and source != "rgb"
     table = np.rint(255 * (values if number else linear_to_srgb(values))).astype(np.uint8)
@@ -85,7 +86,7 @@ def export_curved(image: bpy.types.Image, straight: bool, source: str, curve: by
     def make(_: bpy.types.Image) -> Image:
         pixels = plain.pixels.copy()
         for i in range(3):
-            pixels[..., i] = table[plain.pixels[..., i if source == "rgb" else "rgba".index(source)], i]
+            pixels[..., i] = table[:, i][plain.pixels[..., i if source == "rgb" else "rgba".index(source)]]
         pixels.flags.writeable = False
         mark = hashlib.blake2b(source.encode() + curve, digest_size=6).hexdigest()
         return Image(f"{plain.name} ({mark})", pixels, "linear" if number else "srgb")

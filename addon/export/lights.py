@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import bpy
 import numpy as np
 
 from ...drgs_blender.core.frame import Light
 from .instances import Visible
+from .node_math import rgb
 from .nodes import Paint, Walker, once, plain
 from .sockets import Place, surface_of
 
@@ -41,7 +43,7 @@ def export_light(item: Visible, warn: Warn) -> Light | None:
         name=obj.name,
         kind=kind,
         matrix_world=item.matrix_world,
-        colour=tuple(map(float, colour)),
+        colour=rgb(colour),
         power=power,
         normalize=getattr(light, "normalize", True),
         camera=rays.camera,
@@ -52,21 +54,21 @@ def export_light(item: Visible, warn: Warn) -> Light | None:
     )
 
 
-def _point(light: bpy.types.Light) -> dict[str, object]:
+def _point(light: bpy.types.Light) -> dict[str, Any]:
     return {"radius": light.shadow_soft_size, "soft_falloff": light.use_soft_falloff}
 
 
-def _spot(light: bpy.types.Light) -> dict[str, object]:
+def _spot(light: bpy.types.Light) -> dict[str, Any]:
     return {**_point(light), "spot_size": light.spot_size, "spot_blend": light.spot_blend}
 
 
-def _area(light: bpy.types.Light) -> dict[str, object]:
+def _area(light: bpy.types.Light) -> dict[str, Any]:
     shape = light.shape.lower()
     height = light.size_y if shape in ("rectangle", "ellipse") else light.size
     return {"shape": shape, "size_x": light.size, "size_y": height, "spread": light.spread}
 
 
-_SHAPES: dict[str, Callable[[bpy.types.Light], dict[str, object]]] = {
+_SHAPES: dict[str, Callable[[bpy.types.Light], dict[str, Any]]] = {
     "point": _point,
     "sun": lambda light: {"angle": light.angle},
     "spot": _spot,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Any, cast
 
 import bpy
 import numpy as np
@@ -13,7 +14,7 @@ from . import images
 from .node_math import reflectance
 from .nodes import Paint, Walker, constant, euler, once, plain, vector_rotate
 from .sockets import Place, surface_of
-from .texture_refs import TextureRef
+from .texture_refs import Channel, TextureRef
 
 Warn = Callable[[str], None]
 Array = np.ndarray
@@ -53,7 +54,8 @@ class Look:
     uv_map: str | None = None
 
 
-DEFAULT = Look(Material("Default"))
+DEFAULT_MATERIAL = Material("Default")
+DEFAULT = Look(DEFAULT_MATERIAL)
 
 
 class Materials:
@@ -94,10 +96,11 @@ class Materials:
             "metallic": surface.metallic,
             "emission": surface.emission,
         }
-        values, maps = {}, []
+        values: dict[str, Any] = {}
+        maps: list[str] = []
         for name, paint in paints.items():
             picture = paint.texture
-            values[name] = _usable(tree, name, paint, getattr(DEFAULT.material, name))
+            values[name] = _usable(tree, name, paint, getattr(DEFAULT_MATERIAL, name))
             if isinstance(picture, TextureRef):
                 values[f"{name}_texture"] = self._texture(picture)
                 maps.append(picture.uv_map)
@@ -163,13 +166,13 @@ class _Tree(Walker):
 
     # Textures
 
-    def mean(self, texture: TextureRef) -> Array:
+    def mean(self, texture: Any) -> Array:
         return texture.mean(self._warn)
 
-    def channel(self, texture: TextureRef, name: str) -> TextureRef:
-        return texture.only(name)
+    def channel(self, texture: Any, name: str) -> TextureRef:
+        return texture.only(cast(Channel, name))
 
-    def curved(self, texture: TextureRef, function: Callable[[Array], Array]) -> Paint | None:
+    def curved(self, texture: Any, function: Callable[[Array], Array]) -> Paint | None:
         found = texture.curved(function, self._warn)
         return None if found is None else Paint(np.full(3, found[1]), found[0])
 

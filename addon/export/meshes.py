@@ -13,7 +13,7 @@ from ...drgs_blender.core.frame import Image, Material, MeshState
 from .. import mesh_arrays
 from .export_cache import ExportCache, uid
 from .instances import Key, Visible
-from .materials import DEFAULT, Look, Materials
+from .materials import DEFAULT_MATERIAL, Look, Materials
 
 Warn = Callable[[str], None]
 Array = np.ndarray
@@ -130,7 +130,7 @@ class Meshes:
             corner_normals=None if normals is None else _frozen(normals[corners]),
             uvs=self._uvs(item.object.name, mesh, corners, index, looks),
             material_index=None if index is None or not index.any() else _frozen(index.astype(np.int32)),
-            materials=[look.material or DEFAULT.material for look in looks],
+            materials=[look.material or DEFAULT_MATERIAL for look in looks],
             visibility=item.visibility,
         )
 
@@ -152,7 +152,7 @@ class Meshes:
                 )
                 continue
             if index is None:
-                faces = slice(None) if wanted[0] == uv_map else slice(0)
+                faces: slice | Array = slice(None) if wanted[0] == uv_map else slice(0)
             else:
                 faces = np.isin(index, [i for i, u in enumerate(wanted) if u == uv_map])
             uvs[faces] = values[corners[faces]]

@@ -10,6 +10,12 @@ import numpy as np
 Array = np.ndarray
 
 
+def rgb(colour: Array) -> tuple[float, float, float]:
+    """A colour as frames hold it."""
+    red, green, blue = map(float, colour)
+    return red, green, blue
+
+
 def by_row(function: Callable[..., Array]) -> Callable[..., Array]:
     """A function of (3,) arrays as one of (..., 3) arrays."""
 

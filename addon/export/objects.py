@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import bpy
 import numpy as np
@@ -62,7 +63,7 @@ def _shape(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, key_of: KeyOf,
     mesh = obj.to_mesh(preserve_all_data_layers=True, depsgraph=depsgraph) if editing else obj.data
     try:
         same_faces = check_topology(obj, mesh, asset.mesh, warn)
-        arrays = {
+        arrays: dict[str, Any] = {
             "vertices": mesh_arrays.read_vertices(mesh),
             "corner_normals": _corner_normals(obj, mesh, same_faces, warn),
             **{c: None if captured else _edited(obj, mesh, asset, c, warn) for c in MATERIAL_CHANNELS},

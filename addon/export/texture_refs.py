@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import bpy
 import numpy as np
@@ -19,6 +20,7 @@ from .nodes import LUMINANCE
 
 Array = np.ndarray
 Warn = Callable[[str], None]
+Channel = Literal["rgb", "r", "g", "b", "a", "luminance"]
 
 _CHANNELS = {"r": 0, "g": 1, "b": 2, "a": 3}
 #: Bytes with which a function is probed for working on each channel alone.
@@ -39,19 +41,25 @@ class TextureRef:
 
     image: bpy.types.Image
     straight: bool
-    channel: str
+    channel: Channel
     uv_map: str
     matrix: tuple[tuple[float, ...], ...]
-    interpolation: str
-    extension: str
+    interpolation: Literal["linear", "closest"]
+    extension: Literal["repeat", "extend", "clip", "mirror"]
     curve: bytes = b""
     source: str = "rgb"
 
     def export(self, warn: Warn) -> Image:
         """The pixels."""
         if not self.curve:
-            return images.export_image(self.image, self.straight, warn)
+            return self._plain(warn)
         return images.export_curved(self.image, self.straight, self.source, self.curve, warn)
+
+    def _plain(self, warn: Warn) -> Image:
+        """The pixels before the curve. What has none is no texture: whoever makes a `TextureRef` has looked."""
+        exported = images.export_image(self.image, self.straight, warn)
+        assert exported is not None, self.image
+        return exported
 
     def texture(self, name: str) -> Texture:
         """What it is on the surface; `name` is that of the exported image."""
@@ -65,7 +73,7 @@ class TextureRef:
             return mean[:3]
         return np.full(3, mean[:3] @ LUMINANCE if self.channel == "luminance" else mean[_CHANNELS[self.channel]])
 
-    def only(self, channel: str) -> TextureRef:
+    def only(self, channel: Channel) -> TextureRef:
         """One channel or the luminance; of what is one channel already, itself."""
         return replace(self, channel=channel) if self.channel == "rgb" else self
 
@@ -85,12 +93,12 @@ class TextureRef:
         made = np.maximum(np.nan_to_num(made), 0)
         factor = max(1.0, float(made.max()))
         curve = (made / factor).astype(np.float32)
-        channel = "r" if source != "rgb" and (np.ptp(curve, axis=1) < 1e-6).all() else "rgb"
+        channel: Channel = "r" if source != "rgb" and (np.ptp(curve, axis=1) < 1e-6).all() else "rgb"
         return replace(self, channel=channel, curve=curve.tobytes(), source=source), factor
 
     def _values(self, warn: Warn) -> tuple[Array | None, str]:
         """(256, 3): the values that the picture's bytes stand for, and the channel that they are of."""
-        plain = images.export_image(self.image, self.straight, warn)
+        plain = self._plain(warn)
         if plain.pixels.dtype != np.uint8:
             return None, ""
         if self.curve:

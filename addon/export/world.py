@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import bpy
 import numpy as np
@@ -11,6 +12,7 @@ import numpy as np
 from ...drgs_blender.core.errors import UsageError
 from ...drgs_blender.core.frame import World
 from .images import linear_pixels
+from .node_math import rgb
 from .nodes import Paint, Walker, euler, once, plain, vector_rotate
 from .sockets import Place, surface_of
 
@@ -39,7 +41,7 @@ def export_world(world: bpy.types.World | None, warn: Warn) -> World:
     """
     light = BLACK if world is None else _Tree(world, warn).light()
     pixels, rotation = None, np.eye(3)
-    if isinstance(light.texture, Sky):
+    if world is not None and isinstance(light.texture, Sky):
         pixels, rotation = linear_pixels(light.texture.image, warn), np.array(light.texture.rotation)
         if pixels is None:
             warn(
@@ -51,7 +53,7 @@ def export_world(world: bpy.types.World | None, warn: Warn) -> World:
     if world is not None:
         colour = _usable(colour, rotation, world.name, warn)
         _check_rays(world, warn)
-    return World(environment=pixels, rotation=rotation, colour=tuple(map(float, colour)))
+    return World(environment=pixels, rotation=rotation, colour=rgb(colour))
 
 
 def _check_rays(world: bpy.types.World, warn: Warn) -> None:
@@ -99,7 +101,7 @@ class _Tree(Walker):
             self.warn(surface.node, "the volume is not rendered")
         return self.shader(surface)
 
-    def mean(self, texture: Sky) -> np.ndarray:
+    def mean(self, texture: Any) -> np.ndarray:
         pixels = linear_pixels(texture.image, self._warn)
         if pixels is None:
             return np.full(3, FALLBACK)

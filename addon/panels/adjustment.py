@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import bpy
 
 from .. import assets
 
 
 class _Adjustments:
+    if TYPE_CHECKING:  # of Blender's Panel
+        layout: bpy.types.UILayout
+
     bl_label = "Adjustments"
     bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012 - read by Blender
 

@@ -10,8 +10,8 @@ from .text_layout import bar_text, wrapped
 
 def draw_engine(layout: bpy.types.UILayout, context: bpy.types.Context, always: bool = False) -> None:
     """Set-up of the engine: its buttons where there is none (or `always`), or how far it is."""
-    if setup_job.running():
-        job = setup_job.job
+    job = setup_job.job
+    if job is not None and not job.done:
         layout.progress(text=bar_text(layout, context, job.text, job.fraction), factor=job.fraction)
         layout.operator("drgs.engine_setup_cancel", icon="CANCEL")
         return

@@ -43,13 +43,13 @@ class DRGS_PT_submit(bpy.types.Panel):
 
 def draw_job(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     """The button, and what became of the last job."""
-    if submit.running():
+    job = submit.job
+    if job is not None and not job.done:
         row = layout.row()
-        row.label(text=submit.job.text, icon="SORTTIME")
+        row.label(text=job.text, icon="SORTTIME")
         row.operator("drgs.submit_cancel", text="", icon="CANCEL")
         return
     layout.operator("drgs.submit", icon="EXPORT")
-    job = submit.job
     if job is None:
         return
     box = layout.box()

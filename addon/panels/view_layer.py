@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import bpy
 
 from ...drgs_blender.core.passes import PASSES
@@ -26,7 +28,7 @@ class DRGS_PT_passes(bpy.types.Panel):
         view_layer = context.view_layer
         layout.prop(view_layer.drgs, "others")
         column = layout.column(heading="Include")
-        switches = {}  # one for all passes of a kind
+        switches: dict[str, tuple[Any, str]] = {}  # one for all passes of a kind
         for p in PASSES:
             owner, name = (view_layer, p.blender) if p.blender else (view_layer.drgs, switch_of(p))
             switches.setdefault(name, (owner, label(p).removesuffix("00")))

@@ -79,6 +79,12 @@ class Job:
         running[self.key] = self
 
     @property
+    def process(self) -> SimulateProcess:
+        """The engine's program, once the scene is read."""
+        assert self._process is not None, "the scene is still being read"
+        return self._process
+
+    @property
     def capturing(self) -> bool:
         """Whether the scene is still being read: it must not be edited meanwhile."""
         return self._process is None
@@ -158,7 +164,7 @@ class Job:
         """It says so, but has not written that."""
         missing = [Path(f"{what} in {self.folder}")]
         held = f". {self._held()}" if self._held() else ""
-        raise EngineError(self.subject, output_check.complaint(self._process.name, missing), output_check.REMEDY + held)
+        raise EngineError(self.subject, output_check.complaint(self.process.name, missing), output_check.REMEDY + held)
 
 
 class Bake(Job):
@@ -198,7 +204,7 @@ class Bake(Job):
         return self.count > 0
 
     def _take(self, seconds: float) -> bool:
-        if self._process.counts is None:
+        if self.process.counts is None:
             return False  # until then the folder holds what was there before
         if self._playback is None:
             path = self._inputs / scene_export.MATRICES
@@ -220,7 +226,7 @@ class Bake(Job):
             self._lacks(f"frames {self.first + self.count} to {self.first + self.frames - 1}")
 
     def _show(self, renew: bool) -> None:
-        if not self.count:
+        if not self.count or self._playback is None:
             return
         obj = self.target()
         if renew or cache_playback.modifier_of(obj) is None:
@@ -254,9 +260,10 @@ class Preview(Job):
 
     def _finish(self) -> None:
         cache = ParticleCache(self.folder)
-        if self._process.counts is None or cache.header() is None:
+        counts = self.process.counts
+        if counts is None or cache.header() is None:
             self._lacks("the particles")
-        self.counts = self._process.counts
+        self.counts = counts
         particle_display.show(self.target(), cache.rest().points, self.counts)
 
 

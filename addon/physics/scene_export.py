@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -43,7 +43,7 @@ _KINDS = {"BOOLEAN": bool, "FLOAT": np.float32, "INT": np.int32}
 
 def export_scene(
     obj: bpy.types.Object, scene: bpy.types.Scene, folder: Path, *, still: bool = False
-) -> Iterator[float]:
+) -> Generator[float, None, None]:
     """Write body, settings and all that moves into `folder`, which is emptied before.
 
     The scene is evaluated at every frame of the bake if anything in it may have an effect, and at its own again in

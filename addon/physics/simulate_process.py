@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 import subprocess
-import sys
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -42,11 +41,16 @@ def ending() -> bool:
     for entry in list(_ending):
         process, until = entry
         if process.poll() is not None:
-            process.stdin.close()
+            _close_input(process)
             _ending.remove(entry)
         elif time.monotonic() > until:
             process.kill()
     return bool(_ending)
+
+
+def _close_input(process: subprocess.Popen[bytes]) -> None:
+    assert process.stdin is not None, "it was made a pipe"
+    process.stdin.close()
 
 
 class SimulateProcess:
@@ -75,7 +79,6 @@ class SimulateProcess:
         self._said, self._log = inputs / scene_export.SAID, inputs / scene_export.LOG
         command = engine_link.drgs_command()
         self.name = f"drgs simulate of {command[0]}"
-        options = {"creationflags": subprocess.CREATE_NO_WINDOW} if sys.platform == "win32" else {}
         arguments = [inputs / scene_export.BODY, "--settings", inputs / scene_export.SETTINGS, "--out", folder]
         arguments += ["--overwrite", "--threads", str(threads), "--device", device]
         try:
@@ -86,7 +89,7 @@ class SimulateProcess:
                     stdout=said,
                     stderr=log,
                     env=clean_environment(),
-                    **options,
+                    creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),  # Windows alone has it
                 )
         except OSError as error:
             raise UsageError("Engine", f"{command[0]} cannot be started ({error})", "See the preferences") from error
@@ -126,7 +129,7 @@ class SimulateProcess:
                 # Its input stays open: to close it would be to ask a second time, in the middle of what it saves.
                 _ending.append((self._process, time.monotonic() + _PATIENCE))
                 return
-        self._process.stdin.close()
+        _close_input(self._process)
 
     def result(self, subject: str, held: str = "") -> list[str]:
         """What it warned of, after it has ended by itself.
@@ -143,7 +146,7 @@ class SimulateProcess:
         """
         lines = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
         code = self._process.wait()
-        self._process.stdin.close()
+        _close_input(self._process)
         if code == 0:
             return [f"{subject}: {self._in_words(line.removeprefix(_SAYS))}" for line in lines]
         said = next((line for line in reversed(lines) if line.startswith(_SAYS)), "")

@@ -49,7 +49,7 @@ def steps(scene: bpy.types.Scene, camera: bpy.types.Object, warn: Warn) -> list[
     # Times are even; places on the lens are of a low-discrepancy sequence (Roberts 2018, R2), new at each time.
     square = np.mod(0.5 + np.arange(count)[:, None] * (0.7548776662466927, 0.5698402909980532), 1.0)
     lens = radius * np.array([on_lens(u, v, dof) for u, v in square])
-    return [Step(start + shutter * (i + 0.5) / count, tuple(map(float, lens[i]))) for i in range(count)]
+    return [Step(start + shutter * (i + 0.5) / count, (float(lens[i, 0]), float(lens[i, 1]))) for i in range(count)]
 
 
 def _radius(camera: bpy.types.Camera) -> float:

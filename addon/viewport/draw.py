@@ -120,7 +120,7 @@ class Mode:
 
 #: Where the whole picture lies, and of a strip: where it begins and ends, the first row it has, those of the picture.
 _PLACED = (("VEC4", "rect"), ("VEC4", "strip"))
-_SCREEN = {"inputs": (("VEC2", "pos"),), "passed": (("VEC2", "uv"),), "vertex": _QUAD}
+_SCREEN: dict[str, Any] = {"inputs": (("VEC2", "pos"),), "passed": (("VEC2", "uv"),), "vertex": _QUAD}
 MODES = {
     "rendered": Mode(constants=_PLACED, images=("image",), fragment=_LINEAR, **_SCREEN),
     "composited": Mode(

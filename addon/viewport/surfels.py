@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import bpy
 import gpu
 import numpy as np
@@ -47,7 +49,7 @@ def show(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
             continue
         look = obj.drgs.show_captured, obj.drgs.adjustment.values()
         key = "object", uid(obj), obj.data.as_pointer(), obj.mode, look
-        batch = cache.get(key, (uid(obj), uid(obj.data)), lambda obj=obj: _batch(obj))
+        batch = cache.get(key, (uid(obj), uid(obj.data)), partial(_batch, obj))
         if batch is None:
             continue
         matrix: Matrix = instance.matrix_world

@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 from ...drgs_blender.core.errors import Cancelled, DrgsError
 from ...drgs_blender.core.frame import Frame
@@ -161,7 +162,7 @@ class Worker:
                     view.name,
                     request.frame,
                     not first,
-                    lambda phase, part, view=view: self._tell(view, phase, part),
+                    partial(self._tell, view),
                     self._stop_begin(view) if first else self._stop_refining(view, request),
                 )
             except Cancelled:

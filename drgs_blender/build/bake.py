@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from ..compute.jit import njit
@@ -87,7 +85,7 @@ def _unit(vectors: Array, other: Array) -> Array:
 
 
 @njit
-def _cover(uvs: Any, size: Any, face: Any, weights: Any) -> None:
+def _cover(uvs, size, face, weights):  # type: ignore[no-untyped-def]
     """Find the face under the centre of every texel, the first of several, and where on it the centre lies."""
     for f in range(len(uvs)):
         ax, ay = uvs[f, 0, 0] * size, (1.0 - uvs[f, 0, 1]) * size

@@ -55,7 +55,7 @@ def settings_hash(frame: Frame, assets: Mapping[str, Path]) -> str:
     digest = hashlib.sha256(json.dumps([__version__, description], sort_keys=True).encode())
     for slot, array in sorted(arrays.items()):
         digest.update(f"{slot} {array.dtype.str} {array.shape}".encode())
-        digest.update(np.ascontiguousarray(array).reshape(-1).view(np.uint8))
+        digest.update(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
     return digest.hexdigest()
 
 

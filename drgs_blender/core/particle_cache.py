@@ -242,7 +242,7 @@ def _write(path: Path, arrays: dict[str, Array]) -> None:
     index = {name: [array.dtype.str, list(array.shape)] for name, array in kept.items()}
     text = json.dumps(index, separators=(",", ":")).encode()
     members = [("index.json", [memoryview(text)])]
-    members += [(name, [memoryview(array.reshape(-1).view(np.uint8))]) for name, array in kept.items()]
+    members += [(name, [array.reshape(-1).view(np.uint8).data]) for name, array in kept.items()]
     write_archive(path, members)
 
 

@@ -293,9 +293,7 @@ def _pose(mesh: Any, by_corner: bool, linear: Array, side: float, rest: Any, out
 
 
 @njit
-def pose_surfels(
-    lane: Any, lanes: Any, room: Any, mesh: Any, by_corner: Any, linear: Any, side: Any, rest: Any, out: Any
-) -> None:
+def pose_surfels(lane, lanes, room, mesh, by_corner, linear, side, rest, out):  # type: ignore[no-untyped-def]
     """Pose every so-manyth (`lanes`) block of surfels, from the `lane`-th on.
 
     Arithmetic in double so that a small object far from the origin stays exact.

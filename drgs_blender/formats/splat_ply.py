@@ -41,4 +41,4 @@ def _parts(splats: Splats) -> Iterator[bytes | memoryview]:
         table[:, -8] = np.log(opacity / (1 - opacity))
         table[:, -7:-4] = np.log(splats.scale[rows])
         table[:, -4:] = splats.rotation[rows]
-        yield memoryview(table).cast("B")
+        yield table.data.cast("B")

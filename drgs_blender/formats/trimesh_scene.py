@@ -1,5 +1,6 @@
-"""The meshes of a 3MF or COLLADA file as plain arrays in a file: a program of its own, since a small file may place its
-objects without end. `scene_mesh` runs it with limits.
+"""The meshes of a 3MF or COLLADA file as plain arrays in a file.
+
+A program of its own, since a small file may place its objects without end. `scene_mesh` runs it with limits.
 """
 
 from __future__ import annotations

@@ -31,7 +31,7 @@ def check_crate(path: Path) -> None:
     """
     if path.stat().st_size < _SHORTEST:
         return
-    data = memoryview(np.memmap(path, np.uint8, "r"))
+    data = np.memmap(path, np.uint8, "r").data
     if data[:4] == b"PK\x03\x04":
         name, extra = struct.unpack_from("<2H", data, 26)
         data = data[30 + name + extra :]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
@@ -111,7 +110,7 @@ _ARCTAN = tuple(
 
 
 @njit(inline="always")
-def _angle(y: Any, x: Any) -> Any:
+def _angle(y, x):  # type: ignore[no-untyped-def]
     """arctan2(y, x) for y > 0, without branches."""
     a = abs(x)
     low, high = min(a, y), max(a, y)
@@ -131,7 +130,7 @@ def _angle(y: Any, x: Any) -> Any:
 
 
 @njit(inline="always")
-def face_normal(ux: Any, uy: Any, uz: Any, vx: Any, vy: Any, vz: Any) -> Any:
+def face_normal(ux, uy, uz, vx, vy, vz):  # type: ignore[no-untyped-def]
     """Unit normal and the angles of a face with edges u, v at its first corner; zeros if it has no area."""
     zero, one = np.float32(0.0), np.float32(1.0)
     uu, vv, uv = ux * ux + uy * uy + uz * uz, vx * vx + vy * vy + vz * vz, ux * vx + uy * vy + uz * vz
@@ -151,7 +150,7 @@ def face_normal(ux: Any, uy: Any, uz: Any, vx: Any, vy: Any, vz: Any) -> Any:
 
 
 @njit(inline="always")
-def vertex_normal(weighted: Any, first: Any, last: Any) -> Any:
+def vertex_normal(weighted, first, last):  # type: ignore[no-untyped-def]
     """Unit sum of the weighted normals in some rows, always in the same order."""
     x = y = z = np.float32(0.0)
     for i in range(first, last):

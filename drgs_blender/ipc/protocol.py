@@ -273,7 +273,7 @@ class Link:
             self._write(PREFIX.pack(MAGIC, len(header), size) + header)
             if size:
                 for array in ready.values():
-                    self._write(memoryview(array.reshape(-1).view(np.uint8)))
+                    self._write(array.reshape(-1).view(np.uint8).data)
                     self._write(bytes(_aligned(array.nbytes) - array.nbytes))
 
     def receive(self) -> tuple[Any, dict[str, Array]] | None:
@@ -304,7 +304,7 @@ class Link:
         padding = bytearray(ALIGNMENT)
         for item in placed:
             arrays[item.name] = array = self._allocate(item)
-            self._read(memoryview(array.reshape(-1).view(np.uint8)))
+            self._read(array.reshape(-1).view(np.uint8).data)
             self._read(memoryview(padding)[: _aligned(item.size) - item.size])
         return message, arrays
 

@@ -30,7 +30,7 @@ def fingerprint(capture: Capture, **settings: Any) -> str:
         digest.update(f"{view.name} {view.test} {camera.width} {camera.height}".encode())
         digest.update(np.asarray(camera.matrix_world, np.float64).tobytes())
         digest.update(np.array([camera.fx, camera.fy, camera.cx, camera.cy]).tobytes())
-        digest.update(np.ascontiguousarray(view.colour))
+        digest.update(np.ascontiguousarray(view.colour).data)
         if view.mask is not None:
             digest.update(np.packbits(view.mask > 0.5).tobytes())
     return digest.hexdigest()

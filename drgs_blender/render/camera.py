@@ -10,7 +10,6 @@ weight: no pixel's light is added to another's, and what is denoised stays a pix
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
@@ -107,7 +106,7 @@ def camera_parameters(camera: Camera, settings: RenderSettings, noise_index: int
 
 
 @njit
-def pixel_shift(parameters: Any, pixel: Any) -> Any:
+def pixel_shift(parameters, pixel):  # type: ignore[no-untyped-def]
     """Toroidal shift (x, y) in [0, 1) of the sub-pixel lattice of `pixel` (index y * width + x)."""
     h = mix(np.uint32(pixel) ^ np.uint32(np.int64(parameters[SEED])))
     g = mix(h ^ GOLDEN)
@@ -115,7 +114,7 @@ def pixel_shift(parameters: Any, pixel: Any) -> Any:
 
 
 @njit(inline="always")
-def lattice(shift_x: Any, shift_y: Any, sample: Any, parameters: Any) -> Any:
+def lattice(shift_x, shift_y, sample, parameters):  # type: ignore[no-untyped-def]
     """Position of a pixel's sub-pixel sample: in [0, 1) inside the pixel, or `filter_reach` beyond it."""
     x = shift_x + sample / parameters[SUBPIXELS]
     y = shift_y + sample * _GOLDEN_RATIO
@@ -128,13 +127,13 @@ def lattice(shift_x: Any, shift_y: Any, sample: Any, parameters: Any) -> Any:
 
 
 @njit(inline="always")
-def filter_reach(parameters: Any) -> Any:
+def filter_reach(parameters):  # type: ignore[no-untyped-def]
     """Pixels by which positions may lie beyond the pixel."""
     return max(parameters[FILTER] - 0.5, 0.0)
 
 
 @njit(inline="always")
-def _blackman_harris(u: Any) -> Any:
+def _blackman_harris(u):  # type: ignore[no-untyped-def]
     """Place in [-.5, .5] below which the part `u` of Blackman and Harris's window lies.
 
     The window is nearly a Gaussian; a polynomial of what its own quantiles are near is off by .0015 at most.
@@ -146,7 +145,7 @@ def _blackman_harris(u: Any) -> Any:
 
 
 @njit
-def camera_ray(parameters: Any, px: Any, py: Any) -> Any:
+def camera_ray(parameters, px, py):  # type: ignore[no-untyped-def]
     """World-space ray through pixel position (px, py).
 
     Returns
@@ -178,7 +177,7 @@ def camera_ray(parameters: Any, px: Any, py: Any) -> Any:
 
 
 @njit
-def sample_ray(parameters: Any, pixel: Any, sample: Any) -> Any:
+def sample_ray(parameters, pixel, sample):  # type: ignore[no-untyped-def]
     """`camera_ray` through sub-pixel sample `sample` of `pixel` (index y * width + x)."""
     width = np.int64(parameters[WIDTH])
     shift_x, shift_y = pixel_shift(parameters, pixel)

@@ -29,7 +29,7 @@ def _load(scalar: Any, kind: Any) -> Any:
     """Intrinsic ``load(address, index)``: element `index` of an array of `scalar`, wherever it is aligned."""
 
     @intrinsic
-    def load(typing: Any, address: Any, index: Any) -> Any:
+    def load(typing, address, index):  # type: ignore[no-untyped-def]
         def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
             start = builder.inttoptr(arguments[0], kind.as_pointer())
             value = builder.load(builder.gep(start, [arguments[1]]))

@@ -49,7 +49,7 @@ def digest_of(mesh: Mesh, settings: Settings, colliders: Sequence[Collider], mot
     arrays += [] if motion is None else [motion[0]]
     for array in arrays:
         digest.update(f"{array.dtype.str} {array.shape}".encode())
-        digest.update(_bytes(array))
+        digest.update(_bytes(array).data)
     return digest.hexdigest()
 
 
@@ -63,7 +63,7 @@ def moves_of(settings: Settings, colliders: Sequence[Collider], motion: Array | 
         for name, rows in tracks.items():
             if 0 < frame < len(rows) and not np.array_equal(rows[frame], rows[frame - 1]):
                 digest.update(f"{frame} {name}".encode())
-                digest.update(_bytes(rows[frame]))
+                digest.update(_bytes(rows[frame]).data)
         found.append(digest.hexdigest()[:16])
     while len(found) > 1 and found[-1] == found[-2]:
         found.pop()

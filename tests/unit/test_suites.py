@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -157,6 +158,20 @@ def test_kernels_are_prepared_before_tests_where_there_is_a_program_for_it(suite
     kernels, engine = suites.jobs(plan, table, python, tmp_path, tmp_path)
     assert kernels.commands == [["python", "-m", "drgs_blender.compute.prepare", "--all"]]
     assert engine.after == kernels.title
+
+
+def test_types_of_the_extension_are_checked_where_a_package_can_be_named_as_its_folder(suites, tmp_path):
+    checked = suites.lint(Path("python"), tmp_path / "drgs-blender", tmp_path).commands[2:]
+    assert [command[2:] for command in checked] == [
+        ["mypy"],
+        ["mypy", "-p", "drgs-blender.addon", "-p", "drgs-blender.operators", "-m", "drgs-blender"],
+    ]
+    assert len(suites.lint(Path("python"), tmp_path / "drgs-blender-1.0", tmp_path).commands) == 3
+
+
+def test_types_of_every_tool_are_checked():
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["mypy"]
+    assert settings["modules"] == sorted(path.stem for path in (ROOT / "tools").glob("*.py"))
 
 
 def job_of(suites, folder: Path, name: str, program: str, **options):

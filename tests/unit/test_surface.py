@@ -19,7 +19,9 @@ F = np.float32
 
 
 @njit
-def _meet(tracer, geometry, vertices, faces, places, o, d, mask, t, numbers, out):  # type: ignore[no-untyped-def]
+def _meet(  # type: ignore[no-untyped-def]
+    tracer, geometry, vertices, faces, places, o, d, mask, t, numbers, out
+):
     for i in range(len(o)):
         dx, dy, dz = d[i, 0], d[i, 1], d[i, 2]
         t[i], face, place, u, v, gx, gy, gz = nearest(

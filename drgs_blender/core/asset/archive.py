@@ -97,7 +97,7 @@ def read_archive(path: str | os.PathLike[str], check: Collection[str] = ()) -> d
         if offset + member.size > tail_start or data[offset - len(head) : offset].tobytes() != head:
             raise AssetError(f"{path}, {member.name}", "has a damaged or unexpected header", _RESTORE)
         views[member.name] = data[offset : offset + member.size]
-        if member.name in check and zlib.crc32(views[member.name]) != member.crc:
+        if member.name in check and zlib.crc32(views[member.name].data) != member.crc:
             raise AssetError(f"{path}, {member.name}", "has been altered: its CRC-32 is wrong", _RESTORE)
     end = offsets[-1] + members[-1].size if members else 0
     if end != tail_start or data[tail_start:].tobytes() != tail:

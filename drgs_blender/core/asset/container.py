@@ -172,7 +172,7 @@ def inspect_asset(path: PathLike, verify: bool = True) -> dict[str, Any]:
         ranges["environment.radiance"] = _range(asset.environment.radiance)
     return {
         **{key: value for key, value in manifest.items() if key not in ("members", "provenance")},
-        "digest": hashlib.sha256(members[MANIFEST]).hexdigest(),
+        "digest": hashlib.sha256(members[MANIFEST].data).hexdigest(),
         "verified": verify,
         "counts": counts,
         "bounds": {"surfels": _bounds(surfels.centre), "mesh": _bounds(mesh.vertices)},
@@ -189,7 +189,7 @@ def digest_asset(path: PathLike) -> str:
     """SHA-256 of the manifest, which holds that of every other member: the identity of the asset's content."""
     members = read_archive(path, check=(MANIFEST,))
     _manifest(members, os.fspath(path))
-    return hashlib.sha256(members[MANIFEST]).hexdigest()
+    return hashlib.sha256(members[MANIFEST].data).hexdigest()
 
 
 def check_asset(asset: Asset, subject: str, values: bool = True) -> None:
@@ -261,7 +261,7 @@ def _tensors(
     entry, data = manifest["members"][member], members[member]
     if not isinstance(entry, dict) or entry.get("size") != len(data):
         raise AssetError(where, "does not have the size that the manifest states", _RESTORE)
-    if verify and hashlib.sha256(data).hexdigest() != entry.get("sha256"):
+    if verify and hashlib.sha256(data.data).hexdigest() != entry.get("sha256"):
         raise AssetError(where, "has been altered: its SHA-256 is not that of the manifest", _RESTORE)
     tensors = decode(data, where)
     if entry.get("tensors") != {n: {"dtype": dtype_name(a), "shape": list(a.shape)} for n, a in tensors.items()}:

@@ -69,7 +69,7 @@ def encode(tensors: Mapping[str, Array]) -> list[memoryview]:
             "shape": list(array.shape),
             "data_offsets": [position, position + data.nbytes],
         }
-        buffers.append(memoryview(data.reshape(-1).view(np.uint8)))
+        buffers.append(data.reshape(-1).view(np.uint8).data)
         position += data.nbytes
     text = json.dumps(header, ensure_ascii=False, separators=(",", ":")).encode()
     text += b" " * (-(8 + len(text)) % ALIGNMENT)

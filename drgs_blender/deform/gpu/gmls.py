@@ -22,10 +22,7 @@ def _gradient(rows: Any, s: Any) -> Any:
     )  # fmt: skip
 
 
-def carry_points(
-    lane: Any, lanes: Any, room: Any, source: Any, weight: Any, offset: Any, reach: Any, rows: Any, centre: Any,
-    out: Any,
-) -> None:  # fmt: skip
+def carry_points(lane, lanes, room, source, weight, offset, reach, rows, centre, out):  # type: ignore[no-untyped-def]
     """`gmls._carry`; `source` and `weight` with the point as their last axis."""
     points, gradients, turned = out
     zero = np.float32(0.0)

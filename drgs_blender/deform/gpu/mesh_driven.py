@@ -25,7 +25,7 @@ Array = np.ndarray
 _USABLE = 1e28
 
 
-def weigh_corners(lane: Any, lanes: Any, room: Any, vertices: Any, faces: Any, place: Any, out: Any) -> None:
+def weigh_corners(lane, lanes, room, vertices, faces, place, out):  # type: ignore[no-untyped-def]
     """`geometry._weigh`, one face after the other."""
     (weighted,) = out
     for f in range(lane, len(faces), lanes):
@@ -41,7 +41,7 @@ def weigh_corners(lane: Any, lanes: Any, room: Any, vertices: Any, faces: Any, p
             weighted[p, 0], weighted[p, 1], weighted[p, 2] = w * nx, w * ny, w * nz
 
 
-def sum_corners(lane: Any, lanes: Any, room: Any, weighted: Any, start: Any, side: Any, out: Any) -> None:
+def sum_corners(lane, lanes, room, weighted, start, side, out):  # type: ignore[no-untyped-def]
     """`geometry._sum`; `side` -1 turns the normals round."""
     (normals,) = out
     for v in range(lane, len(normals), lanes):

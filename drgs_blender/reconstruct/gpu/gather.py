@@ -50,10 +50,9 @@ def trace_mesh(
 _HIT = ("float32", "int32", "int32", "int32", "float32", "float32", "float32", "float32", "float32")
 
 
-def gather_points(
-    lane: Any, lanes: Any, room: Any, points: Any, normals: Any, a2s: Any, counts: Any, sequence: Any, scene: Any,
-    faces: Any, cache: Any, radiance: Any, shape: Any, envmap: Any, seen: Any, out: Any,
-) -> None:  # fmt: skip
+def gather_points(  # type: ignore[no-untyped-def]
+    lane, lanes, room, points, normals, a2s, counts, sequence, scene, faces, cache, radiance, shape, envmap, seen, out
+):
     """`decouple.gather._gather`."""
     for i in range(lane, len(a2s), lanes):
         gather_point(i, points, normals, a2s, counts, sequence, scene, faces, cache, radiance, shape, envmap, seen, out)

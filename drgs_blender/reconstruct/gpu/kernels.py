@@ -43,17 +43,14 @@ G_ALPHA, G_DEPTH, G_MEDIAN, G_DISTORTION, G_FEATURES = 0, 1, 2, 3, 4
 CHANNELS = 16
 
 
-def project_rows(
-    lane: Any, lanes: Any, room: Any, centre: Any, tangent_u: Any, tangent_v: Any, opacity: Any, p: Any, width: Any,
-    height: Any, out: Any,
-) -> None:  # fmt: skip
+def project_rows(lane, lanes, room, centre, tangent_u, tangent_v, opacity, p, width, height, out):  # type: ignore[no-untyped-def]
     """`projection.project`."""
     record, depth, box = out
     for i in range(lane, len(centre), lanes):
         project_surfel(i, centre, tangent_u, tangent_v, opacity, p, width, height, record, depth, box)
 
 
-def list_pairs(lane: Any, lanes: Any, room: Any, box: Any, first: Any, tiles_x: Any, out: Any) -> None:
+def list_pairs(lane, lanes, room, box, first, tiles_x, out):  # type: ignore[no-untyped-def]
     """Tile and surfel of every pair of both, surfel by surfel, row by row of tiles."""
     tile, surfel = out
     for i in range(lane, len(box), lanes):
@@ -85,10 +82,7 @@ def meet(record: Any, i: Any, x: Any, y: Any, near: Any, far: Any) -> Any:
     return ex, ey, q, z, exact, su, sv
 
 
-def blend_pixels(
-    lane: Any, lanes: Any, room: Any, record: Any, values: Any, box: Any, start: Any, listed: Any, near: Any, far: Any,
-    tiles_x: Any, out: Any,
-) -> None:  # fmt: skip
+def blend_pixels(lane, lanes, room, record, values, box, start, listed, near, far, tiles_x, out):  # type: ignore[no-untyped-def]
     """The maps of all pixels, as `raster._blend` sums them; neighbouring lanes are of one tile."""
     (maps,) = out
     (sums,) = room
@@ -124,10 +118,7 @@ def blend_pixels(
             maps[y, x, FEATURES + c] = sums[c]
 
 
-def pull_pixels(
-    lane: Any, lanes: Any, room: Any, record: Any, values: Any, box: Any, start: Any, listed: Any, first: Any,
-    near: Any, far: Any, tiles_x: Any, maps: Any, incoming: Any, out: Any,
-) -> None:  # fmt: skip
+def pull_pixels(lane, lanes, room, record, values, box, start, listed, first, near, far, tiles_x, maps, incoming, out):  # type: ignore[no-untyped-def]
     """Transmittance before each surfel, and gradient of its strength, by pixels of the surfels' rectangles.
 
     Parameters
@@ -171,10 +162,9 @@ def pull_pixels(
                     t = t - w
 
 
-def sum_pixels(
-    lane: Any, lanes: Any, room: Any, record: Any, box: Any, listed: Any, tiles: Any, pairs: Any, first: Any,
-    near: Any, far: Any, tiles_x: Any, maps: Any, incoming: Any, pulls: Any, out: Any,
-) -> None:  # fmt: skip
+def sum_pixels(  # type: ignore[no-untyped-def]
+    lane, lanes, room, record, box, listed, tiles, pairs, first, near, far, tiles_x, maps, incoming, pulls, out
+):
     """Gradients of each surfel's record and features from its pixels in one tile.
 
     Parameters
@@ -234,7 +224,7 @@ def sum_pixels(
         slots[pair, OPACITY], slots[pair, TRAVEL] = to_opacity, travel
 
 
-def sum_tiles(lane: Any, lanes: Any, room: Any, slots: Any, first: Any, out: Any) -> None:
+def sum_tiles(lane, lanes, room, slots, first, out):  # type: ignore[no-untyped-def]
     """Add up the slots of each surfel, `first` (m + 1,) to the next one's, in the order of tiles; a lane a number."""
     (total,) = out
     columns = total.shape[1]
@@ -246,10 +236,7 @@ def sum_tiles(lane: Any, lanes: Any, room: Any, slots: Any, first: Any, out: Any
         total[i, c] = found
 
 
-def project_rows_backward(
-    lane: Any, lanes: Any, room: Any, centre: Any, tangent_u: Any, tangent_v: Any, p: Any, index: Any, gradient: Any,
-    out: Any,
-) -> None:  # fmt: skip
+def project_rows_backward(lane, lanes, room, centre, tangent_u, tangent_v, p, index, gradient, out):  # type: ignore[no-untyped-def]
     """`projection.project_backward`."""
     g_centre, g_u, g_v = out
     for k in range(lane, len(index), lanes):

@@ -19,7 +19,7 @@ from ..losses.shape import COVERED, THIN
 from .launch import TensorLauncher
 
 
-def blur_rows(lane: Any, lanes: Any, room: Any, window: Any, pictures: Any, out: Any) -> None:
+def blur_rows(lane, lanes, room, window, pictures, out):  # type: ignore[no-untyped-def]
     """Weighted means of eleven rows, as `photometric._blur_row` has them; black beyond the edges."""
     (blurred,) = out
     m, h, w = pictures.shape
@@ -33,7 +33,7 @@ def blur_rows(lane: Any, lanes: Any, room: Any, window: Any, pictures: Any, out:
         blurred[k, y, x] = total
 
 
-def blur_columns(lane: Any, lanes: Any, room: Any, window: Any, channels: Any, pictures: Any, out: Any) -> None:
+def blur_columns(lane, lanes, room, window, channels, pictures, out):  # type: ignore[no-untyped-def]
     """The same of eleven columns; a pixel has `channels` of them."""
     (blurred,) = out
     m, h, w = pictures.shape

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -23,7 +22,7 @@ from .launch import TensorLauncher
 from .raster import rasterise
 
 
-def descend_rows(lane: Any, lanes: Any, room: Any, gradient: Any, rate: Any, out: Any) -> None:
+def descend_rows(lane, lanes, room, gradient, rate, out):  # type: ignore[no-untyped-def]
     """`adam.descend`."""
     value, first, second = out
     for i in range(lane, len(value), lanes):

@@ -98,7 +98,7 @@ class _Difference(torch.autograd.Function):
 
 
 @njit
-def _blur_row(pictures: Any, m: Any, y: Any, channels: Any, padded: Any, out: Any) -> None:
+def _blur_row(pictures, m, y, channels, padded, out):  # type: ignore[no-untyped-def]
     """One row: the column of eleven rows into a padded buffer, then along it."""
     height, width = pictures.shape[1], pictures.shape[2]
     margin = 5 * channels
@@ -118,7 +118,7 @@ def _blur_row(pictures: Any, m: Any, y: Any, channels: Any, padded: Any, out: An
 
 
 @njit(parallel=True)
-def _blur(pictures: Any, channels: Any, out: Any) -> None:
+def _blur(pictures, channels, out):  # type: ignore[no-untyped-def]
     rows = pictures.shape[1]
     for task in prange(pictures.shape[0] * rows):
         padded = np.empty(pictures.shape[2] + 10 * channels, np.float32)
@@ -126,7 +126,7 @@ def _blur(pictures: Any, channels: Any, out: Any) -> None:
 
 
 @njit(parallel=True)
-def _ssim(mean: Any, square: Any, product: Any, other: Any, other_square: Any, slopes: Any, rows: Any) -> None:
+def _ssim(mean, square, product, other, other_square, slopes, rows):  # type: ignore[no-untyped-def]
     """SSIM summed by rows, and its derivatives by the three blurred pictures."""
     two = np.float32(2.0)
     for y in prange(mean.shape[0]):

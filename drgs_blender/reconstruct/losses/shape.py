@@ -75,7 +75,7 @@ class _Shape(torch.autograd.Function):
 
 
 @njit(inline="always")
-def _difference(alpha: Any, depth: Any, rays: Any, y1: Any, x1: Any, y0: Any, x0: Any) -> Any:
+def _difference(alpha, depth, rays, y1, x1, y0, x0):  # type: ignore[no-untyped-def]
     """From the point seen in pixel 0 to that in pixel 1."""
     far = depth[y1, x1] / max(alpha[y1, x1], THIN)
     near = depth[y0, x0] / max(alpha[y0, x0], THIN)
@@ -87,9 +87,7 @@ def _difference(alpha: Any, depth: Any, rays: Any, y1: Any, x1: Any, y0: Any, x0
 
 
 @njit(parallel=True)
-def _disagreement(
-    alpha: Any, depth: Any, normal: Any, rays: Any, counts: Any, most: Any, slopes: Any, to_normal: Any, rows: Any
-) -> None:
+def _disagreement(alpha, depth, normal, rays, counts, most, slopes, to_normal, rows):  # type: ignore[no-untyped-def]
     """Sums of the rows, gradients of the normals, and of the two differences of each pixel (2, h, w, 3)."""
     height, width = alpha.shape
     for y in prange(1, height - 1):
@@ -120,7 +118,7 @@ def _disagreement(
 
 
 @njit(parallel=True)
-def _to_depth(alpha: Any, depth: Any, rays: Any, slopes: Any, to_alpha: Any, to_depth: Any) -> None:
+def _to_depth(alpha, depth, rays, slopes, to_alpha, to_depth):  # type: ignore[no-untyped-def]
     """Add the gradients of depth and coverage, each pixel from its four neighbours."""
     height, width = alpha.shape
     for y in prange(height):

@@ -9,7 +9,6 @@ from __future__ import annotations
 import logging
 import math
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from scipy.ndimage import binary_dilation, binary_erosion, gaussian_filter, label, maximum_filter, uniform_filter
@@ -342,7 +341,7 @@ def colours_of(points: Array, normals: Array, views: list[View]) -> Array:
 
 
 @njit(parallel=True)
-def _count(low: Any, spacing: Any, p: Any, mask: Any, seen: Any, background: Any) -> None:
+def _count(low, spacing, p, mask, seen, background):  # type: ignore[no-untyped-def]
     """Count views that have grid points in their picture, and those that show background there."""
     height, width = mask.shape
     for i in prange(seen.shape[0]):

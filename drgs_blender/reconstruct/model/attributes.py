@@ -86,12 +86,12 @@ class _Attributes(torch.autograd.Function):
 
 
 @njit
-def _logistic(x: Any) -> Any:
+def _logistic(x):  # type: ignore[no-untyped-def]
     return np.float32(1.0) / (np.float32(1.0) + np.exp(-x))
 
 
 @njit(parallel=True)
-def _frames(scale: Any, rotation: Any, u: Any, v: Any, normal: Any) -> None:
+def _frames(scale, rotation, u, v, normal):  # type: ignore[no-untyped-def]
     one, two = np.float32(1.0), np.float32(2.0)
     for i in prange(len(scale)):
         w, x, y, z = rotation[i, 0], rotation[i, 1], rotation[i, 2], rotation[i, 3]
@@ -113,9 +113,7 @@ def _frames(scale: Any, rotation: Any, u: Any, v: Any, normal: Any) -> None:
 
 
 @njit(parallel=True)
-def _blended(
-    normal: Any, away: Any, values: Any, opacity: Any, sh: Any, tint: Any, blur: Any, alpha: Any, features: Any
-) -> None:
+def _blended(normal, away, values, opacity, sh, tint, blur, alpha, features):  # type: ignore[no-untyped-def]
     """Opacity and features."""
     for i in prange(len(alpha)):
         alpha[i] = _logistic(opacity[i])
@@ -135,11 +133,10 @@ def _blended(
 
 
 @njit(parallel=True)
-def _backward(
-    rotation: Any, values: Any, u: Any, v: Any, normal: Any, alpha: Any, features: Any, g_u: Any, g_v: Any,
-    g_alpha: Any, g_features: Any, to_scale: Any, to_rotation: Any, to_opacity: Any, to_sh: Any, to_tint: Any,
-    to_blur: Any,
-) -> None:  # fmt: skip
+def _backward(  # type: ignore[no-untyped-def]
+    rotation, values, u, v, normal, alpha, features, g_u, g_v, g_alpha, g_features, to_scale, to_rotation, to_opacity,
+    to_sh, to_tint, to_blur,
+):  # fmt: skip
     """Gradients of the raw parameters, into arrays of zeros."""
     one, two = np.float32(1.0), np.float32(2.0)
     for i in prange(len(alpha)):

@@ -11,8 +11,6 @@ nine numbers a surfel, the record. `render.surfels.splats` states the same, unsc
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from ...compute.jit import njit, prange
@@ -32,12 +30,12 @@ LOW_PASS = 8.0
 
 
 @njit
-def _cross(ax: Any, ay: Any, az: Any, bx: Any, by: Any, bz: Any) -> Any:
+def _cross(ax, ay, az, bx, by, bz):  # type: ignore[no-untyped-def]
     return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
 
 
 @njit
-def _in_camera(p: Any, centre: Any, tangent_u: Any, tangent_v: Any, i: Any) -> Any:
+def _in_camera(p, centre, tangent_u, tangent_v, i):  # type: ignore[no-untyped-def]
     """Centre and tangents of surfel i in camera coordinates, float64."""
     c = to_camera(
         p,
@@ -51,10 +49,7 @@ def _in_camera(p: Any, centre: Any, tangent_u: Any, tangent_v: Any, i: Any) -> A
 
 
 @njit
-def project_surfel(
-    i: Any, centre: Any, tangent_u: Any, tangent_v: Any, opacity: Any, p: Any, width: Any, height: Any, record: Any,
-    depth: Any, box: Any,
-) -> None:  # fmt: skip
+def project_surfel(i, centre, tangent_u, tangent_v, opacity, p, width, height, record, depth, box):  # type: ignore[no-untyped-def]
     """Fill row i of records, centre depths and boxes, see `project`."""
     for k in range(4):
         box[i, k] = 0
@@ -96,10 +91,7 @@ def project_surfel(
 
 
 @njit(parallel=True)
-def project(
-    centre: Any, tangent_u: Any, tangent_v: Any, opacity: Any, p: Any, width: Any, height: Any, record: Any, depth: Any,
-    box: Any,
-) -> None:  # fmt: skip
+def project(centre, tangent_u, tangent_v, opacity, p, width, height, record, depth, box):  # type: ignore[no-untyped-def]
     """Fill records, centre depths and boxes; what is not seen, or reaches behind the clip start, has an empty box.
 
     Parameters
@@ -112,10 +104,7 @@ def project(
 
 
 @njit
-def project_surfel_backward(
-    k: Any, centre: Any, tangent_u: Any, tangent_v: Any, p: Any, index: Any, gradient: Any, g_centre: Any, g_u: Any,
-    g_v: Any,
-) -> None:  # fmt: skip
+def project_surfel_backward(k, centre, tangent_u, tangent_v, p, index, gradient, g_centre, g_u, g_v):  # type: ignore[no-untyped-def]
     """Gradients of the surfel of row k, see `project_backward`."""
     fx, fy = p[FX], p[FY]
     i = np.int64(index[k])
@@ -151,9 +140,7 @@ def project_surfel_backward(
 
 
 @njit(parallel=True)
-def project_backward(
-    centre: Any, tangent_u: Any, tangent_v: Any, p: Any, index: Any, gradient: Any, g_centre: Any, g_u: Any, g_v: Any
-) -> None:
+def project_backward(centre, tangent_u, tangent_v, p, index, gradient, g_centre, g_u, g_v):  # type: ignore[no-untyped-def]
     """Gradients of centre and tangents from those of the records.
 
     Parameters

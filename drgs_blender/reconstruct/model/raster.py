@@ -187,10 +187,7 @@ class _Rasterise(torch.autograd.Function):
 
 
 @njit(inline="always")
-def strength(
-    ex: Any, ey: Any, ux: Any, uy: Any, vx: Any, vy: Any, i0: Any, ix: Any, iy: Any, zc: Any, dim: Any,
-    near: Any, far: Any,
-) -> Any:  # fmt: skip
+def strength(ex, ey, ux, uy, vx, vy, i0, ix, iy, zc, dim, near, far):  # type: ignore[no-untyped-def]
     """Squared radius and depth where a pixel at (ex, ey) from the centre meets a splat, and whether the exact
     intersection decides (else the screen-space filter); u, v over z are the last two."""
     big = np.float32(1e30)
@@ -203,9 +200,7 @@ def strength(
 
 
 @njit
-def _blend(
-    record: Any, i: Any, values: Any, x: Any, y: Any, near: Any, far: Any, state: Any, base: Any, channels: Any
-) -> Any:
+def _blend(record, i, values, x, y, near, far, state, base, channels):  # type: ignore[no-untyped-def]
     """Blend splat i into the block at (x, y); how many of its pixels are still open. No branch: vector code."""
     zero, one, half, stop = np.float32(0.0), np.float32(1.0), np.float32(0.5), np.float32(MIN_TRANSMITTANCE)
     rx, ry, opacity, cut = record[i, RX], record[i, RY], record[i, OPACITY], record[i, CUT]
@@ -240,7 +235,7 @@ def _blend(
 
 
 @njit(inline="always")
-def _blocks(box: Any, i: Any, left: Any, top: Any) -> Any:
+def _blocks(box, i, left, top):  # type: ignore[no-untyped-def]
     """Blocks (x0, y0, x1, y1), half-open, of the tile at (left, top) that splat i touches."""
     x0, y0 = max(box[i, 0] - left, 0) // SIDE, max(box[i, 1] - top, 0) // SIDE
     x1, y1 = (min(box[i, 2] - left, TILE) - 1) // SIDE + 1, (min(box[i, 3] - top, TILE) - 1) // SIDE + 1
@@ -248,10 +243,7 @@ def _blocks(box: Any, i: Any, left: Any, top: Any) -> Any:
 
 
 @njit
-def _forward_tile(
-    record: Any, values: Any, box: Any, listed: Any, begin: Any, end: Any, left: Any, top: Any, near: Any, far: Any,
-    state: Any, rows: Any, is_open: Any, maps: Any,
-) -> None:  # fmt: skip
+def _forward_tile(record, values, box, listed, begin, end, left, top, near, far, state, rows, is_open, maps):  # type: ignore[no-untyped-def]
     """All splats of a tile, front to back."""
     height, width, channels = maps.shape[0], maps.shape[1], values.shape[1]
     state[:] = np.float32(0.0)
@@ -288,9 +280,7 @@ def _forward_tile(
 
 
 @njit(parallel=True)
-def _forward(
-    record: Any, values: Any, box: Any, start: Any, listed: Any, p: Any, tiles_x: Any, workers: Any, maps: Any
-) -> None:
+def _forward(record, values, box, start, listed, p, tiles_x, workers, maps):  # type: ignore[no-untyped-def]
     """Fill the maps (h, w, state rows and features). A worker takes every `workers`-th tile: neighbours cost alike."""
     near, far = np.float32(p[CLIP_START]), np.float32(p[CLIP_END])
     rows = _FEATURES + values.shape[1]
@@ -305,10 +295,7 @@ def _forward(
 
 
 @njit(inline="always")
-def slopes(
-    g_alpha: Any, g_depth: Any, alpha: Any, ex: Any, ey: Any, z: Any, exact: Any, su: Any, sv: Any, ux: Any, uy: Any,
-    vx: Any, vy: Any, ix: Any, iy: Any,
-) -> Any:  # fmt: skip
+def slopes(g_alpha, g_depth, alpha, ex, ey, z, exact, su, sv, ux, uy, vx, vy, ix, iy):  # type: ignore[no-untyped-def]
     """Gradients of a pixel's place (ex, ey), of u and v over z, of 1 / z, and the last where the place changes it."""
     zero = np.float32(0.0)
     g_q = np.float32(-0.5) * alpha * g_alpha
@@ -329,10 +316,7 @@ def slopes(
 
 
 @njit
-def _blend_backward(
-    record: Any, i: Any, values: Any, x: Any, y: Any, near: Any, far: Any, state: Any, base: Any, channels: Any,
-    sums: Any,
-) -> Any:  # fmt: skip
+def _blend_backward(record, i, values, x, y, near, far, state, base, channels, sums):  # type: ignore[no-untyped-def]
     """Gradients of splat i from the block at (x, y), added to `sums` lane by lane; how many pixels are still open."""
     zero, one, half, stop = np.float32(0.0), np.float32(1.0), np.float32(0.5), np.float32(MIN_TRANSMITTANCE)
     most = np.float32(MAX_ALPHA)
@@ -399,7 +383,7 @@ def _blend_backward(
 
 
 @njit
-def _load(maps: Any, incoming: Any, y: Any, x: Any, state: Any, base: Any, channels: Any) -> None:
+def _load(maps, incoming, y, x, state, base, channels):  # type: ignore[no-untyped-def]
     """The pixel's totals and gradients into a lane of a block's state, rows LANES apart from `base` on."""
     alpha = np.float32(1.0) - maps[y, x, _T]
     g_alpha, g_depth, g_median, g_dist = incoming[y, x, 0], incoming[y, x, 1], incoming[y, x, 2], incoming[y, x, 3]
@@ -417,10 +401,9 @@ def _load(maps: Any, incoming: Any, y: Any, x: Any, state: Any, base: Any, chann
 
 
 @njit
-def _backward_tile(
-    record: Any, values: Any, box: Any, listed: Any, begin: Any, end: Any, left: Any, top: Any, near: Any, far: Any,
-    state: Any, rows: Any, is_open: Any, sums: Any, maps: Any, incoming: Any, slots: Any,
-) -> None:  # fmt: skip
+def _backward_tile(  # type: ignore[no-untyped-def]
+    record, values, box, listed, begin, end, left, top, near, far, state, rows, is_open, sums, maps, incoming, slots
+):
     """Gradients of all splats of a tile, front to back."""
     height, width, channels = maps.shape[0], maps.shape[1], values.shape[1]
     columns = BEFORE + channels
@@ -458,7 +441,7 @@ def _backward_tile(
 
 
 @njit
-def _fold(sums: Any, columns: Any, slots: Any, entry: Any) -> None:
+def _fold(sums, columns, slots, entry):  # type: ignore[no-untyped-def]
     """Add up the lanes of each column into the slot."""
     for c in range(columns):
         at = np.uintp(c * LANES)
@@ -470,10 +453,7 @@ def _fold(sums: Any, columns: Any, slots: Any, entry: Any) -> None:
 
 
 @njit(parallel=True)
-def _backward(
-    record: Any, values: Any, box: Any, start: Any, listed: Any, p: Any, tiles_x: Any, workers: Any, maps: Any,
-    incoming: Any, slots: Any,
-) -> None:  # fmt: skip
+def _backward(record, values, box, start, listed, p, tiles_x, workers, maps, incoming, slots):  # type: ignore[no-untyped-def]
     """Gradients (entries of all tiles, BEFORE + channels) of each splat by tile, into `slots`."""
     near, far = np.float32(p[CLIP_START]), np.float32(p[CLIP_END])
     rows = _GF + values.shape[1]
@@ -489,7 +469,7 @@ def _backward(
 
 
 @njit
-def _sum_slots(listed: Any, slots: Any, total: Any) -> None:
+def _sum_slots(listed, slots, total):  # type: ignore[no-untyped-def]
     """Add up the slots of each splat, in the order of tiles."""
     for entry in range(len(listed)):
         i = listed[entry]

@@ -76,7 +76,7 @@ class _Mirrored(torch.autograd.Function):
 
 
 @njit
-def _face(d: Any) -> Any:
+def _face(d):  # type: ignore[no-untyped-def]
     """Axis of the face that a direction leaves through, the face's number, and place (a, b) on it in -1..1."""
     x, y, z = abs(d[0]), abs(d[1]), abs(d[2])
     axis = 0 if x >= y and x >= z else 1 if y >= z else 2
@@ -85,7 +85,7 @@ def _face(d: Any) -> Any:
 
 
 @njit
-def _texel(a: Any, size: Any) -> Any:
+def _texel(a, size):  # type: ignore[no-untyped-def]
     """First of the two texels that a place in -1..1 lies between, the part of the second, and its slope by place."""
     x = (a + np.float32(1.0)) * np.float32(0.5 * size) - np.float32(0.5)
     inside = (x > 0.0) & (x < size - 1)
@@ -95,7 +95,7 @@ def _texel(a: Any, size: Any) -> Any:
 
 
 @njit
-def _start(level: Any) -> Any:
+def _start(level):  # type: ignore[no-untyped-def]
     """First texel of a level, and texels along its edges."""
     at, size = 0, SHARPEST
     for _ in range(level):
@@ -105,7 +105,7 @@ def _start(level: Any) -> Any:
 
 
 @njit
-def _turned(pixel: Any, ray: Any) -> Any:
+def _turned(pixel, ray):  # type: ignore[no-untyped-def]
     """Unit ray, unit normal, one over the normal's length, and the reflected direction."""
     one = np.float32(1.0)
     x, y, z = ray[0], ray[1], ray[2]
@@ -119,7 +119,7 @@ def _turned(pixel: Any, ray: Any) -> Any:
 
 
 @njit
-def _levels(pixel: Any, alpha: Any) -> Any:
+def _levels(pixel, alpha):  # type: ignore[no-untyped-def]
     """Blur of a pixel, the sharper of the two levels that it lies between, and the share of the other."""
     blur = pixel[BLUR] / max(alpha, BARE)
     level = blur * np.float32(LEVELS - 1)
@@ -128,7 +128,7 @@ def _levels(pixel: Any, alpha: Any) -> Any:
 
 
 @njit(parallel=True)
-def _look_up(features: Any, alpha: Any, rays: Any, texels: Any, seen: Any) -> None:
+def _look_up(features, alpha, rays, texels, seen):  # type: ignore[no-untyped-def]
     """Light that comes from where each pixel reflects."""
     for y in prange(alpha.shape[0]):
         for x in range(alpha.shape[1]):
@@ -150,10 +150,7 @@ def _look_up(features: Any, alpha: Any, rays: Any, texels: Any, seen: Any) -> No
 
 
 @njit(parallel=True)
-def _look_up_backward(
-    features: Any, alpha: Any, rays: Any, texels: Any, seen: Any, incoming: Any, to_features: Any, to_alpha: Any,
-    to_texels: Any,
-) -> None:  # fmt: skip
+def _look_up_backward(features, alpha, rays, texels, seen, incoming, to_features, to_alpha, to_texels):  # type: ignore[no-untyped-def]
     """A part's pixels in their order: many share a texel."""
     height = alpha.shape[0]
     for part in prange(_PARTS):
@@ -167,10 +164,7 @@ def _look_up_backward(
 
 
 @njit
-def _pixel_backward(
-    pixel: Any, alpha: Any, ray: Any, texels: Any, seen: Any, incoming: Any, to_pixel: Any, to_alpha: Any, x: Any,
-    to_texels: Any,
-) -> None:  # fmt: skip
+def _pixel_backward(pixel, alpha, ray, texels, seen, incoming, to_pixel, to_alpha, x, to_texels):  # type: ignore[no-untyped-def]
     one, two = np.float32(1.0), np.float32(2.0)
     view, normal, inverse, direction = _turned(pixel, ray)
     axis, face, a, b = _face(direction)

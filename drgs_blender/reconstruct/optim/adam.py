@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import torch
@@ -77,7 +76,7 @@ class Adam:
 
 
 @njit
-def some_rows(value: Any, gradient: Any, first: Any, second: Any, rate: Any, begin: Any, end: Any) -> None:
+def some_rows(value, gradient, first, second, rate, begin, end):  # type: ignore[no-untyped-def]
     """The rows from `begin` to `end`. No branch: vector code."""
     b1, b2, epsilon = np.float32(_BETA1), np.float32(_BETA2), np.float32(_EPSILON)
     one = np.float32(1.0)
@@ -94,11 +93,11 @@ def some_rows(value: Any, gradient: Any, first: Any, second: Any, rate: Any, beg
 
 
 @njit
-def _step(value: Any, gradient: Any, first: Any, second: Any, rate: Any) -> None:
+def _step(value, gradient, first, second, rate):  # type: ignore[no-untyped-def]
     some_rows(value, gradient, first, second, rate, 0, len(value))
 
 
 @njit(parallel=True)
-def _step_by_all(value: Any, gradient: Any, first: Any, second: Any, rate: Any) -> None:
+def _step_by_all(value, gradient, first, second, rate):  # type: ignore[no-untyped-def]
     for block in prange((len(value) + _BLOCK - 1) // _BLOCK):
         some_rows(value, gradient, first, second, rate, block * _BLOCK, min((block + 1) * _BLOCK, len(value)))

@@ -7,7 +7,6 @@ Pictures are planar here, (rows, planes, columns), with `PAD` empty columns on e
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -77,7 +76,7 @@ def modulate(signal: Signal, guides: Guides) -> Array:
 
 
 @njit(inline="always")
-def _colour(lobe: Any, albedo: Any, metallic: Any, y: Any, x: Any) -> Any:
+def _colour(lobe, albedo, metallic, y, x):  # type: ignore[no-untyped-def]
     """Surface colour of a lobe's light, at least COLOUR_FLOOR: diffuse a (1 - m), glossy Fresnel's F0."""
     m = metallic[y, x]
     k = ONE - m
@@ -91,12 +90,12 @@ def _colour(lobe: Any, albedo: Any, metallic: Any, y: Any, x: Any) -> Any:
 
 
 @njit(inline="always")
-def _channel(k: Any, red: Any, green: Any, blue: Any) -> Any:
+def _channel(k, red, green, blue):  # type: ignore[no-untyped-def]
     return red if k == 0 else green if k == 1 else blue
 
 
 @njit(inline="always")
-def demodulate_pixel(y: Any, x: Any, components: Any, variance: Any, surface: Any, guide: Any, light: Any) -> None:
+def demodulate_pixel(y, x, components, variance, surface, guide, light):  # type: ignore[no-untyped-def]
     """Fill the planes of a covered pixel, which are 0, and NaN in `SOURCE` and `SURFACE`; `surface` as of `Guides`."""
     coverage, position, normal, albedo, roughness, metallic, index, footprint = surface
     parts = (light.shape[1] - LIGHT) // 6
@@ -135,7 +134,7 @@ def demodulate_pixel(y: Any, x: Any, components: Any, variance: Any, surface: An
 
 
 @njit(inline="always")
-def _lobe_luminance(light: Any, y: Any, c: Any, lobe: Any, parts: Any) -> Any:
+def _lobe_luminance(light, y, c, lobe, parts):  # type: ignore[no-untyped-def]
     total = ZERO
     for part in range(parts):
         k = LIGHT + 3 * (parts * lobe + part)
@@ -144,7 +143,7 @@ def _lobe_luminance(light: Any, y: Any, c: Any, lobe: Any, parts: Any) -> Any:
 
 
 @njit(parallel=True)
-def _demodulate(components: Any, variance: Any, surface: Any, guide: Any, light: Any, spans: Any) -> None:
+def _demodulate(components, variance, surface, guide, light, spans):  # type: ignore[no-untyped-def]
     coverage = surface[0]
     h, w = coverage.shape
     for y in prange(h):
@@ -157,7 +156,7 @@ def _demodulate(components: Any, variance: Any, surface: Any, guide: Any, light:
 
 
 @njit(inline="always")
-def find_span(y: Any, coverage: Any, spans: Any) -> None:
+def find_span(y, coverage, spans):  # type: ignore[no-untyped-def]
     """Which columns of a row are covered."""
     first, last = coverage.shape[1], 0
     for x in range(coverage.shape[1]):
@@ -167,7 +166,7 @@ def find_span(y: Any, coverage: Any, spans: Any) -> None:
 
 
 @njit(inline="always")
-def modulate_pixel(y: Any, x: Any, light: Any, surface: Any, out: Any) -> None:
+def modulate_pixel(y, x, light, surface, out):  # type: ignore[no-untyped-def]
     """Multiply a covered pixel's light by surface colour and coverage again."""
     coverage, _, _, albedo, _, metallic, _, _ = surface
     parts = (light.shape[1] - LIGHT) // 6
@@ -180,7 +179,7 @@ def modulate_pixel(y: Any, x: Any, light: Any, surface: Any, out: Any) -> None:
 
 
 @njit(parallel=True)
-def _modulate(light: Any, spans: Any, surface: Any, out: Any) -> None:
+def _modulate(light, spans, surface, out):  # type: ignore[no-untyped-def]
     coverage = surface[0]
     for y in prange(len(spans)):
         for x in range(spans[y, 0], spans[y, 1]):

@@ -20,7 +20,6 @@ that texture is not blurred. Changes and their reasons:
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
@@ -110,7 +109,7 @@ def sigma_of(level: int) -> np.float32:
 
 
 @njit
-def _clamp_fireflies(y0: Any, y1: Any, guide: Any, spans: Any, light: Any, out: Any) -> None:
+def _clamp_fireflies(y0, y1, guide, spans, light, out):  # type: ignore[no-untyped-def]
     """Scale down outliers among 5 x 5 neighbours of the same object; pixels that hold no number stay as they are."""
     h, planes = light.shape[:2]
     zero, one = np.float32(0.0), np.float32(1.0)
@@ -167,7 +166,7 @@ def _clamp_fireflies(y0: Any, y1: Any, guide: Any, spans: Any, light: Any, out: 
 
 
 @njit(inline="always")
-def stop(x: Any) -> Any:
+def stop(x):  # type: ignore[no-untyped-def]
     """(1 - x / 8)^8 for x in [0, 8], beyond it 0."""
     u = max(np.float32(1.0) - np.float32(0.125) * x, np.float32(0.0))
     u *= u
@@ -176,7 +175,7 @@ def stop(x: Any) -> Any:
 
 
 @njit
-def _weigh(y0: Any, y1: Any, sigma: Any, guide: Any, spans: Any, light: Any) -> None:
+def _weigh(y0, y1, sigma, guide, spans, light):  # type: ignore[no-untyped-def]
     """Inverse deviations of luminance that edges are compared with, from the variance of 3 x 3 pixels (Gaussian)."""
     h = len(light)
     zero, one, tiny = np.float32(0.0), np.float32(1.0), np.float32(1e-8)
@@ -210,7 +209,7 @@ def _weigh(y0: Any, y1: Any, sigma: Any, guide: Any, spans: Any, light: Any) -> 
 
 
 @njit
-def _a_trous(y0: Any, y1: Any, step: Any, guide: Any, spans: Any, light: Any, out: Any) -> None:
+def _a_trous(y0, y1, step, guide, spans, light, out):  # type: ignore[no-untyped-def]
     """One level: 5 x 5 B-spline taps `step` pixels apart."""
     h, planes = light.shape[:2]
     taps = (np.float32(0.0625), np.float32(0.25), np.float32(0.375), np.float32(0.25), np.float32(0.0625))
@@ -298,6 +297,6 @@ def _a_trous(y0: Any, y1: Any, step: Any, guide: Any, spans: Any, light: Any, ou
 
 
 @njit(inline="always")
-def share_of(k: Any) -> Any:
+def share_of(k):  # type: ignore[no-untyped-def]
     """Share of colour channel `k` in luminance."""
     return np.float32(REC709[0]) if k == 0 else np.float32(REC709[1]) if k == 1 else np.float32(REC709[2])

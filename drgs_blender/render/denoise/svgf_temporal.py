@@ -17,7 +17,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -166,19 +165,14 @@ def find_change(signal: Signal, past: Array, source: Array) -> Array:
 
 
 @njit
-def _look_up(
-    y0: Any, y1: Any, guide: Any, spans: Any, vector: Any, expected: Any, other: Any, other_light: Any, out: Any,
-    source: Any,
-) -> None:  # fmt: skip
+def _look_up(y0, y1, guide, spans, vector, expected, other, other_light, out, source):  # type: ignore[no-untyped-def]
     for y in range(y0, y1):
         for x in range(spans[y, 0], spans[y, 1]):
             look_up_pixel(y, x, guide, vector, expected, other, other_light, out, source)
 
 
 @njit
-def look_up_pixel(
-    y: Any, x: Any, guide: Any, vector: Any, expected: Any, other: Any, other_light: Any, out: Any, source: Any
-) -> None:  # fmt: skip
+def look_up_pixel(y, x, guide, vector, expected, other, other_light, out, source):  # type: ignore[no-untyped-def]
     """Bilinear interpolation over those of four pixels that show the same surface."""
     h, planes = out.shape[0], out.shape[1]
     w = out.shape[2] - 2 * PAD
@@ -219,7 +213,7 @@ def look_up_pixel(
 
 
 @njit
-def _compare(y0: Any, y1: Any, guide: Any, spans: Any, light: Any, past: Any, source: Any, out: Any) -> None:
+def _compare(y0, y1, guide, spans, light, past, source, out):  # type: ignore[no-untyped-def]
     """Mean variance of the present and of the past, and square of what differs, around every pixel."""
     h = len(light)
     zero, one = np.float32(0.0), np.float32(1.0)
@@ -264,18 +258,14 @@ def _compare(y0: Any, y1: Any, guide: Any, spans: Any, light: Any, past: Any, so
 
 
 @njit
-def _mix(
-    y0: Any, y1: Any, least: Any, spans: Any, light: Any, past: Any, source: Any, change: Any, guide: Any, out: Any
-) -> None:  # fmt: skip
+def _mix(y0, y1, least, spans, light, past, source, change, guide, out):  # type: ignore[no-untyped-def]
     for y in range(y0, y1):
         for c in range(spans[y, 0] + PAD, spans[y, 1] + PAD):
             mix_pixel(y, c, least, light, past, source, change, guide, out)
 
 
 @njit
-def mix_pixel(
-    y: Any, c: Any, least: Any, light: Any, past: Any, source: Any, change: Any, guide: Any, out: Any
-) -> None:  # fmt: skip
+def mix_pixel(y, c, least, light, past, source, change, guide, out):  # type: ignore[no-untyped-def]
     """Kalman's update; a pixel that holds no number takes over the past."""
     width = (light.shape[1] - LIGHT) // 2
     known, usable = source[y, c] == source[y, c], guide[y, SOURCE, c] == guide[y, SOURCE, c]

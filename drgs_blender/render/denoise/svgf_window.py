@@ -7,7 +7,6 @@ comes of it depends on these frames alone, so that it does not matter in which r
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -103,9 +102,7 @@ def _neighbours(shots: Sequence[Shot | None]) -> Iterator[tuple[int, Shot, Array
 
 
 @njit
-def _add(
-    y0: Any, y1: Any, most: Any, spans: Any, light: Any, source: Any, change: Any, total: Any, weights: Any
-) -> None:  # fmt: skip
+def _add(y0, y1, most, spans, light, source, change, total, weights):  # type: ignore[no-untyped-def]
     """Add a picture to the window's sums, by the variance of the present against that plus the error."""
     width = (light.shape[1] - LIGHT) // 2
     zero, one = np.float32(0.0), np.float32(1.0)
@@ -124,7 +121,7 @@ def _add(
 
 
 @njit
-def _divide(y0: Any, y1: Any, spans: Any, weights: Any, guide: Any, total: Any) -> None:
+def _divide(y0, y1, spans, weights, guide, total):  # type: ignore[no-untyped-def]
     """From sums to means."""
     width = (total.shape[1] - LIGHT) // 2
     for y in range(y0, y1):
@@ -141,7 +138,7 @@ def _divide(y0: Any, y1: Any, spans: Any, weights: Any, guide: Any, total: Any) 
 
 
 @njit(inline="always")
-def _nearest(x: Any, y: Any, w: Any, h: Any) -> Any:
+def _nearest(x, y, w, h):  # type: ignore[no-untyped-def]
     """Column and row of the pixel nearest to a position that counts from the first pixel's centre; -1 outside."""
     half = np.float32(0.5)
     if not (x > -half and y > -half and x < np.float32(w) - half and y < np.float32(h) - half):
@@ -150,7 +147,7 @@ def _nearest(x: Any, y: Any, w: Any, h: Any) -> Any:
 
 
 @njit(inline="always")
-def _away(seen: Any, normal: Any, footprint: Any, y: Any, x: Any, px: Any, py: Any, pz: Any) -> Any:
+def _away(seen, normal, footprint, y, x, px, py, pz):  # type: ignore[no-untyped-def]
     """Distance of (px, py, pz) from the plane through ``seen[y, x]``, in pixel widths."""
     return (
         abs(
@@ -163,10 +160,7 @@ def _away(seen: Any, normal: Any, footprint: Any, y: Any, x: Any, px: Any, py: A
 
 
 @njit
-def _step_back(
-    y0: Any, y1: Any, motion: Any, previous: Any, position: Any, normal: Any, footprint: Any, index: Any, centre: Any,
-    vector: Any, expected: Any,
-) -> None:  # fmt: skip
+def _step_back(y0, y1, motion, previous, position, normal, footprint, index, centre, vector, expected):  # type: ignore[no-untyped-def]
     """Follow the motion of the picture that `vector` leads to, one frame further back."""
     h, w = index.shape
     for y in range(y0, y1):
@@ -187,10 +181,7 @@ def _step_back(
 
 
 @njit
-def _step_ahead(
-    y0: Any, y1: Any, motion: Any, previous: Any, position: Any, normal: Any, footprint: Any, index: Any, centre: Any,
-    vector: Any, expected: Any,
-) -> None:  # fmt: skip
+def _step_ahead(y0, y1, motion, previous, position, normal, footprint, index, centre, vector, expected):  # type: ignore[no-untyped-def]
     """Search the picture after that which `vector` leads to for the pixel whose motion leads back there."""
     h, w = index.shape
     for y in range(y0, y1):

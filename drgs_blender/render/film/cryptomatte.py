@@ -6,8 +6,6 @@ RGBA pass.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from ...compute.jit import njit, prange
@@ -54,7 +52,7 @@ class CryptoFilm:
 
 
 @njit(parallel=True)
-def _rank(start: Any, x0: Any, width: Any, pixel: Any, weight: Any, flags: Any, identity: Any, out: Any) -> None:
+def _rank(start, x0, width, pixel, weight, flags, identity, out):  # type: ignore[no-untyped-def]
     """Add up the weights of each identity in a pixel, and keep the largest."""
     for y in prange(len(start) - 1):
         known, share = np.empty(_SLOTS, np.float32), np.empty(_SLOTS, np.float32)

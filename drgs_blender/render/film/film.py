@@ -18,8 +18,6 @@ catchers alone), both summed over the pixel first, so that the quotient is not o
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from ...compute.jit import njit, prange
@@ -211,38 +209,38 @@ def add_light(light: Array, environment: Array, emission: Array, opaque: Array |
 
 
 @njit(parallel=True)
-def _develop(
-    start: Any,
-    x0: Any,
-    p: Any,
-    pixel: Any,
-    weight: Any,
-    normal: Any,
-    albedo: Any,
-    roughness: Any,
-    metallic: Any,
-    position: Any,
-    depth: Any,
-    owner: Any,
-    emission: Any,
-    flags: Any,
-    pass_index: Any,
-    light: Any,
-    light_variance: Any,
-    unshadowed: Any,
-    components: Any,
-    variance: Any,
-    coverage: Any,
-    out_depth: Any,
-    out_position: Any,
-    out_normal: Any,
-    out_albedo: Any,
-    out_roughness: Any,
-    out_metallic: Any,
-    out_index: Any,
-    out_emission: Any,
-    out_catcher: Any,
-) -> None:
+def _develop(  # type: ignore[no-untyped-def]
+    start,
+    x0,
+    p,
+    pixel,
+    weight,
+    normal,
+    albedo,
+    roughness,
+    metallic,
+    position,
+    depth,
+    owner,
+    emission,
+    flags,
+    pass_index,
+    light,
+    light_variance,
+    unshadowed,
+    components,
+    variance,
+    coverage,
+    out_depth,
+    out_position,
+    out_normal,
+    out_albedo,
+    out_roughness,
+    out_metallic,
+    out_index,
+    out_emission,
+    out_catcher,
+):
     """Sum the points of each pixel; they are neighbours in the arrays."""
     width = np.int64(p[WIDTH])
     per_depth = np.float32(0.0 if p[ORTHOGRAPHIC] != 0.0 else SAME_SURFACE / min(p[FX], p[FY]))
@@ -313,7 +311,7 @@ def _develop(
 
 
 @njit
-def _world(p: Any, pixel: Any, sample: Any, envmap: Any) -> Any:
+def _world(p, pixel, sample, envmap):  # type: ignore[no-untyped-def]
     """The world's radiance along the ray of a sub-pixel sample."""
     _, _, _, dx, dy, dz = sample_ray(p, pixel, sample)
     scale = 1.0 / np.sqrt(dx * dx + dy * dy + dz * dz)
@@ -322,7 +320,7 @@ def _world(p: Any, pixel: Any, sample: Any, envmap: Any) -> Any:
 
 
 @njit(parallel=True)
-def _background(p: Any, x0: Any, y0: Any, alpha: Any, envmap: Any, out: Any) -> None:
+def _background(p, x0, y0, alpha, envmap, out):  # type: ignore[no-untyped-def]
     """Add the world's radiance along every sub-pixel ray, weighted by what the surfaces leave uncovered."""
     width = np.int64(p[WIDTH])
     rows, columns, subpixels = alpha.shape
@@ -340,7 +338,7 @@ def _background(p: Any, x0: Any, y0: Any, alpha: Any, envmap: Any, out: Any) -> 
 
 
 @njit
-def _behind(p: Any, x0: Any, y0: Any, pixel: Any, sample: Any, weight: Any, envmap: Any, out: Any) -> None:
+def _behind(p, x0, y0, pixel, sample, weight, envmap, out):  # type: ignore[no-untyped-def]
     """Add the world's radiance behind some points, by weight."""
     width = np.int64(p[WIDTH])
     for i in range(len(pixel)):

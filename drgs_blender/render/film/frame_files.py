@@ -171,7 +171,7 @@ def _checksum(channels: dict[str, Array], metadata: dict[str, str]) -> str:
     crc = 0
     for name in sorted(channels):
         crc = zlib.crc32(f"{name} {channels[name].dtype} {channels[name].shape}".encode(), crc)
-        crc = zlib.crc32(np.ascontiguousarray(channels[name]).view(np.uint8).reshape(-1), crc)
+        crc = zlib.crc32(np.ascontiguousarray(channels[name]).view(np.uint8).reshape(-1).data, crc)
     for key in sorted(metadata):
         crc = zlib.crc32(f"{key}={metadata[key]}\n".encode(), crc)
     return f"{crc:08x}"

@@ -8,7 +8,7 @@ that a seen point moves exactly as its surfel.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -147,7 +147,7 @@ def vector_pass(before: Motion | None, after: Motion | None, shape: tuple[int, i
 
 
 @njit(inline="always")
-def project(p: Any, x: Any, y: Any, z: Any) -> Any:
+def project(p, x, y, z):  # type: ignore[no-untyped-def]
     """Pixel position and depth of a world-space point through the camera of parameters `p`; inverse of `camera_ray`."""
     x, y, z = x - p[POSITION], y - p[POSITION + 1], z - p[POSITION + 2]
     depth = -(p[2] * x + p[5] * y + p[8] * z)
@@ -158,7 +158,7 @@ def project(p: Any, x: Any, y: Any, z: Any) -> Any:
 
 
 @njit(inline="always")
-def _basis(v: Any, faces: Any, f: Any) -> Any:
+def _basis(v, faces, f):  # type: ignore[no-untyped-def]
     """First corner, two edges, unit normal (0 for a face without area) of face `f`, float64."""
     a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
     x, y, z = np.float64(v[a, 0]), np.float64(v[a, 1]), np.float64(v[a, 2])
@@ -171,10 +171,7 @@ def _basis(v: Any, faces: Any, f: Any) -> Any:
 
 
 @njit(parallel=True)
-def _previous(
-    faces: Any, vertices: Any, places: Any, before: Any, places_before: Any, face: Any, place: Any, barycentric: Any,
-    position: Any, out: Any,
-) -> None:  # fmt: skip
+def _previous(faces, vertices, places, before, places_before, face, place, barycentric, position, out):  # type: ignore[no-untyped-def]
     for i in prange(len(face)):
         f, stand = face[i], place[i]
         if f < 0:
@@ -208,10 +205,7 @@ def _previous(
 
 
 @njit(parallel=True)
-def _displace(
-    start: Any, x0: Any, p: Any, pixel: Any, weight: Any, flags: Any, face: Any, depth: Any, position: Any,
-    previous: Any, out: Any,
-) -> None:  # fmt: skip
+def _displace(start, x0, p, pixel, weight, flags, face, depth, position, previous, out):  # type: ignore[no-untyped-def]
     """Mean displacement of the samples on the surface nearest to the camera, the same that make up Position.
 
     Samples that are tied to no face follow the others.
@@ -245,7 +239,7 @@ def _displace(
 
 
 @njit(parallel=True)
-def _vectors(now: Any, before: Any, position: Any, previous: Any, coverage: Any, vector: Any) -> None:
+def _vectors(now, before, position, previous, coverage, vector):  # type: ignore[no-untyped-def]
     """Difference of the two projections, zero to the last bit where nothing moved."""
     h, w = coverage.shape
     for y in prange(h):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -89,23 +88,20 @@ def arrays_of(buffer: GBuffer) -> tuple[tuple[Array, ...], tuple[tuple[Array, ..
 
 
 @njit(parallel=True)
-def _trace(tracer: Any, view_of: Any, mask: Any, owners: Any, out: Any, lanes: Any) -> None:
+def _trace(tracer, view_of, mask, owners, out, lanes):  # type: ignore[no-untyped-def]
     for lane in prange(lanes):
         trace_samples(np.int64(lane), lanes, None, tracer, view_of, mask, owners, out)
 
 
 @njit(parallel=True)
-def _shade(geometry: Any, moving: Any, view_of: Any, layer: Any, hits: Any, keys: Any, frames: Any, materials: Any,
-           seen: Any, lanes: Any) -> None:  # fmt: skip
+def _shade(geometry, moving, view_of, layer, hits, keys, frames, materials, seen, lanes):  # type: ignore[no-untyped-def]
     for lane in prange(lanes):
         out = frames, materials, seen
         shade_hits(np.int64(lane), lanes, None, geometry, moving, view_of, layer, hits, keys, out)
 
 
 @njit
-def trace_samples(
-    lane: Any, lanes: Any, room: Any, tracer: Any, view_of: Any, mask: Any, owners: Any, out: Any
-) -> None:
+def trace_samples(lane, lanes, room, tracer, view_of, mask, owners, out):  # type: ignore[no-untyped-def]
     """Closest hits of every so-manyth (`lanes`) block of sub-pixel samples, from the `lane`-th on.
 
     Parameters
@@ -141,10 +137,7 @@ def trace_samples(
 
 
 @njit
-def shade_hits(
-    lane: Any, lanes: Any, room: Any, geometry: Any, moving: Any, view_of: Any, layer: Any, hits: Any, keys: Any,
-    out: Any,
-) -> None:  # fmt: skip
+def shade_hits(lane, lanes, room, geometry, moving, view_of, layer, hits, keys, out):  # type: ignore[no-untyped-def]
     """Fill every so-manyth (`lanes`) block of points from their hits, from the `lane`-th on.
 
     Parameters

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -88,9 +87,7 @@ def compact(alpha: Array, parameters: Array, x0: int, y0: int, second: Array | N
 
 
 @njit
-def _number(
-    alpha: Any, second: Any, p: Any, x0: Any, y0: Any, pixel: Any, sample: Any, weight: Any, flags: Any
-) -> None:
+def _number(alpha, second, p, x0, y0, pixel, sample, weight, flags):  # type: ignore[no-untyped-def]
     """List the covered samples in order."""
     width = np.int64(p[WIDTH])
     share = np.float32(1.0 / p[SUBPIXELS])
@@ -111,7 +108,7 @@ def _number(
 
 
 @njit(inline="always")
-def face_viewer(nx: Any, ny: Any, nz: Any, gx: Any, gy: Any, gz: Any, vx: Any, vy: Any, vz: Any) -> Any:
+def face_viewer(nx, ny, nz, gx, gy, gz, vx, vy, vz):  # type: ignore[no-untyped-def]
     """Shading normal on the side of the geometric normal g, which faces the viewer at v, and visible from there.
 
     A smooth normal that looks away from the viewer near a silhouette is bent until it is just visible.

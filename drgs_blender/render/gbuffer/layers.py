@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -97,17 +96,7 @@ def lone(hits: MeshHits, scene: TraceScene) -> Layers:
 
 
 @njit(parallel=True)
-def _combine(
-    alpha: Any,
-    depth: Any,
-    owner: Any,
-    mesh_depth: Any,
-    mesh_owner: Any,
-    object_flags: Any,
-    first: Any,
-    second: Any,
-    opaque: Any,
-) -> None:
+def _combine(alpha, depth, owner, mesh_depth, mesh_owner, object_flags, first, second, opaque):  # type: ignore[no-untyped-def]
     zero, one = np.float32(0.0), np.float32(1.0)
     rows, columns, subpixels = alpha.shape
     for y in prange(rows):

@@ -123,7 +123,7 @@ def primary_surfels(
 
 
 @njit
-def _edge_lengths(vertices: Any, faces: Any, face_object: Any, total: Any, count: Any) -> None:
+def _edge_lengths(vertices, faces, face_object, total, count):  # type: ignore[no-untyped-def]
     """Sum and number of edge lengths an object, from at most about 100,000 evenly chosen faces."""
     step = max(1, len(faces) // 100_000)
     for f in range(0, len(faces), step):
@@ -139,7 +139,7 @@ def _edge_lengths(vertices: Any, faces: Any, face_object: Any, total: Any, count
 
 
 @njit(inline="always")
-def _shoot(tracer: Any, x: Any, y: Any, z: Any, dx: Any, dy: Any, dz: Any, reach: Any) -> Any:
+def _shoot(tracer, x, y, z, dx, dy, dz, reach):  # type: ignore[no-untyped-def]
     """Closest hit on the segment from (x, y, z) along (dx, dy, dz): its parameter, unit face normal, face and u, v.
 
     The face is -1 when nothing is hit.
@@ -157,20 +157,9 @@ def _shoot(tracer: Any, x: Any, y: Any, z: Any, dx: Any, dy: Any, dz: Any, reach
 
 
 @njit(inline="always")
-def _find(
-    tracer: Any,
-    x: Any,
-    y: Any,
-    z: Any,
-    nx: Any,
-    ny: Any,
-    nz: Any,
-    vx: Any,
-    vy: Any,
-    vz: Any,
-    ahead: Any,
-    window: Any,
-) -> Any:
+def _find(  # type: ignore[no-untyped-def]
+    tracer, x, y, z, nx, ny, nz, vx, vy, vz, ahead, window
+):
     """Mesh point of the surfel point (x, y, z) with normal n, seen from v: how it was found, point, face normal, and
     the face with u and v (-1: none)."""
     how = NOWHERE
@@ -206,9 +195,7 @@ def _find(
 
 
 @njit
-def attach_points(
-    lane: Any, lanes: Any, room: Any, tracer: Any, rules: Any, view_of: Any, samples: Any, keys: Any, out: Any
-) -> None:
+def attach_points(lane, lanes, room, tracer, rules, view_of, samples, keys, out):  # type: ignore[no-untyped-def]
     """Fill every so-manyth (`lanes`) block of shading points, from the `lane`-th on; see the module's head.
 
     Parameters
@@ -288,8 +275,7 @@ def attach_points(
 
 
 @njit(parallel=True)
-def _attach(tracer: Any, rules: Any, view_of: Any, samples: Any, keys: Any, frames: Any, materials: Any, seen: Any,
-            lanes: Any) -> None:  # fmt: skip
+def _attach(tracer, rules, view_of, samples, keys, frames, materials, seen, lanes):  # type: ignore[no-untyped-def]
     for lane in prange(lanes):
         attach_points(np.int64(lane), lanes, None, tracer, rules, view_of, samples, keys, (frames, materials, seen))
 

@@ -8,8 +8,6 @@ Lights in front of a holdout are hidden by it.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from ...compute.jit import njit, prange
@@ -55,10 +53,7 @@ def visible_lights(lights: Lights, parameters: Array, x0: int, buffer: GBuffer) 
 
 
 @njit(parallel=True)
-def _look(
-    p: Any, x0: Any, y0: Any, start: Any, alpha: Any, pixel: Any, sample: Any, weight: Any, flags: Any, depth: Any,
-    lights: Any, out: Any,
-) -> None:  # fmt: skip
+def _look(p, x0, y0, start, alpha, pixel, sample, weight, flags, depth, lights, out):  # type: ignore[no-untyped-def]
     width, near = np.int64(p[WIDTH]), p[CLIP_START]
     rows, columns, subpixels = alpha.shape
     for y in prange(rows):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from ...compute.jit import njit
@@ -25,7 +23,7 @@ KINDS, KIND, MOMENTS = 3, 10, 6
 
 
 @njit
-def _add(sums: Any, h: Any, kind: Any, qr: Any, qg: Any, qb: Any, sr: Any, sg: Any, sb: Any) -> None:
+def _add(sums, h, kind, qr, qg, qb, sr, sg, sb):  # type: ignore[no-untyped-def]
     """Add what one sample found, diffuse and glossy, to the sums of point h.
 
     The kinds of light are kept apart because they come in an order that depends on the neighbours.
@@ -46,9 +44,7 @@ def _add(sums: Any, h: Any, kind: Any, qr: Any, qg: Any, qb: Any, sr: Any, sg: A
 
 
 @njit
-def _reflect(
-    sums: Any, s: Any, ints: Any, slot: Any, kind: Any, dr: Any, dg: Any, db: Any, gr: Any, gg: Any, gb: Any
-) -> None:
+def _reflect(sums, s, ints, slot, kind, dr, dg, db, gr, gg, gb):  # type: ignore[no-untyped-def]
     """Add what a slot's point reflects of the light that its diffuse and its glossy lobe get along the ray."""
     i, c = w.at(slot)
     _add(
@@ -58,7 +54,7 @@ def _reflect(
 
 
 @njit
-def deliver(count: Any, found: Any, limit: Any, sums: Any) -> None:
+def deliver(count, found, limit, sums):  # type: ignore[no-untyped-def]
     """Add the light of finished paths to their points; `limit` bounds the mean of an indirect sample's channels."""
     for path in range(count):
         h = np.int64(found[path, CARRIED + 6])
@@ -74,10 +70,7 @@ def deliver(count: Any, found: Any, limit: Any, sums: Any) -> None:
 
 
 @njit
-def _see_lights(
-    slot: Any, s: Any, ints: Any, reach: Any, hit: Any, cosine: Any, ggx: Any, lights: Any, differ: Any, glows: Any,
-    geometry: Any, sums: Any,
-) -> None:  # fmt: skip
+def _see_lights(slot, s, ints, reach, hit, cosine, ggx, lights, differ, glows, geometry, sums):  # type: ignore[no-untyped-def]
     """What lights between a point and what its ray hit shine, and what that emits; the BRDF is not yet weighed."""
     i, _ = w.at(slot)
     position, direction = (s[i + w.OX], s[i + w.OY], s[i + w.OZ]), (s[i + w.LX], s[i + w.LY], s[i + w.LZ])
@@ -98,9 +91,7 @@ def _see_lights(
 
 
 @njit
-def _trace_lights(
-    count: Any, s: Any, ints: Any, scene: Any, lights: Any, shading_model: Any, apart: Any, shift: Any, sums: Any
-) -> None:
+def _trace_lights(count, s, ints, scene, lights, shading_model, apart, shift, sums):  # type: ignore[no-untyped-def]
     """Light samples: draw, trace, add."""
     w.light_directions(s, ints, count, lights)
     w.evaluate(s, count, shading_model)
@@ -118,7 +109,7 @@ def _trace_lights(
 
 
 @njit
-def _see_envmap(count: Any, s: Any, ints: Any, envmap: Any, sums: Any) -> None:
+def _see_envmap(count, s, ints, envmap, sums):  # type: ignore[no-untyped-def]
     """Add what the environment sends along the slots' rays; LIVE is the share that gets through."""
     for slot in range(count):
         i, _ = w.at(slot)
@@ -130,9 +121,7 @@ def _see_envmap(count: Any, s: Any, ints: Any, envmap: Any, sums: Any) -> None:
 
 
 @njit
-def _trace_envmap(
-    count: Any, s: Any, ints: Any, tracer: Any, envmap: Any, shading_model: Any, apart: Any, shift: Any, sums: Any
-) -> None:
+def _trace_envmap(count, s, ints, tracer, envmap, shading_model, apart, shift, sums):  # type: ignore[no-untyped-def]
     """Samples of the environment: draw, weigh, trace, add."""
     w.environment_directions(s, ints, count, envmap)
     w.evaluate(s, count, shading_model)
@@ -150,10 +139,10 @@ def _trace_envmap(
 
 
 @njit
-def trace_batch(
-    strategy: Any, count: Any, rays: Any, paths: Any, begun: Any, found: Any, scene: Any, illumination: Any, table: Any,
-    bounces: Any, shading_model: Any, limit: Any, differ: Any, shift: Any, sums: Any,
-) -> Any:  # fmt: skip
+def trace_batch(  # type: ignore[no-untyped-def]
+    strategy, count, rays, paths, begun, found, scene, illumination, table, bounces, shading_model, limit, differ,
+    shift, sums,
+):  # fmt: skip
     """Samples of one strategy: draw, weigh, trace, and add what they see; return the number of paths under way."""
     s, ints = rays
     p, path_ints = paths
@@ -222,7 +211,7 @@ def trace_batch(
 
 
 @njit
-def finish(sums: Any, h: Any, total: Any, components: Any, moments: Any, i: Any) -> None:
+def finish(sums, h, total, components, moments, i):  # type: ignore[no-untyped-def]
     """Write out point i: its light, and of either lobe sum and sum of squares of `total` samples' luminance."""
     for lobe in range(2):
         for k in range(3):

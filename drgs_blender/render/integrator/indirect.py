@@ -7,8 +7,6 @@ on, Russian roulette ends paths by it.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from ...compute.jit import njit
@@ -34,14 +32,14 @@ FOUND = 10
 
 
 @njit
-def lifted(px: Any, py: Any, pz: Any, gx: Any, gy: Any, gz: Any, extent: Any) -> Any:
+def lifted(px, py, pz, gx, gy, gz, extent):  # type: ignore[no-untyped-def]
     """Lift a ray's start off the surface by more than rounding can push it below."""
     lift = _OFFSET_POINT * max(abs(px), max(abs(py), abs(pz))) + _OFFSET_SCENE * extent
     return px + lift * gx, py + lift * gy, pz + lift * gz
 
 
 @njit
-def _surfaces(s: Any, ints: Any, count: Any, scene: Any, shading_model: Any, table: Any, envmap: Any) -> None:
+def _surfaces(s, ints, count, scene, shading_model, table, envmap):  # type: ignore[no-untyped-def]
     """Normals and materials where the rays hit. What the surfaces emit was taken where the rays left (`_onwards`)."""
     tracer, geometry, extent = scene
     for slot in range(count):
@@ -60,7 +58,7 @@ def _surfaces(s: Any, ints: Any, count: Any, scene: Any, shading_model: Any, tab
 
 
 @njit
-def _towards_envmap(s: Any, ints: Any, count: Any, envmap: Any, tracer: Any, shift: Any, found: Any) -> None:
+def _towards_envmap(s, ints, count, envmap, tracer, shift, found):  # type: ignore[no-untyped-def]
     """The environment samples that `environment_directions` drew and `carry` weighed."""
     for slot in range(count):
         i, c = w.at(slot)
@@ -78,7 +76,7 @@ def _towards_envmap(s: Any, ints: Any, count: Any, envmap: Any, tracer: Any, shi
 
 
 @njit
-def _towards_lights(s: Any, ints: Any, count: Any, lights: Any, tracer: Any, shift: Any, found: Any) -> None:
+def _towards_lights(s, ints, count, lights, tracer, shift, found):  # type: ignore[no-untyped-def]
     """The light samples that `light_directions` drew."""
     for slot in range(count):
         i, c = w.at(slot)
@@ -94,10 +92,7 @@ def _towards_lights(s: Any, ints: Any, count: Any, lights: Any, tracer: Any, shi
 
 
 @njit
-def _onwards(
-    s: Any, ints: Any, count: Any, bounce: Any, last: Any, envmap: Any, lights: Any, any_lights: Any, glows: Any,
-    scene: Any, shift: Any, found: Any,
-) -> Any:  # fmt: skip
+def _onwards(s, ints, count, bounce, last, envmap, lights, any_lights, glows, scene, shift, found):  # type: ignore[no-untyped-def]
     """The BRDF samples; return how many paths go on, in slots 0, 1, ..."""
     tracer, geometry, _ = scene
     going = 0
@@ -153,11 +148,7 @@ def _onwards(
 
 
 @njit
-def trace_paths(
-    s: Any, ints: Any, count: Any, scene: Any, illumination: Any, shading_model: Any, table: Any, bounces: Any,
-    shift: Any,
-    found: Any
-) -> None:  # fmt: skip
+def trace_paths(s, ints, count, scene, illumination, shading_model, table, bounces, shift, found):  # type: ignore[no-untyped-def]
     """Follow `count` paths that `put_hit` began in slots 0, 1, ...; their light goes to rows OWNER of `found`.
 
     Parameters

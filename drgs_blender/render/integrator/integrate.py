@@ -184,12 +184,10 @@ def mixed(seed: int, noise_index: int) -> int:
 
 
 @njit
-def shade_points(
-    lane: Any, lanes: Any, room: Any, keys: Any, frames: Any, surfaces: Any, tracer: Any, geometry: Any, extent: Any,
-    envmap: Any, lit_by: Any, lights: Any, table: Any, sequence: Any, split: Any, subpixels: Any, part: Any,
-    bounces: Any,
-    shading_model: Any, seed: Any, limit: Any, differ: Any, shift: Any, out: Any,
-) -> None:  # fmt: skip
+def shade_points(  # type: ignore[no-untyped-def]
+    lane, lanes, room, keys, frames, surfaces, tracer, geometry, extent, envmap, lit_by, lights, table, sequence, split,
+    subpixels, part, bounces, shading_model, seed, limit, differ, shift, out,
+):  # fmt: skip
     """Shade every so-manyth (`lanes`) block of points, from the `lane`-th on.
 
     Parameters
@@ -274,12 +272,10 @@ def _room() -> Any:
 
 
 @njit(parallel=True)
-def _kernel(
-    keys: Any, frames: Any, surfaces: Any, tracer: Any, geometry: Any, extent: Any, envmap: Any, lit_by: Any,
-    lights: Any, table: Any, sequence: Any, split: Any, subpixels: Any, part: Any, bounces: Any, shading_model: Any,
-    seed: Any,
-    limit: Any, differ: Any, shift: Any, out: Any, lanes: Any,
-) -> None:  # fmt: skip
+def _kernel(  # type: ignore[no-untyped-def]
+    keys, frames, surfaces, tracer, geometry, extent, envmap, lit_by, lights, table, sequence, split, subpixels, part,
+    bounces, shading_model, seed, limit, differ, shift, out, lanes,
+):  # fmt: skip
     # Threads get neighbouring lanes, lanes get every so-manyth block: no thread is left with all the costly ones.
     for lane in prange(lanes):
         shade_points(

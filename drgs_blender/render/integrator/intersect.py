@@ -9,7 +9,7 @@ alone; a device has no others.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -179,9 +179,7 @@ def put_start(tracer, s, ints, slot, own, size, point):  # type: ignore[no-untyp
 
 
 @njit
-def light_radiance(
-    s: Any, ints: Any, slot: Any, others: Any, glossy_others: Any, share: Any, lights: Any, tracer: Any, mask: Any
-) -> Any:  # fmt: skip
+def light_radiance(s, ints, slot, others, glossy_others, share, lights, tracer, mask):  # type: ignore[no-untyped-def]
     """What a light sample brings: radiance over density for the diffuse and for the glossy lobe, 0 when in shadow.
 
     `others` and `share` are the balance heuristic's densities of other strategies, for the diffuse and for the glossy

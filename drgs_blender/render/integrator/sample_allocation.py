@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
@@ -27,12 +26,12 @@ _LIGHT_DIFFUSE, _LIGHT_GLOSSY, _WIDE = F(0.75), F(0.5), F(0.03)
 
 
 @njit
-def _rounded(x: Any) -> Any:
+def _rounded(x):  # type: ignore[no-untyped-def]
     return F(np.int32(x + F(0.5)))
 
 
 @njit
-def _allocate(state: Any, h: Any, share: Any, split: Any) -> None:
+def _allocate(state, h, share, split):  # type: ignore[no-untyped-def]
     """Samples a pixel of each strategy at the h-th point; `share` is the diffuse lobe's part of what it reflects.
 
     Whole numbers in coarse steps: points of one pixel mostly agree, and then their samples add up to these numbers.
@@ -65,11 +64,7 @@ def _allocate(state: Any, h: Any, share: Any, split: Any) -> None:
 
 
 @njit
-def write_point_states(
-    first: Any, last: Any, frames: Any, surfaces: Any, extent: Any, envmap: Any, shading_model: Any, table: Any,
-    split: Any,
-    state: Any, row: Any,
-) -> None:  # fmt: skip
+def write_point_states(first, last, frames, surfaces, extent, envmap, shading_model, table, split, state, row):  # type: ignore[no-untyped-def]
     """What all samples of a point share, see `POINT_STATE`, and its row in the light's tables.
 
     Alpha squared is -1 where the point is unusable.
@@ -97,9 +92,7 @@ def write_point_states(
 
 
 @njit
-def put_sample(
-    tracer: Any, s: Any, ints: Any, slot: Any, i: Any, h: Any, frames: Any, surfaces: Any, state: Any, rate: Any
-) -> None:
+def put_sample(tracer, s, ints, slot, i, h, frames, surfaces, state, rate):  # type: ignore[no-untyped-def]
     """Copy point i, the h-th of its block, into a slot; `rate` is its part of a pixel's samples."""
     _, normal, flat, view = frames
     albedo, _, metallic, own, size = surfaces

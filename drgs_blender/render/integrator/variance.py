@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from ...compute.jit import njit
@@ -34,7 +32,7 @@ def variances(pixel: Array, moments: Array) -> Array:
 
 
 @njit
-def _spread(pixel: Any, moments: Any, variance: Any) -> None:
+def _spread(pixel, moments, variance):  # type: ignore[no-untyped-def]
     n = len(pixel)
     start = 0
     while start < n:

@@ -9,7 +9,6 @@ overlaps their cache misses.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
@@ -57,27 +56,27 @@ _TINY = F(1e-30)
 
 
 @njit
-def batch(capacity: Any) -> Any:
+def batch(capacity):  # type: ignore[no-untyped-def]
     """(float32, uint32) arrays with room for `capacity` slots."""
     packets = (capacity + LANES - 1) // LANES
     return np.zeros(packets * _FLOATS, np.float32), np.zeros(packets * _INTS, np.uint32)
 
 
 @inlined
-def at(slot: Any) -> Any:
+def at(slot):  # type: ignore[no-untyped-def]
     """Places of a slot's field 0 in the two arrays."""
     packet, lane = slot // LANES, slot % LANES
     return packet * _FLOATS + lane, packet * _INTS + lane
 
 
 @inlined
-def packets(count: Any) -> Any:
+def packets(count):  # type: ignore[no-untyped-def]
     """Packets that hold `count` slots."""
     return (count + LANES - 1) // LANES
 
 
 @njit
-def scramble(ints: Any, count: Any) -> None:
+def scramble(ints, count):  # type: ignore[no-untyped-def]
     """Turn N0 to N2, a Sobol' point with reversed bits, into random numbers; CELL is the key of the point set."""
     for p in range(packets(count)):
         c = p * _INTS
@@ -89,7 +88,7 @@ def scramble(ints: Any, count: Any) -> None:
 
 
 @inlined
-def _cosine_direction(s: Any, i: Any, u: Any, v: Any) -> Any:
+def _cosine_direction(s, i, u, v):  # type: ignore[no-untyped-def]
     """World direction in proportion to the cosine."""
     nx, ny, nz = s[i + NX], s[i + NY], s[i + NZ]
     bx, by, bz, cx, cy, cz = sampling.basis(nx, ny, nz)
@@ -98,7 +97,7 @@ def _cosine_direction(s: Any, i: Any, u: Any, v: Any) -> Any:
 
 
 @inlined
-def _ggx_direction(s: Any, i: Any, u: Any, v: Any) -> Any:
+def _ggx_direction(s, i, u, v):  # type: ignore[no-untyped-def]
     """World direction by visible normals."""
     mx, my, mz, vx, vy, vz = s[i + MX], s[i + MY], s[i + MZ], s[i + VX], s[i + VY], s[i + VZ]
     bx, by, bz, cx, cy, cz = sampling.basis(mx, my, mz)
@@ -111,7 +110,7 @@ def _ggx_direction(s: Any, i: Any, u: Any, v: Any) -> Any:
 
 
 @njit
-def cosine_directions(s: Any, ints: Any, count: Any) -> None:
+def cosine_directions(s, ints, count):  # type: ignore[no-untyped-def]
     """Directions in proportion to the cosine."""
     for p in range(packets(count)):
         b, c = p * _FLOATS, p * _INTS
@@ -122,7 +121,7 @@ def cosine_directions(s: Any, ints: Any, count: Any) -> None:
 
 
 @njit
-def ggx_directions(s: Any, ints: Any, count: Any) -> None:
+def ggx_directions(s, ints, count):  # type: ignore[no-untyped-def]
     """Directions by visible normals."""
     for p in range(packets(count)):
         b, c = p * _FLOATS, p * _INTS
@@ -133,7 +132,7 @@ def ggx_directions(s: Any, ints: Any, count: Any) -> None:
 
 
 @njit
-def brdf_directions(s: Any, ints: Any, count: Any) -> None:
+def brdf_directions(s, ints, count):  # type: ignore[no-untyped-def]
     """Directions from the mixture of both lobes; CELL tells which (1 diffuse, 0 specular)."""
     for p in range(packets(count)):
         b, c = p * _FLOATS, p * _INTS
@@ -150,7 +149,7 @@ def brdf_directions(s: Any, ints: Any, count: Any) -> None:
 
 
 @njit
-def environment_directions(s: Any, ints: Any, count: Any, envmap: Any) -> None:
+def environment_directions(s, ints, count, envmap):  # type: ignore[no-untyped-def]
     """Directions towards the environment in proportion to its light on the surface, with MU, MV and PE."""
     for slot in range(count):
         _, c = at(slot)
@@ -186,7 +185,7 @@ def environment_directions(s: Any, ints: Any, count: Any, envmap: Any) -> None:
 
 
 @njit
-def light_directions(s: Any, ints: Any, count: Any, lights: Any) -> None:
+def light_directions(s, ints, count, lights):  # type: ignore[no-untyped-def]
     """Directions towards lights, with ER, EG, EB, distance, density (see ``sample_light``) and the light in CELL."""
     for slot in range(count):
         i, c = at(slot)
@@ -199,7 +198,7 @@ def light_directions(s: Any, ints: Any, count: Any, lights: Any) -> None:
 
 
 @njit
-def look_up(s: Any, ints: Any, count: Any, envmap: Any) -> None:
+def look_up(s, ints, count, envmap):  # type: ignore[no-untyped-def]
     """MU, MV and PE of directions that were not drawn from the environment."""
     for p in range(packets(count)):
         for i in range(p * _FLOATS, p * _FLOATS + LANES):
@@ -211,7 +210,7 @@ def look_up(s: Any, ints: Any, count: Any, envmap: Any) -> None:
 
 
 @njit
-def warm(s: Any, count: Any, envmap: Any) -> None:
+def warm(s, count, envmap):  # type: ignore[no-untyped-def]
     """Fetch what `envmap_radiance` will read, all at once, long before it waits for it."""
     for slot in range(count):
         i, _ = at(slot)
@@ -220,7 +219,7 @@ def warm(s: Any, count: Any, envmap: Any) -> None:
 
 
 @njit
-def evaluate(s: Any, count: Any, shading_model: Any) -> None:
+def evaluate(s, count, shading_model):  # type: ignore[no-untyped-def]
     """BRDF of both lobes times cosine, densities of cosine and GGX sampling, and LIVE: whether any light can pass."""
     for p in range(packets(count)):
         for i in range(p * _FLOATS, p * _FLOATS + LANES):
@@ -263,27 +262,27 @@ def evaluate(s: Any, count: Any, shading_model: Any) -> None:
 
 
 @inlined
-def _factor(s: Any, i: Any, cosine: Any, ggx: Any) -> Any:
+def _factor(s, i, cosine, ggx):  # type: ignore[no-untyped-def]
     """One over the density of all strategies together for the slot at i."""
     brdf_density = cosine * s[i + WC] * s[i + PC] + ggx * s[i + WG] * s[i + PG]
     return ONE / max(brdf_density + s[i + WE] * s[i + PE], _TINY)
 
 
 @inlined
-def _scale(s: Any, i: Any, k: Any) -> None:
+def _scale(s, i, k):  # type: ignore[no-untyped-def]
     """Multiply both lobes of the slot at i."""
     s[i + QR], s[i + QG], s[i + QB] = s[i + QR] * k, s[i + QG] * k, s[i + QB] * k
     s[i + SR], s[i + SG], s[i + SB] = s[i + SR] * k, s[i + SG] * k, s[i + SB] * k
 
 
 @inlined
-def weigh_one(s: Any, i: Any, cosine: Any, ggx: Any) -> None:
+def weigh_one(s, i, cosine, ggx):  # type: ignore[no-untyped-def]
     """`weigh` for the slot at i."""
     _scale(s, i, _factor(s, i, cosine, ggx))
 
 
 @njit
-def weigh(s: Any, count: Any, cosine: Any, ggx: Any) -> None:
+def weigh(s, count, cosine, ggx):  # type: ignore[no-untyped-def]
     """Divide by the density of all strategies together; the arguments (1 or 0) say whether these two take part."""
     for p in range(packets(count)):
         # Two loops, for LLVM vectorises none with so many places that are read and written.
@@ -294,7 +293,7 @@ def weigh(s: Any, count: Any, cosine: Any, ggx: Any) -> None:
 
 
 @njit
-def weigh_apart(s: Any, count: Any) -> None:
+def weigh_apart(s, count):  # type: ignore[no-untyped-def]
     """`weigh` where cosine sampling is of the diffuse lobe alone, GGX sampling of the specular one alone."""
     for p in range(packets(count)):
         for i in range(p * _FLOATS, p * _FLOATS + LANES):
@@ -306,7 +305,7 @@ def weigh_apart(s: Any, count: Any) -> None:
 
 
 @njit
-def drop(s: Any, count: Any, lobe: Any) -> None:
+def drop(s, count, lobe):  # type: ignore[no-untyped-def]
     """Take the lobe whose fields begin at `lobe` (QR or SR) out of the BRDF."""
     for p in range(packets(count)):
         for i in range(p * _FLOATS + lobe, p * _FLOATS + lobe + 3 * LANES):
@@ -314,7 +313,7 @@ def drop(s: Any, count: Any, lobe: Any) -> None:
 
 
 @inlined
-def diffuse_share(mv: Any, r: Any, g: Any, b: Any, kd: Any, metallic: Any, shading_model: Any) -> Any:
+def diffuse_share(mv, r, g, b, kd, metallic, shading_model):  # type: ignore[no-untyped-def]
     """How often the diffuse lobe is sampled, from what both reflect towards the viewer."""
     fr, fg, fb = brdf.fresnel(max(mv, ZERO), r, g, b, metallic, shading_model)
     diffuse = kd * luminance(r, g, b)
@@ -324,7 +323,7 @@ def diffuse_share(mv: Any, r: Any, g: Any, b: Any, kd: Any, metallic: Any, shadi
 
 
 @njit
-def lobe_shares(s: Any, count: Any, shading_model: Any) -> None:
+def lobe_shares(s, count, shading_model):  # type: ignore[no-untyped-def]
     """SHARE: how often the diffuse lobe is sampled."""
     for p in range(packets(count)):
         for i in range(p * _FLOATS, p * _FLOATS + LANES):
@@ -333,7 +332,7 @@ def lobe_shares(s: Any, count: Any, shading_model: Any) -> None:
 
 
 @njit
-def carry(s: Any, count: Any, light: Any) -> None:
+def carry(s, count, light):  # type: ignore[no-untyped-def]
     """Put throughput times both lobes into QR, QG, QB, and what a path's samples are divided by into PG and PE.
 
     PG becomes the density of the mixture of lobes, PE the same plus `light` times the density of light sampling.
@@ -349,7 +348,7 @@ def carry(s: Any, count: Any, light: Any) -> None:
 
 
 @njit
-def fresh_numbers(ints: Any, count: Any, step: Any) -> None:
+def fresh_numbers(ints, count, step):  # type: ignore[no-untyped-def]
     """Move on to the next key and hash three random numbers from it."""
     for p in range(packets(count)):
         c = p * _INTS

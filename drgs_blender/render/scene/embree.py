@@ -156,8 +156,7 @@ _TRACED = types.Tuple((types.float32,) + (types.int32,) * 3 + (types.float32,) *
 
 
 @intrinsic
-def trace(typing: Any, address: Any, scene: Any, ox: Any, oy: Any, oz: Any, dx: Any, dy: Any, dz: Any,
-          tnear: Any, tfar: Any, mask: Any) -> Any:  # fmt: skip
+def trace(typing, address, scene, ox, oy, oz, dx, dy, dz, tnear, tfar, mask):  # type: ignore[no-untyped-def]
     """Closest hit of one ray, for compiled code: ``(t, group, primitive, instance, u, v, gx, gy, gz)``.
 
     `address` is ``TriangleBVH.intersect_address`` and `scene` ``TriangleBVH.scene``, both int64; `mask` is an int32:
@@ -184,8 +183,7 @@ def trace(typing: Any, address: Any, scene: Any, ox: Any, oy: Any, oz: Any, dx: 
 
 
 @intrinsic
-def blocked(typing: Any, address: Any, scene: Any, ox: Any, oy: Any, oz: Any, dx: Any, dy: Any, dz: Any,
-            tnear: Any, tfar: Any, mask: Any) -> Any:  # fmt: skip
+def blocked(typing, address, scene, ox, oy, oz, dx, dy, dz, tnear, tfar, mask):  # type: ignore[no-untyped-def]
     """Return whether anything that has a bit of `mask` (int32) lies on the ray; see `trace`.
 
     `address` is ``TriangleBVH.occluded_address``.

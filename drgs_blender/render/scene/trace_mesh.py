@@ -7,7 +7,6 @@ the last update; nobody may write into it meanwhile.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -263,7 +262,7 @@ def place_vertices(vertices: Array | None, matrix: Array | None, target: Array) 
 
 
 @njit
-def _usable(x: Any, y: Any, z: Any) -> Any:
+def _usable(x, y, z):  # type: ignore[no-untyped-def]
     """The vertex and its largest coordinate, or the origin for an unusable one; how many of these (0 or 1)."""
     size = max(abs(x), max(abs(y), abs(z)))
     # A NaN may hide in the maximum, yet not in the sum.
@@ -274,7 +273,7 @@ def _usable(x: Any, y: Any, z: Any) -> Any:
 
 
 @njit(parallel=True)
-def _copy_vertices(source: Any, target: Any) -> Any:
+def _copy_vertices(source, target):  # type: ignore[no-untyped-def]
     """Copy usable vertices, put the others at the origin: how many those are, how many moved, largest coordinate."""
     bad = moved = 0
     reach = np.float32(0.0)
@@ -297,7 +296,7 @@ def _copy_vertices(source: Any, target: Any) -> Any:
 
 
 @njit(parallel=True)
-def _move_vertices(source: Any, matrix: Any, target: Any) -> Any:
+def _move_vertices(source, matrix, target):  # type: ignore[no-untyped-def]
     """As `_copy_vertices`, moved by a (3, 4) float64 matrix."""
     bad = moved = 0
     reach = np.float32(0.0)
@@ -326,7 +325,7 @@ def _move_vertices(source: Any, matrix: Any, target: Any) -> Any:
 
 
 @njit(parallel=True)
-def _given_normals(normals: Any, vertices: Any, faces: Any, out: Any) -> Any:
+def _given_normals(normals, vertices, faces, out):  # type: ignore[no-untyped-def]
     """Fill (3 m, 3) `out` with the (m, 3, 3) normals made unit; count the faces without area."""
     empty = 0
     for f in prange(len(faces)):
@@ -353,7 +352,7 @@ def _given_normals(normals: Any, vertices: Any, faces: Any, out: Any) -> Any:
 
 
 @njit(parallel=True)
-def _turn_normals(normals: Any, matrix: Any, out: Any) -> None:
+def _turn_normals(normals, matrix, out):  # type: ignore[no-untyped-def]
     """Unit normals through a (3, 3) matrix of normals; (0, 0, 1) where they have no direction."""
     for i in prange(len(normals)):
         x, y, z = normals[i, 0], normals[i, 1], normals[i, 2]
@@ -370,7 +369,7 @@ def _turn_normals(normals: Any, matrix: Any, out: Any) -> None:
 
 
 @njit(parallel=True)
-def _materials(vertex: Any, albedo: Any, roughness: Any, metallic: Any, rows: Any) -> None:
+def _materials(vertex, albedo, roughness, metallic, rows):  # type: ignore[no-untyped-def]
     """Copy the material of vertex[i] to shading row i, within [0, 1]; NaN becomes 0."""
     for i in prange(len(vertex)):
         v = vertex[i]

@@ -5,8 +5,6 @@ A sample's contributions are `n` entries from `base` on of three flat arrays: de
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from ...compute.jit import njit
@@ -24,7 +22,7 @@ _1, _2, _3, _4, _5, _6, _7 = (np.uintp(k) for k in range(1, 8))
 
 
 @njit
-def merge_sort(z: Any, base: Any, n: Any, order: Any) -> None:
+def merge_sort(z, base, n, order):  # type: ignore[no-untyped-def]
     """Stable order of z[base .. base + n] when these are many."""
     by_depth = np.argsort(z[base : base + n], kind="mergesort")
     for k in range(n):
@@ -32,7 +30,7 @@ def merge_sort(z: Any, base: Any, n: Any, order: Any) -> None:
 
 
 @njit
-def rank_sort(z: Any, base: Any, n: Any, rank: Any, order: Any) -> None:
+def rank_sort(z, base, n, rank, order):  # type: ignore[no-untyped-def]
     """Stable order of z[base .. base + n] by counting, for each, how many come before it: vector code, no branch."""
     for k in range(n, (n + LANES - 1) // LANES * LANES):
         z[np.uintp(base + k)] = np.float32(np.inf)
@@ -64,7 +62,7 @@ def rank_sort(z: Any, base: Any, n: Any, rank: Any, order: Any) -> None:
 
 
 @njit
-def prune(z: Any, alpha: Any, splat: Any, base: Any, n: Any, rank: Any, order: Any) -> Any:
+def prune(z, alpha, splat, base, n, rank, order):  # type: ignore[no-untyped-def]
     """Sort the contributions of a sample, drop those behind the point where it is opaque; how many remain."""
     if n > MANY:
         merge_sort(z, base, n, order)
@@ -87,7 +85,7 @@ def prune(z: Any, alpha: Any, splat: Any, base: Any, n: Any, rank: Any, order: A
 
 
 @njit
-def widen(values: Any, room: Any) -> Any:
+def widen(values, room):  # type: ignore[no-untyped-def]
     """The same lists with twice the room."""
     lists = len(values) // room
     wider = np.empty(2 * len(values), values.dtype)
@@ -97,10 +95,7 @@ def widen(values: Any, room: Any) -> Any:
 
 
 @njit
-def weigh(
-    surface: Any, lists_z: Any, lists_a: Any, lists_i: Any, base: Any, n: Any, order: Any, weights: Any,
-    pixel_base: Any, pixel: Any,
-) -> Any:  # fmt: skip
+def weigh(surface, lists_z, lists_a, lists_i, base, n, order, weights, pixel_base, pixel):  # type: ignore[no-untyped-def]
     """Weights of the sorted contributions of a sample.
 
     Returns its transmittance, and the weight, depth times weight, heaviest splat, first and last contribution of the
@@ -134,7 +129,7 @@ def weigh(
 
 
 @njit
-def mean(surface: Any, lists_i: Any, base: Any, order: Any, weights: Any, total: Any, begin: Any, end: Any) -> Any:
+def mean(surface, lists_i, base, order, weights, total, begin, end):  # type: ignore[no-untyped-def]
     """Unit normal and mean attributes of the contributions begin .. end, whose weights sum to `total`."""
     zero, one = np.float32(0.0), np.float32(1.0)
     nx = ny = nz = red = green = blue = roughness = metallic = size = zero

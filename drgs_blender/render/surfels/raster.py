@@ -23,7 +23,6 @@ Numba's sense: in a loop that would count references of every array at every tur
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -123,7 +122,7 @@ def rasterise(splats: Splats, y0: int, y1: int) -> SurfelSamples:
 
 
 @njit(inline="always")
-def gaussian(q: Any) -> Any:
+def gaussian(q):  # type: ignore[no-untyped-def]
     """exp(-q / 2) for 0 <= q <= 12, relative error below 4e-6: Taylor's series of exp(-q / 32) to the 16th power.
 
     Branch-free, so that a loop over samples becomes vector code.
@@ -143,7 +142,7 @@ def gaussian(q: Any) -> Any:
 
 
 @njit
-def _meet(screen: Any, i: Any, opacity: Any, near: Any, far: Any, state: Any, first: Any, last: Any) -> Any:
+def _meet(screen, i, opacity, near, far, state, first, last):  # type: ignore[no-untyped-def]
     """Splat i at the lanes first .. last of a block: strength (0 where it has no part) and depth; how many have one.
 
     One array, constant distances, no branch: the loop becomes vector code.
@@ -182,11 +181,10 @@ def _meet(screen: Any, i: Any, opacity: Any, near: Any, far: Any, state: Any, fi
 
 
 @njit
-def _collect(
-    tile_list: Any, begin: Any, end: Any, screen: Any, surface: Any, box: Any, nearest: Any,
-    left: Any, top: Any, right: Any, bottom: Any, tile_left: Any, tile_top: Any, subpixels: Any,
-    records: Any, surfaces: Any, spans: Any,
-) -> None:  # fmt: skip
+def _collect(  # type: ignore[no-untyped-def]
+    tile_list, begin, end, screen, surface, box, nearest, left, top, right, bottom, tile_left, tile_top, subpixels,
+    records, surfaces, spans,
+):  # fmt: skip
     """Bring together what blending reads of a tile's splats; spans are samples of the tile's rows, and rows."""
     for entry in range(begin, end):
         i, e = np.uintp(tile_list[entry]), np.uintp(entry - begin)
@@ -203,7 +201,7 @@ def _collect(
 
 
 @njit
-def _count(spans: Any, n: Any, blocks_row: Any, start: Any) -> None:
+def _count(spans, n, blocks_row, start):  # type: ignore[no-untyped-def]
     """start[b + 1] .. start[b + 2]: how many of the tile's splats touch the blocks before, and b as well."""
     start[:] = 0
     for e in range(n):
@@ -216,7 +214,7 @@ def _count(spans: Any, n: Any, blocks_row: Any, start: Any) -> None:
 
 
 @njit
-def _bin(spans: Any, n: Any, blocks_row: Any, start: Any, binned: Any) -> None:
+def _bin(spans, n, blocks_row, start, binned):  # type: ignore[no-untyped-def]
     """Counting sort of the tile's splats by block, in order; afterwards start[b] .. start[b + 1] are those of b."""
     for e in range(n):
         first, last = spans[e, 0] // LANES, (spans[e, 2] - 1) // LANES
@@ -228,7 +226,7 @@ def _bin(spans: Any, n: Any, blocks_row: Any, start: Any, binned: Any) -> None:
 
 
 @njit
-def _limit(state: Any) -> Any:
+def _limit(state):  # type: ignore[no-untyped-def]
     """Depth from which on a block takes no contribution, as all its samples are opaque."""
     limit = np.float32(-1e30)
     for lane in range(LANES):
@@ -239,9 +237,7 @@ def _limit(state: Any) -> Any:
 
 
 @njit
-def _place(
-    p: Any, width: Any, y: Any, tile_left: Any, left: Any, right: Any, first: Any, subpixels: Any, state: Any
-) -> None:
+def _place(p, width, y, tile_left, left, right, first, subpixels, state):  # type: ignore[no-untyped-def]
     """Start a block: positions of its samples, nothing gathered. Those outside the window count as opaque."""
     zero = np.float32(0.0)
     for lane in range(LANES):
@@ -256,10 +252,7 @@ def _place(
 
 
 @njit
-def _gather(
-    records: Any, spans: Any, binned: Any, begin: Any, end: Any, first: Any, near: Any, far: Any, state: Any,
-    count: Any, lists_z: Any, lists_a: Any, lists_i: Any, room: Any,
-) -> Any:  # fmt: skip
+def _gather(records, spans, binned, begin, end, first, near, far, state, count, lists_z, lists_a, lists_i, room):  # type: ignore[no-untyped-def]
     """List the contributions of the splats begin .. end to a block's samples.
 
     Returns the splat to go on with: it is less than `end` when a sample's list is full.
@@ -292,11 +285,10 @@ def _gather(
 
 
 @njit
-def _finish(
-    surfaces: Any, lists_z: Any, lists_a: Any, lists_i: Any, room: Any, count: Any, rank: Any, order: Any,
-    weights: Any, pixel_base: Any, pixel: Any, subpixels: Any, y: Any, x: Any, first: Any,
-    owner: Any, out_alpha: Any, out_depth: Any, out_surface: Any,
-) -> None:  # fmt: skip
+def _finish(  # type: ignore[no-untyped-def]
+    surfaces, lists_z, lists_a, lists_i, room, count, rank, order, weights, pixel_base, pixel, subpixels, y, x, first,
+    owner, out_alpha, out_depth, out_surface,
+):  # fmt: skip
     """Resolve the samples of a block and write them; ``owner`` gets each one's heaviest splat. x: of the tile."""
     for lane in range(LANES):
         n = np.int64(count[lane])
@@ -318,27 +310,27 @@ def _finish(
 
 
 @njit(parallel=True)
-def _blend(
-    screen: Any,
-    surface: Any,
-    box: Any,
-    nearest: Any,
-    objects: Any,
-    tile_start: Any,
-    tile_list: Any,
-    p: Any,
-    x0: Any,
-    x1: Any,
-    tile_y0: Any,
-    y0: Any,
-    y1: Any,
-    subpixels: Any,
-    workers: Any,
-    out_alpha: Any,
-    out_depth: Any,
-    out_surface: Any,
-    out_object: Any,
-) -> None:
+def _blend(  # type: ignore[no-untyped-def]
+    screen,
+    surface,
+    box,
+    nearest,
+    objects,
+    tile_start,
+    tile_list,
+    p,
+    x0,
+    x1,
+    tile_y0,
+    y0,
+    y1,
+    subpixels,
+    workers,
+    out_alpha,
+    out_depth,
+    out_surface,
+    out_object,
+):
     """Blend all tiles that meet the rows y0 .. y1. A worker takes every `workers`-th tile: neighbours cost alike."""
     tile_x0 = x0 // TILE
     tiles_x = (x1 - 1) // TILE - tile_x0 + 1

@@ -11,7 +11,6 @@ through two planes.)
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -108,7 +107,7 @@ def prepare(posed: PosedSurfels, camera: Camera, parameters: Array) -> Splats:
 
 
 @njit(inline="always")
-def to_camera(p: Any, x: Any, y: Any, z: Any) -> Any:
+def to_camera(p, x, y, z):  # type: ignore[no-untyped-def]
     """World direction to camera coordinates (right, down, forward)."""
     right, up = p[0] * x + p[3] * y + p[6] * z, p[1] * x + p[4] * y + p[7] * z
     forward = p[LEAN] * right + p[LEAN + 1] * up - (p[2] * x + p[5] * y + p[8] * z)
@@ -116,7 +115,7 @@ def to_camera(p: Any, x: Any, y: Any, z: Any) -> Any:
 
 
 @njit(inline="always")
-def span(focal: Any, centre: Any, sc: Any, pa: Any, pb: Any, sa: Any, sb: Any, r2: Any) -> Any:
+def span(focal, centre, sc, pa, pb, sa, sb, r2):  # type: ignore[no-untyped-def]
     """Least and greatest screen coordinate of the disc u^2 + v^2 <= r2, wholly in front of the camera.
 
     The tangent lines x = x0 + t of the disc's outline solve a quadratic in t; ``pa``, ``pb`` are the tangents'
@@ -129,7 +128,7 @@ def span(focal: Any, centre: Any, sc: Any, pa: Any, pb: Any, sa: Any, sb: Any, r
 
 
 @njit(inline="always")
-def _clipped_bounds(c: Any, a: Any, b: Any, r: Any, near: Any, p: Any) -> Any:
+def _clipped_bounds(c, a, b, r, near, p):  # type: ignore[no-untyped-def]
     """Screen bounds of the square c +- r a +- r b cut at depth `near` (camera coordinates): for discs that cross it."""
     x0 = y0 = np.inf
     x1 = y1 = -np.inf
@@ -153,18 +152,13 @@ def _clipped_bounds(c: Any, a: Any, b: Any, r: Any, near: Any, p: Any) -> Any:
 
 
 @njit(parallel=True)
-def _project(
-    centre: Any, tangent_u: Any, tangent_v: Any, opacity: Any, p: Any, window: Any, screen: Any, box: Any, nearest: Any
-) -> None:
+def _project(centre, tangent_u, tangent_v, opacity, p, window, screen, box, nearest):  # type: ignore[no-untyped-def]
     for i in prange(len(centre)):
         project_surfel(i, centre, tangent_u, tangent_v, opacity, p, window, screen, box, nearest)
 
 
 @njit
-def project_surfel(
-    i: Any, centre: Any, tangent_u: Any, tangent_v: Any, opacity: Any, p: Any, window: Any, screen: Any, box: Any,
-    nearest: Any,
-) -> None:  # fmt: skip
+def project_surfel(i, centre, tangent_u, tangent_v, opacity, p, window, screen, box, nearest):  # type: ignore[no-untyped-def]
     """Fill screen record, box and nearest depth of surfel i; a culled surfel has an empty box (x1 = x0 = 0)."""
     wx0, wy0, wx1, wy1 = window
     near, far, ortho = p[CLIP_START], p[CLIP_END], p[ORTHOGRAPHIC] != 0.0
@@ -251,19 +245,19 @@ def project_surfel(
 
 
 @njit(inline="always")
-def _dim(along: Any, whole: Any) -> Any:
+def _dim(along, whole):  # type: ignore[no-untyped-def]
     """-2 log of the cosine ``along / whole``."""
     return 2.0 * np.log(whole / max(abs(along), 1e-6 * whole))
 
 
 @njit(inline="always")
-def depth_key(bits: Any) -> Any:
+def depth_key(bits):  # type: ignore[no-untyped-def]
     """Bits of a float32 as an integer that compares like the number: negative ones are reversed."""
     return np.uint32(~bits if bits >> np.uint32(31) else bits | np.uint32(0x80000000))
 
 
 @njit
-def depth_order(centre_depth: Any, box: Any) -> Any:
+def depth_order(centre_depth, box):  # type: ignore[no-untyped-def]
     """Indices of the surfels with a box (n, 4), by centre depth (n,) float32; equal depths keep their order.
 
     Radix sort, 3 x 11 bits.
@@ -301,13 +295,13 @@ def depth_order(centre_depth: Any, box: Any) -> Any:
 
 
 @njit(parallel=True)
-def _gather_surface(order: Any, posed: Any, out: Any) -> None:
+def _gather_surface(order, posed, out):  # type: ignore[no-untyped-def]
     for k in prange(len(order)):
         pack_surface(order[k], k, posed, out)
 
 
 @njit
-def pack_surface(i: Any, k: Any, posed: Any, out: Any) -> None:
+def pack_surface(i, k, posed, out):  # type: ignore[no-untyped-def]
     """Pack what blending reads of surfel i as splat k; `posed` are its `SHOWN`."""
     tangent_u, tangent_v, normal, albedo, roughness, metallic, opacity = posed
     uu = vv = np.float32(0.0)
@@ -321,13 +315,13 @@ def pack_surface(i: Any, k: Any, posed: Any, out: Any) -> None:
 
 
 @njit(inline="always")
-def tiles_of(box: Any, i: Any) -> Any:
+def tiles_of(box, i):  # type: ignore[no-untyped-def]
     """Columns and rows of tiles (x0, y0, x1, y1), half-open, that the box of splat i touches."""
     return box[i, 0] // TILE, box[i, 1] // TILE, (box[i, 2] - 1) // TILE + 1, (box[i, 3] - 1) // TILE + 1
 
 
 @njit
-def list_by_tile(box: Any, tile_x0: Any, tile_y0: Any, tiles_x: Any, tiles_y: Any) -> Any:
+def list_by_tile(box, tile_x0, tile_y0, tiles_x, tiles_y):  # type: ignore[no-untyped-def]
     """Counting sort of (tile, splat) pairs: start of each tile's list, and the lists, in splat order."""
     start = np.zeros(tiles_x * tiles_y + 1, np.int64)
     for i in range(len(box)):

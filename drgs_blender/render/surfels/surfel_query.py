@@ -63,14 +63,14 @@ def _access(kind: Any, llvm: Any) -> tuple[Any, Any]:
         return builder.gep(builder.inttoptr(address, llvm.as_pointer()), [index])
 
     @intrinsic
-    def load(typing: Any, address: Any, index: Any) -> Any:
+    def load(typing, address, index):  # type: ignore[no-untyped-def]
         def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
             return builder.load(place(builder, *arguments), align=4)
 
         return kind(types.int64, types.int64), codegen
 
     @intrinsic
-    def store(typing: Any, address: Any, index: Any, value: Any) -> Any:
+    def store(typing, address, index, value):  # type: ignore[no-untyped-def]
         def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
             builder.store(arguments[2], place(builder, *arguments[:2]), align=4)
             return context.get_dummy_value()
@@ -87,7 +87,7 @@ load_long, store_long = _access(types.int64, _long)
 
 
 @intrinsic
-def query_memory(typing: Any) -> Any:
+def query_memory(typing):  # type: ignore[no-untyped-def]
     """Address of memory for one query on the stack of the calling function, for compiled code."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -99,7 +99,7 @@ def query_memory(typing: Any) -> Any:
 
 
 @intrinsic
-def _call(typing: Any, address: Any, scene: Any, ray: Any, settings: Any) -> Any:
+def _call(typing, address, scene, ray, settings):  # type: ignore[no-untyped-def]
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         pointer = ir.IntType(8).as_pointer()
         kind = ir.FunctionType(ir.VoidType(), [pointer] * 3).as_pointer()

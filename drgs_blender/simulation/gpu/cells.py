@@ -34,9 +34,7 @@ def add_to(counts: wp.array(dtype=wp.int64), at: wp.int64, by: wp.int64):
 _NATIVES = {add_to: Native(_ADD, "add_to", "int64")}
 
 
-def number_particles(
-    lane: Any, lanes: Any, room: Any, x: Any, origin: Any, scale: Any, bx: Any, by: Any, bz: Any, out: Any
-) -> None:
+def number_particles(lane, lanes, room, x, origin, scale, bx, by, bz, out):  # type: ignore[no-untyped-def]
     """Key of each particle, and its own number beside it; counts those outside or not finite."""
     keys, order, found = out
     for p in range(lane, len(x), lanes):
@@ -50,7 +48,7 @@ def number_particles(
         order[p] = np.int32(p)
 
 
-def list_blocks(lane: Any, lanes: Any, room: Any, n: Any, keys: Any, out: Any) -> None:
+def list_blocks(lane, lanes, room, n, keys, out):  # type: ignore[no-untyped-def]
     """Blocks with particles, once each, in any order."""
     (found,) = out
     for p in range(lane, n, lanes):
@@ -61,7 +59,7 @@ def list_blocks(lane: Any, lanes: Any, room: Any, n: Any, keys: Any, out: Any) -
             found[BLOCKS + add_to(found, OCCUPIED, 1)] = keys[p] >> 6
 
 
-def index_blocks(lane: Any, lanes: Any, room: Any, n: Any, keys: Any, numbers: Any, sizes: Any, out: Any) -> None:
+def index_blocks(lane, lanes, room, n, keys, numbers, sizes, out):  # type: ignore[no-untyped-def]
     """Tables of the active blocks: their places, those around them, and where particles of their cells begin."""
     active, neighbour, first = out
     by, bz = sizes[1], sizes[2]
@@ -81,7 +79,7 @@ def index_blocks(lane: Any, lanes: Any, room: Any, n: Any, keys: Any, numbers: A
             active[s, 0], active[s, 1], active[s, 2] = number // (by * bz), number // bz % by, number % bz
 
 
-def house_particles(lane: Any, lanes: Any, room: Any, n: Any, keys: Any, numbers: Any, sizes: Any, out: Any) -> None:
+def house_particles(lane, lanes, room, n, keys, numbers, sizes, out):  # type: ignore[no-untyped-def]
     """Which active block each particle is in, sorted."""
     (home,) = out
     for p in range(lane, n, lanes):

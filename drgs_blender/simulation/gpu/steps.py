@@ -94,10 +94,9 @@ NATIVES = {
 }
 
 
-def prepare_particles(
-    lane: Any, lanes: Any, room: Any, order: Any, x: Any, v: Any, affine: Any, tau: Any, mass: Any, volume: Any,
-    pin: Any, n: Any, origin: Any, spacing: Any, clock: Any, times: Any, out: Any,
-) -> None:  # fmt: skip
+def prepare_particles(  # type: ignore[no-untyped-def]
+    lane, lanes, room, order, x, v, affine, tau, mass, volume, pin, n, origin, spacing, clock, times, out
+):
     """What each particle gives to the nodes around it."""
     cell, packet = out
     if clock[STOPPED] != 0.0:
@@ -194,12 +193,10 @@ def bounded_by(vx: Any, vy: Any, vz: Any, gx: Any, gy: Any, gz: Any, spacing: An
     return vx, vy, vz
 
 
-def solve_nodes(
-    lane: Any, lanes: Any, room: Any, sizes: Any, active: Any, first: Any, neighbour: Any, cell: Any, packet: Any,
-    origin: Any, spacing: Any, least: Any, wind: Any, clock: Any, times: Any, rows: Any, shapes: Any, turns: Any,
-    vectors: Any, contacts: Any, planes: Any, pin_velocity: Any, blown: Any, touched: Any, bounded: Any, pinned: Any,
-    out: Any,
-) -> None:  # fmt: skip
+def solve_nodes(  # type: ignore[no-untyped-def]
+    lane, lanes, room, sizes, active, first, neighbour, cell, packet, origin, spacing, least, wind, clock, times, rows,
+    shapes, turns, vectors, contacts, planes, pin_velocity, blown, touched, bounded, pinned, out,
+):  # fmt: skip
     """Particles to grid, and the grid's own step: velocities of all nodes of active blocks."""
     (nodes,) = out
     if clock[STOPPED] != 0.0:
@@ -254,11 +251,10 @@ def carried(nodes: Any, neighbour: Any, b: Any, i: Any, j: Any, k: Any, wx: Any,
     return x, y, z, weight
 
 
-def move_particles(
-    lane: Any, lanes: Any, room: Any, order: Any, home: Any, active: Any, neighbour: Any, nodes: Any, mass: Any,
-    model: Any, parameters: Any, solid: Any, pin: Any, pin_velocity: Any, n: Any, origin: Any, spacing: Any, clock: Any,
-    times: Any, apart: Any, pinned: Any, out: Any,
-) -> None:  # fmt: skip
+def move_particles(  # type: ignore[no-untyped-def]
+    lane, lanes, room, order, home, active, neighbour, nodes, mass, model, parameters, solid, pin, pin_velocity, n,
+    origin, spacing, clock, times, apart, pinned, out,
+):  # fmt: skip
     """Grid to particles: move them, deform them, and find their stress, as `p2g_g2p.gather`."""
     x, v, affine, elastic, total, tau, memory, fastest = out
     if clock[STOPPED] != 0.0:
@@ -314,7 +310,7 @@ def move_particles(
     raise_to(fastest, lane % SLOTS, top)
 
 
-def tick(lane: Any, lanes: Any, room: Any, spacing: Any, times: Any, out: Any) -> None:
+def tick(lane, lanes, room, spacing, times, out):  # type: ignore[no-untyped-def]
     """End a step: note the highest speed, and see whether the next one is still as it was planned."""
     clock, fastest = out
     if clock[STOPPED] != 0.0:
