@@ -23,7 +23,9 @@ class _Listener(event.Listener):
 
 
 def watch(change: Callable[[int], None]) -> None:
-    """Call `change` with 1 when a compilation begins and with -1 when it ends; they nest. Loading from the cache
-    is no compilation."""
+    """Call `change` with 1 when a compilation begins and with -1 when it ends; they nest.
+
+    Loading from the cache is no compilation.
+    """
     event.register("numba:compile", _Listener(change))
     runtime.watchers.append(change)

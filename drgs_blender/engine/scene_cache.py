@@ -81,7 +81,12 @@ class Stage:
         What rays meet.
     tree : SurfelBVH or None
         Surfels that rays meet; None when they meet the mesh.
-    world, environment, lights : of the last frame
+    world : World, optional
+        Of the last frame.
+    environment : EnvironmentLight, optional
+        Of the last frame.
+    lights : Lights
+        Of the last frame.
     """
 
     def __init__(self) -> None:
@@ -95,7 +100,7 @@ class Stage:
         self._current = True
         self.world: World | None = None
         self.environment: EnvironmentLight | None = None
-        self.environments = Lights([])
+        self.lights = Lights([])
         self._emitters = Emitters()
         self._deformer: Deformer | None = None
 
@@ -258,7 +263,7 @@ class Stage:
         for item in self.objects:
             found += item.faults
         found += self.scene.materials.warnings
-        found += self.environments.warnings
+        found += self.lights.warnings
         if self.environment is not None and self.environment.bad_texels:
             found.append(
                 f"world: {self.environment.bad_texels} pixels of the environment are negative, infinite or no "
@@ -286,8 +291,8 @@ class Stage:
         boxes = [self.scene.bvh.bounds()] if len(self.scene.faces) or self.tree is None else []
         boxes += [self.tree.bounds()] if self.tree is not None else []
         low, high = np.min([box[0] for box in boxes], axis=0), np.max([box[1] for box in boxes], axis=0)
-        self.environments = Lights(lights, 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low)), self._emitters)
-        return self.environments
+        self.lights = Lights(lights, 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low)), self._emitters)
+        return self.lights
 
 
 def _check_surface(state: ObjectState, asset: Asset, settings: RenderSettings) -> None:

@@ -76,7 +76,8 @@ class Settings:
         All stages together, once kernels are compiled; None: the steps of the schedule decide.
     materials : bool
         Pull materials and light apart; else albedo is the photographed colour.
-    decoupling : how; its ``seconds`` follow from `minutes`. Normals are learned too: a mesh of photographs has errors
+    decoupling : Settings
+        How; its ``seconds`` follow from `minutes`. Normals are learned too: a mesh of photographs has errors.
     fixed : tuple of str
         Parameters of surfels on faces that are not learned: "offset", "opacity" (the paper's ablation).
     device : {"cpu", "cuda"}
@@ -238,8 +239,10 @@ class _Work:
         return checkpoint.fingerprint(self.capture, **{name: settings[name] for name in DECIDES[phase]})
 
     def learn(self, phase: str, training: Training, begin: float, end: float) -> Gaussians:
-        """Run a training to its end, from its checkpoint if there is one: that of a run with other settings of later
-        phases serves as well."""
+        """Run a training to its end, from its checkpoint if there is one.
+
+        That of a run with other settings of later phases serves as well.
+        """
         file = self.file(phase)
         kept = checkpoint.Checkpoint(file, "" if file is None else self.key(phase), SAVE_EVERY)
         if (state := kept.load()) is not None:
@@ -337,8 +340,11 @@ def preview(gaussians: Gaussians, capture: Capture) -> Array:
 
 
 def judge(gaussians: Gaussians, capture: Capture) -> dict[str, float]:
-    """The views left out, whole pictures: "psnr", the mean of that of each as in published tables and in `drgs
-    evaluate`; "psnr_pooled", of the mean squared error over all; "ssim"."""
+    """Figures of the views left out, whole pictures.
+
+    "psnr" is the mean of that of each, as in published tables and in `drgs evaluate`; "psnr_pooled" that of the mean
+    squared error over all; "ssim".
+    """
     if not capture.testing:
         return {}
     errors, similar = [], []

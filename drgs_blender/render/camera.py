@@ -63,8 +63,10 @@ def check_camera(camera: Camera) -> None:
 
 
 def lean(camera: Camera) -> Array:
-    """(2,) float64: how far rays go to the left and down on a metre along the view axis, which they leave where an
-    orthographic camera looks through one place of its lens (`engine.blur.through`)."""
+    """(2,) float64: how far rays go to the left and down per metre along the view axis.
+
+    They leave it where an orthographic camera looks through one place of its lens (`ipc.blur.through`).
+    """
     matrix = np.asarray(camera.matrix_world, dtype=np.float64)
     return matrix[:3, :2].T @ matrix[:3, 2] if camera.orthographic else np.zeros(2)
 
@@ -150,8 +152,8 @@ def camera_ray(parameters, px, py):  # type: ignore[no-untyped-def]
 
     Returns
     -------
-    (ox, oy, oz, dx, dy, dz): float64; the direction has length 1 along the view axis, so that the ray's parameter is
-    the depth.
+    ox, oy, oz, dx, dy, dz : float
+        The direction has length 1 along the view axis, so that the ray's parameter is the depth.
     """
     p = parameters
     x = (px - p[CX]) / p[FX]

@@ -152,8 +152,9 @@ class Progressive:
 
     Parameters
     ----------
-    frame, processor : as of `pipeline.render`
+    frame : Frame
     backend : RenderBackend
+        As of `pipeline.render`.
     """
 
     def __init__(self, frame: Frame, backend: RenderBackend = CPU) -> None:

@@ -125,7 +125,8 @@ def pull_pixels(lane, lanes, room, record, values, box, start, listed, first, ne
     ----------
     first : (m,) array
         First row of each surfel's rectangle in what is written.
-    incoming : (h, w, G_FEATURES + channels)
+    incoming : (h, w, G_FEATURES + channels) float32 array
+        (h, w, G_FEATURES + channels).
     """
     (pulls,) = out
     height, width, channels = maps.shape[0], maps.shape[1], values.shape[1]
@@ -171,7 +172,8 @@ def sum_pixels(  # type: ignore[no-untyped-def]
     ----------
     listed, tiles, pairs : (k,) array
         Surfel, tile and number of each pair, in the order of tiles.
-    pulls : what `pull_pixels` wrote
+    pulls : array
+        What `pull_pixels` wrote.
     """
     (slots,) = out
     half, width, height = F(0.5), maps.shape[1], maps.shape[0]

@@ -22,7 +22,8 @@ class TensorLauncher(Launcher):
 
     Attributes
     ----------
-    place : where torch has it
+    place : torch.device
+        Where torch has it.
     """
 
     def __init__(self, device: str) -> None:

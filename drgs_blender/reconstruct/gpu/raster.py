@@ -122,7 +122,8 @@ class _Pairs:
         First pair of each surfel, as they are numbered.
     start : (tiles + 1,) int64 array
         First entry of each tile.
-    surfel, tile, number : (k,) int32, int32, int64 of the entries: pairs in the order of tiles, then of surfels
+    surfel, tile, number : (k,) array
+        Of the entries, int32, int32 and int64: pairs in the order of tiles, then of surfels.
     """
 
     def __init__(self, launcher: TensorLauncher, box: Tensor, tiles_x: int, tiles_y: int) -> None:

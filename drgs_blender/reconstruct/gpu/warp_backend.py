@@ -35,12 +35,12 @@ DESCEND = Work(descend_rows, (), {})
 class WarpLearningBackend(LearningBackend):
     """A device of Warp, on which torch has its tensors.
 
+    What fails there is a DeviceError of Warp's work, a RuntimeError of torch's.
+
     Parameters
     ----------
     device : str
         Warp's name of it: "cuda:0", "cpu".
-
-    What fails there is a DeviceError of Warp's work, a RuntimeError of torch's.
     """
 
     def __init__(self, device: str) -> None:

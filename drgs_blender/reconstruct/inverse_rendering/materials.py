@@ -55,9 +55,10 @@ class Materials:
 
     Attributes
     ----------
-    parameters : name -> tensor: "detail" (v, c), "grid0" ... (corners, c). With "metallic" the c = 5 columns are
+    parameters : dict of str to tensor
+        Name -> tensor: "detail" (v, c), "grid0" ... (corners, c). With "metallic" the c = 5 columns are
         albedo, roughness, metallic; with "dielectric" c = 4, without the last; with "specular" c = 7: diffuse colour,
-        roughness, specular colour
+        roughness, specular colour.
 
     Parameters
     ----------

@@ -40,7 +40,9 @@ class Pixels:
     ----------
     view : (n,) int32 array
         Index among the training views.
-    face : (n,) int32; corners : (n, 3) float32, barycentric
+    face : (n,) int32 array
+    corners : (n, 3) float32 array
+        Barycentric coordinates on the face.
     origin : (n, 3) float32 array
         World: the point on the mesh.
     flat : (n, 3) float32 array

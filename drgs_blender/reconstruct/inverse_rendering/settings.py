@@ -22,7 +22,8 @@ class Settings:
         Drawn in each step, over all training views.
     cosine, ggx, light : int
         Directions that each strategy draws at a pixel, even numbers.
-    look : BRDF, "principled" (Blender's) or "paper"
+    shading_model : {"principled", "paper"}
+        BRDF, "principled" (Blender's) or "paper".
     indirect : bool
         Light that other parts of the object send is what the photographs show of them; else it is black.
     shadows : bool

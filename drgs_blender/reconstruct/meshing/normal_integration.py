@@ -86,8 +86,10 @@ def shaded_by(binding: Binding, mesh: Mesh, normals: Array) -> Binding:
 
 
 def shaded_by_own(binding: Binding, mesh: Mesh, surfels: Surfels, turns: Array) -> Binding:
-    """`binding` with the surfels' own normals, on the side of their faces, to which `turns` (v, 3) of the mesh's
-    vertices are added."""
+    """`binding` with the surfels' own normals, on the side of their faces.
+
+    `turns` (v, 3) of the mesh's vertices are added to them.
+    """
     faces = Faces.of(mesh.vertices, mesh.faces)
     own = rotation_matrices(surfels.rotation.astype(np.float64))[..., 2]
     own = np.where(dot(own, faces.normal[binding.face])[:, None] < 0, -own, own)

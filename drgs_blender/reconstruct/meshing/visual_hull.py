@@ -311,7 +311,10 @@ def _carve(low: Array, spacing: float, shape: Array, views: list[View], masks: l
 
     Returns
     -------
-    (shape) bool, (shape) int32
+    kept : bool array
+        Of the grid's shape.
+    seen : int32 array
+        Of the grid's shape: how many views see each point.
     """
     seen, background = np.zeros(tuple(shape), np.int32), np.zeros(tuple(shape), np.int32)
     for view, mask in zip(views, masks, strict=True):

@@ -78,7 +78,11 @@ def attach_learned(
 
     Returns
     -------
-    surfels, their binding at offset 0, and the report of `deform.attach.attach`
+    surfels : Attached
+    binding : Binding
+        At offset 0.
+    report : dict
+        Of `deform.attach.attach`.
     """
     learned = pretrained.surfels()
     faces = Faces.of(mesh.vertices, mesh.faces)

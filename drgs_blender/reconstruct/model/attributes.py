@@ -44,7 +44,10 @@ def attributes(
 
     Returns
     -------
-    tangents u and v (n, 3) scaled by the standard deviations, opacity (n,), features (n, 6 or 10), all float32
+    tangent_u, tangent_v : (n, 3) float32 tensor
+        Scaled by the standard deviations.
+    opacity : (n,) float32 tensor
+    features : (n, 6 or 10) float32 tensor
     """
     return _Attributes.apply(centre.detach().numpy(), eye, bands, mirrors, *(parameters[name] for name in _NAMES))
 

@@ -43,7 +43,9 @@ def densify(
 
     Returns
     -------
-    surfels, and how many were "pruned" and "cut"
+    surfels : Gaussians
+    counts : dict of str to int
+        How many were "pruned" and "cut".
     """
     opacity = gaussians.opacities().numpy(force=True)
     scale = np.exp(gaussians.parameters["scale"].numpy(force=True))

@@ -96,8 +96,12 @@ def project(centre, tangent_u, tangent_v, opacity, p, width, height, record, dep
 
     Parameters
     ----------
-    p : `render.camera.camera_parameters` of a perspective camera
-    record, depth, box : (n, RECORD) float32, (n,) float32, (n, 4) int32 to fill
+    p : array
+        `render.camera.camera_parameters` of a perspective camera.
+    record : (n, RECORD) float32 array
+        To be filled, as the next two.
+    depth : (n,) float32 array
+    box : (n, 4) int32 array
     """
     for i in prange(len(centre)):
         project_surfel(i, centre, tangent_u, tangent_v, opacity, p, width, height, record, depth, box)

@@ -188,8 +188,10 @@ class _Rasterise(torch.autograd.Function):
 
 @njit(inline="always")
 def strength(ex, ey, ux, uy, vx, vy, i0, ix, iy, zc, dim, near, far):  # type: ignore[no-untyped-def]
-    """Squared radius and depth where a pixel at (ex, ey) from the centre meets a splat, and whether the exact
-    intersection decides (else the screen-space filter); u, v over z are the last two."""
+    """Squared radius and depth where a pixel at (ex, ey) from the centre meets a splat.
+
+    Then whether the exact intersection decides (else the screen-space filter); u, v over z are the last two.
+    """
     big = np.float32(1e30)
     z = np.float32(1.0) / (i0 + ix * ex + iy * ey)
     su, sv = ux * ex + uy * ey, vx * ex + vy * ey

@@ -35,7 +35,8 @@ class Adam:
 
     Attributes
     ----------
-    first, second : moments by name, tensors like the parameters
+    first, second : dict of str to tensor
+        Moments by name, tensors like the parameters.
     """
 
     def __init__(self, parameters: dict[str, Tensor], descend: Callable[..., None] = descend) -> None:

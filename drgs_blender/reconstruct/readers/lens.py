@@ -184,7 +184,7 @@ def undistorted(lens: Lens) -> tuple[Lens, Array]:
 
     Returns
     -------
-    pinhole
+    pinhole : Lens
     positions : array
         (2, height, width) float64, (row, column) in pixels of the photograph, pixel centres at integers.
     """

@@ -26,7 +26,8 @@ def usable(developed: Sequence[tuple[Photograph, View | None]], subject: str) ->
 
     Parameters
     ----------
-    developed : what `develop` made of each photograph
+    developed : list
+        What `develop` made of each photograph.
     subject : str
         The capture, for messages.
 

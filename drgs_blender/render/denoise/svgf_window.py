@@ -75,8 +75,11 @@ def window(shots: Sequence[Shot | None], split: bool = True, check: Callable[[],
 
 
 def _neighbours(shots: Sequence[Shot | None]) -> Iterator[tuple[int, Shot, Array, Array]]:
-    """The other pictures that can be reached: how many frames away, the picture, and for each pixel of the middle one
-    (h, w) the vector to its place there (pixels) and the world position it has there."""
+    """The other pictures that can be reached from the middle one.
+
+    Each with how many frames away it is, and for each pixel of the middle one (h, w) the vector to its place there
+    (pixels) and the world position it has there.
+    """
     middle = len(shots) // 2
     centre = shots[middle]
     for direction in (-1, 1):

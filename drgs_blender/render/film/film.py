@@ -82,7 +82,8 @@ class Film:
         buffer : GBuffer
         radiance : Radiance
         pass_index : (objects,) int32 array
-        light : what is seen behind, unless the film is transparent
+        environment : EnvironmentLight
+            What is seen behind, unless the film is transparent.
         environment : EnvironmentLight
         """
         x0, top = self.origin

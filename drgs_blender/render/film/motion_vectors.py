@@ -126,8 +126,10 @@ class MotionFilm:
 
 
 def motion(position: Array, previous: Array, coverage: Array, now: Array, then: Array) -> Motion:
-    """Motion of surfaces seen at `position` (h, w, 3) that are at `previous` at the other time; `now` and `then` are
-    the parameters of the cameras."""
+    """Motion of surfaces seen at `position` (h, w, 3) that are at `previous` at the other time.
+
+    `now` and `then` are the parameters of the cameras.
+    """
     vector = np.full((*coverage.shape, 2), np.nan, np.float32)
     _vectors(now, then, position, previous, coverage, vector)
     return Motion(vector, previous)

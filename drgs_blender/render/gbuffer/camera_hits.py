@@ -106,10 +106,14 @@ def trace_samples(lane, lanes, room, tracer, view_of, mask, owners, out):  # typ
 
     Parameters
     ----------
-    room : not used
-    view_of : `camera.camera_parameters`, column and row of the first sample
-    owners : object of each face and of each place
-    out : `MeshHits.arrays`
+    room : tuple
+        Not used.
+    view_of : tuple
+        `camera.camera_parameters`, column and row of the first sample.
+    owners : tuple of array
+        Object of each face and of each place.
+    out : tuple
+        `MeshHits.arrays`.
     """
     p, x0, y0 = view_of
     face_object, place_object = owners
@@ -142,12 +146,18 @@ def shade_hits(lane, lanes, room, geometry, moving, view_of, layer, hits, keys, 
 
     Parameters
     ----------
-    room : not used
-    geometry, moving : the scene's, and its vertices, faces and places
-    view_of : as of `trace_samples`
-    layer : flags that points must have
-    hits : `MeshHits.arrays`
-    keys, out : `arrays_of`
+    room : tuple
+        Not used.
+    geometry, moving : tuple
+        The scene's, and its vertices, faces and places.
+    view_of : tuple
+        As of `trace_samples`.
+    layer : int
+        Flags that points must have.
+    hits : tuple
+        `MeshHits.arrays`.
+    keys, out : tuple
+        `arrays_of`.
     """
     vertices, faces, places = moving
     p, x0, y0 = view_of

@@ -160,8 +160,10 @@ def _shoot(tracer, x, y, z, dx, dy, dz, reach):  # type: ignore[no-untyped-def]
 def _find(  # type: ignore[no-untyped-def]
     tracer, x, y, z, nx, ny, nz, vx, vy, vz, ahead, window
 ):
-    """Mesh point of the surfel point (x, y, z) with normal n, seen from v: how it was found, point, face normal, and
-    the face with u and v (-1: none)."""
+    """Mesh point of the surfel point (x, y, z) with normal n, seen from v.
+
+    How it was found, point, face normal, and the face with u and v (-1: none).
+    """
     how = NOWHERE
     face, a, b = np.int32(-1), np.float32(0.0), np.float32(0.0)
     hx, hy, hz, gx, gy, gz = x, y, z, nx, ny, nz
@@ -200,8 +202,10 @@ def attach_points(lane, lanes, room, tracer, rules, view_of, samples, keys, out)
 
     Parameters
     ----------
-    room : not used
-    rules, view_of, samples, keys, out : as of `tie_to_mesh`; the last is its three groups of arrays to be filled
+    room : tuple
+        Not used.
+    rules, view_of, samples, keys, out : tuple
+        As of `tie_to_mesh`; the last is its three groups of arrays to be filled.
     """
     tied, any_mesh = rules
     p, windows, x0, y0 = view_of
@@ -286,9 +290,10 @@ def tie_to_mesh(scene: TraceScene, *arguments: Any) -> None:
     Parameters
     ----------
     scene : TraceScene
-    arguments : tuples: whether points are tied at all, and whether there is a mesh; parameters of the camera, windows,
-        and the first column and row of the samples; depth, surface and object of these; pixel, sample and flags of the
-        points; and the arrays to be filled: origin, normal, geometric normal and view; albedo, roughness and metallic;
-        position, depth, object, face, place and barycentric coordinates
+    *arguments : tuple
+        Whether points are tied at all, and whether there is a mesh; parameters of the camera, windows, and the first
+        column and row of the samples; depth, surface and object of these; pixel, sample and flags of the points; and
+        the arrays to be filled: origin, normal, geometric normal and view; albedo, roughness and metallic; position,
+        depth, object, face, place and barycentric coordinates.
     """
     _attach(scene.tracer, *arguments, 8 * get_num_threads())

@@ -108,8 +108,10 @@ class Trees:
         On the device, those of each tree together.
     table : (trees, 3) int64 array
         Now: each one's id, mask and first of its `rows`.
-    moving : the scene's vertices, faces and places, on the device, now
-    trees : as many as there are kinds
+    moving : tuple
+        The scene's vertices, faces and places, on the device, now.
+    trees : list
+        As many as there are kinds.
     """
 
     def __init__(self, launcher: Launcher, layout: object, rows: Array, masks: Array) -> None:
@@ -129,8 +131,10 @@ class Trees:
         return known[0] is layout and np.array_equal(known[1], rows) and np.array_equal(known[2], masks)
 
     def follow(self, scene: TraceScene) -> Any:
-        """Bring them up to date; (3 m, 3) float32 corners of the scene's faces, on the device, which stay there until
-        the next time; None where nothing stands in places."""
+        """Bring them up to date; (3 m, 3) float32 corners of the scene's faces, on the device.
+
+        They stay there until the next time; None where nothing stands in places.
+        """
         launcher = self._launcher
         if self._faces is None or self._faces[0] is not scene.faces:
             self._faces, self._own = (scene.faces, launcher.array(scene.faces)), None

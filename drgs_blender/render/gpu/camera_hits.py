@@ -35,7 +35,8 @@ class DeviceHits(MeshHits):
 
     Attributes
     ----------
-    there : all arrays, on the device
+    on_device : tuple
+        All arrays, on the device.
     anew : callable
         Traces them on this processor.
     """

@@ -205,7 +205,8 @@ class DeviceSamples(SurfelSamples):
 
     Attributes
     ----------
-    there : depth, surface and object index, where they still are
+    on_device : tuple
+        Depth, surface and object index, where they still are.
     """
 
     on_device: tuple[Any, Any, Any]

@@ -1,7 +1,6 @@
-"""Surfels projected, sorted and listed by tile on a device, where they stay: what `surfels.splats.prepare` makes, from
-the same source.
+"""Surfels projected, sorted and listed by tile on a device, where they stay.
 
-The functions here are translated and never run as they stand.
+What `surfels.splats.prepare` makes, from the same source. The functions here are translated and never run as they stand.
 """
 
 from __future__ import annotations
@@ -46,7 +45,8 @@ class DeviceSplats(Splats):
 
     Attributes
     ----------
-    here : the same on the processor, made when that is asked for
+    on_cpu : callable
+        The same on the processor, made when that is asked for.
     """
 
     on_cpu: Callable[[], Splats]
@@ -119,7 +119,8 @@ def prepare(
 
     Parameters
     ----------
-    here : makes the same on the processor
+    on_cpu : callable
+        Makes the same on the processor.
     launcher : Launcher
     posed : PosedSurfels
     camera : Camera

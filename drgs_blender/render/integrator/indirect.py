@@ -153,11 +153,15 @@ def trace_paths(s, ints, count, scene, illumination, shading_model, table, bounc
 
     Parameters
     ----------
-    scene : (Tracer or MixedTracer, Geometry, extent)
-    illumination : (EnvMap, whether it shines, tables of lights, whether there are any: one of them is sampled at every
-        vertex)
-    bounces : vertices of a path, and whether there are surfaces that emit, which are looked for beyond the last too
-    shift : 0, or ``ray_masks.WITHOUT``
+    scene : tuple
+        (Tracer or MixedTracer, Geometry, extent).
+    illumination : tuple
+        (EnvMap, whether it shines, tables of lights, whether there are any: one of them is sampled at every
+        vertex).
+    bounces : tuple
+        Vertices of a path, and whether there are surfaces that emit, which are looked for beyond the last too.
+    shift : int
+        0, or ``ray_masks.WITHOUT``.
     found : (capacity, FOUND) float32 array
         INDIRECT is written.
     """

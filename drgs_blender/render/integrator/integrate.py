@@ -71,20 +71,24 @@ def integrate(
 
     Parameters
     ----------
-    scene, light, lights : what rays meet, what they see when they meet nothing, and what shines in between
+    scene : TraceScene
+        What rays meet.
     environment : EnvironmentLight
+        What rays see that meet nothing.
     points : ShadingPoints
         Visible points, world space.
     settings : RenderSettings
         Samples per pixel, divided among its ``subpixel_count`` places; bounces, shading model, seed, clamp.
     noise_index : int
         Part of the seed.
+    lights : Lights, optional
+        All other lights.
     part : tuple of int
         (i, n): only the i-th of n equal parts of each sub-sample's samples; the mean over all parts is the whole.
     surfels : SurfelBVH, optional
         What rays meet of DR-GS objects next to the scene's meshes; then `points` say which surfels are their own.
     kernel : Kernel, optional
-        None: that of this processor.
+        None: that of the CPU.
 
     Returns
     -------
@@ -192,9 +196,12 @@ def shade_points(  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    room : scratch memory, see `_room`
-    keys, frames, surfaces : arrays of the points
-    out : components and moments of their `Radiance`
+    room : tuple
+        Scratch memory, see `_room`.
+    keys, frames, surfaces : tuple of array
+        Of the points.
+    out : tuple of array
+        Components and moments of their `Radiance`.
     """
     pixel, sample, flags = keys
     components, moments = out

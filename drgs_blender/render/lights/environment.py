@@ -105,7 +105,8 @@ class EnvironmentLight:
         The cells in which it is sampled.
     row_z : (rows + 1,) float32 array
         z at the upper edge of each row of cells, from 1 to -1.
-    facing : the cells weighed by the cosine at a surface
+    product : ProductTables
+        The cells weighed by the cosine at a surface.
     rotation : (3, 3) float32 array
         World direction to environment direction.
     bad_texels : int

@@ -74,8 +74,9 @@ class Lights:
         Which of `lights` each row is.
     count : int
         Lights that shine, and triangles.
-    power : estimated luminance that arrives at the sphere from all directions together (cd / m^2 sr), as the integral
-        of an environment over all directions is
+    power : float
+        Estimated luminance that arrives at the sphere from all directions together (cd / m^2 sr), as the integral
+        of an environment over all directions is.
     rays_differ : bool
         There is one that diffuse rays see and glossy ones do not, or the other way.
     seen : bool
@@ -124,7 +125,11 @@ class Lights:
 
         Returns
         -------
-        (directions (n, 3), distances (n,), radiance (n, 3), densities (n,), rows (n,))
+        directions : (n, 3) array
+        distances : (n,) array
+        radiance : (n, 3) array
+        densities : (n,) array
+        rows : (n,) array
         """
         numbers = np.ascontiguousarray(numbers, np.uint32)
         out, rows = _sample_many(numbers, _rows(points, numbers), *self.tables)
@@ -184,7 +189,7 @@ def sample_light(n0, n1, n2, px, py, pz, table, pick, emitters):  # type: ignore
 
     Returns
     -------
-    (lx, ly, lz, distance, r, g, b, pdf, index)
+    lx, ly, lz, distance, r, g, b, pdf, index : float
         World direction of unit length, distance to the light (infinite for suns), radiance, density per solid angle
         times the probability of the pick, row of the table or, behind those, of the emitters. A negative density
         marks a light that no other strategy finds (without size, or one that nothing shadows): what it adds is
@@ -258,13 +263,16 @@ def emission_along(ox, oy, oz, dx, dy, dz, hit, geometry, table, pick, emitters)
 
     Parameters
     ----------
-    ox .. dz : origin and unit direction, world space
-    hit : what ``trace.surface.nearest`` returned
-    geometry : the scene's
+    ox, oy, oz, dx, dy, dz : float
+        Origin and unit direction, world space.
+    hit : tuple
+        What ``trace.surface.nearest`` returned.
+    geometry : Geometry
+        The scene's.
 
     Returns
     -------
-    (r, g, b, diffuse, glossy)
+    r, g, b, diffuse, glossy : float
         Radiance, 0 without a hit; density per solid angle, pick included, with which ``sample_light`` draws this
         direction by this surface, for either lobe.
     """
@@ -308,15 +316,20 @@ def lights_along(ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, pi
 
     Parameters
     ----------
-    ox .. dz : origin and unit direction, world space; tmax : distance of the surface behind, infinite when none
-    others : sum over all other strategies of count times density in this direction; must be positive
+    ox, oy, oz, dx, dy, dz : float
+        Origin and unit direction, world space.
+    tmax : float
+        Distance of the surface behind, infinite when none.
+    others : float
+        Sum over all other strategies of count times density in this direction; must be positive.
     share : int
         Number of light samples that the balance heuristic reckons with; 0 leaves them out.
-    seen_by : CAMERA, DIFFUSE or GLOSSY: lights that such rays do not see are left out
+    seen_by : int
+        CAMERA, DIFFUSE or GLOSSY: lights that such rays do not see are left out.
 
     Returns
     -------
-    (r, g, b)
+    r, g, b : float
     """
     red, green, blue = ZERO, ZERO, ZERO
     node, count = np.int64(1), np.int64(pick[0, COUNT])

@@ -68,7 +68,10 @@ def build(rows: Array, scale: float) -> tuple[Array, Array]:
 
     Returns
     -------
-    (2^(depth + 1), 16) float32 nodes; (n + 1,) float64 sums of the power of all rows before each
+    nodes : (k, 16) float32 array
+        With k = 2^(depth + 1).
+    sums : (n + 1,) float64 array
+        Of the power of all rows before each.
     """
     nodes = np.zeros((2 << depth_of(len(rows)), _NODE_WIDTH), np.float32)
     power = rows[:, LUMINANCE].astype(np.float64) * rows[:, AREA]

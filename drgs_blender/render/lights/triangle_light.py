@@ -144,7 +144,7 @@ def triangle_direction(i, n1, n2, px, py, pz, rows):  # type: ignore[no-untyped-
 
     Returns
     -------
-    lx, ly, lz, t, u, v, density
+    lx, ly, lz, t, u, v, density : float
         Unit direction, distance (not positive when it is none: the triangle is seen from its edge), barycentric
         coordinates of the second and third corner, density per solid angle.
     """

@@ -144,10 +144,9 @@ def evaluate(
     ----------
     normal, view, light : (..., 3) tensor
         Unit vectors, broadcastable.
-    albedo : (..., 3); roughness, metallic : (...)
-    look : "principled" or "paper"
+    albedo : (..., 3) tensor
     roughness, metallic : tensor
-    shading_model : str
+    shading_model : {"principled", "paper"}
 
     Returns
     -------

@@ -78,8 +78,9 @@ class TriangleTracer:
 
     Parameters
     ----------
-    vertices : (n, 3) world space; faces : (m, 3) integers
-    faces : tensor
+    vertices : (n, 3) tensor
+        World space.
+    faces : (m, 3) tensor
     albedo : (n, 3) tensor
         Per vertex; may require gradients.
     roughness, metallic : (n,) tensor

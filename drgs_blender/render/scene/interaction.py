@@ -172,14 +172,15 @@ def surface_at(face, place, u, v, gx, gy, gz, dx, dy, dz, geometry):  # type: ig
 
     Parameters
     ----------
-    face, place, u, v, gx, gy, gz : of the hit; face >= 0
+    face, place, u, v, gx, gy, gz : float
+        Of the hit; face >= 0.
     dx, dy, dz : float
         Direction of the ray.
     geometry : Geometry
 
     Returns
     -------
-    nx, ny, nz, gx, gy, gz, r, g, b, roughness, metallic, er, eg, eb : float32, object : int32
+    nx, ny, nz, gx, gy, gz, r, g, b, roughness, metallic, er, eg, eb, object : float
         Unit shading and geometric normal, albedo, emitted radiance; linear Rec.709.
     """
     corner = 3 * np.int64(face)
@@ -237,7 +238,8 @@ def position_at(face, place, u, v, vertices, faces, places):  # type: ignore[no-
 
     Parameters
     ----------
-    vertices, faces : ``TriangleBVH``'s
+    vertices, faces : array
+        ``TriangleBVH``'s.
     places : (p, 3, 4) float32 array
         ``TraceScene.places``.
     """

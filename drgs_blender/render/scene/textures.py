@@ -98,14 +98,16 @@ class MaterialTable:
 
     Attributes
     ----------
-    addresses : of the six arrays, for ``material_at``; valid as long as this table lives
-    arrays : what ``material_at`` reads:
+    addresses : tuple of int
+        Of the six arrays, for ``material_at``; valid as long as this table lives.
+    arrays : tuple of array
+        What ``material_at`` reads:
         constants (k, 8) float32, the eight results without textures;
         slots (k, 4) int32, rows of textures for base colour, roughness, metallic and emission, or -1;
         textures (t, 4) int32, image, channel, interpolation, extension;
         transforms (t, 6) float32;
         images (i, 4) int64, address, width, height, kind;
-        decode (256,) float32, linear value of each sRGB byte
+        decode (256,) float32, linear value of each sRGB byte.
     glows : bool
         Whether anything emits light.
     warnings : list of str
@@ -379,14 +381,16 @@ def material_at(material, u, v, addresses):  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    material : integer, index into the materials of the table; not checked
+    material : int
+        Index into the materials of the table; not checked.
     u, v : float
         v upwards.
-    addresses : ``MaterialTable.addresses``
+    addresses : tuple of int
+        ``MaterialTable.addresses``.
 
     Returns
     -------
-    r, g, b, roughness, metallic, er, eg, eb : float32
+    r, g, b, roughness, metallic, er, eg, eb : float
         Base colour, linear Rec.709, above 1 where it was given so; roughness and metallic in [0, 1]; emitted radiance,
         linear Rec.709, finite, >= 0.
     """

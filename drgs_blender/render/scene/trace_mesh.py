@@ -80,7 +80,8 @@ class Part:
         What was last taken in; None before the first time.
     faces : (m, 3) int32 array
         Of its own vertices.
-    vertex, face, row : its rows among vertices, faces, and ``shading`` (objects) or ``normals`` (meshes)
+    vertex, face, row : slice
+        Its rows among vertices, faces, and ``shading`` (objects) or ``normals`` (meshes).
     mask : int
         Of its group.
     smooth : bool

@@ -62,13 +62,15 @@ class Glowing:
     ----------
     mesh : MeshState
         As given.
-    shape : all faces of the mesh, among the scene's
+    shape : slice
+        All faces of the mesh, among the scene's.
     faces : (k,) int64 array
         Those that emit.
     material : (k,) int32 array
         Of ``TraceScene.materials``.
     uvs : (k, 3, 2) float32 array or None
-    places : rows of ``TraceScene.places``, or None where the faces are in world space
+    places : array, optional
+        Rows of ``TraceScene.places``, or None where the faces are in world space.
     """
 
     mesh: MeshState
@@ -89,10 +91,14 @@ class TraceScene:
     ----------
     bvh : TriangleBVH
         TriangleBVH over everything.
-    layout : another object whenever vertices and faces are numbered anew
-    version : another object after every update
-    vertices : (n, 3) float32, faces : (m, 3) int32: as traced (``bvh``'s own arrays), world space save for meshes in
-        several places; a face with a bad vertex is collapsed to one point
+    layout : object
+        Another object whenever vertices and faces are numbered anew.
+    version : object
+        Another object after every update.
+    vertices : (n, 3) float32 array
+        As traced (``bvh``'s own), world space save for meshes in several places.
+    faces : (m, 3) int32 array
+        As traced; a face with a bad vertex is collapsed to one point.
     face_object : (m,) int32 array
         Object of each face (of a mesh in several places: the mesh).
     shading_faces : (m, 3) int32 array

@@ -94,7 +94,8 @@ def transmittance(  # type: ignore[no-untyped-def]
     ----------
     tracer : SurfelTracer
         Or anything that has its fields.
-    ox .. dz : float32 origin and unit direction, world space
+    ox, oy, oz, dx, dy, dz : float
+        Origin and unit direction, world space.
     mask : int
         See ``SurfelBVH.update``; -1 meets all.
     own : int
