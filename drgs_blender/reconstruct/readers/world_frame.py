@@ -94,7 +94,8 @@ def _spread(matrices: Array) -> float:
 def check_silhouettes(views: Sequence[View], subject: str, axes: str) -> None:
     """Raise AssetError where the masks of `views` have no common shape, or are inverted.
 
-    The message names the convention in which they have one. The visual hull of an object covers its silhouettes when the cameras are right, and is empty when they are not.
+    The message names the convention in which they have one. The visual hull of an object covers its silhouettes when
+    the cameras are right, and is empty when they are not.
     """
     masked = [view for view in views if view.mask is not None and view.mask.any() and not view.mask.all()]
     if len(masked) < 3:

@@ -1,6 +1,7 @@
 """Surfels projected, sorted and listed by tile on a device, where they stay.
 
-What `surfels.splats.prepare` makes, from the same source. The functions here are translated and never run as they stand.
+What `surfels.splats.prepare` makes, from the same source. The functions here are translated and never run as they
+stand.
 """
 
 from __future__ import annotations
