@@ -172,7 +172,7 @@ def main(path: str) -> None:
         scene, how, out = prepare(job), SUBJECTS[name], Path(job["out"])
 
         def picture(step: str, scene: bpy.types.Scene = scene, stem: Path = out / name) -> None:
-            for camera_sees, samples, subpixels in (("surfels", job["rays"], 16), ("mesh", 16, 1)):
+            for camera_sees, samples, subpixels in (("surfels", job["samples"], 16), ("mesh", 16, 1)):
                 scene.drgs.camera_sees, scene.drgs.samples, scene.drgs.subpixel_samples = (
                     camera_sees,
                     samples,

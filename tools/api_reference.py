@@ -71,7 +71,7 @@ def pages(root: Path, package: str = PACKAGE) -> dict[str, str]:
     dict of str to str
         Name of a module to the text of its page.
     """
-    tree = griffe.load(package, search_paths=[str(root)], allow_inspection=False)
+    tree: Any = griffe.load(package, search_paths=[str(root)], allow_inspection=False)
     names = public_modules(root, package)
     modules = {name: tree if name == package else tree[name.removeprefix(package + ".")] for name in names}
     writer = Writer(tree, {o.path for m in modules.values() for o in documented(m)} | set(modules))
@@ -227,7 +227,8 @@ class Writer:
 
     def text(self, text: str, scope: Any) -> list[str]:
         """Paragraphs of a docstring as Markdown, line by line; what is indented by four spaces is code."""
-        lines, code = [], False
+        lines: list[tuple[bool, str]] = []
+        code = False
         for line in text.strip("\n").split("\n"):
             blank = not lines or not lines[-1][1].strip()
             code = (code or blank) if line.startswith("    ") else code and not line.strip()

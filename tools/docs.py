@@ -157,7 +157,10 @@ class Page:
             svg = mermaidx.render(found[1]).svg()
         except RuntimeError as error:
             raise DocsError(f"{self.name}: a Mermaid diagram cannot be drawn ({error}). Correct it") from error
-        width = float(re.search(r'viewBox="[-\d.]+ [-\d.]+ ([\d.]+)', svg)[1]) * DIAGRAM_SCALE
+        box = re.search(r'viewBox="[-\d.]+ [-\d.]+ ([\d.]+)', svg)
+        if box is None:
+            raise DocsError(f"{self.name}: a Mermaid diagram came out without a size. Simplify it")
+        width = float(box[1]) * DIAGRAM_SCALE
         svg = svg.replace('width="100%"', f'width="{width:.0f}"', 1).replace("\n", " ")
         return f'```{{raw}} html\n<div class="diagram">{svg}</div>\n```'
 

@@ -210,7 +210,7 @@ def _options(scene: bpy.types.Scene, name: str, composited: bool) -> dict[str, A
     options = scene.drgs
     settings = options.to_settings(composited or scene.render.film_transparent, preferences.read("threads", 0))
     return {
-        "number": scene.frame_current if options.use_animated_seed else 0,
+        "noise_index": scene.frame_current if options.use_animated_seed else 0,
         "settings": settings,
         "passes": ("Combined", "Depth") if composited else ("Combined",),
         "history": name if options.use_viewport_denoise else "",

@@ -54,7 +54,7 @@ def test_images_are_written_by_the_uv_map(lit, scene, tmp_path):
     with pytest.raises(RuntimeError, match="has no UV map"):
         bpy.ops.drgs.bake_light(target="IMAGE", directory=str(tmp_path))
     with_uvs(lit)
-    options = {"target": "IMAGE", "directory": str(tmp_path), "size": 32, "rays": 32, "light": "diffuse"}
+    options = {"target": "IMAGE", "directory": str(tmp_path), "size": 32, "samples": 32, "light": "diffuse"}
     assert bpy.ops.drgs.bake_light(**options, use_animation=True) == {"FINISHED"}
     first, second = (read_exr(tmp_path / f"ball_{number:04}.exr", 32, 32)[8:24, 8:24] for number in (1, 2))
     # Smooth normals of coarse faces lose what lies below the face itself, in the renderer as well: at most a tenth.
@@ -75,7 +75,7 @@ def with_uvs(obj):
 def test_an_image_shows_what_was_baked_last(lit, scene, tmp_path):
     """Whatever it was before: other pixels, another size, another colour space, packed."""
     with_uvs(lit)
-    options = {"target": "IMAGE", "directory": str(tmp_path), "rays": 8, "light": "diffuse"}
+    options = {"target": "IMAGE", "directory": str(tmp_path), "samples": 8, "light": "diffuse"}
     bpy.ops.drgs.bake_light(**options, size=32)
     image = bpy.data.images["ball_0001.exr"]
     dark = np.array(image.pixels).reshape(32, 32, 4)[8:24, 8:24].mean(axis=(0, 1))

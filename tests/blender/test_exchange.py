@@ -164,7 +164,7 @@ def test_the_dialogs_show_what_goes_with_the_format(ball, scene):
     operator = part("operators.export").DRGS_OT_export
     values = {"colour": "relit", "use_animation": True}
     for format_, wanted, unwanted in (
-        ("SPZ", {"rays", "scale", "use_selection", "frame_end"}, {"up"}),
+        ("SPZ", {"samples", "scale", "use_selection", "frame_end"}, {"up"}),
         ("3DGS PLY", {"up", "colour"}, set()),
         ("glTF mesh", {"scale"}, {"colour", "up"}),
         ("OpenEXR", {"format"}, {"scale", "use_selection", "colour"}),

@@ -343,7 +343,7 @@ def test_settings_of_another_version_become_sound_and_are_named(ball, scene, exp
     """A number out of its limits, no number, an entry that this version does not know, another type."""
     blur = part("addon.render_engine.blur")
     kept = {
-        "rays": 2**31 - 1,
+        "samples": 2**31 - 1,
         "camera_sees": 7,
         "bounces": -3,
         "clamp_indirect": float("nan"),
@@ -363,7 +363,7 @@ def test_settings_of_another_version_become_sound_and_are_named(ball, scene, exp
     assert len(blur.steps(scene, scene.camera, warnings.append)) == 1024
     named = {w.split(" is ")[0] for w in warnings}
     assert named == {
-        'Scene "Scene": Rays', 'Scene "Scene": Primary', 'Scene "Scene": Bounces', 'Scene "Scene": Clamp Indirect',
-        'Scene "Scene": Blur Steps', 'View layer "ViewLayer": Other Objects', 'Object "ball": Roughness Factor',
+        'Scene "Scene": Samples', 'Scene "Scene": Camera Sees', 'Scene "Scene": Bounces',
+        'Scene "Scene": Clamp Indirect', 'Scene "Scene": Blur Steps', 'View layer "ViewLayer": Other Objects', 'Object "ball": Roughness Factor',
     }  # fmt: skip
     assert all("is used. Set it anew" in w for w in warnings)

@@ -117,7 +117,7 @@ def test_a_viewport_says_it_with_its_part_and_can_be_closed(cold, monkeypatch):
 
 def test_a_picture_that_is_refined_says_it_too(scene, monkeypatch):
     """Kernels that are not counted have no part of their own."""
-    frame = SimpleNamespace(settings=SimpleNamespace(samples=8))
+    frame = SimpleNamespace(settings=SimpleNamespace(sample_count=8))
     picture = SimpleNamespace(request=SimpleNamespace(frame=frame), fraction=0.5)
     phase = [("Rendering", 0.5)]
     worker = SimpleNamespace(state=lambda name: ("", ""), progress=lambda name: phase[0], names=lambda: ["a"])

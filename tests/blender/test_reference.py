@@ -61,7 +61,7 @@ def test_every_property_of_every_group_is_listed(pages):
         "object.drgs.physics": physics.DrgsPhysicsSettings,
         "object.drgs.physics.regions[i]": physics.DrgsPhysicsRegion,
         "object.drgs.physics.colliders[i]": physics.DrgsPhysicsCollider,
-        f'preferences.addons["{PACKAGE}"].preferences': part("addon.preferences").DrgsPreferences,
+        f'preferences.addons["{PACKAGE}"].preferences': part("addon.panels.preferences").DrgsPreferences,
     }
     assert set(listed) == set(groups)
     for name, cls in groups.items():

@@ -349,18 +349,16 @@ def worker():
     part("addon.engine_link").stop()
 
 
-def request(scene, x=0.0, size=(64, 48), rays=None):
+def request(scene, x=0.0, size=(64, 48), samples=None):
     """What a viewport `x` to the side would ask for."""
     module, frame = part("addon.viewport.worker"), exported()
     model = part("drgs_blender.core.frame")
     matrix = np.array(scene.camera.matrix_world)
     matrix[0, 3] += x
     camera = model.Camera(matrix, *size, size[0], size[0], size[0] / 2, size[1] / 2)
-    settings = (
-        frame.frame.settings
-        if rays is None
-        else dataclasses.replace(frame.frame.settings, samples=rays, strategy_samples=None)
-    )
+    settings = frame.frame.settings
+    if samples is not None:
+        settings = dataclasses.replace(settings, samples=samples, strategy_samples=None)
     found = dataclasses.replace(frame.frame, camera=camera, passes=("Combined",), settings=settings)
     return module.Request(found, part("addon.engine_link").client(), frame.assets)
 

@@ -188,7 +188,7 @@ def test_settings_follow_keyframes_and_drivers(ball, scene, export):
     scene.drgs.use_strategy_samples = False
     for number, samples in ((1, 8), (11, 108)):
         scene.drgs.samples = samples
-        scene.drgs.keyframe_insert("rays", frame=number)
+        scene.drgs.keyframe_insert("samples", frame=number)
     driver = scene.driver_add("drgs.clamp_indirect").driver
     variable = driver.variables.new()
     variable.name, variable.targets[0].id_type, variable.targets[0].id = "z", "OBJECT", ball

@@ -44,7 +44,7 @@ ANIMATION = """
 scene = opened()
 scene.frame_start, scene.frame_end, scene.frame_step = 1, 3, 2
 scene.render.filepath = {out!r} + "/####"
-scene.drgs.samples = {rays}
+scene.drgs.samples = {samples}
 bpy.ops.render.render(animation=True)
 """
 END = """

@@ -120,7 +120,9 @@ def test_the_sky_is_looked_up_to_the_last_bit() -> None:
     u, v = floats(3000, (0, 1), (0, 1))
     rows = np.random.default_rng(3).integers(0, 576, 3000)
     for function, columns in ((environment.envmap_radiance, [u, v]), (environment.envmap_pdf, [u, v, rows])):
-        np.testing.assert_array_equal(on_device(function, columns, (sky.sky,)), here(function, columns, (sky.sky,)))
+        np.testing.assert_array_equal(
+            on_device(function, columns, (sky.envmap,)), here(function, columns, (sky.envmap,))
+        )
 
 
 # --- the language ----------------------------------------------------------------------------------------------------

@@ -435,7 +435,8 @@ def test_nothing_to_do_is_done() -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"cosine": -1}, {"bounces": -1}, {"subpixel_samples": -1}, {"shading_model": "toon"}]
+    "wrong",
+    [{"samples": -1, "strategy_samples": None}, {"bounces": -1}, {"subpixel_samples": -1}, {"shading_model": "toon"}],
 )
 def test_settings_that_make_no_sense_are_refused(wrong: dict) -> None:
     with pytest.raises(UsageError, match="render settings"):
