@@ -207,7 +207,7 @@ def properties_page(package: str) -> str:
         out += [text(about), "", *table(properties(rna))]
         computed = [(n, p) for n, p in vars(cls).items() if isinstance(p, property) and p.__doc__] if cls else []
         if computed:
-            out += ["", "Only to be read:", "", *(f"- `{n}`: {text(p.__doc__)}" for n, p in computed)]
+            out += ["", "Only to be read:", "", *(f"- `{n}`: {text(p.__doc__ or '')}" for n, p in computed)]
     return "\n".join(out) + "\n"
 
 

@@ -364,6 +364,7 @@ def test_settings_of_another_version_become_sound_and_are_named(ball, scene, exp
     named = {w.split(" is ")[0] for w in warnings}
     assert named == {
         'Scene "Scene": Samples', 'Scene "Scene": Camera Sees', 'Scene "Scene": Bounces',
-        'Scene "Scene": Clamp Indirect', 'Scene "Scene": Blur Steps', 'View layer "ViewLayer": Other Objects', 'Object "ball": Roughness Factor',
+        'Scene "Scene": Clamp Indirect', 'Scene "Scene": Blur Steps', 'View layer "ViewLayer": Other Objects',
+        'Object "ball": Roughness Factor',
     }  # fmt: skip
     assert all("is used. Set it anew" in w for w in warnings)

@@ -198,7 +198,7 @@ def test_settings_follow_keyframes_and_drivers(ball, scene, export):
     for number in (1, 6, 11):
         scene.frame_set(number)
         settings = export()[0].settings
-        seen.append(settings.cosine_samples + settings.ggx_samples + settings.environment_samples)
+        seen.append(settings.sample_count)
         assert settings.clamp_indirect == pytest.approx(3)
     assert seen[0] == 8 and seen[2] == 108 and 8 < seen[1] < 108
 
