@@ -45,16 +45,16 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
         name="Samples per Strategy", description="Choose the number of samples of each strategy", default=False
     )
     cosine_samples: IntProperty(
-        name="Cosine",
-        description="Samples per pixel drawn by the cosine of the angle",
+        name="Diffuse (Cosine)",
+        description="Samples per pixel for matte reflection",
         min=1,
         soft_max=512,
         max=65536,
         default=16,
     )
     ggx_samples: IntProperty(
-        name="GGX",
-        description="Samples per pixel drawn by the shape of the highlight",
+        name="Glossy (GGX)",
+        description="Samples per pixel for highlights and mirrors",
         min=1,
         soft_max=256,
         max=65536,
@@ -62,7 +62,7 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
     )
     environment_samples: IntProperty(
         name="Lights",
-        description="Samples per pixel drawn towards the world and lights, the brighter the more",
+        description="Samples per pixel towards the World and lights; bright ones get more",
         min=1,
         soft_max=256,
         max=65536,
@@ -70,7 +70,7 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
     )
     bounces: IntProperty(
         name="Bounces",
-        description="Times that light is passed on between surfaces",
+        description="Indirect bounces; 0 is direct light only",
         min=0,
         soft_max=8,
         max=64,
@@ -78,10 +78,10 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
     )
     device: EnumProperty(
         name="Device",
-        description="What traces the light, bakes simulations and learns from photographs. Without a card the "
-        "processor does all, and says so",
+        description="What renders, simulates and reconstructs. Without a supported card the CPU is used, with a "
+        "warning",
         items=[
-            ("CPU", "CPU", "The processor"),
+            ("CPU", "CPU", "Use the CPU"),
             ("CUDA", "GPU (CUDA)", "An NVIDIA card; Set Up Engine fetches what it needs"),
         ],
         default="CPU",
@@ -102,7 +102,7 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
     )
     clamp_indirect: FloatProperty(
         name="Clamp Indirect",
-        description="Limit the brightness of a single sample of passed-on light. Takes away bright specks, and some "
+        description="Limit the brightness of a single sample of indirect light. Takes away bright specks, and some "
         "light with them; 0 is off",
         min=0.0,
         soft_max=100.0,
@@ -140,7 +140,7 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
     )
     rays_see: EnumProperty(
         name="Rays See",
-        description="What shadow rays, reflections and indirect light meet of DR-GS objects",
+        description="What shadows, reflections and indirect light use of DR-GS objects",
         items=(
             ("mesh", "Mesh", "The triangle mesh that carries the surfels; fast"),
             (
@@ -201,7 +201,7 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
         description="How surfaces reflect light",
         items=(
             ("principled", "Principled", "As Blender's Principled BSDF with GGX"),
-            ("paper", "As Captured", "The BRDF of the paper, with which materials may have been reconstructed"),
+            ("paper", "Cook-Torrance (Paper)", "The paper's BRDF, with which materials may have been reconstructed"),
         ),
         default="principled",
     )

@@ -73,7 +73,7 @@ class DrgsSubmitSettings(bpy.types.PropertyGroup):
     )
     shared: StringProperty(
         name="Shared Folder",
-        description="What all nodes see under the same path; files outside of it are faults. Empty: not looked at",
+        description="Folder that all nodes share under the same path; files outside are reported. Empty: not checked",
         subtype="DIR_PATH",
         options=_RELATIVE,
     )
@@ -84,7 +84,7 @@ class DrgsSubmitSettings(bpy.types.PropertyGroup):
         name="Options", description="Further options of drgs render, such as --threads 8 --memory-mb 6000"
     )
     retries: IntProperty(
-        name="Retries", description="How often a task is queued again whose engine died", min=0, soft_max=10, default=3
+        name="Retries", description="How often a task is retried when the engine crashes", min=0, soft_max=10, default=3
     )
     sbatch: StringProperty(
         name="Options of sbatch", description="Separated by spaces, such as --partition=farm --cpus-per-task=8"

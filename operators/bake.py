@@ -32,7 +32,7 @@ class DRGS_OT_bake_light(CommandOperator, selection.ObjectMode, bpy.types.Operat
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - read by Blender
 
     target: EnumProperty(
-        name="To",
+        name="Bake To",
         description="Where the colour goes",
         items=(
             ("ATTRIBUTE", "Attribute", "A colour attribute of the vertices; one for each frame of an animation"),
@@ -56,7 +56,7 @@ class DRGS_OT_bake_light(CommandOperator, selection.ObjectMode, bpy.types.Operat
         description="Part of the light that is baked",
         items=(
             ("all", "All", "Diffuse light and highlights, these as seen along the normal"),
-            ("diffuse", "Diffuse", "What looks the same from everywhere"),
+            ("diffuse", "Diffuse", "Only light that is the same from every viewpoint"),
         ),
         default="all",
     )

@@ -64,8 +64,8 @@ class DRGS_OT_reconstruct(CommandOperator, bpy.types.Operator):
     )
     test_every: IntProperty(
         name="Hold Out Every Nth Photo",
-        description="Learn nothing from every nth photograph, and measure the result on those; 0 holds out what the "
-        "capture names for tests",
+        description="Keep every nth photograph for measuring the quality; 0 uses the test photographs that the "
+        "capture names",
         default=0,
         min=0,
     )

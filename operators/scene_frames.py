@@ -35,7 +35,7 @@ class SceneFrames(CommandOperator):
         items=(
             ("captured", "Captured", "The captured colour, turned with the surface; else the albedo"),
             ("albedo", "Albedo", "The colour of the surface without light, as it is painted"),
-            ("relit", "Light of the Scene", "The colour in the light of the World, lamps and surfaces that emit"),
+            ("relit", "Light of the Scene", "Lit by the World, lights and surfaces that emit"),
         ),
         default="captured",
     )

@@ -63,7 +63,7 @@ def _check_rays(world: bpy.types.World, warn: Warn) -> None:
     blind = [name for name in ("camera", "diffuse", "glossy") if rays is not None and not getattr(rays, name)]
     if blind:
         hint = "; Film > Transparent hides it from the camera" if "camera" in blind else ""
-        warn(f'World "{world.name}": that {" and ".join(blind)} rays do not see it is not rendered{hint}')
+        warn(f'World "{world.name}": its Ray Visibility is ignored, {" and ".join(blind)} rays see it{hint}')
 
 
 def _usable(colour: np.ndarray, rotation: np.ndarray, name: str, warn: Warn) -> np.ndarray:
@@ -125,7 +125,7 @@ class _Tree(Walker):
             factor = origin.input(0).origin()
             shaders = self.shader(origin.input(1)), self.shader(origin.input(2))
             if factor.socket.is_output and factor.node.type == "LIGHT_PATH":
-                self.warn(node, f'"{factor.socket.name}" cannot be told apart; the light that other rays see is used')
+                self.warn(node, f'"{factor.socket.name}" cannot be told apart: what other rays see is used')
                 return shaders[0]
             share = float(np.clip(self.value(origin.input(0)), 0, 1))
             return self.sum(node, shaders[0].times(1 - share), shaders[1].times(share))

@@ -23,7 +23,7 @@ class DrgsPreferences(bpy.types.AddonPreferences):
         subtype="FILE_PATH",
     )
     threads: IntProperty(
-        name="Threads", description="Processor threads the engine uses; 0 is all of them", min=0, soft_max=64, default=0
+        name="Threads", description="CPU threads that the engine uses; 0 is all of them", min=0, soft_max=64, default=0
     )
 
     def draw(self, context: bpy.types.Context) -> None:

@@ -53,7 +53,7 @@ class DRGS_PT_engine(_SidebarPanel, bpy.types.Panel):
         state = "Running" if running else "Not running"
         layout.label(text=f"{state}, version {__version__}", icon="CHECKMARK" if running else "RADIOBUT_OFF")
         threads = preferences.read("threads", 0) or os.cpu_count()
-        layout.label(text=f"Processor, {threads} threads", icon="BLANK1")
+        layout.label(text=f"CPU, {threads} threads", icon="BLANK1")
         last = engine_link.statistics
         if last:
             seconds, samples = last.get("seconds.total", 0.0), last.get("samples", 0.0) / 1e6

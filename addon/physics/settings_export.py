@@ -37,7 +37,7 @@ def folder_of(obj: bpy.types.Object) -> Path:
         raise UsageError(
             subject_of(obj),
             "its cache lies beside the .blend, which is not saved",
-            f"Save the file, or choose a folder in {PANEL} > Cache",
+            f"Save the file, or choose a folder in {PANEL} > Domain and Cache",
         )
     return Path(os.path.normpath(bpy.path.abspath(path, library=obj.library)))
 
@@ -64,7 +64,7 @@ def check(obj: bpy.types.Object) -> None:
         raise UsageError(
             subject_of(obj),
             f"ends at frame {physics.frame_end}, not after its first, {physics.frame_start}",
-            f"Change the frames in {PANEL} > Cache",
+            f"Change the frames in {PANEL} > Domain and Cache",
         )
 
 
@@ -80,7 +80,9 @@ def own_folder(obj: bpy.types.Object) -> Path:
     for other in bpy.data.objects:
         if other != obj and _has_physics(other) and _same_place(other, own):
             raise UsageError(
-                subject_of(obj), f'has the same cache as "{other.name}", {own}', f"Choose another in {PANEL} > Cache"
+                subject_of(obj),
+                f'has the same cache as "{other.name}", {own}',
+                f"Choose another in {PANEL} > Domain and Cache",
             )
     return own
 

@@ -128,7 +128,7 @@ class ObjectState:
         Metres, object space: faces with an edge that is longer than in the asset by more than this, and more than three
         times as long, span a tear and are left out with their surfels; 0: none.
     grain : float
-        How much surfels that are stretched are grains instead, see `deform.grains`; 0: not at all.
+        How much surfels that are stretched are grains instead, see `deform.granular`; 0: not at all.
     """
 
     name: str
@@ -359,8 +359,8 @@ class RenderSettings:
     device : {"cpu", "cuda"}
         "cuda" has a graphics card do what it can, see docs/gpu.md; without one it is as "cpu", with a warning.
     filter_width : float
-        Of the pixel filter in pixels as Cycles counts it, half of Blackman and Harris's window; 0 is a box of one
-        pixel.
+        Of the pixel filter in pixels as Cycles counts it, half the width of Blackman and Harris's window; 0 is
+        a box of one pixel.
     """
 
     samples: int = 32

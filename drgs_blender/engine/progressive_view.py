@@ -72,7 +72,6 @@ class View:
         Whether coarse pictures show the meshes, which are as detailed as those pictures.
     backend : RenderBackend
         Where the kernels run.
-    backend : RenderBackend
 
     Attributes
     ----------

@@ -49,7 +49,7 @@ class _Loaded:
             asset = self.asset
             if asset.binding is None:
                 problem = f"the surfels of {state.asset} are not bound to its mesh"
-                raise AssetError(f"object {state.name}", problem, "Bind them, or choose the mesh as primary surface")
+                raise AssetError(f"object {state.name}", problem, "Bind them, or set Camera Sees to Mesh")
             self.driven = MeshDriven(asset.mesh, asset.surfels, asset.binding)
         return self.driven
 
@@ -299,7 +299,7 @@ def _check_surface(state: ObjectState, asset: Asset, settings: RenderSettings) -
     """Refuse an asset of which nothing would be seen, or that light would not meet."""
     subject, bare = f"object {state.name}", settings.camera_sees == "mesh" or settings.rays_see == "mesh"
     if bare and not len(asset.mesh.faces):
-        remedy = "Choose surfels as primary surface and as tracer, or import a file whose mesh has faces"
+        remedy = "Set Camera Sees and Rays See to Surfels, or import a file whose mesh has faces"
         raise AssetError(subject, f"the mesh of {state.asset} has no faces", remedy)
     if "surfels" in (settings.camera_sees, settings.rays_see) and not len(asset.surfels):
-        raise AssetError(subject, f"{state.asset} has no surfels", "Choose the mesh as primary surface and as tracer")
+        raise AssetError(subject, f"{state.asset} has no surfels", "Set Camera Sees and Rays See to Mesh")

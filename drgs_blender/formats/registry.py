@@ -46,7 +46,7 @@ class Format:
     Attributes
     ----------
     name : str
-        Shown to users; the key of its `filetypes.ReadType`.
+        Shown to users; the key of its `file_types.ReadType`.
     sniff : callable
         (first bytes, path) -> whether the file is of this format.
     read : callable

@@ -26,7 +26,7 @@ class Writer:
     Attributes
     ----------
     name : str
-        Shown to users; the key of its `filetypes.WriteType`.
+        Shown to users; the key of its `file_types.WriteType`.
     write : callable
         (path, what goes in) -> None, where what goes in is `splats.Splats`, `asset.Mesh` or `asset.Environment`; raises
         WriteError.

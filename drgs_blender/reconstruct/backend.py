@@ -54,7 +54,7 @@ class LearningBackend:
         return rasterise(centre, tangent_u, tangent_v, opacity, features, camera, tally)
 
     def mirrored(self, features: Tensor, alpha: Tensor, rays: Tensor, texels: Tensor) -> Tensor:
-        """`reflection.mirrored`."""
+        """`reflection_probe.mirrored`."""
         return mirrored(features, alpha, rays.numpy(), texels)
 
     def difference(self, picture: Tensor, photograph: Any) -> Tensor:
@@ -76,7 +76,7 @@ class LearningBackend:
     def gatherer(
         self, mesh: Mesh, tree: TriangleBVH, cache: Array | None, counts: tuple[int, int, int], normals: bool
     ) -> Gatherer:
-        """`decouple.gather.Gatherer`."""
+        """`inverse_rendering.estimator.Gatherer`."""
         return Gatherer(mesh, tree, cache, counts, normals)
 
 

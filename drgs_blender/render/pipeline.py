@@ -39,7 +39,7 @@ Check = Callable[[], None]
 
 #: Memory a strip may take, and what a sub-pixel sample takes of it at most (samples, points, light).
 STRIP_BYTES, SAMPLE_BYTES = 64 << 20, 326
-#: Seconds a batch of points should take, how many samples (points times rays) the first one has, fewest points of any.
+#: Seconds a batch of points should take, how many samples (points times theirs) the first has, fewest of any.
 BATCH_SECONDS, FIRST_SAMPLES, FEWEST_POINTS = 0.03, 1 << 17, 16
 
 
@@ -254,9 +254,9 @@ def check_frame(frame: Frame) -> None:
         if name not in BY_NAME:
             raise UsageError(f"pass {name!r}", "does not exist", f"Choose from {', '.join(BY_NAME)}")
     if settings.camera_sees not in ("surfels", "mesh"):
-        raise UsageError("primary visibility", f"is {settings.camera_sees!r}", "Choose surfels or mesh")
+        raise UsageError("Camera Sees", f"is {settings.camera_sees!r}", "Choose surfels or mesh")
     if settings.rays_see not in ("mesh", "surfels"):
-        raise UsageError("rays_see", f"is {settings.rays_see!r}", "Choose mesh or surfels")
+        raise UsageError("Rays See", f"is {settings.rays_see!r}", "Choose mesh or surfels")
     if settings.denoise not in ("none", "svgf", "oidn"):
         raise UsageError("denoiser", f"is {settings.denoise!r}", "Choose none, svgf or oidn")
     if settings.denoise == "oidn":

@@ -35,7 +35,7 @@ Array = np.ndarray
 KEPT_BYTES = 512 << 20
 #: Surfels of a first picture, at most twice as many.
 SURFELS_PER_PIXEL = 3
-#: Parts of a sub-pixel sample at most, and rays of a part.
+#: Parts of a sub-pixel sample at most, and samples of a part.
 _MOST_PARTS, _FEWEST = 32, 4
 
 

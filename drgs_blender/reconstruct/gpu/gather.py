@@ -53,7 +53,7 @@ _HIT = ("float32", "int32", "int32", "int32", "float32", "float32", "float32", "
 def gather_points(  # type: ignore[no-untyped-def]
     lane, lanes, room, points, normals, a2s, counts, sequence, scene, faces, cache, radiance, shape, envmap, seen, out
 ):
-    """`decouple.gather._gather`."""
+    """`inverse_rendering.estimator._gather`."""
     for i in range(lane, len(a2s), lanes):
         gather_point(i, points, normals, a2s, counts, sequence, scene, faces, cache, radiance, shape, envmap, seen, out)
 

@@ -46,7 +46,7 @@ def frames(scale: Tensor, rotation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def mirrored(features: Tensor, alpha: Tensor, rays: Tensor, texels: Tensor) -> Tensor:
-    """`reflection.mirrored`."""
+    """`reflection_probe.mirrored`."""
     rows = torch.nonzero(alpha.detach().flatten() > float(BARE))[:, 0]
     pixel = features.flatten(0, 1).index_select(0, rows)
     blur = pixel[:, BLUR] / alpha.flatten().index_select(0, rows)

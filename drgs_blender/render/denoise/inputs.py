@@ -27,7 +27,7 @@ Array = np.ndarray
 
 #: How far the numbers of two cameras may lie apart (metres, radians, pixels) that are the same one evaluated twice.
 SAME_CAMERA = 1e-4
-_HOW = "Render it with `drgs render --denoise none --passes temporal`, or with For Temporal Denoising switched on"
+_HOW = "Render it with `drgs render --denoise none --passes temporal`, or with Store Denoising Data switched on"
 
 
 @dataclass(slots=True)

@@ -29,7 +29,7 @@ class Instant(NamedTuple):
     Attributes
     ----------
     vertices, places : array
-        Laid out as those of `trace.scene.TraceScene`.
+        Laid out as those of `scene.trace_scene.TraceScene`.
     parameters : array
         `camera.camera_parameters`.
     """

@@ -1,4 +1,4 @@
-"""Shading points tied to the mesh on a device: `primary.primary_surfels` with Warp's rays, from the same source."""
+"""Shading points tied to the mesh on a device: `gbuffer.surfels` with Warp's rays, from the same source."""
 
 from __future__ import annotations
 

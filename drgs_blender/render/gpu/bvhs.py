@@ -84,7 +84,7 @@ class Tree:
         self._fresh = self._looseness(scene)
 
     def _looseness(self, scene: TraceScene) -> float:
-        """As `trace.tree` measures it, 0 for a few triangles."""
+        """As `scene.triangle_bvh` measures it, 0 for a few triangles."""
         if not len(self._runs):
             return 0.0
         some = triangles(scene, self._rows[self._runs.ravel()])

@@ -1,4 +1,4 @@
-"""What the camera sees of meshes, on a device: `primary.camera_hits` with Warp's rays, from the same source."""
+"""What the camera sees of meshes, on a device: `gbuffer.camera_hits` with Warp's rays, from the same source."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def trace(
     launcher: Launcher, mirror: Mirror, on_cpu: Callable[[], MeshHits], scene: TraceScene, parameters: Array, x0: int,
     y0: int, shape: tuple[int, ...], mask: int,
 ) -> MeshHits:  # fmt: skip
-    """`primary.camera_hits.trace_camera` on a device; `here` does it on this processor."""
+    """`gbuffer.camera_hits.trace_camera` on a device; `on_cpu` does it on the CPU."""
     if not mask:
         return on_cpu()
     with launcher.failures("copying the scene"):
@@ -74,7 +74,7 @@ def shade(
     launcher: Launcher, mirror: Mirror, scene: TraceScene, hits: DeviceHits, parameters: Array, x0: int,
     buffer: GBuffer, layer: int,
 ) -> None:  # fmt: skip
-    """`primary.camera_hits.shade_mesh` on a device."""
+    """`gbuffer.camera_hits.shade_mesh` on a device."""
     keys, out = arrays_of(buffer)
     chosen = np.flatnonzero(keys[2] & layer == layer)
     if not len(chosen):

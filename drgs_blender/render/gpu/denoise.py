@@ -313,7 +313,7 @@ class DeviceSignal(Signal):
 def denoise(
     launcher: Launcher, shot: Shot, history: Signal | None, split: bool, still: bool, check: Callable[[], None]
 ) -> tuple[Array, Signal]:
-    """`picture.temporal.denoise_next` on a device; without a history and a motion, `picture.denoise.denoise`."""
+    """`svgf_temporal.denoise_next` on a device; without a history and a motion, `svgf_spatial.denoise`."""
     with launcher.failures("copying the picture"):
         surface = tuple(launcher.array(array) for array in shot.guides.arrays)
         signal = _prepare(launcher, shot, surface, split)
@@ -327,7 +327,7 @@ def denoise(
 
 
 def _prepare(launcher: Launcher, shot: Shot, surface: tuple[Any, ...], split: bool) -> DeviceSignal:
-    """`picture.denoise.prepare`."""
+    """`denoise.svgf_spatial.prepare`."""
     h, w = shot.guides.coverage.shape
     padded = w + 2 * PAD
     guide, spans = launcher.zeros((h, GUIDES, padded)), launcher.zeros((h, 2), "int32")
@@ -356,7 +356,7 @@ def _accumulate(launcher: Launcher, history: Signal, signal: DeviceSignal, shot:
 
 
 def _smooth(launcher: Launcher, signal: DeviceSignal, check: Callable[[], None]) -> Any:
-    """Light after `picture.denoise.smooth`; the signal stays as it is but for its `CERTAINTY`."""
+    """Light after `denoise.svgf_spatial.smooth`; the signal stays as it is but for its `CERTAINTY`."""
     h, _, padded = shape = signal.light.shape
     pixels = h * (padded - 2 * PAD)
     with launcher.failures("denoising"):

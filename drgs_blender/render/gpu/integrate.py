@@ -1,4 +1,4 @@
-"""The integrator on a device: `shade.integrate` with Warp's rays, one lane a point, from the same source."""
+"""The integrator on a device: `integrator.integrate` with Warp's rays, one lane a point, from the same source."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ SHADE = Work(integrate.shade_points, _ROOMS, NATIVES, _constants)
 
 
 class DeviceKernel(integrate.Kernel):
-    """`shade.integrate.Kernel` on a device."""
+    """`integrator.integrate.Kernel` on a device."""
 
     def __init__(self, launcher: Launcher, mirror: Mirror) -> None:
         self._launcher, self._mirror = launcher, mirror

@@ -11,7 +11,7 @@ from ..scene import interaction
 
 
 class MeshTracer(NamedTuple):
-    """``trace.surface.Tracer`` of a device.
+    """``scene.interaction.Tracer`` of a device.
 
     Attributes
     ----------

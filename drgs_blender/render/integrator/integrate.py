@@ -108,7 +108,8 @@ def integrate(
     if not (0.0 <= settings.clamp_indirect < np.inf and 0.0 <= settings.noise_threshold < np.inf):
         raise UsageError("render settings", "the clamp or the threshold is no number of at least 0", "Use 0 for none")
     if settings.shading_model not in brdf.SHADING_MODELS:
-        raise UsageError("render settings", f"look {settings.shading_model!r} is unknown", "Use principled or paper")
+        problem = f"shading model {settings.shading_model!r} is unknown"
+        raise UsageError("render settings", problem, "Use principled or paper")
     n = len(points)
     out = Radiance.dark(n)
     lights = lights or _NO_LIGHTS

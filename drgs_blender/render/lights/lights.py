@@ -266,7 +266,7 @@ def emission_along(ox, oy, oz, dx, dy, dz, hit, geometry, table, pick, emitters)
     ox, oy, oz, dx, dy, dz : float
         Origin and unit direction, world space.
     hit : tuple
-        What ``trace.surface.nearest`` returned.
+        What ``scene.interaction.nearest`` returned.
     geometry : Geometry
         The scene's.
 

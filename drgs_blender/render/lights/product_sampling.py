@@ -25,7 +25,7 @@ _KEPT = 0.1
 
 
 def normals() -> Array:
-    """(SIDE^2, 3) float32 unit normals of the tables, see `facing_row`."""
+    """(SIDE^2, 3) float32 unit normals of the tables, see `product_row`."""
     v, u = np.meshgrid(*[(np.arange(SIDE) + 0.5) / SIDE * 2 - 1] * 2, indexing="ij")
     z = 1 - abs(u) - abs(v)
     fold = np.maximum(-z, 0)

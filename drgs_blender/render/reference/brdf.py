@@ -155,7 +155,7 @@ def evaluate(
         from the viewer at a silhouette; diffuse light does not ask for the view).
     """
     if shading_model not in SHADING_MODELS:
-        raise ValueError(f"look {shading_model!r} is not one of {SHADING_MODELS}")
+        raise ValueError(f"shading model {shading_model!r} is not one of {SHADING_MODELS}")
     normal, view, light = torch.broadcast_tensors(normal, view, light)
     lit = (dot(normal, light) > 0).unsqueeze(-1)
     seen = lit & (dot(normal, view) > 0).unsqueeze(-1)
