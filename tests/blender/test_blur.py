@@ -34,6 +34,7 @@ def alpha(scene, engine="DRGS") -> np.ndarray:
     return read_exr(scene.render.filepath, WIDTH, HEIGHT)[..., 3]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("position", ["START", "CENTER", "END"])
 def test_motion_blur_is_that_of_cycles(white, ball, position):
     """A ball flies half a metre a frame, its mesh bends meanwhile; the shutter is open for one frame."""

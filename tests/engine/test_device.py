@@ -29,6 +29,7 @@ def psnr(a, b):
     return -10 * np.log10(max(error, 1e-20))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("changes", [{}, {"denoise": "svgf"}, {"camera_sees": "mesh", "noise_threshold": 0.05}])
 def test_the_picture_is_the_processors(session, warp_session, make_frame, changes):
     passes = ("Combined", "DiffDir", "GlossInd")

@@ -96,6 +96,7 @@ def test_failures_end_a_blender_on_a_farm_with_their_code(folder, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_frame_that_blender_writes_on_a_full_disk_does_not_stay(folder, tmp_path, small_disk):
     """Blender says that it is saved, and takes the empty file for a finished frame the next time."""
     disk = small_disk("size=16k")

@@ -121,6 +121,7 @@ def test_a_frame_does_not_depend_on_its_chunk(render, tmp_path):
     assert np.array_equal(read_frame(tmp_path / "0003.exr")[0]["Combined"], together)
 
 
+@pytest.mark.slow
 def test_every_view_layer_gets_a_file(render, tmp_path):
     assert render(scene="layers.blend", frames="1")[0] == 0
     assert [p.name for p in sorted(tmp_path.iterdir())] == ["0001_Second_layer.exr", "0001_ViewLayer.exr"]

@@ -138,6 +138,7 @@ def test_inspect_is_json_and_right(file: Path) -> None:
     assert about["provenance"] == asset.provenance and set(about["members"]) == set(DATA_MEMBERS)
 
 
+@pytest.mark.slow
 def test_no_flipped_byte_is_accepted(file: Path) -> None:
     """Mutants of the whole file: every one is refused with an AssetError (or VersionError), never accepted."""
     clean = file.read_bytes()
@@ -167,6 +168,7 @@ def test_no_truncation_is_accepted(file: Path) -> None:
         read_asset(file)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("member", DATA_MEMBERS)
 def test_mutants_with_hashes_recomputed_never_crash(file: Path, member: str) -> None:
     """A hostile writer can make hashes agree; then the data is refused or is a valid asset."""

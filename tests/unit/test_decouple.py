@@ -450,6 +450,7 @@ def _between(found: Decoupled) -> float:
     return float((found.metallic * (1 - found.metallic)).mean())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("weight", "value", "measure"),
     [

@@ -91,6 +91,7 @@ def test_the_camera_sees_the_same_meshes(device: WarpRenderBackend, name: str, v
     alike(seen(CPU, scene, camera), seen(device, scene, camera), camera)
 
 
+@pytest.mark.slow
 def test_rows_do_not_depend_on_those_rendered_with_them(device: WarpRenderBackend) -> None:
     scene, camera = among_meshes()[0], VIEWS["perspective"]
     whole, part = seen(device, scene, camera), seen(device, scene, camera, (11, 29))

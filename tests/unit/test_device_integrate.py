@@ -15,7 +15,6 @@ from drgs_blender.core.frame import Image, Light, Material, MeshState, RenderSet
 from drgs_blender.render.backend import CPU
 from drgs_blender.render.gpu.select_backend import Backends
 from drgs_blender.render.gpu.warp_backend import WarpRenderBackend
-from drgs_blender.render.integrator import wavefront
 from drgs_blender.render.integrator.integrate import integrate
 from drgs_blender.render.lights.environment import EnvironmentLight
 from drgs_blender.render.lights.lights import Lights
@@ -26,6 +25,8 @@ from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene
 BALL = trimesh.creation.icosphere(subdivisions=3)
 SETTINGS = RenderSettings(samples=16, bounces=3, subpixel_samples=2)
 DARK = EnvironmentLight(World(colour=(0.0, 0.0, 0.0)))
+
+pytestmark = pytest.mark.slow  # Warp compiles the whole integrator for them
 
 
 def sky(size: tuple[int, int] = (32, 64)) -> EnvironmentLight:
@@ -293,11 +294,3 @@ def test_every_array_is_copied_to_a_card(monkeypatch: pytest.MonkeyPatch) -> Non
     rooms = [room for own in apart.launcher._rooms.values() for room in own]
     assert not apart.failed and rooms and not any(room.is_contiguous for room in rooms)
     assert psnr(found.total, expected.total) > 60.0
-
-
-def test_every_constant_of_the_wavefront_is_said_to_count_in_lanes_or_not() -> None:
-    """A device divides those that do: one that is left out has it read and write beside its fields."""
-    constants = {name for name, value in vars(wavefront).items() if type(value) is int}
-    assert constants == set(wavefront.IN_LANES)
-    assert len(wavefront.IN_LANES) == len(set(wavefront.IN_LANES))
-    assert all(getattr(wavefront, name) % wavefront.LANES == 0 for name in wavefront.IN_LANES)

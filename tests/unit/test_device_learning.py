@@ -155,6 +155,7 @@ def alike(a: Training, b: Training) -> float:
     return max(float(np.linalg.norm(found[n] - other[n]) / max(np.linalg.norm(found[n]), 1e-9)) for n in names)
 
 
+@pytest.mark.slow
 def test_first_steps_are_the_processors(capture: Capture, region: Region, there: WarpLearningBackend) -> None:
     assert alike(learned(capture, region, CPU, 3), learned(capture, region, there, 3)) < 1e-5
 

@@ -164,6 +164,7 @@ def test_a_step_is_the_processors_to_the_last_digits(launcher: Launcher, case: s
             assert np.abs(expected - old).max() > 30 * bound, name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ground", [
     {"planes": [Plane((0, 0, 0), (0, 0, 1))]},
     {"colliders": [Collider("box", np.array(_FACES), _BOX * [1.5, 1.5, 0.3] - [0.6, 0.6, 0.3])]},

@@ -36,6 +36,7 @@ def both(
     return rasterise(prepare(*given), *rows), device.rasterise(device.prepare(*given), *rows)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [0.0, 1.5])
 @pytest.mark.parametrize("name", SCENES)
 def test_a_device_finds_the_samples_that_the_processor_finds(

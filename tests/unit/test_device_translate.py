@@ -19,7 +19,7 @@ from drgs_blender.compute.warp.types import Array, Struct, TranslationError
 from drgs_blender.core.frame import World
 from drgs_blender.render import sampling
 from drgs_blender.render.gpu.natives import NATIVES
-from drgs_blender.render.integrator import brdf
+from drgs_blender.render.integrator import brdf, wavefront
 from drgs_blender.render.lights import environment
 
 F, U = np.float32, np.uint32
@@ -316,3 +316,11 @@ def test_natives_stand_for_functions() -> None:
 
     found = on_device(use, floats(5, (0, 1)), natives={_makes_a_list: native})
     np.testing.assert_array_equal(found[:, 0], floats(5, (0, 1))[0] * F(0.5) + ONE)
+
+
+def test_every_constant_of_the_wavefront_is_said_to_count_in_lanes_or_not() -> None:
+    """A device divides those that do: one that is left out has it read and write beside its fields."""
+    constants = {name for name, value in vars(wavefront).items() if type(value) is int}
+    assert constants == set(wavefront.IN_LANES)
+    assert len(wavefront.IN_LANES) == len(set(wavefront.IN_LANES))
+    assert all(getattr(wavefront, name) % wavefront.LANES == 0 for name in wavefront.IN_LANES)

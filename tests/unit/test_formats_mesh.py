@@ -265,6 +265,7 @@ def test_damaged_gltf_is_refused_with_the_reason(tmp_path: Path, change: Any, wo
         read_mesh(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("deep", [False, True])
 def test_many_nodes_and_joints_are_read_in_time(tmp_path: Path, deep: bool) -> None:
     """In proportion to their number: 10 000 are a file of some 100 kB."""

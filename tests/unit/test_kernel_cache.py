@@ -145,6 +145,7 @@ def _uses_global(x):
     return _FACTOR * x
 
 
+@pytest.mark.slow
 def test_a_source_that_changed_after_its_import_is_not_kept(tmp_path):
     """What runs is the code of before, what the name would say is that of now."""
     program, source = tmp_path / "program.py", tmp_path / "changing.py"

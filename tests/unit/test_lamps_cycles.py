@@ -124,6 +124,7 @@ def test_irradiance(cycles, name):
     np.testing.assert_allclose(terms.sum(axis=0) / len(hit), cycles[f"lit {name}"], rtol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SEEN)
 def test_radiance_along_a_ray(cycles, name):
     lamp, origin, direction = SEEN[name]
@@ -135,6 +136,7 @@ def test_radiance_along_a_ray(cycles, name):
     assert (expected.max() == 0) == any(word in name for word in hidden)
 
 
+@pytest.mark.slow
 def test_who_sees_a_light(cycles):
     """Blender hides lights from the camera unless told otherwise; a lobe does not see what its rays do not see."""
     assert cycles["no camera"].max() == 0

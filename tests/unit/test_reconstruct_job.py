@@ -72,6 +72,7 @@ def test_mesh_is_closed_faces_outwards_and_lies_on_the_surface(asset, capture):
     assert np.median(angle) < 8  # turned inside out it would be 180
 
 
+@pytest.mark.slow
 def test_views_left_out_are_predicted(asset):
     report = asset.provenance["report"]
     assert report["left_out"] == 3 and report["psnr"] > 27 and report["ssim"] > 0.93

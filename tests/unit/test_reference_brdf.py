@@ -81,6 +81,7 @@ def test_a_narrow_lobe_keeps_its_energy():
     assert mirror_albedo(0.8, 0.05) == pytest.approx(1.0, abs=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shading_model", brdf.SHADING_MODELS)
 @pytest.mark.parametrize("cosine", [1.0, 0.5, 0.2])
 def test_white_furnace(shading_model: str, cosine: float):
