@@ -55,7 +55,7 @@ class _Loaded:
 
 
 @dataclass(slots=True)
-class Standing:
+class CachedObject:
     """An object as it was in the last frame, and what was made of it."""
 
     state: ObjectState
@@ -66,12 +66,12 @@ class Standing:
     faults: list[str] = field(default_factory=list)
 
 
-class Stage:
+class SceneCache:
     """Brings scene and light up to date with a frame.
 
     Attributes
     ----------
-    objects : list of Standing
+    objects : list of CachedObject
         Of the last frame.
     meshes : list of MeshState
         Of the last frame.
@@ -91,12 +91,12 @@ class Stage:
 
     def __init__(self) -> None:
         self._assets: dict[str, _Loaded] = {}
-        self.objects: list[Standing] = []
+        self.objects: list[CachedObject] = []
         self.meshes: list[MeshState] = []
         self.images: list[Image] = []
         self.scene = TraceScene()
         self.tree: SurfelBVH | None = None
-        self._in_tree: list[Standing] = []
+        self._in_tree: list[CachedObject] = []
         self._current = True
         self.world: World | None = None
         self.environment: EnvironmentLight | None = None
@@ -166,7 +166,7 @@ class Stage:
             if known is not None and known.loaded is loaded and known.state is kept and known.traced.seen_only == met:
                 item = known
             else:
-                item = Standing(kept, loaded, traced_object(kept, loaded.asset, met), faults=material_faults(kept))
+                item = CachedObject(kept, loaded, traced_object(kept, loaded.asset, met), faults=material_faults(kept))
             if (seen or met) and item.posed is None:
                 given = item.state, index, loaded.surfels_of(item.state), item.traced
                 item.posed, item.lost = posed_surfels(*given, self._poser(backend))
@@ -182,7 +182,7 @@ class Stage:
         for key, loaded in self._assets.items():
             if key not in used:
                 loaded.driven = None
-        self._plant(objects if met else None)
+        self._update_surfel_bvh(objects if met else None)
         shown = [item for item in objects if item.state.visibility.camera] if seen else []
         return self._joined([item.posed for item in shown if item.posed is not None], backend)
 
@@ -209,7 +209,7 @@ class Stage:
             return on_cpu()
         return backend.with_fallback(lambda: joined(launcher, parts, on_cpu), on_cpu)
 
-    def _plant(self, objects: list[Standing] | None) -> None:
+    def _update_surfel_bvh(self, objects: list[CachedObject] | None) -> None:
         """Bring the tree of surfels up to date; None when light does not meet surfels."""
         if objects is None:
             self.tree, self._in_tree = None, []

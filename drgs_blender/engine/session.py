@@ -29,7 +29,7 @@ from ..render.prepared_scene import PreparedScene
 from ..render.scene.trace_scene import TraceObject
 from .denoise_history import Histories
 from .progressive_view import Pace, View
-from .scene_cache import Stage
+from .scene_cache import SceneCache
 
 logger = logging.getLogger(__name__)
 
@@ -61,7 +61,7 @@ class Placed:
     surfels: PosedSurfels
 
 
-class _Laps:
+class _StageTimer:
     """Seconds a stage; between two stages a cancel is seen."""
 
     def __init__(self, cancelled: IsCancelled | None) -> None:
@@ -82,7 +82,7 @@ class Session:
     """
 
     def __init__(self) -> None:
-        self._stage = Stage()
+        self._scene_cache = SceneCache()
         self._lights: list[Light] = []
         self._histories = Histories()
         self._views: dict[str, View] = {}
@@ -92,12 +92,12 @@ class Session:
         self._compiled: set[str] = set()
 
     def load_asset(self, path: str | os.PathLike[str]) -> str:
-        """Map the asset file at `path`; return its key. See `Stage.load_asset`."""
-        return self._stage.load_asset(path)
+        """Map the asset file at `path`; return its key. See `SceneCache.load_asset`."""
+        return self._scene_cache.load_asset(path)
 
     def asset(self, key: str) -> Asset:
         """The loaded asset of `key`."""
-        return self._stage.asset(key)
+        return self._scene_cache.asset(key)
 
     def render(self, frame: Frame, progress: OnProgress | None = None, cancelled: IsCancelled | None = None) -> Passes:
         """Render one frame.
@@ -146,7 +146,7 @@ class Session:
         array([2.], dtype=float32)
         """
         self._compile(frame, (), progress, cancelled)
-        lap, backend = _Laps(cancelled), self._backends.select(frame.settings.device)
+        lap, backend = _StageTimer(cancelled), self._backends.select(frame.settings.device)
         prepared = self._prepare(frame, lap, progress, backend)
         tell = None if progress is None else lambda part, phase: progress(phase, part)
         passes = self._draw(frame, prepared, tell, cancelled, backend)
@@ -166,10 +166,10 @@ class Session:
             As `render`.
         """
         self._compile(frame, (), progress, None)
-        prepared = self._prepare(frame, _Laps(None), progress)
+        prepared = self._prepare(frame, _StageTimer(None), progress)
         placed = [
             Placed(item.state, item.loaded.asset, item.traced, item.posed)
-            for item in self._stage.objects
+            for item in self._scene_cache.objects
             if item.posed is not None
         ]
         return prepared, placed
@@ -189,11 +189,11 @@ class Session:
         """
         self._views.pop(name, None)
         self._compile(frame, ("viewport",), progress, cancelled)
-        lap, backend = _Laps(cancelled), self._backends.select(frame.settings.device)
-        by_mesh = self._stage.detailed(frame)
+        lap, backend = _StageTimer(cancelled), self._backends.select(frame.settings.device)
+        by_mesh = self._scene_cache.detailed(frame)
         rough = replace(frame, settings=replace(frame.settings, camera_sees="mesh")) if by_mesh else frame
         prepared = self._prepare(rough, lap, progress, backend)
-        view = View(self._stage.kept(frame), self._pace, self._views_begun, by_mesh, backend)
+        view = View(self._scene_cache.kept(frame), self._pace, self._views_begun, by_mesh, backend)
         self._views_begun += 1
         passes = view.begin(
             prepared, lambda frame, prepared, tell: self._draw(frame, prepared, tell, cancelled, backend)
@@ -217,7 +217,7 @@ class Session:
         view = self._views.get(name)
         if view is None:
             return None
-        lap = _Laps(cancelled)
+        lap = _StageTimer(cancelled)
         backend = view.backend
         prepared = self._prepare(view.frame, lap, progress, backend)  # other views may have changed the scene
         passes = view.advance(
@@ -226,7 +226,7 @@ class Session:
         lap("render")
         return self._seen(view, passes, prepared, lap)
 
-    def _seen(self, view: View, passes: Passes, prepared: PreparedScene, lap: _Laps) -> Passes:
+    def _seen(self, view: View, passes: Passes, prepared: PreparedScene, lap: _StageTimer) -> Passes:
         passes.statistics |= self._statistics(view.frame, prepared.surfels, lap)
         passes.statistics |= {"view.fraction": view.fraction, "view.pixel": float(view.pixel)}
         passes.warnings = self._warnings(view.frame.settings)
@@ -244,10 +244,10 @@ class Session:
         sequence, statistics = None, {}
         if frame.history and frame.settings.denoise == "svgf":
             self._lights = renewed(frame.lights, self._lights)
-            scenery = *self._stage.scenery, self._lights
+            scenery = *self._scene_cache.scenery, self._lights
             sequence = self._histories.continued(frame, prepared.scene, scenery)
             statistics["history"] = float(sequence.pictures)
-        instants = {name: self._stage.instant(frame, getattr(frame, name)) for name in ("previous", "next")}
+        instants = {name: self._scene_cache.instant(frame, getattr(frame, name)) for name in ("previous", "next")}
         prepared = replace(prepared, previous=instants["previous"], following=instants["next"])
         history = None if sequence is None else sequence.history
         pictures = render(prepared, frame, tell, cancelled, history=history, backend=backend)
@@ -265,28 +265,28 @@ class Session:
             self._compiled |= wanted
 
     def _prepare(
-        self, frame: Frame, lap: _Laps, progress: OnProgress | None, backend: RenderBackend = CPU
+        self, frame: Frame, lap: _StageTimer, progress: OnProgress | None, backend: RenderBackend = CPU
     ) -> PreparedScene:
         """Bring scene and light up to date with the frame."""
         _check(frame)
         use_threads(frame.settings.threads)
         if progress is not None:
             progress("Deforming", 0.0)
-        posed = self._stage.pose(frame, backend)
+        posed = self._scene_cache.pose(frame, backend)
         lap("deform")
-        environment, lights = self._stage.environment_of(frame.world), self._stage.lights_of(frame.lights)
+        environment, lights = self._scene_cache.environment_of(frame.world), self._scene_cache.lights_of(frame.lights)
         lap("light")
-        return PreparedScene(self._stage.scene, environment, posed, lights, self._stage.tree)
+        return PreparedScene(self._scene_cache.scene, environment, posed, lights, self._scene_cache.tree)
 
     def _warnings(self, settings: RenderSettings) -> list[str]:
         trouble = cache_folder().trouble
-        return self._stage.warnings() + self._backends.warnings(settings) + ([trouble] if trouble else [])
+        return self._scene_cache.warnings() + self._backends.warnings(settings) + ([trouble] if trouble else [])
 
-    def _statistics(self, frame: Frame, posed: PosedSurfels, lap: _Laps) -> dict[str, float]:
+    def _statistics(self, frame: Frame, posed: PosedSurfels, lap: _StageTimer) -> dict[str, float]:
         return lap.seconds | {
             "seconds.total": sum(lap.seconds.values()),
             "objects": float(len(frame.objects)),
-            "triangles": float(len(self._stage.scene.faces)),
+            "triangles": float(len(self._scene_cache.scene.faces)),
             "surfels": float(len(posed)),
         }
 

@@ -72,20 +72,20 @@ def test_history_of_meshes_does_not_show(session, make_frame, asset_path):
 
 def test_only_what_changed_is_given_on(session, make_frame):
     session.render(with_meshes(make_frame(0.1)))
-    floor, squares = session._stage.meshes
-    built = session._stage.scene.bvh.rebuilds
+    floor, squares = session._scene_cache.meshes
+    built = session._scene_cache.scene.bvh.rebuilds
     frame = with_meshes(make_frame(0.1))
     frame.meshes[1].matrices[0, 0, 3] += 0.1
     session.render(frame)
-    assert session._stage.meshes[0] is floor and session._stage.meshes[1] is not squares
+    assert session._scene_cache.meshes[0] is floor and session._scene_cache.meshes[1] is not squares
     assert (
-        session._stage.meshes[1].vertices is squares.vertices
-        and session._stage.meshes[1].materials is squares.materials
+        session._scene_cache.meshes[1].vertices is squares.vertices
+        and session._scene_cache.meshes[1].materials is squares.materials
     )
-    assert session._stage.scene.bvh.rebuilds == built
-    before = list(session._stage.meshes)
+    assert session._scene_cache.scene.bvh.rebuilds == built
+    before = list(session._scene_cache.meshes)
     session.render(frame)
-    assert all(a is b for a, b in zip(before, session._stage.meshes, strict=True))
+    assert all(a is b for a, b in zip(before, session._scene_cache.meshes, strict=True))
 
 
 def test_a_camera_that_does_not_see_the_object_sees_the_mesh_behind_it(session, make_frame):
@@ -141,15 +141,15 @@ def test_array_changed_in_place_is_noticed(session, make_frame, asset_path):
 
 def test_nothing_is_made_again_when_nothing_changed(session, make_frame):
     session.render(make_frame(0.1))
-    light, objects = session._stage.environment, list(session._stage.objects)
+    light, objects = session._scene_cache.environment, list(session._scene_cache.objects)
     frame = make_frame(0.1)
     frame.camera.matrix_world[0, 3] = 0.4
     session.render(frame)
-    assert session._stage.environment is light
-    assert session._stage.objects == objects and session._stage.objects[0] is objects[0]
+    assert session._scene_cache.environment is light
+    assert session._scene_cache.objects == objects and session._scene_cache.objects[0] is objects[0]
     frame.world.rotation = turned(10)
     session.render(frame)
-    assert session._stage.environment is light
+    assert session._scene_cache.environment is light
 
 
 def test_vanished_objects_are_dropped(session, make_frame):
@@ -157,7 +157,7 @@ def test_vanished_objects_are_dropped(session, make_frame):
     session.render(frame)
     frame.objects = []
     empty = session.render(frame)
-    assert session._stage.objects == []
+    assert session._scene_cache.objects == []
     assert empty.statistics["triangles"] == 0
     np.testing.assert_allclose(empty["Depth"], 1e10)
 

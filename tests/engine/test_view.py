@@ -180,7 +180,7 @@ def test_coarse_pixels_cover_the_window(make_frame, size):
 
 def test_thin_surfels_cover_as_much(session, make_frame):
     session.render(make_frame())
-    posed = session._stage.objects[0].posed
+    posed = session._scene_cache.objects[0].posed
     n = len(posed)
     assert thinned(posed, n) is posed
     few = thinned(posed, n // 30)
