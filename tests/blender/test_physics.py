@@ -217,7 +217,7 @@ def test_force_fields_of_the_scene_act_on_it(body, scene):
     expected = (np.cumsum(np.cumsum(strengths)) * (span / 2000) ** 2)[-1]
     np.testing.assert_allclose(moved, [expected, 0, 0], atol=0.05 * expected)
     said = [line.text for line in part("addon.messages").history]
-    assert any(made["MAGNET"].name in text and "(Magnet) plays no part" in text for text in said)
+    assert any(made["MAGNET"].name in text and "(Magnet) has no effect" in text for text in said)
 
 
 @pytest.mark.slow
@@ -231,7 +231,7 @@ def test_faults_name_the_object_and_the_remedy(body, scene, tmp_path):
         assert not bake_job.running and scene.frame_current == 2
 
     physics.pin_group = "Nope"
-    fails('Object "ball": has no vertex group or point attribute "Nope".*Physics > DR-GS Matter')
+    fails('Object "ball": has no vertex group or point attribute "Nope".*Physics > DR-GS Physics')
     physics.pin_group = ""
     bpy.ops.drgs.physics_row(rows="colliders")
     hidden = box_object("Hidden", (3, 3, 3), (4, 4, 4))

@@ -69,7 +69,7 @@ def test_simulated_frames_are_files_of_the_scene(drgs, folder, tmp_path):
     script.write_text(f"""
 import bpy
 cube = bpy.data.objects["Cube"]
-cube.modifiers.new("DR-GS Matter", "MESH_CACHE").filepath = "//drgs_cache/Cube/mesh.pc2"
+cube.modifiers.new("DR-GS Physics", "MESH_CACHE").filepath = "//drgs_cache/Cube/mesh.pc2"
 bpy.ops.wm.save_as_mainfile(filepath={str(scene)!r})
 """)
     subprocess.run(find_blender().command(script), check=True, timeout=600)
