@@ -89,7 +89,8 @@ def test_a_report_tells_of_engine_scene_and_messages(ball, tmp_path):
     path = tmp_path / "report.txt"
     assert bpy.ops.drgs.report(filepath=str(path)) == {"FINISHED"}
     text = path.read_text(encoding="utf-8")
-    for expected in (bpy.app.version_string, "DR-GS can render here", '"ball"', "something about the light", "samples = "):
+    told = '"ball"', "something about the light", "samples = "
+    for expected in (bpy.app.version_string, "DR-GS can render here", *told):
         assert expected in text
     assert "\nsubmit.chunk = " in text and "bpy_struct" not in text and "bl_ext" not in text
     with pytest.raises(RuntimeError, match="cannot be written"):

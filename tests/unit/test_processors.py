@@ -20,7 +20,7 @@ import numpy as np
 from drgs_blender.core.color import srgb_to_linear
 from drgs_blender.engine.scene_objects import world_vertices
 from drgs_blender.core.frame import Light, World
-from drgs_blender.render.lights.lights import Lamps
+from drgs_blender.render.lights.lights import Lights
 from drgs_blender.render.lights.environment import EnvironmentLight
 from drgs_blender.render.integrator.brdf import layer_table
 
@@ -28,7 +28,7 @@ rng = np.random.default_rng(0)
 turns = np.tile(np.eye(4), (90, 1, 1))
 turns[:, :3] = rng.uniform(-3, 3, (90, 3, 4))
 spots = [Light("spot", "spot", t, tuple(rng.random(3)), spot_size=s) for t, s in zip(turns, rng.uniform(0.1, 2, 90))]
-light, lamps = EnvironmentLight(World(rng.random((64, 128, 3), np.float32))), Lamps(spots)
+light, lamps = EnvironmentLight(World(rng.random((64, 128, 3), np.float32))), Lights(spots)
 arrays = {
     "bytes": srgb_to_linear(np.arange(256) / 255), "floats": srgb_to_linear(rng.random(100000)),
     "vertices": world_vertices(rng.random((100000, 3), np.float32), turns[0]), "layer": layer_table(),
