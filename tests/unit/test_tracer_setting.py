@@ -231,7 +231,7 @@ def test_surfels_without_a_mesh_need_the_surfel_tracer(tmp_path: Path) -> None:
     assert 0.02 < picture[6:10, 6:10, :3].mean() < 1.0
     for change in ({"rays_see": "mesh"}, {"camera_sees": "mesh"}):
         frame.settings = replace(SETTINGS, **change)
-        with pytest.raises(AssetError, match=r"Leaves.*no faces.*Choose surfels"):
+        with pytest.raises(AssetError, match=r"Leaves.*no faces.*Set Camera Sees and Rays See to Surfels"):
             session.render(frame)
 
 
