@@ -73,7 +73,7 @@ def groups(package: str = PACKAGE) -> dict[str, Any]:
     Returns
     -------
     dict of str to bpy.types.Struct
-        Expression, such as ``object.drgs.matter``, to the group's type.
+        Expression, such as ``object.drgs.physics``, to the group's type.
     """
     import bpy
 
@@ -127,7 +127,7 @@ def lacking(package: str = PACKAGE) -> list[str]:
     Returns
     -------
     list of str
-        Operators as ``bpy.ops.drgs.bake``, properties as ``scene.drgs.rays``.
+        Operators as ``bpy.ops.drgs.bake``, properties as ``scene.drgs.rays_see``.
     """
     found = []
     for name, rna in operators(package).items():

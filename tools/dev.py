@@ -113,11 +113,13 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     check = command("check", run_check, f"every test; {about}")
     check.add_argument("--rest", dest="others", action="store_true", help="only what `test` leaves out")
     demo = command("demo", run_demo, "render the demo through Blender; further arguments go to examples/demo.py")
-    matter = command("demo-simulation", run_demo_simulation, "bake and render matter; see examples/demo_simulation.py")
+    simulation = command(
+        "demo-simulation", run_demo_simulation, "bake and render matter; see examples/demo_simulation.py"
+    )
     extension = command("extension", run_extension, "build the extension's zip; arguments go to tools/extension.py")
     command("docs", run_docs, "build the site of the documentation in build/docs/html; any warning ends it")
     bench = command("bench", run_bench, "measure; further arguments go to bench/run.py")
-    for sub in (test, check, demo, matter, extension, bench):
+    for sub in (test, check, demo, simulation, extension, bench):
         sub.set_defaults(passes_on=True)
     clean = command("clean", run_clean, "remove build products and caches")
     clean.add_argument("--all", action="store_true", help="also the environments")

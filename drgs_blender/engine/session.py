@@ -247,8 +247,8 @@ class Session:
             scenery = *self._scene_cache.scenery, self._lights
             sequence = self._histories.continued(frame, prepared.scene, scenery)
             statistics["history"] = float(sequence.pictures)
-        instants = {name: self._scene_cache.instant(frame, getattr(frame, name)) for name in ("previous", "next")}
-        prepared = replace(prepared, previous=instants["previous"], following=instants["next"])
+        instant = self._scene_cache.instant
+        prepared = replace(prepared, previous=instant(frame, frame.previous), following=instant(frame, frame.next))
         history = None if sequence is None else sequence.history
         pictures = render(prepared, frame, tell, cancelled, history=history, backend=backend)
         if sequence is not None:

@@ -193,6 +193,11 @@ def _image(line: str, path: Path, notes: list[str]) -> Image | None:
     if file is None or not file.is_file():
         rest = _text(line.strip().split(None, 1)[1])  # a name with spaces and no options
         file = beside(path, rest)
+    return load_texture(file, name, notes)
+
+
+def load_texture(file: Path | None, name: str, notes: list[str]) -> Image | None:
+    """The sRGB texture in `file`; None, and a note that says why of the texture `name`, where there is none."""
     if file is None or not file.is_file():
         notes.append(f"texture {name} not found")
         return None

@@ -16,8 +16,7 @@ from ..core.errors import AssetError
 from . import trimesh_scene
 from .apart import read_apart
 from .files import Image, MaterialFile, MeshFile
-from .images import load_image
-from .obj import beside
+from .obj import beside, load_texture
 from .soup import join_equal
 from .trimesh_scene import ABOUT
 
@@ -64,8 +63,7 @@ def read_scene_mesh(path: Path) -> MeshFile:
     DeviceError
         lxml or pycollada is not installed.
     """
-    with open(path, "rb") as file:
-        kind = "3MF" if file.read(2) == b"PK" else "COLLADA"
+    kind = trimesh_scene.kind_of(path)
     arrays = read_apart(path, trimesh_scene.__name__, kind, _LACKING)
     about = parse_json(arrays[ABOUT].tobytes(), str(path))
     found, pieces = about["found"], about["pieces"]
@@ -136,23 +134,10 @@ def _paint(mesh: MeshFile, pieces: list[dict[str, Any]], path: Path) -> None:
             numbers[key] = len(mesh.materials)
             name = given["picture"]
             if name is not None and name not in pictures:
-                pictures[name] = _picture(name, path, mesh.notes)
+                pictures[name] = load_texture(beside(path, unquote(name.removeprefix("file://"))), name, mesh.notes)
             r, g, b = given["colour"]
             label = given["name"] or f"Material {len(mesh.materials)}"
             mesh.materials.append(
                 MaterialFile(label, (r, g, b), given["roughness"], base_colour_image=pictures.get(name))
             )
         mesh.face_material[first:end] = numbers[key]
-
-
-def _picture(name: str, path: Path, notes: list[str]) -> Image | None:
-    """The picture `name` beside the file at `path`; of an absolute name only the last part is tried."""
-    file = beside(path, unquote(name.removeprefix("file://")))
-    if file is None or not file.is_file():
-        notes.append(f"texture {name} not found")
-        return None
-    try:
-        return Image(load_image(file), srgb=True)
-    except AssetError as error:
-        notes.append(f"texture left out: {error}")
-        return None

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from ..core.asset.archive import first_reason
 from ..core.color import srgb_to_linear
 from ..core.errors import AssetError
 from .files import MeshFile
@@ -166,5 +167,5 @@ def _load(data: bytes, kind: str, path: Path) -> list[Any]:
     except MemoryError:
         raise
     except Exception as error:  # what is wrong with damaged files shows wherever the library stumbles over it
-        said = (str(error).splitlines() or [type(error).__name__])[0][:200]
+        said = first_reason(str(error) or type(error).__name__)
         raise AssetError(str(path), f"is no {kind.upper()} that can be read ({said})", _DAMAGED) from error

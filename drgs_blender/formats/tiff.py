@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from ..core.asset.archive import first_reason
 from ..core.errors import AssetError
 
 Array = np.ndarray
@@ -71,7 +72,7 @@ def _attempt(data: bytes, subject: str, use: Any) -> Any:
         if "imagecodecs" in str(error):
             problem = "is compressed in a way that needs the package imagecodecs"
             raise AssetError(subject, problem, f"Install it: pip install imagecodecs. Or: {_KINDS}") from error
-        said = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
+        said = first_reason(str(error) or type(error).__name__)
         raise AssetError(subject, f"is no TIFF that can be read ({said})", _DAMAGED) from error
     finally:
         noisy.disabled = was

@@ -9,6 +9,7 @@ import io
 import json
 import zipfile
 from collections import Counter, defaultdict
+from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
@@ -38,9 +39,13 @@ _TURNS = {
 def main(source: str, target: str, most_bytes: str, most_seconds: str) -> None:
     """Write the meshes of `source` to `target`; leave with a code (see `apart`)."""
     limit(int(most_bytes), int(most_seconds))
+    hand_over(source, target, kind_of(source), read_scene)
+
+
+def kind_of(source: str | Path) -> str:
+    """What the file at `source` is, "3MF" or "COLLADA": 3MF is a zip."""
     with open(source, "rb") as file:
-        kind = "3MF" if file.read(2) == b"PK" else "COLLADA"
-    hand_over(source, target, kind, read_scene)
+        return "3MF" if file.read(2) == b"PK" else "COLLADA"
 
 
 def read_scene(subject: str) -> dict[str, Array]:
@@ -58,16 +63,16 @@ def read_scene(subject: str) -> dict[str, Array]:
     with open(subject, "rb") as file:
         data = file.read()
     room = _ROOM + _RATIO * len(data)
-    zipped = data.startswith(b"PK")
-    metres, turn, found = _of_3mf(data, subject, room) if zipped else _of_collada(data, subject)
+    kind = kind_of(subject)
+    metres, turn, found = _of_3mf(data, subject, room) if kind == "3MF" else _of_collada(data, subject)
     placed = found.pop("placed", None)
-    scene = _load(data, "3mf" if zipped else "dae")
+    scene = _load(data, kind)
     return _arrays(scene, turn, metres, room, placed, found, subject)
 
 
 def _load(data: bytes, kind: str) -> dict[str, Any]:
     """What trimesh's loader says of the scene: to meshes it would join vertices that differ a little."""
-    if kind == "dae":
+    if kind == "COLLADA":
         import collada
         from trimesh.exchange.dae import load_collada
 
@@ -219,5 +224,4 @@ def _material(material: Any) -> dict[str, Any] | None:
         "colour": [1.0, 1.0, 1.0] if colour is None else [float(c) / 255 for c in colour[:3]],
         "roughness": 0.5 if rough is None else min(max(float(rough), 0.0), 1.0),
         "picture": None if picture is None else picture.info.get("name"),
-        "more": material.normalTexture is not None or material.emissiveTexture is not None,
     }

@@ -38,9 +38,9 @@ class DepthMaps:
     ----------
     depth : (v, h, w) float32 or float64 array
         Metres along the axis of view, +inf where nothing is seen. Its precision is that of the fusion's arithmetic.
-    cosine : (v, h, w) array
-        Of the same dtype Between the surface's normal and the view, 0..1: the weight of a pixel. Below 0.1 a pixel does
-        not count; where nothing is seen, 1 says that space is free.
+    cosine : (v, h, w) float32 or float64 array
+        Of the angle between the surface's normal and the view, 0..1: the weight of a pixel. Below 0.1 a pixel does not
+        count; where nothing is seen, 1 says that space is free. Of the dtype of `depth`.
     origin : (v, 3) float64 array
         Metres, in the frame of the field.
     axes : (v, 3, 3) float64 array

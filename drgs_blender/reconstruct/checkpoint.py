@@ -81,9 +81,9 @@ class Checkpoint:
         """The state that lies there and belongs to this run."""
         return None if self._path is None else load(self._path, self._key)
 
-    def is_due(self) -> bool:
-        """Whether the last state was written a while ago."""
-        return self._path is not None and self._now() - self._saved > self._every
+    def is_due(self, at_once: bool = False) -> bool:
+        """Whether a state is wanted, `at_once` or because the last one was written a while ago."""
+        return self._path is not None and (at_once or self._now() - self._saved > self._every)
 
     def save(self, state: dict[str, Array]) -> None:
         """Write a state; WriteError names the path."""

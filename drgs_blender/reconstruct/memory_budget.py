@@ -18,13 +18,14 @@ def check_fits(needed: float, subject: str, of: str, option: str, value: int, po
     subject, of : str
         What is too large, and what it consists of, for the message.
     option : str
-        What decides its size, and how it is set.
+        What sets its size, for the message.
     value : int
-        What decides its size, and how it is set.
+        Of the option.
     power, margin : int
         The bytes grow with this power of the value and its margin together.
     """
-    if needed > _SHARE * total_memory():
-        fitting = int((value + margin) * (_SHARE * total_memory() / needed) ** (1 / power)) - margin
-        problem = f"is {needed / 2**30:.2g} GiB of {of}, this machine has {total_memory() / 2**30:.2g} GiB of memory"
+    total = total_memory()
+    if needed > _SHARE * total:
+        fitting = int((value + margin) * (_SHARE * total / needed) ** (1 / power)) - margin
+        problem = f"is {needed / 2**30:.2g} GiB of {of}, this machine has {total / 2**30:.2g} GiB of memory"
         raise UsageError(subject, problem, f"Give {option} {max(fitting, 1)} or less")

@@ -255,7 +255,7 @@ class _Work:
             training.step()
             now = time.monotonic()
             stop = self.cancelled()
-            if stop or training.finished or kept.is_due():
+            if kept.is_due(stop or training.finished):
                 kept.save(training.arrays())
             if stop:
                 raise Cancelled

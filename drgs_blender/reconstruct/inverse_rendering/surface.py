@@ -33,7 +33,7 @@ class Seen:
     columns : (u, c) float32 tensor
         Of `Materials`, of the vertices that pixels and edges use.
     offsets : (u, 3) float32 tensor or None
-        Optional What is learned of their normals.
+        What is learned of their normals.
     ends : (e, 2) int64 tensor
         The ends of the edges among those vertices.
     """

@@ -29,7 +29,7 @@ PIXELS = 1.0
 #: Voxels around the region.
 _AROUND = 5
 #: Bytes per voxel of `SignedDistanceField` at the most: sum, weight and count, the field, smoothed, and widened.
-_BYTES_A_VOXEL = 24
+_BYTES_PER_VOXEL = 24
 #: Standard deviation of the smoothing of the field, voxels: below it is the noise of the depth maps.
 SMOOTH = 0.8
 
@@ -86,7 +86,7 @@ def grid(cameras: list[Camera], region: Region, resolution: int = 256) -> tuple[
     low, high = region.low - _AROUND * voxel, region.high + _AROUND * voxel
     shape = tuple(int(n) for n in np.ceil((high - low) / voxel).astype(int) + 1)
     around = 2 * _AROUND + 2
-    needed = _BYTES_A_VOXEL * float(np.prod(shape))
+    needed = _BYTES_PER_VOXEL * float(np.prod(shape))
     check_fits(needed, "the mesh", "voxels", "--voxels", max(shape) - around, 3, around)
     return low, voxel, shape
 

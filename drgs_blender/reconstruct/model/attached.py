@@ -31,9 +31,9 @@ class Attached(Gaussians):
     ----------
     parameters : dict of str to tensor
     base, normal : (n, 3) tensor
-        Tensors: point on the face, its unit normal, its mean edge, world space.
+        Point on the face, and the face's unit normal; world space.
     edge : (n,) tensor
-        Tensors: point on the face, its unit normal, its mean edge, world space.
+        Mean length of the face's edges; metres.
     fixed : tuple of str
         Names of parameters that are not learned.
     light : tensor, optional

@@ -29,7 +29,7 @@ class Movable(Protocol):
         """Steps that are done."""
 
     def move(self, backend: LearningBackend) -> None:
-        """Have `by` do the steps, from the first one."""
+        """Have `backend` do the steps, from the first one."""
 
     def state(self) -> dict[str, Array]:
         """All that `take_up` needs to go on with any processor."""
@@ -62,7 +62,7 @@ class Fallback:
         self._kept_at = 0.0
 
     def begin(self, backend: LearningBackend) -> None:
-        """Have `by` do the steps from the first one, if it is of use."""
+        """Have `backend` do the steps from the first one, if it is of use."""
         self._move(CPU)
         if backend is not CPU:
             self.keep()

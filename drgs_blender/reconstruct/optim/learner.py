@@ -37,7 +37,7 @@ class Learner:
     radius : float
         Of the object, metres.
     background : (3,) float32 tensor
-        Tensor, on the processor.
+        On the processor of `backend`.
     backend : LearningBackend
 
     Attributes

@@ -178,7 +178,7 @@ class Training:
         self.take_up(state)
 
     def move(self, backend: LearningBackend) -> None:
-        """Have `by` do the steps, from the first one: see `Fallback`."""
+        """Have `backend` do the steps, from the first one: see `Fallback`."""
         self.views = Views(self.targets, self._background, backend, self.schedule.seed)
         self.learner = Learner(self._begun, self.schedule, self.region.radius, self.views.background, backend)
 

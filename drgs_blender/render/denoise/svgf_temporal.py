@@ -108,7 +108,7 @@ def denoise_next(
     split : bool
         See `svgf_spatial.denoise`; a history made with another `split` or size is not used.
     check : callable
-        See `svgf_spatial.denoise`; a history made with another `split` or size is not used.
+        See `svgf_spatial.denoise`.
 
     Returns
     -------

@@ -91,9 +91,9 @@ def primary_surfels(
     tied : bool
         False: rays meet surfels, and nothing is tied.
     rasterise : callable
-        Who blends the surfels, and who ties their points; None: this processor.
+        Blends the surfels.
     tie : callable, optional
-        Who blends the surfels, and who ties their points; None: this processor.
+        Ties their points to the mesh; None: on this processor.
     trace, shade : callable
         As of `mesh`, for ordinary meshes next to the surfels.
     """

@@ -101,7 +101,7 @@ def integrate(
         When settings are out of range.
     """
     auto = settings.strategy_samples is None
-    counts = (settings.samples, 0, 0) if settings.strategy_samples is None else settings.strategy_samples
+    counts = settings.strategy_samples or (settings.samples, 0, 0)
     if min(counts) < 0 or settings.bounces < 0 or settings.subpixel_samples < 0:
         problem = "samples, bounces or sub-pixel samples are negative"
         raise UsageError("render settings", problem, "Use counts of zero or more")
@@ -146,9 +146,9 @@ def integrate(
 
     def run(some: ShadingPoints, shift: int, found: Radiance) -> None:
         kernel.shade(
-            (plain(some.pixel), plain(some.sample), plain(some.flags)),
-            (plain(some.origin), plain(some.normal), plain(some.geometric_normal), plain(some.view)),
-            (plain(some.albedo), plain(some.roughness), plain(some.metallic), plain(some.own), plain(some.size)),
+            tuple(map(plain, (some.pixel, some.sample, some.flags))),
+            tuple(map(plain, (some.origin, some.normal, some.geometric_normal, some.view))),
+            tuple(map(plain, (some.albedo, some.roughness, some.metallic, some.own, some.size))),
             *tables,
             *rules,
             shift,

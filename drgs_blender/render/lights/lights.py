@@ -58,9 +58,9 @@ class Lights:
     lights : list of Light
         Blender's lights of one frame.
     centre : array, optional
-        A sphere around what they shine on, world space; only for `power`.
+        Of a sphere around what they shine on, world space; only for `power`.
     radius : float
-        A sphere around what they shine on, world space; only for `power`.
+        Of that sphere.
     emitters : Emitters, optional
         Surfaces that emit light; those that are not among them are found by chance alone.
 
