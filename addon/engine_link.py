@@ -17,7 +17,7 @@ from ..drgs_blender.core.errors import DeviceError
 from ..drgs_blender.core.frame import Frame
 from ..drgs_blender.ipc.client import EngineClient, Passes, locate_engine
 from ..drgs_blender.ipc.locate import VARIABLE
-from . import engine_setup, messages, preferences
+from . import engine_environment, messages, preferences
 
 SET_UP = f"Press Set Up Engine in sidebar > DR-GS, or name an environment in the preferences or in {VARIABLE}"
 UPDATE = "Press Set Up Engine in sidebar > DR-GS; nothing need be fetched for it"
@@ -62,9 +62,9 @@ def command_line() -> list[str]:
     if named or os.environ.get(VARIABLE):
         return locate_engine(named or None)
     folder = own_folder()
-    found = engine_setup.state(folder)
+    found = engine_environment.state(folder)
     if found == "ready":
-        return locate_engine(engine_setup.interpreter(folder))
+        return locate_engine(engine_environment.interpreter(folder))
     if found == "old":
         raise DeviceError("engine", "belongs to another version of the extension", UPDATE)
     if found == "partial":
@@ -93,8 +93,8 @@ def lacks_reconstruction() -> bool:
     """Whether the engine in use is the one that was set up here, without what reconstruction needs. Starts nothing."""
     named = preferences.read("engine_python", "") or os.environ.get(VARIABLE)
     folder = own_folder()
-    ready = not named and engine_setup.state(folder) == "ready"
-    return ready and engine_setup.needs_network(folder, group=engine_setup.RECONSTRUCT)
+    ready = not named and engine_environment.state(folder) == "ready"
+    return ready and engine_environment.needs_network(folder, group=engine_environment.RECONSTRUCT)
 
 
 def problem() -> str:

@@ -7,59 +7,46 @@ make an environment somewhere else; nothing is ever installed into it.
 
 from __future__ import annotations
 
-import functools
-import hashlib
-import json
 import logging
 import os
 import re
 import shutil
 import signal
 import subprocess
-import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, NamedTuple
+from typing import IO
 
 from ..drgs_blender.core.errors import DeviceError
 from ..drgs_blender.core.phases import PREPARING
 from ..drgs_blender.ipc.child_process import clean_environment
 from ..drgs_blender.ipc.locate import VARIABLE
+from .engine_environment import (
+    ENGINE,
+    GPU,
+    PACKAGE,
+    PYTHONS,
+    RECONSTRUCT,
+    SOURCE,
+    Group,
+    alive,
+    digest,
+    entry,
+    interpreter,
+    needs_network,
+    pinned,
+    read_stamp,
+    requirements,
+    site_packages,
+    write_stamp,
+)
 
 log = logging.getLogger("drgs")
-
-#: The extension's folder: what the engine needs and the engine itself come with it.
-SOURCE = Path(__file__).resolve().parents[1]
-PACKAGE = "drgs_blender"
-PYTHONS = "3.11 to 3.13"
-
-
-class Group(NamedTuple):
-    """Packages that are set up together.
-
-    Attributes
-    ----------
-    extra : their name in pyproject.toml, "" for what every engine needs
-    download, disk : bytes that are fetched and that they take, about; measured with Python 3.11 on Linux
-    """
-
-    extra: str
-    download: float
-    disk: float
-
-
-ENGINE = Group("", 175e6, 650e6)
-#: PyTorch. On Linux the package index has it with CUDA, which the engine does not use; measured without.
-RECONSTRUCT = Group("reconstruct", 200e6, 900e6)
-#: NVIDIA Warp, for graphics cards.
-GPU = Group("gpu", 150e6, 400e6)
-CUDA_BYTES = 3e9
 
 #: What is said of kernels that are not there.
 _LATER = "What is missing is compiled when it is first used"
 
-_STAMP = "drgs-engine.json"
 #: Apart from the user's own Python settings; lines arrive as they are written, in UTF-8.
 _FLAGS = ("-I", "-u", "-X", "utf8")
 #: Share of a step with packages after which they are there and are only unpacked.
@@ -73,78 +60,6 @@ _COUNT = re.compile(re.escape(PREPARING) + r", (\d+) of (\d+)")
 #: Name and size of a package that pip begins with.
 _PACKAGE = re.compile(r"(?:Downloading|Using cached|Processing) (?:\S*/)?([A-Za-z0-9_.]+?)-\d\S*( \([\d.]+ \wB\))?")
 _WINDOWS = os.name == "nt"
-
-
-@functools.cache
-def requirements(source: Path = SOURCE, group: Group = ENGINE) -> tuple[str, ...]:
-    """The packages of a group, as pip knows them."""
-    project = tomllib.loads((source / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    return tuple(project["optional-dependencies"][group.extra] if group.extra else project["dependencies"])
-
-
-@functools.cache
-def digest(source: Path = SOURCE) -> str:
-    """What tells one state of the engine's sources from another."""
-    found = hashlib.sha256()
-    for path in sorted((source / PACKAGE).rglob("*.py")):
-        found.update(path.relative_to(source).as_posix().encode())
-        found.update(path.read_bytes())
-    return found.hexdigest()
-
-
-@functools.cache
-def pinned(source: Path = SOURCE) -> tuple[str, ...]:
-    """The very versions of Numba and LLVM for which the release brings compiled kernels, as pip knows them."""
-    try:
-        versions = json.loads((source / PACKAGE / "compute" / "kernels" / "versions.json").read_text(encoding="utf-8"))
-        return tuple(f"{name}=={versions[name]}" for name in ("numba", "llvmlite"))
-    except (OSError, ValueError, KeyError, TypeError):
-        return ()
-
-
-def interpreter(folder: Path) -> Path:
-    """Where the Python of the environment `folder` is, or will be."""
-    return folder / ("Scripts/python.exe" if _WINDOWS else "bin/python")
-
-
-def state(folder: Path, source: Path = SOURCE) -> str:
-    """What `folder` is: "absent", "partial" (a set-up was not finished), "old" (of another version), or "ready"."""
-    if not _alive(folder):
-        return "partial" if folder.is_dir() and any(folder.iterdir()) else "absent"
-    sources = _read_stamp(folder).get("sources")
-    if sources is None or needs_network(folder, source):
-        return "partial"
-    return "ready" if sources == digest(source) else "old"
-
-
-def needs_network(folder: Path, source: Path = SOURCE, group: Group = ENGINE) -> bool:
-    """Whether packages of a group are to be fetched for `folder`."""
-    return not _alive(folder) or _read_stamp(folder).get(_entry(group)) != list(requirements(source, group))
-
-
-def _entry(group: Group) -> str:
-    """Where the stamp keeps what was installed of a group."""
-    return group.extra or "packages"
-
-
-def _alive(folder: Path) -> bool:
-    """Whether `folder` is an environment whose Python is there, and the one that it was made with too."""
-    if not interpreter(folder).is_file():
-        return False
-    try:
-        text = (folder / "pyvenv.cfg").read_text(encoding="utf-8")
-    except OSError:
-        return False
-    home = re.search(r"^home\s*=\s*(.+?)\s*$", text, re.MULTILINE)
-    return home is not None and Path(home[1]).is_dir()
-
-
-def _read_stamp(folder: Path) -> dict[str, object]:
-    try:
-        found = json.loads((folder / _STAMP).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return found if isinstance(found, dict) else {}
 
 
 @dataclass(slots=True)
@@ -282,26 +197,24 @@ class EngineSetup:
         def fetch(text: str, group: Group) -> Step:
             needed = list(requirements(self.source, group))
             command = [*pip, "--only-binary=:all:", "--progress-bar=raw", *needed]
-            return Step(text, command, 0.8, lambda: self._stamp(**{_entry(group): needed}), group.download)
+            return Step(text, command, 0.8, lambda: write_stamp(self.folder, **{entry(group): needed}), group.download)
 
         steps = []
         if ENGINE in missing:
-            clear = afresh or (own.is_symlink() and not own.exists()) or (own.is_file() and not _alive(self.folder))
+            clear = afresh or (own.is_symlink() and not own.exists()) or (own.is_file() and not alive(self.folder))
             make = [str(python), *_FLAGS, "-m", "venv", *(["--clear"] if clear else []), str(self.folder)]
             steps += [
                 Step("Making an environment", make, 0.05),
                 Step("Preparing pip", [*pip, "pip>=24.1"], 0.05),
                 fetch("Installing packages", ENGINE),
             ]
-        if (pins := list(pinned(self.source))) and (
-            ENGINE in missing or _read_stamp(self.folder).get("pinned") != pins
-        ):
+        if (pins := list(pinned(self.source))) and (ENGINE in missing or read_stamp(self.folder).get("pinned") != pins):
             # First, so that the packages find them there; what pip cannot get leaves kernels to be compiled.
             exact = [*pip, "--only-binary=:all:", "--progress-bar=raw", *pins]
-            keep = lambda: self._stamp(pinned=pins)  # noqa: E731
+            keep = lambda: write_stamp(self.folder, pinned=pins)  # noqa: E731
             steps.insert(max(len(steps) - 1, 0), Step("Installing Numba", exact, 0.1, keep, needed=False))
         doctor = [str(own), *_FLAGS, "-m", f"{PACKAGE}.cli.main", "doctor"]
-        ready = lambda: self._stamp(sources=digest(self.source))  # noqa: E731
+        ready = lambda: write_stamp(self.folder, sources=digest(self.source))  # noqa: E731
         steps.append(Step("Trying the engine", doctor, 0.1, ready, before=self._copy))
         names = {RECONSTRUCT: "PyTorch", GPU: "NVIDIA Warp"}
         steps += [fetch(f"Installing {names[group]}", group) for group in missing if group in names]
@@ -340,7 +253,7 @@ class EngineSetup:
 
     def _copy(self) -> None:
         """Put the engine's sources into the environment; the old ones go only when the new ones are there."""
-        target = self._packages() / PACKAGE
+        target = site_packages(self.folder) / PACKAGE
         fresh, old = target.with_name(f"{PACKAGE}.new"), target.with_name(f"{PACKAGE}.old")
         for stale in (fresh, old):
             shutil.rmtree(stale, ignore_errors=True)
@@ -349,15 +262,6 @@ class EngineSetup:
             target.replace(old)
         fresh.replace(target)
         shutil.rmtree(old, ignore_errors=True)
-
-    def _packages(self) -> Path:
-        """The environment's site-packages."""
-        if _WINDOWS:
-            return self.folder / "Lib" / "site-packages"
-        found = sorted((self.folder / "lib").glob("python3*/site-packages"))
-        if not found:
-            raise FileNotFoundError(f"{self.folder / 'lib'} holds no site-packages")
-        return found[-1]
 
     def _read(self) -> None:
         """Follow the output of the command."""
@@ -385,12 +289,6 @@ class EngineSetup:
             self.text = f"Fetching {package[1]}{package[2] or ''}"
         elif line.startswith("Installing collected packages"):
             self.text, self.fraction = self._steps[0].text, self._began + _FETCHED * self._share
-
-    def _stamp(self, **entries: object) -> None:
-        """Remember what is done."""
-        partial = self.folder / f"{_STAMP}.part"
-        partial.write_text(json.dumps(_read_stamp(self.folder) | entries, indent=2), encoding="utf-8")
-        partial.replace(self.folder / _STAMP)
 
     def _fail(self, problem: str) -> None:
         self._close()

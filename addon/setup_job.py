@@ -8,7 +8,8 @@ from pathlib import Path
 import bpy
 
 from . import engine_link, messages, preferences
-from .engine_setup import EngineSetup, Group
+from .engine_environment import Group
+from .engine_setup import EngineSetup
 
 INTERVAL = 0.2
 

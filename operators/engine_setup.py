@@ -12,7 +12,7 @@ from pathlib import Path, PurePath
 import bpy
 from bpy.props import BoolProperty, StringProperty
 
-from ..addon import engine_link, engine_setup, preferences, setup_job
+from ..addon import engine_environment, engine_link, preferences, setup_job
 from ..drgs_blender.core.errors import UsageError
 from ..drgs_blender.ipc.locate import VARIABLE, locate_engine
 from .base import DrgsOperator
@@ -27,8 +27,8 @@ class DRGS_OT_engine_setup(DrgsOperator, bpy.types.Operator):
 
     python: StringProperty(
         name="Python",
-        description=f"Python {engine_setup.PYTHONS} that makes the environment. Empty: the one that Blender brings, "
-        "which stays as it is",
+        description=f"Python {engine_environment.PYTHONS} that makes the environment. Empty: the one that Blender "
+        "brings, which stays as it is",
         subtype="FILE_PATH",
         options={"SKIP_SAVE"},
     )
@@ -67,15 +67,15 @@ class DRGS_OT_engine_setup(DrgsOperator, bpy.types.Operator):
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         folder = engine_link.own_folder()
-        if engine_setup.state(folder) != "absent":
-            self.reconstruct = self.reconstruct or not self._missing(engine_setup.RECONSTRUCT)
-            self.gpu = self.gpu or not self._missing(engine_setup.GPU)
+        if engine_environment.state(folder) != "absent":
+            self.reconstruct = self.reconstruct or not self._missing(engine_environment.RECONSTRUCT)
+            self.gpu = self.gpu or not self._missing(engine_environment.GPU)
         return context.window_manager.invoke_props_dialog(self, width=440, confirm_text="Set Up")
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
         folder = engine_link.own_folder()
-        state = engine_setup.state(folder)
+        state = engine_environment.state(folder)
         text = {
             "absent": "Makes a Python environment for the engine. The folder is",
             "partial": "Goes on with what was begun; what has been fetched is not fetched again. The folder is",
@@ -83,7 +83,7 @@ class DRGS_OT_engine_setup(DrgsOperator, bpy.types.Operator):
             "ready": "Tries the engine and repairs it. The folder is",
         }[state]
         groups = [g for g in self._groups() if self._missing(g)]
-        if state == "ready" and groups == [engine_setup.RECONSTRUCT]:
+        if state == "ready" and groups == [engine_environment.RECONSTRUCT]:
             text = "Adds PyTorch, which From Photographs needs. The folder is"
         column = layout.column(align=True)
         for line in textwrap.wrap(text, 70) + path_lines(folder, 70):
@@ -96,8 +96,8 @@ class DRGS_OT_engine_setup(DrgsOperator, bpy.types.Operator):
             column.label(text=f"To fetch: about {fetch:.0f} MB from the Python package index; {disk:.0f} MB on disk")
         else:
             column.label(text="Nothing is fetched")
-        if engine_setup.RECONSTRUCT in groups and sys.platform == "linux":
-            more = f"{engine_setup.CUDA_BYTES / 1e9:.0f} GB more"
+        if engine_environment.RECONSTRUCT in groups and sys.platform == "linux":
+            more = f"{engine_environment.CUDA_BYTES / 1e9:.0f} GB more"
             column.label(text=f"Linux: PyTorch comes with CUDA, {more} and of no use here,")
             column.label(text="unless an index has a build for processors alone")
         layout.prop(self, "python")
@@ -106,17 +106,17 @@ class DRGS_OT_engine_setup(DrgsOperator, bpy.types.Operator):
         if state != "absent":
             layout.prop(self, "afresh")
 
-    def _groups(self) -> list[engine_setup.Group]:
+    def _groups(self) -> list[engine_environment.Group]:
         """What is wanted."""
-        return [engine_setup.ENGINE, *self._extras()]
+        return [engine_environment.ENGINE, *self._extras()]
 
-    def _extras(self) -> list[engine_setup.Group]:
-        wanted = {engine_setup.RECONSTRUCT: self.reconstruct, engine_setup.GPU: self.gpu}
+    def _extras(self) -> list[engine_environment.Group]:
+        wanted = {engine_environment.RECONSTRUCT: self.reconstruct, engine_environment.GPU: self.gpu}
         return [group for group, chosen in wanted.items() if chosen]
 
-    def _missing(self, group: engine_setup.Group) -> bool:
+    def _missing(self, group: engine_environment.Group) -> bool:
         """Whether it is to be fetched."""
-        return self.afresh or engine_setup.needs_network(engine_link.own_folder(), group=group)
+        return self.afresh or engine_environment.needs_network(engine_link.own_folder(), group=group)
 
     def run(self, context: bpy.types.Context) -> set[str]:
         if any(map(self._missing, self._groups())) and not bpy.app.online_access:
@@ -127,7 +127,9 @@ class DRGS_OT_engine_setup(DrgsOperator, bpy.types.Operator):
             )
         python = Path(bpy.path.abspath(self.python) or sys.executable)
         if not os.path.isfile(python):
-            raise UsageError("Python", f"{python} does not exist", f"Choose a Python of version {engine_setup.PYTHONS}")
+            raise UsageError(
+                "Python", f"{python} does not exist", f"Choose a Python of version {engine_environment.PYTHONS}"
+            )
         job = setup_job.start(python, self.afresh, self._extras(), self.index.strip())
         if os.environ.get(VARIABLE):
             self.warn(f"The variable {VARIABLE} names another engine, which is used as long as it is set")

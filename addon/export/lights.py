@@ -11,7 +11,8 @@ import numpy as np
 from ...drgs_blender.core.frame import Light
 from .instances import Visible
 from .node_math import rgb
-from .nodes import Paint, Walker, once, plain
+from .nodes import Walker
+from .paint import Paint, once, plain
 from .sockets import Place, surface_of
 
 Warn = Callable[[str], None]

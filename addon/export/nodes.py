@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import colorsys
 from collections.abc import Callable, Hashable
-from dataclasses import dataclass, replace
-from functools import wraps
 from typing import Any
 
 import bpy
@@ -18,71 +16,13 @@ from mathutils import Euler, Matrix
 
 from ...drgs_blender.core.color import LUMINANCE as REC709
 from .node_math import BLENDS, OPERATIONS, blackbody, by_row, divide, hsl, hsv, hue_saturation, in_system
+from .paint import Array, Paint, Warn, constant, once, plain
 from .sockets import Place
-
-Warn = Callable[[str], None]
-Array = np.ndarray
 
 #: Luminance weights of Rec.709.
 LUMINANCE = np.array(REC709)
-#: Nodes that may follow each other; Python's own limit is some six times that.
-DEEPEST = 100
 #: Colours with which a function is probed for being a plain scaling of each channel.
 _PROBES = np.array(((0.9, 0.6, 0.3), (0.2, 0.5, 0.8), (0.04, 0.02, 0.07)))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Paint:
-    """A colour, times a texture where there is one."""
-
-    colour: Array
-    texture: Hashable | None = None
-
-    def times(self, factor: Array | float) -> Paint:
-        """Scaled."""
-        return replace(self, colour=self.colour * factor)
-
-    @property
-    def black(self) -> bool:
-        return not self.colour.any()
-
-
-def plain(value: Array | float) -> Paint:
-    """Without texture."""
-    return Paint(np.broadcast_to(np.asarray(value, np.float64), (3,)).copy())
-
-
-def constant(socket: bpy.types.NodeSocket) -> Array:
-    """(3,) float64: a socket's own value."""
-    value = socket.default_value
-    return np.array(value[:3] if hasattr(value, "__len__") else (value,) * 3, np.float64)
-
-
-def once(fallback: Callable[[Any], Any]) -> Callable[..., Any]:
-    """Let a method of a `Walker` work out what a place holds only once, however many nodes ask.
-
-    Without that, nodes whose inputs share a source double the work each. Nodes before the `DEEPEST` are left out: then
-    the method gives ``fallback(walker)``.
-    """
-
-    def decorate(method: Callable[[Any, Place], Any]) -> Callable[[Any, Place], Any]:
-        @wraps(method)
-        def remembered(self: Any, place: Place) -> Any:
-            key = method.__name__, place
-            if key not in self.found:
-                if self.depth >= DEEPEST and place.socket.is_linked:
-                    self.warn(place.node, f"more than {DEEPEST} nodes follow; what comes before is left out")
-                    return fallback(self)
-                self.depth += 1
-                try:
-                    self.found[key] = method(self, place)
-                finally:
-                    self.depth -= 1
-            return self.found[key]
-
-        return remembered
-
-    return decorate
 
 
 class Walker:

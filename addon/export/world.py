@@ -13,7 +13,8 @@ from ...drgs_blender.core.errors import UsageError
 from ...drgs_blender.core.frame import World
 from .images import linear_pixels
 from .node_math import rgb
-from .nodes import Paint, Walker, euler, once, plain, vector_rotate
+from .nodes import Walker, euler, vector_rotate
+from .paint import Paint, once, plain
 from .sockets import Place, surface_of
 
 Warn = Callable[[str], None]

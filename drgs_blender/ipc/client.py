@@ -22,19 +22,18 @@ from ..core.errors import (
     ERROR_CLASSES,
     AssetError,
     Cancelled,
-    DeviceError,
     DrgsError,
     EngineError,
     UsageError,
     VersionError,
 )
 from ..core.frame import Frame
-from ..core.version import __version__
 from . import protocol
 from .child_process import Child
 from .codec import CodecError, encode_frame
+from .handshake import greet
 from .locate import engine_command, locate_engine
-from .protocol import PROTOCOL, Passes, sendable
+from .protocol import Passes, sendable
 from .slots import SentSlots
 from .watchdog import Lost, Watch
 
@@ -300,7 +299,8 @@ class EngineClient:
             self._to_load = list(self._assets)
         if not self._child.greeted:
             try:
-                self._handshake(self._child, cancelled)
+                watch = Watch(self._child, self.greeting, self.stall)
+                greet(self._child, self.command[0], watch, lambda: self._stopped(cancelled))
             except DrgsError:
                 self._abandon()
                 raise
@@ -308,52 +308,11 @@ class EngineClient:
             path = self._to_load[0]
             try:
                 self._load(path, on_progress, cancelled)
-            except (
-                AssetError,
-                VersionError,
-            ) as error:  # the frame may not use it any more; if it does, the engine says so
+            # The frame may not use it any more; if it does, the engine says so.
+            except (AssetError, VersionError) as error:
                 logger.warning("asset not loaded again: %s", error)
                 del self._assets[path]
             del self._to_load[0]
-
-    def _handshake(self, child: Child, cancelled: IsCancelled | None) -> None:
-        watch = Watch(child, self.greeting, self.stall)
-        remedy = "Install the engine in the environment named in the preferences, or correct the path"
-        while True:
-            if self._stopped(cancelled):
-                raise Cancelled
-            try:
-                item = child.inbox.get(timeout=_POLL)
-            except queue.Empty:
-                try:
-                    watch.check()
-                except Lost as silence:
-                    problem = f"does not greet as an engine does: it said nothing for {self.greeting:g} s"
-                    raise DeviceError(self.command[0], problem, remedy) from silence
-                continue
-            if isinstance(item, OSError) and child.pid == 0:
-                raise DeviceError(self.command[0], f"cannot be started ({item})", remedy) from item
-            if isinstance(item, EOFError) and child.killed:
-                raise Lost("was killed while it started") from item
-            if isinstance(item, protocol.ProtocolError):
-                raise DeviceError(self.command[0], f"does not speak as an engine does ({item})", remedy) from item
-            if isinstance(item, Exception):
-                problem = f"did not start as an engine: it {child.epitaph()}"
-                raise DeviceError(self.command[0], problem, remedy) from item
-            if item is None:
-                continue
-            greeting = item[0]
-            if not isinstance(greeting, protocol.Hello):
-                raise DeviceError(self.command[0], "does not greet as an engine does", remedy)
-            if not protocol.same_version(greeting):
-                raise VersionError(
-                    "engine",
-                    f"is version {greeting.version} (protocol {greeting.protocol}), "
-                    f"the extension is version {__version__} (protocol {PROTOCOL})",
-                    "Install the same version of both",
-                )
-            child.welcome()
-            return
 
     def _load(self, path: str, on_progress: OnProgress | None, cancelled: IsCancelled | None) -> str:
         answer, _ = self._request(protocol.LoadAsset(self._next(), path), {}, on_progress, cancelled)

@@ -20,7 +20,7 @@ class Watch:
     """
 
     def __init__(self, child: Child, silence: float, stall: float) -> None:
-        self._child, self._silence, self._stall = child, silence, stall
+        self._child, self.silence, self._stall = child, silence, stall
         self._last = time.monotonic()
         self._seen = (child.heard, child.steps)
         self._quiet = self._still = 0.0
@@ -32,8 +32,8 @@ class Watch:
         self._quiet = 0.0 if self._child.heard != heard else self._quiet + passed
         self._still = 0.0 if self._child.steps != steps else self._still + passed
         self._seen = (self._child.heard, self._child.steps)
-        if self._quiet > self._silence:
-            raise Lost(f"did not answer for {self._silence:g} s")
+        if self._quiet > self.silence:
+            raise Lost(f"did not answer for {self.silence:g} s")
         if self._still > self._stall:
             raise EngineError(
                 "engine", f"made no progress for {self._stall:g} s", "Try fewer samples or a smaller scene"

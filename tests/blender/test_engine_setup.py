@@ -15,8 +15,9 @@ import pytest
 from scenes import PACKAGE, part
 
 setup = part("addon.engine_setup")
+environment = part("addon.engine_environment")
 job = part("addon.setup_job")
-requirements = setup.requirements
+requirements = environment.requirements
 errors = part("drgs_blender.core.errors")
 
 DOCTOR = "import {0}\nprint('DR-GS can render here.')\n"
@@ -103,14 +104,14 @@ def made(tmp_path_factory) -> tuple[Path, Path]:
     top = tmp_path_factory.mktemp("setup")
     source = engine_source(top / "source", wheel(top, "tinydep"), DOCTOR.format("tinydep"))
     folder, before = top / "engine", packages_of_this_python()
-    assert setup.state(folder, source) == "absent" and setup.needs_network(folder, source)
+    assert environment.state(folder, source) == "absent" and environment.needs_network(folder, source)
     running = setup.EngineSetup(folder, Path(sys.executable), source)
     process = running._process
     time.sleep(0.3)
     begin = time.monotonic()
     running.cancel()
     assert time.monotonic() - begin < 2 and process.poll() is not None and running.done
-    assert setup.state(folder, source) == "partial"
+    assert environment.state(folder, source) == "partial"
     if sys.platform == "linux":
         while alive(process.pid) and time.monotonic() - begin < 5:  # killed, and a moment away from its end
             time.sleep(0.02)
@@ -139,8 +140,8 @@ def test_the_versions_of_shipped_kernels_are_asked_for_first_and_not_insisted_on
     assert titles.index("Installing Numba") == titles.index("Installing packages") - 1
     fractions = until_done(running)
     assert running.error is None and fractions == sorted(fractions) and fractions[-1] == 1
-    assert setup.state(folder, source) == "ready"
-    assert bool(list(running._packages().glob("numba-1.0.dist-info"))) == there
+    assert environment.state(folder, source) == "ready"
+    assert bool(list(environment.site_packages(folder).glob("numba-1.0.dist-info"))) == there
     again = setup.EngineSetup(folder, Path("/no/python/is/needed"), source)
     assert ("Installing Numba" in [step.text for step in again._steps]) != there
     again.cancel()
@@ -149,34 +150,34 @@ def test_the_versions_of_shipped_kernels_are_asked_for_first_and_not_insisted_on
 @pytest.mark.slow
 def test_another_version_of_the_engine_needs_no_network(made):
     folder, source = made
-    assert setup.state(folder, source) == "ready" and not setup.needs_network(folder, source)
+    assert environment.state(folder, source) == "ready" and not environment.needs_network(folder, source)
     (source / "drgs_blender" / "new.py").write_text("")
-    setup.digest.cache_clear()
-    assert setup.state(folder, source) == "old"
+    environment.digest.cache_clear()
+    assert environment.state(folder, source) == "old"
     again = setup.EngineSetup(folder, Path("/no/python/is/needed"), source)
     assert [step.text for step in again._steps] == ["Trying the engine", PREPARING]
     until_done(again)
-    assert again.error is None and setup.state(folder, source) == "ready"
+    assert again.error is None and environment.state(folder, source) == "ready"
     assert list(folder.rglob("new.py")) and not list(folder.rglob("drgs_blender.old"))
 
 
 @pytest.mark.slow
 def test_reconstruction_is_added_to_an_engine_that_is_ready(made):
     folder, source = made
-    assert setup.needs_network(folder, source, setup.RECONSTRUCT) and not list(folder.rglob("tinytorch.py"))
-    running = setup.EngineSetup(folder, Path("/no/python/is/needed"), source, extras=[setup.RECONSTRUCT])
+    assert environment.needs_network(folder, source, environment.RECONSTRUCT) and not list(folder.rglob("tinytorch.py"))
+    running = setup.EngineSetup(folder, Path("/no/python/is/needed"), source, extras=[environment.RECONSTRUCT])
     assert running.fraction < 0.1
     fractions = until_done(running)
     assert running.error is None and fractions == sorted(fractions) and fractions[-1] == 1
-    assert setup.state(folder, source) == "ready" and list(folder.rglob("tinytorch.py"))
-    assert not setup.needs_network(folder, source, setup.RECONSTRUCT)
+    assert environment.state(folder, source) == "ready" and list(folder.rglob("tinytorch.py"))
+    assert not environment.needs_network(folder, source, environment.RECONSTRUCT)
 
 
 @pytest.mark.slow
 def test_an_engine_without_reconstruction_renders_and_says_so(made, monkeypatch):
     """Packages that cannot be had leave a working engine, and their want is told before files are chosen."""
     folder, source = made
-    stamp = folder / setup._STAMP
+    stamp = folder / environment._STAMP
     before = stamp.read_text()
     entries = json.loads(before)
     entries.pop("reconstruct", None)
@@ -184,15 +185,17 @@ def test_an_engine_without_reconstruction_renders_and_says_so(made, monkeypatch)
     text = (source / "pyproject.toml").read_text()
     try:
         (source / "pyproject.toml").write_text(text.replace("tinytorch-1.0", "tinytorch-2.0"))
-        setup.requirements.cache_clear()
-        running = setup.EngineSetup(folder, Path("/no/python/is/needed"), source, extras=[setup.RECONSTRUCT])
+        environment.requirements.cache_clear()
+        running = setup.EngineSetup(folder, Path("/no/python/is/needed"), source, extras=[environment.RECONSTRUCT])
         until_done(running)
-        assert "Installing PyTorch" in str(running.error) and setup.state(folder, source) == "ready"
+        assert "Installing PyTorch" in str(running.error) and environment.state(folder, source) == "ready"
         link = part("addon.engine_link")
         monkeypatch.delenv("DRGS_ENGINE")
         monkeypatch.setattr(link, "own_folder", lambda create=False: folder)
-        monkeypatch.setattr(setup, "digest", lambda where=None: json.loads(before)["sources"])
-        monkeypatch.setattr(setup, "requirements", lambda where=None, group=setup.ENGINE: requirements(source, group))
+        monkeypatch.setattr(environment, "digest", lambda where=None: json.loads(before)["sources"])
+        monkeypatch.setattr(
+            environment, "requirements", lambda where=None, group=environment.ENGINE: requirements(source, group)
+        )
         assert link.lacks_reconstruction()
         with pytest.raises(RuntimeError, match="without PyTorch"):
             bpy.ops.drgs.reconstruct(filepath=str(source))
@@ -210,7 +213,7 @@ def prepare(made):
 
     def write(text: str) -> None:
         program.write_text(text)
-        setup.digest.cache_clear()
+        environment.digest.cache_clear()
 
     yield write
     write(before)
@@ -231,7 +234,7 @@ def test_kernels_that_cannot_be_compiled_are_named_and_the_engine_works(made, pr
     prepare("raise SystemExit('error: the compiler is tired')")
     running = setup.EngineSetup(folder, Path("/no/python/is/needed"), source)
     assert until_done(running)[-1] == 1
-    assert running.error is None and running.text == "Ready" and setup.state(folder, source) == "ready"
+    assert running.error is None and running.text == "Ready" and environment.state(folder, source) == "ready"
     assert running.remark.startswith(f"{PREPARING} failed: error: the compiler is tired. ")
     assert "setup.log" in running.remark
 
@@ -244,12 +247,12 @@ def test_cancelled_among_its_kernels_the_engine_works(made, prepare, monkeypatch
     while not running.text.endswith("1 of 2"):
         assert not running.poll() and time.monotonic() < end, running.text
         time.sleep(0.02)
-    assert setup.state(folder, source) == "ready"
+    assert environment.state(folder, source) == "ready"
     process, begin = running._process, time.monotonic()
     monkeypatch.setattr(job, "job", running)
     assert bpy.ops.drgs.engine_setup_cancel() == {"FINISHED"}
     assert time.monotonic() - begin < 2 and process.poll() is not None and running.done and running.error is None
-    assert setup.state(folder, source) == "ready"
+    assert environment.state(folder, source) == "ready"
     said = [m.text for m in part("addon.messages").history]
     assert said[-2:] == [f"The engine is set up in {folder}", "What is missing is compiled when it is first used"]
 
@@ -260,25 +263,25 @@ def test_an_engine_that_does_not_work_is_not_ready(made):
     before = program.read_text()
     try:
         program.write_text("raise SystemExit('error: no Embree')")
-        setup.digest.cache_clear()
+        environment.digest.cache_clear()
         running = setup.EngineSetup(folder, Path(sys.executable), source)
         until_done(running)
         assert "no Embree" in str(running.error) and "setup.log" in str(running.error)
-        assert setup.state(folder, source) == "old"
+        assert environment.state(folder, source) == "old"
     finally:
         program.write_text(before)
-        setup.digest.cache_clear()
+        environment.digest.cache_clear()
 
 
 @pytest.mark.skipif(os.name == "nt", reason="environments have no links there")
 def test_an_environment_whose_python_has_gone_is_made_anew(made, tmp_path):
     folder, source = made
-    own = setup.interpreter(folder)
+    own = environment.interpreter(folder)
     kept = own.readlink()
     own.unlink()
     own.symlink_to(tmp_path / "gone")
     try:
-        assert setup.state(folder, source) == "partial" and setup.needs_network(folder, source)
+        assert environment.state(folder, source) == "partial" and environment.needs_network(folder, source)
         running = setup.EngineSetup(folder, tmp_path / "no-python", source)
         assert "--clear" in running._plan(Path(sys.executable), False, [setup.ENGINE], "")[0].command
     finally:
@@ -316,8 +319,8 @@ def test_too_little_room_is_told_before_anything_is_fetched(tmp_path, monkeypatc
 
 
 def test_the_extension_brings_what_the_engine_needs():
-    assert any(r.startswith("numba") for r in setup.requirements())
-    assert (setup.SOURCE / "drgs_blender" / "cli" / "doctor.py").is_file()
+    assert any(r.startswith("numba") for r in environment.requirements())
+    assert (environment.SOURCE / "drgs_blender" / "cli" / "doctor.py").is_file()
 
 
 def test_offline_nothing_begins(scene, monkeypatch):
@@ -325,7 +328,7 @@ def test_offline_nothing_begins(scene, monkeypatch):
         pytest.skip("this Blender is online")
     with pytest.raises(RuntimeError, match="Allow Online Access"):
         bpy.ops.drgs.engine_setup()
-    assert not job.running() and setup.state(part("addon.engine_link").own_folder()) == "absent"
+    assert not job.running() and environment.state(part("addon.engine_link").own_folder()) == "absent"
 
 
 def test_an_existing_engine_is_chosen_and_another_program_refused(scene, monkeypatch, tmp_path):

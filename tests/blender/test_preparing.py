@@ -151,6 +151,7 @@ def test_a_bake_says_it(body, tmp_path, monkeypatch):
 def test_the_set_up_counts_them_and_cancelled_there_the_engine_answers(tmp_path, monkeypatch):
     """The true engine, in an environment that finds its packages in that of the tests."""
     setup = part("addon.engine_setup")
+    environment = part("addon.engine_environment")
     monkeypatch.setenv("DRGS_CACHE_DIR", str(tmp_path / "kernels"))
     python, folder = os.environ["DRGS_ENGINE"], tmp_path / "engine"
     subprocess.run([python, "-m", "venv", "--without-pip", folder], check=True)
@@ -158,20 +159,20 @@ def test_the_set_up_counts_them_and_cancelled_there_the_engine_answers(tmp_path,
     theirs = subprocess.run(asked, check=True, capture_output=True, text=True).stdout
     (own,) = folder.glob("lib/python3*/site-packages")
     (own / "theirs.pth").write_text(theirs)
-    (folder / setup._STAMP).write_text(json.dumps({"packages": setup.requirements()}))
+    (folder / environment._STAMP).write_text(json.dumps({"packages": environment.requirements()}))
     running = setup.EngineSetup(folder, Path("/no/python/is/needed"))
     wait(lambda: running.poll() or COUNTED.fullmatch(running.text), 240)
     assert not running.done, running.error
-    assert setup.state(folder) == "ready" and running.fraction > 0
+    assert environment.state(folder) == "ready" and running.fraction > 0
     group = running._process.pid
     running.cancel()
-    assert running.remark and running.error is None and setup.state(folder) == "ready"
+    assert running.remark and running.error is None and environment.state(folder) == "ready"
     with pytest.raises(ProcessLookupError):
         for _ in range(100):  # killed, and a moment away from its end
             os.killpg(group, 0)
             time.sleep(0.05)
     locate = part("drgs_blender.ipc.locate").locate_engine
-    with part("drgs_blender.ipc.client").EngineClient(locate(setup.interpreter(folder))) as client:
+    with part("drgs_blender.ipc.client").EngineClient(locate(environment.interpreter(folder))) as client:
         client.start()
         assert client.pid
 

@@ -16,7 +16,7 @@ from ...compute.jit import njit
 from ..memory import load_float, load_int32, load_int64
 from ..sampling import ONE, ZERO, F
 from .embree import blocked, trace
-from .textures import emission_at, emits, material_at
+from .texture_lookup import emission_at, emits, material_at
 
 _TINY = F(1e-30)
 

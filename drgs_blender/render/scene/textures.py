@@ -1,13 +1,11 @@
-"""Materials and their images as flat arrays, and what they say at a point of a surface.
+"""Materials and their images as flat arrays; `texture_lookup` reads them at points of a surface.
 
-Lookups are those of Cycles' Image Texture node, measured in Blender 5.0 (tests/unit/test_textures_cycles.py):
+Images are those of Cycles' Image Texture node, measured in Blender 5.0 (tests/unit/test_textures_cycles.py):
 
-- the four texels around a point are blended **as they are stored**; sRGB bytes are decoded after that;
-- "clip" is transparent black beyond the image, and blends into it over half a texel at the border;
 - colour channels do not look at alpha. Where Cycles does (alpha mode straight or premultiplied, a colour space other
   than Non-Color, the node's Alpha output not in use), it has multiplied the encoded colours by alpha as it loaded
   the image: whoever describes the frame does the same;
-- a point whose coordinates are not finite is transparent black; an image that is missing is magenta.
+- an image that is missing is magenta.
 
 Texels stay where they are: compiled code reads them at their address, so even large images are not copied. So it reads
 the tables too: arrays that are passed on from function to function are counted at each step, by all threads at once.
@@ -25,27 +23,24 @@ from ...core.arrays import frozen
 from ...core.color import LUMINANCE, srgb_to_linear, to_unit
 from ...core.errors import UsageError
 from ...core.frame import Image, Material, Texture
-from ..memory import Place, address, load_float, load_int32, load_int64, load_uint32
-from ..sampling import HALF, ONE, TWO, ZERO, F, luminance
+from ..memory import Place, address
+from .texture_lookup import (
+    BRIGHTEST,
+    BYTE,
+    BYTE_SRGB,
+    CHANNELS,
+    EXTENSIONS,
+    FLOAT,
+    INTERPOLATIONS,
+    WHITEST,
+    material_at,
+)
 
 Array = np.ndarray
 
-#: Kinds of images.
-_BYTE, _BYTE_SRGB, _FLOAT = range(3)
-_CHANNELS = {"r": 0, "g": 1, "b": 2, "a": 3, "luminance": 4, "rgb": 5}
-_A, _LUMINANCE, _RGB = 3, 4, 5
-_INTERPOLATIONS = {"closest": 0, "linear": 1}
-_EXTENSIONS = {"repeat": 0, "extend": 1, "mirror": 2, "clip": 3}
-_REPEAT, _, _MIRROR, _CLIP = range(4)
 _SLOTS = ("base_colour_texture", "roughness_texture", "metallic_texture", "emission_texture")
 #: What Blender shows of an image that is not there.
 _MISSING = np.array([[[255, 0, 255, 255]]], np.uint8)
-#: Base colours above this are cut: the light of many bounces must stay a float32. So are factors of textures.
-_WHITEST = F(1e3)
-#: Radiance above this is cut: its square is still a float32.
-_BRIGHTEST = F(1e15)
-_INFINITE = F(np.inf)
-_BYTE_SCALE = F(1.0 / 255.0)
 
 
 @dataclass(slots=True)
@@ -66,10 +61,10 @@ class _Texels:
         """(4,) float64 linear mean, of about a million texels at most."""
         step = max(1, math.isqrt(self.texels.shape[0] * self.texels.shape[1] >> 20))
         some = self.texels[::step, ::step].reshape(-1, 4)
-        if self.kind == _FLOAT:
+        if self.kind == FLOAT:
             return np.maximum(some, 0.0).mean(axis=0, dtype=np.float64)
         levels = np.arange(256) / 255.0
-        decoded = srgb_to_linear(levels) if self.kind == _BYTE_SRGB else levels
+        decoded = srgb_to_linear(levels) if self.kind == BYTE_SRGB else levels
         shares = [np.bincount(some[:, k], minlength=256) / len(some) for k in range(4)]
         return np.array([*(share @ decoded for share in shares[:3]), shares[3] @ levels])
 
@@ -169,16 +164,16 @@ class MaterialTable:
             return radiance
         image, channel = textures[texture, :2]
         mean = list(self._images.values())[image].mean()
-        if channel == _RGB:
+        if channel == CHANNELS["rgb"]:
             return radiance * mean[:3]
-        return radiance * (mean[:3] @ np.array(LUMINANCE) if channel == _LUMINANCE else mean[channel])
+        return radiance * (mean[:3] @ np.array(LUMINANCE) if channel == CHANNELS["luminance"] else mean[channel])
 
     def _constants(self, material: Material) -> Array:
         given = np.array(
             [*material.base_colour[:3], material.roughness, material.metallic, *material.emission[:3]], np.float64
         )
-        factors = [float(_WHITEST) if t else 1.0 for t in (material.roughness_texture, material.metallic_texture)]
-        highest = np.array([float(_WHITEST)] * 3 + factors + [float(_BRIGHTEST)] * 3)
+        factors = [float(WHITEST) if t else 1.0 for t in (material.roughness_texture, material.metallic_texture)]
+        highest = np.array([float(WHITEST)] * 3 + factors + [float(BRIGHTEST)] * 3)
         kept = np.clip(np.where(np.isnan(given), 0.0, given), 0.0, highest)
         parts = {"base colour": (0, 3), "roughness": (3, 4), "metallic": (4, 5), "emission": (5, 8)}
         for name, (first, last) in parts.items():
@@ -191,9 +186,9 @@ class MaterialTable:
         """Row of a new texture."""
         codes = []
         for name, known in (
-            ("channel", _CHANNELS),
-            ("interpolation", _INTERPOLATIONS),
-            ("extension", _EXTENSIONS),
+            ("channel", CHANNELS),
+            ("interpolation", INTERPOLATIONS),
+            ("extension", EXTENSIONS),
         ):
             value = getattr(texture, name)
             if value not in known:
@@ -213,7 +208,7 @@ class MaterialTable:
             self._rows[name] = len(self._rows)
             image = self._given.get(name)
             if image is None:
-                texels = _Texels(_MISSING, "linear", _MISSING, _BYTE, f"{subject}: image {name!r} is missing")
+                texels = _Texels(_MISSING, "linear", _MISSING, BYTE, f"{subject}: image {name!r} is missing")
             else:
                 before = self._known.get(name)
                 texels = before if before is not None and before.fits(image) else _read(image)
@@ -237,9 +232,9 @@ def _read(image: Image) -> _Texels:
     elif pixels.size == 0:
         problem = f"{subject}: has no pixels, taken as missing"
     if problem:
-        return _Texels(given, image.encoding, _MISSING, _BYTE, problem)
+        return _Texels(given, image.encoding, _MISSING, BYTE, problem)
     if pixels.dtype == np.uint8:
-        return _Texels(given, image.encoding, np.ascontiguousarray(pixels), _BYTE_SRGB if srgb else _BYTE, "")
+        return _Texels(given, image.encoding, np.ascontiguousarray(pixels), BYTE_SRGB if srgb else BYTE, "")
     if pixels.dtype != np.float32:
         problem = f"{subject}: {pixels.dtype} pixels are read as float32"
     with np.errstate(over="ignore", invalid="ignore"):
@@ -252,194 +247,7 @@ def _read(image: Image) -> _Texels:
     if srgb:
         # Floats are decoded before they are blended, bytes after: so does Cycles.
         texels = np.concatenate([srgb_to_linear(texels[..., :3]), texels[..., 3:]], axis=2)
-    return _Texels(given, image.encoding, texels, _FLOAT, problem)
-
-
-@njit
-def _texel(address, kind, index, weight, red, green, blue, alpha):  # type: ignore[no-untyped-def]
-    """Add `weight` times a texel, as stored."""
-    if kind == _FLOAT:
-        index *= 4
-        return (
-            red + weight * load_float(address, index),
-            green + weight * load_float(address, index + 1),
-            blue + weight * load_float(address, index + 2),
-            alpha + weight * load_float(address, index + 3),
-        )
-    word = np.int64(load_uint32(address, index))
-    return (
-        red + weight * F(word & 255),
-        green + weight * F((word >> 8) & 255),
-        blue + weight * F((word >> 16) & 255),
-        alpha + weight * F(word >> 24),
-    )
-
-
-@njit
-def _axis(u, n, interpolation, extension):  # type: ignore[no-untyped-def]
-    """The two texels next to coordinate u along an axis of n texels, and their weights."""
-    if extension == _REPEAT:
-        u -= np.floor(u)
-    elif extension == _MIRROR:
-        u -= TWO * np.floor(u * HALF)
-        u = min(u, TWO - u)
-    else:
-        # Far enough outside to be clipped, near enough to count in integers.
-        u = min(max(u, -ONE), TWO)
-    x = u * F(n)
-    if interpolation == 1:
-        x -= HALF
-    low = np.floor(x)
-    i = np.int64(low)
-    j, b = i, ZERO
-    if interpolation == 1:
-        j, b = i + 1, x - low
-    a = ONE - b
-    if extension == _REPEAT:
-        i = i + n if i < 0 else (i - n if i >= n else i)
-        j = j - n if j >= n else j
-        return i, j, a, b
-    if extension == _CLIP:
-        a = a if 0 <= i < n else ZERO
-        b = b if 0 <= j < n else ZERO
-    return min(max(i, 0), n - 1), min(max(j, 0), n - 1), a, b
-
-
-@njit
-def _decoded(x, decode):  # type: ignore[no-untyped-def]
-    """Linear value of an sRGB value in [0, 255], to 6e-6."""
-    i = min(np.int64(x), 254)
-    below = load_float(decode, i)
-    return below + (x - F(i)) * (load_float(decode, i + 1) - below)
-
-
-@njit
-def _lookup(row, u, v, addresses):  # type: ignore[no-untyped-def]
-    """Red, green, blue, alpha of a texture."""
-    _, _, textures, transforms, images, decode = addresses
-    i = 6 * row
-    s = load_float(transforms, i) * u + load_float(transforms, i + 1) * v + load_float(transforms, i + 2)
-    t = load_float(transforms, i + 3) * u + load_float(transforms, i + 4) * v + load_float(transforms, i + 5)
-    if not (abs(s) < _INFINITE and abs(t) < _INFINITE):
-        return ZERO, ZERO, ZERO, ZERO
-    i = 4 * row
-    interpolation, extension = load_int32(textures, i + 2), load_int32(textures, i + 3)
-    i = 4 * np.int64(load_int32(textures, i))
-    address, width, height, kind = (
-        load_int64(images, i),
-        load_int64(images, i + 1),
-        load_int64(images, i + 2),
-        load_int64(images, i + 3),
-    )
-    left, right, a, b = _axis(s, width, interpolation, extension)
-    low, high, c, d = _axis(t, height, interpolation, extension)
-    # Row 0 is at the top, v = 0 at the bottom.
-    low, high = (height - 1 - low) * width, (height - 1 - high) * width
-    red, green, blue, alpha = _texel(address, kind, low + left, a * c, ZERO, ZERO, ZERO, ZERO)
-    if interpolation == 1:
-        red, green, blue, alpha = _texel(address, kind, low + right, b * c, red, green, blue, alpha)
-        red, green, blue, alpha = _texel(address, kind, high + left, a * d, red, green, blue, alpha)
-        red, green, blue, alpha = _texel(address, kind, high + right, b * d, red, green, blue, alpha)
-    if kind == _BYTE_SRGB:
-        return _decoded(red, decode), _decoded(green, decode), _decoded(blue, decode), alpha * _BYTE_SCALE
-    if kind == _BYTE:
-        return red * _BYTE_SCALE, green * _BYTE_SCALE, blue * _BYTE_SCALE, alpha * _BYTE_SCALE
-    return red, green, blue, alpha
-
-
-@njit
-def _number(row, u, v, addresses):  # type: ignore[no-untyped-def]
-    """One number of a texture; of a colour its luminance, as where Blender plugs a colour into a number."""
-    red, green, blue, alpha = _lookup(row, u, v, addresses)
-    channel = load_int32(addresses[2], 4 * row + 1)
-    if channel >= _LUMINANCE:
-        return luminance(red, green, blue)
-    if channel == _A:
-        return alpha
-    return red if channel == 0 else (green if channel == 1 else blue)
-
-
-@njit
-def _colour(row, u, v, addresses):  # type: ignore[no-untyped-def]
-    """Colour of a texture; of one channel a grey."""
-    if load_int32(addresses[2], 4 * row + 1) == _RGB:
-        red, green, blue, _ = _lookup(row, u, v, addresses)
-        return red, green, blue
-    grey = _number(row, u, v, addresses)
-    return grey, grey, grey
-
-
-@njit
-def _within(x, highest):  # type: ignore[no-untyped-def]
-    """`x` in [0, highest]; NaN is 0."""
-    return min(x, highest) if x > ZERO else ZERO
-
-
-@njit
-def material_at(material, u, v, addresses):  # type: ignore[no-untyped-def]
-    """What a material is at texture coordinates (u, v).
-
-    Parameters
-    ----------
-    material : int
-        Index into the materials of the table; not checked.
-    u, v : float
-        v upwards.
-    addresses : tuple of int
-        ``MaterialTable.addresses``.
-
-    Returns
-    -------
-    r, g, b, roughness, metallic, er, eg, eb : float
-        Base colour, linear Rec.709, above 1 where it was given so; roughness and metallic in [0, 1]; emitted radiance,
-        linear Rec.709, finite, >= 0.
-    """
-    constants, slots = addresses[0], addresses[1]
-    i = 8 * np.int64(material)
-    r, g, b = load_float(constants, i), load_float(constants, i + 1), load_float(constants, i + 2)
-    roughness, metallic = load_float(constants, i + 3), load_float(constants, i + 4)
-    er, eg, eb = load_float(constants, i + 5), load_float(constants, i + 6), load_float(constants, i + 7)
-    i = 4 * np.int64(material)
-    first, second = np.int64(load_int32(slots, i)), np.int64(load_int32(slots, i + 1))
-    third, last = np.int64(load_int32(slots, i + 2)), np.int64(load_int32(slots, i + 3))
-    # Only if all are -1 are all bits set.
-    if (first & second & third & last) == -1:
-        return r, g, b, roughness, metallic, er, eg, eb
-    if first >= 0:
-        x, y, z = _colour(first, u, v, addresses)
-        r, g, b = _within(r * x, _WHITEST), _within(g * y, _WHITEST), _within(b * z, _WHITEST)
-    if second >= 0:
-        roughness = _within(roughness * _number(second, u, v, addresses), ONE)
-    if third >= 0:
-        metallic = _within(metallic * _number(third, u, v, addresses), ONE)
-    er, eg, eb = _emission(last, er, eg, eb, u, v, addresses)
-    return r, g, b, roughness, metallic, er, eg, eb
-
-
-@njit
-def _emission(row, er, eg, eb, u, v, addresses):  # type: ignore[no-untyped-def]
-    """Radiance times a texture, if there is one."""
-    if row < 0:
-        return er, eg, eb
-    x, y, z = _colour(row, u, v, addresses)
-    return _within(er * x, _BRIGHTEST), _within(eg * y, _BRIGHTEST), _within(eb * z, _BRIGHTEST)
-
-
-@njit
-def emits(material, addresses):  # type: ignore[no-untyped-def]
-    """Whether a material emits light, its texture apart."""
-    i = 8 * np.int64(material)
-    return (
-        max(load_float(addresses[0], i + 5), max(load_float(addresses[0], i + 6), load_float(addresses[0], i + 7))) > 0
-    )
-
-
-@njit
-def emission_at(material, u, v, addresses):  # type: ignore[no-untyped-def]
-    """(er, eg, eb) of `material_at`."""
-    i, row = 8 * np.int64(material), np.int64(load_int32(addresses[1], 4 * np.int64(material) + 3))
-    er, eg, eb = load_float(addresses[0], i + 5), load_float(addresses[0], i + 6), load_float(addresses[0], i + 7)
-    return _emission(row, er, eg, eb, u, v, addresses)
+    return _Texels(given, image.encoding, texels, FLOAT, problem)
 
 
 @njit

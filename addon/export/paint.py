@@ -1,0 +1,73 @@
+"""What a socket of a shader node holds: a colour, or a colour times a texture."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, replace
+from functools import wraps
+from typing import Any
+
+import bpy
+import numpy as np
+
+from .sockets import Place
+
+Warn = Callable[[str], None]
+Array = np.ndarray
+
+#: Nodes that may follow each other; Python's own limit is some six times that.
+DEEPEST = 100
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Paint:
+    """A colour, times a texture where there is one."""
+
+    colour: Array
+    texture: Hashable | None = None
+
+    def times(self, factor: Array | float) -> Paint:
+        """Scaled."""
+        return replace(self, colour=self.colour * factor)
+
+    @property
+    def black(self) -> bool:
+        return not self.colour.any()
+
+
+def plain(value: Array | float) -> Paint:
+    """Without texture."""
+    return Paint(np.broadcast_to(np.asarray(value, np.float64), (3,)).copy())
+
+
+def constant(socket: bpy.types.NodeSocket) -> Array:
+    """(3,) float64: a socket's own value."""
+    value = socket.default_value
+    return np.array(value[:3] if hasattr(value, "__len__") else (value,) * 3, np.float64)
+
+
+def once(fallback: Callable[[Any], Any]) -> Callable[..., Any]:
+    """Let a method of a `Walker` work out what a place holds only once, however many nodes ask.
+
+    Without that, nodes whose inputs share a source double the work each. Nodes before the `DEEPEST` are left out: then
+    the method gives ``fallback(walker)``.
+    """
+
+    def decorate(method: Callable[[Any, Place], Any]) -> Callable[[Any, Place], Any]:
+        @wraps(method)
+        def remembered(self: Any, place: Place) -> Any:
+            key = method.__name__, place
+            if key not in self.found:
+                if self.depth >= DEEPEST and place.socket.is_linked:
+                    self.warn(place.node, f"more than {DEEPEST} nodes follow; what comes before is left out")
+                    return fallback(self)
+                self.depth += 1
+                try:
+                    self.found[key] = method(self, place)
+                finally:
+                    self.depth -= 1
+            return self.found[key]
+
+        return remembered
+
+    return decorate

@@ -1,0 +1,213 @@
+"""A material's shaders: what its surface reflects, gives off and lets through."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import bpy
+import numpy as np
+
+from .node_math import reflectance
+from .paint import Array, Paint, constant, once, plain
+from .sockets import Place, surface_of
+from .texture_nodes import TextureWalker
+
+#: Of the Principled BSDF: inputs that must be zero, and what they are called in the warning.
+_LOBES = {
+    "Subsurface Weight": "subsurface",
+    "Transmission Weight": "transmission",
+    "Coat Weight": "coat",
+    "Sheen Weight": "sheen",
+    "Anisotropic": "anisotropy",
+    "Thin Film Thickness": "thin film",
+    "Diffuse Roughness": "diffuse roughness",
+}
+
+
+@dataclass(slots=True)
+class Surface:
+    """What a shader does: light it reflects and gives off, the share it scatters, the share it lets through.
+
+    ``base`` is already times the share that is scattered.
+    """
+
+    base: Paint = field(default_factory=lambda: plain(0))
+    roughness: Paint = field(default_factory=lambda: plain(1))
+    metallic: Paint = field(default_factory=lambda: plain(0))
+    emission: Paint = field(default_factory=lambda: plain(0))
+    scattered: float = 0.0
+    clear: float = 0.0
+
+
+class SurfaceWalker(TextureWalker):
+    """Evaluates a material on a mesh."""
+
+    def surface(self) -> Surface | None:
+        """What the material's surface does; None where nothing is seen of it."""
+        material = self.material
+        # From Blender 5.0 on every material has nodes, and the switch is deprecated.
+        if material.node_tree is None or (bpy.app.version < (5, 0, 0) and not material.use_nodes):
+            base, rough, metal = material.diffuse_color[:3], material.roughness, material.metallic
+            return Surface(plain(base), plain(rough), plain(metal), scattered=1)
+        place = surface_of(material.node_tree)
+        linked = place is not None and place.origin().socket.is_output
+        output = place and place.node
+        if output and output.inputs["Displacement"].is_linked:
+            self.warn(output, "displacement is not rendered")
+        if output and output.inputs["Volume"].is_linked:
+            self.warn(output, "the volume is not rendered")
+            if not linked:
+                return None
+        if not linked:
+            self.say("has no surface, which is black in Blender; its viewport colour is used")
+            return Surface(plain(material.diffuse_color[:3]), plain(material.roughness), scattered=1)
+        surface = self.shader(place)
+        if 0 < surface.clear < 1:
+            state = "left out" if surface.clear > 0.5 else "opaque"
+            self.say(f"is {surface.clear:.0%} transparent, which is not rendered; it is {state}")
+        return None if surface.clear > 0.5 and surface.emission.black else surface
+
+    # Shaders
+
+    @once(lambda self: Surface(plain(self.unknown), scattered=1))
+    def shader(self, place: Place) -> Surface:
+        """What a shader input does."""
+        origin = place.origin()
+        if not origin.socket.is_output:
+            return Surface()
+        evaluate = getattr(self, f"shader_{origin.node.type.lower()}", None)
+        return evaluate(origin) if evaluate is not None else self.other_shader(origin)
+
+    def shader_bsdf_principled(self, output: Place) -> Surface:
+        node = output.node
+        alpha = float(np.clip(self.opacity(output.input("Alpha")), 0, 1))
+        strength = self.number(output.input("Emission Strength"))
+        emission = plain(0)
+        if not strength.black:
+            emission = self.combine(node, np.multiply, self.colour(output.input("Emission Color")), strength)
+        lacking = [said for name, said in _LOBES.items() if name in node.inputs and _used(output.input(name))]
+        if not 0.03 < self.reflectance(output) < 0.05:
+            lacking.append("specular other than that of IOR 1.5")
+        self.complain(output, lacking)
+        return Surface(
+            self.colour(output.input("Base Color")).times(alpha),
+            self.number(output.input("Roughness")),
+            self.number(output.input("Metallic")),
+            emission.times(alpha),
+            scattered=alpha,
+            clear=1 - alpha,
+        )
+
+    def reflectance(self, output: Place) -> float:
+        """Of a Principled BSDF, seen from the front; that of IOR 1.5 where it varies."""
+        ior, level = output.input("IOR").origin().socket, output.input("Specular IOR Level").origin().socket
+        if ior.is_output or level.is_output:
+            return float("nan")
+        return reflectance(ior.default_value) * 2 * level.default_value
+
+    def opacity(self, place: Place) -> float:
+        """A constant alpha; where it varies, the surface is there."""
+        alpha, origin = self.number(place), place.origin()
+        if alpha.texture is None:
+            return float(alpha.colour[0])
+        self.warn(origin.node, "transparency that varies over the surface is not rendered; it is opaque")
+        return 1.0
+
+    def complain(self, output: Place, lacking: list[str]) -> None:
+        """One warning for all that a shader node does beyond the supported."""
+        normal = output.node.inputs.get("Normal")
+        if normal is not None and normal.is_linked:
+            lacking = [*lacking, "its normal or bump map"]
+        if lacking:
+            self.warn(output.node, f"not rendered: {', '.join(lacking)}")
+
+    def shader_bsdf_diffuse(self, output: Place) -> Surface:
+        self.complain(output, [])
+        return Surface(self.colour(output.input("Color")), scattered=1)
+
+    def shader_bsdf_glossy(self, output: Place) -> Surface:
+        self.complain(output, ["anisotropy"] if _used(output.input("Anisotropy")) else [])
+        base, roughness = self.colour(output.input("Color")), self.number(output.input("Roughness"))
+        return Surface(base, roughness, plain(1), scattered=1)
+
+    def shader_bsdf_metallic(self, output: Place) -> Surface:
+        node = output.node
+        lacking = ["anisotropy"] if _used(output.input("Anisotropy")) else []
+        if node.fresnel_type != "F82":
+            lacking.append("physical conductor (its Base Color is used)")
+        self.complain(output, lacking)
+        base, roughness = self.colour(output.inputs()["Base Color"]), self.number(output.input("Roughness"))
+        return Surface(base, roughness, plain(1), scattered=1)
+
+    def shader_emission(self, output: Place) -> Surface:
+        operands = self.colour(output.input("Color")), self.number(output.input("Strength"))
+        return Surface(emission=self.combine(output.node, np.multiply, *operands))
+
+    shader_background = shader_emission
+
+    def shader_bsdf_transparent(self, output: Place) -> Surface:
+        colour = self.fixed(output.input("Color"))
+        if np.ptp(colour) > 0.01 or colour.mean() < 0.99:
+            self.warn(output.node, "coloured transparency is not rendered; it is clear")
+        return Surface(clear=1)
+
+    def shader_mix_shader(self, output: Place) -> Surface:
+        factor = output.input(0).origin()
+        first, second = self.shader(output.input(1)), self.shader(output.input(2))
+        if factor.socket.is_output and factor.node.type == "LIGHT_PATH":
+            self.warn(output.node, f'"{factor.socket.name}" cannot be told apart; the first shader is used')
+            return first
+        share = self.number(output.input(0))
+        if share.texture is None:
+            share = plain(np.clip(share.colour, 0, 1))
+        elif first.clear or second.clear:
+            self.warn(output.node, "transparency that varies over the surface is not rendered; it is opaque")
+            return min(first, second, key=lambda surface: surface.clear)
+        return self.mixed(output.node, first, second, share)
+
+    def shader_add_shader(self, output: Place) -> Surface:
+        node, first, second = output.node, self.shader(output.input(0)), self.shader(output.input(1))
+        half = self.mixed(node, first, second, plain(0.5))
+        return replace(
+            half,
+            base=half.base.times(2),
+            emission=half.emission.times(2),
+            scattered=min(1.0, first.scattered + second.scattered),
+            clear=min(1.0, first.clear + second.clear),
+        )
+
+    def mixed(self, node: bpy.types.Node, first: Surface, second: Surface, share: Paint) -> Surface:
+        """`share` of the second surface, the rest of the first; of roughness and metallic by what each scatters."""
+
+        def mix(f: Array, a: Array, b: Array) -> Array:
+            return a * (1 - f) + b * f
+
+        mean = float(share.colour[0] * (1 if share.texture is None else self.mean(share.texture)[0]))
+        weights = (1 - mean) * first.scattered, mean * second.scattered
+        if first.scattered == second.scattered:
+            rough_share = share
+        else:
+            rough_share = plain(weights[1] / max(sum(weights), 1e-9))
+        return Surface(
+            self.combine(node, mix, share, first.base, second.base),
+            self.combine(node, mix, rough_share, first.roughness, second.roughness),
+            self.combine(node, mix, rough_share, first.metallic, second.metallic),
+            self.combine(node, mix, share, first.emission, second.emission),
+            scattered=sum(weights),
+            clear=(1 - mean) * first.clear + mean * second.clear,
+        )
+
+    def other_shader(self, output: Place) -> Surface:
+        """The nearest to a shader that is not known: its colour, scattered."""
+        node = output.node
+        self.warn(node, f"{node.bl_label} is not supported; a surface of its colour is used")
+        colours = [s for s in node.inputs if s.type == "RGBA" and s.enabled]
+        base = self.colour(Place(colours[0], output.groups)) if colours else plain(0.8)
+        rough = output.input("Roughness") if "Roughness" in node.inputs else None
+        return Surface(base, self.number(rough) if rough else plain(1), scattered=1)
+
+
+def _used(place: Place) -> bool:
+    """Whether a number input is linked or not zero."""
+    origin = place.origin()
+    return origin.socket.is_output or abs(constant(origin.socket)[0]) > 1e-4

@@ -1,0 +1,188 @@
+"""A material's textures, attributes and coordinates: which image lies how on a surface."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, cast
+
+import bpy
+import numpy as np
+
+from . import images
+from .node_math import reflectance
+from .nodes import Walker, euler, vector_rotate
+from .paint import Array, Paint, Warn, plain
+from .sockets import Place
+from .texture_refs import Channel, TextureRef
+
+
+class TextureWalker(Walker):
+    """Evaluates the nodes of a material on a mesh, up to its shaders."""
+
+    def __init__(self, material: bpy.types.Material, mesh: bpy.types.Mesh, warn: Warn) -> None:
+        super().__init__(f'Material "{material.name}"', warn)
+        self.material, self.mesh = material, mesh
+        self.asks_mesh = False
+
+    def say(self, problem: str) -> None:
+        """Warn of the material as a whole."""
+        self._warn(f"{self.owner}: {problem}")
+
+    # Textures
+
+    def mean(self, texture: Any) -> Array:
+        return texture.mean(self._warn)
+
+    def channel(self, texture: Any, name: str) -> TextureRef:
+        return texture.only(cast(Channel, name))
+
+    def curved(self, texture: Any, function: Callable[[Array], Array]) -> Paint | None:
+        found = texture.curved(function, self._warn)
+        return None if found is None else Paint(np.full(3, found[1]), found[0])
+
+    def node_tex_image(self, output: Place) -> Paint:
+        node, image = output.node, output.node.image
+        straight = node.outputs["Alpha"].is_linked
+        if image is None or images.export_image(image, straight, self._warn) is None:
+            name = "has no image" if image is None else f'image "{image.name}" cannot be read'
+            self.warn(node, f"{name}; as in Cycles it is magenta. Choose another, or find its file")
+            return plain(1) if output.socket.name == "Alpha" else Paint(np.array(images.MISSING))
+        if node.projection != "FLAT":
+            self.warn(node, f"the {node.projection.title()} projection is not supported; the UV map is used")
+        if node.interpolation not in ("Linear", "Closest"):
+            self.warn(node, f"{node.interpolation} interpolation is read as Linear")
+        matrix, uv_map = self.coordinates(output.input("Vector"))
+        return Paint(
+            np.ones(3),
+            TextureRef(
+                image,
+                straight,
+                "a" if output.socket.name == "Alpha" else "rgb",
+                uv_map,
+                tuple(map(tuple, matrix.tolist())),
+                "closest" if node.interpolation == "Closest" else "linear",
+                node.extension.lower(),
+            ),
+        )
+
+    def node_tex_environment(self, output: Place) -> Paint:
+        node = output.node
+        if node.image is not None and (picture := images.export_image(node.image, False, self._warn)) is not None:
+            self.warn(node, "an Environment Texture is not supported on surfaces; its mean colour is used")
+            return Paint(images.mean_colour(picture)[:3])
+        return self.nearest(output, output)
+
+    def node_vertex_color(self, output: Place) -> Paint:
+        return self.attribute(output, output.node.layer_name)
+
+    def node_attribute(self, output: Place) -> Paint:
+        node = output.node
+        if node.attribute_type != "GEOMETRY":
+            return self.nearest(output, output)
+        return self.attribute(output, node.attribute_name)
+
+    def attribute(self, output: Place, name: str) -> Paint:
+        """The mean of an attribute of the mesh; "" is the colour attribute that renders."""
+        self.asks_mesh = True
+        if name == "" and len(self.mesh.color_attributes):
+            name = self.mesh.color_attributes[max(self.mesh.color_attributes.render_color_index, 0)].name
+        values = _attribute_values(self.mesh, name)
+        if values is None:
+            self.warn(output.node, f'mesh "{self.mesh.name}" has no values "{name}"; a plain grey is used')
+            return plain(self.unknown)
+        self.warn(output.node, f'values on the mesh are not rendered; the mean of "{name}" is used')
+        mean = values.mean(axis=0, dtype=np.float64)
+        if output.socket.name == "Alpha":
+            return plain(mean[3] if len(mean) == 4 else 1)
+        return plain(mean[:3].mean()) if output.socket.identifier == "Fac" else plain(mean[:3])
+
+    def node_ambient_occlusion(self, output: Place) -> Paint:
+        if output.socket.type == "RGBA":
+            return self.nearest(output, output)
+        self.warn(output.node, "Ambient Occlusion is not supported; 1 is used")
+        return plain(1)
+
+    def node_fresnel(self, output: Place) -> Paint:
+        ior = self.value(output.input("IOR"))
+        self.warn(output.node, "it cannot depend on the direction; the value when seen from the front is used")
+        return plain(reflectance(ior))
+
+    def node_layer_weight(self, output: Place) -> Paint:
+        blend = np.clip(self.value(output.input("Blend")), 0, 0.99999)
+        self.warn(output.node, "it cannot depend on the direction; the value when seen from the front is used")
+        if output.socket.name == "Facing":
+            return plain(0)
+        return plain(reflectance(1 / (1 - blend)))
+
+    # Coordinates
+
+    def coordinates(self, place: Place) -> tuple[Array, str]:
+        """(4, 4) from UV coordinates to those of a texture, and the UV map's name ("" is the active one)."""
+        origin = place.origin()
+        if not origin.socket.is_output:
+            return np.eye(4), ""
+        node, name = origin.node, origin.socket.name
+        if node.type == "UVMAP":
+            return np.eye(4), node.uv_map
+        if node.type == "TEX_COORD":
+            if name != "UV":
+                self.warn(node, f"{name} coordinates are not supported; the UV map is used")
+            return np.eye(4), ""
+        if node.type == "ATTRIBUTE" and node.attribute_type == "GEOMETRY":
+            return np.eye(4), node.attribute_name
+        if node.type == "MAPPING" and node.vector_type != "NORMAL":
+            matrix, uv_map = self.coordinates(origin.input("Vector"))
+            return self.mapping(origin) @ matrix, uv_map
+        if node.type == "VECTOR_ROTATE":
+            matrix, uv_map = self.coordinates(origin.input("Vector"))
+            centre = np.append(self.fixed(origin.input("Center")), 1)
+            turn = np.eye(4)
+            turn[:3, :3] = vector_rotate(self, origin)
+            turn[:3, 3] = (centre - turn @ centre)[:3]
+            return turn @ matrix, uv_map
+        if node.type == "VECT_MATH" and node.operation in ("ADD", "SUBTRACT", "MULTIPLY", "SCALE"):
+            matrix, uv_map = self.coordinates(origin.input(0))
+            change = np.eye(4)
+            if node.operation == "SCALE":
+                change[:3, :3] *= self.value(origin.input("Scale"))
+            elif node.operation == "MULTIPLY":
+                change[:3, :3] = np.diag(self.fixed(origin.input(1)))
+            else:
+                change[:3, 3] = self.fixed(origin.input(1)) * (1 if node.operation == "ADD" else -1)
+            return change @ matrix, uv_map
+        inputs = [s for s in node.inputs if s.type == "VECTOR" and s.is_linked]
+        self.warn(node, f"{node.bl_label} is not supported between UV map and image, and left out")
+        return self.coordinates(Place(inputs[0], origin.groups)) if inputs else (np.eye(4), "")
+
+    def mapping(self, output: Place) -> Array:
+        """(4, 4) of a Mapping node."""
+        node = output.node
+        matrix = np.eye(4)
+        matrix[:3, :3] = euler(self.fixed(output.input("Rotation"))) * self.fixed(output.input("Scale"))
+        if node.vector_type == "VECTOR":
+            return matrix
+        matrix[:3, 3] = self.fixed(output.input("Location"))
+        if node.vector_type == "POINT":
+            return matrix
+        if abs(np.linalg.det(matrix)) < 1e-12:
+            self.warn(node, "a Scale of 0 cannot be undone; it is left out")
+            return np.eye(4)
+        return np.linalg.inv(matrix)
+
+
+def _attribute_values(mesh: bpy.types.Mesh, name: str) -> Array | None:
+    """(n, 1), (n, 2), (n, 3) or (n, 4) float32 values of a mesh's attribute, colours linear; None without any."""
+    attribute = mesh.attributes.get(name)
+    kinds = {
+        "FLOAT_COLOR": ("color", 4),
+        "BYTE_COLOR": ("color", 4),
+        "FLOAT_VECTOR": ("vector", 3),
+        "FLOAT2": ("vector", 2),
+        "FLOAT": ("value", 1),
+    }
+    if attribute is None or attribute.data_type not in kinds or len(attribute.data) == 0:
+        return None
+    prop, width = kinds[attribute.data_type]
+    values = np.empty((len(attribute.data), width), np.float32)
+    attribute.data.foreach_get(prop, values.ravel())
+    return values

@@ -1,0 +1,217 @@
+"""What materials and their images say at a point of a surface, read at the addresses of a `MaterialTable`.
+
+Lookups are those of Cycles' Image Texture node, measured in Blender 5.0 (tests/unit/test_textures_cycles.py):
+
+- the four texels around a point are blended **as they are stored**; sRGB bytes are decoded after that;
+- "clip" is transparent black beyond the image, and blends into it over half a texel at the border;
+- a point whose coordinates are not finite is transparent black.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...compute.jit import njit
+from ..memory import load_float, load_int32, load_int64, load_uint32
+from ..sampling import HALF, ONE, TWO, ZERO, F, luminance
+
+#: Kinds of images.
+BYTE, BYTE_SRGB, FLOAT = range(3)
+CHANNELS = {"r": 0, "g": 1, "b": 2, "a": 3, "luminance": 4, "rgb": 5}
+_A, _LUMINANCE, _RGB = 3, 4, 5
+INTERPOLATIONS = {"closest": 0, "linear": 1}
+EXTENSIONS = {"repeat": 0, "extend": 1, "mirror": 2, "clip": 3}
+_REPEAT, _, _MIRROR, _CLIP = range(4)
+#: Base colours above this are cut: the light of many bounces must stay a float32. So are factors of textures.
+WHITEST = F(1e3)
+#: Radiance above this is cut: its square is still a float32.
+BRIGHTEST = F(1e15)
+_INFINITE = F(np.inf)
+_BYTE_SCALE = F(1.0 / 255.0)
+
+
+@njit
+def _texel(address, kind, index, weight, red, green, blue, alpha):  # type: ignore[no-untyped-def]
+    """Add `weight` times a texel, as stored."""
+    if kind == FLOAT:
+        index *= 4
+        return (
+            red + weight * load_float(address, index),
+            green + weight * load_float(address, index + 1),
+            blue + weight * load_float(address, index + 2),
+            alpha + weight * load_float(address, index + 3),
+        )
+    word = np.int64(load_uint32(address, index))
+    return (
+        red + weight * F(word & 255),
+        green + weight * F((word >> 8) & 255),
+        blue + weight * F((word >> 16) & 255),
+        alpha + weight * F(word >> 24),
+    )
+
+
+@njit
+def _axis(u, n, interpolation, extension):  # type: ignore[no-untyped-def]
+    """The two texels next to coordinate u along an axis of n texels, and their weights."""
+    if extension == _REPEAT:
+        u -= np.floor(u)
+    elif extension == _MIRROR:
+        u -= TWO * np.floor(u * HALF)
+        u = min(u, TWO - u)
+    else:
+        # Far enough outside to be clipped, near enough to count in integers.
+        u = min(max(u, -ONE), TWO)
+    x = u * F(n)
+    if interpolation == 1:
+        x -= HALF
+    low = np.floor(x)
+    i = np.int64(low)
+    j, b = i, ZERO
+    if interpolation == 1:
+        j, b = i + 1, x - low
+    a = ONE - b
+    if extension == _REPEAT:
+        i = i + n if i < 0 else (i - n if i >= n else i)
+        j = j - n if j >= n else j
+        return i, j, a, b
+    if extension == _CLIP:
+        a = a if 0 <= i < n else ZERO
+        b = b if 0 <= j < n else ZERO
+    return min(max(i, 0), n - 1), min(max(j, 0), n - 1), a, b
+
+
+@njit
+def _decoded(x, decode):  # type: ignore[no-untyped-def]
+    """Linear value of an sRGB value in [0, 255], to 6e-6."""
+    i = min(np.int64(x), 254)
+    below = load_float(decode, i)
+    return below + (x - F(i)) * (load_float(decode, i + 1) - below)
+
+
+@njit
+def _lookup(row, u, v, addresses):  # type: ignore[no-untyped-def]
+    """Red, green, blue, alpha of a texture."""
+    _, _, textures, transforms, images, decode = addresses
+    i = 6 * row
+    s = load_float(transforms, i) * u + load_float(transforms, i + 1) * v + load_float(transforms, i + 2)
+    t = load_float(transforms, i + 3) * u + load_float(transforms, i + 4) * v + load_float(transforms, i + 5)
+    if not (abs(s) < _INFINITE and abs(t) < _INFINITE):
+        return ZERO, ZERO, ZERO, ZERO
+    i = 4 * row
+    interpolation, extension = load_int32(textures, i + 2), load_int32(textures, i + 3)
+    i = 4 * np.int64(load_int32(textures, i))
+    address, width, height, kind = (
+        load_int64(images, i),
+        load_int64(images, i + 1),
+        load_int64(images, i + 2),
+        load_int64(images, i + 3),
+    )
+    left, right, a, b = _axis(s, width, interpolation, extension)
+    low, high, c, d = _axis(t, height, interpolation, extension)
+    # Row 0 is at the top, v = 0 at the bottom.
+    low, high = (height - 1 - low) * width, (height - 1 - high) * width
+    red, green, blue, alpha = _texel(address, kind, low + left, a * c, ZERO, ZERO, ZERO, ZERO)
+    if interpolation == 1:
+        red, green, blue, alpha = _texel(address, kind, low + right, b * c, red, green, blue, alpha)
+        red, green, blue, alpha = _texel(address, kind, high + left, a * d, red, green, blue, alpha)
+        red, green, blue, alpha = _texel(address, kind, high + right, b * d, red, green, blue, alpha)
+    if kind == BYTE_SRGB:
+        return _decoded(red, decode), _decoded(green, decode), _decoded(blue, decode), alpha * _BYTE_SCALE
+    if kind == BYTE:
+        return red * _BYTE_SCALE, green * _BYTE_SCALE, blue * _BYTE_SCALE, alpha * _BYTE_SCALE
+    return red, green, blue, alpha
+
+
+@njit
+def _number(row, u, v, addresses):  # type: ignore[no-untyped-def]
+    """One number of a texture; of a colour its luminance, as where Blender plugs a colour into a number."""
+    red, green, blue, alpha = _lookup(row, u, v, addresses)
+    channel = load_int32(addresses[2], 4 * row + 1)
+    if channel >= _LUMINANCE:
+        return luminance(red, green, blue)
+    if channel == _A:
+        return alpha
+    return red if channel == 0 else (green if channel == 1 else blue)
+
+
+@njit
+def _colour(row, u, v, addresses):  # type: ignore[no-untyped-def]
+    """Colour of a texture; of one channel a grey."""
+    if load_int32(addresses[2], 4 * row + 1) == _RGB:
+        red, green, blue, _ = _lookup(row, u, v, addresses)
+        return red, green, blue
+    grey = _number(row, u, v, addresses)
+    return grey, grey, grey
+
+
+@njit
+def _within(x, highest):  # type: ignore[no-untyped-def]
+    """`x` in [0, highest]; NaN is 0."""
+    return min(x, highest) if x > ZERO else ZERO
+
+
+@njit
+def material_at(material, u, v, addresses):  # type: ignore[no-untyped-def]
+    """What a material is at texture coordinates (u, v).
+
+    Parameters
+    ----------
+    material : int
+        Index into the materials of the table; not checked.
+    u, v : float
+        v upwards.
+    addresses : tuple of int
+        ``MaterialTable.addresses``.
+
+    Returns
+    -------
+    r, g, b, roughness, metallic, er, eg, eb : float
+        Base colour, linear Rec.709, above 1 where it was given so; roughness and metallic in [0, 1]; emitted radiance,
+        linear Rec.709, finite, >= 0.
+    """
+    constants, slots = addresses[0], addresses[1]
+    i = 8 * np.int64(material)
+    r, g, b = load_float(constants, i), load_float(constants, i + 1), load_float(constants, i + 2)
+    roughness, metallic = load_float(constants, i + 3), load_float(constants, i + 4)
+    er, eg, eb = load_float(constants, i + 5), load_float(constants, i + 6), load_float(constants, i + 7)
+    i = 4 * np.int64(material)
+    first, second = np.int64(load_int32(slots, i)), np.int64(load_int32(slots, i + 1))
+    third, last = np.int64(load_int32(slots, i + 2)), np.int64(load_int32(slots, i + 3))
+    # Only if all are -1 are all bits set.
+    if (first & second & third & last) == -1:
+        return r, g, b, roughness, metallic, er, eg, eb
+    if first >= 0:
+        x, y, z = _colour(first, u, v, addresses)
+        r, g, b = _within(r * x, WHITEST), _within(g * y, WHITEST), _within(b * z, WHITEST)
+    if second >= 0:
+        roughness = _within(roughness * _number(second, u, v, addresses), ONE)
+    if third >= 0:
+        metallic = _within(metallic * _number(third, u, v, addresses), ONE)
+    er, eg, eb = _emission(last, er, eg, eb, u, v, addresses)
+    return r, g, b, roughness, metallic, er, eg, eb
+
+
+@njit
+def _emission(row, er, eg, eb, u, v, addresses):  # type: ignore[no-untyped-def]
+    """Radiance times a texture, if there is one."""
+    if row < 0:
+        return er, eg, eb
+    x, y, z = _colour(row, u, v, addresses)
+    return _within(er * x, BRIGHTEST), _within(eg * y, BRIGHTEST), _within(eb * z, BRIGHTEST)
+
+
+@njit
+def emits(material, addresses):  # type: ignore[no-untyped-def]
+    """Whether a material emits light, its texture apart."""
+    i = 8 * np.int64(material)
+    return (
+        max(load_float(addresses[0], i + 5), max(load_float(addresses[0], i + 6), load_float(addresses[0], i + 7))) > 0
+    )
+
+
+@njit
+def emission_at(material, u, v, addresses):  # type: ignore[no-untyped-def]
+    """(er, eg, eb) of `material_at`."""
+    i, row = 8 * np.int64(material), np.int64(load_int32(addresses[1], 4 * np.int64(material) + 3))
+    er, eg, eb = load_float(addresses[0], i + 5), load_float(addresses[0], i + 6), load_float(addresses[0], i + 7)
+    return _emission(row, er, eg, eb, u, v, addresses)
