@@ -20,8 +20,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..compute.jit import njit, prange
+from ..compute.jit import njit
 from ..compute.simd import LANES, aligned, fold, lanes, load, quads, repeat, spread
+from ..compute.threads import ELEMENTS, over_range
 from ..core.errors import UsageError
 from ..geometry.occupancy import Volume, crosses_gap
 
@@ -126,7 +127,7 @@ def bind_points(
     distance = np.where(np.take_along_axis(usable, order, 1), np.take_along_axis(distance, order, 1), -1.0)
     weight = np.empty((*index.shape, 4), np.float32)
     reach = np.zeros(len(points), np.float32)
-    _weigh(points, sources, index, distance, weight, reach)
+    over_range(_weigh, len(points), points, sources, index, distance, weight, reach)
     offset = (points - sources[index[:, 0]]).astype(np.float32)
     index = np.where(distance < 0.0, index[:, :1], index)  # of no use, and not to be taken for one that moved apart
     return Weights(index.astype(np.int32), weight, offset, reach, separated, int(stranded.sum()))
@@ -138,11 +139,11 @@ def _squared(x, a, b):  # type: ignore[no-untyped-def]
     return (x[a, 0] - x[b, 0]) ** 2 + (x[a, 1] - x[b, 1]) ** 2 + (x[a, 2] - x[b, 2]) ** 2
 
 
-@njit(parallel=True)
-def _weigh(points, sources, index, distance, weight, reach):  # type: ignore[no-untyped-def]
+@njit
+def _weigh(first, last, points, sources, index, distance, weight, reach):  # type: ignore[no-untyped-def]
     """N, Q and reach of each point; a neighbour with a negative distance does not count."""
     count = index.shape[1]
-    for i in prange(len(points)):
+    for i in range(first, last):
         far = 0.0
         for k in range(count):
             far = max(far, distance[i, k])
@@ -216,7 +217,17 @@ def carry(weights: Weights, x: Array, gradients: Array) -> tuple[Array, Array, i
     rows, centre = pack(x, gradients)
     points, out, turned = blank(weights, x.dtype)
     weight = weights.weight.reshape(-1)
-    _carry(weights.source, weight, weights.offset, weights.reach, rows.reshape(-1), centre, points, out, turned)
+    over_range(
+        _carry,
+        len(weights.source),
+        (weights.source, weight, weights.offset, weights.reach),
+        rows.reshape(-1),
+        centre,
+        points,
+        out,
+        turned,
+        fewest=ELEMENTS,
+    )
     return points, out, int(np.count_nonzero(turned))
 
 
@@ -238,7 +249,9 @@ def pack(x: Array, gradients: Array) -> tuple[Array, Array]:
     """
     centre = _centre(x)
     rows = aligned(LANES * len(x), np.float32)
-    _pack(x, np.ascontiguousarray(gradients, np.float32).reshape(-1, 3, 3), centre, rows)
+    over_range(
+        _pack, len(x), x, np.ascontiguousarray(gradients, np.float32).reshape(-1, 3, 3), centre, rows, fewest=ELEMENTS
+    )
     return rows.reshape(-1, LANES), centre
 
 
@@ -254,9 +267,9 @@ def _centre(x):  # type: ignore[no-untyped-def]
     return total / max(count, 1)
 
 
-@njit(parallel=True)
-def _pack(x, gradients, centre, rows):  # type: ignore[no-untyped-def]
-    for s in prange(len(x)):
+@njit
+def _pack(first, last, x, gradients, centre, rows):  # type: ignore[no-untyped-def]
+    for s in range(first, last):
         row = LANES * s
         for c in range(3):
             for j in range(3):
@@ -327,12 +340,13 @@ def settled(f, p, g, offset, apart, reach):  # type: ignore[no-untyped-def]
     return f, p, turned
 
 
-@njit(parallel=True)
-def _carry(source, weight, offset, reach, rows, centre, points, out, turned):  # type: ignore[no-untyped-def]
+@njit
+def _carry(first, last, weights, rows, centre, points, out, turned):  # type: ignore[no-untyped-def]
+    source, weight, offset, reach = weights
     zero, one = np.float32(0.0), np.float32(1.0)
-    for i in prange(len(source)):
-        first = LANES * source[i, 0]
-        ox, oy, oz = rows[first + 12], rows[first + 13], rows[first + 14]
+    for i in range(first, last):
+        nearest = LANES * source[i, 0]
+        ox, oy, oz = rows[nearest + 12], rows[nearest + 13], rows[nearest + 14]
         # Relative to the first neighbour: N sums to 1 in exact arithmetic alone.
         origin = quads(zero, zero, zero, one) * repeat(ox, oy, oz, zero)
         place = gradient = spread(zero)
@@ -348,7 +362,7 @@ def _carry(source, weight, offset, reach, rows, centre, points, out, turned):  #
             apart = max(apart, dx * dx + dy * dy + dz * dz)
             w += 4
         px, py, pz, _ = fold(place)
-        f, g = _columns(lanes(gradient)), _columns(lanes(load(rows, first)))
+        f, g = _columns(lanes(gradient)), _columns(lanes(load(rows, nearest)))
         q = offset[i, 0], offset[i, 1], offset[i, 2]
         f, p, turned[i] = settled(f, (px, py, pz), g, q, apart, reach[i])
         out[i, 0, 0], out[i, 0, 1], out[i, 0, 2] = f[0], f[1], f[2]

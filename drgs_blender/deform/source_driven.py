@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..compute.jit import njit, prange
+from ..compute.jit import njit
+from ..compute.threads import ELEMENTS, over_range
 from ..core.asset.model import Asset, PosedSurfels
 from ..core.errors import AssetError
 from ..geometry.occupancy import Volume
@@ -75,17 +76,18 @@ class SourceDriven:
         centre, at, self.turned = carry(self._surfels, x, gradients)
         rest = self._rest
         u, v, normal = (np.empty((len(centre), 3), np.float32) for _ in range(3))
-        _update(at.reshape(-1, 9), rest.tangent_u, rest.tangent_v, rest.normal, u, v, normal)
+        frames = rest.tangent_u, rest.tangent_v, rest.normal
+        over_range(_update, len(at), at.reshape(-1, 9), *frames, u, v, normal, fewest=ELEMENTS)
         return PosedSurfels(
             centre.astype(np.float32), u, v, normal, rest.opacity, rest.albedo, rest.roughness, rest.metallic,
             np.full(len(centre), object_index, np.int32),
         )  # fmt: skip
 
 
-@njit(parallel=True)
-def _update(gradients, tangent_u, tangent_v, normal, out_u, out_v, out_normal):  # type: ignore[no-untyped-def]
+@njit
+def _update(first, last, gradients, tangent_u, tangent_v, normal, out_u, out_v, out_normal):  # type: ignore[no-untyped-def]
     """F T and normalised cof(F) n; the rest normal where F collapses space onto a line."""
-    for i in prange(len(gradients)):
+    for i in range(first, last):
         f = gradients[i]
         x, y, z = normal[i, 0], normal[i, 1], normal[i, 2]
         a = (f[4] * f[8] - f[5] * f[7]) * x + (f[5] * f[6] - f[3] * f[8]) * y + (f[3] * f[7] - f[4] * f[6]) * z

@@ -6,7 +6,8 @@ import math
 
 import numpy as np
 
-from ..compute.jit import njit, plain, prange
+from ..compute.jit import njit, plain
+from ..compute.threads import ELEMENTS, over_range
 from ..core.errors import AssetError
 
 Array = np.ndarray
@@ -94,9 +95,10 @@ class VertexNormals:
         normals : (n, 3) float32 array
             Written.
         """
-        empty = _weigh(plain(vertices), plain(faces), self.place, self._weighted)
-        _sum(self._weighted, self.start, normals)
-        return int(empty)
+        corners = plain(vertices), plain(faces), self.place
+        empty = sum(over_range(_weigh, len(faces), *corners, self._weighted, fewest=ELEMENTS))
+        over_range(_sum, len(normals), self._weighted, self.start, normals, fewest=ELEMENTS)
+        return empty
 
 
 #: arctan(x) / x in powers of x^2, to 2e-8 on [0, 1]: Abramowitz and Stegun 4.4.49.
@@ -162,23 +164,20 @@ def vertex_normal(weighted, first, last):  # type: ignore[no-untyped-def]
     return np.float32(0.0), np.float32(0.0), np.float32(1.0)
 
 
-@njit(parallel=True)
-def _weigh(vertices: Array, faces: Array, place: Array, weighted: Array) -> int:
+@njit
+def _weigh(first: int, last: int, vertices: Array, faces: Array, place: Array, weighted: Array) -> int:
     """Put angle x unit normal of each face corner where its vertex looks for it; return how many faces have no area.
 
     Scattering here lets `_sum` read in order: twice as fast as gathering there, where one misses the cache and waits.
     """
     zero = np.float32(0.0)
-    m = len(faces)
     empty = 0
-    for block in prange((m + _BLOCK - 1) // _BLOCK):
-        first = block * _BLOCK
-        count = min(_BLOCK, m - first)
-        lost = 0
-        s = np.empty((6, _BLOCK), np.float32)
+    s = np.empty((6, _BLOCK), np.float32)
+    for begin in range(first, last, _BLOCK):
+        count = min(_BLOCK, last - begin)
         # Gathered first: what follows is then the same arithmetic on eight faces or more at a time.
         for i in range(count):
-            a, b, c = faces[first + i, 0], faces[first + i, 1], faces[first + i, 2]
+            a, b, c = faces[begin + i, 0], faces[begin + i, 1], faces[begin + i, 2]
             x, y, z = vertices[a, 0], vertices[a, 1], vertices[a, 2]
             s[0, i], s[1, i], s[2, i] = vertices[b, 0] - x, vertices[b, 1] - y, vertices[b, 2] - z
             s[3, i], s[4, i], s[5, i] = vertices[c, 0] - x, vertices[c, 1] - y, vertices[c, 2] - z
@@ -188,17 +187,16 @@ def _weigh(vertices: Array, faces: Array, place: Array, weighted: Array) -> int:
             )
         for i in range(count):
             x, y, z = s[0, i], s[1, i], s[2, i]
-            lost += x == zero and y == zero and z == zero
+            empty += x == zero and y == zero and z == zero
             for k in range(3):
-                p, w = place[3 * (first + i) + k], s[3 + k, i]
+                p, w = place[3 * (begin + i) + k], s[3 + k, i]
                 weighted[p, 0], weighted[p, 1], weighted[p, 2] = w * x, w * y, w * z
-        empty += lost
     return empty
 
 
-@njit(parallel=True)
-def _sum(weighted: Array, start: Array, normals: Array) -> None:
-    for v in prange(len(normals)):
+@njit
+def _sum(first: int, last: int, weighted: Array, start: Array, normals: Array) -> None:
+    for v in range(first, last):
         normals[v, 0], normals[v, 1], normals[v, 2] = vertex_normal(weighted, start[v], start[v + 1])
 
 

@@ -15,7 +15,7 @@ from ...render.scene.triangle_bvh import TriangleBVH
 from ..backend import LearningBackend
 from ..capture.training_views import Target
 from ..model.raster import Maps, Tally
-from ..optim.adam import some_rows
+from ..optim.adam import step_rows
 from . import look, losses
 from .gather import DeviceGatherer
 from .launch import TensorLauncher
@@ -26,7 +26,7 @@ def descend_rows(lane, lanes, room, gradient, rate, out):  # type: ignore[no-unt
     """`adam.descend`."""
     value, first, second = out
     for i in range(lane, len(value), lanes):
-        some_rows(value, gradient, first, second, rate, i, i + 1)
+        step_rows(i, i + 1, value, gradient, first, second, rate)
 
 
 DESCEND = Work(descend_rows, (), {})

@@ -14,7 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...compute.jit import njit, prange
+from ...compute.jit import njit
+from ...compute.threads import ROWS, over_range
 from ...core.arrays import Array
 
 #: Part of dissimilarity (1 - SSIM) in the loss; the rest is L1.
@@ -50,7 +51,9 @@ def blur(pictures: Array) -> Array:
     """The window's mean of each of the pictures (m, h, w, c) float32."""
     out = np.empty_like(pictures)
     m, h, w, c = pictures.shape
-    _blur(np.ascontiguousarray(pictures).reshape(m, h, w * c), c, out.reshape(m, h, w * c))
+    over_range(
+        _blur, m * h, np.ascontiguousarray(pictures).reshape(m, h, w * c), c, out.reshape(m, h, w * c), fewest=ROWS
+    )
     return out
 
 
@@ -71,7 +74,7 @@ def _similarity(picture: Array, photograph: Photograph) -> tuple[float, Array]:
     slopes = np.empty((3, *picture.shape), np.float32)
     rows = np.empty(len(picture))
     other, other_square = photograph.blurred()
-    _ssim(mean, square, product, other, other_square, slopes, rows)
+    over_range(_ssim, len(mean), mean, square, product, other, other_square, slopes, rows, fewest=ROWS)
     by_mean, by_square, by_product = blur(slopes)
     gradient = by_mean + 2 * picture * by_square + target * by_product
     return rows.sum() / picture.size, gradient / np.float32(picture.size)
@@ -117,19 +120,19 @@ def _blur_row(pictures, m, y, channels, padded, out):  # type: ignore[no-untyped
             out[m, y, np.uintp(x)] += weight * (padded[np.uintp(low + x)] + padded[np.uintp(high + x)])
 
 
-@njit(parallel=True)
-def _blur(pictures, channels, out):  # type: ignore[no-untyped-def]
+@njit
+def _blur(first, last, pictures, channels, out):  # type: ignore[no-untyped-def]
     rows = pictures.shape[1]
-    for task in prange(pictures.shape[0] * rows):
+    for task in range(first, last):
         padded = np.empty(pictures.shape[2] + 10 * channels, np.float32)
         _blur_row(pictures, task // rows, task % rows, channels, padded, out)
 
 
-@njit(parallel=True)
-def _ssim(mean, square, product, other, other_square, slopes, rows):  # type: ignore[no-untyped-def]
+@njit
+def _ssim(first, last, mean, square, product, other, other_square, slopes, rows):  # type: ignore[no-untyped-def]
     """SSIM summed by rows, and its derivatives by the three blurred pictures."""
     two = np.float32(2.0)
-    for y in prange(mean.shape[0]):
+    for y in range(first, last):
         total = 0.0
         for x in range(mean.shape[1]):
             for c in range(mean.shape[2]):

@@ -12,7 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...compute.jit import njit, prange
+from ...compute.jit import njit
+from ...compute.threads import ROWS, over_range
 from ...core.arrays import Array
 
 #: Mean depths are those of pixels covered at least so much, and normals are compared where they are covered more.
@@ -63,8 +64,18 @@ class _Shape(torch.autograd.Function):
         if by_normals and min(a.shape) > 2:
             inner = (a.shape[0] - 2) * (a.shape[1] - 2)
             slopes, rows = np.zeros((2, *n.shape), np.float32), np.zeros(len(a))
-            _disagreement(a, z, n, rays, counts, np.float32(by_normals / inner), slopes, to_normal, rows)
-            _to_depth(a, z, rays, slopes, to_alpha, to_depth)
+            over_range(
+                _disagreement,
+                len(a),
+                (a, z, n, rays),
+                counts,
+                np.float32(by_normals / inner),
+                slopes,
+                to_normal,
+                rows,
+                fewest=ROWS,
+            )
+            over_range(_to_depth, len(a), a, z, rays, slopes, to_alpha, to_depth, fewest=ROWS)
             loss += by_normals / inner * float(rows.sum())
         ctx.gradients = [to_alpha, to_depth, np.full_like(a, by_distortion / a.size), to_normal]
         return torch.tensor(loss, dtype=torch.float32)
@@ -86,11 +97,12 @@ def _difference(alpha, depth, rays, y1, x1, y0, x0):  # type: ignore[no-untyped-
     )
 
 
-@njit(parallel=True)
-def _disagreement(alpha, depth, normal, rays, counts, most, slopes, to_normal, rows):  # type: ignore[no-untyped-def]
+@njit
+def _disagreement(first, last, maps, counts, most, slopes, to_normal, rows):  # type: ignore[no-untyped-def]
     """Sums of the rows, gradients of the normals, and of the two differences of each pixel (2, h, w, 3)."""
+    alpha, depth, normal, rays = maps
     height, width = alpha.shape
-    for y in prange(1, height - 1):
+    for y in range(max(first, 1), min(last, height - 1)):
         total = 0.0
         for x in range(1, width - 1):
             covered = alpha[y, x]
@@ -117,11 +129,11 @@ def _disagreement(alpha, depth, normal, rays, counts, most, slopes, to_normal, r
         rows[y] = total
 
 
-@njit(parallel=True)
-def _to_depth(alpha, depth, rays, slopes, to_alpha, to_depth):  # type: ignore[no-untyped-def]
+@njit
+def _to_depth(first, last, alpha, depth, rays, slopes, to_alpha, to_depth):  # type: ignore[no-untyped-def]
     """Add the gradients of depth and coverage, each pixel from its four neighbours."""
     height, width = alpha.shape
-    for y in prange(height):
+    for y in range(first, last):
         for x in range(width):
             g = np.float32(0.0)
             for c in range(3):

@@ -8,19 +8,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...compute.jit import njit, prange
+from ...compute.jit import njit
+from ...compute.threads import over_range
 from ...core.arrays import Array
 
 _BETA1, _BETA2, _EPSILON = 0.9, 0.99, 1e-15
-#: Rows that a thread takes at a time, and numbers below which waking threads takes longer than the step.
-_BLOCK, _FEW = 1024, 200_000
+#: Numbers below which waking threads takes longer than the step.
+_FEW = 200_000
 
 
 def descend(value: Tensor, gradient: Tensor, first: Tensor, second: Tensor, rate: Array) -> None:
     """One step of rows (n, k) in place, with their moments; `rate` (k,) float32 by columns."""
     rows = [t.detach().numpy() for t in (value, gradient, first, second)]
-    step = _step if value.numel() < _FEW else _step_by_all
-    step(*rows, rate)
+    over_range(step_rows, len(value), *rows, rate, fewest=_FEW // max(value.shape[1], 1))
 
 
 class Adam:
@@ -77,7 +77,7 @@ class Adam:
 
 
 @njit
-def some_rows(value, gradient, first, second, rate, begin, end):  # type: ignore[no-untyped-def]
+def step_rows(begin, end, value, gradient, first, second, rate):  # type: ignore[no-untyped-def]
     """The rows from `begin` to `end`. No branch: vector code."""
     b1, b2, epsilon = np.float32(_BETA1), np.float32(_BETA2), np.float32(_EPSILON)
     one = np.float32(1.0)
@@ -91,14 +91,3 @@ def some_rows(value, gradient, first, second, rate, begin, end):  # type: ignore
             second[i, k] = v if known else second[i, k]
             after = value[i, k] - rate[k] * m / (np.sqrt(v) + epsilon)
             value[i, k] = after if known else value[i, k]
-
-
-@njit
-def _step(value, gradient, first, second, rate):  # type: ignore[no-untyped-def]
-    some_rows(value, gradient, first, second, rate, 0, len(value))
-
-
-@njit(parallel=True)
-def _step_by_all(value, gradient, first, second, rate):  # type: ignore[no-untyped-def]
-    for block in prange((len(value) + _BLOCK - 1) // _BLOCK):
-        some_rows(value, gradient, first, second, rate, block * _BLOCK, min((block + 1) * _BLOCK, len(value)))

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...compute.jit import njit, prange
+from ...compute.jit import njit
+from ...compute.threads import ROWS, over_range
 from ..film.guides import Guides
 from ..sampling import ONE, ZERO, F, luminance
 
@@ -59,7 +60,7 @@ def demodulate(components: Array, variance: Array, guides: Guides, split: bool =
     guide = np.zeros((h, GUIDES, w + 2 * PAD), np.float32)
     light = np.zeros((h, planes_of(split), w + 2 * PAD), np.float32)
     spans = np.zeros((h, 2), np.int32)
-    _demodulate(components, variance, guides.arrays, guide, light, spans)
+    over_range(_demodulate, len(light), components, variance, guides.arrays, guide, light, spans, fewest=ROWS)
     return Signal(guide, light, spans)
 
 
@@ -71,7 +72,7 @@ def planes_of(split: bool) -> int:
 def modulate(signal: Signal, guides: Guides) -> Array:
     """(h, w, 4, 3) float32: light multiplied by surface colour and coverage again."""
     out = np.zeros((*guides.coverage.shape, 4, 3), np.float32)
-    _modulate(signal.light, signal.spans, guides.arrays, out)
+    over_range(_modulate, len(signal.spans), signal.light, signal.spans, guides.arrays, out, fewest=ROWS)
     return out
 
 
@@ -142,11 +143,11 @@ def _lobe_luminance(light, y, c, lobe, parts):  # type: ignore[no-untyped-def]
     return total
 
 
-@njit(parallel=True)
-def _demodulate(components, variance, surface, guide, light, spans):  # type: ignore[no-untyped-def]
+@njit
+def _demodulate(first, last, components, variance, surface, guide, light, spans):  # type: ignore[no-untyped-def]
     coverage = surface[0]
-    h, w = coverage.shape
-    for y in prange(h):
+    w = coverage.shape[1]
+    for y in range(first, last):
         guide[y, SOURCE] = F(np.nan)
         guide[y, SURFACE] = F(np.nan)
         for x in range(w):
@@ -178,10 +179,10 @@ def modulate_pixel(y, x, light, surface, out):  # type: ignore[no-untyped-def]
                 out[y, x, 2 * lobe + part, k] = value * _channel(k, red, green, blue) * coverage[y, x]
 
 
-@njit(parallel=True)
-def _modulate(light, spans, surface, out):  # type: ignore[no-untyped-def]
+@njit
+def _modulate(first, last, light, spans, surface, out):  # type: ignore[no-untyped-def]
     coverage = surface[0]
-    for y in prange(len(spans)):
+    for y in range(first, last):
         for x in range(spans[y, 0], spans[y, 1]):
             if coverage[y, x] > ZERO:
                 modulate_pixel(y, x, light, surface, out)

@@ -24,8 +24,8 @@ from collections.abc import Callable
 import numpy as np
 
 from ...compute.jit import njit
+from ...compute.threads import ROWS, over_range
 from ...core.color import LUMINANCE as REC709
-from ..film.row_threads import over_rows
 from .demodulation import (
     CERTAINTY,
     LEVELS,
@@ -88,7 +88,7 @@ def prepare(components: Array, variance: Array, guides: Guides, split: bool = Tr
     """Light to be filtered: demodulated, its fireflies clamped; parameters as of `denoise`."""
     signal = demodulate(components, variance, guides, split)
     clamped = np.zeros_like(signal.light)
-    over_rows(_clamp_fireflies, len(clamped), signal.guide, signal.spans, signal.light, clamped)
+    over_range(_clamp_fireflies, len(clamped), signal.guide, signal.spans, signal.light, clamped, fewest=ROWS)
     return Signal(signal.guide, clamped, signal.spans)
 
 
@@ -97,8 +97,8 @@ def smooth(signal: Signal, check: Callable[[], None] = lambda: None) -> Signal:
     light, out, other = signal.light, np.zeros_like(signal.light), np.zeros_like(signal.light)
     for level in range(LEVELS):
         check()
-        over_rows(_weigh, len(light), sigma_of(level), signal.guide, signal.spans, light)
-        over_rows(_a_trous, len(light), 1 << level, signal.guide, signal.spans, light, out)
+        over_range(_weigh, len(light), sigma_of(level), signal.guide, signal.spans, light, fewest=ROWS)
+        over_range(_a_trous, len(light), 1 << level, signal.guide, signal.spans, light, out, fewest=ROWS)
         light, out, other = out, other, out
     return Signal(signal.guide, light, signal.spans)
 

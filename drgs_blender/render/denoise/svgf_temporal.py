@@ -21,8 +21,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...compute.jit import njit
+from ...compute.threads import ROWS, over_range
 from ..film.motion_vectors import Instant, Motion
-from ..film.row_threads import over_rows
 from ..sampling import ONE, ZERO, F
 from .demodulation import (
     LIGHT,
@@ -136,7 +136,7 @@ def accumulate(history: Signal, signal: Signal, motion: Motion, still: bool = Fa
         change[:, BIAS : BIAS + 2] = 0.0
     least = least_gain(still)
     guide, light = signal.guide.copy(), np.zeros_like(signal.light)
-    over_rows(_mix, len(light), least, signal.spans, signal.light, past, source, change, guide, light)
+    over_range(_mix, len(light), least, signal.spans, signal.light, past, source, change, guide, light, fewest=ROWS)
     return Signal(guide, light, signal.spans)
 
 
@@ -151,8 +151,18 @@ def warp(other: Signal, signal: Signal, vector: Array, expected: Array) -> tuple
     """
     light = np.zeros_like(signal.light)
     source = np.full((len(light), light.shape[2]), np.nan, np.float32)
-    over_rows(
-        _look_up, len(light), signal.guide, signal.spans, vector, expected, other.guide, other.light, light, source
+    over_range(
+        _look_up,
+        len(light),
+        signal.guide,
+        signal.spans,
+        vector,
+        expected,
+        other.guide,
+        other.light,
+        light,
+        source,
+        fewest=ROWS,
     )
     return light, source
 
@@ -160,7 +170,7 @@ def warp(other: Signal, signal: Signal, vector: Array, expected: Array) -> tuple
 def find_change(signal: Signal, past: Array, source: Array) -> Array:
     """How two pictures differ beyond their noise, (h, CHANGES, w + 2 PAD) float32."""
     out = np.zeros((len(past), CHANGES, past.shape[2]), np.float32)
-    over_rows(_compare, len(past), signal.guide, signal.spans, signal.light, past, source, out)
+    over_range(_compare, len(past), signal.guide, signal.spans, signal.light, past, source, out, fewest=ROWS)
     return out
 
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 
 from ...compute.jit import njit
-from ..film.row_threads import over_rows
+from ...compute.threads import ROWS, over_range
 from .demodulation import LIGHT, LUMINANCE, PAD, SOURCE, SURFACE, VARIANCE, Signal, modulate
 from .svgf_spatial import prepare, smooth
 from .svgf_temporal import BIAS, CHANGES, NOW, SAME_PLANE, Shot, find_change, warp
@@ -52,7 +52,7 @@ def window(shots: Sequence[Shot | None], split: bool = True, check: Callable[[],
     signal = prepare(shot.components, shot.variance, shot.guides, split)
     total, weights = np.zeros_like(signal.light), np.zeros((len(signal.light), 2, signal.light.shape[2]), np.float32)
     still = np.zeros((len(signal.light), CHANGES, signal.light.shape[2]), np.float32)
-    over_rows(
+    over_range(
         _add,
         len(total),
         np.ones(2, np.float32),
@@ -62,15 +62,27 @@ def window(shots: Sequence[Shot | None], split: bool = True, check: Callable[[],
         still,
         total,
         weights,
+        fewest=ROWS,
     )
     for distance, neighbour, vector, expected in _neighbours(shots):
         check()
         most = np.array(MOST_WEIGHT, np.float32) ** np.float32(distance)
         other = prepare(neighbour.components, neighbour.variance, neighbour.guides, split)
         seen, source = warp(other, signal, vector, expected)
-        over_rows(_add, len(total), most, signal.spans, seen, source, find_change(signal, seen, source), total, weights)
+        over_range(
+            _add,
+            len(total),
+            most,
+            signal.spans,
+            seen,
+            source,
+            find_change(signal, seen, source),
+            total,
+            weights,
+            fewest=ROWS,
+        )
     guide = signal.guide.copy()
-    over_rows(_divide, len(total), signal.spans, weights, guide, total)
+    over_range(_divide, len(total), signal.spans, weights, guide, total, fewest=ROWS)
     return modulate(smooth(Signal(guide, total, signal.spans), check), shot.guides)
 
 
@@ -96,10 +108,9 @@ def _neighbours(shots: Sequence[Shot | None]) -> Iterator[tuple[int, Shot, Array
                 break
             # The picture that the motion belongs to, in both directions the later one.
             g = here.guides if direction < 0 else there.guides
-            over_rows(
+            over_range(
                 kernel, len(vector), motion.vector, motion.previous, g.position, g.normal, g.footprint, g.index,
-                centre.guides.index, vector, expected,
-            )  # fmt: skip
+                centre.guides.index, vector, expected, fewest=ROWS)  # fmt: skip
             yield abs(k - middle), there, vector, expected
             here = there
 

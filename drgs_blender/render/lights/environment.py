@@ -12,7 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...compute.jit import njit, plain, prange
+from ...compute.jit import njit, plain
+from ...compute.threads import ROWS, over_range
 from ...core.asset.model import as_float
 from ...core.errors import UsageError
 from ...core.frame import World
@@ -32,14 +33,14 @@ _CONSTANT = (16, 32, 3)
 _RINGING = 1e-5
 
 
-@njit(parallel=True)
-def _clean(image, tint, rings, texels, found):  # type: ignore[no-untyped-def]
+@njit
+def _clean(first, last, image, tint, rings, texels, found):  # type: ignore[no-untyped-def]
     """Write the tinted picture: black where a texel is no light, but for its negative part if the picture `rings`.
 
     Writes for each row how many texels are no light, and how much of them is negative and positive.
     """
     zero = np.float32(0.0)
-    for row in prange(len(image)):
+    for row in range(first, last):
         bad, dark, bright = 0, 0.0, 0.0
         for column in range(image.shape[1]):
             r, g, b = image[row, column, 0] * tint[0], image[row, column, 1] * tint[1], image[row, column, 2] * tint[2]
@@ -128,10 +129,10 @@ class EnvironmentLight:
         found = np.zeros((len(image), 3))
         with np.errstate(over="ignore"):
             tinted = tint.astype(np.float32)
-        _clean(plain(image), tinted, False, self.texels, found)
+        over_range(_clean, len(self.texels), plain(image), tinted, False, self.texels, found, fewest=ROWS)
         bad, dark, bright = found.sum(axis=0)
         if bad and dark > -_RINGING * bright:
-            _clean(plain(image), tinted, True, self.texels, found)
+            over_range(_clean, len(self.texels), plain(image), tinted, True, self.texels, found, fewest=ROWS)
             bad = 0
         self.bad_texels = int(bad)
         self.rotation = np.ascontiguousarray(rotation, np.float32)

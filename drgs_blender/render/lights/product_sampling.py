@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...compute.jit import njit, prange
+from ...compute.jit import njit
+from ...compute.threads import over_range
 from ..memory import load_float, load_int32, load_uint32
 from .environment_cdf import Cells
 
@@ -80,18 +81,19 @@ class ProductTables:
         self.ratio = np.ones((SIDE * SIDE + 1, size), np.float32)
         power = np.diff(cells.first.astype(np.int64), append=1 << 32) * 2.0**-32
         share = cells.parts.astype(np.float32) if cells.power > 0.0 else np.zeros_like(cells.parts, np.float32)
-        _fill(normals(), cells.part_directions(), share, power, self.starts, self.ratio)
+        rows = normals()
+        over_range(_fill, len(rows), rows, cells.part_directions(), share, power, self.starts, self.ratio)
         self.starts[-1, :blocks] = cells.first
         self.slices = np.empty((SIDE * SIDE + 1, _SLICES), np.int32)
-        _find_slices(self.starts, blocks, self.slices)
+        over_range(_find_slices, len(self.starts), self.starts, blocks, self.slices)
 
 
-@njit(parallel=True)
-def _fill(normals, directions, share, power, starts, ratio):  # type: ignore[no-untyped-def]
+@njit
+def _fill(first, last, normals, directions, share, power, starts, ratio):  # type: ignore[no-untyped-def]
     """Write all rows but the last."""
     parts, blocks = share.shape
     x, y, z = directions[0], directions[1], directions[2]
-    for row in prange(len(normals)):
+    for row in range(first, last):
         weight = np.zeros(blocks, np.float32)
         nx, ny, nz = normals[row, 0], normals[row, 1], normals[row, 2]
         for p in range(parts):
@@ -114,9 +116,9 @@ def _fill(normals, directions, share, power, starts, ratio):  # type: ignore[no-
             start = end
 
 
-@njit(parallel=True)
-def _find_slices(starts, blocks, slices):  # type: ignore[no-untyped-def]
-    for row in prange(len(starts)):
+@njit
+def _find_slices(first, last, starts, blocks, slices):  # type: ignore[no-untyped-def]
+    for row in range(first, last):
         block = 0
         for k in range(_SLICES):
             while block + 1 < blocks and np.int64(starts[row, block + 1]) <= k << _SLICE:

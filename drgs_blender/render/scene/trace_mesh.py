@@ -10,7 +10,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ...compute.jit import njit, plain, prange
+from ...compute.jit import njit, plain
+from ...compute.threads import ELEMENTS, over_range
 from ...core.asset.model import as_float
 from ...core.errors import UsageError
 from ...core.frame import MeshState, Visibility
@@ -25,7 +26,6 @@ NORMAL, ALBEDO, ROUGHNESS, METALLIC, SHADING_WIDTH = slice(0, 3), slice(3, 6), 6
 
 #: Coordinates beyond this (metres) are as unusable as NaN: their products overflow.
 FARTHEST = 1e15
-_BLOCK = 4096
 
 
 @dataclass(slots=True)
@@ -143,11 +143,8 @@ class Part:
 
         Unusable vertices are put at the origin.
         """
-        if matrix is None:
-            bad, moved, self.reach = _copy_vertices(plain(vertices), target)
-        else:
-            bad, moved, self.reach = _move_vertices(plain(vertices), matrix, target)
-        self.bad_vertices, self.bad_faces = int(bad), 0
+        bad, moved, self.reach = _put_vertices(plain(vertices), matrix, target)
+        self.bad_vertices, self.bad_faces = bad, 0
         before, dead = self.dead, torn
         if bad:
             with np.errstate(invalid="ignore", over="ignore"):
@@ -176,8 +173,9 @@ class Part:
     def given_normals(self, normals: Array, vertices: Array, out: Array) -> None:
         """Unit normals from those given, one a corner, into (3 m, 3) `out`; a face's own where they are unusable."""
         given = as_float(normals, (len(self.faces), 3, 3), f"corner normals of {self.name}")
-        empty = _given_normals(plain(given), vertices, self.traced_faces, out)
-        self.empty_faces = int(empty) - (0 if self.dead is None else int(self.dead.sum()))
+        faces = self.traced_faces
+        empty = over_range(_given_normals, len(faces), plain(given), vertices, faces, out, fewest=ELEMENTS)
+        self.empty_faces = sum(empty) - (0 if self.dead is None else int(self.dead.sum()))
 
 
 def mask_of(item: TraceObject | MeshState) -> int:
@@ -216,7 +214,8 @@ def take_object(part: Part, item: TraceObject, vertices: Array, shading: Array) 
         albedo = as_float(item.albedo, (n, 3), f"albedo of {item.name}")
         roughness = as_float(item.roughness, (n,), f"roughness of {item.name}")
         metallic = as_float(item.metallic, (n,), f"metallic of {item.name}")
-        _materials(of_rows, plain(albedo), plain(roughness), plain(metallic), rows)
+        values = plain(albedo), plain(roughness), plain(metallic)
+        over_range(_materials, len(of_rows), of_rows, *values, rows, fewest=ELEMENTS)
     part.item = item
     return moved, died
 
@@ -240,7 +239,8 @@ def take_mesh(part: Part, item: MeshState, places: Places, vertices: Array, norm
         else:
             part.given_normals(item.corner_normals, given, part.own_normals)
     if matrix is not None:
-        _turn_normals(part.own_normals, normal_matrices(places.matrices[:1])[0], rows)
+        turn = normal_matrices(places.matrices[:1])[0]
+        over_range(_turn_normals, len(rows), part.own_normals, turn, rows, fewest=ELEMENTS)
         part.flat_faces = part.count_empty(own) if flattens(matrix) else 0
     part.item = item
     return moved, died
@@ -252,7 +252,7 @@ def place_vertices(vertices: Array | None, matrix: Array | None, target: Array) 
         return
     moved = np.empty_like(target)
     given = plain(np.asarray(vertices, np.float32))
-    bad, _, _ = _copy_vertices(given, moved) if matrix is None else _move_vertices(given, matrix, moved)
+    bad, _, _ = _put_vertices(given, matrix, moved)
     if bad:
         with np.errstate(invalid="ignore", over="ignore"):
             world = given if matrix is None else given @ matrix[:, :3].T + matrix[:, 3]
@@ -260,6 +260,14 @@ def place_vertices(vertices: Array | None, matrix: Array | None, target: Array) 
         target[usable] = moved[usable]
     else:
         target[:] = moved
+
+
+def _put_vertices(source: Array, matrix: Array | None, target: Array) -> tuple[int, int, float]:
+    """Usable vertices, moved by a matrix; how many are not, how many changed, the largest coordinate."""
+    kernel, arguments = (_copy_vertices, ()) if matrix is None else (_move_vertices, (matrix,))
+    found = over_range(kernel, len(source), source, *arguments, target, fewest=ELEMENTS)
+    bad, moved, reach = zip(*found, strict=True) if found else ((), (), ())
+    return sum(bad), sum(moved), max(reach, default=0.0)
 
 
 @njit
@@ -273,63 +281,49 @@ def _usable(x, y, z):  # type: ignore[no-untyped-def]
     return zero, zero, zero, zero, 1
 
 
-@njit(parallel=True)
-def _copy_vertices(source, target):  # type: ignore[no-untyped-def]
+@njit
+def _copy_vertices(first, last, source, target):  # type: ignore[no-untyped-def]
     """Copy usable vertices, put the others at the origin: how many those are, how many moved, largest coordinate."""
     bad = moved = 0
     reach = np.float32(0.0)
-    n = len(source)
-    for block in prange((n + _BLOCK - 1) // _BLOCK):
-        lost = changed = 0
-        far = np.float32(0.0)
-        for i in range(block * _BLOCK, min(n, (block + 1) * _BLOCK)):
-            x, y, z = source[i, 0], source[i, 1], source[i, 2]
-            x, y, z, size, unusable = _usable(x, y, z)
-            lost += unusable
-            if x != target[i, 0] or y != target[i, 1] or z != target[i, 2]:
-                target[i, 0], target[i, 1], target[i, 2] = x, y, z
-                changed += 1
-            far = max(far, size)
-        bad += lost
-        moved += changed
-        reach = max(reach, far)
+    for i in range(first, last):
+        x, y, z = source[i, 0], source[i, 1], source[i, 2]
+        x, y, z, size, unusable = _usable(x, y, z)
+        bad += unusable
+        if x != target[i, 0] or y != target[i, 1] or z != target[i, 2]:
+            target[i, 0], target[i, 1], target[i, 2] = x, y, z
+            moved += 1
+        reach = max(reach, size)
     return bad, moved, reach
 
 
-@njit(parallel=True)
-def _move_vertices(source, matrix, target):  # type: ignore[no-untyped-def]
+@njit
+def _move_vertices(first, last, source, matrix, target):  # type: ignore[no-untyped-def]
     """As `_copy_vertices`, moved by a (3, 4) float64 matrix."""
     bad = moved = 0
     reach = np.float32(0.0)
     m00, m01, m02, m03 = matrix[0, 0], matrix[0, 1], matrix[0, 2], matrix[0, 3]
     m10, m11, m12, m13 = matrix[1, 0], matrix[1, 1], matrix[1, 2], matrix[1, 3]
     m20, m21, m22, m23 = matrix[2, 0], matrix[2, 1], matrix[2, 2], matrix[2, 3]
-    n = len(source)
-    for block in prange((n + _BLOCK - 1) // _BLOCK):
-        lost = changed = 0
-        far = np.float32(0.0)
-        for i in range(block * _BLOCK, min(n, (block + 1) * _BLOCK)):
-            a, b, c = source[i, 0], source[i, 1], source[i, 2]
-            x = np.float32(m00 * a + m01 * b + m02 * c + m03)
-            y = np.float32(m10 * a + m11 * b + m12 * c + m13)
-            z = np.float32(m20 * a + m21 * b + m22 * c + m23)
-            x, y, z, size, unusable = _usable(x, y, z)
-            lost += unusable
-            if x != target[i, 0] or y != target[i, 1] or z != target[i, 2]:
-                target[i, 0], target[i, 1], target[i, 2] = x, y, z
-                changed += 1
-            far = max(far, size)
-        bad += lost
-        moved += changed
-        reach = max(reach, far)
+    for i in range(first, last):
+        a, b, c = source[i, 0], source[i, 1], source[i, 2]
+        x = np.float32(m00 * a + m01 * b + m02 * c + m03)
+        y = np.float32(m10 * a + m11 * b + m12 * c + m13)
+        z = np.float32(m20 * a + m21 * b + m22 * c + m23)
+        x, y, z, size, unusable = _usable(x, y, z)
+        bad += unusable
+        if x != target[i, 0] or y != target[i, 1] or z != target[i, 2]:
+            target[i, 0], target[i, 1], target[i, 2] = x, y, z
+            moved += 1
+        reach = max(reach, size)
     return bad, moved, reach
 
 
-@njit(parallel=True)
-def _given_normals(normals, vertices, faces, out):  # type: ignore[no-untyped-def]
+@njit
+def _given_normals(first, last, normals, vertices, faces, out):  # type: ignore[no-untyped-def]
     """Fill (3 m, 3) `out` with the (m, 3, 3) normals made unit; count the faces without area."""
     empty = 0
-    for f in prange(len(faces)):
+    for f in range(first, last):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
         ux, uy, uz = vertices[b, 0] - vertices[a, 0], vertices[b, 1] - vertices[a, 1], vertices[b, 2] - vertices[a, 2]
         vx, vy, vz = vertices[c, 0] - vertices[a, 0], vertices[c, 1] - vertices[a, 1], vertices[c, 2] - vertices[a, 2]
@@ -352,10 +346,10 @@ def _given_normals(normals, vertices, faces, out):  # type: ignore[no-untyped-de
     return empty
 
 
-@njit(parallel=True)
-def _turn_normals(normals, matrix, out):  # type: ignore[no-untyped-def]
+@njit
+def _turn_normals(first, last, normals, matrix, out):  # type: ignore[no-untyped-def]
     """Unit normals through a (3, 3) matrix of normals; (0, 0, 1) where they have no direction."""
-    for i in prange(len(normals)):
+    for i in range(first, last):
         x, y, z = normals[i, 0], normals[i, 1], normals[i, 2]
         a = matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z
         b = matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z
@@ -369,10 +363,10 @@ def _turn_normals(normals, matrix, out):  # type: ignore[no-untyped-def]
         out[i, 0], out[i, 1], out[i, 2] = a, b, c
 
 
-@njit(parallel=True)
-def _materials(vertex, albedo, roughness, metallic, rows):  # type: ignore[no-untyped-def]
+@njit
+def _materials(first, last, vertex, albedo, roughness, metallic, rows):  # type: ignore[no-untyped-def]
     """Copy the material of vertex[i] to shading row i, within [0, 1]; NaN becomes 0."""
-    for i in prange(len(vertex)):
+    for i in range(first, last):
         v = vertex[i]
         for k in range(3):
             rows[i, 3 + k] = min(np.float32(1.0), max(np.float32(0.0), albedo[v, k]))

@@ -1,0 +1,60 @@
+"""Kernels over a range: each element once, in whatever pieces, on whatever threads."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import pytest
+
+from drgs_blender.compute.jit import get_num_threads, njit, set_num_threads
+from drgs_blender.compute.threads import over_range
+
+
+@njit
+def _count(first, last, seen):
+    for i in range(first, last):
+        seen[i] += 1
+    return first, last
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("fewest", [1, 7, 1000])
+@pytest.mark.parametrize("count", [0, 1, 2, 15, 16, 17, 999, 5000])
+def test_each_element_is_worked_on_once_and_pieces_come_in_order(count, fewest, threads):
+    before = get_num_threads()
+    seen = np.zeros(count, np.int64)
+    try:
+        set_num_threads(min(threads, before))
+        pieces = over_range(_count, count, seen, fewest=fewest)
+    finally:
+        set_num_threads(before)
+    assert (seen == 1).all()
+    assert [first for first, _ in pieces] == [0, *(last for _, last in pieces)][: len(pieces)]
+    assert not pieces or pieces[-1][1] == count
+    if count > fewest:
+        assert all(last - first >= min(fewest, count // threads) for first, last in pieces[:-1])
+
+
+def test_an_error_of_one_piece_is_raised_when_the_others_have_ended(monkeypatch):
+    monkeypatch.setattr("drgs_blender.compute.threads.get_num_threads", lambda: 3)
+    ended = []
+
+    def kernel(first, last):
+        if first == 0:
+            raise MemoryError("no room")
+        ended.append(last - first)
+
+    with pytest.raises(MemoryError, match="no room"):
+        over_range(kernel, 240)
+    assert sum(ended) == 230
+
+
+def test_two_threads_may_ask_at_once():
+    seen = [np.zeros(100_000, np.int64) for _ in range(4)]
+    asking = [threading.Thread(target=over_range, args=(_count, 100_000, s)) for s in seen]
+    for thread in asking:
+        thread.start()
+    for thread in asking:
+        thread.join()
+    assert all((s == 1).all() for s in seen)
