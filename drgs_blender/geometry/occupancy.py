@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..compute.jit import njit, prange
+from ..compute.jit import njit
+from ..compute.threads import ELEMENTS, over_range
 
 Array = np.ndarray
 
@@ -34,10 +35,10 @@ class Volume:
         return self.origin + (np.argwhere(self.part >= 0) + 0.5) * self.spacing
 
 
-@njit(parallel=True)
-def _crossings(points, starts, chosen, part, origin, spacing, reach, out):  # type: ignore[no-untyped-def]
+@njit
+def _crossings(first, last, points, starts, chosen, part, origin, spacing, reach, out):  # type: ignore[no-untyped-def]
     nx, ny, nz = part.shape
-    for i in prange(len(points)):
+    for i in range(first, last):
         for m in range(chosen.shape[1]):
             k = chosen[i, m]
             dx, dy, dz = points[i, 0] - starts[k, 0], points[i, 1] - starts[k, 1], points[i, 2] - starts[k, 2]
@@ -74,8 +75,7 @@ def crosses_gap(volume: Volume, points: Array, sources: Array, chosen: Array, re
     (n, m) bool array
     """
     out = np.empty(chosen.shape, np.bool_)
-    _crossings(
-        np.ascontiguousarray(points, np.float64), np.ascontiguousarray(sources, np.float64),
-        np.ascontiguousarray(chosen, np.int64), volume.part, volume.origin, volume.spacing, reach, out,
-    )  # fmt: skip
+    ways = [np.ascontiguousarray(a, t) for a, t in ((points, np.float64), (sources, np.float64), (chosen, np.int64))]
+    grid = volume.part, volume.origin, volume.spacing
+    over_range(_crossings, len(chosen), *ways, *grid, reach, out, fewest=ELEMENTS)
     return out

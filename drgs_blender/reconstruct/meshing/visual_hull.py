@@ -13,7 +13,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.ndimage import binary_dilation, binary_erosion, gaussian_filter, label, maximum_filter, uniform_filter
 
-from ...compute.jit import njit, prange
+from ...compute.jit import njit
+from ...compute.threads import over_range
 from ...core.arrays import Array
 from ...core.errors import AssetError, first_of
 from ...core.frame import Camera
@@ -318,7 +319,7 @@ def _carve(low: Array, spacing: float, shape: Array, views: list[View], masks: l
     """
     seen, background = np.zeros(tuple(shape), np.int32), np.zeros(tuple(shape), np.int32)
     for view, mask in zip(views, masks, strict=True):
-        _count(low, spacing, world_to_pixel(view.camera), mask, seen, background)
+        over_range(_count, len(seen), low, spacing, world_to_pixel(view.camera), mask, seen, background)
     return (seen >= max(3, int(WITNESSES * len(views)))) & (background <= DISSENT * seen), seen
 
 
@@ -343,11 +344,11 @@ def colours_of(points: Array, normals: Array, views: list[View]) -> Array:
     return np.where(weight[:, None] > 1e-3, total / np.maximum(weight, 1e-3)[:, None], 0.5).astype(np.float32)
 
 
-@njit(parallel=True)
-def _count(low, spacing, p, mask, seen, background):  # type: ignore[no-untyped-def]
+@njit
+def _count(first, last, low, spacing, p, mask, seen, background):  # type: ignore[no-untyped-def]
     """Count views that have grid points in their picture, and those that show background there."""
     height, width = mask.shape
-    for i in prange(seen.shape[0]):
+    for i in range(first, last):
         for j in range(seen.shape[1]):
             for k in range(seen.shape[2]):
                 x, y, z = low[0] + i * spacing, low[1] + j * spacing, low[2] + k * spacing

@@ -13,7 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...compute.jit import njit, prange
+from ...compute.jit import njit
+from ...compute.threads import ROWS, over_range
 from ...core.arrays import Array
 from .attributes import BLUR, NORMAL, TINT
 
@@ -61,7 +62,7 @@ class _Mirrored(torch.autograd.Function):
     def forward(ctx: Any, features: Tensor, alpha: Tensor, rays: Array, texels: Tensor) -> Tensor:
         blended, cover, light = (np.ascontiguousarray(t.detach().numpy()) for t in (features, alpha, texels))
         seen = np.zeros((*cover.shape, 3), np.float32)
-        _look_up(blended, cover, rays, light, seen)
+        over_range(_look_up, len(cover), blended, cover, rays, light, seen, fewest=ROWS)
         ctx.save = (blended, cover, rays, light, seen)
         return torch.from_numpy(blended[..., TINT : TINT + 3] * seen)
 
@@ -71,7 +72,8 @@ class _Mirrored(torch.autograd.Function):
         to_features, to_alpha = np.zeros_like(blended), np.zeros_like(cover)
         to_texels = np.zeros((_PARTS, *light.shape), np.float32)
         incoming = np.ascontiguousarray(gradients[0].numpy())
-        _look_up_backward(blended, cover, rays, light, seen, incoming, to_features, to_alpha, to_texels)
+        out = to_features, to_alpha, to_texels
+        over_range(_look_up_backward, _PARTS, blended, cover, rays, light, seen, incoming, out)
         return torch.from_numpy(to_features), torch.from_numpy(to_alpha), None, torch.from_numpy(to_texels.sum(0))
 
 
@@ -127,10 +129,10 @@ def _levels(pixel, alpha):  # type: ignore[no-untyped-def]
     return blur, low, level - np.float32(low)
 
 
-@njit(parallel=True)
-def _look_up(features, alpha, rays, texels, seen):  # type: ignore[no-untyped-def]
+@njit
+def _look_up(first, last, features, alpha, rays, texels, seen):  # type: ignore[no-untyped-def]
     """Light that comes from where each pixel reflects."""
-    for y in prange(alpha.shape[0]):
+    for y in range(first, last):
         for x in range(alpha.shape[1]):
             if not alpha[y, x] > BARE:
                 continue
@@ -149,11 +151,12 @@ def _look_up(features, alpha, rays, texels, seen):  # type: ignore[no-untyped-de
                     seen[y, x, c] += share * (top + t * (bottom - top))
 
 
-@njit(parallel=True)
-def _look_up_backward(features, alpha, rays, texels, seen, incoming, to_features, to_alpha, to_texels):  # type: ignore[no-untyped-def]
+@njit
+def _look_up_backward(first, last, features, alpha, rays, texels, seen, incoming, out):  # type: ignore[no-untyped-def]
     """A part's pixels in their order: many share a texel."""
+    to_features, to_alpha, to_texels = out
     height = alpha.shape[0]
-    for part in prange(_PARTS):
+    for part in range(first, last):
         for y in range(part * height // _PARTS, (part + 1) * height // _PARTS):
             for x in range(alpha.shape[1]):
                 if alpha[y, x] > BARE:
