@@ -262,7 +262,7 @@ class SceneCache:
                 )
         for item in self.objects:
             found += item.faults
-        found += self.scene.materials.warnings
+        found += self.scene.mesh_materials.table.warnings
         found += self.lights.warnings
         if self.environment is not None and self.environment.bad_texels:
             found.append(

@@ -278,10 +278,11 @@ def test_every_array_is_copied_to_a_card(monkeypatch: pytest.MonkeyPatch) -> Non
     apart = WarpRenderBackend("cpu")
     apart.launcher.apart = True
     apart.mirror.tables(scene, light, shining)
+    materials = scene.mesh_materials
     spoilt = [
-        scene.shading_faces, scene.shading, scene.normals, scene.face_object, scene._material, scene._uvs,
-        scene._place_normal, scene.place_object, scene._material_tables, scene.vertices, *scene.materials.arrays,
-        *(texels.texels for texels in scene.materials._images.values()), light.texels, light.row_z, light.cells.runs,
+        scene.shading_faces, scene.shading, scene.normals, scene.face_object, materials.index, materials.uvs,
+        scene._place_normal, scene.place_object, materials.addresses, scene.vertices, *materials.table.arrays,
+        *(texels.texels for texels in materials.table._images.values()), light.texels, light.row_z, light.cells.runs,
         light.cells.guide, light.cells.block, light.product.starts, light.product.slices, light.product.ratio,
         light.product.first, shining.emitters.rows, shining.emitters.nodes, shining.emitters.sums,
         shining.emitters.faces, shining.emitters.slot, shining.emitters.first, shining.emitters.row,

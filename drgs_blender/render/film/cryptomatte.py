@@ -30,7 +30,7 @@ class CryptoFilm:
         x0, y0, x1, y1 = frame.camera.window
         self._kind, self._scene, self._origin, self._width = kind, scene, (x0, y0), frame.camera.width
         objects = [item.name for item in frame.objects] + [mesh.name for mesh in frame.meshes]
-        self._identities = identities(objects if kind == "object" else [*scene.material_names, DRGS_MATERIAL])
+        self._identities = identities(objects if kind == "object" else [*scene.mesh_materials.names, DRGS_MATERIAL])
         self.pixels = np.zeros((y1 - y0, x1 - x0, 2 * PASSES, 2), np.float32)
 
     def add(self, buffer: GBuffer) -> None:
@@ -39,7 +39,11 @@ class CryptoFilm:
         x0, top = self._origin
         start = np.searchsorted(buffer.points.pixel, np.arange(y0, y1 + 1, dtype=np.int64) * self._width)
         scene = self._scene
-        owner = scene.source[buffer.object_index] if self._kind == "object" else scene.material_of(buffer.face)
+        owner = (
+            scene.source[buffer.object_index]
+            if self._kind == "object"
+            else scene.mesh_materials.of(buffer.face - scene.vertex_faces)
+        )
         points = buffer.points
         rows = self.pixels[y0 - top : y1 - top]
         _rank(start, x0, self._width, points.pixel, points.weight, points.flags, self._identities[owner], rows)

@@ -113,7 +113,7 @@ def integrate(
     n = len(points)
     out = Radiance.dark(n)
     lights = lights or _NO_LIGHTS
-    glows = scene.materials.glows
+    glows = scene.mesh_materials.table.glows
     if n == 0 or sum(counts) == 0 or (environment.black and not lights.count and not glows):
         return out
     share = environment_share(environment, lights)

@@ -14,7 +14,8 @@ from ...core.color import LUMINANCE as WEIGHTS
 from ..memory import Place, address, load_float, load_int32, load_int64
 from ..sampling import ONE, ZERO, F, unit
 from ..scene.interaction import Geometry, emitted
-from ..scene.trace_scene import Glowing, TraceScene
+from ..scene.mesh_materials import Glowing
+from ..scene.trace_scene import TraceScene
 from .light_shapes import DIFFUSE, GLOSSY, SHADOW
 from .mesh_light_tree import Tree, build, emitter_probability, emitters_weight, morton_order, pick_emitter
 from .triangle_light import (
@@ -92,7 +93,7 @@ class Emitters:
     def __init__(self, scene: TraceScene | None = None, previous: Emitters | None = None) -> None:
         self._scene = scene
         glowing = scene.glowing if scene is not None else []
-        self._known: list[Any] = [scene and scene.materials]
+        self._known: list[Any] = [scene and scene.mesh_materials.table]
         for glow in glowing:
             self._known += [glow.mesh, int(glow.faces[0]), None if glow.places is None else glow.places.start]
         if previous is not None and _same(self._known, previous._known):
@@ -210,7 +211,7 @@ def _same(a: list[Any], b: list[Any]) -> bool:
 
 def _luminance(glow: Glowing, scene: TraceScene) -> Array:
     """(k,) float32 estimates of the mean luminance of each face: half of it its own, half its material's."""
-    table, weights = scene.materials, np.array(WEIGHTS)
+    table, weights = scene.mesh_materials.table, np.array(WEIGHTS)
     out = np.zeros(len(glow.faces), np.float32)
     for material in np.unique(glow.material):
         own = glow.material == material

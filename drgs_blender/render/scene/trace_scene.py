@@ -9,19 +9,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
-from typing import Any
 
 import numpy as np
 
-from ...core.asset.model import as_float
-from ...core.errors import UsageError
 from ...core.frame import Image, MeshState, Pose
 from ..memory import Place, address
 from ..sampling import F
 from .instances import Places, normal_matrices, other_matrices, usable_places
 from .interaction import Geometry, Tracer
+from .mesh_materials import Glowing, MeshMaterials
 from .ray_masks import object_flags
-from .textures import MaterialTable
 from .trace_mesh import (
     ALBEDO,
     METALLIC,
@@ -52,33 +49,6 @@ class ObjectFaults:
     bad_faces: int  # touch a bad vertex
     empty_faces: int  # have no area
     bad_places: int = 0  # matrices that are not finite, or flatten one of several places
-
-
-@dataclass(slots=True)
-class Glowing:
-    """A mesh with materials that emit light.
-
-    Attributes
-    ----------
-    mesh : MeshState
-        As given.
-    shape : slice
-        All faces of the mesh, among the scene's.
-    faces : (k,) int64 array
-        Those that emit.
-    material : (k,) int32 array
-        Of ``TraceScene.materials``.
-    uvs : (k, 3, 2) float32 array or None
-    places : array, optional
-        Rows of ``TraceScene.places``, or None where the faces are in world space.
-    """
-
-    mesh: MeshState
-    shape: slice
-    faces: Array
-    material: Array
-    uvs: Array | None
-    places: range | None
 
 
 class TraceScene:
@@ -121,8 +91,8 @@ class TraceScene:
         Which of the frame's objects, or behind them which of its meshes, each is.
     any_ordinary : bool
         Whether the camera may see an ordinary mesh.
-    materials : MaterialTable
-        MaterialTable of the meshes.
+    mesh_materials : MeshMaterials
+        Materials and texture coordinates of the meshes, whose faces begin at `vertex_faces`.
     extent : float
         Metres: the largest absolute coordinate, the scale of rounding errors.
     faults : list of ObjectFaults
@@ -143,21 +113,16 @@ class TraceScene:
         self.object_flags: Array = np.empty(0, np.int32)
         self.rays_differ = False
         self.any_ordinary = False
-        self.materials = MaterialTable([], [])
-        self._material_tables: Array = np.array(self.materials.addresses, np.int64)
+        self.mesh_materials = MeshMaterials()
         self.extent = 0.0
         self.faults: list[ObjectFaults] = []
         self._parts: list[Part] = []
         self._known: list[tuple[MeshState, Places]] = []
-        self._given: list[Any] = []  # lists of materials, images
-        self._first_material: list[int] = []
         self._groups: list[list[int]] = []  # parts of each group
         self._vertex_count = 0
         self._place_normal: Array = np.empty((0, 3, 3), np.float32)
         self.place_object: Array = np.empty(0, np.int32)
         self._first_place: Array = np.zeros(1, np.int32)
-        self._material: Array = np.empty(0, np.int32)
-        self._uvs: Array = np.empty((0, 3, 2), np.float32)
 
     @property
     def vertices(self) -> Array:
@@ -183,15 +148,16 @@ class TraceScene:
 
     def geometry_at(self, place: Place) -> Geometry:
         """`geometry` of arrays that lie elsewhere."""
-        tables = self._material_tables if place is address else np.array(self.materials.addresses_at(place), np.int64)
+        meshes = self.mesh_materials
+        tables = meshes.addresses if place is address else np.array(meshes.table.addresses_at(place), np.int64)
         return Geometry(
             place(self.shading_faces),
             place(self.shading),
             place(self.normals),
             place(self.face_object),
             self.vertex_faces,
-            place(self._material),
-            place(self._uvs) if len(self._uvs) else 0,
+            place(meshes.index),
+            place(meshes.uvs) if len(meshes.uvs) else 0,
             place(self._place_normal),
             place(self.place_object),
             place(tables),
@@ -212,20 +178,21 @@ class TraceScene:
     def glowing(self) -> list[Glowing]:
         """What emits light, in the order of the scene's faces."""
         found: list[Glowing] = []
-        if not self.materials.glows:
+        materials = self.mesh_materials
+        if not materials.table.glows:
             return found
-        glows = np.any(self.materials.arrays[0][:, 5:] > 0.0, axis=1)
+        glows = np.any(materials.table.arrays[0][:, 5:] > 0.0, axis=1)
         for group, members in enumerate(self._groups):
             for part in (self._parts[i] for i in members):
                 if not isinstance(part.item, MeshState):
                     continue
                 rows = slice(part.face.start - self.vertex_faces, part.face.stop - self.vertex_faces)
-                own = np.flatnonzero(glows[self._material[rows]]) + rows.start
+                own = np.flatnonzero(glows[materials.index[rows]]) + rows.start
                 if not len(own):
                     continue
                 where = self._places_of(group, part)
-                uvs = self._uvs[own] if len(self._uvs) else None
-                found.append(Glowing(part.item, part.face, own + self.vertex_faces, self._material[own], uvs, where))
+                uvs = materials.uvs[own] if len(materials.uvs) else None
+                found.append(Glowing(part.item, part.face, own + self.vertex_faces, materials.index[own], uvs, where))
         return found
 
     def _places_of(self, group: int, part: Part) -> range | None:
@@ -276,7 +243,7 @@ class TraceScene:
         if not same or elsewhere or len(known) != len(meshes):
             self._place(stands, len(items))
         self._number(objects, meshes, stands)
-        self._take_materials(parts, before, meshes, images, len(objects))
+        self.mesh_materials.update(parts, before, meshes, images, (len(objects), self.vertex_faces))
         self._commit(parts, vertices, places, moved, elsewhere, died)
         self.version = object()
         self.faults = [ObjectFaults(item.name, 0, 0, 0, p.bad if p else 0) for item, p in zip(items, places)]
@@ -345,8 +312,7 @@ class TraceScene:
         self.shading_faces, self.face_object = np.concatenate(faces), np.concatenate(owners)
         self.shading = np.zeros((rows[True], SHADING_WIDTH), np.float32)
         self.normals = np.zeros((rows[False], 3), np.float32)
-        self._material = np.zeros(face - self.vertex_faces, np.int32)
-        self._uvs = np.empty((0, 3, 2), np.float32)
+        self.mesh_materials.clear(face - self.vertex_faces)
         # A part in places is a group of its own; others of one mask share one.
         alike = groupby(range(len(parts)), lambda i: (parts[i].mask, i if parts[i].instanced else -1))
         self._groups = [list(members) for _, members in alike]
@@ -372,52 +338,6 @@ class TraceScene:
         self.source = np.concatenate([np.arange(len(seen)), np.repeat(np.arange(len(seen)), counts)])
         self.object_flags = flags[self.source]
         self.any_ordinary = any(mesh.visibility.camera and len(p.matrices) > 0 for mesh, p in zip(meshes, where))
-
-    @property
-    def material_names(self) -> list[str]:
-        """Names of the materials of all meshes, in the order of ``materials``."""
-        given = self._given[: max(len(self._first_material) - 1, 0)]
-        return [material.name for materials in given for material in materials]
-
-    def material_of(self, face: Array) -> Array:
-        """(n,) int64 place of materials of faces in ``material_names``; one behind the last for DR-GS objects."""
-        own, none = face - self.vertex_faces, len(self.material_names)
-        found = np.full(len(face), none, np.int64)
-        meshes = own >= 0
-        found[meshes] = self._material[own[meshes]]
-        return found
-
-    def _take_materials(
-        self,
-        parts: Sequence[Part],
-        before: Sequence[TraceObject | MeshState | None],
-        meshes: Sequence[MeshState],
-        images: Sequence[Image],
-        count: int,
-    ) -> None:
-        """Bring materials and texture coordinates of meshes up to date."""
-        given: list[Any] = [mesh.materials for mesh in meshes]
-        first = [int(n) for n in np.cumsum([0, *(len(own) for own in given)])]
-        given += images
-        if first != self._first_material or [id(g) for g in given] != [id(g) for g in self._given]:
-            self.materials = MaterialTable([m for mesh in meshes for m in mesh.materials], list(images), self.materials)
-            self._material_tables = np.array(self.materials.addresses, np.int64)
-            self._given = given
-        if any(mesh.uvs is not None for mesh in meshes) and not len(self._uvs):
-            self._uvs = np.zeros((len(self._material), 3, 2), np.float32)
-            before = [None] * len(before)
-        for part, old in zip(parts, before):
-            mesh = part.item
-            if not isinstance(mesh, MeshState):
-                continue
-            rows = slice(part.face.start - self.vertex_faces, part.face.stop - self.vertex_faces)
-            if old is not mesh or first != self._first_material:
-                self._material[rows] = first[part.source - count] + _material_index(mesh, len(part.faces))
-            if mesh.uvs is None and len(self._uvs):
-                self._uvs[rows] = 0.0
-            elif mesh.uvs is not None and (not isinstance(old, MeshState) or old.uvs is not mesh.uvs):
-                self._uvs[rows] = as_float(mesh.uvs, (len(part.faces), 3, 2), f"texture coordinates of {mesh.name}")
-        self._first_material = first
 
     def _commit(
         self,
@@ -470,17 +390,3 @@ def _order(items: Sequence[TraceObject | MeshState], places: Sequence[Places | N
 
     here = [i for i, where in enumerate(places) if (len(items[i].faces) if where is None else len(where.matrices))]
     return sorted(here, key=kind)
-
-
-def _material_index(mesh: MeshState, count: int) -> Array | int:
-    """Material of each face, within the mesh's materials."""
-    if not mesh.materials:
-        raise UsageError(f"object {mesh.name}", "has no material", "Give it at least one")
-    if mesh.material_index is None:
-        return 0
-    index = np.asarray(mesh.material_index)
-    if index.shape != (count,):
-        raise UsageError(
-            f"object {mesh.name}", f"{len(index)} material indices for {count} faces", "Give one index a face"
-        )
-    return np.clip(index, 0, len(mesh.materials) - 1)

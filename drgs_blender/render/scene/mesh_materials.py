@@ -1,0 +1,150 @@
+"""Materials and texture coordinates of the meshes of a scene, face by face."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ...core.arrays import Array
+from ...core.asset.model import as_float
+from ...core.errors import UsageError
+from ...core.frame import Image, MeshState
+from .textures import MaterialTable
+from .trace_mesh import Part, TraceObject
+
+
+@dataclass(slots=True)
+class Glowing:
+    """A mesh with materials that emit light.
+
+    Attributes
+    ----------
+    mesh : MeshState
+        As given.
+    shape : slice
+        All faces of the mesh, among the scene's.
+    faces : (k,) int64 array
+        Those that emit.
+    material : (k,) int32 array
+        Of ``MeshMaterials.table``.
+    uvs : (k, 3, 2) float32 array or None
+    places : array, optional
+        Rows of ``TraceScene.places``, or None where the faces are in world space.
+    """
+
+    mesh: MeshState
+    shape: slice
+    faces: Array
+    material: Array
+    uvs: Array | None
+    places: range | None
+
+
+class MeshMaterials:
+    """What `TraceScene` knows of the materials of its meshes. Faces count from the first that is of a mesh.
+
+    Attributes
+    ----------
+    table : MaterialTable
+        All materials.
+    addresses : (6,) int64 array
+        ``table.addresses``.
+    index : (k,) int32 array
+        Material of each face, in `table`.
+    uvs : (k, 3, 2) float32 array
+        Texture coordinates of the corners; empty where no mesh has any.
+    """
+
+    def __init__(self) -> None:
+        self.table = MaterialTable([], [])
+        self.addresses: Array = np.array(self.table.addresses, np.int64)
+        self._given: list[Any] = []  # lists of materials, images
+        self._first: list[int] = []  # of each mesh, in `table`
+        self.clear(0)
+
+    def clear(self, count: int) -> None:
+        """Forget the faces; there are `count` now, and each is to be set."""
+        self.index: Array = np.zeros(count, np.int32)
+        self.uvs: Array = np.empty((0, 3, 2), np.float32)
+
+    @property
+    def names(self) -> list[str]:
+        """Names of all materials, in the order of `table`."""
+        given = self._given[: max(len(self._first) - 1, 0)]
+        return [material.name for materials in given for material in materials]
+
+    def of(self, face: Array) -> Array:
+        """(n,) int64 place in `names` of the materials of faces; one behind the last for negative ones."""
+        found = np.full(len(face), len(self.names), np.int64)
+        meshes = face >= 0
+        found[meshes] = self.index[face[meshes]]
+        return found
+
+    def update(
+        self,
+        parts: Sequence[Part],
+        before: Sequence[TraceObject | MeshState | None],
+        meshes: Sequence[MeshState],
+        images: Sequence[Image],
+        sources: tuple[int, int],
+    ) -> None:
+        """Bring all up to date.
+
+        Parameters
+        ----------
+        parts : sequence of Part
+            Of the scene.
+        before : sequence of (TraceObject or MeshState or None)
+            What each part was at the last update.
+        meshes : sequence of MeshState
+            Of the frame.
+        images : sequence of Image
+            That their textures use.
+        sources : tuple of int
+            First source that is a mesh, first face that is of one.
+
+        Raises
+        ------
+        UsageError
+            Where materials, or texture coordinates, do not fit a mesh.
+        """
+        first_source, first_face = sources
+        given: list[Any] = [mesh.materials for mesh in meshes]
+        first = [int(n) for n in np.cumsum([0, *(len(own) for own in given)])]
+        given += images
+        if first != self._first or [id(g) for g in given] != [id(g) for g in self._given]:
+            self.table = MaterialTable([m for mesh in meshes for m in mesh.materials], list(images), self.table)
+            self.addresses = np.array(self.table.addresses, np.int64)
+            self._given = given
+        if any(mesh.uvs is not None for mesh in meshes) and not len(self.uvs):
+            self.uvs = np.zeros((len(self.index), 3, 2), np.float32)
+            before = [None] * len(before)
+        for part, old in zip(parts, before):
+            mesh = part.item
+            if not isinstance(mesh, MeshState):
+                continue
+            rows = slice(part.face.start - first_face, part.face.stop - first_face)
+            if old is not mesh or first != self._first:
+                self.index[rows] = first[part.source - first_source] + _material_index(mesh, len(part.faces))
+            if mesh.uvs is None and len(self.uvs):
+                self.uvs[rows] = 0.0
+            elif mesh.uvs is not None and (not isinstance(old, MeshState) or old.uvs is not mesh.uvs):
+                self.uvs[rows] = as_float(mesh.uvs, (len(part.faces), 3, 2), f"texture coordinates of {mesh.name}")
+        self._first = first
+
+
+def _material_index(mesh: MeshState, count: int) -> Array | int:
+    """Material of each face, within the mesh's materials."""
+    if not mesh.materials:
+        raise UsageError(f"object {mesh.name}", "has no material", "Give it at least one")
+    if mesh.material_index is None:
+        return 0
+    index = np.asarray(mesh.material_index)
+    if index.shape != (count,):
+        raise UsageError(
+            f"object {mesh.name}", f"{len(index)} material indices for {count} faces", "Give one index per face"
+        )
+    return np.clip(index, 0, len(mesh.materials) - 1)
