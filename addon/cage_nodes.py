@@ -72,7 +72,7 @@ def frames(points: Array, vertices: Array, triangles: Array) -> tuple[Array, Arr
     for number, centre in enumerate(((first + second + third) / 3)[sound].tolist()):
         tree.insert(centre, number)
     tree.balance()
-    # The next face ends the reach of the others, lest vertices jump where the nearest change.
+    # The next face ends the reach of the others, so that vertices do not jump where the nearest change.
     found = [tree.find_n(p, min(FACES + 1, len(sound))) for p in points.tolist()]
     distance = np.array([[hit[2] for hit in hits] for hits in found])
     reach = np.maximum(distance[:, -1:] * (1.0 if len(sound) > FACES else 1.5), 1e-30)

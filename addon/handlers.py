@@ -18,7 +18,7 @@ def forget_everything(*_: object) -> None:
 
 @bpy.app.handlers.persistent
 def begin_render(*_: object) -> None:
-    """A picture or an animation begins: what it warns of is told once, not with every frame."""
+    """A picture or an animation begins: each warning is given once, not with every frame."""
     messages.warned.clear()
 
 

@@ -30,9 +30,8 @@ SIZE, TRAIN, TEST, SAMPLES = 128, 40, 8, 32
 
 #: The paper's BRDF and losses: L1 of noisy estimates, white light, neither grids nor smoothness of materials.
 PAPER: dict[str, Any] = {
-    "shading_model": "paper", "unbiased": False, "white": 0.003, "coarse": 0, "smoothness": 0.0, "coarse_to_fine":
-    False,
-    "polish": 0.0, "plain_metals": 0.0,
+    "shading_model": "paper", "unbiased": False, "grey_light_prior": 0.003, "coarse": 0, "smoothness": 0.0,
+    "coarse_to_fine": False, "metal_albedo_prior": 0.0, "metal_smoothness": 0.0,
 }  # fmt: skip
 
 #: Part -> row -> what differs from the settings that the rows share.
@@ -40,8 +39,8 @@ VARIANTS: dict[str, dict[str, dict[str, Any]]] = {
     "estimator": {
         "as it is": {},
         "loss that noise pulls (log, L1)": {"unbiased": False},
-        "weighed by the photographs": {"by_shown": False},
-        "pixels beside clipped ones count whole": {"beside_clipped": 1.0},
+        "weighed by the photographs": {"weight_by_prediction": False},
+        "pixels beside clipped ones count whole": {"clipped_neighbour_weight": 1.0},
         "cosine samples alone (no MIS)": {"cosine": 32, "ggx": 0, "light": 0},
         "four times the rays on a quarter of the pixels": {"pixels": 512, "cosine": 64, "ggx": 32, "light": 32},
     },
@@ -50,8 +49,8 @@ VARIANTS: dict[str, dict[str, dict[str, Any]]] = {
         "environment fine from the start": {"coarse_to_fine": False},
         "environment of 32 rows": {"environment": 32},
         "light learned a quarter as fast": {"light_rate": 0.1},
-        "white-light weight .003": {"white": 0.003},
-        "white-light weight 0": {"white": 0.0},
+        "white-light weight .003": {"grey_light_prior": 0.003},
+        "white-light weight 0": {"grey_light_prior": 0.0},
     },
     "materials": {
         "without nested grids": {"coarse": 0},
@@ -61,9 +60,9 @@ VARIANTS: dict[str, dict[str, dict[str, Any]]] = {
         "the paper's BRDF": {"shading_model": "paper"},
     },
     "priors": {
-        "metallic pulled to 0 or 1": {"bimodal": 0.01},
-        "metals of any brightness": {"polish": 0.0},
-        "metals smoothed like paint": {"plain_metals": 0.0},
+        "metallic pulled to 0 or 1": {"binary_metallic_prior": 0.01},
+        "metals of any brightness": {"metal_albedo_prior": 0.0},
+        "metals smoothed like paint": {"metal_smoothness": 0.0},
         "learned exposure of each photograph": {"exposure": True},
         "learned normals": {"normals": True},
     },
@@ -72,9 +71,9 @@ VARIANTS: dict[str, dict[str, dict[str, Any]]] = {
 #: What makes up for errors of the mesh: row -> what differs.
 ON_OWN_MESH: dict[str, dict[str, Any]] = {
     "": {},
-    ", weighed by the photographs": {"by_shown": False},
-    ", pixels beside clipped ones count whole": {"beside_clipped": 1.0},
-    ", metals smoothed like paint": {"plain_metals": 0.0},
+    ", weighed by the photographs": {"weight_by_prediction": False},
+    ", pixels beside clipped ones count whole": {"clipped_neighbour_weight": 1.0},
+    ", metals smoothed like paint": {"metal_smoothness": 0.0},
 }
 
 

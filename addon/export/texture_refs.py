@@ -80,7 +80,7 @@ class TextureRef:
     def curved(self, function: Callable[[Array], Array], warn: Warn) -> tuple[TextureRef, float] | None:
         """The picture with `function` of (n, 3) colours done to its values, and a factor for it to stay below 1.
 
-        None where that is no curve: the image is not of bytes, or channels work upon each other.
+        None where that is no curve: the image is not of bytes, or channels are mixed.
         """
         values, source = self._values(warn)
         if values is None:

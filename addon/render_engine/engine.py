@@ -94,7 +94,7 @@ class DrgsRenderEngine(bpy.types.RenderEngine):
             info = ""
             if draw:
                 views.show(name)
-                info, late = views.tell(name)
+                info, late = views.status(name)
                 error = error or late
         except Exception as failure:  # an exception here would come with every redraw
             messages.log.exception("viewport failed")

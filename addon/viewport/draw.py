@@ -48,7 +48,7 @@ vec3 decoded(vec3 colour)
   return mix(power, colour / 12.92, lessThanEqual(colour, vec3(0.04045)));
 }
 """
-#: The nearest of the depths around decides, lest a rim of the object sink behind what it stands before.
+#: The nearest of the depths around decides, so that no rim of the object is hidden by what it stands before.
 _COMPOSITE = f"""{_DECODE}
 vec3 shown(vec3 light)
 {{

@@ -42,7 +42,7 @@ def _lit(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> str:
             _from_behind(context.region_data),
             (2.0**view.exposure, 1.0 / max(view.gamma, 1e-3)),
         )
-    return error or views.tell(name)[1]
+    return error or views.status(name)[1]
 
 
 def _lacks_depth(space: bpy.types.SpaceView3D) -> bool:

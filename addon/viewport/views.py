@@ -30,14 +30,14 @@ _BUSY, _IDLE = 0.01, 0.1
 STRIP_PIXELS = 1 << 20
 
 worker = Worker()
-_shown: dict[str, Shown] = {}
-_seen_news = 0
+_shown: dict[str, ViewportState] = {}
+_last_news = 0
 #: Seconds that redraws took, and those that Blender's thread worked in them, for `bench/bench_viewport.py`.
 redraws: deque[tuple[float, float]] = deque(maxlen=10_000)
 
 
 @dataclass(slots=True)
-class Shown:
+class ViewportState:
     """One viewport.
 
     Attributes
@@ -89,7 +89,7 @@ def update(
     camera = view_camera(region, space, rv3d, depsgraph.scene)
     if camera is None:
         return ""
-    shown = _shown.setdefault(name, Shown())
+    shown = _shown.setdefault(name, ViewportState())
     options = _options(depsgraph.scene, name, composited)
     wanted = exported, _values(camera), (options, depthless)
     if shown.wanted and shown.wanted[0] is exported and shown.wanted[1:] == wanted[1:]:
@@ -107,7 +107,7 @@ def update(
     return ""
 
 
-def newest(name: str) -> Shown | None:
+def newest(name: str) -> ViewportState | None:
     """The newest picture of a viewport that is on the graphics card, None before there is one.
 
     Another one is brought there, as much of it as a redraw has time for.
@@ -119,11 +119,11 @@ def newest(name: str) -> Shown | None:
     if shown.arriving is None and picture is not shown.picture:  # what is half there is finished first
         shown.arriving = picture
     if shown.arriving is not None:
-        _bring(shown, shown.arriving)
+        _upload(shown, shown.arriving)
     return shown if shown.picture is not None else None
 
 
-def _bring(shown: Shown, picture: Picture) -> None:
+def _upload(shown: ViewportState, picture: Picture) -> None:
     """The next rows of the picture that is arriving; show it when it is whole."""
     passes = {n: picture.passes[n] for n in draw.KINDS if n in picture.passes}
     height, width = picture.passes["Combined"].shape[:2]
@@ -155,7 +155,7 @@ def show(name: str) -> None:
         draw.picture(shown.strips, rect_of(shown.picture))
 
 
-def tell(name: str) -> tuple[str, str]:
+def status(name: str) -> tuple[str, str]:
     """What to say of a viewport: (what is being done, an error or "")."""
     shown = _shown.get(name)
     error = worker.state(name)[1]
@@ -187,8 +187,8 @@ def forget() -> None:
 def stop() -> None:
     """Forget everything and end what runs."""
     forget()
-    if bpy.app.timers.is_registered(_look):
-        bpy.app.timers.unregister(_look)
+    if bpy.app.timers.is_registered(_poll):
+        bpy.app.timers.unregister(_poll)
     worker.stop()
 
 
@@ -249,13 +249,13 @@ def rect_of(picture: Picture) -> tuple[float, float, float, float]:
 
 
 def _start() -> None:
-    if not bpy.app.timers.is_registered(_look):
-        bpy.app.timers.register(_look, first_interval=_BUSY)
+    if not bpy.app.timers.is_registered(_poll):
+        bpy.app.timers.register(_poll, first_interval=_BUSY)
 
 
-def _look() -> float | None:
+def _poll() -> float | None:
     """Have the viewports drawn again that have news; end when there are none left."""
-    global _seen_news
+    global _last_news
     live = dict(_live())
     for name in set(_shown) - set(live):
         worker.drop(name)
@@ -263,9 +263,9 @@ def _look() -> float | None:
     arriving = {name for name, shown in _shown.items() if shown.arriving is not None}
     news = worker.news  # once: the worker goes on counting
     for name, area in live.items():
-        if news != _seen_news or name in arriving:
+        if news != _last_news or name in arriving:
             area.tag_redraw()
-    _seen_news = news
+    _last_news = news
     if not _shown:
         return None
     return _BUSY if worker.busy() or arriving else _IDLE

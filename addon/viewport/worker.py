@@ -219,7 +219,7 @@ class Worker:
                 loaded[path] = stamp
 
     def _tell(self, view: _View, phase: str, part: float) -> None:
-        """Take a phase in; there is news where the viewport says something else, see `views.tell`."""
+        """Take a phase in; there is news where the viewport says something else, see `views.status`."""
         changed = phase != view.phase or (is_counted(phase) and f"{part:.0%}" != f"{view.part:.0%}")
         view.phase, view.part = phase, part
         self.news += changed

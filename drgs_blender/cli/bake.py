@@ -25,7 +25,7 @@ from .progress import FractionBar
 from .sampling import whole
 
 if TYPE_CHECKING:
-    from ..engine.session import Placed, Session
+    from ..engine.session import PosedObject, Session
 
 Array = np.ndarray
 #: Name of an object, where its light goes, its UV map if that is an image.
@@ -129,7 +129,7 @@ def _bake(
         print(f"{out}: {len(colours)} {'vertices' if texel is None else 'texels'} of {name}")
 
 
-def _uvs_of(path: Path, item: Placed) -> Array:
+def _uvs_of(path: Path, item: PosedObject) -> Array:
     """The UV map in the order of the corners of the object's traced faces, which a mirrored object turns round."""
     try:
         uvs = np.load(path, allow_pickle=False)

@@ -49,7 +49,7 @@ class Histories:
     def __init__(self) -> None:
         self._known: dict[str, Sequence] = {}
 
-    def continued(self, frame: Frame, scene: TraceScene, scenery: tuple[Any, ...]) -> Sequence:
+    def continued(self, frame: Frame, scene: TraceScene, static_state: tuple[Any, ...]) -> Sequence:
         """The sequence that `frame` continues, with what of it is of use.
 
         Parameters
@@ -57,7 +57,7 @@ class Histories:
         frame : Frame
         scene : TraceScene
             Brought up to date for the frame.
-        scenery : tuple
+        static_state : tuple
             Objects, meshes, images, world and lights of the frame, unchanged ones as the same objects.
         """
         settings, camera = frame.settings, frame.camera
@@ -66,7 +66,7 @@ class Histories:
         lasting = replace(
             settings, seed=0, threads=0, device="cpu", samples=0, strategy_samples=None, noise_threshold=0.0
         )
-        situation = renewed(camera, old.situation[0]), renewed(lasting, old.situation[1]), *scenery
+        situation = renewed(camera, old.situation[0]), renewed(lasting, old.situation[1]), *static_state
         split = any(name in frame.passes for name in COMPONENTS)
         fit = scene.layout, scene.places.shape, camera.window, camera.width, camera.height, settings.camera_sees, split
         if fit != old.fit or old.past is None:

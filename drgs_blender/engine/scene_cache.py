@@ -105,7 +105,7 @@ class SceneCache:
         self._deformer: Deformer | None = None
 
     @property
-    def scenery(self) -> tuple[object, ...]:
+    def static_state(self) -> tuple[object, ...]:
         """All but the lights that a picture of the last frame depends on."""
         return *(item.state for item in self.objects), self.meshes, self.images, self.world
 

@@ -42,7 +42,7 @@ _VIEWS = 4
 
 
 @dataclass(slots=True)
-class Placed:
+class PosedObject:
     """An object of a frame as it stands in the world.
 
     Attributes
@@ -62,7 +62,7 @@ class Placed:
 
 
 class _StageTimer:
-    """Seconds a stage; between two stages a cancel is seen."""
+    """Seconds per stage; cancellation is checked between stages."""
 
     def __init__(self, cancelled: IsCancelled | None) -> None:
         self.seconds: dict[str, float] = {}
@@ -146,18 +146,18 @@ class Session:
         array([2.], dtype=float32)
         """
         self._compile(frame, (), progress, cancelled)
-        lap, backend = _StageTimer(cancelled), self._backends.select(frame.settings.device)
-        prepared = self._prepare(frame, lap, progress, backend)
+        timer, backend = _StageTimer(cancelled), self._backends.select(frame.settings.device)
+        prepared = self._prepare(frame, timer, progress, backend)
         tell = None if progress is None else lambda part, phase: progress(phase, part)
         passes = self._draw(frame, prepared, tell, cancelled, backend)
-        lap("render")
+        timer("render")
         x0, y0, x1, y1 = frame.camera.window
-        passes.statistics |= self._statistics(frame, prepared.surfels, lap)
+        passes.statistics |= self._statistics(frame, prepared.surfels, timer)
         passes.statistics["samples"] = float((x1 - x0) * (y1 - y0) * frame.settings.sample_count)
-        passes.warnings = self._warnings(frame.settings) + _unheeded(frame.settings)
+        passes.warnings = self._warnings(frame.settings) + _ignored_settings(frame.settings)
         return passes
 
-    def place(self, frame: Frame, progress: OnProgress | None = None) -> tuple[PreparedScene, list[Placed]]:
+    def place(self, frame: Frame, progress: OnProgress | None = None) -> tuple[PreparedScene, list[PosedObject]]:
         """Scene, light and objects of a frame whose objects are seen as surfels, without its picture.
 
         Raises
@@ -168,7 +168,7 @@ class Session:
         self._compile(frame, (), progress, None)
         prepared = self._prepare(frame, _StageTimer(None), progress)
         placed = [
-            Placed(item.state, item.loaded.asset, item.traced, item.posed)
+            PosedObject(item.state, item.loaded.asset, item.traced, item.posed)
             for item in self._scene_cache.objects
             if item.posed is not None
         ]
@@ -189,20 +189,20 @@ class Session:
         """
         self._views.pop(name, None)
         self._compile(frame, ("viewport",), progress, cancelled)
-        lap, backend = _StageTimer(cancelled), self._backends.select(frame.settings.device)
+        timer, backend = _StageTimer(cancelled), self._backends.select(frame.settings.device)
         by_mesh = self._scene_cache.detailed(frame)
         rough = replace(frame, settings=replace(frame.settings, camera_sees="mesh")) if by_mesh else frame
-        prepared = self._prepare(rough, lap, progress, backend)
+        prepared = self._prepare(rough, timer, progress, backend)
         view = View(self._scene_cache.kept(frame), self._pace, self._views_begun, by_mesh, backend)
         self._views_begun += 1
         passes = view.begin(
             prepared, lambda frame, prepared, tell: self._draw(frame, prepared, tell, cancelled, backend)
         )
-        lap("render")
+        timer("render")
         self._views[name] = view
         while len(self._views) > _VIEWS:
             del self._views[next(iter(self._views))]
-        return self._seen(view, passes, prepared, lap)
+        return self._seen(view, passes, prepared, timer)
 
     def refine(
         self, name: str, progress: OnProgress | None = None, cancelled: IsCancelled | None = None
@@ -217,17 +217,17 @@ class Session:
         view = self._views.get(name)
         if view is None:
             return None
-        lap = _StageTimer(cancelled)
+        timer = _StageTimer(cancelled)
         backend = view.backend
-        prepared = self._prepare(view.frame, lap, progress, backend)  # other views may have changed the scene
+        prepared = self._prepare(view.frame, timer, progress, backend)  # other views may have changed the scene
         passes = view.advance(
             prepared, lambda frame, prepared, tell: self._draw(frame, prepared, tell, cancelled, backend), cancelled
         )
-        lap("render")
-        return self._seen(view, passes, prepared, lap)
+        timer("render")
+        return self._seen(view, passes, prepared, timer)
 
-    def _seen(self, view: View, passes: Passes, prepared: PreparedScene, lap: _StageTimer) -> Passes:
-        passes.statistics |= self._statistics(view.frame, prepared.surfels, lap)
+    def _seen(self, view: View, passes: Passes, prepared: PreparedScene, timer: _StageTimer) -> Passes:
+        passes.statistics |= self._statistics(view.frame, prepared.surfels, timer)
         passes.statistics |= {"view.fraction": view.fraction, "view.pixel": float(view.pixel)}
         passes.warnings = self._warnings(view.frame.settings)
         return passes
@@ -244,8 +244,8 @@ class Session:
         sequence, statistics = None, {}
         if frame.history and frame.settings.denoise == "svgf":
             self._lights = renewed(frame.lights, self._lights)
-            scenery = *self._scene_cache.scenery, self._lights
-            sequence = self._histories.continued(frame, prepared.scene, scenery)
+            static_state = *self._scene_cache.static_state, self._lights
+            sequence = self._histories.continued(frame, prepared.scene, static_state)
             statistics["history"] = float(sequence.pictures)
         instant = self._scene_cache.instant
         prepared = replace(prepared, previous=instant(frame, frame.previous), following=instant(frame, frame.next))
@@ -265,7 +265,7 @@ class Session:
             self._compiled |= wanted
 
     def _prepare(
-        self, frame: Frame, lap: _StageTimer, progress: OnProgress | None, backend: RenderBackend = CPU
+        self, frame: Frame, timer: _StageTimer, progress: OnProgress | None, backend: RenderBackend = CPU
     ) -> PreparedScene:
         """Bring scene and light up to date with the frame."""
         _check(frame)
@@ -273,18 +273,18 @@ class Session:
         if progress is not None:
             progress("Deforming", 0.0)
         posed = self._scene_cache.pose(frame, backend)
-        lap("deform")
+        timer("deform")
         environment, lights = self._scene_cache.environment_of(frame.world), self._scene_cache.lights_of(frame.lights)
-        lap("light")
+        timer("light")
         return PreparedScene(self._scene_cache.scene, environment, posed, lights, self._scene_cache.tree)
 
     def _warnings(self, settings: RenderSettings) -> list[str]:
         trouble = cache_folder().trouble
         return self._scene_cache.warnings() + self._backends.warnings(settings) + ([trouble] if trouble else [])
 
-    def _statistics(self, frame: Frame, posed: PosedSurfels, lap: _StageTimer) -> dict[str, float]:
-        return lap.seconds | {
-            "seconds.total": sum(lap.seconds.values()),
+    def _statistics(self, frame: Frame, posed: PosedSurfels, timer: _StageTimer) -> dict[str, float]:
+        return timer.seconds | {
+            "seconds.total": sum(timer.seconds.values()),
             "objects": float(len(frame.objects)),
             "triangles": float(len(self._scene_cache.scene.faces)),
             "surfels": float(len(posed)),
@@ -309,7 +309,7 @@ def jobs_of(frame: Frame) -> set[str]:
     return jobs
 
 
-def _unheeded(settings: RenderSettings) -> list[str]:
+def _ignored_settings(settings: RenderSettings) -> list[str]:
     """Settings that cannot be followed together with the others."""
     if settings.noise_threshold > 0.0 and part_count(settings) == 1:
         return [

@@ -1,4 +1,4 @@
-"""STL and OFF, read with trimesh, which believes such files: what it would pass over in silence is checked here."""
+"""STL and OFF, read with trimesh; what it would pass over in silence is checked here."""
 
 from __future__ import annotations
 

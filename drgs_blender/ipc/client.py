@@ -58,11 +58,11 @@ class EngineClient:
     command : list of str
         Command line of the engine, see `locate_engine`.
     silence : float
-        Seconds without a sign of life after which the engine is taken for dead.
+        Timeout: seconds without a sign of life after which the engine counts as dead.
     greeting : float
         Seconds a new process has to say something; importing Python on a busy machine takes some.
     stall : float
-        Seconds its main thread may work on one step.
+        Timeout: seconds its main thread may work on one step.
     restarts : int
         How often one request is repeated on a new engine after the old one died.
     shared : bool

@@ -9,11 +9,11 @@ from .child_process import Child
 
 
 class Lost(Exception):
-    """The engine died, fell silent or spoke nonsense; a new one may do better."""
+    """The engine died, did not answer in time or sent invalid data; a new one is worth a try."""
 
 
 class Watch:
-    """Counts how long the engine has been silent, and how long its main thread has stood still.
+    """Timeouts: how long the engine has been silent, and how long its main thread has made no progress.
 
     Time is counted in small steps, so that a pause of this process (a debugger, a suspended machine) is not taken
     for one of the engine.

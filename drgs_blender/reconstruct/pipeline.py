@@ -46,13 +46,13 @@ SAVE_EVERY, SHOW_EVERY = 20.0, 5.0
 #: Steps on the mesh, as a part of those before.
 ON_MESH = 0.4
 #: Parts of the minutes that the surfels get, and their second round on the mesh.
-SHARE, SHARE_ON_MESH = 0.45, 0.15
+SURFEL_TIME_FRACTION, MESH_SURFEL_TIME_FRACTION = 0.45, 0.15
 #: Part of the minutes for materials and light.
-SHARE_OF_MATERIALS = 0.35
-#: Fewer steps of materials than this tell them badly from the light.
+MATERIAL_TIME_FRACTION = 0.35
+#: Fewer steps of materials than this separate them poorly from the light.
 FEW_STEPS = 300
 #: Phase -> the settings that decide its result.
-DECIDES = {
+CHECKPOINT_SETTINGS = {
     "surfels": ("schedule", "minutes"),
     "surfels on the mesh": ("schedule", "minutes", "mesh_resolution", "fixed"),
 }
@@ -75,7 +75,7 @@ class Settings:
     minutes : float, optional
         All stages together, once kernels are compiled; None: the steps of the schedule decide.
     materials : bool
-        Pull materials and light apart; else albedo is the photographed colour.
+        Inverse rendering: materials apart from the light; else albedo is the photographed colour.
     decoupling : Settings
         How; its ``seconds`` follow from `minutes`. Normals are learned too: a mesh of photographs has errors.
     fixed : tuple of str
@@ -158,7 +158,9 @@ def reconstruct(
     if settings.minutes is not None:
         work.tell(Progress(PHASE, 0.0))
         rehearse(settings, have_silhouettes(capture), work.backend, work.cancelled)
-    training = Training(capture, region, settings.schedule, seconds=work.seconds(SHARE), backend=work.backend)
+    training = Training(
+        capture, region, settings.schedule, seconds=work.seconds(SURFEL_TIME_FRACTION), backend=work.backend
+    )
     free = work.learn("surfels", training, 0.0, 0.5)
     work.tell(Progress("mesh", 0.5, len(free)))
     report: dict[str, Any] = {"views": len(capture.training), "left_out": len(capture.testing)}
@@ -236,7 +238,7 @@ class _Work:
     def key(self, phase: str) -> str:
         """Which run a checkpoint of a phase is of: its photographs, and the settings that decide its result."""
         settings = asdict(self.settings)
-        return checkpoint.fingerprint(self.capture, **{name: settings[name] for name in DECIDES[phase]})
+        return checkpoint.fingerprint(self.capture, **{name: settings[name] for name in CHECKPOINT_SETTINGS[phase]})
 
     def learn(self, phase: str, training: Training, begin: float, end: float) -> Gaussians:
         """Run a training to its end, from its checkpoint if there is one.
@@ -273,11 +275,16 @@ class _Work:
 def _on_mesh(
     work: _Work, mesh: Mesh, free: Gaussians, region: Region, report: dict[str, Any]
 ) -> tuple[Gaussians, Binding]:
-    """Algorithm 1, and what it leaves to learn."""
+    """Surfels put on the mesh (DR-GS, algorithm 1), and a second round of learning there."""
     settings = work.settings
     attached, binding, report["attach"] = attach_learned(mesh, free, settings.fixed)
     training = Training(
-        work.capture, region, settings.schedule.on_mesh(ON_MESH), attached, work.seconds(SHARE_ON_MESH), work.backend
+        work.capture,
+        region,
+        settings.schedule.on_mesh(ON_MESH),
+        attached,
+        work.seconds(MESH_SURFEL_TIME_FRACTION),
+        work.backend,
     )
     final = work.learn("surfels on the mesh", training, 0.55, 0.7)
     return final, bound(binding, final)  # type: ignore[arg-type]
@@ -288,7 +295,7 @@ def _decoupled(work: _Work, mesh: Mesh, surfels: Gaussians, thin: bool, report: 
     found = decouple(
         work.capture,
         mesh,
-        replace(work.settings.decoupling, seconds=work.seconds(SHARE_OF_MATERIALS) or 0.0),
+        replace(work.settings.decoupling, seconds=work.seconds(MATERIAL_TIME_FRACTION) or 0.0),
         lambda at: work.tell(Progress("materials", 0.7 + 0.3 * at.part, len(surfels), at.psnr)),
         work.cancelled,
         work.file("materials"),

@@ -164,7 +164,7 @@ def is_closed(faces: Array) -> bool:
 
 
 def _sign(closed: bool) -> Any:
-    """How inside is told."""
+    """How inside and outside are distinguished."""
     import igl
 
     return igl.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER if closed else igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL

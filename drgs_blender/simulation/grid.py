@@ -82,7 +82,7 @@ class Scene:
     solid : (n,) bool array
         Matter that keeps its shape.
     pins : (k,) int64 array
-        Particles that only move as they are told.
+        Particles that are kinematic.
     least : float
         kg, below which a node is empty.
     """
@@ -112,7 +112,7 @@ class Limits:
     speed : float
         m/s, of the fastest, from which on a step must be shorter.
     outside : float
-        m/s, of the fastest of what is told how to move.
+        m/s, of the fastest of what has a given motion.
     """
 
     drift: float

@@ -50,7 +50,7 @@ class Body:
     riders : (k, 3) float64 array
         Points without mass that move along.
     pinned : (n,) bool array, optional
-        Points that only move as they are told.
+        Points that are kinematic.
     velocity : (3,) or (n, 3) array or sequence of float
         m/s, at the start.
     """

@@ -105,7 +105,7 @@ def test_a_redraw_uploads_a_strip_and_the_picture_changes_when_all_are_there(wit
     pictures = [picture(v) for v in (0.25, 0.5, 0.75)]
     current = [pictures[0]]
     monkeypatch.setattr(views.worker, "picture", lambda name: current[0])
-    views._shown["a"] = views.Shown()
+    views._shown["a"] = views.ViewportState()
     try:
 
         def redraws():

@@ -96,14 +96,14 @@ def test_the_bar_of_f12_moves_with_them(scene, shown, captured, monkeypatch):
 def test_a_viewport_says_it_with_its_part_and_can_be_closed(cold, monkeypatch):
     worker = part("addon.viewport.worker").Worker()
     monkeypatch.setattr(views, "worker", worker)
-    monkeypatch.setattr(views, "_shown", {"a": views.Shown()})
+    monkeypatch.setattr(views, "_shown", {"a": views.ViewportState()})
     exported = part("addon.viewport.scenes").exported(bpy.context.evaluated_depsgraph_get())
     request = part("addon.viewport.worker").Request(exported.frame, link.client(), exported.assets)
     try:
         worker.submit("a", request)
-        assert views.tell("a")[0] == phases.STARTING
+        assert views.status("a")[0] == phases.STARTING
         wait(lambda: COUNTED.fullmatch(worker.progress("a")[0]))
-        assert re.fullmatch(COUNTED.pattern + r"  \d+%", views.tell("a")[0])
+        assert re.fullmatch(COUNTED.pattern + r"  \d+%", views.status("a")[0])
         phase, done = views.preparation()
         assert COUNTED.fullmatch(phase) and 0 <= done <= 1
         worker.drop("a")
@@ -122,12 +122,12 @@ def test_a_picture_that_is_refined_says_it_too(scene, monkeypatch):
     phase = [("Rendering", 0.5)]
     worker = SimpleNamespace(state=lambda name: ("", ""), progress=lambda name: phase[0], names=lambda: ["a"])
     monkeypatch.setattr(views, "worker", worker)
-    monkeypatch.setattr(views, "_shown", {"a": views.Shown(picture=picture)})
-    assert views.tell("a") == ("Sample 4/8", "") and views.preparation() == ("", 0.0)
+    monkeypatch.setattr(views, "_shown", {"a": views.ViewportState(picture=picture)})
+    assert views.status("a") == ("Sample 4/8", "") and views.preparation() == ("", 0.0)
     phase[0] = phases.PREPARING, 0.3
-    assert views.tell("a") == (phases.PREPARING, "")
+    assert views.status("a") == (phases.PREPARING, "")
     phase[0] = f"{phases.PREPARING}, 3 of 12", 0.25
-    assert views.tell("a") == (f"{phases.PREPARING}, 3 of 12  25%", "")
+    assert views.status("a") == (f"{phases.PREPARING}, 3 of 12  25%", "")
 
 
 def test_a_bake_says_it(body, tmp_path, monkeypatch):

@@ -482,11 +482,11 @@ def test_news_that_come_while_one_looks_are_not_lost(monkeypatch):
             pass
 
     monkeypatch.setattr(views, "worker", Busy())
-    monkeypatch.setattr(views, "_seen_news", 0)
-    monkeypatch.setattr(views, "_shown", {"a": views.Shown()})
+    monkeypatch.setattr(views, "_last_news", 0)
+    monkeypatch.setattr(views, "_shown", {"a": views.ViewportState()})
     monkeypatch.setattr(views, "_live", lambda: [("a", SimpleNamespace(tag_redraw=lambda: redrawn.append(len(looks))))])
     for i in range(4):
-        views._look()
+        views._poll()
         looks.append(i)
     assert redrawn == [0, 1, 2]
 

@@ -186,8 +186,8 @@ def test_shading_matches_the_renderer_where_the_mesh_shadows_itself():
     assert (sums[:, :, 0].mean((1, 2)) < 0.97 * alone[:, :, 0].mean((1, 2))).any()  # the ball does shadow
 
 
-@pytest.mark.parametrize("by_shown", (False, True))
-def test_only_the_unbiased_loss_leaves_noise_alone(by_shown: bool):
+@pytest.mark.parametrize("weight_by_prediction", (False, True))
+def test_only_the_unbiased_loss_leaves_noise_alone(weight_by_prediction: bool):
     """Two noisy estimates with the true mean: its slope is zero there, that of the common loss pulls."""
     generator = torch.Generator().manual_seed(5)
     photographed = torch.full((40000, 3), 0.3)
@@ -195,7 +195,7 @@ def test_only_the_unbiased_loss_leaves_noise_alone(by_shown: bool):
     # Monte Carlo noise is one-sided: seldom much, mostly too little.
     noise = torch.rand(40000, 2, 3, generator=generator) ** 3 * 4
     shown = photographed[:, None] * noise * factor
-    (pull,) = torch.autograd.grad(unbiased_loss(shown, photographed, by_shown), factor)
+    (pull,) = torch.autograd.grad(unbiased_loss(shown, photographed, weight_by_prediction), factor)
     (biased,) = torch.autograd.grad(log_loss((photographed[:, None] * noise * factor).mean(1), photographed), factor)
     curvature = float((photographed / (photographed + 0.03) ** 0.6).square().mean())
     assert abs(float(pull)) < 0.02 * curvature
@@ -206,9 +206,9 @@ def test_weights_by_what_is_shown_find_the_mean_of_what_was_photographed():
     """One place that mirrors now bright, now dark, as under wrong normals: not a mean that the dark ones pull."""
     photographed = torch.tensor([0.02, 0.05, 0.1, 0.9])[:, None].expand(4, 3)
 
-    def pull(value: float, by_shown: bool) -> float:
+    def pull(value: float, weight_by_prediction: bool) -> float:
         place = torch.tensor(value, requires_grad=True)
-        loss = unbiased_loss(place.expand(4, 2, 3), photographed, by_shown)
+        loss = unbiased_loss(place.expand(4, 2, 3), photographed, weight_by_prediction)
         return float(torch.autograd.grad(loss, place)[0])
 
     mean = float(photographed.mean())
@@ -231,7 +231,7 @@ def test_both_weights_are_alike_near_the_truth():
 
 def test_clipped_photographs_set_no_upper_bound():
     white = torch.ones(4, 3)
-    assert float(unbiased_loss(torch.full((4, 2, 3), 3.0), white, by_shown=True)) == 0
+    assert float(unbiased_loss(torch.full((4, 2, 3), 3.0), white, weight_by_prediction=True)) == 0
     assert float(log_loss(torch.full((4, 3), 3.0), white)) == 0
     assert float(unbiased_loss(torch.full((4, 2, 3), 3.0), white)) == 0
     assert float(log_loss(torch.full((4, 3), 0.5), white)) > 0
@@ -249,10 +249,10 @@ def test_albedo_along_edges_of_metal_is_evened_out_but_for_its_patterns_and_pain
     assert not blotches((ends[:, 0] - ends[:, 1]).abs().detach(), metallic, alike[:, None]).requires_grad
 
 
-@pytest.mark.parametrize("weight", ["plain_metals", "polish"])
+@pytest.mark.parametrize("weight", ["metal_smoothness", "metal_albedo_prior"])
 def test_what_is_said_of_metals_begins_late_and_counts_for_nothing_else(ball, capture, weight, monkeypatch):
     def alike(**other: str) -> bool:
-        settings = replace(SMALL, plain_metals=0.0, polish=0.0, **other)
+        settings = replace(SMALL, metal_smoothness=0.0, metal_albedo_prior=0.0, **other)
         return np.array_equal(
             *(decouple(capture, ball, replace(settings, **{weight: value})).albedo for value in (0.0, 5.0))
         )
@@ -275,14 +275,14 @@ def test_pixels_beside_clipped_ones_are_known_by_channel_and_count_less(ball, ca
     tree.build(ball.vertices, ball.faces)
     pixels = foreground_pixels([replace(view, colour=colour)], ball, tree, 10**6)
     assert int((pixels.colour[:, 0] > 0.9).sum()) == 1
-    assert pixels.beside_clipped.sum(axis=0).tolist() == [12, 0, 0]  # the disc of radius 2, without its middle
-    assert not pixels.beside_clipped[pixels.colour[:, 0] > 0.9].any()
+    assert pixels.next_to_clipped.sum(axis=0).tolist() == [12, 0, 0]  # the disc of radius 2, without its middle
+    assert not pixels.next_to_clipped[pixels.colour[:, 0] > 0.9].any()
 
     photographed = torch.full((2, 3), 0.2)
     shown = torch.full((2, 2, 3), 0.5, requires_grad=True)
     weights = torch.tensor([[1.0, 1.0, 1.0], [0.5, 1.0, 1.0]])
-    for by_shown in (False, True):
-        (slope,) = torch.autograd.grad(unbiased_loss(shown, photographed, by_shown, weights), shown)
+    for weight_by_prediction in (False, True):
+        (slope,) = torch.autograd.grad(unbiased_loss(shown, photographed, weight_by_prediction, weights), shown)
         assert slope[1, :, 0] == pytest.approx(slope[0, :, 0] / 2) and torch.equal(slope[1, :, 1:], slope[0, :, 1:])
 
 
@@ -290,7 +290,7 @@ def alike_whole_and_half(ball: Mesh, capture: Capture, exposure: float) -> bool:
     """Whether photographs that are so much brighter teach the same with pixels beside clipped ones whole and half."""
     views = [replace(view, colour=np.clip(view.colour * np.float32(exposure), 0, 1)) for view in capture.views]
     found = [
-        decouple(replace(capture, views=views), ball, replace(SMALL, beside_clipped=weight)).albedo
+        decouple(replace(capture, views=views), ball, replace(SMALL, clipped_neighbour_weight=weight)).albedo
         for weight in (1.0, 0.5)
     ]
     return np.array_equal(*found)
@@ -303,7 +303,7 @@ def test_only_photographs_that_are_clipped_learn_otherwise_beside_it(ball, captu
 
 def test_pixels_beside_clipped_ones_count_whole_as_long_as_photographs_weigh(ball, capture, monkeypatch):
     """Half from the first step on gained less: light that is not yet known needs them."""
-    monkeypatch.setattr("drgs_blender.reconstruct.inverse_rendering.schedule._BY_SHOWN", 2.0)
+    monkeypatch.setattr("drgs_blender.reconstruct.inverse_rendering.schedule._BY_PREDICTION", 2.0)
     assert alike_whole_and_half(ball, capture, 2.0)
 
 
@@ -454,10 +454,10 @@ def _between(found: Decoupled) -> float:
 @pytest.mark.parametrize(
     ("weight", "value", "measure"),
     [
-        ("white", 0.3, _cast),
+        ("grey_light_prior", 0.3, _cast),
         ("light_smoothness", 0.3, _steps),
         ("smoothness", 1.0, _unevenness),
-        ("bimodal", 1.0, _between),
+        ("binary_metallic_prior", 1.0, _between),
     ],
 )
 def test_each_weight_makes_less_of_what_it_weighs(ball, capture, weight, value, measure):

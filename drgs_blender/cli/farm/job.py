@@ -1,4 +1,4 @@
-"""What a farm shall do, whichever manager it has: command lines for chunks of frames."""
+"""A render job, the same for every farm manager: command lines for chunks of frames."""
 
 from __future__ import annotations
 

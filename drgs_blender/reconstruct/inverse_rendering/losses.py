@@ -58,7 +58,9 @@ def _surely_metal(metallic: Tensor) -> Tensor:
     return metallic.detach() ** _SURELY
 
 
-def unbiased_loss(shown: Tensor, photographed: Tensor, by_shown: bool = False, weights: Tensor | None = None) -> Tensor:
+def unbiased_loss(
+    shown: Tensor, photographed: Tensor, weight_by_prediction: bool = False, weights: Tensor | None = None
+) -> Tensor:
     """Weighted squared error of two independent estimates (n, 2, 3) of each pixel.
 
     The product of both differences has the squared error of their mean value for expectation, without their variance,
@@ -67,7 +69,7 @@ def unbiased_loss(shown: Tensor, photographed: Tensor, by_shown: bool = False, w
     Parameters
     ----------
     shown, photographed : tensor
-    by_shown : bool
+    weight_by_prediction : bool
         Weigh by what is shown, not by what was photographed. Where the mesh is a little off, one place mirrors what the
         photographs show beside it, bright or dark; weights that are least for bright photographs make a mean of these
         that is too dark.
@@ -75,7 +77,7 @@ def unbiased_loss(shown: Tensor, photographed: Tensor, by_shown: bool = False, w
         How much each value counts; None: all the same.
     """
     difference = shown - photographed[:, None]
-    if by_shown:
+    if weight_by_prediction:
         # The weight of an estimate goes with its own slope and the other's difference: it knows nothing of the latter.
         weight = (shown.detach().clamp(min=0) + _KNEE) ** (-2 * _EXPONENT)
         product = (difference.detach().flip(1) * weight * difference).sum(1)

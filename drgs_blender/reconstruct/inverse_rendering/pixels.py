@@ -51,7 +51,7 @@ class Pixels:
         Unit: to the viewer.
     colour : (n, 3) float32 array
         Linear Rec.709 as photographed.
-    beside_clipped : (n, 3) bool array
+    next_to_clipped : (n, 3) bool array
         Not clipped, but a pixel of the object `_BESIDE` away or nearer is, in this channel.
     shown : (n, 3) float32 array
         Unit, or 0: normal by something that knows better than the mesh, facing the viewer.
@@ -64,7 +64,7 @@ class Pixels:
     flat: Array
     towards: Array
     colour: Array
-    beside_clipped: Array
+    next_to_clipped: Array
     shown: Array
 
     def __len__(self) -> int:
@@ -142,7 +142,7 @@ def pixels_of(index: int, view: View, mesh: Mesh, tree: TriangleBVH, normals: No
     flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-30)
     towards = -direction / np.linalg.norm(direction, axis=1, keepdims=True)
     colour = srgb_to_linear(view.colour)
-    told = None if normals is None else np.asarray(normals(view), np.float32)
+    given = None if normals is None else np.asarray(normals(view), np.float32)
     part = Pixels(
         np.full(len(row), index, np.int32),
         face,
@@ -152,7 +152,7 @@ def pixels_of(index: int, view: View, mesh: Mesh, tree: TriangleBVH, normals: No
         towards,
         colour.reshape(-1, 3)[row],
         _beside(seen[..., None] & (colour >= CLIPPED))[row],
-        np.zeros_like(flat) if told is None else unit(told.reshape(-1, 3)[row], (0, 0, 0)),
+        np.zeros_like(flat) if given is None else unit(given.reshape(-1, 3)[row], (0, 0, 0)),
     )
     # A face seen from behind is an error of the mesh, or of its orientation: nothing can be learned there.
     usable = ((flat * towards).sum(1) > _GRAZING) & np.isfinite(part.colour).all(1)

@@ -45,7 +45,7 @@ class Regularisers:
         return self._edges[edge]
 
     def of_materials(self, seen: Seen, edge: Array, has_metallic: bool, knows_metals: bool) -> Tensor:
-        """Smooth where the photographs are alike; metals plain, bright and told from paint.
+        """Smooth where the photographs are alike; metals plain, bright and distinct from paint.
 
         Parameters
         ----------
@@ -63,20 +63,20 @@ class Regularisers:
         likeness = torch.from_numpy(self._likeness[edge])[:, None]
         weights = torch.tensor(_SMOOTH[: seen.columns.shape[1]])
         loss = s.smoothness * ((likeness * differences).mean(0) * weights).sum()
-        told = has_metallic and knows_metals
-        if s.plain_metals > 0 and told:
-            loss = loss + s.plain_metals * s.smoothness * blotches(differences[:, :3], pair[:, :, 4], likeness)
-        if s.bimodal > 0 and has_metallic:
-            loss = loss + s.bimodal * (seen.here[:, 4] * (1 - seen.here[:, 4])).mean()
-        if s.polish > 0 and told:
-            loss = loss + s.polish * dullness(seen.here[:, :3], seen.here[:, 4])
+        has_metals = has_metallic and knows_metals
+        if s.metal_smoothness > 0 and has_metals:
+            loss = loss + s.metal_smoothness * s.smoothness * blotches(differences[:, :3], pair[:, :, 4], likeness)
+        if s.binary_metallic_prior > 0 and has_metallic:
+            loss = loss + s.binary_metallic_prior * (seen.here[:, 4] * (1 - seen.here[:, 4])).mean()
+        if s.metal_albedo_prior > 0 and has_metals:
+            loss = loss + s.metal_albedo_prior * dullness(seen.here[:, :3], seen.here[:, 4])
         return loss
 
     def of_light(self, light: LearnedLight, radiance: Tensor) -> Tensor:
         """Grey and smooth."""
         s, loss = self._settings, torch.zeros(())
-        if s.white > 0:
-            loss = loss + s.white * colour_cast(radiance)
+        if s.grey_light_prior > 0:
+            loss = loss + s.grey_light_prior * colour_cast(radiance)
         if s.light_smoothness > 0:
             loss = loss + s.light_smoothness * light.roughness()
         return loss

@@ -271,10 +271,10 @@ class Job:
             shown = shown * factor[torch.from_numpy(pixels.view).long()][:, None, None]
         photographed = torch.from_numpy(pixels.colour)
         if s.unbiased:
-            by_shown = self.schedule.weighs_by_shown()
-            beside = torch.from_numpy(pixels.beside_clipped)
-            counts = torch.where(beside, s.beside_clipped, 1.0) if by_shown else None
-            loss = unbiased_loss(shown, photographed, by_shown, counts)
+            weight_by_prediction = self.schedule.weighs_by_prediction()
+            beside = torch.from_numpy(pixels.next_to_clipped)
+            counts = torch.where(beside, s.clipped_neighbour_weight, 1.0) if weight_by_prediction else None
+            loss = unbiased_loss(shown, photographed, weight_by_prediction, counts)
         else:
             loss = log_loss(shown.mean(1), photographed)
         self.score.note(float(loss.detach()), shown.detach().mean(1), photographed)

@@ -11,8 +11,8 @@ from .settings import Settings
 #: Where the environment grows and normals begin to turn (light comes first); the last step size in parts of the first.
 _GROWS, _NORMALS, _LAST_RATE = (0.2, 0.45), 0.4, 0.05
 #: Where weights by what is shown begin: before, they let light that is much too bright stay so.
-_BY_SHOWN = 0.3
-#: From here on metals are told from paint well enough to say how bright and how plain they are.
+_BY_PREDICTION = 0.3
+#: From here on metals and paint are distinguished well enough to say how bright and how plain they are.
 _METALS = 0.2
 
 
@@ -59,12 +59,12 @@ class Schedule:
         """How often the rows of the environment are still to be doubled."""
         return sum(part < at for at in _GROWS) if self._settings.coarse_to_fine else 0
 
-    def weighs_by_shown(self) -> bool:
+    def weighs_by_prediction(self) -> bool:
         """Whether differences are weighed by what is shown, else by the photographs."""
-        return self._settings.by_shown and self.part >= _BY_SHOWN
+        return self._settings.weight_by_prediction and self.part >= _BY_PREDICTION
 
     def knows_metals(self) -> bool:
-        """Whether metals are told from paint."""
+        """Whether metals and paint are distinguished."""
         return self.part >= _METALS
 
     def rates(self, part: float, names: Iterable[str]) -> dict[str, float | Array]:

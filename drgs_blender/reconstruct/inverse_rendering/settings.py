@@ -41,24 +41,24 @@ class Settings:
         Weight of the differences of materials along edges, less where the photographs differ.
     light_smoothness : float
         Weight of the differences of log radiance between neighbours in the environment.
-    white : float
+    grey_light_prior : float
         Weight that pulls the environment towards grey.
-    bimodal : float
+    binary_metallic_prior : float
         Weight that pulls metallic to 0 or 1.
-    polish : float
+    metal_albedo_prior : float
         Weight that pulls the colours of metals towards as bright as polished metals are.
-    plain_metals : float
+    metal_smoothness : float
         How much more than other albedo that of metals is smoothed, in parts of `smoothness`: there, errors of normals
         leave blotches.
     unbiased : bool
         Compare two independent estimates of each pixel, so that their noise is not learned from.
-    by_shown : bool
+    weight_by_prediction : bool
         Weigh differences by what is shown, once that is near the photographs; else by the photographs, which finds
         polished metal and the light in it too dark where the mesh is a little off.
-    beside_clipped : float
-        Weight, in a channel, of pixels beside clipped ones, once differences are weighed by what is shown. Where
-        normals are a little off, they are found to mirror bright light that is not theirs, and speak against it; what
-        is clipped cannot speak for it.
+    clipped_neighbour_weight : float
+        Weight per channel of pixels next to clipped ones, once differences are weighed by what is shown. Small errors
+        of normals let them mirror a neighbouring highlight; clipped pixels cannot contradict that, so the light would
+        be found too dim.
     parametrisation : {"metallic", "specular", "dielectric"}
         "metallic" learns albedo and metallic; "specular" diffuse and specular colour, turned into the former at the
         end; "dielectric" albedo alone, metallic is 0.
@@ -88,13 +88,13 @@ class Settings:
     coarse: int = 3
     smoothness: float = 0.01
     light_smoothness: float = 0.001
-    white: float = 0.0003
-    bimodal: float = 0.0
-    polish: float = 0.05
-    plain_metals: float = 5.0
+    grey_light_prior: float = 0.0003
+    binary_metallic_prior: float = 0.0
+    metal_albedo_prior: float = 0.05
+    metal_smoothness: float = 5.0
     unbiased: bool = True
-    by_shown: bool = True
-    beside_clipped: float = 0.5
+    weight_by_prediction: bool = True
+    clipped_neighbour_weight: float = 0.5
     parametrisation: Literal["metallic", "specular", "dielectric"] = "metallic"
     normals: bool = False
     normal_smoothness: float = 0.3

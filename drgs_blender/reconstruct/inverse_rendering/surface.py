@@ -58,8 +58,8 @@ class Surface:
     settings : Settings
     mean : (3,) float array
         Colour of the photographs.
-    told : bool
-        Pixels have normals of their own, that others than the mesh tell.
+    given_normals : bool
+        Whether pixels have normals from elsewhere than the mesh.
 
     Attributes
     ----------
@@ -68,10 +68,10 @@ class Surface:
         Name to tensor: those of the materials, and "normals" (v, 3) where they are learned.
     """
 
-    def __init__(self, mesh: Mesh, settings: Settings, mean: Array, told: bool) -> None:
+    def __init__(self, mesh: Mesh, settings: Settings, mean: Array, given_normals: bool) -> None:
         self._normals = torch.from_numpy(VertexNormals(mesh.faces, len(mesh.vertices))(mesh.vertices))
         self._faces = torch.from_numpy(mesh.faces.astype(np.int64))
-        self._told = told
+        self._given_normals = given_normals
         self.materials = Materials(mesh, settings.parametrisation, settings.coarse, mean)
         self.parameters = dict(self.materials.parameters)
         if settings.normals:
@@ -92,7 +92,7 @@ class Surface:
         if offsets is not None:
             smooth = smooth + offsets
         normal = normalise(blend(smooth, corner_place, shares))
-        if self._told:
+        if self._given_normals:
             normal = _as_shown(pixels, normal, None if offsets is None else blend(offsets, corner_place, shares))
         return Seen(here, normal, columns, offsets, end_place)
 
@@ -105,7 +105,7 @@ class Surface:
 
 
 def _as_shown(pixels: Pixels, normal: Tensor, offsets: Tensor | None) -> Tensor:
-    """Normals (n, 3) told by others than the mesh, with what is learned; its `normal` where they are far off."""
+    """Normals (n, 3) from elsewhere than the mesh, with what is learned; its `normal` where they are far off."""
     shown, flat = torch.from_numpy(pixels.shown), torch.from_numpy(pixels.flat)
     believed = dot(shown, flat)[:, None] >= ALIKE
     # The face's where they are not: nothing has no direction, and its derivative would spoil that of its vertices.

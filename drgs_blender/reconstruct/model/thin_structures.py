@@ -21,7 +21,7 @@ from .gaussians import Gaussians
 
 log = logging.getLogger(__name__)
 
-#: Degrees between two normals that speak of different things; part of the pixels where they do that makes a thing thin.
+#: Degrees between two normals of different surfaces; part of the pixels where they do that makes a thing thin.
 #: A fern has .17 of them, a helmet with straps and rivets .02, round things less.
 APART, THIN = 40.0, 0.06
 #: Views that are asked.

@@ -15,7 +15,7 @@ Array = np.ndarray
 Trace = Callable[[ShadingPoints, tuple[int, int]], Radiance]
 
 _MOST_PARTS = 32
-#: Samples of a pixel before its error is believed, and of one that is partly covered.
+#: Samples of a pixel before its error estimate is used, and of one that is partly covered.
 _FEWEST, _LEAST = 16, 4
 #: Mean absolute deviation of a normal variable, in standard deviations.
 _MEAN_DEVIATION = 0.7979
