@@ -82,6 +82,11 @@ def units(count: int, seed: int = 0) -> list[np.ndarray]:
     return list((v / np.linalg.norm(v, axis=1, keepdims=True)).astype(np.float32).T)
 
 
+@njit
+def _evaluate(nl, nv, vl, nh2, sin2, r, g, b, kd, metallic, a2, norm, shading_model):  # type: ignore[no-untyped-def]
+    return brdf.evaluate((nl, nv, vl, nh2, sin2), (r, g, b), kd, metallic, a2, norm, shading_model)
+
+
 KEYS = [np.random.default_rng(1).integers(0, 2**32, 2000, dtype=np.uint32) for _ in range(2)]
 RENDERER: dict[str, tuple[Any, list[np.ndarray]]] = {
     "mix": (sampling.mix, KEYS[:1]),
@@ -98,7 +103,7 @@ RENDERER: dict[str, tuple[Any, list[np.ndarray]]] = {
         [*floats(500, (0, 1), (0, 1)), *floats(500, (-0.5, 0.5), (-0.5, 0.5), (0.3, 0.7), (0.001, 1), (0, 1), seed=2)],
     ),
     "evaluate": (
-        brdf.evaluate,
+        _evaluate,
         [*floats(500, (0.01, 1), (-0.2, 1), (-1, 1), *[(0, 1)] * 8, (0.1, 2)), np.arange(500) % 2],
     ),
 }
@@ -208,7 +213,8 @@ def test_the_language_means_what_numba_takes_it_for(function: Callable) -> None:
 
 def structures(a, scale):  # type: ignore[no-untyped-def]
     pair = Pair(scale, Scale(a, 4))
-    return pair.first.factor * pair.second.factor, pair.second.turns + scale.turns
+    factor, turns = scale
+    return pair.first.factor * pair.second.factor, pair.second.turns + turns, _swapped(*scale)[1] + factor
 
 
 def test_named_tuples_are_taken_and_made() -> None:

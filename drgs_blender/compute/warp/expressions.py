@@ -189,7 +189,7 @@ class Expressions:
         values: list[Value] = []
         for node in nodes:
             if isinstance(node, ast.Starred):
-                values += self.value(node.value).parts
+                values += self.value(node.value).elements()
             else:
                 values.append(self.value(node))
         return values
@@ -321,9 +321,9 @@ class Expressions:
             return Value(f"wp.{_MATHS[function]}({', '.join(self._as(v, kind) for v in values)})", kind)
         return self._call(function, values)
 
-    def _named_tuple(self, kind: type, values: list[Value]) -> Value:
+    def _named_tuple(self, kind: Any, values: list[Value]) -> Value:
         if not is_struct(kind):
-            if len(values) != len(kind._fields):  # type: ignore[attr-defined]
+            if len(values) != len(kind._fields):
                 raise TranslationError(kind.__name__, f"is made of {len(values)} fields", "Give all of them")
             return together(values, Record(kind, ()))
         name = self._temporary()

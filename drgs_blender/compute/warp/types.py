@@ -89,7 +89,7 @@ class Record(tuple[Type, ...]):
         Types of its fields.
     """
 
-    kind: type
+    kind: Any
 
     def __new__(cls, kind: type, parts: Iterable[Type]) -> Record:
         """Keep the class next to the types."""
@@ -215,6 +215,12 @@ class Value:
     def flat(self) -> list[Value]:
         """The values of which a tuple consists, or the value itself."""
         return [v for part in self.parts for v in part.flat()] if isinstance(self.type, tuple) else [self]
+
+    def elements(self) -> tuple[Value, ...]:
+        """The values of which a tuple or a struct consists."""
+        if isinstance(self.type, Struct):
+            return tuple(Value(f"{self.text}.{name}", kind) for name, kind in self.type.fields.items())
+        return self.parts
 
     @property
     def known(self) -> Type:
