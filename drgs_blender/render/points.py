@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
+from typing import NamedTuple
 
 import numpy as np
 
+from ..compute.jit import plain
 from ..core.asset.model import as_float
 
 Array = np.ndarray
@@ -21,6 +23,23 @@ _WIDTHS = {
     "weight": (), "origin": (3,), "normal": (3,), "geometric_normal": (3,), "view": (3,),
     "albedo": (3,), "roughness": (), "metallic": (),
 }  # fmt: skip
+
+
+class PointArrays(NamedTuple):
+    """`ShadingPoints` for compiled code; `viewer` is its ``view``, a name that Numba takes for an array's method."""
+
+    pixel: Array
+    sample: Array
+    flags: Array
+    origin: Array
+    normal: Array
+    geometric_normal: Array
+    viewer: Array
+    albedo: Array
+    roughness: Array
+    metallic: Array
+    own: Array
+    size: Array
 
 
 @dataclass(slots=True)
@@ -82,6 +101,12 @@ class ShadingPoints:
 
     def __len__(self) -> int:
         return len(self.pixel)
+
+    @property
+    def arrays(self) -> PointArrays:
+        """What compiled code takes."""
+        names = (name if name != "viewer" else "view" for name in PointArrays._fields)
+        return PointArrays(*(plain(getattr(self, name)) for name in names))
 
     def __getitem__(self, rows: slice | Array) -> ShadingPoints:
         """Return the points that `rows` (slice, mask or indices) selects."""

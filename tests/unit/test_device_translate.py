@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip("warp", reason="warp-lang is not installed")
 
 from drgs_blender.compute.jit import njit
-from drgs_blender.compute.warp.kernels import Launcher, Work
+from drgs_blender.compute.warp.kernels import Launcher, Room, Work
 from drgs_blender.compute.warp.runtime import load_module, warp
 from drgs_blender.compute.warp.translate import Native, Translation
 from drgs_blender.compute.warp.types import Array, Struct, TranslationError
@@ -82,6 +82,11 @@ def units(count: int, seed: int = 0) -> list[np.ndarray]:
     return list((v / np.linalg.norm(v, axis=1, keepdims=True)).astype(np.float32).T)
 
 
+@njit
+def _evaluate(nl, nv, vl, nh2, sin2, r, g, b, kd, metallic, a2, norm, shading_model):  # type: ignore[no-untyped-def]
+    return brdf.evaluate((nl, nv, vl, nh2, sin2), (r, g, b), kd, metallic, a2, norm, shading_model)
+
+
 KEYS = [np.random.default_rng(1).integers(0, 2**32, 2000, dtype=np.uint32) for _ in range(2)]
 RENDERER: dict[str, tuple[Any, list[np.ndarray]]] = {
     "mix": (sampling.mix, KEYS[:1]),
@@ -98,7 +103,7 @@ RENDERER: dict[str, tuple[Any, list[np.ndarray]]] = {
         [*floats(500, (0, 1), (0, 1)), *floats(500, (-0.5, 0.5), (-0.5, 0.5), (0.3, 0.7), (0.001, 1), (0, 1), seed=2)],
     ),
     "evaluate": (
-        brdf.evaluate,
+        _evaluate,
         [*floats(500, (0.01, 1), (-0.2, 1), (-1, 1), *[(0, 1)] * 8, (0.1, 2)), np.arange(500) % 2],
     ),
 }
@@ -208,12 +213,58 @@ def test_the_language_means_what_numba_takes_it_for(function: Callable) -> None:
 
 def structures(a, scale):  # type: ignore[no-untyped-def]
     pair = Pair(scale, Scale(a, 4))
-    return pair.first.factor * pair.second.factor, pair.second.turns + scale.turns
+    factor, turns = scale
+    return pair.first.factor * pair.second.factor, pair.second.turns + turns, _swapped(*scale)[1] + factor
 
 
 def test_named_tuples_are_taken_and_made() -> None:
     columns, extra = floats(20, (0, 1)), (Scale(F(0.3), 7),)
     np.testing.assert_array_equal(on_device(structures, columns, extra), here(structures, columns, extra))
+
+
+class Span(NamedTuple):
+    """What Warp has no struct for: an array, a tuple, a truth value known beforehand, a named tuple."""
+
+    values: np.ndarray
+    ends: tuple[np.float32, np.float32]
+    doubled: bool
+    scale: Scale
+
+
+class Spans(NamedTuple):
+    first: Span
+    start: int
+
+
+@njit
+def _at(span, i):  # type: ignore[no-untyped-def]
+    low, high = span.ends
+    x = low + span.values[i] * (high - low) * span.scale.factor
+    if span.doubled:
+        return x + x
+    return x
+
+
+def records(lane, lanes, room, spans, out):  # type: ignore[no-untyped-def]
+    values, ends, _, scale = spans.first
+    room.count[0] = len(values)
+    for i in range(lane, room.count[0], lanes):
+        out[0][i] = _at(spans.first, i) + F(spans.start)
+        out[1][i] = _at(Span(values, (ends[1], ends[0]), False, scale), i)
+
+
+class Own(NamedTuple):
+    count: Any
+
+
+def test_records_hold_arrays_and_tuples_by_name() -> None:
+    values = floats(40, (-1, 1))[0]
+    for doubled in (False, True):
+        spans = Spans(Span(values, (F(0.25), F(3.0)), doubled, Scale(F(0.3), 7)), 5)
+        expected, found = np.zeros((2, 40), np.float32), np.zeros((2, 40), np.float32)
+        records(0, 1, Own(np.zeros(1, np.int64)), spans, expected)
+        Launcher("cpu").launch(Work(records, Own(Room("int64", (1,))), {}), 40, [spans], list(found))
+        np.testing.assert_array_equal(found, expected)
 
 
 def powers(a, b, n):  # type: ignore[no-untyped-def]

@@ -21,6 +21,7 @@ from drgs_blender.render.points import CATCHER
 from drgs_blender.render.sampling import F, sobol
 from drgs_blender.render.scene import ray_masks
 from drgs_blender.render.scene.interaction import nearest
+from drgs_blender.render.scene.ray import Ray
 from drgs_blender.render.scene.trace_scene import TraceScene
 
 GLOW = Material("glow", (0.0, 0.0, 0.0), 1.0, 1.0, (3.0, 2.0, 1.0))
@@ -68,11 +69,11 @@ def bulb(*places: np.ndarray, inwards: bool = False) -> MeshState:
 
 
 @njit
-def _look(origins, directions, tracer, geometry, table, pick, emitters, out):  # type: ignore[no-untyped-def]
+def _look(origins, directions, tracer, geometry, lights, out):  # type: ignore[no-untyped-def]
     for i in range(len(origins)):
         o, d = (origins[i, 0], origins[i, 1], origins[i, 2]), (directions[i, 0], directions[i, 1], directions[i, 2])
-        hit = nearest(tracer, *o, *d, F(0.0), F(np.inf), np.int32(ray_masks.DIFFUSE))
-        out[i, 0], out[i, 1], out[i, 2], out[i, 3], _ = emission_along(*o, *d, hit, geometry, table, pick, emitters)
+        hit = nearest(tracer, Ray(o, d, F(0.0), F(np.inf), np.int32(ray_masks.DIFFUSE)))
+        out[i, 0], out[i, 1], out[i, 2], out[i, 3], _ = emission_along(o, d, hit, geometry, lights)
 
 
 def along(scene: TraceScene, lamps: Lights, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
@@ -80,7 +81,7 @@ def along(scene: TraceScene, lamps: Lights, origins: np.ndarray, directions: np.
     out = np.empty((len(directions), 4), np.float32)
     directions = np.ascontiguousarray(directions, np.float32)
     origins = np.ascontiguousarray(np.broadcast_to(np.float32(origins), directions.shape))
-    _look(origins, directions, scene.tracer, scene.geometry, *lamps.tables, out)
+    _look(origins, directions, scene.tracer, scene.geometry, lamps.tables, out)
     return out
 
 

@@ -13,6 +13,7 @@ from drgs_blender.core.color import LUMINANCE
 from drgs_blender.core.errors import UsageError
 from drgs_blender.core.frame import Light, RenderSettings, World
 from drgs_blender.render.integrator.integrate import integrate
+from drgs_blender.render.integrator.records import Sampler
 from drgs_blender.render.integrator.sample_allocation import ALPHA, COUNTS, POINT_STATE, _allocate
 from drgs_blender.render.lights.environment import EnvironmentLight
 from drgs_blender.render.lights.lights import Lights
@@ -570,10 +571,11 @@ def test_samples_are_allotted_where_they_tell_most(changes: dict, gain: float) -
 def test_points_of_a_pixel_agree_on_their_samples() -> None:
     """Where a texture changes the lobes' shares, few steps of the allotment lie between points of one pixel."""
     counts = []
+    sampler = Sampler._make([0, np.zeros((0, 3), np.uint32), 1, 0, 1, True, *np.float32([64, 32, 32, 1, 0, 1])])
     for share in np.linspace(0.1, 0.8, 141, dtype=np.float32):
         state = np.zeros((1, POINT_STATE), np.float32)
         state[0, ALPHA] = 0.2**4
-        _allocate.py_func(state, 0, share, (True, *np.float32([64, 32, 32, 1, 0, 1])))
+        _allocate.py_func(state, 0, share, sampler)
         counts.append(state[0, COUNTS:])
     assert (np.sum(counts, axis=1) == 128).all() and (np.round(counts) == counts).all()
     assert 4 < len(np.unique(counts, axis=0)) < 20

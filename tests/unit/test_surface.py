@@ -13,6 +13,7 @@ from drgs_blender.core.errors import AssetError, UsageError
 from drgs_blender.core.frame import Image, Material, MeshState, Texture, Visibility
 from drgs_blender.render.scene import ray_masks
 from drgs_blender.render.scene.interaction import nearest, position_at, shadowed, surface_at
+from drgs_blender.render.scene.ray import Ray
 from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene
 
 F = np.float32
@@ -24,13 +25,13 @@ def _meet(  # type: ignore[no-untyped-def]
 ):
     for i in range(len(o)):
         dx, dy, dz = d[i, 0], d[i, 1], d[i, 2]
-        t[i], face, place, u, v, gx, gy, gz = nearest(
-            tracer, o[i, 0], o[i, 1], o[i, 2], dx, dy, dz, F(0.0), F(np.inf), mask
-        )
-        blocked = shadowed(tracer, o[i, 0], o[i, 1], o[i, 2], dx, dy, dz, F(0.0), F(np.inf), mask)
+        ray = Ray((o[i, 0], o[i, 1], o[i, 2]), (dx, dy, dz), F(0.0), F(np.inf), mask)
+        hit = nearest(tracer, ray)
+        t[i], face, place, u, v, _, _, _ = hit
+        blocked = shadowed(tracer, ray)
         numbers[i, 0], numbers[i, 1], numbers[i, 2], numbers[i, 3] = face, place, -1, blocked
         if face >= 0:
-            values = surface_at(face, place, u, v, gx, gy, gz, dx, dy, dz, geometry)
+            values = surface_at(hit, (dx, dy, dz), geometry)
             nx, ny, nz, gx, gy, gz, r, g, b, roughness, metallic, er, eg, eb, owner = values
             x, y, z = position_at(face, place, u, v, vertices, faces, places)
             out[i] = np.array([nx, ny, nz, gx, gy, gz, r, g, b, roughness, metallic, er, eg, eb, x, y, z], np.float32)

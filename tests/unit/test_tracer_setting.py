@@ -141,14 +141,15 @@ def test_lamps_among_surfels_look_the_same_to_both_strategies(tmp_path: Path) ->
 
 @njit
 def _meet_all(tracer, origins, directions, count, out):  # type: ignore[no-untyped-def]
-    s, ints = w.batch(16)
+    rays = w.batch(16)
+    s, ints = rays
     for n in range(len(origins)):
         for k in range(count):
             i, c = w.at(3)
             s[i + w.OX], s[i + w.OY], s[i + w.OZ] = origins[n, 0], origins[n, 1], origins[n, 2]
             s[i + w.LX], s[i + w.LY], s[i + w.LZ] = directions[n, 0], directions[n, 1], directions[n, 2]
             ints[c + w.KEY], ints[c + w.OWN] = mix(U(mix(U(n)) + U(k))), U(0xFFFFFFFF)
-            through, _, hit = intersect.meet(tracer, s, ints, 3, np.int32(-1))
+            through, _, hit = intersect.meet(tracer, rays, 3, np.int32(-1))
             out[n, k, 0], out[n, k, 1], out[n, k, 2], out[n, k, 3] = through, hit[0], F(hit[1]), F(hit[17])
             values = hit[5:17]
             for j in range(12):

@@ -129,9 +129,10 @@ class Body(Expressions):
             if target.id != "_":
                 self._assign_name(target.id, value, kind)
         elif isinstance(target, ast.Tuple):
-            if len(target.elts) != len(value.parts):
+            parts = value.elements()
+            if len(target.elts) != len(parts):
                 raise TranslationError("an assignment", "of a tuple of another length", "Count")
-            for inner, part in zip(target.elts, value.parts):
+            for inner, part in zip(target.elts, parts):
                 self._assign(inner, part)
         elif isinstance(target, ast.Subscript):
             self._store(target, value)

@@ -16,12 +16,14 @@ from .types import (
     INT64,
     Array,
     Known,
+    Record,
     Struct,
     TranslationError,
     Type,
     Value,
     flat,
     given,
+    is_struct,
     promoted,
     shaped,
     together,
@@ -99,7 +101,7 @@ class Expressions:
     def _kept(self, value: Value) -> Value:
         """A value that later assignments do not change."""
         if value.parts:
-            return together([self._kept(part) for part in value.parts])
+            return together([self._kept(part) for part in value.parts], value.type)
         if not isinstance(value.type, str) or value.constant is not None:
             return value
         name = self._temporary()
@@ -187,7 +189,7 @@ class Expressions:
         values: list[Value] = []
         for node in nodes:
             if isinstance(node, ast.Starred):
-                values += self.value(node.value).parts
+                values += self.value(node.value).elements()
             else:
                 values.append(self.value(node))
         return values
@@ -197,6 +199,8 @@ class Expressions:
         if isinstance(owner.type, Array) and node.attr == "shape":
             sizes = [f"wp.int64({owner.text}.shape[{axis}])" for axis in range(owner.type.axes)]
             return together([Value(size, INT64) for size in sizes])
+        if isinstance(owner.type, Record) and node.attr in owner.type.kind._fields:
+            return owner.parts[owner.type.kind._fields.index(node.attr)]
         if not isinstance(owner.type, Struct):
             raise TranslationError(ast.unparse(node), "is no field", "Use a named tuple")
         return Value(f"{owner.text}.{node.attr}", owner.type.fields[node.attr])
@@ -291,7 +295,7 @@ class Expressions:
         if isinstance(function, type) and issubclass(function, np.generic):
             return Value(self._as(values[0], function.__name__), function.__name__)
         if isinstance(function, type) and hasattr(function, "_fields"):
-            return self._struct(function, values)
+            return self._named_tuple(function, values)
         if function in _CASTS:
             return Value(self._as(values[0], _CASTS[function]), _CASTS[function])
         if function in (min, max):
@@ -317,7 +321,11 @@ class Expressions:
             return Value(f"wp.{_MATHS[function]}({', '.join(self._as(v, kind) for v in values)})", kind)
         return self._call(function, values)
 
-    def _struct(self, kind: type, values: list[Value]) -> Value:
+    def _named_tuple(self, kind: Any, values: list[Value]) -> Value:
+        if not is_struct(kind):
+            if len(values) != len(kind._fields):
+                raise TranslationError(kind.__name__, f"is made of {len(values)} fields", "Give all of them")
+            return together(values, Record(kind, ()))
         name = self._temporary()
         self._emit(f"{name} = {self._all.struct(kind)}()")
         for (field, inner), value in zip(Struct(kind).fields.items(), values):

@@ -17,7 +17,7 @@ from ...core.errors import Cancelled, DeviceError
 from .runtime import is_there, load_module, parts_of, preparing, type_for, warp
 from .translate import Constants, Translation
 from .types import Array as ArrayType
-from .types import Type, given, spelled
+from .types import Record, Type, given, like, spelled
 
 Array = np.ndarray
 
@@ -32,7 +32,7 @@ class Room(NamedTuple):
     shape: tuple[int, ...]
 
 
-#: Scratch memory of a function: nested tuples of `Room`.
+#: Scratch memory of a function: nested tuples and named tuples of `Room`.
 Rooms = Any
 
 
@@ -117,7 +117,7 @@ class Launcher:
         work : Work
         pieces : int
         arguments : sequence
-            Numbers, arrays here or on the device, named tuples of numbers, and tuples of all these.
+            Numbers, arrays here or on the device, tuples and named tuples of all these.
         out : sequence
             Arrays that are written to, or tuples of them: those of this process as a whole, those on the device where
             the work does.
@@ -217,4 +217,4 @@ def _flat(rooms: Rooms) -> list[Room]:
 def _types(rooms: Rooms) -> Type:
     if isinstance(rooms, Room):
         return ArrayType(rooms.element, len(rooms.shape))
-    return tuple(_types(inner) for inner in rooms)
+    return like(Record(type(rooms), ()) if hasattr(rooms, "_fields") else (), map(_types, rooms))

@@ -22,7 +22,7 @@ from ...core.asset.archive import replace_file
 from ...core.errors import DeviceError, WriteError
 from ..folders import cache_folder
 from .types import Array as ArrayType
-from .types import Known, Struct, Type, type_of
+from .types import Known, Record, Struct, Type, is_struct, like, type_of
 
 Array = np.ndarray
 
@@ -118,7 +118,7 @@ def is_there(value: Any) -> bool:
 
 
 def type_for(value: Any) -> Type:
-    """Type of an argument as a kernel takes it: numbers, arrays here or there, named tuples, tuples of all these.
+    """Type of an argument as a kernel takes it: numbers, arrays here or there, tuples and named tuples of all these.
 
     A kernel is made for the truth values that it is given.
 
@@ -132,7 +132,9 @@ def type_for(value: Any) -> Type:
     if is_there(value):
         return ArrayType(value.dtype.__name__, value.ndim)
     if isinstance(value, tuple):
-        return Struct(type(value)) if hasattr(value, "_fields") else tuple(type_for(part) for part in value)
+        if _is_whole(value):
+            return Struct(type(value))
+        return like(Record(type(value), ()) if hasattr(value, "_fields") else (), map(type_for, value))
     if isinstance(value, bool):
         return Known(value)
     kind = type_of(value)
@@ -141,9 +143,14 @@ def type_for(value: Any) -> Type:
     return kind
 
 
+def _is_whole(value: tuple[Any, ...]) -> bool:
+    """Whether it is a named tuple that a kernel takes as one argument."""
+    return hasattr(value, "_fields") and is_struct(type(value))
+
+
 def parts_of(value: Any) -> Iterable[Any]:
-    """What a kernel takes of nested tuples, in order: named tuples whole, no truth values, for these are known."""
-    if isinstance(value, tuple) and not hasattr(value, "_fields"):
+    """What a kernel takes of nested tuples, in order: structs whole, no truth values, for these are known."""
+    if isinstance(value, tuple) and not _is_whole(value):
         for part in value:
             yield from parts_of(part)
     elif not isinstance(value, bool):

@@ -1,11 +1,13 @@
 """Types of scalar code as Numba sees them, and how Warp spells them.
 
-A type is the name of a scalar ("float32"), a tuple of types, a `Struct` or an `Array`. Numbers are promoted as Numba
-promotes them, not as numpy does: small integers become 64-bit ones, a float32 next to an integer a float64.
+A type is the name of a scalar ("float32"), a tuple of types, a `Record`, a `Struct` or an `Array`. Numbers are promoted
+as Numba promotes them, not as numpy does: small integers become 64-bit ones, a float32 next to an integer a float64.
 """
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, get_type_hints
 
@@ -43,7 +45,7 @@ class Array:
 
 @dataclass(frozen=True)
 class Struct:
-    """A ``NamedTuple`` of numbers; ``int`` fields are int64."""
+    """A ``NamedTuple`` of numbers, see `is_struct`; ``int`` fields are int64."""
 
     kind: type
 
@@ -59,7 +61,58 @@ class Struct:
 def _field(note: Any) -> Type:
     if hasattr(note, "_fields"):
         return Struct(note)
-    return {int: INT64, float: FLOAT64, bool: BOOL}.get(note) or note.__name__
+    return {int: INT64, float: FLOAT64}.get(note) or note.__name__
+
+
+@functools.cache
+def is_struct(kind: type) -> bool:
+    """Whether a ``NamedTuple`` is a `Struct` of Warp's, by the types of its fields: numbers, and others of its kind.
+
+    One with arrays, tuples or truth values is a `Record`.
+    """
+
+    def is_number(note: Any) -> bool:
+        return note in (int, float) or (isinstance(note, type) and issubclass(note, np.number))
+
+    notes = get_type_hints(kind).values()
+    return all(is_struct(note) if hasattr(note, "_fields") else is_number(note) for note in notes)
+
+
+class Record(tuple[Type, ...]):
+    """A ``NamedTuple`` that holds anything: a tuple whose parts have names, and that vanishes as tuples do.
+
+    Parameters
+    ----------
+    kind : type
+        The named tuple.
+    parts : iterable
+        Types of its fields.
+    """
+
+    kind: Any
+
+    def __new__(cls, kind: type, parts: Iterable[Type]) -> Record:
+        """Keep the class next to the types."""
+        made = super().__new__(cls, parts)
+        made.kind = kind
+        return made
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Record) and self.kind is other.kind and super().__eq__(other)
+
+    def __ne__(self, other: object) -> bool:
+        return not self == other
+
+    def __hash__(self) -> int:
+        return hash((self.kind, tuple(self)))
+
+    def __str__(self) -> str:
+        return f"{self.kind.__name__}({', '.join(map(str, self))})"
+
+
+def like(kind: Type, parts: Iterable[Type]) -> Type:
+    """A tuple of types, with the names of `kind` where that has some."""
+    return Record(kind.kind, parts) if isinstance(kind, Record) else tuple(parts)
 
 
 def type_of(value: Any) -> str | None:
@@ -104,7 +157,7 @@ def unified(a: Type, b: Type) -> Type:
     if a == b:
         return a
     if isinstance(a, tuple) and isinstance(b, tuple) and len(a) == len(b):
-        return tuple(unified(x, y) for x, y in zip(a, b))
+        return like(a, (unified(x, y) for x, y in zip(a, b)))
     return promoted(a, b, arithmetic=False)
 
 
@@ -163,11 +216,17 @@ class Value:
         """The values of which a tuple consists, or the value itself."""
         return [v for part in self.parts for v in part.flat()] if isinstance(self.type, tuple) else [self]
 
+    def elements(self) -> tuple[Value, ...]:
+        """The values of which a tuple or a struct consists."""
+        if isinstance(self.type, Struct):
+            return tuple(Value(f"{self.text}.{name}", kind) for name, kind in self.type.fields.items())
+        return self.parts
+
     @property
     def known(self) -> Type:
         """The type, with truth values that are known."""
         if self.parts:
-            return tuple(part.known for part in self.parts)
+            return like(self.type, (part.known for part in self.parts))
         return Known(self.constant) if isinstance(self.constant, bool) else self.type
 
     @property
@@ -176,15 +235,15 @@ class Value:
         return isinstance(self.constant, int) and abs(self.constant) <= _EXACT
 
 
-def together(values: list[Value]) -> Value:
-    """A tuple of values."""
-    return Value("", tuple(v.type for v in values), None, tuple(values))
+def together(values: list[Value], kind: Type = ()) -> Value:
+    """A tuple of values, with the names of `kind` where that has some."""
+    return Value("", like(kind, (v.type for v in values)), None, tuple(values))
 
 
 def shaped(kind: Type, texts: list[str]) -> Value:
     """A value of a type, its parts taken from the front of `texts`; what is known beforehand takes none."""
     if isinstance(kind, tuple):
-        return together([shaped(inner, texts) for inner in kind])
+        return together([shaped(inner, texts) for inner in kind], kind)
     if isinstance(kind, Known):
         return Value(f"wp.bool({kind.value})", BOOL, kind.value)
     return Value(texts.pop(0), kind)

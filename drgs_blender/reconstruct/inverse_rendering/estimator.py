@@ -51,6 +51,7 @@ from ...render.sampling import (
     unit,
 )
 from ...render.scene.embree import trace
+from ...render.scene.ray import Ray
 from ...render.scene.triangle_bvh import TriangleBVH
 
 Array = np.ndarray
@@ -222,9 +223,8 @@ def gather_point(i, points, normals, a2s, counts, sequence, scene, faces, cache,
                 f = x * x
                 f = f * f * x
                 w0, w1, w2, w3 = w * nl * INVERSE_PI, lobe * (ONE - f), lobe * f, lobe * fresnel_dielectric(vh)
-                _, group, face, _, hu, hv, _, _, _ = trace(
-                    scene[0], scene[1], ox, oy, oz, dx, dy, dz, ZERO, F(np.inf), _NONE
-                )
+                ray = Ray((ox, oy, oz), (dx, dy, dz), ZERO, F(np.inf), _NONE)
+                _, group, face, _, hu, hv, _, _, _ = trace(scene[0], scene[1], ray)
                 if group >= 0:
                     if not seen:
                         continue

@@ -8,7 +8,9 @@ import numpy as np
 
 from ...compute.jit import get_num_threads, njit, prange
 from ..camera import CLIP_END, CLIP_START, WIDTH, sample_ray
+from ..sampling import F
 from ..scene.interaction import nearest, position_at, surface_at
+from ..scene.ray import Hit, Ray
 from ..scene.trace_scene import TraceScene
 from .gbuffer import GBuffer, face_viewer
 
@@ -126,10 +128,8 @@ def trace_samples(lane, lanes, room, tracer, view_of, mask, owners, out):  # typ
         for n in range(block * _BLOCK, min((block + 1) * _BLOCK, count)):
             x, y, k = n // subpixels % columns, n // (subpixels * columns), n % subpixels
             ox, oy, oz, dx, dy, dz = sample_ray(p, (y0 + y) * width + x0 + x, k)
-            t, f, i, u, v, gx, gy, gz = nearest(
-                tracer, np.float32(ox), np.float32(oy), np.float32(oz),
-                np.float32(dx), np.float32(dy), np.float32(dz), near, far, mask,
-            )  # fmt: skip
+            start, along = (F(ox), F(oy), F(oz)), (F(dx), F(dy), F(dz))
+            t, f, i, u, v, gx, gy, gz = nearest(tracer, Ray(start, along, near, far, mask))
             depth[y, x, k], face[y, x, k], place[y, x, k] = t, f, i
             where[y, x, k, 0], where[y, x, k, 1] = u, v
             where[y, x, k, 2], where[y, x, k, 3], where[y, x, k, 4] = gx, gy, gz
@@ -179,10 +179,10 @@ def shade_hits(lane, lanes, room, geometry, moving, view_of, layer, hits, keys, 
             place, u, v = hit_place[y, x, k], where[y, x, k, 0], where[y, x, k, 1]
             # Points that a device found and has lost are traced anew, where a ray along an edge may meet nothing.
             face = max(hit_face[y, x, k], np.int32(0))
+            hit = Hit(hit_depth[y, x, k], face, place, u, v, where[y, x, k, 2], where[y, x, k, 3], where[y, x, k, 4])
             nx, ny, nz, gx, gy, gz, r, g, b, rough, metal, er, eg, eb, who = surface_at(
-                face, place, u, v, where[y, x, k, 2], where[y, x, k, 3], where[y, x, k, 4],
-                np.float32(-vx), np.float32(-vy), np.float32(-vz), geometry,
-            )  # fmt: skip
+                hit, (F(-vx), F(-vy), F(-vz)), geometry
+            )
             sx, sy, sz = face_viewer(
                 np.float64(nx), np.float64(ny), np.float64(nz), np.float64(gx), np.float64(gy), np.float64(gz),
                 vx, vy, vz,

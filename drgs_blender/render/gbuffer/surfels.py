@@ -32,7 +32,9 @@ from ...compute.jit import get_num_threads, njit, prange
 from ...core.frame import Camera
 from ..camera import WIDTH, sample_ray
 from ..points import SECOND
+from ..sampling import F
 from ..scene.interaction import nearest
+from ..scene.ray import Ray
 from ..scene.ray_masks import SURFELS
 from ..scene.trace_scene import TraceScene
 from ..surfels.raster import SurfelSamples, rasterise
@@ -146,10 +148,9 @@ def _shoot(tracer, x, y, z, dx, dy, dz, reach):  # type: ignore[no-untyped-def]
 
     Short segments that start near the surface keep float32 exact where a ray from a distant camera would not.
     """
-    t, face, _, u, v, gx, gy, gz = nearest(
-        tracer, np.float32(x), np.float32(y), np.float32(z), np.float32(dx), np.float32(dy), np.float32(dz),
-        np.float32(0.0), np.float32(reach), np.int32(SURFELS),
-    )  # fmt: skip
+    origin, direction = (F(x), F(y), F(z)), (F(dx), F(dy), F(dz))
+    ray = Ray(origin, direction, F(0.0), F(reach), np.int32(SURFELS))
+    t, face, _, u, v, gx, gy, gz = nearest(tracer, ray)
     length = np.sqrt(np.float64(gx) * gx + np.float64(gy) * gy + np.float64(gz) * gz)
     if face < 0 or length == 0.0:
         return np.float64(0.0), 0.0, 0.0, 0.0, np.int32(-1), u, v

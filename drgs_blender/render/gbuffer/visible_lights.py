@@ -70,8 +70,8 @@ def _look(p, x0, y0, start, alpha, pixel, sample, weight, flags, depth, lights, 
                 origin = F(ox + near * dx), F(oy + near * dy), F(oz + near * dz)
                 direction = F(dx / length), F(dy / length), F(dz / length)
                 end = F((p[CLIP_END] - near) * length)
-                r, g, b = lights_along(*origin, *direction, end, ONE, ZERO, CAMERA, *lights)
-                s, t, u = suns_along(*origin, *direction, _FAR, ONE, ZERO, CAMERA, *lights)
+                r, g, b = lights_along(origin, direction, end, ONE, ZERO, CAMERA, lights)
+                s, t, u = suns_along(origin, direction, _FAR, ONE, ZERO, CAMERA, lights)
                 r, g, b = r + s, g + t, b + u
                 if not r + g + b > ZERO:
                     continue
@@ -80,9 +80,8 @@ def _look(p, x0, y0, start, alpha, pixel, sample, weight, flags, depth, lights, 
                 for i in range(first, n):
                     if flags[i] & CATCHER:
                         continue
-                    r, g, b = lights_along(
-                        *origin, *direction, F((depth[i] - near) * length), ONE, ZERO, CAMERA, *lights
-                    )
+                    reach = F((depth[i] - near) * length)
+                    r, g, b = lights_along(origin, direction, reach, ONE, ZERO, CAMERA, lights)
                     red, green, blue = red + weight[i] * r, green + weight[i] * g, blue + weight[i] * b
                 out[y, x, 0] += red
                 out[y, x, 1] += green

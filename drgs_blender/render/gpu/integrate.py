@@ -5,13 +5,19 @@ from __future__ import annotations
 from types import ModuleType
 from typing import Any
 
+import numpy as np
+
 from ...compute.warp.kernels import Launcher, Room, Work
 from ..integrator import direct, indirect, integrate, sample_allocation, wavefront
+from ..integrator.records import Sampler, Scene, Settings
 from ..lights.environment import EnvironmentLight
 from ..lights.lights import Lights
+from ..points import PointArrays
 from ..scene.trace_scene import TraceScene
 from .natives import NATIVES
 from .scene_mirror import Mirror
+
+Array = np.ndarray
 
 
 def _constants(module: ModuleType, name: str, value: Any) -> Any:
@@ -23,12 +29,12 @@ def _constants(module: ModuleType, name: str, value: Any) -> Any:
     return value
 
 
-_BATCH = (
+_BATCH = wavefront.Batch._make([
     Room("float32", (wavefront._FLOATS // wavefront.LANES,)),
     Room("uint32", (wavefront._INTS // wavefront.LANES,)),
-)
-#: As `integrate._room` makes it, for batches and blocks of one.
-_ROOMS = (
+])  # fmt: skip
+#: As `integrate._scratch` makes it, for batches and blocks of one.
+_ROOMS = integrate.Scratch._make([
     _BATCH,
     _BATCH,
     Room("float32", (1, indirect.FOUND)),
@@ -36,7 +42,7 @@ _ROOMS = (
     Room("float32", (1, sample_allocation.POINT_STATE)),
     Room("uint32", (1,)),
     Room("int64", (1,)),
-)
+])  # fmt: skip
 SHADE = Work(integrate.shade_points, _ROOMS, NATIVES, _constants)
 
 
@@ -50,6 +56,7 @@ class DeviceKernel(integrate.Kernel):
         with self._launcher.failures("copying the scene"):
             return self._mirror.tables(scene, environment, lights)
 
-    def shade(self, *arguments: Any) -> None:
-        *inwards, out = arguments
-        self._launcher.launch(SHADE, len(out[0]), inwards, out)
+    def shade(
+        self, points: PointArrays, scene: Scene, settings: Settings, sampler: Sampler, out: tuple[Array, Array]
+    ) -> None:
+        self._launcher.launch(SHADE, len(out[0]), (points, scene, settings, sampler), out)

@@ -5,9 +5,11 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from ...compute.warp.translate import Native
+from ...compute.warp.types import Record
 from .. import memory
 from ..integrator import intersect
 from ..scene import interaction
+from ..scene.ray import Hit
 
 
 class MeshTracer(NamedTuple):
@@ -100,7 +102,7 @@ def shadowed(
     return hit
 """
 
-_HIT = ("float32", "int32", "int32", "float32", "float32", "float32", "float32", "float32")
+_HIT = Record(Hit, ("float32", "int32", "int32", "float32", "float32", "float32", "float32", "float32"))
 
 #: What stands for functions that are not translated.
 NATIVES: dict[Any, Any] = {

@@ -43,7 +43,7 @@ class Mirror:
         """(tracer, geometry, environment, lights) with the device's addresses; until what they are of changes."""
         state = scene, scene.version
         of_lights = self._table(
-            "lights", (lights, *state), lambda place: (*lights.tables[:2], lights.emitters.address_at(place))
+            "lights", (lights, *state), lambda place: lights.tables._replace(emitters=lights.emitters.address_at(place))
         )
         return self.tracer(scene), self.geometry(scene), self.envmap(environment), of_lights
 

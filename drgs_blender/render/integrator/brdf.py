@@ -150,11 +150,28 @@ def sample_vndf(u, v, ix, iy, iz, alpha, bound):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def evaluate(nl, nv, vl, nh2, sin2, r, g, b, kd, metallic, a2, norm, shading_model):  # type: ignore[no-untyped-def]
+def evaluate(angles, albedo, kd, metallic, a2, norm, shading_model):  # type: ignore[no-untyped-def]
     """Diffuse and specular (RGB each) BRDF values and the density of ``sample_vndf``; all without the cosine.
 
-    nl > 0; where nv <= 0 the specular lobe is black, as in Cycles. Without branches, so that loops over it vectorise.
+    Without branches, so that loops over it vectorise.
+
+    Parameters
+    ----------
+    angles : tuple of float
+        (nl, nv, vl, nh2, sin2): cosines of normal n, light l and view v, and squares of cosine and sine between the
+        half vector and n. nl > 0; where nv <= 0 the specular lobe is black, as in Cycles.
+    albedo : tuple of float
+    kd : float
+        `diffuse_weight`.
+    metallic : float
+    a2 : float
+        `alpha_squared`.
+    norm : float
+        Of `vndf_terms`.
+    shading_model : int
     """
+    nl, nv, vl, nh2, sin2 = angles
+    r, g, b = albedo
     k = kd * INVERSE_PI
     value, d = ggx(nl, nv, nh2, sin2, a2)
     value, d = value if nv > ZERO else ZERO, d if nv > ZERO else ZERO

@@ -44,8 +44,10 @@ def _add(sums, h, kind, qr, qg, qb, sr, sg, sb):  # type: ignore[no-untyped-def]
 
 
 @njit
-def _reflect(sums, s, ints, slot, kind, dr, dg, db, gr, gg, gb):  # type: ignore[no-untyped-def]
+def _reflect(sums, rays, slot, kind, diffuse, glossy):  # type: ignore[no-untyped-def]
     """Add what a slot's point reflects of the light that its diffuse and its glossy lobe get along the ray."""
+    s, ints = rays
+    (dr, dg, db), (gr, gg, gb) = diffuse, glossy
     i, c = w.at(slot)
     _add(
         sums, np.int64(ints[c + w.OWNER]), kind, s[i + w.QR] * dr, s[i + w.QG] * dg, s[i + w.QB] * db,
@@ -70,133 +72,149 @@ def deliver(count, found, limit, sums):  # type: ignore[no-untyped-def]
 
 
 @njit
-def _see_lights(slot, s, ints, reach, hit, cosine, ggx, lights, differ, glows, geometry, sums):  # type: ignore[no-untyped-def]
-    """What lights between a point and what its ray hit shine, and what that emits; the BRDF is not yet weighed."""
+def _see_lights(rays, slot, reach, hit, taking_part, scene, sums):  # type: ignore[no-untyped-def]
+    """What lights between a point and what its ray hit shine, and what that emits; the BRDF is not yet weighed.
+
+    `taking_part` says (1 or 0) whether cosine and GGX sampling do, as in `wavefront.weigh`.
+    """
+    s = rays.floats
+    lights = scene.lights
+    cosine, ggx = taking_part
     i, _ = w.at(slot)
     position, direction = (s[i + w.OX], s[i + w.OY], s[i + w.OZ]), (s[i + w.LX], s[i + w.LY], s[i + w.LZ])
     others, share = cosine * s[i + w.WC] * s[i + w.PC] + ggx * s[i + w.WG] * s[i + w.PG], s[i + w.WL]
     if not others > ZERO:
         return
-    dr, dg, db = lights_along(*position, *direction, reach, others, share, DIFFUSE, *lights)
+    dr, dg, db = lights_along(position, direction, reach, others, share, DIFFUSE, lights)
     gr, gg, gb = dr, dg, db
-    if differ:
-        gr, gg, gb = lights_along(*position, *direction, reach, others, share, GLOSSY, *lights)
-    if glows:
-        r, g, b, density, glossy = emission_along(*position, *direction, hit, geometry, *lights)
+    if scene.traits.lights_differ:
+        gr, gg, gb = lights_along(position, direction, reach, others, share, GLOSSY, lights)
+    if scene.traits.glows:
+        r, g, b, density, glossy = emission_along(position, direction, hit, scene.geometry, lights)
         weight, glossy = ONE / (others + share * density), ONE / (others + share * glossy)
         dr, dg, db = dr + weight * r, dg + weight * g, db + weight * b
         gr, gg, gb = gr + glossy * r, gg + glossy * g, gb + glossy * b
     if dr + dg + db + gr + gg + gb > ZERO:
-        _reflect(sums, s, ints, slot, 2, dr, dg, db, gr, gg, gb)
+        _reflect(sums, rays, slot, 2, (dr, dg, db), (gr, gg, gb))
 
 
 @njit
-def _trace_lights(count, s, ints, scene, lights, shading_model, apart, shift, sums):  # type: ignore[no-untyped-def]
+def _trace_lights(rays, count, scene, settings, sums):  # type: ignore[no-untyped-def]
     """Light samples: draw, trace, add."""
-    w.light_directions(s, ints, count, lights)
-    w.evaluate(s, count, shading_model)
-    mask = np.int32(ray_masks.SHADOW << shift)
+    s = rays.floats
+    w.light_directions(rays, count, scene.lights)
+    w.evaluate(rays, count, settings.shading_model)
+    mask = np.int32(ray_masks.SHADOW << settings.shift)
     for slot in range(count):
         i, _ = w.at(slot)
         others, glossy_others = s[i + w.WC] * s[i + w.PC], s[i + w.WG] * s[i + w.PG]
-        if not apart:
+        if not scene.traits.lobes_apart:
             others = glossy_others = others + glossy_others
         dr, dg, db, gr, gg, gb = light_radiance(
-            s, ints, slot, others, glossy_others, s[i + w.WL], lights, scene[0], mask
+            rays, slot, others, glossy_others, s[i + w.WL], scene.lights, scene.tracer, mask
         )
         if dr + dg + db + gr + gg + gb > ZERO:
-            _reflect(sums, s, ints, slot, 0, dr, dg, db, gr, gg, gb)
+            _reflect(sums, rays, slot, 0, (dr, dg, db), (gr, gg, gb))
 
 
 @njit
-def _see_envmap(count, s, ints, envmap, sums):  # type: ignore[no-untyped-def]
+def _see_envmap(rays, count, envmap, sums):  # type: ignore[no-untyped-def]
     """Add what the environment sends along the slots' rays; LIVE is the share that gets through."""
+    s = rays.floats
     for slot in range(count):
         i, _ = w.at(slot)
         through = s[i + w.LIVE]
         if through > ZERO:
             r, g, b = envmap_radiance(s[i + w.MU], s[i + w.MV], envmap)
-            r, g, b = r * through, g * through, b * through
-            _reflect(sums, s, ints, slot, 0, r, g, b, r, g, b)
+            light = r * through, g * through, b * through
+            _reflect(sums, rays, slot, 0, light, light)
 
 
 @njit
-def _trace_envmap(count, s, ints, tracer, envmap, shading_model, apart, shift, sums):  # type: ignore[no-untyped-def]
+def _trace_envmap(rays, count, scene, settings, sums):  # type: ignore[no-untyped-def]
     """Samples of the environment: draw, weigh, trace, add."""
-    w.environment_directions(s, ints, count, envmap)
-    w.evaluate(s, count, shading_model)
-    if apart:
-        w.weigh_apart(s, count)
+    s = rays.floats
+    w.environment_directions(rays, count, scene.envmap)
+    w.evaluate(rays, count, settings.shading_model)
+    if scene.traits.lobes_apart:
+        w.weigh_apart(rays, count)
     else:
-        w.weigh(s, count, ONE, ONE)
-    w.warm(s, count, envmap)
-    mask = np.int32(ray_masks.SHADOW << shift)
+        w.weigh(rays, count, ONE, ONE)
+    w.warm(rays, count, scene.envmap)
+    mask = np.int32(ray_masks.SHADOW << settings.shift)
     for slot in range(count):
         i, _ = w.at(slot)
         if s[i + w.LIVE] > ZERO:
-            s[i + w.LIVE] = passed(tracer, s, ints, slot, FAR, mask)
-    _see_envmap(count, s, ints, envmap, sums)
+            s[i + w.LIVE] = passed(scene.tracer, rays, slot, FAR, mask)
+    _see_envmap(rays, count, scene.envmap, sums)
 
 
 @njit
-def trace_batch(  # type: ignore[no-untyped-def]
-    strategy, count, rays, paths, begun, found, scene, illumination, table, bounces, shading_model, limit, differ,
-    shift, sums,
-):  # fmt: skip
-    """Samples of one strategy: draw, weigh, trace, and add what they see; return the number of paths under way."""
+def trace_batch(strategy, count, begun, scratch, scene, settings):  # type: ignore[no-untyped-def]
+    """Samples of one strategy: draw, weigh, trace, and add what they see; return the number of paths under way.
+
+    Parameters
+    ----------
+    strategy : int
+    count : int
+        Samples, in slots 0, 1, ... of the scratch memory's `rays`.
+    begun : int
+        Paths under way, in its `paths`.
+    scratch : Scratch
+    scene : Scene
+    settings : Settings
+    """
+    rays, paths, found, sums = scratch.rays, scratch.paths, scratch.found, scratch.sums
     s, ints = rays
-    p, path_ints = paths
-    tracer = scene[0]
-    envmap, envmap_shines, lights, any_lights = illumination
-    lights_differ, apart = differ
-    w.scramble(ints, count)
-    if any_lights and strategy == LIGHTS:
-        _trace_lights(count, s, ints, scene, lights, shading_model, apart, shift, sums)
+    tracer, envmap, shading_model, shift = scene.tracer, scene.envmap, settings.shading_model, settings.shift
+    w.scramble(rays, count)
+    if scene.traits.lights and strategy == LIGHTS:
+        _trace_lights(rays, count, scene, settings, sums)
         return begun
     if strategy == ENVIRONMENT:
-        _trace_envmap(count, s, ints, tracer, envmap, shading_model, apart, shift, sums)
+        _trace_envmap(rays, count, scene, settings, sums)
         return begun
     if strategy == COSINE:
-        w.cosine_directions(s, ints, count)
+        w.cosine_directions(rays, count)
         mask = np.int32(ray_masks.DIFFUSE << shift)
     else:
-        w.ggx_directions(s, ints, count)
+        w.ggx_directions(rays, count)
         mask = np.int32(ray_masks.GLOSSY << shift)
-    w.evaluate(s, count, shading_model)
-    w.look_up(s, ints, count, envmap)
+    w.evaluate(rays, count, shading_model)
+    w.look_up(rays, count, envmap)
     cosine = ggx = ONE
-    if apart and strategy == COSINE:
+    if scene.traits.lobes_apart and strategy == COSINE:
         ggx = ZERO
-        w.drop(s, count, w.SR)
-    if apart and strategy == GGX:
+        w.drop(rays, count, w.SR)
+    if scene.traits.lobes_apart and strategy == GGX:
         cosine = ZERO
-        w.drop(s, count, w.QR)
-    see_lights = any_lights or bounces[1]
+        w.drop(rays, count, w.QR)
+    see_lights = scene.traits.lights or scene.traits.glows
     # Lights are seen before the BRDF is weighed, for they have densities of their own: such rays are traced first.
     if not see_lights:
-        w.weigh(s, count, cosine, ggx)
-    if envmap_shines:
-        w.warm(s, count, envmap)
+        w.weigh(rays, count, cosine, ggx)
+    if scene.traits.environment:
+        w.warm(rays, count, envmap)
     for slot in range(count):
         i, c = w.at(slot)
         if not s[i + w.LIVE] > ZERO:
             continue
         position, direction = (s[i + w.OX], s[i + w.OY], s[i + w.OZ]), (s[i + w.LX], s[i + w.LY], s[i + w.LZ])
-        through, reach, hit = meet(tracer, s, ints, slot, mask)
+        through, reach, hit = meet(tracer, rays, slot, mask)
         if see_lights:
-            _see_lights(slot, s, ints, reach, hit, cosine, ggx, lights, lights_differ, bounces[1], scene[1], sums)
+            _see_lights(rays, slot, reach, hit, (cosine, ggx), scene, sums)
             w.weigh_one(s, i, cosine, ggx)
         s[i + w.LIVE] = through
-        if through == ONE or bounces[0] == 0:
+        if through == ONE or settings.bounces == 0:
             continue
         # Light of surfaces is found by these strategies alone: the density of the environment's samples goes out again.
         others = cosine * s[i + w.WC] * s[i + w.PC] + ggx * s[i + w.WG] * s[i + w.PG]
         rest = (ONE - through) * (ONE + s[i + w.WE] * s[i + w.PE] / max(others, F(1e-30)))
         if begun == BATCH:
-            trace_paths(p, path_ints, begun, scene, illumination, shading_model, table, bounces, shift, found)
-            deliver(begun, found, limit, sums)
+            trace_paths(paths, begun, scene, settings, found)
+            deliver(begun, found, settings.clamp, sums)
             begun = np.int64(0)
-        put_hit(tracer, p, path_ints, begun, *position, *direction, hit, ints[c + w.KEY], begun)
+        put_hit(tracer, paths, begun, (position, direction), hit, ints[c + w.KEY], begun)
         found[begun, CARRIED], found[begun, CARRIED + 1], found[begun, CARRIED + 2] = (
             s[i + w.QR] * rest, s[i + w.QG] * rest, s[i + w.QB] * rest,
         )  # fmt: skip
@@ -205,8 +223,8 @@ def trace_batch(  # type: ignore[no-untyped-def]
         )  # fmt: skip
         found[begun, CARRIED + 6] = F(ints[c + w.OWNER])
         begun += 1
-    if envmap_shines:
-        _see_envmap(count, s, ints, envmap, sums)
+    if scene.traits.environment:
+        _see_envmap(rays, count, envmap, sums)
     return begun
 
 

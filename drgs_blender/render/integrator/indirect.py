@@ -39,13 +39,15 @@ def lifted(px, py, pz, gx, gy, gz, extent):  # type: ignore[no-untyped-def]
 
 
 @njit
-def _surfaces(s, ints, count, scene, shading_model, table, envmap):  # type: ignore[no-untyped-def]
+def _surfaces(rays, count, scene, settings):  # type: ignore[no-untyped-def]
     """Normals and materials where the rays hit. What the surfaces emit was taken where the rays left (`_onwards`)."""
-    tracer, geometry, extent = scene
+    s, ints = rays
+    tracer, geometry, envmap, extent = scene.tracer, scene.geometry, scene.envmap, scene.traits.extent
+    shading_model, layers = settings.shading_model, settings.layers
     for slot in range(count):
         a, c = w.at(slot)
         vx, vy, vz = s[a + w.VX], s[a + w.VY], s[a + w.VZ]
-        nx, ny, nz, gx, gy, gz, r, g, b, roughness, metallic, _, _, _ = surface_of(tracer, s, ints, slot, geometry)
+        nx, ny, nz, gx, gy, gz, r, g, b, roughness, metallic, _, _, _ = surface_of(tracer, rays, slot, geometry)
         mx, my, mz = brdf.glossy_normal(nx, ny, nz, gx, gy, gz, vx, vy, vz)
         s[a + w.NX], s[a + w.NY], s[a + w.NZ] = nx, ny, nz
         s[a + w.MX], s[a + w.MY], s[a + w.MZ] = mx, my, mz
@@ -54,12 +56,14 @@ def _surfaces(s, ints, count, scene, shading_model, table, envmap):  # type: ign
         s[a + w.OX], s[a + w.OY], s[a + w.OZ] = lifted(s[a + w.OX], s[a + w.OY], s[a + w.OZ], gx, gy, gz, extent)
         s[a + w.AR], s[a + w.AG], s[a + w.AB] = r, g, b
         s[a + w.METALLIC], s[a + w.A2] = metallic, brdf.alpha_squared(roughness)
-        s[a + w.KD] = brdf.diffuse_weight(roughness, metallic, mx * vx + my * vy + mz * vz, shading_model, table)
+        s[a + w.KD] = brdf.diffuse_weight(roughness, metallic, mx * vx + my * vy + mz * vz, shading_model, layers)
 
 
 @njit
-def _towards_envmap(s, ints, count, envmap, tracer, shift, found):  # type: ignore[no-untyped-def]
+def _towards_envmap(rays, count, scene, shift, found):  # type: ignore[no-untyped-def]
     """The environment samples that `environment_directions` drew and `carry` weighed."""
+    s, ints = rays
+    tracer, envmap = scene.tracer, scene.envmap
     for slot in range(count):
         i, c = w.at(slot)
         if not s[i + w.LIVE] > ZERO:
@@ -68,7 +72,7 @@ def _towards_envmap(s, ints, count, envmap, tracer, shift, found):  # type: igno
         weight = ONE / s[i + w.PE]
         red, green, blue = red * s[i + w.QR] * weight, green * s[i + w.QG] * weight, blue * s[i + w.QB] * weight
         if red + green + blue > ZERO:
-            through = passed(tracer, s, ints, slot, FAR, np.int32(ray_masks.SHADOW << shift))
+            through = passed(tracer, rays, slot, FAR, np.int32(ray_masks.SHADOW << shift))
             owner = np.int64(ints[c + w.OWNER])
             found[owner, INDIRECT] += red * through
             found[owner, INDIRECT + 1] += green * through
@@ -76,13 +80,15 @@ def _towards_envmap(s, ints, count, envmap, tracer, shift, found):  # type: igno
 
 
 @njit
-def _towards_lights(s, ints, count, lights, tracer, shift, found):  # type: ignore[no-untyped-def]
+def _towards_lights(rays, count, scene, shift, found):  # type: ignore[no-untyped-def]
     """The light samples that `light_directions` drew."""
+    s, ints = rays
+    tracer, lights = scene.tracer, scene.lights
     for slot in range(count):
         i, c = w.at(slot)
         others = s[i + w.SHARE] * s[i + w.PC] + (ONE - s[i + w.SHARE]) * s[i + w.PG]
         dr, dg, db, gr, gg, gb = light_radiance(
-            s, ints, slot, others, others, ONE, lights, tracer, np.int32(ray_masks.SHADOW << shift)
+            rays, slot, others, others, ONE, lights, tracer, np.int32(ray_masks.SHADOW << shift)
         )
         if dr + dg + db + gr + gg + gb > ZERO:
             owner = np.int64(ints[c + w.OWNER])
@@ -92,9 +98,11 @@ def _towards_lights(s, ints, count, lights, tracer, shift, found):  # type: igno
 
 
 @njit
-def _onwards(s, ints, count, bounce, last, envmap, lights, any_lights, glows, scene, shift, found):  # type: ignore[no-untyped-def]
+def _onwards(rays, count, bounce, last, scene, shift, found):  # type: ignore[no-untyped-def]
     """The BRDF samples; return how many paths go on, in slots 0, 1, ..."""
-    tracer, geometry, _ = scene
+    s, ints = rays
+    tracer, envmap, lights = scene.tracer, scene.envmap, scene.lights
+    any_lights, glows = scene.traits.lights, scene.traits.glows
     going = 0
     for slot in range(count):
         i, c = w.at(slot)
@@ -106,19 +114,19 @@ def _onwards(s, ints, count, bounce, last, envmap, lights, any_lights, glows, sc
         mask = np.int32((ray_masks.DIFFUSE if diffuse else ray_masks.GLOSSY) << shift)
         ends = last and not any_lights and not glows
         if ends:
-            through = passed(tracer, s, ints, slot, FAR, mask)
+            through = passed(tracer, rays, slot, FAR, mask)
         else:
-            through, reach, hit = meet(tracer, s, ints, slot, mask)
+            through, reach, hit = meet(tracer, rays, slot, mask)
         owner = np.int64(ints[c + w.OWNER])
         fr, fg, fb = s[i + w.QR], s[i + w.QG], s[i + w.QB]
         if any_lights:
             seen_by = DIFFUSE if diffuse else GLOSSY
-            red, green, blue = lights_along(*position, *direction, reach, s[i + w.PG], ONE, seen_by, *lights)
+            red, green, blue = lights_along(position, direction, reach, s[i + w.PG], ONE, seen_by, lights)
             found[owner, INDIRECT] += fr * red
             found[owner, INDIRECT + 1] += fg * green
             found[owner, INDIRECT + 2] += fb * blue
         if glows:
-            red, green, blue, own, glossy = emission_along(*position, *direction, hit, geometry, *lights)
+            red, green, blue, own, glossy = emission_along(position, direction, hit, scene.geometry, lights)
             weight = ONE / (s[i + w.PG] + (own if diffuse else glossy))
             found[owner, INDIRECT] += fr * red * weight
             found[owner, INDIRECT + 1] += fg * green * weight
@@ -140,7 +148,7 @@ def _onwards(s, ints, count, bounce, last, envmap, lights, any_lights, glows, sc
                     continue
                 fr, fg, fb = fr / survive, fg / survive, fb / survive
             # The slots before this one are done with.
-            put_hit(tracer, s, ints, going, *position, *direction, hit, key, owner)
+            put_hit(tracer, rays, going, (position, direction), hit, key, owner)
             i, _ = w.at(going)
             s[i + w.TR], s[i + w.TG], s[i + w.TB] = fr, fg, fb
             going += 1
@@ -148,49 +156,42 @@ def _onwards(s, ints, count, bounce, last, envmap, lights, any_lights, glows, sc
 
 
 @njit
-def trace_paths(s, ints, count, scene, illumination, shading_model, table, bounces, shift, found):  # type: ignore[no-untyped-def]
+def trace_paths(rays, count, scene, settings, found):  # type: ignore[no-untyped-def]
     """Follow `count` paths that `put_hit` began in slots 0, 1, ...; their light goes to rows OWNER of `found`.
 
     Parameters
     ----------
-    scene : tuple
-        (Tracer or MixedTracer, Geometry, extent).
-    illumination : tuple
-        (EnvMap, whether it shines, tables of lights, whether there are any: one of them is sampled at every
-        vertex).
-    bounces : tuple
-        Vertices of a path, and whether there are surfaces that emit, which are looked for beyond the last too.
-    shift : int
-        0, or ``ray_masks.WITHOUT``.
+    rays : Batch
+    count : int
+    scene : Scene
+    settings : Settings
     found : (capacity, FOUND) float32 array
         INDIRECT is written.
     """
-    tracer, _, _ = scene
-    envmap, envmap_shines, lights, any_lights = illumination
-    vertices, glows = bounces
+    s, ints = rays
+    envmap, lights, shading_model, shift = scene.envmap, scene.lights, settings.shading_model, settings.shift
     for slot in range(count):
         i, c = w.at(slot)
         s[i + w.TR], s[i + w.TG], s[i + w.TB] = ONE, ONE, ONE
         owner = np.int64(ints[c + w.OWNER])
         for k in range(CARRIED):
             found[owner, k] = ZERO
-    for bounce in range(vertices):
-        _surfaces(s, ints, count, scene, shading_model, table, envmap)
-        w.lobe_shares(s, count, shading_model)
-        if envmap_shines:
-            w.fresh_numbers(ints, count, GOLDEN)
-            w.environment_directions(s, ints, count, envmap)
-            w.evaluate(s, count, shading_model)
-            w.carry(s, count, ONE)
-            _towards_envmap(s, ints, count, envmap, tracer, shift, found)
-        if any_lights:
-            w.fresh_numbers(ints, count, U(0x2C1B3C6D))
-            w.light_directions(s, ints, count, lights)
-            w.evaluate(s, count, shading_model)
-            _towards_lights(s, ints, count, lights, tracer, shift, found)
-        w.fresh_numbers(ints, count, U(0x7FEB352D))
-        w.brdf_directions(s, ints, count)
-        w.evaluate(s, count, shading_model)
-        w.carry(s, count, ZERO)
-        last = bounce + 1 == vertices
-        count = _onwards(s, ints, count, bounce, last, envmap, lights, any_lights, glows, scene, shift, found)
+    for bounce in range(settings.bounces):
+        _surfaces(rays, count, scene, settings)
+        w.lobe_shares(rays, count, shading_model)
+        if scene.traits.environment:
+            w.fresh_numbers(rays, count, GOLDEN)
+            w.environment_directions(rays, count, envmap)
+            w.evaluate(rays, count, shading_model)
+            w.carry(rays, count, ONE)
+            _towards_envmap(rays, count, scene, shift, found)
+        if scene.traits.lights:
+            w.fresh_numbers(rays, count, U(0x2C1B3C6D))
+            w.light_directions(rays, count, lights)
+            w.evaluate(rays, count, shading_model)
+            _towards_lights(rays, count, scene, shift, found)
+        w.fresh_numbers(rays, count, U(0x7FEB352D))
+        w.brdf_directions(rays, count)
+        w.evaluate(rays, count, shading_model)
+        w.carry(rays, count, ZERO)
+        count = _onwards(rays, count, bounce, bounce + 1 == settings.bounces, scene, shift, found)

@@ -7,18 +7,18 @@ the frame number.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...compute.jit import get_num_threads, njit, plain, prange
+from ...compute.jit import get_num_threads, njit, prange
 from ...core.color import LUMINANCE
 from ...core.errors import UsageError
 from ...core.frame import RenderSettings
 from .. import sampling
 from ..lights.environment import EnvironmentLight
 from ..lights.lights import Lights
-from ..points import CATCHER, SECOND, Radiance, ShadingPoints
+from ..points import CATCHER, SECOND, PointArrays, Radiance, ShadingPoints
 from ..sampling import GOLDEN, ONE, ZERO, F, U, mix, unit
 from ..scene import ray_masks
 from ..scene.trace_scene import TraceScene
@@ -29,6 +29,7 @@ from . import wavefront as w
 from .direct import BATCH, KIND, KINDS, deliver, finish, trace_batch
 from .indirect import FOUND, trace_paths
 from .intersect import meshes_alone
+from .records import Sampler, Scene, Settings, Traits
 from .sample_allocation import ALPHA, COUNTS, POINT_STATE, put_sample, write_point_states
 from .variance import variances
 
@@ -50,9 +51,11 @@ class Kernel:
         """(tracer, geometry, environment, lights) as `shade` takes them; until the scene's next update."""
         return meshes_alone(scene.tracer), scene.geometry, environment.envmap, lights.tables
 
-    def shade(self, *arguments: Any) -> None:
+    def shade(
+        self, points: PointArrays, scene: Scene, settings: Settings, sampler: Sampler, out: tuple[Array, Array]
+    ) -> None:
         """Shade all points; see `shade_points`."""
-        _kernel(*arguments, 8 * get_num_threads())
+        _kernel(points, *scene, settings, sampler, out, 8 * get_num_threads())
 
 
 def integrate(
@@ -123,37 +126,18 @@ def integrate(
     tracer, geometry, envmap, light_tables = kernel.tables(scene, environment, lights)
     if surfels is not None:
         tracer = tracer._replace(**tracer_of(surfels)._asdict())
-    tables = (
-        tracer,
-        geometry,
-        F(scene.extent if surfels is None else max(scene.extent, surfels.extent)),
-        envmap,
-        (not environment.black, lights.count > 0),
-        light_tables,
-        brdf.layer_table(),
-        sampling.point_set(sum(counts) + 1),
-    )
-    rules = (
-        (auto, *map(F, counts), F(environment_part), F(lights_part), _APART if scene.rays_differ else ONE),
-        settings.subpixel_count,
-        part,
-        (settings.bounces, glows),
-        brdf.SHADING_MODELS[settings.shading_model],
-        U(mixed(settings.seed, noise_index)),
-        F(settings.clamp_indirect * settings.subpixel_count * part[1] / sum(counts)),
-        (lights.rays_differ, scene.rays_differ and (auto or min(counts[:2]) > 0)),
-    )
+    extent = F(scene.extent if surfels is None else max(scene.extent, surfels.extent))
+    apart = scene.rays_differ and (auto or min(counts[:2]) > 0)
+    traits = Traits(extent, not environment.black, lights.count > 0, glows, lights.rays_differ, apart)
+    given = Scene(tracer, geometry, envmap, light_tables, traits)
+    clamp = F(settings.clamp_indirect * settings.subpixel_count * part[1] / sum(counts))
+    how = Settings(settings.bounces, brdf.SHADING_MODELS[settings.shading_model], brdf.layer_table(), clamp, 0)
+    seed, sequence = U(mixed(settings.seed, noise_index)), sampling.point_set(sum(counts) + 1)
+    shares = F(environment_part), F(lights_part), _APART if scene.rays_differ else ONE
+    sampler = Sampler._make([seed, sequence, settings.subpixel_count, *part, auto, *map(F, counts), *shares])
 
     def run(some: ShadingPoints, shift: int, found: Radiance) -> None:
-        kernel.shade(
-            tuple(map(plain, (some.pixel, some.sample, some.flags))),
-            tuple(map(plain, (some.origin, some.normal, some.geometric_normal, some.view))),
-            tuple(map(plain, (some.albedo, some.roughness, some.metallic, some.own, some.size))),
-            *tables,
-            *rules,
-            shift,
-            (found.components, found.moments),
-        )
+        kernel.shade(some.arrays, given, how._replace(shift=shift), sampler, (found.components, found.moments))
 
     run(points, 0, out)
     out.variance = variances(points.pixel, out.moments)
@@ -188,37 +172,63 @@ def mixed(seed: int, noise_index: int) -> int:
     return value >> 32
 
 
+class Scratch(NamedTuple):
+    """Memory that `shade_points` works in.
+
+    Attributes
+    ----------
+    rays : Batch
+        Samples of points, BATCH of them.
+    paths : Batch
+        Paths that these begin.
+    found : (BATCH, FOUND) float32 array
+        Light of the paths, see `indirect`.
+    sums : (block, KINDS * KIND) float32 array
+        Light of the block's points, see `direct`.
+    state : (block, POINT_STATE) float32 array
+        What their samples share, see `sample_allocation`.
+    row : (block,) uint32 array
+        Their rows in the environment's tables.
+    total : (block,) int64 array
+        Their samples.
+    """
+
+    rays: w.Batch
+    paths: w.Batch
+    found: Array
+    sums: Array
+    state: Array
+    row: Array
+    total: Array
+
+
 @njit
-def shade_points(  # type: ignore[no-untyped-def]
-    lane, lanes, room, keys, frames, surfaces, tracer, geometry, extent, envmap, lit_by, lights, table, sequence, split,
-    subpixels, part, bounces, shading_model, seed, limit, differ, shift, out,
-):  # fmt: skip
+def shade_points(lane, lanes, scratch, points, scene, settings, sampler, out):  # type: ignore[no-untyped-def]
     """Shade every so-manyth (`lanes`) block of points, from the `lane`-th on.
 
     Parameters
     ----------
-    room : tuple
-        Scratch memory, see `_room`.
-    keys, frames, surfaces : tuple of array
-        Of the points.
+    scratch : Scratch
+    points : PointArrays
+    scene : Scene
+    settings : Settings
+    sampler : Sampler
     out : tuple of array
-        Components and moments of their `Radiance`.
+        Components and moments of the points' `Radiance`.
     """
-    pixel, sample, flags = keys
     components, moments = out
-    n = len(pixel)
+    n = len(points.pixel)
     blocks = (n + _BLOCK - 1) // _BLOCK
-    scene, illumination = (tracer, geometry, extent), (envmap, lit_by[0], lights, lit_by[1])
-    rays, paths, found, sums, state, row, total = room
-    s, ints = rays
+    rays, sums, state, total, seed = scratch.rays, scratch.sums, scratch.state, scratch.total, sampler.seed
+    ints, part, parts = rays.ints, sampler.part, sampler.parts
     # Samples of a sub-sample's part lie next to each other among those of the pixel.
-    rate = ONE / F(subpixels * part[1])
+    rate = ONE / F(sampler.subpixels * parts)
     for block in range(lane, blocks, lanes):
         start = block * _BLOCK
         end = min(n, start + _BLOCK)
         sums[:] = ZERO
         total[:] = 0
-        write_point_states(start, end, frames, surfaces, extent, envmap, shading_model, table, split, state, row)
+        write_point_states(start, end, points, scene, settings, sampler, scratch)
         begun = np.int64(0)
         for strategy in range(4):
             count = np.int64(0)
@@ -226,49 +236,40 @@ def shade_points(  # type: ignore[no-untyped-def]
                 h = i - start
                 if state[h, ALPHA] < ZERO or state[h, COUNTS + strategy] == ZERO:
                     continue
-                own = U(seed ^ mix(U(pixel[i])))
-                if flags[i] & SECOND:
+                own = U(seed ^ mix(U(points.pixel[i])))
+                if points.flags[i] & SECOND:
                     own = U(own ^ U(0x5BD1E995))
                 key = mix(U(mix(own) + U(U(strategy + 1) * GOLDEN)))
                 step = state[h, COUNTS + strategy] * rate
                 dither = unit(mix(U(key + U(4))))
+                sample = points.sample[i]
                 # Each position begins with another part, lest a part have samples at all positions of a pixel or none.
-                turn = np.int64((np.uint64(U(U(sample[i]) * GOLDEN)) * np.uint64(part[1])) >> np.uint64(32))
-                place = F(sample[i] * part[1] + (part[0] + turn) % part[1])
+                turn = np.int64((np.uint64(U(U(sample) * GOLDEN)) * np.uint64(parts)) >> np.uint64(32))
+                place = F(sample * parts + (part + turn) % parts)
                 first, past = np.int64(place * step + dither), np.int64((place + ONE) * step + dither)
                 for j in range(first, past):
                     if count == BATCH:
-                        begun = trace_batch(
-                            strategy, count, rays, paths, begun, found, scene, illumination, table, bounces,
-                            shading_model,
-                            limit,
-                            differ, shift, sums,
-                        )  # fmt: skip
+                        begun = trace_batch(strategy, count, begun, scratch, scene, settings)
                         count = np.int64(0)
                     total[h] += 1
-                    put_sample(tracer, s, ints, count, i, h, frames, surfaces, state, rate)
+                    put_sample(scene.tracer, rays, count, points, i, state, h, rate)
                     _, c = w.at(count)
                     ints[c + w.KEY] = mix(U(key ^ U(U(j + 1) * U(0x85EBCA6B))))
-                    ints[c + w.CELL], ints[c + w.ROW] = key, row[h]
+                    ints[c + w.CELL], ints[c + w.ROW] = key, scratch.row[h]
+                    sequence = sampler.sequence
                     ints[c + w.N0], ints[c + w.N1], ints[c + w.N2] = sequence[j, 0], sequence[j, 1], sequence[j, 2]
                     count += 1
             if count > 0:
-                begun = trace_batch(
-                    strategy, count, rays, paths, begun, found, scene, illumination, table, bounces, shading_model,
-                    limit,
-                    differ,
-                    shift, sums,
-                )  # fmt: skip
-        trace_paths(paths[0], paths[1], begun, scene, illumination, shading_model, table, bounces, shift, found)
-        deliver(begun, found, limit, sums)
+                begun = trace_batch(strategy, count, begun, scratch, scene, settings)
+        trace_paths(scratch.paths, begun, scene, settings, scratch.found)
+        deliver(begun, scratch.found, settings.clamp, sums)
         for i in range(start, end):
             finish(sums, i - start, total[i - start], components, moments, i)
 
 
 @njit
-def _room() -> Any:
-    """Scratch memory of `shade_points`."""
-    return (
+def _scratch() -> Any:
+    return Scratch(
         w.batch(BATCH),
         w.batch(BATCH),
         np.zeros((BATCH, FOUND), np.float32),
@@ -280,13 +281,9 @@ def _room() -> Any:
 
 
 @njit(parallel=True)
-def _kernel(  # type: ignore[no-untyped-def]
-    keys, frames, surfaces, tracer, geometry, extent, envmap, lit_by, lights, table, sequence, split, subpixels, part,
-    bounces, shading_model, seed, limit, differ, shift, out, lanes,
-):  # fmt: skip
+def _kernel(points, tracer, geometry, envmap, lights, traits, settings, sampler, out, lanes):  # type: ignore[no-untyped-def]
     # Threads get neighbouring lanes, lanes get every so-manyth block: no thread is left with all the costly ones.
     for lane in prange(lanes):
-        shade_points(
-            np.int64(lane), lanes, _room(), keys, frames, surfaces, tracer, geometry, extent, envmap, lit_by, lights,
-            table, sequence, split, subpixels, part, bounces, shading_model, seed, limit, differ, shift, out,
-        )  # fmt: skip
+        # Made here: Numba passes no tuples within tuples to threads.
+        scene = Scene(tracer, geometry, envmap, lights, traits)
+        shade_points(np.int64(lane), lanes, _scratch(), points, scene, settings, sampler, out)

@@ -21,6 +21,7 @@ from ..lights.triangle_light import ABSENT
 from ..sampling import ONE, ZERO, F, U, mix, unit
 from ..scene import ray_masks
 from ..scene.interaction import Tracer, nearest, shadowed, surface_at
+from ..scene.ray import Hit, Ray
 from ..surfels.raster import GAP
 from ..surfels.surfel_tracer import trace_surfels, transmittance
 from . import wavefront as w
@@ -44,119 +45,167 @@ class MixedTracer(NamedTuple):
     surfel_object: int
 
 
+class MixedHit(NamedTuple):
+    """`Hit` of a mesh, or of surfels as one blended surface: then face and place are -1, and the rest describes it.
+
+    Attributes
+    ----------
+    t, face, place, u, v, gx, gy, gz : float32
+        As of `Hit`.
+    nx, ny, nz : float32
+        Unit shading normal.
+    r, g, b, roughness, metallic : float32
+        Linear Rec.709.
+    size : float32
+        Metres: mean larger standard deviation of the surfels.
+    owner : int32
+        Their object; -1: it is a mesh.
+    """
+
+    t: np.float32
+    face: np.int32
+    place: np.int32
+    u: np.float32
+    v: np.float32
+    gx: np.float32
+    gy: np.float32
+    gz: np.float32
+    nx: np.float32
+    ny: np.float32
+    nz: np.float32
+    r: np.float32
+    g: np.float32
+    b: np.float32
+    roughness: np.float32
+    metallic: np.float32
+    size: np.float32
+    owner: np.int32
+
+
 def meshes_alone(meshes: Tracer) -> MixedTracer:
     """A tracer of no surfels."""
     return MixedTracer(*meshes, 0, 0, 0, 0, 0)
 
 
 @njit
-def passed_meshes(tracer, s, ints, slot, far, mask):  # type: ignore[no-untyped-def]
+def ray_of(rays, slot, far, mask):  # type: ignore[no-untyped-def]
+    """The `Ray` of a slot, which ends at `far`."""
+    s, _ = rays
     i, _ = w.at(slot)
-    hidden = shadowed(
-        tracer, s[i + w.OX], s[i + w.OY], s[i + w.OZ], s[i + w.LX], s[i + w.LY], s[i + w.LZ], ZERO, far, mask
-    )
+    origin, direction = (s[i + w.OX], s[i + w.OY], s[i + w.OZ]), (s[i + w.LX], s[i + w.LY], s[i + w.LZ])
+    return Ray(origin, direction, ZERO, far, mask)
+
+
+@njit
+def passed_meshes(tracer, rays, slot, far, mask):  # type: ignore[no-untyped-def]
+    hidden = shadowed(tracer, ray_of(rays, slot, far, mask))
     return ZERO if hidden else ONE
 
 
 @njit
-def passed(tracer, s, ints, slot, far, mask):  # type: ignore[no-untyped-def]
+def passed(tracer, rays, slot, far, mask):  # type: ignore[no-untyped-def]
     """Share of light that reaches a slot's position from its direction, from no farther than `far`."""
-    i, c = w.at(slot)
-    ox, oy, oz, lx, ly, lz = s[i + w.OX], s[i + w.OY], s[i + w.OZ], s[i + w.LX], s[i + w.LY], s[i + w.LZ]
-    if shadowed(tracer, ox, oy, oz, lx, ly, lz, ZERO, far, mask):
+    ray = ray_of(rays, slot, far, mask)
+    if shadowed(tracer, ray):
         return ZERO
     if tracer.surfel_scene == 0:
         return ONE
+    s, ints = rays
+    i, c = w.at(slot)
     return transmittance(
-        tracer, ox, oy, oz, lx, ly, lz, ZERO, far, mask, np.int32(ints[c + w.OWN]),
+        tracer, *ray.origin, *ray.direction, ZERO, far, mask, np.int32(ints[c + w.OWN]),
         s[i + w.GX], s[i + w.GY], s[i + w.GZ], s[i + w.SIZE],
     )  # fmt: skip
 
 
 @njit
-def meet_meshes(tracer, s, ints, slot, mask):  # type: ignore[no-untyped-def]
-    i, _ = w.at(slot)
-    hit = nearest(tracer, s[i + w.OX], s[i + w.OY], s[i + w.OZ], s[i + w.LX], s[i + w.LY], s[i + w.LZ], ZERO, FAR, mask)
-    return (ONE if hit[1] < 0 else ZERO), hit[0], hit
+def meet_meshes(tracer, rays, slot, mask):  # type: ignore[no-untyped-def]
+    hit = nearest(tracer, ray_of(rays, slot, FAR, mask))
+    return (ONE if hit.face < 0 else ZERO), hit.t, hit
 
 
 @njit
-def meet(tracer, s, ints, slot, mask):  # type: ignore[no-untyped-def]
+def meet(tracer, rays, slot, mask):  # type: ignore[no-untyped-def]
     """Follow a slot's ray: ``(through, reach, hit)``.
 
     ``through`` is the share of light that comes from beyond everything: 1 where nothing is met, 0 behind a mesh. Lights
     nearer than ``reach`` are seen. ``hit`` is for `put_hit`, and not to be used where ``through`` is 1.
     """
-    i, c = w.at(slot)
-    ox, oy, oz, lx, ly, lz = s[i + w.OX], s[i + w.OY], s[i + w.OZ], s[i + w.LX], s[i + w.LY], s[i + w.LZ]
-    t, face, place, u, v, gx, gy, gz = nearest(tracer, ox, oy, oz, lx, ly, lz, ZERO, FAR, mask)
+    ray = ray_of(rays, slot, FAR, mask)
+    t, face, place, u, v, gx, gy, gz = nearest(tracer, ray)
     none = np.int32(-1)
     blank = (ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, none)
     if tracer.surfel_scene == 0:
-        return (ONE if face < 0 else ZERO), t, (t, face, place, u, v, gx, gy, gz, *blank)
+        return (ONE if face < 0 else ZERO), t, MixedHit(t, face, place, u, v, gx, gy, gz, *blank)
+    s, ints = rays
+    i, c = w.at(slot)
     key = ints[c + w.KEY]
     through, depth, nx, ny, nz, px, py, pz, r, g, b, roughness, metallic, size, owner, reach = trace_surfels(
-        tracer, ox, oy, oz, lx, ly, lz, ZERO, t, mask, np.int32(ints[c + w.OWN]),
+        tracer, *ray.origin, *ray.direction, ZERO, t, mask, np.int32(ints[c + w.OWN]),
         s[i + w.GX], s[i + w.GY], s[i + w.GZ], s[i + w.SIZE], _GAP, unit(mix(U(key + U(0x632BE59B)))),
     )  # fmt: skip
     if face >= 0:
         if owner < 0 or unit(mix(U(key + U(0x85157AF5)))) < through:
-            return ZERO, reach, (t, face, place, u, v, gx, gy, gz, *blank)
+            return ZERO, reach, MixedHit(t, face, place, u, v, gx, gy, gz, *blank)
         through = ZERO
     blended = (nx, ny, nz, r, g, b, roughness, metallic, size, owner)
-    return through, reach, (depth, none, none, ZERO, ZERO, px, py, pz, *blended)
+    return through, reach, MixedHit(depth, none, none, ZERO, ZERO, px, py, pz, *blended)
 
 
 @njit
-def _put_face(s, ints, slot, px, py, pz, dx, dy, dz, hit, key, owner):  # type: ignore[no-untyped-def]
+def _put_face(rays, slot, start, hit, key, owner):  # type: ignore[no-untyped-def]
+    s, ints = rays
     i, c = w.at(slot)
-    t = hit[0]
+    (px, py, pz), (dx, dy, dz) = start
+    t = hit.t
     s[i + w.OX], s[i + w.OY], s[i + w.OZ] = px + t * dx, py + t * dy, pz + t * dz
     s[i + w.VX], s[i + w.VY], s[i + w.VZ] = -dx, -dy, -dz
-    s[i + w.GX], s[i + w.GY], s[i + w.GZ] = hit[5], hit[6], hit[7]
-    s[i + w.MU], s[i + w.MV] = hit[3], hit[4]
-    ints[c + w.N0], ints[c + w.N1] = U(hit[1]), U(hit[2])
+    s[i + w.GX], s[i + w.GY], s[i + w.GZ] = hit.gx, hit.gy, hit.gz
+    s[i + w.MU], s[i + w.MV] = hit.u, hit.v
+    ints[c + w.N0], ints[c + w.N1] = U(hit.face), U(hit.place)
     ints[c + w.KEY], ints[c + w.OWNER] = key, U(owner)
 
 
 @njit
-def put_hit_meshes(tracer, s, ints, slot, px, py, pz, dx, dy, dz, hit, key, owner):  # type: ignore[no-untyped-def]
-    _put_face(s, ints, slot, px, py, pz, dx, dy, dz, hit, key, owner)
+def put_hit_meshes(tracer, rays, slot, start, hit, key, owner):  # type: ignore[no-untyped-def]
+    _put_face(rays, slot, start, hit, key, owner)
 
 
 @njit
-def put_hit(tracer, s, ints, slot, px, py, pz, dx, dy, dz, hit, key, owner):  # type: ignore[no-untyped-def]
-    """Put what a ray from p along d met (a hit of `meet`) into a slot, as `surface_of` reads it."""
-    _put_face(s, ints, slot, px, py, pz, dx, dy, dz, hit, key, owner)
+def put_hit(tracer, rays, slot, start, hit, key, owner):  # type: ignore[no-untyped-def]
+    """Put what a ray met into a slot, as `surface_of` reads it; `start` is its origin and direction."""
+    _put_face(rays, slot, start, hit, key, owner)
     if tracer.surfel_scene == 0:
         return
+    s, ints = rays
     i, c = w.at(slot)
-    s[i + w.NX], s[i + w.NY], s[i + w.NZ] = hit[8], hit[9], hit[10]
-    s[i + w.AR], s[i + w.AG], s[i + w.AB] = hit[11], hit[12], hit[13]
-    s[i + w.A2], s[i + w.METALLIC], s[i + w.SIZE] = hit[14], hit[15], hit[16]
-    ints[c + w.OWN] = U(hit[17])
+    s[i + w.NX], s[i + w.NY], s[i + w.NZ] = hit.nx, hit.ny, hit.nz
+    s[i + w.AR], s[i + w.AG], s[i + w.AB] = hit.r, hit.g, hit.b
+    s[i + w.A2], s[i + w.METALLIC], s[i + w.SIZE] = hit.roughness, hit.metallic, hit.size
+    ints[c + w.OWN] = U(hit.owner)
 
 
 @njit
-def _face_of(s, ints, slot, geometry):  # type: ignore[no-untyped-def]
+def _face_of(rays, slot, geometry):  # type: ignore[no-untyped-def]
+    s, ints = rays
     i, c = w.at(slot)
-    return surface_at(
-        np.int32(ints[c + w.N0]), np.int32(ints[c + w.N1]), s[i + w.MU], s[i + w.MV],
-        s[i + w.GX], s[i + w.GY], s[i + w.GZ], -s[i + w.VX], -s[i + w.VY], -s[i + w.VZ], geometry,
-    )[:14]  # fmt: skip
+    face, place = np.int32(ints[c + w.N0]), np.int32(ints[c + w.N1])
+    hit = Hit(ZERO, face, place, s[i + w.MU], s[i + w.MV], s[i + w.GX], s[i + w.GY], s[i + w.GZ])
+    return surface_at(hit, (-s[i + w.VX], -s[i + w.VY], -s[i + w.VZ]), geometry)[:14]
 
 
 @njit
-def surface_of_meshes(tracer, s, ints, slot, geometry):  # type: ignore[no-untyped-def]
-    return _face_of(s, ints, slot, geometry)
+def surface_of_meshes(tracer, rays, slot, geometry):  # type: ignore[no-untyped-def]
+    return _face_of(rays, slot, geometry)
 
 
 @njit
-def surface_of(tracer, s, ints, slot, geometry):  # type: ignore[no-untyped-def]
+def surface_of(tracer, rays, slot, geometry):  # type: ignore[no-untyped-def]
     """What `surface_at` says of the hit in a slot, save for its object."""
+    s, ints = rays
     i, c = w.at(slot)
     if ints[c + w.N0] != _SURFELS:
-        return _face_of(s, ints, slot, geometry)
+        return _face_of(rays, slot, geometry)
     return (
         s[i + w.NX], s[i + w.NY], s[i + w.NZ], s[i + w.GX], s[i + w.GY], s[i + w.GZ],
         s[i + w.AR], s[i + w.AG], s[i + w.AB], s[i + w.A2], s[i + w.METALLIC], ZERO, ZERO, ZERO,
@@ -164,38 +213,40 @@ def surface_of(tracer, s, ints, slot, geometry):  # type: ignore[no-untyped-def]
 
 
 @njit
-def put_start_meshes(tracer, s, ints, slot, own, size, point):  # type: ignore[no-untyped-def]
+def put_start_meshes(tracer, rays, slot, points, point):  # type: ignore[no-untyped-def]
     pass
 
 
 @njit
-def put_start(tracer, s, ints, slot, own, size, point):  # type: ignore[no-untyped-def]
+def put_start(tracer, rays, slot, points, point):  # type: ignore[no-untyped-def]
     """Put into a slot which surfels are the `point`-th shading point's own; see ``ShadingPoints``."""
     if tracer.surfel_scene == 0:
         return
+    s, ints = rays
     i, c = w.at(slot)
-    s[i + w.SIZE] = size[point]
-    ints[c + w.OWN] = U(own[point])
+    s[i + w.SIZE] = points.size[point]
+    ints[c + w.OWN] = U(points.own[point])
 
 
 @njit
-def light_radiance(s, ints, slot, others, glossy_others, share, lights, tracer, mask):  # type: ignore[no-untyped-def]
+def light_radiance(rays, slot, others, glossy_others, share, lights, tracer, mask):  # type: ignore[no-untyped-def]
     """What a light sample brings: radiance over density for the diffuse and for the glossy lobe, 0 when in shadow.
 
     `others` and `share` are the balance heuristic's densities of other strategies, for the diffuse and for the glossy
     lobe, and number of light samples.
     """
+    s, ints = rays
     i, c = w.at(slot)
     density = s[i + w.MV]
     r, g, b = s[i + w.ER], s[i + w.EG], s[i + w.EB]
     if not (s[i + w.LIVE] > ZERO and r + g + b > ZERO and density != ZERO):
         return ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
-    flags = light_flags(np.int64(ints[c + w.CELL]), lights[0], lights[2])
+    flags = light_flags(np.int64(ints[c + w.CELL]), lights)
     if flags & ABSENT and mask >> ray_masks.WITHOUT:
         return ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
     bright = ONE
     if flags & SHADOWED:
-        bright = passed(tracer, s, ints, slot, s[i + w.MU] * F(0.9999), mask)
+        bright = passed(tracer, rays, slot, s[i + w.MU] * F(0.9999), mask)
         if not bright > ZERO:
             return ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
     if density < ZERO:

@@ -31,17 +31,19 @@ def _rounded(x):  # type: ignore[no-untyped-def]
 
 
 @njit
-def _allocate(state, h, share, split):  # type: ignore[no-untyped-def]
+def _allocate(state, h, share, sampler):  # type: ignore[no-untyped-def]
     """Samples a pixel of each strategy at the h-th point; `share` is the diffuse lobe's part of what it reflects.
 
     Whole numbers in coarse steps: points of one pixel mostly agree, and then their samples add up to these numbers.
     """
-    auto, cosine, ggx, light, envmap, lights, most = split
-    if auto:
+    cosine, ggx, light = sampler.cosine, sampler.ggx, sampler.light
+    envmap, lights = sampler.environment_share, sampler.lights_share
+    if sampler.auto:
         total = cosine + ggx + light
         alpha = F(math.sqrt(state[h, ALPHA]))
         glossy = _LIGHT_GLOSSY * min(ONE, max(F(0.05), alpha / _WIDE))
-        light = total * min(most, share * _LIGHT_DIFFUSE + (ONE - share) * glossy) if envmap + lights > ZERO else ZERO
+        light = total * min(sampler.most_light, share * _LIGHT_DIFFUSE + (ONE - share) * glossy)
+        light = light if envmap + lights > ZERO else ZERO
         ggx = (total - light) * (ONE - share)
         if total >= F(3.0):
             # Each lobe keeps a ray: what its own rays alone find (`apart`) must not be lost.
@@ -64,13 +66,27 @@ def _allocate(state, h, share, split):  # type: ignore[no-untyped-def]
 
 
 @njit
-def write_point_states(first, last, frames, surfaces, extent, envmap, shading_model, table, split, state, row):  # type: ignore[no-untyped-def]
+def write_point_states(first, last, points, scene, settings, sampler, scratch):  # type: ignore[no-untyped-def]
     """What all samples of a point share, see `POINT_STATE`, and its row in the light's tables.
 
     Alpha squared is -1 where the point is unusable.
+
+    Parameters
+    ----------
+    first, last : int
+        The points, half-open.
+    points : PointArrays
+    scene : Scene
+    settings : Settings
+    sampler : Sampler
+    scratch : Scratch
+        `state` and `row` are written.
     """
-    origin, normal, flat, view = frames
-    albedo, roughness, metallic, _, _ = surfaces
+    origin, normal, flat, view = points.origin, points.normal, points.geometric_normal, points.viewer
+    albedo, roughness, metallic = points.albedo, points.roughness, points.metallic
+    state, row = scratch.state, scratch.row
+    envmap, extent = scene.envmap, scene.traits.extent
+    shading_model, layers = settings.shading_model, settings.layers
     for i in range(first, last):
         h = i - first
         check = roughness[i] + metallic[i]
@@ -83,19 +99,20 @@ def write_point_states(first, last, frames, surfaces, extent, envmap, shading_mo
         state[h, 0], state[h, 1], state[h, 2] = lifted(origin[i, 0], origin[i, 1], origin[i, 2], gx, gy, gz, extent)
         mx, my, mz = brdf.glossy_normal(normal[i, 0], normal[i, 1], normal[i, 2], gx, gy, gz, vx, vy, vz)
         mv = mx * vx + my * vy + mz * vz
-        weight = brdf.diffuse_weight(roughness[i], metallic[i], mv, shading_model, table)
+        weight = brdf.diffuse_weight(roughness[i], metallic[i], mv, shading_model, layers)
         state[h, ALPHA], state[h, WEIGHT] = brdf.alpha_squared(roughness[i]), weight
         state[h, NORMAL], state[h, NORMAL + 1], state[h, NORMAL + 2] = mx, my, mz
         r, g, b = albedo[i, 0], albedo[i, 1], albedo[i, 2]
         row[h] = U(product_row(normal[i, 0], normal[i, 1], normal[i, 2], envmap))
-        _allocate(state, h, w.diffuse_share(mv, r, g, b, weight, metallic[i], shading_model), split)
+        _allocate(state, h, w.diffuse_share(mv, r, g, b, weight, metallic[i], shading_model), sampler)
 
 
 @njit
-def put_sample(tracer, s, ints, slot, i, h, frames, surfaces, state, rate):  # type: ignore[no-untyped-def]
+def put_sample(tracer, rays, slot, points, i, state, h, rate):  # type: ignore[no-untyped-def]
     """Copy point i, the h-th of its block, into a slot; `rate` is its part of a pixel's samples."""
-    _, normal, flat, view = frames
-    albedo, _, metallic, own, size = surfaces
+    s, ints = rays
+    normal, flat, view = points.normal, points.geometric_normal, points.viewer
+    albedo, metallic = points.albedo, points.metallic
     a, c = w.at(slot)
     s[a + w.OX], s[a + w.OY], s[a + w.OZ] = state[h, 0], state[h, 1], state[h, 2]
     s[a + w.NX], s[a + w.NY], s[a + w.NZ] = normal[i, 0], normal[i, 1], normal[i, 2]
@@ -107,4 +124,4 @@ def put_sample(tracer, s, ints, slot, i, h, frames, surfaces, state, rate):  # t
     s[a + w.WC], s[a + w.WG] = state[h, COUNTS + COSINE] * rate, state[h, COUNTS + GGX] * rate
     s[a + w.WE], s[a + w.WL] = state[h, COUNTS + ENVIRONMENT] * rate, state[h, COUNTS + LIGHTS] * rate
     ints[c + w.OWNER] = U(h)
-    put_start(tracer, s, ints, slot, own, size, i)
+    put_start(tracer, rays, slot, points, i)

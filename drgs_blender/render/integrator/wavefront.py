@@ -9,6 +9,7 @@ overlaps their cache misses.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -55,11 +56,26 @@ IN_LANES = (
 _TINY = F(1e-30)
 
 
+class Batch(NamedTuple):
+    """Rays that are worked off together, with what they start from and what they find; see this module's head.
+
+    Attributes
+    ----------
+    floats : (packets * 48 * LANES,) float32 array
+        Fields from OX to SIZE.
+    ints : (packets * 8 * LANES,) uint32 array
+        Fields from N0 to OWN.
+    """
+
+    floats: Array
+    ints: Array
+
+
 @njit
 def batch(capacity):  # type: ignore[no-untyped-def]
-    """(float32, uint32) arrays with room for `capacity` slots."""
+    """A `Batch` with room for `capacity` slots."""
     packets = (capacity + LANES - 1) // LANES
-    return np.zeros(packets * _FLOATS, np.float32), np.zeros(packets * _INTS, np.uint32)
+    return Batch(np.zeros(packets * _FLOATS, np.float32), np.zeros(packets * _INTS, np.uint32))
 
 
 @inlined
@@ -76,8 +92,9 @@ def packets(count):  # type: ignore[no-untyped-def]
 
 
 @njit
-def scramble(ints, count):  # type: ignore[no-untyped-def]
+def scramble(rays, count):  # type: ignore[no-untyped-def]
     """Turn N0 to N2, a Sobol' point with reversed bits, into random numbers; CELL is the key of the point set."""
+    ints = rays.ints
     for p in range(packets(count)):
         c = p * _INTS
         for i in range(c, c + LANES):
@@ -110,8 +127,9 @@ def _ggx_direction(s, i, u, v):  # type: ignore[no-untyped-def]
 
 
 @njit
-def cosine_directions(s, ints, count):  # type: ignore[no-untyped-def]
+def cosine_directions(rays, count):  # type: ignore[no-untyped-def]
     """Directions in proportion to the cosine."""
+    s, ints = rays
     for p in range(packets(count)):
         b, c = p * _FLOATS, p * _INTS
         for k in range(LANES):
@@ -121,8 +139,9 @@ def cosine_directions(s, ints, count):  # type: ignore[no-untyped-def]
 
 
 @njit
-def ggx_directions(s, ints, count):  # type: ignore[no-untyped-def]
+def ggx_directions(rays, count):  # type: ignore[no-untyped-def]
     """Directions by visible normals."""
+    s, ints = rays
     for p in range(packets(count)):
         b, c = p * _FLOATS, p * _INTS
         for k in range(LANES):
@@ -132,8 +151,9 @@ def ggx_directions(s, ints, count):  # type: ignore[no-untyped-def]
 
 
 @njit
-def brdf_directions(s, ints, count):  # type: ignore[no-untyped-def]
+def brdf_directions(rays, count):  # type: ignore[no-untyped-def]
     """Directions from the mixture of both lobes; CELL tells which (1 diffuse, 0 specular)."""
+    s, ints = rays
     for p in range(packets(count)):
         b, c = p * _FLOATS, p * _INTS
         for k in range(LANES):
@@ -149,8 +169,9 @@ def brdf_directions(s, ints, count):  # type: ignore[no-untyped-def]
 
 
 @njit
-def environment_directions(s, ints, count, envmap):  # type: ignore[no-untyped-def]
+def environment_directions(rays, count, envmap):  # type: ignore[no-untyped-def]
     """Directions towards the environment in proportion to its light on the surface, with MU, MV and PE."""
+    s, ints = rays
     for slot in range(count):
         _, c = at(slot)
         ints[c + CELL] = U(block_of(ints[c + ROW], ints[c + N2], envmap))
@@ -185,12 +206,13 @@ def environment_directions(s, ints, count, envmap):  # type: ignore[no-untyped-d
 
 
 @njit
-def light_directions(s, ints, count, lights):  # type: ignore[no-untyped-def]
+def light_directions(rays, count, lights):  # type: ignore[no-untyped-def]
     """Directions towards lights, with ER, EG, EB, distance, density (see ``sample_light``) and the light in CELL."""
+    s, ints = rays
     for slot in range(count):
         i, c = at(slot)
         lx, ly, lz, distance, r, g, b, density, light = sample_light(
-            ints[c + N2], ints[c + N0], ints[c + N1], s[i + OX], s[i + OY], s[i + OZ], *lights
+            ints[c + N2], ints[c + N0], ints[c + N1], s[i + OX], s[i + OY], s[i + OZ], lights
         )
         s[i + LX], s[i + LY], s[i + LZ], s[i + MU], s[i + MV] = lx, ly, lz, distance, density
         s[i + ER], s[i + EG], s[i + EB] = r, g, b
@@ -198,8 +220,9 @@ def light_directions(s, ints, count, lights):  # type: ignore[no-untyped-def]
 
 
 @njit
-def look_up(s, ints, count, envmap):  # type: ignore[no-untyped-def]
+def look_up(rays, count, envmap):  # type: ignore[no-untyped-def]
     """MU, MV and PE of directions that were not drawn from the environment."""
+    s, ints = rays
     for p in range(packets(count)):
         for i in range(p * _FLOATS, p * _FLOATS + LANES):
             s[i + MU], s[i + MV] = map_at(s[i + LX], s[i + LY], s[i + LZ], envmap)
@@ -210,8 +233,9 @@ def look_up(s, ints, count, envmap):  # type: ignore[no-untyped-def]
 
 
 @njit
-def warm(s, count, envmap):  # type: ignore[no-untyped-def]
+def warm(rays, count, envmap):  # type: ignore[no-untyped-def]
     """Fetch what `envmap_radiance` will read, all at once, long before it waits for it."""
+    s = rays.floats
     for slot in range(count):
         i, _ = at(slot)
         if s[i + LIVE] > ZERO:
@@ -219,8 +243,9 @@ def warm(s, count, envmap):  # type: ignore[no-untyped-def]
 
 
 @njit
-def evaluate(s, count, shading_model):  # type: ignore[no-untyped-def]
+def evaluate(rays, count, shading_model):  # type: ignore[no-untyped-def]
     """BRDF of both lobes times cosine, densities of cosine and GGX sampling, and LIVE: whether any light can pass."""
+    s = rays.floats
     for p in range(packets(count)):
         for i in range(p * _FLOATS, p * _FLOATS + LANES):
             lx, ly, lz = s[i + LX], s[i + LY], s[i + LZ]
@@ -236,20 +261,9 @@ def evaluate(s, count, shading_model):  # type: ignore[no-untyped-def]
             mh2, sin2 = (ml + mv) * (ml + mv) * inverse, (cx * cx + cy * cy + cz * cz) * inverse
             a2 = s[i + A2]
             _, norm = brdf.vndf_terms(max(mv, ZERO), a2)
+            angles, albedo = (ml, mv, vl, mh2, sin2), (s[i + AR], s[i + AG], s[i + AB])
             qr, qg, qb, sr, sg, sb, pg = brdf.evaluate(
-                ml,
-                mv,
-                vl,
-                mh2,
-                sin2,
-                s[i + AR],
-                s[i + AG],
-                s[i + AB],
-                s[i + KD],
-                s[i + METALLIC],
-                a2,
-                norm,
-                shading_model,
+                angles, albedo, s[i + KD], s[i + METALLIC], a2, norm, shading_model
             )
             s[i + QR], s[i + QG], s[i + QB] = qr * nl, qg * nl, qb * nl
             above = ml > ZERO
@@ -282,8 +296,9 @@ def weigh_one(s, i, cosine, ggx):  # type: ignore[no-untyped-def]
 
 
 @njit
-def weigh(s, count, cosine, ggx):  # type: ignore[no-untyped-def]
+def weigh(rays, count, cosine, ggx):  # type: ignore[no-untyped-def]
     """Divide by the density of all strategies together; the arguments (1 or 0) say whether these two take part."""
+    s = rays.floats
     for p in range(packets(count)):
         # Two loops, for LLVM vectorises none with so many places that are read and written.
         for i in range(p * _FLOATS, p * _FLOATS + LANES):
@@ -293,8 +308,9 @@ def weigh(s, count, cosine, ggx):  # type: ignore[no-untyped-def]
 
 
 @njit
-def weigh_apart(s, count):  # type: ignore[no-untyped-def]
+def weigh_apart(rays, count):  # type: ignore[no-untyped-def]
     """`weigh` where cosine sampling is of the diffuse lobe alone, GGX sampling of the specular one alone."""
+    s = rays.floats
     for p in range(packets(count)):
         for i in range(p * _FLOATS, p * _FLOATS + LANES):
             light = s[i + WE] * s[i + PE]
@@ -305,8 +321,9 @@ def weigh_apart(s, count):  # type: ignore[no-untyped-def]
 
 
 @njit
-def drop(s, count, lobe):  # type: ignore[no-untyped-def]
+def drop(rays, count, lobe):  # type: ignore[no-untyped-def]
     """Take the lobe whose fields begin at `lobe` (QR or SR) out of the BRDF."""
+    s = rays.floats
     for p in range(packets(count)):
         for i in range(p * _FLOATS + lobe, p * _FLOATS + lobe + 3 * LANES):
             s[i] = ZERO
@@ -323,8 +340,9 @@ def diffuse_share(mv, r, g, b, kd, metallic, shading_model):  # type: ignore[no-
 
 
 @njit
-def lobe_shares(s, count, shading_model):  # type: ignore[no-untyped-def]
+def lobe_shares(rays, count, shading_model):  # type: ignore[no-untyped-def]
     """SHARE: how often the diffuse lobe is sampled."""
+    s = rays.floats
     for p in range(packets(count)):
         for i in range(p * _FLOATS, p * _FLOATS + LANES):
             mv = s[i + MX] * s[i + VX] + s[i + MY] * s[i + VY] + s[i + MZ] * s[i + VZ]
@@ -332,11 +350,12 @@ def lobe_shares(s, count, shading_model):  # type: ignore[no-untyped-def]
 
 
 @njit
-def carry(s, count, light):  # type: ignore[no-untyped-def]
+def carry(rays, count, light):  # type: ignore[no-untyped-def]
     """Put throughput times both lobes into QR, QG, QB, and what a path's samples are divided by into PG and PE.
 
     PG becomes the density of the mixture of lobes, PE the same plus `light` times the density of light sampling.
     """
+    s = rays.floats
     for p in range(packets(count)):
         for i in range(p * _FLOATS, p * _FLOATS + LANES):
             s[i + QR] = s[i + TR] * (s[i + QR] + s[i + SR])
@@ -348,8 +367,9 @@ def carry(s, count, light):  # type: ignore[no-untyped-def]
 
 
 @njit
-def fresh_numbers(ints, count, step):  # type: ignore[no-untyped-def]
+def fresh_numbers(rays, count, step):  # type: ignore[no-untyped-def]
     """Move on to the next key and hash three random numbers from it."""
+    ints = rays.ints
     for p in range(packets(count)):
         c = p * _INTS
         for i in range(c, c + LANES):

@@ -8,6 +8,7 @@ not depend on their number.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -102,8 +103,9 @@ class Cells:
         self.guide = np.zeros(1 << (rows * columns - 1).bit_length(), np.int32)
         self.density = np.zeros((rows, columns), np.float32)
         unit = 2.0**-32 if self.power > 0.0 else 0.0
-        dealt = before, reached, starts, spare, self.runs, self.guide
-        _deal(weights, 1.0 / parts.sum(), self.corners, inner, *dealt, unit / solid, self.step, self.density, texels)
+        blocks = _Blocks(self.corners, inner, before, reached, starts)
+        out = self.runs, self.guide, self.density, texels
+        _deal(weights, 1.0 / parts.sum(), spare, blocks, unit / solid, self.step, *out)
 
     def part_directions(self) -> Array:
         """(3, p, n) float32 unit directions towards the middles of `parts`, in the environment's frame."""
@@ -202,11 +204,49 @@ def _sum_blocks(weights, corners, inner, coarse, bits, lit, parts):  # type: ign
                 parts[((inner[k, 0] >> coarse) << bits) + (inner[k, 1] >> coarse), b] += weights[row, column]
 
 
+class _Blocks(NamedTuple):
+    """The blocks that have light, in their order.
+
+    Attributes
+    ----------
+    corners : (n, 2) int32 array
+        `Cells.corners`.
+    inner : (k, 2) int32 array
+        Cells of a block by row and column from there, in their order.
+    before : (n + 1,) int64 array
+        Lit cells before each block, and in all.
+    reached : (n + 1,) float64 array
+        Power of all blocks before each one; at last 1.
+    starts : (n + 1,) int64 array
+        First random number of each block; at last 2^32.
+    """
+
+    corners: Array
+    inner: Array
+    before: Array
+    reached: Array
+    starts: Array
+
+
 @njit(parallel=True)
-def _deal(  # type: ignore[no-untyped-def]
-    weights, scale, corners, inner, before, reached, starts, spare, runs, guide, per_number, step, density, texels
-):
-    """Divide the random numbers of each block among its lit cells; write their densities."""
+def _deal(weights, scale, spare, blocks, per_number, step, runs, guide, density, texels):  # type: ignore[no-untyped-def]
+    """Divide the random numbers of each block among its lit cells; write their densities.
+
+    Parameters
+    ----------
+    weights : array
+        Power of each cell, `scale` times which all are 1 together.
+    spare : int
+        Random numbers beyond one for each lit cell.
+    blocks : _Blocks
+    per_number : array
+        Density of one random number in a cell of each row.
+    step : int
+        `Cells.step`.
+    runs, guide, density, texels : array
+        Of `Cells`; written.
+    """
+    corners, inner, before, reached, starts = blocks
     rows, columns = weights.shape
     width = (np.int64(1) << 32) // len(guide)
     for b in prange(len(corners)):

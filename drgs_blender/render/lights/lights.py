@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from ...compute.jit import njit, plain
@@ -48,6 +50,24 @@ from .light_tree import (
 from .mesh_lights import Emitters, emitter_bits, emitter_pdf, emitter_row, emitters_luminance, sample_emitter
 
 Array = np.ndarray
+
+
+class LightTables(NamedTuple):
+    """All lights, for compiled code; valid until the next update of the emitters' scene.
+
+    Attributes
+    ----------
+    table : (k, WIDTH) float32 array
+        `Lights.table`.
+    pick : (m, 16) float32 array
+        `Lights.pick`.
+    emitters : int
+        Address of the tables of `mesh_lights.Emitters`; 0: there are none.
+    """
+
+    table: Array
+    pick: Array
+    emitters: int
 
 
 class Lights:
@@ -116,9 +136,9 @@ class Lights:
         self.seen = bool((flags & CAMERA).any())
 
     @property
-    def tables(self) -> tuple[Array, Array, int]:
+    def tables(self) -> LightTables:
         """What compiled code takes as `lights`; until the next update of the emitters' scene."""
-        return self.table, self.pick, self.emitters.address
+        return LightTables(self.table, self.pick, self.emitters.address)
 
     def sample(self, numbers: Array, points: Array) -> tuple[Array, Array, Array, Array, Array]:
         """``sample_light`` for (n, 3) uint32 and (n, 3) or (3,) points.
@@ -132,14 +152,14 @@ class Lights:
         rows : (n,) array
         """
         numbers = np.ascontiguousarray(numbers, np.uint32)
-        out, rows = _sample_many(numbers, _rows(points, numbers), *self.tables)
+        out, rows = _sample_many(numbers, _rows(points, numbers), self.tables)
         return out[:, :3], out[:, 3], out[:, 4:7], out[:, 7], rows
 
     def pdf(self, rows: Array, points: Array, directions: Array) -> Array:
         """(n,) ``pdf_light`` of table rows (n,) for (n, 3) unit directions at (n, 3) or (3,) points."""
         directions = np.ascontiguousarray(directions, np.float32)
         rows = plain(np.broadcast_to(np.asarray(rows, np.int64), len(directions)))
-        return _pdf_many(rows, _rows(points, directions), directions, *self.tables)
+        return _pdf_many(rows, _rows(points, directions), directions, self.tables)
 
     def along(
         self,
@@ -153,7 +173,7 @@ class Lights:
         """(n, 3) ``lights_along`` for (n, 3) unit directions from (n, 3) or (3,) origins."""
         directions = np.ascontiguousarray(directions, np.float32)
         others = plain(np.broadcast_to(np.asarray(others, np.float32), len(directions)))
-        return _along_many(_rows(origins, directions), directions, F(tmax), others, F(share), seen_by, *self.tables)
+        return _along_many(_rows(origins, directions), directions, F(tmax), others, F(share), seen_by, self.tables)
 
     def _power(self, centre: Array, radius: float) -> float:
         table = self.table.astype(np.float64)
@@ -172,8 +192,9 @@ _NO_EMITTERS = Emitters()
 
 
 @njit
-def _emitters_share(px, py, pz, table, pick, emitters):  # type: ignore[no-untyped-def]
+def _emitters_share(px, py, pz, lights):  # type: ignore[no-untyped-def]
     """How often surfaces are sampled from a point, rather than lights; float64."""
+    table, pick, emitters = lights
     if emitters == 0:
         return 0.0
     if pick[0, END] == ZERO:
@@ -184,7 +205,7 @@ def _emitters_share(px, py, pz, table, pick, emitters):  # type: ignore[no-untyp
 
 
 @njit
-def sample_light(n0, n1, n2, px, py, pz, table, pick, emitters):  # type: ignore[no-untyped-def]
+def sample_light(n0, n1, n2, px, py, pz, lights):  # type: ignore[no-untyped-def]
     """A direction from a point towards one of the lights or surfaces, from three uint32.
 
     Returns
@@ -196,7 +217,8 @@ def sample_light(n0, n1, n2, px, py, pz, table, pick, emitters):  # type: ignore
         f cos rgb / |pdf| without a further weight.
         (..., 0, 0, 0, 0, -1 or the light) when the light sends nothing here.
     """
-    share = _emitters_share(px, py, pz, table, pick, emitters)
+    table, pick, emitters = lights
+    share = _emitters_share(px, py, pz, lights)
     if share > 0.0:
         rest = np.float64(n0) * (1.0 / 4294967296.0)
         if rest < share:
@@ -227,45 +249,47 @@ def sample_light(n0, n1, n2, px, py, pz, table, pick, emitters):  # type: ignore
 
 
 @njit
-def light_flags(index, table, emitters):  # type: ignore[no-untyped-def]
+def light_flags(index, lights):  # type: ignore[no-untyped-def]
     """Bits CAMERA, DIFFUSE, GLOSSY (rays that see it), SHADOW (things block it) and ABSENT of what was sampled."""
+    table, _, emitters = lights
     if index >= len(table):
         return emitter_bits(index - len(table), emitters)
     return np.int64(table[index, FLAGS])
 
 
 @njit
-def pdf_light(index, px, py, pz, lx, ly, lz, table, pick, emitters):  # type: ignore[no-untyped-def]
+def pdf_light(index, px, py, pz, lx, ly, lz, lights):  # type: ignore[no-untyped-def]
     """Density per solid angle, pick included, with which ``sample_light`` draws this unit direction by this light.
 
     0 where the light sends nothing from there: the density of samples whose radiance is not 0. 0 for lights without
     size.
     """
+    table = lights.table
     t = light_hit(index, px, py, pz, lx, ly, lz, table)
     if not (t >= ZERO and light_emission(index, lx, ly, lz, table) > ZERO):
         return ZERO
     density = light_pdf(index, px, py, pz, lx, ly, lz, t, table)
     if not density > ZERO:
         return ZERO
-    return density * _probability(index, px, py, pz, table, pick, emitters)
+    return density * _probability(index, px, py, pz, lights)
 
 
 @njit
-def _probability(index, px, py, pz, table, pick, emitters):  # type: ignore[no-untyped-def]
+def _probability(index, px, py, pz, lights):  # type: ignore[no-untyped-def]
     """With which a light is picked."""
-    share = F(1.0 - _emitters_share(px, py, pz, table, pick, emitters))
-    return share * pick_probability(index, px, py, pz, table, pick)
+    share = F(1.0 - _emitters_share(px, py, pz, lights))
+    return share * pick_probability(index, px, py, pz, lights.table, lights.pick)
 
 
 @njit
-def emission_along(ox, oy, oz, dx, dy, dz, hit, geometry, table, pick, emitters):  # type: ignore[no-untyped-def]
+def emission_along(origin, direction, hit, geometry, lights):  # type: ignore[no-untyped-def]
     """What the surface that a ray meets emits, and how it is found by ``sample_light``.
 
     Parameters
     ----------
-    ox, oy, oz, dx, dy, dz : float
-        Origin and unit direction, world space.
-    hit : tuple
+    origin, direction : tuple of float
+        World space; the direction is of unit length.
+    hit : Hit
         What ``scene.interaction.nearest`` returned.
     geometry : Geometry
         The scene's.
@@ -276,26 +300,31 @@ def emission_along(ox, oy, oz, dx, dy, dz, hit, geometry, table, pick, emitters)
         Radiance, 0 without a hit; density per solid angle, pick included, with which ``sample_light`` draws this
         direction by this surface, for either lobe.
     """
-    if hit[1] < 0:
+    if hit.face < 0:
         return ZERO, ZERO, ZERO, ZERO, ZERO
-    r, g, b = emitted(hit[1], hit[3], hit[4], geometry)
+    r, g, b = emitted(hit.face, hit.u, hit.v, geometry)
     if not r + g + b > ZERO:
         return ZERO, ZERO, ZERO, ZERO, ZERO
-    i = emitter_row(hit[1], hit[2], emitters)
+    i = emitter_row(hit.face, hit.place, lights.emitters)
     if i < 0:
         return r, g, b, ZERO, ZERO
-    pdf = emitter_pdf(i, ox, oy, oz, dx, dy, dz, hit[0], emitters)
-    pdf *= F(_emitters_share(ox, oy, oz, table, pick, emitters))
-    flags = light_flags(len(table) + i, table, emitters)
+    ox, oy, oz = origin
+    dx, dy, dz = direction
+    pdf = emitter_pdf(i, ox, oy, oz, dx, dy, dz, hit.t, lights.emitters)
+    pdf *= F(_emitters_share(ox, oy, oz, lights))
+    flags = light_flags(len(lights.table) + i, lights)
     return r, g, b, pdf if flags & DIFFUSE else ZERO, pdf if flags & GLOSSY else ZERO
 
 
 @njit
-def _add_light(i, ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, pick, emitters):  # type: ignore[no-untyped-def]
+def _add_light(i, origin, direction, tmax, others, share, seen_by, lights):  # type: ignore[no-untyped-def]
+    table = lights.table
     flags = np.int64(table[i, FLAGS])
     # What nothing shadows is left to ``sample_light``: only the camera looks at it along rays.
     if not flags & seen_by or not (flags & SHADOW or seen_by & CAMERA):
         return ZERO, ZERO, ZERO
+    ox, oy, oz = origin
+    dx, dy, dz = direction
     t = light_hit(i, ox, oy, oz, dx, dy, dz, table)
     if not (t >= ZERO and (t < tmax or t == tmax == F(np.inf))):
         return ZERO, ZERO, ZERO
@@ -304,20 +333,20 @@ def _add_light(i, ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, p
         return ZERO, ZERO, ZERO
     if share > ZERO:
         density = light_pdf(i, ox, oy, oz, dx, dy, dz, t, table)
-        weight /= others + share * density * _probability(i, ox, oy, oz, table, pick, emitters)
+        weight /= others + share * density * _probability(i, ox, oy, oz, lights)
     else:
         weight /= others
     return weight * table[i, RADIANCE], weight * table[i, RADIANCE + 1], weight * table[i, RADIANCE + 2]
 
 
 @njit
-def lights_along(ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, pick, emitters):  # type: ignore[no-untyped-def]
+def lights_along(origin, direction, tmax, others, share, seen_by, lights):  # type: ignore[no-untyped-def]
     """Sum over the lights with size that a ray meets of L / (others + share * pick * density).
 
     Parameters
     ----------
-    ox, oy, oz, dx, dy, dz : float
-        Origin and unit direction, world space.
+    origin, direction : tuple of float
+        World space; the direction is of unit length.
     tmax : float
         Distance of the surface behind, infinite when none.
     others : float
@@ -331,6 +360,9 @@ def lights_along(ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, pi
     -------
     r, g, b : float
     """
+    ox, oy, oz = origin
+    dx, dy, dz = direction
+    pick = lights.pick
     red, green, blue = ZERO, ZERO, ZERO
     node, count = np.int64(1), np.int64(pick[0, COUNT])
     while node < count:
@@ -339,37 +371,30 @@ def lights_along(ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, pi
             continue
         if pick[node, SECOND] == ZERO:
             for i in range(np.int64(pick[node, FIRST]), np.int64(pick[node, PAST])):
-                r, g, b = _add_light(i, ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, pick, emitters)
+                r, g, b = _add_light(i, origin, direction, tmax, others, share, seen_by, lights)
                 red, green, blue = red + r, green + g, blue + b
         node += 1
-    r, g, b = suns_along(ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, pick, emitters)
+    r, g, b = suns_along(origin, direction, tmax, others, share, seen_by, lights)
     return red + r, green + g, blue + b
 
 
 @njit
-def suns_along(ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, pick, emitters):  # type: ignore[no-untyped-def]
+def suns_along(origin, direction, tmax, others, share, seen_by, lights):  # type: ignore[no-untyped-def]
     """`lights_along` of suns alone."""
+    pick = lights.pick
     red, green, blue = ZERO, ZERO, ZERO
     for i in range(np.int64(pick[0, SUNS]), np.int64(pick[0, END])):
-        r, g, b = _add_light(i, ox, oy, oz, dx, dy, dz, tmax, others, share, seen_by, table, pick, emitters)
+        r, g, b = _add_light(i, origin, direction, tmax, others, share, seen_by, lights)
         red, green, blue = red + r, green + g, blue + b
     return red, green, blue
 
 
 @njit
-def _sample_many(numbers, points, table, pick, emitters):  # type: ignore[no-untyped-def]
+def _sample_many(numbers, points, lights):  # type: ignore[no-untyped-def]
     out, rows = np.empty((len(numbers), 8), np.float32), np.empty(len(numbers), np.int64)
     for j in range(len(numbers)):
         lx, ly, lz, t, r, g, b, pdf, i = sample_light(
-            numbers[j, 0],
-            numbers[j, 1],
-            numbers[j, 2],
-            points[j, 0],
-            points[j, 1],
-            points[j, 2],
-            table,
-            pick,
-            emitters,
+            numbers[j, 0], numbers[j, 1], numbers[j, 2], points[j, 0], points[j, 1], points[j, 2], lights
         )
         out[j, 0], out[j, 1], out[j, 2], out[j, 3] = lx, ly, lz, t
         out[j, 4], out[j, 5], out[j, 6], out[j, 7] = r, g, b, pdf
@@ -378,22 +403,21 @@ def _sample_many(numbers, points, table, pick, emitters):  # type: ignore[no-unt
 
 
 @njit
-def _pdf_many(rows, points, directions, table, pick, emitters):  # type: ignore[no-untyped-def]
+def _pdf_many(rows, points, directions, lights):  # type: ignore[no-untyped-def]
     out = np.empty(len(points), np.float32)
     for j in range(len(points)):
         out[j] = pdf_light(
             rows[j], points[j, 0], points[j, 1], points[j, 2], directions[j, 0], directions[j, 1], directions[j, 2],
-            table, pick, emitters,
+            lights,
         )  # fmt: skip
     return out
 
 
 @njit
-def _along_many(origins, directions, tmax, others, share, seen_by, table, pick, emitters):  # type: ignore[no-untyped-def]
+def _along_many(origins, directions, tmax, others, share, seen_by, lights):  # type: ignore[no-untyped-def]
     out = np.empty((len(origins), 3), np.float32)
     for j in range(len(origins)):
-        out[j, 0], out[j, 1], out[j, 2] = lights_along(
-            origins[j, 0], origins[j, 1], origins[j, 2], directions[j, 0], directions[j, 1], directions[j, 2],
-            tmax, others[j], share, seen_by, table, pick, emitters,
-        )  # fmt: skip
+        origin = origins[j, 0], origins[j, 1], origins[j, 2]
+        direction = directions[j, 0], directions[j, 1], directions[j, 2]
+        out[j, 0], out[j, 1], out[j, 2] = lights_along(origin, direction, tmax, others[j], share, seen_by, lights)
     return out

@@ -20,6 +20,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from ...core.errors import DeviceError
+from .ray import Ray
 
 _REMEDY = "Reinstall the engine's environment with embreex 4.4 or later"
 
@@ -126,7 +127,7 @@ _PRIMITIVE, _GEOMETRY, _INSTANCE, _INSTANCE_PRIMITIVE = 17, 18, 19, 20
 def _emit_call(builder: Any, arguments: Any, words: int) -> Any:
     """Emit: fill a ray on the stack, call Embree at the given address; returns a loader of words by type."""
     word, single, pointer = ir.IntType(32), ir.FloatType(), ir.IntType(8).as_pointer()
-    address, scene, *ray = arguments
+    address, scene, ray = arguments
     memory = cgutils.alloca_once(builder, ir.ArrayType(word, words))
     memory.align = 64
 
@@ -134,7 +135,8 @@ def _emit_call(builder: Any, arguments: Any, words: int) -> Any:
         place = builder.gep(memory, [ir.Constant(word, 0), ir.Constant(word, index)])
         return builder.bitcast(place, kind.as_pointer())
 
-    ox, oy, oz, dx, dy, dz, tnear, tfar, mask = ray
+    origin, direction, tnear, tfar, mask = cgutils.unpack_tuple(builder, ray)
+    (ox, oy, oz), (dx, dy, dz) = cgutils.unpack_tuple(builder, origin), cgutils.unpack_tuple(builder, direction)
     for index, value in enumerate((ox, oy, oz, tnear, dx, dy, dz, ir.Constant(single, 0.0), tfar)):
         builder.store(value, slot(index, single))
     builder.store(mask, slot(_MASK, word))
@@ -151,19 +153,21 @@ def _emit_call(builder: Any, arguments: Any, words: int) -> Any:
     return lambda index, kind: builder.load(slot(index, kind))
 
 
-_ARGUMENTS = (types.int64, types.int64) + (types.float32,) * 8 + (types.int32,)
+_VECTOR = types.UniTuple(types.float32, 3)
+_RAY = types.NamedTuple((_VECTOR, _VECTOR, types.float32, types.float32, types.int32), Ray)
+_ARGUMENTS = (types.int64, types.int64, _RAY)
 _TRACED = types.Tuple((types.float32,) + (types.int32,) * 3 + (types.float32,) * 5)
 
 
 @intrinsic
-def trace(typing, address, scene, ox, oy, oz, dx, dy, dz, tnear, tfar, mask):  # type: ignore[no-untyped-def]
+def trace(typing, address, scene, ray):  # type: ignore[no-untyped-def]
     """Closest hit of one ray, for compiled code: ``(t, group, primitive, instance, u, v, gx, gy, gz)``.
 
-    `address` is ``TriangleBVH.intersect_address`` and `scene` ``TriangleBVH.scene``, both int64; `mask` is an int32:
-    the ray meets groups that have one of its bits. ``group`` is -1 when nothing is hit (then t is `tfar`);
-    ``primitive`` counts from the group's first face; ``instance`` counts the group's places, -1 for a group that
-    stands in the world as it is. The hit is (1 - u - v) v0 + u v1 + v v2; (gx, gy, gz) is the geometric normal
-    (v1 - v0) x (v2 - v0), **not** of unit length, before the instance's matrix.
+    `address` is ``TriangleBVH.intersect_address`` and `scene` ``TriangleBVH.scene``, both int64; `ray` is a `Ray`, its
+    numbers of the very types that are given there: it meets groups that have one of its mask's bits. ``group`` is -1
+    when nothing is hit (then t is `tfar`); ``primitive`` counts from the group's first face; ``instance`` counts the
+    group's places, -1 for a group that stands in the world as it is. The hit is (1 - u - v) v0 + u v1 + v v2;
+    (gx, gy, gz) is the geometric normal (v1 - v0) x (v2 - v0), **not** of unit length, before the instance's matrix.
     """
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -183,8 +187,8 @@ def trace(typing, address, scene, ox, oy, oz, dx, dy, dz, tnear, tfar, mask):  #
 
 
 @intrinsic
-def blocked(typing, address, scene, ox, oy, oz, dx, dy, dz, tnear, tfar, mask):  # type: ignore[no-untyped-def]
-    """Return whether anything that has a bit of `mask` (int32) lies on the ray; see `trace`.
+def blocked(typing, address, scene, ray):  # type: ignore[no-untyped-def]
+    """Return whether anything that has a bit of the ray's mask lies on it; see `trace`.
 
     `address` is ``TriangleBVH.occluded_address``.
     """

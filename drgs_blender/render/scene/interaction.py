@@ -16,6 +16,7 @@ from ...compute.jit import njit
 from ..memory import load_float, load_int32, load_int64
 from ..sampling import ONE, ZERO, F
 from .embree import blocked, trace
+from .ray import Hit
 from .texture_lookup import emission_at, emits, material_at
 
 _TINY = F(1e-30)
@@ -81,26 +82,20 @@ class Geometry(NamedTuple):
 
 
 @njit
-def nearest(tracer, ox, oy, oz, dx, dy, dz, tnear, tfar, mask):  # type: ignore[no-untyped-def]
-    """Closest hit of one ray: ``(t, face, place, u, v, gx, gy, gz)``, all float32 or int32.
-
-    ``face`` is -1 when nothing is hit (t is then `tfar`), ``place`` -1 outside shapes in places. The hit is
-    (1 - u - v) v0 + u v1 + v v2; g is for `surface_at`. `mask` (int32) tells what the ray meets, see `ray_masks`.
-    """
-    t, group, face, place, u, v, gx, gy, gz = trace(
-        tracer.intersect, tracer.scene, ox, oy, oz, dx, dy, dz, tnear, tfar, mask
-    )
+def nearest(tracer, ray):  # type: ignore[no-untyped-def]
+    """Closest `Hit` of a `Ray`."""
+    t, group, face, place, u, v, gx, gy, gz = trace(tracer.intersect, tracer.scene, ray)
     if group >= 0:
         face = np.int32(face + load_int32(tracer.first_face, group))
         if place >= 0:
             place = np.int32(place + load_int32(tracer.first_place, group))
-    return t, face, place, u, v, gx, gy, gz
+    return Hit(t, face, place, u, v, gx, gy, gz)
 
 
 @njit
-def shadowed(tracer, ox, oy, oz, dx, dy, dz, tnear, tfar, mask):  # type: ignore[no-untyped-def]
-    """Whether anything lies on the ray that `mask` tells it to meet."""
-    return blocked(tracer.occluded, tracer.scene, ox, oy, oz, dx, dy, dz, tnear, tfar, mask)
+def shadowed(tracer, ray):  # type: ignore[no-untyped-def]
+    """Whether anything lies on a `Ray` that its mask tells it to meet."""
+    return blocked(tracer.occluded, tracer.scene, ray)
 
 
 @njit(inline="always")
@@ -165,17 +160,17 @@ def emitted(face, u, v, geometry):  # type: ignore[no-untyped-def]
 
 
 @njit
-def surface_at(face, place, u, v, gx, gy, gz, dx, dy, dz, geometry):  # type: ignore[no-untyped-def]
-    """The surface at a hit of `nearest`, seen along the ray's direction d.
+def surface_at(hit, direction, geometry):  # type: ignore[no-untyped-def]
+    """The surface at a hit of `nearest`, seen along the ray's direction.
 
     Both sides are the same: the geometric normal faces the ray's origin, the shading normal follows it.
 
     Parameters
     ----------
-    face, place, u, v, gx, gy, gz : float
-        Of the hit; face >= 0.
-    dx, dy, dz : float
-        Direction of the ray.
+    hit : Hit
+        Of a face; `t` is not read.
+    direction : tuple of float
+        Of the ray.
     geometry : Geometry
 
     Returns
@@ -183,6 +178,8 @@ def surface_at(face, place, u, v, gx, gy, gz, dx, dy, dz, geometry):  # type: ig
     nx, ny, nz, gx, gy, gz, r, g, b, roughness, metallic, er, eg, eb, object : float
         Unit shading and geometric normal, albedo, emitted radiance; linear Rec.709.
     """
+    _, face, place, u, v, gx, gy, gz = hit
+    dx, dy, dz = direction
     corner = 3 * np.int64(face)
     i = np.int64(load_int32(geometry.shading_faces, corner))
     j = np.int64(load_int32(geometry.shading_faces, corner + 1))

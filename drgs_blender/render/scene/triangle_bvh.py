@@ -5,15 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
-from ...compute.jit import njit, prange
+from ...compute.jit import njit, plain, prange
 from ...compute.simd import aligned
 from ...core.errors import DeviceError, UsageError
 from . import embree
 from .embree import blocked, trace
+from .ray import Ray
 
 Array = np.ndarray
 
@@ -47,27 +48,38 @@ class Group:
     places: Array | None = None
 
 
+class _Rays(NamedTuple):
+    """Many a `Ray`: (n, 3) float32 `origins` and `directions`; float32 numbers and an int32 mask for all."""
+
+    origins: Array
+    directions: Array
+    tnear: np.float32
+    tfar: np.float32
+    mask: np.int32
+
+
+@njit(inline="always")
+def _ray(rays, i):  # type: ignore[no-untyped-def]
+    origin = rays.origins[i, 0], rays.origins[i, 1], rays.origins[i, 2]
+    direction = rays.directions[i, 0], rays.directions[i, 1], rays.directions[i, 2]
+    return Ray(origin, direction, rays.tnear, rays.tfar, rays.mask)
+
+
 @njit(parallel=True)
-def _intersect(address, scene, first, origins, directions, tnear, tfar, mask, t, face, instance, u, v):  # type: ignore[no-untyped-def]
-    n, block = len(origins), 512
+def _intersect(address, scene, first, rays, t, face, instance, u, v):  # type: ignore[no-untyped-def]
+    n, block = len(rays.origins), 512
     for b in prange((n + block - 1) // block):
         for i in range(b * block, min(n, (b + 1) * block)):
-            t[i], group, primitive, instance[i], u[i], v[i], _, _, _ = trace(
-                address, scene, origins[i, 0], origins[i, 1], origins[i, 2],
-                directions[i, 0], directions[i, 1], directions[i, 2], tnear, tfar, mask,
-            )  # fmt: skip
+            t[i], group, primitive, instance[i], u[i], v[i], _, _, _ = trace(address, scene, _ray(rays, i))
             face[i] = first[group] + primitive if group >= 0 else np.int32(-1)
 
 
 @njit(parallel=True)
-def _occluded(address, scene, origins, directions, tnear, tfar, mask, out):  # type: ignore[no-untyped-def]
-    n, block = len(origins), 512
+def _occluded(address, scene, rays, out):  # type: ignore[no-untyped-def]
+    n, block = len(rays.origins), 512
     for b in prange((n + block - 1) // block):
         for i in range(b * block, min(n, (b + 1) * block)):
-            out[i] = blocked(
-                address, scene, origins[i, 0], origins[i, 1], origins[i, 2],
-                directions[i, 0], directions[i, 1], directions[i, 2], tnear, tfar, mask,
-            )  # fmt: skip
+            out[i] = blocked(address, scene, _ray(rays, i))
 
 
 @njit(parallel=True)
@@ -236,6 +248,11 @@ def box_of(scene: int) -> tuple[Array, Array]:
     return (low, high) if (low <= high).all() else (np.zeros(3, np.float32), np.zeros(3, np.float32))
 
 
+def _rays(origins: Array, directions: Array, tnear: float, tfar: float, mask: int) -> _Rays:
+    start, along = (plain(np.asarray(a, np.float32)) for a in (origins, directions))
+    return _Rays(start, along, np.float32(tnear), np.float32(tfar), np.int32(mask))
+
+
 class TriangleBVH:
     """Triangles ready for ray casting, whose vertices may move.
 
@@ -339,20 +356,18 @@ class TriangleBVH:
         self, origins: Array, directions: Array, tnear: float = 0.0, tfar: float = math.inf, mask: int = ALL
     ) -> tuple[Array, Array, Array, Array, Array]:
         """As `intersect`, with the place of the face's group between face and u: (n,) int32 or -1."""
-        origins, directions = (np.ascontiguousarray(a, np.float32) for a in (origins, directions))
         t, u, v = np.empty((3, len(origins)), np.float32)
         face, instance = np.empty((2, len(origins)), np.int32)
-        arguments: tuple[Any, ...] = self.intersect_address, self.scene, self.first_face, origins, directions
-        _intersect(*arguments, tnear, tfar, np.int32(mask), t, face, instance, u, v)
+        rays = _rays(origins, directions, tnear, tfar, mask)
+        _intersect(self.intersect_address, self.scene, self.first_face, rays, t, face, instance, u, v)
         return t, face, instance, u, v
 
     def occluded_many(
         self, origins: Array, directions: Array, tnear: float = 0.0, tfar: float = math.inf, mask: int = ALL
     ) -> Array:
         """(n,) bool: whether anything lies on each ray."""
-        origins, directions = (np.ascontiguousarray(a, np.float32) for a in (origins, directions))
         out = np.empty(len(origins), np.bool_)
-        _occluded(self.occluded_address, self.scene, origins, directions, tnear, tfar, np.int32(mask), out)
+        _occluded(self.occluded_address, self.scene, _rays(origins, directions, tnear, tfar, mask), out)
         return out
 
     def _release(self) -> None:

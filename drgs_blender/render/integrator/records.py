@@ -1,0 +1,121 @@
+"""What the integrator's kernels take besides points and batches of rays: the scene, the settings and the sampler."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..lights.environment import EnvMap
+from ..lights.lights import LightTables
+from ..scene.interaction import Geometry
+
+Array = np.ndarray
+
+
+class Traits(NamedTuple):
+    """What is known of a scene beforehand. A device's kernel is made for its truth values, without what they rule out.
+
+    Attributes
+    ----------
+    extent : float32
+        Metres: the largest absolute coordinate, the scale of rounding errors.
+    environment : bool
+        The environment shines.
+    lights : bool
+        There are lights, or surfaces that are sampled as such: one of them is sampled at every vertex of a path.
+    glows : bool
+        There are surfaces that emit, which rays look for beyond a path's last vertex too.
+    lights_differ : bool
+        There is a light that diffuse rays see and glossy ones do not, or the other way.
+    lobes_apart : bool
+        The same of objects: cosine samples are of the diffuse lobe alone, GGX samples of the specular one.
+    """
+
+    extent: np.float32
+    environment: bool
+    lights: bool
+    glows: bool
+    lights_differ: bool
+    lobes_apart: bool
+
+
+class Scene(NamedTuple):
+    """All that rays meet and all that shines; valid until its next update.
+
+    Attributes
+    ----------
+    tracer : MixedTracer
+        How rays are cast; a device has its own.
+    geometry : Geometry
+    envmap : EnvMap
+    lights : LightTables
+    traits : Traits
+    """
+
+    tracer: Any
+    geometry: Geometry
+    envmap: EnvMap
+    lights: LightTables
+    traits: Traits
+
+
+class Settings(NamedTuple):
+    """How light is followed.
+
+    Attributes
+    ----------
+    bounces : int
+        Vertices of a path behind the shading point.
+    shading_model : int
+        One of ``brdf.SHADING_MODELS``.
+    layers : (16, 16) float32 array
+        ``brdf.layer_table()``.
+    clamp : float32
+        Limit of the mean of an indirect sample's channels; 0: none.
+    shift : int
+        Of the masks of rays: 0, or ``ray_masks.WITHOUT``.
+    """
+
+    bounces: int
+    shading_model: int
+    layers: Array
+    clamp: np.float32
+    shift: int
+
+
+class Sampler(NamedTuple):
+    """Where a pixel's samples come from, and how they are divided among strategies.
+
+    Attributes
+    ----------
+    seed : uint32
+        Of job and frame.
+    sequence : (n, 3) uint32 array
+        Points of Sobol' with reversed bits, enough for all samples of a pixel.
+    subpixels : int
+        Places in a pixel among which its samples are divided.
+    part, parts : int
+        Which of how many equal parts of these samples are taken.
+    auto : bool
+        Samples are divided by what each surface reflects; else as given.
+    cosine, ggx, light : float32
+        Samples of a pixel by strategy as given; under `auto` only their sum counts.
+    environment_share, lights_share : float32
+        Parts of the light samples that go to environment and lights; 0 where these do not shine.
+    most_light : float32
+        Part of all samples that go to the light at most, under `auto`.
+    """
+
+    seed: np.uint32
+    sequence: Array
+    subpixels: int
+    part: int
+    parts: int
+    auto: bool
+    cosine: np.float32
+    ggx: np.float32
+    light: np.float32
+    environment_share: np.float32
+    lights_share: np.float32
+    most_light: np.float32

@@ -1,0 +1,58 @@
+"""A ray, and what it meets, for compiled code."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+Vector = tuple[np.float32, np.float32, np.float32]
+
+
+class Ray(NamedTuple):
+    """A piece of a straight line.
+
+    Attributes
+    ----------
+    origin : (x, y, z) float32
+        Metres, world space.
+    direction : (x, y, z) float32
+        World space; distances count in its length.
+    tnear, tfar : float32
+        Distances between which things are met.
+    mask : int32
+        What the ray meets: all that has one of these bits, see `ray_masks`.
+    """
+
+    origin: Vector
+    direction: Vector
+    tnear: np.float32
+    tfar: np.float32
+    mask: np.int32
+
+
+class Hit(NamedTuple):
+    """What a ray meets first: a face at (1 - u - v) v0 + u v1 + v v2.
+
+    Attributes
+    ----------
+    t : float32
+        Distance; the ray's `tfar` when nothing is hit.
+    face : int32
+        Of the scene; -1 when nothing is hit.
+    place : int32
+        Row of the scene's places; -1 outside shapes in places.
+    u, v : float32
+        Barycentric coordinates of the second and of the third corner.
+    gx, gy, gz : float32
+        Geometric normal, of any length; for `interaction.surface_at`.
+    """
+
+    t: np.float32
+    face: np.int32
+    place: np.int32
+    u: np.float32
+    v: np.float32
+    gx: np.float32
+    gy: np.float32
+    gz: np.float32
