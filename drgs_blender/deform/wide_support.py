@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from ..compute.jit import njit
@@ -16,6 +18,48 @@ _MOST = 2048
 _SAME_SIDE = 0.3
 #: Part of an equilateral triangle's area, over the same longest edge, that a span has at least.
 _BROAD = 0.3
+
+
+class Walked(NamedTuple):
+    """A mesh to walk on.
+
+    Attributes
+    ----------
+    vertices : (k, 3) float64 array
+    faces : (m, 3) int32 array
+    normals : (k, 3) array
+        Smooth ones, of the vertices.
+    face_normals : (m, 3) float64 array
+    start, corner : array
+        See `geometry.normals.corner_table`.
+    """
+
+    vertices: Array
+    faces: Array
+    normals: Array
+    face_normals: Array
+    start: Array
+    corner: Array
+
+
+class Feet(NamedTuple):
+    """Where surfels hang on a mesh.
+
+    Attributes
+    ----------
+    face : (n,) int32 array
+    place : (n, 3) float64 array
+    along, across : (n, 3) float64 array
+        Unit vectors in the face, at right angles.
+    reach : (n,) float64 array
+        How large the surfels are, in the unit of the mesh.
+    """
+
+    face: Array
+    place: Array
+    along: Array
+    across: Array
+    reach: Array
 
 
 def spans(
@@ -59,10 +103,8 @@ def spans(
         along /= np.linalg.norm(along, axis=1, keepdims=True)
         across = np.cross(faces.normal[own], along)
         start, corner = corner_table(indices, len(vertices))
-        found[wanted] = _walk(
-            vertices.astype(np.float64), indices, normals, start, corner, faces.normal, own, foot, along, across,
-            reach[wanted].astype(np.float64),
-        )  # fmt: skip
+        mesh = Walked(vertices.astype(np.float64), indices, normals, faces.normal, start, corner)
+        found[wanted] = _walk(mesh, Feet(own, foot, along, across, reach[wanted].astype(np.float64)))
         triangle = vertices[found[wanted]].astype(np.float64)
         edges = np.roll(triangle, -1, axis=1) - triangle
         area = 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
@@ -73,10 +115,10 @@ def spans(
 
 
 @njit
-def _walk(  # type: ignore[no-untyped-def]
-    vertices, indices, normals, start, corner, face_normals, face, foot, along, across, reach
-):
+def _walk(mesh: Walked, feet: Feet) -> Array:
     """For each surfel the vertices nearest to three places around its foot."""
+    vertices, indices, normals, face_normals, start, corner = mesh
+    face, foot, along, across, reach = feet
     found = np.empty((len(face), 3), np.int32)
     seen = np.full(len(vertices), -1, np.int32)
     queue = np.empty(_MOST, np.int32)

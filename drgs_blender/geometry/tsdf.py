@@ -7,8 +7,7 @@ volumetric method for building complex models from range images"; Lorensen and C
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
@@ -27,8 +26,7 @@ BAND = 3.0
 CRUMB = 0.01
 
 
-@dataclass(frozen=True, slots=True)
-class DepthMaps:
+class DepthMaps(NamedTuple):
     """Depth maps of views of one size, and where in them a point is seen.
 
     With ``q = scale * (axes @ (point - origin)) + offset``, ``q[2]`` is the depth of a point and ``q[:2]`` its
@@ -63,6 +61,28 @@ class DepthMaps:
     bilinear: bool
 
 
+class Voxels(NamedTuple):
+    """The sums of a field, voxel by voxel, and where the voxels are.
+
+    Attributes
+    ----------
+    total, weight : (nx, ny, nz) float32 array
+        Of weighted distances in bands, and of the weights.
+    views : (nx, ny, nz) int32 array
+        How many tell something.
+    low : (3,) float64 array
+        Centre of voxel (0, 0, 0), metres.
+    size : float
+        Distance between the centres of neighbours, metres.
+    """
+
+    total: Array
+    weight: Array
+    views: Array
+    low: Array
+    size: float
+
+
 class SignedDistanceField:
     """Mean truncated signed distance at the voxels of a grid: +1 before a surface, -1 behind it, 0 on it.
 
@@ -77,19 +97,15 @@ class SignedDistanceField:
     """
 
     def __init__(self, low: Array, voxel: float, shape: tuple[int, ...]) -> None:
-        self._low, self._voxel = np.ascontiguousarray(low, np.float64), voxel
-        self._total, self._weight = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-        self._count = np.zeros(shape, np.int32)
+        total, weight, views = np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, np.int32)
+        self._voxels = Voxels(total, weight, views, np.ascontiguousarray(low, np.float64), voxel)
 
     def add(self, maps: DepthMaps) -> None:
         """Take depth maps in, in the order of their views.
 
         Sums over the views of one call have the precision of their depth, those over calls are float32.
         """
-        _fuse(
-            self._total, self._weight, self._count, self._low, self._voxel, maps.depth, maps.cosine, maps.origin,
-            maps.axes, maps.scale, maps.offset, maps.perspective, maps.bilinear, BAND * self._voxel,
-        )  # fmt: skip
+        _fuse(self._voxels, maps, BAND * self._voxels.size)
 
     def mesh(self, witnesses: int, smoothing: float, advice: str) -> tuple[Mesh, dict[str, Any]]:
         """The zero level, as a watertight mesh of the components that matter.
@@ -117,16 +133,17 @@ class SignedDistanceField:
         """
         from skimage.measure import marching_cubes  # takes long to import, and most jobs make no mesh
 
-        field = np.full_like(self._total, -1.0)
-        np.divide(self._total, self._weight, out=field, where=self._count >= witnesses)
+        total, weight, views, low, voxel = self._voxels
+        field = np.full_like(total, -1.0)
+        np.divide(total, weight, out=field, where=views >= witnesses)
         field = np.pad(gaussian_filter(field, smoothing), 1, constant_values=1.0)
         if not field.min() < 0 < field.max():
             raise AssetError("surfels", "enclose no volume", advice)
         vertices, faces, _, _ = marching_cubes(field, 0.0)
-        vertices, faces, dropped, volume = main_parts((vertices - 1) * self._voxel + self._low, faces)
+        vertices, faces, dropped, volume = main_parts((vertices - 1) * voxel + low, faces)
         n = len(vertices)
         report = {
-            "voxel": self._voxel, "components_dropped": dropped, "volume": volume, "vertices": n, "faces": len(faces),
+            "voxel": voxel, "components_dropped": dropped, "volume": volume, "vertices": n, "faces": len(faces),
         }  # fmt: skip
         return Mesh(vertices, faces, np.full((n, 3), 0.5), np.full(n, 0.5), np.zeros(n)), report
 
@@ -190,15 +207,14 @@ def _sample(depth: Any, x: Any, y: Any) -> Any:
 
 
 @njit(parallel=True)
-def _fuse(
-    total: Any, weight: Any, count: Any, low: Any, voxel: Any, depth: Any, cosine: Any, origin: Any, axes: Any,
-    scale: Any, offset: Any, perspective: Any, bilinear: Any, band: Any,
-) -> None:  # fmt: skip
+def _fuse(voxels: Voxels, maps: DepthMaps, band: float) -> None:
     """Add views to the sums: +1 before the surface, falling to -1 behind it within the band (metres).
 
     A pixel counts with the cosine at which it sees the surface: the rim of a silhouette says little. The same cosine
     turns distance along the view into distance from the surface. Literals of the maps' type keep all in its precision.
     """
+    total, weight, views, low, voxel = voxels
+    depth, cosine, origin, axes, scale, offset, perspective, bilinear = maps
     height, width = depth.shape[1], depth.shape[2]
     for i in prange(total.shape[0]):
         # A column of voxels along Z at a time: what depends on X and Y alone is found once for each view.
@@ -229,7 +245,7 @@ def _fuse(
                     if gap > depth.dtype.type(-1):
                         value[k] += w * min(w * gap, depth.dtype.type(1))
                         weights[k] += w
-                        count[i, j, k] += 1
+                        views[i, j, k] += 1
             for k in range(total.shape[2]):
                 total[i, j, k] += value[k]
                 weight[i, j, k] += weights[k]

@@ -16,7 +16,7 @@ from ..core.asset.model import Mesh
 from ..core.frame import Camera
 from ..render.scene.triangle_bvh import TriangleBVH
 from .capture.training_views import Target
-from .inverse_rendering.estimator import Gatherer
+from .inverse_rendering.gatherer import Gatherer
 from .losses.photometric import difference
 from .losses.shape import shape_loss
 from .model.attributes import attributes
@@ -76,7 +76,7 @@ class LearningBackend:
     def gatherer(
         self, mesh: Mesh, tree: TriangleBVH, cache: Array | None, counts: tuple[int, int, int], normals: bool
     ) -> Gatherer:
-        """`inverse_rendering.estimator.Gatherer`."""
+        """`inverse_rendering.gatherer.Gatherer`."""
         return Gatherer(mesh, tree, cache, counts, normals)
 
 

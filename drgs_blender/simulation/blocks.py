@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -60,8 +61,7 @@ class Domain:
         return self.origin + (4 * (np.array(self.blocks) - 1) + 0.5) * self.spacing
 
 
-@dataclass(slots=True)
-class Arrangement:
+class Arrangement(NamedTuple):
     """Which particles and nodes are where, until the next sort.
 
     Attributes
@@ -89,6 +89,27 @@ class Arrangement:
     neighbour: Array
     active: Array
     slot: Array
+
+
+class Nodes(NamedTuple):
+    """The nodes of the blocks that have memory.
+
+    Attributes
+    ----------
+    values : (a, 64, 4) float32 array
+        Momentum (kg m/s) or velocity (m/s), and mass (kg); z fastest.
+    active : (a, 3) int32 array
+        See `Arrangement`.
+    origin : (3,) float64 array
+        See `Domain`.
+    spacing : float
+        See `Domain`.
+    """
+
+    values: Array
+    active: Array
+    origin: Array
+    spacing: float
 
 
 @njit(inline="always")

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from ..core.errors import AssetError, UsageError
-from .contact import CONTACTS, Contact, look
+from .contact import CONTACTS, Contact, Field, Motion, Surface, look
 
 Array = np.ndarray
 log = logging.getLogger(__name__)
@@ -78,31 +78,14 @@ class Collider:
         if not 0 <= self.friction < np.inf:
             raise UsageError(self.name, f"has a friction of {self.friction}", "It must be at least 0")
 
+    @property
+    def surface(self) -> Surface:
+        """What it does to matter, for compiled code."""
+        return Surface(self.thickness, CONTACTS[self.contact], self.friction)
+
     def at(self, frame: int) -> Array:
         """(n, 3) vertices, frames counted from 0."""
         return self.vertices[min(max(frame, 0), len(self.vertices) - 1)]
-
-
-@dataclass(frozen=True, slots=True)
-class Field:
-    """Signed distance on a grid, negative inside.
-
-    Attributes
-    ----------
-    origin : (3,) float64 array
-        Metres, in the space of the field.
-    spacing : float
-        Metres.
-    distance : (nx, ny, nz) float32 array
-        Metres.
-    velocity : (nx, ny, nz, 3) float32 array
-        m/s, or with nx = 0 where the surface does not deform.
-    """
-
-    origin: Array
-    spacing: float
-    distance: Array
-    velocity: Array
 
 
 _STILL = np.zeros((0, 0, 0, 3), np.float32)
@@ -225,19 +208,8 @@ class MovingCollider:
         """Whether it changes its shape in this frame."""
         return not self._rigid
 
-    def at(self, part: float) -> tuple[Field | None, Array, Array, Array, Array]:
-        """The field at `part` (0 to 1) of the frame, and its motion.
-
-        Returns
-        -------
-        field : Field or None
-            None where nothing can be touched.
-        rotation : (3, 3) array
-            From the space of the field to the world, as `shift`.
-        shift : (3,) array
-        linear, spin : (3,) array
-            m/s of the field's origin-independent centre and rad/s about ``shift``'s centre, see `collide`.
-        """
+    def at(self, part: float) -> tuple[Field | None, Motion]:
+        """The field at `part` (0 to 1) of the frame, None where nothing can be touched, and its motion."""
         if not self._rigid:
             return self._deforming(part)
         if not self._have_own:
@@ -251,14 +223,13 @@ class MovingCollider:
         spin = self._spin / self._seconds
         shift = centre - turn @ self._centre_rest
         # v(x) = linear + spin x (x - centre), told about the point `shift`.
-        return self._own, turn, shift, linear + np.cross(spin, shift - centre), spin
+        return self._own, Motion(turn, shift, linear + np.cross(spin, shift - centre), spin)
 
     def look(self, points: Array, part: float) -> Array | None:
         """(n, 7) what `contact.surface_near` says of points at `part` of the frame; None where nothing is touched."""
-        field, *motion = self.at(part)
-        if field is None:
-            return None
-        return look(points, field.distance, field.velocity, field.origin, field.spacing, *motion)
+        field, motion = self.at(part)
+        found: Array | None = None if field is None else look(points, field, motion)
+        return found
 
     def distances(self, points: Array, part: float) -> Array:
         """(n,) signed distances of points at `part` of the frame, as matter feels them; infinite far away."""
@@ -304,13 +275,13 @@ class MovingCollider:
     def _make_field(self, vertices: Array, low: Array, high: Array, velocities: Array | None = None) -> Field | None:
         return make_field(vertices, self.collider.faces, self._closed, self.spacing, low, high, velocities)
 
-    def _deforming(self, part: float) -> tuple[Field | None, Array, Array, Array, Array]:
+    def _deforming(self, part: float) -> tuple[Field | None, Motion]:
         if self._built_at < 0 or (part - self._built_at) * self._seconds * self.speed > 0.5 * self.spacing:
             vertices = (1 - part) * self._before + part * self._after
             velocities = (self._after - self._before) / self._seconds
             self._field = self._make_field(vertices, *self._near, velocities)
             self._built_at = part
-        return self._field, np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3)
+        return self._field, Motion(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
 
 
 def check_apart(points: Array, depth: float, colliders: Sequence[MovingCollider], planes: Array) -> None:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from ..compute.jit import njit, prange
 from ..core.errors import UsageError
+from .blocks import Nodes
 
 Array = np.ndarray
 
@@ -18,9 +19,72 @@ Contact = Literal["separate", "slip", "sticky"]
 CONTACTS: dict[str, int] = {"separate": 0, "slip": 1, "sticky": 2}
 
 
+class Field(NamedTuple):
+    """Signed distance on a grid, negative inside.
+
+    Attributes
+    ----------
+    origin : (3,) float64 array
+        Metres, in the space of the field.
+    spacing : float
+        Metres.
+    distance : (nx, ny, nz) float32 array
+        Metres.
+    velocity : (nx, ny, nz, 3) float32 array
+        m/s, or with nx = 0 where the surface does not deform.
+    """
+
+    origin: Array
+    spacing: float
+    distance: Array
+    velocity: Array
+
+
+class Motion(NamedTuple):
+    """Where a field is and how it moves: at ``linear + spin x (x - shift)``.
+
+    Attributes
+    ----------
+    rotation : (3, 3) float64 array
+        From the space of the field to the world, as `shift`.
+    shift : (3,) float64 array
+        Metres.
+    linear : (3,) float64 array
+        m/s.
+    spin : (3,) float64 array
+        rad/s.
+    """
+
+    rotation: Array
+    shift: Array
+    linear: Array
+    spin: Array
+
+
+class Surface(NamedTuple):
+    """What a surface does to matter that touches it.
+
+    Attributes
+    ----------
+    thickness : float
+        Metres by which it is moved outwards.
+    contact : int
+        One of `CONTACTS`.
+    friction : float
+        Coulomb's coefficient, of "separate".
+    """
+
+    thickness: float
+    contact: int
+    friction: float
+
+
 @njit(inline="always")
-def respond(vx, vy, vz, ux, uy, uz, nx, ny, nz, contact, friction):  # type: ignore[no-untyped-def]
-    """Velocity of matter that moves at v and touches what moves at u, with unit normal n."""
+def respond(v, u, n, contact, friction):  # type: ignore[no-untyped-def]
+    """Velocity of matter that moves at v and touches what moves at u, with unit normal n; all (x, y, z)."""
+    vx, vy, vz = v
+    ux, uy, uz = u
+    nx, ny, nz = n
     if contact == 2:
         return ux, uy, uz
     rx, ry, rz = vx - ux, vy - uy, vz - uz
@@ -36,16 +100,25 @@ def respond(vx, vy, vz, ux, uy, uz, nx, ny, nz, contact, friction):  # type: ign
 
 
 @njit(inline="always")
-def surface_near(  # type: ignore[no-untyped-def]
-    wx, wy, wz, distance, velocity, field_origin, field_spacing, rotation, linear, spin
-):
-    """The surface of a collider as seen from a point, told from the collider's ``shift`` in world axes.
+def surface_near(place, field, motion):  # type: ignore[no-untyped-def]
+    """The surface of a collider as seen from a point.
+
+    Parameters
+    ----------
+    place : tuple of float
+        From the collider's ``shift``, in world axes.
+    field : Field
+        Or a tuple in its order, as devices have it; so `motion`.
+    motion : Motion
 
     Returns
     -------
     tuple of float
         Signed distance (infinite outside of the field), unit normal and velocity of the surface.
     """
+    wx, wy, wz = place
+    field_origin, field_spacing, distance, velocity = field
+    rotation, _, linear, spin = motion
     nx, ny, nz = distance.shape
     none = (np.inf, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
     px = (rotation[0, 0] * wx + rotation[1, 0] * wy + rotation[2, 0] * wz - field_origin[0]) / field_spacing
@@ -87,24 +160,22 @@ def surface_near(  # type: ignore[no-untyped-def]
 
 
 @njit(parallel=True)
-def collide(  # type: ignore[no-untyped-def]
-    nodes, active, origin, spacing, distance, velocity, field_origin, field_spacing, rotation, shift, linear, spin,
-    thickness, contact, friction,
-):  # fmt: skip
-    """Change the velocities of nodes inside a collider, in place; it moves at ``linear + spin x (x - shift)``."""
-    for s in prange(len(nodes)):
+def collide(nodes: Nodes, field: Field, motion: Motion, surface: Surface) -> None:
+    """Change the velocities of nodes inside a collider, in place."""
+    values, active, origin, spacing = nodes
+    shift = motion.shift
+    for s in prange(len(values)):
         for n in range(64):
-            if nodes[s, n, 3] <= np.float32(0.0):
+            if values[s, n, 3] <= np.float32(0.0):
                 continue
-            d, mx, my, mz, ux, uy, uz = surface_near(
-                origin[0] + spacing * (4 * active[s, 0] + n // 16) - shift[0],
-                origin[1] + spacing * (4 * active[s, 1] + n // 4 % 4) - shift[1],
-                origin[2] + spacing * (4 * active[s, 2] + n % 4) - shift[2],
-                distance, velocity, field_origin, field_spacing, rotation, linear, spin,
-            )  # fmt: skip
-            if d < thickness:
-                nodes[s, n, 0], nodes[s, n, 1], nodes[s, n, 2] = respond(
-                    nodes[s, n, 0], nodes[s, n, 1], nodes[s, n, 2], ux, uy, uz, mx, my, mz, contact, friction
+            x = origin[0] + spacing * (4 * active[s, 0] + n // 16)
+            y = origin[1] + spacing * (4 * active[s, 1] + n // 4 % 4)
+            z = origin[2] + spacing * (4 * active[s, 2] + n % 4)
+            d, mx, my, mz, ux, uy, uz = surface_near((x - shift[0], y - shift[1], z - shift[2]), field, motion)
+            if d < surface.thickness:
+                v = values[s, n, 0], values[s, n, 1], values[s, n, 2]
+                values[s, n, 0], values[s, n, 1], values[s, n, 2] = respond(
+                    v, (ux, uy, uz), (mx, my, mz), surface.contact, surface.friction
                 )
 
 
@@ -145,9 +216,10 @@ def plane_rows(planes: Sequence[Plane]) -> Array:
 
 
 @njit(parallel=True)
-def bound(nodes, active, origin, spacing, planes):  # type: ignore[no-untyped-def]
-    """Change the velocities of nodes behind planes, in place."""
-    for s in prange(len(nodes)):
+def bound(nodes: Nodes, planes: Array) -> None:
+    """Change the velocities of nodes behind planes, rows of `plane_rows`, in place."""
+    values, active, origin, spacing = nodes
+    for s in prange(len(values)):
         for q in range(len(planes)):
             ax, ay, az = planes[q, 0], planes[q, 1], planes[q, 2]
             base = (
@@ -158,22 +230,19 @@ def bound(nodes, active, origin, spacing, planes):  # type: ignore[no-untyped-de
                 continue
             for n in range(64):
                 depth = base + spacing * (ax * (n // 16) + ay * (n // 4 % 4) + az * (n % 4))
-                if depth <= 1e-9 * spacing and nodes[s, n, 3] > np.float32(0.0):
-                    nodes[s, n, 0], nodes[s, n, 1], nodes[s, n, 2] = respond(
-                        nodes[s, n, 0], nodes[s, n, 1], nodes[s, n, 2], 0.0, 0.0, 0.0, ax, ay, az,
-                        int(planes[q, 4]), planes[q, 5],
-                    )  # fmt: skip
+                if depth <= 1e-9 * spacing and values[s, n, 3] > np.float32(0.0):
+                    v = values[s, n, 0], values[s, n, 1], values[s, n, 2]
+                    values[s, n, 0], values[s, n, 1], values[s, n, 2] = respond(
+                        v, (0.0, 0.0, 0.0), (ax, ay, az), int(planes[q, 4]), planes[q, 5]
+                    )
 
 
 @njit(parallel=True)
-def look(  # type: ignore[no-untyped-def]
-    points, distance, velocity, field_origin, field_spacing, rotation, shift, linear, spin
-):
+def look(points: Array, field: Field, motion: Motion) -> Array:
     """(n, 7) what `surface_near` says of each world point."""
     out = np.empty((len(points), 7))
+    shift = motion.shift
     for p in prange(len(points)):
-        out[p, 0], out[p, 1], out[p, 2], out[p, 3], out[p, 4], out[p, 5], out[p, 6] = surface_near(
-            points[p, 0] - shift[0], points[p, 1] - shift[1], points[p, 2] - shift[2],
-            distance, velocity, field_origin, field_spacing, rotation, linear, spin,
-        )  # fmt: skip
+        place = points[p, 0] - shift[0], points[p, 1] - shift[1], points[p, 2] - shift[2]
+        out[p, 0], out[p, 1], out[p, 2], out[p, 3], out[p, 4], out[p, 5], out[p, 6] = surface_near(place, field, motion)
     return out

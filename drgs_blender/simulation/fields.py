@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..compute.jit import njit, prange
+from .blocks import Nodes
 
 Array = np.ndarray
 
@@ -223,11 +224,12 @@ def blow(x, v, still, rows, dt):  # type: ignore[no-untyped-def]
 
 
 @njit(parallel=True)
-def blow_nodes(nodes, active, origin, spacing, rows, dt):  # type: ignore[no-untyped-def]
+def blow_nodes(nodes: Nodes, rows: Array, dt: float) -> None:
     """The same for the nodes of the grid."""
-    for s in prange(len(nodes)):
+    values, active, origin, spacing = nodes
+    for s in prange(len(values)):
         for n in range(64):
-            if nodes[s, n, 3] <= np.float32(0.0):
+            if values[s, n, 3] <= np.float32(0.0):
                 continue
             x = origin[0] + spacing * (4 * active[s, 0] + n // 16)
             y = origin[1] + spacing * (4 * active[s, 1] + n // 4 % 4)
@@ -235,6 +237,6 @@ def blow_nodes(nodes, active, origin, spacing, rows, dt):  # type: ignore[no-unt
             for r in range(len(rows)):
                 ax, ay, az, flow = push_of(rows[r], x, y, z)
                 slow = 1.0 / (1.0 + dt * flow)
-                nodes[s, n, 0] = np.float32((nodes[s, n, 0] + dt * ax) * slow)
-                nodes[s, n, 1] = np.float32((nodes[s, n, 1] + dt * ay) * slow)
-                nodes[s, n, 2] = np.float32((nodes[s, n, 2] + dt * az) * slow)
+                values[s, n, 0] = np.float32((values[s, n, 0] + dt * ax) * slow)
+                values[s, n, 1] = np.float32((values[s, n, 1] + dt * ay) * slow)
+                values[s, n, 2] = np.float32((values[s, n, 2] + dt * az) * slow)

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
 from ..compute.warp.kernels import Launcher
-from .blocks import Arrangement, Domain, arrange
+from .blocks import Arrangement, Domain, Nodes, arrange
 from .colliders import MovingCollider
-from .contact import CONTACTS, bound, collide
+from .contact import bound, collide
 from .fields import FieldRows, ForceField, blow_nodes
 from .p2g_g2p import advance_nodes, gather, hold_pins, scatter
+from .particles import Particles, Properties, taken
 
 Array = np.ndarray
 
@@ -29,58 +30,13 @@ class Forces:
     fields: tuple[ForceField, ...] = ()
 
 
-@dataclass(slots=True)
-class State:
-    """All that the future depends on, one row a particle.
-
-    Attributes
-    ----------
-    x : (n, 3) float64 array
-        Metres, world.
-    v : (n, 3) float32 array
-        m/s.
-    affine : (n, 9) float32 array
-        Velocity gradient of APIC, 1/s.
-    elastic : (n, 9) float32 array
-        Elastic deformation gradient less 1.
-    total : (n, 9) float32 array
-        Deformation gradient since the start less 1; no rows where no matter is plastic.
-    tau : (n, 6) float32 array
-        Kirchhoff stress, Pa: xx, yy, zz, xy, xz, yz.
-    memory : (n,) float32 array
-        See `constitutive.respond`.
-    """
-
-    x: Array
-    v: Array
-    affine: Array
-    elastic: Array
-    total: Array
-    tau: Array
-    memory: Array
-
-    def taken(self, order: Array) -> State:
-        """The rows in another order."""
-        parts = (getattr(self, f.name) for f in fields(self))
-        return State(*(a.take(order, axis=0) if len(a) else a for a in parts))
-
-
 @dataclass(frozen=True, slots=True)
 class Scene:
     """What is the same in every frame.
 
     Attributes
     ----------
-    mass : (n,) float32 array
-        kg; none: riders.
-    volume : (n,) float32 array
-        Cubic metres at rest.
-    model : (n,) uint8 array
-        See `matter`.
-    parameters : (n, k) float32 array
-        See `matter`.
-    solid : (n,) bool array
-        Matter that keeps its shape.
+    properties : Properties
     pins : (k,) int64 array
         Particles that are kinematic.
     least : float
@@ -92,11 +48,7 @@ class Scene:
     fields: FieldRows
     colliders: list[MovingCollider]
     planes: Array
-    mass: Array
-    volume: Array
-    model: Array
-    parameters: Array
-    solid: Array
+    properties: Properties
     pins: Array
     least: np.float32
 
@@ -138,12 +90,12 @@ class Grid(ABC):
         self._scene = scene
 
     @abstractmethod
-    def enter(self, state: State, frame: int, seconds: float, pin_velocity: Array) -> None:
+    def enter(self, state: Particles, frame: int, seconds: float, pin_velocity: Array) -> None:
         """Begin a frame, which the colliders have entered; `state` itself is not changed.
 
         Parameters
         ----------
-        state : State
+        state : Particles
         frame : int
             Counted from 0.
         seconds : float
@@ -167,17 +119,17 @@ class Grid(ABC):
         """
 
     @abstractmethod
-    def state(self) -> State:
+    def state(self) -> Particles:
         """The state now, in arrays that do not change later."""
 
 
 class HostGrid(Grid):
     """On this processor: particles lie in the order of the blocks."""
 
-    _state: State
+    _state: Particles
     _a: Arrangement
 
-    def enter(self, state: State, frame: int, seconds: float, pin_velocity: Array) -> None:
+    def enter(self, state: Particles, frame: int, seconds: float, pin_velocity: Array) -> None:
         self._state, self._order = state, np.arange(len(state.x))
         self._frame, self._seconds, self._pin_velocity = frame, seconds, pin_velocity
 
@@ -186,13 +138,12 @@ class HostGrid(Grid):
         self._a, lost = arrange(self._state.x, scene.domain)
         if len(lost):
             return False
-        self._state, self._order = self._state.taken(self._a.order), self._order[self._a.order]
-        order = self._order
-        self._mass, self._volume, self._solid = scene.mass[order], scene.volume[order], scene.solid[order]
-        self._model, self._parameters = scene.model[order], scene.parameters[order]
-        self._pins = _inverse(order)[scene.pins]
-        self._nodes = np.empty((len(self._a.active), 64, 4), np.float32)
-        self._held = np.zeros_like(self._nodes) if len(self._pins) else self._nodes[:0]
+        self._state, self._order = taken(self._state, self._a.order), self._order[self._a.order]
+        self._properties = taken(scene.properties, self._order)
+        self._pins = _inverse(self._order)[scene.pins]
+        values = np.empty((len(self._a.active), 64, 4), np.float32)
+        self._nodes = Nodes(values, self._a.active, scene.domain.origin, scene.domain.spacing)
+        self._held = np.zeros_like(values) if len(self._pins) else values[:0]
         self._fastest = np.empty(len(self._a.block), np.float32)
         return True
 
@@ -200,41 +151,27 @@ class HostGrid(Grid):
         scene, forces, s, a, nodes = self._scene, self._scene.forces, self._state, self._a, self._nodes
         (done, dt), *_ = times
         part = (done + 0.5 * dt) / self._seconds
-        h = scene.domain.spacing
-        grid = (scene.domain.origin, h)
-        places = a.block, a.shares, a.start, a.neighbour
-        scatter(s.x, s.v, s.affine, s.tau, self._mass, self._volume, *grid, dt, *places, nodes)
+        scatter(s, self._properties, a, nodes, dt)
         gravity, wind = np.asarray(forces.gravity, np.float64), np.asarray(forces.wind, np.float64)
-        advance_nodes(nodes, scene.least, dt, gravity, wind, forces.drag, forces.damping)
+        advance_nodes(nodes.values, scene.least, dt, gravity, wind, forces.drag, forces.damping)
         if len(scene.fields):
-            blow_nodes(nodes, a.active, *grid, scene.fields.at(self._frame, part), dt)
+            blow_nodes(nodes, scene.fields.at(self._frame, part), dt)
         for moving in scene.colliders:
-            self._touch(moving, part)
+            field, motion = moving.at(part)
+            if field is not None:
+                collide(nodes, field, motion, moving.collider.surface)
         if len(scene.planes):
-            bound(nodes, a.active, *grid, scene.planes)
+            bound(nodes, scene.planes)
         if len(self._pins):
-            hold_pins(s.x, self._pins, self._pin_velocity, self._mass, *grid, a.slot, nodes, self._held)
+            hold_pins(s.x, self._properties.mass, self._pins, self._pin_velocity, a.slot, nodes, self._held)
             kept = s.x[self._pins] + dt * self._pin_velocity
-        gather(
-            s.x, s.v, s.affine, s.elastic, s.total, s.tau, s.memory, self._model, self._parameters, self._mass,
-            self._solid, *grid, dt, *places, nodes, self._fastest,
-        )  # fmt: skip
+        gather(s, self._properties, a, nodes, dt, self._fastest)
         if len(self._pins):
             s.x[self._pins], s.v[self._pins] = kept, self._pin_velocity
         return [float(self._fastest.max())]
 
-    def _touch(self, moving: MovingCollider, part: float) -> None:
-        place, *motion = moving.at(part)
-        if place is None:
-            return
-        c, domain = moving.collider, self._scene.domain
-        collide(
-            self._nodes, self._a.active, domain.origin, domain.spacing, place.distance, place.velocity, place.origin,
-            place.spacing, *motion, c.thickness, CONTACTS[c.contact], c.friction,
-        )  # fmt: skip
-
-    def state(self) -> State:
-        return self._state.taken(_inverse(self._order))
+    def state(self) -> Particles:
+        return taken(self._state, _inverse(self._order))
 
 
 def _inverse(order: Array) -> Array:

@@ -12,7 +12,9 @@ import numpy as np
 from ..compute.jit import njit, prange
 from ..compute.simd import fold, load, quads, repeat, spread, store
 from ..core.sim_materials import ELASTIC, LAMBDA, MU
+from .blocks import Arrangement, Nodes
 from .constitutive import neo_hookean, respond
+from .particles import Particles, Properties
 
 Array = np.ndarray
 
@@ -82,8 +84,9 @@ def _carried(scratch, base, wx, wy, wz):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def stretch(f, p, step, g0, g1, g2, g3, g4, g5, g6, g7, g8):  # type: ignore[no-untyped-def]
-    """F = (1 + step grad v) F, in place, where `f` holds F - 1."""
+def stretch(f, p, step, gradient):  # type: ignore[no-untyped-def]
+    """F = (1 + step grad v) F, in place, where `f` holds F - 1; the gradient of v row by row."""
+    g0, g1, g2, g3, g4, g5, g6, g7, g8 = gradient
     h0, h4, h8 = f[p, 0], f[p, 4], f[p, 8]
     f0, f1, f2, f3, f4, f5, f6, f7, f8 = _ONE + h0, f[p, 1], f[p, 2], f[p, 3], _ONE + h4, f[p, 5], f[p, 6], f[p, 7], _ONE + h8  # noqa: E501  # fmt: skip
     f[p, 0] = h0 + step * (g0 * f0 + g1 * f3 + g2 * f6)
@@ -114,32 +117,23 @@ def momentum_of(p, v, affine, tau, m, q, h, fx, fy, fz):  # type: ignore[no-unty
 
 
 @njit(inline="always")
-def pushed(x, y, z, gx, gy, gz, slow, pull, wx, wy, wz):  # type: ignore[no-untyped-def]
-    """A velocity after a step of what acts on all matter alike."""
+def pushed(velocity, gain, slow, pull, wind):  # type: ignore[no-untyped-def]
+    """A velocity after a step of what acts on all matter alike; vectors as (x, y, z)."""
+    x, y, z = velocity
+    gx, gy, gz = gain
+    wx, wy, wz = wind
     # All forces alike, so that damping does not change where matter comes to rest.
     x, y, z = slow * (x + gx), slow * (y + gy), slow * (z + gz)
     return x + pull * (wx - x), y + pull * (wy - y), z + pull * (wz - z)
 
 
 @njit(parallel=True)
-def scatter(  # type: ignore[no-untyped-def]
-    x, v, affine, tau, mass, volume, origin, spacing, dt, block, shares, start, neighbour, nodes
-):  # fmt: skip
-    """Particles to grid.
-
-    Parameters
-    ----------
-    x : (n, 3) float64 array
-        In the order of the arrangement, as all that is of particles.
-    v : (n, 3) float32 array
-    affine : (n, 9) float32 array
-    tau : (n, 6) float32 array
-    mass : (n,) float32 array
-    volume : (n,) float32 array
-        At rest.
-    nodes : (a, 64, 4) float32 array
-        Written: momentum and mass of the nodes of active blocks.
-    """
+def scatter(particles: Particles, properties: Properties, places: Arrangement, grid: Nodes, dt: float) -> None:
+    """Particles, in the order of the arrangement, to grid: momentum and mass of its nodes are written."""
+    x, v, affine, tau = particles.x, particles.v, particles.affine, particles.tau
+    mass, volume = properties.mass, properties.volume
+    block, shares, start, neighbour = places.block, places.shares, places.start, places.neighbour
+    nodes, origin, spacing = grid.values, grid.origin, grid.spacing
     scale = 1.0 / spacing
     h = np.float32(spacing)
     factor = np.float32(4.0 * dt * scale * scale)
@@ -182,23 +176,31 @@ def scatter(  # type: ignore[no-untyped-def]
 
 
 @njit(parallel=True)
-def advance_nodes(nodes, least, dt, force, wind, drag, damping):  # type: ignore[no-untyped-def]
+def advance_nodes(
+    nodes: Array, least: float, dt: float, force: Array, wind: Array, drag: float, damping: float
+) -> None:
     """Momentum to velocity, in place, and what acts on all matter alike.
 
     Parameters
     ----------
+    nodes : (a, 64, 4) float32 array
+        Values of `Nodes`.
     least : float
         kg, below which a node is empty: momentum over a mass near underflow is noise.
+    dt : float
+        Seconds.
     force : (3,) array
         m/s^2, acceleration.
     wind : (3,) array
-        m/s, towards which `drag` (1/s) pulls.
+        m/s, towards which `drag` pulls.
+    drag : float
+        1/s.
     damping : float
         1/s.
     """
     pull, slow = np.float32(1.0 - np.exp(-dt * drag)), np.float32(np.exp(-dt * damping))
-    gx, gy, gz = np.float32(dt * force[0]), np.float32(dt * force[1]), np.float32(dt * force[2])
-    wx, wy, wz = np.float32(wind[0]), np.float32(wind[1]), np.float32(wind[2])
+    gain = np.float32(dt * force[0]), np.float32(dt * force[1]), np.float32(dt * force[2])
+    flow = np.float32(wind[0]), np.float32(wind[1]), np.float32(wind[2])
     for s in prange(len(nodes)):
         for n in range(64):
             m = nodes[s, n, 3]
@@ -206,25 +208,33 @@ def advance_nodes(nodes, least, dt, force, wind, drag, damping):  # type: ignore
                 nodes[s, n] = np.float32(0.0)
             else:
                 r = _ONE / m
-                x, y, z = nodes[s, n, 0] * r, nodes[s, n, 1] * r, nodes[s, n, 2] * r
-                nodes[s, n, 0], nodes[s, n, 1], nodes[s, n, 2] = pushed(x, y, z, gx, gy, gz, slow, pull, wx, wy, wz)
+                v = nodes[s, n, 0] * r, nodes[s, n, 1] * r, nodes[s, n, 2] * r
+                nodes[s, n, 0], nodes[s, n, 1], nodes[s, n, 2] = pushed(v, gain, slow, pull, flow)
 
 
 @njit(parallel=True)
-def gather(  # type: ignore[no-untyped-def]
-    x, v, affine, elastic, total, tau, memory, model, parameters, mass, solid, origin, spacing, dt,
-    block, shares, start, neighbour, nodes, fastest,
-):  # fmt: skip
+def gather(
+    particles: Particles, properties: Properties, places: Arrangement, grid: Nodes, dt: float, fastest: Array
+) -> None:
     """Grid to particles: move them, deform them, and find their stress for the next step.
 
     Parameters
     ----------
-    elastic, total : (n, 9) float32 array
-        Deformation gradients; `total` has no rows where the two are the same for every particle. Matter that is not
-        `solid` keeps the total it has.
+    particles : Particles
+        In the order of the arrangement; written.
+    properties : Properties
+    places : Arrangement
+    grid : Nodes
+        Velocities.
+    dt : float
+        Seconds.
     fastest : (b,) float32 array
         Written: the highest speed in each block, m/s; infinite where a particle is not finite.
     """
+    x, v, affine, elastic, total, tau, memory = particles
+    mass, model, parameters, solid = properties.mass, properties.model, properties.parameters, properties.solid
+    block, shares, start, neighbour = places.block, places.shares, places.start, places.neighbour
+    nodes, origin, spacing = grid.values, grid.origin, grid.spacing
     scale = 1.0 / spacing
     to_gradient = np.float32(4.0 * scale)
     step = np.float32(dt)
@@ -278,9 +288,10 @@ def gather(  # type: ignore[no-untyped-def]
                 affine[p, 0], affine[p, 1], affine[p, 2] = g0, g1, g2
                 affine[p, 3], affine[p, 4], affine[p, 5] = g3, g4, g5
                 affine[p, 6], affine[p, 7], affine[p, 8] = g6, g7, g8
-                stretch(elastic, p, step, g0, g1, g2, g3, g4, g5, g6, g7, g8)
+                gradient = g0, g1, g2, g3, g4, g5, g6, g7, g8
+                stretch(elastic, p, step, gradient)
                 if apart and solid[p]:
-                    stretch(total, p, step, g0, g1, g2, g3, g4, g5, g6, g7, g8)
+                    stretch(total, p, step, gradient)
                 if model[p] == ELASTIC:
                     neo_hookean(elastic, p, parameters[p, MU], parameters[p, LAMBDA], tau)
                 else:
@@ -289,18 +300,27 @@ def gather(  # type: ignore[no-untyped-def]
 
 
 @njit
-def hold_pins(x, pinned, pin_velocity, mass, origin, spacing, slot, nodes, held):  # type: ignore[no-untyped-def]
+def hold_pins(x: Array, mass: Array, pinned: Array, pin_velocity: Array, slot: Array, grid: Nodes, held: Array) -> None:
     """Nodes with pinned matter move as the pins do.
 
     Parameters
     ----------
+    x : (n, 3) float64 array
+        See `Particles`.
+    mass : (n,) float32 array
+        See `Properties`.
     pinned : (k,) int64 array
         Particles held.
     pin_velocity : (k, 3) float32 array
         m/s.
+    slot : (bx, by, bz) int32 array
+        See `Arrangement`.
+    grid : Nodes
+        Velocities; changed.
     held : (a, 64, 4) float32 array
         Zero before and after: pinned momentum and mass.
     """
+    nodes, origin, spacing = grid.values, grid.origin, grid.spacing
     scale = 1.0 / spacing
     for turn in range(2):
         for q in range(len(pinned)):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -21,7 +21,8 @@ from .blocks import Domain, outside
 from .colliders import Collider, MovingCollider, check_apart
 from .contact import Plane, plane_rows
 from .fields import FieldRows
-from .grid import Forces, Grid, HostGrid, Limits, Scene, State
+from .grid import Forces, Grid, HostGrid, Limits, Scene
+from .particles import Particles, Properties
 from .stepper import Stepper
 
 Array = np.ndarray
@@ -84,7 +85,7 @@ class Solver(Stepper):
 
     Attributes
     ----------
-    state : State
+    state : Particles
         In the order of ``body.points`` and then ``body.riders``.
     """
 
@@ -112,9 +113,9 @@ class Solver(Stepper):
         self._model = padded(matter.model)
         self._reach = np.maximum(self._nearest(body.points, body.riders)[0], domain.spacing)
         self._pins = np.flatnonzero(body.pinned) if body.pinned is not None else np.empty(0, np.int64)
+        properties = Properties(mass, volume, self._model, padded(matter.parameters), padded(matter.keeps_shape))
         self._scene = Scene(
-            domain, self.forces, self._fields, self.colliders, self.planes, mass, volume, self._model,
-            padded(matter.parameters), padded(matter.keeps_shape), self._pins,
+            domain, self.forces, self._fields, self.colliders, self.planes, properties, self._pins,
             np.float32(1e-9 * mass[:n].min(initial=np.inf)),
         )  # fmt: skip
         self.grid = self._grid_on(device)
@@ -137,7 +138,7 @@ class Solver(Stepper):
                 log.warning("%s Simulated on the CPU", error)
         return HostGrid(self._scene)
 
-    def _at_rest(self) -> State:
+    def _at_rest(self) -> Particles:
         body, n = self.body, len(self.body.points)
         x = np.concatenate([body.points, body.riders]).astype(np.float64)
         v = np.zeros((len(x), 3), np.float32)
@@ -149,7 +150,7 @@ class Solver(Stepper):
         memory = np.isin(self._model, (FLUID, SNOW)).astype(np.float32)
         total = np.zeros((len(x) if plastic else 0, 9), np.float32)
         affine, elastic = np.zeros((2, len(x), 9), np.float32)
-        return State(x, v, affine, elastic, total, np.zeros((len(x), 6), np.float32), memory)
+        return Particles(x, v, affine, elastic, total, np.zeros((len(x), 6), np.float32), memory)
 
     def _check_start(self) -> None:
         """Refuse what cannot go well, with what to do about it."""
@@ -176,10 +177,10 @@ class Solver(Stepper):
         return self.state.x[len(self.body.points) :]
 
     def arrays(self) -> dict[str, Array]:
-        return {f.name: getattr(self.state, f.name) for f in fields(self.state)}
+        return self.state._asdict()
 
     def _put(self, arrays: dict[str, Array]) -> None:
-        self.state = State(**arrays)
+        self.state = Particles(**arrays)
 
     def _advance(
         self,

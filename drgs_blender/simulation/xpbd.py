@@ -20,8 +20,9 @@ import numpy as np
 from ..compute.jit import njit, prange
 from ..core.errors import Cancelled, UsageError
 from .colliders import Collider, MovingCollider, check_apart
-from .contact import CONTACTS, Plane, plane_rows, surface_near
+from .contact import Plane, plane_rows
 from .fields import FieldRows, blow
+from .shell import Shell, push, push_planes
 from .solver import Body, Forces
 from .stepper import Stepper
 
@@ -236,16 +237,12 @@ class Lattice(Stepper):
             start = self.x.copy()
             self.x += dt * self.v
             _solve(self.x, self._inverse_mass, self._corners, self._parity, self._gradient, terms)
-            _push_planes(self.x, start, self._inverse_mass, shell_nodes, shell_weights, self.planes)
+            shell = Shell(self.x, start, self._inverse_mass, shell_nodes, shell_weights)
+            push_planes(shell, self.planes)
             for moving in self.colliders:
-                field, rotation, shift, linear, spin = moving.at((step + 1) / count)
+                field, motion = moving.at((step + 1) / count)
                 if field is not None:
-                    c = moving.collider
-                    _push(
-                        self.x, start, self._inverse_mass, shell_nodes, shell_weights, field.distance, field.velocity,
-                        field.origin, field.spacing, rotation, shift, linear, spin, c.thickness, CONTACTS[c.contact],
-                        c.friction, dt,
-                    )  # fmt: skip
+                    push(shell, field, motion, moving.collider.surface, dt)
             self.v = (self.x - start) / dt
             self.steps += 1
             if progress is not None:
@@ -330,78 +327,3 @@ def _embedded_gradients(x, corners, cube, slopes, out):  # type: ignore[no-untyp
                 at = x[corners[cube[i], k], r]
                 a, b, c = a + at * slopes[i, k, 0], b + at * slopes[i, k, 1], c + at * slopes[i, k, 2]
             out[i, r, 0], out[i, r, 1], out[i, r, 2] = a, b, c
-
-
-@njit(inline="always")
-def _move(x, inverse_mass, nodes, weights, dx, dy, dz):  # type: ignore[no-untyped-def]
-    """Move an embedded point by a vector, by moving the nodes that hold it."""
-    total = 0.0
-    for k in range(8):
-        total += weights[k] * weights[k] * inverse_mass[nodes[k]]
-    if total > 0.0:
-        for k in range(8):
-            s = weights[k] * inverse_mass[nodes[k]] / total
-            x[nodes[k], 0] += s * dx
-            x[nodes[k], 1] += s * dy
-            x[nodes[k], 2] += s * dz
-
-
-@njit(inline="always")
-def _contact(x, start, inverse_mass, nodes, weights, depth, nx, ny, nz, ux, uy, uz, contact, friction):  # type: ignore[no-untyped-def]
-    """Take an embedded point that is `depth` inside an obstacle out, which moved by u since the step began.
-
-    Where it was inside before the step, the start of the step moves too: it gains no speed by that.
-    """
-    rx, ry, rz = -ux, -uy, -uz
-    for k in range(8):
-        n = nodes[k]
-        rx += weights[k] * (x[n, 0] - start[n, 0])
-        ry += weights[k] * (x[n, 1] - start[n, 1])
-        rz += weights[k] * (x[n, 2] - start[n, 2])
-    along = rx * nx + ry * ny + rz * nz
-    tx, ty, tz = rx - along * nx, ry - along * ny, rz - along * nz
-    length = np.sqrt(tx * tx + ty * ty + tz * tz)
-    before = depth + min(along, 0.0)
-    if before > 0.0:
-        _move(start, inverse_mass, nodes, weights, before * nx, before * ny, before * nz)
-    hold = 0.0
-    if contact == 2:
-        hold = 1.0
-    elif contact == 0 and length > 1e-30:
-        hold = min(1.0, friction * depth / length)
-    _move(x, inverse_mass, nodes, weights, depth * nx - hold * tx, depth * ny - hold * ty, depth * nz - hold * tz)
-
-
-@njit
-def _push_planes(x, start, inverse_mass, nodes, weights, planes):  # type: ignore[no-untyped-def]
-    for q in range(len(planes)):
-        for p in range(len(nodes)):
-            d = -planes[q, 3]
-            for k in range(8):
-                n = nodes[p, k]
-                d += weights[p, k] * (planes[q, 0] * x[n, 0] + planes[q, 1] * x[n, 1] + planes[q, 2] * x[n, 2])
-            if d < 0.0:
-                _contact(
-                    x, start, inverse_mass, nodes[p], weights[p], -d, planes[q, 0], planes[q, 1], planes[q, 2],
-                    0.0, 0.0, 0.0, int(planes[q, 4]), planes[q, 5],
-                )  # fmt: skip
-
-
-@njit
-def _push(  # type: ignore[no-untyped-def]
-    x, start, inverse_mass, nodes, weights, distance, velocity, origin, spacing, rotation, shift, linear, spin,
-    thickness, contact, friction, dt,
-):  # fmt: skip
-    for p in range(len(nodes)):
-        px, py, pz = -shift[0], -shift[1], -shift[2]
-        for k in range(8):
-            n = nodes[p, k]
-            px, py, pz = px + weights[p, k] * x[n, 0], py + weights[p, k] * x[n, 1], pz + weights[p, k] * x[n, 2]
-        d, nx, ny, nz, ux, uy, uz = surface_near(
-            px, py, pz, distance, velocity, origin, spacing, rotation, linear, spin
-        )
-        if d < thickness:
-            _contact(
-                x, start, inverse_mass, nodes[p], weights[p], thickness - d, nx, ny, nz, dt * ux, dt * uy, dt * uz,
-                contact, friction,
-            )  # fmt: skip

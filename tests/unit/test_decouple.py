@@ -20,7 +20,8 @@ from drgs_blender.core.frame import Camera, Frame, ObjectState, RenderSettings, 
 from drgs_blender.geometry.normals import VertexNormals  # noqa: E402
 from drgs_blender.reconstruct.capture.capture import Capture, View  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.environment import LearnedLight, colour_cast  # noqa: E402
-from drgs_blender.reconstruct.inverse_rendering.estimator import Gatherer, Points  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering.estimator import Points  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering.gatherer import Gatherer  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.losses import blotches, dullness, log_loss, unbiased_loss  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.materials import Materials, from_specular  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.pixels import foreground_pixels  # noqa: E402

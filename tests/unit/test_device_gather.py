@@ -19,7 +19,8 @@ from drgs_blender.core.errors import DeviceError  # noqa: E402
 from drgs_blender.reconstruct.backend import CPU, LearningBackend  # noqa: E402
 from drgs_blender.reconstruct.gpu.gather import GATHER  # noqa: E402
 from drgs_blender.reconstruct.gpu.warp_backend import WarpLearningBackend  # noqa: E402
-from drgs_blender.reconstruct.inverse_rendering.estimator import Gatherer, Points  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering.estimator import Points  # noqa: E402
+from drgs_blender.reconstruct.inverse_rendering.gatherer import Gatherer  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.run import decouple  # noqa: E402
 from drgs_blender.reconstruct.inverse_rendering.settings import Settings  # noqa: E402
 from drgs_blender.render.scene.triangle_bvh import TriangleBVH  # noqa: E402

@@ -1,4 +1,4 @@
-"""Surfels that follow their mesh on a device, where they stay: `deform.mesh_driven` from the same source.
+"""Surfels that follow their mesh on a device, where they stay: `deform.pose` from the same source.
 
 The functions here are translated and never run as they stand.
 """
@@ -16,7 +16,7 @@ from ...compute.warp.posed_surfels import PosedThere
 from ...compute.warp.runtime import warp
 from ...core.asset.model import MATERIAL_CHANNELS, PosedSurfels
 from ...geometry.normals import face_normal, vertex_normal
-from .. import mesh_driven
+from .. import pose
 from ..mesh_driven import MeshDriven, Posing
 
 Array = np.ndarray
@@ -51,12 +51,12 @@ def sum_corners(lane, lanes, room, weighted, start, side, out):  # type: ignore[
 
 def _constants(module: ModuleType, name: str, value: Any) -> Any:
     """One surfel a block."""
-    return 1 if module is mesh_driven and name == "_BLOCK" else value
+    return 1 if module is pose and name == "_BLOCK" else value
 
 
 WEIGH = Work(weigh_corners, (), {})
 SUM = Work(sum_corners, (), {})
-POSE = Work(mesh_driven.pose_surfels, (), {}, _constants)
+POSE = Work(pose.pose_surfels, (), {}, _constants)
 
 
 class _Tables(NamedTuple):

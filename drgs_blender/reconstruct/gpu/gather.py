@@ -17,7 +17,8 @@ from ...render.gpu.scene_mirror import Mirror
 from ...render.lights.environment import EnvironmentLight
 from ...render.scene.embree import trace
 from ...render.scene.triangle_bvh import TriangleBVH
-from ..inverse_rendering.estimator import Gatherer, gather_point
+from ..inverse_rendering.estimator import Lobes, Points, Samples, Sky, Sums, gather_point
+from ..inverse_rendering.gatherer import Gatherer
 
 log = logging.getLogger(__name__)
 
@@ -50,12 +51,11 @@ def trace_mesh(
 _HIT = ("float32", "int32", "int32", "int32", "float32", "float32", "float32", "float32", "float32")
 
 
-def gather_points(  # type: ignore[no-untyped-def]
-    lane, lanes, room, points, normals, a2s, counts, sequence, scene, faces, cache, radiance, shape, envmap, seen, out
-):
-    """`inverse_rendering.estimator._gather`."""
-    for i in range(lane, len(a2s), lanes):
-        gather_point(i, points, normals, a2s, counts, sequence, scene, faces, cache, radiance, shape, envmap, seen, out)
+def gather_points(lane, lanes, room, points, lobes, plan, occluder, sky, envmap, out):  # type: ignore[no-untyped-def]
+    """`inverse_rendering.estimator.gather`."""
+    sums, samples = out
+    for i in range(lane, len(lobes[1]), lanes):
+        gather_point(i, points, lobes, plan, occluder, sky, envmap, sums, samples)
 
 
 GATHER = Work(gather_points, (), NATIVES | {trace: Native(_TRACE, "trace_mesh", _HIT)})
@@ -85,24 +85,20 @@ class DeviceGatherer(Gatherer):
         self.failed = ""
 
     def _gather(
-        self, points: tuple[Array, ...], normal: Array, alpha2: Array, radiance: Array, shape: tuple[Any, ...],
-        environment: EnvironmentLight, out: tuple[Array, ...],
-    ) -> None:  # fmt: skip
+        self, points: Points, lobes: Lobes, sky: Sky, light: EnvironmentLight, sums: Sums, samples: Samples
+    ) -> None:
         if not self.failed:
             try:
                 with self._launcher.failures("copying the mesh"):
-                    counts, sequence, faces, cache = self._kept()
-                    scene, envmap = (
-                        (0, 0 if self._mesh is None else int(self._mesh.id)),
-                        self._mirror.envmap(environment),
-                    )
-                arguments = points, normal, alpha2, counts, sequence, scene, faces, cache, radiance, shape, envmap
-                self._launcher.launch(GATHER, len(alpha2), (*arguments, self._seen), out)
+                    plan, occluder = self._kept()
+                    envmap = self._mirror.envmap(light)
+                arguments = tuple(points), tuple(lobes), plan, occluder, tuple(sky), envmap
+                self._launcher.launch(GATHER, len(lobes.alpha2), arguments, (tuple(sums), tuple(samples)))
                 return
             except DeviceError as error:
                 self.failed = str(error)
                 log.warning("%s Materials are learned on the CPU from here on", self.failed)
-        super()._gather(points, normal, alpha2, radiance, shape, environment, out)
+        super()._gather(points, lobes, sky, light, sums, samples)
 
     def _kept(self) -> tuple[Any, ...]:
         """What stays on the device: the mesh that rays meet, and tables."""
@@ -111,6 +107,7 @@ class DeviceGatherer(Gatherer):
             if len(tree.faces):
                 vertices = wp.array(tree.vertices, dtype=wp.vec3, device=device)
                 self._mesh = wp.Mesh(vertices, wp.array(tree.faces.ravel(), dtype=wp.int32, device=device))
-            arrays = self._counts, self._sequence, self._faces, self._cache
-            self._tables = tuple(map(self._launcher.array, arrays))
+            copy, own = self._launcher.array, self._occluder
+            scene = 0 if self._mesh is None else int(self._mesh.id)
+            self._tables = tuple(map(copy, self._plan)), (0, scene, copy(own.faces), copy(own.cache), *own[4:])
         return self._tables

@@ -1,9 +1,10 @@
 """Kernels of the differentiable rasteriser on a device, one lane a surfel, a pixel or a surfel in a tile.
 
-The functions here are translated and never run as they stand; what they call is the processor's. Forwards, a lane
-walks the list of its pixel's tile. Backwards, a first kernel walks it again and leaves, in a rectangle of each
-surfel's own, what its pixels let through before it and how they want its strength to change; a second one takes a
-surfel in one tile and sums over these pixels, row by row: no two lanes ever write to one number, and every sum has
+The functions here are translated and never run as they stand; what they call is the processor's. What they take comes
+in tuples, in the order of `projection.WorldSurfels`, `projection.Projected`, `blend.Splats` and `blend.Tiles`.
+Forwards, a lane walks the list of its pixel's tile. Backwards, a first kernel walks it again and leaves, in a rectangle
+of each surfel's own, what its pixels let through before it and how they want its strength to change; a second one takes
+a surfel in one tile and sums over these pixels, row by row: no two lanes ever write to one number, and every sum has
 one order. The results are the same bits each time.
 """
 
@@ -17,9 +18,10 @@ from ...compute.warp.kernels import Room, Work
 from ...render.sampling import ONE, ZERO, F
 from ...render.surfels.raster import MAX_ALPHA, gaussian
 from ...render.surfels.splats import TILE
+from ..model.blend import MIN_TRANSMITTANCE, strength
+from ..model.blend_backward import BEFORE, TRAVEL, slopes
 from ..model.projection import (
     CUT,
-    DIM,
     I0,
     IX,
     IY,
@@ -32,8 +34,8 @@ from ..model.projection import (
     VY,
     project_surfel,
     project_surfel_backward,
+    splat_of,
 )
-from ..model.raster import BEFORE, MIN_TRANSMITTANCE, TRAVEL, slopes, strength
 
 #: Columns of a pixel's maps: transmittance, sums of weighted depth and of its square, distortion, median, features.
 T, Z, ZZ, DISTORTION, MEDIAN, FEATURES = 0, 1, 2, 3, 4, 5
@@ -43,11 +45,10 @@ G_ALPHA, G_DEPTH, G_MEDIAN, G_DISTORTION, G_FEATURES = 0, 1, 2, 3, 4
 CHANNELS = 16
 
 
-def project_rows(lane, lanes, room, centre, tangent_u, tangent_v, opacity, p, width, height, out):  # type: ignore[no-untyped-def]
+def project_rows(lane, lanes, room, surfels, p, picture, out):  # type: ignore[no-untyped-def]
     """`projection.project`."""
-    record, depth, box = out
-    for i in range(lane, len(centre), lanes):
-        project_surfel(i, centre, tangent_u, tangent_v, opacity, p, width, height, record, depth, box)
+    for i in range(lane, len(surfels[0]), lanes):
+        project_surfel(i, surfels, p, picture, out)
 
 
 def list_pairs(lane, lanes, room, box, first, tiles_x, out):  # type: ignore[no-untyped-def]
@@ -72,18 +73,17 @@ def inside(box: Any, i: Any, x: Any, y: Any) -> Any:
     return x >= box[i, 0] and x < box[i, 2] and y >= box[i, 1] and y < box[i, 3]
 
 
-def meet(record: Any, i: Any, x: Any, y: Any, near: Any, far: Any) -> Any:
-    """Place of a pixel from surfel i's centre, and what `raster.strength` says of it."""
-    ex, ey = F(x) + F(0.5) - record[i, RX], F(y) + F(0.5) - record[i, RY]
-    q, z, exact, su, sv = strength(
-        ex, ey, record[i, UX], record[i, UY], record[i, VX], record[i, VY], record[i, I0], record[i, IX],
-        record[i, IY], ONE / record[i, I0], record[i, DIM], near, far,
-    )  # fmt: skip
+def meet(splat: Any, x: Any, y: Any, near: Any, far: Any) -> Any:
+    """Place of a pixel from a surfel's centre, and what `blend.strength` says of it."""
+    ex, ey = F(x) + F(0.5) - splat.rx, F(y) + F(0.5) - splat.ry
+    q, z, exact, su, sv = strength(ex, ey, splat, near, far)
     return ex, ey, q, z, exact, su, sv
 
 
-def blend_pixels(lane, lanes, room, record, values, box, start, listed, near, far, tiles_x, out):  # type: ignore[no-untyped-def]
-    """The maps of all pixels, as `raster._blend` sums them; neighbouring lanes are of one tile."""
+def blend_pixels(lane, lanes, room, splats, tiles, out):  # type: ignore[no-untyped-def]
+    """The maps of all pixels, as `blend._blend` sums them; neighbouring lanes are of one tile."""
+    record, values, box, near, far = splats
+    start, listed, tiles_x = tiles
     (maps,) = out
     (sums,) = room
     height, width, channels = maps.shape[0], maps.shape[1], values.shape[1]
@@ -100,7 +100,7 @@ def blend_pixels(lane, lanes, room, record, values, box, start, listed, near, fa
             i = np.int64(listed[entry])
             entry += 1
             if inside(box, i, x, y):
-                _, _, q, z, _, _, _ = meet(record, i, x, y, near, far)
+                _, _, q, z, _, _, _ = meet(splat_of(record, i), x, y, near, far)
                 if q < record[i, CUT]:
                     w = t * min(record[i, OPACITY] * gaussian(q), F(MAX_ALPHA))
                     after = t - w
@@ -118,16 +118,19 @@ def blend_pixels(lane, lanes, room, record, values, box, start, listed, near, fa
             maps[y, x, FEATURES + c] = sums[c]
 
 
-def pull_pixels(lane, lanes, room, record, values, box, start, listed, first, near, far, tiles_x, maps, incoming, out):  # type: ignore[no-untyped-def]
+def pull_pixels(lane, lanes, room, splats, tiles, first, maps, incoming, out):  # type: ignore[no-untyped-def]
     """Transmittance before each surfel, and gradient of its strength, by pixels of the surfels' rectangles.
 
     Parameters
     ----------
     first : (m,) array
         First row of each surfel's rectangle in what is written.
+    maps : array
+        What `blend_pixels` wrote.
     incoming : (h, w, G_FEATURES + channels) float32 array
-        (h, w, G_FEATURES + channels).
     """
+    record, values, box, near, far = splats
+    start, listed, tiles_x = tiles
     (pulls,) = out
     height, width, channels = maps.shape[0], maps.shape[1], values.shape[1]
     stop, most = F(MIN_TRANSMITTANCE), F(MAX_ALPHA)
@@ -147,7 +150,7 @@ def pull_pixels(lane, lanes, room, record, values, box, start, listed, first, ne
             i = np.int64(listed[entry])
             entry += 1
             if inside(box, i, x, y):
-                _, _, q, z, _, _, _ = meet(record, i, x, y, near, far)
+                _, _, q, z, _, _, _ = meet(splat_of(record, i), x, y, near, far)
                 if q < record[i, CUT]:
                     strong = record[i, OPACITY] * gaussian(q)
                     a = min(strong, most)
@@ -163,18 +166,18 @@ def pull_pixels(lane, lanes, room, record, values, box, start, listed, first, ne
                     t = t - w
 
 
-def sum_pixels(  # type: ignore[no-untyped-def]
-    lane, lanes, room, record, box, listed, tiles, pairs, first, near, far, tiles_x, maps, incoming, pulls, out
-):
+def sum_pixels(lane, lanes, room, splats, entries, first, maps, incoming, pulls, out):  # type: ignore[no-untyped-def]
     """Gradients of each surfel's record and features from its pixels in one tile.
 
     Parameters
     ----------
-    listed, tiles, pairs : (k,) array
-        Surfel, tile and number of each pair, in the order of tiles.
+    entries : tuple
+        (k,) arrays: surfel, tile and number of each pair, in the order of tiles; tiles in a row.
     pulls : array
         What `pull_pixels` wrote.
     """
+    record, _, box, near, far = splats
+    listed, tiles, pairs, tiles_x = entries
     (slots,) = out
     half, width, height = F(0.5), maps.shape[1], maps.shape[0]
     channels = incoming.shape[2] - G_FEATURES
@@ -184,8 +187,7 @@ def sum_pixels(  # type: ignore[no-untyped-def]
         x0, x1 = max(left, np.int64(box[i, 0])), min(min(left + TILE, np.int64(box[i, 2])), width)
         y0, y1 = max(top, np.int64(box[i, 1])), min(min(top + TILE, np.int64(box[i, 3])), height)
         across = np.int64(box[i, 2] - box[i, 0])
-        ux, uy, vx, vy = record[i, UX], record[i, UY], record[i, VX], record[i, VY]
-        ix, iy, opacity = record[i, IX], record[i, IY], record[i, OPACITY]
+        splat = splat_of(record, i)
         to_x, to_y, to_ux, to_uy, to_vx, to_vy = ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
         to_i, to_ix, to_iy, to_opacity, travel = ZERO, ZERO, ZERO, ZERO, ZERO
         for y in range(y0, y1):
@@ -193,9 +195,9 @@ def sum_pixels(  # type: ignore[no-untyped-def]
                 at = first[i] + (y - np.int64(box[i, 1])) * across + x - np.int64(box[i, 0])
                 t, pull = pulls[at, 0], pulls[at, 1]
                 if t > ZERO:
-                    ex, ey, q, z, exact, su, sv = meet(record, i, x, y, near, far)
+                    ex, ey, q, z, exact, su, sv = meet(splat, x, y, near, far)
                     kernel = gaussian(q)
-                    alpha = min(opacity * kernel, F(MAX_ALPHA))
+                    alpha = min(splat.opacity * kernel, F(MAX_ALPHA))
                     w = t * alpha
                     g_distortion = incoming[y, x, G_DISTORTION]
                     g_z = w * (
@@ -204,9 +206,7 @@ def sum_pixels(  # type: ignore[no-untyped-def]
                     )
                     if t > half and t - w <= half:
                         g_z += incoming[y, x, G_MEDIAN]
-                    g_ex, g_ey, g_su, g_sv, g_i, slope = slopes(
-                        pull, g_z, alpha, ex, ey, z, exact, su, sv, ux, uy, vx, vy, ix, iy
-                    )
+                    g_ex, g_ey, g_su, g_sv, g_i, slope = slopes(pull, g_z, alpha, ex, ey, z, exact, su, sv, splat)
                     to_x -= g_ex
                     to_y -= g_ey
                     to_ux += g_su * ex
@@ -238,11 +238,10 @@ def sum_tiles(lane, lanes, room, slots, first, out):  # type: ignore[no-untyped-
         total[i, c] = found
 
 
-def project_rows_backward(lane, lanes, room, centre, tangent_u, tangent_v, p, index, gradient, out):  # type: ignore[no-untyped-def]
+def project_rows_backward(lane, lanes, room, surfels, p, index, gradient, out):  # type: ignore[no-untyped-def]
     """`projection.project_backward`."""
-    g_centre, g_u, g_v = out
     for k in range(lane, len(index), lanes):
-        project_surfel_backward(k, centre, tangent_u, tangent_v, p, index, gradient, g_centre, g_u, g_v)
+        project_surfel_backward(k, surfels, p, index, gradient, out)
 
 
 PROJECT = Work(project_rows, (), {})

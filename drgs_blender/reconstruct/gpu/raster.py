@@ -13,8 +13,9 @@ from ...core.errors import DeviceError
 from ...core.frame import Camera
 from ...render.camera import CLIP_END, CLIP_START
 from ...render.surfels.splats import TILE
+from ..model.blend_backward import BEFORE, TRAVEL
 from ..model.projection import OPACITY, RECORD
-from ..model.raster import BEFORE, TRAVEL, Maps, Tally, view_of
+from ..model.raster import Maps, Tally, view_of
 from .kernels import (
     BLEND,
     CHANNELS,
@@ -62,9 +63,9 @@ class _Rasterise(torch.autograd.Function):
         assert features.shape[1] <= CHANNELS
         new = centre.new_empty
         p = torch.from_numpy(parameters).to(centre.device)
-        surfels = [t.detach().contiguous() for t in (centre, tangent_u, tangent_v)]
+        surfels = tuple(t.detach().contiguous() for t in (centre, tangent_u, tangent_v, opacity))
         record, depth, box = new(n, RECORD), new(n), new((n, 4), dtype=torch.int32)
-        launcher.launch(PROJECT, n, (*surfels, opacity.detach().contiguous(), p, width, height), (record, depth, box))
+        launcher.launch(PROJECT, n, (surfels, p, size), (record, depth, box))
         seen = torch.nonzero(box[:, 2] > box[:, 0])[:, 0]
         order = seen[torch.sort(depth[seen], stable=True)[1]]
         record, box, values = record[order], box[order], features.detach()[order]
@@ -72,17 +73,18 @@ class _Rasterise(torch.autograd.Function):
         tiles_x, tiles_y = (width - 1) // TILE + 1, (height - 1) // TILE + 1
         pairs = _Pairs(launcher, box, tiles_x, tiles_y)
         maps = new(height, width, FEATURES + values.shape[1])
-        lists = record, values, box, pairs.start, pairs.surfel
-        launcher.launch(BLEND, tiles_x * tiles_y * TILE * TILE, (*lists, near, far, tiles_x), (maps,))
-        ctx.save = (launcher, surfels, p, order, lists, pairs, near, far, tiles_x, maps, tally)
+        splats, tiles = (record, values, box, near, far), (pairs.start, pairs.surfel, tiles_x)
+        launcher.launch(BLEND, tiles_x * tiles_y * TILE * TILE, (splats, tiles), (maps,))
+        ctx.save = (launcher, surfels, p, order, splats, tiles, pairs, maps, tally)
         ctx.set_materialize_grads(False)
         # Copies: the maps are needed as they are for the way back.
         return maps[..., FEATURES:].clone(), 1 - maps[..., T], *(maps[..., k].clone() for k in (Z, MEDIAN, DISTORTION))
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Any, ...]:
-        launcher, surfels, p, order, lists, pairs, near, far, tiles_x, maps, tally = ctx.save
-        record, values, box, start, listed = lists
+        launcher, surfels, p, order, splats, tiles, pairs, maps, tally = ctx.save
+        _, values, box, _, _ = splats
+        start, listed, tiles_x = tiles
         (m, channels), n = values.shape, len(surfels[0])
         new = maps.new_zeros
         incoming = new(*maps.shape[:2], G_FEATURES + channels)
@@ -95,22 +97,20 @@ class _Rasterise(torch.autograd.Function):
         first, pixels = starts((box[:, 2] - box[:, 0]).long() * (box[:, 3] - box[:, 1]))
         pulls = new(pixels, 2)
         pixel_lanes = (len(start) - 1) * TILE * TILE
-        launcher.launch(PULL, pixel_lanes, (*lists, first, near, far, tiles_x, maps, incoming), (pulls,))
+        launcher.launch(PULL, pixel_lanes, (splats, tiles, first, maps, incoming), (pulls,))
         slots = new(len(listed), BEFORE + channels)
-        entries = listed, pairs.tile, pairs.number, first
-        launcher.launch(
-            SUM_PIXELS, len(listed), (record, box, *entries, near, far, tiles_x, maps, incoming, pulls), (slots,)
-        )
+        entries = listed, pairs.tile, pairs.number, tiles_x
+        launcher.launch(SUM_PIXELS, len(listed), (splats, entries, first, maps, incoming, pulls), (slots,))
         total = new(m, BEFORE + channels)
         launcher.launch(SUM_TILES, total.numel(), (slots, pairs.first), (total,))
-        moved = [new(n, 3) for _ in range(3)]
-        launcher.launch(PROJECT_BACKWARD, m, (*surfels, p, order, total), tuple(moved))
-        g_opacity, g_values = new(n), new(n, channels)
-        g_opacity[order], g_values[order] = total[:, OPACITY], total[:, BEFORE:]
+        found = tuple(new(t.shape) for t in surfels)
+        launcher.launch(PROJECT_BACKWARD, m, (surfels, p, order, total), found)
+        g_values = new(n, channels)
+        found[3][order], g_values[order] = total[:, OPACITY], total[:, BEFORE:]
         if tally is not None:
             tally.travel[order] += total[:, TRAVEL]
             tally.views[order] += 1
-        return *moved, g_opacity, g_values, None, None, None, None
+        return *found, g_values, None, None, None, None
 
 
 class _Pairs:

@@ -15,19 +15,14 @@ miss the object meet the environment, a table of texels; those that hit it the r
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from ...compute.jit import njit, prange
-from ...core.asset.model import Mesh
-from ...core.frame import World
 from ...render.integrator.brdf import fresnel_dielectric, ggx, sample_vndf, vndf_terms
 from ...render.lights.environment import (
-    EnvironmentLight,
+    EnvMap,
     cell_at,
     cell_end,
     direction_in_cell,
@@ -46,23 +41,17 @@ from ...render.sampling import (
     basis,
     cosine_hemisphere,
     mix,
-    point_set,
     scrambled,
     unit,
 )
 from ...render.scene.embree import trace
 from ...render.scene.ray import Ray
-from ...render.scene.triangle_bvh import TriangleBVH
 
 Array = np.ndarray
 
 #: Sums of a pixel: D, S, P, E of the module's text.
 SUMS = 4
-#: Part of the scene's size by which rays start above the surface: more than facets stand off the smooth shape.
-_LIFT = 5e-4
 _BLOCK = 16
-#: Parts in which texel gradients are summed: a fixed number, so that threads do not change the result.
-_PARTS = 8
 _NONE = np.int32(-1)
 
 
@@ -84,14 +73,100 @@ class Samples(NamedTuple):
     weight: Array
 
 
-@dataclass(slots=True)
-class Points:
+class Points(NamedTuple):
     """Pixels of one step: origin, flat, towards (n, 3) float32 as in `Pixels`, key (n,) uint32 of random numbers."""
 
     origin: Array
     flat: Array
     towards: Array
     key: Array
+
+
+class Lobes(NamedTuple):
+    """What of the surfaces is inside the integral.
+
+    Attributes
+    ----------
+    normal : (n, 3) float32 array
+        Unit shading normals.
+    alpha2 : (n,) float32 array
+        Square of GGX's alpha.
+    """
+
+    normal: Array
+    alpha2: Array
+
+
+class Plan(NamedTuple):
+    """How directions are drawn.
+
+    Attributes
+    ----------
+    counts : (3,) int64 array
+        Cosine, GGX and light samples of a pixel, even.
+    sequence : (k, 3) uint32 array
+        Points of a low discrepancy, scrambled pixel by pixel.
+    """
+
+    counts: Array
+    sequence: Array
+
+
+class Occluder(NamedTuple):
+    """The mesh that rays meet.
+
+    Attributes
+    ----------
+    intersect, scene : int
+        Addresses, see `embree.trace`.
+    faces : (m, 3) int32 array
+    cache : (v, 4, 3) float32 array
+        See `radiance_cache`.
+    seen : bool
+        Whether it has radiance; else it is black.
+    lift : np.float32
+        Metres above the surface from which rays start.
+    """
+
+    intersect: int
+    scene: int
+    faces: Array
+    cache: Array
+    seen: bool
+    lift: np.float32
+
+
+class Sky(NamedTuple):
+    """The environment, met by rays that miss.
+
+    Attributes
+    ----------
+    radiance : (height * width, 3) float32 array
+        Lat-long, row by row.
+    height, width : np.int32
+    """
+
+    radiance: Array
+    height: np.int32
+    width: np.int32
+
+
+class Sums(NamedTuple):
+    """What is gathered of pixels and either half of their samples.
+
+    Attributes
+    ----------
+    values : (n, 2, SUMS, 3) float32 array
+        D, S, P, E.
+    by_a2 : (n, 2, SUMS, 3) float32 array
+        Their derivatives by `Lobes.alpha2`.
+    by_normal : (n or 0, 2, SUMS, 9) float32 array
+        Channel by channel, those by the normal; no rows where they are not wanted.
+    """
+
+    values: Array
+    by_a2: Array
+    by_normal: Array
 
 
 @njit
@@ -140,8 +215,9 @@ def _cached(cache, a, b, c, u, v, dx, dy, dz, k):  # type: ignore[no-untyped-def
 
 
 @njit
-def _direction(strategy, n0, n1, n2, normal, view, alpha, bound, frame, row, envmap):  # type: ignore[no-untyped-def]
+def _direction(strategy, numbers, normal, frame, view, alpha, bound, row, envmap):  # type: ignore[no-untyped-def]
     """Direction of a strategy (0 cosine, 1 GGX, 2 light) from three random uint32."""
+    n0, n1, n2 = numbers
     nx, ny, nz = normal
     tx, ty, tz, bx, by, bz = frame
     if strategy == 2:
@@ -169,15 +245,20 @@ def _texels(radiance, t, p, k):  # type: ignore[no-untyped-def]
 
 
 @njit
-def gather_point(i, points, normals, a2s, counts, sequence, scene, faces, cache, radiance, shape, envmap, seen, out):  # type: ignore[no-untyped-def]
-    """All samples of one pixel; see `gather` for what is written."""
+def gather_point(i, points, lobes, plan, occluder, sky, envmap, sums, samples):  # type: ignore[no-untyped-def]
+    """All samples of one pixel, into `Sums` and `Samples`; devices have tuples in the order of the records."""
     origin, flat, towards, key = points
-    sums, by_a2, by_normal, texel, share, weights = out
+    normals, a2s = lobes
+    counts, sequence = plan
+    intersect, scene, faces, cache, seen, lift = occluder
+    radiance, height, width = sky
+    values, by_a2, by_normal = sums
+    texel, share, weights = samples
     learn_normals = by_normal.shape[0] > 0
     nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
     gx, gy, gz = flat[i, 0], flat[i, 1], flat[i, 2]
     vx, vy, vz = towards[i, 0], towards[i, 1], towards[i, 2]
-    ox, oy, oz = origin[i, 0] + shape[2] * gx, origin[i, 1] + shape[2] * gy, origin[i, 2] + shape[2] * gz
+    ox, oy, oz = origin[i, 0] + lift * gx, origin[i, 1] + lift * gy, origin[i, 2] + lift * gz
     nv = nx * vx + ny * vy + nz * vz
     a2 = a2s[i]
     alpha = F(math.sqrt(a2))
@@ -198,7 +279,7 @@ def gather_point(i, points, normals, a2s, counts, sequence, scene, faces, cache,
                 n1 = scrambled(sequence[j, 1], mix(U(own + U(2))))
                 n2 = scrambled(sequence[j, 2], mix(U(own + U(3))))
                 dx, dy, dz = _direction(
-                    strategy, n0, n1, n2, (nx, ny, nz), (vx, vy, vz), alpha, bound, frame, row, envmap
+                    strategy, (n0, n1, n2), (nx, ny, nz), frame, (vx, vy, vz), alpha, bound, row, envmap
                 )
                 nl = nx * dx + ny * dy + nz * dz
                 if not (nl > F(1e-6) and gx * dx + gy * dy + gz * dz > ZERO):
@@ -224,7 +305,7 @@ def gather_point(i, points, normals, a2s, counts, sequence, scene, faces, cache,
                 f = f * f * x
                 w0, w1, w2, w3 = w * nl * INVERSE_PI, lobe * (ONE - f), lobe * f, lobe * fresnel_dielectric(vh)
                 ray = Ray((ox, oy, oz), (dx, dy, dz), ZERO, F(np.inf), _NONE)
-                _, group, face, _, hu, hv, _, _, _ = trace(scene[0], scene[1], ray)
+                _, group, face, _, hu, hv, _, _, _ = trace(intersect, scene, ray)
                 if group >= 0:
                     if not seen:
                         continue
@@ -233,7 +314,7 @@ def gather_point(i, points, normals, a2s, counts, sequence, scene, faces, cache,
                     green = _cached(cache, a, b, c, hu, hv, -dx, -dy, -dz, 1)
                     blue = _cached(cache, a, b, c, hu, hv, -dx, -dy, -dz, 2)
                 else:
-                    four, parts = _bilinear(u, v, shape[0], shape[1])
+                    four, parts = _bilinear(u, v, height, width)
                     red, green, blue = (
                         _texels(radiance, four, parts, 0),
                         _texels(radiance, four, parts, 1),
@@ -244,10 +325,10 @@ def gather_point(i, points, normals, a2s, counts, sequence, scene, faces, cache,
                     weights[i, s, 0], weights[i, s, 1], weights[i, s, 2], weights[i, s, 3] = w0, w1, w2, w3
                 for k in range(3):
                     light = red if k == 0 else (green if k == 1 else blue)
-                    sums[i, half, 0, k] += w0 * light
-                    sums[i, half, 1, k] += w1 * light
-                    sums[i, half, 2, k] += w2 * light
-                    sums[i, half, 3, k] += w3 * light
+                    values[i, half, 0, k] += w0 * light
+                    values[i, half, 1, k] += w1 * light
+                    values[i, half, 2, k] += w2 * light
+                    values[i, half, 3, k] += w3 * light
                     by_a2[i, half, 1, k] += l_a2 * w1 * light
                     by_a2[i, half, 2, k] += l_a2 * w2 * light
                     by_a2[i, half, 3, k] += l_a2 * w3 * light
@@ -267,17 +348,25 @@ def gather_point(i, points, normals, a2s, counts, sequence, scene, faces, cache,
 
 
 @njit(parallel=True)
-def _gather(points, normals, a2s, counts, sequence, scene, faces, cache, radiance, shape, envmap, seen, out):  # type: ignore[no-untyped-def]
-    n = len(a2s)
+def gather(
+    points: Points,
+    lobes: Lobes,
+    plan: Plan,
+    occluder: Occluder,
+    sky: Sky,
+    envmap: EnvMap,
+    sums: Sums,
+    samples: Samples,
+) -> None:
+    """`gather_point` of all points; light samples are drawn by the envmap."""
+    n = len(lobes.alpha2)
     for block in prange((n + _BLOCK - 1) // _BLOCK):
         for i in range(block * _BLOCK, min(n, (block + 1) * _BLOCK)):
-            gather_point(
-                i, points, normals, a2s, counts, sequence, scene, faces, cache, radiance, shape, envmap, seen, out
-            )
+            gather_point(i, points, lobes, plan, occluder, sky, envmap, sums, samples)
 
 
 @njit(parallel=True)
-def _scatter(texel, share, weight, gradient, parts):  # type: ignore[no-untyped-def]
+def scatter(texel, share, weight, gradient, parts):  # type: ignore[no-untyped-def]
     """Sum what each texel's radiance is worth to the loss, in parts of pixels."""
     n, samples = texel.shape[:2]
     for part in prange(len(parts)):
@@ -292,125 +381,3 @@ def _scatter(texel, share, weight, gradient, parts):  # type: ignore[no-untyped-
                         value += weight[i, s, q] * gradient[i, half, q, k]
                     for q in range(4):
                         parts[part, texel[i, s, q], k] += share[i, s, q] * value
-
-
-class Gatherer:
-    """Draws directions at pixels of a mesh and sums what arrives along them.
-
-    Parameters
-    ----------
-    mesh : Mesh
-        What rays meet.
-    tree : TriangleBVH
-        Of its triangles, or of nothing where nothing is in the way.
-    cache : (v, 4, 3) float32 array or None
-        See `cache.radiance_cache`; None: what hits the mesh is black.
-    counts : tuple of int
-        Even numbers of cosine, GGX and light samples a pixel.
-    normals : bool
-        Whether derivatives by the normals are wanted.
-    """
-
-    def __init__(
-        self, mesh: Mesh, tree: TriangleBVH, cache: Array | None, counts: tuple[int, int, int], normals: bool = False
-    ) -> None:
-        self._faces, self._tree, self._normals = mesh.faces, tree, normals
-        self._counts = np.array(counts, np.int64)
-        self._seen = cache is not None
-        self._cache = np.zeros((1, 4, 3), np.float32) if cache is None else np.ascontiguousarray(cache, np.float32)
-        low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-        self._lift = F(_LIFT * float(np.linalg.norm(high - low)))
-        self._sequence = point_set(max(counts) + 1)
-        self._light: EnvironmentLight | None = None
-
-    def aim(self, radiance: Array) -> None:
-        """Draw light samples in proportion to (h, w, 3) `radiance` from now on."""
-        self._light = EnvironmentLight(World(environment=np.ascontiguousarray(radiance, np.float32)))
-
-    def __call__(self, points: Points, normal: Tensor, alpha2: Tensor, radiance: Tensor) -> Tensor:
-        """The sums of `points`.
-
-        Parameters
-        ----------
-        points : Points
-        normal : (n, 3) tensor
-            Unit shading normals.
-        alpha2 : (n,) tensor
-            Square of GGX's alpha.
-        radiance : (h, w, 3) tensor
-            Lat-long, of the size given to `aim`.
-
-        Returns
-        -------
-        (n, 2, 4, 3) tensor
-            D, S, P, E from either half of the samples, each an estimate of its own.
-        """
-        return _Gather.apply(normal, alpha2, radiance, self, points)
-
-    def run(self, points: Points, normal: Array, alpha2: Array, radiance: Array) -> tuple[Array, Array, Array, Samples]:
-        """Sums, their derivatives by alpha2 and by the normal (n, 2, 4, 3[, 3]), and the samples."""
-        if self._light is None:
-            self.aim(radiance)
-        assert self._light is not None
-        n, s = len(alpha2), int(self._counts.sum())
-        sums, by_a2 = np.zeros((2, n, 2, SUMS, 3), np.float32)
-        by_normal = np.zeros((n if self._normals else 0, 2, SUMS, 9), np.float32)
-        samples = Samples(
-            np.empty((n, s, 4), np.int32), np.empty((n, s, 4), np.float32), np.empty((n, s, 4), np.float32)
-        )
-        height, width = radiance.shape[:2]
-        self._gather(
-            (points.origin, points.flat, points.towards, points.key),
-            np.ascontiguousarray(normal),
-            np.ascontiguousarray(alpha2),
-            np.ascontiguousarray(radiance).reshape(-1, 3),
-            (np.int32(height), np.int32(width), self._lift),
-            self._light,
-            (sums, by_a2, by_normal, *samples),
-        )
-        # Weights are of all samples together: either half alone has half of the sum.
-        sums *= 2
-        by_a2 *= 2
-        by_normal *= 2
-        return sums, by_a2, by_normal.reshape(*by_normal.shape[:3], 3, 3), samples
-
-    def _gather(
-        self, points: tuple[Array, ...], normal: Array, alpha2: Array, radiance: Array, shape: tuple[Any, ...],
-        environment: EnvironmentLight, out: tuple[Array, ...],
-    ) -> None:  # fmt: skip
-        """`gather_point` of all points."""
-        scene = self._tree.intersect_address, self._tree.scene
-        _gather(
-            points, normal, alpha2, self._counts, self._sequence, scene, self._faces, self._cache, radiance, shape,
-            environment.envmap, self._seen, out,
-        )  # fmt: skip
-
-
-class _Gather(torch.autograd.Function):
-    """`Gatherer.run` with its derivatives."""
-
-    @staticmethod
-    def forward(
-        ctx: Any, normal: Tensor, alpha2: Tensor, radiance: Tensor, gatherer: Gatherer, points: Points
-    ) -> Tensor:
-        sums, by_a2, by_normal, samples = gatherer.run(
-            points, normal.detach().numpy(), alpha2.detach().numpy(), radiance.detach().numpy()
-        )
-        ctx.kept = by_a2, by_normal, samples, tuple(radiance.shape)
-        return torch.from_numpy(sums)
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        by_a2, by_normal, samples, shape = ctx.kept
-        gradient = gradients[0]
-        for_alpha2 = (gradient * torch.from_numpy(by_a2)).sum((1, 2, 3))
-        for_normal = None
-        if len(by_normal):
-            for_normal = (gradient.unsqueeze(-1) * torch.from_numpy(by_normal)).sum((1, 2, 3))
-        for_radiance = None
-        if ctx.needs_input_grad[2]:
-            parts = np.zeros((_PARTS, shape[0] * shape[1], 3), np.float32)
-            # The factor two of either half, as in `Gatherer.run`.
-            _scatter(*samples, np.ascontiguousarray((2 * gradient).numpy()), parts)
-            for_radiance = torch.from_numpy(parts.sum(axis=0).reshape(shape))
-        return for_normal, for_alpha2, for_radiance, None, None

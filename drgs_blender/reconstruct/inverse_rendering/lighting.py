@@ -6,7 +6,8 @@ import numpy as np
 from torch import Tensor
 
 from .environment import LearnedLight
-from .estimator import Gatherer, Points
+from .estimator import Points
+from .gatherer import Gatherer
 from .pixels import Pixels
 from .settings import Settings
 

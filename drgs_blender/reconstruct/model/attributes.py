@@ -6,7 +6,7 @@ tensor operations would cost as much as blending the pixels. The tests hold this
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -20,8 +20,51 @@ from ...formats.harmonics import basis
 COLOUR, NORMAL, TINT, BLUR = 0, 3, 6, 9
 #: Bands of harmonics -> coefficients.
 COEFFICIENTS = {0: 1, 1: 4, 2: 9, 3: 16}
-#: The parameters that this reads, in the order of the kernels.
-_NAMES = ("scale", "rotation", "opacity", "sh", "tint", "blur")
+
+
+class Learned(NamedTuple):
+    """What is learned of surfels, or gradients of it; names are those of `gaussians.Gaussians`.
+
+    Attributes
+    ----------
+    scale : (n, 2) float32 array
+        Logarithms of the standard deviations, metres.
+    rotation : (n, 4) float32 array
+        Quaternions wxyz, of any length.
+    opacity : (n,) float32 array
+        Logits.
+    sh : (n, k, 3) float32 array
+        Coefficients of the harmonics.
+    tint : (n, 3) float32 array
+        Logits.
+    blur : (n,) float32 array
+        Logits.
+    """
+
+    scale: Array
+    rotation: Array
+    opacity: Array
+    sh: Array
+    tint: Array
+    blur: Array
+
+
+class Attributes(NamedTuple):
+    """What the rasteriser takes of surfels, or gradients of it.
+
+    Attributes
+    ----------
+    tangent_u, tangent_v : (n, 3) float32 array
+        Metres, world, scaled by the standard deviations.
+    opacity : (n,) float32 array
+    features : (n, 6 or 10) float32 array
+        See the columns above.
+    """
+
+    tangent_u: Array
+    tangent_v: Array
+    opacity: Array
+    features: Array
 
 
 def attributes(
@@ -49,7 +92,9 @@ def attributes(
     opacity : (n,) float32 tensor
     features : (n, 6 or 10) float32 tensor
     """
-    return _Attributes.apply(centre.detach().numpy(), eye, bands, mirrors, *(parameters[name] for name in _NAMES))
+    return _Attributes.apply(
+        centre.detach().numpy(), eye, bands, mirrors, *(parameters[name] for name in Learned._fields)
+    )
 
 
 def frames(scale: Array, rotation: Array) -> tuple[Array, Array, Array]:
@@ -64,28 +109,28 @@ class _Attributes(torch.autograd.Function):
     def forward(
         ctx: Any, centre: Array, eye: Array, bands: int, mirrors: bool, *parameters: Tensor
     ) -> tuple[Tensor, ...]:
-        raw = [np.ascontiguousarray(p.detach().numpy(), np.float32) for p in parameters]
+        raw = Learned(*(np.ascontiguousarray(p.detach().numpy(), np.float32) for p in parameters))
         n = len(centre)
         away = centre - np.asarray(eye, np.float32)
         away /= np.maximum(np.sqrt(np.einsum("nk,nk->n", away, away)), 1e-12)[:, None]
-        degree = min(bands, int(raw[3].shape[1] ** 0.5) - 1)
+        degree = min(bands, int(raw.sh.shape[1] ** 0.5) - 1)
         values = basis(away, degree).astype(np.float32)
-        u, v, normal = frames(raw[0], raw[1])
-        alpha, features = np.empty(n, np.float32), np.empty((n, BLUR + 1 if mirrors else TINT), np.float32)
-        _blended(normal, away, values, *raw[2:], alpha, features)
-        ctx.save = (raw, values, u, v, normal, alpha, features)
-        return tuple(torch.from_numpy(a) for a in (u, v, alpha, features))
+        u, v, normal = frames(raw.scale, raw.rotation)
+        found = Attributes(u, v, np.empty(n, np.float32), np.empty((n, BLUR + 1 if mirrors else TINT), np.float32))
+        _colour(raw, normal, away, values, found)
+        ctx.save = (raw, values, normal, found)
+        return tuple(map(torch.from_numpy, found))
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Any, ...]:
-        raw, values, u, v, normal, alpha, features = ctx.save
-        incoming = [
+        raw, values, normal, found = ctx.save
+        incoming = Attributes(*(
             np.zeros_like(a) if g is None else np.ascontiguousarray(g.numpy(), np.float32)
-            for g, a in zip(gradients, (u, v, alpha, features), strict=True)
-        ]
-        to = [np.zeros_like(a) for a in raw]
-        _backward(raw[1], values, u, v, normal, alpha, features, *incoming, *to)
-        return None, None, None, None, *(torch.from_numpy(g) for g in to)
+            for g, a in zip(gradients, found, strict=True)
+        ))  # fmt: skip
+        to = Learned(*map(np.zeros_like, raw))
+        _backward(raw.rotation, values, normal, found, incoming, to)
+        return None, None, None, None, *map(torch.from_numpy, to)
 
 
 @njit
@@ -94,7 +139,7 @@ def _logistic(x):  # type: ignore[no-untyped-def]
 
 
 @njit(parallel=True)
-def _frames(scale, rotation, u, v, normal):  # type: ignore[no-untyped-def]
+def _frames(scale: Array, rotation: Array, u: Array, v: Array, normal: Array) -> None:
     one, two = np.float32(1.0), np.float32(2.0)
     for i in prange(len(scale)):
         w, x, y, z = rotation[i, 0], rotation[i, 1], rotation[i, 2], rotation[i, 3]
@@ -116,8 +161,10 @@ def _frames(scale, rotation, u, v, normal):  # type: ignore[no-untyped-def]
 
 
 @njit(parallel=True)
-def _blended(normal, away, values, opacity, sh, tint, blur, alpha, features):  # type: ignore[no-untyped-def]
-    """Opacity and features."""
+def _colour(raw: Learned, normal: Array, away: Array, values: Array, out: Attributes) -> None:
+    """Opacity and features, written; `away` (n, 3) from the eye, `values` (n, k) of the harmonics in that direction."""
+    opacity, sh, tint, blur = raw.opacity, raw.sh, raw.tint, raw.blur
+    alpha, features = out.opacity, out.features
     for i in prange(len(alpha)):
         alpha[i] = _logistic(opacity[i])
         facing = np.float32(0.0)
@@ -136,11 +183,13 @@ def _blended(normal, away, values, opacity, sh, tint, blur, alpha, features):  #
 
 
 @njit(parallel=True)
-def _backward(  # type: ignore[no-untyped-def]
-    rotation, values, u, v, normal, alpha, features, g_u, g_v, g_alpha, g_features, to_scale, to_rotation, to_opacity,
-    to_sh, to_tint, to_blur,
-):  # fmt: skip
-    """Gradients of the raw parameters, into arrays of zeros."""
+def _backward(
+    rotation: Array, values: Array, normal: Array, found: Attributes, incoming: Attributes, out: Learned
+) -> None:
+    """Gradients of the raw parameters, into arrays of zeros; `values` as of `_colour`."""
+    u, v, alpha, features = found
+    g_u, g_v, g_alpha, g_features = incoming
+    to_scale, to_rotation, to_opacity, to_sh, to_tint, to_blur = out
     one, two = np.float32(1.0), np.float32(2.0)
     for i in prange(len(alpha)):
         to_opacity[i] = g_alpha[i] * alpha[i] * (one - alpha[i])

@@ -11,11 +11,15 @@ nine numbers a surfel, the record. `render.surfels.splats` states the same, unsc
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from ...compute.jit import njit, prange
 from ...render.camera import CLIP_END, CLIP_START, CX, CY, FX, FY, POSITION
 from ...render.surfels.splats import MIN_ALPHA, span, to_camera
+
+Array = np.ndarray
 
 # Columns of a record: projected centre, coefficients of u, v and 1 / z; what follows is not differentiated here.
 RX, RY, UX, UY, VX, VY, I0, IX, IY, OPACITY, CUT, DIM, RECORD = 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12
@@ -29,14 +33,77 @@ EDGE_ON = 1e-3
 LOW_PASS = 8.0
 
 
+class WorldSurfels(NamedTuple):
+    """Surfels in world space, or the gradients of these numbers.
+
+    Attributes
+    ----------
+    centre : (n, 3) float32 array
+        Metres.
+    tangent_u, tangent_v : (n, 3) float32 array
+        Metres, scaled by the standard deviations.
+    opacity : (n,) float32 array
+    """
+
+    centre: Array
+    tangent_u: Array
+    tangent_v: Array
+    opacity: Array
+
+
+class Projected(NamedTuple):
+    """Surfels on the screen.
+
+    Attributes
+    ----------
+    record : (n, RECORD) float32 array
+        See this module's head.
+    depth : (n,) float32 array
+        Of the centres, metres along the view.
+    box : (n, 4) int32 array
+        Pixels (x0, y0, x1, y1) that may see them, half-open; empty where none does.
+    """
+
+    record: Array
+    depth: Array
+    box: Array
+
+
+class Splat(NamedTuple):
+    """A surfel's record: projected centre, coefficients of u, v and 1 / z, opacity, cut and dimming."""
+
+    rx: np.float32
+    ry: np.float32
+    ux: np.float32
+    uy: np.float32
+    vx: np.float32
+    vy: np.float32
+    i0: np.float32
+    ix: np.float32
+    iy: np.float32
+    opacity: np.float32
+    cut: np.float32
+    dim: np.float32
+
+
+@njit(inline="always")
+def splat_of(record, i):  # type: ignore[no-untyped-def]
+    """The record of surfel i."""
+    return Splat(
+        record[i, RX], record[i, RY], record[i, UX], record[i, UY], record[i, VX], record[i, VY], record[i, I0],
+        record[i, IX], record[i, IY], record[i, OPACITY], record[i, CUT], record[i, DIM],
+    )  # fmt: skip
+
+
 @njit
 def _cross(ax, ay, az, bx, by, bz):  # type: ignore[no-untyped-def]
     return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
 
 
 @njit
-def _in_camera(p, centre, tangent_u, tangent_v, i):  # type: ignore[no-untyped-def]
+def _in_camera(p, surfels, i):  # type: ignore[no-untyped-def]
     """Centre and tangents of surfel i in camera coordinates, float64."""
+    centre, tangent_u, tangent_v, _ = surfels
     c = to_camera(
         p,
         np.float64(centre[i, 0]) - p[POSITION],
@@ -49,12 +116,15 @@ def _in_camera(p, centre, tangent_u, tangent_v, i):  # type: ignore[no-untyped-d
 
 
 @njit
-def project_surfel(i, centre, tangent_u, tangent_v, opacity, p, width, height, record, depth, box):  # type: ignore[no-untyped-def]
-    """Fill row i of records, centre depths and boxes, see `project`."""
+def project_surfel(i, surfels, p, picture, out):  # type: ignore[no-untyped-def]
+    """Fill row i of `out`, see `project`; devices have tuples in the order of the records."""
+    _, _, _, opacity = surfels
+    width, height = picture
+    record, depth, box = out
     for k in range(4):
         box[i, k] = 0
     near, far, fx, fy = p[CLIP_START], p[CLIP_END], p[FX], p[FY]
-    c, a, b = _in_camera(p, centre, tangent_u, tangent_v, i)
+    c, a, b = _in_camera(p, surfels, i)
     alpha = np.float64(opacity[i])
     total = c[0] + c[1] + c[2] + a[0] + a[1] + a[2] + b[0] + b[1] + b[2] + alpha
     if not abs(total) < 1e30 or not alpha > MIN_ALPHA:
@@ -91,28 +161,30 @@ def project_surfel(i, centre, tangent_u, tangent_v, opacity, p, width, height, r
 
 
 @njit(parallel=True)
-def project(centre, tangent_u, tangent_v, opacity, p, width, height, record, depth, box):  # type: ignore[no-untyped-def]
-    """Fill records, centre depths and boxes; what is not seen, or reaches behind the clip start, has an empty box.
+def project(surfels: WorldSurfels, p: Array, picture: tuple[int, int], out: Projected) -> None:
+    """Project surfels; what is not seen, or reaches behind the clip start, has an empty box.
 
     Parameters
     ----------
+    surfels : WorldSurfels
     p : array
         `render.camera.camera_parameters` of a perspective camera.
-    record : (n, RECORD) float32 array
-        To be filled, as the next two.
-    depth : (n,) float32 array
-    box : (n, 4) int32 array
+    picture : tuple of int
+        Width and height, pixels.
+    out : Projected
+        To be filled.
     """
-    for i in prange(len(centre)):
-        project_surfel(i, centre, tangent_u, tangent_v, opacity, p, width, height, record, depth, box)
+    for i in prange(len(surfels.opacity)):
+        project_surfel(i, surfels, p, picture, out)
 
 
 @njit
-def project_surfel_backward(k, centre, tangent_u, tangent_v, p, index, gradient, g_centre, g_u, g_v):  # type: ignore[no-untyped-def]
+def project_surfel_backward(k, surfels, p, index, gradient, out):  # type: ignore[no-untyped-def]
     """Gradients of the surfel of row k, see `project_backward`."""
+    g_centre, g_u, g_v, _ = out
     fx, fy = p[FX], p[FY]
     i = np.int64(index[k])
-    c, a, b = _in_camera(p, centre, tangent_u, tangent_v, i)
+    c, a, b = _in_camera(p, surfels, i)
     gx, gy, gi = np.float64(gradient[k, RX]), np.float64(gradient[k, RY]), np.float64(gradient[k, I0])
     z = c[2]
     nx, ny, nz = _cross(a[0], a[1], a[2], b[0], b[1], b[2])
@@ -144,15 +216,19 @@ def project_surfel_backward(k, centre, tangent_u, tangent_v, p, index, gradient,
 
 
 @njit(parallel=True)
-def project_backward(centre, tangent_u, tangent_v, p, index, gradient, g_centre, g_u, g_v):  # type: ignore[no-untyped-def]
+def project_backward(surfels: WorldSurfels, p: Array, index: Array, gradient: Array, out: WorldSurfels) -> None:
     """Gradients of centre and tangents from those of the records.
 
     Parameters
     ----------
+    surfels : WorldSurfels
+    p : array
+        As of `project`.
     index : (m,) array
-        Surfel of each row of `gradient` (m, at least PARAMETERS).
-    g_centre, g_u, g_v : (n, 3) float32 array
-        World space; rows of surfels that were not seen stay as they are.
+        Surfel of each row of `gradient`.
+    gradient : (m, at least PARAMETERS) float32 array
+    out : WorldSurfels
+        Centre and tangents are written; rows of surfels that were not seen stay as they are.
     """
     for k in prange(len(index)):
-        project_surfel_backward(k, centre, tangent_u, tangent_v, p, index, gradient, g_centre, g_u, g_v)
+        project_surfel_backward(k, surfels, p, index, gradient, out)

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import fields
 from typing import Any
 
 import numpy as np
 
 from ...compute.warp.kernels import Launcher
 from ...compute.warp.runtime import warp
-from ..colliders import Field
-from ..contact import CONTACTS
+from ..contact import Field
 from ..fields import COLUMNS
-from ..grid import Grid, Limits, Scene, State
+from ..grid import Grid, Limits, Scene
+from ..particles import Particles
 from .cells import BLOCKS, HOUSE, INDEX, LIST, LOST, NUMBER, OCCUPIED, STARTS, around
 from .steps import (
     CELL,
@@ -74,25 +73,26 @@ class DeviceGrid(Grid):
         self._launches: list[Callable[[], None]] = []
         self._fields: list[tuple[Field | None, list[Any]]] = [(None, [])] * len(scene.colliders)
 
-    def enter(self, state: State, frame: int, seconds: float, pin_velocity: Array) -> None:
+    def enter(self, state: Particles, frame: int, seconds: float, pin_velocity: Array) -> None:
         self._frame, self._seconds = frame, seconds
         with self.launcher.failures("copying particles"):
             if not self._state:
                 self._make_room(state)
-            for f in fields(state):
-                self._state[f.name].assign(getattr(state, f.name))
+            for name, array in state._asdict().items():
+                self._state[name].assign(array)
             if len(pin_velocity):
                 self._pin_velocity.assign(pin_velocity)
 
-    def _make_room(self, state: State) -> None:
+    def _make_room(self, state: Particles) -> None:
         """Arrays that are as large in every frame."""
         scene, there, zeros = self._scene, self.launcher.array, self.launcher.zeros
         n, pins, k = len(state.x), scene.pins, len(scene.colliders)
         pin = np.full(n, -1, np.int32)
         pin[pins] = np.arange(len(pins))
-        self._mass, self._volume, self._pin = there(scene.mass), there(scene.volume), there(pin)
-        self._model, self._solid = there(scene.model.astype(np.int32)), there(scene.solid.astype(np.int32))
-        self._parameters, self._planes = there(scene.parameters), there(scene.planes)
+        own = scene.properties
+        self._mass, self._volume, self._pin = there(own.mass), there(own.volume), there(pin)
+        self._model, self._solid = there(own.model.astype(np.int32)), there(own.solid.astype(np.int32))
+        self._parameters, self._planes = there(own.parameters), there(scene.planes)
         self._keys, self._order, self._home = zeros((2 * n,), "int64"), zeros((2 * n,), "int32"), zeros((n,), "int32")
         self._cell, self._packet = zeros((n, CELL), "int32"), zeros((n, PACKET))
         self._found = zeros((BLOCKS + n,), "int64")
@@ -106,7 +106,7 @@ class DeviceGrid(Grid):
             "contacts": np.zeros((k, SURFACE)),
         }  # fmt: skip
         self._there = {name: zeros(a.shape, a.dtype.name) for name, a in self._plan.items()}
-        self._state = {f.name: zeros(a.shape, a.dtype.name) for f in fields(state) for a in [getattr(state, f.name)]}
+        self._state = {name: zeros(a.shape, a.dtype.name) for name, a in state._asdict().items()}
         domain = scene.domain
         place = self._state["x"], tuple(domain.origin.tolist()), 1.0 / domain.spacing, *domain.blocks
         self._number = self.launcher.recorded(NUMBER, n, place, (self._keys, self._order, self._found))
@@ -150,35 +150,25 @@ class DeviceGrid(Grid):
         scene, s, there, launcher = self._scene, self._state, self._there, self.launcher
         n = len(s["x"])
         grid = tuple(scene.domain.origin.tolist()), scene.domain.spacing
-        clock, times = there["clock"], there["times"]
-        kinds = self._mass, self._volume, self._pin
-        pinned, acts = bool(len(scene.pins)), (there["rows"], there["shapes"], there["turns"], there["vectors"])
+        clock, times = time = there["clock"], there["times"]
+        pins = self._pin_velocity, bool(len(scene.pins))
+        particles, properties = (s["x"], s["v"], s["affine"], s["tau"]), (self._mass, self._volume, self._pin)
+        given = self._cell, self._packet
+        colliders = there["shapes"], there["turns"], there["vectors"], there["contacts"]
+        obstacles = colliders, bool(scene.colliders), self._planes, bool(len(scene.planes)), *pins
+        wind = tuple(map(float, scene.forces.wind))
+        forces = scene.least, wind, there["rows"], bool(len(scene.fields))
+        blocks = self._sizes, self._active, self._first, self._neighbour
+        homes = self._order, self._home, self._active, self._neighbour
+        matter = self._mass, self._model, self._parameters, self._solid, len(s["total"]) > 0
         return [
+            launcher.recorded(PREPARE, n, (self._order, particles, properties, grid, time), given),
+            launcher.recorded(SOLVE, self._blocks * 64, (blocks, given, grid, time, obstacles, forces), (self._nodes,)),
             launcher.recorded(
-                PREPARE, n, (self._order, s["x"], s["v"], s["affine"], s["tau"], *kinds, n, *grid, clock, times),
-                (self._cell, self._packet),
-            ),
-            launcher.recorded(
-                SOLVE, self._blocks * 64,
-                (
-                    self._sizes, self._active, self._first, self._neighbour, self._cell, self._packet, *grid,
-                    scene.least, tuple(map(float, scene.forces.wind)), clock, times, *acts, there["contacts"],
-                    self._planes, self._pin_velocity, bool(len(scene.fields)), bool(scene.colliders),
-                    bool(len(scene.planes)), pinned,
-                ),
-                (self._nodes,),
-            ),
-            launcher.recorded(
-                MOVE, n,
-                (
-                    self._order, self._home, self._active, self._neighbour, self._nodes, self._mass, self._model,
-                    self._parameters, self._solid, self._pin, self._pin_velocity, n, *grid, clock, times,
-                    len(s["total"]) > 0, pinned,
-                ),
-                (*s.values(), self._fastest),
+                MOVE, n, (homes, self._nodes, matter, (self._pin, *pins), grid, time), (*s.values(), self._fastest)
             ),
             launcher.recorded(TICK, 1, (scene.domain.spacing, times), (clock, self._fastest)),
-        ]  # fmt: skip
+        ]
 
     def step(self, times: Sequence[tuple[float, float]], limits: Limits) -> list[float]:
         scene, plan = self._scene, self._plan
@@ -213,7 +203,7 @@ class DeviceGrid(Grid):
             if s and moving.speed == 0.0:
                 plan["turns"][s, c], plan["vectors"][s, c] = plan["turns"][s - 1, c], plan["vectors"][s - 1, c]
                 continue
-            field, turn, shift, linear, spin = moving.at(part)
+            field, motion = moving.at(part)
             if field is not self._fields[c][0]:
                 arrays = [] if field is None else [array(a) for a in (field.distance, field.velocity) if a.size]
                 self._fields[c] = field, arrays
@@ -224,12 +214,11 @@ class DeviceGrid(Grid):
             plan["shapes"][c, SIZE : SIZE + 3] = field.distance.shape
             plan["shapes"][c, DISTANCE] = addresses[0]
             plan["shapes"][c, VELOCITY] = addresses[1] if len(addresses) > 1 else 0
-            own = moving.collider
-            plan["contacts"][c] = field.spacing, own.thickness, CONTACTS[own.contact], own.friction
-            plan["turns"][s, c] = turn
+            plan["contacts"][c] = field.spacing, *moving.collider.surface
+            plan["turns"][s, c], shift, linear, spin = motion
             for row, vector in ((SHIFT, shift), (LINEAR, linear), (SPIN, spin), (ORIGIN, field.origin)):
                 plan["vectors"][s, c, row] = vector
 
-    def state(self) -> State:
+    def state(self) -> Particles:
         with self.launcher.failures("copying particles"):
-            return State(**{name: np.array(array.numpy()) for name, array in self._state.items()})
+            return Particles(**{name: np.array(array.numpy()) for name, array in self._state.items()})

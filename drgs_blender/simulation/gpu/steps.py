@@ -1,5 +1,8 @@
 """A time step on a device: functions that are translated and never run as they stand.
 
+What they take comes in tuples, in the order in which they take them apart: `grid` is origin (x, y, z) and spacing,
+`time` the clock and the times of all steps, `blocks` where particles and nodes are, see `gpu.cells`.
+
 Each node gathers what the particles around it give it, in their order, so that the same bits come of any number of
 threads. Particles keep their places in memory; `order` says which is where among those sorted by cells. Since then they
 may have moved by a cell.
@@ -95,16 +98,20 @@ NATIVES = {
 
 
 def prepare_particles(  # type: ignore[no-untyped-def]
-    lane, lanes, room, order, x, v, affine, tau, mass, volume, pin, n, origin, spacing, clock, times, out
+    lane, lanes, room, order, particles, properties, grid, time, out
 ):
     """What each particle gives to the nodes around it."""
+    x, v, affine, tau = particles
+    mass, volume, pin = properties
+    origin, spacing = grid
+    clock, times = time
     cell, packet = out
     if clock[STOPPED] != 0.0:
         return
     dt = times[int(clock[STEP]), DT]
     scale = 1.0 / spacing
     h, factor = F(spacing), F(4.0 * dt * scale * scale)
-    for at in range(lane, n, lanes):
+    for at in range(lane, len(mass), lanes):
         p = np.int64(order[at])
         m = mass[p]
         if m == ZERO:
@@ -127,10 +134,14 @@ def chosen(weights: Any, which: Any) -> Any:
     return weights[0] if which == 0 else (weights[1] if which == 1 else weights[2])
 
 
-def gathered(
-    i: Any, j: Any, k: Any, s: Any, first: Any, neighbour: Any, cell: Any, packet: Any, pin_velocity: Any, pinned: Any
-) -> Any:
-    """Momentum and mass of node (i, j, k) of active block s, and those of what is pinned."""
+def gathered(i: Any, j: Any, k: Any, s: Any, blocks: Any, given: Any, pins: Any) -> Any:
+    """Momentum and mass of node (i, j, k) of active block s, and those of what is pinned.
+
+    `given` is what `prepare_particles` wrote.
+    """
+    first, neighbour = blocks
+    cell, packet = given
+    pin_velocity, pinned = pins
     px, py, pz, m = ZERO, ZERO, ZERO, ZERO
     hx, hy, hz, held = ZERO, ZERO, ZERO, ZERO
     # Cells that the particles around the node may have been in when they were sorted; along z they are in two blocks.
@@ -165,39 +176,63 @@ def gathered(
     return px, py, pz, m, hx, hy, hz, held
 
 
-def touched_by(
-    vx: Any, vy: Any, vz: Any, gx: Any, gy: Any, gz: Any, step: Any, c: Any, shapes: Any, turns: Any, vectors: Any,
-    contacts: Any,
-) -> Any:  # fmt: skip
-    """Velocity of a node at (gx, gy, gz) after it has met collider c, as `contact.collide` has it."""
+def touched_by(v: Any, place: Any, step: Any, c: Any, colliders: Any) -> Any:
+    """Velocity (x, y, z) of a node at a place (x, y, z) after it has met collider c, as `contact.collide` has it."""
+    shapes, turns, vectors, contacts = colliders
+    vx, vy, vz = v
+    gx, gy, gz = place
     nx, ny, nz = shapes[c, SIZE], shapes[c, SIZE + 1], shapes[c, SIZE + 2]
     some = 1 if shapes[c, VELOCITY] != 0 else 0
+    shift = vectors[step, c, SHIFT]
+    distance = distances_at(shapes[c, DISTANCE], nx, ny, nz)
+    velocity = velocities_at(shapes[c, VELOCITY], nx * some, ny * some, nz * some)
     d, mx, my, mz, ux, uy, uz = surface_near(
-        gx - vectors[step, c, SHIFT, 0], gy - vectors[step, c, SHIFT, 1], gz - vectors[step, c, SHIFT, 2],
-        distances_at(shapes[c, DISTANCE], nx, ny, nz),
-        velocities_at(shapes[c, VELOCITY], nx * some, ny * some, nz * some),
-        vectors[step, c, ORIGIN], contacts[c, CELLS], turns[step, c], vectors[step, c, LINEAR], vectors[step, c, SPIN],
-    )  # fmt: skip
+        (gx - shift[0], gy - shift[1], gz - shift[2]),
+        (vectors[step, c, ORIGIN], contacts[c, CELLS], distance, velocity),
+        (turns[step, c], shift, vectors[step, c, LINEAR], vectors[step, c, SPIN]),
+    )
     if d < contacts[c, THICKNESS]:
-        x, y, z = slide(vx, vy, vz, ux, uy, uz, mx, my, mz, int(contacts[c, CONTACT]), contacts[c, FRICTION])
+        x, y, z = slide(v, (ux, uy, uz), (mx, my, mz), int(contacts[c, CONTACT]), contacts[c, FRICTION])
         return F(x), F(y), F(z)
     return vx, vy, vz
 
 
-def bounded_by(vx: Any, vy: Any, vz: Any, gx: Any, gy: Any, gz: Any, spacing: Any, planes: Any, q: Any) -> Any:
+def bounded_by(v: Any, place: Any, spacing: Any, planes: Any, q: Any) -> Any:
     """The same for a plane, as `contact.bound` has it."""
+    vx, vy, vz = v
+    gx, gy, gz = place
     ax, ay, az = planes[q, 0], planes[q, 1], planes[q, 2]
     if ax * gx + ay * gy + az * gz - planes[q, 3] <= 1e-9 * spacing:
-        x, y, z = slide(vx, vy, vz, 0.0, 0.0, 0.0, ax, ay, az, int(planes[q, 4]), planes[q, 5])
+        x, y, z = slide(v, (0.0, 0.0, 0.0), (ax, ay, az), int(planes[q, 4]), planes[q, 5])
         return F(x), F(y), F(z)
     return vx, vy, vz
 
 
-def solve_nodes(  # type: ignore[no-untyped-def]
-    lane, lanes, room, sizes, active, first, neighbour, cell, packet, origin, spacing, least, wind, clock, times, rows,
-    shapes, turns, vectors, contacts, planes, pin_velocity, blown, touched, bounded, pinned, out,
-):  # fmt: skip
-    """Particles to grid, and the grid's own step: velocities of all nodes of active blocks."""
+def solve_nodes(lane, lanes, room, blocks, given, grid, time, obstacles, forces, out):  # type: ignore[no-untyped-def]
+    """Particles to grid, and the grid's own step: velocities of all nodes of active blocks.
+
+    Parameters
+    ----------
+    lane, lanes : int
+    room : object
+        Not used.
+    blocks : tuple
+    given : tuple of array
+        What `prepare_particles` wrote.
+    grid : tuple
+    time : tuple of array
+    obstacles : tuple
+        Colliders and whether there are any; planes and whether; velocities of pins and whether.
+    forces : tuple
+        kg, below which a node is empty; wind; rows of fields and whether there are any.
+    out : tuple of array
+        Nodes.
+    """
+    sizes, active, first, neighbour = blocks
+    origin, spacing = grid
+    clock, times = time
+    colliders, touched, planes, bounded, pin_velocity, pinned = obstacles
+    least, wind, rows, blown = forces
     (nodes,) = out
     if clock[STOPPED] != 0.0:
         return
@@ -206,15 +241,18 @@ def solve_nodes(  # type: ignore[no-untyped-def]
     for at in range(lane, sizes[0] * 64, lanes):
         s, n = at // 64, at % 64
         i, j, k = 4 * active[s, 0] + n // 16, 4 * active[s, 1] + n // 4 % 4, 4 * active[s, 2] + n % 4
-        px, py, pz, m, hx, hy, hz, held = gathered(i, j, k, s, first, neighbour, cell, packet, pin_velocity, pinned)
+        px, py, pz, m, hx, hy, hz, held = gathered(i, j, k, s, (first, neighbour), given, (pin_velocity, pinned))
         if m < least or m == ZERO:
             nodes[at, 0], nodes[at, 1], nodes[at, 2], nodes[at, 3] = ZERO, ZERO, ZERO, ZERO
             continue
         r = ONE / m
         vx, vy, vz = pushed(
-            px * r, py * r, pz * r, F(times[step, GAIN]), F(times[step, GAIN + 1]), F(times[step, GAIN + 2]),
-            F(times[step, SLOW]), F(times[step, PULL]), F(wind[0]), F(wind[1]), F(wind[2]),
-        )  # fmt: skip
+            (px * r, py * r, pz * r),
+            (F(times[step, GAIN]), F(times[step, GAIN + 1]), F(times[step, GAIN + 2])),
+            F(times[step, SLOW]),
+            F(times[step, PULL]),
+            (F(wind[0]), F(wind[1]), F(wind[2])),
+        )
         gx, gy, gz = origin[0] + spacing * i, origin[1] + spacing * j, origin[2] + spacing * k
         if blown:
             for f in range(rows.shape[1]):
@@ -222,12 +260,12 @@ def solve_nodes(  # type: ignore[no-untyped-def]
                 slow = 1.0 / (1.0 + dt * flow)
                 vx, vy, vz = F((vx + dt * ax) * slow), F((vy + dt * ay) * slow), F((vz + dt * az) * slow)
         if touched:
-            for c in range(shapes.shape[0]):
-                if shapes[c, DISTANCE] != 0:
-                    vx, vy, vz = touched_by(vx, vy, vz, gx, gy, gz, step, c, shapes, turns, vectors, contacts)
+            for c in range(colliders[0].shape[0]):
+                if colliders[0][c, DISTANCE] != 0:
+                    vx, vy, vz = touched_by((vx, vy, vz), (gx, gy, gz), step, c, colliders)
         if bounded:
             for q in range(planes.shape[0]):
-                vx, vy, vz = bounded_by(vx, vy, vz, gx, gy, gz, spacing, planes, q)
+                vx, vy, vz = bounded_by((vx, vy, vz), (gx, gy, gz), spacing, planes, q)
         if pinned and held > PINNED * m:
             vx, vy, vz = hx / held, hy / held, hz / held
         nodes[at, 0], nodes[at, 1], nodes[at, 2], nodes[at, 3] = vx, vy, vz, m
@@ -251,11 +289,13 @@ def carried(nodes: Any, neighbour: Any, b: Any, i: Any, j: Any, k: Any, wx: Any,
     return x, y, z, weight
 
 
-def move_particles(  # type: ignore[no-untyped-def]
-    lane, lanes, room, order, home, active, neighbour, nodes, mass, model, parameters, solid, pin, pin_velocity, n,
-    origin, spacing, clock, times, apart, pinned, out,
-):  # fmt: skip
+def move_particles(lane, lanes, room, blocks, nodes, properties, pins, grid, time, out):  # type: ignore[no-untyped-def]
     """Grid to particles: move them, deform them, and find their stress, as `p2g_g2p.gather`."""
+    order, home, active, neighbour = blocks
+    mass, model, parameters, solid, apart = properties
+    pin, pin_velocity, pinned = pins
+    origin, spacing = grid
+    clock, times = time
     x, v, affine, elastic, total, tau, memory, fastest = out
     if clock[STOPPED] != 0.0:
         return
@@ -263,7 +303,7 @@ def move_particles(  # type: ignore[no-untyped-def]
     scale = 1.0 / spacing
     to_gradient, length = F(4.0 * scale), F(dt)
     top = ZERO
-    for at in range(lane, n, lanes):
+    for at in range(lane, len(mass), lanes):
         p, b = np.int64(order[at]), np.int64(home[at])
         i, j, k, fx, fy, fz = cell_of(x, p, origin, scale)
         i, j, k = i - 4 * active[b, 0] + 1, j - 4 * active[b, 1] + 1, k - 4 * active[b, 2] + 1
@@ -294,9 +334,10 @@ def move_particles(  # type: ignore[no-untyped-def]
             affine[p, 0], affine[p, 1], affine[p, 2] = g0, g1, g2
             affine[p, 3], affine[p, 4], affine[p, 5] = g3, g4, g5
             affine[p, 6], affine[p, 7], affine[p, 8] = g6, g7, g8
-            stretch(elastic, p, length, g0, g1, g2, g3, g4, g5, g6, g7, g8)
+            gradient = g0, g1, g2, g3, g4, g5, g6, g7, g8
+            stretch(elastic, p, length, gradient)
             if apart and solid[p] != 0:
-                stretch(total, p, length, g0, g1, g2, g3, g4, g5, g6, g7, g8)
+                stretch(total, p, length, gradient)
             respond(p, model, parameters, elastic, tau, memory, affine, dt)
         speed = vx * vx + vy * vy + vz * vz
         top = top if speed <= top or top != top else speed  # NaN stays
