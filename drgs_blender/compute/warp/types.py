@@ -81,12 +81,12 @@ def is_struct(kind: type) -> bool:
 class Record(tuple[Type, ...]):
     """A ``NamedTuple`` that holds anything: a tuple whose parts have names, and that vanishes as tuples do.
 
-    Parameters
+    It is the tuple of its fields' types.
+
+    Attributes
     ----------
     kind : type
         The named tuple.
-    parts : iterable
-        Types of its fields.
     """
 
     kind: Any

@@ -50,15 +50,15 @@ class MixedHit(NamedTuple):
 
     Attributes
     ----------
-    t, face, place, u, v, gx, gy, gz : float32
+    t, face, place, u, v, gx, gy, gz : np.float32
         As of `Hit`.
-    nx, ny, nz : float32
+    nx, ny, nz : np.float32
         Unit shading normal.
-    r, g, b, roughness, metallic : float32
+    r, g, b, roughness, metallic : np.float32
         Linear Rec.709.
-    size : float32
+    size : np.float32
         Metres: mean larger standard deviation of the surfels.
-    owner : int32
+    owner : np.int32
         Their object; -1: it is a mesh.
     """
 

@@ -18,7 +18,7 @@ class Traits(NamedTuple):
 
     Attributes
     ----------
-    extent : float32
+    extent : np.float32
         Metres: the largest absolute coordinate, the scale of rounding errors.
     environment : bool
         The environment shines.
@@ -71,7 +71,7 @@ class Settings(NamedTuple):
         One of ``brdf.SHADING_MODELS``.
     layers : (16, 16) float32 array
         ``brdf.layer_table()``.
-    clamp : float32
+    clamp : np.float32
         Limit of the mean of an indirect sample's channels; 0: none.
     shift : int
         Of the masks of rays: 0, or ``ray_masks.WITHOUT``.
@@ -89,7 +89,7 @@ class Sampler(NamedTuple):
 
     Attributes
     ----------
-    seed : uint32
+    seed : np.uint32
         Of job and frame.
     sequence : (n, 3) uint32 array
         Points of Sobol' with reversed bits, enough for all samples of a pixel.
@@ -99,11 +99,11 @@ class Sampler(NamedTuple):
         Which of how many equal parts of these samples are taken.
     auto : bool
         Samples are divided by what each surface reflects; else as given.
-    cosine, ggx, light : float32
+    cosine, ggx, light : np.float32
         Samples of a pixel by strategy as given; under `auto` only their sum counts.
-    environment_share, lights_share : float32
+    environment_share, lights_share : np.float32
         Parts of the light samples that go to environment and lights; 0 where these do not shine.
-    most_light : float32
+    most_light : np.float32
         Part of all samples that go to the light at most, under `auto`.
     """
 

@@ -14,13 +14,13 @@ class Ray(NamedTuple):
 
     Attributes
     ----------
-    origin : (x, y, z) float32
-        Metres, world space.
-    direction : (x, y, z) float32
-        World space; distances count in its length.
-    tnear, tfar : float32
+    origin : tuple of float
+        x, y and z in metres, world space, float32.
+    direction : tuple of float
+        World space, float32; distances count in its length.
+    tnear, tfar : np.float32
         Distances between which things are met.
-    mask : int32
+    mask : np.int32
         What the ray meets: all that has one of these bits, see `ray_masks`.
     """
 
@@ -36,15 +36,15 @@ class Hit(NamedTuple):
 
     Attributes
     ----------
-    t : float32
+    t : np.float32
         Distance; the ray's `tfar` when nothing is hit.
-    face : int32
+    face : np.int32
         Of the scene; -1 when nothing is hit.
-    place : int32
+    place : np.int32
         Row of the scene's places; -1 outside shapes in places.
-    u, v : float32
+    u, v : np.float32
         Barycentric coordinates of the second and of the third corner.
-    gx, gy, gz : float32
+    gx, gy, gz : np.float32
         Geometric normal, of any length; for `interaction.surface_at`.
     """
 
