@@ -253,7 +253,7 @@ def test_gain_at_32_rays_against_the_converged_picture(monkeypatch: pytest.Monke
         tone = [np.clip(a, 0, 1) ** (1 / 2.2) for a in (light.sum(2), truth)]
         return float(-10 * np.log10(np.mean((tone[0] - tone[1]) ** 2)))
 
-    gain = psnr(denoise(film.components, film.variance, film.guides())) - psnr(film.components)
+    gain = psnr(denoise(film.pixels.components, film.pixels.variance, film.guides())) - psnr(film.pixels.components)
     assert gain > 2.0, gain
 
 

@@ -59,7 +59,7 @@ def demodulate(components: Array, variance: Array, guides: Guides, split: bool =
     guide = np.zeros((h, GUIDES, w + 2 * PAD), np.float32)
     light = np.zeros((h, planes_of(split), w + 2 * PAD), np.float32)
     spans = np.zeros((h, 2), np.int32)
-    _demodulate(components, variance, guides.arrays, guide, light, spans)
+    _demodulate(components, variance, guides.plain(), guide, light, spans)
     return Signal(guide, light, spans)
 
 
@@ -71,7 +71,7 @@ def planes_of(split: bool) -> int:
 def modulate(signal: Signal, guides: Guides) -> Array:
     """(h, w, 4, 3) float32: light multiplied by surface colour and coverage again."""
     out = np.zeros((*guides.coverage.shape, 4, 3), np.float32)
-    _modulate(signal.light, signal.spans, guides.arrays, out)
+    _modulate(signal.light, signal.spans, guides.plain(), out)
     return out
 
 
@@ -144,7 +144,7 @@ def _lobe_luminance(light, y, c, lobe, parts):  # type: ignore[no-untyped-def]
 
 @njit(parallel=True)
 def _demodulate(components, variance, surface, guide, light, spans):  # type: ignore[no-untyped-def]
-    coverage = surface[0]
+    coverage = surface.coverage
     h, w = coverage.shape
     for y in prange(h):
         guide[y, SOURCE] = F(np.nan)
@@ -180,7 +180,7 @@ def modulate_pixel(y, x, light, surface, out):  # type: ignore[no-untyped-def]
 
 @njit(parallel=True)
 def _modulate(light, spans, surface, out):  # type: ignore[no-untyped-def]
-    coverage = surface[0]
+    coverage = surface.coverage
     for y in prange(len(spans)):
         for x in range(spans[y, 0], spans[y, 1]):
             if coverage[y, x] > ZERO:
