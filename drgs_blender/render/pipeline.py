@@ -25,7 +25,7 @@ from .film.film import COMPONENTS, Film
 from .film.motion_vectors import Instant, MotionFilm, vector_pass
 from .gbuffer.gbuffer import GBuffer
 from .gbuffer.mesh import primary_mesh
-from .gbuffer.surfels import primary_surfels, snap_windows
+from .gbuffer.surfels import Stages, primary_surfels, snap_windows
 from .gbuffer.visible_lights import visible_lights
 from .integrator.adaptive import part_count, sample_adaptively
 from .points import Radiance, ShadingPoints
@@ -186,7 +186,7 @@ class VisibleSurfaces:
                 _own_surfels(buffer, self._tree, self._objects)
             return buffer
         given = self._splats, self._scene, self._windows, self._camera, y0, y1, self._tree is None
-        return primary_surfels(*given, backend.rasterise, backend.tie, backend.trace, backend.shade)
+        return primary_surfels(*given, Stages(backend.rasterise, backend.tie, backend.trace, backend.shade))
 
 
 def strip_height(width: int, subpixels: int) -> int:

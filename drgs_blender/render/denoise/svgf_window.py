@@ -96,7 +96,7 @@ def _neighbours(shots: Sequence[Shot | None]) -> Iterator[tuple[int, Shot, Array
                 break
             # The picture that the motion belongs to, in both directions the later one.
             g = here.guides if direction < 0 else there.guides
-            over_rows(kernel, len(vector), motion, g, centre.guides.index, vector, expected)
+            over_rows(kernel, len(vector), motion, g, centre.guides.pass_index, vector, expected)
             yield abs(k - middle), there, vector, expected
             here = there
 
@@ -162,14 +162,14 @@ def _away(seen, guides, y, x, px, py, pz):  # type: ignore[no-untyped-def]
 @njit
 def _step_back(y0, y1, motion, guides, centre, vector, expected):  # type: ignore[no-untyped-def]
     """Follow the motion of the picture that `vector` leads to, one frame further back."""
-    h, w = guides.index.shape
+    h, w = guides.pass_index.shape
     for y in range(y0, y1):
         for x in range(w):
             i, j = _nearest(np.float32(x) + vector[y, x, 0], np.float32(y) + vector[y, x, 1], w, h)
             px, py, pz = expected[y, x, 0], expected[y, x, 1], expected[y, x, 2]
             if (
                 i < 0
-                or guides.index[j, i] != centre[y, x]
+                or guides.pass_index[j, i] != centre[y, x]
                 or not _away(guides.position, guides, j, i, px, py, pz) < np.float32(SAME_PLANE)
             ):
                 vector[y, x, 0] = np.float32(np.nan)
@@ -183,7 +183,7 @@ def _step_back(y0, y1, motion, guides, centre, vector, expected):  # type: ignor
 @njit
 def _step_ahead(y0, y1, motion, guides, centre, vector, expected):  # type: ignore[no-untyped-def]
     """Search the picture after that which `vector` leads to for the pixel whose motion leads back there."""
-    h, w = guides.index.shape
+    h, w = guides.pass_index.shape
     for y in range(y0, y1):
         for x in range(w):
             tx, ty = np.float32(x) + vector[y, x, 0], np.float32(y) + vector[y, x, 1]
@@ -201,7 +201,7 @@ def _step_ahead(y0, y1, motion, guides, centre, vector, expected):  # type: igno
                     break
             if (
                 not found
-                or guides.index[j, i] != centre[y, x]
+                or guides.pass_index[j, i] != centre[y, x]
                 or not _away(motion.previous, guides, j, i, px, py, pz) < np.float32(SAME_PLANE)
             ):
                 vector[y, x, 0] = np.float32(np.nan)

@@ -49,7 +49,7 @@ class Pixels(NamedTuple):
     ----------
     coverage : (h, w) array
     position, normal, albedo : (h, w, 3) array
-    roughness, metallic, index, depth : (h, w) array
+    roughness, metallic, pass_index, depth : (h, w) array
     components : (h, w, 4, 3) array
         In the order of `points.Radiance.components`, premultiplied.
     variance : (h, w, 2) array
@@ -66,7 +66,7 @@ class Pixels(NamedTuple):
     albedo: Array
     roughness: Array
     metallic: Array
-    index: Array
+    pass_index: Array
     depth: Array
     components: Array
     variance: Array
@@ -76,7 +76,7 @@ class Pixels(NamedTuple):
     @classmethod
     def empty(cls, size: tuple[int, int]) -> Pixels:
         """Pixels (h, w) that nothing covers."""
-        scalars = {"coverage": (), "roughness": (), "metallic": (), "index": (), "depth": ()}
+        scalars = {"coverage": (), "roughness": (), "metallic": (), "pass_index": (), "depth": ()}
         widths = scalars | {"components": (4, 3), "variance": (2,)}
         made = cls(*(np.zeros((*size, *widths.get(name, (3,))), np.float32) for name in cls._fields))
         made.depth[:] = EMPTY_DEPTH
@@ -176,7 +176,7 @@ class Film:
             "Roughness": seen.roughness,
             "Metallic": seen.metallic,
             "Coverage": seen.coverage,
-            "IndexOB": seen.index,
+            "IndexOB": seen.pass_index,
         }
         made |= {name: values[..., None] for name, values in scalars.items()}
         if "Combined" in names:
@@ -298,7 +298,7 @@ def _develop(y0, y1, points, surfaces, light, pass_index, p, pixels):  # type: i
                 b * inverse,
             )
             pixels.roughness[y, x], pixels.metallic[y, x] = rough * inverse, metal * inverse
-            pixels.index[y, x] = np.float32(pass_index[surfaces.object_index[nearest]])
+            pixels.pass_index[y, x] = np.float32(pass_index[surfaces.object_index[nearest]])
             first = last
 
 

@@ -16,7 +16,7 @@ class Guides(NamedTuple):
 
     Attributes
     ----------
-    coverage, roughness, metallic, index : (h, w) array
+    coverage, roughness, metallic, pass_index : (h, w) array
         See `film.Pixels`, also for the next.
     position, normal, albedo : (h, w, 3) array
     footprint : (h, w) array
@@ -29,7 +29,7 @@ class Guides(NamedTuple):
     albedo: Array
     roughness: Array
     metallic: Array
-    index: Array
+    pass_index: Array
     footprint: Array
 
     def plain(self) -> Guides:

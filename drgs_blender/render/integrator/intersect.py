@@ -22,6 +22,7 @@ from ..sampling import ONE, ZERO, F, U, mix, unit
 from ..scene import ray_masks
 from ..scene.interaction import Tracer, nearest, shadowed, surface_at
 from ..surfels.raster import GAP
+from ..surfels.surfel_query import Start
 from ..surfels.surfel_tracer import trace_surfels, transmittance
 from . import wavefront as w
 
@@ -67,10 +68,8 @@ def passed(tracer, s, ints, slot, far, mask):  # type: ignore[no-untyped-def]
         return ZERO
     if tracer.surfel_scene == 0:
         return ONE
-    return transmittance(
-        tracer, ox, oy, oz, lx, ly, lz, ZERO, far, mask, np.int32(ints[c + w.OWN]),
-        s[i + w.GX], s[i + w.GY], s[i + w.GZ], s[i + w.SIZE],
-    )  # fmt: skip
+    start = Start(np.int32(ints[c + w.OWN]), s[i + w.GX], s[i + w.GY], s[i + w.GZ], s[i + w.SIZE])
+    return transmittance(tracer, (ox, oy, oz), (lx, ly, lz), ZERO, far, mask, start)
 
 
 @njit
@@ -95,10 +94,11 @@ def meet(tracer, s, ints, slot, mask):  # type: ignore[no-untyped-def]
     if tracer.surfel_scene == 0:
         return (ONE if face < 0 else ZERO), t, (t, face, place, u, v, gx, gy, gz, *blank)
     key = ints[c + w.KEY]
+    start = Start(np.int32(ints[c + w.OWN]), s[i + w.GX], s[i + w.GY], s[i + w.GZ], s[i + w.SIZE])
+    number = unit(mix(U(key + U(0x632BE59B))))
     through, depth, nx, ny, nz, px, py, pz, r, g, b, roughness, metallic, size, owner, reach = trace_surfels(
-        tracer, ox, oy, oz, lx, ly, lz, ZERO, t, mask, np.int32(ints[c + w.OWN]),
-        s[i + w.GX], s[i + w.GY], s[i + w.GZ], s[i + w.SIZE], _GAP, unit(mix(U(key + U(0x632BE59B)))),
-    )  # fmt: skip
+        tracer, (ox, oy, oz), (lx, ly, lz), ZERO, t, mask, start, _GAP, number
+    )
     if face >= 0:
         if owner < 0 or unit(mix(U(key + U(0x85157AF5)))) < through:
             return ZERO, reach, (t, face, place, u, v, gx, gy, gz, *blank)

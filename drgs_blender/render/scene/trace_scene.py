@@ -16,6 +16,7 @@ import numpy as np
 from ...core.asset.model import as_float
 from ...core.errors import UsageError
 from ...core.frame import Image, MeshState, Pose
+from ..columns import VERTEX
 from ..memory import Place, address
 from ..sampling import F
 from .instances import Places, normal_matrices, other_matrices, usable_places
@@ -27,7 +28,6 @@ from .trace_mesh import (
     METALLIC,
     NORMAL,
     ROUGHNESS,
-    SHADING_WIDTH,
     Part,
     TraceObject,
     mask_of,
@@ -133,7 +133,7 @@ class TraceScene:
         self.bvh = TriangleBVH()
         self.layout = self.version = object()
         self.shading_faces: Array = np.empty((0, 3), np.int32)
-        self.shading: Array = np.empty((0, SHADING_WIDTH), np.float32)
+        self.shading: Array = np.empty((0, VERTEX), np.float32)
         self.normals: Array = np.empty((0, 3), np.float32)
         self.face_object: Array = np.empty(0, np.int32)
         self.vertex_faces = 0
@@ -343,7 +343,7 @@ class TraceScene:
             self.vertex_faces += m if surfels else 0
         self._vertex_count, self.layout = vertex, object()
         self.shading_faces, self.face_object = np.concatenate(faces), np.concatenate(owners)
-        self.shading = np.zeros((rows[True], SHADING_WIDTH), np.float32)
+        self.shading = np.zeros((rows[True], VERTEX), np.float32)
         self.normals = np.zeros((rows[False], 3), np.float32)
         self._material = np.zeros(face - self.vertex_faces, np.int32)
         self._uvs = np.empty((0, 3, 2), np.float32)
