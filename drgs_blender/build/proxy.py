@@ -21,6 +21,7 @@ from ..formats.mesh import check_extent
 from ..geometry.normals import rotation_matrices
 from ..geometry.tsdf import DepthMaps, SignedDistanceField
 from ..render.camera import camera_parameters
+from ..render.columns import ALBEDO, NORMAL
 from ..render.surfels.raster import rasterise
 from ..render.surfels.splats import prepare
 
@@ -162,8 +163,8 @@ def _look(posed: PosedSurfels, camera: Camera, direction: Array) -> tuple[Array,
     )
     alpha, surface = samples.alpha[..., 0], samples.surface[..., 0, :]
     surface = np.where(alpha[..., None] > 0, surface, 0)
-    cosine = np.abs(surface[..., :3] @ direction.astype(np.float32))
-    return alpha, samples.depth[..., 0].copy(), cosine, surface[..., 3]
+    cosine = np.abs(surface[..., NORMAL : NORMAL + 3] @ direction.astype(np.float32))
+    return alpha, samples.depth[..., 0].copy(), cosine, surface[..., ALBEDO]
 
 
 def _visible(centre: Array, size: Array, camera: Camera, alpha: Array, depth: Array, voxel: float) -> Array:

@@ -25,7 +25,7 @@ from .film.film import COMPONENTS, Film
 from .film.motion_vectors import Instant, MotionFilm, vector_pass
 from .gbuffer.gbuffer import GBuffer
 from .gbuffer.mesh import primary_mesh
-from .gbuffer.surfels import primary_surfels, snap_windows
+from .gbuffer.surfels import Stages, primary_surfels, snap_windows
 from .gbuffer.visible_lights import visible_lights
 from .integrator.adaptive import part_count, sample_adaptively
 from .points import Radiance, ShadingPoints
@@ -124,18 +124,19 @@ def render(
         for matte in mattes:
             matte.add(buffer)
         if lights is not None and lights.seen:
-            film.emission[y0 - top : y1 - top] += visible_lights(lights, parameters, left, buffer)
+            film.pixels.emission[y0 - top : y1 - top] += visible_lights(lights, parameters, left, buffer)
         for motion in moving:
             if motion is not None:
                 motion.add(buffer, scene)
-    motions = [None if motion is None else motion.motion(film.position, film.coverage) for motion in moving]
+    seen = film.pixels
+    motions = [None if motion is None else motion.motion(seen.position, seen.coverage) for motion in moving]
     signal = None
     if settings.denoise != "none":
         tell(end, "Denoising")
     if history is None:
         components = denoised(film, frame, check, backend)
     else:
-        shot = Shot(film.components, film.variance, film.guides(), motions[2])
+        shot = Shot(seen.components, seen.variance, film.guides(), motions[2])
         components, signal = backend.denoise_next(shot, history.signal, split_light(frame), history.still, check)
     tell(1.0, "Done")
     if history is not None:
@@ -145,7 +146,7 @@ def render(
     made |= film.passes(
         tuple(name for name in frame.passes if name not in made),
         components,
-        vector_pass(before, after, film.coverage.shape) if "Vector" in frame.passes else None,
+        vector_pass(before, after, seen.coverage.shape) if "Vector" in frame.passes else None,
         None if before is None else before.previous,
     )
     return {name: made[name] for name in frame.passes}
@@ -154,9 +155,9 @@ def render(
 def denoised(film: Film, frame: Frame, check: Check, backend: RenderBackend = CPU) -> Array | None:
     """(h, w, 4, 3) light of the film without noise, by the denoiser of the frame; None without one."""
     if frame.settings.denoise == "oidn":
-        return denoise_oidn(film.components, film.guides(), split_light(frame), check)
+        return denoise_oidn(film.pixels.components, film.guides(), split_light(frame), check)
     if frame.settings.denoise == "svgf":
-        return backend.denoise(film.components, film.variance, film.guides(), split_light(frame), check)
+        return backend.denoise(film.pixels.components, film.pixels.variance, film.guides(), split_light(frame), check)
     return None
 
 
@@ -185,7 +186,7 @@ class VisibleSurfaces:
                 _own_surfels(buffer, self._tree, self._objects)
             return buffer
         given = self._splats, self._scene, self._windows, self._camera, y0, y1, self._tree is None
-        return primary_surfels(*given, backend.rasterise, backend.tie, backend.trace, backend.shade)
+        return primary_surfels(*given, Stages(backend.rasterise, backend.tie, backend.trace, backend.shade))
 
 
 def strip_height(width: int, subpixels: int) -> int:

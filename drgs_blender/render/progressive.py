@@ -249,7 +249,7 @@ class Progressive:
             film.add(buffer, strip.radiance(buffer.points, exact), prepared.scene.pass_index, prepared.environment)
             if lights is not None and lights.seen:
                 rows = slice(strip.rows[0] - camera.window[1], strip.rows[1] - camera.window[1])
-                film.emission[rows] += visible_lights(lights, self._parameters, camera.window[0], buffer)
+                film.pixels.emission[rows] += visible_lights(lights, self._parameters, camera.window[0], buffer)
         return film.passes(self.frame.passes, denoised(film, self.frame, check, self._backend))
 
 

@@ -28,7 +28,7 @@ def wall(**changes: object) -> Guides:
         "albedo": np.full((H, W, 3), 0.5),
         "roughness": np.full((H, W), 0.5),
         "metallic": np.zeros((H, W)),
-        "index": np.zeros((H, W)),
+        "pass_index": np.zeros((H, W)),
         "footprint": np.full((H, W), 1e-3),
     }
     arrays |= changes  # type: ignore[arg-type]
@@ -84,7 +84,7 @@ def test_edges_stay_sharp(kind: str) -> None:
     else:
         diffuse = np.broadcast_to(np.where(left[..., 0], 0.5, 2.0), (H, W))
     if kind == "object":
-        changes["index"] = np.broadcast_to(left[..., 0], (H, W))
+        changes["pass_index"] = np.broadcast_to(left[..., 0], (H, W))
     if kind == "normal":
         changes["normal"] = np.broadcast_to(np.where(left, [0, -1.0, 0], [-0.8, -0.6, 0]), (H, W, 3))
     if kind == "depth":
@@ -246,14 +246,14 @@ def exposed(monkeypatch: pytest.MonkeyPatch, rays: int, seed: int) -> Film:
 
 @pytest.mark.slow
 def test_gain_at_32_rays_against_the_converged_picture(monkeypatch: pytest.MonkeyPatch) -> None:
-    truth = exposed(monkeypatch, 2048, seed=5).components.sum(2)
+    truth = exposed(monkeypatch, 2048, seed=5).pixels.components.sum(2)
     film = exposed(monkeypatch, 32, seed=1)
 
     def psnr(light: np.ndarray) -> float:
         tone = [np.clip(a, 0, 1) ** (1 / 2.2) for a in (light.sum(2), truth)]
         return float(-10 * np.log10(np.mean((tone[0] - tone[1]) ** 2)))
 
-    gain = psnr(denoise(film.components, film.variance, film.guides())) - psnr(film.components)
+    gain = psnr(denoise(film.pixels.components, film.pixels.variance, film.guides())) - psnr(film.pixels.components)
     assert gain > 2.0, gain
 
 

@@ -18,7 +18,7 @@ from drgs_blender.render.backend import CPU, RenderBackend
 from drgs_blender.render.camera import SUBPIXELS, camera_parameters
 from drgs_blender.render.gbuffer.gbuffer import GBuffer
 from drgs_blender.render.gbuffer.mesh import primary_mesh
-from drgs_blender.render.gbuffer.surfels import primary_surfels, snap_windows
+from drgs_blender.render.gbuffer.surfels import Stages, primary_surfels, snap_windows
 from drgs_blender.render.gpu.warp_backend import WarpRenderBackend
 from drgs_blender.render.scene.ray_masks import CAMERA
 from drgs_blender.render.scene.trace_scene import TraceScene
@@ -111,8 +111,8 @@ def test_meshes_behind_surfels_leave_the_surfels_as_they_are(device: WarpRenderB
     posed = sphere_surfels(1.05)
     here, there = (
         primary_surfels(
-            CPU.prepare(posed, camera, parameters), scene, windows, camera, 0, 40, True, CPU.rasterise, CPU.tie,
-            by.trace, by.shade,
+            CPU.prepare(posed, camera, parameters), scene, windows, camera, 0, 40, True,
+            Stages(trace=by.trace, shade=by.shade),
         )
         for by in (CPU, device)
     )  # fmt: skip

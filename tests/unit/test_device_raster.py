@@ -13,7 +13,7 @@ from test_raster import join, look_along_y, plane_of_surfels, random_surfels
 from drgs_blender.core.frame import MeshState, RenderSettings
 from drgs_blender.render.backend import CPU
 from drgs_blender.render.camera import camera_parameters
-from drgs_blender.render.gbuffer.surfels import primary_surfels, snap_windows
+from drgs_blender.render.gbuffer.surfels import Stages, primary_surfels, snap_windows
 from drgs_blender.render.gpu import raster as device_raster
 from drgs_blender.render.gpu.warp_backend import WarpRenderBackend
 from drgs_blender.render.surfels.raster import SurfelSamples, rasterise
@@ -88,7 +88,7 @@ def test_points_are_tied_to_the_mesh_as_the_processor_ties_them(
     posed, windows = sphere_surfels(1 + offset), snap_windows(scene, 1)
     here, there = (
         primary_surfels(
-            by.prepare(posed, camera, parameters), scene, windows, camera, 0, 40, tied, by.rasterise, by.tie
+            by.prepare(posed, camera, parameters), scene, windows, camera, 0, 40, tied, Stages(by.rasterise, by.tie)
         )
         for by in (CPU, device)
     )
@@ -117,10 +117,10 @@ def test_blended_samples_are_not_copied_to_a_card_again(monkeypatch: pytest.Monk
         samples.append(device.rasterise(*arguments))  # type: ignore[arg-type]
         return samples[-1]
 
-    found = primary_surfels(splats, *given, rasterise_there, device.tie)
+    found = primary_surfels(splats, *given, Stages(rasterise_there, device.tie))
     assert not device.failed and not any(np.shares_memory(array, samples[0].surface) for array in copied)
     other = device.rasterise(splats, 0, 40)  # other samples than the latest are copied
-    again = primary_surfels(splats, *given, lambda *arguments: samples[0], device.tie)
+    again = primary_surfels(splats, *given, Stages(lambda *arguments: samples[0], device.tie))
     assert other.surface is not samples[0].surface
     assert any(np.shares_memory(array, samples[0].surface) for array in copied)
     np.testing.assert_array_equal(found.points.origin, again.points.origin)

@@ -82,10 +82,10 @@ def test_light_is_the_weighted_sum_of_the_samples() -> None:
     points = buffer.points
     expected = np.zeros((120, 4, 3))
     np.add.at(expected, points.pixel, points.weight[:, None, None] * light.components)
-    assert np.allclose(film.components.reshape(-1, 4, 3), expected, atol=1e-6)
+    assert np.allclose(film.pixels.components.reshape(-1, 4, 3), expected, atol=1e-6)
     variance = np.zeros((120, 2))
     np.add.at(variance, points.pixel, points.weight[:, None] ** 2 * light.variance)
-    assert np.allclose(film.variance.reshape(-1, 2), variance, atol=1e-7)
+    assert np.allclose(film.pixels.variance.reshape(-1, 2), variance, atol=1e-7)
 
 
 def test_surface_passes_have_no_dark_rim_and_no_holes() -> None:
@@ -142,7 +142,7 @@ def test_background_is_the_mean_over_the_sub_pixel_rays() -> None:
 
 def test_denoised_light_replaces_all_but_the_noisy_image() -> None:
     film, _, _ = expose(some_coverage(), True)
-    p = film.passes(ALL, 2 * film.components)
+    p = film.passes(ALL, 2 * film.pixels.components)
     assert np.allclose(p["Combined"][..., :3], 2 * p["Noisy Image"][..., :3], rtol=1e-6)
     assert np.array_equal(p["Combined"][..., 3], p["Noisy Image"][..., 3])
     total = p["DiffDir"] + p["DiffInd"] + p["GlossDir"] + p["GlossInd"] + p["Env"] + p["Emit"]

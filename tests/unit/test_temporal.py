@@ -243,7 +243,7 @@ def test_what_comes_into_view_starts_anew() -> None:
     shots = []
     for k in range(5):
         g = wall(step * k - 8, box=True)
-        on_box = g.index == 1
+        on_box = g.pass_index == 1
         shots.append(shot(g, np.where(on_box, 0.5, 3.0), 0.2, k, moved(g, step, on_box)))
     last = shots[-1].guides
     found = diffuse(gathered(shots))
@@ -349,10 +349,10 @@ def test_window_does_not_mix_what_is_hidden_in_other_frames() -> None:
     shots = []
     for k in range(5):
         g = wall(5.0 * k - 10, box=True)
-        on_box = g.index == 1
+        on_box = g.pass_index == 1
         shots.append(shot(g, np.where(on_box, 0.5, 3.0), 0.05, k, moved(g, 5.0, on_box)))
     found = window(shots)[:, :, 0, 0]
-    on_box = shots[2].guides.index == 1
+    on_box = shots[2].guides.pass_index == 1
     albedo = shots[2].guides.albedo[..., 0]
     assert np.abs(found / albedo - np.where(on_box, 0.5, 3.0)).max() < 0.15
 

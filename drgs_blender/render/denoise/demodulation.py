@@ -60,7 +60,7 @@ def demodulate(components: Array, variance: Array, guides: Guides, split: bool =
     guide = np.zeros((h, GUIDES, w + 2 * PAD), np.float32)
     light = np.zeros((h, planes_of(split), w + 2 * PAD), np.float32)
     spans = np.zeros((h, 2), np.int32)
-    over_range(_demodulate, len(light), components, variance, guides.arrays, guide, light, spans, fewest=ROWS)
+    over_range(_demodulate, len(light), components, variance, guides.plain(), guide, light, spans, fewest=ROWS)
     return Signal(guide, light, spans)
 
 
@@ -72,7 +72,7 @@ def planes_of(split: bool) -> int:
 def modulate(signal: Signal, guides: Guides) -> Array:
     """(h, w, 4, 3) float32: light multiplied by surface colour and coverage again."""
     out = np.zeros((*guides.coverage.shape, 4, 3), np.float32)
-    over_range(_modulate, len(signal.spans), signal.light, signal.spans, guides.arrays, out, fewest=ROWS)
+    over_range(_modulate, len(signal.spans), signal.light, signal.spans, guides.plain(), out, fewest=ROWS)
     return out
 
 
@@ -145,7 +145,7 @@ def _lobe_luminance(light, y, c, lobe, parts):  # type: ignore[no-untyped-def]
 
 @njit
 def _demodulate(first, last, components, variance, surface, guide, light, spans):  # type: ignore[no-untyped-def]
-    coverage = surface[0]
+    coverage = surface.coverage
     w = coverage.shape[1]
     for y in range(first, last):
         guide[y, SOURCE] = F(np.nan)
@@ -181,7 +181,7 @@ def modulate_pixel(y, x, light, surface, out):  # type: ignore[no-untyped-def]
 
 @njit
 def _modulate(first, last, light, spans, surface, out):  # type: ignore[no-untyped-def]
-    coverage = surface[0]
+    coverage = surface.coverage
     for y in range(first, last):
         for x in range(spans[y, 0], spans[y, 1]):
             if coverage[y, x] > ZERO:

@@ -108,9 +108,8 @@ def _neighbours(shots: Sequence[Shot | None]) -> Iterator[tuple[int, Shot, Array
                 break
             # The picture that the motion belongs to, in both directions the later one.
             g = here.guides if direction < 0 else there.guides
-            over_range(
-                kernel, len(vector), motion.vector, motion.previous, g.position, g.normal, g.footprint, g.index,
-                centre.guides.index, vector, expected, fewest=ROWS)  # fmt: skip
+            index = centre.guides.pass_index
+            over_range(kernel, len(vector), motion, g, index, vector, expected, fewest=ROWS)
             yield abs(k - middle), there, vector, expected
             here = there
 
@@ -161,43 +160,43 @@ def _nearest(x, y, w, h):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def _away(seen, normal, footprint, y, x, px, py, pz):  # type: ignore[no-untyped-def]
+def _away(seen, guides, y, x, px, py, pz):  # type: ignore[no-untyped-def]
     """Distance of (px, py, pz) from the plane through ``seen[y, x]``, in pixel widths."""
     return (
         abs(
-            normal[y, x, 0] * (px - seen[y, x, 0])
-            + normal[y, x, 1] * (py - seen[y, x, 1])
-            + normal[y, x, 2] * (pz - seen[y, x, 2])
+            guides.normal[y, x, 0] * (px - seen[y, x, 0])
+            + guides.normal[y, x, 1] * (py - seen[y, x, 1])
+            + guides.normal[y, x, 2] * (pz - seen[y, x, 2])
         )
-        / footprint[y, x]
+        / guides.footprint[y, x]
     )
 
 
 @njit
-def _step_back(y0, y1, motion, previous, position, normal, footprint, index, centre, vector, expected):  # type: ignore[no-untyped-def]
+def _step_back(y0, y1, motion, guides, centre, vector, expected):  # type: ignore[no-untyped-def]
     """Follow the motion of the picture that `vector` leads to, one frame further back."""
-    h, w = index.shape
+    h, w = guides.pass_index.shape
     for y in range(y0, y1):
         for x in range(w):
             i, j = _nearest(np.float32(x) + vector[y, x, 0], np.float32(y) + vector[y, x, 1], w, h)
             px, py, pz = expected[y, x, 0], expected[y, x, 1], expected[y, x, 2]
             if (
                 i < 0
-                or index[j, i] != centre[y, x]
-                or not _away(position, normal, footprint, j, i, px, py, pz) < np.float32(SAME_PLANE)
+                or guides.pass_index[j, i] != centre[y, x]
+                or not _away(guides.position, guides, j, i, px, py, pz) < np.float32(SAME_PLANE)
             ):
                 vector[y, x, 0] = np.float32(np.nan)
                 continue
             for k in range(2):
-                vector[y, x, k] += motion[j, i, k]
+                vector[y, x, k] += motion.vector[j, i, k]
             for k in range(3):
-                expected[y, x, k] += previous[j, i, k] - position[j, i, k]
+                expected[y, x, k] += motion.previous[j, i, k] - guides.position[j, i, k]
 
 
 @njit
-def _step_ahead(y0, y1, motion, previous, position, normal, footprint, index, centre, vector, expected):  # type: ignore[no-untyped-def]
+def _step_ahead(y0, y1, motion, guides, centre, vector, expected):  # type: ignore[no-untyped-def]
     """Search the picture after that which `vector` leads to for the pixel whose motion leads back there."""
-    h, w = index.shape
+    h, w = guides.pass_index.shape
     for y in range(y0, y1):
         for x in range(w):
             tx, ty = np.float32(x) + vector[y, x, 0], np.float32(y) + vector[y, x, 1]
@@ -206,20 +205,20 @@ def _step_ahead(y0, y1, motion, previous, position, normal, footprint, index, ce
             found = False
             for _ in range(SEARCHES):
                 i, j = _nearest(qx, qy, w, h)
-                if i < 0 or not abs(motion[j, i, 0]) + abs(motion[j, i, 1]) < np.float32(1e6):
+                if i < 0 or not abs(motion.vector[j, i, 0]) + abs(motion.vector[j, i, 1]) < np.float32(1e6):
                     break
-                qx, qy = tx - motion[j, i, 0], ty - motion[j, i, 1]
+                qx, qy = tx - motion.vector[j, i, 0], ty - motion.vector[j, i, 1]
                 ii, jj = _nearest(qx, qy, w, h)
                 found = ii == i and jj == j
                 if found:
                     break
             if (
                 not found
-                or index[j, i] != centre[y, x]
-                or not _away(previous, normal, footprint, j, i, px, py, pz) < np.float32(SAME_PLANE)
+                or guides.pass_index[j, i] != centre[y, x]
+                or not _away(motion.previous, guides, j, i, px, py, pz) < np.float32(SAME_PLANE)
             ):
                 vector[y, x, 0] = np.float32(np.nan)
                 continue
             vector[y, x, 0], vector[y, x, 1] = qx - np.float32(x), qy - np.float32(y)
             for k in range(3):
-                expected[y, x, k] += position[j, i, k] - previous[j, i, k]
+                expected[y, x, k] += guides.position[j, i, k] - motion.previous[j, i, k]

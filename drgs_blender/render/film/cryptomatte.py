@@ -37,16 +37,12 @@ class CryptoFilm:
         """Take the samples of a strip."""
         y0, y1 = buffer.rows
         x0, top = self._origin
-        start = np.searchsorted(buffer.points.pixel, np.arange(y0, y1 + 1, dtype=np.int64) * self._width)
         scene = self._scene
-        owner = (
-            scene.source[buffer.object_index]
-            if self._kind == "object"
-            else scene.mesh_materials.of(buffer.face - scene.vertex_faces)
-        )
-        points = buffer.points
-        rows = self.pixels[y0 - top : y1 - top]
-        _rank(start, x0, self._width, points.pixel, points.weight, points.flags, self._identities[owner], rows)
+        if self._kind == "object":
+            owner = scene.source[buffer.object_index]
+        else:
+            owner = scene.mesh_materials.of(buffer.face - scene.vertex_faces)
+        _rank(buffer.point_rows(x0, self._width), self._identities[owner], self.pixels[y0 - top : y1 - top])
 
     def passes(self) -> dict[str, Array]:
         """Name -> (h, w, 4) float32."""
@@ -56,8 +52,9 @@ class CryptoFilm:
 
 
 @njit(parallel=True)
-def _rank(start, x0, width, pixel, weight, flags, identity, out):  # type: ignore[no-untyped-def]
+def _rank(points, identity, out):  # type: ignore[no-untyped-def]
     """Add up the weights of each identity in a pixel, and keep the largest."""
+    start, pixel, weight, flags = points.start, points.pixel, points.weight, points.flags
     for y in prange(len(start) - 1):
         known, share = np.empty(_SLOTS, np.float32), np.empty(_SLOTS, np.float32)
         first = start[y]
@@ -74,7 +71,7 @@ def _rank(start, x0, width, pixel, weight, flags, identity, out):  # type: ignor
                             count += 1
                         share[slot] += weight[last]
                 last += 1
-            x = pixel[first] % width - x0
+            x = pixel[first] % points.width - points.x0
             for rank in range(min(count, out.shape[2])):
                 best = rank
                 for slot in range(rank + 1, count):

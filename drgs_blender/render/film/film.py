@@ -18,9 +18,12 @@ catchers alone), both summed over the pixel first, so that the quotient is not o
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from ...compute.jit import njit, prange
+from ...compute.threads import ROWS, over_range
 from ...core.frame import Camera, RenderSettings
 from ..camera import FX, FY, ORTHOGRAPHIC, WIDTH, sample_ray
 from ..gbuffer.gbuffer import GBuffer
@@ -39,25 +42,61 @@ SAME_SURFACE = 8.0
 COMPONENTS = ("DiffDir", "DiffInd", "GlossDir", "GlossInd")
 
 
+class Pixels(NamedTuple):
+    """What points add up to, of all pixels of a window or of some of its rows; float32.
+
+    Attributes
+    ----------
+    coverage : (h, w) array
+    position, normal, albedo : (h, w, 3) array
+    roughness, metallic, pass_index, depth : (h, w) array
+    components : (h, w, 4, 3) array
+        In the order of `points.Radiance.components`, premultiplied.
+    variance : (h, w, 2) array
+        Of the luminance of the premultiplied diffuse and glossy sums.
+    emission : (h, w, 3) array
+        Light that seen surfaces emit.
+    catcher : (h, w, 3) array
+        Sums by weight over the points of catchers: one, luminance, unshadowed luminance.
+    """
+
+    coverage: Array
+    position: Array
+    normal: Array
+    albedo: Array
+    roughness: Array
+    metallic: Array
+    pass_index: Array
+    depth: Array
+    components: Array
+    variance: Array
+    emission: Array
+    catcher: Array
+
+    @classmethod
+    def empty(cls, size: tuple[int, int]) -> Pixels:
+        """Pixels (h, w) that nothing covers."""
+        scalars = {"coverage": (), "roughness": (), "metallic": (), "pass_index": (), "depth": ()}
+        widths = scalars | {"components": (4, 3), "variance": (2,)}
+        made = cls(*(np.zeros((*size, *widths.get(name, (3,))), np.float32) for name in cls._fields))
+        made.depth[:] = EMPTY_DEPTH
+        return made
+
+    def rows(self, first: int, last: int) -> Pixels:
+        """Those of some rows, the same memory."""
+        return Pixels(*(array[first:last] for array in self))
+
+
 class Film:
     """The picture while it is made, of the camera's window.
 
     Attributes
     ----------
-    components : (h, w, 4, 3) float32 array
-        In the order of `points.Radiance.components`, premultiplied.
-    variance : (h, w, 2) float32 array
-        Of the luminance of the premultiplied diffuse and glossy sums.
+    pixels : Pixels
     environment : (h, w, 3) float32 array
         Light straight from the world, as if catchers had no shadow.
-    emission : (h, w, 3) float32 array
-        Light that seen surfaces emit.
-    coverage : (h, w) float32 array
-    catcher : (h, w, 3) float32 array
-        Sums by weight over the points of catchers: one, luminance, unshadowed luminance.
     veiled : (h, w, 3) float32 array
         The part of ``environment`` that is seen through catchers.
-    depth, position, normal, albedo, roughness, metallic, index : (h, w) or (h, w, 3) float32 array
     """
 
     def __init__(self, camera: Camera, settings: RenderSettings, parameters: Array) -> None:
@@ -66,13 +105,8 @@ class Film:
         self.transparent = settings.film_transparent
         self.origin = (x0, y0)
         self.parameters = parameters
-        self.components = np.zeros((*size, 4, 3), np.float32)
-        self.variance = np.zeros((*size, 2), np.float32)
-        self.environment = np.zeros((*size, 3), np.float32)
-        self.emission, self.catcher, self.veiled = (np.zeros((*size, 3), np.float32) for _ in range(3))
-        self.coverage, self.roughness, self.metallic, self.index = (np.zeros(size, np.float32) for _ in range(4))
-        self.depth = np.full(size, EMPTY_DEPTH, np.float32)
-        self.position, self.normal, self.albedo = (np.zeros((*size, 3), np.float32) for _ in range(3))
+        self.pixels = Pixels.empty(size)
+        self.environment, self.veiled = (np.zeros((*size, 3), np.float32) for _ in range(2))
 
     def add(self, buffer: GBuffer, radiance: Radiance, pass_index: Array, environment: EnvironmentLight) -> None:
         """Take the strip `buffer` with the light of its points.
@@ -90,40 +124,11 @@ class Film:
         y0, y1 = buffer.rows
         rows = slice(y0 - top, y1 - top)
         points = buffer.points
-        width = int(self.parameters[WIDTH])
-        start = np.searchsorted(points.pixel, np.arange(y0, y1 + 1, dtype=np.int64) * width)
-        _develop(
-            start,
-            x0,
-            self.parameters,
-            points.pixel,
-            points.weight,
-            points.normal,
-            points.albedo,
-            points.roughness,
-            points.metallic,
-            buffer.position,
-            buffer.depth,
-            buffer.object_index,
-            buffer.emission,
-            points.flags,
-            pass_index,
-            radiance.components,
-            radiance.variance,
-            np.zeros(len(points), np.float32) if radiance.unshadowed is None else radiance.unshadowed,
-            self.components[rows],
-            self.variance[rows],
-            self.coverage[rows],
-            self.depth[rows],
-            self.position[rows],
-            self.normal[rows],
-            self.albedo[rows],
-            self.roughness[rows],
-            self.metallic[rows],
-            self.index[rows],
-            self.emission[rows],
-            self.catcher[rows],
-        )
+        unshadowed = np.zeros(len(points), np.float32) if radiance.unshadowed is None else radiance.unshadowed
+        light = radiance.components, radiance.variance, unshadowed
+        over_range(
+            _develop, y1 - y0, buffer.point_rows(x0, int(self.parameters[WIDTH])), buffer.surfaces(), light,
+            pass_index, self.parameters, self.pixels.rows(y0 - top, y1 - top), fewest=ROWS)  # fmt: skip
         if not self.transparent and not environment.black:
             _background(self.parameters, x0, y0, buffer.alpha, environment.envmap, self.environment[rows])
             caught = np.flatnonzero(points.flags & CATCHER)
@@ -135,16 +140,9 @@ class Film:
 
     def guides(self) -> Guides:
         """What the denoiser tells surfaces apart by."""
-        return Guides(
-            self.coverage,
-            self.position,
-            self.normal,
-            self.albedo,
-            self.roughness,
-            self.metallic,
-            self.index,
-            footprints(self.depth, self.parameters),
-        )
+        known = self.pixels._asdict()
+        shared = {name: known[name] for name in Guides._fields if name in known}
+        return Guides(**shared, footprint=footprints(self.pixels.depth, self.parameters))
 
     def passes(
         self,
@@ -163,36 +161,37 @@ class Film:
         vector, previous : array, optional
             The passes of motion; nothing moves when None.
         """
-        light = self.components if components is None else components
+        seen = self.pixels
+        light = seen.components if components is None else components
         made = {name: np.ascontiguousarray(light[:, :, i]) for i, name in enumerate(COMPONENTS)}
         shadow = self._shadow()
         made["Env"] = self.environment - self.veiled * shadow[..., None] if shadow.any() else self.environment
-        made["Emit"] = self.emission
-        made |= {"Position": self.position, "Normal": self.normal, "Albedo": self.albedo, "Variance": self.variance}
-        made["Vector"] = np.zeros((*self.coverage.shape, 4), np.float32) if vector is None else vector
-        made["Previous Position"] = self.position if previous is None else previous
+        made["Emit"] = seen.emission
+        made |= {"Position": seen.position, "Normal": seen.normal, "Albedo": seen.albedo, "Variance": seen.variance}
+        made["Vector"] = np.zeros((*seen.coverage.shape, 4), np.float32) if vector is None else vector
+        made["Previous Position"] = seen.position if previous is None else previous
         scalars = {
-            "Depth": self.depth,
-            "Roughness": self.roughness,
-            "Metallic": self.metallic,
-            "Coverage": self.coverage,
-            "IndexOB": self.index,
+            "Depth": seen.depth,
+            "Roughness": seen.roughness,
+            "Metallic": seen.metallic,
+            "Coverage": seen.coverage,
+            "IndexOB": seen.pass_index,
         }
         made |= {name: values[..., None] for name, values in scalars.items()}
         if "Combined" in names:
             made["Combined"] = self._beauty(light, made["Env"], shadow)
         if "Noisy Image" in names:
-            made["Noisy Image"] = self._beauty(self.components, made["Env"], shadow)
+            made["Noisy Image"] = self._beauty(seen.components, made["Env"], shadow)
         return {name: made[name] for name in names}
 
     def _shadow(self) -> Array:
         """(h, w) float32 in [0, 1]: how dense the shadows on catchers are."""
-        _, light, unshadowed = np.moveaxis(self.catcher, 2, 0)
+        _, light, unshadowed = np.moveaxis(self.pixels.catcher, 2, 0)
         return np.where(unshadowed > 0, np.clip(1 - light / np.where(unshadowed > 0, unshadowed, 1), 0, 1), 0)
 
     def _beauty(self, light: Array, environment: Array, shadow: Array) -> Array:
-        opaque = self.coverage + self.catcher[:, :, 0] * shadow if self.transparent else np.float32(1.0)
-        return add_light(light, environment, self.emission, opaque)
+        opaque = self.pixels.coverage + self.pixels.catcher[:, :, 0] * shadow if self.transparent else np.float32(1.0)
+        return add_light(light, environment, self.pixels.emission, opaque)
 
 
 def footprints(depth: Array, parameters: Array) -> Array:
@@ -209,60 +208,43 @@ def add_light(light: Array, environment: Array, emission: Array, opaque: Array |
     return out
 
 
-@njit(parallel=True)
-def _develop(  # type: ignore[no-untyped-def]
-    start,
-    x0,
-    p,
-    pixel,
-    weight,
-    normal,
-    albedo,
-    roughness,
-    metallic,
-    position,
-    depth,
-    owner,
-    emission,
-    flags,
-    pass_index,
-    light,
-    light_variance,
-    unshadowed,
-    components,
-    variance,
-    coverage,
-    out_depth,
-    out_position,
-    out_normal,
-    out_albedo,
-    out_roughness,
-    out_metallic,
-    out_index,
-    out_emission,
-    out_catcher,
-):
-    """Sum the points of each pixel; they are neighbours in the arrays."""
-    width = np.int64(p[WIDTH])
+@njit
+def _develop(y0, y1, points, surfaces, light, pass_index, p, pixels):  # type: ignore[no-untyped-def]
+    """Sum the points of each pixel of some rows; they are neighbours in the arrays.
+
+    Parameters
+    ----------
+    points : PointRows
+    surfaces : PointSurfaces
+    light : tuple of array
+        Components, variance and unshadowed luminance of `Radiance`.
+    pass_index : array
+    p : array
+        `camera.camera_parameters`.
+    pixels : Pixels
+    """
+    start, pixel, weight, flags, depth = points.start, points.pixel, points.weight, points.flags, points.depth
+    position = points.position
+    shone, spread, unshadowed = light
     per_depth = np.float32(0.0 if p[ORTHOGRAPHIC] != 0.0 else SAME_SURFACE / min(p[FX], p[FY]))
     fixed = np.float32(SAME_SURFACE / min(p[FX], p[FY]) if p[ORTHOGRAPHIC] != 0.0 else 0.0)
     zero = np.float32(0.0)
-    for y in prange(len(start) - 1):
+    for y in range(y0, y1):
         first = start[y]
         while first < start[y + 1]:
             last = first + 1
             while last < start[y + 1] and pixel[last] == pixel[first]:
                 last += 1
-            x = pixel[first] % width - x0
+            x = pixel[first] % points.width - points.x0
             nearest = -1
             for i in range(first, last):
                 if flags[i] & CATCHER:
                     shine = zero
                     for c in range(4):
-                        shine += luminance(light[i, c, 0], light[i, c, 1], light[i, c, 2])
-                    out_catcher[y, x, 0] += weight[i]
-                    out_catcher[y, x, 1] += weight[i] * shine
-                    out_catcher[y, x, 2] += weight[i] * unshadowed[i]
+                        shine += luminance(shone[i, c, 0], shone[i, c, 1], shone[i, c, 2])
+                    pixels.catcher[y, x, 0] += weight[i]
+                    pixels.catcher[y, x, 1] += weight[i] * shine
+                    pixels.catcher[y, x, 2] += weight[i] * unshadowed[i]
                 elif nearest < 0 or depth[i] < depth[nearest]:
                     nearest = i
             if nearest < 0:
@@ -277,15 +259,19 @@ def _develop(  # type: ignore[no-untyped-def]
                 w = weight[i]
                 total += w
                 for k in range(3):
-                    out_emission[y, x, k] += w * emission[i, k]
+                    pixels.emission[y, x, k] += w * surfaces.emission[i, k]
                 for c in range(4):
                     for k in range(3):
-                        components[y, x, c, k] += w * light[i, c, k]
-                variance[y, x, 0] += w * w * light_variance[i, 0]
-                variance[y, x, 1] += w * w * light_variance[i, 1]
-                nx, ny, nz = nx + w * normal[i, 0], ny + w * normal[i, 1], nz + w * normal[i, 2]
-                r, g, b = r + w * albedo[i, 0], g + w * albedo[i, 1], b + w * albedo[i, 2]
-                rough, metal = rough + w * roughness[i], metal + w * metallic[i]
+                        pixels.components[y, x, c, k] += w * shone[i, c, k]
+                pixels.variance[y, x, 0] += w * w * spread[i, 0]
+                pixels.variance[y, x, 1] += w * w * spread[i, 1]
+                nx, ny, nz = (
+                    nx + w * surfaces.normal[i, 0],
+                    ny + w * surfaces.normal[i, 1],
+                    nz + w * surfaces.normal[i, 2],
+                )
+                r, g, b = r + w * surfaces.albedo[i, 0], g + w * surfaces.albedo[i, 1], b + w * surfaces.albedo[i, 2]
+                rough, metal = rough + w * surfaces.roughness[i], metal + w * surfaces.metallic[i]
                 if depth[i] <= limit:
                     surface += w
                     # Differences to the nearest sample, lest float32 lose small ones far from the origin.
@@ -293,21 +279,25 @@ def _develop(  # type: ignore[no-untyped-def]
                     px += w * (position[i, 0] - position[nearest, 0])
                     py += w * (position[i, 1] - position[nearest, 1])
                     pz += w * (position[i, 2] - position[nearest, 2])
-            coverage[y, x] = min(total, np.float32(1.0))
-            out_depth[y, x] = depth[nearest] + mean_depth / surface
-            out_position[y, x, 0] = position[nearest, 0] + px / surface
-            out_position[y, x, 1] = position[nearest, 1] + py / surface
-            out_position[y, x, 2] = position[nearest, 2] + pz / surface
+            pixels.coverage[y, x] = min(total, np.float32(1.0))
+            pixels.depth[y, x] = depth[nearest] + mean_depth / surface
+            pixels.position[y, x, 0] = position[nearest, 0] + px / surface
+            pixels.position[y, x, 1] = position[nearest, 1] + py / surface
+            pixels.position[y, x, 2] = position[nearest, 2] + pz / surface
             length = np.sqrt(nx * nx + ny * ny + nz * nz)
             if length > np.float32(1e-6) * total:
                 nx, ny, nz = nx / length, ny / length, nz / length
             else:
-                nx, ny, nz = normal[nearest, 0], normal[nearest, 1], normal[nearest, 2]
-            out_normal[y, x, 0], out_normal[y, x, 1], out_normal[y, x, 2] = nx, ny, nz
+                nx, ny, nz = surfaces.normal[nearest, 0], surfaces.normal[nearest, 1], surfaces.normal[nearest, 2]
+            pixels.normal[y, x, 0], pixels.normal[y, x, 1], pixels.normal[y, x, 2] = nx, ny, nz
             inverse = np.float32(1.0) / total
-            out_albedo[y, x, 0], out_albedo[y, x, 1], out_albedo[y, x, 2] = r * inverse, g * inverse, b * inverse
-            out_roughness[y, x], out_metallic[y, x] = rough * inverse, metal * inverse
-            out_index[y, x] = np.float32(pass_index[owner[nearest]])
+            pixels.albedo[y, x, 0], pixels.albedo[y, x, 1], pixels.albedo[y, x, 2] = (
+                r * inverse,
+                g * inverse,
+                b * inverse,
+            )
+            pixels.roughness[y, x], pixels.metallic[y, x] = rough * inverse, metal * inverse
+            pixels.pass_index[y, x] = np.float32(pass_index[surfaces.object_index[nearest]])
             first = last
 
 

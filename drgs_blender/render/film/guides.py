@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,11 +11,16 @@ from ...compute.jit import plain
 Array = np.ndarray
 
 
-@dataclass(slots=True)
-class Guides:
-    """What tells surfaces apart, (h, w) or (h, w, 3) float32; see `film.Film`.
+class Guides(NamedTuple):
+    """What tells the surfaces of a picture apart; float32.
 
-    ``footprint`` (h, w) is the width of a pixel at the surface, metres.
+    Attributes
+    ----------
+    coverage, roughness, metallic, pass_index : (h, w) array
+        See `film.Pixels`, also for the next.
+    position, normal, albedo : (h, w, 3) array
+    footprint : (h, w) array
+        Width of a pixel at the surface, metres.
     """
 
     coverage: Array
@@ -24,10 +29,9 @@ class Guides:
     albedo: Array
     roughness: Array
     metallic: Array
-    index: Array
+    pass_index: Array
     footprint: Array
 
-    @property
-    def arrays(self) -> tuple[Array, ...]:
-        """All of them, in this order, as kernels take them."""
-        return tuple(plain(getattr(self, f.name)) for f in fields(self))
+    def plain(self) -> Guides:
+        """The same as kernels take it, see `compute.jit.plain`."""
+        return Guides(*map(plain, self))

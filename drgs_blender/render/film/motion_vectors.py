@@ -7,7 +7,6 @@ that a seen point moves exactly as its surfel.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -39,8 +38,7 @@ class Instant(NamedTuple):
     parameters: Array
 
 
-@dataclass(slots=True)
-class Motion:
+class Motion(NamedTuple):
     """Where the surfaces of a picture are at another time, mostly one frame earlier.
 
     Attributes
@@ -79,9 +77,7 @@ def previous_positions(
     (n, 3) float32 array
     """
     out = np.empty((len(face), 3), np.float32)
-    _previous(
-        faces, now.vertices, now.places, then.vertices, then.places, face, place, barycentric, position, out
-    )  # fmt: skip
+    _previous(faces, now, then, face, place, barycentric, position, out)
     return out
 
 
@@ -113,12 +109,8 @@ class MotionFilm:
         """Take samples that are at `previous` (n, 3) at the other time."""
         x0, top = self.origin
         y0, y1 = buffer.rows
-        points, parameters = buffer.points, self.now.parameters
-        start = np.searchsorted(points.pixel, np.arange(y0, y1 + 1, dtype=np.int64) * int(parameters[WIDTH]))
-        _displace(
-            start, x0, parameters, points.pixel, points.weight, points.flags, buffer.face, buffer.depth,
-            buffer.position, previous, self.displacement[y0 - top : y1 - top],
-        )  # fmt: skip
+        points = buffer.point_rows(x0, int(self.now.parameters[WIDTH]))
+        _displace(points, self.now.parameters, buffer.face, previous, self.displacement[y0 - top : y1 - top])
 
     def motion(self, position: Array, coverage: Array) -> Motion:
         """Motion of the picture whose passes are `position` and `coverage`."""
@@ -173,15 +165,15 @@ def _basis(v, faces, f):  # type: ignore[no-untyped-def]
 
 
 @njit(parallel=True)
-def _previous(faces, vertices, places, before, places_before, face, place, barycentric, position, out):  # type: ignore[no-untyped-def]
+def _previous(faces, now, then, face, place, barycentric, position, out):  # type: ignore[no-untyped-def]
     for i in prange(len(face)):
         f, stand = face[i], place[i]
         if f < 0:
             out[i, 0], out[i, 1], out[i, 2] = position[i, 0], position[i, 1], position[i, 2]
             continue
         if stand >= 0:
-            x, y, z = position_at(f, stand, barycentric[i, 0], barycentric[i, 1], vertices, faces, places)
-            u, v, w = position_at(f, stand, barycentric[i, 0], barycentric[i, 1], before, faces, places_before)
+            x, y, z = position_at(f, stand, barycentric[i, 0], barycentric[i, 1], now.vertices, faces, now.places)
+            u, v, w = position_at(f, stand, barycentric[i, 0], barycentric[i, 1], then.vertices, faces, then.places)
             out[i, 0], out[i, 1], out[i, 2] = (
                 position[i, 0] + (u - x),
                 position[i, 1] + (v - y),
@@ -189,12 +181,12 @@ def _previous(faces, vertices, places, before, places_before, face, place, baryc
             )
             continue
         b, c = np.float64(barycentric[i, 0]), np.float64(barycentric[i, 1])
-        x, y, z, ux, uy, uz, wx, wy, wz, nx, ny, nz, size = _basis(vertices, faces, f)
+        x, y, z, ux, uy, uz, wx, wy, wz, nx, ny, nz, size = _basis(now.vertices, faces, f)
         # What is left of the position beside the mesh point, in the face's basis.
         dx = position[i, 0] - (x + b * ux + c * wx)
         dy = position[i, 1] - (y + b * uy + c * wy)
         dz = position[i, 2] - (z + b * uz + c * wz)
-        x, y, z, pux, puy, puz, pwx, pwy, pwz, pnx, pny, pnz, _ = _basis(before, faces, f)
+        x, y, z, pux, puy, puz, pwx, pwy, pwz, pnx, pny, pnz, _ = _basis(then.vertices, faces, f)
         off = nx * dx + ny * dy + nz * dz
         if size > 0.0:
             # Along the edges: dual basis w x n / size and n x u / size.
@@ -207,12 +199,13 @@ def _previous(faces, vertices, places, before, places_before, face, place, baryc
 
 
 @njit(parallel=True)
-def _displace(start, x0, p, pixel, weight, flags, face, depth, position, previous, out):  # type: ignore[no-untyped-def]
+def _displace(points, p, face, previous, out):  # type: ignore[no-untyped-def]
     """Mean displacement of the samples on the surface nearest to the camera, the same that make up Position.
 
     Samples that are tied to no face follow the others.
     """
-    width = np.int64(p[WIDTH])
+    start, pixel, weight, flags, depth = points.start, points.pixel, points.weight, points.flags, points.depth
+    position = points.position
     flat = p[ORTHOGRAPHIC] != 0.0
     slope = SAME_SURFACE / min(p[FX], p[FY])
     per_depth, fixed = np.float32(0.0 if flat else slope), np.float32(slope if flat else 0.0)
@@ -235,7 +228,7 @@ def _displace(start, x0, p, pixel, weight, flags, face, depth, position, previou
                     dy += w * (previous[i, 1] - position[i, 1])
                     dz += w * (previous[i, 2] - position[i, 2])
             if total > np.float32(0.0):
-                x = pixel[first] % width - x0
+                x = pixel[first] % points.width - points.x0
                 out[y, x, 0], out[y, x, 1], out[y, x, 2] = dx / total, dy / total, dz / total
             first = last
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,6 +16,52 @@ Array = np.ndarray
 
 #: Least cosine between a shading normal and the direction to the viewer.
 LEAST_FACING = 0.02
+
+
+class PointRows(NamedTuple):
+    """The points of a strip as kernels go through them: row by row, pixel by pixel, sample by sample.
+
+    Attributes
+    ----------
+    start : (rows + 1,) int64 array
+        First point of each row; at last their number.
+    x0, y0, width : int
+        Full-picture pixel of the strip's first one, and the picture's width.
+    pixel, sample, weight, flags : array
+        As of `ShadingPoints`.
+    depth, position : array
+        As of `GBuffer`.
+    """
+
+    start: Array
+    x0: int
+    y0: int
+    width: int
+    pixel: Array
+    sample: Array
+    weight: Array
+    flags: Array
+    depth: Array
+    position: Array
+
+
+class PointSurfaces(NamedTuple):
+    """What the points of a strip show.
+
+    Attributes
+    ----------
+    normal, albedo, roughness, metallic : array
+        As of `ShadingPoints`.
+    emission, object_index : array
+        As of `GBuffer`.
+    """
+
+    normal: Array
+    albedo: Array
+    roughness: Array
+    metallic: Array
+    emission: Array
+    object_index: Array
 
 
 @dataclass(slots=True)
@@ -53,6 +100,19 @@ class GBuffer:
     place: Array
     barycentric: Array
     alpha: Array
+
+    def point_rows(self, x0: int, width: int) -> PointRows:
+        """Its points, row by row, where the window begins at column `x0` of a picture of `width` columns."""
+        points, (y0, y1) = self.points, self.rows
+        start = np.searchsorted(points.pixel, np.arange(y0, y1 + 1, dtype=np.int64) * width)
+        keys = points.pixel, points.sample, points.weight, points.flags
+        return PointRows(start, x0, y0, width, *keys, self.depth, self.position)
+
+    def surfaces(self) -> PointSurfaces:
+        """What its points show."""
+        points = self.points
+        materials = points.albedo, points.roughness, points.metallic
+        return PointSurfaces(points.normal, *materials, self.emission, self.object_index)
 
     def mark_catchers(self, object_flags: Array) -> None:
         """Flag the points of shadow catchers."""

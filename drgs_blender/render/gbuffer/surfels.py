@@ -24,13 +24,14 @@ mesh, whichever is larger. The seen position and depth stay those of the surfels
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ...compute.jit import get_num_threads, njit, prange
 from ...core.frame import Camera
 from ..camera import WIDTH, sample_ray
+from ..columns import ALBEDO, METALLIC, NORMAL, ROUGHNESS, SIZE
 from ..points import SECOND
 from ..sampling import F
 from ..scene.interaction import nearest
@@ -38,7 +39,7 @@ from ..scene.ray import Ray
 from ..scene.ray_masks import SURFELS
 from ..scene.trace_scene import TraceScene
 from ..surfels.raster import SurfelSamples, rasterise
-from ..surfels.splats import SIZE, Splats
+from ..surfels.splats import Splats
 from .camera_hits import MeshHits, shade_mesh, trace_camera
 from .gbuffer import GBuffer, compact, face_viewer
 from .layers import combine
@@ -74,10 +75,7 @@ def primary_surfels(
     y0: int,
     y1: int,
     tied: bool = True,
-    rasterise: Callable[[Splats, int, int], SurfelSamples] = rasterise,
-    tie: Callable[..., None] | None = None,
-    trace: Callable[..., MeshHits] = trace_camera,
-    shade: Callable[..., None] = shade_mesh,
+    stages: Stages | None = None,
 ) -> GBuffer:
     """Blend the surfels of the rows ``y0 .. y1`` (full-picture pixels) and tie them to the mesh.
 
@@ -92,19 +90,16 @@ def primary_surfels(
     y0, y1 : int
     tied : bool
         False: rays meet surfels, and nothing is tied.
-    rasterise : callable
-        Blends the surfels.
-    tie : callable, optional
-        Ties their points to the mesh; None: on this processor.
-    trace, shade : callable
-        As of `mesh`, for ordinary meshes next to the surfels.
+    stages : Stages, optional
+        Who does the work; None: this processor.
     """
-    samples = rasterise(splats, y0, y1)
-    layers = combine(samples, scene, splats.parameters, camera.window[0], y0, trace)
+    stages = stages or Stages()
+    samples = stages.rasterise(splats, y0, y1)
+    layers = combine(samples, scene, splats.parameters, camera.window[0], y0, stages.trace)
     buffer = compact(layers.first, splats.parameters, camera.window[0], y0, layers.second)
     buffer.alpha = layers.opaque
     points = buffer.points
-    (tie or tie_to_mesh)(
+    stages.tie(
         scene,
         (tied, scene.vertex_faces > 0),
         (splats.parameters, windows, camera.window[0], y0),
@@ -119,7 +114,7 @@ def primary_surfels(
         points.own = np.where(points.flags & SECOND, -1, buffer.object_index).astype(np.int32)
         points.size = samples.surface[row - y0, column - camera.window[0], points.sample, SIZE]
     if layers.hits is not None:
-        shade(scene, layers.hits, splats.parameters, camera.window[0], buffer, SECOND)
+        stages.shade(scene, layers.hits, splats.parameters, camera.window[0], buffer, SECOND)
     buffer.mark_catchers(scene.object_flags)
     return buffer
 
@@ -158,13 +153,14 @@ def _shoot(tracer, x, y, z, dx, dy, dz, reach):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def _find(  # type: ignore[no-untyped-def]
-    tracer, x, y, z, nx, ny, nz, vx, vy, vz, ahead, window
-):
-    """Mesh point of the surfel point (x, y, z) with normal n, seen from v.
+def _find(tracer, point, normal, view, ahead, window):  # type: ignore[no-untyped-def]
+    """Mesh point of a surfel's `point` and `normal`, seen from the direction `view`.
 
     How it was found, point, face normal, and the face with u and v (-1: none).
     """
+    x, y, z = point
+    nx, ny, nz = normal
+    vx, vy, vz = view
     how = NOWHERE
     face, a, b = np.int32(-1), np.float32(0.0), np.float32(0.0)
     hx, hy, hz, gx, gy, gz = x, y, z, nx, ny, nz
@@ -229,13 +225,13 @@ def attach_points(lane, lanes, room, tracer, rules, view_of, samples, keys, out)
             slope = np.sqrt(dx * dx + dy * dy + dz * dz)
             vx, vy, vz = -dx / slope, -dy / slope, -dz / slope
             nx, ny, nz = (
-                np.float64(surface[row, column, k, 0]),
-                np.float64(surface[row, column, k, 1]),
-                np.float64(surface[row, column, k, 2]),
+                np.float64(surface[row, column, k, NORMAL]),
+                np.float64(surface[row, column, k, NORMAL + 1]),
+                np.float64(surface[row, column, k, NORMAL + 2]),
             )
             if nx * nx + ny * ny + nz * nz < 0.5:
                 nx, ny, nz = vx, vy, vz
-            window = np.float64(WINDOW_SCALES) * surface[row, column, k, 8]
+            window = np.float64(WINDOW_SCALES) * surface[row, column, k, SIZE]
             if who < len(windows):
                 window = max(window, np.float64(windows[who]))
             # The window starts in front of the surfel, yet not behind the camera.
@@ -245,7 +241,7 @@ def attach_points(lane, lanes, room, tracer, rules, view_of, samples, keys, out)
             face, u, v = np.int32(-1), np.float32(0.0), np.float32(0.0)
             if any_mesh:
                 how, hx, hy, hz, gx, gy, gz, face, u, v = _find(
-                    tracer, x, y, z, nx, ny, nz, vx, vy, vz, ahead, window
+                    tracer, (x, y, z), (nx, ny, nz), (vx, vy, vz), ahead, window
                 )  # fmt: skip
             if not tied:  # the face says how the point moves, nothing else
                 how, hx, hy, hz, gx, gy, gz = NOWHERE, x, y, z, nx, ny, nz
@@ -269,11 +265,11 @@ def attach_points(lane, lanes, room, tracer, rules, view_of, samples, keys, out)
             geometric[n, 0], geometric[n, 1], geometric[n, 2] = gx, gy, gz
             view[n, 0], view[n, 1], view[n, 2] = vx, vy, vz
             albedo[n, 0], albedo[n, 1], albedo[n, 2] = (
-                surface[row, column, k, 3],
-                surface[row, column, k, 4],
-                surface[row, column, k, 5],
+                surface[row, column, k, ALBEDO],
+                surface[row, column, k, ALBEDO + 1],
+                surface[row, column, k, ALBEDO + 2],
             )
-            roughness[n], metallic[n] = surface[row, column, k, 6], surface[row, column, k, 7]
+            roughness[n], metallic[n] = surface[row, column, k, ROUGHNESS], surface[row, column, k, METALLIC]
             position[n, 0], position[n, 1], position[n, 2] = x, y, z
             depth[n], owner[n] = s, who
             tied_face[n], tied_place[n], barycentric[n, 0], barycentric[n, 1] = face, -1, u, v
@@ -298,3 +294,22 @@ def tie_to_mesh(scene: TraceScene, *arguments: Any) -> None:
         depth, object, face, place and barycentric coordinates.
     """
     _attach(scene.tracer, *arguments, 8 * get_num_threads())
+
+
+class Stages(NamedTuple):
+    """Who does the work of `primary_surfels`.
+
+    Attributes
+    ----------
+    rasterise : callable
+        Blends the surfels.
+    tie : callable
+        Ties their points to the mesh.
+    trace, shade : callable
+        As of `mesh.primary_mesh`, for ordinary meshes next to the surfels.
+    """
+
+    rasterise: Callable[[Splats, int, int], SurfelSamples] = rasterise
+    tie: Callable[..., None] = tie_to_mesh
+    trace: Callable[..., MeshHits] = trace_camera
+    shade: Callable[..., None] = shade_mesh

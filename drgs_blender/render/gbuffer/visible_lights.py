@@ -40,29 +40,22 @@ def visible_lights(lights: Lights, parameters: Array, x0: int, buffer: GBuffer) 
     (rows, width, 3) float32 array
         Linear Rec.709, of the buffer's rows.
     """
-    points = buffer.points
-    y0, y1 = buffer.rows
-    width = int(parameters[WIDTH])
-    start = np.searchsorted(points.pixel, np.arange(y0, y1 + 1, dtype=np.int64) * width)
     out = np.zeros((*buffer.alpha.shape[:2], 3), np.float32)
-    _look(
-        parameters, x0, y0, start, buffer.alpha, points.pixel, points.sample, points.weight, points.flags, buffer.depth,
-        lights.tables, out,
-    )  # fmt: skip
+    _look(parameters, buffer.point_rows(x0, int(parameters[WIDTH])), buffer.alpha, lights.tables, out)
     return out
 
 
 @njit(parallel=True)
-def _look(p, x0, y0, start, alpha, pixel, sample, weight, flags, depth, lights, out):  # type: ignore[no-untyped-def]
-    width, near = np.int64(p[WIDTH]), p[CLIP_START]
+def _look(p, points, alpha, lights, out):  # type: ignore[no-untyped-def]
+    pixel, weight, depth, near = points.pixel, points.weight, points.depth, p[CLIP_START]
     rows, columns, subpixels = alpha.shape
     for y in prange(rows):
-        n = start[y]
+        n = points.start[y]
         for x in range(columns):
-            place = (y0 + y) * width + x0 + x
+            place = (points.y0 + y) * points.width + points.x0 + x
             for k in range(subpixels):
                 first = n
-                while n < start[y + 1] and pixel[n] == place and sample[n] == k:
+                while n < points.start[y + 1] and pixel[n] == place and points.sample[n] == k:
                     n += 1
                 ox, oy, oz, dx, dy, dz = sample_ray(p, place, k)
                 length = np.sqrt(dx * dx + dy * dy + dz * dz)
@@ -78,7 +71,7 @@ def _look(p, x0, y0, start, alpha, pixel, sample, weight, flags, depth, lights, 
                 free = (ONE - alpha[y, x, k]) / F(subpixels)
                 red, green, blue = free * r, free * g, free * b
                 for i in range(first, n):
-                    if flags[i] & CATCHER:
+                    if points.flags[i] & CATCHER:
                         continue
                     reach = F((depth[i] - near) * length)
                     r, g, b = lights_along(origin, direction, reach, ONE, ZERO, CAMERA, lights)

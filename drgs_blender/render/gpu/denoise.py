@@ -315,7 +315,7 @@ def denoise(
 ) -> tuple[Array, Signal]:
     """`svgf_temporal.denoise_next` on a device; without a history and a motion, `svgf_spatial.denoise`."""
     with launcher.failures("copying the picture"):
-        surface = tuple(launcher.array(array) for array in shot.guides.arrays)
+        surface = tuple(launcher.array(array) for array in shot.guides)
         signal = _prepare(launcher, shot, surface, split)
     check()
     if history is not None and shot.motion is not None and history.light.shape == signal.light.shape:

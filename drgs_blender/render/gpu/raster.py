@@ -8,42 +8,65 @@ gathers those behind the last.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ...compute.warp.kernels import Launcher, Room, Work
 from ..camera import CLIP_END, CLIP_START, FX, FY, ORTHOGRAPHIC, SUBPIXELS, WIDTH, lattice, pixel_shift
+from ..columns import ALBEDO, METALLIC, NORMAL, OPACITY, ROUGHNESS, SAMPLE, SIZE
 from ..sampling import ONE, ZERO, F
 from ..surfels.blending import GAP, MIN_TRANSMITTANCE
 from ..surfels.raster import MAX_ALPHA, SurfelSamples, gaussian
-from ..surfels.splats import (
-    ALBEDO,
-    CUT,
-    DIM,
-    LOW,
-    METALLIC,
-    NORMAL,
-    OPACITY,
-    ROUGHNESS,
-    RX,
-    RY,
-    SIZE,
-    TILE,
-    ZC,
-    A,
-    B,
-    D,
-    N,
-    Splats,
-)
+from ..surfels.splats import CUT, DIM, LOW, RX, RY, TILE, ZC, A, B, D, N, Splats
 
 #: Contributions that a lane gathers at once.
 MOST = 64
 #: Sums over a cluster of contributions: weight, and times that depth, normal, albedo, roughness, metallic and size; the
 #: weight of its heaviest one. Row 0 is the cluster at hand, row 1 the heaviest so far.
 _WEIGHT, _DEPTH, _NORMAL, _COLOUR, _ROUGHNESS, _METALLIC, _SIZE, _HEAVIEST, _SUMS = 0, 1, 2, 5, 8, 9, 10, 11, 12
+
+
+class Rows(NamedTuple):
+    """Rows that are blended, in full-picture pixels.
+
+    Attributes
+    ----------
+    x0, x1, top : int
+        The window's columns, and its first row.
+    y0, y1 : int
+        The rows, half-open.
+    subpixels : int
+        Samples of a pixel.
+    """
+
+    x0: int
+    x1: int
+    top: int
+    y0: int
+    y1: int
+    subpixels: int
+
+
+class Place(NamedTuple):
+    """Where a sample is.
+
+    Attributes
+    ----------
+    x, y : int
+        Its pixel.
+    px, py : float
+        Its position, pixels.
+    near, far : float
+        Clip range, metres.
+    """
+
+    x: int
+    y: int
+    px: np.float32
+    py: np.float32
+    near: np.float32
+    far: np.float32
 
 
 def meet(screen: Any, i: Any, opacity: Any, near: Any, far: Any, x: Any, y: Any) -> Any:
@@ -102,20 +125,24 @@ def add(sums: Any, owner: Any, surface: Any, i: Any, z: Any, w: Any) -> None:
         sums[0, _HEAVIEST], owner[0] = w, np.int32(i)
 
 
-def gather(
-    lists_z: Any, lists_a: Any, lists_i: Any, screen: Any, surface: Any, box: Any, nearest: Any, tile_list: Any,
-    first: Any, last: Any, x: Any, y: Any, px: Any, py: Any, near: Any, far: Any, t: Any, after: Any, after_splat: Any,
-) -> Any:  # fmt: skip
-    """List the nearest contributions beyond a depth (and splat); how many there are, those left out included."""
+def gather(lists: Any, splats: Any, first: Any, last: Any, place: Place, passed: Any) -> Any:
+    """List the nearest contributions of the entries first .. last of the tiles' list to a sample.
+
+    `passed` is the light that is left, the depth and the splat behind which to look; how many there are, those left out
+    included.
+    """
+    lists_z, lists_a, lists_i = lists
+    screen, surface, box, nearest, _, _, tile_list = splats
+    t, after, after_splat = passed
     stop = F(MIN_TRANSMITTANCE)
     n, left, farthest = 0, t, F(-1e30)
     for entry in range(first, last):
         i = np.int64(tile_list[entry])
-        if x < box[i, 0] or x >= box[i, 2] or y < box[i, 1] or y >= box[i, 3]:
+        if place.x < box[i, 0] or place.x >= box[i, 2] or place.y < box[i, 1] or place.y >= box[i, 3]:
             continue
         if left < stop and nearest[i] >= farthest:
             continue
-        alpha, z = meet(screen, i, surface[i, OPACITY], near, far, px, py)
+        alpha, z = meet(screen, i, surface[i, OPACITY], place.near, place.far, place.px, place.py)
         if not alpha > ZERO or (left < stop and not z < farthest):
             continue
         if z < after or (z == after and i <= after_splat):
@@ -128,39 +155,37 @@ def gather(
     return n
 
 
-def blend_samples(
-    lane: Any, lanes: Any, room: Any, screen: Any, surface: Any, box: Any, nearest: Any, objects: Any,
-    tile_start: Any, tile_list: Any, p: Any, x0: Any, x1: Any, tile_y0: Any, y0: Any, y1: Any, subpixels: Any, out: Any,
-) -> None:  # fmt: skip
-    """Blend the samples of the rows y0 .. y1, as `raster._blend` does."""
+def blend_samples(lane: Any, lanes: Any, room: Any, splats: Any, p: Any, rows: Rows, out: Any) -> None:
+    """Blend samples as `raster._blend` does; `splats` are the arrays of `Splats`."""
     lists_z, lists_a, lists_i, sums, owner = room
+    lists = lists_z, lists_a, lists_i
+    _, surface, _, _, objects, tile_start, _ = splats
+    x0, y0, subpixels = rows.x0, rows.y0, rows.subpixels
     out_alpha, out_depth, out_surface, out_object = out
     tile_x0 = x0 // TILE
-    tiles_x = (x1 - 1) // TILE - tile_x0 + 1
-    columns = x1 - x0
+    tiles_x = (rows.x1 - 1) // TILE - tile_x0 + 1
+    columns = rows.x1 - x0
     width = np.int64(p[WIDTH])
     near, far = F(p[CLIP_START]), F(p[CLIP_END])
     slope = F(1.0 / min(p[FX], p[FY]))
     pixel = ZERO if p[ORTHOGRAPHIC] != 0.0 else slope
     pixel_base = slope if p[ORTHOGRAPHIC] != 0.0 else ZERO
     stop = F(MIN_TRANSMITTANCE)
-    for sample in range(lane, (y1 - y0) * columns * subpixels, lanes):
+    for sample in range(lane, (rows.y1 - y0) * columns * subpixels, lanes):
         number = sample % subpixels
         column, row = sample // subpixels % columns, sample // (subpixels * columns)
         x, y = x0 + column, y0 + row
-        tile = (y // TILE - tile_y0) * tiles_x + x // TILE - tile_x0
+        tile = (y // TILE - rows.top // TILE) * tiles_x + x // TILE - tile_x0
         shift_x, shift_y = pixel_shift(p, y * width + x)
         jx, jy = lattice(shift_x, shift_y, number, p)
         for c in range(_SUMS):
             sums[0, c], sums[1, c] = ZERO, ZERO
         t, before, before_size = ONE, ZERO, F(1e30)
         after, after_splat = F(-1e30), np.int64(-1)
+        place = Place(x, y, F(x + jx), F(y + jy), near, far)
         more: Any = True
         while more:
-            n = gather(
-                lists_z, lists_a, lists_i, screen, surface, box, nearest, tile_list, tile_start[tile],
-                tile_start[tile + 1], x, y, F(x + jx), F(y + jy), near, far, t, after, after_splat,
-            )  # fmt: skip
+            n = gather(lists, splats, tile_start[tile], tile_start[tile + 1], place, (t, after, after_splat))
             k = 0
             while k < min(n, MOST) and t >= stop:
                 z, alpha, i = lists_z[k], lists_a[k], np.int64(lists_i[k])
@@ -183,9 +208,9 @@ def blend_samples(
         f = ONE / length if length > F(1e-6) * total else ZERO
         out_alpha[row, column, number], out_depth[row, column, number] = ONE - t, sums[1, _DEPTH] * g
         for c in range(3):
-            out_surface[row, column, number, c] = f * sums[1, _NORMAL + c]
-        for c in range(6):
-            out_surface[row, column, number, 3 + c] = sums[1, _COLOUR + c] * g
+            out_surface[row, column, number, NORMAL + c] = f * sums[1, _NORMAL + c]
+        for c in range(SAMPLE - ALBEDO):
+            out_surface[row, column, number, ALBEDO + c] = sums[1, _COLOUR + c] * g
         out_object[row, column, number] = objects[owner[1]]
 
 
@@ -199,7 +224,6 @@ _ROOMS = (
 BLEND = Work(blend_samples, _ROOMS, {})
 
 
-@dataclass(slots=True)
 class DeviceSamples(SurfelSamples):
     """`SurfelSamples` that have come back from a device.
 
@@ -214,15 +238,14 @@ class DeviceSamples(SurfelSamples):
 
 def rasterise(launcher: Launcher, splats: Splats, y0: int, y1: int) -> DeviceSamples:
     """`surfels.raster.rasterise` on a device; where ``alpha`` is 0 the other arrays are undefined."""
-    x0, top, x1, _ = splats.window
-    subpixels = int(splats.parameters[SUBPIXELS])
-    shape = y1 - y0, x1 - x0, subpixels
+    rows = Rows(splats.x0, splats.x1, splats.y0, y0, y1, int(splats.parameters[SUBPIXELS]))
+    shape = y1 - y0, rows.x1 - rows.x0, rows.subpixels
     with launcher.failures("blending surfels"):
-        alpha, depth, surface = (launcher.zeros(size) for size in (shape, shape, (*shape, 9)))
+        alpha, depth, surface = (launcher.zeros(size) for size in (shape, shape, (*shape, SAMPLE)))
         owner = launcher.zeros(shape, "int32")
-    arrays = splats.screen, splats.surface, splats.box, splats.nearest, splats.object_index
-    arguments = *arrays, splats.tile_start, splats.tile_list, splats.parameters, x0, x1, top // TILE, y0, y1, subpixels
+    arguments = splats.arrays, splats.parameters, rows
     launcher.launch(BLEND, int(np.prod(shape)), arguments, (alpha, depth, surface, owner))
     with launcher.failures("blending surfels"):
-        on_device = depth, surface, owner
-        return DeviceSamples(alpha.numpy(), depth.numpy(), surface.numpy(), owner.numpy(), on_device)
+        samples = DeviceSamples(alpha.numpy(), depth.numpy(), surface.numpy(), owner.numpy())
+    samples.on_device = depth, surface, owner
+    return samples

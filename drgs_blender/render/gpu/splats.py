@@ -7,7 +7,6 @@ stand.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,13 +17,12 @@ from ...compute.warp.runtime import warp
 from ...compute.warp.search import first_of
 from ...core.asset.model import PosedSurfels
 from ...core.frame import Camera
+from ..columns import SPLAT
 from ..surfels.splats import (
-    PLACED,
     RECORD,
-    SHOWN,
-    SURFACE,
     TILE,
     ZC,
+    Posed,
     Splats,
     depth_key,
     pack_surface,
@@ -40,7 +38,6 @@ _CULLED = 0xFFFFFFFF
 _MOST = (1 << 30) - 1
 
 
-@dataclass(slots=True)
 class DeviceSplats(Splats):
     """`Splats` whose arrays are a device's, but for ``parameters``.
 
@@ -53,12 +50,11 @@ class DeviceSplats(Splats):
     on_cpu: Callable[[], Splats]
 
 
-def project_surfels(lane: Any, lanes: Any, room: Any, placed: Any, p: Any, window: Any, out: Any) -> None:
+def project_surfels(lane: Any, lanes: Any, room: Any, posed: Any, p: Any, window: Any, out: Any) -> None:
     """`splats._project`, and the depths of the centres."""
-    centre, tangent_u, tangent_v, opacity = placed
     screen, box, nearest, depth = out
-    for i in range(lane, len(centre), lanes):
-        project_surfel(i, centre, tangent_u, tangent_v, opacity, p, window, screen, box, nearest)
+    for i in range(lane, len(box), lanes):
+        project_surfel(i, posed, p, window, screen, box, nearest)
         depth[i] = screen[i, ZC]
 
 
@@ -77,7 +73,7 @@ def find_starts(lane: Any, lanes: Any, room: Any, keys: Any, count: Any, first: 
         start[t] = first_of(keys, count, first + t)
 
 
-def gather_splats(lane: Any, lanes: Any, room: Any, order: Any, found: Any, shown: Any, owner: Any, out: Any) -> None:
+def gather_splats(lane: Any, lanes: Any, room: Any, order: Any, found: Any, posed: Any, owner: Any, out: Any) -> None:
     """Records of surfels in order of depth, and the number of tiles of each."""
     screen, box, nearest = found
     out_screen, out_surface, out_box, out_nearest, out_owner, tiles = out
@@ -88,7 +84,7 @@ def gather_splats(lane: Any, lanes: Any, room: Any, order: Any, found: Any, show
         for c in range(4):
             out_box[k, c] = box[i, c]
         out_nearest[k], out_owner[k] = nearest[i], owner[i]
-        pack_surface(i, k, shown, out_surface)
+        pack_surface(i, k, posed, out_surface)
         x0, y0, x1, y1 = tiles_of(box, i)
         tiles[k] = (x1 - x0) * (y1 - y0)
 
@@ -133,8 +129,8 @@ def prepare(
         given = arrays_of(posed, launcher)
         found = zeros((n, RECORD)), zeros((n, 4), "int32"), zeros((n,))
         depth, keys, order = zeros((n,)), zeros((2 * n,), "uint32"), zeros((2 * n,), "int32")
-    placed, shown = (tuple(given[name] for name in names) for names in (PLACED, SHOWN))
-    launcher.launch(PROJECT, n, (placed, parameters, tuple(map(int, camera.window))), (*found, depth))
+    arrays = tuple(given[name] for name in Posed._fields)
+    launcher.launch(PROJECT, n, (arrays, parameters, tuple(map(int, camera.window))), (*found, depth))
     launcher.launch(KEY, n, (depth.view(warp().uint32), found[1]), (keys, order))
     m = np.zeros(1, np.int64)
     with launcher.failures("sorting surfels"):
@@ -144,11 +140,13 @@ def prepare(
     if not seen:
         return on_cpu()
     with launcher.failures("sorting surfels"):
-        made = zeros((seen, RECORD)), zeros((seen, SURFACE)), zeros((seen, 4), "int32"), zeros((seen,))
+        made = zeros((seen, RECORD)), zeros((seen, SPLAT)), zeros((seen, 4), "int32"), zeros((seen,))
         owner, tiles = zeros((seen,), "int32"), zeros((seen,), "int64")
-    launcher.launch(GATHER, seen, (order, found, shown, given["object_index"]), (*made, owner, tiles))
+    launcher.launch(GATHER, seen, (order, found, arrays, given["object_index"]), (*made, owner, tiles))
     lists = _listed(launcher, made[2], tiles, camera.window)
-    return DeviceSplats(*made, owner, *lists, camera.window, parameters, on_cpu)
+    splats = DeviceSplats(*made, owner, *lists, *camera.window, parameters)
+    splats.on_cpu = on_cpu
+    return splats
 
 
 def _listed(launcher: Launcher, box: Any, tiles: Any, window: tuple[int, int, int, int]) -> tuple[Any, Any]:

@@ -83,7 +83,7 @@ class WarpRenderBackend(RenderBackend):
             own = splats.on_cpu() if isinstance(splats, DeviceSplats) else splats
             return rasterise_on_cpu(own, y0, y1)
 
-        if not len(splats):
+        if not splats.number:
             return on_cpu()
 
         def on_device() -> SurfelSamples:

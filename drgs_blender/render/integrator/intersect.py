@@ -23,6 +23,7 @@ from ..scene import ray_masks
 from ..scene.interaction import Tracer, nearest, shadowed, surface_at
 from ..scene.ray import Hit, Ray
 from ..surfels.raster import GAP
+from ..surfels.surfel_query import Start
 from ..surfels.surfel_tracer import trace_surfels, transmittance
 from . import wavefront as w
 
@@ -112,10 +113,8 @@ def passed(tracer, rays, slot, far, mask):  # type: ignore[no-untyped-def]
         return ONE
     s, ints = rays
     i, c = w.at(slot)
-    return transmittance(
-        tracer, *ray.origin, *ray.direction, ZERO, far, mask, np.int32(ints[c + w.OWN]),
-        s[i + w.GX], s[i + w.GY], s[i + w.GZ], s[i + w.SIZE],
-    )  # fmt: skip
+    start = Start(np.int32(ints[c + w.OWN]), s[i + w.GX], s[i + w.GY], s[i + w.GZ], s[i + w.SIZE])
+    return transmittance(tracer, ray.origin, ray.direction, ZERO, far, mask, start)
 
 
 @njit
@@ -140,10 +139,11 @@ def meet(tracer, rays, slot, mask):  # type: ignore[no-untyped-def]
     s, ints = rays
     i, c = w.at(slot)
     key = ints[c + w.KEY]
+    start = Start(np.int32(ints[c + w.OWN]), s[i + w.GX], s[i + w.GY], s[i + w.GZ], s[i + w.SIZE])
+    number = unit(mix(U(key + U(0x632BE59B))))
     through, depth, nx, ny, nz, px, py, pz, r, g, b, roughness, metallic, size, owner, reach = trace_surfels(
-        tracer, *ray.origin, *ray.direction, ZERO, t, mask, np.int32(ints[c + w.OWN]),
-        s[i + w.GX], s[i + w.GY], s[i + w.GZ], s[i + w.SIZE], _GAP, unit(mix(U(key + U(0x632BE59B)))),
-    )  # fmt: skip
+        tracer, ray.origin, ray.direction, ZERO, t, mask, start, _GAP, number
+    )
     if face >= 0:
         if owner < 0 or unit(mix(U(key + U(0x85157AF5)))) < through:
             return ZERO, reach, MixedHit(t, face, place, u, v, gx, gy, gz, *blank)

@@ -16,13 +16,11 @@ from ...core.asset.model import as_float
 from ...core.errors import UsageError
 from ...core.frame import MeshState, Visibility
 from ...geometry.normals import VertexNormals
+from ..columns import ALBEDO, METALLIC, NORMAL, ROUGHNESS
 from .instances import Places, flattens, normal_matrices
 from .ray_masks import group_mask
 
 Array = np.ndarray
-
-#: Columns of ``TraceScene.shading``.
-NORMAL, ALBEDO, ROUGHNESS, METALLIC, SHADING_WIDTH = slice(0, 3), slice(3, 6), 6, 7, 8
 
 #: Coordinates beyond this (metres) are as unusable as NaN: their products overflow.
 FARTHEST = 1e15
@@ -204,9 +202,9 @@ def take_object(part: Part, item: TraceObject, vertices: Array, shading: Array) 
         moved, died = part.take_vertices(given, None, own, item.torn)
     if before is None or moved or died or before.corner_normals is not item.corner_normals:
         if item.corner_normals is None:
-            part.smooth_normals(own, rows[:, NORMAL])
+            part.smooth_normals(own, rows[:, NORMAL : NORMAL + 3])
         else:
-            part.given_normals(item.corner_normals, own, rows[:, NORMAL])
+            part.given_normals(item.corner_normals, own, rows[:, NORMAL : NORMAL + 3])
     names = ("albedo", "roughness", "metallic")
     if before is None or any(getattr(before, name) is not getattr(item, name) for name in names):
         n = len(own)
@@ -369,11 +367,11 @@ def _materials(first, last, vertex, albedo, roughness, metallic, rows):  # type:
     for i in range(first, last):
         v = vertex[i]
         for k in range(3):
-            rows[i, 3 + k] = min(np.float32(1.0), max(np.float32(0.0), albedo[v, k]))
-            if not rows[i, 3 + k] >= 0.0:
-                rows[i, 3 + k] = 0.0
-        rows[i, 6] = min(np.float32(1.0), max(np.float32(0.0), roughness[v]))
-        rows[i, 7] = min(np.float32(1.0), max(np.float32(0.0), metallic[v]))
-        for k in (6, 7):
+            rows[i, ALBEDO + k] = min(np.float32(1.0), max(np.float32(0.0), albedo[v, k]))
+            if not rows[i, ALBEDO + k] >= 0.0:
+                rows[i, ALBEDO + k] = 0.0
+        rows[i, ROUGHNESS] = min(np.float32(1.0), max(np.float32(0.0), roughness[v]))
+        rows[i, METALLIC] = min(np.float32(1.0), max(np.float32(0.0), metallic[v]))
+        for k in (ROUGHNESS, METALLIC):
             if not rows[i, k] >= 0.0:
                 rows[i, k] = 0.0

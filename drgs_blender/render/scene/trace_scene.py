@@ -13,6 +13,7 @@ from itertools import groupby
 import numpy as np
 
 from ...core.frame import Image, MeshState, Pose
+from ..columns import VERTEX
 from ..memory import Place, address
 from ..sampling import F
 from .instances import Places, normal_matrices, other_matrices, usable_places
@@ -24,7 +25,6 @@ from .trace_mesh import (
     METALLIC,
     NORMAL,
     ROUGHNESS,
-    SHADING_WIDTH,
     Part,
     TraceObject,
     mask_of,
@@ -103,7 +103,7 @@ class TraceScene:
         self.bvh = TriangleBVH()
         self.layout = self.version = object()
         self.shading_faces: Array = np.empty((0, 3), np.int32)
-        self.shading: Array = np.empty((0, SHADING_WIDTH), np.float32)
+        self.shading: Array = np.empty((0, VERTEX), np.float32)
         self.normals: Array = np.empty((0, 3), np.float32)
         self.face_object: Array = np.empty(0, np.int32)
         self.vertex_faces = 0
@@ -310,7 +310,7 @@ class TraceScene:
             self.vertex_faces += m if surfels else 0
         self._vertex_count, self.layout = vertex, object()
         self.shading_faces, self.face_object = np.concatenate(faces), np.concatenate(owners)
-        self.shading = np.zeros((rows[True], SHADING_WIDTH), np.float32)
+        self.shading = np.zeros((rows[True], VERTEX), np.float32)
         self.normals = np.zeros((rows[False], 3), np.float32)
         self.mesh_materials.clear(face - self.vertex_faces)
         # A part in places is a group of its own; others of one mask share one.

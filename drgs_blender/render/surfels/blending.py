@@ -1,14 +1,16 @@
 """The contributions of one sample: sorted by depth, weighed front to back, averaged.
 
-A sample's contributions are `n` entries from `base` on of three flat arrays: depth, strength, and number of the splat.
+A sample's contributions are `n` entries from `base` on of the lists of its block.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from ...compute.jit import njit
-from .splats import ALBEDO, METALLIC, NORMAL, ROUGHNESS, SIZE
+from ..columns import ALBEDO, METALLIC, NORMAL, ROUGHNESS, SIZE
 
 #: Samples that vector code works on at a time; a tile's side and the room for contributions are multiples of it.
 LANES = 16
@@ -17,6 +19,47 @@ MANY = 128
 #: Depth jump that separates two surfaces, in units of the mean of the two surfels' sizes.
 GAP = 3.0
 MIN_TRANSMITTANCE = 1e-4
+
+Array = np.ndarray
+
+
+class Contributions(NamedTuple):
+    """What splats contribute to the samples of a block, `LANES` lists one after the other.
+
+    Attributes
+    ----------
+    room : int
+        Places in each list.
+    depth : (LANES * room,) float32 array
+        Metres along the view axis.
+    strength : (LANES * room,) float32 array
+        Opacity times kernel.
+    splat : (LANES * room,) int32 array
+        Its number.
+    """
+
+    room: int
+    depth: Array
+    strength: Array
+    splat: Array
+
+
+class Scratch(NamedTuple):
+    """What resolving the list of one sample needs.
+
+    Attributes
+    ----------
+    rank : (LANES,) int32 array
+    order : (room,) int32 array
+        Of the contributions, front to back.
+    weights : (room,) float32 array
+        Of the contributions in that order.
+    """
+
+    rank: Array
+    order: Array
+    weights: Array
+
 
 _1, _2, _3, _4, _5, _6, _7 = (np.uintp(k) for k in range(1, 8))
 
@@ -62,12 +105,19 @@ def rank_sort(z, base, n, rank, order):  # type: ignore[no-untyped-def]
 
 
 @njit
-def prune(z, alpha, splat, base, n, rank, order):  # type: ignore[no-untyped-def]
-    """Sort the contributions of a sample, drop those behind the point where it is opaque; how many remain."""
+def sort(lists, base, n, scratch):  # type: ignore[no-untyped-def]
+    """Put the contributions of a sample in order."""
     if n > MANY:
-        merge_sort(z, base, n, order)
+        merge_sort(lists.depth, base, n, scratch.order)
     else:
-        rank_sort(z, base, n, rank, order)
+        rank_sort(lists.depth, base, n, scratch.rank, scratch.order)
+
+
+@njit
+def prune(lists, base, n, scratch):  # type: ignore[no-untyped-def]
+    """Sort the contributions of a sample, drop those behind the point where it is opaque; how many remain."""
+    sort(lists, base, n, scratch)
+    z, alpha, splat, order = lists.depth, lists.strength, lists.splat, scratch.order
     old_z, old_alpha, old_splat = (
         z[base : base + n].copy(),
         alpha[base : base + n].copy(),
@@ -85,22 +135,39 @@ def prune(z, alpha, splat, base, n, rank, order):  # type: ignore[no-untyped-def
 
 
 @njit
-def widen(values, room):  # type: ignore[no-untyped-def]
+def contributions(room):  # type: ignore[no-untyped-def]
+    """Empty lists."""
+    size = LANES * room
+    return Contributions(room, np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.int32))
+
+
+@njit
+def scratch_for(room):  # type: ignore[no-untyped-def]
+    """Scratch memory for lists with so much room."""
+    return Scratch(np.empty(LANES, np.int32), np.empty(room, np.int32), np.empty(room, np.float32))
+
+
+@njit
+def widen(lists):  # type: ignore[no-untyped-def]
     """The same lists with twice the room."""
-    lists = len(values) // room
-    wider = np.empty(2 * len(values), values.dtype)
-    for at in range(lists):
-        wider[2 * room * at : 2 * room * at + room] = values[room * at : room * at + room]
+    room, wider = lists.room, contributions(2 * lists.room)
+    for lane in range(LANES):
+        old, new = room * lane, 2 * room * lane
+        wider.depth[new : new + room] = lists.depth[old : old + room]
+        wider.strength[new : new + room] = lists.strength[old : old + room]
+        wider.splat[new : new + room] = lists.splat[old : old + room]
     return wider
 
 
 @njit
-def weigh(surface, lists_z, lists_a, lists_i, base, n, order, weights, pixel_base, pixel):  # type: ignore[no-untyped-def]
+def weigh(surface, lists, base, n, scratch, pixel_base, pixel):  # type: ignore[no-untyped-def]
     """Weights of the sorted contributions of a sample.
 
     Returns its transmittance, and the weight, depth times weight, heaviest splat, first and last contribution of the
     heaviest cluster. ``pixel_base + pixel z`` is the width of a pixel at depth z, metres.
     """
+    order, weights = scratch.order, scratch.weights
+    depths, strengths, splats = lists.depth, lists.strength, lists.splat
     zero, one, stop = np.float32(0.0), np.float32(1.0), np.float32(MIN_TRANSMITTANCE)
     t, last, last_size = one, zero, np.float32(1e30)
     weight, depth, heaviest, owner, begin = zero, zero, zero, np.int32(0), 0
@@ -108,7 +175,7 @@ def weigh(surface, lists_z, lists_a, lists_i, base, n, order, weights, pixel_bas
     k = 0
     while (k < n) & (t >= stop):
         at = np.uintp(base + order[np.uintp(k)])
-        z, alpha, i = lists_z[at], lists_a[at], np.uintp(lists_i[at])
+        z, alpha, i = depths[at], strengths[at], np.uintp(splats[at])
         share = t * alpha
         t = t * (one - alpha)
         size = max(surface[i, SIZE], pixel_base + pixel * z)
@@ -129,12 +196,13 @@ def weigh(surface, lists_z, lists_a, lists_i, base, n, order, weights, pixel_bas
 
 
 @njit
-def mean(surface, lists_i, base, order, weights, total, begin, end):  # type: ignore[no-untyped-def]
+def mean(surface, lists, base, scratch, total, begin, end):  # type: ignore[no-untyped-def]
     """Unit normal and mean attributes of the contributions begin .. end, whose weights sum to `total`."""
+    order, weights, splats = scratch.order, scratch.weights, lists.splat
     zero, one = np.float32(0.0), np.float32(1.0)
     nx = ny = nz = red = green = blue = roughness = metallic = size = zero
     for k in range(begin, end):
-        i, w = np.uintp(lists_i[np.uintp(base + order[np.uintp(k)])]), weights[np.uintp(k)]
+        i, w = np.uintp(splats[np.uintp(base + order[np.uintp(k)])]), weights[np.uintp(k)]
         # Both sides of a thin sheet may lie in one cluster: normals agree with the nearest one.
         signed = -w if nx * surface[i, NORMAL] + ny * surface[i, NORMAL + 1] + nz * surface[i, NORMAL + 2] < zero else w
         nx += signed * surface[i, NORMAL]

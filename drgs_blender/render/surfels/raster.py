@@ -22,22 +22,21 @@ Numba's sense: in a loop that would count references of every array at every tur
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from ...compute.jit import get_num_threads, njit, prange
 from ..camera import CLIP_END, CLIP_START, FX, FY, ORTHOGRAPHIC, SUBPIXELS, WIDTH, lattice, pixel_shift
-from .blending import GAP, LANES, MANY, MIN_TRANSMITTANCE, mean, merge_sort, prune, rank_sort, weigh, widen
+from ..columns import OPACITY, SAMPLE, SPLAT
+from .blending import GAP, LANES, MIN_TRANSMITTANCE, contributions, mean, prune, scratch_for, sort, weigh, widen
 from .splats import (
     CUT,
     DIM,
     LOW,
-    OPACITY,
     RECORD,
     RX,
     RY,
-    SURFACE,
     TILE,
     ZC,
     A,
@@ -63,8 +62,7 @@ _CHECK = 32
 MAX_ALPHA = 0.99
 
 
-@dataclass(slots=True)
-class SurfelSamples:
+class SurfelSamples(NamedTuple):
     """Dense samples of some rows; where ``alpha`` is 0 the other arrays are undefined.
 
     Attributes
@@ -73,9 +71,9 @@ class SurfelSamples:
         Coverage, 1 - transmittance.
     depth : (rows, width, subpixels) float32 array
         Metres along the view axis.
-    surface : (rows, width, subpixels, 9) float32 array
-        World normal (unit, on the surfels' own side, which may face away from the viewer; 0 where they cancel), albedo,
-        roughness, metallic, and the mean standard deviation in metres.
+    surface : (rows, width, subpixels, SAMPLE) float32 array
+        See `columns`. World normals are unit vectors on the surfels' own side, which may face away from the viewer,
+        or 0 where they cancel; the size is the mean standard deviation.
     object_index : (rows, width, subpixels) int32 array
     """
 
@@ -85,39 +83,79 @@ class SurfelSamples:
     object_index: Array
 
 
+class View(NamedTuple):
+    """What blending knows of the camera.
+
+    Attributes
+    ----------
+    parameters : array
+        `camera.camera_parameters`.
+    width, subpixels : int
+        Of the full picture; of a pixel.
+    near, far : float
+        Clip range, metres.
+    pixel_base, pixel : float
+        A pixel at depth z is ``pixel_base + pixel * z`` metres wide.
+    """
+
+    parameters: Array
+    width: int
+    subpixels: int
+    near: np.float32
+    far: np.float32
+    pixel_base: np.float32
+    pixel: np.float32
+
+
+class Tile(NamedTuple):
+    """A tile in full-picture pixels.
+
+    Attributes
+    ----------
+    x, y : int
+        Its first pixel.
+    left, top, right, bottom : int
+        What of it is rendered, half-open.
+    """
+
+    x: int
+    y: int
+    left: int
+    top: int
+    right: int
+    bottom: int
+
+
+class TileSplats(NamedTuple):
+    """What blending reads of the splats of a tile, brought together.
+
+    Attributes
+    ----------
+    screen : (n, RECORD) float32 array
+        With strength and nearest depth in the columns that are free.
+    surface : (n, SPLAT) float32 array
+    span : (n, 4) int32 array
+        First sample of the tile's rows, first row, last sample + 1, last row + 1.
+    object_index : (n,) int32 array
+    """
+
+    screen: Array
+    surface: Array
+    span: Array
+    object_index: Array
+
+
 def rasterise(splats: Splats, y0: int, y1: int) -> SurfelSamples:
     """Blend the splats for the rows ``y0 .. y1`` (full-picture pixels, inside the window)."""
-    x0, top, x1, _ = splats.window
-    subpixels = int(splats.parameters[SUBPIXELS])
-    shape = (y1 - y0, x1 - x0, subpixels)
+    shape = (y1 - y0, splats.x1 - splats.x0, int(splats.parameters[SUBPIXELS]))
     samples = SurfelSamples(
         np.zeros(shape, np.float32),
         np.empty(shape, np.float32),
-        np.empty((*shape, 9), np.float32),
+        np.empty((*shape, SAMPLE), np.float32),
         np.empty(shape, np.int32),
     )
-    if len(splats):
-        _blend(
-            splats.screen,
-            splats.surface,
-            splats.box,
-            splats.nearest,
-            splats.object_index,
-            splats.tile_start,
-            splats.tile_list,
-            splats.parameters,
-            x0,
-            x1,
-            top // TILE,
-            y0,
-            y1,
-            subpixels,
-            4 * get_num_threads(),
-            samples.alpha,
-            samples.depth,
-            samples.surface,
-            samples.object_index,
-        )
+    if splats.number:
+        _blend(splats, y0, y1, 4 * get_num_threads(), samples)
     return samples
 
 
@@ -181,23 +219,27 @@ def _meet(screen, i, opacity, near, far, state, first, last):  # type: ignore[no
 
 
 @njit
-def _collect(  # type: ignore[no-untyped-def]
-    tile_list, begin, end, screen, surface, box, nearest, left, top, right, bottom, tile_left, tile_top, subpixels,
-    records, surfaces, spans,
-):  # fmt: skip
-    """Bring together what blending reads of a tile's splats; spans are samples of the tile's rows, and rows."""
+def _room_for(n):  # type: ignore[no-untyped-def]
+    """Room for n splats of a tile."""
+    screen, surface = np.empty((n, RECORD), np.float32), np.empty((n, SPLAT), np.float32)
+    return TileSplats(screen, surface, np.empty((n, 4), np.int32), np.empty(n, np.int32))
+
+
+@njit
+def _collect(splats, begin, end, tile, subpixels, own):  # type: ignore[no-untyped-def]
+    """Bring together what blending reads of a tile's splats, the entries begin .. end of the list, in `own`."""
+    screen, surface, span, box = own.screen, own.surface, own.span, splats.box
     for entry in range(begin, end):
-        i, e = np.uintp(tile_list[entry]), np.uintp(entry - begin)
+        i, e = np.uintp(splats.tile_list[entry]), np.uintp(entry - begin)
         for c in range(RECORD):
-            records[e, c] = screen[i, c]
-        for c in range(SURFACE):
-            surfaces[e, c] = surface[i, c]
-        records[e, _STRENGTH], records[e, _NEAREST] = surface[i, OPACITY], nearest[i]
-        spans[e, 0], spans[e, 2] = (
-            (max(box[i, 0], left) - tile_left) * subpixels,
-            (min(box[i, 2], right) - tile_left) * subpixels,
-        )
-        spans[e, 1], spans[e, 3] = max(box[i, 1], top) - tile_top, min(box[i, 3], bottom) - tile_top
+            screen[e, c] = splats.screen[i, c]
+        for c in range(SPLAT):
+            surface[e, c] = splats.surface[i, c]
+        screen[e, _STRENGTH], screen[e, _NEAREST] = splats.surface[i, OPACITY], splats.nearest[i]
+        span[e, 0] = (max(box[i, 0], tile.left) - tile.x) * subpixels
+        span[e, 2] = (min(box[i, 2], tile.right) - tile.x) * subpixels
+        span[e, 1], span[e, 3] = max(box[i, 1], tile.top) - tile.y, min(box[i, 3], tile.bottom) - tile.y
+        own.object_index[e] = splats.object_index[i]
 
 
 @njit
@@ -237,36 +279,38 @@ def _limit(state):  # type: ignore[no-untyped-def]
 
 
 @njit
-def _place(p, width, y, tile_left, left, right, first, subpixels, state):  # type: ignore[no-untyped-def]
+def _place(view, tile, y, first, state):  # type: ignore[no-untyped-def]
     """Start a block: positions of its samples, nothing gathered. Those outside the window count as opaque."""
     zero = np.float32(0.0)
     for lane in range(LANES):
         k = np.uintp(lane)
-        x = tile_left + (first + lane) // subpixels
+        x = tile.x + (first + lane) // view.subpixels
         state[_X + k] = state[_Y + k] = state[_LEFT + k] = zero
         state[_FARTHEST + k] = np.float32(-1e30)
-        if left <= x < right:
-            shift_x, shift_y = pixel_shift(p, y * width + x)
-            jx, jy = lattice(shift_x, shift_y, (first + lane) % subpixels, p)
+        if tile.left <= x < tile.right:
+            shift_x, shift_y = pixel_shift(view.parameters, y * view.width + x)
+            jx, jy = lattice(shift_x, shift_y, (first + lane) % view.subpixels, view.parameters)
             state[_X + k], state[_Y + k], state[_LEFT + k] = x + jx, y + jy, np.float32(1.0)
 
 
 @njit
-def _gather(records, spans, binned, begin, end, first, near, far, state, count, lists_z, lists_a, lists_i, room):  # type: ignore[no-untyped-def]
+def _gather(own, binned, begin, end, first, view, state, count, lists):  # type: ignore[no-untyped-def]
     """List the contributions of the splats begin .. end to a block's samples.
 
     Returns the splat to go on with: it is less than `end` when a sample's list is full.
     """
+    screen, span, room, near, far = own.screen, own.span, lists.room, view.near, view.far
+    depth, strength, splat = lists.depth, lists.strength, lists.splat
     limit = np.float32(1e30)
     for entry in range(begin, end):
         i = np.uintp(binned[np.uintp(entry)])
         if (entry - begin) % _CHECK == _CHECK - 1:
             limit = _limit(state)
-        if records[i, _NEAREST] >= limit:
+        if screen[i, _NEAREST] >= limit:
             continue
         hits = _meet(
-            records, i, records[i, _STRENGTH], near, far, state,
-            np.int32(spans[i, 0] - first), np.int32(spans[i, 2] - first),
+            screen, i, screen[i, _STRENGTH], near, far, state,
+            np.int32(span[i, 0] - first), np.int32(span[i, 2] - first),
         )  # fmt: skip
         if hits == 0:
             continue
@@ -275,7 +319,7 @@ def _gather(records, spans, binned, begin, end, first, near, far, state, count, 
             k = np.uintp(lane)
             n = count[k]
             to = k * np.uintp(room) + np.uintp(n)
-            lists_z[to], lists_a[to], lists_i[to] = state[_DEPTH + k], state[_ALPHA + k], i
+            depth[to], strength[to], splat[to] = state[_DEPTH + k], state[_ALPHA + k], i
             n += np.int32(state[_ALPHA + k] > np.float32(0.0))
             count[k] = n
             most = max(most, n)
@@ -285,128 +329,88 @@ def _gather(records, spans, binned, begin, end, first, near, far, state, count, 
 
 
 @njit
-def _finish(  # type: ignore[no-untyped-def]
-    surfaces, lists_z, lists_a, lists_i, room, count, rank, order, weights, pixel_base, pixel, subpixels, y, x, first,
-    owner, out_alpha, out_depth, out_surface,
-):  # fmt: skip
-    """Resolve the samples of a block and write them; ``owner`` gets each one's heaviest splat. x: of the tile."""
+def _finish(own, lists, count, scratch, view, y, x, first, samples):  # type: ignore[no-untyped-def]
+    """Resolve the samples of a block and write them; y, x: row, and first column of the tile, of the samples."""
     for lane in range(LANES):
         n = np.int64(count[lane])
         if n == 0:
             continue
-        base = lane * room
-        if n > MANY:
-            merge_sort(lists_z, base, n, order)
-        else:
-            rank_sort(lists_z, base, n, rank, order)
-        column, k = x + (first + lane) // subpixels, (first + lane) % subpixels
-        t, total, depth, owner[lane], begin, end = weigh(
-            surfaces, lists_z, lists_a, lists_i, base, n, order, weights, pixel_base, pixel
-        )
-        values = mean(surfaces, lists_i, base, order, weights, total, begin, end)
-        for c in range(9):
-            out_surface[y, column, k, c] = values[c]
-        out_alpha[y, column, k], out_depth[y, column, k] = np.float32(1.0) - t, depth * (np.float32(1.0) / total)
+        base = lane * lists.room
+        sort(lists, base, n, scratch)
+        column, k = x + (first + lane) // view.subpixels, (first + lane) % view.subpixels
+        t, total, depth, owner, begin, end = weigh(own.surface, lists, base, n, scratch, view.pixel_base, view.pixel)
+        values = mean(own.surface, lists, base, scratch, total, begin, end)
+        for c in range(SAMPLE):
+            samples.surface[y, column, k, c] = values[c]
+        samples.alpha[y, column, k] = np.float32(1.0) - t
+        samples.depth[y, column, k] = depth * (np.float32(1.0) / total)
+        samples.object_index[y, column, k] = own.object_index[owner]
+
+
+@njit
+def _view(p):  # type: ignore[no-untyped-def]
+    ortho = p[ORTHOGRAPHIC] != 0.0
+    pixel = np.float32(0.0 if ortho else 1.0 / min(p[FX], p[FY]))
+    pixel_base = np.float32(1.0 / min(p[FX], p[FY]) if ortho else 0.0)
+    near, far = np.float32(p[CLIP_START]), np.float32(p[CLIP_END])
+    return View(p, np.int64(p[WIDTH]), np.int64(p[SUBPIXELS]), near, far, pixel_base, pixel)
 
 
 @njit(parallel=True)
-def _blend(  # type: ignore[no-untyped-def]
-    screen,
-    surface,
-    box,
-    nearest,
-    objects,
-    tile_start,
-    tile_list,
-    p,
-    x0,
-    x1,
-    tile_y0,
-    y0,
-    y1,
-    subpixels,
-    workers,
-    out_alpha,
-    out_depth,
-    out_surface,
-    out_object,
-):
-    """Blend all tiles that meet the rows y0 .. y1. A worker takes every `workers`-th tile: neighbours cost alike."""
-    tile_x0 = x0 // TILE
+def _blend(splats, y0, y1, workers, samples):  # type: ignore[no-untyped-def]
+    for worker in prange(workers):
+        _blend_tiles(worker, workers, splats, y0, y1, samples)
+
+
+@njit
+def _blend_tiles(worker, workers, splats, y0, y1, samples):  # type: ignore[no-untyped-def]
+    """Blend tiles that meet the rows y0 .. y1: a worker takes every `workers`-th one, neighbours cost alike."""
+    x0, x1 = splats.x0, splats.x1
+    tile_x0, tile_y0 = x0 // TILE, splats.y0 // TILE
     tiles_x = (x1 - 1) // TILE - tile_x0 + 1
     first_row, last_row = y0 // TILE, (y1 - 1) // TILE
-    n_tiles = tiles_x * (last_row - first_row + 1)
-    width = np.int64(p[WIDTH])
-    near, far = np.float32(p[CLIP_START]), np.float32(p[CLIP_END])
-    ortho = p[ORTHOGRAPHIC] != 0.0
-    # A pixel at depth z is pixel_base + pixel * z metres wide.
-    pixel = np.float32(0.0 if ortho else 1.0 / min(p[FX], p[FY]))
-    pixel_base = np.float32(1.0 / min(p[FX], p[FY]) if ortho else 0.0)
-    blocks_row = TILE * subpixels // LANES
-    for worker in prange(workers):
-        state = np.empty(_BLOCK, np.float32)
-        count = np.empty(LANES, np.int32)
-        room = ROOM
-        lists_z, lists_a = np.empty(LANES * room, np.float32), np.empty(LANES * room, np.float32)
-        lists_i = np.empty(LANES * room, np.int32)
-        rank, order, weights = np.empty(LANES, np.int32), np.empty(room, np.int32), np.empty(room, np.float32)
-        start, binned = np.empty(TILE * blocks_row + 2, np.int64), np.empty(0, np.int32)
-        records, surfaces = np.empty((0, RECORD), np.float32), np.empty((0, SURFACE), np.float32)
-        spans, owner = np.empty((0, 4), np.int32), np.empty(LANES, np.int32)
-        for task in range(worker, n_tiles, workers):
-            tx, ty = tile_x0 + task % tiles_x, first_row + task // tiles_x
-            tile = (ty - tile_y0) * tiles_x + task % tiles_x
-            listed, n = tile_start[tile], tile_start[tile + 1] - tile_start[tile]
-            if n == 0:
+    view = _view(splats.parameters)
+    blocks_row = TILE * view.subpixels // LANES
+    state, count = np.empty(_BLOCK, np.float32), np.empty(LANES, np.int32)
+    lists, scratch = contributions(ROOM), scratch_for(ROOM)
+    start, binned = np.empty(TILE * blocks_row + 2, np.int64), np.empty(0, np.int32)
+    own = _room_for(0)
+    for task in range(worker, tiles_x * (last_row - first_row + 1), workers):
+        tx, ty = tile_x0 + task % tiles_x, first_row + task // tiles_x
+        number = (ty - tile_y0) * tiles_x + task % tiles_x
+        listed, n = splats.tile_start[number], splats.tile_start[number + 1] - splats.tile_start[number]
+        if n == 0:
+            continue
+        left, right = max(tx * TILE, x0), min(tx * TILE + TILE, x1)
+        tile = Tile(tx * TILE, ty * TILE, left, max(ty * TILE, y0), right, min(ty * TILE + TILE, y1))
+        if n > len(own.screen):
+            own = _room_for(2 * n)
+        _collect(splats, listed, listed + n, tile, view.subpixels, own)
+        _count(own.span, n, blocks_row, start)
+        if start[-1] > len(binned):
+            binned = np.empty(2 * start[-1], np.int32)
+        _bin(own.span, n, blocks_row, start, binned)
+        for block in range(TILE * blocks_row):
+            begin, end = start[block], start[block + 1]
+            if begin == end:
                 continue
-            left, top = max(tx * TILE, x0), max(ty * TILE, y0)
-            right, bottom = min(tx * TILE + TILE, x1), min(ty * TILE + TILE, y1)
-            if n > len(records):
-                records, surfaces = np.empty((2 * n, RECORD), np.float32), np.empty((2 * n, SURFACE), np.float32)
-                spans = np.empty((2 * n, 4), np.int32)
-            _collect(
-                tile_list, listed, listed + n, screen, surface, box, nearest, left, top, right, bottom,
-                tx * TILE, ty * TILE, subpixels, records, surfaces, spans,
-            )  # fmt: skip
-            _count(spans, n, blocks_row, start)
-            if start[-1] > len(binned):
-                binned = np.empty(2 * start[-1], np.int32)
-            _bin(spans, n, blocks_row, start, binned)
-            for block in range(TILE * blocks_row):
-                begin, end = start[block], start[block + 1]
+            y = tile.y + block // blocks_row
+            first = block % blocks_row * LANES  # of the samples of the tile's row
+            _place(view, tile, y, first, state)
+            count[:] = 0
+            while True:
+                begin = _gather(own, binned, begin, end, first, view, state, count, lists)
                 if begin == end:
-                    continue
-                y = ty * TILE + block // blocks_row
-                first = block % blocks_row * LANES  # of the samples of the tile's row
-                _place(p, width, y, tx * TILE, left, right, first, subpixels, state)
-                count[:] = 0
-                while True:
-                    begin = _gather(
-                        records, spans, binned, begin, end, first, near, far, state, count,
-                        lists_z, lists_a, lists_i, room,
-                    )  # fmt: skip
-                    if begin == end:
-                        break
-                    most = 0
-                    for lane in range(LANES):
-                        if count[lane] == room:
-                            kept = prune(lists_z, lists_a, lists_i, lane * room, room, rank, order)
-                            if kept < room:
-                                state[_FARTHEST + np.uintp(lane)] = lists_z[lane * room + kept - 1]
-                            count[lane] = kept
-                        most = max(most, count[lane])
-                    if most > room // 2:
-                        lists_z, lists_a = widen(lists_z, room), widen(lists_a, room)
-                        lists_i = widen(lists_i, room)
-                        room *= 2
-                        order, weights = np.empty(room, np.int32), np.empty(room, np.float32)
-                _finish(
-                    surfaces, lists_z, lists_a, lists_i, room, count, rank, order, weights, pixel_base, pixel,
-                    subpixels,
-                    y - y0, tx * TILE - x0, first, owner, out_alpha, out_depth, out_surface,
-                )  # fmt: skip
+                    break
+                most = 0
                 for lane in range(LANES):
-                    if count[lane] > 0:
-                        out_object[y - y0, tx * TILE - x0 + (first + lane) // subpixels, (first + lane) % subpixels] = (
-                            objects[tile_list[listed + owner[lane]]]
-                        )
+                    if count[lane] == lists.room:
+                        kept = prune(lists, lane * lists.room, lists.room, scratch)
+                        if kept < lists.room:
+                            state[_FARTHEST + np.uintp(lane)] = lists.depth[lane * lists.room + kept - 1]
+                        count[lane] = kept
+                    most = max(most, count[lane])
+                if most > lists.room // 2:
+                    lists = widen(lists)
+                    scratch = scratch_for(lists.room)
+            _finish(own, lists, count, scratch, view, y - y0, tile.x - x0, first, samples)

@@ -10,7 +10,7 @@ through two planes.)
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from ...compute.jit import njit, plain, prange
 from ...core.asset.model import PosedSurfels
 from ...core.frame import Camera
 from ..camera import CLIP_END, CLIP_START, CX, CY, FX, FY, LEAN, ORTHOGRAPHIC, POSITION, SUBPIXELS, filter_reach
+from ..columns import ALBEDO, METALLIC, NORMAL, OPACITY, ROUGHNESS, SIZE, SPLAT
 
 Array = np.ndarray
 
@@ -31,24 +32,42 @@ MIN_ALPHA = 1.0 / 255.0
 # LOW d^2 + DIM, weakened by the cosine at which the surfel is seen: the many surfels edge-on along a silhouette would
 # else widen it.
 RX, RY, A, B, N, D, ZC, CUT, LOW, DIM, RECORD = 0, 1, 2, 5, 8, 11, 14, 15, 16, 17, 20
-# Columns of a splat's surface record: normal, albedo, roughness, metallic, size, opacity.
-NORMAL, ALBEDO, ROUGHNESS, METALLIC, SIZE, OPACITY, SURFACE = 0, 3, 6, 7, 8, 9, 10
-
-#: Of `PosedSurfels`: what projection reads, and what `pack_surface` does.
-PLACED = ("centre", "tangent_u", "tangent_v", "opacity")
-SHOWN = ("tangent_u", "tangent_v", "normal", "albedo", "roughness", "metallic", "opacity")
 
 
-@dataclass(slots=True)
-class Splats:
+class Posed(NamedTuple):
+    """The arrays of `PosedSurfels` as kernels take them.
+
+    Attributes
+    ----------
+    centre, tangent_u, tangent_v, normal, opacity, albedo, roughness, metallic, object_index : array
+        See there.
+    """
+
+    centre: Array
+    tangent_u: Array
+    tangent_v: Array
+    normal: Array
+    opacity: Array
+    albedo: Array
+    roughness: Array
+    metallic: Array
+    object_index: Array
+
+    @classmethod
+    def of(cls, posed: PosedSurfels) -> Posed:
+        """Those of `posed`."""
+        return cls(*(plain(getattr(posed, name)) for name in cls._fields))
+
+
+class Splats(NamedTuple):
     """Surfels of one frame on the screen, sorted by the depth of their centres.
 
     Attributes
     ----------
     screen : (m, RECORD) float32 array
         Coefficients in pixels of the full picture.
-    surface : (m, SURFACE) float32 array
-        World-space normal, material, size (metres, larger standard deviation), opacity.
+    surface : (m, SPLAT) float32 array
+        See `columns`: world-space normal, material, size (metres, larger standard deviation), opacity.
     box : (m, 4) int32 array
         Pixels (x0, y0, x1, y1), half-open, inside the window; conservative.
     nearest : (m,) float32 array
@@ -56,8 +75,8 @@ class Splats:
     object_index : (m,) int32 array
     tile_start : array
         (tiles + 1,) int64 and tile_list (k,) int32: splats of each tile, in order.
-    window : tuple of int
-        (x0, y0, x1, y1), the camera's.
+    x0, y0, x1, y1 : int
+        The camera's window, full-picture pixels.
     parameters : array
         See `camera.camera_parameters`.
     """
@@ -69,10 +88,20 @@ class Splats:
     object_index: Array
     tile_start: Array
     tile_list: Array
-    window: tuple[int, int, int, int]
+    x0: int
+    y0: int
+    x1: int
+    y1: int
     parameters: Array
 
-    def __len__(self) -> int:
+    @property
+    def arrays(self) -> tuple[Array, ...]:
+        """All arrays but the parameters, as kernels of a device take them."""
+        return self[:7]
+
+    @property
+    def number(self) -> int:
+        """How many there are."""
         return len(self.screen)
 
 
@@ -93,16 +122,25 @@ def prepare(posed: PosedSurfels, camera: Camera, parameters: Array) -> Splats:
     screen = np.empty((n, RECORD), np.float32)
     box = np.empty((n, 4), np.int32)
     nearest = np.empty(n, np.float32)
-    _project(*(plain(getattr(posed, name)) for name in PLACED), parameters, camera.window, screen, box, nearest)
+    arrays = Posed.of(posed)
+    _project(arrays, parameters, camera.window, screen, box, nearest)
     order = depth_order(np.ascontiguousarray(screen[:, ZC]), box)
-    surface = np.empty((len(order), SURFACE), np.float32)
-    _gather_surface(order, tuple(plain(getattr(posed, name)) for name in SHOWN), surface)
+    surface = np.empty((len(order), SPLAT), np.float32)
+    _gather_surface(order, arrays, surface)
     box = box[order]
     tiles_x = (x1 - 1) // TILE - x0 // TILE + 1
     tiles_y = (y1 - 1) // TILE - y0 // TILE + 1
     start, listed = list_by_tile(box, x0 // TILE, y0 // TILE, tiles_x, tiles_y)
     return Splats(
-        screen[order], surface, box, nearest[order], posed.object_index[order], start, listed, camera.window, parameters
+        screen[order],
+        surface,
+        box,
+        nearest[order],
+        arrays.object_index[order],
+        start,
+        listed,
+        *camera.window,
+        parameters,
     )
 
 
@@ -152,14 +190,15 @@ def _clipped_bounds(c, a, b, r, near, p):  # type: ignore[no-untyped-def]
 
 
 @njit(parallel=True)
-def _project(centre, tangent_u, tangent_v, opacity, p, window, screen, box, nearest):  # type: ignore[no-untyped-def]
-    for i in prange(len(centre)):
-        project_surfel(i, centre, tangent_u, tangent_v, opacity, p, window, screen, box, nearest)
+def _project(posed, p, window, screen, box, nearest):  # type: ignore[no-untyped-def]
+    for i in prange(len(posed.centre)):
+        project_surfel(i, posed, p, window, screen, box, nearest)
 
 
 @njit
-def project_surfel(i, centre, tangent_u, tangent_v, opacity, p, window, screen, box, nearest):  # type: ignore[no-untyped-def]
+def project_surfel(i, posed, p, window, screen, box, nearest):  # type: ignore[no-untyped-def]
     """Fill screen record, box and nearest depth of surfel i; a culled surfel has an empty box (x1 = x0 = 0)."""
+    centre, tangent_u, tangent_v, _, opacity, _, _, _, _ = posed
     wx0, wy0, wx1, wy1 = window
     near, far, ortho = p[CLIP_START], p[CLIP_END], p[ORTHOGRAPHIC] != 0.0
     fx, fy = p[FX], p[FY]
@@ -302,8 +341,8 @@ def _gather_surface(order, posed, out):  # type: ignore[no-untyped-def]
 
 @njit
 def pack_surface(i, k, posed, out):  # type: ignore[no-untyped-def]
-    """Pack what blending reads of surfel i as splat k; `posed` are its `SHOWN`."""
-    tangent_u, tangent_v, normal, albedo, roughness, metallic, opacity = posed
+    """Pack what blending reads of surfel i as splat k."""
+    _, tangent_u, tangent_v, normal, opacity, albedo, roughness, metallic, _ = posed
     uu = vv = np.float32(0.0)
     for c in range(3):
         out[k, NORMAL + c] = normal[i, c]

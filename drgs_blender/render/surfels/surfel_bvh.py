@@ -10,15 +10,13 @@ import numpy as np
 from ...compute.jit import njit, plain
 from ...core.asset.model import PosedSurfels
 from ...core.errors import DeviceError, UsageError
+from ..columns import ALBEDO, METALLIC, NORMAL, PLANE, ROUGHNESS, SIZE, SURFEL
 from ..scene.embree import QUALITY_LOW, QUALITY_REFIT, SCENE_DYNAMIC, address, device, library
 from ..scene.triangle_bvh import aligned, box_of, looseness, neighbours
+from .splats import Posed
 from .surfel_query import CUT, MASK, MIN_ALPHA, OBJECT, OPACITY, RECORD, TANGENT_U, TANGENT_V, WIDTH, callbacks
 
 Array = np.ndarray
-
-# Columns of ``SurfelBVH.surface``: unit shading normal, albedo, roughness, metallic, larger standard deviation, unit
-# normal of the plane; world space, linear Rec.709, metres.
-NORMAL, ALBEDO, ROUGHNESS, METALLIC, SIZE, PLANE, SURFACE = 0, 3, 6, 7, 8, 9, 12
 
 _GEOMETRY_USER = 120
 _ROBUST = 4  # a scene's flag: no box is missed by rounding
@@ -27,10 +25,12 @@ _FARTHEST = 1e15  # coordinates beyond are as unusable as NaN
 
 
 @njit
-def _record(  # type: ignore[no-untyped-def]
-    centre, tangent_u, tangent_v, opacity, objects, masks, normal, albedo, roughness, metallic, words, boxes, surface
-):
-    """Fill records, boxes of the discs and what hits look like; returns how many surfels are not finite."""
+def _record(posed, masks, words, boxes, surface):  # type: ignore[no-untyped-def]
+    """Fill records, boxes of the discs and what hits look like; returns how many surfels are not finite.
+
+    `posed` is a `Posed`.
+    """
+    centre, tangent_u, tangent_v, normal, opacity, albedo, roughness, metallic, objects = posed
     singles = words.view(np.float32)
     bad = 0
     for i in range(len(centre)):
@@ -88,8 +88,8 @@ class SurfelBVH:
     ----------
     intersect_address, occluded_address, scene : int
         What `trace_surfels` and `transmittance` take in compiled code.
-    surface : (n, SURFACE) float32 array
-        What is blended of each surfel, see the columns above.
+    surface : (n, SURFEL) float32 array
+        What is blended of each surfel, see `columns`.
     objects : (n,) int32 array
         Index of each surfel's object.
     rebuilds : int
@@ -115,7 +115,7 @@ class SurfelBVH:
         self._device = device()
         self._geometry: int | None = None
         self.scene: int = 0
-        self.surface: Array = np.empty((0, SURFACE), np.float32)
+        self.surface: Array = np.empty((0, SURFEL), np.float32)
         self.objects: Array = np.empty(0, np.int32)
         self.rebuilds = self.bad = 0
         self._words: Array = np.empty((0, RECORD), np.int32)
@@ -152,15 +152,10 @@ class SurfelBVH:
         same = n == len(self._words)
         words = self._words if same else aligned(RECORD * n, np.int32).reshape(n, RECORD)
         boxes = np.empty((2 * n, 3), np.float32)
-        self.surface = np.empty((n, SURFACE), np.float32)
+        self.surface = np.empty((n, SURFEL), np.float32)
         self.objects = np.ascontiguousarray(posed.object_index, np.int32)
-        self.bad = int(
-            _record(
-                plain(posed.centre), plain(posed.tangent_u), plain(posed.tangent_v), plain(posed.opacity),
-                plain(self.objects), plain(np.asarray(masks, np.int32)), plain(posed.normal), plain(posed.albedo),
-                plain(posed.roughness), plain(posed.metallic), words, boxes, self.surface,
-            )
-        )  # fmt: skip
+        arrays = Posed.of(posed)._replace(object_index=plain(self.objects))
+        self.bad = int(_record(arrays, plain(np.asarray(masks, np.int32)), words, boxes, self.surface))
         self._words = words
         fresh = not same
         if same and len(self._runs):

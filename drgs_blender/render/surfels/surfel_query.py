@@ -18,7 +18,7 @@ from ...compute.jit import cfunc, njit  # first of all: it sets Numba up before 
 # isort: split
 import functools
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from llvmlite import ir
@@ -52,6 +52,27 @@ OWN, COUNT, LAST_INDEX, LAST_T, SCALE, START_NORMAL, PRODUCT = 4, 5, 6, 7, 8, 9,
 DEPTHS = 16
 ALPHAS, INDICES = DEPTHS + CAPACITY, DEPTHS + 2 * CAPACITY
 _WORDS = _CONTEXT + DEPTHS + 3 * CAPACITY
+
+
+class Start(NamedTuple):
+    """The surface that a ray starts on, so that it does not stop the ray.
+
+    Attributes
+    ----------
+    own : int
+        Its object, or -1; then the rest does not matter.
+    x, y, z : float
+        Its unit geometric normal, either side, world space.
+    size : float
+        Mean larger standard deviation of the surfels there, metres.
+    """
+
+    own: int
+    x: float
+    y: float
+    z: float
+    size: float
+
 
 _word, _single, _double, _long = ir.IntType(32), ir.FloatType(), ir.DoubleType(), ir.IntType(64)
 
@@ -111,8 +132,9 @@ def _call(typing, address, scene, ray, settings):  # type: ignore[no-untyped-def
 
 
 @njit
-def begin_query(query, ox, oy, oz, dx, dy, dz, mask, own, gx, gy, gz, scale):  # type: ignore[no-untyped-def]
+def begin_query(query, origin, direction, mask, start):  # type: ignore[no-untyped-def]
     """Fill all of a query but its range; returns the address of the part that callbacks write."""
+    (ox, oy, oz), (dx, dy, dz) = origin, direction
     context = query + 4 * _CONTEXT
     for index, value in ((0, ox), (1, oy), (2, oz), (4, dx), (5, dy), (6, dz), (7, np.float32(0.0))):
         store_single(query, index, value)
@@ -128,12 +150,12 @@ def begin_query(query, ox, oy, oz, dx, dy, dz, mask, own, gx, gy, gz, scale):  #
     store_long(settings, 1, context)
     for index in range(4):
         store_word(context, index, np.int32(-1))
-    store_word(context, OWN, np.int32(own))
+    store_word(context, OWN, np.int32(start.own))
     store_word(context, COUNT, np.int32(0))
     store_word(context, LAST_INDEX, np.int32(-1))
     store_single(context, LAST_T, np.float32(-np.inf))
-    store_single(context, SCALE, scale)
-    for index, value in ((START_NORMAL, gx), (START_NORMAL + 1, gy), (START_NORMAL + 2, gz)):
+    store_single(context, SCALE, start.size)
+    for index, value in ((START_NORMAL, start.x), (START_NORMAL + 1, start.y), (START_NORMAL + 2, start.z)):
         store_single(context, index, value)
     store_double(context + 4 * PRODUCT, 0, 1.0)
     return context

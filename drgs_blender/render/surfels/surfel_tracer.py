@@ -25,10 +25,11 @@ import numpy as np
 from ...compute.jit import get_num_threads, njit, prange
 from ...core.asset.model import as_float
 from ...core.errors import UsageError
+from ..columns import ALBEDO, METALLIC, NORMAL, PLANE, ROUGHNESS, SIZE, SURFEL
 from ..memory import address, load_float, load_int32
 from ..sampling import ONE, ZERO, F
 from .raster import GAP
-from .surfel_bvh import ALBEDO, METALLIC, NORMAL, PLANE, ROUGHNESS, SIZE, SURFACE, SurfelBVH
+from .surfel_bvh import SurfelBVH
 from .surfel_query import (
     ALPHAS,
     CAPACITY,
@@ -39,6 +40,7 @@ from .surfel_query import (
     LAST_T,
     MIN_TRANSMITTANCE,
     PRODUCT,
+    Start,
     begin_query,
     cast,
     load_double,
@@ -66,7 +68,7 @@ class SurfelTracer(NamedTuple):
     surfel_intersect, surfel_occluded, surfel_scene : int
         Addresses, see `SurfelBVH`.
     surface : int
-        Address of (n, SURFACE) float32, ``SurfelBVH.surface``.
+        Address of (n, SURFEL) float32, ``SurfelBVH.surface``.
     surfel_object : int
         Address of (n,) int32, ``SurfelBVH.objects``.
     """
@@ -85,35 +87,28 @@ def tracer_of(bvh: SurfelBVH) -> SurfelTracer:
 
 
 @njit
-def transmittance(  # type: ignore[no-untyped-def]
-    tracer, ox, oy, oz, dx, dy, dz, tnear, tfar, mask, own, gx, gy, gz, size
-):
+def transmittance(tracer, origin, direction, tnear, tfar, mask, start):  # type: ignore[no-untyped-def]
     """Share of light that passes the surfels between `tnear` and `tfar`, 0 where that is below MIN_TRANSMITTANCE.
 
     Parameters
     ----------
     tracer : SurfelTracer
         Or anything that has its fields.
-    ox, oy, oz, dx, dy, dz : float
-        Origin and unit direction, world space.
+    origin, direction : tuple of float
+        (x, y, z), world space; the direction is a unit vector.
     mask : int
         See ``SurfelBVH.update``; -1 meets all.
-    own : int
-        Object that the ray starts on, or -1; then the rest does not matter.
-    gx, gy, gz, size : float
-        Unit geometric normal (either side) and mean surfel size (metres) where the ray starts.
+    start : Start
     """
     query = query_memory()
-    context = begin_query(query, ox, oy, oz, dx, dy, dz, mask, own, gx, gy, gz, size)
+    context = begin_query(query, origin, direction, mask, start)
     cast(tracer.surfel_occluded, tracer.surfel_scene, query, tnear, tfar)
     product = load_double(context + 4 * PRODUCT, 0)
     return F(product) if product >= MIN_TRANSMITTANCE else ZERO
 
 
 @njit
-def trace_surfels(  # type: ignore[no-untyped-def]
-    tracer, ox, oy, oz, dx, dy, dz, tnear, tfar, mask, own, gx, gy, gz, size, gap, number
-):
+def trace_surfels(tracer, origin, direction, tnear, tfar, mask, start, gap, number):  # type: ignore[no-untyped-def]
     """Blend the surfels on a ray: ``(through, t, n (3), g (3), albedo (3), roughness, metallic, size, object, stop)``.
 
     Parameters as for `transmittance`; `gap` is the jump of depth that separates surfaces, in sizes; `number` a float32
@@ -125,7 +120,7 @@ def trace_surfels(  # type: ignore[no-untyped-def]
     where the transmittance falls to `number`, else `tfar`: as often as light passes to some depth, it lies beyond.
     """
     query = query_memory()
-    context = begin_query(query, ox, oy, oz, dx, dy, dz, mask, own, gx, gy, gz, size)
+    context = begin_query(query, origin, direction, mask, start)
     through, total, pick = 1.0, ZERO, number
     near, last, last_size, heaviest, stop = tnear, ZERO, ZERO, ZERO, F(tfar)
     index = owner = best_owner = np.int32(-1)
@@ -136,7 +131,7 @@ def trace_surfels(  # type: ignore[no-untyped-def]
         for k in range(count):
             index = load_word(context, INDICES + k)
             t, alpha = load_single(context, DEPTHS + k), load_single(context, ALPHAS + k)
-            row = tracer.surface + 4 * SURFACE * np.int64(index)
+            row = tracer.surface + 4 * SURFEL * np.int64(index)
             wide = load_float(row, SIZE)
             if sums[0] > ZERO and t - last > F(0.5) * gap * (wide + last_size):
                 better, pick, total = _prefer(sums[0], best[0], pick, total)
@@ -144,7 +139,7 @@ def trace_surfels(  # type: ignore[no-untyped-def]
                     best, best_owner = sums, owner
                 sums, heaviest = _NOTHING, ZERO
             weight = F(through) * alpha
-            sums = _add(sums, row, weight, t, dx, dy, dz)
+            sums = _add(sums, row, weight, t, direction)
             if weight > heaviest:
                 heaviest, owner = weight, load_int32(tracer.surfel_object, np.int64(index))
             last, last_size = t, wide
@@ -200,9 +195,10 @@ def _prefer(weight, best, pick, total):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def _add(sums, row, w, t, dx, dy, dz):  # type: ignore[no-untyped-def]
+def _add(sums, row, w, t, direction):  # type: ignore[no-untyped-def]
     """Add a contribution of weight w at depth t: sums of one, depth, normals towards the ray, material, size."""
     weight, depth, nx, ny, nz, px, py, pz, red, green, blue, roughness, metallic, wide = sums
+    dx, dy, dz = direction
     fx, fy, fz = load_float(row, PLANE), load_float(row, PLANE + 1), load_float(row, PLANE + 2)
     mx, my, mz = load_float(row, NORMAL), load_float(row, NORMAL + 1), load_float(row, NORMAL + 2)
     side = -w if fx * dx + fy * dy + fz * dz > ZERO else w
@@ -272,6 +268,31 @@ class Starts:
         self.normal = as_float(self.normal, (len(self.object_index), 3), "normals of starts")
         self.size = as_float(self.size, (len(self.object_index),), "sizes of starts")
 
+    @property
+    def arrays(self) -> tuple[Array, Array, Array]:
+        """All of them, as kernels take them."""
+        return self.object_index, self.normal, self.size
+
+
+class Rays(NamedTuple):
+    """Many rays, and what all of them have in common.
+
+    Attributes
+    ----------
+    origins, directions : (n, 3) float32 array
+        World space; unit directions.
+    tnear, tfar : float
+        Where they begin and end.
+    mask : int
+        See ``SurfelBVH.update``.
+    """
+
+    origins: Array
+    directions: Array
+    tnear: np.float32
+    tfar: np.float32
+    mask: np.int32
+
 
 def trace(
     bvh: SurfelBVH,
@@ -288,11 +309,8 @@ def trace(
     origins, directions, starts = _checked(origins, directions, starts)
     n = len(origins)
     numbers, index = np.empty((n, 14), np.float32), np.empty(n, np.int32)
-    _trace(
-        tracer_of(bvh), origins, directions, F(tnear), F(tfar),
-        np.int32(mask), (starts.object_index, starts.normal, starts.size), F(gap), 8 * get_num_threads(),
-        numbers, index,
-    )  # fmt: skip
+    rays = Rays(origins, directions, F(tnear), F(tfar), np.int32(mask))
+    _trace(tracer_of(bvh), rays, starts.arrays, F(gap), 8 * get_num_threads(), numbers, index)
     return SurfelHits(
         numbers[:, 0], numbers[:, 1], numbers[:, 2:5], numbers[:, 5:8], numbers[:, 8:11], numbers[:, 11],
         numbers[:, 12], numbers[:, 13], index,
@@ -312,10 +330,8 @@ def transmittance_many(
     """(n,) float32: the share of light that passes along many rays. See `transmittance`."""
     origins, directions, starts = _checked(origins, directions, starts)
     out = np.empty(len(origins), np.float32)
-    _shadow(
-        tracer_of(bvh), origins, directions, F(tnear), F(tfar), np.int32(mask),
-        (starts.object_index, starts.normal, starts.size), 8 * get_num_threads(), out,
-    )  # fmt: skip
+    rays = Rays(origins, directions, F(tnear), F(tfar), np.int32(mask))
+    _shadow(tracer_of(bvh), rays, starts.arrays, 8 * get_num_threads(), out)
     return out
 
 
@@ -329,16 +345,21 @@ def _checked(origins: Array, directions: Array, starts: Starts | None) -> tuple[
     return origins, as_float(directions, (n, 3), "ray directions"), starts
 
 
-@njit(parallel=True)
-def _trace(tracer, origins, directions, tnear, tfar, mask, starts, gap, lanes, numbers, index):  # type: ignore[no-untyped-def]
+@njit
+def _ray(rays, starts, i):  # type: ignore[no-untyped-def]
+    """Origin, direction and start of one of many rays."""
     own, normal, size = starts
+    o, d = rays.origins, rays.directions
+    start = Start(own[i], normal[i, 0], normal[i, 1], normal[i, 2], size[i])
+    return (o[i, 0], o[i, 1], o[i, 2]), (d[i, 0], d[i, 1], d[i, 2]), start
+
+
+@njit(parallel=True)
+def _trace(tracer, rays, starts, gap, lanes, numbers, index):  # type: ignore[no-untyped-def]
     for lane in prange(lanes):
-        for i in range(lane, len(origins), lanes):
-            hit = trace_surfels(
-                tracer, origins[i, 0], origins[i, 1], origins[i, 2],
-                directions[i, 0], directions[i, 1], directions[i, 2], tnear, tfar, mask,
-                own[i], normal[i, 0], normal[i, 1], normal[i, 2], size[i], gap, HEAVIEST,
-            )  # fmt: skip
+        for i in range(lane, len(rays.origins), lanes):
+            origin, direction, start = _ray(rays, starts, i)
+            hit = trace_surfels(tracer, origin, direction, rays.tnear, rays.tfar, rays.mask, start, gap, HEAVIEST)
             values = hit[:14]
             for k in range(14):
                 numbers[i, k] = values[k]
@@ -346,11 +367,8 @@ def _trace(tracer, origins, directions, tnear, tfar, mask, starts, gap, lanes, n
 
 
 @njit(parallel=True)
-def _shadow(tracer, origins, directions, tnear, tfar, mask, starts, lanes, out):  # type: ignore[no-untyped-def]
-    own, normal, size = starts
+def _shadow(tracer, rays, starts, lanes, out):  # type: ignore[no-untyped-def]
     for lane in prange(lanes):
-        for i in range(lane, len(origins), lanes):
-            out[i] = transmittance(
-                tracer, origins[i, 0], origins[i, 1], origins[i, 2], directions[i, 0], directions[i, 1],
-                directions[i, 2], tnear, tfar, mask, own[i], normal[i, 0], normal[i, 1], normal[i, 2], size[i],
-            )  # fmt: skip
+        for i in range(lane, len(rays.origins), lanes):
+            origin, direction, start = _ray(rays, starts, i)
+            out[i] = transmittance(tracer, origin, direction, rays.tnear, rays.tfar, rays.mask, start)
