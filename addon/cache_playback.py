@@ -81,7 +81,7 @@ class Playback:
                 if time.monotonic() > until:
                     break
         except UsageError:  # another bake began and removed the frame just now
-            log.debug("%s: the cache begins anew", self.path)
+            log.debug("%s: the cache starts over", self.path)
         except OSError as error:
             raise WriteError(
                 str(self.path),
@@ -114,7 +114,7 @@ class Playback:
         return np.ascontiguousarray(vertices, "<f4")
 
     def _count_of(self, header: Header, there: set[int]) -> int:
-        """Frames in the file that are those of the cache; 0 where its first or last is not, to begin anew."""
+        """Frames in the file that are those of the cache; 0 where its first or last is not, to start over."""
         if self._matrices is not None:
             return 0  # the cache does not tell whether these have changed
         try:
@@ -155,7 +155,7 @@ def check(obj: bpy.types.Object, warn: Callable[[str], None], *, final: bool) ->
             "Bring the folder along with the .blend, bake again, or use Delete Bake",
         )
     physics = obj.drgs.physics
-    # While a bake begins anew there is none for a moment; then nobody waits for a final picture.
+    # While a bake starts over there is none for a moment; then nobody waits for a final picture.
     if final and (physics.tear or physics.grain) and not (path.parent / HEADER).exists():
         warn(f'"{obj.name}": {path.parent / HEADER} does not exist; its tears and grains are not shown. Bake again')
 

@@ -30,7 +30,7 @@ def partner_of(scene: bpy.types.Scene) -> bpy.types.Scene | None:
 
 
 def set_up(scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer, others: str, compare: bool) -> bpy.types.Scene:
-    """Have `scene` composited with DR-GS; what an earlier call made is made anew, but its render settings are kept.
+    """Have `scene` composited with DR-GS; what an earlier call made is made again, but its render settings are kept.
 
     Parameters
     ----------

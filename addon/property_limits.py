@@ -33,7 +33,7 @@ class Limited:
         if kept is not value:
             told = f"{value:g}" if isinstance(value, float) else "unknown" if value == "" else str(value)
             self._warn(
-                f"{self._subject}: {prop.name} is {told}, which this DR-GS cannot take; {kept} is used. Set it anew"
+                f"{self._subject}: {prop.name} is {told}, which this DR-GS cannot take; {kept} is used. Set it again"
             )
         return kept
 

@@ -5,7 +5,7 @@ python bench/bench_asset.py --scenes scenes --objects spot fern --deformed
 python bench/bench_asset.py --scenes scenes --objects spot fern --sheet
 
 Scenes are those of `drgs evaluate --make-scenes scenes`. Rows are kept, so that objects may be measured one by one, and
-assets, of which --sheet draws some and --deformed scores anew how their surfels follow a pose. An object of 256 pixels
+assets, of which --sheet draws some and --deformed scores again how their surfels follow a pose. An object of 256 pixels
 takes its minutes and three more for what scores it.
 """
 
@@ -154,7 +154,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, nargs=2, default=(3000, 2500), help="of surfels, of materials and light")
     parser.add_argument("--variant", choices=("p", "m"), default="p", help="m: surfels on the mesh")
     parser.add_argument("--samples", type=int, default=128)
-    parser.add_argument("--deformed", action="store_true", help="score the assets that are there, deformed, anew")
+    parser.add_argument("--deformed", action="store_true", help="score the assets that are there, deformed, again")
     parser.add_argument("--sheet", action="store_true", help="draw the assets that are there")
     options = parser.parse_args()
     if options.sheet:

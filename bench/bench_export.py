@@ -2,7 +2,7 @@
 
     python bench/bench_export.py [--side 1000] [--repeats 12]
 
-An object of side^2 vertices, bent anew in every frame by a shape key, with three painted attributes that all differ
+An object of side^2 vertices, bent again in every frame by a shape key, with three painted attributes that all differ
 from the asset's. Only Blender's evaluation and the engine's own work are left out of the figures.
 """
 
@@ -81,7 +81,7 @@ def main() -> None:
         rows.append([text, *(float(v) for v in (np.median(final), final.max(), np.median(seen), seen.max()))])
     body = (
         f"Blender {found['blender']}, an object of {args.side**2:,} vertices and {2 * (args.side - 1) ** 2:,} "
-        "triangles, bent anew in every frame, with albedo, roughness and metallic painted. A final frame reads "
+        "triangles, bent again in every frame, with albedo, roughness and metallic painted. A final frame reads "
         f"everything again; a viewport remembers what did not change. {args.repeats} frames each.\n\n"
         + table(["milliseconds", "final frame, median", "worst", "viewport, median", "worst"], rows)
     )

@@ -80,7 +80,7 @@ def score(scene: Scene, mesh: Mesh, samples: int = 64, step: int = 2) -> tuple[f
 
     Parameters
     ----------
-    step : take every so-manyth test view of each light
+    step : take every n-th test view of each light
     """
     names = ("Albedo", "Roughness", "Metallic", "Coverage")
     white = np.ones((1, 1, 3), np.float32)

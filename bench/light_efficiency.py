@@ -153,7 +153,7 @@ def efficiency(options: argparse.Namespace) -> str:
         f"{BOUNCES} indirect bounce, surfels as primary surface, {AA} sub-pixel samples, SVGF unless said, one "
         f"picture a point; PSNR "
         f"over the subject against {options.reference_rays} rays (mean over seeds, same subpixels and tracer) without "
-        "denoiser. Seconds: whole frame, everything built anew. Without MIS, all samples at the visible point are of "
+        "denoiser. Seconds: whole frame, everything rebuilt. Without MIS, all samples at the visible point are of "
         "the cosine; further hits are as always.\n\n"
         f"![PSNR and time over samples](images/{FIGURE.name})\n\n"
     )

@@ -222,7 +222,7 @@ def subjects_text(options: argparse.Namespace) -> str:
         f"Each program against its own converged picture (ours {options.reference_rays} rays, {REFERENCE_AA} "
         f"sub-pixel samples; "
         f"theirs {options.reference_spp} spp), PSNR in sRGB over the subject (mask eroded by 2 px). Seconds from "
-        "arrays in memory to pixels: scene, environment map and acceleration structure are made anew each time, "
+        "arrays in memory to pixels: scene, environment map and acceleration structure are made again each time, "
         "program and kernels were loaded before. *Sampling alone*: less the setup, the time of a picture of "
         f"{TINY}x{TINY} pixels, which decides in pictures as small as these and counts little in large ones. "
         "log(time) is linear over dB."

@@ -5,7 +5,7 @@
 
 Writes the assets, the .blend, an EXR a frame, a contact sheet (PNG) and an animated picture (WebP). Steps that do not
 wait for each other run side by side; of a demo before, assets and scene are taken where nothing changed that they are
-made of. Frames are always rendered anew.
+made of. Frames are always rendered again.
 """
 
 from __future__ import annotations

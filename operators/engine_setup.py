@@ -35,7 +35,7 @@ class DRGS_OT_engine_setup(DrgsOperator, bpy.types.Operator):
 
     afresh: BoolProperty(
         name="Reinstall",
-        description="Take nothing of an earlier set-up: makes the environment and fetches the packages anew",
+        description="Take nothing of an earlier set-up: makes the environment and fetches the packages again",
         default=False,
         options={"SKIP_SAVE"},
     )

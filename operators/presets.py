@@ -35,7 +35,7 @@ class DRGS_OT_render_preset(DrgsOperator, bpy.types.Operator):
         try:
             bpy.utils.execfile(str(path))
         except Exception as error:  # whatever a program may raise; of another version, or edited
-            problem, remedy = f"cannot be used ({type(error).__name__}: {error})", "Remove it, or keep it anew"
+            problem, remedy = f"cannot be used ({type(error).__name__}: {error})", "Remove it, or keep it once more"
             raise UsageError(str(path), problem, remedy) from error
         return {"FINISHED"}
 

@@ -5,7 +5,7 @@
 
 `record` writes `drgs_blender/compute/kernels.json`: the kernels that each kind of job calls, found by doing the jobs.
 To be run after a kernel that Python calls has got other arguments; a test says so. Takes some minutes: everything is
-compiled anew, in an empty cache, by one process at a time, to measure how long each kernel takes.
+compiled again, in an empty cache, by one process at a time, to measure how long each kernel takes.
 
 `build` compiles all of the list for fixed targets into `drgs_blender/compute/kernels` (docs/kernels.md).
 """

@@ -85,7 +85,7 @@ def run_steps(
 
     Parameters
     ----------
-    log : file for what the commands write; begun anew
+    log : file for what the commands write; begun again
     folder : where they run
     environment : of the commands, besides this process's
     stream : where the line is written; standard output without

@@ -275,7 +275,7 @@ class Cached:
     ----------
     frames : how many, from the first on
     wanted : how many a bake makes
-    changed : settings are not those of the frames, so that a bake begins anew
+    changed : settings are not those of the frames, so that a bake starts over
     """
 
     frames: int

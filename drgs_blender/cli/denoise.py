@@ -109,7 +109,7 @@ def denoise(args: argparse.Namespace) -> int:
             else:
                 middle, pictures, repeated = source.denoise(number, args.passes)
                 if source.settings(number, args.passes) != settings:
-                    raise EngineError(str(path), "its noisy frames were written anew meanwhile", "Try again")
+                    raise EngineError(str(path), "its noisy frames were rewritten meanwhile", "Try again")
                 if repeated and not same_noise:
                     lines.note("neighbours have the same noise, which stays; switch on Animated Seed")
                 same_noise |= repeated

@@ -19,7 +19,7 @@ from .find_blender import Blender
 
 logger = logging.getLogger(__name__)
 
-#: Engines that are started anew for one frame before the job is given back to the farm.
+#: Engines that are started again for one frame before the job is given back to the farm.
 RESTARTS = 2
 
 
@@ -85,7 +85,7 @@ class Machine:
             yield from self._blender.more(frames) if warm else self._blender.frames()
             whole = True
         except AssetError:
-            self.check_assets()  # one that is just being written anew is not a damaged one
+            self.check_assets()  # one that is just being rewritten is not a damaged one
             raise
         finally:
             if not (whole and self._keep):
@@ -99,7 +99,7 @@ class Machine:
         return key
 
     def check_assets(self) -> None:
-        """Refuse what was rendered while an asset was written anew: nobody knows of which of its contents it is.
+        """Refuse what was rendered while an asset was rewritten: nobody knows of which of its contents it is.
 
         Raises
         ------
@@ -109,13 +109,13 @@ class Machine:
             self._check(path)
 
     def _check(self, path: Path) -> None:
-        anew = EngineError(str(path), "was written anew while frames were rendered", "Try again")
+        rewritten = EngineError(str(path), "was rewritten while frames were rendered", "Try again")
         try:
             digest = digest_asset(path)
         except AssetError as error:  # it was whole when it was loaded
-            raise anew from error
+            raise rewritten from error
         if digest != self._contents[path]:
-            raise anew
+            raise rewritten
 
     @property
     def engine_in_use(self) -> EngineClient:
@@ -130,7 +130,7 @@ class Machine:
 
 
 def _stamp(path: Path) -> tuple[int, int] | None:
-    """What changes when a file is written anew."""
+    """What changes when a file is rewritten."""
     with contextlib.suppress(OSError):  # Blender says what is wrong with it
         about = path.stat()
         return about.st_mtime_ns, about.st_size

@@ -144,7 +144,7 @@ def render(args: argparse.Namespace, machine: Machine) -> int:
                 try:
                     passes, settings = picture.render(engine, machine.assets, tell, args.timeout)
                 except AssetError:
-                    machine.check_assets()  # one that is just being written anew is not a damaged one
+                    machine.check_assets()  # one that is just being rewritten is not a damaged one
                     raise
                 note(shot.warnings + passes.warnings)
                 machine.check_assets()

@@ -47,7 +47,7 @@ class CacheFolder:
         if wanted is None:
             self.trouble = "compiled kernels cannot be kept, there is no home folder: name a folder in DRGS_CACHE_DIR"
         elif problem := _problem(wanted):
-            self.trouble = f"compiled kernels cannot be kept in {wanted} ({problem}): every start compiles them anew"
+            self.trouble = f"compiled kernels cannot be kept in {wanted} ({problem}): every start compiles them again"
         if self.trouble:
             log.warning("%s", self.trouble)
             self.path = _temporary()

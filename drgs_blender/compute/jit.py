@@ -102,7 +102,7 @@ class _Memory:
 def plain(array: np.ndarray) -> np.ndarray:
     """`array` as a kernel that only reads it takes it: contiguous, not marked as read only; the same memory if it can.
 
-    Numba compiles a kernel anew for each order of axes and for arrays that are marked, as those of files and messages
+    Numba compiles a kernel again for each order of axes and for arrays that are marked, as those of files and messages
     are.
     """
     array = np.ascontiguousarray(array)

@@ -2,7 +2,7 @@
 
 A file's name says everything on which the machine code depends: the function and its argument types, the import
 closure of its module (`closure`), the target processor, and the versions of Python, Numba and LLVM. Its content
-starts with its own digest: a damaged file is compiled anew. Numba's public hook, a cache locator, chooses only the
+starts with its own digest: a damaged file is compiled again. Numba's public hook, a cache locator, chooses only the
 folder; Numba then reads what it finds unchecked, and two processes that compile at once lose entries of its index.
 """
 

@@ -154,7 +154,7 @@ def _inner_libraries(code_generator: Any) -> Iterator[None]:
 
 
 def _compile(dispatcher: Any, sig: Any) -> Any:
-    """``Dispatcher.compile``: what was compiled for other kernels is compiled anew when Python calls it."""
+    """``Dispatcher.compile``: what was compiled for other kernels is compiled again when Python calls it."""
     arguments = tuple(sigutils.normalize_signature(sig)[0])
     known = dispatcher.overloads.get(arguments)
     if known is not None and not fits(known.library):

@@ -193,7 +193,7 @@ class ParticleCache:
         try:
             return _frame(path)
         except AssetError:
-            if path.exists():  # afterwards: another bake may begin anew, and remove it at any moment
+            if path.exists():  # afterwards: another bake may start over, and remove it at any moment
                 raise
         there = self.frames()
         held = f"There are frames {there[0]} to {there[-1]}" if there else "Bake first: the cache has no frame"

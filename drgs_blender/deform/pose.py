@@ -149,7 +149,7 @@ def pose(mesh: PosedMesh, by_corner: bool, linear: Array, side: float, rest: Res
 
 @njit
 def pose_surfels(lane, lanes, room, mesh, by_corner, linear, side, rest, out):  # type: ignore[no-untyped-def]
-    """Pose every so-manyth (`lanes`) block of surfels, from the `lane`-th on.
+    """Pose every `lanes`-th block of surfels, from the `lane`-th on.
 
     Arithmetic in double so that a small object far from the origin stays exact.
 

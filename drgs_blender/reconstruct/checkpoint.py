@@ -50,10 +50,10 @@ def load(path: Path, key: str) -> dict[str, Array] | None:
         arrays = decode(np.fromfile(path, np.uint8), str(path))
         found = bytes(arrays.pop("fingerprint")).decode()
     except (OSError, AssetError, KeyError, UnicodeDecodeError) as error:
-        log.warning("%s cannot be used (%s); starting anew", path, error)
+        log.warning("%s cannot be used (%s); starting over", path, error)
         return None
     if found != key:
-        log.warning("%s belongs to other photographs or settings, or another drgs; starting anew", path)
+        log.warning("%s belongs to other photographs or settings, or another drgs; starting over", path)
         return None
     return arrays
 

@@ -264,7 +264,7 @@ class _Work:
             if now - told > 1 or training.finished:
                 draw = now - shown > SHOW_EVERY or training.finished
                 picture = training.attempt(lambda: preview(training.gaussians, self.capture)) if draw else None
-                reached = max(reached, training.part)  # the second start of a trial begins anew
+                reached = max(reached, training.part)  # the second start of a trial starts over
                 self.tell(
                     Progress(phase, begin + (end - begin) * reached, len(training.gaussians), training.psnr, picture)
                 )

@@ -87,7 +87,7 @@ def coarse(frame: Frame, size: int, by_mesh: bool = False) -> Frame:
 
 
 def thinned(posed: PosedSurfels, pixels: int) -> PosedSurfels:
-    """Every so-manyth surfel, as much larger, where there are far more than a picture of so many `pixels` can show."""
+    """Keep every n-th surfel, enlarged, where there are far more surfels than a picture of `pixels` can show."""
     step = len(posed) // max(1, SURFELS_PER_PIXEL * pixels)
     if step < 2:
         return posed

@@ -98,7 +98,7 @@ def _check_own(cache: ParticleCache, job: Job) -> None:
 
 
 def _resume(job: Job, cache: ParticleCache, header: Header, overwrite: bool) -> int | None:
-    """The last frame of this simulation in the cache, with the solver put there; None to begin anew."""
+    """The last frame of this simulation in the cache, with the solver put there; None to start over."""
     found, first = cache.header(), job.settings.first
     if found is None:
         return None

@@ -367,4 +367,4 @@ def test_settings_of_another_version_become_sound_and_are_named(ball, scene, exp
         'Scene "Scene": Clamp Indirect', 'Scene "Scene": Blur Steps', 'View layer "ViewLayer": Other Objects',
         'Object "ball": Roughness Factor',
     }  # fmt: skip
-    assert all("is used. Set it anew" in w for w in warnings)
+    assert all("is used. Set it again" in w for w in warnings)

@@ -333,7 +333,7 @@ def test_it_is_baked_on_the_device_of_the_scene(body, scene):
 
 
 def test_the_played_file_is_never_of_two_bakes(tmp_path):
-    """It grows by what is new; another bake in the same folder begins it anew, a kill between two writes does not."""
+    """It grows by what is new; another bake in the same folder begins it again, a kill between two writes does not."""
     cache = particle_cache.ParticleCache(tmp_path)
     rng = np.random.default_rng(1)
 

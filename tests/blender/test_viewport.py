@@ -201,7 +201,7 @@ def test_a_new_colour_reads_no_geometry(crowd, monkeypatch):
 
 
 def test_what_does_not_show_makes_no_new_frame(crowd):
-    """Selecting or naming a camera must not start the picture anew."""
+    """Selecting or naming a camera must not start the picture again."""
     before = exported()
     crowd.twin.select_set(True)
     crowd.scene.camera.name = "Other"

@@ -105,7 +105,7 @@ def test_frames_of_an_asset_that_changes_meanwhile_are_not_kept(folder, tmp_path
         assert process.poll() is None
     write_asset(tmp_path / "tile.drgs", replace(asset, mesh=replace(asset.mesh, albedo=0.5 * asset.mesh.albedo)))
     _, error = process.communicate(timeout=60)
-    assert process.returncode == 75 and "tile.drgs" in error and "written anew" in error
+    assert process.returncode == 75 and "tile.drgs" in error and "rewritten" in error
     assert not list((tmp_path / "out").iterdir())
 
 
@@ -121,7 +121,7 @@ def test_asset_that_is_copied_over_in_place_gives_the_job_back(folder, tmp_path)
     os.truncate(tmp_path / "tile.drgs", 100)
     out, error = process.communicate(timeout=60)
     assert (process.returncode, out.splitlines()[-1]) == (75, "DRGS_EXIT class=retry"), error
-    assert "tile.drgs" in error and "written anew" in error
+    assert "tile.drgs" in error and "rewritten" in error
     assert not list((tmp_path / "out").iterdir())
 
 

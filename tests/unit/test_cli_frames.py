@@ -132,7 +132,7 @@ def test_asset_that_is_copied_over_in_place_gives_the_frame_back(tmp_path, size)
     machine.assets["key"], machine._contents[path] = path, digest_asset(path)
     machine.check_assets()
     os.truncate(path, size)
-    with pytest.raises(EngineError, match=r"a\.drgs: was written anew"):
+    with pytest.raises(EngineError, match=r"a\.drgs: was rewritten"):
         machine.check_assets()
 
 
@@ -157,7 +157,7 @@ def test_engine_that_refuses_what_is_being_copied_gives_the_frame_back(tmp_path)
     machine.assets["key"], machine._contents[path] = path, digest_asset(path)
     job = ["render", str(blend), "--frames=1", f"--out={tmp_path}/#.exr", "--blender", sys.executable]
     args = build_parser().parse_args(job, argparse.Namespace(quiet=True, progress=False))
-    with pytest.raises(EngineError, match=r"a\.drgs: was written anew"):
+    with pytest.raises(EngineError, match=r"a\.drgs: was rewritten"):
         render(args, machine)
     assert not list(tmp_path.glob("*.exr"))
 
@@ -184,5 +184,5 @@ def test_blender_that_refuses_what_is_being_copied_gives_the_frame_back(tmp_path
     machine.assets["key"], machine._contents[path] = path, digest_asset(path)
     monkeypatch.setattr(machine, "_close_blender", lambda: None)  # which forgets the assets of another scene
     job = {"scene": str(tmp_path / "a.blend"), "frames": [1]}
-    with pytest.raises(EngineError, match=r"a\.drgs: was written anew"):
+    with pytest.raises(EngineError, match=r"a\.drgs: was rewritten"):
         list(machine.frames(None, job, 1.0))

@@ -85,7 +85,7 @@ def test_a_change_outside_or_of_comments_keeps_the_cache(package, name, text):
 
 
 def test_what_code_does_not_depend_on_is_no_part_of_the_closure(package):
-    """As the version, so that an update compiles nothing anew whose sources are the same."""
+    """As the version, so that an update compiles nothing again whose sources are the same."""
     (package / "core").mkdir()
     (package / "core/version.py").write_text("from ..reader import B\n")
     (package / "constants.py").write_text("from .core.version import B\nA = 1\n")

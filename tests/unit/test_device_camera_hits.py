@@ -157,9 +157,9 @@ def test_points_whose_hits_are_lost_and_not_found_again_are_on_some_face(monkeyp
 
     def lost(*arguments: object) -> object:
         hits = device.trace(*arguments)  # type: ignore[arg-type]
-        anew = CPU.trace(*arguments)  # type: ignore[arg-type]
-        anew.owner[:], anew.face[:], anew.place[:] = -1, -1, -1
-        hits.on_device, hits.anew = (None,), lambda: anew  # type: ignore[attr-defined]
+        again = CPU.trace(*arguments)  # type: ignore[arg-type]
+        again.owner[:], again.face[:], again.place[:] = -1, -1, -1
+        hits.on_device, hits.again = (None,), lambda: again  # type: ignore[attr-defined]
         device.failed = "a card that is no more"
         return hits
 

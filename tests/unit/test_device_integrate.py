@@ -215,7 +215,7 @@ def test_points_give_the_same_bits_in_any_company(device: WarpRenderBackend) -> 
 
 
 def test_what_moves_is_followed(device: WarpRenderBackend) -> None:
-    """The tree is refitted, places and materials are taken anew."""
+    """The tree is refitted, places and materials are taken again."""
     scene, points, light = TraceScene(), seen(), sky()
     for shift, visibility in ((0.0, Visibility()), (0.4, Visibility()), (-0.3, Visibility(shadow=False))):
         objects = [ball((1.4 + shift, 0.6, 1.9), 0.7)]

@@ -187,7 +187,7 @@ def test_a_frame_in_which_a_body_falls_and_lands(launcher: Launcher, ground: dic
 
 
 def test_a_collider_that_moves_and_bends_through_a_frame(launcher: Launcher) -> None:
-    """Its field is made anew on the way, and is never a later one than the processor's."""
+    """Its field is made again on the way, and is never a later one than the processor's."""
     rest = _BOX * [0.6, 0.6, 0.2] + [-0.1, -0.1, -0.16]
     bat = Collider("bat", np.array(_FACES), np.stack([rest, rest * [1, 1.2, 1] + [0.02, 0, 0.15]]))
     here, there = (body(colliders=[bat, slab(thickness=0.01)]) for _ in range(2))

@@ -1,4 +1,4 @@
-"""Trees of triangles on a device, on Warp's device "cpu": they follow what moves, and are built anew when worn out."""
+"""Trees of triangles on a device, on Warp's device "cpu": they follow what moves, and are rebuilt when worn out."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Compiled kernels on disk: what is damaged, foreign or of another version is compiled anew; nothing stops work."""
+"""Compiled kernels on disk: what is damaged, foreign or of another version is compiled again; nothing stops work."""
 
 from __future__ import annotations
 

@@ -155,7 +155,7 @@ def test_a_damaged_or_foreign_checkpoint_is_not_used(capture, tmp_path, caplog):
     short = Settings(schedule=replace(QUICK, iterations=3, surfels=500), mesh_resolution=32, materials=False)
     (tmp_path / "surfels.state").write_bytes(b"\x08\0\0\0\0\0\0\0{broken")
     reconstruct(capture, short, folder=tmp_path)
-    assert "starting anew" in caplog.text
+    assert "starting over" in caplog.text
     caplog.clear()
     reconstruct(capture, replace(short, schedule=replace(short.schedule, seed=1)), folder=tmp_path)
     assert "other photographs or settings" in caplog.text

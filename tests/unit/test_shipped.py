@@ -1,4 +1,4 @@
-"""Kernels that a release brings: used as they are where they fit, compiled anew where they are damaged or do not."""
+"""Kernels that a release brings: used as they are where they fit, compiled again where they are damaged or do not."""
 
 from __future__ import annotations
 

@@ -421,7 +421,7 @@ def test_options_of_the_command_win_over_the_file(tmp_path, capsys):
 
 
 def test_a_frame_that_goes_away_while_it_is_read_is_not_baked(tmp_path, monkeypatch):
-    """Another bake that begins anew removes frames; Blender, which follows it, waits for the new ones."""
+    """Another bake that starts over removes frames; Blender, which follows it, waits for the new ones."""
     cache, read = ParticleCache(tmp_path), particle_cache._read
     cache.path(4).write_bytes(b"a frame")
 

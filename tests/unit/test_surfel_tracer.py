@@ -135,7 +135,7 @@ def test_surfels_that_moved_are_met_where_they_are() -> None:
     torn = select(cloud(400, seed=10, size=0.01), rng.permutation(400))
     bvh.update(cloud(400, seed=10, size=0.01))
     tidy = bvh.rebuilds
-    bvh.update(torn)  # may be refitted or built anew: the hits are the same
+    bvh.update(torn)  # may be refitted or rebuilt: the hits are the same
     assert bvh.rebuilds in (tidy, tidy + 1)
     check(bvh, torn)
 

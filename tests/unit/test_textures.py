@@ -250,7 +250,7 @@ def test_frozen_pixels_are_read_once():
     second = MaterialTable(materials, [Image("i", wide)], first)
     assert second.arrays[4][0, 0] == first.arrays[4][0, 0]
     assert second.warnings == first.warnings != []
-    # Another encoding, other pixels, or pixels that may have changed are read anew.
+    # Another encoding, other pixels, or pixels that may have changed are read again.
     for image in (Image("i", wide, "srgb"), Image("i", wide.copy())):
         assert MaterialTable(materials, [image], second).arrays[4][0, 0] != first.arrays[4][0, 0]
 

@@ -67,7 +67,7 @@ class Adam:
             value.grad = None
 
     def take(self, rows: Array) -> None:
-        """Keep the moments of `rows` in this order; those of -1 begin anew."""
+        """Keep the moments of `rows` in this order; those of -1 start over."""
         for moments in (self.first, self.second):
             for name, value in moments.items():
                 index = torch.from_numpy(rows).to(value.device)

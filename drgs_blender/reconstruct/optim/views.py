@@ -44,7 +44,7 @@ class Views:
         self.full, self.half = [[backend.bring(view) for view in views] for views in targets] if few else targets
 
     def of_step(self, iteration: int, half: bool, but_aside: bool) -> Target:
-        """The view of a step: all in turn, in an order drawn anew each time.
+        """The view of a step: all in turn, in an order drawn again each time.
 
         Parameters
         ----------

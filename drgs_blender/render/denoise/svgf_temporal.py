@@ -2,7 +2,7 @@
 
 Pictures are compared on demodulated light, so texture moves with its surface and never ghosts. Every pixel looks up
 where its surface was (`motion`); of the four pixels around that place those count that show the same object, lie on the
-tangent plane there and are turned alike. Where none does, a surface has just come into view and starts anew.
+tangent plane there and are turned alike. Where none does, a surface has just come into view and starts over.
 
 This half is recursive, for a picture that follows the user; `svgf_window` has another for final frames. The present's
 weight is not a count of frames but Kalman's gain: with v the variance of this frame and h that of the past, both known
@@ -101,7 +101,7 @@ def denoise_next(
     ----------
     shot : Shot
     history : Signal or None
-        What this function returned for the frame before; None starts anew.
+        What this function returned for the frame before; None starts over.
     still : bool
         Nothing in the scene has changed since then (camera, objects, light), only the noise: pictures are then gathered
         without end, with equal weights.

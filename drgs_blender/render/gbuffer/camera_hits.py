@@ -104,7 +104,7 @@ def _shade(geometry, moving, view_of, layer, hits, keys, frames, materials, seen
 
 @njit
 def trace_samples(lane, lanes, room, tracer, view_of, mask, owners, out):  # type: ignore[no-untyped-def]
-    """Closest hits of every so-manyth (`lanes`) block of sub-pixel samples, from the `lane`-th on.
+    """Closest hits of every `lanes`-th block of sub-pixel samples, from the `lane`-th on.
 
     Parameters
     ----------
@@ -142,7 +142,7 @@ def trace_samples(lane, lanes, room, tracer, view_of, mask, owners, out):  # typ
 
 @njit
 def shade_hits(lane, lanes, room, geometry, moving, view_of, layer, hits, keys, out):  # type: ignore[no-untyped-def]
-    """Fill every so-manyth (`lanes`) block of points from their hits, from the `lane`-th on.
+    """Fill every `lanes`-th block of points from their hits, from the `lane`-th on.
 
     Parameters
     ----------
@@ -177,7 +177,7 @@ def shade_hits(lane, lanes, room, geometry, moving, view_of, layer, hits, keys, 
             scale = -1.0 / np.sqrt(dx * dx + dy * dy + dz * dz)
             vx, vy, vz = scale * dx, scale * dy, scale * dz
             place, u, v = hit_place[y, x, k], where[y, x, k, 0], where[y, x, k, 1]
-            # Points that a device found and has lost are traced anew, where a ray along an edge may meet nothing.
+            # Points that a device found and has lost are traced again, where a ray along an edge may meet nothing.
             face = max(hit_face[y, x, k], np.int32(0))
             hit = Hit(hit_depth[y, x, k], face, place, u, v, where[y, x, k, 2], where[y, x, k, 3], where[y, x, k, 4])
             nx, ny, nz, gx, gy, gz, r, g, b, rough, metal, er, eg, eb, who = surface_at(

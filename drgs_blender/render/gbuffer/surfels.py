@@ -195,7 +195,7 @@ def _find(tracer, point, normal, view, ahead, window):  # type: ignore[no-untype
 
 @njit
 def attach_points(lane, lanes, room, tracer, rules, view_of, samples, keys, out):  # type: ignore[no-untyped-def]
-    """Fill every so-manyth (`lanes`) block of shading points, from the `lane`-th on; see the module's head.
+    """Fill every `lanes`-th block of shading points, from the `lane`-th on; see the module's head.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Warp's trees of the triangles of a scene: they follow what moves, and are built anew where that has worn them out.
+"""Warp's trees of the triangles of a scene: they follow what moves, and are rebuilt where that has worn them out.
 
 The function that places corners is translated and never runs as it stands.
 """

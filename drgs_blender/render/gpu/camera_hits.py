@@ -37,19 +37,19 @@ class DeviceHits(MeshHits):
     ----------
     on_device : tuple
         All arrays, on the device.
-    anew : callable
+    again : callable
         Traces them on this processor.
     """
 
     on_device: tuple[Any, ...]
-    anew: Callable[[], MeshHits]
+    again: Callable[[], MeshHits]
 
     def to_cpu(self) -> MeshHits:
-        """The same in this processor's memory; traced anew where they are lost with the device."""
+        """The same in this processor's memory; traced again where they are lost with the device."""
         try:
             return MeshHits(*(array.numpy() for array in self.on_device))
         except Exception:  # whatever Warp raises for a device that is no more
-            return self.anew()
+            return self.again()
 
 
 def trace(

@@ -78,7 +78,7 @@ class Mirror:
         return found
 
     def _table(self, name: str, made_of: tuple[Any, ...], make: Callable[[Place], Any]) -> Any:
-        """A table made anew where what it is made of is not the same as before."""
+        """A table made again where what it is made of is not the same as before."""
         known = self._known.pop(name, None)
         if known is None or any(a is not b for a, b in zip(known[0], made_of)):
             del known  # gives the memory back before more is taken

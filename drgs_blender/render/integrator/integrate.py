@@ -204,7 +204,7 @@ class Scratch(NamedTuple):
 
 @njit
 def shade_points(lane, lanes, scratch, points, scene, settings, sampler, out):  # type: ignore[no-untyped-def]
-    """Shade every so-manyth (`lanes`) block of points, from the `lane`-th on.
+    """Shade every `lanes`-th block of points, from the `lane`-th on.
 
     Parameters
     ----------
@@ -282,7 +282,7 @@ def _scratch() -> Any:
 
 @njit(parallel=True)
 def _kernel(points, tracer, geometry, envmap, lights, traits, settings, sampler, out, lanes):  # type: ignore[no-untyped-def]
-    # Threads get neighbouring lanes, lanes get every so-manyth block: no thread is left with all the costly ones.
+    # Threads get neighbouring lanes, lanes get every n-th block: no thread is left with all the costly ones.
     for lane in prange(lanes):
         # Made here: Numba passes no tuples within tuples to threads.
         scene = Scene(tracer, geometry, envmap, lights, traits)

@@ -62,7 +62,7 @@ class TraceScene:
     bvh : TriangleBVH
         TriangleBVH over everything.
     layout : object
-        Another object whenever vertices and faces are numbered anew.
+        Another object whenever vertices and faces are numbered again.
     version : object
         Another object after every update.
     vertices : (n, 3) float32 array

@@ -191,7 +191,7 @@ class _Part:
         self._looseness = looseness(self._vertices, self._faces, self._runs)
 
     def refit(self) -> bool:
-        """Follow moved vertices; True when the tree was worn out and built anew instead."""
+        """Follow moved vertices; True when the tree was worn out and rebuilt instead."""
         worn = len(self._runs) > 0 and (looseness(self._vertices, self._faces, self._runs) > DEGRADED * self._looseness)
         if worn:
             self.build()
@@ -230,7 +230,7 @@ def new_scene() -> int:
     """An empty Embree scene whose geometries are refitted.
 
     Only a dynamic scene of low quality keeps one tree a geometry, and only such a tree is refitted; any other scene
-    silently builds anew at each commit. The geometry's own tree is of full quality either way.
+    silently rebuilds at each commit. The geometry's own tree is of full quality either way.
     """
     lib = embree.library()
     scene = lib.rtcNewScene(embree.device())
@@ -282,7 +282,7 @@ class TriangleBVH:
         self.build(self.vertices, self.faces)
 
     def build(self, vertices: Array, faces: Array, groups: Sequence[Group] | None = None) -> None:
-        """Build the trees anew from (n, 3) vertices and (m, 3) faces, both copied.
+        """Rebuild the trees from (n, 3) vertices and (m, 3) faces, both copied.
 
         Parameters
         ----------
