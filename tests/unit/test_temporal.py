@@ -250,7 +250,7 @@ def test_what_comes_into_view_starts_anew() -> None:
     x = np.arange(W) + 0.5
     box = np.abs(x - (W / 2 + 8)) < 5
     fresh = (np.abs(x - (W / 2 + 4)) < 5) & ~box
-    assert (last.index[0] == box).all() and fresh.sum() == 4
+    assert (last.pass_index[0] == box).all() and fresh.sum() == 4
     present = prepare(shots[-1].components, shots[-1].variance, last, split=False)
     assert (found[:, fresh] == diffuse(present)[:, fresh]).all()
     old = np.abs(x - W / 2) > 20
@@ -262,7 +262,7 @@ def test_what_comes_into_view_starts_anew() -> None:
 def test_surfaces_that_turn_away_or_change_places_are_not_mixed() -> None:
     before, now = wall(), wall()
     now.normal[:, : W // 2] = [0.9, -np.sqrt(1 - 0.81), 0]
-    now.index[: H // 2] = 7
+    now.pass_index[: H // 2] = 7
     now.position[:, -6:, 1] += 0.05  # something else of the same object, behind
     found = diffuse(gathered([shot(before, 5.0, 0.1, 0), shot(now, 1.0, 0.1, 1, still(now))]))
     present = diffuse(gathered([shot(now, 1.0, 0.1, 1)]))
