@@ -41,7 +41,7 @@ def over_range(kernel: Callable[..., Any], count: int, *arguments: Any, fewest: 
         Compiled without the interpreter's lock, as `jit.njit` does. It must write to its own piece only.
     count : int
         Number of elements.
-    *arguments
+    *arguments : object
         The same for every piece.
     fewest : int
         Elements of a piece at least, if there are more: `ROWS`, `ELEMENTS`, or 1 where each is long.

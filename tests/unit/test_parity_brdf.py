@@ -27,11 +27,12 @@ def _evaluate_many(cosines, albedo, roughness, metallic, shading_model, table, o
     """Rows of `cosines`: n.l, n.v, v.l, (n.h)^2, sin^2 of n and h."""
     for i in range(len(out)):
         nl, nv, vl, nh2, sin2 = cosines[i]
+        angles = nl, nv, vl, nh2, sin2
         a2 = kernel.alpha_squared(roughness[i])
         kd = kernel.diffuse_weight(roughness[i], metallic[i], nv, shading_model, table)
         _, norm = kernel.vndf_terms(nv, a2)
         r, g, b = albedo[i]
-        values = kernel.evaluate(nl, nv, vl, nh2, sin2, r, g, b, kd, metallic[i], a2, norm, shading_model)
+        values = kernel.evaluate(angles, (r, g, b), kd, metallic[i], a2, norm, shading_model)
         for k in range(7):
             out[i, k] = values[k]
 

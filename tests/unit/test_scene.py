@@ -10,7 +10,8 @@ import trimesh
 
 from drgs_blender.compute.jit import get_num_threads, use_threads
 from drgs_blender.core.errors import AssetError, UsageError
-from drgs_blender.render.scene.trace_scene import ALBEDO, METALLIC, NORMAL, ROUGHNESS, TraceObject, TraceScene
+from drgs_blender.render.columns import ALBEDO, METALLIC, NORMAL, ROUGHNESS
+from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene
 
 
 def trace_object(vertices: np.ndarray, faces: np.ndarray, name: str = "thing", **changes: object) -> TraceObject:
@@ -50,7 +51,7 @@ def test_smooth_normals_are_angle_weighted() -> None:
         a, b = unit(corner[:, (k + 1) % 3] - corner[:, k]), unit(corner[:, (k + 2) % 3] - corner[:, k])
         np.add.at(expected, item.faces[:, k], np.arccos((a * b).sum(-1))[:, None] * flat)
     used = np.unique(item.faces)
-    np.testing.assert_allclose(scene.shading[used, NORMAL], unit(expected[used]), atol=3e-4)
+    np.testing.assert_allclose(scene.shading[used, NORMAL : NORMAL + 3], unit(expected[used]), atol=3e-4)
     assert np.isfinite(scene.shading).all()
 
 
@@ -102,9 +103,9 @@ def test_every_object_keeps_its_own_faces_and_materials(sphere: TraceObject) -> 
     np.testing.assert_array_equal(scene.face_object[face], [0, 1])
     np.testing.assert_array_equal(scene.pass_index, [0, 7])
     row = scene.shading[scene.shading_faces[face[1], 0]]
-    np.testing.assert_allclose(row[ALBEDO], [0.9, 1, 0])
+    np.testing.assert_allclose(row[ALBEDO : ALBEDO + 3], [0.9, 1, 0])
     assert row[ROUGHNESS] == 0 and row[METALLIC] == 0
-    np.testing.assert_allclose(scene.shading[scene.shading_faces[face[0], 0]][ALBEDO], 0.5)
+    np.testing.assert_allclose(scene.shading[scene.shading_faces[face[0], 0]][ALBEDO : ALBEDO + 3], 0.5)
 
 
 def test_given_corner_normals_are_used_and_bad_ones_replaced(sphere: TraceObject) -> None:
@@ -117,8 +118,8 @@ def test_given_corner_normals_are_used_and_bad_ones_replaced(sphere: TraceObject
     expected = np.tile(np.float32([1, 0, 0]), (len(own), 3, 1))
     flat = np.cross(*(sphere.vertices[sphere.faces[3, k]] - sphere.vertices[sphere.faces[3, 0]] for k in (1, 2)))
     expected[3, 1] = flat / np.linalg.norm(flat)
-    np.testing.assert_allclose(scene.shading[own][..., NORMAL], expected, atol=1e-5)
-    np.testing.assert_allclose(scene.shading[own][..., ALBEDO], 0.5)
+    np.testing.assert_allclose(scene.shading[own][..., NORMAL : NORMAL + 3], expected, atol=1e-5)
+    np.testing.assert_allclose(scene.shading[own][..., ALBEDO : ALBEDO + 3], 0.5)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -1e30])
@@ -150,7 +151,7 @@ def test_faces_without_area_are_counted_and_harmless(sphere: TraceObject) -> Non
     scene.update([replace(sphere, faces=faces)])
     assert scene.faults[0].empty_faces == 1
     assert np.isfinite(scene.shading).all()
-    np.testing.assert_allclose(np.linalg.norm(scene.shading[:, NORMAL], axis=1), 1, atol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(scene.shading[:, NORMAL : NORMAL + 3], axis=1), 1, atol=1e-5)
 
 
 def test_arrays_that_do_not_fit_are_named(sphere: TraceObject) -> None:

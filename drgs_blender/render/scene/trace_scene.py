@@ -21,10 +21,6 @@ from .interaction import Geometry, Tracer
 from .mesh_materials import Glowing, MeshMaterials
 from .ray_masks import object_flags
 from .trace_mesh import (
-    ALBEDO,
-    METALLIC,
-    NORMAL,
-    ROUGHNESS,
     Part,
     TraceObject,
     mask_of,
@@ -37,7 +33,7 @@ from .triangle_bvh import Group, TriangleBVH
 
 Array = np.ndarray
 
-__all__ = ["ALBEDO", "METALLIC", "NORMAL", "ROUGHNESS", "ObjectFaults", "TraceObject", "TraceScene"]
+__all__ = ["ObjectFaults", "TraceObject", "TraceScene"]
 
 
 @dataclass(slots=True)
