@@ -132,7 +132,7 @@ class Run:
         return began
 
     def shown(self):
-        return self.views._shown.get(self.name) or self.views.Shown()
+        return self.views._shown.get(self.name) or self.views.ViewportState()
 
     def finished(self) -> bool:
         picture = self.shown().picture
