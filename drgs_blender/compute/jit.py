@@ -6,10 +6,7 @@ had just been compiled, and a frame is the same picture either way; it costs not
 Import ``njit``, ``prange`` and friends from here, never from numba, so that the settings below come first. One
 parallel kernel may run at a time in a process (workqueue is not re-entrant).
 
-What Numba 0.68 does to named tuples in a loop over ``prange``: a write to an array that the loop's body takes out of
-one is dropped without a word, so such arrays are arguments of their own, or are written in a function that the loop
-calls; and one that holds arrays in a tuple of its own is refused, so it is put together within the loop. Nowhere can a
-field named ``view`` be read: it is taken for the method of arrays.
+What kernels take is in docs/kernels.md, with what Numba does to named tuples.
 """
 
 from __future__ import annotations

@@ -54,9 +54,9 @@ def over_range(kernel: Callable[..., Any], count: int, *arguments: Any, fewest: 
     if count <= 0:
         return []
     threads = get_num_threads()
-    size = max(-(-count // (threads * _PIECES)), min(fewest, -(-count // threads)))
     if threads == 1 or count <= fewest:
         return [kernel(0, count, *arguments)]
+    size = max(-(-count // (threads * _PIECES)), min(fewest, -(-count // threads)))
     starts = range(0, count, size)
     results: list[Any] = [None] * len(starts)
     pieces = iter(starts)  # its next value is taken by one thread at a time

@@ -17,7 +17,7 @@ from ...render.gpu.scene_mirror import Mirror
 from ...render.lights.environment import EnvironmentLight
 from ...render.scene.embree import trace
 from ...render.scene.triangle_bvh import TriangleBVH
-from ..inverse_rendering.estimator import Lobes, Points, Samples, Sky, Sums, gather_point
+from ..inverse_rendering.estimator import Lobes, Plan, Points, Samples, Sky, Sums, gather_point
 from ..inverse_rendering.gatherer import Gatherer
 
 log = logging.getLogger(__name__)
@@ -54,7 +54,7 @@ _HIT = ("float32", "int32", "int32", "int32", "float32", "float32", "float32", "
 def gather_points(lane, lanes, room, points, lobes, plan, occluder, sky, envmap, out):  # type: ignore[no-untyped-def]
     """`inverse_rendering.estimator.gather`."""
     sums, samples = out
-    for i in range(lane, len(lobes[1]), lanes):
+    for i in range(lane, len(lobes.alpha2), lanes):
         gather_point(i, points, lobes, plan, occluder, sky, envmap, sums, samples)
 
 
@@ -92,8 +92,8 @@ class DeviceGatherer(Gatherer):
                 with self._launcher.failures("copying the mesh"):
                     plan, occluder = self._kept()
                     envmap = self._mirror.envmap(light)
-                arguments = tuple(points), tuple(lobes), plan, occluder, tuple(sky), envmap
-                self._launcher.launch(GATHER, len(lobes.alpha2), arguments, (tuple(sums), tuple(samples)))
+                arguments = points, lobes, plan, occluder, sky, envmap
+                self._launcher.launch(GATHER, len(lobes.alpha2), arguments, (sums, samples))
                 return
             except DeviceError as error:
                 self.failed = str(error)
@@ -109,5 +109,6 @@ class DeviceGatherer(Gatherer):
                 self._mesh = wp.Mesh(vertices, wp.array(tree.faces.ravel(), dtype=wp.int32, device=device))
             copy, own = self._launcher.array, self._occluder
             scene = 0 if self._mesh is None else int(self._mesh.id)
-            self._tables = tuple(map(copy, self._plan)), (0, scene, copy(own.faces), copy(own.cache), *own[4:])
+            mesh = own._replace(intersect=0, scene=scene, faces=copy(own.faces), cache=copy(own.cache))
+            self._tables = Plan(*map(copy, self._plan)), mesh
         return self._tables

@@ -246,7 +246,7 @@ def _texels(radiance, t, p, k):  # type: ignore[no-untyped-def]
 
 @njit
 def gather_point(i, points, lobes, plan, occluder, sky, envmap, sums, samples):  # type: ignore[no-untyped-def]
-    """All samples of one pixel, into `Sums` and `Samples`; devices have tuples in the order of the records."""
+    """All samples of one pixel, into `Sums` and `Samples`."""
     origin, flat, towards, key = points
     normals, a2s = lobes
     counts, sequence = plan

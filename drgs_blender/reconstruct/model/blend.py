@@ -124,21 +124,29 @@ def blocks_of(box, i, left, top):  # type: ignore[no-untyped-def]
     return x0, y0, x1, y1
 
 
+@njit(inline="always")
+def open_blocks(is_open, left, top, width, height):  # type: ignore[no-untyped-def]
+    """Open the blocks of the tile at (left, top) that are in the picture; how many these are."""
+    count = 0
+    for block in range(BLOCKS * BLOCKS):
+        inside = (left + block % BLOCKS * SIDE < width) & (top + block // BLOCKS * SIDE < height)
+        is_open[block] = inside
+        count += inside
+    return count
+
+
 @njit
 def _blend_tile(splats, tiles, tile, state, is_open, maps):  # type: ignore[no-untyped-def]
     """All splats of a tile, front to back."""
     height, width, rows = maps.shape
     left, top = tile % tiles.across * TILE, tile // tiles.across * TILE
     state[:] = np.float32(0.0)
-    left_open = 0
+    left_open = open_blocks(is_open, left, top, width, height)
     for block in range(BLOCKS * BLOCKS):
         x, y = left + block % BLOCKS * SIDE, top + block // BLOCKS * SIDE
-        inside = (x < width) & (y < height)
-        is_open[block] = inside
-        left_open += inside
         for j in range(LANES):
             # Pixels beyond the picture count as opaque.
-            if inside and x + j % SIDE < width and y + j // SIDE < height:
+            if x + j % SIDE < width and y + j // SIDE < height:
                 state[block * rows * LANES + j] = np.float32(1.0)
     for entry in range(tiles.start[tile], tiles.start[tile + 1]):
         i = np.uintp(tiles.listed[entry])

@@ -20,6 +20,7 @@ from .blend import (
     Tiles,
     Z,
     blocks_of,
+    open_blocks,
     strength,
 )
 from .projection import I0, IX, IY, LOW_PASS, OPACITY, PARAMETERS, RX, RY, UX, UY, VX, VY, splat_of
@@ -147,14 +148,11 @@ def _blend_tile_backward(splats, tiles, tile, state, is_open, sums, maps, incomi
     columns, rows = BEFORE + channels, _GF + channels
     left, top = tile % tiles.across * TILE, tile // tiles.across * TILE
     state[:] = np.float32(0.0)
-    left_open = 0
+    left_open = open_blocks(is_open, left, top, width, height)
     for block in range(BLOCKS * BLOCKS):
         x, y = left + block % BLOCKS * SIDE, top + block // BLOCKS * SIDE
-        inside = (x < width) & (y < height)
-        is_open[block] = inside
-        left_open += inside
         for j in range(LANES):
-            if inside and x + j % SIDE < width and y + j // SIDE < height:
+            if x + j % SIDE < width and y + j // SIDE < height:
                 _load(maps, incoming, y + j // SIDE, x + j % SIDE, state, block * rows * LANES + j, channels)
     for entry in range(tiles.start[tile], tiles.start[tile + 1]):
         i = np.uintp(tiles.listed[entry])

@@ -274,7 +274,7 @@ def _develop(y0, y1, points, surfaces, light, pass_index, p, pixels):  # type: i
                 rough, metal = rough + w * surfaces.roughness[i], metal + w * surfaces.metallic[i]
                 if depth[i] <= limit:
                     surface += w
-                    # Differences to the nearest sample, lest float32 lose small ones far from the origin.
+                    # Differences to the nearest sample, so that float32 keeps small ones far from the origin.
                     mean_depth += w * (depth[i] - depth[nearest])
                     px += w * (position[i, 0] - position[nearest, 0])
                     py += w * (position[i, 1] - position[nearest, 1])

@@ -129,7 +129,7 @@ def prepare(
         given = arrays_of(posed, launcher)
         found = zeros((n, RECORD)), zeros((n, 4), "int32"), zeros((n,))
         depth, keys, order = zeros((n,)), zeros((2 * n,), "uint32"), zeros((2 * n,), "int32")
-    arrays = tuple(given[name] for name in Posed._fields)
+    arrays = Posed(*(given[name] for name in Posed._fields))
     launcher.launch(PROJECT, n, (arrays, parameters, tuple(map(int, camera.window))), (*found, depth))
     launcher.launch(KEY, n, (depth.view(warp().uint32), found[1]), (keys, order))
     m = np.zeros(1, np.int64)

@@ -243,7 +243,7 @@ def shade_points(lane, lanes, scratch, points, scene, settings, sampler, out):  
                 step = state[h, COUNTS + strategy] * rate
                 dither = unit(mix(U(key + U(4))))
                 sample = points.sample[i]
-                # Each position begins with another part, lest a part have samples at all positions of a pixel or none.
+                # Each position begins with another part, so that each part has samples at some positions of a pixel.
                 turn = np.int64((np.uint64(U(U(sample) * GOLDEN)) * np.uint64(parts)) >> np.uint64(32))
                 place = F(sample * parts + (part + turn) % parts)
                 first, past = np.int64(place * step + dither), np.int64((place + ONE) * step + dither)

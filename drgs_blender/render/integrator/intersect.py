@@ -98,6 +98,14 @@ def ray_of(rays, slot, far, mask):  # type: ignore[no-untyped-def]
 
 
 @njit
+def _start_of(rays, slot):  # type: ignore[no-untyped-def]
+    """The surface that a slot's ray starts on."""
+    s, ints = rays
+    i, c = w.at(slot)
+    return Start(np.int32(ints[c + w.OWN]), s[i + w.GX], s[i + w.GY], s[i + w.GZ], s[i + w.SIZE])
+
+
+@njit
 def passed_meshes(tracer, rays, slot, far, mask):  # type: ignore[no-untyped-def]
     hidden = shadowed(tracer, ray_of(rays, slot, far, mask))
     return ZERO if hidden else ONE
@@ -111,10 +119,7 @@ def passed(tracer, rays, slot, far, mask):  # type: ignore[no-untyped-def]
         return ZERO
     if tracer.surfel_scene == 0:
         return ONE
-    s, ints = rays
-    i, c = w.at(slot)
-    start = Start(np.int32(ints[c + w.OWN]), s[i + w.GX], s[i + w.GY], s[i + w.GZ], s[i + w.SIZE])
-    return transmittance(tracer, ray.origin, ray.direction, ZERO, far, mask, start)
+    return transmittance(tracer, ray, _start_of(rays, slot))
 
 
 @njit
@@ -136,13 +141,12 @@ def meet(tracer, rays, slot, mask):  # type: ignore[no-untyped-def]
     blank = (ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, none)
     if tracer.surfel_scene == 0:
         return (ONE if face < 0 else ZERO), t, MixedHit(t, face, place, u, v, gx, gy, gz, *blank)
-    s, ints = rays
-    i, c = w.at(slot)
-    key = ints[c + w.KEY]
-    start = Start(np.int32(ints[c + w.OWN]), s[i + w.GX], s[i + w.GY], s[i + w.GZ], s[i + w.SIZE])
+    _, c = w.at(slot)
+    key = rays.ints[c + w.KEY]
+    before = Ray(ray.origin, ray.direction, ZERO, t, mask)
     number = unit(mix(U(key + U(0x632BE59B))))
     through, depth, nx, ny, nz, px, py, pz, r, g, b, roughness, metallic, size, owner, reach = trace_surfels(
-        tracer, ray.origin, ray.direction, ZERO, t, mask, start, _GAP, number
+        tracer, before, _start_of(rays, slot), _GAP, number
     )
     if face >= 0:
         if owner < 0 or unit(mix(U(key + U(0x85157AF5)))) < through:

@@ -6,6 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ...compute.jit import njit, plain
+
+Array = np.ndarray
+
 Vector = tuple[np.float32, np.float32, np.float32]
 
 
@@ -29,6 +33,37 @@ class Ray(NamedTuple):
     tnear: np.float32
     tfar: np.float32
     mask: np.int32
+
+
+class Rays(NamedTuple):
+    """Many rays, and what all of them have in common; see `Ray`.
+
+    Attributes
+    ----------
+    origins, directions : (n, 3) float32 array
+    tnear, tfar : np.float32
+    mask : np.int32
+    """
+
+    origins: Array
+    directions: Array
+    tnear: np.float32
+    tfar: np.float32
+    mask: np.int32
+
+    @classmethod
+    def of(cls, origins: Array, directions: Array, tnear: float, tfar: float, mask: int) -> Rays:
+        """As compiled code takes them."""
+        start, along = (plain(np.asarray(a, np.float32)) for a in (origins, directions))
+        return cls(start, along, np.float32(tnear), np.float32(tfar), np.int32(mask))
+
+
+@njit(inline="always")
+def ray_at(rays, i):  # type: ignore[no-untyped-def]
+    """One `Ray` of many."""
+    origin = rays.origins[i, 0], rays.origins[i, 1], rays.origins[i, 2]
+    direction = rays.directions[i, 0], rays.directions[i, 1], rays.directions[i, 2]
+    return Ray(origin, direction, rays.tnear, rays.tfar, rays.mask)
 
 
 class Hit(NamedTuple):

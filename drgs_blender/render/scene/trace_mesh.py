@@ -269,14 +269,18 @@ def _put_vertices(source: Array, matrix: Array | None, target: Array) -> tuple[i
 
 
 @njit
-def _usable(x, y, z):  # type: ignore[no-untyped-def]
-    """The vertex and its largest coordinate, or the origin for an unusable one; how many of these (0 or 1)."""
+def _put(x, y, z, target, i):  # type: ignore[no-untyped-def]
+    """Put a vertex, or the origin for an unusable one, to row i: 1 if unusable, 1 if changed, largest coordinate."""
+    zero = np.float32(0.0)
     size = max(abs(x), max(abs(y), abs(z)))
     # A NaN may hide in the maximum, yet not in the sum.
-    if size < FARTHEST and abs(x + y + z) < 4 * FARTHEST:
-        return x, y, z, size, 0
-    zero = np.float32(0.0)
-    return zero, zero, zero, zero, 1
+    usable = size < FARTHEST and abs(x + y + z) < 4 * FARTHEST
+    if not usable:
+        x, y, z, size = zero, zero, zero, zero
+    changed = x != target[i, 0] or y != target[i, 1] or z != target[i, 2]
+    if changed:
+        target[i, 0], target[i, 1], target[i, 2] = x, y, z
+    return int(not usable), int(changed), size
 
 
 @njit
@@ -285,13 +289,8 @@ def _copy_vertices(first, last, source, target):  # type: ignore[no-untyped-def]
     bad = moved = 0
     reach = np.float32(0.0)
     for i in range(first, last):
-        x, y, z = source[i, 0], source[i, 1], source[i, 2]
-        x, y, z, size, unusable = _usable(x, y, z)
-        bad += unusable
-        if x != target[i, 0] or y != target[i, 1] or z != target[i, 2]:
-            target[i, 0], target[i, 1], target[i, 2] = x, y, z
-            moved += 1
-        reach = max(reach, size)
+        unusable, changed, size = _put(source[i, 0], source[i, 1], source[i, 2], target, i)
+        bad, moved, reach = bad + unusable, moved + changed, max(reach, size)
     return bad, moved, reach
 
 
@@ -308,12 +307,8 @@ def _move_vertices(first, last, source, matrix, target):  # type: ignore[no-unty
         x = np.float32(m00 * a + m01 * b + m02 * c + m03)
         y = np.float32(m10 * a + m11 * b + m12 * c + m13)
         z = np.float32(m20 * a + m21 * b + m22 * c + m23)
-        x, y, z, size, unusable = _usable(x, y, z)
-        bad += unusable
-        if x != target[i, 0] or y != target[i, 1] or z != target[i, 2]:
-            target[i, 0], target[i, 1], target[i, 2] = x, y, z
-            moved += 1
-        reach = max(reach, size)
+        unusable, changed, size = _put(x, y, z, target, i)
+        bad, moved, reach = bad + unusable, moved + changed, max(reach, size)
     return bad, moved, reach
 
 

@@ -5,16 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
-from ...compute.jit import njit, plain, prange
+from ...compute.jit import njit, prange
 from ...compute.simd import aligned
 from ...core.errors import DeviceError, UsageError
 from . import embree
 from .embree import blocked, trace
-from .ray import Ray
+from .ray import Rays, ray_at
 
 Array = np.ndarray
 
@@ -48,29 +47,12 @@ class Group:
     places: Array | None = None
 
 
-class _Rays(NamedTuple):
-    """Many a `Ray`: (n, 3) float32 `origins` and `directions`; float32 numbers and an int32 mask for all."""
-
-    origins: Array
-    directions: Array
-    tnear: np.float32
-    tfar: np.float32
-    mask: np.int32
-
-
-@njit(inline="always")
-def _ray(rays, i):  # type: ignore[no-untyped-def]
-    origin = rays.origins[i, 0], rays.origins[i, 1], rays.origins[i, 2]
-    direction = rays.directions[i, 0], rays.directions[i, 1], rays.directions[i, 2]
-    return Ray(origin, direction, rays.tnear, rays.tfar, rays.mask)
-
-
 @njit(parallel=True)
 def _intersect(address, scene, first, rays, t, face, instance, u, v):  # type: ignore[no-untyped-def]
     n, block = len(rays.origins), 512
     for b in prange((n + block - 1) // block):
         for i in range(b * block, min(n, (b + 1) * block)):
-            t[i], group, primitive, instance[i], u[i], v[i], _, _, _ = trace(address, scene, _ray(rays, i))
+            t[i], group, primitive, instance[i], u[i], v[i], _, _, _ = trace(address, scene, ray_at(rays, i))
             face[i] = first[group] + primitive if group >= 0 else np.int32(-1)
 
 
@@ -79,7 +61,7 @@ def _occluded(address, scene, rays, out):  # type: ignore[no-untyped-def]
     n, block = len(rays.origins), 512
     for b in prange((n + block - 1) // block):
         for i in range(b * block, min(n, (b + 1) * block)):
-            out[i] = blocked(address, scene, _ray(rays, i))
+            out[i] = blocked(address, scene, ray_at(rays, i))
 
 
 @njit(parallel=True)
@@ -248,11 +230,6 @@ def box_of(scene: int) -> tuple[Array, Array]:
     return (low, high) if (low <= high).all() else (np.zeros(3, np.float32), np.zeros(3, np.float32))
 
 
-def _rays(origins: Array, directions: Array, tnear: float, tfar: float, mask: int) -> _Rays:
-    start, along = (plain(np.asarray(a, np.float32)) for a in (origins, directions))
-    return _Rays(start, along, np.float32(tnear), np.float32(tfar), np.int32(mask))
-
-
 class TriangleBVH:
     """Triangles ready for ray casting, whose vertices may move.
 
@@ -358,7 +335,7 @@ class TriangleBVH:
         """As `intersect`, with the place of the face's group between face and u: (n,) int32 or -1."""
         t, u, v = np.empty((3, len(origins)), np.float32)
         face, instance = np.empty((2, len(origins)), np.int32)
-        rays = _rays(origins, directions, tnear, tfar, mask)
+        rays = Rays.of(origins, directions, tnear, tfar, mask)
         _intersect(self.intersect_address, self.scene, self.first_face, rays, t, face, instance, u, v)
         return t, face, instance, u, v
 
@@ -367,7 +344,7 @@ class TriangleBVH:
     ) -> Array:
         """(n,) bool: whether anything lies on each ray."""
         out = np.empty(len(origins), np.bool_)
-        _occluded(self.occluded_address, self.scene, _rays(origins, directions, tnear, tfar, mask), out)
+        _occluded(self.occluded_address, self.scene, Rays.of(origins, directions, tnear, tfar, mask), out)
         return out
 
     def _release(self) -> None:

@@ -198,7 +198,7 @@ def _project(posed, p, window, screen, box, nearest):  # type: ignore[no-untyped
 @njit
 def project_surfel(i, posed, p, window, screen, box, nearest):  # type: ignore[no-untyped-def]
     """Fill screen record, box and nearest depth of surfel i; a culled surfel has an empty box (x1 = x0 = 0)."""
-    centre, tangent_u, tangent_v, _, opacity, _, _, _, _ = posed
+    centre, tangent_u, tangent_v, opacity = posed.centre, posed.tangent_u, posed.tangent_v, posed.opacity
     wx0, wy0, wx1, wy1 = window
     near, far, ortho = p[CLIP_START], p[CLIP_END], p[ORTHOGRAPHIC] != 0.0
     fx, fy = p[FX], p[FY]
@@ -342,14 +342,14 @@ def _gather_surface(order, posed, out):  # type: ignore[no-untyped-def]
 @njit
 def pack_surface(i, k, posed, out):  # type: ignore[no-untyped-def]
     """Pack what blending reads of surfel i as splat k."""
-    _, tangent_u, tangent_v, normal, opacity, albedo, roughness, metallic, _ = posed
+    tangent_u, tangent_v = posed.tangent_u, posed.tangent_v
     uu = vv = np.float32(0.0)
     for c in range(3):
-        out[k, NORMAL + c] = normal[i, c]
-        out[k, ALBEDO + c] = albedo[i, c]
+        out[k, NORMAL + c] = posed.normal[i, c]
+        out[k, ALBEDO + c] = posed.albedo[i, c]
         uu += tangent_u[i, c] * tangent_u[i, c]
         vv += tangent_v[i, c] * tangent_v[i, c]
-    out[k, ROUGHNESS], out[k, METALLIC], out[k, OPACITY] = roughness[i], metallic[i], opacity[i]
+    out[k, ROUGHNESS], out[k, METALLIC], out[k, OPACITY] = posed.roughness[i], posed.metallic[i], posed.opacity[i]
     out[k, SIZE] = np.sqrt(max(uu, vv))
 
 

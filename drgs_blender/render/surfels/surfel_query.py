@@ -132,13 +132,13 @@ def _call(typing, address, scene, ray, settings):  # type: ignore[no-untyped-def
 
 
 @njit
-def begin_query(query, origin, direction, mask, start):  # type: ignore[no-untyped-def]
+def begin_query(query, ray, start):  # type: ignore[no-untyped-def]
     """Fill all of a query but its range; returns the address of the part that callbacks write."""
-    (ox, oy, oz), (dx, dy, dz) = origin, direction
+    (ox, oy, oz), (dx, dy, dz) = ray.origin, ray.direction
     context = query + 4 * _CONTEXT
     for index, value in ((0, ox), (1, oy), (2, oz), (4, dx), (5, dy), (6, dz), (7, np.float32(0.0))):
         store_single(query, index, value)
-    store_word(query, _RAY_MASK, np.int32(mask))
+    store_word(query, _RAY_MASK, np.int32(ray.mask))
     for index in (10, 11):
         store_word(query, index, np.int32(0))
     for index in (17, 18, 19, 20):

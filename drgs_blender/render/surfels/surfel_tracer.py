@@ -28,6 +28,7 @@ from ...core.errors import UsageError
 from ..columns import ALBEDO, METALLIC, NORMAL, PLANE, ROUGHNESS, SIZE, SURFEL
 from ..memory import address, load_float, load_int32
 from ..sampling import ONE, ZERO, F
+from ..scene.ray import Rays, ray_at
 from .raster import GAP
 from .surfel_bvh import SurfelBVH
 from .surfel_query import (
@@ -87,28 +88,26 @@ def tracer_of(bvh: SurfelBVH) -> SurfelTracer:
 
 
 @njit
-def transmittance(tracer, origin, direction, tnear, tfar, mask, start):  # type: ignore[no-untyped-def]
-    """Share of light that passes the surfels between `tnear` and `tfar`, 0 where that is below MIN_TRANSMITTANCE.
+def transmittance(tracer, ray, start):  # type: ignore[no-untyped-def]
+    """Share of light that passes the surfels on a ray, 0 where that is below MIN_TRANSMITTANCE.
 
     Parameters
     ----------
     tracer : SurfelTracer
         Or anything that has its fields.
-    origin, direction : tuple of float
-        (x, y, z), world space; the direction is a unit vector.
-    mask : int
-        See ``SurfelBVH.update``; -1 meets all.
+    ray : Ray
+        Its direction is a unit vector; for its mask see ``SurfelBVH.update``, -1 meets all.
     start : Start
     """
     query = query_memory()
-    context = begin_query(query, origin, direction, mask, start)
-    cast(tracer.surfel_occluded, tracer.surfel_scene, query, tnear, tfar)
+    context = begin_query(query, ray, start)
+    cast(tracer.surfel_occluded, tracer.surfel_scene, query, ray.tnear, ray.tfar)
     product = load_double(context + 4 * PRODUCT, 0)
     return F(product) if product >= MIN_TRANSMITTANCE else ZERO
 
 
 @njit
-def trace_surfels(tracer, origin, direction, tnear, tfar, mask, start, gap, number):  # type: ignore[no-untyped-def]
+def trace_surfels(tracer, ray, start, gap, number):  # type: ignore[no-untyped-def]
     """Blend the surfels on a ray: ``(through, t, n (3), g (3), albedo (3), roughness, metallic, size, object, stop)``.
 
     Parameters as for `transmittance`; `gap` is the jump of depth that separates surfaces, in sizes; `number` a float32
@@ -120,7 +119,8 @@ def trace_surfels(tracer, origin, direction, tnear, tfar, mask, start, gap, numb
     where the transmittance falls to `number`, else `tfar`: as often as light passes to some depth, it lies beyond.
     """
     query = query_memory()
-    context = begin_query(query, origin, direction, mask, start)
+    context = begin_query(query, ray, start)
+    tnear, tfar = ray.tnear, ray.tfar
     through, total, pick = 1.0, ZERO, number
     near, last, last_size, heaviest, stop = tnear, ZERO, ZERO, ZERO, F(tfar)
     index = owner = best_owner = np.int32(-1)
@@ -139,7 +139,7 @@ def trace_surfels(tracer, origin, direction, tnear, tfar, mask, start, gap, numb
                     best, best_owner = sums, owner
                 sums, heaviest = _NOTHING, ZERO
             weight = F(through) * alpha
-            sums = _add(sums, row, weight, t, direction)
+            sums = _add(sums, row, weight, t, ray.direction)
             if weight > heaviest:
                 heaviest, owner = weight, load_int32(tracer.surfel_object, np.int64(index))
             last, last_size = t, wide
@@ -274,26 +274,6 @@ class Starts:
         return self.object_index, self.normal, self.size
 
 
-class Rays(NamedTuple):
-    """Many rays, and what all of them have in common.
-
-    Attributes
-    ----------
-    origins, directions : (n, 3) float32 array
-        World space; unit directions.
-    tnear, tfar : float
-        Where they begin and end.
-    mask : int
-        See ``SurfelBVH.update``.
-    """
-
-    origins: Array
-    directions: Array
-    tnear: np.float32
-    tfar: np.float32
-    mask: np.int32
-
-
 def trace(
     bvh: SurfelBVH,
     origins: Array,
@@ -309,7 +289,7 @@ def trace(
     origins, directions, starts = _checked(origins, directions, starts)
     n = len(origins)
     numbers, index = np.empty((n, 14), np.float32), np.empty(n, np.int32)
-    rays = Rays(origins, directions, F(tnear), F(tfar), np.int32(mask))
+    rays = Rays.of(origins, directions, tnear, tfar, mask)
     _trace(tracer_of(bvh), rays, starts.arrays, F(gap), 8 * get_num_threads(), numbers, index)
     return SurfelHits(
         numbers[:, 0], numbers[:, 1], numbers[:, 2:5], numbers[:, 5:8], numbers[:, 8:11], numbers[:, 11],
@@ -330,7 +310,7 @@ def transmittance_many(
     """(n,) float32: the share of light that passes along many rays. See `transmittance`."""
     origins, directions, starts = _checked(origins, directions, starts)
     out = np.empty(len(origins), np.float32)
-    rays = Rays(origins, directions, F(tnear), F(tfar), np.int32(mask))
+    rays = Rays.of(origins, directions, tnear, tfar, mask)
     _shadow(tracer_of(bvh), rays, starts.arrays, 8 * get_num_threads(), out)
     return out
 
@@ -346,20 +326,16 @@ def _checked(origins: Array, directions: Array, starts: Starts | None) -> tuple[
 
 
 @njit
-def _ray(rays, starts, i):  # type: ignore[no-untyped-def]
-    """Origin, direction and start of one of many rays."""
+def _start(starts, i):  # type: ignore[no-untyped-def]
     own, normal, size = starts
-    o, d = rays.origins, rays.directions
-    start = Start(own[i], normal[i, 0], normal[i, 1], normal[i, 2], size[i])
-    return (o[i, 0], o[i, 1], o[i, 2]), (d[i, 0], d[i, 1], d[i, 2]), start
+    return Start(own[i], normal[i, 0], normal[i, 1], normal[i, 2], size[i])
 
 
 @njit(parallel=True)
 def _trace(tracer, rays, starts, gap, lanes, numbers, index):  # type: ignore[no-untyped-def]
     for lane in prange(lanes):
         for i in range(lane, len(rays.origins), lanes):
-            origin, direction, start = _ray(rays, starts, i)
-            hit = trace_surfels(tracer, origin, direction, rays.tnear, rays.tfar, rays.mask, start, gap, HEAVIEST)
+            hit = trace_surfels(tracer, ray_at(rays, i), _start(starts, i), gap, HEAVIEST)
             values = hit[:14]
             for k in range(14):
                 numbers[i, k] = values[k]
@@ -370,5 +346,4 @@ def _trace(tracer, rays, starts, gap, lanes, numbers, index):  # type: ignore[no
 def _shadow(tracer, rays, starts, lanes, out):  # type: ignore[no-untyped-def]
     for lane in prange(lanes):
         for i in range(lane, len(rays.origins), lanes):
-            origin, direction, start = _ray(rays, starts, i)
-            out[i] = transmittance(tracer, origin, direction, rays.tnear, rays.tfar, rays.mask, start)
+            out[i] = transmittance(tracer, ray_at(rays, i), _start(starts, i))
