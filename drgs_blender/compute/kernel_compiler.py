@@ -20,10 +20,12 @@ from typing import Any
 
 import numba
 from llvmlite import binding
-from numba.core import codegen, compiler, errors, sigutils, targetconfig
+from numba.core import codegen, compiler, errors, sigutils, targetconfig, typed_passes
+
+from . import numba_shortcuts
 
 #: Versions of Numba for which this was tested.
-TESTED = ("0.61", "0.62", "0.63", "0.64", "0.65", "0.66", "0.67", "0.68")
+TESTED = ("0.62", "0.63", "0.64", "0.65", "0.66", "0.67", "0.68")
 
 
 def is_tested() -> bool:
@@ -58,11 +60,7 @@ class EntryLibrary(codegen.JITCodeLibrary):
     """Code that Python calls."""
 
     def _optimize_functions(self, ll_module: Any) -> None:
-        ll_module.data_layout = self._codegen._data_layout
-        passes, builder = self._codegen._function_pass_manager()  # once: Numba makes them for each declaration, too
-        for function in ll_module.functions:
-            if not function.is_declaration:
-                passes.run(function, builder)
+        numba_shortcuts.optimize_functions(self, ll_module)
 
     def _optimize_final_module(self) -> None:
         """Optimise; what was linked in is this library's alone.
@@ -118,6 +116,15 @@ class KernelCompiler(compiler.Compiler):
         super().__init__(typingctx, targetctx, library, args, return_type, flags, locals)
         self._kind = kind
 
+    def define_pipelines(self) -> list[Any]:
+        """Numba's passes, with our own lowering."""
+        pipelines = super().define_pipelines()
+        for pipeline in pipelines:
+            own = {typed_passes.NativeLowering: numba_shortcuts.Lowering}
+            pipeline.passes = [(own.get(kind, kind), text) for kind, text in pipeline.passes]
+            pipeline.finalize()
+        return pipelines
+
     def compile_extra(self, func: Any) -> Any:
         """Compile `func`; the garbage collector waits, which would visit all of the compiler's objects."""
         if self.state.library is None:
@@ -129,7 +136,7 @@ class KernelCompiler(compiler.Compiler):
         collects, begun = gc.isenabled(), time.process_time()
         gc.disable()
         try:
-            with _inner_libraries(self.state.targetctx.codegen()):
+            with _inner_libraries(self.state.targetctx.codegen()), numba_shortcuts.shortcuts():
                 return super().compile_extra(func)
         finally:
             KernelCompiler.seconds = time.process_time() - begun

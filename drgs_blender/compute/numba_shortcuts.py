@@ -1,0 +1,174 @@
+"""Shortcuts through Numba while it compiles a kernel: the same machine code's arithmetic, a quarter less time.
+
+Most of compiling is Numba's own Python, and much of that is done again and again:
+
+- which implementation of an operator or function takes the types at hand is searched for at each use (`_call_type`);
+- which variables live where is computed after each of some ten passes, of which the last one needs it (`_postprocess`);
+- the variables of an instruction are looked for in all it holds, its line number included (`_list_vars`);
+- each function is optimised in full before it is linked into its kernel, which is optimised in full again
+  (`optimize_functions`);
+- arrays that a function only borrows have their references counted at each use (`Lowering`).
+
+The methods of Numba are replaced while a kernel is compiled, under Numba's own lock, and only in versions that
+`kernel_compiler.TESTED` lists.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from typing import Any
+
+from llvmlite import binding
+from numba.core import codegen, ir, postproc, transforms, types
+from numba.core.compiler_machinery import register_pass
+from numba.core.typed_passes import NativeLowering
+
+_get_call_type = types.BaseFunction.get_call_type
+_run = postproc.PostProcessor.run
+#: What an instruction holds that is no variable.
+_NO_VARIABLES = frozenset({str, int, bool, float, type(None), ir.Loc})
+
+
+@contextlib.contextmanager
+def shortcuts() -> Iterator[None]:
+    """Have Numba take the shortcuts of this module."""
+    replaced = {
+        (types.BaseFunction, "get_call_type"): _call_type,
+        (postproc.PostProcessor, "run"): _postprocess,
+        (ir.Inst, "_rec_list_vars"): _list_vars,
+    }
+    originals = {key: getattr(*key) for key in replaced}
+    for (owner, name), method in replaced.items():
+        setattr(owner, name, method)
+    try:
+        yield
+    finally:
+        for (owner, name), method in originals.items():
+            setattr(owner, name, method)
+
+
+def _call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
+    """``BaseFunction.get_call_type``, which remembers what it found.
+
+    Not where the implementation is a function compiled for these types, which has its own memory: that is what it is
+    when the implementation's key is not the function itself.
+    """
+    if kws:
+        return _get_call_type(self, context, args, kws)
+    known = self.__dict__.setdefault("_drgs_call_types", {})
+    key = context, tuple(args)
+    signature: Any = known.get(key)
+    if signature is None:
+        signature = _get_call_type(self, context, args, kws)
+        if self._impl_keys.get(signature.args) is self.typing_key:
+            known[key] = signature
+    return signature
+
+
+def _postprocess(self: Any, emit_dels: bool = False, extend_lifetimes: bool = False) -> None:
+    """``PostProcessor.run``: lifetimes are computed where they are asked for."""
+    function = self.func_ir
+    if emit_dels or function.is_generator:
+        _run(self, emit_dels, extend_lifetimes)
+        return
+    function.blocks = transforms.canonicalize_cfg(function.blocks)
+    function.variable_lifetime = postproc.VariableLifetime(function.blocks)
+    function.generator_info = None
+
+
+def _list_vars(self: Any, value: Any) -> list[Any]:
+    """``Inst._rec_list_vars``, by the type of what is looked at, the most frequent first."""
+    kind = type(value)
+    if kind is ir.Var:
+        return [value]
+    if kind in _NO_VARIABLES:
+        return []
+    if kind is dict:
+        return [variable for part in value.values() for variable in _list_vars(self, part)]
+    if kind is tuple or kind is list:
+        return [variable for part in value for variable in _list_vars(self, part)]
+    if isinstance(value, ir.Inst):
+        return value.list_vars()
+    if isinstance(value, (list, tuple)):
+        return [variable for part in value for variable in _list_vars(self, part)]
+    return []
+
+
+def optimize_functions(library: Any, module: Any) -> None:
+    """Make a module's functions shorter before they are linked; they are optimised in full as parts of a kernel.
+
+    Parameters
+    ----------
+    library : numba.core.codegen.JITCodeLibrary
+    module : llvmlite.binding.ModuleRef
+        Changed in place.
+    """
+    module.data_layout = library._codegen._data_layout
+    builder = binding.create_pass_builder(library._codegen._tm, binding.create_pipeline_tuning_options(speed_level=1))
+    passes = binding.create_new_function_pass_manager()
+    passes.add_sroa_pass()
+    passes.add_simplify_cfg_pass()
+    passes.add_instruction_combine_pass()
+    passes.add_refprune_pass(codegen._parse_refprune_flags())
+    for function in module.functions:
+        if not function.is_declaration:
+            passes.run(function, builder)
+
+
+@register_pass(mutates_CFG=True, analysis_only=False)
+class Lowering(NativeLowering):
+    """Numba's lowering, without counts of references in functions that only borrow arrays."""
+
+    _name = "native_lowering"
+
+    def run_pass(self, state: Any) -> bool:
+        """Lower a function."""
+        if not _borrows(state):
+            return super().run_pass(state)
+        counting = state.targetctx
+        state.targetctx = counting.subtarget(enable_nrt=False)
+        try:
+            return super().run_pass(state)
+        finally:
+            state.targetctx = counting
+
+
+#: Expressions that pass on what they are made of, or a view of it.
+_VIEWS = frozenset({
+    "build_tuple", "cast", "exhaust_iter", "getattr", "getitem", "getiter", "iternext", "pair_first", "pair_second",
+    "phi", "static_getitem", "typed_getitem",
+})  # fmt: skip
+
+
+def _borrows(state: Any) -> bool:
+    """Whether a function gets no memory of its own: it returns none, none of its calls does, all arrays are views.
+
+    What it calls may: its arrays are released before it returns. In doubt it does not.
+    """
+    kinds, blocks = state.typemap, state.func_ir.blocks.values()
+
+    def counted(kind: Any) -> bool:
+        return state.targetctx.data_model_manager[kind].contains_nrt_meminfo()
+
+    if counted(state.return_type) or state.func_ir.is_generator:
+        return False
+    for kind in kinds.values():
+        if not isinstance(kind, (types.Array, types.containers.BaseTuple, types.Callable)) and counted(kind):
+            return False  # lists, strings
+    for statement in (statement for block in blocks for statement in block.body):
+        if isinstance(statement, ir.DynamicRaise):
+            return False
+        if isinstance(statement, (ir.SetItem, ir.StaticSetItem)):
+            index = getattr(statement, "index_var", None) or statement.index
+            if counted(kinds[statement.value.name]) or counted(kinds[index.name]):  # the value may have to be copied
+                return False
+        value = getattr(statement, "value", None)
+        if not isinstance(value, ir.Expr) or not counted(kinds[statement.target.name]):
+            continue
+        if value.op == "call":
+            if not isinstance(kinds[value.func.name], types.NamedTupleClass):
+                return False
+        elif value.op not in _VIEWS or (value.op in ("getitem", "typed_getitem") and counted(kinds[value.index.name])):
+            return False
+    return True
