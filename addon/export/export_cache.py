@@ -20,7 +20,7 @@ SHADED = ("mesh", "world")
 
 
 def uid(datablock: bpy.types.ID | None) -> int:
-    """What tells a datablock from all others of this run of Blender, the same for its evaluated copies."""
+    """Identity of a datablock in this run of Blender, the same for its evaluated copies."""
     return 0 if datablock is None else datablock.original.session_uid
 
 

@@ -78,7 +78,7 @@ def _draw() -> None:
             if _lacks_depth(context.space_data):
                 gpu.state.active_framebuffer_get().clear(depth=1.0)
             error = draws(context, context.view_layer.depsgraph)
-    except Exception as failure:  # else it would be printed with every redraw, and told to nobody
+    except Exception as failure:  # else it would be printed with every redraw, and be in no message
         messages.log.exception("overlay failed")
         error = f"DR-GS failed ({type(failure).__name__}: {failure}); the console has the details"
     if error:

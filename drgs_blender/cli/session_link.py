@@ -130,7 +130,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--session", type=Path, metavar="FOLDER", help="let the process of `drgs session start` do it, which is warm"
     )
-    parser.add_argument("--openjd", action="store_true", help="tell an Open Job Description session the progress")
+    parser.add_argument("--openjd", action="store_true", help="report progress to an Open Job Description session")
 
 
 def hand_on(folder: Path, words: Sequence[str]) -> int | None:

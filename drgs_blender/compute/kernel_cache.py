@@ -91,7 +91,7 @@ class KernelCache(NullCache):
         return None
 
     def save_overload(self, sig: Any, cres: Any) -> None:
-        """Keep a compiled form; that it cannot be written costs time at the next start, and is told there."""
+        """Keep a compiled form; where it cannot be written, the next start compiles again and logs why."""
         if cres.library.has_dynamic_globals or any(not x.can_cache for x in cres.lifted):
             return
         cres.library._ensure_finalized()  # a callback's is not yet

@@ -196,6 +196,6 @@ def _add_overload(dispatcher: Any, cres: Any) -> None:
 
 
 def adopt(dispatcher: Any) -> None:
-    """Have a dispatcher made with `KernelCompiler` tell the two kinds of code apart."""
+    """Have a dispatcher made with `KernelCompiler` distinguish the two kinds of code."""
     dispatcher.compile = python_types.MethodType(_compile, dispatcher)
     dispatcher.add_overload = python_types.MethodType(_add_overload, dispatcher)

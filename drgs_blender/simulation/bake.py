@@ -69,8 +69,8 @@ def bake(
     frame = start
     try:
         for frame in range(start + 1, settings.last + 1):
-            told = None if progress is None else (lambda part, f=frame: progress(f, part))
-            solver.advance(1 / settings.fps, job.pin_targets(frame - settings.first), cancelled, told)
+            report = None if progress is None else (lambda part, f=frame: progress(f, part))
+            solver.advance(1 / settings.fps, job.pin_targets(frame - settings.first), cancelled, report)
             _check_own(cache, job)
             cache.write(frame, job.now())
             done += 1

@@ -37,7 +37,7 @@ class NoisyFrame:
     Attributes
     ----------
     shot : Shot
-        Its light and what tells its surfaces apart; its motion leads one frame back.
+        Its light and the denoiser's guides; its motion leads one frame back.
     passes : dict of str to array
         By name, those of the light excepted.
     metadata : dict of str to str

@@ -139,7 +139,7 @@ class Film:
                 )  # fmt: skip
 
     def guides(self) -> Guides:
-        """What the denoiser tells surfaces apart by."""
+        """The denoiser's guides: what differs from surface to surface."""
         known = self.pixels._asdict()
         shared = {name: known[name] for name in Guides._fields if name in known}
         return Guides(**shared, footprint=footprints(self.pixels.depth, self.parameters))

@@ -152,7 +152,7 @@ def ggx_directions(rays, count):  # type: ignore[no-untyped-def]
 
 @njit
 def brdf_directions(rays, count):  # type: ignore[no-untyped-def]
-    """Directions from the mixture of both lobes; CELL tells which (1 diffuse, 0 specular)."""
+    """Directions from the mixture of both lobes; CELL says which (1 diffuse, 0 specular)."""
     s, ints = rays
     for p in range(packets(count)):
         b, c = p * _FLOATS, p * _INTS

@@ -94,7 +94,7 @@ def nearest(tracer, ray):  # type: ignore[no-untyped-def]
 
 @njit
 def shadowed(tracer, ray):  # type: ignore[no-untyped-def]
-    """Whether anything lies on a `Ray` that its mask tells it to meet."""
+    """Whether a shadow `Ray` is blocked by anything that its mask includes."""
     return blocked(tracer.occluded, tracer.scene, ray)
 
 

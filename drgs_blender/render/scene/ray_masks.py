@@ -18,7 +18,7 @@ HOLDOUT, CATCHER = 1, 2
 
 
 def group_mask(visibility: Visibility, surfels: bool, seen_only: bool = False) -> int:
-    """Mask of what has this visibility; `surfels` tells DR-GS meshes from ordinary ones.
+    """Mask of what has this visibility; `surfels` is true for DR-GS meshes.
 
     Of a DR-GS mesh that is `seen_only`, light does not meet the triangles.
     """
