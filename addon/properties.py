@@ -11,7 +11,7 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, Po
 from ..drgs_blender.core.frame import RenderSettings
 from ..drgs_blender.core.passes import PASSES, Pass
 from . import mesh_display
-from .adjustment import DrgsAdjustment
+from .adjustment_settings import DrgsAdjustmentSettings
 from .physics_settings import DrgsPhysicsSettings
 from .property_limits import Limited
 from .submit import DrgsSubmitSettings
@@ -303,7 +303,9 @@ class DrgsObjectSettings(bpy.types.PropertyGroup):
     )
 
     adjustment: PointerProperty(
-        type=DrgsAdjustment, name="Adjustments", description="Changes on top of the material attributes of the object"
+        type=DrgsAdjustmentSettings,
+        name="Adjustments",
+        description="Changes on top of the material attributes of the object",
     )
     show_captured: BoolProperty(
         name="Show as Captured",
@@ -333,7 +335,7 @@ GROUPS = (
 
 
 def register() -> None:
-    bpy.utils.register_class(DrgsAdjustment)
+    bpy.utils.register_class(DrgsAdjustmentSettings)
     for group, owner in GROUPS:
         bpy.utils.register_class(group)
         owner.drgs = PointerProperty(type=group, name="DR-GS")
@@ -343,4 +345,4 @@ def unregister() -> None:
     for group, owner in reversed(GROUPS):
         del owner.drgs
         bpy.utils.unregister_class(group)
-    bpy.utils.unregister_class(DrgsAdjustment)
+    bpy.utils.unregister_class(DrgsAdjustmentSettings)

@@ -11,8 +11,8 @@ import bpy
 from ...drgs_blender.core.errors import UsageError
 from ...drgs_blender.core.frame import Camera, Frame
 from .. import assets, compositing, preferences
-from ..passes import enabled
 from ..property_limits import Limited
+from ..view_layer_passes import enabled
 from .camera import export_camera, picture_of
 from .export_cache import ExportCache, uid
 from .images import end_export

@@ -18,7 +18,7 @@ from ...drgs_blender.ipc.protocol import Passes
 from .. import background_render, engine_link, messages
 from ..export import export_frame
 from ..export.instances import uncancelled
-from ..passes import blender_name, enabled
+from ..view_layer_passes import blender_name, enabled
 from ..viewport import views
 from . import blur
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from ..core.asset.model import PosedSurfels
 from .film.motion_vectors import Instant
 from .lights.environment import EnvironmentLight
-from .lights.lights import Lights
+from .lights.light_sampler import Lights
 from .scene.trace_scene import TraceScene
 from .surfels.surfel_bvh import SurfelBVH
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from ...compute.warp.kernels import Launcher
 from ..lights.environment import ROTATION, EnvironmentLight, EnvMap
-from ..lights.lights import Lights
+from ..lights.light_sampler import Lights
 from ..memory import Place, address
 from ..scene.interaction import Geometry
 from ..scene.ray_masks import CAMERA, DIFFUSE, GLOSSY, ORDINARY, SHADOW, SURFELS, WITHOUT

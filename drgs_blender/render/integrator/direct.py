@@ -6,8 +6,8 @@ import numpy as np
 
 from ...compute.jit import njit
 from ..lights.environment import envmap_radiance
+from ..lights.light_sampler import emission_along, lights_along
 from ..lights.light_shapes import DIFFUSE, GLOSSY
-from ..lights.lights import emission_along, lights_along
 from ..sampling import ONE, ZERO, F, luminance
 from ..scene import ray_masks
 from . import wavefront as w

@@ -11,8 +11,8 @@ import numpy as np
 
 from ...compute.jit import njit
 from ..lights.environment import envmap_pdf, envmap_radiance, map_at
+from ..lights.light_sampler import emission_along, lights_along
 from ..lights.light_shapes import DIFFUSE, GLOSSY
-from ..lights.lights import emission_along, lights_along
 from ..lights.product_sampling import product_row
 from ..sampling import GOLDEN, ONE, ZERO, F, U, mix, unit
 from ..scene import ray_masks

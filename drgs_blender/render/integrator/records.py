@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..lights.environment import EnvMap
-from ..lights.lights import LightTables
+from ..lights.light_sampler import LightTables
 from ..scene.interaction import Geometry
 
 Array = np.ndarray

@@ -16,7 +16,7 @@ import numpy as np
 from ...compute.jit import inlined, njit
 from .. import sampling
 from ..lights.environment import cell_at, cell_end, direction_in_cell, envmap_pdf, envmap_touch, first_cell, map_at
-from ..lights.lights import sample_light
+from ..lights.light_sampler import sample_light
 from ..lights.product_sampling import block_of, in_cells_order
 from ..sampling import INVERSE_PI, ONE, TWO, ZERO, F, U, luminance, mix, scrambled, unit
 from . import brdf

@@ -1,4 +1,4 @@
-"""Adjustments of a DR-GS object: how it looks next to how it was captured or painted, with keyframes and a way back."""
+"""Settings that adjust an object's material: changes to what was captured or painted, with keyframes and a way back."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ NUMBERS = (
 _NEUTRAL = ((1.0, 1.0, 1.0), 0.0, 1.0, 1.0, *(2 * (1.0, 0.0, 0.0, 1.0)))
 
 
-def _masks(settings: DrgsAdjustment, context: bpy.types.Context, typed: str) -> Iterable[str]:
+def _masks(settings: DrgsAdjustmentSettings, context: bpy.types.Context, typed: str) -> Iterable[str]:
     """Names that the mask may have."""
     obj = settings.id_data
     return mesh_arrays.mask_names(obj, typed) if obj.type == "MESH" else []
 
 
-def _tag_changed(settings: DrgsAdjustment, context: bpy.types.Context) -> None:
+def _tag_changed(settings: DrgsAdjustmentSettings, context: bpy.types.Context) -> None:
     """Have viewports and exports see a change that a script made; those in the interface they see anyway."""
     settings.id_data.update_tag(refresh={"OBJECT"})
 
@@ -38,7 +38,7 @@ def _number(label: str, about: str, **limits: float) -> FloatProperty:
     return FloatProperty(name=label, description=about, precision=3, step=1, update=_tag_changed, **limits)
 
 
-class DrgsAdjustment(bpy.types.PropertyGroup):
+class DrgsAdjustmentSettings(bpy.types.PropertyGroup):
     """Changes on top of the material attributes of an object; see drgs_blender.core.frame.Adjustment."""
 
     use: BoolProperty(
@@ -100,7 +100,7 @@ class DrgsAdjustment(bpy.types.PropertyGroup):
             self.property_unset(name)
         self.id_data.update_tag(refresh={"OBJECT"})
 
-    def take(self, other: DrgsAdjustment) -> None:
+    def take(self, other: DrgsAdjustmentSettings) -> None:
         """Have the values of another object's."""
         for name in ("use", "tint", *NUMBERS, "mask", "use_invert"):
             setattr(self, name, getattr(other, name))
