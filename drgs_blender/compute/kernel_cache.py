@@ -1,4 +1,4 @@
-"""Compiled kernels on disk: one file each, checked before it is used.
+"""The kernel cache: compiled kernels on disk, one file each, checked before it is used.
 
 A file's name says everything on which the machine code depends: the function and its argument types, the import
 closure of its module (`closure`), the target processor, and the versions of Python, Numba and LLVM. Its content

@@ -1,4 +1,4 @@
-"""Compile what jobs need before it is called, in as many processes as there are processors.
+"""Ahead-of-time compilation of the kernels that jobs need, in as many processes as there are processors.
 
 python -m drgs_blender.compute.prepare [--all | JOB ...]
 """

@@ -1,4 +1,4 @@
-"""The one table of render passes: the engine fills it, the EXR writer and Blender's view layer read it."""
+"""The one table of render passes (AOVs): the engine fills it, the EXR writer and Blender's view layer read it."""
 
 from __future__ import annotations
 

@@ -1,10 +1,10 @@
-"""Mesh-driven deformation: surfels follow the faces they hang on, exactly.
+"""Mesh-driven deformation: surfels follow exactly the faces that they are bound to.
 
 A face and its unit normal span space, so the deformation gradient of a face is F = [e1' e2' n'] [e1 e2 n]^-1 and the
-scaled tangents become T' = F T. With C = [e1 e2 n]^-1 T precomputed, a frame costs three vertices, one normal and a
-3x3 by 3x2 product a surfel. Rotations are never blended: F comes from the face, and the shading normal from smooth
-vertex normals. A surfel larger than its face has a second F, of three vertices as far apart as it is large, and takes
-the one that stretches it less: neither a single face that is carried badly nor a gap within its reach smears it.
+scaled tangents become T' = F T. With C = [e1 e2 n]^-1 T precomputed, a frame costs three vertices, one normal and a 3x3
+by 3x2 product a surfel. Unlike skinning, this blends no rotations: F comes from the face, and the shading normal from
+smooth vertex normals. A surfel larger than its face has a second F, of three vertices as far apart as it is large, and
+takes the one that stretches it less: neither a single face that is carried badly nor a gap within its reach smears it.
 """
 
 from __future__ import annotations

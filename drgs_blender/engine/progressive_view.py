@@ -1,4 +1,4 @@
-"""The picture of one viewport while it grows: first a coarse one within a set time, then more and more samples."""
+"""Progressive rendering of one viewport: a coarse picture within a set time, then more and more samples."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One frame after the other: composes the stages and keeps what did not change. The only state of the engine.
+"""The session: one frame after the other, composed of the stages; keeps what did not change. The engine's only state.
 
 Usable without the process: ``Session().render(frame)`` gives the same bits as a client's ``render``.
 """

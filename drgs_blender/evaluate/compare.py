@@ -1,4 +1,4 @@
-"""An asset against what is known of the object: views left out, other lights, other poses, materials, shape."""
+"""Scores of an asset against ground truth: views left out, other lights, other poses, materials, shape."""
 
 from __future__ import annotations
 

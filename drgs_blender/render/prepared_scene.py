@@ -1,4 +1,4 @@
-"""What a frame becomes before it is rendered."""
+"""The prepared scene: what a frame becomes before it is rendered."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Frames of a job into a cache; what is there already stays."""
+"""Bakes a simulation: frames of a job into a cache; what is there already stays."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How far what is shown is from the photographs. Radiance is linear Rec.709; photographs lie in [0, 1]."""
+"""Losses of inverse rendering: pixels against photographs. Radiance is linear Rec.709; photographs lie in [0, 1]."""
 
 from __future__ import annotations
 

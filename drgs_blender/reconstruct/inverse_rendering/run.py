@@ -1,4 +1,4 @@
-"""Decoupling: pixels of all photographs, a step at a time, until materials and light explain them."""
+"""Inverse rendering (decoupling): steps over the pixels of all photographs, until materials and light explain them."""
 
 from __future__ import annotations
 

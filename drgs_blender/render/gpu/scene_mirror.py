@@ -1,4 +1,4 @@
-"""What a device knows of a scene: copies of the arrays behind every address, and Warp's trees."""
+"""The copy of a scene on a device: the arrays behind every address, and Warp's BVHs."""
 
 from __future__ import annotations
 

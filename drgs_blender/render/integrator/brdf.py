@@ -1,4 +1,4 @@
-"""The surface: GGX over Lambert, in two looks, as scalar functions for compiled code.
+"""The BRDF, all there is of a BSDF here: GGX over Lambert, in two models, as scalar functions for compiled code.
 
 ``paper`` (0): Cook-Torrance GGX with height-correlated Smith and Schlick Fresnel, F0 = 0.04 (1 - m) + m a; diffuse
 (1 - m) a / pi. ``principled`` (1): Blender's Principled BSDF (distribution GGX, IOR 1.5, no other lobe): a metallic

@@ -1,6 +1,6 @@
 """Indirect light: paths continued in batches from the hits of direct samples.
 
-Every path vertex takes next-event estimation of environment and lights, one sample each, and one BRDF sample, combined
+Every path vertex takes next event estimation of environment and lights, one sample each, and one BRDF sample, combined
 by multiple importance sampling (balance heuristic). The throughput is the path's weight so far; from the fourth vertex
 on, Russian roulette ends paths by it.
 """

@@ -244,7 +244,11 @@ def warm(rays, count, envmap):  # type: ignore[no-untyped-def]
 
 @njit
 def evaluate(rays, count, shading_model):  # type: ignore[no-untyped-def]
-    """BRDF of both lobes times cosine, densities of cosine and GGX sampling, and LIVE: whether any light can pass."""
+    """BRDF of both lobes times cosine, pdfs of cosine and GGX sampling, and LIVE: whether any light can pass.
+
+    Light passes only above both the geometric and the shading normal: the shadow terminator of coarse meshes shows
+    their faces, and is not softened.
+    """
     s = rays.floats
     for p in range(packets(count)):
         for i in range(p * _FLOATS, p * _FLOATS + LANES):

@@ -1,4 +1,4 @@
-"""The environment light: radiance from a direction, and directions in proportion to radiance.
+"""The environment light (environment map): radiance from a direction, and directions in proportion to radiance.
 
 A texel's directions are drawn uniformly over its solid angle (uniform in azimuth and in z), so its density is one
 constant, finite at the poles. Its probability is the luminance, averaged over the texel as the bilinear lookup sees it,

@@ -1,4 +1,4 @@
-"""Which rays meet what: the bits of a group's mask and of a ray's."""
+"""Ray masks: which rays meet which objects, as bits of a group and of a ray."""
 
 from __future__ import annotations
 
