@@ -1,4 +1,4 @@
-"""The object's mesh follows the cache: a PC2 file that grows with it, played by a Mesh Cache modifier.
+"""Playback of a particle cache: a PC2 file that grows with it, played by a Mesh Cache modifier.
 
 Blender itself plays it, by its own frame number: the same in viewports, F12, `blender -b` and on farms that lack the
 extension, in any order of frames, between them (motion vectors), after undo and after loading, and nothing is called at

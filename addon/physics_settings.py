@@ -1,4 +1,4 @@
-"""What the artist sets: material, regions, pins, colliders, space, frames, folder. The state of a bake is not."""
+"""Settings of DR-GS Physics: material, regions, pins, colliders, domain, frames, folder; not the state of a bake."""
 
 from __future__ import annotations
 

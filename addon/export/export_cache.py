@@ -1,4 +1,4 @@
-"""What earlier exports made, for as long as nothing that it was made of changes.
+"""The export cache: what earlier exports made, for as long as nothing that it was made of changes.
 
 A viewport exports after every change; only what changed is read again. What is remembered is frozen, so that the
 engine's client sees by identity that it need not be sent.

@@ -1,4 +1,4 @@
-"""DR-GS objects in viewports of any shading: lit by the engine, or as plain discs without it.
+"""Viewport display of DR-GS objects in any shading: lit by the engine, or as plain discs without it.
 
 Both are drawn after Blender's own objects and tested against their depth: nearer ones hide those, farther ones stay
 behind them. The meshes that carry the surfels would hide them too, so they are shown as boxes meanwhile. Where Blender

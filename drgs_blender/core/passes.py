@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Pass:
-    """One render pass.
+    """One render pass (AOV).
 
     Attributes
     ----------

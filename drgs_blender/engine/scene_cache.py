@@ -1,4 +1,4 @@
-"""The scene of the last frame: assets, posed objects, light. What did not change from frame to frame is kept."""
+"""The scene cache: assets, posed objects and light of the last frame, kept as far as they did not change."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ class Instant(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """Where the surfaces of a picture are at another time, mostly one frame earlier.
+    """The motion vector of each pixel: where its surface is at another time, mostly one frame earlier.
 
     Attributes
     ----------

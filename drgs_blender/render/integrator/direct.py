@@ -1,6 +1,7 @@
 """Direct light: samples of one strategy in batches (draw, evaluate, pdfs, trace), joined by MIS (balance heuristic).
 
-The balance heuristic is the power heuristic with exponent 1: each sample is divided by the sum of all strategies' pdfs.
+Multiple importance sampling with the balance heuristic (the power heuristic with exponent 1): each sample is divided by
+the sum of all strategies' pdfs.
 """
 
 from __future__ import annotations

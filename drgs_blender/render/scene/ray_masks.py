@@ -1,4 +1,4 @@
-"""Ray masks: which rays meet which objects, as bits of a group and of a ray."""
+"""Ray masks, for ray visibility: which rays meet which objects, as bits of a group and of a ray."""
 
 from __future__ import annotations
 
