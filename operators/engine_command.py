@@ -42,7 +42,7 @@ class CommandOperator(DrgsOperator):
         return ""
 
     def follow(self, context: bpy.types.Context, said: str) -> None:
-        """Told now and then while the program works beside a window: all that it has said."""
+        """Called now and then while the program works beside a window, with all its output."""
 
     def stopped(self, event: bpy.types.Event) -> bool:
         """Whether the work is to end before its time."""

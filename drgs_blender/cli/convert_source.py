@@ -1,4 +1,4 @@
-"""What ``drgs convert`` reads: splats, mesh and light of a file, as far as it has them; Z up, in the chosen colour."""
+"""The input of ``drgs convert``: splats, mesh and light of a file, where it has them; Z up, in the chosen colour."""
 
 from __future__ import annotations
 

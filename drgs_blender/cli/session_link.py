@@ -1,4 +1,4 @@
-"""How a chunk of frames reaches the engine of its session: files in a folder that only its owner may use.
+"""The link of a chunk of frames to the engine of its session: files in a folder that only its owner may use.
 
 | File | |
 |---|---|

@@ -1,4 +1,4 @@
-"""How Numba compiles kernels here: functions that only kernels call are compiled once, as a part of their kernels.
+"""Numba's compiler, changed so that functions that only kernels call are compiled once, as a part of their kernels.
 
 Numba makes of each compiled function a library of its own, with machine code and a wrapper for Python, even of one
 that no Python code calls; and it optimises its code again in all that call it. Both are left out here for functions

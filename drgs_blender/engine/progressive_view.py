@@ -16,7 +16,7 @@ from ..render.prepared_scene import PreparedScene
 from ..render.progressive import Progressive, coarse, thinned
 
 IsCancelled = Callable[[], bool]
-#: Makes a whole picture of a frame, telling its progress.
+#: Makes a whole picture of a frame, and reports progress.
 Draw = Callable[[Frame, PreparedScene, Progress], Passes]
 
 #: Seconds that the pixels of a first picture may take (projecting the surfels comes on top, whatever its size).

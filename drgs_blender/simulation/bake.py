@@ -40,7 +40,7 @@ def bake(
     cancelled : callable, optional
         Asked before every time step.
     progress : callable, optional
-        Told the frame that is computed and which part of it is done.
+        Called with the frame that is computed and the part of it that is done.
 
     Returns
     -------

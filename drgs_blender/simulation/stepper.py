@@ -113,7 +113,7 @@ class Stepper(ABC):
         cancelled : callable, optional
             Asked before each step.
         progress : callable, optional
-            Told which part of the frame is done.
+            Called with the part of the frame that is done.
 
         Raises
         ------

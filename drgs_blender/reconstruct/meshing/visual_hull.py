@@ -1,4 +1,4 @@
-"""Where the object is: a region from the cameras, and the visual hull of the masks as the first surface.
+"""The visual hull of the masks as the first surface, and the region of the object from the cameras.
 
 A point belongs to the visual hull when no view that has it in its picture shows background there (Laurentini 1994).
 Surfels that start on it need not be found by gradients.

@@ -1,4 +1,4 @@
-"""From blended surfels to shading points whose secondary rays are safe.
+"""Blended surfels to shading points whose secondary rays are safe.
 
 Rays that light a surfel meet the mesh, and the mesh is not where the surfels are: a ray that starts at a surfel below
 the mesh is blocked by its own surface, one that starts above misses contact shadows. Every point is therefore moved to

@@ -1,4 +1,4 @@
-"""What the integrator's kernels take besides points and batches of rays: the scene, the settings and the sampler."""
+"""Records of the integrator's kernels, besides points and batches of rays: the scene, the settings and the sampler."""
 
 from __future__ import annotations
 
