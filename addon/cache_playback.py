@@ -1,4 +1,4 @@
-"""The object's mesh follows the cache: a PC2 file that grows with it, played by a Mesh Cache modifier.
+"""Playback of a particle cache: a PC2 file that grows with it, played by a Mesh Cache modifier.
 
 Blender itself plays it, by its own frame number: the same in viewports, F12, `blender -b` and on farms that lack the
 extension, in any order of frames, between them (motion vectors), after undo and after loading, and nothing is called at
@@ -116,7 +116,7 @@ class Playback:
     def _count_of(self, header: Header, there: set[int]) -> int:
         """Frames in the file that are those of the cache; 0 where its first or last is not, to start over."""
         if self._matrices is not None:
-            return 0  # the cache does not tell whether these have changed
+            return 0  # the cache does not record whether these have changed
         try:
             with open(self.path, "rb") as file:
                 magic, _, points, _, _, count = _HEAD.unpack(file.read(_HEAD.size))

@@ -54,7 +54,7 @@ def requirements(source: Path = SOURCE, group: Group = ENGINE) -> tuple[str, ...
 
 @functools.cache
 def digest(source: Path = SOURCE) -> str:
-    """What tells one state of the engine's sources from another."""
+    """Fingerprint of the engine's sources."""
     found = hashlib.sha256()
     for path in sorted((source / PACKAGE).rglob("*.py")):
         found.update(path.relative_to(source).as_posix().encode())

@@ -167,7 +167,7 @@ class EngineSetup:
         return not step.needed
 
     def _reason(self, code: int) -> str:
-        """Why a command failed, in its own words, as far as they can be told from the others."""
+        """Why a command failed, in its own words, as far as those are found in its output."""
         for line in self._tail:
             if unreached := _UNREACHED.search(line):
                 kind = unreached[2] or unreached[3]

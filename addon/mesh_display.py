@@ -1,4 +1,4 @@
-"""How the meshes of DR-GS objects are displayed while the viewport draws their splats in their place."""
+"""Viewport display of the meshes of DR-GS objects while the viewport draws their splats in their place."""
 
 from __future__ import annotations
 

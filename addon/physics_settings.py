@@ -1,4 +1,4 @@
-"""What the artist sets: material, regions, pins, colliders, space, frames, folder. The state of a bake is not."""
+"""Settings of DR-GS Physics: material, regions, pins, colliders, domain, frames, folder; not the state of a bake."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ OF_MODEL = {
 #: Numbers that Blender keeps in radians and the engine in degrees.
 ANGLES = ("friction_angle",)
 _FIRST = MATERIALS["jelly"]
-#: Newer Blenders want to be told that a path may start with "//".
+#: Newer Blenders need this option on paths that may start with "//".
 _BLEND_RELATIVE = "is_path_supports_blend_relative" in bpy.types.StringProperty.bl_rna.properties
 _RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"} if _BLEND_RELATIVE else set()
 

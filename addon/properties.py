@@ -11,7 +11,7 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, Po
 from ..drgs_blender.core.frame import RenderSettings
 from ..drgs_blender.core.passes import PASSES, Pass
 from . import mesh_display
-from .adjustment import DrgsAdjustment
+from .adjustment_settings import DrgsAdjustmentSettings
 from .physics_settings import DrgsPhysicsSettings
 from .property_limits import Limited
 from .submit import DrgsSubmitSettings
@@ -207,8 +207,8 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
     )
     seed: IntProperty(
         name="Seed",
-        description="Start value of the random numbers: the same seed gives the same noise. Compare two to tell noise "
-        "from detail",
+        description="Start value of the random numbers: the same seed gives the same noise. Compare two to see "
+        "what is noise and what is detail",
         default=0,
         min=0,
     )
@@ -223,7 +223,7 @@ class DrgsSceneSettings(bpy.types.PropertyGroup):
     def to_settings(
         self, film_transparent: bool, threads: int, warn: Callable[[str], None] = lambda text: None
     ) -> RenderSettings:
-        """The engine's settings; `warn` is told of those that cannot be."""
+        """The engine's settings; `warn` is called with a message for those out of range."""
         own = Limited(self, f'Scene "{self.id_data.name}"', warn)
         strategies = own.cosine_samples, own.ggx_samples, own.environment_samples
         return RenderSettings(
@@ -272,7 +272,7 @@ class DrgsViewLayerSettings(bpy.types.PropertyGroup):
     )
 
 
-def _tell(group: DrgsObjectSettings, context: bpy.types.Context) -> None:
+def _tag_changed(group: DrgsObjectSettings, context: bpy.types.Context) -> None:
     """Have viewports see a change that a script made."""
     group.id_data.update_tag(refresh={"OBJECT"})
 
@@ -303,14 +303,16 @@ class DrgsObjectSettings(bpy.types.PropertyGroup):
     )
 
     adjustment: PointerProperty(
-        type=DrgsAdjustment, name="Adjustments", description="Changes on top of the material attributes of the object"
+        type=DrgsAdjustmentSettings,
+        name="Adjustments",
+        description="Changes on top of the material attributes of the object",
     )
     show_captured: BoolProperty(
         name="Show as Captured",
         description="Before and after: render the object with the material of its asset, without what is painted, "
         "preset or adjusted. Nothing of that is lost",
         default=False,
-        update=_tell,
+        update=_tag_changed,
     )
     physics: PointerProperty(
         type=DrgsPhysicsSettings, name="Physics", description="The simulation of the object and its material"
@@ -333,7 +335,7 @@ GROUPS = (
 
 
 def register() -> None:
-    bpy.utils.register_class(DrgsAdjustment)
+    bpy.utils.register_class(DrgsAdjustmentSettings)
     for group, owner in GROUPS:
         bpy.utils.register_class(group)
         owner.drgs = PointerProperty(type=group, name="DR-GS")
@@ -343,4 +345,4 @@ def unregister() -> None:
     for group, owner in reversed(GROUPS):
         del owner.drgs
         bpy.utils.unregister_class(group)
-    bpy.utils.unregister_class(DrgsAdjustment)
+    bpy.utils.unregister_class(DrgsAdjustmentSettings)

@@ -31,9 +31,9 @@ class Limited:
             if limited != parts:
                 kept = limited if prop.is_array else limited[0]
         if kept is not value:
-            told = f"{value:g}" if isinstance(value, float) else "unknown" if value == "" else str(value)
+            shown = f"{value:g}" if isinstance(value, float) else "unknown" if value == "" else str(value)
             self._warn(
-                f"{self._subject}: {prop.name} is {told}, which this DR-GS cannot take; {kept} is used. Set it again"
+                f"{self._subject}: {prop.name} is {shown}, which this DR-GS cannot take; {kept} is used. Set it again"
             )
         return kept
 

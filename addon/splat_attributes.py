@@ -1,4 +1,4 @@
-"""Splats as point attributes in Blender, told as the columns of a 3DGS PLY.
+"""Splats as point attributes in Blender, converted from and to the columns of a 3DGS PLY.
 
 Read are the names of PLY files, which Blender's PLY importer keeps; those of Blender's own splats, which it has from
 version 5.3 on; and those of gaussian-splatting-blender-addon. Written are Blender's own.

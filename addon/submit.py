@@ -236,7 +236,7 @@ def start(scene: bpy.types.Scene) -> Submission:
     if bpy.app.background:
         while not job.poll():
             time.sleep(0.02)
-        _tell(job)
+        _report(job)
     elif not bpy.app.timers.is_registered(follow):
         bpy.app.timers.register(follow, first_interval=INTERVAL, persistent=True)
     return job
@@ -248,7 +248,7 @@ def follow() -> float | None:
         return None
     ended = job.poll()
     if ended:
-        _tell(job)
+        _report(job)
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
             if area.type == "PROPERTIES":
@@ -256,7 +256,7 @@ def follow() -> float | None:
     return None if ended else INTERVAL
 
 
-def _tell(job: Submission) -> None:
+def _report(job: Submission) -> None:
     for note in job.notes:
         messages.note("WARNING", note)
     messages.note("ERROR" if job.error else "INFO", job.error or job.text)

@@ -63,7 +63,7 @@ def nodes_of(world: bpy.types.World | None) -> tuple[bpy.types.Node, bpy.types.N
 
 
 def shines(world: bpy.types.World | None) -> bool:
-    """Whether an image or a sky lights a world, as far as can be told from the kinds of its nodes."""
+    """Whether an image or a sky lights a world, as far as the kinds of its nodes show."""
     nodes = world.node_tree.nodes if world is not None and world.node_tree is not None else ()
     return any(n.type in ("TEX_ENVIRONMENT", "TEX_SKY", "TEX_IMAGE") and not n.mute for n in nodes)
 

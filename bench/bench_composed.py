@@ -79,7 +79,7 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=list(SCENES))
     options = parser.parse_args()
     if options.seeds < 2:
-        parser.error("--seeds: noise can be told from the rest with two pictures or more")
+        parser.error("--seeds: noise can be separated from the rest with two pictures or more")
     OUT.mkdir(parents=True, exist_ok=True)
     rows = []
     with tempfile.TemporaryDirectory() as temporary:

@@ -140,7 +140,7 @@ def main() -> None:
         f"{settings.samples} samples, one bounce), the same samples and seeds everywhere; medians of {options.runs} "
         f"runs, "
         "copies to and from the device included. Held to: 60 dB between devices. Warp runs one thread on a processor: "
-        "its row there tells that the code is right, not how fast a card is.\n\n"
+        "its row there shows that the code is right, not how fast a card is.\n\n"
         + table(["Where", "First time", "Seconds", "Speed", "PSNR of the light", "Points alike to the last bit"], rows)
     )
     body += (

@@ -2,7 +2,7 @@
 
 python bench/bench_light.py [--part equal-psnr mitsuba denoised relmse cost efficiency ablation] [--size 200] ...
 
-Each part writes its own section. Everything runs on two processors, as far as the system can be told so.
+Each part writes its own section. Everything runs on two processors, as far as the system allows that to be set.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 python bench/bench_parity.py [--size 256] [--seeds 4] [--spp 1024] [--samples 4096]
 
 Every picture is rendered `seeds` times by either program with independent random numbers. Their means are compared as
-they are, and what differs between the programs is told from the noise of both, see `judge.systematic_error`: a sun
+they are, and what differs between the programs is separated from the noise of both, see `judge.systematic_error`: a sun
 that a polished leg mirrors onto a matte one reaches one path in 10^5 or so, and ten pixels of such luck can decide the
 dB of a whole picture.
 """
@@ -44,7 +44,7 @@ class Score:
         return max(self.error, 0.0) + 2 * self.deviation
 
     def __str__(self) -> str:
-        """`error` in dB; where it cannot be told from zero, what it is better than."""
+        """`error` in dB; where it cannot be distinguished from zero, what it is better than."""
         return f"{decibels(self.error):.1f}" if self.error > 2 * self.deviation else f"> {decibels(self.bound):.1f}"
 
 
@@ -89,7 +89,7 @@ def main() -> None:
     parser.add_argument("--lights", nargs="+", default=LIGHTS)
     options = parser.parse_args()
     if options.seeds < 2:
-        parser.error("--seeds: noise can be told from the rest with two pictures or more")
+        parser.error("--seeds: noise can be separated from the rest with two pictures or more")
     names = [(mesh, light, bent) for mesh in options.meshes for light in options.lights for bent in (False, True)]
     cases = {name: pictures(options, *name) for name in names}
     cycles_pictures([job for _, jobs in cases.values() for job in jobs], "parity")
@@ -149,7 +149,7 @@ def report(options: argparse.Namespace, scores: dict[tuple[str, str], dict[bool,
         + f"\n\n{summary('Rest', rest)} {summary('Bent', bent)}\n\n"
         f"- Noise of both programs makes {share:.0%} of the plain error, which is why it changes from pose to pose.\n"
         "- *No noise*: what is left when the differences of independent pairs of pictures are multiplied instead of "
-        "squared; `>` where that cannot be told from zero, and is better than the figure at 95 %.\n"
+        "squared; `>` where that cannot be distinguished from zero, and is better than the figure at 95 %.\n"
         "- *At equal noise*: what the pose itself changes, the bent pose's error without noise put on the noise of "
         f"the rest pose; worst {min(changes):+.2f} dB.\n"
         "- *Cycles itself*: two single pictures of Cycles with different seeds, rest / bent."

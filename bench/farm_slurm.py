@@ -45,14 +45,14 @@ def submit(trio: Trio, scene: Path, to: Path, *options: str) -> None:
     subprocess.run(line, shell=True, env=trio.env, check=True, capture_output=True, timeout=60)
 
 
-def told(to: Path, step: str = "render") -> list[str]:
+def log_lines(to: Path, step: str = "render") -> list[str]:
     """Every line of the logs of a job."""
     return [line for path in (to / "logs").glob(f"{step}-*.log") for line in path.read_text().splitlines()]
 
 
 def saved(to: Path, step: str = "render") -> list[str]:
     """Files of which a job said that they are saved."""
-    return [line for line in told(to, step) if line.startswith("Saved: ")]
+    return [line for line in log_lines(to, step) if line.startswith("Saved: ")]
 
 
 @contextlib.contextmanager
@@ -74,7 +74,7 @@ def fill(disk: Path, trio: Trio, to: Path) -> float:
     with contextlib.suppress(OSError), open(filler, "wb", buffering=0) as file:
         for _ in range(about.f_bavail + 64):
             file.write(bytes(about.f_frsize))
-    trio.until(lambda: any("wait for room" in line for line in told(to)), 120)
+    trio.until(lambda: any("wait for room" in line for line in log_lines(to)), 120)
     filler.unlink()
     return time.monotonic() - started
 
@@ -107,7 +107,7 @@ def faults(scene: Path, folder: Path, count: int, samples: int) -> str:
     rows = [
         ["frames that differ from those of one machine, of", f"{differ} of {count}"],
         ["finished frames that were made again", len(lines) - len(set(lines))],
-        ["chunks queued again: node lost, disk full", sum("attempt 2" in line for line in told(to))],
+        ["chunks queued again: node lost, disk full", sum("attempt 2" in line for line in log_lines(to))],
         ["files in the folder that are no frames", len(odd)],
         ["processes, shared memory and sockets left", leftovers(before)],
         ["seconds that the disk was full", full],

@@ -48,7 +48,7 @@ def run_cycles(jobs: list[dict[str, Any]], name: str, timeout: float = 3000) -> 
 
 
 def cycles_pictures(jobs: list[dict[str, Any]], name: str) -> None:
-    """Render those `jobs` whose pictures do not lie there yet; a picture's job is kept beside it, to tell."""
+    """Render those `jobs` whose pictures do not lie there yet; a picture's job is kept beside it, to compare."""
     missing = []
     for job in jobs:
         note = Path(job["out"]).with_suffix(".job.json")

@@ -303,7 +303,7 @@ def peak_memory() -> int:
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith("VmHWM:"):
             return int(line.split()[1]) * 1024
-    raise RuntimeError("this system does not tell a process its largest memory")
+    raise RuntimeError("this system does not report the peak memory of a process")
 
 
 def large_frame(path: Path, width: int, height: int) -> dict[str, float]:

@@ -79,9 +79,9 @@ def beams(options: argparse.Namespace) -> Rows:
     for per in (4,) if options.short else (4, 8):
         # The clamp ends at a node: how long the beam is depends on where the grid lies.
         ratios = [droop(per, 1e6, 0.1, 60, damping=8.0, offset=k / 4) / timoshenko(100.0) for k in range(4)]
-        told = f"{np.mean(ratios):.3f} ({min(ratios):.3f} to {max(ratios):.3f})"
+        shown = f"{np.mean(ratios):.3f} ({min(ratios):.3f} to {max(ratios):.3f})"
         what = f"cantilever of {per} cells, droop over Timoshenko's: mean and range of four places in the grid"
-        rows.append([what, told, "mean 0.97 to 1.03"])
+        rows.append([what, shown, "mean 0.97 to 1.03"])
     beam = cantilever(4, length=0.75, gravity=(0, 0, -0.1))
     rest = beam.points.copy()
     tip = rest[:, 0] > rest[:, 0].max() - beam.domain.spacing
@@ -99,10 +99,10 @@ def beams(options: argparse.Namespace) -> Rows:
         for youngs_modulus in (1e5, 4e5, 1.6e6)
     }
     values = list(droops.values())
-    told = ", ".join(f"{value:.3f}" for value in values)
+    shown = ", ".join(f"{value:.3f}" for value in values)
     ordered = values[0] > values[1] > values[2] > 0
     rows.append(
-        ["droop under 2 m/s² for E = 1e5, 4e5, 1.6e6, m", told, f"strictly ordered: {'yes' if ordered else 'no'}"]
+        ["droop under 2 m/s² for E = 1e5, 4e5, 1.6e6, m", shown, f"strictly ordered: {'yes' if ordered else 'no'}"]
     )
     stiff = droop(4, 1.6e6, 0.2, 24 if options.short else 60, damping=8.0) / timoshenko(200.0, youngs_modulus=1.6e6)
     rows.append(["stiffest, under 0.2 m/s², over the linear one", stiff, "0.97 to 1.03"])

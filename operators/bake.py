@@ -158,7 +158,7 @@ class DRGS_OT_bake_light(CommandOperator, selection.ObjectMode, bpy.types.Operat
         """Refuse objects of which one would get the light of another."""
         taken: dict[object, bpy.types.Object] = {}
         for obj in objects:
-            # Some disks do not tell capital letters from small ones.
+            # Some file systems are case-insensitive.
             other = taken.setdefault(self._image(obj).casefold() if self.target == "IMAGE" else obj.data, obj)
             if other is obj:
                 continue

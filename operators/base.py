@@ -28,7 +28,7 @@ class DrgsOperator:
         return self.guard(self.run, context)
 
     def guard(self, work: Callable[[bpy.types.Context], set[str]], context: bpy.types.Context) -> set[str]:
-        """Do `work`, and tell its errors."""
+        """Do `work`, and report its errors."""
         try:
             return work(context)
         except DrgsError as error:

@@ -1,4 +1,4 @@
-"""Bind to Armature: automatic weights of an existing armature, that leave no vertex behind."""
+"""Bind to Armature: skinning with automatic weights of an existing armature, that leave no vertex behind."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ from .base import DrgsOperator
 
 _INTERVAL = 0.25
 #: Seconds between two lines in the terminal of a Blender without a window.
-_TELL_EVERY = 10.0
+_REPORT_EVERY = 10.0
 
 
 class CommandOperator(DrgsOperator):
@@ -42,7 +42,7 @@ class CommandOperator(DrgsOperator):
         return ""
 
     def follow(self, context: bpy.types.Context, said: str) -> None:
-        """Told now and then while the program works beside a window: all that it has said."""
+        """Called now and then while the program works beside a window, with all its output."""
 
     def stopped(self, event: bpy.types.Event) -> bool:
         """Whether the work is to end before its time."""
@@ -156,15 +156,15 @@ class CommandOperator(DrgsOperator):
 
     def _wait(self) -> None:
         """Wait for the program, where no status bar shows how far it is: standard output does."""
-        told = ""
+        shown = ""
         while True:
             try:
-                self.process.wait(_TELL_EVERY)
+                self.process.wait(_REPORT_EVERY)
                 return
             except subprocess.TimeoutExpired:
                 state = self.state(self._said())
-            if state != told:
-                say(told := state)
+            if state != shown:
+                say(shown := state)
 
     def _said(self, last: bool = False) -> str:
         """What the program has said; when it has ended, for the last time."""

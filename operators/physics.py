@@ -38,7 +38,7 @@ class _JobOperator(DrgsOperator):
     """Runs a `bake_job.Job` for each of some objects, one after another.
 
     Step by step beside Blender's window, at once in background mode and without a window. Where one fails, that is
-    told, and the next begins.
+    reported, and the next begins.
     """
 
     _job: bake_job.Job
@@ -60,7 +60,7 @@ class _JobOperator(DrgsOperator):
         raise TypeError(f"{type(self).__name__} has no job")
 
     def done(self, context: bpy.types.Context) -> str:
-        """What to tell when it is done."""
+        """The message when it is done."""
         return ""
 
     def stopped(self) -> set[str]:

@@ -50,7 +50,7 @@ class DRGS_OT_copy_messages(DrgsOperator, bpy.types.Operator):
     bl_label = "Copy"
 
     def run(self, context: bpy.types.Context) -> set[str]:
-        context.window_manager.clipboard = told()
+        context.window_manager.clipboard = message_log()
         return {"FINISHED"}
 
 
@@ -79,8 +79,8 @@ class DRGS_OT_report(DrgsOperator, bpy.types.Operator):
         return {"FINISHED"}
 
 
-def told() -> str:
-    """All messages, one a line."""
+def message_log() -> str:
+    """All messages, one per line."""
     stamp = "%Y-%m-%d %H:%M:%S"
     return "\n".join(f"{time.strftime(stamp, time.localtime(m.time))} {m.level} {m.text}" for m in messages.history)
 
@@ -94,7 +94,7 @@ def report(context: bpy.types.Context) -> str:
         "Scene": f"{scene.render.engine}, {scene.render.resolution_x} x {scene.render.resolution_y}\n"
         + "\n".join(values(settings)),
         "Objects": "\n".join(map(described, filter(assets.is_drgs, scene.objects))) or "none",
-        "Messages": told() or "none",
+        "Messages": message_log() or "none",
     }
     return "\n\n".join(f"== {title}\n{text}" for title, text in parts.items()) + "\n"
 

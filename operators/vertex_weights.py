@@ -1,4 +1,4 @@
-"""Vertex groups as sparse arrays: read, interpolated over triangles, written."""
+"""Vertex groups (skinning weights) as sparse arrays: read, interpolated over triangles, written."""
 
 from __future__ import annotations
 

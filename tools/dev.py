@@ -413,7 +413,7 @@ def run_docs(args: argparse.Namespace) -> int:
 
 
 def with_both(program: str, rest: Sequence[str]) -> int:
-    """Run a program of the project in the engine's environment, which is told where Blender's is."""
+    """Run a program of the project in the engine's environment; `DRGS_BLENDER` names Blender's."""
     both()
     os.environ.setdefault("DRGS_BLENDER", str(python_of(blender_folder(BLENDER))))
     return run([python_of(ROOT / ".venv"), ROOT / program, *rest])

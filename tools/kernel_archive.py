@@ -49,7 +49,7 @@ class BuildError(Exception):
 
 
 def sources_digest(package: Path = PACKAGE) -> str:
-    """What tells the sources of which kernels were made from others."""
+    """Digest of the sources of which kernels are made."""
     total = hashlib.sha256()
     for path in sorted(package.rglob("*.py")):
         total.update(path.relative_to(package).as_posix().encode() + b"\0" + path.read_bytes())
@@ -96,8 +96,8 @@ def build(targets: Sequence[str], pythons: Sequence[str], out: Path = FOLDER, jo
             for python, (tag, index) in asked.items():
                 print(f"{name}, {tag}", flush=True)
                 folder = Path(temporary) / name / tag
-                told = {"NUMBA_CPU_NAME": known[name].cpu, "NUMBA_CPU_FEATURES": known[name].features}
-                _compile(python, copy, folder, told, jobs)
+                target = {"NUMBA_CPU_NAME": known[name].cpu, "NUMBA_CPU_FEATURES": known[name].features}
+                _compile(python, copy, folder, target, jobs)
                 sources[index] = next(folder.glob("sources-*.json")).read_bytes()
             made.append((shipped.archive_name(name), _pack(Path(temporary) / name)))
         digest = sources_digest(copy / PACKAGE.name)
@@ -120,10 +120,10 @@ def _facts(pythons: Sequence[str]) -> tuple[dict[str, tuple[str, str]], dict[str
     return asked, next(iter(found.values()))
 
 
-def _compile(python: str, source: Path, folder: Path, told: dict[str, str], jobs: Sequence[str]) -> None:
+def _compile(python: str, source: Path, folder: Path, target: dict[str, str], jobs: Sequence[str]) -> None:
     """Fill a cache folder from the package in `source`, by as many workers as there are processors."""
     environment = {name: value for name, value in os.environ.items() if not name.startswith(("DRGS_", "NUMBA_"))}
-    environment |= told | {"DRGS_CACHE_DIR": str(folder), "PYTHONPATH": str(source)}
+    environment |= target | {"DRGS_CACHE_DIR": str(folder), "PYTHONPATH": str(source)}
     command = [python, "-m", "drgs_blender.compute.prepare", *jobs]
     if subprocess.run(command, env=environment, cwd=source, timeout=3600).returncode:
         raise BuildError("compiling failed; its message is above")

@@ -25,8 +25,8 @@ from typing import IO
 _LINES = 12
 #: Seconds between two looks at the clock, and before time left is estimated.
 _TICK, _EARLY = 0.5, 3.0
-#: Part of a step from which on what it counts tells its speed; part that is done, at most, of one that is late.
-_TELLING, _NEARLY = 0.15, 0.9
+#: Part of a step from which on what it counts gives its speed; part that is done, at most, of one that is late.
+_ESTIMATED, _NEARLY = 0.15, 0.9
 #: Seconds that a command has to end what it started.
 _GRACE = 5.0
 _COUNT = re.compile(r"(\d+) of (\d+)")
@@ -45,7 +45,7 @@ class Step:
     name : what the others call it, and the log
     text : what is done, for people
     command : program and arguments
-    seconds : that it takes, about: what tells how much of all is done
+    seconds : that it takes, about: its weight in how much of all is done
     after : names of the steps that come before it
     makes, of : the file that it makes, and what that depends on; the same again is not made again
     count : of a line that it writes what is to be said instead of `text`, and the part that is done; or None
@@ -268,7 +268,7 @@ class _Run:
         if step.process is None:
             return pace * step.seconds
         spent = now - step.began
-        if step.part > _TELLING:
+        if step.part > _ESTIMATED:
             return spent * max(1.0 - step.part, 0.0) / step.part
         return max(pace * step.seconds - spent, (1.0 - _NEARLY) * spent)
 

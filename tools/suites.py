@@ -81,7 +81,7 @@ class Plan:
     files : list of str
         Files, folders and single tests asked for; empty for all.
     options : list of str
-        What pytest is told besides.
+        Further arguments of pytest.
     """
 
     part: str
@@ -602,7 +602,7 @@ def left_out(report: Path) -> int:
 
 
 def bytecode_kept(environment: Mapping[str, str], build: Path) -> dict[str, str]:
-    """Variables with which compiled tests are kept in ``build``, also where Python is told to keep none.
+    """Variables with which compiled tests are kept in ``build``, also where PYTHONDONTWRITEBYTECODE is set.
 
     To rewrite the assertions of all tests takes longer than to run many of them.
     """

@@ -1,4 +1,4 @@
-"""What earlier exports made, for as long as nothing that it was made of changes.
+"""The export cache: what earlier exports made, for as long as nothing that it was made of changes.
 
 A viewport exports after every change; only what changed is read again. What is remembered is frozen, so that the
 engine's client sees by identity that it need not be sent.
@@ -20,7 +20,7 @@ SHADED = ("mesh", "world")
 
 
 def uid(datablock: bpy.types.ID | None) -> int:
-    """What tells a datablock from all others of this run of Blender, the same for its evaluated copies."""
+    """Identity of a datablock in this run of Blender, the same for its evaluated copies."""
     return 0 if datablock is None else datablock.original.session_uid
 
 

@@ -11,8 +11,8 @@ import bpy
 from ...drgs_blender.core.errors import UsageError
 from ...drgs_blender.core.frame import Camera, Frame
 from .. import assets, compositing, preferences
-from ..passes import enabled
 from ..property_limits import Limited
+from ..view_layer_passes import enabled
 from .camera import export_camera, picture_of
 from .export_cache import ExportCache, uid
 from .images import end_export
@@ -45,7 +45,7 @@ def export_frame(
     Parameters
     ----------
     key_of : gives the engine's key of the asset at a path
-    warn : told of everything that cannot be rendered as the scene has it
+    warn : called with a message for everything that cannot be rendered as the scene has it
     camera : replaces the scene's camera
     frame_set : evaluates the scene at another frame, for passes of motion; without it nothing moves
     cache : what earlier exports of the same depsgraph made and is still true
@@ -91,7 +91,7 @@ def export_frame(
         else:
             meshes.add(item)
             unrendered.add(item.object)
-    unrendered.tell(warn)
+    unrendered.report(warn)
     if materials.override is not None and objects.states:
         warn(f'View layer "{layer.name}": its Material Override is of meshes; DR-GS objects keep their own materials')
     settings = scene.drgs

@@ -207,7 +207,7 @@ def _remembered(image: bpy.types.Image, kind: str, make: Callable[[bpy.types.Ima
 
 
 def _key(image: bpy.types.Image) -> tuple[object, ...] | None:
-    """What the pixels depend on, or None where that cannot be told: painted, generated and moving images."""
+    """What the pixels depend on, or None where that is not known: painted, generated and moving images."""
     if image.source != "FILE" or image.is_dirty:
         return None
     path = bpy.path.abspath(image.filepath, library=image.library)

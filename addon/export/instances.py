@@ -19,7 +19,7 @@ Warn = Callable[[str], None]
 UNRENDERED = {"CURVES": "hair", "POINTCLOUD": "point cloud", "VOLUME": "volume"}
 
 
-#: Tells an instance from all others, at any time: its object, what makes it, its number there.
+#: Identifies an instance, at any time: its object, what makes it, its number there.
 Key = tuple[int, int, tuple[int, ...]]
 
 
@@ -93,8 +93,8 @@ class Unrendered:
         elif any(p.settings.type == "HAIR" and p.settings.render_type == "PATH" for p in obj.particle_systems):
             self._names.setdefault("hair", set()).add(obj.name)
 
-    def tell(self, warn: Warn) -> None:
-        """One warning a kind."""
+    def report(self, warn: Warn) -> None:
+        """One warning per kind."""
         for kind, found in self._names.items():
             names = ", ".join(sorted(found)[:3]) + (", ..." if len(found) > 3 else "")
             objects = "object is" if len(found) == 1 else "objects are"

@@ -155,7 +155,7 @@ class SurfaceWalker(TextureWalker):
         factor = output.input(0).origin()
         first, second = self.shader(output.input(1)), self.shader(output.input(2))
         if factor.socket.is_output and factor.node.type == "LIGHT_PATH":
-            self.warn(output.node, f'"{factor.socket.name}" cannot be told apart; the first shader is used')
+            self.warn(output.node, f'"{factor.socket.name}" is not evaluated per ray; the first shader is used')
             return first
         share = self.number(output.input(0))
         if share.texture is None:

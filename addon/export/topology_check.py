@@ -1,4 +1,4 @@
-"""Whether an evaluated mesh is the asset's mesh, moved: the same vertices, joined by the same faces."""
+"""The topology check: whether an evaluated mesh is the asset's, moved: the same vertices, joined by the same faces."""
 
 from __future__ import annotations
 

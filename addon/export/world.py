@@ -126,7 +126,7 @@ class _Tree(Walker):
             factor = origin.input(0).origin()
             shaders = self.shader(origin.input(1)), self.shader(origin.input(2))
             if factor.socket.is_output and factor.node.type == "LIGHT_PATH":
-                self.warn(node, f'"{factor.socket.name}" cannot be told apart: what other rays see is used')
+                self.warn(node, f'"{factor.socket.name}" is not evaluated per ray: what other rays see is used')
                 return shaders[0]
             share = float(np.clip(self.value(origin.input(0)), 0, 1))
             return self.sum(node, shaders[0].times(1 - share), shaders[1].times(share))

@@ -7,8 +7,8 @@ from typing import Any
 import bpy
 
 from ...drgs_blender.core.passes import PASSES
-from ..passes import label
 from ..properties import switch_of
+from ..view_layer_passes import label
 
 
 class DRGS_PT_passes(bpy.types.Panel):

@@ -289,13 +289,13 @@ def cached(obj: bpy.types.Object, scene: bpy.types.Scene) -> Cached:
     Raises
     ------
     DrgsError
-        The folder cannot be told or read.
+        The folder is unknown or cannot be read.
     """
     folder, physics = folder_of(obj), obj.drgs.physics
     frames = ParticleCache(folder).frames()
     known = scene_export.stored(folder / INPUT)
     changed = False
-    # Values that are animated are those of the first frame, so that only there can be told whether they changed.
+    # Values that are animated are those of the first frame, so that only there a change of them shows.
     if frames and known is not None and (obj.animation_data is None or scene.frame_current == physics.frame_start):
         now = describe(obj, scene)
         changed = any(known.get(key) != now.get(key) for key in (set(now) | {"floor", "domain"}) - {"last"})
@@ -310,7 +310,7 @@ def free(obj: bpy.types.Object) -> None:
     Raises
     ------
     DrgsError
-        Naming the file that stays, or why the folder cannot be told.
+        Naming the file that stays, or why the folder is unknown.
     """
     folder = folder_of(obj)
     while ending():

@@ -66,7 +66,7 @@ def _draw() -> None:
         return
     try:
         _draw_all()
-    except Exception as failure:  # else it would be printed with every redraw, and told to nobody
+    except Exception as failure:  # else it would be printed with every redraw, and be in no message
         messages.log.exception("preview failed")
         shown.clear()
         messages.note(

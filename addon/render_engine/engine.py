@@ -18,7 +18,7 @@ from ...drgs_blender.ipc.protocol import Passes
 from .. import background_render, engine_link, messages
 from ..export import export_frame
 from ..export.instances import uncancelled
-from ..passes import blender_name, enabled
+from ..view_layer_passes import blender_name, enabled
 from ..viewport import views
 from . import blur
 
@@ -51,7 +51,7 @@ class DrgsRenderEngine(bpy.types.RenderEngine):
     bl_use_eevee_viewport = True
 
     def update_render_passes(self, scene: bpy.types.Scene, renderlayer: bpy.types.ViewLayer) -> None:
-        """Tell the compositor which passes a view layer has."""
+        """Register the passes that a view layer has, for the compositor."""
         for p in enabled(scene, renderlayer):
             self.register_pass(scene, renderlayer, blender_name(p), len(p.channels), p.channels, p.kind)
 
@@ -146,7 +146,7 @@ class DrgsRenderEngine(bpy.types.RenderEngine):
         """The mean of the pictures of `steps`, in place of that of `frame`."""
         done = 0
 
-        def tell(phase: str, fraction: float) -> None:
+        def report(phase: str, fraction: float) -> None:
             if is_preparing(phase):
                 self._progress(phase, fraction)
                 return
@@ -155,9 +155,9 @@ class DrgsRenderEngine(bpy.types.RenderEngine):
         def parts() -> Iterator[Passes]:
             nonlocal done
             if (still := sharp(frame)) is not None:
-                yield engine_link.render(still, tell, self._stopped)
+                yield engine_link.render(still, report, self._stopped)
             for step in blur.pictures(frame, steps, depsgraph, export, self._frame_set):
-                yield engine_link.render(share(step, len(steps), done), tell, self._stopped)
+                yield engine_link.render(share(step, len(steps), done), report, self._stopped)
                 done += 1
 
         passes = averaged(parts(), len(steps))

@@ -1,4 +1,4 @@
-"""DR-GS objects in viewports of any shading: lit by the engine, or as plain discs without it.
+"""Viewport display of DR-GS objects in any shading: lit by the engine, or as plain discs without it.
 
 Both are drawn after Blender's own objects and tested against their depth: nearer ones hide those, farther ones stay
 behind them. The meshes that carry the surfels would hide them too, so they are shown as boxes meanwhile. Where Blender
@@ -78,7 +78,7 @@ def _draw() -> None:
             if _lacks_depth(context.space_data):
                 gpu.state.active_framebuffer_get().clear(depth=1.0)
             error = draws(context, context.view_layer.depsgraph)
-    except Exception as failure:  # else it would be printed with every redraw, and told to nobody
+    except Exception as failure:  # else it would be printed with every redraw, and be in no message
         messages.log.exception("overlay failed")
         error = f"DR-GS failed ({type(failure).__name__}: {failure}); the console has the details"
     if error:

@@ -61,7 +61,7 @@ def show(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
 def _batch(obj: bpy.types.Object) -> gpu.types.GPUBatch | None:
     try:
         asset = assets.load(assets.file_of(obj))
-    except DrgsError:  # told by whoever wants to render the object
+    except DrgsError:  # reported when the object is rendered
         return None
     vertices = mesh_arrays.read_vertices(obj.data)
     sizes = _WIDTH * asset.surfels.scale.max(axis=1)
@@ -74,5 +74,5 @@ def colours(obj: bpy.types.Object, asset: Asset) -> Array:
         return asset.surfels.albedo
     try:
         return edited_asset(asset, *look_of(obj, asset, lambda text: None)).surfels.albedo
-    except DrgsError:  # told by whoever wants to render the object, as are warnings
+    except DrgsError:  # reported, as warnings are, when the object is rendered
         return asset.surfels.albedo

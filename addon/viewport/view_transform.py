@@ -1,4 +1,4 @@
-"""The scene's view transform as a table, for pictures that are drawn where Blender expects colours of the display.
+"""The scene's view transform (tone mapping) as a table, for pictures drawn where Blender expects display colours.
 
 Blender does not give its colour management to scripts, except when it saves an image: a grid of colours is saved once
 for every view transform and look, and read back. Exposure and gamma are applied by whoever uses the table.

@@ -46,6 +46,7 @@ class ViewportState:
     picture, strips : what is on the screen
     arriving, arrived : the picture that comes next, and as much of it as redraws have had time for
     since : when the first picture of this request was drawn
+    warned : warnings of the engine that are among the messages already
     """
 
     wanted: tuple[object, ...] = ()
@@ -54,7 +55,7 @@ class ViewportState:
     arriving: Picture | None = None
     arrived: list[draw.Strip] = field(default_factory=list)
     since: float = 0.0
-    told: set[str] = field(default_factory=set)
+    warned: set[str] = field(default_factory=set)
 
 
 def name_of(region: bpy.types.Region) -> str:
@@ -137,8 +138,8 @@ def _upload(shown: ViewportState, picture: Picture) -> None:
     shown.picture, shown.strips = picture, shown.arrived
     shown.arriving, shown.arrived = None, []
     for text in picture.passes.warnings:
-        if text not in shown.told:
-            shown.told.add(text)
+        if text not in shown.warned:
+            shown.warned.add(text)
             messages.note("WARNING", text)
 
 

@@ -28,7 +28,7 @@ class Request:
 
     Attributes
     ----------
-    assets : path of every asset in the frame, with what tells whether the file changed
+    assets : path of every asset in the frame, with the file's time and size, by which changes are found
     """
 
     frame: Frame
@@ -105,7 +105,7 @@ class Worker:
         return None if view is None else view.picture
 
     def state(self, name: str) -> tuple[str, str]:
-        """What to tell of a viewport: (what is being done, an error or "")."""
+        """Status of a viewport: (what is being done, an error or "")."""
         view = self._views.get(name)
         return ("", "") if view is None else (view.phase, view.error)
 
@@ -162,7 +162,7 @@ class Worker:
                     view.name,
                     request.frame,
                     not first,
-                    partial(self._tell, view),
+                    partial(self._note_phase, view),
                     self._stop_begin(view) if first else self._stop_refining(view, request),
                 )
             except Cancelled:
@@ -214,11 +214,13 @@ class Worker:
         for path, stamp in request.assets:
             if loaded.get(path) != stamp:
                 request.client.load_asset(
-                    path, lambda phase, part: self._tell(view, phase, part), lambda: self._ending or self._held > 0
+                    path,
+                    lambda phase, part: self._note_phase(view, phase, part),
+                    lambda: self._ending or self._held > 0,
                 )
                 loaded[path] = stamp
 
-    def _tell(self, view: _View, phase: str, part: float) -> None:
+    def _note_phase(self, view: _View, phase: str, part: float) -> None:
         """Take a phase in; there is news where the viewport says something else, see `views.status`."""
         changed = phase != view.phase or (is_counted(phase) and f"{part:.0%}" != f"{view.part:.0%}")
         view.phase, view.part = phase, part

@@ -1,1 +1,1 @@
-"""From foreign files to a whole asset: make, import, material transfer, proxy meshes; and out to other programs."""
+"""Assets made from foreign files: make, import, material transfer, proxy meshes; and export to other programs."""

@@ -86,7 +86,7 @@ def remove_light(
         report["clipped"] = int((known & (albedo >= 1).any(axis=1)).sum())
     report["notes"] = [
         f"albedo estimated: captured colour over the light of the environment, exposure {report['exposure']:.3g}; "
-        f"{report['too_dark']} surfels too dark to tell, {report['clipped']} as bright as white"
+        f"{report['too_dark']} surfels too dark to estimate, {report['clipped']} as bright as white"
     ]
     asset.provenance["materials"] = "estimated from captured colours, by removing the light of the environment"
     asset.provenance.setdefault("report", {})["remove_light"] = report

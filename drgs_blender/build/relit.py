@@ -13,7 +13,7 @@ from ..core.frame import RenderSettings, World
 from ..geometry.normals import rotation_matrices
 from ..render.integrator.integrate import integrate
 from ..render.lights.environment import EnvironmentLight
-from ..render.lights.lights import Lights
+from ..render.lights.light_sampler import Lights
 from ..render.points import ShadingPoints
 from ..render.scene.trace_scene import TraceObject, TraceScene
 from ..render.surfels.surfel_bvh import SurfelBVH

@@ -91,7 +91,7 @@ def _target(values: list[str]) -> Target:
 
 
 def _bake(
-    args: argparse.Namespace, session: Session, path: Path, targets: list[Target], tell: Callable[[float], None]
+    args: argparse.Namespace, session: Session, path: Path, targets: list[Target], report: Callable[[float], None]
 ) -> None:
     """Bake the objects of one frame."""
     from ..build.bake import picture, texel_points, vertex_points
@@ -120,7 +120,7 @@ def _bake(
         components = light_components(
             prepared.scene, prepared.environment, points, frame.settings, prepared.lights, tree
         )
-        tell((k + 1) / len(targets))
+        report((k + 1) / len(targets))
         colours = components[:, : 4 if args.light == "all" else 2].sum(axis=1)
         if texel is None:
             _write_npy(out, colours)

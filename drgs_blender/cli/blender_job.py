@@ -63,7 +63,7 @@ class ParentGone(Exception):
 
 
 def say_alive(link: Any, protocol: Any) -> None:
-    """Send a word every few seconds, so that the parent can tell a long evaluation from a Blender that hangs."""
+    """Send a sign of life every few seconds, which a long evaluation gives and a Blender that hangs does not."""
     with contextlib.suppress(OSError):
         while True:
             time.sleep(ALIVE_SECONDS)
@@ -173,11 +173,11 @@ class Exporter:
             "layer": depsgraph.view_layer.name if len(layers) > 1 else "",
             "pictures": len(steps),
         }
-        while isinstance(self.tell(frame, about, warnings), self.protocol.Render):
+        while isinstance(self.submit(frame, about, warnings), self.protocol.Render):
             for picture in self.blur.pictures(frame, steps, depsgraph, lambda: export(False), frame_set):
-                self.tell(picture, {}, warnings)
+                self.submit(picture, {}, warnings)
 
-    def tell(self, frame: Any, about: dict[str, Any], warnings: list[str]) -> Any:
+    def submit(self, frame: Any, about: dict[str, Any], warnings: list[str]) -> Any:
         """Send a frame with what is said `about` it, and return the answer."""
         described, arrays = self.encode_frame(frame)
         slots, changed = self.sent.changes(arrays)

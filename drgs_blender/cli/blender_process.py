@@ -205,7 +205,7 @@ class BlenderProcess:
     def _greet(self, job: dict[str, Any]) -> None:
         stream = self._process.stdout
         assert stream is not None and self._process.stdin is not None
-        with contextlib.suppress(BrokenPipeError):  # the end of stdout tells what happened
+        with contextlib.suppress(BrokenPipeError):  # the end of stdout shows that it has ended
             self._process.stdin.write(json.dumps(job).encode() + b"\n")
         self._deadline = time.monotonic() + START_SECONDS
         while (line := stream.readline()) not in (READY, b""):

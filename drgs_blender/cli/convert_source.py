@@ -1,4 +1,4 @@
-"""What ``drgs convert`` reads: splats, mesh and light of a file, as far as it has them; Z up, in the chosen colour."""
+"""The input of ``drgs convert``: splats, mesh and light of a file, where it has them; Z up, in the chosen colour."""
 
 from __future__ import annotations
 
@@ -75,8 +75,8 @@ def open_source(args: argparse.Namespace) -> Source:
     if isinstance(file, SurfelFile):
         surfels = surfels_to_z_up(file.surfels, args.from_up or file.up or "z")
         # Splats go out as they came in, unless it is their albedo that is wanted.
-        told = [note for note in file.notes if args.colour == "albedo" or note not in file.assumed]
-        return AssetSource(args, Asset(surfels, Mesh.empty()), told)
+        notes = [note for note in file.notes if args.colour == "albedo" or note not in file.assumed]
+        return AssetSource(args, Asset(surfels, Mesh.empty()), notes)
     if isinstance(file, EnvironmentFile):
         return AssetSource(args, Asset(_nothing(), Mesh.empty(), environment=file.environment), file.notes)
     if isinstance(file, MeshFile):

@@ -33,7 +33,7 @@ from .output import check_suffix, check_writable
 from .progress import bar
 
 if TYPE_CHECKING:
-    from ..render.denoise.inputs import NoisyFrame
+    from ..render.denoise.noisy_frames import NoisyFrame
 
 EXAMPLES = """examples:
   drgs denoise 'noisy/####.exr' --frames 1-24 --out 'clean/####.exr'
@@ -162,7 +162,7 @@ class _Source:
 
     def frame(self, number: int) -> NoisyFrame:
         """A noisy frame, read when first needed, and when its file is another one."""
-        from ..render.denoise.inputs import read_noisy
+        from ..render.denoise.noisy_frames import read_noisy
         from ..render.film.frame_files import read_checksum
 
         path = frame_path(self._template, number)

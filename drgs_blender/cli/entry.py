@@ -1,4 +1,4 @@
-"""Where the program `drgs` begins: Ctrl+C has its exit code even while Python imports the rest."""
+"""The entry point of the program `drgs`: Ctrl+C has its exit code even while Python imports the rest."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ def say(text: str, stream: IO[str] | None) -> None:
     except BrokenPipeError:
         raise
     except OSError:
-        pass  # there is nobody to tell
+        pass  # nobody reads it
 
 
 def say_end(arguments: Sequence[str], code: int) -> None:
@@ -45,7 +45,7 @@ def say_end(arguments: Sequence[str], code: int) -> None:
 class FrameLines:
     """Prints to stdout; a context manager that keeps a heartbeat going.
 
-    With `openjd`, the number of frames of the job, sessions of Open Job Description are told how much of it is done.
+    With `openjd`, the number of frames of the job, sessions of Open Job Description get its progress.
     The words "Error:", "Exception:" and "Warning" never occur in benign lines: strict workers fail a task on them.
     """
 

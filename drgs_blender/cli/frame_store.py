@@ -24,7 +24,7 @@ from ..core.frame import Frame
 from ..core.passes import BY_NAME
 from ..core.version import __version__
 from ..ipc.codec import encode_frame
-from ..render.denoise.inputs import describe
+from ..render.denoise.noisy_frames import camera_metadata
 from ..render.film.frame_files import read_frame, write_frame
 
 logger = logging.getLogger(__name__)
@@ -124,4 +124,4 @@ def quiet_descriptors() -> Iterator[None]:
 def save(path: Path, pictures: Mapping[str, np.ndarray], frame: Frame, number: int, settings: str) -> None:
     """Write a frame; WriteError when it cannot be written and read back."""
     metadata = {SETTINGS: settings, "frame": str(number), "seed": str(frame.settings.seed)}
-    write_frame(path, dict(pictures), metadata | describe(frame) | cryptomatte.metadata(frame))
+    write_frame(path, dict(pictures), metadata | camera_metadata(frame) | cryptomatte.metadata(frame))

@@ -1,4 +1,4 @@
-"""Where a command writes: checked before work starts, written in one step."""
+"""Output paths of commands: checked before work starts, written in one step."""
 
 from __future__ import annotations
 

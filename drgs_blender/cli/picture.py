@@ -64,25 +64,25 @@ class Picture:
 
         The time in which kernels are compiled, once on a machine, does not count.
         """
-        told, prepared = time.monotonic(), False
-        latest, count = told + timeout, max(self._shot.count, 1)
+        reported, prepared = time.monotonic(), False
+        latest, count = reported + timeout, max(self._shot.count, 1)
         hashes: list[str] = []
 
-        def tell(phase: str, fraction: float) -> None:
-            nonlocal told, prepared, latest
+        def report(phase: str, fraction: float) -> None:
+            nonlocal reported, prepared, latest
             now = time.monotonic()
             if is_preparing(phase):
-                latest += now - told if prepared else 0.0
+                latest += now - reported if prepared else 0.0
                 on_progress(phase, fraction)
             else:
                 done = min(len(hashes) - 1, count - 1)
                 on_progress(f"blur {done}/{count}: {phase}" if count > 1 else phase, (done + fraction) / count)
-            told, prepared = now, is_preparing(phase)
+            reported, prepared = now, is_preparing(phase)
 
         def rendered() -> Iterator[Passes]:
             for part in self._parts():
                 hashes.append(frame_store.settings_hash(part, assets))
-                yield engine.render(part, tell, lambda: time.monotonic() > latest)
+                yield engine.render(part, report, lambda: time.monotonic() > latest)
 
         try:
             passes = blur.averaged(rendered(), count) if self._shot.count else next(rendered())

@@ -36,7 +36,7 @@ EXAMPLES = """examples:
 """
 
 #: Seconds between two lines of progress on stdout.
-_TELL_EVERY = 2.0
+_REPORT_EVERY = 2.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -185,7 +185,7 @@ class _Teller:
         self._bar(f"{progress.phase}{about}", progress.part)
         now = time.monotonic()
         if self._lines and now >= self._next:
-            self._next = now + _TELL_EVERY
+            self._next = now + _REPORT_EVERY
             psnr = f"psnr={progress.psnr:.2f} " if known else ""
             print(
                 f'DRGS_PROGRESS part={progress.part:.3f} surfels={progress.surfels} {psnr}phase="{progress.phase}"',

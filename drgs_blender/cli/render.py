@@ -137,12 +137,12 @@ def render(args: argparse.Namespace, machine: Machine) -> int:
             else:
                 lines.begin(number)
 
-                def tell(phase: str, fraction: float, number: int = number) -> None:
+                def report(phase: str, fraction: float, number: int = number) -> None:
                     lines.progress(number, phase, fraction)
                     progress.set_description(phase if is_preparing(phase) else "frames")
 
                 try:
-                    passes, settings = picture.render(engine, machine.assets, tell, args.timeout)
+                    passes, settings = picture.render(engine, machine.assets, report, args.timeout)
                 except AssetError:
                     machine.check_assets()  # one that is just being rewritten is not a damaged one
                     raise

@@ -1,4 +1,4 @@
-"""How a chunk of frames reaches the engine of its session: files in a folder that only its owner may use.
+"""The link of a chunk of frames to the engine of its session: files in a folder that only its owner may use.
 
 | File | |
 |---|---|
@@ -130,7 +130,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--session", type=Path, metavar="FOLDER", help="let the process of `drgs session start` do it, which is warm"
     )
-    parser.add_argument("--openjd", action="store_true", help="tell an Open Job Description session the progress")
+    parser.add_argument("--openjd", action="store_true", help="report progress to an Open Job Description session")
 
 
 def hand_on(folder: Path, words: Sequence[str]) -> int | None:

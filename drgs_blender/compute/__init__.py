@@ -1,1 +1,1 @@
-"""Compiled code: Numba set up once, its cache, wide numbers."""
+"""Compiled kernels: Numba's configuration, the kernel cache, SIMD."""

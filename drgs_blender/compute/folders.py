@@ -1,4 +1,4 @@
-"""The folder in which compiled kernels are kept: where it is, whose it may be, and what is the matter with it."""
+"""The cache folder of compiled kernels: where it is, its permissions, and what is wrong with it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Compiled kernels on disk: one file each, checked before it is used.
+"""The kernel cache: compiled kernels on disk, one file each, checked before it is used.
 
 A file's name says everything on which the machine code depends: the function and its argument types, the import
 closure of its module (`closure`), the target processor, and the versions of Python, Numba and LLVM. Its content
@@ -91,7 +91,7 @@ class KernelCache(NullCache):
         return None
 
     def save_overload(self, sig: Any, cres: Any) -> None:
-        """Keep a compiled form; that it cannot be written costs time at the next start, and is told there."""
+        """Keep a compiled form; where it cannot be written, the next start compiles again and logs why."""
         if cres.library.has_dynamic_globals or any(not x.can_cache for x in cres.lifted):
             return
         cres.library._ensure_finalized()  # a callback's is not yet

@@ -1,4 +1,4 @@
-"""How Numba compiles kernels here: functions that only kernels call are compiled once, as a part of their kernels.
+"""Numba's compiler, changed so that functions that only kernels call are compiled once, as a part of their kernels.
 
 Numba makes of each compiled function a library of its own, with machine code and a wrapper for Python, even of one
 that no Python code calls; and it optimises its code again in all that call it. Both are left out here for functions
@@ -203,6 +203,6 @@ def _add_overload(dispatcher: Any, cres: Any) -> None:
 
 
 def adopt(dispatcher: Any) -> None:
-    """Have a dispatcher made with `KernelCompiler` tell the two kinds of code apart."""
+    """Have a dispatcher made with `KernelCompiler` distinguish the two kinds of code."""
     dispatcher.compile = python_types.MethodType(_compile, dispatcher)
     dispatcher.add_overload = python_types.MethodType(_add_overload, dispatcher)

@@ -1,4 +1,4 @@
-"""Compile what jobs need before it is called, in as many processes as there are processors.
+"""Ahead-of-time compilation of the kernels that jobs need, in as many processes as there are processors.
 
 python -m drgs_blender.compute.prepare [--all | JOB ...]
 """
@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 #: The one text for it, in Blender and on the command line.
 PHASE = PREPARING
 _POLL = 0.1
-_TELL = 0.4
+_REPORT = 0.4
 #: Of memory, which a process that compiles takes.
 _BYTES = 700 << 20
 
@@ -73,12 +73,12 @@ def _compile(
     if not missing:
         return
     with contextlib.closing(_Pool(missing)) as pool:
-        told = 0.0
+        reported = 0.0
         while pool.is_working():
             if cancelled is not None and cancelled():
                 raise Cancelled
-            if progress is not None and time.monotonic() - told >= _TELL:
-                told = time.monotonic()
+            if progress is not None and time.monotonic() - reported >= _REPORT:
+                reported = time.monotonic()
                 progress(f"{PHASE}, {min(pool.done + 1, len(missing))} of {len(missing)}", pool.fraction)
             pool.wait(_POLL)
 
@@ -261,12 +261,12 @@ def main(argv: list[str] | None = None) -> int:
         parser.error(f"unknown job {', '.join(sorted(unknown))}; there are {', '.join(manifest.jobs())}")
     if not options.jobs and not options.all:
         parser.error("name jobs, or --all")
-    told: list[str] = []
+    shown: list[str] = []
     jobs = list(manifest.jobs()) if options.all else options.jobs
 
     def show(phase: str, fraction: float) -> None:
-        if told[-1:] != [phase]:
-            told.append(phase)
+        if shown[-1:] != [phase]:
+            shown.append(phase)
             print(phase, flush=True)
 
     try:

@@ -1,4 +1,4 @@
-"""Sixteen single-precision numbers at once, for loops that LLVM does not vectorise by itself.
+"""SIMD: sixteen single-precision numbers at once, for loops that LLVM does not vectorise by itself.
 
 ``float32x16`` is a type of compiled code only: `load`, `repeat`, `quads` and `spread` make such values, ``+``, ``-``
 and ``*`` act on each of the sixteen, `store`, `fold` and `lanes` end them. LLVM makes of it what the processor has (one

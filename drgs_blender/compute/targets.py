@@ -31,7 +31,7 @@ class Target:
     needs : tuple of str
         What the processor must have, in LLVM's words.
     cpu, features : str
-        What LLVM is told.
+        Arguments of LLVM.
     systems : tuple of str
         Names by `platform.system` of where it is used; () is everywhere.
     """
@@ -166,11 +166,11 @@ def settle(config: Any) -> None:
 
 
 def current() -> str:
-    """Name of the target for which this process compiles: one of `TARGETS`, "native", or what Numba was told."""
+    """Name of the target for which this process compiles: one of `TARGETS`, "native", or Numba's CPU name."""
     from numba import config
 
     if config.CPU_NAME is None:
         return NATIVE
-    told = config.CPU_NAME, config.CPU_FEATURES
-    named = (t.name for t in TARGETS if (t.cpu, t.features) == told and t.machine == machine_name())
+    chosen = config.CPU_NAME, config.CPU_FEATURES
+    named = (t.name for t in TARGETS if (t.cpu, t.features) == chosen and t.machine == machine_name())
     return next(named, str(config.CPU_NAME))

@@ -1,4 +1,4 @@
-"""A process that compiles the kernels it is told into the cache: a line of JSON each, answered by ``done``.
+"""A process that compiles kernels into the cache: each request is a line of JSON, answered by ``done``.
 
 It ends with its standard input, so with the process that started it, also in the middle of a kernel.
 """

@@ -1,4 +1,4 @@
-"""Whether arrays are the same, and arrays that nobody can change."""
+"""Bitwise equality of arrays, and read-only arrays."""
 
 from __future__ import annotations
 

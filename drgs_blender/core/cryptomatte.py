@@ -1,4 +1,4 @@
-"""Names of Cryptomatte: their numbers, and the manifest that tells readers of a file which is whose.
+"""Cryptomatte: the hash of names to IDs, and the manifest by which readers of a file find the names again.
 
 A name is a number, the MurmurHash3 of its UTF-8 text read as float32 (Friedman and Jones 2015).
 """
@@ -15,7 +15,7 @@ from .frame import Frame
 
 Array = np.ndarray
 
-#: What is told apart -> the beginning of its passes.
+#: Kind of ID -> prefix of its passes.
 KINDS = {"object": "CryptoObject", "material": "CryptoMaterial"}
 #: The material of DR-GS objects, as Blender's add-on names it.
 DRGS_MATERIAL = "DR-GS"

@@ -1,4 +1,4 @@
-"""Whether a picture was written to its end, without decoding it.
+"""File integrity: whether a picture was written to its end, without decoding it.
 
 Where a disk is full, Blender leaves what fitted; and what reads pictures, shows what there is of them or crashes.
 Layouts after the file format pages of OpenEXR, PNG (ISO 15948), JPEG (T.81) and WebP (RFC 9649).

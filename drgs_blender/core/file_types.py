@@ -1,4 +1,4 @@
-"""The names of files that are read and written, and of cameras in them; `formats` knows what is in files."""
+"""File types: extensions of the files that are read and written, and of camera files; `formats` knows content."""
 
 from __future__ import annotations
 

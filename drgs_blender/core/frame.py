@@ -56,7 +56,7 @@ class Camera:
 
 @dataclass(slots=True)
 class Visibility:
-    """Which rays meet an object, as in Blender's Object > Visibility panel.
+    """Camera visibility, ray visibility: which rays meet an object, as in Blender's Object > Visibility panel.
 
     ``diffuse`` and ``glossy`` are indirect rays from a diffuse or glossy scattering, ``shadow`` rays towards lights. A
     ``holdout`` cuts a hole into the picture; of a ``shadow_catcher`` only the shadows on it are seen.
@@ -340,7 +340,8 @@ class RenderSettings:
     bounces : int
         Indirect bounces.
     subpixel_samples : int
-        Places in a pixel among which its samples are divided; 0 chooses by their number (`subpixel_count`).
+        Sub-pixel samples: places in a pixel among which its samples are divided; 0 chooses by their number
+        (`subpixel_count`).
     camera_sees, rays_see : {"surfels", "mesh"}
         What the camera sees of DR-GS objects, and what shadow and indirect rays meet of them: their meshes, or the
         surfels, blended along each ray (slower; for thin things without a good mesh).

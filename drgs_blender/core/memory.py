@@ -1,4 +1,4 @@
-"""How much memory this process may use: that of the machine, or of a container (a cgroup of Linux), if that is less."""
+"""The memory that this process may use: that of the machine, or of a container (a cgroup of Linux), if that is less."""
 
 from __future__ import annotations
 

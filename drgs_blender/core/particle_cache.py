@@ -1,4 +1,4 @@
-"""Simulated frames on disk: one file a frame, complete or not there, in a folder that can be read while it grows.
+"""The particle cache: simulated frames on disk, a file each, whole or absent, that can be read while it grows.
 
     CACHE/cache.json            what was simulated: settings, their digest, counts, frames a second
     CACHE/rest.drgp             points and vertices at rest

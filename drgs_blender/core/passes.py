@@ -1,4 +1,4 @@
-"""The one table of render passes: the engine fills it, the EXR writer and Blender's view layer read it."""
+"""The one table of render passes (AOVs): the engine fills it, the EXR writer and Blender's view layer read it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Pass:
-    """One render pass.
+    """One render pass (AOV).
 
     Attributes
     ----------

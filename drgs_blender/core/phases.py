@@ -1,4 +1,4 @@
-"""What the engine says it is doing before it renders, as every program shows it."""
+"""Names of what the engine does before it renders, as progress messages show them."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """The table of simulation materials, and the columns of each particle that compiled code reads.
 
-A row names one of a few constitutive models and its numbers in SI units; artists' presets are rows too.
+A row names a constitutive model (`simulation.constitutive`) and its numbers in SI units; artists' presets are rows too.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Material:
         "elastic" (neo-Hookean), "corotated" (fixed corotated), "plastic" (Hencky strain, von Mises yield), "sand"
         (Drucker-Prager), "snow" (Stomakhin et al. 2013) or "fluid" (weakly compressible).
     youngs_modulus : float
-        Pa; of a fluid it gives with `poisson` the bulk modulus E / (3 (1 - 2 nu)).
+        Young's modulus, Pa; of a fluid it gives with `poisson` the bulk modulus E / (3 (1 - 2 nu)).
     poisson : float
         Ratio in [0, 0.5).
     density : float

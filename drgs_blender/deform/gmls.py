@@ -1,4 +1,4 @@
-"""Generalised moving least squares: points carried along by particles that know their deformation gradient.
+"""Generalised moving least squares (GMLS): points carried along by particles that know their deformation gradient.
 
 Algorithm 2 of the DR-GS paper, after Martin et al. 2010, in a form that is exact for affine motion with any number of
 neighbours in any position and, with enough of them, for quadratic motion: values and gradients of the neighbours are

@@ -1,10 +1,10 @@
-"""Mesh-driven deformation: surfels follow the faces they hang on, exactly.
+"""Mesh-driven deformation: surfels follow exactly the faces that they are bound to.
 
 A face and its unit normal span space, so the deformation gradient of a face is F = [e1' e2' n'] [e1 e2 n]^-1 and the
-scaled tangents become T' = F T. With C = [e1 e2 n]^-1 T precomputed, a frame costs three vertices, one normal and a
-3x3 by 3x2 product a surfel. Rotations are never blended: F comes from the face, and the shading normal from smooth
-vertex normals. A surfel larger than its face has a second F, of three vertices as far apart as it is large, and takes
-the one that stretches it less: neither a single face that is carried badly nor a gap within its reach smears it.
+scaled tangents become T' = F T. With C = [e1 e2 n]^-1 T precomputed, a frame costs three vertices, one normal and a 3x3
+by 3x2 product a surfel. Unlike skinning, this blends no rotations: F comes from the face, and the shading normal from
+smooth vertex normals. A surfel larger than its face has a second F, of three vertices as far apart as it is large, and
+takes the one that stretches it less: neither a single face that is carried badly nor a gap within its reach smears it.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ class Posing(NamedTuple):
         World space.
     normals : (3 m, 3) float32 array or None
         Of the corners; None: smooth ones are to be made.
-    bent : (m, 3) int32 array
-        Faces that smooth normals are made from: those that are torn are points.
+    smooth_faces : (m, 3) int32 array
+        Faces that smooth normals are made from; torn ones have no area.
     linear : array
         See `pose.pose_surfels`.
-    side : float
+    sign : float
         See `pose.pose_surfels`.
     opacity : array
         Of the surfels where all vertices are finite.
@@ -50,9 +50,9 @@ class Posing(NamedTuple):
 
     vertices: Array
     normals: Array | None
-    bent: Array
+    smooth_faces: Array
     linear: Array
-    side: float
+    sign: float
     opacity: Array
     channels: dict[str, Array]
 
@@ -74,7 +74,7 @@ class MeshDriven:
     degenerate_faces : int
         Faces without area at rest. Their surfels keep their shape in the smooth shading frame and scale with the
         face's edges, since such a face has no deformation gradient.
-    lost : int
+    hidden_count : int
         Surfels of the last pose whose face had a vertex that was not finite; they are transparent.
     rest : Rest
         What of the binding is the same in every pose.
@@ -93,7 +93,7 @@ class MeshDriven:
         self.normals = VertexNormals(mesh.faces, len(mesh.vertices))
         faces, normals = Faces.of(mesh.vertices, mesh.faces), self.normals(mesh.vertices)
         self.degenerate_faces = int(faces.degenerate.sum())
-        self.lost = 0
+        self.hidden_count = 0
         face, corners = binding.face, faces.corners
         offset = (binding.offset * faces.mean_edge[face]).astype(np.float32)
         rest_edge = np.where(faces.degenerate, faces.mean_edge, 0).astype(np.float32)  # 0: a proper face
@@ -151,18 +151,18 @@ class MeshDriven:
         by_corner, normals = posing.normals is not None, posing.normals
         if normals is None:
             normals = np.empty_like(posing.vertices)
-            self.normals.into(posing.vertices, posing.bent, normals)
-            if posing.side < 0:
+            self.normals.into(posing.vertices, posing.smooth_faces, normals)
+            if posing.sign < 0:
                 normals = -normals
         n = len(self.surfels)
         opacity = posing.opacity.copy()
         centre, tangent_u, tangent_v, normal = (np.empty((n, 3), np.float32) for _ in range(4))
         posed = Posed(centre, tangent_u, tangent_v, normal, opacity)
         mesh = PosedMesh(plain(posing.vertices), plain(self.mesh.faces), plain(normals))
-        pose(mesh, by_corner, posing.linear, posing.side, self.rest, posed)
-        self.lost = int(np.count_nonzero(opacity != posing.opacity))
-        if self.lost:
-            log.debug("%d surfels hang on vertices that are not finite; they are hidden", self.lost)
+        pose(mesh, by_corner, posing.linear, posing.sign, self.rest, posed)
+        self.hidden_count = int(np.count_nonzero(opacity != posing.opacity))
+        if self.hidden_count:
+            log.debug("%d surfels hang on vertices that are not finite; they are hidden", self.hidden_count)
         owner = np.full(n, object_index, np.int32)
         return PosedSurfels(*posed, **posing.channels, object_index=owner)
 
@@ -182,13 +182,13 @@ class MeshDriven:
             normals = np.ascontiguousarray(normals, dtype=np.float32).reshape(-1, 3)
             if len(normals) != 3 * len(self.mesh.faces):
                 raise AssetError("corner normals", f"are {len(normals)}, expected {3 * len(self.mesh.faces)}")
-        bent, opacity = self.normals.faces, self.surfels.opacity
+        smooth_faces, opacity = self.normals.faces, self.surfels.opacity
         if torn is not None:
-            bent = np.where(torn[:, None], np.int32(0), bent)
+            smooth_faces = np.where(torn[:, None], np.int32(0), smooth_faces)
             opacity = np.where(torn[self.binding.face], np.float32(0.0), opacity)
         channels = {name: self._channel(name, (materials or {}).get(name)) for name in MATERIAL_CHANNELS}
-        side = -1.0 if np.linalg.det(linear) < 0 else 1.0
-        return Posing(vertices, normals, bent, linear, side, opacity, channels)
+        sign = -1.0 if np.linalg.det(linear) < 0 else 1.0
+        return Posing(vertices, normals, smooth_faces, linear, sign, opacity, channels)
 
     def _channel(self, name: str, edited: Array | None) -> Array:
         """A material channel of the surfels after the vertices' values became `edited`."""

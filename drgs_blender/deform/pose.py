@@ -83,8 +83,8 @@ class Posed(NamedTuple):
 
 
 @njit
-def _raised(linear: Any, nx: float, ny: float, nz: float) -> tuple[float, float, float]:
-    """What stands off a surface with unit normal n goes through matrix_world: A normalise(A^T n), A its linear part."""
+def _transformed_normal(linear: Any, nx: float, ny: float, nz: float) -> tuple[float, float, float]:
+    """A unit normal n as an offset vector through matrix_world: A normalise(A^T n), A its linear part."""
     ox = linear[0, 0] * nx + linear[1, 0] * ny + linear[2, 0] * nz
     oy = linear[0, 1] * nx + linear[1, 1] * ny + linear[2, 1] * nz
     oz = linear[0, 2] * nx + linear[1, 2] * ny + linear[2, 2] * nz
@@ -140,15 +140,15 @@ def tangent_frame(
 
 
 @njit(parallel=True)
-def pose(mesh: PosedMesh, by_corner: bool, linear: Array, side: float, rest: Rest, out: Posed) -> None:
+def pose(mesh: PosedMesh, by_corner: bool, linear: Array, sign: float, rest: Rest, out: Posed) -> None:
     """`pose_surfels`, all of them."""
     blocks = (len(rest.face) + _BLOCK - 1) // _BLOCK
     for block in prange(blocks):
-        pose_surfels(block, blocks, 0, mesh, by_corner, linear, side, rest, out)
+        pose_surfels(block, blocks, 0, mesh, by_corner, linear, sign, rest, out)
 
 
 @njit
-def pose_surfels(lane, lanes, room, mesh, by_corner, linear, side, rest, out):  # type: ignore[no-untyped-def]
+def pose_surfels(lane, lanes, room, mesh, by_corner, linear, sign, rest, out):  # type: ignore[no-untyped-def]
     """Pose every `lanes`-th block of surfels, from the `lane`-th on.
 
     Arithmetic in double so that a small object far from the origin stays exact.
@@ -164,8 +164,8 @@ def pose_surfels(lane, lanes, room, mesh, by_corner, linear, side, rest, out):  
         Whether the mesh has normals of its corners.
     linear : (3, 3) float64 array
         Of the object's matrix.
-    side : float
-        -1 if that mirrors, else 1.
+    sign : float
+        -1 if that mirrors (swaps handedness), else 1.
     rest : Rest
     out : Posed
         Written.
@@ -197,7 +197,7 @@ def pose_surfels(lane, lanes, room, mesh, by_corner, linear, side, rest, out):  
             sz = pa * normals[ja, 2] + pb * normals[jb, 2] + pc * normals[jc, 2]
 
             # Outward unit face normal; a collapsed face takes the smooth one.
-            nx, ny, nz = side * (uy * vz - uz * vy), side * (uz * vx - ux * vz), side * (ux * vy - uy * vx)
+            nx, ny, nz = sign * (uy * vz - uz * vy), sign * (uz * vx - ux * vz), sign * (ux * vy - uy * vx)
             length = math.sqrt(nx * nx + ny * ny + nz * nz)
             uu, vv = ux * ux + uy * uy + uz * uz, vx * vx + vy * vy + vz * vz
             if not (length > 1e-10 * (uu + vv)):
@@ -210,7 +210,7 @@ def pose_surfels(lane, lanes, room, mesh, by_corner, linear, side, rest, out):  
                 sx, sy, sz = nx, ny, nz
             tx, ty, tz, bx, by, bz, sx, sy, sz = tangent_frame(ux, uy, uz, vx, vy, vz, sx, sy, sz)
 
-            hx, hy, hz = _raised(linear, nx, ny, nz)
+            hx, hy, hz = _transformed_normal(linear, nx, ny, nz)
             d = np.float64(offset[i])
             centre[i, 0] = ax + wb * ux + wc * vx + d * hx
             centre[i, 1] = ay + wb * uy + wc * vy + d * hy
@@ -221,7 +221,7 @@ def pose_surfels(lane, lanes, room, mesh, by_corner, linear, side, rest, out):  
                 edges = math.sqrt(uu) + math.sqrt(vv) + math.sqrt(wx * wx + wy * wy + wz * wz)
                 grow = edges / (3.0 * rest_edge[f])
                 ux, uy, uz = grow * tx, grow * ty, grow * tz
-                vx, vy, vz = side * grow * bx, side * grow * by, side * grow * bz
+                vx, vy, vz = sign * grow * bx, sign * grow * by, sign * grow * bz
                 hx, hy, hz = grow * sx, grow * sy, grow * sz
             fx, fy, fz, gx, gy, gz = _tangents((ux, uy, uz), (vx, vy, vz), (hx, hy, hz), coordinates, i)
             if span[i, 0] >= 0:
@@ -229,10 +229,10 @@ def pose_surfels(lane, lanes, room, mesh, by_corner, linear, side, rest, out):  
                 ax, ay, az = np.float64(vertices[ia, 0]), np.float64(vertices[ia, 1]), np.float64(vertices[ia, 2])
                 ux, uy, uz = vertices[ib, 0] - ax, vertices[ib, 1] - ay, vertices[ib, 2] - az
                 vx, vy, vz = vertices[ic, 0] - ax, vertices[ic, 1] - ay, vertices[ic, 2] - az
-                nx, ny, nz = side * (uy * vz - uz * vy), side * (uz * vx - ux * vz), side * (ux * vy - uy * vx)
+                nx, ny, nz = sign * (uy * vz - uz * vy), sign * (uz * vx - ux * vz), sign * (ux * vy - uy * vx)
                 length = math.sqrt(nx * nx + ny * ny + nz * nz)
                 if length > 1e-10 * (ux * ux + uy * uy + uz * uz + vx * vx + vy * vy + vz * vz):
-                    hx, hy, hz = _raised(linear, nx / length, ny / length, nz / length)
+                    hx, hy, hz = _transformed_normal(linear, nx / length, ny / length, nz / length)
                     px, py, pz, qx, qy, qz = _tangents((ux, uy, uz), (vx, vy, vz), (hx, hy, hz), in_span, i)
                     own = fx * fx + fy * fy + fz * fz + gx * gx + gy * gy + gz * gz
                     if (
@@ -242,7 +242,7 @@ def pose_surfels(lane, lanes, room, mesh, by_corner, linear, side, rest, out):  
             tangent_u[i, 0], tangent_u[i, 1], tangent_u[i, 2] = fx, fy, fz
             tangent_v[i, 0], tangent_v[i, 1], tangent_v[i, 2] = gx, gy, gz
 
-            lx, ly, lz = np.float64(local_normal[i, 0]), side * local_normal[i, 1], np.float64(local_normal[i, 2])
+            lx, ly, lz = np.float64(local_normal[i, 0]), sign * local_normal[i, 1], np.float64(local_normal[i, 2])
             nx = tx * lx + bx * ly + sx * lz
             ny = ty * lx + by * ly + sy * lz
             nz = tz * lx + bz * ly + sz * lz

@@ -1,4 +1,4 @@
-"""What a deformation gradient does to a surfel.
+"""The surfel update: rotation and scale of a surfel under a deformation gradient.
 
 A surfel is the image of the unit Gaussian under T = [s_u t_u, s_v t_v] (3 x 2). Under a deformation gradient F it is
 the image under T' = F T, exactly: its covariance becomes F Sigma F^T. `surfel_update` brings T' back to orthogonal

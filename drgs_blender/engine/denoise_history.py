@@ -1,4 +1,4 @@
-"""What the session remembers of the sequences of pictures that follow a user, by their names."""
+"""Histories of the temporal denoiser: what the session keeps of each sequence of pictures, by its name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tells when Numba or Warp compile a kernel: the one long wait of a first picture, which the user should understand."""
+"""Events of JIT compilation by Numba or Warp: the one long wait of a first picture, which the user is shown."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How much memory an engine may take, on machines that many programs share."""
+"""The memory limit of an engine, on machines that many programs share."""
 
 from __future__ import annotations
 

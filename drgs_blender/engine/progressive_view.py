@@ -1,4 +1,4 @@
-"""The picture of one viewport while it grows: first a coarse one within a set time, then more and more samples."""
+"""Progressive rendering of one viewport: a coarse picture within a set time, then more and more samples."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ..render.prepared_scene import PreparedScene
 from ..render.progressive import Progressive, coarse, thinned
 
 IsCancelled = Callable[[], bool]
-#: Makes a whole picture of a frame, telling its progress.
+#: Makes a whole picture of a frame, and reports progress.
 Draw = Callable[[Frame, PreparedScene, Progress], Passes]
 
 #: Seconds that the pixels of a first picture may take (projecting the surfels comes on top, whatever its size).

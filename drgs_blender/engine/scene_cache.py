@@ -1,4 +1,4 @@
-"""The scene of the last frame: assets, posed objects, light. What did not change from frame to frame is kept."""
+"""The scene cache: assets, posed objects and light of the last frame, kept as far as they did not change."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from ..render.backend import CPU, RenderBackend
 from ..render.camera import camera_parameters
 from ..render.film.motion_vectors import Instant
 from ..render.lights.environment import EnvironmentLight
-from ..render.lights.lights import Lights
+from ..render.lights.light_sampler import Lights
 from ..render.lights.mesh_lights import Emitters
 from ..render.scene.ray_masks import group_mask
 from ..render.scene.trace_scene import TraceObject, TraceScene
@@ -62,7 +62,7 @@ class CachedObject:
     loaded: _Loaded
     traced: TraceObject
     posed: PosedSurfels | None = None
-    lost: int = 0
+    hidden_count: int = 0
     faults: list[str] = field(default_factory=list)
 
 
@@ -169,7 +169,7 @@ class SceneCache:
                 item = CachedObject(kept, loaded, traced_object(kept, loaded.asset, met), faults=material_faults(kept))
             if (seen or met) and item.posed is None:
                 given = item.state, index, loaded.surfels_of(item.state), item.traced
-                item.posed, item.lost = posed_surfels(*given, self._poser(backend))
+                item.posed, item.hidden_count = posed_surfels(*given, self._poser(backend))
             objects.append(item)
         meshes, images = renewed(frame.meshes, self.meshes), renewed(frame.images, self.images)
         same = len(objects) == len(self.objects) and all(a is b for a, b in zip(objects, self.objects))
@@ -246,8 +246,8 @@ class SceneCache:
         found = []
         if not self.objects and not self.meshes:
             found.append("the frame has no DR-GS object; the picture shows the world alone")
-        lost = [item.lost for item in self.objects] + [0] * len(self.meshes)
-        for hidden, fault in zip(lost, self.scene.faults, strict=True):
+        hidden_counts = [item.hidden_count for item in self.objects] + [0] * len(self.meshes)
+        for hidden, fault in zip(hidden_counts, self.scene.faults, strict=True):
             if fault.bad_vertices:
                 surfels = f" and {hidden} surfels" if hidden else ""
                 found.append(

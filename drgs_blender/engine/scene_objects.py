@@ -204,7 +204,7 @@ def posed_surfels(
     if state.grain > 0:
         larger = abs(float(np.linalg.det(matrix[:3, :3]))) ** (1 / 3)
         posed = grainy(posed, larger * driven.surfels.scale, state.grain)
-    return _adjusted_surfels(state, posed, driven), driven.lost
+    return _adjusted_surfels(state, posed, driven), driven.hidden_count
 
 
 def join(parts: list[PosedSurfels]) -> PosedSurfels:

@@ -100,7 +100,7 @@ class Server:
         try:
             self._open_session()
         except Exception:
-            logger.exception("the engine is incomplete")  # the first request will meet it again and be told
+            logger.exception("the engine is incomplete")  # the first request meets it again and is answered with it
         gc.freeze()
         gc.enable()
         self._note_preparing(-1)

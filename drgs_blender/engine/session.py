@@ -1,4 +1,4 @@
-"""One frame after the other: composes the stages and keeps what did not change. The only state of the engine.
+"""The session: one frame after the other, composed of the stages; keeps what did not change. The engine's only state.
 
 Usable without the process: ``Session().render(frame)`` gives the same bits as a client's ``render``.
 """
@@ -148,8 +148,8 @@ class Session:
         self._compile(frame, (), progress, cancelled)
         timer, backend = _StageTimer(cancelled), self._backends.select(frame.settings.device)
         prepared = self._prepare(frame, timer, progress, backend)
-        tell = None if progress is None else lambda part, phase: progress(phase, part)
-        passes = self._draw(frame, prepared, tell, cancelled, backend)
+        report = None if progress is None else lambda part, phase: progress(phase, part)
+        passes = self._draw(frame, prepared, report, cancelled, backend)
         timer("render")
         x0, y0, x1, y1 = frame.camera.window
         passes.statistics |= self._statistics(frame, prepared.surfels, timer)
@@ -196,7 +196,7 @@ class Session:
         view = View(self._scene_cache.kept(frame), self._pace, self._views_begun, by_mesh, backend)
         self._views_begun += 1
         passes = view.begin(
-            prepared, lambda frame, prepared, tell: self._draw(frame, prepared, tell, cancelled, backend)
+            prepared, lambda frame, prepared, report: self._draw(frame, prepared, report, cancelled, backend)
         )
         timer("render")
         self._views[name] = view
@@ -221,7 +221,7 @@ class Session:
         backend = view.backend
         prepared = self._prepare(view.frame, timer, progress, backend)  # other views may have changed the scene
         passes = view.advance(
-            prepared, lambda frame, prepared, tell: self._draw(frame, prepared, tell, cancelled, backend), cancelled
+            prepared, lambda frame, prepared, report: self._draw(frame, prepared, report, cancelled, backend), cancelled
         )
         timer("render")
         return self._seen(view, passes, prepared, timer)
@@ -236,7 +236,7 @@ class Session:
         self,
         frame: Frame,
         prepared: PreparedScene,
-        tell: Progress | None,
+        report: Progress | None,
         cancelled: IsCancelled | None,
         backend: RenderBackend,
     ) -> Passes:
@@ -250,7 +250,7 @@ class Session:
         instant = self._scene_cache.instant
         prepared = replace(prepared, previous=instant(frame, frame.previous), following=instant(frame, frame.next))
         history = None if sequence is None else sequence.history
-        pictures = render(prepared, frame, tell, cancelled, history=history, backend=backend)
+        pictures = render(prepared, frame, report, cancelled, history=history, backend=backend)
         if sequence is not None:
             self._histories.keep(frame, sequence, prepared.scene)
         return Passes(pictures, [], statistics)

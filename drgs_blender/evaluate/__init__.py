@@ -1,1 +1,1 @@
-"""How good an asset is: metrics, scenes with known truth, tables."""
+"""Evaluation of assets: metrics, scenes with known truth, tables."""

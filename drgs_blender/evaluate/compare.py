@@ -1,4 +1,4 @@
-"""An asset against what is known of the object: views left out, other lights, other poses, materials, shape."""
+"""Scores of an asset against ground truth: views left out, other lights, other poses, materials, shape."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def _warn_of_known(asset: Asset, capture: Capture) -> None:
     made_of = str(asset.provenance.get("capture"))
     if made_of.split("/")[0] != capture.name.split("/")[0]:
         logger.warning(
-            "%s: the asset was learned from %s: which views it knows cannot be told by their names",
+            "%s: the asset was learned from %s: which views it knows does not show in their names",
             capture.source, made_of,
         )  # fmt: skip
         return

@@ -1,4 +1,4 @@
-"""How alike two pictures, materials and shapes are. Every function says of which pixels and in which encoding.
+"""Metrics of pictures, materials and shapes: PSNR, SSIM, errors. Each says of which pixels and in which encoding.
 
 A picture's PSNR is that of its mean squared error over all pixels and channels, and that of several pictures is the
 mean of theirs. (Averaging over channels, as some published code does, raises it.) Published relighting figures fit a

@@ -1,4 +1,4 @@
-"""What is known about a capture beyond its photographs.
+"""The ground truth of a capture, beyond its photographs.
 
 `truth.json` beside it, as scenes.py writes it, or further captures of the same object under lights that the user names.
 """

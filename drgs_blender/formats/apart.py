@@ -1,4 +1,4 @@
-"""Files read by a program of its own: libraries that may hang or crash on damaged ones, or take all memory.
+"""Files read in a process apart: by libraries that may hang or crash on damaged ones, or take all memory.
 
 The program gets a file to read and one to write arrays to; it leaves with a code, and its last line says why.
 """

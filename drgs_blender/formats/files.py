@@ -1,4 +1,4 @@
-"""What readers of foreign files return: plain arrays plus what a person should be told about them.
+"""Results of readers of foreign files: plain arrays, with notes for the user about them.
 
 Colours are linear Rec.709 already; positions are in the axes of the file unless a field says otherwise.
 """

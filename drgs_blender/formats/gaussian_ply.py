@@ -62,7 +62,7 @@ class Layout:
     known : str
         Other properties whose meaning is known, as a regular expression (kept in the extras, not "unknown").
     note : str
-        Told to the user.
+        Shown to the user.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""The node tree of a glTF file: where each mesh stands, and how skins deform it.
+"""The node tree of a glTF file: transforms of meshes, and skinning.
 
 Two poses. "rest" is what Blender shows with armatures in rest position after its own import: bones lie where the
 inverse bind matrices put them (as far as these are known; the node's default pose else), without scale. It is the

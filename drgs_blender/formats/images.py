@@ -75,7 +75,7 @@ def _deep(image: Pillow.Image, data: bytes, subject: str, limit: int) -> Array:
     """Pixels of more than 8 bits a channel, of an image that is open."""
     raw = _raw(image)
     planes = isinstance(image, TiffImageFile) and image.tag_v2.get(PLANAR_CONFIGURATION, 1) != 1
-    if planes:  # of which Pillow's libtiff takes the first bytes whatever it is told
+    if planes:  # of which Pillow's libtiff takes the first bytes, whatever the raw mode
         return decode_tiff(data, subject, limit)
     if raw in ("RGB;16B", "RGB;16L", "RGB;16N", "RGBA;16B", "RGBA;16L", "RGBA;16N"):
         high, low = (_pixels(data, raw[:-1] + order).astype(np.uint16) for order in _HIGH[raw[-1]])

@@ -1,4 +1,4 @@
-"""What every mesh reader's result goes through: nothing that is not finite reaches the rest of the program."""
+"""Checks of every mesh reader's result: nothing that is not finite reaches the rest of the program."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Many values told by few: codebooks of numbers and palettes of rows, for formats that store indices."""
+"""Vector quantisation: codebooks of numbers and palettes of rows, for formats that store indices."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Array = np.ndarray
 
 #: Bins between the least and the greatest value, in which a codebook is made, and rounds of Lloyd's algorithm.
 _BINS, _ROUNDS = 1 << 16, 24
-#: Rows that tell the principal axes, and axes along which the rows are cut.
+#: Rows that give the principal axes, and axes along which the rows are cut.
 _SAMPLE, _AXES = 1 << 16, 12
 
 

@@ -23,7 +23,7 @@ Array = np.ndarray
 
 #: Entries of the palette of harmonics, and how many stand in a row of its picture.
 _PALETTE, _ROW = 1 << 16, 64
-#: Largest harmonic: one splat that is brighter would take the numbers that tell all others apart.
+#: Largest harmonic: one brighter splat would take the code words that all others need.
 _BRIGHTEST = np.float32(100)
 #: Largest side of a WebP picture.
 _LARGEST = 16383

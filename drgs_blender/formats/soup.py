@@ -1,4 +1,4 @@
-"""Triangles that share no vertices, joined where their corners lie at exactly the same place."""
+"""Triangle soup: triangles that share no vertices, joined where their corners lie at exactly the same place."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""3D Gaussian splats as every other program knows them, and the way from surfels to them."""
+"""3D Gaussian splats as other programs know them: the record of a splat, and the way from surfels to it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What can be checked of a binary USD file before usd-core, which trusts every number in it, takes memory for it.
+"""Checks of a binary USD file before usd-core, which trusts every number in it, takes memory for it.
 
 Layout of crate files after OpenUSD, pxr/usd/sdf/crateFile.h.
 """

@@ -82,7 +82,7 @@ WRITERS: tuple[Writer, ...] = (
         "SOG",
         write_sog,
         "centres to 1/131070 of the range of log(1 + distance), opacities to 1/510, rotations to 1.1 degrees; "
-        "scales, colours and harmonics as the 256 numbers that tell them best",
+        "scales, colours and harmonics as the 256 numbers that fit them best",
         "materials; the order of the splats; harmonics outside -100 to 100; where there are more than 65536, "
         "harmonics become those of a palette",
     ),

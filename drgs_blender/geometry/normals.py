@@ -1,4 +1,4 @@
-"""Geometry shared by deformation and rendering: vertex normals of a triangle mesh whose faces stay the same."""
+"""Vertex normals of a triangle mesh whose faces stay the same, for deformation and rendering."""
 
 from __future__ import annotations
 

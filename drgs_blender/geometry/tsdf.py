@@ -1,8 +1,8 @@
 """Depth maps fused into a truncated signed distance field (TSDF), and the closed mesh of its zero level.
 
-Each view tells the voxels along its rays how far before or behind its surface they lie, and that what it sees through
-is free. What too few views see counts as inside, so the mesh is closed there too (Curless and Levoy 1996, "A
-volumetric method for building complex models from range images"; Lorensen and Cline 1987, marching cubes).
+Each view gives the voxels along its rays their signed distance to its surface, and marks what it sees through as free.
+What too few views see counts as inside, so the mesh is closed there too (Curless and Levoy 1996, "A volumetric method
+for building complex models from range images"; Lorensen and Cline 1987, marching cubes).
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class Voxels(NamedTuple):
     total, weight : (nx, ny, nz) float32 array
         Of weighted distances in bands, and of the weights.
     views : (nx, ny, nz) int32 array
-        How many tell something.
+        How many views have seen it.
     low : (3,) float64 array
         Centre of voxel (0, 0, 0), metres.
     size : float

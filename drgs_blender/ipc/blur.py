@@ -1,4 +1,7 @@
-"""One blurred picture of many: what each shows of it, and their mean. Where they are seen from, Blender's side says."""
+"""Motion blur and depth of field as the mean of many pictures: the share of each, and the mean.
+
+The extension says from where each is seen.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Telling what changed from frame to frame."""
+"""Change detection: what of a frame is the same as in the last one keeps its identity."""
 
 from __future__ import annotations
 

@@ -55,7 +55,7 @@ class Child:
     steps : int
         Of the last `protocol.Alive`, as `preparing`.
     preparing : bool
-    told : tuple of (str, float)
+    last_progress : tuple of (str, float)
         Phase and fraction of the last `protocol.Progress` that was taken out of `inbox`.
     idle : threading.Event
         Set while no request is unanswered.
@@ -71,7 +71,7 @@ class Child:
         self.heard = 0
         self.steps = 0
         self.preparing = False
-        self.told = (STARTING, 0.0)
+        self.last_progress = (STARTING, 0.0)
         self.greeted = False
         self.warm = False
         self.idle = threading.Event()

@@ -369,7 +369,7 @@ class EngineClient:
             item = child.inbox.get(timeout=_POLL)
         except queue.Empty:
             if child.preparing and on_progress is not None:
-                on_progress(*child.told)
+                on_progress(*child.last_progress)
             return None
         if item is None:  # see `wake`
             return None
@@ -378,9 +378,9 @@ class EngineClient:
         if isinstance(item, Exception):
             raise Lost(str(item) or type(item).__name__) from item
         if isinstance(item[0], protocol.Progress):
-            child.told = item[0].phase, item[0].fraction
+            child.last_progress = item[0].phase, item[0].fraction
             if on_progress is not None:
-                on_progress(*child.told)
+                on_progress(*child.last_progress)
             return None
         if isinstance(item[0], protocol.Failed) and item[0].id == 0:
             raise Lost(f"refused a message: {item[0].problem}")

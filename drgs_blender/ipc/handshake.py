@@ -1,4 +1,4 @@
-"""The first words between an engine's process and its client."""
+"""The handshake: the first messages between an engine's process and its client."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where the engine's interpreter is. Never downloads, never guesses in the user's PATH."""
+"""Locates the engine's interpreter. Never downloads, never guesses in the user's PATH."""
 
 from __future__ import annotations
 

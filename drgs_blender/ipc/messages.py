@@ -1,4 +1,4 @@
-"""What extension and engine say to each other; how it is sent is the matter of `protocol`.
+"""The messages between extension and engine; `protocol` encodes and sends them.
 
 Needs numpy and the standard library only.
 """

@@ -1,4 +1,4 @@
-"""How extension and engine send each other `messages`: their form, and the link that carries it (docs/protocol.md).
+"""The ipc protocol of extension and engine: the form of `messages` and the link that carries them (docs/protocol.md).
 
 A message is a fixed prefix, a JSON header of limited size, and arrays: in the pipe behind the header, or in a shared
 region. Everything is checked against limits before memory is taken for it; nothing received is ever executed.

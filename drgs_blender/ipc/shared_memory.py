@@ -1,4 +1,4 @@
-"""Bulk arrays without a pipe: an anonymous memory file that both processes map.
+"""Shared memory for bulk arrays: an anonymous memory file that both processes map, in place of a pipe.
 
 One region a direction, created by the client, inherited by the engine as an open file: it has no name, so nothing
 can be left behind and nobody else can open it. The writing side grows it with ``posix_fallocate`` (a sparse file on a

@@ -1,4 +1,4 @@
-"""Only what changed is sent again: what the sender remembers of each slot, and what the receiver holds.
+"""Slots: only arrays that changed are sent again; what the sender remembers of each, and what the receiver holds.
 
 A slot is the stable name of one array of a frame. The sender gives each new content a version; a frame names a version
 for every slot it uses and carries only the arrays whose version is new. Slots that a frame does not name are dropped

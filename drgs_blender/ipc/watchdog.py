@@ -1,4 +1,4 @@
-"""When an engine that does not answer is given up."""
+"""The watchdog: when an engine that does not answer is given up."""
 
 from __future__ import annotations
 

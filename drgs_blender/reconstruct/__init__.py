@@ -1,1 +1,1 @@
-"""From photographs to an asset: captures, differentiable rasteriser, pre-training, TSDF, decoupling."""
+"""Photographs to an asset: captures, differentiable rasteriser, pre-training, TSDF, decoupling."""

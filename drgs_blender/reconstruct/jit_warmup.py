@@ -34,7 +34,7 @@ def rehearse(settings: Settings, masked: bool, backend: LearningBackend, cancell
     ----------
     settings : Settings
     masked : bool
-        The photographs have masks, or a background that tells as much.
+        The photographs have masks, or a background that masks are made from.
     backend : LearningBackend
     cancelled : callable
 

@@ -1,4 +1,4 @@
-"""What fits into this machine's memory: asked before it is made, since a system that runs out ends programs unasked."""
+"""The memory budget of learning, checked before arrays are made: a system that runs out ends programs unasked."""
 
 from __future__ import annotations
 

@@ -154,15 +154,15 @@ def reconstruct(
     work = _Work(capture, settings, on_progress or (lambda _: None), cancelled or (lambda: False), folder)
     region = find_region(capture)
     grid([view.camera for view in capture.training], region, settings.mesh_resolution)  # before minutes of learning
-    prepare_kernels(("reconstruct",), lambda phase, part: work.tell(Progress(phase, part)), work.cancelled)
+    prepare_kernels(("reconstruct",), lambda phase, part: work.on_progress(Progress(phase, part)), work.cancelled)
     if settings.minutes is not None:
-        work.tell(Progress(PHASE, 0.0))
+        work.on_progress(Progress(PHASE, 0.0))
         rehearse(settings, have_silhouettes(capture), work.backend, work.cancelled)
     training = Training(
         capture, region, settings.schedule, seconds=work.seconds(SURFEL_TIME_FRACTION), backend=work.backend
     )
     free = work.learn("surfels", training, 0.0, 0.5)
-    work.tell(Progress("mesh", 0.5, len(free)))
+    work.on_progress(Progress("mesh", 0.5, len(free)))
     report: dict[str, Any] = {"views": len(capture.training), "left_out": len(capture.testing)}
     mesh, report["mesh"] = mesh_of(free, capture, region, settings.mesh_resolution)
     final: Gaussians = free
@@ -213,10 +213,15 @@ class _Work:
     """What all phases of a run share."""
 
     def __init__(
-        self, capture: Capture, settings: Settings, tell: Callable[[Progress], None], cancelled: Callable[[], bool],
+        self,
+        capture: Capture,
+        settings: Settings,
+        on_progress: Callable[[Progress], None],
+        cancelled: Callable[[], bool],
         folder: Path | None,
-    ) -> None:  # fmt: skip
-        self.capture, self.settings, self.tell, self.cancelled, self.folder = capture, settings, tell, cancelled, folder
+    ) -> None:
+        self.capture, self.settings, self.folder = capture, settings, folder
+        self.on_progress, self.cancelled = on_progress, cancelled
         self.backend = select_backend(settings.device)
         if folder is not None:
             try:
@@ -251,7 +256,7 @@ class _Work:
             known = state
             training.attempt(lambda: training.restore(known), whole=False)
             log.info("%s: going on at step %d", phase, training.iteration)
-        shown = told = time.monotonic()
+        shown = reported = time.monotonic()
         reached = 0.0
         while not training.finished:
             training.step()
@@ -261,14 +266,14 @@ class _Work:
                 kept.save(training.arrays())
             if stop:
                 raise Cancelled
-            if now - told > 1 or training.finished:
+            if now - reported > 1 or training.finished:
                 draw = now - shown > SHOW_EVERY or training.finished
                 picture = training.attempt(lambda: preview(training.gaussians, self.capture)) if draw else None
                 reached = max(reached, training.part)  # the second start of a trial starts over
-                self.tell(
+                self.on_progress(
                     Progress(phase, begin + (end - begin) * reached, len(training.gaussians), training.psnr, picture)
                 )
-                told, shown = now, now if draw else shown
+                reported, shown = now, now if draw else shown
         return training.attempt(lambda: training.gaussians.on(CPU))
 
 
@@ -296,7 +301,7 @@ def _decoupled(work: _Work, mesh: Mesh, surfels: Gaussians, thin: bool, report: 
         work.capture,
         mesh,
         replace(work.settings.decoupling, seconds=work.seconds(MATERIAL_TIME_FRACTION) or 0.0),
-        lambda at: work.tell(Progress("materials", 0.7 + 0.3 * at.part, len(surfels), at.psnr)),
+        lambda at: work.on_progress(Progress("materials", 0.7 + 0.3 * at.part, len(surfels), at.psnr)),
         work.cancelled,
         work.file("materials"),
         work.backend,
@@ -305,8 +310,8 @@ def _decoupled(work: _Work, mesh: Mesh, surfels: Gaussians, thin: bool, report: 
     done, of = found.report["iterations"], work.settings.decoupling.iterations
     if done < min(FEW_STEPS, of):
         log.warning(
-            "materials got %d of %d steps in their part of %g minutes, too few to tell them from the light: give more "
-            "minutes, or photographs of a lower resolution", done, of, work.settings.minutes,
+            "materials got %d of %d steps in their part of %g minutes, too few to separate them from the light: give "
+            "more minutes, or photographs of a lower resolution", done, of, work.settings.minutes,
         )  # fmt: skip
     # Without the clock: the same run gives the same bytes.
     report["decoupling"] = {key: value for key, value in found.report.items() if key != "seconds"}

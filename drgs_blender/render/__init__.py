@@ -1,1 +1,1 @@
-"""From posed surfels and a light to passes and files."""
+"""The renderer: posed surfels and a light to passes and files."""

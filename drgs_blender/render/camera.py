@@ -1,4 +1,4 @@
-"""Camera rays and the sub-pixel positions they go through.
+"""Camera rays, through sub-pixel positions drawn from the pixel filter.
 
 Both primary stages (surfels and mesh) look through the same positions, so their pictures can be compared pixel by
 pixel. The positions of a pixel are a rank-1 lattice (k / n, k * golden ratio), shifted on the torus by a hash of

@@ -16,7 +16,7 @@ from numba import types
 from numba.extending import intrinsic
 
 Array = np.ndarray
-#: Tells where compiled code finds an array: `address`, or where its copy on a device lies.
+#: Gives the address at which compiled code finds an array: `address`, or that of its copy on a device.
 Place = Callable[[Array], int]
 
 

@@ -88,12 +88,12 @@ def render(
         if cancelled is not None and cancelled():
             raise Cancelled
 
-    def tell(part: float, phase: str) -> None:
+    def report(part: float, phase: str) -> None:
         check()
         if progress is not None:
             progress(part, phase)
 
-    tell(0.0, "Projecting")
+    report(0.0, "Projecting")
     scene, lights = prepared.scene, prepared.lights
     visible = VisibleSurfaces(prepared, frame, parameters, backend)
     film = Film(camera, settings, parameters)
@@ -115,7 +115,7 @@ def render(
     batches = Batches(prepared, frame, check, backend)
     height = strip_height(right - left, settings.subpixel_count)
     for y0 in range(top, bottom, height):
-        tell(end * (y0 - top) / (bottom - top), "Rendering")
+        report(end * (y0 - top) / (bottom - top), "Rendering")
         y1 = min(y0 + height, bottom)
         buffer = visible.rows(y0, y1)
         check()
@@ -132,13 +132,13 @@ def render(
     motions = [None if motion is None else motion.motion(seen.position, seen.coverage) for motion in moving]
     signal = None
     if settings.denoise != "none":
-        tell(end, "Denoising")
+        report(end, "Denoising")
     if history is None:
         components = denoised(film, frame, check, backend)
     else:
         shot = Shot(seen.components, seen.variance, film.guides(), motions[2])
         components, signal = backend.denoise_next(shot, history.signal, split_light(frame), history.still, check)
-    tell(1.0, "Done")
+    report(1.0, "Done")
     if history is not None:
         history.signal = signal
     before, after = motions[:2]

@@ -1,4 +1,4 @@
-"""What goes into the integrator and what comes out: compacted visible points and the light they send to the camera."""
+"""Shading points, which the integrator takes, and the light that it returns: what they send to the camera."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a frame becomes before it is rendered."""
+"""The prepared scene: what a frame becomes before it is rendered."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from ..core.asset.model import PosedSurfels
 from .film.motion_vectors import Instant
 from .lights.environment import EnvironmentLight
-from .lights.lights import Lights
+from .lights.light_sampler import Lights
 from .scene.trace_scene import TraceScene
 from .surfels.surfel_bvh import SurfelBVH
 

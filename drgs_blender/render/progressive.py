@@ -1,4 +1,4 @@
-"""A picture that grows: every step gives all its pixels one more part of their samples.
+"""Progressive rendering: every step gives all pixels of a picture one more part of their samples.
 
 For viewports. The parts are those of the whole picture (`pipeline.render`), drawn in another order: once all are there,
 it is the same picture to the rounding of sums, and to the last bit where a noise threshold decides who gets them. No

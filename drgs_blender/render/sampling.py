@@ -1,4 +1,4 @@
-"""Numbers for Monte Carlo and the maps from the unit square, as small scalar functions for compiled code.
+"""Random numbers for Monte Carlo and the maps from the unit square, as small scalar functions for compiled code.
 
 Every number is a pure function of (seed, frame, pixel, strategy, sample index, dimension): pictures do not depend on
 strips, threads or order. The samples of one strategy in one pixel are a Sobol' point set, scrambled as Owen does by a

@@ -1,1 +1,1 @@
-"""Simulated matter: particles that fill a mesh, their motion, frames on disk."""
+"""Simulated matter: particles that fill a mesh, MLS-MPM, XPBD and rigid bodies that move them, frames on disk."""

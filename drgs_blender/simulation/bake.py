@@ -1,4 +1,4 @@
-"""Frames of a job into a cache; what is there already stays."""
+"""Bakes a simulation: frames of a job into a cache; what is there already stays."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def bake(
     cancelled : callable, optional
         Asked before every time step.
     progress : callable, optional
-        Told the frame that is computed and which part of it is done.
+        Called with the frame that is computed and the part of it that is done.
 
     Returns
     -------
@@ -69,8 +69,8 @@ def bake(
     frame = start
     try:
         for frame in range(start + 1, settings.last + 1):
-            told = None if progress is None else (lambda part, f=frame: progress(f, part))
-            solver.advance(1 / settings.fps, job.pin_targets(frame - settings.first), cancelled, told)
+            report = None if progress is None else (lambda part, f=frame: progress(f, part))
+            solver.advance(1 / settings.fps, job.pin_targets(frame - settings.first), cancelled, report)
             _check_own(cache, job)
             cache.write(frame, job.now())
             done += 1

@@ -114,7 +114,7 @@ class Nodes(NamedTuple):
 
 @njit(inline="always")
 def block_of(gx, gy, gz, bx, by, bz):  # type: ignore[no-untyped-def]
-    """Number of the block of a place, told in spacings from the origin; -1 if it is outside or not finite."""
+    """Number of the block of a place, in grid spacings from the origin; -1 if it is outside or not finite."""
     low = MARGIN + 0.5
     inside = low <= gx < 4 * (bx - 1) + 0.5 and low <= gy < 4 * (by - 1) + 0.5 and low <= gz < 4 * (bz - 1) + 0.5
     if inside:  # not for NaN

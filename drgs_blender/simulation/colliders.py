@@ -222,7 +222,7 @@ class MovingCollider:
         linear = (self._centre_after - self._centre_before) / self._seconds
         spin = self._spin / self._seconds
         shift = centre - turn @ self._centre_rest
-        # v(x) = linear + spin x (x - centre), told about the point `shift`.
+        # v(x) = linear + spin x (x - centre), expressed about the point `shift`.
         return self._own, Motion(turn, shift, linear + np.cross(spin, shift - centre), spin)
 
     def look(self, points: Array, part: float) -> Array | None:
@@ -287,7 +287,7 @@ class MovingCollider:
 def check_apart(points: Array, depth: float, colliders: Sequence[MovingCollider], planes: Array) -> None:
     """Refuse a body that is inside of what it should meet, and warn of one that is a little, before anything moves.
 
-    What is thinner than a cell is not seen in the field of a collider: there the neighbours on its two sides tell.
+    What is thinner than a cell is not seen in the field of a collider: there the neighbours on its two sides decide.
 
     Parameters
     ----------

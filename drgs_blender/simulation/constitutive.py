@@ -1,4 +1,4 @@
-"""What deformation does to matter: plastic flow and Kirchhoff stress of one particle, in compiled code.
+"""The constitutive models: plastic flow and Kirchhoff stress of one particle, in compiled code.
 
 Return mappings: von Mises with viscosity after Simo and Hughes (Computational Inelasticity, ch. 3), sand after Klar et
 al. 2016, snow after Stomakhin et al. 2013. Stresses are Kirchhoff's, tau = P F^T, kept as xx, yy, zz, xy, xz, yz.

@@ -1,4 +1,4 @@
-"""What obstacles do to matter that touches them, in compiled code: meshes with a field of distances, and planes."""
+"""Contact of matter with obstacles, in compiled code: meshes with a field of distances, and planes."""
 
 from __future__ import annotations
 

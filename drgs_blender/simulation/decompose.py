@@ -1,4 +1,4 @@
-"""Singular values of 3 x 3 matrices in compiled code."""
+"""Singular value decomposition of 3 x 3 matrices in compiled code."""
 
 from __future__ import annotations
 

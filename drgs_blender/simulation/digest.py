@@ -1,4 +1,4 @@
-"""What frames depend on, as digests: a frame is the same where both of a simulation are.
+"""Digests of all that frames depend on: a frame is the same where both of a simulation are.
 
 One is of the settings and of all at rest. What moves has one for each frame, of its motion until then, so that a longer
 bake goes on from a shorter one.

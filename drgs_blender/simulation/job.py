@@ -1,4 +1,4 @@
-"""From an asset and settings to a solver: fill, materials, pins, colliders, domain."""
+"""A simulation job, from an asset and settings to a solver: fill, materials, pins, colliders, domain."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One step of MLS-MPM: particles to grid, the grid's own step, grid to particles.
+"""One step of MLS-MPM: particles to grid (P2G), the grid's own step, grid to particles (G2P).
 
 After Hu et al. 2018 (moving least squares MPM) with APIC (Jiang et al. 2015) and quadratic B-splines. A block's nodes
 are gathered in a scratch of 8^3 nodes from cell -1 to 6 of the block, which lets particles drift by a cell.

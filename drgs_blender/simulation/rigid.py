@@ -1,4 +1,4 @@
-"""A body that never bends, solved by impulses: it falls, tumbles and comes to rest in one piece.
+"""A rigid body, solved by impulses: it falls, tumbles and comes to rest in one piece.
 
 It touches with the particles at its surface, each a small ball. Impulses of contacts are solved one after the other
 until they agree (projected Gauss-Seidel, Catto 2005), those of friction within Coulomb's cone. What is inside of an

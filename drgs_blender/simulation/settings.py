@@ -1,4 +1,4 @@
-"""What a simulation is, as JSON: checked key by key before anything is computed."""
+"""Settings of a simulation, as JSON: checked key by key before anything is computed."""
 
 from __future__ import annotations
 

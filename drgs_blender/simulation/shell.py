@@ -1,4 +1,4 @@
-"""What obstacles do to a body in a lattice: its outer particles are pushed out, by the nodes that hold them."""
+"""Contact of an XPBD lattice with obstacles: its outer particles are pushed out, by the nodes that hold them."""
 
 from __future__ import annotations
 

@@ -79,7 +79,8 @@ class Solver(Stepper):
     planes : sequence of Plane
         What acts.
     courant : float
-        Time step in parts of what elastic waves and viscosity bear; above 1 is unstable.
+        The Courant number (CFL condition): time step in parts of what elastic waves and viscosity bear; above 1 is
+        unstable.
     device : str
         One of `DEVICES`; what it cannot do is done by this processor, with a warning.
 

@@ -1,4 +1,4 @@
-"""What the solvers have in common: frames that are whole or not there, and states that are kept and taken up again."""
+"""The base of the solvers: frames that are whole or not there, and states that are kept and taken up again."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ class Stepper(ABC):
         cancelled : callable, optional
             Asked before each step.
         progress : callable, optional
-            Told which part of the frame is done.
+            Called with the part of the frame that is done.
 
         Raises
         ------

@@ -230,7 +230,7 @@ GROUPS = (
     ("addon.physics_settings", "DrgsPhysicsSettings"),
     ("addon.physics_settings", "DrgsPhysicsRegion"),
     ("addon.physics_settings", "DrgsPhysicsCollider"),
-    ("addon.adjustment", "DrgsAdjustment"),
+    ("addon.adjustment_settings", "DrgsAdjustmentSettings"),
     ("addon.submit", "DrgsSubmitSettings"),
 )
 

@@ -72,7 +72,7 @@ def test_photographs_become_an_object(scene, photographs, tmp_path):
 
 @pytest.mark.slow
 def test_without_a_window_the_terminal_shows_how_far_it_is(scene, photographs, monkeypatch, capsys):
-    monkeypatch.setattr(part("operators.engine_command"), "_TELL_EVERY", 0.2)
+    monkeypatch.setattr(part("operators.engine_command"), "_REPORT_EVERY", 0.2)
     assert bpy.ops.drgs.reconstruct(filepath=str(photographs), minutes=0.1, use_materials=False) == {"FINISHED"}
     said = capsys.readouterr().out
     lines = [line for line in said.splitlines() if line.startswith('Capture "Sphere": ')]

@@ -57,7 +57,7 @@ def test_every_property_of_every_group_is_listed(pages):
         "scene.drgs.submit": part("addon.submit").DrgsSubmitSettings,
         "view_layer.drgs": properties.DrgsViewLayerSettings,
         "object.drgs": properties.DrgsObjectSettings,
-        "object.drgs.adjustment": part("addon.adjustment").DrgsAdjustment,
+        "object.drgs.adjustment": part("addon.adjustment_settings").DrgsAdjustmentSettings,
         "object.drgs.physics": physics.DrgsPhysicsSettings,
         "object.drgs.physics.regions[i]": physics.DrgsPhysicsRegion,
         "object.drgs.physics.colliders[i]": physics.DrgsPhysicsCollider,

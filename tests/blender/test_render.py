@@ -117,7 +117,7 @@ def test_border_renders_the_same_pixels_as_the_whole(ball, scene):
 def test_passes_of_the_table_reach_the_compositor(ball, scene, captured):
     """Every pass that can be switched on arrives in the render result under Blender's name."""
     layer = scene.view_layers[0]
-    table, names = part("drgs_blender.core.passes").PASSES, part("addon.passes")
+    table, names = part("drgs_blender.core.passes").PASSES, part("addon.view_layer_passes")
     switch = part("addon.properties").switch_of
     for p in table:
         setattr(*((layer, p.blender) if p.blender else (layer.drgs, switch(p))), True)
@@ -156,7 +156,7 @@ def test_only_blenders_own_names_are_used_for_its_passes():
     cycles = importlib.import_module("cycles.engine")
     theirs = {name: (channels, kind) for name, channels, kind in cycles.list_render_passes(scene, layer)}
     for p in table:
-        assert theirs[part("addon.passes").blender_name(p)] == (p.channels, p.kind)
+        assert theirs[part("addon.view_layer_passes").blender_name(p)] == (p.channels, p.kind)
 
 
 def test_view_layers_are_rendered_separately(ball, scene, captured):

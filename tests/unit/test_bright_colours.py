@@ -10,7 +10,7 @@ from test_lamps import light
 from drgs_blender.core.frame import Image, Material, Texture, World
 from drgs_blender.render.integrator.integrate import integrate
 from drgs_blender.render.lights.environment import EnvironmentLight
-from drgs_blender.render.lights.lights import Lights
+from drgs_blender.render.lights.light_sampler import Lights
 from drgs_blender.render.scene.textures import MaterialTable
 from drgs_blender.render.scene.trace_scene import TraceScene
 

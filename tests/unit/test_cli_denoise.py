@@ -124,7 +124,7 @@ def test_neighbours_take_noise_away(denoise, rendered, tmp_path):
 
 def test_one_frame_alone_is_what_the_engine_denoises_alone(denoise, rendered, tmp_path):
     """What is on disk is all that the denoiser works on."""
-    from drgs_blender.render.denoise.inputs import read_noisy
+    from drgs_blender.render.denoise.noisy_frames import read_noisy
     from drgs_blender.render.denoise.svgf_spatial import denoise as spatial
 
     denoise("4", "--window", "1")
@@ -236,10 +236,10 @@ def test_the_same_noise_in_every_frame_is_told(denoise, rendered, tmp_path):
 
 def test_frames_keep_the_cameras_to_the_bit(rendered):
     """The vectors that are made from a file are those of the engine."""
-    from drgs_blender.render.denoise.inputs import describe, read_noisy
+    from drgs_blender.render.denoise.noisy_frames import camera_metadata, read_noisy
 
     noisy = read_noisy(rendered / "noisy" / "0003.exr")
     assert noisy.follows(read_noisy(rendered / "noisy" / "0002.exr"))
     assert not noisy.follows(read_noisy(rendered / "noisy" / "0001.exr"))
     frame = Frame(3, replace(seen(3, 0.0), orthographic=True, region=(1, 2, 30, 20)), [])
-    assert "previous" not in describe(frame) and "true" in describe(frame)["camera"]
+    assert "previous" not in camera_metadata(frame) and "true" in camera_metadata(frame)["camera"]

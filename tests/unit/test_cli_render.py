@@ -295,7 +295,7 @@ def test_frames_with_the_passes_for_it_are_denoised_over_time(render, tmp_path, 
     assert render("--passes", "temporal,Vector", "--denoise", "none")[0] == 0
     code = main(["denoise", str(tmp_path / "####.exr"), "--frames", "1-3", "--out", str(tmp_path / "clean/####.exr")])
     assert code == 0 and "Note" not in capsys.readouterr().out
-    from drgs_blender.render.denoise.inputs import read_noisy
+    from drgs_blender.render.denoise.noisy_frames import read_noisy
 
     frames = [read_noisy(tmp_path / f"000{n}.exr") for n in (1, 2, 3)]
     assert frames[1].follows(frames[0]) and frames[2].follows(frames[1])

@@ -187,7 +187,7 @@ def test_vertices_that_are_not_finite_hide_their_surfels_only():
     driven = MeshDriven(mesh, surfels, binding)
     posed = driven.pose(vertices)
     touched = (mesh.faces[binding.face] == 7).any(axis=1)
-    assert driven.lost == touched.sum() > 0
+    assert driven.hidden_count == touched.sum() > 0
     assert np.array_equal(posed.opacity == 0, touched)
     assert np.isfinite(posed.centre).all() and np.isfinite(posed.normal).all() and np.isfinite(posed.tangent_u).all()
 

@@ -98,9 +98,9 @@ def test_surfels_on_vertices_that_are_not_finite_are_counted(deformer: Deformer)
     vertices = bent(asset.mesh)
     vertices[3] = np.inf
     here, there = asset.pose(vertices), deformer.pose(asset, vertices)
-    assert asset.lost > 0 and (there.opacity == 0).sum() == (here.opacity == 0).sum() >= asset.lost
+    assert asset.hidden_count > 0 and (there.opacity == 0).sum() == (here.opacity == 0).sum() >= asset.hidden_count
     deformer.pose(asset, bent(asset.mesh))
-    assert asset.lost == 0
+    assert asset.hidden_count == 0
 
 
 def test_surfels_of_several_objects_lie_on_the_device_as_one(deformer: Deformer) -> None:

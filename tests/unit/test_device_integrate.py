@@ -17,7 +17,7 @@ from drgs_blender.render.gpu.select_backend import Backends
 from drgs_blender.render.gpu.warp_backend import WarpRenderBackend
 from drgs_blender.render.integrator.integrate import integrate
 from drgs_blender.render.lights.environment import EnvironmentLight
-from drgs_blender.render.lights.lights import Lights
+from drgs_blender.render.lights.light_sampler import Lights
 from drgs_blender.render.lights.mesh_lights import Emitters
 from drgs_blender.render.points import CATCHER, Radiance, ShadingPoints
 from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene

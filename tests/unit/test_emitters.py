@@ -15,7 +15,7 @@ from drgs_blender.compute.jit import njit
 from drgs_blender.core.frame import Image, Material, MeshState, Texture, Visibility, World
 from drgs_blender.render.integrator.integrate import integrate
 from drgs_blender.render.lights.environment import EnvironmentLight
-from drgs_blender.render.lights.lights import Lights, emission_along
+from drgs_blender.render.lights.light_sampler import Lights, emission_along
 from drgs_blender.render.lights.mesh_lights import MOST, Emitters
 from drgs_blender.render.points import CATCHER
 from drgs_blender.render.sampling import F, sobol

@@ -12,7 +12,7 @@ from test_surface import mesh_state
 from drgs_blender.core.frame import Light, Material, MeshState, World
 from drgs_blender.render.integrator.integrate import integrate
 from drgs_blender.render.lights.environment import EnvironmentLight
-from drgs_blender.render.lights.lights import Lights
+from drgs_blender.render.lights.light_sampler import Lights
 from drgs_blender.render.lights.mesh_lights import Emitters
 from drgs_blender.render.scene.trace_scene import TraceScene
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from drgs_blender.core.frame import Light
+from drgs_blender.render.lights.light_sampler import Lights, light_flags
 from drgs_blender.render.lights.light_shapes import CAMERA, DIFFUSE, GLOSSY, INTENSITY, PLACE, RADIANCE, SHADOW
 from drgs_blender.render.lights.light_tree import SECOND, lights_weight, pick_light, pick_probability
-from drgs_blender.render.lights.lights import Lights, light_flags
 from drgs_blender.render.sampling import F, sobol
 
 NUMBERS = sobol(1 << 14)

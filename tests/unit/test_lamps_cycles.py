@@ -15,8 +15,8 @@ import pytest
 from test_lamps import light
 
 from drgs_blender.core.frame import Light
+from drgs_blender.render.lights.light_sampler import Lights, light_flags
 from drgs_blender.render.lights.light_shapes import CAMERA, DIFFUSE, GLOSSY, SHADOW
-from drgs_blender.render.lights.lights import Lights, light_flags
 from drgs_blender.render.sampling import sobol
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -11,7 +11,7 @@ LONGEST = 400
 #: Modules above it, and why they are one.
 REASONS = {
     "drgs_blender/core/frame.py": "the contract between Blender and the engine: all that a frame holds, on one page",
-    "drgs_blender/render/lights/lights.py": "the table of lights, and how it is sampled, met and weighed",
+    "drgs_blender/render/lights/light_sampler.py": "the table of lights, and how it is sampled, met and weighed",
     "drgs_blender/render/surfels/raster.py": "one rasteriser: its tiles, their lists, and the kernel that blends them",
     "tools/dev.py": "one command per function; it runs before there is any environment",
     "tools/suites.py": "from what is to run to what it said: plan, jobs, runner and report read each other",

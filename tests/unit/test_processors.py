@@ -20,7 +20,7 @@ import numpy as np
 from drgs_blender.core.color import srgb_to_linear
 from drgs_blender.engine.scene_objects import world_vertices
 from drgs_blender.core.frame import Light, World
-from drgs_blender.render.lights.lights import Lights
+from drgs_blender.render.lights.light_sampler import Lights
 from drgs_blender.render.lights.environment import EnvironmentLight
 from drgs_blender.render.integrator.brdf import layer_table
 

@@ -13,7 +13,7 @@ from test_integrate import points, settings, sun_picture
 from drgs_blender.core.frame import Light, MeshState, Visibility, World
 from drgs_blender.render.integrator.integrate import integrate
 from drgs_blender.render.lights.environment import EnvironmentLight
-from drgs_blender.render.lights.lights import Lights
+from drgs_blender.render.lights.light_sampler import Lights
 from drgs_blender.render.scene.trace_scene import TraceScene
 
 DARK = World(strength=0.0)

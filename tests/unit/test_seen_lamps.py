@@ -13,7 +13,7 @@ from test_surface import matrix, mesh_state
 
 from drgs_blender.core.frame import Frame, Light, Material, RenderSettings, Visibility, World
 from drgs_blender.render.lights.environment import EnvironmentLight
-from drgs_blender.render.lights.lights import Lights
+from drgs_blender.render.lights.light_sampler import Lights
 from drgs_blender.render.pipeline import render
 from drgs_blender.render.prepared_scene import PreparedScene
 from drgs_blender.render.scene.trace_scene import TraceScene

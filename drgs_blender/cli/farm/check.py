@@ -1,4 +1,4 @@
-"""What a scene would miss on a node, found before it is sent there."""
+"""Checks a scene before it is sent to a farm: what it would miss on a node."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A render job, the same for every farm manager: command lines for chunks of frames."""
+"""A render farm job, the same for every farm manager: command lines for chunks of frames."""
 
 from __future__ import annotations
 

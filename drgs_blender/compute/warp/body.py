@@ -1,4 +1,4 @@
-"""The body of one function on its way to Warp, see `translate`."""
+"""Translates the statements of a Numba function for Warp; see `translate`."""
 
 from __future__ import annotations
 

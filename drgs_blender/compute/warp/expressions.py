@@ -1,4 +1,4 @@
-"""Expressions of one function on their way to Warp, see `body`."""
+"""Translates the expressions of a Numba function for Warp; see `body`."""
 
 from __future__ import annotations
 

@@ -99,7 +99,7 @@ class Launcher:
         self._modules: dict[tuple[Work, tuple[Type, ...]], ModuleType] = {}
 
     def array(self, array: Array, copy: bool | None = None) -> Any:
-        """A Warp array of an array's content; on the processor it is the same memory unless told otherwise."""
+        """A Warp array of an array's content; on the processor it is the same memory unless a copy is asked for."""
         wp = warp()
         copy = self.apart if copy is None else copy
         array = np.ascontiguousarray(array)

@@ -1,4 +1,4 @@
-"""Posed surfels that lie on a device, and come to this processor when somebody asks for them."""
+"""Posed surfels in a device's memory, copied to this processor on demand."""
 
 from __future__ import annotations
 

@@ -75,7 +75,7 @@ def warp() -> Any:
 
 @contextlib.contextmanager
 def preparing() -> Iterator[None]:
-    """While kernels are made ready: tells the `watchers`."""
+    """While kernels are made ready: calls the `watchers`."""
     for watcher in watchers:
         watcher(1)
     try:

@@ -1,4 +1,4 @@
-"""Searching in arrays of a device; translated where a kernel calls it."""
+"""Binary search in arrays of a device; translated where a kernel calls it."""
 
 from __future__ import annotations
 

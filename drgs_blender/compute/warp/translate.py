@@ -1,4 +1,4 @@
-"""From Numba's scalar functions to Warp's: the same source, compiled for the processor here and for the device there.
+"""Translates Numba's scalar functions for Warp: the same source, compiled for the processor here and the device there.
 
 What is translated are functions of numbers, tuples, named tuples and elements of arrays, as the renderer's kernels
 call them for one ray or one point. Their types are inferred from those of the first arguments as Numba infers them, and

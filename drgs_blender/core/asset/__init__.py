@@ -1,4 +1,4 @@
-"""What a DR-GS asset is, and its container file."""
+"""The data of a DR-GS asset, and its container file."""
 
 from .model import MATERIAL_CHANNELS, Asset, Binding, Environment, Mesh, PosedSurfels, Surfels
 

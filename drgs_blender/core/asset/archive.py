@@ -147,7 +147,7 @@ def _map(path: Path) -> Array:
 
 
 def _central_directory(data: Array, subject: str) -> tuple[list[Member], int]:
-    """(members, offset of the directory), with the reasons a user may want to read told apart."""
+    """(members, offset of the directory), with an error of its own for each fault of the file."""
     end = _END.unpack(data[-_END.size :].tobytes())
     signature, disk, first_disk, here, count, length, start, comment = end
     if signature != b"PK\5\6":
@@ -194,7 +194,7 @@ def _refused(flags: int, method: int, packed: int, size: int, attributes: int) -
 
 
 def _check_names(members: Sequence[Member], subject: str) -> None:
-    """Refuse names that would leave a folder, or that some file system cannot tell apart."""
+    """Refuse names that would leave a folder, or that are one name for some file systems."""
     seen: set[str] = set()
     for member in members:
         name = member.name

@@ -1,4 +1,4 @@
-"""What a DR-GS asset is, as plain arrays.
+"""A DR-GS asset as plain arrays: surfels, mesh, binding, environment.
 
 Conventions of every array in this project: right-handed, Z up, metres; float32, C-contiguous, (n, 3); colour is
 linear Rec.709, scene-referred; quaternions are wxyz; roughness is perceptual (alpha = roughness squared).

@@ -41,12 +41,12 @@ def weigh_corners(lane, lanes, room, vertices, faces, place, out):  # type: igno
             weighted[p, 0], weighted[p, 1], weighted[p, 2] = w * nx, w * ny, w * nz
 
 
-def sum_corners(lane, lanes, room, weighted, start, side, out):  # type: ignore[no-untyped-def]
-    """`geometry._sum`; `side` -1 turns the normals round."""
+def sum_corners(lane, lanes, room, weighted, start, sign, out):  # type: ignore[no-untyped-def]
+    """`geometry._sum`; `sign` -1 turns the normals round."""
     (normals,) = out
     for v in range(lane, len(normals), lanes):
         x, y, z = vertex_normal(weighted, start[v], start[v + 1])
-        normals[v, 0], normals[v, 1], normals[v, 2] = side * x, side * y, side * z
+        normals[v, 0], normals[v, 1], normals[v, 2] = sign * x, sign * y, sign * z
 
 
 def _constants(module: ModuleType, name: str, value: Any) -> Any:
@@ -101,7 +101,7 @@ class Deformer:
         posing = driven.posing(*given, matrix_world, torn)
         if not np.abs(posing.vertices).max(initial=0.0) < _USABLE:
             return here()
-        driven.lost = 0
+        driven.hidden_count = 0
         n, launcher, tables = len(driven.surfels), self.launcher, self._tables(driven)
         with launcher.failures("copying a mesh"):
             vertices = launcher.array(posing.vertices)
@@ -111,7 +111,7 @@ class Deformer:
             made = [launcher.zeros((n, 3)) for _ in range(4)]
         normals = self._smooth(tables, driven, posing, vertices) if posing.normals is None else posing.normals
         mesh = vertices, tables.faces, normals
-        arguments = mesh, posing.normals is not None, posing.linear, posing.side, tables.rest
+        arguments = mesh, posing.normals is not None, posing.linear, posing.sign, tables.rest
         launcher.launch(POSE, n, arguments, (*made, opacity))
         names = "centre", "tangent_u", "tangent_v", "normal"
         channels = {name: self._own(tables, driven, name, posing.channels[name]) for name in MATERIAL_CHANNELS}
@@ -122,11 +122,11 @@ class Deformer:
         """(n, 3) normals of the vertices."""
         launcher = self.launcher
         with launcher.failures("copying a mesh"):
-            own = posing.bent is driven.normals.faces
-            faces = tables.faces if own else launcher.array(posing.bent)
+            own = posing.smooth_faces is driven.normals.faces
+            faces = tables.faces if own else launcher.array(posing.smooth_faces)
             weighted, normals = launcher.zeros((3 * len(faces), 3)), launcher.zeros(vertices.shape)
         launcher.launch(WEIGH, len(faces), (vertices, faces, tables.place), (weighted,))
-        launcher.launch(SUM, len(normals), (weighted, tables.start, np.float32(posing.side)), (normals,))
+        launcher.launch(SUM, len(normals), (weighted, tables.start, np.float32(posing.sign)), (normals,))
         return normals
 
     def _tables(self, driven: MeshDriven) -> _Tables:

@@ -1,4 +1,4 @@
-"""What a capture is: calibrated photographs of one object."""
+"""A capture: calibrated photographs of one object."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Views as the optimiser wants them: over one background, in full and half size, with what never changes computed."""
+"""Training views: over one background, in full and half size, with what never changes computed."""
 
 from __future__ import annotations
 

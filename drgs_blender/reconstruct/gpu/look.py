@@ -1,4 +1,4 @@
-"""What a view shows, in plain tensor operations for any device: `attributes` and `reflection` without compiled code."""
+"""Appearance of a view in tensor operations, for any device: `attributes` and `reflection` without compiled code."""
 
 from __future__ import annotations
 

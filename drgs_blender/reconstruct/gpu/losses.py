@@ -1,4 +1,4 @@
-"""How far a view is from what it should be, for any device: `photometric` and `shape` in plain tensor operations.
+"""Losses of a view, for any device: `photometric` and `shape` in plain tensor operations.
 
 The blur alone is a kernel of Warp: libraries of convolutions round otherwise, and not the same way each time.
 """

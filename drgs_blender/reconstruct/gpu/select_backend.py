@@ -1,4 +1,4 @@
-"""The backend that learns: the one that is asked for, or the CPU with a warning that says why."""
+"""Selects the backend of learning: the one that is asked for, or the CPU with a warning and its reason."""
 
 from __future__ import annotations
 

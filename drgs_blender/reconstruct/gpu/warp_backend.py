@@ -1,4 +1,4 @@
-"""A processor for learning that is a device of Warp and of torch."""
+"""The Warp backend of learning: a device of Warp and of torch."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Weighted sums of rows, and of what rows are worth to a loss: interpolation over faces and in grids.
+"""Interpolation as weighted sums of rows, over faces and in grids, with its gradient.
 
 The derivative is summed in a fixed order, unlike that of torch's own indexing, and several times as fast.
 """

@@ -1,4 +1,4 @@
-"""The environment as something to learn: log radiance on a lat-long grid that grows."""
+"""The captured illumination, an environment that is learned: log radiance on a lat-long grid that grows."""
 
 from __future__ import annotations
 

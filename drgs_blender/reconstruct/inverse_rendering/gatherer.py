@@ -1,4 +1,4 @@
-"""What arrives at pixels of a mesh, differentiable in radiance, roughness and normals: `estimator` for torch."""
+"""Light gathered at pixels of a mesh, differentiable in radiance, roughness and normals: `estimator` for torch."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is learned of the light, and the light that pixels gather."""
+"""The learned light, and the light that pixels gather."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How far what is shown is from the photographs. Radiance is linear Rec.709; photographs lie in [0, 1]."""
+"""Losses of inverse rendering: pixels against photographs. Radiance is linear Rec.709; photographs lie in [0, 1]."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def log_loss(shown: Tensor, photographed: Tensor) -> Tensor:
 def dullness(albedo: Tensor, metallic: Tensor) -> Tensor:
     """How much less metals (n, 3), (n,) reflect than polished ones do, mean squared difference of their colours.
 
-    Where light is dim, nothing but metal tells how dim: dark metal in a light that is too even looks almost the same.
+    Where light is dim, only metal shows how dim: dark metal in a light that is too even looks almost the same.
     Metals that are used polished reflect nine tenths and more of their brightest channel. Gradients scale a colour and
     leave its hue; what is not surely metal has none.
     """

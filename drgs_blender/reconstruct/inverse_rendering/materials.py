@@ -1,4 +1,4 @@
-"""Materials of the vertices as something to learn: logits, on the vertices themselves and on nested grids around them.
+"""Learned materials of the vertices: logits, on the vertices themselves and on nested grids around them.
 
 A grid's cell carries what the many pixels around it agree on, so that large areas find their values in few steps; the
 vertices keep the detail. The grids are interpolated linearly, so that they have no blocks.

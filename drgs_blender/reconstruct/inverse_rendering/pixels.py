@@ -90,7 +90,7 @@ def foreground_pixels(
         Keep this many, evenly chosen.
     seed : int
     normals : callable, optional
-        What else than the mesh tells them; see `Pixels.shown`.
+        Normals other than the mesh's; see `Pixels.shown`.
 
     Raises
     ------

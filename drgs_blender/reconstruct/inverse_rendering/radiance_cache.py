@@ -1,4 +1,4 @@
-"""Light that the object itself sends: what the photographs show of each vertex, as a function of direction.
+"""The radiance cache: light that the object itself sends, which photographs show of each vertex by direction.
 
 That is the paper's radiance of the surfels during training. It does not depend on materials that are still unknown.
 """

@@ -1,4 +1,4 @@
-"""What is expected of materials, normals and light, whatever the photographs show."""
+"""Regularisers: what is expected of materials, normals and light, whatever the photographs show."""
 
 from __future__ import annotations
 

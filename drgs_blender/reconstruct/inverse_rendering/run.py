@@ -1,4 +1,4 @@
-"""Decoupling: pixels of all photographs, a step at a time, until materials and light explain them."""
+"""Inverse rendering (decoupling): steps over the pixels of all photographs, until materials and light explain them."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def decouple(
     backend : LearningBackend
         Who follows rays; the rest is done here.
     normals : callable, optional
-        What else than the mesh tells the normals behind pixels. They count where they are within 60 degrees of the
+        Gives the normals behind pixels in place of the mesh. They count where they are within 60 degrees of the
         face, as for surfels that are rendered; what is learned of normals is added to them.
     now : callable
         Seconds since whenever.
@@ -128,7 +128,7 @@ def decouple(
     if not capture.training:
         raise UsageError(str(capture.source), "has no training view", "Leave fewer views out for the test")
     if len(capture.training) < 4:
-        log.warning("only %d views: light and materials can hardly be told apart", len(capture.training))
+        log.warning("only %d views: light and materials can hardly be separated", len(capture.training))
     job = Job(capture, mesh, settings, checkpoint, backend, normals, now)
     schedule = job.schedule
     while schedule.going():

@@ -1,4 +1,4 @@
-"""Where a run of decoupling is, by steps and by time, and what begins there."""
+"""The schedule of inverse rendering: how far a run is, by steps and by time, and what begins there."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How the light and the materials of an object are pulled apart."""
+"""Settings of inverse rendering: how light and materials of an object are separated."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is learned of the surface: its materials, and normals on top of those of the mesh."""
+"""The learned surface: its materials, and normals on top of those of the mesh."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How far a picture is from a photograph: L1 and structural similarity, with their gradient, in compiled code.
+"""The photometric loss: L1 and structural similarity (SSIM), with their gradient, in compiled code.
 
 SSIM is that of Wang et al. 2004 (Gaussian window of 11 pixels, deviation 1.5, black beyond the edges, each channel on
 its own). All its terms are blurred pictures, the blur is separable and its own adjoint, and what depends on the

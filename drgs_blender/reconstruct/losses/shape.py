@@ -1,4 +1,4 @@
-"""What is asked of the shape: the mask, little distortion, surfels' normals as those of the depth map.
+"""Losses of the shape: the mask, little distortion, surfels' normals as those of the depth map.
 
 The last two are those of Huang et al. 2024, "2D Gaussian Splatting". Value and gradient come in one pass over the
 pixels.

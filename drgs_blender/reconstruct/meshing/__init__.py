@@ -1,1 +1,1 @@
-"""From depth maps and masks to a closed mesh."""
+"""Meshing: depth maps and masks to a closed mesh."""

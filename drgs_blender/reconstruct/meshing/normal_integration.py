@@ -1,4 +1,4 @@
-"""Learned normals put into the shape: vertices move along their own normals until the surface stands as they say.
+"""Normal integration: vertices move along their own normals until the surface has the learned normals.
 
 Normals are better than positions where it is fine, positions where it is coarse (Nehab et al. 2005, "Efficiently
 combining positions and normals for precise 3D geometry"). A mesh that has its normals by its vertices keeps them

@@ -1,4 +1,4 @@
-"""Where the object is: a region from the cameras, and the visual hull of the masks as the first surface.
+"""The visual hull of the masks as the first surface, and the region of the object from the cameras.
 
 A point belongs to the visual hull when no view that has it in its picture shows background there (Laurentini 1994).
 Surfels that start on it need not be found by gradients.
@@ -72,7 +72,7 @@ def have_silhouettes(capture: Capture) -> bool:
 
 
 def silhouettes(capture: Capture) -> list[Array] | None:
-    """Masks of the training views, (h, w) float32 each: drawn, or told from a background of one colour; or None.
+    """Masks of the training views, (h, w) float32 each: drawn, or made from a background of one colour; or None.
 
     Raises
     ------
@@ -119,7 +119,7 @@ def aim(cameras: list[Camera]) -> tuple[Array, float]:
     across = np.eye(3) - axis[:, :, None] * axis[:, None, :]
     if np.linalg.cond(across.sum(0)) > 1e6:
         raise AssetError(
-            "cameras", "all look in one direction: depth cannot be told", "Photograph the object from around it"
+            "cameras", "all look in one direction: depth cannot be measured", "Photograph the object from around it"
         )
     middle = np.linalg.solve(across.sum(0), (across @ eye[:, :, None]).sum(0))[:, 0]
     half = [min(c.width / c.fx, c.height / c.fy) / 2 for c in cameras]
@@ -284,7 +284,7 @@ def _without_masks(capture: Capture, views: list[View]) -> Region:
     """Sparse points where there are enough, else points in the sphere that the cameras look at."""
     log.warning(
         "%s: neither masks nor a background of one colour: the surroundings are learned with the object, which takes "
-        "longer and gives a worse shape; masks tell them apart",
+        "longer and gives a worse shape; masks separate them",
         capture.source,
     )
     centre, radius = aim([view.camera for view in views])

@@ -1,4 +1,4 @@
-"""From what is learned of surfels to what the rasteriser blends, forwards and backwards, in one pass over the surfels.
+"""Learned parameters of surfels to what the rasteriser blends, forwards and backwards, in one pass over the surfels.
 
 Quaternions give frames, logarithms sizes, logits what lies in 0..1, harmonics the colour seen from the view; plain
 tensor operations would cost as much as blending the pixels. The tests hold this against such.

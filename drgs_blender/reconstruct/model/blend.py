@@ -1,4 +1,4 @@
-"""Surfels blended into the maps of a view, pixel by pixel, front to back; `raster` has the formulas.
+"""Alpha blending of surfels into the maps of a view, pixel by pixel, front to back; `raster` has the formulas.
 
 Pixels are taken in blocks, of which a splat meets all at once: vector code. A worker keeps the blocks of a tile.
 """

@@ -1,4 +1,4 @@
-"""Densification and pruning: surfels where the pictures ask for more, none where nobody sees them.
+"""Densification and pruning: surfels split where gradients are large, removed where no view sees them.
 
 A surfel whose projected centre is pulled hardest, in absolute values (Ye et al. 2024, "AbsGS"), is cut in two along
 its longer axis; the halves keep its mean and nearly its covariance. How many are cut is set by a budget, not by a

@@ -2,7 +2,7 @@
 
 Outlines show nothing of hollows. What lies in one is found from surfels that begin inside the hull, and hardly ever
 from those that begin on it: they paint what the views see of the hollow onto its lid. Behind a mirror, on the other
-hand, surfels inside explain what is reflected, and explain it wrongly. Neither can be told beforehand:
+hand, surfels inside explain what is reflected, and explain it wrongly. Which is the case is not known beforehand:
 `optim.starts` tries both.
 """
 

@@ -1,4 +1,4 @@
-"""What mirrors: a learned cube of light around the object, looked up along reflected rays.
+"""The reflection probe: a learned cube of light around the object, looked up along reflected rays.
 
 Deferred shading with the split-sum approximation (Karis 2013), as Ref-Gaussian (Yao et al. 2025) pre-trains: each
 pixel's blended normal reflects the view, each surfel says how much and how blurred. Values are display-encoded, like

@@ -1,4 +1,4 @@
-"""Things thinner than the mesh can be, such as leaves: there its normals are those of tubes around what it encloses.
+"""Thin structures, such as leaves: normals of what is thinner than the mesh can be are those of tubes around it.
 
 Surfels have no thickness. Where much of what photographs show is so thin, their own normals are the better ones.
 """

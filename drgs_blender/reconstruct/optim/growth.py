@@ -1,4 +1,4 @@
-"""When surfels are cut, and how many there may be then."""
+"""The schedule of densification: when surfels are split, and how many there may be then."""
 
 from __future__ import annotations
 

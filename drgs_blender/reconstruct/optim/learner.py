@@ -1,4 +1,4 @@
-"""One step of learning: a view is rendered, compared with its photograph, and all parameters go a way down."""
+"""One optimiser step: a view is rendered, compared with its photograph, and all parameters are updated."""
 
 from __future__ import annotations
 

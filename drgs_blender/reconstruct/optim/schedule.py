@@ -1,4 +1,4 @@
-"""How surfels are learned: steps, weights of the losses, learning rates."""
+"""The training schedule of surfels: steps, weights of the losses, learning rates."""
 
 from __future__ import annotations
 

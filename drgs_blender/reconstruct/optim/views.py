@@ -1,4 +1,4 @@
-"""The photographs that steps are taken by, in turn."""
+"""The order of training views: one for each step, in turn."""
 
 from __future__ import annotations
 

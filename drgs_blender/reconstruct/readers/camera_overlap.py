@@ -1,4 +1,4 @@
-"""Whether cameras look at one thing: what is asked of captures without masks, whose silhouettes say nothing."""
+"""Overlap of cameras: whether they look at one thing, for captures whose silhouettes show nothing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every reader of captures returns: where the photographs are, and what is known about each."""
+"""Results of readers of captures: where the photographs are, and what is known about each."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Denoisers: SVGF in space and over time, OIDN."""
+"""The denoiser: SVGF in space and over time, or OIDN."""

@@ -1,4 +1,4 @@
-"""Light as SVGF filters it: divided by surface colour and coverage, in planes, beside what guides the filters.
+"""Demodulation: light as SVGF filters it, divided by surface colour and coverage, in planes, beside the guides.
 
 Pictures are planar here, (rows, planes, columns), with `PAD` empty columns on either side: kernels work on runs of
 `TILE` pixels, plane by plane, with scratch arrays whose strides the compiler knows, so that all of it is SIMD.

@@ -1,4 +1,4 @@
-"""Light of neighbouring frames, brought to this frame's surfaces: SVGF's temporal half, and a window for final frames.
+"""Temporal SVGF: reprojection of the last frame's light to this frame's surfaces, and its mixture with the new light.
 
 Pictures are compared on demodulated light, so texture moves with its surface and never ghosts. Every pixel looks up
 where its surface was (`motion`); of the four pixels around that place those count that show the same object, lie on the

@@ -1,4 +1,4 @@
-"""SVGF for final frames: the light of a window of frames that looks ahead as far as back.
+"""Temporal SVGF for final frames: the light of a window of frames that looks ahead as far as back.
 
 The mean over the frames k - 2 .. k + 2, weighted by v / (v + b), see `svgf_temporal`: a steady change cancels, and what
 comes of it depends on these frames alone, so that it does not matter in which runs and on which machines they are made.

@@ -19,7 +19,7 @@ Array = np.ndarray
 
 #: Passes of each kind.
 PASSES = 3
-#: Things that are told apart in one pixel before the least are left out.
+#: IDs kept per pixel before those of the least coverage are left out.
 _SLOTS = 24
 
 

@@ -1,8 +1,7 @@
-"""From shading points and their light to the pixels of all passes.
+"""The film: shading points and their light become the pixels of all passes.
 
-A pixel is the plain mean of its ``subpixels`` sub-pixel samples (box filter of one pixel), premultiplied by coverage.
-Passes
-that describe the surface are not premultiplied, so that the object has no dark rim in them:
+A pixel is the plain mean of its ``subpixels`` sub-pixel samples drawn from the pixel filter by `camera`, premultiplied
+by coverage. Passes that describe the surface are not premultiplied, so that the object has no dark rim in them:
 
 - Depth, Position: mean of the samples on the surface nearest to the camera (those within `SAME_SURFACE` pixel widths
   of the nearest one), so that no value lies between two surfaces; 1e10 and 0 where the pixel is empty;
@@ -139,7 +138,7 @@ class Film:
                 )  # fmt: skip
 
     def guides(self) -> Guides:
-        """What the denoiser tells surfaces apart by."""
+        """The denoiser's guides: what differs from surface to surface."""
         known = self.pixels._asdict()
         shared = {name: known[name] for name in Guides._fields if name in known}
         return Guides(**shared, footprint=footprints(self.pixels.depth, self.parameters))

@@ -1,4 +1,4 @@
-"""What tells surfaces apart for a denoiser."""
+"""Guides of the denoiser: normals, albedo, position and more, by which it keeps the edges between surfaces."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Array = np.ndarray
 
 
 class Guides(NamedTuple):
-    """What tells the surfaces of a picture apart; float32.
+    """Images by which a denoiser distinguishes the surfaces of a picture (auxiliary features); float32.
 
     Attributes
     ----------

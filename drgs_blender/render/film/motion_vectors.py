@@ -1,4 +1,4 @@
-"""Where every visible surface point is at another time: on its mesh, in the world, in the picture.
+"""Motion vectors: where every visible surface point is at another time, on its mesh, in the world, in the picture.
 
 A point is tied to the mesh by a face and barycentric coordinates. What stands off the mesh (a surfel is not quite on
 it) keeps its coordinates in the basis of the face's two edges and unit normal, as surfels do when they are posed, so
@@ -39,7 +39,7 @@ class Instant(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """Where the surfaces of a picture are at another time, mostly one frame earlier.
+    """The motion vector of each pixel: where its surface is at another time, mostly one frame earlier.
 
     Attributes
     ----------

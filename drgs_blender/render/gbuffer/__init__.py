@@ -1,1 +1,1 @@
-"""What the camera sees: the G-buffer, from surfels and from meshes."""
+"""The G-buffer, what the camera sees, from surfels and from meshes."""

@@ -1,4 +1,4 @@
-"""What of each sub-pixel sample is surfels, an ordinary mesh, a hole or background.
+"""Layers of each sub-pixel sample: surfels, an ordinary mesh, a hole or background.
 
 Surfels are blended on their own; the nearest ordinary mesh on the camera's ray then hides them, or fills what they
 leave free behind them. A holdout hides what lies behind it and is not seen itself; a shadow catcher is a surface that

@@ -1,4 +1,4 @@
-"""From blended surfels to shading points whose secondary rays are safe.
+"""Blended surfels to shading points whose secondary rays are safe.
 
 Rays that light a surfel meet the mesh, and the mesh is not where the surfels are: a ray that starts at a surfel below
 the mesh is blocked by its own surface, one that starts above misses contact shadows. Every point is therefore moved to
@@ -245,7 +245,7 @@ def attach_points(lane, lanes, room, tracer, rules, view_of, samples, keys, out)
                 )  # fmt: skip
             if not tied:  # the face says how the point moves, nothing else
                 how, hx, hy, hz, gx, gy, gz = NOWHERE, x, y, z, nx, ny, nz
-            # A face met by the camera ray shows which side is seen; else the surfel tells, save at its rim.
+            # A face met by the camera ray shows which side is seen; else the surfel does, save at its rim.
             if how in (ALONG_VIEW, ANY_SIDE, FACING):
                 behind = gx * vx + gy * vy + gz * vz < 0.0
             else:

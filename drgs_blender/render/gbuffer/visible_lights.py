@@ -12,8 +12,8 @@ import numpy as np
 
 from ...compute.jit import njit, prange
 from ..camera import CLIP_END, CLIP_START, WIDTH, sample_ray
+from ..lights.light_sampler import Lights, lights_along, suns_along
 from ..lights.light_shapes import CAMERA
-from ..lights.lights import Lights, lights_along, suns_along
 from ..points import CATCHER
 from ..sampling import ONE, ZERO, F
 from .gbuffer import GBuffer

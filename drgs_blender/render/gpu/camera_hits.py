@@ -1,4 +1,4 @@
-"""What the camera sees of meshes, on a device: `gbuffer.camera_hits` with Warp's rays, from the same source."""
+"""Camera rays against meshes on a device: `gbuffer.camera_hits` with Warp's rays, from the same source."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ from ...compute.warp.kernels import Launcher, Room, Work
 from ..integrator import direct, indirect, integrate, sample_allocation, wavefront
 from ..integrator.records import Sampler, Scene, Settings
 from ..lights.environment import EnvironmentLight
-from ..lights.lights import Lights
+from ..lights.light_sampler import Lights
 from ..points import PointArrays
 from ..scene.trace_scene import TraceScene
 from .natives import NATIVES

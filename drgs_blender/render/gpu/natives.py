@@ -1,4 +1,4 @@
-"""What the device has of its own: reading at addresses, and rays that meet triangles by Warp's tree."""
+"""Native functions of a device: reading at addresses, and rays that meet triangles by Warp's BVH."""
 
 from __future__ import annotations
 

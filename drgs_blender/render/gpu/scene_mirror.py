@@ -1,4 +1,4 @@
-"""What a device knows of a scene: copies of the arrays behind every address, and Warp's trees."""
+"""The copy of a scene on a device: the arrays behind every address, and Warp's BVHs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from ...compute.warp.kernels import Launcher
 from ..lights.environment import ROTATION, EnvironmentLight, EnvMap
-from ..lights.lights import Lights
+from ..lights.light_sampler import Lights
 from ..memory import Place, address
 from ..scene.interaction import Geometry
 from ..scene.ray_masks import CAMERA, DIFFUSE, GLOSSY, ORDINARY, SHADOW, SURFELS, WITHOUT

@@ -1,4 +1,4 @@
-"""The backend of a frame: the one that is asked for, or the CPU with a warning that says why."""
+"""Selects the backend of a frame: the one that is asked for, or the CPU with a warning and its reason."""
 
 from __future__ import annotations
 

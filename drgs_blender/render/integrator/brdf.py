@@ -1,4 +1,4 @@
-"""The surface: GGX over Lambert, in two looks, as scalar functions for compiled code.
+"""The BRDF, all there is of a BSDF here: GGX over Lambert, in two models, as scalar functions for compiled code.
 
 ``paper`` (0): Cook-Torrance GGX with height-correlated Smith and Schlick Fresnel, F0 = 0.04 (1 - m) + m a; diffuse
 (1 - m) a / pi. ``principled`` (1): Blender's Principled BSDF (distribution GGX, IOR 1.5, no other lobe): a metallic
@@ -125,7 +125,7 @@ def ggx(nl, nv, nh2, sin2, a2):  # type: ignore[no-untyped-def]
 
 @inlined
 def vndf_terms(nv, a2):  # type: ignore[no-untyped-def]
-    """(bound, norm): the cap's lower bound factor k, and what turns D into the density of reflected directions."""
+    """(bound, norm): the cap's lower bound factor k, and what turns D into the pdf of reflected directions."""
     s = ONE + math.sqrt(max(ZERO, ONE - nv * nv))
     s2 = s * s
     bound = (ONE - a2) * s2 / (s2 + a2 * nv * nv)
@@ -134,7 +134,7 @@ def vndf_terms(nv, a2):  # type: ignore[no-untyped-def]
 
 @inlined
 def sample_vndf(u, v, ix, iy, iz, alpha, bound):  # type: ignore[no-untyped-def]
-    """Reflected direction for view (ix, iy, iz), iz > 0, in the frame of the normal."""
+    """GGX importance sampling: the reflected direction for view (ix, iy, iz), iz > 0, in the frame of the normal."""
     x, y = ix * alpha, iy * alpha
     scale = ONE / math.sqrt(x * x + y * y + iz * iz)
     x, y, z = x * scale, y * scale, iz * scale
@@ -151,7 +151,7 @@ def sample_vndf(u, v, ix, iy, iz, alpha, bound):  # type: ignore[no-untyped-def]
 
 @inlined
 def evaluate(angles, albedo, kd, metallic, a2, norm, shading_model):  # type: ignore[no-untyped-def]
-    """Diffuse and specular (RGB each) BRDF values and the density of ``sample_vndf``; all without the cosine.
+    """Diffuse and specular (RGB each) BRDF values and the pdf of ``sample_vndf``; all without the cosine.
 
     Without branches, so that loops over it vectorise.
 

@@ -1,4 +1,8 @@
-"""Direct light: samples of one strategy in batches (draw, evaluate, pdfs, trace), joined by MIS (balance heuristic)."""
+"""Direct light: samples of one strategy in batches (draw, evaluate, pdfs, trace), joined by MIS (balance heuristic).
+
+Multiple importance sampling with the balance heuristic (the power heuristic with exponent 1): each sample is divided by
+the sum of all strategies' pdfs.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +10,8 @@ import numpy as np
 
 from ...compute.jit import njit
 from ..lights.environment import envmap_radiance
+from ..lights.light_sampler import emission_along, lights_along
 from ..lights.light_shapes import DIFFUSE, GLOSSY
-from ..lights.lights import emission_along, lights_along
 from ..sampling import ONE, ZERO, F, luminance
 from ..scene import ray_masks
 from . import wavefront as w

@@ -1,6 +1,6 @@
 """Indirect light: paths continued in batches from the hits of direct samples.
 
-Every path vertex takes next-event estimation of environment and lights, one sample each, and one BRDF sample, combined
+Every path vertex takes next event estimation of environment and lights, one sample each, and one BRDF sample, combined
 by multiple importance sampling (balance heuristic). The throughput is the path's weight so far; from the fourth vertex
 on, Russian roulette ends paths by it.
 """
@@ -11,8 +11,8 @@ import numpy as np
 
 from ...compute.jit import njit
 from ..lights.environment import envmap_pdf, envmap_radiance, map_at
+from ..lights.light_sampler import emission_along, lights_along
 from ..lights.light_shapes import DIFFUSE, GLOSSY
-from ..lights.lights import emission_along, lights_along
 from ..lights.product_sampling import product_row
 from ..sampling import GOLDEN, ONE, ZERO, F, U, mix, unit
 from ..scene import ray_masks

@@ -17,7 +17,7 @@ from ...core.errors import UsageError
 from ...core.frame import RenderSettings
 from .. import sampling
 from ..lights.environment import EnvironmentLight
-from ..lights.lights import Lights
+from ..lights.light_sampler import Lights
 from ..points import CATCHER, SECOND, PointArrays, Radiance, ShadingPoints
 from ..sampling import GOLDEN, ONE, ZERO, F, U, mix, unit
 from ..scene import ray_masks
@@ -35,9 +35,9 @@ from .variance import variances
 
 Array = np.ndarray
 
-#: Part of the samples that go to the light at most where rays of different kinds meet different objects: there the
+#: Largest share of the samples that goes to the light where rays of different kinds meet different objects: there the
 #: picture follows from how strategies are weighed (docs/rendering.md), and this comes closest to Cycles.
-_APART = F(0.25)
+_MAX_LIGHT_SHARE = F(0.25)
 #: Points of a block.
 _BLOCK = 64
 #: Least share of the light samples that go to environment or lights when both shine.
@@ -132,8 +132,8 @@ def integrate(
     given = Scene(tracer, geometry, envmap, light_tables, traits)
     clamp = F(settings.clamp_indirect * settings.subpixel_count * part[1] / sum(counts))
     how = Settings(settings.bounces, brdf.SHADING_MODELS[settings.shading_model], brdf.layer_table(), clamp, 0)
-    seed, sequence = U(mixed(settings.seed, noise_index)), sampling.point_set(sum(counts) + 1)
-    shares = F(environment_part), F(lights_part), _APART if scene.rays_differ else ONE
+    seed, sequence = U(hash_seed(settings.seed, noise_index)), sampling.point_set(sum(counts) + 1)
+    shares = F(environment_part), F(lights_part), _MAX_LIGHT_SHARE if scene.rays_differ else ONE
     sampler = Sampler._make([seed, sequence, settings.subpixel_count, *part, auto, *map(F, counts), *shares])
 
     def run(some: ShadingPoints, shift: int, found: Radiance) -> None:
@@ -164,8 +164,8 @@ def environment_share(environment: EnvironmentLight, lights: Lights) -> float:
 _NO_LIGHTS = Lights([])
 
 
-def mixed(seed: int, noise_index: int) -> int:
-    """One 32-bit key of the job's seed and the frame's number."""
+def hash_seed(seed: int, noise_index: int) -> int:
+    """A 32-bit hash of the seed and the noise index."""
     value = (seed * 0x9E3779B97F4A7C15 + (noise_index + 1) * 0xD1B54A32D192ED03) & (2**64 - 1)
     value ^= value >> 32
     value = value * 0xD6E8FEB86659FD93 & (2**64 - 1)

@@ -14,9 +14,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ...compute.jit import njit
+from ..lights.light_sampler import light_flags
 from ..lights.light_shapes import DIFFUSE, GLOSSY
 from ..lights.light_shapes import SHADOW as SHADOWED
-from ..lights.lights import light_flags
 from ..lights.triangle_light import ABSENT
 from ..sampling import ONE, ZERO, F, U, mix, unit
 from ..scene import ray_masks

@@ -1,4 +1,4 @@
-"""What the integrator's kernels take besides points and batches of rays: the scene, the settings and the sampler."""
+"""Records of the integrator's kernels, besides points and batches of rays: the scene, the settings and the sampler."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..lights.environment import EnvMap
-from ..lights.lights import LightTables
+from ..lights.light_sampler import LightTables
 from ..scene.interaction import Geometry
 
 Array = np.ndarray

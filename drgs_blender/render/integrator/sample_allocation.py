@@ -1,4 +1,4 @@
-"""State of a shading point that all its samples share: ray origin, lobes, and samples allocated to each strategy."""
+"""Sample allocation: samples of each strategy at a shading point, with the ray origin and lobes that they share."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ import numpy as np
 from ...compute.jit import inlined, njit
 from .. import sampling
 from ..lights.environment import cell_at, cell_end, direction_in_cell, envmap_pdf, envmap_touch, first_cell, map_at
-from ..lights.lights import sample_light
+from ..lights.light_sampler import sample_light
 from ..lights.product_sampling import block_of, in_cells_order
 from ..sampling import INVERSE_PI, ONE, TWO, ZERO, F, U, luminance, mix, scrambled, unit
 from . import brdf
@@ -152,7 +152,7 @@ def ggx_directions(rays, count):  # type: ignore[no-untyped-def]
 
 @njit
 def brdf_directions(rays, count):  # type: ignore[no-untyped-def]
-    """Directions from the mixture of both lobes; CELL tells which (1 diffuse, 0 specular)."""
+    """Directions from the mixture of both lobes; CELL says which (1 diffuse, 0 specular)."""
     s, ints = rays
     for p in range(packets(count)):
         b, c = p * _FLOATS, p * _INTS
@@ -244,7 +244,11 @@ def warm(rays, count, envmap):  # type: ignore[no-untyped-def]
 
 @njit
 def evaluate(rays, count, shading_model):  # type: ignore[no-untyped-def]
-    """BRDF of both lobes times cosine, densities of cosine and GGX sampling, and LIVE: whether any light can pass."""
+    """BRDF of both lobes times cosine, pdfs of cosine and GGX sampling, and LIVE: whether any light can pass.
+
+    Light passes only above both the geometric and the shading normal: the shadow terminator of coarse meshes shows
+    their faces, and is not softened.
+    """
     s = rays.floats
     for p in range(packets(count)):
         for i in range(p * _FLOATS, p * _FLOATS + LANES):

@@ -1,1 +1,1 @@
-"""What shines: the world and Blender's lights."""
+"""Lights: the environment, Blender's lights and mesh lights, their importance sampling and pdfs."""

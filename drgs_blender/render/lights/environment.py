@@ -1,4 +1,4 @@
-"""The environment light: radiance from a direction, and directions in proportion to radiance.
+"""The environment light (environment map): radiance from a direction, and directions in proportion to radiance.
 
 A texel's directions are drawn uniformly over its solid angle (uniform in azimuth and in z), so its density is one
 constant, finite at the poles. Its probability is the luminance, averaged over the texel as the bilinear lookup sees it,
@@ -213,7 +213,7 @@ def map_at(dx, dy, dz, envmap):  # type: ignore[no-untyped-def]
 
 @njit
 def envmap_pdf(u, v, product, envmap):  # type: ignore[no-untyped-def]
-    """Density per solid angle at (u, v) of sampling the environment at a surface whose `product_row` is `product`."""
+    """The pdf per solid angle at (u, v) of sampling the environment at a surface whose `product_row` is `product`."""
     row = min(np.int64(envmap.height - 1), np.int64(v * np.float32(envmap.height)))
     column = min(np.int64(envmap.width - 1), np.int64(u * np.float32(envmap.width)))
     density = load_float(envmap.texels, 4 * (row * envmap.width + column) + 3)

@@ -1,8 +1,8 @@
-"""The CDF of the environment: the power of each sampling cell, and the random numbers that are inverted to it.
+"""The environment map CDF: the power of each sampling cell, and the random numbers that are inverted to it.
 
-Cells follow each other in Morton order, so that equal strata of a random number are compact regions of equal power.
-That order goes through square blocks one after another, which is how the work is divided among threads: results do
-not depend on their number.
+Cells follow each other in Morton order, so that equal strata of a random number are compact regions of equal power,
+which an alias table would scatter. That order goes through square blocks one after another, which is how the work is
+divided among threads: results do not depend on their number.
 """
 
 from __future__ import annotations

@@ -257,7 +257,7 @@ def _volume(vertices, faces):  # type: ignore[no-untyped-def]
 
 @njit
 def _fill(own, vertices, faces, matrices, luminance, bits, turned, rows):  # type: ignore[no-untyped-def]
-    """Rows of faces in (k, 3, 4) places; (k,) `turned` tells that the normals look the other way."""
+    """Rows of faces in (k, 3, 4) places; where (k,) `turned`, the normals look the other way."""
     corners, edges = np.empty((3, 3)), np.empty((2, 3))
     for j in range(len(own) * len(matrices)):
         m, face = matrices[j // len(own)], own[j % len(own)]

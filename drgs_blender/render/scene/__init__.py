@@ -1,1 +1,1 @@
-"""What rays meet: triangles in one BVH, instances, materials, textures."""
+"""The traced scene: triangles in one BVH, instances, materials, textures."""

@@ -1,4 +1,4 @@
-"""Where a shape stands: its matrices checked, for points and for normals."""
+"""Instances: the matrices of a shape, checked, for points and for normals."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a ray meets, for compiled code: from a hit to normals, material, emission and object.
+"""Surface interactions, for compiled code: from a hit to shading normal, material, emission and object.
 
 Two kinds of faces lie in one numbering. DR-GS faces come first; they carry materials at their vertices. Those of
 ordinary meshes follow; they refer to materials, with textures. Faces of shapes that stand in several places are in
@@ -94,7 +94,7 @@ def nearest(tracer, ray):  # type: ignore[no-untyped-def]
 
 @njit
 def shadowed(tracer, ray):  # type: ignore[no-untyped-def]
-    """Whether anything lies on a `Ray` that its mask tells it to meet."""
+    """Whether a shadow `Ray` is blocked by anything that its mask includes."""
     return blocked(tracer.occluded, tracer.scene, ray)
 
 

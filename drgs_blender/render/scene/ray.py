@@ -1,4 +1,4 @@
-"""A ray, and what it meets, for compiled code."""
+"""Rays and hits, for compiled code."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which rays meet what: the bits of a group's mask and of a ray's."""
+"""Ray masks, for ray visibility: which rays meet which objects, as bits of a group and of a ray."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ HOLDOUT, CATCHER = 1, 2
 
 
 def group_mask(visibility: Visibility, surfels: bool, seen_only: bool = False) -> int:
-    """Mask of what has this visibility; `surfels` tells DR-GS meshes from ordinary ones.
+    """Mask of what has this visibility; `surfels` is true for DR-GS meshes.
 
     Of a DR-GS mesh that is `seen_only`, light does not meet the triangles.
     """

@@ -1,4 +1,4 @@
-"""What materials and their images say at a point of a surface, read at the addresses of a `MaterialTable`.
+"""Texture lookup: materials and their images at a point of a surface, read at the addresses of a `MaterialTable`.
 
 Lookups are those of Cycles' Image Texture node, measured in Blender 5.0 (tests/unit/test_textures_cycles.py):
 

@@ -1,4 +1,4 @@
-"""Everything rays can meet in one frame: DR-GS objects and ordinary meshes, with one tree.
+"""Everything rays can meet in one frame: DR-GS objects and ordinary meshes, with one BVH.
 
 DR-GS objects and meshes in one place are triangles in world space; a mesh in several places keeps its vertices in
 object space and a tree of its own, and stands in the scene as instances.

@@ -1,4 +1,4 @@
-"""The tree that rays go through: triangles that move, in the world as they are or standing in many places."""
+"""The BVH of all triangles, with refit: they move, in the world as they are or as instances."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The contributions of one sample: sorted by depth, weighed front to back, averaged.
+"""Alpha blending of one sample's contributions: sorted by depth, weighed front to back, averaged.
 
 A sample's contributions are `n` entries from `base` on of the lists of its block.
 """

@@ -1,10 +1,11 @@
-"""Surfels to sub-pixel samples: exact ray-splat intersection, blended front to back, on the CPU.
+"""The rasteriser: surfels to sub-pixel samples by exact ray-splat intersection, blended front to back, on the CPU.
 
-The kernel of a sample is G = max(exp(-(u^2 + v^2) / 2), exp(-n d^2)), d the distance in pixels between the sample and
-the projected centre, n the samples a pixel: the low-pass filter of that paper at the rate at which the picture is
-sampled, so that silhouettes do not grow by a pixel where there are sub-samples. A sample that the low-pass decides has
-the centre's depth.
-Contributions alpha G below 1/255 are skipped, others clamped to 0.99 and blended until the transmittance is below 1e-4.
+The splats of a frame come from `splats`, their alpha blending from `blending`. The kernel of a sample is G =
+max(exp(-(u^2 + v^2) / 2), exp(-n d^2)), d the distance in pixels between the sample and the projected centre, n the
+samples a pixel: the low-pass filter of 2DGS (Huang et al. 2024) at the rate at which the picture is sampled, so that
+silhouettes do not grow by a pixel where there are sub-samples. A sample that the low-pass decides has the centre's
+depth. Contributions alpha G below 1/255 are skipped, others clamped to 0.99 and blended until the transmittance is
+below 1e-4.
 
 Order. Contributions are blended by the depth at which the ray meets them, not by that of the surfels' centres: every
 sample lists its contributions and sorts them once all are there. A list that is full is sorted early and cut where the

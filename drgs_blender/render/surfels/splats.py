@@ -1,4 +1,4 @@
-"""Surfels on the screen: projected, culled, sorted by depth and listed by tile, ready to be blended by `raster`.
+"""Surfels as splats on the screen: projected, culled, sorted by depth and listed by tile, ready for `raster`.
 
 A surfel is the plane p(u, v) = c + u a + v b with kernel exp(-(u^2 + v^2) / 2); a and b are its scaled tangents and
 need not be orthogonal. In camera coordinates x right, y down, s forward, the ray through a pixel is a linear function

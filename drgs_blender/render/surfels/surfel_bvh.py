@@ -1,4 +1,4 @@
-"""Surfels in an Embree tree: a user geometry whose primitives are the surfels' discs; see `surfel_query`."""
+"""The BVH of surfels in Embree: a user geometry whose primitives are the surfels' discs; see `surfel_query`."""
 
 from __future__ import annotations
 

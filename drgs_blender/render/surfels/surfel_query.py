@@ -1,4 +1,4 @@
-"""What Embree calls back when a ray comes near a surfel, and how a ray tells these callbacks what it wants.
+"""Embree's callbacks for rays that come near surfels, and the query that a ray hands to them.
 
 A surfel is the disc u^2 + v^2 < 2 ln(255 opacity) of its plane c + u a + v b: beyond it opacity times kernel is below
 1/255. Embree walks its tree of the discs' boxes and calls back for every disc whose box a ray passes; the callback
@@ -256,7 +256,7 @@ def _gather(call):  # type: ignore[no-untyped-def]
     store_word(context, COUNT, np.int32(count))
     store_double(context + 4 * PRODUCT, 0, product)
     if count == CAPACITY or product < MIN_TRANSMITTANCE:
-        # A little beyond the last one: those at an equal depth are told apart above, not by Embree's boxes.
+        # A little beyond the last one: those at an equal depth are distinguished above, not by Embree's boxes.
         store_single(ray, _TFAR, beyond(load_single(context, DEPTHS + count - 1)))
 
 

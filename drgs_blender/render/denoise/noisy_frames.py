@@ -1,4 +1,4 @@
-"""Noisy frames on disk as the denoiser over time wants them.
+"""Noisy frames read from disk for the temporal denoiser, and the camera metadata that they need.
 
 A frame file says in its metadata through which camera it was seen (``camera``), and through which its surfaces were one
 frame earlier (``previous``). Where the latter is not the camera of the file before, there is a cut, and nothing leads
@@ -37,7 +37,7 @@ class NoisyFrame:
     Attributes
     ----------
     shot : Shot
-        Its light and what tells its surfaces apart; its motion leads one frame back.
+        Its light and the denoiser's guides; its motion leads one frame back.
     passes : dict of str to array
         By name, those of the light excepted.
     metadata : dict of str to str
@@ -64,8 +64,8 @@ class NoisyFrame:
         return add_light(light, self.passes["Env"], self.passes["Emit"], self.passes["Combined"][..., 3])
 
 
-def describe(frame: Frame) -> dict[str, str]:
-    """What a frame file says of how it was seen, for its metadata."""
+def camera_metadata(frame: Frame) -> dict[str, str]:
+    """Metadata of a frame file: the cameras of this frame and the one before, the denoiser, the noise index."""
     said = {"camera": _camera_text(frame.camera), "denoise": frame.settings.denoise, "noise": str(frame.noise_index)}
     if frame.previous is not None:
         said["previous"] = _camera_text(frame.previous.camera)

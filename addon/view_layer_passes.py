@@ -1,4 +1,4 @@
-"""The engine's table of passes, seen from a view layer."""
+"""The passes that are switched on in a view layer, and their names in Blender; `core.passes` is the engine's table."""
 
 from __future__ import annotations
 

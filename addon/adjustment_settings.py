@@ -1,4 +1,4 @@
-"""Adjustments of a DR-GS object: how it looks next to how it was captured or painted, with keyframes and a way back."""
+"""Settings that adjust an object's material: changes to what was captured or painted, with keyframes and a way back."""
 
 from __future__ import annotations
 
@@ -23,29 +23,29 @@ NUMBERS = (
 _NEUTRAL = ((1.0, 1.0, 1.0), 0.0, 1.0, 1.0, *(2 * (1.0, 0.0, 0.0, 1.0)))
 
 
-def _masks(settings: DrgsAdjustment, context: bpy.types.Context, typed: str) -> Iterable[str]:
+def _masks(settings: DrgsAdjustmentSettings, context: bpy.types.Context, typed: str) -> Iterable[str]:
     """Names that the mask may have."""
     obj = settings.id_data
     return mesh_arrays.mask_names(obj, typed) if obj.type == "MESH" else []
 
 
-def _tell(settings: DrgsAdjustment, context: bpy.types.Context) -> None:
+def _tag_changed(settings: DrgsAdjustmentSettings, context: bpy.types.Context) -> None:
     """Have viewports and exports see a change that a script made; those in the interface they see anyway."""
     settings.id_data.update_tag(refresh={"OBJECT"})
 
 
 def _number(label: str, about: str, **limits: float) -> FloatProperty:
-    return FloatProperty(name=label, description=about, precision=3, step=1, update=_tell, **limits)
+    return FloatProperty(name=label, description=about, precision=3, step=1, update=_tag_changed, **limits)
 
 
-class DrgsAdjustment(bpy.types.PropertyGroup):
+class DrgsAdjustmentSettings(bpy.types.PropertyGroup):
     """Changes on top of the material attributes of an object; see drgs_blender.core.frame.Adjustment."""
 
     use: BoolProperty(
         name="Adjustments",
         description="Apply the adjustments; switched off, the object is as it was before them",
         default=True,
-        update=_tell,
+        update=_tag_changed,
     )
     tint: FloatVectorProperty(
         name="Tint",
@@ -56,7 +56,7 @@ class DrgsAdjustment(bpy.types.PropertyGroup):
         soft_max=1.0,
         max=10.0,
         default=(1.0, 1.0, 1.0),
-        update=_tell,
+        update=_tag_changed,
     )
     hue: FloatProperty(
         name="Hue",
@@ -65,7 +65,7 @@ class DrgsAdjustment(bpy.types.PropertyGroup):
         soft_min=-math.pi,
         soft_max=math.pi,
         default=0.0,
-        update=_tell,
+        update=_tag_changed,
     )
     saturation: _number(
         "Saturation", "Factor on the albedo's saturation; 0 is grey", min=0.0, soft_max=2.0, default=1.0
@@ -83,9 +83,11 @@ class DrgsAdjustment(bpy.types.PropertyGroup):
         name="Mask",
         description="Vertex group or point attribute that limits the adjustments by its values; empty is everywhere",
         search=_masks,
-        update=_tell,
+        update=_tag_changed,
     )
-    use_invert: BoolProperty(name="Invert", description="Adjust where the mask is 0", default=False, update=_tell)
+    use_invert: BoolProperty(
+        name="Invert", description="Adjust where the mask is 0", default=False, update=_tag_changed
+    )
 
     def values(self) -> tuple[object, ...]:
         """All settings, to be compared; () where they change nothing."""
@@ -98,7 +100,7 @@ class DrgsAdjustment(bpy.types.PropertyGroup):
             self.property_unset(name)
         self.id_data.update_tag(refresh={"OBJECT"})
 
-    def take(self, other: DrgsAdjustment) -> None:
+    def take(self, other: DrgsAdjustmentSettings) -> None:
         """Have the values of another object's."""
         for name in ("use", "tint", *NUMBERS, "mask", "use_invert"):
             setattr(self, name, getattr(other, name))

@@ -1,4 +1,4 @@
-"""All lights but the environment, Blender's and meshes': directions towards them, pdfs, those that rays meet.
+"""All lights but the environment, Blender's and meshes': importance sampling of one, its pdf, lights that rays meet.
 
 `light_tree` picks the light to sample from a point, `light_shapes` is one light, `mesh_lights` are emitting surfaces.
 """
