@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...compute.jit import njit, prange
+from ...compute.jit import njit
+from ...compute.threads import ROWS, over_range
 from ...core.cryptomatte import DRGS_MATERIAL, KINDS, identities
 from ...core.frame import Frame
 from ..gbuffer.gbuffer import GBuffer
@@ -42,7 +43,8 @@ class CryptoFilm:
             owner = scene.source[buffer.object_index]
         else:
             owner = scene.mesh_materials.of(buffer.face - scene.vertex_faces)
-        _rank(buffer.point_rows(x0, self._width), self._identities[owner], self.pixels[y0 - top : y1 - top])
+        rows, out = buffer.point_rows(x0, self._width), self.pixels[y0 - top : y1 - top]
+        over_range(_rank, y1 - y0, rows, self._identities[owner], out, fewest=ROWS)
 
     def passes(self) -> dict[str, Array]:
         """Name -> (h, w, 4) float32."""
@@ -51,12 +53,12 @@ class CryptoFilm:
         return {f"{KINDS[self._kind]}{i:02}": np.ascontiguousarray(both[:, :, i]) for i in range(PASSES)}
 
 
-@njit(parallel=True)
-def _rank(points, identity, out):  # type: ignore[no-untyped-def]
+@njit
+def _rank(y0, y1, points, identity, out):  # type: ignore[no-untyped-def]
     """Add up the weights of each identity in a pixel, and keep the largest."""
     start, pixel, weight, flags = points.start, points.pixel, points.weight, points.flags
-    for y in prange(len(start) - 1):
-        known, share = np.empty(_SLOTS, np.float32), np.empty(_SLOTS, np.float32)
+    known, share = np.empty(_SLOTS, np.float32), np.empty(_SLOTS, np.float32)
+    for y in range(y0, y1):
         first = start[y]
         while first < start[y + 1]:
             last, count = first, 0

@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...compute.jit import njit, prange
+from ...compute.jit import njit
 from ...compute.threads import ROWS, over_range
 from ...core.frame import Camera, RenderSettings
 from ..camera import FX, FY, ORTHOGRAPHIC, WIDTH, sample_ray
@@ -129,7 +129,9 @@ class Film:
             _develop, y1 - y0, buffer.point_rows(x0, int(self.parameters[WIDTH])), buffer.surfaces(), light,
             pass_index, self.parameters, self.pixels.rows(y0 - top, y1 - top), fewest=ROWS)  # fmt: skip
         if not self.transparent and not environment.black:
-            _background(self.parameters, x0, y0, buffer.alpha, environment.envmap, self.environment[rows])
+            over_range(
+                _background, y1 - y0, self.parameters, x0, y0, buffer.alpha, environment.envmap,
+                self.environment[rows], fewest=ROWS)  # fmt: skip
             caught = np.flatnonzero(points.flags & CATCHER)
             if len(caught):
                 _behind(
@@ -309,13 +311,13 @@ def _world(p, pixel, sample, envmap):  # type: ignore[no-untyped-def]
     return envmap_radiance(u, v, envmap)
 
 
-@njit(parallel=True)
-def _background(p, x0, y0, alpha, envmap, out):  # type: ignore[no-untyped-def]
+@njit
+def _background(first, last, p, x0, y0, alpha, envmap, out):  # type: ignore[no-untyped-def]
     """Add the world's radiance along every sub-pixel ray, weighted by what the surfaces leave uncovered."""
     width = np.int64(p[WIDTH])
-    rows, columns, subpixels = alpha.shape
+    _, columns, subpixels = alpha.shape
     share = np.float32(1.0 / subpixels)
-    for y in prange(rows):
+    for y in range(first, last):
         for x in range(columns):
             red = green = blue = np.float32(0.0)
             for k in range(subpixels):

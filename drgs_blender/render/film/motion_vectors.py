@@ -11,7 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...compute.jit import njit, prange
+from ...compute.jit import njit
+from ...compute.threads import ELEMENTS, ROWS, over_range
 from ..camera import CX, CY, FX, FY, ORTHOGRAPHIC, POSITION, WIDTH
 from ..gbuffer.gbuffer import GBuffer
 from ..points import CATCHER
@@ -77,7 +78,8 @@ def previous_positions(
     (n, 3) float32 array
     """
     out = np.empty((len(face), 3), np.float32)
-    _previous(faces, now, then, face, place, barycentric, position, out)
+    tied = face, place, barycentric
+    over_range(_previous, len(face), faces, now, then, *tied, position, out, fewest=ELEMENTS)
     return out
 
 
@@ -110,7 +112,8 @@ class MotionFilm:
         x0, top = self.origin
         y0, y1 = buffer.rows
         points = buffer.point_rows(x0, int(self.now.parameters[WIDTH]))
-        _displace(points, self.now.parameters, buffer.face, previous, self.displacement[y0 - top : y1 - top])
+        out = self.displacement[y0 - top : y1 - top]
+        over_range(_displace, y1 - y0, points, self.now.parameters, buffer.face, previous, out, fewest=ROWS)
 
     def motion(self, position: Array, coverage: Array) -> Motion:
         """Motion of the picture whose passes are `position` and `coverage`."""
@@ -123,7 +126,7 @@ def motion(position: Array, previous: Array, coverage: Array, now: Array, then: 
     `now` and `then` are the parameters of the cameras.
     """
     vector = np.full((*coverage.shape, 2), np.nan, np.float32)
-    _vectors(now, then, position, previous, coverage, vector)
+    over_range(_vectors, len(coverage), now, then, position, previous, coverage, vector, fewest=ROWS)
     return Motion(vector, previous)
 
 
@@ -164,9 +167,9 @@ def _basis(v, faces, f):  # type: ignore[no-untyped-def]
     return x, y, z, ux, uy, uz, wx, wy, wz, nx * inverse, ny * inverse, nz * inverse, length
 
 
-@njit(parallel=True)
-def _previous(faces, now, then, face, place, barycentric, position, out):  # type: ignore[no-untyped-def]
-    for i in prange(len(face)):
+@njit
+def _previous(first, last, faces, now, then, face, place, barycentric, position, out):  # type: ignore[no-untyped-def]
+    for i in range(first, last):
         f, stand = face[i], place[i]
         if f < 0:
             out[i, 0], out[i, 1], out[i, 2] = position[i, 0], position[i, 1], position[i, 2]
@@ -198,8 +201,8 @@ def _previous(faces, now, then, face, place, barycentric, position, out):  # typ
         out[i, 2] = z + b * puz + c * pwz + dz
 
 
-@njit(parallel=True)
-def _displace(points, p, face, previous, out):  # type: ignore[no-untyped-def]
+@njit
+def _displace(y0, y1, points, p, face, previous, out):  # type: ignore[no-untyped-def]
     """Mean displacement of the samples on the surface nearest to the camera, the same that make up Position.
 
     Samples that are tied to no face follow the others.
@@ -209,7 +212,7 @@ def _displace(points, p, face, previous, out):  # type: ignore[no-untyped-def]
     flat = p[ORTHOGRAPHIC] != 0.0
     slope = SAME_SURFACE / min(p[FX], p[FY])
     per_depth, fixed = np.float32(0.0 if flat else slope), np.float32(slope if flat else 0.0)
-    for y in prange(len(start) - 1):
+    for y in range(y0, y1):
         first = start[y]
         while first < start[y + 1]:
             last = first
@@ -233,12 +236,11 @@ def _displace(points, p, face, previous, out):  # type: ignore[no-untyped-def]
             first = last
 
 
-@njit(parallel=True)
-def _vectors(now, before, position, previous, coverage, vector):  # type: ignore[no-untyped-def]
+@njit
+def _vectors(first, last, now, before, position, previous, coverage, vector):  # type: ignore[no-untyped-def]
     """Difference of the two projections, zero to the last bit where nothing moved."""
-    h, w = coverage.shape
-    for y in prange(h):
-        for x in range(w):
+    for y in range(first, last):
+        for x in range(coverage.shape[1]):
             if not coverage[y, x] > np.float32(0.0):
                 continue
             ax, ay, _ = project(

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...compute.jit import get_num_threads, njit, prange
+from ...compute.jit import get_num_threads, njit
+from ...compute.threads import over_range
 from ..camera import CLIP_END, CLIP_START, WIDTH, sample_ray
 from ..sampling import F
 from ..scene.interaction import nearest, position_at, surface_at
@@ -67,7 +68,8 @@ def trace_camera(scene: TraceScene, parameters: Array, x0: int, y0: int, shape: 
         hits.owner[:] = -1
         return hits
     owners = scene.face_object, scene.place_object
-    _trace(scene.tracer, (parameters, x0, y0), np.int32(mask), owners, hits.arrays, 8 * get_num_threads())
+    lanes = 8 * get_num_threads()
+    over_range(_trace, lanes, lanes, scene.tracer, (parameters, x0, y0), np.int32(mask), owners, hits.arrays)
     return hits
 
 
@@ -76,7 +78,8 @@ def shade_mesh(scene: TraceScene, hits: MeshHits, parameters: Array, x0: int, bu
     moving = scene.vertices, scene.faces, scene.places
     view_of = parameters, x0, buffer.rows[0]
     keys, out = arrays_of(buffer)
-    _shade(scene.geometry, moving, view_of, layer, hits.arrays, keys, *out, 8 * get_num_threads())
+    lanes = 8 * get_num_threads()
+    over_range(_shade, lanes, lanes, scene.geometry, moving, view_of, layer, hits.arrays, keys, out)
 
 
 def arrays_of(buffer: GBuffer) -> tuple[tuple[Array, ...], tuple[tuple[Array, ...], ...]]:
@@ -89,17 +92,16 @@ def arrays_of(buffer: GBuffer) -> tuple[tuple[Array, ...], tuple[tuple[Array, ..
     return (points.pixel, points.sample, points.flags), (frames, materials, (*seen, *tied))
 
 
-@njit(parallel=True)
-def _trace(tracer, view_of, mask, owners, out, lanes):  # type: ignore[no-untyped-def]
-    for lane in prange(lanes):
-        trace_samples(np.int64(lane), lanes, None, tracer, view_of, mask, owners, out)
+@njit
+def _trace(first, last, lanes, tracer, view_of, mask, owners, out):  # type: ignore[no-untyped-def]
+    for lane in range(first, last):
+        trace_samples(lane, lanes, None, tracer, view_of, mask, owners, out)
 
 
-@njit(parallel=True)
-def _shade(geometry, moving, view_of, layer, hits, keys, frames, materials, seen, lanes):  # type: ignore[no-untyped-def]
-    for lane in prange(lanes):
-        out = frames, materials, seen
-        shade_hits(np.int64(lane), lanes, None, geometry, moving, view_of, layer, hits, keys, out)
+@njit
+def _shade(first, last, lanes, geometry, moving, view_of, layer, hits, keys, out):  # type: ignore[no-untyped-def]
+    for lane in range(first, last):
+        shade_hits(lane, lanes, None, geometry, moving, view_of, layer, hits, keys, out)
 
 
 @njit

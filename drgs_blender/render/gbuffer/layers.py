@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...compute.jit import njit, prange
+from ...compute.jit import njit
+from ...compute.threads import ROWS, over_range
 from ..scene.ray_masks import CATCHER, HOLDOUT, ORDINARY
 from ..scene.trace_scene import TraceScene
 from ..surfels.raster import SurfelSamples
@@ -72,17 +73,9 @@ def combine(
         return Layers(samples.alpha, None, samples.alpha, None)
     hits = trace(scene, parameters, x0, y0, samples.alpha.shape, ORDINARY if scene.any_ordinary else 0)
     first, second, opaque = (np.empty_like(samples.alpha) for _ in range(3))
-    _combine(
-        samples.alpha,
-        samples.depth,
-        samples.object_index,
-        hits.depth,
-        hits.owner,
-        scene.object_flags,
-        first,
-        second,
-        opaque,
-    )
+    seen = samples.alpha, samples.depth, samples.object_index
+    met, out = (hits.depth, hits.owner), (first, second, opaque)
+    over_range(_combine, len(first), seen, met, scene.object_flags, out, fewest=ROWS)
     return Layers(first, second, opaque, hits)
 
 
@@ -91,15 +84,20 @@ def lone(hits: MeshHits, scene: TraceScene) -> Layers:
     nothing = np.zeros(hits.depth.shape, np.float32)
     first, second, opaque = (np.empty_like(nothing) for _ in range(3))
     none = np.zeros(hits.depth.shape, np.int32)
-    _combine(nothing, nothing, none, hits.depth, hits.owner, scene.object_flags, first, second, opaque)
+    met, out = (hits.depth, hits.owner), (first, second, opaque)
+    over_range(_combine, len(first), (nothing, nothing, none), met, scene.object_flags, out, fewest=ROWS)
     return Layers(second, None, opaque, hits)
 
 
-@njit(parallel=True)
-def _combine(alpha, depth, owner, mesh_depth, mesh_owner, object_flags, first, second, opaque):  # type: ignore[no-untyped-def]
+@njit
+def _combine(y0, y1, seen, met, object_flags, out):  # type: ignore[no-untyped-def]
+    """Fill `out`, the three arrays of `Layers`, from alpha, depth and owner of surfels, and depth and owner of hits."""
+    alpha, depth, owner = seen
+    mesh_depth, mesh_owner = met
+    first, second, opaque = out
     zero, one = np.float32(0.0), np.float32(1.0)
-    rows, columns, subpixels = alpha.shape
-    for y in prange(rows):
+    _, columns, subpixels = alpha.shape
+    for y in range(y0, y1):
         for x in range(columns):
             for k in range(subpixels):
                 a = alpha[y, x, k]

@@ -28,7 +28,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...compute.jit import get_num_threads, njit, prange
+from ...compute.jit import get_num_threads, njit
+from ...compute.threads import over_range
 from ...core.frame import Camera
 from ..camera import WIDTH, sample_ray
 from ..columns import ALBEDO, METALLIC, NORMAL, ROUGHNESS, SIZE
@@ -275,10 +276,10 @@ def attach_points(lane, lanes, room, tracer, rules, view_of, samples, keys, out)
             tied_face[n], tied_place[n], barycentric[n, 0], barycentric[n, 1] = face, -1, u, v
 
 
-@njit(parallel=True)
-def _attach(tracer, rules, view_of, samples, keys, frames, materials, seen, lanes):  # type: ignore[no-untyped-def]
-    for lane in prange(lanes):
-        attach_points(np.int64(lane), lanes, None, tracer, rules, view_of, samples, keys, (frames, materials, seen))
+@njit
+def _attach(first, last, lanes, tracer, rules, view_of, samples, keys, out):  # type: ignore[no-untyped-def]
+    for lane in range(first, last):
+        attach_points(lane, lanes, None, tracer, rules, view_of, samples, keys, out)
 
 
 def tie_to_mesh(scene: TraceScene, *arguments: Any) -> None:
@@ -293,7 +294,9 @@ def tie_to_mesh(scene: TraceScene, *arguments: Any) -> None:
         the arrays to be filled: origin, normal, geometric normal and view; albedo, roughness and metallic; position,
         depth, object, face, place and barycentric coordinates.
     """
-    _attach(scene.tracer, *arguments, 8 * get_num_threads())
+    *inwards, frames, materials, seen = arguments
+    lanes = 8 * get_num_threads()
+    over_range(_attach, lanes, lanes, scene.tracer, *inwards, (frames, materials, seen))
 
 
 class Stages(NamedTuple):

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...compute.jit import njit, prange
+from ...compute.jit import njit
+from ...compute.threads import over_range
 from ..camera import CLIP_END, CLIP_START, WIDTH, sample_ray
 from ..lights.light_sampler import Lights, lights_along, suns_along
 from ..lights.light_shapes import CAMERA
@@ -41,15 +42,16 @@ def visible_lights(lights: Lights, parameters: Array, x0: int, buffer: GBuffer) 
         Linear Rec.709, of the buffer's rows.
     """
     out = np.zeros((*buffer.alpha.shape[:2], 3), np.float32)
-    _look(parameters, buffer.point_rows(x0, int(parameters[WIDTH])), buffer.alpha, lights.tables, out)
+    points = buffer.point_rows(x0, int(parameters[WIDTH]))
+    over_range(_look, len(out), parameters, points, buffer.alpha, lights.tables, out)
     return out
 
 
-@njit(parallel=True)
-def _look(p, points, alpha, lights, out):  # type: ignore[no-untyped-def]
+@njit
+def _look(y0, y1, p, points, alpha, lights, out):  # type: ignore[no-untyped-def]
     pixel, weight, depth, near = points.pixel, points.weight, points.depth, p[CLIP_START]
-    rows, columns, subpixels = alpha.shape
-    for y in prange(rows):
+    _, columns, subpixels = alpha.shape
+    for y in range(y0, y1):
         n = points.start[y]
         for x in range(columns):
             place = (points.y0 + y) * points.width + points.x0 + x

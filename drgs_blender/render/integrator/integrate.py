@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...compute.jit import get_num_threads, njit, prange
+from ...compute.jit import get_num_threads, njit
+from ...compute.threads import over_range
 from ...core.color import LUMINANCE
 from ...core.errors import UsageError
 from ...core.frame import RenderSettings
@@ -55,7 +56,8 @@ class Kernel:
         self, points: PointArrays, scene: Scene, settings: Settings, sampler: Sampler, out: tuple[Array, Array]
     ) -> None:
         """Shade all points; see `shade_points`."""
-        _kernel(points, *scene, settings, sampler, out, 8 * get_num_threads())
+        lanes = 8 * get_num_threads()
+        over_range(_kernel, lanes, lanes, points, scene, settings, sampler, out)
 
 
 def integrate(
@@ -280,10 +282,9 @@ def _scratch() -> Any:
     )
 
 
-@njit(parallel=True)
-def _kernel(points, tracer, geometry, envmap, lights, traits, settings, sampler, out, lanes):  # type: ignore[no-untyped-def]
-    # Threads get neighbouring lanes, lanes get every n-th block: no thread is left with all the costly ones.
-    for lane in prange(lanes):
-        # Made here: Numba passes no tuples within tuples to threads.
-        scene = Scene(tracer, geometry, envmap, lights, traits)
-        shade_points(np.int64(lane), lanes, _scratch(), points, scene, settings, sampler, out)
+@njit
+def _kernel(first, last, lanes, points, scene, settings, sampler, out):  # type: ignore[no-untyped-def]
+    # A lane is every n-th block: none has all the costly ones.
+    scratch = _scratch()
+    for lane in range(first, last):
+        shade_points(lane, lanes, scratch, points, scene, settings, sampler, out)

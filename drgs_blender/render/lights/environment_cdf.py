@@ -12,7 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...compute.jit import njit, prange
+from ...compute.jit import njit
+from ...compute.threads import ELEMENTS, over_range
 from ...core.color import LUMINANCE
 
 Array = np.ndarray
@@ -68,7 +69,9 @@ class Cells:
         solid = -np.diff(self.edges) * (2.0 * math.pi / columns)
         weights = np.zeros((rows, columns))
         red, green, blue = (float(weight) for weight in LUMINANCE)
-        _weigh(texels, red, green, blue, solid, self.step, weights)
+        strip = -(-_STRIP // self.step) * self.step
+        luminance = red, green, blue
+        over_range(_weigh, -(-h // strip), strip, texels, luminance, solid, self.step, weights)
 
         self.shift = 0
         while -(-rows >> self.shift) * -(-columns >> self.shift) > _MOST_BLOCKS:
@@ -81,11 +84,13 @@ class Cells:
         coarse = max(0, self.shift - _PARTS.bit_length() + 1)
         parts = np.zeros((1 << 2 * (self.shift - coarse), len(places)))
         lit = np.zeros(len(places), np.int64)
-        _sum_blocks(weights, corners, inner, coarse, self.shift - coarse, lit, parts)
+        few = -(-ELEMENTS // len(inner))
+        blocks = weights, corners, inner, coarse, self.shift - coarse, lit, parts
+        over_range(_sum_blocks, len(corners), *blocks, fewest=few)
         self.power = float(parts.sum())
         if not self.power > 0.0:  # black: all alike, but for the density
             weights[:] = 1.0
-            _sum_blocks(weights, corners, inner, coarse, self.shift - coarse, lit, parts)
+            over_range(_sum_blocks, len(corners), *blocks, fewest=few)
 
         with_light = lit > 0
         self.corners, lit = corners[with_light], lit[with_light]
@@ -103,9 +108,10 @@ class Cells:
         self.guide = np.zeros(1 << (rows * columns - 1).bit_length(), np.int32)
         self.density = np.zeros((rows, columns), np.float32)
         unit = 2.0**-32 if self.power > 0.0 else 0.0
-        blocks = _Blocks(self.corners, inner, before, reached, starts)
+        dealt = _Blocks(self.corners, inner, before, reached, starts)
         out = self.runs, self.guide, self.density, texels
-        _deal(weights, 1.0 / parts.sum(), spare, blocks, unit / solid, self.step, *out)
+        scale, per_number = 1.0 / parts.sum(), unit / solid
+        over_range(_deal, len(lit), weights, scale, spare, dealt, per_number, self.step, out, fewest=few)
 
     def part_directions(self) -> Array:
         """(3, p, n) float32 unit directions towards the middles of `parts`, in the environment's frame."""
@@ -161,17 +167,17 @@ def _luminance(texels, row, red, green, blue, out):  # type: ignore[no-untyped-d
         out[c] = red * texels[row, c, 0] + green * texels[row, c, 1] + blue * texels[row, c, 2]
 
 
-@njit(parallel=True)
-def _weigh(texels, red, green, blue, solid, step, weights):  # type: ignore[no-untyped-def]
+@njit
+def _weigh(first, last, strip, texels, luminance, solid, step, weights):  # type: ignore[no-untyped-def]
     """Add to each cell its solid angle times the mean luminance, as the bilinear lookup has it, over its texels.
 
     The mean over a texel of the bilinear interpolant is three quarters of itself and an eighth of either neighbour,
     along both axes; columns wrap, rows clamp.
     """
     h, w = texels.shape[:2]
-    strip = (_STRIP + step - 1) // step * step
-    for s in prange((h + strip - 1) // strip):
-        upper, here, lower, mixed = np.empty(w), np.empty(w), np.empty(w), np.empty(w)
+    red, green, blue = luminance
+    upper, here, lower, mixed = np.empty(w), np.empty(w), np.empty(w), np.empty(w)
+    for s in range(first, last):
         top, end = s * strip, min(h, (s + 1) * strip)
         _luminance(texels, max(top - 1, 0), red, green, blue, upper)
         _luminance(texels, top, red, green, blue, here)
@@ -190,11 +196,11 @@ def _weigh(texels, red, green, blue, solid, step, weights):  # type: ignore[no-u
                 upper[c], here[c] = here[c], lower[c]
 
 
-@njit(parallel=True)
-def _sum_blocks(weights, corners, inner, coarse, bits, lit, parts):  # type: ignore[no-untyped-def]
+@njit
+def _sum_blocks(first, last, weights, corners, inner, coarse, bits, lit, parts):  # type: ignore[no-untyped-def]
     """Count the lit cells of each block and sum the power of its parts, which are 2^coarse cells wide."""
     rows, columns = weights.shape
-    for b in prange(len(corners)):
+    for b in range(first, last):
         lit[b] = 0
         parts[:, b] = 0.0
         for k in range(len(inner)):
@@ -228,8 +234,8 @@ class _Blocks(NamedTuple):
     starts: Array
 
 
-@njit(parallel=True)
-def _deal(weights, scale, spare, blocks, per_number, step, runs, guide, density, texels):  # type: ignore[no-untyped-def]
+@njit
+def _deal(first, last, weights, scale, spare, blocks, per_number, step, out):  # type: ignore[no-untyped-def]
     """Divide the random numbers of each block among its lit cells; write their densities.
 
     Parameters
@@ -243,13 +249,14 @@ def _deal(weights, scale, spare, blocks, per_number, step, runs, guide, density,
         Density of one random number in a cell of each row.
     step : int
         `Cells.step`.
-    runs, guide, density, texels : array
-        Of `Cells`; written.
+    out : tuple of array
+        Runs, guide, density and texels of `Cells`; written.
     """
     corners, inner, before, reached, starts = blocks
+    runs, guide, density, texels = out
     rows, columns = weights.shape
     width = (np.int64(1) << 32) // len(guide)
-    for b in prange(len(corners)):
+    for b in range(first, last):
         i, start, sum_ = before[b], starts[b], reached[b]
         for k in range(len(inner)):
             row, column = corners[b, 0] + inner[k, 0], corners[b, 1] + inner[k, 1]

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...compute.jit import njit, prange
+from ...compute.jit import njit
 from ...compute.simd import aligned
+from ...compute.threads import ELEMENTS, over_range
 from ...core.errors import DeviceError, UsageError
 from . import embree
 from .embree import blocked, trace
@@ -24,6 +25,8 @@ ALL = -1
 DEGRADED = 2.0
 _RUN = 32  # neighbouring triangles in one box of that measure
 _RUNS = 1024  # boxes looked at
+#: Rays that one thread traces at least.
+_RAYS = 512
 
 
 @dataclass(slots=True)
@@ -47,28 +50,38 @@ class Group:
     places: Array | None = None
 
 
-@njit(parallel=True)
-def _intersect(address, scene, first, rays, t, face, instance, u, v):  # type: ignore[no-untyped-def]
-    n, block = len(rays.origins), 512
-    for b in prange((n + block - 1) // block):
-        for i in range(b * block, min(n, (b + 1) * block)):
-            t[i], group, primitive, instance[i], u[i], v[i], _, _, _ = trace(address, scene, ray_at(rays, i))
-            face[i] = first[group] + primitive if group >= 0 else np.int32(-1)
+@njit
+def _intersect(first, last, tree, rays, t, face, instance, u, v):  # type: ignore[no-untyped-def]
+    address, scene, first_face = tree
+    for i in range(first, last):
+        t[i], group, primitive, instance[i], u[i], v[i], _, _, _ = trace(address, scene, ray_at(rays, i))
+        face[i] = first_face[group] + primitive if group >= 0 else np.int32(-1)
 
 
-@njit(parallel=True)
-def _occluded(address, scene, rays, out):  # type: ignore[no-untyped-def]
-    n, block = len(rays.origins), 512
-    for b in prange((n + block - 1) // block):
-        for i in range(b * block, min(n, (b + 1) * block)):
-            out[i] = blocked(address, scene, ray_at(rays, i))
+@njit
+def _occluded(first, last, address, scene, rays, out):  # type: ignore[no-untyped-def]
+    for i in range(first, last):
+        out[i] = blocked(address, scene, ray_at(rays, i))
 
 
-@njit(parallel=True)
-def looseness(vertices, faces, runs):  # type: ignore[no-untyped-def]
-    """Summed box surface of runs of once neighbouring triangles, relative to the box of them all."""
+def looseness(vertices: Array, faces: Array, runs: Array) -> float:
+    """Summed box surface of runs of once neighbouring triangles, relative to the box of them all.
+
+    Parameters
+    ----------
+    vertices : (n, 3) float32 array
+    faces : (m, 3) int32 array
+    runs : (g, 32) int32 array
+        See `neighbours`.
+    """
     boxes = np.empty((len(runs), 6), np.float32)
-    for g in prange(len(runs)):
+    over_range(_boxes, len(runs), vertices, faces, runs, boxes, fewest=ELEMENTS // _RUN)
+    return float(_relative_surface(boxes))
+
+
+@njit
+def _boxes(first, last, vertices, faces, runs, boxes):  # type: ignore[no-untyped-def]
+    for g in range(first, last):
         x0 = y0 = z0 = np.float32(np.inf)
         x1 = y1 = z1 = np.float32(-np.inf)
         for k in range(runs.shape[1]):
@@ -78,9 +91,14 @@ def looseness(vertices, faces, runs):  # type: ignore[no-untyped-def]
                 x0, y0, z0 = min(x0, x), min(y0, y), min(z0, z)
                 x1, y1, z1 = max(x1, x), max(y1, y), max(z1, z)
         boxes[g, 0], boxes[g, 1], boxes[g, 2], boxes[g, 3], boxes[g, 4], boxes[g, 5] = x0, y0, z0, x1, y1, z1
+
+
+@njit
+def _relative_surface(boxes):  # type: ignore[no-untyped-def]
+    """Summed surface of some boxes, relative to that of the box around them."""
     total = 0.0
     lowest, highest = np.full(3, np.inf), np.full(3, -np.inf)
-    for g in range(len(runs)):
+    for g in range(len(boxes)):
         x, y, z = boxes[g, 3] - boxes[g, 0], boxes[g, 4] - boxes[g, 1], boxes[g, 5] - boxes[g, 2]
         total += x * y + y * z + z * x
         for a in range(3):
@@ -90,9 +108,9 @@ def looseness(vertices, faces, runs):  # type: ignore[no-untyped-def]
     return total / whole if whole > 0.0 else 0.0
 
 
-@njit(parallel=True)
-def _centres(vertices, faces, out):  # type: ignore[no-untyped-def]
-    for i in prange(len(faces)):
+@njit
+def _centres(first, last, vertices, faces, out):  # type: ignore[no-untyped-def]
+    for i in range(first, last):
         a, b, c = faces[i, 0], faces[i, 1], faces[i, 2]
         for k in range(3):
             out[i, k] = (vertices[a, k] + vertices[b, k] + vertices[c, k]) * np.float32(1 / 3)
@@ -106,10 +124,10 @@ def _spread(x):  # type: ignore[no-untyped-def]
     return x
 
 
-@njit(parallel=True)
-def _keys(centre, low, scale, out):  # type: ignore[no-untyped-def]
+@njit
+def _keys(first, last, centre, low, scale, out):  # type: ignore[no-untyped-def]
     """Morton code of each centre and, below it, its index: no two are alike."""
-    for i in prange(len(centre)):
+    for i in range(first, last):
         x = _spread(np.int64((centre[i, 0] - low[0]) * scale[0]))
         y = _spread(np.int64((centre[i, 1] - low[1]) * scale[1]))
         z = _spread(np.int64((centre[i, 2] - low[2]) * scale[2]))
@@ -122,10 +140,11 @@ def neighbours(vertices: Array, faces: Array) -> Array:
     if m < 4 * _RUN:
         return np.empty((0, _RUN), np.int32)
     centre = np.empty((m, 3), np.float32)
-    _centres(vertices, faces, centre)
+    over_range(_centres, m, vertices, faces, centre, fewest=ELEMENTS)
     low, high = (np.array([f(x) for x in centre.T]) for f in (np.min, np.max))  # along an axis is 20 times slower
     key = np.empty(m, np.uint64)
-    _keys(centre, low, np.float32(1023) / np.maximum(high - low, np.float32(1e-30)), key)
+    scale = np.float32(1023) / np.maximum(high - low, np.float32(1e-30))
+    over_range(_keys, m, centre, low, scale, key, fewest=ELEMENTS)
     key.sort()
     order = key.astype(np.uint32).view(np.int32)
     runs = order[: m // _RUN * _RUN].reshape(-1, _RUN)
@@ -336,7 +355,8 @@ class TriangleBVH:
         t, u, v = np.empty((3, len(origins)), np.float32)
         face, instance = np.empty((2, len(origins)), np.int32)
         rays = Rays.of(origins, directions, tnear, tfar, mask)
-        _intersect(self.intersect_address, self.scene, self.first_face, rays, t, face, instance, u, v)
+        tree = self.intersect_address, self.scene, self.first_face
+        over_range(_intersect, len(t), tree, rays, t, face, instance, u, v, fewest=_RAYS)
         return t, face, instance, u, v
 
     def occluded_many(
@@ -344,7 +364,8 @@ class TriangleBVH:
     ) -> Array:
         """(n,) bool: whether anything lies on each ray."""
         out = np.empty(len(origins), np.bool_)
-        _occluded(self.occluded_address, self.scene, Rays.of(origins, directions, tnear, tfar, mask), out)
+        rays = Rays.of(origins, directions, tnear, tfar, mask)
+        over_range(_occluded, len(out), self.occluded_address, self.scene, rays, out, fewest=_RAYS)
         return out
 
     def _release(self) -> None:

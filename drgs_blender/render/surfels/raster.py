@@ -27,7 +27,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...compute.jit import get_num_threads, njit, prange
+from ...compute.jit import get_num_threads, njit
+from ...compute.threads import over_range
 from ..camera import CLIP_END, CLIP_START, FX, FY, ORTHOGRAPHIC, SUBPIXELS, WIDTH, lattice, pixel_shift
 from ..columns import OPACITY, SAMPLE, SPLAT
 from .blending import GAP, LANES, MIN_TRANSMITTANCE, contributions, mean, prune, scratch_for, sort, weigh, widen
@@ -156,7 +157,8 @@ def rasterise(splats: Splats, y0: int, y1: int) -> SurfelSamples:
         np.empty(shape, np.int32),
     )
     if splats.number:
-        _blend(splats, y0, y1, 4 * get_num_threads(), samples)
+        parts = 4 * get_num_threads()
+        over_range(_blend, parts, parts, splats, y0, y1, samples)
     return samples
 
 
@@ -357,15 +359,9 @@ def _view(p):  # type: ignore[no-untyped-def]
     return View(p, np.int64(p[WIDTH]), np.int64(p[SUBPIXELS]), near, far, pixel_base, pixel)
 
 
-@njit(parallel=True)
-def _blend(splats, y0, y1, workers, samples):  # type: ignore[no-untyped-def]
-    for worker in prange(workers):
-        _blend_tiles(worker, workers, splats, y0, y1, samples)
-
-
 @njit
-def _blend_tiles(worker, workers, splats, y0, y1, samples):  # type: ignore[no-untyped-def]
-    """Blend tiles that meet the rows y0 .. y1: a worker takes every `workers`-th one, neighbours cost alike."""
+def _blend(first_part, last_part, parts, splats, y0, y1, samples):  # type: ignore[no-untyped-def]
+    """Blend tiles that meet the rows y0 .. y1: a part is every `parts`-th one, since neighbours cost alike."""
     x0, x1 = splats.x0, splats.x1
     tile_x0, tile_y0 = x0 // TILE, splats.y0 // TILE
     tiles_x = (x1 - 1) // TILE - tile_x0 + 1
@@ -376,7 +372,9 @@ def _blend_tiles(worker, workers, splats, y0, y1, samples):  # type: ignore[no-u
     lists, scratch = contributions(ROOM), scratch_for(ROOM)
     start, binned = np.empty(TILE * blocks_row + 2, np.int64), np.empty(0, np.int32)
     own = _room_for(0)
-    for task in range(worker, tiles_x * (last_row - first_row + 1), workers):
+    for task in range(tiles_x * (last_row - first_row + 1)):
+        if not first_part <= task % parts < last_part:
+            continue
         tx, ty = tile_x0 + task % tiles_x, first_row + task // tiles_x
         number = (ty - tile_y0) * tiles_x + task % tiles_x
         listed, n = splats.tile_start[number], splats.tile_start[number + 1] - splats.tile_start[number]

@@ -14,7 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...compute.jit import njit, plain, prange
+from ...compute.jit import njit, plain
+from ...compute.threads import ELEMENTS, over_range
 from ...core.asset.model import PosedSurfels
 from ...core.frame import Camera
 from ..camera import CLIP_END, CLIP_START, CX, CY, FX, FY, LEAN, ORTHOGRAPHIC, POSITION, SUBPIXELS, filter_reach
@@ -24,6 +25,8 @@ Array = np.ndarray
 
 #: Side of a tile, pixels.
 TILE = 16
+#: Surfels that one thread projects at least: each costs as much as several elements elsewhere.
+_FEW = ELEMENTS // 8
 #: Fainter contributions are skipped.
 MIN_ALPHA = 1.0 / 255.0
 
@@ -123,10 +126,10 @@ def prepare(posed: PosedSurfels, camera: Camera, parameters: Array) -> Splats:
     box = np.empty((n, 4), np.int32)
     nearest = np.empty(n, np.float32)
     arrays = Posed.of(posed)
-    _project(arrays, parameters, camera.window, screen, box, nearest)
+    over_range(_project, n, arrays, parameters, camera.window, screen, box, nearest, fewest=_FEW)
     order = depth_order(np.ascontiguousarray(screen[:, ZC]), box)
     surface = np.empty((len(order), SPLAT), np.float32)
-    _gather_surface(order, arrays, surface)
+    over_range(_gather_surface, len(order), order, arrays, surface, fewest=ELEMENTS)
     box = box[order]
     tiles_x = (x1 - 1) // TILE - x0 // TILE + 1
     tiles_y = (y1 - 1) // TILE - y0 // TILE + 1
@@ -189,9 +192,9 @@ def _clipped_bounds(c, a, b, r, near, p):  # type: ignore[no-untyped-def]
     return x0, x1, y0, y1
 
 
-@njit(parallel=True)
-def _project(posed, p, window, screen, box, nearest):  # type: ignore[no-untyped-def]
-    for i in prange(len(posed.centre)):
+@njit
+def _project(first, last, posed, p, window, screen, box, nearest):  # type: ignore[no-untyped-def]
+    for i in range(first, last):
         project_surfel(i, posed, p, window, screen, box, nearest)
 
 
@@ -333,9 +336,9 @@ def depth_order(centre_depth, box):  # type: ignore[no-untyped-def]
     return order
 
 
-@njit(parallel=True)
-def _gather_surface(order, posed, out):  # type: ignore[no-untyped-def]
-    for k in prange(len(order)):
+@njit
+def _gather_surface(first, last, order, posed, out):  # type: ignore[no-untyped-def]
+    for k in range(first, last):
         pack_surface(order[k], k, posed, out)
 
 

@@ -22,7 +22,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...compute.jit import get_num_threads, njit, prange
+from ...compute.jit import njit
+from ...compute.threads import over_range
 from ...core.asset.model import as_float
 from ...core.errors import UsageError
 from ..columns import ALBEDO, METALLIC, NORMAL, PLANE, ROUGHNESS, SIZE, SURFEL
@@ -57,6 +58,8 @@ Array = np.ndarray
 
 _BEFORE, _TINY = F(1.0 - 5e-7), F(1e-30)
 _NOTHING = (ZERO,) * 14
+#: Rays that one thread traces at least.
+_FEW = 64
 #: In place of a random number: the heaviest surface on a ray, not one by chance.
 HEAVIEST = F(-1.0)
 
@@ -290,7 +293,7 @@ def trace(
     n = len(origins)
     numbers, index = np.empty((n, 14), np.float32), np.empty(n, np.int32)
     rays = Rays.of(origins, directions, tnear, tfar, mask)
-    _trace(tracer_of(bvh), rays, starts.arrays, F(gap), 8 * get_num_threads(), numbers, index)
+    over_range(_trace, n, tracer_of(bvh), rays, starts.arrays, F(gap), numbers, index, fewest=_FEW)
     return SurfelHits(
         numbers[:, 0], numbers[:, 1], numbers[:, 2:5], numbers[:, 5:8], numbers[:, 8:11], numbers[:, 11],
         numbers[:, 12], numbers[:, 13], index,
@@ -311,7 +314,7 @@ def transmittance_many(
     origins, directions, starts = _checked(origins, directions, starts)
     out = np.empty(len(origins), np.float32)
     rays = Rays.of(origins, directions, tnear, tfar, mask)
-    _shadow(tracer_of(bvh), rays, starts.arrays, 8 * get_num_threads(), out)
+    over_range(_shadow, len(out), tracer_of(bvh), rays, starts.arrays, out, fewest=_FEW)
     return out
 
 
@@ -331,19 +334,17 @@ def _start(starts, i):  # type: ignore[no-untyped-def]
     return Start(own[i], normal[i, 0], normal[i, 1], normal[i, 2], size[i])
 
 
-@njit(parallel=True)
-def _trace(tracer, rays, starts, gap, lanes, numbers, index):  # type: ignore[no-untyped-def]
-    for lane in prange(lanes):
-        for i in range(lane, len(rays.origins), lanes):
-            hit = trace_surfels(tracer, ray_at(rays, i), _start(starts, i), gap, HEAVIEST)
-            values = hit[:14]
-            for k in range(14):
-                numbers[i, k] = values[k]
-            index[i] = hit[14]
+@njit
+def _trace(first, last, tracer, rays, starts, gap, numbers, index):  # type: ignore[no-untyped-def]
+    for i in range(first, last):
+        hit = trace_surfels(tracer, ray_at(rays, i), _start(starts, i), gap, HEAVIEST)
+        values = hit[:14]
+        for k in range(14):
+            numbers[i, k] = values[k]
+        index[i] = hit[14]
 
 
-@njit(parallel=True)
-def _shadow(tracer, rays, starts, lanes, out):  # type: ignore[no-untyped-def]
-    for lane in prange(lanes):
-        for i in range(lane, len(rays.origins), lanes):
-            out[i] = transmittance(tracer, ray_at(rays, i), _start(starts, i))
+@njit
+def _shadow(first, last, tracer, rays, starts, out):  # type: ignore[no-untyped-def]
+    for i in range(first, last):
+        out[i] = transmittance(tracer, ray_at(rays, i), _start(starts, i))
