@@ -56,7 +56,8 @@ class Kernel:
         self, points: PointArrays, scene: Scene, settings: Settings, sampler: Sampler, out: tuple[Array, Array]
     ) -> None:
         """Shade all points; see `shade_points`."""
-        lanes = 8 * get_num_threads()
+        blocks = -(-len(points.pixel) // _BLOCK)
+        lanes = min(blocks, 4 * get_num_threads())  # few: each makes scratch memory
         over_range(_kernel, lanes, lanes, points, scene, settings, sampler, out)
 
 
