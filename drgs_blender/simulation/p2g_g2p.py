@@ -122,20 +122,10 @@ def momentum_of(p, v, affine, tau, m, q, h, fx, fy, fz):  # type: ignore[no-unty
 
 @njit(inline="always")
 def apply_forces(velocity, gain, damping_factor, drag_factor, wind):  # type: ignore[no-untyped-def]
-    """A velocity after a step of the forces that act on all matter alike.
+    """A velocity after a step of the forces that act on all matter alike; vectors as (x, y, z), m/s.
 
-    Parameters
-    ----------
-    velocity, gain, wind : tuple of float
-        (x, y, z), m/s; `gain` is what gravity adds in the step.
-    damping_factor : float
-        Share of the velocity that damping leaves, ``exp(-dt damping)``.
-    drag_factor : float
-        Share of the velocity relative to the wind that drag takes, ``1 - exp(-dt drag)``.
-
-    Returns
-    -------
-    tuple of float
+    Gravity adds `gain`; damping leaves the share `damping_factor`, exp(-dt damping), of all; drag takes the share
+    `drag_factor`, 1 - exp(-dt drag), of what is relative to the wind.
     """
     x, y, z = velocity
     gx, gy, gz = gain
@@ -165,9 +155,8 @@ def p2g(
     """
     parts = len(places.shares) - 1
     over_range(_sum_particles, parts, particles, properties, places, grid.origin, grid.spacing, dt, scratch)
-    over_range(
-        _sum_blocks, len(grid.values), places.source, places.source_start, scratch, grid.values, fewest=SLOTS
-    )  # fmt: skip
+    sources = places.source, places.source_start
+    over_range(_sum_blocks, len(grid.values), *sources, scratch, grid.values, fewest=SLOTS)
 
 
 @njit

@@ -350,14 +350,7 @@ def gather_point(i, points, lobes, plan, occluder, sky, envmap, sums, samples): 
 
 
 def gather(
-    points: Points,
-    lobes: Lobes,
-    plan: Plan,
-    occluder: Occluder,
-    sky: Sky,
-    envmap: EnvMap,
-    sums: Sums,
-    samples: Samples,
+    points: Points, lobes: Lobes, plan: Plan, occluder: Occluder, sky: Sky, envmap: EnvMap, sums: Sums, samples: Samples
 ) -> None:
     """`gather_point` of all points; light samples are drawn by the envmap."""
     given = points, lobes, plan, occluder, sky, envmap, sums, samples
