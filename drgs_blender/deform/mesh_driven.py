@@ -15,7 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..compute.jit import njit, plain, prange
+from ..compute.jit import njit, plain
+from ..compute.threads import ELEMENTS, over_range
 from ..core.asset.model import MATERIAL_CHANNELS, Binding, Mesh, PosedSurfels, Surfels
 from ..core.errors import AssetError
 from ..geometry.normals import VertexNormals, rotation_matrices, unit
@@ -204,9 +205,9 @@ class MeshDriven:
         if not changed.any():
             return own
         result = own.reshape(len(own), -1).copy()
-        _repaint(
-            plain(self.mesh.faces), plain(self.binding.face), plain(self.binding.barycentric), changed,
-            plain(edited.reshape(len(rest), -1)), result,
+        over_range(
+            _repaint, len(own), plain(self.mesh.faces), plain(self.binding.face), plain(self.binding.barycentric),
+            changed, plain(edited.reshape(len(rest), -1)), result, fewest=ELEMENTS,
         )  # fmt: skip
         return result.reshape(own.shape)
 
@@ -222,10 +223,10 @@ def _in_spans(vertices: Array, span: Array, tangents: Array) -> Array:
     return found
 
 
-@njit(parallel=True)
-def _repaint(faces: Array, face: Array, weights: Array, changed: Array, edited: Array, values: Array) -> None:
+@njit
+def _repaint(first, last, faces, face, weights, changed, edited, values):  # type: ignore[no-untyped-def]
     """Blend `values` (n, c) of the surfels towards the `edited` (k, c) values of their changed vertices."""
-    for i in prange(len(face)):
+    for i in range(first, last):
         total, new = 0.0, 0.0
         for k in range(3):
             w = max(weights[i, k], np.float32(0.0))

@@ -7,12 +7,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..compute.jit import njit, prange
+from ..compute.jit import njit
+from ..compute.threads import over_range
 
 Array = np.ndarray
 
 #: Surfels of a block.
 _BLOCK = 256
+#: Fewest blocks for which another thread is worth while.
+_FEW = 4
 
 
 class PosedMesh(NamedTuple):
@@ -139,11 +142,15 @@ def tangent_frame(
     return tx, ty, tz, sy * tz - sz * ty, sz * tx - sx * tz, sx * ty - sy * tx, sx, sy, sz
 
 
-@njit(parallel=True)
 def pose(mesh: PosedMesh, by_corner: bool, linear: Array, sign: float, rest: Rest, out: Posed) -> None:
     """`pose_surfels`, all of them."""
     blocks = (len(rest.face) + _BLOCK - 1) // _BLOCK
-    for block in prange(blocks):
+    over_range(_pose, blocks, blocks, mesh, by_corner, linear, sign, rest, out, fewest=_FEW)
+
+
+@njit
+def _pose(first, last, blocks, mesh, by_corner, linear, sign, rest, out):  # type: ignore[no-untyped-def]
+    for block in range(first, last):
         pose_surfels(block, blocks, 0, mesh, by_corner, linear, sign, rest, out)
 
 

@@ -14,7 +14,8 @@ from scipy.ndimage import gaussian_filter
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from ..compute.jit import njit, prange
+from ..compute.jit import njit
+from ..compute.threads import over_range
 from ..core.asset.model import Mesh
 from ..core.errors import AssetError
 
@@ -105,7 +106,7 @@ class SignedDistanceField:
 
         Sums over the views of one call have the precision of their depth, those over calls are float32.
         """
-        _fuse(self._voxels, maps, BAND * self._voxels.size)
+        over_range(_fuse, len(self._voxels.total), self._voxels, maps, BAND * self._voxels.size)
 
     def mesh(self, witnesses: int, smoothing: float, advice: str) -> tuple[Mesh, dict[str, Any]]:
         """The zero level, as a watertight mesh of the components that matter.
@@ -206,9 +207,9 @@ def _sample(depth: Any, x: Any, y: Any) -> Any:
     return top + t * (bottom - top)
 
 
-@njit(parallel=True)
-def _fuse(voxels: Voxels, maps: DepthMaps, band: float) -> None:
-    """Add views to the sums: +1 before the surface, falling to -1 behind it within the band (metres).
+@njit
+def _fuse(first: int, last: int, voxels: Voxels, maps: DepthMaps, band: float) -> None:
+    """Add views to layers of the sums along X: +1 before the surface, falling to -1 behind it within the band (metres).
 
     A pixel counts with the cosine at which it sees the surface: the rim of a silhouette says little. The same cosine
     turns distance along the view into distance from the surface. Literals of the maps' type keep all in its precision.
@@ -216,9 +217,9 @@ def _fuse(voxels: Voxels, maps: DepthMaps, band: float) -> None:
     total, weight, views, low, voxel = voxels
     depth, cosine, origin, axes, scale, offset, perspective, bilinear = maps
     height, width = depth.shape[1], depth.shape[2]
-    for i in prange(total.shape[0]):
-        # A column of voxels along Z at a time: what depends on X and Y alone is found once for each view.
-        value, weights = np.zeros(total.shape[2], depth.dtype), np.zeros(total.shape[2], depth.dtype)
+    # A column of voxels along Z at a time: what depends on X and Y alone is found once for each view.
+    value, weights = np.zeros(total.shape[2], depth.dtype), np.zeros(total.shape[2], depth.dtype)
+    for i in range(first, last):
         for j in range(total.shape[1]):
             value[:], weights[:] = 0, 0
             for m in range(len(depth)):

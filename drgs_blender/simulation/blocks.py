@@ -1,19 +1,19 @@
 """The grid in blocks of 4^3 cells, and particles sorted by the block that they are in.
 
-Only blocks near particles have memory: ``slot`` maps a block of the domain to its place in compact arrays. Blocks of
-one parity never write to the same node, so particles can be scattered in eight passes without races, in an order that
-does not depend on the number of threads. Particles may drift one cell from where they were sorted.
+Only blocks near particles have memory: ``slot`` maps a block of the domain to its place in compact arrays. Each block
+sums what its particles give in nodes of its own; every node then adds up those of the blocks around it, in an order
+that does not depend on the number of threads. Particles may drift one cell from where they were sorted.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
-from ..compute.jit import get_num_threads, njit, prange
+from ..compute.jit import get_num_threads, njit
+from ..compute.threads import ELEMENTS, over_range
 
 Array = np.ndarray
 
@@ -22,6 +22,10 @@ MARGIN = 4
 
 #: What a block costs by itself, in particles.
 _BLOCK = 32
+#: Particles for which another thread is worth while.
+_SHARE = 1024
+#: The same of slots, of 64 nodes each.
+SLOTS = ELEMENTS // 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,12 +74,17 @@ class Arrangement(NamedTuple):
         The particles block by block.
     block : (b, 3) int32 array
         Blocks with particles, those of one parity together.
-    shares : (9, threads + 1) int64 array
-        Blocks cut into as many parts as there are threads, alike in work: those of each parity, and all.
+    shares : (k + 1,) int64 array
+        Blocks cut into parts alike in work, at most one per thread.
     start : (b + 1,) int64 array
         Where the particles of each block begin.
     neighbour : (b, 27) int32 array
         The slot of each block around, x slowest.
+    source : (27 b,) int64 array
+        Slot by slot, the blocks around it with particles, in their order: 27 times the block, plus the column of the
+        slot in `neighbour`.
+    source_start : (a + 1,) int64 array
+        Where those of each slot begin.
     active : (a, 3) int32 array
         Blocks that have memory, by slot.
     slot : (bx, by, bz) int32 array
@@ -87,6 +96,8 @@ class Arrangement(NamedTuple):
     shares: Array
     start: Array
     neighbour: Array
+    source: Array
+    source_start: Array
     active: Array
     slot: Array
 
@@ -122,14 +133,11 @@ def block_of(gx, gy, gz, bx, by, bz):  # type: ignore[no-untyped-def]
     return -1
 
 
-@njit(parallel=True)
-def _blocks_of(x, origin, scale, bx, by, bz):  # type: ignore[no-untyped-def]
-    """Block number of each particle; -1 where it is outside or not finite."""
-    number = np.empty(len(x), np.int64)
-    for p in prange(len(x)):
+@njit
+def _blocks_of(first, last, x, origin, scale, bx, by, bz, number):  # type: ignore[no-untyped-def]
+    for p in range(first, last):
         gx, gy, gz = (x[p, 0] - origin[0]) * scale, (x[p, 1] - origin[1]) * scale, (x[p, 2] - origin[2]) * scale
         number[p] = block_of(gx, gy, gz, bx, by, bz)
-    return number
 
 
 @njit
@@ -163,9 +171,35 @@ def _activate(block, slot):  # type: ignore[no-untyped-def]
     return neighbour, active[:n].copy()
 
 
+@njit
+def _sources(neighbour, slots):  # type: ignore[no-untyped-def]
+    """`Arrangement.source` and `source_start`."""
+    start = np.zeros(slots + 1, np.int64)
+    for b in range(len(neighbour)):
+        for e in range(27):
+            start[neighbour[b, e] + 1] += 1
+    for s in range(slots):
+        start[s + 1] += start[s]
+    place, source = start[:-1].copy(), np.empty(27 * len(neighbour), np.int64)
+    for b in range(len(neighbour)):
+        for e in range(27):
+            s = neighbour[b, e]
+            source[place[s]] = 27 * b + e
+            place[s] += 1
+    return source, start
+
+
+def _numbers(x: Array, domain: Domain) -> Array:
+    """(n,) block number of each particle; -1 where it is outside or not finite."""
+    number = np.empty(len(x), np.int64)
+    scale = 1.0 / domain.spacing
+    over_range(_blocks_of, len(x), x, domain.origin, scale, *domain.blocks, number, fewest=ELEMENTS)
+    return number
+
+
 def outside(x: Array, domain: Domain) -> Array:
     """(k,) indices of the particles (n, 3) outside the domain or not finite."""
-    return np.flatnonzero(_blocks_of(x, domain.origin, 1.0 / domain.spacing, *domain.blocks) < 0)
+    return np.flatnonzero(_numbers(x, domain) < 0)
 
 
 def arrange(x: Array, domain: Domain) -> tuple[Arrangement, Array]:
@@ -184,11 +218,11 @@ def arrange(x: Array, domain: Domain) -> tuple[Arrangement, Array]:
         Indices of particles outside the domain or not finite; where there are any, the arrangement is void.
     """
     bx, by, bz = domain.blocks
-    number = _blocks_of(x, domain.origin, 1.0 / domain.spacing, bx, by, bz)
+    number = _numbers(x, domain)
     lost = np.flatnonzero(number < 0)
     empty = np.empty((0, 3), np.int32)
     if len(lost):
-        return Arrangement(lost, empty, np.zeros((9, 2), np.int64), lost, empty, empty, empty), lost
+        return Arrangement(lost, empty, lost, lost, empty, lost, lost, empty, empty), lost
     order, counts = _counting_sort(number, bx * by * bz)
     used = np.flatnonzero(counts)
     first = (np.cumsum(counts) - counts)[used]
@@ -202,9 +236,8 @@ def arrange(x: Array, domain: Domain) -> tuple[Arrangement, Array]:
     block = np.ascontiguousarray(block[by_parity])
     slot = np.full(domain.blocks, -1, np.int32)
     neighbour, active = _activate(block, slot)
-    bounds = np.concatenate([[0], np.cumsum(np.bincount(parity, minlength=8))])
+    source, source_start = _sources(neighbour, len(active))
     work = start + _BLOCK * np.arange(len(start))
-    ranges = [*pairwise(bounds), (0, len(block))]
-    parts = np.linspace(0, 1, get_num_threads() + 1)
-    shares = np.array([np.searchsorted(work, work[a] + parts * (work[b] - work[a])) for a, b in ranges])
-    return Arrangement(order, block, shares, start.astype(np.int64), neighbour, active, slot), lost
+    parts = min(get_num_threads(), 1 + int(work[-1]) // _SHARE)
+    shares = np.searchsorted(work, np.linspace(0, 1, parts + 1) * work[-1])
+    return Arrangement(order, block, shares, start, neighbour, source, source_start, active, slot), lost

@@ -8,9 +8,10 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from ..compute.jit import njit, prange
+from ..compute.jit import njit
+from ..compute.threads import ELEMENTS, over_range
 from ..core.errors import UsageError
-from .blocks import Nodes
+from .blocks import SLOTS, Nodes
 
 Array = np.ndarray
 
@@ -159,12 +160,16 @@ def surface_near(place, field, motion):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(parallel=True)
 def collide(nodes: Nodes, field: Field, motion: Motion, surface: Surface) -> None:
     """Change the velocities of nodes inside a collider, in place."""
+    over_range(_collide, len(nodes.values), nodes, field, motion, surface, fewest=SLOTS // 4)
+
+
+@njit
+def _collide(first, last, nodes, field, motion, surface):  # type: ignore[no-untyped-def]
     values, active, origin, spacing = nodes
     shift = motion.shift
-    for s in prange(len(values)):
+    for s in range(first, last):
         for n in range(64):
             if values[s, n, 3] <= np.float32(0.0):
                 continue
@@ -215,11 +220,15 @@ def plane_rows(planes: Sequence[Plane]) -> Array:
     return rows
 
 
-@njit(parallel=True)
 def bound(nodes: Nodes, planes: Array) -> None:
     """Change the velocities of nodes behind planes, rows of `plane_rows`, in place."""
+    over_range(_bound, len(nodes.values), nodes, planes, fewest=SLOTS)
+
+
+@njit
+def _bound(first, last, nodes, planes):  # type: ignore[no-untyped-def]
     values, active, origin, spacing = nodes
-    for s in prange(len(values)):
+    for s in range(first, last):
         for q in range(len(planes)):
             ax, ay, az = planes[q, 0], planes[q, 1], planes[q, 2]
             base = (
@@ -237,12 +246,16 @@ def bound(nodes: Nodes, planes: Array) -> None:
                     )
 
 
-@njit(parallel=True)
 def look(points: Array, field: Field, motion: Motion) -> Array:
     """(n, 7) what `surface_near` says of each world point."""
     out = np.empty((len(points), 7))
+    over_range(_look, len(points), points, field, motion, out, fewest=ELEMENTS)
+    return out
+
+
+@njit
+def _look(first, last, points, field, motion, out):  # type: ignore[no-untyped-def]
     shift = motion.shift
-    for p in prange(len(points)):
+    for p in range(first, last):
         place = points[p, 0] - shift[0], points[p, 1] - shift[1], points[p, 2] - shift[2]
         out[p, 0], out[p, 1], out[p, 2], out[p, 3], out[p, 4], out[p, 5], out[p, 6] = surface_near(place, field, motion)
-    return out

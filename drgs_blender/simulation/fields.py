@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..compute.jit import njit, prange
+from ..compute.jit import njit
+from ..compute.threads import over_range
 from .blocks import Nodes
 
 Array = np.ndarray
@@ -24,6 +25,8 @@ SIDES = {"both": 0, "above": 1, "below": 2}
 #: Columns of `FieldRows.at`; what may change from frame to frame comes first.
 _PLACE, _AXIS, _STRENGTH, _FLOW, MOVING = 0, 3, 6, 7, 8
 _KIND, _SHAPE, _FALLOFF, _SIDE, _POWER, _NEAR, _FAR, _RADIAL, _INNER, _OUTER, _SIZE, COLUMNS = range(8, 20)
+#: Fewest places for which another thread is worth while.
+_PLACES = 512
 #: Metres, beyond everything.
 FAR = 1e9
 
@@ -209,25 +212,47 @@ def push_of(f, x, y, z):  # type: ignore[no-untyped-def]
     return s * ax, s * ay, s * az, flow
 
 
-@njit(parallel=True)
-def blow(x, v, still, rows, dt):  # type: ignore[no-untyped-def]
-    """Change the velocities v (n, 3) of matter at x (n, 3) that is not still by a time step of fields, in place."""
-    for i in prange(len(x)):
+def blow(x: Array, v: Array, still: Array, rows: Array, dt: float) -> None:
+    """Change the velocities of matter by a time step of fields, in place.
+
+    Parameters
+    ----------
+    x : (n, 3) float64 array
+        Metres.
+    v : (n, 3) float64 array
+        m/s; changed.
+    still : (n,) bool array
+        What is left as it is.
+    rows : (k, columns) float64 array
+        Of `FieldRows.at`.
+    dt : float
+        Seconds.
+    """
+    over_range(_blow, len(x), x, v, still, rows, dt, fewest=_PLACES)
+
+
+@njit
+def _blow(first, last, x, v, still, rows, dt):  # type: ignore[no-untyped-def]
+    for i in range(first, last):
         if still[i]:
             continue
         for r in range(len(rows)):
             ax, ay, az, flow = push_of(rows[r], x[i, 0], x[i, 1], x[i, 2])
-            slow = 1.0 / (1.0 + dt * flow)
-            v[i, 0] = (v[i, 0] + dt * ax) * slow
-            v[i, 1] = (v[i, 1] + dt * ay) * slow
-            v[i, 2] = (v[i, 2] + dt * az) * slow
+            damping_factor = 1.0 / (1.0 + dt * flow)
+            v[i, 0] = (v[i, 0] + dt * ax) * damping_factor
+            v[i, 1] = (v[i, 1] + dt * ay) * damping_factor
+            v[i, 2] = (v[i, 2] + dt * az) * damping_factor
 
 
-@njit(parallel=True)
 def blow_nodes(nodes: Nodes, rows: Array, dt: float) -> None:
-    """The same for the nodes of the grid."""
+    """`blow` for the nodes of the grid."""
+    over_range(_blow_nodes, len(nodes.values), nodes, rows, dt, fewest=_PLACES // 64)
+
+
+@njit
+def _blow_nodes(first, last, nodes, rows, dt):  # type: ignore[no-untyped-def]
     values, active, origin, spacing = nodes
-    for s in prange(len(values)):
+    for s in range(first, last):
         for n in range(64):
             if values[s, n, 3] <= np.float32(0.0):
                 continue
@@ -236,7 +261,7 @@ def blow_nodes(nodes: Nodes, rows: Array, dt: float) -> None:
             z = origin[2] + spacing * (4 * active[s, 2] + n % 4)
             for r in range(len(rows)):
                 ax, ay, az, flow = push_of(rows[r], x, y, z)
-                slow = 1.0 / (1.0 + dt * flow)
-                values[s, n, 0] = np.float32((values[s, n, 0] + dt * ax) * slow)
-                values[s, n, 1] = np.float32((values[s, n, 1] + dt * ay) * slow)
-                values[s, n, 2] = np.float32((values[s, n, 2] + dt * az) * slow)
+                damping_factor = 1.0 / (1.0 + dt * flow)
+                values[s, n, 0] = np.float32((values[s, n, 0] + dt * ax) * damping_factor)
+                values[s, n, 1] = np.float32((values[s, n, 1] + dt * ay) * damping_factor)
+                values[s, n, 2] = np.float32((values[s, n, 2] + dt * az) * damping_factor)

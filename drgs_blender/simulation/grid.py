@@ -13,7 +13,7 @@ from .blocks import Arrangement, Domain, Nodes, arrange
 from .colliders import MovingCollider
 from .contact import bound, collide
 from .fields import FieldRows, ForceField, blow_nodes
-from .p2g_g2p import advance_nodes, gather, hold_pins, scatter
+from .p2g_g2p import SCRATCH, advance_nodes, g2p, hold_pins, p2g
 from .particles import Particles, Properties, taken
 
 Array = np.ndarray
@@ -143,6 +143,7 @@ class HostGrid(Grid):
         self._pins = _inverse(self._order)[scene.pins]
         values = np.empty((len(self._a.active), 64, 4), np.float32)
         self._nodes = Nodes(values, self._a.active, scene.domain.origin, scene.domain.spacing)
+        self._scratch = np.empty((len(self._a.block), SCRATCH), np.float32)
         self._held = np.zeros_like(values) if len(self._pins) else values[:0]
         self._fastest = np.empty(len(self._a.block), np.float32)
         return True
@@ -151,7 +152,7 @@ class HostGrid(Grid):
         scene, forces, s, a, nodes = self._scene, self._scene.forces, self._state, self._a, self._nodes
         (done, dt), *_ = times
         part = (done + 0.5 * dt) / self._seconds
-        scatter(s, self._properties, a, nodes, dt)
+        p2g(s, self._properties, a, nodes, dt, self._scratch)
         gravity, wind = np.asarray(forces.gravity, np.float64), np.asarray(forces.wind, np.float64)
         advance_nodes(nodes.values, scene.least, dt, gravity, wind, forces.drag, forces.damping)
         if len(scene.fields):
@@ -165,7 +166,7 @@ class HostGrid(Grid):
         if len(self._pins):
             hold_pins(s.x, self._properties.mass, self._pins, self._pin_velocity, a.slot, nodes, self._held)
             kept = s.x[self._pins] + dt * self._pin_velocity
-        gather(s, self._properties, a, nodes, dt, self._fastest)
+        g2p(s, self._properties, a, nodes, dt, self._fastest)
         if len(self._pins):
             s.x[self._pins], s.v[self._pins] = kept, self._pin_velocity
         return [float(self._fastest.max())]

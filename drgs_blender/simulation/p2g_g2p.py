@@ -1,7 +1,7 @@
 """One step of MLS-MPM: particles to grid (P2G), the grid's own step, grid to particles (G2P).
 
-After Hu et al. 2018 (moving least squares MPM) with APIC (Jiang et al. 2015) and quadratic B-splines. A block's nodes
-are gathered in a scratch of 8^3 nodes from cell -1 to 6 of the block, which lets particles drift by a cell.
+After Hu et al. 2018 (moving least squares MPM) with APIC (Jiang et al. 2015) and quadratic B-splines. A block works on
+a scratch of 8^3 nodes from cell -1 to 6 of the block, which lets particles drift by a cell.
 Single precision stalls slow motion and slow strain: positions are double, and deformation gradients are kept less 1.
 """
 
@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..compute.jit import njit, prange
+from ..compute.jit import njit
 from ..compute.simd import fold, load, quads, repeat, spread, store
+from ..compute.threads import over_range
 from ..core.sim_materials import ELASTIC, LAMBDA, MU
-from .blocks import Arrangement, Nodes
+from .blocks import SLOTS, Arrangement, Nodes
 from .constitutive import neo_hookean, respond
 from .particles import Particles, Properties
 
@@ -21,7 +22,10 @@ Array = np.ndarray
 _ZERO, _HALF, _ONE, _ONE_HALF = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(1.5)
 
 #: 8^3 nodes of momentum (or velocity) and mass, and one more, as rows are loaded four nodes at a time.
-_SCRATCH = 2048 + 4
+SCRATCH = 2048 + 4
+
+#: Where the nodes of the block before, of its own and of the block after it begin along an axis of a scratch.
+_BOUNDS = (0, 1, 5, 8)
 
 #: Share of a node's matter that is pinned from which on the node is. On a flat border between pinned and free matter
 #: the last node held is then, over all positions of the grid, on average on the border itself.
@@ -84,7 +88,7 @@ def _carried(scratch, base, wx, wy, wz):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def stretch(f, p, step, gradient):  # type: ignore[no-untyped-def]
+def update_deformation_gradient(f, p, step, gradient):  # type: ignore[no-untyped-def]
     """F = (1 + step grad v) F, in place, where `f` holds F - 1; the gradient of v row by row."""
     g0, g1, g2, g3, g4, g5, g6, g7, g8 = gradient
     h0, h4, h8 = f[p, 0], f[p, 4], f[p, 8]
@@ -117,67 +121,99 @@ def momentum_of(p, v, affine, tau, m, q, h, fx, fy, fz):  # type: ignore[no-unty
 
 
 @njit(inline="always")
-def pushed(velocity, gain, slow, pull, wind):  # type: ignore[no-untyped-def]
-    """A velocity after a step of what acts on all matter alike; vectors as (x, y, z)."""
+def apply_forces(velocity, gain, damping_factor, drag_factor, wind):  # type: ignore[no-untyped-def]
+    """A velocity after a step of the forces that act on all matter alike; vectors as (x, y, z), m/s.
+
+    Gravity adds `gain`; damping leaves the share `damping_factor`, exp(-dt damping), of all; drag takes the share
+    `drag_factor`, 1 - exp(-dt drag), of what is relative to the wind.
+    """
     x, y, z = velocity
     gx, gy, gz = gain
     wx, wy, wz = wind
     # All forces alike, so that damping does not change where matter comes to rest.
-    x, y, z = slow * (x + gx), slow * (y + gy), slow * (z + gz)
-    return x + pull * (wx - x), y + pull * (wy - y), z + pull * (wz - z)
+    x, y, z = damping_factor * (x + gx), damping_factor * (y + gy), damping_factor * (z + gz)
+    return x + drag_factor * (wx - x), y + drag_factor * (wy - y), z + drag_factor * (wz - z)
 
 
-@njit(parallel=True)
-def scatter(particles: Particles, properties: Properties, places: Arrangement, grid: Nodes, dt: float) -> None:
-    """Particles, in the order of the arrangement, to grid: momentum and mass of its nodes are written."""
+def p2g(
+    particles: Particles, properties: Properties, places: Arrangement, grid: Nodes, dt: float, scratch: Array
+) -> None:
+    """Particles to grid: momentum and mass of its nodes are written.
+
+    Parameters
+    ----------
+    particles : Particles
+        In the order of the arrangement.
+    properties : Properties
+    places : Arrangement
+    grid : Nodes
+        Written.
+    dt : float
+        Seconds.
+    scratch : (b, SCRATCH) float32 array
+        A row per block with particles; overwritten.
+    """
+    parts = len(places.shares) - 1
+    over_range(_sum_particles, parts, particles, properties, places, grid.origin, grid.spacing, dt, scratch)
+    sources = places.source, places.source_start
+    over_range(_sum_blocks, len(grid.values), *sources, scratch, grid.values, fewest=SLOTS)
+
+
+@njit
+def _sum_particles(first, last, particles, properties, places, origin, spacing, dt, scratches):  # type: ignore[no-untyped-def]
+    """What the particles of each block in some shares give, in the block's scratch."""
     x, v, affine, tau = particles.x, particles.v, particles.affine, particles.tau
     mass, volume = properties.mass, properties.volume
-    block, shares, start, neighbour = places.block, places.shares, places.start, places.neighbour
-    nodes, origin, spacing = grid.values, grid.origin, grid.spacing
+    block, shares, start = places.block, places.shares, places.start
     scale = 1.0 / spacing
     h = np.float32(spacing)
     factor = np.float32(4.0 * dt * scale * scale)
-    for s in prange(len(nodes)):
-        nodes[s] = np.float32(0.0)
-    for colour in range(8):
-        for t in prange(shares.shape[1] - 1):
-            for b in range(shares[colour, t], shares[colour, t + 1]):
-                scratch = np.zeros(_SCRATCH, np.float32)
-                cx, cy, cz = 4 * block[b, 0] - 1, 4 * block[b, 1] - 1, 4 * block[b, 2] - 1
-                for p in range(start[b], start[b + 1]):
-                    m = mass[p]
-                    if m == np.float32(0.0):
-                        continue
-                    i, j, k, fx, fy, fz = cell_of(x, p, origin, scale)
-                    wx, wy, wz = weights_of(fx), weights_of(fy), weights_of(fz)
-                    q = -factor * volume[p]
-                    mx, my, mz, a00, a01, a02, a10, a11, a12, a20, a21, a22 = momentum_of(
-                        p, v, affine, tau, m, q, h, fx, fy, fz
-                    )
-                    base = (((i - cx) * 8 + (j - cy)) * 8 + (k - cz)) * 4
-                    # A row of nodes along z at once; the fourth has no weight.
-                    along = quads(wz[0], wz[1], wz[2], _ZERO)
-                    here = along * (repeat(mx, my, mz, m) + _steps() * repeat(a02, a12, a22, _ZERO))
-                    per_x, per_y = along * repeat(a00, a10, a20, _ZERO), along * repeat(a01, a11, a21, _ZERO)
-                    for ii in range(3):
-                        line = here + np.float32(ii) * per_x
-                        for jj in range(3):
-                            at = base + ii * 256 + jj * 32
-                            row = (wx[ii] * wy[jj]) * (line + np.float32(jj) * per_y)
-                            store(scratch, at, load(scratch, at) + row)
-                for i in range(8):
-                    for j in range(8):
-                        for k in range(8):
-                            s, n, o = node_of(neighbour, b, i, j, k)
-                            nodes[s, n, 0] += scratch[o]
-                            nodes[s, n, 1] += scratch[o + 1]
-                            nodes[s, n, 2] += scratch[o + 2]
-                            nodes[s, n, 3] += scratch[o + 3]
+    for b in range(shares[first], shares[last]):
+        scratch = scratches[b]
+        scratch[:] = _ZERO
+        cx, cy, cz = 4 * block[b, 0] - 1, 4 * block[b, 1] - 1, 4 * block[b, 2] - 1
+        for p in range(start[b], start[b + 1]):
+            m = mass[p]
+            if m == np.float32(0.0):
+                continue
+            i, j, k, fx, fy, fz = cell_of(x, p, origin, scale)
+            wx, wy, wz = weights_of(fx), weights_of(fy), weights_of(fz)
+            q = -factor * volume[p]
+            mx, my, mz, a00, a01, a02, a10, a11, a12, a20, a21, a22 = momentum_of(
+                p, v, affine, tau, m, q, h, fx, fy, fz
+            )
+            base = (((i - cx) * 8 + (j - cy)) * 8 + (k - cz)) * 4
+            # A row of nodes along z at once; the fourth has no weight.
+            along = quads(wz[0], wz[1], wz[2], _ZERO)
+            here = along * (repeat(mx, my, mz, m) + _steps() * repeat(a02, a12, a22, _ZERO))
+            per_x, per_y = along * repeat(a00, a10, a20, _ZERO), along * repeat(a01, a11, a21, _ZERO)
+            for ii in range(3):
+                line = here + np.float32(ii) * per_x
+                for jj in range(3):
+                    at = base + ii * 256 + jj * 32
+                    row = (wx[ii] * wy[jj]) * (line + np.float32(jj) * per_y)
+                    store(scratch, at, load(scratch, at) + row)
 
 
-@njit(parallel=True)
+@njit
+def _sum_blocks(first, last, source, source_start, scratch, nodes):  # type: ignore[no-untyped-def]
+    """What the blocks around give to the nodes of some slots, in the order of the blocks."""
+    for s in range(first, last):
+        values = nodes[s].reshape(256)
+        values[:] = _ZERO
+        for q in range(source_start[s], source_start[s + 1]):
+            b, e = source[q] // 27, source[q] % 27
+            i0, j0, k0 = _BOUNDS[e // 9], _BOUNDS[e // 3 % 3], _BOUNDS[e % 3]
+            i1, j1, k1 = _BOUNDS[e // 9 + 1], _BOUNDS[e // 3 % 3 + 1], _BOUNDS[e % 3 + 1]
+            for i in range(i0, i1):
+                for j in range(j0, j1):
+                    to, at = (((i + 3) & 3) * 4 + ((j + 3) & 3)) * 16 + ((k0 + 3) & 3) * 4, ((i * 8 + j) * 8 + k0) * 4
+                    for c in range(4 * (k1 - k0)):
+                        values[to + c] += scratch[b, at + c]
+
+
 def advance_nodes(
-    nodes: Array, least: float, dt: float, force: Array, wind: Array, drag: float, damping: float
+    nodes: Array, least: np.float32, dt: float, force: Array, wind: Array, drag: float, damping: float
 ) -> None:
     """Momentum to velocity, in place, and what acts on all matter alike.
 
@@ -185,7 +221,7 @@ def advance_nodes(
     ----------
     nodes : (a, 64, 4) float32 array
         Values of `Nodes`.
-    least : float
+    least : np.float32
         kg, below which a node is empty: momentum over a mass near underflow is noise.
     dt : float
         Seconds.
@@ -198,10 +234,15 @@ def advance_nodes(
     damping : float
         1/s.
     """
-    pull, slow = np.float32(1.0 - np.exp(-dt * drag)), np.float32(np.exp(-dt * damping))
+    over_range(_advance_nodes, len(nodes), nodes, least, dt, force, wind, drag, damping, fewest=SLOTS)
+
+
+@njit
+def _advance_nodes(first, last, nodes, least, dt, force, wind, drag, damping):  # type: ignore[no-untyped-def]
+    drag_factor, damping_factor = np.float32(1.0 - np.exp(-dt * drag)), np.float32(np.exp(-dt * damping))
     gain = np.float32(dt * force[0]), np.float32(dt * force[1]), np.float32(dt * force[2])
     flow = np.float32(wind[0]), np.float32(wind[1]), np.float32(wind[2])
-    for s in prange(len(nodes)):
+    for s in range(first, last):
         for n in range(64):
             m = nodes[s, n, 3]
             if m < least:
@@ -209,11 +250,11 @@ def advance_nodes(
             else:
                 r = _ONE / m
                 v = nodes[s, n, 0] * r, nodes[s, n, 1] * r, nodes[s, n, 2] * r
-                nodes[s, n, 0], nodes[s, n, 1], nodes[s, n, 2] = pushed(v, gain, slow, pull, flow)
+                v = apply_forces(v, gain, damping_factor, drag_factor, flow)
+                nodes[s, n, 0], nodes[s, n, 1], nodes[s, n, 2] = v
 
 
-@njit(parallel=True)
-def gather(
+def g2p(
     particles: Particles, properties: Properties, places: Arrangement, grid: Nodes, dt: float, fastest: Array
 ) -> None:
     """Grid to particles: move them, deform them, and find their stress for the next step.
@@ -231,6 +272,12 @@ def gather(
     fastest : (b,) float32 array
         Written: the highest speed in each block, m/s; infinite where a particle is not finite.
     """
+    over_range(_move_particles, len(places.shares) - 1, particles, properties, places, grid, dt, fastest)
+
+
+@njit
+def _move_particles(first, last, particles, properties, places, grid, dt, fastest):  # type: ignore[no-untyped-def]
+    """`g2p` of the particles in some shares."""
     x, v, affine, elastic, total, tau, memory = particles
     mass, model, parameters, solid = properties.mass, properties.model, properties.parameters, properties.solid
     block, shares, start, neighbour = places.block, places.shares, places.start, places.neighbour
@@ -239,64 +286,63 @@ def gather(
     to_gradient = np.float32(4.0 * scale)
     step = np.float32(dt)
     apart = len(total) > 0
-    for t in prange(shares.shape[1] - 1):
-        for b in range(shares[8, t], shares[8, t + 1]):
-            scratch = np.zeros(_SCRATCH, np.float32)
-            for i in range(8):
-                for j in range(8):
-                    for k in range(8):
-                        s, n, o = node_of(neighbour, b, i, j, k)
-                        scratch[o] = nodes[s, n, 0]
-                        scratch[o + 1] = nodes[s, n, 1]
-                        scratch[o + 2] = nodes[s, n, 2]
-                        scratch[o + 3] = nodes[s, n, 3]
-            cx, cy, cz = 4 * block[b, 0] - 1, 4 * block[b, 1] - 1, 4 * block[b, 2] - 1
-            top = np.float32(0.0)
-            for p in range(start[b], start[b + 1]):
-                i, j, k, fx, fy, fz = cell_of(x, p, origin, scale)
-                wx, wy, wz = weights_of(fx), weights_of(fy), weights_of(fz)
-                base = (((i - cx) * 8 + (j - cy)) * 8 + (k - cz)) * 4
-                blend = per_x = per_y = spread(_ZERO)
-                for ii in range(3):
-                    for jj in range(3):
-                        row = (wx[ii] * wy[jj]) * load(scratch, base + ii * 256 + jj * 32)
-                        blend = blend + row
-                        per_x = per_x + (np.float32(ii) - fx) * row
-                        per_y = per_y + (np.float32(jj) - fy) * row
-                along = quads(wz[0], wz[1], wz[2], _ZERO)
-                blend = along * blend
-                vx, vy, vz, _ = fold(blend)
-                if mass[p] == _ZERO:
-                    # Riders may be where some nodes have no matter: what there is counts fully; F follows no riders.
-                    vx, vy, vz, weight = _carried(scratch, base, wx, wy, wz)
-                    if weight <= _ZERO:
-                        vx, vy, vz = v[p, 0], v[p, 1], v[p, 2]
-                v[p, 0], v[p, 1], v[p, 2] = vx, vy, vz
-                x[p, 0] += dt * vx
-                x[p, 1] += dt * vy
-                x[p, 2] += dt * vz
-                speed = vx * vx + vy * vy + vz * vz
-                top = top if speed <= top or top != top else speed  # NaN stays
-                if mass[p] == _ZERO:
-                    continue
-                b0, b3, b6, _ = fold(along * per_x)
-                b1, b4, b7, _ = fold(along * per_y)
-                b2, b5, b8, _ = fold((_steps() - spread(fz)) * blend)
-                g0, g1, g2 = to_gradient * b0, to_gradient * b1, to_gradient * b2
-                g3, g4, g5 = to_gradient * b3, to_gradient * b4, to_gradient * b5
-                g6, g7, g8 = to_gradient * b6, to_gradient * b7, to_gradient * b8
-                affine[p, 0], affine[p, 1], affine[p, 2] = g0, g1, g2
-                affine[p, 3], affine[p, 4], affine[p, 5] = g3, g4, g5
-                affine[p, 6], affine[p, 7], affine[p, 8] = g6, g7, g8
-                gradient = g0, g1, g2, g3, g4, g5, g6, g7, g8
-                stretch(elastic, p, step, gradient)
-                if apart and solid[p]:
-                    stretch(total, p, step, gradient)
-                if model[p] == ELASTIC:
-                    neo_hookean(elastic, p, parameters[p, MU], parameters[p, LAMBDA], tau)
-                else:
-                    respond(p, model, parameters, elastic, tau, memory, affine, dt)
-            fastest[b] = np.sqrt(top)
+    scratch = np.zeros(SCRATCH, np.float32)
+    for b in range(shares[first], shares[last]):
+        for i in range(8):
+            for j in range(8):
+                for k in range(8):
+                    s, n, o = node_of(neighbour, b, i, j, k)
+                    scratch[o] = nodes[s, n, 0]
+                    scratch[o + 1] = nodes[s, n, 1]
+                    scratch[o + 2] = nodes[s, n, 2]
+                    scratch[o + 3] = nodes[s, n, 3]
+        cx, cy, cz = 4 * block[b, 0] - 1, 4 * block[b, 1] - 1, 4 * block[b, 2] - 1
+        top = np.float32(0.0)
+        for p in range(start[b], start[b + 1]):
+            i, j, k, fx, fy, fz = cell_of(x, p, origin, scale)
+            wx, wy, wz = weights_of(fx), weights_of(fy), weights_of(fz)
+            base = (((i - cx) * 8 + (j - cy)) * 8 + (k - cz)) * 4
+            blend = per_x = per_y = spread(_ZERO)
+            for ii in range(3):
+                for jj in range(3):
+                    row = (wx[ii] * wy[jj]) * load(scratch, base + ii * 256 + jj * 32)
+                    blend = blend + row
+                    per_x = per_x + (np.float32(ii) - fx) * row
+                    per_y = per_y + (np.float32(jj) - fy) * row
+            along = quads(wz[0], wz[1], wz[2], _ZERO)
+            blend = along * blend
+            vx, vy, vz, _ = fold(blend)
+            if mass[p] == _ZERO:
+                # Riders may be where some nodes have no matter: what there is counts fully; F follows no riders.
+                vx, vy, vz, weight = _carried(scratch, base, wx, wy, wz)
+                if weight <= _ZERO:
+                    vx, vy, vz = v[p, 0], v[p, 1], v[p, 2]
+            v[p, 0], v[p, 1], v[p, 2] = vx, vy, vz
+            x[p, 0] += dt * vx
+            x[p, 1] += dt * vy
+            x[p, 2] += dt * vz
+            speed = vx * vx + vy * vy + vz * vz
+            top = top if speed <= top or top != top else speed  # NaN stays
+            if mass[p] == _ZERO:
+                continue
+            b0, b3, b6, _ = fold(along * per_x)
+            b1, b4, b7, _ = fold(along * per_y)
+            b2, b5, b8, _ = fold((_steps() - spread(fz)) * blend)
+            g0, g1, g2 = to_gradient * b0, to_gradient * b1, to_gradient * b2
+            g3, g4, g5 = to_gradient * b3, to_gradient * b4, to_gradient * b5
+            g6, g7, g8 = to_gradient * b6, to_gradient * b7, to_gradient * b8
+            affine[p, 0], affine[p, 1], affine[p, 2] = g0, g1, g2
+            affine[p, 3], affine[p, 4], affine[p, 5] = g3, g4, g5
+            affine[p, 6], affine[p, 7], affine[p, 8] = g6, g7, g8
+            gradient = g0, g1, g2, g3, g4, g5, g6, g7, g8
+            update_deformation_gradient(elastic, p, step, gradient)
+            if apart and solid[p]:
+                update_deformation_gradient(total, p, step, gradient)
+            if model[p] == ELASTIC:
+                neo_hookean(elastic, p, parameters[p, MU], parameters[p, LAMBDA], tau)
+            else:
+                respond(p, model, parameters, elastic, tau, memory, affine, dt)
+        fastest[b] = np.sqrt(top)
 
 
 @njit

@@ -137,10 +137,10 @@ class Rigid(Stepper):
 
     def _step(self, dt: float, part: float, middle: float, reach: float) -> None:
         forces = self.forces
-        slow, pull = np.exp(-dt * forces.damping), 1 - np.exp(-dt * forces.drag)
-        self.motion = slow * (self.motion + dt * np.asarray(forces.gravity, np.float64))
-        self.motion = self.motion + pull * (np.asarray(forces.wind, np.float64) - self.motion)
-        self.spin = slow * (1 - pull) * self.spin
+        damping_factor, drag_factor = np.exp(-dt * forces.damping), 1 - np.exp(-dt * forces.drag)
+        self.motion = damping_factor * (self.motion + dt * np.asarray(forces.gravity, np.float64))
+        self.motion = self.motion + drag_factor * (np.asarray(forces.wind, np.float64) - self.motion)
+        self.spin = damping_factor * (1 - drag_factor) * self.spin
         inverse = np.linalg.inv(self.turn @ self._inertia @ self.turn.T)
         if len(self._fields):
             arm = self._felt @ self.turn.T

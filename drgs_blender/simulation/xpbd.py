@@ -14,10 +14,12 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 
 import numpy as np
 
-from ..compute.jit import njit, prange
+from ..compute.jit import get_num_threads, njit
+from ..compute.threads import ELEMENTS, over_range
 from ..core.errors import Cancelled, UsageError
 from .colliders import Collider, MovingCollider, check_apart
 from .contact import Plane, plane_rows
@@ -29,6 +31,8 @@ from .stepper import Stepper
 Array = np.ndarray
 log = logging.getLogger(__name__)
 
+#: Fewest cubes for which another thread is worth while.
+_FEW = 128
 #: Cubes along the body's longest side.
 CUBES = 14
 #: Least mass of a node, in parts of the heaviest.
@@ -183,7 +187,8 @@ class Lattice(Stepper):
     @property
     def points(self) -> Array:
         found = np.empty(self.body.points.shape)
-        _embedded(self.x, self._corners, self._cube_of, self._weights, found)
+        given = self.x, self._corners, self._cube_of, self._weights
+        over_range(_embedded, len(found), *given, found, fewest=ELEMENTS)
         return found
 
     @property
@@ -193,7 +198,8 @@ class Lattice(Stepper):
     @property
     def gradients(self) -> Array:
         found = np.empty((len(self.body.points), 3, 3), np.float32)
-        _embedded_gradients(self.x, self._corners, self._cube_of, self._slopes, found)
+        given = self.x, self._corners, self._cube_of, self._slopes
+        over_range(_embedded_gradients, len(found), *given, found, fewest=ELEMENTS)
         return found
 
     def arrays(self) -> dict[str, Array]:
@@ -215,7 +221,7 @@ class Lattice(Stepper):
         self.x, self.v = self.x.copy(), self.v.copy()
         forces = self.forces
         gravity, wind = np.asarray(forces.gravity, np.float64), np.asarray(forces.wind, np.float64)
-        pull, slow = 1 - np.exp(-dt * forces.drag), np.exp(-dt * forces.damping)
+        drag_factor, damping_factor = 1 - np.exp(-dt * forces.drag), np.exp(-dt * forces.damping)
         free = self._inverse_mass > 0
         pin_velocity = np.zeros((len(self._fixed), 3))
         if pin_targets is not None and len(self._fixed):
@@ -229,8 +235,8 @@ class Lattice(Stepper):
         for step in range(count):
             if cancelled is not None and cancelled():
                 raise Cancelled
-            self.v[free] = slow * (self.v[free] + dt * gravity)
-            self.v[free] += pull * (wind - self.v[free])
+            self.v[free] = damping_factor * (self.v[free] + dt * gravity)
+            self.v[free] += drag_factor * (wind - self.v[free])
             if len(self._fields):
                 blow(self.x, self.v, ~free, self._fields.at(self.frame, (step + 0.5) / count), dt)
             self.v[self._fixed] = pin_velocity
@@ -251,8 +257,7 @@ class Lattice(Stepper):
             raise self._error("became infinite", "Use mpm, or lower velocities")
 
 
-@njit(parallel=True)
-def _solve(x, inverse_mass, corners, parity, slopes, terms):  # type: ignore[no-untyped-def]
+def _solve(x: Array, inverse_mass: Array, corners: Array, parity: Array, slopes: Array, terms: Array) -> None:
     """One iteration over all cubes: at each of their places, volume and shape at once.
 
     With w the inverse masses, s the slopes, F and P = cof F of a place, a the largest singular value of sum w s s^T,
@@ -264,52 +269,71 @@ def _solve(x, inverse_mass, corners, parity, slopes, terms):  # type: ignore[no-
 
     Parameters
     ----------
+    x : (n, 3) float64 array
+        Metres, of the nodes; changed.
+    inverse_mass : (n,) float64 array
+        1/kg; 0 of those that are held.
+    corners : (cubes, 8) int32 array
+        Nodes of the cubes, those of one parity together.
+    parity : (9,) int64 array
+        Where the cubes of each parity begin.
+    slopes : (5, 8, 3) float64 array
+        Of the places in a cube, see `_slopes`.
     terms : (cubes, 5, 4) float64 array
         Alpha, beta, b and q.
     """
-    for colour in range(8):
-        for q in prange(parity[colour], parity[colour + 1]):
-            f, p, r = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-            own = np.empty((8, 3))
+    given = x, inverse_mass, corners, slopes, terms
+    if get_num_threads() == 1 or len(corners) <= 8 * _FEW:  # cubes are in the order of the passes
+        _solve_cubes(0, len(corners), 0, *given)
+        return
+    for begin, end in pairwise(parity.tolist()):
+        over_range(_solve_cubes, end - begin, begin, *given, fewest=_FEW)
+
+
+@njit
+def _solve_cubes(first, last, begin, x, inverse_mass, corners, slopes, terms):  # type: ignore[no-untyped-def]
+    """`_solve` of cubes, counted from `begin` on."""
+    f, p, r, own = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((8, 3))
+    for q in range(begin + first, begin + last):
+        for k in range(8):
+            for c in range(3):
+                own[k, c] = x[corners[q, k], c] - x[corners[q, 0], c]
+        for t in range(len(slopes)):
+            f[:] = 0.0
             for k in range(8):
-                for c in range(3):
-                    own[k, c] = x[corners[q, k], c] - x[corners[q, 0], c]
-            for t in range(len(slopes)):
-                f[:] = 0.0
-                for k in range(8):
-                    for i in range(3):
-                        for c in range(3):
-                            f[i, c] += own[k, i] * slopes[t, k, c]
-                for i in range(3):
-                    j, m = (i + 1) % 3, (i + 2) % 3
-                    p[i, 0] = f[j, 1] * f[m, 2] - f[j, 2] * f[m, 1]
-                    p[i, 1] = f[j, 2] * f[m, 0] - f[j, 0] * f[m, 2]
-                    p[i, 2] = f[j, 0] * f[m, 1] - f[j, 1] * f[m, 0]
-                volume = f[0, 0] * p[0, 0] + f[0, 1] * p[0, 1] + f[0, 2] * p[0, 2]
-                alpha, beta, scale, share = terms[q, t]
-                pr = pp = 0.0
                 for i in range(3):
                     for c in range(3):
-                        r[i, c] = 0.5 * (f[i, c] - p[i, c])
-                        pr += p[i, c] * r[i, c]
-                        pp += p[i, c] * p[i, c]
-                h = alpha * (1.0 - volume + share * pr) / (beta + alpha * share * pp)
-                for i in range(3):
-                    u, v, w = h * p[i, 0] - r[i, 0], h * p[i, 1] - r[i, 1], h * p[i, 2] - r[i, 2]
-                    for k in range(8):
-                        own[k, i] += (scale * inverse_mass[corners[q, k]]) * (
-                            u * slopes[t, k, 0] + v * slopes[t, k, 1] + w * slopes[t, k, 2]
-                        )
+                        f[i, c] += own[k, i] * slopes[t, k, c]
             for i in range(3):
-                at = x[corners[q, 0], i]
+                j, m = (i + 1) % 3, (i + 2) % 3
+                p[i, 0] = f[j, 1] * f[m, 2] - f[j, 2] * f[m, 1]
+                p[i, 1] = f[j, 2] * f[m, 0] - f[j, 0] * f[m, 2]
+                p[i, 2] = f[j, 0] * f[m, 1] - f[j, 1] * f[m, 0]
+            volume = f[0, 0] * p[0, 0] + f[0, 1] * p[0, 1] + f[0, 2] * p[0, 2]
+            alpha, beta, scale, share = terms[q, t]
+            pr = pp = 0.0
+            for i in range(3):
+                for c in range(3):
+                    r[i, c] = 0.5 * (f[i, c] - p[i, c])
+                    pr += p[i, c] * r[i, c]
+                    pp += p[i, c] * p[i, c]
+            h = alpha * (1.0 - volume + share * pr) / (beta + alpha * share * pp)
+            for i in range(3):
+                u, v, w = h * p[i, 0] - r[i, 0], h * p[i, 1] - r[i, 1], h * p[i, 2] - r[i, 2]
                 for k in range(8):
-                    x[corners[q, k], i] = at + own[k, i]
+                    own[k, i] += (scale * inverse_mass[corners[q, k]]) * (
+                        u * slopes[t, k, 0] + v * slopes[t, k, 1] + w * slopes[t, k, 2]
+                    )
+        for i in range(3):
+            at = x[corners[q, 0], i]
+            for k in range(8):
+                x[corners[q, k], i] = at + own[k, i]
 
 
-@njit(parallel=True)
-def _embedded(x, corners, cube, weights, points):  # type: ignore[no-untyped-def]
+@njit
+def _embedded(first, last, x, corners, cube, weights, points):  # type: ignore[no-untyped-def]
     """Points (n, 3) inside their cubes, written."""
-    for i in prange(len(points)):
+    for i in range(first, last):
         for c in range(3):
             total = 0.0
             for k in range(8):
@@ -317,10 +341,10 @@ def _embedded(x, corners, cube, weights, points):  # type: ignore[no-untyped-def
             points[i, c] = total
 
 
-@njit(parallel=True)
-def _embedded_gradients(x, corners, cube, slopes, out):  # type: ignore[no-untyped-def]
+@njit
+def _embedded_gradients(first, last, x, corners, cube, slopes, out):  # type: ignore[no-untyped-def]
     """Deformation gradients (n, 3, 3) float32 of points inside their cubes, written."""
-    for i in prange(len(out)):
+    for i in range(first, last):
         for r in range(3):
             a = b = c = 0.0
             for k in range(8):

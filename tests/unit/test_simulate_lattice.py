@@ -8,6 +8,7 @@ from matter_cases import cantilever, lattice, solver_of, timoshenko
 
 from drgs_blender.compute.jit import get_num_threads, set_num_threads
 from drgs_blender.core.errors import Cancelled, UsageError
+from drgs_blender.simulation import xpbd
 from drgs_blender.simulation.colliders import Collider
 from drgs_blender.simulation.contact import Plane
 from drgs_blender.simulation.solver import Forces
@@ -130,7 +131,8 @@ def test_pins_hold_and_lead():
 
 
 @pytest.mark.alone
-def test_threads_restoring_and_cancelling_change_no_bit():
+def test_threads_restoring_and_cancelling_change_no_bit(monkeypatch):
+    monkeypatch.setattr(xpbd, "_FEW", 1)  # so small a body would stay on one thread
     threads = get_num_threads()
     planes = [Plane((0, 0, -0.1), (0, 0, 1))]
     whole = Lattice(block(), Forces(), (), planes, cubes=5)

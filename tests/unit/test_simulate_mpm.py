@@ -13,6 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from drgs_blender.compute.jit import get_num_threads, set_num_threads
 from drgs_blender.core.errors import Cancelled, UsageError
+from drgs_blender.simulation import blocks, p2g_g2p
+from drgs_blender.simulation.blocks import arrange
 from drgs_blender.simulation.colliders import Collider
 from drgs_blender.simulation.contact import Plane
 
@@ -429,13 +431,17 @@ def test_turning_everything_turns_the_result():
 
 
 @pytest.mark.alone
-def test_any_number_of_threads_gives_the_same_bits():
+def test_any_number_of_threads_gives_the_same_bits(monkeypatch):
+    """Also where work is cut into the smallest pieces, into which so small a body would not be."""
+    monkeypatch.setattr(blocks, "_SHARE", 1)
+    monkeypatch.setattr(p2g_g2p, "SLOTS", 1)
     threads = get_num_threads()
     results = []
     try:
         for count in (1, threads):
             set_num_threads(count)
             solver = spinning_jelly()
+            assert len(arrange(solver.state.x, solver.domain)[0].shares) == count + 1
             solver.advance(0.3)
             results.append(solver.arrays())
     finally:

@@ -19,7 +19,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...compute.jit import njit, prange
+from ...compute.jit import njit
+from ...compute.threads import over_range
 from ...render.integrator.brdf import fresnel_dielectric, ggx, sample_vndf, vndf_terms
 from ...render.lights.environment import (
     EnvMap,
@@ -51,7 +52,8 @@ Array = np.ndarray
 
 #: Sums of a pixel: D, S, P, E of the module's text.
 SUMS = 4
-_BLOCK = 16
+#: Fewest pixels for which another thread is worth while.
+_FEW = 16
 _NONE = np.int32(-1)
 
 
@@ -347,29 +349,38 @@ def gather_point(i, points, lobes, plan, occluder, sky, envmap, sums, samples): 
                             by_normal[i, half, 3, 3 * k + axis] += w3 * slope * light
 
 
-@njit(parallel=True)
 def gather(
-    points: Points,
-    lobes: Lobes,
-    plan: Plan,
-    occluder: Occluder,
-    sky: Sky,
-    envmap: EnvMap,
-    sums: Sums,
-    samples: Samples,
+    points: Points, lobes: Lobes, plan: Plan, occluder: Occluder, sky: Sky, envmap: EnvMap, sums: Sums, samples: Samples
 ) -> None:
     """`gather_point` of all points; light samples are drawn by the envmap."""
-    n = len(lobes.alpha2)
-    for block in prange((n + _BLOCK - 1) // _BLOCK):
-        for i in range(block * _BLOCK, min(n, (block + 1) * _BLOCK)):
-            gather_point(i, points, lobes, plan, occluder, sky, envmap, sums, samples)
+    given = points, lobes, plan, occluder, sky, envmap, sums, samples
+    over_range(_gather, len(lobes.alpha2), *given, fewest=_FEW)
 
 
-@njit(parallel=True)
-def scatter(texel, share, weight, gradient, parts):  # type: ignore[no-untyped-def]
-    """Sum what each texel's radiance is worth to the loss, in parts of pixels."""
+@njit
+def _gather(first, last, points, lobes, plan, occluder, sky, envmap, sums, samples):  # type: ignore[no-untyped-def]
+    for i in range(first, last):
+        gather_point(i, points, lobes, plan, occluder, sky, envmap, sums, samples)
+
+
+def scatter(samples: Samples, gradient: Array, parts: Array) -> None:
+    """Sum what each texel's radiance is worth to the loss, in parts of pixels.
+
+    Parameters
+    ----------
+    samples : Samples
+    gradient : (n, 2, SUMS, 3) float32 array
+        Of the loss by the sums.
+    parts : (p, texels, 3) float32 array
+        Is added to, each by its own part of the pixels.
+    """
+    over_range(_scatter, len(parts), *samples, gradient, parts)
+
+
+@njit
+def _scatter(first, last, texel, share, weight, gradient, parts):  # type: ignore[no-untyped-def]
     n, samples = texel.shape[:2]
-    for part in prange(len(parts)):
+    for part in range(first, last):
         for i in range(part * n // len(parts), (part + 1) * n // len(parts)):
             for s in range(samples):
                 if texel[i, s, 0] < 0:

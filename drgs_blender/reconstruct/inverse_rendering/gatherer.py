@@ -129,6 +129,6 @@ class _Gather(torch.autograd.Function):
         if ctx.needs_input_grad[2]:
             parts = np.zeros((_PARTS, shape[0] * shape[1], 3), np.float32)
             # The factor two of either half, as in `Gatherer.run`.
-            scatter(*samples, np.ascontiguousarray((2 * gradient).numpy()), parts)
+            scatter(samples, np.ascontiguousarray((2 * gradient).numpy()), parts)
             for_radiance = torch.from_numpy(parts.sum(axis=0).reshape(shape))
         return for_normal, for_alpha2, for_radiance, None, None

@@ -12,7 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...compute.jit import njit, prange
+from ...compute.jit import njit
+from ...compute.threads import ELEMENTS, over_range
 from ...core.arrays import Array
 from ...formats.harmonics import basis
 
@@ -100,7 +101,7 @@ def attributes(
 def frames(scale: Array, rotation: Array) -> tuple[Array, Array, Array]:
     """Tangents of `rotation` (n, 4) wxyz scaled by exp of `scale` (n, 2), and the normal; any length; (n, 3) each."""
     u, v, normal = (np.empty((len(scale), 3), np.float32) for _ in range(3))
-    _frames(scale, rotation, u, v, normal)
+    over_range(_frames, len(scale), scale, rotation, u, v, normal, fewest=ELEMENTS)
     return u, v, normal
 
 
@@ -117,7 +118,7 @@ class _Attributes(torch.autograd.Function):
         values = basis(away, degree).astype(np.float32)
         u, v, normal = frames(raw.scale, raw.rotation)
         found = Attributes(u, v, np.empty(n, np.float32), np.empty((n, BLUR + 1 if mirrors else TINT), np.float32))
-        _colour(raw, normal, away, values, found)
+        over_range(_colour, n, raw, normal, away, values, found, fewest=ELEMENTS)
         ctx.save = (raw, values, normal, found)
         return tuple(map(torch.from_numpy, found))
 
@@ -129,7 +130,8 @@ class _Attributes(torch.autograd.Function):
             for g, a in zip(gradients, found, strict=True)
         ))  # fmt: skip
         to = Learned(*map(np.zeros_like, raw))
-        _backward(raw.rotation, values, normal, found, incoming, to)
+        given = raw.rotation, values, normal, found, incoming
+        over_range(_backward, len(normal), *given, to, fewest=ELEMENTS)
         return None, None, None, None, *map(torch.from_numpy, to)
 
 
@@ -138,10 +140,10 @@ def _logistic(x):  # type: ignore[no-untyped-def]
     return np.float32(1.0) / (np.float32(1.0) + np.exp(-x))
 
 
-@njit(parallel=True)
-def _frames(scale: Array, rotation: Array, u: Array, v: Array, normal: Array) -> None:
+@njit
+def _frames(first: int, last: int, scale: Array, rotation: Array, u: Array, v: Array, normal: Array) -> None:
     one, two = np.float32(1.0), np.float32(2.0)
-    for i in prange(len(scale)):
+    for i in range(first, last):
         w, x, y, z = rotation[i, 0], rotation[i, 1], rotation[i, 2], rotation[i, 3]
         r = one / max(np.sqrt(w * w + x * x + y * y + z * z), np.float32(1e-12))
         w, x, y, z = w * r, x * r, y * r, z * r
@@ -160,12 +162,12 @@ def _frames(scale: Array, rotation: Array, u: Array, v: Array, normal: Array) ->
         normal[i, 2] = one - two * (x * x + y * y)
 
 
-@njit(parallel=True)
-def _colour(raw: Learned, normal: Array, away: Array, values: Array, out: Attributes) -> None:
+@njit
+def _colour(first: int, last: int, raw: Learned, normal: Array, away: Array, values: Array, out: Attributes) -> None:
     """Opacity and features, written; `away` (n, 3) from the eye, `values` (n, k) of the harmonics in that direction."""
     opacity, sh, tint, blur = raw.opacity, raw.sh, raw.tint, raw.blur
     alpha, features = out.opacity, out.features
-    for i in prange(len(alpha)):
+    for i in range(first, last):
         alpha[i] = _logistic(opacity[i])
         facing = np.float32(0.0)
         for c in range(3):
@@ -182,16 +184,14 @@ def _colour(raw: Learned, normal: Array, away: Array, values: Array, out: Attrib
             features[i, BLUR] = _logistic(blur[i])
 
 
-@njit(parallel=True)
-def _backward(
-    rotation: Array, values: Array, normal: Array, found: Attributes, incoming: Attributes, out: Learned
-) -> None:
+@njit
+def _backward(first, last, rotation, values, normal, found, incoming, out):  # type: ignore[no-untyped-def]
     """Gradients of the raw parameters, into arrays of zeros; `values` as of `_colour`."""
     u, v, alpha, features = found
     g_u, g_v, g_alpha, g_features = incoming
     to_scale, to_rotation, to_opacity, to_sh, to_tint, to_blur = out
     one, two = np.float32(1.0), np.float32(2.0)
-    for i in prange(len(alpha)):
+    for i in range(first, last):
         to_opacity[i] = g_alpha[i] * alpha[i] * (one - alpha[i])
         for c in range(3):
             if features[i, COLOUR + c] > 0:

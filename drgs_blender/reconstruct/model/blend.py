@@ -9,7 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...compute.jit import njit, prange
+from ...compute.jit import get_num_threads, njit
+from ...compute.threads import over_range
 from ...render.surfels.raster import MAX_ALPHA, gaussian
 from ...render.surfels.splats import TILE
 from .projection import LOW_PASS, splat_of
@@ -170,12 +171,21 @@ def _blend_tile(splats, tiles, tile, state, is_open, maps):  # type: ignore[no-u
                     maps[y, x, k] = state[(block * rows + k) * LANES + j]
 
 
-@njit(parallel=True)
-def blend(splats: Splats, tiles: Tiles, workers: int, maps: Array) -> None:
-    """Fill the maps (h, w, state rows and features). A worker takes every `workers`-th tile: neighbours cost alike."""
-    rows = maps.shape[2]
-    for worker in prange(workers):
-        state = np.empty(BLOCKS * BLOCKS * rows * LANES, np.float32)
-        is_open = np.empty(BLOCKS * BLOCKS, np.bool_)
+def blend(splats: Splats, tiles: Tiles, maps: Array) -> None:
+    """Fill the maps (h, w, state rows and features)."""
+    workers = workers_of(tiles)
+    over_range(_blend_tiles, workers, workers, splats, tiles, maps)
+
+
+def workers_of(tiles: Tiles) -> int:
+    """Parts in which tiles are worked off, each every so many-th: neighbours cost alike."""
+    return min(4 * get_num_threads(), len(tiles.start) - 1)
+
+
+@njit
+def _blend_tiles(first, last, workers, splats, tiles, maps):  # type: ignore[no-untyped-def]
+    state = np.empty(BLOCKS * BLOCKS * maps.shape[2] * LANES, np.float32)
+    is_open = np.empty(BLOCKS * BLOCKS, np.bool_)
+    for worker in range(first, last):
         for tile in range(worker, len(tiles.start) - 1, workers):
             _blend_tile(splats, tiles, tile, state, is_open, maps)

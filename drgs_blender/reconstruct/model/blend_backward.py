@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...compute.jit import njit, prange
+from ...compute.jit import njit
+from ...compute.threads import over_range
 from ...render.surfels.raster import MAX_ALPHA, gaussian
 from ...render.surfels.splats import TILE
 from .blend import (
@@ -22,6 +23,7 @@ from .blend import (
     blocks_of,
     open_blocks,
     strength,
+    workers_of,
 )
 from .projection import I0, IX, IY, LOW_PASS, OPACITY, PARAMETERS, RX, RY, UX, UY, VX, VY, splat_of
 
@@ -189,16 +191,13 @@ def _fold(sums, columns, slots, entry):  # type: ignore[no-untyped-def]
         slots[entry, c] = a + b
 
 
-@njit(parallel=True)
-def blend_backward(splats: Splats, tiles: Tiles, workers: int, maps: Array, incoming: Array, slots: Array) -> None:
+def blend_backward(splats: Splats, tiles: Tiles, maps: Array, incoming: Array, slots: Array) -> None:
     """Gradients of each splat by tile.
 
     Parameters
     ----------
     splats : Splats
     tiles : Tiles
-    workers : int
-        As of `blend`.
     maps : (h, w, rows) float32 array
         What `blend` wrote.
     incoming : (h, w, 4 + channels) float32 array
@@ -206,12 +205,17 @@ def blend_backward(splats: Splats, tiles: Tiles, workers: int, maps: Array, inco
     slots : (entries of all tiles, BEFORE + channels) float32 array
         Written.
     """
+    workers = workers_of(tiles)
+    over_range(_blend_tiles_backward, workers, workers, splats, tiles, maps, incoming, slots)
+
+
+@njit
+def _blend_tiles_backward(first, last, workers, splats, tiles, maps, incoming, slots):  # type: ignore[no-untyped-def]
     channels = splats.values.shape[1]
-    rows = _GF + channels
-    for worker in prange(workers):
-        state = np.empty(BLOCKS * BLOCKS * rows * LANES, np.float32)
-        sums = np.empty((BEFORE + channels) * LANES, np.float32)
-        is_open = np.empty(BLOCKS * BLOCKS, np.bool_)
+    state = np.empty(BLOCKS * BLOCKS * (_GF + channels) * LANES, np.float32)
+    sums = np.empty((BEFORE + channels) * LANES, np.float32)
+    is_open = np.empty(BLOCKS * BLOCKS, np.bool_)
+    for worker in range(first, last):
         for tile in range(worker, len(tiles.start) - 1, workers):
             _blend_tile_backward(splats, tiles, tile, state, is_open, sums, maps, incoming, slots)
 

@@ -15,7 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...compute.jit import njit, prange
+from ...compute.jit import njit
+from ...compute.threads import over_range
 from ...render.camera import CLIP_END, CLIP_START, CX, CY, FX, FY, POSITION
 from ...render.surfels.splats import MIN_ALPHA, span, to_camera
 
@@ -27,6 +28,8 @@ RX, RY, UX, UY, VX, VY, I0, IX, IY, OPACITY, CUT, DIM, RECORD = 0, 1, 2, 3, 4, 5
 PARAMETERS = 10
 #: Surfels seen at a smaller cosine are edge-on: not seen at all.
 EDGE_ON = 1e-3
+#: Fewest surfels for which another thread is worth while.
+_FEW = 1024
 #: Inverse variance of the screen-space filter, per square pixel: that of pictures with four samples a pixel. What it
 #: shows is weakened by the cosine at which the surfel is seen (without a gradient): the many surfels edge-on along a
 #: silhouette would else widen it by most of a pixel, and the shape would shrink by as much to fit the masks.
@@ -160,7 +163,6 @@ def project_surfel(i, surfels, p, picture, out):  # type: ignore[no-untyped-def]
     box[i, 3] = np.int32(min(np.floor(hi_y), height - 1.0)) + 1
 
 
-@njit(parallel=True)
 def project(surfels: WorldSurfels, p: Array, picture: tuple[int, int], out: Projected) -> None:
     """Project surfels; what is not seen, or reaches behind the clip start, has an empty box.
 
@@ -174,7 +176,12 @@ def project(surfels: WorldSurfels, p: Array, picture: tuple[int, int], out: Proj
     out : Projected
         To be filled.
     """
-    for i in prange(len(surfels.opacity)):
+    over_range(_project, len(surfels.opacity), surfels, p, picture, out, fewest=_FEW)
+
+
+@njit
+def _project(first, last, surfels, p, picture, out):  # type: ignore[no-untyped-def]
+    for i in range(first, last):
         project_surfel(i, surfels, p, picture, out)
 
 
@@ -215,7 +222,6 @@ def project_surfel_backward(k, surfels, p, index, gradient, out):  # type: ignor
         g_v[i, axis] = x * (b_u[0] + b_n[0]) + y * (b_u[1] + b_n[1]) + w * (b_u[2] + b_n[2])
 
 
-@njit(parallel=True)
 def project_backward(surfels: WorldSurfels, p: Array, index: Array, gradient: Array, out: WorldSurfels) -> None:
     """Gradients of centre and tangents from those of the records.
 
@@ -230,5 +236,10 @@ def project_backward(surfels: WorldSurfels, p: Array, index: Array, gradient: Ar
     out : WorldSurfels
         Centre and tangents are written; rows of surfels that were not seen stay as they are.
     """
-    for k in prange(len(index)):
+    over_range(_project_backward, len(index), surfels, p, index, gradient, out, fewest=_FEW)
+
+
+@njit
+def _project_backward(first, last, surfels, p, index, gradient, out):  # type: ignore[no-untyped-def]
+    for k in range(first, last):
         project_surfel_backward(k, surfels, p, index, gradient, out)

@@ -23,7 +23,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...compute.jit import get_num_threads
 from ...core.arrays import Array
 from ...core.errors import UsageError
 from ...core.frame import Camera, RenderSettings
@@ -125,7 +124,7 @@ class _Rasterise(torch.autograd.Function):
         start, listed = list_by_tile(splats.box, 0, 0, tiles_x, tiles_y)
         tiles = Tiles(start, listed, tiles_x)
         maps = np.zeros((height, width, FEATURES + values.shape[1]), np.float32)
-        blend(splats, tiles, 4 * get_num_threads(), maps)
+        blend(splats, tiles, maps)
         ctx.save = (surfels, parameters, order, splats, tiles, maps, tally)
         ctx.set_materialize_grads(False)
         out = torch.from_numpy(maps)
@@ -145,7 +144,7 @@ class _Rasterise(torch.autograd.Function):
         if g_features is not None:
             incoming[..., 4:] = g_features.numpy()
         slots = np.zeros((len(tiles.listed), BEFORE + channels), np.float32)
-        blend_backward(splats, tiles, 4 * get_num_threads(), maps, incoming, slots)
+        blend_backward(splats, tiles, maps, incoming, slots)
         total = np.zeros((len(order), BEFORE + channels), np.float32)
         sum_slots(tiles.listed, slots, total)
         found = WorldSurfels(*(np.zeros(a.shape, np.float32) for a in surfels))

@@ -180,8 +180,8 @@ class DeviceGrid(Grid):
         forces = scene.forces
         with self.launcher.failures("simulating"):
             for s, (done, dt) in enumerate(times):
-                shares = 1 - np.exp(-dt * forces.drag), np.exp(-dt * forces.damping)
-                plan["times"][s] = dt, *shares, *(dt * g for g in forces.gravity)
+                factors = 1 - np.exp(-dt * forces.drag), np.exp(-dt * forces.damping)
+                plan["times"][s] = dt, *factors, *(dt * g for g in forces.gravity)
                 part = (done + 0.5 * dt) / self._seconds
                 plan["rows"][s] = scene.fields.at(self._frame, part)
                 self._place_colliders(s, part)

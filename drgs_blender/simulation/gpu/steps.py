@@ -22,7 +22,7 @@ from ..constitutive import respond
 from ..contact import respond as slide
 from ..contact import surface_near
 from ..fields import push_of
-from ..p2g_g2p import BARE, PINNED, cell_of, momentum_of, node_of, pushed, stretch, weights_of
+from ..p2g_g2p import BARE, PINNED, apply_forces, cell_of, momentum_of, node_of, update_deformation_gradient, weights_of
 
 F = np.float32
 ZERO, ONE = F(0.0), F(1.0)
@@ -30,8 +30,9 @@ ZERO, ONE = F(0.0), F(1.0)
 #: What `clock` holds: the number of the step, cells that particles have drifted, whether the steps that were planned
 #: are no longer good, at which drift and speed they are not (`grid.Limits`), and then the highest speed of each step.
 STEP, DRIFT, STOPPED, MOST_DRIFT, MOST_SPEED, OUTSIDE, TOPS = range(7)
-#: Columns of `times`: a step's length, the shares of wind and damping, and velocity gained by gravity.
-DT, PULL, SLOW, GAIN = 0, 1, 2, 3
+#: Columns of `times`: a step's length, the factors of drag and damping (`p2g_g2p.apply_forces`), and velocity gained
+#: by gravity.
+DT, DRAG_FACTOR, DAMPING_FACTOR, GAIN = 0, 1, 2, 3
 #: Columns of a particle's packet: how far it is from its first node, mass, momentum and its growth from node to node.
 OFFSET, MASS, MOMENTUM, GROWTH, PACKET = 0, 3, 4, 7, 16
 #: Columns of `cell`: the first of the nodes around a particle, and which pin it is, or -1.
@@ -246,19 +247,20 @@ def solve_nodes(lane, lanes, room, blocks, given, grid, time, obstacles, forces,
             nodes[at, 0], nodes[at, 1], nodes[at, 2], nodes[at, 3] = ZERO, ZERO, ZERO, ZERO
             continue
         r = ONE / m
-        vx, vy, vz = pushed(
+        vx, vy, vz = apply_forces(
             (px * r, py * r, pz * r),
             (F(times[step, GAIN]), F(times[step, GAIN + 1]), F(times[step, GAIN + 2])),
-            F(times[step, SLOW]),
-            F(times[step, PULL]),
+            F(times[step, DAMPING_FACTOR]),
+            F(times[step, DRAG_FACTOR]),
             (F(wind[0]), F(wind[1]), F(wind[2])),
         )
         gx, gy, gz = origin[0] + spacing * i, origin[1] + spacing * j, origin[2] + spacing * k
         if blown:
             for f in range(rows.shape[1]):
                 ax, ay, az, flow = push_of(rows[step, f], gx, gy, gz)
-                slow = 1.0 / (1.0 + dt * flow)
-                vx, vy, vz = F((vx + dt * ax) * slow), F((vy + dt * ay) * slow), F((vz + dt * az) * slow)
+                damping_factor = 1.0 / (1.0 + dt * flow)
+                vx, vy = F((vx + dt * ax) * damping_factor), F((vy + dt * ay) * damping_factor)
+                vz = F((vz + dt * az) * damping_factor)
         if touched:
             for c in range(colliders[0].shape[0]):
                 if colliders[0][c, DISTANCE] != 0:
@@ -290,7 +292,7 @@ def carried(nodes: Any, neighbour: Any, b: Any, i: Any, j: Any, k: Any, wx: Any,
 
 
 def move_particles(lane, lanes, room, blocks, nodes, properties, pins, grid, time, out):  # type: ignore[no-untyped-def]
-    """Grid to particles: move them, deform them, and find their stress, as `p2g_g2p.gather`."""
+    """Grid to particles: move them, deform them, and find their stress, as `p2g_g2p.g2p`."""
     order, home, active, neighbour = blocks
     mass, model, parameters, solid, apart = properties
     pin, pin_velocity, pinned = pins
@@ -335,9 +337,9 @@ def move_particles(lane, lanes, room, blocks, nodes, properties, pins, grid, tim
             affine[p, 3], affine[p, 4], affine[p, 5] = g3, g4, g5
             affine[p, 6], affine[p, 7], affine[p, 8] = g6, g7, g8
             gradient = g0, g1, g2, g3, g4, g5, g6, g7, g8
-            stretch(elastic, p, length, gradient)
+            update_deformation_gradient(elastic, p, length, gradient)
             if apart and solid[p] != 0:
-                stretch(total, p, length, gradient)
+                update_deformation_gradient(total, p, length, gradient)
             respond(p, model, parameters, elastic, tau, memory, affine, dt)
         speed = vx * vx + vy * vy + vz * vz
         top = top if speed <= top or top != top else speed  # NaN stays
