@@ -381,14 +381,18 @@ def scatter(samples: Samples, gradient: Array, parts: Array) -> None:
 def _scatter(first, last, texel, share, weight, gradient, parts):  # type: ignore[no-untyped-def]
     n, samples = texel.shape[:2]
     for part in range(first, last):
+        own = parts[part]
         for i in range(part * n // len(parts), (part + 1) * n // len(parts)):
             for s in range(samples):
                 if texel[i, s, 0] < 0:
                     continue
                 half = 2 * s // samples
-                for k in range(3):
-                    value = ZERO
-                    for q in range(4):
-                        value += weight[i, s, q] * gradient[i, half, q, k]
-                    for q in range(4):
-                        parts[part, texel[i, s, q], k] += share[i, s, q] * value
+                red = green = blue = ZERO
+                for q in range(4):
+                    w, of = weight[i, s, q], gradient[i, half, q]
+                    red, green, blue = red + w * of[0], green + w * of[1], blue + w * of[2]
+                for q in range(4):
+                    to, w = own[texel[i, s, q]], share[i, s, q]
+                    to[0] += w * red
+                    to[1] += w * green
+                    to[2] += w * blue
