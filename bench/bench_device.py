@@ -20,7 +20,7 @@ from ours import pinhole
 from report import table, write_section
 from subjects import asset_path
 
-from drgs_blender.compute.jit import use_threads
+from drgs_blender.compute.threads import use_threads
 from drgs_blender.compute.warp.runtime import cuda_devices, warp
 from drgs_blender.core.asset.container import read_asset
 from drgs_blender.core.errors import DeviceError

@@ -24,7 +24,7 @@ from embreex import rtcore_scene
 from embreex.mesh_construction import TriangleMesh
 from report import OUT, keep, processor_seconds, table, write_section
 
-from drgs_blender.compute.jit import get_num_threads
+from drgs_blender.compute.threads import get_num_threads
 from drgs_blender.core.frame import Camera
 from drgs_blender.geometry.normals import VertexNormals
 from drgs_blender.reconstruct.capture.capture import Capture

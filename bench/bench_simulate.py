@@ -22,7 +22,7 @@ from simulate_motion import motion
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "unit"))
 from matter_cases import lattice, solver_of
 
-from drgs_blender.compute.jit import get_num_threads, set_num_threads
+from drgs_blender.compute.threads import get_num_threads, use_threads
 from drgs_blender.core.asset.model import Mesh
 from drgs_blender.core.particle_cache import ParticleCache
 from drgs_blender.deform.gmls import bind_points, carry
@@ -59,7 +59,7 @@ def throughput(options: argparse.Namespace) -> str:
     for material in ("jelly", "elastic", "metal", "sand", "snow", "water"):
         speeds = []
         for count in (1, threads):
-            set_num_threads(count)
+            use_threads(count)
             solver = box_of(options.particles, material)
             step = 0.9 * FRAME / solver.steps_of(FRAME)
             solver.advance(2 * step)
@@ -67,7 +67,7 @@ def throughput(options: argparse.Namespace) -> str:
             p, w = clock(lambda: solver.advance(20 * step))  # noqa: B023
             speeds.append(len(solver.points) * (solver.steps - before) / (p if count == 1 else w) / 1e6)
         rows.append([material, len(solver.points), *speeds])
-    set_num_threads(threads)
+    use_threads(threads)
     hold = f"jelly: 5.5 on one core, 10 on {threads}" if threads == 2 else "jelly: 5.5 on one core"
     rows.append(["hold to", "", hold, ""])
     return table(["material", "particles", "M steps/s, one core", f"M steps/s, {threads} threads"], rows)
@@ -103,7 +103,7 @@ def against_taichi(options: argparse.Namespace) -> str:
     threads, rows = get_num_threads(), []
     version = ""
     for count, how, hold in ((1, ["--atomic"], "2.0"), (1, [], ""), (threads, ["--atomic"], "1.6")):
-        set_num_threads(count)
+        use_threads(count)
         solver = box_of(options.particles, "jelly")
         dt = 0.9 * FRAME / solver.steps_of(FRAME)
         solver.advance(2 * dt)
@@ -115,7 +115,7 @@ def against_taichi(options: argparse.Namespace) -> str:
         ours = n * (solver.steps - before) / (p if count == 1 else w)
         rows.append([count, "atomic" if how else "plain", ours, n / theirs[kind], ours * theirs[kind] / n, hold])
         version = theirs["version"]
-    set_num_threads(threads)
+    use_threads(threads)
     h = 0.05
     points = lattice((0.4, 0.3, 0.3), h / 2)
     velocity = np.cross([2.0, -2.0, 4.0], points - points.mean(axis=0)) + 2 * np.sin(9 * points[:, [1, 2, 0]])

@@ -17,7 +17,7 @@ from report import table
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "unit"))
 from matter_cases import lattice, solver_of
 
-from drgs_blender.compute.jit import use_threads
+from drgs_blender.compute.threads import use_threads
 from drgs_blender.compute.warp.kernels import Launcher
 from drgs_blender.compute.warp.runtime import cuda_devices
 from drgs_blender.core.errors import DeviceError

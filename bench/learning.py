@@ -9,7 +9,7 @@ import ours
 from judge import environments, frame_camera
 from report import table
 
-from drgs_blender.compute.jit import use_threads
+from drgs_blender.compute.threads import use_threads
 from drgs_blender.core.asset.container import read_asset
 from drgs_blender.core.color import linear_to_srgb
 from drgs_blender.core.errors import DeviceError

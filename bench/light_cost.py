@@ -21,7 +21,9 @@ import trimesh
 from light_cases import CASES, Case
 from report import OUT, table
 
-from drgs_blender.compute.jit import njit, prange, source_digest, use_threads
+from drgs_blender.compute.closure import digest
+from drgs_blender.compute.jit import njit
+from drgs_blender.compute.threads import over_range, use_threads
 from drgs_blender.core.asset import Asset, Binding, Mesh, Surfels
 from drgs_blender.core.asset.container import read_asset, write_asset
 from drgs_blender.core.frame import Frame
@@ -90,16 +92,19 @@ def child(environment: dict[str, str], *arguments: object) -> Any:
     return json.loads(done.stdout.splitlines()[-1])
 
 
-@njit(parallel=True)
-def _plain(lanes: int, steps: int) -> Array:
+@njit
+def _plain(first: int, last: int, steps: int, sums: Array) -> None:
     """Work that any two free processors do in half the time of one."""
-    sums = np.zeros(lanes)
-    for lane in prange(lanes):
+    for lane in range(first, last):
         total = 0.0
         for i in range(steps):
             total += np.sin(i * 1e-3 + lane)
         sums[lane] = total
-    return sums
+
+
+def plain_loop() -> None:
+    """`_plain` on all threads."""
+    over_range(_plain, 16, 4_000_000, np.zeros(16))
 
 
 def threads(size: int) -> list[list[object]]:
@@ -260,7 +265,7 @@ def svgf(size: int) -> list[object]:
 
 def large_asset(count: int) -> Path:
     """A ball of about `count` triangles with `count` surfels on it, made once."""
-    path = OUT / source_digest() / f"ball-{count}.drgs"
+    path = OUT / digest(Path(__file__)) / f"ball-{count}.drgs"
     if path.exists():
         return path
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -353,7 +358,14 @@ def main(arguments: list[str]) -> None:
     task, *rest = arguments
     if task == "threads":
         stage = Stage.of(CASE, read_asset(CASE.files[0]).mesh, int(rest[0]))
-        print(json.dumps({"integrator": stage.seconds(), "plain": median_seconds(lambda: _plain(16, 4_000_000))}))
+        print(
+            json.dumps(
+                {
+                    "integrator": stage.seconds(),
+                    "plain": median_seconds(plain_loop),
+                }
+            )
+        )
     elif task == "memory":
         print(json.dumps(large_frame(Path(rest[0]), int(rest[1]), int(rest[2]))))
 

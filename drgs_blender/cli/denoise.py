@@ -92,7 +92,7 @@ def denoise(args: argparse.Namespace) -> int:
         raise UsageError("--frames", "has frames that are not in --sequence", "Give all frames of the shot there")
     check_writable(frame_path(args.out, frames[0]))
 
-    from ..compute.jit import use_threads
+    from ..compute.threads import use_threads
     from . import frame_store
 
     frame_store.remove_abandoned(args.out)

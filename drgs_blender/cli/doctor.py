@@ -89,7 +89,7 @@ def numba(args: argparse.Namespace) -> str:
     """Numba and its threads."""
     from ..compute.jit import numba
 
-    return f"{numba.__version__}, {numba.config.NUMBA_NUM_THREADS} threads, layer {numba.config.THREADING_LAYER}"
+    return f"{numba.__version__}, {numba.config.NUMBA_NUM_THREADS} threads"
 
 
 def cache(args: argparse.Namespace) -> str:

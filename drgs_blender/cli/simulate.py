@@ -100,7 +100,7 @@ def run(args: argparse.Namespace) -> int:
         check_writable(frame_path(args.vertices, 1))
     check_writable(args.out / "cache.json")
 
-    from ..compute.jit import use_threads
+    from ..compute.threads import use_threads
     from ..core.asset.container import read_asset
     from ..simulation.bake import bake
     from ..simulation.job import prepare

@@ -1,10 +1,10 @@
-"""Numba, set up once: cached compilation in a user folder, the `workqueue` layer, strict arithmetic.
+"""Numba, set up once: cached compilation in a user folder, strict arithmetic.
 
 Strict, because with fast-math the same source gave other last digits when a kernel came out of the cache than when it
 had just been compiled, and a frame is the same picture either way; it costs nothing that could be measured.
 
-Import ``njit``, ``prange`` and friends from here, never from numba, so that the settings below come first. One
-parallel kernel may run at a time in a process (workqueue is not re-entrant).
+Import ``njit`` and friends from here, never from numba, so that the settings below come first. Kernels run on all
+threads by `threads.over_range`.
 
 What kernels take is in docs/kernels.md, with what Numba does to named tuples.
 """
@@ -21,11 +21,9 @@ import numpy as np
 from . import targets
 from .folders import wanted_folder
 
-os.environ.setdefault("NUMBA_THREADING_LAYER", "workqueue")
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import numba
-from numba import get_num_threads, prange, set_num_threads
 from numba.core.ccallback import CFunc
 from numba.extending import overload as _overload
 
@@ -106,12 +104,4 @@ def plain(array: np.ndarray) -> np.ndarray:
     return array if array.flags.writeable else np.asarray(_Memory(array))
 
 
-def use_threads(count: int) -> None:
-    """Run kernels on `count` threads; 0 is all the threads Numba has."""
-    limit = numba.config.NUMBA_NUM_THREADS
-    set_num_threads(limit if count <= 0 else min(count, limit))
-
-
-__all__ = [
-    "cfunc", "get_num_threads", "inlined", "njit", "overload", "plain", "prange", "set_num_threads", "use_threads",
-]  # fmt: skip
+__all__ = ["cfunc", "inlined", "njit", "overload", "plain"]

@@ -1,19 +1,23 @@
 """Kernels over a range, on all threads.
 
-A plain kernel that lets go of the interpreter's lock runs as fast on threads of our own as Numba's ``parallel=True``,
-and compiles in about half the time: Numba infers the types of a parallel loop twice, and optimises its body about four
+A plain kernel that releases the interpreter's lock runs as fast on threads of our own as Numba's ``parallel=True``, and
+compiles in about half the time: Numba infers the types of a parallel loop twice, and optimises its body about four
 times over. Nor does it matter here that another thread runs kernels at the same time.
+
+How many threads is a setting of each thread that calls kernels; ``NUMBA_NUM_THREADS`` is the most, by default one per
+processor.
 """
 
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache
 from typing import Any
 
-from .jit import get_num_threads
+from .jit import numba
 
 #: Pieces per thread, so that threads that are done early have something to take.
 _PIECES = 8
@@ -21,6 +25,20 @@ _PIECES = 8
 ROWS = 24
 #: The same of elements of arrays: vertices, faces, surfels.
 ELEMENTS = 4096
+
+_setting = threading.local()
+
+
+def get_num_threads() -> int:
+    """Threads on which this thread's kernels run."""
+    count: int = getattr(_setting, "count", numba.config.NUMBA_NUM_THREADS)
+    return count
+
+
+def use_threads(count: int) -> None:
+    """Run this thread's kernels on `count` threads, or on as many as there are; 0 is all of them."""
+    limit = numba.config.NUMBA_NUM_THREADS
+    _setting.count = limit if count <= 0 else min(count, limit)
 
 
 @cache
@@ -75,4 +93,4 @@ def over_range(kernel: Callable[..., Any], count: int, *arguments: Any, fewest: 
     return results
 
 
-__all__ = ["ELEMENTS", "ROWS", "over_range"]
+__all__ = ["ELEMENTS", "ROWS", "get_num_threads", "over_range", "use_threads"]

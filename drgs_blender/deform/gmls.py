@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..compute.jit import njit
+from ..compute.jit import inlined, njit
 from ..compute.simd import LANES, aligned, fold, lanes, load, quads, repeat, spread
 from ..compute.threads import ELEMENTS, over_range
 from ..core.errors import UsageError
@@ -133,7 +133,7 @@ def bind_points(
     return Weights(index.astype(np.int32), weight, offset, reach, separated, int(stranded.sum()))
 
 
-@njit(inline="always")
+@inlined
 def _squared(x, a, b):  # type: ignore[no-untyped-def]
     """Squared distance between two rows."""
     return (x[a, 0] - x[b, 0]) ** 2 + (x[a, 1] - x[b, 1]) ** 2 + (x[a, 2] - x[b, 2]) ** 2

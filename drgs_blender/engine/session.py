@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..compute.folders import cache_folder
-from ..compute.jit import use_threads
 from ..compute.prepare import prepare_kernels
+from ..compute.threads import use_threads
 from ..core.asset.model import Asset, PosedSurfels
 from ..core.errors import Cancelled, UsageError
 from ..core.frame import Frame, Light, ObjectState, RenderSettings

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..compute.jit import get_num_threads
+from ..compute.threads import get_num_threads
 from ..core.asset import Environment
 from ..core.asset.archive import replace_by
 from ..core.errors import AssetError

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from ..compute.jit import njit, plain
+from ..compute.jit import inlined, njit, plain
 from ..compute.threads import ELEMENTS, over_range
 from ..core.errors import AssetError
 
@@ -111,7 +111,7 @@ _ARCTAN = tuple(
 )
 
 
-@njit(inline="always")
+@inlined
 def _angle(y, x):  # type: ignore[no-untyped-def]
     """arctan2(y, x) for y > 0, without branches."""
     a = abs(x)
@@ -131,7 +131,7 @@ def _angle(y, x):  # type: ignore[no-untyped-def]
     return np.float32(math.pi) - p if x < np.float32(0.0) else p
 
 
-@njit(inline="always")
+@inlined
 def face_normal(ux, uy, uz, vx, vy, vz):  # type: ignore[no-untyped-def]
     """Unit normal and the angles of a face with edges u, v at its first corner; zeros if it has no area."""
     zero, one = np.float32(0.0), np.float32(1.0)
@@ -151,7 +151,7 @@ def face_normal(ux, uy, uz, vx, vy, vz):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(inline="always")
+@inlined
 def vertex_normal(weighted, first, last):  # type: ignore[no-untyped-def]
     """Unit sum of the weighted normals in some rows, always in the same order."""
     x = y = z = np.float32(0.0)

@@ -39,7 +39,7 @@ _ANSWERS = (protocol.Loaded, protocol.Result, protocol.Need, protocol.Stopped, p
 def clean_environment() -> dict[str, str]:
     """This process's environment without what would make the engine's Python behave like Blender's."""
     kept = {name: value for name, value in os.environ.items() if not name.upper().startswith("PYTHON")}
-    return kept | {"NUMBA_THREADING_LAYER": "workqueue", "OMP_WAIT_POLICY": "PASSIVE", "PYTHONNOUSERSITE": "1"}
+    return kept | {"OMP_WAIT_POLICY": "PASSIVE", "PYTHONNOUSERSITE": "1"}
 
 
 class Child:

@@ -13,7 +13,7 @@ import math
 
 import numpy as np
 
-from ..compute.jit import njit
+from ..compute.jit import inlined, njit
 from ..core.errors import UsageError
 from ..core.frame import Camera, RenderSettings
 from .sampling import GOLDEN, mix
@@ -115,7 +115,7 @@ def pixel_shift(parameters, pixel):  # type: ignore[no-untyped-def]
     return np.float64(h) * 2.0**-32, np.float64(g) * 2.0**-32
 
 
-@njit(inline="always")
+@inlined
 def lattice(shift_x, shift_y, sample, parameters):  # type: ignore[no-untyped-def]
     """Position of a pixel's sub-pixel sample: in [0, 1) inside the pixel, or `filter_reach` beyond it."""
     x = shift_x + sample / parameters[SUBPIXELS]
@@ -128,13 +128,13 @@ def lattice(shift_x, shift_y, sample, parameters):  # type: ignore[no-untyped-de
     return min(x, 0.995), min(y, 0.995)
 
 
-@njit(inline="always")
+@inlined
 def filter_reach(parameters):  # type: ignore[no-untyped-def]
     """Pixels by which positions may lie beyond the pixel."""
     return max(parameters[FILTER] - 0.5, 0.0)
 
 
-@njit(inline="always")
+@inlined
 def _blackman_harris(u):  # type: ignore[no-untyped-def]
     """Place in [-.5, .5] below which the part `u` of Blackman and Harris's window lies.
 

@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..compute.jit import use_threads
+from ..compute.threads import use_threads
 from ..core.cryptomatte import KINDS
 from ..core.errors import Cancelled, UsageError
 from ..core.frame import Frame

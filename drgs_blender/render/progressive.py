@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from ..compute.jit import njit, use_threads
+from ..compute.jit import njit
+from ..compute.threads import use_threads
 from ..core.asset.model import PosedSurfels
 from ..core.errors import Cancelled
 from ..core.frame import Camera, Frame, RenderSettings

@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..compute.jit import get_num_threads, njit
-from ..compute.threads import ELEMENTS, over_range
+from ..compute.jit import inlined, njit
+from ..compute.threads import ELEMENTS, get_num_threads, over_range
 
 Array = np.ndarray
 
@@ -123,7 +123,7 @@ class Nodes(NamedTuple):
     spacing: float
 
 
-@njit(inline="always")
+@inlined
 def block_of(gx, gy, gz, bx, by, bz):  # type: ignore[no-untyped-def]
     """Number of the block of a place, in grid spacings from the origin; -1 if it is outside or not finite."""
     low = MARGIN + 0.5

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from ..compute.jit import njit
+from ..compute.jit import inlined, njit
 from ..core.sim_materials import (
     COROTATED,
     ELASTIC,
@@ -33,7 +33,7 @@ _FLOOR = np.float32(0.02)  # of the volume ratio in logarithms and powers
 _NORM = math.sqrt(2 / 3)  # of a deviator per uniaxial stress, and of equivalent plastic strain per norm of a strain
 
 
-@njit(inline="always")
+@inlined
 def _put(tau, p, u, a, b, c):  # type: ignore[no-untyped-def]
     """tau = U diag(a, b, c) U^T."""
     tau[p, 0] = a * u[0] * u[0] + b * u[1] * u[1] + c * u[2] * u[2]
@@ -44,7 +44,7 @@ def _put(tau, p, u, a, b, c):  # type: ignore[no-untyped-def]
     tau[p, 5] = a * u[3] * u[6] + b * u[4] * u[7] + c * u[5] * u[8]
 
 
-@njit(inline="always")
+@inlined
 def _compose(f, p, u, a, b, c, v):  # type: ignore[no-untyped-def]
     """F = U diag(a, b, c) V^T, where `f` holds F - 1."""
     f[p, 0] = a * u[0] * v[0] + b * u[1] * v[1] + c * u[2] * v[2] - 1.0
@@ -58,7 +58,7 @@ def _compose(f, p, u, a, b, c, v):  # type: ignore[no-untyped-def]
     f[p, 8] = a * u[6] * v[6] + b * u[7] * v[7] + c * u[8] * v[8] - 1.0
 
 
-@njit(inline="always")
+@inlined
 def neo_hookean(f, p, mu, first, tau):  # type: ignore[no-untyped-def]
     """tau = mu (F F^T - 1) + lambda log(J) 1, for row p, where `f` holds F - 1."""
     one = np.float32(1.0)

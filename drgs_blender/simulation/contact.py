@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from ..compute.jit import njit
+from ..compute.jit import inlined, njit
 from ..compute.threads import ELEMENTS, over_range
 from ..core.errors import UsageError
 from .blocks import SLOTS, Nodes
@@ -80,7 +80,7 @@ class Surface(NamedTuple):
     friction: float
 
 
-@njit(inline="always")
+@inlined
 def respond(v, u, n, contact, friction):  # type: ignore[no-untyped-def]
     """Velocity of matter that moves at v and touches what moves at u, with unit normal n; all (x, y, z)."""
     vx, vy, vz = v
@@ -100,7 +100,7 @@ def respond(v, u, n, contact, friction):  # type: ignore[no-untyped-def]
     return ux + rx, uy + ry, uz + rz
 
 
-@njit(inline="always")
+@inlined
 def surface_near(place, field, motion):  # type: ignore[no-untyped-def]
     """The surface of a collider as seen from a point.
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-from ..compute.jit import njit
+from ..compute.jit import inlined, njit
 
 
-@njit(inline="always")
+@inlined
 def _turn(spp, sqq, spq, spr, sqr):  # type: ignore[no-untyped-def]
     """One Jacobi rotation in the plane (p, q) that zeroes spq: (c, s, spp, sqq, spr, sqr)."""
     if abs(spq) <= 1e-14 * (abs(spp) + abs(sqq)):

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..compute.jit import njit
+from ..compute.jit import inlined, njit
 from ..compute.threads import over_range
 from .blocks import Nodes
 
@@ -137,7 +137,7 @@ def noise(x, y, z, seed):  # type: ignore[no-untyped-def]
     return 1.6 * total
 
 
-@njit(inline="always")
+@inlined
 def _fall(distance, power, nearest, farthest):  # type: ignore[no-untyped-def]
     if distance > farthest:
         return 0.0

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..compute.jit import njit
+from ..compute.jit import inlined, njit
 from ..compute.simd import fold, load, quads, repeat, spread, store
 from ..compute.threads import over_range
 from ..core.sim_materials import ELASTIC, LAMBDA, MU
@@ -36,7 +36,7 @@ PINNED = np.float32(0.2)
 BARE = np.float32(0.1)
 
 
-@njit(inline="always")
+@inlined
 def weights_of(f):  # type: ignore[no-untyped-def]
     """Quadratic B-spline weights of three nodes, `f` from the first one in spacings; they sum to 1 as rounded."""
     a, c = _ONE_HALF - f, f - _HALF
@@ -44,7 +44,7 @@ def weights_of(f):  # type: ignore[no-untyped-def]
     return first, (_ONE - first) - last, last
 
 
-@njit(inline="always")
+@inlined
 def cell_of(x, p, origin, scale):  # type: ignore[no-untyped-def]
     """The first of the three nodes around a particle along each axis, and how far after it the particle is."""
     gx, gy, gz = (x[p, 0] - origin[0]) * scale, (x[p, 1] - origin[1]) * scale, (x[p, 2] - origin[2]) * scale
@@ -52,7 +52,7 @@ def cell_of(x, p, origin, scale):  # type: ignore[no-untyped-def]
     return i, j, k, np.float32(gx - i), np.float32(gy - j), np.float32(gz - k)
 
 
-@njit(inline="always")
+@inlined
 def node_of(neighbour, b, i, j, k):  # type: ignore[no-untyped-def]
     """Where node (i, j, k) of block b's scratch is: slot and number in the grid, and offset in the scratch."""
     e = (((i + 3) >> 2) * 3 + ((j + 3) >> 2)) * 3 + ((k + 3) >> 2)
@@ -60,13 +60,13 @@ def node_of(neighbour, b, i, j, k):  # type: ignore[no-untyped-def]
     return neighbour[b, e], n, ((i * 8 + j) * 8 + k) * 4
 
 
-@njit(inline="always")
+@inlined
 def _steps():  # type: ignore[no-untyped-def]
     """How many spacings each node of a row is from its first."""
     return quads(_ZERO, _ONE, np.float32(2.0), np.float32(3.0))
 
 
-@njit(inline="always")
+@inlined
 def _carried(scratch, base, wx, wy, wz):  # type: ignore[no-untyped-def]
     """Velocity that matter gives to a rider, and the weight of the nodes it comes from: 0 where there is no matter."""
     heaviest = _ZERO
@@ -87,7 +87,7 @@ def _carried(scratch, base, wx, wy, wz):  # type: ignore[no-untyped-def]
     return x, y, z, weight
 
 
-@njit(inline="always")
+@inlined
 def update_deformation_gradient(f, p, step, gradient):  # type: ignore[no-untyped-def]
     """F = (1 + step grad v) F, in place, where `f` holds F - 1; the gradient of v row by row."""
     g0, g1, g2, g3, g4, g5, g6, g7, g8 = gradient
@@ -104,7 +104,7 @@ def update_deformation_gradient(f, p, step, gradient):  # type: ignore[no-untype
     f[p, 8] = h8 + step * (g6 * f2 + g7 * f5 + g8 * f8)
 
 
-@njit(inline="always")
+@inlined
 def momentum_of(p, v, affine, tau, m, q, h, fx, fy, fz):  # type: ignore[no-untyped-def]
     """Momentum that particle p gives to the first node around it, and its increments to the next nodes.
 
@@ -120,7 +120,7 @@ def momentum_of(p, v, affine, tau, m, q, h, fx, fy, fz):  # type: ignore[no-unty
     return mx, my, mz, a00, a01, a02, a10, a11, a12, a20, a21, a22
 
 
-@njit(inline="always")
+@inlined
 def apply_forces(velocity, gain, damping_factor, drag_factor, wind):  # type: ignore[no-untyped-def]
     """A velocity after a step of the forces that act on all matter alike; vectors as (x, y, z), m/s.
 

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..compute.jit import njit
+from ..compute.jit import inlined, njit
 from ..core.errors import Cancelled
 from .colliders import Collider, MovingCollider, check_apart, rigid_motion
 from .contact import CONTACTS, Plane, plane_rows
@@ -214,31 +214,31 @@ def _rows(arm: Array, normal: Array, velocity: Array, gap: Array, contact: float
     return rows
 
 
-@njit(inline="always")
+@inlined
 def _dot(a, b):  # type: ignore[no-untyped-def]
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@njit(inline="always")
+@inlined
 def _cross(a, b):  # type: ignore[no-untyped-def]
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-@njit(inline="always")
+@inlined
 def _speed(both, r):  # type: ignore[no-untyped-def]
     """Velocity of a point of the body."""
     x, y, z = _cross(both[1], r)
     return both[0, 0] + x, both[0, 1] + y, both[0, 2] + z
 
 
-@njit(inline="always")
+@inlined
 def _yields(r, d, inverse_mass, inverse):  # type: ignore[no-untyped-def]
     """How much a point of the body gains of speed by an impulse along d, 1/kg."""
     c = _cross(r, d)
     return inverse_mass + c[0] * _dot(inverse[0], c) + c[1] * _dot(inverse[1], c) + c[2] * _dot(inverse[2], c)
 
 
-@njit(inline="always")
+@inlined
 def _kick(both, r, impulse, inverse_mass, inverse):  # type: ignore[no-untyped-def]
     c = _cross(r, impulse)
     for i in range(3):

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..compute.jit import njit
+from ..compute.jit import inlined, njit
 from .contact import Field, Motion, Surface, surface_near
 
 Array = np.ndarray
@@ -36,7 +36,7 @@ class Shell(NamedTuple):
     weights: Array
 
 
-@njit(inline="always")
+@inlined
 def _move(x, shell, p, dx, dy, dz):  # type: ignore[no-untyped-def]
     """Move particle p of the shell by a vector, by moving the nodes x that hold it."""
     inverse_mass, nodes, weights = shell.inverse_mass, shell.nodes, shell.weights
@@ -52,7 +52,7 @@ def _move(x, shell, p, dx, dy, dz):  # type: ignore[no-untyped-def]
             x[n, 2] += s * dz
 
 
-@njit(inline="always")
+@inlined
 def _contact(shell, p, depth, normal, moved, contact, friction):  # type: ignore[no-untyped-def]
     """Take particle p that is `depth` inside an obstacle out, which `moved` by (x, y, z) since the step began.
 

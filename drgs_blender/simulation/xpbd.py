@@ -18,8 +18,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from ..compute.jit import get_num_threads, njit
-from ..compute.threads import ELEMENTS, over_range
+from ..compute.jit import njit
+from ..compute.threads import ELEMENTS, get_num_threads, over_range
 from ..core.errors import Cancelled, UsageError
 from .colliders import Collider, MovingCollider, check_apart
 from .contact import Plane, plane_rows

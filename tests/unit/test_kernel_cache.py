@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from drgs_blender.compute import folders, kernel_cache, manifest
-from drgs_blender.compute.jit import cfunc, njit, plain, prange
+from drgs_blender.compute.jit import cfunc, njit, plain
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -33,7 +33,7 @@ def _outer(x):
 
 def _sum(values):
     total = 0.0
-    for i in prange(len(values)):
+    for i in numba.prange(len(values)):
         total += inner(values[i])
     return total
 

@@ -7,7 +7,7 @@ import functools
 import numpy as np
 import pytest
 
-from drgs_blender.compute.jit import get_num_threads, set_num_threads
+from drgs_blender.compute.threads import get_num_threads, use_threads
 from drgs_blender.core.color import LUMINANCE
 from drgs_blender.core.errors import UsageError
 from drgs_blender.core.frame import World
@@ -125,10 +125,10 @@ def test_any_number_of_threads_makes_the_same_cells() -> None:
     world = World(environment=np.random.default_rng(0).random((96, 192, 3)).astype(np.float32) ** 4)
     before = get_num_threads()
     try:
-        set_num_threads(1)
+        use_threads(1)
         one = EnvironmentLight(world)
     finally:
-        set_num_threads(before)
+        use_threads(before)
     many = EnvironmentLight(world)
     for name in ("runs", "guide", "density", "first", "parts"):
         np.testing.assert_array_equal(getattr(one.cells, name), getattr(many.cells, name))

@@ -7,7 +7,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from drgs_blender.compute.jit import get_num_threads, set_num_threads  # noqa: E402
+from drgs_blender.compute.threads import get_num_threads, use_threads  # noqa: E402
 from drgs_blender.core.asset.model import PosedSurfels  # noqa: E402
 from drgs_blender.core.errors import UsageError  # noqa: E402
 from drgs_blender.core.frame import Camera, RenderSettings  # noqa: E402
@@ -138,13 +138,13 @@ def test_same_bits_with_any_number_of_threads_and_again():
     threads = get_num_threads()
     try:
         for count in (1, threads, threads):
-            set_num_threads(count)
+            use_threads(count)
             given, tally = surfels(2000, seed=5, size=0.08), Tally.of(2000)
             maps = rasterise(**given, camera=view, tally=tally)
             (maps.features.square().sum() + maps.depth.sum() + maps.distortion.sum()).backward()
             results.append([maps.features.detach().numpy(), *(v.grad.numpy() for v in given.values()), tally.travel])
     finally:
-        set_num_threads(threads)
+        use_threads(threads)
     for other in results[1:]:
         assert all(np.array_equal(a, b) for a, b in zip(results[0], other, strict=True))
 

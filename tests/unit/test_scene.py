@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from drgs_blender.compute.jit import get_num_threads, use_threads
+from drgs_blender.compute.threads import get_num_threads, use_threads
 from drgs_blender.core.errors import AssetError, UsageError
 from drgs_blender.render.columns import ALBEDO, METALLIC, NORMAL, ROUGHNESS
 from drgs_blender.render.scene.trace_scene import TraceObject, TraceScene

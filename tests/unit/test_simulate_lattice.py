@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from matter_cases import cantilever, lattice, solver_of, timoshenko
 
-from drgs_blender.compute.jit import get_num_threads, set_num_threads
+from drgs_blender.compute.threads import get_num_threads, use_threads
 from drgs_blender.core.errors import Cancelled, UsageError
 from drgs_blender.simulation import xpbd
 from drgs_blender.simulation.colliders import Collider
@@ -139,7 +139,7 @@ def test_threads_restoring_and_cancelling_change_no_bit(monkeypatch):
     for _ in range(6):
         whole.advance(FRAME)
     try:
-        set_num_threads(1)
+        use_threads(1)
         part = Lattice(block(), Forces(), (), planes, cubes=5)
         for _ in range(3):
             part.advance(FRAME)
@@ -152,7 +152,7 @@ def test_threads_restoring_and_cancelling_change_no_bit(monkeypatch):
         for _ in range(3):
             later.advance(FRAME)
     finally:
-        set_num_threads(threads)
+        use_threads(threads)
     assert later.points.tobytes() == whole.points.tobytes()
 
 

@@ -11,7 +11,7 @@ from plain_mpm import PlainMpm
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from drgs_blender.compute.jit import get_num_threads, set_num_threads
+from drgs_blender.compute.threads import get_num_threads, use_threads
 from drgs_blender.core.errors import Cancelled, UsageError
 from drgs_blender.simulation import blocks, p2g_g2p
 from drgs_blender.simulation.blocks import arrange
@@ -439,13 +439,13 @@ def test_any_number_of_threads_gives_the_same_bits(monkeypatch):
     results = []
     try:
         for count in (1, threads):
-            set_num_threads(count)
+            use_threads(count)
             solver = spinning_jelly()
             assert len(arrange(solver.state.x, solver.domain)[0].shares) == count + 1
             solver.advance(0.3)
             results.append(solver.arrays())
     finally:
-        set_num_threads(threads)
+        use_threads(threads)
     for name in results[0]:
         assert results[0][name].tobytes() == results[1][name].tobytes()
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drgs_blender.compute.jit import get_num_threads, use_threads
+from drgs_blender.compute.threads import get_num_threads, use_threads
 from drgs_blender.core.frame import Camera, RenderSettings
 from drgs_blender.render.camera import camera_parameters, camera_ray
 from drgs_blender.render.denoise.demodulation import LIGHT, PAD, Signal

@@ -7,8 +7,8 @@ import threading
 import numpy as np
 import pytest
 
-from drgs_blender.compute.jit import get_num_threads, njit, set_num_threads
-from drgs_blender.compute.threads import over_range
+from drgs_blender.compute.jit import njit
+from drgs_blender.compute.threads import get_num_threads, over_range, use_threads
 
 
 @njit
@@ -25,10 +25,10 @@ def test_each_element_is_worked_on_once_and_pieces_come_in_order(count, fewest, 
     before = get_num_threads()
     seen = np.zeros(count, np.int64)
     try:
-        set_num_threads(min(threads, before))
+        use_threads(min(threads, before))
         pieces = over_range(_count, count, seen, fewest=fewest)
     finally:
-        set_num_threads(before)
+        use_threads(before)
     assert (seen == 1).all()
     assert [first for first, _ in pieces] == [0, *(last for _, last in pieces)][: len(pieces)]
     assert not pieces or pieces[-1][1] == count

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...compute.jit import njit
+from ...compute.jit import inlined, njit
 from ...compute.threads import ROWS, over_range
 from ...core.arrays import Array
 
@@ -85,7 +85,7 @@ class _Shape(torch.autograd.Function):
         return *(gradients[0] * torch.from_numpy(g) for g in ctx.gradients), None, None, None, None
 
 
-@njit(inline="always")
+@inlined
 def _difference(alpha, depth, rays, y1, x1, y0, x0):  # type: ignore[no-untyped-def]
     """From the point seen in pixel 0 to that in pixel 1."""
     far = depth[y1, x1] / max(alpha[y1, x1], THIN)

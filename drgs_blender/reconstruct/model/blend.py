@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...compute.jit import get_num_threads, njit
-from ...compute.threads import over_range
+from ...compute.jit import inlined, njit
+from ...compute.threads import get_num_threads, over_range
 from ...render.surfels.raster import MAX_ALPHA, gaussian
 from ...render.surfels.splats import TILE
 from .projection import LOW_PASS, splat_of
@@ -67,7 +67,7 @@ class Tiles(NamedTuple):
     across: int
 
 
-@njit(inline="always")
+@inlined
 def strength(ex, ey, splat, near, far):  # type: ignore[no-untyped-def]
     """Squared radius and depth where a pixel at (ex, ey) from the centre meets a splat.
 
@@ -117,7 +117,7 @@ def _blend(splats, i, x, y, state, base):  # type: ignore[no-untyped-def]
     return is_open
 
 
-@njit(inline="always")
+@inlined
 def blocks_of(box, i, left, top):  # type: ignore[no-untyped-def]
     """Blocks (x0, y0, x1, y1), half-open, of the tile at (left, top) that splat i touches."""
     x0, y0 = max(box[i, 0] - left, 0) // SIDE, max(box[i, 1] - top, 0) // SIDE
@@ -125,7 +125,7 @@ def blocks_of(box, i, left, top):  # type: ignore[no-untyped-def]
     return x0, y0, x1, y1
 
 
-@njit(inline="always")
+@inlined
 def open_blocks(is_open, left, top, width, height):  # type: ignore[no-untyped-def]
     """Open the blocks of the tile at (left, top) that are in the picture; how many these are."""
     count = 0

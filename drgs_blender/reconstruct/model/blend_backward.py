@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...compute.jit import njit
+from ...compute.jit import inlined, njit
 from ...compute.threads import over_range
 from ...render.surfels.raster import MAX_ALPHA, gaussian
 from ...render.surfels.splats import TILE
@@ -37,7 +37,7 @@ _R, _S, _A, _M, _MM, _GA, _GZ, _GM, _GD, _G, _GW, _GF = 1, 2, 3, 4, 5, 6, 7, 8, 
 TRAVEL, BEFORE = PARAMETERS, PARAMETERS + 1
 
 
-@njit(inline="always")
+@inlined
 def slopes(g_alpha, g_depth, alpha, ex, ey, z, exact, su, sv, splat):  # type: ignore[no-untyped-def]
     """Gradients of a pixel's place (ex, ey), of u and v over z, of 1 / z, and the last where the place changes it."""
     zero = np.float32(0.0)

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...compute.jit import njit
+from ...compute.jit import inlined, njit
 from ...compute.threads import over_range
 from ...render.camera import CLIP_END, CLIP_START, CX, CY, FX, FY, POSITION
 from ...render.surfels.splats import MIN_ALPHA, span, to_camera
@@ -89,7 +89,7 @@ class Splat(NamedTuple):
     dim: np.float32
 
 
-@njit(inline="always")
+@inlined
 def splat_of(record, i):  # type: ignore[no-untyped-def]
     """The record of surfel i."""
     return Splat(

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...compute.jit import njit
+from ...compute.jit import inlined, njit
 from ...compute.threads import ROWS, over_range
 from ..film.guides import Guides
 from ..sampling import ONE, ZERO, F, luminance
@@ -76,7 +76,7 @@ def modulate(signal: Signal, guides: Guides) -> Array:
     return out
 
 
-@njit(inline="always")
+@inlined
 def _colour(lobe, albedo, metallic, y, x):  # type: ignore[no-untyped-def]
     """Surface colour of a lobe's light, at least COLOUR_FLOOR: diffuse a (1 - m), glossy Fresnel's F0."""
     m = metallic[y, x]
@@ -90,12 +90,12 @@ def _colour(lobe, albedo, metallic, y, x):  # type: ignore[no-untyped-def]
     return max(red, floor), max(green, floor), max(blue, floor)
 
 
-@njit(inline="always")
+@inlined
 def _channel(k, red, green, blue):  # type: ignore[no-untyped-def]
     return red if k == 0 else green if k == 1 else blue
 
 
-@njit(inline="always")
+@inlined
 def demodulate_pixel(y, x, components, variance, surface, guide, light):  # type: ignore[no-untyped-def]
     """Fill the planes of a covered pixel, which are 0, and NaN in `SOURCE` and `SURFACE`; `surface` as of `Guides`."""
     coverage, position, normal, albedo, roughness, metallic, index, footprint = surface
@@ -134,7 +134,7 @@ def demodulate_pixel(y, x, components, variance, surface, guide, light):  # type
             light[y, k, c] = ZERO
 
 
-@njit(inline="always")
+@inlined
 def _lobe_luminance(light, y, c, lobe, parts):  # type: ignore[no-untyped-def]
     total = ZERO
     for part in range(parts):
@@ -156,7 +156,7 @@ def _demodulate(first, last, components, variance, surface, guide, light, spans)
         find_span(y, coverage, spans)
 
 
-@njit(inline="always")
+@inlined
 def find_span(y, coverage, spans):  # type: ignore[no-untyped-def]
     """Which columns of a row are covered."""
     first, last = coverage.shape[1], 0
@@ -166,7 +166,7 @@ def find_span(y, coverage, spans):  # type: ignore[no-untyped-def]
     spans[y, 0], spans[y, 1] = first, max(last, first)
 
 
-@njit(inline="always")
+@inlined
 def modulate_pixel(y, x, light, surface, out):  # type: ignore[no-untyped-def]
     """Multiply a covered pixel's light by surface colour and coverage again."""
     coverage, _, _, albedo, _, metallic, _, _ = surface

@@ -23,7 +23,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ...compute.jit import njit
+from ...compute.jit import inlined, njit
 from ...compute.threads import ROWS, over_range
 from ...core.color import LUMINANCE as REC709
 from .demodulation import (
@@ -165,7 +165,7 @@ def _clamp_fireflies(y0, y1, guide, spans, light, out):  # type: ignore[no-untyp
                         out[y, k, x0 + i] = light[y, k, x0 + i] * sums[1 + 2 * lobe, i]
 
 
-@njit(inline="always")
+@inlined
 def stop(x):  # type: ignore[no-untyped-def]
     """(1 - x / 8)^8 for x in [0, 8], beyond it 0."""
     u = max(np.float32(1.0) - np.float32(0.125) * x, np.float32(0.0))
@@ -296,7 +296,7 @@ def _a_trous(y0, y1, step, guide, spans, light, out):  # type: ignore[no-untyped
                     out[y, LUMINANCE + lobe, x0 + i] = sums[2 + LUMINANCE + lobe, i]
 
 
-@njit(inline="always")
+@inlined
 def share_of(k):  # type: ignore[no-untyped-def]
     """Share of colour channel `k` in luminance."""
     return np.float32(REC709[0]) if k == 0 else np.float32(REC709[1]) if k == 1 else np.float32(REC709[2])

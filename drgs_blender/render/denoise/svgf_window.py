@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
-from ...compute.jit import njit
+from ...compute.jit import inlined, njit
 from ...compute.threads import ROWS, over_range
 from .demodulation import LIGHT, LUMINANCE, PAD, SOURCE, SURFACE, VARIANCE, Signal, modulate
 from .svgf_spatial import prepare, smooth
@@ -150,7 +150,7 @@ def _divide(y0, y1, spans, weights, guide, total):  # type: ignore[no-untyped-de
                     total[y, k, c] *= inverse
 
 
-@njit(inline="always")
+@inlined
 def _nearest(x, y, w, h):  # type: ignore[no-untyped-def]
     """Column and row of the pixel nearest to a position that counts from the first pixel's centre; -1 outside."""
     half = np.float32(0.5)
@@ -159,7 +159,7 @@ def _nearest(x, y, w, h):  # type: ignore[no-untyped-def]
     return np.int64(np.floor(x + half)), np.int64(np.floor(y + half))
 
 
-@njit(inline="always")
+@inlined
 def _away(seen, guides, y, x, px, py, pz):  # type: ignore[no-untyped-def]
     """Distance of (px, py, pz) from the plane through ``seen[y, x]``, in pixel widths."""
     return (

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import OpenEXR
 
-from ...compute.jit import get_num_threads
+from ...compute.threads import get_num_threads
 from ...core.cryptomatte import METADATA
 from ...core.errors import AssetError, UsageError, WriteError
 from ...core.passes import BY_NAME

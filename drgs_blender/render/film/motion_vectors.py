@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...compute.jit import njit
+from ...compute.jit import inlined, njit
 from ...compute.threads import ELEMENTS, ROWS, over_range
 from ..camera import CX, CY, FX, FY, ORTHOGRAPHIC, POSITION, WIDTH
 from ..gbuffer.gbuffer import GBuffer
@@ -143,7 +143,7 @@ def vector_pass(before: Motion | None, after: Motion | None, shape: tuple[int, i
     return out
 
 
-@njit(inline="always")
+@inlined
 def project(p, x, y, z):  # type: ignore[no-untyped-def]
     """Pixel position and depth of a world-space point through the camera of parameters `p`; inverse of `camera_ray`."""
     x, y, z = x - p[POSITION], y - p[POSITION + 1], z - p[POSITION + 2]
@@ -154,7 +154,7 @@ def project(p, x, y, z):  # type: ignore[no-untyped-def]
     return p[CX] + p[FX] * right * scale, p[CY] - p[FY] * up * scale, depth
 
 
-@njit(inline="always")
+@inlined
 def _basis(v, faces, f):  # type: ignore[no-untyped-def]
     """First corner, two edges, unit normal (0 for a face without area) of face `f`, float64."""
     a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]

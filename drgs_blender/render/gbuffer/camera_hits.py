@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...compute.jit import get_num_threads, njit
-from ...compute.threads import over_range
+from ...compute.jit import njit
+from ...compute.threads import get_num_threads, over_range
 from ..camera import CLIP_END, CLIP_START, WIDTH, sample_ray
 from ..sampling import F
 from ..scene.interaction import nearest, position_at, surface_at

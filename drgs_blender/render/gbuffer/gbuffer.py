@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...compute.jit import njit
+from ...compute.jit import inlined, njit
 from ..camera import SUBPIXELS, WIDTH
 from ..points import CATCHER, SECOND, ShadingPoints
 from ..scene.ray_masks import CATCHER as CATCHER_OBJECT
@@ -167,7 +167,7 @@ def _number(alpha, second, p, x0, y0, pixel, sample, weight, flags):  # type: ig
                         n += 1
 
 
-@njit(inline="always")
+@inlined
 def face_viewer(nx, ny, nz, gx, gy, gz, vx, vy, vz):  # type: ignore[no-untyped-def]
     """Shading normal on the side of the geometric normal g, which faces the viewer at v, and visible from there.
 

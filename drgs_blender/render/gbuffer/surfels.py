@@ -28,8 +28,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...compute.jit import get_num_threads, njit
-from ...compute.threads import over_range
+from ...compute.jit import inlined, njit
+from ...compute.threads import get_num_threads, over_range
 from ...core.frame import Camera
 from ..camera import WIDTH, sample_ray
 from ..columns import ALBEDO, METALLIC, NORMAL, ROUGHNESS, SIZE
@@ -136,7 +136,7 @@ def _edge_lengths(vertices, faces, face_object, total, count):  # type: ignore[n
                 count[owner] += 1
 
 
-@njit(inline="always")
+@inlined
 def _shoot(tracer, x, y, z, dx, dy, dz, reach):  # type: ignore[no-untyped-def]
     """Closest hit on the segment from (x, y, z) along (dx, dy, dz): its parameter, unit face normal, face and u, v.
 
@@ -153,7 +153,7 @@ def _shoot(tracer, x, y, z, dx, dy, dz, reach):  # type: ignore[no-untyped-def]
     return np.float64(t), gx / length, gy / length, gz / length, face, u, v
 
 
-@njit(inline="always")
+@inlined
 def _find(tracer, point, normal, view, ahead, window):  # type: ignore[no-untyped-def]
     """Mesh point of a surfel's `point` and `normal`, seen from the direction `view`.
 

@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...compute.jit import get_num_threads, njit
-from ...compute.threads import over_range
+from ...compute.jit import njit
+from ...compute.threads import get_num_threads, over_range
 from ...core.color import LUMINANCE
 from ...core.errors import UsageError
 from ...core.frame import RenderSettings

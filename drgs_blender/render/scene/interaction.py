@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...compute.jit import njit
+from ...compute.jit import inlined, njit
 from ..memory import load_float, load_int32, load_int64
 from ..sampling import ONE, ZERO, F
 from .embree import blocked, trace
@@ -98,7 +98,7 @@ def shadowed(tracer, ray):  # type: ignore[no-untyped-def]
     return blocked(tracer.occluded, tracer.scene, ray)
 
 
-@njit(inline="always")
+@inlined
 def _blend(rows, i, j, k, w, u, v):  # type: ignore[no-untyped-def]
     """A float32 column blended over a face, from where its corners' values lie."""
     return w * load_float(rows, i) + u * load_float(rows, j) + v * load_float(rows, k)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...compute.jit import njit, plain
+from ...compute.jit import inlined, plain
 
 Array = np.ndarray
 
@@ -58,7 +58,7 @@ class Rays(NamedTuple):
         return cls(start, along, np.float32(tnear), np.float32(tfar), np.int32(mask))
 
 
-@njit(inline="always")
+@inlined
 def ray_at(rays, i):  # type: ignore[no-untyped-def]
     """One `Ray` of many."""
     origin = rays.origins[i, 0], rays.origins[i, 1], rays.origins[i, 2]

@@ -27,8 +27,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...compute.jit import get_num_threads, njit
-from ...compute.threads import over_range
+from ...compute.jit import inlined, njit
+from ...compute.threads import get_num_threads, over_range
 from ..camera import CLIP_END, CLIP_START, FX, FY, ORTHOGRAPHIC, SUBPIXELS, WIDTH, lattice, pixel_shift
 from ..columns import OPACITY, SAMPLE, SPLAT
 from .blending import GAP, LANES, MIN_TRANSMITTANCE, contributions, mean, prune, scratch_for, sort, weigh, widen
@@ -162,7 +162,7 @@ def rasterise(splats: Splats, y0: int, y1: int) -> SurfelSamples:
     return samples
 
 
-@njit(inline="always")
+@inlined
 def gaussian(q):  # type: ignore[no-untyped-def]
     """exp(-q / 2) for 0 <= q <= 12, relative error below 4e-6: Taylor's series of exp(-q / 32) to the 16th power.
 

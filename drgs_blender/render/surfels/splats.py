@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...compute.jit import njit, plain
+from ...compute.jit import inlined, njit, plain
 from ...compute.threads import ELEMENTS, over_range
 from ...core.asset.model import PosedSurfels
 from ...core.frame import Camera
@@ -147,7 +147,7 @@ def prepare(posed: PosedSurfels, camera: Camera, parameters: Array) -> Splats:
     )
 
 
-@njit(inline="always")
+@inlined
 def to_camera(p, x, y, z):  # type: ignore[no-untyped-def]
     """World direction to camera coordinates (right, down, forward)."""
     right, up = p[0] * x + p[3] * y + p[6] * z, p[1] * x + p[4] * y + p[7] * z
@@ -155,7 +155,7 @@ def to_camera(p, x, y, z):  # type: ignore[no-untyped-def]
     return right + p[LEAN] * forward, -(up + p[LEAN + 1] * forward), forward
 
 
-@njit(inline="always")
+@inlined
 def span(focal, centre, sc, pa, pb, sa, sb, r2):  # type: ignore[no-untyped-def]
     """Least and greatest screen coordinate of the disc u^2 + v^2 <= r2, wholly in front of the camera.
 
@@ -168,7 +168,7 @@ def span(focal, centre, sc, pa, pb, sa, sb, r2):  # type: ignore[no-untyped-def]
     return centre + focal * (-qb - root) / qa, centre + focal * (-qb + root) / qa
 
 
-@njit(inline="always")
+@inlined
 def _clipped_bounds(c, a, b, r, near, p):  # type: ignore[no-untyped-def]
     """Screen bounds of the square c +- r a +- r b cut at depth `near` (camera coordinates): for discs that cross it."""
     x0 = y0 = np.inf
@@ -286,13 +286,13 @@ def project_surfel(i, posed, p, window, screen, box, nearest):  # type: ignore[n
     nearest[i] = max(c[2] - deep, near)
 
 
-@njit(inline="always")
+@inlined
 def _dim(along, whole):  # type: ignore[no-untyped-def]
     """-2 log of the cosine ``along / whole``."""
     return 2.0 * np.log(whole / max(abs(along), 1e-6 * whole))
 
 
-@njit(inline="always")
+@inlined
 def depth_key(bits):  # type: ignore[no-untyped-def]
     """Bits of a float32 as an integer that compares like the number: negative ones are reversed."""
     return np.uint32(~bits if bits >> np.uint32(31) else bits | np.uint32(0x80000000))
@@ -356,7 +356,7 @@ def pack_surface(i, k, posed, out):  # type: ignore[no-untyped-def]
     out[k, SIZE] = np.sqrt(max(uu, vv))
 
 
-@njit(inline="always")
+@inlined
 def tiles_of(box, i):  # type: ignore[no-untyped-def]
     """Columns and rows of tiles (x0, y0, x1, y1), half-open, that the box of splat i touches."""
     return box[i, 0] // TILE, box[i, 1] // TILE, (box[i, 2] - 1) // TILE + 1, (box[i, 3] - 1) // TILE + 1

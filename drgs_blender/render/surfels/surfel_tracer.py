@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...compute.jit import njit
+from ...compute.jit import inlined, njit
 from ...compute.threads import over_range
 from ...core.asset.model import as_float
 from ...core.errors import UsageError
@@ -182,7 +182,7 @@ def trace_surfels(tracer, ray, start, gap, number):  # type: ignore[no-untyped-d
     )  # fmt: skip
 
 
-@njit(inline="always")
+@inlined
 def _prefer(weight, best, pick, total):  # type: ignore[no-untyped-def]
     """Whether a surface takes the place of the one chosen so far; the random number, renewed; all weight so far.
 
@@ -197,7 +197,7 @@ def _prefer(weight, best, pick, total):  # type: ignore[no-untyped-def]
     return False, (pick - share) / (ONE - share), total
 
 
-@njit(inline="always")
+@inlined
 def _add(sums, row, w, t, direction):  # type: ignore[no-untyped-def]
     """Add a contribution of weight w at depth t: sums of one, depth, normals towards the ray, material, size."""
     weight, depth, nx, ny, nz, px, py, pz, red, green, blue, roughness, metallic, wide = sums
