@@ -1,4 +1,4 @@
-"""One module an artist's verb."""
+"""Operators of the extension: one module per group of operators."""
 
 from __future__ import annotations
 

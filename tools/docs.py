@@ -31,7 +31,10 @@ NAVIGATION = {
         *("docs/formats.md", "docs/asset-format.md", "docs/farm/nodes.md", "docs/farm/slurm.md"),
         *("docs/farm/openjd.md", "docs/farm/flamenco.md"),
     ),
-    "Internals": ("docs/architecture.md", "docs/kernels.md", "docs/protocol.md", "CONTRIBUTING.md"),
+    "Internals": (
+        *("docs/architecture.md", "docs/libraries.md", "docs/kernels.md", "docs/protocol.md"),
+        "CONTRIBUTING.md",
+    ),
 }
 #: Folders, below the laid out sources, of the two references.
 PYTHON, BLENDER = "reference/python", "reference/blender"

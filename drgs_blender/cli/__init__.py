@@ -1,1 +1,1 @@
-"""The `drgs` command; one module a command."""
+"""The command line `drgs`: one module per command."""

@@ -35,7 +35,7 @@ logger = logging.getLogger(__name__)
 
 Array = np.ndarray
 
-#: Seconds between two signs of life, and between two progress messages of one phase.
+#: Seconds between two heartbeats, and between two progress messages of one phase.
 ALIVE_SECONDS = 0.5
 PROGRESS_SECONDS = 0.1
 

@@ -14,10 +14,10 @@ from ..core.asset.tensors import parse_json
 from ..core.color import srgb_to_linear
 from ..core.errors import AssetError
 from . import trimesh_scene
-from .apart import read_apart
 from .files import Image, MaterialFile, MeshFile
 from .obj import beside, load_texture
 from .soup import join_equal
+from .subprocess_reader import read_apart
 from .trimesh_scene import ABOUT
 
 Array = np.ndarray

@@ -16,7 +16,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from ..core.errors import AssetError
-from .apart import hand_over, limit
+from .subprocess_reader import hand_over, limit
 
 Array = np.ndarray
 
@@ -37,7 +37,7 @@ _TURNS = {
 
 
 def main(source: str, target: str, most_bytes: str, most_seconds: str) -> None:
-    """Write the meshes of `source` to `target`; leave with a code (see `apart`)."""
+    """Write the meshes of `source` to `target`; exit with a code (see `subprocess_reader`)."""
     limit(int(most_bytes), int(most_seconds))
     hand_over(source, target, kind_of(source), read_scene)
 

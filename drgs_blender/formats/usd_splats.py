@@ -13,11 +13,11 @@ import numpy as np
 from ..core.asset.archive import replace_by
 from ..core.errors import DeviceError, WriteError
 from . import usd_stage
-from .apart import PATIENCE, SECONDS, read_apart
 from .axes import UP_AXES
 from .files import SurfelFile
 from .splat_scene import Piece, join_pieces
 from .splats import Splats, writable
+from .subprocess_reader import PATIENCE, SECONDS, read_apart
 from .usd_crate import check_crate
 from .usd_stage import DEGREE, HARMONICS, NO_SPLATS, SCHEMA, SPACE, UP
 

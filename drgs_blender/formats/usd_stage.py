@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..core.errors import AssetError
-from .apart import hand_over, limit
+from .subprocess_reader import hand_over, limit
 
 Array = np.ndarray
 
@@ -29,7 +29,7 @@ NO_SPLATS = f"holds no splats ({SCHEMA}), and of USD nothing else is read"
 
 
 def main(source: str, target: str, most_bytes: str, most_seconds: str) -> None:
-    """Write the pieces of the stage `source` to `target`; leave with a code (see `apart`)."""
+    """Write the pieces of the stage `source` to `target`; exit with a code (see `subprocess_reader`)."""
     limit(int(most_bytes), int(most_seconds))
 
     def read(subject: str) -> dict[str, Array]:

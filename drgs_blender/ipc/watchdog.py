@@ -1,4 +1,4 @@
-"""The watchdog: when an engine that does not answer is given up."""
+"""Watchdog: timeouts for missed heartbeats (`Alive` messages) and for a stalled main thread."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Obstacles: signed distance of meshes that stand, move rigidly or deform.
+"""SDF colliders: signed distance fields of meshes that stand, move rigidly or deform.
 
 A mesh that moves as a rigid body has one field in its own space. One that deforms gets a new field, around the
 particles alone, each time it has moved half a cell.

@@ -39,7 +39,7 @@ CUBES = 14
 _LIGHTEST = 0.02
 #: Corners of a cube, as offsets.
 _CORNERS = np.array([(i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1)])
-#: Where in a cube it is looked at how it deforms, and the parts of its matter that do so.
+#: Quadrature points of a cube and their weights.
 _PLACES = np.concatenate([[[0.5, 0.5, 0.5]], 0.5 + (_CORNERS[[0, 3, 5, 6]] - 0.5) / np.sqrt(3)])
 _SHARES = np.array([0.8, 0.05, 0.05, 0.05, 0.05])
 
@@ -80,7 +80,7 @@ class Lattice(Stepper):
         cubes: int = CUBES,
     ) -> None:
         if not body.matter.keeps_shape.all():
-            raise UsageError("solver", "xpbd knows no sand and no fluids", "Use mpm for them")
+            raise UsageError("solver", "xpbd supports no sand and no fluids", "Use mpm for them")
         if (body.matter.model > 1).any():
             log.warning("xpbd shows all matter as elastic; mpm shows what bends and stays bent")
         self.body, self.forces = body, forces or Forces()

@@ -22,7 +22,7 @@ from drgs_blender.build.proxy import mesh_from_surfels
 from drgs_blender.cli.main import main
 from drgs_blender.core.asset.archive import read_archive, replace_by, replace_file
 from drgs_blender.core.errors import AssetError, WriteError
-from drgs_blender.formats import apart, gltf_document, usd_stage
+from drgs_blender.formats import gltf_document, subprocess_reader, usd_stage
 from drgs_blender.formats.axes import scaled_surfels
 from drgs_blender.formats.glb import Glb
 from drgs_blender.formats.gltf_nodes import INSTANCES
@@ -164,7 +164,7 @@ def test_what_a_full_disk_keeps_from_being_read_is_said(tmp_path: Path, monkeypa
     SPLATS[".usdc"](tmp_path / "a.usda", random_splats(7))
     code = f"from {usd_stage.__name__} import main; main({str(tmp_path / 'a.usda')!r}, '/dev/full', {1 << 40}, 60)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.returncode == apart.FULL and done.stderr.splitlines()[-1] == "No space left on device"
+    assert done.returncode == subprocess_reader.FULL and done.stderr.splitlines()[-1] == "No space left on device"
     monkeypatch.setattr(subprocess, "run", lambda *_, **__: done_bytes(done))
     with pytest.raises(WriteError, match=r"cannot hold what is in .*a\.usda \(No space left .*TMPDIR"):
         read_surfels(tmp_path / "a.usda")

@@ -18,7 +18,8 @@ EXPECTED = (
     "reprojection", "motion vector", "Cryptomatte", "BVH", "refit", "splat", "rasteriser", "tile", "alpha blending",
     "surfel", "densification", "TSDF", "marching cubes", "Adam", "SSIM", "P2G", "G2P", "constitutive model",
     "Young's modulus", "CFL", "XPBD", "rigid body", "GMLS", "skinning", "shape key", "ipc protocol", "shared memory",
-    "handshake", "session", "progressive rendering", "render farm", "chunk", "kernel cache",
+    "handshake", "session", "progressive rendering", "render farm", "chunk", "kernel cache", "heartbeat",
+    "transmittance", "lobe", "estimator", "history", "SDF collider",
 )  # fmt: skip
 
 

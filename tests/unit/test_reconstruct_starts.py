@@ -78,7 +78,7 @@ def test_a_hollow_that_no_outline_shows_is_found(monkeypatch, caplog):
     with caplog.at_level("INFO"):
         both = learned(capture)
     assert "inside the hull: +" in caplog.text and not both.trying
-    monkeypatch.setattr(train, "MANY", 1000)
+    monkeypatch.setattr(train, "MIN_VIEWS", 1000)
     alone = learned(capture)
     assert far_off(both, capture) < 0.5 * far_off(alone, capture)
 
@@ -86,7 +86,7 @@ def test_a_hollow_that_no_outline_shows_is_found(monkeypatch, caplog):
 @pytest.mark.slow
 def test_the_start_that_loses_leaves_no_trace(monkeypatch):
     capture = balls(24, 40)
-    monkeypatch.setattr(starts, "WORTH", 1000.0)
+    monkeypatch.setattr(starts, "MIN_GAIN_DB", 1000.0)
     tried = learned(capture)
     # The winner did not see the views that were kept aside until the trial's end: neither does this one.
     monkeypatch.setattr(starts.Trial, "is_due", lambda self, part, _: self.end() if part >= starts.TRIAL else None)
@@ -111,7 +111,7 @@ def test_starts_are_judged_by_the_views_that_neither_saw():
     training = Training(capture, find_region(capture), replace(QUICK, surfels=200))
     expected = training.learner.error_of(training.views.aside())
     half = training.views.half
-    seen = [k for k in range(len(half)) if k % starts.ASIDE != starts.ASIDE // 2]
+    seen = [k for k in range(len(half)) if k % starts.HOLDOUT_EVERY != starts.HOLDOUT_EVERY // 2]
     for k in seen:
         half[k] = None
     assert training.learner.error_of(training.views.aside()) == expected and len(half) - len(seen) == 3
@@ -175,7 +175,7 @@ def test_views_kept_aside_are_learned_from_after_the_trial(monkeypatch):
     while not training.finished:
         training.step()
     full, half = training.targets
-    kept = {id(view) for k, view in enumerate(half) if k % starts.ASIDE == starts.ASIDE // 2}
+    kept = {id(view) for k, view in enumerate(half) if k % starts.HOLDOUT_EVERY == starts.HOLDOUT_EVERY // 2}
     assert kept and not kept & during and {id(view) for view in full} <= after
 
 

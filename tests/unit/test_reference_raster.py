@@ -224,9 +224,9 @@ def test_a_jump_of_the_depth_separates_surfaces():
     assert float(rasterise(join(near, behind, close), camera, centre, 3.0).depth) == pytest.approx(4.0)
 
 
-def test_chunks_do_not_change_the_picture():
+def test_batches_do_not_change_the_picture():
     cloud = splats(15, 7)
-    same(rasterise(cloud, look()), rasterise(cloud, look(), chunk=100), 1e-12)
+    same(rasterise(cloud, look()), rasterise(cloud, look(), batch_size=100), 1e-12)
 
 
 def test_a_scene_of_no_surfels_is_empty():

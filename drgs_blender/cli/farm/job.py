@@ -28,7 +28,7 @@ class Job:
     clean : str or None
         The same of the denoised frames, if there are any.
     chunk : int
-        Most frames of one task.
+        Size of a chunk: most frames of one task.
     options : tuple of str
         Further options of ``drgs render``.
     program : tuple of str

@@ -21,11 +21,13 @@ from .gaussians import Gaussians
 
 log = logging.getLogger(__name__)
 
-#: Degrees between two normals of different surfaces; part of the pixels where they do that makes a thing thin.
-#: A fern has .17 of them, a helmet with straps and rivets .02, round things less.
-APART, THIN = 40.0, 0.06
-#: Views that are asked.
-ASKED = 15
+#: Degrees from which on the normals of surfels and mesh count as different.
+MIN_ANGLE = 40.0
+#: Fraction of pixels with different normals from which on an object is thin: a fern has 0.17, a helmet with straps and
+#: rivets 0.02, round objects less.
+THIN_FRACTION = 0.06
+#: Views sampled, at most.
+SAMPLED_VIEWS = 15
 
 
 def normals_of(gaussians: Gaussians) -> Normals:
@@ -44,12 +46,12 @@ def is_thin(gaussians: Gaussians, mesh: Mesh, views: list[View]) -> bool:
     tree.build(mesh.vertices, mesh.faces)
     smooth = VertexNormals(mesh.faces, len(mesh.vertices))(mesh.vertices)
     cosines = []
-    for index, view in enumerate(views[:: math.ceil(len(views) / ASKED)]):
+    for index, view in enumerate(views[:: math.ceil(len(views) / SAMPLED_VIEWS)]):
         pixels = pixels_of(index, view, mesh, tree, normals_of(gaussians))
         by_mesh = unit(np.einsum("nk,nkc->nc", pixels.corners, smooth[mesh.faces[pixels.face]]))
         known = (pixels.shown != 0).any(axis=1)
         cosines.append(np.einsum("nc,nc->n", pixels.shown, by_mesh)[known])
-    apart = float((np.concatenate([*cosines, [1.0]]) < math.cos(math.radians(APART))).mean())
-    thin = apart > THIN
-    log.info("normals of surfels and mesh differ in %.1f %% of pixels%s", 100 * apart, ": thin" if thin else "")
+    different = float((np.concatenate([*cosines, [1.0]]) < math.cos(math.radians(MIN_ANGLE))).mean())
+    thin = different > THIN_FRACTION
+    log.info("normals of surfels and mesh differ in %.1f %% of pixels%s", 100 * different, ": thin" if thin else "")
     return thin

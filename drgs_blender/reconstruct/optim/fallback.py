@@ -1,4 +1,4 @@
-"""Work on a device that may fail: the state that outlives it, and the way back to this processor."""
+"""Fallback to the CPU when a GPU fails during training."""
 
 from __future__ import annotations
 
@@ -17,42 +17,42 @@ from ..backend import CPU, LearningBackend
 log = logging.getLogger(__name__)
 _T = TypeVar("_T")
 
-#: Seconds between two states that outlive the device.
+#: Seconds between two copies of the state, from which training goes on after a failure.
 KEEP_EVERY = 20.0
 
 
 class Movable(Protocol):
-    """What is learned, on one processor or another."""
+    """Training that can be moved between CPU and GPU."""
 
     @property
     def iteration(self) -> int:
         """Steps that are done."""
 
     def move(self, backend: LearningBackend) -> None:
-        """Have `backend` do the steps, from the first one."""
+        """Run the steps on `backend`, from the first one."""
 
     def state(self) -> dict[str, Array]:
-        """All that `take_up` needs to go on with any processor."""
+        """All that `load_state` needs to go on with any backend."""
 
-    def take_up(self, state: dict[str, Array]) -> None:
+    def load_state(self, state: dict[str, Array]) -> None:
         """Go on from a `state`."""
 
 
 class Fallback:
-    """Who does the steps, and this processor in its stead once it has failed.
+    """The backend of the steps: a GPU, and the CPU once the GPU has failed.
 
     Parameters
     ----------
     learned : Movable
     now : callable
-        Seconds since whenever.
+        Seconds of a clock.
 
     Attributes
     ----------
     backend : LearningBackend
-        Who does the steps.
+        Where the steps run.
     failed : str
-        Why another one than this processor is of no use any more, in words; empty while it is.
+        Why the GPU is not used any more; empty while it is.
     """
 
     def __init__(self, learned: Movable, now: Callable[[], float] = time.monotonic) -> None:
@@ -62,20 +62,20 @@ class Fallback:
         self._kept_at = 0.0
 
     def begin(self, backend: LearningBackend) -> None:
-        """Have `backend` do the steps from the first one, if it is of use."""
+        """Run the steps on `backend` from the first one, unless it has failed before."""
         self._move(CPU)
         if backend is not CPU:
             self.keep()
             self.attempt(lambda: None if self.failed else self._move(backend), whole=False)
 
     def attempt(self, work: Callable[[], _T], whole: bool = True) -> _T:
-        """Have the processor do some work; where it fails, this one does it, and goes on.
+        """Run `work` on the present backend; where that fails, run it and all that follows on the CPU.
 
         Parameters
         ----------
         work : callable
         whole : bool
-            The state is of use when the work was left half-done; else the last one that was kept is.
+            The state is valid after work that was interrupted; else the last copy is loaded.
         """
         try:
             return work()
@@ -87,21 +87,21 @@ class Fallback:
             with suppress(DeviceError, RuntimeError):
                 state = self._learned.state() if whole else state
             self._move(CPU)
-            self._learned.take_up(state)
+            self._learned.load_state(state)
             log.warning("%s Learned on the CPU from step %d on", self.failed, self._learned.iteration)
         return work()
 
     def keep(self) -> None:
-        """Remember the state as it is now, so that a device cannot take it along when it fails."""
+        """Copy the present state, so that it is not lost when the GPU fails."""
         self.remember(self.attempt(self._learned.state))
 
     def keep_if_away(self, every: float = 0.0) -> None:
-        """The same, where a device does the work and the last time was `every` seconds ago."""
+        """The same, where the steps run on a GPU and the last copy is `every` seconds old."""
         if self.backend is not CPU and self._now() >= self._kept_at + every:
             self.keep()
 
     def remember(self, state: dict[str, Array]) -> None:
-        """Go on from this state when the device fails and loses its own."""
+        """Go on from this state when the GPU fails and its own is lost."""
         self._kept = {name: np.array(value) for name, value in state.items()}
         self._kept_at = self._now()
 

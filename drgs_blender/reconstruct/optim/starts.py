@@ -12,14 +12,19 @@ from ..model.gaussians import Gaussians
 
 log = logging.getLogger(__name__)
 
-#: Part of the schedule that both starts of `initialisation` are tried for, by views of which every n-th is kept aside;
-#: decibels there that surfels inside the hull must bring. At least so many views leave some to keep aside.
-TRIAL, ASIDE, WORTH, MANY = 0.2, 8, 0.75, 16
+#: Part of the schedule for which both starts of `initialisation` are tried.
+TRIAL = 0.2
+#: Every n-th view is held out of a trial, to compare the starts by.
+HOLDOUT_EVERY = 8
+#: Least gain in PSNR in these views, in decibels, for which surfels inside the hull are taken.
+MIN_GAIN_DB = 0.75
+#: Fewest training views with which there is a trial.
+MIN_VIEWS = 16
 
 
 def is_aside(view: int) -> bool:
     """Whether a trial keeps the view of this number for its end."""
-    return view % ASIDE == ASIDE // 2
+    return view % HOLDOUT_EVERY == HOLDOUT_EVERY // 2
 
 
 class Trial:
@@ -66,7 +71,7 @@ class Trial:
         gain = 10 * math.log10(max(float(first["aside"][0]), 1e-10) / max(error, 1e-10))
         log.info("surfels inside the hull: %+.2f dB in views kept aside", gain)
         self.end()
-        return None if gain >= WORTH else first  # nor what is no number
+        return None if gain >= MIN_GAIN_DB else first  # nor what is no number
 
     def end(self) -> None:
         """Go on with the present start alone."""

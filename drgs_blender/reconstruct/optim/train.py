@@ -26,7 +26,7 @@ from .fallback import KEEP_EVERY, Fallback
 from .growth import Growth
 from .learner import Learner
 from .schedule import Schedule
-from .starts import MANY, Trial
+from .starts import MIN_VIEWS, Trial
 from .views import Views
 
 _T = TypeVar("_T")
@@ -84,7 +84,7 @@ class Training:
         rival = None
         if gaussians is None:
             gaussians = on_hull(capture, region, schedule.surfels, schedule.bands, schedule.seed)
-            if len(capture.training) >= MANY:
+            if len(capture.training) >= MIN_VIEWS:
                 rival = inside_hull(gaussians, capture, region, schedule.bands, schedule.seed)
         self.clock, self.trial, self.fallback = Clock(seconds, now), Trial(rival), Fallback(self, now)
         self._begin(gaussians, backend)
@@ -134,7 +134,7 @@ class Training:
             self.fallback.keep_if_away(KEEP_EVERY)
 
     def attempt(self, work: Callable[[], _T], whole: bool = True) -> _T:
-        """Have the processor do some work: `Fallback.attempt`."""
+        """Run `work`, if need be on the CPU: see `Fallback.attempt`."""
         return self.fallback.attempt(work, whole)
 
     def _learn(self) -> None:
@@ -165,7 +165,7 @@ class Training:
         spent = self.clock.spent + float(first["numbers"][1])
         better = self.trial.decide(error)
         if better is not None:
-            self.attempt(lambda: self.take_up(better), whole=False)
+            self.attempt(lambda: self.load_state(better), whole=False)
         self.clock.end_trial(spent)
 
     def arrays(self) -> dict[str, Array]:
@@ -175,21 +175,21 @@ class Training:
     def restore(self, state: dict[str, Array]) -> None:
         """Go on from what `arrays` returned."""
         self.trial.restore(state)
-        self.take_up(state)
+        self.load_state(state)
 
     def move(self, backend: LearningBackend) -> None:
-        """Have `backend` do the steps, from the first one: see `Fallback`."""
+        """Run the steps on `backend`, from the first one: see `Fallback`."""
         self.views = Views(self.targets, self._background, backend, self.schedule.seed)
         self.learner = Learner(self._begun, self.schedule, self.region.radius, self.views.background, backend)
 
     def state(self) -> dict[str, Array]:
-        """All of the present start that `take_up` needs."""
+        """All of the present start that `load_state` needs."""
         learner, growth = self.learner, self.growth
         counts = [learner.iteration, learner.optimiser.steps, growth.start, growth.rounds, learner.light.steps]
         numbers = [learner.error, self.clock.spent, self.clock.tried]
         return learner.arrays() | {"counts": np.array(counts, np.int64), "numbers": np.array(numbers)}
 
-    def take_up(self, state: dict[str, Array]) -> None:
+    def load_state(self, state: dict[str, Array]) -> None:
         """Go on from a `state`, with the trial as it is."""
         learner, growth = self.learner, self.growth
         learner.restore(state)

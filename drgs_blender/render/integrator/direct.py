@@ -61,7 +61,7 @@ def _reflect(sums, rays, slot, kind, diffuse, glossy):  # type: ignore[no-untype
 
 @njit
 def deliver(count, found, limit, sums):  # type: ignore[no-untyped-def]
-    """Add the light of finished paths to their points; `limit` bounds the mean of an indirect sample's channels."""
+    """Add the light of finished paths to their points; `limit` is `clamp_indirect`, scaled to one sample."""
     for path in range(count):
         h = np.int64(found[path, CARRIED + 6])
         fr, fg, fb = found[path, CARRIED], found[path, CARRIED + 1], found[path, CARRIED + 2]

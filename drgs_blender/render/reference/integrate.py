@@ -89,7 +89,8 @@ class TriangleTracer:
         Unit, or None for flat shading.
     offset : float
         Metres by which points are lifted off the surface they lie on.
-    chunk : int
+    batch_size : int
+        Ray-face pairs tested at once.
     """
 
     def __init__(
@@ -101,7 +102,7 @@ class TriangleTracer:
         metallic: Tensor,
         corner_normals: Tensor | None = None,
         offset: float = 1e-5,
-        chunk: int = 1 << 18,
+        batch_size: int = 1 << 18,
     ) -> None:
         self.faces = faces.long()
         with torch.no_grad():
@@ -114,7 +115,7 @@ class TriangleTracer:
             self.levels = [dot(plane, corner) for plane in self.planes]
             self.face_normal = across / torch.sqrt(area2)
         self.albedo, self.roughness, self.metallic = albedo, roughness, metallic
-        self.corner_normals, self.offset, self.chunk = corner_normals, offset, chunk
+        self.corner_normals, self.offset, self.batch_size = corner_normals, offset, batch_size
 
     @torch.no_grad()
     def _search(self, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -130,7 +131,7 @@ class TriangleTracer:
 
     def closest(self, origin: Tensor, direction: Tensor) -> tuple[Tensor, SurfacePoints]:
         """See `Tracer`."""
-        step = max(1, self.chunk // max(1, len(self.faces)))
+        step = max(1, self.batch_size // max(1, len(self.faces)))
         if not len(origin) or not len(self.faces):
             return EmptyTracer().closest(origin, direction)
         found = [self._search(o, d) for o, d in zip(origin.split(step), direction.split(step))]

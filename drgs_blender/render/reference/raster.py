@@ -130,7 +130,7 @@ def rasterise(
     position: Tensor | None = None,
     gap: float | None = None,
     samples: int = 1,
-    chunk: int = 1 << 18,
+    batch_size: int = 1 << 18,
 ) -> ReferenceGBuffer:
     """G-buffer of surfels at pixel positions.
 
@@ -152,12 +152,12 @@ def rasterise(
         of all. None blends all contributions.
     samples : int
         Positions a pixel; the low-pass filter is that much narrower in variance.
-    chunk : int
+    batch_size : int
         Surfel-pixel pairs held at once.
     """
     if position is None:
         position = pixel_centres(camera, splats.centre.dtype, str(splats.centre.device))
-    step = max(1, chunk // max(1, len(splats.centre)))
+    step = max(1, batch_size // max(1, len(splats.centre)))
     parts = [_blend(splats, camera, p, gap, samples) for p in position.split(step)]
     return ReferenceGBuffer(
         **{f.name: torch.cat([getattr(p, f.name) for p in parts]) for f in fields(ReferenceGBuffer)}

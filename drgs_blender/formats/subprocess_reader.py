@@ -1,6 +1,7 @@
-"""Files read in a process apart: by libraries that may hang or crash on damaged ones, or take all memory.
+"""Read files in a subprocess with resource limits: libraries may hang or crash on damaged files, or exhaust memory.
 
-The program gets a file to read and one to write arrays to; it leaves with a code, and its last line says why.
+The subprocess gets a file to read and one to write arrays to. Its exit code says how it ended, and the last line of its
+stderr why. Processor time, memory and time by the clock are limited, in proportion to the file's size.
 """
 
 from __future__ import annotations
@@ -21,19 +22,21 @@ from ..core.errors import AssetError, DeviceError, WriteError
 
 Array = np.ndarray
 
-#: Codes to leave with: the file is refused (the reason is the last line of stderr), the library is not installed, what
-#: was read cannot be handed over (likewise).
+#: Exit codes: the file is refused (the reason is the last line of stderr), the library is not installed, the arrays
+#: cannot be written (likewise).
 REFUSED, LACKING, FULL = 65, 69, 73
-#: Processor time and memory for a file: some for the library, and in proportion to its bytes.
+#: Limit of processor time: seconds for starting the library, and one second more for so many bytes of the file.
 SECONDS, _PACE = 5.0, 1 << 20
-#: By the clock it may take so many times as long: the machine may be busy, and who waits takes no processor time.
+#: Limit of time by the clock, in multiples of that of processor time: the machine may be busy, and waiting takes no
+#: processor time.
 PATIENCE = 20
+#: Limit of memory (Linux): bytes for the library, and so many more for each byte of the file.
 _MEMORY, _RATIO = 8 << 30, 32
 REMEDY = "Export it again, or restore it from a copy"
 
 
 def hand_over(source: str, target: str, kind: str, read: Callable[[str], Mapping[str, Array]]) -> None:
-    """In the program: write what `read` makes of `source` to `target`; leave with a code where that fails.
+    """In the subprocess: write what `read` makes of `source` to `target`; exit with a code where that fails.
 
     Parameters
     ----------
@@ -61,7 +64,7 @@ def hand_over(source: str, target: str, kind: str, read: Callable[[str], Mapping
 
 
 def limit(most_bytes: int, most_seconds: int) -> None:
-    """In the program: let it fail beyond these limits, and leave no image of its memory where it crashes.
+    """In the subprocess: set limits beyond which it fails, and write no core dump where it crashes.
 
     At most so many bytes of memory (Linux) and seconds of processor time (not on Windows).
     """
@@ -87,7 +90,7 @@ def read_apart(
     seconds: float = SECONDS,
     patience: float = PATIENCE,
 ) -> dict[str, Array]:
-    """The arrays that ``module.main`` hands over, from a process that may take time and memory in proportion.
+    """The arrays that ``module.main`` writes, in a subprocess with limits in proportion to the file.
 
     Parameters
     ----------
