@@ -36,6 +36,11 @@ from . import closure, shipped
 from .folders import cache_folder, write_atomically
 from .kernel_compiler import KernelCompiler, LoadedLibrary, is_nested
 
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
 log = logging.getLogger(__name__)
 _MAGIC = b"drgs kernel 2\n"
 _DIGEST = 32
@@ -48,6 +53,41 @@ _CONFIG = ("OPT", "BOUNDSCHECK", "DEBUGINFO_DEFAULT", "LOOP_VECTORIZE", "SLP_VEC
 
 class DamagedError(Exception):
     """What a file holds is not what was written."""
+
+
+class Claim:
+    """A lock on a file, which keeps processes from compiling the same; it ends with its process.
+
+    Where files cannot be locked (Windows, some network folders), every process gets one.
+    """
+
+    def __init__(self, file: int | None = None) -> None:
+        self._file = file
+
+    @classmethod
+    def of(cls, path: Path) -> Claim | None:
+        """The lock on `path`, which is made where it is not there; None while another process has it."""
+        if fcntl is None:
+            return cls()
+        try:
+            path.parent.mkdir(exist_ok=True, mode=0o700)
+            file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        except OSError:
+            return cls()
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(file)
+            return None
+        except OSError:
+            pass
+        return cls(file)
+
+    def close(self) -> None:
+        """Give it up; the file stays, since another process may wait for it."""
+        if self._file is not None:
+            os.close(self._file)
+            self._file = None
 
 
 class KernelCache(NullCache):
@@ -113,6 +153,11 @@ class KernelCache(NullCache):
             return True  # it would not be kept
         folder = cache_folder().path
         return shipped.has(name) or (folder is not None and (folder / self._folder() / name).is_file())
+
+    def claim(self, sig: Any, codegen: Any) -> Claim | None:
+        """The right to compile for `sig`, until it is closed; None while another process has it."""
+        folder, name = cache_folder().path, self.file_name(sig, codegen)
+        return Claim.of(folder / self._folder() / f".{name}.lock.tmp") if folder is not None else Claim()
 
     def file_name(self, sig: Any, codegen: Any) -> str | None:
         """Name of the file for `sig`; None for types that have no name of their own, of which none is kept."""

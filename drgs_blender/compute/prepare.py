@@ -1,6 +1,6 @@
 """Ahead-of-time compilation of the kernels that jobs need, in as many processes as there are processors.
 
-python -m drgs_blender.compute.prepare [--all | JOB ...]
+python -m drgs_blender.compute.prepare [--all | JOB ...] [--processes N]
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from ..core.memory import available_memory
 from ..core.phases import PREPARING
 from . import closure, manifest, shipped
 from .folders import cache_folder
-from .kernel_cache import KernelCache
+from .kernel_cache import Claim, KernelCache
 from .manifest import Kernel
 
 log = logging.getLogger(__name__)
@@ -33,10 +33,13 @@ log = logging.getLogger(__name__)
 PHASE = PREPARING
 _POLL = 0.1
 _REPORT = 0.4
+#: Seconds without any progress after which what another process has begun is compiled here as well.
+_PATIENCE = 180.0
 #: Of memory, which a process that compiles takes.
 _BYTES = 700 << 20
 
 Progress = Callable[[str, float], None]
+_Known = tuple[Kernel, KernelCache, tuple[Any, ...]]
 
 
 def prepare_kernels(
@@ -65,14 +68,17 @@ def prepare_kernels(
 
 
 def _compile(
-    jobs: Iterable[str], progress: Progress | None = None, cancelled: Callable[[], bool] | None = None
+    jobs: Iterable[str],
+    progress: Progress | None = None,
+    cancelled: Callable[[], bool] | None = None,
+    most: int | None = None,
 ) -> None:
     if cache_folder().path is None:
         return
-    missing = lacking(manifest.needed(jobs))
+    missing = _missing(manifest.needed(jobs))
     if not missing:
         return
-    with contextlib.closing(_Pool(missing)) as pool:
+    with contextlib.closing(_Pool(missing, min(processes(), most or processes()))) as pool:
         reported = 0.0
         while pool.is_working():
             if cancelled is not None and cancelled():
@@ -85,8 +91,12 @@ def _compile(
 
 def lacking(kernels: Iterable[Kernel]) -> list[Kernel]:
     """Those of some kernels that are not compiled yet and can be compiled ahead."""
+    return [kernel for kernel, _, _ in _missing(kernels)]
+
+
+def _missing(kernels: Iterable[Kernel]) -> list[_Known]:
     codegen = _codegen()
-    return [kernel for kernel, cache, signature in _known(kernels) if not cache.is_there(signature, codegen)]
+    return [known for known in _known(kernels) if not known[1].is_there(known[2], codegen)]
 
 
 def _codegen() -> Any:
@@ -95,7 +105,7 @@ def _codegen() -> Any:
     return numba.core.registry.cpu_target.target_context.codegen()
 
 
-def _known(kernels: Iterable[Kernel]) -> Iterator[tuple[Kernel, KernelCache, tuple[Any, ...]]]:
+def _known(kernels: Iterable[Kernel]) -> Iterator[_Known]:
     """Kernels that exist, with their caches and argument types; not those of packages that are not installed."""
     for kernel in kernels:
         try:
@@ -156,6 +166,8 @@ def processes() -> int:
 class _Pool:
     """Worker processes, each compiling one kernel at a time; the longest first.
 
+    What another process compiles at the same time, here or on another machine with the same folder, is left to it.
+
     Attributes
     ----------
     done : int
@@ -164,14 +176,15 @@ class _Pool:
         Part of the time of compiling them all that lies behind.
     """
 
-    def __init__(self, kernels: list[Kernel]) -> None:
-        self._left = list(reversed(kernels))
-        self._all = sum(kernel.seconds for kernel in kernels)
+    def __init__(self, kernels: list[_Known], most: int) -> None:
+        self._left, self._codegen = list(kernels), _codegen()
+        self._all = sum(kernel.seconds for kernel, _, _ in kernels)
         self.done, self.fraction = 0, 0.0
+        self._progress = time.monotonic()
         self._answers: queue.SimpleQueue[tuple[_Worker, bool]] = queue.SimpleQueue()
         self._workers: list[_Worker] = []
         try:
-            for _ in range(min(len(kernels), processes())):
+            for _ in range(min(len(kernels), most)):
                 self._workers.append(_Worker(self._answers))
                 self._give(self._workers[-1])
         except OSError as error:  # no more processes may be started
@@ -181,32 +194,49 @@ class _Pool:
             raise
 
     def is_working(self) -> bool:
-        """Whether a worker still has something to do."""
-        return any(worker.kernel is not None for worker in self._workers)
+        """Whether a worker still has something to do, or will have."""
+        return any(worker.kernel is not None or (worker.lives and self._left) for worker in self._workers)
 
     def wait(self, seconds: float) -> None:
         """Take an answer, or wait for so long."""
         try:
             worker, lives = self._answers.get(timeout=seconds)
         except queue.Empty:
-            return
-        if worker.kernel is not None:
-            self.done += lives
-            self.fraction = min(1.0, self.fraction + worker.kernel.seconds / (self._all or 1.0))
-            worker.kernel = None
-        if lives:
-            self._give(worker)
+            pass
+        else:
+            worker.lives = lives
+            if worker.kernel is not None:
+                self._count(worker.kernel, lives)
+                worker.end()
+        for worker in self._workers:
+            if worker.lives and worker.kernel is None:
+                self._give(worker)
 
     def close(self) -> None:
         """End all workers."""
         for worker in self._workers:
             worker.close()
 
+    def _count(self, kernel: Kernel, is_done: bool) -> None:
+        self.done += is_done
+        self._progress = time.monotonic()
+        self.fraction = min(1.0, self.fraction + kernel.seconds / (self._all or 1.0))
+
     def _give(self, worker: _Worker) -> None:
-        if self._left and not worker.give(self._left[-1]):
-            return
-        if self._left:
-            self._left.pop()
+        """Give a worker the longest kernel that nobody compiles or has compiled meanwhile."""
+        for known in tuple(self._left):
+            kernel, cache, signature = known
+            if cache.is_there(signature, self._codegen):
+                self._left.remove(known)
+                self._count(kernel, True)
+                continue
+            claim = cache.claim(signature, self._codegen)
+            if claim is None and time.monotonic() - self._progress > _PATIENCE:
+                claim = Claim()
+            if claim is not None:
+                if worker.give(kernel, claim):
+                    self._left.remove(known)
+                return
 
 
 class _Worker:
@@ -214,6 +244,7 @@ class _Worker:
 
     def __init__(self, answers: queue.SimpleQueue[tuple[_Worker, bool]]) -> None:
         self.kernel: Kernel | None = None
+        self.lives, self._claim = True, Claim()
         environment = os.environ | {"NUMBA_NUM_THREADS": "1"}
         if folder := cache_folder().path:
             environment["DRGS_CACHE_DIR"] = str(folder)
@@ -227,21 +258,29 @@ class _Worker:
         )
         threading.Thread(target=self._listen, args=(answers,), daemon=True).start()
 
-    def give(self, kernel: Kernel) -> bool:
+    def give(self, kernel: Kernel, claim: Claim) -> bool:
         """Have a kernel compiled; False where the process has ended."""
         assert self._process.stdin is not None
         try:
             self._process.stdin.write(json.dumps([kernel.module, kernel.name, kernel.arguments]) + "\n")
             self._process.stdin.flush()
         except OSError:
+            self.lives = False
+            claim.close()
             return False
-        self.kernel = kernel
+        self.kernel, self._claim = kernel, claim
         return True
+
+    def end(self) -> None:
+        """Note that it compiles nothing any more."""
+        self._claim.close()
+        self.kernel = None
 
     def close(self) -> None:
         """End it at once: a kernel that it is compiling is lost, nothing else."""
         self._process.kill()
         self._process.wait()
+        self.end()
 
     def _listen(self, answers: queue.SimpleQueue[tuple[_Worker, bool]]) -> None:
         assert self._process.stdout is not None
@@ -256,6 +295,7 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m drgs_blender.compute.prepare", description=__doc__.split("\n")[0])
     parser.add_argument("jobs", nargs="*", metavar="JOB", help=f"any of {', '.join(manifest.jobs())}")
     parser.add_argument("--all", action="store_true", help="of all jobs")
+    parser.add_argument("--processes", type=int, metavar="N", help="at most so many; default one per processor")
     options = parser.parse_args(argv)
     if unknown := set(options.jobs) - set(manifest.jobs()):
         parser.error(f"unknown job {', '.join(sorted(unknown))}; there are {', '.join(manifest.jobs())}")
@@ -272,7 +312,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         if cache_folder().trouble:  # which was logged
             return EXIT_CANNOT_WRITE
-        _compile(jobs, show)
+        _compile(jobs, show, most=options.processes)
         missing = lacking(manifest.needed(jobs))
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED

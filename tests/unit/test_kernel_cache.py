@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import subprocess
 import sys
@@ -478,6 +479,40 @@ def test_workers_compile_the_package_of_the_process_that_started_them(tmp_path):
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert len(kernels(tmp_path / "cache")) == 1
+
+
+def test_processes_that_compile_at_once_share_the_work(tmp_path):
+    """Each kernel is compiled once, by whichever comes first, and both end when all are there."""
+    names = "{'mix', '_look_up', '_number', '_copy_vertices', '_move_vertices', '_spread', '_modulate'}"
+    code = "from drgs_blender.compute import prepare, manifest\n"
+    code += f"kernels = [k for ks in manifest.jobs().values() for k in ks if k.name in {names}]\n"
+    code += "kernels = sorted(set(kernels), key=lambda k: k.name)\n"
+    code += "manifest.needed = lambda jobs: kernels\n"
+    code += "raise SystemExit(prepare.main(['denoise', '--processes', '1']))\n"
+    records = [tmp_path / "one", tmp_path / "two"]
+    environment = os.environ | {"DRGS_CACHE_DIR": str(tmp_path / "cache"), "DRGS_SHIPPED": "0"}
+    both = [
+        subprocess.Popen([sys.executable, "-c", code], env=environment | {"DRGS_RECORD_KERNELS": str(record)})
+        for record in records
+    ]
+    assert [process.wait(timeout=300) for process in both] == [0, 0]
+    compiled = [json.loads(line) for record in records for line in record.read_text().splitlines()]
+    compiled = [tuple(map(str, row[:3])) for row in compiled if row[3] > 0]
+    assert len(compiled) == len(set(compiled)) == len(kernels(tmp_path / "cache")) >= 6
+
+
+def test_a_claim_is_one_processes_until_it_ends(tmp_path):
+    path = tmp_path / "folder" / ".kernel.lock.tmp"
+    first = kernel_cache.Claim.of(path)
+    assert first is not None
+    if kernel_cache.fcntl is not None:
+        assert kernel_cache.Claim.of(path) is None
+    first.close()
+    second = kernel_cache.Claim.of(path)
+    assert second is not None
+    second.close()
+    (tmp_path / "file").touch()
+    assert kernel_cache.Claim.of(tmp_path / "file" / "no folder") is not None  # nothing that would keep from compiling
 
 
 def test_no_more_workers_than_processors_and_memory_allow(monkeypatch):
