@@ -86,6 +86,8 @@ class Claim:
     def close(self) -> None:
         """Give it up; the file stays, since another process may wait for it."""
         if self._file is not None:
+            with contextlib.suppress(OSError):
+                fcntl.flock(self._file, fcntl.LOCK_UN)  # a child may have the file open as well
             os.close(self._file)
             self._file = None
 

@@ -165,7 +165,7 @@ def _compile(dispatcher: Any, sig: Any) -> Any:
     arguments = tuple(sigutils.normalize_signature(sig)[0])
     known = dispatcher.overloads.get(arguments)
     if known is not None and not fits(known.library):
-        del dispatcher.overloads[arguments]
+        dispatcher.overloads.pop(arguments, None)
         known = None
     if not is_nested():
         return type(dispatcher).compile(dispatcher, sig)

@@ -20,7 +20,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from llvmlite import binding
-from numba.core import codegen, ir, postproc, transforms, types
+from numba.core import codegen, config, ir, postproc, transforms, types
 from numba.core.compiler_machinery import register_pass
 from numba.core.typed_passes import NativeLowering
 
@@ -110,7 +110,8 @@ def optimize_functions(library: Any, module: Any) -> None:
     passes.add_sroa_pass()
     passes.add_simplify_cfg_pass()
     passes.add_instruction_combine_pass()
-    passes.add_refprune_pass(codegen._parse_refprune_flags())
+    if config.LLVM_REFPRUNE_PASS:
+        passes.add_refprune_pass(codegen._parse_refprune_flags())
     for function in module.functions:
         if not function.is_declaration:
             passes.run(function, builder)
@@ -134,11 +135,8 @@ class Lowering(NativeLowering):
             state.targetctx = counting
 
 
-#: Expressions that pass on what they are made of, or a view of it.
-_VIEWS = frozenset({
-    "build_tuple", "cast", "exhaust_iter", "getattr", "getitem", "getiter", "iternext", "pair_first", "pair_second",
-    "phi", "static_getitem", "typed_getitem",
-})  # fmt: skip
+#: Expressions that pass on what they are made of.
+_VIEWS = frozenset({"build_tuple", "cast", "exhaust_iter", "getiter", "iternext", "pair_first", "pair_second", "phi"})
 
 
 def _borrows(state: Any) -> bool:
@@ -151,24 +149,36 @@ def _borrows(state: Any) -> bool:
     def counted(kind: Any) -> bool:
         return state.targetctx.data_model_manager[kind].contains_nrt_meminfo()
 
-    if counted(state.return_type) or state.func_ir.is_generator:
+    def plain(kind: Any) -> bool:
+        """Arrays and tuples of them, or nothing that is counted; no lists and strings."""
+        if isinstance(kind, types.containers.BaseTuple):
+            return all(map(plain, kind.types))
+        if isinstance(kind, types.Callable):
+            return not isinstance(kind, types.ObjModeDispatcher)
+        return isinstance(kind, types.Array) or not counted(kind)
+
+    def is_view(value: Any) -> bool:
+        if value.op == "call":
+            return isinstance(kinds[value.func.name], types.NamedTupleClass)
+        if value.op == "getattr":
+            return value.attr != "imag"
+        if value.op in ("getitem", "typed_getitem", "static_getitem"):
+            index = value.index_var if value.op == "static_getitem" else value.index
+            if isinstance(index, ir.Var) and counted(kinds[index.name]):
+                return False  # by an array: a copy
+            return value.op == "static_getitem" or isinstance(kinds[value.value.name], types.Array)
+        return value.op in _VIEWS
+
+    if counted(state.return_type) or state.func_ir.is_generator or not all(map(plain, kinds.values())):
         return False
-    for kind in kinds.values():
-        if not isinstance(kind, (types.Array, types.containers.BaseTuple, types.Callable)) and counted(kind):
-            return False  # lists, strings
     for statement in (statement for block in blocks for statement in block.body):
-        if isinstance(statement, ir.DynamicRaise):
+        if isinstance(statement, (ir.DynamicRaise, ir.Print)):
             return False
         if isinstance(statement, (ir.SetItem, ir.StaticSetItem)):
             index = getattr(statement, "index_var", None) or statement.index
-            if counted(kinds[statement.value.name]) or counted(kinds[index.name]):  # the value may have to be copied
-                return False
+            if any(isinstance(v, ir.Var) and counted(kinds[v.name]) for v in (statement.value, index)):
+                return False  # the value may have to be copied
         value = getattr(statement, "value", None)
-        if not isinstance(value, ir.Expr) or not counted(kinds[statement.target.name]):
-            continue
-        if value.op == "call":
-            if not isinstance(kinds[value.func.name], types.NamedTupleClass):
-                return False
-        elif value.op not in _VIEWS or (value.op in ("getitem", "typed_getitem") and counted(kinds[value.index.name])):
+        if isinstance(value, ir.Expr) and counted(kinds[statement.target.name]) and not is_view(value):
             return False
     return True

@@ -232,7 +232,7 @@ class _Pool:
                 continue
             claim = cache.claim(signature, self._codegen)
             if claim is None and time.monotonic() - self._progress > _PATIENCE:
-                claim = Claim()
+                claim, self._progress = Claim(), time.monotonic()
             if claim is not None:
                 if worker.give(kernel, claim):
                     self._left.remove(known)

@@ -13,7 +13,7 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import cache
 from typing import Any
 
@@ -83,12 +83,15 @@ def over_range(kernel: Callable[..., Any], count: int, *arguments: Any, fewest: 
         for first in pieces:
             results[first // size] = kernel(first, min(first + size, count), *arguments)
 
-    others = [_pool(threads).submit(work) for _ in range(min(threads, len(starts)) - 1)]
+    others: list[Future[None]] = []
     try:
+        for _ in range(min(threads, len(starts)) - 1):
+            others.append(_pool(threads).submit(work))
         work()
     finally:
-        wait(others)
-    for other in others:
+        begun = [other for other in others if not other.cancel()]  # threads may be at work for another call
+        wait(begun)
+    for other in begun:
         other.result()
     return results
 

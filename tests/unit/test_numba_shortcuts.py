@@ -178,6 +178,73 @@ def test_ways_to_make_arrays_without_a_call(function, counted) -> None:
         assert stats.alloc - begun.alloc == stats.free - begun.free
 
 
+_ORDER = np.array([2, 0, 1])
+
+
+@njit(cache=False)
+def _changes_index(pair):
+    i = 0
+    a = pair[i]
+    i = 1
+    b = pair[i]
+    return a[0] + b[0, 0]
+
+
+@njit(cache=False)
+def _lends(n):
+    return _changes_index((np.ones(n), np.ones((n, n))))
+
+
+@njit(cache=False)
+def _reorders(n):
+    return _reordered(np.arange(float(n)))
+
+
+@njit(cache=False)
+def _reordered(a):
+    b = a[_ORDER]
+    return b[0] + a.imag[1]
+
+
+@pytest.mark.parametrize(("function", "result"), [(_lends, 2.0), (_reorders, 2.0)])
+def test_what_looks_like_a_view_and_is_not_is_freed(function, result, counted) -> None:
+    assert function(5) == result
+    begun = rtsys.get_allocation_stats()
+    for _ in range(20):
+        function(5)
+    stats = rtsys.get_allocation_stats()
+    assert stats.alloc - begun.alloc == stats.free - begun.free > 0
+
+
+class Named(NamedTuple):
+    """An array with a text."""
+
+    name: str
+    a: np.ndarray
+
+
+def test_texts_in_records_and_prints(capfd) -> None:
+    """A text that comes with arrays is released; what is printed is the view, not the array that it is of."""
+
+    @njit(cache=False)
+    def first(named):
+        return named.a[0]
+
+    @njit(cache=False)
+    def shows(a):
+        print(a[1])
+
+    text = "".join(["a text", " of its own"])
+    named = Named(text, np.ones(3))
+    assert first(named) == 1.0
+    held = sys.getrefcount(text)
+    for _ in range(50):
+        first(named)
+    assert sys.getrefcount(text) == held
+    shows(np.arange(6.0).reshape(2, 3))
+    assert capfd.readouterr().out.strip() == "[3. 4. 5.]"
+
+
 def test_what_a_kernel_returns_outlives_its_arguments() -> None:
     row = _row(Pair(np.full((2, 1000), 7.0), np.zeros(1)), 1)
     gc.collect()

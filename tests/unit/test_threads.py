@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -58,3 +59,25 @@ def test_two_threads_may_ask_at_once():
     for thread in asking:
         thread.join()
     assert all((s == 1).all() for s in seen)
+
+
+def test_calls_within_calls_end(monkeypatch):
+    """Pool threads that wait for pool threads would wait for ever."""
+    monkeypatch.setattr("drgs_blender.compute.threads.get_num_threads", lambda: 2)
+    ended = []
+
+    def level(depth):
+        def kernel(first, last):
+            time.sleep(0.001)  # the other thread takes something
+            if depth:
+                over_range(level(depth - 1), 8)
+            else:
+                ended.append(last - first)
+
+        return kernel
+
+    calling = threading.Thread(target=over_range, args=(level(2), 8), daemon=True)
+    calling.start()
+    calling.join(60)
+    assert not calling.is_alive()
+    assert sum(ended) == 8**3
