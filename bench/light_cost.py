@@ -358,14 +358,7 @@ def main(arguments: list[str]) -> None:
     task, *rest = arguments
     if task == "threads":
         stage = Stage.of(CASE, read_asset(CASE.files[0]).mesh, int(rest[0]))
-        print(
-            json.dumps(
-                {
-                    "integrator": stage.seconds(),
-                    "plain": median_seconds(plain_loop),
-                }
-            )
-        )
+        print(json.dumps({"integrator": stage.seconds(), "plain": median_seconds(plain_loop)}))
     elif task == "memory":
         print(json.dumps(large_frame(Path(rest[0]), int(rest[1]), int(rest[2]))))
 

@@ -86,13 +86,9 @@ def _list_vars(self: Any, value: Any) -> list[Any]:
         return []
     if kind is dict:
         return [variable for part in value.values() for variable in _list_vars(self, part)]
-    if kind is tuple or kind is list:
-        return [variable for part in value for variable in _list_vars(self, part)]
-    if isinstance(value, ir.Inst):
-        return value.list_vars()
     if isinstance(value, (list, tuple)):
         return [variable for part in value for variable in _list_vars(self, part)]
-    return []
+    return value.list_vars() if isinstance(value, ir.Inst) else []
 
 
 def optimize_functions(library: Any, module: Any) -> None:

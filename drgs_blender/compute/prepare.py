@@ -1,6 +1,6 @@
 """Ahead-of-time compilation of the kernels that jobs need, in as many processes as there are processors.
 
-python -m drgs_blender.compute.prepare [--all | JOB ...] [--processes N]
+python -m drgs_blender.compute.prepare [--all | JOB ...]
 """
 
 from __future__ import annotations
@@ -71,14 +71,13 @@ def _compile(
     jobs: Iterable[str],
     progress: Progress | None = None,
     cancelled: Callable[[], bool] | None = None,
-    most: int | None = None,
 ) -> None:
     if cache_folder().path is None:
         return
     missing = _missing(manifest.needed(jobs))
     if not missing:
         return
-    with contextlib.closing(_Pool(missing, min(processes(), most or processes()))) as pool:
+    with contextlib.closing(_Pool(missing)) as pool:
         reported = 0.0
         while pool.is_working():
             if cancelled is not None and cancelled():
@@ -176,7 +175,7 @@ class _Pool:
         Part of the time of compiling them all that lies behind.
     """
 
-    def __init__(self, kernels: list[_Known], most: int) -> None:
+    def __init__(self, kernels: list[_Known]) -> None:
         self._left, self._codegen = list(kernels), _codegen()
         self._all = sum(kernel.seconds for kernel, _, _ in kernels)
         self.done, self.fraction = 0, 0.0
@@ -184,7 +183,7 @@ class _Pool:
         self._answers: queue.SimpleQueue[tuple[_Worker, bool]] = queue.SimpleQueue()
         self._workers: list[_Worker] = []
         try:
-            for _ in range(min(len(kernels), most)):
+            for _ in range(min(len(kernels), processes())):
                 self._workers.append(_Worker(self._answers))
                 self._give(self._workers[-1])
         except OSError as error:  # no more processes may be started
@@ -295,7 +294,6 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m drgs_blender.compute.prepare", description=__doc__.split("\n")[0])
     parser.add_argument("jobs", nargs="*", metavar="JOB", help=f"any of {', '.join(manifest.jobs())}")
     parser.add_argument("--all", action="store_true", help="of all jobs")
-    parser.add_argument("--processes", type=int, metavar="N", help="at most so many; default one per processor")
     options = parser.parse_args(argv)
     if unknown := set(options.jobs) - set(manifest.jobs()):
         parser.error(f"unknown job {', '.join(sorted(unknown))}; there are {', '.join(manifest.jobs())}")
@@ -312,7 +310,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         if cache_folder().trouble:  # which was logged
             return EXIT_CANNOT_WRITE
-        _compile(jobs, show, most=options.processes)
+        _compile(jobs, show)
         missing = lacking(manifest.needed(jobs))
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED

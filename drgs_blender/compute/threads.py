@@ -21,6 +21,8 @@ from .jit import numba
 
 #: Pieces per thread, so that threads that are done early have something to take.
 _PIECES = 8
+#: Lanes per thread: few, since each may make scratch memory.
+_LANES = 4
 #: Fewest rows of a picture in a piece, because handing one over costs as much as some of them.
 ROWS = 24
 #: The same of elements of arrays: vertices, faces, surfels.
@@ -96,4 +98,22 @@ def over_range(kernel: Callable[..., Any], count: int, *arguments: Any, fewest: 
     return results
 
 
-__all__ = ["ELEMENTS", "ROWS", "get_num_threads", "over_range", "use_threads"]
+def over_lanes(kernel: Callable[..., Any], most: int, *arguments: Any) -> None:
+    """Call ``kernel(first, last, lanes, *arguments)`` for pieces of 0 .. `lanes`; a lane is every `lanes`-th item.
+
+    For items of which neighbours cost alike: no thread is left with all the costly ones.
+
+    Parameters
+    ----------
+    kernel : callable
+        As of `over_range`.
+    most : int
+        Number of items: there are no more lanes.
+    *arguments : object
+        The same for every piece.
+    """
+    lanes = min(most, _LANES * get_num_threads())
+    over_range(kernel, lanes, lanes, *arguments)
+
+
+__all__ = ["ELEMENTS", "ROWS", "get_num_threads", "over_lanes", "over_range", "use_threads"]

@@ -488,7 +488,8 @@ def test_processes_that_compile_at_once_share_the_work(tmp_path):
     code += f"kernels = [k for ks in manifest.jobs().values() for k in ks if k.name in {names}]\n"
     code += "kernels = sorted(set(kernels), key=lambda k: k.name)\n"
     code += "manifest.needed = lambda jobs: kernels\n"
-    code += "raise SystemExit(prepare.main(['denoise', '--processes', '1']))\n"
+    code += "prepare.processes = lambda: 1\n"
+    code += "raise SystemExit(prepare.main(['denoise']))\n"
     records = [tmp_path / "one", tmp_path / "two"]
     environment = os.environ | {"DRGS_CACHE_DIR": str(tmp_path / "cache"), "DRGS_SHIPPED": "0"}
     both = [

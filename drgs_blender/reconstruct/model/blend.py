@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...compute.jit import inlined, njit
-from ...compute.threads import get_num_threads, over_range
+from ...compute.threads import over_lanes
 from ...render.surfels.raster import MAX_ALPHA, gaussian
 from ...render.surfels.splats import TILE
 from .projection import LOW_PASS, splat_of
@@ -173,13 +173,7 @@ def _blend_tile(splats, tiles, tile, state, is_open, maps):  # type: ignore[no-u
 
 def blend(splats: Splats, tiles: Tiles, maps: Array) -> None:
     """Fill the maps (h, w, state rows and features)."""
-    workers = workers_of(tiles)
-    over_range(_blend_tiles, workers, workers, splats, tiles, maps)
-
-
-def workers_of(tiles: Tiles) -> int:
-    """Parts in which tiles are worked off, each every so many-th: neighbours cost alike."""
-    return min(4 * get_num_threads(), len(tiles.start) - 1)
+    over_lanes(_blend_tiles, len(tiles.start) - 1, splats, tiles, maps)
 
 
 @njit

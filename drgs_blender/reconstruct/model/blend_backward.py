@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...compute.jit import inlined, njit
-from ...compute.threads import over_range
+from ...compute.threads import over_lanes
 from ...render.surfels.raster import MAX_ALPHA, gaussian
 from ...render.surfels.splats import TILE
 from .blend import (
@@ -23,7 +23,6 @@ from .blend import (
     blocks_of,
     open_blocks,
     strength,
-    workers_of,
 )
 from .projection import I0, IX, IY, LOW_PASS, OPACITY, PARAMETERS, RX, RY, UX, UY, VX, VY, splat_of
 
@@ -205,8 +204,7 @@ def blend_backward(splats: Splats, tiles: Tiles, maps: Array, incoming: Array, s
     slots : (entries of all tiles, BEFORE + channels) float32 array
         Written.
     """
-    workers = workers_of(tiles)
-    over_range(_blend_tiles_backward, workers, workers, splats, tiles, maps, incoming, slots)
+    over_lanes(_blend_tiles_backward, len(tiles.start) - 1, splats, tiles, maps, incoming, slots)
 
 
 @njit

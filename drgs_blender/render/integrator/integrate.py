@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...compute.jit import njit
-from ...compute.threads import get_num_threads, over_range
+from ...compute.threads import over_lanes
 from ...core.color import LUMINANCE
 from ...core.errors import UsageError
 from ...core.frame import RenderSettings
@@ -57,8 +57,7 @@ class Kernel:
     ) -> None:
         """Shade all points; see `shade_points`."""
         blocks = -(-len(points.pixel) // _BLOCK)
-        lanes = min(blocks, 4 * get_num_threads())  # few: each makes scratch memory
-        over_range(_kernel, lanes, lanes, points, scene, settings, sampler, out)
+        over_lanes(_kernel, blocks, points, scene, settings, sampler, out)
 
 
 def integrate(
