@@ -58,7 +58,8 @@ def steps(out: Path, frames: str) -> list[Step]:
         environments.kernels("kernels", "import", seconds=12.0),
         environments.kernels("more kernels", "frame", "denoise", seconds=32.0, after="kernels"),
         asset("robot", EXAMPLES / "robot/RobotExpressive.glb", 2.0),
-        asset("helmet", EXAMPLES / "helmet/FlightHelmet.gltf", 8.0),
+        # A prop of a hundred pixels: its own triangles will do, and surfels of a pixel each.
+        asset("helmet", EXAMPLES / "helmet/FlightHelmet.gltf", 5.0, "--max-triangles=100000", "--density=80"),
         asset("playbot", EXAMPLES / "playbot/playbot.ply", 10.0, "--up=-y", command="import", after="kernels"),
         Step("extension", "Building the extension", building, 0.5, (environments.FOR_ENGINE,)),
         Step("scene", "Setting the scene", setting, 4.0, (*assets, "extension", *blenders), scene, of_scene),
