@@ -62,6 +62,12 @@ class EntryLibrary(codegen.JITCodeLibrary):
     def _optimize_functions(self, ll_module: Any) -> None:
         numba_shortcuts.optimize_functions(self, ll_module)
 
+    def add_linking_library(self, library: Any) -> None:
+        """Note a library that is called, and those that it calls itself, each once."""
+        library._ensure_finalized()
+        called = library._linking_libraries if isinstance(library, InnerLibrary) else ()
+        self._linking_libraries = list(dict.fromkeys((*self._linking_libraries, library, *called)))
+
     def _optimize_final_module(self) -> None:
         """Optimise; what was linked in is this library's alone.
 
@@ -75,14 +81,23 @@ class EntryLibrary(codegen.JITCodeLibrary):
 
 
 class InnerLibrary(EntryLibrary):
-    """Code that is only linked into other libraries: not optimised by itself, never made machine code of."""
+    """Code that is only linked into other libraries: not optimised by itself, never made machine code of.
 
-    def _optimize_final_module(self) -> None:
-        pass
+    What it calls is not linked into it but, each once, into the library that Python calls.
+    """
 
-    def _finalize_final_module(self) -> None:
+    def finalize(self) -> None:
+        """End it: nothing is added any more."""
+        for library in self._linking_libraries:
+            self._reload_init.update(library._reload_init)
+        for function in self._final_module.functions:
+            if not function.is_declaration and function.linkage == binding.Linkage.external:
+                function.linkage = "weak_odr"
         self._finalize_dynamic_globals()
         self._finalized = True
+
+    def _get_module_for_linking(self) -> Any:
+        return self._final_module
 
     def get_pointer_to_function(self, name: str) -> int:
         """None: nothing calls it but compiled code."""

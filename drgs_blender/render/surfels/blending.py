@@ -153,9 +153,10 @@ def widen(lists):  # type: ignore[no-untyped-def]
     room, wider = lists.room, contributions(2 * lists.room)
     for lane in range(LANES):
         old, new = room * lane, 2 * room * lane
-        wider.depth[new : new + room] = lists.depth[old : old + room]
-        wider.strength[new : new + room] = lists.strength[old : old + room]
-        wider.splat[new : new + room] = lists.splat[old : old + room]
+        for k in range(room):  # assigning slices would take a second to compile
+            wider.depth[new + k] = lists.depth[old + k]
+            wider.strength[new + k] = lists.strength[old + k]
+            wider.splat[new + k] = lists.splat[old + k]
     return wider
 
 
