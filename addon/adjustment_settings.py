@@ -29,13 +29,13 @@ def _masks(settings: DrgsAdjustmentSettings, context: bpy.types.Context, typed: 
     return mesh_arrays.mask_names(obj, typed) if obj.type == "MESH" else []
 
 
-def _tag_changed(settings: DrgsAdjustmentSettings, context: bpy.types.Context) -> None:
-    """Have viewports and exports see a change that a script made; those in the interface they see anyway."""
+def tag_changed(settings: bpy.types.PropertyGroup, context: bpy.types.Context) -> None:
+    """Update callback: tag the object, so that viewports and exports see changes made by scripts, too."""
     settings.id_data.update_tag(refresh={"OBJECT"})
 
 
 def _number(label: str, about: str, **limits: float) -> FloatProperty:
-    return FloatProperty(name=label, description=about, precision=3, step=1, update=_tag_changed, **limits)
+    return FloatProperty(name=label, description=about, precision=3, step=1, update=tag_changed, **limits)
 
 
 class DrgsAdjustmentSettings(bpy.types.PropertyGroup):
@@ -45,7 +45,7 @@ class DrgsAdjustmentSettings(bpy.types.PropertyGroup):
         name="Adjustments",
         description="Apply the adjustments; switched off, the object is as it was before them",
         default=True,
-        update=_tag_changed,
+        update=tag_changed,
     )
     tint: FloatVectorProperty(
         name="Tint",
@@ -56,7 +56,7 @@ class DrgsAdjustmentSettings(bpy.types.PropertyGroup):
         soft_max=1.0,
         max=10.0,
         default=(1.0, 1.0, 1.0),
-        update=_tag_changed,
+        update=tag_changed,
     )
     hue: FloatProperty(
         name="Hue",
@@ -65,7 +65,7 @@ class DrgsAdjustmentSettings(bpy.types.PropertyGroup):
         soft_min=-math.pi,
         soft_max=math.pi,
         default=0.0,
-        update=_tag_changed,
+        update=tag_changed,
     )
     saturation: _number(
         "Saturation", "Factor on the albedo's saturation; 0 is grey", min=0.0, soft_max=2.0, default=1.0
@@ -83,11 +83,9 @@ class DrgsAdjustmentSettings(bpy.types.PropertyGroup):
         name="Mask",
         description="Vertex group or point attribute that limits the adjustments by its values; empty is everywhere",
         search=_masks,
-        update=_tag_changed,
+        update=tag_changed,
     )
-    use_invert: BoolProperty(
-        name="Invert", description="Adjust where the mask is 0", default=False, update=_tag_changed
-    )
+    use_invert: BoolProperty(name="Invert", description="Adjust where the mask is 0", default=False, update=tag_changed)
 
     def values(self) -> tuple[object, ...]:
         """All settings, to be compared; () where they change nothing."""
@@ -100,7 +98,7 @@ class DrgsAdjustmentSettings(bpy.types.PropertyGroup):
             self.property_unset(name)
         self.id_data.update_tag(refresh={"OBJECT"})
 
-    def take(self, other: DrgsAdjustmentSettings) -> None:
+    def copy_from(self, other: DrgsAdjustmentSettings) -> None:
         """Have the values of another object's."""
         for name in ("use", "tint", *NUMBERS, "mask", "use_invert"):
             setattr(self, name, getattr(other, name))

@@ -164,7 +164,7 @@ def _path_of(obj: bpy.types.Object, modifier: bpy.types.Modifier) -> Path:
     return Path(bpy.path.abspath(modifier.filepath, library=obj.library))
 
 
-def look_of(obj: bpy.types.Object) -> dict[str, Any]:
+def fracture_state(obj: bpy.types.Object) -> dict[str, Any]:
     """`tear` and `grain` of the played mesh, see `frame.ObjectState`; empty where nothing is played."""
     modifier, physics = modifier_of(obj), obj.drgs.physics
     if modifier is None:

@@ -45,7 +45,7 @@ _client: EngineClient | None = None
 statistics: dict[str, float] = {}
 
 
-def own_folder(create: bool = False) -> Path:
+def engine_folder(create: bool = False) -> Path:
     """The environment that Set Up Engine makes."""
     return Path(bpy.utils.extension_path_user(preferences.ROOT, path="engine", create=create))
 
@@ -61,7 +61,7 @@ def command_line() -> list[str]:
     named = bpy.path.abspath(preferences.read("engine_python", ""))
     if named or os.environ.get(VARIABLE):
         return locate_engine(named or None)
-    folder = own_folder()
+    folder = engine_folder()
     found = engine_environment.state(folder)
     if found == "ready":
         return locate_engine(engine_environment.interpreter(folder))
@@ -92,7 +92,7 @@ def drgs_command() -> list[str]:
 def lacks_reconstruction() -> bool:
     """Whether the engine in use is the one that was set up here, without what reconstruction needs. Starts nothing."""
     named = preferences.read("engine_python", "") or os.environ.get(VARIABLE)
-    folder = own_folder()
+    folder = engine_folder()
     ready = not named and engine_environment.state(folder) == "ready"
     return ready and engine_environment.needs_network(folder, group=engine_environment.RECONSTRUCT)
 

@@ -132,7 +132,7 @@ class EngineSetup:
         except OSError as error:
             raise DeviceError(str(folder), f"cannot be made ({error})", "Check its permissions") from error
         self._steps = self._plan(python, afresh, missing, index)
-        self._whole = sum(s.weight for s in self._steps)
+        self._total_weight = sum(s.weight for s in self._steps)
         self._next()
 
     def poll(self) -> bool:
@@ -150,13 +150,13 @@ class EngineSetup:
                 raise OSError(self._reason(code)[:300])
             step.then()
         except OSError as error:
-            if not self._forgiven(step, error):
+            if not self._continues_without(step, error):
                 return True
         self.fraction = self._began + self._share
         self._next()
         return self.done
 
-    def _forgiven(self, step: Step, error: OSError) -> bool:
+    def _continues_without(self, step: Step, error: OSError) -> bool:
         """Whether the set-up goes on without what a step was for; else it has failed."""
         problem = f"{step.text} failed: {error}"
         if step.needed:
@@ -172,8 +172,8 @@ class EngineSetup:
             if unreached := _UNREACHED.search(line):
                 kind = unreached[2] or unreached[3]
                 return f"the package index does not answer ({kind})"
-        said = next((t for t in reversed(self._tail) if _REASON.search(t)), None)
-        return said or " ".join(self._tail[-2:]) or f"exit code {code}"
+        reason = next((t for t in reversed(self._tail) if _REASON.search(t)), None)
+        return reason or " ".join(self._tail[-2:]) or f"exit code {code}"
 
     def cancel(self) -> None:
         """End the command under way and all it started. What was finished stays."""
@@ -228,7 +228,7 @@ class EngineSetup:
             return
         step = self._steps[0]
         self.text, self._tail, self._began = step.text, [], self.fraction
-        self._share = step.weight / self._whole
+        self._share = step.weight / self._total_weight
         self.fetched = self._package_bytes = 0.0
         try:
             step.before()
@@ -247,7 +247,7 @@ class EngineSetup:
                     creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
                 )
         except OSError as error:
-            if self._forgiven(step, error):
+            if self._continues_without(step, error):
                 self._steps.pop(0)
                 self._next()
 

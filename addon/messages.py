@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 log = logging.getLogger("drgs")
 
-KEPT = 50
+MAX_MESSAGES = 50
 
 
 class Message(NamedTuple):
@@ -26,7 +26,7 @@ class Message(NamedTuple):
 
 
 #: Newest last.
-history: deque[Message] = deque(maxlen=KEPT)
+history: deque[Message] = deque(maxlen=MAX_MESSAGES)
 
 
 def note(level: str, text: str) -> None:

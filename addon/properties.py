@@ -11,7 +11,7 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, Po
 from ..drgs_blender.core.frame import RenderSettings
 from ..drgs_blender.core.passes import PASSES, Pass
 from . import mesh_display
-from .adjustment_settings import DrgsAdjustmentSettings
+from .adjustment_settings import DrgsAdjustmentSettings, tag_changed
 from .physics_settings import DrgsPhysicsSettings
 from .property_limits import Limited
 from .submit import DrgsSubmitSettings
@@ -272,11 +272,6 @@ class DrgsViewLayerSettings(bpy.types.PropertyGroup):
     )
 
 
-def _tag_changed(group: DrgsObjectSettings, context: bpy.types.Context) -> None:
-    """Have viewports see a change that a script made."""
-    group.id_data.update_tag(refresh={"OBJECT"})
-
-
 def _get_path(group: DrgsObjectSettings) -> str:
     return group.asset.filepath if group.asset else ""
 
@@ -312,7 +307,7 @@ class DrgsObjectSettings(bpy.types.PropertyGroup):
         description="Before and after: render the object with the material of its asset, without what is painted, "
         "preset or adjusted. Nothing of that is lost",
         default=False,
-        update=_tag_changed,
+        update=tag_changed,
     )
     physics: PointerProperty(
         type=DrgsPhysicsSettings, name="Physics", description="The simulation of the object and its material"

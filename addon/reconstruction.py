@@ -29,9 +29,9 @@ class Reconstruction:
         self.out, self.part, self.text, self.cancelled = out, 0.0, "Reading the photographs", False
         self._shown = 0
 
-    def follow(self, said: str) -> None:
+    def follow(self, output: str) -> None:
         """Take in what the program has said so far."""
-        found = _LINE.findall(said)
+        found = _LINE.findall(output)
         if found:
             part, surfels, psnr, phase = found[-1]
             self.part = float(part)

@@ -32,7 +32,7 @@ def start(python: Path, afresh: bool = False, extras: Sequence[Group] = (), inde
     """
     global job
     engine_link.stop()  # Windows does not let go of files in use
-    job = EngineSetup(engine_link.own_folder(create=True), python, afresh=afresh, extras=extras, index=index)
+    job = EngineSetup(engine_link.engine_folder(create=True), python, afresh=afresh, extras=extras, index=index)
     messages.note("INFO", f"Setting up the engine in {job.folder}")
     if not bpy.app.background and not bpy.app.timers.is_registered(follow):
         bpy.app.timers.register(follow, first_interval=INTERVAL, persistent=True)

@@ -123,12 +123,12 @@ class Submission:
             [Path(bpy.path.abspath(settings.folder)).absolute() / JOB_FILES[settings.manager]]
         )
         no_window = getattr(subprocess, "CREATE_NO_WINDOW", 0)  # Windows alone has it
-        self._said, self._log = tempfile.TemporaryFile(), tempfile.TemporaryFile()  # noqa: SIM115 - until it has ended
+        self._stdout, self._log = tempfile.TemporaryFile(), tempfile.TemporaryFile()  # noqa: SIM115 - until it has ended
         try:
             self._process = subprocess.Popen(
                 words,
                 stdin=subprocess.DEVNULL,
-                stdout=self._said,
+                stdout=self._stdout,
                 stderr=self._log,
                 env=clean_environment(),
                 creationflags=no_window,
@@ -157,7 +157,7 @@ class Submission:
             self.text = "Cancelled"
 
     def _finish(self) -> None:
-        said, log = (self._read(stream) for stream in (self._said, self._log))
+        said, log = (self._read(stream) for stream in (self._stdout, self._log))
         marks = ("note ", "missing ")
         self.notes = [line.partition(" ")[2].strip() for line in said if line.startswith(marks)]
         missing = self._expected.missing()

@@ -132,7 +132,7 @@ class Run:
         return began
 
     def shown(self):
-        return self.views._shown.get(self.name) or self.views.ViewportState()
+        return self.views._viewports.get(self.name) or self.views.ViewportState()
 
     def finished(self) -> bool:
         picture = self.shown().picture

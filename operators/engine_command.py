@@ -37,11 +37,11 @@ class CommandOperator(DrgsOperator):
         """What follows the work; returns what execute returns."""
         return {"FINISHED"}
 
-    def state(self, said: str) -> str:
-        """How far the work is, of all that the program has said; asked now and then."""
+    def state(self, output: str) -> str:
+        """Progress for the status bar, from all output of the program so far."""
         return ""
 
-    def follow(self, context: bpy.types.Context, said: str) -> None:
+    def follow(self, context: bpy.types.Context, output: str) -> None:
         """Called now and then while the program works beside a window, with all its output."""
 
     def stopped(self, event: bpy.types.Event) -> bool:
@@ -90,7 +90,7 @@ class CommandOperator(DrgsOperator):
         Parameters
         ----------
         subject : what messages are about
-        status : what the status bar says meanwhile
+        status : text of the status bar meanwhile
         failure : what became of the subject where the program fails: "could not be ..."
         files : that it writes
         """
@@ -117,7 +117,7 @@ class CommandOperator(DrgsOperator):
         if event.type != "TIMER":
             return {"PASS_THROUGH"}
         if self.process.poll() is None:
-            self.follow(context, self._said())
+            self.follow(context, self._read_output())
             return {"PASS_THROUGH"}
         self._release(context)
         return self.guard(self._finish, context)
@@ -131,7 +131,7 @@ class CommandOperator(DrgsOperator):
             except subprocess.TimeoutExpired:
                 self._process.kill()
                 self._process.wait()
-            self._said(last=True)
+            self._read_output(last=True)
             self._release(context)
             self.clear()
 
@@ -162,33 +162,33 @@ class CommandOperator(DrgsOperator):
                 self.process.wait(_REPORT_EVERY)
                 return
             except subprocess.TimeoutExpired:
-                state = self.state(self._said())
+                state = self.state(self._read_output())
             if state != shown:
-                say(shown := state)
+                print_line(shown := state)
 
-    def _said(self, last: bool = False) -> str:
-        """What the program has said; when it has ended, for the last time."""
+    def _read_output(self, last: bool = False) -> str:
+        """All output of the program so far; `last` removes the log, after the program has ended."""
         assert self._log is not None, "only after `start`"
-        said = self._log.read_text(encoding="utf-8", errors="replace")
+        output = self._log.read_text(encoding="utf-8", errors="replace")
         if last:
             assert self.process.stdin is not None, "it was made a pipe"
             self.process.stdin.close()
             with contextlib.suppress(OSError):  # Windows lets go of it late
                 self._log.unlink()
-        return said
+        return output
 
     def _finish(self, context: bpy.types.Context) -> set[str]:
-        """Tell what the program said, and go on, or say why it could not do its work."""
-        lines = [line for line in self._said(last=True).strip().splitlines() if not line.startswith("DRGS_")]
+        """Report the output of the ended program, then go on, or raise its error."""
+        lines = [line for line in self._read_output(last=True).strip().splitlines() if not line.startswith("DRGS_")]
         try:
             if self.process.returncode:
-                said = [line for line in lines if line.startswith("drgs: ")] or lines
-                reason = said[-1].removeprefix("drgs: ") if said else f"exit code {self.process.returncode}"
+                errors = [line for line in lines if line.startswith("drgs: ")] or lines
+                reason = errors[-1].removeprefix("drgs: ") if errors else f"exit code {self.process.returncode}"
                 raise AssetError(self._subject, f"{self._failure}: {reason.rstrip('.')}", "")
             for line in lines:
                 messages.note("INFO", line)
                 if bpy.app.background:
-                    say(line)
+                    print_line(line)
             if missing := self._expected.missing():
                 problem = f"{self._failure}: {output_check.complaint(self._program, missing)}"
                 raise EngineError(self._subject, problem, output_check.REMEDY)
@@ -203,7 +203,7 @@ class CommandOperator(DrgsOperator):
             self._timer = None
 
 
-def say(text: str) -> None:
-    """A line for the terminal of a Blender without a window."""
+def print_line(text: str) -> None:
+    """Print a line, for a Blender without a window."""
     sys.stdout.write(f"{text}\n")
     sys.stdout.flush()

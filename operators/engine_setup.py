@@ -16,7 +16,7 @@ from ..addon import engine_environment, engine_link, preferences, setup_job
 from ..drgs_blender.core.errors import UsageError
 from ..drgs_blender.ipc.locate import VARIABLE, locate_engine
 from .base import DrgsOperator
-from .engine_command import say
+from .engine_command import print_line
 
 
 class DRGS_OT_engine_setup(DrgsOperator, bpy.types.Operator):
@@ -66,7 +66,7 @@ class DRGS_OT_engine_setup(DrgsOperator, bpy.types.Operator):
         return True
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        folder = engine_link.own_folder()
+        folder = engine_link.engine_folder()
         if engine_environment.state(folder) != "absent":
             self.reconstruct = self.reconstruct or not self._missing(engine_environment.RECONSTRUCT)
             self.gpu = self.gpu or not self._missing(engine_environment.GPU)
@@ -74,7 +74,7 @@ class DRGS_OT_engine_setup(DrgsOperator, bpy.types.Operator):
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
-        folder = engine_link.own_folder()
+        folder = engine_link.engine_folder()
         state = engine_environment.state(folder)
         text = {
             "absent": "Makes a Python environment for the engine. The folder is",
@@ -116,7 +116,7 @@ class DRGS_OT_engine_setup(DrgsOperator, bpy.types.Operator):
 
     def _missing(self, group: engine_environment.Group) -> bool:
         """Whether it is to be fetched."""
-        return self.afresh or engine_environment.needs_network(engine_link.own_folder(), group=group)
+        return self.afresh or engine_environment.needs_network(engine_link.engine_folder(), group=group)
 
     def run(self, context: bpy.types.Context) -> set[str]:
         if any(map(self._missing, self._groups())) and not bpy.app.online_access:
@@ -134,11 +134,11 @@ class DRGS_OT_engine_setup(DrgsOperator, bpy.types.Operator):
         if os.environ.get(VARIABLE):
             self.warn(f"The variable {VARIABLE} names another engine, which is used as long as it is set")
         if bpy.app.background:
-            said = ""
+            printed = ""
             while setup_job.follow() is not None:
-                if job.text != said:
-                    said = job.text
-                    say(f"Set Up Engine: {said}")
+                if job.text != printed:
+                    printed = job.text
+                    print_line(f"Set Up Engine: {printed}")
                 time.sleep(setup_job.INTERVAL)
             if job.error is not None:
                 raise job.error

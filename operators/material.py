@@ -162,7 +162,7 @@ class DRGS_OT_copy_material(DrgsOperator, selection.ObjectMode, bpy.types.Operat
             for channel, own in values.items():
                 copied = np.einsum("nc,nc...->n...", match.barycentric, own[match.corners])
                 mesh_arrays.write_channel(obj.data, channel, copied)
-            obj.drgs.adjustment.take(source.drgs.adjustment)
+            obj.drgs.adjustment.copy_from(source.drgs.adjustment)
         return {"FINISHED"}
 
 

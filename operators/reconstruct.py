@@ -129,13 +129,13 @@ class DRGS_OT_reconstruct(CommandOperator, bpy.types.Operator):
     def stopped(self, event: bpy.types.Event) -> bool:
         return _job().cancelled  # Esc may be meant for anything else in so many minutes
 
-    def state(self, said: str) -> str:
+    def state(self, output: str) -> str:
         job = _job()
-        job.follow(said)
+        job.follow(output)
         return f"{self._subject}: {job.text}, {job.part:.0%}"
 
-    def follow(self, context: bpy.types.Context, said: str) -> None:
-        context.workspace.status_text_set(f"{self.state(said)}. Cancel is in the sidebar")
+    def follow(self, context: bpy.types.Context, output: str) -> None:
+        context.workspace.status_text_set(f"{self.state(output)}. Cancel is in the sidebar")
         _redraw(context)
 
     def done(self, context: bpy.types.Context) -> set[str]:

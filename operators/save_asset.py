@@ -10,7 +10,7 @@ import bpy
 from bpy.props import BoolProperty, StringProperty
 
 from ..addon import assets, mesh_arrays, messages
-from ..addon.export.objects import look_of
+from ..addon.export.objects import appearance_of
 from ..drgs_blender.core.asset import MATERIAL_CHANNELS
 from ..drgs_blender.core.asset.container import write_asset
 from ..drgs_blender.core.errors import UsageError
@@ -86,7 +86,7 @@ def save(obj: bpy.types.Object, path: Path, depsgraph: bpy.types.Depsgraph) -> N
     """
     source = assets.file_of(obj)
     asset = assets.load(source)
-    painted, adjustment = look_of(obj.evaluated_get(depsgraph), asset, messages.Warnings())
+    painted, adjustment = appearance_of(obj.evaluated_get(depsgraph), asset, messages.Warnings())
     edited = edited_asset(asset, painted, adjustment)
     write_asset(path, replace(edited, provenance={**asset.provenance, "edited_from": source.name}))
 

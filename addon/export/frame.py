@@ -36,7 +36,7 @@ def export_frame(
     camera: Camera | None = None,
     frame_set: FrameSet | None = None,
     cache: ExportCache | None = None,
-    shown: Callable[[bpy.types.Object], bool] | None = None,
+    is_visible: Callable[[bpy.types.Object], bool] | None = None,
     passes: tuple[str, ...] | None = None,
     cancelled: Callable[[], bool] | None = None,
 ) -> Frame:
@@ -49,7 +49,7 @@ def export_frame(
     camera : replaces the scene's camera
     frame_set : evaluates the scene at another frame, for passes of motion; without it nothing moves
     cache : what earlier exports of the same depsgraph made and is still true
-    shown : whether an evaluated object is in the picture; all are when None
+    is_visible : whether an evaluated object is in the picture; all are when None
     passes : replace those of the view layer
     cancelled : asked before each object
 
@@ -76,7 +76,7 @@ def export_frame(
     objects, meshes = DrgsObjects(depsgraph, key_of, warn, cache), Meshes(depsgraph, materials, warn, cache)
     others = Limited(depsgraph.view_layer.drgs, f'View layer "{depsgraph.view_layer.name}"', warn).others
     for item in uncancelled(visible(depsgraph), cancelled):
-        if shown is not None and not shown(item.object):
+        if is_visible is not None and not is_visible(item.object):
             continue
         if others != "SEEN" and not assets.is_drgs(item.object):
             item = _unseen(item, others)

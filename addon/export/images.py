@@ -23,7 +23,7 @@ DATA = {"Non-Color", "Raw"}
 #: What Cycles shows for an image it cannot read.
 MISSING = (1.0, 0.0, 1.0)
 #: Exports for which an image that none of them used is remembered: view layers and scenes take turns.
-KEPT = 4
+KEPT_EXPORTS = 4
 
 #: What was made of an image -> (the number of the export that used it last, result).
 _known: dict[tuple[object, ...], tuple[int, Any]] = {}
@@ -104,7 +104,7 @@ def end_export() -> None:
     """Drop what the last exports did not use."""
     global _export
     _export += 1
-    for key in [k for k, (used, _) in _known.items() if used < _export - KEPT]:
+    for key in [k for k, (used, _) in _known.items() if used < _export - KEPT_EXPORTS]:
         del _known[key]
 
 

@@ -12,8 +12,8 @@ from ...drgs_blender.core.frame import Light
 from .instances import Visible
 from .node_math import rgb
 from .nodes import Walker
-from .paint import Paint, once, plain
-from .sockets import Place, surface_of
+from .paint import Paint, once, uniform
+from .sockets import SocketRef, surface_of
 
 Warn = Callable[[str], None]
 
@@ -92,9 +92,9 @@ class _Tree(Walker):
         return np.zeros(3) if surface is None else self.shader(surface)
 
     @once(lambda self: np.ones(3))
-    def shader(self, place: Place) -> np.ndarray:
+    def shader(self, ref: SocketRef) -> np.ndarray:
         """(3,) of a shader input."""
-        origin = place.origin()
+        origin = ref.origin()
         if not origin.socket.is_output:
             return np.zeros(3)
         node = origin.node
@@ -108,16 +108,16 @@ class _Tree(Walker):
         self.warn(node, f"{node.bl_label} is not supported in a light; its own colour is used")
         return np.ones(3)
 
-    def node_light_falloff(self, output: Place) -> Paint:
+    def node_light_falloff(self, output: SocketRef) -> Paint:
         strength = self.number(output.input("Strength"))
         if output.socket.name != "Quadratic" or self.value(output.input("Smooth")) != 0:
             self.warn(output.node, "only the natural, quadratic falloff is rendered")
         return strength
 
-    def node_tex_ies(self, output: Place) -> Paint:
+    def node_tex_ies(self, output: SocketRef) -> Paint:
         self.warn(output.node, "IES profiles are not rendered; it shines evenly")
-        return self.number(output.input("Strength")) if "Strength" in output.node.inputs else plain(1)
+        return self.number(output.input("Strength")) if "Strength" in output.node.inputs else uniform(1)
 
-    def node_tex_image(self, output: Place) -> Paint:
+    def node_tex_image(self, output: SocketRef) -> Paint:
         self.warn(output.node, "images are not projected by lights; white is used")
-        return plain(1)
+        return uniform(1)

@@ -15,15 +15,15 @@ from .texture_refs import TextureRef
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
-    """A material as it is exported; ``material`` None is one that nothing is seen of. ``uv_map`` "" is the active."""
+class ExportedMaterial:
+    """An exported material; ``material`` None is an invisible one, ``uv_map`` "" the active UV map."""
 
     material: Material | None
     uv_map: str | None = None
 
 
 DEFAULT_MATERIAL = Material("Default")
-DEFAULT = Look(DEFAULT_MATERIAL)
+DEFAULT = ExportedMaterial(DEFAULT_MATERIAL)
 
 
 class Materials:
@@ -31,7 +31,7 @@ class Materials:
 
     def __init__(self, warn: Warn, override: bpy.types.Material | None = None) -> None:
         self._warn, self.override = warn, override
-        self._known: dict[tuple[int, int], Look] = {}
+        self._known: dict[tuple[int, int], ExportedMaterial] = {}
         self.images: dict[str, Image] = {}
 
     def slots(self, obj: bpy.types.Object) -> list[bpy.types.Material | None]:
@@ -39,23 +39,23 @@ class Materials:
         own = [slot.material for slot in obj.material_slots]
         return own if self.override is None else [self.override] * max(len(own), 1)
 
-    def look(self, material: bpy.types.Material | None, mesh: bpy.types.Mesh) -> Look:
-        """How an evaluated material shows on an evaluated mesh."""
+    def export(self, material: bpy.types.Material | None, mesh: bpy.types.Mesh) -> ExportedMaterial:
+        """The frame's description of an evaluated material on an evaluated mesh."""
         if material is None:
             return DEFAULT
         for key in ((material.as_pointer(), 0), (material.as_pointer(), mesh.as_pointer())):
             if key in self._known:
                 return self._known[key]
         tree = SurfaceWalker(material, mesh, self._warn)
-        look = self._look(tree)
-        self._known[material.as_pointer(), mesh.as_pointer() if tree.asks_mesh else 0] = look
-        return look
+        exported = self._build(tree)
+        self._known[material.as_pointer(), mesh.as_pointer() if tree.uses_mesh else 0] = exported
+        return exported
 
-    def _look(self, tree: SurfaceWalker) -> Look:
+    def _build(self, tree: SurfaceWalker) -> ExportedMaterial:
         material = tree.material
         surface = tree.surface()
         if surface is None:
-            return Look(None)
+            return ExportedMaterial(None)
         # A surface is there or not; one that is there scatters as if it were there entirely.
         base = surface.base.times(1 / (1 - surface.clear)) if surface.clear < 1 else surface.base
         paints = {
@@ -75,7 +75,7 @@ class Materials:
         if len(set(maps)) > 1:
             names = ", ".join(name or "the active one" for name in dict.fromkeys(maps))
             self._warn(f'Material "{material.name}": of its UV maps ({names}) only the first is used')
-        return Look(Material(material.name, **values), maps[0] if maps else None)
+        return ExportedMaterial(Material(material.name, **values), maps[0] if maps else None)
 
     def _texture(self, picture: TextureRef) -> Texture:
         exported = picture.export(self._warn)
@@ -87,7 +87,7 @@ def _usable(tree: SurfaceWalker, name: str, paint: Paint, default: tuple[float, 
     """The number or colour of a field of frame.Material, finite and where it can be."""
     colour = paint.colour
     if not np.isfinite(colour).all():
-        tree.say(f"its {name.replace('_', ' ')} is not finite; Blender's default is used. Check its drivers")
+        tree.report(f"its {name.replace('_', ' ')} is not finite; Blender's default is used. Check its drivers")
         colour = np.broadcast_to(default, 3)
     colour = np.maximum(colour, 0)
     if name in ("roughness", "metallic") and paint.texture is None:

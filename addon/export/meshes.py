@@ -13,7 +13,7 @@ from ...drgs_blender.core.frame import Image, Material, MeshState
 from .. import mesh_arrays
 from .export_cache import ExportCache, uid
 from .instances import Key, Visible
-from .materials import DEFAULT_MATERIAL, Look, Materials
+from .materials import DEFAULT_MATERIAL, ExportedMaterial, Materials
 
 Warn = Callable[[str], None]
 Array = np.ndarray
@@ -113,11 +113,11 @@ class Meshes:
     ) -> MeshState | None:
         if len(mesh.polygons) == 0:
             return None
-        looks = [self._materials.look(material, mesh) for material in slots or [None]]
+        exported = [self._materials.export(material, mesh) for material in slots or [None]]
         corners, polygons, index = arrays.corners, arrays.polygons, arrays.material_index
         if index is not None:
-            index = np.clip(index, 0, len(looks) - 1)[polygons]  # as Cycles reads what is out of range
-        corners, index = _seen(corners, index, looks)
+            index = np.clip(index, 0, len(exported) - 1)[polygons]  # as Cycles reads what is out of range
+        corners, index = _seen(corners, index, exported)
         if len(corners) == 0:
             return None
         normals = arrays.normals
@@ -128,21 +128,21 @@ class Meshes:
             matrices=np.empty((0, 4, 4)),
             pass_indices=np.empty(0, np.int32),
             corner_normals=None if normals is None else _frozen(normals[corners]),
-            uvs=self._uvs(item.object.name, mesh, corners, index, looks),
+            uvs=self._uvs(item.object.name, mesh, corners, index, exported),
             material_index=None if index is None or not index.any() else _frozen(index.astype(np.int32)),
-            materials=[look.material or DEFAULT_MATERIAL for look in looks],
+            materials=[material.material or DEFAULT_MATERIAL for material in exported],
             visibility=item.visibility,
         )
 
     def _uvs(
-        self, name: str, mesh: bpy.types.Mesh, corners: Array, index: Array | None, looks: list[Look]
+        self, name: str, mesh: bpy.types.Mesh, corners: Array, index: Array | None, exported: list[ExportedMaterial]
     ) -> Array | None:
         """(m, 3, 2) float32 frozen: for every face the UV map that its material asks for; None where none does."""
-        wanted = [look.uv_map for look in looks]
-        if all(uv_map is None for uv_map in wanted):
+        requested = [material.uv_map for material in exported]
+        if all(uv_map is None for uv_map in requested):
             return None
         uvs = np.zeros((len(corners), 3, 2), np.float32)
-        for uv_map in {u for u in wanted if u is not None}:
+        for uv_map in {u for u in requested if u is not None}:
             values = mesh_arrays.read_uvs(mesh, uv_map)
             if values is None:
                 which = f'the UV map "{uv_map}"' if uv_map else "a UV map"
@@ -152,9 +152,9 @@ class Meshes:
                 )
                 continue
             if index is None:
-                faces: slice | Array = slice(None) if wanted[0] == uv_map else slice(0)
+                faces: slice | Array = slice(None) if requested[0] == uv_map else slice(0)
             else:
-                faces = np.isin(index, [i for i, u in enumerate(wanted) if u == uv_map])
+                faces = np.isin(index, [i for i, u in enumerate(requested) if u == uv_map])
             uvs[faces] = values[corners[faces]]
         return _frozen(uvs)
 
@@ -183,9 +183,9 @@ def _images_of(state: MeshState | None) -> set[str]:
     return {texture.image for texture in textures if texture is not None}
 
 
-def _seen(corners: Array, index: Array | None, looks: list[Look]) -> tuple[Array, Array | None]:
+def _seen(corners: Array, index: Array | None, exported: list[ExportedMaterial]) -> tuple[Array, Array | None]:
     """Only the faces whose material is seen."""
-    unseen = [i for i, look in enumerate(looks) if look.material is None]
+    unseen = [i for i, material in enumerate(exported) if material.material is None]
     if not unseen:
         return corners, index
     if index is None:

@@ -16,8 +16,8 @@ from mathutils import Euler, Matrix
 
 from ...drgs_blender.core.color import LUMINANCE as REC709
 from .node_math import BLENDS, OPERATIONS, blackbody, by_row, divide, hsl, hsv, hue_saturation, in_system
-from .paint import Array, Paint, Warn, constant, once, plain
-from .sockets import Place
+from .paint import Array, Paint, Warn, constant, once, uniform
+from .sockets import SocketRef
 
 #: Luminance weights of Rec.709.
 LUMINANCE = np.array(REC709)
@@ -34,15 +34,15 @@ class Walker:
     def __init__(self, owner: str, warn: Warn) -> None:
         self.owner = owner
         self._warn = warn
-        self._said: set[str] = set()
-        self.found: dict[tuple[str, Place], Any] = {}
+        self._warned: set[str] = set()
+        self.found: dict[tuple[str, SocketRef], Any] = {}
         self.depth = 0
 
     def warn(self, node: bpy.types.Node, problem: str) -> None:
         """Say `problem` once."""
         text = f'{self.owner}, node "{node.label or node.name}": {problem}'
-        if text not in self._said:
-            self._said.add(text)
+        if text not in self._warned:
+            self._warned.add(text)
             self._warn(text)
 
     # What a subclass knows of its textures
@@ -61,32 +61,32 @@ class Walker:
 
     # Sockets
 
-    @once(lambda self: plain(self.unknown))
-    def colour(self, place: Place) -> Paint:
+    @once(lambda self: uniform(self.unknown))
+    def colour(self, ref: SocketRef) -> Paint:
         """Value of a colour or vector input."""
-        origin = place.origin()
+        origin = ref.origin()
         if not origin.socket.is_output:
             return Paint(constant(origin.socket))
         evaluate = getattr(self, f"node_{origin.node.type.lower()}", None)
-        return evaluate(origin) if evaluate is not None else self.nearest(origin, place)
+        return evaluate(origin) if evaluate is not None else self.nearest(origin, ref)
 
-    def number(self, place: Place) -> Paint:
+    def number(self, ref: SocketRef) -> Paint:
         """Value of a number input; of a colour its luminance, of a vector its mean."""
-        paint, source = self.colour(place), place.origin()
+        paint, source = self.colour(ref), ref.origin()
         if not source.socket.is_output or source.socket.type == "VALUE":
             return paint
         if source.socket.type == "VECTOR":
-            return plain(self.flat(source.node, paint).mean())
+            return uniform(self.flat(source.node, paint).mean())
         return self.grey(source.node, paint)
 
-    def fixed(self, place: Place) -> Array:
+    def fixed(self, ref: SocketRef) -> Array:
         """(3,): an input that must not vary over the surface."""
-        paint = self.colour(place)
-        return self.flat(place.origin().node, paint)
+        paint = self.colour(ref)
+        return self.flat(ref.origin().node, paint)
 
-    def value(self, place: Place) -> float:
+    def value(self, ref: SocketRef) -> float:
         """A number that must not vary over the surface."""
-        return float(self.flat(place.origin().node, self.number(place))[0])
+        return float(self.flat(ref.origin().node, self.number(ref))[0])
 
     def flat(self, node: bpy.types.Node, paint: Paint) -> Array:
         """(3,): the mean of a paint."""
@@ -98,24 +98,24 @@ class Walker:
     def grey(self, node: bpy.types.Node, paint: Paint) -> Paint:
         """Luminance."""
         if paint.texture is None:
-            return plain(paint.colour @ LUMINANCE)
+            return uniform(paint.colour @ LUMINANCE)
         texture = self.channel(paint.texture, "luminance")
         if texture is None:
-            return plain(self.flat(node, paint) @ LUMINANCE)
+            return uniform(self.flat(node, paint) @ LUMINANCE)
         if texture == paint.texture or np.ptp(paint.colour) < 1e-6:
-            return Paint(plain(paint.colour @ LUMINANCE).colour, texture)
+            return Paint(uniform(paint.colour @ LUMINANCE).colour, texture)
         self.warn(node, "the luminance of a tinted image is that of the image, scaled")
         mean = self.mean(paint.texture)
-        return Paint(plain((paint.colour * mean) @ LUMINANCE / max(mean @ LUMINANCE, 1e-9)).colour, texture)
+        return Paint(uniform((paint.colour * mean) @ LUMINANCE / max(mean @ LUMINANCE, 1e-9)).colour, texture)
 
     def part(self, node: bpy.types.Node, paint: Paint, index: int) -> Paint:
         """Red, green or blue."""
         if paint.texture is None:
-            return plain(paint.colour[index])
+            return uniform(paint.colour[index])
         texture = self.channel(paint.texture, "rgb"[index])
         if texture is None:
-            return plain(self.flat(node, paint)[index])
-        return Paint(plain(paint.colour[index]).colour, texture)
+            return uniform(self.flat(node, paint)[index])
+        return Paint(uniform(paint.colour[index]).colour, texture)
 
     def combine(self, node: bpy.types.Node, function: Callable[..., Array], *paints: Paint) -> Paint:
         """`function` of (..., 3) arrays for paints.
@@ -130,7 +130,7 @@ class Walker:
             return np.asarray(function(*(p.colour * levels.get(p.texture, 0 if p.texture else 1) for p in paints)))
 
         if not textures:
-            return plain(at({}))
+            return uniform(at({}))
         if len(textures) == 1:
             (texture,) = textures
             zero, *probed = (at({texture: level}) for level in (np.zeros(3), *_PROBES))
@@ -142,7 +142,7 @@ class Walker:
         influence = {t: np.abs(whole - at({**means, t: np.zeros(3)})).max() for t in textures}
         texture = max(influence, key=lambda t: influence[t])
         if influence[texture] < 1e-6:
-            return plain(whole)
+            return uniform(whole)
         if len(textures) > 1 and sorted(influence.values())[-2] < 1e-6:
             return self.combine(node, function, *(_fixed_but(p, texture, means) for p in paints))
         curved = self.curved(texture, lambda value: at({**means, texture: value}))
@@ -153,15 +153,15 @@ class Walker:
         halved = at({**means, texture: means[texture] / 2})
         if whole.sum() < halved.sum():
             self.warn(node, "this cannot be done to an image; the mean colour is used. Bake it to an image")
-            return plain(whole)
+            return uniform(whole)
         self.warn(node, "this cannot be done to an image exactly; the image is scaled to the right mean")
         mean = means[texture]
         return Paint(np.where(mean > 1e-9, whole / np.maximum(mean, 1e-9), 1.0), texture)
 
-    def nearest(self, origin: Place, place: Place) -> Paint:
+    def nearest(self, origin: SocketRef, ref: SocketRef) -> Paint:
         """An unknown node: its first linked colour, the mean of its own colours, or what the input is without it."""
         node = origin.node
-        colours = [Place(s, origin.groups) for s in node.inputs if s.type == "RGBA" and s.enabled]
+        colours = [SocketRef(s, origin.groups) for s in node.inputs if s.type == "RGBA" and s.enabled]
         linked = [c for c in colours if c.socket.is_linked]
         if linked:
             self.warn(node, f"{node.bl_label} is not supported and left out")
@@ -169,24 +169,24 @@ class Walker:
         if origin.socket.type == "RGBA" or node.type.startswith("TEX_"):
             self.warn(node, f"{node.bl_label} is not supported; a plain colour is used. Bake it to an image")
             if origin.socket.type == "RGBA" and colours:
-                return plain(np.mean([constant(c.socket) for c in colours], axis=0))
-            return plain(self.unknown)
-        own = constant(place.socket) if hasattr(place.socket, "default_value") else np.full(3, self.unknown)
-        said = f"{own[0]:g}" if place.socket.type == "VALUE" else "a plain colour"
-        self.warn(node, f"{node.bl_label} is not supported; {said} is used for {place.socket.name}")
-        return plain(own)
+                return uniform(np.mean([constant(c.socket) for c in colours], axis=0))
+            return uniform(self.unknown)
+        own = constant(ref.socket) if hasattr(ref.socket, "default_value") else np.full(3, self.unknown)
+        text = f"{own[0]:g}" if ref.socket.type == "VALUE" else "a plain colour"
+        self.warn(node, f"{node.bl_label} is not supported; {text} is used for {ref.socket.name}")
+        return uniform(own)
 
     # Nodes
 
-    def node_rgb(self, output: Place) -> Paint:
+    def node_rgb(self, output: SocketRef) -> Paint:
         return Paint(constant(output.socket))
 
     node_value = node_rgb
 
-    def node_blackbody(self, output: Place) -> Paint:
+    def node_blackbody(self, output: SocketRef) -> Paint:
         return Paint(blackbody(self.value(output.input("Temperature"))))
 
-    def node_mix(self, output: Place) -> Paint:
+    def node_mix(self, output: SocketRef) -> Paint:
         node, inputs = output.node, output.inputs()
         kind = {"FLOAT": "Float", "VECTOR": "Vector", "RGBA": "Color"}.get(node.data_type)
         if kind is None:
@@ -198,7 +198,7 @@ class Walker:
         blend = node.blend_type if kind == "Color" else "MIX"
         return self.blended(node, blend, node.clamp_factor, node.clamp_result, factor, *operands)
 
-    def node_mix_rgb(self, output: Place) -> Paint:
+    def node_mix_rgb(self, output: SocketRef) -> Paint:
         node = output.node
         operands = self.number(output.input(0)), self.colour(output.input(1)), self.colour(output.input(2))
         return self.blended(node, node.blend_type, True, node.use_clamp, *operands)
@@ -218,7 +218,7 @@ class Walker:
 
         return self.combine(node, mix, factor, a, b)
 
-    def node_math(self, output: Place) -> Paint:
+    def node_math(self, output: SocketRef) -> Paint:
         node = output.node
         if node.operation not in OPERATIONS:
             return self.first_input(output)
@@ -226,7 +226,7 @@ class Walker:
         operands = [self.number(output.input(i)) for i in range(count)]
         return self.combine(node, (lambda *v: np.clip(function(*v), 0, 1)) if node.use_clamp else function, *operands)
 
-    def node_vect_math(self, output: Place) -> Paint:
+    def node_vect_math(self, output: SocketRef) -> Paint:
         node = output.node
         if node.operation == "SCALE":
             scale = self.number(output.input("Scale"))
@@ -236,16 +236,16 @@ class Walker:
         count, function = OPERATIONS[node.operation]
         return self.combine(node, function, *(self.colour(output.input(i)) for i in range(count)))
 
-    def first_input(self, output: Place) -> Paint:
+    def first_input(self, output: SocketRef) -> Paint:
         """Pass on what goes into an operation that is not known."""
         self.warn(output.node, f"{output.node.operation.title()} is not supported; its first input is used")
         return self.colour(output.input(0))
 
-    def node_clamp(self, output: Place) -> Paint:
+    def node_clamp(self, output: SocketRef) -> Paint:
         operands = [self.number(output.input(i)) for i in range(3)]
         return self.combine(output.node, np.clip, *operands)
 
-    def node_map_range(self, output: Place) -> Paint:
+    def node_map_range(self, output: SocketRef) -> Paint:
         node = output.node
         if node.data_type != "FLOAT" or node.interpolation_type != "LINEAR":
             return self.nearest(output, output)
@@ -259,24 +259,24 @@ class Walker:
         inputs = output.inputs()
         return self.combine(node, mapped, *(self.number(inputs[name]) for name in names))
 
-    def node_gamma(self, output: Place) -> Paint:
+    def node_gamma(self, output: SocketRef) -> Paint:
         operands = self.colour(output.input("Color")), self.number(output.input("Gamma"))
         return self.combine(output.node, lambda c, g: np.maximum(c, 0) ** g, *operands)
 
-    def node_invert(self, output: Place) -> Paint:
+    def node_invert(self, output: SocketRef) -> Paint:
         operands = self.number(output.input(0)), self.colour(output.input("Color"))
         return self.combine(output.node, lambda f, c: c + f * (1 - 2 * c), *operands)
 
-    def node_brightcontrast(self, output: Place) -> Paint:
+    def node_brightcontrast(self, output: SocketRef) -> Paint:
         operands = (self.colour(output.input(0)), self.number(output.input(1)), self.number(output.input(2)))
         return self.combine(output.node, lambda c, b, k: np.maximum((1 + k) * c + b - k / 2, 0), *operands)
 
-    def node_hue_sat(self, output: Place) -> Paint:
+    def node_hue_sat(self, output: SocketRef) -> Paint:
         inputs = output.inputs()
         operands = [self.number(inputs[name]) for name in ("Hue", "Saturation", "Value", "Fac")]
         return self.combine(output.node, hue_saturation, *operands, self.colour(inputs["Color"]))
 
-    def node_curve_rgb(self, output: Place) -> Paint:
+    def node_curve_rgb(self, output: SocketRef) -> Paint:
         mapping = output.node.mapping
         mapping.initialize()
 
@@ -288,7 +288,7 @@ class Walker:
 
         return self.combine(output.node, curved, self.number(output.input(0)), self.colour(output.input("Color")))
 
-    def node_valtorgb(self, output: Place) -> Paint:
+    def node_valtorgb(self, output: SocketRef) -> Paint:
         ramp, alpha = output.node.color_ramp, output.socket.name == "Alpha"
 
         @by_row
@@ -297,20 +297,20 @@ class Walker:
 
         return self.combine(output.node, ramped, self.number(output.input(0)))
 
-    def node_rgbtobw(self, output: Place) -> Paint:
+    def node_rgbtobw(self, output: SocketRef) -> Paint:
         return self.grey(output.node, self.colour(output.input(0)))
 
-    def node_separate_color(self, output: Place) -> Paint:
+    def node_separate_color(self, output: SocketRef) -> Paint:
         node, colour = output.node, self.colour(output.input(0))
         index = list(node.outputs).index(output.socket)
         mode = getattr(node, "mode", "RGB")
         if mode == "RGB":
             return self.part(node, colour, index)
-        return plain((hsv if mode == "HSV" else hsl)(self.flat(node, colour))[index])
+        return uniform((hsv if mode == "HSV" else hsl)(self.flat(node, colour))[index])
 
     node_seprgb = node_sepxyz = node_separate_color
 
-    def node_combine_color(self, output: Place) -> Paint:
+    def node_combine_color(self, output: SocketRef) -> Paint:
         mode = getattr(output.node, "mode", "RGB")
 
         @by_row
@@ -337,7 +337,7 @@ def euler(angles: Array) -> Array:
     return np.array(Euler(tuple(angles), "XYZ").to_matrix())
 
 
-def vector_rotate(walker: Walker, output: Place) -> Array:
+def vector_rotate(walker: Walker, output: SocketRef) -> Array:
     """(3, 3) rotation of a Vector Rotate node, about the origin."""
     node = output.node
     if node.rotation_type == "EULER_XYZ":

@@ -42,9 +42,9 @@ class DrgsObjects:
         obj = item.object
         check_modifiers(obj, self._depsgraph)
         cache_playback.check(obj, self._warn, final=self._depsgraph.mode == "RENDER")
-        look = obj.drgs.show_captured, obj.drgs.adjustment.values(), *cache_playback.look_of(obj).items()
+        appearance = obj.drgs.show_captured, obj.drgs.adjustment.values(), *cache_playback.fracture_state(obj).items()
         shape = self._cache.get(
-            ("object", uid(obj), obj.name, obj.data.as_pointer(), obj.mode, str(assets.file_of(obj)), look),
+            ("object", uid(obj), obj.name, obj.data.as_pointer(), obj.mode, str(assets.file_of(obj)), appearance),
             (uid(obj), uid(obj.data)),
             lambda: _shape(obj, self._depsgraph, self._key_of, self._warn),
         )
@@ -71,15 +71,15 @@ def _shape(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, key_of: KeyOf,
         for array in arrays.values():
             if array is not None:
                 array.flags.writeable = False  # so that the engine's client need not copy it
-        look = cache_playback.look_of(obj)
+        appearance = cache_playback.fracture_state(obj)
         adjustment = None if captured else _adjustment(obj, mesh, warn)
-        return ObjectState(name=obj.name, asset=key_of(path), adjustment=adjustment, **arrays, **look)
+        return ObjectState(name=obj.name, asset=key_of(path), adjustment=adjustment, **arrays, **appearance)
     finally:
         if editing:
             obj.to_mesh_clear()
 
 
-def look_of(obj: bpy.types.Object, asset: Asset, warn: Warn) -> tuple[dict[str, np.ndarray], Adjustment | None]:
+def appearance_of(obj: bpy.types.Object, asset: Asset, warn: Warn) -> tuple[dict[str, np.ndarray], Adjustment | None]:
     """What an evaluated object in Object Mode has painted, where it differs from its asset, and its adjustments.
 
     Raises

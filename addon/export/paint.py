@@ -10,7 +10,7 @@ from typing import Any
 import bpy
 import numpy as np
 
-from .sockets import Place
+from .sockets import SocketRef
 
 Warn = Callable[[str], None]
 Array = np.ndarray
@@ -35,7 +35,7 @@ class Paint:
         return not self.colour.any()
 
 
-def plain(value: Array | float) -> Paint:
+def uniform(value: Array | float) -> Paint:
     """Without texture."""
     return Paint(np.broadcast_to(np.asarray(value, np.float64), (3,)).copy())
 
@@ -53,17 +53,17 @@ def once(fallback: Callable[[Any], Any]) -> Callable[..., Any]:
     the method gives ``fallback(walker)``.
     """
 
-    def decorate(method: Callable[[Any, Place], Any]) -> Callable[[Any, Place], Any]:
+    def decorate(method: Callable[[Any, SocketRef], Any]) -> Callable[[Any, SocketRef], Any]:
         @wraps(method)
-        def remembered(self: Any, place: Place) -> Any:
-            key = method.__name__, place
+        def remembered(self: Any, ref: SocketRef) -> Any:
+            key = method.__name__, ref
             if key not in self.found:
-                if self.depth >= DEEPEST and place.socket.is_linked:
-                    self.warn(place.node, f"more than {DEEPEST} nodes follow; what comes before is left out")
+                if self.depth >= DEEPEST and ref.socket.is_linked:
+                    self.warn(ref.node, f"more than {DEEPEST} nodes follow; what comes before is left out")
                     return fallback(self)
                 self.depth += 1
                 try:
-                    self.found[key] = method(self, place)
+                    self.found[key] = method(self, ref)
                 finally:
                     self.depth -= 1
             return self.found[key]

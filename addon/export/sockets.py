@@ -7,7 +7,7 @@ from typing import NamedTuple
 import bpy
 
 
-class Place(NamedTuple):
+class SocketRef(NamedTuple):
     """A socket, and the group nodes that were entered to come to it, outermost first."""
 
     socket: bpy.types.NodeSocket
@@ -17,40 +17,40 @@ class Place(NamedTuple):
     def node(self) -> bpy.types.Node:
         return self.socket.node
 
-    def input(self, key: int | str) -> Place:
+    def input(self, key: int | str) -> SocketRef:
         """An input of the same node by index or name."""
-        return Place(self.node.inputs[key], self.groups)
+        return SocketRef(self.node.inputs[key], self.groups)
 
-    def inputs(self) -> dict[str, Place]:
+    def inputs(self) -> dict[str, SocketRef]:
         """The inputs of the same node by identifier, which is unique."""
-        return {s.identifier: Place(s, self.groups) for s in self.node.inputs}
+        return {s.identifier: SocketRef(s, self.groups) for s in self.node.inputs}
 
-    def origin(self) -> Place:
+    def origin(self) -> SocketRef:
         """The output that feeds this input, through reroutes, muted nodes and groups.
 
         Where nothing does, the input whose own value counts.
         """
-        own = place = self
-        while place.socket.is_linked:
-            link = place.socket.links[0]
+        own = ref = self
+        while ref.socket.is_linked:
+            link = ref.socket.links[0]
             if link.is_muted or not link.is_valid:  # a loop has a link that is not valid
                 return own
-            source = Place(link.from_socket, place.groups)
+            source = SocketRef(link.from_socket, ref.groups)
             node = source.node
             if node.mute:
                 passed = [i.from_socket for i in node.internal_links if i.to_socket == source.socket]
                 if not passed:
                     return own
-                place = Place(passed[0], place.groups)
+                ref = SocketRef(passed[0], ref.groups)
             elif node.type == "REROUTE":
-                place = source.input(0)
+                ref = source.input(0)
             elif node.type == "GROUP" and node.node_tree is not None:
                 exits = [n for n in node.node_tree.nodes if n.type == "GROUP_OUTPUT" and n.is_active_output]
                 if not exits:
                     return source
-                own = place = Place(_same(exits[0].inputs, source.socket), (*place.groups, node))
-            elif node.type == "GROUP_INPUT" and place.groups:
-                own = place = Place(_same(place.groups[-1].inputs, source.socket), place.groups[:-1])
+                own = ref = SocketRef(_same(exits[0].inputs, source.socket), (*ref.groups, node))
+            elif node.type == "GROUP_INPUT" and ref.groups:
+                own = ref = SocketRef(_same(ref.groups[-1].inputs, source.socket), ref.groups[:-1])
             else:
                 return source
         return own
@@ -61,7 +61,7 @@ def _same(sockets: bpy.types.bpy_prop_collection, socket: bpy.types.NodeSocket) 
     return next(s for s in sockets if s.identifier == socket.identifier)
 
 
-def surface_of(tree: bpy.types.NodeTree | None) -> Place | None:
+def surface_of(tree: bpy.types.NodeTree | None) -> SocketRef | None:
     """The surface socket of the output that Cycles would use; None without one."""
     output = tree and (tree.get_output_node("CYCLES") or tree.get_output_node("ALL"))
-    return Place(output.inputs["Surface"]) if output else None
+    return SocketRef(output.inputs["Surface"]) if output else None

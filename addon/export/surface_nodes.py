@@ -8,8 +8,8 @@ import bpy
 import numpy as np
 
 from .node_math import reflectance
-from .paint import Array, Paint, constant, once, plain
-from .sockets import Place, surface_of
+from .paint import Array, Paint, constant, once, uniform
+from .sockets import SocketRef, surface_of
 from .texture_nodes import TextureWalker
 
 #: Of the Principled BSDF: inputs that must be zero, and what they are called in the warning.
@@ -31,10 +31,10 @@ class Surface:
     ``base`` is already times the share that is scattered.
     """
 
-    base: Paint = field(default_factory=lambda: plain(0))
-    roughness: Paint = field(default_factory=lambda: plain(1))
-    metallic: Paint = field(default_factory=lambda: plain(0))
-    emission: Paint = field(default_factory=lambda: plain(0))
+    base: Paint = field(default_factory=lambda: uniform(0))
+    roughness: Paint = field(default_factory=lambda: uniform(1))
+    metallic: Paint = field(default_factory=lambda: uniform(0))
+    emission: Paint = field(default_factory=lambda: uniform(0))
     scattered: float = 0.0
     clear: float = 0.0
 
@@ -48,10 +48,10 @@ class SurfaceWalker(TextureWalker):
         # From Blender 5.0 on every material has nodes, and the switch is deprecated.
         if material.node_tree is None or (bpy.app.version < (5, 0, 0) and not material.use_nodes):
             base, rough, metal = material.diffuse_color[:3], material.roughness, material.metallic
-            return Surface(plain(base), plain(rough), plain(metal), scattered=1)
-        place = surface_of(material.node_tree)
-        linked = place is not None and place.origin().socket.is_output
-        output = place and place.node
+            return Surface(uniform(base), uniform(rough), uniform(metal), scattered=1)
+        ref = surface_of(material.node_tree)
+        linked = ref is not None and ref.origin().socket.is_output
+        output = ref and ref.node
         if output and output.inputs["Displacement"].is_linked:
             self.warn(output, "displacement is not rendered")
         if output and output.inputs["Volume"].is_linked:
@@ -59,36 +59,36 @@ class SurfaceWalker(TextureWalker):
             if not linked:
                 return None
         if not linked:
-            self.say("has no surface, which is black in Blender; its viewport colour is used")
-            return Surface(plain(material.diffuse_color[:3]), plain(material.roughness), scattered=1)
-        surface = self.shader(place)
+            self.report("has no surface, which is black in Blender; its viewport colour is used")
+            return Surface(uniform(material.diffuse_color[:3]), uniform(material.roughness), scattered=1)
+        surface = self.shader(ref)
         if 0 < surface.clear < 1:
             state = "left out" if surface.clear > 0.5 else "opaque"
-            self.say(f"is {surface.clear:.0%} transparent, which is not rendered; it is {state}")
+            self.report(f"is {surface.clear:.0%} transparent, which is not rendered; it is {state}")
         return None if surface.clear > 0.5 and surface.emission.black else surface
 
     # Shaders
 
-    @once(lambda self: Surface(plain(self.unknown), scattered=1))
-    def shader(self, place: Place) -> Surface:
+    @once(lambda self: Surface(uniform(self.unknown), scattered=1))
+    def shader(self, ref: SocketRef) -> Surface:
         """What a shader input does."""
-        origin = place.origin()
+        origin = ref.origin()
         if not origin.socket.is_output:
             return Surface()
         evaluate = getattr(self, f"shader_{origin.node.type.lower()}", None)
         return evaluate(origin) if evaluate is not None else self.other_shader(origin)
 
-    def shader_bsdf_principled(self, output: Place) -> Surface:
+    def shader_bsdf_principled(self, output: SocketRef) -> Surface:
         node = output.node
         alpha = float(np.clip(self.opacity(output.input("Alpha")), 0, 1))
         strength = self.number(output.input("Emission Strength"))
-        emission = plain(0)
+        emission = uniform(0)
         if not strength.black:
             emission = self.combine(node, np.multiply, self.colour(output.input("Emission Color")), strength)
-        lacking = [said for name, said in _LOBES.items() if name in node.inputs and _used(output.input(name))]
+        unsupported = [text for name, text in _LOBES.items() if name in node.inputs and _used(output.input(name))]
         if not 0.03 < self.reflectance(output) < 0.05:
-            lacking.append("specular other than that of IOR 1.5")
-        self.complain(output, lacking)
+            unsupported.append("specular other than that of IOR 1.5")
+        self.warn_unsupported(output, unsupported)
         return Surface(
             self.colour(output.input("Base Color")).times(alpha),
             self.number(output.input("Roughness")),
@@ -98,60 +98,60 @@ class SurfaceWalker(TextureWalker):
             clear=1 - alpha,
         )
 
-    def reflectance(self, output: Place) -> float:
+    def reflectance(self, output: SocketRef) -> float:
         """Of a Principled BSDF, seen from the front; that of IOR 1.5 where it varies."""
         ior, level = output.input("IOR").origin().socket, output.input("Specular IOR Level").origin().socket
         if ior.is_output or level.is_output:
             return float("nan")
         return reflectance(ior.default_value) * 2 * level.default_value
 
-    def opacity(self, place: Place) -> float:
+    def opacity(self, ref: SocketRef) -> float:
         """A constant alpha; where it varies, the surface is there."""
-        alpha, origin = self.number(place), place.origin()
+        alpha, origin = self.number(ref), ref.origin()
         if alpha.texture is None:
             return float(alpha.colour[0])
         self.warn(origin.node, "transparency that varies over the surface is not rendered; it is opaque")
         return 1.0
 
-    def complain(self, output: Place, lacking: list[str]) -> None:
+    def warn_unsupported(self, output: SocketRef, unsupported: list[str]) -> None:
         """One warning for all that a shader node does beyond the supported."""
         normal = output.node.inputs.get("Normal")
         if normal is not None and normal.is_linked:
-            lacking = [*lacking, "its normal or bump map"]
-        if lacking:
-            self.warn(output.node, f"not rendered: {', '.join(lacking)}")
+            unsupported = [*unsupported, "its normal or bump map"]
+        if unsupported:
+            self.warn(output.node, f"not rendered: {', '.join(unsupported)}")
 
-    def shader_bsdf_diffuse(self, output: Place) -> Surface:
-        self.complain(output, [])
+    def shader_bsdf_diffuse(self, output: SocketRef) -> Surface:
+        self.warn_unsupported(output, [])
         return Surface(self.colour(output.input("Color")), scattered=1)
 
-    def shader_bsdf_glossy(self, output: Place) -> Surface:
-        self.complain(output, ["anisotropy"] if _used(output.input("Anisotropy")) else [])
+    def shader_bsdf_glossy(self, output: SocketRef) -> Surface:
+        self.warn_unsupported(output, ["anisotropy"] if _used(output.input("Anisotropy")) else [])
         base, roughness = self.colour(output.input("Color")), self.number(output.input("Roughness"))
-        return Surface(base, roughness, plain(1), scattered=1)
+        return Surface(base, roughness, uniform(1), scattered=1)
 
-    def shader_bsdf_metallic(self, output: Place) -> Surface:
+    def shader_bsdf_metallic(self, output: SocketRef) -> Surface:
         node = output.node
-        lacking = ["anisotropy"] if _used(output.input("Anisotropy")) else []
+        unsupported = ["anisotropy"] if _used(output.input("Anisotropy")) else []
         if node.fresnel_type != "F82":
-            lacking.append("physical conductor (its Base Color is used)")
-        self.complain(output, lacking)
+            unsupported.append("physical conductor (its Base Color is used)")
+        self.warn_unsupported(output, unsupported)
         base, roughness = self.colour(output.inputs()["Base Color"]), self.number(output.input("Roughness"))
-        return Surface(base, roughness, plain(1), scattered=1)
+        return Surface(base, roughness, uniform(1), scattered=1)
 
-    def shader_emission(self, output: Place) -> Surface:
+    def shader_emission(self, output: SocketRef) -> Surface:
         operands = self.colour(output.input("Color")), self.number(output.input("Strength"))
         return Surface(emission=self.combine(output.node, np.multiply, *operands))
 
     shader_background = shader_emission
 
-    def shader_bsdf_transparent(self, output: Place) -> Surface:
+    def shader_bsdf_transparent(self, output: SocketRef) -> Surface:
         colour = self.fixed(output.input("Color"))
         if np.ptp(colour) > 0.01 or colour.mean() < 0.99:
             self.warn(output.node, "coloured transparency is not rendered; it is clear")
         return Surface(clear=1)
 
-    def shader_mix_shader(self, output: Place) -> Surface:
+    def shader_mix_shader(self, output: SocketRef) -> Surface:
         factor = output.input(0).origin()
         first, second = self.shader(output.input(1)), self.shader(output.input(2))
         if factor.socket.is_output and factor.node.type == "LIGHT_PATH":
@@ -159,15 +159,15 @@ class SurfaceWalker(TextureWalker):
             return first
         share = self.number(output.input(0))
         if share.texture is None:
-            share = plain(np.clip(share.colour, 0, 1))
+            share = uniform(np.clip(share.colour, 0, 1))
         elif first.clear or second.clear:
             self.warn(output.node, "transparency that varies over the surface is not rendered; it is opaque")
             return min(first, second, key=lambda surface: surface.clear)
         return self.mixed(output.node, first, second, share)
 
-    def shader_add_shader(self, output: Place) -> Surface:
+    def shader_add_shader(self, output: SocketRef) -> Surface:
         node, first, second = output.node, self.shader(output.input(0)), self.shader(output.input(1))
-        half = self.mixed(node, first, second, plain(0.5))
+        half = self.mixed(node, first, second, uniform(0.5))
         return replace(
             half,
             base=half.base.times(2),
@@ -187,7 +187,7 @@ class SurfaceWalker(TextureWalker):
         if first.scattered == second.scattered:
             rough_share = share
         else:
-            rough_share = plain(weights[1] / max(sum(weights), 1e-9))
+            rough_share = uniform(weights[1] / max(sum(weights), 1e-9))
         return Surface(
             self.combine(node, mix, share, first.base, second.base),
             self.combine(node, mix, rough_share, first.roughness, second.roughness),
@@ -197,17 +197,17 @@ class SurfaceWalker(TextureWalker):
             clear=(1 - mean) * first.clear + mean * second.clear,
         )
 
-    def other_shader(self, output: Place) -> Surface:
+    def other_shader(self, output: SocketRef) -> Surface:
         """The nearest to a shader that is not known: its colour, scattered."""
         node = output.node
         self.warn(node, f"{node.bl_label} is not supported; a surface of its colour is used")
         colours = [s for s in node.inputs if s.type == "RGBA" and s.enabled]
-        base = self.colour(Place(colours[0], output.groups)) if colours else plain(0.8)
+        base = self.colour(SocketRef(colours[0], output.groups)) if colours else uniform(0.8)
         rough = output.input("Roughness") if "Roughness" in node.inputs else None
-        return Surface(base, self.number(rough) if rough else plain(1), scattered=1)
+        return Surface(base, self.number(rough) if rough else uniform(1), scattered=1)
 
 
-def _used(place: Place) -> bool:
+def _used(ref: SocketRef) -> bool:
     """Whether a number input is linked or not zero."""
-    origin = place.origin()
+    origin = ref.origin()
     return origin.socket.is_output or abs(constant(origin.socket)[0]) > 1e-4

@@ -11,8 +11,8 @@ import numpy as np
 from . import images
 from .node_math import reflectance
 from .nodes import Walker, euler, vector_rotate
-from .paint import Array, Paint, Warn, plain
-from .sockets import Place
+from .paint import Array, Paint, Warn, uniform
+from .sockets import SocketRef
 from .texture_refs import Channel, TextureRef
 
 
@@ -22,9 +22,9 @@ class TextureWalker(Walker):
     def __init__(self, material: bpy.types.Material, mesh: bpy.types.Mesh, warn: Warn) -> None:
         super().__init__(f'Material "{material.name}"', warn)
         self.material, self.mesh = material, mesh
-        self.asks_mesh = False
+        self.uses_mesh = False
 
-    def say(self, problem: str) -> None:
+    def report(self, problem: str) -> None:
         """Warn of the material as a whole."""
         self._warn(f"{self.owner}: {problem}")
 
@@ -40,13 +40,13 @@ class TextureWalker(Walker):
         found = texture.curved(function, self._warn)
         return None if found is None else Paint(np.full(3, found[1]), found[0])
 
-    def node_tex_image(self, output: Place) -> Paint:
+    def node_tex_image(self, output: SocketRef) -> Paint:
         node, image = output.node, output.node.image
         straight = node.outputs["Alpha"].is_linked
         if image is None or images.export_image(image, straight, self._warn) is None:
             name = "has no image" if image is None else f'image "{image.name}" cannot be read'
             self.warn(node, f"{name}; as in Cycles it is magenta. Choose another, or find its file")
-            return plain(1) if output.socket.name == "Alpha" else Paint(np.array(images.MISSING))
+            return uniform(1) if output.socket.name == "Alpha" else Paint(np.array(images.MISSING))
         if node.projection != "FLAT":
             self.warn(node, f"the {node.projection.title()} projection is not supported; the UV map is used")
         if node.interpolation not in ("Linear", "Closest"):
@@ -65,60 +65,60 @@ class TextureWalker(Walker):
             ),
         )
 
-    def node_tex_environment(self, output: Place) -> Paint:
+    def node_tex_environment(self, output: SocketRef) -> Paint:
         node = output.node
         if node.image is not None and (picture := images.export_image(node.image, False, self._warn)) is not None:
             self.warn(node, "an Environment Texture is not supported on surfaces; its mean colour is used")
             return Paint(images.mean_colour(picture)[:3])
         return self.nearest(output, output)
 
-    def node_vertex_color(self, output: Place) -> Paint:
+    def node_vertex_color(self, output: SocketRef) -> Paint:
         return self.attribute(output, output.node.layer_name)
 
-    def node_attribute(self, output: Place) -> Paint:
+    def node_attribute(self, output: SocketRef) -> Paint:
         node = output.node
         if node.attribute_type != "GEOMETRY":
             return self.nearest(output, output)
         return self.attribute(output, node.attribute_name)
 
-    def attribute(self, output: Place, name: str) -> Paint:
+    def attribute(self, output: SocketRef, name: str) -> Paint:
         """The mean of an attribute of the mesh; "" is the colour attribute that renders."""
-        self.asks_mesh = True
+        self.uses_mesh = True
         if name == "" and len(self.mesh.color_attributes):
             name = self.mesh.color_attributes[max(self.mesh.color_attributes.render_color_index, 0)].name
         values = _attribute_values(self.mesh, name)
         if values is None:
             self.warn(output.node, f'mesh "{self.mesh.name}" has no values "{name}"; a plain grey is used')
-            return plain(self.unknown)
+            return uniform(self.unknown)
         self.warn(output.node, f'values on the mesh are not rendered; the mean of "{name}" is used')
         mean = values.mean(axis=0, dtype=np.float64)
         if output.socket.name == "Alpha":
-            return plain(mean[3] if len(mean) == 4 else 1)
-        return plain(mean[:3].mean()) if output.socket.identifier == "Fac" else plain(mean[:3])
+            return uniform(mean[3] if len(mean) == 4 else 1)
+        return uniform(mean[:3].mean()) if output.socket.identifier == "Fac" else uniform(mean[:3])
 
-    def node_ambient_occlusion(self, output: Place) -> Paint:
+    def node_ambient_occlusion(self, output: SocketRef) -> Paint:
         if output.socket.type == "RGBA":
             return self.nearest(output, output)
         self.warn(output.node, "Ambient Occlusion is not supported; 1 is used")
-        return plain(1)
+        return uniform(1)
 
-    def node_fresnel(self, output: Place) -> Paint:
+    def node_fresnel(self, output: SocketRef) -> Paint:
         ior = self.value(output.input("IOR"))
         self.warn(output.node, "it cannot depend on the direction; the value when seen from the front is used")
-        return plain(reflectance(ior))
+        return uniform(reflectance(ior))
 
-    def node_layer_weight(self, output: Place) -> Paint:
+    def node_layer_weight(self, output: SocketRef) -> Paint:
         blend = np.clip(self.value(output.input("Blend")), 0, 0.99999)
         self.warn(output.node, "it cannot depend on the direction; the value when seen from the front is used")
         if output.socket.name == "Facing":
-            return plain(0)
-        return plain(reflectance(1 / (1 - blend)))
+            return uniform(0)
+        return uniform(reflectance(1 / (1 - blend)))
 
     # Coordinates
 
-    def coordinates(self, place: Place) -> tuple[Array, str]:
+    def coordinates(self, ref: SocketRef) -> tuple[Array, str]:
         """(4, 4) from UV coordinates to those of a texture, and the UV map's name ("" is the active one)."""
-        origin = place.origin()
+        origin = ref.origin()
         if not origin.socket.is_output:
             return np.eye(4), ""
         node, name = origin.node, origin.socket.name
@@ -152,9 +152,9 @@ class TextureWalker(Walker):
             return change @ matrix, uv_map
         inputs = [s for s in node.inputs if s.type == "VECTOR" and s.is_linked]
         self.warn(node, f"{node.bl_label} is not supported between UV map and image, and left out")
-        return self.coordinates(Place(inputs[0], origin.groups)) if inputs else (np.eye(4), "")
+        return self.coordinates(SocketRef(inputs[0], origin.groups)) if inputs else (np.eye(4), "")
 
-    def mapping(self, output: Place) -> Array:
+    def mapping(self, output: SocketRef) -> Array:
         """(4, 4) of a Mapping node."""
         node = output.node
         matrix = np.eye(4)

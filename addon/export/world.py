@@ -14,14 +14,14 @@ from ...drgs_blender.core.frame import World
 from .images import linear_pixels
 from .node_math import rgb
 from .nodes import Walker, euler, vector_rotate
-from .paint import Paint, once, plain
-from .sockets import Place, surface_of
+from .paint import Paint, once, uniform
+from .sockets import SocketRef, surface_of
 
 Warn = Callable[[str], None]
 
 #: Linear light when nothing better is known: the grey of Blender's default world.
 FALLBACK = 0.05
-BLACK = plain(0)
+BLACK = uniform(0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,10 +112,10 @@ class _Tree(Walker):
 
     # Shaders
 
-    @once(lambda self: plain(self.unknown))
-    def shader(self, place: Place) -> Paint:
+    @once(lambda self: uniform(self.unknown))
+    def shader(self, ref: SocketRef) -> Paint:
         """Light of a shader input."""
-        origin = place.origin()
+        origin = ref.origin()
         if not origin.socket.is_output:
             return BLACK
         node = origin.node
@@ -133,7 +133,7 @@ class _Tree(Walker):
         if node.type == "ADD_SHADER":
             return self.sum(node, self.shader(origin.input(0)), self.shader(origin.input(1)))
         self.warn(node, f"{node.bl_label} is not supported as light of the world; a dim grey is used")
-        return plain(FALLBACK)
+        return uniform(FALLBACK)
 
     def sum(self, node: bpy.types.Node, first: Paint, second: Paint) -> Paint:
         """Sum of two lights."""
@@ -141,11 +141,11 @@ class _Tree(Walker):
 
     # Textures
 
-    def node_tex_environment(self, output: Place) -> Paint:
+    def node_tex_environment(self, output: SocketRef) -> Paint:
         node = output.node
         if node.image is None:
             self.warn(node, "has no image; Blender shows magenta, a dim grey is used. Choose one")
-            return plain(FALLBACK)
+            return uniform(FALLBACK)
         if node.type == "TEX_ENVIRONMENT" and node.projection != "EQUIRECTANGULAR":
             self.warn(node, "the Mirror Ball projection is read as Equirectangular")
         if node.interpolation != "Linear":
@@ -153,19 +153,19 @@ class _Tree(Walker):
         turn = self.rotation(output.input("Vector"))
         return Paint(np.ones(3), Sky(node.image, tuple(map(tuple, turn.tolist()))))
 
-    def node_tex_image(self, output: Place) -> Paint:
+    def node_tex_image(self, output: SocketRef) -> Paint:
         self.warn(output.node, "an Image Texture is read as an Environment Texture")
         return self.node_tex_environment(output)
 
-    def node_tex_sky(self, output: Place) -> Paint:
+    def node_tex_sky(self, output: SocketRef) -> Paint:
         self.warn(output.node, "the sky is replaced by plain light of its usual colour. Bake it to an image")
         return Paint(np.array((0.35, 0.55, 1.0)))
 
     # Directions
 
-    def rotation(self, place: Place) -> np.ndarray:
+    def rotation(self, ref: SocketRef) -> np.ndarray:
         """What the nodes before a texture do to the view direction, as a rotation."""
-        origin = place.origin()
+        origin = ref.origin()
         if not origin.socket.is_output:
             return np.eye(3)
         node, name = origin.node, origin.socket.name
@@ -184,9 +184,9 @@ class _Tree(Walker):
             return vector_rotate(self, origin) @ self.rotation(origin.input("Vector"))
         inputs = [s for s in node.inputs if s.type == "VECTOR" and s.is_linked]
         self.warn(node, f"{node.bl_label} is not supported between direction and image, and left out")
-        return self.rotation(Place(inputs[0], origin.groups)) if inputs else np.eye(3)
+        return self.rotation(SocketRef(inputs[0], origin.groups)) if inputs else np.eye(3)
 
-    def mapping(self, output: Place) -> np.ndarray:
+    def mapping(self, output: SocketRef) -> np.ndarray:
         """Mapping node; a texture is turned the other way than a point."""
         node = output.node
         for name, neutral in (("Location", 0.0), ("Scale", 1.0)):

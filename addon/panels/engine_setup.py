@@ -19,7 +19,7 @@ def draw_engine(layout: bpy.types.UILayout, context: bpy.types.Context, always: 
         return
     if setup_job.job is not None and setup_job.job.error is not None:
         wrapped(layout, context, str(setup_job.job.error), "ERROR")
-    if engine_environment.needs_network(engine_link.own_folder()) and not bpy.app.online_access:
+    if engine_environment.needs_network(engine_link.engine_folder()) and not bpy.app.online_access:
         wrapped(layout, context, "The set-up fetches Python packages; Blender is offline", "INTERNET_OFFLINE")
         layout.prop(context.preferences.system, "use_online_access")
     column = layout.column(align=True)

@@ -137,7 +137,7 @@ def _draw_bake(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
         layout.label(text="Settings have changed since", icon="INFO")
         text = "Rebake"
     else:
-        text = "Bake" if found.frames >= found.wanted else f"Resume ({found.frames} of {found.wanted})"
+        text = "Bake" if found.frames >= found.expected else f"Resume ({found.frames} of {found.expected})"
     row.operator("drgs.bake_physics", text=f"Bake{more}" if more else text, icon="REC")
     row.operator("drgs.free_physics", text="", icon="TRASH")
 

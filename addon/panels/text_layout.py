@@ -34,8 +34,8 @@ def bar_text(
     Where the region is too narrow, the text is written above the bar, which says the number alone.
     """
     number = f"{part:.0%}"
-    said = f"{text}  {number}" if percent else text
-    if len(said) <= _letters(context):
-        return said
+    full = f"{text}  {number}" if percent else text
+    if len(full) <= _letters(context):
+        return full
     wrapped(layout, context, text)
     return number

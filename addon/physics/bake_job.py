@@ -25,7 +25,7 @@ from .. import assets, cache_playback, messages, output_check
 from ..export.export_cache import uid
 from ..physics_settings import DrgsPhysicsSettings
 from . import particle_display, scene_export
-from .settings_export import check, describe, folder_of, own_folder, subject_of
+from .settings_export import check, describe, exclusive_folder, folder_of, subject_of
 from .simulate_process import SimulateProcess, ending
 
 #: Where a capture lies inside the cache.
@@ -108,9 +108,9 @@ class Job:
             self._process = SimulateProcess(self._inputs, self.folder, self._threads, self._device)
             return False
         alive = self._process.alive
-        if self._take(seconds) or alive:
+        if self._read_frames(seconds) or alive:
             return False
-        for line in self._process.result(self.subject, self._held()):
+        for line in self._process.result(self.subject, self._kept_results()):
             messages.note("WARNING", line)
         self._finish()
         return True
@@ -149,21 +149,21 @@ class Job:
         part, text = self._process.preparation
         return (part, text) if part < 1.0 and text else (0.0, "Filling the body")
 
-    def _take(self, seconds: float) -> bool:
+    def _read_frames(self, seconds: float) -> bool:
         """Take in what is new, for about `seconds`; whether there was anything."""
         return False
 
-    def _held(self) -> str:
+    def _kept_results(self) -> str:
         """What can be said of what there is when it ends early."""
         return ""
 
     def _finish(self) -> None:
         """The program has done its job."""
 
-    def _lacks(self, what: str) -> NoReturn:
+    def _raise_missing(self, what: str) -> NoReturn:
         """It says so, but has not written that."""
         missing = [Path(f"{what} in {self.folder}")]
-        held = f". {self._held()}" if self._held() else ""
+        held = f". {self._kept_results()}" if self._kept_results() else ""
         raise EngineError(self.subject, output_check.complaint(self.process.name, missing), output_check.REMEDY + held)
 
 
@@ -177,7 +177,7 @@ class Bake(Job):
     """
 
     def __init__(self, obj: bpy.types.Object, scene: bpy.types.Scene) -> None:
-        folder = own_folder(obj)
+        folder = exclusive_folder(obj)
         super().__init__(obj, scene, folder / INPUT, folder, still=False)
         physics = obj.drgs.physics
         self.first, self.frames, self.count = physics.frame_start, physics.frame_end - physics.frame_start + 1, 0
@@ -200,10 +200,10 @@ class Bake(Job):
         self.close()
         if self._process is not None and not self.count:
             with suppress(DrgsError):  # whatever it is, the next bake says it
-                self._take(0.0)
+                self._read_frames(0.0)
         return self.count > 0
 
-    def _take(self, seconds: float) -> bool:
+    def _read_frames(self, seconds: float) -> bool:
         if self.process.counts is None:
             return False  # until then the folder holds what was there before
         if self._playback is None:
@@ -217,13 +217,13 @@ class Bake(Job):
         self._show(renew=not before)
         return True
 
-    def _held(self) -> str:
+    def _kept_results(self) -> str:
         return f"The first {self.count} frames can be played" if self.count else ""
 
     def _finish(self) -> None:
         self._show(renew=True)
         if self.count < self.frames:
-            self._lacks(f"frames {self.first + self.count} to {self.first + self.frames - 1}")
+            self._raise_missing(f"frames {self.first + self.count} to {self.first + self.frames - 1}")
 
     def _show(self, renew: bool) -> None:
         if not self.count or self._playback is None:
@@ -262,7 +262,7 @@ class Preview(Job):
         cache = ParticleCache(self.folder)
         counts = self.process.counts
         if counts is None or cache.header() is None:
-            self._lacks("the particles")
+            self._raise_missing("the particles")
         self.counts = counts
         particle_display.show(self.target(), cache.rest().points, self.counts)
 
@@ -274,12 +274,12 @@ class Cached:
     Attributes
     ----------
     frames : how many, from the first on
-    wanted : how many a bake makes
+    expected : frames that a bake makes
     changed : settings are not those of the frames, so that a bake starts over
     """
 
     frames: int
-    wanted: int
+    expected: int
     changed: bool
 
 

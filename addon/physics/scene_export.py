@@ -33,8 +33,8 @@ BODY, SETTINGS, MATRICES, MOTION = "body.drgs", "settings.json", "matrices.npy",
 _COLLIDER = "collider_"
 #: A file of a collider, as `_capture_motion` calls it after the object, its name as in URLs.
 COLLIDER_FILE = re.compile(_COLLIDER + r"\d{3}_(.*?)\.(?:ply|npy)")
-#: What the engine's program says is kept beside what it was given.
-SAID, LOG = "said.txt", "log.txt"
+#: Standard output and log of the engine's program, beside its input.
+STDOUT, LOG = "stdout.txt", "log.txt"
 #: Least volume to which the object may scale a cubic metre, as the engine holds it.
 _FLATTEST = 1e-12
 #: Types of attributes that can mark a part of a mesh.
@@ -111,7 +111,7 @@ def clear(folder: Path) -> None:
     """Remove what `export_scene` wrote and the folder, as far as nothing else is in it."""
     with suppress(OSError):
         for path in folder.iterdir():
-            if path.name in (BODY, SETTINGS, MATRICES, MOTION, SAID, LOG) or path.name.startswith(_COLLIDER):
+            if path.name in (BODY, SETTINGS, MATRICES, MOTION, STDOUT, LOG) or path.name.startswith(_COLLIDER):
                 path.unlink(missing_ok=True)
         os.rmdir(folder)
 

@@ -68,7 +68,7 @@ def check(obj: bpy.types.Object) -> None:
         )
 
 
-def own_folder(obj: bpy.types.Object) -> Path:
+def exclusive_folder(obj: bpy.types.Object) -> Path:
     """The cache of an object, which no other object of any scene may have.
 
     Raises
@@ -78,7 +78,7 @@ def own_folder(obj: bpy.types.Object) -> Path:
     """
     own = folder_of(obj)
     for other in bpy.data.objects:
-        if other != obj and _has_physics(other) and _same_place(other, own):
+        if other != obj and _has_physics(other) and _same_folder(other, own):
             raise UsageError(
                 subject_of(obj),
                 f'has the same cache as "{other.name}", {own}',
@@ -91,7 +91,7 @@ def _has_physics(obj: bpy.types.Object) -> bool:
     return obj.type == "MESH" and obj.drgs.physics.use and not obj.library and bool(obj.users_scene)
 
 
-def _same_place(obj: bpy.types.Object, folder: Path) -> bool:
+def _same_folder(obj: bpy.types.Object, folder: Path) -> bool:
     with suppress(UsageError):  # it has no place yet
         return os.path.normcase(os.path.realpath(folder_of(obj))) == os.path.normcase(os.path.realpath(folder))
     return False

@@ -25,8 +25,8 @@ from . import scene_export
 #: Seconds that Blender waits for a program that is ended, and seconds after which that is killed: saving what it needs
 #: to go on takes some.
 _WAIT, _PATIENCE = 0.2, 5.0
-#: How a line of the program's log begins.
-_SAYS = "drgs: "
+#: Prefix of the messages in the program's log.
+_PREFIX = "drgs: "
 _COUNTS = re.compile(r"(\d+) particles.*at least (\d+) time steps")
 #: A line while kernels are compiled.
 _PREPARING = re.compile(r'DRGS_PROGRESS part=([\d.]+) phase="([^"]*)"')
@@ -76,17 +76,17 @@ class SimulateProcess:
     def __init__(self, inputs: Path, folder: Path, threads: int = 0, device: str = "cpu") -> None:
         self._counts: tuple[int, int] | None = None
         self._inputs, self._folder = inputs, folder
-        self._said, self._log = inputs / scene_export.SAID, inputs / scene_export.LOG
+        self._stdout, self._log = inputs / scene_export.STDOUT, inputs / scene_export.LOG
         command = engine_link.drgs_command()
         self.name = f"drgs simulate of {command[0]}"
         arguments = [inputs / scene_export.BODY, "--settings", inputs / scene_export.SETTINGS, "--out", folder]
         arguments += ["--overwrite", "--threads", str(threads), "--device", device]
         try:
-            with open(self._said, "wb") as said, open(self._log, "wb") as log:
+            with open(self._stdout, "wb") as output, open(self._log, "wb") as log:
                 self._process = subprocess.Popen(
                     [*command, "--no-progress", "simulate", *map(str, arguments)],
                     stdin=subprocess.PIPE,
-                    stdout=said,
+                    stdout=output,
                     stderr=log,
                     env=clean_environment(),
                     creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),  # Windows alone has it
@@ -104,7 +104,7 @@ class SimulateProcess:
         """Particles, and time steps a frame at least; None until the body is filled."""
         if self._counts is None:
             with suppress(OSError):
-                found = _COUNTS.search(self._said.read_text(encoding="utf-8", errors="replace"))
+                found = _COUNTS.search(self._stdout.read_text(encoding="utf-8", errors="replace"))
                 self._counts = (int(found[1]), int(found[2])) if found else None
         return self._counts
 
@@ -112,7 +112,7 @@ class SimulateProcess:
     def preparation(self) -> tuple[float, str]:
         """The part that is done of what comes before the body is filled, and words for it; (0, "") before any."""
         with suppress(OSError):
-            found = _PREPARING.findall(self._said.read_text(encoding="utf-8", errors="replace"))
+            found = _PREPARING.findall(self._stdout.read_text(encoding="utf-8", errors="replace"))
             if found:
                 return float(found[-1][0]), found[-1][1]
         return 0.0, ""
@@ -148,14 +148,14 @@ class SimulateProcess:
         code = self._process.wait()
         _close_input(self._process)
         if code == 0:
-            return [f"{subject}: {self._in_words(line.removeprefix(_SAYS))}" for line in lines]
-        said = next((line for line in reversed(lines) if line.startswith(_SAYS)), "")
-        if said and code != EXIT_TERMINATED:
-            raise AssetError(subject, self._in_words(said.removeprefix(_SAYS)).rstrip("."), held)
+            return [f"{subject}: {self._in_words(line.removeprefix(_PREFIX))}" for line in lines]
+        reported = next((line for line in reversed(lines) if line.startswith(_PREFIX)), "")
+        if reported and code != EXIT_TERMINATED:
+            raise AssetError(subject, self._in_words(reported.removeprefix(_PREFIX)).rstrip("."), held)
         if code == EXIT_CANNOT_WRITE:  # nor could its log
             remedy = "Free some space or choose another folder, and bake again"
             raise WriteError(f"{subject}, {self._folder}", "cannot be written", f"{remedy}. {held}".rstrip(". "))
-        last = lines[-1][:300] if lines else "it said nothing"
+        last = lines[-1][:300] if lines else "it printed nothing"
         remedy = "Bake again: it goes on" + (f". {held}" if held else "")
         raise EngineError(subject, f"the engine's program ended ({code}): {last.rstrip('.')}", remedy)
 

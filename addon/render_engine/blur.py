@@ -91,7 +91,7 @@ def focus_distance(camera: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> 
 
 def pictures(
     sharp: Frame,
-    wanted: list[Step],
+    steps: list[Step],
     depsgraph: bpy.types.Depsgraph,
     export: Callable[[], Frame],
     frame_set: Callable[[int, float], None],
@@ -105,9 +105,9 @@ def pictures(
     """
     own = depsgraph.scene.frame_current, depsgraph.scene.frame_subframe
     now = sum(own)
-    moves = any(step.time for step in wanted)
+    moves = any(step.time for step in steps)
     try:
-        for step in wanted:
+        for step in steps:
             frame = sharp
             if moves:
                 whole = math.floor(now + step.time)

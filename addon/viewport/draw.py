@@ -119,12 +119,12 @@ class Mode:
 
 
 #: Where the whole picture lies, and of a strip: where it begins and ends, the first row it has, those of the picture.
-_PLACED = (("VEC4", "rect"), ("VEC4", "strip"))
+_PLACEMENT = (("VEC4", "rect"), ("VEC4", "strip"))
 _SCREEN: dict[str, Any] = {"inputs": (("VEC2", "pos"),), "passed": (("VEC2", "uv"),), "vertex": _QUAD}
 MODES = {
-    "rendered": Mode(constants=_PLACED, images=("image",), fragment=_LINEAR, **_SCREEN),
+    "rendered": Mode(constants=_PLACEMENT, images=("image",), fragment=_LINEAR, **_SCREEN),
     "composited": Mode(
-        constants=(*_PLACED, ("VEC4", "projection"), ("VEC2", "grading")),
+        constants=(*_PLACEMENT, ("VEC4", "projection"), ("VEC2", "grading")),
         images=("image", "depth", "table"),
         fragment=_COMPOSITE,
         depth_test="LESS_EQUAL",
@@ -172,7 +172,7 @@ def shader(name: str) -> gpu.types.GPUShader:
 class Strip(NamedTuple):
     """Rows of a picture on the graphics card, with a neighbouring row on either side to be smoothed with."""
 
-    place: tuple[float, float, float, float]  # constant "strip" of the shaders
+    span: tuple[float, float, float, float]  # constant "strip" of the shaders
     textures: dict[str, gpu.types.GPUTexture]  # by pass
 
 
@@ -224,7 +224,7 @@ def picture(strips: Iterable[Strip], rect: Rect) -> None:
     rect : (x0, y0, x1, y1) of the whole picture in the region, 0 to 1, y upwards
     """
     for s in strips:
-        _draw("rendered", _quad("rendered"), {"rect": rect, "strip": s.place}, {"image": s.textures["Combined"]})
+        _draw("rendered", _quad("rendered"), {"rect": rect, "strip": s.span}, {"image": s.textures["Combined"]})
 
 
 def composite(
@@ -246,14 +246,14 @@ def composite(
     """
     lines = (projection[2, 2], projection[2, 3], projection[3, 2], projection[3, 3])
     for s in strips:
-        constants = {"rect": rect, "strip": s.place, "projection": lines, "grading": grading}
+        constants = {"rect": rect, "strip": s.span, "projection": lines, "grading": grading}
         images = {"image": s.textures["Combined"], "depth": s.textures["Depth"], "table": table}
         _draw("composited", _quad("composited"), constants, images)
 
 
-def disc_batch(places: Array, albedo: Array, sizes: Array) -> gpu.types.GPUBatch:
+def disc_batch(positions: Array, albedo: Array, sizes: Array) -> gpu.types.GPUBatch:
     """Discs at (n, 3) places with (n, 3) linear colours and (n,) diameters, in metres."""
-    given = {"pos": places, "albedo": albedo, "size": sizes}
+    given = {"pos": positions, "albedo": albedo, "size": sizes}
     return batch_for_shader(shader("surfels"), "POINTS", given)
 
 

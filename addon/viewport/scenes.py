@@ -48,24 +48,24 @@ _scenes: dict[Key, _Scene] = {}
 
 
 def exported(
-    depsgraph: bpy.types.Depsgraph, local: str = "", shown: Callable[[bpy.types.Object], bool] | None = None
+    depsgraph: bpy.types.Depsgraph, local: str = "", is_visible: Callable[[bpy.types.Object], bool] | None = None
 ) -> Exported:
     """The scene of an evaluated viewport `depsgraph`; the same object for as long as nothing changes.
 
     Parameters
     ----------
-    local : name of the local view that `shown` is of
+    local : name of the local view that `is_visible` is of
     """
     key = depsgraph.scene.name_full, depsgraph.view_layer.name, local
     scene = _scenes.setdefault(key, _Scene())
     if not scene.current or scene.exported is None:
-        made = _export(depsgraph, scene.cache, shown)
+        made = _export(depsgraph, scene.cache, is_visible)
         scene.exported, scene.current = renewed(made, scene.exported), True
     return scene.exported
 
 
 def _export(
-    depsgraph: bpy.types.Depsgraph, cache: ExportCache, shown: Callable[[bpy.types.Object], bool] | None
+    depsgraph: bpy.types.Depsgraph, cache: ExportCache, is_visible: Callable[[bpy.types.Object], bool] | None
 ) -> Exported:
     assets: dict[str, tuple[int, int]] = {}
 
@@ -73,7 +73,9 @@ def _export(
         return os.path.realpath(path)  # as the engine makes it; it is asked later, by the worker
 
     try:
-        frame = export_frame(depsgraph, key_of, messages.Warnings(), camera=NO_CAMERA, cache=cache, shown=shown)
+        frame = export_frame(
+            depsgraph, key_of, messages.Warnings(), camera=NO_CAMERA, cache=cache, is_visible=is_visible
+        )
     except DrgsError as error:
         messages.note("ERROR", str(error))
         return Exported(error=str(error))

@@ -14,7 +14,7 @@ from ...drgs_blender.core.errors import DrgsError
 from ...drgs_blender.core.material_adjustments import edited_asset
 from .. import assets, mesh_arrays
 from ..export.export_cache import ExportCache, uid
-from ..export.objects import look_of
+from ..export.objects import appearance_of
 from . import draw
 
 Array = np.ndarray
@@ -24,7 +24,7 @@ _WIDTH = 2.5
 cache = ExportCache()
 
 
-def places(asset: Asset, vertices: Array) -> Array:
+def posed_centres(asset: Asset, vertices: Array) -> Array:
     """(n, 3) float32: where the surfels are when the mesh has these (v, 3) vertices; bound ones follow their face."""
     binding = asset.binding
     if binding is None or len(vertices) != len(asset.mesh.vertices):
@@ -65,7 +65,7 @@ def _batch(obj: bpy.types.Object) -> gpu.types.GPUBatch | None:
         return None
     vertices = mesh_arrays.read_vertices(obj.data)
     sizes = _WIDTH * asset.surfels.scale.max(axis=1)
-    return draw.disc_batch(places(asset, vertices), colours(obj, asset), sizes.astype(np.float32))
+    return draw.disc_batch(posed_centres(asset, vertices), colours(obj, asset), sizes.astype(np.float32))
 
 
 def colours(obj: bpy.types.Object, asset: Asset) -> Array:
@@ -73,6 +73,6 @@ def colours(obj: bpy.types.Object, asset: Asset) -> Array:
     if obj.drgs.show_captured or obj.mode == "EDIT":  # then its mesh is a wrapper without attributes
         return asset.surfels.albedo
     try:
-        return edited_asset(asset, *look_of(obj, asset, lambda text: None)).surfels.albedo
+        return edited_asset(asset, *appearance_of(obj, asset, lambda text: None)).surfels.albedo
     except DrgsError:  # reported, as warnings are, when the object is rendered
         return asset.surfels.albedo

@@ -30,7 +30,7 @@ _BUSY, _IDLE = 0.01, 0.1
 STRIP_PIXELS = 1 << 20
 
 worker = Worker()
-_shown: dict[str, ViewportState] = {}
+_viewports: dict[str, ViewportState] = {}
 _last_news = 0
 #: Seconds that redraws took, and those that Blender's thread worked in them, for `bench/bench_viewport.py`.
 redraws: deque[tuple[float, float]] = deque(maxlen=10_000)
@@ -42,14 +42,14 @@ class ViewportState:
 
     Attributes
     ----------
-    wanted : exported scene, camera and settings that were asked for last
-    picture, strips : what is on the screen
-    arriving, arrived : the picture that comes next, and as much of it as redraws have had time for
-    since : when the first picture of this request was drawn
-    warned : warnings of the engine that are among the messages already
+    requested : exported scene, camera and settings of the latest request
+    picture, strips : the picture on the screen
+    arriving, arrived : the next picture, and its strips that are on the graphics card
+    since : time at which the first picture of this request was drawn
+    warned : warnings of the engine that are messages already
     """
 
-    wanted: tuple[object, ...] = ()
+    requested: tuple[object, ...] = ()
     picture: Picture | None = None
     strips: list[draw.Strip] = field(default_factory=list)
     arriving: Picture | None = None
@@ -90,16 +90,16 @@ def update(
     camera = view_camera(region, space, rv3d, depsgraph.scene)
     if camera is None:
         return ""
-    shown = _shown.setdefault(name, ViewportState())
+    viewport = _viewports.setdefault(name, ViewportState())
     options = _options(depsgraph.scene, name, composited)
-    wanted = exported, _values(camera), (options, depthless)
-    if shown.wanted and shown.wanted[0] is exported and shown.wanted[1:] == wanted[1:]:
+    requested = exported, _values(camera), (options, depthless)
+    if viewport.requested and viewport.requested[0] is exported and viewport.requested[1:] == requested[1:]:
         return ""
     try:
         client = engine_link.client()
     except DrgsError as error:
         return str(error)
-    shown.wanted = wanted
+    viewport.requested = requested
     frame = replace(exported.frame, camera=camera, **options)
     if composited:
         frame = _alone(frame, depthless)
@@ -113,33 +113,33 @@ def newest(name: str) -> ViewportState | None:
 
     Another one is brought there, as much of it as a redraw has time for.
     """
-    shown = _shown.get(name)
-    if shown is None:
+    viewport = _viewports.get(name)
+    if viewport is None:
         return None
     picture = worker.picture(name)
-    if shown.arriving is None and picture is not shown.picture:  # what is half there is finished first
-        shown.arriving = picture
-    if shown.arriving is not None:
-        _upload(shown, shown.arriving)
-    return shown if shown.picture is not None else None
+    if viewport.arriving is None and picture is not viewport.picture:  # what is half there is finished first
+        viewport.arriving = picture
+    if viewport.arriving is not None:
+        _upload(viewport, viewport.arriving)
+    return viewport if viewport.picture is not None else None
 
 
-def _upload(shown: ViewportState, picture: Picture) -> None:
+def _upload(viewport: ViewportState, picture: Picture) -> None:
     """The next rows of the picture that is arriving; show it when it is whole."""
     passes = {n: picture.passes[n] for n in draw.KINDS if n in picture.passes}
     height, width = picture.passes["Combined"].shape[:2]
     rows = rows_of_strip(height, width)
-    top = rows * len(shown.arrived)
-    shown.arrived.append(draw.strip(passes, top, min(top + rows, height)))
+    top = rows * len(viewport.arrived)
+    viewport.arrived.append(draw.strip(passes, top, min(top + rows, height)))
     if top + rows < height:
         return
-    if shown.picture is None or shown.picture.request is not picture.request:
-        shown.since = time.perf_counter()
-    shown.picture, shown.strips = picture, shown.arrived
-    shown.arriving, shown.arrived = None, []
+    if viewport.picture is None or viewport.picture.request is not picture.request:
+        viewport.since = time.perf_counter()
+    viewport.picture, viewport.strips = picture, viewport.arrived
+    viewport.arriving, viewport.arrived = None, []
     for text in picture.passes.warnings:
-        if text not in shown.warned:
-            shown.warned.add(text)
+        if text not in viewport.warned:
+            viewport.warned.add(text)
             messages.note("WARNING", text)
 
 
@@ -151,24 +151,24 @@ def rows_of_strip(height: int, width: int) -> int:
 
 def show(name: str) -> None:
     """Draw the newest picture of a rendered viewport into its region."""
-    shown = newest(name)
-    if shown is not None and shown.picture is not None:
-        draw.picture(shown.strips, rect_of(shown.picture))
+    viewport = newest(name)
+    if viewport is not None and viewport.picture is not None:
+        draw.picture(viewport.strips, rect_of(viewport.picture))
 
 
 def status(name: str) -> tuple[str, str]:
     """What to say of a viewport: (what is being done, an error or "")."""
-    shown = _shown.get(name)
+    viewport = _viewports.get(name)
     error = worker.state(name)[1]
-    if shown is None or error:
+    if viewport is None or error:
         return "", error
     phase, part = worker.progress(name)
     if is_counted(phase):
         return f"{phase}  {part:.0%}", ""
-    if shown.picture is None or is_preparing(phase):
+    if viewport.picture is None or is_preparing(phase):
         return phase or STARTING, ""
-    samples = shown.picture.request.frame.settings.sample_count
-    return f"Sample {round(shown.picture.fraction * samples)}/{samples}", ""
+    samples = viewport.picture.request.frame.settings.sample_count
+    return f"Sample {round(viewport.picture.fraction * samples)}/{samples}", ""
 
 
 def preparation() -> tuple[str, float]:
@@ -179,9 +179,9 @@ def preparation() -> tuple[str, float]:
 
 def forget() -> None:
     """Nothing of the last file is seen in the next."""
-    for name in list(_shown):
+    for name in list(_viewports):
         worker.drop(name)
-    _shown.clear()
+    _viewports.clear()
     scenes.forget()
 
 
@@ -197,10 +197,10 @@ def _export(depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D) -> sce
     if space.local_view is None:
         return scenes.exported(depsgraph)
 
-    def shown(obj: bpy.types.Object) -> bool:
+    def is_visible(obj: bpy.types.Object) -> bool:
         return obj.type == "LIGHT" or obj.original.local_view_get(space)  # lights shine in every view
 
-    return scenes.exported(depsgraph, f"{space.as_pointer():x}", shown)
+    return scenes.exported(depsgraph, f"{space.as_pointer():x}", is_visible)
 
 
 def _options(scene: bpy.types.Scene, name: str, composited: bool) -> dict[str, Any]:
@@ -258,16 +258,16 @@ def _poll() -> float | None:
     """Have the viewports drawn again that have news; end when there are none left."""
     global _last_news
     live = dict(_live())
-    for name in set(_shown) - set(live):
+    for name in set(_viewports) - set(live):
         worker.drop(name)
-        del _shown[name]
-    arriving = {name for name, shown in _shown.items() if shown.arriving is not None}
+        del _viewports[name]
+    arriving = {name for name, viewport in _viewports.items() if viewport.arriving is not None}
     news = worker.news  # once: the worker goes on counting
     for name, area in live.items():
         if news != _last_news or name in arriving:
             area.tag_redraw()
     _last_news = news
-    if not _shown:
+    if not _viewports:
         return None
     return _BUSY if worker.busy() or arriving else _IDLE
 

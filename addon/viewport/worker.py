@@ -50,7 +50,7 @@ class Picture:
 class _View:
     name: str
     request: Request
-    asked: float
+    submitted: float
     begun: bool = False
     fraction: float = 0.0
     picture: Picture | None = None
@@ -78,7 +78,7 @@ class Worker:
             if view is None:
                 view = self._views[name] = _View(name, request, time.perf_counter())
             elif view.begun:
-                view.asked = time.perf_counter()
+                view.submitted = time.perf_counter()
             view.request, view.begun, view.fraction, view.error = request, False, 0.0, ""
             if self._thread is None:
                 self._ending = False
@@ -154,7 +154,7 @@ class Worker:
                     self._changed.wait()
                 if self._ending or view is None:
                     return
-                request, first, asked = view.request, not view.begun, view.asked
+                request, first, submitted = view.request, not view.begun, view.submitted
                 view.begun = True
             try:
                 self._load(view, request)
@@ -179,7 +179,7 @@ class Worker:
             now = time.perf_counter()
             fraction = passes.statistics.get("view.fraction", 1.0)
             with self._changed:
-                view.picture, view.phase, view.part = Picture(request, passes, fraction, now - asked), "", 0.0
+                view.picture, view.phase, view.part = Picture(request, passes, fraction, now - submitted), "", 0.0
                 if view.request is request:
                     view.fraction = fraction
             self.news += 1
@@ -190,7 +190,7 @@ class Worker:
             return None
         waiting = [view for view in self._views.values() if not view.begun]
         if waiting:
-            return min(waiting, key=lambda view: view.asked)
+            return min(waiting, key=lambda view: view.submitted)
         growing = [view for view in self._views.values() if _unfinished(view)]
         return min(growing, key=lambda view: view.fraction, default=None)
 

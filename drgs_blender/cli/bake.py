@@ -99,15 +99,15 @@ def _bake(
     from ..formats.exr import write_exr_picture
 
     frame = surface_frame(path, args.samples, session)
-    prepared, placed = session.place(frame)
+    prepared, posed = session.prepare(frame)
     tree = prepared.surfel_bvh
-    index = {item.state.name: i for i, item in enumerate(placed)}
+    index = {item.state.name: i for i, item in enumerate(posed)}
     for k, (name, out, uvs) in enumerate(targets):
         if name not in index:
             known = ", ".join(index) or "none"
             raise UsageError(f"--object {name}", f"is not in {path}, which has {known}", "Choose one of them")
         check_writable(out)
-        item = placed[index[name]]
+        item = posed[index[name]]
         if not len(item.mesh.faces):
             raise UsageError(f"object {name}", "has no mesh that light could be baked to", "Import it with a mesh")
         texel = None
@@ -116,7 +116,7 @@ def _bake(
         else:
             points, texel = texel_points(item.mesh, _uvs_of(uvs, item), args.size)
         if tree is not None:
-            points = own_surfels(points, index[name], float(tree.sizes(len(placed))[index[name]]))
+            points = own_surfels(points, index[name], float(tree.sizes(len(posed))[index[name]]))
         components = light_components(
             prepared.scene, prepared.environment, points, frame.settings, prepared.lights, tree
         )

@@ -44,13 +44,13 @@ def do(job: dict[str, Any], reader: io.FileIO, writer: io.FileIO) -> None:
     version = importlib.import_module(f"{package}.drgs_blender.core.version").__version__
     link = protocol.Link(reader, writer)
     link.send(protocol.Hello(protocol.PROTOCOL, version, os.getpid()))
-    threading.Thread(target=say_alive, args=(link, protocol), daemon=True).start()
+    threading.Thread(target=send_heartbeats, args=(link, protocol), daemon=True).start()
     try:
         render_frames(Exporter(link, package, job["passes"]), job)
         link.send(protocol.Shutdown())
     except errors.DrgsError as error:
         link.send(protocol.Failed(0, type(error).__name__, error.subject, error.problem, error.remedy))
-    except ParentGone:
+    except ParentExited:
         return
     except Exception as error:
         # Reported to the parent, which ends the job; the traceback is in Blender's output (-v).
@@ -58,12 +58,12 @@ def do(job: dict[str, Any], reader: io.FileIO, writer: io.FileIO) -> None:
         link.send(protocol.Failed(0, "DrgsError", "Blender", f"{type(error).__name__}: {error}", ""))
 
 
-class ParentGone(Exception):
-    """Nobody reads what this side sends."""
+class ParentExited(Exception):
+    """The parent has ended: its end of the link is closed."""
 
 
-def say_alive(link: Any, protocol: Any) -> None:
-    """Send a sign of life every few seconds, which a long evaluation gives and a Blender that hangs does not."""
+def send_heartbeats(link: Any, protocol: Any) -> None:
+    """Send a heartbeat every few seconds: it goes on during a long evaluation, and ends when Blender hangs."""
     with contextlib.suppress(OSError):
         while True:
             time.sleep(ALIVE_SECONDS)
@@ -129,23 +129,23 @@ class Exporter:
         """The parent's key of the asset at `path`."""
         if path not in self.keys:
             self.requests += 1
-            self.keys[path] = self.ask(self.protocol.LoadAsset(self.requests, str(path))).key
+            self.keys[path] = self.request(self.protocol.LoadAsset(self.requests, str(path))).key
         return self.keys[path]
 
-    def ask(self, message: Any, arrays: dict[str, Any] | None = None) -> Any:
-        """Send a request and return the answer; ParentGone when nobody is there."""
+    def request(self, message: Any, arrays: dict[str, Any] | None = None) -> Any:
+        """Send a request and return the answer; ParentExited when the parent has ended."""
         try:
             self.link.send(message, arrays)
         except OSError as error:
-            raise ParentGone from error
+            raise ParentExited from error
         answer = self.link.receive()
         if answer is None:
-            raise ParentGone
+            raise ParentExited
         return answer[0]
 
     def more(self) -> list[int]:
         """Further frames from the parent, none when it has no more."""
-        answer = self.ask(self.protocol.Render(0, {}, {}))
+        answer = self.request(self.protocol.Render(0, {}, {}))
         return answer.frame["frames"] if isinstance(answer, self.protocol.Render) else []
 
     def send(self, depsgraph: Any, frame_set: Any) -> None:
@@ -178,11 +178,11 @@ class Exporter:
                 self.submit(picture, {}, warnings)
 
     def submit(self, frame: Any, about: dict[str, Any], warnings: list[str]) -> Any:
-        """Send a frame with what is said `about` it, and return the answer."""
+        """Send a frame with its number, layer and count of pictures, `about`; return the answer."""
         described, arrays = self.encode_frame(frame)
         slots, changed = self.sent.changes(arrays)
         self.requests += 1
-        return self.ask(
+        return self.request(
             self.protocol.Render(self.requests, about | {"warnings": warnings, "frame": described}, slots), changed
         )
 
@@ -264,7 +264,7 @@ def render_frames(exporter: Exporter, job: dict[str, Any]) -> None:
         scene = bpy.context.scene
         if job.get("report"):
             about = {"files": outside_files(), "notes": differences(scene)}
-            exporter.ask(exporter.protocol.Render(0, about, {}))
+            exporter.request(exporter.protocol.Render(0, about, {}))
         if not any(layer.use for layer in scene.view_layers):  # Blender would crash
             problem, remedy = "has no view layer that is rendered", "Switch on Use for Rendering of one"
             raise exporter.errors.UsageError(f'scene "{scene.name}"', problem, remedy)

@@ -93,7 +93,7 @@ class BlenderProcess:
         self._deadline: float | None = None  # set while this side waits
         self.report: dict[str, Any] = {}  # about the file, when the job asks for it
         self._latest = np.inf  # when the frame has to be there
-        self._silent = self._late = False
+        self._is_silent = self._is_late = False
 
     def __enter__(self) -> BlenderProcess:
         repository, temporary = self._make_folders()
@@ -107,7 +107,7 @@ class BlenderProcess:
             raise DeviceError(f"Blender at {self._blender.program}", f"does not start ({error})") from error
         self._listener = threading.Thread(target=self._listen, daemon=True)
         self._listener.start()
-        self._link = Link(self._process.stdout, self._process.stdin, self._hear)  # type: ignore[arg-type]
+        self._link = Link(self._process.stdout, self._process.stdin, self._reset_deadline)  # type: ignore[arg-type]
         threading.Thread(target=self._watch, daemon=True).start()
         try:
             self._greet(self._job | {"repository": repository, "folder": self._folder})
@@ -130,7 +130,7 @@ class BlenderProcess:
 
     def more(self, frames: Sequence[int]) -> Iterator[Evaluated]:
         """As `frames`, for a Blender that was kept and has finished those it was given before."""
-        self._answer(protocol.Render(0, {"frames": list(frames)}, {}))
+        self._send(protocol.Render(0, {"frames": list(frames)}, {}))
         yield from self.frames()
 
     def frames(self) -> Iterator[Evaluated]:
@@ -151,7 +151,7 @@ class BlenderProcess:
                 self.report = message.frame
             else:
                 yield self._evaluated(message, arrays)
-            self._answer(protocol.Result(message.id, [], {}))
+            self._send(protocol.Result(message.id, [], {}))
 
     def _next(self) -> tuple[Any, dict[str, np.ndarray]]:
         """What Blender sends next, assets being loaded for it: Render or Shutdown, and arrays."""
@@ -162,17 +162,17 @@ class BlenderProcess:
                 return message, arrays
             if not isinstance(message, protocol.LoadAsset):
                 raise EngineError("Blender", f"sent {type(message).__name__}, which makes no sense here", "Try again")
-            self._answer(protocol.Loaded(message.id, self._key_of(Path(message.path)), 0, 0))
+            self._send(protocol.Loaded(message.id, self._key_of(Path(message.path)), 0, 0))
 
     def _pictures(self, count: int, warnings: list[str]) -> Iterator[Frame]:
         """The pictures of a blurred frame; behind them Blender announces the frame again and waits as before."""
-        self._answer(protocol.Render(0, {}, {}))
+        self._send(protocol.Render(0, {}, {}))
         for _ in range(count):
             message, arrays = self._next()
             frame = self._frame(message, arrays)
             warnings[:] = message.frame["warnings"]
             yield frame
-            self._answer(protocol.Result(message.id, [], {}))
+            self._send(protocol.Result(message.id, [], {}))
         self._frame(*self._next())
 
     def _make_folders(self) -> tuple[str | None, Path]:
@@ -213,8 +213,8 @@ class BlenderProcess:
         received = self._link.receive() if line else None
         self._deadline = None
         if received is None:
-            self._complain_of_silence(START_SECONDS)
-            raise DeviceError(f"Blender at {self._blender.program}", f"cannot do the job: {self._epitaph()}", _CHECK)
+            self._raise_timeout(START_SECONDS)
+            raise DeviceError(f"Blender at {self._blender.program}", f"cannot do the job: {self._exit_text()}", _CHECK)
         message = received[0]
         if not isinstance(message, protocol.Hello) or not protocol.same_version(message):
             version = getattr(message, "version", "unknown")
@@ -223,28 +223,30 @@ class BlenderProcess:
 
     def _receive(self) -> tuple[Any, dict[str, np.ndarray]]:
         try:
-            self._hear()
+            self._reset_deadline()
             received = self._link.receive()
             while received is not None and isinstance(received[0], protocol.Progress):
                 received = self._link.receive()
         except (ProtocolError, OSError) as error:
-            self._complain_of_silence(SILENT_SECONDS)
-            raise EngineError("Blender", f"stopped in the middle of a message ({error})", self._epitaph()) from error
+            self._raise_timeout(SILENT_SECONDS)
+            raise EngineError("Blender", f"stopped in the middle of a message ({error})", self._exit_text()) from error
         finally:
             self._deadline = None
         if received is None:
-            self._complain_of_silence(SILENT_SECONDS)
-            raise EngineError("Blender", f"ended before the job: {self._epitaph()}", "Try again; -vv shows its output")
+            self._raise_timeout(SILENT_SECONDS)
+            raise EngineError(
+                "Blender", f"ended before the job: {self._exit_text()}", "Try again; -vv shows its output"
+            )
         message = received[0]
         if isinstance(message, protocol.Failed):
             raise ERROR_CLASSES.get(message.error, DrgsError)(message.subject, message.problem, message.remedy)
         return received
 
-    def _answer(self, message: Any) -> None:
+    def _send(self, message: Any) -> None:
         try:
             self._link.send(message)
         except OSError as error:  # it died while this side worked
-            raise EngineError("Blender", f"ended before the job: {self._epitaph()}", "Try again") from error
+            raise EngineError("Blender", f"ended before the job: {self._exit_text()}", "Try again") from error
 
     def _evaluated(self, message: protocol.Render, sent: dict[str, np.ndarray]) -> Evaluated:
         frame, about = self._frame(message, sent), message.frame
@@ -260,7 +262,7 @@ class BlenderProcess:
             raise EngineError("Blender", f"did not send {missing[0]}", "Try again")
         return decode_frame(message.frame["frame"], arrays)
 
-    def _hear(self) -> None:
+    def _reset_deadline(self) -> None:
         """Something arrived, or waiting begins."""
         self._deadline = max(self._deadline or 0.0, time.monotonic() + SILENT_SECONDS)
 
@@ -269,14 +271,14 @@ class BlenderProcess:
         while not self._ended.wait(0.5):
             deadline, now = self._deadline, time.monotonic()
             if deadline is not None and now > min(deadline, self._latest):
-                self._silent, self._late = now > deadline, now > self._latest
+                self._is_silent, self._is_late = now > deadline, now > self._latest
                 self._process.kill()
                 return
 
-    def _complain_of_silence(self, seconds: float) -> None:
-        if self._late:
+    def _raise_timeout(self, seconds: float) -> None:
+        if self._is_late:
             raise EngineError("Blender", f"evaluated one frame for more than {self._timeout:g} s", "Raise --timeout")
-        if self._silent:
+        if self._is_silent:
             raise EngineError("Blender", f"did not answer for {seconds:g} s and was ended", "Try again")
 
     def _listen(self) -> None:
@@ -291,7 +293,7 @@ class BlenderProcess:
             self._words.append(text)
             logger.debug("blender: %s", text)
 
-    def _epitaph(self) -> str:
+    def _exit_text(self) -> str:
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(5)
         self._listener.join(2)

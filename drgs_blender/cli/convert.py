@@ -13,7 +13,7 @@ from ..core.errors import UsageError
 from ..core.file_types import Held
 from ..core.frame_sequences import frame_path
 from ..formats.axes import UP_AXES
-from .frame_range import frames_wanted
+from .frame_range import requested_frames
 from .output import check_writable
 from .progress import clock
 from .relight import finite, positive
@@ -71,7 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Convert one file, or those of all frames."""
-    frames = frames_wanted(args.frames, args.input, args.output)
+    frames = requested_frames(args.frames, args.input, args.output)
     if frames is None:
         convert(args)
         return 0

@@ -149,7 +149,7 @@ class FrameSource:
         self._args, session = args, Session()
         self._frame = surface_frame(args.input, args.samples, session)
         self.notes: list[str] = []
-        self._prepared, self._objects = session.place(self._frame)
+        self._prepared, self._objects = session.prepare(self._frame)
         self._seen = [i for i, item in enumerate(self._objects) if item.state.visibility.camera]
         self._session = session  # keeps the scene
         faces = any(len(self._objects[i].mesh.faces) for i in self._seen)

@@ -103,7 +103,7 @@ def denoise(args: argparse.Namespace) -> int:
         for done, number in enumerate(frames, 1):
             lines.begin(number)
             path, settings = frame_path(args.out, number), source.settings(number, args.passes)
-            whole = None if args.overwrite else frame_store.read_whole(path)
+            whole = None if args.overwrite else frame_store.read_complete(path)
             if whole is not None and whole[1].get(frame_store.SETTINGS) == settings:
                 lines.skipped(path)
             else:

@@ -13,8 +13,8 @@ def main() -> int:
         return run()
     except KeyboardInterrupt:
         from ..core.errors import EXIT_INTERRUPTED
-        from .frame_lines import say, say_end
+        from .frame_lines import emit, emit_exit_class
 
-        say("drgs: interrupted\n", sys.stderr)
-        say_end(sys.argv[1:], EXIT_INTERRUPTED)
+        emit("drgs: interrupted\n", sys.stderr)
+        emit_exit_class(sys.argv[1:], EXIT_INTERRUPTED)
         return EXIT_INTERRUPTED

@@ -16,7 +16,7 @@ HEARTBEAT_SECONDS = 30.0
 PROGRESS_SECONDS = 5.0
 
 
-def say(text: str, stream: IO[str] | None) -> None:
+def emit(text: str, stream: IO[str] | None) -> None:
     """Write a text at once. A log that cannot be written, as its disk is full, costs words and no frames.
 
     Raises
@@ -35,11 +35,11 @@ def say(text: str, stream: IO[str] | None) -> None:
         pass  # nobody reads it
 
 
-def say_end(arguments: Sequence[str], code: int) -> None:
+def emit_exit_class(arguments: Sequence[str], code: int) -> None:
     """The last line of the commands that farms run, which they read."""
     command = next((word for word in arguments if not word.startswith("-")), None)
     if command in ("render", "denoise") and not {"-h", "--help"} & set(arguments):
-        say(f"DRGS_EXIT class={EXIT_CLASSES.get(code, 'internal')}\n", sys.stdout)
+        emit(f"DRGS_EXIT class={EXIT_CLASSES.get(code, 'internal')}\n", sys.stdout)
 
 
 class FrameLines:
@@ -71,47 +71,47 @@ class FrameLines:
     def begin(self, frame: int) -> None:
         """A frame's description arrived."""
         self._started = time.monotonic()
-        self._say(f"Fra:{frame} | Rendering | Sample 0/100", doing=True)
+        self._emit(f"Fra:{frame} | Rendering | Sample 0/100", doing=True)
 
     def progress(self, frame: int, phase: str, fraction: float) -> None:
         """Where the picture stands; most calls print nothing."""
         fraction = 0.0 if is_preparing(phase) else min(max(fraction, 0.0), 1.0)  # nothing of the picture is done
         self._doing = f"Fra:{frame} | {phase.capitalize()} | Sample {int(100 * fraction)}/100"
         if time.monotonic() - self._last >= self._interval:
-            self._say(self._doing)
-            self._tell_openjd(fraction, f"frame {frame}, {phase}")
+            self._emit(self._doing)
+            self._report_to_openjd(fraction, f"frame {frame}, {phase}")
 
     def finished(self, frames: int) -> None:
         """So many frames of the job are there, made or found."""
         self._finished = frames
-        self._tell_openjd(0.0, f"{frames} of {self._openjd} frames")
+        self._report_to_openjd(0.0, f"{frames} of {self._openjd} frames")
 
     def saved(self, path: object) -> None:
         """A frame is on disk and verified."""
         minutes, seconds = divmod(time.monotonic() - self._started, 60)
-        self._say(f"Saved: '{path}'\n Time: {int(minutes):02d}:{seconds:05.2f}")
+        self._emit(f"Saved: '{path}'\n Time: {int(minutes):02d}:{seconds:05.2f}")
 
     def skipped(self, path: object) -> None:
         """A frame is there already, complete and of the same settings."""
-        self._say(f"skipping existing frame '{path}'")
+        self._emit(f"skipping existing frame '{path}'")
 
     def note(self, text: str) -> None:
         """Something the user should know that does not stop the job."""
-        self._say(f"Note: {text}")
+        self._emit(f"Note: {text}")
 
-    def _tell_openjd(self, fraction: float, status: str) -> None:
+    def _report_to_openjd(self, fraction: float, status: str) -> None:
         if self._openjd:
             done = 100 * (self._finished + min(max(fraction, 0.0), 1.0)) / self._openjd
-            self._say(f"openjd_progress: {min(done, 100.0):.1f}\nopenjd_status: {status}")
+            self._emit(f"openjd_progress: {min(done, 100.0):.1f}\nopenjd_status: {status}")
 
-    def _say(self, line: str, doing: bool = False) -> None:
+    def _emit(self, line: str, doing: bool = False) -> None:
         with self._lock:
             if doing:
                 self._doing = line
             self._last = time.monotonic()
-            say(line + "\n", sys.stdout)
+            emit(line + "\n", sys.stdout)
 
     def _beat(self) -> None:
         while not self._ended.wait(min(1.0, self._heartbeat / 4)):
             if time.monotonic() - self._last >= self._heartbeat:
-                self._say(self._doing)
+                self._emit(self._doing)

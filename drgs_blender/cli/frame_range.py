@@ -63,7 +63,7 @@ def parse_frames(text: str) -> list[int]:
     return list(frames)
 
 
-def frames_wanted(text: str | None, source: Path, output: Path) -> list[int] | None:
+def requested_frames(text: str | None, source: Path, output: Path) -> list[int] | None:
     """The frames of a sequence of files, one file each; None where `source` is a single file.
 
     Parameters

@@ -61,17 +61,17 @@ def settings_hash(frame: Frame, assets: Mapping[str, Path]) -> str:
 
 def is_complete(path: Path, frame: Frame, settings: str) -> bool:
     """Whether `path` is a frame that decodes, has the right size and passes, and was made with these settings."""
-    whole = read_whole(path)
+    stored = read_complete(path)
     x0, y0, x1, y1 = frame.camera.window
     expected = {name: (y1 - y0, x1 - x0, len(BY_NAME[name].channels)) for name in frame.passes}
     return (
-        whole is not None
-        and whole[1].get(SETTINGS) == settings
-        and {name: p.shape for name, p in whole[0].items()} == expected
+        stored is not None
+        and stored[1].get(SETTINGS) == settings
+        and {name: p.shape for name, p in stored[0].items()} == expected
     )
 
 
-def read_whole(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]] | None:
+def read_complete(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]] | None:
     """Passes and metadata of the frame at `path`; None where there is none that decodes."""
     if not path.is_file():
         return None

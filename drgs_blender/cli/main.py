@@ -20,7 +20,7 @@ from typing import NoReturn
 
 from ..core import errors
 from ..core.version import __version__
-from .frame_lines import say, say_end
+from .frame_lines import emit, emit_exit_class
 
 logger = logging.getLogger(__name__)
 
@@ -111,7 +111,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             stream.reconfigure(errors="backslashreplace")  # names of files can have what the terminal has not
     code = run_command(arguments)
     with contextlib.suppress(BrokenPipeError):
-        say_end(arguments, code)
+        emit_exit_class(arguments, code)
     for name in ("stdout", "stderr"):
         try:
             getattr(sys, name).flush()
@@ -136,10 +136,10 @@ def run_command(arguments: Sequence[str], run: Callable[[argparse.Namespace], in
         finally:
             signal.signal(signal.SIGTERM, previous)
     except errors.DrgsError as error:
-        say(f"drgs: {error}\n", sys.stderr)
+        emit(f"drgs: {error}\n", sys.stderr)
         return error.exit_code
     except (KeyboardInterrupt, errors.Cancelled):
-        say("drgs: interrupted\n", sys.stderr)
+        emit("drgs: interrupted\n", sys.stderr)
         return errors.EXIT_INTERRUPTED
     except BrokenPipeError:
         sys.stdout = None  # the reader left; nothing may be flushed at exit
@@ -149,13 +149,13 @@ def run_command(arguments: Sequence[str], run: Callable[[argparse.Namespace], in
     except MemoryError as error:
         logger.info("out of memory", exc_info=True)
         reason = f" ({error})" if str(error) else ""
-        say(f"drgs: the memory is not enough for this{reason}. Use a smaller picture or file.\n", sys.stderr)
+        emit(f"drgs: the memory is not enough for this{reason}. Use a smaller picture or file.\n", sys.stderr)
         return errors.EXIT_RETRY
     except Exception as error:
         # The one place where any exception ends: a user gets a sentence, -v a traceback, a farm its exit code.
         logger.info("internal error", exc_info=True)
         hint = "" if verbose else " Run again with -v for details and report it."
-        say(f"drgs: internal: {type(error).__name__}: {error}.{hint}\n", sys.stderr)
+        emit(f"drgs: internal: {type(error).__name__}: {error}.{hint}\n", sys.stderr)
         return errors.EXIT_INTERNAL
 
 

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def surface_frame(path: Path, samples: int, session: Session) -> Frame:
-    """Frame whose surfaces get `samples` samples of light per point; ``session.place`` finds its assets."""
+    """Frame whose surfaces get `samples` samples of light per point; ``session.prepare`` finds its assets."""
     from ..ipc.frame_file import read_frame_file
 
     frame = read_frame_file(path)

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from ..core.phases import is_counted, is_preparing
-from .frame_lines import say
+from .frame_lines import emit
 from .interrupt import interruptible
 
 #: Between two lines while kernels are compiled: for programs, and for people without a terminal.
@@ -80,7 +80,7 @@ class FractionBar:
     def __exit__(self, *_: object) -> None:
         self._bar.close()
         if self._for_programs and self._next:
-            say('DRGS_PROGRESS part=1.000 phase="Ready"\n', sys.stdout)
+            emit('DRGS_PROGRESS part=1.000 phase="Ready"\n', sys.stdout)
 
     def __call__(self, phase: str, fraction: float) -> None:
         """Show what is being done and the part of it that is done, in [0, 1]."""
@@ -92,19 +92,19 @@ class FractionBar:
         self._bar.update(max(0.0, min(1.0, fraction) - self._bar.n))
         self._bar.refresh()  # the clock goes on where nothing else does
         if is_preparing(phase):
-            self._say(phase, fraction)
+            self._emit(phase, fraction)
 
-    def _say(self, phase: str, fraction: float) -> None:
+    def _emit(self, phase: str, fraction: float) -> None:
         """Nothing else is heard for minutes where there is no bar."""
         now = time.monotonic()
         if now < self._next:
             return
         if self._for_programs:
             self._next = now + PROGRAM_SECONDS
-            say(f'DRGS_PROGRESS part={fraction:.3f} phase="{phase}"\n', sys.stdout)
+            emit(f'DRGS_PROGRESS part={fraction:.3f} phase="{phase}"\n', sys.stdout)
         elif self._for_people:
             self._next = now + PEOPLE_SECONDS
-            say(f"drgs: {phase}\n", sys.stderr)
+            emit(f"drgs: {phase}\n", sys.stderr)
 
 
 def prepare_engine(args: argparse.Namespace, *jobs: str) -> None:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 from ..core.file_types import CAMERAS
 from ..core.phases import is_preparing
 from ..formats.axes import UP_AXES
-from .frame_lines import say
+from .frame_lines import emit
 from .interrupt import interruptible
 from .output import check_suffix, check_writable, write_and_report
 from .progress import FractionBar
@@ -133,7 +133,7 @@ def run(args: argparse.Namespace) -> int:
 
     def note(text: str) -> None:
         if not args.quiet and any(work.glob("*.state")):
-            say(f"drgs: {text}\n", sys.stderr)
+            emit(f"drgs: {text}\n", sys.stderr)
 
     note(f"an earlier run was stopped: going on with {work}, where it is of these photographs and settings")
     with interruptible() as cancelled, FractionBar(args, "reconstructing") as bar:

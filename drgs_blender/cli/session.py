@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any
 from ..core.asset.archive import replace_file
 from ..core.errors import EXIT_INTERRUPTED, EXIT_TERMINATED, EngineError, UsageError
 from . import sampling
-from .session_link import POLL_SECONDS, Lock, end, is_running, own_folder
+from .session_link import POLL_SECONDS, Lock, claim_folder, end, is_running
 
 if TYPE_CHECKING:
     from .machine import Machine
@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
     if args.action == "stop":
         end(folder)
         return 0
-    own_folder(folder)
+    claim_folder(folder)
     return start(folder, args.idle) if args.action == "start" else serve(folder, args.idle)
 
 
@@ -92,12 +92,12 @@ def serve(folder: Path, idle: int) -> int:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(EXIT_TERMINATED))
     with Machine(keep=True) as machine:
         machine.engine().start()
-        life = _Life(folder, idle, _take_over(folder))
+        watch = _IdleWatch(folder, idle, _take_over(folder))
         while True:
             for request in folder.glob("request-*.json"):
                 about = json.loads(request.read_text())
-                with life.at_work(folder / f"{about['name']}.waits"):
-                    code = _answer(folder, about, machine)
+                with watch.at_work(folder / f"{about['name']}.waits"):
+                    code = _run_request(folder, about, machine)
                 replace_file(folder / f"{about['name']}.code", [str(code).encode()])
                 request.unlink(missing_ok=True)
                 if code in (EXIT_INTERRUPTED, EXIT_TERMINATED):  # it was asked to end while it worked
@@ -118,7 +118,7 @@ def _take_over(folder: Path) -> Lock:
     return lock
 
 
-def _answer(folder: Path, about: dict[str, Any], machine: Machine) -> int:
+def _run_request(folder: Path, about: dict[str, Any], machine: Machine) -> int:
     """Run one command line; its exit code."""
     from .denoise import denoise
     from .main import run_command, set_up_logging
@@ -140,7 +140,7 @@ def _answer(folder: Path, about: dict[str, Any], machine: Machine) -> int:
     return code
 
 
-class _Life:
+class _IdleWatch:
     """Asks this process to end when nobody needs it any more."""
 
     def __init__(self, folder: Path, idle: int, lock: Lock) -> None:

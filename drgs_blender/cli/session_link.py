@@ -28,13 +28,13 @@ from typing import IO
 
 from ..core.asset.archive import replace_file
 from ..core.errors import EngineError, UsageError, WriteError
-from .frame_lines import HEARTBEAT_SECONDS, say
+from .frame_lines import HEARTBEAT_SECONDS, emit
 
 logger = logging.getLogger(__name__)
 
 POLL_SECONDS = 0.05
 #: Names of the files above, and of those that are being written.
-_OWN = re.compile(r"lock|log|pid|stop|\.?(request-)?[0-9a-f]{8}\.(json|waits|out|err|code)(\.[0-9a-f]{8}\.tmp)?")
+_FILES = re.compile(r"lock|log|pid|stop|\.?(request-)?[0-9a-f]{8}\.(json|waits|out|err|code)(\.[0-9a-f]{8}\.tmp)?")
 #: A process that works says something at least every `HEARTBEAT_SECONDS`.
 SILENT_SECONDS = 4 * HEARTBEAT_SECONDS
 #: How long a process that was asked to end may take.
@@ -74,7 +74,7 @@ class Lock:
         self._file.close()
 
 
-def own_folder(folder: Path) -> None:
+def claim_folder(folder: Path) -> None:
     """Make `folder`; refuse one in which others may write, as what lies there is executed, or that holds other files.
 
     Raises
@@ -87,7 +87,7 @@ def own_folder(folder: Path) -> None:
     except OSError as error:
         problem = f"cannot be made ({error.strerror or error})"
         raise WriteError(f"session {folder}", problem, "Choose another folder") from error
-    if foreign := next((name for name in names if not _OWN.fullmatch(name)), None):
+    if foreign := next((name for name in names if not _FILES.fullmatch(name)), None):
         problem = f"is a folder with other files ({foreign!r}), and sessions empty theirs"
         raise UsageError(f"session {folder}", problem, "Choose a new folder")
     if os.name != "nt" and (about.st_uid != os.getuid() or about.st_mode & 0o022):
@@ -150,7 +150,7 @@ def hand_on(folder: Path, words: Sequence[str]) -> int | None:
     if not is_running(folder):
         logger.info("session %s: is not there, this process does the work", folder)
         return None
-    own_folder(folder)
+    claim_folder(folder)
     name = secrets.token_hex(4)
     request = folder / f"request-{name}.json"
     files = {kind: folder / f"{name}.{kind}" for kind in ("out", "err", "code", "waits")}
@@ -159,19 +159,19 @@ def hand_on(folder: Path, words: Sequence[str]) -> int | None:
     replace_file(request, [json.dumps({"name": name, "words": list(words), "cwd": os.getcwd()}).encode()])
     try:
         tails = [_tail(files["out"], sys.stdout), _tail(files["err"], sys.stderr)]
-        heard = time.monotonic()
+        last_output = time.monotonic()
         while True:
             # Looked at in this order: the code is there before the request goes, and before the process ends.
             gone = not request.exists() or not is_running(folder)
             ended = files["code"].exists()
-            news = [next(tail) for tail in tails]
+            printed = [next(tail) for tail in tails]
             if ended:
                 return int(files["code"].read_text())
             if gone:
                 raise EngineError(f"session {folder}", "its process died", "Try again")
-            if any(news) or (not files["out"].exists() and _others_wait(folder, request)):
-                heard = time.monotonic()
-            if time.monotonic() - heard > SILENT_SECONDS:
+            if any(printed) or (not files["out"].exists() and _other_requests(folder, request)):
+                last_output = time.monotonic()
+            if time.monotonic() - last_output > SILENT_SECONDS:
                 end(folder)
                 problem = f"said nothing for {SILENT_SECONDS:g} s and was ended"
                 raise EngineError(f"session {folder}", problem, "Try again")
@@ -186,7 +186,7 @@ def hand_on(folder: Path, words: Sequence[str]) -> int | None:
             path.unlink(missing_ok=True)
 
 
-def _others_wait(folder: Path, request: Path) -> bool:
+def _other_requests(folder: Path, request: Path) -> bool:
     """Whether another chunk may be the one that is worked at."""
     return any(other != request for other in folder.glob("request-*.json"))
 
@@ -199,5 +199,5 @@ def _tail(path: Path, stream: IO[str]) -> Iterator[bool]:
     with open(path, "rb") as source:
         while True:
             if text := decoder.decode(source.read()):
-                say(text, stream)
+                emit(text, stream)
             yield bool(text)

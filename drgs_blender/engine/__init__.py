@@ -1,1 +1,1 @@
-"""The engine process: protocol, server, session, client."""
+"""The engine process: the server on pipes, the session that renders frames, the caches between frames."""

@@ -15,7 +15,7 @@ from ..render.film.motion_vectors import Instant
 from ..render.scene.trace_scene import TraceScene
 
 #: Names of which the session keeps the history.
-KEPT = 4
+MAX_HISTORIES = 4
 
 
 @dataclass(slots=True)
@@ -79,7 +79,7 @@ class Histories:
         )
         return Sequence(History(old.history.signal, instant, still), old.past, fit, situation, old.pictures)
 
-    def keep(self, frame: Frame, sequence: Sequence, scene: TraceScene) -> None:
+    def store(self, frame: Frame, sequence: Sequence, scene: TraceScene) -> None:
         """Remember `sequence` after its picture `frame` was made."""
         before, past = sequence.history.instant, sequence.past
         sequence.past = Instant(
@@ -91,5 +91,5 @@ class Histories:
         sequence.pictures += 1
         self._known.pop(frame.history, None)
         self._known[frame.history] = sequence
-        while len(self._known) > KEPT:
+        while len(self._known) > MAX_HISTORIES:
             del self._known[next(iter(self._known))]

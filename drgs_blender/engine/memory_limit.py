@@ -13,7 +13,7 @@ VARIABLE = "DRGS_MEMORY_MB"
 OPTION = "--memory-mb"
 
 
-def memory_wanted(arguments: list[str]) -> int | None:
+def requested_limit(arguments: list[str]) -> int | None:
     """Megabytes that the command line or the environment allow; None for no limit, also where they make no sense."""
     text = arguments[arguments.index(OPTION) + 1] if OPTION in arguments[:-1] else os.environ.get(VARIABLE, "")
     return int(text) if text.isdecimal() and int(text) > 0 else None
@@ -30,7 +30,7 @@ def limit_memory(megabytes: int) -> bool:
         return False
     import resource
 
-    wanted = megabytes << 20
+    limit = megabytes << 20
     _, hard = resource.getrlimit(resource.RLIMIT_DATA)
-    resource.setrlimit(resource.RLIMIT_DATA, (wanted if hard < 0 else min(wanted, hard), hard))
+    resource.setrlimit(resource.RLIMIT_DATA, (limit if hard < 0 else min(limit, hard), hard))
     return True

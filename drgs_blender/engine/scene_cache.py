@@ -142,8 +142,8 @@ class SceneCache:
         assets = [self._assets[state.asset].asset for state in frame.objects if state.asset in self._assets]
         return all(len(a.surfels) <= _SURFELS_A_VERTEX * len(a.mesh.vertices) for a in assets)
 
-    def kept(self, frame: Frame) -> Frame:
-        """The frame as it is now, whatever becomes of its arrays; those of the scene are kept already."""
+    def snapshot(self, frame: Frame) -> Frame:
+        """Copy of a frame that is safe from later changes of its arrays; those of the scene are copies already."""
         states = [item.state for item in self.objects]
         world = frame.world if self.world is None else self.world
         return renewed(replace(frame, objects=states, meshes=self.meshes, images=self.images, world=world), None)

@@ -22,7 +22,7 @@ Array = np.ndarray
 _MIRRORED = [0, 2, 1]  # order of the corners of a face whose object is mirrored
 
 
-def _given(state: ObjectState, name: str, shape: tuple[int, ...], what: str) -> Array | None:
+def _checked_array(state: ObjectState, name: str, shape: tuple[int, ...], what: str) -> Array | None:
     """Array `name` of the object, or None; AssetError when it does not fit the asset's mesh."""
     value = getattr(state, name)
     if value is None:
@@ -57,7 +57,7 @@ def moved_vertices(state: ObjectState, asset: Asset, pose: Pose) -> Array | None
 
 def _material(state: ObjectState, name: str, rest: Array, what: str) -> Array:
     """Material channel `name` within [0, 1]; the asset's, `rest`, where there is none or it is not a number."""
-    given = _given(state, name, rest.shape, what)
+    given = _checked_array(state, name, rest.shape, what)
     if given is None:
         return rest
     if given.min(initial=0) >= 0 and given.max(initial=1) <= 1:  # both are NaN where one value is
@@ -128,9 +128,9 @@ def traced_object(state: ObjectState, asset: Asset, seen_only: bool = False) -> 
             f"its mesh has {len(state.vertices)} vertices, its asset has {n}",
             "Remove or disable modifiers that add or remove geometry, or bind the object again",
         )
-    vertices = _given(state, "vertices", (n, 3), f"{n} vertices")
+    vertices = _checked_array(state, "vertices", (n, 3), f"{n} vertices")
     vertices = mesh.vertices if vertices is None else vertices
-    normals = _given(state, "corner_normals", (m, 3, 3), f"{m} faces")
+    normals = _checked_array(state, "corner_normals", (m, 3, 3), f"{m} faces")
     materials = {name: _material(state, name, getattr(mesh, name), f"{n} vertices") for name in MATERIAL_CHANNELS}
     if state.adjustment is not None:
         materials = adjusted(materials, state.adjustment, _mask(state, n))

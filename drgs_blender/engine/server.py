@@ -1,4 +1,4 @@
-"""The engine's side of the link: one thread computes, one listens, one shows that the engine is alive.
+"""The engine's side of the link: one thread computes, one listens, one sends heartbeats.
 
 The engine lives exactly as long as its parent: the end of its standard input, SIGTERM and (on Linux) the parent's
 death end it at once. It holds nothing that would have to be cleaned up.
@@ -29,7 +29,7 @@ from ..ipc.codec import CodecError, decode_frame
 from ..ipc.protocol import PROTOCOL, Link, ProtocolError
 from ..ipc.shared_memory import Region
 from ..ipc.slots import HeldSlots
-from .memory_limit import limit_memory, memory_wanted
+from .memory_limit import limit_memory, requested_limit
 
 logger = logging.getLogger(__name__)
 
@@ -80,20 +80,20 @@ class Server:
             _refuse(self.link, str(error))
         except BaseException:
             logger.exception("the listening thread failed")
-            _leave(EXIT_INTERNAL)
-        _leave(EXIT_OK)
+            _exit(EXIT_INTERNAL)
+        _exit(EXIT_OK)
 
-    def show_life(self) -> None:
-        """Say regularly that the engine is there and whether it advances."""
+    def send_heartbeats(self) -> None:
+        """Send a heartbeat (`Alive`) at regular intervals, with the progress of the main thread."""
         while True:
             time.sleep(ALIVE_SECONDS)
-            self._answer(protocol.Alive(self._steps, self._prepares))
+            self._send(protocol.Alive(self._steps, self._prepares))
 
     # --- the main thread -------------------------------------------------------------------------------------------
 
     def serve(self) -> None:
         """Answer requests, one after the other, for ever."""
-        for target in (self.listen, self.show_life):
+        for target in (self.listen, self.send_heartbeats):
             threading.Thread(target=target, name=f"drgs-{target.__name__}", daemon=True).start()
         self._note_preparing(1, STARTING)
         gc.disable()  # modules stay: to look for garbage among them takes a tenth of the time of loading them
@@ -111,7 +111,7 @@ class Server:
             try:
                 self._handle(message, arrays)
             except Cancelled:
-                self._answer(protocol.Stopped(message.id))
+                self._send(protocol.Stopped(message.id))
             except DrgsError as error:
                 logger.info("request %d: %s", message.id, error)
                 self._fail(message.id, type(error).__name__, error.subject, error.problem, error.remedy)
@@ -130,14 +130,14 @@ class Server:
             session = self._open_session()
             key = session.load_asset(message.path)
             asset = session.asset(key)
-            self._answer(protocol.Loaded(message.id, key, len(asset.mesh.vertices), len(asset.surfels)))
+            self._send(protocol.Loaded(message.id, key, len(asset.mesh.vertices), len(asset.surfels)))
             return
         if isinstance(message, protocol.Refine):
-            self._show(message, self._open_session().refine(message.view, self._progress, self._cancelled))
+            self._send_passes(message, self._open_session().refine(message.view, self._progress, self._cancelled))
             return
         held, missing = self.held.update(message.slots, arrays)
         if missing:
-            self._answer(protocol.Need(message.id, missing))
+            self._send(protocol.Need(message.id, missing))
             return
         try:
             frame = decode_frame(message.frame, held)
@@ -145,16 +145,16 @@ class Server:
             raise DrgsError("frame", f"cannot be read: {error}", "Report it with the engine's log") from error
         session = self._open_session()
         if isinstance(message, protocol.View):
-            self._show(message, session.view(message.view, frame, self._progress, self._cancelled))
+            self._send_passes(message, session.view(message.view, frame, self._progress, self._cancelled))
         else:
-            self._show(message, session.render(frame, self._progress, self._cancelled))
+            self._send_passes(message, session.render(frame, self._progress, self._cancelled))
 
-    def _show(self, message: Any, passes: Any) -> None:
-        """Answer with a picture; with Need where there is none."""
+    def _send_passes(self, message: Any, passes: Any) -> None:
+        """Send the passes of a picture as the result; Need where there is none."""
         if passes is None:
-            self._answer(protocol.Need(message.id, []))
+            self._send(protocol.Need(message.id, []))
         else:
-            self._answer(protocol.Result(message.id, passes.warnings, passes.statistics), passes)
+            self._send(protocol.Result(message.id, passes.warnings, passes.statistics), passes)
 
     def _open_session(self) -> Any:
         if self.session is None:
@@ -182,7 +182,7 @@ class Server:
         last_phase, last_time = self._reported
         if phase != last_phase or now - last_time >= PROGRESS_SECONDS:
             self._reported = phase, now
-            self._answer(protocol.Progress(self._current, phase, self._fraction))
+            self._send(protocol.Progress(self._current, phase, self._fraction))
 
     @property
     def _prepares(self) -> bool:
@@ -196,33 +196,33 @@ class Server:
         if change > 0:
             self._progress(phase, self._fraction)
         if self._preparing <= 1:
-            self._answer(protocol.Alive(self._steps, self._prepares))
+            self._send(protocol.Alive(self._steps, self._prepares))
 
     def _fail(self, request: int, error: str, subject: str, problem: str, remedy: str) -> None:
-        self._answer(protocol.Failed(request, error, subject, problem, remedy))
+        self._send(protocol.Failed(request, error, subject, problem, remedy))
 
-    def _answer(self, message: Any, arrays: dict[str, Array] | None = None) -> None:
+    def _send(self, message: Any, arrays: dict[str, Array] | None = None) -> None:
         try:
             self.link.send(message, arrays)
         except OSError:  # the client is gone
-            _leave(EXIT_OK)
+            _exit(EXIT_OK)
 
 
 def _refuse(link: Link, problem: str) -> None:
-    """Say why the link cannot go on, and end."""
+    """Send why the link cannot be used, and end the process."""
     logger.error("the client does not speak the engine's protocol: %s", problem)
     with contextlib.suppress(OSError):  # nobody may be listening
         link.send(protocol.Failed(0, "EngineError", "engine link", problem, "Install the same version of both"))
-    _leave(EXIT_INTERNAL)
+    _exit(EXIT_INTERNAL)
 
 
-def _leave(code: int) -> None:
+def _exit(code: int) -> None:
     leave_temporary()
     logging.shutdown()
     os._exit(code)
 
 
-def take_pipes() -> Link:
+def claim_pipes() -> Link:
     """Keep the pipes for messages: whatever else writes to standard output goes to standard error from now on."""
     reader = os.fdopen(os.dup(0), "rb", buffering=0)
     writer = os.fdopen(os.dup(1), "wb", buffering=0)
@@ -253,7 +253,7 @@ def shake_hands(link: Link) -> None:
         _refuse(link, str(error))
         raise AssertionError("unreachable") from error
     if received is None:
-        _leave(EXIT_OK)
+        _exit(EXIT_OK)
         raise AssertionError("unreachable")
     welcome = received[0]
     if not isinstance(welcome, protocol.Welcome):
@@ -263,7 +263,7 @@ def shake_hands(link: Link) -> None:
         problem = f"is version {welcome.version}, the engine is version {__version__}"
         with contextlib.suppress(OSError):  # the client may have left already
             link.send(protocol.Failed(0, "VersionError", "extension", problem, "Install the same version of both"))
-        _leave(EXIT_VERSION)
+        _exit(EXIT_VERSION)
     try:
         link.incoming = Region(welcome.to_engine) if welcome.to_engine > 2 else None
         link.outgoing = Region(welcome.to_client) if welcome.to_client > 2 else None
@@ -273,12 +273,12 @@ def shake_hands(link: Link) -> None:
 
 def main() -> None:
     """Run the engine on this process's standard input and output until the client leaves."""
-    link = take_pipes()
+    link = claim_pipes()
     logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(levelname)s %(name)s: %(message)s")
     faulthandler.enable(sys.stderr)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C in the terminal is for the client, which ends us
     die_with_parent()
-    if megabytes := memory_wanted(sys.argv):
+    if megabytes := requested_limit(sys.argv):
         limit_memory(megabytes)
     shake_hands(link)
     Server(link).serve()

@@ -157,7 +157,7 @@ class Session:
         passes.warnings = self._warnings(frame.settings) + _ignored_settings(frame.settings)
         return passes
 
-    def place(self, frame: Frame, progress: OnProgress | None = None) -> tuple[PreparedScene, list[PosedObject]]:
+    def prepare(self, frame: Frame, progress: OnProgress | None = None) -> tuple[PreparedScene, list[PosedObject]]:
         """Scene, light and objects of a frame whose objects are seen as surfels, without its picture.
 
         Raises
@@ -167,12 +167,12 @@ class Session:
         """
         self._compile(frame, (), progress, None)
         prepared = self._prepare(frame, _StageTimer(None), progress)
-        placed = [
+        posed = [
             PosedObject(item.state, item.loaded.asset, item.traced, item.posed)
             for item in self._scene_cache.objects
             if item.posed is not None
         ]
-        return prepared, placed
+        return prepared, posed
 
     def view(
         self, name: str, frame: Frame, progress: OnProgress | None = None, cancelled: IsCancelled | None = None
@@ -193,7 +193,7 @@ class Session:
         by_mesh = self._scene_cache.detailed(frame)
         rough = replace(frame, settings=replace(frame.settings, camera_sees="mesh")) if by_mesh else frame
         prepared = self._prepare(rough, timer, progress, backend)
-        view = View(self._scene_cache.kept(frame), self._pace, self._views_begun, by_mesh, backend)
+        view = View(self._scene_cache.snapshot(frame), self._pace, self._views_begun, by_mesh, backend)
         self._views_begun += 1
         passes = view.begin(
             prepared, lambda frame, prepared, report: self._draw(frame, prepared, report, cancelled, backend)
@@ -202,7 +202,7 @@ class Session:
         self._views[name] = view
         while len(self._views) > _VIEWS:
             del self._views[next(iter(self._views))]
-        return self._seen(view, passes, prepared, timer)
+        return self._with_statistics(view, passes, prepared, timer)
 
     def refine(
         self, name: str, progress: OnProgress | None = None, cancelled: IsCancelled | None = None
@@ -224,9 +224,9 @@ class Session:
             prepared, lambda frame, prepared, report: self._draw(frame, prepared, report, cancelled, backend), cancelled
         )
         timer("render")
-        return self._seen(view, passes, prepared, timer)
+        return self._with_statistics(view, passes, prepared, timer)
 
-    def _seen(self, view: View, passes: Passes, prepared: PreparedScene, timer: _StageTimer) -> Passes:
+    def _with_statistics(self, view: View, passes: Passes, prepared: PreparedScene, timer: _StageTimer) -> Passes:
         passes.statistics |= self._statistics(view.frame, prepared.surfels, timer)
         passes.statistics |= {"view.fraction": view.fraction, "view.pixel": float(view.pixel)}
         passes.warnings = self._warnings(view.frame.settings)
@@ -252,7 +252,7 @@ class Session:
         history = None if sequence is None else sequence.history
         pictures = render(prepared, frame, report, cancelled, history=history, backend=backend)
         if sequence is not None:
-            self._histories.keep(frame, sequence, prepared.scene)
+            self._histories.store(frame, sequence, prepared.scene)
         return Passes(pictures, [], statistics)
 
     def _compile(

@@ -33,7 +33,7 @@ OBEY_SECONDS, OBEY_SECONDS_COLD = 2.0, 15.0
 
 _LOG_LINES = 500
 _LOG_LINE = 2000
-_ANSWERS = (protocol.Loaded, protocol.Result, protocol.Need, protocol.Stopped, protocol.Failed)
+_REPLIES = (protocol.Loaded, protocol.Result, protocol.Need, protocol.Stopped, protocol.Failed)
 
 
 def clean_environment() -> dict[str, str]:
@@ -50,7 +50,7 @@ class Child:
     inbox : queue.Queue
         (message, arrays) as they arrive; at the end one exception that says why there will be no more. None only wakes
         whoever waits.
-    heard : int
+    reads : int
         Grows with every byte that arrives.
     steps : int
         Of the last `protocol.Alive`, as `preparing`.
@@ -68,7 +68,7 @@ class Child:
     def __init__(self, command: list[str], shared: bool) -> None:
         self.command = command
         self.inbox: queue.Queue[tuple[Any, dict[str, Array]] | Exception | None] = queue.Queue()
-        self.heard = 0
+        self.reads = 0
         self.steps = 0
         self.preparing = False
         self.last_progress = (STARTING, 0.0)
@@ -157,7 +157,7 @@ class Child:
             if thread is not threading.current_thread():
                 thread.join(2.0)
 
-    def epitaph(self) -> str:
+    def exit_message(self) -> str:
         """How the process ended, for an error message."""
         try:
             code = self._process.wait(1.0) if self._process is not None else None
@@ -197,7 +197,7 @@ class Child:
         end: Exception
         try:
             while (received := link.receive()) is not None:
-                self._take(*received)
+                self._dispatch(*received)
             end = EOFError("the engine closed its pipe")
         except (ProtocolError, OSError, MemoryError) as error:
             end = error
@@ -211,13 +211,13 @@ class Child:
             region.close()
 
     def _note(self) -> None:
-        self.heard += 1
+        self.reads += 1
 
-    def _take(self, message: Any, arrays: dict[str, Array]) -> None:
+    def _dispatch(self, message: Any, arrays: dict[str, Array]) -> None:
         if isinstance(message, protocol.Alive):
             self.steps, self.preparing = message.steps, message.preparing
             return
-        if isinstance(message, _ANSWERS):
+        if isinstance(message, _REPLIES):
             self.warm |= isinstance(message, protocol.Result)
             self.idle.set()
         self.inbox.put((message, arrays))

@@ -35,7 +35,7 @@ from .handshake import greet
 from .locate import engine_command, locate_engine
 from .protocol import Passes, sendable
 from .slots import SentSlots
-from .watchdog import Lost, Watch
+from .watchdog import EngineLost, Watchdog
 
 logger = logging.getLogger(__name__)
 
@@ -58,7 +58,7 @@ class EngineClient:
     command : list of str
         Command line of the engine, see `locate_engine`.
     silence : float
-        Timeout: seconds without a sign of life after which the engine counts as dead.
+        Timeout: seconds without a heartbeat after which the engine counts as dead.
     greeting : float
         Seconds a new process has to say something; importing Python on a busy machine takes some.
     stall : float
@@ -242,7 +242,7 @@ class EngineClient:
             if isinstance(answer, protocol.Result):
                 return Passes(pictures, answer.warnings, answer.statistics)
             self._sent.forget()
-        raise Lost("keeps asking for arrays it was sent")
+        raise EngineLost("keeps asking for arrays it was sent")
 
     # --- one request -----------------------------------------------------------------------------------------------
 
@@ -269,10 +269,10 @@ class EngineClient:
             try:
                 self._ensure(on_progress, cancelled)
                 return work()
-            except Lost as loss:
+            except EngineLost as loss:
                 problem = str(loss)
                 if self._child is not None and isinstance(loss.__cause__, EOFError):
-                    problem = self._child.epitaph()
+                    problem = self._child.exit_message()
                 self._abandon()
                 if attempt == self.restarts:
                     remedy = "Try again; if it happens again, see the engine's log and look at the memory it has"
@@ -299,8 +299,8 @@ class EngineClient:
             self._to_load = list(self._assets)
         if not self._child.greeted:
             try:
-                watch = Watch(self._child, self.greeting, self.stall)
-                greet(self._child, self.command[0], watch, lambda: self._stopped(cancelled))
+                watchdog = Watchdog(self._child, self.greeting, self.stall)
+                greet(self._child, self.command[0], watchdog, lambda: self._stopped(cancelled))
             except DrgsError:
                 self._abandon()
                 raise
@@ -317,7 +317,7 @@ class EngineClient:
     def _load(self, path: str, on_progress: OnProgress | None, cancelled: IsCancelled | None) -> str:
         answer, _ = self._request(protocol.LoadAsset(self._next(), path), {}, on_progress, cancelled)
         if not isinstance(answer, protocol.Loaded):
-            raise Lost(f"answered {type(answer).__name__} when asked to load an asset")
+            raise EngineLost(f"answered {type(answer).__name__} when asked to load an asset")
         self._assets[path] = answer.key
         return answer.key
 
@@ -333,18 +333,18 @@ class EngineClient:
         assert child is not None
         self._settle(child, on_progress, cancelled)
         child.request(message, arrays)
-        watch = Watch(child, self.silence, self.stall)
+        watchdog = Watchdog(child, self.silence, self.stall)
         stop_at = None
         try:
             while True:
-                item = self._take(child, on_progress)
+                item = self._next_reply(child, on_progress)
                 if item is not None and item[0].id == message.id:
                     if isinstance(item[0], protocol.Stopped):
                         raise Cancelled
                     if isinstance(item[0], protocol.Failed):
                         raise _as_error(item[0])
                     return item
-                watch.check()
+                watchdog.check()
                 if stop_at is None and self._stopped(cancelled):
                     stop_at = time.monotonic() + (0.0 if self._closing else _CANCEL_WAIT)
                     child.cancel(message.id)
@@ -356,14 +356,14 @@ class EngineClient:
 
     def _settle(self, child: Child, on_progress: OnProgress | None, cancelled: IsCancelled | None) -> None:
         """Wait until the engine has answered a request that was cancelled before."""
-        watch = Watch(child, self.silence, self.stall)
+        watchdog = Watchdog(child, self.silence, self.stall)
         while not child.idle.is_set():
-            self._take(child, on_progress)
-            watch.check()
+            self._next_reply(child, on_progress)
+            watchdog.check()
             if self._stopped(cancelled):
                 raise Cancelled
 
-    def _take(self, child: Child, on_progress: OnProgress | None) -> tuple[Any, dict[str, Array]] | None:
+    def _next_reply(self, child: Child, on_progress: OnProgress | None) -> tuple[Any, dict[str, Array]] | None:
         """The next answer, or None after a short wait; progress is passed on."""
         try:
             item = child.inbox.get(timeout=_POLL)
@@ -376,14 +376,14 @@ class EngineClient:
         if isinstance(item, CodecError):
             raise UsageError("frame", str(item), "Correct the setting or object it names") from item
         if isinstance(item, Exception):
-            raise Lost(str(item) or type(item).__name__) from item
+            raise EngineLost(str(item) or type(item).__name__) from item
         if isinstance(item[0], protocol.Progress):
             child.last_progress = item[0].phase, item[0].fraction
             if on_progress is not None:
                 on_progress(*child.last_progress)
             return None
         if isinstance(item[0], protocol.Failed) and item[0].id == 0:
-            raise Lost(f"refused a message: {item[0].problem}")
+            raise EngineLost(f"refused a message: {item[0].problem}")
         return item
 
 

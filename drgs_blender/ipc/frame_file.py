@@ -36,9 +36,9 @@ _REMEDY = "Export the frame again"
 def write_frame_file(path: Path, frame: Frame) -> None:
     """Write `frame`, whose objects name the files of their assets. Raises WriteError."""
     data, arrays = encode_frame(frame)
-    apart = {slot: _write_apart(path.parent, array) for slot, array in arrays.items() if array.nbytes >= _LARGE}
-    text = json.dumps({"format": FORMAT, "version": __version__, "frame": data, "apart": apart}, allow_nan=False)
-    inside = {slot: array for slot, array in arrays.items() if slot not in apart}
+    beside = {slot: _write_beside(path.parent, array) for slot, array in arrays.items() if array.nbytes >= _LARGE}
+    text = json.dumps({"format": FORMAT, "version": __version__, "frame": data, "apart": beside}, allow_nan=False)
+    inside = {slot: array for slot, array in arrays.items() if slot not in beside}
     replace_file(path, encode({_DESCRIPTION: np.frombuffer(text.encode(), np.uint8)} | inside))
 
 
@@ -67,7 +67,7 @@ def read_frame_file(path: Path) -> Frame:
     if kind not in range(1, FORMAT + 1):
         problem = f"has format {str(kind)[:20]} (of DR-GS {str(content.get('version'))[:20]}); this is {__version__}"
         raise VersionError(subject, problem, "Use a later DR-GS, or export the frame again with this one")
-    arrays |= _read_apart(path, content.get("apart"))
+    arrays |= _read_beside(path, content.get("apart"))
     frame: Any = content.get("frame")
     try:
         for upgrade in _UPGRADES[kind - 1 :]:
@@ -98,7 +98,7 @@ def _named_samples(frame: dict[str, Any]) -> dict[str, Any]:
 _UPGRADES = (_named_samples,)
 
 
-def _write_apart(folder: Path, array: Array) -> str:
+def _write_beside(folder: Path, array: Array) -> str:
     """Write an array to a file that its content names, unless that is there; return the name."""
     data = io.BytesIO()
     np.save(data, array, allow_pickle=False)
@@ -108,7 +108,7 @@ def _write_apart(folder: Path, array: Array) -> str:
     return name
 
 
-def _read_apart(path: Path, names: Any) -> dict[str, Array]:
+def _read_beside(path: Path, names: Any) -> dict[str, Array]:
     """The arrays that lie beside a frame file, by slot."""
     subject = str(path)
     if not isinstance(names, dict):

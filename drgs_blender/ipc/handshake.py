@@ -9,13 +9,13 @@ from ..core.errors import Cancelled, DeviceError, VersionError
 from ..core.version import __version__
 from . import protocol
 from .child_process import Child
-from .watchdog import Lost, Watch
+from .watchdog import EngineLost, Watchdog
 
 _POLL = 0.04
 _REMEDY = "Install the engine in the environment named in the preferences, or correct the path"
 
 
-def greet(child: Child, program: str, watch: Watch, stopped: Callable[[], bool]) -> None:
+def greet(child: Child, program: str, watchdog: Watchdog, stopped: Callable[[], bool]) -> None:
     """Wait until a new process has greeted as an engine of this version.
 
     Parameters
@@ -24,7 +24,7 @@ def greet(child: Child, program: str, watch: Watch, stopped: Callable[[], bool])
         The process.
     program : str
         What was started, named in errors.
-    watch : Watch
+    watchdog : Watchdog
         When its silence is too long.
     stopped : callable
         Whether to wait no longer; asked every 40 ms.
@@ -47,19 +47,19 @@ def greet(child: Child, program: str, watch: Watch, stopped: Callable[[], bool])
             item = child.inbox.get(timeout=_POLL)
         except queue.Empty:
             try:
-                watch.check()
-            except Lost as silence:
-                problem = f"does not greet as an engine does: it said nothing for {watch.silence:g} s"
+                watchdog.check()
+            except EngineLost as silence:
+                problem = f"does not greet as an engine does: it said nothing for {watchdog.silence:g} s"
                 raise DeviceError(program, problem, _REMEDY) from silence
             continue
         if isinstance(item, OSError) and child.pid == 0:
             raise DeviceError(program, f"cannot be started ({item})", _REMEDY) from item
         if isinstance(item, EOFError) and child.killed:
-            raise Lost("was killed while it started") from item
+            raise EngineLost("was killed while it started") from item
         if isinstance(item, protocol.ProtocolError):
             raise DeviceError(program, f"does not speak as an engine does ({item})", _REMEDY) from item
         if isinstance(item, Exception):
-            problem = f"did not start as an engine: it {child.epitaph()}"
+            problem = f"did not start as an engine: it {child.exit_message()}"
             raise DeviceError(program, problem, _REMEDY) from item
         if item is None:
             continue

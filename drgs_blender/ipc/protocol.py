@@ -52,6 +52,7 @@ __all__ = [  # the messages are part of it
     "PREFIX",
     "PROTOCOL",
     "Alive",
+    "ArrayHeader",
     "Cancel",
     "Failed",
     "Hello",
@@ -60,7 +61,6 @@ __all__ = [  # the messages are part of it
     "Loaded",
     "Need",
     "Passes",
-    "Placed",
     "Progress",
     "ProtocolError",
     "RawIO",
@@ -152,8 +152,8 @@ def pack(message: Any, arrays: dict[str, Array], where: str) -> tuple[bytes, int
 
 
 @dataclass(slots=True)
-class Placed:
-    """One array of a message: where its bytes lie in the bulk."""
+class ArrayHeader:
+    """One row of a message's array table: name, type, shape, and the position of its bytes in the bulk."""
 
     name: str
     dtype: np.dtype
@@ -162,7 +162,7 @@ class Placed:
     size: int
 
 
-def unpack(header: bytes) -> tuple[Any, str, list[Placed], int]:
+def unpack(header: bytes) -> tuple[Any, str, list[ArrayHeader], int]:
     """Check a header; return (message, "inline" or "shared", its arrays, bytes of the bulk).
 
     Raises
@@ -187,20 +187,20 @@ def unpack(header: bytes) -> tuple[Any, str, list[Placed], int]:
         message = decode(MESSAGES[kind], data["body"], "", {})
     except CodecError as error:
         raise ProtocolError(f"{kind}: {error}") from error
-    placed: list[Placed] = []
+    headers: list[ArrayHeader] = []
     offset = 0
     for entry in data["arrays"]:
-        item = _place(entry, offset)
-        placed.append(item)
+        item = _array_header(entry, offset)
+        headers.append(item)
         offset = _aligned(item.offset + item.size)
         if offset > MAX_BULK:
             raise ProtocolError(f"the arrays have more than {MAX_BULK} bytes")
-    if len({item.name for item in placed}) != len(placed):
+    if len({item.name for item in headers}) != len(headers):
         raise ProtocolError("two arrays have the same name")
-    return message, data["where"], placed, offset
+    return message, data["where"], headers, offset
 
 
-def _place(entry: Any, offset: int) -> Placed:
+def _array_header(entry: Any, offset: int) -> ArrayHeader:
     """Check one row of the array table; arrays lie one behind the other, each on a multiple of `ALIGNMENT`."""
     if not isinstance(entry, list) or len(entry) != 4:
         raise ProtocolError("an array is not described by name, dtype, shape and offset")
@@ -214,7 +214,7 @@ def _place(entry: Any, offset: int) -> Placed:
     size = math.prod(shape) * DTYPES[dtype].itemsize
     if type(start) is not int or start != offset or size > MAX_BULK:
         raise ProtocolError(f"array {name[:100]!r} does not lie where it must")
-    return Placed(name, DTYPES[dtype], tuple(shape), start, size)
+    return ArrayHeader(name, DTYPES[dtype], tuple(shape), start, size)
 
 
 # --- the link -----------------------------------------------------------------------------------------------------
@@ -230,7 +230,7 @@ class Link:
     ----------
     reader, writer : RawIO
         Unbuffered binary files.
-    heard : callable, optional
+    on_read : callable, optional
         Called whenever bytes arrive.
 
     Attributes
@@ -239,8 +239,8 @@ class Link:
         Shared memory of arrays; None: they travel in the pipe.
     """
 
-    def __init__(self, reader: RawIO, writer: RawIO, heard: Callable[[], None] | None = None) -> None:
-        self._reader, self._writer, self._heard = reader, writer, heard
+    def __init__(self, reader: RawIO, writer: RawIO, on_read: Callable[[], None] | None = None) -> None:
+        self._reader, self._writer, self._on_read = reader, writer, on_read
         self._sending = threading.Lock()
         self.incoming: Region | None = None
         self.outgoing: Region | None = None
@@ -294,21 +294,21 @@ class Link:
             raise ProtocolError(f"a header of {header_size} bytes is announced, at most {MAX_HEADER} are allowed")
         header = bytearray(header_size)
         self._read(memoryview(header))
-        message, where, placed, size = unpack(bytes(header))
+        message, where, headers, size = unpack(bytes(header))
         if inline_size != (size if where == "inline" else 0):
             raise ProtocolError(f"{inline_size} bytes of arrays are announced, the header describes {size}")
         self.bulk_received += size
         if where == "shared":
-            return message, self._copy_shared(placed, size)
+            return message, self._copy_shared(headers, size)
         arrays: dict[str, Array] = {}
         padding = bytearray(ALIGNMENT)
-        for item in placed:
+        for item in headers:
             arrays[item.name] = array = self._allocate(item)
             self._read(array.reshape(-1).view(np.uint8).data)
             self._read(memoryview(padding)[: _aligned(item.size) - item.size])
         return message, arrays
 
-    def _copy_shared(self, placed: list[Placed], size: int) -> dict[str, Array]:
+    def _copy_shared(self, headers: list[ArrayHeader], size: int) -> dict[str, Array]:
         if self.incoming is None:
             raise ProtocolError("arrays are announced in a shared region, but there is none")
         try:
@@ -316,14 +316,14 @@ class Link:
         except (ValueError, OSError) as error:
             raise ProtocolError(str(error)) from error
         arrays: dict[str, Array] = {}
-        for item in placed:
+        for item in headers:
             source = np.frombuffer(region, item.dtype, math.prod(item.shape), item.offset)
             arrays[item.name] = array = self._allocate(item)
             array.reshape(-1)[:] = source
         return arrays
 
     @staticmethod
-    def _allocate(item: Placed) -> Array:
+    def _allocate(item: ArrayHeader) -> Array:
         try:
             return np.empty(item.shape, item.dtype)
         except (MemoryError, ValueError) as error:
@@ -343,8 +343,8 @@ class Link:
                     return False
                 raise ProtocolError("the pipe ended in the middle of a message")
             view = view[count:]
-            if self._heard is not None:
-                self._heard()
+            if self._on_read is not None:
+                self._on_read()
         return True
 
 

@@ -46,8 +46,8 @@ def begin_of(bake, count):
 
 def computed_last(obj) -> int:
     """Frames that the last bake did not find in the cache."""
-    said = (settings_export.folder_of(obj) / bake_job.INPUT / scene_export.SAID).read_text()
-    return int(re.search(r"(\d+) of them computed now", said)[1])
+    reported = (settings_export.folder_of(obj) / bake_job.INPUT / scene_export.STDOUT).read_text()
+    return int(re.search(r"(\d+) of them computed now", reported)[1])
 
 
 def box_object(name, low, high):

@@ -105,7 +105,7 @@ def test_a_redraw_uploads_a_strip_and_the_picture_changes_when_all_are_there(wit
     pictures = [picture(v) for v in (0.25, 0.5, 0.75)]
     current = [pictures[0]]
     monkeypatch.setattr(views.worker, "picture", lambda name: current[0])
-    views._shown["a"] = views.ViewportState()
+    views._viewports["a"] = views.ViewportState()
     try:
 
         def redraws():
@@ -115,11 +115,11 @@ def test_a_redraw_uploads_a_strip_and_the_picture_changes_when_all_are_there(wit
                     current[0] = pictures[min(i, 2)]
                 shown = views.newest("a")
                 seen.append(None if shown is None else [p is shown.picture for p in pictures].index(True))
-            return seen, [len(s.textures) for s in views._shown["a"].strips]
+            return seen, [len(s.textures) for s in views._viewports["a"].strips]
 
         seen, textures = with_gpu(redraws)
     finally:
-        del views._shown["a"]
+        del views._viewports["a"]
     assert seen == [None, None, 0, 0, 0, 2, 2, 2, 2, 2, 2, 2] and textures == [1, 1, 1]
 
 

@@ -191,7 +191,7 @@ def test_an_engine_without_reconstruction_renders_and_says_so(made, monkeypatch)
         assert "Installing PyTorch" in str(running.error) and environment.state(folder, source) == "ready"
         link = part("addon.engine_link")
         monkeypatch.delenv("DRGS_ENGINE")
-        monkeypatch.setattr(link, "own_folder", lambda create=False: folder)
+        monkeypatch.setattr(link, "engine_folder", lambda create=False: folder)
         monkeypatch.setattr(environment, "digest", lambda where=None: json.loads(before)["sources"])
         monkeypatch.setattr(
             environment, "requirements", lambda where=None, group=environment.ENGINE: requirements(source, group)
@@ -328,7 +328,7 @@ def test_offline_nothing_begins(scene, monkeypatch):
         pytest.skip("this Blender is online")
     with pytest.raises(RuntimeError, match="Allow Online Access"):
         bpy.ops.drgs.engine_setup()
-    assert not job.running() and environment.state(part("addon.engine_link").own_folder()) == "absent"
+    assert not job.running() and environment.state(part("addon.engine_link").engine_folder()) == "absent"
 
 
 def test_an_existing_engine_is_chosen_and_another_program_refused(scene, monkeypatch, tmp_path):

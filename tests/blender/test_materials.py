@@ -717,7 +717,7 @@ def test_images_that_no_export_uses_are_let_go(scene, export, tmp_path):
     export()
     assert images._known
     obj.hide_viewport = True
-    for _ in range(images.KEPT + 2):
+    for _ in range(images.KEPT_EXPORTS + 2):
         export()
     assert not images._known
 

@@ -115,7 +115,7 @@ def test_a_bake_is_stopped_at_once_and_goes_on(body, scene):
     np.testing.assert_array_equal(vertices(body, 3), cache_of(body).read(3).vertices)
     assert np.abs(vertices(body, 3) - vertices(body, 1)).max() > 0.1, "it spins"
     found = bake_job.cached(body, scene)
-    assert done <= found.frames < found.wanted == wanted and not found.changed
+    assert done <= found.frames < found.expected == wanted and not found.changed
     # So does one whose Blender dies: the pipe that it holds is closed then.
     again = bake_job.Bake(body, scene)
     begin_of(again, found.frames + 1)

@@ -96,7 +96,7 @@ def test_the_bar_of_f12_moves_with_them(scene, shown, captured, monkeypatch):
 def test_a_viewport_says_it_with_its_part_and_can_be_closed(cold, monkeypatch):
     worker = part("addon.viewport.worker").Worker()
     monkeypatch.setattr(views, "worker", worker)
-    monkeypatch.setattr(views, "_shown", {"a": views.ViewportState()})
+    monkeypatch.setattr(views, "_viewports", {"a": views.ViewportState()})
     exported = part("addon.viewport.scenes").exported(bpy.context.evaluated_depsgraph_get())
     request = part("addon.viewport.worker").Request(exported.frame, link.client(), exported.assets)
     try:
@@ -122,7 +122,7 @@ def test_a_picture_that_is_refined_says_it_too(scene, monkeypatch):
     phase = [("Rendering", 0.5)]
     worker = SimpleNamespace(state=lambda name: ("", ""), progress=lambda name: phase[0], names=lambda: ["a"])
     monkeypatch.setattr(views, "worker", worker)
-    monkeypatch.setattr(views, "_shown", {"a": views.ViewportState(picture=picture)})
+    monkeypatch.setattr(views, "_viewports", {"a": views.ViewportState(picture=picture)})
     assert views.status("a") == ("Sample 4/8", "") and views.preparation() == ("", 0.0)
     phase[0] = phases.PREPARING, 0.3
     assert views.status("a") == (phases.PREPARING, "")

@@ -483,7 +483,7 @@ def test_news_that_come_while_one_looks_are_not_lost(monkeypatch):
 
     monkeypatch.setattr(views, "worker", Busy())
     monkeypatch.setattr(views, "_last_news", 0)
-    monkeypatch.setattr(views, "_shown", {"a": views.ViewportState()})
+    monkeypatch.setattr(views, "_viewports", {"a": views.ViewportState()})
     monkeypatch.setattr(views, "_live", lambda: [("a", SimpleNamespace(tag_redraw=lambda: redrawn.append(len(looks))))])
     for i in range(4):
         views._poll()
@@ -584,7 +584,7 @@ def test_meshes_are_boxes_while_the_overlay_is_on(crowd):
 def test_discs_follow_the_mesh(ball, ball_file):
     """At rest they are the surfels; where the mesh is turned and moved, so are they."""
     asset = part("addon.assets").load(ball_file)
-    places = part("addon.viewport.surfels").places
+    places = part("addon.viewport.surfels").posed_centres
     np.testing.assert_allclose(places(asset, asset.mesh.vertices), asset.surfels.centre, atol=1e-6)
     lifted = dataclasses.replace(asset.binding, offset=np.full_like(asset.binding.offset, 0.3))
     high = dataclasses.replace(asset, binding=lifted)

@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 
 from drgs_blender.core.errors import EXIT_RETRY, EngineError
-from drgs_blender.engine.memory_limit import memory_wanted
+from drgs_blender.engine.memory_limit import requested_limit
 
 linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Linux alone has such a limit")
 
 
 def test_option_wins_over_the_variable(monkeypatch):
     monkeypatch.setenv("DRGS_MEMORY_MB", "500")
-    assert memory_wanted(["-m", "--memory-mb", "700"]) == 700
-    assert memory_wanted(["-m"]) == memory_wanted(["-m", "--memory-mb"]) == 500
+    assert requested_limit(["-m", "--memory-mb", "700"]) == 700
+    assert requested_limit(["-m"]) == requested_limit(["-m", "--memory-mb"]) == 500
     for nonsense in ("", "-3", "0", "much"):
         monkeypatch.setenv("DRGS_MEMORY_MB", nonsense)
-        assert memory_wanted([]) is None
+        assert requested_limit([]) is None
 
 
 @linux

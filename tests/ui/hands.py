@@ -222,7 +222,7 @@ def drawn() -> bool:
     """Whether the viewport shows every ray of what was asked for last."""
     views = part("addon.viewport.views")
     name = views.name_of(where()[2])
-    shown, newest = views._shown.get(name), views.worker.picture(name)
+    shown, newest = views._viewports.get(name), views.worker.picture(name)
     if shown is None or newest is None or views.worker.busy():
         return False
     return shown.picture is newest and newest.fraction == 1

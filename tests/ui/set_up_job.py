@@ -24,7 +24,7 @@ def running() -> bool:
 
 
 def state() -> str:
-    return part("addon.engine_environment").state(part("addon.engine_link").own_folder())
+    return part("addon.engine_environment").state(part("addon.engine_link").engine_folder())
 
 
 def work() -> Iterator[float]:
