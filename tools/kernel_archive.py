@@ -40,7 +40,7 @@ for kernel in kernels:
         manifest.dispatcher(kernel), manifest.signature(kernel)
     except LookupError as error:
         gone.append(str(error))
-print(json.dumps([len(kernels), [f"{k.module}:{k.name}" for k in prepare.lacking(kernels)] + gone]))
+print(json.dumps([len(kernels), [f"{k.module}:{k.name}" for k in prepare.not_compiled(kernels)] + gone]))
 """
 
 

@@ -108,14 +108,14 @@ def kernels(args: argparse.Namespace) -> str:
     from ..compute.jit import numba
 
     wanted, own = shipped.versions(), {"numba": numba.__version__, "llvmlite": importlib.metadata.version("llvmlite")}
-    stock = prepare.stock()
+    stock = prepare.count_kernels()
     missing = f", {stock.missing} are compiled when needed" if stock.missing else ""
-    said = f"{targets.current()}, {stock.shipped + stock.kept} ready ({stock.shipped} shipped){missing}"
+    text = f"{targets.current()}, {stock.shipped + stock.compiled} ready ({stock.shipped} shipped){missing}"
     if wanted and wanted != own:
         other = " and ".join(f"{name} {version}" for name, version in wanted.items())
         remedy = f"To use those of the release: pip install {' '.join(f'{n}=={v}' for n, v in wanted.items())}"
-        raise DeviceError("kernels", f"{said}; those of the release were made with {other}", remedy)
-    return said
+        raise DeviceError("kernels", f"{text}; those of the release were made with {other}", remedy)
+    return text
 
 
 def embree(args: argparse.Namespace) -> str:

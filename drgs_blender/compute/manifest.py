@@ -110,32 +110,32 @@ class _Reader:
         while self.at < len(self.tokens):
             found.append(self.one())
             if self.at < len(self.tokens):
-                self.take(",")
+                self.expect(",")
         return tuple(found)
 
-    def take(self, wanted: str = "") -> str:
-        if self.at == len(self.tokens) or (wanted and self.tokens[self.at] != wanted):
-            raise LookupError(f"{wanted or 'more'} expected in {''.join(self.tokens)}")
+    def expect(self, token: str = "") -> str:
+        if self.at == len(self.tokens) or (token and self.tokens[self.at] != token):
+            raise LookupError(f"{token or 'more'} expected in {''.join(self.tokens)}")
         self.at += 1
         return self.tokens[self.at - 1]
 
     def group(self) -> list[Any]:
-        self.take("(")
+        self.expect("(")
         found = []
         while self.tokens[self.at] != ")":
             found.append(self.one())
             if self.tokens[self.at] == ",":
-                self.take()
-        self.take(")")
+                self.expect()
+        self.expect(")")
         return found
 
     def one(self) -> Any:
         if self.tokens[self.at] == "(":
             return types.BaseTuple.from_types(tuple(self.group()))
-        word = self.take()
+        word = self.expect()
         if word == "array":
-            self.take("(")
-            dtype, _, dimensions, _, layout, _, mutable, _, aligned, _ = (self.take() for _ in range(10))
+            self.expect("(")
+            dtype, _, dimensions, _, layout, _, mutable, _, aligned, _ = (self.expect() for _ in range(10))
             return types.Array(_scalar(dtype), int(dimensions), layout, mutable == "False", aligned=aligned == "True")
         if ":" in word:
             module, _, name = word.partition(":")

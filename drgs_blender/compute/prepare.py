@@ -88,7 +88,7 @@ def _compile(
             pool.wait(_POLL)
 
 
-def lacking(kernels: Iterable[Kernel]) -> list[Kernel]:
+def not_compiled(kernels: Iterable[Kernel]) -> list[Kernel]:
     """Those of some kernels that are not compiled yet and can be compiled ahead."""
     return [kernel for kernel, _, _ in _missing(kernels)]
 
@@ -117,37 +117,37 @@ def _known(kernels: Iterable[Kernel]) -> Iterator[_Known]:
 
 
 @dataclass(frozen=True)
-class Stock:
+class KernelCounts:
     """How many kernels of all jobs are where.
 
     Attributes
     ----------
     shipped : int
         Come with the release.
-    kept : int
+    compiled : int
         Were compiled here.
     missing : int
         Are compiled when they are needed.
     """
 
     shipped: int
-    kept: int
+    compiled: int
     missing: int
 
 
-def stock() -> Stock:
+def count_kernels() -> KernelCounts:
     """Where the kernels of all jobs are; those of packages that are not installed do not count."""
     codegen = _codegen()
-    brought = kept = missing = 0
+    brought = compiled = missing = 0
     for _, cache, signature in _known(manifest.needed(manifest.jobs())):
         name = cache.file_name(signature, codegen)
         if name is not None and shipped.has(name):
             brought += 1
         elif cache.is_there(signature, codegen):
-            kept += 1
+            compiled += 1
         else:
             missing += 1
-    return Stock(brought, kept, missing)
+    return KernelCounts(brought, compiled, missing)
 
 
 def processes() -> int:
@@ -176,16 +176,16 @@ class _Pool:
     """
 
     def __init__(self, kernels: list[_Known]) -> None:
-        self._left, self._codegen = list(kernels), _codegen()
+        self._remaining, self._codegen = list(kernels), _codegen()
         self._all = sum(kernel.seconds for kernel, _, _ in kernels)
         self.done, self.fraction = 0, 0.0
         self._progress = time.monotonic()
-        self._answers: queue.SimpleQueue[tuple[_Worker, bool]] = queue.SimpleQueue()
+        self._results: queue.SimpleQueue[tuple[_Worker, bool]] = queue.SimpleQueue()
         self._workers: list[_Worker] = []
         try:
             for _ in range(min(len(kernels), processes())):
-                self._workers.append(_Worker(self._answers))
-                self._give(self._workers[-1])
+                self._workers.append(_Worker(self._results))
+                self._assign(self._workers[-1])
         except OSError as error:  # no more processes may be started
             log.warning("kernels are compiled by %d processes: %s", len(self._workers), error)
         except BaseException:
@@ -194,22 +194,22 @@ class _Pool:
 
     def is_working(self) -> bool:
         """Whether a worker still has something to do, or will have."""
-        return any(worker.kernel is not None or (worker.lives and self._left) for worker in self._workers)
+        return any(worker.kernel is not None or (worker.is_alive and self._remaining) for worker in self._workers)
 
     def wait(self, seconds: float) -> None:
         """Take an answer, or wait for so long."""
         try:
-            worker, lives = self._answers.get(timeout=seconds)
+            worker, is_alive = self._results.get(timeout=seconds)
         except queue.Empty:
             pass
         else:
-            worker.lives = lives
+            worker.is_alive = is_alive
             if worker.kernel is not None:
-                self._count(worker.kernel, lives)
+                self._count(worker.kernel, is_alive)
                 worker.end()
         for worker in self._workers:
-            if worker.lives and worker.kernel is None:
-                self._give(worker)
+            if worker.is_alive and worker.kernel is None:
+                self._assign(worker)
 
     def close(self) -> None:
         """End all workers."""
@@ -221,29 +221,29 @@ class _Pool:
         self._progress = time.monotonic()
         self.fraction = min(1.0, self.fraction + kernel.seconds / (self._all or 1.0))
 
-    def _give(self, worker: _Worker) -> None:
+    def _assign(self, worker: _Worker) -> None:
         """Give a worker the longest kernel that nobody compiles or has compiled meanwhile."""
-        for known in tuple(self._left):
+        for known in tuple(self._remaining):
             kernel, cache, signature = known
             if cache.is_there(signature, self._codegen):
-                self._left.remove(known)
+                self._remaining.remove(known)
                 self._count(kernel, True)
                 continue
             claim = cache.claim(signature, self._codegen)
             if claim is None and time.monotonic() - self._progress > _PATIENCE:
                 claim, self._progress = Claim(), time.monotonic()
             if claim is not None:
-                if worker.give(kernel, claim):
-                    self._left.remove(known)
+                if worker.assign(kernel, claim):
+                    self._remaining.remove(known)
                 return
 
 
 class _Worker:
     """A process that runs `drgs_blender.compute.worker`, and the thread that waits for its answers."""
 
-    def __init__(self, answers: queue.SimpleQueue[tuple[_Worker, bool]]) -> None:
+    def __init__(self, results: queue.SimpleQueue[tuple[_Worker, bool]]) -> None:
         self.kernel: Kernel | None = None
-        self.lives, self._claim = True, Claim()
+        self.is_alive, self._claim = True, Claim()
         environment = os.environ | {"NUMBA_NUM_THREADS": "1"}
         if folder := cache_folder().path:
             environment["DRGS_CACHE_DIR"] = str(folder)
@@ -255,16 +255,16 @@ class _Worker:
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, encoding="utf-8"
         )
-        threading.Thread(target=self._listen, args=(answers,), daemon=True).start()
+        threading.Thread(target=self._listen, args=(results,), daemon=True).start()
 
-    def give(self, kernel: Kernel, claim: Claim) -> bool:
+    def assign(self, kernel: Kernel, claim: Claim) -> bool:
         """Have a kernel compiled; False where the process has ended."""
         assert self._process.stdin is not None
         try:
             self._process.stdin.write(json.dumps([kernel.module, kernel.name, kernel.arguments]) + "\n")
             self._process.stdin.flush()
         except OSError:
-            self.lives = False
+            self.is_alive = False
             claim.close()
             return False
         self.kernel, self._claim = kernel, claim
@@ -281,12 +281,12 @@ class _Worker:
         self._process.wait()
         self.end()
 
-    def _listen(self, answers: queue.SimpleQueue[tuple[_Worker, bool]]) -> None:
+    def _listen(self, results: queue.SimpleQueue[tuple[_Worker, bool]]) -> None:
         assert self._process.stdout is not None
         for line in self._process.stdout:
             if line.strip() == "done":
-                answers.put((self, True))
-        answers.put((self, False))
+                results.put((self, True))
+        results.put((self, False))
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -311,7 +311,7 @@ def main(argv: list[str] | None = None) -> int:
         if cache_folder().trouble:  # which was logged
             return EXIT_CANNOT_WRITE
         _compile(jobs, show)
-        missing = lacking(manifest.needed(jobs))
+        missing = not_compiled(manifest.needed(jobs))
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
     except DrgsError as error:

@@ -28,7 +28,7 @@ _SAME = 1 / 512
 
 
 @dataclass(slots=True)
-class Plain:
+class UniformMaterial:
     """One material for the whole mesh; linear Rec.709."""
 
     colour: tuple[float, float, float]
@@ -37,7 +37,7 @@ class Plain:
 
 
 @dataclass(slots=True)
-class Textured:
+class TexturedMaterial:
     """Materials in pictures.
 
     Attributes
@@ -55,7 +55,7 @@ class Textured:
     uvs: Array
 
 
-def mesh_material(mesh: Mesh, subject: str) -> Plain | Textured:
+def mesh_material(mesh: Mesh, subject: str) -> UniformMaterial | TexturedMaterial:
     """What the surface of `mesh` looks like to other programs.
 
     Each triangle has a place of its own in the pictures, where they hold the interpolation of its corners' materials;
@@ -77,10 +77,10 @@ def mesh_material(mesh: Mesh, subject: str) -> Plain | Textured:
     used = values[np.unique(mesh.faces)]
     if np.ptp(used, axis=0).max() < _SAME:
         red, green, blue, roughness, metallic = np.median(used, axis=0).tolist()
-        return Plain((red, green, blue), roughness, metallic)
+        return UniformMaterial((red, green, blue), roughness, metallic)
     texels, uvs = bake_atlas(values[mesh.faces], subject)
     surface = np.insert(texels[..., 3:], 0, 0.0, axis=2)
-    return Textured(_png(linear_to_srgb(texels[..., :3])), _png(surface), uvs)
+    return TexturedMaterial(_png(linear_to_srgb(texels[..., :3])), _png(surface), uvs)
 
 
 def bake_atlas(corner_values: Array, subject: str) -> tuple[Array, Array]:

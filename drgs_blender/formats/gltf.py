@@ -129,10 +129,10 @@ def _primitive(
         if normals is not None:
             piece.normals = np.einsum("nij,nj->ni", blend[:, :, :3], normals)
     else:
-        places = tree.mesh_worlds(node_index)
-        document.take(max(len(places) - 1, 0) * (vertices.nbytes + faces.nbytes))
-        piece = _placed(vertices, faces, normals, places, material)
-        uvs, colours = (None if a is None else np.tile(a, (len(places), 1)) for a in (uvs, colours))
+        matrices = tree.mesh_worlds(node_index)
+        document.reserve(max(len(matrices) - 1, 0) * (vertices.nbytes + faces.nbytes))
+        piece = _instances(vertices, faces, normals, matrices, material)
+        uvs, colours = (None if a is None else np.tile(a, (len(matrices), 1)) for a in (uvs, colours))
     piece.vertices = vertices_up(piece.vertices)
     if piece.normals is not None:
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -142,14 +142,14 @@ def _primitive(
     return piece
 
 
-def _placed(vertices: Array, faces: Array, normals: Array | None, places: Array, material: int) -> _Piece:
-    """A copy of a primitive for each of the matrices `places` (n, 4, 4), as one."""
+def _instances(vertices: Array, faces: Array, normals: Array | None, matrices: Array, material: int) -> _Piece:
+    """A copy of a primitive for each of the matrices `matrices` (n, 4, 4), as one."""
     with np.errstate(all="ignore"):  # values that overflow are refused when all is joined
-        linear = places[:, :3, :3]
-        moved = vertices @ linear.transpose(0, 2, 1) + places[:, None, :3, 3]
+        linear = matrices[:, :3, :3]
+        moved = vertices @ linear.transpose(0, 2, 1) + matrices[:, None, :3, 3]
         mirrored = np.linalg.det(linear) < 0  # the outside stays outside
         corners = np.where(mirrored[:, None, None], faces[:, ::-1], faces)
-        corners += len(vertices) * np.arange(len(places))[:, None, None]
+        corners += len(vertices) * np.arange(len(matrices))[:, None, None]
         piece = _Piece(moved.reshape(-1, 3), corners.reshape(-1, 3), material)
         if normals is not None:
             cofactors = np.stack([np.cross(linear[:, (i + 1) % 3], linear[:, (i + 2) % 3]) for i in range(3)], axis=1)

@@ -128,7 +128,7 @@ class Document:
         elif count > EMPTY_LIMIT:
             raise AssetError(self.subject, f"declares {count} values without data", _DAMAGED)
         else:
-            self.take(count * width * dtype.itemsize)
+            self.reserve(count * width * dtype.itemsize)
             values = np.zeros((count, width), dtype)
         if sparse := self.get(entry, "sparse", dict):
             values = self._sparse(sparse, values, dtype, shape)
@@ -211,11 +211,11 @@ class Document:
             raise AssetError(self.subject, f"has an accessor that leaves buffer view {view}", _DAMAGED)
         if not count:
             return np.zeros((0, rows * columns), dtype)
-        self.take(count * size)
+        self.reserve(count * size)
         block = np.lib.stride_tricks.as_strided(buffer[first:], (count, columns, column), (stride, pitch, 1))
         return np.ascontiguousarray(block).view(dtype).reshape(count, rows * columns)
 
-    def take(self, size: int) -> None:
+    def reserve(self, size: int) -> None:
         """Note that `size` bytes of values are made of the file; refuse it where they become too many."""
         self._room -= size
         if self._room < 0:

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..core.asset import Mesh
 from ..geometry.normals import VertexNormals
-from .atlas import Plain, mesh_material
+from .atlas import UniformMaterial, mesh_material
 from .files import plain_name
 from .glb import Glb
 
@@ -28,7 +28,7 @@ def write_gltf_mesh(path: Path, mesh: Mesh) -> None:
     material = mesh_material(mesh, str(path))
     normals = VertexNormals(mesh.faces, len(mesh.vertices))(mesh.vertices)
     pbr: dict[str, Any] = {}
-    if isinstance(material, Plain):
+    if isinstance(material, UniformMaterial):
         pbr |= {"baseColorFactor": [*material.colour, 1.0]}
         pbr |= {"roughnessFactor": material.roughness, "metallicFactor": material.metallic}
         attributes = {

@@ -55,7 +55,7 @@ def read_gltf_splats(path: Path) -> SurfelFile:
             settings = document.get(extensions, EXTENSION, dict)
             if settings is not None:
                 splats, places = _primitive(document, primitive, settings), tree.mesh_worlds(index)
-                document.take(max(len(places) - 1, 0) * max(splats.sh.nbytes, _LEAST))
+                document.reserve(max(len(places) - 1, 0) * max(splats.sh.nbytes, _LEAST))
                 pieces += [Piece(splats, place, settings.get("colorSpace") == _LINEAR) for place in places]
     if not pieces:
         raise AssetError(document.subject, "has no splats in its scene", "Export it again")
@@ -76,7 +76,7 @@ def _primitive(document: Document, primitive: dict[str, Any], settings: dict[str
         raise AssetError(document.subject, f"has splats with {', '.join(compressed)}", "Export it without compression")
     attributes = document.get(primitive, "attributes", dict, {})
 
-    def take(name: str, kind: str, count: int | None = None) -> Array:
+    def read(name: str, kind: str, count: int | None = None) -> Array:
         if name not in attributes:
             raise AssetError(document.subject, f"has splats without {name}", "Export it again")
         with np.errstate(over="ignore", invalid="ignore"):
@@ -85,7 +85,7 @@ def _primitive(document: Document, primitive: dict[str, Any], settings: dict[str
             raise AssetError(document.subject, f"has {len(values)} {name} for {count} splats", "Export it again")
         return values
 
-    centre = take("POSITION", "VEC3")
+    centre = read("POSITION", "VEC3")
     n = len(centre)
     degree = 0
     while degree < 3 and f"{EXTENSION}:SH_DEGREE_{degree + 1}_COEF_0" in attributes:
@@ -93,10 +93,10 @@ def _primitive(document: Document, primitive: dict[str, Any], settings: dict[str
     names = [f"{EXTENSION}:SH_DEGREE_{l}_COEF_{i}" for l in range(degree + 1) for i in range(_WIDTHS[l])]
     return Splats(
         centre,
-        take(f"{EXTENSION}:SCALE", "VEC3", n),
-        take(f"{EXTENSION}:ROTATION", "VEC4", n)[:, [3, 0, 1, 2]],
-        take(f"{EXTENSION}:OPACITY", "SCALAR", n)[:, 0],
-        np.stack([take(name, "VEC3", n) for name in names], axis=1),
+        read(f"{EXTENSION}:SCALE", "VEC3", n),
+        read(f"{EXTENSION}:ROTATION", "VEC4", n)[:, [3, 0, 1, 2]],
+        read(f"{EXTENSION}:OPACITY", "SCALAR", n)[:, 0],
+        np.stack([read(name, "VEC3", n) for name in names], axis=1),
     )
 
 

@@ -17,12 +17,12 @@ from . import trimesh_scene
 from .files import Image, MaterialFile, MeshFile
 from .obj import beside, load_texture
 from .soup import join_equal
-from .subprocess_reader import read_apart
+from .subprocess_reader import read_in_subprocess
 from .trimesh_scene import ABOUT
 
 Array = np.ndarray
 
-_LACKING = ("needs the packages lxml and pycollada", "Install them: pip install lxml pycollada")
+_NOT_INSTALLED = ("needs the packages lxml and pycollada", "Install them: pip install lxml pycollada")
 _REMEDY = "Import it in another program and export glTF (.glb), which is read whole"
 #: What of a file is left out: elements of its XML, and what they are called.
 _LEFT_OUT = {
@@ -64,7 +64,7 @@ def read_scene_mesh(path: Path) -> MeshFile:
         lxml or pycollada is not installed.
     """
     kind = trimesh_scene.kind_of(path)
-    arrays = read_apart(path, trimesh_scene.__name__, kind, _LACKING)
+    arrays = read_in_subprocess(path, trimesh_scene.__name__, kind, _NOT_INSTALLED)
     about = parse_json(arrays[ABOUT].tobytes(), str(path))
     found, pieces = about["found"], about["pieces"]
     left_out = [name for tags, name in _LEFT_OUT[kind].items() if any(found.get(tag) for tag in tags)]
@@ -126,18 +126,18 @@ def _paint(mesh: MeshFile, pieces: list[dict[str, Any]], path: Path) -> None:
     pictures: dict[str, Image | None] = {}
     mesh.face_material = np.full(len(mesh.faces), -1, np.int32)
     for piece, (_, first, end) in zip(pieces, mesh.parts):
-        given = piece["material"]
-        if given is None:
+        arguments = piece["material"]
+        if arguments is None:
             continue
-        key = repr(sorted(given.items()))
+        key = repr(sorted(arguments.items()))
         if key not in numbers:
             numbers[key] = len(mesh.materials)
-            name = given["picture"]
+            name = arguments["picture"]
             if name is not None and name not in pictures:
                 pictures[name] = load_texture(beside(path, unquote(name.removeprefix("file://"))), name, mesh.notes)
-            r, g, b = given["colour"]
-            label = given["name"] or f"Material {len(mesh.materials)}"
+            r, g, b = arguments["colour"]
+            label = arguments["name"] or f"Material {len(mesh.materials)}"
             mesh.materials.append(
-                MaterialFile(label, (r, g, b), given["roughness"], base_colour_image=pictures.get(name))
+                MaterialFile(label, (r, g, b), arguments["roughness"], base_colour_image=pictures.get(name))
             )
         mesh.face_material[first:end] = numbers[key]

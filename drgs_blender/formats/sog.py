@@ -77,14 +77,14 @@ class _Files:
 
     def meta(self) -> bytes:
         """The JSON."""
-        return self.read("meta.json") if self._zip else self._plain(self.path)
+        return self.read("meta.json") if self._zip else self._read_file(self.path)
 
     def read(self, name: str) -> bytes:
         """A file of the zip, or one beside meta.json."""
         if Path(name).name != name or not is_name(name):
             raise AssetError(self.subject, f"refers to {name[:60]!r}, which is no file beside it", _REMEDY)
         if self._zip is None:
-            return self._plain(self.path.parent / name)
+            return self._read_file(self.path.parent / name)
         found = [i for i in self._zip.infolist() if Path(i.filename).name == name]
         if not found:
             raise AssetError(self.subject, f"lacks {name}", _REMEDY)
@@ -97,7 +97,7 @@ class _Files:
         except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError, OSError) as error:
             raise AssetError(self.subject, f"has a damaged {name} ({error})", _REMEDY) from error
 
-    def _plain(self, path: Path) -> bytes:
+    def _read_file(self, path: Path) -> bytes:
         try:
             if path.exists() and not path.is_file():
                 raise OSError("not a regular file")

@@ -44,8 +44,8 @@ class Piece:
 def join_pieces(pieces: list[Piece], path: Path, layout: str, up: str) -> SurfelFile:
     """All splats of a scene as surfels. A node that flattens loses its splats, which is said."""
     with np.errstate(all="ignore"):
-        placed = [place(piece) for piece in pieces]
-    whole = join_splats(placed)
+        transformed_pieces = [transformed(piece) for piece in pieces]
+    whole = join_splats(transformed_pieces)
     scale = log_scale(whole.scale)
     file = decode_arrays(whole.centre, scale, whole.rotation, whole.opacity, whole.sh, path, layout)
     file.up = up
@@ -54,7 +54,7 @@ def join_pieces(pieces: list[Piece], path: Path, layout: str, up: str) -> Surfel
     return file
 
 
-def place(piece: Piece) -> Splats:
+def transformed(piece: Piece) -> Splats:
     """The splats of a node in the scene, their colours encoded."""
     own, matrix = piece.splats, piece.matrix
     sh = encoded(own.sh) if piece.linear else own.sh

@@ -24,7 +24,7 @@ Array = np.ndarray
 
 #: Exit codes: the file is refused (the reason is the last line of stderr), the library is not installed, the arrays
 #: cannot be written (likewise).
-REFUSED, LACKING, FULL = 65, 69, 73
+REFUSED, NOT_INSTALLED, FULL = 65, 69, 73
 #: Limit of processor time: seconds for starting the library, and one second more for so many bytes of the file.
 SECONDS, _PACE = 5.0, 1 << 20
 #: Limit of time by the clock, in multiples of that of processor time: the machine may be busy, and waiting takes no
@@ -35,7 +35,7 @@ _MEMORY, _RATIO = 8 << 30, 32
 REMEDY = "Export it again, or restore it from a copy"
 
 
-def hand_over(source: str, target: str, kind: str, read: Callable[[str], Mapping[str, Array]]) -> None:
+def write_arrays(source: str, target: str, kind: str, read: Callable[[str], Mapping[str, Array]]) -> None:
     """In the subprocess: write what `read` makes of `source` to `target`; exit with a code where that fails.
 
     Parameters
@@ -51,7 +51,7 @@ def hand_over(source: str, target: str, kind: str, read: Callable[[str], Mapping
         sys.stderr.write(f"\n{error.problem}\n")
         sys.exit(REFUSED)
     except ImportError:
-        sys.exit(LACKING)
+        sys.exit(NOT_INSTALLED)
     except Exception as error:  # what libraries raise of damaged files has no common type
         sys.stderr.write(f"\ncannot be read as {kind} ({first_reason(str(error) or type(error).__name__)})\n")
         sys.exit(REFUSED)
@@ -81,11 +81,11 @@ def limit(most_bytes: int, most_seconds: int) -> None:
         resource.setrlimit(kind, (min([wanted, *known]), most))
 
 
-def read_apart(
+def read_in_subprocess(
     path: Path,
     module: str,
     kind: str,
-    lacking: tuple[str, str],
+    missing_library: tuple[str, str],
     remedies: Mapping[str, str] | None = None,
     seconds: float = SECONDS,
     patience: float = PATIENCE,
@@ -99,7 +99,7 @@ def read_apart(
         Dotted name; its `main` takes a source, a target and the two limits as text.
     kind : str
         What errors call such files.
-    lacking : tuple of str
+    missing_library : tuple of str
         Problem and remedy where its library is not installed.
     remedies : mapping of str to str, optional
         Reason for which a file is refused -> what to do, where that is not `REMEDY`.
@@ -126,8 +126,8 @@ def read_apart(
         target = Path(folder) / "arrays"
         # The package as it is here, wherever that comes from.
         code = f"import sys; sys.path.insert(0, sys.argv[1]); from {module} import main; main(*sys.argv[2:])"
-        given = Path(__file__).resolve().parents[2], path.absolute(), target, _MEMORY + _RATIO * size, most
-        command = [sys.executable, "-c", code, *map(str, given)]
+        arguments = Path(__file__).resolve().parents[2], path.absolute(), target, _MEMORY + _RATIO * size, most
+        command = [sys.executable, "-c", code, *map(str, arguments)]
         try:
             done = subprocess.run(command, capture_output=True, timeout=patience * most, stdin=subprocess.DEVNULL)
         except subprocess.TimeoutExpired as error:
@@ -136,14 +136,14 @@ def read_apart(
             raise DeviceError(subject, f"cannot be read: Python does not start ({error})", "See drgs doctor") from error
         if done.returncode == -getattr(signal, "SIGXCPU", 0):  # Windows has no such signal
             raise slow
-        if done.returncode == LACKING:
-            raise DeviceError(subject, *lacking)
-        said = (done.stderr.decode(errors="replace").strip().splitlines() or [""])[-1][:300]
+        if done.returncode == NOT_INSTALLED:
+            raise DeviceError(subject, *missing_library)
+        reason = (done.stderr.decode(errors="replace").strip().splitlines() or [""])[-1][:300]
         if done.returncode == FULL:
-            problem = f"cannot hold what is in {subject} ({said})"
+            problem = f"cannot hold what is in {subject} ({reason})"
             raise WriteError(folder, problem, "Free space there, or name another folder by the variable TMPDIR")
         if done.returncode:
-            known = done.returncode == REFUSED and said
-            problem = said if known else f"cannot be read: {kind} crashes on it"
-            raise AssetError(subject, problem, (remedies or {}).get(said, REMEDY))
+            known = done.returncode == REFUSED and reason
+            problem = reason if known else f"cannot be read: {kind} crashes on it"
+            raise AssetError(subject, problem, (remedies or {}).get(reason, REMEDY))
         return decode(np.fromfile(target, np.uint8), subject)

@@ -16,7 +16,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from ..core.errors import AssetError
-from .subprocess_reader import hand_over, limit
+from .subprocess_reader import limit, write_arrays
 
 Array = np.ndarray
 
@@ -25,7 +25,7 @@ ABOUT = "about"
 #: Meshes may be placed until they are so many bytes, some and in proportion to the file; a zip may hold as many.
 _ROOM, _RATIO = 64 << 20, 64
 #: Times that a 3MF file may place an object, some and in proportion to its size.
-_PLACED, _PER_BYTE = 1000, 0.1
+_MAX_INSTANCES, _PER_BYTE = 1000, 0.1
 #: Metres of 3MF's units.
 UNITS = {"micron": 1e-6, "millimeter": 1e-3, "centimeter": 1e-2, "inch": 0.0254, "foot": 0.3048, "meter": 1.0}
 #: COLLADA's up axes, to Z up.
@@ -39,7 +39,7 @@ _TURNS = {
 def main(source: str, target: str, most_bytes: str, most_seconds: str) -> None:
     """Write the meshes of `source` to `target`; exit with a code (see `subprocess_reader`)."""
     limit(int(most_bytes), int(most_seconds))
-    hand_over(source, target, kind_of(source), read_scene)
+    write_arrays(source, target, kind_of(source), read_scene)
 
 
 def kind_of(source: str | Path) -> str:
@@ -65,9 +65,9 @@ def read_scene(subject: str) -> dict[str, Array]:
     room = _ROOM + _RATIO * len(data)
     kind = kind_of(subject)
     metres, turn, found = _of_3mf(data, subject, room) if kind == "3MF" else _of_collada(data, subject)
-    placed = found.pop("placed", None)
+    instances = found.pop("placed", None)
     scene = _load(data, kind)
-    return _arrays(scene, turn, metres, room, placed, found, subject)
+    return _arrays(scene, turn, metres, room, instances, found, subject)
 
 
 def _load(data: bytes, kind: str) -> dict[str, Any]:
@@ -129,19 +129,19 @@ def _of_3mf(data: bytes, subject: str, room: int) -> tuple[float, Array, dict[st
         raise AssetError(subject, f"has the unknown unit {unit[:30]!r}")
     if "world" not in objects:
         raise AssetError(subject, "places none of its objects")
-    most = _PLACED + _PER_BYTE * len(data)
-    if (placed := _placed("world", objects, {}, subject)) > most:
-        raise AssetError(subject, f"places its objects {placed} times, more than such a file can")
-    return UNITS[unit], np.eye(4), {**found, "placed": placed}
+    most = _MAX_INSTANCES + _PER_BYTE * len(data)
+    if (instances := _instances("world", objects, {}, subject)) > most:
+        raise AssetError(subject, f"places its objects {instances} times, more than such a file can")
+    return UNITS[unit], np.eye(4), {**found, "placed": instances}
 
 
-def _placed(name: str, objects: dict[str, Counter[str]], known: dict[str, int], subject: str, depth: int = 0) -> int:
+def _instances(name: str, objects: dict[str, Counter[str]], known: dict[str, int], subject: str, depth: int = 0) -> int:
     """How many objects without components the object `name` places."""
     if depth > 50:
         raise AssetError(subject, "has objects that contain themselves")
     if name not in known:
         inner = objects.get(name, Counter())
-        count = sum(n * _placed(other, objects, known, subject, depth + 1) for other, n in inner.items())
+        count = sum(n * _instances(other, objects, known, subject, depth + 1) for other, n in inner.items())
         known[name] = count if inner else 1
     return known[name]
 
@@ -174,14 +174,14 @@ def _arrays(
     turn: Array,
     metres: float,
     room: int,
-    placed: int | None,
+    instances: int | None,
     found: dict[str, Any],
     subject: str,
 ) -> dict[str, Array]:
     arrays: dict[str, Array] = {}
     pieces = []
-    if placed is not None and len(scene["graph"]) != placed:
-        raise AssetError(subject, f"places objects {placed} times, of which {len(scene['graph'])} can be followed")
+    if instances is not None and len(scene["graph"]) != instances:
+        raise AssetError(subject, f"places objects {instances} times, of which {len(scene['graph'])} can be followed")
     for i, node in enumerate(scene["graph"]):
         mesh = scene["geometry"][node["geometry"]]
         matrix = turn @ np.asarray(node["matrix"], np.float64)
@@ -193,9 +193,9 @@ def _arrays(
             piece: dict[str, Array] = {"vertices": (vertices @ linear.T + matrix[:3, 3]) * metres}
             piece["faces"] = faces[:, ::-1] if np.linalg.det(linear) < 0 else faces
             visual = mesh.get("visual")
-            given = {"normals": mesh.get("vertex_normals"), "colours": mesh.get("vertex_colors"),
+            attributes = {"normals": mesh.get("vertex_normals"), "colours": mesh.get("vertex_colors"),
                      "uvs": getattr(visual, "uv", None)}  # fmt: skip
-            for name, values in given.items():
+            for name, values in attributes.items():
                 width = 2 if name == "uvs" else 3
                 if values is not None and np.ndim(values) == 2 and len(values) == len(vertices):
                     piece[name] = np.asarray(values, np.float64)[:, :width]

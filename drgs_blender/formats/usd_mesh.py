@@ -16,7 +16,7 @@ from ..core.asset import Mesh
 from ..core.asset.archive import replace_file
 from ..core.version import __version__
 from ..geometry.normals import VertexNormals
-from .atlas import Plain, Textured, mesh_material
+from .atlas import TexturedMaterial, UniformMaterial, mesh_material
 
 Array = np.ndarray
 
@@ -40,7 +40,7 @@ def write_usd_mesh(path: Path, mesh: Mesh) -> None:
     """
     material = mesh_material(mesh, str(path))
     files = {"asset.usda": _stage(mesh, material).encode()}
-    if isinstance(material, Textured):
+    if isinstance(material, TexturedMaterial):
         files |= {"textures/color.png": material.colour, "textures/surface.png": material.surface}
     data = io.BytesIO()
     with zipfile.ZipFile(data, "w", zipfile.ZIP_STORED) as archive:
@@ -53,7 +53,7 @@ def write_usd_mesh(path: Path, mesh: Mesh) -> None:
     replace_file(path, [data.getbuffer()])
 
 
-def _stage(mesh: Mesh, material: Plain | Textured) -> str:
+def _stage(mesh: Mesh, material: UniformMaterial | TexturedMaterial) -> str:
     """The stage as text."""
     normals = VertexNormals(mesh.faces, len(mesh.vertices))(mesh.vertices)
     extent = np.stack([mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)])
@@ -70,21 +70,21 @@ def _stage(mesh: Mesh, material: Plain | Textured) -> str:
         f"point3f[] points = {_tuples(mesh.vertices)}",
         f'normal3f[] normals = {_tuples(normals)} (\n    interpolation = "vertex"\n)',
     ]
-    if isinstance(material, Textured):
+    if isinstance(material, TexturedMaterial):
         uvs = material.uvs.reshape(-1, 2) * [1, -1] + [0, 1]  # v points up in USD
         lines.append(f'texCoord2f[] primvars:st = {_tuples(uvs)} (\n    interpolation = "faceVarying"\n)')
     lines += ["rel material:binding = </Asset/Material>", "}", *_material(material), "}"]
     return "\n".join(lines) + "\n"
 
 
-def _material(material: Plain | Textured) -> list[str]:
+def _material(material: UniformMaterial | TexturedMaterial) -> list[str]:
     surface = [
         'def Shader "Surface"\n{',
         'uniform token info:id = "UsdPreviewSurface"',
         "token outputs:surface",
     ]
     shaders: list[str] = []
-    if isinstance(material, Plain):
+    if isinstance(material, UniformMaterial):
         surface += [
             f"color3f inputs:diffuseColor = ({', '.join(f'{v:.9g}' for v in material.colour)})",
             f"float inputs:roughness = {material.roughness:.9g}",

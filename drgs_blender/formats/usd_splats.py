@@ -17,7 +17,7 @@ from .axes import UP_AXES
 from .files import SurfelFile
 from .splat_scene import Piece, join_pieces
 from .splats import Splats, writable
-from .subprocess_reader import PATIENCE, SECONDS, read_apart
+from .subprocess_reader import PATIENCE, SECONDS, read_in_subprocess
 from .usd_crate import check_crate
 from .usd_stage import DEGREE, HARMONICS, NO_SPLATS, SCHEMA, SPACE, UP
 
@@ -25,7 +25,7 @@ Array = np.ndarray
 
 #: What to do for what is not read.
 MESHES = "For its meshes, import it in Blender and export glTF (.glb), which is read"
-_LACKING = ("needs the package usd-core", "Install it: pip install usd-core")
+_NOT_INSTALLED = ("needs the package usd-core", "Install it: pip install usd-core")
 _NAMES = (b".usda", b".usdc", b".usd")
 
 
@@ -47,7 +47,7 @@ def read_usd_splats(path: Path) -> SurfelFile:
         usd-core is not installed.
     """
     check_crate(path)
-    arrays = read_apart(path, usd_stage.__name__, "USD", _LACKING, {NO_SPLATS: MESHES}, SECONDS, PATIENCE)
+    arrays = read_in_subprocess(path, usd_stage.__name__, "USD", _NOT_INSTALLED, {NO_SPLATS: MESHES}, SECONDS, PATIENCE)
     up = arrays.pop(UP).tobytes().decode(errors="replace")
     pieces = []
     for i in range(sum(name.endswith("/matrix") for name in arrays)):
@@ -102,5 +102,5 @@ def _usd(subject: str) -> tuple[Any, Any]:
     try:
         from pxr import Usd, UsdGeom
     except ImportError as error:
-        raise DeviceError(subject, *_LACKING) from error
+        raise DeviceError(subject, *_NOT_INSTALLED) from error
     return Usd, UsdGeom

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..core.errors import AssetError
-from .subprocess_reader import hand_over, limit
+from .subprocess_reader import limit, write_arrays
 
 Array = np.ndarray
 
@@ -37,7 +37,7 @@ def main(source: str, target: str, most_bytes: str, most_seconds: str) -> None:
 
         return read_stage(subject, Usd, UsdGeom)
 
-    hand_over(source, target, "USD", read)
+    write_arrays(source, target, "USD", read)
 
 
 def read_stage(subject: str, usd: Any, geometry: Any) -> dict[str, Array]:
@@ -113,7 +113,7 @@ def _space(prim: Any) -> str:
 def _splats(prim: Any, time: Any, subject: str) -> dict[str, Array]:
     """The attributes of a prim; those that are absent or too short have the schema's defaults."""
 
-    def take(name: str, width: int, each: int = 1) -> Array | None:
+    def values_of(name: str, width: int, each: int = 1) -> Array | None:
         for attribute in (prim.GetAttribute(name), prim.GetAttribute(name + "h")):  # float before half
             value = attribute.Get(time) if attribute else None
             if value is not None and len(value):
@@ -122,14 +122,14 @@ def _splats(prim: Any, time: Any, subject: str) -> dict[str, Array]:
         return None
 
     n = 0
-    centre = take("positions", 3)
+    centre = values_of("positions", 3)
     if centre is None:
         raise AssetError(subject, f"has {prim.GetPath()} without positions")
     n = len(centre)
     degree = prim.GetAttribute(DEGREE).Get() if prim.GetAttribute(DEGREE) else 3
     count = (int(degree) + 1) ** 2 if isinstance(degree, int) and 0 <= degree <= 8 else 1
-    harmonics = take(HARMONICS, 3, count)
-    rotation, scale, opacity = take("orientations", 4), take("scales", 3), take("opacities", 1)
+    harmonics = values_of(HARMONICS, 3, count)
+    rotation, scale, opacity = values_of("orientations", 4), values_of("scales", 3), values_of("opacities", 1)
     sh = np.zeros((n, 1, 3), np.float32) if harmonics is None else harmonics[: n * count].reshape(n, count, 3)
     identity = np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1))
     return {

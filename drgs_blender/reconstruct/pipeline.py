@@ -171,7 +171,7 @@ def reconstruct(
         final, binding = _on_mesh(work, mesh, free, region, report)
     report |= judge(final, capture)
     visible = final.opacities().detach().numpy() >= UNSEEN
-    surfels = _kept(final, visible)
+    surfels = _visible_surfels(final, visible)
     found, thin, smooth = None, False, VertexNormals(mesh.faces, len(mesh.vertices))(mesh.vertices)
     if settings.materials:
         # Surfels on the mesh have its normals.
@@ -193,7 +193,7 @@ def reconstruct(
             binding = shaded_by_own(binding, mesh, surfels, found.normals - smooth)
         elif settings.decoupling.normals:
             binding = shaded_by(binding, mesh, found.normals)
-        _take_materials(surfels, mesh, binding)
+        _copy_materials(surfels, mesh, binding)
         environment, origin = Environment(found.environment), "pulled apart from the light"
     learned = [view.name for view in capture.training]
     provenance = {"capture": capture.name, "learned_from": learned, "variant": settings.variant, "materials": origin}
@@ -254,7 +254,7 @@ class _Work:
         kept = checkpoint.Checkpoint(file, "" if file is None else self.key(phase), SAVE_EVERY)
         if (state := kept.load()) is not None:
             known = state
-            training.attempt(lambda: training.restore(known), whole=False)
+            training.attempt(lambda: training.restore(known), interruptible=False)
             log.info("%s: going on at step %d", phase, training.iteration)
         shown = reported = time.monotonic()
         reached = 0.0
@@ -318,7 +318,7 @@ def _decoupled(work: _Work, mesh: Mesh, surfels: Gaussians, thin: bool, report: 
     return found
 
 
-def _take_materials(surfels: Surfels, mesh: Mesh, binding: Binding) -> None:
+def _copy_materials(surfels: Surfels, mesh: Mesh, binding: Binding) -> None:
     """Give surfels the materials of the mesh where they hang on it, in place."""
     corners, share = mesh.faces[binding.face], binding.barycentric
     for name in MATERIAL_CHANNELS:
@@ -326,7 +326,7 @@ def _take_materials(surfels: Surfels, mesh: Mesh, binding: Binding) -> None:
         setattr(surfels, name, np.clip(blended, 0, 1).astype(np.float32))
 
 
-def _kept(gaussians: Gaussians, visible: Array) -> Surfels:
+def _visible_surfels(gaussians: Gaussians, visible: Array) -> Surfels:
     """Surfels that can be seen."""
     surfels = gaussians.surfels()
     rows = {name: getattr(surfels, name)[visible] for name in Surfels.__dataclass_fields__ if name != "extras"}
@@ -341,8 +341,8 @@ def _drawn(gaussians: Gaussians, view: View, capture: Capture) -> Array:
     """(h, w, 3) sRGB in 0..1."""
     with torch.no_grad():
         background = torch.tensor(background_of(capture), dtype=torch.float32, device=gaussians.backend.device)
-        look = gaussians.look(view.camera, background)
-    return np.clip(look.colour.numpy(force=True), 0, 1)
+        rendered = gaussians.render(view.camera, background)
+    return np.clip(rendered.colour.numpy(force=True), 0, 1)
 
 
 def preview(gaussians: Gaussians, capture: Capture) -> Array:

@@ -615,7 +615,7 @@ def test_more_pixels_than_memory_are_refused_before_they_are_read(tmp_path):
 def test_the_memory_counted_for_a_pixel_is_what_learning_keeps_of_it(tmp_path, monkeypatch):
     """Masks before real surroundings take most: colour, mask, the colour cut out, and all in half size."""
     targets = pytest.importorskip("drgs_blender.reconstruct.capture.training_views")
-    monkeypatch.setattr(targets, "KEPT", 0)  # blurred copies are kept of few pixels alone
+    monkeypatch.setattr(targets, "MAX_CACHED_PIXELS", 0)  # blurred copies are kept of few pixels alone
     captures.write_nerfstudio(captures.make(tmp_path))
     capture = replace(read_capture(tmp_path), background=None)
     held = {}

@@ -21,7 +21,7 @@ from drgs_blender.core.errors import DeviceError  # noqa: E402
 from drgs_blender.reconstruct.backend import CPU, LearningBackend  # noqa: E402
 from drgs_blender.reconstruct.capture.capture import Capture  # noqa: E402
 from drgs_blender.reconstruct.capture.training_views import Target  # noqa: E402
-from drgs_blender.reconstruct.gpu import kernels, look, losses, select_backend  # noqa: E402
+from drgs_blender.reconstruct.gpu import appearance, kernels, losses, select_backend  # noqa: E402
 from drgs_blender.reconstruct.gpu import raster as device_raster  # noqa: E402
 from drgs_blender.reconstruct.gpu.warp_backend import DESCEND, WarpLearningBackend  # noqa: E402
 from drgs_blender.reconstruct.losses.photometric import Photograph  # noqa: E402
@@ -85,7 +85,7 @@ def test_gradients_of_shared_texels_do_not_depend_on_the_order() -> None:
     found = []
     for order in (torch.arange(4000), torch.randperm(4000)):
         table.grad = None
-        (look._Rows.apply(table, index[order]) * pull[order]).sum().backward()
+        (appearance._Rows.apply(table, index[order]) * pull[order]).sum().backward()
         found.append(table.grad)
     assert torch.equal(*found)
     exact = torch.zeros(50, 3, dtype=torch.float64).index_add(0, index, torch.nan_to_num(pull).double())
@@ -238,7 +238,7 @@ def broken(*_: Any, **__: Any) -> None:
 def kept(capture: Capture, region: Region) -> tuple[Training, Training]:
     """A training on a device that has kept its state, and one of this processor with the same."""
     training, here = learned(capture, region, WarpLearningBackend("cpu"), 7), Training(capture, region, SCHEDULE)
-    training.fallback.keep()
+    training.fallback.save_state()
     here.restore(training.arrays())
     return training, here
 
@@ -368,9 +368,9 @@ def test_nothing_of_this_process_meets_what_is_on_a_device(
     monkeypatch.setattr(torch.Tensor, "__float__", lambda _: 0.5)
     training = Training(capture, region, replace(SCHEDULE, mirrors=0.0, shape=0.0))
     training.move(there)
-    training.learner.step(training.views.of_step(0, half=True, but_aside=False), 0.0)
+    training.learner.step(training.views.of_step(0, half=True, without_held_out=False), 0.0)
     training.learner.optimiser.take(np.array([0, -1, 2]))
-    training.gaussians.take(np.array([1, 2]))
+    training.gaussians.select(np.array([1, 2]))
     assert set(asked) >= {kernels.SUM_PIXELS, losses.ROWS, DESCEND}
 
 

@@ -67,7 +67,7 @@ def far_off(training: Training, capture: Capture) -> float:
     y, x = np.mgrid[: view.height, : view.width] - 0.5 * view.height + 0.5
     into = (np.hypot(x, y) < 0.2 * view.height) & (alpha > 0.99)
     with torch.no_grad():
-        maps = training.gaussians.look(view, torch.zeros(3)).maps
+        maps = training.gaussians.render(view, torch.zeros(3)).maps
     seen = (maps.depth / maps.alpha.clamp(min=1e-3)).numpy()
     return float(np.median(np.abs(seen - depth)[into]))
 
@@ -88,7 +88,7 @@ def test_the_start_that_loses_leaves_no_trace(monkeypatch):
     capture = balls(24, 40)
     monkeypatch.setattr(starts, "MIN_GAIN_DB", 1000.0)
     tried = learned(capture)
-    # The winner did not see the views that were kept aside until the trial's end: neither does this one.
+    # The winner did not see the held-out views until the trial's end: neither does this one.
     monkeypatch.setattr(starts.Trial, "is_due", lambda self, part, _: self.end() if part >= starts.TRIAL else None)
     alone = learned(capture)
     for name, value in tried.gaussians.arrays().items():
@@ -109,12 +109,12 @@ def test_a_start_that_predicts_nothing_is_not_taken(monkeypatch):
 def test_starts_are_judged_by_the_views_that_neither_saw():
     capture = balls(24, 24)
     training = Training(capture, find_region(capture), replace(QUICK, surfels=200))
-    expected = training.learner.error_of(training.views.aside())
+    expected = training.learner.error_of(training.views.held_out())
     half = training.views.half
     seen = [k for k in range(len(half)) if k % starts.HOLDOUT_EVERY != starts.HOLDOUT_EVERY // 2]
     for k in seen:
         half[k] = None
-    assert training.learner.error_of(training.views.aside()) == expected and len(half) - len(seen) == 3
+    assert training.learner.error_of(training.views.held_out()) == expected and len(half) - len(seen) == 3
 
 
 def test_the_clock_does_not_favour_the_start_that_came_second(monkeypatch):
@@ -160,7 +160,7 @@ def test_by_the_clock_a_trial_takes_its_share_and_the_schedule_goes_on_evenly(mo
     assert after[0] == pytest.approx(starts.TRIAL, abs=0.02)
 
 
-def test_views_kept_aside_are_learned_from_after_the_trial(monkeypatch):
+def test_held_out_views_are_learned_from_after_the_trial(monkeypatch):
     capture = balls(24, 40)
     training = Training(capture, find_region(capture), replace(QUICK, iterations=100, surfels=500))
     during, after = set(), set()

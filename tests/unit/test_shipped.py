@@ -153,7 +153,7 @@ def test_kernels_of_other_versions_or_targets_are_left_alone(release, compiled, 
     ],
 )
 def test_doctor_counts_kernels(monkeypatch, tmp_path, stock, line):
-    monkeypatch.setattr(prepare, "stock", lambda: prepare.Stock(*stock))
+    monkeypatch.setattr(prepare, "count_kernels", lambda: prepare.KernelCounts(*stock))
     monkeypatch.setattr(shipped, "FOLDER", tmp_path)
     assert doctor.kernels(None) == f"{targets.current()}, {line}"
     versions = {"numba": numba.__version__, "llvmlite": kernel_cache.llvmlite.__version__}

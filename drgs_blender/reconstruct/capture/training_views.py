@@ -17,7 +17,7 @@ from ..meshing.visual_hull import silhouettes
 from .capture import Capture, View
 
 #: Pixels of all views up to which what SSIM knows of photographs beforehand is kept: 24 bytes each.
-KEPT = 30_000_000
+MAX_CACHED_PIXELS = 30_000_000
 #: Background given to photographs whose masks take their real one away, sRGB.
 GREY = (0.5, 0.5, 0.5)
 
@@ -75,7 +75,7 @@ def targets(capture: Capture) -> list[list[Target]]:
         raise AssetError(str(capture.source), "has black pictures alone", "Check the exposure and the files")
     drawn = silhouettes(capture)
     masks: list[Array | None] = [None for _ in views] if drawn is None else [*drawn]
-    keep = sum(view.colour[..., 0].size for view in views) <= KEPT
+    keep = sum(view.colour[..., 0].size for view in views) <= MAX_CACHED_PIXELS
     full, half = [], []
     for view, mask in zip(views, masks, strict=True):
         colour = composed(view, capture)
@@ -104,18 +104,18 @@ def half_size(picture: Array) -> Array:
     return np.ascontiguousarray(picture[: 2 * h, : 2 * w].reshape(h, 2, w, 2, -1).mean(axis=(1, 3)), np.float32)
 
 
-def pixel_rays(camera: Camera, place: torch.device | None = None) -> Tensor:
+def pixel_rays(camera: Camera, device: torch.device | None = None) -> Tensor:
     """(h, w, 3) float32 directions of the pixels' centres, world space, of unit depth; on the processor or a device."""
-    local = _local_rays(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, place)
-    turn = torch.tensor(np.asarray(camera.matrix_world)[:3, :3].T, dtype=torch.float32, device=place)
+    local = _local_rays(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, device)
+    turn = torch.tensor(np.asarray(camera.matrix_world)[:3, :3].T, dtype=torch.float32, device=device)
     return local @ turn
 
 
 @lru_cache(maxsize=8)
 def _local_rays(
-    width: int, height: int, fx: float, fy: float, cx: float, cy: float, place: torch.device | None
+    width: int, height: int, fx: float, fy: float, cx: float, cy: float, device: torch.device | None
 ) -> Tensor:
     """The same in the camera's own frame: views of one lens share it."""
     x, y = (np.arange(width) + 0.5 - cx) / fx, -(np.arange(height) + 0.5 - cy) / fy
     rays = np.stack([*np.meshgrid(x, y), np.full((height, width), -1.0)], -1)
-    return torch.tensor(rays, dtype=torch.float32, device=place)
+    return torch.tensor(rays, dtype=torch.float32, device=device)

@@ -16,7 +16,7 @@ from ..backend import LearningBackend
 from ..capture.training_views import Target
 from ..model.raster import Maps, Tally
 from ..optim.adam import step_rows
-from . import look, losses
+from . import appearance, losses
 from .gather import DeviceGatherer
 from .launch import TensorLauncher
 from .raster import rasterise
@@ -54,7 +54,7 @@ class WarpLearningBackend(LearningBackend):
     def attributes(
         self, parameters: dict[str, Tensor], centre: Tensor, eye: Array, bands: int, mirrors: bool
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        return look.attributes(parameters, centre, eye, bands, mirrors)
+        return appearance.attributes(parameters, centre, eye, bands, mirrors)
 
     def rasterise(
         self, centre: Tensor, tangent_u: Tensor, tangent_v: Tensor, opacity: Tensor, features: Tensor, camera: Camera,
@@ -63,7 +63,7 @@ class WarpLearningBackend(LearningBackend):
         return rasterise(self.launcher, centre, tangent_u, tangent_v, opacity, features, camera, tally)
 
     def mirrored(self, features: Tensor, alpha: Tensor, rays: Tensor, texels: Tensor) -> Tensor:
-        return look.mirrored(features, alpha, rays, texels)
+        return appearance.mirrored(features, alpha, rays, texels)
 
     def difference(self, picture: Tensor, photograph: Tensor) -> Tensor:
         return losses.difference(self.launcher, picture, photograph)

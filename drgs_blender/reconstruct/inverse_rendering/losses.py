@@ -14,13 +14,13 @@ _KNEE, _EXPONENT = 0.03, 0.6
 _POLISHED, _SURELY = 0.95, 6
 
 
-def log_loss(shown: Tensor, photographed: Tensor) -> Tensor:
+def log_loss(predicted: Tensor, photographed: Tensor) -> Tensor:
     """Mean absolute difference of log(1 + x), (n, 3) each; a clipped photograph sets no upper bound.
 
     Its expectation over noisy estimates is least for a scene with little noise, not for the true one: light is made
     even and surfaces rough.
     """
-    difference = torch.log1p(photographed) - torch.log1p(shown)
+    difference = torch.log1p(photographed) - torch.log1p(predicted)
     return torch.where(photographed >= CLIPPED, difference.clamp(min=0), difference.abs()).mean()
 
 
@@ -59,7 +59,7 @@ def _surely_metal(metallic: Tensor) -> Tensor:
 
 
 def unbiased_loss(
-    shown: Tensor, photographed: Tensor, weight_by_prediction: bool = False, weights: Tensor | None = None
+    predicted: Tensor, photographed: Tensor, weight_by_prediction: bool = False, weights: Tensor | None = None
 ) -> Tensor:
     """Weighted squared error of two independent estimates (n, 2, 3) of each pixel.
 
@@ -68,7 +68,7 @@ def unbiased_loss(
 
     Parameters
     ----------
-    shown, photographed : tensor
+    predicted, photographed : tensor
     weight_by_prediction : bool
         Weigh by what is shown, not by what was photographed. Where the mesh is a little off, one place mirrors what the
         photographs show beside it, bright or dark; weights that are least for bright photographs make a mean of these
@@ -76,10 +76,10 @@ def unbiased_loss(
     weights : (n, 3) tensor, optional
         How much each value counts; None: all the same.
     """
-    difference = shown - photographed[:, None]
+    difference = predicted - photographed[:, None]
     if weight_by_prediction:
         # The weight of an estimate goes with its own slope and the other's difference: it knows nothing of the latter.
-        weight = (shown.detach().clamp(min=0) + _KNEE) ** (-2 * _EXPONENT)
+        weight = (predicted.detach().clamp(min=0) + _KNEE) ** (-2 * _EXPONENT)
         product = (difference.detach().flip(1) * weight * difference).sum(1)
         product = product - product.detach() / 2  # the slope of a product, and its value
     else:

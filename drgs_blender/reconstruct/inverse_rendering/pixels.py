@@ -53,8 +53,8 @@ class Pixels:
         Linear Rec.709 as photographed.
     next_to_clipped : (n, 3) bool array
         Not clipped, but a pixel of the object `_BESIDE` away or nearer is, in this channel.
-    shown : (n, 3) float32 array
-        Unit, or 0: normal by something that knows better than the mesh, facing the viewer.
+    detail_normal : (n, 3) float32 array
+        Unit normal of finer detail than the mesh, facing the viewer; 0 where there is none.
     """
 
     view: Array
@@ -65,7 +65,7 @@ class Pixels:
     towards: Array
     colour: Array
     next_to_clipped: Array
-    shown: Array
+    detail_normal: Array
 
     def __len__(self) -> int:
         return len(self.view)
@@ -90,7 +90,7 @@ def foreground_pixels(
         Keep this many, evenly chosen.
     seed : int
     normals : callable, optional
-        Normals other than the mesh's; see `Pixels.shown`.
+        Normals other than the mesh's; see `Pixels.detail_normal`.
 
     Raises
     ------

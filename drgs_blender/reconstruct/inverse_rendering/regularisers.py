@@ -10,7 +10,7 @@ from .environment import LearnedLight, colour_cast
 from .losses import blotches, dullness
 from .radiance_cache import edges_of
 from .settings import Settings
-from .surface import Seen
+from .surface import SurfaceSamples
 
 Array = np.ndarray
 
@@ -26,15 +26,15 @@ class Regularisers:
     Parameters
     ----------
     faces : (f, 3) int32 array
-    seen : (v, 3) float32 array
+    colours : (v, 3) float32 array
         Mean colour of the photographs at the vertices.
     settings : Settings
     """
 
-    def __init__(self, faces: Array, seen: Array, settings: Settings) -> None:
+    def __init__(self, faces: Array, colours: Array, settings: Settings) -> None:
         self._settings = settings
         self._edges = edges_of(faces)
-        self._likeness = _likeness(self._edges, seen)
+        self._likeness = _likeness(self._edges, colours)
 
     def draw(self, generator: np.random.Generator) -> Array:
         """Numbers of the edges of a step, (e,) int64."""
@@ -44,12 +44,12 @@ class Regularisers:
         """Vertices (e, 2) of edges."""
         return self._edges[edge]
 
-    def of_materials(self, seen: Seen, edge: Array, has_metallic: bool, knows_metals: bool) -> Tensor:
+    def of_materials(self, samples: SurfaceSamples, edge: Array, has_metallic: bool, knows_metals: bool) -> Tensor:
         """Smooth where the photographs are alike; metals plain, bright and distinct from paint.
 
         Parameters
         ----------
-        seen : Seen
+        samples : SurfaceSamples
         edge : (e,) int array
             Numbers of its edges.
         has_metallic : bool
@@ -58,18 +58,18 @@ class Regularisers:
             It is known well enough to say more of metals.
         """
         s = self._settings
-        pair = seen.at_ends(seen.columns)
+        pair = samples.at_ends(samples.columns)
         differences = (pair[:, 0] - pair[:, 1]).abs()
         likeness = torch.from_numpy(self._likeness[edge])[:, None]
-        weights = torch.tensor(_SMOOTH[: seen.columns.shape[1]])
+        weights = torch.tensor(_SMOOTH[: samples.columns.shape[1]])
         loss = s.smoothness * ((likeness * differences).mean(0) * weights).sum()
         has_metals = has_metallic and knows_metals
         if s.metal_smoothness > 0 and has_metals:
             loss = loss + s.metal_smoothness * s.smoothness * blotches(differences[:, :3], pair[:, :, 4], likeness)
         if s.binary_metallic_prior > 0 and has_metallic:
-            loss = loss + s.binary_metallic_prior * (seen.here[:, 4] * (1 - seen.here[:, 4])).mean()
+            loss = loss + s.binary_metallic_prior * (samples.materials[:, 4] * (1 - samples.materials[:, 4])).mean()
         if s.metal_albedo_prior > 0 and has_metals:
-            loss = loss + s.metal_albedo_prior * dullness(seen.here[:, :3], seen.here[:, 4])
+            loss = loss + s.metal_albedo_prior * dullness(samples.materials[:, :3], samples.materials[:, 4])
         return loss
 
     def of_light(self, light: LearnedLight, radiance: Tensor) -> Tensor:
@@ -81,13 +81,13 @@ class Regularisers:
             loss = loss + s.light_smoothness * light.roughness()
         return loss
 
-    def of_normals(self, seen: Seen) -> Tensor:
+    def of_normals(self, samples: SurfaceSamples) -> Tensor:
         """Offsets small, and alike along edges."""
-        if seen.offsets is None:
+        if samples.offsets is None:
             return torch.zeros(())
-        turned = seen.at_ends(seen.offsets)
+        turned = samples.at_ends(samples.offsets)
         loss = self._settings.normal_smoothness * (((turned[:, 0] - turned[:, 1]) ** 2).sum(1).mean())
-        return loss + 0.02 * self._settings.normal_smoothness * (seen.offsets**2).sum(1).mean()
+        return loss + 0.02 * self._settings.normal_smoothness * (samples.offsets**2).sum(1).mean()
 
 
 def _likeness(edges: Array, colours: Array) -> Array:

@@ -30,7 +30,7 @@ from .radiance_cache import filled, radiance_cache
 from .regularisers import Regularisers
 from .schedule import Schedule
 from .settings import Settings
-from .surface import Seen, Surface
+from .surface import Surface, SurfaceSamples
 
 Array = np.ndarray
 log = logging.getLogger(__name__)
@@ -162,9 +162,9 @@ class Score:
         """Decibels in sRGB; NaN before the first step."""
         return float(-10 * np.log10(np.maximum(self.error, 1e-12)))
 
-    def note(self, loss: float, shown: Tensor, photographed: Tensor) -> None:
+    def note(self, loss: float, predicted: Tensor, photographed: Tensor) -> None:
         """Take a step's pixels (n, 3) in, linear Rec.709."""
-        a, b = (linear_to_srgb(x.clamp(0, 1).numpy()) for x in (shown, photographed))
+        a, b = (linear_to_srgb(x.clamp(0, 1).numpy()) for x in (predicted, photographed))
         error = float(((a - b) ** 2).mean())
         first = not self.error >= 0
         self.loss = loss if first else 0.95 * self.loss + 0.05 * loss
@@ -206,12 +206,12 @@ class Job:
         mean = self._pixels.colour.mean(axis=0)
         self.lighting = Lighting(gatherer, settings, 2.5 * float(mean.mean()))
         self.surface = Surface(mesh, settings, mean, normals is not None)
-        seen = np.maximum(cache[:, 0] * 0.28209479, 0)
-        self._regularisers = Regularisers(mesh.faces, seen, settings)
+        colours = np.maximum(cache[:, 0] * 0.28209479, 0)
+        self._regularisers = Regularisers(mesh.faces, colours, settings)
         #: Logarithm of the brightness of the photographs, one each.
         self._exposure = torch.zeros(len(capture.training)) if settings.exposure else None
         self._adam = Adam(self._learned())
-        shape = _digest(mesh.vertices, mesh.faces, self._pixels.shown)
+        shape = _digest(mesh.vertices, mesh.faces, self._pixels.detail_normal)
         key = states.fingerprint(capture, mesh=shape, **asdict(settings))
         self.checkpoint = states.Checkpoint(checkpoint, key, _SAVE, now)
         if (state := self.checkpoint.load()) is not None:
@@ -250,34 +250,34 @@ class Job:
             self.lighting.aim(self.lighting.learned.radiance().numpy())
 
     def _loss(self, pixels: Pixels, key: Array, edge: Array) -> Tensor:
-        seen = self.surface.at(pixels, self._regularisers.edges(edge))
+        samples = self.surface.at(pixels, self._regularisers.edges(edge))
         radiance = self.lighting.learned.radiance()
-        loss = self._difference(pixels, key, seen, radiance)
+        loss = self._difference(pixels, key, samples, radiance)
         has_metallic, knows_metals = self.surface.materials.metallic, self.schedule.knows_metals()
-        loss = loss + self._regularisers.of_materials(seen, edge, has_metallic, knows_metals)
+        loss = loss + self._regularisers.of_materials(samples, edge, has_metallic, knows_metals)
         loss = loss + self._regularisers.of_light(self.lighting.learned, radiance)
-        return loss + self._regularisers.of_normals(seen)
+        return loss + self._regularisers.of_normals(samples)
 
-    def _difference(self, pixels: Pixels, key: Array, seen: Seen, radiance: Tensor) -> Tensor:
-        """Between what is shown and what was photographed."""
+    def _difference(self, pixels: Pixels, key: Array, samples: SurfaceSamples, radiance: Tensor) -> Tensor:
+        """Loss between predicted and photographed colours."""
         s, materials = self._settings, self.surface.materials
-        roughness = materials.roughness(seen.here)
+        roughness = materials.roughness(samples.materials)
         alpha2 = (roughness**2).clamp(min=MIN_ALPHA) ** 2
-        sums = self.lighting.gather(pixels, key, seen.normal, alpha2, radiance)
-        nv = dot(seen.normal, torch.from_numpy(pixels.towards)).clamp(1e-3, 1)
-        shown = materials.reflect(seen.here, sums, nv, s.shading_model)
+        sums = self.lighting.gather(pixels, key, samples.normal, alpha2, radiance)
+        nv = dot(samples.normal, torch.from_numpy(pixels.towards)).clamp(1e-3, 1)
+        predicted = materials.reflect(samples.materials, sums, nv, s.shading_model)
         if self._exposure is not None:
             factor = torch.exp(self._exposure - self._exposure.mean())
-            shown = shown * factor[torch.from_numpy(pixels.view).long()][:, None, None]
+            predicted = predicted * factor[torch.from_numpy(pixels.view).long()][:, None, None]
         photographed = torch.from_numpy(pixels.colour)
         if s.unbiased:
             weight_by_prediction = self.schedule.weighs_by_prediction()
             beside = torch.from_numpy(pixels.next_to_clipped)
             counts = torch.where(beside, s.clipped_neighbour_weight, 1.0) if weight_by_prediction else None
-            loss = unbiased_loss(shown, photographed, weight_by_prediction, counts)
+            loss = unbiased_loss(predicted, photographed, weight_by_prediction, counts)
         else:
-            loss = log_loss(shown.mean(1), photographed)
-        self.score.note(float(loss.detach()), shown.detach().mean(1), photographed)
+            loss = log_loss(predicted.mean(1), photographed)
+        self.score.note(float(loss.detach()), predicted.detach().mean(1), photographed)
         return loss
 
     def result(self) -> Decoupled:

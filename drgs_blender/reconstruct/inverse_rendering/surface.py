@@ -21,12 +21,12 @@ Array = np.ndarray
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class SurfaceSamples:
     """The surface at the n pixels and e edges of a step, with derivatives by what is learned.
 
     Attributes
     ----------
-    here : (n, c) float32 tensor
+    materials : (n, c) float32 tensor
         Columns of `Materials` at the pixels.
     normal : (n, 3) float32 tensor
         Unit, world space.
@@ -38,7 +38,7 @@ class Seen:
         The ends of the edges among those vertices.
     """
 
-    here: Tensor
+    materials: Tensor
     normal: Tensor
     columns: Tensor
     offsets: Tensor | None
@@ -77,24 +77,24 @@ class Surface:
         if settings.normals:
             self.parameters["normals"] = torch.zeros(len(mesh.vertices), 3)
 
-    def at(self, pixels: Pixels, edges: Array) -> Seen:
+    def at(self, pixels: Pixels, edges: Array) -> SurfaceSamples:
         """The surface at pixels and at edges (e, 2) of vertices."""
         corner = self._faces[torch.from_numpy(pixels.face)]
         ends = torch.from_numpy(edges)
-        used, place = torch.unique(torch.cat([corner.flatten(), ends.flatten()]), return_inverse=True)
-        corner_place, end_place = place[: corner.numel()].view(-1, 3), place[corner.numel() :].view(-1, 2)
+        used, index = torch.unique(torch.cat([corner.flatten(), ends.flatten()]), return_inverse=True)
+        corner_index, end_index = index[: corner.numel()].view(-1, 3), index[corner.numel() :].view(-1, 2)
         shares = torch.from_numpy(pixels.corners)
 
         columns = self.materials.at(used)
-        here = blend(columns, corner_place, shares)
+        materials = blend(columns, corner_index, shares)
         smooth = self._normals[used]
         offsets = self.parameters["normals"].index_select(0, used) if "normals" in self.parameters else None
         if offsets is not None:
             smooth = smooth + offsets
-        normal = normalise(blend(smooth, corner_place, shares))
+        normal = normalise(blend(smooth, corner_index, shares))
         if self._given_normals:
-            normal = _as_shown(pixels, normal, None if offsets is None else blend(offsets, corner_place, shares))
-        return Seen(here, normal, columns, offsets, end_place)
+            normal = _with_detail(pixels, normal, None if offsets is None else blend(offsets, corner_index, shares))
+        return SurfaceSamples(materials, normal, columns, offsets, end_index)
 
     def normals(self) -> Array:
         """(v, 3) float32 unit: smooth vertex normals with what was learned on top."""
@@ -104,10 +104,10 @@ class Surface:
         return normals.numpy().astype(np.float32)
 
 
-def _as_shown(pixels: Pixels, normal: Tensor, offsets: Tensor | None) -> Tensor:
+def _with_detail(pixels: Pixels, normal: Tensor, offsets: Tensor | None) -> Tensor:
     """Normals (n, 3) from elsewhere than the mesh, with what is learned; its `normal` where they are far off."""
-    shown, flat = torch.from_numpy(pixels.shown), torch.from_numpy(pixels.flat)
-    believed = dot(shown, flat)[:, None] >= ALIKE
+    detail, flat = torch.from_numpy(pixels.detail_normal), torch.from_numpy(pixels.flat)
+    believed = dot(detail, flat)[:, None] >= ALIKE
     # The face's where they are not: nothing has no direction, and its derivative would spoil that of its vertices.
-    own = torch.where(believed, shown, flat)
+    own = torch.where(believed, detail, flat)
     return torch.where(believed, own if offsets is None else normalise(own + offsets), normal)

@@ -94,11 +94,11 @@ def grid(cameras: list[Camera], region: Region, resolution: int = 256) -> tuple[
 def surface_maps(gaussians: Gaussians, camera: Camera) -> tuple[Array, Array]:
     """Depth (h, w), +inf where less than half is covered, and cosine between normal and view, 1 there."""
     with torch.no_grad():
-        look = gaussians.look(camera, torch.zeros(3), 0)
+        rendered = gaussians.render(camera, torch.zeros(3), 0)
         # The median: a mean is drawn backwards by the little that shines through from the far side.
-        covered = look.maps.median.numpy() > 0
-        depth = np.where(covered, look.maps.median.numpy(), np.inf)
-        normal = look.normal.numpy()
+        covered = rendered.maps.median.numpy() > 0
+        depth = np.where(covered, rendered.maps.median.numpy(), np.inf)
+        normal = rendered.normal.numpy()
     rays = pixel_rays(camera).numpy()
     length = np.linalg.norm(normal, axis=-1) * np.linalg.norm(rays, axis=-1)
     cosine = -(normal * rays).sum(-1) / np.maximum(length, 1e-9)

@@ -59,7 +59,7 @@ class Attached(Gaussians):
 
     def on(self, backend: LearningBackend) -> Attached:
         """The same surfels where another processor has its tensors."""
-        parameters, light = self._there(backend)
+        parameters, light = self._tensors_on(backend)
         base, normal, edge = (t.to(backend.device) for t in (self.base, self.normal, self.edge))
         return Attached(parameters, base, normal, edge, self.fixed, light, backend)
 

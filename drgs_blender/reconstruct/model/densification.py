@@ -59,7 +59,7 @@ def densify(
     count = min(max(budget - len(kept), 0), int((pull > 0).sum()))
     cut = np.sort(np.argsort(-pull, kind="stable")[:count])
     # The first half takes the place of the whole and keeps its moments.
-    after = gaussians.take(np.concatenate([kept, kept[cut]]))
+    after = gaussians.select(np.concatenate([kept, kept[cut]]))
     if count:
         _part(after, cut, np.arange(len(kept), len(kept) + count))
     optimiser.take(np.concatenate([kept, np.full(count, -1)]))

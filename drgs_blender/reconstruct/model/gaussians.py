@@ -27,7 +27,7 @@ MATT = -3.0
 
 
 @dataclass(slots=True)
-class Look:
+class RenderedView:
     """One view of the surfels.
 
     Attributes
@@ -105,7 +105,7 @@ class Gaussians:
         """(n,) in 0..1."""
         return torch.sigmoid(self.parameters["opacity"])
 
-    def look(
+    def render(
         self,
         camera: Camera,
         background: Tensor,
@@ -113,7 +113,7 @@ class Gaussians:
         tally: Tally | None = None,
         rays: Tensor | None = None,
         mirrors: bool = True,
-    ) -> Look:
+    ) -> RenderedView:
         """Render a view over `background` (3,); `rays` are `training_views.pixel_rays` where they are at hand."""
         mirrors = mirrors and self.light is not None
         centre, eye = self.centres(), np.asarray(camera.matrix_world)[:3, 3]
@@ -124,9 +124,9 @@ class Gaussians:
             assert self.light is not None
             rays = pixel_rays(camera, self.backend.device) if rays is None else rays
             colour = colour + self.backend.mirrored(maps.features, maps.alpha, rays, pyramid(self.light))
-        return Look(colour, maps.features[..., NORMAL : NORMAL + 3], maps)
+        return RenderedView(colour, maps.features[..., NORMAL : NORMAL + 3], maps)
 
-    def take(self, rows: Array) -> Gaussians:
+    def select(self, rows: Array) -> Gaussians:
         """The surfels `rows`, in this order, as a set of their own."""
         index = torch.from_numpy(np.asarray(rows, np.int64)).to(self.backend.device)
         return self.like({k: v.detach()[index].clone() for k, v in self.parameters.items()})
@@ -137,9 +137,9 @@ class Gaussians:
 
     def on(self, backend: LearningBackend) -> Gaussians:
         """The same surfels where another processor has its tensors."""
-        return Gaussians(*self._there(backend), backend)
+        return Gaussians(*self._tensors_on(backend), backend)
 
-    def _there(self, backend: LearningBackend) -> tuple[dict[str, Tensor], Tensor | None]:
+    def _tensors_on(self, backend: LearningBackend) -> tuple[dict[str, Tensor], Tensor | None]:
         """Parameters and light at a processor's place."""
         light = None if self.light is None else self.light.detach().to(backend.device)
         return {k: v.detach().to(backend.device) for k, v in self.parameters.items()}, light

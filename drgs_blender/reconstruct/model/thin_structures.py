@@ -35,7 +35,7 @@ def normals_of(gaussians: Gaussians) -> Normals:
 
     def shown(view: View) -> Array:
         with torch.no_grad():
-            return gaussians.look(view.camera, torch.zeros(3), 0, mirrors=False).normal.numpy(force=True)
+            return gaussians.render(view.camera, torch.zeros(3), 0, mirrors=False).normal.numpy(force=True)
 
     return shown
 
@@ -49,8 +49,8 @@ def is_thin(gaussians: Gaussians, mesh: Mesh, views: list[View]) -> bool:
     for index, view in enumerate(views[:: math.ceil(len(views) / SAMPLED_VIEWS)]):
         pixels = pixels_of(index, view, mesh, tree, normals_of(gaussians))
         by_mesh = unit(np.einsum("nk,nkc->nc", pixels.corners, smooth[mesh.faces[pixels.face]]))
-        known = (pixels.shown != 0).any(axis=1)
-        cosines.append(np.einsum("nc,nc->n", pixels.shown, by_mesh)[known])
+        known = (pixels.detail_normal != 0).any(axis=1)
+        cosines.append(np.einsum("nc,nc->n", pixels.detail_normal, by_mesh)[known])
     different = float((np.concatenate([*cosines, [1.0]]) < math.cos(math.radians(MIN_ANGLE))).mean())
     thin = different > THIN_FRACTION
     log.info("normals of surfels and mesh differ in %.1f %% of pixels%s", 100 * different, ": thin" if thin else "")

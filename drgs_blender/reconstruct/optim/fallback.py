@@ -18,7 +18,7 @@ log = logging.getLogger(__name__)
 _T = TypeVar("_T")
 
 #: Seconds between two copies of the state, from which training goes on after a failure.
-KEEP_EVERY = 20.0
+SAVE_EVERY = 20.0
 
 
 class Movable(Protocol):
@@ -43,7 +43,7 @@ class Fallback:
 
     Parameters
     ----------
-    learned : Movable
+    training : Movable
     now : callable
         Seconds of a clock.
 
@@ -55,27 +55,27 @@ class Fallback:
         Why the GPU is not used any more; empty while it is.
     """
 
-    def __init__(self, learned: Movable, now: Callable[[], float] = time.monotonic) -> None:
-        self._learned, self._now = learned, now
+    def __init__(self, training: Movable, now: Callable[[], float] = time.monotonic) -> None:
+        self._training, self._now = training, now
         self.backend, self.failed = CPU, ""
-        self._kept: dict[str, Array] = {}
-        self._kept_at = 0.0
+        self._saved: dict[str, Array] = {}
+        self._saved_at = 0.0
 
     def begin(self, backend: LearningBackend) -> None:
         """Run the steps on `backend` from the first one, unless it has failed before."""
         self._move(CPU)
         if backend is not CPU:
-            self.keep()
-            self.attempt(lambda: None if self.failed else self._move(backend), whole=False)
+            self.save_state()
+            self.attempt(lambda: None if self.failed else self._move(backend), interruptible=False)
 
-    def attempt(self, work: Callable[[], _T], whole: bool = True) -> _T:
+    def attempt(self, work: Callable[[], _T], interruptible: bool = True) -> _T:
         """Run `work` on the present backend; where that fails, run it and all that follows on the CPU.
 
         Parameters
         ----------
         work : callable
-        whole : bool
-            The state is valid after work that was interrupted; else the last copy is loaded.
+        interruptible : bool
+            The state is valid after an interruption of the work; otherwise the last copy is loaded.
         """
         try:
             return work()
@@ -83,28 +83,28 @@ class Fallback:
             if self.backend is CPU:
                 raise
             self.failed = (str(error).strip() or type(error).__name__).splitlines()[0]
-            state = self._kept
+            state = self._saved
             with suppress(DeviceError, RuntimeError):
-                state = self._learned.state() if whole else state
+                state = self._training.state() if interruptible else state
             self._move(CPU)
-            self._learned.load_state(state)
-            log.warning("%s Learned on the CPU from step %d on", self.failed, self._learned.iteration)
+            self._training.load_state(state)
+            log.warning("%s Learned on the CPU from step %d on", self.failed, self._training.iteration)
         return work()
 
-    def keep(self) -> None:
+    def save_state(self) -> None:
         """Copy the present state, so that it is not lost when the GPU fails."""
-        self.remember(self.attempt(self._learned.state))
+        self.remember(self.attempt(self._training.state))
 
-    def keep_if_away(self, every: float = 0.0) -> None:
+    def save_gpu_state(self, every: float = 0.0) -> None:
         """The same, where the steps run on a GPU and the last copy is `every` seconds old."""
-        if self.backend is not CPU and self._now() >= self._kept_at + every:
-            self.keep()
+        if self.backend is not CPU and self._now() >= self._saved_at + every:
+            self.save_state()
 
     def remember(self, state: dict[str, Array]) -> None:
         """Go on from this state when the GPU fails and its own is lost."""
-        self._kept = {name: np.array(value) for name, value in state.items()}
-        self._kept_at = self._now()
+        self._saved = {name: np.array(value) for name, value in state.items()}
+        self._saved_at = self._now()
 
     def _move(self, backend: LearningBackend) -> None:
         self.backend = backend  # before anything that may fail there
-        self._learned.move(backend)
+        self._training.move(backend)

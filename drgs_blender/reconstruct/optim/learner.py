@@ -15,7 +15,7 @@ from ..backend import LearningBackend
 from ..capture.training_views import Target, pixel_rays
 from ..model.attributes import TINT
 from ..model.densification import densify
-from ..model.gaussians import Gaussians, Look
+from ..model.gaussians import Gaussians, RenderedView
 from ..model.raster import Tally
 from .adam import Adam
 from .schedule import LIGHT_RATE, Schedule, learning_rates
@@ -77,30 +77,30 @@ class Learner:
         # Also when done again, after a device has left it half-done.
         self.optimiser.steps = self.light.steps = self.iteration
         with _one_thread():
-            look, rays = self._look(target, part)
-            self._loss(look, target, rays, part).backward()
-            self._descend(part)
-            squared = _squared_error(look, target)
+            rendered, rays = self._render(target, part)
+            self._loss(rendered, target, rays, part).backward()
+            self._optimise(part)
+            squared = _squared_error(rendered, target)
         self.error = squared if not self.iteration else 0.98 * self.error + 0.02 * squared
         self.iteration += 1
 
-    def _look(self, target: Target, part: float) -> tuple[Look, Tensor]:
+    def _render(self, target: Target, part: float) -> tuple[RenderedView, Tensor]:
         """The surfels as the view sees them, and its rays."""
         schedule = self._schedule
         rays = pixel_rays(target.camera, self._backend.device)
         tally = self.tally if part < schedule.densify[1] else None
         mirrors = part >= schedule.mirrors < 1
         bands = min(schedule.bands, int(part * 8))
-        return self.gaussians.look(target.camera, self._background, bands, tally, rays, mirrors), rays
+        return self.gaussians.render(target.camera, self._background, bands, tally, rays, mirrors), rays
 
-    def _descend(self, part: float) -> None:
+    def _optimise(self, part: float) -> None:
         parameters = self.gaussians.parameters
         self.optimiser.step(parameters, learning_rates(part, self._radius, parameters["sh"].shape[1]))
         if self.gaussians.light is not None:
             self.light.step({"light": self.gaussians.light}, {"light": LIGHT_RATE[0] * LIGHT_RATE[1] ** part})
 
-    def _loss(self, look: Look, target: Target, rays: Tensor, part: float) -> Tensor:
-        schedule, maps = self._schedule, look.maps
+    def _loss(self, rendered: RenderedView, target: Target, rays: Tensor, part: float) -> Tensor:
+        schedule, maps = self._schedule, rendered.maps
         shaped = part >= schedule.shape
         weights = (
             schedule.mask,
@@ -109,9 +109,9 @@ class Learner:
         )
         counts = _importance(maps.features)
         shape = self._backend.shape_loss(
-            maps.alpha, maps.depth, maps.distortion, look.normal, target.mask, rays, counts, weights
+            maps.alpha, maps.depth, maps.distortion, rendered.normal, target.mask, rays, counts, weights
         )
-        return self._backend.difference(look.colour, target.photograph) + shape
+        return self._backend.difference(rendered.colour, target.photograph) + shape
 
     def densify(self, budget: int) -> None:
         """Cut surfels, until there are `budget` at most."""
@@ -126,7 +126,7 @@ class Learner:
         errors = []
         for target in views:
             with torch.no_grad():
-                errors.append(_squared_error(self.gaussians.look(target.camera, self._background), target))
+                errors.append(_squared_error(self.gaussians.render(target.camera, self._background), target))
         return float(np.mean(errors))
 
     def arrays(self) -> dict[str, Array]:
@@ -152,9 +152,9 @@ class Learner:
         self.tally = Tally(there("travel"), there("views"))
 
 
-def _squared_error(look: Look, target: Target) -> float:
+def _squared_error(rendered: RenderedView, target: Target) -> float:
     """Mean over the picture."""
-    return float((look.colour.detach().clamp(0, 1) - target.colour).square().mean())
+    return float((rendered.colour.detach().clamp(0, 1) - target.colour).square().mean())
 
 
 def _importance(features: Tensor) -> Tensor:

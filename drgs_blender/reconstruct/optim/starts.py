@@ -1,4 +1,4 @@
-"""The trial of two starts: each is learned for a while, and the better one in views that neither saw goes on."""
+"""Trial of two initialisations: both are trained for a while; the one that predicts held-out views better goes on."""
 
 from __future__ import annotations
 
@@ -20,15 +20,17 @@ HOLDOUT_EVERY = 8
 MIN_GAIN_DB = 0.75
 #: Fewest training views with which there is a trial.
 MIN_VIEWS = 16
+#: Key of the first start's error among the arrays of checkpoints.
+_ERROR = "aside"
 
 
-def is_aside(view: int) -> bool:
-    """Whether a trial keeps the view of this number for its end."""
+def is_held_out(view: int) -> bool:
+    """Whether a trial does not train on the view of this number, but compares the starts by it."""
     return view % HOLDOUT_EVERY == HOLDOUT_EVERY // 2
 
 
 class Trial:
-    """What a trial knows of the two starts.
+    """State of the trial of two starts.
 
     Parameters
     ----------
@@ -40,7 +42,7 @@ class Trial:
     rival : Gaussians or None
         None at the end.
     first : dict or None
-        State of the first start when its turn was over, and its error in views kept "aside"; before that None.
+        State of the first start at the end of its turn, with its error in the held-out views; before that None.
     """
 
     def __init__(self, rival: Gaussians | None) -> None:
@@ -58,18 +60,18 @@ class Trial:
         even = self.first is not None and iteration >= self.first["counts"][0]
         return self.goes_on and (part >= TRIAL or bool(even))
 
-    def keep_first(self, state: dict[str, Array], error: float) -> Gaussians:
+    def store_first(self, state: dict[str, Array], error: float) -> Gaussians:
         """Keep the state of the first start and its mean squared error; returns the other one."""
         assert self.rival is not None
-        self.first = state | {"aside": np.array([error])}
+        self.first = state | {_ERROR: np.array([error])}
         return self.rival
 
     def decide(self, error: float) -> dict[str, Array] | None:
         """End the trial by the second start's mean squared error: the state of the first one where that is better."""
         first = self.first
         assert first is not None
-        gain = 10 * math.log10(max(float(first["aside"][0]), 1e-10) / max(error, 1e-10))
-        log.info("surfels inside the hull: %+.2f dB in views kept aside", gain)
+        gain = 10 * math.log10(max(float(first[_ERROR][0]), 1e-10) / max(error, 1e-10))
+        log.info("surfels inside the hull: %+.2f dB in held-out views", gain)
         self.end()
         return None if gain >= MIN_GAIN_DB else first  # nor what is no number
 

@@ -22,7 +22,7 @@ from ..meshing.visual_hull import Region
 from ..model.gaussians import Gaussians
 from ..model.initialisation import enough, inside_hull, on_hull
 from .clock import Clock
-from .fallback import KEEP_EVERY, Fallback
+from .fallback import SAVE_EVERY, Fallback
 from .growth import Growth
 from .learner import Learner
 from .schedule import Schedule
@@ -131,15 +131,15 @@ class Training:
             self.attempt(self._learn)
             self.densify_when_due()
             self._decide_when_due()
-            self.fallback.keep_if_away(KEEP_EVERY)
+            self.fallback.save_gpu_state(SAVE_EVERY)
 
-    def attempt(self, work: Callable[[], _T], whole: bool = True) -> _T:
+    def attempt(self, work: Callable[[], _T], interruptible: bool = True) -> _T:
         """Run `work`, if need be on the CPU: see `Fallback.attempt`."""
-        return self.fallback.attempt(work, whole)
+        return self.fallback.attempt(work, interruptible)
 
     def _learn(self) -> None:
         part = self.part
-        target = self.views.of_step(self.iteration, half=part < self.schedule.coarse, but_aside=self.trying)
+        target = self.views.of_step(self.iteration, half=part < self.schedule.coarse, without_held_out=self.trying)
         self.learner.step(target, part)
 
     def densify_when_due(self) -> None:
@@ -149,23 +149,23 @@ class Training:
         if due <= self.growth.rounds:
             return
         budget = self.growth.budget(part)
-        self.fallback.keep_if_away()
-        self.attempt(lambda: self.learner.densify(budget), whole=False)
+        self.fallback.save_gpu_state()
+        self.attempt(lambda: self.learner.densify(budget), interruptible=False)
         self.growth.rounds = due
 
     def _decide_when_due(self) -> None:
         """At the end of a trial's turn: the other start's, or on with the better one."""
         if not self.trial.is_due(self.part, self.iteration):
             return
-        error = self.attempt(lambda: self.learner.error_of(self.views.aside()))
+        error = self.attempt(lambda: self.learner.error_of(self.views.held_out()))
         first = self.trial.first
         if first is None:
-            self._begin(self.trial.keep_first(self.attempt(self.state), error), self.fallback.backend)
+            self._begin(self.trial.store_first(self.attempt(self.state), error), self.fallback.backend)
             return
         spent = self.clock.spent + float(first["numbers"][1])
         better = self.trial.decide(error)
         if better is not None:
-            self.attempt(lambda: self.load_state(better), whole=False)
+            self.attempt(lambda: self.load_state(better), interruptible=False)
         self.clock.end_trial(spent)
 
     def arrays(self) -> dict[str, Array]:

@@ -9,7 +9,7 @@ import torch
 
 from ..backend import LearningBackend
 from ..capture.training_views import Target
-from .starts import is_aside
+from .starts import is_held_out
 
 #: Pixels of all views up to which these stay on a device, 16 bytes each.
 KEPT_ON_DEVICE = 100_000_000
@@ -43,7 +43,7 @@ class Views:
         few = pixels <= KEPT_ON_DEVICE
         self.full, self.half = [[backend.bring(view) for view in views] for views in targets] if few else targets
 
-    def of_step(self, iteration: int, half: bool, but_aside: bool) -> Target:
+    def of_step(self, iteration: int, half: bool, without_held_out: bool) -> Target:
         """The view of a step: all in turn, in an order drawn again each time.
 
         Parameters
@@ -51,15 +51,15 @@ class Views:
         iteration : int
         half : bool
             In half size.
-        but_aside : bool
-            Without those that a trial keeps aside.
+        without_held_out : bool
+            Without the views that a trial holds out.
         """
         views = self.half if half else self.full
-        if but_aside:
-            views = [view for k, view in enumerate(views) if not is_aside(k)]
+        if without_held_out:
+            views = [view for k, view in enumerate(views) if not is_held_out(k)]
         turn, place = divmod(iteration, len(views))
         return self._backend.bring(views[np.random.default_rng([self._seed, turn]).permutation(len(views))[place]])
 
-    def aside(self) -> Iterator[Target]:
-        """The views that a trial keeps aside, in half size."""
-        return (self._backend.bring(view) for k, view in enumerate(self.half) if is_aside(k))
+    def held_out(self) -> Iterator[Target]:
+        """The views that a trial holds out, in half size."""
+        return (self._backend.bring(view) for k, view in enumerate(self.half) if is_held_out(k))

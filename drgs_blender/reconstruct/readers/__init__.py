@@ -16,12 +16,12 @@ from ...formats.axes import UP_AXES
 from ..capture.capture import Capture
 from ..memory_budget import check_fits
 from . import colmap, llff, nero, tensoir, transforms
-from .camera_overlap import check_sight
+from .camera_overlap import check_overlap
 from .develop import cut_out, develop, find_background
 from .layout import Layout
 from .lens import Lens
 from .usable_photographs import usable
-from .world_frame import AXES, check_places, check_silhouettes, turn_upright
+from .world_frame import AXES, check_positions, check_silhouettes, turn_upright
 
 logger = logging.getLogger(__name__)
 
@@ -102,7 +102,7 @@ def read_capture(
     layout = reader.read(path, light) if reader.lights else reader.read(path)
     photographs = sorted(layout.photographs, key=lambda photograph: _natural(photograph.name))
     matrices = np.stack([AXES[axes](photograph.matrix) for photograph in photographs])
-    check_places(matrices, str(path), axes)
+    check_positions(matrices, str(path), axes)
     turn = _turn(layout, matrices, axes, up)
     for photograph, matrix in zip(photographs, matrices):
         photograph.matrix = turn @ matrix
@@ -124,7 +124,7 @@ def read_capture(
     learned = [view for view in views if not view.test]
     check_silhouettes(learned, str(path), axes)
     if all(view.mask is None for view in learned):
-        check_sight(learned, str(path))
+        check_overlap(learned, str(path))
     points = None if layout.points is None else (layout.points @ turn[:3, :3].T).astype(np.float32)
     return Capture(path, views, find_background(views), points)
 

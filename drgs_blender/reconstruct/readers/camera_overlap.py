@@ -19,7 +19,7 @@ _FEWEST = 3
 _VIEWS = 32
 
 
-def check_sight(views: Sequence[View], subject: str) -> None:
+def check_overlap(views: Sequence[View], subject: str) -> None:
     """Raise AssetError where cameras stand in two groups that look at nothing in common.
 
     Groups are farther from each other than either is wide: two objects, or two calibrations in one file. Close-ups and
@@ -27,13 +27,13 @@ def check_sight(views: Sequence[View], subject: str) -> None:
     """
     if len(views) < 2 * _FEWEST:
         return
-    tree = linkage(np.stack([_place(view) for view in views]), "single")
+    tree = linkage(np.stack([_position(view) for view in views]), "single")
     label = fcluster(tree, 2, "maxclust")
     groups = [[view for view, k in zip(views, label) if k == group] for group in (1, 2)]
     if min(map(len, groups)) < _FEWEST or (gap := tree[-1, 2]) <= max(map(_width, groups)):
         return
     first, second = ([view.camera for view in group[:: len(group) // _VIEWS + 1]] for group in groups)
-    if _look_at_sight(first, second) or _look_at_sight(second, first):
+    if _share_view(first, second) or _share_view(second, first):
         return
     raise AssetError(
         subject,
@@ -43,27 +43,27 @@ def check_sight(views: Sequence[View], subject: str) -> None:
     )
 
 
-def _place(view: View) -> Array:
+def _position(view: View) -> Array:
     return view.camera.matrix_world[:3, 3]
 
 
 def _width(views: list[View]) -> float:
     """Diagonal of the box of the cameras' places."""
-    return float(np.linalg.norm(np.ptp([_place(view) for view in views], axis=0)))
+    return float(np.linalg.norm(np.ptp([_position(view) for view in views], axis=0)))
 
 
-def _look_at_sight(viewers: list[Camera], others: list[Camera]) -> bool:
+def _share_view(viewers: list[Camera], targets: list[Camera]) -> bool:
     """Whether half of the viewers have on their axis what half of the others have in their picture."""
-    eye, axis = (np.stack([camera.matrix_world[:3, k] for camera in others]) for k in (3, 2))
+    eye, axis = (np.stack([camera.matrix_world[:3, k] for camera in targets]) for k in (3, 2))
     looking = 0
     for viewer in viewers:
         start, forward = viewer.matrix_world[:3, 3], -viewer.matrix_world[:3, 2]
         # Where the viewer's axis comes closest to those of the others.
-        across, apart = axis @ forward, start - eye
-        away = (across * (apart * axis).sum(axis=1) - apart @ forward) / np.maximum(1 - across**2, 1e-9)
+        across, offset = axis @ forward, start - eye
+        away = (across * (offset * axis).sum(axis=1) - offset @ forward) / np.maximum(1 - across**2, 1e-9)
         points = start + away[away > 0, None] * forward
-        seen = np.sum([_in_picture(points, camera) for camera in others], axis=0)
-        looking += bool((2 * seen >= len(others)).any())
+        seen = np.sum([_in_picture(points, camera) for camera in targets], axis=0)
+        looking += bool((2 * seen >= len(targets)).any())
     return 2 * looking >= len(viewers)
 
 

@@ -63,7 +63,7 @@ def turn_upright(matrices: Array) -> Array:
     return np.stack([x, np.cross(z, x), z])
 
 
-def check_places(matrices: Array, subject: str, axes: str) -> None:
+def check_positions(matrices: Array, subject: str, axes: str) -> None:
     """Raise AssetError where cameras do not see an object from several sides, or too near or far to compute with."""
     if len(matrices) < 2:
         raise AssetError(subject, "has one camera", "Shape needs photographs from several sides: take 20 or more")
