@@ -21,7 +21,7 @@ import numpy as np
 from bench_evaluate import mean, of_truth, score, under_other_lights
 from decouple_score import with_materials_of
 from PIL import Image
-from report import DOCUMENT, OUT, ROOT, keep, table, write_section
+from report import DOCUMENT, OUT, ROOT, store_row, table, write_section
 
 from drgs_blender.core.asset.container import write_asset
 from drgs_blender.core.asset.model import Asset
@@ -71,7 +71,7 @@ def with_true_materials(asset: Asset, folder: Path) -> Path:
     return path
 
 
-def under_others(folder: Path, posed: bool = False) -> Truth:
+def relit_truth(folder: Path, posed: bool = False) -> Truth:
     """What is known of a scene, at rest or posed, under the lights that were not photographed."""
     truth = read_truth(folder)
     assert truth is not None
@@ -79,7 +79,7 @@ def under_others(folder: Path, posed: bool = False) -> Truth:
     return replace(truth, sets=sets)
 
 
-def learned(capture: Capture, settings: Settings) -> tuple[Asset, float]:
+def reconstruct_timed(capture: Capture, settings: Settings) -> tuple[Asset, float]:
     """An asset, and the seconds after stage (i): of the mesh, the materials and the light."""
     began: list[float] = []
 
@@ -108,17 +108,17 @@ def row(report: dict[str, Any], beside: list[str], seconds: float) -> list[str]:
     ]
 
 
-def deformed_anew(objects: list[str], scenes: Path, samples: int) -> None:
+def rescore_deformed(objects: list[str], scenes: Path, samples: int) -> None:
     """Score how the surfels of kept assets look deformed, without learning them again; the rest of their rows stays."""
     before, section = DOCUMENT.read_text(encoding="utf-8").split("<!-- begin asset -->")
     for name in objects:
-        truth = under_others(scenes / name, posed=True)
+        truth = relit_truth(scenes / name, posed=True)
         found = score(FOLDER / f"{name}.drgs", scenes / name, "surfels", samples, truth)["lights"]
         line = next(line for line in section.splitlines() if line.startswith(f"| {name} | surfels |"))
         cells = line.strip("| ").split(" | ")
         cells[COLUMNS.index(DEFORMED)] = pair(found)
         section = section.replace(line, f"| {' | '.join(cells)} |")
-        keep(FOLDER / "rows.json", f"{name}|surfels", cells[2:])
+        store_row(FOLDER / "rows.json", f"{name}|surfels", cells[2:])
         print(*cells, flush=True)
     DOCUMENT.write_text(f"{before}<!-- begin asset -->{section}", encoding="utf-8")
 
@@ -160,19 +160,19 @@ def main() -> None:
     if options.sheet:
         return sheet(options.objects, options.scenes, options.samples)
     if options.deformed:
-        return deformed_anew(options.objects, options.scenes, options.samples)
+        return rescore_deformed(options.objects, options.scenes, options.samples)
     for name in options.objects:
         capture = read_capture(options.scenes / name)
         folder, path = options.scenes / name, FOLDER / f"{name}.drgs"
         path.parent.mkdir(parents=True, exist_ok=True)
-        asset, seconds = learned(capture, settings_of(options))
+        asset, seconds = reconstruct_timed(capture, settings_of(options))
         write_asset(path, asset)
-        others, references = under_others(folder), (with_true_materials(asset, folder), of_truth(folder))
+        relit, references = relit_truth(folder), (with_true_materials(asset, folder), of_truth(folder))
         for camera_sees in ("surfels",) if options.variant == "m" else ("surfels", "mesh"):  # the mesh is one
-            beside = [pair(score(one, folder, camera_sees, options.samples, others)["lights"]) for one in references]
+            beside = [pair(score(one, folder, camera_sees, options.samples, relit)["lights"]) for one in references]
             found = row(score(path, folder, camera_sees, options.samples), beside, seconds)
             seen = "surfels (M)" if options.variant == "m" else camera_sees
-            rows = keep(FOLDER / "rows.json", f"{name}|{seen}", found)
+            rows = store_row(FOLDER / "rows.json", f"{name}|{seen}", found)
             print(name, camera_sees, *found, flush=True)
     side = max(capture.views[0].colour.shape[:2])
     bound = f"{options.time_budget:g} minutes" if options.time_budget else "{} and {} steps".format(*options.steps)

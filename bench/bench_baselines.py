@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 from bench_evaluate import mean, under_other_lights
-from report import OUT, keep, table, write_section
+from report import OUT, store_row, table, write_section
 
 from drgs_blender.cli.evaluate import session_renderer
 from drgs_blender.core.asset import Environment
@@ -109,7 +109,7 @@ def main() -> None:
     for name in options.objects:
         for method in options.methods:
             found = row(options.scenes / name, method, options)
-            rows = keep(FOLDER / "rows.json", f"{name}|{method}", found)
+            rows = store_row(FOLDER / "rows.json", f"{name}|{method}", found)
             print(name, method, *found, flush=True)
     about = "{} and {} steps".format(*options.steps)
     body = (

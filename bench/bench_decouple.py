@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 from decouple_score import COLUMNS, Scene, score, with_materials_of
-from report import OUT, ROOT, keep, processor_seconds, table, write_section
+from report import OUT, ROOT, processor_seconds, store_row, table, write_section
 
 from drgs_blender.core.asset import Mesh
 from drgs_blender.core.color import srgb_to_linear
@@ -216,7 +216,7 @@ def main() -> None:
     scene = Scene.read(scene_folder(options.scene))
     warm(scene)
     for part in options.part:
-        kept = keep(FOLDER / "rows.json", part, PARTS[part](scene, options.iterations))
+        kept = store_row(FOLDER / "rows.json", part, PARTS[part](scene, options.iterations))
         print(table(("", *COLUMNS), [(name, *row) for name, row in kept[part].items()]), flush=True)
     rows = [(name, *row) for part in PARTS for name, row in kept.get(part, {}).items()]
     write_section("decouple", "Materials and light from photographs", text(scene, rows, options.iterations))

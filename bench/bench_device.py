@@ -74,7 +74,7 @@ def frames(options: argparse.Namespace, cards: list[str]) -> str:
         for k in range(options.runs + 1):
             began = time.perf_counter()
             moved = (vertices * (1 + 1e-3 * k)).astype(np.float32)
-            ours.look(path, sky, camera, vertices=moved, **common)
+            ours.first_view(path, sky, camera, vertices=moved, **common)
             first.append(time.perf_counter() - began)
         if processor.failed:
             raise DeviceError("device", processor.failed, "")

@@ -46,7 +46,7 @@ TITLES = {
     "posed-captured": "Show as Captured",
 }
 #: Edit -> what was pressed.
-MADE_BY = {
+EDITED_BY = {
     "gold": "Set Material, Gold",
     "mirror": "Adjustments: roughness x 0.1, metallic + 1, value x 3",
     "gilded": "Set Material, Gold, Mask",
@@ -82,7 +82,7 @@ def load(folder: Path, name: str, camera_sees: str) -> dict[str, Layers]:
     return {f.stem.removeprefix(f"{name}-").removesuffix(end): read_layers(f) for f in files}
 
 
-class Places:
+class PixelFaces:
     """Which faces the pixels of a picture show, found by the pass Position alone."""
 
     def __init__(self, layers: Layers, vertices: Array, faces: Array) -> None:
@@ -123,19 +123,19 @@ def means(before: Layers, after: Layers, pixels: Array) -> list[str]:
 def rows_of(name: str, pictures: dict[str, Layers], arrays: dict[str, Array]) -> list[list[object]]:
     """A subject's lines of the table."""
     before = pictures["captured"]
-    places = Places(before, arrays["rest"], arrays["faces"])
+    pixel_faces = PixelFaces(before, arrays["rest"], arrays["faces"])
     rows: list[list[object]] = []
-    for edit, made_by in MADE_BY.items():
+    for edit, made_by in EDITED_BY.items():
         part = PARTS[name].get(edit)
         mask = np.ones(len(arrays["rest"])) if part is None else arrays[part]
-        inside, outside = places.of(mask)
+        inside, outside = pixel_faces.of(mask)
         kept = "-" if part is None else f"{changed(before, pictures[edit], outside)} of {outside.sum()}"
         rows.append([name, made_by, part or "all", *means(before, pictures[edit], inside), kept])
     posed, edited = pictures["posed-captured"], pictures["posed-all"]
-    places = Places(posed, arrays["posed"], arrays["faces"])
-    _, outside = places.of(np.max([arrays[part] for part in PARTS[name].values()], axis=0))
+    pixel_faces = PixelFaces(posed, arrays["posed"], arrays["faces"])
+    _, outside = pixel_faces.of(np.max([arrays[part] for part in PARTS[name].values()], axis=0))
     for part in PARTS[name].values():
-        inside, _ = places.of(arrays[part])
+        inside, _ = pixel_faces.of(arrays[part])
         kept = f"{changed(posed, edited, outside)} of {outside.sum()}" if outside.any() else "-"
         rows.append([name, "the last three, posed", part, *means(posed, edited, inside), kept])
     return rows

@@ -31,21 +31,24 @@ def points(n: int, mu: float, albedo: float, roughness: float, metallic: float) 
     )  # fmt: skip
 
 
-def solve(light: EnvironmentLight, seen: ShadingPoints, counts: tuple[int, int, int], look: str) -> np.ndarray:
+def solve(
+    light: EnvironmentLight, surface: ShadingPoints, counts: tuple[int, int, int], shading_model: str
+) -> np.ndarray:
     """(n,) mean radiance of each point."""
-    settings = RenderSettings(strategy_samples=counts, subpixel_samples=1, bounces=0, shading_model=look)  # type: ignore[arg-type]
-    return integrate(EMPTY, light, seen, settings, 0).total.mean(axis=1)
+    settings = RenderSettings(strategy_samples=counts, subpixel_samples=1, bounces=0, shading_model=shading_model)  # type: ignore[arg-type]
+    return integrate(EMPTY, light, surface, settings, 0).total.mean(axis=1)
 
 
 def furnace() -> list[list[object]]:
     white = EnvironmentLight(World())
     rows = []
-    for look in ("principled", "paper"):
+    for shading_model in ("principled", "paper"):
         for metallic in (0.0, 1.0):
-            row: list[object] = [look, metallic]
+            row: list[object] = [shading_model, metallic]
             for roughness in (0.05, 0.3, 0.6, 1.0):
                 totals = [
-                    solve(white, points(4000, mu, 1, roughness, metallic), (32, 32, 0), look) for mu in (0.2, 0.9)
+                    solve(white, points(4000, mu, 1, roughness, metallic), (32, 32, 0), shading_model)
+                    for mu in (0.2, 0.9)
                 ]
                 row.append(" / ".join(f"{t.mean():.4f}" for t in totals))
             rows.append(row)
@@ -66,12 +69,12 @@ def strategies() -> list[list[object]]:
     rows = []
     for roughness in (0.15, 0.5, 0.9):
         for metallic in (0.0, 1.0):
-            seen = points(20000, 0.6, 0.8, roughness, metallic)
-            every = solve(light, seen, (64, 64, 64), "principled")
-            row: list[object] = [roughness, metallic, f"{every.mean():.4f} ± {every.std() / len(seen) ** 0.5:.4f}"]
+            surface = points(20000, 0.6, 0.8, roughness, metallic)
+            every = solve(light, surface, (64, 64, 64), "principled")
+            row: list[object] = [roughness, metallic, f"{every.mean():.4f} ± {every.std() / len(surface) ** 0.5:.4f}"]
             for counts in ((256, 0, 0), (0, 256, 0), (0, 0, 256)):
-                alone = solve(light, seen, counts, "principled")
-                row.append(f"{alone.mean():.4f} ± {alone.std() / len(seen) ** 0.5:.4f}")
+                alone = solve(light, surface, counts, "principled")
+                row.append(f"{alone.mean():.4f} ± {alone.std() / len(surface) ** 0.5:.4f}")
             rows.append(row)
     return rows
 

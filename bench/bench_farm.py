@@ -88,7 +88,7 @@ def kills(scene: Path, folder: Path, count: int, samples: int) -> str:
     return "SIGKILL 0.2 to 0.4 s into a frame, one engine after the other.\n\n" + table(["", ""], rows)
 
 
-def left(scene: Path, folder: Path, count: int, samples: int) -> str:
+def leftovers_report(scene: Path, folder: Path, count: int, samples: int) -> str:
     """What remains on the machine of jobs that were ended in every way."""
     rows = []
     for what in ("engine killed", "Blender killed", "drgs killed", "drgs terminated", "session killed", "disk full"):
@@ -318,7 +318,7 @@ PARTS: dict[str, tuple[str, Callable[[Path, Path, int, int], str], int, int]] = 
     "faults": ("Frames on three nodes while things fail", farm_slurm.faults, 240, 1024),
     "chunks": ("Chunks of any size give the same files", farm_slurm.chunks, 48, 64),
     "kills": ("Killed engines", kills, 50, 0),
-    "leftovers": ("What faults leave behind", left, 0, 0),
+    "leftovers": ("What faults leave behind", leftovers_report, 0, 0),
     "overhead": ("Overhead of a farm's task", overhead, 12, 64),
     "scaling": ("Workers on one machine", scaling, 10, 65536),
     "processors": ("Nodes with other processors", processors, 3, 16),

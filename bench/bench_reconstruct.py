@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from embreex import rtcore_scene
 from embreex.mesh_construction import TriangleMesh
-from report import OUT, keep, processor_seconds, table, write_section
+from report import OUT, processor_seconds, store_row, table, write_section
 
 from drgs_blender.compute.threads import get_num_threads
 from drgs_blender.core.frame import Camera
@@ -161,7 +161,7 @@ def surfels(options: argparse.Namespace, part: str = "surfels") -> None:
         row |= against_truth(training.gaussians, training, capture, options.capture)
     row |= {"views": len(capture.training), "size": capture.views[0].camera.width}
     row["limit"] = f"{options.time_budget:g} min" if options.time_budget else f"{schedule.iterations} steps"
-    rows = keep(ROWS / f"{part}.json", f"{options.capture.name}|{row['size']}|{row['limit']}", row)
+    rows = store_row(ROWS / f"{part}.json", f"{options.capture.name}|{row['size']}|{row['limit']}", row)
     names = (
         "size", "views", "limit", "wall", "cpu", "steps", "surfels", "psnr", "psnr_pooled", "ssim", "normal", "depth",
         "overlap",
@@ -178,11 +178,11 @@ def surfels(options: argparse.Namespace, part: str = "surfels") -> None:
         "pooled, of the mean squared error, which the worst views decide; normals (mean angle, degrees), depth "
         "(median, metres) and silhouettes (intersection over union) of the mesh against the true one.\n\n"
     )
-    cells = [(key.split("|")[0], *(shown(r.get(name, "-")) for name in names)) for key, r in rows.items()]
+    cells = [(key.split("|")[0], *(formatted(r.get(name, "-")) for name in names)) for key, r in rows.items()]
     write_section(f"reconstruct-{part}", title, body + table(head, cells))
 
 
-def shown(value: Any) -> Any:
+def formatted(value: Any) -> Any:
     """Two decimals for decibels and degrees alike, four for small numbers."""
     return value if not isinstance(value, float) else f"{value:.4f}" if abs(value) < 1 else f"{value:.2f}"
 
@@ -198,9 +198,9 @@ def ablations(options: argparse.Namespace) -> None:
             continue
         training, row = trained(capture, replace(base, **change), None)
         row |= against_truth(training.gaussians, training, capture, options.capture)
-        rows = keep(ROWS / "ablations.json", name, row)
+        rows = store_row(ROWS / "ablations.json", name, row)
     cells = [
-        (name, *(shown(row[key]) for key in ("psnr", "ssim", "normal", "depth", "overlap", "cpu")))
+        (name, *(formatted(row[key]) for key in ("psnr", "ssim", "normal", "depth", "overlap", "cpu")))
         for name, row in rows.items()
     ]
     head = ("Stage (i)", "PSNR dB", "SSIM", "Normals deg", "Depth", "Silhouettes", "processor s")
@@ -215,7 +215,7 @@ def variants(options: argparse.Namespace) -> None:
     warm(capture)
     schedule = Schedule(iterations=options.iterations or 1500, surfels=10000)
     training, row = trained(capture, schedule, None)
-    rows = keep(ROWS / "variants.json", "P: free surfels", row)
+    rows = store_row(ROWS / "variants.json", "P: free surfels", row)
     mesh, _ = mesh_of(training.gaussians, capture, training.region)
     light = training.gaussians.light
     for name, fixed in (
@@ -229,8 +229,8 @@ def variants(options: argparse.Namespace) -> None:
         while not again.finished:
             again.step()
         result = {"surfels": len(attached), "cpu": processor_seconds() - begun} | judge(again.gaussians, capture)
-        rows = keep(ROWS / "variants.json", name, result)
-    cells = [(n, r["surfels"], *(shown(r[k]) for k in ("psnr", "ssim", "cpu"))) for n, r in rows.items()]
+        rows = store_row(ROWS / "variants.json", name, result)
+    cells = [(n, r["surfels"], *(formatted(r[k]) for k in ("psnr", "ssim", "cpu"))) for n, r in rows.items()]
     head = ("Variant", "Surfels", "PSNR dB", "SSIM", "processor s")
     body = f"{options.capture.name}, {schedule.iterations} steps, and {ON_MESH:g} of them again on the mesh.\n\n"
     write_section("reconstruct-variants", "Free surfels and surfels on the mesh", body + table(head, cells))

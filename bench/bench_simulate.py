@@ -33,7 +33,7 @@ from drgs_blender.simulation.job import PER_CELL, prepare
 from drgs_blender.simulation.settings import parse_settings
 from drgs_blender.simulation.solver import Solver
 
-HERE = Path(__file__).resolve().parent
+BENCH = Path(__file__).resolve().parent
 FRAME = 1 / 24
 
 
@@ -45,7 +45,7 @@ def clock(call) -> tuple[float, float]:  # type: ignore[no-untyped-def]
 
 
 def box_of(particles: int, material: str) -> Solver:
-    """A moving cube of about so many particles, 8 a cell, on a grid of 64 cells."""
+    """A moving cube of about `particles` particles, 8 per cell, on a grid of 64 cells."""
     side = (particles / 8) ** (1 / 3) / 64
     points = lattice((side,) * 3, 1 / 128) + 0.2
     velocity = 0.3 * np.sin(9 * points[:, [1, 2, 0]])
@@ -88,7 +88,7 @@ def in_taichi(python: Path, solver: Solver, dt: float, steps: int, threads: int,
     with tempfile.TemporaryDirectory() as folder:
         given, made = Path(folder) / "in.npz", Path(folder) / "out.npz"
         np.savez(given, **{k: a[order] for k, a in columns.items()}, **grid, gravity=solver.forces.gravity, dt=dt)
-        command = [python, HERE / "taichi_mpm.py", given, made, "--steps", steps, "--threads", threads]
+        command = [python, BENCH / "taichi_mpm.py", given, made, "--steps", steps, "--threads", threads]
         said = subprocess.run([*map(str, command), *how], check=True, capture_output=True, text=True).stdout
         back = np.argsort(order)
         with np.load(made) as found:

@@ -23,7 +23,7 @@ from pathlib import Path
 from bench_engine import first_frame, plane_asset
 from report import OUT, ROOT, table, write_section
 
-KEPT = OUT / "startup.json"
+RESULTS = OUT / "startup.json"
 #: What -> (hold, stretch), seconds.
 GOALS = {
     "all kernels, cold": (60, 35),
@@ -104,19 +104,19 @@ def _shipped(picture: list[object], cache: Path) -> float:
     return seconds
 
 
-def whole(command: str, folder: Path) -> float:
-    """Seconds of a command of tools/dev.py with an empty cache folder, the kernels of a release put aside."""
+def dev_command_seconds(command: str, folder: Path) -> float:
+    """Seconds of a command of tools/dev.py with an empty cache folder, without the kernels of a release."""
     shutil.rmtree(folder / "cache", ignore_errors=True)
     shutil.rmtree(ROOT / "out" / "demo", ignore_errors=True)
-    kernels, aside = ROOT / "drgs_blender/compute/kernels", ROOT / "build/kernels-aside"
-    aside.parent.mkdir(exist_ok=True)
+    kernels, hidden = ROOT / "drgs_blender/compute/kernels", ROOT / "build/kernels-hidden"
+    hidden.parent.mkdir(exist_ok=True)
     if kernels.is_dir():
-        kernels.replace(aside)
+        kernels.replace(hidden)
     try:
         return run([sys.executable, ROOT / "tools/dev.py", command], DRGS_CACHE_DIR=folder / "cache")
     finally:
-        if aside.is_dir():
-            aside.replace(kernels)
+        if hidden.is_dir():
+            hidden.replace(kernels)
 
 
 def clone(folder: Path) -> float:
@@ -136,23 +136,23 @@ def main() -> None:
     parser.add_argument("--ci", action="store_true", help="measure `.ci/run` of a clean clone as well")
     options = parser.parse_args()
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # else each start compiles all sources: users have them compiled
-    rows: dict[str, list[object]] = json.loads(KEPT.read_text()) if KEPT.exists() else {}
+    rows: dict[str, list[object]] = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
 
-    def keep(found: dict[str, float]) -> None:
+    def record(found: dict[str, float]) -> None:
         rows.update({what: [seconds, time.strftime("%Y-%m-%d")] for what, seconds in found.items()})
-        KEPT.parent.mkdir(parents=True, exist_ok=True)
-        KEPT.write_text(json.dumps(rows))
+        RESULTS.parent.mkdir(parents=True, exist_ok=True)
+        RESULTS.write_text(json.dumps(rows))
 
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         if not options.no_kernels:
-            keep(measure(folder, options.repeats) | {"repeats": options.repeats})
+            record(measure(folder, options.repeats) | {"repeats": options.repeats})
         if options.demo:
-            keep({"`make demo` after the environments, cold": whole("demo", folder)})
+            record({"`make demo` after the environments, cold": dev_command_seconds("demo", folder)})
         if options.tests:
-            keep({"`make test`, cold": whole("test", folder)})
+            record({"`make test`, cold": dev_command_seconds("test", folder)})
         if options.ci:
-            keep({"`.ci/run`, environments and cache cold": clone(folder)})
+            record({"`.ci/run`, environments and cache cold": clone(folder)})
     shown = [[what, *rows.get(what, ["not measured", ""]), *goals] for what, goals in GOALS.items()]
     repeats = int(str(rows["repeats"][0])) if "repeats" in rows else options.repeats  # of the run that measured them
     text = (

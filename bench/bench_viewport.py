@@ -25,7 +25,7 @@ import numpy as np
 from report import ROOT, table, write_section
 from subjects import SOURCES, asset_path
 
-HERE = Path(__file__).resolve().parent
+BENCH = Path(__file__).resolve().parent
 ENABLE = """
 import bpy
 bpy.ops.preferences.addon_enable(module='bl_ext.user_default.drgs')
@@ -86,7 +86,7 @@ def measure(command: list[str], asset: Path, screen: dict[str, str], repeats: in
             )
             window = [*command, "--gpu-backend", "opengl", "--window-geometry", "0", "0", "640", "360"]
             running = subprocess.Popen(
-                [*window, "--python", str(HERE / "viewport_job.py")], env=environment, stdout=out, stderr=out
+                [*window, "--python", str(BENCH / "viewport_job.py")], env=environment, stdout=out, stderr=out
             )
             try:
                 end = time.monotonic() + 900

@@ -31,7 +31,7 @@ H = 1 / 64
 
 
 def cube(particles: int) -> Solver:
-    """About so many particles of jelly, 8 a cell, that fall onto a floor."""
+    """A cube of about `particles` particles of jelly, 8 per cell, that falls onto a floor."""
     side = (particles / 8) ** (1 / 3) * H
     points = lattice((side,) * 3, H / 2) + 0.05
     floor = Plane((0, 0, 0), (0, 0, 1))
@@ -41,7 +41,7 @@ def cube(particles: int) -> Solver:
 
 
 def timed(solver: Solver, frames: int) -> tuple[float, float]:
-    """Seconds of the first frame, and the median of the others."""
+    """Seconds of the first frame, and the median of the following frames."""
     grid, seconds = solver.grid, []
     for _ in range(frames):
         began = time.perf_counter()

@@ -44,7 +44,7 @@ def learning(path: Path, size: int, steps: int, surfels: int, missing: str) -> s
     capture = photographs(path, size)
     region, schedule = find_region(capture), Schedule(iterations=steps, surfels=surfels)
 
-    def learned(schedule: Schedule, backend: LearningBackend) -> Training:
+    def train(schedule: Schedule, backend: LearningBackend) -> Training:
         training = Training(capture, region, schedule, backend=backend)
         while not training.finished:
             training.step()
@@ -54,8 +54,8 @@ def learning(path: Path, size: int, steps: int, surfels: int, missing: str) -> s
 
     def run(backend: LearningBackend, threads: int) -> list[str]:
         use_threads(threads)
-        learned(replace(schedule, iterations=FIRST), backend)
-        training = learned(schedule, backend)
+        train(replace(schedule, iterations=FIRST), backend)
+        training = train(schedule, backend)
         use_threads(0)
         found = judge(training.gaussians.on(CPU), capture)
         rate = f"{steps / training.clock.spent:.1f}"

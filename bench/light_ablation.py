@@ -49,7 +49,7 @@ VARIANTS: dict[str, Callable[[Frame], Frame]] = {
 }
 
 
-def standing(name: str, height: float, x: float, y: float, turn: float = 0.0, **materials: float) -> ObjectState:
+def on_ground(name: str, height: float, x: float, y: float, turn: float = 0.0, **materials: float) -> ObjectState:
     """An example on the ground, so tall, turned about the vertical by degrees; `materials` are the same all over."""
     key = SESSION.load_asset(asset_path(name, max_triangles=82000))
     vertices = SESSION.asset(key).mesh.vertices
@@ -85,11 +85,11 @@ def frame_of(
 
 def scenes(options: argparse.Namespace) -> dict[str, Frame]:
     """A polished object alone, and a composed scene."""
-    polished = standing("robot", 1.0, 0, 0, 25, roughness=0.1, metallic=1.0, albedo=0.9)
+    polished = on_ground("robot", 1.0, 0, 0, 25, roughness=0.1, metallic=1.0, albedo=0.9)
     several = [
-        standing("helmet", 0.6, 0.6, -0.3, 20),
-        standing("robot", 1.1, -0.25, 0.2, 20),
-        standing("spot", 0.5, 0.1, -0.7, 60, roughness=0.15, metallic=1.0, albedo=0.9),
+        on_ground("helmet", 0.6, 0.6, -0.3, 20),
+        on_ground("robot", 1.1, -0.25, 0.2, 20),
+        on_ground("spot", 0.5, 0.1, -0.7, 60, roughness=0.15, metallic=1.0, albedo=0.9),
     ]
     return {
         "one object": frame_of([polished], [], "forest", 20, options),

@@ -186,7 +186,7 @@ def rays_of(stage: Stage, rng: np.random.Generator) -> tuple[list[tuple[Array, A
     for count, draw in (
         (by_cosine, lambda i: cosine(points.normal[i], rng)),
         (by_ggx, lambda i: ggx(points.normal[i], points.view[i], points.roughness[i], rng)),
-        (by_light, lambda i: stage.light.sample(whole(len(i), rng), points.normal[i])[0]),
+        (by_light, lambda i: stage.light.sample(uint32_numbers(len(i), rng), points.normal[i])[0]),
     ):
         of = np.repeat(
             np.arange(len(points)), np.floor(count / settings.subpixel_samples + rng.random(len(points))).astype(int)
@@ -204,7 +204,7 @@ def rays_of(stage: Stage, rng: np.random.Generator) -> tuple[list[tuple[Array, A
     normal *= -np.sign((normal * first[1][met]).sum(axis=1, keepdims=True))
     hit = first[0][met] + t[met, None] * first[1][met]
     hit += (1e-5 * np.abs(hit).max(axis=1) + 2e-6 * scene.extent)[:, None] * normal
-    towards = [stage.light.sample(whole(len(met), rng), normal)[0], cosine(normal, rng)]
+    towards = [stage.light.sample(uint32_numbers(len(met), rng), normal)[0], cosine(normal, rng)]
     good = [above(d, normal) for d in towards]
     shadow = (
         np.concatenate([hit[g] for g in good]).astype(np.float32),
@@ -213,7 +213,7 @@ def rays_of(stage: Stage, rng: np.random.Generator) -> tuple[list[tuple[Array, A
     return [camera, first], shadow
 
 
-def whole(count: int, rng: np.random.Generator) -> Array:
+def uint32_numbers(count: int, rng: np.random.Generator) -> Array:
     """(count, 3) random numbers as light sampling takes them."""
     return rng.integers(0, 2**32, (count, 3), dtype=np.uint32)
 

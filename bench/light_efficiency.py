@@ -12,10 +12,9 @@ import numpy as np
 from judge import frame_camera, psnr
 from light_cases import BOUNCES, Case, Reference
 from report import OUT, ROOT, table
-from subjects import spread_materials
+from subjects import source_digest, spread_materials
 
 from drgs_blender.build.make import make_asset
-from drgs_blender.compute.jit import source_digest
 from drgs_blender.core.asset import Asset, Mesh
 from drgs_blender.core.asset.container import read_asset, write_asset
 

@@ -27,8 +27,10 @@ def relight(asset: Path, environment: Path | np.ndarray, camera: dict[str, Any],
     return SESSION.render(frame_of(asset, environment, camera, **more))
 
 
-def look(asset: Path, environment: Path | np.ndarray, camera: dict[str, Any], **more: Any) -> dict[str, np.ndarray]:
-    """The same, as a viewport's first picture."""
+def first_view(
+    asset: Path, environment: Path | np.ndarray, camera: dict[str, Any], **more: Any
+) -> dict[str, np.ndarray]:
+    """Passes of one object under one HDRI, as in the first picture of a viewport."""
     return SESSION.view("bench", frame_of(asset, environment, camera, **more))
 
 

@@ -59,7 +59,7 @@ def command_line() -> str:
     return " ".join(["python", f"bench/{Path(sys.argv[0]).name}", *words])
 
 
-def keep(file: Path, name: str, value: Any) -> dict[str, Any]:
+def store_row(file: Path, name: str, value: Any) -> dict[str, Any]:
     """Put what was measured to what `file` holds of earlier runs; all of it."""
     file.parent.mkdir(parents=True, exist_ok=True)
     rows: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {}

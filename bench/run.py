@@ -11,7 +11,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-HERE = Path(__file__).resolve().parent
+BENCH = Path(__file__).resolve().parent
 
 
 def run(program: Path, options: list[str]) -> int:
@@ -19,7 +19,7 @@ def run(program: Path, options: list[str]) -> int:
 
 
 def main() -> int:
-    programs = {p.stem.removeprefix("bench_"): p for p in sorted(HERE.glob("bench_*.py"))}
+    programs = {p.stem.removeprefix("bench_"): p for p in sorted(BENCH.glob("bench_*.py"))}
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"{', '.join(programs)}; all by default")
     chosen, options = parser.parse_known_args()
