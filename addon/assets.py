@@ -28,7 +28,7 @@ def is_drgs(obj: bpy.types.Object | None) -> bool:
 
 
 def collection(context: bpy.types.Context) -> bpy.types.Collection:
-    """Where new objects go: the active collection, or the scene's own where that one is of a library.
+    """The collection for new objects: the active one, or the scene's own where that one is of a library.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Any mesh with faces carries an object: what Surface Deform refuses, by Geometry Nodes.
+"""Cage deformation by Geometry Nodes, for cages that Surface Deform refuses: any mesh with faces.
 
 Each vertex keeps its place in the frames of the nearest faces (two edges and the normal) and goes to the mean of where
 they bring it: values and gradients blended, as by generalised moving least squares (Martin et al. 2010). A cage that is
@@ -50,7 +50,7 @@ def carry(obj: bpy.types.Object, cage: bpy.types.Object, modifier: bpy.types.Mod
 
 
 def frames(points: Array, vertices: Array, triangles: Array) -> tuple[Array, Array, Array]:
-    """Where points are in the frames of the nearest faces of a cage, times the share that each face has in them.
+    """Coordinates of points in the frames of the nearest faces of a cage, times each face's weight.
 
     Parameters
     ----------

@@ -102,7 +102,7 @@ def clear(scene: bpy.types.Scene) -> bool:
 
 
 def differences(partner: bpy.types.Scene) -> list[str]:
-    """What of the scene below has changed since the partner was made, and is not shared by both."""
+    """Settings of the background scene that have changed since the partner was made, and are not shared by both."""
     below = partner.drgs.background_scene
     kinds = (
         (_drgs(below), [o for c in partner.collection.children if c.name.startswith(RENDERED) for o in c.objects]),

@@ -73,12 +73,12 @@ def pinned(source: Path = SOURCE) -> tuple[str, ...]:
 
 
 def interpreter(folder: Path) -> Path:
-    """Where the Python of the environment `folder` is, or will be."""
+    """Path of the Python of the environment `folder`, also before it exists."""
     return folder / ("Scripts/python.exe" if _WINDOWS else "bin/python")
 
 
 def state(folder: Path, source: Path = SOURCE) -> str:
-    """What `folder` is: "absent", "partial" (a set-up was not finished), "old" (of another version), or "ready"."""
+    """State of `folder`: "absent", "partial" (a set-up was not finished), "old" (of another version), or "ready"."""
     if not alive(folder):
         return "partial" if folder.is_dir() and any(folder.iterdir()) else "absent"
     sources = read_stamp(folder).get("sources")
@@ -93,7 +93,7 @@ def needs_network(folder: Path, source: Path = SOURCE, group: Group = ENGINE) ->
 
 
 def entry(group: Group) -> str:
-    """Where the stamp keeps what was installed of a group."""
+    """Key of the stamp for the installed packages of a group."""
     return group.extra or "packages"
 
 
@@ -125,7 +125,7 @@ def write_stamp(folder: Path, **entries: object) -> None:
 
 
 def site_packages(folder: Path) -> Path:
-    """Where the packages of the environment `folder` are; FileNotFoundError where there is no such place."""
+    """Folder of the packages of the environment `folder`; FileNotFoundError where there is none."""
     if _WINDOWS:
         return folder / "Lib" / "site-packages"
     found = sorted((folder / "lib").glob("python3*/site-packages"))

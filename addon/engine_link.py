@@ -98,7 +98,7 @@ def lacks_reconstruction() -> bool:
 
 
 def problem() -> str:
-    """What is wrong with the engine's place, "" when it is there. Starts nothing."""
+    """Problem with the location of the engine, "" when it is there. Starts nothing."""
     try:
         command_line()
     except DeviceError as error:

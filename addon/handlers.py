@@ -10,7 +10,7 @@ from .export import images
 
 @bpy.app.handlers.persistent
 def forget_everything(*_: object) -> None:
-    """Nothing of the last file may be seen in the next."""
+    """Drop the state of the last file, so that nothing of it is seen in the next."""
     assets.forget()
     images.forget()
     messages.history.clear()

@@ -1,4 +1,4 @@
-"""What the user should know, kept for the panel: warnings and errors of exports, renders and the engine.
+"""Messages for the user, shown by the panel: warnings and errors of exports, renders and the engine.
 
 Plain data, so that it may be written from the render thread and drawn from the interface.
 """

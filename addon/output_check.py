@@ -26,7 +26,7 @@ class ExpectedFiles:
         return list(self._before)
 
     def missing(self) -> list[Path]:
-        """Those that were not written."""
+        """The files that were not written."""
         return [path for path, before in self._before.items() if _stamp(path) in (None, before)]
 
 

@@ -1,4 +1,4 @@
-"""Settings as their own limits allow them: files of another version, and scripts, may hold anything."""
+"""Settings clamped to their limits: files of other versions, and scripts, may hold any value."""
 
 from __future__ import annotations
 

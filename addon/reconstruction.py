@@ -12,7 +12,7 @@ _LINE = re.compile(r'DRGS_PROGRESS part=([\d.]+) surfels=(\d+) (?:psnr=(-?[\d.]+
 
 
 class Reconstruction:
-    """What is known of a run of ``drgs reconstruct``.
+    """Progress of a run of ``drgs reconstruct``.
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ class Reconstruction:
         self._shown = 0
 
     def follow(self, output: str) -> None:
-        """Take in what the program has said so far."""
+        """Update the progress from all output of the program so far."""
         found = _LINE.findall(output)
         if found:
             part, surfels, psnr, phase = found[-1]

@@ -25,7 +25,7 @@ def label(render_pass: Pass) -> str:
 
 
 def blender_name(render_pass: Pass) -> str:
-    """What this Blender calls a pass."""
+    """Name of a pass in this Blender."""
     return label(render_pass) if bpy.app.version >= (5, 0, 0) else render_pass.name
 
 

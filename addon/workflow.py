@@ -1,4 +1,4 @@
-"""What lies between a file and a picture, what of it is done, and what comes next."""
+"""The workflow: steps from a file to a picture, which are done, and which is next."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def target(context: bpy.types.Context) -> bpy.types.Object | None:
 
 
 def poser_of(obj: bpy.types.Object) -> bpy.types.Object | None:
-    """What bends a DR-GS object: armature, lattice or cage, in this order."""
+    """The object that deforms a DR-GS object: armature, lattice or cage, in this order."""
     moved_by = {m.type: m.target if m.type == "SURFACE_DEFORM" else m.object for m in obj.modifiers if m.type in BENDS}
     carriers = (*(moved_by.get(kind) for kind in BENDS), *map(cage_nodes.cage_of, obj.modifiers))
     return next((found for found in carriers if found is not None), None)

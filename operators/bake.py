@@ -89,7 +89,7 @@ class DRGS_OT_bake_light(CommandOperator, selection.ObjectMode, bpy.types.Operat
             for name in map(self._attribute_name, self._frames):
                 check_name(name, objects)
         self._names = tuple(obj.name for obj in objects)
-        self._check_places(objects)
+        self._check_targets(objects)
         with self.folder("drgs-bake-") as folder:
             scenes = str(folder / f"{_NUMBER}{SUFFIX}")
             arguments = ["bake", scenes, "--samples", str(self.samples), "--light", self.light]
@@ -102,7 +102,7 @@ class DRGS_OT_bake_light(CommandOperator, selection.ObjectMode, bpy.types.Operat
                 write_frame_file(frame_path(scenes, number), frame)
             files = []
             for i, obj in enumerate(objects):
-                place = self._place(context, i, obj)
+                place = self._target_of(context, i, obj)
                 arguments += ["--object", obj.name, *place]
                 files += [frame_path(place[0], number) for number in self._frames]
         return self.start(context, arguments, "Light", "Baking light", "could not be baked", files)
@@ -154,12 +154,12 @@ class DRGS_OT_bake_light(CommandOperator, selection.ObjectMode, bpy.types.Operat
         clean = re.sub(r"[^\w.-]+", "_", obj.name)
         return str(Path(bpy.path.abspath(self.directory)) / f"{clean}_{_NUMBER}.exr")
 
-    def _check_places(self, objects: list[bpy.types.Object]) -> None:
+    def _check_targets(self, objects: list[bpy.types.Object]) -> None:
         """Refuse objects of which one would get the light of another."""
-        taken: dict[object, bpy.types.Object] = {}
+        targets: dict[object, bpy.types.Object] = {}
         for obj in objects:
             # Some file systems are case-insensitive.
-            other = taken.setdefault(self._image(obj).casefold() if self.target == "IMAGE" else obj.data, obj)
+            other = targets.setdefault(self._image(obj).casefold() if self.target == "IMAGE" else obj.data, obj)
             if other is obj:
                 continue
             if self.target == "IMAGE":
@@ -169,7 +169,7 @@ class DRGS_OT_bake_light(CommandOperator, selection.ObjectMode, bpy.types.Operat
                 remedy = "Choose Object > Relations > Make Single User, or bake to images"
             raise UsageError(f'Objects "{other.name}" and "{obj.name}"', problem, remedy)
 
-    def _place(self, context: bpy.types.Context, index: int, obj: bpy.types.Object) -> list[str]:
+    def _target_of(self, context: bpy.types.Context, index: int, obj: bpy.types.Object) -> list[str]:
         """Where the program writes the light of an object, and the UV map where that is an image."""
         if self.target == "ATTRIBUTE":
             return [self._attribute(index)]

@@ -34,7 +34,7 @@ class CommandOperator(DrgsOperator):
     _folder: Path | None = None
 
     def done(self, context: bpy.types.Context) -> set[str]:
-        """What follows the work; returns what execute returns."""
+        """Called after the program has succeeded; returns what execute returns."""
         return {"FINISHED"}
 
     def state(self, output: str) -> str:

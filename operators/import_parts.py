@@ -82,13 +82,13 @@ class DRGS_OT_import_parts(CommandOperator, bpy.types.Operator):
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         try:
-            self._take_dropped()
+            self._assign_dropped_files()
         except UsageError as error:
             return self.fail(error)
         return context.window_manager.invoke_props_dialog(self, width=420)
 
     def run(self, context: bpy.types.Context) -> set[str]:
-        self._take_dropped()
+        self._assign_dropped_files()
         arguments = self._arguments()
         name = Path(self.surfels or self.mesh).name
         status = f"Making {self._target.name}"
@@ -101,7 +101,7 @@ class DRGS_OT_import_parts(CommandOperator, bpy.types.Operator):
             sequences.play(objects, list(self._frames), stem.rstrip("#_-. ") or stem)
         return {"FINISHED"}
 
-    def _take_dropped(self) -> None:
+    def _assign_dropped_files(self) -> None:
         """Files that were dropped, each where it belongs; what was dropped before does not stay."""
         paths = [Path(self.directory) / f.name for f in self.files if f.name]
         paths = paths or ([Path(self.filepath)] if self.filepath else [])
@@ -119,7 +119,7 @@ class DRGS_OT_import_parts(CommandOperator, bpy.types.Operator):
         """The assets to write."""
         return [frame_path(str(self._target), frame) for frame in self._frames] or [self._target]
 
-    def _take_target(self) -> None:
+    def _choose_target(self) -> None:
         """Find where to write: never over the asset of an object."""
         target = Path(bpy.path.abspath(self.out or self.surfels or self.mesh)).with_suffix(".drgs")
         if self._frames and "#" not in target.name:
@@ -135,7 +135,7 @@ class DRGS_OT_import_parts(CommandOperator, bpy.types.Operator):
             raise UsageError("Import", "neither surfels nor a mesh are given", "Choose at least one file")
         arguments = ["import", surfels] if surfels else ["make", mesh]
         self._frames = tuple(frames_of(surfels)) if "#" in Path(surfels).name else ()
-        self._take_target()
+        self._choose_target()
         if self._frames:
             arguments += ["--frames", ",".join(map(str, self._frames))]
         if surfels and mesh:
@@ -158,7 +158,7 @@ class DRGS_OT_import_parts(CommandOperator, bpy.types.Operator):
 
 
 def kind_of(path: Path) -> str:
-    """What a file is taken for: "surfels", "mesh" or "environment". Whether it can be read, the engine says."""
+    """Kind of a file by its name and header: "surfels", "mesh" or "environment". The engine checks the rest."""
     suffix = path.suffix.lower()
     kinds = [t.kind for t in READ.values() if suffix in t.extensions]
     if suffix not in SPLATS:

@@ -26,7 +26,7 @@ def _all(*value: float) -> Change:
 
 
 class Preset(NamedTuple):
-    """What becomes of the channels that it names; albedo is linear Rec.709."""
+    """Material preset: values of the channels that it names; albedo is linear Rec.709."""
 
     label: str
     about: str

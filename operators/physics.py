@@ -48,7 +48,7 @@ class _JobOperator(DrgsOperator):
 
     @classmethod
     def objects(cls, context: bpy.types.Context) -> list[bpy.types.Object]:
-        """Those to simulate."""
+        """The objects to simulate."""
         return [context.object]
 
     @classmethod
@@ -84,18 +84,18 @@ class _JobOperator(DrgsOperator):
         try:
             going = True
             while going:
-                self.guard(self._whole, context)
+                self.guard(self._run_blocking, context)
                 going = self._next(context)
         finally:
             self.cancel(context)
         return self._result()
 
-    def _whole(self, context: bpy.types.Context) -> set[str]:
+    def _run_blocking(self, context: bpy.types.Context) -> set[str]:
         """Run the present job, and wait for it."""
         try:
             while not self._job.step():
                 time.sleep(_SHARE)
-            return self._tell(context)
+            return self._report_done(context)
         finally:
             self._job.close()
 
@@ -107,11 +107,11 @@ class _JobOperator(DrgsOperator):
                 continue
             bake_job.waiting.discard(key)
             obj = bake_job.object_of(key)
-            if obj is not None and self.guard(partial(self._take_up, obj), context) == {"RUNNING_MODAL"}:
+            if obj is not None and self.guard(partial(self._begin_job, obj), context) == {"RUNNING_MODAL"}:
                 return True
         return False
 
-    def _take_up(self, obj: bpy.types.Object, context: bpy.types.Context) -> set[str]:
+    def _begin_job(self, obj: bpy.types.Object, context: bpy.types.Context) -> set[str]:
         self._job = self.begin(obj, context.scene)
         return {"RUNNING_MODAL"}
 
@@ -140,7 +140,7 @@ class _JobOperator(DrgsOperator):
     def _part(self, context: bpy.types.Context) -> set[str]:
         """Go on with the present job for a moment."""
         if self._job.step(_SHARE):
-            return self._tell(context)
+            return self._report_done(context)
         context.workspace.status_text_set(f"{self._job.subject}: {self._job.progress()[1]}. Esc cancels")
         _redraw(context, "PROPERTIES")
         return {"PASS_THROUGH"}
@@ -156,7 +156,7 @@ class _JobOperator(DrgsOperator):
         bake_job.waiting.difference_update(self._queue)
         self._queue.clear()
 
-    def _tell(self, context: bpy.types.Context) -> set[str]:
+    def _report_done(self, context: bpy.types.Context) -> set[str]:
         text = self.done(context)
         messages.note("INFO", text)
         self.report({"INFO"}, text)

@@ -86,7 +86,7 @@ def message_log() -> str:
 
 
 def report(context: bpy.types.Context) -> str:
-    """What a developer wants to know; takes a second or two."""
+    """Report of the installation for developers; takes a second or two."""
     scene, settings = context.scene, context.scene.drgs
     parts = {
         "Program": f"DR-GS {__version__}, Blender {bpy.app.version_string}, {platform.platform()}",
@@ -100,7 +100,7 @@ def report(context: bpy.types.Context) -> str:
 
 
 def values(group: bpy.types.PropertyGroup, prefix: str = "") -> list[str]:
-    """What is set in a group and in those inside it, a line each."""
+    """Values of a property group and its nested groups, one line each."""
     lines = []
     for prop in group.bl_rna.properties:
         if prop.identifier in ("rna_type", "name"):

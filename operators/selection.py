@@ -1,4 +1,4 @@
-"""What operators work on: the selected DR-GS objects that may be changed."""
+"""The objects that operators work on: selected DR-GS objects that may be changed."""
 
 from __future__ import annotations
 
@@ -125,5 +125,5 @@ def select_only(context: bpy.types.Context, objects: Iterable[bpy.types.Object],
 
 
 def of_type(objects: Iterable[bpy.types.Object], kind: str) -> Iterator[bpy.types.Object]:
-    """Those of `objects` that are of a type and no DR-GS objects."""
+    """The `objects` of a type that are no DR-GS objects."""
     return (o for o in objects if o.type == kind and not assets.is_drgs(o))

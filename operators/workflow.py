@@ -81,15 +81,15 @@ class DRGS_OT_add_camera(DrgsOperator, bpy.types.Operator):
         context.scene.camera = camera
         view = context.region_data if context.area is not None and context.area.type == "VIEW_3D" else None
         if view is not None:
-            camera.matrix_world = standing(view)
+            camera.matrix_world = viewpoint(view)
         else:
             objects = [o for o in context.scene.objects if assets.is_drgs(o)]
             frame(context, camera, objects)
         return {"FINISHED"}
 
 
-def standing(view: bpy.types.RegionView3D) -> Matrix:
-    """Where a viewport looks from; Blender has orthographic ones stand in what they look at."""
+def viewpoint(view: bpy.types.RegionView3D) -> Matrix:
+    """Camera-to-world matrix of a viewport; Blender has orthographic ones stand in what they look at."""
     back = view.view_distance if view.view_perspective == "ORTHO" else 0.0
     return view.view_matrix.inverted() @ Matrix.Translation((0, 0, back))
 

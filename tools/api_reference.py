@@ -289,7 +289,7 @@ class Writer:
         return None
 
     def origin(self, path: str) -> str:
-        """Where that is defined which a package gives under another path, too."""
+        """Definition of an object that a package re-exports."""
         name = path.removeprefix(self.tree.path + ".")
         try:
             member = self.tree[name] if name != path else None

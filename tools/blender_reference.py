@@ -116,7 +116,7 @@ def properties(rna: Any) -> list[Any]:
     return [p for p in added if p.description.strip() or not p.is_hidden]
 
 
-def lacking(package: str = PACKAGE) -> list[str]:
+def undescribed(package: str = PACKAGE) -> list[str]:
     """Names of operators and properties without a description.
 
     Parameters
@@ -156,7 +156,7 @@ def pages(package: str = PACKAGE) -> dict[str, str]:
     ReferenceIncomplete
         Something has no description.
     """
-    if missing := lacking(package):
+    if missing := undescribed(package):
         raise ReferenceIncomplete(f"without a description: {', '.join(missing)}. Give each one where it is defined")
     return {"operators.md": operators_page(package), "properties.md": properties_page(package), "index.md": INDEX}
 
@@ -259,7 +259,7 @@ def number(value: Any) -> str:
 
 
 def extent(p: Any) -> str:
-    """What a number may be; the range of its slider, where that is narrower."""
+    """Limits of a number; the range of its slider, where that is narrower."""
     if p.type not in ("INT", "FLOAT"):
         return ""
     hard, soft = limits(p.hard_min, p.hard_max), limits(p.soft_min, p.soft_max)

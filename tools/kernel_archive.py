@@ -30,7 +30,7 @@ versions = {"numba": numba.__version__, "llvmlite": llvmlite.__version__}
 print(json.dumps([sys.implementation.cache_tag, closure.shipped_index(), versions]))
 """
 #: What is still to be compiled, and what cannot be.
-_LACKING = """
+_NOT_COMPILED = """
 import json, sys
 from drgs_blender.compute import manifest, prepare
 kernels = manifest.needed(sys.argv[1:])
@@ -128,7 +128,7 @@ def _compile(python: str, source: Path, folder: Path, target: dict[str, str], jo
     if subprocess.run(command, env=environment, cwd=source, timeout=3600).returncode:
         raise BuildError("compiling failed; its message is above")
     answer = subprocess.run(
-        [python, "-c", _LACKING, *jobs], env=environment, cwd=source, timeout=600, capture_output=True, text=True
+        [python, "-c", _NOT_COMPILED, *jobs], env=environment, cwd=source, timeout=600, capture_output=True, text=True
     )
     if answer.returncode:
         raise BuildError(f"cannot be checked: {answer.stderr.strip()[-500:]}")

@@ -63,13 +63,13 @@ class Step:
     before: Callable[[], object] = lambda: None
     #: What is known while it runs.
     process: subprocess.Popen[bytes] | None = None
-    said: str = ""
+    status: str = ""
     part: float = 0.0
     began: float = 0.0
     took: float = 0.0
     tail: deque[str] = field(default_factory=lambda: deque(maxlen=_LINES))
     thread: threading.Thread | None = None
-    taken: str = ""  # digest of `of` at its start
+    stamp: str = ""  # digest of `of` at its start
 
 
 def counted(line: str) -> tuple[str, float] | None:
@@ -98,8 +98,8 @@ def run_steps(
         After all commands were ended.
     """
     log.parent.mkdir(parents=True, exist_ok=True)
-    with open(log, "w", encoding="utf-8") as kept:
-        return _Run(steps, log, folder, environment, kept, Line(stream or sys.stdout)).whole()
+    with open(log, "w", encoding="utf-8") as log_file:
+        return _Run(steps, log, folder, environment, log_file, Line(stream or sys.stdout)).whole()
 
 
 class Line:
@@ -135,10 +135,10 @@ class Line:
 
 class _Run:
     def __init__(
-        self, steps: Sequence[Step], log: Path, folder: Path, environment: dict[str, str], kept: IO[str], line: Line
+        self, steps: Sequence[Step], log: Path, folder: Path, environment: dict[str, str], log_file: IO[str], line: Line
     ) -> None:
         self._steps, self._log, self._folder = list(steps), log, folder
-        self._environment, self._kept, self._line = os.environ | environment, kept, line
+        self._environment, self._log_file, self._line = os.environ | environment, log_file, line
         self._lock = threading.Lock()
         self._done: set[str] = set()
         self._changed = threading.Event()
@@ -172,15 +172,15 @@ class _Run:
         """Start a step; whether there was something to do."""
         command = [str(part) for part in step.command]
         if step.makes is not None:
-            step.taken = digest(step.of, command)
-            if step.makes.is_file() and _stamp(step.makes) == step.taken:
+            step.stamp = digest(step.of, command)
+            if step.makes.is_file() and _stamp(step.makes) == step.stamp:
                 self._write(step, f"{step.makes} is up to date")
                 self._done.add(step.name)
                 return False
             _stamp_file(step.makes).unlink(missing_ok=True)
         step.before()
         self._write(step, "$ " + " ".join(command))
-        step.said, step.began = step.text, time.monotonic()
+        step.status, step.began = step.text, time.monotonic()
         try:
             step.process = subprocess.Popen(
                 command,
@@ -206,15 +206,15 @@ class _Run:
                 if line:
                     step.tail.append(line)
                 if found := step.count(line):
-                    step.said, step.part = found
+                    step.status, step.part = found
                     self._changed.set()
         step.process.wait()
         self._changed.set()
 
     def _write(self, step: Step, line: str) -> None:
         with self._lock:
-            self._kept.write(f"{time.monotonic() - self._began:7.1f} {step.name}: {line}\n")
-            self._kept.flush()
+            self._log_file.write(f"{time.monotonic() - self._began:7.1f} {step.name}: {line}\n")
+            self._log_file.flush()
 
     def _collect(self) -> None:
         """Take note of what has ended."""
@@ -226,18 +226,18 @@ class _Run:
             if step.process.returncode:
                 self._line.clear()
                 command = " ".join(str(part) for part in step.command)
-                said = "\n".join(f"    {line}" for line in step.tail)
+                status = "\n".join(f"    {line}" for line in step.tail)
                 raise StepFailed(
-                    f"{step.text} failed ({step.process.returncode}): {command}\n{said}\nAll of it: {self._log}"
+                    f"{step.text} failed ({step.process.returncode}): {command}\n{status}\nAll of it: {self._log}"
                 )
             if step.makes is not None:
-                _stamp_file(step.makes).write_text(json.dumps({"of": step.taken}), encoding="utf-8")
+                _stamp_file(step.makes).write_text(json.dumps({"of": step.stamp}), encoding="utf-8")
             step.took = time.monotonic() - step.began
             self._done.add(step.name)
 
     def _show(self) -> None:
         running = [s for s in self._steps if s.process is not None and s.name not in self._done]
-        text = f"{len(self._done)} of {len(self._steps)} done. {', '.join(s.said for s in running)}"
+        text = f"{len(self._done)} of {len(self._steps)} done. {', '.join(s.status for s in running)}"
         self._line.show(text, self._left())
 
     def _left(self) -> str:
@@ -301,7 +301,7 @@ _PRODUCTS = {"__pycache__", "kernels"}
 
 
 def digest(files: Iterable[Path], command: Sequence[str]) -> str:
-    """What changes when one of `files`, of all files in those that are folders, or the command does."""
+    """Digest of `files`, of all files in those that are folders, and of the command."""
     found = hashlib.sha256("\0".join(command).encode())
     for top in files:
         for path in sorted(p for p in top.rglob("*") if not _PRODUCTS.intersection(p.parts)) if top.is_dir() else [top]:

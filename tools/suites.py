@@ -66,7 +66,7 @@ class Suite:
 
 @dataclass
 class Plan:
-    """What one command runs.
+    """The plan of one command: suites, files, options.
 
     Attributes
     ----------
@@ -264,7 +264,7 @@ def suite_jobs(name: str, suite: Suite, plan: Plan, python: Path, root: Path, fo
 
 
 def lonely(files: Iterable[str], root: Path) -> list[str]:
-    """Those of the files (and files in the folders) that hold tests marked ``alone``: others need not be imported."""
+    """Files (also in the folders) that hold tests marked ``alone``: others need not be imported."""
     found = []
     for file in files:
         path = root / file.split("::")[0]
@@ -279,7 +279,7 @@ def lonely(files: Iterable[str], root: Path) -> list[str]:
 def jobs(
     plan: Plan, suites: Mapping[str, Suite], python_of: Mapping[str, Callable[[], Path]], root: Path, folder: Path
 ) -> list[Job]:
-    """What a plan runs; makes the environments that it needs.
+    """Jobs of a plan; makes the environments that it needs.
 
     Parameters
     ----------
@@ -323,16 +323,16 @@ class Runner:
         Folder that programs start in.
     environment : mapping of str to str
         Their variables.
-    many : int
+    workers : int
         Jobs at a time.
     """
 
-    def __init__(self, root: Path, environment: Mapping[str, str], many: int) -> None:
-        self.root, self.environment, self.many = root, dict(environment), many
+    def __init__(self, root: Path, environment: Mapping[str, str], workers: int) -> None:
+        self.root, self.environment, self.workers = root, dict(environment), workers
         #: Title -> exit codes of its commands.
         self.codes: dict[str, list[int]] = {}
         self._processes: list[subprocess.Popen] = []
-        self._said = time.monotonic()
+        self._last_report = time.monotonic()
         self._line = 0
 
     def run(self, all_jobs: Sequence[Job]) -> None:
@@ -347,7 +347,7 @@ class Runner:
             while waiting or running:
                 for job in list(waiting):
                     ready = not (job.after in titles and job.after not in self.codes)
-                    room = not running if job.alone else len(running) < self.many
+                    room = not running if job.alone else len(running) < self.workers
                     if any(other.job.alone for other in running) or not (ready and room):
                         continue
                     if job.alone and any(not other.alone for other in waiting):
@@ -411,9 +411,9 @@ class Runner:
 
     def _progress(self, running: Sequence[_Running]) -> None:
         terminal, now = sys.stdout.isatty(), time.monotonic()
-        if not running or now - self._said < (1 if terminal else PROGRESS_SECONDS):
+        if not running or now - self._last_report < (1 if terminal else PROGRESS_SECONDS):
             return
-        self._said = now
+        self._last_report = now
         line = "   ".join(f"{item.job.title} {item.far()}" for item in running)
         if terminal:
             line = line[: shutil.get_terminal_size().columns - 1]
@@ -461,7 +461,7 @@ class _Running:
         return True
 
     def far(self) -> str:
-        """How far it is, as pytest says, else how long it has been running."""
+        """Progress as pytest reports it, else the time it has been running."""
         with contextlib.suppress(OSError), self.job.log.open("rb") as log:
             log.seek(max(0, self.job.log.stat().st_size - 4000))
             if found := re.findall(rb"\[ *(\d+%)\]", log.read()):
@@ -555,7 +555,7 @@ def run(
     all_jobs = jobs(plan, suites, python_of, root, folder)
     if not all_jobs:
         raise Failure(f"none of the suites {', '.join(plan.suites)} holds {', '.join(plan.files)}")
-    runner = Runner(root, bytecode_kept(environment, build), workers())
+    runner = Runner(root, bytecode_folder(environment, build), workers())
     began = time.monotonic()
     runner.run(all_jobs)
     report, wrong, left = Report(), [], 0
@@ -595,13 +595,13 @@ def summed_up(
 
 
 def left_out(report: Path) -> int:
-    """How many slow tests were left out of those that fit, which tests/pace.py writes beside the report."""
+    """Number of matching slow tests that were left out, which tests/pace.py writes beside the report."""
     with contextlib.suppress(OSError, ValueError):
         return int(report.with_suffix(".left").read_text(encoding="utf-8"))
     return 0
 
 
-def bytecode_kept(environment: Mapping[str, str], build: Path) -> dict[str, str]:
+def bytecode_folder(environment: Mapping[str, str], build: Path) -> dict[str, str]:
     """Variables with which compiled tests are kept in ``build``, also where PYTHONDONTWRITEBYTECODE is set.
 
     To rewrite the assertions of all tests takes longer than to run many of them.

@@ -1,4 +1,4 @@
-"""An evaluated scene -> the Frame the engine renders."""
+"""Export: the evaluated depsgraph to the `Frame` that the engine renders; materials, lights, world, camera, meshes."""
 
 from .frame import export_frame
 

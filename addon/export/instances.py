@@ -1,4 +1,4 @@
-"""What the view layer shows: every visible surface and light, instances included, and which rays meet it."""
+"""Visible objects of the view layer: surfaces and lights, instances included, with their ray visibility."""
 
 from __future__ import annotations
 

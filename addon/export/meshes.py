@@ -93,7 +93,7 @@ class Meshes:
         return found
 
     def keys(self) -> list[list[Key]]:
-        """Which instance each place of each of `states` is."""
+        """Instance keys of each of `states`, one per matrix."""
         return [shape.keys for shape in self._shapes.values() if shape.state is not None]
 
     def _arrays(self, obj: bpy.types.Object) -> _Arrays:

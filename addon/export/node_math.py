@@ -1,4 +1,4 @@
-"""What shader nodes compute, on arrays: blends, operations, colour systems, physics. No bpy."""
+"""Math of shader nodes on arrays: blends, operations, colour systems, physics. No bpy."""
 
 from __future__ import annotations
 
@@ -114,6 +114,6 @@ def blackbody(kelvin: float) -> Array:
 
 
 def reflectance(ior: float) -> float:
-    """Of a dielectric in air, seen from the front; below 0 as at 0, where there is nothing to enter."""
+    """Fresnel reflectance of a dielectric in air at normal incidence; below 0 as at 0."""
     ior = max(ior, 0.0)
     return ((ior - 1) / (ior + 1)) ** 2

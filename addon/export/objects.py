@@ -80,7 +80,7 @@ def _shape(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, key_of: KeyOf,
 
 
 def appearance_of(obj: bpy.types.Object, asset: Asset, warn: Warn) -> tuple[dict[str, np.ndarray], Adjustment | None]:
-    """What an evaluated object in Object Mode has painted, where it differs from its asset, and its adjustments.
+    """Painted channels of an evaluated object in Object Mode that differ from its asset, and its adjustments.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What a socket of a shader node holds: a colour, or a colour times a texture."""
+"""Value of a shader node's socket: a colour, or a colour times a texture."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Paint:
 
 
 def uniform(value: Array | float) -> Paint:
-    """Without texture."""
+    """Paint of one value everywhere, without texture."""
     return Paint(np.broadcast_to(np.asarray(value, np.float64), (3,)).copy())
 
 

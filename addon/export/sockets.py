@@ -1,4 +1,4 @@
-"""Where a socket gets its value from: through links, reroutes, muted nodes and groups."""
+"""Sources of socket values: links followed through reroutes, muted nodes and node groups."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import bpy
 
 
 class SocketRef(NamedTuple):
-    """A socket, and the group nodes that were entered to come to it, outermost first."""
+    """A socket with its context: the group nodes around it, outermost first (Blender's `SocketInContext`)."""
 
     socket: bpy.types.NodeSocket
     groups: tuple[bpy.types.Node, ...] = ()

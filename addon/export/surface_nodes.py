@@ -26,7 +26,7 @@ _LOBES = {
 
 @dataclass(slots=True)
 class Surface:
-    """What a shader does: light it reflects and gives off, the share it scatters, the share it lets through.
+    """Result of a shader: reflected and emitted light, scattered share, transparent share.
 
     ``base`` is already times the share that is scattered.
     """
@@ -43,7 +43,7 @@ class SurfaceWalker(TextureWalker):
     """Evaluates a material on a mesh."""
 
     def surface(self) -> Surface | None:
-        """What the material's surface does; None where nothing is seen of it."""
+        """The material's surface; None where it is invisible."""
         material = self.material
         # From Blender 5.0 on every material has nodes, and the switch is deprecated.
         if material.node_tree is None or (bpy.app.version < (5, 0, 0) and not material.use_nodes):
@@ -71,7 +71,7 @@ class SurfaceWalker(TextureWalker):
 
     @once(lambda self: Surface(uniform(self.unknown), scattered=1))
     def shader(self, ref: SocketRef) -> Surface:
-        """What a shader input does."""
+        """The surface of a shader input."""
         origin = ref.origin()
         if not origin.socket.is_output:
             return Surface()
@@ -99,7 +99,7 @@ class SurfaceWalker(TextureWalker):
         )
 
     def reflectance(self, output: SocketRef) -> float:
-        """Of a Principled BSDF, seen from the front; that of IOR 1.5 where it varies."""
+        """Reflectance of a Principled BSDF at normal incidence; that of IOR 1.5 where it varies."""
         ior, level = output.input("IOR").origin().socket, output.input("Specular IOR Level").origin().socket
         if ior.is_output or level.is_output:
             return float("nan")

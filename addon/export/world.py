@@ -164,7 +164,7 @@ class _Tree(Walker):
     # Directions
 
     def rotation(self, ref: SocketRef) -> np.ndarray:
-        """What the nodes before a texture do to the view direction, as a rotation."""
+        """Rotation of the view direction by the nodes before a texture."""
         origin = ref.origin()
         if not origin.socket.is_output:
             return np.eye(3)

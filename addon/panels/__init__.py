@@ -1,4 +1,4 @@
-"""What the extension shows in Blender's interface."""
+"""Panels of the extension in Blender's editors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How far the set-up of the engine is, or the buttons that begin it."""
+"""Progress of the engine's set-up, or the buttons that begin it."""
 
 from __future__ import annotations
 

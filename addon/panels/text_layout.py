@@ -29,7 +29,7 @@ def _letters(context: bpy.types.Context) -> int:
 def bar_text(
     layout: bpy.types.UILayout, context: bpy.types.Context, text: str, part: float, percent: bool = True
 ) -> str:
-    """What a progress bar says: `text`, followed by a number where `percent` asks for it.
+    """Text of a progress bar: `text`, followed by the percentage where `percent` asks for it.
 
     Where the region is too narrow, the text is written above the bar, which says the number alone.
     """

@@ -1,4 +1,4 @@
-"""Bakes and previews: from the scene over the engine's program to what is shown, in steps that Blender does not feel.
+"""Bakes and previews: export, simulation, display, in short timer steps, so that the interface stays responsive.
 
 What runs is known to this module alone; nothing of it is stored in the .blend.
 """
@@ -43,7 +43,7 @@ waiting: set[int] = set()
 
 
 class Job:
-    """Something the engine's program does for an object.
+    """A run of the engine's program for one object.
 
     Parameters
     ----------
@@ -150,18 +150,18 @@ class Job:
         return (part, text) if part < 1.0 and text else (0.0, "Filling the body")
 
     def _read_frames(self, seconds: float) -> bool:
-        """Take in what is new, for about `seconds`; whether there was anything."""
+        """Read new results for about `seconds`; whether there were any."""
         return False
 
     def _kept_results(self) -> str:
-        """What can be said of what there is when it ends early."""
+        """Sentence about the results that remain after an early end."""
         return ""
 
     def _finish(self) -> None:
         """The program has done its job."""
 
     def _raise_missing(self, what: str) -> NoReturn:
-        """It says so, but has not written that."""
+        """Raise the error of a program that reported success without writing its output."""
         missing = [Path(f"{what} in {self.folder}")]
         held = f". {self._kept_results()}" if self._kept_results() else ""
         raise EngineError(self.subject, output_check.complaint(self.process.name, missing), output_check.REMEDY + held)
@@ -269,7 +269,7 @@ class Preview(Job):
 
 @dataclass(frozen=True, slots=True)
 class Cached:
-    """What the cache of an object holds.
+    """Content of an object's particle cache.
 
     Attributes
     ----------
@@ -284,7 +284,7 @@ class Cached:
 
 
 def cached(obj: bpy.types.Object, scene: bpy.types.Scene) -> Cached:
-    """What is baked already.
+    """Content of the object's cache: baked frames, expected frames, changed settings.
 
     Raises
     ------
@@ -324,7 +324,7 @@ def free(obj: bpy.types.Object) -> None:
 
 
 def chosen(context: bpy.types.Context) -> list[bpy.types.Object]:
-    """What Bake bakes: the selected objects with physics, the active one last, or the one an editor is pinned to."""
+    """Objects to bake: the selected objects with physics, the active one last, or the one an editor is pinned to."""
     active = context.active_object
     if context.object != active:
         found = [context.object]
@@ -339,7 +339,7 @@ def is_waiting(obj: bpy.types.Object | None) -> bool:
 
 
 def of(obj: bpy.types.Object | None) -> Job | None:
-    """What is being done for an object."""
+    """The running job of an object."""
     return None if obj is None else running.get(uid(obj))
 
 

@@ -37,7 +37,7 @@ def fields_on(obj: bpy.types.Object, scene: bpy.types.Scene) -> list[bpy.types.O
 
 
 def describe_field(other: bpy.types.Object) -> dict[str, Any]:
-    """What stays from frame to frame."""
+    """The settings of a force field that are the same in every frame."""
     field = other.field
     data: dict[str, Any] = {
         "kind": KINDS[field.type],

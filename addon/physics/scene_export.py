@@ -1,4 +1,4 @@
-"""What the engine needs of the scene, as files: the body, its pins and regions, its motion, and the colliders'.
+"""The scene as files for the engine: the body, its pins and regions, its motion, and the colliders'.
 
 Capturing is a generator that goes on by a frame at a time, so that Blender's window stays alive meanwhile.
 """
@@ -183,7 +183,7 @@ def _capture_motion(
 
 
 def contacts(obj: bpy.types.Object) -> list[dict[str, Any]]:
-    """How each collider acts, as `export_scene` writes it."""
+    """Contact settings of each collider, as `export_scene` writes it."""
     return [_contact(settings) for _, settings in _obstacles(obj)]
 
 

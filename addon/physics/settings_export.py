@@ -1,4 +1,4 @@
-"""The artist's settings as the engine reads them (docs/simulation.md), and the folder they are baked into."""
+"""Simulation settings as JSON for the engine (docs/simulation.md), and the cache folder of an object."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PANEL = "Physics > DR-GS Physics"
 
 
 def subject_of(obj: bpy.types.Object) -> str:
-    """How messages call an object."""
+    """Name of an object in messages."""
     return f'Object "{obj.name}"'
 
 

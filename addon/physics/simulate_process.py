@@ -132,7 +132,7 @@ class SimulateProcess:
         _close_input(self._process)
 
     def result(self, subject: str, held: str = "") -> list[str]:
-        """What it warned of, after it has ended by itself.
+        """Warnings of the program, after it has ended by itself.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""Settings of the render by name: those that come with the extension, and the user's own."""
+"""Render presets: those that come with the extension, and the user's own."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""DR-GS as a render engine of Blender."""
+"""DR-GS as a render engine of Blender: final renders (F12), motion blur and depth of field."""
 
 from __future__ import annotations
 

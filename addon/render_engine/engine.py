@@ -193,7 +193,7 @@ class DrgsRenderEngine(bpy.types.RenderEngine):
 
 
 def summary(frame: Frame, statistics: dict[str, float]) -> str:
-    """What a picture was made of, for the line above it."""
+    """Statistics of a picture, for the line above it."""
     parts = [f"{frame.settings.sample_count} samples"]
     parts += [f"{int(statistics[name]):,} {name}" for name in ("surfels", "triangles") if statistics.get(name)]
     seconds = statistics.get("seconds.total")

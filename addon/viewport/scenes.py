@@ -95,5 +95,5 @@ def changed(depsgraph: bpy.types.Depsgraph) -> None:
 
 
 def forget() -> None:
-    """Nothing that was exported is true any more."""
+    """Drop all exported scenes."""
     _scenes.clear()

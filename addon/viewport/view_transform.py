@@ -23,7 +23,7 @@ Key = tuple[str, str, str]
 
 
 def key_of(scene: bpy.types.Scene) -> Key:
-    """What the table of a scene depends on."""
+    """Key of a scene's table: its colour management settings."""
     view = scene.view_settings
     return scene.display_settings.display_device, view.view_transform, view.look
 

@@ -1,4 +1,4 @@
-"""The viewports: what each wants to see, and the newest picture of it.
+"""The viewports: the latest request of each, and its newest picture.
 
 Everything here runs on Blender's own thread and returns at once; the `worker` waits for the engine. A timer looks
 whether there is news and has the regions drawn again.
@@ -59,7 +59,7 @@ class ViewportState:
 
 
 def name_of(region: bpy.types.Region) -> str:
-    """What the engine calls a viewport."""
+    """Name of a viewport for the engine."""
     return f"viewport {region.as_pointer():x}"
 
 
@@ -157,7 +157,7 @@ def show(name: str) -> None:
 
 
 def status(name: str) -> tuple[str, str]:
-    """What to say of a viewport: (what is being done, an error or "")."""
+    """Status of a viewport: (progress text, error or "")."""
     viewport = _viewports.get(name)
     error = worker.state(name)[1]
     if viewport is None or error:
@@ -172,13 +172,13 @@ def status(name: str) -> tuple[str, str]:
 
 
 def preparation() -> tuple[str, float]:
-    """What is said while kernels are compiled for a viewport, and the part that is done; ("", 0) otherwise."""
+    """Progress text while kernels are compiled for a viewport, and the part that is done; ("", 0) otherwise."""
     found = (worker.progress(name) for name in worker.names())
     return next((each for each in found if is_preparing(each[0])), ("", 0.0))
 
 
 def forget() -> None:
-    """Nothing of the last file is seen in the next."""
+    """Drop all viewport states, so that nothing of the last file is shown in the next."""
     for name in list(_viewports):
         worker.drop(name)
     _viewports.clear()

@@ -24,7 +24,7 @@ log = logging.getLogger("drgs")
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """What a viewport wants to see.
+    """A viewport's request: frame, client, assets.
 
     Attributes
     ----------
@@ -110,7 +110,7 @@ class Worker:
         return ("", "") if view is None else (view.phase, view.error)
 
     def progress(self, name: str) -> tuple[str, float]:
-        """What is being done for the next picture of a viewport, and the part of it that is done."""
+        """Phase of the next picture of a viewport, and the part of it that is done."""
         view = self._views.get(name)
         return ("", 0.0) if view is None else (view.phase, view.part)
 

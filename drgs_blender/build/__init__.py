@@ -1,1 +1,1 @@
-"""Assets made from foreign files: make, import, material transfer, proxy meshes; and export to other programs."""
+"""Assets made from other files: mesh to surfels, import of splats, material transfer, proxy meshes, baking; export."""

@@ -158,7 +158,7 @@ def points_of_surfels(surfels: Surfels, owner: int, size: float) -> ShadingPoint
 
 
 def own_surfels(points: ShadingPoints, owner: int, size: float) -> ShadingPoints:
-    """The same `points`, which know which surfels are their own, see `points_of_surfels`."""
+    """The `points` with the numbers of their own surfels, see `points_of_surfels`."""
     n = len(points)
     return replace(points, own=np.full(n, owner, np.int32), size=np.full(n, size, np.float32))
 

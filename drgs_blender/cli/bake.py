@@ -22,7 +22,7 @@ from .frame_range import check_template, parse_frames
 from .output import check_suffix, check_writable
 from .placed_frame import surface_frame
 from .progress import FractionBar
-from .sampling import whole
+from .sampling import int_range
 
 if TYPE_CHECKING:
     from ..engine.session import PosedObject, Session
@@ -47,13 +47,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "(m, 3, 2), one a face corner; may be given several times",
     )  # fmt: skip
     parser.add_argument("--frames", help="frames: #### in FRAME and OUT becomes the number; 1-24")
-    parser.add_argument("--size", type=whole(16, 16384), default=1024, metavar="N", help="image side; default 1024")
+    parser.add_argument("--size", type=int_range(16, 16384), default=1024, metavar="N", help="image side; default 1024")
     parser.add_argument(
         "--light", choices=("all", "diffuse"), default="all",
         help="all light, highlights as seen along the normal, or what looks the same from everywhere; default all",
     )  # fmt: skip
     parser.add_argument(
-        "--samples", type=whole(3, 65536), default=256, metavar="N", help="samples a point; default 256"
+        "--samples", type=int_range(3, 65536), default=256, metavar="N", help="samples a point; default 256"
     )
 
 
@@ -74,11 +74,11 @@ def run(args: argparse.Namespace) -> int:
     session = Session()
     with FractionBar(args, "baking") as progress:
         for i, (path, named) in enumerate(steps):
-            _bake(args, session, path, named, partial(_tell, progress, i, len(steps)))
+            _bake(args, session, path, named, partial(_report_progress, progress, i, len(steps)))
     return 0
 
 
-def _tell(progress: Callable[[str, float], None], done: int, count: int, part: float) -> None:
+def _report_progress(progress: Callable[[str, float], None], done: int, count: int, part: float) -> None:
     progress("", (done + part) / count)
 
 

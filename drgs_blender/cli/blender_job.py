@@ -188,7 +188,7 @@ class Exporter:
 
 
 def outside_files() -> list[tuple[str, str]]:
-    """What the open file refers to outside of itself, as stored and as found here; not the brushes of its tools."""
+    """External files of the open .blend, as stored and as found here; without the brushes of its tools."""
     import bpy
 
     stored = bpy.utils.blend_paths(absolute=False, packed=False, local=False)
@@ -212,7 +212,7 @@ def _caches() -> Iterator[tuple[str, str]]:
 
 
 def differences(scene: Any) -> list[str]:
-    """What the file asks for and a batch render does without."""
+    """Settings of the file that a batch render ignores."""
     import bpy
 
     notes = []

@@ -17,7 +17,7 @@ from .frame_range import requested_frames
 from .output import check_writable
 from .progress import clock
 from .relight import finite, positive
-from .sampling import whole
+from .sampling import int_range
 
 EXAMPLES = """examples:
   drgs convert capture.ply capture.spz
@@ -65,7 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     splats.add_argument("--env-rotation", type=finite, default=0.0, metavar="DEG", help="as in `drgs relight`")
     splats.add_argument("--env-strength", type=finite, default=1.0, metavar="S", help="factor on the environment")
     splats.add_argument(
-        "--samples", type=whole(1, 65536), default=256, metavar="N", help="samples a surfel; default 256"
+        "--samples", type=int_range(1, 65536), default=256, metavar="N", help="samples a surfel; default 256"
     )
 
 

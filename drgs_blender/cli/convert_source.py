@@ -19,18 +19,18 @@ from .relight import read_environment, read_vertices, rotation_z
 
 Array = np.ndarray
 
-_SHOWN = {
+_COLOUR_NAMES = {
     "captured": "captured colour",
     "albedo": "albedo",
     "relit": "colour under the environment",
     "scene": "colour in the light of the scene",
 }
 #: Rows of an environment that has no picture.
-_PLAIN = 8
+_UNIFORM_ROWS = 8
 
 
 class Source(Protocol):
-    """What a file holds.
+    """Content of a file to be converted.
 
     Attributes
     ----------
@@ -135,7 +135,7 @@ class AssetSource:
         settings = RenderSettings(samples=args.samples, subpixel_samples=1)
         with FractionBar(args, "lighting") as progress:
             colour = relit_colours(asset, surfels, self._vertices, world, settings, progress)
-        return splats_of(surfels, colour), _SHOWN["relit"]
+        return splats_of(surfels, colour), _COLOUR_NAMES["relit"]
 
 
 class FrameSource:
@@ -150,24 +150,24 @@ class FrameSource:
         self._frame = surface_frame(args.input, args.samples, session)
         self.notes: list[str] = []
         self._prepared, self._objects = session.prepare(self._frame)
-        self._seen = [i for i, item in enumerate(self._objects) if item.state.visibility.camera]
+        self._visible = [i for i, item in enumerate(self._objects) if item.state.visibility.camera]
         self._session = session  # keeps the scene
-        faces = any(len(self._objects[i].mesh.faces) for i in self._seen)
+        faces = any(len(self._objects[i].mesh.faces) for i in self._visible)
         kinds: list[Held] = ["mesh"] if faces else []
-        self.kinds: tuple[Held, ...] = (*kinds, "splats", "environment") if self._seen else ("environment",)
+        self.kinds: tuple[Held, ...] = (*kinds, "splats", "environment") if self._visible else ("environment",)
 
     def environment(self) -> Environment:
         """The World, turned as it is in the scene."""
         from ..formats.latlong import directions
 
         picture = self._frame.world.environment
-        look = directions(_PLAIN if picture is None else len(picture))
+        look = directions(_UNIFORM_ROWS if picture is None else len(picture))
         radiance = self._prepared.environment.lookup(look.reshape(-1, 3).astype(np.float32)).reshape(look.shape)
         return Environment(radiance)
 
     def mesh(self) -> Mesh:
         """All meshes as one, with the materials they have in the frame."""
-        meshes = [self._objects[i].mesh for i in self._seen]
+        meshes = [self._objects[i].mesh for i in self._visible]
         first = np.cumsum([0, *(len(m.vertices) for m in meshes)])
 
         def joined(name: str) -> Array:
@@ -185,11 +185,11 @@ class FrameSource:
         """The surfels of all objects, in the colour that was chosen."""
         choice = self._args.colour or "captured"
         if choice != "relit":
-            parts = [_unlit(self._surfels(i), choice) for i in self._seen]
+            parts = [_unlit(self._surfels(i), choice) for i in self._visible]
             return join_splats([splats for splats, _ in parts]), " or the ".join(dict.fromkeys(s for _, s in parts))
         with FractionBar(self._args, "lighting") as progress:
-            lit = [self._lit(i, progress) for i in self._seen]
-        return join_splats(lit), _SHOWN["scene"]
+            lit = [self._lit(i, progress) for i in self._visible]
+        return join_splats(lit), _COLOUR_NAMES["scene"]
 
     def _surfels(self, index: int) -> Surfels:
         from ..build.export import surfels_of_pose
@@ -219,8 +219,8 @@ class FrameSource:
 def _unlit(surfels: Surfels, choice: str) -> tuple[Splats, str]:
     """Splats in the captured colour or the albedo, and which of them it is."""
     if choice == "albedo" or surfels.sh is None:
-        return splats_of(surfels, surfels.albedo), _SHOWN["albedo"]
-    return splats_of(surfels), _SHOWN["captured"]
+        return splats_of(surfels, surfels.albedo), _COLOUR_NAMES["albedo"]
+    return splats_of(surfels), _COLOUR_NAMES["captured"]
 
 
 def _mirrors(matrix: Array) -> bool:

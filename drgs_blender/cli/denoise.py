@@ -58,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--passes", type=sampling.passes, metavar="NAMES", help="passes to write; default: what the noisy frames hold"
     )
     parser.add_argument(
-        "--threads", type=sampling.whole(0, 1024), default=0, help="threads, 0 for all cores; default 0"
+        "--threads", type=sampling.int_range(0, 1024), default=0, help="threads, 0 for all cores; default 0"
     )
     parser.add_argument("--overwrite", action="store_true", help="denoise frames that are already there, too")
     session_link.add_arguments(parser)
@@ -66,7 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def odd(text: str) -> int:
     """An odd whole number from 1 to 15."""
-    value = sampling.whole(1, 15)(text)
+    value = sampling.int_range(1, 15)(text)
     if value % 2 == 0:
         raise argparse.ArgumentTypeError(f"{value} is not odd")
     return value
@@ -74,7 +74,7 @@ def odd(text: str) -> int:
 
 def run(args: argparse.Namespace) -> int:
     """Denoise every frame that is not there yet, here or in the session's process."""
-    if args.session and (code := session_link.hand_on(args.session, args.words)) is not None:
+    if args.session and (code := session_link.delegate(args.session, args.words)) is not None:
         return code
     return denoise(args)
 

@@ -182,7 +182,7 @@ def torch(args: argparse.Namespace) -> str:
 
 
 def variables(args: argparse.Namespace) -> str:
-    """What the environment sets."""
+    """Environment variables that are set."""
     return (
         ", ".join(f"{name}={value}" for name, value in sorted(os.environ.items()) if name.startswith("DRGS_")) or "none"
     )

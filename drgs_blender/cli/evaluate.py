@@ -47,10 +47,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--pictures", type=Path, metavar="DIR", help="write ours, the true ones and their difference, side by side"
     )
     parser.add_argument(
-        "--test-every", type=sampling.whole(2, 10**6), metavar="N", help="views left out, if the capture does not say"
+        "--test-every",
+        type=sampling.int_range(2, 10**6),
+        metavar="N",
+        help="views left out, if the capture does not say",
     )
     parser.add_argument(
-        "--resolution", type=sampling.whole(8, 65536), metavar="N", help="longer side of the views left out"
+        "--resolution", type=sampling.int_range(8, 65536), metavar="N", help="longer side of the views left out"
     )
     parser.add_argument("--axes", choices=tuple(CAMERAS), default="opengl", help="as given to drgs reconstruct")
     parser.add_argument("--up", choices=tuple(UP_AXES), help="as given to drgs reconstruct")
@@ -77,12 +80,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     scenes.add_argument(
         "--objects", nargs="+", metavar="NAME", help="which of spot, cat, robot, helmet, fern; default all"
     )
-    scenes.add_argument("--size", type=sampling.whole(16, 4096), metavar="N", help="pixels of a side; default 256")
-    scenes.add_argument("--train", type=sampling.whole(2, 10000), metavar="N", help="training views; default 120")
-    scenes.add_argument("--test", type=sampling.whole(2, 10000), metavar="N", help="views left out; default 16")
+    scenes.add_argument("--size", type=sampling.int_range(16, 4096), metavar="N", help="pixels of a side; default 256")
+    scenes.add_argument("--train", type=sampling.int_range(2, 10000), metavar="N", help="training views; default 120")
+    scenes.add_argument("--test", type=sampling.int_range(2, 10000), metavar="N", help="views left out; default 16")
     scenes.add_argument(
         "--spp",
-        type=sampling.whole(1, 65536),
+        type=sampling.int_range(1, 65536),
         metavar="N",
         help="of Cycles, a pixel, before denoising; default 64",
     )
@@ -126,7 +129,7 @@ def make(args: argparse.Namespace) -> int:
 
 
 def plan_of(args: argparse.Namespace) -> Plan:
-    """What the options ask for."""
+    """The plan of scenes from the options."""
     from ..evaluate.scenes import SMALL, Plan
 
     given: dict[str, Any] = {

@@ -74,7 +74,7 @@ class FrameLines:
         self._emit(f"Fra:{frame} | Rendering | Sample 0/100", doing=True)
 
     def progress(self, frame: int, phase: str, fraction: float) -> None:
-        """Where the picture stands; most calls print nothing."""
+        """Report the progress of a picture; most calls print nothing."""
         fraction = 0.0 if is_preparing(phase) else min(max(fraction, 0.0), 1.0)  # nothing of the picture is done
         self._doing = f"Fra:{frame} | {phase.capitalize()} | Sample {int(100 * fraction)}/100"
         if time.monotonic() - self._last >= self._interval:
@@ -82,7 +82,7 @@ class FrameLines:
             self._report_to_openjd(fraction, f"frame {frame}, {phase}")
 
     def finished(self, frames: int) -> None:
-        """So many frames of the job are there, made or found."""
+        """Note that `frames` frames of the job are there, made or found."""
         self._finished = frames
         self._report_to_openjd(0.0, f"{frames} of {self._openjd} frames")
 
@@ -96,7 +96,7 @@ class FrameLines:
         self._emit(f"skipping existing frame '{path}'")
 
     def note(self, text: str) -> None:
-        """Something the user should know that does not stop the job."""
+        """Print a warning that does not stop the job."""
         self._emit(f"Note: {text}")
 
     def _report_to_openjd(self, fraction: float, status: str) -> None:

@@ -102,7 +102,7 @@ def remove_abandoned(template: str) -> None:
 
 @contextlib.contextmanager
 def quiet_descriptors() -> Iterator[None]:
-    """Nothing reaches stdout and stderr: OpenEXR prints "Warning:", on which strict farms fail a task.
+    """Silence stdout and stderr: OpenEXR prints "Warning:", on which strict farms fail a task.
 
     Its C++ side writes to the descriptors, its Python side to the streams.
     """

@@ -15,7 +15,7 @@ from .frame_range import requested_frames
 from .output import check_suffix, check_writable, write_and_report
 from .progress import FractionBar, clock, prepare_engine
 from .relight import positive
-from .sampling import whole
+from .sampling import int_range
 
 EXAMPLES = """examples:
   drgs import point_cloud.ply --mesh fuse_post.ply --out capture.drgs
@@ -57,10 +57,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="up axis of surfels and mesh, --up=-y for most photogrammetry; default: what the formats say",
     )
     parser.add_argument(
-        "--resolution", type=whole(8, 1024), metavar="N", help="voxels along the longest side of a built mesh"
+        "--resolution", type=int_range(8, 1024), metavar="N", help="voxels along the longest side of a built mesh"
     )
     parser.add_argument(
-        "--max-triangles", type=whole(1, 10**8), metavar="N", help="budget for the texture detail of a mesh"
+        "--max-triangles", type=int_range(1, 10**8), metavar="N", help="budget for the texture detail of a mesh"
     )
 
 

@@ -129,9 +129,9 @@ def as_lines(value: Any, depth: int = 0) -> Iterator[str]:
             yield from as_lines(item, depth + 1)
         elif isinstance(item, list):
             more = f", ... ({len(item)} in all)" if len(item) > _FEW else ""
-            yield f"{pad}{key}: {', '.join(plain(part) for part in item[:_FEW]) or 'none'}{more}"
+            yield f"{pad}{key}: {', '.join(format_value(part) for part in item[:_FEW]) or 'none'}{more}"
         else:
-            yield f"{pad}{key}: {plain(item)}" if named else f"{pad}- {plain(item)}"
+            yield f"{pad}{key}: {format_value(item)}" if named else f"{pad}- {format_value(item)}"
 
 
 def is_short(value: Any) -> bool:
@@ -139,7 +139,7 @@ def is_short(value: Any) -> bool:
     return isinstance(value, list) and not any(isinstance(item, dict | list) or len(str(item)) > 30 for item in value)
 
 
-def plain(value: Any) -> str:
+def format_value(value: Any) -> str:
     """A value as a person writes it."""
     if value is None or value == {}:
         return "none"

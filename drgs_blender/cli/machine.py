@@ -24,11 +24,11 @@ RESTARTS = 2
 
 
 class Machine:
-    """What renders; a context manager, at whose end all of it is gone.
+    """Blender and the engine for rendering; a context manager that ends both.
 
     Parameters
     ----------
-    keep : bool
+    keep_blender : bool
         Leave Blender, with its scene, for the next chunk.
 
     Attributes
@@ -37,8 +37,8 @@ class Machine:
         Engine's key -> path of every asset of the open scene.
     """
 
-    def __init__(self, keep: bool = False) -> None:
-        self._keep = keep
+    def __init__(self, keep_blender: bool = False) -> None:
+        self._keep_blender = keep_blender
         self._engine: EngineClient | None = None
         self._blender: BlenderProcess | None = None
         self._opened: tuple[object, ...] = ()
@@ -76,7 +76,7 @@ class Machine:
         )
         if not warm:
             self._close_blender()
-            process = BlenderProcess(blender, job | {"frames": frames, "keep": self._keep}, self._load, timeout)
+            process = BlenderProcess(blender, job | {"frames": frames, "keep": self._keep_blender}, self._load, timeout)
             process.__enter__()
             self._blender, self._opened = process, opened
         assert self._blender is not None
@@ -88,7 +88,7 @@ class Machine:
             self.check_assets()  # one that is just being rewritten is not a damaged one
             raise
         finally:
-            if not (whole and self._keep):
+            if not (whole and self._keep_blender):
                 self._close_blender()
 
     def _load(self, path: Path) -> str:

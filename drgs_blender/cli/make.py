@@ -12,7 +12,7 @@ from ..formats.axes import UP_AXES
 from .output import check_suffix, check_writable, write_and_report
 from .progress import clock
 from .relight import positive
-from .sampling import whole
+from .sampling import int_range
 
 EXAMPLES = """examples:
   drgs make helmet.gltf --out helmet.drgs
@@ -40,10 +40,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scale", type=positive, default=1.0, metavar="S", help="factor on all lengths")
     parser.add_argument("--env", type=Path, help="environment kept in the asset")
     parser.add_argument(
-        "--max-triangles", type=whole(1, 10**8), metavar="N", help="budget when the mesh is divided for texture detail"
+        "--max-triangles",
+        type=int_range(1, 10**8),
+        metavar="N",
+        help="budget when the mesh is divided for texture detail",
     )
     parser.add_argument(
-        "--density", type=whole(1, 100_000), metavar="D", help="surfels along the mesh's diagonal, at least"
+        "--density", type=int_range(1, 100_000), metavar="D", help="surfels along the mesh's diagonal, at least"
     )
 
 

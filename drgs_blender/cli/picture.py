@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class Picture:
-    """What is rendered of an evaluated frame.
+    """One picture to render of an evaluated frame.
 
     Parameters
     ----------

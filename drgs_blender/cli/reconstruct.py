@@ -23,7 +23,7 @@ from .frame_lines import emit
 from .interrupt import interruptible
 from .output import check_suffix, check_writable, write_and_report
 from .progress import FractionBar
-from .sampling import whole
+from .sampling import int_range
 
 if TYPE_CHECKING:
     from ..reconstruct.pipeline import Progress
@@ -50,22 +50,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="p keeps free surfels, for particles and for meshes (default); m hangs them on the mesh's faces",
     )
     parser.add_argument(
-        "--resolution", type=whole(8, 1 << 16), metavar="N", help="pixels of the longer side; default: all"
+        "--resolution", type=int_range(8, 1 << 16), metavar="N", help="pixels of the longer side; default: all"
     )
-    parser.add_argument("--iterations", type=whole(1, 10**7), metavar="N", help="steps of the surfels; default 3000")
+    parser.add_argument(
+        "--iterations", type=int_range(1, 10**7), metavar="N", help="steps of the surfels; default 3000"
+    )
     parser.add_argument(
         "--surfels",
-        type=whole(10, 5_000_000),
+        type=int_range(10, 5_000_000),
         metavar="N",
         help="at most, before --variant m makes its own; default 16000",
     )
-    parser.add_argument("--voxels", type=whole(16, 1024), metavar="N", help="of the mesh's longest side; default 256")
+    parser.add_argument(
+        "--voxels", type=int_range(16, 1024), metavar="N", help="of the mesh's longest side; default 256"
+    )
     parser.add_argument(
         "--time-budget", type=_minutes, metavar="M", help="all stages together, about, once kernels are compiled"
     )
     parser.add_argument(
         "--test-every",
-        type=whole(2, 10**6),
+        type=int_range(2, 10**6),
         metavar="K",
         help="leave out every K-th view, and measure on those; if the capture does not say which",
     )

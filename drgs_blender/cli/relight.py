@@ -197,6 +197,6 @@ def read_environment(args: argparse.Namespace, asset: Asset) -> np.ndarray:
 
 
 def rotation_z(degrees: float) -> np.ndarray:
-    """What Rotation Z of a Mapping node does to a direction: (3, 3)."""
+    """(3, 3) rotation of directions by Rotation Z of a Mapping node."""
     cos, sin = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
     return np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])

@@ -63,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     session_link.add_arguments(parser)
     group = parser.add_argument_group("machine")
     group.add_argument(
-        "--memory-mb", type=sampling.whole(256, 1 << 24), metavar="MB", help="most memory of the engine (Linux)"
+        "--memory-mb", type=sampling.int_range(256, 1 << 24), metavar="MB", help="most memory of the engine (Linux)"
     )
     group.add_argument(
         "--timeout", type=seconds, metavar="S", default=float("inf"), help="most seconds for a frame; then exit code 75"
@@ -81,7 +81,7 @@ def seconds(text: str) -> float:
 
 def run(args: argparse.Namespace) -> int:
     """Render every frame that is not there yet, here or by the session's engine."""
-    if args.session and (code := session_link.hand_on(args.session, args.words)) is not None:
+    if args.session and (code := session_link.delegate(args.session, args.words)) is not None:
         return code
     from .machine import Machine
 

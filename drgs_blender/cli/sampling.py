@@ -35,14 +35,14 @@ def add_arguments(
     def choices(field: str) -> tuple[str, ...]:
         return get_args(hints[field])
 
-    add("--samples", "samples", "per pixel, divided among lights and lobes by the material", type=whole(1, 65536))
+    add("--samples", "samples", "per pixel, divided among lights and lobes by the material", type=int_range(1, 65536))
     group.add_argument(
         "--strategy-samples",
         type=strategies,
         metavar="C,G,L",
         help="samples per pixel by cosine, by GGX and towards lights, instead of --samples (the paper has 16,8,8)",
     )
-    add("--bounces", "bounces", "indirect bounces", type=whole(0, 64))
+    add("--bounces", "bounces", "indirect bounces", type=int_range(0, 64))
     add(
         "--noise-threshold",
         "noise_threshold",
@@ -59,7 +59,7 @@ def add_arguments(
         "--subpixel-samples",
         "subpixel_samples",
         "places in a pixel among which its samples are divided, 0 for as many as suit them",
-        type=whole(0, 1024),
+        type=int_range(0, 1024),
     )
     add(
         "--filter-width",
@@ -76,9 +76,9 @@ def add_arguments(
     )
     add("--denoise", "denoise", "denoiser", choices=choices("denoise"))
     add("--shading-model", "shading_model", "reflection model", choices=choices("shading_model"))
-    add("--seed", "seed", "seed of the noise", type=whole(0, 2**31 - 1))
+    add("--seed", "seed", "seed of the noise", type=int_range(0, 2**31 - 1))
     add("--device", "device", "what traces light; without a card the processor does", choices=choices("device"))
-    add("--threads", "threads", "threads, 0 for all cores", type=whole(0, 1024))
+    add("--threads", "threads", "threads, 0 for all cores", type=int_range(0, 1024))
     if not output:
         return
     group.add_argument(
@@ -98,7 +98,7 @@ def add_arguments(
     )
 
 
-def whole(low: int, high: int) -> Any:
+def int_range(low: int, high: int) -> Any:
     """Parser of a whole number from `low` to `high`."""
 
     def parse(text: str) -> int:

@@ -50,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("action", choices=("start", "stop", "serve"))
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="of the session, for its owner alone")
     parser.add_argument(
-        "--idle", type=sampling.whole(1, 1 << 20), default=1800, metavar="S", help="ends unused after; default 1800"
+        "--idle", type=sampling.int_range(1, 1 << 20), default=1800, metavar="S", help="ends unused after; default 1800"
     )
 
 
@@ -90,9 +90,9 @@ def serve(folder: Path, idle: int) -> int:
     from .machine import Machine
 
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(EXIT_TERMINATED))
-    with Machine(keep=True) as machine:
+    with Machine(keep_blender=True) as machine:
         machine.engine().start()
-        watch = _IdleWatch(folder, idle, _take_over(folder))
+        watch = _IdleWatch(folder, idle, _claim(folder))
         while True:
             for request in folder.glob("request-*.json"):
                 about = json.loads(request.read_text())
@@ -105,12 +105,12 @@ def serve(folder: Path, idle: int) -> int:
             time.sleep(POLL_SECONDS)
 
 
-def _take_over(folder: Path) -> Lock:
+def _claim(folder: Path) -> Lock:
     """Make `folder` that of this process: the lock on it."""
     lock = Lock(folder / "lock")
     # What a killed session left. It is listed before the lock is taken: from then on chunks may come.
     old = [path for path in folder.iterdir() if path.name not in ("lock", "log")]
-    if not lock.take(1.0):
+    if not lock.acquire(1.0):
         raise UsageError(f"session {folder}", "is running", "Stop it, or choose another folder")
     for path in old:
         path.unlink(missing_ok=True)
@@ -141,7 +141,7 @@ def _run_request(folder: Path, about: dict[str, Any], machine: Machine) -> int:
 
 
 class _IdleWatch:
-    """Asks this process to end when nobody needs it any more."""
+    """Ends this process when it is idle for too long, or when its parents have ended."""
 
     def __init__(self, folder: Path, idle: int, lock: Lock) -> None:
         self._folder, self._idle = folder, idle
@@ -183,7 +183,7 @@ class _IdleWatch:
             return "nothing was asked of it" if time.monotonic() - self._since > self._idle else None
         with contextlib.suppress(OSError):  # the folder went just now
             lock = Lock(waits)
-            free = lock.take()
+            free = lock.acquire()
             lock.close()
             if free and self._waits is waits:  # else it has just been answered
                 return "nobody waits for its frames"

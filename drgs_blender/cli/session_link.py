@@ -47,14 +47,14 @@ class Lock:
     def __init__(self, path: Path) -> None:
         self._file: IO[bytes] = open(path, "a+b")  # noqa: SIM115 - open as long as it is locked
 
-    def take(self, patience: float = 0.0) -> bool:
+    def acquire(self, patience: float = 0.0) -> bool:
         """Lock it, unless another process has, and keeps it for `patience` seconds: who only looks, takes it too."""
         deadline = time.monotonic() + patience
-        while not (taken := self._take()) and time.monotonic() < deadline:
+        while not (locked := self._try_lock()) and time.monotonic() < deadline:
             time.sleep(POLL_SECONDS / 5)
-        return taken
+        return locked
 
-    def _take(self) -> bool:
+    def _try_lock(self) -> bool:
         try:
             if sys.platform == "win32":
                 import msvcrt
@@ -100,7 +100,7 @@ def is_running(folder: Path) -> bool:
         return False
     lock = Lock(folder / "lock")
     try:
-        return not lock.take()
+        return not lock.acquire()
     finally:
         lock.close()
 
@@ -110,13 +110,13 @@ def end(folder: Path) -> None:
     if not is_running(folder):
         return
     (folder / "stop").touch()
-    if not _until_gone(folder, END_SECONDS):
+    if not _wait_until_ended(folder, END_SECONDS):
         with contextlib.suppress(OSError, ValueError):  # it ended just now
             os.kill(int((folder / "pid").read_text()), signal.SIGTERM if os.name == "nt" else signal.SIGKILL)
-        _until_gone(folder, END_SECONDS)
+        _wait_until_ended(folder, END_SECONDS)
 
 
-def _until_gone(folder: Path, seconds: float) -> bool:
+def _wait_until_ended(folder: Path, seconds: float) -> bool:
     deadline = time.monotonic() + seconds
     while running := is_running(folder):
         if time.monotonic() > deadline:
@@ -133,7 +133,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--openjd", action="store_true", help="report progress to an Open Job Description session")
 
 
-def hand_on(folder: Path, words: Sequence[str]) -> int | None:
+def delegate(folder: Path, words: Sequence[str]) -> int | None:
     """Have the session's process run the command `words`, and print what it prints.
 
     Returns
@@ -155,7 +155,7 @@ def hand_on(folder: Path, words: Sequence[str]) -> int | None:
     request = folder / f"request-{name}.json"
     files = {kind: folder / f"{name}.{kind}" for kind in ("out", "err", "code", "waits")}
     waits = Lock(files["waits"])
-    waits.take()
+    waits.acquire()
     replace_file(request, [json.dumps({"name": name, "words": list(words), "cwd": os.getcwd()}).encode()])
     try:
         tails = [_tail(files["out"], sys.stdout), _tail(files["err"], sys.stderr)]

@@ -21,7 +21,7 @@ from ..core.particle_cache import ParticleCache
 from .interrupt import interruptible
 from .output import check_suffix, check_writable
 from .progress import FractionBar, clock, prepare_engine
-from .sampling import whole
+from .sampling import int_range
 
 if TYPE_CHECKING:
     from ..simulation.settings import Settings
@@ -35,7 +35,7 @@ EXAMPLES = """examples:
 """
 
 #: Time steps a frame from which a bake is slower than its settings let expect.
-_MANY_STEPS = 2000
+_WARN_STEPS = 2000
 #: Options that are a number of the material.
 _MATTER = ("youngs_modulus", "poisson", "density")
 
@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="CACHE", help="folder of the frames")
     parser.add_argument("--settings", type=Path, metavar="S.json", help="what is simulated")
     parser.add_argument("--overwrite", action="store_true", help="remove what the folder holds of other settings")
-    parser.add_argument("--threads", type=whole(0, 1024), default=0, help="threads, 0 for all cores")
+    parser.add_argument("--threads", type=int_range(0, 1024), default=0, help="threads, 0 for all cores")
     group = parser.add_argument_group("settings, over those of the file")
     group.add_argument(
         "--material", metavar="NAME", help="jelly, rubber, cloth, metal, clay, foam, sand, snow, water, ..."
@@ -64,7 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--pin", action="append", default=[], metavar="GROUP", help="vertex group that stays; repeatable"
     )
     group.add_argument("--collider", action="append", default=[], metavar="MESH", help="mesh in the way; repeatable")
-    group.add_argument("--frames", type=whole(1, 1_000_000), metavar="N", help="frames, the one at rest included")
+    group.add_argument("--frames", type=int_range(1, 1_000_000), metavar="N", help="frames, the one at rest included")
     group.add_argument("--fps", type=float, help="frames a second; default 24")
     made = parser.add_argument_group("also written")
     made.add_argument("--vertices", metavar="V####.npy", help="the mesh of each frame, for `drgs relight --vertices`")
@@ -117,7 +117,7 @@ def run(args: argparse.Namespace) -> int:
     print(
         f"{report['particles']} particles{parts} ({report['method']}), at least {steps} time steps a frame", flush=True
     )
-    if steps > _MANY_STEPS:
+    if steps > _WARN_STEPS:
         logger.warning(
             "%s: %d time steps a frame take long; a lower stiffness or resolution, or a larger body, needs fewer",
             args.asset, steps,
@@ -135,7 +135,7 @@ def run(args: argparse.Namespace) -> int:
 
         done = bake(job, cache, overwrite=args.overwrite, cancelled=stopped, progress=progress)
     print(f"{args.out}: frames {settings.first} to {settings.last}, {done} of them computed now")
-    _write_others(args, cache, asset.mesh.faces, settings)
+    _write_exports(args, cache, asset.mesh.faces, settings)
     return 0
 
 
@@ -172,7 +172,7 @@ def _settings(args: argparse.Namespace) -> Settings:
     return parse_settings(data, str(args.settings or "settings"), folder)
 
 
-def _write_others(args: argparse.Namespace, cache: ParticleCache, faces: np.ndarray, settings: Settings) -> None:
+def _write_exports(args: argparse.Namespace, cache: ParticleCache, faces: np.ndarray, settings: Settings) -> None:
     """Poses as arrays and a file for other programs, from the cache."""
     from ..core.asset.archive import replace_file
     from ..formats.point_cache import write_point_cache

@@ -41,7 +41,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", required=True, metavar="PATTERN", help="EXR files, as of drgs render")
     parser.add_argument("--denoised", metavar="PATTERN", help="EXR files of a second step that denoises over time")
     parser.add_argument("--to", type=Path, metavar="FOLDER", help="where the job is written; default: SCENE-job")
-    parser.add_argument("--chunk", type=sampling.whole(1, 1_000_000), default=5, metavar="N", help="frames a task; 5")
+    parser.add_argument(
+        "--chunk", type=sampling.int_range(1, 1_000_000), default=5, metavar="N", help="frames a task; 5"
+    )
     parser.add_argument("--name", help="name of the job; default: the scene's")
     parser.add_argument("--drgs", default="drgs", metavar="COMMAND", help="how a node starts drgs; default drgs")
     parser.add_argument(
@@ -56,14 +58,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("managers")
     group.add_argument(
         "--chunk-seconds",
-        type=sampling.whole(0, 86400),
+        type=sampling.int_range(0, 86400),
         default=0,
         metavar="S",
         help="openjd: how long a chunk should take, where the scheduler adapts chunks",
     )
     group.add_argument(
         "--retries",
-        type=sampling.whole(0, 1000),
+        type=sampling.int_range(0, 1000),
         default=slurm.RETRIES,
         metavar="N",
         help=f"slurm: how often a chunk is queued again after code 75 or 73; default {slurm.RETRIES}",

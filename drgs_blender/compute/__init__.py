@@ -1,1 +1,1 @@
-"""Compiled kernels: Numba's configuration, the kernel cache, SIMD."""
+"""Compiled kernels: Numba's configuration, the kernel cache, threads, SIMD, ahead-of-time compilation."""

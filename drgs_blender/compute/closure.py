@@ -166,7 +166,7 @@ def packed(rows: dict[str, tuple[str, list[str]]]) -> bytes:
 
 
 def unpacked(data: bytes) -> dict[str, tuple[str, list[str]]]:
-    """What `packed` packed.
+    """Inverse of `packed`.
 
     Raises
     ------

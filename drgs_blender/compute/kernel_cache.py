@@ -52,7 +52,7 @@ _CONFIG = ("OPT", "BOUNDSCHECK", "DEBUGINFO_DEFAULT", "LOOP_VECTORIZE", "SLP_VEC
 
 
 class DamagedError(Exception):
-    """What a file holds is not what was written."""
+    """A file is damaged: its content is not what was written."""
 
 
 class Claim:

@@ -89,7 +89,7 @@ def _compile(
 
 
 def not_compiled(kernels: Iterable[Kernel]) -> list[Kernel]:
-    """Those of some kernels that are not compiled yet and can be compiled ahead."""
+    """The kernels among these that are not compiled yet and can be compiled ahead."""
     return [kernel for kernel, _, _ in _missing(kernels)]
 
 
@@ -118,7 +118,7 @@ def _known(kernels: Iterable[Kernel]) -> Iterator[_Known]:
 
 @dataclass(frozen=True)
 class KernelCounts:
-    """How many kernels of all jobs are where.
+    """Numbers of kernels of all jobs: shipped, compiled here, missing.
 
     Attributes
     ----------
@@ -136,7 +136,7 @@ class KernelCounts:
 
 
 def count_kernels() -> KernelCounts:
-    """Where the kernels of all jobs are; those of packages that are not installed do not count."""
+    """Count the kernels of all jobs; those of packages that are not installed do not count."""
     codegen = _codegen()
     brought = compiled = missing = 0
     for _, cache, signature in _known(manifest.needed(manifest.jobs())):
@@ -151,7 +151,7 @@ def count_kernels() -> KernelCounts:
 
 
 def processes() -> int:
-    """How many kernels may be compiled at once: one per processor that this process may use, and as memory allows."""
+    """Number of kernels compiled at once: one per processor that this process may use, as memory allows."""
     allowed = os.cpu_count() or 1
     with contextlib.suppress(AttributeError, OSError):  # not every system has it
         allowed = len(os.sched_getaffinity(0))

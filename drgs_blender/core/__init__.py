@@ -1,1 +1,1 @@
-"""The data contract: frames, assets, passes, errors. numpy only, so that the extension may use it."""
+"""The data contract, numpy only: frames, assets, passes (AOVs), simulation materials, particle caches, errors."""

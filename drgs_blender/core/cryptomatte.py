@@ -49,7 +49,7 @@ def identities(names: list[str]) -> Array:
 
 
 def metadata(frame: Frame, layer: str = "") -> dict[str, str]:
-    """What a file with the Cryptomatte passes of `frame` says of them.
+    """Metadata of a file with the Cryptomatte passes of `frame`.
 
     Parameters
     ----------

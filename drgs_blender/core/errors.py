@@ -73,7 +73,7 @@ class AssetError(DrgsError):
 
 
 class DeviceError(DrgsError):
-    """Something needed to compute (engine interpreter, Embree, a device) is absent."""
+    """A part needed to compute (engine interpreter, Embree, a device) is absent."""
 
     exit_code = EXIT_NO_DEVICE
 

@@ -190,7 +190,7 @@ class Texture:
 
 @dataclass(slots=True)
 class Material:
-    """What Blender's Principled BSDF says of an ordinary surface. Where there is a texture, the number multiplies it.
+    """Parameters of Blender's Principled BSDF for an ordinary surface. Numbers multiply their textures.
 
     Attributes
     ----------
@@ -328,7 +328,7 @@ class World:
 
 @dataclass(slots=True)
 class RenderSettings:
-    """How a frame is solved.
+    """Settings of the renderer for a frame.
 
     Attributes
     ----------
@@ -398,7 +398,7 @@ class RenderSettings:
 
 @dataclass(slots=True)
 class Pose:
-    """Where one shape is at another time.
+    """Transform and vertices of one shape at another time.
 
     Attributes
     ----------

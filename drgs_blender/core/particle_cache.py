@@ -35,7 +35,7 @@ _AGAIN = "Bake again"
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """What a cache holds.
+    """Header of a particle cache.
 
     Attributes
     ----------
@@ -146,7 +146,7 @@ class ParticleCache:
                 ) from error
 
     def header(self) -> Header | None:
-        """What the folder holds; None where it is no cache.
+        """The header of the cache in the folder; None where it is no cache.
 
         Raises
         ------

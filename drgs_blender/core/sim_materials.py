@@ -106,7 +106,7 @@ class Material:
         return float(np.sqrt(modulus * (MOST_HARDENING if self.model == "snow" else 1) / self.density))
 
     def diffusivity(self) -> float:
-        """Of the momentum in what flows, m^2 / s: it bounds time steps as the wave speed does."""
+        """Momentum diffusivity of what flows, m^2 / s: it bounds time steps as the wave speed does."""
         return 4 / 3 * self.viscosity / self.density if self.model == "fluid" else 0.0
 
     def row(self) -> list[float]:
@@ -188,7 +188,7 @@ def make_material(name: str, changes: Mapping[str, Any] | None = None, subject: 
 
 @dataclass(slots=True)
 class Matter:
-    """What each particle is made of, as arrays.
+    """Material parameters of each particle, as arrays.
 
     Attributes
     ----------

@@ -1,1 +1,1 @@
-"""Surfels follow a mesh: binding (Algorithm 1) and the mesh-driven update."""
+"""Deformation: surfels are attached to a mesh (binding, Algorithm 1) and follow it; GMLS, fracture, granular."""

@@ -42,7 +42,7 @@ _TORN = 3.0
 
 @dataclass(slots=True)
 class Weights:
-    """What carries each of n points along; computed once.
+    """Sources and weights of each of n points; computed once.
 
     Attributes
     ----------

@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 
 
 class Posing(NamedTuple):
-    """What a pose is made from, checked.
+    """Checked arguments of a pose.
 
     Attributes
     ----------
@@ -171,7 +171,7 @@ class MeshDriven:
         self, vertices_world: Array, corner_normals_world: Array | None, materials: Mapping[str, Array | None] | None,
         matrix_world: Array | None, torn: Array | None,
     ) -> Posing:  # fmt: skip
-        """What a pose is made from; parameters as of `pose`."""
+        """Check the arguments of a pose; parameters as of `pose`."""
         vertices = np.ascontiguousarray(vertices_world, dtype=np.float32)
         if vertices.shape != self.mesh.vertices.shape:
             raise AssetError(

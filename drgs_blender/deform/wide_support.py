@@ -43,7 +43,7 @@ class Walked(NamedTuple):
 
 
 class Feet(NamedTuple):
-    """Where surfels hang on a mesh.
+    """Attachment of surfels to a mesh.
 
     Attributes
     ----------

@@ -68,13 +68,21 @@ class Histories:
         )
         situation = renewed(camera, old.situation[0]), renewed(lasting, old.situation[1]), *static_state
         split = any(name in frame.passes for name in COMPONENTS)
-        fit = scene.layout, scene.places.shape, camera.window, camera.width, camera.height, settings.camera_sees, split
+        fit = (
+            scene.layout,
+            scene.instances.shape,
+            camera.window,
+            camera.width,
+            camera.height,
+            settings.camera_sees,
+            split,
+        )
         if fit != old.fit or old.past is None:
             return Sequence(fit=fit, situation=situation)
         still = len(situation) == len(old.situation) and all(a is b for a, b in zip(situation, old.situation))
         instant = Instant(
             scene.vertices if still or same_bits(old.past.vertices, scene.vertices) else old.past.vertices,
-            scene.places if still or same_bits(old.past.places, scene.places) else old.past.places,
+            scene.instances if still or same_bits(old.past.instances, scene.instances) else old.past.instances,
             old.past.parameters,
         )
         return Sequence(History(old.history.signal, instant, still), old.past, fit, situation, old.pictures)
@@ -84,7 +92,7 @@ class Histories:
         before, past = sequence.history.instant, sequence.past
         sequence.past = Instant(
             past.vertices if past and before and before.vertices is scene.vertices else scene.vertices.copy(),
-            past.places if past and before and before.places is scene.places else scene.places.copy(),
+            past.instances if past and before and before.instances is scene.instances else scene.instances.copy(),
             camera_parameters(frame.camera, frame.settings, frame.noise_index),
         )
         sequence.history.instant = None  # the scene's arrays are for this picture only

@@ -28,7 +28,7 @@ SIZES = (1, 2, 4, 8)
 
 
 class Pace:
-    """What pixels of a first picture cost here, learnt from those made so far: a fixed part and one a pixel."""
+    """Cost model of first pictures on this machine, fitted to those made so far: a fixed part and one per pixel."""
 
     def __init__(self) -> None:
         self._seconds = 5e-7
@@ -38,7 +38,7 @@ class Pace:
             self._add(pixels, 0.02 + pixels * self._seconds)
 
     def size(self, pixels: int) -> int:
-        """Side of the coarse pixels with which what so many pixels cost is `FIRST_SECONDS` at most."""
+        """Side of the coarse pixels with which a picture of `pixels` pixels takes `FIRST_SECONDS` at most."""
         return next((n for n in SIZES if pixels / n**2 * self._seconds <= FIRST_SECONDS), SIZES[-1])
 
     def note(self, pixels: int, seconds: float) -> None:
@@ -58,7 +58,7 @@ class Pace:
 
 
 class View:
-    """What is known of one viewport's picture.
+    """Progressive state of one viewport's picture.
 
     Parameters
     ----------

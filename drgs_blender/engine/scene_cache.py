@@ -238,11 +238,11 @@ class SceneCache:
             None if pose is None else moved_vertices(item.state, item.loaded.asset, pose)
             for pose, item in zip(moment.objects, self.objects)
         ]
-        vertices, places = self.scene.at(moved, moment.meshes)
-        return Instant(vertices, places, camera_parameters(moment.camera, frame.settings, frame.noise_index))
+        vertices, instances = self.scene.at(moved, moment.meshes)
+        return Instant(vertices, instances, camera_parameters(moment.camera, frame.settings, frame.noise_index))
 
     def warnings(self) -> list[str]:
-        """What the user should know about the meshes of the last frame."""
+        """Warnings about the meshes of the last frame."""
         found = []
         if not self.objects and not self.meshes:
             found.append("the frame has no DR-GS object; the picture shows the world alone")
@@ -256,9 +256,9 @@ class SceneCache:
                 )
             if fault.empty_faces:
                 found.append(f"{fault.name}: {fault.empty_faces} faces have no area; light passes through them")
-            if fault.bad_places:
+            if fault.bad_instances:
                 found.append(
-                    f"{fault.name}: {fault.bad_places} instances are flat, not finite or too far away; left out"
+                    f"{fault.name}: {fault.bad_instances} instances are flat, not finite or too far away; left out"
                 )
         for item in self.objects:
             found += item.faults

@@ -92,7 +92,7 @@ def _adjusted_surfels(state: ObjectState, posed: PosedSurfels, driven: MeshDrive
 
 
 def material_faults(state: ObjectState) -> list[str]:
-    """What is wrong with the material channels of an object, in words for the user."""
+    """Problems of the material channels of an object, in words for the user."""
     counts = {name: int(np.isnan(getattr(state, name)).sum()) for name in MATERIAL_CHANNELS if _has(state, name)}
     return [
         f"{state.name}: {count} values of its {name} are not numbers; the asset's are used there"

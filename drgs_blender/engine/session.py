@@ -292,7 +292,7 @@ class Session:
 
 
 def jobs_of(frame: Frame) -> set[str]:
-    """What a frame needs compiled, in the words of `compute.manifest`."""
+    """Jobs of `compute.manifest` whose kernels a frame needs."""
     settings, jobs = frame.settings, {"frame"}
     if settings.camera_sees == "mesh":
         jobs.add("mesh")

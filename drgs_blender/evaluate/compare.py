@@ -160,7 +160,7 @@ def _white(view: View, background: tuple[float, float, float] | None) -> tuple[A
     return np.clip(view.colour + (1 - np.asarray(background, np.float32)) * (1 - mask), 0, 1), view.mask
 
 
-def _looks(
+def _image_metrics(
     ours: Sequence[Array] | Array, true: Sequence[Array] | Array, distances: Distances
 ) -> dict[str, float | None]:
     """Means of the measures that look at whole pictures."""
@@ -191,7 +191,7 @@ def _novel(
         "coverage": float(np.mean([m.mean() for m in inside])),
         "psnr": mean_psnr(ours, true),
         "psnr_foreground": mean_psnr(ours, true, inside),
-        **_looks(ours, true, distances),
+        **_image_metrics(ours, true, distances),
     }
 
 
@@ -206,7 +206,7 @@ def _relit(item: TruthSet, pictures: list[dict[str, Array]], distances: Distance
         if show is not None:
             show(item.name, k, a, b)
     about = {"name": item.name, "light": item.light, "posed": item.posed, "views": len(item.views)}
-    return {**about, **scores, **_looks(ours, true, distances)}
+    return {**about, **scores, **_image_metrics(ours, true, distances)}
 
 
 def _inside(item: TruthSet) -> Array:
@@ -295,8 +295,8 @@ def table(report: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _number(value: float | None, places: int = 4) -> str:
-    return "not computed" if value is None else f"{value:.{places}f}"
+def _number(value: float | None, digits: int = 4) -> str:
+    return "not computed" if value is None else f"{value:.{digits}f}"
 
 
 def _shape(name: str, geometry: dict[str, float]) -> str:

@@ -48,7 +48,7 @@ _WORD = "DRGS-SCENE"
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """How scenes are made.
+    """Settings of the scenes to be made.
 
     Attributes
     ----------

@@ -57,7 +57,7 @@ class TruthSet:
 
 @dataclass(slots=True)
 class Truth:
-    """All that is known.
+    """Ground truth of a scene.
 
     Attributes
     ----------

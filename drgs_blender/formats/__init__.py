@@ -1,1 +1,1 @@
-"""Foreign files in and out, behind one registry."""
+"""File formats: readers and writers of meshes, splats, images and environments, behind one registry."""

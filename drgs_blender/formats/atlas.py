@@ -56,7 +56,7 @@ class TexturedMaterial:
 
 
 def mesh_material(mesh: Mesh, subject: str) -> UniformMaterial | TexturedMaterial:
-    """What the surface of `mesh` looks like to other programs.
+    """Material of the surface of `mesh` for other programs.
 
     Each triangle has a place of its own in the pictures, where they hold the interpolation of its corners' materials;
     without mip maps that is what is shown.

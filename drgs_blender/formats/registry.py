@@ -70,7 +70,7 @@ class Format:
 
     @property
     def kind(self) -> Kind:
-        """What comes out."""
+        """Kind of the data that is read."""
         return READ[self.name].kind
 
 

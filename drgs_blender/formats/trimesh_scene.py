@@ -43,7 +43,7 @@ def main(source: str, target: str, most_bytes: str, most_seconds: str) -> None:
 
 
 def kind_of(source: str | Path) -> str:
-    """What the file at `source` is, "3MF" or "COLLADA": 3MF is a zip."""
+    """Format of the file at `source`, "3MF" or "COLLADA": 3MF is a zip."""
     with open(source, "rb") as file:
         return "3MF" if file.read(2) == b"PK" else "COLLADA"
 

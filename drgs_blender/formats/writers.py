@@ -46,7 +46,7 @@ class Writer:
 
     @property
     def kind(self) -> Held:
-        """What goes in."""
+        """Kind of the data that is written."""
         return WRITTEN[self.name].kind
 
     @property

@@ -1,1 +1,1 @@
-"""Geometry of surfaces: vertex normals, occupancy, signed distance fields."""
+"""Geometry of surfaces: vertex normals, occupancy, signed distance fields (TSDF)."""

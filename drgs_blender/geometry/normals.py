@@ -16,7 +16,7 @@ _BLOCK = 256  # faces worked on together
 
 
 def corner_table(faces: Array, n_vertices: int) -> tuple[Array, Array]:
-    """Which face corners touch each vertex, as compressed rows.
+    """Face corners at each vertex, as compressed rows (CSR).
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ class VertexNormals:
         return normals
 
     def into(self, vertices: Array, faces: Array, normals: Array) -> int:
-        """As a call, into (n, 3) float32 `normals`; returns how many faces have no area.
+        """Write vertex normals into (n, 3) float32 `normals`; returns the number of faces without area.
 
         Parameters
         ----------

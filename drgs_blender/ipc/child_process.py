@@ -158,7 +158,7 @@ class Child:
                 thread.join(2.0)
 
     def exit_message(self) -> str:
-        """How the process ended, for an error message."""
+        """Description of how the process ended, for an error message."""
         try:
             code = self._process.wait(1.0) if self._process is not None else None
         except subprocess.TimeoutExpired:

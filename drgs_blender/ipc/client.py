@@ -99,7 +99,7 @@ class EngineClient:
 
     @property
     def log(self) -> str:
-        """What the engine wrote to its standard error lately, for an error report."""
+        """The latest lines of the engine's standard error, for an error report."""
         return self._child.log if self._child is not None else self._past_log
 
     @property

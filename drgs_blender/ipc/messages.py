@@ -37,7 +37,7 @@ class Loaded:
 
 @dataclass(slots=True)
 class Progress:
-    """Where a request stands; ``fraction`` of the phase or picture in [0, 1]."""
+    """Progress of a request; ``fraction`` of the phase or picture in [0, 1]."""
 
     id: int
     phase: str

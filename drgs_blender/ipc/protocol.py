@@ -95,7 +95,7 @@ DTYPES = {d: np.dtype(d) for d in ("<f4", "<f8", "<i4", "<i8", "|u1")}
 
 
 class ProtocolError(ValueError):
-    """What was received is not a message of this protocol."""
+    """The received data is not a message of this protocol."""
 
 
 class RawIO(Protocol):

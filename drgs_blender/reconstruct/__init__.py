@@ -1,1 +1,1 @@
-"""Photographs to an asset: captures, differentiable rasteriser, pre-training, TSDF, decoupling."""
+"""Photographs to an asset: readers, training of surfels, meshing (TSDF), inverse rendering."""

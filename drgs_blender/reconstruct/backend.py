@@ -37,7 +37,7 @@ class LearningBackend:
     device = torch.device("cpu")
 
     def bring(self, target: Target) -> Target:
-        """What a view is compared with, where this can read it."""
+        """Copy a training view to the backend's memory."""
         return target
 
     def attributes(

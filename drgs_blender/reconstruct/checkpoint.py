@@ -43,7 +43,7 @@ def save(path: Path, arrays: dict[str, Array], key: str) -> None:
 
 
 def load(path: Path, key: str) -> dict[str, Array] | None:
-    """What `save` wrote, or None where there is nothing, or something else, said in a warning."""
+    """The state that `save` wrote; None where there is none, or with a warning where it is of another run."""
     if not path.exists():
         return None
     try:

@@ -62,7 +62,7 @@ UNSEEN = 0.05
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """What is made of a capture.
+    """Settings of a reconstruction.
 
     Attributes
     ----------
@@ -96,7 +96,7 @@ class Settings:
 
 @dataclass(slots=True)
 class Progress:
-    """Where a reconstruction stands.
+    """Progress of a reconstruction.
 
     Attributes
     ----------
@@ -241,7 +241,7 @@ class _Work:
         return None if self.folder is None else self.folder / f"{phase.replace(' ', '-')}.state"
 
     def key(self, phase: str) -> str:
-        """Which run a checkpoint of a phase is of: its photographs, and the settings that decide its result."""
+        """Key of a checkpoint of a phase: digest of the photographs, and of the settings that decide its result."""
         settings = asdict(self.settings)
         return checkpoint.fingerprint(self.capture, **{name: settings[name] for name in CHECKPOINT_SETTINGS[phase]})
 

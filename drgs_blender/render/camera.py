@@ -2,9 +2,8 @@
 
 Both primary stages (surfels and mesh) look through the same positions, so their pictures can be compared pixel by
 pixel. The positions of a pixel are a rank-1 lattice (k / n, k * golden ratio), shifted on the torus by a hash of
-(seed, frame, pixel): evenly spread for every n, uniform one by one, hence an unbiased box filter of one pixel. A filter
-of another shape is what these positions are drawn from (Ernst et al. 2006, "Filter importance sampling"), all of equal
-weight: no pixel's light is added to another's, and what is denoised stays a pixel's own.
+(seed, frame, pixel): evenly spread for every n, uniform one by one, hence an unbiased box filter of one pixel. Filters
+of another shape warp them (`pixel_filter`).
 """
 
 from __future__ import annotations
@@ -16,6 +15,7 @@ import numpy as np
 from ..compute.jit import inlined, njit
 from ..core.errors import UsageError
 from ..core.frame import Camera, RenderSettings
+from .pixel_filter import check_filter, filter_position
 from .sampling import GOLDEN, mix
 
 Array = np.ndarray
@@ -25,8 +25,6 @@ POSITION, FX, FY, CX, CY, ORTHOGRAPHIC, CLIP_START, CLIP_END, WIDTH, SEED, SUBPI
     *(9, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21, 22, 24, 25),
 )
 _GOLDEN_RATIO = 0.6180339887498949
-#: Widest pixel filter; its window is twice as wide, as that of Cycles.
-WIDEST = 10.0
 
 
 def check_camera(camera: Camera) -> None:
@@ -89,10 +87,7 @@ def camera_parameters(camera: Camera, settings: RenderSettings, noise_index: int
         raise UsageError(
             "sub-pixel samples", f"are {settings.subpixel_samples}", "Choose some, or 0 for as many as suit the rays"
         )
-    if not 0 <= settings.filter_width <= WIDEST:
-        raise UsageError(
-            "pixel filter", f"is {settings.filter_width:g} pixels wide", f"Choose 0 (a box) to {WIDEST:g}, such as 1.5"
-        )
+    check_filter(settings.filter_width)
     matrix = np.asarray(camera.matrix_world, dtype=np.float64)
     out = np.empty(PARAMETERS)
     out[:9] = matrix[:3, :3].ravel()
@@ -120,30 +115,8 @@ def lattice(shift_x, shift_y, sample, parameters):  # type: ignore[no-untyped-de
     """Position of a pixel's sub-pixel sample: in [0, 1) inside the pixel, or `filter_reach` beyond it."""
     x = shift_x + sample / parameters[SUBPIXELS]
     y = shift_y + sample * _GOLDEN_RATIO
-    x, y = x - math.floor(x), y - math.floor(y)
     width = parameters[FILTER]
-    if width > 0.0:
-        return 0.5 + 2.0 * width * _blackman_harris(x), 0.5 + 2.0 * width * _blackman_harris(y)
-    # Just below one, so that adding the pixel's index in float32 stays inside the pixel for pictures of 65536 pixels.
-    return min(x, 0.995), min(y, 0.995)
-
-
-@inlined
-def filter_reach(parameters):  # type: ignore[no-untyped-def]
-    """Pixels by which positions may lie beyond the pixel."""
-    return max(parameters[FILTER] - 0.5, 0.0)
-
-
-@inlined
-def _blackman_harris(u):  # type: ignore[no-untyped-def]
-    """Place in [-.5, .5] below which the part `u` of Blackman and Harris's window lies.
-
-    The window is nearly a Gaussian; a polynomial of what its own quantiles are near is off by .0015 at most.
-    """
-    z = math.sqrt(-math.log(max(4.0 * u * (1.0 - u), 1e-6)))
-    z2 = z * z
-    x = min(z * (0.1794079 - z2 * (0.00088309 + z2 * 0.00020995)), 0.5)
-    return x if u > 0.5 else -x
+    return filter_position(x - math.floor(x), width), filter_position(y - math.floor(y), width)
 
 
 @njit

@@ -16,12 +16,12 @@ from numba import types
 from numba.extending import intrinsic
 
 Array = np.ndarray
-#: Gives the address at which compiled code finds an array: `address`, or that of its copy on a device.
-Place = Callable[[Array], int]
+#: Function of an array to the address at which compiled code reads it: `address`, or that of a copy on a device.
+AddressOf = Callable[[Array], int]
 
 
 def address(array: Array) -> int:
-    """Where the data of a C-contiguous array lies."""
+    """Address of the data of a C-contiguous array."""
     return int(array.__array_interface__["data"][0])
 
 

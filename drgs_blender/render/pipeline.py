@@ -105,7 +105,7 @@ def render(
     if settings.denoise != "svgf":
         history = None
     left, top, right, bottom = camera.window
-    now = Instant(scene.vertices, scene.places, parameters)
+    now = Instant(scene.vertices, scene.instances, parameters)
     past = None if history is None else history.instant
     moving = [
         None if then is None else MotionFilm((bottom - top, right - left), (left, top), now, then)

@@ -104,7 +104,7 @@ class ShadingPoints:
 
     @property
     def arrays(self) -> PointArrays:
-        """What compiled code takes."""
+        """Arrays for compiled code."""
         names = (name if name != "viewer" else "view" for name in PointArrays._fields)
         return PointArrays(*(plain(getattr(self, name)) for name in names))
 

@@ -15,7 +15,7 @@ from .job import Job
 log = logging.getLogger(__name__)
 
 #: Seconds of computing that an interruption may cost.
-_KEEP_EVERY = 5.0
+_SAVE_EVERY = 5.0
 
 
 def bake(
@@ -71,10 +71,10 @@ def bake(
         for frame in range(start + 1, settings.last + 1):
             report = None if progress is None else (lambda part, f=frame: progress(f, part))
             solver.advance(1 / settings.fps, job.pin_targets(frame - settings.first), cancelled, report)
-            _check_own(cache, job)
+            _check_owner(cache, job)
             cache.write(frame, job.now())
             done += 1
-            if time.monotonic() - kept_at > _KEEP_EVERY:
+            if time.monotonic() - kept_at > _SAVE_EVERY:
                 cache.write_state(frame, solver.arrays())
                 kept, kept_at = frame, time.monotonic()
     finally:
@@ -89,7 +89,7 @@ def _owned(cache: ParticleCache, job: Job) -> bool:
     return header is not None and (header.digest, header.moves) == (job.digest, job.moves)
 
 
-def _check_own(cache: ParticleCache, job: Job) -> None:
+def _check_owner(cache: ParticleCache, job: Job) -> None:
     """Frames of two simulations must never lie in one folder."""
     if not _owned(cache, job):
         raise UsageError(

@@ -66,7 +66,7 @@ class Domain:
 
 
 class Arrangement(NamedTuple):
-    """Which particles and nodes are where, until the next sort.
+    """Blocks of particles and nodes, until the next sort.
 
     Attributes
     ----------

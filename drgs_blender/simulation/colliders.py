@@ -80,7 +80,7 @@ class Collider:
 
     @property
     def surface(self) -> Surface:
-        """What it does to matter, for compiled code."""
+        """Contact properties for compiled code."""
         return Surface(self.thickness, CONTACTS[self.contact], self.friction)
 
     def at(self, frame: int) -> Array:
@@ -252,7 +252,7 @@ class MovingCollider:
         return distance, closest, out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-300)
 
     def count_divided(self, points: Array, distances: Array) -> int:
-        """How many of a body's points have the mesh between them and a neighbour at the start of the frame.
+        """Number of a body's points that the mesh separates from a neighbour at the start of the frame.
 
         Parameters
         ----------

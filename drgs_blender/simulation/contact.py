@@ -42,7 +42,7 @@ class Field(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """Where a field is and how it moves: at ``linear + spin x (x - shift)``.
+    """Rigid motion of a field: at ``linear + spin x (x - shift)``.
 
     Attributes
     ----------

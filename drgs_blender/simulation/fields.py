@@ -88,7 +88,7 @@ class FieldRows:
         self._still = np.array([field.row() for field in fields], np.float64).reshape(len(fields), COLUMNS - MOVING)
 
     def push(self, frame: int) -> float:
-        """What they accelerate by at most, but for vortices, from `frame` to the next, m/s^2."""
+        """Largest acceleration by the fields, but for vortices, from `frame` to the next, m/s^2."""
         return float(sum(max(abs(row[_STRENGTH]) for row in self._around(f, frame)) for f in self._frames))
 
     @staticmethod
@@ -148,7 +148,7 @@ def _fall(distance, power, nearest, farthest):  # type: ignore[no-untyped-def]
 
 @njit
 def push_of(f, x, y, z):  # type: ignore[no-untyped-def]
-    """What a field does at a place.
+    """Force of a field at a position.
 
     Parameters
     ----------

@@ -21,7 +21,7 @@ Array = np.ndarray
 
 @dataclass(frozen=True, slots=True)
 class Forces:
-    """What acts on all matter: gravity (m/s^2), wind (m/s) that pulls with drag (1/s), damping (1/s), fields."""
+    """Forces on all matter: gravity (m/s^2), wind (m/s) that pulls with drag (1/s), damping (1/s), fields."""
 
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
     wind: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -32,7 +32,7 @@ class Forces:
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """What is the same in every frame.
+    """Scene data that is the same in every frame.
 
     Attributes
     ----------

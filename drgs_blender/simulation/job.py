@@ -99,7 +99,7 @@ class Job:
         return ParticleFrame(points.astype(np.float32), gradients, vertices.astype(np.float32))
 
     def pin_targets(self, frame: int) -> Array | None:
-        """Where pinned points are `frame` frames after the start, world; None where they stay."""
+        """World positions of pinned points `frame` frames after the start; None where they stay."""
         return None if self._pins is None else self._pins.at(frame)
 
 

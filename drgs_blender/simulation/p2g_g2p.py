@@ -54,7 +54,7 @@ def cell_of(x, p, origin, scale):  # type: ignore[no-untyped-def]
 
 @inlined
 def node_of(neighbour, b, i, j, k):  # type: ignore[no-untyped-def]
-    """Where node (i, j, k) of block b's scratch is: slot and number in the grid, and offset in the scratch."""
+    """Location of node (i, j, k) of block b's scratch: slot and number in the grid, and offset in the scratch."""
     e = (((i + 3) >> 2) * 3 + ((j + 3) >> 2)) * 3 + ((k + 3) >> 2)
     n = (((i + 3) & 3) * 4 + ((j + 3) & 3)) * 4 + ((k + 3) & 3)
     return neighbour[b, e], n, ((i * 8 + j) * 8 + k) * 4

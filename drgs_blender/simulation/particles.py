@@ -11,7 +11,7 @@ Rows = TypeVar("Rows", "Particles", "Properties")
 
 
 class Particles(NamedTuple):
-    """All that the future depends on.
+    """State of the particles, which changes from step to step.
 
     Attributes
     ----------
@@ -42,7 +42,7 @@ class Particles(NamedTuple):
 
 
 class Properties(NamedTuple):
-    """What is the same in every frame.
+    """Constant properties of the particles.
 
     Attributes
     ----------

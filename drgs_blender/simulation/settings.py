@@ -156,7 +156,7 @@ class _Reader:
             raise self.fail(key, f"a number{bounds}")
         return float(value)
 
-    def whole(self, key: str, low: int, high: int) -> int:
+    def integer(self, key: str, low: int, high: int) -> int:
         value = self.data[key]
         if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
             raise self.fail(key, f"a whole number from {low} to {high}")
@@ -274,7 +274,7 @@ class _Reader:
 _KEYS: dict[str, Any] = {
     "material": lambda r, k: r.material(k),
     "regions": lambda r, k: tuple(i.region_of_matter() for i in r.items(k)),
-    "resolution": lambda r, k: r.whole(k, 4, 400),
+    "resolution": lambda r, k: r.integer(k, 4, 400),
     "solver": lambda r, k: r.choice(k, SOLVERS),
     "gravity": lambda r, k: r.vector(k),
     "wind": lambda r, k: r.vector(k),
@@ -291,12 +291,12 @@ _KEYS: dict[str, Any] = {
     "floor_friction": lambda r, k: r.number(k, 0, 1e6),
     "domain": lambda r, k: r.optional(k, r.box),
     "walls": lambda r, k: r.choice(k, WALLS),
-    "first": lambda r, k: r.whole(k, -1_048_574, 1_048_574),
-    "last": lambda r, k: r.whole(k, -1_048_574, 1_048_574),
+    "first": lambda r, k: r.integer(k, -1_048_574, 1_048_574),
+    "last": lambda r, k: r.integer(k, -1_048_574, 1_048_574),
     "fps": lambda r, k: r.number(k, 0.1, 10_000),
     "courant": lambda r, k: r.number(k, 0.01, 1.0),
     "jitter": lambda r, k: r.optional(k, lambda key: r.number(key, 0, 1)),
-    "seed": lambda r, k: r.whole(k, 0, 2**31 - 1),
+    "seed": lambda r, k: r.integer(k, 0, 2**31 - 1),
     "device": lambda r, k: r.choice(k, tuple(DEVICES)),
     "matrix_world": lambda r, k: r.matrix(k),
 }

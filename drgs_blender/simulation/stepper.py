@@ -64,7 +64,7 @@ class Stepper(ABC):
 
     @abstractmethod
     def arrays(self) -> dict[str, Array]:
-        """What `restore` needs to go on from here."""
+        """The state that `restore` needs to go on from here."""
 
     @abstractmethod
     def _put(self, arrays: dict[str, Array]) -> None:

@@ -1,4 +1,4 @@
-"""XPBD, for a quick look: an elastic body as a lattice of cubes, solved by positions.
+"""XPBD, the preview: an elastic body as a lattice of cubes, solved by positions.
 
 XPBD (Macklin et al. 2016) in small steps of one iteration, with the stable neo-Hookean energy (Smith et al. 2018, as
 constraints Macklin and Mueller 2021). Solved as their two constraints, shape is under tension at rest, which one

@@ -76,7 +76,7 @@ def test_a_group_that_nobody_reaches_is_none():
 
 
 def test_nothing_lacks_a_description():
-    assert blender_reference.lacking(PACKAGE) == []
+    assert blender_reference.undescribed(PACKAGE) == []
 
 
 def test_what_lacks_a_description_is_named():
@@ -94,7 +94,7 @@ def test_what_lacks_a_description_is_named():
     bpy.types.WindowManager.silent = PointerProperty(type=Silent)
     try:
         expected = {"bpy.ops.drgs.silent", "bpy.ops.drgs.silent(unsaid)", "WindowManager.silent.unsaid"}
-        assert set(blender_reference.lacking(PACKAGE)) == expected
+        assert set(blender_reference.undescribed(PACKAGE)) == expected
         with pytest.raises(blender_reference.ReferenceIncomplete, match=r"silent\.unsaid"):
             blender_reference.pages(PACKAGE)
     finally:

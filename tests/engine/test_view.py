@@ -37,7 +37,7 @@ def pictures(session, frame, name="A"):
     return found
 
 
-def close(a, b):
+def assert_close(a, b):
     """Same passes up to the rounding of sums."""
     assert a.keys() == b.keys()
     for name in a:
@@ -72,7 +72,7 @@ def test_last_picture_is_the_final_one(session, make_frame, settings):
     frame = lit(make_frame(0.2, **settings))
     frame.passes = ("Combined", "Depth", "Normal", "Albedo", "DiffDir", "GlossInd", "Env", "Emit", "IndexOB")
     found = pictures(session, frame)
-    close(found[-1], session.render(frame))
+    assert_close(found[-1], session.render(frame))
     fractions = [p.statistics["view.fraction"] for p in found]
     assert fractions[0] == 0.0 and fractions == sorted(fractions)
 
@@ -105,7 +105,7 @@ def test_region_is_the_final_one_too(session, make_frame):
     frame.camera.region = (7, 5, 31, 29)
     found = pictures(session, frame)
     assert found[-1]["Combined"].shape == (24, 24, 4)
-    close(found[-1], session.render(frame))
+    assert_close(found[-1], session.render(frame))
 
 
 def test_every_picture_is_as_bright_as_the_last(session, make_frame, monkeypatch):
@@ -144,7 +144,7 @@ def test_views_in_turn_do_not_show_in_each_other(session, make_frame):
             passes = session.refine(name)
             states[name] = passes.statistics
             if passes.statistics["view.fraction"] == 1:
-                close(passes, expected["AB".index(name)])
+                assert_close(passes, expected["AB".index(name)])
 
 
 def test_array_changed_by_its_owner_does_not_show(session, make_frame):
@@ -155,7 +155,7 @@ def test_array_changed_by_its_owner_does_not_show(session, make_frame):
     frame.camera.matrix_world[:] = 0
     while (passes := session.refine("A")).statistics["view.fraction"] < 1:
         pass
-    close(passes, expected)
+    assert_close(passes, expected)
 
 
 def test_unknown_view_cannot_be_refined(session, make_frame):
@@ -254,7 +254,7 @@ def test_process_gives_the_pictures_of_the_library(client, make_frame, session):
     while passes.statistics["view.fraction"] < 1:
         passes = client.view("A", frame, go_on=True)
     assert client.bulk_bytes[0] == sent  # to go on, nothing is sent
-    close(passes, session.render(frame))
+    assert_close(passes, session.render(frame))
 
 
 @pytest.mark.slow
@@ -309,4 +309,4 @@ def test_cancelled_step_leaves_the_view_as_it_was(session, make_frame, monkeypat
         pytest.fail("no step was ever drawn")
     while (passes := session.refine("A")).statistics["view.fraction"] < 1:
         pass
-    close(passes, session.render(frame))
+    assert_close(passes, session.render(frame))

@@ -162,7 +162,7 @@ def test_session_that_hangs_is_ended_and_the_chunk_given_back(folder, warm, tmp_
     os.kill(server(warm), signal.SIGSTOP)
     started = time.monotonic()
     with pytest.raises(EngineError, match="said nothing for 3 s"):
-        session_link.hand_on(warm, ["render", "a.blend", "--frames", "1", "--out", "#.exr"])
+        session_link.delegate(warm, ["render", "a.blend", "--frames", "1", "--out", "#.exr"])
     assert time.monotonic() - started < 15
     assert all_gone(all_of_it, 5) and not session_link.is_running(warm)
 
@@ -224,13 +224,13 @@ def test_chunk_that_comes_at_once_is_not_taken_for_an_old_one(tmp_path, monkeypa
     (tmp_path / "request-00000000.json").touch()
 
     class Seen(session_link.Lock):
-        def take(self, patience: float = 0.0) -> bool:
-            taken = super().take(patience)
+        def acquire(self, patience: float = 0.0) -> bool:
+            taken = super().acquire(patience)
             (tmp_path / "request-11111111.json").touch()
             return taken
 
     monkeypatch.setattr(session, "Lock", Seen)
-    lock = session._take_over(tmp_path)
+    lock = session._claim(tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["lock", "pid", "request-11111111.json"]
     lock.close()
 

@@ -233,7 +233,7 @@ def test_pixels_that_are_not_square_keep_their_two_focal_lengths(tmp_path):
 # --- bad input ------------------------------------------------------------------------------------------------------
 
 
-def refused(path, *words, error=AssetError, **options):
+def assert_refused(path, *words, error=AssetError, **options):
     with pytest.raises(error) as caught:
         read_capture(path, **options)
     for word in words:
@@ -249,7 +249,7 @@ def test_cameras_of_another_convention_are_named_by_their_silhouettes(tmp_path, 
     }[axes]
     scene = captures.make(tmp_path)
     captures.write_nerf(scene, convert=convert)
-    refused(tmp_path, "silhouettes do not meet", f"--axes {axes}")
+    assert_refused(tmp_path, "silhouettes do not meet", f"--axes {axes}")
     view = read_capture(tmp_path, axes=axes).views[0]
     np.testing.assert_allclose(view.camera.matrix_world, scene.cameras[0], atol=1e-9)
 
@@ -262,14 +262,14 @@ def test_silhouettes_of_other_objects_are_refused(tmp_path):
         x, y = rng.integers(0, 40), rng.integers(0, 32)
         pixels[y : y + 6, x : x + 6] = 255
         Image.fromarray(pixels).save(tmp_path / "train" / f"r_{k}.png")
-    refused(tmp_path, "no common shape")
+    assert_refused(tmp_path, "no common shape")
 
 
 def test_inverted_masks_are_told(tmp_path):
     captures.write_nerfstudio(captures.make(tmp_path))
     for mask in (tmp_path / "masks").iterdir():
         Image.fromarray(255 - np.asarray(Image.open(mask))).save(mask)
-    refused(tmp_path, "masks that are inverted", "white is the object")
+    assert_refused(tmp_path, "masks that are inverted", "white is the object")
 
 
 def test_holes_in_masks_that_fill_the_picture_are_not_taken_for_inverted(tmp_path):
@@ -303,7 +303,7 @@ def test_groups_of_cameras_that_look_at_different_things_are_refused(tmp_path):
     scene = captures.make(tmp_path, 16)
     for matrix in scene.cameras[10:]:
         matrix[:3, 3] += [60, 20, 0]
-    refused(before_clutter(scene), "two groups of cameras", "10 with r_0", "6 with r_10", "nothing in common")
+    assert_refused(before_clutter(scene), "two groups of cameras", "10 with r_0", "6 with r_10", "nothing in common")
 
 
 @pytest.mark.parametrize("across", [0.0, 2.0])
@@ -325,23 +325,23 @@ def test_close_ups_and_pictures_from_afar_are_one_capture(tmp_path, across):
 def test_missing_images_are_counted_and_named(tmp_path):
     captures.write_nerf(captures.make(tmp_path))
     (tmp_path / "train" / "r_3.png").unlink()
-    refused(tmp_path, "1 of 12 images", "train/r_3")
+    assert_refused(tmp_path, "1 of 12 images", "train/r_3")
     scene = captures.make(tmp_path / "colmap")
     captures.write_colmap(scene, True)
     (scene.folder / "images" / "005.png").unlink()
-    refused(scene.folder, "1 of 12 images", "005.png")
+    assert_refused(scene.folder, "1 of 12 images", "005.png")
     scene = captures.make(tmp_path / "llff")
     captures.write_llff(scene)
     (scene.folder / "images" / "005.png").unlink()
-    refused(scene.folder, "12 cameras", "images: 11")
+    assert_refused(scene.folder, "12 cameras", "images: 11")
     scene = captures.make(tmp_path / "nero")
     captures.write_nero(scene)
     (scene.folder / "7.png").unlink()
-    refused(scene.folder, "1 of 12 images", "7.png")
+    assert_refused(scene.folder, "1 of 12 images", "7.png")
     scene = captures.make(tmp_path / "tensoir")
     captures.write_tensoir(scene)
     (scene.folder / "train_005" / "rgba_sunset.png").unlink()
-    refused(scene.folder, "1 of 12 images", "train_005/rgba_sunset.png")
+    assert_refused(scene.folder, "1 of 12 images", "train_005/rgba_sunset.png")
 
 
 def test_masks_and_photographs_of_another_shape_are_refused(tmp_path):
@@ -349,15 +349,15 @@ def test_masks_and_photographs_of_another_shape_are_refused(tmp_path):
     captures.write_nerfstudio(scene)
     mask = tmp_path / "masks" / "frame_00002.png"
     Image.new("L", (40, 48)).save(mask)
-    refused(tmp_path, "frame_00002.png", "40 x 48")
+    assert_refused(tmp_path, "frame_00002.png", "40 x 48")
     Image.fromarray(captures.picture(scene.cameras[2], 96, 80)[..., 3]).save(mask)  # the same shape, larger
     capture = read_capture(tmp_path)
     assert abs(capture.views[2].mask.mean() - capture.views[8].mask.mean()) < 0.05
     image = tmp_path / "images" / "frame_00004.png"
     Image.new("RGB", (40, 48), "red").save(image)
-    refused(tmp_path, "calibrated for 48 x 40")
+    assert_refused(tmp_path, "calibrated for 48 x 40")
     mask.unlink()
-    refused(tmp_path, "names the mask")
+    assert_refused(tmp_path, "names the mask")
 
 
 def test_a_picture_of_another_shape_than_the_one_camera_of_a_file_is_refused(tmp_path):
@@ -367,7 +367,7 @@ def test_a_picture_of_another_shape_than_the_one_camera_of_a_file_is_refused(tmp
     Image.fromarray(captures.picture(scene.cameras[5], 96, 80)).save(image)  # the same shape, larger
     assert len(read_capture(tmp_path).views) == 12
     Image.fromarray(captures.picture(scene.cameras[5])[10:26]).save(image)
-    refused(tmp_path, "r_5.png", "48 x 16 pixels", "48 x 40")
+    assert_refused(tmp_path, "r_5.png", "48 x 16 pixels", "48 x 40")
     data = json.loads(path.read_text())
     for frame in data["frames"]:  # each says what it was taken with
         frame["camera_angle_x"] = data["camera_angle_x"]
@@ -383,7 +383,7 @@ def test_black_photographs_are_left_out_and_a_black_capture_is_refused(tmp_path,
             assert "frame_00002.png" in caplog.text
         if k >= 2:
             Image.new("RGB", (48, 40)).save(tmp_path / "images" / f"frame_{k:05d}.png")
-    refused(tmp_path, "images that are black")
+    assert_refused(tmp_path, "images that are black")
 
 
 def test_photographs_of_one_colour_are_left_out(tmp_path, caplog):
@@ -400,14 +400,14 @@ def test_pictures_of_hardly_a_pixel_are_refused(tmp_path, size):
     captures.write_nerf(captures.make(tmp_path))
     for file in (tmp_path / "train").iterdir():
         Image.effect_noise(size, 100).convert("RGBA").save(file)
-    refused(tmp_path, "r_0.png", f"{size[0]} x {size[1]} pixels", "larger photographs")
+    assert_refused(tmp_path, "r_0.png", f"{size[0]} x {size[1]} pixels", "larger photographs")
 
 
 def test_a_resolution_that_leaves_hardly_a_pixel_of_a_narrow_picture_is_refused(tmp_path):
     captures.write_nerf(captures.make(tmp_path))
     for file in (tmp_path / "train").iterdir():
         Image.effect_noise((12, 100), 100).convert("RGBA").save(file)
-    refused(tmp_path, "r_0.png", "1 x 8 pixels", "larger --resolution", resolution=8)
+    assert_refused(tmp_path, "r_0.png", "1 x 8 pixels", "larger --resolution", resolution=8)
 
 
 def test_an_empty_mask_is_named_and_its_photograph_left_out(tmp_path, caplog):
@@ -474,12 +474,12 @@ def test_pictures_that_exif_turns_are_used_as_stored_and_named(tmp_path, caplog)
 
 def test_one_camera_or_one_place_is_no_capture(tmp_path):
     captures.write_nerf(captures.make(tmp_path / "one", 1))
-    refused(tmp_path / "one", "one camera")
+    assert_refused(tmp_path / "one", "one camera")
     scene = captures.make(tmp_path / "spot")
     for matrix in scene.cameras:
         matrix[:3, 3] = [1, 2, 3]
     captures.write_nerf(scene)
-    refused(scene.folder, "in one place")
+    assert_refused(scene.folder, "in one place")
 
 
 @pytest.mark.parametrize("convert", [np.linalg.inv, lambda m: np.linalg.inv(m @ captures.OPENCV)])
@@ -489,7 +489,7 @@ def test_an_object_that_turns_before_one_camera_is_told_by_name(tmp_path, conver
     for matrix in scene.cameras:
         matrix[:3, 3] = 3 * matrix[:3, 2]
     captures.write_nerf(scene, convert=convert)
-    refused(tmp_path, "in one place", "--axes opengl-inverse")
+    assert_refused(tmp_path, "in one place", "--axes opengl-inverse")
 
 
 def test_places_that_single_precision_cannot_tell_apart_are_refused(tmp_path):
@@ -498,7 +498,7 @@ def test_places_that_single_precision_cannot_tell_apart_are_refused(tmp_path):
     for matrix in scene.cameras:
         matrix[:3, 3] += [5e5, 5e6, 0]
     captures.write_nerf(scene)
-    refused(tmp_path, "digits do not suffice", "origin near the object")
+    assert_refused(tmp_path, "digits do not suffice", "origin near the object")
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1e6])
@@ -508,7 +508,7 @@ def test_captures_too_small_or_large_for_any_camera_are_refused(tmp_path, scale)
     for matrix in scene.cameras:
         matrix[:3, 3] *= scale
     captures.write_nerf(scene)
-    refused(tmp_path, "of each other", "another unit")
+    assert_refused(tmp_path, "of each other", "another unit")
 
 
 @pytest.mark.parametrize("wrong", [1, 5])
@@ -541,13 +541,13 @@ def test_a_folder_of_captures_is_told_from_one(tmp_path):
     for name in ("b", "a"):
         (tmp_path / name).mkdir()
         captures.write_nerf(captures.make(tmp_path / name))
-    refused(tmp_path, "holds some", f"{tmp_path / 'a'}, {tmp_path / 'b'}. Give one")
+    assert_refused(tmp_path, "holds some", f"{tmp_path / 'a'}, {tmp_path / 'b'}. Give one")
 
 
 def test_damaged_files_are_refused_by_name(tmp_path):
-    refused(tmp_path / "nothing", "does not exist")
-    refused(tmp_path / ("a" * 300), "cannot be read: File name too long")
-    refused(tmp_path, "is no capture", "COLMAP")
+    assert_refused(tmp_path / "nothing", "does not exist")
+    assert_refused(tmp_path / ("a" * 300), "cannot be read: File name too long")
+    assert_refused(tmp_path, "is no capture", "COLMAP")
     file = tmp_path / "transforms.json"
     for text, word in (
         ("{", "not JSON"),
@@ -557,7 +557,7 @@ def test_damaged_files_are_refused_by_name(tmp_path):
         ('{"frames": [{"transform_matrix": 1}]}', "no file_path"),
     ):
         file.write_text(text)
-        refused(tmp_path, str(file), word)
+        assert_refused(tmp_path, str(file), word)
     scene = captures.make(tmp_path / "c")
     path = captures.write_nerfstudio(scene)
     good = json.loads(path.read_text())
@@ -579,12 +579,12 @@ def test_damaged_files_are_refused_by_name(tmp_path):
         ({"test_filenames": 5}, "test_filenames"),
     ):
         path.write_text(json.dumps(good | change))
-        refused(scene.folder, word)
+        assert_refused(scene.folder, word)
     colmap = captures.make(tmp_path / "colmap")
     captures.write_colmap(colmap, True)
     images = colmap.folder / "sparse/0/images.bin"
     images.write_bytes(images.read_bytes()[:-40])
-    refused(colmap.folder, "damaged")
+    assert_refused(colmap.folder, "damaged")
 
 
 def test_a_pickle_that_would_run_code_is_refused(tmp_path):
@@ -596,7 +596,7 @@ def test_a_pickle_that_would_run_code_is_refused(tmp_path):
             return (exec, (f"open({str(tmp_path / 'ran')!r}, 'w')",))
 
     (tmp_path / "3-camera.pkl").write_bytes(pickle.dumps(Evil()))
-    refused(tmp_path, "3-camera.pkl", "exec")
+    assert_refused(tmp_path, "3-camera.pkl", "exec")
     assert not (tmp_path / "ran").exists()
 
 
@@ -608,7 +608,7 @@ def test_more_pixels_than_memory_are_refused_before_they_are_read(tmp_path):
     for key in ("fl_x", "fl_y", "cx", "cy", "w", "h"):
         data[key] *= factor
     path.write_text(json.dumps(data))
-    refused(tmp_path, "memory", "--resolution", error=UsageError)
+    assert_refused(tmp_path, "memory", "--resolution", error=UsageError)
     assert len(read_capture(tmp_path, resolution=24).views) == 12
 
 

@@ -68,7 +68,7 @@ def picture(buffer: GBuffer, values: np.ndarray, camera: Camera) -> np.ndarray:
     return out
 
 
-def alike(here: GBuffer, there: GBuffer, camera: Camera) -> None:
+def assert_alike(here: GBuffer, there: GBuffer, camera: Camera) -> None:
     assert len(here.points) > 500
     np.testing.assert_allclose(there.alpha.mean(), here.alpha.mean(), atol=1e-4)
     for name in ("position", "depth", "emission", "face", "place", "object_index", "barycentric"):
@@ -88,7 +88,7 @@ def alike(here: GBuffer, there: GBuffer, camera: Camera) -> None:
 def test_the_camera_sees_the_same_meshes(device: WarpRenderBackend, name: str, view: str) -> None:
     """Textures, emission, places, mirrored ones, what is hidden from the camera."""
     scene, camera = SCENES[name]()[0], VIEWS[view]
-    alike(seen(CPU, scene, camera), seen(device, scene, camera), camera)
+    assert_alike(seen(CPU, scene, camera), seen(device, scene, camera), camera)
 
 
 @pytest.mark.slow
@@ -158,7 +158,7 @@ def test_points_whose_hits_are_lost_and_not_found_again_are_on_some_face(monkeyp
     def lost(*arguments: object) -> object:
         hits = device.trace(*arguments)  # type: ignore[arg-type]
         again = CPU.trace(*arguments)  # type: ignore[arg-type]
-        again.owner[:], again.face[:], again.place[:] = -1, -1, -1
+        again.owner[:], again.face[:], again.instance[:] = -1, -1, -1
         hits.on_device, hits.again = (None,), lambda: again  # type: ignore[attr-defined]
         device.failed = "a card that is no more"
         return hits

@@ -281,7 +281,7 @@ def test_every_array_is_copied_to_a_card(monkeypatch: pytest.MonkeyPatch) -> Non
     materials = scene.mesh_materials
     spoilt = [
         scene.shading_faces, scene.shading, scene.normals, scene.face_object, materials.index, materials.uvs,
-        scene._place_normal, scene.place_object, materials.addresses, scene.vertices, *materials.table.arrays,
+        scene._instance_normal, scene.instance_object, materials.addresses, scene.vertices, *materials.table.arrays,
         *(texels.texels for texels in materials.table._images.values()), light.texels, light.row_z, light.cells.runs,
         light.cells.guide, light.cells.block, light.product.starts, light.product.slices, light.product.ratio,
         light.product.first, shining.emitters.rows, shining.emitters.nodes, shining.emitters.sums,

@@ -36,7 +36,7 @@ HEIGHT, WIDTH = 23, 31
 
 
 @pytest.fixture(scope="module")
-def there() -> WarpLearningBackend:
+def on_device() -> WarpLearningBackend:
     return WarpLearningBackend("cpu")
 
 
@@ -44,10 +44,12 @@ def random(*shape: int, seed: int = 0, low: float = 0.0, high: float = 1.0) -> A
     return torch.tensor(np.random.default_rng([seed, *shape]).uniform(low, high, shape), dtype=torch.float32)
 
 
-def hold_alike(work: Callable[..., Any], inputs: list[Any], there: WarpLearningBackend, close: float = 1e-5) -> None:
+def assert_alike(
+    work: Callable[..., Any], inputs: list[Any], on_device: WarpLearningBackend, close: float = 1e-5
+) -> None:
     """`work(processor, *inputs)` has the same values and gradients of all inputs on both processors."""
     results = []
-    for by in (CPU, there):
+    for by in (CPU, on_device):
         given = [value.clone().requires_grad_() for value in inputs]
         found = work(by, *given)
         found = found if isinstance(found, tuple) else (found,)
@@ -59,23 +61,23 @@ def hold_alike(work: Callable[..., Any], inputs: list[Any], there: WarpLearningB
 
 
 @pytest.mark.parametrize(("bands", "mirrors"), [(0, True), (2, True), (1, False)])
-def test_attributes(there: WarpLearningBackend, bands: int, mirrors: bool) -> None:
+def test_attributes(on_device: WarpLearningBackend, bands: int, mirrors: bool) -> None:
     raw, centre = surfels()
     names = list(raw)
-    hold_alike(
+    assert_alike(
         lambda by, *values: by.attributes(dict(zip(names, values, strict=True)), centre, EYE, bands, mirrors),
-        list(raw.values()), there,
+        list(raw.values()), on_device,
     )  # fmt: skip
 
 
-def test_what_is_mirrored(there: WarpLearningBackend) -> None:
+def test_what_is_mirrored(on_device: WarpLearningBackend) -> None:
     """Pixels hardly covered among them, and one without a normal."""
     features, alpha = random(HEIGHT, WIDTH, 10, low=-1), random(HEIGHT, WIDTH, seed=1)
     features[..., 6:] = 0.9 * alpha[..., None] * features[..., 6:].abs()
     alpha[:3] = 0.9 * float(BARE)
     features[4, 5, 3:6] = 0
     rays, cube = random(HEIGHT, WIDTH, 3, seed=2, low=-1), random(6, 3, 32, 32, seed=3, low=-2)
-    hold_alike(lambda by, f, a, c: by.mirrored(f, a, rays, pyramid(c)), [features, alpha, cube], there)
+    assert_alike(lambda by, f, a, c: by.mirrored(f, a, rays, pyramid(c)), [features, alpha, cube], on_device)
 
 
 def test_gradients_of_shared_texels_do_not_depend_on_the_order() -> None:
@@ -92,30 +94,30 @@ def test_gradients_of_shared_texels_do_not_depend_on_the_order() -> None:
     torch.testing.assert_close(found[0].double(), exact, rtol=1e-6, atol=1e-6)
 
 
-def test_difference_from_a_photograph(there: WarpLearningBackend) -> None:
+def test_difference_from_a_photograph(on_device: WarpLearningBackend) -> None:
     """Saturated in part, where brighter is as good."""
     colour = random(HEIGHT, WIDTH, 3)
     colour[5:9] = 1.0
     target = Target(None, Photograph.of(colour.numpy()), None)  # type: ignore[arg-type]
     picture = random(HEIGHT, WIDTH, 3, seed=1, high=1.3)
-    hold_alike(lambda by, p: by.difference(p, by.bring(target).photograph), [picture], there)
+    assert_alike(lambda by, p: by.difference(p, by.bring(target).photograph), [picture], on_device)
 
 
 @pytest.mark.parametrize("weights", [(0.1, 0.0, 0.0), (0.0, 0.7, 0.0), (0.0, 0.0, 0.25)])
-def test_losses_of_the_shape(there: WarpLearningBackend, weights: tuple[float, float, float]) -> None:
+def test_losses_of_the_shape(on_device: WarpLearningBackend, weights: tuple[float, float, float]) -> None:
     alpha = random(HEIGHT, WIDTH, low=0.2)
     alpha[:4, :5] = 0
     maps = [alpha, alpha * (3 + 0.3 * random(HEIGHT, WIDTH, seed=1)), random(HEIGHT, WIDTH, seed=2)]
     normal, mask = random(HEIGHT, WIDTH, 3, seed=3, low=-0.7, high=0.7), random(HEIGHT, WIDTH, seed=4)
     rays, counts = random(HEIGHT, WIDTH, 3, seed=5, low=-1), random(HEIGHT, WIDTH, seed=6)
     work = lambda by, a, z, d, n: by.shape_loss(a, z, d, n, mask, rays, counts, weights)  # noqa: E731
-    hold_alike(work, [*maps, normal], there)
+    assert_alike(work, [*maps, normal], on_device)
 
 
-def test_a_step_down(there: WarpLearningBackend) -> None:
+def test_a_step_down(on_device: WarpLearningBackend) -> None:
     """To the last bit; gradients that are no numbers change nothing."""
     found = []
-    for by in (CPU, there):
+    for by in (CPU, on_device):
         value, first, second = random(50, 6), random(50, 6, seed=1), random(50, 6, seed=2)
         gradient = random(50, 6, seed=3, low=-1)
         gradient[3, 2] = float("nan")
@@ -156,24 +158,26 @@ def alike(a: Training, b: Training) -> float:
 
 
 @pytest.mark.slow
-def test_first_steps_are_the_processors(capture: Capture, region: Region, there: WarpLearningBackend) -> None:
-    assert alike(learned(capture, region, CPU, 3), learned(capture, region, there, 3)) < 1e-5
+def test_first_steps_are_the_processors(capture: Capture, region: Region, on_device: WarpLearningBackend) -> None:
+    assert alike(learned(capture, region, CPU, 3), learned(capture, region, on_device, 3)) < 1e-5
 
 
-def test_a_device_learns_as_well_as_the_processor(capture: Capture, region: Region, there: WarpLearningBackend) -> None:
+def test_a_device_learns_as_well_as_the_processor(
+    capture: Capture, region: Region, on_device: WarpLearningBackend
+) -> None:
     """All of the schedule: surfels cut, mirrors, shape. What begins as last digits grows, but leads no other way."""
-    here, other = (learned(capture, region, by, SCHEDULE.iterations) for by in (CPU, there))
+    here, other = (learned(capture, region, by, SCHEDULE.iterations) for by in (CPU, on_device))
     assert here.growth.rounds == other.growth.rounds == SCHEDULE.rounds
     assert here.psnr > 20
     assert abs(here.psnr - other.psnr) < 0.1
     assert not other.fallback.failed
-    assert other.gaussians.backend is there
+    assert other.gaussians.backend is on_device
 
 
 def test_a_state_of_one_processor_is_of_use_to_the_other(
-    capture: Capture, region: Region, there: WarpLearningBackend
+    capture: Capture, region: Region, on_device: WarpLearningBackend
 ) -> None:
-    for one, other in ((CPU, there), (there, CPU)):
+    for one, other in ((CPU, on_device), (on_device, CPU)):
         begun = learned(capture, region, one, 20)
         going_on = Training(capture, region, SCHEDULE, backend=other)
         going_on.restore(begun.arrays())
@@ -190,11 +194,11 @@ def test_a_device_that_fails_is_a_warning_and_the_processor_goes_on(
     caplog: pytest.LogCaptureFixture,
 ) -> None:  # fmt: skip
     """From where it failed: nothing is lost."""
-    there = WarpLearningBackend("cpu")
-    training = learned(capture, region, there, 10)
+    on_device = WarpLearningBackend("cpu")
+    training = learned(capture, region, on_device, 10)
     expected = Training(capture, region, SCHEDULE)
     expected.restore(training.arrays())
-    fail_at(work, there, error, monkeypatch)
+    fail_at(work, on_device, error, monkeypatch)
     for _ in range(10):
         training.step()
         expected.step()
@@ -207,24 +211,24 @@ def test_a_device_that_fails_is_a_warning_and_the_processor_goes_on(
     assert alike(expected, training) == 0
 
 
-def fail_at(work: Work, there: WarpLearningBackend, error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
+def fail_at(work: Work, on_device: WarpLearningBackend, error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
     """Have the device fail at some work from now on."""
-    launch = there.launcher.launch
+    launch = on_device.launcher.launch
 
     def failing(asked: Work, *arguments: Any) -> None:
         if asked is work:
             raise error
         launch(asked, *arguments)
 
-    monkeypatch.setattr(there.launcher, "launch", failing)
+    monkeypatch.setattr(on_device.launcher, "launch", failing)
 
 
 def test_a_step_that_fails_half_done_is_done_again(
     capture: Capture, region: Region, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    there = WarpLearningBackend("cpu")
-    training = learned(capture, region, there, 10)
-    fail_at(DESCEND, there, RuntimeError("CUDA error"), monkeypatch)
+    on_device = WarpLearningBackend("cpu")
+    training = learned(capture, region, on_device, 10)
+    fail_at(DESCEND, on_device, RuntimeError("CUDA error"), monkeypatch)
     training.step()
     learner = training.learner
     assert training.iteration == learner.optimiser.steps == learner.light.steps == 11
@@ -359,24 +363,24 @@ def test_nothing_of_this_process_meets_what_is_on_a_device(
         assert {tensor.device.type for tensor in tensors} == {"meta"}, work.function.__name__
         asked.append(work)
 
-    there = WarpLearningBackend("cpu")
-    there.device = torch.device("meta")
-    monkeypatch.setattr(there.launcher, "launch", launch)
+    on_device = WarpLearningBackend("cpu")
+    on_device.device = torch.device("meta")
+    monkeypatch.setattr(on_device.launcher, "launch", launch)
     ends = lambda counts: (torch.nn.functional.pad(torch.cumsum(counts, 0), (1, 0)), 1000)  # noqa: E731
     monkeypatch.setattr(device_raster, "starts", ends)
     monkeypatch.setattr(torch, "nonzero", lambda x: torch.zeros(90, x.dim(), dtype=torch.int64, device=x.device))
     monkeypatch.setattr(torch.Tensor, "__float__", lambda _: 0.5)
     training = Training(capture, region, replace(SCHEDULE, mirrors=0.0, shape=0.0))
-    training.move(there)
+    training.move(on_device)
     training.learner.step(training.views.of_step(0, half=True, without_held_out=False), 0.0)
-    training.learner.optimiser.take(np.array([0, -1, 2]))
+    training.learner.optimiser.reindex(np.array([0, -1, 2]))
     training.gaussians.select(np.array([1, 2]))
     assert set(asked) >= {kernels.SUM_PIXELS, losses.ROWS, DESCEND}
 
 
 @pytest.mark.slow
 def test_an_asset_is_learned_on_the_device_asked_for(
-    capture: Capture, there: WarpLearningBackend, monkeypatch: pytest.MonkeyPatch
+    capture: Capture, on_device: WarpLearningBackend, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Surfels, mesh, surfels on the mesh: as on this processor, but for what begins as last digits."""
     pytest.importorskip("skimage")

@@ -13,9 +13,9 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("warp", reason="warp-lang is not installed")
 
 from test_reconstruct_raster import (  # noqa: E402
+    assert_each_map_matches_brute_force,
+    assert_matches_brute_force,
     camera,
-    hold_against_brute_force,
-    hold_each_map_against_brute_force,
     surfels,
 )
 
@@ -75,11 +75,11 @@ def test_maps_are_the_processors_to_the_last_bit_and_gradients_but_for_it(
 
 @pytest.mark.parametrize(("n", "size"), [(1, 1.0), (60, 0.25), (400, 0.12)])
 def test_maps_and_gradients_are_those_of_the_brute_force(launcher: TensorLauncher, n: int, size: float) -> None:
-    hold_against_brute_force(partial(there.rasterise, launcher), n, size)
+    assert_matches_brute_force(partial(there.rasterise, launcher), n, size)
 
 
 def test_every_map_has_a_gradient_of_its_own(launcher: TensorLauncher) -> None:
-    hold_each_map_against_brute_force(partial(there.rasterise, launcher))
+    assert_each_map_matches_brute_force(partial(there.rasterise, launcher))
 
 
 def test_a_device_with_memory_of_its_own_finds_the_same_bits_each_time(

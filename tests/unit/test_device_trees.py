@@ -45,7 +45,7 @@ def hits(device: WarpRenderBackend, scene: TraceScene, count: int = 4000) -> lis
     return [(t, face, instance), out]
 
 
-def agree(device: WarpRenderBackend, scene: TraceScene) -> None:
+def assert_agree(device: WarpRenderBackend, scene: TraceScene) -> None:
     (t, face, instance), found = hits(device, scene)
     assert (face >= 0).mean() > 0.2
     other = (found[1] != face) | ((found[2] >= 0) != (instance >= 0))
@@ -72,17 +72,17 @@ def test_a_tree_is_refitted_until_it_is_worn_out(device: WarpRenderBackend) -> N
     """What was near goes everywhere: the boxes of the old tree would all be met, and the hits are Embree's still."""
     scene, item = TraceScene(), ball((0.0, 0.0, 0.0), 2.0)
     scene.update([item])
-    agree(device, scene)
+    assert_agree(device, scene)
     bent = item.vertices * np.float32([1.2, 0.9, 1.0]) + np.float32(0.1) * np.sin(3 * item.vertices[:, ::-1])
     scene.update([moved(item, bent)])
-    agree(device, scene)
+    assert_agree(device, scene)
     assert builds(device.mirror) == 1
     shuffled = item.vertices[np.random.default_rng(2).permutation(len(item.vertices))]
     scene.update([moved(item, shuffled)])
-    agree(device, scene)
+    assert_agree(device, scene)
     assert builds(device.mirror) == 2
     scene.update([moved(item, shuffled * np.float32(1.1))])  # as good as when it was built
-    agree(device, scene)
+    assert_agree(device, scene)
     assert builds(device.mirror) == 2
 
 
@@ -101,7 +101,7 @@ def test_what_stands_in_places_is_followed(device: WarpRenderBackend) -> None:
         few, others = plates[:split], plates[split:]
         meshes = [floor(*few, visibility=shut), floor(*others, visibility=shut, name="others", vertices=narrow)]
         scene.update([moved(item, vertices)], meshes)
-        agree(device, scene)
+        assert_agree(device, scene)
 
 
 def test_of_a_scene_that_moves_only_vertices_go_to_a_card(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -117,4 +117,4 @@ def test_of_a_scene_that_moves_only_vertices_go_to_a_card(monkeypatch: pytest.Mo
         copied.clear()
         tracer = device.mirror.tracer(scene)
         assert sum(copied) == scene.vertices.nbytes + 24 and tracer.kinds == 1  # and one row of the table
-        agree(device, scene)
+        assert_agree(device, scene)

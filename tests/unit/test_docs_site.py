@@ -115,8 +115,13 @@ def test_the_navigation_names_every_guide(docs: types.ModuleType) -> None:
 
 def test_links_of_every_guide_are_there(docs: types.ModuleType) -> None:
     named = {"README.md", *(page for group in docs.NAVIGATION.values() for page in group)}
+    broken = []
     for name in named:
-        docs.Page(ROOT, name).linked(named)
+        try:
+            docs.Page(ROOT, name).linked(named)
+        except docs.DocsError as error:
+            broken.append(str(error))
+    assert not broken, "\n".join(broken)
 
 
 def test_a_link_to_nowhere_is_an_error_and_one_to_a_source_is_the_reference(

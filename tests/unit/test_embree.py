@@ -203,12 +203,12 @@ def test_places_hit_as_copies_and_follow_what_moves() -> None:
     mesh = trimesh.creation.icosphere(subdivisions=3)
     vertices, faces = mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32)
     bvh, plain = TriangleBVH(), TriangleBVH()
-    bvh.build(vertices, faces, [Group(0, len(faces), places=PLACES)])
+    bvh.build(vertices, faces, [Group(0, len(faces), instances=PLACES)])
     built = bvh.rebuilds
     plain.build(*copies(vertices, faces, PLACES))
     assert_same_hits(bvh, plain, len(faces))
     other = PLACES[::-1] + np.float32(0.1)
-    bvh.refit(moved=(), places={0: other})
+    bvh.refit(moved=(), instances={0: other})
     plain.build(*copies(vertices, faces, other))
     assert_same_hits(bvh, plain, len(faces), 1)
     vertices = vertices * np.float32([1.0, 0.7, 1.3])
@@ -217,7 +217,7 @@ def test_places_hit_as_copies_and_follow_what_moves() -> None:
     assert_same_hits(bvh, plain, len(faces), 2)
     for count in (2, 7):  # the number of places may change
         more = np.concatenate([PLACES, PLACES + np.float32([0, 0, 0, 2])])[:count]
-        bvh.refit(moved=(), places={0: more})
+        bvh.refit(moved=(), instances={0: more})
         plain.build(*copies(vertices, faces, more))
         assert_same_hits(bvh, plain, len(faces), 3)
     assert bvh.rebuilds == built

@@ -96,5 +96,5 @@ def test_adam_forgets_what_is_new_and_keeps_what_stays():
     optimiser.step({"x": value}, {"x": np.array([0.1, 0.0])})
     assert torch.equal(value.detach()[:, 1], torch.ones(4))  # a rate for each column
     before = optimiser.first["x"].clone()
-    optimiser.take(np.array([3, -1, 0]))
+    optimiser.reindex(np.array([3, -1, 0]))
     assert np.array_equal(optimiser.first["x"], np.stack([before[3], np.zeros(2), before[0]]))

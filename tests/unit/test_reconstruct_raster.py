@@ -89,10 +89,10 @@ def double(given: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
 
 @pytest.mark.parametrize(("n", "size"), [(1, 1.0), (60, 0.25), (400, 0.12)])
 def test_maps_and_gradients_are_those_of_the_brute_force(n, size):
-    hold_against_brute_force(rasterise, n, size)
+    assert_matches_brute_force(rasterise, n, size)
 
 
-def hold_against_brute_force(rasterise, n, size):
+def assert_matches_brute_force(rasterise, n, size):
     view, given = camera(), surfels(n, seed=n, size=size)
     maps = rasterise(**given, camera=view)
     ours = (maps.features, maps.alpha, maps.depth, maps.median, maps.distortion)
@@ -112,10 +112,10 @@ def hold_against_brute_force(rasterise, n, size):
 
 
 def test_every_map_has_a_gradient_of_its_own():
-    hold_each_map_against_brute_force(rasterise)
+    assert_each_map_matches_brute_force(rasterise)
 
 
-def hold_each_map_against_brute_force(rasterise):
+def assert_each_map_matches_brute_force(rasterise):
     """Each map alone: an error in one must not hide behind the larger gradients of another."""
     view = camera(20, 16)
     for k in range(5):

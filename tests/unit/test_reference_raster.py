@@ -67,7 +67,7 @@ def join(*parts: Splats) -> Splats:
     return Splats(*(torch.cat([getattr(p, name) for p in parts]) for name in Splats.__dataclass_fields__))
 
 
-def same(a, b, tolerance: float = 1e-9) -> None:
+def assert_same(a, b, tolerance: float = 1e-9) -> None:
     for name in a.__dataclass_fields__:
         torch.testing.assert_close(getattr(a, name), getattr(b, name), rtol=0, atol=tolerance, msg=name)
 
@@ -114,7 +114,7 @@ def test_the_nearer_surfel_wins_whatever_the_order_of_storage():
     centre = project(camera, near.centre)[0]
     strength_far = float(rasterise(far, camera, centre).coverage)
     ways = [rasterise(join(near, far), camera, centre), rasterise(join(far, near), camera, centre)]
-    same(*ways)
+    assert_same(*ways)
     w_near, w_far = 0.9, 0.1 * strength_far
     assert float(ways[0].coverage) == pytest.approx(w_near + w_far)
     expected = torch.tensor([[w_near, w_far, 0]], dtype=F64) / (w_near + w_far)
@@ -148,7 +148,7 @@ def test_tangents_may_turn_and_shear_while_their_covariance_stays():
     turned.tangent_u = c * cloud.tangent_u + s * cloud.tangent_v
     turned.tangent_v = c * cloud.tangent_v - s * cloud.tangent_u
     assert ((turned.tangent_u * turned.tangent_v).sum(1).abs() > 1e-4).any()
-    same(rasterise(cloud, camera), rasterise(turned, camera))
+    assert_same(rasterise(cloud, camera), rasterise(turned, camera))
 
 
 def test_the_picture_turns_with_the_camera():
@@ -202,7 +202,7 @@ def test_normals_face_the_viewer_and_have_length_one():
     flipped.normal = -cloud.normal
     camera = look()
     a, b = rasterise(cloud, camera), rasterise(flipped, camera)
-    same(a, b)
+    assert_same(a, b)
     seen = a.coverage > 0
     torch.testing.assert_close(torch.linalg.vector_norm(a.normal[seen], dim=1), torch.ones(int(seen.sum()), dtype=F64))
     assert ((a.normal * camera_rays(camera, pixel_centres(camera))[1]).sum(1)[seen] < 0).all()
@@ -226,7 +226,7 @@ def test_a_jump_of_the_depth_separates_surfaces():
 
 def test_batches_do_not_change_the_picture():
     cloud = splats(15, 7)
-    same(rasterise(cloud, look()), rasterise(cloud, look(), batch_size=100), 1e-12)
+    assert_same(rasterise(cloud, look()), rasterise(cloud, look(), batch_size=100), 1e-12)
 
 
 def test_a_scene_of_no_surfels_is_empty():

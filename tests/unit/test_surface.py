@@ -47,7 +47,7 @@ def meet(scene: TraceScene, origins: np.ndarray, directions: np.ndarray, mask: i
     """t (n,), (n, 4) face, place, object, blocked, and (n, 17) the surface."""
     o, d = (np.ascontiguousarray(a, np.float32) for a in (origins, directions))
     t, numbers, out = np.empty(len(o), np.float32), np.empty((len(o), 4), np.int32), np.zeros((len(o), 17), np.float32)
-    arrays = scene.vertices, scene.faces, scene.places
+    arrays = scene.vertices, scene.faces, scene.instances
     _meet(scene.tracer, scene.geometry, *arrays, o, d, np.int32(mask), t, numbers, out)
     return t, numbers, out
 
@@ -298,8 +298,8 @@ def test_matrices_that_cannot_be_used_are_left_out_and_counted(matrices: list, u
     good = trace_object(vertices + F([0, 0, 50]), faces)
     for _ in range(2):
         scene.update([good], [mesh_state(vertices, faces, *matrices, name="cup")])
-        assert (scene.faults[1].name, scene.faults[1].bad_places) == ("cup", left_out)
-        assert scene.faults[0].bad_places == 0
+        assert (scene.faults[1].name, scene.faults[1].bad_instances) == ("cup", left_out)
+        assert scene.faults[0].bad_instances == 0
         assert len(scene.faces) == len(faces) * (1 + (usable > 0))
         origins, directions = aimed_rays(1000)
         t, numbers, out = meet(scene, origins, directions)

@@ -35,7 +35,7 @@ def other(kind: str) -> bytes:
     return data.getvalue()
 
 
-def check(path: Path, whole: bytes) -> None:
+def assert_complete(path: Path, whole: bytes) -> None:
     """It is whole as it is, and not without any number of its last bytes."""
     path.write_bytes(whole)
     assert is_whole(path)
@@ -46,11 +46,11 @@ def check(path: Path, whole: bytes) -> None:
 
 @pytest.mark.parametrize("compression", COMPRESSIONS)
 def test_exr_with_any_compression(tmp_path: Path, compression: str) -> None:
-    check(tmp_path / "a.exr", exr(tmp_path / "a.exr", compression))
+    assert_complete(tmp_path / "a.exr", exr(tmp_path / "a.exr", compression))
 
 
 def test_exr_of_several_layers(tmp_path: Path) -> None:
-    check(tmp_path / "a.exr", exr(tmp_path / "a.exr", "ZIP", 3))
+    assert_complete(tmp_path / "a.exr", exr(tmp_path / "a.exr", "ZIP", 3))
 
 
 def test_exr_whose_table_was_never_written(tmp_path: Path) -> None:
@@ -63,4 +63,4 @@ def test_exr_whose_table_was_never_written(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["PNG", "JPEG", "WebP"])
 def test_other_formats(tmp_path: Path, kind: str) -> None:
-    check(tmp_path / "a", other(kind))
+    assert_complete(tmp_path / "a", other(kind))

@@ -1,1 +1,1 @@
-"""Jobs for farm managers, written as each of them wants to have it; none of them is replaced here."""
+"""Job files for render farms: Slurm, OpenJD, Flamenco; and the check before a submission."""

@@ -17,7 +17,7 @@ _TILES = re.compile(r"<(UDIM|UVTILE)>")
 
 @dataclass(slots=True)
 class Report:
-    """What was found.
+    """Findings of a check.
 
     Attributes
     ----------

@@ -51,7 +51,7 @@ _ANY = object()
 
 
 class Expressions:
-    """What the expressions of a function become.
+    """Translation of the expressions of a function.
 
     A call of what returns a tuple takes lines of its own, which go before the one under way.
 
@@ -383,7 +383,7 @@ def named(name: str, kind: Type) -> Value:
 
 
 def assigned(tree: ast.FunctionDef) -> dict[str, int]:
-    """How often each variable of a function is assigned."""
+    """Number of assignments of each variable of a function."""
     found: dict[str, int] = {}
     for node in ast.walk(tree):
         if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):

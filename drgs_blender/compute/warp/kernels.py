@@ -136,7 +136,7 @@ class Launcher:
                     array[...] = result.numpy()
 
     def recorded(self, work: Work, pieces: int, arguments: Sequence[Any], out: Sequence[Any]) -> Callable[[], None]:
-        """The same launch, not done now but whenever it is called, at little cost; all its arrays are the device's.
+        """A recorded launch, executed whenever it is called, at little cost; all its arrays are the device's.
 
         Raises
         ------

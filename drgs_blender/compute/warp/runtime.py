@@ -149,7 +149,7 @@ def _is_whole(value: tuple[Any, ...]) -> bool:
 
 
 def parts_of(value: Any) -> Iterable[Any]:
-    """What a kernel takes of nested tuples, in order: structs whole, no truth values, for these are known."""
+    """Kernel arguments of nested tuples, in order: structs whole, no truth values, for these are known."""
     if isinstance(value, tuple) and not _is_whole(value):
         for part in value:
             yield from parts_of(part)

@@ -8,7 +8,7 @@ import numpy as np
 
 
 def first_of(keys: Any, count: Any, key: Any) -> Any:
-    """How many of the `count` first keys, whole numbers in rising order, are lower."""
+    """Number of the `count` first keys, integers in rising order, that are lower (binary search)."""
     low, high = np.int64(0), np.int64(count)
     while low < high:
         middle = (low + high) // 2

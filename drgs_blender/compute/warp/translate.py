@@ -151,7 +151,7 @@ class Translation:
         return self._numbers.setdefault((kind, text), f"N{len(self._numbers)}")
 
     def resolve(self, function: Any, name: str) -> Any:
-        """What a global name of a function means there."""
+        """Translation of a global name of a function."""
         if name in function.__globals__:
             return self.constants(sys.modules[function.__module__], name, function.__globals__[name])
         closure = inspect.getclosurevars(function)

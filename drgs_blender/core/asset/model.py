@@ -128,7 +128,7 @@ class Mesh:
 
 @dataclass(slots=True)
 class Binding:
-    """How surfel i hangs on face ``face[i]``: p = sum_k barycentric_k v_k + offset * r_rest * n_face.
+    """Binding of surfel i to face ``face[i]``: p = sum_k barycentric_k v_k + offset * r_rest * n_face.
 
     Attributes
     ----------

@@ -1,1 +1,1 @@
-"""Deformation on a graphics card; on the CPU, by the same translation, for tests."""
+"""Deformation on a graphics card, by Warp; on Warp's CPU device for tests."""

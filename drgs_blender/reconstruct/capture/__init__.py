@@ -1,1 +1,1 @@
-"""A capture: calibrated photographs of one object, and the views that training uses."""
+"""A capture: calibrated photographs of one object, and the training views made of them."""

@@ -57,7 +57,7 @@ class Capture:
 
     @property
     def name(self) -> str:
-        """What it is called in reports: its folder, and its file where one was chosen."""
+        """Name in reports: the folder, and the file where one was chosen."""
         path = self.source.resolve()
         return f"{path.parent.name}/{path.name}" if path.is_file() else path.name
 

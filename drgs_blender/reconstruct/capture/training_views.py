@@ -48,7 +48,7 @@ class Target:
 
 
 def background_of(capture: Capture) -> tuple[float, float, float]:
-    """What the surfels are seen against."""
+    """Background colour behind the surfels."""
     if capture.background is not None:
         return capture.background
     masked = all(view.mask is not None for view in capture.training)

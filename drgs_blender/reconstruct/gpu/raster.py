@@ -138,7 +138,7 @@ class _Pairs:
 
 
 def starts(counts: Tensor) -> tuple[Tensor, int]:
-    """Where runs of these lengths (m,) begin, and the last ends: (m + 1,) int64, and the latter as a number.
+    """Prefix sum of the lengths of runs (m,): (m + 1,) int64, and its last value as a number.
 
     Raises
     ------

@@ -36,6 +36,6 @@ class LearnedLight:
 
 
 def colour_cast(radiance: Tensor) -> Tensor:
-    """How far (h, w, 3) radiance is from grey, in parts of its mean: the paper's regulariser of white balance."""
+    """Deviation of (h, w, 3) radiance from grey, relative to its mean: the paper's white-balance regulariser."""
     grey = radiance.mean(-1, keepdim=True)
     return (radiance - grey).abs().mean() / radiance.detach().mean()

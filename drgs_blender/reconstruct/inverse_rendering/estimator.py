@@ -58,7 +58,7 @@ _NONE = np.int32(-1)
 
 
 class Samples(NamedTuple):
-    """What `scatter` needs of each drawn direction; (n, s, ...), s over both halves.
+    """Records of the drawn directions for `scatter`; (n, s, ...), s over both halves.
 
     Attributes
     ----------
@@ -85,7 +85,7 @@ class Points(NamedTuple):
 
 
 class Lobes(NamedTuple):
-    """What of the surfaces is inside the integral.
+    """Surface properties inside the integral.
 
     Attributes
     ----------
@@ -100,7 +100,7 @@ class Lobes(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """How directions are drawn.
+    """Sampling plan: how directions are drawn.
 
     Attributes
     ----------
@@ -154,7 +154,7 @@ class Sky(NamedTuple):
 
 
 class Sums(NamedTuple):
-    """What is gathered of pixels and either half of their samples.
+    """Sums gathered per pixel, for either half of its samples.
 
     Attributes
     ----------

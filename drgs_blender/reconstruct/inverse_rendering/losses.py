@@ -25,7 +25,7 @@ def log_loss(predicted: Tensor, photographed: Tensor) -> Tensor:
 
 
 def dullness(albedo: Tensor, metallic: Tensor) -> Tensor:
-    """How much less metals (n, 3), (n,) reflect than polished ones do, mean squared difference of their colours.
+    """Metal albedo prior: mean squared difference of the colours of metals (n, 3), (n,) from polished ones.
 
     Where light is dim, only metal shows how dim: dark metal in a light that is too even looks almost the same.
     Metals that are used polished reflect nine tenths and more of their brightest channel. Gradients scale a colour and
@@ -37,7 +37,7 @@ def dullness(albedo: Tensor, metallic: Tensor) -> Tensor:
 
 
 def blotches(differences: Tensor, metallic: Tensor, likeness: Tensor) -> Tensor:
-    """How uneven metal is: mean over edges, summed over channels.
+    """Metal smoothness prior: unevenness of metal, mean over edges, summed over channels.
 
     The albedo of metal takes in what its normals are off, from vertex to vertex, as no diffuse light evens them out.
 

@@ -27,7 +27,7 @@ _DIELECTRIC = 0.04
 
 
 class Grids:
-    """Where the vertices lie in nested grids: (v, 8) corners and shares of each, corners numbered without gaps."""
+    """Position of the vertices in nested grids: (v, 8) corners and shares of each, corners numbered without gaps."""
 
     def __init__(self, vertices: Array, count: int) -> None:
         low = vertices.min(axis=0)
@@ -51,7 +51,7 @@ class Grids:
 
 
 class Materials:
-    """What is learned of the surface.
+    """The learned materials of the surface.
 
     Attributes
     ----------

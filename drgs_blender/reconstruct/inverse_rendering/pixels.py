@@ -78,7 +78,7 @@ class Pixels:
 def foreground_pixels(
     views: list[View], mesh: Mesh, tree: TriangleBVH, most: int, seed: int = 0, normals: Normals | None = None
 ) -> Pixels:
-    """What the pixels of `views` see of the mesh, a pixel away from its outline and the mask's.
+    """The pixels of `views` that see the mesh, a pixel away from its outline and the mask's.
 
     Parameters
     ----------
@@ -120,7 +120,7 @@ def foreground_pixels(
 
 
 def pixels_of(index: int, view: View, mesh: Mesh, tree: TriangleBVH, normals: Normals | None = None) -> Pixels:
-    """Those of one view, the `index`-th; see `foreground_pixels`."""
+    """The foreground pixels of one view, the `index`-th; see `foreground_pixels`."""
     height, width = view.colour.shape[:2]
     x0, y0, x1, y1 = view.camera.window
     if (height, width) != (y1 - y0, x1 - x0):

@@ -70,7 +70,7 @@ class Decoupled:
 
 @dataclass(slots=True)
 class Progress:
-    """How far a run is: `part` of it is done, 0..1; `result` makes what it has so far."""
+    """Progress of a run: `part` of it is done, 0..1; `result` makes the present result."""
 
     iteration: int
     part: float
@@ -145,7 +145,7 @@ def decouple(
 
 
 class Score:
-    """How near to the photographs the pixels of the last steps are: running means.
+    """Running means of loss and error of the last steps.
 
     Attributes
     ----------
@@ -163,7 +163,7 @@ class Score:
         return float(-10 * np.log10(np.maximum(self.error, 1e-12)))
 
     def note(self, loss: float, predicted: Tensor, photographed: Tensor) -> None:
-        """Take a step's pixels (n, 3) in, linear Rec.709."""
+        """Add a step's loss and pixels (n, 3), linear Rec.709."""
         a, b = (linear_to_srgb(x.clamp(0, 1).numpy()) for x in (predicted, photographed))
         error = float(((a - b) ** 2).mean())
         first = not self.error >= 0
@@ -281,7 +281,7 @@ class Job:
         return loss
 
     def result(self) -> Decoupled:
-        """What has been learned so far."""
+        """Materials and light as learned so far."""
         known = self._weight > 1e-3
         values = np.column_stack(self.surface.materials.values())
         values = np.clip(filled(values, known, self._mesh), 0, 1)

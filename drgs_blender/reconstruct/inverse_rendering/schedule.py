@@ -43,7 +43,7 @@ class Schedule:
 
     @property
     def part(self) -> float:
-        """What is done of the schedule, more than 1 where time is over."""
+        """Fraction of the schedule that is done, more than 1 where time is over."""
         done = self.iteration / self._settings.iterations
         return max(done, self.elapsed / self._settings.seconds) if self._settings.seconds > 0 else done
 
@@ -56,7 +56,7 @@ class Schedule:
         self.iteration, self._spent = iteration, spent
 
     def doublings_ahead(self, part: float) -> int:
-        """How often the rows of the environment are still to be doubled."""
+        """Number of doublings of the environment's resolution that are still to come."""
         return sum(part < at for at in _GROWS) if self._settings.coarse_to_fine else 0
 
     def weighs_by_prediction(self) -> bool:

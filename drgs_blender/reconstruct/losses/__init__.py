@@ -1,1 +1,1 @@
-"""Losses of pre-training: photographs, shape."""
+"""Losses of training: photometric (L1, SSIM), and of the shape (normals, distortion, masks)."""

@@ -29,7 +29,7 @@ WINDOW = tuple(np.float32(x) for x in _TAPS / _TAPS.sum())
 
 @dataclass(slots=True)
 class Photograph:
-    """What to compare with: colour (h, w, 3) float32, and its blurred values and squares (2, h, w, 3) where kept."""
+    """Target of the loss: colour (h, w, 3) float32, and its blurred values and squares (2, h, w, 3) where kept."""
 
     colour: Array
     kept: Array | None = None

@@ -1,1 +1,1 @@
-"""Meshing: depth maps and masks to a closed mesh."""
+"""Meshing: visual hull, TSDF fusion of depth maps, silhouette fit, normal integration; the result is a closed mesh."""

@@ -38,7 +38,7 @@ AWAY = 2
 
 @dataclass(slots=True)
 class Region:
-    """Where surfels may be.
+    """The region of the object, in which surfels may be.
 
     Attributes
     ----------

@@ -1,1 +1,1 @@
-"""The surfels that are learned, and the differentiable rasteriser that shows them."""
+"""The surfels that are learned: parameters, initialisation, and the differentiable rasteriser (2DGS)."""

@@ -58,7 +58,7 @@ class Attached(Gaussians):
         return Attached(parameters, self.base, self.normal, self.edge, self.fixed, self.light, self.backend)
 
     def on(self, backend: LearningBackend) -> Attached:
-        """The same surfels where another processor has its tensors."""
+        """The same surfels with tensors on another backend's device."""
         parameters, light = self._tensors_on(backend)
         base, normal, edge = (t.to(backend.device) for t in (self.base, self.normal, self.edge))
         return Attached(parameters, base, normal, edge, self.fixed, light, backend)

@@ -24,7 +24,7 @@ COEFFICIENTS = {0: 1, 1: 4, 2: 9, 3: 16}
 
 
 class Learned(NamedTuple):
-    """What is learned of surfels, or gradients of it; names are those of `gaussians.Gaussians`.
+    """Learned parameters of surfels, or their gradients; names are those of `gaussians.Gaussians`.
 
     Attributes
     ----------
@@ -51,7 +51,7 @@ class Learned(NamedTuple):
 
 
 class Attributes(NamedTuple):
-    """What the rasteriser takes of surfels, or gradients of it.
+    """Attributes of surfels for the rasteriser, or their gradients.
 
     Attributes
     ----------
@@ -71,7 +71,7 @@ class Attributes(NamedTuple):
 def attributes(
     parameters: dict[str, Tensor], centre: Tensor, eye: Array, bands: int, mirrors: bool
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """What a view from `eye` (3,) blends; differentiable in the parameters of `gaussians.Gaussians`.
+    """Attributes that a view from `eye` (3,) blends; differentiable in the parameters of `gaussians.Gaussians`.
 
     The dependence of direction and facing on the centre is not differentiated.
 

@@ -50,7 +50,7 @@ class Splats(NamedTuple):
 
 
 class Tiles(NamedTuple):
-    """Which splats may be seen in which tile of the picture.
+    """Splats per tile of the picture.
 
     Attributes
     ----------

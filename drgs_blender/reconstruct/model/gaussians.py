@@ -28,7 +28,7 @@ MATT = -3.0
 
 @dataclass(slots=True)
 class RenderedView:
-    """One view of the surfels.
+    """A rendered view of the surfels.
 
     Attributes
     ----------
@@ -136,11 +136,11 @@ class Gaussians:
         return Gaussians(parameters, self.light, self.backend)
 
     def on(self, backend: LearningBackend) -> Gaussians:
-        """The same surfels where another processor has its tensors."""
+        """The same surfels with tensors on another backend's device."""
         return Gaussians(*self._tensors_on(backend), backend)
 
     def _tensors_on(self, backend: LearningBackend) -> tuple[dict[str, Tensor], Tensor | None]:
-        """Parameters and light at a processor's place."""
+        """Parameters and light as tensors on a backend's device."""
         light = None if self.light is None else self.light.detach().to(backend.device)
         return {k: v.detach().to(backend.device) for k, v in self.parameters.items()}, light
 
@@ -149,7 +149,7 @@ class Gaussians:
         return {k: v.numpy(force=True) for k, v in self.parameters.items()}
 
     def surfels(self) -> Surfels:
-        """What an asset holds. The albedo is the mean colour as photographed, light included, decoded."""
+        """Surfels as an asset holds them. The albedo is the mean colour as photographed, light included, decoded."""
         with torch.no_grad():
             raw = self.arrays()
             u, v, normal = self.frames()

@@ -35,7 +35,7 @@ from .projection import OPACITY, RECORD, Projected, WorldSurfels, project, proje
 
 @dataclass(slots=True)
 class Maps:
-    """What a view shows: features (h, w, c), the others (h, w); see the module."""
+    """Maps of a view: features (h, w, c), the others (h, w); see the module."""
 
     features: Tensor
     alpha: Tensor
@@ -46,7 +46,7 @@ class Maps:
 
 @dataclass(slots=True)
 class Tally:
-    """What a backward pass notes about surfels, for densification.
+    """Gradient statistics of surfels, collected by backward passes for densification.
 
     Attributes
     ----------
@@ -62,7 +62,7 @@ class Tally:
 
     @classmethod
     def of(cls, n: int, place: torch.device | None = None) -> Tally:
-        """Nothing noted yet about `n` surfels."""
+        """Empty statistics of `n` surfels."""
         return cls(torch.zeros(n, device=place), torch.zeros(n, dtype=torch.int32, device=place))
 
 

@@ -31,7 +31,7 @@ SAMPLED_VIEWS = 15
 
 
 def normals_of(gaussians: Gaussians) -> Normals:
-    """What surfels show of normals in a view."""
+    """Function that renders the normals of surfels in a view."""
 
     def shown(view: View) -> Array:
         with torch.no_grad():

@@ -1,1 +1,1 @@
-"""The optimiser and the training of stage (i)."""
+"""Training of stage (i): the optimiser (Adam), densification and pruning, schedules, training views."""

@@ -66,7 +66,7 @@ class Adam:
             self._descend(*rows, np.ascontiguousarray(rate * np.float32(correction)))
             value.grad = None
 
-    def take(self, rows: Array) -> None:
+    def reindex(self, rows: Array) -> None:
         """Keep the moments of `rows` in this order; those of -1 start over."""
         for moments in (self.first, self.second):
             for name, value in moments.items():

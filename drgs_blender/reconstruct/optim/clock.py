@@ -33,7 +33,7 @@ class Clock:
         self.spent = self.tried = 0.0
 
     def part(self, trying: bool) -> float:
-        """What part of the schedule the time spent is, 0 without a limit.
+        """Fraction of the time limit that is spent, 0 without a limit.
 
         Parameters
         ----------

@@ -96,7 +96,7 @@ class Fallback:
         self.remember(self.attempt(self._training.state))
 
     def save_gpu_state(self, every: float = 0.0) -> None:
-        """The same, where the steps run on a GPU and the last copy is `every` seconds old."""
+        """Copy the state where the steps run on a GPU and the last copy is `every` seconds old."""
         if self.backend is not CPU and self._now() >= self._saved_at + every:
             self.save_state()
 

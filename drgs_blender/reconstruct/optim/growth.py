@@ -29,7 +29,7 @@ class Growth:
         return int(self._grown(part) * self._schedule.rounds)
 
     def budget(self, part: float) -> int:
-        """How many surfels there may be then."""
+        """Largest number of surfels at this part of the schedule."""
         return int(self.start + (self._schedule.surfels - self.start) * self._grown(part))
 
     def _grown(self, part: float) -> float:

@@ -14,10 +14,10 @@ from ...core.arrays import Array
 from ..backend import LearningBackend
 from ..capture.training_views import Target, pixel_rays
 from ..model.attributes import TINT
-from ..model.densification import densify
 from ..model.gaussians import Gaussians, RenderedView
 from ..model.raster import Tally
 from .adam import Adam
+from .densification import densify
 from .schedule import LIGHT_RATE, Schedule, learning_rates
 
 log = logging.getLogger(__name__)

@@ -17,7 +17,7 @@ COLOUR_RATE, HIGHER_BANDS = (2e-2, 0.1), 0.1
 
 @dataclass(frozen=True, slots=True)
 class Schedule:
-    """How surfels are learned.
+    """Settings of the training of surfels.
 
     Attributes
     ----------

@@ -80,7 +80,7 @@ class Trial:
         self.rival = self.first = None
 
     def arrays(self) -> dict[str, Array]:
-        """What `restore` needs; nothing where no trial goes on."""
+        """The arrays that `restore` needs; none where no trial goes on."""
         if not self.goes_on:
             return {}
         return {"trying": np.ones(1, np.int64)} | {f"before.{k}": v for k, v in (self.first or {}).items()}

@@ -97,7 +97,7 @@ class Training:
 
     @property
     def gaussians(self) -> Gaussians:
-        """What has been learned."""
+        """The surfels as trained so far."""
         return self.learner.gaussians
 
     @property
@@ -112,17 +112,17 @@ class Training:
 
     @property
     def part(self) -> float:
-        """What is done of the schedule, 0..1."""
+        """Fraction of the schedule that is done, 0..1."""
         return min(max(self.iteration / self.schedule.iterations, self.clock.part(self.trying)), 1.0)
 
     @property
     def finished(self) -> bool:
-        """Nothing is left to do."""
+        """Whether the schedule is done."""
         return self.part >= 1 and not self.trying
 
     @property
     def psnr(self) -> float | None:
-        """Of the latest training views, decibels; None before the first step."""
+        """PSNR of the latest training views, decibels; None before the first step."""
         return None if not self.iteration else -10 * float(np.log10(max(self.learner.error, 1e-10)))
 
     def step(self) -> None:

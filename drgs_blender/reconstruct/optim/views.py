@@ -16,7 +16,7 @@ KEPT_ON_DEVICE = 100_000_000
 
 
 class Views:
-    """What surfels are compared with, where a processor can read it.
+    """The training views, in the memory of a backend.
 
     Parameters
     ----------

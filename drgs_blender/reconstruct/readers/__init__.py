@@ -1,4 +1,4 @@
-"""Captures of every layout, recognised by what lies in the folder."""
+"""Readers of captures: COLMAP, NeRF transforms, LLFF, NeRO, TensoIR; recognised by the files of the folder."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ Distort = Callable[[Array, Array, Array], tuple[Array, Array]]
 
 @dataclass(frozen=True, slots=True)
 class Lens:
-    """What a camera does with the directions of light.
+    """Lens model of a camera: intrinsics and distortion.
 
     Attributes
     ----------

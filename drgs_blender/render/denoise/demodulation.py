@@ -50,7 +50,7 @@ class Signal:
     spans: Array
 
     def to_cpu(self) -> Signal | None:
-        """The same in this process's memory; None where it is lost with the device that had it."""
+        """A copy in this process's memory; None where it is lost with the device that had it."""
         return self
 
 
@@ -65,7 +65,7 @@ def demodulate(components: Array, variance: Array, guides: Guides, split: bool =
 
 
 def planes_of(split: bool) -> int:
-    """How many planes a signal has."""
+    """Number of planes of a signal."""
     return LIGHT + (12 if split else 6)
 
 
@@ -158,7 +158,7 @@ def _demodulate(first, last, components, variance, surface, guide, light, spans)
 
 @inlined
 def find_span(y, coverage, spans):  # type: ignore[no-untyped-def]
-    """Which columns of a row are covered."""
+    """Span of the covered columns of a row."""
     first, last = coverage.shape[1], 0
     for x in range(coverage.shape[1]):
         if coverage[y, x] > ZERO:

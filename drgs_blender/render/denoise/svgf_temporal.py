@@ -71,7 +71,7 @@ class Shot:
 
 @dataclass(slots=True)
 class History:
-    """What the pictures of a sequence leave for the next one.
+    """Temporal history: data of the last pictures of a sequence for the next one.
 
     Attributes
     ----------
@@ -168,7 +168,7 @@ def warp(other: Signal, signal: Signal, vector: Array, expected: Array) -> tuple
 
 
 def find_change(signal: Signal, past: Array, source: Array) -> Array:
-    """How two pictures differ beyond their noise, (h, CHANGES, w + 2 PAD) float32."""
+    """Difference of two pictures beyond their noise, (h, CHANGES, w + 2 PAD) float32."""
     out = np.zeros((len(past), CHANGES, past.shape[2]), np.float32)
     over_range(_compare, len(past), signal.guide, signal.spans, signal.light, past, source, out, fewest=ROWS)
     return out

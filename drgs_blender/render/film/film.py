@@ -82,7 +82,7 @@ class Pixels(NamedTuple):
         return made
 
     def rows(self, first: int, last: int) -> Pixels:
-        """Those of some rows, the same memory."""
+        """View of some rows, in the same memory."""
         return Pixels(*(array[first:last] for array in self))
 
 

@@ -33,5 +33,5 @@ class Guides(NamedTuple):
     footprint: Array
 
     def plain(self) -> Guides:
-        """The same as kernels take it, see `compute.jit.plain`."""
+        """The same as plain arrays for kernels, see `compute.jit.plain`."""
         return Guides(*map(plain, self))

@@ -28,14 +28,14 @@ class Instant(NamedTuple):
 
     Attributes
     ----------
-    vertices, places : array
+    vertices, instances : array
         Laid out as those of `scene.trace_scene.TraceScene`.
     parameters : array
         `camera.camera_parameters`.
     """
 
     vertices: Array
-    places: Array
+    instances: Array
     parameters: Array
 
 
@@ -56,7 +56,7 @@ class Motion(NamedTuple):
 
 
 def previous_positions(
-    faces: Array, now: Instant, then: Instant, face: Array, place: Array, barycentric: Array, position: Array
+    faces: Array, now: Instant, then: Instant, face: Array, instance: Array, barycentric: Array, position: Array
 ) -> Array:
     """World positions of surface points at another time.
 
@@ -66,8 +66,8 @@ def previous_positions(
     now, then : Instant
     face : (n,) int32 array
         The face each point is tied to; negative for points that are tied to nothing and do not move.
-    place : (n,) int32 array
-        The row of ``places`` that the face stands in; negative for a face in world space.
+    instance : (n,) int32 array
+        The row of ``instances`` that the face stands in; negative for a face in world space.
     barycentric : (n, 2) float32 array
         Weights of the face's second and third corner, as Embree gives them.
     position : (n, 3) float32 array
@@ -78,7 +78,7 @@ def previous_positions(
     (n, 3) float32 array
     """
     out = np.empty((len(face), 3), np.float32)
-    tied = face, place, barycentric
+    tied = face, instance, barycentric
     over_range(_previous, len(face), faces, now, then, *tied, position, out, fewest=ELEMENTS)
     return out
 
@@ -103,8 +103,8 @@ class MotionFilm:
     def add(self, buffer: GBuffer, scene: TraceScene) -> None:
         """Take the samples of the strip `buffer`."""
         position = buffer.position
-        if self.then.vertices is not self.now.vertices or self.then.places is not self.now.places:
-            tied = buffer.face, buffer.place, buffer.barycentric
+        if self.then.vertices is not self.now.vertices or self.then.instances is not self.now.instances:
+            tied = buffer.face, buffer.instance, buffer.barycentric
             self.displace(buffer, previous_positions(scene.faces, self.now, self.then, *tied, position))
 
     def displace(self, buffer: GBuffer, previous: Array) -> None:
@@ -168,15 +168,15 @@ def _basis(v, faces, f):  # type: ignore[no-untyped-def]
 
 
 @njit
-def _previous(first, last, faces, now, then, face, place, barycentric, position, out):  # type: ignore[no-untyped-def]
+def _previous(first, last, faces, now, then, face, instance, barycentric, position, out):  # type: ignore[no-untyped-def]
     for i in range(first, last):
-        f, stand = face[i], place[i]
+        f, stand = face[i], instance[i]
         if f < 0:
             out[i, 0], out[i, 1], out[i, 2] = position[i, 0], position[i, 1], position[i, 2]
             continue
         if stand >= 0:
-            x, y, z = position_at(f, stand, barycentric[i, 0], barycentric[i, 1], now.vertices, faces, now.places)
-            u, v, w = position_at(f, stand, barycentric[i, 0], barycentric[i, 1], then.vertices, faces, then.places)
+            x, y, z = position_at(f, stand, barycentric[i, 0], barycentric[i, 1], now.vertices, faces, now.instances)
+            u, v, w = position_at(f, stand, barycentric[i, 0], barycentric[i, 1], then.vertices, faces, then.instances)
             out[i, 0], out[i, 1], out[i, 2] = (
                 position[i, 0] + (u - x),
                 position[i, 1] + (v - y),

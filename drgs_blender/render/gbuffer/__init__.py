@@ -1,1 +1,1 @@
-"""The G-buffer, what the camera sees, from surfels and from meshes."""
+"""The G-buffer: the camera's primary hits of surfels, meshes and visible lights, and their shading points."""

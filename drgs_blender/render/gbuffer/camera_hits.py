@@ -23,7 +23,7 @@ _BLOCK = 256
 
 @dataclass(slots=True)
 class MeshHits:
-    """What camera rays through the sub-pixel samples of some rows meet first.
+    """First hits of meshes by camera rays through the sub-pixel samples of some rows.
 
     Attributes
     ----------
@@ -31,7 +31,7 @@ class MeshHits:
         Metres along the view axis.
     owner : (rows, width, subpixels) int32 array
         Object, or -1 where nothing is met; the other arrays are undefined there.
-    face, place : (rows, width, subpixels) int32 array
+    face, instance : (rows, width, subpixels) int32 array
     where : (rows, width, subpixels, 5) float32 array
         The hit's u and v, and its geometric normal as `surface_at` wants it.
     """
@@ -39,13 +39,13 @@ class MeshHits:
     depth: Array
     owner: Array
     face: Array
-    place: Array
+    instance: Array
     where: Array
 
     @property
     def arrays(self) -> tuple[Array, ...]:
         """All of them."""
-        return self.depth, self.owner, self.face, self.place, self.where
+        return self.depth, self.owner, self.face, self.instance, self.where
 
 
 def trace_camera(scene: TraceScene, parameters: Array, x0: int, y0: int, shape: tuple[int, ...], mask: int) -> MeshHits:
@@ -62,12 +62,12 @@ def trace_camera(scene: TraceScene, parameters: Array, x0: int, y0: int, shape: 
         (rows, width, subpixels).
     mask : int
     """
-    owner, face, place = (np.empty(shape, np.int32) for _ in range(3))
-    hits = MeshHits(np.empty(shape, np.float32), owner, face, place, np.empty((*shape, 5), np.float32))
+    owner, face, instance = (np.empty(shape, np.int32) for _ in range(3))
+    hits = MeshHits(np.empty(shape, np.float32), owner, face, instance, np.empty((*shape, 5), np.float32))
     if not mask:
         hits.owner[:] = -1
         return hits
-    owners = scene.face_object, scene.place_object
+    owners = scene.face_object, scene.instance_object
     lanes = 8 * get_num_threads()
     over_range(_trace, lanes, lanes, scene.tracer, (parameters, x0, y0), np.int32(mask), owners, hits.arrays)
     return hits
@@ -75,7 +75,7 @@ def trace_camera(scene: TraceScene, parameters: Array, x0: int, y0: int, shape: 
 
 def shade_mesh(scene: TraceScene, hits: MeshHits, parameters: Array, x0: int, buffer: GBuffer, layer: int) -> None:
     """Fill the points of `buffer` that have the flags `layer` from `hits`."""
-    moving = scene.vertices, scene.faces, scene.places
+    moving = scene.vertices, scene.faces, scene.instances
     view_of = parameters, x0, buffer.rows[0]
     keys, out = arrays_of(buffer)
     lanes = 8 * get_num_threads()
@@ -88,7 +88,7 @@ def arrays_of(buffer: GBuffer) -> tuple[tuple[Array, ...], tuple[tuple[Array, ..
     frames = points.origin, points.normal, points.geometric_normal, points.view
     materials = points.albedo, points.roughness, points.metallic
     seen = buffer.position, buffer.depth, buffer.object_index, buffer.emission
-    tied = buffer.face, buffer.place, buffer.barycentric
+    tied = buffer.face, buffer.instance, buffer.barycentric
     return (points.pixel, points.sample, points.flags), (frames, materials, (*seen, *tied))
 
 
@@ -120,8 +120,8 @@ def trace_samples(lane, lanes, room, tracer, view_of, mask, owners, out):  # typ
         `MeshHits.arrays`.
     """
     p, x0, y0 = view_of
-    face_object, place_object = owners
-    depth, owner, face, place, where = out
+    face_object, instance_object = owners
+    depth, owner, face, instance, where = out
     width = np.int64(p[WIDTH])
     rows, columns, subpixels = depth.shape
     near, far = np.float32(p[CLIP_START]), np.float32(p[CLIP_END])
@@ -132,12 +132,12 @@ def trace_samples(lane, lanes, room, tracer, view_of, mask, owners, out):  # typ
             ox, oy, oz, dx, dy, dz = sample_ray(p, (y0 + y) * width + x0 + x, k)
             start, along = (F(ox), F(oy), F(oz)), (F(dx), F(dy), F(dz))
             t, f, i, u, v, gx, gy, gz = nearest(tracer, Ray(start, along, near, far, mask))
-            depth[y, x, k], face[y, x, k], place[y, x, k] = t, f, i
+            depth[y, x, k], face[y, x, k], instance[y, x, k] = t, f, i
             where[y, x, k, 0], where[y, x, k, 1] = u, v
             where[y, x, k, 2], where[y, x, k, 3], where[y, x, k, 4] = gx, gy, gz
             owner[y, x, k] = -1
             if f >= 0 and i >= 0:
-                owner[y, x, k] = place_object[i]
+                owner[y, x, k] = instance_object[i]
             elif f >= 0:
                 owner[y, x, k] = face_object[f]
 
@@ -161,14 +161,14 @@ def shade_hits(lane, lanes, room, geometry, moving, view_of, layer, hits, keys, 
     keys, out : tuple
         `arrays_of`.
     """
-    vertices, faces, places = moving
+    vertices, faces, instances = moving
     p, x0, y0 = view_of
-    hit_depth, _, hit_face, hit_place, where = hits
+    hit_depth, _, hit_face, hit_instance, where = hits
     pixel, sample, flags = keys
     frames, materials, seen = out
     origin, normal, geometric, view = frames
     albedo, roughness, metallic = materials
-    position, depth, owner, emission, out_face, out_place, barycentric = seen
+    position, depth, owner, emission, out_face, out_instance, barycentric = seen
     width = np.int64(p[WIDTH])
     for block in range(lane, (len(pixel) + _BLOCK - 1) // _BLOCK, lanes):
         for n in range(block * _BLOCK, min((block + 1) * _BLOCK, len(pixel))):
@@ -178,10 +178,10 @@ def shade_hits(lane, lanes, room, geometry, moving, view_of, layer, hits, keys, 
             _, _, _, dx, dy, dz = sample_ray(p, pixel[n], sample[n])
             scale = -1.0 / np.sqrt(dx * dx + dy * dy + dz * dz)
             vx, vy, vz = scale * dx, scale * dy, scale * dz
-            place, u, v = hit_place[y, x, k], where[y, x, k, 0], where[y, x, k, 1]
+            instance, u, v = hit_instance[y, x, k], where[y, x, k, 0], where[y, x, k, 1]
             # Points that a device found and has lost are traced again, where a ray along an edge may meet nothing.
             face = max(hit_face[y, x, k], np.int32(0))
-            hit = Hit(hit_depth[y, x, k], face, place, u, v, where[y, x, k, 2], where[y, x, k, 3], where[y, x, k, 4])
+            hit = Hit(hit_depth[y, x, k], face, instance, u, v, where[y, x, k, 2], where[y, x, k, 3], where[y, x, k, 4])
             nx, ny, nz, gx, gy, gz, r, g, b, rough, metal, er, eg, eb, who = surface_at(
                 hit, (F(-vx), F(-vy), F(-vz)), geometry
             )
@@ -189,7 +189,7 @@ def shade_hits(lane, lanes, room, geometry, moving, view_of, layer, hits, keys, 
                 np.float64(nx), np.float64(ny), np.float64(nz), np.float64(gx), np.float64(gy), np.float64(gz),
                 vx, vy, vz,
             )  # fmt: skip
-            px, py, pz = position_at(face, place, u, v, vertices, faces, places)
+            px, py, pz = position_at(face, instance, u, v, vertices, faces, instances)
             origin[n, 0], origin[n, 1], origin[n, 2] = px, py, pz
             position[n, 0], position[n, 1], position[n, 2] = px, py, pz
             normal[n, 0], normal[n, 1], normal[n, 2] = sx, sy, sz
@@ -199,4 +199,4 @@ def shade_hits(lane, lanes, room, geometry, moving, view_of, layer, hits, keys, 
             roughness[n], metallic[n] = rough, metal
             depth[n], owner[n] = hit_depth[y, x, k], who
             emission[n, 0], emission[n, 1], emission[n, 2] = er, eg, eb
-            out_face[n], out_place[n], barycentric[n, 0], barycentric[n, 1] = face, place, u, v
+            out_face[n], out_instance[n], barycentric[n, 0], barycentric[n, 1] = face, instance, u, v

@@ -46,7 +46,7 @@ class PointRows(NamedTuple):
 
 
 class PointSurfaces(NamedTuple):
-    """What the points of a strip show.
+    """Surfaces at the shading points of a strip.
 
     Attributes
     ----------
@@ -82,7 +82,7 @@ class GBuffer:
         As numbered by `scene.TraceScene`.
     emission : (n, 3) float32 array
         Radiance that the surface itself sends to the camera.
-    face, place : (n,) int32 array
+    face, instance : (n,) int32 array
         What the point is tied to, as `interaction.nearest` numbers it; face -1 for a surfel off all meshes.
     barycentric : (n, 2) float32 array
         Weights of the face's second and third corner.
@@ -97,7 +97,7 @@ class GBuffer:
     object_index: Array
     emission: Array
     face: Array
-    place: Array
+    instance: Array
     barycentric: Array
     alpha: Array
 
@@ -109,7 +109,7 @@ class GBuffer:
         return PointRows(start, x0, y0, width, *keys, self.depth, self.position)
 
     def surfaces(self) -> PointSurfaces:
-        """What its points show."""
+        """Surfaces at its shading points."""
         points = self.points
         materials = points.albedo, points.roughness, points.metallic
         return PointSurfaces(points.normal, *materials, self.emission, self.object_index)
@@ -134,7 +134,7 @@ def compact(alpha: Array, parameters: Array, x0: int, y0: int, second: Array | N
         Of a second layer, or None: its points follow those of their samples.
     """
     n = np.count_nonzero(alpha) + (0 if second is None else np.count_nonzero(second))
-    pixel, sample, owner, face, place = np.empty((5, n), np.int32)
+    pixel, sample, owner, face, instance = np.empty((5, n), np.int32)
     weight, roughness, metallic, depth = np.empty((4, n), np.float32)
     origin, normal, geometric, view, albedo, position = (np.empty((n, 3), np.float32) for _ in range(6))
     flags = np.zeros(n, np.uint8)
@@ -142,7 +142,7 @@ def compact(alpha: Array, parameters: Array, x0: int, y0: int, second: Array | N
     _number(alpha, none if second is None else second, parameters, x0, y0, pixel, sample, weight, flags)
     points = ShadingPoints(pixel, sample, weight, origin, normal, geometric, view, albedo, roughness, metallic, flags)
     emission = np.zeros((n, 3), np.float32)
-    tied = face, place, np.empty((n, 2), np.float32)
+    tied = face, instance, np.empty((n, 2), np.float32)
     return GBuffer((y0, y0 + len(alpha)), points, position, depth, owner, emission, *tied, alpha)
 
 

@@ -108,7 +108,7 @@ def primary_surfels(
         (points.pixel, points.sample, points.flags),
         (points.origin, points.normal, points.geometric_normal, points.view),
         (points.albedo, points.roughness, points.metallic),
-        (buffer.position, buffer.depth, buffer.object_index, buffer.face, buffer.place, buffer.barycentric),
+        (buffer.position, buffer.depth, buffer.object_index, buffer.face, buffer.instance, buffer.barycentric),
     )
     if not tied:
         row, column = np.divmod(points.pixel, splats.parameters[WIDTH].astype(np.int64))
@@ -300,7 +300,7 @@ def tie_to_mesh(scene: TraceScene, *arguments: Any) -> None:
 
 
 class Stages(NamedTuple):
-    """Who does the work of `primary_surfels`.
+    """Functions for the stages of `primary_surfels`.
 
     Attributes
     ----------

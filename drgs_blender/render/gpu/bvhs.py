@@ -19,21 +19,23 @@ Array = np.ndarray
 
 
 def place_corners(
-    lane: Any, lanes: Any, room: Any, vertices: Any, faces: Any, places: Any, rows: Any, out: Any
+    lane: Any, lanes: Any, room: Any, vertices: Any, faces: Any, instances: Any, rows: Any, out: Any
 ) -> None:
     """Corners of triangles where they stand, three rows each."""
     (points,) = out
     for i in range(lane, len(rows), lanes):
-        face, place = rows[i, 0], rows[i, 1]
+        face, instance = rows[i, 0], rows[i, 1]
         for c in range(3):
             v, row = faces[face, c], 3 * i + c
             x, y, z = np.float64(vertices[v, 0]), np.float64(vertices[v, 1]), np.float64(vertices[v, 2])
-            if place < 0:
+            if instance < 0:
                 points[row, 0], points[row, 1], points[row, 2] = x, y, z
             else:
                 for a in range(3):
-                    turned = places[place, a, 0] * x + places[place, a, 1] * y + places[place, a, 2] * z
-                    points[row, a] = turned + places[place, a, 3]
+                    turned = (
+                        instances[instance, a, 0] * x + instances[instance, a, 1] * y + instances[instance, a, 2] * z
+                    )
+                    points[row, a] = turned + instances[instance, a, 3]
 
 
 PLACE = Work(place_corners, (), {})
@@ -138,12 +140,12 @@ class Trees:
         launcher = self._launcher
         if self._faces is None or self._faces[0] is not scene.faces:
             self._faces, self._own = (scene.faces, launcher.array(scene.faces)), None
-        given = self.moving = launcher.array(scene.vertices), self._faces[1], launcher.array(scene.places)
+        given = self.moving = launcher.array(scene.vertices), self._faces[1], launcher.array(scene.instances)
         for tree in self.trees:
             tree.follow(scene, given)
         ids = np.array([tree.id for tree in self.trees], np.int64)
         self.table = np.stack([ids, self._kinds, self._starts[:-1]], axis=1)
-        if not len(scene.places):
+        if not len(scene.instances):
             return None
         m = len(scene.faces)
         if self._own is None:
@@ -158,7 +160,7 @@ def triangles(scene: TraceScene, rows: Array) -> Array:
     """(k, 3, 3) float32 corners of triangles where they stand."""
     out = scene.vertices[scene.faces[rows[:, 0]]]
     moved = np.flatnonzero(rows[:, 1] >= 0)
-    matrices = scene.places[rows[moved, 1]].astype(np.float64)
+    matrices = scene.instances[rows[moved, 1]].astype(np.float64)
     out[moved] = np.einsum("kij,kcj->kci", matrices[:, :, :3], out[moved]) + matrices[:, None, :, 3]
     return out
 

@@ -45,7 +45,7 @@ class DeviceHits(MeshHits):
     again: Callable[[], MeshHits]
 
     def to_cpu(self) -> MeshHits:
-        """The same in this processor's memory; traced again where they are lost with the device."""
+        """A copy in the CPU's memory; traced again where they are lost with the device."""
         try:
             return MeshHits(*(array.numpy() for array in self.on_device))
         except Exception:  # whatever Warp raises for a device that is no more
@@ -62,12 +62,12 @@ def trace(
     with launcher.failures("copying the scene"):
         tracer, owners, zeros = mirror.tracer(scene), mirror.owners(scene), launcher.zeros
         depth, where = zeros(shape), zeros((*shape, 5))
-        owner, face, place = (zeros(shape, "int32") for _ in range(3))
-    on_device = depth, owner, face, place, where
+        owner, face, instance = (zeros(shape, "int32") for _ in range(3))
+    on_device = depth, owner, face, instance, where
     arguments = tracer, (parameters, x0, y0), np.int32(mask), owners
     launcher.launch(TRACE, int(np.prod(shape)), arguments, on_device)
     with launcher.failures("tracing the camera's rays"):
-        return DeviceHits(depth.numpy(), owner.numpy(), face, place, where, on_device, on_cpu)
+        return DeviceHits(depth.numpy(), owner.numpy(), face, instance, where, on_device, on_cpu)
 
 
 def shade(

@@ -23,7 +23,7 @@ class MeshTracer(NamedTuple):
     kinds : int
         Of masks.
     faces : int
-        Address of (k, 2) int32, the scene's face and place of each triangle; 0: they are the scene's faces.
+        Address of (k, 2) int32, the scene's face and instance of each triangle; 0: they are the scene's faces.
     corners : int
         Address of (m, 3, 3) float32, corners of the scene's faces; read where a shape stands in places.
     """
@@ -61,7 +61,7 @@ def nearest(
     start = wp.vec3(ox, oy, oz) + tnear * along
     t = wp.float32(tfar)
     face = wp.int32(-1)
-    place = wp.int32(-1)
+    instance = wp.int32(-1)
     u = wp.float32(0.0)
     v = wp.float32(0.0)
     normal = wp.vec3(0.0, 0.0, 0.0)
@@ -79,11 +79,11 @@ def nearest(
     if face >= 0 and tracer.faces != wp.int64(0):
         i = wp.int64(2) * wp.int64(face)
         face = load_int32(tracer.faces, i)
-        place = load_int32(tracer.faces, i + wp.int64(1))
-        if place >= 0:
+        instance = load_int32(tracer.faces, i + wp.int64(1))
+        if instance >= 0:
             first = corner(tracer, face, 0)
             normal = wp.cross(corner(tracer, face, 1) - first, corner(tracer, face, 2) - first)
-    return t, face, place, u, v, normal[0], normal[1], normal[2]
+    return t, face, instance, u, v, normal[0], normal[1], normal[2]
 """
 
 _SHADOWED = """

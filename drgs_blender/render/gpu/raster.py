@@ -48,8 +48,8 @@ class Rows(NamedTuple):
     subpixels: int
 
 
-class Place(NamedTuple):
-    """Where a sample is.
+class PixelPosition(NamedTuple):
+    """Position of a sub-pixel sample.
 
     Attributes
     ----------
@@ -125,7 +125,7 @@ def add(sums: Any, owner: Any, surface: Any, i: Any, z: Any, w: Any) -> None:
         sums[0, _HEAVIEST], owner[0] = w, np.int32(i)
 
 
-def gather(lists: Any, splats: Any, first: Any, last: Any, place: Place, passed: Any) -> Any:
+def gather(lists: Any, splats: Any, first: Any, last: Any, position: PixelPosition, passed: Any) -> Any:
     """List the nearest contributions of the entries first .. last of the tiles' list to a sample.
 
     `passed` is the light that is left, the depth and the splat behind which to look; how many there are, those left out
@@ -138,11 +138,11 @@ def gather(lists: Any, splats: Any, first: Any, last: Any, place: Place, passed:
     n, left, farthest = 0, t, F(-1e30)
     for entry in range(first, last):
         i = np.int64(tile_list[entry])
-        if place.x < box[i, 0] or place.x >= box[i, 2] or place.y < box[i, 1] or place.y >= box[i, 3]:
+        if position.x < box[i, 0] or position.x >= box[i, 2] or position.y < box[i, 1] or position.y >= box[i, 3]:
             continue
         if left < stop and nearest[i] >= farthest:
             continue
-        alpha, z = meet(screen, i, surface[i, OPACITY], place.near, place.far, place.px, place.py)
+        alpha, z = meet(screen, i, surface[i, OPACITY], position.near, position.far, position.px, position.py)
         if not alpha > ZERO or (left < stop and not z < farthest):
             continue
         if z < after or (z == after and i <= after_splat):
@@ -182,10 +182,10 @@ def blend_samples(lane: Any, lanes: Any, room: Any, splats: Any, p: Any, rows: R
             sums[0, c], sums[1, c] = ZERO, ZERO
         t, before, before_size = ONE, ZERO, F(1e30)
         after, after_splat = F(-1e30), np.int64(-1)
-        place = Place(x, y, F(x + jx), F(y + jy), near, far)
+        position = PixelPosition(x, y, F(x + jx), F(y + jy), near, far)
         more: Any = True
         while more:
-            n = gather(lists, splats, tile_start[tile], tile_start[tile + 1], place, (t, after, after_splat))
+            n = gather(lists, splats, tile_start[tile], tile_start[tile + 1], position, (t, after, after_splat))
             k = 0
             while k < min(n, MOST) and t >= stop:
                 z, alpha, i = lists_z[k], lists_a[k], np.int64(lists_i[k])

@@ -10,7 +10,7 @@ import numpy as np
 from ...compute.warp.kernels import Launcher
 from ..lights.environment import ROTATION, EnvironmentLight, EnvMap
 from ..lights.light_sampler import Lights
-from ..memory import Place, address
+from ..memory import AddressOf, address
 from ..scene.interaction import Geometry
 from ..scene.ray_masks import CAMERA, DIFFUSE, GLOSSY, ORDINARY, SHADOW, SURFELS, WITHOUT
 from ..scene.trace_scene import TraceScene
@@ -43,7 +43,9 @@ class Mirror:
         """(tracer, geometry, environment, lights) with the device's addresses; until what they are of changes."""
         state = scene, scene.version
         of_lights = self._table(
-            "lights", (lights, *state), lambda place: lights.tables._replace(emitters=lights.emitters.address_at(place))
+            "lights",
+            (lights, *state),
+            lambda address_of: lights.tables._replace(emitters=lights.emitters.address_at(address_of)),
         )
         return self.tracer(scene), self.geometry(scene), self.envmap(environment), of_lights
 
@@ -54,7 +56,7 @@ class Mirror:
         return envmap._replace(**{name: getattr(environment.envmap, name) for name in ROTATION})
 
     def geometry(self, scene: TraceScene) -> Geometry:
-        """What lies behind the faces; until the scene's next update."""
+        """Records of the faces (`Geometry`); until the scene's next update."""
         found: Geometry = self._table("geometry", (scene, scene.version), scene.geometry_at)
         return found
 
@@ -62,7 +64,7 @@ class Mirror:
         """Objects of the scene's faces and places, as arrays; until its next update."""
         copy = self._launcher.array
         found: tuple[Any, Any] = self._table(
-            "owners", (scene, scene.version), lambda place: (copy(scene.face_object), copy(scene.place_object))
+            "owners", (scene, scene.version), lambda address_of: (copy(scene.face_object), copy(scene.instance_object))
         )
         return found
 
@@ -73,21 +75,23 @@ class Mirror:
         return self._trees.moving
 
     def tracer(self, scene: TraceScene) -> MeshTracer:
-        """How rays meet the scene; until its next update."""
-        found: MeshTracer = self._table("rays_see", (scene, scene.version), lambda place: self._tracer(scene, place))
+        """The tracer of rays into the scene; until its next update."""
+        found: MeshTracer = self._table(
+            "rays_see", (scene, scene.version), lambda address_of: self._tracer(scene, address_of)
+        )
         return found
 
-    def _table(self, name: str, made_of: tuple[Any, ...], make: Callable[[Place], Any]) -> Any:
+    def _table(self, name: str, made_of: tuple[Any, ...], make: Callable[[AddressOf], Any]) -> Any:
         """A table made again where what it is made of is not the same as before."""
         known = self._known.pop(name, None)
         if known is None or any(a is not b for a, b in zip(known[0], made_of)):
             del known  # gives the memory back before more is taken
             kept: list[Any] = []
-            known = made_of, make(lambda array: self._place(array, kept)), kept
+            known = made_of, make(lambda array: self._address_on_device(array, kept)), kept
         self._known[name] = known
         return known[1]
 
-    def _place(self, array: Array, kept: list[Any]) -> int:
+    def _address_on_device(self, array: Array, kept: list[Any]) -> int:
         """Where the device finds a copy of an array."""
         if not self._launcher.apart:
             kept.append(array)
@@ -98,8 +102,8 @@ class Mirror:
         kept.append(copy)
         return int(copy.ptr)
 
-    def _tracer(self, scene: TraceScene, place: Place) -> MeshTracer:
-        rows, masks = scene.standing()
+    def _tracer(self, scene: TraceScene, address_of: AddressOf) -> MeshTracer:
+        rows, masks = scene.world_triangles()
         if not len(rows):
             self._trees = None
             return MeshTracer(0, 0, 0, 0)
@@ -108,8 +112,8 @@ class Mirror:
         if self._trees is None or not self._trees.of(scene.layout, rows, rays):
             self._trees = None  # gives the memory back before more is taken
             self._trees = Trees(self._launcher, scene.layout, rows, rays)
-        trees, placed = self._trees, len(scene.places) > 0
+        trees, placed = self._trees, len(scene.instances) > 0
         corners = trees.follow(scene)
         plain = len(trees.trees) == 1 and not placed
         faces = 0 if plain else int(trees.rows.ptr)
-        return MeshTracer(place(trees.table), len(trees.trees), faces, int(corners.ptr) if placed else 0)
+        return MeshTracer(address_of(trees.table), len(trees.trees), faces, int(corners.ptr) if placed else 0)

@@ -35,7 +35,7 @@ class Backends:
         return self._known.get(device, CPU)
 
     def warnings(self, settings: RenderSettings) -> list[str]:
-        """What of the device asked for was not used, and why."""
+        """Warnings: which requested device was not used, and why."""
         device = settings.device
         backend = self._found(device)
         why = self._missing.get(device) or backend.failed
@@ -47,7 +47,7 @@ class Backends:
 
 
 def card() -> str:
-    """What is known of the card that "cuda" stands for.
+    """Properties of the card that "cuda" stands for.
 
     Raises
     ------

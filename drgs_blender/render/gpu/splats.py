@@ -59,7 +59,7 @@ def project_surfels(lane: Any, lanes: Any, room: Any, posed: Any, p: Any, window
 
 
 def key_depths(lane: Any, lanes: Any, room: Any, bits: Any, box: Any, out: Any) -> None:
-    """What surfels are sorted by: those that are culled go last."""
+    """Sort keys of surfels: depth; culled ones go last."""
     keys, order = out
     for i in range(lane, len(box), lanes):
         keys[i] = depth_key(bits[i]) if box[i, 2] > box[i, 0] else np.uint32(_CULLED)
@@ -67,7 +67,7 @@ def key_depths(lane: Any, lanes: Any, room: Any, bits: Any, box: Any, out: Any) 
 
 
 def find_starts(lane: Any, lanes: Any, room: Any, keys: Any, count: Any, first: Any, out: Any) -> None:
-    """How many of `count` sorted keys are less than `first`, `first` + 1, ..."""
+    """Numbers of `count` sorted keys that are less than `first`, `first` + 1, ..."""
     (start,) = out
     for t in range(lane, len(start), lanes):
         start[t] = first_of(keys, count, first + t)

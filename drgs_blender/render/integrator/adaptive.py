@@ -24,7 +24,7 @@ _DARK = 1e-4
 
 
 def part_count(settings: RenderSettings) -> int:
-    """In how many equal parts the samples can be drawn; 1 when nothing is gained by it."""
+    """Number of equal parts in which the samples can be drawn; 1 when nothing is gained by it."""
     if settings.noise_threshold <= 0.0:
         return 1
     if settings.strategy_samples is None:

@@ -60,7 +60,7 @@ def layer_albedo(roughness, nv, table):  # type: ignore[no-untyped-def]
 
 @njit
 def diffuse_weight(roughness, metallic, nv, shading_model, table):  # type: ignore[no-untyped-def]
-    """What multiplies albedo / pi in the diffuse lobe."""
+    """Factor of albedo / pi in the diffuse lobe."""
     # Metals interpolated over a triangle are 1 to rounding, above or below: none has a diffuse lobe.
     rest = ONE - metallic if metallic < _METAL else ZERO
     if shading_model == PAPER:

@@ -46,7 +46,7 @@ _LEAST_SHARE = 0.1
 
 
 class Kernel:
-    """What shades points, and where it finds the scene: all threads here; `render.gpu` has the same for a card."""
+    """The kernel that shades points, with its scene: on all CPU threads; `render.gpu` has the same for a card."""
 
     def tables(self, scene: TraceScene, environment: EnvironmentLight, lights: Lights) -> tuple[Any, Any, Any, Any]:
         """(tracer, geometry, environment, lights) as `shade` takes them; until the scene's next update."""

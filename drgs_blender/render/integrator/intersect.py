@@ -38,7 +38,7 @@ class MixedTracer(NamedTuple):
     occluded: int
     scene: int
     first_face: int
-    first_place: int
+    first_instance: int
     surfel_intersect: int
     surfel_occluded: int
     surfel_scene: int
@@ -51,7 +51,7 @@ class MixedHit(NamedTuple):
 
     Attributes
     ----------
-    t, face, place, u, v, gx, gy, gz : np.float32
+    t, face, instance, u, v, gx, gy, gz : np.float32
         As of `Hit`.
     nx, ny, nz : np.float32
         Unit shading normal.
@@ -65,7 +65,7 @@ class MixedHit(NamedTuple):
 
     t: np.float32
     face: np.int32
-    place: np.int32
+    instance: np.int32
     u: np.float32
     v: np.float32
     gx: np.float32
@@ -136,11 +136,11 @@ def meet(tracer, rays, slot, mask):  # type: ignore[no-untyped-def]
     nearer than ``reach`` are seen. ``hit`` is for `put_hit`, and not to be used where ``through`` is 1.
     """
     ray = ray_of(rays, slot, FAR, mask)
-    t, face, place, u, v, gx, gy, gz = nearest(tracer, ray)
+    t, face, instance, u, v, gx, gy, gz = nearest(tracer, ray)
     none = np.int32(-1)
     blank = (ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, none)
     if tracer.surfel_scene == 0:
-        return (ONE if face < 0 else ZERO), t, MixedHit(t, face, place, u, v, gx, gy, gz, *blank)
+        return (ONE if face < 0 else ZERO), t, MixedHit(t, face, instance, u, v, gx, gy, gz, *blank)
     _, c = w.at(slot)
     key = rays.ints[c + w.KEY]
     before = Ray(ray.origin, ray.direction, ZERO, t, mask)
@@ -150,7 +150,7 @@ def meet(tracer, rays, slot, mask):  # type: ignore[no-untyped-def]
     )
     if face >= 0:
         if owner < 0 or unit(mix(U(key + U(0x85157AF5)))) < through:
-            return ZERO, reach, MixedHit(t, face, place, u, v, gx, gy, gz, *blank)
+            return ZERO, reach, MixedHit(t, face, instance, u, v, gx, gy, gz, *blank)
         through = ZERO
     blended = (nx, ny, nz, r, g, b, roughness, metallic, size, owner)
     return through, reach, MixedHit(depth, none, none, ZERO, ZERO, px, py, pz, *blended)
@@ -166,7 +166,7 @@ def _put_face(rays, slot, start, hit, key, owner):  # type: ignore[no-untyped-de
     s[i + w.VX], s[i + w.VY], s[i + w.VZ] = -dx, -dy, -dz
     s[i + w.GX], s[i + w.GY], s[i + w.GZ] = hit.gx, hit.gy, hit.gz
     s[i + w.MU], s[i + w.MV] = hit.u, hit.v
-    ints[c + w.N0], ints[c + w.N1] = U(hit.face), U(hit.place)
+    ints[c + w.N0], ints[c + w.N1] = U(hit.face), U(hit.instance)
     ints[c + w.KEY], ints[c + w.OWNER] = key, U(owner)
 
 
@@ -193,8 +193,8 @@ def put_hit(tracer, rays, slot, start, hit, key, owner):  # type: ignore[no-unty
 def _face_of(rays, slot, geometry):  # type: ignore[no-untyped-def]
     s, ints = rays
     i, c = w.at(slot)
-    face, place = np.int32(ints[c + w.N0]), np.int32(ints[c + w.N1])
-    hit = Hit(ZERO, face, place, s[i + w.MU], s[i + w.MV], s[i + w.GX], s[i + w.GY], s[i + w.GZ])
+    face, instance = np.int32(ints[c + w.N0]), np.int32(ints[c + w.N1])
+    hit = Hit(ZERO, face, instance, s[i + w.MU], s[i + w.MV], s[i + w.GX], s[i + w.GY], s[i + w.GZ])
     return surface_at(hit, (-s[i + w.VX], -s[i + w.VY], -s[i + w.VZ]), geometry)[:14]
 
 
@@ -205,7 +205,7 @@ def surface_of_meshes(tracer, rays, slot, geometry):  # type: ignore[no-untyped-
 
 @njit
 def surface_of(tracer, rays, slot, geometry):  # type: ignore[no-untyped-def]
-    """What `surface_at` says of the hit in a slot, save for its object."""
+    """Surface (`surface_at`) of the hit in a slot, save for its object."""
     s, ints = rays
     i, c = w.at(slot)
     if ints[c + w.N0] != _SURFELS:
@@ -234,7 +234,7 @@ def put_start(tracer, rays, slot, points, point):  # type: ignore[no-untyped-def
 
 @njit
 def light_radiance(rays, slot, others, glossy_others, share, lights, tracer, mask):  # type: ignore[no-untyped-def]
-    """What a light sample brings: radiance over density for the diffuse and for the glossy lobe, 0 when in shadow.
+    """Radiance over density of a light sample, for the diffuse and the glossy lobe; 0 when in shadow.
 
     `others` and `share` are the balance heuristic's densities of other strategies, for the diffuse and for the glossy
     lobe, and number of light samples.

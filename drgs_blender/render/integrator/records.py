@@ -14,7 +14,7 @@ Array = np.ndarray
 
 
 class Traits(NamedTuple):
-    """What is known of a scene beforehand. A device's kernel is made for its truth values, without what they rule out.
+    """Compile-time traits of a scene. A device's kernel is made for its truth values, without what they rule out.
 
     Attributes
     ----------
@@ -41,7 +41,7 @@ class Traits(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """All that rays meet and all that shines; valid until its next update.
+    """Surfaces and lights for the integrator's kernels; valid until the next update.
 
     Attributes
     ----------
@@ -61,7 +61,7 @@ class Scene(NamedTuple):
 
 
 class Settings(NamedTuple):
-    """How light is followed.
+    """Settings of the path tracer.
 
     Attributes
     ----------
@@ -85,7 +85,7 @@ class Settings(NamedTuple):
 
 
 class Sampler(NamedTuple):
-    """Where a pixel's samples come from, and how they are divided among strategies.
+    """Sample sequence of a pixel, and its division among strategies.
 
     Attributes
     ----------

@@ -67,7 +67,7 @@ def _allocate(state, h, share, sampler):  # type: ignore[no-untyped-def]
 
 @njit
 def write_point_states(first, last, points, scene, settings, sampler, scratch):  # type: ignore[no-untyped-def]
-    """What all samples of a point share, see `POINT_STATE`, and its row in the light's tables.
+    """State shared by all samples of a point, see `POINT_STATE`, and its row in the light's tables.
 
     Alpha squared is -1 where the point is unusable.
 

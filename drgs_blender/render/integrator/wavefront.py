@@ -335,7 +335,7 @@ def drop(rays, count, lobe):  # type: ignore[no-untyped-def]
 
 @inlined
 def diffuse_share(mv, r, g, b, kd, metallic, shading_model):  # type: ignore[no-untyped-def]
-    """How often the diffuse lobe is sampled, from what both reflect towards the viewer."""
+    """Probability of sampling the diffuse lobe, from what both reflect towards the viewer."""
     fr, fg, fb = brdf.fresnel(max(mv, ZERO), r, g, b, metallic, shading_model)
     diffuse = kd * luminance(r, g, b)
     share = min(max(diffuse / max(diffuse + luminance(fr, fg, fb), _TINY), F(0.1)), F(0.8))

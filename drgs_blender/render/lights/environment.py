@@ -17,7 +17,7 @@ from ...compute.threads import ROWS, over_range
 from ...core.asset.model import as_float
 from ...core.errors import UsageError
 from ...core.frame import World
-from ..memory import Place, address, load_float, load_int32, load_uint32
+from ..memory import AddressOf, address, load_float, load_int32, load_uint32
 from ..sampling import fast_acos, fast_atan2_turns, sincos_turns, unit
 from .environment_cdf import Cells
 from .product_sampling import ProductTables, block_of, in_cells_order, product_ratio, product_row
@@ -147,28 +147,28 @@ class EnvironmentLight:
 
     @property
     def envmap(self) -> EnvMap:
-        """What compiled code reads; valid while this light lives and its rotation is not replaced."""
+        """Environment map for compiled code; valid while this light lives and its rotation is not replaced."""
         return self.envmap_at(address)
 
-    def envmap_at(self, place: Place) -> EnvMap:
+    def envmap_at(self, address_of: AddressOf) -> EnvMap:
         """`envmap` of arrays that lie elsewhere."""
         height, width = self.texels.shape[:2]
         cells, product = self.cells, self.product
         return EnvMap(
-            place(self.texels),
+            address_of(self.texels),
             height,
             width,
-            place(cells.runs),
-            place(cells.guide),
+            address_of(cells.runs),
+            address_of(cells.guide),
             len(cells.guide),
-            place(self.row_z),
+            address_of(self.row_z),
             cells.step,
             width // cells.step,
-            place(product.starts),
-            place(product.slices),
-            place(product.ratio),
-            place(product.first),
-            place(cells.block),
+            address_of(product.starts),
+            address_of(product.slices),
+            address_of(product.ratio),
+            address_of(product.first),
+            address_of(cells.block),
             len(product.first),
             cells.block.shape[1],
             cells.shift,
@@ -247,7 +247,7 @@ def envmap_radiance(u, v, envmap):  # type: ignore[no-untyped-def]
 
 @njit
 def envmap_touch(u, v, envmap):  # type: ignore[no-untyped-def]
-    """Some value from both rows of texels that `envmap_radiance` will read there: brings them into the cache."""
+    """Prefetch: a value from both rows of texels that `envmap_radiance` will read, to bring them into the cache."""
     h, w = envmap.height, envmap.width
     y = min(max(v * np.float32(h) - np.float32(0.5), np.float32(0.0)), np.float32(h - 1))
     column, row = min(np.int64(u * np.float32(w)), w - 1), np.int64(y)
@@ -262,15 +262,15 @@ def first_cell(n, envmap):  # type: ignore[no-untyped-def]
 
 
 @njit
-def cell_end(place, envmap):  # type: ignore[no-untyped-def]
-    """Last random number (uint32) that falls on the cell at a place."""
-    return load_uint32(envmap.cells, 2 * np.int64(place))
+def cell_end(cell_index, envmap):  # type: ignore[no-untyped-def]
+    """Last random number (uint32) that falls on the cell of this index."""
+    return load_uint32(envmap.cells, 2 * np.int64(cell_index))
 
 
 @njit
-def cell_at(place, envmap):  # type: ignore[no-untyped-def]
-    """(row, column) of the cell at a place, upper and lower z of its row, density per solid angle."""
-    cell = np.int64(load_uint32(envmap.cells, 2 * np.int64(place) + 1))
+def cell_at(cell_index, envmap):  # type: ignore[no-untyped-def]
+    """(row, column) of the cell of this index, upper and lower z of its row, density per solid angle."""
+    cell = np.int64(load_uint32(envmap.cells, 2 * np.int64(cell_index) + 1))
     row, column = cell // envmap.columns, cell % envmap.columns
     density = load_float(envmap.texels, 4 * (row * envmap.step * envmap.width + column * envmap.step) + 3)
     return row, column, load_float(envmap.row_z, row), load_float(envmap.row_z, row + 1), density
@@ -324,10 +324,10 @@ def _sample_many(numbers, product, envmap):  # type: ignore[no-untyped-def]
         number, ratio = in_cells_order(
             product[i], block_of(product[i], numbers[i, 0], envmap), numbers[i, 0], numbers[i, 1], envmap
         )
-        place = first_cell(number, envmap)
-        while number > cell_end(place, envmap):
-            place += 1
-        _, column, upper, lower, pdf[i] = cell_at(place, envmap)
+        cell_index = first_cell(number, envmap)
+        while number > cell_end(cell_index, envmap):
+            cell_index += 1
+        _, column, upper, lower, pdf[i] = cell_at(cell_index, envmap)
         pdf[i] *= ratio
         directions[i, 0], directions[i, 1], directions[i, 2], _, _ = direction_in_cell(
             column, upper, lower, numbers[i, 1], numbers[i, 2], envmap

@@ -137,7 +137,7 @@ class Lights:
 
     @property
     def tables(self) -> LightTables:
-        """What compiled code takes as `lights`; until the next update of the emitters' scene."""
+        """Light tables for compiled code; until the next update of the emitters' scene."""
         return LightTables(self.table, self.pick, self.emitters.address)
 
     def sample(self, numbers: Array, points: Array) -> tuple[Array, Array, Array, Array, Array]:
@@ -283,7 +283,7 @@ def _probability(index, px, py, pz, lights):  # type: ignore[no-untyped-def]
 
 @njit
 def emission_along(origin, direction, hit, geometry, lights):  # type: ignore[no-untyped-def]
-    """What the surface that a ray meets emits, and how it is found by ``sample_light``.
+    """Emission of the surface that a ray meets, and its pdf by ``sample_light``.
 
     Parameters
     ----------
@@ -305,7 +305,7 @@ def emission_along(origin, direction, hit, geometry, lights):  # type: ignore[no
     r, g, b = emitted(hit.face, hit.u, hit.v, geometry)
     if not r + g + b > ZERO:
         return ZERO, ZERO, ZERO, ZERO, ZERO
-    i = emitter_row(hit.face, hit.place, lights.emitters)
+    i = emitter_row(hit.face, hit.instance, lights.emitters)
     if i < 0:
         return r, g, b, ZERO, ZERO
     ox, oy, oz = origin

@@ -11,7 +11,7 @@ import numpy as np
 
 from ...compute.jit import njit
 from ...core.color import LUMINANCE as WEIGHTS
-from ..memory import Place, address, load_float, load_int32, load_int64
+from ..memory import AddressOf, address, load_float, load_int32, load_int64
 from ..sampling import ONE, ZERO, F, unit
 from ..scene.interaction import Geometry, emitted
 from ..scene.mesh_materials import Glowing
@@ -40,8 +40,8 @@ Array = np.ndarray
 MOST = 1 << 20
 #: Triangles that have less than this part of the power are left to chance, and those with less area (square metres).
 _FAINTEST, _SMALLEST = 1e-9, 1e-18
-#: Barycentric places at which a triangle's texture is looked up.
-_PLACES = np.array([[4, 4, 4], [8, 2, 2], [2, 8, 2], [2, 2, 8]], np.float32) / 12
+#: Barycentric coordinates at which a triangle's texture is looked up.
+_LOOKUPS = np.array([[4, 4, 4], [8, 2, 2], [2, 8, 2], [2, 2, 8]], np.float32) / 12
 
 
 class EmitterTables(NamedTuple):
@@ -54,9 +54,9 @@ class EmitterTables(NamedTuple):
     faces : int
         Address of (n,) int32, the scene's face of each row.
     slot : int
-        Address of (m - vertex_faces,) int32, of each face, or -1; counted within the mesh where it stands in places.
+        Address of (m - vertex_faces,) int32, of each face, or -1; counted within the mesh where it is instanced.
     first : int
-        Address of (places,) int32, what to add for each place.
+        Address of (instances,) int32, offset of each instance.
     row : int
         Address of (slots,) int32, or -1.
     geometry : Geometry
@@ -95,7 +95,7 @@ class Emitters:
         glowing = scene.glowing if scene is not None else []
         self._known: list[Any] = [scene and scene.mesh_materials.table]
         for glow in glowing:
-            self._known += [glow.mesh, int(glow.faces[0]), None if glow.places is None else glow.places.start]
+            self._known += [glow.mesh, int(glow.faces[0]), None if glow.instances is None else glow.instances.start]
         if previous is not None and _same(self._known, previous._known):
             self._take(previous)
             return
@@ -128,17 +128,17 @@ class Emitters:
 
     @property
     def address(self) -> int:
-        """What compiled code takes, 0 where there is none; until the next update of the scene."""
+        """Address of the tables for compiled code, 0 where there are none; until the next update of the scene."""
         return self.address_at(address)
 
-    def address_at(self, place: Place) -> int:
+    def address_at(self, address_of: AddressOf) -> int:
         """`address` of arrays that lie elsewhere."""
         if self._scene is None or not self.count:
             return 0
-        where = [place(array) for array in (self.rows, self.nodes, self.sums)] + [self.count, len(self.nodes) // 2]
-        where += [place(array) for array in (self.faces, self.slot, self.first, self.row)]
-        self._tables = np.array([*where, *self._scene.geometry_at(place)], np.int64)
-        return place(self._tables)
+        where = [address_of(array) for array in (self.rows, self.nodes, self.sums)] + [self.count, len(self.nodes) // 2]
+        where += [address_of(array) for array in (self.faces, self.slot, self.first, self.row)]
+        self._tables = np.array([*where, *self._scene.geometry_at(address_of)], np.int64)
+        return address_of(self._tables)
 
     def power(self, centre: Array, radius: float) -> float:
         """Luminance that arrives at a sphere from all directions together, as `Lights.power`."""
@@ -151,11 +151,11 @@ class Emitters:
 
     def _gather(self, scene: TraceScene, glowing: list[Glowing], known: list[tuple[Array, bool]]) -> None:
         """Fill all arrays."""
-        sizes = [len(glow.faces) * (1 if glow.places is None else len(glow.places)) for glow in glowing]
+        sizes = [len(glow.faces) * (1 if glow.instances is None else len(glow.instances)) for glow in glowing]
         slots = 0
         kept: list[tuple[Glowing, int, int]] = []
         self.slot = np.full(len(scene.faces) - scene.vertex_faces, -1, np.int32)
-        self.first = np.zeros(max(len(scene.places), 1), np.int32)
+        self.first = np.zeros(max(len(scene.instances), 1), np.int32)
         for index in np.argsort(sizes, kind="stable"):
             glow, size = glowing[index], sizes[index]
             if slots + size > MOST:
@@ -169,11 +169,13 @@ class Emitters:
         here = np.eye(3, 4, dtype=np.float32)[None]
         for glow, start, size in kept:
             own = np.arange(len(glow.faces), dtype=np.int32)
-            self.slot[glow.faces - scene.vertex_faces] = own + (start if glow.places is None else 0)
+            self.slot[glow.faces - scene.vertex_faces] = own + (start if glow.instances is None else 0)
             matrices = here
-            if glow.places is not None:
-                self.first[glow.places.start : glow.places.stop] = start + len(own) * np.arange(len(glow.places))
-                matrices = scene.places[glow.places.start : glow.places.stop]
+            if glow.instances is not None:
+                self.first[glow.instances.start : glow.instances.stop] = start + len(own) * np.arange(
+                    len(glow.instances)
+                )
+                matrices = scene.instances[glow.instances.start : glow.instances.stop]
             part = slice(start, start + size)
             v = glow.mesh.visibility
             bits = DIFFUSE * v.diffuse | GLOSSY * v.glossy | SHADOW | ABSENT * (not v.shadow_catcher)
@@ -218,9 +220,9 @@ def _luminance(glow: Glowing, scene: TraceScene) -> Array:
         mean = float(table.mean_emission(material) @ weights)
         out[own] = mean
         if table.arrays[1][material, 3] >= 0 and glow.uvs is not None:
-            uv = np.einsum("pc,fcd->fpd", _PLACES, glow.uvs[own]).reshape(-1, 2)
+            uv = np.einsum("pc,fcd->fpd", _LOOKUPS, glow.uvs[own]).reshape(-1, 2)
             found = table.lookup(np.full(len(uv), material, np.int32), uv)[:, 5:] @ weights
-            out[own] = 0.5 * (mean + found.reshape(-1, len(_PLACES)).mean(axis=1))
+            out[own] = 0.5 * (mean + found.reshape(-1, len(_LOOKUPS)).mean(axis=1))
     return out
 
 
@@ -299,7 +301,7 @@ def sample_emitter(rest, n1, n2, px, py, pz, emitters):  # type: ignore[no-untyp
 
 
 @njit
-def emitter_row(face, place, emitters):  # type: ignore[no-untyped-def]
+def emitter_row(face, instance, emitters):  # type: ignore[no-untyped-def]
     """Row of the triangle that a ray hit, -1 when it is not sampled."""
     if emitters == 0:
         return np.int64(-1)
@@ -310,8 +312,8 @@ def emitter_row(face, place, emitters):  # type: ignore[no-untyped-def]
     slot = np.int64(load_int32(tables.slot, own))
     if slot < 0:
         return slot
-    if place >= 0:
-        slot += load_int32(tables.first, np.int64(place))
+    if instance >= 0:
+        slot += load_int32(tables.first, np.int64(instance))
     return np.int64(load_int32(tables.row, slot))
 
 

@@ -119,7 +119,7 @@ def layer_table() -> np.ndarray:
 
 
 def layer_albedo(cosine: Tensor, roughness: Tensor) -> Tensor:
-    """What Cycles takes the dielectric layer to reflect of white light towards a view at `cosine`."""
+    """Albedo of the dielectric layer in Cycles, for a view at `cosine`."""
     table = torch.as_tensor(layer_table(), dtype=cosine.dtype, device=cosine.device)
     y, x = torch.broadcast_tensors(cosine.clamp(0, 1) * (_CELLS - 1), roughness.clamp(0, 1) * (_CELLS - 1))
     j, i = y.detach().long().clamp(max=_CELLS - 2), x.detach().long().clamp(max=_CELLS - 2)

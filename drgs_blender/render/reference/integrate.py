@@ -54,14 +54,14 @@ class SurfacePoints:
 
 
 class Tracer(Protocol):
-    """What finds the surface along a ray; anything with this method can stand in for `TriangleTracer`."""
+    """Interface of ray tracers: the surface along a ray; anything with this method can replace `TriangleTracer`."""
 
     def closest(self, origin: Tensor, direction: Tensor) -> tuple[Tensor, SurfacePoints]:
         """Mask (n,) of the rays that hit, and the k points they hit, in order, ready to be lit."""
 
 
 class EmptyTracer:
-    """Nothing is ever hit."""
+    """Tracer of an empty scene: rays hit nothing."""
 
     def closest(self, origin: Tensor, direction: Tensor) -> tuple[Tensor, SurfacePoints]:
         """See `Tracer`."""

@@ -1,1 +1,1 @@
-"""The traced scene: triangles in one BVH, instances, materials, textures."""
+"""The traced scene: triangle BVHs (Embree), instances, mesh materials, textures, ray masks, hits."""

@@ -112,7 +112,7 @@ def device() -> int:
 
 
 def address(function: Any) -> int:
-    """Where a function of `library` lies in this process."""
+    """Address of a function of `library` in this process."""
     return ctypes.cast(function, ctypes.c_void_p).value or 0
 
 

@@ -1,4 +1,4 @@
-"""Instances: the matrices of a shape, checked, for points and for normals."""
+"""Instances: the object-to-world matrices of a mesh, checked, for points and for normals."""
 
 from __future__ import annotations
 
@@ -18,33 +18,33 @@ _SMALLEST, _LARGEST = 1e-12, 1e12
 
 
 @dataclass(slots=True)
-class Places:
-    """The usable places of one shape.
+class Instances:
+    """The usable instances of one mesh.
 
     Attributes
     ----------
     matrices : (k, 3, 4) float64 array
         Object-to-world.
     pass_index : (k,) int32 array
-    kept : (places of the mesh,) bool array
-        Which of them these are.
+    usable : (instances of the mesh,) bool array
+        Which of them are usable.
     bad : int
-        How many places were left out.
+        How many instances were left out.
     instanced : bool
-        Whether the shape keeps its own tree and stands in its places; else it goes into the world as it is.
+        Whether the mesh has a BVH of its own, with several instances; otherwise it is part of the world's.
     """
 
     matrices: Array
     pass_index: Array
-    kept: Array
+    usable: Array
     bad: int
     instanced: bool
 
 
-def usable_places(mesh: MeshState) -> Places:
+def usable_instances(mesh: MeshState) -> Instances:
     """Check the matrices of `mesh`.
 
-    A mesh in one place may be flattened (a face is a face from any side); one in several places may not, as rays go
+    A single instance may be flattened (a face is a face from any side); one of several may not, as rays go
     through the inverse matrix. Matrices that are not finite are left out always.
 
     Raises
@@ -70,16 +70,16 @@ def usable_places(mesh: MeshState) -> Places:
             usable &= np.abs(np.linalg.det(linear / np.where(lengths > 0, lengths, 1)[:, None])) > _FLAT
     kept = np.ascontiguousarray(matrices[usable, :3])
     bad = len(matrices) - len(kept)
-    return Places(kept, index[usable].astype(np.int32), usable, bad, len(kept) > 1)
+    return Instances(kept, index[usable].astype(np.int32), usable, bad, len(kept) > 1)
 
 
-def other_matrices(matrices: Array, places: Places) -> Array:
-    """(k, 3, 4) float64: where the usable `places` are at another time; as now where that is unknown or no number."""
+def other_matrices(matrices: Array, instances: Instances) -> Array:
+    """(k, 3, 4) float64: matrices of the usable `instances` at another time; as now where unknown or not finite."""
     given = np.asarray(matrices, np.float64)
-    if given.shape != (len(places.kept), 4, 4):
-        return places.matrices
-    chosen = given[places.kept, :3]
-    return np.where(np.isfinite(chosen).all(axis=(1, 2), keepdims=True), chosen, places.matrices)
+    if given.shape != (len(instances.usable), 4, 4):
+        return instances.matrices
+    chosen = given[instances.usable, :3]
+    return np.where(np.isfinite(chosen).all(axis=(1, 2), keepdims=True), chosen, instances.matrices)
 
 
 def flattens(matrix: Array) -> bool:

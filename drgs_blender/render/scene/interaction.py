@@ -23,7 +23,7 @@ _TINY = F(1e-30)
 
 
 class Tracer(NamedTuple):
-    """How rays are cast; valid until the next update of the scene. All are int64.
+    """Ray tracer of the scene for compiled code; valid until the next update of the scene. All are int64.
 
     Attributes
     ----------
@@ -31,7 +31,7 @@ class Tracer(NamedTuple):
         Addresses, see `triangle_bvh.TriangleBVH`.
     first_face : int
         Address of (groups,) int32, the first face of each group.
-    first_place : int
+    first_instance : int
         Address of (groups,) int32, the first row of each group's places in ``Geometry.place_*``.
     """
 
@@ -39,11 +39,11 @@ class Tracer(NamedTuple):
     occluded: int
     scene: int
     first_face: int
-    first_place: int
+    first_instance: int
 
 
 class Geometry(NamedTuple):
-    """What lies behind the faces; valid until the next update of the scene. Addresses of arrays, save for two numbers.
+    """Geometry and materials of the faces; valid until the next update of the scene. Addresses, save for two numbers.
 
     Attributes
     ----------
@@ -61,9 +61,9 @@ class Geometry(NamedTuple):
         (m - vertex_faces,) int32, rows of ``materials``.
     uvs : int
         (m - vertex_faces, 3, 2) float32, or 0 when no mesh has any.
-    place_normal : int
+    instance_normal : int
         (p, 3, 3) float32, matrices of normals.
-    place_object : int
+    instance_object : int
         (p,) int32.
     materials : int
         (6,) int64, ``textures.MaterialTable.addresses``.
@@ -76,20 +76,20 @@ class Geometry(NamedTuple):
     vertex_faces: int
     material: int
     uvs: int
-    place_normal: int
-    place_object: int
+    instance_normal: int
+    instance_object: int
     materials: int
 
 
 @njit
 def nearest(tracer, ray):  # type: ignore[no-untyped-def]
     """Closest `Hit` of a `Ray`."""
-    t, group, face, place, u, v, gx, gy, gz = trace(tracer.intersect, tracer.scene, ray)
+    t, group, face, instance, u, v, gx, gy, gz = trace(tracer.intersect, tracer.scene, ray)
     if group >= 0:
         face = np.int32(face + load_int32(tracer.first_face, group))
-        if place >= 0:
-            place = np.int32(place + load_int32(tracer.first_place, group))
-    return Hit(t, face, place, u, v, gx, gy, gz)
+        if instance >= 0:
+            instance = np.int32(instance + load_int32(tracer.first_instance, group))
+    return Hit(t, face, instance, u, v, gx, gy, gz)
 
 
 @njit
@@ -105,9 +105,9 @@ def _blend(rows, i, j, k, w, u, v):  # type: ignore[no-untyped-def]
 
 
 @njit
-def _turned(matrices, place, x, y, z):  # type: ignore[no-untyped-def]
+def _turned(matrices, instance, x, y, z):  # type: ignore[no-untyped-def]
     """A normal of a shape as a unit vector in world space; (0, 0, 0) when it has no direction."""
-    m = 9 * np.int64(place)
+    m = 9 * np.int64(instance)
     a = load_float(matrices, m) * x + load_float(matrices, m + 1) * y + load_float(matrices, m + 2) * z
     b = load_float(matrices, m + 3) * x + load_float(matrices, m + 4) * y + load_float(matrices, m + 5) * z
     c = load_float(matrices, m + 6) * x + load_float(matrices, m + 7) * y + load_float(matrices, m + 8) * z
@@ -117,16 +117,16 @@ def _turned(matrices, place, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @njit
-def _normal_of_place(normals, i, j, k, w, u, v, matrices, place):  # type: ignore[no-untyped-def]
+def _normal_of_instance(normals, i, j, k, w, u, v, matrices, instance):  # type: ignore[no-untyped-def]
     """Each corner's normal is turned before they are blended, as it is for a mesh in a single place."""
     ax, ay, az = _turned(
-        matrices, place, load_float(normals, i), load_float(normals, i + 1), load_float(normals, i + 2)
+        matrices, instance, load_float(normals, i), load_float(normals, i + 1), load_float(normals, i + 2)
     )
     bx, by, bz = _turned(
-        matrices, place, load_float(normals, j), load_float(normals, j + 1), load_float(normals, j + 2)
+        matrices, instance, load_float(normals, j), load_float(normals, j + 1), load_float(normals, j + 2)
     )
     cx, cy, cz = _turned(
-        matrices, place, load_float(normals, k), load_float(normals, k + 1), load_float(normals, k + 2)
+        matrices, instance, load_float(normals, k), load_float(normals, k + 1), load_float(normals, k + 2)
     )
     return w * ax + u * bx + v * cx, w * ay + u * by + v * cy, w * az + u * bz + v * cz
 
@@ -178,7 +178,7 @@ def surface_at(hit, direction, geometry):  # type: ignore[no-untyped-def]
     nx, ny, nz, gx, gy, gz, r, g, b, roughness, metallic, er, eg, eb, object : float
         Unit shading and geometric normal, albedo, emitted radiance; linear Rec.709.
     """
-    _, face, place, u, v, gx, gy, gz = hit
+    _, face, instance, u, v, gx, gy, gz = hit
     dx, dy, dz = direction
     corner = 3 * np.int64(face)
     i = np.int64(load_int32(geometry.shading_faces, corner))
@@ -205,15 +205,15 @@ def surface_at(hit, direction, geometry):  # type: ignore[no-untyped-def]
         r, g, b, roughness, metallic, er, eg, eb = material_at(material, s, t, _tables(geometry))
         rows = geometry.normals
         i, j, k = 3 * i, 3 * j, 3 * k
-        if place < 0:
+        if instance < 0:
             nx = _blend(rows, i, j, k, w, u, v)
             ny = _blend(rows, i + 1, j + 1, k + 1, w, u, v)
             nz = _blend(rows, i + 2, j + 2, k + 2, w, u, v)
         else:
-            nx, ny, nz = _normal_of_place(rows, i, j, k, w, u, v, geometry.place_normal, place)
+            nx, ny, nz = _normal_of_instance(rows, i, j, k, w, u, v, geometry.instance_normal, instance)
             scale = ONE / max(abs(gx), max(abs(gy), max(abs(gz), _TINY)))
-            gx, gy, gz = _turned(geometry.place_normal, place, gx * scale, gy * scale, gz * scale)
-            owner = load_int32(geometry.place_object, np.int64(place))
+            gx, gy, gz = _turned(geometry.instance_normal, instance, gx * scale, gy * scale, gz * scale)
+            owner = load_int32(geometry.instance_object, np.int64(instance))
     scale = ONE / math.sqrt(max(gx * gx + gy * gy + gz * gz, _TINY))
     if gx * dx + gy * dy + gz * dz > ZERO:
         scale = -scale
@@ -230,26 +230,26 @@ def surface_at(hit, direction, geometry):  # type: ignore[no-untyped-def]
 
 
 @njit
-def position_at(face, place, u, v, vertices, faces, places):  # type: ignore[no-untyped-def]
+def position_at(face, instance, u, v, vertices, faces, instances):  # type: ignore[no-untyped-def]
     """World-space point of a hit, float64, blended from the corners: nearer to the face than origin + t direction.
 
     Parameters
     ----------
     vertices, faces : array
         ``TriangleBVH``'s.
-    places : (p, 3, 4) float32 array
-        ``TraceScene.places``.
+    instances : (p, 3, 4) float32 array
+        ``TraceScene.instances``.
     """
     w = 1.0 - np.float64(u) - np.float64(v)
     a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
     x = w * vertices[a, 0] + u * vertices[b, 0] + v * vertices[c, 0]
     y = w * vertices[a, 1] + u * vertices[b, 1] + v * vertices[c, 1]
     z = w * vertices[a, 2] + u * vertices[b, 2] + v * vertices[c, 2]
-    if place < 0:
+    if instance < 0:
         return x, y, z
-    m = places
+    m = instances
     return (
-        m[place, 0, 0] * x + m[place, 0, 1] * y + m[place, 0, 2] * z + m[place, 0, 3],
-        m[place, 1, 0] * x + m[place, 1, 1] * y + m[place, 1, 2] * z + m[place, 1, 3],
-        m[place, 2, 0] * x + m[place, 2, 1] * y + m[place, 2, 2] * z + m[place, 2, 3],
+        m[instance, 0, 0] * x + m[instance, 0, 1] * y + m[instance, 0, 2] * z + m[instance, 0, 3],
+        m[instance, 1, 0] * x + m[instance, 1, 1] * y + m[instance, 1, 2] * z + m[instance, 1, 3],
+        m[instance, 2, 0] * x + m[instance, 2, 1] * y + m[instance, 2, 2] * z + m[instance, 2, 3],
     )

@@ -31,8 +31,8 @@ class Glowing:
     material : (k,) int32 array
         Of ``MeshMaterials.table``.
     uvs : (k, 3, 2) float32 array or None
-    places : array, optional
-        Rows of ``TraceScene.places``, or None where the faces are in world space.
+    instances : array, optional
+        Rows of ``TraceScene.instances``, or None where the faces are in world space.
     """
 
     mesh: MeshState
@@ -40,11 +40,11 @@ class Glowing:
     faces: Array
     material: Array
     uvs: Array | None
-    places: range | None
+    instances: range | None
 
 
 class MeshMaterials:
-    """What `TraceScene` knows of the materials of its meshes. Faces count from the first that is of a mesh.
+    """Materials of the meshes of a `TraceScene`. Faces count from the first that is of a mesh.
 
     Attributes
     ----------

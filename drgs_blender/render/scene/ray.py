@@ -53,7 +53,7 @@ class Rays(NamedTuple):
 
     @classmethod
     def of(cls, origins: Array, directions: Array, tnear: float, tfar: float, mask: int) -> Rays:
-        """As compiled code takes them."""
+        """The ray for compiled code."""
         start, along = (plain(np.asarray(a, np.float32)) for a in (origins, directions))
         return cls(start, along, np.float32(tnear), np.float32(tfar), np.int32(mask))
 
@@ -67,7 +67,7 @@ def ray_at(rays, i):  # type: ignore[no-untyped-def]
 
 
 class Hit(NamedTuple):
-    """What a ray meets first: a face at (1 - u - v) v0 + u v1 + v v2.
+    """First hit of a ray: a face at (1 - u - v) v0 + u v1 + v v2.
 
     Attributes
     ----------
@@ -75,7 +75,7 @@ class Hit(NamedTuple):
         Distance; the ray's `tfar` when nothing is hit.
     face : np.int32
         Of the scene; -1 when nothing is hit.
-    place : np.int32
+    instance : np.int32
         Row of the scene's places; -1 outside shapes in places.
     u, v : np.float32
         Barycentric coordinates of the second and of the third corner.
@@ -85,7 +85,7 @@ class Hit(NamedTuple):
 
     t: np.float32
     face: np.int32
-    place: np.int32
+    instance: np.int32
     u: np.float32
     v: np.float32
     gx: np.float32

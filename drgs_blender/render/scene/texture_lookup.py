@@ -152,7 +152,7 @@ def _within(x, highest):  # type: ignore[no-untyped-def]
 
 @njit
 def material_at(material, u, v, addresses):  # type: ignore[no-untyped-def]
-    """What a material is at texture coordinates (u, v).
+    """Values of a material at texture coordinates (u, v).
 
     Parameters
     ----------

@@ -23,7 +23,7 @@ from ...core.arrays import frozen
 from ...core.color import LUMINANCE, srgb_to_linear, to_unit
 from ...core.errors import UsageError
 from ...core.frame import Image, Material, Texture
-from ..memory import Place, address
+from ..memory import AddressOf, address
 from .texture_lookup import (
     BRIGHTEST,
     BYTE,
@@ -68,10 +68,10 @@ class _Texels:
         shares = [np.bincount(some[:, k], minlength=256) / len(some) for k in range(4)]
         return np.array([*(share @ decoded for share in shares[:3]), shares[3] @ levels])
 
-    def row(self, place: Place = address) -> tuple[int, int, int, int]:
+    def row(self, address_of: AddressOf = address) -> tuple[int, int, int, int]:
         """Address, width, height, kind."""
         height, width = self.texels.shape[:2]
-        return place(self.texels), width, height, self.kind
+        return address_of(self.texels), width, height, self.kind
 
 
 class MaterialTable:
@@ -140,12 +140,12 @@ class MaterialTable:
         # Only needed above; they would keep the pixels of the frame before alive.
         self._given, self._known = {}, {}
 
-    def addresses_at(self, place: Place) -> tuple[int, ...]:
+    def addresses_at(self, address_of: AddressOf) -> tuple[int, ...]:
         """`addresses` of arrays and pictures that lie elsewhere."""
         constants, slots, textures, transforms, images, decode = self.arrays
-        if place is not address:
-            images = np.array([texels.row(place) for texels in self._images.values()], np.int64).reshape(-1, 4)
-        return tuple(place(array) for array in (constants, slots, textures, transforms, images, decode))
+        if address_of is not address:
+            images = np.array([texels.row(address_of) for texels in self._images.values()], np.int64).reshape(-1, 4)
+        return tuple(address_of(array) for array in (constants, slots, textures, transforms, images, decode))
 
     def lookup(self, material: Array, uv: Array) -> Array:
         """(n, 8) float32, the results of ``material_at`` for (n,) integers and (n, 2) coordinates."""

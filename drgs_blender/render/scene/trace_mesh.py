@@ -17,7 +17,7 @@ from ...core.errors import UsageError
 from ...core.frame import MeshState, Visibility
 from ...geometry.normals import VertexNormals
 from ..columns import ALBEDO, METALLIC, NORMAL, ROUGHNESS
-from .instances import Places, flattens, normal_matrices
+from .instances import Instances, flattens, normal_matrices
 from .ray_masks import group_mask
 
 Array = np.ndarray
@@ -115,11 +115,11 @@ class Part:
     smoother: VertexNormals | None = None
     own_normals: Array | None = None  # of meshes, object space
 
-    def fits(self, item: TraceObject | MeshState, places: Places | None) -> bool:
+    def fits(self, item: TraceObject | MeshState, instances: Instances | None) -> bool:
         """Whether `item` can take the part's place without a new layout."""
         return (
             self.smooth == (item.corner_normals is None)
-            and self.instanced == (places is not None and places.instanced)
+            and self.instanced == (instances is not None and instances.instanced)
             and self.mask == mask_of(item)
             and self.vertex.stop - self.vertex.start == len(item.vertices)
             and (self.faces is item.faces or np.array_equal(self.faces, item.faces))
@@ -218,12 +218,12 @@ def take_object(part: Part, item: TraceObject, vertices: Array, shading: Array) 
     return moved, died
 
 
-def take_mesh(part: Part, item: MeshState, places: Places, vertices: Array, normals: Array) -> tuple[bool, bool]:
+def take_mesh(part: Part, item: MeshState, instances: Instances, vertices: Array, normals: Array) -> tuple[bool, bool]:
     """Bring a mesh up to date in the scene's `vertices` and `normals`; what `Part.take_vertices` returns."""
     before = part.item if isinstance(part.item, MeshState) else None
     own, rows = vertices[part.vertex], normals[part.row]
     given = as_float(item.vertices, (-1, 3), f"vertices of {item.name}")
-    matrix = None if part.instanced else places.matrices[0]
+    matrix = None if part.instanced else instances.matrices[0]
     moved, died = False, False
     other_shape = before is None or before.vertices is not item.vertices
     if other_shape or not part.instanced:
@@ -237,7 +237,7 @@ def take_mesh(part: Part, item: MeshState, places: Places, vertices: Array, norm
         else:
             part.given_normals(item.corner_normals, given, part.own_normals)
     if matrix is not None:
-        turn = normal_matrices(places.matrices[:1])[0]
+        turn = normal_matrices(instances.matrices[:1])[0]
         over_range(_turn_normals, len(rows), part.own_normals, turn, rows, fewest=ELEMENTS)
         part.flat_faces = part.count_empty(own) if flattens(matrix) else 0
     part.item = item

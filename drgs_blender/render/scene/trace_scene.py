@@ -1,6 +1,6 @@
 """Everything rays can meet in one frame: DR-GS objects and ordinary meshes, with one BVH.
 
-DR-GS objects and meshes in one place are triangles in world space; a mesh in several places keeps its vertices in
+DR-GS objects and meshes of one instance are triangles in world space; a mesh of several keeps its vertices in
 object space and a tree of its own, and stands in the scene as instances.
 """
 
@@ -14,9 +14,9 @@ import numpy as np
 
 from ...core.frame import Image, MeshState, Pose
 from ..columns import VERTEX
-from ..memory import Place, address
+from ..memory import AddressOf, address
 from ..sampling import F
-from .instances import Places, normal_matrices, other_matrices, usable_places
+from .instances import Instances, normal_matrices, other_matrices, usable_instances
 from .interaction import Geometry, Tracer
 from .mesh_materials import Glowing, MeshMaterials
 from .ray_masks import object_flags
@@ -38,19 +38,19 @@ __all__ = ["ObjectFaults", "TraceObject", "TraceScene"]
 
 @dataclass(slots=True)
 class ObjectFaults:
-    """What was wrong with one object in the last update; such faces and places are invisible to rays."""
+    """Problems of one object in the last update; such faces and instances are invisible to rays."""
 
     name: str
     bad_vertices: int  # NaN, infinite or absurdly far
     bad_faces: int  # touch a bad vertex
     empty_faces: int  # have no area
-    bad_places: int = 0  # matrices that are not finite, or flatten one of several places
+    bad_instances: int = 0  # matrices that are not finite, or flatten one of several
 
 
 class TraceScene:
     """All objects and meshes of a frame.
 
-    Objects are numbered: DR-GS objects as given, then meshes as given, then the places of meshes that stand in
+    Objects are numbered: DR-GS objects as given, then meshes as given, then the instances of meshes that have
     several, in the order of the meshes.
 
     Attributes
@@ -62,23 +62,23 @@ class TraceScene:
     version : object
         Another object after every update.
     vertices : (n, 3) float32 array
-        As traced (``bvh``'s own), world space save for meshes in several places.
+        As traced (``bvh``'s own), world space save for meshes of several instances.
     faces : (m, 3) int32 array
         As traced; a face with a bad vertex is collapsed to one point.
     face_object : (m,) int32 array
-        Object of each face (of a mesh in several places: the mesh).
+        Object of each face (of a mesh of several instances: the mesh).
     shading_faces : (m, 3) int32 array
         Rows of ``shading`` (DR-GS objects) or of ``normals`` at the corners of each face.
     shading : (k, 8) float32 array
         Unit shading normal (3), albedo (3), roughness, metallic.
     normals : (r, 3) float32 array
-        Of meshes; object space where these stand in several places.
+        Of meshes; object space where these have several instances.
     vertex_faces : int
         How many faces are of DR-GS objects; those come first.
-    places : (p, 3, 4) float32 array
-        Object-to-world matrices of meshes in several places.
-    place_object : (p,) int32 array
-        Object of each place.
+    instances : (p, 3, 4) float32 array
+        Object-to-world matrices of meshes of several instances.
+    instance_object : (p,) int32 array
+        Object of each instance.
     rays_differ : bool
         Whether there is an object that diffuse rays meet and glossy ones do not, or the other way.
     pass_index, object_flags : (objects,) int32 array
@@ -103,7 +103,7 @@ class TraceScene:
         self.normals: Array = np.empty((0, 3), np.float32)
         self.face_object: Array = np.empty(0, np.int32)
         self.vertex_faces = 0
-        self.places: Array = np.empty((0, 3, 4), np.float32)
+        self.instances: Array = np.empty((0, 3, 4), np.float32)
         self.pass_index: Array = np.empty(0, np.int32)
         self.source: Array = np.empty(0, np.int64)
         self.object_flags: Array = np.empty(0, np.int32)
@@ -113,12 +113,12 @@ class TraceScene:
         self.extent = 0.0
         self.faults: list[ObjectFaults] = []
         self._parts: list[Part] = []
-        self._known: list[tuple[MeshState, Places]] = []
+        self._known: list[tuple[MeshState, Instances]] = []
         self._groups: list[list[int]] = []  # parts of each group
         self._vertex_count = 0
-        self._place_normal: Array = np.empty((0, 3, 3), np.float32)
-        self.place_object: Array = np.empty(0, np.int32)
-        self._first_place: Array = np.zeros(1, np.int32)
+        self._instance_normal: Array = np.empty((0, 3, 3), np.float32)
+        self.instance_object: Array = np.empty(0, np.int32)
+        self._first_instance: Array = np.zeros(1, np.int32)
 
     @property
     def vertices(self) -> Array:
@@ -132,47 +132,50 @@ class TraceScene:
 
     @property
     def tracer(self) -> Tracer:
-        """How compiled code casts rays into the scene; until the next update."""
+        """Ray tracer for compiled code; until the next update."""
         bvh = self.bvh
-        tables = address(bvh.first_face), address(self._first_place)
+        tables = address(bvh.first_face), address(self._first_instance)
         return Tracer(bvh.intersect_address, bvh.occluded_address, bvh.scene, *tables)
 
     @property
     def geometry(self) -> Geometry:
-        """What compiled code finds behind a hit; until the next update."""
+        """Geometry and materials of hits, for compiled code; until the next update."""
         return self.geometry_at(address)
 
-    def geometry_at(self, place: Place) -> Geometry:
+    def geometry_at(self, address_of: AddressOf) -> Geometry:
         """`geometry` of arrays that lie elsewhere."""
         meshes = self.mesh_materials
-        tables = meshes.addresses if place is address else np.array(meshes.table.addresses_at(place), np.int64)
+        tables = (
+            meshes.addresses if address_of is address else np.array(meshes.table.addresses_at(address_of), np.int64)
+        )
         return Geometry(
-            place(self.shading_faces),
-            place(self.shading),
-            place(self.normals),
-            place(self.face_object),
+            address_of(self.shading_faces),
+            address_of(self.shading),
+            address_of(self.normals),
+            address_of(self.face_object),
             self.vertex_faces,
-            place(meshes.index),
-            place(meshes.uvs) if len(meshes.uvs) else 0,
-            place(self._place_normal),
-            place(self.place_object),
-            place(tables),
+            address_of(meshes.index),
+            address_of(meshes.uvs) if len(meshes.uvs) else 0,
+            address_of(self._instance_normal),
+            address_of(self.instance_object),
+            address_of(tables),
         )
 
-    def standing(self) -> tuple[Array, Array]:
-        """Every triangle of the scene where it stands: (k, 2) int32 face and place (or -1), and its (k,) int32 mask."""
+    def world_triangles(self) -> tuple[Array, Array]:
+        """All triangles of the scene in world space: (k, 2) int32 faces and instances (or -1), and (k,) int32 masks."""
         rows, masks = [np.empty((0, 2), np.int32)], [np.empty(0, np.int32)]
         for group, members in enumerate(self._groups):
             for part in (self._parts[i] for i in members):
-                faces, where = np.arange(part.face.start, part.face.stop, dtype=np.int32), self._places_of(group, part)
-                places = np.array([-1] if where is None else where, np.int32)
-                rows.append(np.stack([np.tile(faces, len(places)), np.repeat(places, len(faces))], axis=1))
+                faces = np.arange(part.face.start, part.face.stop, dtype=np.int32)
+                where = self._instances_of(group, part)
+                instances = np.array([-1] if where is None else where, np.int32)
+                rows.append(np.stack([np.tile(faces, len(instances)), np.repeat(instances, len(faces))], axis=1))
                 masks.append(np.full(len(rows[-1]), part.mask, np.int32))
         return np.concatenate(rows), np.concatenate(masks)
 
     @property
     def glowing(self) -> list[Glowing]:
-        """What emits light, in the order of the scene's faces."""
+        """Emissive surfaces, in the order of the scene's faces."""
         found: list[Glowing] = []
         materials = self.mesh_materials
         if not materials.table.glows:
@@ -186,16 +189,16 @@ class TraceScene:
                 own = np.flatnonzero(glows[materials.index[rows]]) + rows.start
                 if not len(own):
                     continue
-                where = self._places_of(group, part)
+                where = self._instances_of(group, part)
                 uvs = materials.uvs[own] if len(materials.uvs) else None
                 found.append(Glowing(part.item, part.face, own + self.vertex_faces, materials.index[own], uvs, where))
         return found
 
-    def _places_of(self, group: int, part: Part) -> range | None:
-        """Rows of `places` in which a part of a group stands; None where it is in world space."""
+    def _instances_of(self, group: int, part: Part) -> range | None:
+        """Rows of `instances` in which a part of a group stands; None where it is in world space."""
         if not part.instanced:
             return None
-        first, objects = int(self._first_place[group]), len(self.faults) - len(self._known)
+        first, objects = int(self._first_instance[group]), len(self.faults) - len(self._known)
         return range(first, first + len(self._known[part.source - objects][1].matrices))
 
     def update(
@@ -215,17 +218,17 @@ class TraceScene:
         (parts, self._parts), (known, self._known) = (self._parts, []), (self._known, [])
         kept = [k[1] if k[0] is mesh else None for k, mesh in zip(known, meshes)]
         kept += [None] * (len(meshes) - len(kept))
-        stands = [old or usable_places(mesh) for old, mesh in zip(kept, meshes)]
-        places: list[Places | None] = [*([None] * len(objects)), *stands]
-        order = _order(items, places)
-        same = [p.source for p in parts] == order and all(p.fits(items[p.source], places[p.source]) for p in parts)
+        stands = [old or usable_instances(mesh) for old, mesh in zip(kept, meshes)]
+        instances: list[Instances | None] = [*([None] * len(objects)), *stands]
+        order = _order(items, instances)
+        same = [p.source for p in parts] == order and all(p.fits(items[p.source], instances[p.source]) for p in parts)
         if not same:
-            parts = self._lay_out(items, places, order)
+            parts = self._lay_out(items, instances, order)
         before = [part.item for part in parts]
         vertices = self.bvh.vertices if same else np.zeros((self._vertex_count, 3), np.float32)
         moved, elsewhere, died = set(), set(), not same
         for index, part in enumerate(parts):
-            item, where = items[part.source], places[part.source]
+            item, where = items[part.source], instances[part.source]
             if part.item is item:
                 continue
             if isinstance(item, TraceObject):
@@ -237,12 +240,12 @@ class TraceScene:
             moved |= {index} if change[0] else set()
             died |= change[1]
         if not same or elsewhere or len(known) != len(meshes):
-            self._place(stands, len(items))
+            self._list_instances(stands, len(items))
         self._number(objects, meshes, stands)
         self.mesh_materials.update(parts, before, meshes, images, (len(objects), self.vertex_faces))
-        self._commit(parts, vertices, places, moved, elsewhere, died)
+        self._commit(parts, vertices, instances, moved, elsewhere, died)
         self.version = object()
-        self.faults = [ObjectFaults(item.name, 0, 0, 0, p.bad if p else 0) for item, p in zip(items, places)]
+        self.faults = [ObjectFaults(item.name, 0, 0, 0, p.bad if p else 0) for item, p in zip(items, instances)]
         for part in parts:
             fault = self.faults[part.source]
             fault.bad_vertices, fault.empty_faces = part.bad_vertices, max(part.empty_faces, part.flat_faces)
@@ -250,7 +253,7 @@ class TraceScene:
         self._parts, self._known = parts, list(zip(meshes, stands))
 
     def at(self, objects: Sequence[Array | None], meshes: Sequence[Pose | None]) -> tuple[Array, Array]:
-        """`vertices` and `places` as they would be with everything at another time, for motion.
+        """`vertices` and `instances` as they would be with everything at another time, for motion.
 
         Parameters
         ----------
@@ -259,7 +262,7 @@ class TraceScene:
         meshes : sequence of (Pose or None)
             Of every mesh, or None; vertices or matrices of another number than now are ignored, unusable ones too.
         """
-        vertices, places = self.vertices.copy(), self.places.copy()
+        vertices, instances = self.vertices.copy(), self.instances.copy()
         first = np.cumsum([0, *(len(p.matrices) if p.instanced else 0 for _, p in self._known)])
         for part in self._parts:
             own = vertices[part.vertex]
@@ -273,24 +276,24 @@ class TraceScene:
             given = mesh.vertices if pose.vertices is None else pose.vertices
             moved = other_matrices(pose.matrices, now)
             if now.instanced:
-                places[first[index] : first[index + 1]] = moved
+                instances[first[index] : first[index + 1]] = moved
             place_vertices(given, None if now.instanced else moved[0], own)
-        return vertices, places
+        return vertices, instances
 
     def close(self) -> None:
         """Give the tree's memory back."""
         self.bvh.close()
 
     def _lay_out(
-        self, items: Sequence[TraceObject | MeshState], places: Sequence[Places | None], order: list[int]
+        self, items: Sequence[TraceObject | MeshState], instances: Sequence[Instances | None], order: list[int]
     ) -> list[Part]:
-        """Give everything its place in the scene's arrays; all that depends on topology alone."""
+        """Lay out the scene's arrays: all that depends on topology alone."""
         parts = []
         faces, owners = [np.empty((0, 3), np.int32)], [np.empty(0, np.int32)]
         vertex = face = self.vertex_faces = 0
         rows = {True: 0, False: 0}
         for source in order:
-            item, where = items[source], places[source]
+            item, where = items[source], instances[source]
             own, n = own_faces(item), len(item.vertices)
             m, smooth, surfels = len(own), item.corner_normals is None, isinstance(item, TraceObject)
             row = rows[surfels]
@@ -309,20 +312,20 @@ class TraceScene:
         self.shading = np.zeros((rows[True], VERTEX), np.float32)
         self.normals = np.zeros((rows[False], 3), np.float32)
         self.mesh_materials.clear(face - self.vertex_faces)
-        # A part in places is a group of its own; others of one mask share one.
+        # A part with instances is a group of its own; others of one mask share one.
         alike = groupby(range(len(parts)), lambda i: (parts[i].mask, i if parts[i].instanced else -1))
         self._groups = [list(members) for _, members in alike]
         return parts
 
-    def _place(self, where: Sequence[Places], first: int) -> None:
-        """List the places of meshes in several; their objects are numbered from `first`."""
+    def _list_instances(self, where: Sequence[Instances], first: int) -> None:
+        """List the instances of meshes that have several; their objects are numbered from `first`."""
         matrices = np.concatenate([np.empty((0, 3, 4)), *(p.matrices for p in where if p.instanced)])
-        self.places = np.ascontiguousarray(matrices, np.float32)
-        self._place_normal = normal_matrices(matrices)
-        self.place_object = np.arange(first, first + len(matrices), dtype=np.int32)
+        self.instances = np.ascontiguousarray(matrices, np.float32)
+        self._instance_normal = normal_matrices(matrices)
+        self.instance_object = np.arange(first, first + len(matrices), dtype=np.int32)
 
-    def _number(self, objects: Sequence[TraceObject], meshes: Sequence[MeshState], where: Sequence[Places]) -> None:
-        """Pass index and flags of all objects and places; see the class."""
+    def _number(self, objects: Sequence[TraceObject], meshes: Sequence[MeshState], where: Sequence[Instances]) -> None:
+        """Pass index and flags of all objects and instances; see the class."""
         index = [np.array([o.pass_index for o in objects], np.int32)]
         index.append(np.array([p.pass_index[0] if len(p.pass_index) else 0 for p in where], np.int32))
         index += [p.pass_index for p in where if p.instanced]
@@ -339,21 +342,21 @@ class TraceScene:
         self,
         parts: Sequence[Part],
         vertices: Array,
-        places: Sequence[Places | None],
+        instances: Sequence[Instances | None],
         moved: set[int],
         elsewhere: set[int],
         other_faces: bool,
     ) -> None:
         """Bring the tree up to date: parts whose vertices `moved`, shapes that stand `elsewhere`."""
-        first_place, count = [], 0
+        first_instance, count = [], 0
         matrices: dict[int, Array] = {}
         for index, members in enumerate(self._groups):
-            where = places[parts[members[0]].source]
-            first_place.append(count)
+            where = instances[parts[members[0]].source]
+            first_instance.append(count)
             if parts[members[0]].instanced and where is not None:
-                matrices[index] = self.places[count : count + len(where.matrices)]
+                matrices[index] = self.instances[count : count + len(where.matrices)]
                 count += len(where.matrices)
-        self._first_place = np.array(first_place or [0], np.int32)
+        self._first_instance = np.array(first_instance or [0], np.int32)
         if other_faces:
             faces = [part.traced_faces + np.int32(part.vertex.start) for part in parts]
             groups = [
@@ -372,17 +375,17 @@ class TraceScene:
         self.extent = float(F(max(reach, default=0.0)))
 
 
-def _order(items: Sequence[TraceObject | MeshState], places: Sequence[Places | None]) -> list[int]:
-    """Indices of what is traced, in the order of the scene's arrays: objects, meshes in one place, in several.
+def _order(items: Sequence[TraceObject | MeshState], instances: Sequence[Instances | None]) -> list[int]:
+    """Indices of what is traced, in the order of the scene's arrays: objects, meshes of one instance, of several.
 
-    Neighbours of one mask share a group, so each kind is sorted by mask; meshes stay in order of places.
+    Neighbours of one mask share a group, so each kind is sorted by mask; meshes stay in order of instances.
     """
 
     def kind(source: int) -> tuple[int, int]:
-        where = places[source]
+        where = instances[source]
         if where is None:
             return 0, mask_of(items[source])
         return (2, 0) if where.instanced else (1, mask_of(items[source]))
 
-    here = [i for i, where in enumerate(places) if (len(items[i].faces) if where is None else len(where.matrices))]
+    here = [i for i, where in enumerate(instances) if (len(items[i].faces) if where is None else len(where.matrices))]
     return sorted(here, key=kind)

@@ -39,7 +39,7 @@ class Group:
         The faces, half-open.
     mask : int
         int32 bits; a ray meets the group when it has one of them.
-    places : array, optional
+    instances : array, optional
         None when the vertices are in world space; else (k, 3, 4) float32 object-to-world matrices, invertible: the
         group's faces stand in k places and share one tree.
     """
@@ -47,7 +47,7 @@ class Group:
     first: int
     last: int
     mask: int = ALL
-    places: Array | None = None
+    instances: Array | None = None
 
 
 @njit
@@ -161,15 +161,15 @@ class _Part:
         self._triangles: int | None = None
         self._instances: int | None = None
         self._shape: int | None = None
-        if group.places is not None:
+        if group.instances is not None:
             self._shape = new_scene()
         self.build()
-        if group.places is not None:
+        if group.instances is not None:
             self._instances = self._lib.rtcNewGeometry(self._device, embree.GEOMETRY_INSTANCE_ARRAY)
             self._lib.rtcSetGeometryInstancedScene(self._instances, self._shape)
             self._lib.rtcSetGeometryMask(self._instances, self._mask)
             self._lib.rtcAttachGeometryByID(top, self._instances, index)
-            self.place(group.places)
+            self.set_instances(group.instances)
 
     def build(self) -> None:
         """Build the triangles' own tree from scratch."""
@@ -201,13 +201,13 @@ class _Part:
             self._commit()
         return worn
 
-    def place(self, places: Array) -> None:
-        """Let the group stand in (k, 3, 4) `places`, copied."""
-        self._places = aligned(12 * len(places), np.float32).reshape(-1, 3, 4)
-        self._places[:] = places
+    def set_instances(self, instances: Array) -> None:
+        """Let the group stand in (k, 3, 4) `instances`, copied."""
+        self._matrices = aligned(12 * len(instances), np.float32).reshape(-1, 3, 4)
+        self._matrices[:] = instances
         self._lib.rtcSetSharedGeometryBuffer(
             self._instances, embree.BUFFER_TRANSFORM, 0, embree.FORMAT_FLOAT3X4_ROW_MAJOR,
-            self._places.ctypes.data, 0, 48, len(places),
+            self._matrices.ctypes.data, 0, 48, len(instances),
         )  # fmt: skip
         self._lib.rtcCommitGeometry(self._instances)
 
@@ -313,7 +313,7 @@ class TriangleBVH:
         self,
         vertices: Array | None = None,
         moved: Collection[int] | None = None,
-        places: Mapping[int, Array] | None = None,
+        instances: Mapping[int, Array] | None = None,
     ) -> None:
         """Follow moved vertices; rebuild the tree of a group that is worn out.
 
@@ -323,15 +323,15 @@ class TriangleBVH:
             Or None: those already written into ``self.vertices``.
         moved : iterable of int, optional
             The groups whose vertices moved, or None: all.
-        places : mapping of int to array, optional
+        instances : mapping of int to array, optional
             group -> new (k, 3, 4) matrices, for groups that were built with places.
         """
         if vertices is not None:
             self.vertices[:] = vertices
         for index in range(len(self._parts)) if moved is None else sorted(moved):
             self.rebuilds += self._parts[index].refit()
-        for index, matrices in (places or {}).items():
-            self._parts[index].place(matrices)
+        for index, matrices in (instances or {}).items():
+            self._parts[index].set_instances(matrices)
         self._commit()
 
     def _commit(self) -> None:

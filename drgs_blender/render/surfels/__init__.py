@@ -1,1 +1,1 @@
-"""Surfels on the screen and along rays."""
+"""Surfels: rasterised on the screen (splats), and traced along rays (surfel BVH)."""

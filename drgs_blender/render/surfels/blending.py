@@ -24,7 +24,7 @@ Array = np.ndarray
 
 
 class Contributions(NamedTuple):
-    """What splats contribute to the samples of a block, `LANES` lists one after the other.
+    """Contributions of splats to the samples of a block, `LANES` lists one after the other.
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ class Contributions(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """What resolving the list of one sample needs.
+    """Scratch memory for resolving the list of one sample.
 
     Attributes
     ----------
@@ -149,7 +149,7 @@ def scratch_for(room):  # type: ignore[no-untyped-def]
 
 @njit
 def widen(lists):  # type: ignore[no-untyped-def]
-    """The same lists with twice the room."""
+    """Copy of the lists with twice the capacity."""
     room, wider = lists.room, contributions(2 * lists.room)
     for lane in range(LANES):
         old, new = room * lane, 2 * room * lane

@@ -86,7 +86,7 @@ class SurfelSamples(NamedTuple):
 
 
 class View(NamedTuple):
-    """What blending knows of the camera.
+    """Camera parameters for blending.
 
     Attributes
     ----------
@@ -129,7 +129,7 @@ class Tile(NamedTuple):
 
 
 class TileSplats(NamedTuple):
-    """What blending reads of the splats of a tile, brought together.
+    """Splats of a tile for blending, gathered in contiguous memory.
 
     Attributes
     ----------

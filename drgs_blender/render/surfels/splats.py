@@ -18,8 +18,9 @@ from ...compute.jit import inlined, njit, plain
 from ...compute.threads import ELEMENTS, over_range
 from ...core.asset.model import PosedSurfels
 from ...core.frame import Camera
-from ..camera import CLIP_END, CLIP_START, CX, CY, FX, FY, LEAN, ORTHOGRAPHIC, POSITION, SUBPIXELS, filter_reach
+from ..camera import CLIP_END, CLIP_START, CX, CY, FILTER, FX, FY, LEAN, ORTHOGRAPHIC, POSITION, SUBPIXELS
 from ..columns import ALBEDO, METALLIC, NORMAL, OPACITY, ROUGHNESS, SIZE, SPLAT
+from ..pixel_filter import filter_reach
 
 Array = np.ndarray
 
@@ -58,7 +59,7 @@ class Posed(NamedTuple):
 
     @classmethod
     def of(cls, posed: PosedSurfels) -> Posed:
-        """Those of `posed`."""
+        """The splats of `posed`."""
         return cls(*(plain(getattr(posed, name)) for name in cls._fields))
 
 
@@ -104,7 +105,7 @@ class Splats(NamedTuple):
 
     @property
     def number(self) -> int:
-        """How many there are."""
+        """Number of splats."""
         return len(self.screen)
 
 
@@ -275,7 +276,7 @@ def project_surfel(i, posed, p, window, screen, box, nearest):  # type: ignore[n
     if in_front:
         lo_x, hi_x = min(lo_x, rx - low), max(hi_x, rx + low)
         lo_y, hi_y = min(lo_y, ry - low), max(hi_y, ry + low)
-    reach = filter_reach(p)
+    reach = filter_reach(p[FILTER])
     lo_x, hi_x, lo_y, hi_y = lo_x - reach, hi_x + reach, lo_y - reach, hi_y + reach
     if not (lo_x < wx1 and hi_x > wx0 and lo_y < wy1 and hi_y > wy0):
         return

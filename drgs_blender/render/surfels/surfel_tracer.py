@@ -65,7 +65,7 @@ HEAVIEST = F(-1.0)
 
 
 class SurfelTracer(NamedTuple):
-    """How rays are cast at surfels; valid until the next update of the tree. All are int64.
+    """Ray tracer of surfels for compiled code; valid until the next update of the tree. All are int64.
 
     Attributes
     ----------
@@ -85,7 +85,7 @@ class SurfelTracer(NamedTuple):
 
 
 def tracer_of(bvh: SurfelBVH) -> SurfelTracer:
-    """How compiled code casts rays at the surfels of `bvh`; until its next update."""
+    """The tracer of the surfels of `bvh` for compiled code; until its next update."""
     tables = address(bvh.surface), address(bvh.objects)
     return SurfelTracer(bvh.intersect_address, bvh.occluded_address, bvh.scene, *tables)
 
@@ -218,7 +218,7 @@ def _add(sums, row, w, t, direction):  # type: ignore[no-untyped-def]
 
 @dataclass(slots=True)
 class SurfelHits:
-    """What many rays met; where ``object_index`` is -1 the rest but ``through`` is undefined.
+    """Hits of many rays; where ``object_index`` is -1 the rest but ``through`` is undefined.
 
     Attributes
     ----------

@@ -1,1 +1,1 @@
-"""The grid of the particle solver on a graphics card."""
+"""MLS-MPM on a graphics card, by Warp: the particle grid and its time steps."""

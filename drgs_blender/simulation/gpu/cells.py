@@ -80,7 +80,7 @@ def index_blocks(lane, lanes, room, n, keys, numbers, sizes, out):  # type: igno
 
 
 def house_particles(lane, lanes, room, n, keys, numbers, sizes, out):  # type: ignore[no-untyped-def]
-    """Which active block each particle is in, sorted."""
+    """Active block of each particle, sorted."""
     (home,) = out
     for p in range(lane, n, lanes):
         home[p] = np.int32(first_of(numbers, sizes[0], keys[p] >> 6))

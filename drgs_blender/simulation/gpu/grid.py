@@ -135,7 +135,7 @@ class DeviceGrid(Grid):
         return True
 
     def _take_blocks(self, count: int) -> None:
-        """Memory for so many active blocks, and the launches that work on it."""
+        """Memory for a number of active blocks, and the launches that work on it."""
         zeros, recorded, n = self.launcher.zeros, self.launcher.recorded, len(self._order) // 2
         self._launches, self._blocks = [], count
         self._active, self._neighbour = zeros((count, 3), "int32"), zeros((count, 27), "int32")

@@ -101,7 +101,7 @@ NATIVES = {
 def prepare_particles(  # type: ignore[no-untyped-def]
     lane, lanes, room, order, particles, properties, grid, time, out
 ):
-    """What each particle gives to the nodes around it."""
+    """P2G contribution of each particle to the nodes around it."""
     x, v, affine, tau = particles
     mass, volume, pin = properties
     origin, spacing = grid
@@ -199,7 +199,7 @@ def touched_by(v: Any, place: Any, step: Any, c: Any, colliders: Any) -> Any:
 
 
 def bounded_by(v: Any, place: Any, spacing: Any, planes: Any, q: Any) -> Any:
-    """The same for a plane, as `contact.bound` has it."""
+    """Velocity bounded by a plane, as `contact.bound` has it."""
     vx, vy, vz = v
     gx, gy, gz = place
     ax, ay, az = planes[q, 0], planes[q, 1], planes[q, 2]

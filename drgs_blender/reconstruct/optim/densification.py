@@ -13,9 +13,9 @@ import numpy as np
 import torch
 
 from ...core.arrays import Array
-from ..optim.adam import Adam
-from .gaussians import Gaussians
-from .raster import Tally
+from ..model.gaussians import Gaussians
+from ..model.raster import Tally
+from .adam import Adam
 
 #: Surfels fainter than this vanish.
 FAINT = 0.03
@@ -62,7 +62,7 @@ def densify(
     after = gaussians.select(np.concatenate([kept, kept[cut]]))
     if count:
         _part(after, cut, np.arange(len(kept), len(kept) + count))
-    optimiser.take(np.concatenate([kept, np.full(count, -1)]))
+    optimiser.reindex(np.concatenate([kept, np.full(count, -1)]))
     return after, {"pruned": int((~keep).sum()), "cut": count}
 
 
