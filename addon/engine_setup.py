@@ -89,12 +89,12 @@ class EngineSetup:
 
     Attributes
     ----------
-    text : what is done now, for people
+    text : the present step, for people
     fraction : 0..1
     fetched : bytes of packages that came so far, of the step under way
     log_file : beside the folder; what the commands wrote
     error : why it ended, or None
-    remark : what the engine, which is ready, does without, and why; or ""
+    remark : parts that the ready engine lacks, and why; or ""
     done : whether nothing more will happen
     """
 

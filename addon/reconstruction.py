@@ -20,7 +20,7 @@ class Reconstruction:
 
     Attributes
     ----------
-    part : what is done, 0..1
+    part : fraction that is done, 0..1
     text : in which phase it is, and how good
     cancelled : asked to end before its time
     """

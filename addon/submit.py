@@ -99,9 +99,9 @@ class Submission:
 
     Attributes
     ----------
-    text : what it does or has done
-    notes : what a node would do differently
-    command : what submits the job, "" until it is written
+    text : present or last step
+    notes : differences on a node
+    command : command that submits the job, "" until it is written
     error : why there is no job, "" when there is none
 
     Raises

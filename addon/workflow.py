@@ -23,7 +23,7 @@ class Step(NamedTuple):
     label : name for people
     done : whether it needs nothing more
     needed : whether there is no picture without it
-    text : what is there, what is missing, what to do
+    text : the state of the step, and the next action
     """
 
     key: str

@@ -89,10 +89,10 @@ class CommandOperator(DrgsOperator):
 
         Parameters
         ----------
-        subject : what messages are about
+        subject : name of the object in messages
         status : text of the status bar meanwhile
-        failure : what became of the subject where the program fails: "could not be ..."
-        files : that it writes
+        failure : predicate of the message where the program fails: "could not be ..."
+        files : files that it writes
         """
         self._subject, self._failure = subject, failure
         self._expected = output_check.ExpectedFiles(files)

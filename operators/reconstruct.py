@@ -127,7 +127,7 @@ class DRGS_OT_reconstruct(CommandOperator, bpy.types.Operator):
         return self.start(context, arguments, subject, f"Making {out.name}", "could not be reconstructed", [out])
 
     def stopped(self, event: bpy.types.Event) -> bool:
-        return _job().cancelled  # Esc may be meant for anything else in so many minutes
+        return _job().cancelled  # Esc may be meant for anything else during these minutes
 
     def state(self, output: str) -> str:
         job = _job()

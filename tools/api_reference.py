@@ -364,7 +364,7 @@ def short(value: Any) -> str:
 
 
 def fenced(ticks: int, directive: str, argument: str, body: list[str], options: Iterable[str] = ()) -> list[str]:
-    """A directive between fences of so many backticks."""
+    """A directive between fences of backticks."""
     fence = "`" * ticks
     return [f"{fence}{{{directive}}} {argument}", *options, "", *body, fence]
 

@@ -48,7 +48,7 @@ def export_frame(
     warn : called with a message for everything that cannot be rendered as the scene has it
     camera : replaces the scene's camera
     frame_set : evaluates the scene at another frame, for passes of motion; without it nothing moves
-    cache : what earlier exports of the same depsgraph made and is still true
+    cache : of earlier exports of the same depsgraph
     is_visible : whether an evaluated object is in the picture; all are when None
     passes : replace those of the view layer
     cancelled : asked before each object

@@ -136,7 +136,7 @@ class SimulateProcess:
 
         Parameters
         ----------
-        subject : what messages are about
+        subject : name of the object in messages
         held : a sentence about what there is all the same
 
         Raises

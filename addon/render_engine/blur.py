@@ -30,7 +30,7 @@ class Step:
     Attributes
     ----------
     time : frames before (negative) or after the frame's own
-    lens : where in the aperture its centre of projection is, metres to the right and up
+    lens : position of its centre of projection in the aperture, metres to the right and up
     """
 
     time: float

@@ -73,7 +73,7 @@ class BlenderProcess:
     blender : Blender
         Which Blender.
     job : dict
-        What it should do, JSON-able: ``scene``, ``frames``, ``scripts``, ``passes``; with ``report`` the attribute of
+        Job description, JSON-able: ``scene``, ``frames``, ``scripts``, ``passes``; with ``report`` the attribute of
         that name has its ``files`` (as stored and as found) and ``notes`` before the first frame comes; with ``keep``
         it waits for `more` frames after these.
     key_of : callable

@@ -37,7 +37,7 @@ class Source(Protocol):
     kinds : tuple of {"splats", "mesh", "environment"}
         Best first.
     notes : list of str
-        What its reader converted or assumed.
+        Conversions and assumptions of its reader.
     """
 
     kinds: tuple[Held, ...]

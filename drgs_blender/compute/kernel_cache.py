@@ -102,7 +102,7 @@ class KernelCache(NullCache):
     kind : str
         Forms of one function that are compiled in another way have another kind.
     options : dict, optional
-        Those of Numba's decorator.
+        Options of Numba's decorator.
     """
 
     def __init__(self, function: Any, kind: str = "kernel", options: dict[str, Any] | None = None) -> None:

@@ -25,11 +25,11 @@ class Target:
     Attributes
     ----------
     name : str
-        What the user calls it.
+        Name for users.
     machine : str
         "x86_64" or "arm64".
     needs : tuple of str
-        What the processor must have, in LLVM's words.
+        Required processor features, by LLVM's names.
     cpu, features : str
         Arguments of LLVM.
     systems : tuple of str

@@ -55,7 +55,7 @@ def metadata(frame: Frame, layer: str = "") -> dict[str, str]:
     ----------
     frame : Frame
     layer : str
-        What stands in the file before the names of passes, with its dot.
+        Prefix of the pass names in the file, with its dot.
     """
     names: dict[str, Iterable[str]] = {
         "object": [*(item.name for item in frame.objects), *(mesh.name for mesh in frame.meshes)],

@@ -42,9 +42,9 @@ class DrgsError(Exception):
     subject : str
         The file, object or setting the error is about.
     problem : str
-        What is wrong with it.
+        The problem.
     remedy : str
-        What the user can do; None is what helps against most errors of the class.
+        Advice for the user; None stands for the usual advice of the class.
     """
 
     exit_code = EXIT_INTERNAL

@@ -18,7 +18,7 @@ class ReadType:
     extensions : tuple of str
         Usual endings; they never decide alone.
     kind : {"surfels", "mesh", "environment", "materials"}
-        What comes out.
+        Kind of the data that is read.
     """
 
     extensions: tuple[str, ...]
@@ -34,7 +34,7 @@ class WriteType:
     extensions : tuple of str
         Endings that choose it.
     kind : {"splats", "mesh", "environment"}
-        What goes in.
+        Kind of the data that is written.
     up : {"z", "y"}
         The up axis that the format prescribes, or that is written unless asked otherwise.
     fixed : bool

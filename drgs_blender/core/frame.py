@@ -172,7 +172,7 @@ class Texture:
     image : str
         Name of one of ``Frame.images``.
     channel : {"rgb", "r", "g", "b", "a", "luminance"}
-        What of it: "rgb" for colours, one channel or the luminance for numbers.
+        Channel that is used: "rgb" for colours, one channel or the luminance for numbers.
     transform : (2, 3) float64 array
         Maps (u, v, 1) to the image's own (u, v); v = 0 is the image's bottom edge.
     interpolation : {"linear", "closest"}
@@ -343,7 +343,7 @@ class RenderSettings:
         Sub-pixel samples: places in a pixel among which its samples are divided; 0 chooses by their number
         (`subpixel_count`).
     camera_sees, rays_see : {"surfels", "mesh"}
-        What the camera sees of DR-GS objects, and what shadow and indirect rays meet of them: their meshes, or the
+        Representation of DR-GS objects for camera rays, and for shadow and indirect rays: their meshes, or the
         surfels, blended along each ray (slower; for thin things without a good mesh).
     denoise : {"none", "svgf", "oidn"}
     shading_model : {"principled", "paper"}

@@ -319,7 +319,7 @@ def settled(f, p, g, offset, apart, reach):  # type: ignore[no-untyped-def]
     Returns
     -------
     f, p : tuple of float
-        Those to take.
+        The deformation gradient and the position to use.
     turned : bool
         Whether they are the nearest neighbour's.
     """

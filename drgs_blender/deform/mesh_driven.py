@@ -78,7 +78,7 @@ class MeshDriven:
     hidden_count : int
         Surfels of the last pose whose face had a vertex that was not finite; they are transparent.
     rest : Rest
-        What of the binding is the same in every pose.
+        Constants of the binding, the same in every pose.
     """
 
     def __init__(self, mesh: Mesh, surfels: Surfels, binding: Binding) -> None:

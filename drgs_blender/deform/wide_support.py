@@ -79,7 +79,7 @@ def spans(
     normals : (k, 3) array
         Its smooth normals.
     faces : Faces
-        Those of the mesh, measured.
+        The mesh's faces, measured.
     face : (n,) array
         Faces on which the surfels hang.
     weights : (n, 3) array

@@ -29,7 +29,7 @@ class Sequence:
     past : Instant, optional
         The instant of the last picture.
     fit : tuple
-        What must stay for the history to be of use: layout of the scene, window, primary surface, split of light.
+        Key under which the history is valid: layout of the scene, window, primary surface, split of light.
     situation : tuple
         All that decides what a picture shows; the same objects (``is``) as long as nothing changed.
     pictures : int

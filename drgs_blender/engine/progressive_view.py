@@ -63,7 +63,7 @@ class View:
     Parameters
     ----------
     frame : Frame
-        What it shows; nobody may change it. Where it names a ``history``, coarse pictures are denoised with it.
+        The frame, which must not be changed. Where it names a ``history``, coarse pictures are denoised with it.
     pace : Pace
         For how coarse the first picture is.
     number : int

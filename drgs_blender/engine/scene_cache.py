@@ -78,7 +78,7 @@ class SceneCache:
     images : list of Image
         Of the last frame.
     scene : TraceScene
-        What rays meet.
+        Scene that rays are traced in.
     tree : SurfelBVH or None
         Surfels that rays meet; None when they meet the mesh.
     world : World, optional

@@ -182,7 +182,7 @@ def posed_surfels(
     state : ObjectState
     index : int
     driven : MeshDriven or Surfels
-        What poses them; surfels without a mesh follow the object's matrix.
+        Binding that poses them; surfels without a mesh follow the object's matrix.
     traced : TraceObject
     pose : callable
         `MeshDriven.pose`, or another that does the same elsewhere.

@@ -48,7 +48,7 @@ class PosedObject:
     Attributes
     ----------
     state : ObjectState
-        What the frame says of it.
+        The object's state in the frame.
     mesh : TraceObject
         As rays see it, with the frame's materials.
     surfels : PosedSurfels

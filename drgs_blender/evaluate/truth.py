@@ -41,7 +41,7 @@ class TruthSet:
     posed : bool
         The object is deformed.
     views : list of View
-        What Cycles saw, in the light's own exposure.
+        Views by Cycles, in the light's own exposure.
     maps : list of dict of str to (h, w, c) array
         Passes of each view: Coverage, and of Albedo, Roughness, Metallic, Normal, Depth what is known; empty where
         nothing is.

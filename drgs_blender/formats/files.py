@@ -31,11 +31,11 @@ class SurfelFile:
     unknown : list of str
         Properties of the file that the layout does not name.
     notes : list of str
-        What was converted, dropped or assumed.
+        Conversions, losses and assumptions of the reader.
     up : str, optional
         The up axis that the format prescribes (a key of ``axes.UP_AXES``); None where it prescribes none.
     assumed : list of str
-        Those of the notes that are of surfels and their materials; whoever wants the splats lost nothing.
+        The notes that concern surfels and their materials only, not the splats.
     """
 
     surfels: Surfels
@@ -114,7 +114,7 @@ class MeshFile:
     up_axis : {"Z", "unknown"}
         "Z" where positions are known to be Z up (glTF is converted on reading), "unknown" else.
     notes : list of str
-        What was converted, dropped or assumed.
+        Conversions, losses and assumptions of the reader.
     """
 
     vertices: Array
@@ -148,7 +148,7 @@ class EnvironmentFile:
     layout : str
         Which program writes such files.
     notes : list of str
-        What was converted or assumed.
+        Conversions and assumptions of the reader.
     """
 
     environment: Environment

@@ -52,7 +52,7 @@ class Layout:
     Attributes
     ----------
     name : str
-        Who writes it.
+        Program that writes it.
     has, lacks : tuple of str
         Properties that must and must not be there.
     albedo, roughness, metallic : Channel, optional

@@ -28,7 +28,7 @@ def write_point_cache(path: Path, frames: Iterable[Array], count: int, points: i
     path : Path
         Ends in .pc2 or .mdd, which decides the format.
     frames : iterable of (points, 3) array
-        As many as `count`, metres, object space, Z up; in Mesh Cache leave the axes at Y forward, Z up.
+        `count` arrays, metres, object space, Z up; in Mesh Cache leave the axes at Y forward, Z up.
     count : int
         Frames.
     points : int

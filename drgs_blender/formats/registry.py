@@ -54,7 +54,7 @@ class Format:
     note : str
         One line for the documentation.
     instead : str
-        What to do where something else than `kind` is wanted of such a file.
+        Advice where something else than `kind` is wanted of such a file.
     """
 
     name: str

@@ -25,12 +25,12 @@ Array = np.ndarray
 #: Exit codes: the file is refused (the reason is the last line of stderr), the library is not installed, the arrays
 #: cannot be written (likewise).
 REFUSED, NOT_INSTALLED, FULL = 65, 69, 73
-#: Limit of processor time: seconds for starting the library, and one second more for so many bytes of the file.
+#: Limit of processor time: seconds for starting the library, and bytes of the file per further second.
 SECONDS, _PACE = 5.0, 1 << 20
 #: Limit of time by the clock, in multiples of that of processor time: the machine may be busy, and waiting takes no
 #: processor time.
 PATIENCE = 20
-#: Limit of memory (Linux): bytes for the library, and so many more for each byte of the file.
+#: Limit of memory (Linux): bytes for the library, and bytes per byte of the file.
 _MEMORY, _RATIO = 8 << 30, 32
 REMEDY = "Export it again, or restore it from a copy"
 
@@ -42,7 +42,7 @@ def write_arrays(source: str, target: str, kind: str, read: Callable[[str], Mapp
     ----------
     source, target : str
     kind : str
-        What errors call such files.
+        Name of such files in errors.
     read : callable
     """
     try:
@@ -66,7 +66,7 @@ def write_arrays(source: str, target: str, kind: str, read: Callable[[str], Mapp
 def limit(most_bytes: int, most_seconds: int) -> None:
     """In the subprocess: set limits beyond which it fails, and write no core dump where it crashes.
 
-    At most so many bytes of memory (Linux) and seconds of processor time (not on Windows).
+    Memory is limited on Linux, processor time everywhere but on Windows.
     """
     if sys.platform == "win32":
         return
@@ -98,7 +98,7 @@ def read_in_subprocess(
     module : str
         Dotted name; its `main` takes a source, a target and the two limits as text.
     kind : str
-        What errors call such files.
+        Name of such files in errors.
     missing_library : tuple of str
         Problem and remedy where its library is not installed.
     remedies : mapping of str to str, optional

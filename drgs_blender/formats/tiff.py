@@ -40,7 +40,7 @@ def decode_tiff(data: bytes, subject: str, limit: int) -> Array:
     data : bytes
         The file.
     subject : str
-        What errors call it.
+        Name in errors.
     limit : int
         Pixels at most.
 

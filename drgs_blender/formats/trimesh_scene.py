@@ -22,7 +22,7 @@ Array = np.ndarray
 
 #: Name of the array that holds the rest as JSON.
 ABOUT = "about"
-#: Meshes may be placed until they are so many bytes, some and in proportion to the file; a zip may hold as many.
+#: Limit of all placed meshes, and of a zip's content: bytes, and bytes per byte of the file.
 _ROOM, _RATIO = 64 << 20, 64
 #: Times that a 3MF file may place an object, some and in proportion to its size.
 _MAX_INSTANCES, _PER_BYTE = 1000, 0.1

@@ -20,7 +20,7 @@ DEGREE = "radiance:sphericalHarmonicsDegree"
 HARMONICS = "radiance:sphericalHarmonicsCoefficients"
 #: Attribute of UsdColorSpaceAPI, and how the names of linear light with our primaries start.
 SPACE, LINEAR = "colorSpace:name", "lin_rec709"
-#: Splats may be repeated by references until they are so many bytes, some and in proportion to the files.
+#: Limit of splats that references repeat: bytes, and bytes per byte of the files.
 _SPLATS, _RATIO = 64 << 20, 32
 #: Name of the text that says which axis is up.
 UP = "up"

@@ -91,7 +91,7 @@ class VertexNormals:
         ----------
         vertices : (n, 3) float32 array
         faces : (m, 3) int32 array
-            Those of this object, of which some may be collapsed to a point.
+            The object's faces, of which some may be collapsed to a point.
         normals : (n, 3) float32 array
             Written.
         """

@@ -118,7 +118,7 @@ class SignedDistanceField:
         smoothing : float
             Standard deviation of the filter of the field, in voxels.
         advice : str
-            What to do where no mesh can be made, for the message.
+            Advice where no mesh can be made, for the message.
 
         Returns
         -------

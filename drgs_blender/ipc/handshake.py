@@ -23,7 +23,7 @@ def greet(child: Child, program: str, watchdog: Watchdog, stopped: Callable[[], 
     child : Child
         The process.
     program : str
-        What was started, named in errors.
+        The started program, for errors.
     watchdog : Watchdog
         When its silence is too long.
     stopped : callable

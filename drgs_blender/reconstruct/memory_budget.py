@@ -16,9 +16,9 @@ def check_fits(needed: float, subject: str, of: str, option: str, value: int, po
     ----------
     needed : float
     subject, of : str
-        What is too large, and what it consists of, for the message.
+        The array that is too large, and its elements, for the message.
     option : str
-        What sets its size, for the message.
+        Option that sets its size, for the message.
     value : int
         Of the option.
     power, margin : int

@@ -103,7 +103,7 @@ class Progress:
     phase : str
         "Preparing the engine (first time only)", "surfels", "mesh", "surfels on the mesh", "materials".
     part : float
-        What is done of all, 0..1.
+        Fraction that is done, 0..1.
     surfels : int
         How many there are.
     psnr : float, optional

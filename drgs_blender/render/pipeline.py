@@ -65,7 +65,7 @@ def render(
     cancelled : callable, optional
         Called several times per second; True ends the rendering.
     history : History, optional
-        What earlier frames leave to the denoiser SVGF; brought up to date when the frame is done.
+        Temporal history of the denoiser SVGF; brought up to date when the frame is done.
     backend : RenderBackend
         Where the kernels run.
 

@@ -129,7 +129,7 @@ class Radiance:
         For points flagged CATCHER the luminance that would leave them if rays met shadow catchers alone (masks shifted
         by `ray_masks.WITHOUT`); not read elsewhere.
     moments : (n, 5) float32 array
-        What ``variance`` is made of (`integrator.variance`): number of samples, then sum and sum of squares of their
+        Moments for ``variance`` (`integrator.variance`): number of samples, then sum and sum of squares of their
         luminance, diffuse and glossy; may be empty.
     """
 

@@ -19,11 +19,11 @@ class PreparedScene:
     Attributes
     ----------
     scene : TraceScene
-        What rays meet; its objects are in the order of ``frame.objects``.
+        Scene that rays are traced in; its objects are in the order of ``frame.objects``.
     environment : EnvironmentLight
         The frame's world.
     surfels : PosedSurfels
-        Those of all objects; not used where ``frame.settings.camera_sees`` is "mesh".
+        Surfels of all objects; not used where ``frame.settings.camera_sees`` is "mesh".
     lights : Lights, optional
         All lights but the environment, emitting meshes included.
     surfel_bvh : SurfelBVH, optional

@@ -111,7 +111,7 @@ class _Strip:
     latest: Array | None = None
 
     def begin(self, points: int, settings: RenderSettings, parts: int) -> None:
-        """Make room for the light of so many points."""
+        """Allocate memory for the light of the points."""
         self.light = Sampling(points, settings.sample_count, parts, settings.noise_threshold)
         self.moments, self.latest = np.zeros((points, 5), np.float32), np.zeros((points, 5), np.float32)
 

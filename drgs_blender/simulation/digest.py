@@ -29,7 +29,7 @@ def digest_of(mesh: Mesh, settings: Settings, colliders: Sequence[Collider], mot
     mesh : Mesh
     settings : Settings
     colliders : sequence of Collider
-        Those of the settings.
+        Colliders of the settings.
     motion : (k, n, 3) array or None
         Vertices of the mesh, that pins follow; None where they stay.
     """

@@ -44,7 +44,7 @@ class ForceField:
         Rows of eight: place (metres), axis (any length), strength (m/s^2) and flow (1/s), a frame each from the first
         one simulated on; the last one stays. Flow is how it slows what moves in it: wind blows at strength / flow.
     shape : str
-        What distances are measured from: "point", "plane" (across its axis) or "line" (along its axis).
+        Origin of distances: "point", "plane" (across its axis) or "line" (along its axis).
     falloff : str
         Whether distance counts from all around, in a tube or in a cone along the axis.
     side : str
@@ -222,7 +222,7 @@ def blow(x: Array, v: Array, still: Array, rows: Array, dt: float) -> None:
     v : (n, 3) float64 array
         m/s; changed.
     still : (n,) bool array
-        What is left as it is.
+        Particles that are not pushed.
     rows : (k, columns) float64 array
         Of `FieldRows.at`.
     dt : float

@@ -79,13 +79,13 @@ class Settings:
     domain : tuple of tuple of float, optional
         Corners of the space that is simulated, world; None is chosen from the body and what is around it.
     walls : str
-        What its sides do; "open" makes leaving an error.
+        Boundary condition at its sides; "open" makes leaving an error.
     first, last : int
         Frames.
     fps : float
         Frames per second.
     device : str
-        What computes them, one of `DEVICES`; frames do not depend on it, but for last digits.
+        Device of the computation, one of `DEVICES`; frames do not depend on it, but for last digits.
     matrix_world : tuple of tuple of float
         (4, 4) object to world.
     """

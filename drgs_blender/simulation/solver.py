@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 _DRIFT = 0.85
 #: Cells that matter or a collider moves at most in a step.
 _FASTEST = 0.5
-#: A step so many times shorter than the stiffness asks for means that the motion has run away.
+#: A step this many times shorter than the stiffness asks for means that the motion has run away.
 _RUNAWAY = 200.0
 
 
@@ -73,11 +73,11 @@ class Solver(Stepper):
     domain : Domain
         Where particles may be; leaving it is an error.
     forces : Forces, optional
-        What acts.
+        Forces on all matter.
     colliders : sequence of Collider
-        What acts.
+        Mesh obstacles.
     planes : sequence of Plane
-        What acts.
+        Plane obstacles.
     courant : float
         The Courant number (CFL condition): time step in parts of what elastic waves and viscosity bear; above 1 is
         unstable.

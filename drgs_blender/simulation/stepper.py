@@ -30,7 +30,7 @@ class Stepper(ABC):
     launcher : Launcher or None
         Of the device that computes frames, if that is not this processor.
     colliders : list of MovingCollider
-        What matter cannot enter.
+        Obstacles.
     planes : array
         The same, as rows of `contact.plane_rows`.
         What matter cannot enter, the latter as rows of `contact.plane_rows`.

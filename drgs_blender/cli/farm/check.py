@@ -22,11 +22,11 @@ class Report:
     Attributes
     ----------
     faults : list of str
-        What a node cannot do without.
+        Requirements that a node lacks.
     notes : list of str
-        What a node will do differently, or only perhaps.
+        Differences on a node, certain or possible.
     files : list of Path
-        What the scene refers to, that exists.
+        Existing files that the scene refers to.
     error : DrgsError, optional
         The first fault that DR-GS itself met.
     """

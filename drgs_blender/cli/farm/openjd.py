@@ -30,7 +30,7 @@ def write_bundle(job: Job, folder: Path, seconds: int = 0, files: Iterable[Path]
     seconds : int
         How long a chunk should take, for schedulers that adapt its size; 0 leaves it at ``job.chunk`` frames.
     files : iterable of Path
-        What the scene needs, for schedulers that copy it to the nodes.
+        Files that the scene needs, for schedulers that copy them to the nodes.
 
     Returns
     -------

@@ -74,7 +74,7 @@ class Translation:
     Parameters
     ----------
     natives : mapping
-        What stands for functions that are not translated: the device's own, or other ones that are.
+        Replacements of functions that are not translated: the device's own, or translated ones.
     constants : callable
         May replace integers of modules, see `Constants`.
     fused : bool

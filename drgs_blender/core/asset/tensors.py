@@ -84,7 +84,7 @@ def decode(buffer: Array, subject: str = "tensors") -> dict[str, Array]:
     buffer : (n,) uint8 array
         The whole file; the arrays are as writable as it is.
     subject : str
-        What errors name.
+        Name in errors.
 
     Raises
     ------

@@ -41,7 +41,7 @@ class Capture:
     Attributes
     ----------
     source : Path
-        What was read.
+        The file or folder that was read.
     views : list of View
         In the order of their names.
     background : tuple of float, optional

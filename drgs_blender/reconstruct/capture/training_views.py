@@ -31,7 +31,7 @@ class Target:
     camera : Camera
         Of that size.
     photograph : Photograph or tensor
-        What it should look like; on a device the colour alone, (h, w, 3).
+        The photograph to be matched; on a device the colour alone, (h, w, 3).
     mask : (h, w) tensor or None
         Tensor in 0..1, or None where nothing is known of it.
     """

@@ -126,7 +126,7 @@ def pull_pixels(lane, lanes, room, splats, tiles, first, maps, incoming, out):  
     first : (m,) array
         First row of each surfel's rectangle in what is written.
     maps : array
-        What `blend_pixels` wrote.
+        Output of `blend_pixels`.
     incoming : (h, w, G_FEATURES + channels) float32 array
     """
     record, values, box, near, far = splats
@@ -174,7 +174,7 @@ def sum_pixels(lane, lanes, room, splats, entries, first, maps, incoming, pulls,
     entries : tuple
         (k,) arrays: surfel, tile and number of each pair, in the order of tiles; tiles in a row.
     pulls : array
-        What `pull_pixels` wrote.
+        Output of `pull_pixels`.
     """
     record, _, box, near, far = splats
     listed, tiles, pairs, tiles_x = entries

@@ -63,7 +63,7 @@ class Samples(NamedTuple):
     Attributes
     ----------
     texel : (n, s, 4) int32 array
-        What a direction that misses the object reads, the first -1 for any other.
+        Texels that a direction that misses the object reads; the first is -1 for any other direction.
     share : (n, s, 4) float32 array
         Of these texels.
     weight : (n, s, 4) float32 array

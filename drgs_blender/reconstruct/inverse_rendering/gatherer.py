@@ -29,7 +29,7 @@ class Gatherer:
     Parameters
     ----------
     mesh : Mesh
-        What rays meet.
+        Mesh that rays are traced against.
     tree : TriangleBVH
         Of its triangles, or of nothing where nothing is in the way.
     cache : (v, 4, 3) float32 array or None

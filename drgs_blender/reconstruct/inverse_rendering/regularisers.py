@@ -55,7 +55,7 @@ class Regularisers:
         has_metallic : bool
             Metallic is learned.
         knows_metals : bool
-            It is known well enough to say more of metals.
+            Metallic is known well enough for priors on metals.
         """
         s = self._settings
         pair = samples.at_ends(samples.columns)

@@ -107,7 +107,7 @@ def decouple(
     checkpoint : Path, optional
         File to go on from when it lies there and fits, written every few seconds, removed at the end.
     backend : LearningBackend
-        Who follows rays; the rest is done here.
+        Backend that traces rays; the rest runs on the CPU.
     normals : callable, optional
         Gives the normals behind pixels in place of the mesh. They count where they are within 60 degrees of the
         face, as for surfels that are rendered; what is learned of normals is added to them.

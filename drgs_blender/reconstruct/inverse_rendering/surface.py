@@ -33,7 +33,7 @@ class SurfaceSamples:
     columns : (u, c) float32 tensor
         Of `Materials`, of the vertices that pixels and edges use.
     offsets : (u, 3) float32 tensor or None
-        What is learned of their normals.
+        Learned offsets of their normals.
     ends : (e, 2) int64 tensor
         The ends of the edges among those vertices.
     """

@@ -32,7 +32,7 @@ WITNESSES = 0.2
 CELLS = 96
 #: Part of a mask that small parts of the object must have for themselves to be missed where they are left out.
 SHOWN = 0.01
-#: Parts of the object thinner than a cell begin so many cells from the parts that are not.
+#: Distance in cells at which parts thinner than a cell begin, from the thicker parts.
 AWAY = 2
 
 

@@ -198,7 +198,7 @@ def blend_backward(splats: Splats, tiles: Tiles, maps: Array, incoming: Array, s
     splats : Splats
     tiles : Tiles
     maps : (h, w, rows) float32 array
-        What `blend` wrote.
+        Output of `blend`.
     incoming : (h, w, 4 + channels) float32 array
         Gradients of alpha, depth, median, distortion and features.
     slots : (entries of all tiles, BEFORE + channels) float32 array

@@ -58,7 +58,7 @@ class Gaussians:
     light : tensor, optional
         The cube of `reflection`; None: nothing is mirrored.
     backend : LearningBackend
-        Who shows them, where all their tensors are.
+        Backend that renders them and holds their tensors.
     """
 
     def __init__(

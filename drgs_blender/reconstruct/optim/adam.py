@@ -31,7 +31,7 @@ class Adam:
     parameters : dict of str to tensor
         name -> float32 tensor whose first axis counts rows.
     descend : callable
-        What does a step, where the tensors are.
+        Function of one step on the device of the tensors.
 
     Attributes
     ----------

@@ -34,7 +34,7 @@ def densify(
     optimiser : Adam
         Its moments follow the surfels.
     tally : Tally
-        What backward passes noted since the last time.
+        Gradient statistics since the last round.
     budget : int
     largest : float
         Surfels with a larger deviation vanish, metres.

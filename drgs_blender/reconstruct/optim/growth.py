@@ -18,7 +18,7 @@ class Growth:
     ----------
     start : int
     rounds : int
-        Those that are done.
+        Number of rounds that are done.
     """
 
     def __init__(self, schedule: Schedule, start: int) -> None:

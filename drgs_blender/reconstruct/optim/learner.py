@@ -46,7 +46,7 @@ class Learner:
     optimiser, light : Adam
         Of the surfels' parameters; of the light that they mirror.
     tally : Tally
-        What densification goes by.
+        Gradient statistics for densification.
     iteration : int
         Steps that are done.
     error : float
@@ -72,7 +72,7 @@ class Learner:
         target : Target
             Where the processor can read it.
         part : float
-            What is done of the schedule, 0..1.
+            Fraction of the schedule that is done, 0..1.
         """
         # Also when done again, after a device has left it half-done.
         self.optimiser.steps = self.light.steps = self.iteration

@@ -65,7 +65,7 @@ def learning_rates(part: float, radius: float, harmonics: int) -> dict[str, floa
     Parameters
     ----------
     part : float
-        What is done of the schedule, 0..1.
+        Fraction of the schedule that is done, 0..1.
     radius : float
         Of the object, metres.
     harmonics : int

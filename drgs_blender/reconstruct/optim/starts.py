@@ -55,7 +55,7 @@ class Trial:
         return self.rival is not None
 
     def is_due(self, part: float, iteration: int) -> bool:
-        """Whether the turn of the present start is over, at this part of the schedule and after so many steps."""
+        """Whether the turn of the present start is over, at this part of the schedule and after `iteration` steps."""
         # No more steps than the first had: compiling falls to it, and by the clock that would be counted against it.
         even = self.first is not None and iteration >= self.first["counts"][0]
         return self.goes_on and (part >= TRIAL or bool(even))

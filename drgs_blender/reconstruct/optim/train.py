@@ -47,7 +47,7 @@ class Training:
     seconds : float, optional
         Where the steps would take longer, the schedule runs by the clock.
     backend : LearningBackend
-        Who does the steps; what it fails at, and all that follows, is done by this processor.
+        Backend of the steps; where it fails, they go on on the CPU.
     now : callable
         Seconds since whenever.
 
@@ -62,7 +62,7 @@ class Training:
     trial : Trial
         Of the starts.
     fallback : Fallback
-        Who does the steps.
+        Backend of the steps, with its fallback to the CPU.
     growth : Growth
     views : Views
     learner : Learner

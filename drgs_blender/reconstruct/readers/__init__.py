@@ -71,10 +71,10 @@ def read_capture(
     resolution : int, optional
         Pixels of the longer side at most; None keeps the photographs' size.
     test_every : int, optional
-        Leave out every so many views, from the first in the order of their names; where the capture itself says which
+        Leave out every n-th view, from the first in the order of their names; where the capture itself says which
         views are left out, that counts instead.
     axes : str
-        What the matrices of a file are taken for, a key of `AXES`; "opengl" is each layout's own convention.
+        Convention of the file's matrices, a key of `AXES`; "opengl" is each layout's own convention.
     up : str, optional
         The world's up axis, a key of `formats.axes.UP_AXES`; None: as the layout prescribes, else found from the
         cameras, which people hold level.

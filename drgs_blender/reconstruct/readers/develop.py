@@ -44,7 +44,7 @@ def develop(
     resolution : int or None
         Pixels of the longer side at most; None keeps the size.
     known : dict of Lens to tuple of (Lens, array)
-        What `undistorted` says of lenses that distort, filled as they are met.
+        Results of `undistorted` for lenses with distortion, filled as they occur.
 
     Raises
     ------

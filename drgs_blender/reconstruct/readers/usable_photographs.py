@@ -27,7 +27,7 @@ def usable(developed: Sequence[tuple[Photograph, View | None]], subject: str) ->
     Parameters
     ----------
     developed : list
-        What `develop` made of each photograph.
+        Results of `develop` for each photograph.
     subject : str
         The capture, for messages.
 

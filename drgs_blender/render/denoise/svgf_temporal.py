@@ -76,7 +76,7 @@ class History:
     Attributes
     ----------
     signal : Signal, optional
-        What `denoise_next` returned for the last picture; None before the first.
+        Result of `denoise_next` for the last picture; None before the first.
     instant : Instant, optional
         The scene as it was in that picture.
     still : bool
@@ -101,7 +101,7 @@ def denoise_next(
     ----------
     shot : Shot
     history : Signal or None
-        What this function returned for the frame before; None starts over.
+        Result of this function for the frame before; None starts over.
     still : bool
         Nothing in the scene has changed since then (camera, objects, light), only the noise: pictures are then gathered
         without end, with equal weights.

@@ -116,7 +116,7 @@ class Film:
         radiance : Radiance
         pass_index : (objects,) int32 array
         environment : EnvironmentLight
-            What is seen behind, unless the film is transparent.
+            Background, unless the film is transparent.
         environment : EnvironmentLight
         """
         x0, top = self.origin

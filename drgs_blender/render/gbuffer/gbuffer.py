@@ -83,11 +83,11 @@ class GBuffer:
     emission : (n, 3) float32 array
         Radiance that the surface itself sends to the camera.
     face, instance : (n,) int32 array
-        What the point is tied to, as `interaction.nearest` numbers it; face -1 for a surfel off all meshes.
+        Face and instance at the point, as `interaction.nearest` numbers them; face -1 for a surfel off all meshes.
     barycentric : (n, 2) float32 array
         Weights of the face's second and third corner.
     alpha : (rows, width, subpixels) float32 array
-        What of each sub-pixel sample hides the background; shadow catchers do not.
+        Share of each sub-pixel sample that hides the background; shadow catchers do not.
     """
 
     rows: tuple[int, int]

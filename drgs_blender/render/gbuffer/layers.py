@@ -36,7 +36,7 @@ class Layers:
     second : array or None
         Ordinary meshes, or None when there are none.
     opaque : array
-        What hides the background, holdouts included.
+        Share that hides the background, holdouts included.
     hits : MeshHits or None
         Of ordinary meshes, or None when there are none.
     """
@@ -66,7 +66,7 @@ def combine(
     x0, y0 : int
         Full-picture pixel of the first sample.
     trace : callable
-        Who casts the camera's rays.
+        Function that casts the camera's rays.
     """
     special = bool((scene.object_flags & (HOLDOUT | CATCHER)).any())
     if not scene.any_ordinary and not special:

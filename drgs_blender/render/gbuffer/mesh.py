@@ -39,7 +39,7 @@ def primary_mesh(
         `camera.camera_parameters`.
     y0, y1 : int
     trace, shade : callable
-        Who casts the rays, and who finds what they have met.
+        Functions that cast the rays, and that find surfaces at their hits.
     """
     x0, _, x1, _ = camera.window
     hits = trace(scene, parameters, x0, y0, (y1 - y0, x1 - x0, int(parameters[SUBPIXELS])), CAMERA)

@@ -92,7 +92,7 @@ def primary_surfels(
     tied : bool
         False: rays meet surfels, and nothing is tied.
     stages : Stages, optional
-        Who does the work; None: this processor.
+        Functions of a backend; None: the CPU's.
     """
     stages = stages or Stages()
     samples = stages.rasterise(splats, y0, y1)

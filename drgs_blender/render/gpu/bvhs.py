@@ -113,7 +113,7 @@ class Trees:
     moving : tuple
         The scene's vertices, faces and places, on the device, now.
     trees : list
-        As many as there are kinds.
+        One tree per kind.
     """
 
     def __init__(self, launcher: Launcher, layout: object, rows: Array, masks: Array) -> None:

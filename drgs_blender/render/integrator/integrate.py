@@ -77,9 +77,9 @@ def integrate(
     Parameters
     ----------
     scene : TraceScene
-        What rays meet.
+        Scene that rays are traced in.
     environment : EnvironmentLight
-        What rays see that meet nothing.
+        Light of rays that meet nothing.
     points : ShadingPoints
         Visible points, world space.
     settings : RenderSettings
@@ -91,7 +91,7 @@ def integrate(
     part : tuple of int
         (i, n): only the i-th of n equal parts of each sub-sample's samples; the mean over all parts is the whole.
     surfels : SurfelBVH, optional
-        What rays meet of DR-GS objects next to the scene's meshes; then `points` say which surfels are their own.
+        Surfels of DR-GS objects, traced next to the meshes; then `points` say which surfels are their own.
     kernel : Kernel, optional
         None: that of the CPU.
 
@@ -188,7 +188,7 @@ class Scratch(NamedTuple):
     sums : (block, KINDS * KIND) float32 array
         Light of the block's points, see `direct`.
     state : (block, POINT_STATE) float32 array
-        What their samples share, see `sample_allocation`.
+        State shared by their samples, see `sample_allocation`.
     row : (block,) uint32 array
         Their rows in the environment's tables.
     total : (block,) int64 array

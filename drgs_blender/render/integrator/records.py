@@ -23,11 +23,11 @@ class Traits(NamedTuple):
     environment : bool
         The environment shines.
     lights : bool
-        There are lights, or surfaces that are sampled as such: one of them is sampled at every vertex of a path.
+        Whether there are lights, or surfaces sampled as lights: one of them is sampled at every vertex of a path.
     glows : bool
-        There are surfaces that emit, which rays look for beyond a path's last vertex too.
+        Whether surfaces emit, for which rays are traced beyond a path's last vertex too.
     lights_differ : bool
-        There is a light that diffuse rays see and glossy ones do not, or the other way.
+        Whether diffuse and glossy rays see different lights.
     lobes_apart : bool
         The same of objects: cosine samples are of the diffuse lobe alone, GGX samples of the specular one.
     """

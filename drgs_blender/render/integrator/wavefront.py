@@ -304,7 +304,7 @@ def weigh(rays, count, cosine, ggx):  # type: ignore[no-untyped-def]
     """Divide by the density of all strategies together; the arguments (1 or 0) say whether these two take part."""
     s = rays.floats
     for p in range(packets(count)):
-        # Two loops, for LLVM vectorises none with so many places that are read and written.
+        # Two loops, for LLVM vectorises none that reads and writes this many arrays.
         for i in range(p * _FLOATS, p * _FLOATS + LANES):
             s[i + ER] = _factor(s, i, cosine, ggx)
         for i in range(p * _FLOATS, p * _FLOATS + LANES):

@@ -98,9 +98,9 @@ class Lights:
         Estimated luminance that arrives at the sphere from all directions together (cd / m^2 sr), as the integral
         of an environment over all directions is.
     rays_differ : bool
-        There is one that diffuse rays see and glossy ones do not, or the other way.
+        Whether diffuse and glossy rays see different lights.
     seen : bool
-        There is a light that the camera sees.
+        Whether the camera sees a light.
     warnings : list of str
         Lights that are left out, and why.
     """
@@ -290,7 +290,7 @@ def emission_along(origin, direction, hit, geometry, lights):  # type: ignore[no
     origin, direction : tuple of float
         World space; the direction is of unit length.
     hit : Hit
-        What ``scene.interaction.nearest`` returned.
+        Result of ``scene.interaction.nearest``.
     geometry : Geometry
         The scene's.
 

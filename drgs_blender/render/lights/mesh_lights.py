@@ -86,7 +86,7 @@ class Emitters:
     count : int
         Triangles that are sampled.
     rays_differ : bool
-        There is one that diffuse rays see and glossy ones do not, or the other way.
+        Whether diffuse and glossy rays see different lights.
     warnings : list of str
     """
 

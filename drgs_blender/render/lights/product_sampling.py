@@ -69,7 +69,7 @@ class ProductTables:
     Parameters
     ----------
     cells : Cells
-        What the tables weigh again.
+        Sampling cells that the tables reweight.
     """
 
     def __init__(self, cells: Cells) -> None:

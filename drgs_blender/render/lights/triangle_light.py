@@ -24,7 +24,7 @@ ABSENT, CLOSED = 16, 32
 #: What a triangle of a closed surface is reckoned to send to where it turns its back; it may be seen from within.
 BACK = F(0.02)
 
-#: Triangles nearer than so many longest edges are sampled by solid angle, if they cover more than the steradians.
+#: Triangles nearer than this many longest edges, and larger than this many steradians, are sampled by solid angle.
 _NEAR, _LEAST_ANGLE = F(5.0), 1e-5
 _THIRD, _FOUR_PI, _TINY = F(1.0 / 3.0), F(4.0 * math.pi), F(1e-30)
 _LEAST_COSINE = F(1e-3)

@@ -36,7 +36,7 @@ class Light:
     image : (h, w, 3) tensor or None
         Linear Rec.709 radiance; may require a gradient. None is white.
     rotation : (3, 3) tensor
-        That takes world directions into the image's.
+        Rotation from world directions to the image's.
     colour : (3,) tensor
         Factor, strength included.
     """

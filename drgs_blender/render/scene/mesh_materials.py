@@ -27,7 +27,7 @@ class Glowing:
     shape : slice
         All faces of the mesh, among the scene's.
     faces : (k,) int64 array
-        Those that emit.
+        Emissive faces.
     material : (k,) int32 array
         Of ``MeshMaterials.table``.
     uvs : (k, 3, 2) float32 array or None
@@ -98,11 +98,11 @@ class MeshMaterials:
         parts : sequence of Part
             Of the scene.
         before : sequence of (TraceObject or MeshState or None)
-            What each part was at the last update.
+            State of each part at the last update.
         meshes : sequence of MeshState
             Of the frame.
         images : sequence of Image
-            That their textures use.
+            Images of their textures.
         sources : tuple of int
             First source that is a mesh, first face that is of one.
 

@@ -25,7 +25,7 @@ class Ray(NamedTuple):
     tnear, tfar : np.float32
         Distances between which things are met.
     mask : np.int32
-        What the ray meets: all that has one of these bits, see `ray_masks`.
+        Ray mask: the ray meets groups that share a bit, see `ray_masks`.
     """
 
     origin: Vector

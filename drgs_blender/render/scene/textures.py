@@ -82,7 +82,7 @@ class MaterialTable:
     materials : list of Material
         In the order of the indices that ``material_at`` takes.
     images : list of Image
-        What their textures refer to by name; only those in use are looked at.
+        Images that their textures name; only those in use are read.
     previous : MaterialTable, optional
         Table of the frame before: what it made of images whose pixels are the same frozen array is taken over.
 
@@ -96,7 +96,7 @@ class MaterialTable:
     addresses : tuple of int
         Of the six arrays, for ``material_at``; valid as long as this table lives.
     arrays : tuple of array
-        What ``material_at`` reads:
+        Arrays that ``material_at`` reads:
         constants (k, 8) float32, the eight results without textures;
         slots (k, 4) int32, rows of textures for base colour, roughness, metallic and emission, or -1;
         textures (t, 4) int32, image, channel, interpolation, extension;
@@ -106,7 +106,7 @@ class MaterialTable:
     glows : bool
         Whether anything emits light.
     warnings : list of str
-        What was wrong and how it was taken, in words.
+        Problems and their substitutes, in words.
     """
 
     def __init__(self, materials: list[Material], images: list[Image], previous: MaterialTable | None = None) -> None:

@@ -75,7 +75,7 @@ class Part:
     source : int
         Its index among the objects, then meshes, of the update.
     item : TraceObject or MeshState, optional
-        What was last taken in; None before the first time.
+        The object of the last update; None before the first.
     faces : (m, 3) int32 array
         Of its own vertices.
     vertex, face, row : slice
@@ -91,7 +91,7 @@ class Part:
     reach : float
         Metres, the largest coordinate of its vertices.
     bad_vertices, bad_faces : int
-        That are unusable, or touch one that is.
+        Numbers of unusable vertices, and of faces with one.
     empty_faces, flat_faces : int
         Without area as a shape, and where its matrix puts it.
     """

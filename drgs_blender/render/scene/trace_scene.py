@@ -92,7 +92,7 @@ class TraceScene:
     extent : float
         Metres: the largest absolute coordinate, the scale of rounding errors.
     faults : list of ObjectFaults
-        What was wrong, one entry an object, then one a mesh.
+        Problems, one entry per object, then one per mesh.
     """
 
     def __init__(self) -> None:

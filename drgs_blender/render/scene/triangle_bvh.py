@@ -260,7 +260,7 @@ class TriangleBVH:
     first_face : (groups,) int32 array
         The first face of each group, what turns a traced primitive into a face.
     intersect_address, occluded_address, scene : int
-        What ``trace`` and ``blocked`` take in compiled code.
+        Arguments of ``trace`` and ``blocked`` in compiled code.
     rebuilds : int
         How often a group's tree was built from scratch.
     """

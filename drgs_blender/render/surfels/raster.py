@@ -117,7 +117,7 @@ class Tile(NamedTuple):
     x, y : int
         Its first pixel.
     left, top, right, bottom : int
-        What of it is rendered, half-open.
+        Its rendered part, half-open.
     """
 
     x: int

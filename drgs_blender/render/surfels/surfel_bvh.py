@@ -87,9 +87,9 @@ class SurfelBVH:
     Attributes
     ----------
     intersect_address, occluded_address, scene : int
-        What `trace_surfels` and `transmittance` take in compiled code.
+        Arguments of `trace_surfels` and `transmittance` in compiled code.
     surface : (n, SURFEL) float32 array
-        What is blended of each surfel, see `columns`.
+        Blended attributes of each surfel, see `columns`.
     objects : (n,) int32 array
         Index of each surfel's object.
     rebuilds : int

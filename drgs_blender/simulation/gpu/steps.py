@@ -219,7 +219,7 @@ def solve_nodes(lane, lanes, room, blocks, given, grid, time, obstacles, forces,
         Not used.
     blocks : tuple
     given : tuple of array
-        What `prepare_particles` wrote.
+        Output of `prepare_particles`.
     grid : tuple
     time : tuple of array
     obstacles : tuple
