@@ -107,7 +107,7 @@ def test_a_new_camera_stands_before_what_the_viewport_looks_at(perspective):
     distance = 7.0 if perspective == "PERSP" else 0.0
     matrix = (Matrix.Translation((1, 2, 3)) @ turned @ Matrix.Translation((0, 0, distance))).inverted()
     view = SimpleNamespace(view_matrix=matrix, view_distance=7.0, view_perspective=perspective)
-    assert np.allclose(part("operators.workflow").standing(view).translation, (1, -5, 3), atol=1e-4)
+    assert np.allclose(part("operators.workflow").viewpoint(view).translation, (1, -5, 3), atol=1e-4)
 
 
 def test_show_rendered_makes_drgs_the_engine(ball, scene):
