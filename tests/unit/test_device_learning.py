@@ -326,7 +326,7 @@ def test_surfels_half_cut_are_of_no_use(capture: Capture, region: Region, monkey
         training.learner.optimiser.first.clear()
         broken()
 
-    monkeypatch.setattr(training.learner.optimiser, "take", half)
+    monkeypatch.setattr(training.learner.optimiser, "reindex", half)
     training.learner.iteration = here.learner.iteration = 40
     training.densify_when_due()
     here.densify_when_due()
