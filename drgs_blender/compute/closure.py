@@ -11,6 +11,7 @@ import contextlib
 import functools
 import hashlib
 import json
+import os
 import sys
 from pathlib import Path
 
@@ -41,64 +42,79 @@ def digest(path: Path) -> str:
     str
         16 hexadecimal digits.
     """
-    total = hashlib.sha256()
-    for member in sorted(closure(path), key=lambda file: (file != path, _name(file))):
+    total, own = hashlib.sha256(), str(path)
+    for member in sorted(_members(own), key=lambda file: (file != own, _name(file))):
         total.update(_name(member).encode() + b"\0" + _facts(member)[0].encode())
     _index.save()
     return total.hexdigest()[:_DIGITS]
 
 
-_noted: dict[Path, tuple[int, int] | None] = {}
+_noted: dict[str, tuple[int, int] | None] = {}
 
 
 def note(path: Path) -> None:
     """Remember a source file as it is when its module is imported."""
-    if path not in _noted:
-        _noted[path] = _stamp(path)
+    file = str(path)
+    if file not in _noted:
+        _noted[file] = _stamp(file)
+
+
+def changed(path: Path) -> bool:
+    """Whether sources of a module's kernels were changed after they were imported: its digest is then another's."""
+    return any(map(_is_changed, _members(str(path))))
 
 
 @functools.cache
-def changed(path: Path) -> bool:
-    """Whether sources of a module's kernels were changed after they were imported: its digest is then another's."""
-    return any(file in _noted and _noted[file] != _stamp(file) for file in closure(path))
+def _is_changed(file: str) -> bool:
+    """Asked after `_facts` has read the file, which is never read again."""
+    return file in _noted and _noted[file] != _stamp(file)
 
 
-def _stamp(path: Path) -> tuple[int, int] | None:
+def _stamp(file: str) -> tuple[int, int] | None:
     try:
-        facts = path.stat()
+        facts = os.stat(file)
     except OSError:
         return None
     return facts.st_mtime_ns, facts.st_size
 
 
-@functools.cache
 def closure(path: Path) -> frozenset[Path]:
     """Source files of `path` and of everything of the package that it imports, directly or not, but `NEUTRAL` ones."""
-    seen, pending = {path}, [path]
+    return frozenset(map(Path, _members(str(path))))
+
+
+# Files are texts from here on: a start asks thousands of times which file comes after which, and texts are compared in
+# a tenth of the time of a `Path`.
+
+
+@functools.cache
+def _members(file: str) -> frozenset[str]:
+    seen, pending = {file}, [file]
     while pending:
         for other in _facts(pending.pop())[1]:
-            if other not in seen and _name(other) not in NEUTRAL:
+            if other not in seen:
                 seen.add(other)
                 pending.append(other)
     return frozenset(seen)
 
 
 @functools.cache
-def _name(path: Path) -> str:
+def _name(file: str) -> str:
     """The same on every machine: below the package, or the bare name."""
+    path = Path(file)
     return path.relative_to(PACKAGE.parent).as_posix() if path.is_relative_to(PACKAGE) else path.name
 
 
 @functools.cache
-def _facts(path: Path) -> tuple[str, tuple[Path, ...]]:
+def _facts(file: str) -> tuple[str, tuple[str, ...]]:
     """Digest of a source file without comments and docstrings, and the package's files that it imports."""
-    source = path.read_bytes()
-    key = hashlib.sha256(_name(path).encode() + b"\0" + source).hexdigest()
+    source = Path(file).read_bytes()
+    key = hashlib.sha256(_name(file).encode() + b"\0" + source).hexdigest()
     if key not in _index.rows:
-        _index.add(key, *_parse(source, path))
+        _index.add(key, *_parse(source, Path(file)))
     facts, imported = _index.rows[key]
-    found = {file for name in imported for file in _files(tuple(name.split(".")))} - {path}
-    return facts, tuple(sorted(found))
+    found = {other for name in imported for other in _files(name)} - {file}
+    return facts, tuple(sorted(other for other in found if _name(other) not in NEUTRAL))
 
 
 def _parse(source: bytes, path: Path) -> tuple[str, list[str]]:
@@ -184,19 +200,24 @@ _index = _Index()
 
 
 @functools.cache
-def _files(name: tuple[str, ...]) -> tuple[Path, ...]:
+def _files(name: str) -> tuple[str, ...]:
     """Files that run when a dotted name is imported from the package: its module and the packages above it."""
-    if name[0] != PACKAGE.name:
+    first, *parts = name.split(".")
+    if first != PACKAGE.name:
         return ()
-    found, folder = [], PACKAGE
-    for part in name[1:]:
-        found.append(folder / "__init__.py")
-        if (folder / f"{part}.py").is_file():
-            found.append(folder / f"{part}.py")
+    found, folder = [], str(PACKAGE)
+    for part in (*parts, ""):
+        files, folders = _inside(folder)
+        found += [os.path.join(folder, file) for file in ("__init__.py", f"{part}.py") if file in files]
+        if f"{part}.py" in files or part not in folders:
             break
-        folder = folder / part
-        if not folder.is_dir():
-            break
-    else:
-        found.append(folder / "__init__.py")
-    return tuple(path for path in found if path.is_file())
+        folder = os.path.join(folder, part)
+    return tuple(found)
+
+
+@functools.cache
+def _inside(folder: str) -> tuple[frozenset[str], frozenset[str]]:
+    """Names of the files and of the folders in a folder: to list it is quicker than to ask for each."""
+    with os.scandir(folder) as entries:
+        kinds = [(entry.name, entry.is_dir()) for entry in entries]
+    return frozenset(name for name, is_dir in kinds if not is_dir), frozenset(name for name, is_dir in kinds if is_dir)

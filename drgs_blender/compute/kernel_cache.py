@@ -109,7 +109,6 @@ class KernelCache(NullCache):
         self.function, self.kind, self.options = function, kind, options or {}
         self._names: dict[tuple[Any, ...], str | None] = {}
         self._source = _source(function.__code__.co_filename)
-        closure.note(self._source)
 
     @property
     def cache_path(self) -> str | None:
@@ -242,7 +241,10 @@ def _constant(value: Any) -> str:
 
 @functools.cache
 def _source(name: str) -> Path:
-    return Path(name).resolve()
+    """The file of a module that is being imported."""
+    path = Path(name).resolve()
+    closure.note(path)
+    return path
 
 
 def pack(content: bytes) -> bytes:

@@ -39,8 +39,9 @@ def package(tmp_path, monkeypatch):
 
 
 def forget() -> None:
-    for function in (closure.digest, closure.closure, closure.changed, closure._facts, closure._files, closure._name):
-        function.cache_clear()
+    cached = "digest", "_members", "_is_changed", "_facts", "_files", "_inside", "_name"
+    for name in cached:
+        getattr(closure, name).cache_clear()
 
 
 def key(folder: Path) -> str:
