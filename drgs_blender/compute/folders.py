@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import contextlib
 import functools
 import logging
 import os
@@ -160,16 +161,29 @@ def _prune(folder: Path) -> None:
     """Remove what was not used for a month; a clock that jumped back makes nothing old."""
     now = time.time()
     try:
-        found = [*folder.iterdir(), *folder.glob("*/.*.tmp")]
+        found = _ours(folder)
     except OSError as error:
         log.info("old kernels in %s: %s", folder, error)
         return
     for path in found:
         try:
-            if _OURS.fullmatch(path.name) and now - path.lstat().st_mtime > _MONTH:
+            if now - path.lstat().st_mtime > _MONTH:
                 _remove(path)
         except OSError as error:
             log.info("old kernels in %s: %s", path, error)
+
+
+def _ours(folder: Path) -> list[Path]:
+    """What was put into a folder, and unfinished files in its folders; each start asks."""
+    found = []
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            if _OURS.fullmatch(entry.name):
+                found.append(Path(entry.path))
+            with contextlib.suppress(OSError):  # a link in a circle, or another process has removed it
+                hidden = [name for name in os.listdir(entry.path) if name[0] == "."] if entry.is_dir() else []
+                found += [Path(entry.path, name) for name in hidden if _OURS.fullmatch(name)]
+    return found
 
 
 def _remove(path: Path) -> None:

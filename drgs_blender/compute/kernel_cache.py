@@ -11,13 +11,15 @@ from __future__ import annotations
 import contextlib
 import functools
 import hashlib
+import importlib
 import json
 import logging
 import os
 import pickle
 import re
 import sys
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from types import CodeType
 from typing import Any
@@ -42,7 +44,7 @@ except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
 log = logging.getLogger(__name__)
-_MAGIC = b"drgs kernel 2\n"
+_MAGIC = b"drgs kernel 3\n"
 _DIGEST = 32
 ENDING = ".kernel"
 
@@ -293,13 +295,28 @@ def _reduce(cres: Any) -> bytes:
     values = [*module.functions, *module.global_variables]
     symbols = [value.name for value in values if not value.is_declaration]
     needed = [value.name for value in values if value.is_declaration and not value.name.startswith("llvm.")]
-    code = library.name, library._get_compiled_object(), symbols, needed
     environments = tuple(cres._find_referenced_environments())
+    modules = sorted({str(other.globals["__name__"]) for other in environments})
+    code = library.name, library._get_compiled_object(), symbols, needed, modules
+    environments = _in_use(environments, str(module))
     return dumps((code, descriptor, cres.environment, cres.signature, cres.objectmode, cres.reload_init, environments))
 
 
-def _provide(symbols: list[str], target_context: Any) -> None:
-    """Have the functions of Numba there that machine code calls.
+def _in_use(environments: tuple[Any, ...], llvm_code: str) -> tuple[Any, ...]:
+    """Environments to which LLVM code refers: of most functions in a kernel no more is left than a variable for it.
+
+    Each would be looked for when the kernel is loaded, and the module imported that it is of: much of Numba.
+    """
+    uses = Counter(re.findall(r"_ZN08NumbaEnv[\w.$]*", llvm_code))
+    return tuple(other for other in environments if uses[other.env_name] != 1)
+
+
+#: Functions outside of kernels that were found.
+_there: set[str] = set()
+
+
+def _provide(symbols: list[str], target_context: Any, modules: Iterable[str] = ()) -> None:
+    """Have the functions of Numba there that machine code calls, which some of its `modules` may bring.
 
     Its registries of all that it can compile, with SciPy's linear algebra, take a third of a second to load: they are
     left to the first kernel that is compiled, or that calls what only they bring.
@@ -308,21 +325,26 @@ def _provide(symbols: list[str], target_context: Any) -> None:
     known = target_context.codegen()._engine._defined_symbols
 
     def missing() -> list[str]:
-        return [name for name in symbols if name not in known and binding.address_of_symbol(name) is None]
+        new = set(symbols) - _there - known
+        return [name for name in sorted(new) if binding.address_of_symbol(name) is None]
 
+    if missing():
+        for name in modules:
+            importlib.import_module(name)
     if missing():
         target_context.refresh()
         if absent := missing():
             raise DamagedError(f"nothing has {', '.join(absent)}")  # to run it would end the process
+    _there.update(symbols)
 
 
 def _rebuild(target_context: Any, content: bytes) -> Any:
     code, descriptor, environment, signature, objectmode, reload_init, environments = pickle.loads(content)
-    name, machine_code, symbols, needed = code
+    name, machine_code, symbols, needed, modules = code
     for function in reload_init:
         function()
     codegen = target_context.codegen()
-    _provide(needed, target_context)
+    _provide(needed, target_context, modules)
     library = LoadedLibrary(codegen, name)
     library.enable_object_caching()
     library._set_compiled_object(machine_code)

@@ -5,7 +5,6 @@ python -m drgs_blender.compute.prepare [--all | JOB ...]
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import json
 import logging
@@ -291,6 +290,8 @@ class _Worker:
 
 def main(argv: list[str] | None = None) -> int:
     """The command line; the return value is the exit code."""
+    import argparse  # of no use to an engine, which imports this module when it starts
+
     parser = argparse.ArgumentParser(prog="python -m drgs_blender.compute.prepare", description=__doc__.split("\n")[0])
     parser.add_argument("jobs", nargs="*", metavar="JOB", help=f"any of {', '.join(manifest.jobs())}")
     parser.add_argument("--all", action="store_true", help="of all jobs")

@@ -51,3 +51,20 @@ def test_command_line_starts_without_heavy_imports():
 def test_relighting_imports_without_torch(module):
     result = run_blocked({"torch", "bpy", "skimage"}, f"import {module}")
     assert result.returncode == 0, result.stderr
+
+
+#: What a first picture needs none of, and no other package imports for it.
+LATER = (
+    "torch", "trimesh", "PIL", "OpenEXR", "igl", "skimage", "tifffile", "warp", "scipy.sparse", "argparse", "asyncio",
+    "drgs_blender.render.gpu.warp_backend", "drgs_blender.formats", "drgs_blender.build",
+)  # fmt: skip
+
+
+def test_an_engine_starts_with_nothing_that_it_needs_later():
+    program = f"""
+import sys
+import drgs_blender.engine.server, drgs_blender.engine.jit_events, drgs_blender.engine.session
+print(*set({LATER!r}) & set(sys.modules))
+"""
+    result = run_blocked(set(), program)
+    assert (result.stdout.strip(), result.returncode) == ("", 0), result.stderr

@@ -191,6 +191,34 @@ def test_numba_s_compiler_is_loaded_only_for_what_is_compiled(tmp_path):
     assert said == [["8", "True", "True"], ["8", "True", "False"]]
 
 
+_ENVIRONMENTS = """
+import sys
+import numpy as np
+from drgs_blender.compute.jit import njit
+@njit
+def turned(a): return np.ascontiguousarray(a[::-1])
+@njit
+def backwards(a, n):
+    if n < 0: raise ValueError("negative", n)
+    return turned(a)
+print(*backwards(np.arange(3), 0), "numba.np.arrayobj" in sys.modules)
+try: backwards(np.arange(3), -7)
+except ValueError as error: print(error.args)
+"""
+
+
+@pytest.mark.slow
+def test_a_kernel_is_loaded_with_the_environments_that_it_uses_alone(tmp_path):
+    """Others would bring modules of Numba; without one, a kernel could not say what is wrong."""
+    program, said = tmp_path / "program.py", []
+    program.write_text(_ENVIRONMENTS)
+    environment = os.environ | {"DRGS_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": str(ROOT)}
+    for _ in range(2):
+        done = subprocess.run([sys.executable, program], env=environment, capture_output=True, text=True, check=True)
+        said.append(done.stdout.splitlines())
+    assert said == [[f"2 1 0 {compiled}", "('negative', -7)"] for compiled in (True, False)]
+
+
 @pytest.mark.parametrize(("symbol", "times"), [("NRT_decref", 0), ("malloc", 0), ("function_of_nobody", 1)])
 def test_what_a_kernel_calls_and_is_not_there_is_loaded_with_the_compiler(monkeypatch, symbol, times):
     target, calls = numba.core.registry.cpu_target.target_context, []

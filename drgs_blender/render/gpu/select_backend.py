@@ -6,7 +6,6 @@ from ...compute.warp.runtime import name_of, warp
 from ...core.errors import DeviceError
 from ...core.frame import RenderSettings
 from ..backend import CPU, RenderBackend
-from .warp_backend import WarpRenderBackend
 
 #: Failures after which a device is left alone; before, the next picture tries it again: its scene may be smaller.
 _TRIES = 3
@@ -28,6 +27,8 @@ class Backends:
 
     def _found(self, device: str) -> RenderBackend:
         if device not in self._known and device not in self._missing:
+            from .warp_backend import WarpRenderBackend  # ten modules, which few starts need
+
             try:
                 self._known[device] = WarpRenderBackend(name_of(device))
             except DeviceError as error:
