@@ -22,6 +22,7 @@ from ..core.asset import Asset
 from ..core.errors import UsageError
 from ..core.frame import Frame, ObjectState, RenderSettings, World
 from ..core.frame_sequences import frame_path
+from ..core.loading import many_imports
 from ..core.particle_cache import ParticleCache
 from . import sampling
 from .camera_file import read_camera
@@ -87,9 +88,10 @@ def run(args: argparse.Namespace) -> int:
     for number, _ in poses:
         check_writable(frame_path(args.out, number))
 
-    from ..engine.session import Session
+    with many_imports():
+        from ..engine.session import Session
 
-    session = Session()
+        session = Session()
     key = session.load_asset(args.asset)
     world = World(read_environment(args, session.asset(key)), rotation_z(args.env_rotation), strength=args.env_strength)
     for number, vertices in poses:

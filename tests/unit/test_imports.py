@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import gc
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from drgs_blender.core.loading import many_imports
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "drgs_blender"
@@ -68,3 +71,10 @@ print(*set({LATER!r}) & set(sys.modules))
 """
     result = run_blocked(set(), program)
     assert (result.stdout.strip(), result.returncode) == ("", 0), result.stderr
+
+
+def test_garbage_is_collected_again_after_imports():
+    with pytest.raises(ImportError), many_imports():
+        assert not gc.isenabled()
+        raise ImportError("a part is missing")
+    assert gc.isenabled()
