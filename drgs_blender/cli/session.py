@@ -25,8 +25,9 @@ from typing import TYPE_CHECKING, Any
 
 from ..core.asset.archive import replace_file
 from ..core.errors import EXIT_INTERRUPTED, EXIT_TERMINATED, EngineError, UsageError
+from ..core.file_lock import FileLock
 from . import sampling
-from .session_link import POLL_SECONDS, Lock, claim_folder, end, is_running
+from .session_link import POLL_SECONDS, acquire, claim_folder, end, is_running
 
 if TYPE_CHECKING:
     from .machine import Machine
@@ -105,12 +106,12 @@ def serve(folder: Path, idle: int) -> int:
             time.sleep(POLL_SECONDS)
 
 
-def _claim(folder: Path) -> Lock:
+def _claim(folder: Path) -> FileLock:
     """Make `folder` that of this process: the lock on it."""
-    lock = Lock(folder / "lock")
+    lock = FileLock(folder / "lock")
     # What a killed session left. It is listed before the lock is taken: from then on chunks may come.
     old = [path for path in folder.iterdir() if path.name not in ("lock", "log")]
-    if not lock.acquire(1.0):
+    if not acquire(lock, folder, 1.0):
         raise UsageError(f"session {folder}", "is running", "Stop it, or choose another folder")
     for path in old:
         path.unlink(missing_ok=True)
@@ -143,7 +144,7 @@ def _run_request(folder: Path, about: dict[str, Any], machine: Machine) -> int:
 class _IdleWatch:
     """Ends this process when it is idle for too long, or when its parents have ended."""
 
-    def __init__(self, folder: Path, idle: int, lock: Lock) -> None:
+    def __init__(self, folder: Path, idle: int, lock: FileLock) -> None:
         self._folder, self._idle = folder, idle
         self._lock = lock  # which goes with this process
         self._waits: Path | None = None
@@ -182,7 +183,7 @@ class _IdleWatch:
         if waits is None:
             return "nothing was asked of it" if time.monotonic() - self._since > self._idle else None
         with contextlib.suppress(OSError):  # the folder went just now
-            lock = Lock(waits)
+            lock = FileLock(waits)
             free = lock.acquire()
             lock.close()
             if free and self._waits is waits:  # else it has just been answered

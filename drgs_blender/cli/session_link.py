@@ -28,6 +28,7 @@ from typing import IO
 
 from ..core.asset.archive import replace_file
 from ..core.errors import EngineError, UsageError, WriteError
+from ..core.file_lock import FileLock
 from .frame_lines import HEARTBEAT_SECONDS, emit
 
 logger = logging.getLogger(__name__)
@@ -39,39 +40,6 @@ _FILES = re.compile(r"lock|log|pid|stop|\.?(request-)?[0-9a-f]{8}\.(json|waits|o
 SILENT_SECONDS = 4 * HEARTBEAT_SECONDS
 #: How long a process that was asked to end may take.
 END_SECONDS = 4.0
-
-
-class Lock:
-    """A lock on a file that ends with the process which holds it."""
-
-    def __init__(self, path: Path) -> None:
-        self._file: IO[bytes] = open(path, "a+b")  # noqa: SIM115 - open as long as it is locked
-
-    def acquire(self, patience: float = 0.0) -> bool:
-        """Lock it, unless another process has, and keeps it for `patience` seconds: who only looks, takes it too."""
-        deadline = time.monotonic() + patience
-        while not (locked := self._try_lock()) and time.monotonic() < deadline:
-            time.sleep(POLL_SECONDS / 5)
-        return locked
-
-    def _try_lock(self) -> bool:
-        try:
-            if sys.platform == "win32":
-                import msvcrt
-
-                self._file.seek(0)
-                msvcrt.locking(self._file.fileno(), msvcrt.LK_NBLCK, 1)
-            else:
-                import fcntl
-
-                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            return False
-        return True
-
-    def close(self) -> None:
-        """Give it back."""
-        self._file.close()
 
 
 def claim_folder(folder: Path) -> None:
@@ -94,13 +62,28 @@ def claim_folder(folder: Path) -> None:
         raise UsageError(f"session {folder}", "is a folder in which others may write", "Choose a folder of your own")
 
 
+def acquire(lock: FileLock, folder: Path, patience: float = 0.0) -> bool:
+    """Acquire a lock in a session's `folder`, unless another process has it for `patience` seconds.
+
+    Raises
+    ------
+    WriteError
+        Files cannot be locked there.
+    """
+    try:
+        return lock.acquire(patience)
+    except OSError as error:
+        problem = f"is on a drive that cannot lock files ({error.strerror or error})"
+        raise WriteError(f"session {folder}", problem, "Choose a folder on a local disk") from error
+
+
 def is_running(folder: Path) -> bool:
     """Whether a session's process lives."""
     if not os.path.isfile(folder / "lock"):  # unlike a Path's, False for any name that cannot be
         return False
-    lock = Lock(folder / "lock")
+    lock = FileLock(folder / "lock")
     try:
-        return not lock.acquire()
+        return not acquire(lock, folder)
     finally:
         lock.close()
 
@@ -154,8 +137,8 @@ def delegate(folder: Path, words: Sequence[str]) -> int | None:
     name = secrets.token_hex(4)
     request = folder / f"request-{name}.json"
     files = {kind: folder / f"{name}.{kind}" for kind in ("out", "err", "code", "waits")}
-    waits = Lock(files["waits"])
-    waits.acquire()
+    waits = FileLock(files["waits"])
+    acquire(waits, folder)
     replace_file(request, [json.dumps({"name": name, "words": list(words), "cwd": os.getcwd()}).encode()])
     try:
         tails = [_tail(files["out"], sys.stdout), _tail(files["err"], sys.stderr)]

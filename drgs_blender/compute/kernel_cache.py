@@ -34,14 +34,10 @@ from numba.core.compiler import CompileResult
 from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
 
+from ..core.file_lock import FileLock
 from . import closure, shipped
 from .folders import cache_folder, write_atomically
 from .kernel_compiler import KernelCompiler, LoadedLibrary, is_nested
-
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None  # type: ignore[assignment]
 
 log = logging.getLogger(__name__)
 _MAGIC = b"drgs kernel 3\n"
@@ -58,40 +54,29 @@ class DamagedError(Exception):
 
 
 class Claim:
-    """A lock on a file, which keeps processes from compiling the same; it ends with its process.
+    """A lock that keeps processes from compiling the same kernel; without one where files cannot be locked."""
 
-    Where files cannot be locked (Windows, some network folders), every process gets one.
-    """
-
-    def __init__(self, file: int | None = None) -> None:
-        self._file = file
+    def __init__(self, lock: FileLock | None = None) -> None:
+        self._lock = lock
 
     @classmethod
     def of(cls, path: Path) -> Claim | None:
         """The lock on `path`, which is made where it is not there; None while another process has it."""
-        if fcntl is None:
-            return cls()
+        lock: FileLock | None = None
         try:
             path.parent.mkdir(exist_ok=True, mode=0o700)
-            file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            lock = FileLock(path)
+            if lock.acquire():
+                return cls(lock)
         except OSError:
-            return cls()
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            os.close(file)
-            return None
-        except OSError:
-            pass
-        return cls(file)
+            return cls(lock)
+        lock.close()
+        return None
 
     def close(self) -> None:
-        """Give it up; the file stays, since another process may wait for it."""
-        if self._file is not None:
-            with contextlib.suppress(OSError):
-                fcntl.flock(self._file, fcntl.LOCK_UN)  # a child may have the file open as well
-            os.close(self._file)
-            self._file = None
+        """Release it."""
+        if self._lock is not None:
+            self._lock.close()
 
 
 class KernelCache(NullCache):
@@ -115,8 +100,8 @@ class KernelCache(NullCache):
     @property
     def cache_path(self) -> str | None:
         """Folder of the files."""
-        folder = cache_folder().path
-        return str(folder / self._folder()) if folder else None
+        path = self._path("")
+        return str(path) if path else None
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """The compiled form for `sig`, None if there is none (that can be used)."""
@@ -139,28 +124,27 @@ class KernelCache(NullCache):
             return
         cres.library._ensure_finalized()  # a callback's is not yet
         self._record(sig, KernelCompiler.seconds)
-        folder, name = cache_folder(), self.file_name(sig, cres.codegen)
-        if name is None or folder.path is None:
+        name = self.file_name(sig, cres.codegen)
+        path = self._path(name) if name is not None else None
+        if path is None:
             return
-        path = folder.path / self._folder() / name
         try:
             path.parent.mkdir(exist_ok=True, mode=0o700)
             write_atomically(path, pack(_reduce(cres)))
         except OSError as error:
-            folder.failed(path, error)
+            cache_folder().failed(path, error)
 
     def is_there(self, sig: Any, codegen: Any) -> bool:
         """Whether the compiled form for `sig` need not be compiled."""
         name = self.file_name(sig, codegen)
         if name is None:
             return True  # it would not be kept
-        folder = cache_folder().path
-        return shipped.has(name) or (folder is not None and (folder / self._folder() / name).is_file())
+        return shipped.has(name) or ((path := self._path(name)) is not None and path.is_file())
 
     def claim(self, sig: Any, codegen: Any) -> Claim | None:
         """The right to compile for `sig`, until it is closed; None while another process has it."""
-        folder, name = cache_folder().path, self.file_name(sig, codegen)
-        return Claim.of(folder / self._folder() / f".{name}.lock.tmp") if folder is not None else Claim()
+        path = self._path(f".{self.file_name(sig, codegen)}.lock.tmp")
+        return Claim.of(path) if path is not None else Claim()
 
     def file_name(self, sig: Any, codegen: Any) -> str | None:
         """Name of the file for `sig`; None for types that have no name of their own, of which none is kept."""
@@ -198,9 +182,7 @@ class KernelCache(NullCache):
     def _found(self, name: str) -> Iterator[bytes]:
         if (data := shipped.read(name)) is not None:
             yield data
-        folder = cache_folder().path
-        if folder is not None:
-            path = folder / self._folder() / name
+        if (path := self._path(name)) is not None:
             try:
                 data = path.read_bytes()
                 with contextlib.suppress(OSError):
@@ -216,8 +198,12 @@ class KernelCache(NullCache):
     def _closure(self) -> str:
         return closure.digest(self._source)
 
-    def _folder(self) -> str:
-        return f"{self.function.__module__.rpartition('.')[2]}-{self._closure}"
+    def _path(self, name: str) -> Path | None:
+        """A file of this function's folder, or the folder for no name; None where nothing is kept."""
+        folder = cache_folder().path
+        if folder is None:
+            return None
+        return folder / f"{self.function.__module__.rpartition('.')[2]}-{self._closure}" / name
 
 
 def _code_facts(function: Any) -> tuple[str, str]:

@@ -59,6 +59,8 @@ class _Flags(compiler.Flags):
 class EntryLibrary(codegen.JITCodeLibrary):
     """Code that Python calls."""
 
+    _linking_libraries: list[Any]
+
     def _optimize_functions(self, ll_module: Any) -> None:
         numba_shortcuts.optimize_functions(self, ll_module)
 

@@ -15,6 +15,7 @@ from processes import all_gone, children, listening
 
 from drgs_blender.cli import denoise, session, session_link
 from drgs_blender.core.errors import EngineError
+from drgs_blender.core.file_lock import FileLock
 from drgs_blender.render.film.frame_files import read_frame
 
 from .conftest import PROGRAM, same_pixels
@@ -223,13 +224,13 @@ def test_chunk_that_comes_at_once_is_not_taken_for_an_old_one(tmp_path, monkeypa
     """Whoever sees the lock taken may ask, before the new session has tidied up what a killed one left."""
     (tmp_path / "request-00000000.json").touch()
 
-    class Seen(session_link.Lock):
+    class Seen(FileLock):
         def acquire(self, patience: float = 0.0) -> bool:
             taken = super().acquire(patience)
             (tmp_path / "request-11111111.json").touch()
             return taken
 
-    monkeypatch.setattr(session, "Lock", Seen)
+    monkeypatch.setattr(session, "FileLock", Seen)
     lock = session._claim(tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["lock", "pid", "request-11111111.json"]
     lock.close()

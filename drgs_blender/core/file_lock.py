@@ -1,0 +1,78 @@
+"""Locks on files between processes, which the system releases when their process ends."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import sys
+import time
+from pathlib import Path
+
+_POLL_SECONDS = 0.01
+#: How Windows says that another process has the lock.
+_BUSY = errno.EACCES, errno.EDEADLK, 36
+
+
+class FileLock:
+    """An exclusive lock on a file, made where it is not there; its content does not matter.
+
+    Parameters
+    ----------
+    path : Path
+
+    Raises
+    ------
+    OSError
+        The file can be neither opened nor made.
+    """
+
+    def __init__(self, path: Path) -> None:
+        flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_NOINHERIT", 0)
+        self._file: int | None = os.open(path, flags, 0o600)
+
+    def acquire(self, patience: float = 0.0) -> bool:
+        """Lock the file, and say whether that was possible within `patience` seconds.
+
+        Raises
+        ------
+        OSError
+            Files cannot be locked here, as on some network drives.
+        """
+        deadline = time.monotonic() + patience
+        while not (locked := self._try()) and time.monotonic() < deadline:
+            time.sleep(_POLL_SECONDS)
+        return locked
+
+    def _try(self) -> bool:
+        assert self._file is not None, "closed"
+        if sys.platform == "win32":
+            import msvcrt
+
+            try:
+                os.lseek(self._file, 0, os.SEEK_SET)
+                msvcrt.locking(self._file, msvcrt.LK_NBLCK, 1)
+            except OSError as error:
+                if error.errno in _BUSY:
+                    return False
+                raise
+        else:
+            import fcntl
+
+            try:
+                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                return False
+        return True
+
+    def close(self) -> None:
+        """Release the lock; the file stays, since another process may wait for it."""
+        if self._file is None:
+            return
+        if sys.platform != "win32":
+            import fcntl
+
+            with contextlib.suppress(OSError):
+                fcntl.flock(self._file, fcntl.LOCK_UN)  # a child may have the file open as well
+        os.close(self._file)
+        self._file = None
