@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from ..core.color import srgb_to_linear, to_unit
@@ -11,6 +13,42 @@ Array = np.ndarray
 
 #: Columns of sampled materials: albedo (linear Rec.709), roughness, metallic.
 CHANNELS = 5
+#: Points looked up at a time: what is found on the way stays in the processor's cache.
+TOGETHER = 16384
+
+
+class Places(NamedTuple):
+    """Where points lie in the pyramids of all images of one layout.
+
+    Attributes
+    ----------
+    fine, coarse : Corners
+        In the level whose pixels are as large as the footprint, or smaller; in the next one, of some points.
+    blended : (k,) int64 array
+        The points of `coarse`.
+    share : (k,) float32 array
+        How much of the coarse level they take.
+    """
+
+    fine: Corners
+    coarse: Corners
+    blended: Array
+    share: Array
+
+
+class Corners(NamedTuple):
+    """Four pixels around each of n points, and how far the point is from the first to the last.
+
+    Attributes
+    ----------
+    pixel : (4, n) int64 array
+        Number of the top left, top right, bottom left and bottom right pixel.
+    x, y : (n,) float32 array
+    """
+
+    pixel: Array
+    x: Array
+    y: Array
 
 
 class Pyramid:
@@ -23,8 +61,10 @@ class Pyramid:
 
     Attributes
     ----------
-    levels : list of (h, w, c) array
+    levels : list of (h, w, 3) array
         Level 0 is the image, each next one the mean of 2 x 2 pixels.
+    layout : tuple
+        Equal for images whose points are found at the same `places`.
     """
 
     def __init__(self, image: Image) -> None:
@@ -32,19 +72,32 @@ class Pyramid:
         pixels = to_unit(np.repeat(pixels[..., :1], 3, axis=2) if pixels.shape[2] < 3 else pixels[..., :3])
         self.image = image
         encoded = image.srgb and image.pixels.dtype.kind == "u"
-        self.levels = [np.ascontiguousarray(srgb_to_linear(pixels) if encoded else pixels)]
-        while max(self.levels[-1].shape[:2]) > 1:
-            self.levels.append(_halve(self.levels[-1]))
+        levels = [srgb_to_linear(pixels) if encoded else pixels]
+        while max(levels[-1].shape[:2]) > 1:
+            levels.append(_halve(levels[-1]))
+        self._sizes = np.array([level.shape[1::-1] for level in levels])  # width and height
+        self._starts = np.concatenate([[0], np.cumsum(self._sizes.prod(axis=1))])
+        # All pixels of all levels, channel by channel: numpy is slow at rows of three numbers.
+        self._planes = np.empty((3, self._starts[-1]), np.float32)
+        self.levels = []
+        for level, start, stop in zip(levels, self._starts, self._starts[1:]):
+            self._planes[:, start:stop] = level.reshape(-1, 3).T
+            self.levels.append(self._planes[:, start:stop].T.reshape(level.shape))
+        self.layout = (levels[0].shape[:2], tuple(image.wrap), np.asarray(image.uv_transform, np.float64).tobytes())
 
     def texels(self, uvs: Array) -> Array:
         """Texture coordinates (..., 2), v up -> positions in pixels of level 0, row 0 at the top."""
         transform = np.asarray(self.image.uv_transform, np.float64)
         moved = uvs @ transform[:, :2].T + transform[:, 2]
-        height, width = self.levels[0].shape[:2]
+        width, height = self._sizes[0]
         return np.stack([moved[..., 0] * width, (1 - moved[..., 1]) * height], -1)
 
     def sample(self, texels: Array, footprint: Array) -> Array:
-        """Mean colour (n, 3) around positions.
+        """Mean colour (n, 3) around positions; parameters are those of `places`."""
+        return self.look_up(self.places(texels, footprint)).T
+
+    def places(self, texels: Array, footprint: Array) -> Places:
+        """Find the pixels around positions.
 
         Parameters
         ----------
@@ -55,30 +108,38 @@ class Pyramid:
         """
         level = np.clip(np.log2(np.maximum(footprint, 1)), 0, len(self.levels) - 1)
         low = np.minimum(level.astype(np.int64), max(len(self.levels) - 2, 0))
-        part = (level - low).astype(np.float32)[:, None]
-        result = np.zeros((len(texels), 3), np.float32)
-        for k in np.unique(low):
-            rows = np.flatnonzero(low == k)
-            value = self._bilinear(k, texels[rows])
-            blend = part[rows]
-            if k + 1 < len(self.levels) and blend.any():
-                value = (1 - blend) * value + blend * self._bilinear(k + 1, texels[rows])
-            result[rows] = value
+        share = (level - low).astype(np.float32)
+        x, y = np.ascontiguousarray(texels.T)
+        blended = np.flatnonzero(share)
+        coarse = self._corners(low[blended] + 1, x[blended], y[blended])
+        return Places(self._corners(low, x, y), coarse, blended, share[blended])
+
+    def look_up(self, places: Places, channels: slice = slice(0, 3)) -> Array:
+        """Colours (channels, n) at `places`, those of a pyramid of the same layout."""
+        planes = self._planes[channels]
+        result = np.empty((len(planes), len(places.fine.x)), np.float32)
+        for plane, colour in zip(planes, result):
+            colour[:] = _bilinear(plane, places.fine)
+            if len(places.blended):
+                fine, coarse = colour[places.blended], _bilinear(plane, places.coarse)
+                colour[places.blended] = (1 - places.share) * fine + places.share * coarse
         return result
 
-    def _bilinear(self, level: int, texels: Array) -> Array:
-        pixels = self.levels[level]
-        size = np.array(pixels.shape[1::-1])
-        position = texels * (size / np.array(self.levels[0].shape[1::-1])) - 0.5
-        start = np.floor(position)
-        part = (position - start).astype(np.float32)
-        start = start.astype(np.int64)
-        x = [_wrap(start[:, 0] + k, int(size[0]), self.image.wrap[0]) for k in (0, 1)]
-        y = [_wrap(start[:, 1] + k, int(size[1]), self.image.wrap[1]) for k in (0, 1)]
-        fx, fy = part[:, :1], part[:, 1:]
-        top = (1 - fx) * pixels[y[0], x[0]] + fx * pixels[y[0], x[1]]
-        bottom = (1 - fx) * pixels[y[1], x[0]] + fx * pixels[y[1], x[1]]
-        return (1 - fy) * top + fy * bottom
+    def _corners(self, level: Array, x: Array, y: Array) -> Corners:
+        """The pixels around positions in pixels of level 0, each in a level of its own."""
+        scale = self._sizes / self._sizes[0]
+        width, height = self._sizes[:, 0][level], self._sizes[:, 1][level]
+        x, y = x * scale[:, 0][level] - 0.5, y * scale[:, 1][level] - 0.5
+        left, top = np.floor(x), np.floor(y)
+        part_x, part_y = (x - left).astype(np.float32), (y - top).astype(np.float32)
+        columns = [_wrap(left.astype(np.int64) + k, width, self.image.wrap[0]) for k in (0, 1)]
+        rows = [_wrap(top.astype(np.int64) + k, height, self.image.wrap[1]) for k in (0, 1)]
+        pixel = np.empty((4, len(x)), np.int64)
+        for k, row in enumerate(rows):
+            first = self._starts[level] + row * width
+            np.add(first, columns[0], out=pixel[2 * k])
+            np.add(first, columns[1], out=pixel[2 * k + 1])
+        return Corners(pixel, part_x, part_y)
 
 
 class Materials:
@@ -99,7 +160,7 @@ class Materials:
         self.textured = np.array([bool(self._images(m)) for m in self._materials])
 
     def sample(self, material: Array, uvs: Array, scale: Array) -> Array:
-        """Values (n, CHANNELS) of points.
+        """Values (n, CHANNELS) of points, channel by channel in memory.
 
         Parameters
         ----------
@@ -110,19 +171,27 @@ class Materials:
         scale : (n, 2) array
             Width of the area to average, in texture coordinates.
         """
-        result = np.empty((len(material), CHANNELS), np.float32)
+        result = np.empty((CHANNELS, len(material)), np.float32)
         for index in np.unique(material):
-            rows = np.flatnonzero(material == index)
-            m = self._materials[index]
-            values = np.empty((len(rows), CHANNELS), np.float32)
-            values[:] = (*m.base_colour, m.roughness, m.metallic)
-            for image, columns, channels in self._images(m):
-                pyramid = self._pyramid(image)
-                footprint = np.abs(scale[rows]) * pyramid.levels[0].shape[1::-1] * _zoom(image)
-                colour = pyramid.sample(pyramid.texels(uvs[rows].astype(np.float64)), footprint.max(axis=1))
-                values[:, columns] *= colour[:, channels]
-            result[rows] = values
-        return np.clip(result, 0, 1)
+            of_material = np.flatnonzero(material == index)
+            for first in range(0, len(of_material), TOGETHER):
+                rows = of_material[first : first + TOGETHER]
+                result[:, rows] = self._of_material(self._materials[index], uvs[rows], scale[rows])
+        return np.clip(result, 0, 1, out=result).T
+
+    def _of_material(self, m: MaterialFile, uvs: Array, scale: Array) -> Array:
+        """Values (CHANNELS, n) of points of one material."""
+        values = np.empty((CHANNELS, len(uvs)), np.float32)
+        values[:] = np.array((*m.base_colour, m.roughness, m.metallic))[:, None]
+        places: dict[tuple[object, ...], Places] = {}
+        for image, columns, channels in self._images(m):
+            pyramid = self._pyramid(image)
+            if pyramid.layout not in places:
+                footprint = np.abs(scale) * pyramid.levels[0].shape[1::-1] * _zoom(image)
+                texels = pyramid.texels(uvs.astype(np.float64))
+                places[pyramid.layout] = pyramid.places(texels, np.maximum(footprint[:, 0], footprint[:, 1]))
+            values[columns] *= pyramid.look_up(places[pyramid.layout], channels)
+        return values
 
     def texel_size(self) -> Array:
         """Smallest texel of each material in texture coordinates, (materials + 1,); 1 where it has no texture."""
@@ -159,10 +228,26 @@ def _halve(pixels: Array) -> Array:
     return 0.25 * (padded[::2, ::2] + padded[1::2, ::2] + padded[::2, 1::2] + padded[1::2, 1::2])
 
 
-def _wrap(index: Array, size: int, mode: str) -> Array:
+def _bilinear(plane: Array, corners: Corners) -> Array:
+    """One channel at each point, between its four pixels."""
+    pixel, x, y = corners
+    other_x = 1 - x
+    top = other_x * plane.take(pixel[0]) + x * plane.take(pixel[1])
+    bottom = other_x * plane.take(pixel[2]) + x * plane.take(pixel[3])
+    return (1 - y) * top + y * bottom
+
+
+def _wrap(index: Array, size: Array, mode: str) -> Array:
+    """Bring indices back into an image; each has a size of its own."""
+    outside = np.flatnonzero((index < 0) | (index >= size))
+    if not len(outside):
+        return index
+    out, size = index[outside], size[outside]
     if mode == "clamp":
-        return np.clip(index, 0, size - 1)
-    if mode == "mirror":
-        index = np.mod(index, 2 * size)
-        return np.where(index < size, index, 2 * size - 1 - index)
-    return np.mod(index, size)
+        index[outside] = np.clip(out, 0, size - 1)
+    elif mode == "mirror":
+        out = np.mod(out, 2 * size)
+        index[outside] = np.where(out < size, out, 2 * size - 1 - out)
+    else:
+        index[outside] = np.mod(out, size)
+    return index
