@@ -16,8 +16,9 @@ from ..deform.face_frames import Faces
 from ..formats.axes import scaled_surfels, surfels_to_z_up
 from ..formats.files import MaterialsFile, MeshFile, SurfelFile, plain_name
 from ..formats.gaussian_ply import LAYOUTS
-from .make import TOLERANCE, mesh_with_materials, read_environment_of, read_mesh_file, scale_mesh
+from .make import mesh_with_materials, read_environment_of, read_mesh_file, scale_mesh
 from .proxy import mesh_from_surfels
+from .refine import TOLERANCE
 from .transfer import surfels_to_vertices, vertices_to_surfels
 
 Array = np.ndarray

@@ -94,16 +94,19 @@ def _clusters(group: Array, normals: Array, agree: float) -> Array:
 def edges(net: Net) -> tuple[Array, int]:
     """Number of the edge between points from each corner to the next, (m, 3), and how many edges there are."""
     place = net.point[net.faces]
-    ends = np.sort(np.stack([place, np.roll(place, -1, axis=1)], -1), axis=-1)
-    key = ends[..., 0] * (int(net.point.max(initial=0)) + 1) + ends[..., 1]
+    following = place[:, [1, 2, 0]]
+    key = np.minimum(place, following) * (int(net.point.max(initial=0)) + 1) + np.maximum(place, following)
     unique, number = np.unique(key.reshape(-1), return_inverse=True)
     return number.reshape(-1, 3), len(unique)
 
 
 def edge_lengths(net: Net) -> Array:
     """Length of the edge from each corner to the next, (m, 3)."""
-    corners = net.vertices[net.faces]
-    return np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=-1)
+    corners, square = np.ascontiguousarray(net.faces.T), 0.0
+    for axis in np.ascontiguousarray(net.vertices.T):  # numpy is slow at rows of three numbers
+        at = axis.take(corners)
+        square = square + (at[[1, 2, 0]] - at) ** 2
+    return np.ascontiguousarray(np.sqrt(square).T)
 
 
 def close_marks(edge: Array, lengths: Array, marked: Array) -> Array:
@@ -133,42 +136,45 @@ def subdivide(net: Net, edge: Array, marked: Array) -> Net:
 
     A face is bisected at its longest edge, and each half at its own marked edge if it has one.
     """
-    lengths = edge_lengths(net)
-    turn = (lengths.argmax(axis=1)[:, None] + np.arange(3)) % 3  # start at the longest edge
-    faces = np.take_along_axis(net.faces, turn, 1)
-    uvs = np.take_along_axis(net.uvs, turn[..., None], 1)
-    edge = np.take_along_axis(edge, turn, 1)
+    m, n = len(net.faces), len(net.vertices)
+    longest = edge_lengths(net).argmax(axis=1)[:, None]
+    turn = 3 * np.arange(m)[:, None] + (longest + np.arange(3)) % 3  # start at the longest edge
+    faces, uvs = net.faces.take(turn), net.uvs.reshape(-1, 2).take(turn, axis=0)
+    edge = edge.take(turn)
     split = marked[edge]
 
     # Middles: one a pair of vertices; those of one edge between points share a place.
-    ends = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], -1), axis=-1)
-    n = len(net.vertices)
-    pairs, first, middle = np.unique(ends[split][:, 0] * n + ends[split][:, 1], return_index=True, return_inverse=True)
+    start, end = faces[split], faces[:, [1, 2, 0]][split]
+    key = np.minimum(start, end) * n + np.maximum(start, end)
+    pairs, first, middle = np.unique(key, return_index=True, return_inverse=True)
     a, b = pairs // n, pairs % n
     place = np.cumsum(marked) - 1 + int(net.point.max(initial=-1)) + 1
     middles = np.full(faces.shape, -1, np.int64)
     middles[split] = n + middle.reshape(-1)
 
-    corner = np.concatenate([faces, middles], 1)  # slots: corners 0-2, middles 3-5
-    slot_uvs = np.concatenate([uvs, 0.5 * (uvs + np.roll(uvs, -1, axis=1))], 1)
+    # Children take the place of their parent in the list, so that neighbours stay close in memory: the half at the
+    # first end of the longest edge, then the other one, each perhaps in two.
+    parts = split.sum(axis=1) + 1
+    parent = np.repeat(np.arange(m), parts)
+    one = np.cumsum(parts) - parts
+    other = one + 1 + split[:, 2]
     none, left, right = ~split[:, 0], split[:, 0] & ~split[:, 2], split[:, 0] & ~split[:, 1]
     twice_left, twice_right = split[:, 0] & split[:, 2], split[:, 0] & split[:, 1]
-    recipes = (
-        (none, (0, 1, 2)),
-        (left, (0, 3, 2)),
-        (twice_left, (0, 3, 5)),
-        (twice_left, (3, 2, 5)),
-        (right, (3, 1, 2)),
-        (twice_right, (3, 1, 4)),
-        (twice_right, (3, 4, 2)),
-    )
-    # Children take the place of their parent in the list, so that neighbours stay close in memory.
-    order = np.argsort(np.concatenate([np.flatnonzero(rows) for rows, _ in recipes]), kind="stable")
+    slots = np.empty((len(parent), 3), np.int64)  # 0-2: corners, 3-5: middles
+    slots[one[none]] = 0, 1, 2
+    slots[one[left]] = 0, 3, 2
+    slots[one[twice_left]] = 0, 3, 5
+    slots[one[twice_left] + 1] = 3, 2, 5
+    slots[other[right]] = 3, 1, 2
+    slots[other[twice_right]] = 3, 1, 4
+    slots[other[twice_right] + 1] = 3, 4, 2
+    slots += 6 * parent[:, None]
+    middle_uvs = 0.5 * (uvs + uvs[:, [1, 2, 0]])
     return Net(
         np.concatenate([net.vertices, 0.5 * (net.vertices[a] + net.vertices[b])]),
         np.concatenate([net.point, place[edge[split][first]]]),
         np.concatenate([net.values, 0.5 * (net.values[a] + net.values[b])]),
-        np.concatenate([corner[rows][:, slots] for rows, slots in recipes])[order],
-        np.concatenate([slot_uvs[rows][:, slots] for rows, slots in recipes])[order],
-        np.concatenate([net.tags[rows] for rows, _ in recipes])[order],
+        np.concatenate([faces, middles], 1).take(slots),
+        np.concatenate([uvs, middle_uvs], 1).reshape(-1, 2).take(slots, axis=0),
+        net.tags.take(parent, axis=0),
     )

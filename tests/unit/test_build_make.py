@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from drgs_blender.build.make import _Looked, _net, make_asset, mesh_with_materials
+from drgs_blender.build.make import _net, make_asset, mesh_with_materials
+from drgs_blender.build.refine import _Looked
 from drgs_blender.build.texture import Materials, Pyramid
 from drgs_blender.build.topology import Net, close_marks, edge_lengths, edges, subdivide, survivors, weld
 from drgs_blender.core.errors import AssetError
@@ -153,9 +154,9 @@ def test_what_a_division_leaves_is_known_and_looked_up_once():
     file = plane(6, Image(pixels, srgb=False), vertex_roughness=np.linspace(0, 1, 49).astype(np.float32))
     materials = Materials(file.materials)
     net = _net(file, "plane", {"notes": []})
-    looked, known = _Looked(net, materials), 0
+    edge, count = edges(net)
+    looked, known = _Looked(net, edge, materials), 0
     for _ in range(5):
-        edge, count = edges(net)
         marked = close_marks(edge, edge_lengths(net), rng.random(count) < 0.03)
         kept, before = survivors(net, edge, marked), net
         net = subdivide(net, edge, marked)
@@ -164,8 +165,10 @@ def test_what_a_division_leaves_is_known_and_looked_up_once():
         assert len(kept) == len(net.faces) and len(rows) < len(kept)
         for name in ("faces", "uvs", "tags"):
             np.testing.assert_array_equal(getattr(net, name)[rows], getattr(before, name)[kept[rows]])
-        looked = _Looked(net, materials, looked, kept)
-        np.testing.assert_array_equal(looked.errors, _Looked(net, materials).errors)
+        edge, count = edges(net)
+        looked, fresh = _Looked(net, edge, materials, looked, kept), _Looked(net, edge, materials)
+        np.testing.assert_array_equal(looked.errors, fresh.errors)
+        np.testing.assert_array_equal(looked.values, fresh.values)
     assert known and looked.errors.max() > 0.1
 
 
