@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..geometry.rows import number_rows
+
 Array = np.ndarray
 
 
@@ -65,14 +67,14 @@ def weld(
     """
     extent = np.ptp(vertices, axis=0).max(initial=0.0)
     grid = np.round((vertices - vertices.min(axis=0)) / max(extent * 2e-7, 1e-30)).astype(np.int64)
-    place = np.unique(grid, axis=0, return_inverse=True)[1].reshape(-1)
+    place = number_rows(*grid.T)
     corner_vertex = faces.reshape(-1)
     corner_place, corner_key = place[corner_vertex], np.repeat(keys, 3)
-    group = np.unique(np.stack([corner_place, corner_key], -1), axis=0, return_inverse=True)[1].reshape(-1)
+    group = number_rows(corner_place, corner_key)
     label = np.zeros(len(group), np.int64)
     if normals is not None:
         label = _clusters(group, normals.reshape(-1, 3), agree)
-    _, first, new = np.unique(np.stack([group, label], -1), axis=0, return_index=True, return_inverse=True)
+    _, first, new = np.unique(number_rows(group, label), return_index=True, return_inverse=True)
     point = np.unique(corner_place[first], return_inverse=True)[1].reshape(-1)
     return corner_vertex[first], point, new.reshape(-1, 3)
 

@@ -17,9 +17,10 @@ from scipy.spatial import cKDTree
 
 from ..core.asset.model import Binding, Mesh, Surfels
 from ..core.errors import AssetError
-from ..geometry.normals import quaternions, unit
+from ..geometry.normals import lengths, quaternions, unit
+from ..geometry.rows import number_rows
 from .binding import project
-from .face_frames import Faces
+from .face_frames import Faces, product
 
 Array = np.ndarray
 log = logging.getLogger(__name__)
@@ -113,7 +114,7 @@ def attach(
         deviation = _nearest_centres(faces, patches.face)
     else:
         rims = _rims(patches, corners, faces.normal[patches.face], sharp_edges(mesh, faces))
-        pieces = np.einsum("npk,nkc->npc", patches.weights, corners)
+        pieces = product(patches.weights, corners)
         frame, deviation = _fit(frame, centre, pieces, spread, rims)
 
     at = mesh.faces[patches.face]
@@ -140,8 +141,8 @@ def cut(patches: _Patches, faces: Faces, longest: float) -> _Patches:
     done_weights: list[Array] = []
     face, weights, total = patches.face, patches.weights, 0
     while len(face):
-        corners = np.einsum("npk,nkc->npc", weights, faces.corners[face])
-        edges = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=-1)
+        corners = product(weights, faces.corners[face])
+        edges = lengths(corners[:, [1, 2, 0]] - corners)
         start = edges.argmax(axis=1)  # the edge from corner `start` to the next one
         split = edges.max(axis=1) > longest
         done_face.append(face[~split])
@@ -166,7 +167,7 @@ def cut(patches: _Patches, faces: Faces, longest: float) -> _Patches:
 def _face_frames(corners: Array, normal: Array) -> Array:
     """Rotations (n, 3, 3) [t_u, t_v, normal] with t_u along the first edge (any tangent where that is a point)."""
     first = corners[:, 1] - corners[:, 0]
-    short = np.linalg.norm(first, axis=1) < 1e-12
+    short = lengths(first) < 1e-12
     first[short] = corners[short, 2] - corners[short, 0]
     tangent = unit(first)
     return np.stack([tangent, np.cross(normal, tangent), normal], -1)
@@ -177,10 +178,11 @@ def sharp_edges(mesh: Mesh, faces: Faces) -> Array:
 
     Vertices at one place count as one, so that hard edges whose vertices are split are judged by their angle.
     """
-    _, place = np.unique(mesh.vertices, axis=0, return_inverse=True)
-    corner = place.reshape(-1)[mesh.faces]
-    ends = np.sort(np.stack([corner[:, [1, 2]], corner[:, [2, 0]], corner[:, [0, 1]]], axis=1).reshape(-1, 2), axis=1)
-    edge = np.unique(ends, axis=0, return_inverse=True)[1].reshape(-1)
+    place = number_rows(*mesh.vertices.T)
+    corner = place[mesh.faces]
+    start, end = corner[:, [1, 2, 0]], corner[:, [2, 0, 1]]
+    key = np.minimum(start, end) * len(place) + np.maximum(start, end)
+    edge = np.unique(key.reshape(-1), return_inverse=True)[1]
     proper = np.repeat(~faces.degenerate, 3)
     count = np.bincount(edge[proper], minlength=edge.max() + 1)
     normal = np.repeat(faces.normal, 3, axis=0)
@@ -192,10 +194,13 @@ def sharp_edges(mesh: Mesh, faces: Faces) -> Array:
 
 def _rims(patches: _Patches, corners: Array, normal: Array, sharp: Array) -> Array:
     """(n, 3, 3): unit directions across the sharp edges that a patch lies on, by the corner opposite; 0 elsewhere."""
-    along = np.roll(corners, 1, axis=1) - np.roll(corners, -1, axis=1)
-    across = unit(np.cross(normal[:, None], along).reshape(-1, 3)).reshape(-1, 3, 3)
     on = (patches.weights == 0).sum(axis=1) == 2  # bisection keeps weights on an edge exactly zero
-    return across * (on & sharp[patches.face])[..., None]
+    on &= sharp[patches.face]
+    rows = np.flatnonzero(on.any(axis=1))
+    along = corners[rows][:, [2, 0, 1]] - corners[rows][:, [1, 2, 0]]
+    result = np.zeros(corners.shape)
+    result[rows] = unit(np.cross(normal[rows, None], along)) * on[rows, :, None]
+    return result
 
 
 def _fit(frame: Array, centre: Array, pieces: Array, spread: float, rims: Array) -> tuple[Array, Array]:
@@ -207,16 +212,19 @@ def _fit(frame: Array, centre: Array, pieces: Array, spread: float, rims: Array)
     less = max(0.0, 1 - RIM / spread)
     plane = frame[:, :, :2]
     middle = pieces.mean(axis=1)
-    rays = np.einsum("npc,nci->npi", pieces - middle[:, None], plane)
+    rays = product(pieces - middle[:, None], plane)
     moved = np.einsum("nc,nci->ni", middle - centre, plane)
-    covariance = np.einsum("npi,npj->nij", rays, rays) / 12 + np.einsum("ni,nj->nij", moved, moved)
+    covariance = product(rays.swapaxes(1, 2), rays) / 12 + moved[:, :, None] * moved[:, None, :]
     for k in range(3):
-        across = np.einsum("nc,nci->ni", rims[:, k], plane)
+        rows = np.flatnonzero(rims[:, k].any(axis=1))
+        across = np.einsum("nc,nci->ni", rims[rows, k], plane[rows])
         shrink = np.eye(2) - less * across[:, :, None] * across[:, None, :]
-        covariance = shrink @ covariance @ shrink
+        covariance[rows] = shrink @ covariance[rows] @ shrink
     values, axes = np.linalg.eigh(covariance)
     values, axes = values[:, ::-1], axes[:, :, ::-1]  # longest first
-    axes = axes * np.where(np.linalg.det(axes) < 0, -1, 1)[:, None, None] ** np.array([0, 1])
+    axes = axes.copy()
+    mirrored = axes[:, 0, 0] * axes[:, 1, 1] < axes[:, 0, 1] * axes[:, 1, 0]
+    axes[mirrored, :, 1] *= -1
     axes = axes * np.where(axes[:, :1, :1] < 0, -1, 1)  # at most 90 degrees from the first edge
     turned = np.concatenate([plane @ axes, frame[:, :, 2:]], -1)
     return turned, spread * np.sqrt(np.maximum(values, 0))

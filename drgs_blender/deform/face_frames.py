@@ -6,18 +6,40 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..geometry.normals import VertexNormals, unit
+from ..geometry.normals import VertexNormals, lengths, unit
 
 Array = np.ndarray
 
 #: A face is degenerate when twice its area is below this part of its squared longest edge: single precision no longer
 #: says where it faces.
 DEGENERATE = 1e-6
+#: Matrices multiplied at a time: they stay in the processor's cache.
+_TOGETHER = 4096
 
 
 def dot(a: Array, b: Array) -> Array:
     """Row-wise dot products of (n, c) arrays."""
     return np.einsum("nc,nc->n", a, b)
+
+
+def product(a: Array, b: Array) -> Array:
+    """Products (n, i, j) float64 of small matrices (n, i, k) and (n, k, j).
+
+    Sums are those of np.einsum, whose loops over three numbers cost more than the arithmetic; here loops run along n.
+    """
+    result = np.empty((len(a), a.shape[1], b.shape[2]))
+    for first in range(0, len(a), _TOGETHER):
+        rows = slice(first, first + _TOGETHER)
+        left, right = (
+            np.ascontiguousarray(np.moveaxis(a[rows], 0, -1)),
+            np.ascontiguousarray(np.moveaxis(b[rows], 0, -1)),
+        )
+        for i, row in enumerate(left):
+            total = np.zeros(right.shape[1:])
+            for factor, vector in zip(row, right):
+                total += factor * vector
+            result[rows, i] = total.T
+    return result
 
 
 @dataclass(slots=True)
@@ -47,13 +69,13 @@ class Faces:
     def of(cls, vertices: Array, faces: Array) -> Faces:
         """Measure the faces (m, 3) of `vertices` (n, 3)."""
         corners = np.asarray(vertices, np.float64)[faces]
-        edges = np.roll(corners, -1, axis=1) - corners
-        lengths = np.linalg.norm(edges, axis=-1)
+        edges = corners[:, [1, 2, 0]] - corners
+        edge = lengths(edges)
         cross = np.cross(edges[:, 0], -edges[:, 2])
-        twice_area = np.linalg.norm(cross, axis=-1)
-        degenerate = ~(twice_area > DEGENERATE * lengths.max(axis=1, initial=0.0) ** 2)
+        twice_area = lengths(cross)
+        degenerate = ~(twice_area > DEGENERATE * edge.max(axis=1, initial=0.0) ** 2)
         cross[degenerate] = (0, 0, 1)
-        return cls(corners, unit(cross), 0.5 * twice_area, np.nan_to_num(lengths.mean(axis=1)), degenerate)
+        return cls(corners, unit(cross), 0.5 * twice_area, np.nan_to_num(edge.mean(axis=1)), degenerate)
 
 
 def shading_frames(faces: Faces, indices: Array, vertices: Array, face: Array, barycentric: Array) -> Array:

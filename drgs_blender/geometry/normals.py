@@ -200,11 +200,20 @@ def _sum(first: int, last: int, weighted: Array, start: Array, normals: Array) -
         normals[v, 0], normals[v, 1], normals[v, 2] = vertex_normal(weighted, start[v], start[v + 1])
 
 
+def lengths(vectors: Array) -> Array:
+    """Lengths (...) of (..., 3) vectors: those of np.linalg.norm, which is slow at rows of three numbers."""
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    return np.sqrt(x * x + y * y + z * z)
+
+
 def unit(vectors: Array, fallback: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> Array:
     """Normalise (..., 3) vectors, keeping their dtype; those without a direction become `fallback`."""
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    length = lengths(vectors)
     proper = np.isfinite(length) & (length > 1e-30)
-    return np.where(proper, vectors / np.where(proper, length, 1), np.asarray(fallback, vectors.dtype))
+    result = vectors / np.where(proper, length, 1)[..., None]
+    if not proper.all():
+        result[~proper] = fallback
+    return result
 
 
 def rotation_matrices(quaternions: Array) -> Array:

@@ -1,11 +1,13 @@
-"""Vertex normals shared by deformation and rendering."""
+"""Vertex normals shared by deformation and rendering; arithmetic on many small rows."""
 
 from __future__ import annotations
 
 import numpy as np
 import trimesh
 
-from drgs_blender.geometry.normals import VertexNormals, corner_table
+from drgs_blender.deform.face_frames import product
+from drgs_blender.geometry.normals import VertexNormals, corner_table, lengths, unit
+from drgs_blender.geometry.rows import number_rows
 
 
 def test_cube_corners_point_along_the_diagonal_however_it_is_triangulated():
@@ -36,3 +38,18 @@ def test_corner_table_lists_every_corner_once():
     faces = np.array([[0, 1, 2], [2, 1, 3]])
     start, corner = corner_table(faces, 5)
     assert [sorted(corner[start[v] : start[v + 1]]) for v in range(5)] == [[0], [1, 4], [2, 3], [5], []]
+
+
+def test_fast_forms_have_the_bits_of_the_plain_ones():
+    rng = np.random.default_rng(0)
+    vectors = rng.normal(size=(9000, 3, 3))
+    for dtype in (np.float32, np.float64):
+        np.testing.assert_array_equal(lengths(vectors.astype(dtype)), np.linalg.norm(vectors.astype(dtype), axis=-1))
+    np.testing.assert_array_equal(
+        unit(np.array([[0.0, 0, 2], [0, 0, 0], [np.inf, 0, 0]]), (1, 0, 0))[1:], [[1, 0, 0]] * 2
+    )
+    flat = vectors[:, :, :2]
+    np.testing.assert_array_equal(product(vectors, flat), np.einsum("nij,njk->nik", vectors, flat))
+    assert product(vectors[:0], flat[:0]).shape == (0, 3, 2)
+    for rows in (rng.integers(-3, 4, (5000, 3)), np.round(rng.normal(size=(5000, 3)), 1), np.zeros((0, 2), int)):
+        np.testing.assert_array_equal(number_rows(*rows.T), np.unique(rows, axis=0, return_inverse=True)[1].reshape(-1))

@@ -1,0 +1,28 @@
+"""Rows of numbers told apart."""
+
+from __future__ import annotations
+
+import numpy as np
+
+Array = np.ndarray
+
+
+def number_rows(*columns: Array) -> Array:
+    """Number (n,) of each row among the distinct ones in lexicographic order: the inverse of np.unique(axis=0).
+
+    Columns are ranked one by one, which is several times as fast as comparing whole rows.
+
+    Parameters
+    ----------
+    *columns : (n,) arrays
+
+    Examples
+    --------
+    >>> number_rows(np.array([2, 0, 2, 0]), np.array([1, 5, 0, 5]))
+    array([2, 0, 1, 0])
+    """
+    number = np.unique(columns[0], return_inverse=True)[1]
+    for column in columns[1:]:
+        rank = np.unique(column, return_inverse=True)[1]
+        number = np.unique(number * (int(rank.max(initial=0)) + 1) + rank, return_inverse=True)[1]
+    return number
