@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -16,6 +18,8 @@ Array = np.ndarray
 NEAREST = 24
 #: Thickness given to the kernel of a surfel, as a part of its larger standard deviation.
 THICKNESS = 0.5
+#: Vertices worked on at a time: what is found on the way stays in the processor's cache.
+_TOGETHER = 2048
 
 
 def surfels_to_vertices(mesh: Mesh, surfels: Surfels, binding: Binding) -> int:
@@ -30,29 +34,73 @@ def surfels_to_vertices(mesh: Mesh, surfels: Surfels, binding: Binding) -> int:
     int
         Vertices that took the nearest surfels.
     """
-    vertices = mesh.vertices.astype(np.float64)
-    k = min(NEAREST, len(surfels))
-    distance, index = cKDTree(surfels.centre).query(vertices, k=k)
-    distance, index = distance.reshape(-1, k), index.reshape(-1, k)
     frames = rotation_matrices(surfels.rotation.astype(np.float64))
     inward = -dot(frames[..., 2], Faces.of(mesh.vertices, mesh.faces).normal[binding.face]) > 0
     outward = np.where(inward[:, None], -frames[..., 2], frames[..., 2])
-    ray = vertices[:, None] - surfels.centre[index]
     scale = np.maximum(surfels.scale.astype(np.float64), 1e-12)
-    size = np.stack([scale[:, 0], scale[:, 1], THICKNESS * scale.max(axis=1)], -1)
-    square = np.sum((np.einsum("vkc,vkci->vki", ray, frames[index]) / size[index]) ** 2, axis=-1)
-    normal = VertexNormals(mesh.faces, len(vertices))(mesh.vertices)
-    facing = np.einsum("vkc,vc->vk", outward[index], normal) > 0
-    weight = surfels.opacity[index] * np.exp(-0.5 * square) * facing
-    lonely = weight.sum(axis=1) < 1e-3
-    same_side = np.where(facing.any(axis=1, keepdims=True), facing, True)
-    near = same_side / (distance**2 + (0.1 * scale[index].max(axis=-1)) ** 2)
-    weight = np.where(lonely[:, None], near * (surfels.opacity[index] + 1e-3), weight)
-    weight /= weight.sum(axis=1, keepdims=True)
-    for name in ("albedo", "roughness", "metallic"):
-        values = getattr(surfels, name)[index]
-        setattr(mesh, name, np.einsum("vk,vk...->v...", weight, values).astype(np.float32).clip(0, 1))
-    return int(lonely.sum())
+    size = np.stack([scale[:, 0], scale[:, 1], THICKNESS * scale.max(axis=1)])
+    around = _Around(surfels, frames.transpose(1, 2, 0).copy(), outward.T.copy(), size, 0.1 * scale.max(axis=1))
+    normal = VertexNormals(mesh.faces, len(mesh.vertices))(mesh.vertices)
+    tree, k, lonely = cKDTree(surfels.centre), min(NEAREST, len(surfels)), 0
+    found = {name: np.empty_like(getattr(mesh, name)) for name in ("albedo", "roughness", "metallic")}
+    for first in range(0, len(mesh.vertices), _TOGETHER):
+        rows = slice(first, first + _TOGETHER)
+        vertices = mesh.vertices[rows].astype(np.float64)
+        distance, index = tree.query(vertices, k=k)
+        index = index.reshape(-1, k)
+        weight, alone = around.weights(vertices, normal[rows], distance.reshape(-1, k), index)
+        lonely += int(alone.sum())
+        for name in found:
+            values = getattr(surfels, name)[index]
+            found[name][rows] = np.einsum("vk,vk...->v...", weight, values).astype(np.float32).clip(0, 1)
+    for name, values in found.items():
+        setattr(mesh, name, values)
+    return lonely
+
+
+class _Around(NamedTuple):
+    """Surfels by the coordinates of which a vertex weighs them, each (n,) or with n last.
+
+    Attributes
+    ----------
+    surfels : Surfels
+    frames : (3, 3, n) array
+        Axes of the surfels in their second dimension.
+    outward : (3, n) array
+        Normals on the side on which they hang.
+    size : (3, n) array
+        Standard deviations along the axes.
+    least : (n,) array
+        Added to distances, so that no surfel weighs all.
+    """
+
+    surfels: Surfels
+    frames: Array
+    outward: Array
+    size: Array
+    least: Array
+
+    def weights(self, vertices: Array, normal: Array, distance: Array, index: Array) -> tuple[Array, Array]:
+        """Weights (v, k), whose sum is 1, of the surfels `index` (v, k) at vertices; which no surfel reaches (v,)."""
+        ray = [vertices[:, c, None] - centre.take(index) for c, centre in enumerate(self.surfels.centre.T)]
+        square = 0.0
+        for axis in range(3):
+            along = 0.0
+            for c in range(3):
+                along = along + ray[c] * self.frames[c, axis].take(index)
+            square = square + (along / self.size[axis].take(index)) ** 2
+        side = 0.0
+        for c in range(3):
+            side = side + self.outward[c].take(index) * normal[:, c, None]
+        facing = np.greater(side, 0)
+        opacity = self.surfels.opacity[index]
+        weight = opacity * np.exp(-0.5 * square) * facing
+        lonely = weight.sum(axis=1) < 1e-3
+        alone = np.flatnonzero(lonely)
+        same_side = np.where(facing[alone].any(axis=1, keepdims=True), facing[alone], True)
+        near = same_side / (distance[alone] ** 2 + self.least[index[alone]] ** 2)
+        weight[alone] = near * (opacity[alone] + 1e-3)
+        return weight / weight.sum(axis=1, keepdims=True), lonely
 
 
 def vertices_to_surfels(mesh: Mesh, surfels: Surfels, binding: Binding) -> None:
