@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from ..formats.mesh import check_extent
 from ..geometry.normals import rotation_matrices
 from ..geometry.tsdf import DepthMaps, SignedDistanceField
 from ..render.camera import camera_parameters
-from ..render.columns import ALBEDO, NORMAL
+from ..render.columns import NORMAL
 from ..render.surfels.raster import rasterise
 from ..render.surfels.splats import prepare
 
@@ -70,20 +70,18 @@ def mesh_from_surfels(surfels: Surfels, *, resolution: int = 192, views: int = 6
     shape = tuple(int(n) for n in np.ceil((high - low) / voxel) + 1)
     cameras = [_camera(direction, low, high, voxel) for direction in _directions(views)]
 
-    seen = np.zeros((len(posed), 3))
+    looks, seen = [], np.zeros((len(posed), 3))
     for camera, direction in zip(cameras, _directions(views)):
-        alpha, depth, _, _ = _look(posed, camera, direction)
-        seen += _visible(posed.centre, surfels.scale.max(axis=1), camera, alpha, depth, voxel)[:, None] * direction
+        look = _look(posed, camera, direction)
+        seen += _visible(posed.centre, surfels.scale.max(axis=1), camera, look.depth, voxel)[:, None] * direction
+        looks.append(look)
     outward = np.where((np.einsum("nc,nc->n", seen, posed.normal) < 0)[:, None], -posed.normal, posed.normal)
 
     field = SignedDistanceField(low, voxel, shape)
-    for camera, direction in zip(cameras, _directions(views)):
-        front = (outward @ direction > 0).astype(np.float32)
-        flagged = replace(posed, normal=outward.astype(np.float32), albedo=np.repeat(front[:, None], 3, axis=1))
-        alpha, depth, cosine, facing = _look(flagged, camera, direction)
-        cosine[facing < 0.5] = 0  # a back side: says nothing about what is before it
-        depth[alpha < 0.5], cosine[alpha < 0.5] = np.inf, 1
-        field.add(_depth_maps(camera, depth, cosine))
+    for camera, direction, look in zip(cameras, _directions(views), looks):
+        back = outward @ direction <= 0
+        look.cosine[np.isfinite(look.depth) & back[look.owner]] = 0  # says nothing about what is before it
+        field.add(_depth_maps(camera, look.depth, look.cosine))
     mesh, report = field.mesh(WITNESSES, SMOOTH, "Give the mesh that they were captured with")
     report = {"resolution": resolution} | report
     log.info("mesh from surfels: %s", report)
@@ -156,23 +154,44 @@ def _depth_maps(camera: Camera, depth: Array, cosine: Array) -> DepthMaps:
     )
 
 
-def _look(posed: PosedSurfels, camera: Camera, direction: Array) -> tuple[Array, Array, Array, Array]:
-    """Coverage, depth, cosine between surface and view, and red albedo (size, size) of a view."""
-    samples = rasterise(
-        prepare(posed, camera, camera_parameters(camera, RenderSettings(subpixel_samples=1), 0)), 0, camera.height
-    )
-    alpha, surface = samples.alpha[..., 0], samples.surface[..., 0, :]
-    surface = np.where(alpha[..., None] > 0, surface, 0)
-    cosine = np.abs(surface[..., NORMAL : NORMAL + 3] @ direction.astype(np.float32))
-    return alpha, samples.depth[..., 0].copy(), cosine, surface[..., ALBEDO]
+class _Look(NamedTuple):
+    """What a view sees.
+
+    Attributes
+    ----------
+    depth : (size, size) float32 array
+        Along the view, metres; +inf where less than half is covered.
+    cosine : (size, size) float32 array
+        Between surface and view; 1 where less than half is covered.
+    owner : (size, size) int32 array
+        The surfel that covers most.
+    """
+
+    depth: Array
+    cosine: Array
+    owner: Array
 
 
-def _visible(centre: Array, size: Array, camera: Camera, alpha: Array, depth: Array, voxel: float) -> Array:
+def _look(posed: PosedSurfels, camera: Camera, direction: Array) -> _Look:
+    """Rasterise a view, with all normals on the side of the camera."""
+    away = posed.normal @ direction < 0
+    number = np.arange(len(posed), dtype=np.int32)
+    towards = replace(posed, normal=np.where(away[:, None], -posed.normal, posed.normal), object_index=number)
+    parameters = camera_parameters(camera, RenderSettings(subpixel_samples=1), 0)
+    samples = rasterise(prepare(towards, camera, parameters), 0, camera.height)
+    covered = samples.alpha[..., 0] >= 0.5
+    cosine, owner = np.ones(covered.shape, np.float32), np.zeros(covered.shape, np.int32)
+    normal = samples.surface[..., 0, NORMAL : NORMAL + 3][covered]
+    cosine[covered] = np.abs(normal @ direction.astype(np.float32))
+    owner[covered] = samples.object_index[..., 0][covered]
+    return _Look(np.where(covered, samples.depth[..., 0], np.float32(np.inf)), cosine, owner)
+
+
+def _visible(centre: Array, size: Array, camera: Camera, depth: Array, voxel: float) -> Array:
     """Which surfels lie on what the view sees, (n,) bool."""
     local = (centre - camera.matrix_world[:3, 3]) @ camera.matrix_world[:3, :3]
     x = np.floor(local[:, 0] * camera.fx + camera.cx).astype(int)
     y = np.floor(-local[:, 1] * camera.fy + camera.cy).astype(int)
     inside = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
     x, y = np.where(inside, x, 0), np.where(inside, y, 0)
-    near = np.abs(-local[:, 2] - depth[y, x]) < voxel + 0.5 * size
-    return inside & (alpha[y, x] >= 0.5) & near
+    return inside & (np.abs(-local[:, 2] - depth[y, x]) < voxel + 0.5 * size)
