@@ -216,9 +216,14 @@ def _fuse(first: int, last: int, voxels: Voxels, maps: DepthMaps, band: float) -
     """
     total, weight, views, low, voxel = voxels
     depth, cosine, origin, axes, scale, offset, perspective, bilinear = maps
-    height, width = depth.shape[1], depth.shape[2]
-    # A column of voxels along Z at a time: what depends on X and Y alone is found once for each view.
-    value, weights = np.zeros(total.shape[2], depth.dtype), np.zeros(total.shape[2], depth.dtype)
+    height, width, layers = depth.shape[1], depth.shape[2], total.shape[2]
+    zero, one = depth.dtype.type(0), depth.dtype.type(1)
+    # A column of voxels along Z at a time: what depends on X and Y alone is found once for each view. Pixels are read
+    # in a loop of their own, so that those before and after it become vector code.
+    value, weights = np.empty(layers, depth.dtype), np.empty(layers, depth.dtype)
+    px, py = np.empty(layers), np.empty(layers)
+    gap, share = np.empty(layers, depth.dtype), np.empty(layers, depth.dtype)
+    heights = low[2] + np.arange(layers) * voxel
     for i in range(first, last):
         for j in range(total.shape[1]):
             value[:], weights[:] = 0, 0
@@ -227,26 +232,33 @@ def _fuse(first: int, last: int, voxels: Voxels, maps: DepthMaps, band: float) -
                 right, down, ahead = axes[m, 0], axes[m, 1], axes[m, 2]
                 right_xy, down_xy = right[0] * x + right[1] * y, down[0] * x + down[1] * y
                 ahead_xy = ahead[0] * x + ahead[1] * y
-                for k in range(total.shape[2]):
-                    z = low[2] + k * voxel - origin[m, 2]
-                    away = (ahead_xy + ahead[2] * z) * scale[m, 2] + offset[m, 2]
-                    if away <= 0.0:
-                        continue
-                    px = (right_xy + right[2] * z) * scale[m, 0] + offset[m, 0]
-                    py = (down_xy + down[2] * z) * scale[m, 1] + offset[m, 1]
+                for k in range(layers):
+                    z = heights[k] - origin[m, 2]
+                    far = (ahead_xy + ahead[2] * z) * scale[m, 2] + offset[m, 2]
+                    qx = (right_xy + right[2] * z) * scale[m, 0] + offset[m, 0]
+                    qy = (down_xy + down[2] * z) * scale[m, 1] + offset[m, 1]
                     if perspective:
-                        px, py = px / away, py / away
-                    if px < 0.0 or py < 0.0 or px >= width or py >= height:
+                        qx, qy = qx / far, qy / far
+                    inside = (far > 0.0) & (qx >= 0.0) & (qy >= 0.0) & (qx < width) & (qy < height)
+                    px[k], py[k], gap[k] = qx if inside else -1.0, qy, far
+                for k in range(layers):
+                    share[k] = 0
+                    if px[k] < 0.0:
                         continue
-                    w = cosine[m, int(py), int(px)]
-                    if w < 0.1:
-                        continue
-                    seen = _sample(depth[m], px, py) if bilinear else depth[m, int(py), int(px)]
-                    gap = (seen - depth.dtype.type(away)) / depth.dtype.type(band)
-                    if gap > depth.dtype.type(-1):
-                        value[k] += w * min(w * gap, depth.dtype.type(1))
-                        weights[k] += w
-                        views[i, j, k] += 1
-            for k in range(total.shape[2]):
+                    row, column = np.uintp(np.int64(py[k])), np.uintp(np.int64(px[k]))
+                    share[k] = cosine[m, row, column]
+                    seen = _sample(depth[m], px[k], py[k]) if bilinear else depth[m, row, column]
+                    gap[k] = seen - gap[k]
+                for k in range(layers):
+                    w, distance = share[k], gap[k] / depth.dtype.type(band)
+                    counts = (w >= 0.1) & (distance > -one)
+                    share[k] = w if counts else zero
+                    gap[k] = w * min(w * distance, one) if counts else zero
+                for k in range(layers):
+                    value[k] += gap[k]
+                    weights[k] += share[k]
+                for k in range(layers):
+                    views[i, j, k] += np.int32(share[k] > zero)
+            for k in range(layers):
                 total[i, j, k] += value[k]
                 weight[i, j, k] += weights[k]
