@@ -131,16 +131,16 @@ def prepare(posed: PosedSurfels, camera: Camera, parameters: Array) -> Splats:
     order = depth_order(np.ascontiguousarray(screen[:, ZC]), box)
     surface = np.empty((len(order), SPLAT), np.float32)
     over_range(_gather_surface, len(order), order, arrays, surface, fewest=ELEMENTS)
-    box = box[order]
+    box = box.take(order, axis=0)  # faster than an index
     tiles_x = (x1 - 1) // TILE - x0 // TILE + 1
     tiles_y = (y1 - 1) // TILE - y0 // TILE + 1
     start, listed = list_by_tile(box, x0 // TILE, y0 // TILE, tiles_x, tiles_y)
     return Splats(
-        screen[order],
+        screen.take(order, axis=0),
         surface,
         box,
-        nearest[order],
-        arrays.object_index[order],
+        nearest.take(order),
+        arrays.object_index.take(order),
         start,
         listed,
         *camera.window,
