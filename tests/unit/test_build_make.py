@@ -172,6 +172,36 @@ def test_what_a_division_leaves_is_known_and_looked_up_once():
     assert known and looked.errors.max() > 0.1
 
 
+def test_an_edge_that_both_faces_see_alike_is_looked_up_once_and_a_seam_twice():
+    rng = np.random.default_rng(5)
+    file = plane(6, Image(rng.random((64, 64, 3)).astype(np.float32), srgb=False))
+    net = _net(file, "plane", {"notes": []})
+    net.uvs[::5] += 0.3  # islands of their own
+    edge, count = edges(net)
+    materials = Materials(file.materials)
+    lookups = []
+    sample = materials.sample
+    materials.sample = lambda material, *rest: lookups.append(len(material)) or sample(material, *rest)
+    together = _Looked(net, edge, materials).errors
+    shared, lookups[:] = sum(lookups), []
+    apart = _Looked(net, np.arange(edge.size).reshape(edge.shape), materials).errors
+    np.testing.assert_array_equal(together, apart)
+    assert 0 < sum(lookups) - shared < 3 * (edge.size - count)  # three points an edge, but not at seams
+
+
+def test_images_of_one_layout_are_found_as_each_alone():
+    rng = np.random.default_rng(6)
+    colour, rough = (Image(rng.random((16, 8, 3)).astype(np.float32), srgb=False) for _ in range(2))
+    uvs, scale, one = rng.normal(size=(500, 2)), rng.random((500, 2)) ** 4, np.zeros(500, int)
+    both, first, second = (
+        Materials([MaterialFile("m", (1, 1, 1), 1, 1, base_colour_image=a, metallic_roughness_image=b)])
+        for a, b in ((colour, rough), (colour, None), (None, rough))
+    )
+    found = both.sample(one, uvs, scale)
+    np.testing.assert_array_equal(found[:, :3], first.sample(one, uvs, scale)[:, :3])
+    np.testing.assert_array_equal(found[:, 3:], second.sample(one, uvs, scale)[:, 3:])
+
+
 def test_no_crack_opens_between_vertices_that_share_a_place():
     cube = trimesh.creation.box()
     vertices, faces = cube.vertices[cube.faces].reshape(-1, 3), np.arange(36).reshape(-1, 3)
