@@ -68,7 +68,7 @@ def steps(out: Path, frames: str) -> list[Step]:
             "Starting Blender",
             [*drgs, "render", scene, "--frames", frames, "--out", pattern, "--denoise", "svgf", "--overwrite"],
             4.0 + 1.3 * count,
-            ("scene", "more kernels"),
+            ("scene", "kernels"),  # it waits for what is not compiled yet, and Blender starts meanwhile
             count=rendered,
             before=partial(shutil.rmtree, out / "frames", ignore_errors=True),
         ),
