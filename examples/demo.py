@@ -54,13 +54,20 @@ def steps(out: Path, frames: str) -> list[Step]:
     of_scene = (*assets.values(), extension, EXAMPLES / "demo_scene.py", EXAMPLES / "robot")
     blenders = () if os.environ.get("DRGS_BLENDER") else (environments.FOR_BLENDER,)
     return [
-        # First those of an asset, which is then made, and the scene with it, while the others are compiled.
-        environments.kernels("kernels", "import", seconds=12.0),
-        environments.kernels("more kernels", "frame", "denoise", seconds=32.0, after="kernels"),
+        # Those of an asset first; what is not compiled when it is needed is waited for.
+        environments.kernels("kernels", "import", "frame", "denoise", seconds=40.0),
         asset("robot", EXAMPLES / "robot/RobotExpressive.glb", 2.0),
-        # A prop of a hundred pixels: its own triangles will do, and surfels of a pixel each.
+        # Props of a hundred pixels: surfels and voxels of a pixel each will do.
         asset("helmet", EXAMPLES / "helmet/FlightHelmet.gltf", 5.0, "--max-triangles=100000", "--density=80"),
-        asset("playbot", EXAMPLES / "playbot/playbot.ply", 10.0, "--up=-y", command="import", after="kernels"),
+        asset(
+            "playbot",
+            EXAMPLES / "playbot/playbot.ply",
+            10.0,
+            "--up=-y",
+            "--resolution=128",
+            command="import",
+            after="helmet",
+        ),
         Step("extension", "Building the extension", building, 0.5, (environments.FOR_ENGINE,)),
         Step("scene", "Setting the scene", setting, 4.0, (*assets, "extension", *blenders), scene, of_scene),
         Step(
@@ -68,7 +75,7 @@ def steps(out: Path, frames: str) -> list[Step]:
             "Starting Blender",
             [*drgs, "render", scene, "--frames", frames, "--out", pattern, "--denoise", "svgf", "--overwrite"],
             4.0 + 1.3 * count,
-            ("scene", "kernels"),  # it waits for what is not compiled yet, and Blender starts meanwhile
+            ("scene",),
             count=rendered,
             before=partial(shutil.rmtree, out / "frames", ignore_errors=True),
         ),

@@ -56,9 +56,15 @@ def jobs() -> dict[str, tuple[Kernel, ...]]:
 
 
 def needed(names: Iterable[str]) -> list[Kernel]:
-    """The kernels of some jobs, each once, those first that take longest; unknown jobs have none."""
+    """The kernels of some jobs, each once, in the order in which they are best compiled; unknown jobs have none.
+
+    First the one that takes longest, beside which all others may be compiled; then those of the first job, of the
+    second and so on, in each by the time they take.
+    """
     table = jobs()
-    return sorted({kernel for name in names for kernel in table.get(name, ())}, key=lambda k: (-k.seconds, k.name))
+    by_time = lambda kernel: (-kernel.seconds, kernel.name)  # noqa: E731
+    found = list(dict.fromkeys(kernel for name in names for kernel in sorted(table.get(name, ()), key=by_time)))
+    return sorted(found, key=lambda kernel: kernel is not min(found, key=by_time))
 
 
 def dispatcher(kernel: Kernel) -> Any:

@@ -37,6 +37,8 @@ _PATIENCE = 180.0
 #: Of memory, which a process that compiles takes.
 _BYTES = 700 << 20
 
+#: How much lower the priority of workers that yield is, on the scale of ``nice``.
+_LOWER = 5
 Progress = Callable[[str, float], None]
 _Known = tuple[Kernel, KernelCache, tuple[Any, ...]]
 
@@ -182,8 +184,8 @@ class _Pool:
         self._results: queue.SimpleQueue[tuple[_Worker, bool]] = queue.SimpleQueue()
         self._workers: list[_Worker] = []
         try:
-            for _ in range(min(len(kernels), processes())):
-                self._workers.append(_Worker(self._results))
+            for number in range(min(len(kernels), processes())):
+                self._workers.append(_Worker(self._results, yields=number > 0))
                 self._assign(self._workers[-1])
         except OSError as error:  # no more processes may be started
             log.warning("kernels are compiled by %d processes: %s", len(self._workers), error)
@@ -238,9 +240,17 @@ class _Pool:
 
 
 class _Worker:
-    """A process that runs `drgs_blender.compute.worker`, and the thread that waits for its answers."""
+    """A process that runs `drgs_blender.compute.worker`, and the thread that waits for its answers.
 
-    def __init__(self, results: queue.SimpleQueue[tuple[_Worker, bool]]) -> None:
+    Parameters
+    ----------
+    results : SimpleQueue
+        For its answers.
+    yields : bool
+        Whether it yields to other programs, and to the worker that has the longest kernel, on which all wait.
+    """
+
+    def __init__(self, results: queue.SimpleQueue[tuple[_Worker, bool]], yields: bool = False) -> None:
         self.kernel: Kernel | None = None
         self.is_alive, self._claim = True, Claim()
         environment = os.environ | {"NUMBA_NUM_THREADS": "1"}
@@ -254,6 +264,9 @@ class _Worker:
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, encoding="utf-8"
         )
+        if yields and hasattr(os, "setpriority"):  # not on Windows
+            with contextlib.suppress(OSError):
+                os.setpriority(os.PRIO_PROCESS, self._process.pid, os.getpriority(os.PRIO_PROCESS, 0) + _LOWER)
         threading.Thread(target=self._listen, args=(results,), daemon=True).start()
 
     def assign(self, kernel: Kernel, claim: Claim) -> bool:
