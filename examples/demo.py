@@ -15,6 +15,7 @@ import os
 import shutil
 import sys
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
@@ -126,7 +127,8 @@ def publish(frames: list[Path], out: Path, fps: int = 24) -> None:
         linear = np.clip(read_frame(path)[0]["Combined"][..., :3], 0, 1)  # Rec.709 -> 8-bit sRGB
         return Image.fromarray((linear_to_srgb(linear) * 255 + 0.5).astype(np.uint8))
 
-    pictures = list(map(picture, frames))
+    with ThreadPoolExecutor() as pool:
+        pictures = list(pool.map(picture, frames))
     chosen = pictures[:: max(1, len(pictures) // 8)][:8]
     width, height = chosen[0].size
     sheet = Image.new("RGB", (width * 4, height * ((len(chosen) + 3) // 4)))

@@ -164,7 +164,7 @@ def processes() -> int:
 
 
 class _Pool:
-    """Worker processes, each compiling one kernel at a time; the longest first.
+    """Worker processes, each compiling one kernel at a time, in the order given.
 
     What another process compiles at the same time, here or on another machine with the same folder, is left to it.
 
@@ -183,19 +183,20 @@ class _Pool:
         self._progress = time.monotonic()
         self._results: queue.SimpleQueue[tuple[_Worker, bool]] = queue.SimpleQueue()
         self._workers: list[_Worker] = []
+        self._most = min(len(kernels), processes())
         try:
-            for number in range(min(len(kernels), processes())):
-                self._workers.append(_Worker(self._results, yields=number > 0))
-                self._assign(self._workers[-1])
-        except OSError as error:  # no more processes may be started
-            log.warning("kernels are compiled by %d processes: %s", len(self._workers), error)
+            self._assign()
         except BaseException:
             self.close()
             raise
 
     def is_working(self) -> bool:
         """Whether a worker still has something to do, or will have."""
-        return any(worker.kernel is not None or (worker.is_alive and self._remaining) for worker in self._workers)
+        if any(worker.kernel is not None for worker in self._workers):
+            return True
+        return bool(self._remaining) and (
+            len(self._workers) < self._most or any(worker.is_alive for worker in self._workers)
+        )
 
     def wait(self, seconds: float) -> None:
         """Take an answer, or wait for so long."""
@@ -208,9 +209,7 @@ class _Pool:
             if worker.kernel is not None:
                 self._count(worker.kernel, is_alive)
                 worker.end()
-        for worker in self._workers:
-            if worker.is_alive and worker.kernel is None:
-                self._assign(worker)
+        self._assign()
 
     def close(self) -> None:
         """End all workers."""
@@ -222,8 +221,27 @@ class _Pool:
         self._progress = time.monotonic()
         self.fraction = min(1.0, self.fraction + kernel.seconds / (self._all or 1.0))
 
-    def _assign(self, worker: _Worker) -> None:
-        """Give a worker the longest kernel that nobody compiles or has compiled meanwhile."""
+    def _assign(self) -> None:
+        """Give idle workers a kernel each; no more are started than have one."""
+        idle = [worker for worker in self._workers if worker.is_alive and worker.kernel is None]
+        while idle or len(self._workers) < self._most:
+            if (found := self._claim()) is None:
+                return
+            known, claim = found
+            try:
+                worker = idle.pop() if idle else _Worker(self._results, yields=bool(self._workers))
+            except OSError as error:  # no more processes may be started
+                log.warning("kernels are compiled by %d processes: %s", len(self._workers), error)
+                self._most = len(self._workers)
+                claim.close()
+                continue
+            if worker not in self._workers:
+                self._workers.append(worker)
+            if worker.assign(known[0], claim):
+                self._remaining.remove(known)
+
+    def _claim(self) -> tuple[_Known, Claim] | None:
+        """The first kernel that nobody compiles or has compiled meanwhile."""
         for known in tuple(self._remaining):
             kernel, cache, signature = known
             if cache.is_there(signature, self._codegen):
@@ -234,9 +252,8 @@ class _Pool:
             if claim is None and time.monotonic() - self._progress > _PATIENCE:
                 claim, self._progress = Claim(), time.monotonic()
             if claim is not None:
-                if worker.assign(kernel, claim):
-                    self._remaining.remove(known)
-                return
+                return known, claim
+        return None
 
 
 class _Worker:
@@ -244,7 +261,7 @@ class _Worker:
 
     Parameters
     ----------
-    results : SimpleQueue
+    results : queue
         For its answers.
     yields : bool
         Whether it yields to other programs, and to the worker that has the longest kernel, on which all wait.
