@@ -60,6 +60,15 @@ class EntryLibrary(codegen.JITCodeLibrary):
     """Code that Python calls."""
 
     _linking_libraries: list[Any]
+    _shared_module: Any
+
+    def finalize(self) -> None:
+        """Link in what is called, and what that calls, each once; then as Numba does."""
+        for library in self._linking_libraries:
+            self._final_module.link_in(_own_module(library), preserve=True)
+            self._reload_init.update(library._reload_init)
+        self._linking_libraries = []
+        super().finalize()
 
     def _optimize_functions(self, ll_module: Any) -> None:
         numba_shortcuts.optimize_functions(self, ll_module)
@@ -90,8 +99,6 @@ class InnerLibrary(EntryLibrary):
 
     def finalize(self) -> None:
         """End it: nothing is added any more."""
-        for library in self._linking_libraries:
-            self._reload_init.update(library._reload_init)
         for function in self._final_module.functions:
             if not function.is_declaration and function.linkage == binding.Linkage.external:
                 function.linkage = "weak_odr"
@@ -99,12 +106,22 @@ class InnerLibrary(EntryLibrary):
         self._finalized = True
 
     def _get_module_for_linking(self) -> Any:
-        return self._final_module
+        """With what it calls: for libraries of Numba's own kinds, which link only what they call themselves."""
+        if self._shared_module is None:
+            self._shared_module = self._final_module.clone()
+            for library in self._linking_libraries:
+                self._shared_module.link_in(_own_module(library), preserve=True)
+        return self._shared_module
 
     def get_pointer_to_function(self, name: str) -> int:
         """None: nothing calls it but compiled code."""
         self._ensure_finalized()
         return 0
+
+
+def _own_module(library: Any) -> Any:
+    """LLVM code to link: of our libraries without what they call, which is linked in by itself."""
+    return library._final_module if isinstance(library, InnerLibrary) else library._get_module_for_linking()
 
 
 class LoadedLibrary(EntryLibrary):

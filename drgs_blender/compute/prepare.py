@@ -261,8 +261,8 @@ class _Worker:
 
     Parameters
     ----------
-    results : queue
-        For its answers.
+    results : object
+        The queue of its answers.
     yields : bool
         Whether it yields to other programs, and to the worker that has the longest kernel, on which all wait.
     """

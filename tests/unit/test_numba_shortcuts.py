@@ -286,3 +286,32 @@ def test_numba_is_left_as_it_was() -> None:
     assert _methods() == before
     with numba_shortcuts.shortcuts():
         assert all(now is not then for now, then in zip(_methods(), before, strict=True))
+
+
+def test_functions_that_several_call_are_linked_once() -> None:
+    """Calls in a diamond, one branch of it never taken, of kernels of ours and of a function of Numba's own kind."""
+
+    @njit
+    def bottom(x):
+        total = 0.0
+        for k in range(3):
+            total += x * k
+        return total
+
+    @njit
+    def left(x, taken):
+        return bottom(x) if taken else 1.0
+
+    @njit
+    def right(x):
+        return bottom(x) + left(x, True)
+
+    def top(x):
+        return left(x, False) + right(x) + bottom(x + 1)
+
+    ours, numbas = njit(top, cache=False), numba.njit(top)
+    assert numbas(2.0) == ours(2.0) == top(2.0) == 22.0
+    other = njit(lambda x: right(x), cache=False)
+    assert other(2.0) == 12.0
+    module = ours.overloads[(types.float64,)].library
+    assert sum("bottom" in name and "define" in name for name in module.get_llvm_str().splitlines()) <= 1
