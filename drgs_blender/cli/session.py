@@ -67,8 +67,9 @@ def run(args: argparse.Namespace) -> int:
 
 def start(folder: Path, idle: int) -> int:
     """Begin the process, and wait until it is there."""
-    if is_running(folder):
-        raise UsageError(f"session {folder}", "is running", "Stop it, or choose another folder")
+    with FileLock(folder / "lock") as lock:
+        if not acquire(lock, folder):
+            raise UsageError(f"session {folder}", "is running", "Stop it, or choose another folder")
     command = [sys.executable, "-m", "drgs_blender.cli.main", "session", "serve", str(folder), f"--idle={idle}"]
     # It inherits no stream: whoever runs this command would wait until it ends.
     log = folder / "log"
@@ -183,9 +184,8 @@ class _IdleWatch:
         if waits is None:
             return "nothing was asked of it" if time.monotonic() - self._since > self._idle else None
         with contextlib.suppress(OSError):  # the folder went just now
-            lock = FileLock(waits)
-            free = lock.acquire()
-            lock.close()
+            with FileLock(waits) as lock:
+                free = lock.acquire()
             if free and self._waits is waits:  # else it has just been answered
                 return "nobody waits for its frames"
         return None

@@ -81,11 +81,11 @@ def is_running(folder: Path) -> bool:
     """Whether a session's process lives."""
     if not os.path.isfile(folder / "lock"):  # unlike a Path's, False for any name that cannot be
         return False
-    lock = FileLock(folder / "lock")
-    try:
-        return not acquire(lock, folder)
-    finally:
-        lock.close()
+    with FileLock(folder / "lock") as lock:
+        try:
+            return not lock.acquire()
+        except OSError:  # a drive that loses its locks does not end what runs
+            return True
 
 
 def end(folder: Path) -> None:

@@ -23,7 +23,8 @@ PACKAGE = Path(__file__).resolve().parent.parent
 SHIPPED = Path(__file__).with_name("kernels")
 #: What kernels' modules import and machine code does not depend on, or only through the target's name.
 NEUTRAL = frozenset(f"drgs_blender/{name}.py" for name in (
-    "compute/closure", "compute/folders", "compute/shipped", "compute/targets", "core/errors", "core/version",
+    "compute/closure", "compute/folders", "compute/shipped", "compute/targets", "core/errors", "core/file_lock",
+    "core/version",
 ))  # fmt: skip
 _DIGITS = 16
 

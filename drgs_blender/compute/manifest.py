@@ -56,15 +56,13 @@ def jobs() -> dict[str, tuple[Kernel, ...]]:
 
 
 def needed(names: Iterable[str]) -> list[Kernel]:
-    """The kernels of some jobs, each once, in the order in which they are best compiled; unknown jobs have none.
+    """The kernels of some jobs, each once: those of the first job, of the second and so on, in each the longest first.
 
-    First the one that takes longest, beside which all others may be compiled; then those of the first job, of the
-    second and so on, in each by the time they take.
+    Unknown jobs have none.
     """
     table = jobs()
     by_time = lambda kernel: (-kernel.seconds, kernel.name)  # noqa: E731
-    found = list(dict.fromkeys(kernel for name in names for kernel in sorted(table.get(name, ()), key=by_time)))
-    return sorted(found, key=lambda kernel: kernel is not min(found, key=by_time))
+    return list(dict.fromkeys(kernel for name in names for kernel in sorted(table.get(name, ()), key=by_time)))
 
 
 def dispatcher(kernel: Kernel) -> Any:

@@ -54,7 +54,7 @@ def prepare_kernels(
     Parameters
     ----------
     jobs : iterable of str
-        Of `manifest.jobs`.
+        Of `manifest.jobs`; the kernels of the first are compiled first, beside the one that takes longest of all.
     progress : callable, optional
         Called with "Preparing the engine (first time only), 3 of 12" and the part that is done.
     cancelled : callable, optional
@@ -164,7 +164,7 @@ def processes() -> int:
 
 
 class _Pool:
-    """Worker processes, each compiling one kernel at a time, in the order given.
+    """Worker processes, each compiling one kernel at a time: first the longest, on which all wait, then in order.
 
     What another process compiles at the same time, here or on another machine with the same folder, is left to it.
 
@@ -177,7 +177,9 @@ class _Pool:
     """
 
     def __init__(self, kernels: list[_Known]) -> None:
-        self._remaining, self._codegen = list(kernels), _codegen()
+        self._longest = max(kernels, key=lambda known: known[0].seconds)
+        self._remaining = sorted(kernels, key=lambda known: known is not self._longest)
+        self._codegen = _codegen()
         self._all = sum(kernel.seconds for kernel, _, _ in kernels)
         self.done, self.fraction = 0, 0.0
         self._progress = time.monotonic()
@@ -229,16 +231,28 @@ class _Pool:
                 return
             known, claim = found
             try:
-                worker = idle.pop() if idle else _Worker(self._results, yields=bool(self._workers))
-            except OSError as error:  # no more processes may be started
-                log.warning("kernels are compiled by %d processes: %s", len(self._workers), error)
-                self._most = len(self._workers)
+                worker = idle.pop() if idle else self._start(yields=known is not self._longest)
+            except BaseException:
                 claim.close()
-                continue
-            if worker not in self._workers:
-                self._workers.append(worker)
-            if worker.assign(known[0], claim):
+                raise
+            if worker is None:
+                claim.close()
+            elif worker.assign(known[0], claim):
                 self._remaining.remove(known)
+
+    def _start(self, yields: bool) -> _Worker | None:
+        """Another worker; None where there can be no more, for lack of memory or as the system refuses."""
+        if self._workers and available_memory() < _BYTES:
+            self._most = len(self._workers)
+            return None
+        try:
+            worker = _Worker(self._results, yields)
+        except (OSError, RuntimeError) as error:  # no process, no thread
+            log.warning("kernels are compiled by %d processes: %s", len(self._workers), error)
+            self._most = len(self._workers)
+            return None
+        self._workers.append(worker)
+        return worker
 
     def _claim(self) -> tuple[_Known, Claim] | None:
         """The first kernel that nobody compiles or has compiled meanwhile."""
@@ -264,10 +278,15 @@ class _Worker:
     results : object
         The queue of its answers.
     yields : bool
-        Whether it yields to other programs, and to the worker that has the longest kernel, on which all wait.
+        Whether it yields to other programs, as all do but the one that has the longest kernel.
+
+    Raises
+    ------
+    OSError, RuntimeError
+        No more processes, or threads, may be started.
     """
 
-    def __init__(self, results: queue.SimpleQueue[tuple[_Worker, bool]], yields: bool = False) -> None:
+    def __init__(self, results: queue.SimpleQueue[tuple[_Worker, bool]], yields: bool) -> None:
         self.kernel: Kernel | None = None
         self.is_alive, self._claim = True, Claim()
         environment = os.environ | {"NUMBA_NUM_THREADS": "1"}
@@ -284,7 +303,11 @@ class _Worker:
         if yields and hasattr(os, "setpriority"):  # not on Windows
             with contextlib.suppress(OSError):
                 os.setpriority(os.PRIO_PROCESS, self._process.pid, os.getpriority(os.PRIO_PROCESS, 0) + _LOWER)
-        threading.Thread(target=self._listen, args=(results,), daemon=True).start()
+        try:
+            threading.Thread(target=self._listen, args=(results,), daemon=True).start()
+        except RuntimeError:
+            self.close()
+            raise
 
     def assign(self, kernel: Kernel, claim: Claim) -> bool:
         """Have a kernel compiled; False where the process has ended."""

@@ -11,7 +11,7 @@ from pathlib import Path
 
 _POLL_SECONDS = 0.01
 #: How Windows says that another process has the lock.
-_BUSY = errno.EACCES, errno.EDEADLK, 36
+_BUSY = errno.EACCES, errno.EDEADLK
 
 
 class FileLock:
@@ -69,10 +69,25 @@ class FileLock:
         """Release the lock; the file stays, since another process may wait for it."""
         if self._file is None:
             return
-        if sys.platform != "win32":
-            import fcntl
+        file, self._file = self._file, None
+        with contextlib.suppress(OSError):  # of what is not locked
+            if sys.platform == "win32":
+                import msvcrt
 
-            with contextlib.suppress(OSError):
-                fcntl.flock(self._file, fcntl.LOCK_UN)  # a child may have the file open as well
-        os.close(self._file)
-        self._file = None
+                os.lseek(file, 0, os.SEEK_SET)
+                msvcrt.locking(file, msvcrt.LK_UNLCK, 1)
+            else:
+                import fcntl
+
+                fcntl.flock(file, fcntl.LOCK_UN)  # a child may have the file open as well
+        os.close(file)
+
+    def __enter__(self) -> FileLock:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __del__(self) -> None:
+        if getattr(self, "_file", None) is not None:
+            self.close()

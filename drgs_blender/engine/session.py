@@ -259,10 +259,10 @@ class Session:
         self, frame: Frame, jobs: tuple[str, ...], progress: OnProgress | None, cancelled: IsCancelled | None
     ) -> None:
         """Have the kernels compiled that a frame and some jobs besides need."""
-        wanted = {*jobs, *jobs_of(frame)} - self._compiled
-        if wanted:
-            prepare_kernels(wanted, progress, cancelled)
-            self._compiled |= wanted
+        missing = [job for job in dict.fromkeys((*jobs_of(frame), *jobs)) if job not in self._compiled]
+        if missing:
+            prepare_kernels(missing, progress, cancelled)
+            self._compiled.update(missing)
 
     def _prepare(
         self, frame: Frame, timer: _StageTimer, progress: OnProgress | None, backend: RenderBackend = CPU
@@ -291,21 +291,21 @@ class Session:
         }
 
 
-def jobs_of(frame: Frame) -> set[str]:
-    """Jobs of `compute.manifest` whose kernels a frame needs."""
-    settings, jobs = frame.settings, {"frame"}
+def jobs_of(frame: Frame) -> list[str]:
+    """Jobs of `compute.manifest` whose kernels a frame needs, in the order of the stages."""
+    settings, jobs = frame.settings, ["frame"]
     if settings.camera_sees == "mesh":
-        jobs.add("mesh")
+        jobs.append("mesh")
     if settings.rays_see == "surfels":
-        jobs.add("surfel rays")
+        jobs.append("surfel rays")
     if settings.denoise == "svgf":
-        jobs.add("denoise")
+        jobs.append("denoise")
     if frame.lights or frame.meshes:
-        jobs.add("lights")
+        jobs.append("lights")
     if frame.previous is not None or frame.next is not None:
-        jobs.add("motion")
+        jobs.append("motion")
     if any(name.startswith("Crypto") for name in frame.passes):
-        jobs.add("mattes")
+        jobs.append("mattes")
     return jobs
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from drgs_blender.cli import session_link
+from drgs_blender.cli import session, session_link
 from drgs_blender.compute.kernel_cache import Claim
 from drgs_blender.core.errors import WriteError
 from drgs_blender.core.file_lock import FileLock
@@ -70,5 +70,16 @@ def test_a_drive_without_locks(monkeypatch, tmp_path):
     claim = Claim.of(tmp_path / "lock")
     assert claim is not None
     claim.close()
+    assert session_link.is_running(tmp_path)  # what runs is not taken for ended
     with pytest.raises(WriteError, match="No locks available"):
-        session_link.is_running(tmp_path)
+        session._claim(tmp_path)
+
+
+def test_a_lock_that_is_dropped_is_released(tmp_path):
+    lock = FileLock(tmp_path / "lock")
+    assert lock.acquire()
+    del lock
+    with FileLock(tmp_path / "lock") as other:
+        assert other.acquire()
+    with FileLock(tmp_path / "lock") as other:
+        assert other.acquire()
