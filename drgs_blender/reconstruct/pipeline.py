@@ -29,9 +29,9 @@ from .inverse_rendering.run import Decoupled, decouple
 from .inverse_rendering.settings import Settings as Decoupling
 from .jit_warmup import rehearse
 from .losses.photometric import Photograph, structural_similarity
+from .meshing.depth_fusion import fuse, grid
 from .meshing.normal_integration import follow_normals, shaded_by, shaded_by_own
 from .meshing.silhouette_fit import fill_silhouettes
-from .meshing.tsdf import fuse, grid
 from .meshing.visual_hull import Region, find_region, have_silhouettes, silhouettes
 from .model.attached import attach_learned, bound
 from .model.gaussians import Gaussians

@@ -17,7 +17,7 @@ from shapes import plain_mesh, sphere_mesh
 from drgs_blender.core.errors import UsageError
 from drgs_blender.core.frame import Camera
 from drgs_blender.reconstruct.capture.training_views import pixel_rays
-from drgs_blender.reconstruct.meshing import tsdf
+from drgs_blender.reconstruct.meshing import depth_fusion
 from drgs_blender.reconstruct.meshing.silhouette_fit import FARTHEST, fill_silhouettes
 from drgs_blender.reconstruct.meshing.visual_hull import Region, silhouettes
 
@@ -57,10 +57,10 @@ def off(vertices: np.ndarray) -> np.ndarray:
 
 
 def test_exact_depth_maps_make_an_exact_mesh(cameras, monkeypatch):
-    monkeypatch.setattr(tsdf, "surface_maps", lambda _, view: hit(view))
+    monkeypatch.setattr(depth_fusion, "surface_maps", lambda _, view: hit(view))
     low = np.full(3, -RADIUS)
     region = Region(np.zeros(3), 2 * RADIUS, low, -low, np.zeros((0, 3)), np.zeros((0, 3)), PIXEL)
-    mesh, report = tsdf.fuse(None, cameras, region)  # type: ignore[arg-type]
+    mesh, report = depth_fusion.fuse(None, cameras, region)  # type: ignore[arg-type]
     assert report["voxel"] == pytest.approx(PIXEL, rel=0.05)
     assert -0.3 < off(mesh.vertices).mean() < 0  # what the smoothing takes
     filled = off(fill_silhouettes(mesh, cameras, [mask_of(view) for view in cameras]))
@@ -72,17 +72,17 @@ def test_more_voxels_than_memory_are_refused_with_how_many_fit(cameras, monkeypa
         raise LookupError
 
     monkeypatch.setattr("drgs_blender.reconstruct.memory_budget.total_memory", lambda: 2.0**25)
-    monkeypatch.setattr(tsdf, "surface_maps", begun)
+    monkeypatch.setattr(depth_fusion, "surface_maps", begun)
     sharp = [replace(view, fx=9 * view.fx) for view in cameras]
     low = np.full(3, -RADIUS)
     region = Region(np.zeros(3), 2 * RADIUS, low, -low, np.zeros((0, 3)), np.zeros((0, 3)), PIXEL)
     with pytest.raises(UsageError, match=r"GiB of voxels.*--voxels") as refused:
-        tsdf.fuse(None, sharp, region, 1024)  # type: ignore[arg-type]
+        depth_fusion.fuse(None, sharp, region, 1024)  # type: ignore[arg-type]
     fitting = int(re.search(r"--voxels (\d+) or less", str(refused.value))[1])  # type: ignore[index]
     with pytest.raises(LookupError):
-        tsdf.fuse(None, sharp, region, fitting)  # type: ignore[arg-type]
+        depth_fusion.fuse(None, sharp, region, fitting)  # type: ignore[arg-type]
     with pytest.raises(UsageError):
-        tsdf.fuse(None, sharp, region, fitting + 2)  # type: ignore[arg-type]
+        depth_fusion.fuse(None, sharp, region, fitting + 2)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("pixels", [-1.2, 0.8])
