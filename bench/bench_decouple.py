@@ -125,8 +125,8 @@ def long_run(scene: Scene, iterations: int) -> dict[str, list[float]]:
 
 def own_meshes(scene: Scene) -> tuple[Mesh, Mesh]:
     """The mesh of stage (i) as it is fused, and with the outlines of the masks."""
-    from drgs_blender.reconstruct.meshing.silhouette_fit import fill_silhouettes
     from drgs_blender.reconstruct.meshing.depth_fusion import fuse
+    from drgs_blender.reconstruct.meshing.silhouette_fit import fill_silhouettes
     from drgs_blender.reconstruct.meshing.visual_hull import find_region, silhouettes
     from drgs_blender.reconstruct.optim.schedule import Schedule
     from drgs_blender.reconstruct.optim.train import Training
