@@ -70,18 +70,19 @@ def mesh_from_surfels(surfels: Surfels, *, resolution: int = 192, views: int = 6
     shape = tuple(int(n) for n in np.ceil((high - low) / voxel) + 1)
     cameras = [_camera(direction, low, high, voxel) for direction in _directions(views)]
 
-    looks, seen = [], np.zeros((len(posed), 3))
+    covered, seen = [], np.zeros((len(posed), 3))
     for camera, direction in zip(cameras, _directions(views)):
-        look = _look(posed, camera, direction)
-        seen += _visible(posed.centre, surfels.scale.max(axis=1), camera, look.depth, voxel)[:, None] * direction
-        looks.append(look)
+        pixels = _rasterise(posed, camera, direction)
+        depth, _ = pixels.maps(camera)
+        seen += _visible(posed.centre, surfels.scale.max(axis=1), camera, depth, voxel)[:, None] * direction
+        covered.append(pixels)
     outward = np.where((np.einsum("nc,nc->n", seen, posed.normal) < 0)[:, None], -posed.normal, posed.normal)
 
     field = SignedDistanceField(low, voxel, shape)
-    for camera, direction, look in zip(cameras, _directions(views), looks):
+    for camera, direction, pixels in zip(cameras, _directions(views), covered):
         back = outward @ direction <= 0
-        look.cosine[np.isfinite(look.depth) & back[look.owner]] = 0  # says nothing about what is before it
-        field.add(_depth_maps(camera, look.depth, look.cosine))
+        pixels.cosine[back[pixels.surfel]] = 0  # says nothing about what is before it
+        field.add(_depth_maps(camera, *pixels.maps(camera)))
     mesh, report = field.mesh(WITNESSES, SMOOTH, "Give the mesh that they were captured with")
     report = {"resolution": resolution} | report
     log.info("mesh from surfels: %s", report)
@@ -154,25 +155,35 @@ def _depth_maps(camera: Camera, depth: Array, cosine: Array) -> DepthMaps:
     )
 
 
-class _Look(NamedTuple):
-    """What a view sees.
+class _CoveredPixels(NamedTuple):
+    """The pixels of a view that surfels cover by half or more; of the others nothing is kept.
 
     Attributes
     ----------
-    depth : (size, size) float32 array
-        Along the view, metres; +inf where less than half is covered.
-    cosine : (size, size) float32 array
-        Between surface and view; 1 where less than half is covered.
-    owner : (size, size) int32 array
-        The surfel that covers most.
+    place : (p,) int32 array
+        Index in the flattened picture.
+    depth : (p,) float32 array
+        Along the view, metres.
+    cosine : (p,) float32 array
+        Between surface and view.
+    surfel : (p,) int32 array
+        The one that covers most of the pixel.
     """
 
+    place: Array
     depth: Array
     cosine: Array
-    owner: Array
+    surfel: Array
+
+    def maps(self, camera: Camera) -> tuple[Array, Array]:
+        """Depth and cosine of all pixels, (height, width) float32; +inf and 1 where less than half is covered."""
+        shape = camera.height, camera.width
+        depth, cosine = np.full(shape, np.inf, np.float32), np.ones(shape, np.float32)
+        depth.reshape(-1)[self.place], cosine.reshape(-1)[self.place] = self.depth, self.cosine
+        return depth, cosine
 
 
-def _look(posed: PosedSurfels, camera: Camera, direction: Array) -> _Look:
+def _rasterise(posed: PosedSurfels, camera: Camera, direction: Array) -> _CoveredPixels:
     """Rasterise a view, with all normals on the side of the camera."""
     away = posed.normal @ direction < 0
     number = np.arange(len(posed), dtype=np.int32)
@@ -180,11 +191,13 @@ def _look(posed: PosedSurfels, camera: Camera, direction: Array) -> _Look:
     parameters = camera_parameters(camera, RenderSettings(subpixel_samples=1), 0)
     samples = rasterise(prepare(towards, camera, parameters), 0, camera.height)
     covered = samples.alpha[..., 0] >= 0.5
-    cosine, owner = np.ones(covered.shape, np.float32), np.zeros(covered.shape, np.int32)
     normal = samples.surface[..., 0, NORMAL : NORMAL + 3][covered]
-    cosine[covered] = np.abs(normal @ direction.astype(np.float32))
-    owner[covered] = samples.object_index[..., 0][covered]
-    return _Look(np.where(covered, samples.depth[..., 0], np.float32(np.inf)), cosine, owner)
+    return _CoveredPixels(
+        np.flatnonzero(covered).astype(np.int32),
+        samples.depth[..., 0][covered],
+        np.abs(normal @ direction.astype(np.float32)),
+        samples.object_index[..., 0][covered],
+    )
 
 
 def _visible(centre: Array, size: Array, camera: Camera, depth: Array, voxel: float) -> Array:
