@@ -77,10 +77,11 @@ def mesh_from_surfels(surfels: Surfels, *, resolution: int = 192, views: int = 6
         seen += _visible(posed.centre, surfels.scale.max(axis=1), camera, depth, voxel)[:, None] * direction
         covered.append(pixels)
     outward = np.where((np.einsum("nc,nc->n", seen, posed.normal) < 0)[:, None], -posed.normal, posed.normal)
+    known = seen.any(axis=1)  # others, large ones whose centre is hidden, may face either way
 
     field = SignedDistanceField(low, voxel, shape)
     for camera, direction, pixels in zip(cameras, _directions(views), covered):
-        back = outward @ direction <= 0
+        back = known & (outward @ direction <= 0)
         pixels.cosine[back[pixels.surfel]] = 0  # says nothing about what is before it
         field.add(_depth_maps(camera, *pixels.maps(camera)))
     mesh, report = field.mesh(WITNESSES, SMOOTH, "Give the mesh that they were captured with")

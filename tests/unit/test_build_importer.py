@@ -106,6 +106,37 @@ def test_proxy_closes_an_open_capture_instead_of_carving_its_inside():
     assert solid.volume == pytest.approx(4 / 3 * np.pi - cap, rel=0.08)
 
 
+def squares(low, high, fixed: int, at: float, facing: int, spacing: float = 0.05) -> tuple[np.ndarray, np.ndarray]:
+    """Points (n, 3) of a grid on a rectangle that is level along an axis, and their normals."""
+    first, second = (np.arange(a + spacing / 2, b, spacing) for a, b in zip(low, high))
+    points = np.stack(np.meshgrid(first, second), -1).reshape(-1, 2)
+    return np.insert(points, fixed, at, axis=1), np.tile(facing * np.eye(3)[fixed], (len(points), 1))
+
+
+def test_large_surfels_whose_centre_no_view_sees_count_from_both_sides():
+    """A block with a well. Four large surfels inside it make the floor of the well, and face down by mistake."""
+    side, well, top, floor = 1.4, 0.4, 1.0, 0.5
+    parts = [squares((-side, -side), (side, side), 2, z, facing) for z, facing in ((0, -1), (top, 1))]
+    for axis in (0, 1):
+        for sign in (-1, 1):
+            parts.append(squares((-side, 0), (side, top), axis, sign * side, sign))
+            parts.append(squares((-well, floor), (well, top), axis, sign * well, -sign))
+    centre, normal = (np.concatenate(arrays) for arrays in zip(*parts))
+    opening = (np.abs(centre[:, :2]) < well).all(axis=1) & (centre[:, 2] == top)
+    large = np.array([[0.65, 0, floor], [-0.65, 0, floor], [0, 0.65, floor], [0, -0.65, floor]])
+    centre = np.concatenate([centre[~opening], large])
+    normal = np.concatenate([normal[~opening], np.tile([0.0, 0, -1], (4, 1))])
+    n = len(centre)
+    along = np.roll(normal, 1, axis=1)
+    frame = np.stack([along, np.cross(normal, along), normal], -1)
+    scale = np.full((n, 2), 0.04)
+    scale[-4:] = 0.4
+    capture = Surfels(centre, scale, quaternions(frame), np.full(n, 0.99), np.ones((n, 3)), np.ones(n), np.zeros(n))
+    mesh, report = mesh_from_surfels(capture, resolution=64, views=96)
+    inside = (np.abs(mesh.vertices[:, :2]) < 0.5 * well).all(axis=1) & (mesh.vertices[:, 2] > 0.25)
+    assert inside.any() and mesh.vertices[inside, 2].max() < floor + report["voxel"], "the well is open to its floor"
+
+
 @pytest.mark.slow
 def test_import_without_a_mesh_builds_and_binds_one(shared_data):
     asset = import_asset(shared_data / "splats/playbot_lod3_2scale_sh2.ply", resolution=64)
