@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import faulthandler
-import gc
 import logging
 import os
 import queue
@@ -22,6 +21,7 @@ import numpy as np
 
 from ..compute.folders import leave_temporary
 from ..core.errors import EXIT_INTERNAL, EXIT_OK, EXIT_VERSION, Cancelled, DeviceError, DrgsError
+from ..core.loading import many_imports
 from ..core.phases import PREPARING, STARTING, is_counted
 from ..core.version import __version__
 from ..ipc import protocol
@@ -96,13 +96,11 @@ class Server:
         for target in (self.listen, self.send_heartbeats):
             threading.Thread(target=target, name=f"drgs-{target.__name__}", daemon=True).start()
         self._note_preparing(1, STARTING)
-        gc.disable()  # modules stay: to look for garbage among them takes a tenth of the time of loading them
-        try:
-            self._open_session()
-        except Exception:
-            logger.exception("the engine is incomplete")  # the first request meets it again and is answered with it
-        gc.freeze()
-        gc.enable()
+        with many_imports():
+            try:
+                self._open_session()
+            except Exception:
+                logger.exception("the engine is incomplete")  # the first request meets it again and is answered with it
         self._note_preparing(-1)
         while True:
             message, arrays = self._requests.get()

@@ -74,7 +74,11 @@ print(*set({LATER!r}) & set(sys.modules))
 
 
 def test_garbage_is_collected_again_after_imports():
-    with pytest.raises(ImportError), many_imports():
-        assert not gc.isenabled()
-        raise ImportError("a part is missing")
-    assert gc.isenabled()
+    try:
+        with pytest.raises(ImportError), many_imports():
+            assert not gc.isenabled()
+            raise ImportError("a part is missing")
+        assert gc.isenabled()
+        assert gc.get_freeze_count()
+    finally:
+        gc.unfreeze()  # or the objects of all tests before would never be freed
