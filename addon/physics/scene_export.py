@@ -35,6 +35,8 @@ _COLLIDER = "collider_"
 COLLIDER_FILE = re.compile(_COLLIDER + r"\d{3}_(.*?)\.(?:ply|npy)")
 #: Standard output and log of the engine's program, beside its input.
 STDOUT, LOG = "stdout.txt", "log.txt"
+#: What STDOUT was called earlier: old bakes still have it.
+_OLD_STDOUT = "said.txt"
 #: Least volume to which the object may scale a cubic metre, as the engine holds it.
 _FLATTEST = 1e-12
 #: Types of attributes that can mark a part of a mesh.
@@ -111,7 +113,8 @@ def clear(folder: Path) -> None:
     """Remove what `export_scene` wrote and the folder, as far as nothing else is in it."""
     with suppress(OSError):
         for path in folder.iterdir():
-            if path.name in (BODY, SETTINGS, MATRICES, MOTION, STDOUT, LOG) or path.name.startswith(_COLLIDER):
+            written = path.name in (BODY, SETTINGS, MATRICES, MOTION, STDOUT, _OLD_STDOUT, LOG)
+            if written or path.name.startswith(_COLLIDER):
                 path.unlink(missing_ok=True)
         os.rmdir(folder)
 

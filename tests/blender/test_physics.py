@@ -85,6 +85,17 @@ def test_frames_are_played_in_any_order_by_any_blender(body, scene, captured, tm
     np.testing.assert_array_equal(np.load(moved / "found.npy"), baked[4])
 
 
+def test_input_of_old_bakes_is_removed_whole_and_nothing_else(tmp_path):
+    names = [scene_export.SETTINGS, scene_export.LOG, scene_export.STDOUT, "said.txt", "collider_000_Box.ply"]
+    for folder, others in ((tmp_path / "own", []), (tmp_path / "shared", ["notes.txt"])):
+        folder.mkdir()
+        for name in names + others:
+            (folder / name).touch()
+        scene_export.clear(folder)
+        assert folder.exists() == bool(others)
+    assert [path.name for path in folder.iterdir()] == others
+
+
 @pytest.mark.slow
 def test_a_bake_is_stopped_at_once_and_goes_on(body, scene):
     physics = body.drgs.physics
