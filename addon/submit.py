@@ -157,16 +157,16 @@ class Submission:
             self.text = "Cancelled"
 
     def _finish(self) -> None:
-        said, log = (self._read(stream) for stream in (self._stdout, self._log))
+        lines, log = (self._read(stream) for stream in (self._stdout, self._log))
         marks = ("note ", "missing ")
-        self.notes = [line.partition(" ")[2].strip() for line in said if line.startswith(marks)]
+        self.notes = [line.partition(" ")[2].strip() for line in lines if line.startswith(marks)]
         missing = self._expected.missing()
-        if self._process.returncode == 0 and (missing or len(said) < 2):
+        if self._process.returncode == 0 and (missing or len(lines) < 2):
             self.text = "No job was written"
             problem = output_check.complaint(self._program, missing) if missing else f"{self._program} named no command"
             self.error = f"{problem}. {output_check.REMEDY}."
         elif self._process.returncode == 0:
-            self.text, self.command = said[-2].removesuffix(". Submit with"), said[-1]
+            self.text, self.command = lines[-2].removesuffix(". Submit with"), lines[-1]
         else:
             last = log[-1] if log else f"ended with code {self._process.returncode} and no word"
             self.text, self.error = "No job was written", last.removeprefix("drgs: ")

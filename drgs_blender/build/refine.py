@@ -20,7 +20,7 @@ FINEST = 1 / 1500
 #: A vertex averages its texture over this part of its mean edge.
 FOOTPRINT = 0.7
 #: Texture compared with the interpolation is averaged over this part of an edge, so that finer detail is noticed.
-LOOK = 0.1
+EDGE_FOOTPRINT = 0.1
 #: Rounds of subdivision at most.
 ROUNDS = 16
 
@@ -41,11 +41,11 @@ def refine(net: Net, materials: Materials, tolerance: float, max_triangles: int)
     """
     finest = FINEST * float(np.linalg.norm(np.ptp(net.vertices, axis=0)))
     edge, count = edges(net)
-    looked = _Looked(net, edge, materials)
+    fit = _TextureFit(net, edge, materials)
     for done in range(ROUNDS + 1):
         lengths = edge_lengths(net)
         error = np.zeros(count)
-        np.maximum.at(error, edge.reshape(-1), looked.errors.reshape(-1))
+        np.maximum.at(error, edge.reshape(-1), fit.errors.reshape(-1))
         length = np.zeros(count)
         np.maximum.at(length, edge.reshape(-1), lengths.reshape(-1))
         wanted = (error > tolerance) & (length > 2 * finest)
@@ -58,8 +58,8 @@ def refine(net: Net, materials: Materials, tolerance: float, max_triangles: int)
         kept = survivors(net, edge, marked)
         net = subdivide(net, edge, marked)
         edge, count = edges(net)
-        looked = _Looked(net, edge, materials, looked, kept)
-    return net, looked.values, done, unresolved
+        fit = _TextureFit(net, edge, materials, fit, kept)
+    return net, fit.values, done, unresolved
 
 
 def _within_budget(edge: Array, lengths: Array, priority: Array, max_triangles: int) -> Array:
@@ -79,8 +79,8 @@ def _within_budget(edge: Array, lengths: Array, priority: Array, max_triangles: 
     return np.zeros(len(priority), bool)
 
 
-class _Looked:
-    """How well a net follows its textures; of what a division left as it was, nothing is looked up again.
+class _TextureFit:
+    """Vertex values of a net and their errors along edges; what a division leaves as it was is not sampled again.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ class _Looked:
     edge : array
         See `topology.edges`.
     materials : Materials
-    before : _Looked, optional
+    before : _TextureFit, optional
         Of the net that was divided.
     kept : array, optional
         `survivors` of the division.
@@ -103,7 +103,7 @@ class _Looked:
     """
 
     def __init__(
-        self, net: Net, edge: Array, materials: Materials, before: _Looked | None = None, kept: Array | None = None
+        self, net: Net, edge: Array, materials: Materials, before: _TextureFit | None = None, kept: Array | None = None
     ) -> None:
         m = len(net.faces)
         if before is None or kept is None:
@@ -127,11 +127,11 @@ class _Looked:
         self._along[new] = 0
         sides = np.flatnonzero(coarse & (moved | np.roll(moved, -1, axis=1)))
         self._along.reshape(-1)[sides] = compare.along(
-            edge.reshape(-1)[sides], sides, LOOK * extent.reshape(-1, 2)[sides]
+            edge.reshape(-1)[sides], sides, EDGE_FOOTPRINT * extent.reshape(-1, 2)[sides]
         )
         self._middle[new] = 0
         rows = np.flatnonzero(coarse.any(axis=1) & moved.any(axis=1))
-        self._middle[rows] = compare.middle(rows, LOOK * extent[rows].mean(axis=1))
+        self._middle[rows] = compare.middle(rows, EDGE_FOOTPRINT * extent[rows].mean(axis=1))
         self.errors = self._along.copy()
         row, longest = np.arange(m), edge_lengths(net).argmax(axis=1)
         self.errors[row, longest] = np.maximum(self.errors[row, longest], self._middle)

@@ -17,8 +17,8 @@ CHANNELS = 5
 TOGETHER = 16384
 
 
-class Places(NamedTuple):
-    """Where points lie in the pyramids of all images of one layout.
+class TrilinearTaps(NamedTuple):
+    """Pixels between which points are interpolated, in pyramids of one layout.
 
     Attributes
     ----------
@@ -64,7 +64,7 @@ class Pyramid:
     levels : list of (h, w, 3) array
         Level 0 is the image, each next one the mean of 2 x 2 pixels.
     layout : tuple
-        Equal for images whose points are found at the same `places`.
+        Equal for images whose points are found at the same `taps`.
     """
 
     def __init__(self, image: Image) -> None:
@@ -93,10 +93,10 @@ class Pyramid:
         return np.stack([moved[..., 0] * width, (1 - moved[..., 1]) * height], -1)
 
     def sample(self, texels: Array, footprint: Array) -> Array:
-        """Mean colour (n, 3) around positions; parameters are those of `places`."""
-        return self.look_up(self.places(texels, footprint)).T
+        """Mean colour (n, 3) around positions; parameters are those of `taps`."""
+        return self.look_up(self.taps(texels, footprint)).T
 
-    def places(self, texels: Array, footprint: Array) -> Places:
+    def taps(self, texels: Array, footprint: Array) -> TrilinearTaps:
         """Find the pixels around positions.
 
         Parameters
@@ -112,17 +112,17 @@ class Pyramid:
         x, y = np.ascontiguousarray(texels.T)
         blended = np.flatnonzero(share)
         coarse = self._corners(low[blended] + 1, x[blended], y[blended])
-        return Places(self._corners(low, x, y), coarse, blended, share[blended])
+        return TrilinearTaps(self._corners(low, x, y), coarse, blended, share[blended])
 
-    def look_up(self, places: Places, channels: slice = slice(0, 3)) -> Array:
-        """Colours (channels, n) at `places`, those of a pyramid of the same layout."""
+    def look_up(self, taps: TrilinearTaps, channels: slice = slice(0, 3)) -> Array:
+        """Colours (channels, n) at `taps`, those of a pyramid of the same layout."""
         planes = self._planes[channels]
-        result = np.empty((len(planes), len(places.fine.x)), np.float32)
+        result = np.empty((len(planes), len(taps.fine.x)), np.float32)
         for plane, colour in zip(planes, result):
-            colour[:] = _bilinear(plane, places.fine)
-            if len(places.blended):
-                fine, coarse = colour[places.blended], _bilinear(plane, places.coarse)
-                colour[places.blended] = (1 - places.share) * fine + places.share * coarse
+            colour[:] = _bilinear(plane, taps.fine)
+            if len(taps.blended):
+                fine, coarse = colour[taps.blended], _bilinear(plane, taps.coarse)
+                colour[taps.blended] = (1 - taps.share) * fine + taps.share * coarse
         return result
 
     def _corners(self, level: Array, x: Array, y: Array) -> Corners:
@@ -183,14 +183,14 @@ class Materials:
         """Values (CHANNELS, n) of points of one material."""
         values = np.empty((CHANNELS, len(uvs)), np.float32)
         values[:] = np.array((*m.base_colour, m.roughness, m.metallic))[:, None]
-        places: dict[tuple[object, ...], Places] = {}
+        taps: dict[tuple[object, ...], TrilinearTaps] = {}
         for image, columns, channels in self._images(m):
             pyramid = self._pyramid(image)
-            if pyramid.layout not in places:
+            if pyramid.layout not in taps:
                 footprint = np.abs(scale) * pyramid.levels[0].shape[1::-1] * _zoom(image)
                 texels = pyramid.texels(uvs.astype(np.float64))
-                places[pyramid.layout] = pyramid.places(texels, np.maximum(footprint[:, 0], footprint[:, 1]))
-            values[columns] *= pyramid.look_up(places[pyramid.layout], channels)
+                taps[pyramid.layout] = pyramid.taps(texels, np.maximum(footprint[:, 0], footprint[:, 1]))
+            values[columns] *= pyramid.look_up(taps[pyramid.layout], channels)
         return values
 
     def texel_size(self) -> Array:

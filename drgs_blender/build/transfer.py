@@ -39,7 +39,9 @@ def surfels_to_vertices(mesh: Mesh, surfels: Surfels, binding: Binding) -> int:
     outward = np.where(inward[:, None], -frames[..., 2], frames[..., 2])
     scale = np.maximum(surfels.scale.astype(np.float64), 1e-12)
     size = np.stack([scale[:, 0], scale[:, 1], THICKNESS * scale.max(axis=1)])
-    around = _Around(surfels, frames.transpose(1, 2, 0).copy(), outward.T.copy(), size, 0.1 * scale.max(axis=1))
+    neighbours = _SurfelNeighbours(
+        surfels, frames.transpose(1, 2, 0).copy(), outward.T.copy(), size, 0.1 * scale.max(axis=1)
+    )
     normal = VertexNormals(mesh.faces, len(mesh.vertices))(mesh.vertices)
     tree, k, lonely = cKDTree(surfels.centre), min(NEAREST, len(surfels)), 0
     found = {name: np.empty_like(getattr(mesh, name)) for name in ("albedo", "roughness", "metallic")}
@@ -48,7 +50,7 @@ def surfels_to_vertices(mesh: Mesh, surfels: Surfels, binding: Binding) -> int:
         vertices = mesh.vertices[rows].astype(np.float64)
         distance, index = tree.query(vertices, k=k)
         index = index.reshape(-1, k)
-        weight, alone = around.weights(vertices, normal[rows], distance.reshape(-1, k), index)
+        weight, alone = neighbours.weights(vertices, normal[rows], distance.reshape(-1, k), index)
         lonely += int(alone.sum())
         for name in found:
             values = getattr(surfels, name)[index]
@@ -58,8 +60,8 @@ def surfels_to_vertices(mesh: Mesh, surfels: Surfels, binding: Binding) -> int:
     return lonely
 
 
-class _Around(NamedTuple):
-    """Surfels by the coordinates of which a vertex weighs them, each (n,) or with n last.
+class _SurfelNeighbours(NamedTuple):
+    """Surfels as a vertex weighs those near it, with n last in each array.
 
     Attributes
     ----------
@@ -70,15 +72,15 @@ class _Around(NamedTuple):
         Normals on the side on which they hang.
     size : (3, n) array
         Standard deviations along the axes.
-    least : (n,) array
-        Added to distances, so that no surfel weighs all.
+    softening : (n,) array
+        Length whose square is added to squared distances, so that a surfel at a vertex does not take all the weight.
     """
 
     surfels: Surfels
     frames: Array
     outward: Array
     size: Array
-    least: Array
+    softening: Array
 
     def weights(self, vertices: Array, normal: Array, distance: Array, index: Array) -> tuple[Array, Array]:
         """Weights (v, k), whose sum is 1, of the surfels `index` (v, k) at vertices; which no surfel reaches (v,)."""
@@ -98,7 +100,7 @@ class _Around(NamedTuple):
         lonely = weight.sum(axis=1) < 1e-3
         alone = np.flatnonzero(lonely)
         same_side = np.where(facing[alone].any(axis=1, keepdims=True), facing[alone], True)
-        near = same_side / (distance[alone] ** 2 + self.least[index[alone]] ** 2)
+        near = same_side / (distance[alone] ** 2 + self.softening[index[alone]] ** 2)
         weight[alone] = near * (opacity[alone] + 1e-3)
         return weight / weight.sum(axis=1, keepdims=True), lonely
 

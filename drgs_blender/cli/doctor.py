@@ -108,9 +108,9 @@ def kernels(args: argparse.Namespace) -> str:
     from ..compute.jit import numba
 
     wanted, own = shipped.versions(), {"numba": numba.__version__, "llvmlite": importlib.metadata.version("llvmlite")}
-    stock = prepare.count_kernels()
-    missing = f", {stock.missing} are compiled when needed" if stock.missing else ""
-    text = f"{targets.current()}, {stock.shipped + stock.compiled} ready ({stock.shipped} shipped){missing}"
+    counts = prepare.count_kernels()
+    missing = f", {counts.missing} are compiled when needed" if counts.missing else ""
+    text = f"{targets.current()}, {counts.shipped + counts.compiled} ready ({counts.shipped} shipped){missing}"
     if wanted and wanted != own:
         other = " and ".join(f"{name} {version}" for name, version in wanted.items())
         remedy = f"To use those of the release: pip install {' '.join(f'{n}=={v}' for n, v in wanted.items())}"

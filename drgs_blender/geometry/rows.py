@@ -8,9 +8,10 @@ Array = np.ndarray
 
 
 def number_rows(*columns: Array) -> Array:
-    """Number (n,) of each row among the distinct ones in lexicographic order: the inverse of np.unique(axis=0).
+    """Number (n,) of each row among the distinct ones in lexicographic order.
 
-    Columns are ranked one by one, which is several times as fast as comparing whole rows.
+    These are the indices that ``np.unique(rows, axis=0, return_inverse=True)`` returns second. Columns are ranked one
+    by one, which is several times as fast as comparing whole rows.
 
     Parameters
     ----------

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from drgs_blender.build.make import _net, make_asset, mesh_with_materials
-from drgs_blender.build.refine import _Looked
+from drgs_blender.build.refine import _TextureFit
 from drgs_blender.build.texture import Materials, Pyramid
 from drgs_blender.build.topology import Net, close_marks, edge_lengths, edges, subdivide, survivors, weld
 from drgs_blender.core.errors import AssetError
@@ -155,7 +155,7 @@ def test_what_a_division_leaves_is_known_and_looked_up_once():
     materials = Materials(file.materials)
     net = _net(file, "plane", {"notes": []})
     edge, count = edges(net)
-    looked, known = _Looked(net, edge, materials), 0
+    fit, known = _TextureFit(net, edge, materials), 0
     for _ in range(5):
         marked = close_marks(edge, edge_lengths(net), rng.random(count) < 0.03)
         kept, before = survivors(net, edge, marked), net
@@ -166,10 +166,10 @@ def test_what_a_division_leaves_is_known_and_looked_up_once():
         for name in ("faces", "uvs", "tags"):
             np.testing.assert_array_equal(getattr(net, name)[rows], getattr(before, name)[kept[rows]])
         edge, count = edges(net)
-        looked, fresh = _Looked(net, edge, materials, looked, kept), _Looked(net, edge, materials)
-        np.testing.assert_array_equal(looked.errors, fresh.errors)
-        np.testing.assert_array_equal(looked.values, fresh.values)
-    assert known and looked.errors.max() > 0.1
+        fit, fresh = _TextureFit(net, edge, materials, fit, kept), _TextureFit(net, edge, materials)
+        np.testing.assert_array_equal(fit.errors, fresh.errors)
+        np.testing.assert_array_equal(fit.values, fresh.values)
+    assert known and fit.errors.max() > 0.1
 
 
 def test_an_edge_that_both_faces_see_alike_is_looked_up_once_and_a_seam_twice():
@@ -182,9 +182,9 @@ def test_an_edge_that_both_faces_see_alike_is_looked_up_once_and_a_seam_twice():
     lookups = []
     sample = materials.sample
     materials.sample = lambda material, *rest: lookups.append(len(material)) or sample(material, *rest)
-    together = _Looked(net, edge, materials).errors
+    together = _TextureFit(net, edge, materials).errors
     shared, lookups[:] = sum(lookups), []
-    apart = _Looked(net, np.arange(edge.size).reshape(edge.shape), materials).errors
+    apart = _TextureFit(net, np.arange(edge.size).reshape(edge.shape), materials).errors
     np.testing.assert_array_equal(together, apart)
     assert 0 < sum(lookups) - shared < 3 * (edge.size - count)  # three points an edge, but not at seams
 
