@@ -38,8 +38,20 @@ GOALS = {
 }
 
 
+_PACE: list[float] = []
+
+
+def pace() -> float:
+    """Seconds of ten million additions in Python: machines that are shared are fast at one time and slow at another."""
+    begun, total = time.process_time(), 0
+    for i in range(10_000_000):
+        total += i
+    return time.process_time() - begun
+
+
 def run(command: list[object], **environment: object) -> float:
     """Seconds that a command takes, which hears of no variable of ours or Numba's but these; it must succeed."""
+    _PACE.append(pace())
     begun = time.perf_counter()
     merged = {name: value for name, value in os.environ.items() if not name.startswith(("DRGS_", "NUMBA_"))}
     merged |= {name: str(value) for name, value in environment.items()}
@@ -139,7 +151,9 @@ def main() -> None:
     rows: dict[str, list[object]] = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
 
     def record(found: dict[str, float]) -> None:
-        rows.update({what: [seconds, time.strftime("%Y-%m-%d")] for what, seconds in found.items()})
+        meanwhile = round(statistics.median(_PACE), 2)
+        _PACE.clear()
+        rows.update({what: [seconds, time.strftime("%Y-%m-%d"), meanwhile] for what, seconds in found.items()})
         RESULTS.parent.mkdir(parents=True, exist_ok=True)
         RESULTS.write_text(json.dumps(rows))
 
@@ -153,14 +167,17 @@ def main() -> None:
             record({"`make test`, cold": dev_command_seconds("test", folder)})
         if options.ci:
             record({"`.ci/run`, environments and cache cold": clone(folder)})
-    shown = [[what, *rows.get(what, ["not measured", ""]), *goals] for what, goals in GOALS.items()]
+    shown = [[what, *(rows.get(what, ["not measured"]) + [""] * 3)[:3], *goals] for what, goals in GOALS.items()]
     repeats = int(str(rows["repeats"][0])) if "repeats" in rows else options.repeats  # of the run that measured them
     text = (
         "Cold: an empty cache folder, without kernels of a release. Whole processes, their start included; medians of "
         f"{repeats}, of {repeats + 2} where warm or shipped, of 7 for the first pixel; the last three "
-        "rows once.\n\n"
+        "rows once. Pace: seconds that ten million additions in Python took meanwhile, as machines that are shared are "
+        "fast at one time and slow at another.\n\n"
     )
-    write_section("startup", "Starting", text + table(("What", "Seconds", "Measured", "Hold", "Stretch"), shown))
+    write_section(
+        "startup", "Starting", text + table(("What", "Seconds", "Measured", "Pace", "Hold", "Stretch"), shown)
+    )
 
 
 if __name__ == "__main__":
