@@ -42,7 +42,7 @@ _PACE: list[float] = []
 
 
 def pace() -> float:
-    """Seconds of ten million additions in Python: machines that are shared are fast at one time and slow at another."""
+    """Processor seconds of ten million additions in Python: what a shared machine does at the time."""
     begun, total = time.process_time(), 0
     for i in range(10_000_000):
         total += i
