@@ -71,7 +71,7 @@ def picture(buffer: GBuffer, values: np.ndarray, camera: Camera) -> np.ndarray:
 def assert_alike(here: GBuffer, there: GBuffer, camera: Camera) -> None:
     assert len(here.points) > 500
     np.testing.assert_allclose(there.alpha.mean(), here.alpha.mean(), atol=1e-4)
-    for name in ("position", "depth", "emission", "face", "place", "object_index", "barycentric"):
+    for name in ("position", "depth", "emission", "face", "instance", "object_index", "barycentric"):
         assert getattr(there, name).dtype == getattr(here, name).dtype
     for name in ("albedo", "roughness", "metallic", "normal", "geometric_normal", "view"):
         a, b = (picture(buffer, getattr(buffer.points, name), camera) for buffer in (here, there))
