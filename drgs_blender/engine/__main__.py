@@ -1,9 +1,9 @@
 """``python -m drgs_blender.engine``: the engine, on pipes; started by the extension, not by hand."""
 
-import gc
+from ..core.loading import many_imports
 
 if __name__ == "__main__":
-    gc.disable()  # until all modules are there, see `Server.serve`
-    from .server import main
+    with many_imports():
+        from .server import main
 
     main()

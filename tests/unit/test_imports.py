@@ -73,6 +73,13 @@ print(*set({LATER!r}) & set(sys.modules))
     assert (result.stdout.strip(), result.returncode) == ("", 0), result.stderr
 
 
+def test_an_engine_collects_garbage_when_it_works():
+    code = "import gc, runpy\nfrom drgs_blender.engine import server\nserver.main = lambda: print(gc.isenabled())\n"
+    code += "runpy.run_module('drgs_blender.engine', run_name='__main__')"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    assert done.stdout == "True\n"
+
+
 def test_garbage_is_collected_again_after_imports():
     try:
         with pytest.raises(ImportError), many_imports():
