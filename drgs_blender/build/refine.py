@@ -40,10 +40,9 @@ def refine(net: Net, materials: Materials, tolerance: float, max_triangles: int)
         Edges still above the tolerance.
     """
     finest = FINEST * float(np.linalg.norm(np.ptp(net.vertices, axis=0)))
-    edge, count = edges(net)
-    fit = _TextureFit(net, edge, materials)
+    (edge, count), lengths = edges(net), edge_lengths(net)
+    fit = _TextureFit(net, edge, lengths, materials)
     for done in range(ROUNDS + 1):
-        lengths = edge_lengths(net)
         error = np.zeros(count)
         np.maximum.at(error, edge.reshape(-1), fit.errors.reshape(-1))
         length = np.zeros(count)
@@ -57,8 +56,8 @@ def refine(net: Net, materials: Materials, tolerance: float, max_triangles: int)
             break
         kept = survivors(net, edge, marked)
         net = subdivide(net, edge, marked)
-        edge, count = edges(net)
-        fit = _TextureFit(net, edge, materials, fit, kept)
+        (edge, count), lengths = edges(net), edge_lengths(net)
+        fit = _TextureFit(net, edge, lengths, materials, fit, kept)
     return net, fit.values, done, unresolved
 
 
@@ -87,6 +86,8 @@ class _TextureFit:
     net : Net
     edge : array
         See `topology.edges`.
+    lengths : array
+        See `topology.edge_lengths`.
     materials : Materials
     before : _TextureFit, optional
         Of the net that was divided.
@@ -103,7 +104,13 @@ class _TextureFit:
     """
 
     def __init__(
-        self, net: Net, edge: Array, materials: Materials, before: _TextureFit | None = None, kept: Array | None = None
+        self,
+        net: Net,
+        edge: Array,
+        lengths: Array,
+        materials: Materials,
+        before: _TextureFit | None = None,
+        kept: Array | None = None,
     ) -> None:
         m = len(net.faces)
         if before is None or kept is None:
@@ -133,7 +140,7 @@ class _TextureFit:
         rows = np.flatnonzero(coarse.any(axis=1) & moved.any(axis=1))
         self._middle[rows] = compare.middle(rows, EDGE_FOOTPRINT * extent[rows].mean(axis=1))
         self.errors = self._along.copy()
-        row, longest = np.arange(m), edge_lengths(net).argmax(axis=1)
+        row, longest = np.arange(m), lengths.argmax(axis=1)
         self.errors[row, longest] = np.maximum(self.errors[row, longest], self._middle)
 
 

@@ -10,8 +10,38 @@ import time
 from pathlib import Path
 
 _POLL_SECONDS = 0.01
-#: How Windows says that another process has the lock.
-_BUSY = errno.EACCES, errno.EDEADLK
+
+if sys.platform == "win32":
+    import msvcrt
+
+    def _lock(file: int) -> bool:
+        """Lock an open file; False while another process has it."""
+        os.lseek(file, 0, os.SEEK_SET)
+        try:
+            msvcrt.locking(file, msvcrt.LK_NBLCK, 1)
+        except OSError as error:
+            if error.errno in (errno.EACCES, errno.EDEADLK):  # another process has it
+                return False
+            raise
+        return True
+
+    def _unlock(file: int) -> None:
+        os.lseek(file, 0, os.SEEK_SET)
+        msvcrt.locking(file, msvcrt.LK_UNLCK, 1)
+
+else:
+    import fcntl
+
+    def _lock(file: int) -> bool:
+        """Lock an open file; False while another process has it."""
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return False
+        return True
+
+    def _unlock(file: int) -> None:
+        fcntl.flock(file, fcntl.LOCK_UN)  # a child may have the file open as well
 
 
 class FileLock:
@@ -27,9 +57,11 @@ class FileLock:
         The file can be neither opened nor made.
     """
 
+    _file: int | None = None
+
     def __init__(self, path: Path) -> None:
         flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_NOINHERIT", 0)
-        self._file: int | None = os.open(path, flags, 0o600)
+        self._file = os.open(path, flags, 0o600)
 
     def acquire(self, patience: float = 0.0) -> bool:
         """Lock the file, and say whether that was possible within `patience` seconds.
@@ -39,31 +71,11 @@ class FileLock:
         OSError
             Files cannot be locked here, as on some network drives.
         """
+        assert self._file is not None, "closed"
         deadline = time.monotonic() + patience
-        while not (locked := self._try()) and time.monotonic() < deadline:
+        while not (locked := _lock(self._file)) and time.monotonic() < deadline:
             time.sleep(_POLL_SECONDS)
         return locked
-
-    def _try(self) -> bool:
-        assert self._file is not None, "closed"
-        if sys.platform == "win32":
-            import msvcrt
-
-            try:
-                os.lseek(self._file, 0, os.SEEK_SET)
-                msvcrt.locking(self._file, msvcrt.LK_NBLCK, 1)
-            except OSError as error:
-                if error.errno in _BUSY:
-                    return False
-                raise
-        else:
-            import fcntl
-
-            try:
-                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                return False
-        return True
 
     def close(self) -> None:
         """Release the lock; the file stays, since another process may wait for it."""
@@ -71,15 +83,7 @@ class FileLock:
             return
         file, self._file = self._file, None
         with contextlib.suppress(OSError):  # of what is not locked
-            if sys.platform == "win32":
-                import msvcrt
-
-                os.lseek(file, 0, os.SEEK_SET)
-                msvcrt.locking(file, msvcrt.LK_UNLCK, 1)
-            else:
-                import fcntl
-
-                fcntl.flock(file, fcntl.LOCK_UN)  # a child may have the file open as well
+            _unlock(file)
         os.close(file)
 
     def __enter__(self) -> FileLock:
@@ -88,6 +92,4 @@ class FileLock:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def __del__(self) -> None:
-        if getattr(self, "_file", None) is not None:
-            self.close()
+    __del__ = close

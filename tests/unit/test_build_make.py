@@ -155,7 +155,7 @@ def test_what_a_division_leaves_is_known_and_looked_up_once():
     materials = Materials(file.materials)
     net = _net(file, "plane", {"notes": []})
     edge, count = edges(net)
-    fit, known = _TextureFit(net, edge, materials), 0
+    fit, known = _TextureFit(net, edge, edge_lengths(net), materials), 0
     for _ in range(5):
         marked = close_marks(edge, edge_lengths(net), rng.random(count) < 0.03)
         kept, before = survivors(net, edge, marked), net
@@ -166,7 +166,9 @@ def test_what_a_division_leaves_is_known_and_looked_up_once():
         for name in ("faces", "uvs", "tags"):
             np.testing.assert_array_equal(getattr(net, name)[rows], getattr(before, name)[kept[rows]])
         edge, count = edges(net)
-        fit, fresh = _TextureFit(net, edge, materials, fit, kept), _TextureFit(net, edge, materials)
+        lengths = edge_lengths(net)
+        fit = _TextureFit(net, edge, lengths, materials, fit, kept)
+        fresh = _TextureFit(net, edge, lengths, materials)
         np.testing.assert_array_equal(fit.errors, fresh.errors)
         np.testing.assert_array_equal(fit.values, fresh.values)
     assert known and fit.errors.max() > 0.1
@@ -182,9 +184,9 @@ def test_an_edge_that_both_faces_see_alike_is_looked_up_once_and_a_seam_twice():
     lookups = []
     sample = materials.sample
     materials.sample = lambda material, *rest: lookups.append(len(material)) or sample(material, *rest)
-    together = _TextureFit(net, edge, materials).errors
+    together = _TextureFit(net, edge, edge_lengths(net), materials).errors
     shared, lookups[:] = sum(lookups), []
-    apart = _TextureFit(net, np.arange(edge.size).reshape(edge.shape), materials).errors
+    apart = _TextureFit(net, np.arange(edge.size).reshape(edge.shape), edge_lengths(net), materials).errors
     np.testing.assert_array_equal(together, apart)
     assert 0 < sum(lookups) - shared < 3 * (edge.size - count)  # three points an edge, but not at seams
 
