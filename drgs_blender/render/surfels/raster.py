@@ -28,7 +28,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...compute.jit import inlined, njit
-from ...compute.threads import get_num_threads, over_range
+from ...compute.threads import over_lanes
 from ..camera import CLIP_END, CLIP_START, FX, FY, ORTHOGRAPHIC, SUBPIXELS, WIDTH, lattice, pixel_shift
 from ..columns import OPACITY, SAMPLE, SPLAT
 from .blending import GAP, LANES, MIN_TRANSMITTANCE, contributions, mean, prune, scratch_for, sort, weigh, widen
@@ -157,8 +157,7 @@ def rasterise(splats: Splats, y0: int, y1: int) -> SurfelSamples:
         np.empty(shape, np.int32),
     )
     if splats.number:
-        parts = 4 * get_num_threads()
-        over_range(_blend, parts, parts, splats, y0, y1, samples)
+        over_lanes(_blend, len(splats.tile_start) - 1, splats, y0, y1, samples)
     return samples
 
 
