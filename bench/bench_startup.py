@@ -1,10 +1,11 @@
 """From nothing to a picture: kernels compiled and shipped, the engine, the demo.
 
-    python bench/bench_startup.py [--repeats N] [--demo] [--tests] [--ci]
+    python bench/bench_startup.py [--repeats N] [--demo] [--tests] [--ci] [--against COMMIT]
 
 Cold is an empty cache folder, without kernels of a release. ``--demo`` runs ``make demo`` with one, the environments
-standing; ``--tests`` runs ``make test`` with one. These two, and what a release brings, keep the figure and the date of
-an earlier run where they are not measured.
+standing; ``--tests`` runs ``make test`` with one. ``--against`` measures the first pixel of another commit and of this
+one in turn. These, and what a release brings, keep the figure and the date of an earlier run where they are not
+measured.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import shutil
 import statistics
 import subprocess
 import sys
+import sysconfig
 import tempfile
 import time
 from pathlib import Path
@@ -32,6 +34,8 @@ GOALS = {
     "`drgs relight`, start to picture, kernels shipped": (3, 1),
     "`drgs relight`, start to picture, warm": ("", ""),
     "engine process to first pixel, warm": (0.8, 0.4),
+    "the same, in turn with the next row": ("", ""),
+    "the same of commit {commit}": ("", ""),
     "`make demo` after the environments, cold": (75, 45),
     "`make test`, cold": (480, 300),
     "`.ci/run`, environments and cache cold": (2100, 1500),
@@ -138,6 +142,45 @@ def clone(folder: Path) -> float:
     return run([copy / ".ci/run"], DRGS_CACHE_DIR=folder / "cache-of-clone")
 
 
+#: Prints the seconds to the first pixel of the checkout that it runs in.
+_FIRST_PIXEL = """
+import pathlib, sys
+from bench_engine import first_frame, plane_asset
+path = pathlib.Path(sys.argv[1])
+if not path.exists():
+    plane_asset(path)
+    first_frame(path)
+print(first_frame(path)["start_to_first_frame_s"])
+"""
+
+
+def first_pixels(commits: list[str], folder: Path, pairs: int = 9) -> list[float]:
+    """Median seconds to the first pixel of commits, each in an environment of its own, measured in turn."""
+    _PACE.append(pace())
+    starts = []
+    for number, commit in enumerate(commits):
+        checkout, environment = folder / f"checkout{number}", folder / f"environment{number}"
+        subprocess.run(["git", "clone", "--quiet", "--shared", "--no-checkout", ROOT, checkout], check=True)
+        subprocess.run(["git", "-C", checkout, "checkout", "--quiet", "--detach", commit], check=True)
+        subprocess.run([sys.executable, "-m", "venv", "--without-pip", environment], check=True)
+        site = Path(sysconfig.get_path("purelib", vars={"base": str(environment)}))
+        (site / "checkout.pth").write_text(f"{checkout}\n{sysconfig.get_path('purelib')}\n")
+        python = environment / Path(sys.executable).relative_to(sys.prefix)
+        paths = os.pathsep.join(map(str, (checkout, checkout / "bench")))
+        variables = {"PYTHONPATH": paths, "DRGS_ENGINE": str(python), "DRGS_SHIPPED": "0"}
+        variables["DRGS_CACHE_DIR"] = str(folder / f"kernels{number}")
+        command = [str(python), "-P", "-c", _FIRST_PIXEL, str(folder / f"sheet{number}.drgs")]
+        starts.append((command, os.environ | variables))
+    seconds = [
+        [
+            float(subprocess.run(command, env=variables, check=True, capture_output=True).stdout)
+            for command, variables in starts
+        ]
+        for _ in range(pairs + 1)  # the first compiles
+    ]
+    return [statistics.median(column) for column in zip(*seconds[1:], strict=True)]
+
+
 def main() -> None:
     """Measure and write the section."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -146,6 +189,7 @@ def main() -> None:
     parser.add_argument("--demo", action="store_true", help="measure `make demo` as well")
     parser.add_argument("--tests", action="store_true", help="measure `make test` as well")
     parser.add_argument("--ci", action="store_true", help="measure `.ci/run` of a clean clone as well")
+    parser.add_argument("--against", metavar="COMMIT", help="measure the first pixel of this commit as well")
     options = parser.parse_args()
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # else each start compiles all sources: users have them compiled
     rows: dict[str, list[object]] = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
@@ -161,13 +205,21 @@ def main() -> None:
         folder = Path(name)
         if not options.no_kernels:
             record(measure(folder, options.repeats) | {"repeats": options.repeats})
+        if options.against:
+            other, this = first_pixels([options.against, "HEAD"], folder)
+            names = "the same, in turn with the next row", "the same of commit {commit}"
+            record(dict(zip(names, (this, other), strict=True)) | {"against": options.against})
         if options.demo:
             record({"`make demo` after the environments, cold": dev_command_seconds("demo", folder)})
         if options.tests:
             record({"`make test`, cold": dev_command_seconds("test", folder)})
         if options.ci:
             record({"`.ci/run`, environments and cache cold": clone(folder)})
-    shown = [[what, *(rows.get(what, ["not measured"]) + [""] * 3)[:3], *goals] for what, goals in GOALS.items()]
+    commit = str(rows.get("against", ["-"])[0])
+    shown = [
+        [what.format(commit=commit), *(rows.get(what, ["not measured"]) + [""] * 3)[:3], *goals]
+        for what, goals in GOALS.items()
+    ]
     repeats = int(str(rows["repeats"][0])) if "repeats" in rows else options.repeats  # of the run that measured them
     text = (
         "Cold: an empty cache folder, without kernels of a release. Whole processes, their start included; medians of "
