@@ -26,7 +26,7 @@ from subjects import spread_asset
 BOUNCES = 3
 SCENES = {
     "outdoors": "textured floor, sun of 4 degrees, HDRI",
-    "studio": "two objects, one mirrored; metal ball, cube; soft point, spot, area light, a lamp in the picture",
+    "studio": "two objects, one mirrored; metal ball, cube; soft point, spot, area light, a light in the picture",
     "scattered": "a mesh in 20 places, disk light with spread, panel that glows",
     "visibility": "object unseen by the camera, one without shadow, holdout",
     "catcher": "the same, floor a shadow catcher",
@@ -129,7 +129,7 @@ def report(options: argparse.Namespace, rows: list[tuple[str, ...]]) -> str:
         f"both. Each picture is the mean of {options.seeds} with independent random numbers, of {options.spp} spp "
         f"and {options.samples} samples. Cycles' shadow terminator offsets and clamps are off. *No noise* and *Cycles "
         "itself* as in the section on parity.\n\n" + table(columns, rows) + "\n\n"
-        "In the last two scenes sky and lamps stand next to objects that only some rays meet, where a picture depends "
+        "In the last two scenes sky and lights stand next to objects that only some rays meet, where a picture depends "
         "on how strategies are weighed (docs/rendering.md)."
     )
 

@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 import ours
-from device_matter import matter
+from device_simulation import matter
 from judge import environments, frame_camera
 from learning import learning
 from ours import pinhole

@@ -20,7 +20,7 @@ from report import table, write_section
 from simulate_motion import motion
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "unit"))
-from matter_cases import lattice, solver_of
+from simulation_cases import lattice, solver_of
 
 from drgs_blender.compute.threads import get_num_threads, use_threads
 from drgs_blender.core.asset.model import Mesh

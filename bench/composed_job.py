@@ -69,7 +69,7 @@ def subject(path: str, turn: float = 0.0) -> bpy.types.Object:
     return obj
 
 
-def lamp(kind: str, energy: float, at: tuple, target: tuple = (0, 0, 0.7), **values: object) -> bpy.types.Object:
+def add_light(kind: str, energy: float, at: tuple, target: tuple = (0, 0, 0.7), **values: object) -> bpy.types.Object:
     light = bpy.data.lights.new(kind.title(), kind)
     light.energy = energy
     for key, value in values.items():
@@ -129,7 +129,7 @@ def outdoors(job: dict) -> None:
     """A DR-GS object on a textured floor; sun with an angle, and an HDRI."""
     subject(job["asset"], 0.6)
     floor(painted())
-    lamp("SUN", 1.5, (3, -2, 4), angle=math.radians(4))
+    add_light("SUN", 1.5, (3, -2, 4), angle=math.radians(4))
     world(strength=0.3, image=Path(job["hdris"]) / "city.exr")
     camera((2.2, -3.2, 1.8))
 
@@ -137,7 +137,7 @@ def outdoors(job: dict) -> None:
 def studio(job: dict) -> None:
     """Two DR-GS objects, one a mirrored linked duplicate; polished ball, cube; soft point, spot and area light.
 
-    A small lamp is seen by the camera.
+    A small light is seen by the camera.
     """
     first = subject(job["asset"], 0.6)
     first.location.x -= 0.9
@@ -148,10 +148,10 @@ def studio(job: dict) -> None:
     floor(material("Floor", (0.5, 0.55, 0.6), 0.6))
     ball(material("Metal", (0.9, 0.7, 0.4), 0.3, 1.0), 0.4, (0.2, -0.9, 0.4))
     cube(material("Paint", (0.7, 0.15, 0.1), 0.4), 0.6, (0.1, 0.9, 0.3), 0.5)
-    lamp("POINT", 60, (-2, -2, 2.5), shadow_soft_size=0.3)
-    lamp("SPOT", 150, (2.5, -1.5, 3), shadow_soft_size=0.1, spot_size=math.radians(50), spot_blend=0.4)
-    lamp("AREA", 50, (0.5, 2.5, 2.5), shape="RECTANGLE", size=1.5, size_y=0.6)
-    lamp("POINT", 0.15, (0.75, -0.5, 1.0), shadow_soft_size=0.08, color=(1, 0.6, 0.4)).visible_camera = True
+    add_light("POINT", 60, (-2, -2, 2.5), shadow_soft_size=0.3)
+    add_light("SPOT", 150, (2.5, -1.5, 3), shadow_soft_size=0.1, spot_size=math.radians(50), spot_blend=0.4)
+    add_light("AREA", 50, (0.5, 2.5, 2.5), shape="RECTANGLE", size=1.5, size_y=0.6)
+    add_light("POINT", 0.15, (0.75, -0.5, 1.0), shadow_soft_size=0.08, color=(1, 0.6, 0.4)).visible_camera = True
     world((0.3, 0.35, 0.5), 0.1)
     camera((0.6, -4.6, 2.2), (0.1, 0, 0.55))
 
@@ -174,7 +174,7 @@ def scattered(job: dict) -> None:
         place.rotation_euler = rng.uniform(-0.5, 0.5, 3) + np.array((0, 0, a))
         place.scale = rng.uniform(0.7, 1.3, 3) * (-1 if i % 3 == 0 else 1, 1, 1)
         bpy.context.collection.objects.link(place)
-    lamp("AREA", 40, (-1.5, -2, 3), shape="DISK", size=0.8, spread=math.radians(100))
+    add_light("AREA", 40, (-1.5, -2, 3), shape="DISK", size=0.8, spread=math.radians(100))
     bpy.ops.mesh.primitive_plane_add(size=3, location=(3, 0.5, 1.6), rotation=(0, -math.pi / 2, 0))
     finish("Panel", material("Panel", emission=2.0))
     world()
@@ -185,8 +185,8 @@ def visibility(job: dict) -> None:
     """What only some rays meet: an object that only throws a shadow, one without, a holdout; a floor that catches."""
     seen = subject(job["asset"], 0.6)
     world((0.7, 0.8, 1.0), 0.25)
-    lamp("SUN", 2.0, (2, -2, 4), angle=math.radians(6))
-    lamp("POINT", 60, (-1.5, -2, 2), shadow_soft_size=0.2)
+    add_light("SUN", 2.0, (2, -2, 4), angle=math.radians(6))
+    add_light("POINT", 60, (-1.5, -2, 2), shadow_soft_size=0.2)
     unseen = seen.copy()
     bpy.context.collection.objects.link(unseen)
     unseen.location, unseen.scale, unseen.visible_camera = (1.0, -0.8, 0.6), seen.scale / 2, False

@@ -11,7 +11,7 @@ import trimesh
 from report import table
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "unit"))
-from matter_cases import cantilever, energy, lattice, momenta, solver_of, timoshenko
+from simulation_cases import cantilever, energy, lattice, momenta, solver_of, timoshenko
 
 from drgs_blender.deform.gmls import bind_points, carry
 from drgs_blender.simulation.contact import Plane

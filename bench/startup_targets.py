@@ -35,7 +35,7 @@ def tasks(asset: Path) -> dict[str, Callable[[], np.ndarray]]:
     sys.path.insert(0, str(ROOT / "tests" / "unit"))
     from dataclasses import replace
 
-    from matter_cases import lattice, solver_of
+    from simulation_cases import lattice, solver_of
 
     from drgs_blender.core.asset.container import read_asset
     from drgs_blender.core.frame import Camera, Frame, ObjectState, RenderSettings, World

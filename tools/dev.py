@@ -26,6 +26,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
+import job_runner
 import suites
 from suites import Failure
 
@@ -437,7 +438,7 @@ def run(command: Sequence[str | Path]) -> int:
     try:
         return process.wait()
     finally:
-        suites.end(process, patience=0.0)
+        job_runner.end(process, patience=0.0)
 
 
 if __name__ == "__main__":

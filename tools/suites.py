@@ -1,27 +1,23 @@
-"""The test suites: what runs where, side by side, what it printed, what it took (standard library only).
+"""The test suites: what is run where, and what came out.
 
-`Plan` says what is run, `jobs` makes programs of it, `Runner` runs these and `Report` sums up what they wrote.
+`Plan` is what a command runs, `jobs` makes programs of it; `job_runner` runs these, `junit_report` reads what they
+wrote. Standard library only.
 """
 
 from __future__ import annotations
 
 import contextlib
-import json
 import os
-import re
 import shutil
-import signal
-import subprocess
-import sys
 import time
-import xml.etree.ElementTree as xml
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO
 
-#: A suite that takes longer hangs; the slow faults, of which `DRGS_FAULTS=whole` runs all, take as many times as long.
-SECONDS = 2400
+from job_runner import SECONDS, Job, Runner
+from junit_report import Report
+
+#: The slow faults, of which `DRGS_FAULTS=whole` runs all, take as many times as long.
 WHOLE_TIMES = 15
 #: Python says where a test is that takes longer than any: so a suite that is ended names it.
 STUCK_SECONDS = 600
@@ -29,11 +25,7 @@ STUCK_SECONDS = 600
 WINDOW_TIMES = 3
 #: With one processor, too, two suites run side by side: many tests wait for other programs.
 LEAST_WORKERS, MOST_WORKERS = 2, 8
-#: How often a run without a terminal says how far it is.
-PROGRESS_SECONDS = 30
 SLOWEST = 25
-#: pytest's exit code where no test fits what was asked for.
-NO_TESTS = 5
 LINT = "lint"
 WINDOW = "window"
 
@@ -144,7 +136,7 @@ def parse(words: Sequence[str], names: Iterable[str], root: Path) -> tuple[list[
     return suites, files, list(words[first:])
 
 
-def of_suite(file: str, suite: Suite) -> list[str]:
+def within_suite(file: str, suite: Suite) -> list[str]:
     """What of a file, a folder or a test is a suite's: itself, those folders of the suite that it holds, or nothing."""
     path = file.split("::")[0].rstrip("/")
     if any(f"{path}/".startswith(f"{folder}/") for folder in suite.folders):
@@ -153,47 +145,6 @@ def of_suite(file: str, suite: Suite) -> list[str]:
 
 
 # Jobs
-
-
-@dataclass
-class Job:
-    """A program of a run.
-
-    Attributes
-    ----------
-    title : str
-        For people.
-    commands : list of list of str
-        Run one after another, all of them.
-    log : Path
-        What they print.
-    report : Path or None
-        The JUnit file that pytest writes.
-    seconds : float
-        Longest time of one command.
-    environment : dict of str
-        Variables besides.
-    after : str
-        Title of a job that has to end before.
-    alone : bool
-        Whether nothing else may run.
-    may_be_empty : bool
-        Whether it passes where no test fits.
-    """
-
-    title: str
-    commands: list[list[str]]
-    log: Path
-    report: Path | None = None
-    seconds: float = SECONDS
-    environment: dict[str, str] = field(default_factory=dict)
-    after: str = ""
-    alone: bool = False
-    may_be_empty: bool = False
-
-    def meaning(self, code: int) -> int:
-        """Exit code of a command, 0 if it is as good as that."""
-        return 0 if code == NO_TESTS and self.may_be_empty else code
 
 
 KERNELS = "kernels"
@@ -232,12 +183,12 @@ def suite_jobs(name: str, suite: Suite, plan: Plan, python: Path, root: Path, fo
 
     A choice of tests is one job, as it is to be quick, with all threads.
     """
-    files = [each for file in plan.files for each in of_suite(file, suite)] or list(suite.folders)
+    files = [each for file in plan.files for each in within_suite(file, suite)] or list(suite.folders)
     part = "all" if name in plan.whole_suites or any("::" in file for file in files) else plan.part
     whole = WHOLE_TIMES if os.environ.get("DRGS_FAULTS") == "whole" else 1
     made = []
     for lane in ("all",) if plan.selects else ("shared", "alone"):
-        among = lonely(files, root) if lane == "alone" else files
+        among = files_marked_alone(files, root) if lane == "alone" else files
         if not among:
             continue
         own = f"{name}-alone" if lane == "alone" else name
@@ -263,7 +214,7 @@ def suite_jobs(name: str, suite: Suite, plan: Plan, python: Path, root: Path, fo
     return made
 
 
-def lonely(files: Iterable[str], root: Path) -> list[str]:
+def files_marked_alone(files: Iterable[str], root: Path) -> list[str]:
     """Files (also in the folders) that hold tests marked ``alone``: others need not be imported."""
     found = []
     for file in files:
@@ -305,236 +256,13 @@ def jobs(
         after = kernels.title
     named = [name for name in plan.suites if name != LINT]
     if plan.files:
-        named = [name for name in named if any(of_suite(file, suites[name]) for file in plan.files)]
+        named = [name for name in named if any(within_suite(file, suites[name]) for file in plan.files)]
     for name in named:
         made += suite_jobs(name, suites[name], plan, python_of[name](), root, folder, after)
     return sorted(made, key=lambda job: job.alone)
 
 
 # Running
-
-
-class Runner:
-    """Runs jobs side by side; what each prints is shown when it has ended.
-
-    Parameters
-    ----------
-    root : Path
-        Folder that programs start in.
-    environment : mapping of str to str
-        Their variables.
-    workers : int
-        Jobs at a time.
-    """
-
-    def __init__(self, root: Path, environment: Mapping[str, str], workers: int) -> None:
-        self.root, self.environment, self.workers = root, dict(environment), workers
-        #: Title -> exit codes of its commands.
-        self.codes: dict[str, list[int]] = {}
-        self._processes: list[subprocess.Popen] = []
-        self._last_report = time.monotonic()
-        self._line = 0
-
-    def run(self, all_jobs: Sequence[Job]) -> None:
-        """Run all; on an interrupt end all with their children."""
-        if len(all_jobs) == 1:
-            with self._ending():
-                self._alone_at_a_terminal(all_jobs[0])
-            return
-        waiting, running = list(all_jobs), list[_Running]()
-        titles = {job.title for job in all_jobs}
-        with self._ending():
-            while waiting or running:
-                for job in list(waiting):
-                    ready = not (job.after in titles and job.after not in self.codes)
-                    room = not running if job.alone else len(running) < self.workers
-                    if any(other.job.alone for other in running) or not (ready and room):
-                        continue
-                    if job.alone and any(not other.alone for other in waiting):
-                        continue
-                    waiting.remove(job)
-                    running.append(_Running(job, self._start))
-                time.sleep(0.1)
-                for item in [item for item in running if item.ended()]:
-                    running.remove(item)
-                    self.codes[item.job.title] = item.codes
-                    self._show(item)
-                self._progress(running)
-
-    def _alone_at_a_terminal(self, job: Job) -> None:
-        """A single job prints as it goes, so that a debugger can be used."""
-        codes = self.codes.setdefault(job.title, [])
-        for command in job.commands:
-            process = self._start(job, command, None)
-            try:
-                codes.append(job.meaning(process.wait(job.seconds)))
-            except subprocess.TimeoutExpired:
-                print(f"{job.title}: ended after {job.seconds:.0f} s", flush=True)
-                end(process)
-                codes.append(124)
-
-    def _start(self, job: Job, command: Sequence[str], log: IO[bytes] | None) -> subprocess.Popen:
-        process = subprocess.Popen(
-            list(command), cwd=self.root, env=self.environment | job.environment, stdout=log,
-            stderr=subprocess.STDOUT if log else None, stdin=subprocess.DEVNULL if log else None,
-            start_new_session=os.name != "nt",
-        )  # fmt: skip
-        self._processes.append(process)
-        return process
-
-    @contextlib.contextmanager
-    def _ending(self) -> Iterator[None]:
-        """End everything that still runs, also where this program is asked to end."""
-        before = signal.signal(signal.SIGTERM, _interrupt)
-        try:
-            yield
-        finally:
-            signal.signal(signal.SIGTERM, before)
-            self._erase()
-            for process in self._processes:
-                end(process)
-
-    def _show(self, item: _Running) -> None:
-        self._erase()
-        text = item.job.log.read_text(encoding="utf-8", errors="replace")
-        bad = any(item.codes)
-        print(f"== {item.job.title}: {'FAILED' if bad else 'done'} after {item.seconds:.0f} s", flush=True)
-        if bad:
-            print(text.rstrip(), flush=True)
-            if item.late:
-                print(f"{item.job.title}: ended after {item.job.seconds:.0f} s; where it was is said above", flush=True)
-        elif item.job.report is not None:
-            # why tests were skipped, and how many passed
-            at = text.rfind("= short test summary info =")
-            lines = text[at:].splitlines()[1:] if at >= 0 else text.splitlines()[-1:]
-            print("\n".join(lines), flush=True)
-
-    def _progress(self, running: Sequence[_Running]) -> None:
-        terminal, now = sys.stdout.isatty(), time.monotonic()
-        if not running or now - self._last_report < (1 if terminal else PROGRESS_SECONDS):
-            return
-        self._last_report = now
-        line = "   ".join(f"{item.job.title} {item.far()}" for item in running)
-        if terminal:
-            line = line[: shutil.get_terminal_size().columns - 1]
-            print("\r" + line.ljust(self._line), end="", flush=True)
-            self._line = len(line)
-        else:
-            print(f"   ... {line}", flush=True)
-
-    def _erase(self) -> None:
-        if self._line:
-            print("\r" + " " * self._line + "\r", end="", flush=True)
-            self._line = 0
-
-
-class _Running:
-    """A job under way."""
-
-    def __init__(self, job: Job, start: Callable[[Job, Sequence[str], IO[bytes]], subprocess.Popen]) -> None:
-        self.job, self._start = job, start
-        self.codes: list[int] = []
-        self.late = False
-        self.began = time.monotonic()
-        job.log.parent.mkdir(parents=True, exist_ok=True)
-        self._log = job.log.open("wb")
-        self._next()
-
-    def _next(self) -> None:
-        self._since = time.monotonic()
-        self._process = self._start(self.job, self.job.commands[len(self.codes)], self._log)
-
-    def ended(self) -> bool:
-        """Whether all its commands have ended; starts the next, and ends one that takes too long."""
-        code = self._process.poll()
-        if code is None and time.monotonic() - self._since > self.job.seconds:
-            end(self._process)
-            self.late, code = True, 124
-        if code is None:
-            return False
-        self.codes.append(self.job.meaning(code))
-        if len(self.codes) < len(self.job.commands):
-            self._next()
-            return False
-        self._log.close()
-        self.seconds = time.monotonic() - self.began
-        return True
-
-    def far(self) -> str:
-        """Progress as pytest reports it, else the time it has been running."""
-        with contextlib.suppress(OSError), self.job.log.open("rb") as log:
-            log.seek(max(0, self.job.log.stat().st_size - 4000))
-            if found := re.findall(rb"\[ *(\d+%)\]", log.read()):
-                return found[-1].decode()
-        return f"{time.monotonic() - self.began:.0f} s"
-
-
-def _interrupt(*_: object) -> None:
-    raise KeyboardInterrupt
-
-
-def end(process: subprocess.Popen, patience: float = 5.0) -> None:
-    """End a program of its own group with all its children: asked first, so that it tidies up."""
-    if process.poll() is not None:
-        return
-    if os.name == "nt":
-        subprocess.run(["taskkill", "/F", "/T", "/PID", str(process.pid)], capture_output=True)
-        process.wait()
-        return
-    os.killpg(process.pid, signal.SIGINT)
-    with contextlib.suppress(subprocess.TimeoutExpired):
-        process.wait(patience)
-    with contextlib.suppress(ProcessLookupError):
-        os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
-
-
-# What came out
-
-
-@dataclass
-class Report:
-    """Counts and times of tests, read from the files that pytest wrote.
-
-    Attributes
-    ----------
-    passed, failed, skipped : int
-        Tests.
-    durations : list of dict
-        ``suite``, ``test``, ``seconds`` (set-up and tear-down included) of each, the slowest first.
-    """
-
-    passed: int = 0
-    failed: int = 0
-    skipped: int = 0
-    durations: list[dict] = field(default_factory=list)
-
-    def add(self, path: Path) -> int:
-        """Count the tests of a report; how many there were."""
-        if not path.exists():
-            return 0
-        root, total = xml.parse(path).getroot(), 0
-        for suite in root.iter("testsuite"):
-            tests, skipped = int(suite.get("tests", 0)), int(suite.get("skipped", 0))
-            failed = int(suite.get("failures", 0)) + int(suite.get("errors", 0))
-            self.failed += failed
-            self.skipped += skipped
-            self.passed += tests - failed - skipped
-            total += tests
-        for case in root.iter("testcase"):
-            test = f"{case.get('classname')}::{case.get('name')}"
-            self.durations.append({"suite": path.stem, "test": test, "seconds": float(case.get("time", 0))})
-        return total
-
-    def write(self, path: Path) -> None:
-        """Keep the times."""
-        self.durations.sort(key=lambda entry: -entry["seconds"])
-        path.write_text(json.dumps(self.durations, indent=0), encoding="utf-8")
-
-    def slowest(self, count: int) -> list[str]:
-        """Lines that name the slowest tests."""
-        entries = sorted(self.durations, key=lambda entry: -entry["seconds"])[:count]
-        return [f"{entry['seconds']:7.1f} s  {entry['suite']:<8} {entry['test']}" for entry in entries]
 
 
 def run(
@@ -567,10 +295,10 @@ def run(
             if not tests and not job.may_be_empty:
                 wrong.append(job.title)
         wrong += [job.title] * (any(codes) and job.title not in wrong)
-    return summed_up(plan, report, wrong, left, time.monotonic() - began, earlier, build)
+    return summarise(plan, report, wrong, left, time.monotonic() - began, earlier, build)
 
 
-def summed_up(
+def summarise(
     plan: Plan, report: Report, wrong: list[str], left: int, seconds: float, earlier: Path, build: Path
 ) -> int:
     """Print what came out; the exit code."""

@@ -29,7 +29,7 @@ def painted(obj, colour, roughness=0.5, metallic=0.0, emission=0.0):
     return obj
 
 
-def lamp(scene, kind, energy, at, **values):
+def add_light(scene, kind, energy, at, **values):
     data = bpy.data.lights.new(kind, kind)
     data.energy = energy
     for key, value in values.items():
@@ -41,7 +41,7 @@ def lamp(scene, kind, energy, at, **values):
 
 
 def furnish(scene, ball) -> None:
-    """A floor, a mirrored copy of the ball, four cubes, one thing unseen, three lamps, a glowing panel, a sky."""
+    """A floor, a mirrored copy of the ball, four cubes, one thing unseen, three lights, a glowing panel, a sky."""
     _, background = new_world(scene)
     background.inputs["Color"].default_value, background.inputs["Strength"].default_value = (0.4, 0.6, 1, 1), 0.15
     square = [(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)]
@@ -65,9 +65,9 @@ def furnish(scene, ball) -> None:
     unseen.scale, unseen.location, unseen.visible_camera = (0.3, 0.3, 0.3), (0.3, -0.7, 0.6), False
     panel = painted(mesh_object("Panel", square, [(0, 1, 2, 3)]), (0, 0, 0), 1.0, 1.0, 1.5)
     panel.location, panel.rotation_euler = (3, 0, 0.2), (0, -math.pi / 2, 0)
-    lamp(scene, "POINT", 80, (-2, -3, 3), shadow_soft_size=0.4)
-    lamp(scene, "AREA", 60, (1, -2, 3), shape="DISK", size=0.8, spread=2.0)
-    lamp(scene, "SPOT", 1, (0.3, -1.5, 0.4), shadow_soft_size=0.1).visible_camera = True
+    add_light(scene, "POINT", 80, (-2, -3, 3), shadow_soft_size=0.4)
+    add_light(scene, "AREA", 60, (1, -2, 3), shape="DISK", size=0.8, spread=2.0)
+    add_light(scene, "SPOT", 1, (0.3, -1.5, 0.4), shadow_soft_size=0.1).visible_camera = True
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ import bpy
 import numpy as np
 import pytest
 from scenes import mesh_object, new_world, part, read_exr
-from test_composed import CUBE, SIDES, lamp, painted
+from test_composed import CUBE, SIDES, add_light, painted
 
 pytestmark = pytest.mark.blender_api
 
@@ -25,7 +25,7 @@ def shared_scene(ball, scene):
     front.scale, front.location = (0.3, 0.3, 0.6), (0.5, -1.5, -0.4)
     back = painted(mesh_object("Back", CUBE, SIDES), (0.1, 0.3, 0.8), 1.0)
     back.scale, back.location = (0.5, 0.5, 0.9), (-1.0, 1.8, -0.1)
-    lamp(scene, "SUN", 2, (2, -2, 3), angle=0.05)
+    add_light(scene, "SUN", 2, (2, -2, 3), angle=0.05)
     scene.camera.location, scene.camera.rotation_euler = (0, -5, 1), (np.pi / 2 - 0.2, 0, 0)
     scene.render.engine = "CYCLES"
     cycles = scene.cycles

@@ -187,7 +187,7 @@ def test_what_cannot_be_converted_is_said(ball, scene, tmp_path):
     select(ball)
     with pytest.raises(RuntimeError, match="is a DR-GS object already"):
         bpy.ops.drgs.convert()
-    light = bpy.data.objects.new("Lamp", bpy.data.lights.new("Lamp", "POINT"))
+    light = bpy.data.objects.new("Light", bpy.data.lights.new("Light", "POINT"))
     scene.collection.objects.link(light)
     select(light)
     with pytest.raises(RuntimeError, match="neither faces nor the attributes of splats"):

@@ -157,7 +157,7 @@ def test_every_panel_draws_and_every_poll_answers(scene, ball_file, loaded):
 
 @pytest.mark.parametrize("kind", ["POINT", "AREA"])
 def test_panels_of_a_light_draw(scene, kind):
-    obj = bpy.data.objects.new("Lamp", bpy.data.lights.new("Lamp", kind))
+    obj = bpy.data.objects.new("Light", bpy.data.lights.new("Light", kind))
     context = type("Context", (), {"engine": "DRGS", "object": obj, "light": obj.data})
     rays = part("addon.panels.ray_visibility")
     for cls in rays.CLASSES:

@@ -11,7 +11,7 @@ from scenes import part
 pytestmark = pytest.mark.blender_api
 
 
-def lamp(scene, kind: str, name: str = "Lamp", **values) -> bpy.types.Object:
+def add_light(scene, kind: str, name: str = "Light", **values) -> bpy.types.Object:
     """A light object in the scene, its data set to `values`."""
     data = bpy.data.lights.new(name, kind)
     for key, value in values.items():
@@ -38,11 +38,11 @@ KINDS = {
 @pytest.mark.parametrize("kind", KINDS)
 def test_light_is_described_by_blenders_numbers(scene, export, kind):
     values, expected = KINDS[kind]
-    obj = lamp(scene, kind, energy=50, color=(0.25, 0.5, 1), **values)
+    obj = add_light(scene, kind, energy=50, color=(0.25, 0.5, 1), **values)
     obj.matrix_world = Matrix.Translation((1, 2, 3)) @ Matrix.Rotation(0.5, 4, "X") @ Matrix.Diagonal((2, 1, 1, 1))
     frame, warnings = export()
     (light,) = frame.lights
-    assert not warnings and (light.name, light.kind) == ("Lamp", kind.lower())
+    assert not warnings and (light.name, light.kind) == ("Light", kind.lower())
     np.testing.assert_allclose(light.matrix_world, np.array(obj.matrix_world))
     assert light.colour == (0.25, 0.5, 1) and light.power == 50 and light.normalize and light.cast_shadow
     for name, value in expected.items():
@@ -51,14 +51,14 @@ def test_light_is_described_by_blenders_numbers(scene, export, kind):
 
 @pytest.mark.parametrize("shape", ["SQUARE", "DISK", "RECTANGLE", "ELLIPSE"])
 def test_area_shapes_have_two_sides(scene, export, shape):
-    lamp(scene, "AREA", shape=shape, size=2.0, size_y=3.0)
+    add_light(scene, "AREA", shape=shape, size=2.0, size_y=3.0)
     (light,) = export()[0].lights
     assert light.shape == shape.lower() and light.size_x == 2
     assert light.size_y == (3 if shape in ("RECTANGLE", "ELLIPSE") else 2)
 
 
 def test_rays_that_see_a_light_and_shadows(scene, export):
-    obj = lamp(scene, "POINT")
+    obj = add_light(scene, "POINT")
     (light,) = export()[0].lights
     assert (light.camera, light.diffuse, light.glossy) == (False, True, True), "as Blender makes lights"
     obj.visible_camera, obj.visible_glossy, obj.data.use_shadow = True, False, False
@@ -68,7 +68,7 @@ def test_rays_that_see_a_light_and_shadows(scene, export):
 
 @pytest.mark.skipif(bpy.app.version < (4, 5, 0), reason="Blender's lights have these from 4.5 on")
 def test_exposure_temperature_and_size(scene, export):
-    obj = lamp(scene, "AREA", energy=10, exposure=2, use_temperature=True, temperature=3000, normalize=False)
+    obj = add_light(scene, "AREA", energy=10, exposure=2, use_temperature=True, temperature=3000, normalize=False)
     obj.data.color = (1, 0.5, 1)
     (light,) = export()[0].lights
     assert light.power == pytest.approx(40) and light.normalize is False
@@ -77,21 +77,21 @@ def test_exposure_temperature_and_size(scene, export):
 
 @pytest.mark.skipif(bpy.app.version < (4, 5, 0), reason="Blender's own colours are known from 4.5 on")
 @pytest.mark.parametrize("kelvin", [1900, 3200, 4500, 6500, 9000, 12000])
-def test_glowing_bodies_have_blenders_colour(scene, kelvin):
-    light = lamp(scene, "POINT", use_temperature=True, temperature=kelvin).data
+def test_mesh_lightsing_bodies_have_blenders_colour(scene, kelvin):
+    light = add_light(scene, "POINT", use_temperature=True, temperature=kelvin).data
     theirs = np.array(light.temperature_color)
     ours = part("addon.export.node_math").blackbody(kelvin)
     np.testing.assert_allclose(ours, theirs, rtol=0.02, atol=0.02)
 
 
 def test_instances_of_lights_are_lights_and_portals_are_not(scene, export):
-    obj = lamp(scene, "SPOT")
+    obj = add_light(scene, "SPOT")
     group = bpy.data.collections.new("Group")
     group.objects.link(obj)
     empty = bpy.data.objects.new("Instance", None)
     empty.instance_type, empty.instance_collection, empty.location = "COLLECTION", group, (7, 0, 0)
     scene.collection.objects.link(empty)
-    lamp(scene, "AREA", "Portal").data.cycles.is_portal = True
+    add_light(scene, "AREA", "Portal").data.cycles.is_portal = True
     frame, warnings = export()
     assert sorted(light.matrix_world[0, 3] for light in frame.lights) == [0, 7] and not warnings
     obj.hide_render = True  # of no concern to the viewport
@@ -105,7 +105,7 @@ def emission(light: bpy.types.Light) -> tuple[bpy.types.NodeTree, bpy.types.Node
 
 
 def test_nodes_of_a_light_multiply_it(scene, export):
-    light = lamp(scene, "POINT", energy=10, color=(1, 0.5, 1)).data
+    light = add_light(scene, "POINT", energy=10, color=(1, 0.5, 1)).data
     tree, node = emission(light)
     node.inputs["Color"].default_value, node.inputs["Strength"].default_value = (0.5, 1, 0.25, 1), 3
     frame, warnings = export()
@@ -121,25 +121,25 @@ def test_nodes_of_a_light_multiply_it(scene, export):
     assert not warnings, "this is how light falls off anyway"
     tree.links.new(falloff.outputs["Constant"], node.inputs["Strength"])
     (warning,) = export()[1]
-    assert '"Lamp"' in warning and "falloff" in warning
+    assert '"Light"' in warning and "falloff" in warning
 
 
 @pytest.mark.parametrize("kind", ["ShaderNodeTexIES", "ShaderNodeTexNoise", "ShaderNodeTexImage"])
 def test_what_shapes_a_light_is_named_and_never_black(scene, export, kind):
-    tree, node = emission(lamp(scene, "SPOT").data)
+    tree, node = emission(add_light(scene, "SPOT").data)
     odd = tree.nodes.new(kind)
     odd.label = "The Odd One"
     tree.links.new(odd.outputs[0], node.inputs["Strength"])
     frame, warnings = export()
     assert min(frame.lights[0].colour) > 0.1
-    assert len(warnings) == 1 and 'Light "Lamp", node "The Odd One"' in warnings[0]
+    assert len(warnings) == 1 and 'Light "Light", node "The Odd One"' in warnings[0]
 
 
 def test_what_cannot_be_done_to_a_light_is_said(scene, export):
-    obj = lamp(scene, "POINT", use_custom_distance=True)
+    obj = add_light(scene, "POINT", use_custom_distance=True)
     obj.light_linking.receiver_collection = bpy.data.collections.new("Lit")
     obj.data.energy = float("nan")
     frame, warnings = export()
-    assert len(warnings) == 3 and all('Light "Lamp"' in w for w in warnings)
+    assert len(warnings) == 3 and all('Light "Light"' in w for w in warnings)
     assert any("not finite; it is off. Check" in w for w in warnings), "and what to do"
     assert frame.lights[0].power == 0

@@ -118,9 +118,9 @@ def painted(ball_file):
 def others(ball_file):
     imported(ball_file)
     plane = mesh_object("Plane", [(0, 0, 0), (1, 0, 0), (0, 1, 0)], [(0, 1, 2)])
-    lamp = bpy.data.objects.new("Lamp", bpy.data.lights.new("Lamp", "AREA"))
-    bpy.context.scene.collection.objects.link(lamp)
-    select(armature_object({"Bone": ((0, 0, 0), (0, 0, 1))}), plane, lamp)
+    light = bpy.data.objects.new("Light", bpy.data.lights.new("Light", "AREA"))
+    bpy.context.scene.collection.objects.link(light)
+    select(armature_object({"Bone": ((0, 0, 0), (0, 0, 1))}), plane, light)
 
 
 def elsewhere(ball_file):

@@ -19,7 +19,7 @@ PLANE = [(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)]
 
 @pytest.fixture
 def crowd(ball):
-    """The DR-GS ball, a second one that shares its mesh, a plane with a material, a lamp and a world."""
+    """The DR-GS ball, a second one that shares its mesh, a plane with a material, a light and a world."""
     scene = bpy.context.scene
     twin = bpy.data.objects.new("Twin", ball.data)
     twin.drgs.asset = ball.drgs.asset
@@ -27,10 +27,10 @@ def crowd(ball):
     scene.collection.objects.link(twin)
     plane = mesh_object("Plane", PLANE, [(0, 1, 2, 3)])
     plane.data.materials.append(bpy.data.materials.new("Paint"))
-    lamp = bpy.data.objects.new("Lamp", bpy.data.lights.new("Lamp", "POINT"))
-    scene.collection.objects.link(lamp)
+    light = bpy.data.objects.new("Light", bpy.data.lights.new("Light", "POINT"))
+    scene.collection.objects.link(light)
     new_world(scene)
-    return SimpleNamespace(scene=scene, ball=ball, twin=twin, plane=plane, lamp=lamp)
+    return SimpleNamespace(scene=scene, ball=ball, twin=twin, plane=plane, light=light)
 
 
 def exported():
@@ -99,7 +99,7 @@ def colour(c):
 
 
 def shine(c):
-    c.lamp.data.energy *= 2
+    c.light.data.energy *= 2
 
 
 def brighten(c):
@@ -617,7 +617,7 @@ def test_discs_have_the_colours_that_are_painted_and_adjusted(ball, ball_file):
 
 def test_composited_frame_shows_our_objects_alone(crowd):
     views = part("addon.viewport.views")
-    crowd.lamp.visible_camera = True
+    crowd.light.visible_camera = True
     frame = exported().frame
     alone = views._alone(frame)
     assert frame.meshes[0].visibility.camera and not alone.meshes[0].visibility.camera

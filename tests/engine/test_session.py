@@ -384,7 +384,7 @@ def test_a_threshold_that_cannot_be_followed_is_named(session, make_frame):
 
 
 def test_regions_and_history_do_not_show_in_adaptive_frames(session, make_frame, asset_path):
-    """Whether a pixel goes on is its own affair: a region is a crop, with a lamp in the scene too."""
+    """Whether a pixel goes on is its own affair: a region is a crop, with a light in the scene too."""
     frame = make_frame(0.2)
     frame.settings = replace(frame.settings, noise_threshold=0.2, samples=64, subpixel_samples=2)
     place = np.eye(4)

@@ -45,10 +45,10 @@ def assert_close(a, b):
 
 
 def lit(frame):
-    """The frame with a lamp that the camera sees, and a second object that only catches shadows."""
+    """The frame with a light that the camera sees, and a second object that only catches shadows."""
     matrix = np.eye(4)
     matrix[:3, 3] = 0.6, -1.5, 1.2
-    frame.lights = [Light("Lamp", "point", matrix, power=60.0, radius=0.2, camera=True)]
+    frame.lights = [Light("Light", "point", matrix, power=60.0, radius=0.2, camera=True)]
     place = np.diag([3.0, 3.0, 0.1, 1.0])
     place[2, 3] = -1.3
     frame.objects.append(

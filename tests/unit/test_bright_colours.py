@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from test_integrate import points, settings
-from test_lamps import light
+from test_light_sampler import light
 
 from drgs_blender.core.frame import Image, Material, Texture, World
 from drgs_blender.render.integrator.integrate import integrate
@@ -27,11 +27,11 @@ CYCLES = {
 
 @pytest.mark.parametrize("metallic, roughness", list(CYCLES))
 def test_diffuse_light_grows_with_the_base_colour_and_that_of_metals_ends_at_white(metallic, roughness):
-    lamps = Lights([light("sun", 0, 0, 0, tilt=0.3, power=1.0)])
+    sampler = Lights([light("sun", 0, 0, 0, tilt=0.3, power=1.0)])
     sky, how = EnvironmentLight(World(strength=0.0)), settings(0, 0, 1, shading_model="principled")
     found = [
         integrate(
-            TraceScene(), sky, points(1, mu=1.0, albedo=a, roughness=roughness, metallic=metallic), how, 0, lamps
+            TraceScene(), sky, points(1, mu=1.0, albedo=a, roughness=roughness, metallic=metallic), how, 0, sampler
         ).components[0, :, 0].sum()
         for a in BASES
     ]  # fmt: skip

@@ -129,7 +129,7 @@ def test_objects_stand_where_their_matrices_put_them(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("rays_see", ["mesh", "surfels"])
-def test_the_light_of_the_scene_is_baked_with_its_lamps_and_shadows(tmp_path: Path, rays_see: str) -> None:
+def test_the_light_of_the_scene_is_baked_with_its_lights_and_shadows(tmp_path: Path, rays_see: str) -> None:
     """A sun from above of 1 W/m2 on a plate of albedo a leaves a / pi; half of it lies in the shadow of a mesh."""
     asset = str(plate(tmp_path / "plate.drgs", 0.8, meshless=rays_see == "surfels"))
     settings = RenderSettings(bounces=0, shading_model="paper", rays_see=rays_see)  # type: ignore[arg-type]

@@ -47,7 +47,7 @@ ALPHA2 = (ROUGHNESS**4).astype(np.float32)
 
 
 def sky(rows: int = 16) -> np.ndarray:
-    """A coloured gradient with a lamp."""
+    """A coloured gradient with a light."""
     image = np.random.default_rng(3).uniform(0.2, 1.0, (rows, 2 * rows, 3)).astype(np.float32)
     image[rows // 4, rows // 2] = 12.0
     return image
@@ -418,7 +418,7 @@ def test_materials_and_light_are_found_again(ball, capture):
     error = np.sqrt(((found.albedo * scale - ball.albedo) ** 2).mean())
     assert error < 0.45 * ball.albedo.std(axis=0).mean()
     bright = np.unravel_index(found.environment.sum(-1).argmax(), (16, 32))
-    # Lamps at rows and columns (4.6, 10.2) and (8.1, 23.4) of 16 x 32.
+    # Lights at rows and columns (4.6, 10.2) and (8.1, 23.4) of 16 x 32.
     assert min(np.hypot(bright[0] - 4.6, bright[1] - 10.2), np.hypot(bright[0] - 8.1, bright[1] - 23.4)) < 2, bright
     assert found.report["psnr"] > 34
     assert found.report["views"] == 14 and found.report["unseen_vertices"] < 0.2 * len(ball.vertices)

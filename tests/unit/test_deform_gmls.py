@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from matter_cases import lattice, solver_of
 from scipy.spatial.transform import Rotation
+from simulation_cases import lattice, solver_of
 
 from drgs_blender.core.asset.model import Asset, Mesh
 from drgs_blender.core.errors import AssetError, UsageError

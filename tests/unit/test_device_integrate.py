@@ -73,7 +73,7 @@ def placed(x: float, y: float, z: float, scale: float = 1.0) -> np.ndarray:
     return matrix
 
 
-def lamps() -> Lights:
+def some_lights() -> Lights:
     """Every kind that shines in another way, more than one leaf of the tree."""
     down = placed(0.5, 0.4, 3.0)
     side = placed(2.5, -1.0, 2.0) @ np.array([[0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1.0]])
@@ -96,14 +96,14 @@ def under_sky() -> tuple:
     return scene, sky(), None, seen()
 
 
-def under_lamps() -> tuple:
+def under_lights() -> tuple:
     scene = TraceScene()
     scene.update([ball((1.6, 0.6, 1.9), 0.6)], [floor()])
-    return scene, sky(), lamps(), seen()
+    return scene, sky(), some_lights(), seen()
 
 
-def lamps_alone() -> tuple:
-    return (*under_lamps()[:1], DARK, *under_lamps()[2:])
+def lights_alone() -> tuple:
+    return (*under_lights()[:1], DARK, *under_lights()[2:])
 
 
 def among_meshes() -> tuple:
@@ -150,7 +150,7 @@ def hidden() -> tuple:
     ]
     scene = TraceScene()
     scene.update([ball((1.4, 0.6, 0.2), 0.4)], meshes)
-    return scene, sky(), lamps(), seen()
+    return scene, sky(), some_lights(), seen()
 
 
 def caught() -> tuple:
@@ -158,11 +158,11 @@ def caught() -> tuple:
     scene.update([ball((0.6, 0.3, 0.8), 0.5)], [floor(visibility=Visibility(shadow_catcher=True))])
     points = seen(600)
     points.flags[:] = CATCHER
-    return scene, sky(), lamps(), points
+    return scene, sky(), some_lights(), points
 
 
 SCENES: dict[str, Callable[[], tuple]] = {
-    f.__name__: f for f in (under_sky, under_lamps, lamps_alone, among_meshes, hidden, caught)
+    f.__name__: f for f in (under_sky, under_lights, lights_alone, among_meshes, hidden, caught)
 }
 
 
@@ -202,13 +202,13 @@ def test_a_device_finds_the_light_that_the_processor_finds(
     replace(SETTINGS, strategy_samples=(0, 0, 8)),
 ])  # fmt: skip
 def test_settings_mean_the_same_on_a_device(device: WarpRenderBackend, settings: RenderSettings) -> None:
-    here, there = both(device, under_lamps(), settings, (1, 2))
+    here, there = both(device, under_lights(), settings, (1, 2))
     assert here.total.max() > 0.1
     assert psnr(here.total, there.total) > 60.0
 
 
 def test_points_give_the_same_bits_in_any_company(device: WarpRenderBackend) -> None:
-    scene, light, shining, points = under_lamps()
+    scene, light, shining, points = under_lights()
     whole = device.integrate(scene, light, points, SETTINGS, 0, shining)
     part = device.integrate(scene, light, points[100:300], SETTINGS, 0, shining)
     np.testing.assert_array_equal(part.components, whole.components[100:300])
@@ -246,7 +246,7 @@ def test_without_a_card_the_processor_does_all_and_says_so(monkeypatch: pytest.M
 
 
 def test_a_device_that_fails_is_left_alone_and_its_work_done_here(device: WarpRenderBackend, monkeypatch) -> None:
-    scene, light, shining, points = under_lamps()
+    scene, light, shining, points = under_lights()
     broken = WarpRenderBackend("cpu")
     monkeypatch.setattr(
         broken.launcher, "_room", lambda *arguments: (_ for _ in ()).throw(RuntimeError("out of memory\nat 0"))

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from matter_cases import energy, lattice, momenta, solver_of
+from simulation_cases import energy, lattice, momenta, solver_of
 
 pytest.importorskip("warp", reason="warp-lang is not installed")
 

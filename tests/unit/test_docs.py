@@ -44,3 +44,21 @@ def test_options_that_are_named_exist() -> None:
     text = (ROOT / "docs" / "command-line.md").read_text(encoding="utf-8")
     named = {flag for code in re.findall(r"`([^`\n]+)`", text) for flag in re.findall(r"(?<![\w-])--[a-z][\w-]*", code)}
     assert len(named) > 30 and not named - known - {"--help", "--version"}
+
+
+def test_names_of_the_code_exist() -> None:
+    """Identifiers in code marks, but the names of tests' modules and what other programs call theirs."""
+    folders = ("drgs_blender", "addon", "operators", "tests", "tools", "bench", "examples")
+    paths = [path for folder in folders for path in (ROOT / folder).rglob("*.py")]
+    text = "\n".join(path.read_text(encoding="utf-8") for path in [*paths, ROOT / "pyproject.toml"])
+    known = set(re.findall(r"[A-Za-z_]\w*", text)) | {path.stem for path in paths}
+    known |= {"rgba_city", "MaxArraySize"}  # a file of TensoIR's, a limit of Slurm's
+    for page in PAGES:
+        code = [c for c in re.findall(r"(?<!`)`([^`\n]+)`(?!`)", page.read_text(encoding="utf-8")) if " " not in c]
+        named = {
+            name
+            for c in code
+            for name in re.findall(r"[A-Za-z_]\w*", c)
+            if "_" in name or re.search("[a-z][A-Z]", name)
+        }
+        assert not named - known, page.name

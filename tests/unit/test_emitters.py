@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from test_integrate import points, settings
-from test_lamps import irradiance, light
+from test_light_sampler import irradiance, light
 from test_surface import matrix, mesh_state
 
 from drgs_blender.compute.jit import njit
@@ -76,12 +76,12 @@ def _look(origins, directions, tracer, geometry, lights, out):  # type: ignore[n
         out[i, 0], out[i, 1], out[i, 2], out[i, 3], _ = emission_along(o, d, hit, geometry, lights)
 
 
-def along(scene: TraceScene, lamps: Lights, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+def along(scene: TraceScene, sampler: Lights, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """(n, 4): what rays meet, and the density with which it is drawn from the same place."""
     out = np.empty((len(directions), 4), np.float32)
     directions = np.ascontiguousarray(directions, np.float32)
     origins = np.ascontiguousarray(np.broadcast_to(np.float32(origins), directions.shape))
-    _look(origins, directions, scene.tracer, scene.geometry, lamps.tables, out)
+    _look(origins, directions, scene.tracer, scene.geometry, sampler.tables, out)
     return out
 
 
@@ -101,8 +101,8 @@ def light_of(
     scene = scene_of(*meshes, images=images)
     seen = points(count, **({"albedo": 0.8, "roughness": 0.4, "origin": (0.3, 0.1, 0.0)} | changes))  # type: ignore[arg-type]
     how = settings(*counts, bounces=bounces, shading_model="principled")
-    lamps = Lights(list(lights), np.zeros(3), 3.0, Emitters(scene) if sampled else None)
-    found = integrate(scene, EnvironmentLight(World(strength=strength)), seen, how, 0, lamps).components.astype(float)
+    sampler = Lights(list(lights), np.zeros(3), 3.0, Emitters(scene) if sampled else None)
+    found = integrate(scene, EnvironmentLight(World(strength=strength)), seen, how, 0, sampler).components.astype(float)
     return found.mean(0), found.std(0) / math.sqrt(count)
 
 
@@ -133,26 +133,26 @@ def test_irradiance_is_lambert_s_formula(height: float, turn: float) -> None:
     )
     corners[:, 2] += height + 0.9 * abs(s)
     scene = scene_of(mesh_state(corners, np.int32([[0, 1, 2]]), materials=[GLOW]))
-    lamps = Lights([], emitters=Emitters(scene))
-    assert lamps.count == 1
-    assert irradiance(lamps, numbers=sobol(1 << 13)) == pytest.approx(2.0 * polygon_irradiance(corners), rel=3e-3)
+    sampler = Lights([], emitters=Emitters(scene))
+    assert sampler.count == 1
+    assert irradiance(sampler, numbers=sobol(1 << 13)) == pytest.approx(2.0 * polygon_irradiance(corners), rel=3e-3)
 
 
 @pytest.mark.parametrize("count", [1, 5, 70, 3000])
 def test_what_is_drawn_and_what_is_found_have_one_density(count: int) -> None:
     """So the weights of both strategies sum to one: p / (p + q) and q / (p + q), with the same p and q."""
     scene = scene_of(soup(count, size=min(0.2, 2.0 / math.sqrt(count))))
-    lamps = Lights([light("point", 0, 1, 2, radius=0.2, power=30)], emitters=Emitters(scene))
+    sampler = Lights([light("point", 0, 1, 2, radius=0.2, power=30)], emitters=Emitters(scene))
     rng = np.random.default_rng(1)
     numbers = rng.integers(0, 1 << 32, (4000, 3), np.uint32)
     origins = np.float32(rng.uniform((-1, -1, -0.2), (1, 1, 0.2), (4000, 3)))
-    directions, distance, radiance, density, row = lamps.sample(numbers, origins)
+    directions, distance, radiance, density, row = sampler.sample(numbers, origins)
     surface = (row >= 1) & (density > 0)
     assert surface.mean() > 0.1
     t, _, _, _ = scene.bvh.intersect(origins, directions)
     first = surface & (np.abs(t - distance) < 1e-5 * distance)
     assert first.sum() > 200
-    found = along(scene, lamps, origins, directions)
+    found = along(scene, sampler, origins, directions)
     np.testing.assert_allclose(found[first, :3], radiance[first], rtol=1e-6)
     # Rounding moves the direction, and the cosine of what is seen from its edge with it.
     ratio = found[first, 3] / density[first]
@@ -168,11 +168,11 @@ def test_densities_over_all_directions_sum_to_one(count: int) -> None:
     corners = np.full((count, 3, 3), 0.4)
     corners[..., :2] = (at[:, None] + rng.random((count, 3, 2)) / side) * 2 - 1
     scene = scene_of(mesh_state(corners.reshape(-1, 3), np.arange(3 * count).reshape(-1, 3), materials=[GLOW]))
-    lamps = Lights([], emitters=Emitters(scene))
+    sampler = Lights([], emitters=Emitters(scene))
     u, v = (rng.random((2, 400, 400)) + np.stack(np.meshgrid(*[np.arange(400)] * 2))).reshape(2, -1) / 400
     r = np.sqrt(1 - v * v)
     upwards = np.stack([r * np.cos(2 * math.pi * u), r * np.sin(2 * math.pi * u), v], -1)
-    total = along(scene, lamps, np.zeros(3), upwards)[:, 3].mean() * 2 * math.pi
+    total = along(scene, sampler, np.zeros(3), upwards)[:, 3].mean() * 2 * math.pi
     assert total == pytest.approx(1.0, abs=0.02)
 
 
@@ -252,8 +252,8 @@ def test_a_catcher_s_own_world_has_no_light_of_other_surfaces() -> None:
     scene = scene_of(panel(place((0.2, 0.3, 0.8), 0.3)))
     seen = points(500, albedo=0.8, flags=np.full(500, CATCHER, np.int32))
     how = settings(16, 8, 8)
-    lamps = Lights([], emitters=Emitters(scene))
-    found = integrate(scene, EnvironmentLight(World(strength=0.0)), seen, how, 0, lamps)
+    sampler = Lights([], emitters=Emitters(scene))
+    found = integrate(scene, EnvironmentLight(World(strength=0.0)), seen, how, 0, sampler)
     assert found.components.max() > 0 and found.unshadowed is not None and found.unshadowed.max() == 0
 
 

@@ -444,10 +444,10 @@ def test_settings_that_make_no_sense_are_refused(wrong: dict) -> None:
         integrate(EMPTY, WHITE, points(1), replace(settings(4), **wrong), 0)
 
 
-# --- lamps ---------------------------------------------------------------------------------------------------------
+# --- lights ---------------------------------------------------------------------------------------------------------
 
 
-def area_lamp(**changes: object) -> Lights:
+def area_light(**changes: object) -> Lights:
     """A square of one metre, two metres above the origin, shining down."""
     matrix = np.eye(4)
     matrix[:3, 3] = (0.3, 0.2, 2.0)
@@ -460,37 +460,37 @@ DARK = EnvironmentLight(World(colour=(0.0, 0.0, 0.0)))
 @pytest.mark.parametrize(
     "strategies", [{"cosine": 512}, {"environment": 512}, {"cosine": 64, "ggx": 64, "environment": 64}]
 )
-def test_every_strategy_finds_the_same_lamp(strategies: dict) -> None:
+def test_every_strategy_finds_the_same_light(strategies: dict) -> None:
     """Irradiance below a panel by quadrature over its area, against rays that meet it and samples drawn from it."""
     cells = (np.arange(200) + 0.5) / 200 - 0.5
     x, y = np.meshgrid(cells + 0.3, cells + 0.2)
     square = x**2 + y**2 + 4.0
     radiance = 30.0 / np.pi  # of one square metre, normalised
     expected = float(np.mean(radiance * 4.0 / square**2)) * 0.5 / np.pi
-    got = integrate(EMPTY, DARK, points(400, albedo=0.5), settings(**strategies), 3, area_lamp())
+    got = integrate(EMPTY, DARK, points(400, albedo=0.5), settings(**strategies), 3, area_light())
     values = got.components[:, DIFFUSE_DIRECT, 0]
     assert values.mean() == pytest.approx(expected, abs=max(4 * float(values.std()) / 20, 1e-4 * expected))
     assert values.std() / 20 < 0.02 * expected
 
 
 @pytest.mark.parametrize("auto", [False, True])
-def test_sky_and_lamps_share_the_light_samples_without_bias(auto: bool) -> None:
+def test_sky_and_lights_share_the_light_samples_without_bias(auto: bool) -> None:
     sky, counts = EnvironmentLight(World(sun_picture())), settings(cosine=16, ggx=16, environment=64, auto=auto)
     some = points(3000, albedo=0.7, roughness=0.3)
-    together, alone, lamps = (
-        luminance(integrate(EMPTY, light, some, counts, 8, lamp))
-        for light, lamp in ((sky, area_lamp()), (sky, None), (DARK, area_lamp()))
+    together, alone, lit = (
+        luminance(integrate(EMPTY, light, some, counts, 8, one))
+        for light, one in ((sky, area_light()), (sky, None), (DARK, area_light()))
     )
-    noise = np.sqrt(sum(v.var() for v in (together, alone, lamps)) / 3000)
-    assert together.mean() == pytest.approx(alone.mean() + lamps.mean(), abs=4 * noise)
+    noise = np.sqrt(sum(v.var() for v in (together, alone, lit)) / 3000)
+    assert together.mean() == pytest.approx(alone.mean() + lit.mean(), abs=4 * noise)
     assert noise < 0.01 * together.mean()
 
 
-def test_a_lamp_without_shadow_shines_through() -> None:
+def test_a_light_without_shadow_shines_through() -> None:
     wall = scene_of((np.float32([[-9, -9, 1], [9, -9, 1], [0, 9, 1]]), np.int32([[0, 1, 2]])))
-    through = integrate(wall, DARK, points(50), settings(environment=64), 0, area_lamp(cast_shadow=False))
-    free = integrate(EMPTY, DARK, points(50), settings(environment=64), 0, area_lamp(cast_shadow=False))
-    blocked = integrate(wall, DARK, points(50), settings(environment=64), 0, area_lamp())
+    through = integrate(wall, DARK, points(50), settings(environment=64), 0, area_light(cast_shadow=False))
+    free = integrate(EMPTY, DARK, points(50), settings(environment=64), 0, area_light(cast_shadow=False))
+    blocked = integrate(wall, DARK, points(50), settings(environment=64), 0, area_light())
     np.testing.assert_allclose(through.components, free.components, rtol=1e-4)  # rays start a little higher
     assert free.components.max() > 0.1 and not blocked.components.any()
 
@@ -499,7 +499,7 @@ def test_a_lamp_without_shadow_shines_through() -> None:
     "changes", [{"kind": "sun", "angle": 0.0}, {"cast_shadow": False, "size_x": 0.02, "size_y": 0.02}]
 )
 @pytest.mark.parametrize("rays", [(1, 1, 1), (16, 8, 8)])
-def test_mirrors_reflect_lamps_that_only_lamp_samples_find(changes: dict, rays: tuple[int, int, int]) -> None:
+def test_mirrors_reflect_lights_that_only_light_samples_find(changes: dict, rays: tuple[int, int, int]) -> None:
     """Where next to no light samples are allotted to a surface, some are left for them."""
     some = points(400, roughness=0.03, metallic=1.0)
     mirrored = 2 * some.view[0, 2] * some.normal[0] - some.view[0]
@@ -507,19 +507,19 @@ def test_mirrors_reflect_lamps_that_only_lamp_samples_find(changes: dict, rays: 
     matrix[:3, 2], matrix[:3, 3] = mirrored, 2 * mirrored  # it shines along its own -Z
     matrix[:3, 0] = np.cross([0, 1, 0], mirrored) / np.linalg.norm(np.cross([0, 1, 0], mirrored))
     matrix[:3, 1] = np.cross(mirrored, matrix[:3, 0])
-    lamps = Lights([replace(Light("lamp", "area", matrix, power=30.0), **changes)], radius=1.0)  # type: ignore[arg-type]
+    sampler = Lights([replace(Light("light", "area", matrix, power=30.0), **changes)], radius=1.0)  # type: ignore[arg-type]
     found = {}
     for auto, counts in ((False, (16, 8, 64)), (True, rays)):
-        value = luminance(integrate(EMPTY, DARK, some, settings(*counts, auto=auto), 0, lamps)).astype(float)
+        value = luminance(integrate(EMPTY, DARK, some, settings(*counts, auto=auto), 0, sampler)).astype(float)
         found[auto] = value.mean(), value.std() / 20
     (whole, a), (allotted, b) = found[False], found[True]
     assert whole > 1.0 and abs(allotted - whole) < 4.5 * np.hypot(a, b) + 1e-3 * whole
 
 
-def test_lobes_that_do_not_see_a_lamp_get_nothing_of_it() -> None:
+def test_lobes_that_do_not_see_a_light_get_nothing_of_it() -> None:
     some, counts = points(50, roughness=0.4), settings(cosine=32, ggx=32, environment=32)
-    both = integrate(EMPTY, DARK, some, counts, 0, area_lamp())
-    diffuse = integrate(EMPTY, DARK, some, counts, 0, area_lamp(glossy=False))
+    both = integrate(EMPTY, DARK, some, counts, 0, area_light())
+    diffuse = integrate(EMPTY, DARK, some, counts, 0, area_light(glossy=False))
     assert both.components[:, 2].any() and not diffuse.components[:, 2].any()
     np.testing.assert_allclose(diffuse.components[:, 0], both.components[:, 0], rtol=1e-5)
 
@@ -582,14 +582,14 @@ def test_points_of_a_pixel_agree_on_their_samples() -> None:
 
 
 def test_no_bit_depends_on_the_neighbours_where_batches_overflow() -> None:
-    """Samples of a point that fall into two batches of rays, paths too many for one, lamps and sky at once."""
+    """Samples of a point that fall into two batches of rays, paths too many for one, lights and sky at once."""
     box = trimesh.creation.box((4, 4, 4))
     room = scene_of((np.asarray(box.vertices), np.asarray(box.faces)[:10]), albedo=0.9)
     sky, counts = EnvironmentLight(World(sun_picture())), settings(cosine=40, ggx=12, environment=12, bounces=2)
     some = points(64)
-    whole = integrate(room, sky, some, counts, 0, area_lamp())
+    whole = integrate(room, sky, some, counts, 0, area_light())
     for first, last in ((37, 64), (10, 50)):
-        cut = integrate(room, sky, some[first:last], counts, 0, area_lamp())
+        cut = integrate(room, sky, some[first:last], counts, 0, area_light())
         np.testing.assert_array_equal(cut.components, whole.components[first:last])
         np.testing.assert_array_equal(cut.variance, whole.variance[first:last])
 

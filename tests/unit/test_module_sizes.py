@@ -14,7 +14,6 @@ REASONS = {
     "drgs_blender/render/lights/light_sampler.py": "the table of lights, and how it is sampled, met and weighed",
     "drgs_blender/render/surfels/raster.py": "one rasteriser: its tiles, their lists, and the kernel that blends them",
     "tools/dev.py": "one command per function; it runs before there is any environment",
-    "tools/suites.py": "from what is to run to what it said: plan, jobs, runner and report read each other",
     "drgs_blender/ipc/client.py": "one class: the life of a request, which its lock, its child and its errors share",
 }
 

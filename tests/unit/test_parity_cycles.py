@@ -42,7 +42,7 @@ EXPECTED = np.array([(diffuse, glossy) for _, diffuse, glossy in CYCLES])
 
 
 def sky() -> World:
-    """Low-resolution noise with a lamp: every error of mapping, rotation or interpolation shows."""
+    """Low-resolution noise with a light: every error of mapping, rotation or interpolation shows."""
     image = np.random.default_rng(3).random((8, 16, 3)).astype(np.float32) ** 2
     image[2, 5] = 12.0
     c, s = math.cos(math.radians(40)), math.sin(math.radians(40))

@@ -32,7 +32,7 @@ AA = 4
 
 
 def world() -> World:
-    """A random sky with a lamp, turned and coloured."""
+    """A random sky with a light, turned and coloured."""
     image = np.random.default_rng(3).random((8, 16, 3)).astype(np.float32) ** 2
     image[2, 5] = 12.0
     angle = math.radians(40)

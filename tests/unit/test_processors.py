@@ -28,12 +28,12 @@ rng = np.random.default_rng(0)
 turns = np.tile(np.eye(4), (90, 1, 1))
 turns[:, :3] = rng.uniform(-3, 3, (90, 3, 4))
 spots = [Light("spot", "spot", t, tuple(rng.random(3)), spot_size=s) for t, s in zip(turns, rng.uniform(0.1, 2, 90))]
-light, lamps = EnvironmentLight(World(rng.random((64, 128, 3), np.float32))), Lights(spots)
+light, lights = EnvironmentLight(World(rng.random((64, 128, 3), np.float32))), Lights(spots)
 arrays = {
     "bytes": srgb_to_linear(np.arange(256) / 255), "floats": srgb_to_linear(rng.random(100000)),
     "vertices": world_vertices(rng.random((100000, 3), np.float32), turns[0]), "layer": layer_table(),
     "edges": light.row_z, "runs": light.cells.runs, "starts": light.product.starts, "ratio": light.product.ratio,
-    "lamps": lamps.table, "tree": lamps.pick,
+    "lights": lights.table, "tree": lights.pick,
 }
 for name, array in arrays.items():
     print(name, hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest())

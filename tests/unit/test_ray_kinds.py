@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_glow import lamp, panel, wall
 from test_integrate import points, settings, sun_picture
+from test_mesh_lights import area_light, panel, wall
 
 from drgs_blender.core.frame import Light, MeshState, Visibility, World
 from drgs_blender.render.integrator.integrate import integrate
@@ -49,7 +49,7 @@ def test_keeping_lobes_apart_changes_no_mean(auto: bool) -> None:
     buried = wall()
     buried.matrices, buried.visibility = np.diag([0.2, 0.2, 0.2, 1.0])[None], Visibility(glossy=False)
     buried.matrices[0, 2, 3] = -0.5
-    low = lamp()
+    low = area_light()
     low.matrix_world[2, 3] = 0.6
     sky = World(sun_picture() * np.float32(0.05))
     (together, a), (apart, b) = (light_of([panel(), wall(), *more], sky, [low], 2, auto) for more in ([], [buried]))
@@ -70,16 +70,16 @@ def test_sky_behind_what_shadow_rays_alone_meet_is_as_bright_as_in_cycles() -> N
 
 
 def indirect(metallic: float, **seen: bool) -> np.ndarray:
-    """Mean indirect light from a wall that a lamp just before it lights, by kind, (2, 3)."""
+    """Mean indirect light from a wall that a light just before it lights, by kind, (2, 3)."""
     shiny = wall()
     shiny.materials[0].metallic = metallic
-    low = lamp()
+    low = area_light()
     low.matrix_world[:3, 3] = 1.4, 0.0, 0.6
     low.matrix_world[:3, :3] = [[0, 0, -1], [0, 1, 0], [1, 0, 0]]  # it shines along +X
     return light_of([shiny], DARK, [replace(low, size_x=1.5, **seen)], 1)[0][[1, 3]]
 
 
-def test_lamps_shine_at_further_surfaces_on_the_lobes_that_see_them() -> None:
+def test_lights_shine_at_further_surfaces_on_the_lobes_that_see_them() -> None:
     both, hidden, kept = indirect(1.0), indirect(1.0, glossy=False), indirect(1.0, diffuse=False)
     assert both.min() > 1e-3 and not hidden.any()  # a metal has no diffuse lobe
     np.testing.assert_allclose(kept, both, rtol=1e-5)

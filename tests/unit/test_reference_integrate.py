@@ -84,7 +84,7 @@ def test_each_strategy_and_all_together_find_the_truth(counts: tuple[int, int, i
 def test_the_balance_heuristic_keeps_its_promise():
     """Veach 1997, theorem 9.2: its variance exceeds any single strategy's by (1 / min n - 1 / sum n) mu^2 at most."""
     image = np.full((16, 32, 3), 0.2, dtype=np.float32)
-    image[3, 5] = 100.0  # a lamp
+    image[3, 5] = 100.0  # a light
     light = Light.from_world(World(environment=image))
     points = points_up((0.1, 0.4, 0.8), (1.0, 1.0, 0.0))
 

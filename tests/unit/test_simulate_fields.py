@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from matter_cases import lattice, solver_of
+from simulation_cases import lattice, solver_of
 
 from drgs_blender.core.errors import UsageError
 from drgs_blender.simulation.fields import FieldRows, ForceField, noise, push_of

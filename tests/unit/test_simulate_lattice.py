@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from matter_cases import cantilever, lattice, solver_of, timoshenko
+from simulation_cases import cantilever, lattice, solver_of, timoshenko
 
 from drgs_blender.compute.threads import get_num_threads, use_threads
 from drgs_blender.core.errors import Cancelled, UsageError

@@ -6,10 +6,10 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from matter_cases import cantilever, energy, lattice, masses, momenta, solver_of, timoshenko
 from plain_mpm import PlainMpm
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
+from simulation_cases import cantilever, energy, lattice, masses, momenta, solver_of, timoshenko
 
 from drgs_blender.compute.threads import get_num_threads, use_threads
 from drgs_blender.core.errors import Cancelled, UsageError

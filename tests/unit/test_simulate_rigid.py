@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
-from matter_cases import lattice, solver_of
 from scipy.spatial.transform import Rotation
+from simulation_cases import lattice, solver_of
 
 from drgs_blender.core.errors import Cancelled, UsageError
 from drgs_blender.simulation.colliders import Collider

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
-from matter_cases import lattice
+from simulation_cases import lattice
 
 from drgs_blender.core.errors import UsageError
 from drgs_blender.simulation.colliders import Collider, MovingCollider, check_apart

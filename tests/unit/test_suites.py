@@ -23,7 +23,8 @@ SLEEP = "import os, subprocess, sys\nopen('pid{}', 'w').write(str(os.getpid()))\
 
 
 @pytest.fixture
-def suites():
+def suites(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "tools"))
     spec = importlib.util.spec_from_file_location("drgs_suites", ROOT / "tools" / "suites.py")
     module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)

@@ -120,18 +120,18 @@ def test_the_sky_is_seen_through_surfels_by_every_strategy(tmp_path: Path) -> No
         assert lit / bare == pytest.approx(expected, abs=0.015), counts
 
 
-def test_lamps_among_surfels_look_the_same_to_both_strategies(tmp_path: Path) -> None:
+def test_lights_among_surfels_look_the_same_to_both_strategies(tmp_path: Path) -> None:
     """An area light in the middle of a cloud: by its own samples, and by rays that happen to meet it."""
     session, key = session_with(tmp_path, Asset(strewn(150, seed=2), Mesh.empty()))
     matrix = np.eye(4)
     matrix[2, 3] = 1.5
-    lamp = Light("Panel", "area", matrix, power=50.0, shape="square", size_x=1.5)
+    light = Light("Panel", "area", matrix, power=50.0, shape="square", size_x=1.5)
     found = []
     for counts in ((0, 0, 2048), (8192, 0, 0)):
         how = replace(SETTINGS, strategy_samples=counts, shading_model="paper")
         frame = Frame(
             1, from_above(2, scale=1e4), [ObjectState("Cloud", key, matrix, visibility=Visibility(camera=False))],
-            DARK, how, meshes=[quad("Ground", 0.0, roughness=1.0)], lights=[lamp],
+            DARK, how, meshes=[quad("Ground", 0.0, roughness=1.0)], lights=[light],
         )  # fmt: skip
         found.append(session.render(frame)["Combined"][..., 0].mean())
         frame.objects = []

@@ -93,7 +93,7 @@ def _see_lights(rays, slot, reach, hit, taking_part, scene, sums):  # type: igno
     gr, gg, gb = dr, dg, db
     if scene.traits.lights_differ:
         gr, gg, gb = lights_along(position, direction, reach, others, share, GLOSSY, lights)
-    if scene.traits.glows:
+    if scene.traits.emissive:
         r, g, b, density, glossy = emission_along(position, direction, hit, scene.geometry, lights)
         weight, glossy = ONE / (others + share * density), ONE / (others + share * glossy)
         dr, dg, db = dr + weight * r, dg + weight * g, db + weight * b
@@ -193,7 +193,7 @@ def trace_batch(strategy, count, begun, scratch, scene, settings):  # type: igno
     if scene.traits.lobes_apart and strategy == GGX:
         cosine = ZERO
         w.drop(rays, count, w.QR)
-    see_lights = scene.traits.lights or scene.traits.glows
+    see_lights = scene.traits.lights or scene.traits.emissive
     # Lights are seen before the BRDF is weighed, for they have densities of their own: such rays are traced first.
     if not see_lights:
         w.weigh(rays, count, cosine, ggx)

@@ -102,7 +102,7 @@ def _onwards(rays, count, bounce, last, scene, shift, found):  # type: ignore[no
     """The BRDF samples; return how many paths go on, in slots 0, 1, ..."""
     s, ints = rays
     tracer, envmap, lights = scene.tracer, scene.envmap, scene.lights
-    any_lights, glows = scene.traits.lights, scene.traits.glows
+    any_lights, emissive = scene.traits.lights, scene.traits.emissive
     going = 0
     for slot in range(count):
         i, c = w.at(slot)
@@ -112,7 +112,7 @@ def _onwards(rays, count, bounce, last, scene, shift, found):  # type: ignore[no
         direction = (s[i + w.LX], s[i + w.LY], s[i + w.LZ])
         diffuse = ints[c + w.CELL] == U(1)
         mask = np.int32((ray_masks.DIFFUSE if diffuse else ray_masks.GLOSSY) << shift)
-        ends = last and not any_lights and not glows
+        ends = last and not any_lights and not emissive
         if ends:
             through = passed(tracer, rays, slot, FAR, mask)
         else:
@@ -125,7 +125,7 @@ def _onwards(rays, count, bounce, last, scene, shift, found):  # type: ignore[no
             found[owner, INDIRECT] += fr * red
             found[owner, INDIRECT + 1] += fg * green
             found[owner, INDIRECT + 2] += fb * blue
-        if glows:
+        if emissive:
             red, green, blue, own, glossy = emission_along(position, direction, hit, scene.geometry, lights)
             weight = ONE / (s[i + w.PG] + (own if diffuse else glossy))
             found[owner, INDIRECT] += fr * red * weight

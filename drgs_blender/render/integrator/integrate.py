@@ -118,8 +118,8 @@ def integrate(
     n = len(points)
     out = Radiance.dark(n)
     lights = lights or _NO_LIGHTS
-    glows = scene.mesh_materials.table.glows
-    if n == 0 or sum(counts) == 0 or (environment.black and not lights.count and not glows):
+    emissive = scene.mesh_materials.table.emissive
+    if n == 0 or sum(counts) == 0 or (environment.black and not lights.count and not emissive):
         return out
     share = environment_share(environment, lights)
     # Where neither shines, nothing is drawn by its light, though surfaces may emit some.
@@ -130,7 +130,7 @@ def integrate(
         tracer = tracer._replace(**tracer_of(surfels)._asdict())
     extent = F(scene.extent if surfels is None else max(scene.extent, surfels.extent))
     apart = scene.rays_differ and (auto or min(counts[:2]) > 0)
-    traits = Traits(extent, not environment.black, lights.count > 0, glows, lights.rays_differ, apart)
+    traits = Traits(extent, not environment.black, lights.count > 0, emissive, lights.rays_differ, apart)
     given = Scene(tracer, geometry, envmap, light_tables, traits)
     clamp = F(settings.clamp_indirect * settings.subpixel_count * part[1] / sum(counts))
     how = Settings(settings.bounces, brdf.SHADING_MODELS[settings.shading_model], brdf.layer_table(), clamp, 0)

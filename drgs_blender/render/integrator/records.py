@@ -24,7 +24,7 @@ class Traits(NamedTuple):
         The environment shines.
     lights : bool
         Whether there are lights, or surfaces sampled as lights: one of them is sampled at every vertex of a path.
-    glows : bool
+    emissive : bool
         Whether surfaces emit, for which rays are traced beyond a path's last vertex too.
     lights_differ : bool
         Whether diffuse and glossy rays see different lights.
@@ -35,7 +35,7 @@ class Traits(NamedTuple):
     extent: np.float32
     environment: bool
     lights: bool
-    glows: bool
+    emissive: bool
     lights_differ: bool
     lobes_apart: bool
 

@@ -14,7 +14,7 @@ from ...core.color import LUMINANCE as WEIGHTS
 from ..memory import AddressOf, address, load_float, load_int32, load_int64
 from ..sampling import ONE, ZERO, F, unit
 from ..scene.interaction import Geometry, emitted
-from ..scene.mesh_materials import Glowing
+from ..scene.mesh_materials import EmissiveMesh
 from ..scene.trace_scene import TraceScene
 from .light_shapes import DIFFUSE, GLOSSY, SHADOW
 from .mesh_light_tree import Tree, build, emitter_probability, emitters_weight, morton_order, pick_emitter
@@ -92,10 +92,14 @@ class Emitters:
 
     def __init__(self, scene: TraceScene | None = None, previous: Emitters | None = None) -> None:
         self._scene = scene
-        glowing = scene.glowing if scene is not None else []
+        meshes = scene.emissive_meshes if scene is not None else []
         self._known: list[Any] = [scene and scene.mesh_materials.table]
-        for glow in glowing:
-            self._known += [glow.mesh, int(glow.faces[0]), None if glow.instances is None else glow.instances.start]
+        for emitter in meshes:
+            self._known += [
+                emitter.mesh,
+                int(emitter.faces[0]),
+                None if emitter.instances is None else emitter.instances.start,
+            ]
         if previous is not None and _same(self._known, previous._known):
             self._take(previous)
             return
@@ -104,8 +108,8 @@ class Emitters:
         self.slot, self.first, self.row = (np.full(1, -1, np.int32) for _ in range(3))
         self.count, self.scale, self.rays_differ = 0, 0.0, False
         self._shut: list[tuple[Array, bool]] = []  # faces of meshes, whether they are closed
-        if scene is not None and glowing:
-            self._gather(scene, glowing, previous._shut if previous is not None else [])
+        if scene is not None and meshes:
+            self._gather(scene, meshes, previous._shut if previous is not None else [])
         self.nodes, self.sums = build(self.rows[: self.count], self.scale)
 
     def _take(self, other: Emitters) -> None:
@@ -149,47 +153,49 @@ class Emitters:
         square = np.maximum(((middle - centre) ** 2).sum(axis=1), max(float(radius), 1e-9) ** 2)
         return float((rows[:, LUMINANCE] * rows[:, AREA] / square).sum() * self.scale)
 
-    def _gather(self, scene: TraceScene, glowing: list[Glowing], known: list[tuple[Array, bool]]) -> None:
+    def _gather(self, scene: TraceScene, meshes: list[EmissiveMesh], known: list[tuple[Array, bool]]) -> None:
         """Fill all arrays."""
-        sizes = [len(glow.faces) * (1 if glow.instances is None else len(glow.instances)) for glow in glowing]
+        sizes = [
+            len(emitter.faces) * (1 if emitter.instances is None else len(emitter.instances)) for emitter in meshes
+        ]
         slots = 0
-        kept: list[tuple[Glowing, int, int]] = []
+        kept: list[tuple[EmissiveMesh, int, int]] = []
         self.slot = np.full(len(scene.faces) - scene.vertex_faces, -1, np.int32)
         self.first = np.zeros(max(len(scene.instances), 1), np.int32)
         for index in np.argsort(sizes, kind="stable"):
-            glow, size = glowing[index], sizes[index]
+            emitter, size = meshes[index], sizes[index]
             if slots + size > MOST:
                 self.warnings.append(
-                    f"{glow.mesh.name}: {size} emitting faces are too many to be sampled; rays find them by chance"
+                    f"{emitter.mesh.name}: {size} emitting faces are too many to be sampled; rays find them by chance"
                 )
                 continue
-            kept.append((glow, slots, size))
+            kept.append((emitter, slots, size))
             slots += size
         rows, faces = np.zeros((slots, WIDTH), np.float32), np.zeros(slots, np.int32)
         here = np.eye(3, 4, dtype=np.float32)[None]
-        for glow, start, size in kept:
-            own = np.arange(len(glow.faces), dtype=np.int32)
-            self.slot[glow.faces - scene.vertex_faces] = own + (start if glow.instances is None else 0)
+        for emitter, start, size in kept:
+            own = np.arange(len(emitter.faces), dtype=np.int32)
+            self.slot[emitter.faces - scene.vertex_faces] = own + (start if emitter.instances is None else 0)
             matrices = here
-            if glow.instances is not None:
-                self.first[glow.instances.start : glow.instances.stop] = start + len(own) * np.arange(
-                    len(glow.instances)
+            if emitter.instances is not None:
+                self.first[emitter.instances.start : emitter.instances.stop] = start + len(own) * np.arange(
+                    len(emitter.instances)
                 )
-                matrices = scene.instances[glow.instances.start : glow.instances.stop]
+                matrices = scene.instances[emitter.instances.start : emitter.instances.stop]
             part = slice(start, start + size)
-            v = glow.mesh.visibility
+            v = emitter.mesh.visibility
             bits = DIFFUSE * v.diffuse | GLOSSY * v.glossy | SHADOW | ABSENT * (not v.shadow_catcher)
             self.rays_differ |= v.diffuse != v.glossy
-            faces[part] = np.tile(glow.faces, len(matrices))
-            shut = next((entry for entry in known if entry[0] is glow.mesh.faces), None)
-            shut = shut or (glow.mesh.faces, _is_closed(glow.mesh.faces))
+            faces[part] = np.tile(emitter.faces, len(matrices))
+            shut = next((entry for entry in known if entry[0] is emitter.mesh.faces), None)
+            shut = shut or (emitter.mesh.faces, _is_closed(emitter.mesh.faces))
             self._shut.append(shut)
             bits |= CLOSED * shut[1]
             # Normals look outwards where the surface is closed; a mirrored place turns the order of the corners.
-            inwards = shut[1] and _volume(scene.vertices, scene.faces[glow.shape]) < 0.0
+            inwards = shut[1] and _volume(scene.vertices, scene.faces[emitter.shape]) < 0.0
             turned = (np.linalg.det(matrices[:, :, :3]) < 0.0) != inwards
-            luminance = _luminance(glow, scene)
-            _fill(glow.faces, scene.vertices, scene.faces, matrices, luminance, F(bits), turned, rows[part])
+            luminance = _luminance(emitter, scene)
+            _fill(emitter.faces, scene.vertices, scene.faces, matrices, luminance, F(bits), turned, rows[part])
         self._order(rows, faces)
 
     def _order(self, rows: Array, faces: Array) -> None:
@@ -211,16 +217,16 @@ def _same(a: list[Any], b: list[Any]) -> bool:
     return len(a) == len(b) and all(x is y or (isinstance(x, int) and x == y) for x, y in zip(a, b))
 
 
-def _luminance(glow: Glowing, scene: TraceScene) -> Array:
+def _luminance(emitter: EmissiveMesh, scene: TraceScene) -> Array:
     """(k,) float32 estimates of the mean luminance of each face: half of it its own, half its material's."""
     table, weights = scene.mesh_materials.table, np.array(WEIGHTS)
-    out = np.zeros(len(glow.faces), np.float32)
-    for material in np.unique(glow.material):
-        own = glow.material == material
+    out = np.zeros(len(emitter.faces), np.float32)
+    for material in np.unique(emitter.material):
+        own = emitter.material == material
         mean = float(table.mean_emission(material) @ weights)
         out[own] = mean
-        if table.arrays[1][material, 3] >= 0 and glow.uvs is not None:
-            uv = np.einsum("pc,fcd->fpd", _LOOKUPS, glow.uvs[own]).reshape(-1, 2)
+        if table.arrays[1][material, 3] >= 0 and emitter.uvs is not None:
+            uv = np.einsum("pc,fcd->fpd", _LOOKUPS, emitter.uvs[own]).reshape(-1, 2)
             found = table.lookup(np.full(len(uv), material, np.int32), uv)[:, 5:] @ weights
             out[own] = 0.5 * (mean + found.reshape(-1, len(_LOOKUPS)).mean(axis=1))
     return out

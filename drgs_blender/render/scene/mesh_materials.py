@@ -17,7 +17,7 @@ from .trace_mesh import Part, TraceObject
 
 
 @dataclass(slots=True)
-class Glowing:
+class EmissiveMesh:
     """A mesh with materials that emit light.
 
     Attributes

@@ -103,7 +103,7 @@ class MaterialTable:
         transforms (t, 6) float32;
         images (i, 4) int64, address, width, height, kind;
         decode (256,) float32, linear value of each sRGB byte.
-    glows : bool
+    emissive : bool
         Whether anything emits light.
     warnings : list of str
         Problems and their substitutes, in words.
@@ -135,7 +135,7 @@ class MaterialTable:
             np.array([texels.row() for texels in self._images.values()], np.int64).reshape(-1, 4),
             srgb_to_linear(np.arange(256) / 255.0),
         )
-        self.glows = bool((constants[:, 5:] > 0.0).any())
+        self.emissive = bool((constants[:, 5:] > 0.0).any())
         self.addresses = self.addresses_at(address)
         # Only needed above; they would keep the pixels of the frame before alive.
         self._given, self._known = {}, {}

@@ -18,7 +18,7 @@ from ..memory import AddressOf, address
 from ..sampling import F
 from .instances import Instances, normal_matrices, other_matrices, usable_instances
 from .interaction import Geometry, Tracer
-from .mesh_materials import Glowing, MeshMaterials
+from .mesh_materials import EmissiveMesh, MeshMaterials
 from .ray_masks import object_flags
 from .trace_mesh import (
     Part,
@@ -174,24 +174,26 @@ class TraceScene:
         return np.concatenate(rows), np.concatenate(masks)
 
     @property
-    def glowing(self) -> list[Glowing]:
+    def emissive_meshes(self) -> list[EmissiveMesh]:
         """Emissive surfaces, in the order of the scene's faces."""
-        found: list[Glowing] = []
+        found: list[EmissiveMesh] = []
         materials = self.mesh_materials
-        if not materials.table.glows:
+        if not materials.table.emissive:
             return found
-        glows = np.any(materials.table.arrays[0][:, 5:] > 0.0, axis=1)
+        emissive = np.any(materials.table.arrays[0][:, 5:] > 0.0, axis=1)
         for group, members in enumerate(self._groups):
             for part in (self._parts[i] for i in members):
                 if not isinstance(part.item, MeshState):
                     continue
                 rows = slice(part.face.start - self.vertex_faces, part.face.stop - self.vertex_faces)
-                own = np.flatnonzero(glows[materials.index[rows]]) + rows.start
+                own = np.flatnonzero(emissive[materials.index[rows]]) + rows.start
                 if not len(own):
                     continue
                 where = self._instances_of(group, part)
                 uvs = materials.uvs[own] if len(materials.uvs) else None
-                found.append(Glowing(part.item, part.face, own + self.vertex_faces, materials.index[own], uvs, where))
+                found.append(
+                    EmissiveMesh(part.item, part.face, own + self.vertex_faces, materials.index[own], uvs, where)
+                )
         return found
 
     def _instances_of(self, group: int, part: Part) -> range | None:

@@ -1,6 +1,6 @@
-"""Runs inside Blender's Python: what Cycles makes of Blender's lights, for test_lamps_cycles.py.
+"""Runs inside Blender's Python: what Cycles makes of Blender's lights, for test_lights_cycles.py.
 
-    .venv-blender/bin/python tests/unit/cycles_lamps.py JOB.json
+    .venv-blender/bin/python tests/unit/cycles_lights.py JOB.json
 
 The job lists lights by the fields of drgs_blender.core.frame.Light. With ``look`` = [origin, direction], the result is
 the radiance of the light seen from there; without it, the irradiance at the origin on a plane that faces +Z, from a
@@ -22,7 +22,7 @@ PIXELS = 8
 
 def add_light(entry: dict) -> None:
     kind = entry["kind"]
-    light = bpy.data.lights.new("lamp", kind.upper())
+    light = bpy.data.lights.new("light", kind.upper())
     light.color, light.energy, light.normalize = entry["colour"], entry["power"], entry["normalize"]
     if kind in ("point", "spot"):
         light.shadow_soft_size, light.use_soft_falloff = entry["radius"], entry.get("soft_falloff", True)
@@ -33,10 +33,10 @@ def add_light(entry: dict) -> None:
     if kind == "area":
         light.shape, light.size, light.size_y = entry["shape"].upper(), entry["size_x"], entry["size_y"]
         light.spread = entry["spread"]
-    lamp = bpy.data.objects.new("lamp", light)
-    lamp.matrix_world = Matrix(entry["matrix_world"])
-    lamp.visible_camera, lamp.visible_diffuse, lamp.visible_glossy = entry["camera"], entry["diffuse"], entry["glossy"]
-    bpy.context.collection.objects.link(lamp)
+    obj = bpy.data.objects.new("light", light)
+    obj.matrix_world = Matrix(entry["matrix_world"])
+    obj.visible_camera, obj.visible_diffuse, obj.visible_glossy = entry["camera"], entry["diffuse"], entry["glossy"]
+    bpy.context.collection.objects.link(obj)
 
 
 def add_receiver(roughness: float | None) -> None:

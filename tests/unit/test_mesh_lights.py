@@ -1,4 +1,4 @@
-"""Light of surfaces that emit: what it does must be what a lamp of the same shape and radiance does."""
+"""Light of surfaces that emit: what it does must be what a light of the same shape and radiance does."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ def panel() -> MeshState:
     return mesh_state(corners, FACES, materials=[Material("glow", (0.0, 0.0, 0.0), 1.0, 1.0, RADIANCE)])
 
 
-def lamp() -> Light:
+def area_light() -> Light:
     """The same light as one of Blender's: it shines down."""
     place = np.eye(4)
     place[2, 3] = 1.0
-    return Light("lamp", "area", place, RADIANCE, math.pi * 4.0, size_x=2.0)
+    return Light("light", "area", place, RADIANCE, math.pi * 4.0, size_x=2.0)
 
 
 def wall() -> MeshState:
@@ -50,15 +50,15 @@ def total(meshes: list[MeshState], lights: list[Light], bounces: int, strength: 
     seen = points(4000, albedo=0.8, roughness=0.4, origin=(0.3, 0.1, 0.0))
     light = EnvironmentLight(World(strength=strength))
     how = settings(16, 8, 8, bounces=bounces, shading_model="principled")
-    lamps = Lights(lights, emitters=Emitters(scene))
-    found = integrate(scene, light, seen, how, 0, lamps).components.astype(float)
+    sampler = Lights(lights, emitters=Emitters(scene))
+    found = integrate(scene, light, seen, how, 0, sampler).components.astype(float)
     return found.mean(0), found.std(0) / math.sqrt(len(found))
 
 
 @pytest.mark.parametrize("bounces", [0, 1, 3])
-def test_a_panel_lights_as_a_lamp_does(bounces: int) -> None:
+def test_a_panel_lights_as_a_light_does(bounces: int) -> None:
     """Direct and indirect light in a world without light, up to the last bounce."""
-    (glow, a), (lit, b) = total([panel(), wall()], [], bounces, 0.0), total([wall()], [lamp()], bounces, 0.0)
+    (glow, a), (lit, b) = total([panel(), wall()], [], bounces, 0.0), total([wall()], [area_light()], bounces, 0.0)
     assert lit[0].min() > 0.2 and (bounces == 0 or lit[1].max() > 0.005)
     assert (np.abs(glow - lit) <= 4.5 * np.hypot(a, b) + 1e-4).all()
     assert (np.hypot(a, b)[:2] < 0.02 * lit[:2] + 2e-4).all()

@@ -1,4 +1,4 @@
-"""Lamps in the picture: how bright they are, what hides them, what they leave of alpha."""
+"""Lights in the picture: how bright they are, what hides them, what they leave of alpha."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def picture(
     return render(PreparedScene(scene, EnvironmentLight(World(strength=0.0)), posed, Lights(lights)), frame)
 
 
-def test_a_lamp_covers_what_it_should_with_its_radiance_and_no_alpha() -> None:
+def test_a_light_covers_what_it_should_with_its_radiance_and_no_alpha() -> None:
     seen = picture([panel(0.0)], [], film_transparent=True, subpixel_samples=16)
     middle = seen["Emit"][SIZE // 2 - 3 : SIZE // 2 + 3, SIZE // 2 - 7 : SIZE // 2 + 7]
     np.testing.assert_allclose(middle, np.broadcast_to(SHINE, middle.shape), rtol=1e-5)
@@ -59,11 +59,11 @@ def test_a_lamp_covers_what_it_should_with_its_radiance_and_no_alpha() -> None:
 
 
 @pytest.mark.parametrize("change", [{"camera": False}, {"power": 0.0}])
-def test_lamps_are_seen_only_where_they_are_to_be(change: dict) -> None:
+def test_lights_are_seen_only_where_they_are_to_be(change: dict) -> None:
     assert not picture([panel(0.0, **change)], [])["Emit"].any()
 
 
-def test_surfaces_hide_lamps_behind_them_and_lamps_hide_nothing() -> None:
+def test_surfaces_hide_lights_behind_them_and_lights_hide_nothing() -> None:
     half = mesh_state(SQUARE * (0.5, 1, 9) - (0.5, 0, 0), FACES, matrix((0, 1.0, 0)), materials=[BLACK])
     before, behind = (picture([panel(y)], [half])["Emit"] for y in (0.9, 1.1))
     left = slice(0, SIZE // 2 - 1)
@@ -77,10 +77,10 @@ def test_surfaces_hide_lamps_behind_them_and_lamps_hide_nothing() -> None:
 
 @pytest.mark.parametrize(("clip", "factor"), [((3.9, 4.1), 1), ((4.1, 9), 0), ((0.1, 3.9), 0), ((0.1, 9), 1)])
 @pytest.mark.parametrize("meshes", [[], [wall(1.0, BLACK)]])
-def test_lamps_beyond_the_clip_distances_are_not_seen_and_suns_are(clip: tuple, factor: float, meshes: list) -> None:
+def test_lights_beyond_the_clip_distances_are_not_seen_and_suns_are(clip: tuple, factor: float, meshes: list) -> None:
     """Measured in Cycles of Blender 5.0. A mesh beyond them hides nothing."""
-    lamp, sun = panel(0.0), replace(panel(0.0), kind="sun", angle=0.5, power=1.0)
-    found, middle = picture([lamp], meshes, clip=clip)["Emit"], (SIZE // 2, SIZE // 2)
+    light, sun = panel(0.0), replace(panel(0.0), kind="sun", angle=0.5, power=1.0)
+    found, middle = picture([light], meshes, clip=clip)["Emit"], (SIZE // 2, SIZE // 2)
     np.testing.assert_allclose(found[middle], factor * SHINE, rtol=1e-5)
     hidden = bool(meshes) and clip[1] > 5
     assert picture([sun], meshes, clip=clip)["Emit"][middle].any() != hidden
@@ -97,7 +97,7 @@ def test_surfels_let_through_what_they_leave_free(opacity: float) -> None:
     assert not hidden.any()
 
 
-def test_holdouts_hide_lamps_and_catchers_do_not() -> None:
+def test_holdouts_hide_lights_and_catchers_do_not() -> None:
     for kind, factor in (("holdout", 0.0), ("shadow_catcher", 1.0)):
         cut = mesh_state(SQUARE * 9, FACES, matrix((0, 0, 0)), materials=[BLACK], visibility=Visibility(**{kind: True}))
         seen = picture([panel(1.0)], [cut], film_transparent=True)["Emit"][SIZE // 2, SIZE // 2]

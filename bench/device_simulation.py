@@ -1,6 +1,6 @@
 """Simulated matter on every device there is: frames a second, and how far apart they end.
 
-python bench/device_matter.py [--particles 100000] [--frames 24]    # prints; bench_device.py writes it
+python bench/device_simulation.py [--particles 100000] [--frames 24]    # prints; bench_device.py writes it
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from report import table
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "unit"))
-from matter_cases import lattice, solver_of
+from simulation_cases import lattice, solver_of
 
 from drgs_blender.compute.threads import use_threads
 from drgs_blender.compute.warp.kernels import Launcher

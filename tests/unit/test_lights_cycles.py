@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_lamps import light
+from test_light_sampler import light
 
 from drgs_blender.core.frame import Light
 from drgs_blender.render.lights.light_sampler import Lights, light_flags
@@ -20,7 +20,7 @@ from drgs_blender.render.lights.light_shapes import CAMERA, DIFFUSE, GLOSSY, SHA
 from drgs_blender.render.sampling import sobol
 
 ROOT = Path(__file__).resolve().parents[2]
-JOB = Path(__file__).with_name("cycles_lamps.py")
+JOB = Path(__file__).with_name("cycles_lights.py")
 
 #: Irradiance at the origin, facing up.
 LIT = {
@@ -94,19 +94,19 @@ def cycles(tmp_path_factory) -> dict[str, np.ndarray]:
     if not python.exists():
         pytest.skip("Blender's Python is not installed in .venv-blender")
 
-    def entry(lamp: Light, **more) -> dict:
-        return dataclasses.asdict(lamp) | {"matrix_world": np.asarray(lamp.matrix_world).tolist()} | more
+    def entry(one: Light, **more) -> dict:
+        return dataclasses.asdict(one) | {"matrix_world": np.asarray(one.matrix_world).tolist()} | more
 
     above = light("area", 0, 0, 1)
-    jobs = {f"lit {name}": entry(lamp) for name, lamp in LIT.items()}
-    for name, (lamp, origin, direction) in SEEN.items():
-        jobs[f"seen {name}"] = entry(dataclasses.replace(lamp, camera=True), look=(origin, direction))
+    jobs = {f"lit {name}": entry(one) for name, one in LIT.items()}
+    for name, (one, origin, direction) in SEEN.items():
+        jobs[f"seen {name}"] = entry(dataclasses.replace(one, camera=True), look=(origin, direction))
     jobs["no camera"] = entry(above, look=((0, 0, 0), (0, 0, 1)))
     jobs["no diffuse"] = entry(dataclasses.replace(above, diffuse=False))
     jobs["no glossy"] = entry(dataclasses.replace(above, glossy=False))
     jobs["no glossy, glossy"] = entry(dataclasses.replace(above, glossy=False), glossy_roughness=0.5)
     jobs["no diffuse, glossy"] = entry(dataclasses.replace(above, diffuse=False), glossy_roughness=0.5)
-    path = tmp_path_factory.mktemp("lamps") / "job.json"
+    path = tmp_path_factory.mktemp("lights") / "job.json"
     path.write_text(json.dumps(list(jobs.values())))
     subprocess.run([str(python), str(JOB), str(path)], check=True, timeout=300, capture_output=True)
     results = json.loads(path.with_suffix(".result.json").read_text())
@@ -116,8 +116,8 @@ def cycles(tmp_path_factory) -> dict[str, np.ndarray]:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", LIT)
 def test_irradiance(cycles, name):
-    lamps = Lights([LIT[name]])
-    directions, _, radiance, density, _ = lamps.sample(sobol(1 << 17), (0, 0, 0))
+    sampler = Lights([LIT[name]])
+    directions, _, radiance, density, _ = sampler.sample(sobol(1 << 17), (0, 0, 0))
     hit = density != 0
     terms = radiance[hit] * (np.maximum(directions[hit, 2], 0) / np.abs(density[hit]))[:, None].astype(float)
     assert cycles[f"lit {name}"].max() > 0
@@ -127,9 +127,9 @@ def test_irradiance(cycles, name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SEEN)
 def test_radiance_along_a_ray(cycles, name):
-    lamp, origin, direction = SEEN[name]
+    one, origin, direction = SEEN[name]
     unit = np.array([direction]) / np.linalg.norm(direction)
-    found = Lights([dataclasses.replace(lamp, camera=True)]).along(origin, unit, seen_by=CAMERA)[0]
+    found = Lights([dataclasses.replace(one, camera=True)]).along(origin, unit, seen_by=CAMERA)[0]
     expected = cycles[f"seen {name}"]
     np.testing.assert_allclose(found, expected, rtol=1e-3)
     hidden = ("beside", "corner", "turned", "behind", "outside")
@@ -142,8 +142,8 @@ def test_who_sees_a_light(cycles):
     assert cycles["no camera"].max() == 0
     assert cycles["no diffuse"].max() == 0 < cycles["no glossy"].max()
     assert cycles["no glossy, glossy"].max() == 0 < cycles["no diffuse, glossy"].max()
-    lamps = Lights([light("area", 0, 0, 1, diffuse=False)])
-    assert light_flags(0, lamps.tables) == GLOSSY | SHADOW
-    assert not lamps.along((0, 0, 0), [[0, 0, 1]], seen_by=DIFFUSE).any()
-    assert not lamps.along((0, 0, 0), [[0, 0, 1]], seen_by=CAMERA).any()
-    assert lamps.along((0, 0, 0), [[0, 0, 1]], seen_by=GLOSSY).all()
+    sampler = Lights([light("area", 0, 0, 1, diffuse=False)])
+    assert light_flags(0, sampler.tables) == GLOSSY | SHADOW
+    assert not sampler.along((0, 0, 0), [[0, 0, 1]], seen_by=DIFFUSE).any()
+    assert not sampler.along((0, 0, 0), [[0, 0, 1]], seen_by=CAMERA).any()
+    assert sampler.along((0, 0, 0), [[0, 0, 1]], seen_by=GLOSSY).all()
