@@ -13,6 +13,7 @@ import hashlib
 import json
 import os
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 from .folders import cache_folder, write_atomically
@@ -27,6 +28,7 @@ NEUTRAL = frozenset(f"drgs_blender/{name}.py" for name in (
     "core/version",
 ))  # fmt: skip
 _DIGITS = 16
+_MOST_ROWS = 4000
 
 
 @functools.cache
@@ -50,14 +52,34 @@ def digest(path: Path) -> str:
     return total.hexdigest()[:_DIGITS]
 
 
-_noted: dict[str, tuple[int, int] | None] = {}
+def package_digest() -> str:
+    """Digest of all sources of the package, for caches that do not know which of them a kernel is made of."""
+    total = hashlib.sha256()
+    for file in sorted(_sources()):
+        total.update(_name(file).encode() + b"\0" + Path(file).read_bytes())
+    return total.hexdigest()[:_DIGITS]
 
 
-def note(path: Path) -> None:
+def _sources() -> Iterator[str]:
+    for folder, folders, files in os.walk(str(PACKAGE)):
+        folders[:] = [name for name in folders if name != "__pycache__"]
+        yield from (os.path.join(folder, name) for name in files if name.endswith(".py"))
+
+
+#: File -> what it was when this process began to import kernels.
+_noted: dict[str, tuple[int, ...] | None] = {}
+
+
+def note(file: str) -> None:
     """Remember a source file as it is when its module is imported."""
-    file = str(path)
     if file not in _noted:
         _noted[file] = _stamp(file)
+
+
+def note_package() -> None:
+    """Remember all sources of the package, before the modules of kernels are imported."""
+    for file in _sources():
+        note(file)
 
 
 def changed(path: Path) -> bool:
@@ -71,12 +93,13 @@ def _is_changed(file: str) -> bool:
     return file in _noted and _noted[file] != _stamp(file)
 
 
-def _stamp(file: str) -> tuple[int, int] | None:
+def _stamp(file: str) -> tuple[int, ...] | None:
+    """Of a file that is unpacked or copied over another the modification time alone may be the same."""
     try:
         facts = os.stat(file)
     except OSError:
         return None
-    return facts.st_mtime_ns, facts.st_size
+    return facts.st_mtime_ns, facts.st_ctime_ns, facts.st_size, facts.st_ino
 
 
 def closure(path: Path) -> frozenset[Path]:
@@ -159,6 +182,9 @@ class _Index:
     @functools.cached_property
     def rows(self) -> dict[str, tuple[str, list[str]]]:
         found: dict[str, tuple[str, list[str]]] = {}
+        if self.path:
+            with contextlib.suppress(OSError):
+                os.utime(self.path)  # what is used is not removed
         for path in (SHIPPED / shipped_index(), self.path):
             with contextlib.suppress(OSError, ValueError, TypeError, AttributeError, RecursionError):
                 rows = unpacked(path.read_bytes()) if path else {}
@@ -166,6 +192,8 @@ class _Index:
         return found
 
     def add(self, key: str, facts: str, imported: list[str]) -> None:
+        if len(self.rows) >= _MOST_ROWS:  # of sources that are edited, each version is one
+            self.rows.clear()
         self.rows[key] = facts, imported
         self.added = True
 

@@ -11,7 +11,6 @@ What kernels take is in docs/kernels.md, with what Numba does to named tuples.
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import os
 from typing import Any
@@ -19,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from . import targets
-from .folders import wanted_folder
+from .folders import cache_folder
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
@@ -27,18 +26,18 @@ import numba
 from numba.core.ccallback import CFunc
 from numba.extending import overload as _overload
 
-if "NUMBA_CACHE_DIR" not in os.environ:  # where Numba keeps kernels itself, see `kernel_compiler.TESTED`
-    with contextlib.suppress(RuntimeError):  # there is no home folder
-        numba.config.CACHE_DIR = str(wanted_folder() / "numba")
-
-from . import kernel_compiler
+from . import closure, kernel_compiler
 from .kernel_cache import KernelCache
 
 log = logging.getLogger(__name__)
+closure.note_package()
 targets.settle(numba.config)
 _OWN_CACHE = kernel_compiler.is_tested() and not numba.config.DISABLE_JIT
 if not kernel_compiler.is_tested():
-    log.warning("Numba %s was not tested: kernels take longer to compile", numba.__version__)
+    log.warning("Numba %s was not tested: kernels take longer to compile, when they are called", numba.__version__)
+    if (folder := cache_folder().path) is not None:
+        # Numba's own files tell one version of a kernel's file from another, but not of what that imports
+        numba.config.CACHE_DIR = str(folder / f"numba-{closure.package_digest()}")
 
 
 def njit(function: Any = None, *, cache: bool = True, **options: Any) -> Any:

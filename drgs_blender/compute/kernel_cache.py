@@ -155,7 +155,7 @@ class KernelCache(NullCache):
 
     def _make_name(self, sig: Any, codegen: Any) -> str | None:
         arguments = describe(sigutils.normalize_signature(sig)[0])
-        if arguments is None or closure.changed(self._source):
+        if arguments is None or not self._closure:
             return None
         cells = self.function.__closure__ or ()
         triple, *target = codegen.magic_tuple()
@@ -184,7 +184,7 @@ class KernelCache(NullCache):
             yield data
         if (path := self._path(name)) is not None:
             try:
-                data = path.read_bytes()
+                data = _read_own(path)
                 with contextlib.suppress(OSError):
                     os.utime(path.parent)
             except FileNotFoundError:
@@ -196,14 +196,36 @@ class KernelCache(NullCache):
 
     @functools.cached_property
     def _closure(self) -> str:
-        return closure.digest(self._source)
+        """Digest of the sources; "" where they are not what is being run, or cannot be read."""
+        try:
+            digest = closure.digest(self._source)
+            if not closure.changed(self._source):
+                return digest
+            problem = "its sources, or those that it imports, changed after they were imported"
+        except (OSError, SyntaxError, ValueError) as error:
+            problem = f"its sources cannot be read, {error}"
+        log.warning("compiled kernels of %s are not kept: %s", self._source, problem)
+        return ""
 
     def _path(self, name: str) -> Path | None:
         """A file of this function's folder, or the folder for no name; None where nothing is kept."""
         folder = cache_folder().path
-        if folder is None:
+        if folder is None or not self._closure:
             return None
         return folder / f"{self.function.__module__.rpartition('.')[2]}-{self._closure}" / name
+
+
+def _read_own(path: Path) -> bytes:
+    """The bytes of a file of this user's: it is executed, and the folder may once have been open to others.
+
+    Raises
+    ------
+    OSError
+    """
+    with path.open("rb") as file:
+        if hasattr(os, "geteuid") and (owner := os.fstat(file.fileno()).st_uid) != os.geteuid():
+            raise PermissionError(f"is of user {owner}, not of this one")
+        return file.read()
 
 
 def _code_facts(function: Any) -> tuple[str, str]:
@@ -231,7 +253,7 @@ def _constant(value: Any) -> str:
 def _source(name: str) -> Path:
     """The file of a module that is being imported."""
     path = Path(name).resolve()
-    closure.note(path)
+    closure.note(str(path))
     return path
 
 

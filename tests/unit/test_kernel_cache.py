@@ -146,28 +146,6 @@ def _uses_global(x):
     return _FACTOR * x
 
 
-@pytest.mark.slow
-def test_a_source_that_changed_after_its_import_is_not_kept(tmp_path):
-    """What runs is the code of before, what the name would say is that of now."""
-    program, source = tmp_path / "program.py", tmp_path / "changing.py"
-    text = "from drgs_blender.compute.jit import njit\nK = 1.0\n@njit\ndef f(x): return x + K\n"
-    program.write_text(
-        "import changing, pathlib, sys\n"
-        "if sys.argv[1:]: pathlib.Path('changing.py').write_text(sys.argv[1])\nprint(changing.f(1.0))\n"
-    )
-    source.write_text(text)
-    environment = os.environ | {
-        "DRGS_CACHE_DIR": str(tmp_path / "cache"),
-        "PYTHONPATH": f"{ROOT}{os.pathsep}{tmp_path}",
-    }
-    said = []
-    for arguments in ([text.replace("1.0", "1000.0")], []):
-        command = [sys.executable, program, *arguments]
-        done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=True)
-        said.append(done.stdout.strip())
-    assert said == ["2.0", "1001.0"]
-
-
 _LOADED = """
 import sys
 from drgs_blender.compute.jit import njit
