@@ -1,11 +1,10 @@
 """From nothing to a picture: kernels compiled and shipped, the engine, the demo.
 
-    python bench/bench_startup.py [--repeats N] [--demo] [--tests] [--ci] [--against COMMIT]
+    python bench/bench_startup.py [--repeats N] [--demo] [--tests] [--ci] [--earlier]
 
 Cold is an empty cache folder, without kernels of a release. ``--demo`` runs ``make demo`` with one, the environments
-standing; ``--tests`` runs ``make test`` with one. ``--against`` measures the first pixel of another commit and of this
-one in turn. These, and what a release brings, keep the figure and the date of an earlier run where they are not
-measured.
+standing; ``--tests`` runs ``make test`` with one. ``--earlier`` measures the first pixel of an earlier commit and of
+this one in turn. What is not measured keeps the figure and the date that docs/benchmarks.md has.
 """
 
 from __future__ import annotations
@@ -13,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
 import shutil
 import statistics
 import subprocess
@@ -22,10 +22,12 @@ import tempfile
 import time
 from pathlib import Path
 
+import OpenEXR
 from bench_engine import first_frame, plane_asset
-from report import OUT, ROOT, table, write_section
+from report import DOCUMENT, ROOT, table, write_section
 
-RESULTS = OUT / "startup.json"
+#: The first pixel of this commit and of another one, measured in turn.
+IN_TURN = "the same, in turn with the next row", "the same of an earlier commit"
 #: What -> (hold, stretch), seconds.
 GOALS = {
     "all kernels, cold": (60, 35),
@@ -34,14 +36,18 @@ GOALS = {
     "`drgs relight`, start to picture, kernels shipped": (3, 1),
     "`drgs relight`, start to picture, warm": ("", ""),
     "engine process to first pixel, warm": (0.8, 0.4),
-    "the same, in turn with the next row": ("", ""),
-    "the same of commit {commit}": ("", ""),
+    IN_TURN[0]: ("", ""),
+    IN_TURN[1]: ("", ""),
     "`make demo` after the environments, cold": (75, 45),
     "`make test`, cold": (480, 300),
     "`.ci/run`, environments and cache cold": (2100, 1500),
 }
 
 
+#: Pixels of a picture's side, and samples per pixel, of `drgs relight`.
+SIZE, SAMPLES = 256, 32
+#: Of which docs/benchmarks.md has the first pixel of another machine, or hour.
+EARLIER = "0a3e415"
 _PACE: list[float] = []
 
 
@@ -54,28 +60,34 @@ def pace() -> float:
 
 
 def run(command: list[object], **environment: object) -> float:
-    """Seconds that a command takes, which hears of no variable of ours or Numba's but these; it must succeed."""
+    """Seconds that a command takes; it must succeed.
+
+    It hears of no variable of ours or Numba's but these, and which torch the environments have.
+    """
+    ours = "DRGS_", "NUMBA_"
+    merged = {name: value for name, value in os.environ.items() if not name.startswith(ours) or name == "DRGS_TORCH"}
+    merged |= {name: str(value) for name, value in environment.items()}
     _PACE.append(pace())
     begun = time.perf_counter()
-    merged = {name: value for name, value in os.environ.items() if not name.startswith(("DRGS_", "NUMBA_"))}
-    merged |= {name: str(value) for name, value in environment.items()}
     done = subprocess.run(list(map(str, command)), env=merged, cwd=ROOT, capture_output=True, text=True)
+    seconds = time.perf_counter() - begun
+    _PACE.append(pace())
     if done.returncode:
         raise SystemExit(f"{' '.join(map(str, command))} failed:\n{done.stdout[-2000:]}{done.stderr[-2000:]}")
-    return time.perf_counter() - begun
+    return seconds
 
 
 def relight(folder: Path) -> list[object]:
-    """One relit frame of a cow of 100,000 surfels, 256 x 256, under an HDRI."""
-    camera = {"matrix_world": [[1, 0, 0, 0], [0, 0, -1, -3], [0, 1, 0, 0], [0, 0, 0, 1]], "width": 256, "height": 256}
-    (folder / "camera.json").write_text(json.dumps(camera | {"fov_x": 40}))
+    """One relit frame of a cow of 100,000 surfels, `SIZE` x `SIZE`, under an HDRI."""
     drgs = [sys.executable, "-m", "drgs_blender.cli.main"]
     if not (folder / "spot.drgs").exists():
         run([*drgs, "make", ROOT / "examples/spot/spot_triangulated.obj", "--out", folder / "spot.drgs"])
         kernels = [sys.executable, ROOT / "tools/kernels.py", "record", "--do", "environment", folder]
-        run(kernels)
+        run(kernels)  # writes light.exr
+    camera = {"matrix_world": [[1, 0, 0, 0], [0, 0, -1, -3], [0, 1, 0, 0], [0, 0, 0, 1]], "width": SIZE, "height": SIZE}
+    (folder / "camera.json").write_text(json.dumps(camera | {"fov_x": 40}))
     return [*drgs, "relight", folder / "spot.drgs", "--camera", folder / "camera.json", "--env", folder / "light.exr",
-            "--out", folder / "frame.exr"]  # fmt: skip
+            "--samples", SAMPLES, "--out", folder / "frame.exr"]  # fmt: skip
 
 
 def cold(command: list[object], folder: Path, repeats: int) -> float:
@@ -99,6 +111,8 @@ def measure(folder: Path, repeats: int) -> dict[str, float]:
     }
     warm = [run(picture, DRGS_CACHE_DIR=folder / "cache", DRGS_SHIPPED="0") for _ in range(repeats + 2)]
     rows["`drgs relight`, start to picture, warm"] = statistics.median(warm)
+    with OpenEXR.File(str(folder / "frame.exr")) as file:
+        assert file.channels()["RGBA"].pixels.shape[:2] == (SIZE, SIZE)
     shipped = folder / "shipped"
     if (ROOT / "drgs_blender/compute/kernels").is_dir():
         rows["`drgs relight`, start to picture, kernels shipped"] = statistics.median(
@@ -120,16 +134,15 @@ def _shipped(picture: list[object], cache: Path) -> float:
     return seconds
 
 
-def dev_command_seconds(command: str, folder: Path) -> float:
+def dev_command_seconds(folder: Path, *command: object) -> float:
     """Seconds of a command of tools/dev.py with an empty cache folder, without the kernels of a release."""
     shutil.rmtree(folder / "cache", ignore_errors=True)
-    shutil.rmtree(ROOT / "out" / "demo", ignore_errors=True)
     kernels, hidden = ROOT / "drgs_blender/compute/kernels", ROOT / "build/kernels-hidden"
     hidden.parent.mkdir(exist_ok=True)
     if kernels.is_dir():
         kernels.replace(hidden)
     try:
-        return run([sys.executable, ROOT / "tools/dev.py", command], DRGS_CACHE_DIR=folder / "cache")
+        return run([sys.executable, ROOT / "tools/dev.py", *command], DRGS_CACHE_DIR=folder / "cache")
     finally:
         if hidden.is_dir():
             hidden.replace(kernels)
@@ -181,6 +194,30 @@ def first_pixels(commits: list[str], folder: Path, pairs: int = 9) -> list[float
     return [statistics.median(column) for column in zip(*seconds[1:], strict=True)]
 
 
+def earlier(document: str) -> dict[str, list[object]]:
+    """The rows that docs/benchmarks.md has: what -> seconds, date, pace."""
+    rows: dict[str, list[object]] = {}
+    for what in GOALS:
+        if found := re.search(rf"^\| {re.escape(what)} \| ([\d.]+) \| ([\d-]+) \| ([\d.]*) \|", document, re.MULTILINE):
+            rows[what] = [float(found[1]), found[2], found[3]]
+    return rows
+
+
+def write(rows: dict[str, list[object]], repeats: int) -> None:
+    """Write the section."""
+    shown = [[what, *(rows.get(what, ["not measured"]) + [""] * 3)[:3], *goals] for what, goals in GOALS.items()]
+    text = (
+        "Cold: an empty cache folder, without kernels of a release. Whole processes, their start included; medians of "
+        f"{repeats}, of {repeats + 2} where warm or shipped, of 7 for the first pixel, of 9 for the two in turn; the "
+        f"last three rows once. `drgs relight` renders {SIZE} x {SIZE} pixels with {SAMPLES} samples. The earlier "
+        f"commit, {EARLIER}, is the one whose first pixel took 0.845 s in the section *The engine process*, on another "
+        "day. Pace: seconds that ten million additions in Python took before and after: machines that are shared are "
+        "fast at one time and slow at another.\n\n"
+    )
+    columns = "What", "Seconds", "Measured", "Pace", "Hold", "Stretch"
+    write_section("startup", "Starting", text + table(columns, shown))
+
+
 def main() -> None:
     """Measure and write the section."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -189,47 +226,36 @@ def main() -> None:
     parser.add_argument("--demo", action="store_true", help="measure `make demo` as well")
     parser.add_argument("--tests", action="store_true", help="measure `make test` as well")
     parser.add_argument("--ci", action="store_true", help="measure `.ci/run` of a clean clone as well")
-    parser.add_argument("--against", metavar="COMMIT", help="measure the first pixel of this commit as well")
+    parser.add_argument("--earlier", action="store_true", help=f"measure the first pixel of {EARLIER} as well")
     options = parser.parse_args()
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # else each start compiles all sources: users have them compiled
-    rows: dict[str, list[object]] = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+    rows = earlier(DOCUMENT.read_text(encoding="utf-8"))
 
     def record(found: dict[str, float]) -> None:
         meanwhile = round(statistics.median(_PACE), 2)
         _PACE.clear()
         rows.update({what: [seconds, time.strftime("%Y-%m-%d"), meanwhile] for what, seconds in found.items()})
-        RESULTS.parent.mkdir(parents=True, exist_ok=True)
-        RESULTS.write_text(json.dumps(rows))
+        write(rows, options.repeats)
 
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         if not options.no_kernels:
-            record(measure(folder, options.repeats) | {"repeats": options.repeats})
-        if options.against:
-            other, this = first_pixels([options.against, "HEAD"], folder)
-            names = "the same, in turn with the next row", "the same of commit {commit}"
-            record(dict(zip(names, (this, other), strict=True)) | {"against": options.against})
+            record(measure(folder, options.repeats))
+        if options.earlier:
+            other, this = first_pixels([EARLIER, "HEAD"], folder)
+            record({IN_TURN[0]: this, IN_TURN[1]: other})
         if options.demo:
-            record({"`make demo` after the environments, cold": dev_command_seconds("demo", folder)})
+            record(
+                {
+                    "`make demo` after the environments, cold": dev_command_seconds(
+                        folder, "demo", "--out", folder / "demo"
+                    )
+                }
+            )
         if options.tests:
-            record({"`make test`, cold": dev_command_seconds("test", folder)})
+            record({"`make test`, cold": dev_command_seconds(folder, "test")})
         if options.ci:
             record({"`.ci/run`, environments and cache cold": clone(folder)})
-    commit = str(rows.get("against", ["-"])[0])
-    shown = [
-        [what.format(commit=commit), *(rows.get(what, ["not measured"]) + [""] * 3)[:3], *goals]
-        for what, goals in GOALS.items()
-    ]
-    repeats = int(str(rows["repeats"][0])) if "repeats" in rows else options.repeats  # of the run that measured them
-    text = (
-        "Cold: an empty cache folder, without kernels of a release. Whole processes, their start included; medians of "
-        f"{repeats}, of {repeats + 2} where warm or shipped, of 7 for the first pixel; the last three "
-        "rows once. Pace: seconds that ten million additions in Python took meanwhile, as machines that are shared are "
-        "fast at one time and slow at another.\n\n"
-    )
-    write_section(
-        "startup", "Starting", text + table(("What", "Seconds", "Measured", "Pace", "Hold", "Stretch"), shown)
-    )
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """What kernels for a fixed target cost against those for this very processor.
 
-    python bench/startup_targets.py [--runs 7] [--targets x86-64-v4 x86-64-v3 ...]
+    python bench/bench_targets.py [--runs 7] [--targets x86-64-v4 x86-64-v3 ...]
 
 One process per target, each with one thread, which take turns; processor time, so that what else runs on the machine
 matters little. The same frames are also compared bit for bit.
@@ -22,9 +22,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
-from report import table
+from report import ROOT, table, write_section
 
-ROOT = Path(__file__).resolve().parent.parent
 SIZE = 256
 TASKS = ("mesh", "surfels", "surfel rays", "denoised", "simulated")
 COLUMNS = ["work", "kernels for", "ms", "against native", "spread", "same bits"]
@@ -158,7 +157,13 @@ def main() -> None:
     if options.child:
         work(options.child)
         return
-    print(table(COLUMNS, measure(options.targets, options.runs)))
+    rows = measure(options.targets, options.runs)
+    text = (
+        "Processor time of one thread, each kind of kernels in a process of its own, in turn; medians of "
+        f"{options.runs}. Spread: of single turns. Same bits: of the frame, or of the particles, as by kernels for this "
+        "very processor.\n\n"
+    )
+    write_section("targets", "Kernels for fixed targets", text + table(COLUMNS, rows))
 
 
 if __name__ == "__main__":
