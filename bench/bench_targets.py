@@ -160,8 +160,8 @@ def main() -> None:
     rows = measure(options.targets, options.runs)
     text = (
         "Processor time of one thread, each kind of kernels in a process of its own, in turn; medians of "
-        f"{options.runs}. Spread: of single turns. Same bits: of the frame, or of the particles, as by kernels for this "
-        "very processor.\n\n"
+        f"{options.runs}. Spread: of single turns. Same bits: of the frame, or of the particles, as by kernels for "
+        "this very processor.\n\n"
     )
     write_section("targets", "Kernels for fixed targets", text + table(COLUMNS, rows))
 

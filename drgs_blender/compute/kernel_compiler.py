@@ -5,8 +5,9 @@ that no Python code calls; and it optimises its code again in all that call it. 
 met while another one is compiled: they become LLVM code to be linked into their callers, which are optimised whole.
 That halves the time of compiling and leaves the arithmetic as it is.
 
-Only documented hooks are used to get in (``pipeline_class``), and subclasses; what they rely on is not promised by
-Numba, so the versions it was tried with are listed, and with others Numba compiles and keeps kernels in its own way.
+A function gets this compiler by ``pipeline_class``, which Numba documents. The rest (`numba_shortcuts`, the kinds of
+library, the dispatcher's cache and overloads, see `adopt`) is what Numba does not promise: the versions that it was
+tried with are listed, and with others Numba compiles and keeps kernels in its own way.
 """
 
 from __future__ import annotations
