@@ -25,8 +25,8 @@ from numba.core import codegen, compiler, errors, sigutils, targetconfig, typed_
 
 from . import numba_shortcuts
 
-#: Versions of Numba for which this was tested.
-TESTED = ("0.62", "0.63", "0.64", "0.65", "0.66", "0.67", "0.68")
+#: Versions of Numba with which frames are the same bit for bit (tools/numba_versions.py).
+TESTED = ("0.63", "0.64", "0.65", "0.66", "0.67", "0.68")
 
 
 def is_tested() -> bool:
